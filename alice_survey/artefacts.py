@@ -1,0 +1,213 @@
+"""Stages of a workspace: folders that appear whole or not at all, skipped while nothing changed.
+
+A stage folder is written as `NAME.partial` and renamed when complete. Its `stage.json` carries the
+stage's version, its settings, a digest of every input file and the time it took; a later run skips
+the stage while all of these still hold.
+"""
+
+import contextlib
+import csv
+import hashlib
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from alice_survey.errors import WorkspaceError
+
+STAGE_FILE = "stage.json"
+STAGES = (
+    "plan", "flight", "pool", "images", "calibration", "sparse", "dense", "mosaic", "report",
+)  # fmt: skip
+"""Stage folders in the order in which the loop writes them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """One step of the loop: what it depends on and the folder it writes."""
+
+    name: str
+    version: int
+    """Raise it when the stage's code changes its result."""
+    settings: Mapping[str, Any]
+    """Everything but files that the result depends on, as JSON values."""
+    inputs: Sequence[Path] = ()
+    """Files and folders that the result depends on; `stage.json` files inside do not count."""
+    resumes: bool = False
+    """Work can go on in what an interrupted run of the same digest left."""
+
+
+def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], None]) -> bool:
+    """Do a stage's work unless its folder is there and nothing it depends on has changed.
+
+    Args:
+        workspace: folder that holds the stage folders; made when missing.
+        stage: what to do it for.
+        work: writes its files into the folder it is given (`NAME.partial`).
+
+    Returns:
+        True when the work was done, False when it was skipped.
+    """
+    final, partial = workspace / stage.name, workspace / f"{stage.name}.partial"
+    replaced = workspace / f"{stage.name}.replaced"
+    if replaced.exists():  # a kill fell between the two renames below
+        if final.exists():
+            shutil.rmtree(replaced)
+        else:
+            replaced.rename(final)
+    previous = read_stage(final)
+    inputs = digest_inputs(stage.inputs, workspace, previous)
+    digest = _digest_stage(stage, inputs)
+    if previous is not None and previous.get("digest") == digest:
+        if partial.exists():
+            shutil.rmtree(partial)
+        return False
+
+    marker = partial / ".digest"
+    if partial.exists() and not (stage.resumes and _text(marker) == digest):
+        shutil.rmtree(partial)
+    partial.mkdir(parents=True, exist_ok=True)
+    with atomic_path(marker) as path:
+        path.write_text(digest)
+    started = time.monotonic()
+    work(partial)
+    record = {
+        "stage": stage.name,
+        "version": stage.version,
+        "digest": digest,
+        "settings": stage.settings,
+        "inputs": inputs,
+        "took_s": round(time.monotonic() - started, 3),
+    }
+    write_json(partial / STAGE_FILE, record)
+    marker.unlink()
+    if final.exists():
+        final.rename(replaced)
+    partial.rename(final)
+    if replaced.exists():
+        shutil.rmtree(replaced)
+    return True
+
+
+def is_current(workspace: Path, stage: Stage) -> bool:
+    """Whether the stage's folder is there and nothing it depends on has changed."""
+    previous = read_stage(workspace / stage.name)
+    if previous is None:
+        return False
+    inputs = digest_inputs(stage.inputs, workspace, previous)
+    return bool(previous.get("digest") == _digest_stage(stage, inputs))
+
+
+def need_stage(workspace: Path, name: str, command: str) -> Path:
+    """The folder of a finished stage.
+
+    Raises:
+        WorkspaceError: it is not there; the message names the command that makes it.
+    """
+    folder = workspace / name
+    if read_stage(folder) is None:
+        raise WorkspaceError(f"{folder} is not there yet; run 'alice-survey {command}' first")
+    return folder
+
+
+def read_stage(folder: Path) -> dict[str, Any] | None:
+    """The content of a stage's `stage.json`, or None where no whole stage is."""
+    try:
+        record = json.loads((folder / STAGE_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return record if isinstance(record, dict) else None
+
+
+def digest_inputs(
+    inputs: Sequence[Path], workspace: Path, previous: Mapping[str, Any] | None
+) -> dict[str, list[Any]]:
+    """Digest every file of the inputs, as `{path: [size, mtime_ns, digest]}`.
+
+    A file whose size and modification time stand in `previous` is not read again.
+
+    Raises:
+        WorkspaceError: an input does not exist.
+    """
+    known = dict((previous or {}).get("inputs", {}))
+    digests: dict[str, list[Any]] = {}
+    for path in _files(inputs):
+        name = os.path.relpath(path, workspace)
+        stat = path.stat()
+        old = known.get(name)
+        if old is not None and old[:2] == [stat.st_size, stat.st_mtime_ns]:
+            digests[name] = old
+        else:
+            with path.open("rb") as file:
+                content = hashlib.file_digest(file, "blake2b").hexdigest()[:32]
+            digests[name] = [stat.st_size, stat.st_mtime_ns, content]
+    return digests
+
+
+def _files(inputs: Sequence[Path]) -> Iterator[Path]:
+    for path in inputs:
+        if path.is_dir():
+            inside = (p for p in sorted(path.rglob("*")) if p.is_file())
+            yield from (p for p in inside if p.name != STAGE_FILE)
+        elif path.is_file():
+            yield path
+        else:
+            raise WorkspaceError(f"{path}: no such file or folder")
+
+
+def _digest_stage(stage: Stage, inputs: Mapping[str, Sequence[Any]]) -> str:
+    content = {name: entry[2] for name, entry in inputs.items()}
+    text = json.dumps([stage.name, stage.version, stage.settings, content], sort_keys=True)
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def _text(path: Path) -> str | None:
+    try:
+        return path.read_text()
+    except OSError:
+        return None
+
+
+@contextlib.contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """A path to write to, beside `path` and with its suffix, that replaces it when all went well."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.tmp{os.getpid()}{path.suffix}")
+    try:
+        yield temporary
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write indented JSON atomically, without NaN (which JSON lacks)."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(data, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def read_json(path: Path) -> Any:
+    """Read JSON.
+
+    Raises:
+        WorkspaceError: the file is missing or no JSON.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise WorkspaceError(f"{path}: no such file") from None
+    except ValueError as error:
+        raise WorkspaceError(f"{path}: not valid JSON: {error}") from None
+
+
+def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Write a CSV file atomically; None and NaN become empty cells."""
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(header)
+        for row in rows:
+            writer.writerow(["" if cell is None or cell != cell else cell for cell in row])

@@ -1,0 +1,241 @@
+"""Settings of a survey: `survey.toml` as frozen sections that refuse what they do not know."""
+
+import math
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from alice_survey.errors import ConfigError
+
+Jerlov = Literal["I", "II", "III", "1C", "3C", "5C", "7C", "9C"]
+Latitude = Annotated[float, Field(ge=-85, le=85)]
+Longitude = Annotated[float, Field(ge=-180, le=180)]
+
+
+class Config(BaseModel):
+    """A settings section: immutable, and an unknown key is an error."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class AreaConfig(Config):
+    """Where to survey: a rectangle whose corner is the datum, or a polygon.
+
+    The datum is the origin of the local North-East-Down frame, on the sea surface.
+    """
+
+    latitude_deg: Latitude = 32.8236
+    longitude_deg: Longitude = 34.9553
+    length_m: float = Field(15.0, gt=0, le=10_000)
+    width_m: float = Field(17.0, gt=0, le=10_000)
+    heading_deg: float = Field(0.0, ge=0, lt=360)
+    polygon_ne_m: tuple[tuple[float, float], ...] | None = None
+    polygon_latlon_deg: tuple[tuple[Latitude, Longitude], ...] | None = None
+    seafloor_depth_m: float = Field(15.0, gt=0, le=6000)
+
+    @model_validator(mode="after")
+    def _one_shape(self) -> Self:
+        polygons = [p for p in (self.polygon_ne_m, self.polygon_latlon_deg) if p is not None]
+        if len(polygons) > 1:
+            raise ValueError("give polygon_ne_m or polygon_latlon_deg, not both")
+        if polygons and len(polygons[0]) < 3:
+            raise ValueError(f"a polygon needs 3 corners or more, got {len(polygons[0])}")
+        return self
+
+
+class CameraConfig(Config):
+    """The stereo pair as designed: two Manta G-917 behind flat ports (paper, section III.B)."""
+
+    width_px: int = Field(3384, ge=64, le=20_000)
+    height_px: int = Field(2710, ge=64, le=20_000)
+    pixel_um: float = Field(3.69, gt=0, le=100)
+    focal_mm: float = Field(12.5, gt=0, le=500)
+    f_number: float = Field(4.0, ge=0.7, le=64)
+    baseline_m: float = Field(0.1, gt=0, le=2)
+    port_distance_m: float = Field(0.02, ge=0, le=0.5)
+    glass_thickness_m: float = Field(0.01, ge=0, le=0.5)
+    n_glass: float = Field(1.52, ge=1, le=2)
+    position_body_m: tuple[float, float, float] = (0.55, -0.05, 0.08)
+    dvl_position_body_m: tuple[float, float, float] = (-0.4145, 0.0, 0.11)
+    shortest_interval_s: float = Field(0.1, gt=0, le=60)
+    quantum_efficiency: float = Field(0.5, gt=0, le=1)
+    full_well_e: float = Field(9000.0, gt=100)
+    read_noise_e: float = Field(12.0, ge=0)
+
+
+class WaterConfig(Config):
+    """The water between port and sea floor."""
+
+    n_water: float = Field(1.34, ge=1, le=1.4)
+    jerlov: Jerlov = "II"
+
+
+class PlanConfig(Config):
+    """How densely the sea floor is imaged."""
+
+    altitude_m: float = Field(2.0, ge=0.3, le=10)
+    speed_mps: float = Field(0.2, gt=0, le=3)
+    forward_overlap: float = Field(0.6, ge=0, le=0.95)
+    side_overlap: float = Field(0.29, ge=0, le=0.95)
+    line_spacing_m: float | None = Field(None, gt=0, le=20)
+    line_heading_deg: float | None = Field(None, ge=0, lt=360)
+    cross_lines: int = Field(1, ge=0, le=50)
+    margin_m: float = Field(0.0, ge=0, le=50)
+    allowed_blur_px: float = Field(1.0, gt=0, le=20)
+    turn_radius_m: float = Field(0.5, gt=0, le=20)
+
+
+class FlightConfig(Config):
+    """How well the vehicle follows its lines, and how well it knows where it is."""
+
+    rate_hz: float = Field(20.0, ge=10, le=200)
+    track_sigma_m: float = Field(0.05, ge=0, le=5)
+    altitude_sigma_m: float = Field(0.03, ge=0, le=1)
+    heading_sigma_deg: float = Field(1.5, ge=0, le=30)
+    roll_sigma_deg: float = Field(1.5, ge=0, le=30)
+    pitch_sigma_deg: float = Field(1.5, ge=0, le=30)
+    correlation_s: float = Field(8.0, gt=0, le=1000)
+    position_bias_sigma_m: float = Field(0.3, ge=0, le=100)
+    position_walk_m_per_sqrt_s: float = Field(0.005, ge=0, le=1)
+    depth_noise_m: float = Field(0.01, ge=0, le=10)
+    altitude_noise_m: float = Field(0.02, ge=0, le=10)
+    attitude_noise_deg: float = Field(0.3, ge=0, le=30)
+    heading_bias_sigma_deg: float = Field(1.0, ge=0, le=30)
+
+
+class SeafloorConfig(Config):
+    """The simulated sea floor."""
+
+    relief_m: float = Field(0.35, ge=0, le=5)
+    grid_m: float = Field(0.01, gt=0, le=1)
+    rocks_per_m2: float = Field(0.5, ge=0, le=20)
+    largest_rock_m: float = Field(0.35, gt=0, le=2)
+    amphora: bool = True
+
+
+class ImagingConfig(Config):
+    """How pictures are taken and rendered."""
+
+    scale: int = Field(1, ge=1, le=16)
+    image_format: Literal["png", "jpg"] = "png"
+    strobe_lumens: float = Field(30_000.0, gt=0)
+    strobe_beam_deg: float = Field(120.0, gt=1, lt=180)
+    strobes_body_m: tuple[tuple[float, float, float], ...] = ((0.75, 0.0, 0.08), (-0.6, 0.0, 0.08))
+    samples: int = Field(2, ge=1, le=8)
+    noise: bool = True
+    range_maps: bool = False
+    pool_views: int = Field(25, ge=8, le=200)
+
+
+class ReconstructConfig(Config):
+    """How pictures become a model."""
+
+    feature_scale: float = Field(1.0, gt=0.05, le=1)
+    max_features: int = Field(8000, ge=200, le=50_000)
+    working_range_m: float | None = Field(None, gt=0, le=100)
+    dem_cell_m: float | None = Field(None, gt=0, le=10)
+    mosaic_pixel_m: float | None = Field(None, gt=0, le=10)
+
+
+class SurveyConfig(Config):
+    """A whole survey, as `survey.toml` says it."""
+
+    name: str = Field("survey", min_length=1, max_length=80, pattern=r"^[\w .-]+$")
+    seed: int = Field(1, ge=0, lt=2**32)
+    area: AreaConfig = AreaConfig()
+    camera: CameraConfig = CameraConfig()
+    water: WaterConfig = WaterConfig()
+    plan: PlanConfig = PlanConfig()
+    flight: FlightConfig = FlightConfig()
+    seafloor: SeafloorConfig = SeafloorConfig()
+    imaging: ImagingConfig = ImagingConfig()
+    reconstruct: ReconstructConfig = ReconstructConfig()
+
+
+def load_config(path: Path) -> SurveyConfig:
+    """Read `survey.toml`.
+
+    Raises:
+        ConfigError: the file is missing, is no TOML, or holds an unknown key or a value out of
+            range; the message names the file, the key, the value and what is allowed.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; 'alice-survey init DIR' writes one") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from None
+    try:
+        settings = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}") from None
+    return parse_config(settings, str(path))
+
+
+def parse_config(settings: dict[str, Any], origin: str) -> SurveyConfig:
+    """Check settings that came from `origin`.
+
+    Raises:
+        ConfigError: as `load_config`.
+    """
+    try:
+        return SurveyConfig.model_validate(settings)
+    except ValidationError as error:
+        raise ConfigError(f"{origin}: {_one_line(error)}") from None
+
+
+def _one_line(error: ValidationError) -> str:
+    faults = []
+    for fault in error.errors():
+        key = ".".join(str(part) for part in fault["loc"]) or "settings"
+        if fault["type"] == "extra_forbidden":
+            faults.append(f"{key} is not a known setting{_nearest(fault['loc'])}")
+        elif fault["type"] == "value_error":
+            faults.append(f"{key}: {fault['ctx']['error']}")
+        else:
+            faults.append(f"{key} = {_shown(fault['input'])}: {_requirement(fault)}")
+    return "; ".join(faults)
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _requirement(fault: Any) -> str:
+    message = str(fault["msg"])
+    section: type[BaseModel] = SurveyConfig
+    for part in fault["loc"]:
+        if not (isinstance(part, str) and part in section.model_fields):
+            return message
+        field = section.model_fields[part]
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            section = field.annotation
+            continue
+        signs = {"Gt": (">", "gt"), "Ge": (">=", "ge"), "Lt": ("<", "lt"), "Le": ("<=", "le")}
+        bounds = [
+            f"{signs[type(limit).__name__][0]} {getattr(limit, signs[type(limit).__name__][1])}"
+            for limit in field.metadata
+            if type(limit).__name__ in signs
+        ]
+        return f"{message} (allowed: {' and '.join(bounds)})" if bounds else message
+    return message
+
+
+def _nearest(location: tuple[str | int, ...]) -> str:
+    import difflib
+
+    section: type[BaseModel] = SurveyConfig
+    for part in location[:-1]:
+        annotation = section.model_fields[str(part)].annotation
+        if not (isinstance(annotation, type) and issubclass(annotation, BaseModel)):
+            return ""
+        section = annotation
+    close = difflib.get_close_matches(str(location[-1]), section.model_fields, n=1)
+    return (
+        f"; did you mean {close[0]}?" if close else f"; known are {', '.join(section.model_fields)}"
+    )

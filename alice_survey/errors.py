@@ -1,0 +1,33 @@
+"""Known faults: one line that says what is wrong, with the numbers and what to change."""
+
+
+class AliceError(Exception):
+    """A fault the user can mend; the command line prints it as one line and exits with 1."""
+
+
+class ConfigError(AliceError):
+    """A setting is missing, unknown or out of range."""
+
+
+class WorkspaceError(AliceError):
+    """A workspace lacks a stage or a file that a command needs."""
+
+
+class PlanError(AliceError):
+    """No plan meets what was asked for."""
+
+
+class ImageError(AliceError):
+    """Pictures are missing, unreadable or do not fit together."""
+
+
+class NavigationError(AliceError):
+    """A navigation log cannot be used."""
+
+
+class CalibrationError(AliceError):
+    """A rig cannot be calibrated from the views given, or its file is wrong."""
+
+
+class ReconstructionError(AliceError):
+    """The pictures do not give a model."""

@@ -1,0 +1,92 @@
+"""Run pure functions over pictures, pairs and tiles: in order, in parallel, with a bounded queue."""
+
+import multiprocessing
+import os
+import sys
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from typing import TypeVar
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def default_threads() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+def parallel_map(
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    *,
+    threads: int,
+    label: str,
+    total: int | None = None,
+) -> Iterator[Result]:
+    """Yield `function(item)` for each item, in the order of the items, with a progress bar.
+
+    With one thread the work runs here; else in local processes (spawned, so that threads of numeric
+    libraries are never forked), of which each uses one core. At most three items per process are
+    queued, so that memory stays bounded.
+
+    Args:
+        function: a module-level function (it travels to other processes).
+        items: what to work on.
+        threads: how many processes.
+        label: what the progress bar says.
+        total: how many items, when `items` has no length.
+    """
+    if total is None and hasattr(items, "__len__"):
+        total = len(items)
+    if threads <= 1:
+        yield from progress(map(function, items), label, total)
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(threads, mp_context=context, initializer=_one_core) as executor:
+        yield from progress(_in_order(executor, function, items, 3 * threads), label, total)
+
+
+def _in_order(
+    executor: Executor, function: Callable[[Item], Result], items: Iterable[Item], queued: int
+) -> Iterator[Result]:
+    waiting: deque[Future[Result]] = deque()
+    try:
+        for item in items:
+            waiting.append(executor.submit(function, item))
+            if len(waiting) >= queued:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        for future in waiting:
+            future.cancel()
+
+
+def _one_core() -> None:
+    import cv2
+
+    cv2.setNumThreads(1)
+    os.environ["OMP_NUM_THREADS"] = "1"
+
+
+def progress(items: Iterable[Item], label: str, total: int | None = None) -> Iterator[Item]:
+    """Pass items through while a bar on standard error shows how far the work is.
+
+    On a terminal the bar moves; elsewhere one line says when the work is done.
+    """
+    if sys.stderr.isatty():
+        from rich.console import Console
+        from rich.progress import track
+
+        yield from track(items, label, total=total, console=Console(stderr=True))
+        return
+    import time
+
+    started, count = time.monotonic(), 0
+    for item in items:
+        count += 1
+        yield item
+    took_s = time.monotonic() - started
+    sys.stderr.write(f"{label}: {count} done in {took_s:.1f} s\n")

@@ -1,0 +1,116 @@
+"""Frames and how to pass between them: geodetic, NED, body and camera.
+
+World `ned` is local North-East-Down with its origin at the datum on the sea surface; `body` is
+forward-right-down; `cam` is right-down-forward. `a_from_b` takes coordinates in b to a.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform, Rotation
+
+Array = NDArray[np.float64]
+
+BODY_FROM_NADIR_CAM = Rotation.from_matrix([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+"""Nadir mount, image top towards the bow: x_cam = y_body, y_cam = -x_body, z_cam = z_body."""
+
+
+@dataclass(frozen=True)
+class Datum:
+    """Origin of the local NED frame: a point of the sea surface on the WGS 84 ellipsoid."""
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float = 0.0
+    """Height of the sea surface (or of the reference level named elsewhere) above the ellipsoid."""
+
+    @cached_property
+    def _ecef(self) -> Any:
+        from pyproj import Transformer
+
+        return Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+
+    @cached_property
+    def _ned_from_ecef(self) -> Rotation:
+        lat, lon = np.deg2rad([self.latitude_deg, self.longitude_deg])
+        north = [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)]
+        east = [-np.sin(lon), np.cos(lon), 0.0]
+        down = [-np.cos(lat) * np.cos(lon), -np.cos(lat) * np.sin(lon), -np.sin(lat)]
+        return Rotation.from_matrix([north, east, down])
+
+    @cached_property
+    def _origin_ecef(self) -> Array:
+        xyz = self._ecef.transform(self.longitude_deg, self.latitude_deg, self.height_m)
+        return np.asarray(xyz, dtype=np.float64)
+
+    def ned_from_geodetic(self, lat_lon_depth: Array) -> Array:
+        """Take (N, 3) rows of latitude and longitude (degrees) and depth (m) to NED metres."""
+        rows = np.asarray(lat_lon_depth, dtype=np.float64).reshape(-1, 3)
+        ecef = self._ecef.transform(rows[:, 1], rows[:, 0], self.height_m - rows[:, 2])
+        ned: Array = self._ned_from_ecef.apply(np.stack(ecef, axis=1) - self._origin_ecef)
+        return ned
+
+    def geodetic_from_ned(self, points_ned: Array) -> Array:
+        """Take (N, 3) NED metres to rows of latitude and longitude (degrees) and depth (m)."""
+        points = np.asarray(points_ned, dtype=np.float64).reshape(-1, 3)
+        ecef = self._ned_from_ecef.inv().apply(points) + self._origin_ecef
+        lon, lat, height = self._ecef.transform(*ecef.T, direction="INVERSE")
+        return np.stack([lat, lon, self.height_m - height], axis=1)
+
+    @property
+    def utm_epsg(self) -> int:
+        """EPSG code of the UTM zone (WGS 84) that holds the datum."""
+        zone = min(int((self.longitude_deg + 180.0) // 6.0) + 1, 60)
+        return (32600 if self.latitude_deg >= 0 else 32700) + zone
+
+
+def rotation_from_attitude(roll_rad: Any, pitch_rad: Any, heading_rad: Any) -> Rotation:
+    """Rotation `ned_from_body` from SNAME attitude (z-y-x: heading, pitch, roll), radians."""
+    angles = np.stack(np.broadcast_arrays(heading_rad, pitch_rad, roll_rad), axis=-1)
+    return Rotation.from_euler("ZYX", angles)
+
+
+def attitude_from_rotation(ned_from_body: Rotation) -> Array:
+    """Roll, pitch and heading (radians, last axis) of `ned_from_body`; heading in (-pi, pi]."""
+    angles: Array = ned_from_body.as_euler("ZYX")
+    return angles[..., ::-1]
+
+
+def interpolate_poses(time_s: Array, poses: RigidTransform, at_s: Array) -> RigidTransform:
+    """Poses at other times: straight between positions, great circle between attitudes.
+
+    Args:
+        time_s: (T,) strictly increasing seconds of the poses.
+        poses: (T,) transforms.
+        at_s: (N,) seconds within the range of time_s.
+
+    Raises:
+        ValueError: a time lies outside of the range (no extrapolation).
+    """
+    from scipy.spatial.transform import Slerp
+
+    at_s = np.asarray(at_s, dtype=np.float64)
+    if at_s.size and (at_s.min() < time_s[0] or at_s.max() > time_s[-1]):
+        raise ValueError(f"times beyond {time_s[0]} to {time_s[-1]} s")
+    positions = np.stack([np.interp(at_s, time_s, p) for p in poses.translation.T], axis=1)
+    rotations = Slerp(time_s, poses.rotation)(at_s)
+    return RigidTransform.from_components(positions, rotations)
+
+
+def pose_to_json(pose: RigidTransform) -> dict[str, list[float]]:
+    """One pose as a JSON object."""
+    return {
+        "quaternion_xyzw": [float(q) for q in pose.rotation.as_quat(canonical=True)],
+        "translation_m": [float(t) for t in pose.translation],
+    }
+
+
+def pose_from_json(data: dict[str, list[float]]) -> RigidTransform:
+    """The inverse of `pose_to_json`."""
+    return RigidTransform.from_components(
+        np.asarray(data["translation_m"], dtype=np.float64),
+        Rotation.from_quat(np.asarray(data["quaternion_xyzw"], dtype=np.float64)),
+    )

@@ -1,0 +1,119 @@
+"""The pinhole that comes nearest to a flat-port camera over a range of distances.
+
+A flat port has no single centre of projection. A pinhole of focal length f n_water whose centre is
+moved along the axis comes close; pictures warped to it at one working range suit any software that
+knows pinholes, at a residual that `residual_px` states.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.frames import Array
+from camera_calib.flat_port import FlatPortCamera
+
+
+@dataclass(frozen=True, kw_only=True)
+class VirtualPinhole:
+    """An ideal pinhole in water, with the axes of its camera and a centre moved along z."""
+
+    width_px: int
+    height_px: int
+    focal_px: float
+    cx_px: float
+    cy_px: float
+    centre_z_m: float
+    """Where the centre is on the camera's axis, before (+) or behind (-) the entrance pupil."""
+    working_range_m: float
+    """Distance from the entrance pupil along the axis at which the warp is exact."""
+
+    @property
+    def virtual_from_cam(self) -> RigidTransform:
+        """From the flat-port camera's frame to the pinhole's."""
+        return RigidTransform.from_translation([0.0, 0.0, -self.centre_z_m])
+
+    def project(self, points_cam: Array) -> Array:
+        """Ideal pixels, (..., 2), of points (..., 3) in the flat-port camera's frame."""
+        z = points_cam[..., 2:] - self.centre_z_m
+        centre = np.array([self.cx_px, self.cy_px])
+        pixels: Array = self.focal_px * points_cam[..., :2] / z + centre
+        return pixels
+
+    def at_depth(self, pixels: Array, depth_m: Array | float) -> Array:
+        """Points (..., 3) in the flat-port camera's frame that pixels (..., 2) see at z = depth_m."""
+        z = np.broadcast_to(np.asarray(depth_m, dtype=np.float64), pixels.shape[:-1])
+        slopes = (pixels - np.array([self.cx_px, self.cy_px])) / self.focal_px
+        return np.concatenate([slopes * (z - self.centre_z_m)[..., None], z[..., None]], axis=-1)
+
+
+def best_pinhole(camera: FlatPortCamera, near_m: float, far_m: float) -> VirtualPinhole:
+    """The axial pinhole with the least rms residual over the frame and a range of distances.
+
+    Args:
+        camera: the flat-port camera.
+        near_m: nearest distance from the entrance pupil along the axis.
+        far_m: farthest; the warp is exact at the harmonic mean of both (equal parallax to either).
+    """
+    working = 2.0 / (1.0 / near_m + 1.0 / far_m)
+    depths = 1.0 / np.linspace(1.0 / far_m, 1.0 / near_m, 7)
+
+    def at(centre_z_m: float) -> VirtualPinhole:
+        return VirtualPinhole(
+            width_px=camera.width_px,
+            height_px=camera.height_px,
+            focal_px=camera.n_water * (camera.fx_px + camera.fy_px) / 2,
+            cx_px=camera.cx_px,
+            cy_px=camera.cy_px,
+            centre_z_m=centre_z_m,
+            working_range_m=working,
+        )
+
+    reach = 2.0 * (camera.port_distance_m + camera.glass_thickness_m) + 1e-6
+    best = minimize_scalar(
+        lambda z: float(np.sqrt(np.nanmean(residual_px(camera, at(z), depths) ** 2))),
+        bounds=(-reach, reach),
+        method="bounded",
+        options={"xatol": 1e-7},
+    )
+    return at(float(best.x))
+
+
+def residual_px(
+    camera: FlatPortCamera, pinhole: VirtualPinhole, depths_m: Array, grid: int = 15
+) -> Array:
+    """How far a warped picture's pixels are from where the pinhole would see each point.
+
+    Args:
+        camera: the flat-port camera.
+        pinhole: its stand-in.
+        depths_m: (D,) distances along the axis from the entrance pupil.
+        grid: pixels a side of the frame at which to look.
+
+    Returns:
+        (D, grid, grid) distances in pixels of the pinhole.
+    """
+    x = np.linspace(0.0, camera.width_px, grid)
+    y = np.linspace(0.0, camera.height_px, grid)
+    pixels = np.stack(np.meshgrid(x, y), axis=-1)
+    ideal = pinhole.project(camera.at_depth(pixels, pinhole.working_range_m))
+    rows = [
+        np.linalg.norm(pinhole.project(camera.at_depth(pixels, d)) - ideal, axis=-1)
+        for d in depths_m
+    ]
+    return np.stack(rows)
+
+
+def warp_maps(camera: FlatPortCamera, pinhole: VirtualPinhole) -> tuple[Array, Array]:
+    """Where each pixel of the pinhole's picture is found in the camera's picture.
+
+    Returns:
+        x and y in OpenCV's pixels (origin at the first pixel's centre), float32, for `cv2.remap`.
+    """
+    x = np.arange(pinhole.width_px) + 0.5
+    y = np.arange(pinhole.height_px) + 0.5
+    pixels = np.stack(np.meshgrid(x, y), axis=-1)
+    source = camera.project(pinhole.at_depth(pixels, pinhole.working_range_m)) - 0.5
+    source = np.where(np.isfinite(source), source, -10.0).astype(np.float32)
+    return source[..., 0], source[..., 1]

@@ -1,0 +1,147 @@
+"""The sparse model as the later stages see it: views through ideal pinholes, and points."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.artefacts import read_json, write_json
+from alice_survey.frames import Array, Datum
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldFrame:
+    """What the coordinates of a model mean. The third axis points down in every frame."""
+
+    name: Literal["ned", "model"]
+    """`ned`: north, east, down from the datum; `model`: arbitrary origin and heading, levelled."""
+    datum: Datum | None
+    scaled: bool
+    """Whether lengths are metres."""
+    vertical_datum: str
+    """Name of the level from which depths and heights count."""
+    notes: tuple[str, ...] = ()
+    """What a reader of any result must know, such as where the scale came from."""
+
+    @property
+    def unit(self) -> str:
+        """Name of the unit of length for labels."""
+        return "m" if self.scaled else "model units"
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """One registered picture, as an ideal pinhole sees it."""
+
+    image: str
+    """Name in the manifest."""
+    camera: str
+    station: int
+    width_px: int
+    height_px: int
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    world_from_cam: RigidTransform
+
+    def project(self, points_world: Array) -> Array:
+        """Pixels (N, 2) of points (N, 3); NaN behind the camera."""
+        points = self.world_from_cam.inv().apply(points_world)
+        z = np.where(points[:, 2:] > 0, points[:, 2:], np.nan)
+        focal, centre = np.array([self.fx_px, self.fy_px]), np.array([self.cx_px, self.cy_px])
+        pixels: Array = focal * points[:, :2] / z + centre
+        return pixels
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SparseModel:
+    """Registered views and triangulated points, in one world frame."""
+
+    frame: WorldFrame
+    views: tuple[View, ...]
+    """Sorted by image name."""
+    points_world: Array
+    """(P, 3)."""
+    observations: NDArray[np.int64]
+    """(O, 2) rows of point index and view index."""
+
+
+def write_frame(path: Path, frame: WorldFrame) -> None:
+    """Write `frame.json`."""
+    datum = frame.datum
+    data: dict[str, Any] = {
+        "name": frame.name,
+        "datum": None
+        if datum is None
+        else {
+            "latitude_deg": datum.latitude_deg,
+            "longitude_deg": datum.longitude_deg,
+            "height_m": datum.height_m,
+        },
+        "scaled": frame.scaled,
+        "vertical_datum": frame.vertical_datum,
+        "notes": list(frame.notes),
+    }
+    write_json(path, data)
+
+
+def read_frame(path: Path) -> WorldFrame:
+    """Read `frame.json`."""
+    data = read_json(path)
+    return WorldFrame(
+        name=data["name"],
+        datum=None if data["datum"] is None else Datum(**data["datum"]),
+        scaled=data["scaled"],
+        vertical_datum=data["vertical_datum"],
+        notes=tuple(data["notes"]),
+    )
+
+
+def read_model(sparse: Path) -> SparseModel:
+    """Read the model of a finished `sparse/` stage."""
+    import pycolmap
+
+    cameras = read_json(sparse / "cameras.json")["images"]
+    model = pycolmap.Reconstruction(sparse / "model")
+    images = sorted(
+        (i for i in model.images.values() if i.has_pose), key=lambda image: str(image.name)
+    )
+    views = []
+    for image in images:
+        camera = model.cameras[image.camera_id]
+        fx, fy, cx, cy = camera.params
+        cam_from_world = image.cam_from_world()
+        pose = RigidTransform.from_components(
+            cam_from_world.translation, Rotation.from_quat(cam_from_world.rotation.quat)
+        )
+        views.append(
+            View(
+                image=image.name,
+                camera=cameras[image.name]["camera"],
+                station=cameras[image.name]["station"],
+                width_px=camera.width,
+                height_px=camera.height,
+                fx_px=fx,
+                fy_px=fy,
+                cx_px=cx,
+                cy_px=cy,
+                world_from_cam=pose.inv(),
+            )
+        )
+    view_of = {image.image_id: index for index, image in enumerate(images)}
+    ids = sorted(model.points3D)
+    rows = [
+        (index, view_of[element.image_id])
+        for index, point_id in enumerate(ids)
+        for element in model.points3D[point_id].track.elements
+    ]
+    return SparseModel(
+        frame=read_frame(sparse / "frame.json"),
+        views=tuple(views),
+        points_world=np.array([model.points3D[i].xyz for i in ids]).reshape(-1, 3),
+        observations=np.array(rows, dtype=np.int64).reshape(-1, 2),
+    )
