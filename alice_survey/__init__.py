@@ -1,0 +1,1 @@
+"""Plan, fly, image, reconstruct and score close-range underwater imaging surveys."""

@@ -1,5 +1,7 @@
 """Known faults: one line that says what is wrong, with the numbers and what to change."""
 
+import sys
+
 
 class AliceError(Exception):
     """A fault the user can mend; the command line prints it as one line and exits with 1."""
@@ -31,3 +33,8 @@ class CalibrationError(AliceError):
 
 class ReconstructionError(AliceError):
     """The pictures do not give a model."""
+
+
+def warn(text: str) -> None:
+    """Tell the user, in one line on standard error, of something that work goes on without."""
+    sys.stderr.write(f"warning: {text}\n")

@@ -4,7 +4,7 @@ import multiprocessing
 import os
 import sys
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sized
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from typing import TypeVar
 
@@ -38,7 +38,7 @@ def parallel_map(
         label: what the progress bar says.
         total: how many items, when `items` has no length.
     """
-    if total is None and hasattr(items, "__len__"):
+    if total is None and isinstance(items, Sized):
         total = len(items)
     if threads <= 1:
         yield from progress(map(function, items), label, total)

@@ -1,0 +1,1 @@
+"""Cameras behind flat ports: models, rigs, tables, calibration."""

@@ -1,0 +1,1 @@
+"""Survey planning and flight."""
