@@ -174,9 +174,9 @@ def _project(points: Array, camera: Array) -> Array:
                 reach += water / math.sqrt(b_water) if b_water > 0.0 else math.inf
                 if not radius < reach:
                     continue
-            # f(t) = air t + glass t / sqrt(n_g^2 + (n_g^2 - 1) t^2) + water ... - radius, with t the
-            # tangent in air, is concave: from its tangent at 0 Newton climbs to the root and never
-            # passes it.
+            # f(t) = air t + glass t / sqrt(n_g^2 + (n_g^2 - 1) t^2) + water ... - radius, with t
+            # the tangent in air, is concave: from its tangent at 0 Newton climbs to the root and
+            # never passes it.
             tangent = radius / (air + glass / n_glass + water / n_water)
             for _ in range(_NEWTON_STEPS):
                 t2 = tangent * tangent

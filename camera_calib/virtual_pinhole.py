@@ -42,7 +42,7 @@ class VirtualPinhole:
         return pixels
 
     def at_depth(self, pixels: Array, depth_m: Array | float) -> Array:
-        """Points (..., 3) in the flat-port camera's frame that pixels (..., 2) see at z = depth_m."""
+        """Points (..., 3) in the flat-port camera's frame where pixels (..., 2) see z = depth_m."""
         z = np.broadcast_to(np.asarray(depth_m, dtype=np.float64), pixels.shape[:-1])
         slopes = (pixels - np.array([self.cx_px, self.cy_px])) / self.focal_px
         return np.concatenate([slopes * (z - self.centre_z_m)[..., None], z[..., None]], axis=-1)
