@@ -84,7 +84,10 @@ class PlanConfig(Config):
     cross_lines: int = Field(1, ge=0, le=50)
     margin_m: float = Field(0.0, ge=0, le=50)
     allowed_blur_px: float = Field(1.0, gt=0, le=20)
+    strobe_lead_s: float = Field(0.0002, ge=0, le=0.1)
     turn_radius_m: float = Field(0.5, gt=0, le=20)
+    turn_rate_limit_deg_s: float = Field(30.0, gt=0, le=180)
+    run_in_m: float = Field(0.5, ge=0.1, le=20)
 
 
 class FlightConfig(Config):
@@ -97,6 +100,7 @@ class FlightConfig(Config):
     roll_sigma_deg: float = Field(1.5, ge=0, le=30)
     pitch_sigma_deg: float = Field(1.5, ge=0, le=30)
     correlation_s: float = Field(8.0, gt=0, le=1000)
+    terrain_smoothing_m: float = Field(1.5, gt=0, le=100)
     position_bias_sigma_m: float = Field(0.3, ge=0, le=100)
     position_walk_m_per_sqrt_s: float = Field(0.005, ge=0, le=1)
     depth_noise_m: float = Field(0.01, ge=0, le=10)
