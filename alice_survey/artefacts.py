@@ -13,6 +13,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,19 @@ class Stage:
     """Work can go on in what an interrupted run of the same digest left."""
 
 
+_checking: ContextVar[bool] = ContextVar("checking", default=False)
+
+
+@contextlib.contextmanager
+def only_checking() -> Iterator[None]:
+    """Within this block `run_stage` works nothing; it tells whether there would be work."""
+    token = _checking.set(True)
+    try:
+        yield
+    finally:
+        _checking.reset(token)
+
+
 def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], None]) -> bool:
     """Do a stage's work unless its folder is there and nothing it depends on has changed.
 
@@ -52,6 +66,8 @@ def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], None]) -> bo
     Returns:
         True when the work was done, False when it was skipped.
     """
+    if _checking.get():
+        return not is_current(workspace, stage)
     final, partial = workspace / stage.name, workspace / f"{stage.name}.partial"
     replaced = workspace / f"{stage.name}.replaced"
     if replaced.exists():  # a kill fell between the two renames below

@@ -1,0 +1,281 @@
+"""The command line: each command parses, calls and prints; the work is elsewhere."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from alice_survey.errors import AliceError
+
+app = typer.Typer(
+    name="alice-survey",
+    help="Plan, fly, image and reconstruct close-range underwater imaging surveys, and score them.",
+    epilog="A first survey, planned, flown, pictured, reconstructed and scored: alice-survey demo",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    rich_markup_mode=None,
+)
+
+Workspace = Annotated[
+    Path, typer.Option("-w", "--workspace", help="Folder that holds the stages of one survey.")
+]
+SurveyFile = Annotated[
+    Path | None,
+    typer.Option(
+        "-s", "--survey", help="Settings; WORKSPACE/survey.toml, then ./survey.toml, if not given."
+    ),
+]
+Threads = Annotated[
+    int | None, typer.Option(min=1, max=256, help="Cores to use; all when not given.")
+]
+Scale = Annotated[
+    int | None,
+    typer.Option(min=1, max=16, help="Divide the resolution of rendered pictures by this."),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON.")]
+WORK = Path("work")
+
+
+def _examples(*lines: str) -> str:
+    """An epilog that keeps its lines (the first character tells the formatter not to wrap)."""
+    return "\b\nExamples:\n" + "\n".join(f"  alice-survey {line}" for line in lines)
+
+
+def _print(table: str, data: Any, as_json: bool) -> None:
+    typer.echo(json.dumps(data, indent=2) if as_json else table)
+
+
+@app.command(epilog=_examples("init reef", "run -w reef --scale 4"))
+def init(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write it into.")],
+) -> None:
+    """Write a commented survey.toml.
+
+    It holds the paper's mission: 15 x 17 m, lines 1 m apart, 2 m altitude, 0.2 m/s.
+    """
+    from alice_survey.survey import init_survey
+
+    typer.echo(f"wrote {init_survey(folder)}; next: alice-survey plan -w {folder}")
+
+
+@app.command(
+    epilog=_examples(
+        "fov",
+        "fov --lens 12.5 --lens 25 --altitude 1.5 --altitude 2 --n-water 1.345 --json",
+        "fov --validate",
+    )
+)
+def fov(
+    lens: Annotated[list[float] | None, typer.Option(help="Focal length, mm.")] = None,
+    altitude: Annotated[list[float] | None, typer.Option(help="Metres.")] = None,
+    n_water: Annotated[float, typer.Option(min=1.0, max=1.4, help="Index of the water.")] = 1.34,
+    validate: Annotated[
+        bool, typer.Option("--validate", help="Compare with the paper's table; exit 1 if it fails.")
+    ] = False,
+    survey: SurveyFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Tell field of view and resolution.
+
+    Footprints and pixels on the sea floor through the exact flat port, for any lens and altitude.
+    """
+    from alice_survey.tables import fov_report, validation_report
+
+    if validate:
+        table, data, passed = validation_report()
+    else:
+        table, data, passed = fov_report(lens, altitude, n_water, survey)
+    _print(table, data, as_json)
+    raise typer.Exit(0 if passed else 1)
+
+
+@app.command(epilog=_examples("plan -w reef", "plan -w reef -s other.toml --json"))
+def plan(workspace: Workspace = WORK, survey: SurveyFile = None, as_json: AsJson = False) -> None:
+    """Plan lines and camera settings.
+
+    They image the whole area at the overlap asked for.
+    """
+    from alice_survey.survey import run
+
+    _print(*run(["plan"], workspace, survey), as_json)
+
+
+@app.command(epilog=_examples("fly -w reef"))
+def fly(workspace: Workspace = WORK, survey: SurveyFile = None, as_json: AsJson = False) -> None:
+    """Fly the plan.
+
+    Writes the true track, the trigger times and the navigation log with its errors.
+    """
+    from alice_survey.survey import run
+
+    _print(*run(["flight"], workspace, survey), as_json)
+
+
+@app.command(epilog=_examples("image -w reef --scale 4 --threads 2"))
+def image(
+    workspace: Workspace = WORK,
+    survey: SurveyFile = None,
+    scale: Scale = None,
+    threads: Threads = None,
+    as_json: AsJson = False,
+) -> None:
+    """Render the stereo pictures.
+
+    Those of the flight and those of a board in a pool, for the calibration.
+    """
+    from alice_survey.survey import run
+
+    _print(*run(["pool", "images"], workspace, survey, scale, threads), as_json)
+
+
+@app.command(epilog=_examples("calibrate -w reef"))
+def calibrate(
+    workspace: Workspace = WORK,
+    survey: SurveyFile = None,
+    threads: Threads = None,
+    as_json: AsJson = False,
+) -> None:
+    """Calibrate the rig through its ports.
+
+    From the pictures of the board in the pool.
+    """
+    from alice_survey.survey import run
+
+    _print(*run(["calibration"], workspace, survey, None, threads), as_json)
+
+
+@app.command(
+    name="import-images",
+    epilog=_examples(
+        "import-images photos -w reef",
+        "import-images --left cam1 --right cam2 -w reef",
+        "import-images photos --navigation dive.csv --clock-offset -1.5 --masks masks -w reef",
+        "import-images --video GX010001.MP4 --every 0.5 -w reef",
+    ),
+)
+def import_images(
+    folders: Annotated[
+        list[Path] | None, typer.Argument(metavar="DIR...", help="Folders of pictures.")
+    ] = None,
+    left: Annotated[Path | None, typer.Option(help="Pictures of the left camera.")] = None,
+    right: Annotated[Path | None, typer.Option(help="Pictures of the right camera.")] = None,
+    video: Annotated[Path | None, typer.Option(help="A video to take frames from.")] = None,
+    every: Annotated[float, typer.Option(min=0.01, help="Seconds between frames.")] = 1.0,
+    navigation: Annotated[Path | None, typer.Option(help="CSV: time, position, ...")] = None,
+    clock_offset: Annotated[float, typer.Option(help="Seconds to add to picture times.")] = 0.0,
+    time_zone: Annotated[str, typer.Option(help="Of times that name none.")] = "UTC",
+    rig: Annotated[Path | None, typer.Option(help="rig.json of the cameras.")] = None,
+    masks: Annotated[Path | None, typer.Option(help="Folder of masks; black is left out.")] = None,
+    workspace: Workspace = WORK,
+) -> None:
+    """Bring in real pictures.
+
+    Mono or stereo pictures or a video, with a navigation log, GPS from EXIF, or nothing at all.
+    """
+    from reconstruct.import_images import import_images as work
+
+    work(
+        workspace, folders or [], left=left, right=right, video=video, every_s=every,
+        navigation=navigation, clock_offset_s=clock_offset, time_zone=time_zone, rig=rig,
+        masks=masks,
+    )  # fmt: skip
+    typer.echo(f"pictures are in {workspace / 'images'}; next: alice-survey reconstruct")
+
+
+@app.command(epilog=_examples("reconstruct -w reef", "reconstruct -w reef --threads 2 --json"))
+def reconstruct(
+    workspace: Workspace = WORK,
+    survey: SurveyFile = None,
+    threads: Threads = None,
+    as_json: AsJson = False,
+) -> None:
+    """Turn pictures into a model.
+
+    Camera track, DEM, point cloud and orthomosaic.
+    """
+    from alice_survey.survey import RECONSTRUCT, run
+
+    _print(*run(RECONSTRUCT, workspace, survey, None, threads), as_json)
+
+
+@app.command(epilog=_examples("scale -w reef --points '0,0,0 1.2,0,0.1' --length 0.5"))
+def scale(
+    points: Annotated[
+        str, typer.Option(help="Two points of the model, 'x,y,z x,y,z' (see docs/real-pictures).")
+    ],
+    length: Annotated[float, typer.Option(min=1e-6, help="Their true distance, m.")],
+    workspace: Workspace = WORK,
+) -> None:
+    """Scale a model by a known length."""
+    from reconstruct.scale import scale_model
+
+    typer.echo(scale_model(workspace, points, length))
+
+
+@app.command(epilog=_examples("evaluate -w reef", "evaluate -w reef --json"))
+def evaluate(
+    workspace: Workspace = WORK,
+    survey: SurveyFile = None,
+    threads: Threads = None,
+    as_json: AsJson = False,
+) -> None:
+    """Score a simulated survey.
+
+    Camera track, surface and mosaic against the truth.
+    """
+    from alice_survey.survey import run
+
+    _print(*run(["report"], workspace, survey, None, threads), as_json)
+
+
+@app.command(name="run", epilog=_examples("run -w reef --scale 4"))
+def run_all(
+    workspace: Workspace = WORK,
+    survey: SurveyFile = None,
+    scale: Scale = None,
+    threads: Threads = None,
+    as_json: AsJson = False,
+) -> None:
+    """Do the whole loop.
+
+    plan, fly, image, calibrate, reconstruct, evaluate: stages that are up to date are skipped.
+    """
+    from alice_survey.survey import LOOP, run
+
+    _print(*run(LOOP, workspace, survey, scale, threads), as_json)
+
+
+@app.command(epilog=_examples("demo", "demo -w demo --threads 2"))
+def demo(
+    workspace: Workspace = Path("demo"), threads: Threads = None, as_json: AsJson = False
+) -> None:
+    """Do the loop on a built-in survey.
+
+    A few metres of sea floor with rocks and an amphora, at a quarter of the resolution.
+    """
+    from alice_survey.survey import run_demo
+
+    _print(*run_demo(workspace, threads), as_json)
+
+
+@app.command(epilog=_examples("status -w reef", "status -w reef --json"))
+def status(workspace: Workspace = WORK, survey: SurveyFile = None, as_json: AsJson = False) -> None:
+    """Say what a workspace holds.
+
+    What is there, what is stale, and what the next command is.
+    """
+    from alice_survey.survey import workspace_status
+
+    _print(*workspace_status(workspace, survey), as_json)
+
+
+def main() -> None:
+    """Run the command line; a known fault is one line on standard error and exit code 1."""
+    try:
+        app()
+    except AliceError as error:
+        typer.echo(f"error: {error}", err=True)
+        raise SystemExit(1) from error

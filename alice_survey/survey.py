@@ -1,0 +1,227 @@
+"""The whole loop: which stages there are, in which order, and what each has found."""
+
+import contextlib
+import fcntl
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from alice_survey.artefacts import only_checking, read_json, read_stage
+from alice_survey.config import SurveyConfig, load_config
+from alice_survey.errors import AliceError, ConfigError, WorkspaceError
+from alice_survey.executor import default_threads
+from alice_survey.summaries import SUMMARIES
+
+LOOP = ("plan", "flight", "pool", "images", "calibration", "sparse", "dense", "mosaic", "report")
+RECONSTRUCT = ("calibration", "sparse", "dense", "mosaic")
+_NEEDS = {
+    "plan": (),
+    "flight": ("plan",),
+    "pool": (),
+    "images": ("plan", "flight"),
+    "calibration": ("pool",),
+    "sparse": ("images", "calibration"),
+    "dense": ("sparse",),
+    "mosaic": ("dense",),
+    "report": ("mosaic",),
+}
+_COMMANDS = {
+    "plan": "plan",
+    "flight": "fly",
+    "pool": "image",
+    "images": "image",
+    "calibration": "calibrate",
+    "sparse": "reconstruct",
+    "dense": "reconstruct",
+    "mosaic": "reconstruct",
+    "report": "evaluate",
+}
+_SIMULATED = ("plan", "flight", "pool", "images", "calibration", "report")
+
+StageWork = Callable[[Path, SurveyConfig, int], bool]
+
+
+def _work_of(stage: str) -> StageWork:
+    """The function that does a stage; its packages are loaded only now."""
+    match stage:
+        case "plan":
+            from missions.plan import run_plan as work
+        case "flight":
+            from missions.fly import run_fly as work
+        case "pool":
+            from alice_survey.seafloor.imaging import run_pool as work
+        case "images":
+            from alice_survey.seafloor.imaging import run_images as work
+        case "calibration":
+            from camera_calib.calibrate import run_calibrate as work
+        case "sparse":
+            from reconstruct.sparse import run_sparse as work
+        case "dense":
+            from reconstruct.dense import run_dense as work
+        case "mosaic":
+            from reconstruct.mosaic import run_mosaic as work
+        case "report":
+            from reconstruct.evaluate import run_evaluate as work
+        case _:
+            raise ValueError(stage)
+    return work
+
+
+def run(
+    stages: Sequence[str],
+    workspace: Path,
+    survey: Path | None,
+    scale: int | None = None,
+    threads: int | None = None,
+) -> tuple[str, dict[str, Any]]:
+    """Do stages one after the other; those that are up to date are skipped.
+
+    Args:
+        stages: names in order.
+        workspace: folder of the survey.
+        survey: settings file; None looks for survey.toml in the workspace, then here.
+        scale: overrides `imaging.scale`.
+        threads: cores to use; None for all.
+
+    Returns:
+        What each stage has found, as text and as JSON values.
+    """
+    imported = is_imported(workspace)
+    config = settings(workspace, survey, needed=not imported)
+    if scale is not None:
+        imaging = config.imaging.model_copy(update={"scale": scale})
+        config = config.model_copy(update={"imaging": imaging})
+    if imported:
+        stages = [stage for stage in stages if stage != "calibration"]
+        for stage in stages:
+            if stage in _SIMULATED:
+                raise WorkspaceError(
+                    f"{workspace} holds imported pictures; '{_COMMANDS[stage]}' is for simulated "
+                    "surveys: choose another workspace with -w"
+                )
+    lines, found = [], {}
+    with _only_one(workspace):
+        for stage in stages:
+            done = _work_of(stage)(workspace, config, threads or default_threads())
+            text, data = SUMMARIES[stage](workspace / stage)
+            found[stage] = {"done": done, **data}
+            lines.append(f"{stage}: {text}" if done else f"{stage}: (up to date) {text}")
+    return "\n".join(lines), found
+
+
+def settings(workspace: Path, survey: Path | None, *, needed: bool) -> SurveyConfig:
+    """The settings of a workspace.
+
+    Raises:
+        ConfigError: the file is wrong, or none is there though it is needed.
+    """
+    if survey is not None:
+        return load_config(survey)
+    for path in (workspace / "survey.toml", Path("survey.toml")):
+        if path.is_file():
+            return load_config(path)
+    if needed:
+        raise ConfigError(
+            f"no survey.toml in {workspace} or here: 'alice-survey init {workspace}' writes one"
+        )
+    return SurveyConfig()
+
+
+def is_imported(workspace: Path) -> bool:
+    """Whether the pictures of a workspace are real ones."""
+    path = workspace / "images" / "survey.json"
+    return path.is_file() and read_json(path).get("source") == "imported"
+
+
+def init_survey(folder: Path, template: str = "survey.toml") -> Path:
+    """Write a commented settings file, never over one that is there.
+
+    Raises:
+        WorkspaceError: the file exists or the folder cannot be written.
+    """
+    path = folder / "survey.toml"
+    if path.exists():
+        raise WorkspaceError(f"{path} exists already; edit it, or remove it first")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with resources.as_file(resources.files("alice_survey") / template) as source:
+            shutil.copyfile(source, path)
+    except OSError as error:
+        raise WorkspaceError(f"{path}: cannot be written: {error.strerror}") from None
+    return path
+
+
+def run_demo(workspace: Path, threads: int | None) -> tuple[str, dict[str, Any]]:
+    """Do the whole loop on the built-in survey, and say where its pictures are."""
+    if not (workspace / "survey.toml").exists():
+        init_survey(workspace, "demo.toml")
+    text, found = run(LOOP, workspace, None, None, threads)
+    pictures = [
+        ("the plan", "plan/map.png"),
+        ("a picture", "images/left/000000.png"),
+        ("the surface", "dense/dem.png"),
+        ("the mosaic", "mosaic/mosaic.png"),
+        ("the errors", "report/errors.png"),
+        ("the track", "report/track.png"),
+    ]
+    rows = [f"  {what:12} {workspace / path}" for what, path in pictures]
+    return "\n".join([text, "", "Pictures to look at:", *rows]), found
+
+
+def workspace_status(workspace: Path, survey: Path | None) -> tuple[str, dict[str, Any]]:
+    """What a workspace holds, stage by stage, and the next command."""
+    if not workspace.is_dir():
+        raise WorkspaceError(f"{workspace}: no such folder; 'alice-survey init' makes one")
+    imported = is_imported(workspace)
+    config = settings(workspace, survey, needed=not imported)
+    states: dict[str, str] = {}
+    for stage in LOOP:
+        if imported and stage in _SIMULATED and stage != "images":
+            continue
+        states[stage] = _state(workspace, stage, config, states, imported)
+    pending = [stage for stage, state in states.items() if state != "up to date"]
+    command = f"alice-survey {_COMMANDS[pending[0]]} -w {workspace}" if pending else None
+    rows = []
+    for stage, state in states.items():
+        record = read_stage(workspace / stage)
+        took = f"{record['took_s']:8.1f} s" if record else " " * 10
+        rows.append(f"{stage:12} {state:32} {took}")
+    after = f"next: {command}" if command else "nothing is left to do"
+    return "\n".join([*rows, after]), {"stages": states, "next": command}
+
+
+def _state(
+    workspace: Path, stage: str, config: SurveyConfig, before: dict[str, str], imported: bool
+) -> str:
+    there = read_stage(workspace / stage) is not None
+    if not there:
+        return "interrupted" if (workspace / f"{stage}.partial").exists() else "missing"
+    for need in _NEEDS[stage]:
+        if before.get(need, "up to date") != "up to date":
+            return f"stale ({need} is {before[need].split()[0]})"
+    if imported and stage == "images":
+        return "up to date"
+    try:
+        with only_checking():
+            stale = _work_of(stage)(workspace, config, 1)
+    except AliceError as error:
+        return f"stale ({error})"
+    return "stale (settings or inputs changed)" if stale else "up to date"
+
+
+@contextlib.contextmanager
+def _only_one(workspace: Path) -> Iterator[None]:
+    """Hold the workspace so that no second run writes into it."""
+    try:
+        workspace.mkdir(parents=True, exist_ok=True)
+        lock = (workspace / ".lock").open("w")
+    except OSError as error:
+        raise WorkspaceError(f"{workspace} cannot be written: {error.strerror}") from None
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise WorkspaceError(f"another command is working in {workspace}; wait for it") from None
+        yield

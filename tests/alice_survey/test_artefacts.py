@@ -1,0 +1,173 @@
+"""Stages appear whole, are skipped while nothing changed, and survive a kill."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from alice_survey.artefacts import (
+    Stage,
+    atomic_path,
+    need_stage,
+    only_checking,
+    run_stage,
+    write_csv,
+)
+from alice_survey.errors import WorkspaceError
+
+
+def stage(inputs: list[Path], value: int = 1, version: int = 1, resumes: bool = False) -> Stage:
+    return Stage(
+        name="made", version=version, settings={"value": value}, inputs=inputs, resumes=resumes
+    )
+
+
+class Work:
+    """Counts how often it was done."""
+
+    def __init__(self) -> None:
+        self.done = 0
+
+    def __call__(self, folder: Path) -> None:
+        self.done += 1
+        (folder / "result.txt").write_text("result")
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    path = tmp_path / "source" / "a.txt"
+    path.parent.mkdir()
+    path.write_text("one")
+    return path
+
+
+def test_unchanged_stage_is_skipped(tmp_path: Path, source: Path) -> None:
+    work = Work()
+    assert run_stage(tmp_path, stage([source]), work)
+    assert not run_stage(tmp_path, stage([source]), work)
+    os.utime(source)  # touched, not changed
+    assert not run_stage(tmp_path, stage([source.parent]), work)
+    assert work.done == 1
+    assert (tmp_path / "made" / "result.txt").read_text() == "result"
+
+
+@pytest.mark.parametrize("change", ["content", "settings", "version", "new file", "removed file"])
+def test_changed_stage_is_redone(tmp_path: Path, source: Path, change: str) -> None:
+    extra = source.parent / "b.txt"
+    if change == "removed file":
+        extra.write_text("extra")
+    work, folder = Work(), source.parent
+    run_stage(tmp_path, stage([folder]), work)
+    if change == "content":
+        source.write_text("two")
+    elif change == "new file":
+        extra.write_text("extra")
+    elif change == "removed file":
+        extra.unlink()
+    changed = stage([folder], 2 if change == "settings" else 1, 2 if change == "version" else 1)
+
+    with only_checking():
+        assert run_stage(tmp_path, changed, work)
+    assert work.done == 1
+    assert run_stage(tmp_path, changed, work)
+    assert work.done == 2
+
+
+def test_failed_work_keeps_the_old_result(tmp_path: Path, source: Path) -> None:
+    run_stage(tmp_path, stage([source]), Work())
+
+    def fail(folder: Path) -> None:
+        (folder / "half.txt").write_text("half")
+        raise RuntimeError("broke")
+
+    with pytest.raises(RuntimeError, match="broke"):
+        run_stage(tmp_path, stage([source], value=2), fail)
+    assert [p.name for p in sorted((tmp_path / "made").iterdir())] == ["result.txt", "stage.json"]
+
+
+def test_resumed_work_finds_what_it_left_only_under_the_same_digest(
+    tmp_path: Path, source: Path
+) -> None:
+    seen: list[bool] = []
+
+    def work(folder: Path) -> None:
+        seen.append((folder / "first.txt").exists())
+        (folder / "first.txt").write_text("first")
+        if len(seen) < 4:
+            raise RuntimeError("broke")
+
+    for value in (1, 1, 2, 2):
+        attempt = stage([source], value=value, resumes=True)
+        if len(seen) < 3:
+            with pytest.raises(RuntimeError):
+                run_stage(tmp_path, attempt, work)
+        else:
+            run_stage(tmp_path, attempt, work)
+    assert seen == [False, True, False, True]
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from alice_survey import artefacts
+target, call = Path(sys.argv[1]), int(sys.argv[2])
+calls = 0
+def step(original):
+    def counted(*args, **kwargs):
+        global calls
+        calls += 1
+        if calls == call:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return original(*args, **kwargs)
+    return counted
+for owner, name in [(Path, "rename"), (Path, "replace"), (Path, "write_text"), (Path, "mkdir"),
+                    (Path, "unlink"), (artefacts.shutil, "rmtree")]:
+    setattr(owner, name, step(getattr(owner, name)))
+made = artefacts.Stage(name="made", version=1, settings={"value": int(sys.argv[3])})
+artefacts.run_stage(target, made, lambda folder: (folder / "result.txt").write_text(sys.argv[3]))
+"""
+
+
+def test_a_kill_at_any_step_loses_nothing(tmp_path: Path) -> None:
+    """Whatever call the kill falls on, the next run ends with the right, whole stage."""
+    killed = 0
+    for call in range(1, 40):
+        folder = tmp_path / str(call)
+        folder.mkdir()
+        run_stage(folder, stage([], value=1), lambda f: (f / "result.txt").write_text("1") and None)
+        command = [sys.executable, "-c", KILLED, str(folder), str(call), "2"]
+        died = subprocess.run(command, check=False).returncode == -signal.SIGKILL
+        run_stage(folder, stage([], value=2), lambda f: (f / "result.txt").write_text("2") and None)
+        assert (folder / "made" / "result.txt").read_text() == "2"
+        assert [p.name for p in sorted(folder.iterdir())] == ["made"]
+        assert json.loads((folder / "made" / "stage.json").read_text())["settings"] == {"value": 2}
+        killed += died
+        if not died:
+            break
+    assert killed >= 8
+
+
+def test_missing_input_and_missing_stage_are_known_faults(tmp_path: Path) -> None:
+    with pytest.raises(WorkspaceError, match="no such file"):
+        run_stage(tmp_path, stage([tmp_path / "absent"]), Work())
+    with pytest.raises(WorkspaceError, match="alice-survey plan"):
+        need_stage(tmp_path, "plan", "plan")
+
+
+def test_atomic_path_leaves_nothing_behind_on_failure(tmp_path: Path) -> None:
+    target = tmp_path / "a.txt"
+    target.write_text("old")
+    with pytest.raises(RuntimeError), atomic_path(target) as path:
+        path.write_text("half")
+        raise RuntimeError
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+    assert target.read_text() == "old"
+
+
+def test_csv_writes_unknown_values_as_empty_cells(tmp_path: Path) -> None:
+    write_csv(tmp_path / "a.csv", ["x", "y"], [[1.5, float("nan")], [None, "t"]])
+    assert (tmp_path / "a.csv").read_text() == "x,y\n1.5,\n,t\n"
