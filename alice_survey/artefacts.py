@@ -190,7 +190,7 @@ def _text(path: Path) -> str | None:
 
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """A path to write to, beside `path` and with its suffix, that replaces it when all went well."""
+    """A path to write to, beside `path`, that replaces it when all went well."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.tmp{os.getpid()}{path.suffix}")
     try:

@@ -1,4 +1,4 @@
-"""Run pure functions over pictures, pairs and tiles: in order, in parallel, with a bounded queue."""
+"""Run pure functions over pictures, pairs and tiles: in order, parallel, with a bounded queue."""
 
 import multiprocessing
 import os

@@ -223,5 +223,7 @@ def _only_one(workspace: Path) -> Iterator[None]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise WorkspaceError(f"another command is working in {workspace}; wait for it") from None
+            raise WorkspaceError(
+                f"another command is working in {workspace}; wait for it"
+            ) from None
         yield

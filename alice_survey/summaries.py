@@ -1,0 +1,79 @@
+"""What each stage has found, in a line to read and as JSON values."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from alice_survey.artefacts import read_json
+
+Summary = tuple[str, dict[str, Any]]
+
+
+def _plan(folder: Path) -> Summary:
+    plan = read_json(folder / "plan.json")
+    text = (
+        f"{len(plan['lines'])} lines, {plan['stations']} stations, {plan['length_m']:.0f} m, "
+        f"{plan['duration_s'] / 60:.0f} min; overlap {plan['forward_overlap']:.0%} forward, "
+        f"{plan['side_overlap']:.0%} side; a picture every {plan['interval_s']:.2f} s, exposed "
+        f"{1e3 * plan['exposure_s']:.2g} ms; map in {folder / 'map.png'}"
+    )
+    return text, plan
+
+
+def _flight(folder: Path) -> Summary:
+    triggers = len((folder / "triggers.csv").read_text().splitlines()) - 1
+    return f"{triggers} triggers; track in {folder / 'track.png'}", {"triggers": triggers}
+
+
+def _pictures(folder: Path) -> Summary:
+    count = len((folder / "manifest.csv").read_text().splitlines()) - 1
+    return f"{count} pictures in {folder}", {"pictures": count}
+
+
+def _calibration(folder: Path) -> Summary:
+    found = read_json(folder / "calibration.json")
+    text = f"{found['views']} views, {found['rms_px']:.3f} px rms; rig in {folder / 'rig.json'}"
+    return text, {key: found[key] for key in ("views", "rms_px", "worst_px")}
+
+
+def _sparse(folder: Path) -> Summary:
+    found = read_json(folder / "registration.json")
+    text = (
+        f"{found['registered']} of {found['total']} pictures registered, "
+        f"{found['mean_reprojection_px']:.2f} px; {found['scale_source']}"
+    )
+    return text, found
+
+
+def _dense(folder: Path) -> Summary:
+    found = read_json(folder / "cloud.json")
+    return f"{found['points']} points; surface in {folder / 'dem.tif'}", found
+
+
+def _mosaic(folder: Path) -> Summary:
+    found = read_json(folder / "mosaic.json")
+    text = f"{found['width_px']} x {found['height_px']} px in {folder / 'mosaic.tif'}"
+    return text, found
+
+
+def _report(folder: Path) -> Summary:
+    found = read_json(folder / "report.json")
+    rows = [
+        (f"{group}.{name}", value) for group, part in found.items() for name, value in part.items()
+    ]
+    table = "\n".join(f"  {name:44} {value}" for name, value in rows)
+    return f"score in {folder / 'report.json'}\n{table}", found
+
+
+SUMMARIES: dict[str, Callable[[Path], Summary]] = {
+    "plan": _plan,
+    "flight": _flight,
+    "pool": _pictures,
+    "images": _pictures,
+    "calibration": _calibration,
+    "sparse": _sparse,
+    "dense": _dense,
+    "mosaic": _mosaic,
+    "report": _report,
+}
+"""By stage: takes its folder."""

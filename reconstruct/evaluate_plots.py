@@ -1,0 +1,110 @@
+"""Pictures of a score: track and camera errors, the error of the surface, one sheet of all."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+
+from alice_survey.artefacts import atomic_path, read_json
+from alice_survey.frames import Array
+
+if TYPE_CHECKING:
+    from reconstruct.evaluate import CameraScore, SurfaceScore
+
+_STYLE: dict[str, Any] = {"font.size": 9, "axes.titlesize": 10, "figure.dpi": 110}
+
+
+def plot_track(path: Path, plan_file: Path, cameras: "CameraScore") -> None:
+    """Planned lines, camera positions coloured by error, and the error of each picture."""
+    plan = read_json(plan_file)
+    places, length_mm = cameras.positions_ned, 1e3 * np.linalg.norm(cameras.misses_m, axis=1)
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(11, 5.5), layout="constrained")
+        plane, strips = figure.subplots(1, 2, width_ratios=[1, 1.2])
+        for line in plan["lines"]:
+            (n0, e0), (n1, e1) = line["start_ne_m"], line["end_ne_m"]
+            plane.plot([e0, e1], [n0, n1], color="0.75", linewidth=3, zorder=1)
+        area = np.array([*plan["area_ne_m"], plan["area_ne_m"][0]])
+        plane.plot(area[:, 1], area[:, 0], "k--", linewidth=1)
+        dots = plane.scatter(
+            places[:, 1], places[:, 0], c=length_mm, s=14, cmap="viridis", zorder=2
+        )
+        figure.colorbar(dots, ax=plane, label="position error (mm)", shrink=0.8)
+        plane.set(xlabel="east (m)", ylabel="north (m)", title="Camera positions over the plan")
+        plane.set_aspect("equal")
+        for axis, name in enumerate(("north", "east", "down")):
+            strips.plot(1e3 * cameras.misses_m[:, axis], ".", markersize=4, label=name)
+        strips.axhline(0, color="0.6", linewidth=0.8)
+        strips.set(xlabel="picture", ylabel="error (mm)")
+        strips.set_title(f"Error after a rigid alignment: {1e3 * cameras.rms_m:.2f} mm rms")
+        strips.legend(loc="upper right")
+        _save(figure, path)
+
+
+def plot_errors(path: Path, surface: "SurfaceScore", area_ne: Array) -> None:
+    """Map and histogram of height errors of the surface."""
+    figures = surface.to_json()
+    limit = max(5.0, 3 * figures["height_median_mm"], figures["height_95_mm"])
+    west, east, south, north = surface.extent_m
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(11, 5.5), layout="constrained")
+        plane, bars = figure.subplots(1, 2, width_ratios=[1.3, 1])
+        image = plane.imshow(
+            1e3 * surface.map_m,
+            extent=(west, east, south, north),
+            vmin=-limit,
+            vmax=limit,
+            cmap="RdBu_r",
+            interpolation="nearest",
+        )
+        closed = np.vstack([area_ne, area_ne[:1]])
+        plane.plot(closed[:, 1], closed[:, 0], "k--", linewidth=1)
+        figure.colorbar(image, ax=plane, label="height error (mm)", shrink=0.8)
+        plane.set(xlabel="east (m)", ylabel="north (m)", title="Surface less truth")
+        plane.set_facecolor("0.85")
+        bars.hist(1e3 * surface.height_m, bins=np.linspace(-4 * limit, 4 * limit, 161), log=True)
+        bars.set(xlabel="height error (mm)", ylabel="cells")
+        bars.set_title(
+            f"height rms {figures['height_rms_mm']:.2f} mm, distance rms "
+            f"{figures['distance_rms_mm']:.2f} mm, {surface.completeness:.1%} complete"
+        )
+        _save(figure, path)
+
+
+def plot_sheet(path: Path, workspace: Path, surface: "SurfaceScore") -> None:
+    """Plan, one picture, surface, mosaic and error map on one sheet."""
+    pictures = [
+        ("A picture", next(iter(sorted((workspace / "images" / "left").iterdir())), None)),
+        ("Surface", workspace / "dense" / "dem.png"),
+        ("Mosaic", workspace / "mosaic" / "mosaic.png"),
+    ]
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(12, 10), layout="constrained")
+        panels = figure.subplots(2, 2).ravel()
+        for panel, (title, file) in zip(panels, pictures, strict=False):
+            panel.set_title(title)
+            panel.axis("off")
+            if file is not None:
+                panel.imshow(_read(file))
+        west, east, south, north = surface.extent_m
+        panels[3].set_title("Surface less truth (mm)")
+        image = panels[3].imshow(
+            1e3 * surface.map_m, extent=(west, east, south, north), vmin=-10, vmax=10, cmap="RdBu_r"
+        )
+        figure.colorbar(image, ax=panels[3], shrink=0.8)
+        _save(figure, path)
+
+
+def _read(path: Path) -> Any:
+    import cv2
+
+    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    order = cv2.COLOR_BGRA2RGBA if picture.shape[2] == 4 else cv2.COLOR_BGR2RGB
+    return cv2.cvtColor(picture, order)
+
+
+def _save(figure: Figure, path: Path) -> None:
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, metadata={"Software": None})

@@ -1,0 +1,155 @@
+"""The command line: quick, with examples everywhere, one line for a known fault."""
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from typer.main import get_command
+from typer.testing import CliRunner
+
+from alice_survey.cli import app, main
+from alice_survey.config import SurveyConfig, load_config
+from alice_survey.survey import LOOP, init_survey
+
+COMMANDS = (
+    "init", "fov", "plan", "fly", "image", "calibrate", "import-images", "reconstruct", "scale",
+    "evaluate", "run", "demo", "status",
+)  # fmt: skip
+PACKAGE = Path(__file__).parents[2] / "alice_survey"
+
+
+def fails(
+    arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> str:
+    """Run a command that must end in exit code 1 with one line; returns the line."""
+    monkeypatch.setattr(sys, "argv", ["alice-survey", *arguments])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 1
+    shown = capsys.readouterr().err.strip()
+    assert shown.startswith("error: ")
+    assert len(shown.splitlines()) == 1
+    return shown
+
+
+def test_help_loads_nothing_heavy() -> None:
+    """`--help` answers at once because numeric packages are not even imported."""
+    code = (
+        "import sys; from alice_survey.cli import app\n"
+        "try: app(['--help'])\n"
+        "except SystemExit: pass\n"
+        "heavy = {'numpy', 'scipy', 'cv2', 'pycolmap', 'open3d', 'pydantic', 'matplotlib'}\n"
+        "sys.exit(', '.join(heavy & set(sys.modules)) or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "import-images" in done.stdout
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself_with_examples(command: str) -> None:
+    shown = CliRunner().invoke(app, [command, "--help"])
+    assert shown.exit_code == 0
+    examples = re.findall(rf"^ +alice-survey ({command}.*)$", shown.output, re.MULTILINE)
+    assert examples
+    parser = get_command(app).commands[command]  # type: ignore[attr-defined]
+    for example in examples:
+        parser.make_context(command, shlex.split(example)[1:])  # it parses
+
+
+def test_all_commands_are_known() -> None:
+    assert set(get_command(app).commands) == set(COMMANDS)  # type: ignore[attr-defined]
+
+
+def test_module_runs_as_the_command() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "alice_survey", "fov", "--validate", "--json"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert [row["passed"] for row in json.loads(done.stdout)] == [True] * 6
+
+
+def test_the_template_states_every_default(tmp_path: Path) -> None:
+    """survey.toml as written is the default survey, but for the paper's stated line spacing."""
+    path = init_survey(tmp_path)
+    written = load_config(path)
+    default = SurveyConfig()
+    assert written.model_copy(update={"plan": default.plan}) == default
+    assert written.plan.line_spacing_m == 1.0
+    assert written.plan.model_copy(update={"line_spacing_m": None}) == default.plan
+    text = path.read_text()
+    for section, field in SurveyConfig.model_fields.items():
+        keys = getattr(field.annotation, "model_fields", {section: None})
+        for key in keys:
+            assert re.search(rf"^(# )?{key} = ", text, re.MULTILINE), f"{section}.{key}"
+
+
+def test_the_demo_is_a_survey() -> None:
+    text = (PACKAGE / "demo.toml").read_text()
+    config = SurveyConfig.model_validate(tomllib.loads(text))
+    assert config.imaging.scale == 4
+    assert config.plan.forward_overlap >= 0.6
+    assert config.plan.side_overlap >= 0.3
+    assert config.seafloor.relief_m >= 0.3
+
+
+def test_init_never_overwrites(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "survey.toml").write_text("# mine")
+    shown = fails(["init", str(tmp_path)], capsys, monkeypatch)
+    assert "exists" in shown
+    assert (tmp_path / "survey.toml").read_text() == "# mine"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "[plan]\naltitud_m = 2",
+            "plan.altitud_m is not a known setting; did you mean altitude_m?",
+        ),
+        ("[plan]\naltitude_m = -1", "plan.altitude_m = -1"),
+        ("[plan]\nforward_overlap = 1.2", "less than or equal to 0.95"),
+        ("[plan]\nspeed_mps = nan", "plan.speed_mps = nan"),
+        ("[area]\nlength_m = 0", "area.length_m = 0"),
+        ("[plan\naltitude_m = 2", "not valid TOML"),
+        ("[water]\njerlov = 'X'", "water.jerlov = 'X'"),
+    ],
+)
+def test_a_wrong_setting_is_one_line(
+    text: str,
+    said: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (tmp_path / "survey.toml").write_text(text)
+    shown = fails(["plan", "-w", str(tmp_path)], capsys, monkeypatch)
+    assert said in shown
+    assert str(tmp_path / "survey.toml") in shown
+
+
+def test_stages_name_the_command_that_is_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert "init" in fails(["plan", "-w", "w"], capsys, monkeypatch)
+    init_survey(tmp_path / "w")
+    assert "'alice-survey plan'" in fails(["fly", "-w", "w"], capsys, monkeypatch)
+    assert "'alice-survey image'" in fails(["calibrate", "-w", "w"], capsys, monkeypatch)
+    assert "'alice-survey image'" in fails(["evaluate", "-w", "w"], capsys, monkeypatch)
+
+
+def test_status_names_the_next_command(tmp_path: Path) -> None:
+    init_survey(tmp_path)
+    shown = CliRunner().invoke(app, ["status", "-w", str(tmp_path), "--json"])
+    data = json.loads(shown.output)
+    assert data["stages"] == dict.fromkeys(LOOP, "missing")
+    assert data["next"] == f"alice-survey plan -w {tmp_path}"
