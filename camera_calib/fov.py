@@ -173,7 +173,7 @@ def apparent_distance_m(camera: FlatPortCamera, altitude_m: float) -> float:
     return air + altitude_m / camera.n_water
 
 
-def format_fov_table(rows: Sequence[FovRow]) -> str:
+def format_fov(rows: Sequence[FovRow]) -> str:
     """The rows as a plain text table."""
     header = (
         "lens", "altitude", "footprint", "pixel centre/mean/corner", "diagonal air/water",
@@ -205,7 +205,7 @@ def format_fov_table(rows: Sequence[FovRow]) -> str:
     return "\n".join([_text_table(header, cells), *notes])
 
 
-def format_paper_checks(checks: Sequence[PaperCheck]) -> str:
+def format_checks(checks: Sequence[PaperCheck]) -> str:
     """The comparison with the paper as a plain text table."""
     header = ("lens", "quantity", "computed", "paper", "difference", "allowed", "", "note")
     cells = [
