@@ -1,12 +1,16 @@
 """Run pure functions over pictures, pairs and tiles: in order, parallel, with a bounded queue."""
 
+import ctypes
 import multiprocessing
 import os
+import signal
 import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sized
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from typing import TypeVar
+
+_PR_SET_PDEATHSIG = 1
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -44,7 +48,7 @@ def parallel_map(
         yield from progress(map(function, items), label, total)
         return
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(threads, mp_context=context, initializer=_one_core) as executor:
+    with ProcessPoolExecutor(threads, mp_context=context, initializer=_start_worker) as executor:
         yield from progress(_in_order(executor, function, items, 3 * threads), label, total)
 
 
@@ -64,11 +68,14 @@ def _in_order(
             future.cancel()
 
 
-def _one_core() -> None:
+def _start_worker() -> None:
+    """Use one core, and end with the process that started this one, even if that is killed."""
     import cv2
 
     cv2.setNumThreads(1)
     os.environ["OMP_NUM_THREADS"] = "1"
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def progress(items: Iterable[Item], label: str, total: int | None = None) -> Iterator[Item]:
