@@ -1,4 +1,4 @@
-"""Pictures of a plan and of the flight that followed it."""
+"""The map of a plan."""
 
 import math
 from pathlib import Path
@@ -79,7 +79,7 @@ def _summary(plan: Plan) -> str:
 
 
 def _sheet(plan: Plan) -> tuple[Figure, Axes]:
-    layout = ConstrainedLayoutEngine(rect=(0, 0.07, 1, 0.93))
+    layout = ConstrainedLayoutEngine(rect=(0, 0.07, 1, 0.9))
     figure = Figure(figsize=(8.5, 8.5), facecolor="white", layout=layout)
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from alice_survey.errors import PlanError
 from alice_survey.frames import Array
@@ -76,13 +77,28 @@ class Route:
 
     def places(self, along_m: Array) -> Array:
         """Where the route is, (N, 2), at distances (N,); it goes on straight beyond its ends."""
+        result = np.empty((len(along_m), 2))
+        for leg, rows, within_m in self._by_leg(along_m):
+            result[rows] = leg.places(within_m)
+        return result
+
+    def headings_rad(self, along_m: Array) -> Array:
+        """Heading of the route, (N,), at distances (N,); not wrapped within a leg."""
+        result = np.empty(len(along_m))
+        for leg, rows, within_m in self._by_leg(along_m):
+            result[rows] = leg.heading_rad + leg.curvature_per_m * within_m
+        return result
+
+    def _by_leg(self, along_m: Array) -> Iterator[tuple[Leg, NDArray[np.intp], Array]]:
+        """Each leg that is met, the indices of its distances, and these from its start."""
         starts = self.starts_m
         index = np.clip(np.searchsorted(starts, along_m, side="right") - 1, 0, len(self.legs) - 1)
-        result = np.empty((len(along_m), 2))
-        for i in np.unique(index):
-            rows = index == i
-            result[rows] = self.legs[i].places(along_m[rows] - starts[i])
-        return result
+        order = np.argsort(index, kind="stable")
+        cuts = np.searchsorted(index[order], np.arange(len(self.legs) + 1))
+        for i, leg in enumerate(self.legs):
+            rows = order[cuts[i] : cuts[i + 1]]
+            if len(rows):
+                yield leg, rows, along_m[rows] - starts[i]
 
     def line_starts_m(self) -> dict[int, float]:
         """Distance along the route at which each line of the plan starts."""
