@@ -70,7 +70,17 @@ class FlatPortCamera:
         distortion = [self.k1, self.k2, self.p1, self.p2, self.k3]
         port = [self.port_distance_m, self.glass_thickness_m, self.n_glass, self.n_water]
         unit = np.asarray(self.normal) / math.hypot(*self.normal)
-        return np.array([*lens, *distortion, *port, *unit])
+        return np.array([*lens, *distortion, *port, *unit, self._fold])
+
+    @property
+    def _fold(self) -> float:
+        """Square of the tangent in air at which radial distortion turns back; inf if it never does.
+
+        There d/dr (r + k1 r^3 + k2 r^5 + k3 r^7) = 0, a cubic in w = 1 / r^2 with a leading 1.
+        """
+        roots = np.roots([1.0, 3 * self.k1, 5 * self.k2, 7 * self.k3])
+        nearest = max(roots.real[np.abs(roots.imag) < 1e-9], default=0.0)
+        return 1.0 / float(nearest) if nearest > 1e-9 else math.inf
 
     def project(self, points_cam: Array) -> Array:
         """Project points in the water to pixels.
@@ -80,7 +90,8 @@ class FlatPortCamera:
 
         Returns:
             (..., 2) pixels (not clipped to the frame); NaN where the point is not in the water
-            before the port or no light reaches the pupil from it.
+            before the port, no light reaches the pupil from it, or it lies so far out that the lens
+            model folds back.
         """
         points = np.ascontiguousarray(points_cam, dtype=np.float64)
         pixels: Array = _project(points.reshape(-1, 3), self._parameters)
@@ -153,7 +164,7 @@ def camera_from_json(data: dict[str, Any]) -> FlatPortCamera:
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def _project(points: Array, camera: Array) -> Array:
-    fx, fy, cx, cy, k1, k2, p1, p2, k3, air, glass, n_glass, n_water, nx, ny, nz = camera
+    fx, fy, cx, cy, k1, k2, p1, p2, k3, air, glass, n_glass, n_water, nx, ny, nz, fold = camera
     a_glass, b_glass = n_glass * n_glass, n_glass * n_glass - 1.0
     a_water, b_water = n_water * n_water, n_water * n_water - 1.0
     pixels = np.full((points.shape[0], 2), np.nan)
@@ -197,6 +208,8 @@ def _project(points: Array, camera: Array) -> Array:
             continue
         u, v = dx / dz, dy / dz
         r2 = u * u + v * v
+        if not r2 < fold:
+            continue
         radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
         pixels[i, 0] = fx * (u * radial + 2.0 * p1 * u * v + p2 * (r2 + 2.0 * u * u)) + cx
         pixels[i, 1] = fy * (v * radial + p1 * (r2 + 2.0 * v * v) + 2.0 * p2 * u * v) + cy
@@ -205,7 +218,7 @@ def _project(points: Array, camera: Array) -> Array:
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def _unproject(pixels: Array, camera: Array) -> tuple[Array, Array]:
-    fx, fy, cx, cy, k1, k2, p1, p2, k3, air, glass, n_glass, n_water, nx, ny, nz = camera
+    fx, fy, cx, cy, k1, k2, p1, p2, k3, air, glass, n_glass, n_water, nx, ny, nz, fold = camera
     points = np.full((pixels.shape[0], 3), np.nan)
     directions = np.full((pixels.shape[0], 3), np.nan)
     for i in range(pixels.shape[0]):
@@ -231,7 +244,7 @@ def _unproject(pixels: Array, camera: Array) -> tuple[Array, Array]:
             if abs(step_u) + abs(step_v) <= 1e-15 * (1.0 + abs(u) + abs(v)):
                 converged = True
                 break
-        if not converged:
+        if not (converged and u * u + v * v < fold):
             continue
         length = math.sqrt(u * u + v * v + 1.0)
         dx, dy, dz = u / length, v / length, 1.0 / length

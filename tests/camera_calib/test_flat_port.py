@@ -1,0 +1,283 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from alice_survey.errors import CalibrationError
+from camera_calib.flat_port import FlatPortCamera, camera_from_json
+from tests.oracles_camera import lens_pixel, project_by_bisection, project_by_shortest_path
+
+Array = NDArray[np.float64]
+
+MANTA = FlatPortCamera(
+    width_px=3384,
+    height_px=2710,
+    fx_px=3387.5,
+    fy_px=3387.5,
+    cx_px=1692.0,
+    cy_px=1355.0,
+    port_distance_m=0.02,
+    glass_thickness_m=0.01,
+)
+
+
+def tilted(angle_deg: float, azimuth_deg: float) -> tuple[float, float, float]:
+    angle, azimuth = math.radians(angle_deg), math.radians(azimuth_deg)
+    return (
+        math.sin(angle) * math.cos(azimuth),
+        math.sin(angle) * math.sin(azimuth),
+        math.cos(angle),
+    )
+
+
+@st.composite
+def cameras(draw: st.DrawFn) -> FlatPortCamera:
+    """Cameras over the ranges in which the model is to be exact."""
+    return replace(
+        MANTA,
+        fx_px=draw(st.floats(2500.0, 8000.0)),
+        fy_px=draw(st.floats(2500.0, 8000.0)),
+        cx_px=draw(st.floats(1600.0, 1800.0)),
+        cy_px=draw(st.floats(1300.0, 1400.0)),
+        k1=draw(st.floats(-0.15, 0.15)),
+        k2=draw(st.floats(-0.05, 0.1)),
+        p1=draw(st.floats(-2e-3, 2e-3)),
+        p2=draw(st.floats(-2e-3, 2e-3)),
+        k3=draw(st.floats(-0.02, 0.02)),
+        port_distance_m=draw(st.floats(0.0, 0.2)),
+        glass_thickness_m=draw(st.floats(0.0, 0.2)),
+        n_glass=draw(st.floats(1.45, 1.8)),
+        n_water=draw(st.floats(1.0, 1.36)),
+        normal=tilted(draw(st.floats(0.0, 10.0)), draw(st.floats(0.0, 360.0))),
+    )
+
+
+@settings(deadline=None, max_examples=150)
+@given(camera=cameras(), distance_m=st.floats(0.3, 20.0))
+def test_a_pixel_comes_back_within_a_billionth(camera: FlatPortCamera, distance_m: float) -> None:
+    pixels = camera.pixel_centres(step=241).reshape(-1, 2)
+    glass, directions = camera.unproject(pixels)
+
+    back = camera.project(glass + distance_m * directions)
+
+    assert np.abs(back - pixels).max() < 1e-9
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    camera=cameras(),
+    x=st.floats(-0.4, 0.4),
+    y=st.floats(-0.4, 0.4),
+    water_m=st.floats(0.3, 20.0),
+)
+def test_project_agrees_with_the_shortest_optical_path(
+    camera: FlatPortCamera, x: float, y: float, water_m: float
+) -> None:
+    glass_m = camera.port_distance_m + camera.glass_thickness_m
+    point = (glass_m + water_m) * np.array(camera.normal) + water_m * np.array([x, y, 0.0])
+    if camera.port_distance_m < 1e-6:
+        camera = replace(camera, port_distance_m=1e-6)
+    if camera.glass_thickness_m < 1e-6:
+        camera = replace(camera, glass_thickness_m=1e-6)
+
+    np.testing.assert_allclose(
+        camera.project(point), project_by_shortest_path(camera, point), atol=1e-8
+    )
+
+
+@settings(deadline=None, max_examples=150)
+@given(
+    camera=cameras(),
+    slope=st.floats(0.0, 0.6),
+    azimuth=st.floats(0.0, 6.28),
+    water_m=st.floats(0.3, 20.0),
+)
+def test_project_agrees_with_bisection(
+    camera: FlatPortCamera, slope: float, azimuth: float, water_m: float
+) -> None:
+    camera = replace(camera, normal=(0.0, 0.0, 1.0))
+    z = camera.port_distance_m + camera.glass_thickness_m + water_m
+    point = np.array([slope * z * math.cos(azimuth), slope * z * math.sin(azimuth), z])
+    if not np.all(np.isfinite(camera.project(point))):
+        assert slope > 0.4  # only far outside of the frame may a lens have no image
+        return
+
+    np.testing.assert_allclose(
+        camera.project(point), project_by_bisection(camera, point), atol=1e-8
+    )
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 5.0, 15.0, 25.0, 32.0])
+def test_a_ray_obeys_snells_law_in_closed_form(angle_deg: float) -> None:
+    angle = math.radians(angle_deg)
+    pixel = np.array([MANTA.cx_px + MANTA.fx_px * math.tan(angle), MANTA.cy_px])
+
+    glass, direction = MANTA.unproject(pixel)
+
+    in_glass = math.asin(math.sin(angle) / 1.52)
+    in_water = math.asin(math.sin(angle) / 1.34)
+    at_glass = 0.02 * math.tan(angle) + 0.01 * math.tan(in_glass)
+    np.testing.assert_allclose(glass, [at_glass, 0.0, 0.03], atol=1e-15)
+    np.testing.assert_allclose(direction, [math.sin(in_water), 0, math.cos(in_water)], atol=1e-15)
+
+
+def test_without_port_and_water_it_is_opencvs_camera() -> None:
+    rng = np.random.default_rng(1)
+    camera = replace(MANTA, k1=-0.1, k2=0.05, p1=1e-3, p2=-2e-3, k3=0.01, n_glass=1.0, n_water=1.0)
+    points = rng.uniform([-1, -1, 2], [1, 1, 4], (200, 3))
+
+    expected = [lens_pixel(camera, point) for point in points]
+
+    np.testing.assert_allclose(camera.project(points), expected, atol=1e-9)
+
+
+def test_near_the_axis_water_magnifies_by_its_index() -> None:
+    camera = replace(MANTA, port_distance_m=0.0, glass_thickness_m=0.0)
+    point = np.array([1e-5, -2e-5, 2.0])
+
+    offset = camera.project(point) - [camera.cx_px, camera.cy_px]
+
+    np.testing.assert_allclose(offset, 1.34 * 3387.5 * point[:2] / 2.0, rtol=1e-8)
+
+
+@given(factor=st.floats(0.1, 10.0), x=st.floats(-0.5, 0.5), y=st.floats(-0.5, 0.5))
+def test_pixels_do_not_know_the_unit_of_length(factor: float, x: float, y: float) -> None:
+    point = np.array([x, y, 1.5])
+    camera = replace(MANTA, normal=tilted(4.0, 70.0))
+    larger = replace(camera, port_distance_m=0.02 * factor, glass_thickness_m=0.01 * factor)
+
+    np.testing.assert_allclose(larger.project(factor * point), camera.project(point), atol=1e-8)
+
+
+@given(angle=st.floats(-3.2, 3.2), x=st.floats(-0.5, 0.5), y=st.floats(-0.5, 0.5))
+def test_a_square_port_is_symmetric_about_its_axis(angle: float, x: float, y: float) -> None:
+    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    centre = np.array([MANTA.cx_px, MANTA.cy_px])
+
+    pixel = MANTA.project(np.array([x, y, 1.5])) - centre
+    turned = MANTA.project(np.array([*(turn @ [x, y]), 1.5])) - centre
+
+    np.testing.assert_allclose(turned, turn @ pixel, atol=1e-8)
+
+
+def test_two_tilts_that_agree_give_one_pixel() -> None:
+    point = np.array([0.3, -0.2, 2.0])
+    exact = replace(MANTA, normal=tilted(3.0, 30.0)).project(point)
+
+    rounded = tuple(value * (1 + 4e-7) for value in tilted(3.0, 30.0))
+
+    np.testing.assert_allclose(replace(MANTA, normal=rounded).project(point), exact, atol=1e-9)
+
+
+def test_points_outside_of_the_water_have_no_pixel() -> None:
+    points = np.array([[0.0, 0.0, z] for z in (-1.0, 0.0, 0.01, 0.02, 0.025, 0.03, 0.0301)])
+
+    seen = np.isfinite(MANTA.project(points)).all(axis=1)
+
+    assert seen.tolist() == [False] * 6 + [True]
+
+
+def test_light_beyond_the_critical_angle_never_reaches_a_pupil_on_the_glass() -> None:
+    camera = replace(MANTA, port_distance_m=0.0, glass_thickness_m=0.0)
+    critical = math.tan(math.asin(1 / 1.34))
+    points = np.array([[critical * f, 0.0, 1.0] for f in (0.9, 0.9999, 1.0001, 1.5)])
+
+    seen = np.isfinite(camera.project(points)).all(axis=1)
+
+    assert seen.tolist() == [True, True, False, False]
+
+
+def test_a_lens_that_folds_gives_no_pixel_beyond_its_fold() -> None:
+    # Barrel distortion r (1 - 0.3 r^2) turns back at r = 1.054 in air: what lies beyond would be
+    # drawn over the frame a second time.
+    camera = replace(MANTA, k1=-0.3, port_distance_m=0.0, glass_thickness_m=0.0)
+    for tangent, seen in ((1.0, True), (1.05, True), (1.06, False), (1.7, False)):
+        angle = math.asin(math.sin(math.atan(tangent)) / 1.34)
+        point = np.array([2.0 * math.tan(angle), 0.0, 2.0])
+        assert np.isfinite(camera.project(point)).all() == seen, tangent
+
+
+def test_a_pixel_that_no_ray_reaches_has_none() -> None:
+    camera = replace(MANTA, k1=-0.3)  # distorted radii end at 0.703
+    reach = camera.fx_px * np.array([0.69, 0.71])
+    pixels = np.stack([camera.cx_px + reach, np.full(2, camera.cy_px)], axis=1)
+
+    glass, direction = camera.unproject(pixels)
+
+    assert np.isfinite(glass).all(axis=1).tolist() == [True, False]
+    assert np.isfinite(direction).all(axis=1).tolist() == [True, False]
+
+
+def test_shapes_follow_the_argument() -> None:
+    pixels = MANTA.pixel_centres(step=1000)
+    assert pixels.shape == (3, 4, 2)
+    np.testing.assert_allclose(pixels[1, 2], [2000.5, 1000.5])
+
+    points = MANTA.at_depth(pixels, 2.0)
+    assert points.shape == (3, 4, 3)
+    np.testing.assert_allclose(points[..., 2], 2.0)
+    np.testing.assert_allclose(MANTA.project(points), pixels, atol=1e-9)
+    assert MANTA.project(points[0, 0]).shape == (2,)
+
+
+def test_at_depth_takes_a_depth_for_each_pixel() -> None:
+    pixels = MANTA.pixel_centres(step=1000)
+    depths = np.linspace(1.0, 3.0, 12).reshape(3, 4)
+
+    points = MANTA.at_depth(pixels, depths)
+
+    np.testing.assert_allclose(points[..., 2], depths)
+
+
+def test_a_reduced_camera_sees_the_same_points_at_smaller_pixels() -> None:
+    small = MANTA.reduced(4)
+    points = MANTA.at_depth(MANTA.pixel_centres(500), 2.0)
+
+    assert (small.width_px, small.height_px) == (846, 677)
+    np.testing.assert_allclose(small.project(points) * 4, MANTA.project(points), atol=1e-9)
+
+
+def test_the_border_goes_round_the_frame_once() -> None:
+    border = MANTA.border(8)
+
+    assert border.shape == (32, 2)
+    np.testing.assert_allclose(border[::8], [[0, 0], [3384, 0], [3384, 2710], [0, 2710]], atol=1e-9)
+    closed = np.vstack([border, border[:1]])
+    lengths = np.linalg.norm(np.diff(closed, axis=0), axis=1)
+    assert lengths.sum() == pytest.approx(2 * (3384 + 2710))
+
+
+def test_json_keeps_every_parameter() -> None:
+    camera = replace(MANTA, k1=0.1, p2=1e-4, normal=tilted(2.0, 40.0))
+    assert camera_from_json(camera.to_json()) == camera
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"fx_px": math.nan}, "fx_px"),
+        ({"cx_px": math.inf}, "cx_px"),
+        ({"width_px": 0}, "width_px"),
+        ({"fy_px": -1.0}, "fy_px"),
+        ({"port_distance_m": -0.01}, "port_distance_m"),
+        ({"n_water": 0.9}, "n_water"),
+        ({"normal": (0.0, 0.1, 1.0)}, "normal"),
+        ({"normal": (0.0, 0.0, -1.0)}, "normal"),
+    ],
+)
+def test_a_camera_that_cannot_be_is_refused(change: dict[str, object], words: str) -> None:
+    with pytest.raises(CalibrationError, match=words) as fault:
+        replace(MANTA, **change)
+    assert "\n" not in str(fault.value)
+
+
+def test_json_with_an_unknown_or_a_missing_key_is_refused() -> None:
+    data = MANTA.to_json()
+    with pytest.raises(CalibrationError, match="k9"):
+        camera_from_json({**data, "k9": 0.1})
+    with pytest.raises(CalibrationError, match="fx_px"):
+        camera_from_json({key: value for key, value in data.items() if key != "fx_px"})

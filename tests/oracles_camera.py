@@ -1,0 +1,110 @@
+"""Slow, obvious twins of the flat-port camera, written apart from it."""
+
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import bisect, minimize
+
+from camera_calib.flat_port import FlatPortCamera
+
+Array = NDArray[np.float64]
+
+
+def lens_pixel(camera: FlatPortCamera, ray_air: Array) -> Array:
+    """Pixel of a ray in air, by OpenCV."""
+    matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]])
+    distortion = np.array([camera.k1, camera.k2, camera.p1, camera.p2, camera.k3])
+    pixels, _ = cv2.projectPoints(
+        np.asarray(ray_air, dtype=np.float64).reshape(1, 1, 3),
+        np.zeros(3),
+        np.zeros(3),
+        matrix,
+        distortion,
+    )
+    return np.asarray(pixels, dtype=np.float64).reshape(2)
+
+
+def project_by_bisection(camera: FlatPortCamera, point_cam: Array) -> Array:
+    """Pixel of a point through a port square to the axis: Fermat's principle by bisection.
+
+    The derivative of the optical path with respect to where the light meets the glass is the
+    difference of the sines, n sin = n' sin'. With both zero, the angle in air decides how far from
+    the axis the light ends; that distance grows with it and is bisected.
+    """
+    x, y, z = point_cam
+    radius = math.hypot(x, y)
+    water_m = z - camera.port_distance_m - camera.glass_thickness_m
+
+    def reaches(angle: float) -> float:
+        in_glass = math.asin(math.sin(angle) / camera.n_glass)
+        in_water = math.asin(math.sin(angle) / camera.n_water)
+        return (
+            camera.port_distance_m * math.tan(angle)
+            + camera.glass_thickness_m * math.tan(in_glass)
+            + water_m * math.tan(in_water)
+            - radius
+        )
+
+    angle = bisect(reaches, 0.0, math.pi / 2 - 1e-12, xtol=1e-15, rtol=1e-15, maxiter=200)
+    ray = np.array([0.0, 0.0, 1.0])
+    if radius > 0:
+        ray[:2] = math.tan(angle) * np.array([x, y]) / radius
+    return lens_pixel(camera, ray)
+
+
+def project_by_shortest_path(camera: FlatPortCamera, point_cam: Array) -> Array:
+    """Pixel of a point through any port: the optical path, minimised in space.
+
+    Light crosses the inner glass at A and the outer glass at B, each free in two dimensions. The
+    path |A| + n_glass |B - A| + n_water |P - B| is convex; its least value is found by Newton's
+    method on all four unknowns, without any thought of a plane of refraction.
+    """
+    normal = np.asarray(camera.normal) / np.linalg.norm(camera.normal)
+    first = np.cross(normal, [0.3, -0.5, 0.8])
+    first /= np.linalg.norm(first)
+    axes = np.stack([first, np.cross(normal, first)], axis=1)
+    inner = camera.port_distance_m * normal
+    outer = inner + camera.glass_thickness_m * normal
+    # Differences A - 0, B - A and P - B are linear in the unknowns: d = base + matrix @ unknowns.
+    zeros = np.zeros((3, 2))
+    spans = [
+        (1.0, inner, np.hstack([axes, zeros])),
+        (camera.n_glass, outer - inner, np.hstack([-axes, axes])),
+        (camera.n_water, np.asarray(point_cam) - outer, np.hstack([zeros, -axes])),
+    ]
+
+    def path(unknowns: Array) -> float:
+        return sum(n * float(np.linalg.norm(base + m @ unknowns)) for n, base, m in spans)
+
+    def gradient(unknowns: Array) -> Array:
+        total = np.zeros(4)
+        for n, base, m in spans:
+            d = base + m @ unknowns
+            total += n * m.T @ (d / np.linalg.norm(d))
+        return total
+
+    def hessian(unknowns: Array) -> Array:
+        total = np.zeros((4, 4))
+        for n, base, m in spans:
+            d = base + m @ unknowns
+            length = np.linalg.norm(d)
+            unit = d / length
+            total += n * m.T @ ((np.eye(3) - np.outer(unit, unit)) / length) @ m
+        return total
+
+    along = float(np.asarray(point_cam) @ normal)
+    sideways = np.asarray(point_cam) @ axes
+    start = np.concatenate(
+        [
+            sideways * (camera.port_distance_m / along),
+            sideways * ((camera.port_distance_m + camera.glass_thickness_m) / along),
+        ]
+    )
+    found = minimize(
+        path, start, jac=gradient, hess=hessian, method="trust-exact", options={"gtol": 1e-9}
+    ).x
+    for _ in range(5):  # a trust region stops at the rounding of the path; the gradient goes on
+        found = found - np.linalg.solve(hessian(found), gradient(found))
+    return lens_pixel(camera, inner + axes @ found[:2])
