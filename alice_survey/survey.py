@@ -47,26 +47,43 @@ def _work_of(stage: str) -> StageWork:
     """The function that does a stage; its packages are loaded only now."""
     match stage:
         case "plan":
-            from missions.plan import run_plan as work
+            from missions.plan import run_plan
+
+            return run_plan
         case "flight":
-            from missions.fly import run_fly as work
+            from missions.fly import run_fly
+
+            return run_fly
         case "pool":
-            from alice_survey.seafloor.imaging import run_pool as work
+            from alice_survey.seafloor.imaging import run_pool
+
+            return run_pool
         case "images":
-            from alice_survey.seafloor.imaging import run_images as work
+            from alice_survey.seafloor.imaging import run_images
+
+            return run_images
         case "calibration":
-            from camera_calib.calibrate import run_calibrate as work
+            from camera_calib.calibrate import run_calibrate
+
+            return run_calibrate
         case "sparse":
-            from reconstruct.sparse import run_sparse as work
+            from reconstruct.sparse import run_sparse
+
+            return run_sparse
         case "dense":
-            from reconstruct.dense import run_dense as work
+            from reconstruct.dense import run_dense
+
+            return run_dense
         case "mosaic":
-            from reconstruct.mosaic import run_mosaic as work
+            from reconstruct.mosaic import run_mosaic
+
+            return run_mosaic
         case "report":
-            from reconstruct.evaluate import run_evaluate as work
+            from reconstruct.evaluate import run_evaluate
+
+            return run_evaluate
         case _:
             raise ValueError(stage)
-    return work
 
 
 def run(

@@ -202,17 +202,17 @@ class _Problem:
         return np.stack([left.project(in_left), right.project(in_right)], axis=1)
 
     def residuals(self, x: Array) -> Array:
-        return self._flat(self.predict(x) - self.pixels, self.observed)
-
-    def _flat(self, misses: Array, observed: NDArray[np.bool_]) -> Array:
-        return np.where(observed[..., None], misses, 0.0).ravel()
+        """Misses in x and y, view by view; 0 where no corner was found."""
+        misses = np.where(self.observed[..., None], self.predict(x) - self.pixels, 0.0)
+        return misses.ravel()
 
     def jacobian(self, x: Array) -> Array:
         """Central differences; a board's pose moves its own view only."""
 
         def slope(step: Array) -> Array:
             change = self.predict(x + step) - self.predict(x - step)
-            return np.where(self.observed[..., None], change, 0.0) / (2 * step.max())
+            seen: Array = np.where(self.observed[..., None], change, 0.0)
+            return seen / (2 * float(step.max()))
 
         views = len(self.pixels)
         jacobian = np.zeros((views, self.pixels[0].size, x.size))
@@ -324,7 +324,7 @@ def _scale(pool: Path, camera: CameraConfig) -> int:
     picture = cv2.imread(str(first), cv2.IMREAD_GRAYSCALE)
     if picture is None:
         raise CalibrationError(f"{first} cannot be decoded")
-    height, width = picture.shape
+    height, width = map(int, picture.shape)
     scale = round(camera.width_px / width)
     if (camera.width_px // scale, camera.height_px // scale) != (width, height):
         raise CalibrationError(

@@ -21,6 +21,7 @@ from alice_survey.config import SurveyConfig
 from alice_survey.errors import WorkspaceError
 from alice_survey.frames import Array
 from alice_survey.seafloor.terrain import Terrain, read_terrain
+from alice_survey.seafloor.texture import survey_texture
 from reconstruct.alignment import align_rigid, align_similarity
 from reconstruct.evaluate_mosaic import MosaicScore, score_mosaic
 from reconstruct.evaluate_overlap import overlaps_reached
@@ -198,7 +199,7 @@ def run_evaluate(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     inputs = [truth / "poses.csv", truth / "terrain.ply", truth / "rig.json", dense / "dem.tif"]
     inputs += [mosaic / "mosaic.tif", sparse / "track.csv", sparse / "registration.json"]
     inputs += [plan / "plan.json", workspace / "flight" / "triggers.csv"]
-    stage = Stage(name="report", version=1, settings={}, inputs=inputs)
+    stage = Stage(name="report", version=1, settings={"seed": config.seed}, inputs=inputs)
 
     def work(folder: Path) -> None:
         area_ne = np.array(read_json(plan / "plan.json")["area_ne_m"])
@@ -209,7 +210,12 @@ def run_evaluate(workspace: Path, config: SurveyConfig, threads: int) -> bool:
         )
         surface = score_surface(dense / "dem.tif", area_ne, terrain, cameras.truth_from_world)
         painted = score_mosaic(
-            mosaic / "mosaic.tif", dense / "dem.tif", area_ne, terrain, cameras.truth_from_world
+            mosaic / "mosaic.tif",
+            dense / "dem.tif",
+            area_ne,
+            terrain,
+            survey_texture(config),
+            cameras.truth_from_world,
         )
         overlaps = overlaps_reached(workspace, truth)
         write_json(folder / "report.json", _report(cameras, surface, painted, overlaps))

@@ -2,15 +2,17 @@
 
 import csv
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.frames import Array
-from alice_survey.seafloor.terrain import Terrain
+from alice_survey.seafloor.terrain import Floats, Terrain
 from alice_survey.trajectory import read_columns
 
-_ABOVE_M = 50.0
+_ABOVE_M = 8.0
+"""Rays start so far above the mean sea floor: far enough, and near enough for float32."""
 
 
 def read_true_poses(path: Path) -> dict[str, RigidTransform]:
@@ -29,6 +31,26 @@ def surface_depth(terrain: Terrain, points_ne: Array) -> Array:
     Returns:
         (N,) metres, positive down; NaN beyond the terrain's edge.
     """
+    return _look_down(terrain, points_ne)[0]
+
+
+def surface_material(terrain: Terrain, points_ne: Array) -> tuple[Array, Floats]:
+    """The topmost true surface under (N, 2) north and east.
+
+    Returns:
+        Points, (N, 3) NED, and their material, (N,); NaN depth beyond the terrain's edge.
+    """
+    depth, hits = _look_down(terrain, points_ne)
+    patch = terrain.patch()
+    triangle = np.where(np.isfinite(depth), hits["primitive_ids"].numpy(), 0).astype(np.int64)
+    corners = patch.material[patch.triangles[triangle]]
+    uv = hits["primitive_uvs"].numpy()
+    shares = np.column_stack([1 - uv.sum(axis=1), uv])
+    material: Floats = (corners * shares).sum(axis=1).astype(np.float32)
+    return np.column_stack([points_ne, depth]), material
+
+
+def _look_down(terrain: Terrain, points_ne: Array) -> tuple[Array, Any]:
     import open3d as o3d
 
     places = points_ne - terrain.offset_ned[:2]
@@ -37,7 +59,7 @@ def surface_depth(terrain: Terrain, points_ne: Array) -> Array:
     hits = terrain.raycasting_scene().cast_rays(o3d.core.Tensor(rays.astype(np.float32)))
     reach = hits["t_hit"].numpy().astype(np.float64)
     depth: Array = np.where(np.isfinite(reach), reach - _ABOVE_M, np.nan) + terrain.offset_ned[2]
-    return depth
+    return depth, hits
 
 
 def surface_distance(terrain: Terrain, points_ned: Array) -> Array:
