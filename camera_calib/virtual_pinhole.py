@@ -1,8 +1,8 @@
 """The pinhole that comes nearest to a flat-port camera over a range of distances.
 
 A flat port has no single centre of projection. A pinhole of focal length f n_water whose centre is
-moved along the axis comes close; pictures warped to it at one working range suit any software that
-knows pinholes, at a residual that `residual_px` states.
+moved along the port's normal comes close; pictures warped to it at one working range suit any
+software that knows pinholes, at a residual that `residual_px` states.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from camera_calib.flat_port import FlatPortCamera
 
 @dataclass(frozen=True, kw_only=True)
 class VirtualPinhole:
-    """An ideal pinhole in water, with the axes of its camera and a centre moved along z."""
+    """An ideal pinhole in water, with the axes of its camera and a centre of its own."""
 
     width_px: int
     height_px: int
@@ -25,31 +25,40 @@ class VirtualPinhole:
     cx_px: float
     cy_px: float
     centre_z_m: float
-    """Where the centre is on the camera's axis, before (+) or behind (-) the entrance pupil."""
+    """Where the centre is along the camera's axis, before (+) or behind (-) the entrance pupil."""
     working_range_m: float
     """Distance from the entrance pupil along the axis at which the warp is exact."""
+    centre_x_m: float = 0.0
+    centre_y_m: float = 0.0
+    """Beside the axis: not zero where the port is tilted."""
 
     @property
     def virtual_from_cam(self) -> RigidTransform:
         """From the flat-port camera's frame to the pinhole's."""
-        return RigidTransform.from_translation([0.0, 0.0, -self.centre_z_m])
+        return RigidTransform.from_translation(
+            [-self.centre_x_m, -self.centre_y_m, -self.centre_z_m]
+        )
 
     def project(self, points_cam: Array) -> Array:
         """Ideal pixels, (..., 2), of points (..., 3) in the flat-port camera's frame."""
         z = points_cam[..., 2:] - self.centre_z_m
-        centre = np.array([self.cx_px, self.cy_px])
-        pixels: Array = self.focal_px * points_cam[..., :2] / z + centre
+        sideways = points_cam[..., :2] - np.array([self.centre_x_m, self.centre_y_m])
+        pixels: Array = self.focal_px * sideways / z + np.array([self.cx_px, self.cy_px])
         return pixels
 
     def at_depth(self, pixels: Array, depth_m: Array | float) -> Array:
         """Points (..., 3) in the flat-port camera's frame where pixels (..., 2) see z = depth_m."""
         z = np.broadcast_to(np.asarray(depth_m, dtype=np.float64), pixels.shape[:-1])
         slopes = (pixels - np.array([self.cx_px, self.cy_px])) / self.focal_px
-        return np.concatenate([slopes * (z - self.centre_z_m)[..., None], z[..., None]], axis=-1)
+        sideways = slopes * (z - self.centre_z_m)[..., None]
+        sideways = sideways + np.array([self.centre_x_m, self.centre_y_m])
+        return np.concatenate([sideways, z[..., None]], axis=-1)
 
 
 def best_pinhole(camera: FlatPortCamera, near_m: float, far_m: float) -> VirtualPinhole:
-    """The axial pinhole with the least rms residual over the frame and a range of distances.
+    """The pinhole with the least rms residual over the frame and a range of distances.
+
+    Its centre is sought along the port's normal through the entrance pupil.
 
     Args:
         camera: the flat-port camera.
@@ -59,20 +68,23 @@ def best_pinhole(camera: FlatPortCamera, near_m: float, far_m: float) -> Virtual
     working = 2.0 / (1.0 / near_m + 1.0 / far_m)
     depths = 1.0 / np.linspace(1.0 / far_m, 1.0 / near_m, 7)
 
-    def at(centre_z_m: float) -> VirtualPinhole:
+    def at(shift_m: float) -> VirtualPinhole:
+        x_m, y_m, z_m = (shift_m * component for component in camera.normal)
         return VirtualPinhole(
             width_px=camera.width_px,
             height_px=camera.height_px,
             focal_px=camera.n_water * (camera.fx_px + camera.fy_px) / 2,
             cx_px=camera.cx_px,
             cy_px=camera.cy_px,
-            centre_z_m=centre_z_m,
+            centre_x_m=x_m,
+            centre_y_m=y_m,
+            centre_z_m=z_m,
             working_range_m=working,
         )
 
     reach = 2.0 * (camera.port_distance_m + camera.glass_thickness_m) + 1e-6
     best = minimize_scalar(
-        lambda z: float(np.sqrt(np.nanmean(residual_px(camera, at(z), depths) ** 2))),
+        lambda shift: float(np.sqrt(np.nanmean(residual_px(camera, at(shift), depths) ** 2))),
         bounds=(-reach, reach),
         method="bounded",
         options={"xatol": 1e-7},

@@ -1,0 +1,162 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.config import CameraConfig, WaterConfig
+from alice_survey.errors import AliceError, CalibrationError
+from camera_calib.rig import Rig, design_rig, read_rig, write_rig
+
+CONFIG = CameraConfig(position_body_m=(0.5, -0.06, 0.09))
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return design_rig(CONFIG, WaterConfig())
+
+
+def calibrated(rig: Rig) -> Rig:
+    """A rig as a calibration leaves it: nothing is nominal."""
+    rng = np.random.default_rng(3)
+    right = RigidTransform.from_components(
+        [-0.1003, 0.0004, -0.0002], Rotation.from_rotvec(rng.normal(0, 0.01, 3))
+    )
+    left = replace(rig.cameras["left"], k1=-0.05, p1=1e-4, normal=(0.01, 0.0, (1 - 1e-4) ** 0.5))
+    return replace(
+        rig,
+        cameras={"left": left, "right": rig.cameras["right"]},
+        cam_from_rig={"left": RigidTransform.identity(), "right": right},
+        sigmas={"left.fx_px": 0.3},
+        source="a test",
+    )
+
+
+def test_the_left_ports_outer_glass_is_where_the_settings_say(rig: Rig) -> None:
+    glass = rig.body_from_cam("left").apply([0.0, 0.0, 0.02 + 0.01])
+    np.testing.assert_allclose(glass, [0.5, -0.06, 0.09], atol=1e-12)
+
+
+def test_the_right_camera_is_a_baseline_to_starboard(rig: Rig) -> None:
+    apart = rig.body_from_cam("right").translation - rig.body_from_cam("left").translation
+    np.testing.assert_allclose(apart, [0.0, 0.1, 0.0], atol=1e-12)
+    assert rig.baseline_m == pytest.approx(0.1)
+    assert rig.reference == "left"
+
+
+def test_the_cameras_look_down_with_the_image_top_to_the_bow(rig: Rig) -> None:
+    for name in ("left", "right"):
+        rotation = rig.body_from_cam(name).rotation
+        np.testing.assert_allclose(rotation.apply([0, 0, 1]), [0, 0, 1], atol=1e-12)
+        np.testing.assert_allclose(rotation.apply([0, -1, 0]), [1, 0, 0], atol=1e-12)
+        np.testing.assert_allclose(rotation.apply([1, 0, 0]), [0, 1, 0], atol=1e-12)
+
+
+def test_the_design_has_the_papers_focal_length_in_pixels(rig: Rig) -> None:
+    camera = rig.cameras["left"]
+    assert camera.fx_px == pytest.approx(12.5 / 3.69e-3)
+    assert (camera.cx_px, camera.cy_px) == (1692.0, 1355.0)
+    assert camera.n_water == 1.34
+
+
+def test_a_scaled_design_sees_the_same_with_larger_pixels(rig: Rig) -> None:
+    small = design_rig(CONFIG, WaterConfig(), scale=4)
+    point = np.array([0.3, -0.2, 2.0])
+    for name in rig.cameras:
+        np.testing.assert_allclose(
+            small.cameras[name].project(point) * 4, rig.cameras[name].project(point), atol=1e-9
+        )
+    assert small.baseline_m == rig.baseline_m
+
+
+def test_a_rig_in_other_water_keeps_all_else(rig: Rig) -> None:
+    pool = rig.in_water(1.333)
+    assert {c.n_water for c in pool.cameras.values()} == {1.333}
+    assert replace(pool.cameras["left"], n_water=1.34) == rig.cameras["left"]
+    assert pool.baseline_m == rig.baseline_m
+
+
+def test_one_camera_has_no_baseline(rig: Rig) -> None:
+    mono = replace(
+        rig,
+        cameras={"left": rig.cameras["left"]},
+        cam_from_rig={"left": rig.cam_from_rig["left"]},
+    )
+    assert np.isnan(mono.baseline_m)
+
+
+def test_a_rig_file_gives_back_what_was_written(tmp_path: Path, rig: Rig) -> None:
+    before = calibrated(rig)
+    write_rig(tmp_path / "rig.json", before)
+    after = read_rig(tmp_path / "rig.json")
+
+    assert after.cameras == before.cameras
+    assert list(after.cameras) == ["left", "right"]
+    assert after.source == "a test"
+    assert after.sigmas == {"left.fx_px": 0.3}
+    assert after.baseline_m == pytest.approx(before.baseline_m, abs=1e-15)
+    for name in before.cameras:
+        np.testing.assert_allclose(
+            after.body_from_cam(name).as_matrix(),
+            before.body_from_cam(name).as_matrix(),
+            atol=1e-15,
+        )
+
+
+def test_a_rig_file_is_the_same_each_time(tmp_path: Path, rig: Rig) -> None:
+    write_rig(tmp_path / "a.json", calibrated(rig))
+    write_rig(tmp_path / "b.json", calibrated(rig))
+
+    assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
+
+
+def test_faults_of_a_rig_file_are_one_line_with_its_name(tmp_path: Path, rig: Rig) -> None:
+    path = tmp_path / "rig.json"
+    write_rig(path, rig)
+    good = json.loads(path.read_text())
+
+    def fault(change: dict[str, object]) -> str:
+        path.write_text(json.dumps({**good, **change}))
+        with pytest.raises(AliceError) as error:
+            read_rig(path)
+        return str(error.value)
+
+    left = good["cameras"]["left"]
+    texts = {
+        "version": fault({"version": 9}),
+        "rig file": fault({"format": "something"}),
+        "fx_px": fault({"cameras": {"left": {**left, "fx_px": -1}}}),
+        "k9": fault({"cameras": {"left": {**left, "k9": 0.1}}}),
+        "cam_from_rig": fault(
+            {"cameras": {"left": {k: v for k, v in left.items() if k != "cam_from_rig"}}}
+        ),
+        "translation_m": fault({"body_from_rig": {"quaternion_xyzw": [0, 0, 0, 1]}}),
+        "norm": fault(
+            {"body_from_rig": {"quaternion_xyzw": [0, 0, 0, 0], "translation_m": [0, 0, 0]}}
+        ),
+        "camera": fault({"cameras": {}}),
+    }
+    for words, text in texts.items():
+        assert str(path) in text
+        assert "\n" not in text
+        assert words in text
+
+
+def test_a_missing_or_broken_rig_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(AliceError, match="no such file"):
+        read_rig(tmp_path / "none.json")
+    (tmp_path / "bad.json").write_text("{")
+    with pytest.raises(AliceError, match="not valid JSON"):
+        read_rig(tmp_path / "bad.json")
+    (tmp_path / "list.json").write_text("[1, 2]")
+    with pytest.raises(AliceError, match=r"list\.json"):
+        read_rig(tmp_path / "list.json")
+
+
+def test_every_camera_needs_a_pose(rig: Rig) -> None:
+    with pytest.raises(CalibrationError, match="pose"):
+        replace(rig, cam_from_rig={"left": RigidTransform.identity()})
+    with pytest.raises(CalibrationError, match="pose"):
+        replace(rig, cameras={}, cam_from_rig={})
