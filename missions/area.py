@@ -49,8 +49,10 @@ def area_polygon(area: AreaConfig) -> Polygon:
             f"{_FARTHEST_M / 1e3:.0f} km: move the datum or check the corner"
         )
     polygon = Polygon(corners)
-    if polygon.area < 1e-4:
-        raise PlanError(f"area: {polygon.area:.2g} m2 is no size; its corners lie on one line")
+    if polygon.convex_hull.area < 1e-4:
+        raise PlanError(
+            f"area: {polygon.convex_hull.area:.2g} m2 is no size; its corners lie on one line"
+        )
     if not polygon.is_valid:
         raise PlanError(f"area: {_fault(polygon)}; list the corners in order round the edge")
     return polygon

@@ -19,8 +19,9 @@ class Swath:
     """What is surely seen of a level sea floor on a line, about the left port's outer glass.
 
     A footprint bulges: seen through a flat port its sides are convex. `port_m` and `starboard_m`
-    are the least reach of the union of the footprints of a line, `ahead_m` and `astern_m` the reach
-    of one footprint over its whole width. All count along the vehicle's axes from the point below
+    are the least reach of the union of the footprints of a line, without gaps while its stations
+    are no farther apart than `along_m`; `ahead_m` and `astern_m` are the reach of one footprint
+    over its whole width. All count along the vehicle's axes from the point below
     the glass, positive in the direction of their names, and may be negative.
     """
 

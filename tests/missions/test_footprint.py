@@ -1,0 +1,193 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import RigidTransform, Rotation
+from shapely.geometry import LineString, Polygon
+from shapely.ops import unary_union
+
+from alice_survey.config import CameraConfig, WaterConfig
+from alice_survey.errors import PlanError
+from alice_survey.frames import rotation_from_attitude
+from camera_calib.rig import Rig, design_rig
+from missions.footprint import (
+    camera_swath,
+    common_swath,
+    footprint_ne,
+    footprint_polygon,
+    footprint_size_m,
+    glass_point_cam,
+    joint_swath,
+    level_pose,
+    overlap,
+    step_for_overlap,
+)
+
+RIG = design_rig(CameraConfig(), WaterConfig())
+LEFT = RIG.cameras["left"]
+IDEAL = design_rig(CameraConfig(port_distance_m=0.0, glass_thickness_m=0.0), WaterConfig()).cameras[
+    "left"
+]
+
+
+def test_size_through_a_port_is_the_sum_of_three_tangents() -> None:
+    across, along = footprint_size_m(LEFT, 2.0)
+
+    for size, half_mm in ((across, 3384 * 3.69e-3 / 2), (along, 2710 * 3.69e-3 / 2)):
+        sine = math.sin(math.atan(half_mm / 12.5))
+        angles = [math.asin(sine / n) for n in (1.0, 1.52, 1.34)]
+        parts = [d * math.tan(a) for d, a in zip((0.02, 0.01, 2.0), angles, strict=True)]
+        assert size == pytest.approx(2 * sum(parts), rel=1e-12)
+
+
+def test_size_of_an_ideal_port_is_the_known_one() -> None:
+    assert footprint_size_m(IDEAL, 2.0) == pytest.approx((1.415, 1.154), abs=6e-4)
+
+
+@given(
+    altitude_m=st.floats(0.3, 10),
+    heading=st.floats(-3.2, 3.2),
+    north=st.floats(-1e3, 1e3),
+    east=st.floats(-1e3, 1e3),
+)
+def test_a_level_footprint_is_the_same_wherever_it_points(
+    altitude_m: float, heading: float, north: float, east: float
+) -> None:
+    pose = level_pose(LEFT, np.array([north, east]), altitude_m, 30.0, heading)
+    border = footprint_ne(LEFT, pose, 30.0)
+
+    turn = np.array(
+        [[math.cos(heading), math.sin(heading)], [-math.sin(heading), math.cos(heading)]]
+    )
+    about = (border - [north, east]) @ turn.T
+    home = footprint_ne(LEFT, level_pose(LEFT, np.zeros(2), altitude_m, 30.0, 0.0), 30.0)
+    np.testing.assert_allclose(about, home, atol=1e-9)
+
+
+def test_altitude_counts_from_the_outer_glass() -> None:
+    pose = level_pose(LEFT, np.zeros(2), 2.0, 15.0, 0.7)
+    glass = pose.apply(glass_point_cam(LEFT))
+    np.testing.assert_allclose(glass, [0.0, 0.0, 13.0], atol=1e-12)
+    assert pose.translation[2] == pytest.approx(12.97)
+
+
+def test_the_top_of_the_picture_is_ahead_and_its_right_to_starboard() -> None:
+    border = footprint_ne(LEFT, level_pose(LEFT, np.zeros(2), 2.0, 15.0, 0.0), 15.0)
+    top_left, top_right, bottom_right, bottom_left = border[::16]
+    assert top_left[0] > 0 > top_left[1]
+    assert top_right[0] > 0 < top_right[1]
+    assert bottom_right[0] < 0 < bottom_right[1]
+    assert bottom_left[0] < 0 > bottom_left[1]
+
+
+def test_every_border_point_is_seen_at_the_border() -> None:
+    """The footprint projected back falls on the border, for a leaning vehicle too."""
+    rotation = rotation_from_attitude(0.1, -0.15, 2.0) * RIG.body_from_cam("left").rotation
+    pose = RigidTransform.from_components([3.0, -4.0, 12.0], rotation)
+    hits = footprint_ne(LEFT, pose, 15.0)
+
+    points = pose.inv().apply(np.column_stack([hits, np.full(len(hits), 15.0)]))
+
+    np.testing.assert_allclose(LEFT.project(points), LEFT.border(16), atol=1e-8)
+
+
+def test_a_camera_that_looks_up_sees_no_sea_floor() -> None:
+    level = level_pose(LEFT, np.zeros(2), 2.0, 15.0, 0.0)
+    up = RigidTransform.from_components(
+        level.translation, Rotation.from_rotvec([math.pi, 0, 0]) * level.rotation
+    )
+    assert np.isnan(footprint_ne(LEFT, up, 15.0)).all()
+    with pytest.raises(PlanError, match="does not see the sea floor"):
+        footprint_polygon(LEFT, up, 15.0)
+
+    below = footprint_ne(LEFT, level, 12.0)
+    assert np.isnan(below).all()
+
+
+def test_a_footprint_bulges() -> None:
+    """Refraction draws the corners in: the middle row is the widest."""
+    polygon = footprint_polygon(LEFT, level_pose(LEFT, np.zeros(2), 2.0, 15.0, 0.0), 15.0)
+    across, along = footprint_size_m(LEFT, 2.0)
+    box = polygon.bounds
+
+    assert box[3] - box[1] == pytest.approx(across, rel=1e-9)
+    assert box[2] - box[0] == pytest.approx(along, rel=1e-9)
+    assert 0.95 * across * along < polygon.area < 0.995 * across * along
+
+
+def leaning(rig: Rig) -> Rig:
+    """A rig whose cameras are not square to each other."""
+    right = RigidTransform.from_components(
+        [-0.1, 0.003, 0.001], Rotation.from_rotvec([0.01, -0.02, 0.03])
+    )
+    normal = (math.sin(0.02), 0.0, math.cos(0.02))
+    return replace(
+        rig,
+        cameras={"left": rig.cameras["left"], "right": replace(LEFT, normal=normal)},
+        cam_from_rig={"left": RigidTransform.identity(), "right": right},
+    )
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    altitude_m=st.floats(0.5, 6.0),
+    forward=st.floats(0.15, 0.95),
+    rig=st.sampled_from([RIG, leaning(RIG)]),
+)
+def test_what_a_swath_promises_is_seen(altitude_m: float, forward: float, rig: Rig) -> None:
+    """Slow twin: the union of both cameras' real footprints along a line holds the swath."""
+    step_m = step_for_overlap(footprint_size_m(LEFT, altitude_m)[1], forward)
+    depth_m = 50.0
+    glass_body = rig.body_from_cam("left").apply(glass_point_cam(LEFT))
+    union = {}
+    for name in rig.cameras:
+        shapes = []
+        for i in range(-6, 7):
+            body = np.array([i * step_m, 0.0, depth_m - altitude_m]) - glass_body
+            pose = RigidTransform.from_translation(body) * rig.body_from_cam(name)
+            shapes.append(footprint_polygon(rig.cameras[name], pose, depth_m))
+        union[name] = unary_union(shapes)
+    reach = 2 * step_m
+    middle = Polygon([(-reach, -99), (reach, -99), (reach, 99), (-reach, 99)])
+
+    for name in rig.cameras:
+        swath = camera_swath(rig, name, altitude_m, step_m)
+        seen = union[name].intersection(middle)
+        edges = [
+            LineString([(-reach, side), (reach, side)])
+            for side in (-swath.port_m + 1e-6, swath.starboard_m - 1e-6)
+        ]
+        assert all(seen.buffer(1e-7).covers(edge) for edge in edges)
+        # ... and not much less than is seen.
+        assert swath.across_m > 0.95 * (seen.bounds[3] - seen.bounds[1])
+
+    both, either = common_swath(rig, altitude_m, step_m), joint_swath(rig, altitude_m, step_m)
+    assert both.across_m < either.across_m
+    assert both.half_across_m == min(both.port_m, both.starboard_m)
+
+
+def test_the_stereo_swath_is_narrower_by_the_baseline() -> None:
+    left = camera_swath(RIG, "left", 2.0, 0.47)
+    both, either = common_swath(RIG, 2.0, 0.47), joint_swath(RIG, 2.0, 0.47)
+
+    assert left.port_m == pytest.approx(left.starboard_m)
+    assert both.port_m == pytest.approx(left.port_m - 0.1)
+    assert both.starboard_m == pytest.approx(left.starboard_m)
+    assert either.across_m == pytest.approx(left.across_m + 0.1)
+    assert left.along_m == pytest.approx(2 * left.ahead_m)
+
+
+def test_cameras_that_see_nothing_in_common_leave_a_gap() -> None:
+    wide = design_rig(CameraConfig(baseline_m=2.0), WaterConfig())
+    assert common_swath(wide, 1.0, 0.2).half_across_m < 0
+    with pytest.raises(PlanError, match="gap"):
+        joint_swath(wide, 1.0, 0.2)
+
+
+@given(extent_m=st.floats(0.1, 10), share=st.floats(0, 0.95))
+def test_overlap_and_step_are_inverse(extent_m: float, share: float) -> None:
+    assert overlap(extent_m, step_for_overlap(extent_m, share)) == pytest.approx(share)
+    assert overlap(extent_m, 2 * extent_m) == 0.0
