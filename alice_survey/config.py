@@ -139,6 +139,8 @@ class ReconstructConfig(Config):
     feature_scale: float = Field(1.0, gt=0.05, le=1)
     max_features: int = Field(8000, ge=200, le=50_000)
     working_range_m: float | None = Field(None, gt=0, le=100)
+    dense_scale: float | None = Field(None, gt=0.05, le=1)
+    dense_partners: int = Field(4, ge=1, le=12)
     dem_cell_m: float | None = Field(None, gt=0, le=10)
     mosaic_pixel_m: float | None = Field(None, gt=0, le=10)
 

@@ -1,0 +1,155 @@
+"""Many depths of one view become one, and views check each other.
+
+A depth is believed where several independent matches agree: partners of one view, then the depth
+maps of neighbouring views. What only one match claims and nothing confirms is left out.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from alice_survey.frames import Array
+from reconstruct.model import View
+
+Float32 = NDArray[np.float32]
+
+GATE_SIGMAS = 3.0
+"""Depths that differ by no more than this many standard deviations of their difference agree."""
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def merge_depths(
+    depths: Float32, sigmas: Float32, gate: float
+) -> tuple[Float32, Float32, NDArray[np.uint8]]:
+    """Take the depth that most partners agree on, pixel by pixel.
+
+    Among the depths of a pixel the one with most others within the gate wins (the more certain
+    company where numbers are equal); the result is the weighted mean of that company. A pixel at
+    which two or more partners have a depth and none agree stays unknown.
+
+    Args:
+        depths: (K, H, W) depths from K partners, NaN where unknown.
+        sigmas: (K, H, W) their standard deviations.
+        gate: largest difference in standard deviations of the difference.
+
+    Returns:
+        (H, W) depth and its standard deviation, NaN where unknown, and how many partners agree.
+    """
+    count, height, width = depths.shape
+    merged = np.full((height, width), np.nan, np.float32)
+    sigma = np.full((height, width), np.nan, np.float32)
+    agreeing = np.zeros((height, width), np.uint8)
+    for row in range(height):
+        for column in range(width):
+            known = 0
+            best_company, best_weight, best = 0, 0.0, -1
+            for k in range(count):
+                z = depths[k, row, column]
+                if math.isnan(z):
+                    continue
+                known += 1
+                s = sigmas[k, row, column]
+                company, weight = 0, 0.0
+                for j in range(count):
+                    other = depths[j, row, column]
+                    if math.isnan(other):
+                        continue
+                    t = sigmas[j, row, column]
+                    if (z - other) ** 2 <= gate * gate * (s * s + t * t):
+                        company += 1
+                        weight += 1.0 / (t * t)
+                if company > best_company or (company == best_company and weight > best_weight):
+                    best_company, best_weight, best = company, weight, k
+            if best < 0 or (known > 1 and best_company == 1):
+                continue
+            z = depths[best, row, column]
+            s = sigmas[best, row, column]
+            total, weights = 0.0, 0.0
+            for j in range(count):
+                other = depths[j, row, column]
+                if math.isnan(other):
+                    continue
+                t = sigmas[j, row, column]
+                if (z - other) ** 2 <= gate * gate * (s * s + t * t):
+                    total += other / (t * t)
+                    weights += 1.0 / (t * t)
+            merged[row, column] = total / weights
+            sigma[row, column] = math.sqrt(1.0 / weights)
+            agreeing[row, column] = best_company
+    return merged, sigma, agreeing
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def count_witnesses(
+    depth: Float32,
+    sigma: Float32,
+    ray_from_pixel: Array,
+    other_from_ref: Array,
+    other_depth: Float32,
+    other_sigma: Float32,
+    other_pinhole: Array,
+    gate: float,
+) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
+    """See which depths another view confirms and which it sees through.
+
+    Args:
+        depth: (H, W) of the reference.
+        sigma: (H, W) of it.
+        ray_from_pixel: (4,) fx, fy, cx, cy of the reference, px.
+        other_from_ref: (3, 4) transform of points from the reference camera to the other.
+        other_depth: (h, w) of the other view.
+        other_sigma: (h, w) of it.
+        other_pinhole: (4,) fx, fy, cx, cy of the other view, px.
+        gate: largest difference in standard deviations of the difference.
+
+    Returns:
+        (H, W) 1 where the other view finds its surface at the same depth, and (H, W) 1 where it
+        finds its surface clearly behind, so that the reference's point cannot be there.
+    """
+    height, width = depth.shape
+    confirmed = np.zeros((height, width), np.int8)
+    refuted = np.zeros((height, width), np.int8)
+    for row in range(height):
+        y = (row + 0.5 - ray_from_pixel[3]) / ray_from_pixel[1]
+        for column in range(width):
+            z = depth[row, column]
+            if math.isnan(z):
+                continue
+            x = (column + 0.5 - ray_from_pixel[2]) / ray_from_pixel[0]
+            t = other_from_ref
+            a = z * (t[0, 0] * x + t[0, 1] * y + t[0, 2]) + t[0, 3]
+            b = z * (t[1, 0] * x + t[1, 1] * y + t[1, 2]) + t[1, 3]
+            c = z * (t[2, 0] * x + t[2, 1] * y + t[2, 2]) + t[2, 3]
+            if c <= 0.0:
+                continue
+            u = math.floor(other_pinhole[0] * a / c + other_pinhole[2])
+            v = math.floor(other_pinhole[1] * b / c + other_pinhole[3])
+            if u < 0 or v < 0 or u >= other_depth.shape[1] or v >= other_depth.shape[0]:
+                continue
+            there = other_depth[v, u]
+            if math.isnan(there):
+                continue
+            s, r = sigma[row, column], other_sigma[v, u]
+            tolerance = gate * math.sqrt(s * s + r * r)
+            if abs(there - c) <= tolerance:
+                confirmed[row, column] = 1
+            elif there > c + tolerance:
+                refuted[row, column] = 1
+    return confirmed, refuted
+
+
+def pinhole_of(view: View) -> Array:
+    """(4,) fx, fy, cx, cy of a view."""
+    return np.array([view.fx_px, view.fy_px, view.cx_px, view.cy_px])
+
+
+def points_from_depth(view: View, depth: Float32) -> Array:
+    """World points (N, 3) of the known pixels of a depth map, in the order of the pixels."""
+    rows, columns = np.nonzero(np.isfinite(depth))
+    z = depth[rows, columns].astype(np.float64)
+    x = (columns + 0.5 - view.cx_px) / view.fx_px * z
+    y = (rows + 0.5 - view.cy_px) / view.fy_px * z
+    points: Array = view.world_from_cam.apply(np.stack([x, y, z], axis=1))
+    return points

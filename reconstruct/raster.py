@@ -1,0 +1,146 @@
+"""GeoTIFFs over the local east-north plane, and pictures of a surface.
+
+Rasters of the `ned` frame carry an azimuthal equidistant projection centred on the datum. In it
+north and east of the NED frame are the map's axes, true to scale: within 1 km of the datum the
+tangent plane and the map differ by under 0.01 mm. UTM would turn the grid by the convergence of
+its meridian and stretch it by up to 0.04 % (0.4 mm a metre), so that either every height is
+resampled or lengths are wrong; any GIS reprojects on the fly.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from pyproj.crs import ProjectedCRS
+from pyproj.crs.coordinate_operation import AzimuthalEquidistantConversion
+from rasterio.crs import CRS
+from rasterio.transform import Affine
+from rasterio.windows import Window
+
+from alice_survey.artefacts import atomic_path
+from alice_survey.frames import Array, Datum
+from reconstruct.dem import DemGrid
+from reconstruct.model import WorldFrame
+
+BLOCK = 256
+"""Pixels a side of the blocks of a tiled TIFF."""
+
+
+def local_crs(datum: Datum) -> CRS:
+    """The projection whose east and north are those of the NED frame of a datum."""
+    method = AzimuthalEquidistantConversion(
+        latitude_natural_origin=datum.latitude_deg, longitude_natural_origin=datum.longitude_deg
+    )
+    crs = ProjectedCRS(method, name="Local east and north of the survey's datum")
+    return CRS.from_wkt(crs.to_wkt())
+
+
+def crs_of(frame: WorldFrame) -> CRS | None:
+    """The projection of rasters of a frame; None in the `model` frame."""
+    return None if frame.name == "model" or frame.datum is None else local_crs(frame.datum)
+
+
+def transform_of(grid: DemGrid) -> Affine:
+    """Map coordinates (east, north) from (column, row)."""
+    return Affine(grid.cell, 0.0, grid.west, 0.0, -grid.cell, grid.north)
+
+
+def frame_tags(frame: WorldFrame) -> dict[str, str]:
+    """What a raster says about its frame."""
+    tags = {
+        "FRAME": frame.name,
+        "UNIT": frame.unit,
+        "VERTICAL_DATUM": frame.vertical_datum,
+        "AREA_OR_POINT": "Area",
+    }
+    if frame.notes:
+        tags["NOTES"] = "; ".join(frame.notes)
+    return tags
+
+
+@contextmanager
+def tiled_raster(
+    path: Path, grid: DemGrid, frame: WorldFrame, dtype: str, nodata: float | None, text: str
+) -> Iterator[Any]:
+    """A one-band tiled GeoTIFF to write to, window by window.
+
+    Args:
+        path: of the file.
+        grid: cells.
+        frame: that the grid lies in.
+        dtype: of the band.
+        nodata: value of unknown cells.
+        text: what the band holds.
+    """
+    profile = {
+        "driver": "GTiff",
+        "width": grid.columns,
+        "height": grid.rows,
+        "count": 1,
+        "dtype": dtype,
+        "nodata": nodata,
+        "crs": crs_of(frame),
+        "transform": transform_of(grid),
+        "tiled": True,
+        "blockxsize": BLOCK,
+        "blockysize": BLOCK,
+        "compress": "deflate",
+        "predictor": 3 if dtype.startswith("float") else 2,
+        "bigtiff": "if_safer",
+        "num_threads": 1,
+    }
+    with rasterio.open(path, "w", **profile) as raster:
+        raster.update_tags(**frame_tags(frame))
+        raster.set_band_description(1, text)
+        yield raster
+
+
+def tiles_of(grid: DemGrid, size: int) -> list[Window]:
+    """Windows of a grid, row by row; a multiple of `BLOCK` as size fits the blocks of files."""
+    return [
+        Window(column, row, min(size, grid.columns - column), min(size, grid.rows - row))
+        for row in range(0, grid.rows, size)
+        for column in range(0, grid.columns, size)
+    ]
+
+
+def hillshade(height: Array, cell: float, exaggeration: float = 1.0) -> Array:
+    """Shade (0 to 1) of a surface lit from the north-west, 45 degrees up; NaN stays NaN."""
+    down, right = np.gradient(height * exaggeration, cell)
+    normal = np.stack([-right, down, np.ones_like(height)], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    light = np.array([-0.5, 0.5, np.sqrt(0.5)])
+    shade: Array = np.clip(normal @ light, 0.0, 1.0)
+    return shade
+
+
+def preview_dem(dem: Path, picture: Path, longest_px: int = 1600) -> None:
+    """Write a shaded, coloured picture of a DEM; what is unknown is white."""
+    with rasterio.open(dem) as raster:
+        shrink = max(1.0, max(raster.width, raster.height) / longest_px)
+        shape = (max(2, int(raster.height / shrink)), max(2, int(raster.width / shrink)))
+        resampling = rasterio.enums.Resampling.average
+        height = raster.read(1, out_shape=shape, resampling=resampling).astype(np.float64)
+        cell = raster.transform.a * raster.width / shape[1]
+    known = np.isfinite(height)
+    low, high = np.percentile(height[known], [1, 99]) if known.any() else (0.0, 1.0)
+    level = np.clip((height - low) / max(high - low, 1e-9), 0, 1)
+    tint = cv2.applyColorMap(
+        (np.nan_to_num(level) * 255).astype(np.uint8), cv2.COLORMAP_VIRIDIS
+    ).astype(np.float64)
+    shade = np.nan_to_num(hillshade(height, cell), nan=np.sqrt(0.5))
+    colour = np.where(
+        known[..., None], np.clip(tint * (0.25 + 1.05 * shade[..., None]), 0, 255), 255
+    )
+    write_png(picture, colour.astype(np.uint8))
+
+
+def write_png(path: Path, picture: NDArray[np.uint8]) -> None:
+    """Write a BGR or BGRA picture; the same pixels give the same bytes."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(cv2.imencode(".png", picture)[1].tobytes())

@@ -1,0 +1,143 @@
+"""Which pictures to match with which for depth.
+
+A good partner sees most of what the reference sees (overlap) from a place far enough to the side
+that depth shows (base-to-height ratio), yet near enough that the picture looks alike. Depth from a
+match that is good to s pixels is good to s (Z / f) (Z / B): the rig partner (B / Z of 0.05 at 2 m)
+covers everything but is coarse, neighbours along and across the track carry the precision.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.errors import ReconstructionError
+from alice_survey.frames import Array
+from reconstruct.model import SparseModel, View
+
+LEAST_POINTS = 8
+"""Sparse points that a view must see for its range of depths to be known."""
+_SAMPLE = 400
+"""Points of a view at which overlap is measured."""
+_LEAST_OVERLAP = 0.15
+_WIDEST_ANGLE_DEG = 40.0
+_GOOD_RATIO = (0.15, 0.45)
+_USABLE_RATIO = (0.02, 0.8)
+_LEAST_GAIN = 0.03
+"""Share of a view's points that another partner must newly serve to be worth its time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StereoPair:
+    """A reference view and a partner to match it with."""
+
+    reference: int
+    """Index of the view whose depth is found."""
+    partner: int
+    overlap: float
+    """Share of the reference's points that the partner sees."""
+    base_to_height: float
+    """Baseline across the line of sight, over the median distance."""
+
+
+def points_of_views(model: SparseModel) -> list[Array]:
+    """World coordinates (N, 3) of the sparse points that each view observed."""
+    order = np.argsort(model.observations[:, 1], kind="stable")
+    points, views = model.observations[order].T
+    starts = np.searchsorted(views, np.arange(1, len(model.views)))
+    return [model.points_world[seen] for seen in np.split(points, starts)]
+
+
+def in_frame(view: View, points_world: Array) -> NDArray[np.bool_]:
+    """Whether points (N, 3) lie before the camera and inside of its picture, occluded or not."""
+    pixels = view.project(points_world)
+    inside = (pixels >= 0) & (pixels < [view.width_px, view.height_px])  # NaN compares as False
+    return np.asarray(inside.all(axis=1))
+
+
+def choose_pairs(model: SparseModel, per_view: int = 4) -> list[list[StereoPair]]:
+    """Choose partners for every view.
+
+    Partners are taken one by one; each time the one that most raises the expected number of
+    points that at least one partner matches well, so that partners complement each other: one
+    ahead, one astern, one abeam.
+
+    Args:
+        model: views and sparse points.
+        per_view: largest number of partners of a view.
+
+    Returns:
+        For every view its pairs, best first; none for a view with too few sparse points.
+
+    Raises:
+        ReconstructionError: no view has a partner.
+    """
+    sights = [view.world_from_cam.rotation.apply([0.0, 0.0, 1.0]) for view in model.views]
+    centres = np.array([view.world_from_cam.translation for view in model.views]).reshape(-1, 3)
+    observed = points_of_views(model)
+    chosen: list[list[StereoPair]] = []
+    for index in range(len(model.views)):
+        points = observed[index]
+        if len(points) < LEAST_POINTS:
+            chosen.append([])
+            continue
+        points = points[:: max(1, len(points) // _SAMPLE)]
+        distance = float(np.median(np.linalg.norm(points - centres[index], axis=1)))
+        candidates: list[tuple[StereoPair, Array]] = []
+        near = np.linalg.norm(centres - centres[index], axis=1) < _USABLE_RATIO[1] * distance
+        for other in np.flatnonzero(near):
+            base = centres[other] - centres[index]
+            if other == index:
+                continue
+            if sights[index] @ sights[other] < np.cos(np.deg2rad(_WIDEST_ANGLE_DEG)):
+                continue
+            across = np.linalg.norm(base - (base @ sights[index]) * sights[index])
+            ratio = float(across / distance)
+            if not _USABLE_RATIO[0] <= ratio <= _USABLE_RATIO[1]:
+                continue
+            if across < abs(base @ sights[index]):  # too much along the line of sight to rectify
+                continue
+            served = in_frame(model.views[other], points).astype(np.float64)
+            if served.mean() < _LEAST_OVERLAP:
+                continue
+            pair = StereoPair(
+                reference=index,
+                partner=int(other),
+                overlap=float(served.mean()),
+                base_to_height=ratio,
+            )
+            candidates.append((pair, served * _quality(ratio)))
+        chosen.append(_complementary(candidates, per_view))
+    if not any(chosen):
+        raise ReconstructionError(
+            f"none of {len(model.views)} registered pictures has a partner with "
+            f"{_LEAST_OVERLAP:.0%} overlap to find depth with; add pictures that overlap"
+        )
+    return chosen
+
+
+def _quality(ratio: float) -> float:
+    """Chance that a match at this base-to-height ratio is found and tells depth well."""
+    low, high = _GOOD_RATIO
+    if ratio < low:
+        return 0.8 * float(np.sqrt(ratio / low))
+    if ratio > high:
+        return 0.8 * (high / ratio) ** 2
+    return 0.8
+
+
+def _complementary(candidates: list[tuple[StereoPair, Array]], per_view: int) -> list[StereoPair]:
+    pairs: list[StereoPair] = []
+    candidates = list(candidates)
+    if not candidates:
+        return pairs
+    missed = np.ones_like(candidates[0][1])
+    while candidates and len(pairs) < per_view:
+        gains = [float((missed * quality).mean()) for _, quality in candidates]
+        best = int(np.argmax(gains))
+        if gains[best] < _LEAST_GAIN and pairs:
+            break
+        pair, quality = candidates.pop(best)
+        missed = missed * (1.0 - quality)
+        pairs.append(pair)
+    return pairs
