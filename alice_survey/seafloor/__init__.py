@@ -1,0 +1,1 @@
+"""A simulated sea floor, its water and light, and a renderer that looks through a camera."""

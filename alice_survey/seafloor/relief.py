@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from alice_survey.frames import Array
 
@@ -68,6 +69,19 @@ def ground_relief(
     heights *= relief_m / max(float(np.ptp(heights)), 1e-12)
     result: Array = heights - heights.mean()
     return result
+
+
+def trough_share(sand: Array, grid_m: float) -> Array:
+    """How much of a trough each point of the sand is, 0 to 1: where light, dark matter gathers.
+
+    Args:
+        sand: (R, C) heights, positive up.
+        grid_m: spacing of the grid.
+    """
+    wide = _RIPPLE_LENGTH_M / 2.0 / grid_m
+    hollow = gaussian_filter(sand, wide) - gaussian_filter(sand, wide / 4.0)
+    share: Array = np.clip(hollow / (0.3 * _RIPPLE_HEIGHT_M), 0.0, 1.0)
+    return share
 
 
 def scatter_rocks(

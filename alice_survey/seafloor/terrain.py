@@ -19,13 +19,14 @@ from alice_survey.config import SeafloorConfig, SurveyConfig
 from alice_survey.errors import ConfigError, WorkspaceError
 from alice_survey.frames import Array
 from alice_survey.seafloor.amphora import BELLY_X_M, LENGTH_M, amphora_mesh
-from alice_survey.seafloor.relief import add_rocks, ground_relief, scatter_rocks
+from alice_survey.seafloor.relief import add_rocks, ground_relief, scatter_rocks, trough_share
 
 Floats = NDArray[np.float32]
 Triangles = NDArray[np.int32]
 
-SAND, ROCK, CERAMIC = 0.0, 1.0, 2.0
-"""Values of `material`; between sand and rock it is the share of rock."""
+DETRITUS, SAND, ROCK, CERAMIC = -1.0, 0.0, 1.0, 2.0
+"""Values of `material`; in between it is the share (of dark matter that gathers in the troughs of
+ripples, or of rock)."""
 
 _FORMAT = {"format": "alice-survey terrain", "version": 1}
 _MOST_VERTICES = 60_000_000
@@ -54,7 +55,8 @@ class TerrainObject:
         for corner in range(3):
             np.add.at(sums, self.triangles[:, corner], faces)
         length = np.linalg.norm(sums, axis=1, keepdims=True)
-        return (sums / np.maximum(length, 1e-30)).astype(np.float32)
+        normals: Floats = (sums / np.maximum(length, 1e-30)).astype(np.float32)
+        return normals
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,7 +71,7 @@ class Patch:
     normals: Floats
     """(V, 3) unit normals that point into the water."""
     material: Floats
-    """(V,) see `SAND`, `ROCK`, `CERAMIC`."""
+    """(V,) see `DETRITUS`, `SAND`, `ROCK`, `CERAMIC`."""
 
     @cached_property
     def scene(self) -> Any:
@@ -95,8 +97,8 @@ class Terrain:
     """(2,) north and east of `depths[0, 0]` about the offset."""
     depths: Floats
     """(R, C) depth about the offset's, positive down; rows go north, columns east."""
-    rock: Floats
-    """(R, C) share of rock, 0 to 1."""
+    material: Floats
+    """(R, C) -1 to 1, see `DETRITUS`, `SAND`, `ROCK`."""
     objects: tuple[TerrainObject, ...] = ()
 
     @property
@@ -179,7 +181,7 @@ class Terrain:
         vertices = [np.dstack([ne - centre, depths]).reshape(-1, 3).astype(np.float32)]
         triangles = [_grid_triangles(*depths.shape)]
         normals = [self._normals(rows, columns).reshape(-1, 3)]
-        material = [self.rock[rows, columns].ravel()]
+        material = [self.material[rows, columns].ravel()]
         first = depths.size
         window = corners - self.offset_ned[:2]
         for item in self.objects:
@@ -208,7 +210,8 @@ class Terrain:
         normals /= np.linalg.norm(normals, axis=2, keepdims=True)
         top, left = rows.start - wide[0].start, columns.start - wide[1].start
         height, width = self.depths[rows, columns].shape
-        return normals[top : top + height, left : left + width].astype(np.float32)
+        inner: Floats = normals[top : top + height, left : left + width].astype(np.float32)
+        return inner
 
     def write(self, path: Path) -> None:
         """Write the mesh as binary PLY, and beside it, with suffix `.json`, what else is known."""
@@ -240,7 +243,7 @@ class Terrain:
             "rows": self.depths.shape[0],
             "columns": self.depths.shape[1],
             "corner_ne_m": self.corner_ne.tolist(),
-            "materials": {"sand": SAND, "rock": ROCK, "ceramic": CERAMIC},
+            "materials": {"detritus": DETRITUS, "sand": SAND, "rock": ROCK, "ceramic": CERAMIC},
             "objects": objects,
         }
         write_json(path.with_suffix(".json"), record)
@@ -287,7 +290,7 @@ def read_terrain(path: Path) -> Terrain:
             grid_m=float(record["grid_m"]),
             corner_ne=np.array(record["corner_ne_m"], dtype=np.float64),
             depths=np.ascontiguousarray(vertices["xyz"][:size, 2]).reshape(shape),
-            rock=np.ascontiguousarray(vertices["material"][:size]).reshape(shape),
+            material=np.ascontiguousarray(vertices["material"][:size]).reshape(shape),
             objects=tuple(objects),
         )
     except OSError as error:
@@ -340,7 +343,7 @@ def build_terrain(
         grid_m=grid_m,
         corner_ne=corner,
         depths=(-heights).astype(np.float32),
-        rock=rock.astype(np.float32),
+        material=np.where(rock > 0.01, rock, -trough_share(sand, grid_m)).astype(np.float32),
     )
     if not config.amphora:
         return terrain
@@ -375,7 +378,7 @@ def terrain_bounds(
 
 
 def _fields(terrain: Terrain) -> dict[str, Any]:
-    names = ("offset_ned", "grid_m", "corner_ne", "depths", "rock")
+    names = ("offset_ned", "grid_m", "corner_ne", "depths", "material")
     return {name: getattr(terrain, name) for name in names}
 
 
