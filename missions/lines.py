@@ -82,18 +82,19 @@ class LineSpacing:
 def longer_side_heading(polygon: Polygon) -> float:
     """Direction of the longer side of the smallest rectangle round a polygon, radians in [0, pi).
 
-    Of two sides of one length, the one that comes first from the area's first corner.
+    Of two sides of one length, the one along the area's first side.
     """
     box = polygon.minimum_rotated_rectangle
     if not isinstance(box, Polygon):
         raise PlanError("area: its corners lie on one line")
-    corners = polygon_corners(box)
-    nearest = int(np.argmin(np.linalg.norm(corners - polygon_corners(polygon)[0], axis=1)))
-    corners = np.roll(corners, -nearest, axis=0)
-    edges = [corners[1] - corners[0], corners[2] - corners[1]]
-    lengths = [float(np.linalg.norm(edge)) for edge in edges]
-    edge = edges[1] if lengths[1] > lengths[0] + 1e-6 else edges[0]
-    heading = math.atan2(edge[1], edge[0]) % math.pi
+    sides = np.diff(polygon_corners(box)[:3], axis=0)
+    lengths = np.linalg.norm(sides, axis=1)
+    if abs(lengths[0] - lengths[1]) < 1e-6:
+        first = np.diff(polygon_corners(polygon)[:2], axis=0)[0]
+        side = sides[int(np.argmax(np.abs(sides @ first)))]
+    else:
+        side = sides[int(np.argmax(lengths))]
+    heading = math.atan2(side[1], side[0]) % math.pi
     return 0.0 if math.pi - heading < 1e-12 else heading
 
 

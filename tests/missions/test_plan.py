@@ -1,0 +1,288 @@
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from pyproj import Geod
+from shapely.geometry import Polygon, shape
+
+from alice_survey.artefacts import read_stage
+from alice_survey.config import SurveyConfig, parse_config
+from alice_survey.errors import AliceError, PlanError
+from camera_calib.rig import design_rig
+from missions.coverage import covered_share, footprint_outline, footprints_ne
+from missions.footprint import common_swath
+from missions.plan import Plan, make_plan, read_plan, run_plan
+
+
+def survey(**sections: Any) -> SurveyConfig:
+    return parse_config(sections, "test")
+
+
+def planned(**sections: Any) -> Plan:
+    config = survey(**sections)
+    return make_plan(config, design_rig(config.camera, config.water))
+
+
+SMALL = {"area": {"length_m": 4.6, "width_m": 4.0, "heading_deg": 20.0}}
+
+
+def test_the_papers_mission() -> None:
+    """15 x 17 m, lines 1 m apart, 2 m altitude, 0.2 m/s, 12.5 mm lens."""
+    plan = planned(plan={"line_spacing_m": 1.0})
+
+    assert plan.footprint_m == pytest.approx((1.4410, 1.1749), abs=1e-4)
+    assert plan.line_spacing_m == 1.0
+    assert plan.side_overlap == pytest.approx(0.306, abs=1e-3)
+    assert plan.forward_overlap == pytest.approx(0.600, abs=1e-3)
+    assert plan.interval_s == pytest.approx(2.349)
+    assert sum(line.kind == "survey" for line in plan.lines) == 15
+    assert sum(line.kind == "cross" for line in plan.lines) == 1
+    assert plan.stations == 15 * 38 + 33
+    assert plan.coverage == pytest.approx(1.0, abs=1e-12)
+    # Lines of 17 m and 14 half circles of 0.5 m radius, a cross line, run-ins: 27 minutes.
+    assert plan.duration_s == pytest.approx(1624, abs=1)
+    assert plan.details["imaging"]["paper_rule"]["forward_overlap"] == pytest.approx(
+        0.319, abs=1e-3
+    )
+
+
+def test_an_ideal_port_gives_the_known_overlap_of_29_percent() -> None:
+    plan = planned(
+        camera={"port_distance_m": 0.0, "glass_thickness_m": 0.0}, plan={"line_spacing_m": 1.0}
+    )
+    assert plan.side_overlap == pytest.approx(0.293, abs=5e-4)
+
+
+def test_the_length_of_a_plan_in_closed_form() -> None:
+    plan = planned(
+        area={"length_m": 10.0, "width_m": 3.0}, plan={"line_spacing_m": 1.0, "cross_lines": 0}
+    )
+    count = len(plan.lines)
+    line_m = plan.lines[0].length_m
+
+    assert line_m == pytest.approx((plan.lines[0].stations - 1) * plan.station_spacing_m)
+    # Half circles of 0.5 m radius between lines 1 m apart, half a metre of run at each end.
+    expected = count * (line_m + 2 * 0.5) + (count - 1) * math.pi * 0.5
+    assert plan.length_m == pytest.approx(expected, abs=1e-5)
+    assert plan.duration_s == pytest.approx(expected / 0.2, abs=1e-4)
+
+
+def test_the_demos_mission_has_what_a_demo_needs() -> None:
+    plan = planned(area=SMALL["area"], plan={"side_overlap": 0.3})
+
+    assert sum(line.kind == "survey" for line in plan.lines) >= 4
+    assert sum(line.kind == "cross" for line in plan.lines) == 1
+    assert plan.stations >= 48
+    assert plan.forward_overlap >= 0.6
+    assert plan.side_overlap >= 0.3
+    assert plan.coverage == pytest.approx(1.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("wanted", [0.1, 0.29, 0.45, 0.6])
+def test_an_overlap_that_is_asked_for_is_reached_on_real_footprints(wanted: float) -> None:
+    config = survey(area={"length_m": 12.0, "width_m": 8.0}, plan={"side_overlap": wanted})
+    rig = design_rig(config.camera, config.water)
+    plan = make_plan(config, rig)
+    first, second = plan.lines[:2]
+    outline = footprint_outline(plan, rig)
+    one = footprints_ne(first, outline)[3]
+    two = footprints_ne(second, outline)[-4]
+
+    # The middle row of both pictures: how much of it is seen twice?
+    across = np.array([-math.sin(first.heading_rad), math.cos(first.heading_rad)])
+    one_m, two_m = one @ across, two @ across
+    shared = min(one_m.max(), two_m.max()) - max(one_m.min(), two_m.min())
+    measured = shared / (one_m.max() - one_m.min())
+
+    assert plan.side_overlap == pytest.approx(measured, abs=1e-6)
+    assert plan.side_overlap >= wanted - 1e-9
+
+
+def test_a_line_spacing_that_is_too_wide_is_kept_and_warned_of(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    plan = planned(area=SMALL["area"], plan={"line_spacing_m": 1.3, "side_overlap": 0.45})
+
+    err = capsys.readouterr().err
+    assert plan.line_spacing_m == 1.3
+    assert "overlap by 9.8%, less than the 45.0% asked for, which needs 0.793 m" in err
+    assert "gaps" in err
+    assert all(text.startswith("warning: ") for text in err.splitlines())
+    assert plan.coverage < 0.999
+
+
+def test_a_good_line_spacing_gives_no_warning(capsys: pytest.CaptureFixture[str]) -> None:
+    planned(plan={"line_spacing_m": 1.0})
+    assert capsys.readouterr().err == ""
+
+
+def test_a_margin_widens_what_is_covered() -> None:
+    config = survey(area=SMALL["area"], plan={"margin_m": 0.5})
+    rig = design_rig(config.camera, config.water)
+    plan = make_plan(config, rig)
+    swath = common_swath(rig, 2.0, plan.station_spacing_m)
+    wide = Polygon(plan.area_ne_m).buffer(0.5, join_style="mitre")
+
+    assert covered_share(wide, plan.lines, swath, plan.station_spacing_m) == pytest.approx(1.0)
+    narrow = planned(area=SMALL["area"])
+    assert covered_share(wide, narrow.lines, swath, plan.station_spacing_m) < 0.999
+    assert plan.area_ne_m == narrow.area_ne_m
+
+
+@pytest.mark.parametrize("heading_deg", [0.0, 33.0, 90.0, 200.0])
+def test_lines_take_the_heading_they_are_given(heading_deg: float) -> None:
+    plan = planned(area=SMALL["area"], plan={"line_heading_deg": heading_deg})
+
+    assert math.degrees(plan.lines[0].heading_rad) == pytest.approx(heading_deg, abs=1e-6)
+    assert plan.coverage == pytest.approx(1.0, abs=1e-9)
+
+
+def test_the_first_line_starts_at_the_first_corner() -> None:
+    for corners in (
+        [[0, 0], [20, 0], [20, 10], [0, 10]],
+        [[20, 10], [0, 10], [0, 0], [20, 0]],
+        [[20, 0], [20, 10], [0, 10], [0, 0]],
+    ):
+        plan = planned(area={"polygon_ne_m": corners})
+        starts = [math.dist(plan.lines[0].start_ne_m, corner) for corner in corners]
+        assert starts[0] == min(starts)
+
+
+def test_without_forward_overlap_the_certificate_shows_the_gaps() -> None:
+    plan = planned(area=SMALL["area"], plan={"forward_overlap": 0.0, "cross_lines": 0})
+    assert 0.85 < plan.coverage < 0.995
+
+
+@pytest.mark.parametrize(
+    ("sections", "words"),
+    [
+        ({"area": {"length_m": 0.3, "width_m": 0.2}}, "less than one picture of 1.44 x 1.17 m"),
+        ({"area": {"length_m": 9000, "width_m": 9000}}, "split the area"),
+        ({"plan": {"altitude_m": 9.0}, "area": {"seafloor_depth_m": 5.0}}, "altitude_m 9"),
+        ({"plan": {"altitude_m": 0.3}, "camera": {"baseline_m": 1.0}}, "no view in common"),
+        ({"plan": {"speed_mps": 2.0, "forward_overlap": 0.95}}, "lower speed_mps"),
+        ({"plan": {"speed_mps": 0.4, "turn_radius_m": 0.5}}, "46 deg/s"),
+    ],
+)
+def test_what_cannot_be_planned_is_told_in_one_line(sections: dict[str, Any], words: str) -> None:
+    with pytest.raises(PlanError) as fault:
+        planned(**sections)
+    assert words in str(fault.value)
+    assert "\n" not in str(fault.value)
+
+
+def test_an_absurd_overlap_is_refused_by_the_settings() -> None:
+    for overlap in (1.0, -0.1, 60, math.nan):
+        with pytest.raises(AliceError, match="forward_overlap"):
+            survey(plan={"forward_overlap": overlap})
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("survey")
+    assert run_plan(folder, survey(name="small", **SMALL), 1)
+    return folder
+
+
+def test_a_plan_file_gives_back_the_plan(workspace: Path) -> None:
+    plan = read_plan(workspace / "plan" / "plan.json")
+
+    assert plan == planned(name="small", **SMALL)
+    data = json.loads((workspace / "plan" / "plan.json").read_text())
+    assert data["stations"] == plan.stations == sum(line["stations"] for line in data["lines"])
+    assert data["strobe"]["pulse_s"] > data["exposure_s"]
+
+
+def test_a_stage_is_skipped_until_a_setting_that_matters_changes(workspace: Path) -> None:
+    config = survey(name="small", **SMALL)
+    assert not run_plan(workspace, config, 1)
+    assert not run_plan(workspace, config.model_copy(update={"seed": 9}), 1)
+    before = read_stage(workspace / "plan")
+    assert before is not None
+    assert "seed" not in before["settings"]
+
+
+def test_a_plan_is_the_same_bytes_each_time(workspace: Path, tmp_path: Path) -> None:
+    run_plan(tmp_path, survey(name="small", **SMALL), 1)
+    for name in ("plan.json", "plan.geojson", "lines.csv", "map.png"):
+        assert (workspace / "plan" / name).read_bytes() == (tmp_path / "plan" / name).read_bytes()
+
+
+def test_geojson_has_the_right_sizes_on_the_ellipsoid(workspace: Path) -> None:
+    plan = read_plan(workspace / "plan" / "plan.json")
+    features = json.loads((workspace / "plan" / "plan.geojson").read_text())["features"]
+    of_role: dict[str, list[dict[str, Any]]] = {}
+    for feature in features:
+        of_role.setdefault(feature["properties"]["role"], []).append(feature)
+    geod = Geod(ellps="WGS84")
+
+    assert len(of_role["station"]) == len(of_role["footprint"]) == plan.stations
+    assert len(of_role["line"]) == len(plan.lines)
+    area, _ = geod.geometry_area_perimeter(shape(of_role["area"][0]["geometry"]))
+    # Counter-clockwise rings have a positive area; the sea floor is 15 m below the ellipsoid.
+    assert area == pytest.approx(4.6 * 4.0, rel=1e-5)
+    for feature, line in zip(of_role["line"], plan.lines, strict=True):
+        (lon_0, lat_0), (lon_1, lat_1) = feature["geometry"]["coordinates"]
+        azimuth, _, distance = geod.inv(lon_0, lat_0, lon_1, lat_1)
+        assert distance == pytest.approx(line.length_m, abs=1e-4)
+        assert azimuth % 360 == pytest.approx(math.degrees(line.heading_rad), abs=1e-3)
+    footprint, _ = geod.geometry_area_perimeter(shape(of_role["footprint"][0]["geometry"]))
+    assert footprint == pytest.approx(1.44 * 1.17, rel=0.05)
+    assert [f["properties"]["station"] for f in of_role["station"]] == list(range(plan.stations))
+
+
+def test_lines_csv_has_a_row_for_each_line(workspace: Path) -> None:
+    plan = read_plan(workspace / "plan" / "plan.json")
+    rows = (workspace / "plan" / "lines.csv").read_text().splitlines()
+
+    assert len(rows) == 1 + len(plan.lines)
+    cells = dict(zip(rows[0].split(","), rows[1].split(","), strict=True))
+    place = plan.datum.ned_from_geodetic(
+        np.array(
+            [
+                [
+                    float(cells["start_latitude_deg"]),
+                    float(cells["start_longitude_deg"]),
+                    float(cells["depth_m"]),
+                ]
+            ]
+        )
+    )[0]
+    np.testing.assert_allclose(place[:2], plan.lines[0].start_ne_m, atol=1e-4)
+    assert cells["depth_m"] == "13.000"
+
+
+def test_the_map_is_a_picture_with_ink(workspace: Path) -> None:
+    with Image.open(workspace / "plan" / "map.png") as picture:
+        pixels = np.asarray(picture.convert("L"))
+        assert "Software" not in picture.info
+    assert min(pixels.shape) > 900
+    assert 0.05 < (pixels < 230).mean() < 0.9
+
+
+def test_a_broken_plan_file_is_told_in_one_line(workspace: Path, tmp_path: Path) -> None:
+    good = json.loads((workspace / "plan" / "plan.json").read_text())
+    path = tmp_path / "plan.json"
+    for change, words in (
+        ({"version": 7}, "version"),
+        ({"lines": [{**good["lines"][0], "kind": "zigzag"}]}, "zigzag"),
+        ({"speed_mps": "fast"}, "fast"),
+        ({"datum": {"latitude": 1}}, "latitude"),
+    ):
+        path.write_text(json.dumps({**good, **change}))
+        with pytest.raises(PlanError, match=words) as fault:
+            read_plan(path)
+        assert "\n" not in str(fault.value)
+    path.write_text(json.dumps({k: v for k, v in good.items() if k != "interval_s"}))
+    with pytest.raises(PlanError, match="lacks 'interval_s'"):
+        read_plan(path)
+
+
+def test_stations_are_counted_from_the_lines(workspace: Path) -> None:
+    plan = read_plan(workspace / "plan" / "plan.json")
+    assert replace(plan, lines=plan.lines[:1]).stations == plan.lines[0].stations
