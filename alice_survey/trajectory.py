@@ -46,10 +46,18 @@ def read_track(path: Path) -> Trajectory:
     """Read what `write_track` wrote.
 
     Raises:
-        NavigationError: the file is missing, lacks a column or holds a value that is no number.
+        NavigationError: the file is missing, lacks a column, holds a value that is no number, has
+            no rows, or its times do not increase.
     """
     columns = read_columns(path, TRACK_COLUMNS)
     time_s, north, east, depth, roll, pitch, heading = (columns[c] for c in TRACK_COLUMNS)
+    if not len(time_s):
+        raise NavigationError(f"{path}: has no rows")
+    late = np.flatnonzero(np.diff(time_s) <= 0)
+    if len(late):
+        raise NavigationError(
+            f"{path} line {late[0] + 3}: time_s {time_s[late[0] + 1]:g} does not increase"
+        )
     rotation = rotation_from_attitude(*(np.deg2rad(a) for a in (roll, pitch, heading)))
     poses = RigidTransform.from_components(np.stack([north, east, depth], axis=1), rotation)
     return Trajectory(time_s=time_s, ned_from_body=poses)
