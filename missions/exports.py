@@ -10,6 +10,7 @@ import numpy as np
 import shapely
 
 from alice_survey.artefacts import atomic_path, write_csv
+from alice_survey.executor import progress
 from alice_survey.frames import Array, Datum
 from camera_calib.rig import Rig
 from missions.coverage import footprint_outline, footprints_ne
@@ -44,7 +45,9 @@ def write_geojson(path: Path, plan: Plan, rig: Rig) -> None:
     """Area, lines, stations and footprints of the first camera, RFC 7946 (WGS 84)."""
     with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write('{"type": "FeatureCollection", "features": [\n')
-        for index, feature in enumerate(_features(plan, rig)):
+        count = 1 + len(plan.lines) + 2 * plan.stations
+        features = progress(_features(plan, rig), "plan features", count)
+        for index, feature in enumerate(features):
             file.write((",\n" if index else "") + json.dumps(feature, allow_nan=False))
         file.write("\n]}\n")
 

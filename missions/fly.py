@@ -1,11 +1,13 @@
 """Fly a plan in simulation: the true track, the triggers and the navigation log."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from alice_survey.artefacts import Stage, need_stage, run_stage, write_csv
 from alice_survey.config import SurveyConfig
+from alice_survey.executor import progress
 from alice_survey.seafloor.terrain import survey_terrain
 from alice_survey.trajectory import write_track
 from missions.flight_plots import draw_flight
@@ -43,17 +45,27 @@ def run_fly(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     )
 
     def work(folder: Path) -> None:
-        plan = read_plan(plan_path)
-        floor = survey_terrain(config, plan.area_ne_m)
-        rng = np.random.default_rng([config.seed, _SEED_STREAM])
-        flight = fly_plan(plan, config.flight, floor, config.camera.position_body_m, rng)
-        log = navigate(flight.truth, config.flight, floor, config.camera, rng)
-        write_track(folder / "truth" / "track.csv", flight.truth)
-        _write_triggers(folder / "triggers.csv", flight)
-        write_navigation(folder / "navigation.csv", log, plan.datum)
-        draw_flight(folder / "track.png", plan, flight, log)
+        for _ in progress(_steps(folder, plan_path, config), "flight", 4):
+            pass
 
     return run_stage(workspace, stage, work)
+
+
+def _steps(folder: Path, plan_path: Path, config: SurveyConfig) -> Iterator[str]:
+    """Write the files of a flight, and say after each step what is done."""
+    plan = read_plan(plan_path)
+    floor = survey_terrain(config, plan.area_ne_m)
+    yield "sea floor"
+    rng = np.random.default_rng([config.seed, _SEED_STREAM])
+    flight = fly_plan(plan, config.flight, floor, config.camera.position_body_m, rng)
+    write_track(folder / "truth" / "track.csv", flight.truth)
+    _write_triggers(folder / "triggers.csv", flight)
+    yield "track"
+    log = navigate(flight.truth, config.flight, floor, config.camera, rng)
+    write_navigation(folder / "navigation.csv", log, plan.datum)
+    yield "navigation"
+    draw_flight(folder / "track.png", plan, flight, log)
+    yield "plot"
 
 
 def _write_triggers(path: Path, flight: Flight) -> None:
