@@ -118,7 +118,9 @@ def _draw_strips(strips: list[Axes], plan: Plan, flight: Flight, log: Navigation
     strips[3].set_ylabel("navigation error, m")
     strips[3].set_xlabel("time, s")
     for axes in strips[1:]:
-        axes.legend(loc="upper right", ncol=3, fontsize=7, framealpha=0.85)
+        axes.legend(
+            loc="lower right", bbox_to_anchor=(1.0, 0.97), ncol=3, fontsize=7.5, frameon=False
+        )
 
 
 def _rms(values: Array) -> float:
