@@ -37,7 +37,7 @@ class PoolBoard:
     columns: int = 11
     rows: int = 8
     """Inner corners along x and along y."""
-    square_m: float = 0.035
+    square_m: float = 0.04
 
     @property
     def corners(self) -> Array:
@@ -76,24 +76,26 @@ def pool_poses(
 def _pool_pose(
     board: PoolBoard, rig: Rig, view: int, views: int, rng: np.random.Generator
 ) -> RigidTransform:
-    first = rig.cameras[rig.reference]
-    centre = board.outline.mean(axis=0)
+    # The places aimed at are in the pictures of all cameras in turn.
+    name = list(rig.cameras)[view % len(rig.cameras)]
+    camera, rig_from_cam = rig.cameras[name], rig.cam_from_rig[name].inv()
+    frame, centre = np.array([camera.width_px, camera.height_px]), board.outline.mean(axis=0)
     for attempt in range(_TRIES):
-        # Near views of the middle fill the frame; later tries draw back and towards the middle.
+        # As near as the board fits at the place aimed at, or up to twice as far; later tries draw
+        # back, and towards the middle.
         ease = attempt / _TRIES
         near = NEAREST_M + ease * (FARTHEST_M - NEAREST_M)
-        distance_m = 1.0 / rng.uniform(1.0 / FARTHEST_M, 1.0 / near)
+        distance_m = 1.0 / rng.uniform(1.0 / min(2.0 * near, FARTHEST_M), 1.0 / near)
         tilt = STEEPEST_RAD * math.sqrt(rng.uniform(0.05, 1.0)) * (1.0 - 0.5 * ease)
         towards = 2.399963 * view + rng.uniform(-0.5, 0.5)
         spin = rng.uniform(-0.5, 0.5) + (math.pi / 2.0 if view % 4 == 3 else 0.0)
         cell = np.array([view % 3, (view // 3) % 3]) + rng.uniform(0.0, 1.0, 2)
-        frame = np.array([first.width_px, first.height_px])
         pixel = frame * (0.5 + (cell / 3.0 - 0.5) * (1.0 - 0.5 * ease))
         lean = Rotation.from_rotvec([tilt * math.cos(towards), tilt * math.sin(towards), 0.0])
         turn = lean * Rotation.from_rotvec([0.0, 0.0, spin])
-        place = first.at_depth(pixel, distance_m) - turn.apply(centre)
-        rig_from_board = RigidTransform.from_components(place, turn)
-        if all(_in_frame(board, rig, name, rig_from_board) for name in rig.cameras):
+        place = camera.at_depth(pixel, distance_m) - turn.apply(centre)
+        rig_from_board = rig_from_cam * RigidTransform.from_components(place, turn)
+        if all(_in_frame(board, rig, other, rig_from_board) for other in rig.cameras):
             return rig_from_board
     raise CalibrationError(
         f"pool view {view + 1} of {views}: a board of {board.columns} x {board.rows} corners of "

@@ -129,7 +129,7 @@ def _take_board(job: tuple[_Shoot, PoolBoard, int, str, Array]) -> ImageRecord:
         return record
     one = true_rig(config).cameras[camera]
     # Large pixels need more rays for the same precision of an edge on the board.
-    samples = config.imaging.samples * (2 if config.imaging.scale > 1 else 1)
+    samples = config.imaging.samples + (1 if config.imaging.scale > 1 else 0)
     light = render_board(board, one, RigidTransform.from_matrix(matrix), samples)
     sensor = make_sensor(config.camera, one.n_water, 1.0, config.imaging.scale)
     white = _POOL_WHITE * sensor.full_well_e
