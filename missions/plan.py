@@ -104,6 +104,11 @@ def make_plan(config: SurveyConfig, rig: Rig) -> Plan:
     route = route_through(lines, wanted.turn_radius_m, wanted.run_in_m)
     stations = sum(line.stations for line in lines)
     coverage = covered_share(area, lines, stereo, step_m)
+    if coverage < 0.999 and spacing.spacing_m <= 2 * stereo.half_across_m:
+        warn(
+            f"every camera surely sees only {coverage:.1%} of the area: a picture every "
+            f"{step_m:.3g} m leaves gaps at its corners, raise forward_overlap"
+        )
     return Plan(
         name=config.name,
         datum=area_datum(config.area),

@@ -153,9 +153,12 @@ def test_the_first_line_starts_at_the_first_corner() -> None:
         assert starts[0] == min(starts)
 
 
-def test_without_forward_overlap_the_certificate_shows_the_gaps() -> None:
+def test_without_forward_overlap_the_certificate_shows_the_gaps(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     plan = planned(area=SMALL["area"], plan={"forward_overlap": 0.0, "cross_lines": 0})
     assert 0.85 < plan.coverage < 0.995
+    assert f"sees only {plan.coverage:.1%} of the area" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
