@@ -1,0 +1,135 @@
+"""SIFT features of one picture, spread over it, with exact integer descriptors."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.artefacts import atomic_path
+from alice_survey.frames import Array
+
+_CONTRAST = 0.01
+"""SIFT's contrast threshold: a quarter of the usual, since sediment has little."""
+_CELLS = 16
+"""Cells along the longer side over which features are spread."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Features:
+    """Keypoints of a picture, the largest of every part of it first."""
+
+    pixels: Array
+    """(N, 2) from the outer corner of the first pixel (its centre is 0.5, 0.5)."""
+    scale_px: NDArray[np.float32]
+    """(N,) diameters."""
+    descriptors: NDArray[np.uint8]
+    """(N, 128) RootSIFT times 512, as COLMAP keeps them."""
+
+
+def find_features(
+    grey: NDArray[np.uint8],
+    mask: NDArray[np.bool_] | None,
+    *,
+    scale: float,
+    most: int,
+) -> Features:
+    """Find SIFT features.
+
+    Args:
+        grey: (H, W) normalised picture.
+        mask: (H, W) where features may be, or None.
+        scale: the picture is reduced by this much first, at most 1.
+        most: how many to keep, evenly over the picture.
+    """
+    height, width = grey.shape
+    small = grey
+    if scale < 1.0:
+        size = (max(1, round(width * scale)), max(1, round(height * scale)))
+        small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    # Without the precise upscaling every keypoint lies a quarter pixel towards the origin.
+    sift = cv2.SIFT_create(contrastThreshold=_CONTRAST, enable_precise_upscale=True)
+    keypoints = sift.detect(small, None)
+    steps = np.array([width / small.shape[1], height / small.shape[0]])
+    pixels = np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2)
+    pixels = (pixels + 0.5) * steps
+    sizes = np.array([k.size for k in keypoints], dtype=np.float64)
+    response = np.array([k.response for k in keypoints], dtype=np.float64)
+    if mask is not None:
+        columns = np.clip(pixels[:, 0].astype(int), 0, width - 1)
+        rows = np.clip(pixels[:, 1].astype(int), 0, height - 1)
+        usable = np.flatnonzero(mask[rows, columns])
+    else:
+        usable = np.arange(len(pixels))
+    chosen = usable[spread(pixels[usable], sizes[usable], response[usable], (width, height), most)]
+    if not len(chosen):
+        return Features(
+            pixels=np.zeros((0, 2)),
+            scale_px=np.zeros(0, np.float32),
+            descriptors=np.zeros((0, 128), np.uint8),
+        )
+    picked = [keypoints[i] for i in chosen]
+    _, sift_descriptors = sift.compute(small, picked)
+    return Features(
+        pixels=pixels[chosen],
+        scale_px=np.array([k.size for k in picked], dtype=np.float32) * np.float32(steps.mean()),
+        descriptors=root_sift(sift_descriptors),
+    )
+
+
+def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Square roots of L1-normalised SIFT (Arandjelovic & Zisserman 2012), times 512 in bytes."""
+    total = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9)
+    root = np.sqrt(np.maximum(descriptors, 0.0) / total)
+    rounded: NDArray[np.uint8] = np.minimum(np.rint(512.0 * root), 255).astype(np.uint8)
+    return rounded
+
+
+def spread(
+    pixels: Array, sizes: Array, response: Array, size: tuple[int, int], most: int
+) -> NDArray[np.intp]:
+    """Choose features so that every part of the picture keeps its largest.
+
+    Large features lie above the noise of dim pictures: on a real dark sea floor choosing by size
+    gave 1.6 times the verified matches of choosing by strength.
+
+    Args:
+        pixels: (N, 2).
+        sizes: (N,) diameters, by which features are chosen.
+        response: (N,) strength, which decides between equals.
+        size: width and height of the picture.
+        most: how many to choose at most.
+
+    Returns:
+        Indices; first the largest of every cell, then the second of every cell, and so on.
+    """
+    if not len(pixels):
+        return np.zeros(0, np.intp)
+    column, row = (pixels // (max(size) / _CELLS)).astype(np.int64).T
+    cells = row * _CELLS + column
+    # x and y last: ties must not depend on the order of detection
+    order = np.lexsort((pixels[:, 1], pixels[:, 0], -response, -sizes, cells))
+    starts = np.flatnonzero(np.r_[True, np.diff(cells[order]) != 0])
+    rank = np.arange(len(order)) - np.repeat(starts, np.diff(np.r_[starts, len(order)]))
+    turn: NDArray[np.intp] = order[np.lexsort((-sizes[order], rank))]
+    return turn[:most]
+
+
+def save_features(path: Path, features: Features) -> None:
+    """Write features so that an interrupted run can go on."""
+    with atomic_path(path) as temporary:
+        np.savez(
+            temporary,
+            pixels=features.pixels,
+            scale_px=features.scale_px,
+            descriptors=features.descriptors,
+        )
+
+
+def load_features(path: Path) -> Features:
+    """Read what `save_features` wrote."""
+    with np.load(path) as data:
+        return Features(
+            pixels=data["pixels"], scale_px=data["scale_px"], descriptors=data["descriptors"]
+        )

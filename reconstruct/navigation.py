@@ -1,0 +1,188 @@
+"""A navigation log of a real dive, and what it says at the moment of each picture."""
+
+import csv
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, tzinfo
+from pathlib import Path
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
+
+import numpy as np
+
+from alice_survey.errors import NavigationError, warn
+from alice_survey.frames import Array
+
+POSITION = ("latitude_deg", "longitude_deg", "depth_m")
+OPTIONAL = (
+    "roll_deg", "pitch_deg", "heading_deg", "altitude_m", "sigma_horizontal_m", "sigma_depth_m",
+    "sigma_attitude_deg", "sigma_heading_deg", "sigma_altitude_m",
+)  # fmt: skip
+_RANGES = {"latitude_deg": (-85.0, 85.0), "longitude_deg": (-180.0, 180.0)}
+_GAP_S, _GAP_INTERVALS = 2.0, 5.0
+"""A gap is longer than both so many seconds and so many median intervals."""
+_NAMED = 8
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NavigationLog:
+    """Positions and more against time; angles in degrees as logged."""
+
+    time_s: Array
+    """(T,) increasing seconds: as logged, or since `start_utc`."""
+    columns: dict[str, Array]
+    """(T,) values; NaN where a cell is empty."""
+    start_utc: datetime | None
+    """Of the first row, where the log holds dates."""
+
+    @property
+    def longest_gap_s(self) -> float:
+        """Seconds between rows beyond which nothing is interpolated."""
+        if len(self.time_s) < 2:
+            return _GAP_S
+        return max(_GAP_S, _GAP_INTERVALS * float(np.median(np.diff(self.time_s))))
+
+    def at(self, time_s: Array) -> dict[str, Array]:
+        """All columns at other times, (N,) each.
+
+        NaN before the first and after the last row, in gaps, and where a time is NaN. Angles turn
+        the short way round.
+        """
+        return {name: self._at(name, values, time_s) for name, values in self.columns.items()}
+
+    def _at(self, name: str, values: Array, at_s: Array) -> Array:
+        known = np.isfinite(values)
+        times, values = self.time_s[known], values[known]
+        found = np.full(at_s.shape, np.nan)
+        if not len(times):
+            return found
+        after = np.clip(np.searchsorted(times, at_s), 0, len(times) - 1)
+        before = np.clip(np.searchsorted(times, at_s, side="right") - 1, 0, len(times) - 1)
+        with np.errstate(invalid="ignore"):
+            inside = (at_s >= times[0]) & (at_s <= times[-1])
+            inside &= times[after] - times[before] <= self.longest_gap_s
+        turning = name in ("roll_deg", "pitch_deg", "heading_deg", "longitude_deg")
+        smooth = np.unwrap(values, period=360.0) if turning else values
+        found[inside] = np.interp(at_s[inside], times, smooth)
+        if name == "heading_deg":
+            found %= 360.0
+        elif turning:
+            found = (found + 180.0) % 360.0 - 180.0
+        return found
+
+
+def find_zone(name: str) -> tzinfo:
+    """A time zone by name.
+
+    Raises:
+        NavigationError: there is none of that name.
+    """
+    try:
+        return UTC if name == "UTC" else ZoneInfo(name)
+    except (ZoneInfoNotFoundError, ValueError, OSError):
+        raise NavigationError(
+            f"--time-zone {name!r} is not known; give a name such as Europe/Oslo or UTC"
+        ) from None
+
+
+def read_navigation(path: Path, zone: tzinfo) -> NavigationLog:
+    """Read a navigation CSV: `time_s` or `time_utc`, latitude, longitude, depth, and optional rest.
+
+    A row without a finite time or position, or whose time does not follow the row before, is left
+    out with a warning that names its line; an optional value that is no number is left out alone.
+
+    Args:
+        path: the file.
+        zone: of dates that name none.
+
+    Raises:
+        NavigationError: the file cannot be read, lacks a column, or holds no usable row.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file, skipinitialspace=True)
+            header = [name.strip() for name in reader.fieldnames or []]
+            reader.fieldnames = header
+            rows = [(reader.line_num, row) for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise NavigationError(f"{path}: cannot be read: {error}") from None
+    time_name = next((name for name in ("time_s", "time_utc") if name in header), None)
+    if time_name is None:
+        raise NavigationError(f"{path}: no column time_s or time_utc; it has {', '.join(header)}")
+    missing = [name for name in POSITION if name not in header]
+    if missing:
+        raise NavigationError(f"{path}: column {missing[0]} is missing; it has {', '.join(header)}")
+    names = [*POSITION, *(name for name in OPTIONAL if name in header)]
+    start: datetime | None = None
+    times: list[float] = []
+    table: list[list[float]] = []
+    faults: list[str] = []
+    for line, row in rows:
+        try:
+            date = _date(row[time_name], zone) if time_name == "time_utc" else None
+            if date is not None and start is None:
+                start = date
+            since = date - start if date is not None and start is not None else None
+            time = since.total_seconds() if since is not None else _number(row, time_name)
+            position = [_number(row, name) for name in POSITION]
+        except ValueError as error:
+            faults.append(f"line {line}: {error}")
+            continue
+        if times and time <= times[-1]:
+            faults.append(f"line {line}: its time does not follow that of the row before")
+            continue
+        rest = []
+        for name in names[len(POSITION) :]:
+            try:
+                rest.append(_number(row, name) if (row[name] or "").strip() else math.nan)
+            except ValueError as error:
+                faults.append(f"line {line}: {error} (that value only)")
+                rest.append(math.nan)
+        times.append(time)
+        table.append([*position, *rest])
+    if faults:
+        more = f" and {len(faults) - _NAMED} more" if len(faults) > _NAMED else ""
+        warn(f"{path}: left out {'; '.join(faults[:_NAMED])}{more}")
+    if not times:
+        raise NavigationError(f"{path}: no row with a time and a position")
+    values = np.array(table)
+    columns = {name: values[:, i] for i, name in enumerate(names)}
+    return NavigationLog(time_s=np.array(times), columns=columns, start_utc=start)
+
+
+def _number(row: dict[str, str | None], name: str) -> float:
+    cell = row.get(name)
+    try:
+        value = float(cell or "")
+    except ValueError:
+        raise ValueError(f"{name} is {cell!r}, not a number") from None
+    if not math.isfinite(value):
+        raise ValueError(f"{name} is {value}")
+    low, high = _RANGES.get(name, (-math.inf, math.inf))
+    if not low <= value <= high:
+        raise ValueError(f"{name} is {value}, not within {low} to {high}")
+    return value
+
+
+def _date(cell: str | None, zone: tzinfo) -> datetime:
+    try:
+        date = datetime.fromisoformat((cell or "").strip())
+    except ValueError:
+        raise ValueError(f"time_utc is {cell!r}, not a date such as 2024-05-01T12:00:00Z") from None
+    return (date.replace(tzinfo=zone) if date.tzinfo is None else date).astimezone(UTC)
+
+
+def warn_of_gaps(images: Sequence[str], time_s: Array, found: Array, log: NavigationLog) -> None:
+    """Say which pictures got no position, and why."""
+    lost = [i for i, value in enumerate(found) if not np.isfinite(value)]
+    if not lost:
+        return
+    names = ", ".join(images[i] for i in lost[:_NAMED])
+    more = f" and {len(lost) - _NAMED} more" if len(lost) > _NAMED else ""
+    known = [time_s[i] for i in lost if np.isfinite(time_s[i])]
+    when = f"; their times are {min(known):.1f} to {max(known):.1f} s" if known else ""
+    warn(
+        f"{len(lost)} pictures get no navigation, without a time, beyond the log "
+        f"({log.time_s[0]:.1f} to {log.time_s[-1]:.1f} s) or in a gap over "
+        f"{log.longest_gap_s:.1f} s{when}: {names}{more}"
+    )

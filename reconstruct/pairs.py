@@ -1,0 +1,154 @@
+"""Which pictures to match: by their footprints, by their order, or by a first coarse look."""
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial import KDTree
+from scipy.spatial.transform import RigidTransform
+from shapely import STRtree
+from shapely.geometry import Polygon
+
+from alice_survey.frames import Array, Datum, rotation_from_attitude
+from alice_survey.manifest import ImageRecord
+from camera_calib.rig import Rig
+
+Pair = tuple[int, int]
+"""Indices of two pictures, the smaller first."""
+
+SMALL_SET = 60
+"""Up to this many pictures every pair gets at least a coarse look."""
+NEIGHBOURS = 4
+"""Stations on either side that are matched when nothing else is known."""
+_NEAREST = 20
+"""Pictures nearest by navigation that get a coarse look when footprints are not known."""
+_LEAST_OVERLAP = 0.05
+_SURE_OVERLAP = 0.3
+
+
+def choose_pairs(
+    records: Sequence[ImageRecord], rig: Rig | None, datum: Datum | None
+) -> tuple[list[Pair], list[Pair]]:
+    """Pairs to match fully, and pairs to match only if a coarse look finds something.
+
+    With a rig, positions, attitudes and altitudes: pairs whose footprints overlap. With positions
+    only: the nearest pictures. Without either: neighbours in order, and every other pair where the
+    pictures are few. Pictures of one station and of neighbouring stations are always matched.
+
+    Args:
+        records: pictures.
+        rig: calibrated cameras, when known.
+        datum: origin of local coordinates; None without positions.
+    """
+    sure = neighbours(records, 0)
+    maybe: set[Pair] = set()
+    placed: set[int] = set()
+    if datum is not None and rig is not None:
+        posed = [i for i, r in enumerate(records) if _has_pose(r)]
+        near, touching = _overlapping([records[i] for i in posed], rig, datum)
+        sure |= {(posed[i], posed[j]) for i, j in near}
+        maybe |= {(posed[i], posed[j]) for i, j in touching}
+        placed = set(posed)
+    elif datum is not None and len(records) > SMALL_SET:
+        maybe |= _nearest(records, datum)
+        sure |= neighbours(records, 1)
+        placed = {i for i, r in enumerate(records) if r.has_position}
+    if len(placed) < len(records):
+        in_order = neighbours(records, NEIGHBOURS)
+        sure |= {(i, j) for i, j in in_order if i not in placed or j not in placed}
+        if len(records) <= SMALL_SET:
+            maybe |= set(itertools.combinations(range(len(records)), 2))
+    return sorted(sure), sorted(maybe - sure)
+
+
+def neighbours(records: Sequence[ImageRecord], reach: int) -> set[Pair]:
+    """All pairs of pictures whose stations are at most `reach` places apart in order."""
+    order = {s: i for i, s in enumerate(sorted({r.station for r in records}))}
+    places = [order[r.station] for r in records]
+    by_place = sorted(range(len(records)), key=lambda i: (places[i], i))
+    pairs = set()
+    for a, i in enumerate(by_place):
+        for j in by_place[a + 1 :]:
+            if places[j] - places[i] > reach:
+                break
+            pairs.add((min(i, j), max(i, j)))
+    return pairs
+
+
+def footprints(records: Sequence[ImageRecord], rig: Rig, datum: Datum) -> list[Polygon]:
+    """Where the borders of pictures meet the sea floor, taken as level at the altitude measured.
+
+    Args:
+        records: pictures with position, attitude and altitude.
+        rig: cameras and lever arms.
+        datum: origin of local coordinates.
+
+    Returns:
+        Polygons in north and east, metres; empty where a ray of the border never descends.
+    """
+    borders = {name: camera.unproject(camera.border(8)) for name, camera in rig.cameras.items()}
+    positions = positions_ned(records, datum)
+    reference = rig.cameras[rig.reference]
+    glass = reference.port_distance_m + reference.glass_thickness_m
+    polygons = []
+    for record, position in zip(records, positions, strict=True):
+        attitude = np.deg2rad([record.roll_deg, record.pitch_deg, record.heading_deg])
+        ned_from_body = RigidTransform.from_components(position, rotation_from_attitude(*attitude))
+        outer_glass = (ned_from_body * rig.body_from_rig).apply([0.0, 0.0, glass])
+        floor = outer_glass[2] + record.altitude_m
+        ned_from_cam = ned_from_body * rig.body_from_cam(record.camera)
+        points, directions = borders[record.camera]
+        starts = ned_from_cam.apply(points)
+        rays = ned_from_cam.rotation.apply(directions)
+        if not np.all(rays[:, 2] > 0.1):
+            polygons.append(Polygon())
+            continue
+        hits = starts + ((floor - starts[:, 2]) / rays[:, 2])[:, None] * rays
+        polygons.append(Polygon(hits[:, :2]).buffer(0))
+    return polygons
+
+
+def positions_ned(records: Sequence[ImageRecord], datum: Datum) -> Array:
+    """Positions of pictures from navigation, (N, 3) metres; NaN where there are none."""
+    rows = np.array([[r.latitude_deg, r.longitude_deg, r.depth_m] for r in records])
+    rows = rows.reshape(-1, 3)
+    known = np.isfinite(rows).all(axis=1)
+    positions = np.full(rows.shape, np.nan)
+    positions[known] = datum.ned_from_geodetic(rows[known])
+    return positions
+
+
+def _has_pose(record: ImageRecord) -> bool:
+    return record.has_position and record.has_attitude and record.altitude_m > 0
+
+
+def _overlapping(
+    records: Sequence[ImageRecord], rig: Rig, datum: Datum
+) -> tuple[set[Pair], set[Pair]]:
+    polygons = footprints(records, rig, datum)
+    tree = STRtree(polygons)
+    sure, maybe = set(), set()
+    for i, polygon in enumerate(polygons):
+        for j in sorted(int(k) for k in tree.query(polygon) if k > i):
+            smaller = min(polygon.area, polygons[j].area)
+            overlap = polygon.intersection(polygons[j]).area / smaller if smaller > 0 else 0.0
+            if overlap >= _SURE_OVERLAP:
+                sure.add((i, j))
+            elif overlap >= _LEAST_OVERLAP:
+                maybe.add((i, j))
+    return sure, maybe
+
+
+def _nearest(records: Sequence[ImageRecord], datum: Datum) -> set[Pair]:
+    positions = positions_ned(records, datum)
+    known = np.flatnonzero(np.isfinite(positions).all(axis=1))
+    if len(known) < 2:
+        return set()
+    count = min(_NEAREST + 1, len(known))
+    nearest = np.atleast_2d(KDTree(positions[known]).query(positions[known], k=count)[1])
+    return {
+        (min(int(known[a]), int(known[b])), max(int(known[a]), int(known[b])))
+        for a, row in enumerate(nearest)
+        for b in row
+        if a != b
+    }

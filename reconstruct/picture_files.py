@@ -1,0 +1,245 @@
+"""Picture files as cameras write them: found, checked by decoding them whole, and copied."""
+
+import re
+import shutil
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta, timezone, tzinfo
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.errors import ImageError
+
+PLAIN = (".jpg", ".jpeg", ".png")
+TIFF = (".tif", ".tiff")
+RAW = (
+    ".3fr", ".arw", ".cr2", ".cr3", ".dng", ".erf", ".gpr", ".iiq", ".kdc", ".mef", ".mos", ".mrw",
+    ".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f",
+)  # fmt: skip
+_GPS, _EXIF = 0x8825, 0x8769
+_DATE, _SUBSECOND, _OFFSET = 0x9003, 0x9291, 0x9011
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureFacts:
+    """What a picture file holds; `fault` says why it cannot be used."""
+
+    path: Path
+    width_px: int = 0
+    height_px: int = 0
+    highest: int = 255
+    """Largest value of any pixel; above 255 in a picture of 16 bits."""
+    time_local: datetime | None = None
+    """When it was taken; with a zone if the camera wrote one."""
+    latitude_deg: float | None = None
+    longitude_deg: float | None = None
+    altitude_m: float | None = None
+    fault: str = ""
+
+
+def find_pictures(folder: Path) -> list[Path]:
+    """Picture files of a folder (not of folders inside), numbers in their names in order.
+
+    Masks (`NAME_mask.png` beside `NAME.*`) and hidden files are left out.
+
+    Raises:
+        ImageError: it is no folder that can be read, or it holds no picture.
+    """
+    try:
+        inside = list(folder.iterdir())
+    except OSError as error:
+        raise ImageError(f"{folder}: cannot be read: {error.strerror}") from None
+    known = (*PLAIN, *TIFF, *RAW)
+    pictures = [
+        p
+        for p in inside
+        if p.suffix.lower() in known and not p.name.startswith(".") and not p.is_dir()
+    ]
+    stems = {p.stem for p in pictures}
+    pictures = [p for p in pictures if not _is_mask(p, stems)]
+    if not pictures:
+        raise ImageError(f"{folder}: holds no pictures (JPEG, PNG, TIFF or camera RAW)")
+    return sorted(pictures, key=lambda p: (natural_key(p.name), p.name))
+
+
+def _is_mask(path: Path, stems: set[str]) -> bool:
+    return path.stem.endswith("_mask") and path.stem[: -len("_mask")] in stems
+
+
+def natural_key(name: str) -> list[tuple[int, int, str]]:
+    """A sorting key that puts picture2 before picture10."""
+    parts = re.split(r"(\d+)", name.lower())
+    return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in parts]
+
+
+def safe_name(stem: str) -> str:
+    """A stem of letters, digits, dots, dashes and underscores that cannot leave its folder."""
+    return re.sub(r"[^\w.-]", "_", stem).strip(".") or "picture"
+
+
+def inspect(path: Path) -> PictureFacts:
+    """Decode a picture whole and read when and where it was taken; never raises for a bad file."""
+    try:
+        if not path.is_file():
+            return PictureFacts(path=path, fault="no regular file")
+        pixels = decode(path)
+    except (ImageError, OSError) as error:
+        return PictureFacts(path=path, fault=str(error))
+    height, width = pixels.shape[:2]
+    facts = PictureFacts(
+        path=path, width_px=width, height_px=height, highest=int(pixels.max(initial=0))
+    )
+    return _with_exif(facts)
+
+
+def decode(path: Path) -> NDArray[Any]:
+    """All pixels of a picture, (H, W) or (H, W, 3) BGR, 8 or 16 bits.
+
+    Raises:
+        ImageError: it cannot be decoded to its end.
+    """
+    suffix = path.suffix.lower()
+    if suffix in RAW:
+        return _develop(path)
+    if suffix in PLAIN:
+        _check_whole(path)
+    flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        pixels = cv2.imread(str(path), flags)
+    except cv2.error:
+        pixels = None
+    if pixels is None:
+        raise ImageError("cannot be decoded")
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise ImageError(f"holds {pixels.dtype} pixels; 8 or 16 bits can be read")
+    if pixels.ndim == 3 and pixels.shape[2] not in (3, 4):
+        raise ImageError(f"has {pixels.shape[2]} channels; 1, 3 or 4 can be read")
+    return np.ascontiguousarray(pixels[..., :3] if pixels.ndim == 3 else pixels)
+
+
+def _check_whole(path: Path) -> None:
+    """Decode with a library that refuses truncated files (OpenCV fills them with grey)."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            image.load()
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise ImageError(f"corrupt: {error}".replace(str(path), path.name)) from None
+
+
+def _develop(path: Path) -> NDArray[Any]:
+    """A RAW picture in 16 bits: the camera's daylight colours, the same for every picture."""
+    import rawpy
+
+    try:
+        with rawpy.imread(str(path)) as raw:
+            rgb = raw.postprocess(
+                output_bps=16, no_auto_bright=True, use_camera_wb=False, use_auto_wb=False,
+                user_flip=0,
+            )  # fmt: skip
+    except (rawpy.LibRawError, OSError, ValueError) as error:
+        text = error.args[0] if error.args else error
+        text = text.decode(errors="replace") if isinstance(text, bytes) else text
+        raise ImageError(f"RAW cannot be developed: {text}") from None
+    return np.ascontiguousarray(rgb[..., ::-1])
+
+
+def _with_exif(facts: PictureFacts) -> PictureFacts:
+    from dataclasses import replace
+
+    from PIL import Image
+
+    try:
+        with Image.open(facts.path) as image:
+            exif = image.getexif()
+            details, gps = exif.get_ifd(_EXIF), exif.get_ifd(_GPS)
+    except (OSError, SyntaxError, ValueError, KeyError, TypeError):
+        return facts  # a RAW format that Pillow does not know, or broken tags: pixels suffice
+    return replace(
+        facts,
+        time_local=_time(details, exif),
+        latitude_deg=_angle(gps, 2, 1, "S"),
+        longitude_deg=_angle(gps, 4, 3, "W"),
+        altitude_m=_altitude(gps),
+    )
+
+
+def _time(details: Any, exif: Any) -> datetime | None:
+    text = details.get(_DATE) or exif.get(_DATE)
+    try:
+        time = datetime.strptime(str(text).strip("\0 "), "%Y:%m:%d %H:%M:%S")
+    except ValueError:
+        return None
+    digits = re.match(r"\d+", str(details.get(_SUBSECOND, "")))
+    if digits:
+        time += timedelta(seconds=float(f"0.{digits[0]}"))
+    zone = re.fullmatch(r"([+-])(\d\d):(\d\d)", str(details.get(_OFFSET, "")).strip("\0 "))
+    if zone:
+        shift = timedelta(hours=int(zone[2]), minutes=int(zone[3]))
+        time = time.replace(tzinfo=timezone(-shift if zone[1] == "-" else shift))
+    return time
+
+
+def _number(value: Any) -> float | None:
+    try:
+        number = float(Fraction(*value) if isinstance(value, tuple) else value)
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+    return number if np.isfinite(number) else None
+
+
+def _angle(gps: Any, key: int, reference: int, negative: str) -> float | None:
+    parts = [_number(p) for p in gps.get(key, ())]
+    if len(parts) != 3 or any(p is None for p in parts):
+        return None
+    degrees, minutes, seconds = (float(p or 0.0) for p in parts)
+    angle = degrees + minutes / 60.0 + seconds / 3600.0
+    if not 0 <= angle <= (90 if key == 2 else 180):
+        return None
+    return -angle if str(gps.get(reference, "")).upper().startswith(negative) else angle
+
+
+def _altitude(gps: Any) -> float | None:
+    altitude = _number(gps.get(6))
+    below = gps.get(5) in (1, b"\x01")
+    return None if altitude is None else -altitude if below else altitude
+
+
+def to_utc(time: datetime, zone: tzinfo) -> datetime:
+    """A camera's time in UTC; `zone` where the camera wrote none."""
+    return (time.replace(tzinfo=zone) if time.tzinfo is None else time).astimezone(UTC)
+
+
+def bits_used(highest: int) -> int:
+    """Bits of the sensor whose largest value was `highest`: 8, 10, 12, 14 or 16."""
+    return next(bits for bits in (8, 10, 12, 14, 16) if highest < 2**bits)
+
+
+def copy_picture(source: Path, target: Path, bits: int) -> None:
+    """Bring a picture in: JPEG and PNG of 8 bits as they are, all else as PNG of 8 bits.
+
+    Args:
+        source: a file that `inspect` found whole.
+        target: where it goes, with the suffix `target_suffix` gives.
+        bits: `bits_used` by all pictures of the camera; lower bits are cut off.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if source.suffix.lower() in PLAIN and target.suffix == source.suffix.lower() and bits == 8:
+        shutil.copyfile(source, target)
+        return
+    pixels = decode(source)
+    if pixels.dtype == np.uint16:
+        pixels = (pixels >> (bits - 8)).astype(np.uint8)
+    if not cv2.imwrite(str(target), pixels, [cv2.IMWRITE_PNG_COMPRESSION, 3]):
+        raise ImageError(f"{target}: cannot be written")
+
+
+def target_suffix(source: Path, bits: int) -> str:
+    """`.jpg`, `.jpeg` or `.png` for files copied as they are, `.png` for all else."""
+    suffix = source.suffix.lower()
+    return suffix if suffix in (".jpg", ".jpeg") and bits == 8 else ".png"
