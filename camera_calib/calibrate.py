@@ -30,6 +30,8 @@ _STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-3, 1e-6, 1e-6, 1e-7, 1e-7, 1e-6, 1e-6])
 _SCALES = np.array([10.0, 10.0, 10.0, 10.0, 0.1, 0.1, 0.01, 0.01, 0.1, 0.01])
 _POSE_STEP, _POSE_SCALE = 1e-7, 0.1
 _FEWEST_VIEWS = 6
+_NEAREST_PORT_M = 1e-5
+"""Above the step of its derivative, so that the glass never passes the pupil."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,9 +88,12 @@ def find_corners(picture: Array, board: Board) -> Array | None:
         (rows * columns, 2) pixels, row by row from a corner of the board, or None when the board
         was not found whole.
     """
-    flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-    found, corners = cv2.findChessboardCornersSB(picture, (board.columns, board.rows), flags=flags)
-    if not found:
+    for flags in (0, cv2.CALIB_CB_EXHAUSTIVE):  # the second looks harder and takes 3 times as long
+        size = (board.columns, board.rows)
+        found, corners = cv2.findChessboardCornersSB(picture, size, flags=flags)
+        if found:
+            break
+    else:
         return None
     grid = corners.reshape(board.rows, board.columns, 2).astype(np.float64)
     steps = [np.linalg.norm(np.diff(grid, axis=a), axis=-1).min() for a in (0, 1)]
@@ -142,7 +147,7 @@ class _Problem:
         self.poses = slice(2 * len(_FREE), None)
         free = np.full(6 * len(poses), np.inf)
         f, w, h = start.cameras[self.names[0]].fx_px, self.pixels[..., 0], self.pixels[..., 1]
-        low = [f / 2, f / 2, 0.0, 0.0, -2.0, -2.0, -0.5, -0.5, -2.0, 0.0]
+        low = [f / 2, f / 2, 0.0, 0.0, -2.0, -2.0, -0.5, -0.5, -2.0, _NEAREST_PORT_M]
         high = [2 * f, 2 * f, np.nanmax(w), np.nanmax(h), 2.0, 2.0, 0.5, 0.5, 2.0, 0.5]
         self.low = np.concatenate([low, low, -free])
         self.high = np.concatenate([high, high, free])
