@@ -11,8 +11,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from alice_survey.artefacts import write_json
-from alice_survey.frames import Array
+from reconstruct.dem import DemGrid, bin_points
 from reconstruct.model import WorldFrame
+from reconstruct.points import Points
 
 Float32 = NDArray[np.float32]
 
@@ -30,67 +31,82 @@ _PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def thin(
-    starts: NDArray[np.int64], order: NDArray[np.int64], values: Float32, sigmas: Float32
+    starts: NDArray[np.int64],
+    order: NDArray[np.int64],
+    enu: Float32,
+    normals: Float32,
+    colours: NDArray[np.uint8],
+    sigmas: Float32,
+    edge: float,
 ) -> tuple[Float32, Float32]:
     """Average the points of each cube, weighted by their certainty.
 
     Args:
-        starts: (C + 1,) where the points of each cube start in `order`.
-        order: (N,) point numbers sorted by cube.
-        values: (N, K) numbers to average, by point number.
-        sigmas: (N,) standard deviations.
-
-    Returns:
-        (C, K) averages and (C,) standard deviations: the weighted mean of those of the points,
-        since points of one cube mostly come from the same few matches and err together.
-    """
-    cubes, width = starts.size - 1, values.shape[1]
-    mean = np.zeros((cubes, width), np.float32)
-    sigma = np.zeros(cubes, np.float32)
-    total = np.zeros(width)
-    for cube in range(cubes):
-        total[:] = 0.0
-        weights, deviation = 0.0, 0.0
-        for i in range(starts[cube], starts[cube + 1]):
-            point = order[i]
-            w = 1.0 / (sigmas[point] * sigmas[point])
-            weights += w
-            deviation += w * sigmas[point]
-            for k in range(width):
-                total[k] += w * values[point, k]
-        for k in range(width):
-            mean[cube, k] = total[k] / weights
-        sigma[cube] = deviation / weights
-    return mean, sigma
-
-
-def thinned_points(
-    points_enu: Float32,
-    normals_enu: Float32,
-    colours: NDArray[np.uint8],
-    sigmas: Float32,
-    edge: float,
-) -> NDArray[Any]:
-    """One vertex for every cube that holds points.
-
-    Args:
-        points_enu: (N, 3) from the cloud's offset.
-        normals_enu: (N, 3) unit vectors.
+        starts: (C + 1,) where the points of each column of cubes start in `order`.
+        order: (M,) point numbers sorted by column.
+        enu: (N, 3) east, north, up, by point number.
+        normals: (N, 3) unit vectors; points with NaN are left out.
         colours: (N, 3) RGB.
         sigmas: (N,) standard deviations.
-        edge: of the cubes, which are aligned to whole multiples of it.
+        edge: of the cubes; a column's cubes start at whole multiples of it.
 
     Returns:
-        (C,) records of `VERTEX`, sorted by cube: east, then north, then up.
+        (K, 9) means of position, normal (not of unit length) and colour, and (K,) standard
+        deviations, column by column from below. A standard deviation is the weighted mean of those
+        of the points, since points of one cube mostly come from the same few matches and err
+        together.
     """
-    cubes = np.floor(points_enu.astype(np.float64) / edge).astype(np.int64)
-    if len(cubes) == 0:
-        return np.empty(0, VERTEX)
-    order = np.lexsort(cubes.T[::-1])
-    step = np.any(np.diff(cubes[order], axis=0) != 0, axis=1)
-    starts = np.concatenate([[0], np.flatnonzero(step) + 1, [len(order)]]).astype(np.int64)
-    values = np.concatenate([points_enu, normals_enu, colours.astype(np.float32)], axis=1)
-    mean, sigma = thin(starts, order, values, sigmas)
+    mean = np.empty((order.size, 9), np.float32)
+    sigma = np.empty(order.size, np.float32)
+    sums = np.zeros(9)
+    cubes = 0
+    for column in range(starts.size - 1):
+        inside = order[starts[column] : starts[column + 1]]
+        levels = np.empty(inside.size, np.int64)
+        for i in range(inside.size):
+            levels[i] = math.floor(enu[inside[i], 2] / edge)
+        ranks = np.argsort(levels, kind="mergesort")
+        first = 0
+        while first < ranks.size:
+            level = levels[ranks[first]]
+            sums[:] = 0.0
+            weights, deviation = 0.0, 0.0
+            while first < ranks.size and levels[ranks[first]] == level:
+                point = inside[ranks[first]]
+                first += 1
+                if math.isnan(normals[point, 0]):
+                    continue
+                w = 1.0 / (sigmas[point] * sigmas[point])
+                weights += w
+                deviation += w * sigmas[point]
+                for k in range(3):
+                    sums[k] += w * enu[point, k]
+                    sums[3 + k] += w * normals[point, k]
+                    sums[6 + k] += w * colours[point, k]
+            if weights > 0.0:
+                for k in range(9):
+                    mean[cubes, k] = sums[k] / weights
+                sigma[cubes] = deviation / weights
+                cubes += 1
+    return mean[:cubes], sigma[:cubes]
+
+
+def thinned_points(grid: DemGrid, points: Points) -> NDArray[Any]:
+    """One vertex for every cube over a grid's cells that holds points.
+
+    Args:
+        grid: columns of cubes; points outside of it are left out, and those without normal.
+        points: in the coordinates of the grid, which are those of the vertices.
+
+    Returns:
+        (M,) records of `VERTEX`, by rows from the north, columns from the west, and from below.
+    """
+    starts, order = bin_points(
+        points.enu, grid.north, grid.west, grid.cell, grid.rows, grid.columns
+    )
+    mean, sigma = thin(
+        starts, order, points.enu, points.normals, points.colours, points.sigmas, grid.cell
+    )
     vertices = np.empty(len(mean), VERTEX)
     vertices["x"], vertices["y"], vertices["z"] = mean[:, :3].T
     length = np.maximum(np.linalg.norm(mean[:, 3:6], axis=1), 1e-6)
@@ -98,28 +114,6 @@ def thinned_points(
     vertices["red"], vertices["green"], vertices["blue"] = np.rint(mean[:, 6:9]).T
     vertices["sigma"] = sigma
     return vertices
-
-
-def normals_of_depth(depth: Float32, pinhole: Array) -> Float32:
-    """Unit normals (H, W, 3) in the camera frame, towards the camera; NaN where unknown.
-
-    The surface is spanned by the points two pixels to either side.
-
-    Args:
-        depth: (H, W) along the axis, NaN where unknown.
-        pinhole: (4,) fx, fy, cx, cy, px.
-    """
-    height, width = depth.shape
-    x = ((np.arange(width) + 0.5 - pinhole[2]) / pinhole[0]).astype(np.float32)
-    y = ((np.arange(height) + 0.5 - pinhole[3]) / pinhole[1]).astype(np.float32)
-    points = np.stack([depth * x[None, :], depth * y[:, None], depth], axis=-1)
-    normals = np.full(points.shape, np.nan, np.float32)
-    along = points[2:-2, 4:] - points[2:-2, :-4]
-    down = points[4:, 2:-2] - points[:-4, 2:-2]
-    normal = np.cross(down, along)
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), np.float32(1e-20))
-    normals[2:-2, 2:-2] = normal
-    return normals
 
 
 def voxel_edge(cell: float, cells: int, most_points: int) -> float:

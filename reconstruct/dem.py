@@ -3,12 +3,14 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from alice_survey.frames import Array
+from reconstruct.points import Points
 
 Float32 = NDArray[np.float32]
 
@@ -33,11 +35,11 @@ class DemGrid:
     rows: int
     columns: int
 
-    def east_of(self, column: Array | float) -> Array:
+    def east_of(self, column: NDArray[Any] | float) -> Array:
         """East coordinate of a position in columns; cell centres are at n + 0.5."""
         return np.asarray(self.west + np.asarray(column) * self.cell)
 
-    def north_of(self, row: Array | float) -> Array:
+    def north_of(self, row: NDArray[Any] | float) -> Array:
         """North coordinate of a position in rows; cell centres are at n + 0.5."""
         return np.asarray(self.north - np.asarray(row) * self.cell)
 
@@ -49,6 +51,16 @@ class DemGrid:
             cell=self.cell,
             rows=rows,
             columns=columns,
+        )
+
+    def moved(self, east: float, north: float) -> "DemGrid":
+        """The same cells, in coordinates in which they lie elsewhere."""
+        return DemGrid(
+            west=self.west + east,
+            north=self.north + north,
+            cell=self.cell,
+            rows=self.rows,
+            columns=self.columns,
         )
 
 
@@ -72,38 +84,35 @@ def round_cell(length: float) -> float:
     return round(length, digits)
 
 
-def fuse_points(
-    grid: DemGrid, points_world: Array, sigmas: Float32, views: NDArray[np.int32]
-) -> tuple[Float32, Float32, NDArray[np.uint16]]:
+def fuse_points(grid: DemGrid, points: Points) -> tuple[Float32, Float32, NDArray[np.uint16]]:
     """Give each cell of a grid one height from the points that fall in it.
 
     Args:
-        grid: cells, of which points outside are ignored.
-        points_world: (N, 3) with the third axis down.
-        sigmas: (N,) standard deviations of their heights.
-        views: (N,) whose depth map each point comes from, in ascending order.
+        grid: cells, of which points outside are ignored, in the coordinates of the points.
+        points: of all views that see the grid.
 
     Returns:
-        Height (positive up) and standard deviation, NaN in empty cells, and how many views the
-        height rests on; (rows, columns) each.
+        Height and standard deviation, NaN in empty cells, and how many views the height rests on;
+        (rows, columns) each.
     """
     starts, order = bin_points(
-        points_world, grid.north, grid.west, grid.cell, grid.rows, grid.columns
+        points.enu, grid.north, grid.west, grid.cell, grid.rows, grid.columns
     )
-    heights = -points_world[order, 2]
-    height, sigma, count = fuse_cells(starts, heights, sigmas[order], views[order], _GATE)
+    height, sigma, count = fuse_cells(
+        starts, points.enu[order, 2], points.sigmas[order], points.views[order], _GATE
+    )
     shape = (grid.rows, grid.columns)
     return height.reshape(shape), sigma.reshape(shape), count.reshape(shape)
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def bin_points(
-    points_world: Array, north: float, west: float, cell: float, rows: int, columns: int
+    points_enu: Float32, north: float, west: float, cell: float, rows: int, columns: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Sort points by the cell they fall in, keeping their order within each.
 
     Args:
-        points_world: (N, 3), of which those outside of the grid are left out.
+        points_enu: (N, 3), of which those outside of the grid are left out.
         north: north coordinate of the outer edge of the first row.
         west: east coordinate of the outer edge of the first column.
         cell: side of a cell.
@@ -114,18 +123,18 @@ def bin_points(
         (rows * columns + 1,) where the points of each cell start, and point numbers in that order.
     """
     starts = np.zeros(rows * columns + 1, np.int64)
-    for i in range(len(points_world)):
-        row = math.floor((north - points_world[i, 0]) / cell)
-        column = math.floor((points_world[i, 1] - west) / cell)
+    for i in range(len(points_enu)):
+        row = math.floor((north - points_enu[i, 1]) / cell)
+        column = math.floor((points_enu[i, 0] - west) / cell)
         if 0 <= row < rows and 0 <= column < columns:
             starts[row * columns + column + 1] += 1
     for k in range(rows * columns):
         starts[k + 1] += starts[k]
     order = np.empty(starts[-1], np.int64)
     place = starts[:-1].copy()
-    for i in range(len(points_world)):
-        row = math.floor((north - points_world[i, 0]) / cell)
-        column = math.floor((points_world[i, 1] - west) / cell)
+    for i in range(len(points_enu)):
+        row = math.floor((north - points_enu[i, 1]) / cell)
+        column = math.floor((points_enu[i, 0] - west) / cell)
         if 0 <= row < rows and 0 <= column < columns:
             order[place[row * columns + column]] = i
             place[row * columns + column] += 1
@@ -135,7 +144,7 @@ def bin_points(
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def fuse_cells(
     starts: NDArray[np.int64],
-    heights: Array,
+    heights: Float32,
     sigmas: Float32,
     views: NDArray[np.int32],
     gate: float,

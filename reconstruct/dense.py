@@ -14,29 +14,32 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from rasterio.windows import Window
 
 from alice_survey.artefacts import Stage, need_stage, run_stage
 from alice_survey.config import ReconstructConfig, SurveyConfig
 from alice_survey.errors import ReconstructionError, warn
 from alice_survey.executor import parallel_map
 from alice_survey.frames import Array
-from reconstruct.cloud import (
-    normals_of_depth,
-    thinned_points,
-    voxel_edge,
-    write_cloud_json,
-    write_ply,
-)
-from reconstruct.dem import FILL_CELLS, DemGrid, fill_gaps, fuse_points, grid_over, round_cell
+from reconstruct.cloud import voxel_edge, write_cloud_json, write_ply
+from reconstruct.dem import DemGrid, grid_over, round_cell
 from reconstruct.depth import pair_depth
-from reconstruct.fusion import GATE_SIGMAS, count_witnesses, merge_depths, pinhole_of
+from reconstruct.fusion import GATE_SIGMAS, count_witnesses, merge_depths
+from reconstruct.light import (
+    LightSamples,
+    compare_light,
+    joined_samples,
+    low_pass,
+    solve_light,
+    write_light,
+)
 from reconstruct.model import SparseModel, View, WorldFrame, read_model
 from reconstruct.normalise import normalise
 from reconstruct.pictures import Pictures
-from reconstruct.raster import preview_dem, tiled_raster, tiles_of
+from reconstruct.points import pinhole_of
+from reconstruct.raster import preview_dem, tiled_raster
 from reconstruct.rectify import scaled_view
 from reconstruct.stereo_pairs import choose_pairs, in_frame, points_of_views
+from reconstruct.tiles import Tile, ViewSummary, fuse_tile, tile_tasks
 from reconstruct.view_store import ViewStore
 
 LARGEST_PIXELS = 3_000_000
@@ -45,11 +48,14 @@ CELL_PIXELS = 2.5
 """Side of a DEM cell in mean ground pixels of the pictures as matched."""
 _WITNESSES = 8
 """Neighbouring views that a view's depth is held against."""
-_TILE_CELLS = 512
 _MOST_CELLS = 4_000_000_000
 _MOST_POINTS = 40_000_000
 _BOUND_PERCENT = 0.1
-"""Points of a view left out at each side when the extent of the DEM is found."""
+"""Share of a view's points left out on each of its four sides, so that none strays far off."""
+_LIGHT_LATTICE = 28
+"""Pixels along a picture's width at which the light of views is compared."""
+_LEAST_PIXELS = 100
+"""A view with fewer pixels of confirmed depth is left out."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,44 +88,6 @@ class CheckTask:
     index: int
     view: View
     neighbours: tuple[tuple[int, View], ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ViewSummary:
-    """Where the points of a view lie."""
-
-    bounds: tuple[float, float, float, float] | None
-    """South, west, north, east; None where no depth was found."""
-    up: float
-    """Median height of its points."""
-    footprint: float
-    """Side of a pixel on the ground."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class TileTask:
-    """One tile of the grid to fuse."""
-
-    store: ViewStore
-    window: Window
-    grid: DemGrid
-    """Of the tile with its rim."""
-    rim: tuple[int, int, int, int]
-    """Cells around the tile, top, bottom, left, right, that only serve to fill gaps."""
-    views: tuple[tuple[int, View], ...]
-    offset_enu: tuple[float, float, float]
-    edge: float
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Tile:
-    """A fused tile."""
-
-    window: Window
-    height: NDArray[np.float32]
-    sigma: NDArray[np.float32]
-    count: NDArray[np.uint16]
-    vertices: NDArray[Any]
 
 
 def run_dense(workspace: Path, config: SurveyConfig, threads: int) -> bool:
@@ -212,7 +180,13 @@ def build_surface(
     grid = surface_grid(summaries, settings.dem_cell_m, model.frame)
     offset = _offset(grid, summaries)
     edge = voxel_edge(grid.cell, grid.rows * grid.columns, _MOST_POINTS)
-    tasks = tile_tasks(store, grid, views, summaries, offset, edge)
+    light = solve_light(
+        joined_samples([summary.light for summary in summaries]),
+        [view.image for view in views],
+        [view.camera for view in views],
+    )
+    write_light(folder / "light.json", light)
+    tasks = tile_tasks(store, grid, views, summaries, light, offset, edge)
     tiles = parallel_map(fuse_tile, tasks, threads=threads, label="fuse")
     count = write_ply(
         folder / "cloud.ply", _write_rasters(folder, grid, model.frame, tiles), offset, model.frame
@@ -251,6 +225,7 @@ def prepare_view(task: PrepareTask) -> None:
         valid = cv2.resize(valid.astype(np.uint8), task.size_px, interpolation=cv2.INTER_AREA) > 0
     task.store.save(task.index, "colour", colour)
     task.store.save(task.index, "valid", valid)
+    task.store.save(task.index, "low", low_pass(colour, valid))
     task.store.save(task.index, "grey", normalise(colour))
 
 
@@ -311,17 +286,45 @@ def check_view(task: CheckTask) -> ViewSummary:
         supported += seen
         refuted += through
     kept = np.isfinite(depth) & (confirmed + supported >= 3) & (refuted <= supported)
-    store.save(task.index, "kept", kept)
     rows, columns = np.nonzero(kept)
-    if len(rows) < 100:
-        return ViewSummary(bounds=None, up=np.nan, footprint=np.nan)
+    if len(rows) < _LEAST_PIXELS:
+        store.save(task.index, "kept", np.zeros_like(kept))
+        return ViewSummary(bounds=None, up=np.nan, footprint=np.nan, light=joined_samples([]))
     points = _world_points(view, depth, rows, columns)
     low, high = np.percentile(points[:, :2], [_BOUND_PERCENT, 100 - _BOUND_PERCENT], axis=0)
+    beyond = (points[:, :2] < low) | (points[:, :2] > high)
+    kept[rows, columns] = ~beyond.any(axis=1)
+    store.save(task.index, "kept", kept)
     return ViewSummary(
         bounds=(float(low[0]), float(low[1]), float(high[0]), float(high[1])),
         up=float(-np.median(points[:, 2])),
         footprint=float(np.median(depth[kept]) / np.sqrt(view.fx_px * view.fy_px)),
+        light=_shared_light(task, points, rows, columns),
     )
+
+
+def _shared_light(
+    task: CheckTask, points: Array, rows: NDArray[np.int64], columns: NDArray[np.int64]
+) -> LightSamples:
+    """Compare the light of a view and its neighbours on a lattice of its pixels."""
+    step = max(1, task.view.width_px // _LIGHT_LATTICE)
+    chosen = (rows % step == 0) & (columns % step == 0)
+    spots = points[chosen]
+    size = np.array([task.view.width_px, task.view.height_px])
+    here = (np.stack([columns[chosen], rows[chosen]], axis=1) + 0.5) / size
+    own = np.asarray(task.store.load(task.index, "low"))
+    parts = []
+    for number, other in task.neighbours:
+        seen = in_frame(other, spots)
+        there = other.project(spots[seen]) / [other.width_px, other.height_px]
+        parts.append(
+            compare_light(
+                (task.index, number),
+                (own, np.asarray(task.store.load(number, "low"))),
+                (here[seen].astype(np.float32), there.astype(np.float32)),
+            )
+        )
+    return joined_samples(parts)
 
 
 def surface_grid(
@@ -351,135 +354,6 @@ def surface_grid(
     return grid
 
 
-def tile_tasks(
-    store: ViewStore,
-    grid: DemGrid,
-    views: Sequence[View],
-    summaries: Sequence[ViewSummary],
-    offset_enu: tuple[float, float, float],
-    edge: float,
-) -> list[TileTask]:
-    """Tiles in the order of the file's rows, each with the views whose points may fall in it."""
-    tasks = []
-    for window in tiles_of(grid, _TILE_CELLS):
-        row, column = int(window.row_off), int(window.col_off)
-        rows, columns = int(window.height), int(window.width)
-        rim = (
-            min(FILL_CELLS, row),
-            min(FILL_CELLS, grid.rows - row - rows),
-            min(FILL_CELLS, column),
-            min(FILL_CELLS, grid.columns - column - columns),
-        )
-        part = grid.window(
-            row - rim[0], column - rim[2], rows + rim[0] + rim[1], columns + rim[2] + rim[3]
-        )
-        south, east = float(part.north_of(part.rows)), float(part.east_of(part.columns))
-        seeing = []
-        for index, summary in enumerate(summaries):
-            if summary.bounds is None:
-                continue
-            s, w, n, e = summary.bounds
-            margin = 0.05 * max(n - s, e - w)  # points beyond the percentiles of the bounds
-            beside = s - margin >= part.north or n + margin <= south
-            if not (beside or w - margin >= east or e + margin <= part.west):
-                seeing.append((index, views[index]))
-        tasks.append(
-            TileTask(
-                store=store,
-                window=window,
-                grid=part,
-                rim=rim,
-                views=tuple(seeing),
-                offset_enu=offset_enu,
-                edge=edge,
-            )
-        )
-    return tasks
-
-
-def fuse_tile(task: TileTask) -> Tile:
-    """Fuse the points of all views in a tile into cells and cloud points."""
-    grid, (top, bottom, left, right) = task.grid, task.rim
-    parts = [_points_in_tile(task, index, view) for index, view in task.views]
-    points = np.concatenate([p.points for p in parts] or [np.empty((0, 3))])
-    sigmas = np.concatenate([p.sigmas for p in parts] or [np.empty(0, np.float32)])
-    numbers = np.concatenate(
-        [
-            np.full(len(p.points), index, np.int32)
-            for p, (index, _) in zip(parts, task.views, strict=True)
-        ]
-        or [np.empty(0, np.int32)]
-    )
-    height, sigma, count = fuse_points(grid, points, sigmas, numbers)
-    height, sigma = fill_gaps(height, sigma, FILL_CELLS)
-    inner = (slice(top, grid.rows - bottom), slice(left, grid.columns - right))
-    own = grid.window(top, left, grid.rows - top - bottom, grid.columns - left - right)
-    inside = (
-        (points[:, 0] <= own.north)
-        & (points[:, 0] > own.north_of(own.rows))
-        & (points[:, 1] >= own.west)
-        & (points[:, 1] < own.east_of(own.columns))
-    )
-    normals = np.concatenate([p.normals_world for p in parts] or [np.empty((0, 3), np.float32)])
-    colours = np.concatenate([p.colours for p in parts] or [np.empty((0, 3), np.uint8)])
-    inside &= np.isfinite(normals).all(axis=1)
-    local = _enu(points[inside]) - np.array(task.offset_enu)
-    vertices = thinned_points(
-        local.astype(np.float32),
-        _enu(normals[inside]).astype(np.float32),
-        colours[inside],
-        sigmas[inside],
-        task.edge,
-    )
-    return Tile(
-        window=task.window,
-        height=height[inner],
-        sigma=sigma[inner],
-        count=count[inner],
-        vertices=vertices,
-    )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Points:
-    points: Array
-    sigmas: NDArray[np.float32]
-    normals_world: NDArray[np.float32]
-    colours: NDArray[np.uint8]
-    """RGB."""
-
-
-def _points_in_tile(task: TileTask, index: int, view: View) -> _Points:
-    store, grid = task.store, task.grid
-    depth = np.asarray(store.load(index, "depth"))
-    rows, columns = np.nonzero(store.load(index, "kept"))
-    points = _world_points(view, depth, rows, columns)
-    inside = (
-        (points[:, 0] <= grid.north)
-        & (points[:, 0] > grid.north_of(grid.rows))
-        & (points[:, 1] >= grid.west)
-        & (points[:, 1] < grid.east_of(grid.columns))
-    )
-    rows, columns, points = rows[inside], columns[inside], points[inside]
-    if len(rows) == 0:
-        empty = np.empty((0, 3))
-        return _Points(
-            points=empty,
-            sigmas=np.empty(0, np.float32),
-            normals_world=empty.astype(np.float32),
-            colours=empty.astype(np.uint8),
-        )
-    top, bottom = max(rows.min() - 2, 0), rows.max() + 3
-    pinhole = pinhole_of(view) - [0, 0, 0, top]
-    normals = normals_of_depth(depth[top:bottom], pinhole)[rows - top, columns]
-    return _Points(
-        points=points,
-        sigmas=np.asarray(store.load(index, "sigma"))[rows, columns],
-        normals_world=view.world_from_cam.rotation.apply(normals).astype(np.float32),
-        colours=np.asarray(store.load(index, "colour"))[rows, columns][:, ::-1],
-    )
-
-
 def _world_points(
     view: View, depth: NDArray[np.float32], rows: NDArray[np.int64], columns: NDArray[np.int64]
 ) -> Array:
@@ -488,10 +362,6 @@ def _world_points(
     y = (rows + 0.5 - view.cy_px) / view.fy_px * z
     points: Array = view.world_from_cam.apply(np.stack([x, y, z], axis=1))
     return points
-
-
-def _enu(vectors_world: Array | NDArray[np.float32]) -> Array:
-    return np.stack([vectors_world[:, 1], vectors_world[:, 0], -vectors_world[:, 2]], axis=1)
 
 
 def _points_in_sight(model: SparseModel) -> Iterator[Array]:

@@ -11,7 +11,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from alice_survey.frames import Array
-from reconstruct.model import View
 
 Float32 = NDArray[np.float32]
 
@@ -138,18 +137,3 @@ def count_witnesses(
             elif there > c + tolerance:
                 refuted[row, column] = 1
     return confirmed, refuted
-
-
-def pinhole_of(view: View) -> Array:
-    """(4,) fx, fy, cx, cy of a view."""
-    return np.array([view.fx_px, view.fy_px, view.cx_px, view.cy_px])
-
-
-def points_from_depth(view: View, depth: Float32) -> Array:
-    """World points (N, 3) of the known pixels of a depth map, in the order of the pixels."""
-    rows, columns = np.nonzero(np.isfinite(depth))
-    z = depth[rows, columns].astype(np.float64)
-    x = (columns + 0.5 - view.cx_px) / view.fx_px * z
-    y = (rows + 0.5 - view.cy_px) / view.fy_px * z
-    points: Array = view.world_from_cam.apply(np.stack([x, y, z], axis=1))
-    return points

@@ -36,7 +36,7 @@ def local_crs(datum: Datum) -> CRS:
     method = AzimuthalEquidistantConversion(
         latitude_natural_origin=datum.latitude_deg, longitude_natural_origin=datum.longitude_deg
     )
-    crs = ProjectedCRS(method, name="Local east and north of the survey's datum")
+    crs = ProjectedCRS(method, name="Local east and north of the survey's datum", geodetic_crs=4326)
     return CRS.from_wkt(crs.to_wkt())
 
 

@@ -1,0 +1,270 @@
+"""Light of lamps and lens taken out of the colours, as far as overlapping pictures tell it.
+
+A lamp that travels with the camera leaves the same pattern in every picture: the model is
+`log I = log J + m(camera, place in the picture) + g(picture)`, with J what the sea floor itself
+shows. Two pictures that see one spot share J, so that their difference tells m and g without any
+assumption about the scene (the multiplicative part of Koeser et al. 2021, "Robustly removing deep
+sea lighting effects for visual mapping of abyssal plains"). No picture is stretched by itself.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, diags_array, vstack
+
+from alice_survey.artefacts import read_json, write_json
+from alice_survey.frames import Array
+
+GRID = (9, 11)
+"""Rows and columns of nodes over a picture, first and last on its edges."""
+LOW_WIDTH_PX = 108
+"""Width to which pictures are shrunk before their light is compared."""
+_DARKEST, _BRIGHTEST = 3.0, 250.0
+"""Grey levels beyond which a pixel tells nothing of the light."""
+_MISFIT = 0.1
+"""Difference of logarithms above which two views of a spot count less (shadow, gloss, mismatch)."""
+_NODE_SIGMA, _BEND_SIGMA, _GAIN_SIGMA = 2.0, 0.05, 0.3
+"""Expected size of m at a node, of its second difference, and of g; logarithms."""
+_SAMPLES_PER_FACT = 20.0
+"""Samples of one pair of pictures that together tell as much as one independent one."""
+_ROUNDS = 6
+_LARGEST_GAIN = 8.0
+_WHITE_LEVEL, _WHITE_PERCENT = 215.0, 98.0
+_GREY_LEVEL = 105.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LightSamples:
+    """Spots that two pictures see; arrays of N rows."""
+
+    views: NDArray[np.int32]
+    """(N, 2) numbers of the two views."""
+    places: NDArray[np.float32]
+    """(N, 2, 2) where each sees the spot: x and y over the picture's width and height."""
+    levels: NDArray[np.float32]
+    """(N, 2, 3) logarithm of the low-passed BGR levels."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LightModel:
+    """What to divide colours by."""
+
+    patterns: dict[str, Array]
+    """Per camera (rows, columns, 3): logarithm of the light at the nodes, BGR."""
+    gains: dict[str, Array]
+    """Per picture (3,): logarithm of its light, BGR."""
+    white: Array
+    """(3,) factors of the whole survey that make its middle grey and its brightest white."""
+
+    def factors(self, camera: str, image: str) -> NDArray[np.float32]:
+        """(rows, columns, 3) factors at the nodes that take a picture's BGR to even light."""
+        log_light = self.patterns[camera] + self.gains[image]
+        lift = np.clip(np.exp(-log_light), 1.0 / _LARGEST_GAIN, _LARGEST_GAIN)
+        return (lift * self.white).astype(np.float32)
+
+
+def low_pass(colour: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """A small blurred copy (h, w, 3) of what is valid, in which views can be compared.
+
+    Args:
+        colour: (H, W, 3).
+        valid: (H, W); what is not is left out of all averages (0 where nothing is near).
+    """
+    height, width = valid.shape
+    small = (LOW_WIDTH_PX, max(8, round(LOW_WIDTH_PX * height / width)))
+    weight = valid.astype(np.float32)
+    picture = colour.astype(np.float32) * weight[..., None]
+    total, weight = (
+        cv2.GaussianBlur(cv2.resize(p, small, interpolation=cv2.INTER_AREA), (0, 0), 1.0)
+        for p in (picture, weight)
+    )
+    low: NDArray[np.float32] = total / np.maximum(weight, 1e-3)[..., None]
+    return low
+
+
+def at_places(picture: NDArray[np.float32], places: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Bilinear values (N, 3) of a picture at places (N, 2) given over its width and height."""
+    height, width = picture.shape[:2]
+    x = (places[:, 0] * width - 0.5).astype(np.float32).reshape(-1, 1)
+    y = (places[:, 1] * height - 0.5).astype(np.float32).reshape(-1, 1)
+    found: NDArray[np.float32] = cv2.remap(
+        picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    return found.reshape(-1, 3)
+
+
+def compare_light(
+    views: tuple[int, int],
+    pictures: tuple[NDArray[np.float32], NDArray[np.float32]],
+    places: tuple[NDArray[np.float32], NDArray[np.float32]],
+) -> LightSamples:
+    """What two views of the same spots show.
+
+    Args:
+        views: their numbers.
+        pictures: low-passed, BGR.
+        places: (N, 2) each, where they see the spots.
+    """
+    first, second = (at_places(p, at) for p, at in zip(pictures, places, strict=True))
+    levels = np.stack([first, second], axis=1)
+    usable = ((levels > _DARKEST) & (levels < _BRIGHTEST)).all(axis=(1, 2))
+    return LightSamples(
+        views=np.broadcast_to(np.array(views, np.int32), (int(usable.sum()), 2)).copy(),
+        places=np.stack(places, axis=1)[usable],
+        levels=np.log(levels[usable]),
+    )
+
+
+def joined_samples(parts: Sequence[LightSamples]) -> LightSamples:
+    """Samples of several pairs as one."""
+    return LightSamples(
+        views=np.concatenate([np.empty((0, 2), np.int32), *(p.views for p in parts)]),
+        places=np.concatenate([np.empty((0, 2, 2), np.float32), *(p.places for p in parts)]),
+        levels=np.concatenate([np.empty((0, 2, 3), np.float32), *(p.levels for p in parts)]),
+    )
+
+
+def solve_light(samples: LightSamples, images: Sequence[str], cameras: Sequence[str]) -> LightModel:
+    """Find patterns and gains by robust least squares over all pairs of views.
+
+    What overlaps cannot tell (a common factor; a slope over the picture that gains along a line
+    could undo) is held at its smallest by weak priors.
+
+    Args:
+        samples: spots seen by two views.
+        images: names of the views, by number.
+        cameras: their cameras.
+    """
+    names = sorted(set(cameras))
+    nodes = GRID[0] * GRID[1]
+    unknowns = nodes * len(names) + len(images)
+    camera_of = np.array([names.index(camera) for camera in cameras])
+    count = len(samples.views)
+    design = csr_array((count, unknowns))
+    for side, sign in ((0, 1.0), (1, -1.0)):
+        columns, weights = _node_weights(samples.places[:, side])
+        columns = columns + nodes * camera_of[samples.views[:, side]][:, None]
+        gain = nodes * len(names) + samples.views[:, side]
+        columns = np.concatenate([columns, gain[:, None]], axis=1)
+        weights = np.concatenate([weights, np.ones((count, 1))], axis=1)
+        rows = np.repeat(np.arange(count), columns.shape[1])
+        part = csr_array((sign * weights.ravel(), (rows, columns.ravel())), (count, unknowns))
+        design = design + part
+    prior = _prior(len(names), len(images))
+    solution = np.zeros((unknowns, 3))
+    for channel in range(3):
+        target = (samples.levels[:, 0, channel] - samples.levels[:, 1, channel]).astype(np.float64)
+        x = np.zeros(unknowns)
+        for _ in range(_ROUNDS):
+            misfit = np.abs(target - design @ x)
+            weight = 1.0 / np.maximum(misfit, _MISFIT) / _MISFIT / _SAMPLES_PER_FACT
+            weighted = diags_array(weight) @ design
+            normal = (weighted.T @ design + prior).toarray()
+            x = np.linalg.solve(normal, weighted.T @ target)
+        solution[:, channel] = x
+    patterns = solution[: nodes * len(names)].reshape(len(names), *GRID, 3)
+    patterns = patterns - patterns.mean(axis=(0, 1, 2))
+    gains = solution[nodes * len(names) :]
+    gains = gains - gains.mean(axis=0)
+    even = LightModel(
+        patterns=dict(zip(names, patterns, strict=True)),
+        gains=dict(zip(images, gains, strict=True)),
+        white=np.ones(3),
+    )
+    return LightModel(
+        patterns=even.patterns,
+        gains=even.gains,
+        white=_white(samples, even, images, cameras),
+    )
+
+
+def _node_weights(places: NDArray[np.float32]) -> tuple[NDArray[np.int64], Array]:
+    """The four nodes around each place and their bilinear weights, (N, 4) each."""
+    rows, columns = GRID
+    x = np.clip(places[:, 0].astype(np.float64), 0, 1) * (columns - 1)
+    y = np.clip(places[:, 1].astype(np.float64), 0, 1) * (rows - 1)
+    left = np.minimum(x.astype(np.int64), columns - 2)
+    top = np.minimum(y.astype(np.int64), rows - 2)
+    a, b = x - left, y - top
+    corner = top * columns + left
+    nodes = np.stack([corner, corner + 1, corner + columns, corner + columns + 1], axis=1)
+    weights = np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b], axis=1)
+    return nodes, weights
+
+
+def _prior(cameras: int, views: int) -> Any:
+    rows, columns = GRID
+    number = np.arange(rows * columns).reshape(rows, columns)
+    triples = np.concatenate(
+        [
+            np.stack([number[:, :-2], number[:, 1:-1], number[:, 2:]], axis=-1).reshape(-1, 3),
+            np.stack([number[:-2], number[1:-1], number[2:]], axis=-1).reshape(-1, 3),
+        ]
+    )
+    nodes = rows * columns
+    unknowns = nodes * cameras + views
+    parts = []
+    for camera in range(cameras):
+        at = np.repeat(np.arange(len(triples)), 3)
+        bend = np.tile([1.0, -2.0, 1.0], len(triples)) / _BEND_SIGMA
+        parts.append(
+            csr_array((bend, (at, (triples + camera * nodes).ravel())), (len(triples), unknowns))
+        )
+    size = np.concatenate(
+        [np.full(nodes * cameras, 1.0 / _NODE_SIGMA), np.full(views, 1.0 / _GAIN_SIGMA)]
+    )
+    parts.append(csr_array((size, (np.arange(unknowns), np.arange(unknowns)))))
+    root = vstack(parts).tocsr()
+    return root.T @ root
+
+
+def _white(
+    samples: LightSamples, light: LightModel, images: Sequence[str], cameras: Sequence[str]
+) -> Array:
+    """Factors that make the survey's median grey, and bright enough without burning out."""
+    if not len(samples.views):
+        return np.ones(3)
+    first = samples.views[:, 0]
+    nodes, weights = _node_weights(samples.places[:, 0])
+    level = np.empty((len(first), 3))
+    for number in np.unique(first):
+        mine = first == number
+        factors = light.factors(cameras[number], images[number]).reshape(-1, 3)
+        lift = (factors[nodes[mine]] * weights[mine][..., None]).sum(axis=1)
+        level[mine] = np.exp(samples.levels[mine, 0]) * lift
+    middle = np.median(level, axis=0)
+    grey = middle.mean() / middle
+    bright = np.percentile((level * grey).mean(axis=1), _WHITE_PERCENT)
+    lift = min(_WHITE_LEVEL / bright, _GREY_LEVEL / middle.mean())
+    white: Array = grey * lift
+    return white
+
+
+def write_light(path: Path, light: LightModel) -> None:
+    """Write `light.json`."""
+    write_json(
+        path,
+        {
+            "format": "alice-survey light",
+            "version": 1,
+            "channels": ["blue", "green", "red"],
+            "white": [round(float(w), 6) for w in light.white],
+            "patterns": {n: np.round(p, 5).tolist() for n, p in sorted(light.patterns.items())},
+            "gains": {n: np.round(g, 5).tolist() for n, g in sorted(light.gains.items())},
+        },
+    )
+
+
+def read_light(path: Path) -> LightModel:
+    """Read `light.json`."""
+    data = read_json(path)
+    return LightModel(
+        patterns={name: np.array(pattern) for name, pattern in data["patterns"].items()},
+        gains={name: np.array(gain) for name, gain in data["gains"].items()},
+        white=np.array(data["white"]),
+    )

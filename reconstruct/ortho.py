@@ -1,0 +1,139 @@
+"""Which view paints which pixel of the mosaic: projection, sight lines and quality."""
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from alice_survey.frames import Array
+
+Float32 = NDArray[np.float32]
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def visible_cells(
+    height: Float32, camera_enu: Array, west: float, north: float, cell: float, tolerance: float
+) -> NDArray[np.bool_]:
+    """Which cells of a DEM a camera sees over the DEM itself.
+
+    From each cell's centre the line to the camera is followed, cell by cell, until it is above
+    all of the DEM; the DEM hides the cell where it rises above the line by more than a tolerance.
+
+    Args:
+        height: (H, W) up, NaN where unknown (there nothing hides).
+        camera_enu: (3,) the camera's centre, in the coordinates of the DEM.
+        west: east coordinate of the first column's outer edge.
+        north: north coordinate of the first row's outer edge.
+        cell: side of a cell.
+        tolerance: in the unit of height.
+
+    Returns:
+        (H, W); False where the height is unknown.
+    """
+    rows, columns = height.shape
+    visible = np.zeros((rows, columns), np.bool_)
+    top = -np.inf
+    for row in range(rows):
+        for column in range(columns):
+            if height[row, column] > top:
+                top = height[row, column]
+    camera_column = (camera_enu[0] - west) / cell - 0.5
+    camera_row = (north - camera_enu[1]) / cell - 0.5
+    for row in range(rows):
+        for column in range(columns):
+            h = height[row, column]
+            if math.isnan(h) or h >= camera_enu[2]:
+                continue
+            right, down = camera_column - column, camera_row - row
+            steps = max(abs(right), abs(down))
+            hidden = False
+            if steps >= 1.0:
+                rise = (camera_enu[2] - h) / steps
+                last = min(steps, (top - h) / rise)
+                for n in range(1, math.floor(last) + 1):
+                    r = round(row + down * n / steps)
+                    c = round(column + right * n / steps)
+                    if r < 0 or c < 0 or r >= rows or c >= columns:
+                        break
+                    if height[r, c] > h + rise * n + tolerance:
+                        hidden = True
+                        break
+            visible[row, column] = not hidden
+    return visible
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def look_up(
+    height: Float32,
+    visible: NDArray[np.bool_],
+    first_cell: tuple[float, float],
+    cells_per_pixel: float,
+    cam_from_enu: Array,
+    pinhole: Array,
+    size: tuple[int, int],
+    first_enu: tuple[float, float],
+    pixel: float,
+    rim: float,
+) -> tuple[Float32, Float32, Float32]:
+    """Where a view sees each pixel of a tile, and how well.
+
+    The quality is the distance from the rim of the picture (1 in the middle, 0 at the rim) times
+    the cosine of the angle to the vertical over the distance squared, so that the middle of near,
+    steep views wins.
+
+    Args:
+        height: (H, W) up at the pixels' centres, NaN where unknown.
+        visible: cells of the DEM that the view sees.
+        first_cell: row and column of the first pixel's centre in `visible` (cell centres whole).
+        cells_per_pixel: side of a pixel over side of a cell.
+        cam_from_enu: (3, 4) transform to the camera.
+        pinhole: (4,) fx, fy, cx, cy, px.
+        size: width and height of the picture, px.
+        first_enu: east and north of the first pixel's centre.
+        pixel: side of a pixel.
+        rim: pixels of the picture at its edges that are not used.
+
+    Returns:
+        (H, W) x and y in OpenCV's pixels (-1 where not seen) and the quality (0 where not seen).
+    """
+    rows, columns = height.shape
+    x = np.full((rows, columns), -1.0, np.float32)
+    y = np.full((rows, columns), -1.0, np.float32)
+    quality = np.zeros((rows, columns), np.float32)
+    t = cam_from_enu
+    half = 0.5 * min(size[0], size[1])
+    for row in range(rows):
+        north = first_enu[1] - row * pixel
+        cell_row = round(first_cell[0] + row * cells_per_pixel)
+        if cell_row < 0 or cell_row >= visible.shape[0]:
+            continue
+        for column in range(columns):
+            up = height[row, column]
+            if math.isnan(up):
+                continue
+            cell_column = round(first_cell[1] + column * cells_per_pixel)
+            if cell_column < 0 or cell_column >= visible.shape[1]:
+                continue
+            if not visible[cell_row, cell_column]:
+                continue
+            east = first_enu[0] + column * pixel
+            c = t[2, 0] * east + t[2, 1] * north + t[2, 2] * up + t[2, 3]
+            if c <= 0.0:
+                continue
+            a = t[0, 0] * east + t[0, 1] * north + t[0, 2] * up + t[0, 3]
+            b = t[1, 0] * east + t[1, 1] * north + t[1, 2] * up + t[1, 3]
+            u = pinhole[0] * a / c + pinhole[2]
+            v = pinhole[1] * b / c + pinhole[3]
+            inset = min(min(u, size[0] - u), min(v, size[1] - v)) - rim
+            if inset <= 0.0:
+                continue
+            distance = math.sqrt(a * a + b * b + c * c)
+            # the camera's height over the point, along the third row of enu_from_cam
+            cosine = -(t[0, 2] * a + t[1, 2] * b + t[2, 2] * c) / distance
+            if cosine <= 0.05:
+                continue
+            x[row, column] = u - 0.5
+            y[row, column] = v - 0.5
+            quality[row, column] = inset / half * cosine / (distance * distance)
+    return x, y, quality

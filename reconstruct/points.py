@@ -1,0 +1,195 @@
+"""Depth maps as points with normals and colours, in local east, north, up."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from alice_survey.frames import Array
+from reconstruct.model import View
+
+Float32 = NDArray[np.float32]
+
+_ENU_FROM_WORLD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+_REACH = 2
+"""Normals are spanned by the points this many pixels to either side."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Points:
+    """Points of one or more views; arrays of N rows."""
+
+    enu: Float32
+    """(N, 3) east, north, up from an offset that the caller knows."""
+    normals: Float32
+    """(N, 3) unit vectors towards the camera; NaN beside unknown depth."""
+    colours: NDArray[np.uint8]
+    """(N, 3) RGB."""
+    sigmas: Float32
+    """(N,) standard deviations of the depth."""
+    views: NDArray[np.int32]
+    """(N,) number of the view, in ascending order."""
+
+
+def pinhole_of(view: View) -> Array:
+    """(4,) fx, fy, cx, cy of a view, px."""
+    return np.array([view.fx_px, view.fy_px, view.cx_px, view.cy_px])
+
+
+def enu_from_cam(view: View, offset_enu: Array) -> Array:
+    """(3, 4) transform from a view's camera to east, north, up from an offset."""
+    matrix = _ENU_FROM_WORLD @ view.world_from_cam.as_matrix()[:3]
+    matrix[:, 3] -= offset_enu
+    return np.ascontiguousarray(matrix)
+
+
+def points_in_box(
+    view: View,
+    number: int,
+    depth: Float32,
+    sigma: Float32,
+    kept: NDArray[np.bool_],
+    colour: NDArray[np.uint8],
+    factors: Float32,
+    offset_enu: Array,
+    box: tuple[float, float, float, float],
+) -> Points:
+    """The kept points of a depth map inside of a box.
+
+    Args:
+        view: that the depth belongs to.
+        number: of the view.
+        depth: (H, W) along the axis.
+        sigma: (H, W) of it.
+        kept: (H, W) which pixels to take.
+        colour: (H, W, 3) BGR.
+        factors: (rows, columns, 3) at nodes spread over the picture, by which colours are taken.
+        offset_enu: (3,) origin of the points.
+        box: west, east, south, north from that origin; a point on the west or north edge is inside.
+    """
+    transform = enu_from_cam(view, offset_enu)
+    enu, normals, colours, sigmas = gather(
+        depth, sigma, kept, colour, factors, pinhole_of(view), transform, np.array(box)
+    )
+    return Points(
+        enu=enu,
+        normals=normals,
+        colours=colours,
+        sigmas=sigmas,
+        views=np.full(len(enu), number, np.int32),
+    )
+
+
+def joined(parts: list[Points]) -> Points:
+    """Points of several views as one."""
+    empty = np.empty((0, 3), np.float32)
+    none = Points(
+        enu=empty,
+        normals=empty,
+        colours=empty.astype(np.uint8),
+        sigmas=empty[:, 0],
+        views=empty[:, 0].astype(np.int32),
+    )
+    parts = [none, *parts]
+    return Points(
+        enu=np.concatenate([p.enu for p in parts]),
+        normals=np.concatenate([p.normals for p in parts]),
+        colours=np.concatenate([p.colours for p in parts]),
+        sigmas=np.concatenate([p.sigmas for p in parts]),
+        views=np.concatenate([p.views for p in parts]),
+    )
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def gather(
+    depth: Float32,
+    sigma: Float32,
+    kept: NDArray[np.bool_],
+    colour: NDArray[np.uint8],
+    factors: Float32,
+    pinhole: Array,
+    enu_from_cam: Array,
+    box: Array,
+) -> tuple[Float32, Float32, NDArray[np.uint8], Float32]:
+    """Points, normals, colours (RGB) and standard deviations of pixels whose point is in a box.
+
+    Args:
+        depth: (H, W) along the axis, NaN where unknown.
+        sigma: (H, W) of it.
+        kept: (H, W) which pixels to take.
+        colour: (H, W, 3) BGR.
+        factors: (rows, columns, 3) at nodes spread over the picture, BGR.
+        pinhole: (4,) fx, fy, cx, cy, px.
+        enu_from_cam: (3, 4) transform.
+        box: (4,) west, east, south, north.
+
+    Returns:
+        (N, 3), (N, 3), (N, 3), (N,), row by row; a normal is NaN beside unknown depth.
+    """
+    height, width = depth.shape
+    t = enu_from_cam
+    enu = np.empty((height * width, 3), np.float32)
+    pixels = np.empty((height * width, 2), np.int32)
+    count = 0
+    for row in range(height):
+        y = (row + 0.5 - pinhole[3]) / pinhole[1]
+        for column in range(width):
+            if not kept[row, column]:
+                continue
+            x = (column + 0.5 - pinhole[2]) / pinhole[0]
+            z = depth[row, column]
+            east = z * (t[0, 0] * x + t[0, 1] * y + t[0, 2]) + t[0, 3]
+            north = z * (t[1, 0] * x + t[1, 1] * y + t[1, 2]) + t[1, 3]
+            if east < box[0] or east >= box[1] or north <= box[2] or north > box[3]:
+                continue
+            enu[count, 0] = east
+            enu[count, 1] = north
+            enu[count, 2] = z * (t[2, 0] * x + t[2, 1] * y + t[2, 2]) + t[2, 3]
+            pixels[count, 0] = row
+            pixels[count, 1] = column
+            count += 1
+    normals = np.full((count, 3), np.nan, np.float32)
+    colours = np.empty((count, 3), np.uint8)
+    sigmas = np.empty(count, np.float32)
+    a, b = np.empty(3), np.empty(3)
+    for i in range(count):
+        row, column = pixels[i, 0], pixels[i, 1]
+        sigmas[i] = sigma[row, column]
+        place = (row + 0.5) / height * (factors.shape[0] - 1)
+        node_row = min(int(place), factors.shape[0] - 2)
+        p = place - node_row
+        place = (column + 0.5) / width * (factors.shape[1] - 1)
+        node = min(int(place), factors.shape[1] - 2)
+        q = place - node
+        for k in range(3):
+            above = factors[node_row, node, k] * (1 - q) + factors[node_row, node + 1, k] * q
+            below = (
+                factors[node_row + 1, node, k] * (1 - q) + factors[node_row + 1, node + 1, k] * q
+            )
+            level = colour[row, column, k] * (above * (1 - p) + below * p)
+            colours[i, 2 - k] = min(255, int(level + 0.5))
+        up, down, left, right = row - 2, row + 2, column - 2, column + 2
+        if up < 0 or left < 0 or down >= height or right >= width:
+            continue
+        x = (column + 0.5 - pinhole[2]) / pinhole[0]
+        y = (row + 0.5 - pinhole[3]) / pinhole[1]
+        step_x, step_y = _REACH / pinhole[0], _REACH / pinhole[1]
+        z_l, z_r = depth[row, left], depth[row, right]
+        z_u, z_d = depth[up, column], depth[down, column]
+        a[0] = (x + step_x) * z_r - (x - step_x) * z_l
+        a[1] = y * (z_r - z_l)
+        a[2] = z_r - z_l
+        b[0] = x * (z_d - z_u)
+        b[1] = (y + step_y) * z_d - (y - step_y) * z_u
+        b[2] = z_d - z_u
+        n0 = b[1] * a[2] - b[2] * a[1]
+        n1 = b[2] * a[0] - b[0] * a[2]
+        n2 = b[0] * a[1] - b[1] * a[0]
+        length = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
+        if not length > 0.0:  # NaN as well
+            continue
+        for k in range(3):
+            normals[i, k] = (t[k, 0] * n0 + t[k, 1] * n1 + t[k, 2] * n2) / length
+    return enu[:count].copy(), normals, colours, sigmas

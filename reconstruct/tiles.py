@@ -1,0 +1,157 @@
+"""Fusing the points of all views, tile by tile, into cells of the DEM and points of the cloud."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rasterio.windows import Window
+
+from reconstruct.cloud import thinned_points
+from reconstruct.dem import FILL_CELLS, DemGrid, fill_gaps, fuse_points
+from reconstruct.light import LightModel, LightSamples
+from reconstruct.model import View
+from reconstruct.points import joined, points_in_box
+from reconstruct.raster import tiles_of
+from reconstruct.view_store import ViewStore
+
+_TILE_CELLS = 512
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewSummary:
+    """Where the points of a view lie."""
+
+    bounds: tuple[float, float, float, float] | None
+    """South, west, north, east; None where no depth was found."""
+    up: float
+    """Median height of its points."""
+    footprint: float
+    """Side of a pixel on the ground."""
+    light: LightSamples
+    """What it and its neighbours show of the same spots."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TileTask:
+    """One tile of the grid to fuse."""
+
+    store: ViewStore
+    window: Window
+    grid: DemGrid
+    """Of the tile with its rim."""
+    rim: tuple[int, int, int, int]
+    """Cells around the tile, top, bottom, left, right, that only serve to fill gaps."""
+    views: tuple[tuple[int, View], ...]
+    light: LightModel
+    offset_enu: tuple[float, float, float]
+    edge: float
+    """Of the cubes to which the cloud is thinned."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Tile:
+    """A fused tile."""
+
+    window: Window
+    height: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    count: NDArray[np.uint16]
+    vertices: NDArray[Any]
+
+
+def tile_tasks(
+    store: ViewStore,
+    grid: DemGrid,
+    views: Sequence[View],
+    summaries: Sequence[ViewSummary],
+    light: LightModel,
+    offset_enu: tuple[float, float, float],
+    edge: float,
+) -> list[TileTask]:
+    """Tiles in the order of the file's rows, each with the views whose points may fall in it."""
+    tasks = []
+    for window in tiles_of(grid, _TILE_CELLS):
+        row, column = int(window.row_off), int(window.col_off)
+        rows, columns = int(window.height), int(window.width)
+        rim = (
+            min(FILL_CELLS, row),
+            min(FILL_CELLS, grid.rows - row - rows),
+            min(FILL_CELLS, column),
+            min(FILL_CELLS, grid.columns - column - columns),
+        )
+        part = grid.window(
+            row - rim[0], column - rim[2], rows + rim[0] + rim[1], columns + rim[2] + rim[3]
+        )
+        south, east = float(part.north_of(part.rows)), float(part.east_of(part.columns))
+        seeing = []
+        for index, summary in enumerate(summaries):
+            if summary.bounds is None:
+                continue
+            s, w, n, e = summary.bounds
+            beside = s >= part.north or n <= south
+            if not (beside or w >= east or e <= part.west):
+                seeing.append((index, views[index]))
+        tasks.append(
+            TileTask(
+                store=store,
+                window=window,
+                grid=part,
+                rim=rim,
+                views=tuple(seeing),
+                light=light,
+                offset_enu=offset_enu,
+                edge=edge,
+            )
+        )
+    return tasks
+
+
+def fuse_tile(task: TileTask) -> Tile:
+    """Fuse the points of all views in a tile into cells and cloud points."""
+    offset = np.array(task.offset_enu)
+    grid = task.grid.moved(-offset[0], -offset[1])
+    box = (
+        grid.west,
+        float(grid.east_of(grid.columns)),
+        float(grid.north_of(grid.rows)),
+        grid.north,
+    )
+    store = task.store
+    points = joined(
+        [
+            points_in_box(
+                view,
+                index,
+                np.asarray(store.load(index, "depth")),
+                np.asarray(store.load(index, "sigma")),
+                np.asarray(store.load(index, "kept")),
+                np.asarray(store.load(index, "colour")),
+                task.light.factors(view.camera, view.image),
+                offset,
+                box,
+            )
+            for index, view in task.views
+        ]
+    )
+    height, sigma, count = fuse_points(grid, points)
+    height, sigma = fill_gaps(height, sigma, FILL_CELLS)
+    top, bottom, left, right = task.rim
+    inner = (slice(top, grid.rows - bottom), slice(left, grid.columns - right))
+    own = grid.window(top, left, grid.rows - top - bottom, grid.columns - left - right)
+    columns = DemGrid(
+        west=own.west,
+        north=own.north,
+        cell=task.edge,
+        rows=math.ceil(own.rows * own.cell / task.edge - 1e-9),
+        columns=math.ceil(own.columns * own.cell / task.edge - 1e-9),
+    )
+    return Tile(
+        window=task.window,
+        height=(height[inner] + offset[2]).astype(np.float32),
+        sigma=sigma[inner],
+        count=count[inner],
+        vertices=thinned_points(columns, points),
+    )
