@@ -78,10 +78,11 @@ def _tube(line: Array, around: int) -> tuple[Array, NDArray[np.int64]]:
     angle = 2.0 * np.pi * np.arange(around) / around
     centre = np.stack([line[:, 0], line[:, 1], zero], axis=1)
     rings = (
-        centre[:, None]
-        + _HANDLE_HALF_DEPTH_M * np.cos(angle)[:, None] * across[:, None]
+        _HANDLE_HALF_DEPTH_M * np.cos(angle)[:, None] * across[:, None]
         + _HANDLE_HALF_WIDTH_M * np.sin(angle)[:, None] * up
     )
+    rings[[0, -1]] = 0.0  # closed ends
+    rings += centre[:, None]
     return rings.reshape(-1, 3), _ring_triangles(len(line), around)
 
 

@@ -106,8 +106,8 @@ def scatter_rocks(
     rocks = []
     for _ in range(count):
         place = rng.uniform((south, west), (north, east))
-        # Inverse transform of a density that falls with the size to the power of -2.
-        power = -1.0
+        # Inverse transform of a density that falls with the size to the power of -1.5.
+        power = -0.5
         u = rng.uniform()
         size_m = (smallest_m**power + u * (largest_m**power - smallest_m**power)) ** (1 / power)
         wave_numbers = rng.normal(0.0, [[2.4, 2.4]] * 4 + [[6.0, 6.0]] * 6)

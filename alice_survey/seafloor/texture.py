@@ -116,7 +116,7 @@ def _albedo(points: Array, material: Array, footprint: Array, seed: int, out: Ar
             else:
                 r, g, b = _sand(coarse[i], fine[i], hue[i], max(-kind, 0.0))
                 # The edge of a stone is ragged, not the smooth contour of the grid.
-                stone = _step(0.3, 0.7, kind + 0.3 * fine[i]) if kind > 0.001 else 0.0
+                stone = _step(0.44, 0.56, kind + 0.3 * fine[i]) if kind > 0.001 else 0.0
                 if stone < 1.0:
                     r, g, b = _specked(x[i], y[i], z[i], apart[i], seed, fine[i], r, g, b)
                 if stone > 0.0:

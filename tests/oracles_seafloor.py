@@ -1,0 +1,114 @@
+"""Slow, obvious twins of what the simulated sea floor computes, written apart from it."""
+
+import math
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+U32 = 0xFFFFFFFF
+
+
+def fermat_pixels(camera: dict[str, float], points_cam: np.ndarray) -> np.ndarray:
+    """Pixels of points seen through a flat port, by Fermat's principle of the quickest path.
+
+    The light's way from a point to the pupil crosses the outer glass at radius r2 and the inner at
+    r1; both minimise the optical path. It is convex, so that halving brackets finds it: the inner
+    search has the best r1 for each r2.
+
+    Args:
+        camera: fx_px, fy_px, cx_px, cy_px, k1, k2, p1, p2, k3, port_distance_m, glass_thickness_m,
+            n_glass, n_water of a port square to the axis.
+        points_cam: (N, 3).
+
+    Returns:
+        (N, 2) pixels that count from the outer corner of the first pixel.
+    """
+    d, g = camera["port_distance_m"], camera["glass_thickness_m"]
+    radius = np.hypot(points_cam[:, 0], points_cam[:, 1])
+    water = points_cam[:, 2] - d - g
+
+    def slope_inner(r1: np.ndarray, r2: np.ndarray) -> np.ndarray:
+        """Derivative of the path through air and glass by r1."""
+        return r1 / np.hypot(d, r1) - camera["n_glass"] * (r2 - r1) / np.hypot(g, r2 - r1)
+
+    def best_inner(r2: np.ndarray) -> np.ndarray:
+        low, high = np.zeros_like(r2), r2.copy()
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            rising = slope_inner(middle, r2) > 0.0
+            low, high = np.where(rising, low, middle), np.where(rising, middle, high)
+        return 0.5 * (low + high)
+
+    low, high = np.zeros_like(radius), radius.copy()
+    for _ in range(60):
+        r2 = 0.5 * (low + high)
+        r1 = best_inner(r2)
+        # Derivative of the whole path by r2 (that by r1 is zero).
+        slope = camera["n_glass"] * (r2 - r1) / np.hypot(g, r2 - r1)
+        slope -= camera["n_water"] * (radius - r2) / np.hypot(water, radius - r2)
+        rising = slope > 0.0
+        low, high = np.where(rising, low, r2), np.where(rising, r2, high)
+    tangent = best_inner(0.5 * (low + high)) / d
+    away = np.where(radius > 0.0, radius, 1.0)
+    x, y = tangent * points_cam[:, 0] / away, tangent * points_cam[:, 1] / away
+    r2 = x * x + y * y
+    radial = 1.0 + camera["k1"] * r2 + camera["k2"] * r2**2 + camera["k3"] * r2**3
+    xd = x * radial + 2.0 * camera["p1"] * x * y + camera["p2"] * (r2 + 2.0 * x * x)
+    yd = y * radial + camera["p1"] * (r2 + 2.0 * y * y) + 2.0 * camera["p2"] * x * y
+    return np.column_stack([
+        camera["fx_px"] * xd + camera["cx_px"], camera["fy_px"] * yd + camera["cy_px"],
+    ])  # fmt: skip
+
+
+def world_to_cam(ned_from_cam: RigidTransform, points_ned: np.ndarray) -> np.ndarray:
+    """Points in the camera's frame, spelled out: R^T (p - t)."""
+    rotation, place = ned_from_cam.rotation.as_matrix(), ned_from_cam.translation
+    return (points_ned - place) @ rotation
+
+
+def mix_bits(h: int) -> int:
+    """The integer hash, in Python's unbounded integers."""
+    h ^= h >> 15
+    h = (h * 0x2C1B3C6D) & U32
+    h ^= h >> 12
+    h = (h * 0x297A2D39) & U32
+    return h ^ (h >> 15)
+
+
+def gradient_noise(x: float, y: float, z: float, lattice: float, seed: int) -> float:
+    """Gradient noise at one place: the ramps of the eight corners of its cell, faded together."""
+    place = [x / lattice, y / lattice, z / lattice]
+    cell = [math.floor(p) for p in place]
+    inside = [p - c for p, c in zip(place, cell, strict=True)]
+    fade = [t**3 * (t * (6.0 * t - 15.0) + 10.0) for t in inside]
+    total = 0.0
+    for corner in np.ndindex(2, 2, 2):
+        at = [c + k for c, k in zip(cell, corner, strict=True)]
+        h = (at[0] * 0x8DA6B343) & U32 ^ (at[1] * 0xD8163841) & U32 ^ (at[2] * 0xCB1AB31F) & U32
+        h = mix_bits(h ^ seed)
+        gradient = [((h >> shift) & 1023) - 511.5 for shift in (0, 10, 20)]
+        ramp = sum(s * (t - k) for s, t, k in zip(gradient, inside, corner, strict=True))
+        weight = math.prod(f if k else 1.0 - f for f, k in zip(fade, corner, strict=True))
+        total += weight * ramp
+    return 2.5 / 511.5 * total
+
+
+def direct_light(
+    point: np.ndarray,
+    normal: np.ndarray,
+    path_m: float,
+    strobes: np.ndarray,
+    axis: np.ndarray,
+    profile: np.ndarray,
+    peak: float,
+    attenuation: np.ndarray,
+) -> np.ndarray:
+    """What strobes send that shine on the point with the share `profile` of their peak, (3,)."""
+    total = np.zeros(3)
+    for strobe, share in zip(strobes, profile, strict=True):
+        ray = strobe - point
+        distance = np.linalg.norm(ray)
+        cosine = max(float(normal @ ray) / distance, 0.0)
+        lost = np.exp(-attenuation * (distance + path_m))
+        total += share * peak * cosine / distance**2 * lost
+    return total
