@@ -1,5 +1,6 @@
 """Run pure functions over pictures, pairs and tiles: in order, parallel, with a bounded queue."""
 
+import contextlib
 import ctypes
 import multiprocessing
 import os
@@ -11,6 +12,7 @@ from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from typing import TypeVar
 
 _PR_SET_PDEATHSIG = 1
+_CORES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -48,7 +50,10 @@ def parallel_map(
         yield from progress(map(function, items), label, total)
         return
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(threads, mp_context=context, initializer=_start_worker) as executor:
+    with (
+        _one_core_each(),
+        ProcessPoolExecutor(threads, mp_context=context, initializer=_start_worker) as executor,
+    ):
         yield from progress(_in_order(executor, function, items, 3 * threads), label, total)
 
 
@@ -68,12 +73,26 @@ def _in_order(
             future.cancel()
 
 
+@contextlib.contextmanager
+def _one_core_each() -> Iterator[None]:
+    """Have processes started meanwhile load their numeric libraries for one core each."""
+    before = {name: os.environ.get(name) for name in _CORES}
+    os.environ.update(dict.fromkeys(_CORES, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
 def _start_worker() -> None:
     """Use one core, and end with the process that started this one, even if that is killed."""
     import cv2
 
     cv2.setNumThreads(1)
-    os.environ["OMP_NUM_THREADS"] = "1"
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
