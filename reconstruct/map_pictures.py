@@ -34,6 +34,7 @@ from reconstruct.matching import (
 from reconstruct.normalise import normalise
 from reconstruct.pairs import choose_pairs
 from reconstruct.pictures import read_colour, read_mask
+from reconstruct.priors import pinhole_positions, refine_with_positions
 from reconstruct.working_range import Distances, find_distances
 
 RATIO = 0.8
@@ -110,6 +111,9 @@ def run_mapping(
         if inputs.rig is not None:
             poses = {name: inputs.rig.cam_from_rig[name] for name in cameras}
             mapped = map_calibrated(seen, poses, lenses, partial, config.seed)
+            if inputs.datum is not None and mapped.scaled:
+                told = pinhole_positions(inputs.records, inputs.rig, lenses, inputs.datum)
+                mapped = refine_with_positions(mapped, inputs.records, *told)
         else:
             mapped = map_self_calibrated(seen, partial, config.seed)
         _write(partial, inputs, mapped, distances)

@@ -217,6 +217,13 @@ def _run_mapper(
     options.min_model_size = 3
     options.mapper.init_min_tri_angle = _LEAST_ANGLE_DEG
     options.ba_refine_sensor_from_rig = False
+    if cam_from_rig is not None:
+        # A station at the end of a line may share with its neighbour only what the two pictures
+        # of one station saw: such points carry it.
+        options.triangulation.ignore_two_view_tracks = False
+        # The first pair is of arbitrary scale, in which the rig does not fit; what it failed to
+        # triangulate within a station is tried again once the scale has settled.
+        options.triangulation.re_min_ratio = 0.9
     if calibrated:
         options.ba_refine_focal_length = False
         options.ba_refine_extra_params = False

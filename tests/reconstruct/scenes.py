@@ -1,0 +1,111 @@
+"""A synthetic survey whose every ray is known: stereo stations over relief, through flat ports."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.config import CameraConfig, WaterConfig
+from alice_survey.frames import Array, Datum, rotation_from_attitude
+from alice_survey.manifest import ImageRecord
+from camera_calib.rig import Rig, design_rig
+from reconstruct.matching import PairMatches
+
+DATUM = Datum(32.8236, 34.9553)
+SEAFLOOR_M = 15.0
+ALTITUDE_M = 2.0
+CALIBRATED = 2
+"""COLMAP's number of a pair of calibrated pictures."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scene:
+    """Truth, and what cameras and navigation say of it."""
+
+    rig: Rig
+    records: list[ImageRecord]
+    ned_from_cam: list[RigidTransform]
+    points_ned: Array
+    pixels: list[Array]
+    """As the flat-port cameras see them."""
+    ids: list[Array]
+    """Which point every pixel shows."""
+    pairs: list[tuple[int, int, PairMatches]]
+
+
+def make_scene(
+    *,
+    lines: int = 3,
+    stations: int = 7,
+    points: int = 1500,
+    noise_px: float = 0.0,
+    bias_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    port_distance_m: float = 0.02,
+    seed: int = 5,
+) -> Scene:
+    """Fly lawnmower lines 1 m apart over relief of about 0.3 m and look at random points.
+
+    Navigation is the truth plus a constant bias and 0.1 degrees of attitude noise.
+    """
+    rng = np.random.default_rng(seed)
+    camera = CameraConfig(port_distance_m=port_distance_m)
+    rig = design_rig(camera, WaterConfig(), scale=4)
+    length = 0.55 * stations
+    north = rng.uniform(-1.5, length + 1.5, points)
+    east = rng.uniform(-1.5, lines + 0.5, points)
+    relief = 0.1 * np.sin(2.1 * north) + 0.06 * np.cos(3.3 * east + north)
+    points_ned = np.stack([north, east, SEAFLOOR_M + relief], axis=1)
+    records, poses, pixels, ids = [], [], [], []
+    for station in range(lines * stations):
+        line, step = divmod(station, stations)
+        place = step if line % 2 == 0 else stations - 1 - step
+        heading = 0.0 if line % 2 == 0 else np.pi
+        body = np.array([0.55 * place, float(line), SEAFLOOR_M - ALTITUDE_M])
+        body += rng.normal(0, 0.03, 3)
+        attitude = np.array([0, 0, heading]) + rng.normal(0, np.deg2rad(1.5), 3)
+        ned_from_body = RigidTransform.from_components(body, rotation_from_attitude(*attitude))
+        told = np.rad2deg(attitude + rng.normal(0, np.deg2rad(0.1), 3))
+        latitude, longitude, depth = DATUM.geodetic_from_ned(body[None] + bias_m)[0]
+        for name, cam in rig.cameras.items():
+            pose = ned_from_body * rig.body_from_cam(name)
+            seen = cam.project(pose.inv().apply(points_ned))
+            inside = np.all((seen > 1) & (seen < [cam.width_px - 1, cam.height_px - 1]), axis=1)
+            ids.append(np.flatnonzero(inside))
+            pixels.append(seen[inside] + rng.normal(0, noise_px, (int(inside.sum()), 2)))
+            poses.append(pose)
+            records.append(
+                ImageRecord(
+                    image=f"{name}/{station:06d}.png",
+                    camera=name,
+                    station=station,
+                    time_s=2.0 * station,
+                    latitude_deg=latitude,
+                    longitude_deg=longitude,
+                    depth_m=depth,
+                    roll_deg=told[0],
+                    pitch_deg=told[1],
+                    heading_deg=told[2] % 360.0,
+                    altitude_m=ALTITUDE_M,
+                    sigma_horizontal_m=0.3,
+                    sigma_depth_m=0.02,
+                    sigma_attitude_deg=0.3,
+                    sigma_heading_deg=1.0,
+                )
+            )
+    pairs = []
+    for i in range(len(ids)):
+        for j in range(i + 1, len(ids)):
+            _, a, b = np.intersect1d(ids[i], ids[j], return_indices=True)
+            if len(a) >= 15:
+                matches = np.stack([a, b], axis=1).astype(np.uint32)
+                geometry = {"config": CALIBRATED, "E": None, "F": None, "H": None}
+                pairs.append((i, j, PairMatches(matches=matches, geometry=geometry)))
+    return Scene(
+        rig=rig,
+        records=records,
+        ned_from_cam=poses,
+        points_ned=points_ned,
+        pixels=pixels,
+        ids=ids,
+        pairs=pairs,
+    )
