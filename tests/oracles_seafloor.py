@@ -3,7 +3,9 @@
 import math
 
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform
+from scipy.special import erf
 
 U32 = 0xFFFFFFFF
 
@@ -112,3 +114,41 @@ def direct_light(
         lost = np.exp(-attenuation * (distance + path_m))
         total += share * peak * cosine / distance**2 * lost
     return total
+
+
+def fit_saddle(picture: np.ndarray, near: np.ndarray, half: int) -> np.ndarray:
+    """The crossing of two soft edges, fitted to a window of a chessboard's picture.
+
+    OpenCV's `cornerSubPix` is good to 0.03 to 0.1 px on edges as sharp as these; this fit is a
+    better ruler.
+
+    Args:
+        picture: (H, W) grey values of a blurred board.
+        near: (2,) a place within a pixel of the corner, in pixels from the outer corner of the
+            first pixel.
+        half: half the size of the window.
+
+    Returns:
+        (2,) in the same pixels.
+    """
+    column, row = (int(p) for p in near)
+    window = (slice(row - half, row + half + 1), slice(column - half, column + half + 1))
+    y, x = (axis[window] + 0.5 for axis in np.mgrid[: picture.shape[0], : picture.shape[1]])
+    grey = picture[window]
+    dy, dx = np.gradient(grey)
+    # Edges run where gradients are: their mean direction, four times turned.
+    first = (
+        np.angle((np.hypot(dx, dy) * (dx + 1j * dy) ** 4 / (dx**2 + dy**2 + 1e-9) ** 2).sum()) / 4
+    )
+
+    def misses(q: np.ndarray) -> np.ndarray:
+        along = [(x - q[0]) * np.cos(a) + (y - q[1]) * np.sin(a) for a in (q[2], q[3])]
+        step = q[5] * erf(along[0] / q[4]) * erf(along[1] / q[4])
+        return (q[6] + q[7] * (x - near[0]) + q[8] * (y - near[1]) + step - grey).ravel()
+
+    height = 0.5 * np.ptp(grey)
+    starts = [
+        [*near, first, first + np.pi / 2, 1.5, sign * height, grey.mean(), 0, 0] for sign in (1, -1)
+    ]
+    fits = [least_squares(misses, start) for start in starts]
+    return min(fits, key=lambda fit: fit.cost).x[:2]

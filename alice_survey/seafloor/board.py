@@ -23,7 +23,7 @@ STEEPEST_RAD = math.radians(35.0)
 _WHITE, _BLACK, _TILE = 0.75, 0.04, 0.30
 _WALL_M = 3.5
 """The pool's wall, square to the axis of the camera."""
-_TRIES = 4000
+_TRIES = 600
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,24 +129,24 @@ def render_board(
     board_from_cam = cam_from_board.inv()
     rotation, place = board_from_cam.rotation.as_matrix(), board_from_cam.translation
     picture = np.empty((camera.height_px, camera.width_px, 3), dtype=np.float32)
-    stains = _stains(camera)
+    light = _uneven_light(camera)
     for first, last in ray_bands(camera, samples):
         rays = camera_rays(camera, samples, first, last)
         _shade_board(
             rays.origins, rays.directions, rays.vignetting, rotation, place, board.square_m,
-            board.columns, board.rows, samples, stains[first:last], picture[first:last],
+            board.columns, board.rows, samples, light[first:last], picture[first:last],
         )  # fmt: skip
     return picture
 
 
-def _stains(camera: FlatPortCamera) -> Floats:
-    """Uneven light and stains on the wall, a few percent, (H, W)."""
+def _uneven_light(camera: FlatPortCamera) -> Floats:
+    """Uneven light, a few percent over the frame, (H, W)."""
     y, x = np.mgrid[: camera.height_px, : camera.width_px] / camera.width_px
     total = np.zeros(x.size, dtype=np.float32)
-    for lattice in (0.5, 0.1, 0.02):
+    for lattice in (0.7, 0.3):
         part = np.empty(x.size, dtype=np.float32)
         noise(x.ravel(), y.ravel(), np.zeros(x.size), lattice, 99, part)
-        total += np.float32(0.03) * part
+        total += np.float32(0.04) * part
     return total.reshape(x.shape)
 
 
@@ -161,7 +161,7 @@ def _shade_board(
     columns: int,
     rows: int,
     samples: int,
-    stains: Array,
+    light: Array,
     picture: Array,
 ) -> None:
     count = samples * samples
@@ -195,7 +195,7 @@ def _shade_board(
                 joint = min(abs(x - math.floor(x + 0.5)), abs(y - math.floor(y + 0.5))) < 0.02
                 shade = vignetting[i] * _TILE * (0.9 if joint else 1.0)
                 red, green, blue = red + 0.55 * shade, green + 0.95 * shade, blue + shade
-        level = (1.0 + stains[row, column]) / count
+        level = (1.0 + light[row, column]) / count
         picture[row, column, 0] = red * level
         picture[row, column, 1] = green * level
         picture[row, column, 2] = blue * level
