@@ -5,7 +5,7 @@ not at all, and none depends on another.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -74,14 +74,15 @@ def run_pool(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     Returns:
         True when done, False when nothing had changed.
     """
-    imaging = config.imaging
+    imaging, board = config.imaging, PoolBoard()
     stage = Stage(
         name="pool",
-        version=1,
+        version=2,
         settings={
             "seed": config.seed,
             "camera": config.camera.model_dump(mode="json"),
             "n_water": config.water.n_water,
+            "board": asdict(board),
             "imaging": imaging.model_dump(
                 mode="json", include={"scale", "image_format", "samples", "noise", "pool_views"}
             ),
@@ -90,7 +91,7 @@ def run_pool(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     )
 
     def work(folder: Path) -> None:
-        board, rig = PoolBoard(), true_rig(config)
+        rig = true_rig(config)
         rng = np.random.default_rng([config.seed, _POOL_STREAM])
         poses = pool_poses(board, rig, imaging.pool_views, rng)
         shown = board_records(rig, poses)
@@ -102,10 +103,7 @@ def run_pool(workspace: Path, config: SurveyConfig, threads: int) -> bool:
         ]
         records = list(parallel_map(_take_board, jobs, threads=threads, label="pool pictures"))
         write_manifest(folder / "manifest.csv", records)
-        write_json(
-            folder / "board.json",
-            {"columns": board.columns, "rows": board.rows, "square_m": board.square_m},
-        )
+        write_json(folder / "board.json", asdict(board))
         write_rig(folder / "truth" / "rig.json", rig)
         write_json(
             folder / "truth" / "boards.json",
@@ -160,7 +158,7 @@ def run_images(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     sections = ("camera", "water", "seafloor", "imaging")
     stage = Stage(
         name="images",
-        version=1,
+        version=2,
         settings={
             "seed": config.seed,
             "seafloor_depth_m": config.area.seafloor_depth_m,
