@@ -1,0 +1,107 @@
+from datetime import UTC, datetime
+from pathlib import Path
+from zoneinfo import ZoneInfo
+
+import numpy as np
+import pytest
+
+from alice_survey.errors import NavigationError
+from reconstruct.navigation import find_zone, read_navigation, warn_of_gaps
+
+HEADER = "time_s,latitude_deg,longitude_deg,depth_m,heading_deg,altitude_m"
+
+
+def log_file(folder: Path, *rows: str, header: str = HEADER) -> Path:
+    path = folder / "nav.csv"
+    path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8-sig")
+    return path
+
+
+def test_values_lie_on_the_line_between_rows(tmp_path: Path) -> None:
+    path = log_file(tmp_path, "0,60.0,5.0,10,350,2.0", "1,60.2,5.4,12,10,3.0", "2,60.4,5.4,12,30,")
+    log = read_navigation(path, UTC)
+    found = log.at(np.array([0.5, 1.0, 1.5]))
+    np.testing.assert_allclose(found["latitude_deg"], [60.1, 60.2, 60.3])
+    np.testing.assert_allclose(found["depth_m"], [11, 12, 12])
+    np.testing.assert_allclose(found["heading_deg"], [0, 10, 20], atol=1e-9)  # the short way
+    np.testing.assert_allclose(found["altitude_m"], [2.5, 3.0, np.nan])
+
+
+def test_nothing_is_made_up_beyond_the_log_or_in_gaps(tmp_path: Path) -> None:
+    rows = [f"{t},60,5,{t},0,2" for t in (0, 1, 2, 3, 20, 21)]
+    log = read_navigation(log_file(tmp_path, *rows), UTC)
+    assert log.longest_gap_s == 5.0
+    depth = log.at(np.array([-0.1, 2.5, 3.0, 10.0, 20.5, 21.1, np.nan]))["depth_m"]
+    np.testing.assert_allclose(depth, [np.nan, 2.5, 3.0, np.nan, 20.5, np.nan, np.nan])
+
+
+def test_bad_rows_are_left_out_and_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = log_file(
+        tmp_path,
+        "0,60,5,1,0,2",
+        "1,nan,5,1,0,2",
+        "2,60,5,x,0,2",
+        "3,60,5,3,nan,2",
+        "2.5,60,5,3,0,2",
+        "4,97,5,4,0,2",
+        "5,60,5,5,0,2",
+    )
+    log = read_navigation(path, UTC)
+    np.testing.assert_allclose(log.time_s, [0, 3, 5])
+    assert np.isnan(log.columns["heading_deg"][1])
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    for line, what in ((3, "latitude_deg is nan"), (4, "depth_m is 'x'"), (5, "heading_deg is nan"),
+                       (6, "does not follow"), (7, "latitude_deg is 97")):  # fmt: skip
+        assert f"line {line}: {what}" in told.replace("its time ", "")
+
+
+def test_dates_obey_their_own_zone_else_the_one_given(tmp_path: Path) -> None:
+    header = "time_utc,latitude_deg,longitude_deg,depth_m"
+    path = log_file(
+        tmp_path, "2024-07-01 12:00:00,60,5,1", "2024-07-01T10:00:02.5+00:00,60,5,2", header=header
+    )
+    log = read_navigation(path, find_zone("Europe/Oslo"))
+    assert log.start_utc == datetime(2024, 7, 1, 10, tzinfo=UTC)
+    np.testing.assert_allclose(log.time_s, [0, 2.5])
+    assert find_zone("Europe/Oslo") == ZoneInfo("Europe/Oslo")
+
+
+@pytest.mark.parametrize(
+    ("header", "rows", "message"),
+    [
+        ("latitude_deg,longitude_deg,depth_m", [], "no column time_s or time_utc"),
+        ("time_s,latitude_deg,longitude_deg", [], "column depth_m is missing"),
+        (HEADER, [], "no row with a time and a position"),
+        (HEADER, ["0,nan,5,1,0,2"], "no row with a time and a position"),
+    ],
+)
+def test_a_useless_log_gives_one_line(
+    tmp_path: Path, header: str, rows: list[str], message: str
+) -> None:
+    with pytest.raises(NavigationError, match=message):
+        read_navigation(log_file(tmp_path, *rows, header=header), UTC)
+
+
+def test_other_faults_give_one_line(tmp_path: Path) -> None:
+    with pytest.raises(NavigationError, match=r"nav\.csv: cannot be read"):
+        read_navigation(tmp_path / "nav.csv", UTC)
+    (tmp_path / "nav.csv").write_bytes(b"\xff\xfe\x00time")
+    with pytest.raises(NavigationError, match="cannot be read"):
+        read_navigation(tmp_path / "nav.csv", UTC)
+    for name in ("Mars/Olympus", "../../etc/passwd", ""):
+        with pytest.raises(NavigationError, match="time-zone"):
+            find_zone(name)
+
+
+def test_pictures_without_navigation_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = read_navigation(log_file(tmp_path, "0,60,5,1,0,2", "1,60,5,1,0,2"), UTC)
+    warn_of_gaps(["a.jpg", "b.jpg"], np.array([0.5, 9.0]), np.array([1.0, np.nan]), log)
+    told = capsys.readouterr().err
+    assert "1 pictures" in told
+    assert "b.jpg" in told
+    assert "a.jpg" not in told
