@@ -22,6 +22,7 @@ from alice_survey.errors import CalibrationError, warn
 from alice_survey.executor import parallel_map
 from alice_survey.frames import Array
 from alice_survey.manifest import read_manifest
+from camera_calib.corners import find_chessboard
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.rig import Rig, design_rig, write_rig
 
@@ -76,33 +77,6 @@ class Calibration:
     def rms_px(self) -> float:
         """Root mean square length of the residuals."""
         return float(np.sqrt(np.nanmean((self.residuals_px**2).sum(axis=-1))))
-
-
-def find_corners(picture: Array, board: Board) -> Array | None:
-    """Corners of a chessboard in a grey picture, refined below a pixel.
-
-    The size of the window of refinement follows the board's squares, so that neighbouring corners
-    never fall into it.
-
-    Returns:
-        (rows * columns, 2) pixels, row by row from a corner of the board, or None when the board
-        was not found whole.
-    """
-    for flags in (0, cv2.CALIB_CB_EXHAUSTIVE):  # the second looks harder and takes 3 times as long
-        size = (board.columns, board.rows)
-        found, corners = cv2.findChessboardCornersSB(picture, size, flags=flags)
-        if found:
-            break
-    else:
-        return None
-    grid = corners.reshape(board.rows, board.columns, 2).astype(np.float64)
-    steps = [np.linalg.norm(np.diff(grid, axis=a), axis=-1).min() for a in (0, 1)]
-    half = int(np.clip(min(steps) / 3, 2, 15))
-    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
-    refined = cv2.cornerSubPix(
-        picture, corners.astype(np.float32), (half, half), (-1, -1), criteria
-    )
-    return np.asarray(refined, dtype=np.float64).reshape(-1, 2) + 0.5
 
 
 def calibrate(views: Sequence[StereoView], board: Board, start: Rig) -> Calibration:
@@ -305,7 +279,7 @@ def run_calibrate(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     pool = need_stage(workspace, "pool", "image")
     stage = Stage(
         name="calibration",
-        version=1,
+        version=2,
         settings={
             "camera": config.camera.model_dump(mode="json"),
             "water": config.water.model_dump(mode="json"),
@@ -366,7 +340,7 @@ def _corners_of(job: tuple[Path, Board]) -> Array | None:
     if picture is None:
         warn(f"{path} cannot be decoded; left out")
         return None
-    return find_corners(picture, board)
+    return find_chessboard(picture, board.columns, board.rows)
 
 
 def _summary(calibration: Calibration) -> dict[str, object]:

@@ -26,7 +26,7 @@ from reconstruct.alignment import align_rigid, align_similarity
 from reconstruct.evaluate_mosaic import MosaicScore, score_mosaic
 from reconstruct.evaluate_overlap import overlaps_reached
 from reconstruct.evaluate_plots import plot_errors, plot_sheet, plot_track
-from reconstruct.sparse import read_track_poses
+from reconstruct.track import read_track_poses
 from reconstruct.truth import read_true_poses, surface_depth, surface_distance
 
 GOOD_M = 0.01

@@ -1,0 +1,86 @@
+"""Corners of a chessboard are found far below a pixel, half pixel included."""
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from camera_calib.corners import find_chessboard, fit_saddles, linear_light
+
+COLUMNS, ROWS = 9, 6
+FINE = 8
+
+
+def drawn_board(noise: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """A tilted board seen by a pinhole, area-sampled in linear light, and its true corners."""
+    rng = np.random.default_rng(seed)
+    turn = Rotation.from_euler("xyz", rng.uniform(-25, 25, 3), degrees=True).as_matrix()
+    centre = np.array([(COLUMNS - 1) / 2, (ROWS - 1) / 2, 0.0])
+    shift = np.array([rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), 16.0])
+    matrix = np.array([[400.0, 0, 160.0], [0, 400.0, 120.0], [0, 0, 1]])
+    to_pixels = matrix @ np.column_stack([turn[:, :2], shift - turn @ centre])
+    y, x = np.mgrid[: 240 * FINE, : 320 * FINE]
+    pixels = np.stack([(x + 0.5) / FINE, (y + 0.5) / FINE, np.ones(x.shape)], axis=-1)
+    board = pixels @ np.linalg.inv(to_pixels).T
+    u, v = board[..., 0] / board[..., 2], board[..., 1] / board[..., 2]
+    inside = (u > -1) & (u < COLUMNS) & (v > -1) & (v < ROWS)
+    dark = (np.floor(u) + np.floor(v)) % 2 == 0
+    light = np.where(inside & dark, 0.05, 0.7)
+    light = light.reshape(240, FINE, 320, FINE).mean(axis=(1, 3))
+    light = light + rng.normal(0, noise, light.shape)
+    encoded = np.where(
+        light <= 0.0031308, 12.92 * light, 1.055 * np.abs(light) ** (1 / 2.4) - 0.055
+    )
+    picture = np.clip(np.rint(255 * encoded), 0, 255).astype(np.uint8)
+    cx, cy = np.meshgrid(np.arange(COLUMNS), np.arange(ROWS))
+    corners = np.stack([cx, cy, np.ones(cx.shape)], axis=-1).reshape(-1, 3) @ to_pixels.T
+    return picture, corners[:, :2] / corners[:, 2:]
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("noise", "bound_px"), [(0.0, 0.02), (0.01, 0.06)])
+def test_corners_are_where_they_were_drawn(seed: int, noise: float, bound_px: float) -> None:
+    picture, true = drawn_board(noise, seed)
+
+    found = find_chessboard(picture, COLUMNS, ROWS)
+
+    assert found is not None
+    flipped = found[::-1]  # a board may be read from either end
+    miss = min(np.abs(found - true).max(), np.abs(flipped - true).max())
+    assert miss < bound_px
+
+
+def test_the_fit_beats_opencvs_refinement() -> None:
+    picture, true = drawn_board(0.01, 11)
+    found = find_chessboard(picture, COLUMNS, ROWS)
+    assert found is not None
+    true = true if np.abs(found - true).max() < 1 else true[::-1]
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
+    near = (true - 0.5).astype(np.float32).reshape(-1, 1, 2)
+    theirs = cv2.cornerSubPix(picture, near, (5, 5), (-1, -1), criteria).reshape(-1, 2) + 0.5
+
+    ours_px, theirs_px = (np.sqrt(np.mean((c - true) ** 2)) for c in (found, theirs))
+
+    assert ours_px < theirs_px
+
+
+def test_no_board_is_none() -> None:
+    grey = np.random.default_rng(1).integers(90, 160, (240, 320)).astype(np.uint8)
+    assert find_chessboard(grey, COLUMNS, ROWS) is None
+
+
+def test_a_corner_at_the_edge_or_on_nothing_is_nan() -> None:
+    picture, true = drawn_board(0.0, 0)
+    light = linear_light(picture)
+    near = np.array([[3.0, 100.0], true[0], [float("200"), 5.0]])
+    found = fit_saddles(light, near, 5)
+    assert np.isnan(found[0]).all()
+    assert np.abs(found[1] - true[0]).max() < 0.05
+
+
+def test_linear_light_inverts_the_srgb_curve() -> None:
+    light = linear_light(np.arange(256, dtype=np.uint8))
+    assert light[0] == 0
+    assert light[255] == pytest.approx(1)
+    assert light[188] == pytest.approx(0.5, abs=0.005)
+    assert np.all(np.diff(light) > 0)
