@@ -11,7 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from alice_survey.artefacts import write_json
-from reconstruct.dem import DemGrid, bin_points
+from reconstruct.dem import DemGrid, bin_points, sorted_ranks
 from reconstruct.model import WorldFrame
 from reconstruct.points import Points
 
@@ -65,7 +65,7 @@ def thin(
         levels = np.empty(inside.size, np.int64)
         for i in range(inside.size):
             levels[i] = math.floor(enu[inside[i], 2] / edge)
-        ranks = np.argsort(levels, kind="mergesort")
+        ranks = sorted_ranks(levels)
         first = 0
         while first < ranks.size:
             level = levels[ranks[first]]

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -14,10 +15,13 @@ from reconstruct.points import Points
 
 Float32 = NDArray[np.float32]
 
-_MAD_TO_SIGMA = 1.4826
 _GATE = 3.0
 FILL_CELLS = 3
 """Cells that lie no farther than this from known ones on opposite sides are filled."""
+STRAY_CELLS = 4
+"""Reach of the square around a cell in which others must be known."""
+_LEAST_COMPANY = 0.3
+"""Share of that square that must be known; what is lonelier is mostly wrong."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,6 +146,29 @@ def bin_points(
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
+def sorted_ranks(values: NDArray[Any]) -> NDArray[np.int64]:
+    """Indices that sort values upwards (Shell's sort, which numba compiles in no time).
+
+    The order of equal values depends on the values alone, not on the machine.
+    """
+    count = values.size
+    ranks = np.arange(count)
+    gap = 1
+    while gap < count:
+        gap = 3 * gap + 1
+    while gap > 1:
+        gap //= 3
+        for i in range(gap, count):
+            moved = ranks[i]
+            j = i
+            while j >= gap and values[ranks[j - gap]] > values[moved]:
+                ranks[j] = ranks[j - gap]
+                j -= gap
+            ranks[j] = moved
+    return ranks
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
 def fuse_cells(
     starts: NDArray[np.int64],
     heights: Float32,
@@ -174,7 +201,7 @@ def fuse_cells(
         if first == last:
             continue
         values = heights[first:last]
-        order = np.argsort(values)
+        order = sorted_ranks(values)
         half = 0.0
         for i in range(values.size):
             half += 0.5 / sigmas[first + i] ** 2
@@ -185,7 +212,14 @@ def fuse_cells(
                 median_at = i
                 break
         median = values[median_at]
-        scatter = np.median(np.abs(values - median)) * 1.4826
+        misses = np.empty(values.size, np.float32)
+        for i in range(values.size):
+            misses[i] = abs(values[i] - median)
+        ranks = sorted_ranks(misses)
+        middle = values.size // 2
+        scatter = 1.4826 * misses[ranks[middle]]
+        if values.size % 2 == 0:
+            scatter = 0.5 * (scatter + 1.4826 * misses[ranks[middle - 1]])
         reach = gate * max(scatter, sigmas[first + median_at])
         total, weights, squares = 0.0, 0.0, 0.0
         formal, in_view, view_weight, seen, last_view = 0.0, 0, 0.0, 0, -1
@@ -262,3 +296,16 @@ def fill_gaps(height: Float32, sigma: Float32, reach: int) -> tuple[Float32, Flo
                 filled[row, column] = total / weights
                 filled_sigma[row, column] = doubt
     return filled, filled_sigma
+
+
+def without_strays(height: Float32) -> NDArray[np.bool_]:
+    """Which cells have company: enough known cells in the square around them.
+
+    Beyond the edge of the array a cell counts as unknown.
+    """
+    known = np.isfinite(height)
+    side = 2 * STRAY_CELLS + 1
+    share = cv2.boxFilter(
+        known.astype(np.float32), -1, (side, side), borderType=cv2.BORDER_CONSTANT
+    )
+    return np.asarray(known & (share >= _LEAST_COMPANY))

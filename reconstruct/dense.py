@@ -26,6 +26,7 @@ from reconstruct.depth import pair_depth
 from reconstruct.fusion import GATE_SIGMAS, count_witnesses, merge_depths
 from reconstruct.light import (
     LightSamples,
+    at_nodes,
     compare_light,
     joined_samples,
     low_pass,
@@ -45,7 +46,7 @@ from reconstruct.view_store import ViewStore
 LARGEST_PIXELS = 3_000_000
 """Pictures with more pixels are halved for matching, until they have fewer."""
 CELL_PIXELS = 2.5
-"""Side of a DEM cell in mean ground pixels of the pictures as matched."""
+"""Side of a DEM cell in mean ground pixels of the pictures as matched, unless depth is coarser."""
 _WITNESSES = 8
 """Neighbouring views that a view's depth is held against."""
 _MOST_CELLS = 4_000_000_000
@@ -182,6 +183,7 @@ def build_surface(
     edge = voxel_edge(grid.cell, grid.rows * grid.columns, _MOST_POINTS)
     light = solve_light(
         joined_samples([summary.light for summary in summaries]),
+        np.stack([summary.nodes for summary in summaries]),
         [view.image for view in views],
         [view.camera for view in views],
     )
@@ -260,10 +262,10 @@ def view_depth(task: DepthTask) -> None:
 
 
 def check_view(task: CheckTask) -> ViewSummary:
-    """Keep the depths that at least two matches beside the view's own word support.
+    """Keep the depths that two independent matches support.
 
     A depth stays where the partners that agree and the neighbouring views that find the same
-    surface number three or more, and no more views see through it than confirm it.
+    surface number two or more, and no more views see through it than confirm it.
     """
     store, view = task.store, task.view
     depth = np.asarray(store.load(task.index, "depth"))
@@ -285,11 +287,19 @@ def check_view(task: CheckTask) -> ViewSummary:
         )
         supported += seen
         refuted += through
-    kept = np.isfinite(depth) & (confirmed + supported >= 3) & (refuted <= supported)
+    kept = np.isfinite(depth) & (confirmed + supported >= 2) & (refuted <= supported)
     rows, columns = np.nonzero(kept)
+    nodes = at_nodes(np.asarray(store.load(task.index, "low")))
     if len(rows) < _LEAST_PIXELS:
         store.save(task.index, "kept", np.zeros_like(kept))
-        return ViewSummary(bounds=None, up=np.nan, footprint=np.nan, light=joined_samples([]))
+        return ViewSummary(
+            bounds=None,
+            up=np.nan,
+            footprint=np.nan,
+            sigma=np.nan,
+            light=joined_samples([]),
+            nodes=nodes,
+        )
     points = _world_points(view, depth, rows, columns)
     low, high = np.percentile(points[:, :2], [_BOUND_PERCENT, 100 - _BOUND_PERCENT], axis=0)
     beyond = (points[:, :2] < low) | (points[:, :2] > high)
@@ -299,7 +309,9 @@ def check_view(task: CheckTask) -> ViewSummary:
         bounds=(float(low[0]), float(low[1]), float(high[0]), float(high[1])),
         up=float(-np.median(points[:, 2])),
         footprint=float(np.median(depth[kept]) / np.sqrt(view.fx_px * view.fy_px)),
+        sigma=float(np.median(sigma[kept])),
         light=_shared_light(task, points, rows, columns),
+        nodes=nodes,
     )
 
 
@@ -343,8 +355,9 @@ def surface_grid(
         )
     if cell is not None and not frame.scaled:
         warn("reconstruct.dem_cell_m is taken in model units: the model has no scale")
-    footprints = [s.footprint for s in summaries if s.bounds is not None]
-    size = cell or round_cell(CELL_PIXELS * float(np.median(footprints)))
+    footprint = float(np.nanmedian([s.footprint for s in summaries]))
+    sigma = float(np.nanmedian([s.sigma for s in summaries]))
+    size = cell or round_cell(max(CELL_PIXELS * footprint, sigma))
     grid = grid_over(bounds, size)
     if grid.rows * grid.columns > _MOST_CELLS:
         raise ReconstructionError(

@@ -14,6 +14,8 @@ _BLOCK_PX = 5
 _JUMP_PX = 1.0
 """A step of disparity between neighbours from which on both are taken to mix near and far."""
 _SPECKLE_PX = 200
+_LEAST_SLOPE = 2.0
+"""Mean change over two pixels, grey levels, around a pixel that can be matched."""
 _STEPS = 16
 """OpenCV counts disparity in sixteenths of a pixel."""
 
@@ -47,7 +49,20 @@ def match(
     )
     fixed = matcher.compute(left, right)
     disparity = unrounded(fixed) / np.float32(_STEPS)
-    return np.where(fixed >= 0, disparity, np.float32(np.nan))
+    at_end = (disparity < 1) | (disparity > disparities_px - 2)  # the true one may lie beyond
+    return np.where(at_end | ~has_texture(left), np.float32(np.nan), disparity)
+
+
+def has_texture(grey: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Where a rectified picture changes along its rows enough for a match to mean something.
+
+    Without this, an even area takes the smoothest surface that the search allows, and several
+    pairs may agree on it.
+    """
+    slope = cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=1)
+    side = 2 * _BLOCK_PX + 1
+    mean: NDArray[np.float32] = cv2.boxFilter(np.abs(slope), -1, (side, side))
+    return np.asarray(mean >= _LEAST_SLOPE)
 
 
 def unrounded(fixed: NDArray[np.int16]) -> NDArray[np.float32]:

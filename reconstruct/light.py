@@ -4,7 +4,9 @@ A lamp that travels with the camera leaves the same pattern in every picture: th
 `log I = log J + m(camera, place in the picture) + g(picture)`, with J what the sea floor itself
 shows. Two pictures that see one spot share J, so that their difference tells m and g without any
 assumption about the scene (the multiplicative part of Koeser et al. 2021, "Robustly removing deep
-sea lighting effects for visual mapping of abyssal plains"). No picture is stretched by itself.
+sea lighting effects for visual mapping of abyssal plains"). What overlaps cannot tell, such as the
+fall-off across a single line, is taken from the median of all pictures, in which the scene averages
+out; it weighs the more, the more pictures there are. No picture is stretched by itself.
 """
 
 from collections.abc import Sequence
@@ -33,9 +35,14 @@ _NODE_SIGMA, _BEND_SIGMA, _GAIN_SIGMA = 2.0, 0.05, 0.3
 _SAMPLES_PER_FACT = 20.0
 """Samples of one pair of pictures that together tell as much as one independent one."""
 _ROUNDS = 6
+_SCENE_SIGMA = 0.5
+"""Spread of the sea floor's own logarithmic brightness from picture to picture."""
+_FEWEST_PICTURES = 6
+"""Of a camera, for their median to say something."""
 _LARGEST_GAIN = 8.0
 _WHITE_LEVEL, _WHITE_PERCENT = 215.0, 98.0
 _GREY_LEVEL = 105.0
+_NORM = 6.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -59,7 +66,7 @@ class LightModel:
     gains: dict[str, Array]
     """Per picture (3,): logarithm of its light, BGR."""
     white: Array
-    """(3,) factors of the whole survey that make its middle grey and its brightest white."""
+    """(3,) factors, the same for all pictures, that take the cast of water and light away."""
 
     def factors(self, camera: str, image: str) -> NDArray[np.float32]:
         """(rows, columns, 3) factors at the nodes that take a picture's BGR to even light."""
@@ -129,33 +136,35 @@ def joined_samples(parts: Sequence[LightSamples]) -> LightSamples:
     )
 
 
-def solve_light(samples: LightSamples, images: Sequence[str], cameras: Sequence[str]) -> LightModel:
+def solve_light(
+    samples: LightSamples, nodes: Array, images: Sequence[str], cameras: Sequence[str]
+) -> LightModel:
     """Find patterns and gains by robust least squares over all pairs of views.
-
-    What overlaps cannot tell (a common factor; a slope over the picture that gains along a line
-    could undo) is held at its smallest by weak priors.
 
     Args:
         samples: spots seen by two views.
+        nodes: (V, rows, columns, 3) logarithm of what each view shows at the nodes, BGR; NaN where
+            it shows nothing.
         images: names of the views, by number.
         cameras: their cameras.
     """
     names = sorted(set(cameras))
-    nodes = GRID[0] * GRID[1]
-    unknowns = nodes * len(names) + len(images)
+    count_nodes = GRID[0] * GRID[1]
+    unknowns = count_nodes * len(names) + len(images)
     camera_of = np.array([names.index(camera) for camera in cameras])
     count = len(samples.views)
     design = csr_array((count, unknowns))
     for side, sign in ((0, 1.0), (1, -1.0)):
         columns, weights = _node_weights(samples.places[:, side])
-        columns = columns + nodes * camera_of[samples.views[:, side]][:, None]
-        gain = nodes * len(names) + samples.views[:, side]
+        columns = columns + count_nodes * camera_of[samples.views[:, side]][:, None]
+        gain = count_nodes * len(names) + samples.views[:, side]
         columns = np.concatenate([columns, gain[:, None]], axis=1)
         weights = np.concatenate([weights, np.ones((count, 1))], axis=1)
         rows = np.repeat(np.arange(count), columns.shape[1])
         part = csr_array((sign * weights.ravel(), (rows, columns.ravel())), (count, unknowns))
         design = design + part
     prior = _prior(len(names), len(images))
+    pull, pulled = _typical(nodes, camera_of, len(names), unknowns)
     solution = np.zeros((unknowns, 3))
     for channel in range(3):
         target = (samples.levels[:, 0, channel] - samples.levels[:, 1, channel]).astype(np.float64)
@@ -164,12 +173,12 @@ def solve_light(samples: LightSamples, images: Sequence[str], cameras: Sequence[
             misfit = np.abs(target - design @ x)
             weight = 1.0 / np.maximum(misfit, _MISFIT) / _MISFIT / _SAMPLES_PER_FACT
             weighted = diags_array(weight) @ design
-            normal = (weighted.T @ design + prior).toarray()
-            x = np.linalg.solve(normal, weighted.T @ target)
+            normal = (weighted.T @ design + prior).toarray() + np.diag(pull[:, channel])
+            x = np.linalg.solve(normal, weighted.T @ target + pulled[:, channel])
         solution[:, channel] = x
-    patterns = solution[: nodes * len(names)].reshape(len(names), *GRID, 3)
+    patterns = solution[: count_nodes * len(names)].reshape(len(names), *GRID, 3)
     patterns = patterns - patterns.mean(axis=(0, 1, 2))
-    gains = solution[nodes * len(names) :]
+    gains = solution[count_nodes * len(names) :]
     gains = gains - gains.mean(axis=0)
     even = LightModel(
         patterns=dict(zip(names, patterns, strict=True)),
@@ -223,10 +232,50 @@ def _prior(cameras: int, views: int) -> Any:
     return root.T @ root
 
 
+def _typical(
+    nodes: Array, camera_of: NDArray[np.int64], cameras: int, unknowns: int
+) -> tuple[Array, Array]:
+    """Weights, and weights times values, (unknowns, 3), of each camera's median picture."""
+    pull, pulled = np.zeros((unknowns, 3)), np.zeros((unknowns, 3))
+    size = GRID[0] * GRID[1]
+    for camera in range(cameras):
+        pictures = nodes[camera_of == camera].reshape(-1, size, 3)
+        known = np.isfinite(pictures)
+        count = known.sum(axis=0)
+        total = np.where(known, pictures, 0.0).sum(axis=1, keepdims=True)
+        relative = pictures - total / np.maximum(known.sum(axis=1, keepdims=True), 1)
+        for node in range(size):
+            for channel in range(3):
+                if count[node, channel] < _FEWEST_PICTURES:
+                    continue
+                values = relative[known[:, node, channel], node, channel]
+                weight = count[node, channel] / _SCENE_SIGMA**2
+                at = camera * size + node
+                pull[at, channel] = weight
+                pulled[at, channel] = weight * np.median(values)
+    return pull, pulled
+
+
+def at_nodes(low: NDArray[np.float32]) -> Array:
+    """Logarithm of a low-passed picture at the nodes, (rows, columns, 3); NaN where dark or burnt.
+
+    The outermost nodes take what is shown a little inside of the edge.
+    """
+    x, y = np.meshgrid(np.linspace(0.01, 0.99, GRID[1]), np.linspace(0.01, 0.99, GRID[0]))
+    places = np.column_stack([x.ravel(), y.ravel()]).astype(np.float32)
+    level = at_places(low, places).reshape(*GRID, 3).astype(np.float64)
+    usable = ((level > _DARKEST) & (level < _BRIGHTEST)).all(axis=-1, keepdims=True)
+    return np.where(usable, np.log(np.maximum(level, _DARKEST)), np.nan)
+
+
 def _white(
     samples: LightSamples, light: LightModel, images: Sequence[str], cameras: Sequence[str]
 ) -> Array:
-    """Factors that make the survey's median grey, and bright enough without burning out."""
+    """Factors that make what is bright neutral, and the survey light without burning out.
+
+    The cast is the 6-norm of each colour, between the mean (grey world, which paints a lawn
+    purple) and the largest value ("shades of gray", Finlayson & Trezzi 2004).
+    """
     if not len(samples.views):
         return np.ones(3)
     first = samples.views[:, 0]
@@ -237,11 +286,11 @@ def _white(
         factors = light.factors(cameras[number], images[number]).reshape(-1, 3)
         lift = (factors[nodes[mine]] * weights[mine][..., None]).sum(axis=1)
         level[mine] = np.exp(samples.levels[mine, 0]) * lift
-    middle = np.median(level, axis=0)
-    grey = middle.mean() / middle
-    bright = np.percentile((level * grey).mean(axis=1), _WHITE_PERCENT)
-    lift = min(_WHITE_LEVEL / bright, _GREY_LEVEL / middle.mean())
-    white: Array = grey * lift
+    cast = (level**_NORM).mean(axis=0) ** (1.0 / _NORM)
+    neutral = cast.mean() / cast
+    grey = (level * neutral).mean(axis=1)
+    bright, middle = np.percentile(grey, _WHITE_PERCENT), np.median(grey)
+    white: Array = neutral * min(_WHITE_LEVEL / bright, _GREY_LEVEL / middle)
     return white
 
 

@@ -40,6 +40,8 @@ _CACHED_BYTES = 600_000_000
 """Pictures kept by each process."""
 _BROAD_POWER, _FINE_POWER = 3, 24
 """Powers of quality that weigh views in the broad and in the fine band."""
+_HIDES_CELLS = 2.5
+"""Height over a line of sight, in cells of the DEM, at which a cell hides what is behind it."""
 _LEAST_SHARE = 0.1
 """Views of less than this share of the best quality are not used."""
 _THUMBNAIL_PX = 1600
@@ -134,7 +136,7 @@ def build_mosaic(
             "notes": [
                 *model.frame.notes,
                 "colours: light of lamp and lens evened out over the survey; one factor per "
-                "colour for the whole survey makes its median grey",
+                "colour for the whole survey makes what is bright in it neutral",
             ],
             "pictures": names,
         },
@@ -241,7 +243,7 @@ def _look(
     grid = task.grid
     camera = enu_from_cam(view, np.zeros(3))
     visible = visible_cells(
-        dem, camera[:, 3], around.west, around.north, around.cell, 0.5 * around.cell
+        dem, camera[:, 3], around.west, around.north, around.cell, _HIDES_CELLS * around.cell
     )
     east, north = float(grid.east_of(0.5)), float(grid.north_of(0.5))
     rotation = camera[:, :3].T

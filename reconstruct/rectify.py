@@ -16,6 +16,8 @@ from scipy.spatial.transform import Rotation
 from alice_survey.frames import Array
 from reconstruct.model import View
 
+_LEAST_COSINE = 0.75
+"""Of the angle by which a view may be turned."""
 _HALF = 0.5
 """OpenCV counts pixels from the first pixel's centre, the model from its outer corner."""
 
@@ -85,11 +87,15 @@ def rectify(reference: View, partner: View, points_world: Array) -> Rectificatio
     sights = [v.world_from_cam.rotation.apply([0.0, 0.0, 1.0]) for v in (reference, partner)]
     sight = sights[0] + sights[1]
     z_axis = sight - (sight @ x_axis) * x_axis
+    if np.linalg.norm(z_axis) < _LEAST_COSINE:
+        return None
     z_axis /= np.linalg.norm(z_axis)
-    if min(s @ z_axis for s in sights) < 0.5:
+    if min(s @ z_axis for s in sights) < _LEAST_COSINE:
         return None
     world_from_rect = Rotation.from_matrix(np.stack([x_axis, np.cross(z_axis, x_axis), z_axis], 1))
-    focal = (reference.fx_px + reference.fy_px) / 2.0
+    # a picture turned by t is stretched by cos(t)^-3 in area at its middle: undo it on average
+    stretch = float(np.prod([(s @ z_axis) ** -1.5 for s in sights])) ** 0.5
+    focal = (reference.fx_px + reference.fy_px) / 2.0 / stretch
     turn = (world_from_rect.inv() * reference.world_from_cam.rotation).as_matrix()
     homographies, boxes = [], []
     for view in (reference, partner):

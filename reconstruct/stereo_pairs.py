@@ -21,6 +21,8 @@ _SAMPLE = 400
 """Points of a view at which overlap is measured."""
 _LEAST_OVERLAP = 0.15
 _WIDEST_ANGLE_DEG = 40.0
+_LARGEST_TILT = 0.6
+"""Largest sine of the angle between a line of sight and the plane square to the baseline."""
 _GOOD_RATIO = (0.15, 0.45)
 _USABLE_RATIO = (0.02, 0.8)
 _LEAST_GAIN = 0.03
@@ -58,9 +60,10 @@ def in_frame(view: View, points_world: Array) -> NDArray[np.bool_]:
 def choose_pairs(model: SparseModel, per_view: int = 4) -> list[list[StereoPair]]:
     """Choose partners for every view.
 
-    Partners are taken one by one; each time the one that most raises the expected number of
-    points that at least one partner matches well, so that partners complement each other: one
-    ahead, one astern, one abeam.
+    The rig partner comes first: it was exposed at the same moment, under the same light. Others
+    are taken one by one; each time the one that most raises the expected number of points that at
+    least one partner matches well, so that partners complement each other: one ahead, one astern,
+    one abeam.
 
     Args:
         model: views and sparse points.
@@ -95,7 +98,8 @@ def choose_pairs(model: SparseModel, per_view: int = 4) -> list[list[StereoPair]
             ratio = float(across / distance)
             if not _USABLE_RATIO[0] <= ratio <= _USABLE_RATIO[1]:
                 continue
-            if across < abs(base @ sights[index]):  # too much along the line of sight to rectify
+            tilt = max(abs(base @ sights[i]) for i in (index, other)) / np.linalg.norm(base)
+            if tilt > _LARGEST_TILT:
                 continue
             served = in_frame(model.views[other], points).astype(np.float64)
             if served.mean() < _LEAST_OVERLAP:
@@ -106,8 +110,10 @@ def choose_pairs(model: SparseModel, per_view: int = 4) -> list[list[StereoPair]
                 overlap=float(served.mean()),
                 base_to_height=ratio,
             )
-            candidates.append((pair, served * _quality(ratio)))
-        chosen.append(_complementary(candidates, per_view))
+            candidates.append((pair, served * _quality(ratio) * (1.0 - tilt * tilt)))
+        stations = [view.station for view in model.views]
+        rig = [c for c in candidates if stations[c[0].partner] == stations[index]]
+        chosen.append(_complementary(rig, candidates, per_view))
     if not any(chosen):
         raise ReconstructionError(
             f"none of {len(model.views)} registered pictures has a partner with "
@@ -126,12 +132,18 @@ def _quality(ratio: float) -> float:
     return 0.8
 
 
-def _complementary(candidates: list[tuple[StereoPair, Array]], per_view: int) -> list[StereoPair]:
-    pairs: list[StereoPair] = []
-    candidates = list(candidates)
+def _complementary(
+    first: list[tuple[StereoPair, Array]],
+    candidates: list[tuple[StereoPair, Array]],
+    per_view: int,
+) -> list[StereoPair]:
     if not candidates:
-        return pairs
+        return []
+    pairs = [pair for pair, _ in first[:per_view]]
     missed = np.ones_like(candidates[0][1])
+    for _, quality in first[:per_view]:
+        missed = missed * (1.0 - quality)
+    candidates = [c for c in candidates if c[0] not in pairs]
     while candidates and len(pairs) < per_view:
         gains = [float((missed * quality).mean()) for _, quality in candidates]
         best = int(np.argmax(gains))

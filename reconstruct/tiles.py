@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rasterio.windows import Window
 
+from alice_survey.frames import Array
 from reconstruct.cloud import thinned_points
-from reconstruct.dem import FILL_CELLS, DemGrid, fill_gaps, fuse_points
+from reconstruct.dem import FILL_CELLS, STRAY_CELLS, DemGrid, fill_gaps, fuse_points, without_strays
 from reconstruct.light import LightModel, LightSamples
 from reconstruct.model import View
 from reconstruct.points import joined, points_in_box
@@ -18,6 +19,9 @@ from reconstruct.raster import tiles_of
 from reconstruct.view_store import ViewStore
 
 _TILE_CELLS = 512
+_WORST_CELLS = 2.0
+"""Depths less certain than this many cells are left out: rig stereo from afar, mostly."""
+_RIM = FILL_CELLS + STRAY_CELLS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,8 +34,12 @@ class ViewSummary:
     """Median height of its points."""
     footprint: float
     """Side of a pixel on the ground."""
+    sigma: float
+    """Median standard deviation of its depth."""
     light: LightSamples
     """What it and its neighbours show of the same spots."""
+    nodes: Array
+    """What it shows at the nodes of the light model; see `light.at_nodes`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +51,7 @@ class TileTask:
     grid: DemGrid
     """Of the tile with its rim."""
     rim: tuple[int, int, int, int]
-    """Cells around the tile, top, bottom, left, right, that only serve to fill gaps."""
+    """Cells around the tile, top, bottom, left, right, that only serve to judge and fill."""
     views: tuple[tuple[int, View], ...]
     light: LightModel
     offset_enu: tuple[float, float, float]
@@ -77,10 +85,10 @@ def tile_tasks(
         row, column = int(window.row_off), int(window.col_off)
         rows, columns = int(window.height), int(window.width)
         rim = (
-            min(FILL_CELLS, row),
-            min(FILL_CELLS, grid.rows - row - rows),
-            min(FILL_CELLS, column),
-            min(FILL_CELLS, grid.columns - column - columns),
+            min(_RIM, row),
+            min(_RIM, grid.rows - row - rows),
+            min(_RIM, column),
+            min(_RIM, grid.columns - column - columns),
         )
         part = grid.window(
             row - rim[0], column - rim[2], rows + rim[0] + rim[1], columns + rim[2] + rim[3]
@@ -120,23 +128,26 @@ def fuse_tile(task: TileTask) -> Tile:
         grid.north,
     )
     store = task.store
-    points = joined(
-        [
+    parts = []
+    for index, view in task.views:
+        sigma = np.asarray(store.load(index, "sigma"))
+        parts.append(
             points_in_box(
                 view,
                 index,
                 np.asarray(store.load(index, "depth")),
-                np.asarray(store.load(index, "sigma")),
-                np.asarray(store.load(index, "kept")),
+                sigma,
+                np.asarray(store.load(index, "kept")) & (sigma <= _WORST_CELLS * grid.cell),
                 np.asarray(store.load(index, "colour")),
                 task.light.factors(view.camera, view.image),
                 offset,
                 box,
             )
-            for index, view in task.views
-        ]
-    )
+        )
+    points = joined(parts)
     height, sigma, count = fuse_points(grid, points)
+    stray = ~without_strays(height)
+    height[stray], sigma[stray], count[stray] = np.nan, np.nan, 0
     height, sigma = fill_gaps(height, sigma, FILL_CELLS)
     top, bottom, left, right = task.rim
     inner = (slice(top, grid.rows - bottom), slice(left, grid.columns - right))

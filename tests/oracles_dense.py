@@ -1,0 +1,275 @@
+"""Slow, obvious twins of the dense kernels, and small scenes whose truth is known."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.artefacts import write_json
+from alice_survey.frames import BODY_FROM_NADIR_CAM, Array, Datum
+from reconstruct.model import SparseModel, View, WorldFrame, write_frame
+
+DATUM = Datum(32.8236, 34.9553)
+FRAME = WorldFrame(
+    name="ned", datum=DATUM, scaled=True, vertical_datum="sea surface", notes=("a test",)
+)
+WIDTH, HEIGHT, FOCAL = 320, 256, 430.0
+ALTITUDE_M, DEPTH_M = 2.0, 12.0
+
+
+def merged(depths: Array, sigmas: Array, gate: float) -> tuple[float, float, int]:
+    """One pixel of `merge_depths`."""
+    known = [(float(z), float(s)) for z, s in zip(depths, sigmas, strict=True) if not math.isnan(z)]
+    companies = [
+        [(y, t) for y, t in known if (z - y) ** 2 <= gate**2 * (s**2 + t**2)] for z, s in known
+    ]
+    if not companies:
+        return math.nan, math.nan, 0
+    best = max(companies, key=lambda c: (len(c), sum(1 / t**2 for _, t in c)))
+    if len(known) > 1 and len(best) == 1:
+        return math.nan, math.nan, 0
+    weights = [1 / t**2 for _, t in best]
+    mean = sum(w * y for w, (y, _) in zip(weights, best, strict=True)) / sum(weights)
+    return mean, sum(weights) ** -0.5, len(best)
+
+
+def fused(heights: Array, sigmas: Array, views: Array, gate: float) -> tuple[float, float, int]:
+    """One cell of `fuse_cells`."""
+    weights = 1.0 / np.asarray(sigmas, dtype=np.float64) ** 2
+    order = np.argsort(heights, kind="stable")
+    reached = np.cumsum(weights[order]) >= weights.sum() / 2
+    at = order[np.argmax(reached)]
+    median = heights[at]
+    scatter = 1.4826 * np.median(np.abs(heights - median))
+    near = np.abs(heights - median) <= gate * max(scatter, sigmas[at])
+    h, w, v = heights[near], weights[near], views[near]
+    mean = np.average(h, weights=w)
+    variance = np.average((h - mean) ** 2, weights=w)
+    formal = sum(w[v == view].mean() for view in np.unique(v))
+    return float(mean), math.sqrt(1 / formal + variance / len(np.unique(v))), len(np.unique(v))
+
+
+def sees(height: Array, camera: Array, cell: float, row: int, column: int) -> float:
+    """How far the DEM rises at most over the line from a cell to the camera (negative: free).
+
+    The DEM's first row and column have their outer edges at north 0 and west 0.
+    """
+    start = np.array([(column + 0.5) * cell, -(row + 0.5) * cell, height[row, column]])
+    highest = -math.inf
+    for share in np.linspace(0, 1, 4001)[1:]:
+        east, north, up = start + share * (camera - start)
+        r, c = math.floor(-north / cell), math.floor(east / cell)
+        if (r, c) == (row, column):
+            continue
+        if not (0 <= r < height.shape[0] and 0 <= c < height.shape[1]):
+            break
+        highest = max(highest, height[r, c] - up)
+    return highest
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """A sea floor given by its depth, and what it is painted with."""
+
+    depth_of: Callable[[Array, Array], Array]
+    """Depth from north and east, metres."""
+    paint: Callable[[Array, Array], Array]
+    """BGR levels (..., 3) from north and east."""
+
+
+def flat(north: Array, east: Array) -> Array:
+    return np.full(np.broadcast(north, east).shape, DEPTH_M)
+
+
+def sloped_with_step(north: Array, east: Array) -> Array:
+    """A gentle slope with a block, 0.1 m high, 0.4 m square, over the middle."""
+    block = (np.abs(north - 0.3) < 0.2) & (np.abs(east - 0.35) < 0.2)
+    return DEPTH_M + 0.08 * north - 0.05 * east - 0.1 * block
+
+
+def speckle(seed: int = 3) -> Callable[[Array, Array], Array]:
+    """Random grey texture with detail from 5 to 80 mm."""
+    rng = np.random.default_rng(seed)
+    step, half = 0.0025, 2.5
+    size = int(2 * half / step)
+    picture = np.zeros((size, size), np.float32)
+    for detail_m in (0.005, 0.01, 0.03, 0.08):
+        coarse = int(2 * half / detail_m)
+        noise = rng.normal(size=(coarse, coarse)).astype(np.float32)
+        picture += cv2.resize(noise, (size, size), interpolation=cv2.INTER_CUBIC)
+    picture = np.clip(110 + 22 * picture, 5, 245)
+
+    def paint(north: Array, east: Array) -> Array:
+        x = ((east + half) / step - 0.5).astype(np.float32)
+        y = ((north + half) / step - 0.5).astype(np.float32)
+        grey = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+        return np.stack([grey, 0.9 * grey, 0.8 * grey], axis=-1)
+
+    return paint
+
+
+PERIOD_M = 0.3
+
+
+def position_code(north: Array, east: Array) -> Array:
+    """Blue tells east and green tells north, periodic, 2 levels a millimetre at most."""
+    wave = 2 * np.pi / PERIOD_M
+    blue, green = 128 + 100 * np.sin(wave * east), 128 + 100 * np.sin(wave * north)
+    return np.stack([blue, green, np.full_like(blue, 128)], axis=-1)
+
+
+def stereo_views(norths: Array, easts: Array, heading_deg: float = 20.0) -> list[View]:
+    """Nadir stereo pairs, 0.1 m apart, over points of the sea floor."""
+    ned_from_body = Rotation.from_euler("ZYX", [heading_deg, 1.0, -1.5], degrees=True)
+    views = []
+    for station, (north, east) in enumerate(zip(norths, easts, strict=True)):
+        for camera, side in (("left", -0.05), ("right", 0.05)):
+            over = np.array([north, east, DEPTH_M - ALTITUDE_M])
+            centre = over + ned_from_body.apply([0, side, 0])
+            pose = RigidTransform.from_components(centre, ned_from_body * BODY_FROM_NADIR_CAM)
+            views.append(
+                View(
+                    image=f"{camera}/{station:03d}.png",
+                    camera=camera,
+                    station=station,
+                    width_px=WIDTH,
+                    height_px=HEIGHT,
+                    fx_px=FOCAL,
+                    fy_px=FOCAL,
+                    cx_px=WIDTH / 2 + 2.0,
+                    cy_px=HEIGHT / 2 - 1.5,
+                    world_from_cam=pose,
+                )
+            )
+    return sorted(views, key=lambda view: view.image)
+
+
+def hits(view: View, scene: Scene, oversample: int = 1) -> Array:
+    """World points (H, W, 3) that a view's pixels see, approached from above (within 1e-9 m)."""
+    step = 1.0 / oversample
+    x = (np.arange(view.width_px * oversample) + 0.5) * step
+    y = (np.arange(view.height_px * oversample) + 0.5) * step
+    grid_x, grid_y = np.meshgrid((x - view.cx_px) / view.fx_px, (y - view.cy_px) / view.fy_px)
+    rays = np.stack([grid_x, grid_y, np.ones_like(grid_x)], axis=-1)
+    world = view.world_from_cam.rotation.apply(rays.reshape(-1, 3)).reshape(rays.shape)
+    centre = view.world_from_cam.translation
+    reach = np.full(grid_x.shape, 0.9 * ALTITUDE_M)
+    for _ in range(45):  # down in small steps while above the surface, so that edges hide
+        points = centre + reach[..., None] * world
+        above = scene.depth_of(points[..., 0], points[..., 1]) - points[..., 2]
+        reach = reach + np.where(above > 0, 0.35 * above, 0.0)
+    return centre + reach[..., None] * world
+
+
+def render(view: View, scene: Scene) -> np.ndarray:
+    """A picture (H, W, 3), each pixel the mean of 2 x 2 samples, without noise."""
+    points = hits(view, scene, oversample=2)
+    fine = scene.paint(points[..., 0], points[..., 1])
+    mean = fine.reshape(view.height_px, 2, view.width_px, 2, 3).mean(axis=(1, 3))
+    return np.rint(np.clip(mean, 0, 255)).astype(np.uint8)
+
+
+def sparse_model(views: list[View], scene: Scene, points: int = 400, seed: int = 5) -> SparseModel:
+    """Points of the surface and the views in whose frames they lie."""
+    rng = np.random.default_rng(seed)
+    centres = np.array([view.world_from_cam.translation[:2] for view in views])
+    low, high = centres.min(axis=0) - 0.8, centres.max(axis=0) + 0.8
+    place = rng.uniform(low, high, (points, 2))
+    world = np.column_stack([place, scene.depth_of(place[:, 0], place[:, 1])])
+    rows = []
+    for number, view in enumerate(views):
+        pixels = view.project(world)
+        inside = ((pixels > 0) & (pixels < [view.width_px, view.height_px])).all(axis=1)
+        rows += [(int(point), number) for point in np.flatnonzero(inside)]
+    return SparseModel(
+        frame=FRAME,
+        views=tuple(views),
+        points_world=world,
+        observations=np.array(sorted(rows), dtype=np.int64).reshape(-1, 2),
+    )
+
+
+def write_workspace(folder: Path, model: SparseModel, scene: Scene) -> Path:
+    """A workspace with finished `images` and `sparse` stages."""
+    for view in model.views:
+        path = folder / "images" / view.image
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), render(view, scene))
+    sparse = folder / "sparse"
+    (sparse / "model").mkdir(parents=True)
+    _colmap(model).write(str(sparse / "model"))
+    write_frame(sparse / "frame.json", model.frame)
+    cameras = {view.camera: view for view in model.views}
+    write_json(
+        sparse / "cameras.json",
+        {
+            "cameras": {name: _lens(view) for name, view in cameras.items()},
+            "images": {
+                view.image: {"camera": view.camera, "station": view.station, "mask": ""}
+                for view in model.views
+            },
+        },
+    )
+    for stage in ("images", "sparse"):
+        write_json(folder / stage / "stage.json", {})
+    return folder
+
+
+def _lens(view: View) -> dict[str, object]:
+    pinhole = [view.fx_px, view.fy_px, view.cx_px, view.cy_px]
+    return {
+        "kind": "colmap",
+        "model": "PINHOLE",
+        "width_px": view.width_px,
+        "height_px": view.height_px,
+        "params": pinhole,
+        "pinhole": {
+            "width_px": view.width_px,
+            "height_px": view.height_px,
+            "focal_px": view.fx_px,
+            "cx_px": view.cx_px,
+            "cy_px": view.cy_px,
+        },
+    }
+
+
+def _colmap(model: SparseModel) -> pycolmap.Reconstruction:
+    colmap = pycolmap.Reconstruction()
+    names = sorted({view.camera for view in model.views})
+    for number, name in enumerate(names, 1):
+        view = next(v for v in model.views if v.camera == name)
+        colmap.add_camera_with_trivial_rig(
+            pycolmap.Camera(
+                camera_id=number,
+                model="PINHOLE",
+                width=view.width_px,
+                height=view.height_px,
+                params=[view.fx_px, view.fy_px, view.cx_px, view.cy_px],
+            )
+        )
+    tracks: dict[int, list[pycolmap.TrackElement]] = {}
+    for number, view in enumerate(model.views, 1):
+        seen = model.observations[model.observations[:, 1] == number - 1, 0]
+        image = pycolmap.Image(
+            name=view.image, camera_id=names.index(view.camera) + 1, image_id=number
+        )
+        pixels = view.project(model.points_world[seen])
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in pixels])
+        for place, point in enumerate(seen):
+            element = pycolmap.TrackElement(number, place)
+            tracks.setdefault(int(point), []).append(element)
+        cam_from_world = view.world_from_cam.inv()
+        colmap.add_image_with_trivial_frame(
+            image,
+            pycolmap.Rigid3d(
+                pycolmap.Rotation3d(cam_from_world.rotation.as_quat()), cam_from_world.translation
+            ),
+        )
+    for point in sorted(tracks):
+        colmap.add_point3D(model.points_world[point], pycolmap.Track(tracks[point]))
+    return colmap

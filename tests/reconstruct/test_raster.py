@@ -1,0 +1,106 @@
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from pyproj import Transformer
+
+from reconstruct.dem import DemGrid
+from reconstruct.raster import crs_of, hillshade, local_crs, preview_dem, tiled_raster, tiles_of
+from tests.oracles_dense import DATUM, FRAME
+
+GRID = DemGrid(west=-12.5, north=40.0, cell=0.25, rows=300, columns=420)
+
+
+def heights() -> np.ndarray:
+    rows, columns = np.mgrid[: GRID.rows, : GRID.columns]
+    return (-12.0 + 0.01 * columns - 0.02 * rows).astype(np.float32)
+
+
+def write(path, frame=FRAME, values=None) -> None:
+    values = heights() if values is None else values
+    with tiled_raster(path, GRID, frame, "float32", np.nan, "height, positive up (m)") as raster:
+        for window in tiles_of(GRID, 256):
+            part = values[
+                window.row_off : window.row_off + window.height,
+                window.col_off : window.col_off + window.width,
+            ]
+            raster.write(part, 1, window=window)
+
+
+def test_a_known_point_lands_on_its_latitude_longitude_and_utm(tmp_path):
+    write(tmp_path / "dem.tif")
+    north_m, east_m = 17.875, 51.125  # centre of a cell
+    with rasterio.open(tmp_path / "dem.tif") as raster:
+        row, column = raster.index(east_m, north_m)
+        assert raster.xy(row, column) == pytest.approx((east_m, north_m), abs=1e-9)
+        assert raster.read(1)[row, column] == heights()[row, column]
+        crs = raster.crs.to_wkt()
+    lat, lon, _ = DATUM.geodetic_from_ned(np.array([[north_m, east_m, 0.0]]))[0]
+    to_geodetic = Transformer.from_crs(crs, 4326, always_xy=True)
+    assert to_geodetic.transform(east_m, north_m) == pytest.approx((lon, lat), abs=1e-11)
+    to_utm = Transformer.from_crs(crs, DATUM.utm_epsg, always_xy=True)
+    from_geodetic = Transformer.from_crs(4326, DATUM.utm_epsg, always_xy=True)
+    utm = to_utm.transform(east_m, north_m)
+    assert utm == pytest.approx(from_geodetic.transform(lon, lat), abs=1e-5)
+    # and why the file is not in UTM: there the same offset is turned and stretched
+    base = from_geodetic.transform(DATUM.longitude_deg, DATUM.latitude_deg)
+    assert abs(utm[1] - base[1] - north_m) > 0.1
+
+
+@pytest.mark.parametrize("distance_m", [10.0, 1000.0])
+def test_map_axes_are_north_and_east_of_the_tangent_plane(distance_m: float):
+    points = distance_m * np.array([[0.6, 0.8, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    lat_lon = DATUM.geodetic_from_ned(points)
+    to_map = Transformer.from_crs(4326, local_crs(DATUM).to_wkt(), always_xy=True)
+    east, north = to_map.transform(lat_lon[:, 1], lat_lon[:, 0])
+    np.testing.assert_allclose(np.column_stack([north, east]), points[:, :2], atol=2e-5)
+
+
+def test_the_file_says_what_it_holds(tmp_path):
+    write(tmp_path / "dem.tif")
+    with rasterio.open(tmp_path / "dem.tif") as raster:
+        assert raster.tags()["VERTICAL_DATUM"] == "sea surface"
+        assert raster.tags()["FRAME"] == "ned"
+        assert raster.descriptions == ("height, positive up (m)",)
+        assert np.isnan(raster.nodata)
+        assert raster.block_shapes == [(256, 256)]
+
+
+def test_the_model_frame_has_no_crs(tmp_path):
+    frame = replace(FRAME, name="model", datum=None, scaled=False)
+    assert crs_of(frame) is None
+    write(tmp_path / "dem.tif", frame)
+    with rasterio.open(tmp_path / "dem.tif") as raster:
+        assert raster.crs is None
+        assert raster.tags()["UNIT"] == "model units"
+        assert raster.transform.a == 0.25
+
+
+def test_the_same_heights_give_the_same_bytes(tmp_path):
+    for name in ("a.tif", "b.tif"):
+        write(tmp_path / name)
+    assert (tmp_path / "a.tif").read_bytes() == (tmp_path / "b.tif").read_bytes()
+
+
+def test_hillshade_of_planes():
+    rows, columns = np.mgrid[:20, :30].astype(float)
+    level = hillshade(np.zeros((20, 30)), 1.0)
+    np.testing.assert_allclose(level, np.sqrt(0.5))
+    # rises to the south-east, so it faces the light in the north-west squarely
+    facing = hillshade((rows + columns) * np.sqrt(0.5), 1.0)
+    np.testing.assert_allclose(facing, 1.0, atol=1e-12)
+    away = hillshade(-(rows + columns) * np.sqrt(0.5), 1.0)
+    np.testing.assert_allclose(away, 0.0, atol=1e-12)
+
+
+def test_preview_is_white_where_nothing_is_known(tmp_path):
+    values = heights()
+    values[:, 300:] = np.nan
+    write(tmp_path / "dem.tif", values=values)
+    preview_dem(tmp_path / "dem.tif", tmp_path / "dem.png", longest_px=210)
+    picture = cv2.imread(str(tmp_path / "dem.png"))
+    assert picture.shape == (150, 210, 3)
+    assert (picture[:, 155:] == 255).all()
+    assert (picture[5:-5, 5:145] < 255).any(axis=2).all()
