@@ -82,7 +82,7 @@ def fit_navigation(
 
     Args:
         records: registered pictures.
-        model_from_cam: pose of each picture's camera (entrance pupil) in the model.
+        model_from_cam: pose of each picture's camera in the model.
         body_from_cam: lever arm of every camera, metres; the identity where positions are of the
             cameras themselves.
         datum: origin of the local frame.
@@ -113,11 +113,11 @@ def fit_navigation(
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Problem:
     centres: Array
-    """(N, 3) entrance pupils in the model."""
+    """(N, 3) camera centres in the model."""
     model_from_body: Rotation
     """(N,) attitudes in the model."""
     levers: Array
-    """(N, 3) body origin less entrance pupil, in the body frame, metres."""
+    """(N, 3) body origin less camera centre, in the body frame, metres."""
     measured_ned: Array
     position_sigma_m: Array
     ned_from_body: Rotation

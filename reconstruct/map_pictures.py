@@ -23,7 +23,7 @@ from camera_calib.rig import Rig
 from reconstruct.database import Observations, VerifiedPair
 from reconstruct.features import find_features, load_features, save_features
 from reconstruct.lens import Lens, flat_port_lens
-from reconstruct.mapping import SELF_CALIBRATION, Mapped, map_calibrated, map_self_calibrated
+from reconstruct.mapping import Mapped, map_calibrated
 from reconstruct.matching import (
     PairTask,
     as_seen,
@@ -33,8 +33,10 @@ from reconstruct.matching import (
 )
 from reconstruct.normalise import normalise
 from reconstruct.pairs import choose_pairs
+from reconstruct.picture_files import exif_focal_px
 from reconstruct.pictures import read_colour, read_mask
 from reconstruct.priors import pinhole_positions, refine_with_positions
+from reconstruct.self_calibration import SIMPLE, map_self_calibrated
 from reconstruct.working_range import Distances, find_distances
 
 RATIO = 0.8
@@ -97,7 +99,7 @@ def run_mapping(
     def work(partial: Path) -> None:
         features = _find_all(inputs, partial / "features", config, threads)
         lenses, distances = _lenses(inputs, features, config, threads)
-        cameras = _cameras(inputs, lenses)
+        cameras, exif_focal = _cameras(inputs, lenses)
         pairs = _match_all(inputs, features, cameras, lenses, config.seed, threads)
         seen = Observations(
             images=inputs.records,
@@ -115,7 +117,7 @@ def run_mapping(
                 told = pinhole_positions(inputs.records, inputs.rig, lenses, inputs.datum)
                 mapped = refine_with_positions(mapped, inputs.records, *told)
         else:
-            mapped = map_self_calibrated(seen, partial, config.seed)
+            mapped = map_self_calibrated(seen, exif_focal, partial, config.seed)
         _write(partial, inputs, mapped, distances)
         shutil.rmtree(partial / "features")
 
@@ -174,26 +176,34 @@ def _lenses(
     return lenses, distances
 
 
-def _cameras(inputs: Inputs, lenses: Mapping[str, Lens]) -> dict[str, pycolmap.Camera]:
-    """COLMAP's cameras: pinholes of a rig, else first guesses to calibrate from."""
-    cameras = {}
+def _cameras(
+    inputs: Inputs, lenses: Mapping[str, Lens]
+) -> tuple[dict[str, pycolmap.Camera], set[str]]:
+    """COLMAP's cameras: pinholes of a rig, else first guesses to calibrate from.
+
+    Also the names of those whose focal length EXIF states.
+    """
+    cameras, stated = {}, set()
     for name in _camera_names(inputs):
         if name in lenses:
             cameras[name] = lenses[name].pinhole.colmap
             continue
-        first = next(r.image for r in inputs.records if r.camera == name)
-        guess = pycolmap.infer_camera_from_image(inputs.images / first)
-        height, width = read_colour(inputs.images / first).shape[:2]
-        focal = guess.mean_focal_length()  # from EXIF, else 1.2 times the longer side
-        # EXIF knows nothing of water, and crops: it is a start, never a known focal length.
+        first = inputs.images / next(r.image for r in inputs.records if r.camera == name)
+        height, width = read_colour(first).shape[:2]
+        focal = exif_focal_px(first, width, height)
+        if np.isfinite(focal):
+            stated.add(name)
+        else:  # from COLMAP's table of cameras, else 1.2 times the longer side
+            focal = pycolmap.infer_camera_from_image(first).mean_focal_length()
         cameras[name] = pycolmap.Camera(
-            model=SELF_CALIBRATION,
+            model=SIMPLE,
             width=width,
             height=height,
-            params=[focal, focal, width / 2, height / 2, 0.0, 0.0, 0.0, 0.0],
+            params=[focal, width / 2, height / 2, 0.0, 0.0],
+            # EXIF knows nothing of water and of crops: pairs are verified without it.
             has_prior_focal_length=False,
         )
-    return cameras
+    return cameras, stated
 
 
 def _camera_names(inputs: Inputs) -> list[str]:

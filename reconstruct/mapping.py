@@ -5,27 +5,27 @@ threads; only work on single pictures and pairs is spread.
 """
 
 import shutil
+import sys
+import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.errors import ReconstructionError, warn
+from alice_survey.errors import ReconstructionError
 from alice_survey.frames import Array
 from alice_survey.manifest import ImageRecord
-from reconstruct.database import Observations, rigid3d, write_database
-from reconstruct.lens import Lens, self_calibrated_lens
+from reconstruct.database import Observations, write_database
+from reconstruct.lens import Lens
 
-SELF_CALIBRATION = "OPENCV"
-"""COLMAP's camera model for pictures without a calibration."""
+_FEW_MATCHES = 12
+"""Matches that suffice in a second try, when the first one lost pictures (COLMAP: 15 to 100)."""
 _LEAST_ANGLE_DEG = 6.0
 """Of the first pair: nadir pictures with 60 % overlap rarely reach COLMAP's 16 degrees."""
-_LEAST_STATIONS = 3
-"""Stations with both cameras from which a rig is taken."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,6 +44,7 @@ class Mapped:
     rig_factor: float
     """By what the model was multiplied to give the rig its known (or unit) size back."""
     notes: tuple[str, ...] = ()
+    """What a reader of the result must know."""
 
 
 def map_calibrated(
@@ -65,8 +66,8 @@ def map_calibrated(
     pinhole_from_rig = {
         name: lenses[name].pinhole_from_cam * cam_from_rig[name] for name in seen.cameras
     }
-    found = _run_mapper(seen, pinhole_from_rig, folder, seed, calibrated=True)
-    model = _largest(found, seen.images)
+    found = run_mapper(seen, pinhole_from_rig, folder, seed, free="nothing")
+    model = largest(found, seen.images)
     known = _baseline(list(pinhole_from_rig.values())[:2])
     factor = 1.0
     if len(seen.cameras) > 1:
@@ -76,92 +77,11 @@ def map_calibrated(
     return Mapped(
         model=model,
         lenses=lenses,
-        models=_sizes(found),
+        models=sizes(found),
         scaled=len(seen.cameras) > 1,
         baseline=known,
         rig_factor=factor,
     )
-
-
-def map_self_calibrated(seen: Observations, folder: Path, seed: int) -> Mapped:
-    """Map with cameras calibrated from the pictures; two cameras become one rigid rig.
-
-    Two cameras are first mapped freely. The mean of their relative poses is the rig of a second
-    mapping that holds it constant, after which one adjustment refines that one rig with all else.
-    The baseline is then the model's unit of length.
-
-    Args:
-        seen: cameras to start from, keypoints as found, matches.
-        folder: for scratch files.
-        seed: of the mapper.
-    """
-    found = _run_mapper(seen, None, folder, seed, calibrated=False)
-    model = _largest(found, seen.images)
-    notes: tuple[str, ...] = ()
-    baseline, factor = float("nan"), 1.0
-    if len(seen.cameras) == 2:
-        cam_from_rig = rig_from_model(model, seen.images, list(seen.cameras))
-        if cam_from_rig is None:
-            notes = ("fewer than 3 stations have both cameras: mapped without a rig",)
-            warn(notes[0])
-        else:
-            cameras = {
-                name: pycolmap.Camera(model.cameras[number].todict())
-                for number, name in enumerate(seen.cameras, 1)
-                if number in model.cameras
-            }
-            second = replace(seen, cameras={**seen.cameras, **cameras})
-            found = _run_mapper(second, cam_from_rig, folder, seed, calibrated=False)
-            model = _largest(found, seen.images)
-            _adjust(model)
-            factor = 1.0 / model_baseline(model)
-            scale_model(model, factor)
-            baseline = 1.0
-            notes = ("the baseline of the self-calibrated stereo rig is the unit of length",)
-    lenses: dict[str, Lens] = {
-        name: self_calibrated_lens(model.cameras[number])
-        for number, name in enumerate(seen.cameras, 1)
-        if number in model.cameras
-    }
-    _to_pinholes(
-        model, {n: lenses[name] for n, name in enumerate(seen.cameras, 1) if name in lenses}
-    )
-    return Mapped(
-        model=model,
-        lenses=lenses,
-        models=_sizes(found),
-        scaled=False,
-        baseline=baseline,
-        rig_factor=factor,
-        notes=notes,
-    )
-
-
-def rig_from_model(
-    model: pycolmap.Reconstruction, images: Sequence[ImageRecord], cameras: Sequence[str]
-) -> dict[str, RigidTransform] | None:
-    """The mean pose of the second camera in the first's frame, over the stations that have both.
-
-    Returns:
-        `cam_from_rig` of both, or None where fewer than 3 stations have both.
-    """
-    poses: dict[int, dict[str, RigidTransform]] = {}
-    for number, record in enumerate(images, 1):
-        if number in model.images and model.images[number].has_pose:
-            pose = as_transform(model.images[number].cam_from_world())
-            poses.setdefault(record.station, {})[record.camera] = pose
-    first, second = cameras
-    relative = [p[second] * p[first].inv() for _, p in sorted(poses.items()) if len(p) == 2]
-    if len(relative) < _LEAST_STATIONS:
-        return None
-    turns = Rotation.concatenate([r.rotation for r in relative])
-    shifts = np.stack([r.translation for r in relative])
-    for _ in range(2):  # a station that went astray must not turn the rig
-        away = (turns * turns.mean().inv()).magnitude()
-        keep = np.flatnonzero(away <= 3.0 * np.median(away) + 1e-9)
-        turns, shifts = turns[keep], shifts[keep]
-    mean = RigidTransform.from_components(np.median(shifts, axis=0), turns.mean())
-    return {first: RigidTransform.identity(), second: mean}
 
 
 def as_transform(pose: Any) -> RigidTransform:
@@ -196,20 +116,45 @@ def _sensor_poses(rig: Any) -> dict[Any, Array]:
     return {s: np.array(p.translation) for s, p in rig.non_ref_sensors.items()}
 
 
-def _run_mapper(
+def run_mapper(
     seen: Observations,
     cam_from_rig: Mapping[str, RigidTransform] | None,
     folder: Path,
     seed: int,
     *,
-    calibrated: bool,
+    free: Literal["nothing", "distortion", "all"],
 ) -> list[pycolmap.Reconstruction]:
-    """All models, largest first."""
-    pycolmap.logging.minloglevel = 2
-    scratch = folder / "mapper"
-    shutil.rmtree(scratch, ignore_errors=True)
-    scratch.mkdir(parents=True)
-    write_database(scratch / "database.db", seen, cam_from_rig)
+    """Map incrementally; with lower demands once more if that loses pictures.
+
+    Args:
+        seen: cameras, keypoints, matches.
+        cam_from_rig: poses of the cameras on one rig, which are held constant; None: every camera
+            moves by itself.
+        folder: for scratch files.
+        seed: of the mapper.
+        free: what of the cameras is refined besides their poses.
+
+    Returns:
+        All models, largest first.
+    """
+    found = _map_once(seen, cam_from_rig, folder, _options(cam_from_rig, seed, free))
+    if not found or found[0].num_reg_images() < len(seen.images):
+        options = _options(cam_from_rig, seed, free)
+        options.min_num_matches = _FEW_MATCHES
+        options.mapper.abs_pose_min_num_inliers = _FEW_MATCHES
+        options.mapper.init_min_num_inliers = 3 * _FEW_MATCHES
+        options.triangulation.ignore_two_view_tracks = False
+        again = _map_once(seen, cam_from_rig, folder, options)
+        if again and (not found or again[0].num_reg_images() > found[0].num_reg_images()):
+            return again
+    return found
+
+
+def _options(
+    cam_from_rig: Mapping[str, RigidTransform] | None,
+    seed: int,
+    free: Literal["nothing", "distortion", "all"],
+) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
     options.num_threads = options.mapper.num_threads = 1
@@ -224,11 +169,24 @@ def _run_mapper(
         # The first pair is of arbitrary scale, in which the rig does not fit; what it failed to
         # triangulate within a station is tried again once the scale has settled.
         options.triangulation.re_min_ratio = 0.9
-    if calibrated:
-        options.ba_refine_focal_length = False
-        options.ba_refine_extra_params = False
-        options.mapper.abs_pose_refine_focal_length = False
-        options.mapper.abs_pose_refine_extra_params = False
+    options.ba_refine_focal_length = free == "all"
+    options.mapper.abs_pose_refine_focal_length = free == "all"
+    options.ba_refine_extra_params = free != "nothing"
+    options.mapper.abs_pose_refine_extra_params = free != "nothing"
+    return options
+
+
+def _map_once(
+    seen: Observations,
+    cam_from_rig: Mapping[str, RigidTransform] | None,
+    folder: Path,
+    options: pycolmap.IncrementalPipelineOptions,
+) -> list[pycolmap.Reconstruction]:
+    pycolmap.logging.minloglevel = 2
+    scratch = folder / "mapper"
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir(parents=True)
+    write_database(scratch / "database.db", seen, cam_from_rig)
     total = len({r.station for r in seen.images}) if cam_from_rig else len(seen.images)
     found = _with_bar(
         "mapping",
@@ -242,9 +200,14 @@ def _run_mapper(
     return sorted(models, key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
 
 
-def _largest(
+def largest(
     models: Sequence[pycolmap.Reconstruction], images: Sequence[ImageRecord]
 ) -> pycolmap.Reconstruction:
+    """The model with the most pictures.
+
+    Raises:
+        ReconstructionError: there is none.
+    """
     if not models:
         raise ReconstructionError(
             f"no model: no two of the {len(images)} pictures share enough of the same spots; "
@@ -253,7 +216,8 @@ def _largest(
     return models[0]
 
 
-def _sizes(models: Sequence[pycolmap.Reconstruction]) -> tuple[int, ...]:
+def sizes(models: Sequence[pycolmap.Reconstruction]) -> tuple[int, ...]:
+    """Pictures in each model."""
     return tuple(int(model.num_reg_images()) for model in models)
 
 
@@ -264,47 +228,16 @@ def _baseline(cam_from_rig: Sequence[RigidTransform]) -> float:
     return float(np.linalg.norm((second * first.inv()).translation))
 
 
-def _adjust(model: pycolmap.Reconstruction) -> None:
-    """Refine everything, the one rig and the cameras included, in place."""
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.ceres.solver_options.num_threads = 1
-    pycolmap.bundle_adjustment(model, options)
-
-
-def _to_pinholes(model: pycolmap.Reconstruction, lenses: Mapping[int, Lens]) -> None:
-    """Make the model one of ideal pinholes, in place."""
-    for image in model.images.values():
-        lens = lenses[image.camera_id]
-        points = image.points2D
-        ideal = lens.to_pinhole(np.array([p.xy for p in points]).reshape(-1, 2))
-        for point, xy in zip(points, ideal, strict=True):
-            point.xy = xy if np.all(np.isfinite(xy)) else np.full(2, -1e6)
-    for number, lens in lenses.items():
-        camera, pinhole = model.cameras[number], lens.pinhole.colmap
-        camera.model = pinhole.model
-        camera.width, camera.height = pinhole.width, pinhole.height
-        camera.params = pinhole.params
-    model.update_point_3d_errors()
-
-
 def _with_bar(label: str, total: int, work: Callable[[Callable[[], None]], Any]) -> Any:
     """Do work that reports every step, with a bar that shows how far it is."""
+    if not sys.stderr.isatty():
+        started = time.monotonic()
+        result = work(lambda: None)
+        sys.stderr.write(f"{label}: done in {time.monotonic() - started:.1f} s\n")
+        return result
     from rich.console import Console
     from rich.progress import Progress
 
-    with Progress(console=Console(stderr=True), transient=True) as bar:
+    with Progress(console=Console(stderr=True)) as bar:
         task = bar.add_task(label, total=total)
         return work(lambda: bar.advance(task))
-
-
-__all__ = [
-    "Mapped",
-    "as_transform",
-    "map_calibrated",
-    "map_self_calibrated",
-    "model_baseline",
-    "rig_from_model",
-    "rigid3d",
-    "scale_model",
-]

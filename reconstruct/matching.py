@@ -144,6 +144,8 @@ def match_pair(task: PairTask) -> PairMatches:
     matches = match_descriptors(a.descriptors, b.descriptors, task.ratio)
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = task.seed
+    # A strip's overlap lies along the border and moves by one shift, as a watermark would.
+    options.detect_watermark = False
     if len(matches) < options.min_num_inliers:
         return PairMatches(matches=matches[:0], geometry=None)
     geometry = pycolmap.estimate_two_view_geometry(

@@ -21,7 +21,7 @@ RAW = (
     ".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f",
 )  # fmt: skip
 _GPS, _EXIF = 0x8825, 0x8769
-_DATE, _SUBSECOND, _OFFSET = 0x9003, 0x9291, 0x9011
+_DATE, _SUBSECOND, _OFFSET, _FOCAL_35 = 0x9003, 0x9291, 0x9011, 0xA405
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,6 +208,24 @@ def _altitude(gps: Any) -> float | None:
     altitude = _number(gps.get(6))
     below = gps.get(5) in (1, b"\x01")
     return None if altitude is None else -altitude if below else altitude
+
+
+def exif_focal_px(path: Path, width_px: int, height_px: int) -> float:
+    """Focal length in air, pixels, from the one that EXIF gives for 35 mm film; NaN without.
+
+    Film is 36 mm wide; makers relate the longer sides (or the diagonals, which differs by a few
+    per cent).
+    """
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            stated = _number(image.getexif().get_ifd(_EXIF).get(_FOCAL_35))
+    except (OSError, SyntaxError, ValueError, KeyError, TypeError):
+        return float("nan")
+    if stated is None or not 5 <= stated <= 1000:
+        return float("nan")
+    return stated / 36.0 * max(width_px, height_px)
 
 
 def to_utc(time: datetime, zone: tzinfo) -> datetime:

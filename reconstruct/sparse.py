@@ -19,7 +19,7 @@ from alice_survey.config import SurveyConfig
 from alice_survey.errors import ImageError, ReconstructionError
 from alice_survey.frames import Datum
 from alice_survey.manifest import ImageRecord, read_manifest
-from camera_calib.rig import read_rig
+from camera_calib.rig import Rig, read_rig
 from reconstruct.alignment import Similarity
 from reconstruct.georeference import Fit, fit_navigation, level
 from reconstruct.lens import Lens, lens_from_json
@@ -121,8 +121,9 @@ def _place(workspace: Path, partial: Path, inputs: Inputs, survey: Mapping[str, 
     }
     names = sorted(poses)
     records = [of_name[name] for name in names]
-    pupils = [pupil_pose(poses[r.image], lenses[r.camera]) for r in records]
-    placed = _find_place(workspace, model, records, pupils, inputs, survey, mapping)
+    pinholes = [poses[name] for name in names]
+    levers = body_from_pinhole(inputs.rig, lenses)
+    placed = _find_place(workspace, model, records, pinholes, levers, inputs, survey, mapping)
 
     move = placed.world_from_model
     rotation = pycolmap.Rotation3d(move.rotation.as_quat())
@@ -138,16 +139,21 @@ def _place(workspace: Path, partial: Path, inputs: Inputs, survey: Mapping[str, 
     write_json(partial / "registration.json", _registration(model, mapping, placed, rows))
 
 
-def pupil_pose(world_from_pinhole: RigidTransform, lens: Lens) -> RigidTransform:
-    """Pose of a camera's entrance pupil, given that of its pinhole, both in metres."""
-    return world_from_pinhole * lens.pinhole_from_cam
+def body_from_pinhole(rig: Rig | None, lenses: Mapping[str, Lens]) -> dict[str, RigidTransform]:
+    """Lever arms of the pinholes, metres; the identity without a rig, when navigation is theirs."""
+    if rig is None:
+        return dict.fromkeys(lenses, RigidTransform.identity())
+    return {
+        name: rig.body_from_cam(name) * lens.pinhole_from_cam.inv() for name, lens in lenses.items()
+    }
 
 
 def _find_place(
     workspace: Path,
     model: pycolmap.Reconstruction,
     records: Sequence[ImageRecord],
-    pupils: Sequence[RigidTransform],
+    pinholes: Sequence[RigidTransform],
+    levers: Mapping[str, RigidTransform],
     inputs: Inputs,
     survey: Mapping[str, Any],
     mapping: Mapping[str, Any],
@@ -155,20 +161,15 @@ def _find_place(
     points = np.array([p.xyz for _, p in sorted(model.points3D.items())]).reshape(-1, 3)
     if len(points) < 3:
         raise ReconstructionError(f"the model has {len(points)} points only")
-    centres = np.stack([p.translation for p in _by_station(records, pupils)])
+    centres = np.stack([p.translation for p in _by_station(records, pinholes)])
     levelled = level(points, centres)
     known = _known_scale(workspace, mapping)
     notes = [*survey.get("notes", []), *mapping["notes"]]
     fit = None
     if inputs.datum is not None:
-        levers = (
-            dict.fromkeys({r.camera for r in records}, RigidTransform.identity())
-            if inputs.rig is None
-            else {name: inputs.rig.body_from_cam(name) for name in inputs.rig.cameras}
-        )
         fit = fit_navigation(
             records,
-            pupils,
+            pinholes,
             levers,
             inputs.datum,
             levelled,
@@ -216,10 +217,10 @@ def _known_scale(workspace: Path, mapping: Mapping[str, Any]) -> tuple[float, st
 
 
 def _by_station(
-    records: Sequence[ImageRecord], pupils: Sequence[RigidTransform]
+    records: Sequence[ImageRecord], poses: Sequence[RigidTransform]
 ) -> list[RigidTransform]:
     order = sorted(range(len(records)), key=lambda i: (records[i].station, records[i].image))
-    return [pupils[i] for i in order]
+    return [poses[i] for i in order]
 
 
 def _registration(

@@ -48,9 +48,14 @@ def track_rows(
 ) -> list[TrackRow]:
     """Rows of all registered pictures of a COLMAP model of ideal pinholes, by station and name.
 
-    The pinhole's centre lies before or behind the entrance pupil, which is where the camera is.
+    The pinhole's centre lies before or behind the entrance pupil, which is where the camera is; in
+    a model without scale the few millimetres between them are not known and left out.
     """
     points = {i: p.xyz for i, p in model.points3D.items()}
+    pupils = {
+        name: lens.pinhole_from_cam if frame.scaled else RigidTransform.identity()
+        for name, lens in lenses.items()
+    }
     rows = []
     for image in model.images.values():
         if not image.has_pose:
@@ -69,7 +74,7 @@ def track_rows(
                 station=record.station,
                 camera=record.camera,
                 time_s=record.time_s,
-                world_from_cam=cam_from_world.inv() * lenses[record.camera].pinhole_from_cam,
+                world_from_cam=cam_from_world.inv() * pupils[record.camera],
                 points=len(seen),
                 reprojection_px=float(misses.mean()),
             )

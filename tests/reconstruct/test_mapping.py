@@ -15,12 +15,12 @@ from reconstruct.mapping import (
     Mapped,
     as_transform,
     map_calibrated,
-    map_self_calibrated,
     model_baseline,
     scale_model,
 )
 from reconstruct.matching import as_seen
 from reconstruct.priors import pinhole_positions, refine_with_positions
+from reconstruct.self_calibration import map_self_calibrated
 from tests.reconstruct.scenes import DATUM, Scene, make_scene
 
 
@@ -134,9 +134,7 @@ def test_self_calibration_finds_focal_length_distortion_and_rig() -> None:
         params=[760.0, 760.0, 400.0, 300.0, -0.08, 0.03, 0.0, 0.0],
     )  # fmt: skip
     scene = oblique_scene(truth, rng)
-    start = pycolmap.Camera(
-        model="OPENCV", width=800, height=600, params=[960.0, 960, 400, 300, 0, 0, 0, 0]
-    )
+    start = pycolmap.Camera(model="RADIAL", width=800, height=600, params=[960.0, 400, 300, 0, 0])
     seen = Observations(
         images=scene.records,
         cameras={"left": start, "right": pycolmap.Camera(start.todict())},
@@ -144,7 +142,7 @@ def test_self_calibration_finds_focal_length_distortion_and_rig() -> None:
         pairs=scene.pairs,
     )
     with TemporaryDirectory() as folder:
-        mapped = map_self_calibrated(seen, Path(folder), 1)
+        mapped = map_self_calibrated(seen, (), Path(folder), 1)
     assert mapped.models[0] == len(scene.records)
     assert not mapped.scaled
     assert mapped.baseline == 1.0
