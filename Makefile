@@ -28,7 +28,7 @@ demo: $(READY)
 	$(BIN)/alice-survey demo -w $(WORKSPACE)
 
 test: $(READY)
-	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
 lint: $(READY)
 	$(BIN)/ruff check .

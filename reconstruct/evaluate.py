@@ -72,7 +72,7 @@ class SurfaceScore:
     map_m: Array
     """(rows, columns) of `height_m`; NaN where there is no cell."""
     extent_m: tuple[float, float, float, float]
-    """West, east, south, north edges of the map."""
+    """West, east, south, north edges of the map, moved (not turned) to the true frame."""
 
     @property
     def completeness(self) -> float:
@@ -157,6 +157,7 @@ def score_surface(
     )
     place = np.where(filled[:, None], points, plane)
     inside = contains_xy(Polygon(area_ne), place[:, 0], place[:, 1])
+    shift_ne = (plane - np.stack([norths, easts, 0 * easts], -1).reshape(-1, 3)).mean(axis=0)[:2]
     cell_m2 = abs(transform.a * transform.e)
     expected = round(Polygon(area_ne).area / cell_m2)
     used = inside & filled
@@ -168,10 +169,10 @@ def score_surface(
         height_m=misses[used],
         map_m=misses.reshape(heights.shape),
         extent_m=(
-            transform.c,
-            transform.c + columns * transform.a,
-            transform.f + rows * transform.e,
-            transform.f,
+            transform.c + shift_ne[1],
+            transform.c + columns * transform.a + shift_ne[1],
+            transform.f + rows * transform.e + shift_ne[0],
+            transform.f + shift_ne[0],
         ),
     )
 

@@ -70,7 +70,7 @@ def score_mosaic(
         texture: true reflectance.
         truth_from_world: alignment from the model's to the true NED.
     """
-    area = Polygon(area_ne)
+    area = area_in_world(area_ne, terrain, truth_from_world)
     with rasterio.open(mosaic) as source, rasterio.open(dem) as heights:
         transform = source.transform
         windows = _patches(source.height, source.width, transform, area)
@@ -94,6 +94,12 @@ def score_mosaic(
         pixel_m=float(transform.a),
         coverage=coverage,
     )
+
+
+def area_in_world(area_ne: Array, terrain: Terrain, truth_from_world: RigidTransform) -> Polygon:
+    """The survey area where the model has it: navigation may have shifted and turned the model."""
+    corners = np.column_stack([area_ne, np.full(len(area_ne), terrain.offset_ned[2])])
+    return Polygon(truth_from_world.inv().apply(corners)[:, :2])
 
 
 def _patches(rows: int, columns: int, transform: Any, area: Polygon) -> list[Window]:

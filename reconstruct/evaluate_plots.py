@@ -67,8 +67,9 @@ def plot_errors(path: Path, surface: "SurfaceScore", area_ne: Array) -> None:
         bars.hist(1e3 * surface.height_m, bins=np.linspace(-4 * limit, 4 * limit, 161), log=True)
         bars.set(xlabel="height error (mm)", ylabel="cells")
         bars.set_title(
-            f"height rms {figures['height_rms_mm']:.2f} mm, distance rms "
-            f"{figures['distance_rms_mm']:.2f} mm, {surface.completeness:.1%} complete"
+            f"rms {figures['height_rms_mm']:.2f} mm in height, {figures['distance_rms_mm']:.2f} mm "
+            f"in distance; {surface.completeness:.1%} complete",
+            fontsize=9,
         )
         _save(figure, path)
 

@@ -1,0 +1,154 @@
+"""The whole loop on a small survey: its score, its reproducibility, and what a kill does to it."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+
+from alice_survey.survey import LOOP
+
+pytestmark = [pytest.mark.xdist_group("loop"), pytest.mark.slow]
+
+SMALL = """
+seed = 3
+[area]
+length_m = 1.3
+width_m = 1.5
+seafloor_depth_m = 12.0
+[plan]
+side_overlap = 0.35
+[seafloor]
+relief_m = 0.2
+grid_m = 0.02
+[imaging]
+scale = 6
+pool_views = 10
+"""
+
+
+def start(workspace: Path, threads: int) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", "alice_survey", "run", "-w", str(workspace)]
+    return subprocess.Popen(
+        [*command, "--threads", str(threads)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+
+
+def survey(folder: Path) -> Path:
+    folder.mkdir()
+    (folder / "survey.toml").write_text(SMALL)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    workspace = survey(tmp_path_factory.mktemp("loop") / "one")
+    assert start(workspace, threads=1).wait() == 0
+    return workspace
+
+
+def results(workspace: Path) -> dict[str, bytes]:
+    """Every file of the finished stages but times and SQLite files."""
+    return {
+        str(path.relative_to(workspace)): path.read_bytes()
+        for stage in LOOP
+        for path in sorted((workspace / stage).rglob("*"))
+        if path.is_file() and path.name != "stage.json" and path.suffix != ".db"
+    }
+
+
+def test_the_small_survey_is_reconstructed(undisturbed: Path) -> None:
+    score = json.loads((undisturbed / "report" / "report.json").read_text())
+    assert score["cameras"]["registered"] == score["cameras"]["total"] >= 16
+    assert 0.05 < score["cameras"]["rms_mm"] < 8
+    assert abs(score["cameras"]["scale_error_ppm"]) < 4000
+    assert 0.3 < score["surface"]["distance_rms_mm"] < 8
+    assert score["surface"]["completeness"] > 0.9
+    assert score["mosaic"]["coverage"] > 0.9
+    assert score["mosaic"]["position_median_mm"] < 8
+    assert score["overlaps"]["forward_mean"] == pytest.approx(0.6, abs=0.06)
+
+
+def test_truth_is_not_read_by_reconstruct(undisturbed: Path, tmp_path: Path) -> None:
+    """Without the truth beside the pictures the reconstruction is the same, to the byte."""
+    workspace = tmp_path / "blind"
+    shutil.copytree(undisturbed, workspace)
+    for stage in ("sparse", "dense", "mosaic", "report", "calibration"):
+        shutil.rmtree(workspace / stage)
+    shutil.rmtree(workspace / "images" / "truth")
+    shutil.rmtree(workspace / "flight" / "truth")
+    shutil.rmtree(workspace / "pool" / "truth", ignore_errors=True)
+    command = [sys.executable, "-m", "alice_survey", "reconstruct", "-w", str(workspace)]
+    subprocess.run([*command, "--threads", "1"], check=True, capture_output=True)
+    seen, whole = results(workspace), results(undisturbed)
+    for name in seen:
+        if name.split("/")[0] in {"calibration", "sparse", "dense", "mosaic"}:
+            assert seen[name] == whole[name], name
+
+
+def test_killed_in_every_stage_it_ends_the_same(undisturbed: Path, tmp_path: Path) -> None:
+    workspace = survey(tmp_path / "killed")
+    rng = np.random.default_rng(5)
+    kills = 0
+    for stage in LOOP:
+        run = start(workspace, threads=1)
+        partial = workspace / f"{stage}.partial"
+        while run.poll() is None and not partial.exists() and not (workspace / stage).exists():
+            time.sleep(0.01)
+        time.sleep(rng.uniform(0, 1.5))
+        if run.poll() is None:
+            os.killpg(run.pid, signal.SIGKILL)
+            kills += 1
+        run.wait()
+    assert kills >= 6
+    assert start(workspace, threads=1).wait() == 0
+    assert not list(workspace.glob("*.partial"))
+    again, whole = results(workspace), results(undisturbed)
+    assert set(again) == set(whole)
+    different = [name for name in whole if again[name] != whole[name]]
+    assert not different
+
+
+def test_more_threads_give_the_same_numbers(undisturbed: Path, tmp_path: Path) -> None:
+    workspace = survey(tmp_path / "two")
+    assert start(workspace, threads=2).wait() == 0
+    for name in ("sparse/track.csv", "report/cameras.csv"):
+        one, two = (
+            [row.split(",") for row in (w / name).read_text().splitlines()]
+            for w in (undisturbed, workspace)
+        )
+        assert len(one) == len(two)
+        for a, b in zip(one, two, strict=True):
+            for x, y in zip(a, b, strict=True):
+                try:
+                    assert float(x) == pytest.approx(float(y), abs=1e-6)
+                except ValueError:
+                    assert x == y
+    with (
+        rasterio.open(undisturbed / "dense" / "dem.tif") as a,
+        rasterio.open(workspace / "dense" / "dem.tif") as b,
+    ):
+        np.testing.assert_allclose(a.read(1), b.read(1), rtol=0, atol=1e-6)
+        assert a.transform == b.transform
+    with (
+        rasterio.open(undisturbed / "mosaic" / "mosaic.tif") as a,
+        rasterio.open(workspace / "mosaic" / "mosaic.tif") as b,
+    ):
+        np.testing.assert_array_equal(a.read(), b.read())
+
+
+def test_a_second_run_does_nothing(undisturbed: Path) -> None:
+    before = {p: p.stat().st_mtime_ns for p in undisturbed.rglob("*") if p.name != ".lock"}
+    assert start(undisturbed, threads=1).wait() == 0
+    after = {p: p.stat().st_mtime_ns for p in undisturbed.rglob("*") if p.name != ".lock"}
+    assert before == after
