@@ -18,9 +18,9 @@ Float32 = NDArray[np.float32]
 _GATE = 3.0
 FILL_CELLS = 3
 """Cells that lie no farther than this from known ones on opposite sides are filled."""
-STRAY_CELLS = 4
+STRAY_CELLS = 8
 """Reach of the square around a cell in which others must be known."""
-_LEAST_COMPANY = 0.3
+_LEAST_COMPANY = 0.22
 """Share of that square that must be known; what is lonelier is mostly wrong."""
 
 

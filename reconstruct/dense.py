@@ -7,21 +7,19 @@ prepare pictures, find each view's depth with a few partners, let neighbours con
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.artefacts import Stage, need_stage, run_stage
+from alice_survey.artefacts import Stage, need_stage, run_stage, write_json
 from alice_survey.config import ReconstructConfig, SurveyConfig
 from alice_survey.errors import ReconstructionError, warn
 from alice_survey.executor import parallel_map
 from alice_survey.frames import Array
 from reconstruct.cloud import voxel_edge, write_cloud_json, write_ply
-from reconstruct.dem import DemGrid, grid_over, round_cell
+from reconstruct.dem import FILL_CELLS, DemGrid, grid_over, round_cell
 from reconstruct.depth import pair_depth
 from reconstruct.fusion import GATE_SIGMAS, count_witnesses, merge_depths
 from reconstruct.light import (
@@ -35,16 +33,14 @@ from reconstruct.light import (
 )
 from reconstruct.model import SparseModel, View, WorldFrame, read_model
 from reconstruct.normalise import normalise
-from reconstruct.pictures import Pictures
 from reconstruct.points import pinhole_of
+from reconstruct.probe import find_conditions, open_pictures, shrunk
 from reconstruct.raster import preview_dem, tiled_raster
 from reconstruct.rectify import scaled_view
 from reconstruct.stereo_pairs import choose_pairs, in_frame, points_of_views
 from reconstruct.tiles import Tile, ViewSummary, fuse_tile, tile_tasks
 from reconstruct.view_store import ViewStore
 
-LARGEST_PIXELS = 3_000_000
-"""Pictures with more pixels are halved for matching, until they have fewer."""
 CELL_PIXELS = 2.5
 """Side of a DEM cell in mean ground pixels of the pictures as matched, unless depth is coarser."""
 _WITNESSES = 8
@@ -79,6 +75,7 @@ class DepthTask:
     view: View
     partners: tuple[tuple[int, View], ...]
     points_world: Array
+    match_sigma_px: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,9 +140,11 @@ def build_surface(
     store = ViewStore(folder / "scratch")
     store.folder.mkdir(parents=True, exist_ok=True)
     partners = choose_pairs(model, settings.dense_partners)
-    views = [
-        scaled_view(view, settings.dense_scale or matching_scale(view)) for view in model.views
-    ]
+    points = list(_points_in_sight(model))
+    conditions = find_conditions(
+        workspace, model.views, partners, points, settings.dense_scale, threads
+    )
+    views = [scaled_view(view, conditions.scale) for view in model.views]
     prepare = [
         PrepareTask(
             workspace=workspace,
@@ -163,9 +162,10 @@ def build_surface(
             index=index,
             view=views[index],
             partners=tuple((pair.partner, views[pair.partner]) for pair in pairs),
-            points_world=points,
+            points_world=points[index],
+            match_sigma_px=conditions.match_sigma_px,
         )
-        for index, (pairs, points) in enumerate(zip(partners, _points_in_sight(model), strict=True))
+        for index, pairs in enumerate(partners)
     ]
     _drain(parallel_map(view_depth, depths, threads=threads, label="match"))
     checks = [
@@ -199,32 +199,33 @@ def build_surface(
             "overlap, sharper texture or better positions"
         )
     write_cloud_json(folder / "cloud.json", count, offset, edge, model.frame)
+    write_json(
+        folder / "surface.json",
+        {
+            "format": "alice-survey surface",
+            "version": 1,
+            "matching_scale": conditions.scale,
+            "match_sigma_px": conditions.match_sigma_px,
+            "cell": grid.cell,
+            "unit": model.frame.unit,
+            "rows": grid.rows,
+            "columns": grid.columns,
+            "frame": model.frame.name,
+            "vertical_datum": model.frame.vertical_datum,
+            "pairs": sum(len(pairs) for pairs in partners),
+            "gaps_bridged_cells": FILL_CELLS,
+            "notes": list(model.frame.notes),
+        },
+    )
     preview_dem(folder / "dem.tif", folder / "dem.png")
     shutil.rmtree(store.folder)
-
-
-def matching_scale(view: View) -> float:
-    """1, 1/2, 1/4, ...: the largest at which a picture has no more than `LARGEST_PIXELS`."""
-    scale = 1.0
-    while view.width_px * view.height_px * scale * scale > LARGEST_PIXELS:
-        scale /= 2.0
-    return scale
-
-
-@lru_cache(maxsize=1)
-def _pictures(workspace: Path) -> Pictures:
-    return Pictures.open(workspace)
 
 
 def prepare_view(task: PrepareTask) -> None:
     """Keep a picture's colour, evened-out grey and validity at the size of matching."""
     if task.store.has(task.index, "grey"):
         return
-    pictures = _pictures(task.workspace)
-    colour, valid = pictures.colour(task.image), pictures.valid(task.image)
-    if colour.shape[1::-1] != task.size_px:
-        colour = cv2.resize(colour, task.size_px, interpolation=cv2.INTER_AREA)
-        valid = cv2.resize(valid.astype(np.uint8), task.size_px, interpolation=cv2.INTER_AREA) > 0
+    colour, valid = shrunk(open_pictures(task.workspace), task.image, task.size_px)
     task.store.save(task.index, "colour", colour)
     task.store.save(task.index, "valid", valid)
     task.store.save(task.index, "low", low_pass(colour, valid))
@@ -247,6 +248,7 @@ def view_depth(task: DepthTask) -> None:
             np.asarray(store.load(task.index, "valid")),
             np.asarray(store.load(number, "valid")),
             task.points_world,
+            task.match_sigma_px,
         )
         if found is not None:
             depths.append(found[0])

@@ -9,7 +9,7 @@ from reconstruct.model import View
 from reconstruct.rectify import Rectification, depth_in_reference, rectify, warp
 
 MATCH_SIGMA_PX = 0.3
-"""Standard deviation of a match that semi-global matching finds."""
+"""Standard deviation of a match that semi-global matching finds, before a survey tells its own."""
 _BLOCK_PX = 5
 _JUMP_PX = 1.0
 """A step of disparity between neighbours from which on both are taken to mix near and far."""
@@ -95,6 +95,7 @@ def pair_depth(
     valid_reference: NDArray[np.bool_],
     valid_partner: NDArray[np.bool_],
     points_world: Array,
+    match_sigma_px: float,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
     """Depth of the reference from one partner.
 
@@ -106,6 +107,7 @@ def pair_depth(
         valid_reference: (H, W) which pixels may be used.
         valid_partner: likewise.
         points_world: (N, 3) points that bound the depth.
+        match_sigma_px: standard deviation of a match.
 
     Returns:
         (H, W) depth along the reference's axis and its standard deviation, NaN where unknown; None
@@ -121,7 +123,7 @@ def pair_depth(
     disparity[~inside] = np.nan
     _drop_outside(disparity, _valid(valid_partner, pair.rect_from_partner, pair))
     depth = depth_in_reference(reference, pair, without_mixed(disparity))
-    sigma = depth * depth * np.float32(MATCH_SIGMA_PX / (pair.focal_px * pair.baseline))
+    sigma = depth * depth * np.float32(match_sigma_px / (pair.focal_px * pair.baseline))
     return depth, sigma
 
 

@@ -19,7 +19,7 @@ from reconstruct.raster import tiles_of
 from reconstruct.view_store import ViewStore
 
 _TILE_CELLS = 512
-_WORST_CELLS = 2.0
+_WORST_CELLS = 1.5
 """Depths less certain than this many cells are left out: rig stereo from afar, mostly."""
 _RIM = FILL_CELLS + STRAY_CELLS
 

@@ -1,4 +1,3 @@
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +7,7 @@ import rasterio
 from alice_survey.artefacts import read_json
 from alice_survey.config import ReconstructConfig, SurveyConfig
 from alice_survey.errors import ReconstructionError, WorkspaceError
-from reconstruct.dense import matching_scale, run_dense
+from reconstruct.dense import run_dense
 from tests.oracles_dense import (
     DEPTH_M,
     Scene,
@@ -114,6 +113,7 @@ def test_scratch_is_gone_and_files_are_there(workspace: Path):
         "cloud.ply",
         "cloud.json",
         "light.json",
+        "surface.json",
         "stage.json",
     }
 
@@ -129,7 +129,7 @@ def test_bytes_do_not_depend_on_the_number_of_processes(workspace: Path, tmp_pat
     for name in ("images", "sparse"):
         (other / name).symlink_to(workspace / name)
     assert run_dense(other, CONFIG, 2)
-    for name in ("dem.tif", "sigma.tif", "count.tif", "cloud.ply", "cloud.json", "light.json"):
+    for name in ("dem.tif", "sigma.tif", "count.tif", "cloud.ply", "surface.json", "light.json"):
         assert (other / "dense" / name).read_bytes() == (workspace / "dense" / name).read_bytes()
 
 
@@ -149,9 +149,3 @@ def test_a_workspace_without_model_says_which_command_makes_one(tmp_path: Path):
     (tmp_path / "sparse" / "stage.json").unlink()
     with pytest.raises(WorkspaceError, match="reconstruct"):
         run_dense(tmp_path, CONFIG, 1)
-
-
-def test_large_pictures_are_halved_until_they_fit():
-    view = survey_views()[0]
-    assert matching_scale(view) == 1.0
-    assert matching_scale(replace(view, width_px=3384, height_px=2710)) == 0.5

@@ -86,7 +86,7 @@ def test_depth_of_a_slope_with_a_step(heading_deg: float):
     place = rng.uniform(-0.3, 0.9, (200, 2))
     points = np.column_stack([place, sloped_with_step(*place.T)])
 
-    depth, sigma = pair_depth(one, other, *greys, everywhere, everywhere, points)
+    depth, sigma = pair_depth(one, other, *greys, everywhere, everywhere, points, 0.3)
 
     true = one.world_from_cam.inv().apply(hits(one, scene).reshape(-1, 3))[:, 2]
     error = depth - true.reshape(depth.shape)
@@ -105,9 +105,9 @@ def test_masked_pixels_get_no_depth():
     masked = everywhere.copy()
     masked[:, :200] = False
     points = np.array([[0.1, 0.1, DEPTH_M + 0.05], [0.0, 0.2, DEPTH_M - 0.05]] * 3)
-    here, _ = pair_depth(one, other, *greys, masked, everywhere, points)
-    there, _ = pair_depth(one, other, *greys, everywhere, masked, points)
-    free, _ = pair_depth(one, other, *greys, everywhere, everywhere, points)
+    here, _ = pair_depth(one, other, *greys, masked, everywhere, points, 0.3)
+    there, _ = pair_depth(one, other, *greys, everywhere, masked, points, 0.3)
+    free, _ = pair_depth(one, other, *greys, everywhere, everywhere, points, 0.3)
     assert np.isfinite(free[:, :200]).any()
     assert not np.isfinite(here[:, :200]).any()
     assert np.isfinite(here[:, 210:]).any()
