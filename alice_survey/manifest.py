@@ -5,6 +5,7 @@ Pictures enter a reconstruction through `images/manifest.csv` only, never by a f
 
 import csv
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -82,9 +83,9 @@ def read_manifest(path: Path) -> list[ImageRecord]:
             records = [_record(path, line, row) for line, row in enumerate(reader, 2)]
     except OSError as error:
         raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
-    names = [record.image for record in records]
-    for name in {n for n in names if names.count(n) > 1}:
-        raise ImageError(f"{path}: picture {name} is named twice")
+    for name, count in Counter(record.image for record in records).items():
+        if count > 1:
+            raise ImageError(f"{path}: picture {name} is named twice")
     return records
 
 

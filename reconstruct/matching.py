@@ -108,8 +108,14 @@ class PairMatches:
     """What COLMAP needs to know of the pair's geometry, or None where there is none."""
 
 
-@lru_cache(maxsize=12)
 def _features(path: Path) -> Features:
+    """Features from their file; those read last are kept, as long as their file is the same."""
+    stat = path.stat()
+    return _kept(path, stat.st_mtime_ns, stat.st_ino)
+
+
+@lru_cache(maxsize=32)
+def _kept(path: Path, _changed_ns: int, _inode: int) -> Features:
     return load_features(path)
 
 

@@ -1,5 +1,6 @@
 import csv
 import json
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -308,3 +309,59 @@ def test_one_or_two_processes_write_the_same(tmp_path: Path, draw: Draw) -> None
     one, two = tmp_path / "w1" / "images", tmp_path / "w2" / "images"
     for file in sorted(p for p in one.rglob("*") if p.is_file() and p.name != "stage.json"):
         assert file.read_bytes() == (two / file.relative_to(one)).read_bytes()
+
+
+def write_dng(path: Path, mosaic: np.ndarray) -> None:
+    """A minimal RAW file: a 16-bit RGGB mosaic with the tags that LibRaw needs."""
+    height, width = mosaic.shape
+    texts = {271: b"Alice\0", 272: b"Test\0", 50708: b"Alice Test\0"}
+    rationals = {50721: [1, 0, 0, 0, 1, 0, 0, 0, 1], 50728: [1, 1, 1]}
+    plain = {
+        254: (4, [0]), 256: (4, [width]), 257: (4, [height]), 258: (3, [16]), 259: (3, [1]),
+        262: (3, [32803]), 274: (3, [1]), 277: (3, [1]), 278: (4, [height]),
+        279: (4, [2 * width * height]), 33421: (3, [2, 2]), 33422: (1, [0, 1, 1, 2]),
+        50706: (1, [1, 4, 0, 0]), 50714: (3, [0]), 50717: (3, [65535]), 50778: (3, [21]),
+    }  # fmt: skip
+    tags = sorted([273, *texts, *rationals, *plain])
+    start = 8 + 2 + 12 * len(tags) + 4
+    extra, entries = b"", b""
+    for tag in tags:
+        if tag in texts:
+            kind, count, data = 2, len(texts[tag]), texts[tag]
+        elif tag in rationals:
+            kind = 10 if tag == 50721 else 5
+            count = len(rationals[tag])
+            data = b"".join(struct.pack("<iI", v, 1) for v in rationals[tag])
+        else:
+            kind, values = plain.get(tag, (4, [0]))
+            count, data = len(values), struct.pack(f"<{len(values)}{' BsHI'[kind]}", *values)
+            if tag == 273:
+                data = b"PIXL"
+        if len(data) > 4:
+            offset, extra = start + len(extra), extra + data + b"\0" * (len(data) % 2)
+            data = struct.pack("<I", offset)
+        entries += struct.pack("<HHI", tag, kind, count) + data.ljust(4, b"\0")
+    entries = entries.replace(b"PIXL", struct.pack("<I", start + len(extra)))
+    header = b"II*\0" + struct.pack("<IH", 8, len(tags))
+    path.write_bytes(header + entries + b"\0" * 4 + extra + mosaic.astype("<u2").tobytes())
+
+
+def test_raw_pictures_are_developed_alike(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One gain for all: a picture half as bright stays darker, by the same curve."""
+    (tmp_path / "in").mkdir()
+    x = np.arange(128) + np.zeros((96, 1))
+    for name, level in (("a", 1.0), ("b", 0.5)):
+        write_dng(tmp_path / "in" / f"{name}.dng", level * (8000 + 250 * x))
+    (tmp_path / "in" / "c.dng").write_bytes(b"II*\0 broken")
+    import_images(tmp_path / "w", [tmp_path / "in"])
+    assert "c.dng is left out" in capsys.readouterr().err
+    images = tmp_path / "w" / "images"
+    bright, dim = (cv2.imread(str(images / "camera" / f"{n}.png"), 0) for n in "ab")
+    assert bright.shape == (96, 128)
+    inner = (slice(10, -10), slice(10, -10))
+    assert np.all(np.diff(bright[inner].mean(axis=0)) > -0.5)
+    light = ((bright[inner] / 255.0 + 0.099) / 1.099) ** (1 / 0.45)  # BT.709 undone
+    expected = 255.0 * (1.099 * (light / 2) ** 0.45 - 0.099)
+    assert np.abs(dim[inner] - expected).max() < 2.0

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from reconstruct.features import Features, save_features
+from reconstruct.features import Features, load_features, save_features
 from reconstruct.matching import (
     PairTask,
     camera_from_text,
@@ -120,3 +120,15 @@ def test_a_camera_survives_text() -> None:
     assert again.model == camera.model
     np.testing.assert_array_equal(again.params, camera.params)
     assert again.has_prior_focal_length == camera.has_prior_focal_length
+
+
+def test_features_written_anew_are_read_anew(tmp_path: Path) -> None:
+    """One process may map a workspace twice with other settings."""
+    task, _ = two_views(tmp_path, outliers=0)
+    many = match_pair(task)
+    whole = load_features(task.first)
+    few = Features(
+        pixels=whole.pixels[:40], scale_px=whole.scale_px[:40], descriptors=whole.descriptors[:40]
+    )
+    save_features(task.first, few)
+    assert 30 <= len(match_pair(task).matches) <= 40 < len(many.matches)
