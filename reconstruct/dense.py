@@ -359,7 +359,7 @@ def surface_grid(
         warn("reconstruct.dem_cell_m is taken in model units: the model has no scale")
     footprint = float(np.nanmedian([s.footprint for s in summaries]))
     sigma = float(np.nanmedian([s.sigma for s in summaries]))
-    size = cell or round_cell(max(CELL_PIXELS * footprint, sigma))
+    size = cell or round_cell(max(CELL_PIXELS * footprint, 1.5 * sigma))
     grid = grid_over(bounds, size)
     if grid.rows * grid.columns > _MOST_CELLS:
         raise ReconstructionError(

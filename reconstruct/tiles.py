@@ -18,8 +18,8 @@ from reconstruct.points import joined, points_in_box
 from reconstruct.raster import tiles_of
 from reconstruct.view_store import ViewStore
 
-_TILE_CELLS = 512
-_WORST_CELLS = 1.5
+_TILE_CELLS = 256
+_WORST_CELLS = 1.0
 """Depths less certain than this many cells are left out: rig stereo from afar, mostly."""
 _RIM = FILL_CELLS + STRAY_CELLS
 
