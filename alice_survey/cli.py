@@ -170,19 +170,23 @@ def import_images(
     rig: Annotated[Path | None, typer.Option(help="rig.json of the cameras.")] = None,
     masks: Annotated[Path | None, typer.Option(help="Folder of masks; black is left out.")] = None,
     workspace: Workspace = WORK,
+    threads: Threads = None,
 ) -> None:
     """Bring in real pictures.
 
     Mono or stereo pictures or a video, with a navigation log, GPS from EXIF, or nothing at all.
     """
+    from alice_survey.executor import default_threads
     from reconstruct.import_images import import_images as work
 
     work(
         workspace, folders or [], left=left, right=right, video=video, every_s=every,
         navigation=navigation, clock_offset_s=clock_offset, time_zone=time_zone, rig=rig,
-        masks=masks,
+        masks=masks, threads=threads or default_threads(),
     )  # fmt: skip
-    typer.echo(f"pictures are in {workspace / 'images'}; next: alice-survey reconstruct")
+    typer.echo(
+        f"pictures are in {workspace / 'images'}; next: alice-survey reconstruct -w {workspace}"
+    )
 
 
 @app.command(epilog=_examples("reconstruct -w reef", "reconstruct -w reef --threads 2 --json"))
@@ -201,10 +205,18 @@ def reconstruct(
     _print(*run(RECONSTRUCT, workspace, survey, None, threads), as_json)
 
 
-@app.command(epilog=_examples("scale -w reef --points '0,0,0 1.2,0,0.1' --length 0.5"))
+@app.command(
+    epilog=_examples(
+        "scale -w reef --points '0,0,0 1.2,0,0.1' --length 0.5",
+        "scale -w reef --points 'left/001.png:512,300 left/001.png:930,312' --length 0.5",
+    )
+)
 def scale(
     points: Annotated[
-        str, typer.Option(help="Two points of the model, 'x,y,z x,y,z' (see docs/real-pictures).")
+        str,
+        typer.Option(
+            help="Two points: 'x,y,z x,y,z', or spots in pictures, 'IMAGE:x,y IMAGE:x,y'."
+        ),
     ],
     length: Annotated[float, typer.Option(min=1e-6, help="Their true distance, m.")],
     workspace: Workspace = WORK,

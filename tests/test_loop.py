@@ -31,6 +31,8 @@ grid_m = 0.02
 [imaging]
 scale = 6
 pool_views = 10
+[reconstruct]
+max_features = 1200
 """
 
 
