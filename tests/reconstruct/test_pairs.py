@@ -92,8 +92,12 @@ def test_pairs_by_footprint_are_those_that_share_the_sea_floor() -> None:
         for i, j in itertools.combinations(range(len(scene.records)), 2)
     }
     chosen = set(sure) | set(maybe)
-    much = {pair for pair, n in shared.items() if n > 60}
-    assert much <= chosen
+    records = scene.records
+    one_camera = {p for p in shared if records[p[0]].camera == records[p[1]].camera}
+    stations = {p for p in shared if records[p[0]].station == records[p[1]].station}
+    assert {pair for pair, n in shared.items() if n > 60} & one_camera <= chosen
+    assert stations <= set(sure)
+    assert chosen <= one_camera | stations
     assert all(shared[pair] > 20 for pair in sure)
     nothing = {pair for pair, n in shared.items() if n == 0}
     assert len(chosen & nothing) <= 0.02 * len(nothing)
