@@ -232,7 +232,7 @@ def run_evaluate(workspace: Path, config: SurveyConfig, threads: int) -> bool:
         )
         plot_track(folder / "track.png", plan / "plan.json", cameras)
         plot_errors(folder / "errors.png", surface, area_ne)
-        plot_sheet(folder / "sheet.png", workspace, surface)
+        plot_sheet(folder / "sheet.png", workspace, cameras, surface, area_ne)
 
     return run_stage(workspace, stage, work)
 

@@ -74,10 +74,13 @@ def plot_errors(path: Path, surface: "SurfaceScore", area_ne: Array) -> None:
         _save(figure, path)
 
 
-def plot_sheet(path: Path, workspace: Path, surface: "SurfaceScore") -> None:
-    """Plan, one picture, surface, mosaic and error map on one sheet."""
+def plot_sheet(
+    path: Path, workspace: Path, cameras: "CameraScore", surface: "SurfaceScore", area_ne: Array
+) -> None:
+    """The picture nearest to the middle of the area, surface, mosaic and error on one sheet."""
+    away = np.linalg.norm(cameras.positions_ned[:, :2] - area_ne.mean(axis=0), axis=1)
     pictures = [
-        ("A picture", next(iter(sorted((workspace / "images" / "left").iterdir())), None)),
+        ("A picture", workspace / "images" / cameras.names[int(away.argmin())]),
         ("Surface", workspace / "dense" / "dem.png"),
         ("Mosaic", workspace / "mosaic" / "mosaic.png"),
     ]
@@ -87,8 +90,7 @@ def plot_sheet(path: Path, workspace: Path, surface: "SurfaceScore") -> None:
         for panel, (title, file) in zip(panels, pictures, strict=False):
             panel.set_title(title)
             panel.axis("off")
-            if file is not None:
-                panel.imshow(_read(file))
+            panel.imshow(_read(file))
         west, east, south, north = surface.extent_m
         panels[3].set_title("Surface less truth (mm)")
         image = panels[3].imshow(
