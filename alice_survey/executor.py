@@ -6,12 +6,14 @@ import multiprocessing
 import os
 import signal
 import sys
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sized
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from typing import TypeVar
 
 _PR_SET_PDEATHSIG = 1
+_WORTH_TELLING_S = 2.0
 _CORES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 Item = TypeVar("Item")
@@ -100,7 +102,7 @@ def _start_worker() -> None:
 def progress(items: Iterable[Item], label: str, total: int | None = None) -> Iterator[Item]:
     """Pass items through while a bar on standard error shows how far the work is.
 
-    On a terminal the bar moves; elsewhere one line says when the work is done.
+    On a terminal the bar moves; elsewhere one line says that work of some seconds is done.
     """
     if sys.stderr.isatty():
         from rich.console import Console
@@ -108,11 +110,10 @@ def progress(items: Iterable[Item], label: str, total: int | None = None) -> Ite
 
         yield from track(items, label, total=total, console=Console(stderr=True))
         return
-    import time
-
     started, count = time.monotonic(), 0
     for item in items:
         count += 1
         yield item
     took_s = time.monotonic() - started
-    sys.stderr.write(f"{label}: {count} done in {took_s:.1f} s\n")
+    if took_s > _WORTH_TELLING_S:
+        sys.stderr.write(f"{label}: {count} done in {took_s:.1f} s\n")
