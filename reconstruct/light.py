@@ -41,7 +41,7 @@ _FEWEST_PICTURES = 6
 """Of a camera, for their median to say something."""
 _LARGEST_GAIN = 8.0
 _WHITE_LEVEL, _WHITE_PERCENT = 215.0, 98.0
-_GREY_LEVEL = 105.0
+_GREY_LEVEL = 128.0
 _NORM = 6.0
 
 
