@@ -21,10 +21,6 @@ from typing import Any
 from alice_survey.errors import WorkspaceError
 
 STAGE_FILE = "stage.json"
-STAGES = (
-    "plan", "flight", "pool", "images", "calibration", "sparse", "dense", "mosaic", "report",
-)  # fmt: skip
-"""Stage folders in the order in which the loop writes them."""
 
 
 @dataclass(frozen=True, kw_only=True)
