@@ -108,6 +108,12 @@ def import_images(
     for path in given:
         if path.resolve().is_relative_to((workspace / "images").resolve()):
             raise WorkspaceError(f"{path} is inside {workspace / 'images'}, which is written anew")
+    for simulated in (workspace / "images" / "truth", workspace / "pool" / "truth"):
+        if simulated.exists():
+            raise WorkspaceError(
+                f"{workspace} holds a simulated survey, whose rig is not that of real pictures: "
+                "choose another workspace with -w"
+            )
     stage = Stage(
         name="images",
         version=1,

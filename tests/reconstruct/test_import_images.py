@@ -11,7 +11,7 @@ from PIL import Image
 
 from alice_survey.artefacts import read_json
 from alice_survey.config import CameraConfig, WaterConfig
-from alice_survey.errors import AliceError, ImageError
+from alice_survey.errors import AliceError, ImageError, WorkspaceError
 from alice_survey.manifest import read_manifest
 from camera_calib.rig import design_rig, write_rig
 from reconstruct.import_images import import_images
@@ -290,6 +290,19 @@ def test_every_fault_gives_one_line(tmp_path: Path, draw: Draw) -> None:
             import_images(w, folders, **given)  # type: ignore[arg-type]
         assert "\n" not in str(caught.value)
     assert not (w / "images").exists()
+
+
+@pytest.mark.parametrize("stage", ["images", "pool"])
+def test_a_simulated_survey_is_not_mixed_with_real_pictures(
+    tmp_path: Path, draw: Draw, stage: str
+) -> None:
+    truth = tmp_path / "w" / stage / "truth"
+    truth.mkdir(parents=True)
+    for number in range(2):
+        draw(tmp_path / "in" / f"{number}.jpg", number)
+    with pytest.raises(WorkspaceError, match="simulated survey"):
+        import_images(tmp_path / "w", [tmp_path / "in"])
+    assert truth.is_dir()
 
 
 def test_a_navigation_log_of_another_day_is_refused(tmp_path: Path, draw: Draw) -> None:
