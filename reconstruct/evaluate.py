@@ -200,6 +200,7 @@ def run_evaluate(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     inputs = [truth / "poses.csv", truth / "terrain.ply", truth / "rig.json", dense / "dem.tif"]
     inputs += [mosaic / "mosaic.tif", sparse / "track.csv", sparse / "registration.json"]
     inputs += [plan / "plan.json", workspace / "flight" / "triggers.csv"]
+    inputs += [images / "manifest.csv"]
     stage = Stage(name="report", version=1, settings={"seed": config.seed}, inputs=inputs)
 
     def work(folder: Path) -> None:

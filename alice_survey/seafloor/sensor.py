@@ -113,9 +113,3 @@ def _curve() -> NDArray[np.uint8]:
     linear = np.linspace(0.0, 1.0, 65_536)
     encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     return np.floor(255.0 * encoded + 0.5).astype(np.uint8)
-
-
-def linear_from_grey(grey: NDArray[np.uint8]) -> Array:
-    """Share of the full scale that a grey value stands for: the inverse of the sRGB curve."""
-    encoded = np.asarray(grey, dtype=np.float64) / 255.0
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)

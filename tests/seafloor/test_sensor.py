@@ -7,10 +7,10 @@ from alice_survey.seafloor.sensor import (
     Sensor,
     develop,
     expose,
-    linear_from_grey,
     make_sensor,
     nominal_gain,
 )
+from camera_calib.corners import linear_light
 
 
 def plain(read_noise_e: float = 0.0, full_well_e: float = 1e5) -> Sensor:
@@ -83,7 +83,7 @@ def test_grey_values_follow_the_srgb_curve_and_back() -> None:
     grey = develop(np.full((1, 1, 3), 0.2140 * 1e4, dtype=np.float32), 1e-4)
     assert grey.tolist() == [[[127, 127, 127]]]
     ramp = np.linspace(0, 1, 1001, dtype=np.float32)
-    linear = linear_from_grey(develop(np.dstack([ramp] * 3), 1.0))[0, :, 0]
+    linear = linear_light(develop(np.dstack([ramp] * 3), 1.0))[0, :, 0]
     np.testing.assert_allclose(linear, ramp, atol=0.0046)
     assert np.all(np.diff(linear) >= 0)
 
