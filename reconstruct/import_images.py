@@ -372,7 +372,7 @@ def _place(
                 f"{np.nanmin(times):.1f} to {np.nanmax(times):.1f} s, log at {log.time_s[0]:.1f} "
                 f"to {log.time_s[-1]:.1f} s; check --clock-offset and --time-zone"
             )
-        notes.append("no positions: the model is unscaled, without CRS")
+        notes.append("no positions: no CRS, and unscaled unless a rig or a known length scales it")
         return list(records), None, "none"
     if log is None:
         notes.append("positions from EXIF GPS, of unknown accuracy")

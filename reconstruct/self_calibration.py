@@ -89,7 +89,9 @@ def map_self_calibrated(
     if cam_from_rig is not None:
         factor, baseline = 1.0 / model_baseline(model), 1.0
         scale_model(model, factor)
-        notes.append("the baseline of the self-calibrated stereo rig is the unit of length")
+        notes.append(
+            "the stereo rig calibrated itself; unless scaled, its baseline is the unit of length"
+        )
     lenses: dict[str, Lens] = {
         name: self_calibrated_lens(model.cameras[number])
         for number, name in enumerate(seen.cameras, 1)
