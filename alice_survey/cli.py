@@ -1,11 +1,22 @@
 """The command line: each command parses, calls and prints; the work is elsewhere."""
 
-import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
+from alice_survey.cli_camera import app as camera_app
+from alice_survey.cli_options import (
+    CONTEXT,
+    WORK,
+    AsJson,
+    Scale,
+    SurveyFile,
+    Threads,
+    Workspace,
+    examples,
+    print_result,
+)
 from alice_survey.errors import AliceError
 
 app = typer.Typer(
@@ -15,40 +26,13 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings=CONTEXT,
     rich_markup_mode=None,
 )
-
-Workspace = Annotated[
-    Path, typer.Option("-w", "--workspace", help="Folder that holds the stages of one survey.")
-]
-SurveyFile = Annotated[
-    Path | None,
-    typer.Option(
-        "-s", "--survey", help="Settings; WORKSPACE/survey.toml, then ./survey.toml, if not given."
-    ),
-]
-Threads = Annotated[
-    int | None, typer.Option(min=1, max=256, help="Cores to use; all when not given.")
-]
-Scale = Annotated[
-    int | None,
-    typer.Option(min=1, max=16, help="Divide the resolution of rendered pictures by this."),
-]
-AsJson = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON.")]
-WORK = Path("work")
+app.add_typer(camera_app, name="camera")
 
 
-def _examples(*lines: str) -> str:
-    """An epilog that keeps its lines (the first character tells the formatter not to wrap)."""
-    return "\b\nExamples:\n" + "\n".join(f"  alice-survey {line}" for line in lines)
-
-
-def _print(table: str, data: Any, as_json: bool) -> None:
-    typer.echo(json.dumps(data, indent=2) if as_json else table)
-
-
-@app.command(epilog=_examples("init reef", "run -w reef --scale 4"))
+@app.command(epilog=examples("init reef", "run -w reef --scale 4"))
 def init(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write it into.")],
 ) -> None:
@@ -62,7 +46,7 @@ def init(
 
 
 @app.command(
-    epilog=_examples(
+    epilog=examples(
         "fov",
         "fov --lens 12.5 --lens 25 --altitude 1.5 --altitude 2 --n-water 1.345 --json",
         "fov --validate",
@@ -88,11 +72,11 @@ def fov(
         table, data, passed = validation_report()
     else:
         table, data, passed = fov_report(lens, altitude, n_water, survey)
-    _print(table, data, as_json)
+    print_result(table, data, as_json)
     raise typer.Exit(0 if passed else 1)
 
 
-@app.command(epilog=_examples("plan -w reef", "plan -w reef -s other.toml --json"))
+@app.command(epilog=examples("plan -w reef", "plan -w reef -s other.toml --json"))
 def plan(workspace: Workspace = WORK, survey: SurveyFile = None, as_json: AsJson = False) -> None:
     """Plan lines and camera settings.
 
@@ -100,10 +84,10 @@ def plan(workspace: Workspace = WORK, survey: SurveyFile = None, as_json: AsJson
     """
     from alice_survey.survey import run
 
-    _print(*run(["plan"], workspace, survey), as_json)
+    print_result(*run(["plan"], workspace, survey), as_json)
 
 
-@app.command(epilog=_examples("fly -w reef"))
+@app.command(epilog=examples("fly -w reef"))
 def fly(workspace: Workspace = WORK, survey: SurveyFile = None, as_json: AsJson = False) -> None:
     """Fly the plan.
 
@@ -111,10 +95,10 @@ def fly(workspace: Workspace = WORK, survey: SurveyFile = None, as_json: AsJson 
     """
     from alice_survey.survey import run
 
-    _print(*run(["flight"], workspace, survey), as_json)
+    print_result(*run(["flight"], workspace, survey), as_json)
 
 
-@app.command(epilog=_examples("image -w reef --scale 4 --threads 2"))
+@app.command(epilog=examples("image -w reef --scale 4 --threads 2"))
 def image(
     workspace: Workspace = WORK,
     survey: SurveyFile = None,
@@ -128,10 +112,10 @@ def image(
     """
     from alice_survey.survey import run
 
-    _print(*run(["pool", "images"], workspace, survey, scale, threads), as_json)
+    print_result(*run(["pool", "images"], workspace, survey, scale, threads), as_json)
 
 
-@app.command(epilog=_examples("calibrate -w reef"))
+@app.command(epilog=examples("calibrate -w reef"))
 def calibrate(
     workspace: Workspace = WORK,
     survey: SurveyFile = None,
@@ -144,12 +128,12 @@ def calibrate(
     """
     from alice_survey.survey import run
 
-    _print(*run(["calibration"], workspace, survey, None, threads), as_json)
+    print_result(*run(["calibration"], workspace, survey, None, threads), as_json)
 
 
 @app.command(
     name="import-images",
-    epilog=_examples(
+    epilog=examples(
         "import-images photos -w reef",
         "import-images --left cam1 --right cam2 -w reef",
         "import-images photos --navigation dive.csv --clock-offset -1.5 --masks masks -w reef",
@@ -189,7 +173,7 @@ def import_images(
     )
 
 
-@app.command(epilog=_examples("reconstruct -w reef", "reconstruct -w reef --threads 2 --json"))
+@app.command(epilog=examples("reconstruct -w reef", "reconstruct -w reef --threads 2 --json"))
 def reconstruct(
     workspace: Workspace = WORK,
     survey: SurveyFile = None,
@@ -202,11 +186,11 @@ def reconstruct(
     """
     from alice_survey.survey import RECONSTRUCT, run
 
-    _print(*run(RECONSTRUCT, workspace, survey, None, threads), as_json)
+    print_result(*run(RECONSTRUCT, workspace, survey, None, threads), as_json)
 
 
 @app.command(
-    epilog=_examples(
+    epilog=examples(
         "scale -w reef --points '0,0,0 1.2,0,0.1' --length 0.5",
         "scale -w reef --points 'left/001.png:512,300 left/001.png:930,312' --length 0.5",
     )
@@ -227,7 +211,7 @@ def scale(
     typer.echo(scale_model(workspace, points, length))
 
 
-@app.command(epilog=_examples("evaluate -w reef", "evaluate -w reef --json"))
+@app.command(epilog=examples("evaluate -w reef", "evaluate -w reef --json"))
 def evaluate(
     workspace: Workspace = WORK,
     survey: SurveyFile = None,
@@ -240,10 +224,10 @@ def evaluate(
     """
     from alice_survey.survey import run
 
-    _print(*run(["report"], workspace, survey, None, threads), as_json)
+    print_result(*run(["report"], workspace, survey, None, threads), as_json)
 
 
-@app.command(name="run", epilog=_examples("run -w reef --scale 4"))
+@app.command(name="run", epilog=examples("run -w reef --scale 4"))
 def run_all(
     workspace: Workspace = WORK,
     survey: SurveyFile = None,
@@ -257,10 +241,10 @@ def run_all(
     """
     from alice_survey.survey import LOOP, run
 
-    _print(*run(LOOP, workspace, survey, scale, threads), as_json)
+    print_result(*run(LOOP, workspace, survey, scale, threads), as_json)
 
 
-@app.command(epilog=_examples("demo", "demo -w demo --threads 2"))
+@app.command(epilog=examples("demo", "demo -w demo --threads 2"))
 def demo(
     workspace: Workspace = Path("demo"), threads: Threads = None, as_json: AsJson = False
 ) -> None:
@@ -270,10 +254,10 @@ def demo(
     """
     from alice_survey.survey import run_demo
 
-    _print(*run_demo(workspace, threads), as_json)
+    print_result(*run_demo(workspace, threads), as_json)
 
 
-@app.command(epilog=_examples("status -w reef", "status -w reef --json"))
+@app.command(epilog=examples("status -w reef", "status -w reef --json"))
 def status(workspace: Workspace = WORK, survey: SurveyFile = None, as_json: AsJson = False) -> None:
     """Say what a workspace holds.
 
@@ -281,7 +265,7 @@ def status(workspace: Workspace = WORK, survey: SurveyFile = None, as_json: AsJs
     """
     from alice_survey.survey import workspace_status
 
-    _print(*workspace_status(workspace, survey), as_json)
+    print_result(*workspace_status(workspace, survey), as_json)
 
 
 def main() -> None:

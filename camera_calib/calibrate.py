@@ -24,7 +24,7 @@ from alice_survey.frames import Array
 from alice_survey.manifest import read_manifest
 from camera_calib.corners import find_chessboard
 from camera_calib.flat_port import FlatPortCamera
-from camera_calib.rig import Rig, design_rig, write_rig
+from camera_calib.rig import Covariance, Rig, design_rig, write_rig
 
 _FREE = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3", "port_distance_m")
 _STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-3, 1e-6, 1e-6, 1e-7, 1e-7, 1e-6, 1e-6])
@@ -223,7 +223,7 @@ class _Problem:
                 self.names[1]: right_from_left,
             },
             source=f"calibration through the ports from {len(self.pixels)} stereo views of a board",
-            sigmas=dict(zip(names, map(float, sigma), strict=True)),
+            covariance=Covariance(parameters=names, matrix=covariance),
         )
         misses = np.where(self.observed[..., None], self.predict(x) - self.pixels, np.nan)
         correlation = covariance / np.outer(sigma, sigma)

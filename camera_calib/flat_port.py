@@ -42,6 +42,15 @@ class FlatPortCamera:
     p1: float = 0.0
     p2: float = 0.0
     k3: float = 0.0
+    k4: float = 0.0
+    k5: float = 0.0
+    k6: float = 0.0
+    """k4 to k6 divide: OpenCV's rational model."""
+    s1: float = 0.0
+    s2: float = 0.0
+    s3: float = 0.0
+    s4: float = 0.0
+    """s1 to s4: OpenCV's thin prism."""
     port_distance_m: float = 0.0
     """From the entrance pupil to the inner glass, along the port's normal."""
     glass_thickness_m: float = 0.0

@@ -1,19 +1,52 @@
 """The rig: cameras behind their ports, fixed to each other and to the vehicle; `rig.json`."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.artefacts import read_json, write_json
 from alice_survey.config import CameraConfig, WaterConfig
 from alice_survey.errors import CalibrationError
-from alice_survey.frames import BODY_FROM_NADIR_CAM, pose_from_json, pose_to_json
+from alice_survey.frames import BODY_FROM_NADIR_CAM, Array, pose_from_json, pose_to_json
 from camera_calib.flat_port import FlatPortCamera, camera_from_json
 
-_FORMAT = {"format": "alice-survey rig", "version": 1}
+_FORMAT = {"format": "alice-survey rig", "version": 2}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Covariance:
+    """How well calibrated parameters are known, and together."""
+
+    parameters: tuple[str, ...]
+    """Names such as `left.fx_px`, `left.normal_x` or `right.rx_rad` (see docs/formats.md)."""
+    matrix: Array
+    """(P, P), in the products of the parameters' units."""
+
+    def __post_init__(self) -> None:
+        count = len(self.parameters)
+        if len(set(self.parameters)) != count or self.matrix.shape != (count, count):
+            raise CalibrationError(
+                f"covariance: {self.matrix.shape} values for {count} parameters, or a name twice"
+            )
+        if not np.all(np.isfinite(self.matrix)) or np.any(np.diag(self.matrix) < 0):
+            raise CalibrationError("covariance: a value is not finite or a variance negative")
+
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """Standard deviations by name."""
+        return dict(zip(self.parameters, np.sqrt(np.diag(self.matrix)).tolist(), strict=True))
+
+    @property
+    def correlation(self) -> Array:
+        """(P, P); rows of a parameter without variance are 0."""
+        sigma = np.sqrt(np.diag(self.matrix))
+        scale = np.divide(1.0, sigma, out=np.zeros_like(sigma), where=sigma > 0)
+        correlation: Array = self.matrix * np.outer(scale, scale)
+        return correlation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,12 +59,17 @@ class Rig:
     """Pose of the reference camera's entrance pupil on the vehicle (the lever arm)."""
     source: str
     """Where the numbers come from, in words; it is printed with every result."""
-    sigmas: Mapping[str, float] = field(default_factory=dict)
-    """Standard deviations of calibrated parameters by name, such as `left.fx_px`."""
+    covariance: Covariance | None = None
+    """Of the calibrated parameters; None for a design."""
 
     def __post_init__(self) -> None:
         if not self.cameras or set(self.cameras) != set(self.cam_from_rig):
             raise CalibrationError("rig: every camera needs one pose and every pose a camera")
+
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """Standard deviations of calibrated parameters by name, such as `left.fx_px`."""
+        return {} if self.covariance is None else self.covariance.sigmas
 
     @property
     def reference(self) -> str:
@@ -104,8 +142,13 @@ def write_rig(path: Path, rig: Rig) -> None:
         "source": rig.source,
         "cameras": cameras,
         "body_from_rig": pose_to_json(rig.body_from_rig),
-        "sigmas": dict(rig.sigmas),
+        "sigmas": rig.sigmas,
     }
+    if rig.covariance is not None:
+        body["covariance"] = {
+            "parameters": list(rig.covariance.parameters),
+            "matrix": rig.covariance.matrix.tolist(),
+        }
     write_json(path, body)
 
 
@@ -129,8 +172,17 @@ def read_rig(path: Path) -> Rig:
             cam_from_rig=poses,
             body_from_rig=pose_from_json(data["body_from_rig"]),
             source=str(data["source"]),
-            sigmas={str(k): float(v) for k, v in data.get("sigmas", {}).items()},
+            covariance=_covariance_from_json(data.get("covariance")),
         )
     except (KeyError, TypeError, ValueError, AttributeError, CalibrationError) as error:
         what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
         raise CalibrationError(f"{path}: {what}") from None
+
+
+def _covariance_from_json(data: dict[str, Any] | None) -> Covariance | None:
+    if data is None:
+        return None
+    return Covariance(
+        parameters=tuple(map(str, data["parameters"])),
+        matrix=np.array(data["matrix"], dtype=np.float64),
+    )

@@ -8,9 +8,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.config import CameraConfig, WaterConfig
 from alice_survey.errors import AliceError, CalibrationError
-from camera_calib.rig import Rig, design_rig, read_rig, write_rig
+from camera_calib.rig import Covariance, Rig, design_rig, read_rig, write_rig
 
 CONFIG = CameraConfig(position_body_m=(0.5, -0.06, 0.09))
+COVARIANCE = np.array([[0.09, 0.001], [0.001, 0.0001]])
 
 
 @pytest.fixture
@@ -29,7 +30,7 @@ def calibrated(rig: Rig) -> Rig:
         rig,
         cameras={"left": left, "right": rig.cameras["right"]},
         cam_from_rig={"left": RigidTransform.identity(), "right": right},
-        sigmas={"left.fx_px": 0.3},
+        covariance=Covariance(parameters=("left.fx_px", "left.k1"), matrix=COVARIANCE),
         source="a test",
     )
 
@@ -95,7 +96,8 @@ def test_a_rig_file_gives_back_what_was_written(tmp_path: Path, rig: Rig) -> Non
     assert after.cameras == before.cameras
     assert list(after.cameras) == ["left", "right"]
     assert after.source == "a test"
-    assert after.sigmas == {"left.fx_px": 0.3}
+    assert after.sigmas == pytest.approx({"left.fx_px": 0.3, "left.k1": 0.01})
+    np.testing.assert_array_equal(after.covariance.matrix, COVARIANCE)
     assert after.baseline_m == pytest.approx(before.baseline_m, abs=1e-15)
     for name in before.cameras:
         np.testing.assert_allclose(
