@@ -9,18 +9,25 @@ from the outer corner of the first pixel, whose centre is (0.5, 0.5).
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from alice_survey.errors import CalibrationError
 from alice_survey.frames import Array
+from camera_calib import lens, refraction
 
-_NEWTON_STEPS = 60
 _FORWARD = (0.0, 0.0, 1.0)
+_LENS = ("fx_px", "fy_px", "cx_px", "cy_px", *lens.COEFFICIENTS)
+_PORT = ("port_distance_m", "glass_thickness_m", "n_glass", "n_water")
+_NORMAL = ("normal_x", "normal_y")
+
+PARAMETERS = (*_LENS, *_PORT, *_NORMAL)
+"""What can be calibrated, in the order of `FlatPortCamera.project_jacobian`. The unit normal has
+two: its first two components, sines of the port's tilt about the camera's y and x axes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,22 +81,40 @@ class FlatPortCamera:
             raise CalibrationError(f"camera: normal {self.normal} is no unit vector facing forward")
 
     @cached_property
-    def _parameters(self) -> Array:
-        lens = [self.fx_px, self.fy_px, self.cx_px, self.cy_px]
-        distortion = [self.k1, self.k2, self.p1, self.p2, self.k3]
-        port = [self.port_distance_m, self.glass_thickness_m, self.n_glass, self.n_water]
+    def _lens(self) -> Array:
+        return np.array([getattr(self, name) for name in _LENS])
+
+    @cached_property
+    def _port(self) -> Array:
         unit = np.asarray(self.normal) / math.hypot(*self.normal)
-        return np.array([*lens, *distortion, *port, *unit, self._fold])
+        return np.array([*(getattr(self, name) for name in _PORT), *unit])
 
-    @property
+    @cached_property
     def _fold(self) -> float:
-        """Square of the tangent in air at which radial distortion turns back; inf if it never does.
+        return lens.fold(self._lens[4:])
 
-        There d/dr (r + k1 r^3 + k2 r^5 + k3 r^7) = 0, a cubic in w = 1 / r^2 with a leading 1.
+    def parameter(self, name: str) -> float:
+        """The value of one of `PARAMETERS`."""
+        if name in _NORMAL:
+            return float(self.normal[_NORMAL.index(name)])
+        return float(getattr(self, name))
+
+    def with_parameters(self, values: Mapping[str, float]) -> "FlatPortCamera":
+        """The same camera with some of `PARAMETERS` set to other values.
+
+        Raises:
+            CalibrationError: a name is unknown or a value out of range.
         """
-        roots = np.roots([1.0, 3 * self.k1, 5 * self.k2, 7 * self.k3])
-        nearest = max(roots.real[np.abs(roots.imag) < 1e-9], default=0.0)
-        return 1.0 / float(nearest) if nearest > 1e-9 else math.inf
+        unknown = sorted(set(values) - set(PARAMETERS))
+        if unknown:
+            raise CalibrationError(f"camera: no parameter is called {', '.join(unknown)}")
+        x, y = (float(values.get(name, self.parameter(name))) for name in _NORMAL)
+        if not x * x + y * y < 1.0:
+            raise CalibrationError(f"camera: normal_x, normal_y = {x:.6g}, {y:.6g} exceed 1")
+        plain: dict[str, Any] = {n: float(v) for n, v in values.items() if n not in _NORMAL}
+        if set(_NORMAL) & set(values):
+            plain["normal"] = (x, y, math.sqrt(1.0 - x * x - y * y))
+        return replace(self, **plain)
 
     def project(self, points_cam: Array) -> Array:
         """Project points in the water to pixels.
@@ -103,8 +128,31 @@ class FlatPortCamera:
             model folds back.
         """
         points = np.ascontiguousarray(points_cam, dtype=np.float64)
-        pixels: Array = _project(points.reshape(-1, 3), self._parameters)
+        pixels: Array = refraction.project(
+            points.reshape(-1, 3), self._lens, self._port, self._fold
+        )
         return pixels.reshape(*points.shape[:-1], 2)
+
+    def project_jacobian(self, points_cam: Array) -> tuple[Array, Array, Array]:
+        """Project points, with the analytic slopes of the pixels.
+
+        Args:
+            points_cam: (..., 3) points in the camera frame, metres.
+
+        Returns:
+            Pixels, (..., 2); their slopes by the point, (..., 2, 3), px/m; and by each of
+            `PARAMETERS`, (..., 2, 22). NaN where `project` is.
+        """
+        points = np.ascontiguousarray(points_cam, dtype=np.float64)
+        pixels, by_point, by_parameter = refraction.project_jacobian(
+            points.reshape(-1, 3), self._lens, self._port, self._fold
+        )
+        shape = points.shape[:-1]
+        return (
+            pixels.reshape(*shape, 2),
+            by_point.reshape(*shape, 2, 3),
+            by_parameter.reshape(*shape, 2, len(PARAMETERS)),
+        )
 
     def unproject(self, pixels: Array) -> tuple[Array, Array]:
         """The ray in water that ends at each pixel.
@@ -118,7 +166,9 @@ class FlatPortCamera:
             reflected.
         """
         array = np.ascontiguousarray(pixels, dtype=np.float64)
-        points, directions = _unproject(array.reshape(-1, 2), self._parameters)
+        points, directions = refraction.unproject(
+            array.reshape(-1, 2), self._lens, self._port, self._fold
+        )
         shape = (*array.shape[:-1], 3)
         return points.reshape(shape), directions.reshape(shape)
 
@@ -171,105 +221,19 @@ def camera_from_json(data: dict[str, Any]) -> FlatPortCamera:
         raise CalibrationError(f"camera: {error}") from None
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _project(points: Array, camera: Array) -> Array:
-    fx, fy, cx, cy, k1, k2, p1, p2, k3, air, glass, n_glass, n_water, nx, ny, nz, fold = camera
-    a_glass, b_glass = n_glass * n_glass, n_glass * n_glass - 1.0
-    a_water, b_water = n_water * n_water, n_water * n_water - 1.0
-    pixels = np.full((points.shape[0], 2), np.nan)
-    for i in range(points.shape[0]):
-        x, y, z = points[i]
-        along = nx * x + ny * y + nz * z
-        water = along - air - glass
-        if not water > 0.0:
-            continue
-        rx, ry, rz = x - along * nx, y - along * ny, z - along * nz
-        radius = math.sqrt(rx * rx + ry * ry + rz * rz)
-        tangent = 0.0
-        if radius > 0.0:
-            if air == 0.0:
-                reach = glass / math.sqrt(b_glass) if b_glass > 0.0 else math.inf
-                if glass == 0.0:
-                    reach = 0.0
-                reach += water / math.sqrt(b_water) if b_water > 0.0 else math.inf
-                if not radius < reach:
-                    continue
-            # f(t) = air t + glass t / sqrt(n_g^2 + (n_g^2 - 1) t^2) + water ... - radius, with t
-            # the tangent in air, is concave: from its tangent at 0 Newton climbs to the root and
-            # never passes it.
-            tangent = radius / (air + glass / n_glass + water / n_water)
-            for _ in range(_NEWTON_STEPS):
-                t2 = tangent * tangent
-                root_glass = math.sqrt(a_glass + b_glass * t2)
-                root_water = math.sqrt(a_water + b_water * t2)
-                miss = tangent * (air + glass / root_glass + water / root_water) - radius
-                slope = air + glass * a_glass / root_glass**3 + water * a_water / root_water**3
-                step = miss / slope
-                tangent -= step
-                if abs(step) <= 1e-15 * tangent:
-                    break
-            else:
-                if not abs(step) <= 1e-12 * tangent:
-                    continue
-            tangent /= radius
-        dx, dy, dz = rx * tangent + nx, ry * tangent + ny, rz * tangent + nz
-        if not dz > 0.0:
-            continue
-        u, v = dx / dz, dy / dz
-        r2 = u * u + v * v
-        if not r2 < fold:
-            continue
-        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        pixels[i, 0] = fx * (u * radial + 2.0 * p1 * u * v + p2 * (r2 + 2.0 * u * u)) + cx
-        pixels[i, 1] = fy * (v * radial + p1 * (r2 + 2.0 * v * v) + 2.0 * p2 * u * v) + cy
-    return pixels
+def pose_jacobian(by_point: Array, points_cam: Array) -> Array:
+    """Slopes of pixels by a small motion of the points in the camera's frame.
 
+    Args:
+        by_point: (..., 2, 3) slopes of the pixels by the points.
+        points_cam: (..., 3).
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _unproject(pixels: Array, camera: Array) -> tuple[Array, Array]:
-    fx, fy, cx, cy, k1, k2, p1, p2, k3, air, glass, n_glass, n_water, nx, ny, nz, fold = camera
-    points = np.full((pixels.shape[0], 3), np.nan)
-    directions = np.full((pixels.shape[0], 3), np.nan)
-    for i in range(pixels.shape[0]):
-        ud, vd = (pixels[i, 0] - cx) / fx, (pixels[i, 1] - cy) / fy
-        u, v = ud, vd
-        converged = False
-        for _ in range(_NEWTON_STEPS):
-            r2 = u * u + v * v
-            radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-            slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))
-            miss_u = u * radial + 2.0 * p1 * u * v + p2 * (r2 + 2.0 * u * u) - ud
-            miss_v = v * radial + p1 * (r2 + 2.0 * v * v) + 2.0 * p2 * u * v - vd
-            uu = radial + u * u * slope + 2.0 * p1 * v + 6.0 * p2 * u
-            uv = u * v * slope + 2.0 * p1 * u + 2.0 * p2 * v
-            vv = radial + v * v * slope + 6.0 * p1 * v + 2.0 * p2 * u
-            determinant = uu * vv - uv * uv
-            if not determinant > 0.0:
-                break
-            step_u = (vv * miss_u - uv * miss_v) / determinant
-            step_v = (uu * miss_v - uv * miss_u) / determinant
-            u -= step_u
-            v -= step_v
-            if abs(step_u) + abs(step_v) <= 1e-15 * (1.0 + abs(u) + abs(v)):
-                converged = True
-                break
-        if not (converged and u * u + v * v < fold):
-            continue
-        length = math.sqrt(u * u + v * v + 1.0)
-        dx, dy, dz = u / length, v / length, 1.0 / length
-        cos_air = dx * nx + dy * ny + dz * nz
-        if not cos_air > 0.0:
-            continue
-        x, y, z = dx * air / cos_air, dy * air / cos_air, dz * air / cos_air
-        sin2 = 1.0 - cos_air * cos_air
-        cos_glass = math.sqrt(1.0 - sin2 / (n_glass * n_glass))
-        bend = cos_glass - cos_air / n_glass
-        gx, gy, gz = dx / n_glass + bend * nx, dy / n_glass + bend * ny, dz / n_glass + bend * nz
-        x += gx * glass / cos_glass
-        y += gy * glass / cos_glass
-        z += gz * glass / cos_glass
-        cos_water = math.sqrt(1.0 - sin2 / (n_water * n_water))
-        bend = cos_water - cos_air / n_water
-        points[i] = x, y, z
-        directions[i] = dx / n_water + bend * nx, dy / n_water + bend * ny, dz / n_water + bend * nz
-    return points, directions
+    Returns:
+        (..., 2, 6): by a rotation vector about the pupil (p becomes exp(r) p, per radian), then by
+        a translation.
+    """
+    x, y, z = points_cam[..., 0], points_cam[..., 1], points_cam[..., 2]
+    zero = np.zeros_like(x)
+    turned = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=-1)
+    by_rotation = by_point @ turned.reshape(*x.shape, 3, 3)
+    return np.concatenate([by_rotation, by_point], axis=-1)

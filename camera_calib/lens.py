@@ -1,0 +1,123 @@
+"""OpenCV's lens distortion with all its named terms, its slopes and its inverse.
+
+    x = u L + 2 p1 u v + p2 (r2 + 2 u^2) + s1 r2 + s2 r2^2
+    y = v L + p1 (r2 + 2 v^2) + 2 p2 u v + s3 r2 + s4 r2^2
+    L = (1 + k1 r2 + k2 r2^2 + k3 r2^3) / (1 + k4 r2 + k5 r2^2 + k6 r2^3),  r2 = u^2 + v^2
+
+(u, v) are tangents of the ray in air, (x, y) what the sensor sees of them. The source is OpenCV's
+documentation of `calib3d`. Coefficients come as one vector in the order of `COEFFICIENTS`.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from alice_survey.frames import Array
+
+COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
+"""The same order as OpenCV's vector of distortion coefficients."""
+
+_NEWTON_STEPS = 60
+_BISECTIONS = 60
+
+
+def fold(k: Array) -> float:
+    """Square of the tangent in air at which radial distortion turns back; inf if it never does.
+
+    With N and D the numerator and denominator of L, d(r N / D)/dr vanishes where
+    N D + 2 w (N' D - N D') = 0 in w = r^2; beyond the first such w, or the first pole of L, two
+    rays meet in one pixel.
+
+    Args:
+        k: (12,) coefficients.
+    """
+    top = np.polynomial.Polynomial([1.0, k[0], k[1], k[4]])
+    bottom = np.polynomial.Polynomial([1.0, k[5], k[6], k[7]])
+    w = np.polynomial.Polynomial([0.0, 1.0])
+    turns = top * bottom + 2.0 * w * (top.deriv() * bottom - top * bottom.deriv())
+    found = [_first_positive_root(polynomial) for polynomial in (turns, bottom)]
+    return min(found)
+
+
+def _first_positive_root(polynomial: np.polynomial.Polynomial) -> float:
+    # With w = 1 / q the leading coefficient is 1, however small the others are.
+    roots = np.roots(polynomial.trim().coef)
+    nearest = max(roots.real[np.abs(roots.imag) < 1e-9], default=0.0)
+    return 1.0 / float(nearest) if nearest > 1e-9 else math.inf
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def radial(r2: float, k: Array) -> tuple[float, float, float]:
+    """L, its slope dL/d(r2), and its denominator."""
+    top = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
+    bottom = 1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))
+    top_slope = k[0] + r2 * (2.0 * k[1] + 3.0 * r2 * k[4])
+    bottom_slope = k[5] + r2 * (2.0 * k[6] + 3.0 * r2 * k[7])
+    ratio = top / bottom
+    return ratio, (top_slope - ratio * bottom_slope) / bottom, bottom
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def distort(u: float, v: float, k: Array) -> tuple[float, float]:
+    """(x, y) of the ray with tangents (u, v)."""
+    r2 = u * u + v * v
+    top = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
+    ratio = top / (1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7])))
+    uv2 = 2.0 * u * v
+    x = u * ratio + k[2] * uv2 + k[3] * (r2 + 2.0 * u * u) + r2 * (k[8] + r2 * k[9])
+    y = v * ratio + k[2] * (r2 + 2.0 * v * v) + k[3] * uv2 + r2 * (k[10] + r2 * k[11])
+    return x, y
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def distort_slopes(u: float, v: float, k: Array) -> tuple[float, float, float, float, float, float]:
+    """(x, y) and their slopes dx/du, dx/dv, dy/du, dy/dv."""
+    r2 = u * u + v * v
+    ratio, slope, _ = radial(r2, k)
+    uv2 = 2.0 * u * v
+    x = u * ratio + k[2] * uv2 + k[3] * (r2 + 2.0 * u * u) + r2 * (k[8] + r2 * k[9])
+    y = v * ratio + k[2] * (r2 + 2.0 * v * v) + k[3] * uv2 + r2 * (k[10] + r2 * k[11])
+    prism_x, prism_y = 2.0 * (k[8] + 2.0 * r2 * k[9]), 2.0 * (k[10] + 2.0 * r2 * k[11])
+    cross = uv2 * slope + 2.0 * (k[2] * u + k[3] * v)
+    x_u = ratio + 2.0 * u * u * slope + 2.0 * k[2] * v + 6.0 * k[3] * u + prism_x * u
+    y_v = ratio + 2.0 * v * v * slope + 6.0 * k[2] * v + 2.0 * k[3] * u + prism_y * v
+    return x, y, x_u, cross + prism_x * v, cross + prism_y * u, y_v
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def undistort(x: float, y: float, k: Array, fold2: float) -> tuple[float, float]:
+    """The ray (u, v) that the sensor sees at (x, y); NaN where no ray before the fold goes there.
+
+    Newton's method from (x, y); where that strays, from the radial part's inverse, which bisection
+    finds as it is monotonic up to the fold.
+    """
+    for attempt in range(2):
+        u, v = x, y
+        if attempt == 1:
+            seen = math.sqrt(x * x + y * y)
+            low, high = 0.0, math.sqrt(fold2) if fold2 < math.inf else max(1.0, seen)
+            while fold2 == math.inf and high * radial(high * high, k)[0] < seen and high < 1e6:
+                high *= 2.0
+            for _ in range(_BISECTIONS):
+                middle = 0.5 * (low + high)
+                if middle * radial(middle * middle, k)[0] < seen:
+                    low = middle
+                else:
+                    high = middle
+            u, v = x * low / seen, y * low / seen
+        for _ in range(_NEWTON_STEPS):
+            found_x, found_y, x_u, x_v, y_u, y_v = distort_slopes(u, v, k)
+            determinant = x_u * y_v - x_v * y_u
+            if not determinant > 0.0:
+                break
+            miss_x, miss_y = found_x - x, found_y - y
+            step_u = (y_v * miss_x - x_v * miss_y) / determinant
+            step_v = (x_u * miss_y - y_u * miss_x) / determinant
+            u -= step_u
+            v -= step_v
+            if abs(step_u) + abs(step_v) <= 1e-15 * (1.0 + abs(u) + abs(v)):
+                if u * u + v * v < fold2:
+                    return u, v
+                break
+    return math.nan, math.nan
