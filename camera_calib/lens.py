@@ -47,7 +47,7 @@ def _first_positive_root(polynomial: np.polynomial.Polynomial) -> float:
     return 1.0 / float(nearest) if nearest > 1e-9 else math.inf
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def radial(r2: float, k: Array) -> tuple[float, float, float]:
     """L, its slope dL/d(r2), and its denominator."""
     top = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
@@ -58,7 +58,7 @@ def radial(r2: float, k: Array) -> tuple[float, float, float]:
     return ratio, (top_slope - ratio * bottom_slope) / bottom, bottom
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def distort(u: float, v: float, k: Array) -> tuple[float, float]:
     """(x, y) of the ray with tangents (u, v)."""
     r2 = u * u + v * v
@@ -70,7 +70,7 @@ def distort(u: float, v: float, k: Array) -> tuple[float, float]:
     return x, y
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def distort_slopes(u: float, v: float, k: Array) -> tuple[float, float, float, float, float, float]:
     """(x, y) and their slopes dx/du, dx/dv, dy/du, dy/dv."""
     r2 = u * u + v * v
@@ -85,7 +85,7 @@ def distort_slopes(u: float, v: float, k: Array) -> tuple[float, float, float, f
     return x, y, x_u, cross + prism_x * v, cross + prism_y * u, y_v
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def undistort(x: float, y: float, k: Array, fold2: float) -> tuple[float, float]:
     """The ray (u, v) that the sensor sees at (x, y); NaN where no ray before the fold goes there.
 

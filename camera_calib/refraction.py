@@ -18,7 +18,7 @@ LENS_COUNT, PORT_COUNT = 16, 7
 PARAMETER_COUNT = LENS_COUNT + 6
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def air_tangent(radius: float, water: float, port: Array) -> float:
     """Tangent in air, against the port's normal, of the light from a point in the water.
 
@@ -61,7 +61,7 @@ def air_tangent(radius: float, water: float, port: Array) -> float:
     return tangent
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def project(points: Array, lens: Array, port: Array, fold: float) -> Array:
     """(N, 2) pixels of (N, 3) points."""
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
@@ -91,7 +91,7 @@ def project(points: Array, lens: Array, port: Array, fold: float) -> Array:
     return pixels
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def unproject(pixels: Array, lens: Array, port: Array, fold: float) -> tuple[Array, Array]:
     """Points on the outer glass and unit directions in water, (N, 3) each, of (N, 2) pixels."""
     air, glass, n_glass, n_water, nx, ny, nz = port
@@ -124,7 +124,7 @@ def unproject(pixels: Array, lens: Array, port: Array, fold: float) -> tuple[Arr
     return points, directions
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def project_jacobian(
     points: Array, lens: Array, port: Array, fold: float
 ) -> tuple[Array, Array, Array]:
@@ -213,7 +213,7 @@ def project_jacobian(
     return pixels, by_point, by_parameter
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _by_lens(
     u: float, v: float, x: float, y: float, fx: float, fy: float, k: Array, out: Array
 ) -> None:

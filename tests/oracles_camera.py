@@ -1,6 +1,7 @@
 """Slow, obvious twins of the flat-port camera, written apart from it."""
 
 import math
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -9,13 +10,16 @@ from scipy.optimize import bisect, minimize
 
 from camera_calib.flat_port import FlatPortCamera
 
+COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
+"""In the order of OpenCV's vector."""
+
 Array = NDArray[np.float64]
 
 
 def lens_pixel(camera: FlatPortCamera, ray_air: Array) -> Array:
     """Pixel of a ray in air, by OpenCV."""
     matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]])
-    distortion = np.array([camera.k1, camera.k2, camera.p1, camera.p2, camera.k3])
+    distortion = np.array([camera.parameter(name) for name in COEFFICIENTS])
     pixels, _ = cv2.projectPoints(
         np.asarray(ray_air, dtype=np.float64).reshape(1, 1, 3),
         np.zeros(3),
@@ -108,3 +112,10 @@ def project_by_shortest_path(camera: FlatPortCamera, point_cam: Array) -> Array:
     for _ in range(5):  # a trust region stops at the rounding of the path; the gradient goes on
         found = found - np.linalg.solve(hessian(found), gradient(found))
     return lens_pixel(camera, inner + axes @ found[:2])
+
+
+def numeric_slope(at: Callable[[float], Array], step: float) -> Array:
+    """Slope of a function of one number at 0, by differences of sixth order."""
+    weights = {1: 45.0, 2: -9.0, 3: 1.0}
+    total = sum(w * (at(i * step) - at(-i * step)) for i, w in weights.items())
+    return np.asarray(total / (60.0 * step))

@@ -6,10 +6,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from alice_survey.errors import CalibrationError
-from camera_calib.flat_port import FlatPortCamera, camera_from_json
-from tests.oracles_camera import lens_pixel, project_by_bisection, project_by_shortest_path
+from camera_calib.flat_port import (
+    PARAMETERS,
+    FlatPortCamera,
+    camera_from_json,
+    pose_jacobian,
+)
+from tests.oracles_camera import (
+    lens_pixel,
+    numeric_slope,
+    project_by_bisection,
+    project_by_shortest_path,
+)
 
 Array = NDArray[np.float64]
 
@@ -48,6 +59,13 @@ def cameras(draw: st.DrawFn) -> FlatPortCamera:
         p1=draw(st.floats(-2e-3, 2e-3)),
         p2=draw(st.floats(-2e-3, 2e-3)),
         k3=draw(st.floats(-0.02, 0.02)),
+        k4=draw(st.floats(-0.05, 0.05)),
+        k5=draw(st.floats(-0.02, 0.02)),
+        k6=draw(st.floats(-0.01, 0.01)),
+        s1=draw(st.floats(-1e-3, 1e-3)),
+        s2=draw(st.floats(-1e-3, 1e-3)),
+        s3=draw(st.floats(-1e-3, 1e-3)),
+        s4=draw(st.floats(-1e-3, 1e-3)),
         port_distance_m=draw(st.floats(0.0, 0.2)),
         glass_thickness_m=draw(st.floats(0.0, 0.2)),
         n_glass=draw(st.floats(1.45, 1.8)),
@@ -109,6 +127,96 @@ def test_project_agrees_with_bisection(
     np.testing.assert_allclose(
         camera.project(point), project_by_bisection(camera, point), atol=1e-8
     )
+
+
+@st.composite
+def points_in_water(draw: st.DrawFn) -> Array:
+    """Points within and a little beyond the frame, from near to far, one on the port's normal."""
+    rng = np.random.default_rng(draw(st.integers(0, 1000)))
+    directions = np.stack([*rng.uniform(-0.4, 0.4, (2, 20)), np.ones(20)], axis=1)
+    return directions * rng.uniform(0.75, 10.0, (20, 1))
+
+
+@settings(deadline=None, max_examples=60)
+@given(camera=cameras(), points=points_in_water())
+def test_slopes_by_the_point_are_those_of_project(camera: FlatPortCamera, points: Array) -> None:
+    points = np.vstack([points, 1.5 * np.array(camera.normal)])
+    pixels, by_point, _ = camera.project_jacobian(points)
+
+    np.testing.assert_allclose(pixels, camera.project(points), atol=1e-9)
+    for axis in range(3):
+        moved = numeric_slope(lambda h, a=axis: camera.project(points + h * np.eye(3)[a]), 1e-3)
+        np.testing.assert_allclose(by_point[..., axis], moved, rtol=1e-6, atol=2e-4)
+
+
+STEPS = dict.fromkeys(PARAMETERS, 0.0001) | {
+    "fx_px": 0.1, "fy_px": 0.1, "cx_px": 0.1, "cy_px": 0.1, "n_glass": 1e-3, "n_water": 1e-3,
+}  # fmt: skip
+
+
+@settings(deadline=None, max_examples=40)
+@given(camera=cameras(), points=points_in_water())
+def test_slopes_by_each_parameter_are_those_of_project(
+    camera: FlatPortCamera, points: Array
+) -> None:
+    camera = replace(
+        camera,
+        port_distance_m=camera.port_distance_m + 1e-3,
+        glass_thickness_m=camera.glass_thickness_m + 1e-3,
+        n_water=camera.n_water + 4e-3,
+    )
+    points = np.vstack([points, 1.5 * np.array(camera.normal)])
+    _, _, by_parameter = camera.project_jacobian(points)
+
+    for i, name in enumerate(PARAMETERS):
+        value, step = camera.parameter(name), STEPS[name]
+        moved = numeric_slope(
+            lambda h, n=name, v=value: camera.with_parameters({n: v + h}).project(points), step
+        )
+        scale = 1e-8 * max(1.0, float(np.abs(moved).max())) + 1e-9 / step
+        np.testing.assert_allclose(by_parameter[..., i], moved, rtol=1e-6, atol=scale, err_msg=name)
+
+
+def test_slopes_by_a_pose_are_those_of_moved_points() -> None:
+    rng = np.random.default_rng(5)
+    camera = replace(MANTA, normal=tilted(4.0, 70.0), k1=-0.1)
+    points = rng.uniform([-0.5, -0.4, 1.5], [0.5, 0.4, 2.5], (30, 3))
+    _, by_point, _ = camera.project_jacobian(points)
+    slopes = pose_jacobian(by_point, points)
+
+    assert slopes.shape == (30, 2, 6)
+    for axis in range(3):
+        unit = np.eye(3)[axis]
+        turned = numeric_slope(
+            lambda h, u=unit: camera.project(Rotation.from_rotvec(h * u).apply(points)), 1e-3
+        )
+        shifted = numeric_slope(lambda h, u=unit: camera.project(points + h * u), 1e-3)
+        np.testing.assert_allclose(slopes[..., axis], turned, rtol=1e-6, atol=1e-4)
+        np.testing.assert_allclose(slopes[..., 3 + axis], shifted, rtol=1e-6, atol=1e-4)
+
+
+def test_slopes_are_missing_where_pixels_are() -> None:
+    points = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 0.03], [0.1, 0.1, 1.0], [np.nan, 0.0, 1.0]])
+    pixels, by_point, by_parameter = MANTA.project_jacobian(points)
+
+    seen = [False, False, True, False]
+    assert np.isfinite(pixels).all(axis=1).tolist() == seen
+    assert np.isfinite(by_point).all(axis=(1, 2)).tolist() == seen
+    assert np.isfinite(by_parameter).all(axis=(1, 2)).tolist() == seen
+
+
+def test_parameters_go_by_name() -> None:
+    values = {name: 0.01 * (i + 1) for i, name in enumerate(PARAMETERS)} | {
+        "n_glass": 1.49, "n_water": 1.342, "fx_px": 3000.0, "fy_px": 3001.0,
+    }  # fmt: skip
+    camera = MANTA.with_parameters(values)
+
+    assert {name: camera.parameter(name) for name in PARAMETERS} == pytest.approx(values)
+    assert math.hypot(*camera.normal) == pytest.approx(1.0, abs=1e-15)
+    with pytest.raises(CalibrationError, match="k9"):
+        MANTA.with_parameters({"k9": 0.1})
+    with pytest.raises(CalibrationError, match="normal_x"):
+        MANTA.with_parameters({"normal_x": 0.9, "normal_y": 0.9})
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 5.0, 15.0, 25.0, 32.0])
