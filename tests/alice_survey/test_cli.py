@@ -6,7 +6,9 @@ import shlex
 import subprocess
 import sys
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.main import get_command
@@ -17,8 +19,8 @@ from alice_survey.config import SurveyConfig, load_config
 from alice_survey.survey import LOOP, init_survey
 
 COMMANDS = (
-    "init", "fov", "plan", "fly", "image", "calibrate", "import-images", "reconstruct", "scale",
-    "evaluate", "run", "demo", "status",
+    "init", "fov", "target", "plan", "fly", "image", "calibrate", "import-images", "reconstruct",
+    "scale", "evaluate", "run", "demo", "status", "camera",
 )  # fmt: skip
 PACKAGE = Path(__file__).parents[2] / "alice_survey"
 
@@ -51,15 +53,26 @@ def test_help_loads_nothing_heavy() -> None:
     assert "import-images" in done.stdout
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_explains_itself_with_examples(command: str) -> None:
-    shown = CliRunner().invoke(app, [command, "--help"])
+def leaves(command: Any, *path: str) -> Iterator[tuple[str, ...]]:
+    """Names of all commands, those of groups below their group."""
+    if not hasattr(command, "commands"):
+        yield path
+        return
+    for name, below in command.commands.items():
+        yield from leaves(below, *path, name)
+
+
+@pytest.mark.parametrize("path", leaves(get_command(app)), ids=" ".join)
+def test_every_command_explains_itself_with_examples(path: tuple[str, ...]) -> None:
+    shown = CliRunner().invoke(app, [*path, "--help"])
     assert shown.exit_code == 0
-    examples = re.findall(rf"^ +alice-survey ({command}.*)$", shown.output, re.MULTILINE)
+    examples = re.findall(rf"^ +alice-survey ({' '.join(path)}.*)$", shown.output, re.MULTILINE)
     assert examples
-    parser = get_command(app).commands[command]  # type: ignore[attr-defined]
+    parser: Any = get_command(app)
+    for name in path:
+        parser = parser.commands[name]
     for example in examples:
-        parser.make_context(command, shlex.split(example)[1:])  # it parses
+        parser.make_context(path[-1], shlex.split(example)[len(path) :])  # it parses
 
 
 def test_all_commands_are_known() -> None:
