@@ -36,9 +36,9 @@ from alice_survey.seafloor.renderer import Scene, flat_floor_radiance, range_map
 from alice_survey.seafloor.sensor import Sensor, develop, expose, make_sensor, nominal_gain
 from alice_survey.seafloor.terrain import read_terrain, survey_terrain
 from alice_survey.seafloor.texture import SAND_ALBEDO, survey_texture
-from alice_survey.seafloor.water import water_optics
 from alice_survey.trajectory import Trajectory, read_columns, read_track
 from camera_calib.rig import Rig, read_rig, write_rig
+from camera_calib.water import water_optics
 
 CAMERAS = ("left", "right")
 VERTICAL_DATUM = "sea surface at the datum (simulated)"

@@ -15,8 +15,8 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.config import ImagingConfig
 from alice_survey.frames import Array
-from alice_survey.seafloor.water import WaterOptics, phase_per_sr
 from camera_calib.flat_port import FlatPortCamera
+from camera_calib.water import WaterOptics, phase_per_sr
 
 LUMENS_PER_WATT = 683.0 * 106.86 / 300.0
 """White light of an even spectrum from 400 to 700 nm: 683 lm/W times the mean of the CIE photopic

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from alice_survey.config import CameraConfig
 from alice_survey.frames import Array
-from alice_survey.seafloor.water import WAVELENGTH_NM
+from camera_calib.water import WAVELENGTH_NM
 
 Floats = NDArray[np.float32]
 

@@ -19,14 +19,14 @@ from alice_survey.seafloor.light import (
     beam_solid_angle_sr,
     camera_light,
 )
-from alice_survey.seafloor.water import (
+from camera_calib.flat_port import FlatPortCamera
+from camera_calib.water import (
     ASYMMETRY,
     WaterOptics,
     diffuse_attenuation_per_m,
     phase_per_sr,
     water_optics,
 )
-from camera_calib.flat_port import FlatPortCamera
 from tests.oracles_seafloor import direct_light
 
 CLEAR_TO_TURBID: Sequence[Jerlov] = ("I", "II", "III", "1C", "3C", "5C", "7C", "9C")
