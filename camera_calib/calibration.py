@@ -8,6 +8,7 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.errors import CalibrationError
 from alice_survey.frames import Array
+from camera_calib.freedom import HELD, Freedom
 from camera_calib.rig import Rig
 
 
@@ -53,6 +54,10 @@ class Calibration:
     rejections: tuple[Rejection, ...] = ()
     warnings: tuple[str, ...] = ()
     """What the views do not constrain, one line each."""
+    freedom: Freedom = HELD
+    """What of the rig was adjusted, and the prior."""
+    rejected: Array | None = None
+    """(V, cameras, N, 2) measured pixels that took no part; NaN elsewhere."""
 
     def __post_init__(self) -> None:
         shape = (len(self.views), len(self.rig.cameras), len(self.target_points), 2)
