@@ -5,9 +5,18 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from alice_survey.errors import ConfigError
+from alice_survey.seawater import GREEN_NM, n_water
 
 Jerlov = Literal["I", "II", "III", "1C", "3C", "5C", "7C", "9C"]
 Latitude = Annotated[float, Field(ge=-85, le=85)]
@@ -66,10 +75,25 @@ class CameraConfig(Config):
 
 
 class WaterConfig(Config):
-    """The water between port and sea floor."""
+    """The water between port and sea floor.
+
+    Its index of refraction is `n_water`, or follows from temperature and salinity; then
+    `SurveyConfig` sets `n_water` for the depth of its sea floor.
+    """
 
     n_water: float = Field(1.34, ge=1, le=1.4)
     jerlov: Jerlov = "II"
+    temperature_c: float | None = Field(None, ge=-2, le=35)
+    salinity_psu: float | None = Field(None, ge=0, le=43)
+    wavelength_nm: float | None = Field(None, ge=380, le=750)
+
+    @model_validator(mode="after")
+    def _both_or_none(self) -> Self:
+        if (self.temperature_c is None) != (self.salinity_psu is None):
+            raise ValueError("give temperature_c and salinity_psu both, or n_water")
+        if self.wavelength_nm is not None and self.temperature_c is None:
+            raise ValueError("wavelength_nm needs temperature_c and salinity_psu")
+        return self
 
 
 class PlanConfig(Config):
@@ -158,6 +182,31 @@ class SurveyConfig(Config):
     seafloor: SeafloorConfig = SeafloorConfig()
     imaging: ImagingConfig = ImagingConfig()
     reconstruct: ReconstructConfig = ReconstructConfig()
+
+    @field_validator("water")
+    @classmethod
+    def _index_at_the_sea_floor(cls, water: WaterConfig, info: ValidationInfo) -> WaterConfig:
+        area = info.data.get("area")
+        if water.temperature_c is None or water.salinity_psu is None or area is None:
+            return water
+        try:
+            index = float(
+                n_water(
+                    water.temperature_c,
+                    water.salinity_psu,
+                    area.seafloor_depth_m,
+                    water.wavelength_nm or GREEN_NM,
+                )
+            )
+        except ConfigError as error:
+            raise ValueError(str(error)) from None
+        # Settings that were resolved once come back with their own index.
+        if "n_water" in water.model_fields_set and abs(water.n_water - index) > 1e-9:
+            raise ValueError(
+                f"temperature_c and salinity_psu give n_water = {index:.5f}, and n_water = "
+                f"{water.n_water:g} is set too: leave one out"
+            )
+        return water.model_copy(update={"n_water": index})
 
 
 def load_config(path: Path) -> SurveyConfig:

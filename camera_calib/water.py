@@ -1,19 +1,40 @@
-"""Optical properties of sea water by Jerlov type, for the camera's three colour channels.
+"""Optical properties of sea water: index of refraction, and attenuation by Jerlov type.
 
 Jerlov's tables give K_d, the attenuation of daylight with depth. A beam from a strobe is weakened
 more: by c = a + b (absorption and scattering). The two are joined here by Kirk's relation (1984),
 K_d mu_0 = sqrt(a^2 + 0.256 a b), with mu_0 = 0.9, and by an assumption for each type on the share
 of scattering at 550 nm, b / (a + b), rising from clear ocean to turbid coast as measurements of
 these types do; b falls as 1 / wavelength, as it does for particles.
+
+The index of refraction is that of `alice_survey.seawater` (Quan and Fry 1995).
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
 from alice_survey.config import Jerlov
+from alice_survey.errors import ConfigError
 from alice_survey.frames import Array
+from alice_survey.seawater import n_water, pressure_dbar
+from camera_calib.text_table import text_table
+
+__all__ = [
+    "ASYMMETRY",
+    "CHANNELS",
+    "WAVELENGTH_NM",
+    "WaterOptics",
+    "WaterRow",
+    "diffuse_attenuation_per_m",
+    "n_water",
+    "phase_per_sr",
+    "water_optics",
+    "water_report",
+    "water_table",
+]
 
 CHANNELS = ("red", "green", "blue")
 WAVELENGTH_NM = np.array([600.0, 530.0, 460.0])
@@ -23,17 +44,18 @@ ASYMMETRY = 0.924
 """Mean cosine of the Henyey-Greenstein phase function: with it 1.7 % of the scattered light goes
 backward, as in Petzold's measurements (1.8 %; Mobley 1994, section 3.10)."""
 
-_TABLE_NM = np.array([450.0, 550.0, 650.0])
-_DIFFUSE_PER_M: dict[Jerlov, tuple[float, float, float]] = {
-    "I": (0.019, 0.063, 0.36),
-    "II": (0.068, 0.089, 0.40),
-    "III": (0.135, 0.12, 0.445),
-    "1C": (0.25, 0.12, 0.45),
-    "3C": (0.39, 0.19, 0.46),
-    "5C": (0.56, 0.30, 0.54),
-    "7C": (0.89, 0.46, 0.63),
-    "9C": (1.6, 0.63, 0.76),
-}
+_TABLE_NM = np.linspace(400.0, 700.0, 13)
+_DIFFUSE_PER_M: dict[Jerlov, tuple[float, ...]] = {
+    "I": (.028, .022, .019, .018, .027, .043, .063, .089, .235, .305, .36, .42, .56),
+    "II": (.096, .081, .068, .062, .07, .076, .089, .115, .26, .335, .4, .465, .61),
+    "III": (.185, .16, .135, .116, .115, .116, .12, .148, .295, .375, .445, .52, .66),
+    "1C": (.51, .36, .25, .17, .14, .13, .12, .15, .3, .37, .45, .51, .65),
+    "3C": (.78, .54, .39, .29, .22, .2, .19, .21, .33, .4, .46, .56, .71),
+    "5C": (1.1, .78, .56, .43, .36, .31, .3, .33, .4, .48, .54, .65, .8),
+    "7C": (1.6, 1.2, .89, .71, .58, .49, .46, .46, .48, .54, .63, .78, .92),
+    "9C": (2.4, 1.9, 1.6, 1.23, .99, .78, .63, .58, .6, .65, .76, .92, 1.1),
+}  # fmt: skip
+"""Jerlov (1976), Marine Optics, table XXVII: every 25 nm from 400 to 700."""
 _SCATTERED_SHARE: dict[Jerlov, float] = {
     "I": 0.35, "II": 0.70, "III": 0.75, "1C": 0.75, "3C": 0.80, "5C": 0.83, "7C": 0.85, "9C": 0.86,
 }  # fmt: skip
@@ -43,31 +65,45 @@ _KIRK = 0.256
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WaterOptics:
-    """How water absorbs and scatters light in red, green and blue."""
+    """How water absorbs and scatters light of some wavelengths, mostly red, green and blue."""
 
     absorption_per_m: Array
-    """(3,)."""
+    """(W,)."""
     scattering_per_m: Array
-    """(3,)."""
+    """(W,)."""
 
     @property
     def attenuation_per_m(self) -> Array:
-        """(3,) beam attenuation: light that is scattered once counts as lost to the beam."""
+        """(W,) beam attenuation: light that is scattered once counts as lost to the beam."""
         return self.absorption_per_m + self.scattering_per_m
 
 
 def diffuse_attenuation_per_m(jerlov: Jerlov, wavelength_nm: Array) -> Array:
-    """Jerlov's K_d, straight between the table's wavelengths."""
+    """Jerlov's K_d, straight between the table's wavelengths.
+
+    Raises:
+        ConfigError: a wavelength is beyond the table.
+    """
+    beyond = wavelength_nm[~((wavelength_nm >= _TABLE_NM[0]) & (wavelength_nm <= _TABLE_NM[-1]))]
+    if beyond.size:
+        raise ConfigError(
+            f"wavelength {beyond.flat[0]:g} nm: Jerlov's table of attenuation spans "
+            f"{_TABLE_NM[0]:g} to {_TABLE_NM[-1]:g} nm"
+        )
     return np.interp(wavelength_nm, _TABLE_NM, _DIFFUSE_PER_M[jerlov])
 
 
-def water_optics(jerlov: Jerlov) -> WaterOptics:
-    """Absorption and scattering of a Jerlov type in the three channels (see the module)."""
+def water_optics(jerlov: Jerlov, wavelength_nm: Array = WAVELENGTH_NM) -> WaterOptics:
+    """Absorption and scattering of a Jerlov type (see the module), in the three channels if none.
+
+    Raises:
+        ConfigError: a wavelength is beyond Jerlov's table (400 to 700 nm).
+    """
     ratio = _SCATTERED_SHARE[jerlov] / (1.0 - _SCATTERED_SHARE[jerlov])
     at_550 = float(diffuse_attenuation_per_m(jerlov, np.array([550.0]))[0])
     scattering_550 = ratio * _MEAN_COSINE * at_550 / math.sqrt(1.0 + _KIRK * ratio)
-    scattering = scattering_550 * 550.0 / WAVELENGTH_NM
-    diffuse = _MEAN_COSINE * diffuse_attenuation_per_m(jerlov, WAVELENGTH_NM)
+    scattering = scattering_550 * 550.0 / wavelength_nm
+    diffuse = _MEAN_COSINE * diffuse_attenuation_per_m(jerlov, wavelength_nm)
     half = 0.5 * _KIRK * scattering
     return WaterOptics(
         absorption_per_m=np.sqrt(half**2 + diffuse**2) - half,
@@ -85,3 +121,103 @@ def phase_per_sr(cosine: Array, asymmetry: float = ASYMMETRY) -> Array:
     g = asymmetry
     phase: Array = (1.0 - g * g) / (4.0 * np.pi * (1.0 + g * g - 2.0 * g * cosine) ** 1.5)
     return phase
+
+
+@dataclass(frozen=True, kw_only=True)
+class WaterRow:
+    """Water for light of one wavelength."""
+
+    channel: str
+    """red, green or blue; empty for another wavelength."""
+    wavelength_nm: float
+    n_water: float
+    diffuse_per_m: float
+    """Jerlov's K_d, of daylight."""
+    absorption_per_m: float
+    scattering_per_m: float
+    beam_per_m: float
+    """Of a beam from a strobe: absorption and scattering."""
+
+
+def water_table(
+    temperature_c: float,
+    salinity_psu: float,
+    depth_m: float,
+    jerlov: Jerlov,
+    wavelengths_nm: Sequence[float] | None = None,
+) -> list[WaterRow]:
+    """Index and attenuation by wavelength; the camera's three channels when none are given.
+
+    Raises:
+        ConfigError: the water or a wavelength is out of range.
+    """
+    nm = WAVELENGTH_NM if wavelengths_nm is None else np.asarray(wavelengths_nm, dtype=np.float64)
+    index = n_water(temperature_c, salinity_psu, depth_m, nm)
+    diffuse, optics = diffuse_attenuation_per_m(jerlov, nm), water_optics(jerlov, nm)
+    names = dict(zip(WAVELENGTH_NM.tolist(), CHANNELS, strict=True))
+    columns = (index, diffuse, optics.absorption_per_m, optics.scattering_per_m)
+    return [
+        WaterRow(
+            channel=names.get(wave, ""),
+            wavelength_nm=wave,
+            n_water=n,
+            diffuse_per_m=kd,
+            absorption_per_m=a,
+            scattering_per_m=b,
+            beam_per_m=a + b,
+        )
+        for wave, n, kd, a, b in zip(
+            nm.tolist(), *(column.tolist() for column in columns), strict=True
+        )
+    ]
+
+
+def water_report(
+    temperature_c: float,
+    salinity_psu: float,
+    depth_m: float,
+    jerlov: str,
+    wavelengths_nm: Sequence[float] | None = None,
+) -> tuple[str, dict[str, Any]]:
+    """`water_table` as text and as JSON values.
+
+    Raises:
+        ConfigError: as `water_table`, or the Jerlov type is unknown.
+    """
+    kind = next((name for name in _DIFFUSE_PER_M if name == jerlov), None)
+    if kind is None:
+        raise ConfigError(f"no Jerlov type {jerlov!r}: known are {', '.join(_DIFFUSE_PER_M)}")
+    rows = water_table(temperature_c, salinity_psu, depth_m, kind, wavelengths_nm)
+    pressure = float(pressure_dbar(depth_m))
+    table = text_table(
+        ("channel", "wavelength", "n_water", "daylight K_d", "absorption", "scattering", "beam c"),
+        [
+            (
+                row.channel or "-",
+                f"{row.wavelength_nm:g} nm",
+                f"{row.n_water:.5f}",
+                f"{row.diffuse_per_m:.3f} /m",
+                f"{row.absorption_per_m:.3f} /m",
+                f"{row.scattering_per_m:.3f} /m",
+                f"{row.beam_per_m:.3f} /m",
+            )
+            for row in rows
+        ],
+    )
+    head = (
+        f"{temperature_c:g} C, {salinity_psu:g} psu, {depth_m:g} m deep ({pressure:.1f} dbar), "
+        f"Jerlov {jerlov}"
+    )
+    sources = (
+        "n relative to air: Quan & Fry 1995, pressure after Millard & Seaver 1990; "
+        "K_d: Jerlov 1976; a and b from K_d after Kirk 1984"
+    )
+    data = {
+        "temperature_c": temperature_c,
+        "salinity_psu": salinity_psu,
+        "depth_m": depth_m,
+        "pressure_dbar": pressure,
+        "jerlov": jerlov,
+        "rows": [asdict(row) for row in rows],
+    }
+    return "\n".join([head, table, sources]), data

@@ -158,7 +158,7 @@ def run_images(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     sections = ("camera", "water", "seafloor", "imaging")
     stage = Stage(
         name="images",
-        version=2,
+        version=3,
         settings={
             "seed": config.seed,
             "seafloor_depth_m": config.area.seafloor_depth_m,

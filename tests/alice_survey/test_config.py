@@ -9,6 +9,7 @@ from pydantic import ValidationError
 
 from alice_survey.config import AreaConfig, PlanConfig, SurveyConfig, load_config, parse_config
 from alice_survey.errors import ConfigError
+from alice_survey.seawater import n_water
 
 
 def fault(settings: dict[str, Any]) -> str:
@@ -84,7 +85,11 @@ def test_a_value_out_of_range_is_named_with_its_range(
         ),
         ({"plan": {"sped_mps": 2}}, "did you mean speed_mps?"),
         ({"plans": {}}, "plans is not a known setting; did you mean plan?"),
-        ({"water": {"zzz": 2}}, "water.zzz is not a known setting; known are n_water, jerlov"),
+        (
+            {"water": {"zzz": 2}},
+            "water.zzz is not a known setting; known are n_water, jerlov, temperature_c, "
+            "salinity_psu, wavelength_nm",
+        ),
     ],
 )
 def test_an_unknown_key_is_refused_and_a_near_one_offered(
@@ -129,6 +134,40 @@ def test_settings_come_back_from_their_json() -> None:
         "x",
     )
     assert SurveyConfig.model_validate(config.model_dump(mode="json")) == config
+
+
+def test_the_index_of_water_follows_from_temperature_salinity_and_depth() -> None:
+    sea = {"temperature_c": 24.0, "salinity_psu": 35.0}
+    for depth_m, wavelength_nm in ((15.0, 530.0), (4000.0, 460.0)):
+        config = parse_config(
+            {
+                "water": sea | ({} if wavelength_nm == 530.0 else {"wavelength_nm": 460.0}),
+                "area": {"seafloor_depth_m": depth_m},
+            },
+            "x",
+        )
+        assert config.water.n_water == float(n_water(24.0, 35.0, depth_m, wavelength_nm))
+        assert SurveyConfig.model_validate(config.model_dump(mode="json")) == config
+    assert parse_config({}, "x").water.n_water == 1.34
+
+
+@pytest.mark.parametrize(
+    ("water", "words"),
+    [
+        (
+            {"temperature_c": 24, "salinity_psu": 35, "n_water": 1.34},
+            "water: temperature_c and salinity_psu give n_water = 1.34118, and n_water = 1.34 is "
+            "set too: leave one out",
+        ),
+        ({"temperature_c": 24}, "water: give temperature_c and salinity_psu both, or n_water"),
+        ({"salinity_psu": 35}, "water: give temperature_c and salinity_psu both, or n_water"),
+        ({"wavelength_nm": 460}, "water: wavelength_nm needs temperature_c and salinity_psu"),
+        ({"temperature_c": 50, "salinity_psu": 35}, "water.temperature_c = 50"),
+        ({"temperature_c": 24, "salinity_psu": 350}, "water.salinity_psu = 350"),
+    ],
+)
+def test_water_is_told_once_and_whole(water: dict[str, float], words: str) -> None:
+    assert words in fault({"water": water})
 
 
 def test_two_shapes_of_area_are_refused() -> None:
