@@ -208,7 +208,9 @@ def _pixel_slopes(p: Array, lens: Array, port: Array, fold: float, out: Array) -
 
     Args:
         p: (3,) in the camera's frame.
-        lens, port, fold: as there.
+        lens: as there.
+        port: as there.
+        fold: as there.
         out: (2, 4), filled: slopes by x, y, z, then the pixel.
 
     Returns:
