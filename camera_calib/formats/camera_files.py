@@ -1,0 +1,277 @@
+"""COLMAP's cameras.txt and cameras.bin, and the same with the ports of Refractive COLMAP.
+
+COLMAP: https://colmap.github.io/format.html, one line a camera: `CAMERA_ID MODEL WIDTH HEIGHT
+PARAMS[]`. Refractive COLMAP (She et al. 2024, https://arxiv.org/abs/2403.08640) appends
+`REFRAC_MODEL REFRAC_PARAMS[]` to the line; its binary has an int32 after the parameters, the
+refraction model's number or -1, and then its parameters. A FLATPORT has `Nx Ny Nz int_dist
+int_thick na ng nw`, lengths in metres, the normal pointing into the water.
+"""
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pycolmap
+
+from alice_survey.artefacts import atomic_path
+from alice_survey.errors import CalibrationError
+from camera_calib.flat_port import FlatPortCamera
+from camera_calib.formats.fields import Fields, read_bytes, read_text
+from camera_calib.formats.opencv_model import camera_in_air, distorts
+
+FLATPORT = "FLATPORT"
+MODELS = {
+    "SIMPLE_PINHOLE": (0, ("f", "cx", "cy")),
+    "PINHOLE": (1, ("fx", "fy", "cx", "cy")),
+    "SIMPLE_RADIAL": (2, ("f", "cx", "cy", "k1")),
+    "RADIAL": (3, ("f", "cx", "cy", "k1", "k2")),
+    "OPENCV": (4, ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
+    "FULL_OPENCV": (6, ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
+}
+"""Number and parameters of COLMAP's models that OpenCV's model contains."""
+_REFRACTION = {0: FLATPORT, 1: "DOMEPORT"}
+_NO_REFRACTION = -1
+_PORT_PARAMETERS = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraRecord:
+    """A camera as these files have it."""
+
+    camera_id: int
+    model: str
+    width_px: int
+    height_px: int
+    params: tuple[float, ...]
+    port: tuple[float, ...] | None = None
+    """Parameters of a FLATPORT."""
+
+    def fields(self, path: Path) -> Fields:
+        """The record as named values, for checks that name file and camera."""
+        names = MODELS[self.model][1]
+        values = {
+            "WIDTH": float(self.width_px),
+            "HEIGHT": float(self.height_px),
+            **{name: [value] for name, value in zip(names, self.params, strict=True)},
+            "REFRAC_PARAMS": None if self.port is None else list(self.port),
+        }
+        return Fields(path=path, values=values, prefix=f"camera {self.camera_id}: ")
+
+
+def record_of(camera_id: int, camera: FlatPortCamera, *, port: bool) -> CameraRecord:
+    """The record of a camera, of the smallest model that holds its distortion.
+
+    Args:
+        camera_id: number in the file.
+        camera: without thin-prism terms.
+        port: add the port's parameters.
+    """
+    if distorts(camera, "k3", "k4", "k5", "k6"):
+        model = "FULL_OPENCV"
+    else:
+        model = "OPENCV" if distorts(camera, "k1", "k2", "p1", "p2") else "PINHOLE"
+    ours = {"fx": "fx_px", "fy": "fy_px", "cx": "cx_px", "cy": "cy_px"}
+    housing = (
+        *camera.normal,
+        camera.port_distance_m,
+        camera.glass_thickness_m,
+        1.0,
+        camera.n_glass,
+        camera.n_water,
+    )
+    return CameraRecord(
+        camera_id=camera_id,
+        model=model,
+        width_px=camera.width_px,
+        height_px=camera.height_px,
+        params=tuple(getattr(camera, ours.get(name, name)) for name in MODELS[model][1]),
+        port=housing if port else None,
+    )
+
+
+def camera_of(path: Path, record: CameraRecord) -> FlatPortCamera:
+    """The camera of a record, without its port.
+
+    Raises:
+        CalibrationError: a value is no finite number or out of range.
+    """
+    fields = record.fields(path)
+    names = MODELS[record.model][1]
+    values = {name: fields.number(name) for name in names}
+    focal = values.get("f", 0.0)
+    return camera_in_air(
+        fields,
+        "f" if "f" in values else "fx",
+        (fields.size("WIDTH"), fields.size("HEIGHT")),
+        lens=(values.get("fx", focal), values.get("fy", focal), values["cx"], values["cy"]),
+        coefficients={name: value for name, value in values.items() if name[0] in "kp"},
+    )
+
+
+def read_records(path: Path) -> list[CameraRecord]:
+    """Cameras of a cameras.txt or cameras.bin of either kind, in the order of their numbers.
+
+    Raises:
+        CalibrationError: no such file, or it is malformed, or a model is not OpenCV's.
+    """
+    records = _read_binary(path) if path.suffix.lower() == ".bin" else _read_text(path)
+    if not records:
+        raise CalibrationError(f"{path}: holds no camera")
+    ids = [record.camera_id for record in records]
+    if len(set(ids)) != len(ids):
+        raise CalibrationError(f"{path}: two cameras of one CAMERA_ID")
+    return sorted(records, key=lambda record: record.camera_id)
+
+
+def write_records(path: Path, records: Sequence[CameraRecord]) -> None:
+    """Write the cameras.txt or cameras.bin of Refractive COLMAP."""
+    with atomic_path(path) as temporary:
+        if path.suffix.lower() == ".bin":
+            temporary.write_bytes(
+                struct.pack("<Q", len(records)) + b"".join(_packed(record) for record in records)
+            )
+        else:
+            head = [
+                "# Camera list with one line of data per camera:",
+                "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[] OPTIONAL[REFRAC_MODEL "
+                "REFRAC_PARAMS[]]",
+                f"# Number of cameras: {len(records)}",
+            ]
+            text = "\n".join([*head, *map(_line, records)]) + "\n"
+            temporary.write_text(text, encoding="utf-8")
+
+
+def _line(record: CameraRecord) -> str:
+    items = [record.camera_id, record.model, record.width_px, record.height_px]
+    items += map(_digits, record.params)
+    if record.port is not None:
+        items += [FLATPORT, *map(_digits, record.port)]
+    return " ".join(map(str, items))
+
+
+def _digits(value: float) -> str:
+    return f"{value:.17g}"
+
+
+def _packed(record: CameraRecord) -> bytes:
+    number = MODELS[record.model][0]
+    size = (record.width_px, record.height_px)
+    start = struct.pack("<IiQQ", record.camera_id, number, *size)
+    body = struct.pack(f"<{len(record.params)}d", *record.params)
+    if record.port is None:
+        return start + body + struct.pack("<i", _NO_REFRACTION)
+    return start + body + struct.pack(f"<i{_PORT_PARAMETERS}d", 0, *record.port)
+
+
+def _read_text(path: Path) -> list[CameraRecord]:
+    records = []
+    for row, line in enumerate(read_text(path).splitlines(), start=1):
+        items = line.split()
+        if not items or items[0].startswith("#"):
+            continue
+        where = f"{path}: line {row}"
+        if len(items) < 5:
+            raise CalibrationError(f"{where}: CAMERA_ID MODEL WIDTH HEIGHT PARAMS[] wanted")
+        model = _known(where, items[1])
+        count = len(MODELS[model][1])
+        params, port = items[4 : 4 + count], items[4 + count :]
+        if len(params) < count or (port and _is_number(port[0])):
+            raise CalibrationError(f"{where}: {model} has {count} PARAMS: {len(items) - 4} found")
+        if port:
+            _must_be_flat(where, port[0])
+            if len(port) != 1 + _PORT_PARAMETERS:
+                raise CalibrationError(
+                    f"{where}: {FLATPORT} has {_PORT_PARAMETERS} REFRAC_PARAMS: "
+                    f"{len(port) - 1} found"
+                )
+        try:
+            records.append(
+                CameraRecord(
+                    camera_id=int(items[0]),
+                    model=model,
+                    width_px=int(items[2]),
+                    height_px=int(items[3]),
+                    params=tuple(map(float, params)),
+                    port=tuple(map(float, port[1:])) if port else None,
+                )
+            )
+        except ValueError as error:
+            raise CalibrationError(f"{where}: {error}") from None
+    return records
+
+
+def _read_binary(path: Path) -> list[CameraRecord]:
+    content = read_bytes(path)
+    # Only one of the two kinds ends where the file ends: the other is 4 bytes or more off.
+    for refractive in (False, True):
+        records = _unpacked(path, content, refractive)
+        if records is not None:
+            return records
+    raise CalibrationError(f"{path}: is no cameras.bin of COLMAP or Refractive COLMAP")
+
+
+def _unpacked(path: Path, content: bytes, refractive: bool) -> list[CameraRecord] | None:
+    """Cameras of a binary file, or None when it is not of this kind to the last byte."""
+    records = []
+    at = 8
+    try:
+        (count,) = struct.unpack_from("<Q", content)
+        for _ in range(min(count, len(content))):
+            camera_id, number, width, height = struct.unpack_from("<IiQQ", content, at)
+            model = {known: name for name, (known, _) in MODELS.items()}.get(number)
+            if model is None:
+                if at == 8:
+                    _known(f"{path}: camera {camera_id}", _model_name(number))
+                return None
+            size = len(MODELS[model][1])
+            params = struct.unpack_from(f"<{size}d", content, at + 24)
+            at += 24 + 8 * size
+            port = None
+            if refractive:
+                (refraction,) = struct.unpack_from("<i", content, at)
+                at += 4
+                if refraction != _NO_REFRACTION:
+                    name = _REFRACTION.get(refraction, str(refraction))
+                    _must_be_flat(f"{path}: camera {camera_id}", name)
+                    port = struct.unpack_from(f"<{_PORT_PARAMETERS}d", content, at)
+                    at += 8 * _PORT_PARAMETERS
+            records.append(
+                CameraRecord(
+                    camera_id=camera_id,
+                    model=model,
+                    width_px=width,
+                    height_px=height,
+                    params=params,
+                    port=port,
+                )
+            )
+    except struct.error:
+        return None
+    return records if at == len(content) else None
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _model_name(number: int) -> str:
+    names = {int(value): name for name, value in pycolmap.CameraModelId.__members__.items()}
+    return str(names.get(number, f"number {number}"))
+
+
+def _known(where: str, model: str) -> str:
+    if model not in MODELS:
+        raise CalibrationError(
+            f"{where}: model {model} is not OpenCV's: {', '.join(MODELS)} can be read"
+        )
+    return model
+
+
+def _must_be_flat(where: str, refraction: str) -> None:
+    if refraction != FLATPORT:
+        raise CalibrationError(f"{where}: port {refraction} is not flat: {FLATPORT} can be read")

@@ -1,0 +1,300 @@
+"""COLMAP's models and rig configurations, and the cameras of Refractive COLMAP.
+
+A folder holds `cameras.txt` (or `.bin`) and `rig_config.json`, which gives names (folders of
+pictures) and poses; for COLMAP also the other files of a model without pictures, so that it opens
+there. `rig_config.json` is https://colmap.github.io/rigs.html; Refractive COLMAP, a fork of 3.10,
+has that version's: cameras by `camera_id`, the reference by `ref_camera_id`.
+"""
+
+import json
+import tempfile
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.artefacts import write_json
+from alice_survey.errors import CalibrationError, warn
+from camera_calib.flat_port import FlatPortCamera
+from camera_calib.formats.camera_files import (
+    MODELS,
+    CameraRecord,
+    camera_of,
+    read_records,
+    record_of,
+    write_records,
+)
+from camera_calib.formats.documents import read_json_fields
+from camera_calib.formats.fields import Fields
+from camera_calib.formats.rigs import Reading, assemble
+from camera_calib.rig import Rig
+
+CAMERA_FILES = ("cameras.bin", "cameras.txt")
+RIG_CONFIG = "rig_config.json"
+
+
+def read_colmap(path: Path, reading: Reading) -> Rig:
+    """Read a model's cameras, of COLMAP or Refractive COLMAP, and what ties them to a rig.
+
+    Args:
+        path: folder of a model, its cameras.txt or cameras.bin, or a rig_config.json.
+        reading: picture size, for a rig_config.json without a model, and the camera wanted.
+
+    Raises:
+        CalibrationError: a file is malformed, or several cameras have no common rig.
+    """
+    file = _camera_file(path)
+    if file is None:
+        return _from_config_alone(path, reading)
+    folder = file.parent
+    records = read_records(file)
+    config = folder / RIG_CONFIG
+    ties = _config_ties(config, records) if config.exists() else _model_ties(folder, records)
+    if not ties:
+        chosen = [r for r in records if str(r.camera_id) == reading.camera or len(records) == 1]
+        if len(chosen) != 1:
+            ids = ", ".join(str(record.camera_id) for record in records)
+            raise CalibrationError(
+                f"{file}: cameras {ids} have no common rig: choose one with --camera, "
+                f"or put {RIG_CONFIG} beside it"
+            )
+        ties = [(chosen[0], str(chosen[0].camera_id), RigidTransform.identity())]
+    cameras = [_camera(file, record) for record, _, _ in ties]
+    tool = "Refractive COLMAP" if any(record.port for record, _, _ in ties) else "COLMAP"
+    names = [name for _, name, _ in ties]
+    return assemble(path, reading, tool, names, cameras, [pose for _, _, pose in ties])
+
+
+def write_colmap(path: Path, rig: Rig) -> list[Path]:
+    """Write a model without pictures and the rig configuration.
+
+    Args:
+        path: folder, or the cameras.txt or cameras.bin in it; text when it does not say.
+        rig: cameras without ports.
+    """
+    folder, file = _target(path)
+    model = pycolmap.Reconstruction()
+    sensors = pycolmap.Rig(rig_id=1)
+    entries = []
+    for i, (name, camera) in enumerate(rig.cameras.items(), start=1):
+        record = record_of(i, camera, port=False)
+        colmap = pycolmap.Camera(
+            camera_id=i,
+            model=record.model,
+            width=record.width_px,
+            height=record.height_px,
+            params=np.array(record.params),
+        )
+        model.add_camera(colmap)
+        entry: dict[str, Any] = {"image_prefix": f"{name}/"}
+        if i == 1:
+            sensors.add_ref_sensor(colmap.sensor_id)
+            entry["ref_sensor"] = True
+        else:
+            pose = rig.cam_from_rig[name]
+            rigid = pycolmap.Rigid3d(
+                pycolmap.Rotation3d(pose.rotation.as_quat()), np.array(pose.translation)
+            )
+            sensors.add_sensor(colmap.sensor_id, rigid)
+            entry |= _pose_entry(pose)
+        entries.append(
+            entry | {"camera_model_name": record.model, "camera_params": list(record.params)}
+        )
+    model.add_rig(sensors)
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".model") as temporary:
+        (model.write_binary if file.suffix == ".bin" else model.write_text)(temporary)
+        written = [part.replace(folder / part.name) for part in sorted(Path(temporary).iterdir())]
+    write_json(folder / RIG_CONFIG, [{"cameras": entries}])
+    return [*written, folder / RIG_CONFIG]
+
+
+def write_flatport(path: Path, rig: Rig) -> list[Path]:
+    """Write cameras with FLATPORT parameters and the rig configuration of COLMAP 3.10."""
+    folder, file = _target(path)
+    records = [record_of(i, c, port=True) for i, c in enumerate(rig.cameras.values(), start=1)]
+    entries = [
+        {"camera_id": i, "image_prefix": f"{name}/", **_pose_entry(rig.cam_from_rig[name])}
+        for i, name in enumerate(rig.cameras, start=1)
+    ]
+    write_records(file, records)
+    write_json(folder / RIG_CONFIG, [{"ref_camera_id": 1, "cameras": entries}])
+    return [file, folder / RIG_CONFIG]
+
+
+def targets(path: Path) -> list[Path]:
+    """The files that writing to `path` would replace."""
+    folder, file = _target(path)
+    kinds = [file.with_stem(stem) for stem in ("cameras", "rigs", "frames", "images", "points3D")]
+    return [*kinds, folder / RIG_CONFIG]
+
+
+def _target(path: Path) -> tuple[Path, Path]:
+    if path.name in CAMERA_FILES:
+        return path.parent, path
+    if path.suffix in (".txt", ".bin", ".json"):
+        raise CalibrationError(f"{path}: name a folder, or {' or '.join(CAMERA_FILES)} in it")
+    return path, path / "cameras.txt"
+
+
+def _camera_file(path: Path) -> Path | None:
+    if path.is_dir() or path.name == RIG_CONFIG:
+        folder = path if path.is_dir() else path.parent
+        found = [folder / name for name in CAMERA_FILES if (folder / name).is_file()]
+        if not found and path.is_dir() and not (path / RIG_CONFIG).is_file():
+            raise CalibrationError(f"{path}: holds neither {' nor '.join(CAMERA_FILES)}")
+        return found[0] if found else None
+    return path
+
+
+def _camera(path: Path, record: CameraRecord) -> FlatPortCamera:
+    camera = camera_of(path, record)
+    if record.port is None:
+        return camera
+    fields = record.fields(path)
+    x, y, z, distance, thickness, n_air, n_glass, n_water = fields.numbers("REFRAC_PARAMS", 8)
+    length = float(np.linalg.norm([x, y, z]))
+    if abs(length - 1.0) > 1e-6 or z <= 0:
+        raise fields.fault("REFRAC_PARAMS", f"has no unit normal facing forward: {x} {y} {z}")
+    if min(n_air, n_glass / n_air, n_water / n_air) < 1:
+        raise fields.fault("REFRAC_PARAMS", f"has the indices {n_air} {n_glass} {n_water}")
+    # Snell's law knows ratios only, so that an index of air other than 1 divides the others.
+    return replace(
+        camera,
+        normal=(float(x), float(y), float(z)),
+        port_distance_m=float(distance),
+        glass_thickness_m=float(thickness),
+        n_glass=float(n_glass / n_air),
+        n_water=float(n_water / n_air),
+    )
+
+
+_Tie = tuple[CameraRecord, str, RigidTransform]
+
+
+def _config_ties(path: Path, records: Sequence[CameraRecord]) -> list[_Tie]:
+    """Each camera with its name and pose, the reference first, after a rig configuration."""
+    entries = _entries(path)
+    free = list(records)
+    ties = []
+    guessed = False
+    for entry in entries:
+        if "camera_id" in entry:
+            wanted = int(entry.number("camera_id"))
+            found = next((r for r in free if r.camera_id == wanted), None)
+        elif "camera_params" in entry:
+            model, params = _entry_lens(entry)
+            same = (r for r in free if r.model == model and np.allclose(r.params, params))
+            found = next(same, None)
+        else:
+            guessed = len(records) > 1
+            found = free[0] if len(records) == len(entries) else None
+        if found is None:
+            raise entry.fault("image_prefix", f"{entry.text('image_prefix')} fits no camera")
+        free.remove(found)
+        ties.append((found, _prefix_name(entry), _entry_pose(entry)))
+    if guessed:
+        warn(f"{path}: its cameras carry no numbers: taken in the order of their CAMERA_ID")
+    return ties
+
+
+def _model_ties(folder: Path, records: Sequence[CameraRecord]) -> list[_Tie]:
+    """The same after the model's own rig; empty when no rig holds all cameras with poses."""
+    if len(records) == 1 or not any((folder / f"rigs{end}").exists() for end in (".bin", ".txt")):
+        return []
+    try:
+        model = pycolmap.Reconstruction(folder)
+    except (RuntimeError, ValueError, OSError) as error:
+        raise CalibrationError(f"{folder}: COLMAP cannot read it: {_one_line(error)}") from None
+    by_id = {record.camera_id: record for record in records}
+    for _, rig in sorted(model.rigs.items()):
+        reference = rig.ref_sensor_id.id
+        poses = {reference: RigidTransform.identity()}
+        for sensor, rigid in rig.non_ref_sensors.items():
+            if rigid is not None:
+                poses[sensor.id] = _rigid(rigid)
+        if set(poses) == set(by_id):
+            order = [reference, *sorted(set(poses) - {reference})]
+            return [(by_id[i], f"cam{i}", poses[i]) for i in order]
+    return []
+
+
+def _from_config_alone(path: Path, reading: Reading) -> Rig:
+    file = path / RIG_CONFIG if path.is_dir() else path
+    entries = _entries(file)
+    size = reading.size(file)
+    cameras = []
+    for i, entry in enumerate(entries, start=1):
+        model, params = _entry_lens(entry)
+        record = CameraRecord(
+            camera_id=i, model=model, width_px=size[0], height_px=size[1], params=params
+        )
+        cameras.append(camera_of(file, record))
+    names = [_prefix_name(entry) for entry in entries]
+    return assemble(file, reading, "COLMAP", names, cameras, [_entry_pose(e) for e in entries])
+
+
+def _entries(path: Path) -> list[Fields]:
+    """Cameras of a rig configuration, the reference first."""
+    rigs = read_json_fields(path).get("list")
+    if len(rigs) != 1 or not isinstance(rigs[0], dict):
+        raise CalibrationError(f"{path}: a list of one rig wanted, {len(rigs)} found")
+    rig = Fields(path=path, values=rigs[0])
+    cameras = rig.get("cameras")
+    if not isinstance(cameras, list) or not all(isinstance(camera, dict) for camera in cameras):
+        raise rig.fault("cameras", "is no list of cameras")
+    entries = [Fields(path=path, values=c, prefix=f"cameras[{i}].") for i, c in enumerate(cameras)]
+    first = rig.number("ref_camera_id") if "ref_camera_id" in rig else None
+    references = [
+        entry
+        for entry in entries
+        if entry.values.get("ref_sensor") is True
+        or (first is not None and entry.number("camera_id") == first)
+    ]
+    if len(references) != 1:
+        raise rig.fault("cameras", f"has {len(references)} reference cameras; 1 wanted")
+    return [references[0], *(entry for entry in entries if entry is not references[0])]
+
+
+def _entry_lens(entry: Fields) -> tuple[str, tuple[float, ...]]:
+    model = entry.text("camera_model_name")
+    if model not in MODELS:
+        raise entry.fault("camera_model_name", f"{model} is not OpenCV's: {', '.join(MODELS)}")
+    return model, tuple(entry.numbers("camera_params", len(MODELS[model][1])).tolist())
+
+
+def _entry_pose(entry: Fields) -> RigidTransform:
+    if entry.values.get("ref_sensor") is True:
+        return RigidTransform.identity()
+    w, x, y, z = entry.numbers("cam_from_rig_rotation", 4)
+    if abs(np.linalg.norm([w, x, y, z]) - 1.0) > 1e-3:
+        raise entry.fault("cam_from_rig_rotation", "is no unit quaternion w x y z")
+    return RigidTransform.from_components(
+        entry.numbers("cam_from_rig_translation", 3), Rotation.from_quat([x, y, z, w])
+    )
+
+
+def _pose_entry(pose: RigidTransform) -> dict[str, list[float]]:
+    x, y, z, w = pose.rotation.as_quat(canonical=True).tolist()
+    return {
+        "cam_from_rig_rotation": [w, x, y, z],
+        "cam_from_rig_translation": pose.translation.tolist(),
+    }
+
+
+def _prefix_name(entry: Fields) -> str:
+    return entry.text("image_prefix").strip("/") or "cam"
+
+
+def _rigid(rigid: Any) -> RigidTransform:
+    return RigidTransform.from_components(
+        np.array(rigid.translation), Rotation.from_quat(np.array(rigid.rotation.quat))
+    )
+
+
+def _one_line(error: Exception) -> str:
+    return json.dumps(" ".join(str(error).split())[:200])

@@ -1,0 +1,101 @@
+"""Kalibr's camchain YAML: pinhole cameras with radial-tangential distortion, one after the other.
+
+The format is that of https://github.com/ethz-asl/kalibr/wiki/yaml-formats: `T_cn_cnm1` takes points
+of the camera before (cam0 for cam1) to this camera, `radtan` has k1 k2 p1 p2 with OpenCV's meaning,
+and pixels count from the centre of the first one.
+"""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.artefacts import atomic_path
+from alice_survey.errors import CalibrationError, warn
+from camera_calib.flat_port import FlatPortCamera
+from camera_calib.formats.documents import read_yaml
+from camera_calib.formats.fields import Fields
+from camera_calib.formats.opencv_model import HALF_PIXEL, camera_in_air
+from camera_calib.formats.rigs import Reading, assemble
+from camera_calib.rig import Rig
+
+_NOT_HELD = ("T_cam_imu", "T_imu_cam", "timeshift_cam_imu")
+_TOPIC = re.compile(r"/(?P<name>[A-Za-z0-9][A-Za-z0-9_./-]*)/image_raw")
+
+
+def read_kalibr(path: Path, reading: Reading) -> Rig:
+    """Read a chain of cameras.
+
+    Raises:
+        CalibrationError: a key is missing or wrong, or a model is not pinhole with radtan.
+    """
+    top = read_yaml(path)
+    count = sum(f"cam{i}" in top for i in range(len(top.values)))
+    if count == 0 or f"cam{count - 1}" not in top:
+        raise CalibrationError(f"{path}: lacks cam0, or a camera of the chain is left out")
+    cameras, poses, names = [], [RigidTransform.identity()], []
+    for i in range(count):
+        fields = top.fields(f"cam{i}")
+        cameras.append(_camera(fields))
+        names.append(_name(fields, f"cam{i}"))
+        if i > 0:
+            poses.append(fields.pose("T_cn_cnm1") * poses[-1])
+        left_out = [key for key in _NOT_HELD if key in fields]
+        if left_out:
+            warn(f"{path}: cam{i}: {', '.join(left_out)} left out: a rig holds no IMU")
+    return assemble(path, reading, "Kalibr", names, cameras, poses)
+
+
+def write_kalibr(path: Path, rig: Rig) -> list[Path]:
+    """Write a chain of cameras in the order of the rig."""
+    chain: dict[str, Any] = {}
+    names = list(rig.cameras)
+    for i, (name, camera) in enumerate(rig.cameras.items()):
+        entry: dict[str, Any] = {}
+        if i > 0:
+            before = rig.cam_from_rig[names[i - 1]]
+            entry["T_cn_cnm1"] = (rig.cam_from_rig[name] * before.inv()).as_matrix().tolist()
+        entry["cam_overlaps"] = [other for other in range(len(names)) if other != i]
+        entry["camera_model"] = "pinhole"
+        entry["distortion_coeffs"] = [camera.k1, camera.k2, camera.p1, camera.p2]
+        entry["distortion_model"] = "radtan"
+        centre = [camera.cx_px - HALF_PIXEL, camera.cy_px - HALF_PIXEL]
+        entry["intrinsics"] = [camera.fx_px, camera.fy_px, *centre]
+        entry["resolution"] = [camera.width_px, camera.height_px]
+        entry["rostopic"] = f"/{name}/image_raw"
+        chain[f"cam{i}"] = entry
+    with atomic_path(path) as temporary:
+        text = yaml.safe_dump(chain, sort_keys=False, default_flow_style=None, width=1000)
+        temporary.write_text(text, encoding="utf-8")
+    return [path]
+
+
+def _camera(fields: Fields) -> FlatPortCamera:
+    if fields.text("camera_model") != "pinhole":
+        raise fields.fault("camera_model", f"is {fields.text('camera_model')}; pinhole wanted")
+    model = fields.text("distortion_model")
+    if model not in ("radtan", "none"):
+        raise fields.fault("distortion_model", f"is {model}; radtan or none wanted")
+    k = fields.numbers("distortion_coeffs", 4) if model == "radtan" else ()
+    fx, fy, cx, cy = fields.numbers("intrinsics", 4)
+    width, height = fields.numbers("resolution", 2)
+    size = Fields(
+        path=fields.path,
+        prefix=f"{fields.prefix}resolution: ",
+        values={"width": width, "height": height},
+    )
+    return camera_in_air(
+        fields,
+        "intrinsics",
+        (size.size("width"), size.size("height")),
+        lens=(fx, fy, cx + HALF_PIXEL, cy + HALF_PIXEL),
+        coefficients=dict(zip(("k1", "k2", "p1", "p2"), map(float, k), strict=False)),
+    )
+
+
+def _name(fields: Fields, default: str) -> str:
+    topic = fields.values.get("rostopic")
+    found = _TOPIC.fullmatch(topic) if isinstance(topic, str) else None
+    return default if found is None else found["name"]

@@ -1,0 +1,173 @@
+"""The formats there are: how each is read and written, what it holds, how it is recognised."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from alice_survey.errors import CalibrationError
+from camera_calib.formats.camera_files import read_records
+from camera_calib.formats.colmap import (
+    CAMERA_FILES,
+    RIG_CONFIG,
+    read_colmap,
+    targets,
+    write_colmap,
+    write_flatport,
+)
+from camera_calib.formats.documents import read_yaml
+from camera_calib.formats.fields import read_text
+from camera_calib.formats.kalibr import read_kalibr, write_kalibr
+from camera_calib.formats.opencv import read_opencv, write_opencv
+from camera_calib.formats.rigs import Reading
+from camera_calib.formats.ros import SUFFIXES, read_ros, write_ros
+from camera_calib.rig import Rig, read_rig, write_rig
+
+PORT, K3, RATIONAL, PRISM, COVARIANCE, MOUNT = "port", "k3", "rational", "prism", "covariance", "m"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Format:
+    """One format of camera calibrations."""
+
+    name: str
+    title: str
+    holds: frozenset[str]
+    read: Callable[[Path, Reading], Rig]
+    write: Callable[[Path, Rig], list[Path]]
+    targets: Callable[[Path], list[Path]]
+    """The files that writing to a path would replace."""
+
+
+def _read_own(path: Path, reading: Reading) -> Rig:
+    del reading  # rig.json leaves nothing open
+    return read_rig(path)
+
+
+def _write_own(path: Path, rig: Rig) -> list[Path]:
+    write_rig(path, rig)
+    return [path]
+
+
+def _itself(path: Path) -> list[Path]:
+    return [path]
+
+
+_FORMATS = (
+    Format(
+        name="rig",
+        title="rig.json of this project",
+        holds=frozenset({PORT, K3, RATIONAL, PRISM, COVARIANCE, MOUNT}),
+        read=_read_own,
+        write=_write_own,
+        targets=_itself,
+    ),
+    Format(
+        name="opencv",
+        title="OpenCV YAML or XML",
+        holds=frozenset({PORT, K3, RATIONAL, PRISM, COVARIANCE, MOUNT}),
+        read=read_opencv,
+        write=write_opencv,
+        targets=_itself,
+    ),
+    Format(
+        name="colmap",
+        title="COLMAP model and rig_config.json",
+        holds=frozenset({K3, RATIONAL}),
+        read=read_colmap,
+        write=write_colmap,
+        targets=targets,
+    ),
+    Format(
+        name="flatport",
+        title="Refractive COLMAP cameras with FLATPORT",
+        holds=frozenset({PORT, K3, RATIONAL}),
+        read=read_colmap,
+        write=write_flatport,
+        targets=targets,
+    ),
+    Format(
+        name="kalibr",
+        title="Kalibr camchain YAML",
+        holds=frozenset(),
+        read=read_kalibr,
+        write=write_kalibr,
+        targets=_itself,
+    ),
+    Format(
+        name="ros",
+        title="ROS camera_info YAML",
+        holds=frozenset({K3, RATIONAL}),
+        read=read_ros,
+        write=write_ros,
+        targets=_itself,
+    ),
+)
+FORMATS = {each.name: each for each in _FORMATS}
+
+
+def format_named(name: str) -> Format:
+    """A format by its name.
+
+    Raises:
+        CalibrationError: there is none of this name.
+    """
+    if name not in FORMATS:
+        raise CalibrationError(f"no format {name!r}: {', '.join(FORMATS)}")
+    return FORMATS[name]
+
+
+def detect(path: Path) -> Format:
+    """The format of a file or folder, from its name and content.
+
+    Raises:
+        CalibrationError: it does not exist, or is of no known format.
+    """
+    if not path.exists():
+        raise CalibrationError(f"{path}: no such file or folder")
+    name = _of_folder(path) if path.is_dir() else _of_file(path)
+    if name is None:
+        raise CalibrationError(f"{path}: of no known format: say which with --from")
+    return FORMATS[name]
+
+
+def of_target(path: Path) -> Format:
+    """The format that the name of a new file calls for.
+
+    Raises:
+        CalibrationError: several formats have such names.
+    """
+    if path.name in CAMERA_FILES:
+        return FORMATS["colmap"]
+    by_suffix = {".json": "rig", ".xml": "opencv"}
+    if path.suffix.lower() not in by_suffix:
+        raise CalibrationError(f"{path}: say the format with --to: {', '.join(FORMATS)}")
+    return FORMATS[by_suffix[path.suffix.lower()]]
+
+
+def _of_folder(path: Path) -> str | None:
+    for name in CAMERA_FILES:
+        if (path / name).is_file():
+            return _of_file(path / name)
+    if (path / RIG_CONFIG).is_file():
+        return "colmap"
+    files = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
+    return "ros" if files and all(_of_file(file) == "ros" for file in files) else None
+
+
+def _of_file(path: Path) -> str | None:
+    suffix = path.suffix.lower()
+    if suffix in (".txt", ".bin"):
+        ports = any(record.port for record in read_records(path))
+        return "flatport" if ports else "colmap"
+    text = read_text(path)
+    if suffix == ".json":
+        return "colmap" if text.lstrip().startswith("[") else "rig"
+    if suffix == ".xml" or text.startswith("%YAML:1.") or "!!opencv-matrix" in text:
+        return "opencv"
+    if suffix in SUFFIXES:
+        fields = read_yaml(path)
+        if "cam0" in fields:
+            return "kalibr"
+        if "camera_matrix" in fields and "image_width" in fields:
+            return "ros"
+    return None

@@ -1,0 +1,184 @@
+"""Rigs from the pieces that files give, and with parts taken away or put on."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.errors import CalibrationError
+from alice_survey.frames import BODY_FROM_NADIR_CAM
+from camera_calib.flat_port import FlatPortCamera
+from camera_calib.formats.fields import Fields, camera_name
+from camera_calib.rig import Covariance, Rig
+
+UNKNOWN_MOUNT = RigidTransform.from_components([0.0, 0.0, 0.0], BODY_FROM_NADIR_CAM)
+"""Pose on the vehicle of rigs whose file tells none: at the body's origin, looking down."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """What a file may leave open."""
+
+    image_size: tuple[int, int] | None = None
+    """Width and height, px."""
+    extrinsics: Path | None = None
+    """File that holds R and T when they are not with the intrinsics."""
+    metres_per_unit: float = 1.0
+    """Length of one unit of the file's translations."""
+    camera: str | None = None
+    """The one camera that is wanted."""
+
+    def size(self, path: Path) -> tuple[int, int]:
+        """Width and height for a file that does not tell them.
+
+        Raises:
+            CalibrationError: nobody tells.
+        """
+        if self.image_size is None:
+            raise CalibrationError(f"{path}: lacks image_width and image_height: give --image-size")
+        return self.image_size
+
+
+def assemble(
+    path: Path,
+    reading: Reading,
+    tool: str,
+    names: Sequence[str],
+    cameras: Sequence[FlatPortCamera],
+    cam_from_rig: Sequence[RigidTransform],
+) -> Rig:
+    """A rig of cameras and poses in the units of a file; the first camera becomes the reference.
+
+    Raises:
+        CalibrationError: a name is unfit or there twice.
+    """
+    plain = [camera_name(path, name) for name in names]
+    if len(set(plain)) != len(plain):
+        raise CalibrationError(f"{path}: two cameras of one name ({', '.join(plain)})")
+    rig_from_first = cam_from_rig[0].inv()
+    poses = [pose * rig_from_first for pose in cam_from_rig]
+    poses[0] = RigidTransform.identity()
+    return Rig(
+        cameras=dict(zip(plain, cameras, strict=True)),
+        cam_from_rig={name: _scaled(p, reading) for name, p in zip(plain, poses, strict=True)},
+        body_from_rig=UNKNOWN_MOUNT,
+        source=f"{tool} file {path.name}",
+    )
+
+
+def default_names(count: int) -> list[str]:
+    """Names for cameras whose file tells none."""
+    return ["left", "right"] if count == 2 else [f"cam{i}" for i in range(count)]
+
+
+def only(rig: Rig, camera: str) -> Rig:
+    """One camera of a rig, with its own pose on the vehicle and its share of the covariance.
+
+    Raises:
+        CalibrationError: there is no such camera.
+    """
+    if camera not in rig.cameras:
+        raise CalibrationError(f"no camera {camera!r}; there are {', '.join(rig.cameras)}")
+    kept = [name for name in _parameters(rig) if name.startswith(f"{camera}.")]
+    # The pose in the rig was a parameter of this camera; alone it is the reference.
+    kept = [name for name in kept if name.rsplit(".", 1)[1] not in POSE_PARAMETERS]
+    return replace(
+        rig,
+        cameras={camera: rig.cameras[camera]},
+        cam_from_rig={camera: RigidTransform.identity()},
+        body_from_rig=_mount(rig, camera),
+        covariance=_part(rig.covariance, kept),
+    )
+
+
+POSE_PARAMETERS = ("rx_rad", "ry_rad", "rz_rad", "x_m", "y_m", "z_m")
+
+
+def renamed(rig: Rig, names: Sequence[str]) -> Rig:
+    """The same rig with other names of its cameras, in order.
+
+    Raises:
+        CalibrationError: too few or too many names, one twice, or one that is unfit.
+    """
+    if len(names) != len(rig.cameras) or len(set(names)) != len(names):
+        raise CalibrationError(
+            f"--names {','.join(names)}: {len(rig.cameras)} different names wanted, "
+            f"for {', '.join(rig.cameras)}"
+        )
+    new = {
+        old: camera_name(Path("--names"), name)
+        for old, name in zip(rig.cameras, names, strict=True)
+    }
+    covariance = rig.covariance
+    if covariance is not None:
+        parts = (name.rsplit(".", 1) for name in covariance.parameters)
+        covariance = replace(
+            covariance, parameters=tuple(f"{new[camera]}.{what}" for camera, what in parts)
+        )
+    return replace(
+        rig,
+        cameras={new[name]: camera for name, camera in rig.cameras.items()},
+        cam_from_rig={new[name]: pose for name, pose in rig.cam_from_rig.items()},
+        covariance=covariance,
+    )
+
+
+def referenced(rig: Rig) -> Rig:
+    """The same rig counted from its first camera, whose pose becomes the identity."""
+    rig_from_first = rig.cam_from_rig[rig.reference].inv()
+    poses = {name: pose * rig_from_first for name, pose in rig.cam_from_rig.items()}
+    poses[rig.reference] = RigidTransform.identity()
+    return replace(rig, cam_from_rig=poses, body_from_rig=_mount(rig, rig.reference))
+
+
+def own_keys(fields: Fields, rig: Rig) -> Rig:
+    """A rig with what only files of this project tell: mount, source and covariance."""
+    if "body_from_rig" in fields:
+        rig = replace(rig, body_from_rig=fields.pose("body_from_rig"))
+    if "source" in fields:
+        rig = replace(rig, source=str(fields.get("source")))
+    if "covariance" in fields:
+        names = fields.texts("covariance_parameters")
+        matrix = fields.matrix("covariance", len(names), len(names))
+        strange = {name.rsplit(".", 1)[0] for name in names} - set(rig.cameras)
+        if strange:
+            raise fields.fault("covariance_parameters", f"names no camera: {sorted(strange)[0]}")
+        rig = replace(rig, covariance=Covariance(parameters=tuple(names), matrix=matrix))
+    return rig
+
+
+def with_port(rig: Rig, port: Mapping[str, Any]) -> Rig:
+    """Every camera of a rig behind a port, square to the axis unless it has one that is not.
+
+    Args:
+        rig: cameras in air, or behind ports some of whose numbers change.
+        port: by field of `FlatPortCamera`: lengths in metres and indices.
+    """
+    cameras = {name: replace(c, **dict(port)) for name, c in rig.cameras.items()}
+    return replace(rig, cameras=cameras)
+
+
+def _scaled(pose: RigidTransform, reading: Reading) -> RigidTransform:
+    return RigidTransform.from_components(
+        np.asarray(pose.translation) * reading.metres_per_unit, pose.rotation
+    )
+
+
+def _mount(rig: Rig, camera: str) -> RigidTransform:
+    if rig.body_from_rig is UNKNOWN_MOUNT:  # stays unknown, whichever camera is the reference
+        return UNKNOWN_MOUNT
+    return rig.body_from_cam(camera)
+
+
+def _parameters(rig: Rig) -> tuple[str, ...]:
+    return () if rig.covariance is None else rig.covariance.parameters
+
+
+def _part(covariance: Covariance | None, names: Sequence[str]) -> Covariance | None:
+    if covariance is None or not names:
+        return None
+    at = [covariance.parameters.index(name) for name in names]
+    return Covariance(parameters=tuple(names), matrix=covariance.matrix[np.ix_(at, at)])

@@ -1,0 +1,163 @@
+"""ROS's camera_info YAML: a file for each camera, as `camera_calibration_parsers` reads and writes.
+
+Keys are those of http://wiki.ros.org/camera_calibration_parsers, their meaning that of
+`sensor_msgs/CameraInfo`. A stereo pair has no pose as such: each camera has the rotation R to the
+rectified pair (`rectification_matrix`), and the second's projection P has -f B in its last column.
+From both follows the second camera's pose in the first, R2^T R1 and R2^T (P2[:, 3] / f).
+"""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.artefacts import atomic_path
+from alice_survey.errors import CalibrationError, warn
+from alice_survey.frames import Array
+from camera_calib.flat_port import FlatPortCamera
+from camera_calib.formats.documents import read_yaml
+from camera_calib.formats.fields import Fields
+from camera_calib.formats.opencv_model import camera_matrix, distortion, read_camera
+from camera_calib.formats.rigs import Reading, assemble
+from camera_calib.rig import Rig
+
+_MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14)}
+SUFFIXES = (".yaml", ".yml")
+
+
+def read_ros(path: Path, reading: Reading) -> Rig:
+    """Read a file of one camera, or a folder that holds those of a stereo pair.
+
+    Raises:
+        CalibrationError: a key is missing or wrong, or the folder does not hold one or two files.
+    """
+    if not path.is_dir():
+        fields = read_yaml(path)
+        if "projection_matrix" in fields and np.any(_projection(fields)[:, 3]):
+            warn(f"{path}: baseline left out: give the folder of both files to read a pair")
+        return assemble(path, reading, "ROS", [_name(fields, 0, 1)], [_camera(fields)], _ONE)
+    files = [file for file in sorted(path.iterdir()) if file.suffix.lower() in SUFFIXES]
+    if not 1 <= len(files) <= 2:
+        raise CalibrationError(f"{path}: {len(files)} .yaml files; 1, or 2 of a pair, wanted")
+    every = [read_yaml(file) for file in files]
+    if len(every) == 1:
+        return read_ros(files[0], reading)
+    moved = [bool(np.any(_projection(fields)[:, 3])) for fields in every]
+    if sum(moved) != 1:
+        raise CalibrationError(
+            f"{path}: one of two projection_matrix needs a baseline in its last column and the "
+            f"other none; {sum(moved)} have one"
+        )
+    first, second = every if moved[1] else every[::-1]
+    return assemble(
+        path,
+        reading,
+        "ROS",
+        [_name(first, 0, 2), _name(second, 1, 2)],
+        [_camera(first), _camera(second)],
+        [RigidTransform.identity(), _second_from_first(first, second)],
+    )
+
+
+def write_ros(path: Path, rig: Rig) -> list[Path]:
+    """Write a file of one camera, or into a folder those of a stereo pair, rectified by OpenCV.
+
+    Raises:
+        CalibrationError: the rig has more than two cameras, or two that cannot be rectified.
+    """
+    names = list(rig.cameras)
+    if len(names) > 2:
+        raise CalibrationError(
+            f"{path}: ROS has pairs of cameras, the rig has {len(names)}: choose one with --camera"
+        )
+    if len(names) == 1:
+        camera = rig.cameras[names[0]]
+        projection = np.hstack([camera_matrix(camera), np.zeros((3, 1))])
+        _write(path, _document(names[0], camera, np.eye(3), projection))
+        return [path]
+    if path.suffix:
+        raise CalibrationError(f"{path}: a pair has two files: name a folder for them")
+    first, second = rig.cameras.values()
+    size = (first.width_px, first.height_px)
+    second_from_first = rig.cam_from_rig[names[1]]
+    if size != (second.width_px, second.height_px):
+        raise CalibrationError(f"{path}: ROS rectifies pairs of one picture size only")
+    if float(np.linalg.norm(second_from_first.translation)) == 0.0:
+        raise CalibrationError(f"{path}: the cameras have no baseline to rectify along")
+    r1, r2, p1, p2, *_ = cv2.stereoRectify(
+        camera_matrix(first), distortion(first), camera_matrix(second), distortion(second), size,
+        second_from_first.rotation.as_matrix(), second_from_first.translation[:, None],
+        flags=cv2.CALIB_ZERO_DISPARITY, alpha=0.0,
+    )  # fmt: skip
+    files = [path / f"{name}.yaml" for name in names]
+    pieces = zip(files, names, (first, second), (r1, r2), (p1, p2), strict=True)
+    for file, name, camera, rotation, projection in pieces:
+        _write(file, _document(name, camera, rotation, projection))
+    return files
+
+
+_ONE = (RigidTransform.identity(),)
+
+
+def _camera(fields: Fields) -> FlatPortCamera:
+    model = fields.text("distortion_model") if "distortion_model" in fields else "plumb_bob"
+    if model not in _MODELS:
+        raise fields.fault("distortion_model", f"is {model}; {' or '.join(_MODELS)} wanted")
+    key = "distortion_coefficients"
+    k = fields.vector(key, 0, *_MODELS[model])
+    size = (fields.size("image_width"), fields.size("image_height"))
+    return read_camera(fields, "camera_matrix", key if k.size else None, size)
+
+
+def _projection(fields: Fields) -> Array:
+    return fields.matrix("projection_matrix", 3, 4)
+
+
+def _name(fields: Fields, index: int, count: int) -> str:
+    if "camera_name" in fields:
+        return fields.text("camera_name")
+    return fields.path.stem if count == 2 else f"cam{index}"
+
+
+def _rectification(fields: Fields) -> Rotation:
+    key = "rectification_matrix"
+    return fields.rotation(key, fields.matrix(key, 3, 3))
+
+
+def _second_from_first(first: Fields, second: Fields) -> RigidTransform:
+    projection = _projection(second)
+    if min(projection[0, 0], projection[1, 1]) <= 0 or projection[2, 3] != 0:
+        raise second.fault(
+            "projection_matrix", "is not of the form [f 0 cx fTx; 0 f cy fTy; 0 0 1 0]"
+        )
+    baseline = projection[:, 3] / [projection[0, 0], projection[1, 1], 1.0]
+    back = _rectification(second).inv()
+    return RigidTransform.from_components(back.apply(baseline), back * _rectification(first))
+
+
+def _document(name: str, camera: FlatPortCamera, rotation: Array, projection: Array) -> Any:
+    k = distortion(camera)
+    return {
+        "image_width": camera.width_px,
+        "image_height": camera.height_px,
+        "camera_name": name,
+        "camera_matrix": _matrix(camera_matrix(camera)),
+        "distortion_model": "plumb_bob" if k.size == 5 else "rational_polynomial",
+        "distortion_coefficients": _matrix(k[None]),
+        "rectification_matrix": _matrix(rotation),
+        "projection_matrix": _matrix(projection),
+    }
+
+
+def _matrix(values: Array) -> dict[str, Any]:
+    rows, columns = values.shape
+    return {"rows": rows, "cols": columns, "data": values.ravel().tolist()}
+
+
+def _write(path: Path, document: Any) -> None:
+    with atomic_path(path) as temporary:
+        text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=1000)
+        temporary.write_text(text, encoding="utf-8")

@@ -1,0 +1,98 @@
+"""What a format is given comes back from it: random rigs, out and in again."""
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from camera_calib.formats.convert import Conversion, convert
+from camera_calib.formats.registry import FORMATS, detect
+from camera_calib.formats.rigs import Reading
+from camera_calib.rig import Rig, read_rig, write_rig
+from tests.strategies_formats import (
+    EVERY,
+    PLUMB_BOB,
+    RADTAN,
+    RATIONAL,
+    assert_same_geometry,
+    covariance_of,
+    rigs,
+)
+
+QUICK = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
+TARGETS = {
+    "rig": ("rig", "rig.json", {"terms": EVERY, "port": True, "most": 3}),
+    "opencv-yaml": ("opencv", "cameras.yml", {"terms": EVERY, "port": True}),
+    "opencv-xml": ("opencv", "cameras.xml", {"terms": EVERY, "port": True}),
+    "colmap-text": ("colmap", "model", {"terms": RATIONAL, "most": 3}),
+    "colmap-binary": ("colmap", "model/cameras.bin", {"terms": RATIONAL, "most": 3}),
+    "flatport-text": ("flatport", "model", {"terms": RATIONAL, "port": True, "most": 3}),
+    "flatport-binary": (
+        "flatport", "model/cameras.bin", {"terms": RATIONAL, "port": True, "most": 3},
+    ),
+    "kalibr": ("kalibr", "camchain.yaml", {"terms": RADTAN, "most": 3}),
+    "ros-rational": ("ros", "out", {"terms": RATIONAL, "one_size": True}),
+    "ros-plumb-bob": ("ros", "out", {"terms": PLUMB_BOB, "one_size": True}),
+}  # fmt: skip
+
+
+def target_of(folder: Path, name: str, rig: Rig) -> Path:
+    """A single camera of ROS is a file, a pair a folder."""
+    return folder / ("out.yaml" if name == "out" and len(rig.cameras) == 1 else name)
+
+
+@pytest.mark.parametrize("case", TARGETS)
+def test_a_rig_comes_back_through_a_format_found_by_itself(case: str) -> None:
+    kind, name, what = TARGETS[case]
+
+    @QUICK
+    @given(rig=rigs(**what))
+    def comes_back(rig: Rig) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            target = target_of(Path(folder), name, rig)
+            FORMATS[kind].write(target, rig)
+            assert detect(target).name == kind
+            after = detect(target).read(target, Reading())
+        assert_same_geometry(after, rig)
+
+    comes_back()
+
+
+@QUICK
+@given(rig=rigs(port=True), seed=st.integers(0, 1000))
+def test_opencv_holds_all_that_a_rig_has(rig: Rig, seed: int) -> None:
+    full = replace(rig, covariance=covariance_of(rig, np.random.default_rng(seed)))
+    with tempfile.TemporaryDirectory() as folder:
+        own, other, back = (Path(folder) / name for name in ("a.json", "b.xml", "c.json"))
+        write_rig(own, full)
+        convert(Conversion(source=own, target=other))
+        convert(Conversion(source=other, target=back))
+        after = read_rig(back)
+
+    for name, camera in full.cameras.items():
+        assert after.cameras[name].normal == camera.normal
+        assert after.cameras[name].n_glass == camera.n_glass
+        np.testing.assert_allclose(
+            after.body_from_cam(name).as_matrix(), full.body_from_cam(name).as_matrix(), atol=1e-14
+        )
+    assert after.source == full.source
+    assert full.covariance is not None
+    assert after.covariance is not None
+    assert after.covariance.parameters == full.covariance.parameters
+    np.testing.assert_array_equal(after.covariance.matrix, full.covariance.matrix)
+
+
+@pytest.mark.parametrize("suffix", [".yml", ".xml"])
+@QUICK
+@given(rig=rigs(port=True))
+def test_the_same_rig_gives_the_same_bytes(suffix: str, rig: Rig) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        files = [Path(folder) / f"{name}{suffix}" for name in "ab"]
+        for file in files:
+            FORMATS["opencv"].write(file, rig)
+        assert files[0].read_bytes() == files[1].read_bytes()
