@@ -1,10 +1,11 @@
 """Commands on cameras behind flat ports: `alice-survey camera ...`."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from alice_survey.cli_options import CONTEXT, AsJson, examples, print_result
+from alice_survey.cli_options import CONTEXT, AsJson, Threads, examples, print_result
 
 app = typer.Typer(
     help="Look at, convert and judge camera models behind flat ports.",
@@ -34,3 +35,42 @@ def water(
     from camera_calib.water import water_report
 
     print_result(*water_report(temperature, salinity, depth, jerlov, wavelength), as_json)
+
+
+@app.command(
+    epilog=examples(
+        "camera undisperse images/left/*.png --rig rig.json --range 2 -o corrected/left",
+        "camera undisperse dive/*.jpg --rig rig.json --range 1.5 -o out --glass pmma --salinity 39",
+    )
+)
+def undisperse(
+    pictures: Annotated[list[Path], typer.Argument(metavar="PICTURE...", help="In colour.")],
+    rig: Annotated[Path, typer.Option(help="rig.json; its indices hold for green.")],
+    folder: Annotated[Path, typer.Option("-o", "--out", help="Folder for the corrected ones.")],
+    distance: Annotated[float, typer.Option("--range", min=0.0, help="To the scene, m.")],
+    camera: Annotated[str | None, typer.Option(help="Whose; the rig's first if none.")] = None,
+    temperature: Annotated[float, typer.Option(help="Of the water, C.")] = 20.0,
+    salinity: Annotated[float, typer.Option(help="psu; 0 is fresh.")] = 35.0,
+    depth: Annotated[float, typer.Option(help="Below the surface, m.")] = 10.0,
+    glass: Annotated[
+        str, typer.Option(help="Port: bk7, fused-silica, sapphire, pmma, polycarbonate.")
+    ] = "bk7",
+    wavelength: Annotated[
+        list[float] | None, typer.Option(help="nm, thrice: of red, green and blue.")
+    ] = None,
+    threads: Threads = None,
+    as_json: AsJson = False,
+) -> None:
+    """Warp red and blue onto green.
+
+    A flat port shows each colour at its own scale: some pixels apart at the edge of the frame.
+    """
+    from alice_survey.executor import default_threads
+    from camera_calib.undisperse import undisperse_files
+
+    text, data = undisperse_files(
+        pictures, folder, rig=rig, camera=camera, range_m=distance, temperature_c=temperature,
+        salinity_psu=salinity, depth_m=depth, glass=glass, wavelengths_nm=wavelength,
+        threads=threads or default_threads(),
+    )  # fmt: skip
+    print_result(text, data, as_json)
