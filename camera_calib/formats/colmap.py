@@ -9,7 +9,6 @@ has that version's: cameras by `camera_id`, the reference by `ref_camera_id`.
 import json
 import tempfile
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +29,7 @@ from camera_calib.formats.camera_files import (
 )
 from camera_calib.formats.documents import read_json_fields
 from camera_calib.formats.fields import Fields
+from camera_calib.formats.opencv_model import behind_port
 from camera_calib.formats.rigs import Reading, assemble
 from camera_calib.rig import Rig
 
@@ -163,7 +163,9 @@ def _camera(path: Path, record: CameraRecord) -> FlatPortCamera:
     if min(n_air, n_glass / n_air, n_water / n_air) < 1:
         raise fields.fault("REFRAC_PARAMS", f"has the indices {n_air} {n_glass} {n_water}")
     # Snell's law knows ratios only, so that an index of air other than 1 divides the others.
-    return replace(
+    return behind_port(
+        fields,
+        "REFRAC_PARAMS",
         camera,
         normal=(float(x), float(y), float(z)),
         port_distance_m=float(distance),

@@ -6,7 +6,6 @@ two have `M1 D1 M2 D2` and the second's pose `R T` in the first (x2 = R x1 + T),
 `port`, `port1`, `port2`, `camera_names`, `body_from_rig`, `source`, `covariance`.
 """
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from alice_survey.errors import CalibrationError
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.formats.documents import read_storage
 from camera_calib.formats.fields import Fields
-from camera_calib.formats.opencv_model import camera_matrix, distortion, read_camera
+from camera_calib.formats.opencv_model import behind_port, camera_matrix, distortion, read_camera
 from camera_calib.formats.rigs import Reading, assemble, default_names, own_keys
 from camera_calib.rig import Rig
 
@@ -131,7 +130,7 @@ def _camera(
     port = fields.fields(f"port{number}")
     x, y, z = port.vector("normal", 3).tolist()
     numbers: dict[str, Any] = {name: port.number(name) for name in _PORT_LENGTHS}
-    return replace(camera, **numbers, normal=(x, y, z))
+    return behind_port(fields, f"port{number}", camera, **numbers, normal=(x, y, z))
 
 
 def _size(fields: Fields, number: str, reading: Reading) -> tuple[int, int]:

@@ -5,10 +5,12 @@ its outer corner: principal points differ by 0.5 and nothing else does.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from alice_survey.errors import CalibrationError
 from alice_survey.frames import Array
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.formats.fields import Fields
@@ -102,3 +104,21 @@ def camera_in_air(
         cy_px=cy,
         **{**coefficients, **IN_AIR},
     )
+
+
+def behind_port(fields: Fields, key: str, camera: FlatPortCamera, **port: Any) -> FlatPortCamera:
+    """A camera with the port of a file.
+
+    Args:
+        fields: where the port is.
+        key: of the port.
+        camera: in air.
+        **port: fields of `FlatPortCamera`.
+
+    Raises:
+        CalibrationError: a value is out of range; the message names file and key.
+    """
+    try:
+        return replace(camera, **port)
+    except CalibrationError as error:
+        raise fields.fault(key, f"is no port: {error}") from None

@@ -1,0 +1,286 @@
+"""pycolmap opens what is written for COLMAP; the fork's files are as its own code writes them."""
+
+import json
+import struct
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from hypothesis import given, settings
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.errors import CalibrationError
+from camera_calib.flat_port import FlatPortCamera
+from camera_calib.formats.camera_files import MODELS
+from camera_calib.formats.colmap import read_colmap, write_colmap, write_flatport
+from camera_calib.formats.registry import detect
+from camera_calib.formats.rigs import Reading
+from camera_calib.rig import Rig
+from tests.strategies_formats import POINTS_RIG, RATIONAL, assert_same_geometry, rigs
+
+AIR = FlatPortCamera(
+    width_px=1920, height_px=1200, fx_px=705.5, fy_px=705.25, cx_px=963.5, cy_px=604.75,
+    n_water=1.0,
+)  # fmt: skip
+WET = replace(
+    AIR, port_distance_m=0.025, glass_thickness_m=0.01, n_glass=1.49, n_water=1.333,
+    normal=(0.6, 0.0, 0.8),
+)  # fmt: skip
+
+
+def pair(camera: FlatPortCamera) -> Rig:
+    turn = Rotation.from_rotvec([0.01, -0.02, 0.03])
+    return Rig(
+        cameras={"left": camera, "right": replace(camera, fx_px=710.5, k1=-0.125)},
+        cam_from_rig={
+            "left": RigidTransform.identity(),
+            "right": RigidTransform.from_components([-0.1, 0.001, 0.002], turn),
+        },
+        body_from_rig=RigidTransform.identity(),
+        source="a test",
+    )
+
+
+def fault(path: Path, reading: Reading | None = None) -> str:
+    with pytest.raises(CalibrationError) as error:
+        read_colmap(path, reading or Reading())
+    shown = str(error.value)
+    assert str(path) in shown
+    assert "\n" not in shown
+    return shown
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_models_are_as_colmap_has_them(name: str) -> None:
+    number, parameters = MODELS[name]
+    assert int(pycolmap.CameraModelId.__members__[name]) == number
+    camera = pycolmap.Camera(model=name, width=9, height=9, params=np.ones(len(parameters)))
+    told = camera.params_info.split(", ")
+    if name in ("SIMPLE_RADIAL", "RADIAL"):  # COLMAP calls their first coefficient k or k1
+        told = [{"k": "k1"}.get(each, each) for each in told]
+    assert tuple(told) == parameters
+
+
+@pytest.mark.parametrize("target", ["model", "model/cameras.bin"])
+@settings(max_examples=25, deadline=None)
+@given(rig=rigs(RATIONAL, most=3))
+def test_colmap_projects_as_we_do_from_what_it_reads(target: str, rig: Rig) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        written = write_colmap(Path(folder) / target, rig)
+        assert all(path.is_file() for path in written)
+        model = pycolmap.Reconstruction(Path(folder) / "model")
+        (config,) = pycolmap.read_rig_config(Path(folder) / "model" / "rig_config.json")
+
+    (sensors,) = model.rigs.values()
+    for i, ((name, camera), entry) in enumerate(
+        zip(rig.cameras.items(), config.cameras, strict=True), start=1
+    ):
+        theirs = model.cameras[i]
+        assert (theirs.width, theirs.height) == (camera.width_px, camera.height_px)
+        assert entry.image_prefix == f"{name}/"
+        assert entry.ref_sensor == (i == 1)
+        assert entry.camera.model == theirs.model
+        np.testing.assert_array_equal(entry.camera.params, theirs.params)
+        points = POINTS_RIG
+        if i > 1:
+            rigid = sensors.sensor_from_rig(theirs.sensor_id)
+            assert rigid is not None
+            np.testing.assert_allclose(entry.cam_from_rig.matrix(), rigid.matrix(), atol=1e-14)
+            points = points @ rigid.matrix()[:, :3].T + rigid.matrix()[:, 3]
+        ours = camera.project(rig.cam_from_rig[name].apply(POINTS_RIG))
+        known = np.isfinite(ours[:, 0])
+        assert known.any()
+        seen = np.array([theirs.img_from_cam(point) for point in points[known]])
+        np.testing.assert_allclose(seen, ours[known], atol=1e-8, rtol=0)
+
+
+def test_colmap_applies_the_rig_to_a_database_of_pictures(tmp_path: Path) -> None:
+    rig = pair(AIR)
+    write_colmap(tmp_path / "model", rig)
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        for name in ("left", "right"):
+            camera = pycolmap.Camera(
+                model="SIMPLE_PINHOLE", width=1920, height=1200, params=[1000.0, 960.0, 600.0]
+            )
+            camera_id = database.write_camera(camera)
+            for number in range(3):
+                image = pycolmap.Image(name=f"{name}/{number}.png", camera_id=camera_id)
+                database.write_image(image)
+        config = pycolmap.read_rig_config(tmp_path / "model" / "rig_config.json")
+        pycolmap.apply_rig_config(config, database)
+
+        (sensors,) = database.read_all_rigs()
+        assert len(database.read_all_frames()) == 3
+        ((_, rigid),) = sensors.non_ref_sensors.items()
+        np.testing.assert_allclose(
+            rigid.matrix(), rig.cam_from_rig["right"].as_matrix()[:3], atol=1e-14
+        )
+        applied = {camera.model.name: camera for camera in database.read_all_cameras()}
+    np.testing.assert_array_equal(applied["PINHOLE"].params, [705.5, 705.25, 963.5, 604.75])
+    assert applied["OPENCV"].params[4] == -0.125
+
+
+def test_a_model_that_colmap_wrote_gives_its_rig(tmp_path: Path) -> None:
+    """Poses come from the model's own rigs where there is no rig_config.json."""
+    rig = pair(AIR)
+    for kind in ("cameras.txt", "cameras.bin"):
+        folder = tmp_path / kind[-3:]
+        write_colmap(folder / kind, rig)
+        (folder / "rig_config.json").unlink()
+        after = read_colmap(folder, Reading())
+        assert list(after.cameras) == ["cam1", "cam2"]
+        np.testing.assert_allclose(
+            after.cam_from_rig["cam2"].as_matrix(), rig.cam_from_rig["right"].as_matrix(),
+            atol=1e-14,
+        )  # fmt: skip
+
+
+def test_cameras_without_a_rig_are_read_one_by_one(tmp_path: Path) -> None:
+    path = tmp_path / "cameras.txt"
+    path.write_text(
+        "# a comment\n3 SIMPLE_RADIAL 640 480 500 320 240 -0.1\n7 PINHOLE 9 8 5 6 4 3\n"
+    )
+    assert "3, 7" in fault(path)
+    rig = read_colmap(path, Reading(camera="3"))
+    (camera,) = rig.cameras.values()
+    assert (camera.fx_px, camera.fy_px, camera.cx_px, camera.k1) == (500, 500, 320, -0.1)
+    assert camera.n_water == 1.0
+
+
+def test_a_rig_configuration_alone_needs_the_picture_size(tmp_path: Path) -> None:
+    rig = pair(AIR)
+    write_colmap(tmp_path / "model", rig)
+    alone = tmp_path / "rig_config.json"
+    alone.write_text((tmp_path / "model" / "rig_config.json").read_text())
+    assert "--image-size" in fault(alone)
+    assert_same_geometry(read_colmap(alone, Reading(image_size=(1920, 1200))), rig)
+
+
+def test_a_rig_configuration_without_cameras_takes_them_in_order_and_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = pair(AIR)
+    write_colmap(tmp_path, rig)
+    config = json.loads((tmp_path / "rig_config.json").read_text())
+    for entry in config[0]["cameras"]:
+        del entry["camera_model_name"], entry["camera_params"]
+    (tmp_path / "rig_config.json").write_text(json.dumps(config))
+    assert_same_geometry(read_colmap(tmp_path, Reading()), rig)
+    assert "in the order of their CAMERA_ID" in capsys.readouterr().err
+
+
+def test_the_forks_text_is_a_line_of_lens_and_port(tmp_path: Path) -> None:
+    rig = pair(WET)
+    write_flatport(tmp_path, rig)
+    lines = (tmp_path / "cameras.txt").read_text().splitlines()
+    assert lines[1].endswith("PARAMS[] OPTIONAL[REFRAC_MODEL REFRAC_PARAMS[]]")
+    left, right = (line.split() for line in lines[3:])
+    assert left[:8] == ["1", "PINHOLE", "1920", "1200", "705.5", "705.25", "963.5", "604.75"]
+    assert left[8] == "FLATPORT"
+    assert list(map(float, left[9:])) == [0.6, 0.0, 0.8, 0.025, 0.01, 1.0, 1.49, 1.333]
+    assert right[1] == "OPENCV"
+    assert len(right) == 4 + 8 + 1 + 8
+    (config,) = json.loads((tmp_path / "rig_config.json").read_text())
+    assert config["ref_camera_id"] == 1
+    assert config["cameras"][1]["camera_id"] == 2
+    x, y, z, w = rig.cam_from_rig["right"].rotation.as_quat()
+    assert config["cameras"][1]["cam_from_rig_rotation"] == pytest.approx([w, x, y, z], abs=1e-15)
+
+
+def test_the_forks_binary_has_the_port_after_each_lens(tmp_path: Path) -> None:
+    write_flatport(tmp_path / "cameras.bin", pair(WET))
+    content = (tmp_path / "cameras.bin").read_bytes()
+    assert struct.unpack_from("<QIiQQ", content) == (2, 1, 1, 1920, 1200)
+    assert struct.unpack_from("<4di8d", content, 32) == (
+        705.5, 705.25, 963.5, 604.75, 0, 0.6, 0.0, 0.8, 0.025, 0.01, 1.0, 1.49, 1.333,
+    )  # fmt: skip
+    assert len(content) == 8 + 2 * (24 + 4 + 64) + 8 * 4 + 8 * 8
+
+
+def test_the_fork_may_leave_a_camera_without_port(tmp_path: Path) -> None:
+    text = tmp_path / "cameras.txt"
+    text.write_text(
+        "1 PINHOLE 9 8 5 6 4 3 FLATPORT 0 0 1 0.02 0.01 1 1.5 1.33\n2 PINHOLE 9 8 5 6 4 3\n"
+    )
+    assert detect(text).name == "flatport"
+    dry = read_colmap(text, Reading(camera="2")).cameras["2"]
+    assert (dry.n_water, dry.port_distance_m) == (1.0, 0.0)
+    binary = tmp_path / "cameras.bin"
+    lens = (1, 9, 8, 5.0, 6.0, 4.0, 3.0)
+    port = (0, 0.0, 0.0, 1.0, 0.02, 0.01, 1.0, 1.5, 1.33)
+    binary.write_bytes(
+        struct.pack("<Q", 2)
+        + struct.pack("<IiQQ4di8d", 1, *lens, *port)
+        + struct.pack("<IiQQ4di", 2, *lens, -1)
+    )
+    assert detect(binary).name == "flatport"
+    assert read_colmap(binary, Reading(camera="1")).cameras["1"].n_water == 1.33
+    assert read_colmap(binary, Reading(camera="2")).cameras["2"] == dry
+
+
+def test_an_index_of_air_divides_the_others(tmp_path: Path) -> None:
+    path = tmp_path / "cameras.txt"
+    path.write_text("1 PINHOLE 9 8 5 6 4 3 FLATPORT 0 0 1 0.02 0.01 1.25 1.5 1.5\n")
+    camera = read_colmap(path, Reading()).cameras["1"]
+    assert (camera.n_glass, camera.n_water) == (1.2, 1.2)
+
+
+def test_faults_name_file_and_line(tmp_path: Path) -> None:
+    path = tmp_path / "cameras.txt"
+
+    def text_fault(line: str) -> str:
+        path.write_text(line + "\n")
+        return fault(path)
+
+    lens = "1 PINHOLE 9 8 5 6 4 3"
+    faults = {
+        "line 1": text_fault("1 PINHOLE 9"),
+        "OPENCV_FISHEYE is not OpenCV's": text_fault("1 OPENCV_FISHEYE 9 8 1 1 1 1 0 0 0 0"),
+        "PINHOLE has 4 PARAMS: 3 found": text_fault("1 PINHOLE 9 8 5 6 4"),
+        "PINHOLE has 4 PARAMS: 5 found": text_fault(lens + " 1"),
+        "DOMEPORT is not flat": text_fault(lens + " DOMEPORT 0 0 0 0.05 0.007 1 1.52 1.334"),
+        "8 REFRAC_PARAMS: 2 found": text_fault(lens + " FLATPORT 0 0"),
+        "unit normal": text_fault(lens + " FLATPORT 0 0 2 0.05 0.007 1 1.52 1.334"),
+        "indices": text_fault(lens + " FLATPORT 0 0 1 0.05 0.007 1 1.52 0.9"),
+        "port_distance_m": text_fault(lens + " FLATPORT 0 0 1 -0.05 0.007 1 1.52 1.33"),
+        "could not convert": text_fault("1 PINHOLE 9 8 5 6 x 3"),
+        "finite": text_fault("1 PINHOLE 9 8 5 6 nan 3"),
+        "focal": text_fault("1 PINHOLE 9 8 0 6 4 3"),
+        "WIDTH": text_fault("1 PINHOLE 0 8 5 6 4 3"),
+        "holds no camera": text_fault("# nothing"),
+        "of one CAMERA_ID": text_fault(f"{lens}\n{lens}"),
+    }
+    for words, shown in faults.items():
+        assert words in shown
+    binary = tmp_path / "cameras.bin"
+    good = struct.pack("<QIiQQ4d", 1, 1, 1, 9, 8, 5, 6, 4, 3)
+    for content in (b"", good[:-1], good + b"x", struct.pack("<Q", 1 << 60), b"\xff" * 90):
+        binary.write_bytes(content)
+        assert "cameras.bin" in fault(binary)
+    binary.write_bytes(struct.pack("<QIiQQ8d", 1, 1, 5, 9, 8, *[1.0] * 8))
+    assert "OPENCV_FISHEYE" in fault(binary)
+
+
+def test_faults_of_a_rig_configuration_name_the_key(tmp_path: Path) -> None:
+    write_colmap(tmp_path, pair(AIR))
+    path = tmp_path / "rig_config.json"
+    good = json.loads(path.read_text())
+
+    def config_fault(**change: object) -> str:
+        (rig,) = json.loads(json.dumps(good))
+        rig["cameras"][1] |= change
+        path.write_text(json.dumps([rig]))
+        return fault(path)
+
+    assert "cam_from_rig_rotation" in config_fault(cam_from_rig_rotation=[1, 0, 0])
+    assert "unit quaternion" in config_fault(cam_from_rig_rotation=[1, 0, 0, 9])
+    assert "cam_from_rig_translation" in config_fault(cam_from_rig_translation="x")
+    assert "fits no camera" in config_fault(camera_params=[1.0] * 8)
+    assert "2 reference cameras" in config_fault(ref_sensor=True)
+    path.write_text(json.dumps([]))
+    assert "list of one rig" in fault(path)
+    path.write_text("{")
+    assert "not valid JSON" in fault(path)

@@ -1,0 +1,213 @@
+"""OpenCV's own loader and projection agree with what is written, and its samples are read."""
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.errors import CalibrationError
+from camera_calib.flat_port import FlatPortCamera
+from camera_calib.formats.opencv import read_opencv, write_opencv
+from camera_calib.formats.rigs import Reading
+from camera_calib.rig import Rig
+from tests.strategies_formats import POINTS_RIG, rigs
+
+AIR = FlatPortCamera(
+    width_px=640, height_px=480, fx_px=530.0, fy_px=531.0, cx_px=320.25, cy_px=241.0, n_water=1.0
+)
+STEREO = Rig(
+    cameras={"left": AIR, "right": replace(AIR, fx_px=540.0, k1=-0.1)},
+    cam_from_rig={
+        "left": RigidTransform.identity(),
+        "right": RigidTransform.from_components([-0.1, 0, 0], Rotation.from_rotvec([0, 0.01, 0])),
+    },
+    body_from_rig=RigidTransform.identity(),
+    source="a test",
+)
+MATRIX = "!!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: "
+GOOD = (
+    "%YAML:1.0\n---\nimage_width: 640\nimage_height: 480\n"
+    f"camera_matrix: {MATRIX}[ 530., 0., 319.5, 0., 531., 239.5, 0., 0., 1. ]\n"
+)
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def fault(path: Path, text: str, reading: Reading | None = None) -> str:
+    with pytest.raises(CalibrationError) as error:
+        read_opencv(write(path, text), reading or Reading())
+    shown = str(error.value)
+    assert str(path) in shown
+    assert "\n" not in shown
+    return shown
+
+
+@pytest.mark.parametrize("suffix", [".yml", ".xml"])
+@settings(max_examples=25, deadline=None)
+@given(rig=rigs())
+def test_opencv_projects_as_we_do_from_what_its_loader_reads(suffix: str, rig: Rig) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"rig{suffix}"
+        write_opencv(path, rig)
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+        keys = ("M1", "D1", "M2", "D2", "R", "T", "camera_matrix", "distortion_coefficients")
+        read = {key: storage.getNode(key).mat() for key in keys}
+        sizes = [
+            int(storage.getNode(key).real())
+            for key in storage.root().keys()  # noqa: SIM118 - no dict
+            if "image_" in key
+        ]
+        storage.release()
+
+    first, *rest = rig.cameras.values()
+    assert sizes[:2] == [first.width_px, first.height_px]
+    zero = np.zeros(3)
+    each = [("camera_matrix", "distortion_coefficients", zero, zero)]
+    if rest:
+        turn = Rotation.from_matrix(read["R"]).as_rotvec()
+        each = [("M1", "D1", zero, zero), ("M2", "D2", turn, read["T"])]
+    for (name, camera), (m, d, rvec, tvec) in zip(rig.cameras.items(), each, strict=True):
+        seen, _ = cv2.projectPoints(POINTS_RIG, rvec, tvec, read[m], read[d])
+        ours = camera.project(rig.cam_from_rig[name].apply(POINTS_RIG))
+        known = np.isfinite(ours[:, 0])
+        assert known.any()
+        np.testing.assert_allclose(seen[known, 0] + 0.5, ours[known], atol=1e-8, rtol=0)
+
+
+def test_the_half_pixel_is_taken_once(tmp_path: Path) -> None:
+    write_opencv(tmp_path / "a.yml", replace(STEREO, cameras={"left": AIR}, cam_from_rig={
+        "left": RigidTransform.identity()}))  # fmt: skip
+    storage = cv2.FileStorage(str(tmp_path / "a.yml"), cv2.FILE_STORAGE_READ)
+    matrix = storage.getNode("camera_matrix").mat()
+    np.testing.assert_array_equal(matrix[:2, 2], [319.75, 240.5])
+
+
+def test_opencvs_sample_calibration_of_one_camera_is_read(shared_data: Path) -> None:
+    path = shared_data / "opencv_stereo" / "left_intrinsics.yml"
+    (camera,) = read_opencv(path, Reading()).cameras.values()
+
+    assert (camera.width_px, camera.height_px) == (640, 480)
+    assert camera.fx_px == camera.fy_px == 535.91573396163199
+    assert camera.cx_px == pytest.approx(342.28315473308373 + 0.5, abs=1e-12)
+    assert (camera.k1, camera.k3) == (-0.26637260909660682, 0.23839153080878486)
+    assert (camera.k4, camera.s1, camera.n_water) == (0.0, 0.0, 1.0)
+
+
+def test_opencvs_sample_of_a_pair_asks_for_what_it_lacks(shared_data: Path, tmp_path: Path) -> None:
+    path = shared_data / "opencv_stereo" / "intrinsics.yml"
+    with pytest.raises(CalibrationError, match="--image-size"):
+        read_opencv(path, Reading())
+    with pytest.raises(CalibrationError, match=r"lacks R and T.*--extrinsics"):
+        read_opencv(path, Reading(image_size=(640, 480)))
+
+    pose = write(
+        tmp_path / "extrinsics.yml",
+        f"%YAML:1.0\n---\nR: {MATRIX}[ 1., 0., 0., 0., 1., 0., 0., 0., 1. ]\n"
+        "T: !!opencv-matrix\n   rows: 3\n   cols: 1\n   dt: d\n   data: [ -3.33, 0., 0. ]\n",
+    )
+    rig = read_opencv(path, Reading(image_size=(640, 480), extrinsics=pose, metres_per_unit=0.025))
+    assert rig.baseline_m == pytest.approx(3.33 * 0.025, abs=1e-15)
+    assert list(rig.cameras) == ["left", "right"]
+    assert rig.cameras["right"].k1 == -0.16916358306948096
+
+
+def test_a_list_of_pictures_is_no_calibration(shared_data: Path) -> None:
+    path = shared_data / "opencv_stereo" / "stereo_calib.xml"
+    with pytest.raises(CalibrationError, match=r"stereo_calib\.xml: lacks camera_matrix"):
+        read_opencv(path, Reading())
+
+
+@pytest.mark.parametrize(
+    ("matrix", "k"), [("cameraMatrix", "distCoeffs"), ("Camera_Matrix", "Distortion_Coefficients")]
+)
+def test_other_common_keys_are_understood(tmp_path: Path, matrix: str, k: str) -> None:
+    text = GOOD.replace("camera_matrix", matrix) + f"{k}: [ -0.1, 0.02, 0.001, -0.002 ]\n"
+    (camera,) = read_opencv(write(tmp_path / "a.yml", text), Reading()).cameras.values()
+    assert (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px) == (530, 531, 320, 240)
+    assert (camera.k1, camera.k2, camera.p1, camera.p2) == (-0.1, 0.02, 0.001, -0.002)
+
+
+def test_a_tilted_sensor_is_refused_and_a_level_one_read(tmp_path: Path) -> None:
+    coefficients = "distortion_coefficients: [" + ", ".join(["0.001"] * 12)
+    level = write(tmp_path / "a.yml", GOOD + coefficients + ", 0., 0. ]\n")
+    (camera,) = read_opencv(level, Reading()).cameras.values()
+    assert (camera.k6, camera.s4) == (0.001, 0.001)
+    shown = fault(tmp_path / "b.yml", GOOD + coefficients + ", 0.01, 0. ]\n")
+    assert "distortion_coefficients" in shown
+    assert "tilts" in shown
+
+
+def test_faults_name_file_and_key(tmp_path: Path) -> None:
+    path = tmp_path / "bad.yml"
+    matrix = "[ 530., 0., 319.5, 0., 531., 239.5, 0., 0., 1. ]"
+    faults = {
+        "image_width": fault(path, GOOD.replace("640", "6.5")),
+        "camera_matrix": fault(path, GOOD.replace("319.5", "abc")),
+        "[fx 0 cx": fault(path, GOOD.replace("530., 0.", "530., 2.")),
+        "focal": fault(path, GOOD.replace("530.", "-530.")),
+        "3 x 3": fault(path, GOOD.replace("rows: 3", "rows: 2")),
+        "9 wanted": fault(path, GOOD.replace(", 1. ]", " ]")),
+        "finite": fault(path, GOOD.replace("319.5", ".Nan")),
+        "4 or 5 or 8 or 12 or 14": fault(path, GOOD + "distortion_coefficients: [ 1., 2. ]\n"),
+        "port.n_glass": fault(
+            path, GOOD + "port:\n   normal: [ 0., 0., 1. ]\n   port_distance_m: 0.02\n"
+            "   glass_thickness_m: 0.01\n",
+        ),
+        "n_water": fault(
+            path, GOOD + "port:\n   normal: [ 0., 0., 1. ]\n   port_distance_m: 0.02\n"
+            "   glass_thickness_m: 0.01\n   n_glass: 1.5\n   n_water: many\n",
+        ),
+        "is no rotation": fault(
+            path,
+            GOOD.replace("camera_matrix", "M1") + f"M2: {MATRIX}{matrix}\n"
+            f"R: {MATRIX}[ 1., 0., 0., 0., 2., 0., 0., 0., 1. ]\nT: [ 1., 0., 0. ]\n",
+        ),
+        "twice": fault(path, GOOD + "image_width: 3\n"),
+        "lacks camera_matrix": fault(path, "%YAML:1.0\n---\na: 1\n"),
+        "no mapping": fault(path, "%YAML:1.0\n---\n- 1\n- 2\n"),
+        "line 3": fault(path, "%YAML:1.0\n---\na: [ 1., 2.\n"),
+        "FileStorage": fault(path, "hello\n"),
+        "is empty": fault(path, "\n"),
+        "camera_names": fault(path, GOOD + "camera_names: [ a, b ]\n"),
+        "camera name '../up'": fault(path, GOOD + "camera_names: [ ../up ]\n"),
+    }  # fmt: skip
+    for words, shown in faults.items():
+        assert words in shown
+
+
+def test_no_entity_of_xml_is_ever_seen_by_the_parser(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def parsed(*_: object) -> None:
+        raise AssertionError("the parser was called")
+
+    monkeypatch.setattr(cv2, "FileStorage", parsed)
+    bomb = '<?xml version="1.0"?>\n<!{} lol [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;">]>\n'
+    for declaration in ("DOCTYPE", "doctype", " DOCTYPE"):
+        text = bomb.format(declaration) + "<opencv_storage><a>&b;</a></opencv_storage>\n"
+        assert "DOCTYPE" in fault(tmp_path / "bomb.xml", text)
+    assert "parts" in fault(tmp_path / "deep.xml", "<a>" * 6000)
+    assert "parts" in fault(tmp_path / "deep.yml", "%YAML:1.0\n---\na: " + "[" * 6000)
+    assert "1 MiB" in fault(tmp_path / "long.yml", "#" * (1 << 20) + "\n")
+    (tmp_path / "wide.xml").write_bytes('<?xml version="1.0"?><!DOCTYPE a>'.encode("utf-16"))
+    with pytest.raises(CalibrationError, match="UTF-8"):
+        read_opencv(tmp_path / "wide.xml", Reading())
+
+
+def test_three_cameras_are_too_many(tmp_path: Path) -> None:
+    three = replace(
+        STEREO,
+        cameras={**STEREO.cameras, "third": AIR},
+        cam_from_rig={**STEREO.cam_from_rig, "third": RigidTransform.identity()},
+    )
+    with pytest.raises(CalibrationError, match=r"hold two cameras, the rig has 3.*--camera"):
+        write_opencv(tmp_path / "a.yml", three)
+    assert list(tmp_path.iterdir()) == []
