@@ -24,7 +24,8 @@ from camera_calib.rig import Covariance, Rig
 
 HUBER = 3.0
 """Length, in sigmas of a coordinate, from which a residual's pull no longer grows."""
-_RAYLEIGH_MEDIAN = math.sqrt(2.0 * math.log(2.0))
+RAYLEIGH_MEDIAN = math.sqrt(2.0 * math.log(2.0))
+"""Median length of a residual, in sigmas of a coordinate, of normal noise."""
 _LEAST_NOISE_PX = 1e-9
 _STEPS = 100
 _SETTLED = 1e-4
@@ -148,7 +149,7 @@ class _Solver(Problem):
         """Sigma of a coordinate from the median length of the residuals."""
         lengths = np.sqrt((residuals[self.seen] ** 2).sum(axis=-1))
         share = math.sqrt(2 * int(self.seen.sum()) / self.spare)
-        return max(float(np.median(lengths)) / _RAYLEIGH_MEDIAN * share, _LEAST_NOISE_PX)
+        return max(float(np.median(lengths)) / RAYLEIGH_MEDIAN * share, _LEAST_NOISE_PX)
 
     def solve(self, state: State, settled: float) -> Adjustment:
         """Step down from a guess until a step is shorter than `settled` sigmas."""

@@ -1,355 +1,422 @@
-"""Calibrate the stereo rig through its ports from pictures of a chessboard under water.
+"""Calibrate cameras and ports from views of a target: in air, through the ports, or both.
 
-One least-squares problem over all views of both cameras: intrinsics, lens distortion, the distance
-of each port, the pose of the right camera and the pose of the board in every view. Thickness and
-index of the glass, index of the water and the port's normal are taken as known.
+Every mode ends in one adjustment of all cameras over all views (`adjust`); modes differ in what is
+free and where the first values come from. Points that the robust solution misses by a clear
+multiple of the noise are then left out, and named.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Literal
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
-from scipy.optimize import least_squares
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
-from alice_survey.artefacts import Stage, need_stage, read_json, run_stage, write_json
-from alice_survey.config import CameraConfig, SurveyConfig
-from alice_survey.errors import CalibrationError, warn
-from alice_survey.executor import parallel_map
+from alice_survey.errors import CalibrationError
 from alice_survey.frames import Array
-from alice_survey.manifest import read_manifest
-from camera_calib.corners import find_chessboard
+from camera_calib.adjust import RAYLEIGH_MEDIAN, Adjustment, adjust, stack_views
+from camera_calib.advice import advice
+from camera_calib.calibration import Calibration, Rejection, TargetView
 from camera_calib.flat_port import FlatPortCamera
-from camera_calib.rig import Covariance, Rig, design_rig, write_rig
+from camera_calib.freedom import (
+    PINHOLE,
+    PORT,
+    Freedom,
+    Prior,
+    intrinsics,
+    of_cameras,
+    pose_names,
+)
+from camera_calib.normal_equations import Flags
+from camera_calib.rig import Rig
+from camera_calib.start import first_cam_from_rig, first_focal_px, locate_all, spans
 
-_FREE = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3", "port_distance_m")
-_STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-3, 1e-6, 1e-6, 1e-7, 1e-7, 1e-6, 1e-6])
-_SCALES = np.array([10.0, 10.0, 10.0, 10.0, 0.1, 0.1, 0.01, 0.01, 0.1, 0.01])
-_POSE_STEP, _POSE_SCALE = 1e-7, 0.1
-_FEWEST_VIEWS = 6
-_NEAREST_PORT_M = 1e-5
-"""Above the step of its derivative, so that the glass never passes the pupil."""
+Intrinsics = Literal["held", "prior", "free"]
 
-
-@dataclass(frozen=True, kw_only=True)
-class Board:
-    """A chessboard."""
-
-    columns: int
-    rows: int
-    """Inner corners along x and along y."""
-    square_m: float
-
-    @property
-    def points(self) -> Array:
-        """(rows * columns, 3) corners in the board's frame, row by row, z = 0."""
-        y, x = np.mgrid[: self.rows, : self.columns]
-        return np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3) * self.square_m
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class StereoView:
-    """The corners that both cameras see in one view of the board."""
-
-    name: str
-    left: Array
-    """(C, 2) pixels; a row is NaN where a corner was not found."""
-    right: Array
-    """(C, 2)."""
+FEWEST_VIEWS = 4
+OUTLIER = 6.0
+"""Length of a residual, in sigmas of a coordinate, beyond which a point takes no part: of normal
+noise one in 65 million is longer."""
+_DULLEST = 3.0
+"""Largest noise of one picture, in that of all, that still is noise."""
+_LEAST_LIMIT_PX = 1e-4
+_ROUNDS = 6
+_FEWEST_FITTING = 0.5
+"""Share of a picture's points; with fewer the whole picture is left out."""
+_ROUGHLY = 0.1
+"""Sigmas to which values are found that only serve as a start."""
+_LOOSEST_FOCAL = 0.1
+"""Largest sigma of a focal length, as a share of it, that still is a calibration."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Calibration:
-    """A calibrated rig and how well it fits."""
-
-    rig: Rig
-    residuals_px: Array
-    """(views, 2 cameras, corners, 2)."""
-    correlation: Array
-    """(20, 20) correlation of the parameters of left then right, in the order of `parameters`."""
-    parameters: tuple[str, ...]
-
-    @property
-    def rms_px(self) -> float:
-        """Root mean square length of the residuals."""
-        return float(np.sqrt(np.nanmean((self.residuals_px**2).sum(axis=-1))))
-
-
-def calibrate(views: Sequence[StereoView], board: Board, start: Rig) -> Calibration:
-    """Adjust the rig and all board poses together, with a robust (soft L1) loss.
+def calibrate(
+    views: Sequence[TargetView],
+    points: Array,
+    start: Rig,
+    freedom: Freedom,
+    *,
+    source: str = "calibration",
+) -> Calibration:
+    """Adjust a rig over all views, from a rig near the truth.
 
     Args:
-        views: what both cameras saw.
-        board: the board.
-        start: a rig near the truth, such as the design; what is not adjusted is taken from it.
+        views: where the cameras saw the target.
+        points: (N, 3) the target's points in its own frame, metres.
+        start: near the truth, such as the design; what is not adjusted is taken from it.
+        freedom: what is adjusted.
+        source: how, for the rig's `source`.
 
     Raises:
-        CalibrationError: too few views, or the solution leaves the range of a real camera.
+        CalibrationError: too few views, or they do not determine what is free.
     """
-    if len(views) < _FEWEST_VIEWS:
-        raise CalibrationError(
-            f"{len(views)} views with the whole board in both pictures; at least {_FEWEST_VIEWS} "
-            "are needed: take more, nearer and at more angles"
-        )
-    problem = _Problem(views, board, start)
-    x = problem.start
-    for adjusted, loss_px, tolerance in ((problem.poses, 20.0, 1e-3), (slice(None), 0.5, 1e-11)):
-        x = problem.adjust(x, adjusted, loss_px, tolerance)
-    return problem.solution(x)
-
-
-class _Problem:
-    """Residuals of all views as a function of one vector: cameras, rig, board poses."""
-
-    def __init__(self, views: Sequence[StereoView], board: Board, start: Rig) -> None:
-        self.rig, self.names, self.points = start, tuple(start.cameras), board.points
-        self.pixels = np.stack([[v.left, v.right] for v in views])
-        self.observed: NDArray[np.bool_] = np.asarray(np.isfinite(self.pixels).all(axis=-1))
-        right = start.cam_from_rig[self.names[1]]
-        boards = [_locate(self.points, v.left, start.cameras[self.names[0]], v.name) for v in views]
-        cameras = [[getattr(start.cameras[n], f) for f in _FREE] for n in self.names]
-        poses = [_vector(right), *(_vector(pose) for pose in boards)]
-        self.start = np.concatenate([*cameras, *poses])
-        rest = np.full(6 * len(poses), _POSE_SCALE)
-        self.scales = np.concatenate([_SCALES, _SCALES, rest])
-        self.steps = np.concatenate([_STEPS, _STEPS, np.full(6 * len(poses), _POSE_STEP)])
-        self.fixed = 2 * len(_FREE) + 6
-        self.poses = slice(2 * len(_FREE), None)
-        free = np.full(6 * len(poses), np.inf)
-        f, w, h = start.cameras[self.names[0]].fx_px, self.pixels[..., 0], self.pixels[..., 1]
-        low = [f / 2, f / 2, 0.0, 0.0, -2.0, -2.0, -0.5, -0.5, -2.0, _NEAREST_PORT_M]
-        high = [2 * f, 2 * f, np.nanmax(w), np.nanmax(h), 2.0, 2.0, 0.5, 0.5, 2.0, 0.5]
-        self.low = np.concatenate([low, low, -free])
-        self.high = np.concatenate([high, high, free])
-        self.start = np.clip(self.start, self.low + 1e-9, self.high - 1e-9)
-
-    def adjust(self, x: Array, adjusted: slice, loss_px: float, tolerance: float) -> Array:
-        """Adjust a part of the parameters to the least robust loss, from x.
-
-        Raises:
-            CalibrationError: no convergence, or a parameter ran to the bound of what is real.
-        """
-
-        def whole(part: Array) -> Array:
-            moved = x.copy()
-            moved[adjusted] = part
-            return moved
-
-        def slopes(part: Array) -> Array:
-            return self.jacobian(whole(part))[:, adjusted]
-
-        def misses(part: Array) -> Array:
-            return self.residuals(whole(part))
-
-        result = least_squares(
-            misses,
-            x[adjusted],
-            jac=slopes,
-            bounds=(self.low[adjusted], self.high[adjusted]),
-            loss="soft_l1",
-            f_scale=loss_px,
-            x_scale=self.scales[adjusted],
-            xtol=tolerance,
-            ftol=tolerance,
-            gtol=tolerance,
-            max_nfev=200,
-        )
-        if not result.success:
-            raise CalibrationError(f"the adjustment did not converge: {result.message}")
-        return whole(result.x)
-
-    def cameras(self, x: Array) -> tuple[FlatPortCamera, FlatPortCamera, RigidTransform]:
-        """Both cameras and `right_from_left`."""
-        count = len(_FREE)
-        models = []
-        for i, name in enumerate(self.names):
-            values: dict[str, Any] = dict(zip(_FREE, map(float, x[i * count :]), strict=False))
-            models.append(replace(self.rig.cameras[name], **values))
-        return models[0], models[1], _pose(x[2 * count : self.fixed])
-
-    def predict(self, x: Array) -> Array:
-        """Pixels, (views, 2, corners, 2)."""
-        left, right, right_from_left = self.cameras(x)
-        poses = x[self.fixed :].reshape(-1, 6)
-        rotations = Rotation.from_rotvec(poses[:, :3]).as_matrix()
-        in_left = np.einsum("vij,cj->vci", rotations, self.points) + poses[:, None, 3:]
-        in_right = right_from_left.apply(in_left.reshape(-1, 3)).reshape(in_left.shape)
-        return np.stack([left.project(in_left), right.project(in_right)], axis=1)
-
-    def residuals(self, x: Array) -> Array:
-        """Misses in x and y, view by view; 0 where no corner was found."""
-        misses = np.where(self.observed[..., None], self.predict(x) - self.pixels, 0.0)
-        return misses.ravel()
-
-    def jacobian(self, x: Array) -> Array:
-        """Central differences; a board's pose moves its own view only."""
-
-        def slope(step: Array) -> Array:
-            change = self.predict(x + step) - self.predict(x - step)
-            seen: Array = np.where(self.observed[..., None], change, 0.0)
-            return seen / (2 * float(step.max()))
-
-        views = len(self.pixels)
-        jacobian = np.zeros((views, self.pixels[0].size, x.size))
-        for i in range(self.fixed):
-            step = np.zeros_like(x)
-            step[i] = self.steps[i]
-            jacobian[:, :, i] = slope(step).reshape(views, -1)
-        each = np.arange(views)
-        for i in range(self.fixed, self.fixed + 6):
-            step = np.zeros_like(x)
-            step[i::6] = self.steps[i]
-            jacobian[each, :, i + 6 * each] = slope(step).reshape(views, -1)
-        flat: Array = jacobian.reshape(-1, x.size)
-        return flat
-
-    def solution(self, x: Array) -> Calibration:
-        """The calibrated rig, with the covariance at the solution."""
-        covariance = _covariance(self.jacobian(x), self.residuals(x), self.observed)
-        left, right, right_from_left = self.cameras(x)
-        sigma = np.sqrt(np.diag(covariance))
-        cameras = tuple(f"{name}.{field}" for name in self.names for field in _FREE)
-        pose = [f"{self.names[1]}.{p}" for p in ("rx_rad", "ry_rad", "rz_rad", "x_m", "y_m", "z_m")]
-        names = (*cameras, *pose)
-        rig = replace(
-            self.rig,
-            cameras={self.names[0]: left, self.names[1]: right},
-            cam_from_rig={
-                self.names[0]: RigidTransform.identity(),
-                self.names[1]: right_from_left,
+    usable, rejections = _usable(views, points)
+    _check_served(usable, start)
+    found = locate_all(start, usable, points)
+    for view, pose in zip(usable, found, strict=True):
+        if pose is None:
+            rejections.append(_whole(view.name, view.pixels, "no pose of the target was found"))
+    alive = [i for i, pose in enumerate(found) if pose is not None]
+    usable = [usable[i] for i in alive]
+    _check_enough(len(usable), len(views))
+    pixels = stack_views(usable, start, len(points))
+    poses = RigidTransform.concatenate([pose for pose in found if pose is not None])
+    adjusted, kept, alive_views = _adjusted_without_outliers(
+        usable, pixels, points, start, poses, freedom
+    )
+    rejections += _rejected(usable, pixels, kept, start, adjusted)
+    _check_focal(adjusted.rig, adjusted.rig_from_target)
+    used = np.where(kept[..., None], pixels, np.nan)[alive_views]
+    left_out = np.where(kept[..., None], np.nan, pixels)[alive_views]
+    names = list(start.cameras)
+    final = tuple(
+        TargetView(
+            name=usable[v].name,
+            pixels={
+                name: used[i, c] for c, name in enumerate(names) if np.isfinite(used[i, c]).any()
             },
-            source=f"calibration through the ports from {len(self.pixels)} stereo views of a board",
-            covariance=Covariance(parameters=names, matrix=covariance),
         )
-        misses = np.where(self.observed[..., None], self.predict(x) - self.pixels, np.nan)
-        correlation = covariance / np.outer(sigma, sigma)
-        return Calibration(rig=rig, residuals_px=misses, correlation=correlation, parameters=names)
-
-
-def _covariance(jacobian: Array, residuals: Array, observed: NDArray[np.bool_]) -> Array:
-    """Covariance of cameras and rig with the board poses marginalised, scaled to the residuals."""
-    fixed = 2 * len(_FREE) + 6
-    normal = jacobian.T @ jacobian
-    cc, cb, bb = normal[:fixed, :fixed], normal[:fixed, fixed:], normal[fixed:, fixed:]
-    schur = cc - cb @ np.linalg.solve(bb, cb.T)
-    freedom = 2 * int(observed.sum()) - jacobian.shape[1]
-    variance = float(residuals @ residuals) / freedom
-    scale = 1.0 / np.sqrt(np.diag(schur))
-    covariance: Array = variance * np.linalg.inv(schur * np.outer(scale, scale))
-    return covariance * np.outer(scale, scale)
-
-
-def _locate(points: Array, pixels: Array, camera: FlatPortCamera, name: str) -> RigidTransform:
-    """A first pose of the board, `cam_from_board`, taking the camera for a pinhole in water."""
-    focal = camera.n_water * np.array([camera.fx_px, camera.fy_px])
-    matrix = np.diag([*focal, 1.0])
-    matrix[:2, 2] = camera.cx_px, camera.cy_px
-    seen = np.isfinite(pixels).all(axis=1)
-    found, rotation, translation = cv2.solvePnP(
-        points[seen], pixels[seen], matrix, None, flags=cv2.SOLVEPNP_IPPE
+        for i, v in enumerate(np.flatnonzero(alive_views))
     )
-    if not found:
-        raise CalibrationError(f"view {name}: the board's pose cannot be found")
-    return RigidTransform.from_components(
-        translation.ravel(), Rotation.from_rotvec(rotation.ravel())
+    rig = replace(adjusted.rig, source=f"{source} from {len(final)} views")
+    return Calibration(
+        rig=rig,
+        target_points=points,
+        views=final,
+        rig_from_target=adjusted.rig_from_target,
+        residuals_px=adjusted.residuals_px,
+        weights=adjusted.weights,
+        noise_px=adjusted.noise_px,
+        rejections=tuple(rejections),
+        warnings=advice(
+            rig,
+            used,
+            adjusted.residuals_px,
+            (view.name for view in final),
+            adjusted.rig_from_target,
+            adjusted.noise_px,
+        ),
+        freedom=freedom,
+        rejected=left_out,
     )
 
 
-def _vector(pose: RigidTransform) -> Array:
-    return np.concatenate([pose.rotation.as_rotvec(), pose.translation])
+def recalibrate(calibration: Calibration, views: Sequence[TargetView]) -> Calibration:
+    """The same calibration from other views, such as some of its own."""
+    freedom, source = calibration.freedom, "calibration"
+    return calibrate(views, calibration.target_points, calibration.rig, freedom, source=source)
 
 
-def _pose(vector: Array) -> RigidTransform:
-    return RigidTransform.from_components(vector[3:], Rotation.from_rotvec(vector[:3]))
+def calibrate_in_air(
+    views: Sequence[TargetView],
+    points: Array,
+    sizes: Mapping[str, tuple[int, int]],
+    lens: str = "opencv5",
+    start: Rig | None = None,
+) -> Calibration:
+    """Intrinsics of each camera alone, then of all with the rig, in air, from nothing.
+
+    Args:
+        views: where the cameras saw the target.
+        points: (N, 3) of the target, metres.
+        sizes: width and height of each camera's pictures; the first is the reference.
+        lens: name of a lens model (`freedom.LENSES`).
+        start: a rig near the truth, where one is known.
+
+    Raises:
+        CalibrationError: too few views, or they do not determine the cameras.
+    """
+    names = intrinsics(lens)
+    if start is None:
+        blank = {
+            name: blank_camera(size, n_water=1.0, port_distance_m=0.0, glass_thickness_m=0.0)
+            for name, size in sizes.items()
+        }
+        start = first_rig(views, points, blank, lens)
+    free = (*of_cameras(start, names), *pose_names(start))
+    return calibrate(views, points, start, Freedom(free=free), source="calibration in air")
 
 
-def run_calibrate(workspace: Path, config: SurveyConfig, threads: int) -> bool:
-    """Calibrate the rig from `pool/` and write `calibration/`.
+def calibrate_through_ports(
+    views: Sequence[TargetView],
+    points: Array,
+    start: Rig,
+    known: Intrinsics,
+    lens: str = "opencv5",
+    sigmas: Mapping[str, float] | None = None,
+) -> Calibration:
+    """Rig and housings in one adjustment: distance and normal of each port, pose of each camera.
+
+    Args:
+        views: where the cameras saw the target, under water.
+        points: (N, 3) of the target, metres.
+        start: cameras calibrated in air, or a design; with glass, water and a guess of the ports.
+        known: whether the cameras' intrinsics are held at the start's, taken with their
+            covariance as a prior, or found anew.
+        lens: name of the lens model that is found anew.
+        sigmas: more parameters that are known about as the start has them, such as
+            `left.glass_thickness_m`, with their standard deviations.
+
+    Raises:
+        CalibrationError: too few views, they do not determine what is free, or the start has no
+            covariance to serve as a prior.
+    """
+    extra = Prior.around(start, sigmas or {})
+    free = [*of_cameras(start, PORT), *pose_names(start)]
+    if known == "free":
+        free += of_cameras(start, intrinsics(lens))
+    if known == "prior":
+        extra = Prior.of_rig(start, of_cameras(start, intrinsics("full"))).and_also(extra)
+    freedom = Freedom(
+        free=tuple(name for name in free if name not in extra.parameters), prior=extra
+    )
+    source = f"calibration through the ports, intrinsics {known},"
+    return calibrate(views, points, start, freedom, source=source)
+
+
+def calibrate_in_water_alone(
+    views: Sequence[TargetView],
+    points: Array,
+    cameras: Mapping[str, FlatPortCamera],
+    lens: str = "opencv5",
+    sigmas: Mapping[str, float] | None = None,
+) -> Calibration:
+    """Rig, housings and intrinsics from views under water, where nothing else exists.
+
+    Args:
+        views: where the cameras saw the target, under water.
+        points: (N, 3) of the target, metres.
+        cameras: blank ones (`blank_camera`) with glass, water and a guess of the port distance.
+        lens: name of a lens model.
+        sigmas: as of `calibrate_through_ports`.
+
+    Raises:
+        CalibrationError: too few views, or they do not determine what is free.
+    """
+    start = first_rig(views, points, cameras, lens)
+    return calibrate_through_ports(views, points, start, "free", lens, sigmas)
+
+
+def blank_camera(
+    size: tuple[int, int],
+    *,
+    n_water: float,
+    port_distance_m: float,
+    glass_thickness_m: float,
+    n_glass: float = 1.52,
+) -> FlatPortCamera:
+    """A camera of which only its port and the size of its pictures are known."""
+    width, height = size
+    return FlatPortCamera(
+        width_px=width,
+        height_px=height,
+        fx_px=float(width),
+        fy_px=float(width),
+        cx_px=width / 2.0,
+        cy_px=height / 2.0,
+        port_distance_m=port_distance_m,
+        glass_thickness_m=glass_thickness_m,
+        n_glass=n_glass,
+        n_water=n_water,
+    )
+
+
+def first_rig(
+    views: Sequence[TargetView], points: Array, blank: Mapping[str, FlatPortCamera], lens: str
+) -> Rig:
+    """A rig near the truth from nothing but views: each camera alone, then how they stand.
+
+    Raises:
+        CalibrationError: a camera has too few views, or no view joins it to the others.
+    """
+    usable, _ = _usable(views, points)
+    for name in blank:
+        count = sum(name in view.pixels for view in usable)
+        if count < FEWEST_VIEWS:
+            raise CalibrationError(
+                f"{count} views of the target from the camera {name}; at least {FEWEST_VIEWS} are "
+                "needed: take more, nearer and at more angles"
+            )
+    cameras = {name: _alone(name, camera, usable, points, lens) for name, camera in blank.items()}
+    return Rig(
+        cameras=cameras,
+        cam_from_rig=first_cam_from_rig(cameras, usable, points),
+        body_from_rig=RigidTransform.identity(),
+        source="first values",
+    )
+
+
+def _alone(
+    name: str, blank: FlatPortCamera, views: Sequence[TargetView], points: Array, lens: str
+) -> FlatPortCamera:
+    """One camera's intrinsics, its port held: first its focal length and k1, then all."""
+    mine = [
+        TargetView(name=v.name, pixels={name: v.pixels[name]}) for v in views if name in v.pixels
+    ]
+    size = (blank.width_px, blank.height_px)
+    focal_px = first_focal_px([v.pixels[name] for v in mine], points, size) / blank.n_water
+    rig = Rig(
+        cameras={name: replace(blank, fx_px=focal_px, fy_px=focal_px)},
+        cam_from_rig={name: RigidTransform.identity()},
+        body_from_rig=RigidTransform.identity(),
+        source="first values",
+    )
+    wanted = intrinsics(lens)
+    for fields in (PINHOLE, [*PINHOLE, "k1"], wanted):
+        found = zip(mine, locate_all(rig, mine, points), strict=True)
+        located = [(view, pose) for view, pose in found if pose is not None]
+        poses = RigidTransform.concatenate([pose for _, pose in located])
+        freedom = Freedom(free=of_cameras(rig, [f for f in fields if f in wanted]))
+        rig = adjust([v for v, _ in located], points, rig, poses, freedom, _ROUGHLY).rig
+    return rig.cameras[name]
+
+
+def _usable(views: Sequence[TargetView], points: Array) -> tuple[list[TargetView], list[Rejection]]:
+    """Views without the pictures that show too little of the target for a pose."""
+    usable, rejections = [], []
+    for view in views:
+        enough = {name: seen for name, seen in view.pixels.items() if spans(seen, points)}
+        rejections += [
+            _whole(view.name, {name: seen}, "shows too little of the target for a pose")
+            for name, seen in view.pixels.items()
+            if name not in enough
+        ]
+        if enough:
+            usable.append(replace(view, pixels=enough))
+    return usable, rejections
+
+
+def _whole(view: str, pixels: Mapping[str, Array], reason: str) -> Rejection:
+    return Rejection(view=view, camera=", ".join(pixels), points=0, reason=reason)
+
+
+def _check_enough(usable: int, given: int) -> None:
+    if usable < FEWEST_VIEWS:
+        of = f" of {given}" if given > usable else ""
+        raise CalibrationError(
+            f"{usable}{of} views of the target can be used; at least {FEWEST_VIEWS} are needed: "
+            "take more, nearer and at more angles"
+        )
+
+
+def _check_served(views: Sequence[TargetView], rig: Rig) -> None:
+    for name in rig.cameras:
+        if views and not any(name in view.pixels for view in views):
+            raise CalibrationError(f"no view shows the target to the camera {name}")
+
+
+def _check_focal(rig: Rig, poses: RigidTransform) -> None:
+    """Refuse what views that face the same way give: a focal length of any size."""
+    for name, sigma in rig.sigmas.items():
+        camera, field = name.split(".")
+        if field not in ("fx_px", "fy_px"):
+            continue
+        share = sigma / rig.cameras[camera].parameter(field)
+        if share > _LOOSEST_FOCAL:
+            normals = poses.rotation.apply([0.0, 0.0, 1.0]).reshape(-1, 3)
+            widest = np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0)))
+            raise CalibrationError(
+                f"{name} is known to {share:.0%} only: the {len(normals)} poses of the target "
+                f"differ by {widest:.1f} deg at most: tilt it by 20 to 40 deg about both axes"
+            )
+
+
+def _adjusted_without_outliers(
+    views: Sequence[TargetView],
+    pixels: Array,
+    points: Array,
+    rig: Rig,
+    poses: RigidTransform,
+    freedom: Freedom,
+) -> tuple[Adjustment, Flags, Flags]:
+    """Adjust and leave out what misses by far, until that stays the same.
 
     Returns:
-        True when done, False when nothing had changed.
-
-    Raises:
-        CalibrationError: too few usable views.
+        The adjustment; which points (V, cameras, N) took part; which views (V,) did.
     """
-    pool = need_stage(workspace, "pool", "image")
-    stage = Stage(
-        name="calibration",
-        version=2,
-        settings={
-            "camera": config.camera.model_dump(mode="json"),
-            "water": config.water.model_dump(mode="json"),
-        },
-        inputs=[pool / "manifest.csv", pool / "board.json", pool / "left", pool / "right"],
-    )
-
-    def work(folder: Path) -> None:
-        board = Board(**read_json(pool / "board.json"))
-        start = design_rig(config.camera, config.water, _scale(pool, config.camera))
-        calibration = calibrate(read_views(pool, board, threads), board, start)
-        write_rig(folder / "rig.json", calibration.rig)
-        write_json(folder / "calibration.json", _summary(calibration))
-
-    return run_stage(workspace, stage, work)
-
-
-def _scale(pool: Path, camera: CameraConfig) -> int:
-    """How many times larger than designed the pixels of a pool's pictures are."""
-    first = pool / read_manifest(pool / "manifest.csv")[0].image
-    picture = cv2.imread(str(first), cv2.IMREAD_GRAYSCALE)
-    if picture is None:
-        raise CalibrationError(f"{first} cannot be decoded")
-    height, width = map(int, picture.shape)
-    scale = round(camera.width_px / width)
-    if (camera.width_px // scale, camera.height_px // scale) != (width, height):
-        raise CalibrationError(
-            f"{first} has {width} x {height} px, which is no whole fraction of the camera's "
-            f"{camera.width_px} x {camera.height_px}: set [camera] width_px and height_px"
-        )
-    return scale
+    measured = np.asarray(np.isfinite(pixels).all(axis=-1))
+    kept, alive = measured, np.ones(len(views), dtype=bool)
+    for _ in range(_ROUNDS):
+        trimmed = [_trimmed(view, kept[v], rig) for v, view in enumerate(views) if alive[v]]
+        adjusted = adjust(trimmed, points, rig, poses, freedom)
+        lengths = np.full(measured.shape, np.inf)
+        lengths[alive] = _lengths(adjusted, pixels[alive], points)
+        limits = _limits(np.where(measured, lengths, np.nan), adjusted.noise_px)
+        fits = measured & (lengths <= limits[..., None])
+        share = fits.sum(axis=2) / np.maximum(measured.sum(axis=2), 1)
+        fits &= (share >= _FEWEST_FITTING)[..., None]
+        if np.array_equal(fits, kept):
+            break
+        still = alive & fits.any(axis=(1, 2))
+        poses = adjusted.rig_from_target[np.flatnonzero(still[alive])]
+        rig, kept, alive = adjusted.rig, fits, still
+        _check_enough(int(alive.sum()), len(views))
+    return adjusted, kept, alive
 
 
-def read_views(pool: Path, board: Board, threads: int) -> list[StereoView]:
-    """Find the board in all pictures of a pool; views that lack it are named and left out."""
-    records = read_manifest(pool / "manifest.csv")
-    jobs = [(pool / record.image, board) for record in records]
-    corners = dict(
-        zip(
-            ((r.station, r.camera) for r in records),
-            parallel_map(_corners_of, jobs, threads=threads, label="board corners"),
-            strict=True,
-        )
-    )
-    views = []
-    for station in sorted({record.station for record in records}):
-        left, right = corners.get((station, "left")), corners.get((station, "right"))
-        if left is None or right is None:
-            warn(f"view {station}: the whole board was not found in both pictures; left out")
-            continue
-        views.append(StereoView(name=str(station), left=left, right=right))
-    return views
+def _limits(lengths: Array, noise_px: float) -> Array:
+    """(V, cameras) longest residual that fits, px: a picture may be less sharp than the others."""
+    own = np.full(lengths.shape[:2], np.nan)
+    seen = np.isfinite(lengths).any(axis=2)
+    own[seen] = np.nanmedian(np.where(np.isfinite(lengths), lengths, np.nan)[seen], axis=1)
+    sigma = np.clip(np.nan_to_num(own / RAYLEIGH_MEDIAN), noise_px, _DULLEST * noise_px)
+    return np.maximum(OUTLIER * sigma, _LEAST_LIMIT_PX)
 
 
-def _corners_of(job: tuple[Path, Board]) -> Array | None:
-    path, board = job
-    picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if picture is None:
-        warn(f"{path} cannot be decoded; left out")
-        return None
-    return find_chessboard(picture, board.columns, board.rows)
-
-
-def _summary(calibration: Calibration) -> dict[str, object]:
-    lengths = np.sqrt((calibration.residuals_px**2).sum(axis=-1))
-    return {
-        "rms_px": round(calibration.rms_px, 6),
-        "worst_px": round(float(np.nanmax(lengths)), 6),
-        "views": len(lengths),
-        "rms_px_by_view": [round(float(np.sqrt(np.nanmean(v**2))), 6) for v in lengths],
-        "parameters": list(calibration.parameters),
-        "correlation": np.round(calibration.correlation, 6).tolist(),
+def _trimmed(view: TargetView, kept: Flags, rig: Rig) -> TargetView:
+    pixels = {
+        name: np.where(kept[c, :, None], view.pixels[name], np.nan)
+        for c, name in enumerate(rig.cameras)
+        if name in view.pixels and kept[c].any()
     }
+    return replace(view, pixels=pixels)
+
+
+def _lengths(adjusted: Adjustment, pixels: Array, points: Array) -> Array:
+    """(V, cameras, N) misses of all measured points, also of those that took no part; px."""
+    misses = np.full(pixels.shape[:-1], np.inf)
+    for c, (name, camera) in enumerate(adjusted.rig.cameras.items()):
+        for v in range(len(pixels)):
+            pose = adjusted.rig.cam_from_rig[name] * adjusted.rig_from_target[v]
+            misses[v, c] = np.linalg.norm(camera.project(pose.apply(points)) - pixels[v, c], axis=1)
+    return np.where(np.isfinite(misses), misses, np.inf)
+
+
+def _rejected(
+    views: Sequence[TargetView], pixels: Array, kept: Flags, rig: Rig, adjusted: Adjustment
+) -> list[Rejection]:
+    """What the adjustment left out, picture by picture."""
+    limit = f"{OUTLIER:.0f} sigmas (of {adjusted.noise_px:.2g} px or the picture's own)"
+    rejections = []
+    for v, view in enumerate(views):
+        for c, name in enumerate(rig.cameras):
+            measured = int(np.isfinite(pixels[v, c, :, 0]).sum())
+            lost = measured - int(kept[v, c].sum())
+            if lost and lost == measured:
+                reason = f"fits badly: most of its points miss by more than {limit}"
+                rejections.append(_whole(view.name, {name: pixels[v, c]}, reason))
+            elif lost:
+                reason = f"missed by more than {limit}"
+                rejections.append(
+                    Rejection(view=view.name, camera=name, points=lost, reason=reason)
+                )
+    return rejections

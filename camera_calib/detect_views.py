@@ -1,0 +1,113 @@
+"""Find the target in all pictures of a calibration."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+
+from alice_survey.errors import CalibrationError, warn
+from alice_survey.executor import parallel_map
+from camera_calib.calibration import Rejection, TargetView
+from camera_calib.detect import Detection, detect_with_reasons
+from camera_calib.picture_sets import PictureSet
+from camera_calib.target import Target
+
+_READ = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+
+Size = tuple[int, int]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Detections:
+    """What all pictures show of the target."""
+
+    views: tuple[TargetView, ...]
+    """Those in which a camera saw it."""
+    sizes: Mapping[str, Size]
+    """Width and height of each camera's pictures."""
+    rejections: tuple[Rejection, ...]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Seen:
+    size: Size | None
+    """None where the picture cannot be decoded."""
+    detection: Detection | None
+
+
+def detect_views(sets: Sequence[PictureSet], target: Target, threads: int) -> Detections:
+    """Find the target in sets of pictures; what cannot be used is named and left out.
+
+    Args:
+        sets: pictures of one moment each.
+        target: what to look for.
+        threads: cores to use.
+
+    Raises:
+        CalibrationError: a camera has pictures of different sizes, or none that shows the target.
+    """
+    jobs = [(path, target) for one in sets for path in one.paths.values()]
+    found = iter(list(parallel_map(_look, jobs, threads=threads, label="target points")))
+    seen = {(one.name, camera): next(found) for one in sets for camera in one.paths}
+    paths = {(one.name, camera): path for one in sets for camera, path in one.paths.items()}
+    cameras = list(dict.fromkeys(camera for one in sets for camera in one.paths))
+    rejections: list[Rejection] = []
+    for (view, camera), what in seen.items():
+        if what.detection is None:
+            warn(f"{paths[view, camera]} cannot be decoded; left out")
+            reason = "the picture cannot be decoded"
+            rejections.append(Rejection(view=view, camera=camera, points=0, reason=reason))
+        else:
+            rejections += what.detection.rejections(view, camera)
+    sizes = {camera: _one_size(camera, seen, paths) for camera in cameras}
+    for camera in cameras:
+        _check_found(camera, target, [s for (_, c), s in seen.items() if c == camera])
+    views = []
+    for one in sets:
+        pixels = {}
+        for camera in one.paths:
+            detection = seen[one.name, camera].detection
+            if detection is not None and detection.pixels is not None:
+                pixels[camera] = detection.pixels
+        if pixels:
+            views.append(TargetView(name=one.name, pixels=pixels))
+    return Detections(views=tuple(views), sizes=sizes, rejections=tuple(rejections))
+
+
+def _look(job: tuple[Path, Target]) -> _Seen:
+    path, target = job
+    picture = cv2.imread(str(path), _READ)
+    if picture is None:
+        return _Seen(size=None, detection=None)
+    height, width = map(int, picture.shape[:2])
+    return _Seen(size=(width, height), detection=detect_with_reasons(target, picture))
+
+
+def _one_size(
+    camera: str, seen: Mapping[tuple[str, str], _Seen], paths: Mapping[tuple[str, str], Path]
+) -> Size:
+    sizes = {key: what.size for key, what in seen.items() if key[1] == camera and what.size}
+    if not sizes:
+        raise CalibrationError(f"none of the pictures of {camera} can be decoded")
+    counts = Counter(sizes.values()).most_common()
+    if len(counts) > 1:
+        (common, many), (other, few) = counts[:2]
+        odd = next(paths[key].name for key, size in sizes.items() if size == other)
+        raise CalibrationError(
+            f"pictures of {camera} differ in size: {many} of {common[0]} x {common[1]} px, {few} "
+            f"of {other[0]} x {other[1]} px (such as {odd}): give those of one size"
+        )
+    return counts[0][0]
+
+
+def _check_found(camera: str, target: Target, seen: Sequence[_Seen]) -> None:
+    looked = [what.detection for what in seen if what.detection is not None]
+    if any(detection.pixels is not None for detection in looked):
+        return
+    reasons = Counter(str(detection.refused) for detection in looked).most_common(1)
+    raise CalibrationError(
+        f"the target '{target.description}' was found in none of the {len(looked)} pictures of "
+        f"{camera}; of {reasons[0][1]} of them: {reasons[0][0]}"
+    )
