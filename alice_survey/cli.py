@@ -49,29 +49,59 @@ def init(
     epilog=examples(
         "fov",
         "fov --lens 12.5 --lens 25 --altitude 1.5 --altitude 2 --n-water 1.345 --json",
-        "fov --validate",
+        "fov --lens 12.5 --temperature 22 --salinity 35 --port-distance 30 --glass 12 --coc 2",
+        "fov --focus-air 1.5 --f-number 5.6 --speed 0.2 --speed 0.5 --exposure 1 --exposure 3",
+        "fov --rig calibration/rig.json --altitude 2 --plot fov.png --csv fov.csv",
+        "fov --validate --markdown",
     )
 )
 def fov(
     lens: Annotated[list[float] | None, typer.Option(help="Focal length, mm.")] = None,
-    altitude: Annotated[list[float] | None, typer.Option(help="Metres.")] = None,
-    n_water: Annotated[float, typer.Option(min=1.0, max=1.4, help="Index of the water.")] = 1.34,
+    altitude: Annotated[list[float] | None, typer.Option(help="Of the outer glass, m.")] = None,
+    n_water: Annotated[float | None, typer.Option(help="Index of the water.")] = None,
+    temperature: Annotated[float | None, typer.Option(help="Of the water, C.")] = None,
+    salinity: Annotated[float | None, typer.Option(help="Of the water, psu.")] = None,
+    port_distance: Annotated[float | None, typer.Option(help="Pupil to glass, mm.")] = None,
+    glass: Annotated[float | None, typer.Option(help="Thickness of the port, mm.")] = None,
+    n_glass: Annotated[float | None, typer.Option(help="Index of the port.")] = None,
+    rig: Annotated[Path | None, typer.Option(help="A calibrated rig.json instead.")] = None,
+    f_number: Annotated[float | None, typer.Option(help="Aperture, 4 for F/4.")] = None,
+    coc: Annotated[float, typer.Option(help="Blur circle that is sharp, px.")] = 1.0,
+    focus_air: Annotated[float | None, typer.Option(help="Focus set in air, m.")] = None,
+    pixel: Annotated[float | None, typer.Option(help="Pitch of the sensor, um.")] = None,
+    match_sigma: Annotated[
+        float, typer.Option(min=1e-6, help="Disparity noise of the pair, px.")
+    ] = 0.3,
+    speed: Annotated[list[float] | None, typer.Option(help="Over ground, m/s.")] = None,
+    exposure: Annotated[list[float] | None, typer.Option(help="Shutter or strobe, ms.")] = None,
+    blur: Annotated[float | None, typer.Option(min=1e-6, help="Allowed motion blur, px.")] = None,
     validate: Annotated[
-        bool, typer.Option("--validate", help="Compare with the paper's table; exit 1 if it fails.")
+        bool, typer.Option("--validate", help="Check what the paper says; exit 1 if it fails.")
     ] = False,
-    survey: SurveyFile = None,
+    plot: Annotated[Path | None, typer.Option(help="Draw it: .png, .svg or .pdf.")] = None,
+    csv: Annotated[Path | None, typer.Option(help="Write the rows as CSV.")] = None,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown.")] = False,
+    survey: Annotated[
+        Path | None, typer.Option("-s", "--survey", help="Camera, water and plan to take.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Tell field of view and resolution.
 
-    Footprints and pixels on the sea floor through the exact flat port, for any lens and altitude.
+    Footprint, pixel, focus, depth of field, stereo and blur through the exact flat port, for any
+    lens, altitude and water. What is not given is the survey's, or else the paper's.
     """
-    from alice_survey.tables import fov_report, validation_report
+    from alice_survey.tables import FovOptions, Output, fov_report, validation_report
 
-    if validate:
-        table, data, passed = validation_report()
-    else:
-        table, data, passed = fov_report(lens, altitude, n_water, survey)
+    output = Output(markdown=markdown, csv=csv, plot=plot)
+    options = FovOptions(
+        lens_mm=lens or (), altitude_m=altitude or (), speed_mps=speed or (),
+        exposure_ms=exposure or (), survey=survey, rig=rig, n_water=n_water,
+        temperature_c=temperature, salinity_psu=salinity, port_distance_mm=port_distance,
+        glass_mm=glass, n_glass=n_glass, pixel_um=pixel, f_number=f_number, coc_px=coc,
+        focus_air_m=focus_air, match_sigma_px=match_sigma, blur_px=blur,
+    )  # fmt: skip
+    table, data, passed = validation_report(output) if validate else fov_report(options, output)
     print_result(table, data, as_json)
     raise typer.Exit(0 if passed else 1)
 

@@ -85,7 +85,7 @@ def test_module_runs_as_the_command() -> None:
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert [row["passed"] for row in json.loads(done.stdout)] == [True] * 6
+    assert [row["passed"] for row in json.loads(done.stdout)["table"]] == [True] * 6
 
 
 def test_the_template_states_every_default(tmp_path: Path) -> None:

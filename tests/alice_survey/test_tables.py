@@ -1,0 +1,137 @@
+"""The `fov` command: options, files and faults."""
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from alice_survey.cli import app
+from alice_survey.config import CameraConfig, WaterConfig
+from alice_survey.errors import AliceError, ConfigError
+from alice_survey.seawater import n_water
+from alice_survey.tables import FovOptions, Output, fov_report, validation_report
+from camera_calib.rig import design_rig, write_rig
+
+QUIET = Output()
+
+
+def rows(**options: object) -> list[dict[str, float]]:
+    return fov_report(FovOptions(**options), QUIET)[1]["rows"]  # type: ignore[arg-type, no-any-return]
+
+
+def test_options_reach_the_rows() -> None:
+    row = rows(
+        lens_mm=[16.0], altitude_m=[1.5], n_water=1.345, port_distance_mm=35.0, glass_mm=12.0,
+        f_number=5.6, coc_px=2.0, focus_air_m=1.2, match_sigma_px=0.5,
+    )[0]  # fmt: skip
+    wanted = {
+        "lens_mm": 16.0, "altitude_m": 1.5, "n_water": 1.345, "port_distance_m": 0.035,
+        "glass_thickness_m": 0.012, "f_number": 5.6, "coc_px": 2.0, "focus_set_m": 1.2,
+        "match_sigma_px": 0.5,
+    }  # fmt: skip
+    assert {key: row[key] for key in wanted} == pytest.approx(wanted)
+    glass = rows(lens_mm=[16.0], n_glass=1.4)[0]
+    assert glass["horizontal_m"] > rows(lens_mm=[16.0])[0]["horizontal_m"]
+    half = rows(lens_mm=[16.0], pixel_um=3.69 / 2)[0]
+    assert half["pixel_centre_mm"] == pytest.approx(rows(lens_mm=[16.0])[0]["pixel_centre_mm"] / 2)
+
+
+def test_water_by_temperature_and_salinity() -> None:
+    row = rows(temperature_c=20.0, salinity_psu=35.0)[0]
+    # At the sea floor's depth of the default survey.
+    assert row["n_water"] == pytest.approx(float(n_water(20.0, 35.0, 15.0)))
+
+
+def test_a_survey_s_settings_are_taken_unless_said_otherwise(tmp_path: Path) -> None:
+    survey = tmp_path / "survey.toml"
+    survey.write_text(
+        "[camera]\nfocal_mm = 16.0\nport_distance_m = 0.05\n[water]\nn_water = 1.337\n"
+        "[plan]\naltitude_m = 1.7\nspeed_mps = 0.3\nallowed_blur_px = 0.5\n"
+    )
+    _, data, _ = fov_report(FovOptions(survey=survey), QUIET)
+    [row] = data["rows"]
+    assert (row["lens_mm"], row["altitude_m"], row["n_water"]) == (16.0, 1.7, 1.337)
+    assert row["port_distance_m"] == 0.05
+    [blur] = data["blur"]
+    assert (blur["speed_mps"], blur["allowed_px"]) == (0.3, 0.5)
+    other = rows(survey=survey, lens_mm=[8.0], n_water=1.35)[0]
+    assert (other["lens_mm"], other["n_water"]) == (8.0, 1.35)
+
+
+def test_a_rig_brings_lens_and_port_and_may_change_its_water(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "rig.json"
+    write_rig(path, design_rig(CameraConfig(), WaterConfig(n_water=1.333)))
+    row = rows(rig=path)[0]
+    assert row["n_water"] == 1.333
+    assert rows(rig=path, n_water=1.345)[0]["n_water"] == 1.345
+    assert not capsys.readouterr().err
+
+    write_rig(path, design_rig(CameraConfig(), WaterConfig(n_water=1.333), scale=4))
+    quarter = rows(rig=path)[0]
+    assert "846 px wide" in capsys.readouterr().err
+    assert quarter["horizontal_m"] == pytest.approx(row["horizontal_m"], rel=2e-3)
+    # The same sensor: the lens, and with it the blur circle in micrometres, is the same.
+    assert quarter["lens_mm"] == pytest.approx(row["lens_mm"])
+    assert quarter["corner_blur_px"] == pytest.approx(row["corner_blur_px"] / 4, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"temperature_c": 20.0}, "together"),
+        ({"temperature_c": 20.0, "salinity_psu": 35.0, "n_water": 1.34}, "together"),
+        ({"port_distance_mm": -1.0}, "port_distance_m = -0.001"),
+        ({"f_number": 0.0}, "f_number"),
+        ({"n_water": 2.0}, "n_water"),
+        ({"rig": Path("rig.json"), "lens_mm": [12.5]}, "leave out --lens"),
+        ({"rig": Path("rig.json"), "glass_mm": 10.0}, "leave out --glass"),
+        ({"rig": Path("nowhere.json")}, "nowhere.json"),
+        ({"lens_mm": [500.0], "altitude_m": [0.2]}, "cannot focus"),
+    ],
+)
+def test_faults_are_one_line(options: dict[str, object], words: str) -> None:
+    with pytest.raises(AliceError, match=words) as fault:
+        fov_report(FovOptions(**options), QUIET)  # type: ignore[arg-type]
+    assert "\n" not in str(fault.value)
+
+
+def test_files_are_written_or_refused(tmp_path: Path) -> None:
+    fov_report(FovOptions(), Output(csv=tmp_path / "a.csv", plot=tmp_path / "a.png"))
+    assert len((tmp_path / "a.csv").read_text().splitlines()) == 3
+    assert (tmp_path / "a.png").stat().st_size > 50_000
+    with pytest.raises(ConfigError, match="cannot be written"):
+        fov_report(FovOptions(), Output(csv=tmp_path / "missing" / "a.csv"))
+
+
+def test_validation_prints_checks_claims_and_angles(tmp_path: Path) -> None:
+    text, data, passed = validation_report(Output(csv=tmp_path / "v.csv", plot=tmp_path / "v.svg"))
+    assert passed
+    assert set(data) == {"passed", "rule", "table", "claims", "angles"}
+    for words in ("The paper's table", "The paper's further claims", "A flat port against"):
+        assert words in text
+    assert (tmp_path / "v.csv").read_text().startswith("claim,verdict,computed,assumption,rule\n")
+    assert "paper<" in (tmp_path / "v.svg").read_text()
+
+
+def test_the_command_prints_text_markdown_and_json() -> None:
+    runner = CliRunner()
+    text = runner.invoke(app, ["fov", "--speed", "0.2", "--speed", "0.5"])
+    assert text.exit_code == 0
+    assert text.output.count("m/s") == 4
+    assert runner.invoke(app, ["fov", "--markdown"]).output.startswith("### Footprint")
+    data = json.loads(runner.invoke(app, ["fov", "--altitude", "1", "--json"]).output)
+    assert [row["lens_mm"] for row in data["rows"]] == [12.5, 25.0]
+    assert data["rows"][0]["frame_near_altitude_m"] is None
+    checked = runner.invoke(app, ["fov", "--validate", "--json"])
+    assert checked.exit_code == 0
+    assert json.loads(checked.output)["passed"] is True
+
+
+def test_a_failed_check_exits_with_1(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("camera_calib.fov_paper.PAPER_TABLE", ((12.5, "vertical", "m", "1.30"),))
+    shown = CliRunner().invoke(app, ["fov", "--validate"])
+    assert shown.exit_code == 1
+    assert "FAIL" in shown.output
