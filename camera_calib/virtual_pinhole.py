@@ -55,7 +55,9 @@ class VirtualPinhole:
         return np.concatenate([sideways, z[..., None]], axis=-1)
 
 
-def best_pinhole(camera: FlatPortCamera, near_m: float, far_m: float) -> VirtualPinhole:
+def best_pinhole(
+    camera: FlatPortCamera, near_m: float, far_m: float, working_range_m: float | None = None
+) -> VirtualPinhole:
     """The pinhole with the least rms residual over the frame and a range of distances.
 
     Its centre is sought along the port's normal through the entrance pupil.
@@ -63,9 +65,11 @@ def best_pinhole(camera: FlatPortCamera, near_m: float, far_m: float) -> Virtual
     Args:
         camera: the flat-port camera.
         near_m: nearest distance from the entrance pupil along the axis.
-        far_m: farthest; the warp is exact at the harmonic mean of both (equal parallax to either).
+        far_m: farthest.
+        working_range_m: where the warp is exact; the harmonic mean of near and far (equal parallax
+            to either) when not given.
     """
-    working = 2.0 / (1.0 / near_m + 1.0 / far_m)
+    working = working_range_m or 2.0 / (1.0 / near_m + 1.0 / far_m)
     depths = 1.0 / np.linspace(1.0 / far_m, 1.0 / near_m, 7)
 
     def at(shift_m: float) -> VirtualPinhole:
