@@ -74,3 +74,32 @@ def undisperse(
         threads=threads or default_threads(),
     )  # fmt: skip
     print_result(text, data, as_json)
+
+
+@app.command(
+    epilog=examples(
+        "camera residual --near 1.5 --far 2.5",
+        "camera residual --near 1 --far 3 --rig rig.json --camera left --plot residual.png",
+    )
+)
+def residual(
+    near: Annotated[float, typer.Option(help="Nearest distance, m.")],
+    far: Annotated[float, typer.Option(help="Farthest distance, m.")],
+    survey: Annotated[Path | None, typer.Option("-s", "--survey", help="Its design.")] = None,
+    rig: Annotated[Path | None, typer.Option(help="rig.json; instead of a design.")] = None,
+    camera: Annotated[str | None, typer.Option(help="The rig's first if none.")] = None,
+    exact_at: Annotated[float | None, typer.Option(help="Range of the warp, m.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="PNG, PDF or SVG to draw.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Tell what approximations cost.
+
+    Pixels that pinholes after a warp, and COLMAP's cameras without one, are wrong by through this
+    port. Distances are from the entrance pupil along the axis.
+    """
+    from camera_calib.residual_report import residual_report
+
+    text, data = residual_report(
+        near, far, survey=survey, rig=rig, camera=camera, working_range_m=exact_at, plot=plot
+    )
+    print_result(text, data, as_json)
