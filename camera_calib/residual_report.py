@@ -104,12 +104,13 @@ def draw_residuals(camera: FlatPortCamera, found: list[Residual], title: str, pa
     upper, lower = figure.subfigures(2, 1, height_ratios=(1.0, 1.15))
     axes = upper.subplots(1, len(found), squeeze=False)[0]
     maps = [residual(camera, one.stand_in, one.distances_m, grid=61) for one in found]
-    high = float(np.ceil(np.log10(max(float(one.map_px.max()) for one in maps))))
-    norm = mpl.colors.LogNorm(10.0 ** (high - 3), 10.0**high, clip=True)
+    high = max(float(one.map_px.max()) for one in maps)
+    low = max(min(one.rms_px for one in found) / 3, 1e-5 * high)
+    norm = mpl.colors.LogNorm(low, high, clip=True)
     for one, fine, axis in zip(found, maps, axes, strict=True):
         x, y = fine.pixels[0, :, 0], fine.pixels[:, 0, 1]
         shown = axis.pcolormesh(
-            x, y, np.maximum(fine.map_px, norm.vmin),
+            x, y, np.maximum(fine.map_px, low),
             norm=norm, cmap="viridis", shading="gouraud", rasterized=True,
         )  # fmt: skip
         axis.set(aspect="equal", xlim=(x[0], x[-1]), ylim=(y[-1], y[0]), xticks=[], yticks=[])
@@ -129,7 +130,7 @@ def draw_residuals(camera: FlatPortCamera, found: list[Residual], title: str, pa
         ylabel="rms over the frame, px",
         yscale="log",
         xlim=(distances[0], distances[-1]),
-        ylim=(norm.vmin / 10, norm.vmax),
+        ylim=(low / 3, 1.3 * high),
     )
     plain.spines[["top", "right"]].set_visible(False)
     plain.grid(visible=True, which="both", alpha=0.25)

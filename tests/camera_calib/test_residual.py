@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 import pycolmap
@@ -44,6 +45,7 @@ def behind_port(distance_mm: float, glass_mm: float, tilt_deg: float = 0.0) -> F
     )
 
 
+@lru_cache
 def study(camera: FlatPortCamera, *, turned: bool = True) -> dict[str, Residual]:
     found = approximations(
         camera, 1.5, 2.5, distances_m=(1.5, 2.0, 2.5), working_range_m=2.0, turned=turned
