@@ -145,6 +145,35 @@ def image(
     print_result(*run(["pool", "images"], workspace, survey, scale, threads), as_json)
 
 
+@app.command(
+    epilog=examples(
+        'target "charuco 12x9 40mm 30mm" -o board.pdf',
+        'target "chessboard 9x6 25mm" -o board.svg --paper A4',
+        'target "apriltag 6x6 88mm 0.3" -o grid.pdf --paper A1',
+        'target "charuco 12x9 40mm 30mm DICT_5X5_250 legacy" -o board.png --dpi 600',
+    )
+)
+def target(
+    what: Annotated[
+        str, typer.Argument(metavar="TARGET", help="In words, as below, or a target's JSON file.")
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="A .pdf, .svg or .png file.")],
+    paper: Annotated[
+        str | None, typer.Option(help="A4, A3, A2, A1, A0 or letter; as needed if not given.")
+    ] = None,
+    dpi: Annotated[float, typer.Option(min=50, max=2400, help="Of a PNG.")] = 300.0,
+    as_json: AsJson = False,
+) -> None:
+    """Print a calibration target.
+
+    A chessboard (inner corners, square), a ChArUco board (squares, square, marker) or a grid of
+    AprilTags (tags, tag, gap over tag) at true scale, and beside it its JSON file.
+    """
+    from camera_calib.target_sheet import print_target
+
+    print_result(*print_target(what, output, paper, dpi), as_json)
+
+
 @app.command(epilog=examples("calibrate -w reef"))
 def calibrate(
     workspace: Workspace = WORK,

@@ -1,11 +1,14 @@
-"""Corners of a chessboard to a fiftieth of a pixel: the crossing of two soft edges is fitted.
+"""Corners of checkered patterns to a fiftieth of a pixel: the crossing of two soft edges is fitted.
 
-OpenCV finds the board; its `cornerSubPix` is good to about a tenth of a pixel on pictures with
-noise, which a stereo rig of 0.1 m baseline feels at the sea floor. Here the grey values around each
-corner are explained by the product of two blurred edges, in linear light.
+OpenCV's `cornerSubPix` is good to about a tenth of a pixel on pictures with noise, which a stereo
+rig of 0.1 m baseline feels at the sea floor. Here the grey values around each corner are explained
+by the product of two blurred edges, in linear light. The window follows the board: it is cut to the
+shape of its squares, and to a cross along the edges where markers or bits stand between them.
 """
 
 import math
+from dataclasses import dataclass, replace
+from typing import Self
 
 import cv2
 import numpy as np
@@ -14,10 +17,286 @@ from numpy.typing import NDArray
 
 from alice_survey.frames import Array
 
+Grey = NDArray[np.uint8] | NDArray[np.float32] | NDArray[np.float64]
+
+FITTED, AT_BORDER, NOT_SETTLED, UNLIKE_A_CORNER, ASTRAY, UNSEEN = range(6)
+"""What became of a corner."""
+REASONS = {
+    AT_BORDER: "too near to the border of the picture",
+    NOT_SETTLED: "the fit of its edges did not settle",
+    UNLIKE_A_CORNER: "it looks unlike a corner: hidden, in glare or out of focus",
+    ASTRAY: "not where its neighbours say it must be, or of the wrong colours",
+}
 _BLUR_PX = 0.8
+_WHITE_NOISE = 4.0 * math.pi * _BLUR_PX**2
+"""Variance of white noise over its variance after the blur."""
 _STEPS = 30
-_FARTHEST_PX = 1.5
+_FARTHEST_PX, _FARTHEST = 1.5, 0.1
+"""How far from its start a corner may settle: the more of this, and of so many squares."""
+_NARROWEST_PX, _WIDEST_PX = 0.2, 8.0
+_HALF_PX = 12
+_REACH = 0.45
+"""Half the window in squares; it must not reach the neighbouring edges."""
+_CLEAR_PX = 2.0
+"""Distance kept from other edges, which are blurred too."""
+_LEAST_PX = 1.0
+_FEWEST_PIXELS = 25
+_WORST_MISFIT = 0.25
+_LEAST_CONTRAST = 0.001
 _TWO_OVER_ROOT_PI = 2.0 / math.sqrt(math.pi)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Corners:
+    """Fitted corners."""
+
+    pixels: Array
+    """(N, 2) from the outer corner of the first pixel; NaN rows were not fitted."""
+    sigma_px: Array
+    """(N,) standard deviation of a coordinate, from the misses of the fit; NaN likewise."""
+    contrast: Array
+    """(N,) half the difference of black and white in linear light; above 0 where the square between
+    the ways back along both steps is black, below 0 where it is white; NaN likewise."""
+    states: NDArray[np.intp]
+    """(N,) FITTED, a key of REASONS, or UNSEEN where there was nothing to start from."""
+
+    def take(self, order: NDArray[np.intp]) -> Self:
+        """These corners in another order."""
+        return replace(
+            self,
+            pixels=self.pixels[order],
+            sigma_px=self.sigma_px[order],
+            contrast=self.contrast[order],
+            states=self.states[order],
+        )
+
+    def joined(self, more: Self) -> Self:
+        """These corners and then more."""
+        return replace(
+            self,
+            pixels=np.concatenate([self.pixels, more.pixels]),
+            sigma_px=np.concatenate([self.sigma_px, more.sigma_px]),
+            contrast=np.concatenate([self.contrast, more.contrast]),
+            states=np.concatenate([self.states, more.states]),
+        )
+
+    def without(self, which: NDArray[np.bool_], state: int) -> Self:
+        """These corners, but some of them unfitted for a reason."""
+        return replace(
+            self,
+            pixels=np.where(which[:, None], np.nan, self.pixels),
+            sigma_px=np.where(which, np.nan, self.sigma_px),
+            contrast=np.where(which, np.nan, self.contrast),
+            states=np.where(which, state, self.states),
+        )
+
+
+def linear_light(picture: NDArray[np.uint8]) -> Array:
+    """Undo the sRGB curve (IEC 61966-2-1): 8-bit grey values to 0 to 1, linear."""
+    encoded = np.arange(256) / 255.0
+    table = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    linear: Array = table[picture]
+    return linear
+
+
+def _light(picture: Grey) -> Array:
+    if picture.dtype == np.uint8:
+        return linear_light(picture.astype(np.uint8))
+    return picture.astype(np.float64)
+
+
+def fit_corners(
+    picture: Grey,
+    near: Array,
+    pixels_per_square: Array,
+    reach: float = 1.0,
+    arm: float = 1.0,
+) -> Corners:
+    """Fit the crossing of two soft edges around each corner.
+
+    Args:
+        picture: (H, W) grey values: of 8 bits, encoded by the sRGB curve, or linear, 0 to 1.
+        near: (N, 2) places within a pixel of the corners, from the outer corner of the first pixel.
+        pixels_per_square: (N, 2, 2) at each corner, the steps in pixels along one edge (first
+            column) and along the other (second column) by one square.
+        reach: distance to the next edges that cross these two, in squares.
+        arm: distance to the next edges beside these two, in squares; in between, farther than that
+            from both edges, there may be anything.
+    """
+    fits = np.full((len(near), 4), np.nan)
+    states = np.full(len(near), UNSEEN, dtype=np.intp)
+    height, width = picture.shape
+    inside = np.isfinite(near).all(axis=1) & np.isfinite(pixels_per_square).all(axis=(1, 2))
+    inside &= (near >= 0).all(axis=1) & (near < [width, height]).all(axis=1)
+    if inside.any():
+        seen = near[inside]
+        room = _HALF_PX + 4
+        low = np.maximum(np.floor(seen.min(axis=0)).astype(int) - room, 0)
+        high = np.ceil(seen.max(axis=0)).astype(int) + room
+        part = picture[low[1] : high[1], low[0] : high[0]]
+        light = _light(part)
+        light = cv2.GaussianBlur(light, (0, 0), _BLUR_PX)
+        fits[inside], states[inside] = _fit_corners(
+            light, seen - low, np.ascontiguousarray(pixels_per_square[inside]), reach, arm
+        )
+        fits[inside, :2] += low
+    return Corners(pixels=fits[:, :2], sigma_px=fits[:, 2], contrast=fits[:, 3], states=states)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _fit_corners(
+    picture: Array, near: Array, steps: Array, reach: float, arm: float
+) -> tuple[Array, NDArray[np.intp]]:
+    out, states = np.full((near.shape[0], 4), np.nan), np.zeros(near.shape[0], np.intp)
+    side = 2 * _HALF_PX + 1
+    window, used = np.empty((side, side)), np.empty((side, side), np.bool_)
+    for i in range(near.shape[0]):
+        column, row = int(near[i, 0]), int(near[i, 1])
+        states[i] = _cut(picture, column, row, near[i], steps[i], reach, arm, window, used)
+        if states[i] != FITTED:
+            continue
+        best = _start(window, used, near[i, 0] - column, near[i, 1] - row, steps[i])
+        x, y = best[0], best[1]
+        best, cost, normal = _descend(window, used, best)
+        count = used.sum()
+        area = abs(steps[i, 0, 0] * steps[i, 1, 1] - steps[i, 0, 1] * steps[i, 1, 0])
+        farthest = max(_FARTHEST_PX, _FARTHEST * math.sqrt(area))
+        settled = math.hypot(best[0] - x, best[1] - y) < farthest
+        if not settled or not _NARROWEST_PX < best[4] < _WIDEST_PX:
+            states[i] = NOT_SETTLED
+            continue
+        variance = cost / (count - 9)
+        if abs(best[5]) < _LEAST_CONTRAST or variance > (_WORST_MISFIT * best[5]) ** 2:
+            states[i] = UNLIKE_A_CORNER
+            continue
+        inverse = np.linalg.inv(normal + 1e-12 * np.eye(9))
+        out[i, 0], out[i, 1] = column + best[0], row + best[1]
+        out[i, 2] = math.sqrt(0.5 * (inverse[0, 0] + inverse[1, 1]) * variance * _WHITE_NOISE)
+        out[i, 3] = best[5]
+    return out, states
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _cut(
+    picture: Array,
+    column: int,
+    row: int,
+    centre: Array,
+    steps: Array,
+    reach: float,
+    arm: float,
+    window: Array,
+    used: NDArray[np.bool_],
+) -> int:
+    """Fill the window with the pixels around a corner; tell which of them show its edges only."""
+    rows, columns = picture.shape
+    used[:] = False
+    area = steps[0, 0] * steps[1, 1] - steps[0, 1] * steps[1, 0]
+    if abs(area) < 1.0:
+        return NOT_SETTLED
+    # Squares along the two edges per pixel across; steps are columns.
+    ux, uy = steps[1, 1] / area, -steps[0, 1] / area
+    vx, vy = -steps[1, 0] / area, steps[0, 0] / area
+    u_px, v_px = math.hypot(ux, uy), math.hypot(vx, vy)
+    u_reach = max(min(_REACH, reach - _CLEAR_PX * u_px), _LEAST_PX * u_px)
+    v_reach = max(min(_REACH, reach - _CLEAR_PX * v_px), _LEAST_PX * v_px)
+    u_arm = max(arm - _CLEAR_PX * u_px, _LEAST_PX * u_px)
+    v_arm = max(arm - _CLEAR_PX * v_px, _LEAST_PX * v_px)
+    count = 0
+    for j in range(-_HALF_PX, _HALF_PX + 1):
+        for i in range(-_HALF_PX, _HALF_PX + 1):
+            x, y = column + i + 0.5 - centre[0], row + j + 0.5 - centre[1]
+            u, v = abs(ux * x + uy * y), abs(vx * x + vy * y)
+            if u > u_reach or v > v_reach or (u > u_arm and v > v_arm):
+                continue
+            if not (0 <= row + j < rows and 0 <= column + i < columns):
+                return AT_BORDER
+            window[j + _HALF_PX, i + _HALF_PX] = picture[row + j, column + i]
+            used[j + _HALF_PX, i + _HALF_PX] = True
+            count += 1
+    return FITTED if count >= _FEWEST_PIXELS else NOT_SETTLED
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _start(window: Array, used: NDArray[np.bool_], x: float, y: float, steps: Array) -> Array:
+    """Centre, normals of both edges, blur, contrast, level and its slopes, to begin with."""
+    low, high, total, count = np.inf, -np.inf, 0.0, 0
+    for j in range(window.shape[0]):
+        for i in range(window.shape[1]):
+            if used[j, i]:
+                low, high = min(low, window[j, i]), max(high, window[j, i])
+                total += window[j, i]
+                count += 1
+    one = math.atan2(steps[0, 0], -steps[1, 0])
+    two = math.atan2(steps[0, 1], -steps[1, 1])
+    start = np.array([x, y, one, two, 1.5, 0.5 * (high - low), total / count, 0.0, 0.0])
+    cost = _equations(window, used, start)[0]
+    start[5] = -start[5]
+    if _equations(window, used, start)[0] > cost:
+        start[5] = -start[5]
+    return start
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _descend(window: Array, used: NDArray[np.bool_], start: Array) -> tuple[Array, float, Array]:
+    """Levenberg-Marquardt on what `_start` lists; returns the cost and the normal matrix too."""
+    q, damping = start.copy(), 1e-3
+    cost, normal, right = _equations(window, used, q)
+    for _ in range(_STEPS):
+        damped = normal.copy()
+        for k in range(9):
+            damped[k, k] += damping * normal[k, k] + 1e-12
+        step = np.linalg.solve(damped, right)
+        tried = q - step
+        new_cost, new_normal, new_right = _equations(window, used, tried)
+        if new_cost < cost:
+            small = abs(step[0]) + abs(step[1]) < 1e-6
+            q, cost, normal, right = tried, new_cost, new_normal, new_right
+            damping *= 0.2
+            if small:
+                break
+        else:
+            damping *= 5.0
+            if damping > 1e8:
+                break
+    return q, cost, normal
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _equations(window: Array, used: NDArray[np.bool_], q: Array) -> tuple[float, Array, Array]:
+    """Sum of squares of the misses, and the normal equations."""
+    cost, normal, right = 0.0, np.zeros((9, 9)), np.zeros(9)
+    slope = np.empty(9)
+    c1, s1, c2, s2 = math.cos(q[2]), math.sin(q[2]), math.cos(q[3]), math.sin(q[3])
+    blur = q[4] if abs(q[4]) > 1e-3 else 1e-3
+    for j in range(window.shape[0]):
+        for i in range(window.shape[1]):
+            if not used[j, i]:
+                continue
+            # The window's first pixel is _HALF_PX before the pixel that holds the start.
+            across, down = float(i - _HALF_PX), float(j - _HALF_PX)
+            x, y = across + 0.5 - q[0], down + 0.5 - q[1]
+            u, v = (x * c1 + y * s1) / blur, (x * c2 + y * s2) / blur
+            one, two = math.erf(u), math.erf(v)
+            du = _TWO_OVER_ROOT_PI * math.exp(-u * u) * two * q[5]
+            dv = _TWO_OVER_ROOT_PI * math.exp(-v * v) * one * q[5]
+            slope[0] = -(du * c1 + dv * c2) / blur
+            slope[1] = -(du * s1 + dv * s2) / blur
+            slope[2] = du * (y * c1 - x * s1) / blur
+            slope[3] = dv * (y * c2 - x * s2) / blur
+            slope[4] = -(du * u + dv * v) / blur
+            slope[5] = one * two
+            slope[6], slope[7], slope[8] = 1.0, across, down
+            miss = q[6] + q[7] * across + q[8] * down + q[5] * one * two - window[j, i]
+            cost += miss * miss
+            for a in range(9):
+                right[a] += slope[a] * miss
+                for b in range(a, 9):
+                    normal[a, b] += slope[a] * slope[b]
+    for a in range(9):
+        for b in range(a):
+            normal[a, b] = normal[b, a]
+    return cost, normal, right
 
 
 def find_chessboard(picture: NDArray[np.uint8], columns: int, rows: int) -> Array | None:
@@ -39,127 +318,5 @@ def find_chessboard(picture: NDArray[np.uint8], columns: int, rows: int) -> Arra
     else:
         return None
     near = corners.reshape(rows, columns, 2).astype(np.float64) + 0.5
-    steps = [np.linalg.norm(np.diff(near, axis=a), axis=-1).min() for a in (0, 1)]
-    half = int(np.clip(0.4 * min(steps), 3, 12))
-    linear = cv2.GaussianBlur(linear_light(picture), (0, 0), _BLUR_PX)
-    return fit_saddles(linear, near.reshape(-1, 2), half)
-
-
-def linear_light(picture: NDArray[np.uint8]) -> Array:
-    """Undo the sRGB curve (IEC 61966-2-1): 8-bit grey values to 0 to 1, linear."""
-    encoded = np.arange(256) / 255.0
-    table = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-    linear: Array = table[picture]
-    return linear
-
-
-def fit_saddles(picture: Array, near: Array, half: int) -> Array:
-    """Fit the crossing of two soft edges around each corner.
-
-    Args:
-        picture: (H, W) linear grey values of a slightly blurred board.
-        near: (N, 2) places within a pixel of the corners, from the outer corner of the first pixel.
-        half: half the size of the window; it must not reach the neighbouring corners.
-
-    Returns:
-        (N, 2) in the same pixels; a row is NaN where the window leaves the picture or the fit
-        does not settle near its start.
-    """
-    return np.asarray(_fit_saddles(np.ascontiguousarray(picture, dtype=np.float64), near, half))
-
-
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _fit_saddles(picture: Array, near: Array, half: int) -> Array:
-    out = np.full(near.shape, np.nan)
-    rows, columns = picture.shape
-    for i in range(near.shape[0]):
-        column, row = int(near[i, 0]), int(near[i, 1])
-        if column - half < 1 or row - half < 1:
-            continue
-        if column + half + 2 > columns or row + half + 2 > rows:
-            continue
-        window = picture[row - half : row + half + 1, column - half : column + half + 1]
-        angle = _edge_angle(picture, column, row, half)
-        best = np.inf
-        for sign in (-1.0, 1.0):
-            start = np.array([
-                near[i, 0] - column, near[i, 1] - row, angle, angle + 0.5 * math.pi, 1.5,
-                sign * 0.5 * (window.max() - window.min()), window.mean(), 0.0, 0.0,
-            ])  # fmt: skip
-            found, cost = _descend(window, start, half)
-            moved = math.hypot(found[0] - start[0], found[1] - start[1])
-            if cost < best and moved < _FARTHEST_PX and found[4] > 0.2:
-                best = cost
-                out[i, 0], out[i, 1] = column + found[0], row + found[1]
-    return out
-
-
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _edge_angle(picture: Array, column: int, row: int, half: int) -> float:
-    """Direction of one edge's normal: mean of the gradients' directions, four times turned."""
-    cosine, sine = 0.0, 0.0
-    for y in range(row - half, row + half + 1):
-        for x in range(column - half, column + half + 1):
-            dx = picture[y, x + 1] - picture[y, x - 1]
-            dy = picture[y + 1, x] - picture[y - 1, x]
-            turned = 4.0 * math.atan2(dy, dx)
-            weight = math.hypot(dx, dy)
-            cosine += weight * math.cos(turned)
-            sine += weight * math.sin(turned)
-    return 0.25 * math.atan2(sine, cosine)
-
-
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _descend(window: Array, start: Array, half: int) -> tuple[Array, float]:
-    """Levenberg-Marquardt on centre, two angles, blur, contrast, level and its slopes."""
-    q, damping = start.copy(), 1e-3
-    cost, normal, right = _equations(window, q, half)
-    for _ in range(_STEPS):
-        damped = normal.copy()
-        for k in range(9):
-            damped[k, k] += damping * normal[k, k] + 1e-12
-        step = np.linalg.solve(damped, right)
-        tried = q - step
-        new_cost, new_normal, new_right = _equations(window, tried, half)
-        if new_cost < cost:
-            small = abs(step[0]) + abs(step[1]) < 1e-6
-            q, cost, normal, right = tried, new_cost, new_normal, new_right
-            damping *= 0.2
-            if small:
-                break
-        else:
-            damping *= 5.0
-            if damping > 1e8:
-                break
-    return q, cost
-
-
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _equations(window: Array, q: Array, half: int) -> tuple[float, Array, Array]:
-    """Sum of squares of the misses, and the normal equations."""
-    cost, normal, right = 0.0, np.zeros((9, 9)), np.zeros(9)
-    slope = np.empty(9)
-    c1, s1, c2, s2 = math.cos(q[2]), math.sin(q[2]), math.cos(q[3]), math.sin(q[3])
-    blur = q[4] if abs(q[4]) > 1e-3 else 1e-3
-    for j in range(window.shape[0]):
-        for i in range(window.shape[1]):
-            # The window's first pixel is `half` before the pixel that holds the start.
-            x, y = i - half + 0.5 - q[0], j - half + 0.5 - q[1]
-            u, v = (x * c1 + y * s1) / blur, (x * c2 + y * s2) / blur
-            one, two = math.erf(u), math.erf(v)
-            du = _TWO_OVER_ROOT_PI * math.exp(-u * u) * two * q[5]
-            dv = _TWO_OVER_ROOT_PI * math.exp(-v * v) * one * q[5]
-            slope[0] = -(du * c1 + dv * c2) / blur
-            slope[1] = -(du * s1 + dv * s2) / blur
-            slope[2] = du * (y * c1 - x * s1) / blur
-            slope[3] = dv * (y * c2 - x * s2) / blur
-            slope[4] = -(du * u + dv * v) / blur
-            slope[5] = one * two
-            slope[6], slope[7], slope[8] = 1.0, float(i - half), float(j - half)
-            miss = q[6] + q[7] * (i - half) + q[8] * (j - half) + q[5] * one * two - window[j, i]
-            cost += miss * miss
-            for a in range(9):
-                right[a] += slope[a] * miss
-                for b in range(9):
-                    normal[a, b] += slope[a] * slope[b]
-    return cost, normal, right
+    steps = np.stack(np.gradient(near, axis=(1, 0)), axis=-1).reshape(-1, 2, 2)
+    return fit_corners(picture, near.reshape(-1, 2), steps).pixels

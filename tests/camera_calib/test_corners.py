@@ -5,7 +5,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from camera_calib.corners import find_chessboard, fit_saddles, linear_light
+from camera_calib.corners import (
+    AT_BORDER,
+    FITTED,
+    NOT_SETTLED,
+    UNLIKE_A_CORNER,
+    UNSEEN,
+    find_chessboard,
+    fit_corners,
+    linear_light,
+)
+from tests.oracles_targets import slow_corner
 
 COLUMNS, ROWS = 9, 6
 FINE = 8
@@ -69,13 +79,77 @@ def test_no_board_is_none() -> None:
     assert find_chessboard(grey, COLUMNS, ROWS) is None
 
 
-def test_a_corner_at_the_edge_or_on_nothing_is_nan() -> None:
+def test_a_corner_at_the_border_or_on_nothing_is_nan_and_says_why() -> None:
     picture, true = drawn_board(0.0, 0)
-    light = linear_light(picture)
-    near = np.array([[3.0, 100.0], true[0], [float("200"), 5.0]])
-    found = fit_saddles(light, near, 5)
-    assert np.isnan(found[0]).all()
-    assert np.abs(found[1] - true[0]).max() < 0.05
+    near = np.array([[3.0, 100.0], true[0], [200.0, 9.0], [np.nan, 1.0], [-4.0, 50.0]])
+
+    found = fit_corners(picture, near, np.tile(20.0 * np.eye(2), (5, 1, 1)))
+
+    assert found.states.tolist() == [AT_BORDER, FITTED, NOT_SETTLED, UNSEEN, UNSEEN]
+    assert np.isnan(found.pixels[found.states != FITTED]).all()
+    assert np.abs(found.pixels[1] - true[0]).max() < 0.05
+
+
+def test_a_corner_behind_an_edge_is_refused() -> None:
+    picture, true = drawn_board(0.01, 0)
+    x, y = true[20].astype(int)
+    hidden = picture.copy()
+    hidden[y - 20 : y + 20, x - 20 : x + 1] = 90
+    near = true[20:21]
+
+    states = [
+        int(fit_corners(shown, near, 20.0 * np.eye(2)[None]).states[0])
+        for shown in (picture, hidden)
+    ]
+
+    assert states[0] == FITTED
+    assert states[1] in (UNLIKE_A_CORNER, NOT_SETTLED)
+
+
+def test_the_fit_is_its_slow_twin() -> None:
+    picture, true = drawn_board(0.01, 5)
+    light = cv2.GaussianBlur(linear_light(picture), (0, 0), 0.8)
+    grid = true.reshape(ROWS, COLUMNS, 2)
+    steps = np.stack(np.gradient(grid, axis=(1, 0)), axis=-1).reshape(-1, 2, 2)
+
+    found = fit_corners(picture, true, steps)
+
+    y, x = np.mgrid[: picture.shape[0], : picture.shape[1]]
+    for i in (0, 17, 31, 53):
+        off = np.stack([x + 0.5 - true[i, 0], y + 0.5 - true[i, 1]], axis=-1)
+        along = np.abs(off @ np.linalg.inv(steps[i]).T)
+        used = (along <= 0.45).all(axis=-1) & (np.abs(off).max(axis=-1) < 12)
+        slow = slow_corner(light, used, true[i])
+        np.testing.assert_allclose(found.pixels[i], slow, atol=2e-3)
+
+
+def test_sigmas_are_true() -> None:
+    errors, sigmas = [], []
+    for seed in range(8):
+        picture, true = drawn_board(0.02, seed)
+        grid = true.reshape(ROWS, COLUMNS, 2)
+        steps = np.stack(np.gradient(grid, axis=(1, 0)), axis=-1).reshape(-1, 2, 2)
+        found = fit_corners(picture, true, steps)
+        errors.append(found.pixels - true)
+        sigmas.append(found.sigma_px)
+
+    normalised = np.concatenate(errors) / np.concatenate(sigmas)[:, None]
+
+    assert 0.6 < np.sqrt(np.nanmean(normalised**2)) < 1.2
+
+
+@pytest.mark.parametrize("turn", [0, 1])
+def test_contrast_tells_the_colours(turn: int) -> None:
+    picture, true = drawn_board(0.01, 3)
+    grid = true.reshape(ROWS, COLUMNS, 2)
+    steps = np.stack(np.gradient(grid, axis=(1, 0)), axis=-1).reshape(-1, 2, 2)
+    row, column = np.mgrid[:ROWS, :COLUMNS]
+    black = ((row + column) % 2 == 0).ravel()  # the square (0, 0), left and above, is black
+    shown = 255 - picture if turn else picture
+
+    contrast = fit_corners(shown, true, steps).contrast
+
+    assert np.all((contrast > 0) == (black if turn == 0 else ~black))
 
 
 def test_linear_light_inverts_the_srgb_curve() -> None:

@@ -1,0 +1,379 @@
+"""Calibration targets: chessboards, ChArUco boards and AprilTag grids.
+
+The frame of every target: the origin is its first point, x runs right along the rows of points, y
+down along the columns, z into the board, away from the camera. Points are numbered row by row from
+the top left, as the board is read when it hangs upright.
+
+- A chessboard's points are its inner corners. The square at its top left is black wherever that can
+  be told (see `Target.symmetries`).
+- A ChArUco board is OpenCV's: its points are the inner corners too, and the markers, in the white
+  squares, count row by row from the top left. `legacy` is the layout before OpenCV 4.6: boards with
+  an even number of rows then begin with a white square.
+- An AprilTag grid is Kalibr's: tags of the family 36h11 with a black border of two bits (so that a
+  tag is ten bits wide), and small black squares that touch the tags' corners. Tags count from the
+  bottom left, upwards row by row. Its points are the four corners of all tags, two rows of points
+  for a row of tags. (Kalibr numbers the points from the bottom left, with y up and z towards the
+  camera: its point in row r of R is ours in row R - 1 - r.)
+"""
+
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.artefacts import read_json, write_json
+from alice_survey.errors import CalibrationError
+from alice_survey.frames import Array
+
+Kind = Literal["chessboard", "charuco", "apriltag"]
+Indices = NDArray[np.intp]
+
+FORMAT, VERSION = "alice-survey target", 1
+TAG_FAMILY = "DICT_APRILTAG_36h11"
+TAG_BITS, TAG_BORDER_BITS = 10, 2
+"""Bits along a tag with its border, and the width of the border."""
+_DEFAULT_DICTIONARY = "DICT_5X5_1000"
+_FEWEST, _MOST = 3, 100
+_SMALLEST_M, _LARGEST_M = 1e-4, 10.0
+_WIDEST_SPACING = 1.0
+_NARROWEST_SPACING = 0.1
+_UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+_GRAMMAR = (
+    "write 'chessboard 9x6 25mm' (inner corners, square), 'charuco 12x9 40mm 30mm' (squares, "
+    "square, marker; then, if needed, a dictionary such as DICT_5X5_250, and legacy), "
+    "'apriltag 6x6 88mm 0.3' (tags, tag, gap over tag) or the path of a target's JSON file"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Target:
+    """A flat pattern whose points are known.
+
+    Raises:
+        CalibrationError: no such target can be made or used.
+    """
+
+    kind: Kind
+    columns: int
+    rows: int
+    """Inner corners of a chessboard, squares of a ChArUco board, tags of an AprilTag grid."""
+    size_m: float
+    """Side of a square, or of a tag."""
+    marker_m: float | None = None
+    """Side of a marker (ChArUco)."""
+    dictionary: str | None = None
+    """OpenCV's name of the markers' dictionary (ChArUco)."""
+    legacy: bool = False
+    """Laid out as OpenCV did before 4.6 (ChArUco)."""
+    spacing: float | None = None
+    """Gap between tags over the side of a tag (AprilTag)."""
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("chessboard", "charuco", "apriltag"):
+            raise CalibrationError(f"target: no kind '{self.kind}'; {_GRAMMAR}")
+        fewest = 1 if self.kind == "apriltag" else _FEWEST
+        if not (fewest <= self.columns <= _MOST and fewest <= self.rows <= _MOST):
+            raise CalibrationError(
+                f"target: {self.columns}x{self.rows} {_COUNTED[self.kind]}: each count must be "
+                f"{fewest} to {_MOST}"
+            )
+        if not _SMALLEST_M <= self.size_m <= _LARGEST_M:
+            raise CalibrationError(
+                f"target: {self.size_m * 1e3:g} mm for a {_SIZED[self.kind]}: it must be "
+                f"{_SMALLEST_M * 1e3:g} to {_LARGEST_M * 1e3:g} mm; check the unit"
+            )
+        self._check_charuco()
+        self._check_apriltag()
+
+    def _check_charuco(self) -> None:
+        if self.kind != "charuco":
+            if self.marker_m is not None or self.dictionary is not None or self.legacy:
+                raise CalibrationError(
+                    f"target: a {self.kind} has no marker size, dictionary or legacy layout; "
+                    + _GRAMMAR
+                )
+            return
+        if self.marker_m is None or self.dictionary is None:
+            raise CalibrationError(f"target: a charuco needs its markers; {_GRAMMAR}")
+        if not 0.3 * self.size_m <= self.marker_m <= 0.95 * self.size_m:
+            raise CalibrationError(
+                f"target: markers of {self.marker_m * 1e3:g} mm in squares of "
+                f"{self.size_m * 1e3:g} mm: a marker must be 30 to 95 % of its square"
+            )
+        if self.dictionary not in dictionary_names():
+            raise CalibrationError(
+                f"target: no dictionary '{self.dictionary}'; take one of "
+                + ", ".join(dictionary_names())
+            )
+        held, needed = len(aruco_dictionary(self.dictionary).bytesList), len(self._white_squares)
+        if held < needed:
+            raise CalibrationError(
+                f"target: {self.columns}x{self.rows} squares need {needed} markers, "
+                f"{self.dictionary} has {held}: take a larger dictionary or fewer squares"
+            )
+
+    def _check_apriltag(self) -> None:
+        if self.kind != "apriltag":
+            if self.spacing is not None:
+                raise CalibrationError(f"target: a {self.kind} has no spacing; {_GRAMMAR}")
+            return
+        if self.spacing is None:
+            raise CalibrationError(f"target: an apriltag grid needs its spacing; {_GRAMMAR}")
+        if not _NARROWEST_SPACING <= self.spacing <= _WIDEST_SPACING:
+            raise CalibrationError(
+                f"target: spacing {self.spacing:g}: it is the gap over the tag, "
+                f"{_NARROWEST_SPACING} to {_WIDEST_SPACING} (Kalibr's tagSpacing, such as 0.3)"
+            )
+        held = len(aruco_dictionary(TAG_FAMILY).bytesList)
+        if self.columns * self.rows > held:
+            raise CalibrationError(
+                f"target: {self.columns}x{self.rows} tags; the family 36h11 has {held}"
+            )
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of points."""
+        if self.kind == "charuco":
+            return self.rows - 1, self.columns - 1
+        if self.kind == "apriltag":
+            return 2 * self.rows, 2 * self.columns
+        return self.rows, self.columns
+
+    @cached_property
+    def points(self) -> Array:
+        """(N, 3) points in the target's frame, metres, row by row, z = 0."""
+        rows, columns = self.shape
+        y, x = (self._places(count) for count in (rows, columns))
+        grid_x, grid_y = np.meshgrid(x, y)
+        return np.stack([grid_x, grid_y, np.zeros_like(grid_x)], axis=-1).reshape(-1, 3)
+
+    def _places(self, count: int) -> Array:
+        index = np.arange(count, dtype=np.float64)
+        if self.spacing is None:
+            places: Array = index * self.size_m
+        else:
+            places = (index // 2 * (1.0 + self.spacing) + index % 2) * self.size_m
+        return places
+
+    @property
+    def outline(self) -> tuple[float, float, float, float]:
+        """Least x, least y, greatest x, greatest y of the pattern in the target's frame, metres.
+
+        The border of the black pattern; a target also needs a white margin around it.
+        """
+        x, y = self.points[-1, :2]
+        around = self.size_m * (1.0 if self.spacing is None else self.spacing)
+        return -around, -around, float(x) + around, float(y) + around
+
+    @cached_property
+    def symmetries(self) -> tuple[Indices, ...]:
+        """Other numberings of the points under which the target looks the same.
+
+        Each entry is an array of N indices: what was taken for point i may be point `entry[i]`.
+        Empty for targets with markers, and for chessboards of which one corner square is black and
+        its opposite white (an odd and an even count). A chessboard with two odd or two even counts
+        looks the same when turned by half a turn; with equal even counts by quarter turns too.
+        """
+        if self.kind != "chessboard" or (self.columns + self.rows) % 2:
+            return ()
+        grid = np.arange(self.columns * self.rows).reshape(self.rows, self.columns)
+        turns = (1, 2, 3) if self.columns == self.rows and self.columns % 2 == 0 else (2,)
+        return tuple(np.rot90(grid, turn).ravel() for turn in turns)
+
+    @property
+    def top_left_black(self) -> NDArray[np.bool_]:
+        """(N,) whether the area above and left of a point is black; it is opposite below it."""
+        rows, columns = self.shape
+        y, x = np.mgrid[:rows, :columns]
+        black: NDArray[np.bool_] = ((x + y + self.first_square_white) % 2 == 0).ravel()
+        return black
+
+    @property
+    def first_square_white(self) -> bool:
+        """Whether the square at the top left is white: so in old ChArUco boards of even rows."""
+        return self.legacy and self.rows % 2 == 0
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """Whether the points cannot be numbered for certain: two cameras may number unlike."""
+        return bool(self.symmetries)
+
+    @property
+    def description(self) -> str:
+        """The target in words that `parse_target` reads."""
+        words = [self.kind, f"{self.columns}x{self.rows}", f"{self.size_m * 1e3:.10g}mm"]
+        if self.marker_m is not None:
+            words += [f"{self.marker_m * 1e3:.10g}mm", str(self.dictionary)]
+        if self.spacing is not None:
+            words.append(f"{self.spacing:.10g}")
+        return " ".join([*words, "legacy"] if self.legacy else words)
+
+    @cached_property
+    def _white_squares(self) -> list[tuple[int, int]]:
+        """Column and row of the squares that hold a ChArUco board's markers, in their order."""
+        first = int(self.first_square_white)
+        return [
+            (x, y) for y in range(self.rows) for x in range(self.columns) if (x + y + first) % 2
+        ]
+
+    @property
+    def marker_places(self) -> Array:
+        """(M, 2) top left corner of each marker by its number, in the target's frame, metres."""
+        if self.kind == "charuco" and self.marker_m is not None:
+            margin = (self.size_m - self.marker_m) / 2.0
+            return (np.array(self._white_squares, dtype=np.float64) - 1.0) * self.size_m + margin
+        if self.kind == "apriltag":
+            grid = self.points[:, :2].reshape(*self.shape, 2)[::2, ::2]
+            return np.ascontiguousarray(grid[::-1]).reshape(-1, 2)
+        return np.empty((0, 2))
+
+    def to_json(self) -> dict[str, Any]:
+        """As a JSON object; what its kind lacks is left out."""
+        data: dict[str, Any] = {"format": FORMAT, "version": VERSION, "kind": self.kind}
+        data |= {"columns": self.columns, "rows": self.rows, "size_m": self.size_m}
+        if self.kind == "charuco":
+            data |= {
+                "marker_m": self.marker_m,
+                "dictionary": self.dictionary,
+                "legacy": self.legacy,
+            }
+        if self.kind == "apriltag":
+            data |= {"spacing": self.spacing}
+        return data
+
+    @classmethod
+    def from_json(cls, data: Any) -> Self:
+        """The inverse of `to_json`.
+
+        Raises:
+            CalibrationError: it is no target, or a newer one than this program knows.
+        """
+        if not isinstance(data, dict) or data.get("format") != FORMAT:
+            raise CalibrationError(f'target: its file must hold "format": "{FORMAT}"')
+        if data.get("version") != VERSION:
+            raise CalibrationError(f"target: version {data.get('version')}; {VERSION} is known")
+        values = {key: value for key, value in data.items() if key not in ("format", "version")}
+        try:
+            for key, kinds in _TYPES.items():
+                if key in values and (
+                    not isinstance(values[key], kinds)
+                    or (isinstance(values[key], bool) and bool not in kinds)
+                ):
+                    raise TypeError(f"{key} is {values[key]!r}")
+            return cls(**values)
+        except TypeError as error:
+            raise CalibrationError(f"target: its file is wrong: {error}") from None
+
+
+_COUNTED = {"chessboard": "inner corners", "charuco": "squares", "apriltag": "tags"}
+_SIZED = {"chessboard": "square", "charuco": "square", "apriltag": "tag"}
+_TYPES: dict[str, tuple[type, ...]] = {
+    "kind": (str,),
+    "columns": (int,),
+    "rows": (int,),
+    "size_m": (int, float),
+    "marker_m": (int, float),
+    "dictionary": (str,),
+    "legacy": (bool,),
+    "spacing": (int, float),
+}
+
+
+def parse_target(text: str) -> Target:
+    """Read a target from words, or from the JSON file that `alice-survey target` writes.
+
+    Raises:
+        CalibrationError: the words or the file are wrong; the message shows how they must be.
+        WorkspaceError: the file is missing or no JSON.
+    """
+    words = text.split()
+    if text.strip().lower().endswith(".json"):
+        return read_target(Path(text.strip()))
+    kind = words[0].lower() if words else ""
+    if kind == "chessboard" and len(words) == 3:
+        columns, rows = _counts(words[1])
+        return Target(kind="chessboard", columns=columns, rows=rows, size_m=_length_m(words[2]))
+    if kind == "apriltag" and len(words) == 4:
+        columns, rows = _counts(words[1])
+        return Target(
+            kind="apriltag",
+            columns=columns,
+            rows=rows,
+            size_m=_length_m(words[2]),
+            spacing=_number(words[3], "spacing"),
+        )
+    if kind == "charuco" and 4 <= len(words) <= 6:
+        columns, rows = _counts(words[1])
+        legacy = words[-1].lower() == "legacy"
+        names = words[4:-1] if legacy else words[4:]
+        if len(names) <= 1:
+            return Target(
+                kind="charuco",
+                columns=columns,
+                rows=rows,
+                size_m=_length_m(words[2]),
+                marker_m=_length_m(words[3]),
+                dictionary=_dictionary_called(names[0]) if names else _DEFAULT_DICTIONARY,
+                legacy=legacy,
+            )
+    raise CalibrationError(f"target '{text}' is not understood: {_GRAMMAR}")
+
+
+def read_target(path: Path) -> Target:
+    """Read a target's JSON file.
+
+    Raises:
+        CalibrationError: the file describes no target.
+        WorkspaceError: it is missing or no JSON.
+    """
+    data = read_json(path)
+    try:
+        return Target.from_json(data)
+    except CalibrationError as error:
+        raise CalibrationError(f"{path}: {error}") from None
+
+
+def write_target(path: Path, target: Target) -> None:
+    """Write a target's JSON file, which `parse_target` reads."""
+    write_json(path, target.to_json())
+
+
+def dictionary_names() -> list[str]:
+    """OpenCV's names of marker dictionaries."""
+    return sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
+
+
+def aruco_dictionary(name: str) -> Any:
+    """OpenCV's dictionary of a name that `dictionary_names` holds."""
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+
+
+def _dictionary_called(word: str) -> str:
+    """OpenCV's own spelling of a dictionary's name; the word itself when there is none."""
+    return {name.upper(): name for name in dictionary_names()}.get(word.upper(), word)
+
+
+def _counts(word: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d{1,6})[xX](\d{1,6})", word)
+    if match is None:
+        raise CalibrationError(f"target: '{word}' is no pair of counts such as 9x6")
+    return int(match[1]), int(match[2])
+
+
+def _length_m(word: str) -> float:
+    match = re.fullmatch(r"(\d+\.?\d*|\.\d+)(mm|cm|m)", word)
+    if match is None:
+        raise CalibrationError(f"target: '{word}' is no length with its unit, such as 25mm")
+    return round(float(match[1]) * _UNITS_M[match[2]], 12)
+
+
+def _number(word: str, name: str) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        raise CalibrationError(f"target: {name} '{word}' is no number") from None
