@@ -221,8 +221,9 @@ def _unpacked(path: Path, content: bytes, refractive: bool) -> list[CameraRecord
             camera_id, number, width, height = struct.unpack_from("<IiQQ", content, at)
             model = {known: name for name, (known, _) in MODELS.items()}.get(number)
             if model is None:
-                if at == 8:
-                    _known(f"{path}: camera {camera_id}", _model_name(number))
+                name = _model_name(number) if at == 8 else None
+                if name is not None:
+                    _known(f"{path}: camera {camera_id}", name)
                 return None
             size = len(MODELS[model][1])
             params = struct.unpack_from(f"<{size}d", content, at + 24)
@@ -232,7 +233,9 @@ def _unpacked(path: Path, content: bytes, refractive: bool) -> list[CameraRecord
                 (refraction,) = struct.unpack_from("<i", content, at)
                 at += 4
                 if refraction != _NO_REFRACTION:
-                    name = _REFRACTION.get(refraction, str(refraction))
+                    name = _REFRACTION.get(refraction)
+                    if name is None:
+                        return None
                     _must_be_flat(f"{path}: camera {camera_id}", name)
                     port = struct.unpack_from(f"<{_PORT_PARAMETERS}d", content, at)
                     at += 8 * _PORT_PARAMETERS
@@ -259,9 +262,9 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _model_name(number: int) -> str:
+def _model_name(number: int) -> str | None:
     names = {int(value): name for name, value in pycolmap.CameraModelId.__members__.items()}
-    return str(names.get(number, f"number {number}"))
+    return names.get(number)
 
 
 def _known(where: str, model: str) -> str:

@@ -6,7 +6,6 @@ there. `rig_config.json` is https://colmap.github.io/rigs.html; Refractive COLMA
 has that version's: cameras by `camera_id`, the reference by `ref_camera_id`.
 """
 
-import json
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,6 +29,7 @@ from camera_calib.formats.camera_files import (
 from camera_calib.formats.documents import read_json_fields
 from camera_calib.formats.fields import Fields
 from camera_calib.formats.opencv_model import behind_port
+from camera_calib.formats.rig_files import read_rigs
 from camera_calib.formats.rigs import Reading, assemble
 from camera_calib.rig import Rig
 
@@ -53,7 +53,7 @@ def read_colmap(path: Path, reading: Reading) -> Rig:
     folder = file.parent
     records = read_records(file)
     config = folder / RIG_CONFIG
-    ties = _config_ties(config, records) if config.exists() else _model_ties(folder, records)
+    ties = _config_ties(config, records) if config.exists() else _model_ties(file, records)
     if not ties:
         chosen = [r for r in records if str(r.camera_id) == reading.camera or len(records) == 1]
         if len(chosen) != 1:
@@ -126,8 +126,9 @@ def write_flatport(path: Path, rig: Rig) -> list[Path]:
     return [file, folder / RIG_CONFIG]
 
 
-def targets(path: Path) -> list[Path]:
+def model_files(path: Path, rig: Rig) -> list[Path]:
     """The files that writing to `path` would replace."""
+    del rig
     folder, file = _target(path)
     kinds = [file.with_stem(stem) for stem in ("cameras", "rigs", "frames", "images", "points3D")]
     return [*kinds, folder / RIG_CONFIG]
@@ -135,10 +136,15 @@ def targets(path: Path) -> list[Path]:
 
 def _target(path: Path) -> tuple[Path, Path]:
     if path.name in CAMERA_FILES:
-        return path.parent, path
-    if path.suffix in (".txt", ".bin", ".json"):
+        folder, file = path.parent, path
+    elif path.suffix in (".txt", ".bin", ".json"):
         raise CalibrationError(f"{path}: name a folder, or {' or '.join(CAMERA_FILES)} in it")
-    return path, path / "cameras.txt"
+    else:
+        folder, file = path, path / "cameras.txt"
+    other = next(folder / name for name in CAMERA_FILES if name != file.name)
+    if other.exists():
+        raise CalibrationError(f"{other}: is there already, and COLMAP would read one of the two")
+    return folder, file
 
 
 def _camera_file(path: Path) -> Path | None:
@@ -204,24 +210,15 @@ def _config_ties(path: Path, records: Sequence[CameraRecord]) -> list[_Tie]:
     return ties
 
 
-def _model_ties(folder: Path, records: Sequence[CameraRecord]) -> list[_Tie]:
-    """The same after the model's own rig; empty when no rig holds all cameras with poses."""
-    if len(records) == 1 or not any((folder / f"rigs{end}").exists() for end in (".bin", ".txt")):
+def _model_ties(file: Path, records: Sequence[CameraRecord]) -> list[_Tie]:
+    """The same after the model's own rigs; empty when none holds all cameras with poses."""
+    rigs = file.with_stem("rigs")
+    if len(records) == 1 or not rigs.exists():
         return []
-    try:
-        model = pycolmap.Reconstruction(folder)
-    except (RuntimeError, ValueError, OSError) as error:
-        raise CalibrationError(f"{folder}: COLMAP cannot read it: {_one_line(error)}") from None
     by_id = {record.camera_id: record for record in records}
-    for _, rig in sorted(model.rigs.items()):
-        reference = rig.ref_sensor_id.id
-        poses = {reference: RigidTransform.identity()}
-        for sensor, rigid in rig.non_ref_sensors.items():
-            if rigid is not None:
-                poses[sensor.id] = _rigid(rigid)
+    for poses in read_rigs(rigs):
         if set(poses) == set(by_id):
-            order = [reference, *sorted(set(poses) - {reference})]
-            return [(by_id[i], f"cam{i}", poses[i]) for i in order]
+            return [(by_id[i], f"cam{i}", pose) for i, pose in poses.items()]
     return []
 
 
@@ -290,13 +287,3 @@ def _pose_entry(pose: RigidTransform) -> dict[str, list[float]]:
 
 def _prefix_name(entry: Fields) -> str:
     return entry.text("image_prefix").strip("/") or "cam"
-
-
-def _rigid(rigid: Any) -> RigidTransform:
-    return RigidTransform.from_components(
-        np.array(rigid.translation), Rotation.from_quat(np.array(rigid.rotation.quat))
-    )
-
-
-def _one_line(error: Exception) -> str:
-    return json.dumps(" ".join(str(error).split())[:200])

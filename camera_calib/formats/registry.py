@@ -9,8 +9,8 @@ from camera_calib.formats.camera_files import read_records
 from camera_calib.formats.colmap import (
     CAMERA_FILES,
     RIG_CONFIG,
+    model_files,
     read_colmap,
-    targets,
     write_colmap,
     write_flatport,
 )
@@ -19,7 +19,7 @@ from camera_calib.formats.fields import read_text
 from camera_calib.formats.kalibr import read_kalibr, write_kalibr
 from camera_calib.formats.opencv import read_opencv, write_opencv
 from camera_calib.formats.rigs import Reading
-from camera_calib.formats.ros import SUFFIXES, read_ros, write_ros
+from camera_calib.formats.ros import SUFFIXES, read_ros, ros_files, write_ros
 from camera_calib.rig import Rig, read_rig, write_rig
 
 PORT, K3, RATIONAL, PRISM, COVARIANCE, MOUNT = "port", "k3", "rational", "prism", "covariance", "m"
@@ -34,8 +34,8 @@ class Format:
     holds: frozenset[str]
     read: Callable[[Path, Reading], Rig]
     write: Callable[[Path, Rig], list[Path]]
-    targets: Callable[[Path], list[Path]]
-    """The files that writing to a path would replace."""
+    targets: Callable[[Path, Rig], list[Path]]
+    """The files that writing a rig to a path would replace."""
 
 
 def _read_own(path: Path, reading: Reading) -> Rig:
@@ -48,7 +48,8 @@ def _write_own(path: Path, rig: Rig) -> list[Path]:
     return [path]
 
 
-def _itself(path: Path) -> list[Path]:
+def _itself(path: Path, rig: Rig) -> list[Path]:
+    del rig
     return [path]
 
 
@@ -75,7 +76,7 @@ _FORMATS = (
         holds=frozenset({K3, RATIONAL}),
         read=read_colmap,
         write=write_colmap,
-        targets=targets,
+        targets=model_files,
     ),
     Format(
         name="flatport",
@@ -83,7 +84,7 @@ _FORMATS = (
         holds=frozenset({PORT, K3, RATIONAL}),
         read=read_colmap,
         write=write_flatport,
-        targets=targets,
+        targets=model_files,
     ),
     Format(
         name="kalibr",
@@ -99,7 +100,7 @@ _FORMATS = (
         holds=frozenset({K3, RATIONAL}),
         read=read_ros,
         write=write_ros,
-        targets=_itself,
+        targets=ros_files,
     ),
 )
 FORMATS = {each.name: each for each in _FORMATS}

@@ -151,14 +151,20 @@ def own_keys(fields: Fields, rig: Rig) -> Rig:
 
 
 def with_port(rig: Rig, port: Mapping[str, Any]) -> Rig:
-    """Every camera of a rig behind a port, square to the axis unless it has one that is not.
+    """Every camera of a rig behind a port; what was known of the numbers it had is forgotten.
 
     Args:
         rig: cameras in air, or behind ports some of whose numbers change.
-        port: by field of `FlatPortCamera`: lengths in metres and indices.
+        port: by field of `FlatPortCamera`: lengths in metres, indices, `normal`.
     """
-    cameras = {name: replace(c, **dict(port)) for name, c in rig.cameras.items()}
-    return replace(rig, cameras=cameras)
+    changed = {"normal_x", "normal_y"} if "normal" in port else set()
+    changed |= set(port)
+    kept = [name for name in _parameters(rig) if name.rsplit(".", 1)[1] not in changed]
+    return replace(
+        rig,
+        cameras={name: replace(camera, **dict(port)) for name, camera in rig.cameras.items()},
+        covariance=_part(rig.covariance, kept),
+    )
 
 
 def _scaled(pose: RigidTransform, reading: Reading) -> RigidTransform:

@@ -78,8 +78,7 @@ def write_ros(path: Path, rig: Rig) -> list[Path]:
         projection = np.hstack([camera_matrix(camera), np.zeros((3, 1))])
         _write(path, _document(names[0], camera, np.eye(3), projection))
         return [path]
-    if path.suffix:
-        raise CalibrationError(f"{path}: a pair has two files: name a folder for them")
+    files = ros_files(path, rig)
     first, second = rig.cameras.values()
     size = (first.width_px, first.height_px)
     second_from_first = rig.cam_from_rig[names[1]]
@@ -92,11 +91,23 @@ def write_ros(path: Path, rig: Rig) -> list[Path]:
         second_from_first.rotation.as_matrix(), second_from_first.translation[:, None],
         flags=cv2.CALIB_ZERO_DISPARITY, alpha=0.0,
     )  # fmt: skip
-    files = [path / f"{name}.yaml" for name in names]
     pieces = zip(files, names, (first, second), (r1, r2), (p1, p2), strict=True)
     for file, name, camera, rotation, projection in pieces:
         _write(file, _document(name, camera, rotation, projection))
     return files
+
+
+def ros_files(path: Path, rig: Rig) -> list[Path]:
+    """The files that writing a rig would replace.
+
+    Raises:
+        CalibrationError: a pair should go into one file.
+    """
+    if len(rig.cameras) == 1:
+        return [path]
+    if path.suffix:
+        raise CalibrationError(f"{path}: a pair has two files: name a folder for them")
+    return [path / f"{name}.yaml" for name in rig.cameras]
 
 
 _ONE = (RigidTransform.identity(),)

@@ -138,6 +138,21 @@ def test_a_model_that_colmap_wrote_gives_its_rig(tmp_path: Path) -> None:
         )  # fmt: skip
 
 
+def test_rigs_that_are_malformed_or_hold_too_little_are_refused(tmp_path: Path) -> None:
+    for kind, cut in (("cameras.txt", 20), ("cameras.bin", 1)):
+        folder = tmp_path / kind[-3:]
+        write_colmap(folder / kind, pair(AIR))
+        (folder / "rig_config.json").unlink()
+        rigs_file = folder / f"rigs{kind[-4:]}"
+        good = rigs_file.read_bytes()
+        for bad in (good[:-cut], good + b"1 2", good.replace(b"CAMERA 2", b"LIDAR 2") + b"\0"):
+            rigs_file.write_bytes(bad)
+            with pytest.raises(CalibrationError, match=r"rigs\.(txt|bin)"):
+                read_colmap(folder, Reading())
+        rigs_file.write_bytes(struct.pack("<Q", 0) if kind.endswith("bin") else b"# none\n")
+        assert "no common rig" in fault(folder)
+
+
 def test_cameras_without_a_rig_are_read_one_by_one(tmp_path: Path) -> None:
     path = tmp_path / "cameras.txt"
     path.write_text(

@@ -1,0 +1,356 @@
+"""Conversions: nothing is lost unasked, the price of a stand-in is told, faults are one line."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.cli import main
+from alice_survey.config import CameraConfig, WaterConfig
+from alice_survey.errors import AliceError, CalibrationError
+from camera_calib.formats.convert import convert_files
+from camera_calib.formats.in_water import in_water
+from camera_calib.formats.registry import FORMATS, detect
+from camera_calib.formats.rigs import only, renamed, with_port
+from camera_calib.rig import Rig, design_rig, read_rig, write_rig
+from tests.strategies_formats import assert_same_geometry, covariance_of
+
+DESIGN = design_rig(CameraConfig(), WaterConfig(), scale=4)
+BENT = replace(
+    DESIGN,
+    cameras={
+        "left": replace(DESIGN.cameras["left"], k1=-0.1, p2=1e-3),
+        "right": replace(DESIGN.cameras["right"], k1=-0.12),
+    },
+)
+FULL = replace(BENT, covariance=covariance_of(BENT, np.random.default_rng(4)))
+IN_AIR = with_port(BENT, {"port_distance_m": 0.0, "glass_thickness_m": 0.0, "n_water": 1.0})
+CHANNELS = {
+    "opencv": "o.xml",
+    "colmap": "model",
+    "flatport": "flat",
+    "kalibr": "c.yaml",
+    "ros": "r",
+}
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> Path:
+    write_rig(tmp_path / "rig.json", FULL)
+    return tmp_path / "rig.json"
+
+
+def refused(source: Path, target: Path, **options: Any) -> str:
+    """A conversion that must fail in one line, and write nothing."""
+    before = sorted(target.parent.iterdir()) if target.parent.is_dir() else []
+    with pytest.raises(AliceError) as error:
+        convert_files(source, target, **options)
+    assert (sorted(target.parent.iterdir()) if target.parent.is_dir() else []) == before
+    shown = str(error.value)
+    assert "\n" not in shown
+    return shown
+
+
+@pytest.mark.parametrize("name", ["colmap", "kalibr", "ros"])
+def test_a_port_is_not_lost_unasked(own: Path, tmp_path: Path, name: str) -> None:
+    shown = refused(own, tmp_path / CHANNELS[name], target_format=name, drop_covariance=True)
+    for words in ("port of left, right", "20 mm", "glass 10 mm", "1.34", "--drop-port", "--water"):
+        assert words in shown
+
+
+@pytest.mark.parametrize("name", ["colmap", "flatport", "kalibr", "ros"])
+def test_a_covariance_is_not_lost_unasked(own: Path, tmp_path: Path, name: str) -> None:
+    water = None if name == "flatport" else (1.5, 3.0)
+    shown = refused(own, tmp_path / CHANNELS[name], target_format=name, water=water)
+    assert "covariance of 8 parameters" in shown
+    assert "--drop-covariance" in shown
+
+
+@pytest.mark.parametrize(
+    ("name", "term"), [("kalibr", "k3"), ("kalibr", "k5"), ("ros", "s1"), ("colmap", "s4"),
+                       ("flatport", "s2")],
+)  # fmt: skip
+def test_distortion_is_never_lost(tmp_path: Path, name: str, term: str) -> None:
+    rig = replace(IN_AIR, cameras={**IN_AIR.cameras})
+    cameras = {**rig.cameras, "right": replace(rig.cameras["right"], **{term: 1e-3})}
+    write_rig(tmp_path / "rig.json", replace(rig, cameras=cameras))
+    shown = refused(tmp_path / "rig.json", tmp_path / CHANNELS[name], target_format=name)
+    assert term in shown
+    assert "of right" in shown
+
+
+@pytest.mark.parametrize("name", ["colmap", "kalibr", "ros"])
+def test_a_dropped_port_leaves_the_cameras_in_air_and_a_warning(
+    own: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = tmp_path / CHANNELS[name]
+    convert_files(own, target, target_format=name, drop_port=True, drop_covariance=True)
+    warned = capsys.readouterr().err
+    assert "left out the port of left, right (20 mm, glass 10 mm, water 1.34)" in warned
+    assert "left out the covariance of" in warned
+    assert "left out the rig's pose on the vehicle" in warned
+    after = FORMATS[name].read(target, _reading())
+    assert_same_geometry(after, IN_AIR)
+
+
+def test_flatport_carries_the_port(own: Path, tmp_path: Path) -> None:
+    text, data = convert_files(
+        own, tmp_path / "flat", target_format="flatport", drop_covariance=True
+    )
+    assert "port 20 mm, glass 10 mm, water 1.34" in text
+    assert data["to"] == "flatport"
+    assert detect(tmp_path / "flat").name == "flatport"
+    convert_files(tmp_path / "flat", tmp_path / "back.json")
+    assert_same_geometry(read_rig(tmp_path / "back.json"), BENT)
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "FULL_OPENCV"])
+def test_the_price_in_water_is_what_colmap_misses_the_exact_camera_by(
+    own: Path, tmp_path: Path, model: str
+) -> None:
+    text, data = convert_files(
+        own, tmp_path / "model", target_format="colmap", water=(1.5, 3.0), model=model,
+        drop_covariance=True,
+    )  # fmt: skip
+    opened = pycolmap.Reconstruction(tmp_path / "model")
+    (sensors,) = opened.rigs.values()
+    after = FORMATS["colmap"].read(tmp_path / "model", _reading())
+    mount, _ = in_water(FULL, 1.5, 3.0, model)
+    for i, (name, camera) in enumerate(BENT.cameras.items(), start=1):
+        colmap = opened.cameras[i]
+        assert colmap.model.name == model
+        # Points that the exact camera sees at the corners and all over, near and far.
+        pixels = camera.pixel_centres(step=40).reshape(-1, 2)
+        misses = []
+        for depth in np.linspace(1.5, 3.0, 7):
+            points_rig = BENT.cam_from_rig[name].inv().apply(camera.at_depth(pixels, depth))
+            # the new rig's frame is its first camera's, whose centre has moved
+            points_new = mount.cam_from_rig["left"].apply(points_rig)
+            if i > 1:
+                matrix = sensors.sensor_from_rig(colmap.sensor_id).matrix()
+                points_new = points_new @ matrix[:, :3].T + matrix[:, 3]
+            seen = np.array([colmap.img_from_cam(point) for point in points_new])
+            misses.append(np.linalg.norm(seen - pixels, axis=1))
+        price = data["price"][name]
+        rms = float(np.sqrt(np.mean(np.square(misses))))
+        assert 0.5 * price["rms_px"] < rms < 1.3 * price["rms_px"]
+        assert np.max(misses) < 1.05 * price["max_px"]
+        assert 0.001 < price["rms_px"] < 0.1  # a quarter of the resolution
+        assert f"{name}: {model} for 1.5 to 3 m of water misses" in text
+    assert list(after.cameras) == ["left", "right"]
+
+
+def test_centres_follow_the_fit_onto_the_vehicle() -> None:
+    fitted, _ = in_water(FULL, 1.5, 3.0, "OPENCV")
+    for name in FULL.cameras:
+        moved = (FULL.body_from_cam(name).inv() * fitted.body_from_cam(name)).translation
+        # Through this port the best centre is some 7 mm behind the pupil.
+        assert -0.009 < moved[2] < -0.005
+        assert np.linalg.norm(moved[:2]) < 1e-3
+    assert fitted.covariance is None
+
+
+def test_a_camera_in_air_fits_itself(tmp_path: Path) -> None:
+    """The way of a rational lens into Kalibr: the best radtan, at a stated price."""
+    rational = replace(IN_AIR.cameras["left"], k4=0.02)
+    rig = only(replace(IN_AIR, cameras={**IN_AIR.cameras, "left": rational}), "left")
+    write_rig(tmp_path / "rig.json", rig)
+    _, data = convert_files(
+        tmp_path / "rig.json", tmp_path / "c.yaml", target_format="kalibr", water=(1.0, 4.0)
+    )
+    assert data["price"]["left"]["max_px"] < 0.05
+
+
+def test_a_port_given_with_cameras_in_air_makes_the_rig(tmp_path: Path) -> None:
+    FORMATS["kalibr"].write(tmp_path / "c.yaml", IN_AIR)
+    options = {"port_distance_mm": 20.0, "glass_mm": 10.0}
+    shown = refused(tmp_path / "c.yaml", tmp_path / "rig.json", **options)
+    assert "--n-water" in shown
+    convert_files(tmp_path / "c.yaml", tmp_path / "rig.json", n_water=1.34, **options)
+    assert_same_geometry(read_rig(tmp_path / "rig.json"), BENT)
+
+
+def test_changed_numbers_take_their_covariance_with_them() -> None:
+    wet = with_port(FULL, {"n_water": 1.36})
+    assert wet.covariance is not None
+    assert not any("n_water" in name for name in wet.covariance.parameters)
+    assert FULL.covariance is not None
+    sigmas = FULL.covariance.sigmas
+    assert wet.sigmas == {name: sigmas[name] for name in wet.covariance.parameters}
+    assert len(wet.sigmas) == 6
+
+
+def test_one_camera_of_a_rig_keeps_its_place_on_the_vehicle(own: Path, tmp_path: Path) -> None:
+    convert_files(own, tmp_path / "right.yml", target_format="opencv", camera="right")
+    convert_files(tmp_path / "right.yml", tmp_path / "right.json")
+    alone = read_rig(tmp_path / "right.json")
+    assert list(alone.cameras) == ["right"]
+    np.testing.assert_allclose(
+        alone.body_from_cam("right").as_matrix(), FULL.body_from_cam("right").as_matrix(),
+        atol=1e-14,
+    )  # fmt: skip
+    assert set(alone.sigmas) == {"right.fx_px", "right.k1", "right.n_water"}
+    shown = refused(own, tmp_path / "x.yml", target_format="opencv", camera="middle")
+    assert "left, right" in shown
+
+
+def test_names_can_be_chosen(own: Path, tmp_path: Path) -> None:
+    convert_files(own, tmp_path / "new.json", names="port,starboard")
+    rig = read_rig(tmp_path / "new.json")
+    assert list(rig.cameras) == ["port", "starboard"]
+    assert rig.covariance is not None
+    assert "starboard.x_m" in rig.covariance.parameters
+    for names in ("a", "a,a", "a,../b", "a,b c"):
+        assert "--names" in refused(own, tmp_path / "other.json", names=names)
+    assert renamed(rig, ["left", "right"]).sigmas == FULL.sigmas
+
+
+def test_a_name_of_a_camera_cannot_lead_out_of_the_folder(own: Path, tmp_path: Path) -> None:
+    data = json.loads(own.read_text())
+    data["cameras"] = {
+        "left": data["cameras"]["left"],
+        "../../outside": data["cameras"]["right"],
+    }
+    del data["covariance"]
+    own.write_text(json.dumps(data))
+    for name, target in CHANNELS.items():
+        shown = refused(own, tmp_path / "deep" / target, target_format=name)
+        assert "camera name '../../outside'" in shown
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["rig.json"]
+
+
+def test_the_mount_of_foreign_cameras_is_said_to_be_unknown(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    FORMATS["ros"].write(tmp_path / "pair", IN_AIR)
+    convert_files(tmp_path / "pair", tmp_path / "rig.json")
+    assert "tells no pose on the vehicle" in capsys.readouterr().err
+    rig = read_rig(tmp_path / "rig.json")
+    np.testing.assert_allclose(rig.body_from_rig.translation, 0.0)
+    np.testing.assert_allclose(rig.body_from_rig.apply([0.0, 0.0, 1.0]), [0, 0, 1], atol=1e-15)
+    convert_files(tmp_path / "pair", tmp_path / "c.yaml", target_format="kalibr")
+    assert "vehicle" not in capsys.readouterr().err
+
+
+def test_files_that_are_there_are_not_replaced_unasked(tmp_path: Path) -> None:
+    write_rig(tmp_path / "rig.json", IN_AIR)
+    for name, target in CHANNELS.items():
+        convert_files(tmp_path / "rig.json", tmp_path / target, target_format=name)
+        shown = refused(tmp_path / "rig.json", tmp_path / target, target_format=name)
+        assert "exists" in shown
+        convert_files(tmp_path / "rig.json", tmp_path / target, target_format=name, overwrite=True)
+    shown = refused(
+        tmp_path / "rig.json", tmp_path / "model" / "cameras.bin", target_format="colmap",
+        overwrite=True,
+    )  # fmt: skip
+    assert "one of the two" in shown
+
+
+def test_formats_are_found_from_files_and_names(tmp_path: Path) -> None:
+    write_rig(tmp_path / "rig.json", IN_AIR)
+    for name, target in CHANNELS.items():
+        FORMATS[name].write(tmp_path / target, _wet(name))
+        assert detect(tmp_path / target).name == name
+    assert detect(tmp_path / "model" / "rig_config.json").name == "colmap"
+    _, data = convert_files(tmp_path / "rig.json", tmp_path / "again.xml")
+    assert data["to"] == "opencv"
+    (tmp_path / "note.txt").write_text("hello\n")
+    (tmp_path / "note.md").write_text("hello\n")
+    (tmp_path / "a.yaml").write_text("a: 1\n")
+    (tmp_path / "empty").mkdir()
+    faults = {
+        "no such file": refused(tmp_path / "none.yml", tmp_path / "x.json"),
+        "CAMERA_ID": refused(tmp_path / "note.txt", tmp_path / "x.json"),
+        "say which with --from": refused(tmp_path / "note.md", tmp_path / "x.json"),
+        "a.yaml: of no known format": refused(tmp_path / "a.yaml", tmp_path / "x.json"),
+        "empty: of no known format": refused(tmp_path / "empty", tmp_path / "x.json"),
+        "--to: rig, opencv, colmap": refused(tmp_path / "rig.json", tmp_path / "x.yaml"),
+        "no format 'metashape'": refused(
+            tmp_path / "rig.json", tmp_path / "x", target_format="metashape"
+        ),
+    }
+    for words, shown in faults.items():
+        assert words in shown
+
+
+def test_contradictions_are_refused(own: Path, tmp_path: Path) -> None:
+    to = {"target_format": "colmap", "drop_covariance": True}
+    target = tmp_path / "m"
+    assert "one of them" in refused(own, target, water=(1.5, 3.0), drop_port=True, **to)
+    assert "OPENCV or FULL_OPENCV" in refused(own, target, water=(1.5, 3.0), model="FOV", **to)
+    assert "near < far" in refused(own, target, water=(3.0, 1.5), **to)
+
+
+def test_a_reference_of_its_own_pose_is_counted_out(tmp_path: Path) -> None:
+    """A rig whose first camera is not at its origin means the same afterwards."""
+    shift = RigidTransform.from_translation([0.3, 0.2, 0.1])
+    moved = replace(
+        IN_AIR, cam_from_rig={name: pose * shift for name, pose in IN_AIR.cam_from_rig.items()}
+    )
+    write_rig(tmp_path / "rig.json", moved)
+    convert_files(tmp_path / "rig.json", tmp_path / "o.yml", target_format="opencv")
+    convert_files(tmp_path / "o.yml", tmp_path / "back.json")
+    after = read_rig(tmp_path / "back.json")
+    for name in moved.cameras:
+        np.testing.assert_allclose(
+            after.body_from_cam(name).as_matrix(), moved.body_from_cam(name).as_matrix(),
+            atol=1e-14,
+        )  # fmt: skip
+
+
+def test_the_command_converts_and_names_faults(
+    own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(*arguments: str) -> int:
+        monkeypatch.setattr(sys, "argv", ["alice-survey", "camera", "convert", *arguments])
+        try:
+            main()
+        except SystemExit as stopped:
+            return int(stopped.code or 0)
+        return 0
+
+    assert run(str(own), str(tmp_path / "c.yaml"), "--to", "kalibr", "--json") == 1
+    shown = capsys.readouterr().err
+    assert shown.startswith("error: ")
+    assert len(shown.splitlines()) == 1
+    options = ("--to", "kalibr", "--water", "1.5", "3", "--drop-covariance", "--json")
+    assert run(str(own), str(tmp_path / "c.yaml"), *options) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data["written"] == [str(tmp_path / "c.yaml")]
+    assert data["baseline_m"] == pytest.approx(0.1, abs=1e-3)
+    assert (tmp_path / "c.yaml").is_file()
+
+
+def _reading() -> Any:
+    from camera_calib.formats.rigs import Reading
+
+    return Reading()
+
+
+def _wet(name: str) -> Rig:
+    return BENT if name == "flatport" else IN_AIR
+
+
+def test_hostile_files_of_every_kind_end_in_one_line(tmp_path: Path) -> None:
+    """Cut short anywhere, or with a byte changed, a file is read or refused; nothing else."""
+    rng = np.random.default_rng(8)
+    for name, target in CHANNELS.items():
+        rig = only(_wet(name), "left")
+        place = tmp_path / (target if name != "ros" else "r.yaml")
+        FORMATS[name].write(place, rig)
+        file = next(place.glob("cameras.*")) if place.is_dir() else place
+        good = file.read_bytes()
+        for _ in range(40):
+            cut = bytearray(good[: rng.integers(1, len(good))])
+            cut[rng.integers(0, len(cut))] = rng.integers(0, 256)
+            file.write_bytes(bytes(cut))
+            try:
+                FORMATS[name].read(place, _reading())
+            except CalibrationError as error:
+                assert "\n" not in str(error)

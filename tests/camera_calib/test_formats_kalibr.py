@@ -1,0 +1,169 @@
+"""Kalibr's camchain: the keys and conventions of its wiki, read back apart from our reader."""
+
+import tempfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.errors import CalibrationError
+from camera_calib.formats.kalibr import read_kalibr, write_kalibr
+from camera_calib.formats.registry import detect
+from camera_calib.formats.rigs import Reading
+from camera_calib.rig import Rig
+from tests.strategies_formats import POINTS_RIG, RADTAN, rigs
+
+EXAMPLE = """\
+cam0:
+  camera_model: pinhole
+  intrinsics: [461.629, 460.152, 362.680, 246.049]
+  distortion_model: radtan
+  distortion_coeffs: [-0.27695497, 0.06712482, 8.7538e-4, 1e-05]
+  T_cam_imu:
+  - [0.01779318, 0.99967549,-0.01822936, 0.07008565]
+  - [-0.9998017, 0.01795239, 0.00860714,-0.01771023]
+  - [0.00893160, 0.01807260, 0.99979678, 0.00399246]
+  - [0.0, 0.0, 0.0, 1.0]
+  timeshift_cam_imu: -8.121e-05
+  rostopic: /cam0/image_raw
+  resolution: [752, 480]
+cam1:
+  camera_model: pinhole
+  intrinsics: [463.0, 460.0, 373.850, 253.749]
+  distortion_model: none
+  distortion_coeffs: []
+  T_cn_cnm1:
+  - [0.0, -1.0, 0.0, -0.1]
+  - [1.0, 0.0, 0.0, 0.0]
+  - [0.0, 0.0, 1.0, 0.0]
+  - [0.0, 0.0, 0.0, 1.0]
+  rostopic: /stereo/cam1/image_raw
+  resolution: [752, 480]
+cam2:
+  camera_model: pinhole
+  intrinsics: [463.0, 460.0, 373.850, 253.749]
+  distortion_model: none
+  distortion_coeffs: []
+  T_cn_cnm1:
+  - [1.0, 0.0, 0.0, 0.0]
+  - [0.0, 1.0, 0.0, -0.5]
+  - [0.0, 0.0, 1.0, 0.0]
+  - [0.0, 0.0, 0.0, 1.0]
+  rostopic: something else
+  resolution: [752, 480]
+"""
+
+
+def fault(path: Path, text: str) -> str:
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(CalibrationError) as error:
+        read_kalibr(path, Reading())
+    shown = str(error.value)
+    assert str(path) in shown
+    assert "\n" not in shown
+    return shown
+
+
+@settings(max_examples=25, deadline=None)
+@given(rig=rigs(RADTAN, most=3))
+def test_opencv_projects_as_we_do_from_the_chain(rig: Rig) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        write_kalibr(Path(folder) / "camchain.yaml", rig)
+        chain = yaml.safe_load((Path(folder) / "camchain.yaml").read_text())
+
+    assert list(chain) == [f"cam{i}" for i in range(len(rig.cameras))]
+    cam_from_rig = np.eye(4)
+    for i, ((name, camera), entry) in enumerate(
+        zip(rig.cameras.items(), chain.values(), strict=True)
+    ):
+        assert (entry["camera_model"], entry["distortion_model"]) == ("pinhole", "radtan")
+        assert entry["resolution"] == [camera.width_px, camera.height_px]
+        assert entry["cam_overlaps"] == [other for other in range(len(chain)) if other != i]
+        assert ("T_cn_cnm1" in entry) == (i > 0)
+        cam_from_rig = np.array(entry.get("T_cn_cnm1", np.eye(4))) @ cam_from_rig
+        fx, fy, cx, cy = entry["intrinsics"]
+        seen, _ = cv2.projectPoints(
+            POINTS_RIG,
+            Rotation.from_matrix(cam_from_rig[:3, :3]).as_rotvec(),
+            cam_from_rig[:3, 3],
+            np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
+            np.array(entry["distortion_coeffs"]),
+        )
+        ours = camera.project(rig.cam_from_rig[name].apply(POINTS_RIG))
+        known = np.isfinite(ours[:, 0])
+        assert known.any()
+        np.testing.assert_allclose(seen[known, 0] + 0.5, ours[known], atol=1e-8, rtol=0)
+
+
+def test_an_example_like_that_of_the_wiki_is_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "camchain.yaml"
+    path.write_text(EXAMPLE)
+    assert detect(path).name == "kalibr"
+    rig = read_kalibr(path, Reading())
+
+    assert list(rig.cameras) == ["cam0", "stereo_cam1", "cam2"]
+    first = rig.cameras["cam0"]
+    assert (first.fx_px, first.fy_px) == (461.629, 460.152)
+    assert (first.cx_px, first.cy_px) == pytest.approx((363.18, 246.549), abs=1e-12)
+    assert (first.width_px, first.height_px, first.n_water) == (752, 480, 1.0)
+    # 1e-05, without a dot, is text to a YAML 1.1 parser
+    assert (first.k1, first.k2, first.p1, first.p2) == (-0.27695497, 0.06712482, 8.7538e-4, 1e-05)
+    assert rig.cameras["cam2"].k1 == 0.0
+    # The chain: cam1 at (0, -0.1, 0) of cam0, cam2 at (0, 0.5, 0) of cam1, whose y is cam0's x.
+    centre = rig.cam_from_rig["stereo_cam1"].inv().translation
+    np.testing.assert_allclose(centre, [0.0, -0.1, 0.0], atol=1e-15)
+    centre = rig.cam_from_rig["cam2"].inv().translation
+    np.testing.assert_allclose(centre, [0.5, -0.1, 0.0], atol=1e-15)
+    assert "T_cam_imu, timeshift_cam_imu left out" in capsys.readouterr().err
+
+
+def test_rounded_rotations_are_made_rotations(tmp_path: Path) -> None:
+    path = tmp_path / "camchain.yaml"
+    path.write_text(EXAMPLE.replace("[1.0, 0.0, 0.0, 0.0]", "[0.9999, 0.0, 0.0, 0.0]"))
+    pose = read_kalibr(path, Reading()).cam_from_rig["cam2"]
+    assert isinstance(pose, RigidTransform)
+    np.testing.assert_allclose(np.linalg.det(pose.rotation.as_matrix()), 1.0, atol=1e-14)
+
+
+def test_faults_name_file_and_key(tmp_path: Path) -> None:
+    path = tmp_path / "camchain.yaml"
+    faults = {
+        "cam1.distortion_model is equidistant": fault(
+            path, EXAMPLE.replace("distortion_model: none", "distortion_model: equidistant", 1)
+        ),
+        "cam0.camera_model is omni": fault(path, EXAMPLE.replace("pinhole", "omni", 1)),
+        "cam0.distortion_coeffs holds 3": fault(path, EXAMPLE.replace(", 1e-05]", "]")),
+        "cam0.intrinsics": fault(path, EXAMPLE.replace("461.629", "fast")),
+        "cam0.intrinsics has focal": fault(path, EXAMPLE.replace("461.629", "-461.629")),
+        "cam0.resolution": fault(path, EXAMPLE.replace("[752, 480]", "[752]", 1)),
+        "width": fault(path, EXAMPLE.replace("[752, 480]", "[752.5, 480]", 1)),
+        "lacks cam1.T_cn_cnm1": fault(path, EXAMPLE.replace("T_cn_cnm1", "T_c1_c0", 1)),
+        "cam1.T_cn_cnm1 is no rotation": fault(path, EXAMPLE.replace("[0.0, -1.0", "[0.0, 1.0")),
+        "row 0 0 0 1": fault(
+            path, EXAMPLE.replace("1.0]\n  rostopic: /s", "2.0]\n  rostopic: /s")
+        ),
+        "left out": fault(path, EXAMPLE.replace("cam1:", "cam7:")),
+        "lacks cam0": fault(path, "a: 1\n"),
+        "no mapping": fault(path, "- 1\n"),
+        "line 3": fault(path, "cam0:\n  a: [1\n"),
+        "the key a twice": fault(path, "a: 1\na: 2\n"),
+        "an alias": fault(path, "a: &x [1]\nb: *x\n"),
+        "two cameras of one name": fault(path, EXAMPLE.replace("/stereo/cam1/", "/cam0/")),
+    }  # fmt: skip
+    for words, shown in faults.items():
+        assert words in shown
+
+
+def test_yaml_constructs_nothing(tmp_path: Path) -> None:
+    made = tmp_path / "made"
+    shown = fault(
+        tmp_path / "a.yaml", f"cam0: !!python/object/apply:pathlib.Path.touch\n- {made}\n"
+    )
+    assert "not valid YAML" in shown
+    assert not made.exists()

@@ -1,0 +1,204 @@
+"""ROS's camera_info: keys of camera_calibration_parsers, poses from the rectified pair."""
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from hypothesis import assume, given, settings
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.errors import CalibrationError
+from camera_calib.flat_port import FlatPortCamera
+from camera_calib.formats.registry import detect
+from camera_calib.formats.rigs import Reading
+from camera_calib.formats.ros import read_ros, write_ros
+from camera_calib.rig import Rig
+from tests.strategies_formats import POINTS_RIG, RATIONAL, assert_same_geometry, rigs
+
+SAMPLE = """\
+image_width: 2448
+image_height: 2050
+camera_name: prosilica
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [4827.94, 0, 1223.5, 0, 4835.62, 1024.5, 0, 0, 1]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [-0.41527, 0.31874, -0.00197, 7.1e-04, 0]
+rectification_matrix:
+  rows: 3
+  cols: 3
+  data: [1, 0, 0, 0, 1, 0, 0, 0, 1]
+projection_matrix:
+  rows: 3
+  cols: 4
+  data: [4827.94, 0, 1223.5, 0, 0, 4835.62, 1024.5, 0, 0, 0, 1, 0]
+"""
+AIR = FlatPortCamera(
+    width_px=640, height_px=480, fx_px=530.0, fy_px=531.0, cx_px=320.25, cy_px=241.0, n_water=1.0
+)
+PAIR = Rig(
+    cameras={"left": AIR, "right": replace(AIR, k1=-0.1)},
+    cam_from_rig={
+        "left": RigidTransform.identity(),
+        "right": RigidTransform.from_translation([-0.1, 0.0, 0.0]),
+    },
+    body_from_rig=RigidTransform.identity(),
+    source="a test",
+)
+
+
+def fault(path: Path, text: str | None = None) -> str:
+    if text is not None:
+        path.write_text(text, encoding="utf-8")
+    with pytest.raises(CalibrationError) as error:
+        read_ros(path, Reading())
+    shown = str(error.value)
+    assert str(path) in shown
+    assert "\n" not in shown
+    return shown
+
+
+@settings(max_examples=25, deadline=None)
+@given(rig=rigs(RATIONAL, one_size=True))
+def test_rectified_by_opencv_a_pair_is_where_the_file_says(rig: Rig) -> None:
+    """As image_geometry does: a ray goes through R and P to the rectified picture.
+
+    There both cameras see a point on one row (or column), and the last column of P says how far
+    apart; in the raw picture OpenCV projects points with the file's K and D to where we do.
+    """
+    assume(len(rig.cameras) == 2)
+    with tempfile.TemporaryDirectory() as folder:
+        files = write_ros(Path(folder) / "pair", rig)
+        assert [file.name for file in files] == ["left.yaml", "right.yaml"]
+        documents = [yaml.safe_load(file.read_text()) for file in files]
+
+    rectified = []
+    for (name, camera), document in zip(rig.cameras.items(), documents, strict=True):
+        assert document["camera_name"] == name
+        k, d, r, p = (
+            np.array(document[key]["data"]).reshape(document[key]["rows"], document[key]["cols"])
+            for key in (
+                "camera_matrix", "distortion_coefficients", "rectification_matrix",
+                "projection_matrix",
+            )
+        )  # fmt: skip
+        assert document["distortion_model"] == (
+            "plumb_bob" if d.size == 5 else "rational_polynomial"
+        )
+        points = rig.cam_from_rig[name].apply(POINTS_RIG)
+        seen, _ = cv2.projectPoints(np.ascontiguousarray(points), np.zeros(3), np.zeros(3), k, d)
+        ours = camera.project(points)
+        known = np.isfinite(ours[:, 0])
+        assert known.any()
+        np.testing.assert_allclose(seen[known, 0] + 0.5, ours[known], atol=1e-8, rtol=0)
+        # Of the camera's own frame a point goes through R; of the first camera's rectified frame,
+        # through the last column of P. Tangents, since OpenCV may choose any focal length.
+        first = POINTS_RIG @ np.array(documents[0]["rectification_matrix"]["data"]).reshape(3, 3).T
+        own = points @ r.T @ p[:, :3].T
+        assert (name == "right") == bool(np.any(p[:, 3]))
+        np.testing.assert_allclose(tangents(own, p), tangents(first @ p[:, :3].T + p[:, 3], p),
+                                   atol=1e-12)  # fmt: skip
+        rectified.append(tangents(own, p))
+    across = np.abs(rectified[0] - rectified[1]).max(axis=0)
+    assert across.min() < 1e-12  # one row, or one column
+    assert across.max() > 1e-3
+
+
+def tangents(homogeneous: np.ndarray, projection: np.ndarray) -> np.ndarray:
+    """What a projection matrix without its focal length and principal point would give."""
+    pixels = homogeneous[:, :2] / homogeneous[:, 2:]
+    return (pixels - projection[:2, 2]) / projection[[0, 1], [0, 1]]
+
+
+def test_the_sample_of_the_wiki_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "prosilica.yaml"
+    path.write_text(SAMPLE)
+    assert detect(path).name == "ros"
+    rig = read_ros(path, Reading())
+    camera = rig.cameras["prosilica"]
+    assert (camera.width_px, camera.height_px) == (2448, 2050)
+    assert (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px) == (
+        4827.94, 4835.62, 1224.0, 1025.0,
+    )  # fmt: skip
+    assert (camera.k1, camera.k2, camera.p1, camera.p2) == (-0.41527, 0.31874, -0.00197, 7.1e-04)
+
+
+def test_the_reference_is_the_camera_without_baseline(tmp_path: Path) -> None:
+    """Whatever the order of the files' names."""
+    folder = tmp_path / "pair"
+    write_ros(folder, PAIR)
+    (folder / "left.yaml").rename(folder / "z.yaml")
+    rig = read_ros(folder, Reading())
+    assert rig.reference == "left"
+    assert_same_geometry(rig, PAIR)
+
+
+def test_half_a_pair_says_that_the_other_half_is_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_ros(tmp_path / "pair", PAIR)
+    rig = read_ros(tmp_path / "pair" / "right.yaml", Reading())
+    assert rig.cameras["right"].k1 == -0.1
+    assert "baseline left out" in capsys.readouterr().err
+
+
+def test_what_ros_has_no_files_for_is_refused(tmp_path: Path) -> None:
+    def refused(rig: Rig, path: Path) -> str:
+        with pytest.raises(CalibrationError) as error:
+            write_ros(path, rig)
+        return str(error.value)
+
+    identity = RigidTransform.identity()
+    three = replace(
+        PAIR,
+        cameras={**PAIR.cameras, "third": AIR},
+        cam_from_rig={**PAIR.cam_from_rig, "third": identity},
+    )
+    sizes = replace(PAIR, cameras={"left": AIR, "right": replace(AIR, width_px=641)})
+    same = replace(PAIR, cam_from_rig={"left": identity, "right": identity})
+    assert "--camera" in refused(three, tmp_path / "a")
+    assert "picture size" in refused(sizes, tmp_path / "a")
+    assert "no baseline" in refused(same, tmp_path / "a")
+    assert "name a folder" in refused(PAIR, tmp_path / "a.yaml")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_faults_name_file_and_key(tmp_path: Path) -> None:
+    path = tmp_path / "a.yaml"
+    faults = {
+        "distortion_model is equidistant": fault(path, SAMPLE.replace("plumb_bob", "equidistant")),
+        "distortion_coefficients.data holds 5": fault(
+            path, SAMPLE.replace("plumb_bob", "rational_polynomial")
+        ),
+        "lacks image_width": fault(path, SAMPLE.replace("image_width", "width")),
+        "camera_matrix.data holds 8": fault(path, SAMPLE.replace("0, 0, 1]\nd", "0, 0]\nd")),
+        "camera_matrix is not of the form": fault(
+            path, SAMPLE.replace("4827.94, 0,", "4827.94, 1,", 1)
+        ),
+        "camera name 'a b'": fault(path, SAMPLE.replace("prosilica", "a b")),
+        "projection_matrix is no 3 x 4": fault(path, SAMPLE.replace("cols: 4", "cols: 3")),
+    }  # fmt: skip
+    for words, shown in faults.items():
+        assert words in shown
+    folder = tmp_path / "pair"
+    folder.mkdir()
+    assert "0 .yaml files" in fault(folder)
+    for name in ("a.yaml", "b.yaml"):
+        (folder / name).write_text(SAMPLE)
+    assert "0 have one" in fault(folder)
+    moved = SAMPLE.replace("1223.5, 0, 0, 4835.62", "1223.5, -99.0, 0, 4835.62")
+    (folder / "b.yaml").write_text(moved)
+    assert "two cameras of one name" in fault(folder)
+    (folder / "b.yaml").write_text(
+        moved.replace("prosilica", "other").replace("[1, 0, 0, 0, 1", "[1, 0, 0, 0, 3")
+    )
+    with pytest.raises(CalibrationError, match=r"b\.yaml: rectification_matrix is no rotation"):
+        read_ros(folder, Reading())
