@@ -160,8 +160,8 @@ class Problem:
             blocks.append((pixels - self.pixels[v, c])[..., None])
             rows = np.concatenate(blocks, axis=-1)
             use = self.seen[v, c] & (weights[v, c] > 0)
-            rows = np.where(use[..., None, None], rows, 0.0)
-            rows *= np.sqrt(np.where(use, weights[v, c], 0.0))[..., None, None]
+            rows *= np.sqrt(weights[v, c])[..., None, None]
+            rows[~use] = 0.0
             rows = rows.reshape(len(v), -1, rows.shape[-1])
             square = rows.transpose(0, 2, 1) @ rows
             at = np.concatenate([self.lens_at[c], self.pose_at[c]])

@@ -1,0 +1,115 @@
+"""Synthetic truth for calibrations: a rig as built, a board before it, noisy views."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.config import CameraConfig, WaterConfig
+from camera_calib.calibration import TargetView
+from camera_calib.flat_port import FlatPortCamera
+from camera_calib.rig import Rig, design_rig
+
+Array = NDArray[np.float64]
+
+DESIGN = design_rig(CameraConfig(), WaterConfig())
+COLUMNS, ROWS, SQUARE_M = 11, 8, 0.03
+"""A board of 12 x 9 squares has 11 x 8 inner corners."""
+
+
+def board(columns: int = COLUMNS, rows: int = ROWS, square_m: float = SQUARE_M) -> Array:
+    y, x = np.mgrid[:rows, :columns]
+    return np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3) * square_m
+
+
+BOARD = board()
+
+
+def tilted(x_deg: float, y_deg: float) -> tuple[float, float, float]:
+    normal = np.array([np.tan(np.deg2rad(x_deg)), np.tan(np.deg2rad(y_deg)), 1.0])
+    x, y, z = (normal / np.linalg.norm(normal)).tolist()
+    return x, y, z
+
+
+def built_rig() -> Rig:
+    """Near the design, not equal to it: lenses, ports with tilt, pose of the right camera."""
+    lens = {"k1": -0.05, "k2": 0.03, "p1": 2e-4, "p2": -2e-4, "k3": 0.004}
+    left = replace(
+        DESIGN.cameras["left"], fx_px=3395.0, fy_px=3396.0, cx_px=1698.0, cy_px=1350.0,
+        port_distance_m=0.0212, normal=tilted(0.6, -0.4), **lens,
+    )  # fmt: skip
+    right = replace(
+        DESIGN.cameras["right"], fx_px=3380.0, fy_px=3381.0, cx_px=1685.0, cy_px=1361.0,
+        port_distance_m=0.0191, normal=tilted(-0.5, 0.7), **lens,
+    )  # fmt: skip
+    turn = Rotation.from_rotvec(np.deg2rad([0.2, -0.3, 0.25]))
+    return replace(
+        DESIGN,
+        cameras={"left": left, "right": right},
+        cam_from_rig={
+            "left": RigidTransform.identity(),
+            "right": RigidTransform.from_components([-0.1003, 0.0002, -0.0003], turn),
+        },
+    )
+
+
+def in_air(rig: Rig) -> Rig:
+    def bare(camera: FlatPortCamera) -> FlatPortCamera:
+        return replace(
+            camera, n_water=1.0, port_distance_m=0.0, glass_thickness_m=0.0, normal=(0.0, 0.0, 1.0)
+        )
+
+    return replace(rig, cameras={name: bare(camera) for name, camera in rig.cameras.items()})
+
+
+def board_poses(
+    rig: Rig,
+    count: int,
+    rng: np.random.Generator,
+    *,
+    near_m: float = 0.6,
+    far_m: float = 2.2,
+    tilt_deg: float = 35.0,
+    points: Array = BOARD,
+) -> RigidTransform:
+    """Poses `rig_from_target` in which every camera sees the whole board."""
+    poses: list[RigidTransform] = []
+    first = rig.cameras[rig.reference]
+    size = np.array([first.width_px, first.height_px])
+    while len(poses) < count:
+        turn = Rotation.from_rotvec(np.deg2rad(rng.uniform(-tilt_deg, tilt_deg, 3)))
+        place = first.at_depth(rng.uniform(0.15, 0.85, 2) * size, rng.uniform(near_m, far_m))
+        pose = RigidTransform.from_components(place - turn.apply(points.mean(axis=0)), turn)
+        pixels = [rig.cameras[n].project((rig.cam_from_rig[n] * pose).apply(points))
+                  for n in rig.cameras]  # fmt: skip
+        if all(np.all((p > 5) & (p < size - 5)) for p in pixels):
+            poses.append(pose)
+    return RigidTransform.concatenate(poses)
+
+
+def views_of(
+    rig: Rig,
+    poses: RigidTransform,
+    noise_px: float,
+    rng: np.random.Generator,
+    points: Array = BOARD,
+) -> list[TargetView]:
+    return [
+        TargetView(
+            name=f"{v:02d}",
+            pixels={
+                name: camera.project((rig.cam_from_rig[name] * poses[v]).apply(points))
+                + rng.normal(0.0, noise_px, (len(points), 2))
+                for name, camera in rig.cameras.items()
+            },
+        )
+        for v in range(len(poses))
+    ]
+
+
+def with_pixels(view: TargetView, camera: str, pixels: Array | None) -> TargetView:
+    """The same view with other pixels of one camera, or without that camera."""
+    rest: Mapping[str, Array] = {n: p for n, p in view.pixels.items() if n != camera}
+    return replace(view, pixels=dict(rest) if pixels is None else {**rest, camera: pixels})
