@@ -50,6 +50,8 @@ class Adjustment:
     noise_px: float
     """Standard deviation of one coordinate of a measured point."""
     steps: int
+    is_settled: bool
+    """Whether the last step was as short as asked for."""
 
 
 def stack_views(views: Sequence[TargetView], rig: Rig, count: int) -> Array:
@@ -80,6 +82,8 @@ def adjust(
     rig_from_target: RigidTransform,
     freedom: Freedom,
     settled: float = _SETTLED,
+    *,
+    at_most: int | None = None,
 ) -> Adjustment:
     """Adjust a rig and all poses of the target together.
 
@@ -90,13 +94,15 @@ def adjust(
         rig_from_target: (V,) poses near the truth.
         freedom: what of the rig is adjusted.
         settled: length of a step, in sigmas, at which the adjustment ends.
+        at_most: it may also end, not settled, after so many steps: views that do not fit at all
+            creep for long, and can be left out once the others fit.
 
     Raises:
         CalibrationError: there are fewer measurements than unknowns, the views do not determine
-            a parameter, or the adjustment does not settle.
+            a parameter, or the adjustment does not settle though it must.
     """
     problem = _Solver(stack_views(views, start, len(points)), points, start, freedom)
-    return problem.solve(problem.state(start, rig_from_target), settled)
+    return problem.solve(problem.state(start, rig_from_target), settled, at_most)
 
 
 def cramer_rao(
@@ -151,7 +157,7 @@ class _Solver(Problem):
         share = math.sqrt(2 * int(self.seen.sum()) / self.spare)
         return max(float(np.median(lengths)) / RAYLEIGH_MEDIAN * share, _LEAST_NOISE_PX)
 
-    def solve(self, state: State, settled: float) -> Adjustment:
+    def solve(self, state: State, settled: float, at_most: int | None) -> Adjustment:
         """Step down from a guess until a step is shorter than `settled` sigmas."""
         least = _LEAST_DAMPING if self.names else _POSE_DAMPING
         if self.spare <= 0:
@@ -163,7 +169,7 @@ class _Solver(Problem):
         lost = self.seen & ~np.isfinite(residuals).all(axis=-1)
         if lost.any():  # points that the start cannot project take part once it has improved
             self.seen = self.seen & ~lost
-            first = self.solve(state, settled)
+            first = self.solve(state, settled, at_most)
             self.seen = self.seen | lost
             state = self.state(first.rig, first.rig_from_target)
             residuals = self.residuals(state)
@@ -173,7 +179,7 @@ class _Solver(Problem):
                     "start from values nearer to the truth, or choose a simpler lens"
                 )
         damping, noise_px = 1e-3, self.spread(residuals)
-        for step in range(1, _STEPS + 1):
+        for step in range(1, (at_most or _STEPS) + 1):
             weights = self.weights(residuals, noise_px)
             equations = self.equations(state, weights / noise_px**2)
             cost = self.cost(state, residuals, noise_px)
@@ -189,18 +195,16 @@ class _Solver(Problem):
                 if drop >= 0 or gain < settled**2:
                     break
                 damping = max(10.0 * damping, 1e-9)
-                if damping > 1e12:
-                    raise CalibrationError(
-                        "the adjustment is stuck: start from values nearer to the truth"
-                    )
             if drop >= 0:
                 state, residuals = tried, tried_residuals
             noise_before, noise_px = noise_px, self.spread(residuals)
             same_noise = abs(noise_px / noise_before - 1) < settled or noise_px < 1e-6
             if gain < settled**2 and same_noise and (damping <= least or drop < 0):
-                return self.result(state, residuals, noise_px, step)
+                return self.result(state, residuals, noise_px, step, is_settled=True)
             good = drop > 0.25 * gain or gain < settled**2
             damping = max(damping * (0.01 if good else 0.5), 0.1 * _LEAST_DAMPING)
+        if at_most is not None:
+            return self.result(state, residuals, noise_px, at_most, is_settled=False)
         self.covariance(equations)  # names what the views leave open, if that is the reason
         raise CalibrationError(
             f"the adjustment did not settle in {_STEPS} steps (the last moved by "
@@ -214,7 +218,10 @@ class _Solver(Problem):
         weights: Array = np.where(self.seen, limit / np.maximum(length, limit), 0.0)
         return weights
 
-    def result(self, state: State, residuals: Array, spread: float, steps: int) -> Adjustment:
+    def result(
+        self, state: State, residuals: Array, spread: float, steps: int, *, is_settled: bool
+    ) -> Adjustment:
+        """The adjusted rig and poses, with the covariance at this guess."""
         weights = self.weights(residuals, spread)
         noise_px = self._noise(residuals, weights)
         covariance = self.covariance(
@@ -237,6 +244,7 @@ class _Solver(Problem):
             weights=np.where(self.seen, weights, np.nan),
             noise_px=noise_px,
             steps=steps,
+            is_settled=is_settled,
         )
 
     def _noise(self, residuals: Array, weights: Array) -> float:

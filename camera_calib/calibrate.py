@@ -28,6 +28,7 @@ from camera_calib.freedom import (
     pose_names,
 )
 from camera_calib.normal_equations import Flags
+from camera_calib.observability import unobservable
 from camera_calib.rig import Rig
 from camera_calib.start import first_cam_from_rig, first_focal_px, locate_all, spans
 
@@ -41,6 +42,8 @@ _DULLEST = 3.0
 """Largest noise of one picture, in that of all, that still is noise."""
 _LEAST_LIMIT_PX = 1e-4
 _ROUNDS = 6
+_STEPS = 40
+"""Of an adjustment that may still hold views which do not fit at all."""
 _FEWEST_FITTING = 0.5
 """Share of a picture's points; with fewer the whole picture is left out."""
 _ROUGHLY = 0.1
@@ -213,7 +216,8 @@ def calibrate_in_water_alone(
         CalibrationError: too few views, or they do not determine what is free.
     """
     start = first_rig(views, points, cameras, lens)
-    return calibrate_through_ports(views, points, start, "free", lens, sigmas)
+    found = calibrate_through_ports(views, points, start, "free", lens, sigmas)
+    return replace(found, warnings=(*found.warnings, *unobservable(found)))
 
 
 def blank_camera(
@@ -286,7 +290,9 @@ def _alone(
         located = [(view, pose) for view, pose in found if pose is not None]
         poses = RigidTransform.concatenate([pose for _, pose in located])
         freedom = Freedom(free=of_cameras(rig, [f for f in fields if f in wanted]))
-        rig = adjust([v for v, _ in located], points, rig, poses, freedom, _ROUGHLY).rig
+        rig = adjust(
+            [v for v, _ in located], points, rig, poses, freedom, _ROUGHLY, at_most=_STEPS
+        ).rig
     return rig.cameras[name]
 
 
@@ -357,20 +363,35 @@ def _adjusted_without_outliers(
     kept, alive = measured, np.ones(len(views), dtype=bool)
     for _ in range(_ROUNDS):
         trimmed = [_trimmed(view, kept[v], rig) for v, view in enumerate(views) if alive[v]]
-        adjusted = adjust(trimmed, points, rig, poses, freedom)
+        adjusted = adjust(trimmed, points, rig, poses, freedom, at_most=_STEPS)
         lengths = np.full(measured.shape, np.inf)
         lengths[alive] = _lengths(adjusted, pixels[alive], points)
         limits = _limits(np.where(measured, lengths, np.nan), adjusted.noise_px)
-        fits = measured & (lengths <= limits[..., None])
-        share = fits.sum(axis=2) / np.maximum(measured.sum(axis=2), 1)
-        fits &= (share >= _FEWEST_FITTING)[..., None]
-        if np.array_equal(fits, kept):
-            break
-        still = alive & fits.any(axis=(1, 2))
+        fitting = _fitting(measured, kept, measured & (lengths <= limits[..., None]))
+        if np.array_equal(fitting, kept) and adjusted.is_settled:
+            return adjusted, kept, alive
+        still = alive & fitting.any(axis=(1, 2))
+        _check_enough(int(still.sum()), len(views))
         poses = adjusted.rig_from_target[np.flatnonzero(still[alive])]
-        rig, kept, alive = adjusted.rig, fits, still
-        _check_enough(int(alive.sum()), len(views))
-    return adjusted, kept, alive
+        rig, kept, alive = adjusted.rig, fitting, still
+    trimmed = [_trimmed(view, kept[v], rig) for v, view in enumerate(views) if alive[v]]
+    return adjust(trimmed, points, rig, poses, freedom), kept, alive
+
+
+def _fitting(measured: Flags, kept: Flags, fits: Flags) -> Flags:
+    """Which points take part next, (V, cameras, N).
+
+    Where a picture does not fit, the pose of its view is no measure for the others yet: of the
+    pictures of one view only the worst is left out at a time.
+    """
+    share = fits.sum(axis=2) / np.maximum(measured.sum(axis=2), 1)
+    fitting = np.asarray(fits & (share >= _FEWEST_FITTING)[..., None])
+    served = np.asarray(kept.any(axis=2))
+    for v in np.flatnonzero((served & (share < _FEWEST_FITTING)).any(axis=1)):
+        worst = int(np.argmin(np.where(served[v], share[v], np.inf)))
+        others = served[v] & (np.arange(len(share[v])) != worst)
+        fitting[v] = kept[v] & others[:, None]
+    return fitting
 
 
 def _limits(lengths: Array, noise_px: float) -> Array:

@@ -183,15 +183,19 @@ class Problem:
         """(K,) parameters of the prior less its mean; a turn counts from the mean's rotation."""
         return _surprise(self.prior, self.values(state)[self.prior_at], self.rig, state)
 
+    def information(self, equations: Equations) -> Array:
+        """What is known of the rig's parameters, (P, P), with the target's poses marginalised."""
+        solved = np.linalg.solve(equations.view, equations.between.transpose(0, 2, 1))
+        told: Array = np.tensordot(equations.between, solved, axes=([0, 2], [0, 1]))
+        return equations.rig - told
+
     def covariance(self, equations: Equations) -> Covariance:
-        """Inverse of the rig's information, with the poses of the target marginalised."""
-        schur = equations.rig - np.einsum(
-            "vpi,vqi->pq",
-            equations.between,
-            np.linalg.solve(equations.view, equations.between.transpose(0, 2, 1)).transpose(
-                0, 2, 1
-            ),
-        )
+        """Inverse of the information.
+
+        Raises:
+            CalibrationError: a parameter, or a sum of some, is not determined.
+        """
+        schur = self.information(equations)
         if not self.names:
             return Covariance(parameters=(), matrix=np.zeros((0, 0)))
         # Held against what the views would tell if poses and all else were known.

@@ -28,6 +28,7 @@ _CLEAR = 2.0
 """A second pose that misses this many times more than the first is not looked at."""
 _ROUGHLY = 0.3
 """Sigmas to which poses are found that only serve as a start."""
+_STEPS = 30
 _FOCALS = 0.5 * 1.25 ** np.arange(14)
 """Focal lengths that are tried, in widths of the picture: 0.5 to 9 (90 to 6 degrees)."""
 
@@ -86,7 +87,7 @@ def _refined(
     settled: float,
 ) -> tuple[RigidTransform, Array]:
     """Poses of least residuals, and the mean robust length of each view's residuals."""
-    adjusted = adjust(views, points, rig, start, HELD, settled)
+    adjusted = adjust(views, points, rig, start, HELD, settled, at_most=_STEPS)
     lengths = np.sqrt((adjusted.residuals_px**2).sum(axis=-1)) * np.sqrt(adjusted.weights)
     return adjusted.rig_from_target, np.nanmean(lengths.reshape(len(views), -1), axis=1)
 
