@@ -18,6 +18,8 @@ from camera_calib.rig import Covariance, Rig
 
 _OVERLAP_GRID = 25
 """Pixels a side of the reference frame at which the overlap of the cameras is looked for."""
+_EDGE_PX = 1e-6
+"""Beyond rounding: a point on the edge of a frame is in it."""
 
 
 def covariance_of(rig: Rig) -> Covariance:
@@ -255,9 +257,8 @@ def overlap_points(rig: Rig, range_m: float) -> Array:
 
 def _in_frame(camera: FlatPortCamera, pixels: Array) -> NDArray[np.bool_]:
     x, y = pixels[:, 0], pixels[:, 1]
-    inside: NDArray[np.bool_] = (
-        (x >= 0.0) & (x <= camera.width_px) & (y >= 0.0) & (y <= camera.height_px)
-    )
+    right, bottom = camera.width_px + _EDGE_PX, camera.height_px + _EDGE_PX
+    inside: NDArray[np.bool_] = (x >= -_EDGE_PX) & (x <= right) & (y >= -_EDGE_PX) & (y <= bottom)
     return inside
 
 
