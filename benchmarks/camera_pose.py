@@ -196,8 +196,9 @@ def table(levels: Sequence[Level]) -> str:
     ]
     for level in levels:
         published = PUBLISHED.get(level.noise_px)
-        ratios = "-"
+        ratios = scores = "-"
         if level.noise_px > 0:
+            scores = f"{level.by_sigma:.3f}"
             ratios = f"{level.rms_deg / level.bound_deg:.3f} / {level.rms_mm / level.bound_mm:.3f}"
         rows.append(
             f"| {level.noise_px} "
@@ -205,6 +206,6 @@ def table(levels: Sequence[Level]) -> str:
             f"| {level.mean_deg:.3g} / {level.mean_mm:.3g} "
             f"| {level.rms_deg:.3g} / {level.rms_mm:.3g} "
             f"| {level.bound_deg:.3g} / {level.bound_mm:.3g} | {ratios} "
-            f"| {level.by_sigma:.3f} | {level.missed:.2f}, {level.wrong:.2f} |"
+            f"| {scores} | {level.missed:.2f}, {level.wrong:.2f} |"
         )
     return "\n".join(rows)

@@ -1,0 +1,249 @@
+"""Points per second of the flat-port camera, beside peers, in the same run.
+
+Peers do less than `project` does (no port), so equal work is compared where there is a peer for it:
+- `cv2.projectPoints` projects through a lens without a port. Its Python binding always fills in
+  the slopes by the lens and the pose too, so it stands beside `project` and `project_jacobian`.
+- COLMAP's OPENCV camera projects and unprojects through a lens without a port, and nothing else.
+- `cv2.undistortPoints` inverts the lens, told to iterate until a pixel is right to 1e-9.
+- AquaCal projects through one flat interface: beside `project` with glass of thickness 0.
+All get the same float64 points and the same distortion, after a run each to warm up; runs alternate
+and the best of each counts, so that what else the machine does slows nobody alone.
+"""
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
+import numpy as np
+import pycolmap
+
+from alice_survey.config import CameraConfig, WaterConfig
+from alice_survey.frames import Array
+from camera_calib.flat_port import FlatPortCamera
+from camera_calib.rig import design_rig
+
+_CORES = 2
+_POOL = ThreadPoolExecutor(_CORES)
+_SAME_PX = 1e-9
+_SAME_AS_AQUACAL_PX = 1e-4
+"""AquaCal stops at 1e-9 m on the interface: some 1e-6 px here."""
+_UNTIL = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One piece of work and a peer's like it, in millions of points per second."""
+
+    what: str
+    ours: float
+    ours_two_cores: float
+    peer: str
+    theirs: float
+    theirs_two_cores: float | None
+    """None where the peer is another program."""
+    goals: tuple[float, ...] = ()
+    """The least ratios on one core that are asked for."""
+
+    @property
+    def ratio(self) -> float:
+        """Ours over theirs, on one core."""
+        return self.ours / self.theirs
+
+
+def lens_camera() -> FlatPortCamera:
+    """The paper's camera with all five common distortion terms."""
+    camera = design_rig(CameraConfig(), WaterConfig()).cameras["left"]
+    return replace(camera, k1=-0.12, k2=0.08, p1=2e-4, p2=-3e-4, k3=0.01)
+
+
+def measure(points_count: int, runs: int, aquacal: Path | None) -> list[Row]:
+    """All rows.
+
+    Args:
+        points_count: how many points each run takes.
+        runs: how many runs of each; the best counts.
+        aquacal: a Python interpreter that can import AquaCal.
+    """
+    camera = lens_camera()
+    rng = np.random.default_rng(1)
+    pixels = rng.uniform([0, 0], [camera.width_px, camera.height_px], (points_count, 2))
+    points = camera.at_depth(pixels, rng.uniform(0.6, 10.0, points_count))
+    matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]])
+    distortion = np.array([camera.k1, camera.k2, camera.p1, camera.p2, camera.k3])
+    zero = np.zeros(3)
+    colmap = pycolmap.Camera(
+        model="FULL_OPENCV",
+        width=camera.width_px,
+        height=camera.height_px,
+        params=[*matrix[[0, 1], [0, 1]], *matrix[:2, 2], *distortion, 0.0, 0.0, 0.0],
+    )
+
+    def opencv(some: Array) -> Array:
+        found: Array = cv2.projectPoints(some, zero, zero, matrix, distortion)[0]
+        return found.reshape(-1, 2)
+
+    def opencv_back(some: Array) -> Array:
+        found: Array = cv2.undistortPoints(some, matrix, distortion, criteria=_UNTIL)
+        return found.reshape(-1, 2)
+
+    in_air = replace(camera, n_water=1.0, port_distance_m=0.0, glass_thickness_m=0.0)
+    _same("cv2.projectPoints", opencv(points), in_air.project(points), _SAME_PX)
+    _same("COLMAP's projection", colmap.img_from_cam(points), in_air.project(points), _SAME_PX)
+    rays = np.hstack([opencv_back(pixels), np.ones((points_count, 1))])
+    _same("cv2.undistortPoints", in_air.project(rays), pixels, 1e-6)
+    _same("unproject", camera.project(np.add(*camera.unproject(pixels))), pixels, _SAME_PX)
+
+    works: dict[str, tuple[Callable[[Array], object], Array]] = {
+        "project": (camera.project, points),
+        "unproject": (camera.unproject, pixels),
+        "project_jacobian": (camera.project_jacobian, points),
+        "cv2.projectPoints": (opencv, points),
+        "cv2.undistortPoints": (opencv_back, pixels),
+        "COLMAP's img_from_cam": (colmap.img_from_cam, points),
+        "COLMAP's cam_from_img": (colmap.cam_from_img, pixels),
+    }
+    one = {name: partial(*work) for name, work in works.items()}
+    two = {f"{name}, two cores": _shared(*work) for name, work in works.items()}
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        best = race({**one, **two}, runs)
+    finally:
+        cv2.setNumThreads(threads)
+    speed = {name: points_count / seconds / 1e6 for name, seconds in best.items()}
+
+    def row(what: str, ours: str, peer: str, *goals: float) -> Row:
+        return Row(
+            what=what,
+            ours=speed[ours],
+            ours_two_cores=speed[f"{ours}, two cores"],
+            peer=peer,
+            theirs=speed[peer],
+            theirs_two_cores=speed[f"{peer}, two cores"],
+            goals=goals,
+        )
+
+    rows = [
+        row("project", "project", "cv2.projectPoints", 1.0, 2.0),
+        row("project", "project", "COLMAP's img_from_cam"),
+        row("project with slopes", "project_jacobian", "cv2.projectPoints"),
+        row("unproject", "unproject", "cv2.undistortPoints"),
+        row("unproject", "unproject", "COLMAP's cam_from_img"),
+    ]
+    if aquacal is not None:
+        rows.append(beside_aquacal(replace(camera, glass_thickness_m=0.0), points, runs, aquacal))
+    return rows
+
+
+def beside_aquacal(camera: FlatPortCamera, points: Array, runs: int, python: Path) -> Row:
+    """Projection through one interface, in turns with AquaCal in a process of its own."""
+    some = points[: min(len(points), 20_000)]
+    with TemporaryDirectory() as folder:
+        case = Path(folder) / "case.npz"
+        np.savez(
+            case,
+            points=some,
+            matrix=[[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]],
+            distortion=[camera.k1, camera.k2, camera.p1, camera.p2, camera.k3],
+            size=[camera.width_px, camera.height_px],
+            port_distance_m=camera.port_distance_m,
+            n_water=camera.n_water,
+        )
+        with _peer(python, case) as (name, run):
+            pixels = np.load(case.with_suffix(".pixels.npy"))
+            _same(name, pixels, camera.project(some), _SAME_AS_AQUACAL_PX)
+            ours, both = partial(camera.project, some), _shared(camera.project, some)
+            for work in (ours, both):
+                work()
+            seconds = [np.inf, np.inf, np.inf]
+            for _ in range(max(runs // 3, 3)):
+                for i, timed in enumerate((lambda: _timed(ours), lambda: _timed(both), run)):
+                    seconds[i] = min(seconds[i], timed())
+    speed = [len(some) / s / 1e6 for s in seconds]
+    return Row(
+        what="project, no glass",
+        ours=speed[0],
+        ours_two_cores=speed[1],
+        peer=f"refractive_project_batch ({name})",
+        theirs=speed[2],
+        theirs_two_cores=None,
+        goals=(20.0,),
+    )
+
+
+@contextmanager
+def _peer(python: Path, case: Path) -> Iterator[tuple[str, Callable[[], float]]]:
+    """AquaCal's name, and a function that has it run once and tells the seconds it took."""
+    script = Path(__file__).with_name("aquacal_peer.py")
+    with subprocess.Popen(
+        [str(python), str(script), str(case)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        if process.stdin is None or process.stdout is None:
+            raise RuntimeError("the pipes to AquaCal are missing")
+        to_peer, from_peer = process.stdin, process.stdout
+
+        def run() -> float:
+            to_peer.write("run\n")
+            to_peer.flush()
+            return float(from_peer.readline())
+
+        name = from_peer.readline().strip()
+        if not name:
+            raise SystemExit(f"{python} cannot run AquaCal: install it there, or give --aquacal")
+        yield name, run
+        to_peer.close()
+
+
+def race(works: Mapping[str, Callable[[], object]], runs: int) -> dict[str, float]:
+    """Least seconds of each, in turns, after one run each to warm up."""
+    best = dict.fromkeys(works, np.inf)
+    for run in range(runs + 1):
+        for name, work in works.items():
+            seconds = _timed(work)
+            if run:
+                best[name] = min(best[name], seconds)
+    return best
+
+
+def _timed(work: Callable[[], object]) -> float:
+    started = time.perf_counter()
+    work()
+    return time.perf_counter() - started
+
+
+def _shared(work: Callable[[Array], object], rows: Array) -> Callable[[], object]:
+    """The work on all cores, each with its share of the rows."""
+    shares = np.array_split(rows, _CORES)
+    return lambda: list(_POOL.map(work, shares))
+
+
+def _same(what: str, found: Array, expected: Array, limit_px: float) -> None:
+    miss = np.abs(found - expected).max()
+    if not miss < limit_px:
+        sys.exit(f"{what} does other work: its pixels differ by {miss:.3g}")
+
+
+def table(rows: list[Row]) -> str:
+    """The rows in Markdown."""
+    lines = [
+        "| work | M points/s, one core | two | peer | M points/s, one core | two | ratio |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        theirs_two = "-" if row.theirs_two_cores is None else f"{row.theirs_two_cores:.3g}"
+        lines.append(
+            f"| {row.what} | {row.ours:.3g} | {row.ours_two_cores:.3g} | {row.peer} "
+            f"| {row.theirs:.3g} | {theirs_two} | {row.ratio:.3g} |"
+        )
+    return "\n".join(lines)
