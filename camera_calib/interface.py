@@ -27,6 +27,8 @@ _MISFIT = 0.03
 """A pose that misses its points by more than this share of the frame's diagonal is no pose."""
 _AMBIGUOUS = 1.5
 _STEPS = 100
+_SETTLED_PX = 1e-9
+"""A step that moves the pixels by less ends the search."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -228,16 +230,18 @@ def place_camera(
             glass_thickness_m=glass_thickness_m,
             n_glass=n_glass,
         )
-        found.append(_settle(fixed))
+        if _cost(fixed) < math.inf:
+            found.append(_settle(fixed))
     found.sort(key=lambda camera: camera.reference_rms_px)
-    best = found[0]
     limit = _MISFIT * math.hypot(lens.width_px, lens.height_px)
-    if not best.reference_rms_px < limit:
+    if not found or not found[0].reference_rms_px < limit:
+        missed = f" by {found[0].reference_rms_px:.0f} px rms" if found else ""
         raise CalibrationError(
-            f"{reference.source}: the best pose misses the reference points by "
-            f"{best.reference_rms_px:.0f} px rms ({limit:.0f} px are allowed): check their order, "
-            "their units and that pixels and lens are of the same camera"
+            f"{reference.source}: the best pose misses the reference points{missed} "
+            f"({limit:.0f} px are allowed): check their order, their units and that pixels and "
+            "lens are of the same camera"
         )
+    best = found[0]
     _warn_if_ambiguous(found)
     if plane.heights_m(best.position_world) > 0.0:
         flipped = replace(plane, normal_world=-plane.normal_world)
@@ -301,15 +305,12 @@ def _settle(camera: FixedCamera) -> FixedCamera:
         step = np.asarray(-np.linalg.solve(damped, gradient), dtype=np.float64)
         tried = camera.moved(step)
         new_cost = _cost(tried)
+        if float(np.abs(by_motion @ step).max()) < _SETTLED_PX:
+            return tried if math.isfinite(new_cost) else camera
         if new_cost <= cost:
-            settled = float(np.abs(by_motion @ step).max()) < 1e-10
-            camera, cost, damping = tried, new_cost, 0.1 * damping if damping > 1e-9 else 0.0
-            if settled:
-                break
+            camera, cost, damping = tried, new_cost, 0.1 * damping
         else:
             damping = max(10.0 * damping, 1e-9)
-            if damping > 1e9:
-                break
     return camera
 
 

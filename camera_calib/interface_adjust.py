@@ -17,6 +17,7 @@ from scipy.stats import chi2
 from alice_survey.errors import CalibrationError
 from alice_survey.frames import Array
 from camera_calib.flat_port import PARAMETERS
+from camera_calib.freedom import PORT, POSE
 from camera_calib.interface import FixedCamera, Reference, check_sides, place_camera
 from camera_calib.rig import Covariance, Rig
 from camera_calib.single_lens import KnownLens
@@ -28,8 +29,6 @@ _ROUNDS = 60
 _SETTLED_PX = 1e-6
 _CHUNK = 20_000
 _FEWEST_POINTS = 50
-_POSE = ("rx_rad", "ry_rad", "rz_rad", "x_m", "y_m", "z_m")
-_PORT = ("port_distance_m", "normal_x", "normal_y")
 _STEP = 1e-6
 
 
@@ -160,7 +159,7 @@ def refine(tank: Tank, pixels: Array) -> Refinement:
         if usable < _FEWEST_POINTS:
             raise CalibrationError(
                 f"{usable} detections give a point in the water; at least {_FEWEST_POINTS} are "
-                "needed to refine the poses: leave --refine out"
+                "needed to refine the poses: use --no-refine"
             )
         if count <= _ROUNDS // 2:  # then the scale is held, so that the search can settle
             sigma_px = noise_px(found)
@@ -188,7 +187,7 @@ def refine(tank: Tank, pixels: Array) -> Refinement:
                 tank=replace(tank, covariance=covariance), sigma_px=sigma_px, rounds=count
             )
     raise CalibrationError(
-        f"the refinement of the poses did not settle in {_ROUNDS} rounds: leave --refine out, or "
+        f"the refinement of the poses did not settle in {_ROUNDS} rounds: use --no-refine, or "
         "check that detections of all cameras are of the same moments"
     )
 
@@ -339,7 +338,7 @@ def _rig_covariance(tank: Tank) -> Covariance:
         lens_rows[:, block] = np.eye(block.stop - block.start)
         rows.append(lens_rows)
         names += [f"{camera.name}.{name}" for name in tank.lenses[i].free]
-        derived = _PORT if i == 0 else (*_PORT, *_POSE)
+        derived = PORT if i == 0 else (*PORT, *POSE)
         names += [f"{camera.name}.{name}" for name in derived]
         rows.append(_derived_slopes(tank, i))
     carried = np.concatenate(rows)
@@ -358,14 +357,19 @@ def _derived_slopes(tank: Tank, i: int) -> Array:
             for sign in (1.0, -1.0):
                 moved = list(tank.cameras)
                 moved[j] = moved[j].moved(sign * step)
-                ends.append(_derived(moved[0], moved[i], i == 0))
+                port = np.array([moved[i].camera.parameter(name) for name in PORT])
+                pose = _pose_change(tank, moved[0], moved[i], i)
+                ends.append(port if i == 0 else np.concatenate([port, pose]))
             slopes[:, tank.motion_block(j).start + axis] = (ends[0] - ends[1]) / (2 * _STEP)
     return slopes
 
 
-def _derived(first: FixedCamera, camera: FixedCamera, is_first: bool) -> Array:
-    port = np.array([camera.camera.parameter(name) for name in _PORT])
-    if is_first:
-        return port
-    pose: RigidTransform = camera.cam_from_world * first.cam_from_world.inv()
-    return np.concatenate([port, pose.rotation.as_rotvec(), pose.translation])
+def _pose_change(tank: Tank, first: FixedCamera, camera: FixedCamera, i: int) -> Array:
+    """How a camera's pose in the first one's frame differs from the tank's: turn, then shift.
+
+    The turn is about the camera's own axes, as the sigmas of a rig's rotations are meant.
+    """
+    before = tank.cameras[i].cam_from_world * tank.cameras[0].cam_from_world.inv()
+    after: RigidTransform = camera.cam_from_world * first.cam_from_world.inv()
+    turn = (after.rotation * before.rotation.inv()).as_rotvec()
+    return np.concatenate([turn, after.translation - before.translation])

@@ -5,7 +5,8 @@ views that took no part: one view at a time is left out, its pose alone is then 
 remains is held-out error. A model that folds back within the frame is no lens and is not taken.
 """
 
-from collections.abc import Mapping, Sequence
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -16,22 +17,11 @@ from alice_survey.errors import CalibrationError
 from alice_survey.executor import parallel_map
 from alice_survey.frames import Array
 from camera_calib.flat_port import PARAMETERS, FlatPortCamera, pose_jacobian
+from camera_calib.freedom import LENSES, intrinsics
 from camera_calib.lens import COEFFICIENTS
 
-_PINHOLE = ("fx_px", "fy_px", "cx_px", "cy_px")
 _HALF_PX = 0.5
 """OpenCV counts from the centre of the first pixel."""
-_DECENTRED = ("p1", "p2")
-MODELS: Mapping[str, tuple[str, ...]] = {
-    "pinhole": (),
-    "radial 1": ("k1", *_DECENTRED),
-    "radial 2": ("k1", "k2", *_DECENTRED),
-    "radial 3": ("k1", "k2", *_DECENTRED, "k3"),
-    "rational": ("k1", "k2", *_DECENTRED, "k3", "k4", "k5", "k6"),
-    "rational prism": COEFFICIENTS,
-}
-"""Distortion models by name: which of OpenCV's coefficients each adjusts. Elements of a real lens
-are a little off centre, so that every model with distortion has the decentring terms p1 and p2."""
 _FEWEST_VIEWS = 6
 _OUTLYING = 3.0
 """A view whose residual is so many times the median view's is left out (blur, a moving board)."""
@@ -87,7 +77,7 @@ def calibrate_single_lens(
     views: Sequence[LensView],
     target_points: Array,
     size_px: tuple[int, int],
-    models: Sequence[str] = tuple(MODELS),
+    models: Sequence[str] = tuple(LENSES),
     threads: int = 1,
 ) -> SingleLens:
     """Calibrate one camera in air.
@@ -96,16 +86,16 @@ def calibrate_single_lens(
         views: pictures of the target.
         target_points: (N, 3) its points, z = 0, metres.
         size_px: width and height of the pictures.
-        models: names of `MODELS` to choose from.
+        models: names of `freedom.LENSES` to choose from.
         threads: cores to use.
 
     Raises:
         CalibrationError: too few views, an unknown model, or none that fits the frame.
     """
-    unknown = [name for name in models if name not in MODELS]
+    unknown = [name for name in models if name not in LENSES]
     if unknown or not models:
         raise CalibrationError(
-            f"no lens model is called {', '.join(unknown) or '(none)'}; known: {'; '.join(MODELS)}"
+            f"no lens model is called {', '.join(unknown) or '(none)'}; known: {'; '.join(LENSES)}"
         )
     kept, rejected = _without_outlying(views, target_points, size_px, models)
     jobs = [(kept, target_points, size_px, name) for name in models]
@@ -118,7 +108,7 @@ def calibrate_single_lens(
         )
     chosen = min(sound, key=lambda model: model.held_out_px)
     fit = _fit(kept, target_points, size_px, chosen.name)
-    free = _free(chosen.name)
+    free = intrinsics(chosen.name)
     return SingleLens(
         camera=fit.camera,
         free=free,
@@ -139,10 +129,6 @@ class _Fit:
     view_rms_px: Array
 
 
-def _free(model: str) -> tuple[str, ...]:
-    return (*_PINHOLE, *MODELS[model])
-
-
 def _seen(view: LensView, target_points: Array) -> tuple[Array, Array]:
     found = np.isfinite(view.pixels).all(axis=1)
     return target_points[found], view.pixels[found]
@@ -155,15 +141,16 @@ def _fit(
     pairs = [_seen(view, target_points) for view in views]
     # OpenCV wants single precision; at a unit of its own size a target loses nothing by it.
     scale = float(np.ptp(target_points, axis=0).max())
-    solution = cv2.calibrateCameraExtended(
-        [(points / scale).astype(np.float32) for points, _ in pairs],
-        [(pixels - _HALF_PX).astype(np.float32) for _, pixels in pairs],
-        size_px,
-        None,
-        None,
-        flags=_flags(MODELS[model]),
-        criteria=_CRITERIA,
-    )
+    with _one_thread():
+        solution = cv2.calibrateCameraExtended(
+            [(points / scale).astype(np.float32) for points, _ in pairs],
+            [(pixels - _HALF_PX).astype(np.float32) for _, pixels in pairs],
+            size_px,
+            None,
+            None,
+            flags=_flags(LENSES[model]),
+            criteria=_CRITERIA,
+        )
     _, matrix, distortion, rotations, translations, _, _, view_rms = solution
     values = dict(zip(COEFFICIENTS, map(float, distortion.ravel()), strict=False))
     camera = FlatPortCamera(
@@ -181,6 +168,17 @@ def _fit(
         translations=np.stack(translations).reshape(-1, 3) * scale,
         view_rms_px=np.asarray(view_rms).ravel(),
     )
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """OpenCV's threads add up in no fixed order; one gives the same bytes every time."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
 
 
 def _flags(free: Sequence[str]) -> int:
@@ -203,7 +201,7 @@ def _without_outlying(
 ) -> tuple[list[LensView], dict[str, float]]:
     """Leave out, one by one, views that no model fits as it fits the others."""
     kept, rejected = list(views), dict[str, float]()
-    richest = max(models, key=lambda name: len(MODELS[name]))
+    richest = max(models, key=lambda name: len(LENSES[name]))
     while True:
         if len(kept) < _FEWEST_VIEWS:
             raise CalibrationError(

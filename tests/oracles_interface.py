@@ -1,0 +1,116 @@
+"""Slow, obvious twins of triangulation, and a tank whose truth is known."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from camera_calib.flat_port import FlatPortCamera
+from camera_calib.interface import FixedCamera, Plane, Reference, plane_through
+from camera_calib.interface_adjust import Tank
+from camera_calib.single_lens import KnownLens
+
+Array = NDArray[np.float64]
+
+LENS = FlatPortCamera(
+    width_px=2704,
+    height_px=1520,
+    fx_px=1230.0,
+    fy_px=1228.0,
+    cx_px=1350.0,
+    cy_px=750.0,
+    k1=-0.2,
+    k2=0.05,
+    p1=-0.0008,
+    p2=0.0005,
+    n_water=1.0,
+)
+SIZE_M = np.array([0.40, 0.21, 0.20])
+"""The tank: x right, y to the front camera, z down; the water surface is z = 0."""
+
+
+def triangulate_slowly(
+    cameras: Sequence[FlatPortCamera],
+    poses: Sequence[RigidTransform],
+    pixels: Array,
+    start: Array,
+) -> Array:
+    """One point of least squared reprojection error, by scipy with numeric slopes."""
+
+    def miss(point: Array) -> Array:
+        seen = [c.project(pose.apply(point)) for c, pose in zip(cameras, poses, strict=True)]
+        return (np.stack(seen) - pixels).ravel()
+
+    found = least_squares(miss, start, jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    return np.asarray(found.x)
+
+
+def nearest_slowly(origins: Array, directions: Array) -> Array:
+    """One point nearest to rays, (C, 3) each, as a linear least-squares problem."""
+    across = [np.eye(3) - np.outer(d, d) for d in directions]
+    rows = np.concatenate(across)
+    right = np.concatenate([a @ o for a, o in zip(across, origins, strict=True)])
+    return np.linalg.lstsq(rows, right, rcond=None)[0]
+
+
+def looking(position: Array, target: Array, right: Array) -> RigidTransform:
+    """Camera from world, of a camera at a place that looks at another, its x axis near `right`."""
+    z = (target - position) / np.linalg.norm(target - position)
+    x = right - (right @ z) * z
+    x /= np.linalg.norm(x)
+    rotation = Rotation.from_matrix(np.stack([x, np.cross(z, x), z]))
+    return RigidTransform.from_components(-rotation.apply(position), rotation)
+
+
+def true_tank(
+    glass_m: Sequence[float] = (0.0, 0.006), n_water: float = 1.333, lean_m: float = 0.008
+) -> Tank:
+    """Two cameras, above the water and before a front wall that leans, exactly where they are."""
+    x, y, z = SIZE_M
+    tops = np.array([[0, 0, 0], [x, 0, 0], [x, y, 0], [0, y, 0]], dtype=np.float64)
+    fronts = np.array([[0, y, 0], [x, y, 0], [x, y - lean_m, z], [0, y - lean_m, z]])
+    places = (np.array([0.19, 0.08, -0.21]), np.array([0.18, 0.40, 0.08]))
+    middle = SIZE_M / 2
+    lens = KnownLens(camera=LENS)
+    cameras = []
+    for i, (points, place) in enumerate(zip((tops, fronts), places, strict=True)):
+        pose = looking(place, middle, np.array([-1.0 if i == 0 else 1.0, 0.02, 0.01]))
+        pixels = LENS.project(pose.apply(points))
+        reference = Reference(camera=f"cam{i + 1}", pixels=pixels, points_world=points)
+        fixed = FixedCamera(
+            name=f"cam{i + 1}",
+            lens=LENS,
+            cam_from_world=pose,
+            plane=into_water(reference, middle),
+            reference=reference,
+            n_water=n_water,
+            glass_thickness_m=glass_m[i],
+        )
+        cameras.append(fixed)
+    return Tank(
+        cameras=tuple(cameras),
+        lenses=(lens, lens),
+        reference_sigma_px=1.0,
+        covariance=np.zeros((12, 12)),
+    )
+
+
+def into_water(reference: Reference, inside: Array) -> Plane:
+    """The plane of reference points with its normal on the side of a point in the water."""
+    plane = plane_through(reference)
+    if plane.heights_m(inside) < 0:
+        plane = replace(plane, normal_world=-plane.normal_world)
+    return plane
+
+
+def points_in_tank(rng: np.random.Generator, count: int) -> Array:
+    """Places in the water, away from the walls."""
+    return SIZE_M * rng.uniform(0.1, 0.75, (count, 3))
+
+
+def seen(tank: Tank, points_world: Array) -> Array:
+    """(C, N, 2) exact pixels."""
+    return np.stack([c.camera.project(c.cam_from_world.apply(points_world)) for c in tank.cameras])
