@@ -18,6 +18,8 @@ PROFILE_BINS = 12
 _FEWEST_IN_BIN = 8
 COVERED_REACH = 0.75
 """A corner of the frame is covered when a point lies beyond this share of both half sides."""
+TILTED_DEG = 15.0
+"""A view tilted by less tells little of focal length and port."""
 CORNERS = ("top left", "top right", "bottom left", "bottom right")
 
 

@@ -1,5 +1,6 @@
 """How figures of a calibration report look: style, and parts that several of them share."""
 
+import math
 from collections.abc import Callable, Sequence
 from io import BytesIO
 from typing import Any
@@ -8,7 +9,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -53,6 +54,10 @@ _STYLE: dict[str, Any] = {
 _DPI = 130
 WIDTH = 10.4
 _MOST_LABELS = 45
+_WIDE = 5.0
+"""Largest over least value from which levels go by factors."""
+_FINE, _COARSE, _DECADES = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0), (1.0, 2.0, 5.0), (1.0, 3.0)
+_MOST_LEVELS = 11
 
 Draw = Callable[[Figure], None]
 
@@ -137,11 +142,46 @@ def finish_profile(above: Axes, below: Axes, label: str, noise: float) -> None:
 
 
 def shared_levels(maps: Sequence[Array]) -> Array:
-    """About ten round numbers for some maps together, from 0 unless all values are far from it."""
+    """Some ten round numbers for maps together: evenly spaced, or by factors where values differ.
+
+    Factors show the middle of a frame as well as its corners, where an uncertainty may be a hundred
+    times larger.
+    """
     known = np.concatenate([values[np.isfinite(values)] for values in maps])
+    known = known[known > 0]
     low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
-    low = low if low > 0.5 * high else 0.0
-    return np.asarray(MaxNLocator(10).tick_values(low, max(high, low + 1e-9)), dtype=np.float64)
+    if not len(known) or high < _WIDE * low:
+        even = MaxNLocator(9).tick_values(low, max(high, low + 1e-9))
+        return np.asarray(even, dtype=np.float64)
+    low = max(low, float(np.quantile(known, 0.02)))
+    for steps in (_FINE, _COARSE, _DECADES):
+        decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+        series = np.array([step * 10.0**d for d in decades for step in steps])
+        first = max(int(np.searchsorted(series, low, side="right")) - 1, 0)
+        levels = series[first : int(np.searchsorted(series, high)) + 1]
+        if len(levels) <= _MOST_LEVELS:
+            break
+    return np.asarray(levels, dtype=np.float64)
+
+
+def banded(levels: Array) -> dict[str, Any]:
+    """Arguments of a filled contour whose bands have evenly spaced colours."""
+    return {
+        "levels": levels,
+        "cmap": SEQUENTIAL,
+        "norm": BoundaryNorm(levels.tolist(), SEQUENTIAL.N),
+        "extend": "min",
+    }
+
+
+def level_bar(
+    figure: Figure, image: Any, axes: Axes | list[Axes], levels: Array, text: str
+) -> None:
+    """A colour bar that names every level."""
+    bar = figure.colorbar(image, ax=axes, shrink=0.88, pad=0.015, spacing="uniform")
+    bar.set_ticks(levels.tolist(), labels=[f"{level:.4g}" for level in levels])
+    bar.minorticks_off()
+    bar.set_label(text)
 
 
 def draw_map(axes: Axes, judged: Judgement, name: str, values: Array, levels: Array) -> Any:
@@ -149,11 +189,11 @@ def draw_map(axes: Axes, judged: Judgement, name: str, values: Array, levels: Ar
     pixels = judged.cameras[name].map_pixels
     x, y = pixels[0, :, 0], pixels[:, 0, 1]
     shown = np.ma.masked_invalid(values)
-    image = axes.contourf(x, y, shown, levels=levels, cmap=SEQUENTIAL)
+    image = axes.contourf(x, y, shown, **banded(levels))
     lines = axes.contour(x, y, shown, levels=levels[1:-1], colors="white", linewidths=0.7)
-    middle = (levels[0] + levels[-1]) / 2
+    middle = float(levels[len(levels) // 2])
     for label in axes.clabel(lines, levels[1:-1:2], fmt="%g", fontsize=7.5):
-        label.set_color("white" if float(label.get_text()) > middle else INK)
+        label.set_color("white" if float(label.get_text()) >= middle else INK)
     axes.set_facecolor("#d9d9d9")
     draw_frame(axes, judged, name)
     return image

@@ -13,9 +13,9 @@ from camera_calib.report_figure import (
     COLOURS,
     DIVERGING,
     INK,
-    SEQUENTIAL,
     SOFT,
     axes_grid,
+    banded,
     colour,
     draw_frame,
     draw_map,
@@ -23,6 +23,7 @@ from camera_calib.report_figure import (
     finish_profile,
     frame_height,
     label_views,
+    level_bar,
     plain,
     png,
     shared_levels,
@@ -155,7 +156,10 @@ def plot_profiles(judged: Judgement) -> bytes:
                 draw_profile(grid[0][column], grid[1][column], found, c, name)
         noise = judged.calibration.noise_px
         for column, label in enumerate(
-            ("radius from the principal point (px)", "angle to the port's normal in water (deg)")
+            (
+                "radius from the principal point (px)",
+                "angle to the port's normal outside (deg)",
+            )
         ):
             grid[0][column].axhline(noise, color=INK, lw=1.0, ls="--", label="noise")
             finish_profile(grid[0][column], grid[1][column], label, noise)
@@ -262,7 +266,7 @@ def plot_projection(judged: Judgement) -> bytes:
                 image = draw_map(axes, judged, name, values, levels)
                 axes.set_title(f"{plain(name)}: {kind}", color=colour(c))
                 axes.set_ylabel("y (px)" if c == 0 else "")
-            figure.colorbar(image, ax=grid[row], shrink=0.85, label="sigma (px)", pad=0.015)
+            level_bar(figure, image, grid[row], levels, "sigma (px)")
 
     return png(frame_height(judged, 2), draw)
 
@@ -288,11 +292,11 @@ def plot_ranges(judged: Judgement) -> bytes:
         axes.set(xlabel="distance (m)", ylabel="sigma of a projection (px)")
         axes.set_title("Projection")
         _log_axes(axes)
-        axes.legend(ncols=1, fontsize=7.5, loc="best")
+        _legend_below(axes)
         if stereo:
             _draw_stereo(panels[1], judged)
 
-    return png(4.2, draw)
+    return png(5.0, draw)
 
 
 def _draw_stereo(axes: Axes, judged: Judgement) -> None:
@@ -309,7 +313,11 @@ def _draw_stereo(axes: Axes, judged: Judgement) -> None:
     axes.set(xlabel="distance (m)", ylabel="sigma (mm)")
     axes.set_title("Stereo")
     _log_axes(axes)
-    axes.legend(fontsize=7.5, loc="best")
+    _legend_below(axes)
+
+
+def _legend_below(axes: Axes) -> None:
+    axes.legend(ncols=2, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.14))
 
 
 def _log_axes(axes: Axes) -> None:
@@ -339,12 +347,9 @@ def plot_stereo_map(judged: Judgement) -> bytes:
             ("distance, after the best rigid motion (shape)", "distance from the rig"),
             strict=True,
         ):
-            kept = 1e3 * values[values <= np.quantile(values, 0.97)]
-            levels = shared_levels([kept])
-            image = axes.tricontourf(
-                x, y, 1e3 * values, levels=levels, cmap=SEQUENTIAL, extend="max"
-            )
-            figure.colorbar(image, ax=axes, shrink=0.9, label="sigma (mm)")
+            levels = shared_levels([1e3 * values])
+            image = axes.tricontourf(x, y, 1e3 * values, **banded(levels))
+            level_bar(figure, image, axes, levels, "sigma (mm)")
             axes.set(aspect="equal", xlabel="right (m)", ylabel="down (m)", title=title)
             axes.invert_yaxis()
             axes.grid(visible=False)

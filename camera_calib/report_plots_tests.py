@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
 from alice_survey.frames import Array
-from camera_calib.fit_quality import COVERED_REACH
+from camera_calib.fit_quality import COVERED_REACH, TILTED_DEG
 from camera_calib.judgement import Judgement
 from camera_calib.report_figure import (
     BAND,
@@ -24,11 +24,11 @@ from camera_calib.report_figure import (
     finish_profile,
     frame_height,
     label_views,
+    level_bar,
     plain,
     png,
     shared_levels,
 )
-from camera_calib.verdicts import TILTED_DEG
 
 
 def plot_halves(judged: Judgement) -> bytes:
@@ -45,6 +45,10 @@ def plot_halves(judged: Judgement) -> bytes:
             image = draw_map(axes, judged, name, values, levels)
             step = (slice(1, None, 3), slice(1, None, 3))
             places, arrows = halves.pixels[step], halves.difference_px[step]
+            longest = float(np.nanquantile(np.concatenate([m.ravel() for m in maps]), 0.9))
+            arrows = arrows / np.maximum(
+                1.0, np.linalg.norm(arrows, axis=-1, keepdims=True) / longest
+            )
             axes.quiver(
                 places[..., 0],
                 places[..., 1],
@@ -53,7 +57,7 @@ def plot_halves(judged: Judgement) -> bytes:
                 angles="xy",
                 color=COLOURS[1],
                 width=0.004,
-                scale=8 * float(levels[-1]),
+                scale=11 * longest,
             )
             axes.set_title(
                 f"{plain(name)}: {halves.rms_px:.3f} px rms "
@@ -61,7 +65,7 @@ def plot_halves(judged: Judgement) -> bytes:
                 color=colour(c),
             )
             axes.set_ylabel("y (px)" if c == 0 else "")
-        figure.colorbar(image, ax=grid[0], shrink=0.85, label="difference (px)", pad=0.015)
+        level_bar(figure, image, grid[0], levels, "difference (px)")
 
     return png(frame_height(judged), draw)
 

@@ -99,7 +99,7 @@ def residuals_section(judged: Judgement) -> Section:
                 alt="Lines: rms and mean outward part of residuals against radius and angle",
                 shows="Rms of one coordinate (above) and mean part away from the centre (below), "
                 "with two sigmas of chance as bars, against the radius and against the "
-                "angle of the ray in water to the port's normal.",
+                "angle of the ray outside to the port's normal.",
                 good="Flat at the dashed lines.",
                 otherwise="A trend with the radius speaks of lens distortion, one with the angle "
                 "that starts at the port's normal of the port's distance, glass or index.",

@@ -1,9 +1,9 @@
 """Sections of a calibration report: its tests, what the views cover, what was rejected."""
 
 from camera_calib import report_plots_tests as plots
+from camera_calib.fit_quality import TILTED_DEG
 from camera_calib.judgement import Judgement
 from camera_calib.report_page import Figure, Section, Table
-from camera_calib.verdicts import TILTED_DEG
 
 
 def hold_out_section(judged: Judgement) -> Section:
@@ -141,14 +141,21 @@ def coverage_section(judged: Judgement) -> Section:
                 f"{views.range_m.min():.2f} to {views.range_m.max():.2f}",
             )
         )
+    bare = [
+        f"{name}: no points near the {', '.join(c.coverage.uncovered)} of the frame."
+        for name, c in judged.cameras.items()
+        if c.coverage.uncovered
+    ]
     return Section(
         title="Coverage",
+        text=bare or ["Points come near all corners of all frames."],
         figures=[
             Figure(
                 png=plots.plot_coverage(judged),
                 title="Where points fell",
                 alt="Counts of points by cell of each frame; corners without points hatched",
-                shows="Points seen by cell; hatched corners have none.",
+                shows="Points seen by cell. In hatched corners there are none: distortion is "
+                "guessed there.",
                 good="All cells filled, corners too.",
                 otherwise="Hold the target so that it fills the empty parts, partly out of the "
                 "frame if it can be read so (ChArUco, AprilTags).",

@@ -229,17 +229,6 @@ def test_a_forgotten_port_is_told() -> None:
     assert any("fit 2 times worse" in text for text in told)
 
 
-def test_views_at_one_distance_without_tilt_are_told() -> None:
-    """The lines on coverage, on a calibration cut down to views that are all alike."""
-    found = usual()
-    pose = found.rig_from_target[0]
-    flat = type(pose).from_translation([-0.15, -0.1, 1.0])
-    alike = replace(found, rig_from_target=type(pose).concatenate([flat] * len(found.views)))
-    told = " ".join(v.text for v in verdicts(judge(alike, None)) if v.level == "look")
-    assert "left: views only from 1.00 to 1.00 m" in told
-    assert "left: 0 views tilted by more than 15 degrees" in told
-
-
 def test_the_working_range_follows_the_views() -> None:
     """A target measured in squares of its own has no metres: 2 would be inside of the camera."""
     assert judge(usual(), None).working_range_m == 2.0
