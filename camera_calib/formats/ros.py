@@ -63,7 +63,7 @@ def read_ros(path: Path, reading: Reading) -> Rig:
 
 
 def write_ros(path: Path, rig: Rig) -> list[Path]:
-    """Write a file of one camera, or into a folder those of a stereo pair, rectified by OpenCV.
+    """Write a file of one camera, or into a folder those of a stereo pair, rectified as by OpenCV.
 
     Raises:
         CalibrationError: the rig has more than two cameras, or two that cannot be rectified.
@@ -86,11 +86,14 @@ def write_ros(path: Path, rig: Rig) -> list[Path]:
         raise CalibrationError(f"{path}: ROS rectifies pairs of one picture size only")
     if float(np.linalg.norm(second_from_first.translation)) == 0.0:
         raise CalibrationError(f"{path}: the cameras have no baseline to rectify along")
-    r1, r2, p1, p2, *_ = cv2.stereoRectify(
+    _, _, p1, p2, *_ = cv2.stereoRectify(
         camera_matrix(first), distortion(first), camera_matrix(second), distortion(second), size,
         second_from_first.rotation.as_matrix(), second_from_first.translation[:, None],
         flags=cv2.CALIB_ZERO_DISPARITY, alpha=0.0,
     )  # fmt: skip
+    axis = int(np.argmax(np.abs(p2[:2, 3])))
+    r1, r2, line = _rectified(second_from_first, axis)
+    p2[:, 3] = p2[axis, axis] * line
     pieces = zip(files, names, (first, second), (r1, r2), (p1, p2), strict=True)
     for file, name, camera, rotation, projection in pieces:
         _write(file, _document(name, camera, rotation, projection))
@@ -147,6 +150,27 @@ def _second_from_first(first: Fields, second: Fields) -> RigidTransform:
     baseline = projection[:, 3] / [projection[0, 0], projection[1, 1], 1.0]
     back = _rectification(second).inv()
     return RigidTransform.from_components(back.apply(baseline), back * _rectification(first))
+
+
+def _rectified(second_from_first: RigidTransform, axis: int) -> tuple[Array, Array, Array]:
+    """Rotations of both cameras to a pair with its baseline along x (0) or y (1), and that line.
+
+    Each takes half of the turn between the cameras, then both what is left to the axis, as
+    `cv2.stereoRectify` does; that one takes turns below 1e-5 rad for none, so that the pose could
+    not be had back from its rotations.
+    """
+    half = Rotation.from_rotvec(-0.5 * second_from_first.rotation.as_rotvec())
+    shift = half.apply(second_from_first.translation)
+    length = float(np.linalg.norm(shift))
+    line = np.zeros(3)
+    line[axis] = np.sign(shift[axis])
+    across = np.cross(shift / length, line)
+    sine = float(np.linalg.norm(across))
+    angle = np.arctan2(sine, shift @ line / length)
+    level = Rotation.from_rotvec(across * (angle / sine if sine > 0 else 0.0))
+    second = level * half
+    first = second * second_from_first.rotation
+    return first.as_matrix(), second.as_matrix(), line * length
 
 
 def _document(name: str, camera: FlatPortCamera, rotation: Array, projection: Array) -> Any:
