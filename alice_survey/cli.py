@@ -1,7 +1,7 @@
 """The command line: each command parses, calls and prints; the work is elsewhere."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -174,20 +174,68 @@ def target(
     print_result(*print_target(what, output, paper, dpi), as_json)
 
 
-@app.command(epilog=examples("calibrate -w reef"))
+@app.command(
+    epilog=examples(
+        "calibrate -w reef",
+        "calibrate --left 'left*.jpg' --right 'right*.jpg' --target 'chessboard 9x6 25mm' -o air",
+        "calibrate --pictures dry --target 'charuco 12x9 40mm 30mm' --lens rational -o one",
+        "calibrate --left L --right R --target board.json --water --start air/rig.json"
+        " --glass 0.01 -o pool",
+    )
+)
 def calibrate(
     workspace: Workspace = WORK,
+    left: Annotated[str | None, typer.Option(help="Folder or 'pattern' of pictures.")] = None,
+    right: Annotated[str | None, typer.Option(help="Those of the right camera.")] = None,
+    pictures: Annotated[str | None, typer.Option(help="Those of a single camera.")] = None,
+    target: Annotated[str | None, typer.Option(help="In words, or target.json.")] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Folder to write.")] = None,
+    lens: Annotated[
+        str, typer.Option(help="pinhole, k1, k2, opencv4, opencv5, rational, prism or full.")
+    ] = "opencv5",
+    water: Annotated[
+        bool, typer.Option("--water/--air", help="Where: under water through ports, or in air.")
+    ] = False,
+    start: Annotated[Path | None, typer.Option(help="rig.json calibrated in air.")] = None,
+    intrinsics: Annotated[
+        Literal["held", "prior", "free"] | None,
+        typer.Option(help="What is done with those of --start; prior where it has sigmas."),
+    ] = None,
+    port_distance: Annotated[float | None, typer.Option(min=0, help="First value, m.")] = None,
+    glass: Annotated[float | None, typer.Option(min=0, help="Thickness, m.")] = None,
+    glass_sigma: Annotated[
+        float | None, typer.Option(min=1e-7, help="Find the thickness too; known to this, m.")
+    ] = None,
+    n_glass: Annotated[float | None, typer.Option(min=1, max=2, help="1.52 if not given.")] = None,
+    n_water: Annotated[
+        float | None, typer.Option(min=1, max=1.4, help="1.34 if not given.")
+    ] = None,
+    carry_to_n: Annotated[
+        float | None, typer.Option(min=1, max=1.4, help="Also write the rig in other water.")
+    ] = None,
     survey: SurveyFile = None,
     threads: Threads = None,
     as_json: AsJson = False,
 ) -> None:
-    """Calibrate the rig through its ports.
+    """Calibrate cameras, in air or through their ports.
 
-    From the pictures of the board in the pool.
+    From the pool of a survey, or from pictures of a target: chessboard, ChArUco or AprilTag grid.
+    Writes the rig with its covariance, the residuals and a report.
     """
-    from alice_survey.survey import run
+    if left is None and right is None and pictures is None:
+        from alice_survey.survey import run
 
-    print_result(*run(["calibration"], workspace, survey, None, threads), as_json)
+        result = run(["calibration"], workspace, survey, None, threads)
+    else:
+        from camera_calib.calibrate_pictures import calibrate_command
+
+        result = calibrate_command(
+            left=left, right=right, pictures=pictures, target=target, output=output, lens=lens,
+            water=water, start=start, known=intrinsics, port_distance_m=port_distance,
+            glass_thickness_m=glass, glass_sigma_m=glass_sigma, n_glass=n_glass, n_water=n_water,
+            carry_to_n=carry_to_n, threads=threads,
+        )  # fmt: skip
+    print_result(*result, as_json)
 
 
 @app.command(

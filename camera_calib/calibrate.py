@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.errors import CalibrationError
 from alice_survey.frames import Array
-from camera_calib.adjust import RAYLEIGH_MEDIAN, Adjustment, adjust, stack_views
+from camera_calib.adjust import adjust, stack_views
 from camera_calib.advice import advice
 from camera_calib.calibration import Calibration, Rejection, TargetView
 from camera_calib.flat_port import FlatPortCamera
@@ -27,25 +27,20 @@ from camera_calib.freedom import (
     of_cameras,
     pose_names,
 )
-from camera_calib.normal_equations import Flags
 from camera_calib.observability import unobservable
+from camera_calib.outliers import (
+    FEWEST_VIEWS,
+    STEPS,
+    adjust_without_outliers,
+    check_enough,
+    rejected,
+    whole_picture,
+)
 from camera_calib.rig import Rig
 from camera_calib.start import first_cam_from_rig, first_focal_px, locate_all, spans
 
 Intrinsics = Literal["held", "prior", "free"]
 
-FEWEST_VIEWS = 4
-OUTLIER = 6.0
-"""Length of a residual, in sigmas of a coordinate, beyond which a point takes no part: of normal
-noise one in 65 million is longer."""
-_DULLEST = 3.0
-"""Largest noise of one picture, in that of all, that still is noise."""
-_LEAST_LIMIT_PX = 1e-4
-_ROUNDS = 6
-_STEPS = 40
-"""Of an adjustment that may still hold views which do not fit at all."""
-_FEWEST_FITTING = 0.5
-"""Share of a picture's points; with fewer the whole picture is left out."""
 _ROUGHLY = 0.1
 """Sigmas to which values are found that only serve as a start."""
 _LOOSEST_FOCAL = 0.1
@@ -77,16 +72,17 @@ def calibrate(
     found = locate_all(start, usable, points)
     for view, pose in zip(usable, found, strict=True):
         if pose is None:
-            rejections.append(_whole(view.name, view.pixels, "no pose of the target was found"))
+            reason = "no pose of the target was found"
+            rejections += [whole_picture(view.name, camera, reason) for camera in view.pixels]
     alive = [i for i, pose in enumerate(found) if pose is not None]
     usable = [usable[i] for i in alive]
-    _check_enough(len(usable), len(views))
+    check_enough(len(usable), len(views))
     pixels = stack_views(usable, start, len(points))
     poses = RigidTransform.concatenate([pose for pose in found if pose is not None])
-    adjusted, kept, alive_views = _adjusted_without_outliers(
+    adjusted, kept, alive_views = adjust_without_outliers(
         usable, pixels, points, start, poses, freedom
     )
-    rejections += _rejected(usable, pixels, kept, start, adjusted)
+    rejections += rejected(usable, pixels, kept, start, adjusted)
     _check_focal(adjusted.rig, adjusted.rig_from_target)
     used = np.where(kept[..., None], pixels, np.nan)[alive_views]
     left_out = np.where(kept[..., None], np.nan, pixels)[alive_views]
@@ -252,21 +248,33 @@ def first_rig(
     Raises:
         CalibrationError: a camera has too few views, or no view joins it to the others.
     """
+    cameras = first_cameras(views, points, blank, lens)
     usable, _ = _usable(views, points)
-    for name in blank:
-        count = sum(name in view.pixels for view in usable)
-        if count < FEWEST_VIEWS:
-            raise CalibrationError(
-                f"{count} views of the target from the camera {name}; at least {FEWEST_VIEWS} are "
-                "needed: take more, nearer and at more angles"
-            )
-    cameras = {name: _alone(name, camera, usable, points, lens) for name, camera in blank.items()}
     return Rig(
         cameras=cameras,
         cam_from_rig=first_cam_from_rig(cameras, usable, points),
         body_from_rig=RigidTransform.identity(),
         source="first values",
     )
+
+
+def first_cameras(
+    views: Sequence[TargetView], points: Array, blank: Mapping[str, FlatPortCamera], lens: str
+) -> dict[str, FlatPortCamera]:
+    """Each camera near the truth from its own views, its port held.
+
+    Raises:
+        CalibrationError: a camera has too few views.
+    """
+    usable, _ = _usable(views, points)
+    for name in blank:
+        count = sum(name in view.pixels for view in usable)
+        if count < FEWEST_VIEWS:
+            raise CalibrationError(
+                f"{count} views of the target from {name}; at least {FEWEST_VIEWS} are "
+                "needed: take more, nearer and at more angles"
+            )
+    return {name: _alone(name, camera, usable, points, lens) for name, camera in blank.items()}
 
 
 def _alone(
@@ -291,7 +299,7 @@ def _alone(
         poses = RigidTransform.concatenate([pose for _, pose in located])
         freedom = Freedom(free=of_cameras(rig, [f for f in fields if f in wanted]))
         rig = adjust(
-            [v for v, _ in located], points, rig, poses, freedom, _ROUGHLY, at_most=_STEPS
+            [v for v, _ in located], points, rig, poses, freedom, _ROUGHLY, at_most=STEPS
         ).rig
     return rig.cameras[name]
 
@@ -302,26 +310,13 @@ def _usable(views: Sequence[TargetView], points: Array) -> tuple[list[TargetView
     for view in views:
         enough = {name: seen for name, seen in view.pixels.items() if spans(seen, points)}
         rejections += [
-            _whole(view.name, {name: seen}, "shows too little of the target for a pose")
-            for name, seen in view.pixels.items()
+            whole_picture(view.name, name, "shows too little of the target for a pose")
+            for name in view.pixels
             if name not in enough
         ]
         if enough:
             usable.append(replace(view, pixels=enough))
     return usable, rejections
-
-
-def _whole(view: str, pixels: Mapping[str, Array], reason: str) -> Rejection:
-    return Rejection(view=view, camera=", ".join(pixels), points=0, reason=reason)
-
-
-def _check_enough(usable: int, given: int) -> None:
-    if usable < FEWEST_VIEWS:
-        of = f" of {given}" if given > usable else ""
-        raise CalibrationError(
-            f"{usable}{of} views of the target can be used; at least {FEWEST_VIEWS} are needed: "
-            "take more, nearer and at more angles"
-        )
 
 
 def _check_served(views: Sequence[TargetView], rig: Rig) -> None:
@@ -344,100 +339,3 @@ def _check_focal(rig: Rig, poses: RigidTransform) -> None:
                 f"{name} is known to {share:.0%} only: the {len(normals)} poses of the target "
                 f"differ by {widest:.1f} deg at most: tilt it by 20 to 40 deg about both axes"
             )
-
-
-def _adjusted_without_outliers(
-    views: Sequence[TargetView],
-    pixels: Array,
-    points: Array,
-    rig: Rig,
-    poses: RigidTransform,
-    freedom: Freedom,
-) -> tuple[Adjustment, Flags, Flags]:
-    """Adjust and leave out what misses by far, until that stays the same.
-
-    Returns:
-        The adjustment; which points (V, cameras, N) took part; which views (V,) did.
-    """
-    measured = np.asarray(np.isfinite(pixels).all(axis=-1))
-    kept, alive = measured, np.ones(len(views), dtype=bool)
-    for _ in range(_ROUNDS):
-        trimmed = [_trimmed(view, kept[v], rig) for v, view in enumerate(views) if alive[v]]
-        adjusted = adjust(trimmed, points, rig, poses, freedom, at_most=_STEPS)
-        lengths = np.full(measured.shape, np.inf)
-        lengths[alive] = _lengths(adjusted, pixels[alive], points)
-        limits = _limits(np.where(measured, lengths, np.nan), adjusted.noise_px)
-        fitting = _fitting(measured, kept, measured & (lengths <= limits[..., None]))
-        if np.array_equal(fitting, kept) and adjusted.is_settled:
-            return adjusted, kept, alive
-        still = alive & fitting.any(axis=(1, 2))
-        _check_enough(int(still.sum()), len(views))
-        poses = adjusted.rig_from_target[np.flatnonzero(still[alive])]
-        rig, kept, alive = adjusted.rig, fitting, still
-    trimmed = [_trimmed(view, kept[v], rig) for v, view in enumerate(views) if alive[v]]
-    return adjust(trimmed, points, rig, poses, freedom), kept, alive
-
-
-def _fitting(measured: Flags, kept: Flags, fits: Flags) -> Flags:
-    """Which points take part next, (V, cameras, N).
-
-    Where a picture does not fit, the pose of its view is no measure for the others yet: of the
-    pictures of one view only the worst is left out at a time.
-    """
-    share = fits.sum(axis=2) / np.maximum(measured.sum(axis=2), 1)
-    fitting = np.asarray(fits & (share >= _FEWEST_FITTING)[..., None])
-    served = np.asarray(kept.any(axis=2))
-    for v in np.flatnonzero((served & (share < _FEWEST_FITTING)).any(axis=1)):
-        worst = int(np.argmin(np.where(served[v], share[v], np.inf)))
-        others = served[v] & (np.arange(len(share[v])) != worst)
-        fitting[v] = kept[v] & others[:, None]
-    return fitting
-
-
-def _limits(lengths: Array, noise_px: float) -> Array:
-    """(V, cameras) longest residual that fits, px: a picture may be less sharp than the others."""
-    own = np.full(lengths.shape[:2], np.nan)
-    seen = np.isfinite(lengths).any(axis=2)
-    own[seen] = np.nanmedian(np.where(np.isfinite(lengths), lengths, np.nan)[seen], axis=1)
-    sigma = np.clip(np.nan_to_num(own / RAYLEIGH_MEDIAN), noise_px, _DULLEST * noise_px)
-    return np.maximum(OUTLIER * sigma, _LEAST_LIMIT_PX)
-
-
-def _trimmed(view: TargetView, kept: Flags, rig: Rig) -> TargetView:
-    pixels = {
-        name: np.where(kept[c, :, None], view.pixels[name], np.nan)
-        for c, name in enumerate(rig.cameras)
-        if name in view.pixels and kept[c].any()
-    }
-    return replace(view, pixels=pixels)
-
-
-def _lengths(adjusted: Adjustment, pixels: Array, points: Array) -> Array:
-    """(V, cameras, N) misses of all measured points, also of those that took no part; px."""
-    misses = np.full(pixels.shape[:-1], np.inf)
-    for c, (name, camera) in enumerate(adjusted.rig.cameras.items()):
-        for v in range(len(pixels)):
-            pose = adjusted.rig.cam_from_rig[name] * adjusted.rig_from_target[v]
-            misses[v, c] = np.linalg.norm(camera.project(pose.apply(points)) - pixels[v, c], axis=1)
-    return np.where(np.isfinite(misses), misses, np.inf)
-
-
-def _rejected(
-    views: Sequence[TargetView], pixels: Array, kept: Flags, rig: Rig, adjusted: Adjustment
-) -> list[Rejection]:
-    """What the adjustment left out, picture by picture."""
-    limit = f"{OUTLIER:.0f} sigmas (of {adjusted.noise_px:.2g} px or the picture's own)"
-    rejections = []
-    for v, view in enumerate(views):
-        for c, name in enumerate(rig.cameras):
-            measured = int(np.isfinite(pixels[v, c, :, 0]).sum())
-            lost = measured - int(kept[v, c].sum())
-            if lost and lost == measured:
-                reason = f"fits badly: most of its points miss by more than {limit}"
-                rejections.append(_whole(view.name, {name: pixels[v, c]}, reason))
-            elif lost:
-                reason = f"missed by more than {limit}"
-                rejections.append(
-                    Rejection(view=view.name, camera=name, points=lost, reason=reason)
-                )
-    return rejections

@@ -1,18 +1,22 @@
 """The files that a calibration leaves: rig, numbers, corners and report."""
 
 from collections.abc import Iterator, Sequence
-from importlib.util import find_spec
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from alice_survey.artefacts import write_csv, write_json
+from alice_survey.errors import warn
 from camera_calib.adjust import stack_views
 from camera_calib.calibrate import recalibrate
 from camera_calib.calibration import Calibration, TargetView
+from camera_calib.detect_views import Detections
+from camera_calib.report import write_report
 from camera_calib.rig import write_rig
 from camera_calib.start import locate
+from camera_calib.validation import hold_out
 
 _CORNERS = (
     "view", "camera", "point", "x_px", "y_px", "residual_x_px", "residual_y_px", "weight",
@@ -36,11 +40,6 @@ def write_calibration(
 
 
 def _write_report(folder: Path, calibration: Calibration) -> None:
-    if find_spec("camera_calib.report") is None:
-        return
-    from camera_calib.report import write_report
-    from camera_calib.validation import hold_out
-
     held = hold_out(calibration.views, lambda views: recalibrate(calibration, views), locate)
     write_report(folder, calibration, held)
 
@@ -103,3 +102,26 @@ def _corner_rows(calibration: Calibration, measured: Sequence[TargetView]) -> It
             for i in np.flatnonzero(np.isfinite(pixels[m, c, :, 0])).tolist():
                 numbers = [*pixels[m, c, i], *residuals[i], weights[i]]
                 yield [view.name, name, i, *(round(float(number), 5) for number in numbers)]
+
+
+def tell(found: Detections) -> None:
+    """Warn of each picture in which the target was not found."""
+    for rejection in found.rejections:
+        if rejection.points == 0:
+            warn(f"view {rejection.view}, {rejection.camera}: {rejection.reason}; left out")
+
+
+def finish(folder: Path, calibration: Calibration, found: Detections) -> Calibration:
+    """Tell what a calibration left out and does not know, and write its files."""
+    lost = [r for r in calibration.rejections if r.points]
+    if lost:
+        views = ", ".join(dict.fromkeys(r.view for r in lost))
+        warn(f"{sum(r.points for r in lost)} points left out as outliers, of views {views}")
+    for rejection in calibration.rejections:
+        if not rejection.points:
+            warn(f"view {rejection.view}, {rejection.camera} left out: {rejection.reason}")
+    for line in calibration.warnings:
+        warn(line)
+    whole = replace(calibration, rejections=(*found.rejections, *calibration.rejections))
+    write_calibration(folder, whole, found.views)
+    return whole

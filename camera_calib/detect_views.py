@@ -6,14 +6,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
+import numpy as np
 
 from alice_survey.errors import CalibrationError, warn
 from alice_survey.executor import parallel_map
 from camera_calib.calibration import Rejection, TargetView
 from camera_calib.detect import Detection, detect_with_reasons
+from camera_calib.grow import chessboard_size
 from camera_calib.picture_sets import PictureSet
 from camera_calib.target import Target
 
+_CHECKED = 3
 _READ = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
 Size = tuple[int, int]
@@ -35,6 +38,8 @@ class _Seen:
     size: Size | None
     """None where the picture cannot be decoded."""
     detection: Detection | None
+    board: Size | None = None
+    """Corners along the longer and the shorter side of the chessboard, where it was looked at."""
 
 
 def detect_views(sets: Sequence[PictureSet], target: Target, threads: int) -> Detections:
@@ -48,7 +53,11 @@ def detect_views(sets: Sequence[PictureSet], target: Target, threads: int) -> De
     Raises:
         CalibrationError: a camera has pictures of different sizes, or none that shows the target.
     """
-    jobs = [(path, target) for one in sets for path in one.paths.values()]
+    jobs = [
+        (path, target, i in _checked(len(sets)))
+        for i, one in enumerate(sets)
+        for path in one.paths.values()
+    ]
     found = iter(list(parallel_map(_look, jobs, threads=threads, label="target points")))
     seen = {(one.name, camera): next(found) for one in sets for camera in one.paths}
     paths = {(one.name, camera): path for one in sets for camera, path in one.paths.items()}
@@ -61,6 +70,7 @@ def detect_views(sets: Sequence[PictureSet], target: Target, threads: int) -> De
             rejections.append(Rejection(view=view, camera=camera, points=0, reason=reason))
         else:
             rejections += what.detection.rejections(view, camera)
+    _check_board(target, list(seen.values()))
     sizes = {camera: _one_size(camera, seen, paths) for camera in cameras}
     for camera in cameras:
         _check_found(camera, target, [s for (_, c), s in seen.items() if c == camera])
@@ -76,13 +86,23 @@ def detect_views(sets: Sequence[PictureSet], target: Target, threads: int) -> De
     return Detections(views=tuple(views), sizes=sizes, rejections=tuple(rejections))
 
 
-def _look(job: tuple[Path, Target]) -> _Seen:
-    path, target = job
+def _checked(count: int) -> set[int]:
+    """Numbers of the views in which the size of the board is looked at."""
+    return {(2 * i + 1) * count // (2 * _CHECKED) for i in range(_CHECKED)}
+
+
+def _look(job: tuple[Path, Target, bool]) -> _Seen:
+    path, target, check = job
     picture = cv2.imread(str(path), _READ)
     if picture is None:
         return _Seen(size=None, detection=None)
     height, width = map(int, picture.shape[:2])
-    return _Seen(size=(width, height), detection=detect_with_reasons(target, picture))
+    detection = detect_with_reasons(target, picture)
+    board = None
+    if check and target.kind == "chessboard" and detection.pixels is not None:
+        grey = picture if picture.dtype == np.uint8 else (picture >> 8).astype(np.uint8)
+        board = chessboard_size(grey)
+    return _Seen(size=(width, height), detection=detection, board=board)
 
 
 def _one_size(
@@ -100,6 +120,20 @@ def _one_size(
             f"of {other[0]} x {other[1]} px (such as {odd}): give those of one size"
         )
     return counts[0][0]
+
+
+def _check_board(target: Target, seen: Sequence[_Seen]) -> None:
+    """A part of a larger chessboard looks like a smaller one, but not like the same part always."""
+    wanted = max(target.columns, target.rows), min(target.columns, target.rows)
+    boards = [what.board for what in seen if what.board is not None]
+    larger = [b for b in boards if b[0] >= wanted[0] and b[1] >= wanted[1] and b != wanted]
+    if len(larger) > len(boards) / 2:
+        (columns, rows), count = Counter(larger).most_common(1)[0]
+        raise CalibrationError(
+            f"the chessboard has {columns}x{rows} inner corners in {count} of {len(boards)} "
+            f"pictures looked at, more than the {target.columns}x{target.rows} of --target: count "
+            "them again"
+        )
 
 
 def _check_found(camera: str, target: Target, seen: Sequence[_Seen]) -> None:

@@ -196,7 +196,7 @@ def first_cam_from_rig(
     Raises:
         CalibrationError: no chain of shared views joins a camera to the first.
     """
-    poses = {name: _poses_alone(name, camera, views, points) for name, camera in cameras.items()}
+    poses = {name: poses_alone(name, camera, views, points) for name, camera in cameras.items()}
     names = list(cameras)
     found = {names[0]: RigidTransform.identity()}
     while len(found) < len(names):
@@ -218,9 +218,10 @@ def first_cam_from_rig(
     return {name: found[name] for name in names}
 
 
-def _poses_alone(
+def poses_alone(
     name: str, camera: FlatPortCamera, views: Sequence[TargetView], points: Array
 ) -> dict[int, RigidTransform]:
+    """Poses of the target in the frame of one camera, by the number of the view."""
     alone = Rig(
         cameras={name: camera},
         cam_from_rig={name: RigidTransform.identity()},
