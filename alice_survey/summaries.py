@@ -32,7 +32,10 @@ def _pictures(folder: Path) -> Summary:
 
 def _calibration(folder: Path) -> Summary:
     found = read_json(folder / "calibration.json")
-    text = f"{found['views']} views, {found['rms_px']:.3f} px rms; rig in {folder / 'rig.json'}"
+    text = (
+        f"{found['views']} views, {found['rms_px']:.3f} px rms; rig in {folder / 'rig.json'}, "
+        f"report in {folder / 'report.html'}"
+    )
     return text, {key: found[key] for key in ("views", "rms_px", "worst_px")}
 
 
