@@ -47,13 +47,15 @@ caption{text-align:left;font-weight:600;padding-bottom:5px;overflow-wrap:anywher
 th{text-align:left;color:var(--soft);font-weight:600;border-bottom:1.5px solid var(--line);
 padding:4px 10px 4px 0;vertical-align:bottom}
 td{border-bottom:1px solid var(--line);padding:3px 10px 3px 0;vertical-align:top;
-overflow-wrap:anywhere}
+overflow-wrap:break-word}
 td:first-child{font-weight:600}
 @media(max-width:760px){figcaption{grid-template-columns:1fr}.tables{grid-template-columns:1fr}}
 @media print{@page{size:A4;margin:14mm}body{background:#fff;font-size:10.5pt}
+figcaption{display:block}figcaption p{margin:0 0 3px}.facts{display:block}
+.fact{display:inline-block;width:31%;margin:0 1% 2mm 0}
 main{max-width:none;padding:0}nav{display:none}.card{border:0;padding:0;margin:0 0 8mm}
 figure,tr,.fact{break-inside:avoid}h2,h3,caption{break-after:avoid}
-.tables{grid-template-columns:1fr 1fr}table{font-size:8.5pt}
+.tables{display:block}.scroll{margin:0 0 5mm}table{font-size:8.5pt;width:auto}
 *{-webkit-print-color-adjust:exact;print-color-adjust:exact}}
 """
 _TAGS = {"good": "good", "look": "look", "bad": "bad"}
