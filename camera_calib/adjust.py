@@ -26,7 +26,8 @@ HUBER = 3.0
 """Length, in sigmas of a coordinate, from which a residual's pull no longer grows."""
 RAYLEIGH_MEDIAN = math.sqrt(2.0 * math.log(2.0))
 """Median length of a residual, in sigmas of a coordinate, of normal noise."""
-_LEAST_NOISE_PX = 1e-9
+_LEAST_NOISE_PX = 1e-6
+"""Below it the rounding of projections shows."""
 _STEPS = 100
 _SETTLED = 1e-4
 _LEAST_DAMPING = 1e-13
@@ -84,6 +85,7 @@ def adjust(
     settled: float = _SETTLED,
     *,
     at_most: int | None = None,
+    blur: Array | None = None,
 ) -> Adjustment:
     """Adjust a rig and all poses of the target together.
 
@@ -96,12 +98,15 @@ def adjust(
         settled: length of a step, in sigmas, at which the adjustment ends.
         at_most: it may also end, not settled, after so many steps: views that do not fit at all
             creep for long, and can be left out once the others fit.
+        blur: (V, cameras) noise of each picture over that of all; None for alike ones.
 
     Raises:
         CalibrationError: there are fewer measurements than unknowns, the views do not determine
             a parameter, or the adjustment does not settle though it must.
     """
     problem = _Solver(stack_views(views, start, len(points)), points, start, freedom)
+    if blur is not None:
+        problem.blur = blur[..., None]
     return problem.solve(problem.state(start, rig_from_target), settled, at_most)
 
 
@@ -136,9 +141,17 @@ def cramer_rao(
 class _Solver(Problem):
     """Steps down to the least robust loss."""
 
+    blur: Array = np.ones((1, 1, 1))
+    """(V, C, 1) noise of each picture over `noise_px`."""
+
+    def lengths(self, residuals: Array, noise_px: float) -> Array:
+        """(V, C, N) of residuals, in sigmas of their pictures."""
+        length: Array = np.sqrt(np.einsum("vcni,vcni->vcn", residuals, residuals))
+        return length / (noise_px * self.blur)
+
     def cost(self, state: State, residuals: Array, noise_px: float) -> float:
         """Half the robust sum of squares in sigmas; inf where a seen point is not projected."""
-        length = np.sqrt((residuals[self.seen] ** 2).sum(axis=-1)) / noise_px
+        length = self.lengths(residuals, noise_px)[self.seen]
         if not np.all(np.isfinite(length)):
             return math.inf
         loss = np.where(length <= HUBER, 0.5 * length**2, HUBER * (length - 0.5 * HUBER))
@@ -153,7 +166,7 @@ class _Solver(Problem):
 
     def spread(self, residuals: Array) -> float:
         """Sigma of a coordinate from the median length of the residuals."""
-        lengths = np.sqrt((residuals[self.seen] ** 2).sum(axis=-1))
+        lengths = self.lengths(residuals, 1.0)[self.seen]
         share = math.sqrt(2 * int(self.seen.sum()) / self.spare)
         return max(float(np.median(lengths)) / RAYLEIGH_MEDIAN * share, _LEAST_NOISE_PX)
 
@@ -181,7 +194,7 @@ class _Solver(Problem):
         damping, noise_px = 1e-3, self.spread(residuals)
         for step in range(1, (at_most or _STEPS) + 1):
             weights = self.weights(residuals, noise_px)
-            equations = self.equations(state, weights / noise_px**2)
+            equations = self.equations(state, weights / (noise_px * self.blur) ** 2)
             cost = self.cost(state, residuals, noise_px)
             pinned = (self.values(state) <= self.low) & (equations.rig_slope > 0)
             while True:
@@ -198,7 +211,7 @@ class _Solver(Problem):
             if drop >= 0:
                 state, residuals = tried, tried_residuals
             noise_before, noise_px = noise_px, self.spread(residuals)
-            same_noise = abs(noise_px / noise_before - 1) < settled or noise_px < 1e-6
+            same_noise = abs(noise_px / noise_before - 1) < settled or noise_px == _LEAST_NOISE_PX
             if gain < settled**2 and same_noise and (damping <= least or drop < 0):
                 return self.result(state, residuals, noise_px, step, is_settled=True)
             good = drop > 0.25 * gain or gain < settled**2
@@ -213,9 +226,8 @@ class _Solver(Problem):
 
     def weights(self, residuals: Array, noise_px: float) -> Array:
         """(V, C, N) Huber's weights; 0 where unseen."""
-        length = np.sqrt(np.where(self.seen[..., None], residuals, 0.0) ** 2 @ np.ones(2))
-        limit = HUBER * noise_px
-        weights: Array = np.where(self.seen, limit / np.maximum(length, limit), 0.0)
+        length = np.where(self.seen, self.lengths(residuals, noise_px), 0.0)
+        weights: Array = np.where(self.seen, HUBER / np.maximum(length, HUBER), 0.0)
         return weights
 
     def result(
@@ -225,7 +237,7 @@ class _Solver(Problem):
         weights = self.weights(residuals, spread)
         noise_px = self._noise(residuals, weights)
         covariance = self.covariance(
-            self.equations(state, np.where(self.seen, 1.0 / noise_px**2, 0.0))
+            self.equations(state, np.where(self.seen, (noise_px * self.blur) ** -2.0, 0.0))
         )
         names = list(self.rig.cameras)
         poses = RigidTransform.from_components(state.shifts, Rotation.from_matrix(state.rotations))
@@ -253,7 +265,7 @@ class _Solver(Problem):
         P. J. Huber 1981, "Robust Statistics", section 7.6: mean square of the pull over the square
         of its mean slope; in two dimensions the slope of a clipped pull is half its weight.
         """
-        pull = (weights[..., None] * residuals)[self.seen]
+        pull = (weights * self.lengths(residuals, 1.0))[self.seen]
         w = weights[self.seen]
         slope = float(np.mean(np.where(w < 1.0, 0.5 * w, 1.0)))
         noise_px = math.sqrt(float((pull**2).sum()) / self.spare) / slope

@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.errors import CalibrationError
 from alice_survey.frames import Array
-from camera_calib.adjust import RAYLEIGH_MEDIAN, Adjustment, adjust
+from camera_calib.adjust import Adjustment, adjust
 from camera_calib.calibration import Rejection, TargetView
 from camera_calib.freedom import Freedom
 from camera_calib.normal_equations import Flags
@@ -20,6 +20,11 @@ OUTLIER = 6.0
 noise one in 65 million is longer."""
 _DULLEST = 3.0
 """Largest noise of one picture, in that of all, that still is noise."""
+_BY_CHANCE = 2.0
+"""Mean square of how far pictures' noise differs, in what chance makes of equal ones."""
+_DRAWN = 16.0
+"""Coordinates by which a picture's noise is drawn towards that of all."""
+_SAME_BLUR = 0.1
 _LEAST_LIMIT_PX = 1e-4
 _ROUNDS = 6
 STEPS = 40
@@ -43,21 +48,25 @@ def adjust_without_outliers(
     """
     measured = np.asarray(np.isfinite(pixels).all(axis=-1))
     kept, alive = measured, np.ones(len(views), dtype=bool)
+    blur = np.ones(measured.shape[:2])
     for _ in range(_ROUNDS):
         trimmed = [_trimmed(view, kept[v], rig) for v, view in enumerate(views) if alive[v]]
-        adjusted = adjust(trimmed, points, rig, poses, freedom, at_most=STEPS)
+        adjusted = adjust(trimmed, points, rig, poses, freedom, at_most=STEPS, blur=blur[alive])
         lengths = np.full(measured.shape, np.inf)
         lengths[alive] = _lengths(adjusted, pixels[alive], points)
-        limits = _limits(np.where(measured, lengths, np.nan), adjusted.noise_px)
+        found = np.ones_like(blur)
+        found[alive] = _blur(adjusted)
+        limits = np.maximum(OUTLIER * adjusted.noise_px * found, _LEAST_LIMIT_PX)
         fitting = _fitting(measured, kept, measured & (lengths <= limits[..., None]))
-        if np.array_equal(fitting, kept) and adjusted.is_settled:
+        same = np.array_equal(fitting, kept) and np.allclose(found, blur, rtol=_SAME_BLUR)
+        if same and adjusted.is_settled:
             return adjusted, kept, alive
         still = alive & fitting.any(axis=(1, 2))
         check_enough(int(still.sum()), len(views))
         poses = adjusted.rig_from_target[np.flatnonzero(still[alive])]
-        rig, kept, alive = adjusted.rig, fitting, still
+        rig, kept, alive, blur = adjusted.rig, fitting, still, found
     trimmed = [_trimmed(view, kept[v], rig) for v, view in enumerate(views) if alive[v]]
-    return adjust(trimmed, points, rig, poses, freedom), kept, alive
+    return adjust(trimmed, points, rig, poses, freedom, blur=blur[alive]), kept, alive
 
 
 def _fitting(measured: Flags, kept: Flags, fits: Flags) -> Flags:
@@ -76,13 +85,27 @@ def _fitting(measured: Flags, kept: Flags, fits: Flags) -> Flags:
     return fitting
 
 
-def _limits(lengths: Array, noise_px: float) -> Array:
-    """(V, cameras) longest residual that fits, px: a picture may be less sharp than the others."""
-    own = np.full(lengths.shape[:2], np.nan)
-    seen = np.isfinite(lengths).any(axis=2)
-    own[seen] = np.nanmedian(np.where(np.isfinite(lengths), lengths, np.nan)[seen], axis=1)
-    sigma = np.clip(np.nan_to_num(own / RAYLEIGH_MEDIAN), noise_px, _DULLEST * noise_px)
-    return np.maximum(OUTLIER * sigma, _LEAST_LIMIT_PX)
+def _blur(adjusted: Adjustment) -> Array:
+    """Noise of each picture over that of all, (V, cameras); 1 where all are alike by chance.
+
+    Far targets and moving water blur some pictures more than others; weighted by their own noise
+    they tell more. Noise is the mean square of residuals after Huber's weights, drawn a little
+    towards that of all, so that a picture of few points gets no weight by luck.
+    """
+    pull = (adjusted.weights[..., None] * adjusted.residuals_px) ** 2
+    count = 2.0 * np.isfinite(adjusted.weights).sum(axis=2)
+    square = np.nansum(pull, axis=(2, 3))
+    # Each view's pose takes up six of its coordinates.
+    free = count * (1.0 - np.minimum(6.0 / count.sum(axis=1, keepdims=True), 0.9))
+    share = np.divide(square, free, out=np.ones_like(square), where=count > 0)
+    share[count > 0] /= square.sum() / free.sum()
+    seen = count > 0
+    chance = np.mean((share[seen] - 1.0) ** 2 * count[seen] / 2.0)
+    if chance < _BY_CHANCE:
+        return np.ones_like(share)
+    drawn = (count * share + _DRAWN) / (count + _DRAWN)
+    blur: Array = np.clip(np.sqrt(drawn), 1.0 / _DULLEST, _DULLEST)
+    return blur
 
 
 def _trimmed(view: TargetView, kept: Flags, rig: Rig) -> TargetView:
@@ -108,7 +131,7 @@ def rejected(
     views: Sequence[TargetView], pixels: Array, kept: Flags, rig: Rig, adjusted: Adjustment
 ) -> list[Rejection]:
     """What the adjustment left out, picture by picture."""
-    limit = f"{OUTLIER:.0f} sigmas (of {adjusted.noise_px:.2g} px or the picture's own)"
+    limit = f"{OUTLIER:.0f} sigmas (of {adjusted.noise_px:.2g} px, or of the picture's own noise)"
     rejections = []
     for v, view in enumerate(views):
         for c, name in enumerate(rig.cameras):
