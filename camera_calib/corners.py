@@ -41,7 +41,7 @@ _CLEAR_PX = 2.0
 """Distance kept from other edges, which are blurred too."""
 _LEAST_PX = 1.0
 _FEWEST_PIXELS = 25
-_WORST_MISFIT = 0.25
+_WORST_MISFIT = 0.2
 _LEAST_CONTRAST = 0.001
 _TWO_OVER_ROOT_PI = 2.0 / math.sqrt(math.pi)
 
@@ -297,26 +297,3 @@ def _equations(window: Array, used: NDArray[np.bool_], q: Array) -> tuple[float,
         for b in range(a):
             normal[a, b] = normal[b, a]
     return cost, normal, right
-
-
-def find_chessboard(picture: NDArray[np.uint8], columns: int, rows: int) -> Array | None:
-    """Find all inner corners of a chessboard.
-
-    Args:
-        picture: (H, W) grey values, encoded by the sRGB curve as pictures of 8 bits are.
-        columns: inner corners along x of the board.
-        rows: along y.
-
-    Returns:
-        (rows * columns, 2) pixels from the outer corner of the first pixel, row by row; a row is
-        NaN where the fit failed. None when the board was not found whole.
-    """
-    for flags in (0, cv2.CALIB_CB_EXHAUSTIVE):  # the second looks harder and takes 3 times as long
-        found, corners = cv2.findChessboardCornersSB(picture, (columns, rows), flags=flags)
-        if found:
-            break
-    else:
-        return None
-    near = corners.reshape(rows, columns, 2).astype(np.float64) + 0.5
-    steps = np.stack(np.gradient(near, axis=(1, 0)), axis=-1).reshape(-1, 2, 2)
-    return fit_corners(picture, near.reshape(-1, 2), steps).pixels

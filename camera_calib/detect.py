@@ -28,14 +28,17 @@ from camera_calib.corners import (
 )
 from camera_calib.detect_board import (
     LARGE_PX,
-    chessboard_size,
+    SMALL_PX,
     find_chessboard_near,
     find_markers_near,
     reduced,
     unusable,
 )
+from camera_calib.grow import chessboard_size, spans_board
 from camera_calib.neighbours import from_neighbours
 from camera_calib.target import TAG_BITS, TAG_BORDER_BITS, Target
+
+__all__ = ["Detection", "as_grey", "chessboard_size", "detect", "detect_with_reasons"]
 
 Picture = NDArray[np.uint8] | NDArray[np.uint16]
 Bools = NDArray[np.bool_]
@@ -137,7 +140,7 @@ def as_grey(picture: Picture) -> Grey:
 
 def _no_chessboard(target: Target, grey: Grey) -> str:
     wanted = f"no chessboard of {target.columns}x{target.rows} inner corners with all its sides"
-    seen = chessboard_size(reduced(grey, LARGE_PX).picture)
+    seen = chessboard_size(reduced(grey, SMALL_PX).picture)
     return wanted if seen is None else f"{wanted}; one of {seen[0]}x{seen[1]}, or a part, is seen"
 
 
@@ -166,6 +169,8 @@ def _refined(target: Target, grey: Grey, near: Array) -> Detection:
         needed = f"{_FEWEST_POINTS} on more than one line are needed"
         refused = f"only {int(used.sum())} of {len(used)} points, {needed}"
         return Detection(pixels=None, refused=f"{refused} ({why})" if why else refused)
+    if target.kind == "chessboard" and not spans_board(used.reshape(target.shape)):
+        return Detection(pixels=None, refused=_no_chessboard(target, grey))
     return Detection(pixels=corners.pixels, sigma_px=corners.sigma_px, dropped=dropped)
 
 
@@ -214,7 +219,8 @@ def _without_astray(target: Target, corners: Corners) -> Corners:
     if target.is_ambiguous:  # of such chessboards the first square may be white
         contrast *= np.sign(np.median(contrast))
     astray = np.zeros(len(fitted), dtype=np.bool_)
-    astray[fitted] = (off > _FARTHEST_OFF) | (contrast < _WEAKEST * np.median(contrast))
+    faint = contrast < _WEAKEST * max(float(np.median(contrast)), 0.0)
+    astray[fitted] = (off > _FARTHEST_OFF) | faint
     return corners.without(astray, ASTRAY)
 
 

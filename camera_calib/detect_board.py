@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from alice_survey.frames import Array
-from camera_calib.corners import Grey, fit_corners
+from camera_calib.corners import Grey
+from camera_calib.grow import grown_chessboard
 from camera_calib.neighbours import from_neighbours
 from camera_calib.target import TAG_BORDER_BITS, TAG_FAMILY, Target, aruco_dictionary
 
@@ -18,15 +19,11 @@ SMALL_PX, LARGE_PX = 1000, 2000
 """Longest sides of the reduced pictures that detectors look at."""
 _DARK, _FLAT = 8, 4
 """Grey levels of 255 that the brightest pixels and the range of a usable picture exceed."""
-_MOST_ROUNDS = 40
-_WEAKEST = 0.2
-"""Contrast of a grown corner over the middle one of those it grows from."""
-_OFF = 0.15
-"""Farthest a grown corner may be from where its neighbours say it is, in squares."""
-_LEAST_SHARE = 0.6
-"""Of a chessboard's corners that must be fitted where OpenCV did not find it whole."""
-_LEAST_OUTER_SHARE = 0.5
-"""The same of each of its outer rows and columns, which tell where it ends."""
+
+
+_AGREED = 0.7
+"""Share of the markers that must stand where the target has them; half do in a wrong layout."""
+_LEAST_PX = 32
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -59,6 +56,8 @@ def reduced(grey: Grey, longest_px: int) -> Reduced:
 
 def unusable(grey: Grey) -> str | None:
     """Why nobody could find anything in a picture, if so."""
+    if min(grey.shape) < _LEAST_PX:
+        return f"only {grey.shape[1]} x {grey.shape[0]} px"
     low, high = np.percentile(reduced(grey, SMALL_PX).picture, [0.1, 99.9])
     if high < _DARK:
         return f"too dark: 99.9 % of its pixels are at most {high:.0f} of 255"
@@ -83,15 +82,16 @@ def find_chessboard_near(target: Target, grey: Grey) -> Array | None:
 
 
 def _chessboard_tries(target: Target, grey: Grey) -> Iterator[Array | None]:
-    """OpenCV's detectors, from the quick ones to those that see what the quick ones miss."""
+    """Detectors, from the quick one to those that see what it misses."""
     size = (target.columns, target.rows)
     small, large = reduced(grey, SMALL_PX), reduced(grey, LARGE_PX)
-    for part, flags in ((small, 0), (large, cv2.CALIB_CB_EXHAUSTIVE)):
-        found, corners = cv2.findChessboardCornersSB(part.picture, size, flags=flags)
-        yield part.whole(corners) if found else None
-    for part in (small, large):
-        grown = _grown(target, part.picture)
+    found, corners = cv2.findChessboardCornersSB(small.picture, size, flags=0)
+    yield small.whole(corners) if found else None
+    for part in (small, large) if large.picture.size > small.picture.size else (small,):
+        grown = grown_chessboard(part.picture, target.shape)
         yield None if grown is None else grown * part.scale
+    found, corners = cv2.findChessboardCornersSB(large.picture, size, flags=cv2.CALIB_CB_EXHAUSTIVE)
+    yield large.whole(corners) if found else None
     # The classic detector takes minutes on large pictures that hold no board.
     classic = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
     found, corners = cv2.findChessboardCorners(small.picture, size, flags=classic)
@@ -100,110 +100,6 @@ def _chessboard_tries(target: Target, grey: Grey) -> Iterator[Array | None]:
         whole = reduced(grey, max(grey.shape))
         found, corners = cv2.findChessboardCornersSB(whole.picture, size, flags=0)
         yield whole.whole(corners) if found else None
-
-
-def chessboard_size(picture: NDArray[np.uint8]) -> tuple[int, int] | None:
-    """How many inner corners, along the longer and the shorter side, a chessboard has.
-
-    Args:
-        picture: (H, W) grey values of 8 bits.
-
-    Returns:
-        The size of a chessboard of any size in the picture, or of a part; None where there is none.
-    """
-    part = _part_of_chessboard(reduced(picture, SMALL_PX).picture)
-    if part is None:
-        return None
-    shorter, longer = sorted(part.shape[:2])
-    return longer, shorter
-
-
-def _part_of_chessboard(picture: NDArray[np.uint8]) -> Array | None:
-    """(rows, columns, 2) corners of a chessboard, or of a part, in OpenCV's pixels."""
-    found, corners, squares = cv2.findChessboardCornersSBWithMeta(
-        picture, (3, 3), flags=cv2.CALIB_CB_LARGER
-    )
-    if not found:
-        return None
-    rows, columns = squares.shape[:2]
-    grid: Array = corners.reshape(rows, columns, 2).astype(np.float64)
-    return grid
-
-
-def _grown(target: Target, picture: NDArray[np.uint8]) -> Array | None:
-    """(N, 2) corners of a chessboard of which OpenCV finds a part only.
-
-    The part grows by corners that fit next to it. Where it ends is known when its outer rows and
-    columns are seen and just as many as the board has; then so is its numbering.
-    """
-    part = _part_of_chessboard(picture)
-    if part is None:
-        return None
-    rows, columns = part.shape[:2]
-    grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2)
-    pixels = part.reshape(-1, 2) + 0.5
-    steps = from_neighbours(grid.astype(np.float64), pixels, grid.astype(np.float64))[1]
-    fits = fit_corners(picture, pixels, steps)
-    contrast = _alternating(grid) * fits.contrast
-    middle = float(np.nanmedian(contrast)) if np.isfinite(contrast).any() else 0.0
-    good = contrast > _WEAKEST * middle if middle > 0 else contrast < _WEAKEST * middle
-    known = dict(zip(map(tuple, grid[good].tolist()), fits.pixels[good], strict=True))
-    longest = max(target.columns, target.rows)
-    for _ in range(_MOST_ROUNDS):
-        if len(known) < 4 or (np.ptp(np.array(list(known)), axis=0) >= longest).any():
-            break
-        fresh = _next_to(picture, known, middle)
-        if not fresh:
-            break
-        known |= fresh
-    return _whole_board(target, known)
-
-
-def _alternating(places: NDArray[np.int_]) -> Array:
-    """1 and -1 in turn, as the colours of a chessboard's corners."""
-    signs: Array = 1.0 - 2.0 * (places.sum(axis=1) % 2)
-    return signs
-
-
-def _next_to(
-    picture: NDArray[np.uint8], known: dict[tuple[int, ...], Array], middle: float
-) -> dict[tuple[int, ...], Array]:
-    """Corners that fit up to two squares from known ones: one that is hidden may lie between.
-
-    Their contrast must alternate as the known ones', of which `middle` is the middle one.
-    """
-    near = [(a, b) for a in range(-2, 3) for b in range(-2, 3) if abs(a) + abs(b) <= 2]
-    asked = np.array(sorted({(x + a, y + b) for x, y in known for a, b in near} - set(known)))
-    board = np.array(list(known), dtype=np.float64)
-    pixels = np.array(list(known.values()))
-    expected, steps = from_neighbours(board, pixels, asked.astype(np.float64))
-    fits = fit_corners(picture, expected, steps)
-    good = _alternating(asked) * fits.contrast / middle > _WEAKEST
-    miss = (fits.pixels[good] - expected[good])[..., None]
-    off = np.linalg.norm(np.linalg.solve(steps[good], miss)[..., 0], axis=1)
-    good[good] = off < _OFF
-    keys = [(int(x), int(y)) for x, y in asked[good]]
-    return dict(zip(keys, fits.pixels[good], strict=True))
-
-
-def _whole_board(target: Target, known: dict[tuple[int, ...], Array]) -> Array | None:
-    """The known corners as the target's, where they span it whole; NaN rows are not known."""
-    places = np.array(list(known))
-    if len(places) < 4:
-        return None
-    low, span = places.min(axis=0), np.ptp(places, axis=0) + 1
-    grid = np.full((span[1], span[0], 2), np.nan)
-    for place, pixel in known.items():
-        grid[place[1] - low[1], place[0] - low[0]] = pixel
-    if grid.shape[:2] != target.shape:
-        grid = np.swapaxes(grid, 0, 1)
-    if grid.shape[:2] != target.shape:
-        return None
-    seen = np.isfinite(grid[..., 0])
-    sides = (seen[0], seen[-1], seen[:, 0], seen[:, -1])
-    if seen.mean() < _LEAST_SHARE or min(side.mean() for side in sides) < _LEAST_OUTER_SHARE:
-        return None
-    return grid.reshape(-1, 2)
 
 
 def find_markers_near(target: Target, grey: Grey) -> tuple[Array | None, str]:
@@ -262,7 +158,7 @@ def _read_markers(target: Target, part: Reduced) -> tuple[Array, Array, str]:
     whole = np.zeros(len(once), dtype=np.bool_)
     if agree is not None:
         whole = agree.reshape(-1, 4).all(axis=1)
-    if whole.sum() < max(2.0, 0.5 * len(once)):
+    if whole.sum() < max(2.0, _AGREED * len(once)):
         why = f"{len(once)} {wanted} read, but not where the target has them: check its counts"
         return none, none, why + (" and layout (legacy?)" if target.kind == "charuco" else "")
     return board[np.repeat(whole, 4)], pixels[np.repeat(whole, 4)], ""

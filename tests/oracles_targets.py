@@ -75,37 +75,47 @@ def picture_light(
         warp: takes (M, 2) pixels of the picture to those of the homography (lens distortion).
     """
     rectangles = black_rectangles(target)
-    grid_x = _merged(rectangles[:, [0, 2]])
-    grid_y = _merged(rectangles[:, [1, 3]])
-    black = np.zeros((len(grid_y) + 1, len(grid_x) + 1), dtype=bool)
-    mid = 1e-7
-    for x0, y0, x1, y1 in rectangles:
-        a, b = np.searchsorted(grid_x, [x0 + mid, x1 + mid])
-        c, d = np.searchsorted(grid_y, [y0 + mid, y1 + mid])
-        black[c:d, a:b] = True
     margin = 0.5 * target.size_m
     outer = np.array(target.outline) + np.array([-margin, -margin, margin, margin])
+    # Lines of a grid that no edge crosses: what lies between two neighbours has one shade.
+    grid_x = _merged(np.concatenate([rectangles[:, [0, 2]].ravel(), outer[[0, 2]]]))
+    grid_y = _merged(np.concatenate([rectangles[:, [1, 3]].ravel(), outer[[1, 3]]]))
+    shade = np.full((len(grid_y) + 1, len(grid_x) + 1), WALL)
+    shade[1:-1, 1:-1] = WHITE
+    for x0, y0, x1, y1 in rectangles:
+        a, b = np.searchsorted(grid_x, [x0 + 1e-7, x1 + 1e-7])
+        c, d = np.searchsorted(grid_y, [y0 + 1e-7, y1 + 1e-7])
+        shade[c:d, a:b] = BLACK
     back = np.linalg.inv(pixels_from_board)
     width, height = size
-    light = np.empty((height, width))
+
+    def cells(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Column and row of the grid that pixels (..., 2) see."""
+        flat = pixels.reshape(-1, 2) if warp is None else warp(pixels.reshape(-1, 2))
+        ray = np.column_stack([flat, np.ones(len(flat))]) @ back.T
+        ahead = ray[:, 2] * back[2, 2] > 0
+        u = np.where(ahead, ray[:, 0] / ray[:, 2], np.inf)
+        v = np.where(ahead, ray[:, 1] / ray[:, 2], np.inf)
+        column, row = np.searchsorted(grid_x, u), np.searchsorted(grid_y, v)
+        return column.reshape(pixels.shape[:-1]), row.reshape(pixels.shape[:-1])
+
+    y, x = np.mgrid[: height + 1, : width + 1].astype(float)
+    column, row = cells(np.stack([x, y], axis=-1))
+    light = shade[row, column][:-1, :-1]
+    parts = [(slice(0, -1), slice(1, None)), (slice(1, None), slice(0, -1))]
+    parts.append((slice(1, None), slice(1, None)))
+    mixed = np.zeros((height, width), dtype=bool)
+    for j, i in parts:
+        mixed |= (column[j, i] != column[:-1, :-1]) | (row[j, i] != row[:-1, :-1])
     # Samples are strewn, or an edge along the pixels would be rounded to a sample's width.
     rng = np.random.default_rng(0)
-    x = np.arange(width * fine)
-    band = 32
-    for first in range(0, height, band):
-        last = min(first + band, height)
-        corners = np.stack(np.meshgrid(x, np.arange(first * fine, last * fine)), axis=-1)
-        pixels = ((corners + rng.uniform(0, 1, corners.shape)) / fine).reshape(-1, 2)
-        if warp is not None:
-            pixels = warp(pixels)
-        ray = np.column_stack([pixels, np.ones(len(pixels))]) @ back.T
-        u, v = ray[:, 0] / ray[:, 2], ray[:, 1] / ray[:, 2]
-        value = np.where(
-            black[np.searchsorted(grid_y, v), np.searchsorted(grid_x, u)], BLACK, WHITE
-        )
-        on = (u > outer[0]) & (u < outer[2]) & (v > outer[1]) & (v < outer[3])
-        value = np.where(on & (ray[:, 2] * back[2, 2] > 0), value, WALL)
-        light[first:last] = value.reshape(last - first, fine, width, fine).mean(axis=(1, 3))
+    first = np.argwhere(mixed)[:, ::-1]
+    grid = np.stack(np.meshgrid(np.arange(fine), np.arange(fine)), axis=-1).reshape(-1, 2)
+    for start in range(0, len(first), 20_000):
+        part = first[start : start + 20_000]
+        samples = rng.uniform(0, 1, (len(part), fine * fine, 2))
+        column, row = cells(part[:, None] + (grid + samples) / fine)
+        light[part[:, 1], part[:, 0]] = shade[row, column].mean(axis=1)
     return cv2.GaussianBlur(light, (0, 0), blur_px) if blur_px > 0 else light
 
 
