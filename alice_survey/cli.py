@@ -169,7 +169,7 @@ def target(
     A chessboard (inner corners, square), a ChArUco board (squares, square, marker) or a grid of
     AprilTags (tags, tag, gap over tag) at true scale, and beside it its JSON file.
     """
-    from camera_calib.target_sheet import print_target
+    from camera_calib.targets.sheet import print_target
 
     print_result(*print_target(what, output, paper, dpi), as_json)
 
@@ -227,7 +227,7 @@ def calibrate(
 
         result = run(["calibration"], workspace, survey, None, threads)
     else:
-        from camera_calib.calibrate_pictures import calibrate_command
+        from camera_calib.calibration.pictures import calibrate_command
 
         result = calibrate_command(
             left=left, right=right, pictures=pictures, target=target, output=output, lens=lens,

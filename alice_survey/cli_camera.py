@@ -66,7 +66,7 @@ def undisperse(
     A flat port shows each colour at its own scale: some pixels apart at the edge of the frame.
     """
     from alice_survey.executor import default_threads
-    from camera_calib.undisperse import undisperse_files
+    from camera_calib.approximation.undisperse import undisperse_files
 
     text, data = undisperse_files(
         pictures, folder, rig=rig, camera=camera, range_m=distance, temperature_c=temperature,
@@ -97,7 +97,7 @@ def residual(
     Pixels that pinholes after a warp, and COLMAP's cameras without one, are wrong by through this
     port. Distances are from the entrance pupil along the axis.
     """
-    from camera_calib.residual_report import residual_report
+    from camera_calib.approximation.report import residual_report
 
     text, data = residual_report(
         near, far, survey=survey, rig=rig, camera=camera, working_range_m=exact_at, plot=plot
@@ -195,7 +195,7 @@ def tank(
 
     Lens from a board in air, poses from points on the flat interface each camera looks through.
     """
-    from camera_calib.tank import TankSettings, run_tank
+    from camera_calib.tank.run import TankSettings, run_tank
 
     settings = TankSettings(
         boards=tuple(boards), board=board, references=tuple(reference), detections=detections,
@@ -220,6 +220,6 @@ def uncertainty(
 
     For pixels over the frame, for triangulated points and for lengths, against distance.
     """
-    from camera_calib.uncertainty_report import uncertainty_report
+    from camera_calib.report.rig_uncertainty import uncertainty_report
 
     print_result(*uncertainty_report(rig, ranges, near, far, noise), as_json)

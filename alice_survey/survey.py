@@ -63,7 +63,7 @@ def _work_of(stage: str) -> StageWork:
 
             return run_images
         case "calibration":
-            from camera_calib.calibrate_run import run_calibrate
+            from camera_calib.calibration.run import run_calibrate
 
             return run_calibrate
         case "sparse":

@@ -9,8 +9,8 @@ from alice_survey.config import CameraConfig, SurveyConfig, load_config, parse_c
 from alice_survey.errors import ConfigError, warn
 
 if TYPE_CHECKING:
-    from camera_calib.fov import FovChoices, FovRow
-    from camera_calib.fov_text import TextTable
+    from camera_calib.fov.table import FovChoices, FovRow
+    from camera_calib.fov.text import TextTable
     from camera_calib.rig import Rig
 
 PAPER_LENSES_MM = (12.5, 25.0)
@@ -53,10 +53,10 @@ class FovOptions:
 
 def fov_report(options: FovOptions, output: Output) -> tuple[str, Any, bool]:
     """FOV, resolution, focus, stereo and blur as text and JSON values."""
-    from camera_calib.fov import FovChoices, blur_table, fov_table, rig_fov_table
-    from camera_calib.fov_angles import angle_table
-    from camera_calib.fov_plot import draw_fov
-    from camera_calib.fov_text import as_csv, fov_csv_rows, fov_tables
+    from camera_calib.fov.angles import angle_table
+    from camera_calib.fov.plot import draw_fov
+    from camera_calib.fov.table import FovChoices, blur_table, fov_table, rig_fov_table
+    from camera_calib.fov.text import as_csv, fov_csv_rows, fov_tables
 
     settings = _settings(options)
     choices = FovChoices(
@@ -99,11 +99,11 @@ def fov_report(options: FovOptions, output: Output) -> tuple[str, Any, bool]:
 
 def validation_report(output: Output) -> tuple[str, Any, bool]:
     """The paper's claims on optics, and whether every check that has a rule passed."""
-    from camera_calib.fov import FovChoices, fov_table
-    from camera_calib.fov_angles import angle_table
-    from camera_calib.fov_paper import paper_settings, validate_paper
-    from camera_calib.fov_plot import draw_fov
-    from camera_calib.fov_text import as_csv, validation_csv_rows, validation_tables
+    from camera_calib.fov.angles import angle_table
+    from camera_calib.fov.paper import paper_settings, validate_paper
+    from camera_calib.fov.plot import draw_fov
+    from camera_calib.fov.table import FovChoices, fov_table
+    from camera_calib.fov.text import as_csv, validation_csv_rows, validation_tables
 
     validation = validate_paper()
     if output.csv is not None:
@@ -204,7 +204,7 @@ def _metres(mm: float | None) -> float | None:
 
 
 def _told(tables: "Sequence[TextTable]", output: Output) -> str:
-    from camera_calib.fov_text import as_markdown, as_text
+    from camera_calib.fov.text import as_markdown, as_text
 
     return as_markdown(tables) if output.markdown else as_text(tables)
 

@@ -15,9 +15,9 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.executor import parallel_map
 from alice_survey.frames import Array
-from camera_calib.adjust import cramer_rao
-from camera_calib.calibrate import Intrinsics, calibrate_through_ports
-from camera_calib.freedom import (
+from camera_calib.calibration.adjust import cramer_rao
+from camera_calib.calibration.calibrate import Intrinsics, calibrate_through_ports
+from camera_calib.calibration.freedom import (
     PORT,
     Freedom,
     Prior,

@@ -7,7 +7,7 @@ from typing import Any
 from alice_survey.config import CameraConfig, PlanConfig
 from alice_survey.errors import PlanError
 from camera_calib.flat_port import FlatPortCamera
-from camera_calib.fov import apparent_distance_m
+from camera_calib.fov.table import apparent_distance_m
 from missions.footprint import footprint_size_m, overlap, step_for_overlap
 
 _EXPOSURE_STEP_S = 1e-5

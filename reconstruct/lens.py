@@ -14,8 +14,8 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.errors import WorkspaceError
 from alice_survey.frames import Array
+from camera_calib.approximation.virtual_pinhole import VirtualPinhole, best_pinhole
 from camera_calib.flat_port import FlatPortCamera, camera_from_json
-from camera_calib.virtual_pinhole import VirtualPinhole, best_pinhole
 
 _LARGEST_GROWTH = 1.5
 """An undistorted picture has at most this many times the width and height of the one taken."""

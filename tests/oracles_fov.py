@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_calib.flat_port import FlatPortCamera
-from camera_calib.fov_focus import FocusedLens
+from camera_calib.fov.focus import FocusedLens
 from camera_calib.rig import Rig
 from tests.oracles_camera import project_by_shortest_path
 

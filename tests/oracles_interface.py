@@ -9,9 +9,9 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from camera_calib.flat_port import FlatPortCamera
-from camera_calib.interface import FixedCamera, Plane, Reference, plane_through
-from camera_calib.interface_adjust import Tank
-from camera_calib.single_lens import KnownLens
+from camera_calib.tank.adjust import Tank
+from camera_calib.tank.interface import FixedCamera, Plane, Reference, plane_through
+from camera_calib.tank.single_lens import KnownLens
 
 Array = NDArray[np.float64]
 

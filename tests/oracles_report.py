@@ -10,13 +10,13 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.config import CameraConfig, WaterConfig
-from camera_calib.adjust import adjust
-from camera_calib.calibration import Calibration, TargetView
+from camera_calib.calibration.adjust import adjust
+from camera_calib.calibration.freedom import PORT, POSE, Freedom, intrinsics, of_cameras, pose_names
+from camera_calib.calibration.result import Calibration, TargetView
+from camera_calib.calibration.start import locate
 from camera_calib.flat_port import FlatPortCamera
-from camera_calib.freedom import PORT, POSE, Freedom, intrinsics, of_cameras, pose_names
+from camera_calib.report.validation import HeldOut, hold_out
 from camera_calib.rig import Covariance, Rig, design_rig
-from camera_calib.start import locate
-from camera_calib.validation import HeldOut, hold_out
 
 Array = NDArray[np.float64]
 

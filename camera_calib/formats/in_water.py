@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.errors import CalibrationError
+from camera_calib.approximation.residual import COLMAP_PARAMETERS, Residual, approximations
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.formats.opencv_model import IN_AIR
-from camera_calib.residual import COLMAP_PARAMETERS, Residual, approximations
 from camera_calib.rig import Rig
 
 MODELS = ("OPENCV", "FULL_OPENCV")

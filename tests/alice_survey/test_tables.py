@@ -131,7 +131,7 @@ def test_the_command_prints_text_markdown_and_json() -> None:
 
 
 def test_a_failed_check_exits_with_1(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("camera_calib.fov_paper.PAPER_TABLE", ((12.5, "vertical", "m", "1.30"),))
+    monkeypatch.setattr("camera_calib.fov.paper.PAPER_TABLE", ((12.5, "vertical", "m", "1.30"),))
     shown = CliRunner().invoke(app, ["fov", "--validate"])
     assert shown.exit_code == 1
     assert "FAIL" in shown.output

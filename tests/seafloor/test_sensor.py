@@ -10,7 +10,7 @@ from alice_survey.seafloor.sensor import (
     make_sensor,
     nominal_gain,
 )
-from camera_calib.corners import linear_light
+from camera_calib.targets.corners import linear_light
 
 
 def plain(read_noise_e: float = 0.0, full_well_e: float = 1e5) -> Sensor:

@@ -1,0 +1,299 @@
+"""What it costs to treat a flat-port camera as one of the cameras that other software knows.
+
+Two ways: warp the pictures at one range to a virtual pinhole, or let a camera with distortion
+absorb refraction. Either is exact at most at one range; `approximations` states what is left over
+the frame and over an interval of distances.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from alice_survey.errors import CalibrationError, ConfigError
+from alice_survey.frames import Array
+from camera_calib.approximation.virtual_pinhole import VirtualPinhole, best_pinhole
+from camera_calib.flat_port import FlatPortCamera
+
+COLMAP_PARAMETERS = {
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": (
+        "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6",
+    ),
+}  # fmt: skip
+"""COLMAP's camera models that are judged here, their parameters in COLMAP's order."""
+
+FITTED = ("SIMPLE_RADIAL", "OPENCV", "FULL_OPENCV")
+"""Models that are fitted to pictures without a warp."""
+
+_GRID = 15
+_CANCELLING_PX = 0.01
+"""Price of a distortion coefficient of 1: of coefficients that cancel in FULL_OPENCV's fraction,
+the smallest are taken; the residual grows by less than 1 % for it."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StandIn:
+    """A camera of one centre that stands in for a flat-port camera."""
+
+    name: str
+    model: str
+    """COLMAP's name of the camera model."""
+    params: tuple[float, ...]
+    """In COLMAP's order and pixels."""
+    warped_at_m: float | None
+    """Pictures are warped so that they are exact at this range; None: they are used as they are."""
+    centre_m: tuple[float, float, float]
+    """Of projection, in the flat-port camera's frame."""
+    approx_from_cam: Rotation
+    """Turn of the axes against those of the flat-port camera."""
+
+    def project(self, points_cam: Array) -> Array:
+        """Pixels, (..., 2), of points (..., 3) in the flat-port camera's frame."""
+        from_centre = points_cam - np.array(self.centre_m)
+        seen = self.approx_from_cam.apply(from_centre.reshape(-1, 3)).reshape(points_cam.shape)
+        return colmap_pixels(self.model, self.params, seen)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Residual:
+    """The price of a stand-in over the frame and some distances."""
+
+    stand_in: StandIn
+    distances_m: Array
+    """(D,) from the entrance pupil along the axis."""
+    pixels: Array
+    """(rows, columns, 2) places in the picture, corners included."""
+    misses_px: Array
+    """(D, rows, columns, 2): pixel of the stand-in less pixel of the (warped) picture."""
+
+    @property
+    def sizes_px(self) -> Array:
+        """(D, rows, columns) lengths of the misses."""
+        lengths: Array = np.linalg.norm(self.misses_px, axis=-1)
+        return lengths
+
+    @property
+    def rms_by_distance_px(self) -> Array:
+        """(D,) over the frame's area."""
+        weights = _area_weights(*self.pixels.shape[:2])
+        rms: Array = np.sqrt(np.sum(self.sizes_px**2 * weights, axis=(1, 2)))
+        return rms
+
+    @property
+    def rms_px(self) -> float:
+        """Over the frame's area and the distances."""
+        return float(np.sqrt(np.mean(self.rms_by_distance_px**2)))
+
+    @property
+    def max_px(self) -> float:
+        """Anywhere in the frame, its corners included, at any of the distances."""
+        return float(self.sizes_px.max())
+
+    @property
+    def map_px(self) -> Array:
+        """(rows, columns) rms over the distances."""
+        rms: Array = np.sqrt(np.mean(self.sizes_px**2, axis=0))
+        return rms
+
+    def to_json(self) -> dict[str, Any]:
+        """All of it as JSON values; the map rounded to 1e-5 px."""
+        camera = self.stand_in
+        return {
+            "name": camera.name,
+            "model": camera.model,
+            "params": dict(zip(COLMAP_PARAMETERS[camera.model], camera.params, strict=True)),
+            "warped_at_m": camera.warped_at_m,
+            "centre_m": list(camera.centre_m),
+            "turn_deg": np.rad2deg(camera.approx_from_cam.as_rotvec()).tolist(),
+            "rms_px": self.rms_px,
+            "max_px": self.max_px,
+            "distances_m": self.distances_m.tolist(),
+            "rms_by_distance_px": self.rms_by_distance_px.tolist(),
+            "max_by_distance_px": self.sizes_px.max(axis=(1, 2)).tolist(),
+            "map_x_px": self.pixels[0, :, 0].tolist(),
+            "map_y_px": self.pixels[:, 0, 1].tolist(),
+            "map_px": np.round(self.map_px, 5).tolist(),
+        }
+
+
+def approximations(
+    camera: FlatPortCamera,
+    near_m: float,
+    far_m: float,
+    *,
+    distances_m: Sequence[float] | None = None,
+    working_range_m: float | None = None,
+    turned: bool = True,
+) -> list[Residual]:
+    """The usual stand-ins for a flat-port camera over an interval of distances.
+
+    Two pinholes after a warp, at the entrance pupil and at the best point of the port's normal;
+    then COLMAP's SIMPLE_RADIAL, OPENCV and FULL_OPENCV, fitted by least squares to exact rays, with
+    the centre along the port's normal.
+
+    Args:
+        camera: exact.
+        near_m: nearest distance from the entrance pupil along the axis.
+        far_m: farthest.
+        distances_m: at which to look, all counting alike; nine, evenly from near to far, when not
+            given.
+        working_range_m: where warped pictures are exact; the harmonic mean when not given.
+        turned: let the fitted cameras' axes turn, as bundle adjustment does with a tilted port.
+
+    Raises:
+        ConfigError: the interval is empty or reaches into the port.
+        CalibrationError: a part of the frame sees nothing.
+    """
+    closest = _outer_glass_m(camera)
+    if not closest < near_m < far_m < np.inf:
+        raise ConfigError(
+            f"distances {near_m:g} to {far_m:g} m: give near < far, both beyond the port's outer "
+            f"glass, {closest:g} m from the entrance pupil"
+        )
+    distances = np.linspace(near_m, far_m, 9) if distances_m is None else np.array(distances_m)
+    best = best_pinhole(camera, near_m, far_m, working_range_m)
+    at_pupil = replace(best, centre_x_m=0.0, centre_y_m=0.0, centre_z_m=0.0)
+    pixels, points = _seen(camera, distances, _GRID)
+    stand_ins = [
+        _warped("pinhole at the pupil, warped", at_pupil),
+        _warped("pinhole at the best point, warped", best),
+        *(_fitted(model, camera, pixels, points, turned) for model in FITTED),
+    ]
+    return [residual(camera, one, distances) for one in stand_ins]
+
+
+def residual(
+    camera: FlatPortCamera, stand_in: StandIn, distances_m: Array, grid: int = _GRID
+) -> Residual:
+    """How far a stand-in is from the flat-port camera.
+
+    Args:
+        camera: exact.
+        stand_in: for it.
+        distances_m: (D,) from the entrance pupil along the axis.
+        grid: places along each side of the frame.
+
+    Raises:
+        CalibrationError: a part of the frame sees nothing.
+    """
+    pixels, points = _seen(camera, distances_m, grid)
+    shown = pixels
+    if stand_in.warped_at_m is not None:
+        shown = stand_in.project(camera.at_depth(pixels, stand_in.warped_at_m))
+    return Residual(
+        stand_in=stand_in,
+        distances_m=distances_m,
+        pixels=pixels,
+        misses_px=stand_in.project(points) - shown,
+    )
+
+
+def colmap_pixels(model: str, params: Sequence[float] | Array, points: Array) -> Array:
+    """Project points in front of a COLMAP camera.
+
+    Args:
+        model: a key of `COLMAP_PARAMETERS`.
+        params: in COLMAP's order.
+        points: (..., 3) in the camera's frame.
+
+    Returns:
+        (..., 2) pixels, counted from the outer corner of the first.
+    """
+    value = dict(zip(COLMAP_PARAMETERS[model], np.asarray(params), strict=True))
+    fx, fy = value.get("fx", value.get("f")), value.get("fy", value.get("f"))
+    u, v = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]
+    k1, k2, k3, k4, k5, k6 = (value.get(f"k{i}", 0.0) for i in range(1, 7))
+    p1, p2 = value.get("p1", 0.0), value.get("p2", 0.0)
+    r2 = u * u + v * v
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    x = u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
+    y = v * radial + 2 * p2 * u * v + p1 * (r2 + 2 * v * v)
+    pixels: Array = np.stack([fx * x + value["cx"], fy * y + value["cy"]], axis=-1)
+    return pixels
+
+
+def _warped(name: str, pinhole: VirtualPinhole) -> StandIn:
+    return StandIn(
+        name=name,
+        model="PINHOLE",
+        params=(pinhole.focal_px, pinhole.focal_px, pinhole.cx_px, pinhole.cy_px),
+        warped_at_m=pinhole.working_range_m,
+        centre_m=(pinhole.centre_x_m, pinhole.centre_y_m, pinhole.centre_z_m),
+        approx_from_cam=Rotation.identity(),
+    )
+
+
+def _fitted(
+    model: str, camera: FlatPortCamera, pixels: Array, points: Array, turned: bool
+) -> StandIn:
+    """Least squares over shift along the normal (m), turn (rotation vector) and intrinsics."""
+    normal = np.asarray(camera.normal)
+    names = COLMAP_PARAMETERS[model]
+    is_distortion = np.array([name[0] in "kp" for name in names])
+    weights = _area_weights(*pixels.shape[:2]) / len(points)
+    scale = np.sqrt(weights)[None, :, :, None]
+
+    def stand_in(unknowns: Array) -> StandIn:
+        x_m, y_m, z_m = (unknowns[0] * normal).tolist()
+        return StandIn(
+            name=f"{model}, fitted",
+            model=model,
+            params=tuple(unknowns[4 if turned else 1 :].tolist()),
+            warped_at_m=None,
+            centre_m=(x_m, y_m, z_m),
+            approx_from_cam=Rotation.from_rotvec(unknowns[1:4] if turned else np.zeros(3)),
+        )
+
+    def cost(unknowns: Array) -> Array:
+        one = stand_in(unknowns)
+        coefficients = np.array(one.params)[is_distortion]
+        misses = (one.project(points) - pixels) * scale
+        return np.concatenate([misses.ravel(), _CANCELLING_PX * coefficients])
+
+    start = {
+        "f": camera.n_water * (camera.fx_px + camera.fy_px) / 2,
+        "fx": camera.n_water * camera.fx_px,
+        "fy": camera.n_water * camera.fy_px,
+        "cx": camera.cx_px,
+        "cy": camera.cy_px,
+    }
+    first = np.array([0.0] * (4 if turned else 1) + [start.get(name, 0.0) for name in names])
+    return stand_in(least_squares(cost, first, x_scale="jac", max_nfev=200).x)
+
+
+def _seen(camera: FlatPortCamera, distances: Array, grid: int) -> tuple[Array, Array]:
+    """Places in the frame, (grid, grid, 2), and what they see at each distance, (D, ..., 3)."""
+    x = np.linspace(0.0, camera.width_px, grid)
+    y = np.linspace(0.0, camera.height_px, grid)
+    pixels = np.stack(np.meshgrid(x, y), axis=-1)
+    points = np.stack([camera.at_depth(pixels, float(z)) for z in distances])
+    if not np.all(np.isfinite(points)):
+        raise CalibrationError(
+            "a part of the frame sees nothing: the lens model or the port does not reach the "
+            "corners"
+        )
+    return pixels, points
+
+
+def _area_weights(rows: int, columns: int) -> Array:
+    """Shares of the frame, by the trapezoidal rule: places on its border count half."""
+    sides = []
+    for count in (rows, columns):
+        side = np.ones(count)
+        side[[0, -1]] = 0.5
+        sides.append(side / side.sum())
+    weights: Array = np.outer(*sides)
+    return weights
+
+
+def _outer_glass_m(camera: FlatPortCamera) -> float:
+    """Farthest along the axis that the outer glass is from the entrance pupil, over the frame."""
+    points, _ = camera.unproject(camera.border(8))
+    nearest = camera.port_distance_m + camera.glass_thickness_m
+    return max(nearest, float(np.nanmax(points[:, 2], initial=0.0)))

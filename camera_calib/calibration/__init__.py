@@ -1,0 +1,1 @@
+"""Calibrate a rig from views of a target: start, joint adjustment, outliers, advice, files."""

@@ -1,0 +1,277 @@
+"""Calibrate from pictures of a target: `alice-survey calibrate --left ... --right ...`."""
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from alice_survey.errors import CalibrationError, WorkspaceError
+from alice_survey.executor import default_threads
+from camera_calib.calibration.calibrate import (
+    Intrinsics,
+    blank_camera,
+    calibrate_in_air,
+    calibrate_in_water_alone,
+    calibrate_through_ports,
+    first_cameras,
+)
+from camera_calib.calibration.detect_views import Detections, Size, detect_views
+from camera_calib.calibration.files import finish, summary, tell
+from camera_calib.calibration.freedom import intrinsics
+from camera_calib.calibration.numbering import same_numbering
+from camera_calib.calibration.picture_sets import find_pictures, pair_pictures
+from camera_calib.calibration.result import Calibration
+from camera_calib.flat_port import FlatPortCamera
+from camera_calib.rig import Rig, read_rig, write_rig
+from camera_calib.targets.target import Target, parse_target
+
+ONE_CAMERA = "camera"
+"""Name of the camera of `--pictures`."""
+_GUESSED_PORT_M = 0.02
+_FRESH_WATER, _GLASS = 1.34, 1.52
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureCalibration:
+    """What the user says of pictures to calibrate from."""
+
+    pictures: Mapping[str, str]
+    """Folder or pattern by camera; the first is the reference."""
+    target: str
+    """As `parse_target` reads it."""
+    lens: str = "opencv5"
+    water: bool = False
+    """The pictures were taken under water, through the ports."""
+    start: Path | None = None
+    """rig.json of a calibration in air, or an earlier one."""
+    known: Intrinsics | None = None
+    """What is done with the intrinsics of `start`; None: prior if it has a covariance, or held."""
+    port_distance_m: float | None = None
+    """First value; it is found."""
+    glass_thickness_m: float | None = None
+    glass_sigma_m: float | None = None
+    """The thickness is found too, known this well."""
+    n_glass: float | None = None
+    n_water: float | None = None
+    carry_to_n: float | None = None
+    """Also write the rig in water of this index."""
+
+
+def calibrate_command(
+    left: str | None,
+    right: str | None,
+    pictures: str | None,
+    target: str | None,
+    output: Path | None,
+    threads: int | None,
+    **others: Any,
+) -> tuple[str, dict[str, Any]]:
+    """`calibrate_pictures` from the options of the command line.
+
+    Args:
+        left: folder or pattern of the left camera's pictures.
+        right: the right camera's.
+        pictures: of one camera, instead.
+        target: in words, or the path of its file.
+        output: folder to write.
+        threads: cores to use; None for all.
+        others: further fields of `PictureCalibration`.
+
+    Raises:
+        CalibrationError: options are missing or do not go together, or as of `calibrate_pictures`.
+    """
+    places = {"left": left, "right": right, ONE_CAMERA: pictures}
+    given = {camera: place for camera, place in places.items() if place is not None}
+    if pictures is not None and len(given) > 1:
+        raise CalibrationError("give --left and --right, or --pictures, not both")
+    if pictures is None and len(given) == 1:
+        raise CalibrationError("give both --left and --right, or --pictures for a single camera")
+    if target is None:
+        raise CalibrationError("--target is missing: what is seen, such as 'chessboard 9x6 25mm'")
+    if output is None:
+        raise CalibrationError("-o is missing: the folder to write the calibration into")
+    settings = PictureCalibration(pictures=given, target=target, **others)
+    return calibrate_pictures(settings, output, threads or default_threads())
+
+
+def calibrate_pictures(
+    settings: PictureCalibration, output: Path, threads: int
+) -> tuple[str, dict[str, Any]]:
+    """Calibrate from pictures and write a folder of results.
+
+    Returns:
+        What was found, as text and as JSON values.
+
+    Raises:
+        CalibrationError: the pictures, the target or the settings do not give a calibration.
+    """
+    if output.exists() and not (output / "calibration.json").is_file() and any(output.iterdir()):
+        raise WorkspaceError(f"{output} holds other files: choose another folder with -o")
+    target = parse_target(settings.target)
+    intrinsics(settings.lens)
+    start = None if settings.start is None else read_rig(settings.start)
+    _check_settings(settings, start)
+    lists = {camera: find_pictures(place) for camera, place in settings.pictures.items()}
+    found = detect_views(pair_pictures(lists), target, threads)
+    tell(found)
+    calibration = _calibrated(settings, found, target, start)
+    partial = output.with_name(f"{output.name}.partial")
+    if partial.exists():
+        shutil.rmtree(partial)
+    partial.mkdir(parents=True)
+    calibration = finish(partial, calibration, found)
+    if settings.carry_to_n is not None:
+        write_rig(partial / "rig_carried.json", carried(calibration.rig, settings.carry_to_n))
+    if output.exists():
+        shutil.rmtree(output)
+    partial.rename(output)
+    data = summary(calibration)
+    return _text(calibration, output, settings), data
+
+
+def carried(rig: Rig, n_water: float) -> Rig:
+    """The rig in other water, which says so."""
+    old = next(iter(rig.cameras.values())).n_water
+    return replace(
+        rig.in_water(n_water),
+        source=f"{rig.source}, carried from water of index {old:g} to {n_water:g}",
+    )
+
+
+def _check_settings(settings: PictureCalibration, start: Rig | None) -> None:
+    ports = {
+        "--port-distance": settings.port_distance_m,
+        "--glass": settings.glass_thickness_m,
+        "--glass-sigma": settings.glass_sigma_m,
+        "--n-glass": settings.n_glass,
+        "--n-water": settings.n_water,
+        "--carry-to-n": settings.carry_to_n,
+        "--intrinsics": settings.known,
+    }
+    if not settings.water:
+        given = [name for name, value in ports.items() if value is not None]
+        if given:
+            raise CalibrationError(f"{', '.join(given)} need --water: pictures in air see no port")
+        return
+    if settings.known in ("held", "prior") and start is None:
+        raise CalibrationError(
+            f"--intrinsics {settings.known} needs --start, the rig.json of a calibration in air"
+        )
+    if settings.glass_thickness_m is None:
+        thin = start is None or all(c.glass_thickness_m == 0.0 for c in start.cameras.values())
+        if thin:
+            raise CalibrationError(
+                "--water needs --glass, the thickness of the port in metres (0 for a thin film)"
+            )
+
+
+def _calibrated(
+    settings: PictureCalibration, found: Detections, target: Target, start: Rig | None
+) -> Calibration:
+    points, lens = target.points, settings.lens
+    cameras = _first(settings, found.sizes, start)
+    known = settings.known
+    if start is not None:
+        start = replace(_matching(start, found.sizes), cameras=cameras)
+        known = known or ("held" if start.covariance is None else "prior")
+    views = found.views
+    if target.is_ambiguous and len(cameras) > 1:
+        near = cameras if start is not None else first_cameras(views, points, cameras, lens)
+        views = tuple(same_numbering(near, views, points, target.symmetries))
+    if not settings.water:
+        return calibrate_in_air(views, points, found.sizes, lens, start)
+    sigmas = {}
+    if settings.glass_sigma_m is not None:
+        sigmas = {f"{name}.glass_thickness_m": settings.glass_sigma_m for name in cameras}
+    if start is None or known is None:
+        return calibrate_in_water_alone(views, points, cameras, lens, sigmas)
+    return calibrate_through_ports(views, points, start, known, lens, sigmas)
+
+
+def _first(
+    settings: PictureCalibration, sizes: Mapping[str, Size], start: Rig | None
+) -> dict[str, FlatPortCamera]:
+    """Cameras of the start, or blank ones, in air or behind the port that the user names."""
+    if start is not None:
+        given = _matching(start, sizes).cameras
+        prepare = _behind_port if settings.water else _bare
+        return {name: prepare(camera, settings) for name, camera in given.items()}
+    if not settings.water:
+        bare = {"n_water": 1.0, "port_distance_m": 0.0, "glass_thickness_m": 0.0}
+        return {name: blank_camera(size, **bare) for name, size in sizes.items()}
+    port_m, thickness_m = settings.port_distance_m, settings.glass_thickness_m
+    return {
+        name: blank_camera(
+            size,
+            n_water=_FRESH_WATER if settings.n_water is None else settings.n_water,
+            n_glass=_GLASS if settings.n_glass is None else settings.n_glass,
+            port_distance_m=_GUESSED_PORT_M if port_m is None else port_m,
+            glass_thickness_m=0.0 if thickness_m is None else thickness_m,
+        )
+        for name, size in sizes.items()
+    }
+
+
+def _bare(camera: FlatPortCamera, _: PictureCalibration) -> FlatPortCamera:
+    """A camera out of its housing."""
+    return replace(
+        camera, n_water=1.0, port_distance_m=0.0, glass_thickness_m=0.0, normal=(0.0, 0.0, 1.0)
+    )
+
+
+def _behind_port(camera: FlatPortCamera, settings: PictureCalibration) -> FlatPortCamera:
+    """A camera of the start behind the port and in the water that the user names."""
+    given = {
+        "glass_thickness_m": settings.glass_thickness_m,
+        "n_glass": settings.n_glass,
+        "n_water": settings.n_water,
+        "port_distance_m": settings.port_distance_m,
+    }
+    if settings.n_water is None and camera.n_water == 1.0:
+        given["n_water"] = _FRESH_WATER
+    if settings.port_distance_m is None and camera.port_distance_m == 0.0:
+        given["port_distance_m"] = _GUESSED_PORT_M
+    return camera.with_parameters({k: v for k, v in given.items() if v is not None})
+
+
+def _matching(start: Rig, sizes: Mapping[str, Size]) -> Rig:
+    """The cameras of a start that are calibrated, if its pictures have the same size."""
+    if not set(sizes) <= set(start.cameras):
+        raise CalibrationError(
+            f"the start has cameras {', '.join(start.cameras)}; pictures are of {', '.join(sizes)}"
+        )
+    for name, size in sizes.items():
+        camera = start.cameras[name]
+        if (camera.width_px, camera.height_px) != size:
+            raise CalibrationError(
+                f"pictures of {name} have {size[0]} x {size[1]} px, the start's camera "
+                f"{camera.width_px} x {camera.height_px}"
+            )
+    names = list(sizes)
+    to_first = start.cam_from_rig[names[0]].inv()
+    return replace(
+        start,
+        cameras={name: start.cameras[name] for name in names},
+        cam_from_rig={name: start.cam_from_rig[name] * to_first for name in names},
+        body_from_rig=start.body_from_cam(names[0]),
+    )
+
+
+def _text(calibration: Calibration, output: Path, settings: PictureCalibration) -> str:
+    rig, square = calibration.rig, (calibration.residuals_px**2).sum(axis=-1)
+    points = int((square == square).sum())
+    rows = [
+        f"{len(calibration.views)} views, {points} points, {calibration.rms_px:.3f} px rms "
+        f"(noise {calibration.noise_px:.3f} px); {len(calibration.warnings)} warnings",
+    ]
+    if len(rig.cameras) > 1:
+        rows.append(f"baseline {rig.baseline_m:.6g} m")
+    for name, sigma in rig.sigmas.items():
+        if name.endswith(("fx_px", "port_distance_m", "normal_x", "normal_y")):
+            camera, field = name.split(".")
+            rows.append(f"{name:24} {rig.cameras[camera].parameter(field):12.6g} +- {sigma:.2g}")
+    rows.append(f"rig in {output / 'rig.json'}; report in {output / 'report.html'}")
+    if settings.carry_to_n is not None:
+        rows.append(f"in water of index {settings.carry_to_n:g}: {output / 'rig_carried.json'}")
+    return "\n".join(rows)

@@ -1,0 +1,306 @@
+"""One figure of what lenses see through a flat port: six panels."""
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from alice_survey.errors import ConfigError
+from camera_calib.fov.angles import RELIEF, AngleRow
+from camera_calib.fov.paper import PAPER_TABLE
+from camera_calib.fov.table import TRUSTED_FOV_DEG, FovChoices, FovRow
+
+FovTable = Callable[[Sequence[float], FovChoices], list[FovRow]]
+"""Rows of all lenses at altitudes, lenses outside."""
+
+_NO_DATES = {
+    ".png": {"Software": None},
+    ".svg": {"Date": None, "Creator": None},
+    ".pdf": {"CreationDate": None, "Creator": None, "Producer": None},
+}
+_COLOURS = ("#1b4f72", "#c8553d", "#1e8449", "#6c3483", "#b7950b", "#566573")
+_STYLES = ("-", "--", ":", "-.")
+_CURVE_POINTS = 30
+
+
+def draw_fov(
+    path: Path,
+    table: FovTable,
+    altitudes_m: Sequence[float],
+    choices: FovChoices,
+    *,
+    speeds_mps: Sequence[float],
+    exposures_s: Sequence[float],
+    allowed_px: float,
+    angles: Sequence[AngleRow],
+    paper: bool,
+) -> None:
+    """Draw footprint, pixel, depth of field, depth precision, blur and distortion.
+
+    Args:
+        path: ends in .png, .svg or .pdf; the same input gives the same bytes.
+        table: rows of all lenses at given altitudes.
+        altitudes_m: altitudes of interest; the curves go some way beyond them.
+        choices: circle of confusion, focus, matching noise.
+        speeds_mps: of the blur curves.
+        exposures_s: of interest; marked.
+        allowed_px: blur that is allowed; marked.
+        angles: distortion against the field of view.
+        paper: mark what the paper's table prints; its sensor is drawn.
+
+    Raises:
+        ConfigError: another suffix, or the file cannot be written.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in _NO_DATES:
+        raise ConfigError(f"{path}: plots are written as {', '.join(_NO_DATES)}: change the suffix")
+    marked = _by_lens(table(altitudes_m, choices))
+    low, high = 0.25 * min(altitudes_m), 1.5 * max(altitudes_m)
+    curve = np.linspace(max(low, 0.01), high, _CURVE_POINTS).tolist()
+    curves = _by_lens(table(curve, choices))
+    soft = _by_lens(table(curve, replace(choices, coc_px=3 * choices.coc_px)))
+
+    figure = Figure(figsize=(15.0, 9.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(2, 3)
+    for axes in panels.flat:
+        axes.grid(visible=True, color="#d5d8dc", lw=0.6)
+        axes.set_axisbelow(True)
+        axes.spines[["top", "right"]].set_visible(False)
+    _footprints(panels[0, 0], curves, marked, paper=paper)
+    _pixels(panels[0, 1], curves, marked, paper=paper)
+    _depth_of_field(panels[0, 2], curves, soft, choices)
+    _precision(panels[1, 0], curves, marked)
+    _blur(panels[1, 1], marked, speeds_mps, exposures_s, allowed_px)
+    _distortion(panels[1, 2], angles, marked)
+    first = next(iter(marked.values()))[0]
+    figure.suptitle(
+        f"Through a flat port: n {first.n_water:.4g}, {_port(first)} before the pupil",
+        fontsize=13,
+    )
+    try:
+        with mpl.rc_context({"svg.hashsalt": "fov", "svg.fonttype": "none"}):
+            figure.savefig(path, dpi=120, metadata=_NO_DATES[suffix])
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def _port(row: FovRow | AngleRow) -> str:
+    return f"port {row.port_distance_m * 1e3:.4g} + {row.glass_thickness_m * 1e3:.4g} mm"
+
+
+def _by_lens(rows: Sequence[FovRow]) -> dict[float, list[FovRow]]:
+    lenses: dict[float, list[FovRow]] = {}
+    for row in rows:
+        lenses.setdefault(round(row.lens_mm, 6), []).append(row)
+    return lenses
+
+
+def _colour(i: int) -> str:
+    return _COLOURS[i % len(_COLOURS)]
+
+
+def _values(rows: Sequence[FovRow], name: str) -> list[float]:
+    return [getattr(row, name) for row in rows]
+
+
+def _curve_pair(
+    axes: Axes,
+    curves: dict[float, list[FovRow]],
+    marked: dict[float, list[FovRow]],
+    solid: tuple[str, str],
+    dashed: tuple[str, str],
+) -> None:
+    for i, (lens, rows) in enumerate(curves.items()):
+        altitude = _values(rows, "altitude_m")
+        axes.plot(
+            altitude, _values(rows, solid[0]), color=_colour(i), label=f"{lens:.4g} mm {solid[1]}"
+        )
+        axes.plot(
+            altitude, _values(rows, dashed[0]), "--", color=_colour(i),
+            label=f"{lens:.4g} mm {dashed[1]}",
+        )  # fmt: skip
+        for name in (solid[0], dashed[0]):
+            axes.plot(
+                _values(marked[lens], "altitude_m"), _values(marked[lens], name),
+                "o", ms=4, color=_colour(i),
+            )  # fmt: skip
+    axes.set_xlabel("altitude of the outer glass, m")
+    axes.set_xlim(left=0)
+    axes.set_ylim(bottom=0)
+
+
+def _paper(axes: Axes, quantities: Sequence[str], lenses: Collection[float]) -> None:
+    printed = [
+        float(value)
+        for lens, quantity, _, value in PAPER_TABLE
+        if quantity in quantities and lens in lenses
+    ]
+    if printed:
+        axes.plot(
+            [2.0] * len(printed), printed, "x", ms=7, mew=1.6, color="black", label="paper",
+            zorder=5,
+        )  # fmt: skip
+
+
+def _footprints(
+    axes: Axes, curves: dict[float, list[FovRow]], marked: dict[float, list[FovRow]], *, paper: bool
+) -> None:
+    _curve_pair(axes, curves, marked, ("horizontal_m", "wide"), ("vertical_m", "high"))
+    if paper:
+        _paper(axes, ("horizontal", "vertical"), curves)
+    axes.set_title("Footprint")
+    axes.set_ylabel("m")
+    axes.legend(frameon=False, fontsize=9)
+
+
+def _pixels(
+    axes: Axes, curves: dict[float, list[FovRow]], marked: dict[float, list[FovRow]], *, paper: bool
+) -> None:
+    _curve_pair(axes, curves, marked, ("pixel_centre_mm", "centre"), ("pixel_corner_mm", "corner"))
+    if paper:
+        _paper(axes, ("pixel",), curves)
+    axes.set_title("Pixel on the sea floor")
+    axes.set_ylabel("mm")
+    axes.legend(frameon=False, fontsize=9)
+
+
+def _depth_of_field(
+    axes: Axes,
+    curves: dict[float, list[FovRow]],
+    soft: dict[float, list[FovRow]],
+    choices: FovChoices,
+) -> None:
+    altitude = _values(next(iter(curves.values())), "altitude_m")
+    top = 2.0 * max(altitude)
+    for i, (lens, rows) in enumerate(curves.items()):
+        for band, style in ((soft[lens], "--"), (rows, "-")):
+            near = _values(band, "near_altitude_m")
+            far = np.minimum(_values(band, "far_altitude_m"), 2 * top)
+            label = f"{lens:.4g} mm, {band[0].coc_px:g} px"
+            axes.plot(altitude, near, style, color=_colour(i), lw=1.2, label=label)
+            axes.plot(altitude, far, style, color=_colour(i), lw=1.2)
+            if band is rows:
+                axes.fill_between(altitude, near, far, color=_colour(i), alpha=0.22, lw=0)
+    axes.plot(altitude, altitude, color="black", lw=0.9, ls=":", label="the sea floor")
+    where = (
+        "focused on the sea floor"
+        if choices.focus_air_m is None
+        else f"focused at {choices.focus_air_m:g} m in air"
+    )
+    f_number = next(iter(curves.values()))[0].f_number
+    axes.set_title(f"Depth of field at the centre, F/{f_number:g},\n{where}")
+    axes.set_xlabel("altitude of the outer glass, m")
+    axes.set_ylabel("altitudes that are sharp, m")
+    axes.set_xlim(0, max(altitude))
+    axes.set_ylim(0, top)
+    axes.legend(facecolor="white", edgecolor="none", framealpha=0.8, fontsize=9, loc="upper left")
+
+
+def _precision(
+    axes: Axes, curves: dict[float, list[FovRow]], marked: dict[float, list[FovRow]]
+) -> None:
+    first = next(iter(curves.values()))[0]
+    if not np.isfinite(first.baseline_m):
+        axes.set_axis_off()
+        axes.text(0.5, 0.5, "one camera: no stereo", ha="center", transform=axes.transAxes)
+        return
+    axes.set_title(
+        f"Depth precision of the {first.baseline_m * 1e3:.0f} mm pair,\n"
+        f"{first.match_sigma_px:g} px of disparity noise"
+    )
+    for i, (lens, rows) in enumerate(curves.items()):
+        axes.plot(
+            _values(rows, "altitude_m"), _values(rows, "depth_sigma_mm"), color=_colour(i),
+            label=f"{lens:.4g} mm",
+        )  # fmt: skip
+        axes.plot(
+            _values(marked[lens], "altitude_m"), _values(marked[lens], "depth_sigma_mm"), "o",
+            ms=4, color=_colour(i),
+        )  # fmt: skip
+    axes.set_xlabel("altitude of the outer glass, m")
+    axes.set_ylabel("one sigma, mm")
+    axes.set_xlim(left=0)
+    axes.set_ylim(bottom=0)
+    axes.legend(frameon=False, fontsize=9)
+
+
+def _blur(
+    axes: Axes,
+    marked: dict[float, list[FovRow]],
+    speeds_mps: Sequence[float],
+    exposures_s: Sequence[float],
+    allowed_px: float,
+) -> None:
+    low, high = 0.2 * min(exposures_s), 5.0 * max(exposures_s)
+    exposure = np.geomspace(low, high, 2)
+    altitude = next(iter(marked.values()))[0].altitude_m
+    for i, (lens, rows) in enumerate(marked.items()):
+        pixel_m = rows[0].pixel_centre_mm * 1e-3
+        for k, speed in enumerate(speeds_mps):
+            axes.loglog(
+                exposure * 1e3, speed * exposure / pixel_m, _STYLES[k % len(_STYLES)],
+                color=_colour(i), label=f"{lens:.4g} mm, {speed:g} m/s",
+            )  # fmt: skip
+            axes.plot(
+                np.asarray(exposures_s) * 1e3, speed * np.asarray(exposures_s) / pixel_m, "o",
+                ms=4, color=_colour(i),
+            )  # fmt: skip
+    axes.axhline(allowed_px, color="black", lw=0.9, ls="--")
+    axes.annotate(
+        f"{allowed_px:g} px", (high * 1e3, allowed_px), ha="right", va="bottom", fontsize=9,
+        xytext=(-2, 2), textcoords="offset points",
+    )  # fmt: skip
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter("{x:g}")
+    axes.set_title(f"Motion blur at {altitude:g} m altitude")
+    axes.set_xlabel("exposure, ms")
+    axes.set_ylabel("px")
+    axes.set_xlim(low * 1e3, high * 1e3)
+    axes.legend(frameon=False, fontsize=9)
+
+
+def _distortion(axes: Axes, angles: Sequence[AngleRow], marked: dict[float, list[FovRow]]) -> None:
+    degrees = [row.fov_air_deg for row in angles]
+    curves = (
+        ("displacement_px", "corner displaced", "-", "#212f3d"),
+        ("chromatic_px", "blue from red in it", "-.", "#6c3483"),
+        ("residual_max_px", "best pinhole, worst", "--", "#1e8449"),
+        ("residual_rms_px", "best pinhole, rms", "-", "#1e8449"),
+    )
+    for name, label, style, colour in curves:
+        values = np.array([getattr(row, name) for row in angles])
+        if np.all(values > 1e-6):
+            axes.semilogy(degrees, values, style, color=colour)
+            axes.annotate(
+                label, (degrees[-1], values[-1]), ha="right", va="top", fontsize=9, color=colour,
+                xytext=(0, -17), textcoords="offset points",
+            )  # fmt: skip
+    axes.axvline(TRUSTED_FOV_DEG, color="black", lw=0.9, ls="--")
+    bottom = 0.1 * axes.get_ylim()[0]
+    axes.set_ylim(bottom=bottom)
+    axes.annotate(
+        f"the paper's {TRUSTED_FOV_DEG:g} deg", (TRUSTED_FOV_DEG, bottom), rotation=90,
+        ha="left", va="bottom", fontsize=9, xytext=(3, 6), textcoords="offset points",
+    )  # fmt: skip
+    for i, (lens, rows) in enumerate(marked.items()):
+        angle = rows[0].diagonal_air_deg
+        axes.axvline(angle, color=_colour(i), lw=0.9, ls=":")
+        axes.annotate(
+            f"{lens:.4g} mm", (angle, bottom), rotation=90, ha="right", va="bottom", fontsize=9,
+            color=_colour(i), xytext=(-2, 6), textcoords="offset points",
+        )  # fmt: skip
+    axes.yaxis.set_major_formatter("{x:g}")
+    first = angles[0]
+    axes.set_title(
+        f"Against the field of view: n {first.n_water:.4g}, {_port(first)},\n"
+        f"{first.altitude_m:g} m altitude, relief +/-{RELIEF:.0%}",
+        fontsize=11,
+    )
+    axes.set_xlabel("full angle of the diagonal in air, deg")
+    axes.set_ylabel("px")

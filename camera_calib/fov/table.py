@@ -1,0 +1,347 @@
+"""Field of view, resolution, focus, stereo and blur of a lens behind the flat port.
+
+Everything follows from the exact flat-port camera. Near the axis a port of distance d and glass g,
+seen from the entrance pupil, brings the sea floor at altitude a to the apparent distance
+D = d + g / n_glass + a / n_water (paraxial Snell's law); the tests hold the rows below against
+the closed forms that follow from it.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from alice_survey.config import CameraConfig, WaterConfig
+from alice_survey.errors import ConfigError
+from alice_survey.frames import Array
+from camera_calib.flat_port import FlatPortCamera
+from camera_calib.fov.focus import (
+    FocusedLens,
+    air_rays,
+    apparent_depths,
+    apparent_distance_m,
+    glass_z_m,
+)
+from camera_calib.fov.stereo import disparity_per_m, stereo_overlap
+from camera_calib.rig import Rig, design_rig
+
+__all__ = [
+    "MATCH_SIGMA_PX", "TRUSTED_FOV_DEG", "BlurRow", "FovChoices", "FovRow", "apparent_distance_m",
+    "blur_table", "fov_table", "json_row", "rig_fov_table",
+]  # fmt: skip
+
+MATCH_SIGMA_PX = 0.3
+"""Disparity noise for which the depth precision is stated."""
+
+TRUSTED_FOV_DEG = 70.0
+"""Full angle in air up to which the paper trusts a flat port (its section III.B)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FovChoices:
+    """What a table of fields of view is asked for beside lenses, altitudes, water and port."""
+
+    coc_px: float = 1.0
+    """Largest blur circle that counts as sharp."""
+    focus_air_m: float | None = None
+    """Distance in air that the lens is set to; the sea floor's own when None."""
+    match_sigma_px: float = MATCH_SIGMA_PX
+    """Noise of a disparity between the two cameras."""
+
+    def __post_init__(self) -> None:
+        check_range("coc", [self.coc_px], 1e-3, 1e3, "px")
+        check_range("match_sigma", [self.match_sigma_px], 1e-6, 1e3, "px")
+        if self.focus_air_m is not None:
+            check_range("focus in air", [self.focus_air_m], 1e-3, 1e6, "m")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FovRow:
+    """What one lens sees from one altitude. Altitude is that of the port's outer glass.
+
+    The sea floor is level and square to the axis of the left (or only, or reference) camera. What
+    does not exist (the stereo of one camera, a frame that is nowhere sharp) is NaN.
+    """
+
+    lens_mm: float
+    altitude_m: float
+    n_water: float
+    port_distance_m: float
+    glass_thickness_m: float
+    horizontal_m: float
+    """Width of the footprint along the middle row."""
+    vertical_m: float
+    """Height of the footprint along the middle column."""
+    pixel_centre_mm: float
+    """Root of the area on the sea floor of the central pixel."""
+    pixel_mean_mm: float
+    """Width of the footprint over the number of columns."""
+    pixel_corner_mm: float
+    """Root of the area on the sea floor of a corner pixel, the largest of the four."""
+    diagonal_air_deg: float
+    """Full angle of the frame's diagonal in air."""
+    diagonal_water_deg: float
+    """The same beam after the port."""
+    baseline_m: float
+    """Distance between the two pupils."""
+    stereo_overlap: float
+    """Share of the area of the left camera's footprint that the right one sees too."""
+    depth_sigma_mm: float
+    """Depth precision of the pair below its middle, for `match_sigma_px` of disparity noise."""
+    match_sigma_px: float
+    focus_air_m: float
+    """Distance from the entrance pupil to set in air for a sharp sea floor at the centre."""
+    f_number: float
+    coc_px: float
+    """Largest blur circle that counts as sharp."""
+    focus_set_m: float
+    """Distance in air that the limits below are for."""
+    hyperfocal_air_m: float
+    """Least focus distance in air for which everything beyond is sharp."""
+    hyperfocal_altitude_m: float
+    """Altitude of the sea floor that this distance focuses on."""
+    near_altitude_m: float
+    """Nearest sharp altitude at the centre of the frame; 0 when all from the glass on is sharp."""
+    far_altitude_m: float
+    """Farthest sharp altitude at the centre; may be inf."""
+    depth_of_field_m: float
+    """Far less near, in water."""
+    frame_near_altitude_m: float
+    """As near, but sharp in the whole frame (the port bends the field); NaN when none is."""
+    frame_far_altitude_m: float
+    floor_blur_px: float
+    """Blur circle of the sea floor at the centre, from defocus."""
+    corner_blur_px: float
+    """Longer axis of its blur in the worst corner: the port's field curvature and astigmatism."""
+    within_trusted_fov: bool
+    """The diagonal is within the 70 degrees for which the paper trusts a flat port."""
+
+    def to_json(self) -> dict[str, Any]:
+        """All fields as JSON values; NaN and inf are null."""
+        return json_row(asdict(self))
+
+
+@dataclass(frozen=True, kw_only=True)
+class BlurRow:
+    """Motion blur of the central pixel. Exposure is the shorter of shutter and strobe."""
+
+    lens_mm: float
+    altitude_m: float
+    speed_mps: float
+    exposure_s: float
+    blur_px: float
+    allowed_px: float
+    longest_exposure_s: float
+    """For which the blur is `allowed_px`."""
+
+    def to_json(self) -> dict[str, Any]:
+        """All fields as JSON values."""
+        return json_row(asdict(self))
+
+
+def fov_table(
+    lenses_mm: Sequence[float],
+    altitudes_m: Sequence[float],
+    n_water: float,
+    camera_config: CameraConfig,
+    choices: FovChoices | None = None,
+) -> list[FovRow]:
+    """Footprint, resolution, focus and stereo of lenses at altitudes, through the port as designed.
+
+    Args:
+        lenses_mm: focal lengths in air.
+        altitudes_m: of the left port's outer glass above a level sea floor.
+        n_water: index of refraction of the water; 1 is air.
+        camera_config: sensor, port, baseline and f-number.
+        choices: circle of confusion, focus, matching noise.
+
+    Returns:
+        One row per lens and altitude, lenses outside.
+
+    Raises:
+        ConfigError: a lens, an altitude or the index is out of range, a lens cannot be focused, or
+            a lens is so short that light of the frame's edge is totally reflected or never reaches
+            the sea floor.
+    """
+    check_range("lens", lenses_mm, 0.5, 500.0, "mm")
+    check_range("altitude", altitudes_m, 0.01, 1000.0, "m")
+    check_range("n_water", [n_water], 1.0, 1.4, "")
+    water = WaterConfig(n_water=n_water)
+    rows = []
+    for lens_mm in lenses_mm:
+        config = camera_config.model_copy(update={"focal_mm": float(lens_mm)})
+        rig = design_rig(config, water)
+        rows += [
+            _row(rig, config, float(altitude), choices or FovChoices(), float(lens_mm) * 1e-3)
+            for altitude in altitudes_m
+        ]
+    return rows
+
+
+def rig_fov_table(
+    rig: Rig,
+    altitudes_m: Sequence[float],
+    camera_config: CameraConfig,
+    choices: FovChoices | None = None,
+) -> list[FovRow]:
+    """The same of a calibrated rig, with its lens distortion, port tilt and relative pose.
+
+    Args:
+        rig: the first camera is the left one, the second its partner.
+        altitudes_m: of the first camera's outer glass, where the normal of its pupil meets it.
+        camera_config: `pixel_um` and `f_number`, which a rig does not know; the rest is not used.
+        choices: circle of confusion, focus, matching noise.
+
+    Returns:
+        One row per altitude.
+
+    Raises:
+        ConfigError: as `fov_table`.
+    """
+    check_range("altitude", altitudes_m, 0.01, 1000.0, "m")
+    return [
+        _row(rig, camera_config, float(altitude), choices or FovChoices(), None)
+        for altitude in altitudes_m
+    ]
+
+
+def blur_table(
+    rows: Sequence[FovRow],
+    speeds_mps: Sequence[float],
+    exposures_s: Sequence[float],
+    allowed_px: float,
+) -> list[BlurRow]:
+    """How far the central pixel moves over the sea floor while it is exposed.
+
+    Args:
+        rows: lenses and altitudes.
+        speeds_mps: over ground.
+        exposures_s: of the shutter, or of the strobe where that alone lights the scene.
+        allowed_px: blur for which the longest exposure is told.
+
+    Raises:
+        ConfigError: a value is out of range.
+    """
+    check_range("speed", speeds_mps, 1e-6, 1e3, "m/s")
+    check_range("exposure", exposures_s, 1e-9, 1e3, "s")
+    check_range("blur", [allowed_px], 1e-6, 1e6, "px")
+    return [
+        BlurRow(
+            lens_mm=row.lens_mm,
+            altitude_m=row.altitude_m,
+            speed_mps=speed,
+            exposure_s=exposure,
+            blur_px=speed * exposure / (row.pixel_centre_mm * 1e-3),
+            allowed_px=allowed_px,
+            longest_exposure_s=allowed_px * row.pixel_centre_mm * 1e-3 / speed,
+        )
+        for row in rows
+        for speed in speeds_mps
+        for exposure in exposures_s
+    ]
+
+
+def check_range(what: str, values: Sequence[float], least: float, most: float, unit: str) -> None:
+    """Refuse numbers that are out of range or not finite.
+
+    Raises:
+        ConfigError: names the first of them and what is allowed.
+    """
+    for value in values:
+        if not least <= value <= most:
+            raise ConfigError(
+                f"{what} {value} {unit}".rstrip() + f": allowed {least:g} to {most:g}"
+            )
+
+
+def json_row(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The values with NaN and inf, which JSON does not know, as None."""
+    return {
+        key: None if isinstance(value, float) and not math.isfinite(value) else value
+        for key, value in values.items()
+    }
+
+
+def _row(
+    rig: Rig, config: CameraConfig, altitude_m: float, choices: FovChoices, focal_m: float | None
+) -> FovRow:
+    camera = rig.cameras[rig.reference]
+    pixel_m = config.pixel_um * 1e-6
+    image_m = math.sqrt(camera.fx_px * camera.fy_px) * pixel_m
+    lens_mm = (focal_m or image_m) * 1e3
+    w, h = float(camera.width_px), float(camera.height_px)
+    corners = np.array([[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]])
+    floor_z = glass_z_m(camera) + altitude_m
+    edges = camera.at_depth(np.array([[0, h / 2], [w, h / 2], [w / 2, 0], [w / 2, h]]), floor_z)
+    horizontal = float(np.linalg.norm(edges[1] - edges[0]))
+    corner_pixels = np.clip(corners, 0.5, [w - 0.5, h - 0.5])
+    centre = np.array([w / 2, h / 2])
+    pixel_mm = _pixel_sizes_mm(camera, np.vstack([centre, corner_pixels]), floor_z)
+    if not (np.all(np.isfinite(edges)) and np.all(np.isfinite(pixel_mm))):
+        raise ConfigError(f"lens {lens_mm:g} mm: light of the frame's edge finds no way out")
+
+    seen = apparent_depths(camera, np.vstack([centre, corners]))
+    depths = seen.at(altitude_m)
+    focus_air_m = float(2.0 / np.sum(1.0 / depths[0]))
+    focus_m = focus_air_m if choices.focus_air_m is None else choices.focus_air_m
+    # A calibrated focal length is the image distance, at the focus it was calibrated at.
+    focal = focal_m or 1.0 / (1.0 / image_m + 1.0 / focus_m)
+    lens = FocusedLens(focal_m=focal, f_number=config.f_number, pixel_m=pixel_m, focus_m=focus_m)
+    at_centre = apparent_depths(camera, centre[None])
+    near, far = at_centre.sharp_altitudes_m(lens, choices.coc_px)
+    frame_near, frame_far = seen.sharp_altitudes_m(lens, choices.coc_px)
+    hyperfocal = lens.hyperfocal_m(choices.coc_px)
+    blur = lens.blur_px(depths)
+    air_deg = _widest_deg(air_rays(camera, corners))
+    return FovRow(
+        lens_mm=lens_mm,
+        altitude_m=altitude_m,
+        n_water=camera.n_water,
+        port_distance_m=camera.port_distance_m,
+        glass_thickness_m=camera.glass_thickness_m,
+        horizontal_m=horizontal,
+        vertical_m=float(np.linalg.norm(edges[3] - edges[2])),
+        pixel_centre_mm=float(pixel_mm[0]),
+        pixel_mean_mm=horizontal / w * 1e3,
+        pixel_corner_mm=float(pixel_mm[1:].max()),
+        diagonal_air_deg=air_deg,
+        diagonal_water_deg=_widest_deg(camera.unproject(corners)[1]),
+        baseline_m=rig.baseline_m,
+        stereo_overlap=stereo_overlap(rig, floor_z),
+        depth_sigma_mm=choices.match_sigma_px / disparity_per_m(rig, floor_z) * 1e3,
+        match_sigma_px=choices.match_sigma_px,
+        focus_air_m=focus_air_m,
+        f_number=config.f_number,
+        coc_px=choices.coc_px,
+        focus_set_m=focus_m,
+        hyperfocal_air_m=hyperfocal,
+        hyperfocal_altitude_m=float(
+            np.mean((hyperfocal - at_centre.offset_m) / at_centre.slope),
+        ),
+        near_altitude_m=near,
+        far_altitude_m=far,
+        depth_of_field_m=far - near,
+        frame_near_altitude_m=frame_near,
+        frame_far_altitude_m=frame_far,
+        floor_blur_px=float(blur[0].max()),
+        corner_blur_px=float(blur[1:].max()),
+        within_trusted_fov=air_deg <= TRUSTED_FOV_DEG,
+    )
+
+
+def _pixel_sizes_mm(camera: FlatPortCamera, pixels: Array, floor_z: float) -> Array:
+    """Root of the area of unit squares around pixels (N, 2), on the sea floor."""
+    square = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+    x, y = np.moveaxis(camera.at_depth(pixels[:, None] + square, floor_z)[..., :2], -1, 0)
+    doubled = (x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1)).sum(axis=1)
+    sizes: Array = np.sqrt(np.abs(doubled) / 2) * 1e3
+    return sizes
+
+
+def _widest_deg(corner_rays: Array) -> float:
+    """The larger angle between opposite corners; directions (4, 3) in order around the frame."""
+    a, b = corner_rays[:2], corner_rays[2:]
+    sines = np.linalg.norm(np.cross(a, b), axis=1)
+    return float(np.degrees(np.arctan2(sines, (a * b).sum(axis=1))).max())

@@ -1,0 +1,298 @@
+"""Tables of fields of view as plain text, Markdown and CSV."""
+
+import csv
+import io
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from camera_calib.fov.angles import RELIEF, AngleRow
+from camera_calib.fov.paper import PAPER_RULE, PaperCheck, PaperClaim, Validation
+from camera_calib.fov.table import TRUSTED_FOV_DEG, BlurRow, FovRow
+from camera_calib.text_table import text_table
+
+
+@dataclass(frozen=True, kw_only=True)
+class TextTable:
+    """A titled table of words, and notes below it."""
+
+    title: str
+    header: tuple[str, ...]
+    cells: tuple[tuple[str, ...], ...]
+    notes: tuple[str, ...] = ()
+    listed: bool = False
+    """Plain text shows a list under each new first cell: the cells are long."""
+
+
+def as_text(tables: Iterable[TextTable]) -> str:
+    """The tables one below the other, in columns of spaces."""
+    return "\n\n".join(_list(t) if t.listed else _columns(t) for t in tables)
+
+
+def as_markdown(tables: Iterable[TextTable]) -> str:
+    """The tables one below the other, in Markdown."""
+    return "\n\n".join(_markdown(table) for table in tables)
+
+
+def as_csv(rows: Sequence[Mapping[str, Any]]) -> str:
+    """One line per row, with the first row's keys as header; None is an empty cell."""
+    out = io.StringIO()
+    writer = csv.DictWriter(out, fieldnames=list(rows[0]) if rows else [], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return out.getvalue()
+
+
+def fov_csv_rows(rows: Sequence[FovRow], blur: Sequence[BlurRow]) -> list[dict[str, Any]]:
+    """Each lens and altitude with each speed and exposure, flat."""
+    per_row = len(blur) // max(len(rows), 1)
+    return [
+        row.to_json() | moving.to_json()
+        for i, row in enumerate(rows)
+        for moving in blur[i * per_row : (i + 1) * per_row]
+    ]
+
+
+def validation_csv_rows(validation: Validation) -> list[dict[str, Any]]:
+    """Every check and claim, flat."""
+    checks = [
+        {
+            "claim": f"{c.quantity} of the {c.lens_mm:g} mm lens: {c.paper} {c.unit}",
+            "verdict": "pass" if c.passed else "FAIL",
+            "computed": f"{c.computed:.4f} {c.unit}",
+            "assumption": PAPER_RULE.partition(";")[0],
+            "rule": f"within {c.tolerance:g} {c.unit}",
+        }
+        for c in validation.table
+    ]
+    claims = [
+        {
+            "claim": c.claim,
+            "verdict": _verdict(c),
+            "computed": c.computed,
+            "assumption": c.assumption,
+            "rule": c.rule,
+        }
+        for c in validation.claims
+    ]
+    return checks + claims
+
+
+def fov_tables(rows: Sequence[FovRow], blur: Sequence[BlurRow] = ()) -> list[TextTable]:
+    """Footprint and resolution, stereo, focus and depth of field, and motion blur."""
+    if not rows:
+        return []
+    return [_footprints(rows), _focus(rows), *([_blur(blur)] if blur else [])]
+
+
+def validation_tables(validation: Validation) -> list[TextTable]:
+    """The paper's table, its claims, and the flat port against the angle."""
+    return [_checks(validation.table), _claims(validation.claims), angles_table(validation.angles)]
+
+
+def _footprints(rows: Sequence[FovRow]) -> TextTable:
+    first = rows[0]
+    notes = [
+        f"n_water {first.n_water:g}, port {first.port_distance_m * 1e3:g} mm + glass "
+        f"{first.glass_thickness_m * 1e3:g} mm; altitude of the port's outer glass"
+    ]
+    if math.isfinite(first.baseline_m):
+        notes.append(
+            f"stereo: baseline {first.baseline_m * 1e3:.1f} mm, share of the left footprint that "
+            f"both see; depth sigma for {first.match_sigma_px:g} px of disparity noise"
+        )
+    if any(not row.within_trusted_fov for row in rows):
+        notes.append(f"(!) wider than {TRUSTED_FOV_DEG:g} deg: the paper trusts no flat port here")
+    return TextTable(
+        title="Footprint and resolution",
+        header=(
+            "lens", "altitude", "footprint", "pixel centre/mean/corner", "diagonal air/water",
+            "stereo", "depth sigma",
+        ),
+        cells=tuple(
+            (
+                f"{r.lens_mm:.4g} mm",
+                f"{r.altitude_m:g} m",
+                f"{r.horizontal_m:.3f} x {r.vertical_m:.3f} m",
+                f"{r.pixel_centre_mm:.3f} / {r.pixel_mean_mm:.3f} / {r.pixel_corner_mm:.3f} mm",
+                f"{r.diagonal_air_deg:.1f} / {r.diagonal_water_deg:.1f} deg"
+                + ("" if r.within_trusted_fov else " (!)"),
+                _known(r.stereo_overlap, f"{r.stereo_overlap:.1%}"),
+                _known(r.depth_sigma_mm, f"{r.depth_sigma_mm:.2f} mm"),
+            )
+            for r in rows
+        ),
+        notes=tuple(notes),
+    )  # fmt: skip
+
+
+def _focus(rows: Sequence[FovRow]) -> TextTable:
+    first = rows[0]
+    return TextTable(
+        title=f"Focus and depth of field at F/{first.f_number:g}, blur circle {first.coc_px:g} px",
+        header=(
+            "lens", "altitude", "focus in air", "set to", "sharp at the centre", "depth of field",
+            "sharp in the whole frame", "blur centre/corner", "hyperfocal air/altitude",
+        ),
+        cells=tuple(
+            (
+                f"{r.lens_mm:.4g} mm",
+                f"{r.altitude_m:g} m",
+                f"{r.focus_air_m:.3f} m",
+                f"{r.focus_set_m:.3f} m",
+                _span(r.near_altitude_m, r.far_altitude_m),
+                _known(r.depth_of_field_m, f"{r.depth_of_field_m:.3f} m", "unlimited"),
+                _span(r.frame_near_altitude_m, r.frame_far_altitude_m),
+                f"{r.floor_blur_px:.2f} / {r.corner_blur_px:.2f} px",
+                f"{r.hyperfocal_air_m:.2f} / {r.hyperfocal_altitude_m:.2f} m",
+            )
+            for r in rows
+        ),
+        notes=(
+            "focus in air: distance from the entrance pupil at which to focus in air so that the "
+            "sea floor is sharp in water; sharp from and to: altitudes",
+            "thin lens of a flat field; a flat port bends the field, so that a corner is blurred "
+            "when the centre is sharp",
+        ),
+    )  # fmt: skip
+
+
+def _blur(blur: Sequence[BlurRow]) -> TextTable:
+    return TextTable(
+        title="Motion blur",
+        header=(
+            "lens", "altitude", "speed", "exposure", "blur",
+            f"longest exposure for {blur[0].allowed_px:g} px",
+        ),
+        cells=tuple(
+            (
+                f"{b.lens_mm:.4g} mm",
+                f"{b.altitude_m:g} m",
+                f"{b.speed_mps:g} m/s",
+                f"{b.exposure_s * 1e3:g} ms",
+                f"{b.blur_px:.2f} px",
+                f"{b.longest_exposure_s * 1e3:.3f} ms",
+            )
+            for b in blur
+        ),
+        notes=("of the central pixel; exposure of the shutter, or of the strobe if that is short",),
+    )  # fmt: skip
+
+
+def _checks(checks: Sequence[PaperCheck]) -> TextTable:
+    return TextTable(
+        title="The paper's table of fields of view at 2 m",
+        header=("lens", "quantity", "computed", "paper", "difference", "allowed", "", "note"),
+        cells=tuple(
+            (
+                f"{c.lens_mm:g} mm",
+                c.quantity,
+                f"{c.computed:.4f} {c.unit}",
+                f"{c.paper} {c.unit}",
+                f"{c.difference:+.4f}",
+                f"{c.tolerance:g}",
+                "pass" if c.passed else "FAIL",
+                c.note,
+            )
+            for c in checks
+        ),
+        notes=(f"rule: {PAPER_RULE}",),
+    )
+
+
+def _claims(claims: Sequence[PaperClaim]) -> TextTable:
+    return TextTable(
+        title="The paper's further claims",
+        header=("claim", "verdict", "computed", "if", "rule"),
+        cells=tuple((c.claim, _verdict(c), c.computed, c.assumption, c.rule) for c in claims),
+        notes=(
+            "pass or FAIL: under the rule named; true or not true: what follows from an "
+            "assumption, without a rule, so that it cannot fail",
+        ),
+        listed=True,
+    )
+
+
+def _verdict(claim: PaperClaim) -> str:
+    if claim.rule:
+        return "pass" if claim.holds else "FAIL"
+    return "true" if claim.holds else "not true"
+
+
+def angles_table(angles: Sequence[AngleRow]) -> TextTable:
+    """What the port does against the lens's angle."""
+    first = angles[0]
+    return TextTable(
+        title=(
+            f"A flat port against the lens's angle: n {first.n_water:g}, port "
+            f"{first.port_distance_m * 1e3:g} mm + glass {first.glass_thickness_m * 1e3:g} mm, "
+            f"{first.altitude_m:g} m"
+        ),
+        header=(
+            "in air", "lens", "in water", "incidence", "displacement", "viewpoint", "residual rms",
+            "max", "blue - red", "corner blur",
+        ),
+        cells=tuple(
+            (
+                f"{a.fov_air_deg:g} deg",
+                f"{a.lens_mm:.2f} mm",
+                f"{a.fov_water_deg:.1f} deg",
+                f"{a.fov_air_deg / 2:g} deg",
+                f"{a.displacement_px:.0f} px, {a.displacement_percent:.1f} %",
+                f"{a.viewpoint_shift_mm:+.2f} mm",
+                f"{a.residual_rms_px:.3f} px",
+                f"{a.residual_max_px:.2f} px",
+                f"{a.chromatic_px:.1f} px",
+                f"{a.corner_blur_px:.2f} px",
+            )
+            for a in angles
+        ),
+        notes=(
+            "one sensor, lenses to fit; angles of the diagonal; displacement of the corner from a "
+            "paraxial pinhole; viewpoint: where corner rays meet the axis less where central ones "
+            "do",
+            f"residual of the best virtual pinhole over relief of +/-{RELIEF:.0%}; blue - red in "
+            "the corner; corner blur when the centre is in focus",
+        ),
+    )  # fmt: skip
+
+
+def _known(value: float, text: str, unbounded: str = "-") -> str:
+    if math.isfinite(value):
+        return text
+    return unbounded if math.isinf(value) else "-"
+
+
+def _span(near: float, far: float) -> str:
+    if math.isnan(near):
+        return "nowhere"
+    return f"{near:.3f} m to " + _known(far, f"{far:.3f} m", "infinity")
+
+
+def _columns(table: TextTable) -> str:
+    return "\n".join([table.title, text_table(table.header, table.cells), *table.notes])
+
+
+def _list(table: TextTable) -> str:
+    lines, last = [table.title], ""
+    for subject, verdict, *cells in table.cells:
+        if subject != last:
+            lines.append(subject)
+            last = subject
+        words = [
+            f"{name}: {cell}"
+            for name, cell in zip(table.header[3:], cells[1:], strict=True)
+            if cell
+        ]
+        lines.append(f"  {verdict:<8}  {cells[0]}")
+        lines += [f"            {word}" for word in words]
+    return "\n".join([*lines, *table.notes])
+
+
+def _markdown(table: TextTable) -> str:
+    def line(cells: Sequence[str]) -> str:
+        return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+    rows = [line(table.header), line(["---"] * len(table.header)), *map(line, table.cells)]
+    return "\n".join([f"### {table.title}", "", *rows, *(f"\n{note}" for note in table.notes)])

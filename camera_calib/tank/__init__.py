@@ -1,0 +1,1 @@
+"""Fixed cameras that look into water through one flat interface: poses, points, plots."""

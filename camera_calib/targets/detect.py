@@ -1,0 +1,249 @@
+"""Find a target in a picture, and its points to a few hundredths of a pixel.
+
+OpenCV finds the board or its markers, on a reduced picture where that suffices (`detect_board`);
+then every point is fitted at full resolution (`corners`). Of boards with markers any part may be
+seen. A plain chessboard's outer rows and columns must be seen: of a part nobody can tell which part
+it is; corners in between may be hidden.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from alice_survey.errors import CalibrationError
+from alice_survey.frames import Array
+from camera_calib.calibration.result import Rejection
+from camera_calib.targets.corners import (
+    ASTRAY,
+    FITTED,
+    REASONS,
+    Corners,
+    Grey,
+    fit_corners,
+)
+from camera_calib.targets.detect_board import (
+    LARGE_PX,
+    SMALL_PX,
+    find_chessboard_near,
+    find_markers_near,
+    reduced,
+    unusable,
+)
+from camera_calib.targets.grow import chessboard_size, spans_board
+from camera_calib.targets.neighbours import from_neighbours
+from camera_calib.targets.target import TAG_BITS, TAG_BORDER_BITS, Target
+
+__all__ = ["Detection", "as_grey", "chessboard_size", "detect", "detect_with_reasons"]
+
+Picture = NDArray[np.uint8] | NDArray[np.uint16]
+Bools = NDArray[np.bool_]
+
+_FEWEST_POINTS = 6
+_FARTHEST_OFF = 0.2
+"""Of a point from where its neighbours say it is, in squares."""
+_WEAKEST = 0.15
+"""Contrast of a corner over the middle one of the picture."""
+_SECOND_LOOK = 0.5
+"""How much smaller the window is for points that did not fit."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Detection:
+    """What was found of a target in one picture."""
+
+    pixels: Array | None
+    """(N, 2) from the outer corner of the first pixel, NaN rows not found; None: not the target."""
+    sigma_px: Array | None = None
+    """(N,) standard deviation of a coordinate that the misfit of each corner stands for."""
+    refused: str | None = None
+    """Why the picture was refused."""
+    dropped: Mapping[str, int] = field(default_factory=dict)
+    """How many points were seen but not used, by reason."""
+
+    def rejections(self, view: str, camera: str) -> tuple[Rejection, ...]:
+        """What took no part, for a calibration's report."""
+        if self.refused is not None:
+            return (Rejection(view=view, camera=camera, points=0, reason=self.refused),)
+        return tuple(
+            Rejection(view=view, camera=camera, points=count, reason=reason)
+            for reason, count in self.dropped.items()
+        )
+
+
+def detect(target: Target, picture: Picture) -> Array | None:
+    """Find the points of a target.
+
+    Args:
+        target: what to look for.
+        picture: (H, W) or (H, W, 3) blue, green, red, as OpenCV reads it; 8 bits (encoded by the
+            sRGB curve; a linear encoding shifts no corner) or 16 bits (linear).
+
+    Returns:
+        (N, 2) pixels from the outer corner of the first pixel, in the order of `target.points`; NaN
+        rows were not found. None when the target was not found.
+
+    Raises:
+        CalibrationError: the picture is of another kind than 8 or 16 bits, grey or colour.
+    """
+    return detect_with_reasons(target, picture).pixels
+
+
+def detect_with_reasons(target: Target, picture: Picture) -> Detection:
+    """As `detect`, and what was refused and why."""
+    grey = as_grey(picture)
+    poor = unusable(grey)
+    if poor is not None:
+        return Detection(pixels=None, refused=poor)
+    if target.kind == "chessboard":
+        near, why = find_chessboard_near(target, grey), ""
+    else:
+        near, why = find_markers_near(target, grey)
+    if near is None:
+        return Detection(pixels=None, refused=why or _no_chessboard(target, grey))
+    return _refined(target, grey, near)
+
+
+def as_grey(picture: Picture) -> Grey:
+    """8-bit grey values, or linear ones of which the brightest are 1.
+
+    Raises:
+        CalibrationError: the picture is of another kind than 8 or 16 bits, grey or colour.
+    """
+    channels = picture.shape[2] if picture.ndim == 3 else 1
+    depth_known = picture.dtype in (np.uint8, np.uint16)
+    if (
+        not depth_known
+        or picture.ndim not in (2, 3)
+        or channels not in (1, 3, 4)
+        or not picture.size
+    ):
+        raise CalibrationError(
+            f"a picture of shape {picture.shape} and type {picture.dtype} cannot hold a target: "
+            "give grey or colour pictures of 8 or 16 bits"
+        )
+    flat: NDArray[Any] = picture if picture.ndim == 2 else picture[..., 0]
+    if channels > 1:
+        code = cv2.COLOR_BGR2GRAY if channels == 3 else cv2.COLOR_BGRA2GRAY
+        flat = cv2.cvtColor(picture, code)
+    if flat.dtype == np.uint8:
+        return np.ascontiguousarray(flat, dtype=np.uint8)
+    # Cameras of 10 or 12 bits fill a part of the range only.
+    brightest = max(float(np.percentile(flat[::4, ::4], 99.9)), 1.0)
+    linear: NDArray[np.float32] = np.minimum(flat / np.float32(brightest), np.float32(1.0))
+    return linear
+
+
+def _no_chessboard(target: Target, grey: Grey) -> str:
+    wanted = f"no chessboard of {target.columns}x{target.rows} inner corners with all its sides"
+    seen = chessboard_size(reduced(grey, SMALL_PX).picture)
+    return wanted if seen is None else f"{wanted}; one of {seen[0]}x{seen[1]}, or a part, is seen"
+
+
+def _refined(target: Target, grey: Grey, near: Array) -> Detection:
+    """Fit all points, coarse to fine, number them, and leave out what does not fit."""
+    part = reduced(grey, LARGE_PX)
+    if (part.scale > 1.2).any():
+        coarse = _fit(target, part.picture, near / part.scale).pixels * part.scale
+        near = np.where(np.isfinite(coarse), coarse, near)
+    corners = _fit(target, grey, near)
+    if target.kind == "chessboard":
+        order = _numbering(target, near, corners)
+        near, corners = near[order], corners.take(order)
+    corners = _without_astray(target, corners)
+    corners = _second_look(target, grey, corners)
+    used = corners.states == FITTED
+    seen = np.isfinite(near).all(axis=1)
+    counts = {
+        reason: int(np.sum(seen & (corners.states == state))) for state, reason in REASONS.items()
+    }
+    dropped = {reason: count for reason, count in counts.items() if count}
+    board = target.points[used, :2] / target.size_m
+    flat = np.linalg.matrix_rank(board - board.mean(axis=0), tol=0.1) if used.any() else 0
+    if used.sum() < _FEWEST_POINTS or flat < 2:
+        why = "; ".join(f"{count}: {reason}" for reason, count in dropped.items())
+        needed = f"{_FEWEST_POINTS} on more than one line are needed"
+        refused = f"only {int(used.sum())} of {len(used)} points, {needed}"
+        return Detection(pixels=None, refused=f"{refused} ({why})" if why else refused)
+    if target.kind == "chessboard" and not spans_board(used.reshape(target.shape)):
+        return Detection(pixels=None, refused=_no_chessboard(target, grey))
+    return Detection(pixels=corners.pixels, sigma_px=corners.sigma_px, dropped=dropped)
+
+
+def _fit(target: Target, grey: Grey, near: Array, shrink: float = 1.0) -> Corners:
+    """Fit the points that have a start; the others stay NaN."""
+    board, known = target.points[:, :2] / target.size_m, np.isfinite(near).all(axis=1)
+    steps = np.full((len(near), 2, 2), np.nan)
+    steps[known] = from_neighbours(board[known], near[known], board[known])[1]
+    return _fit_with(target, grey, near, steps, shrink)
+
+
+def _fit_with(target: Target, grey: Grey, near: Array, steps: Array, shrink: float) -> Corners:
+    reach, arm = 1.0, 1.0
+    if target.marker_m is not None:
+        arm = 0.5 * (1.0 - target.marker_m / target.size_m)
+    if target.spacing is not None:
+        reach, arm = target.spacing, min(target.spacing, TAG_BORDER_BITS / TAG_BITS)
+    return fit_corners(grey, near, steps, shrink * reach, arm)
+
+
+def _second_look(target: Target, grey: Grey, corners: Corners) -> Corners:
+    """Look again, in smaller windows, where the neighbours of unfitted points say they must be."""
+    used = corners.states == FITTED
+    if used.all() or used.sum() < 4:
+        return corners
+    board = target.points[:, :2] / target.size_m
+    near, steps = from_neighbours(board[used], corners.pixels[used], board)
+    pitch = max(1.0, float(target.spacing or 0.0))
+    beside = cKDTree(board[used]).query(board)[0] < 1.1 * pitch
+    near[used | ~beside] = np.nan
+    again = _fit_with(target, grey, near, steps, _SECOND_LOOK)
+    found = again.states == FITTED
+    order = np.where(found, np.arange(len(used)) + len(used), np.arange(len(used)))
+    return _without_astray(target, corners.joined(again).take(order))
+
+
+def _without_astray(target: Target, corners: Corners) -> Corners:
+    """Leave out corners far from where the others say, of the wrong colours or too faint."""
+    fitted = corners.states == FITTED
+    if fitted.sum() < 5:
+        return corners
+    board, pixels = target.points[fitted, :2] / target.size_m, corners.pixels[fitted]
+    expected, steps = from_neighbours(board, pixels, board, others=True)
+    off = np.linalg.norm(np.linalg.solve(steps, (pixels - expected)[..., None])[..., 0], axis=1)
+    contrast = np.where(target.top_left_black[fitted], 1.0, -1.0) * corners.contrast[fitted]
+    if target.is_ambiguous:  # of such chessboards the first square may be white
+        contrast *= np.sign(np.median(contrast))
+    astray = np.zeros(len(fitted), dtype=np.bool_)
+    faint = contrast < _WEAKEST * max(float(np.median(contrast)), 0.0)
+    astray[fitted] = (off > _FARTHEST_OFF) | faint
+    return corners.without(astray, ASTRAY)
+
+
+def _numbering(target: Target, near: Array, corners: Corners) -> NDArray[np.intp]:
+    """Which of the corners found is which point: the first square black, then nearest to upright.
+
+    A chessboard whose first square cannot be told is read as it hangs: two cameras that are turned
+    against each other by more than a quarter turn would disagree.
+    """
+    rows, columns = target.shape
+    grid = np.arange(rows * columns).reshape(rows, columns)
+    sign = np.where(target.top_left_black, 1.0, -1.0)
+    best, best_score = grid.ravel(), -np.inf
+    for turn in range(4) if rows == columns else (0, 2):
+        order = np.rot90(grid, turn).ravel()
+        # A quarter turn swaps the two steps of a corner, and so the sense of its colours.
+        contrast = corners.contrast[order] * (1.0 if turn % 2 == 0 else -1.0)
+        colours = float(np.sign(np.nansum(np.sign(sign * contrast))))
+        seen = near[order].reshape(rows, columns, 2)
+        along = np.nanmean(np.diff(seen, axis=1), axis=(0, 1))
+        down = np.nanmean(np.diff(seen, axis=0), axis=(0, 1))
+        upright = along[0] / np.hypot(*along) + down[1] / np.hypot(*down)
+        score = 10.0 * colours + float(upright)
+        if score > best_score:
+            best, best_score = order, score
+    return best

@@ -1,0 +1,235 @@
+"""Find a chessboard that is partly hidden or in glare, by growing it from four of its corners.
+
+OpenCV's detectors want every inner corner. Here saddles of the grey values are gathered; four that
+stand as a square's corners do, with colours in turn, are a start, and corners that fit next to the
+known ones are added until none does. A board whose outer rows and columns are seen, and count as
+many corners as they must, is known whole, whatever is hidden in between.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from alice_survey.frames import Array
+from camera_calib.targets.corners import fit_corners
+from camera_calib.targets.neighbours import from_neighbours
+
+Place = tuple[int, int]
+Places = dict[Place, Array]
+
+_BLUR_PX = 1.5
+_APART_PX = 7
+_FAINTEST = 0.02
+"""Weakest saddle over the strongest."""
+_MOST_SADDLES = 600
+_MOST_STARTS = 25
+_MOST_ROUNDS = 40
+_MOST_TRIES = 3
+_NEAR = 40
+_ALIKE = 0.15
+"""Least strength of a saddle over that of the stronger one beside which it stands in a start."""
+_OFF = 0.15
+"""Farthest a grown corner may be from where its neighbours say it is, in squares."""
+_WEAKEST = 0.2
+"""Contrast of a grown corner over the middle one of those it grows from."""
+_FEWEST = 9
+_LONGEST = 100
+_LEAST_SHARE = 0.5
+"""Of the corners that must be fitted."""
+_LEAST_OUTER_SHARE = 0.25
+"""The same of each of the outer rows and columns, which tell where the board ends."""
+
+
+def grown_chessboard(picture: NDArray[np.uint8], shape: tuple[int, int]) -> Array | None:
+    """Find a chessboard of which corners may be hidden.
+
+    Args:
+        picture: (H, W) grey values of 8 bits.
+        shape: rows and columns of inner corners.
+
+    Returns:
+        (rows * columns, 2) pixels from the outer corner of the first pixel, in any numbering; NaN
+        rows were not found. None when the board was not found.
+    """
+    for known in _boards(picture, max(shape)):
+        grid = _spread(known)
+        if grid.shape[:2] != shape:
+            grid = np.swapaxes(grid, 0, 1)
+        if grid.shape[:2] != shape:
+            continue
+        if spans_board(np.isfinite(grid[..., 0])):
+            return grid.reshape(-1, 2)
+    return None
+
+
+def spans_board(seen: NDArray[np.bool_]) -> bool:
+    """Whether the corners seen, (rows, columns), tell for certain where the board ends."""
+    sides = (seen[0], seen[-1], seen[:, 0], seen[:, -1])
+    outer = min(float(side.mean()) for side in sides)
+    return bool(seen.mean() >= _LEAST_SHARE and outer >= _LEAST_OUTER_SHARE)
+
+
+def chessboard_size(picture: NDArray[np.uint8]) -> tuple[int, int] | None:
+    """How many inner corners, along the longer and the shorter side, a chessboard has.
+
+    Args:
+        picture: (H, W) grey values of 8 bits.
+
+    Returns:
+        The size of the largest chessboard, or part of one, in the picture; None: there is none.
+    """
+    sizes: list[tuple[int, int]] = [
+        _spread(known).shape[:2] for known in _boards(picture, _LONGEST)
+    ]
+    if not sizes:
+        return None
+    shorter, longer = sorted(max(sizes, key=math.prod))
+    return longer, shorter
+
+
+def _spread(known: Places) -> Array:
+    """(rows, columns, 2) the known corners on their grid, NaN where none is known."""
+    places = np.array(list(known))
+    low = places.min(axis=0)
+    columns, rows = np.ptp(places, axis=0) + 1
+    grid = np.full((rows, columns, 2), np.nan)
+    for (x, y), pixel in known.items():
+        grid[y - low[1], x - low[0]] = pixel
+    return grid
+
+
+def _boards(picture: NDArray[np.uint8], longest: int) -> Iterator[Places]:
+    """Boards grown from the starts in a picture, each found once."""
+    taken = np.empty((0, 2))
+    for start in _starts(picture):
+        corners = np.array(list(start.values()))
+        apart = np.linalg.norm(taken[:, None] - corners[None], axis=-1)
+        if np.any(apart < _APART_PX):
+            continue
+        known = _grow(picture, start, longest)
+        if len(known) >= _FEWEST:
+            taken = np.concatenate([taken, list(known.values())])
+            yield known
+
+
+def _starts(picture: NDArray[np.uint8]) -> Iterator[Places]:
+    """Four saddles each that stand like the corners of a square, strongest first."""
+    saddles, angles, strengths = _saddles(picture)
+    if len(saddles) < 4:
+        return
+    tree = cKDTree(saddles)
+    near = np.asarray(tree.query(saddles, k=min(_NEAR, len(saddles)))[1])
+    count = 0
+    for c, others in enumerate(near.tolist()):
+        alike = [i for i in others[1:] if strengths[i] > _ALIKE * strengths[c]]
+        turned = [i for i in alike if np.cos(2.0 * (angles[i] - angles[c])) < -0.4]
+        if len(turned) < 2:
+            continue
+        a, along = turned[0], saddles[turned[0]] - saddles[c]
+        for b in turned[1:]:
+            down = saddles[b] - saddles[c]
+            cross = along[0] * down[1] - along[1] * down[0]
+            lengths = np.hypot(*along), np.hypot(*down)
+            if abs(cross) < 0.5 * lengths[0] * lengths[1] or max(lengths) > 2.5 * min(lengths):
+                continue
+            off, d = tree.query(saddles[a] + down)
+            if off < 0.25 * min(lengths) and np.cos(2.0 * (angles[d] - angles[c])) > 0.4:
+                right, below = (a, b) if cross > 0 else (b, a)
+                corners = {(0, 0): c, (1, 0): right, (0, 1): below, (1, 1): d}
+                yield {place: saddles[i] for place, i in corners.items()}
+                count += 1
+                break
+        if count >= _MOST_STARTS:
+            return
+
+
+def _saddles(picture: NDArray[np.uint8]) -> tuple[Array, Array, Array]:
+    """(M, 2) pixels of saddles, strongest first, (M,) directions of greatest curvature, strengths.
+
+    The strength goes with the square of the contrast.
+    """
+    grey = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), _BLUR_PX)
+    xx, yy, xy = (cv2.Sobel(grey, cv2.CV_32F, *order) for order in ((2, 0), (0, 2), (1, 1)))
+    strength = xy**2 - xx * yy
+    peak = cv2.dilate(strength, np.ones((_APART_PX, _APART_PX), dtype=np.uint8))
+    floor = max(_FAINTEST * float(strength.max()), 1e-3)
+    y, x = np.nonzero((strength >= peak) & (strength > floor))
+    order = np.argsort(-strength[y, x], kind="stable")[:_MOST_SADDLES]
+    y, x = y[order], x[order]
+    angles: Array = 0.5 * np.arctan2(2.0 * xy[y, x], xx[y, x] - yy[y, x]).astype(np.float64)
+    return np.column_stack([x + 0.5, y + 0.5]), angles, strength[y, x].astype(np.float64)
+
+
+def _grow(picture: NDArray[np.uint8], start: Places, longest: int) -> Places:
+    """Add corners that fit next to the known ones, until none does or the board gets too large."""
+    places = np.array(list(start))
+    pixels = np.array(list(start.values()))
+    steps = from_neighbours(places.astype(np.float64), pixels, places.astype(np.float64))[1]
+    fits = fit_corners(picture, pixels, steps)
+    contrast = _alternating(places) * fits.contrast
+    middle = float(np.median(contrast))
+    if not np.isfinite(middle) or (contrast / middle < _WEAKEST).any():
+        return {}
+    known: Places = dict(zip(start, fits.pixels, strict=True))
+    tries: Counter[Place] = Counter()
+    for _ in range(_MOST_ROUNDS):
+        fresh = _next_to(picture, known, middle, tries)
+        grown = _knit(known | fresh)
+        if grown.keys() <= known.keys() or not grown:
+            break
+        known = grown
+        if (np.ptp(np.array(list(known)), axis=0) >= longest).any():
+            break
+    return known
+
+
+def _knit(known: Places) -> Places:
+    """Only corners with two known neighbours: one that fits by chance off the board has fewer."""
+    while True:
+        kept = {
+            (x, y): pixel
+            for (x, y), pixel in known.items()
+            if sum(n in known for n in ((x - 1, y), (x + 1, y), (x, y - 1), (x, y + 1))) >= 2
+        }
+        if len(kept) == len(known):
+            return known
+        known = kept
+
+
+def _alternating(places: NDArray[np.int_]) -> Array:
+    """1 and -1 in turn, as the colours of a chessboard's corners."""
+    signs: Array = 1.0 - 2.0 * (places.sum(axis=1) % 2)
+    return signs
+
+
+def _next_to(
+    picture: NDArray[np.uint8], known: Places, middle: float, tries: Counter[Place]
+) -> Places:
+    """Corners that fit next to known ones, or beyond one that is hidden.
+
+    Their contrast must alternate as the known ones', of which `middle` is the middle one. A place
+    is tried only so often, which `tries` counts.
+    """
+    far = 2 if len(known) >= _FEWEST else 1
+    moves = [(a, b) for a in range(-far, far + 1) for b in range(-far, far + 1)]
+    moves = [(a, b) for a, b in moves if abs(a) + abs(b) <= far]
+    around = {(x + a, y + b) for x, y in known for a, b in moves} - set(known)
+    worth = sorted(place for place in around if tries[place] < _MOST_TRIES)
+    if not worth:
+        return {}
+    tries.update(worth)
+    asked = np.array(worth)
+    board, pixels = np.array(list(known), dtype=np.float64), np.array(list(known.values()))
+    expected, steps = from_neighbours(board, pixels, asked.astype(np.float64))
+    fits = fit_corners(picture, expected, steps)
+    good = _alternating(asked) * fits.contrast / middle > _WEAKEST
+    miss = (fits.pixels[good] - expected[good])[..., None]
+    off = np.linalg.norm(np.linalg.solve(steps[good], miss)[..., 0], axis=1)
+    good[good] = off < _OFF
+    keys = [(int(x), int(y)) for x, y in asked[good]]
+    return dict(zip(keys, fits.pixels[good], strict=True))

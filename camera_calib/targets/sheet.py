@@ -1,0 +1,294 @@
+"""Print a target at true scale: PDF, SVG or PNG, with a bar to check the printer by."""
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from alice_survey.artefacts import atomic_path
+from alice_survey.errors import CalibrationError
+from alice_survey.frames import Array
+from camera_calib.targets.pattern import black_rectangles
+from camera_calib.targets.target import Target, parse_target, write_target
+
+PAPERS_MM = {
+    "A4": (210.0, 297.0),
+    "A3": (297.0, 420.0),
+    "A2": (420.0, 594.0),
+    "A1": (594.0, 841.0),
+    "A0": (841.0, 1189.0),
+    "letter": (215.9, 279.4),
+}
+SUFFIXES = (".pdf", ".svg", ".png")
+BAR_MM = 100.0
+_MARGIN_MM = 8.0
+"""White around the pattern; printers leave about 5 mm blank themselves."""
+_STRIP_MM = 11.0
+"""Below the pattern, for the bar and the words."""
+_TICK_MM, _LINE_MM, _TEXT_MM = 3.0, 0.3, 2.6
+_POINTS_PER_MM = 72.0 / 25.4
+_LARGEST_PAGE_MM = 5080.0
+"""A PDF page is at most 200 inches."""
+_MOST_PIXELS = 600_000_000
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sheet:
+    """A page: black rectangles and a line of words; y runs down from the top left corner."""
+
+    width_mm: float
+    height_mm: float
+    rectangles_mm: Array
+    """(M, 4) least x, least y, greatest x, greatest y."""
+    words: str
+    words_at_mm: tuple[float, float]
+    """Left end of the words' base line."""
+    target_at_mm: tuple[float, float]
+    """The target's first point."""
+
+
+def lay_out(target: Target, paper: str | None = None) -> Sheet:
+    """Place a target on a page, upright or lying, with the bar and the words below it.
+
+    Args:
+        target: what to print.
+        paper: a name in `PAPERS_MM`; without it the page is as large as the target needs.
+
+    Raises:
+        CalibrationError: the paper is unknown, or the target does not fit; then the message says
+            how large it could be.
+    """
+    left, top, right, bottom = (1e3 * side for side in target.outline)
+    width, height = right - left, bottom - top
+    # On a page of its own a board gets half a square of white all around.
+    margin = max(_MARGIN_MM, -0.5 * left) if paper is None else _MARGIN_MM
+    needed = max(width, BAR_MM) + 2.0 * margin, height + _STRIP_MM + 2.0 * margin
+    page = needed if paper is None else _on_paper(target, needed, paper)
+    if max(page) > _LARGEST_PAGE_MM:
+        raise CalibrationError(
+            f"a page of {page[0]:.0f} x {page[1]:.0f} mm; files hold at most "
+            f"{_LARGEST_PAGE_MM:.0f} mm: take fewer or smaller squares"
+        )
+    x = (page[0] - width) / 2.0
+    y = (page[1] - height - _STRIP_MM) / 2.0
+    place = np.array([x - left, y - top])
+    pattern = 1e3 * black_rectangles(target) + np.tile(place, 2)
+    bar_x, bar_y = _MARGIN_MM, page[1] - _MARGIN_MM
+    words = f"{target.description} - print at 100 %: the bar is {BAR_MM:.0f} mm"
+    return Sheet(
+        width_mm=page[0],
+        height_mm=page[1],
+        rectangles_mm=np.concatenate([pattern, _bar(bar_x, bar_y)]),
+        words=words,
+        words_at_mm=(bar_x, bar_y - _TICK_MM - 1.0),
+        target_at_mm=(float(place[0]), float(place[1])),
+    )
+
+
+def _on_paper(target: Target, needed: tuple[float, float], paper: str) -> tuple[float, float]:
+    known = {name.lower(): name for name in PAPERS_MM}
+    if paper.lower() not in known:
+        raise CalibrationError(f"no paper '{paper}'; take one of {', '.join(PAPERS_MM)}")
+    name = known[paper.lower()]
+    upright = PAPERS_MM[name]
+    pages = [upright, upright[::-1]]
+    for page in pages:
+        if needed[0] <= page[0] and needed[1] <= page[1]:
+            return page
+    raise CalibrationError(
+        f"{target.description} needs a page of {needed[0]:.0f} x {needed[1]:.0f} mm, {name} has "
+        f"{upright[0]:g} x {upright[1]:g} mm: {_advice(target, pages)}"
+    )
+
+
+def _advice(target: Target, pages: list[tuple[float, float]]) -> str:
+    """How large the target could be on one of the pages."""
+    left, top, right, bottom = (1e3 * side for side in target.outline)
+    scale = max(
+        min(
+            (page[0] - 2.0 * _MARGIN_MM) / (right - left),
+            (page[1] - 2.0 * _MARGIN_MM - _STRIP_MM) / (bottom - top),
+        )
+        for page in pages
+    )
+    size_mm = math.floor(scale * target.size_m * 1e4) / 10.0
+    larger = "take larger paper, fewer squares"
+    if size_mm < 1.0:
+        return larger
+    fitting = replace(
+        target,
+        size_m=size_mm * 1e-3,
+        marker_m=None
+        if target.marker_m is None
+        else math.floor(target.marker_m / target.size_m * size_mm * 10.0) * 1e-4,
+    )
+    return f"{larger}, or at the most '{fitting.description}'"
+
+
+def _bar(x: float, y: float) -> Array:
+    """A line of 100 mm between the outer edges of two ticks; y is the lower end of the ticks."""
+    middle = y - _TICK_MM / 2.0
+    return np.array(
+        [
+            [x, y - _TICK_MM, x + _LINE_MM, y],
+            [x + _LINE_MM, middle - _LINE_MM / 2, x + BAR_MM - _LINE_MM, middle + _LINE_MM / 2],
+            [x + BAR_MM - _LINE_MM, y - _TICK_MM, x + BAR_MM, y],
+        ]
+    )
+
+
+def to_pdf(sheet: Sheet) -> bytes:
+    """The page as a PDF 1.4 of filled rectangles and one line of Helvetica."""
+    scale = _POINTS_PER_MM
+
+    def number(value: float) -> str:
+        return f"{value:.5f}".rstrip("0").rstrip(".")
+
+    drawn = ["0 g"]
+    for x0, y0, x1, y1 in sheet.rectangles_mm:
+        box = (x0, sheet.height_mm - y1, x1 - x0, y1 - y0)
+        drawn.append(" ".join(number(value * scale) for value in box) + " re")
+    drawn.append("f")
+    x, y = sheet.words_at_mm[0] * scale, (sheet.height_mm - sheet.words_at_mm[1]) * scale
+    words = sheet.words.replace("\\", r"\\").replace("(", r"\(").replace(")", r"\)")
+    drawn.append(f"BT /F1 {number(_TEXT_MM * scale)} Tf {number(x)} {number(y)} Td ({words}) Tj ET")
+    content = ("\n".join(drawn) + "\n").encode("ascii")
+    page = f"{number(sheet.width_mm * scale)} {number(sheet.height_mm * scale)}"
+    objects = [
+        b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
+        b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
+        (
+            f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {page}] /Contents 4 0 R "
+            "/Resources << /Font << /F1 5 0 R >> >> >>"
+        ).encode("ascii"),
+        b"<< /Length %d >>\nstream\n%sendstream" % (len(content), content),
+        b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica >>",
+    ]
+    file, starts = b"%PDF-1.4\n", []
+    for i, thing in enumerate(objects, start=1):
+        starts.append(len(file))
+        file += b"%d 0 obj\n%s\nendobj\n" % (i, thing)
+    table = b"".join(b"%010d 00000 n \n" % start for start in starts)
+    count = len(objects) + 1
+    file += b"xref\n0 %d\n0000000000 65535 f \n%s" % (count, table)
+    place = file.rindex(b"xref\n0 ")
+    return file + b"trailer\n<< /Size %d /Root 1 0 R >>\nstartxref\n%d\n%%%%EOF\n" % (count, place)
+
+
+def to_svg(sheet: Sheet) -> str:
+    """The page as an SVG whose unit is the millimetre."""
+    width, height = f"{sheet.width_mm:.10g}", f"{sheet.height_mm:.10g}"
+    path = "".join(
+        f"M{x0:.10g} {y0:.10g}H{x1:.10g}V{y1:.10g}H{x0:.10g}Z"
+        for x0, y0, x1, y1 in sheet.rectangles_mm.round(7)
+    )
+    x, y = sheet.words_at_mm
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}mm" height="{height}mm" '
+        f'viewBox="0 0 {width} {height}">\n'
+        f'<rect width="{width}" height="{height}" fill="white"/>\n'
+        f'<path d="{path}" fill="black" shape-rendering="crispEdges"/>\n'
+        f'<text x="{x:.10g}" y="{y:.10g}" font-family="Helvetica, Arial, sans-serif" '
+        f'font-size="{_TEXT_MM}">{sheet.words}</text>\n</svg>\n'
+    )
+
+
+def to_pixels(sheet: Sheet, dpi: float) -> NDArray[np.uint8]:
+    """The page without its words as grey values; a pixel that an edge cuts is grey by its share.
+
+    Raises:
+        CalibrationError: the picture would be too large.
+    """
+    per_mm = dpi / 25.4
+    width, height = (math.ceil(s * per_mm) for s in (sheet.width_mm, sheet.height_mm))
+    if width * height > _MOST_PIXELS:
+        raise CalibrationError(
+            f"a picture of {width} x {height} px: lower --dpi, or write a PDF or SVG, whose lines "
+            "have no pixels"
+        )
+    black = np.zeros((height, width), dtype=np.float32)
+    for x0, y0, x1, y1 in sheet.rectangles_mm * per_mm:
+        rows, down = _shares(y0, y1)
+        columns, across = _shares(x0, x1)
+        black[rows, columns] += down[:, None] * across[None, :]
+    return np.rint(255.0 * (1.0 - np.minimum(black, 1.0))).astype(np.uint8)
+
+
+def _shares(low: float, high: float) -> tuple[slice, NDArray[np.float32]]:
+    """Which pixels an interval meets, and how much of each it covers."""
+    first, last = math.floor(low), math.ceil(high)
+    edges = np.arange(first, last + 1)
+    covered = np.minimum(edges[1:], high) - np.maximum(edges[:-1], low)
+    return slice(first, last), covered.astype(np.float32)
+
+
+def write_sheet(
+    target: Target, path: Path, paper: str | None = None, dpi: float = 300.0
+) -> tuple[Path, Sheet]:
+    """Write a page to print, and beside it the target's JSON file, for calibrations.
+
+    Args:
+        target: what to print.
+        path: where to; its suffix, .pdf, .svg or .png, says how.
+        paper: a name in `PAPERS_MM`, or as large as needed.
+        dpi: pixels per inch of a PNG.
+
+    Returns:
+        The path of the JSON file, and the page.
+
+    Raises:
+        CalibrationError: the suffix or the paper is unknown, or the target does not fit.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise CalibrationError(f"{path}: write to a name that ends in {', '.join(SUFFIXES)}")
+    sheet = lay_out(target, paper)
+    with atomic_path(path) as temporary:
+        if suffix == ".pdf":
+            temporary.write_bytes(to_pdf(sheet))
+        elif suffix == ".svg":
+            temporary.write_text(to_svg(sheet), encoding="utf-8")
+        else:
+            _write_png(sheet, temporary, dpi)
+    described = path.with_suffix(".json")
+    write_target(described, target)
+    return described, sheet
+
+
+def _write_png(sheet: Sheet, path: Path, dpi: float) -> None:
+    picture = Image.fromarray(to_pixels(sheet, dpi))
+    x, y = (place * dpi / 25.4 for place in sheet.words_at_mm)
+    font = ImageFont.load_default(size=max(_TEXT_MM * dpi / 25.4, 8.0))
+    ImageDraw.Draw(picture).text((x, y), sheet.words, fill=0, font=font, anchor="ls")
+    picture.save(path, format="PNG", dpi=(dpi, dpi))
+
+
+def print_target(
+    text: str, path: Path, paper: str | None, dpi: float
+) -> tuple[str, dict[str, object]]:
+    """Do what `alice-survey target` does; what it says, as text and as JSON values."""
+    target = parse_target(text)
+    described, sheet = write_sheet(target, path, paper, dpi)
+    lines = [
+        f"wrote {path}, {sheet.width_mm:.1f} x {sheet.height_mm:.1f} mm, and {described}",
+        "print it at 100 % (no fitting to the page), glue it flat, and measure the bar of "
+        f"{BAR_MM:.0f} mm and a row of squares",
+    ]
+    if target.is_ambiguous:
+        lines.append(
+            "this chessboard looks the same when turned by half a turn, so that cameras that are "
+            "turned against each other may number its corners unlike: better take an odd and an "
+            "even count, such as 9x6"
+        )
+    data = {
+        "file": str(path),
+        "target_file": str(described),
+        "target": target.to_json(),
+        "page_mm": [round(sheet.width_mm, 3), round(sheet.height_mm, 3)],
+        "points": len(target.points),
+        "ambiguous": target.is_ambiguous,
+    }
+    return "\n".join(lines), data

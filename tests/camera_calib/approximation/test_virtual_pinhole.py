@@ -1,0 +1,148 @@
+import math
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from camera_calib.approximation.virtual_pinhole import (
+    VirtualPinhole,
+    best_pinhole,
+    residual_px,
+    warp_maps,
+)
+from camera_calib.flat_port import FlatPortCamera
+
+CAMERA = FlatPortCamera(
+    width_px=3384,
+    height_px=2710,
+    fx_px=3388.0,
+    fy_px=3388.0,
+    cx_px=1692.0,
+    cy_px=1355.0,
+)
+DEPTHS_M = np.linspace(1.5, 2.5, 5)
+DESIGNS = [
+    # port mm, glass mm: at the pupil px, at the best point px, shift mm, tilted by 2 degrees px
+    (5, 6, 0.18, 0.014, 1.3, 0.015),
+    (20, 10, 0.92, 0.062, 6.9, 0.068),
+    (50, 15, 2.44, 0.158, 18.0, 0.172),
+    (100, 20, 5.02, 0.313, 38.0, 0.341),
+]
+"""Residual of a fixed warp at 2 m with 0.5 m of relief, from the project's design study."""
+
+
+def behind_port(distance_mm: float, glass_mm: float, tilt_deg: float = 0.0) -> FlatPortCamera:
+    tilt = math.radians(tilt_deg)
+    return replace(
+        CAMERA,
+        port_distance_m=distance_mm / 1e3,
+        glass_thickness_m=glass_mm / 1e3,
+        normal=(math.sin(tilt), 0.0, math.cos(tilt)),
+    )
+
+
+def rms(camera: FlatPortCamera, pinhole: VirtualPinhole) -> float:
+    return float(np.sqrt(np.mean(residual_px(camera, pinhole, DEPTHS_M) ** 2)))
+
+
+@pytest.mark.parametrize(("port", "glass", "at_pupil", "best", "shift_mm", "tilted"), DESIGNS)
+def test_residuals_are_those_of_the_design_study(
+    port: float, glass: float, at_pupil: float, best: float, shift_mm: float, tilted: float
+) -> None:
+    camera = behind_port(port, glass)
+    pinhole = best_pinhole(camera, 1.5, 2.5)
+
+    assert rms(camera, pinhole) == pytest.approx(best, rel=0.08)
+    assert -pinhole.centre_z_m * 1e3 == pytest.approx(shift_mm, rel=0.06)
+    assert rms(camera, replace(pinhole, centre_z_m=0.0)) == pytest.approx(at_pupil, rel=0.2)
+
+    leaning = behind_port(port, glass, tilt_deg=2.0)
+    assert rms(leaning, best_pinhole(leaning, 1.5, 2.5)) == pytest.approx(tilted, rel=0.08)
+
+
+def test_no_other_point_of_the_normal_is_better() -> None:
+    camera = behind_port(20, 10, tilt_deg=2.0)
+    best = best_pinhole(camera, 1.5, 2.5)
+    depths = 1 / np.linspace(1 / 2.5, 1 / 1.5, 7)
+    least = np.mean(residual_px(camera, best, depths) ** 2)
+
+    for factor in (0.9, 0.99, 1.01, 1.1):
+        other = replace(
+            best, centre_x_m=best.centre_x_m * factor, centre_z_m=best.centre_z_m * factor
+        )
+        assert np.mean(residual_px(camera, other, depths) ** 2) > least
+
+
+def test_the_warp_is_exact_at_the_working_range() -> None:
+    camera = behind_port(50, 15, tilt_deg=1.0)
+    pinhole = best_pinhole(camera, 1.5, 2.5)
+
+    assert pinhole.working_range_m == pytest.approx(1.875)
+    assert residual_px(camera, pinhole, np.array([1.875])).max() < 1e-9
+
+
+def test_a_port_of_no_thickness_on_the_pupil_moves_only_by_refraction() -> None:
+    camera = behind_port(0, 0)
+    pinhole = best_pinhole(camera, 1.5, 2.5)
+
+    # All rays meet in the pupil: any range fits without parallax.
+    assert abs(pinhole.centre_z_m) < 1e-6
+    assert residual_px(camera, pinhole, DEPTHS_M).max() < 0.01
+
+
+@given(
+    x=st.floats(0, 3384),
+    y=st.floats(0, 2710),
+    depth_m=st.floats(0.5, 10),
+    centre=st.tuples(*[st.floats(-0.05, 0.05)] * 3),
+)
+def test_at_depth_and_project_are_inverse(
+    x: float, y: float, depth_m: float, centre: tuple[float, float, float]
+) -> None:
+    pinhole = VirtualPinhole(
+        width_px=3384,
+        height_px=2710,
+        focal_px=4540.0,
+        cx_px=1690.0,
+        cy_px=1357.0,
+        centre_x_m=centre[0],
+        centre_y_m=centre[1],
+        centre_z_m=centre[2],
+        working_range_m=2.0,
+    )
+    point = pinhole.at_depth(np.array([x, y]), depth_m)
+
+    assert point[2] == depth_m
+    np.testing.assert_allclose(pinhole.project(point), [x, y], atol=1e-8)
+    inside = pinhole.virtual_from_cam.apply(point)
+    np.testing.assert_allclose(
+        4540.0 * inside[:2] / inside[2] + [1690.0, 1357.0], [x, y], atol=1e-8
+    )
+
+
+def test_a_warped_picture_is_what_the_pinhole_sees() -> None:
+    """Pixels that hold their own coordinates on the sea floor, and half a pixel in its place."""
+    camera = behind_port(20, 10, tilt_deg=1.5).reduced(8)
+    pinhole = best_pinhole(camera, 1.5, 2.5)
+    floor = camera.at_depth(camera.pixel_centres(), pinhole.working_range_m)[..., :2]
+    x, y = warp_maps(camera, pinhole)
+
+    warped = cv2.remap(
+        floor.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT,
+        borderValue=(np.nan, np.nan),
+    )  # fmt: skip
+
+    grid = np.stack(
+        np.meshgrid(np.arange(pinhole.width_px) + 0.5, np.arange(pinhole.height_px) + 0.5), axis=-1
+    )
+    expected = pinhole.at_depth(grid, pinhole.working_range_m)[..., :2]
+    inside = np.isfinite(warped).all(axis=-1)
+    # The pinhole's frame is a little wider than what light through the port fills.
+    assert 0.85 < inside.mean() < 1.0
+    pixel_m = pinhole.working_range_m / pinhole.focal_px
+    # OpenCV's remap places samples to 1/32 px; half a pixel too much or too little would be 0.5.
+    assert np.abs(warped - expected)[inside].max() < 0.025 * pixel_m
+    assert x.dtype == np.float32

@@ -1,0 +1,290 @@
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.config import CameraConfig, WaterConfig
+from alice_survey.errors import ConfigError
+from camera_calib.flat_port import FlatPortCamera
+from camera_calib.fov.table import (
+    MATCH_SIGMA_PX,
+    FovChoices,
+    FovRow,
+    apparent_distance_m,
+    blur_table,
+    fov_table,
+    rig_fov_table,
+)
+from camera_calib.rig import Rig, design_rig
+from tests.oracles_camera import project_by_shortest_path
+from tests.oracles_fov import triangulated_depth_sigma_m
+
+NO_PORT = CameraConfig(port_distance_m=0.0, glass_thickness_m=0.0)
+PORT = CameraConfig()
+
+
+def left(config: CameraConfig, n_water: float) -> FlatPortCamera:
+    return design_rig(config, WaterConfig(n_water=n_water)).cameras["left"]
+
+
+def crooked_rig() -> Rig:
+    """Distorted lenses, tilted ports, and cameras that look past each other a little."""
+    normal = np.array([0.03, -0.02, 1.0])
+    normal /= np.linalg.norm(normal)
+    rig = design_rig(PORT, WaterConfig())
+    cameras = {
+        name: replace(camera, k1=-0.12, k2=0.08, p1=1e-3, normal=tuple(normal.tolist()))
+        for name, camera in rig.cameras.items()
+    }
+    poses = {
+        "left": RigidTransform.identity(),
+        "right": RigidTransform.from_components(
+            [-0.1, 0.001, 0.002], Rotation.from_euler("xyz", [0.5, 1.0, -0.4], degrees=True)
+        ),
+    }
+    return replace(rig, cameras=cameras, cam_from_rig=poses)
+
+
+@pytest.mark.parametrize(
+    ("lens_mm", "n_water", "horizontal_m", "vertical_m"),
+    [
+        (12.5, 1.33, 1.427, 1.163),
+        (12.5, 1.34, 1.415, 1.154),
+        (25.0, 1.33, 0.741, 0.596),
+        (25.0, 1.34, 0.735, 0.592),
+    ],
+)
+def test_footprints_without_a_port_are_those_of_two_sines(
+    lens_mm: float, n_water: float, horizontal_m: float, vertical_m: float
+) -> None:
+    row = fov_table([lens_mm], [2.0], n_water, NO_PORT)[0]
+
+    for size, half_mm, table in (
+        (row.horizontal_m, 3384 * 3.69e-3 / 2, horizontal_m),
+        (row.vertical_m, 2710 * 3.69e-3 / 2, vertical_m),
+    ):
+        in_air = math.atan(half_mm / lens_mm)
+        in_water = math.asin(math.sin(in_air) / n_water)
+        assert size == pytest.approx(2 * 2.0 * math.tan(in_water), rel=1e-12)
+        assert size == pytest.approx(table, abs=6e-4)
+
+
+@given(n_water=st.floats(1.0, 1.4), lens_mm=st.floats(5.0, 100.0), altitude_m=st.floats(0.3, 20.0))
+def test_without_a_port_water_magnifies_a_pinhole_n_times(
+    n_water: float, lens_mm: float, altitude_m: float
+) -> None:
+    row = fov_table([lens_mm], [altitude_m], n_water, NO_PORT)[0]
+    assert row.pixel_centre_mm == pytest.approx(3.69e-3 * altitude_m * 1e3 / (n_water * lens_mm))
+    assert row.focus_air_m == pytest.approx(altitude_m / n_water)
+    half_air = math.radians(row.diagonal_air_deg / 2)
+    assert math.sin(half_air) == pytest.approx(
+        n_water * math.sin(math.radians(row.diagonal_water_deg / 2))
+    )
+
+
+def test_in_air_it_is_a_pinhole() -> None:
+    row = fov_table([12.5], [2.0], 1.0, NO_PORT)[0]
+
+    assert row.horizontal_m == pytest.approx(2 * 3384 * 3.69e-3 / 12.5)
+    assert row.pixel_centre_mm == pytest.approx(row.pixel_mean_mm)
+    assert row.pixel_corner_mm == pytest.approx(row.pixel_centre_mm)
+    assert row.diagonal_water_deg == pytest.approx(row.diagonal_air_deg)
+    assert row.diagonal_air_deg == pytest.approx(65.2, abs=0.05)
+    assert row.focus_air_m == pytest.approx(2.0)
+    assert row.corner_blur_px == pytest.approx(0.0, abs=1e-9)
+    # A rectangle less the strip of one baseline.
+    assert row.stereo_overlap == pytest.approx(1 - 0.1 / row.horizontal_m)
+
+
+@given(altitude_m=st.floats(0.3, 10.0), n_water=st.floats(1.0, 1.36), lens_mm=st.floats(8.0, 50.0))
+def test_pixel_sizes_are_those_near_the_axis_and_shrink_outwards(
+    altitude_m: float, n_water: float, lens_mm: float
+) -> None:
+    camera = left(PORT.model_copy(update={"focal_mm": lens_mm}), n_water)
+    row = fov_table([lens_mm], [altitude_m], n_water, PORT)[0]
+
+    paraxial_mm = (0.02 + 0.01 / 1.52 + altitude_m / n_water) / camera.fx_px * 1e3
+    assert row.pixel_centre_mm == pytest.approx(paraxial_mm, rel=1e-6)
+    assert row.horizontal_m == pytest.approx(row.pixel_mean_mm * 1e-3 * 3384)
+    # Refraction narrows what a pixel sees towards the corner.
+    assert row.pixel_corner_mm <= row.pixel_mean_mm * (1 + 1e-9)
+    assert row.pixel_mean_mm <= row.pixel_centre_mm * (1 + 1e-9)
+
+
+@given(altitude_m=st.floats(1.0, 10.0), n_water=st.floats(1.3, 1.36))
+def test_depth_precision_near_the_axis_is_n_d_squared_over_f_b(
+    altitude_m: float, n_water: float
+) -> None:
+    row = fov_table([12.5], [altitude_m], n_water, PORT)[0]
+    apparent_m = 0.02 + 0.01 / 1.52 + altitude_m / n_water
+    closed_mm = MATCH_SIGMA_PX * n_water * apparent_m**2 / (12.5e3 / 3.69 * 0.1) * 1e3
+    assert row.depth_sigma_mm == pytest.approx(closed_mm, rel=4e-3)
+
+
+@pytest.mark.parametrize("altitude_m", [0.5, 2.0])
+@pytest.mark.parametrize("kind", ["design", "crooked"])
+def test_depth_precision_is_the_scatter_of_triangulated_points(
+    kind: str, altitude_m: float
+) -> None:
+    rig = crooked_rig() if kind == "crooked" else design_rig(PORT, WaterConfig())
+    row = rig_fov_table(rig, [altitude_m], PORT)[0]
+    floor_z = 0.03 * rig.cameras["left"].normal[2] + altitude_m
+    scatter_m = triangulated_depth_sigma_m(
+        rig, floor_z, MATCH_SIGMA_PX, 20_000, np.random.default_rng(4)
+    )
+    assert row.depth_sigma_mm == pytest.approx(scatter_m * 1e3, rel=0.02)
+
+
+def test_depth_precision_and_focus_at_the_papers_range() -> None:
+    row = fov_table([12.5], [2.0], 1.34, NO_PORT)[0]
+    assert row.depth_sigma_mm == pytest.approx(2.64, abs=0.01)
+    fresh = fov_table([12.5], [2.0], 1.33, NO_PORT)[0]
+    assert fresh.focus_air_m == pytest.approx(1.5, abs=0.01)
+
+
+def test_a_focused_point_is_sharp_where_its_rays_seem_to_come_from() -> None:
+    """Rays that leave one point cross the axis, traced back in air, at the focus distance."""
+    camera = left(PORT, 1.34)
+    point = np.array([0.0, 1e-4, 2.03])
+    pixel = camera.project(point)
+    apparent = point[1] / ((pixel[1] - camera.cy_px) / camera.fy_px)
+
+    assert apparent_distance_m(camera, 2.0) == pytest.approx(apparent, rel=1e-6)
+    assert fov_table([12.5], [2.0], 1.34, PORT)[0].focus_air_m == pytest.approx(apparent, rel=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["design", "crooked"])
+def test_overlap_is_the_share_of_random_spots_that_both_cameras_see(kind: str) -> None:
+    rig = crooked_rig() if kind == "crooked" else design_rig(PORT, WaterConfig())
+    first, second = rig.cameras["left"], rig.cameras["right"]
+    floor_z = 0.03 * first.normal[2] + 1.0
+    rng = np.random.default_rng(7)
+    spots = np.column_stack([rng.uniform(-0.6, 0.6, (60_000, 2)), np.full(60_000, floor_z)])
+
+    def sees(camera: FlatPortCamera, points: Any) -> Any:
+        pixels = camera.project(points)
+        return np.all((pixels >= 0) & (pixels <= [camera.width_px, camera.height_px]), axis=1)
+
+    ours = sees(first, spots)
+    both = ours & sees(second, rig.cam_from_rig["right"].apply(spots))
+    row = rig_fov_table(rig, [1.0], PORT)[0]
+    assert row.stereo_overlap == pytest.approx(both.sum() / ours.sum(), abs=0.006)
+    assert 0.7 < row.stereo_overlap < 0.95
+
+
+def test_cameras_that_see_nothing_together_have_no_depth() -> None:
+    row = fov_table([50.0], [0.2], 1.34, PORT)[0]
+    assert row.horizontal_m < row.baseline_m
+    assert row.stereo_overlap == 0.0
+    assert math.isnan(row.depth_sigma_mm)
+    assert row.to_json()["depth_sigma_mm"] is None
+
+
+def test_a_designed_rig_gives_the_row_of_its_lens() -> None:
+    ours = rig_fov_table(design_rig(PORT, WaterConfig(n_water=1.34)), [2.0], PORT)[0]
+    wanted = fov_table([12.5], [2.0], 1.34, PORT)[0]
+    # A calibrated focal length is the image distance at its focus: 0.8 % more than the lens's.
+    rough = {"near_altitude_m", "far_altitude_m", "depth_of_field_m", "hyperfocal_air_m",
+             "hyperfocal_altitude_m", "frame_near_altitude_m", "frame_far_altitude_m",
+             "corner_blur_px"}  # fmt: skip
+    for key, value in wanted.to_json().items():
+        assert ours.to_json()[key] == pytest.approx(value, rel=0.03 if key in rough else 1e-9), key
+
+
+def test_a_calibrated_rig_is_seen_with_its_distortion_and_tilt() -> None:
+    """The ends of the middle row, found on the sea floor, come back through the shortest path."""
+    rig = crooked_rig()
+    camera = rig.cameras["left"]
+    row = rig_fov_table(rig, [2.0], PORT)[0]
+    straight = fov_table([12.5], [2.0], 1.34, PORT)[0]
+    assert abs(row.horizontal_m / straight.horizontal_m - 1) > 0.01
+
+    ends = np.array([[0.0, 1355.0], [3384.0, 1355.0]])
+    spots = camera.at_depth(ends, 0.03 * camera.normal[2] + 2.0)
+    assert row.horizontal_m == pytest.approx(float(np.linalg.norm(spots[1] - spots[0])))
+    for end, spot in zip(ends, spots, strict=True):
+        np.testing.assert_allclose(project_by_shortest_path(camera, spot), end, atol=1e-5)
+
+
+def test_one_camera_has_a_field_of_view_but_no_stereo() -> None:
+    rig = design_rig(PORT, WaterConfig())
+    single = replace(
+        rig,
+        cameras={"left": rig.cameras["left"]},
+        cam_from_rig={"left": RigidTransform.identity()},
+    )
+    row = rig_fov_table(single, [2.0], PORT)[0]
+    assert row.horizontal_m == pytest.approx(1.441, abs=1e-3)
+    for value in (row.baseline_m, row.stereo_overlap, row.depth_sigma_mm):
+        assert math.isnan(value)
+
+
+def test_rows_come_lens_by_lens_and_scale_with_altitude() -> None:
+    rows = fov_table([12.5, 25.0], [1.0, 2.0], 1.34, NO_PORT)
+
+    assert [(r.lens_mm, r.altitude_m) for r in rows] == [
+        (12.5, 1.0), (12.5, 2.0), (25.0, 1.0), (25.0, 2.0),
+    ]  # fmt: skip
+    assert rows[1].horizontal_m == pytest.approx(2 * rows[0].horizontal_m)
+    assert rows[1].depth_sigma_mm == pytest.approx(4 * rows[0].depth_sigma_mm, rel=0.01)
+
+
+def test_a_thicker_or_farther_port_sees_more() -> None:
+    def row(**port: float) -> FovRow:
+        return fov_table([12.5], [2.0], 1.34, PORT.model_copy(update=port))[0]
+
+    base = row()
+    for port in ({"port_distance_m": 0.05}, {"glass_thickness_m": 0.03}, {"n_glass": 1.4}):
+        assert row(**port).horizontal_m > base.horizontal_m
+
+
+def test_wide_lenses_are_marked() -> None:
+    narrow, wide = fov_table([12.5, 8.0], [2.0], 1.34, PORT)
+    assert narrow.within_trusted_fov
+    assert not wide.within_trusted_fov
+
+
+def test_blur_is_the_way_made_in_pixels_and_the_longest_exposure_its_inverse() -> None:
+    rows = fov_table([12.5, 25.0], [2.0], 1.33, NO_PORT)
+    blur = blur_table(rows, [0.2, 0.5], [1e-3, 3e-3], 1.5)
+    assert len(blur) == 8
+    paper = next(b for b in blur if (b.lens_mm, b.speed_mps, b.exposure_s) == (12.5, 0.5, 3e-3))
+    assert paper.blur_px == pytest.approx(3.38, abs=0.005)
+    for b in blur:
+        again = blur_table([r for r in rows if r.lens_mm == b.lens_mm], [b.speed_mps],
+                           [b.longest_exposure_s], 1.0)[0]  # fmt: skip
+        assert again.blur_px == pytest.approx(1.5)
+
+
+@pytest.mark.parametrize(
+    ("lenses", "altitudes", "n_water", "words"),
+    [
+        ([0.0], [2.0], 1.34, "lens 0"),
+        ([math.nan], [2.0], 1.34, "lens nan"),
+        ([12.5], [-1.0], 1.34, "altitude -1"),
+        ([12.5], [math.inf], 1.34, "altitude inf"),
+        ([12.5], [2.0], 2.0, "n_water 2"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(
+    lenses: list[float], altitudes: list[float], n_water: float, words: str
+) -> None:
+    with pytest.raises(ConfigError, match=words) as fault:
+        fov_table(lenses, altitudes, n_water, PORT)
+    assert "allowed" in str(fault.value)
+    assert "\n" not in str(fault.value)
+
+
+def test_choices_out_of_range_are_refused() -> None:
+    for wrong in ({"coc_px": 0.0}, {"match_sigma_px": math.nan}, {"focus_air_m": -1.0}):
+        with pytest.raises(ConfigError, match="allowed"):
+            FovChoices(**wrong)
+    rows = fov_table([12.5], [2.0], 1.34, PORT)
+    for speeds, exposures, allowed in (([0.0], [1e-3], 1), ([0.2], [-1], 1), ([0.2], [1e-3], 0)):
+        with pytest.raises(ConfigError, match="allowed"):
+            blur_table(rows, speeds, exposures, allowed)

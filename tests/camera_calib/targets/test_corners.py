@@ -1,0 +1,153 @@
+"""Corners of a chessboard are found far below a pixel, half pixel included."""
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from camera_calib.targets.corners import (
+    AT_BORDER,
+    FITTED,
+    NOT_SETTLED,
+    UNLIKE_A_CORNER,
+    UNSEEN,
+    fit_corners,
+    linear_light,
+)
+from tests.oracles_targets import slow_corner
+
+COLUMNS, ROWS = 9, 6
+FINE = 8
+
+
+def drawn_board(noise: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """A tilted board seen by a pinhole, area-sampled in linear light, and its true corners."""
+    rng = np.random.default_rng(seed)
+    turn = Rotation.from_euler("xyz", rng.uniform(-25, 25, 3), degrees=True).as_matrix()
+    centre = np.array([(COLUMNS - 1) / 2, (ROWS - 1) / 2, 0.0])
+    shift = np.array([rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), 16.0])
+    matrix = np.array([[400.0, 0, 160.0], [0, 400.0, 120.0], [0, 0, 1]])
+    to_pixels = matrix @ np.column_stack([turn[:, :2], shift - turn @ centre])
+    y, x = np.mgrid[: 240 * FINE, : 320 * FINE]
+    pixels = np.stack([(x + 0.5) / FINE, (y + 0.5) / FINE, np.ones(x.shape)], axis=-1)
+    board = pixels @ np.linalg.inv(to_pixels).T
+    u, v = board[..., 0] / board[..., 2], board[..., 1] / board[..., 2]
+    inside = (u > -1) & (u < COLUMNS) & (v > -1) & (v < ROWS)
+    dark = (np.floor(u) + np.floor(v)) % 2 == 0
+    light = np.where(inside & dark, 0.05, 0.7)
+    light = light.reshape(240, FINE, 320, FINE).mean(axis=(1, 3))
+    light = light + rng.normal(0, noise, light.shape)
+    encoded = np.where(
+        light <= 0.0031308, 12.92 * light, 1.055 * np.abs(light) ** (1 / 2.4) - 0.055
+    )
+    picture = np.clip(np.rint(255 * encoded), 0, 255).astype(np.uint8)
+    cx, cy = np.meshgrid(np.arange(COLUMNS), np.arange(ROWS))
+    corners = np.stack([cx, cy, np.ones(cx.shape)], axis=-1).reshape(-1, 3) @ to_pixels.T
+    return picture, corners[:, :2] / corners[:, 2:]
+
+
+def steps_of(corners: np.ndarray) -> np.ndarray:
+    """(N, 2, 2) steps to the next corners along the rows and the columns."""
+    grid = corners.reshape(ROWS, COLUMNS, 2)
+    return np.stack(np.gradient(grid, axis=(1, 0)), axis=-1).reshape(-1, 2, 2)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("noise", "bound_px"), [(0.0, 0.02), (0.01, 0.06)])
+def test_corners_are_where_they_were_drawn(seed: int, noise: float, bound_px: float) -> None:
+    picture, true = drawn_board(noise, seed)
+    start = true + np.random.default_rng(seed).uniform(-0.7, 0.7, true.shape)
+
+    found = fit_corners(picture, start, steps_of(true))
+
+    assert np.all(found.states == FITTED)
+    assert 1e-4 < np.abs(found.pixels - true).max() < bound_px
+
+
+def test_the_fit_beats_opencvs_refinement() -> None:
+    picture, true = drawn_board(0.01, 11)
+    found = fit_corners(picture, true, steps_of(true)).pixels
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
+    near = (true - 0.5).astype(np.float32).reshape(-1, 1, 2)
+    theirs = cv2.cornerSubPix(picture, near, (5, 5), (-1, -1), criteria).reshape(-1, 2) + 0.5
+
+    ours_px, theirs_px = (np.sqrt(np.mean((c - true) ** 2)) for c in (found, theirs))
+
+    assert ours_px < 0.7 * theirs_px
+
+
+def test_a_corner_at_the_border_or_on_nothing_is_nan_and_says_why() -> None:
+    picture, true = drawn_board(0.0, 0)
+    near = np.array([[3.0, 100.0], true[0], [200.0, 9.0], [np.nan, 1.0], [-4.0, 50.0]])
+
+    found = fit_corners(picture, near, np.tile(20.0 * np.eye(2), (5, 1, 1)))
+
+    assert found.states.tolist() == [AT_BORDER, FITTED, NOT_SETTLED, UNSEEN, UNSEEN]
+    assert np.isnan(found.pixels[found.states != FITTED]).all()
+    assert np.abs(found.pixels[1] - true[0]).max() < 0.05
+
+
+def test_a_corner_behind_an_edge_is_refused() -> None:
+    picture, true = drawn_board(0.01, 0)
+    x, y = true[20].astype(int)
+    hidden = picture.copy()
+    hidden[y - 20 : y + 20, x - 20 : x + 1] = 90
+    near = true[20:21]
+
+    states = [
+        int(fit_corners(shown, near, 20.0 * np.eye(2)[None]).states[0])
+        for shown in (picture, hidden)
+    ]
+
+    assert states[0] == FITTED
+    assert states[1] in (UNLIKE_A_CORNER, NOT_SETTLED)
+
+
+def test_the_fit_is_its_slow_twin() -> None:
+    picture, true = drawn_board(0.01, 5)
+    light = cv2.GaussianBlur(linear_light(picture), (0, 0), 0.8)
+    steps = steps_of(true)
+
+    found = fit_corners(picture, true, steps)
+
+    y, x = np.mgrid[: picture.shape[0], : picture.shape[1]]
+    for i in (0, 17, 31, 53):
+        off = np.stack([x + 0.5 - true[i, 0], y + 0.5 - true[i, 1]], axis=-1)
+        along = np.abs(off @ np.linalg.inv(steps[i]).T)
+        used = (along <= 0.45).all(axis=-1) & (np.abs(off).max(axis=-1) < 12)
+        slow = slow_corner(light, used, true[i])
+        np.testing.assert_allclose(found.pixels[i], slow, atol=2e-3)
+
+
+def test_sigmas_are_true() -> None:
+    errors, sigmas = [], []
+    for seed in range(8):
+        picture, true = drawn_board(0.02, seed)
+        found = fit_corners(picture, true, steps_of(true))
+        errors.append(found.pixels - true)
+        sigmas.append(found.sigma_px)
+
+    normalised = np.concatenate(errors) / np.concatenate(sigmas)[:, None]
+
+    assert 0.6 < np.sqrt(np.nanmean(normalised**2)) < 1.2
+
+
+@pytest.mark.parametrize("turn", [0, 1])
+def test_contrast_tells_the_colours(turn: int) -> None:
+    picture, true = drawn_board(0.01, 3)
+    steps = steps_of(true)
+    row, column = np.mgrid[:ROWS, :COLUMNS]
+    black = ((row + column) % 2 == 0).ravel()  # the square (0, 0), left and above, is black
+    shown = 255 - picture if turn else picture
+
+    contrast = fit_corners(shown, true, steps).contrast
+
+    assert np.all((contrast > 0) == (black if turn == 0 else ~black))
+
+
+def test_linear_light_inverts_the_srgb_curve() -> None:
+    light = linear_light(np.arange(256, dtype=np.uint8))
+    assert light[0] == 0
+    assert light[255] == pytest.approx(1)
+    assert light[188] == pytest.approx(0.5, abs=0.005)
+    assert np.all(np.diff(light) > 0)

@@ -1,0 +1,77 @@
+"""Chessboards are found in whatever part of them shows, and not where there are none."""
+
+import cv2
+import numpy as np
+import pytest
+
+from camera_calib.targets.grow import chessboard_size, grown_chessboard, spans_board
+from camera_calib.targets.target import parse_target
+from tests.oracles_targets import picture_light, seen_from, to_srgb, true_pixels
+
+SIZE = (640, 480)
+BOARD = parse_target("chessboard 9x6 25mm")
+
+
+def view(turn: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
+    seen = seen_from(BOARD, SIZE, turn, 0.7)
+    light = picture_light(BOARD, seen, SIZE, fine=4)
+    noisy = light + np.random.default_rng(2).normal(0, 0.01, light.shape)
+    return to_srgb(noisy), true_pixels(BOARD, seen)
+
+
+@pytest.mark.parametrize("turn", [(0, 0, 0), (30, 25, 20), (-50, 10, 100)])
+def test_whole_boards_are_found(turn: tuple[float, float, float]) -> None:
+    picture, true = view(turn)
+    found = grown_chessboard(picture, (6, 9))
+    assert found is not None
+    # In any numbering: every corner is one of the true ones, and none twice.
+    near = np.linalg.norm(found[:, None] - true[None], axis=2)
+    assert near.min(axis=1).max() < 0.1
+    assert len(set(near.argmin(axis=1))) == 54
+    assert chessboard_size(picture) == (9, 6)
+    assert grown_chessboard(picture, (6, 8)) is None
+    assert grown_chessboard(picture, (7, 9)) is None
+
+
+def test_hidden_corners_are_left_out() -> None:
+    picture, true = view((30, 25, 20))
+    for spot in (true[20], true[49]):
+        x, y = spot.astype(int)
+        cv2.circle(picture, (int(x), int(y)), 25, 170, -1)
+    found = grown_chessboard(picture, (6, 9))
+    assert found is not None
+    seen = found[np.isfinite(found).all(axis=1)]
+    near = np.linalg.norm(seen[:, None] - true[None], axis=2)
+    assert 44 <= len(seen) <= 52
+    assert near.min(axis=1).max() < 0.4
+    assert not {20, 49} & set(near.argmin(axis=1))
+
+
+def test_the_part_that_shows_is_counted_but_not_taken_for_the_board() -> None:
+    picture, true = view((0, 0, 0))
+    picture[:, : int((true[0, 0] + true[1, 0]) / 2)] = 90
+    assert grown_chessboard(picture, (6, 9)) is None
+    assert chessboard_size(picture) == (8, 6)
+
+
+def test_there_is_no_board_in_noise_or_texture() -> None:
+    rng = np.random.default_rng(4)
+    noise = rng.integers(0, 256, (300, 400)).astype(np.uint8)
+    texture = cv2.GaussianBlur(noise.astype(np.float32), (0, 0), 4)
+    stretched = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    for picture in (noise, stretched, np.full((50, 50), 7, np.uint8)):
+        assert chessboard_size(picture) is None
+        assert grown_chessboard(picture, (4, 4)) is None
+
+
+def test_a_board_ends_where_its_outer_rows_are_seen() -> None:
+    seen = np.ones((6, 9), dtype=bool)
+    assert spans_board(seen)
+    seen[2:4, 2:7] = False
+    assert spans_board(seen)
+    seen[:, 8] = False
+    assert not spans_board(seen)
+    seen[2:5, 8] = True
+    assert spans_board(seen)
+    seen[1:5, :7] = False
+    assert not spans_board(seen)

@@ -1,0 +1,175 @@
+"""Printed targets are true to scale: the files, drawn and measured by others' means, say so."""
+
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from alice_survey.errors import CalibrationError
+from camera_calib.targets.detect import detect
+from camera_calib.targets.sheet import BAR_MM, PAPERS_MM, lay_out, print_target, write_sheet
+from camera_calib.targets.target import Target, parse_target
+
+KINDS = [
+    "chessboard 7x4 20mm",
+    "charuco 7x5 20mm 15mm DICT_4X4_50",
+    "apriltag 3x2 40mm 0.3",
+]
+MM_PER_POINT = 25.4 / 72.0
+
+
+def painted(rectangles_mm: np.ndarray, page_mm: tuple[float, float], dpi: float) -> np.ndarray:
+    """A page by samples at the middles of sub-pixels: 4 x 4 a pixel."""
+    per_mm, fine = dpi / 25.4, 4
+    width, height = (int(np.ceil(side * per_mm)) for side in page_mm)
+    black = np.zeros((height * fine, width * fine), dtype=bool)
+    for x0, y0, x1, y1 in np.rint(rectangles_mm * per_mm * fine).astype(int):
+        black[y0:y1, x0:x1] = True
+    share = black.reshape(height, fine, width, fine).mean(axis=(1, 3))
+    return np.rint(255 * (1 - share)).astype(np.uint8)
+
+
+def read_pdf(path: Path) -> tuple[np.ndarray, tuple[float, float], str]:
+    """Filled rectangles in mm from the top left, the page in mm, and the words."""
+    file = path.read_bytes()
+    start = int(re.search(rb"startxref\n(\d+)\n%%EOF\n$", file)[1])
+    head = re.match(rb"xref\n0 (\d+)\n0000000000 65535 f \n", file[start:])
+    entries = file[start + head.end() :].split(b"\n")[: int(head[1]) - 1]
+    for number, entry in enumerate(entries, start=1):
+        assert file[int(entry[:10]) :].startswith(b"%d 0 obj\n" % number)
+    box = [float(v) for v in re.search(rb"/MediaBox \[([^\]]*)\]", file)[1].split()]
+    length, stream = re.search(rb"/Length (\d+) >>\nstream\n(.*)endstream", file, re.S).groups()
+    assert int(length) == len(stream)
+    boxes = re.findall(rb"^([\d. ]+) re$", stream, re.M)
+    x, y, w, h = np.array([[float(v) for v in line.split()] for line in boxes]).T
+    rectangles = np.column_stack([x, box[3] - y - h, x + w, box[3] - y]) * MM_PER_POINT
+    words = re.search(rb"\((.*)\) Tj", stream)[1].decode()
+    return rectangles, (box[2] * MM_PER_POINT, box[3] * MM_PER_POINT), words
+
+
+def read_svg(path: Path) -> tuple[np.ndarray, tuple[float, float], str]:
+    root = ET.parse(path).getroot()  # noqa: S314, our own file
+    space = {"s": "http://www.w3.org/2000/svg"}
+    page = tuple(float(root.attrib[side].removesuffix("mm")) for side in ("width", "height"))
+    assert [float(v) for v in root.attrib["viewBox"].split()] == [0, 0, *page]
+    path_data = root.find("s:path", space).attrib["d"]
+    boxes = re.findall(r"M([\d.]+) ([\d.]+)H([\d.]+)V([\d.]+)H\1Z", path_data)
+    assert "".join(f"M{a} {b}H{c}V{d}H{a}Z" for a, b, c, d in boxes) == path_data
+    return np.array(boxes, dtype=float), page, root.find("s:text", space).text
+
+
+def check_scale(target: Target, picture: np.ndarray, dpi: float, within_m: float) -> None:
+    """The points measured in a picture of the page are where the target has them."""
+    found = detect(target, picture)
+    assert found is not None
+    assert np.isfinite(found).all()
+    metres = found * 25.4e-3 / dpi
+    off = (metres - metres.mean(axis=0)) - (target.points - target.points.mean(axis=0))[:, :2]
+    assert np.abs(off).max() < within_m
+    true = np.linalg.norm(target.points[-1] - target.points[0])
+    assert np.linalg.norm(metres[-1] - metres[0]) == pytest.approx(true, rel=1e-3)
+
+
+def check_bar(rectangles: np.ndarray, page: tuple[float, float], pattern_bottom: float) -> None:
+    """The last three rectangles: a bar of 100 mm below the pattern."""
+    bar = rectangles[-3:]
+    assert bar[:, 2].max() - bar[:, 0].min() == pytest.approx(BAR_MM, abs=1e-3)
+    assert bar[:, 1].min() > pattern_bottom + 2
+    assert bar.min() > 4
+    assert np.all(bar[:, 2:].max(axis=0) < np.array(page) - 4)
+
+
+@pytest.mark.parametrize("text", KINDS)
+@pytest.mark.parametrize("suffix", [".pdf", ".svg"])
+def test_lines_are_true_to_scale(text: str, suffix: str, tmp_path: Path) -> None:
+    target = parse_target(text)
+    path = tmp_path / f"board{suffix}"
+
+    described, _ = write_sheet(target, path)
+
+    rectangles, page, words = (read_pdf if suffix == ".pdf" else read_svg)(path)
+    check_bar(rectangles, page, rectangles[:-3, 3].max())
+    # The painter rounds edges to 32 um.
+    check_scale(target, painted(rectangles[:-3], page, 200.0), 200.0, 25e-6)
+    assert words.startswith(target.description) and "100 %" in words
+    assert parse_target(str(described)) == target
+
+
+@pytest.mark.parametrize("text", KINDS)
+@pytest.mark.parametrize("dpi", [150.0, 301.5])
+def test_pixels_are_true_to_scale(text: str, dpi: float, tmp_path: Path) -> None:
+    path = tmp_path / "board.png"
+    target = parse_target(text)
+
+    _, sheet = write_sheet(target, path, dpi=dpi)
+
+    with Image.open(path) as image:
+        assert image.info["dpi"] == pytest.approx((dpi, dpi), rel=1e-4)
+        picture = np.asarray(image)
+    check_scale(target, picture, dpi, 10e-6)
+    size_mm = np.array([sheet.width_mm, sheet.height_mm])
+    assert np.all(np.abs(np.array(picture.shape[::-1]) * 25.4 / dpi - size_mm) < 0.2)
+
+
+@pytest.mark.parametrize("suffix", [".pdf", ".svg", ".png"])
+def test_the_same_target_gives_the_same_bytes(suffix: str, tmp_path: Path) -> None:
+    paths = [tmp_path / f"{name}{suffix}" for name in "ab"]
+    for path in paths:
+        write_sheet(parse_target(KINDS[1]), path, dpi=100)
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+
+
+@pytest.mark.parametrize("paper", list(PAPERS_MM))
+def test_boards_lie_or_stand_on_paper_and_stay_on_it(paper: str) -> None:
+    for text in ("chessboard 9x6 20mm", "chessboard 6x9 20mm"):
+        sheet = lay_out(parse_target(text), paper.lower())
+        page = sheet.width_mm, sheet.height_mm
+        assert tuple(sorted(page)) == tuple(sorted(PAPERS_MM[paper]))
+        assert sheet.rectangles_mm.min() >= 7.9
+        assert np.all(sheet.rectangles_mm[:, 2:].max(axis=0) <= np.array(page) - 7.9)
+        # The pattern is centred from side to side.
+        sides = sheet.rectangles_mm[:-3, 0].min(), page[0] - sheet.rectangles_mm[:-3, 2].max()
+        assert sides[0] == pytest.approx(sides[1])
+
+
+@pytest.mark.parametrize(
+    "text", ["chessboard 9x6 40mm", "charuco 12x9 40mm 30mm", "apriltag 6x6 88mm 0.3"]
+)
+def test_what_does_not_fit_is_told_with_what_would(text: str) -> None:
+    with pytest.raises(CalibrationError, match="needs a page of") as caught:
+        lay_out(parse_target(text), "A4")
+    fitting = re.search(r"at the most '(.*)'$", str(caught.value))[1]
+    lay_out(parse_target(fitting), "A4")
+    larger = re.sub(
+        r"(\d+x\d+) ([\d.]+)mm", lambda m: f"{m[1]} {float(m[2]) + 0.2:.4g}mm", fitting, count=1
+    )
+    with pytest.raises(CalibrationError, match="needs a page of"):
+        lay_out(parse_target(larger), "A4")
+
+
+def test_wrong_wishes_give_one_clear_line(tmp_path: Path) -> None:
+    target = parse_target(KINDS[0])
+    for path, paper, dpi, said in (
+        ("board.gif", None, 300.0, "ends in .pdf, .svg, .png"),
+        ("board.pdf", "A7", 300.0, "no paper 'A7'; take one of A4"),
+        ("board.png", "A0", 2400.0, "lower --dpi"),
+    ):
+        with pytest.raises(CalibrationError, match=said):
+            write_sheet(target, tmp_path / path, paper, dpi)
+    with pytest.raises(CalibrationError, match="at most 5080 mm"):
+        lay_out(parse_target("chessboard 9x6 1m"))
+    assert not list(tmp_path.iterdir())
+
+
+def test_ambiguous_chessboards_are_told(tmp_path: Path) -> None:
+    said = {
+        text: print_target(text, tmp_path / "board.svg", None, 300.0)
+        for text in ("chessboard 8x6 25mm", "chessboard 9x6 25mm")
+    }
+    text, data = said["chessboard 8x6 25mm"]
+    assert "turned" in text and data["ambiguous"] is True
+    text, data = said["chessboard 9x6 25mm"]
+    assert "turned" not in text and data["ambiguous"] is False and data["points"] == 54
