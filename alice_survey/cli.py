@@ -180,7 +180,7 @@ def target(
         "calibrate --left 'left*.jpg' --right 'right*.jpg' --target 'chessboard 9x6 25mm' -o air",
         "calibrate --pictures dry --target 'charuco 12x9 40mm 30mm' --lens rational -o one",
         "calibrate --left L --right R --target board.json --water --start air/rig.json"
-        " --glass 0.01 -o pool",
+        " --glass 10 -o pool",
     )
 )
 def calibrate(
@@ -201,14 +201,20 @@ def calibrate(
         Literal["held", "prior", "free"] | None,
         typer.Option(help="What is done with those of --start; prior where it has sigmas."),
     ] = None,
-    port_distance: Annotated[float | None, typer.Option(min=0, help="First value, m.")] = None,
-    glass: Annotated[float | None, typer.Option(min=0, help="Thickness, m.")] = None,
+    port_distance: Annotated[float | None, typer.Option(min=0, help="First value, mm.")] = None,
+    glass: Annotated[float | None, typer.Option(min=0, help="Thickness, mm.")] = None,
     glass_sigma: Annotated[
-        float | None, typer.Option(min=1e-7, help="Find the thickness too; known to this, m.")
+        float | None, typer.Option(min=1e-4, help="Find the thickness too; known to this, mm.")
     ] = None,
     n_glass: Annotated[float | None, typer.Option(min=1, max=2, help="1.52 if not given.")] = None,
+    n_glass_sigma: Annotated[
+        float | None, typer.Option(min=1e-7, help="Find the index of the glass too.")
+    ] = None,
     n_water: Annotated[
         float | None, typer.Option(min=1, max=1.4, help="1.34 if not given.")
+    ] = None,
+    n_water_sigma: Annotated[
+        float | None, typer.Option(min=1e-7, help="Find the index of the water too.")
     ] = None,
     carry_to_n: Annotated[
         float | None, typer.Option(min=1, max=1.4, help="Also write the rig in other water.")
@@ -231,8 +237,9 @@ def calibrate(
 
         result = calibrate_command(
             left=left, right=right, pictures=pictures, target=target, output=output, lens=lens,
-            water=water, start=start, known=intrinsics, port_distance_m=port_distance,
-            glass_thickness_m=glass, glass_sigma_m=glass_sigma, n_glass=n_glass, n_water=n_water,
+            water=water, start=start, known=intrinsics, port_distance_mm=port_distance,
+            glass_mm=glass, glass_sigma_mm=glass_sigma, n_glass=n_glass,
+            n_glass_sigma=n_glass_sigma, n_water=n_water, n_water_sigma=n_water_sigma,
             carry_to_n=carry_to_n, threads=threads,
         )  # fmt: skip
     print_result(*result, as_json)

@@ -40,7 +40,7 @@ def water(
 @app.command(
     epilog=examples(
         "camera undisperse images/left/*.png --rig rig.json --range 2 -o corrected/left",
-        "camera undisperse dive/*.jpg --rig rig.json --range 1.5 -o out --glass pmma --salinity 39",
+        "camera undisperse dive/*.jpg --rig rig.json --range 1.5 -o out --material pmma",
     )
 )
 def undisperse(
@@ -52,7 +52,7 @@ def undisperse(
     temperature: Annotated[float, typer.Option(help="Of the water, C.")] = 20.0,
     salinity: Annotated[float, typer.Option(help="psu; 0 is fresh.")] = 35.0,
     depth: Annotated[float, typer.Option(help="Below the surface, m.")] = 10.0,
-    glass: Annotated[
+    material: Annotated[
         str, typer.Option(help="Port: bk7, fused-silica, sapphire, pmma, polycarbonate.")
     ] = "bk7",
     wavelength: Annotated[
@@ -70,7 +70,7 @@ def undisperse(
 
     text, data = undisperse_files(
         pictures, folder, rig=rig, camera=camera, range_m=distance, temperature_c=temperature,
-        salinity_psu=salinity, depth_m=depth, glass=glass, wavelengths_nm=wavelength,
+        salinity_psu=salinity, depth_m=depth, glass=material, wavelengths_nm=wavelength,
         threads=threads or default_threads(),
     )  # fmt: skip
     print_result(text, data, as_json)

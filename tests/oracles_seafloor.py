@@ -1,6 +1,7 @@
 """Slow, obvious twins of what the simulated sea floor computes, written apart from it."""
 
 import math
+from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -10,7 +11,7 @@ from scipy.special import erf
 U32 = 0xFFFFFFFF
 
 
-def fermat_pixels(camera: dict[str, float], points_cam: np.ndarray) -> np.ndarray:
+def fermat_pixels(camera: dict[str, Any], points_cam: np.ndarray) -> np.ndarray:
     """Pixels of points seen through a flat port, by Fermat's principle of the quickest path.
 
     The light's way from a point to the pupil crosses the outer glass at radius r2 and the inner at
@@ -19,12 +20,18 @@ def fermat_pixels(camera: dict[str, float], points_cam: np.ndarray) -> np.ndarra
 
     Args:
         camera: fx_px, fy_px, cx_px, cy_px, k1, k2, p1, p2, k3, port_distance_m, glass_thickness_m,
-            n_glass, n_water of a port square to the axis.
+            n_glass, n_water and the port's normal.
         points_cam: (N, 3).
 
     Returns:
         (N, 2) pixels that count from the outer corner of the first pixel.
     """
+    # In axes of the port: its normal is the third.
+    normal = np.asarray(camera["normal"])
+    side = np.cross(normal, [0.6, -0.8, 0.0])
+    side /= np.linalg.norm(side)
+    cam_from_port = np.column_stack([side, np.cross(normal, side), normal])
+    points_cam = points_cam @ cam_from_port
     d, g = camera["port_distance_m"], camera["glass_thickness_m"]
     radius = np.hypot(points_cam[:, 0], points_cam[:, 1])
     water = points_cam[:, 2] - d - g
@@ -52,7 +59,9 @@ def fermat_pixels(camera: dict[str, float], points_cam: np.ndarray) -> np.ndarra
         low, high = np.where(rising, low, r2), np.where(rising, r2, high)
     tangent = best_inner(0.5 * (low + high)) / d
     away = np.where(radius > 0.0, radius, 1.0)
-    x, y = tangent * points_cam[:, 0] / away, tangent * points_cam[:, 1] / away
+    sideways = points_cam[:, :2] * (tangent / away)[:, None]
+    ray = np.column_stack([sideways, np.ones(len(sideways))]) @ cam_from_port.T
+    x, y = ray[:, 0] / ray[:, 2], ray[:, 1] / ray[:, 2]
     r2 = x * x + y * y
     radial = 1.0 + camera["k1"] * r2 + camera["k2"] * r2**2 + camera["k3"] * r2**3
     xd = x * radial + 2.0 * camera["p1"] * x * y + camera["p2"] * (r2 + 2.0 * x * x)

@@ -30,7 +30,7 @@ relief_m = 0.2
 grid_m = 0.02
 [imaging]
 scale = 6
-pool_views = 10
+pool_views = 12
 [reconstruct]
 max_features = 1200
 """

@@ -19,15 +19,17 @@ CENTRE_TOLERANCE_PX = 10.0
 """At full resolution."""
 PORT_TOLERANCE_M = 0.001
 TURN_TOLERANCE_RAD = np.deg2rad(0.3)
+TILT_TOLERANCE = float(np.sin(np.deg2rad(0.3)))
+"""Of a port's normal, about each axis."""
 BASELINE_TOLERANCE_M = 0.0002
 
 
 def true_rig(config: SurveyConfig) -> Rig:
     """The survey's rig with errors of manufacture, the same for pool and sea.
 
-    Focal length, principal point, lens distortion and port distance of each camera differ from the
-    design, and so does the pose of the right camera; the left camera's place on the vehicle, glass
-    and indices do not.
+    Focal length, principal point, lens distortion, port distance and the port's normal of each
+    camera differ from the design, and so does the pose of the right camera; the left camera's place
+    on the vehicle, glass and indices do not.
     """
     rng = np.random.default_rng([config.seed, _SEED_STREAM])
     design = design_rig(config.camera, config.water)
@@ -37,6 +39,7 @@ def true_rig(config: SurveyConfig) -> Rig:
     }
     turn = Rotation.from_rotvec(rng.uniform(-TURN_TOLERANCE_RAD, TURN_TOLERANCE_RAD, 3))
     shift = rng.uniform(-BASELINE_TOLERANCE_M, BASELINE_TOLERANCE_M, 3)
+    cameras = {name: _tilted(camera, rng) for name, camera in cameras.items()}
     drawn = design.cam_from_rig["right"]
     right = RigidTransform.from_components(drawn.translation + shift, turn * drawn.rotation)
     return replace(
@@ -64,3 +67,8 @@ def _built(camera: FlatPortCamera, rng: np.random.Generator) -> FlatPortCamera:
         p2=rng.uniform(-3e-4, 3e-4),
         port_distance_m=max(port_m, 0.0),
     )
+
+
+def _tilted(camera: FlatPortCamera, rng: np.random.Generator) -> FlatPortCamera:
+    x, y = rng.uniform(-TILT_TOLERANCE, TILT_TOLERANCE, 2)
+    return camera.with_parameters({"normal_x": float(x), "normal_y": float(y)})

@@ -77,7 +77,7 @@ def run_pool(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     imaging, board = config.imaging, PoolBoard()
     stage = Stage(
         name="pool",
-        version=2,
+        version=3,
         settings={
             "seed": config.seed,
             "camera": config.camera.model_dump(mode="json"),
@@ -158,7 +158,7 @@ def run_images(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     sections = ("camera", "water", "seafloor", "imaging")
     stage = Stage(
         name="images",
-        version=3,
+        version=4,
         settings={
             "seed": config.seed,
             "seafloor_depth_m": config.area.seafloor_depth_m,

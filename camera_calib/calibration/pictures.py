@@ -47,13 +47,16 @@ class PictureCalibration:
     """rig.json of a calibration in air, or an earlier one."""
     known: Intrinsics | None = None
     """What is done with the intrinsics of `start`; None: prior if it has a covariance, or held."""
-    port_distance_m: float | None = None
+    port_distance_mm: float | None = None
     """First value; it is found."""
-    glass_thickness_m: float | None = None
-    glass_sigma_m: float | None = None
-    """The thickness is found too, known this well."""
+    glass_mm: float | None = None
+    """Thickness."""
+    glass_sigma_mm: float | None = None
+    """The thickness is found too, known this well; likewise the indices."""
     n_glass: float | None = None
+    n_glass_sigma: float | None = None
     n_water: float | None = None
+    n_water_sigma: float | None = None
     carry_to_n: float | None = None
     """Also write the rig in water of this index."""
 
@@ -141,11 +144,13 @@ def carried(rig: Rig, n_water: float) -> Rig:
 
 def _check_settings(settings: PictureCalibration, start: Rig | None) -> None:
     ports = {
-        "--port-distance": settings.port_distance_m,
-        "--glass": settings.glass_thickness_m,
-        "--glass-sigma": settings.glass_sigma_m,
+        "--port-distance": settings.port_distance_mm,
+        "--glass": settings.glass_mm,
+        "--glass-sigma": settings.glass_sigma_mm,
         "--n-glass": settings.n_glass,
+        "--n-glass-sigma": settings.n_glass_sigma,
         "--n-water": settings.n_water,
+        "--n-water-sigma": settings.n_water_sigma,
         "--carry-to-n": settings.carry_to_n,
         "--intrinsics": settings.known,
     }
@@ -158,11 +163,11 @@ def _check_settings(settings: PictureCalibration, start: Rig | None) -> None:
         raise CalibrationError(
             f"--intrinsics {settings.known} needs --start, the rig.json of a calibration in air"
         )
-    if settings.glass_thickness_m is None:
+    if settings.glass_mm is None:
         thin = start is None or all(c.glass_thickness_m == 0.0 for c in start.cameras.values())
         if thin:
             raise CalibrationError(
-                "--water needs --glass, the thickness of the port in metres (0 for a thin film)"
+                "--water needs --glass, the thickness of the port in mm (0 for a thin film)"
             )
 
 
@@ -181,9 +186,17 @@ def _calibrated(
         views = tuple(same_numbering(near, views, points, target.symmetries))
     if not settings.water:
         return calibrate_in_air(views, points, found.sizes, lens, start)
-    sigmas = {}
-    if settings.glass_sigma_m is not None:
-        sigmas = {f"{name}.glass_thickness_m": settings.glass_sigma_m for name in cameras}
+    known_to = {
+        "glass_thickness_m": _metres(settings.glass_sigma_mm),
+        "n_glass": settings.n_glass_sigma,
+        "n_water": settings.n_water_sigma,
+    }
+    sigmas = {
+        f"{name}.{parameter}": sigma
+        for name in cameras
+        for parameter, sigma in known_to.items()
+        if sigma is not None
+    }
     if start is None or known is None:
         return calibrate_in_water_alone(views, points, cameras, lens, sigmas)
     return calibrate_through_ports(views, points, start, known, lens, sigmas)
@@ -200,7 +213,7 @@ def _first(
     if not settings.water:
         bare = {"n_water": 1.0, "port_distance_m": 0.0, "glass_thickness_m": 0.0}
         return {name: blank_camera(size, **bare) for name, size in sizes.items()}
-    port_m, thickness_m = settings.port_distance_m, settings.glass_thickness_m
+    port_m, thickness_m = _metres(settings.port_distance_mm), _metres(settings.glass_mm)
     return {
         name: blank_camera(
             size,
@@ -213,6 +226,10 @@ def _first(
     }
 
 
+def _metres(length_mm: float | None) -> float | None:
+    return None if length_mm is None else length_mm / 1e3
+
+
 def _bare(camera: FlatPortCamera, _: PictureCalibration) -> FlatPortCamera:
     """A camera out of its housing."""
     return replace(
@@ -223,14 +240,14 @@ def _bare(camera: FlatPortCamera, _: PictureCalibration) -> FlatPortCamera:
 def _behind_port(camera: FlatPortCamera, settings: PictureCalibration) -> FlatPortCamera:
     """A camera of the start behind the port and in the water that the user names."""
     given = {
-        "glass_thickness_m": settings.glass_thickness_m,
+        "glass_thickness_m": _metres(settings.glass_mm),
         "n_glass": settings.n_glass,
         "n_water": settings.n_water,
-        "port_distance_m": settings.port_distance_m,
+        "port_distance_m": _metres(settings.port_distance_mm),
     }
     if settings.n_water is None and camera.n_water == 1.0:
         given["n_water"] = _FRESH_WATER
-    if settings.port_distance_m is None and camera.port_distance_m == 0.0:
+    if settings.port_distance_mm is None and camera.port_distance_m == 0.0:
         given["port_distance_m"] = _GUESSED_PORT_M
     return camera.with_parameters({k: v for k, v in given.items() if v is not None})
 

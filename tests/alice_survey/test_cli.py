@@ -62,7 +62,7 @@ def leaves(command: Any, *path: str) -> Iterator[tuple[str, ...]]:
         yield from leaves(below, *path, name)
 
 
-@pytest.mark.parametrize("path", leaves(get_command(app)), ids=" ".join)
+@pytest.mark.parametrize("path", list(leaves(get_command(app))), ids=" ".join)
 def test_every_command_explains_itself_with_examples(path: tuple[str, ...]) -> None:
     shown = CliRunner().invoke(app, [*path, "--help"])
     assert shown.exit_code == 0

@@ -65,7 +65,7 @@ def test_corners_are_where_fermat_puts_them(
 
     if np.abs(by_fit - truth).max() > 10.0:
         by_opencv, by_fit = by_opencv[::-1], by_fit[::-1]
-    assert np.linalg.norm(by_fit - truth, axis=1).max() < 0.05
+    assert np.linalg.norm(by_fit - truth, axis=1).max() < 0.08
     assert _rms(by_fit - truth) < 0.02
     assert _rms(by_opencv - truth) < 0.05
     assert np.linalg.norm(by_opencv - truth, axis=1).max() < 0.12
@@ -122,6 +122,7 @@ def test_the_rig_as_built_is_near_its_drawing_but_not_on_it() -> None:
         assert 0.0 < abs(camera.fx_px / design.fx_px - 1.0) < 0.0031
         assert 0.0 < abs(camera.cx_px - design.cx_px) <= 2.6  # 10 px at full resolution
         assert 0.0 < abs(camera.port_distance_m - design.port_distance_m) < 0.00101
+        assert 0.0 < np.rad2deg(np.arccos(camera.normal[2])) < 0.43  # 0.3 degrees about each axis
         assert -0.06 < camera.k1 < -0.04
     turn = built.cam_from_rig["right"].rotation.magnitude()
     assert 0.0 < np.rad2deg(turn) < 0.53  # 0.3 degrees about each axis

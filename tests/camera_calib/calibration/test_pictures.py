@@ -151,7 +151,7 @@ def test_from_dry_pictures_to_the_sea(dry: Path, wet: Path, truth: Rig, tmp_path
     calibrate_pictures(air, tmp_path / "air", threads=1)
     pool = PictureCalibration(
         pictures=both(wet), target=POOL_BOARD, water=True, start=tmp_path / "air" / "rig.json",
-        glass_thickness_m=0.01, carry_to_n=1.342,
+        glass_mm=10.0, carry_to_n=1.342,
     )  # fmt: skip
     text, found = calibrate_pictures(pool, tmp_path / "pool", threads=1)
 
@@ -274,9 +274,9 @@ def test_a_start_of_another_size(dry: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "what"),
     [
-        ({"glass_thickness_m": 0.01}, "--glass need"),
+        ({"glass_mm": 10.0}, "--glass need"),
         ({"water": True}, "--glass, the thickness"),
-        ({"water": True, "known": "prior", "glass_thickness_m": 0.01}, "needs --start"),
+        ({"water": True, "known": "prior", "glass_mm": 10.0}, "needs --start"),
         ({"lens": "fisheye"}, "no lens model"),
         ({"target": "chessboard"}, "chessboard"),
         ({"start": Path("nowhere.json")}, "nowhere.json"),
