@@ -4,6 +4,12 @@
 in each coordinate. Distance and normal of both ports and the pose of the right camera are unknown;
 the intrinsics are held at the truth, drawn from what a calibration in air would know and then taken
 with that prior, or unknown too. The adjustment starts from the design.
+
+The root mean square of 200 errors scatters by 5 % about the true one: of 39 that equal their
+bounds (13 in each mode) some exceed 1.15 times it by chance in up to 6 % of all runs. Errors are
+nearly linear in the noise, though, and of that linear part the mean square is known: it is the
+bound. Figures `without luck` are the bound and what is found of the rest (control variates); they
+scatter by less than 1 %.
 """
 
 from collections.abc import Sequence
@@ -15,7 +21,7 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.executor import parallel_map
 from alice_survey.frames import Array
-from camera_calib.calibration.adjust import cramer_rao
+from camera_calib.calibration.adjust import cramer_rao, stack_views
 from camera_calib.calibration.calibrate import Intrinsics, calibrate_through_ports
 from camera_calib.calibration.freedom import (
     PORT,
@@ -26,6 +32,9 @@ from camera_calib.calibration.freedom import (
     pose_names,
     value,
 )
+from camera_calib.calibration.normal_equations import Problem
+from camera_calib.calibration.result import TargetView
+from camera_calib.report.uncertainty import baseline_sigma_m
 from camera_calib.rig import Covariance, Rig
 from tests.camera_calib.calibration_scenes import (
     BOARD,
@@ -34,6 +43,7 @@ from tests.camera_calib.calibration_scenes import (
     built_rig,
     in_air,
     views_of,
+    with_values,
 )
 
 MODES: tuple[Intrinsics, ...] = ("held", "prior", "free")
@@ -46,6 +56,8 @@ _TRUTH = built_rig()
 _LENS = of_cameras(_TRUTH, intrinsics("opencv5"))
 _PORTS = (*of_cameras(_TRUTH, PORT), *pose_names(_TRUTH))
 _BASELINE = "baseline_m"
+RIG = (*_PORTS, _BASELINE)
+"""What the goals of the errors are for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,11 +70,25 @@ class Parameter:
     bound: float
     by_sigma: float
     """Root mean square of error / sigma."""
+    ratio_without_luck: float
+    """Error over its bound."""
+    by_sigma_without_luck: float
 
     @property
     def ratio(self) -> float:
         """Error over its bound."""
         return self.rms / self.bound
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Trial:
+    """Of all parameters of one calibration and of the baseline, in the order of the bound."""
+
+    errors: Array
+    first_order: Array
+    """The errors that the same noise causes if it is so small that all is linear."""
+    sigmas: Array
+    """By the calibration itself."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +104,7 @@ class Mode:
         low, high = GOAL_OF_SIGMA
         found = []
         for p in self.parameters:
-            if (p.name in _PORTS or p.name == _BASELINE) and not p.ratio <= GOAL_OF_BOUND:
+            if p.name in RIG and not p.ratio <= GOAL_OF_BOUND:
                 found.append(f"{self.known}, {p.name}: {p.ratio:.3f} x its bound > {GOAL_OF_BOUND}")
             if not low <= p.by_sigma <= high:
                 found.append(f"{self.known}, {p.name}: error / sigma {p.by_sigma:.3f}")
@@ -106,34 +132,55 @@ def _scene() -> tuple[RigidTransform, Covariance]:
 def bound_of(known: Intrinsics) -> Covariance:
     """The least covariance of any unbiased calibration of these views."""
     poses, lens = _scene()
-    free = (*_PORTS, *_LENS) if known == "free" else _PORTS
-    prior = Prior.of_rig(replace(_TRUTH, covariance=lens), _LENS) if known == "prior" else None
-    freedom = Freedom(free=free) if prior is None else Freedom(free=free, prior=prior)
+    freedom = _freedom(known, replace(_TRUTH, covariance=lens))
     everywhere = np.ones((_VIEWS, 2, len(BOARD)), dtype=np.bool_)
     return cramer_rao(_TRUTH, BOARD, poses, everywhere, freedom, _NOISE_PX)
 
 
-def run_trial(seed: int, known: Intrinsics) -> tuple[Array, Array]:
-    """Errors of all parameters and of the baseline, and their sigmas by the calibration itself."""
+def _freedom(known: Intrinsics, start: Rig) -> Freedom:
+    if known == "prior":
+        return Freedom(free=_PORTS, prior=Prior.of_rig(start, _LENS))
+    return Freedom(free=(*_PORTS, *_LENS) if known == "free" else _PORTS)
+
+
+def run_trial(seed: int, known: Intrinsics) -> Trial:
+    """Calibrate once."""
     rng = np.random.default_rng([seed, 3])
     poses, lens = _scene()
     truth = np.array([value(_TRUTH, name) for name in _LENS])
     start = DESIGN
     if known == "held":
-        start = _with_lens(DESIGN, truth, None)
+        start = with_values(DESIGN, dict(zip(_LENS, truth, strict=True)))
     if known == "prior":
-        start = _with_lens(DESIGN, rng.multivariate_normal(truth, lens.matrix), lens)
+        drawn = rng.multivariate_normal(truth, lens.matrix)
+        start = with_values(replace(DESIGN, covariance=lens), dict(zip(_LENS, drawn, strict=True)))
     views = views_of(_TRUTH, poses, _NOISE_PX, rng)
     found = calibrate_through_ports(views, BOARD, start, known).rig
-    if found.covariance is None:
-        raise RuntimeError("a calibration came without its covariance")
-    names = found.covariance.parameters
+    names = list(found.sigmas)
     errors = np.array([value(found, name) - value(_TRUTH, name) for name in names])
     turn = found.cam_from_rig["right"].rotation * _TRUTH.cam_from_rig["right"].rotation.inv()
     for axis, angle in zip("xyz", turn.as_rotvec(), strict=True):
         errors[names.index(f"right.r{axis}_rad")] = angle
-    sigmas = [*found.sigmas.values(), _baseline_sigma(found, found.covariance)]
-    return np.append(errors, found.baseline_m - _TRUTH.baseline_m), np.array(sigmas)
+    linear = _first_order(views, poses, _freedom(known, start))
+    shift = _TRUTH.cam_from_rig["right"].translation
+    at = [names.index(f"right.{axis}_m") for axis in "xyz"]
+    along = float(linear[at] @ shift / np.linalg.norm(shift))
+    return Trial(
+        errors=np.append(errors, found.baseline_m - _TRUTH.baseline_m),
+        first_order=np.append(linear, along),
+        sigmas=np.array([*found.sigmas.values(), baseline_sigma_m(found, "right")]),
+    )
+
+
+def _first_order(views: Sequence[TargetView], poses: RigidTransform, freedom: Freedom) -> Array:
+    """The step of Gauss and Newton from the truth: its covariance is the bound."""
+    problem = Problem(stack_views(views, _TRUTH, len(BOARD)), BOARD, _TRUTH, freedom)
+    weights = np.where(problem.seen, _NOISE_PX**-2.0, 0.0)
+    equations = problem.equations(problem.state(_TRUTH, poses), weights)
+    by_poses = np.linalg.solve(equations.view, equations.view_slope[..., None])[..., 0]
+    slope = equations.rig_slope - np.einsum("vpi,vi->p", equations.between, by_poses)
+    step: Array = -problem.covariance(equations).matrix @ slope
+    return step
 
 
 def run_mode(known: Intrinsics, seeds: Sequence[int], threads: int = 1) -> Mode:
@@ -141,53 +188,42 @@ def run_mode(known: Intrinsics, seeds: Sequence[int], threads: int = 1) -> Mode:
     work, label = partial(run_trial, known=known), f"calibrations, {known}"
     found = list(parallel_map(work, seeds, threads=threads, label=label))
     bound = bound_of(known)
-    rms = np.sqrt(np.mean([errors**2 for errors, _ in found], axis=0))
-    scores = np.sqrt(np.mean([(errors / sigmas) ** 2 for errors, sigmas in found], axis=0))
     names = (*bound.parameters, _BASELINE)
-    bounds = [*bound.sigmas.values(), _baseline_sigma(_TRUTH, bound)]
+    truth = replace(_TRUTH, covariance=bound)
+    bounds = np.array([*bound.sigmas.values(), baseline_sigma_m(truth, "right")])
+    square = np.mean([trial.errors**2 for trial in found], axis=0)
+    by_sigma = np.mean([(trial.errors / trial.sigmas) ** 2 for trial in found], axis=0)
+    luck = np.mean([(trial.first_order / bounds) ** 2 for trial in found], axis=0) - 1.0
+    columns = zip(names, square, bounds, by_sigma, luck, strict=True)
     return Mode(
         known=known,
         trials=len(found),
         parameters=tuple(
-            Parameter(name=n, rms=float(r), bound=b, by_sigma=float(s))
-            for n, r, b, s in zip(names, rms, bounds, scores, strict=True)
+            Parameter(
+                name=name,
+                rms=float(np.sqrt(s)),
+                bound=float(b),
+                by_sigma=float(np.sqrt(e)),
+                ratio_without_luck=float(np.sqrt(s / b**2 - more)),
+                by_sigma_without_luck=float(np.sqrt(e - more)),
+            )
+            for name, s, b, e, more in columns
         ),
     )
-
-
-def _baseline_sigma(rig: Rig, covariance: Covariance) -> float:
-    at = [covariance.parameters.index(f"right.{axis}_m") for axis in "xyz"]
-    shift = rig.cam_from_rig["right"].translation
-    along = shift / np.linalg.norm(shift)
-    return float(np.sqrt(along @ covariance.matrix[np.ix_(at, at)] @ along))
-
-
-def _with_lens(rig: Rig, values: Array, covariance: Covariance | None) -> Rig:
-    """The rig behind lenses of these values of `_LENS`."""
-    cameras = {
-        name: camera.with_parameters(
-            {
-                parameter.split(".")[1]: float(number)
-                for parameter, number in zip(_LENS, values, strict=True)
-                if parameter.startswith(f"{name}.")
-            }
-        )
-        for name, camera in rig.cameras.items()
-    }
-    return replace(rig, cameras=cameras, covariance=covariance)
 
 
 def table(modes: Sequence[Mode]) -> str:
     """The parameters of ports and rig in Markdown; the lens's are in the JSON."""
     lines = ["| parameter |", "|---|"]
     for mode in modes:
-        lines[0] += f" {mode.known}: bound | rms / bound | error / sigma |"
-        lines[1] += "---|---|---|"
-    for name in (*_PORTS, _BASELINE):
+        lines[0] += f" {mode.known}: bound | rms / bound | without luck | error / sigma |"
+        lines[1] += "---|---|---|---|"
+    for name in RIG:
         line = f"| {name} |"
         for mode in modes:
             p = next(p for p in mode.parameters if p.name == name)
-            line += f" {_in_words(p.name, p.bound)} | {p.ratio:.3f} | {p.by_sigma:.3f} |"
+            line += f" {_in_words(p.name, p.bound)} | {p.ratio:.3f} | {p.ratio_without_luck:.3f} |"
+            line += f" {p.by_sigma:.3f} |"
         lines.append(line)
     return "\n".join(lines)
 

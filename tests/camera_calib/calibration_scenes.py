@@ -64,6 +64,17 @@ def in_air(rig: Rig) -> Rig:
     return replace(rig, cameras={name: bare(camera) for name, camera in rig.cameras.items()})
 
 
+def with_values(rig: Rig, values: Mapping[str, float]) -> Rig:
+    """The rig with other values of some parameters of its cameras, such as `left.fx_px`."""
+    cameras = {
+        name: camera.with_parameters(
+            {n.split(".")[1]: v for n, v in values.items() if n.startswith(f"{name}.")}
+        )
+        for name, camera in rig.cameras.items()
+    }
+    return replace(rig, cameras=cameras)
+
+
 def board_poses(
     rig: Rig,
     count: int,

@@ -9,8 +9,17 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.errors import CalibrationError
+from benchmarks.camera_calibration import (
+    GOAL_OF_BOUND,
+    GOAL_OF_SIGMA,
+    MODES,
+    RIG,
+    bound_of,
+    run_mode,
+    run_trial,
+)
 from camera_calib.calibration.adjust import adjust, cramer_rao
-from camera_calib.calibration.calibrate import Intrinsics, calibrate_through_ports
+from camera_calib.calibration.calibrate import Intrinsics
 from camera_calib.calibration.freedom import (
     HELD,
     PORT,
@@ -23,7 +32,7 @@ from camera_calib.calibration.freedom import (
 )
 from camera_calib.calibration.result import TargetView
 from camera_calib.calibration.start import locate_all
-from camera_calib.rig import Covariance, Rig
+from camera_calib.rig import Rig
 from tests.camera_calib.calibration_scenes import (
     BOARD,
     DESIGN,
@@ -33,96 +42,48 @@ from tests.camera_calib.calibration_scenes import (
     in_air,
     views_of,
     with_pixels,
+    with_values,
 )
 
 NOISE_PX = 0.1
-TRIALS = 200
+TRIALS = 60
 TRUTH = built_rig()
 LENS = of_cameras(TRUTH, intrinsics("opencv5"))
 PORTS = (*of_cameras(TRUTH, PORT), *pose_names(TRUTH))
 
 
-def errors(found: Rig, names: tuple[str, ...]) -> np.ndarray:
-    """Found less true; turns of the right camera about its own axes."""
-    out = np.array([value(found, name) - value(TRUTH, name) for name in names])
-    turn = found.cam_from_rig["right"].rotation * TRUTH.cam_from_rig["right"].rotation.inv()
-    for axis, angle in zip("xyz", turn.as_rotvec(), strict=True):
-        out[names.index(f"right.r{axis}_rad")] = angle
-    return out
-
-
-def baseline_sigma(rig: Rig, covariance: Covariance) -> float:
-    at = [covariance.parameters.index(f"right.{axis}_m") for axis in "xyz"]
-    shift = rig.cam_from_rig["right"].translation
-    along = shift / np.linalg.norm(shift)
-    return float(np.sqrt(along @ covariance.matrix[np.ix_(at, at)] @ along))
-
-
-def with_lens_of(rig: Rig, values: dict[str, float], covariance: Covariance | None) -> Rig:
-    """The design behind lenses of given values."""
-    cameras = {
-        name: camera.with_parameters(
-            {n.split(".")[1]: v for n, v in values.items() if n.startswith(f"{name}.")}
-        )
-        for name, camera in rig.cameras.items()
-    }
-    return replace(rig, cameras=cameras, covariance=covariance)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("known", ["held", "prior", "free"])
+@pytest.mark.parametrize("known", MODES)
 def test_errors_reach_the_cramer_rao_bound_and_match_their_sigmas(known: Intrinsics) -> None:
-    """25 stereo views, 0.1 px, unknown ports; first values are those of the design."""
-    rng = np.random.default_rng(2026)
-    poses = board_poses(TRUTH, 25, rng)
-    everywhere = np.ones((25, 2, len(BOARD)), dtype=bool)
-    air = in_air(TRUTH)
-    in_air_knows = cramer_rao(
-        air, BOARD, board_poses(air, 25, rng), everywhere,
-        Freedom(free=(*LENS, *pose_names(air))), NOISE_PX,
-    )  # fmt: skip
-    lens_values = np.array([value(TRUTH, name) for name in LENS])
-    at = [in_air_knows.parameters.index(name) for name in LENS]
-    lens_covariance = Covariance(parameters=LENS, matrix=in_air_knows.matrix[np.ix_(at, at)])
-    prior = Prior.of_rig(replace(TRUTH, covariance=lens_covariance), LENS)
-    freedom = {
-        "held": Freedom(free=PORTS),
-        "prior": Freedom(free=PORTS, prior=prior),
-        "free": Freedom(free=(*PORTS, *LENS)),
-    }[known]
-    bound = cramer_rao(TRUTH, BOARD, poses, everywhere, freedom, NOISE_PX)
-    names, rows, scores = bound.parameters, [], []
-    baselines = []
-    for _ in range(TRIALS):
-        start = DESIGN
-        if known == "held":
-            start = with_lens_of(DESIGN, dict(zip(LENS, lens_values, strict=True)), None)
-        if known == "prior":
-            drawn = rng.multivariate_normal(lens_values, lens_covariance.matrix)
-            start = with_lens_of(DESIGN, dict(zip(LENS, drawn, strict=True)), lens_covariance)
-        views = views_of(TRUTH, poses, NOISE_PX, rng)
-        found = calibrate_through_ports(views, BOARD, start, known).rig
-        assert found.covariance is not None
-        assert found.covariance.parameters == names
-        rows.append(errors(found, names))
-        scores.append(rows[-1] / [found.sigmas[name] for name in names])
-        off = found.baseline_m - TRUTH.baseline_m
-        baselines.append((off, off / baseline_sigma(found, found.covariance)))
+    """25 stereo views, 0.1 px, unknown ports; first values are those of the design.
 
-    ratio = np.sqrt(np.mean(np.square(rows), axis=0)) / np.sqrt(np.diag(bound.matrix))
-    score = np.sqrt(np.mean(np.square(scores), axis=0))
-    baseline_rms, baseline_score = np.sqrt(np.mean(np.square(baselines), axis=0))
-    of_ports = [i for i, name in enumerate(names) if name in PORTS]
-    assert 0.85 < ratio[of_ports].min() <= ratio[of_ports].max() <= 1.15
-    assert 0.85 < baseline_rms / baseline_sigma(TRUTH, bound) <= 1.15
-    assert 0.8 < score.min() <= score.max() < 1.25
-    assert 0.8 < baseline_score < 1.25
+    The bounds are the goals over 200 trials, and nearer ones; without the luck of the draws (see
+    `benchmarks.camera_calibration`) 60 trials tell each figure to 1.5 %, so that no seed decides.
+    """
+    mode = run_mode(known, range(TRIALS))
+
+    found = {p.name: p for p in mode.parameters}
+    ratios = [found[name].ratio_without_luck for name in RIG]
+    assert 0.95 < min(ratios) <= max(ratios) <= 1.05 < GOAL_OF_BOUND
+    low, high = GOAL_OF_SIGMA
+    scores = [p.by_sigma_without_luck for p in mode.parameters]
+    assert low < 0.95 < min(scores) <= max(scores) < 1.05 < high
     # Sizes that this geometry gives, so that the bound itself is no slip.
-    sigmas = bound.sigmas
     low_mm, high_mm = {"held": (0.2, 0.45), "prior": (0.3, 1.0), "free": (0.7, 2.4)}[known]
-    assert low_mm < 1e3 * sigmas["left.port_distance_m"] < high_mm
-    assert 0.007 < np.rad2deg(sigmas["left.normal_x"]) < 0.09
-    assert 0.003 < 1e3 * baseline_sigma(TRUTH, bound) < 0.03
+    assert low_mm < 1e3 * found["left.port_distance_m"].bound < high_mm
+    assert 0.007 < np.rad2deg(found["left.normal_x"].bound) < 0.09
+    assert 0.003 < 1e3 * found["baseline_m"].bound < 0.03
+
+
+def test_the_linear_part_of_errors_is_nearly_all_and_has_the_bound_as_covariance() -> None:
+    trials = [run_trial(seed, "held") for seed in range(20)]
+    information = np.linalg.inv(bound_of("held").matrix)
+    linear = np.array([trial.first_order[:-1] for trial in trials])  # the last is the baseline's
+    squares = np.einsum("tp,pq,tq->t", linear, information, linear)
+    # Chi-squared with 20 x 12 degrees of freedom: a sigma of 9 %.
+    assert squares.mean() / len(information) == pytest.approx(1.0, abs=0.4)
+    for trial in trials:
+        assert (np.abs(trial.errors - trial.first_order) / trial.sigmas).max() < 0.3
 
 
 def test_a_solve_of_25_stereo_views_takes_less_than_0_15_s() -> None:
@@ -288,7 +249,7 @@ def test_the_better_of_prior_and_views_wins_in_proportion() -> None:
     name = "left.port_distance_m"
     alone = adjust(views, points, rig, poses, Freedom(free=(name,))).rig
     sigma_m = alone.sigmas[name]
-    moved = with_lens_of(rig, {name: value(alone, name) + 2.0 * sigma_m}, None)
+    moved = with_values(rig, {name: value(alone, name) + 2.0 * sigma_m})
     prior = Prior.around(moved, {name: sigma_m})
 
     both = adjust(views, points, rig, poses, Freedom(prior=prior)).rig
@@ -321,7 +282,7 @@ def test_a_prior_on_a_turn_counts_from_its_own_rotation() -> None:
 
 def test_a_port_at_the_pupil_stays_there() -> None:
     """A distance cannot be negative; noise that asks for it gives 0, not an error."""
-    flat = with_lens_of(TRUTH, dict.fromkeys(of_cameras(TRUTH, ("port_distance_m",)), 0.0), None)
+    flat = with_values(TRUTH, dict.fromkeys(of_cameras(TRUTH, ("port_distance_m",)), 0.0))
     ends = []
     for seed in range(6):
         rng = np.random.default_rng([2, seed])
