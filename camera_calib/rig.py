@@ -12,9 +12,11 @@ from alice_survey.artefacts import read_json, write_json
 from alice_survey.config import CameraConfig, WaterConfig
 from alice_survey.errors import CalibrationError
 from alice_survey.frames import BODY_FROM_NADIR_CAM, Array, pose_from_json, pose_to_json
-from camera_calib.flat_port import FlatPortCamera, camera_from_json
+from camera_calib.flat_port import FlatPortCamera, camera_from_json, numbers
 
 _FORMAT = {"format": "alice-survey rig", "version": 2}
+_NORM_TOLERANCE = 1e-3
+"""Of a quaternion in a file that was typed or rounded."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,6 +41,14 @@ class Covariance:
     def sigmas(self) -> dict[str, float]:
         """Standard deviations by name."""
         return dict(zip(self.parameters, np.sqrt(np.diag(self.matrix)).tolist(), strict=True))
+
+    def without(self, field: str) -> "Covariance":
+        """Of all parameters but one of every camera: it is marginalised."""
+        names = self.parameters
+        kept = [i for i, name in enumerate(names) if not name.endswith(f".{field}")]
+        return Covariance(
+            parameters=tuple(names[i] for i in kept), matrix=self.matrix[np.ix_(kept, kept)]
+        )
 
     @property
     def correlation(self) -> Array:
@@ -90,9 +100,14 @@ class Rig:
         return self.body_from_rig * self.cam_from_rig[camera].inv()
 
     def in_water(self, n_water: float) -> "Rig":
-        """The same rig in other water: a pool calibration carried to the sea."""
+        """The same rig in other water: a pool calibration carried to the sea.
+
+        What was found of the old water's index says nothing of the new one: it leaves the
+        covariance.
+        """
         cameras = {name: replace(c, n_water=n_water) for name, c in self.cameras.items()}
-        return replace(self, cameras=cameras)
+        covariance = None if self.covariance is None else self.covariance.without("n_water")
+        return replace(self, cameras=cameras, covariance=covariance)
 
 
 def design_rig(camera: CameraConfig, water: WaterConfig, scale: int = 1) -> Rig:
@@ -160,29 +175,64 @@ def read_rig(path: Path) -> Rig:
     """
     data = read_json(path)
     try:
-        if {key: data[key] for key in _FORMAT} != _FORMAT:
-            raise CalibrationError(f"is no rig file of version {_FORMAT['version']}")
-        poses = {name: pose_from_json(c["cam_from_rig"]) for name, c in data["cameras"].items()}
-        cameras = {
-            name: camera_from_json({k: v for k, v in c.items() if k != "cam_from_rig"})
-            for name, c in data["cameras"].items()
-        }
+        data = _mapping(data, "the file")
+        if data.get("format") != _FORMAT["format"]:
+            raise CalibrationError(f'is no rig file: "format" is not "{_FORMAT["format"]}"')
+        if data.get("version") != _FORMAT["version"]:
+            raise CalibrationError(
+                f"is a rig file of version {data.get('version')}; this program reads version "
+                f"{_FORMAT['version']}: calibrate again, or change the file by docs/formats.md"
+            )
+        given = _mapping(data["cameras"], "cameras")
+        cameras, poses = {}, {}
+        for name, values in given.items():
+            rest = dict(_mapping(values, name))
+            poses[name] = _pose(rest.pop("cam_from_rig"), f"{name}: cam_from_rig")
+            cameras[name] = _camera(rest, name)
         return Rig(
             cameras=cameras,
             cam_from_rig=poses,
-            body_from_rig=pose_from_json(data["body_from_rig"]),
+            body_from_rig=_pose(data["body_from_rig"], "body_from_rig"),
             source=str(data["source"]),
             covariance=_covariance_from_json(data.get("covariance")),
         )
-    except (KeyError, TypeError, ValueError, AttributeError, CalibrationError) as error:
+    except (KeyError, TypeError, ValueError, CalibrationError) as error:
         what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
         raise CalibrationError(f"{path}: {what}") from None
+
+
+def _mapping(data: Any, what: str) -> dict[str, Any]:
+    if not isinstance(data, dict):
+        raise CalibrationError(f"{what} is no object of names and values")
+    return data
+
+
+def _camera(data: dict[str, Any], name: str) -> FlatPortCamera:
+    try:
+        return camera_from_json(data)
+    except CalibrationError as error:
+        raise CalibrationError(f"{name}: {str(error).removeprefix('camera: ')}") from None
+
+
+def _pose(data: Any, what: str) -> RigidTransform:
+    pose = _mapping(data, what)
+    numbers(pose["translation_m"], 3, f"{what}.translation_m")
+    quaternion = numbers(pose["quaternion_xyzw"], 4, f"{what}.quaternion_xyzw")
+    length = float(np.linalg.norm(quaternion))
+    if abs(length - 1.0) > _NORM_TOLERANCE:
+        raise CalibrationError(f"{what}.quaternion_xyzw has the norm {length:g}, not 1")
+    return pose_from_json(pose)
 
 
 def _covariance_from_json(data: dict[str, Any] | None) -> Covariance | None:
     if data is None:
         return None
+    names, rows = _mapping(data, "covariance")["parameters"], data["matrix"]
+    if not isinstance(names, list) or not isinstance(rows, list) or len(names) != len(rows):
+        raise CalibrationError("covariance: as many rows of matrix as parameters are wanted")
+    matrix = [
+        numbers(row, len(names), f"covariance: the row of {names[i]}") for i, row in enumerate(rows)
+    ]
     return Covariance(
-        parameters=tuple(map(str, data["parameters"])),
-        matrix=np.array(data["matrix"], dtype=np.float64),
+        parameters=tuple(map(str, names)), matrix=np.array(matrix).reshape(len(names), len(names))
     )

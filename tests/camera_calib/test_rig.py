@@ -72,6 +72,16 @@ def test_a_scaled_design_sees_the_same_with_larger_pixels(rig: Rig) -> None:
     assert small.baseline_m == rig.baseline_m
 
 
+def test_a_rig_in_other_water_forgets_only_how_well_the_index_was_known(rig: Rig) -> None:
+    names = ("left.fx_px", "left.n_water", "left.k1", "right.n_water")
+    root = np.random.default_rng(1).normal(size=(4, 4))
+    found = replace(rig, covariance=Covariance(parameters=names, matrix=root @ root.T))
+    sea = found.in_water(1.34)
+    assert sea.covariance is not None
+    assert sea.covariance.parameters == ("left.fx_px", "left.k1")
+    np.testing.assert_array_equal(sea.covariance.matrix, (root @ root.T)[np.ix_([0, 2], [0, 2])])
+
+
 def test_a_rig_in_other_water_keeps_all_else(rig: Rig) -> None:
     pool = rig.in_water(1.333)
     assert {c.n_water for c in pool.cameras.values()} == {1.333}
