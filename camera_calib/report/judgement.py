@@ -236,7 +236,8 @@ def _camera(
     pixels = frame_pixels(model, _MAP_COLUMNS, _MAP_ROWS)
     halves = None
     if held is not None and held.halves is not None:
-        halves = halves_difference(held.halves, name, pixels, range_m, anchors)
+        prior = held.used.freedom.prior
+        halves = halves_difference(held.halves, name, pixels, range_m, anchors, prior)
     coarse, compensating = pixels[::2, ::2], compensation(rig, name, anchors)
     return CameraJudgement(
         seen=seen,

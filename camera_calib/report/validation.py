@@ -21,6 +21,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.errors import CalibrationError, warn
 from alice_survey.frames import Array
+from camera_calib.calibration.freedom import NO_PRIOR, Prior
 from camera_calib.calibration.result import Calibration, TargetView
 from camera_calib.flat_port import FlatPortCamera, pose_jacobian
 from camera_calib.report.fit_quality import rms_length_px, within_gate
@@ -195,9 +196,18 @@ class HalvesDifference:
 
 
 def halves_difference(
-    halves: tuple[Rig, Rig], camera: str, pixels: Array, range_m: float, anchors_cam: Array
+    halves: tuple[Rig, Rig],
+    camera: str,
+    pixels: Array,
+    range_m: float,
+    anchors_cam: Array,
+    prior: Prior = NO_PRIOR,
 ) -> HalvesDifference:
     """Compare two calibrations as mrcal compares models: over the frame, after the best pose.
+
+    An error d of the prior's mean, of information I, moves a calibration of covariance S by S I d.
+    Both halves have the same d, so that most of it does not show: what differs are the errors by
+    noise, S - S I S of each, and (S1 - S2) I d.
 
     Args:
         halves: the rigs.
@@ -205,20 +215,27 @@ def halves_difference(
         pixels: (R, C, 2) where to look.
         range_m: distance of the points along the axis.
         anchors_cam: (A, 3) points in the camera's frame that fix the pose between both.
+        prior: what both calibrations took as known.
     """
     first, second = (rig.cameras[camera] for rig in halves)
     pose = _best_pose(first, second, anchors_cam)
     flat = pixels.reshape(-1, 2)
     points = first.at_depth(flat, range_m)
-    variance = np.zeros(len(flat))
-    for rig in halves:
+    variance, shared = np.zeros(len(flat)), np.zeros((len(flat), 2, len(prior.parameters)))
+    for rig, sign in zip(halves, (-1.0, 1.0), strict=True):
         _, by_point, plain = camera_slopes(rig, camera, points)
         moved = plain + pose_jacobian(by_point, points) @ compensation(rig, camera, anchors_cam)
-        variance += np.einsum("nap,pq,naq->n", moved, covariance_of(rig).matrix, moved)
+        covariance = covariance_of(rig)
+        at = [covariance.parameters.index(name) for name in prior.parameters]
+        by_prior = moved @ covariance.matrix[:, at]
+        shared += sign * by_prior
+        variance += np.einsum("nap,pq,naq->n", moved, covariance.matrix, moved)
+        variance -= np.einsum("nap,pq,naq->n", by_prior, prior.information, by_prior)
+    variance += np.einsum("nap,pq,naq->n", shared, prior.information, shared)
     return HalvesDifference(
         pixels=pixels,
         difference_px=(second.project(pose.apply(points)) - flat).reshape(pixels.shape),
-        expected_px=np.sqrt(variance).reshape(pixels.shape[:-1]),
+        expected_px=np.sqrt(np.maximum(variance, 0.0)).reshape(pixels.shape[:-1]),
     )
 
 

@@ -5,7 +5,15 @@ import numpy as np
 import pytest
 
 from alice_survey.errors import CalibrationError
-from camera_calib.calibration.freedom import Freedom, of_cameras, pose_names
+from camera_calib.calibration.freedom import (
+    PORT,
+    Freedom,
+    Prior,
+    intrinsics,
+    of_cameras,
+    pose_names,
+    value,
+)
 from camera_calib.calibration.result import Calibration, TargetView
 from camera_calib.calibration.start import locate
 from camera_calib.report.judgement import anchors_cam
@@ -92,6 +100,34 @@ def test_halves_differ_as_their_covariances_promise() -> None:
             )
             ratios.append(difference.rms_px / difference.expected_rms_px)
     assert 0.6 < np.sqrt(np.mean(np.square(ratios))) < 1.4
+
+
+def test_an_error_of_the_prior_is_the_same_in_both_halves() -> None:
+    """A prior about as good as the views: its own error hardly shows between halves."""
+    lens = of_cameras(DESIGN, intrinsics("opencv5"))
+    true = np.array([value(true_rig(), name) for name in lens])
+    ratios, independent = [], []
+    for seed in range(1, 6):
+        found, rng = usual(seed), np.random.default_rng([seed, 5])
+        assert found.rig.covariance is not None
+        at = [found.rig.covariance.parameters.index(name) for name in lens]
+        covariance = 0.3 * found.rig.covariance.matrix[np.ix_(at, at)]
+        mean = rng.multivariate_normal(true, covariance)
+        prior = Prior(parameters=lens, mean=mean, covariance=covariance)
+        ports = (*of_cameras(DESIGN, PORT), *pose_names(DESIGN))
+        freedom = Freedom(free=ports, prior=prior)
+        first, second = (
+            adjusted(found.views[i::2], found.target_points, found.rig, freedom).rig
+            for i in range(2)
+        )
+        for name, camera in found.rig.cameras.items():
+            pixels, anchors = frame_pixels(camera, 9, 7), anchors_cam(found, name)
+            shared = halves_difference((first, second), name, pixels, 1.5, anchors, prior)
+            apart = halves_difference((first, second), name, pixels, 1.5, anchors)
+            ratios.append(shared.rms_px / shared.expected_rms_px)
+            independent.append(apart.rms_px / apart.expected_rms_px)
+    assert 0.75 < np.sqrt(np.mean(np.square(ratios))) < 1.3
+    assert np.sqrt(np.mean(np.square(independent))) < 0.75
 
 
 def test_the_same_calibration_twice_does_not_differ() -> None:
