@@ -49,7 +49,9 @@ class Adjustment:
     weights: Array
     """(V, cameras, N) robust weights in (0, 1]; NaN where unseen."""
     noise_px: float
-    """Standard deviation of one coordinate of a measured point."""
+    """Standard deviation of one coordinate of a measured point, in all."""
+    blur: Array
+    """(V, cameras) noise of each picture over that."""
     steps: int
     is_settled: bool
     """Whether the last step was as short as asked for."""
@@ -255,6 +257,7 @@ class _Solver(Problem):
             residuals_px=np.where(self.seen[..., None], residuals, np.nan),
             weights=np.where(self.seen, weights, np.nan),
             noise_px=noise_px,
+            blur=np.broadcast_to(self.blur[..., 0], self.seen.shape[:2]),
             steps=steps,
             is_settled=is_settled,
         )

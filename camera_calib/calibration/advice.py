@@ -7,7 +7,6 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.frames import Array
-from camera_calib.calibration.result import Calibration
 from camera_calib.rig import Covariance, Rig
 
 FEW_VIEWS = 10
@@ -22,6 +21,7 @@ _BADLY = 2.5
 """A picture's residuals over those of all."""
 _LENS_ONLY = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
 _FOCAL = ("fx_px", "fy_px")
+_WATER = ("n_water",)
 _USEFUL = {
     "fx_px": (0.005, "of the focal length", "more views at 20 to 40 degrees of tilt"),
     "fy_px": (0.005, "of the focal length", "more views at 20 to 40 degrees of tilt"),
@@ -66,23 +66,6 @@ def advice(
         lines += _alike(rig.covariance)
     lines += _bad_pictures(rig, residuals_px, list(names), noise_px)
     return tuple(lines)
-
-
-def of_calibration(calibration: Calibration) -> tuple[str, ...]:
-    """`advice` on a finished calibration."""
-    measured = np.full(calibration.residuals_px.shape, np.nan)
-    for v, view in enumerate(calibration.views):
-        for c, camera in enumerate(calibration.rig.cameras):
-            if camera in view.pixels:
-                measured[v, c] = view.pixels[camera]
-    return advice(
-        calibration.rig,
-        measured,
-        calibration.residuals_px,
-        (view.name for view in calibration.views),
-        calibration.rig_from_target,
-        calibration.noise_px,
-    )
 
 
 def _uncovered(camera: str, rig: Rig, pixels: Array) -> list[str]:
@@ -151,7 +134,7 @@ def _alike(covariance: Covariance) -> list[str]:
     strong = np.abs(covariance.correlation) > _ALIKE
     names = covariance.parameters
     fields = [name.split(".")[1] for name in names]
-    for kin in (_LENS_ONLY, _FOCAL):  # always alike, and never used apart
+    for kin in (_LENS_ONLY, _FOCAL, _WATER):  # always alike, and never used apart
         at = [i for i, field in enumerate(fields) if field in kin]
         strong[np.ix_(at, at)] = False
     groups: list[set[int]] = []

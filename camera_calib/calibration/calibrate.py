@@ -116,6 +116,7 @@ def calibrate(
         ),
         freedom=freedom,
         rejected=left_out,
+        blur=adjusted.blur,
     )
 
 

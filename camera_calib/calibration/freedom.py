@@ -22,6 +22,9 @@ PINHOLE = ("fx_px", "fy_px", "cx_px", "cy_px")
 PORT = ("port_distance_m", "normal_x", "normal_y")
 """What a calibration through a port finds; glass and indices are known better from elsewhere."""
 
+_ONE_WATER = ".n_water"
+_SAME = 1.0 - 0.5e-4
+"""Correlation of what is known of one number twice: both differ by 0.01 sigma."""
 _OPENCV4 = ("k1", "k2", "p1", "p2")
 LENSES: Mapping[str, tuple[str, ...]] = {
     "pinhole": (),
@@ -106,11 +109,18 @@ class Prior:
 
     @classmethod
     def around(cls, rig: Rig, sigmas: Mapping[str, float]) -> "Prior":
-        """Independent knowledge: each parameter is the rig's value, give or take its sigma."""
+        """Each parameter is the rig's value, give or take its sigma, independent of the others.
+
+        Only the indices of the water are one number: all cameras look into the same.
+        """
+        spread = np.array(list(sigmas.values()))
+        water = np.array([name.endswith(_ONE_WATER) for name in sigmas], dtype=bool)
+        alike = np.where(np.outer(water, water), _SAME, 0.0)
+        np.fill_diagonal(alike, 1.0)
         return cls(
             parameters=tuple(sigmas),
             mean=np.array([value(rig, name) for name in sigmas]),
-            covariance=np.diag(np.square(list(sigmas.values()))),
+            covariance=alike * np.outer(spread, spread),
         )
 
     @classmethod

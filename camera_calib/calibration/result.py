@@ -58,6 +58,8 @@ class Calibration:
     """What of the rig was adjusted, and the prior."""
     rejected: Array | None = None
     """(V, cameras, N, 2) measured pixels that took no part; NaN elsewhere."""
+    blur: Array | None = None
+    """(V, cameras) noise of each picture over `noise_px`; None for alike ones."""
 
     def __post_init__(self) -> None:
         shape = (len(self.views), len(self.rig.cameras), len(self.target_points), 2)

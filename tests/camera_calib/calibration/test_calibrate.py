@@ -19,12 +19,14 @@ from camera_calib.calibration.calibrate import (
 from camera_calib.calibration.freedom import (
     PORT,
     Freedom,
+    Prior,
     intrinsics,
     of_cameras,
     pose_names,
     value,
 )
 from camera_calib.calibration.observability import held_effect
+from camera_calib.calibration.result import TargetView
 from camera_calib.calibration.start import locate
 from camera_calib.rig import Rig
 from tests.camera_calib.calibration_scenes import (
@@ -135,6 +137,20 @@ def test_what_hangs_on_the_index_of_water_is_what_a_new_calibration_finds() -> N
     fx_px = found.rig.cameras["left"].fx_px
     assert effect.slopes["left.fx_px"] == pytest.approx(-fx_px / 1.34, rel=0.01)
     assert effect.sigma > 0.02
+
+
+def test_cameras_with_an_index_to_be_found_look_into_one_water() -> None:
+    rng = np.random.default_rng(6)
+    sea = TRUTH.in_water(1.342)
+    views = views_of(sea, board_poses(sea, 12, rng), NOISE_PX, rng)
+    sigmas = {"left.n_water": 0.002, "right.n_water": 0.002}
+    found = calibrate_through_ports(views, BOARD, TRUTH, "held", sigmas=sigmas).rig
+    left, right = (camera.n_water for camera in found.cameras.values())
+    assert left == pytest.approx(1.342, abs=4 * found.sigmas["left.n_water"])
+    assert found.sigmas["left.n_water"] < 5e-4
+    assert abs(left - right) < 0.02 * 0.002
+    apart = Prior.around(TRUTH, {"left.n_glass": 0.01, "right.n_glass": 0.01}).covariance
+    np.testing.assert_allclose(apart, 1e-4 * np.eye(2), rtol=1e-12)
 
 
 def test_glass_with_a_sigma_is_adjusted_and_widens_the_rest() -> None:
@@ -347,8 +363,8 @@ def test_unknown_lenses_are_refused() -> None:
         calibrate_in_air(views, BOARD, SIZES, "fisheye")
 
 
-def test_sharp_pictures_weigh_more_than_dull_ones() -> None:
-    """Half of the pictures three times as noisy: nearly as good as knowing which."""
+def views_of_uneven_noise() -> tuple[list[TargetView], RigidTransform, np.ndarray]:
+    """Half of the pictures three times as noisy: views, poses and noise (V, cameras)."""
     rng = np.random.default_rng(21)
     poses = board_poses(TRUTH, 20, rng)
     clean = views_of(TRUTH, poses, 0.0, rng)
@@ -363,6 +379,32 @@ def test_sharp_pictures_weigh_more_than_dull_ones() -> None:
         )
         for v, view in enumerate(clean)
     ]
+    return views, poses, blur
+
+
+def test_what_views_tell_of_the_water_counts_pictures_as_the_calibration_did() -> None:
+    """A prior as good as the views are said to be halves the variance."""
+    views, _, blur = views_of_uneven_noise()
+    found = calibrate_through_ports(views, BOARD, TRUTH, "free")
+    assert found.blur is not None
+    np.testing.assert_allclose(found.blur * found.noise_px, blur, rtol=0.35)
+    told = held_effect(found, "n_water").sigma
+    alike = held_effect(replace(found, blur=None), "n_water").sigma
+
+    prior = Prior.around(found.rig, dict.fromkeys(of_cameras(TRUTH, ["n_water"]), told))
+    # One step from where it starts: sigmas are those at the calibration itself.
+    both = adjust(
+        views, BOARD, found.rig, found.rig_from_target,
+        Freedom(free=found.freedom.free, prior=prior), at_most=1, blur=found.blur,
+    ).rig  # fmt: skip
+
+    assert both.sigmas["left.n_water"] == pytest.approx(told / np.sqrt(2), rel=0.05)
+    assert alike > 1.15 * told
+
+
+def test_sharp_pictures_weigh_more_than_dull_ones() -> None:
+    """Nearly as good as knowing which they are."""
+    views, poses, blur = views_of_uneven_noise()
     found = calibrate_through_ports(views, BOARD, TRUTH, "held")
     alike = adjust(views, BOARD, TRUTH, poses, found.freedom)
     known = adjust(views, BOARD, TRUTH, poses, found.freedom, blur=blur / np.sqrt(np.mean(blur**2)))
