@@ -10,7 +10,7 @@ from the outer corner of the first pixel, whose centre is (0.5, 0.5).
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -24,6 +24,14 @@ _FORWARD = (0.0, 0.0, 1.0)
 _LENS = ("fx_px", "fy_px", "cx_px", "cy_px", *lens.COEFFICIENTS)
 _PORT = ("port_distance_m", "glass_thickness_m", "n_glass", "n_water")
 _NORMAL = ("normal_x", "normal_y")
+_MOST_PX = 1e7
+_RANGES = (
+    ("port_distance_m", 100.0, " m"),
+    ("glass_thickness_m", 10.0, " m"),
+    ("n_glass", 3.0, ""),
+    ("n_water", 2.0, ""),
+)
+"""Largest value of what describes a port; the wall of a tank may be some metres away."""
 
 PARAMETERS = (*_LENS, *_PORT, *_NORMAL)
 """What can be calibrated, in the order of `FlatPortCamera.project_jacobian`. The unit normal has
@@ -73,10 +81,14 @@ class FlatPortCamera:
                 raise CalibrationError(f"camera: {field.name} = {value} is not finite")
         if min(self.width_px, self.height_px) < 1 or min(self.fx_px, self.fy_px) <= 0:
             raise CalibrationError("camera: width_px, height_px, fx_px and fy_px must be positive")
-        if min(self.port_distance_m, self.glass_thickness_m) < 0:
-            raise CalibrationError("camera: port_distance_m and glass_thickness_m must be >= 0")
-        if min(self.n_glass, self.n_water) < 1:
-            raise CalibrationError("camera: n_glass and n_water must be 1 or more")
+        if max(self.width_px, self.height_px, self.fx_px, self.fy_px) > _MOST_PX:
+            raise CalibrationError(f"camera: a size or focal length exceeds {_MOST_PX:g} px")
+        for name, most, unit in _RANGES:
+            least, given = 1.0 if unit == "" else 0.0, getattr(self, name)
+            if not least <= given <= most:
+                raise CalibrationError(
+                    f"camera: {name} = {given:g}: {least:g} to {most:g}{unit} allowed"
+                )
         if abs(math.hypot(*self.normal) - 1) > 1e-6 or self.normal[2] <= 0:
             raise CalibrationError(f"camera: normal {self.normal} is no unit vector facing forward")
 
@@ -220,10 +232,36 @@ def camera_from_json(data: dict[str, Any]) -> FlatPortCamera:
     Raises:
         CalibrationError: a key is missing or unknown, or a value is out of range.
     """
-    try:
-        return FlatPortCamera(**(data | {"normal": tuple(data.get("normal", _FORWARD))}))
-    except TypeError as error:
-        raise CalibrationError(f"camera: {error}") from None
+    known = {field.name: field.default for field in fields(FlatPortCamera)}
+    missing = [name for name, default in known.items() if default is MISSING and name not in data]
+    unknown = [name for name in data if name not in known]
+    if missing or unknown:
+        what = f"lacks {', '.join(missing)}" if missing else f"{', '.join(unknown)} is unknown"
+        raise CalibrationError(f"camera: {what}")
+    for name, value in data.items():
+        if name == "normal":
+            numbers(value, 3, "camera: normal")
+        elif isinstance(value, bool) or not isinstance(value, int | float):
+            raise CalibrationError(f"camera: {name} = {value!r} is no number")
+    for name in ("width_px", "height_px"):
+        if not float(data[name]).is_integer():
+            raise CalibrationError(f"camera: {name} = {data[name]:g} is no whole number")
+    return FlatPortCamera(**(data | {"normal": tuple(data.get("normal", _FORWARD))}))
+
+
+def numbers(value: Any, count: int, what: str) -> Array:
+    """A list of so many finite numbers of a JSON file.
+
+    Raises:
+        CalibrationError: it is none; `what` says where it stands.
+    """
+    plain = isinstance(value, list | tuple) and all(
+        isinstance(one, int | float) and not isinstance(one, bool) and math.isfinite(one)
+        for one in value
+    )
+    if not plain or len(value) != count:
+        raise CalibrationError(f"{what} = {value!r:.60}: {count} finite numbers wanted")
+    return np.array(value, dtype=np.float64)
 
 
 def pose_jacobian(by_point: Array, points_cam: Array) -> Array:

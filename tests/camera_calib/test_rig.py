@@ -172,3 +172,51 @@ def test_every_camera_needs_a_pose(rig: Rig) -> None:
         replace(rig, cam_from_rig={"left": RigidTransform.identity()})
     with pytest.raises(CalibrationError, match="pose"):
         replace(rig, cameras={}, cam_from_rig={})
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "words"),
+    [
+        (("cameras", "left", "fx_px"), "3387.5", "left: fx_px = '3387.5' is no number"),
+        (("cameras", "left", "fx_px"), True, "left: fx_px = True is no number"),
+        (("cameras", "left", "fx_px"), float("nan"), "left: fx_px = nan is not finite"),
+        (("cameras", "left", "fx_px"), 1e300, "exceeds 1e+07 px"),
+        (("cameras", "left", "width_px"), 640.5, "width_px = 640.5 is no whole number"),
+        (("cameras", "left", "n_water"), 5, "n_water = 5: 1 to 2 allowed"),
+        (("cameras", "left", "glass_thickness_m"), 1e9, "0 to 10 m allowed"),
+        (("cameras", "left", "normal"), [0.0, 1.0], "3 finite numbers wanted"),
+        (("cameras", "left", "normal"), [0.0, 0.0, 1.0, 0.0], "3 finite numbers wanted"),
+        (("cameras", "right", "cam_from_rig"), 5, "right: cam_from_rig is no object"),
+        (("cameras", "right", "cam_from_rig", "translation_m"), [0, 0, float("nan")], "right"),
+        (("cameras", "right", "cam_from_rig", "quaternion_xyzw"), [[0, 0, 0, 1]], "4 finite"),
+        (("cameras",), [], "cameras is no object"),
+        (("version",), 1, "of version 1; this program reads version 2"),
+        (("covariance", "matrix"), [[0.1, 0.0], [0.0]], "row of left.k1"),
+        (("covariance", "parameters"), ["left.fx_px"], "as many rows"),
+    ],
+)
+def test_a_wrong_value_of_a_rig_file_is_named(
+    place: tuple[str, ...], value: object, words: str, tmp_path: Path, rig: Rig
+) -> None:
+    path = tmp_path / "rig.json"
+    write_rig(path, calibrated(rig))
+    data = json.loads(path.read_text())
+    inner = data
+    for key in place[:-1]:
+        inner = inner[key]
+    inner[place[-1]] = value
+    path.write_text(json.dumps(data))
+
+    with pytest.raises(CalibrationError) as error:
+        read_rig(path)
+
+    assert str(error.value).startswith(f"{path}: ")
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_rig_file_saved_with_a_byte_order_mark_is_read(tmp_path: Path, rig: Rig) -> None:
+    write_rig(tmp_path / "rig.json", rig)
+    text = (tmp_path / "rig.json").read_text(encoding="utf-8")
+    (tmp_path / "rig.json").write_text(text, encoding="utf-8-sig")
+    assert read_rig(tmp_path / "rig.json").cameras == rig.cameras
