@@ -389,3 +389,8 @@ def main() -> None:
     except AliceError as error:
         typer.echo(f"error: {error}", err=True)
         raise SystemExit(1) from error
+    except OSError as error:  # a full disk, a folder where a file should be, no permission
+        where = error.filename2 or error.filename
+        text = error.strerror or str(error)
+        typer.echo(f"error: {text}" if where is None else f"error: {where}: {text}", err=True)
+        raise SystemExit(1) from error

@@ -122,6 +122,28 @@ def test_init_never_overwrites(
 
 
 @pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["target", "chessboard 9x6 25mm", "-o", "FILE/b.pdf"], "FILE: File exists"),
+        (["target", "chessboard 9x6 25mm", "-o", "FOLDER/d.pdf"], "d.pdf: Is a directory"),
+        (["fov", "--rig", "FOLDER"], "FOLDER: Is a directory"),
+    ],
+)
+def test_what_the_file_system_refuses_is_one_line(
+    arguments: list[str],
+    said: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (tmp_path / "FILE").write_text("a file")
+    (tmp_path / "FOLDER" / "d.pdf").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    assert said in fails(arguments, capsys, monkeypatch)
+    assert (tmp_path / "FILE").read_text() == "a file"
+
+
+@pytest.mark.parametrize(
     ("text", "said"),
     [
         (
