@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from alice_survey.errors import CalibrationError, warn
+from alice_survey.errors import CalibrationError
 from alice_survey.executor import parallel_map
 from camera_calib.calibration.picture_sets import PictureSet
 from camera_calib.calibration.result import Rejection, TargetView
@@ -37,7 +37,7 @@ class Detections:
 class _Seen:
     size: Size | None
     """None where the picture cannot be decoded."""
-    detection: Detection | None
+    detection: Detection
     board: Size | None = None
     """Corners along the longer and the shorter side of the chessboard, where it was looked at."""
 
@@ -64,12 +64,7 @@ def detect_views(sets: Sequence[PictureSet], target: Target, threads: int) -> De
     cameras = list(dict.fromkeys(camera for one in sets for camera in one.paths))
     rejections: list[Rejection] = []
     for (view, camera), what in seen.items():
-        if what.detection is None:
-            warn(f"{paths[view, camera]} cannot be decoded; left out")
-            reason = "the picture cannot be decoded"
-            rejections.append(Rejection(view=view, camera=camera, points=0, reason=reason))
-        else:
-            rejections += what.detection.rejections(view, camera)
+        rejections += what.detection.rejections(view, camera)
     _check_board(target, list(seen.values()))
     sizes = {camera: _one_size(camera, seen, paths) for camera in cameras}
     for camera in cameras:
@@ -78,9 +73,9 @@ def detect_views(sets: Sequence[PictureSet], target: Target, threads: int) -> De
     for one in sets:
         pixels = {}
         for camera in one.paths:
-            detection = seen[one.name, camera].detection
-            if detection is not None and detection.pixels is not None:
-                pixels[camera] = detection.pixels
+            points = seen[one.name, camera].detection.pixels
+            if points is not None:
+                pixels[camera] = points
         if pixels:
             views.append(TargetView(name=one.name, pixels=pixels))
     return Detections(views=tuple(views), sizes=sizes, rejections=tuple(rejections))
@@ -93,11 +88,17 @@ def _checked(count: int) -> set[int]:
 
 def _look(job: tuple[Path, Target, bool]) -> _Seen:
     path, target, check = job
+    if _is_cut_short(path):
+        return _Seen(size=None, detection=Detection(pixels=None, refused="the file is cut short"))
     picture = cv2.imread(str(path), _READ)
     if picture is None:
-        return _Seen(size=None, detection=None)
+        reason = f"{path.name} cannot be decoded as a picture"
+        return _Seen(size=None, detection=Detection(pixels=None, refused=reason))
     height, width = map(int, picture.shape[:2])
-    detection = detect_with_reasons(target, picture)
+    try:
+        detection = detect_with_reasons(target, picture)
+    except CalibrationError as error:
+        detection = Detection(pixels=None, refused=str(error))
     board = None
     if check and target.kind == "chessboard" and detection.pixels is not None:
         grey = picture if picture.dtype == np.uint8 else (picture >> 8).astype(np.uint8)
@@ -105,12 +106,26 @@ def _look(job: tuple[Path, Target, bool]) -> _Seen:
     return _Seen(size=(width, height), detection=detection, board=board)
 
 
+def _is_cut_short(path: Path) -> bool:
+    """Whether a JPEG's data end before its picture does; OpenCV would fill the rest with grey.
+
+    Coded data hold no markers (ITU T.81, B.1.1.5), so that the end of the image must be among what
+    follows the last start of a scan.
+    """
+    if path.suffix.lower() not in (".jpg", ".jpeg") or not path.is_file():
+        return False
+    data = path.read_bytes()
+    scan = data.rfind(b"\xff\xda")
+    return data.startswith(b"\xff\xd8") and scan >= 0 and data.find(b"\xff\xd9", scan) < 0
+
+
 def _one_size(
     camera: str, seen: Mapping[tuple[str, str], _Seen], paths: Mapping[tuple[str, str], Path]
 ) -> Size:
     sizes = {key: what.size for key, what in seen.items() if key[1] == camera and what.size}
     if not sizes:
-        raise CalibrationError(f"none of the pictures of {camera} can be decoded")
+        first = next(what.detection.refused for key, what in seen.items() if key[1] == camera)
+        raise CalibrationError(f"none of the pictures of {camera} can be read: {first}")
     counts = Counter(sizes.values()).most_common()
     if len(counts) > 1:
         (common, many), (other, few) = counts[:2]
@@ -137,7 +152,7 @@ def _check_board(target: Target, seen: Sequence[_Seen]) -> None:
 
 
 def _check_found(camera: str, target: Target, seen: Sequence[_Seen]) -> None:
-    looked = [what.detection for what in seen if what.detection is not None]
+    looked = [what.detection for what in seen if what.size is not None]
     if any(detection.pixels is not None for detection in looked):
         return
     reasons = Counter(str(detection.refused) for detection in looked).most_common(1)

@@ -162,7 +162,7 @@ class Problem:
             use = self.seen[v, c] & (weights[v, c] > 0)
             rows *= np.sqrt(weights[v, c])[..., None, None]
             rows[~use] = 0.0
-            rows = rows.reshape(len(v), -1, rows.shape[-1])
+            rows = rows.reshape(len(v), 2 * len(self.points), rows.shape[-1])
             square = rows.transpose(0, 2, 1) @ rows
             at = np.concatenate([self.lens_at[c], self.pose_at[c]])
             p = len(at)

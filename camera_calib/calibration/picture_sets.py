@@ -74,6 +74,9 @@ def pair_pictures(lists: Mapping[str, Sequence[Path]]) -> list[PictureSet]:
             f"pictures do not pair: {described}: name those of one moment with one number, or "
             "give lists of the same length"
         )
+    if all(numbered.values()):
+        names = ", ".join(f"{paths[0].name} of {camera}" for camera, paths in lists.items())
+        warn(f"numbers in the names differ: pictures are paired by their order, first {names}")
     sets = zip(*lists.values(), strict=True)
     return [
         PictureSet(name=paths[0].stem, paths=dict(zip(lists, paths, strict=True))) for paths in sets

@@ -1,6 +1,7 @@
 """How figures of a calibration report look: style, and parts that several of them share."""
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from io import BytesIO
 from typing import Any
@@ -69,7 +70,9 @@ def png(height: float, draw: Draw, width: float = WIDTH) -> bytes:
         FigureCanvasAgg(figure)
         draw(figure)
         file = BytesIO()
-        figure.savefig(file, format="png", dpi=_DPI, metadata={"Software": None})
+        with warnings.catch_warnings():  # a picture's name may have letters that the font lacks
+            warnings.filterwarnings("ignore", message="Glyph")
+            figure.savefig(file, format="png", dpi=_DPI, metadata={"Software": None})
     return file.getvalue()
 
 

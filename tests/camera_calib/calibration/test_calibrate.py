@@ -413,3 +413,13 @@ def test_sharp_pictures_weigh_more_than_dull_ones() -> None:
         assert sigma == pytest.approx(known.rig.sigmas[name], rel=0.1)
     assert found.noise_px == pytest.approx(np.sqrt(np.mean(blur**2)), rel=0.1)
     assert found.rejections == ()
+
+
+@pytest.mark.parametrize("blind", ["left", "right"])
+def test_a_view_of_one_camera_of_two_is_located(blind: str) -> None:
+    rng = np.random.default_rng(8)
+    poses = board_poses(TRUTH, 1, rng)
+    view = with_pixels(views_of(TRUTH, poses, 0.0, rng)[0], blind, None)
+    apart = locate(TRUTH, view, BOARD).inv() * poses[0]
+    assert np.linalg.norm(apart.translation) < 1e-6
+    assert apart.rotation.magnitude() < 1e-6

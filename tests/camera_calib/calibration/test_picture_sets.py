@@ -70,3 +70,12 @@ def test_pictures_are_found_in_folders_and_by_patterns(
     monkeypatch.chdir(tmp_path.parent)
     assert len(find_pictures(f"{tmp_path.name}/left*")) == 2
     assert len(find_pictures(f"{tmp_path.name[:-1]}?/left*")) == 2
+
+
+def test_pairs_by_order_of_pictures_with_other_numbers_are_told(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    pair_pictures({"left": paths("a1.png", "a2.png"), "right": paths("b51.png", "b52.png")})
+    shown = capsys.readouterr().err
+    assert "paired by their order, first a1.png of left, b51.png of right" in shown
+    assert len(shown.splitlines()) == 1

@@ -13,6 +13,8 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.errors import AliceError, CalibrationError
 from alice_survey.seafloor.board import PoolBoard, board_records, pool_poses, render_board
+from camera_calib.calibration.detect_views import detect_views
+from camera_calib.calibration.picture_sets import find_pictures, pair_pictures
 from camera_calib.calibration.pictures import (
     PictureCalibration,
     calibrate_command,
@@ -20,6 +22,7 @@ from camera_calib.calibration.pictures import (
     carried,
 )
 from camera_calib.rig import Rig, read_rig, write_rig
+from camera_calib.targets.target import parse_target
 from tests.camera_calib.calibration_scenes import built_rig, in_air
 
 BOARD = "chessboard 9x6 1m"
@@ -204,6 +207,27 @@ def test_corrupt_pictures_and_pictures_without_the_board_are_left_out(
     whole = {(r["view"], r["camera"]) for r in found["rejections"] if r["points"] == 0}
     assert whole == {("03", "left"), ("05", "right")}
     assert found["views"] == 12
+
+
+def test_pictures_that_are_cut_short_or_of_another_kind_are_named(
+    dry: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for view in range(3):
+        picture = cv2.imread(str(dry / "left" / f"{view:02d}.png"))
+        cv2.imwrite(str(folder / f"{view}.jpg"), picture)
+    whole = (folder / "1.jpg").read_bytes()
+    (folder / "1.jpg").write_bytes(whole[: len(whole) * 2 // 3])
+    cv2.imwrite(str(folder / "3.tif"), np.zeros((451, 564), dtype=np.float32))
+    sets = pair_pictures({"camera": find_pictures(str(folder))})
+
+    found = detect_views(sets, parse_target(POOL_BOARD), threads=1)
+
+    assert [view.name for view in found.views] == ["0", "2"]
+    reasons = {r.view: r.reason for r in found.rejections if not r.points}
+    assert reasons["1"] == "the file is cut short"
+    assert "float32" in reasons["3"]
 
 
 def refuses(settings: PictureCalibration, tmp_path: Path) -> str:
