@@ -67,9 +67,7 @@ def held_effect(calibration: Calibration, name: str) -> HeldEffect:
     wider = Freedom(free=(*freedom.free, *held), prior=freedom.prior)
     pixels = stack_views(calibration.views, rig, len(calibration.target_points))
     problem = Problem(pixels, calibration.target_points, rig, wider)
-    blur = np.ones(pixels.shape[:2]) if calibration.blur is None else calibration.blur
-    noise_px = calibration.noise_px * blur[..., None]
-    weights = np.where(problem.seen, noise_px**-2.0, 0.0)
+    weights = np.where(problem.seen, calibration.sigma_px[..., None] ** -2.0, 0.0)
     state = problem.state(rig, calibration.rig_from_target)
     information = problem.information(problem.equations(state, weights))
     adjusted = freedom.names(rig)

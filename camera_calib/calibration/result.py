@@ -50,7 +50,8 @@ class Calibration:
     weights: Array
     """(V, cameras, N) robust weights, 1 for a point that fits; NaN where unseen."""
     noise_px: float
-    """Standard deviation of one coordinate of a measured point, from the residuals."""
+    """Standard deviation of one coordinate of a measured point in all pictures, from the
+    residuals."""
     rejections: tuple[Rejection, ...] = ()
     warnings: tuple[str, ...] = ()
     """What the views do not constrain, one line each."""
@@ -68,6 +69,12 @@ class Calibration:
                 f"calibration: residuals {self.residuals_px.shape}, weights {self.weights.shape}; "
                 f"{shape} wanted"
             )
+
+    @property
+    def sigma_px(self) -> Array:
+        """(V, cameras) standard deviation of one coordinate in each picture."""
+        alike: Array = np.full(self.residuals_px.shape[:2], self.noise_px)
+        return alike if self.blur is None else alike * self.blur
 
     @property
     def rms_px(self) -> float:

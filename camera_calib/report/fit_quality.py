@@ -23,14 +23,14 @@ TILTED_DEG = 15.0
 CORNERS = ("top left", "top right", "bottom left", "bottom right")
 
 
-def within_gate(residuals_px: Array, noise_px: float) -> NDArray[np.bool_]:
-    """Which residuals (..., 2) are known and no outliers."""
+def within_gate(residuals_px: Array, noise_px: Array | float) -> NDArray[np.bool_]:
+    """Which residuals (..., 2) are known and no outliers, by the noise (...) of a coordinate."""
     squared = (residuals_px**2).sum(axis=-1)
     known: NDArray[np.bool_] = squared <= (GATE_SIGMAS * noise_px) ** 2
     return known
 
 
-def rms_length_px(residuals_px: Array, noise_px: float) -> float:
+def rms_length_px(residuals_px: Array, noise_px: Array | float) -> float:
     """Root mean square length of the residuals (..., 2) that are no outliers; NaN for none."""
     kept = residuals_px[within_gate(residuals_px, noise_px)]
     return float(np.sqrt((kept**2).sum(axis=-1).mean())) if len(kept) else float("nan")
@@ -68,7 +68,7 @@ class PictureFit:
 
 def picture_fits(calibration: Calibration) -> list[PictureFit]:
     """All pictures, view by view, cameras in the rig's order."""
-    rows = []
+    rows, noise_px = [], calibration.sigma_px
     for v, view in enumerate(calibration.views):
         for c, camera in enumerate(calibration.rig.cameras):
             residuals = calibration.residuals_px[v, c]
@@ -85,7 +85,7 @@ def picture_fits(calibration: Calibration) -> list[PictureFit]:
                     points=int(seen.sum()),
                     rms_px=float(np.sqrt((lengths[seen] ** 2).mean())),
                     worst_px=float(lengths[seen].max()),
-                    outliers=int((lengths[seen] > GATE_SIGMAS * calibration.noise_px).sum()),
+                    outliers=int((lengths[seen] > GATE_SIGMAS * noise_px[v, c]).sum()),
                     range_m=float(pose.apply(calibration.target_points[seen])[:, 2].mean()),
                     tilt_deg=float(np.degrees(np.arccos(min(along_axis, 1.0)))),
                 )
@@ -101,6 +101,8 @@ class CameraResiduals:
     """(N, 2) as measured."""
     residuals_px: Array
     """(N, 2) projected less measured."""
+    sigma_px: Array
+    """(N,) expected standard deviation of a coordinate: the noise of the point's picture."""
     view: NDArray[np.intp]
     """(N,) number of the view."""
     radius_px: Array
@@ -121,12 +123,14 @@ def camera_residuals(calibration: Calibration, camera: str) -> CameraResiduals:
     """The points of one camera, without outliers."""
     index = list(calibration.rig.cameras).index(camera)
     residuals = calibration.residuals_px[:, index]
-    kept = within_gate(residuals, calibration.noise_px)
+    sigma_px = np.repeat(calibration.sigma_px[:, index, None], residuals.shape[1], axis=1)
+    kept = within_gate(residuals, sigma_px)
     measured = seen_pixels(calibration.views, camera, residuals.shape[1])[kept]
     model = calibration.rig.cameras[camera]
     return CameraResiduals(
         pixels=measured,
         residuals_px=residuals[kept],
+        sigma_px=sigma_px[kept],
         view=np.nonzero(kept)[0],
         radius_px=radius_px(model, measured),
         incidence_deg=incidence_deg(model, measured),
@@ -234,12 +238,11 @@ def largest_radius_px(camera: FlatPortCamera) -> float:
     return float(radius_px(camera, camera.border(1)).max())
 
 
-def residual_profiles(camera: FlatPortCamera, seen: CameraResiduals, noise_px: float) -> "Profiles":
+def residual_profiles(camera: FlatPortCamera, seen: CameraResiduals) -> "Profiles":
     """Residuals against the radius and against the angle at the port."""
-    sigma = np.full(len(seen.radius_px), noise_px)
     corner_deg = incidence_deg(camera, camera.border(1))
     steepest = float(np.nanmax(np.append(corner_deg, seen.incidence_deg)))
-    by = (seen.residuals_px, seen.outward_px, sigma)
+    by = (seen.residuals_px, seen.outward_px, seen.sigma_px)
     return Profiles(
         radius=profile(seen.radius_px, *by, largest_radius_px(camera)),
         incidence=profile(seen.incidence_deg, *by, steepest),

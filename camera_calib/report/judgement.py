@@ -166,7 +166,7 @@ def judge(
             calibration.rig_from_target,
             calibration.residuals_px,
             calibration.target_points,
-            calibration.noise_px,
+            calibration.sigma_px,
         )
         points = overlap_points(rig, range_m)
         stereo_map = StereoMap(
@@ -241,7 +241,7 @@ def _camera(
     coarse, compensating = pixels[::2, ::2], compensation(rig, name, anchors)
     return CameraJudgement(
         seen=seen,
-        profiles=residual_profiles(model, seen, calibration.noise_px),
+        profiles=residual_profiles(model, seen),
         coverage=coverage(model, seen.pixels),
         spread=spread(rig, name, calibration),
         homography=homography_test(calibration, name),

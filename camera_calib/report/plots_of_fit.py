@@ -168,17 +168,17 @@ def plot_profiles(judged: Judgement) -> bytes:
 
 
 def plot_histogram(judged: Judgement) -> bytes:
-    """Residuals in units of the noise against the normal law."""
+    """Residuals in units of their pictures' noise against the normal law."""
 
     def draw(figure: Figure) -> None:
-        noise = judged.calibration.noise_px
+        sigma_px = judged.calibration.sigma_px[..., None, None]
         edges = np.linspace(-6, 6, 61)
         middle = (edges[1:] + edges[:-1]) / 2
         normal = np.exp(-0.5 * middle**2) / np.sqrt(2 * np.pi)
         for c, (axes, name) in enumerate(
             zip(axes_grid(figure, len(judged.cameras))[0], judged.cameras, strict=True)
         ):
-            every = judged.calibration.residuals_px[:, c] / noise
+            every = judged.calibration.residuals_px[:, c] / sigma_px[:, c]
             values = every[np.isfinite(every)]
             inside = values[np.abs(values) < edges[-1]]
             axes.hist(

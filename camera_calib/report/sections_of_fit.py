@@ -70,8 +70,8 @@ def residuals_section(judged: Judgement) -> Section:
         title="Residuals",
         text=(
             "A residual is where the model sees a point less where it was measured. Means and "
-            f"profiles leave out outliers (longer than {GATE_SIGMAS:g} times the noise of "
-            f"{noise:.3f} px); bars and histogram do not.",
+            f"profiles leave out outliers (longer than {GATE_SIGMAS:g} times the noise, of "
+            f"{noise:.3f} px unless a picture has its own); bars and histogram do not.",
         ),
         figures=[
             Figure(

@@ -168,7 +168,7 @@ def score_hold_out(held: HeldOut) -> HoldOutScore:
         points=points,
         rms_px=rms_length_px(held.residuals_px, noise_px),
         expected_px=float(np.sqrt(expected / points)) if points else float("nan"),
-        used_rms_px=rms_length_px(held.used.residuals_px, noise_px),
+        used_rms_px=rms_length_px(held.used.residuals_px, held.used.sigma_px[..., None]),
         outliers=int(np.isfinite(held.residuals_px[..., 0]).sum()) - points,
     )
 
@@ -321,7 +321,7 @@ def length_errors(
     rig_from_target: RigidTransform,
     residuals_px: Array,
     target_points: Array,
-    noise_px: float,
+    noise_px: Array | float,
 ) -> LengthErrors:
     """Triangulate what two or more cameras saw of each view and compare lengths with the target's.
 
@@ -335,9 +335,10 @@ def length_errors(
         rig_from_target: (V,) its poses; they only tell the directions of the lengths.
         residuals_px: (V, cameras, N, 2); outliers among them take no part.
         target_points: (N, 3).
-        noise_px: standard deviation of one coordinate.
+        noise_px: standard deviation of one coordinate, of all or of each picture (V, cameras).
     """
     near = neighbours(target_points)
+    sigma_px = np.broadcast_to(noise_px, (len(views), len(rig.cameras)))
     poses = [rig.cam_from_rig[camera] for camera in rig.cameras]
     back = rig.cam_from_rig[rig.reference]
     parts: list[tuple[Array, ...]] = []
@@ -346,8 +347,8 @@ def length_errors(
         for c, camera in enumerate(rig.cameras):
             if camera in view.pixels:
                 pixels[c] = view.pixels[camera]
-        pixels[~within_gate(residuals_px[v], noise_px)] = np.nan
-        found = triangulate(list(rig.cameras.values()), poses, pixels, noise_px)
+        pixels[~within_gate(residuals_px[v], sigma_px[v, :, None])] = np.nan
+        found = triangulate(list(rig.cameras.values()), poses, pixels, sigma_px[v].tolist())
         seen = np.nonzero(np.isfinite(found.points_world).all(axis=1))[0]
         if len(seen) < 2:
             continue

@@ -66,7 +66,7 @@ def test_residuals_of_a_sound_calibration_are_noise_everywhere() -> None:
     found = usual()
     for name, camera in found.rig.cameras.items():
         seen = camera_residuals(found, name)
-        profiles = residual_profiles(camera, seen, found.noise_px)
+        profiles = residual_profiles(camera, seen)
         for by in (profiles.radius, profiles.incidence):
             known = by.count >= 30
             chance = found.noise_px / np.sqrt(by.count[known])
@@ -92,6 +92,23 @@ def test_outliers_are_counted_and_set_aside() -> None:
     assert rms_length_px(spoiled, found.noise_px) == pytest.approx(
         rms_length_px(found.residuals_px, found.noise_px), rel=0.01
     )
+
+
+def test_points_of_a_dull_picture_are_judged_by_its_own_noise() -> None:
+    found = usual()
+    blur = np.ones(found.residuals_px.shape[:2])
+    blur[3, 1] = 4.0
+    dull = replace(found, residuals_px=found.residuals_px * blur[..., None, None])
+    told = replace(dull, blur=blur)
+
+    assert max(picture.outliers for picture in picture_fits(dull)) > 5
+    assert max(picture.outliers for picture in picture_fits(told)) == 0
+    camera, seen = found.rig.cameras["right"], camera_residuals(told, "right")
+    np.testing.assert_allclose(seen.sigma_px[seen.view == 3], 4.0 * found.noise_px)
+    np.testing.assert_allclose(seen.sigma_px[seen.view != 3], found.noise_px)
+    by = residual_profiles(camera, seen).radius
+    known = by.count >= 30
+    np.testing.assert_allclose(by.rms_px[known], by.expected_px[known], rtol=0.35)
 
 
 def test_pictures_tell_their_distance_and_tilt() -> None:

@@ -197,6 +197,23 @@ def test_lengths_err_as_their_noise() -> None:
     assert np.std(scaled) == pytest.approx(1.0, abs=0.2)
 
 
+def test_lengths_in_dull_pictures_err_as_their_noise() -> None:
+    """Every second view three times as noisy."""
+    rig, made = true_rig(), synthetic_views(true_rig(), 16, 0.0, 4)
+    rng, noise_px = np.random.default_rng(8), np.tile([[0.05, 0.05], [0.15, 0.15]], (8, 1))
+    views, misses = [], np.full((16, 2, len(made.points), 2), np.nan)
+    for v, view in enumerate(made.views):
+        pixels = {}
+        for c, (name, seen) in enumerate(view.pixels.items()):
+            pixels[name] = seen + rng.normal(0.0, noise_px[v, c], seen.shape)
+            misses[v, c] = seen - pixels[name]
+        views.append(replace(view, pixels=pixels))
+    found = length_errors(rig, views, made.rig_from_target, misses, made.points, noise_px)
+    scores = (found.error_m - found.bias_m) / found.sigma_m
+    for odd in (0, 1):
+        assert np.std(scores[found.view % 2 == odd]) == pytest.approx(1.0, abs=0.1)
+
+
 def test_a_wrong_baseline_is_a_wrong_scale() -> None:
     found = usual()
     longer = moved_rig(found.rig, {"right.x_m": -0.001 * 0.1001})
