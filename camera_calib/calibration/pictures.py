@@ -1,12 +1,15 @@
 """Calibrate from pictures of a target: `alice-survey calibrate --left ... --right ...`."""
 
+import contextlib
+import shlex
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from alice_survey.errors import CalibrationError, WorkspaceError
+from alice_survey.artefacts import read_json
+from alice_survey.errors import CalibrationError, WorkspaceError, warn
 from alice_survey.executor import default_threads
 from camera_calib.calibration.calibrate import (
     Intrinsics,
@@ -22,12 +25,17 @@ from camera_calib.calibration.freedom import intrinsics
 from camera_calib.calibration.numbering import same_numbering
 from camera_calib.calibration.picture_sets import find_pictures, pair_pictures
 from camera_calib.calibration.result import Calibration
+from camera_calib.calibration.told import calibration_text
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.rig import Rig, read_rig, write_rig
 from camera_calib.targets.target import Target, parse_target
 
 ONE_CAMERA = "camera"
 """Name of the camera of `--pictures`."""
+_WRITTEN = (
+    "rig.json", "rig_carried.json", "calibration.json", "corners.csv", "report.html", "report.json",
+)  # fmt: skip
+"""By this command; a folder with other files is not replaced."""
 _GUESSED_PORT_M = 0.02
 _FRESH_WATER, _GLASS = 1.34, 1.52
 
@@ -109,28 +117,22 @@ def calibrate_pictures(
     Raises:
         CalibrationError: the pictures, the target or the settings do not give a calibration.
     """
-    if output.exists() and not (output / "calibration.json").is_file() and any(output.iterdir()):
-        raise WorkspaceError(f"{output} holds other files: choose another folder with -o")
+    _check_output(output, settings.start)
     target = parse_target(settings.target)
     intrinsics(settings.lens)
     start = None if settings.start is None else read_rig(settings.start)
     _check_settings(settings, start)
     lists = {camera: find_pictures(place) for camera, place in settings.pictures.items()}
-    found = detect_views(pair_pictures(lists), target, threads)
-    tell(found)
-    calibration = _calibrated(settings, found, target, start)
-    partial = output.with_name(f"{output.name}.partial")
-    if partial.exists():
-        shutil.rmtree(partial)
-    partial.mkdir(parents=True)
-    calibration = finish(partial, calibration, found)
-    if settings.carry_to_n is not None:
-        write_rig(partial / "rig_carried.json", carried(calibration.rig, settings.carry_to_n))
-    if output.exists():
-        shutil.rmtree(output)
-    partial.rename(output)
-    data = summary(calibration)
-    return _text(calibration, output, settings), data
+    with _replacing(output) as partial:
+        found = detect_views(pair_pictures(lists), target, threads)
+        tell(found)
+        calibration = finish(partial, _calibrated(settings, found, target, start), found)
+        _check_sides(calibration.rig)
+        if settings.carry_to_n is not None:
+            write_rig(partial / "rig_carried.json", carried(calibration.rig, settings.carry_to_n))
+    verdicts = read_json(output / "report.json")["verdicts"]
+    text = calibration_text(calibration, target, verdicts)
+    return "\n".join([text, *_next(calibration, output, settings)]), summary(calibration)
 
 
 def carried(rig: Rig, n_water: float) -> Rig:
@@ -275,20 +277,71 @@ def _matching(start: Rig, sizes: Mapping[str, Size]) -> Rig:
     )
 
 
-def _text(calibration: Calibration, output: Path, settings: PictureCalibration) -> str:
-    rig, square = calibration.rig, (calibration.residuals_px**2).sum(axis=-1)
-    points = int((square == square).sum())
-    rows = [
-        f"{len(calibration.views)} views, {points} points, {calibration.rms_px:.3f} px rms "
-        f"(noise {calibration.noise_px:.3f} px); {len(calibration.warnings)} warnings",
-    ]
-    if len(rig.cameras) > 1:
-        rows.append(f"baseline {rig.baseline_m:.6g} m")
-    for name, sigma in rig.sigmas.items():
-        if name.endswith(("fx_px", "port_distance_m", "normal_x", "normal_y")):
-            camera, field = name.split(".")
-            rows.append(f"{name:24} {rig.cameras[camera].parameter(field):12.6g} +- {sigma:.2g}")
-    rows.append(f"rig in {output / 'rig.json'}; report in {output / 'report.html'}")
+def _next(calibration: Calibration, output: Path, settings: PictureCalibration) -> list[str]:
+    """Where the results are, and what to do with them."""
+    rig = shlex.quote(str(output / "rig.json"))
+    lines = [f"rig in {output / 'rig.json'}; read {output / 'report.html'}"]
     if settings.carry_to_n is not None:
-        rows.append(f"in water of index {settings.carry_to_n:g}: {output / 'rig_carried.json'}")
-    return "\n".join(rows)
+        lines.append(f"in water of index {settings.carry_to_n:g}: {output / 'rig_carried.json'}")
+    if settings.water:
+        lines.append(f"next: alice-survey camera uncertainty {rig}")
+    else:
+        places = "--pictures P" if ONE_CAMERA in calibration.rig.cameras else "--left L --right R"
+        lines.append(
+            f"next, behind ports, with pictures under water: alice-survey calibrate {places} "
+            f"--target T --water --glass MM --start {rig} -o DIR"
+        )
+    return lines
+
+
+def _check_sides(rig: Rig) -> None:
+    """Tell when the pictures of the two cameras seem to be swapped."""
+    if set(rig.cameras) != {"left", "right"}:
+        return
+    x, y, z = (1e3 * rig.cam_from_rig["right"].inv().translation).tolist()
+    if x < -max(abs(y), abs(z)):
+        warn(
+            f"the right camera stands {-x:.0f} mm to the left of the left one: swap --left and "
+            "--right, unless the cameras hang upside down"
+        )
+
+
+def _check_output(output: Path, start: Path | None) -> None:
+    """Refuse what is no folder of this command, before hours of work and not after.
+
+    Raises:
+        WorkspaceError: it cannot be written or would take something with it.
+    """
+    if not output.name or output.name == "..":
+        raise WorkspaceError(f"-o {output}: name a folder of its own, such as -o air")
+    if not output.exists():
+        return
+    if not output.is_dir():
+        raise WorkspaceError(f"{output} is a file: name a folder with -o")
+    others = sorted(path.name for path in output.iterdir() if path.name not in _WRITTEN)
+    if others:
+        raise WorkspaceError(
+            f"{output} holds other files (such as {others[0]}): choose another folder with -o"
+        )
+    if start is not None and start.resolve().parent == output.resolve():
+        raise WorkspaceError(
+            f"{output} holds the rig of --start, which would be replaced: choose another folder "
+            "with -o"
+        )
+
+
+@contextlib.contextmanager
+def _replacing(output: Path) -> Iterator[Path]:
+    """A folder to write to that takes the place of `output` when all went well."""
+    partial = output.with_name(f"{output.name}.partial")
+    if partial.exists():
+        shutil.rmtree(partial)
+    partial.mkdir(parents=True)
+    try:
+        yield partial
+        if output.exists():
+            shutil.rmtree(output)
+        partial.rename(output)
+    finally:
+        if partial.exists():
+            shutil.rmtree(partial)

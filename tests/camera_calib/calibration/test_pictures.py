@@ -143,8 +143,12 @@ def test_opencv_agrees_on_the_real_set(real: tuple[Path, str, Any]) -> None:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No report, whose plots take seconds."""
-    monkeypatch.setattr("camera_calib.calibration.files.write_report", lambda *_: None)
+    """A report without plots, which take seconds."""
+
+    def without_plots(folder: Path, *_: object) -> None:
+        (folder / "report.json").write_text('{"verdicts": []}')
+
+    monkeypatch.setattr("camera_calib.calibration.files.write_report", without_plots)
 
 
 @pytest.mark.usefixtures("quick")
@@ -158,7 +162,8 @@ def test_from_dry_pictures_to_the_sea(dry: Path, wet: Path, truth: Rig, tmp_path
     )  # fmt: skip
     text, found = calibrate_pictures(pool, tmp_path / "pool", threads=1)
 
-    assert "left.port_distance_m" in text
+    assert "left port: " in text
+    assert "camera uncertainty" in text
     assert found["with_prior"][0] == "left.fx_px"
     rig = read_rig(tmp_path / "pool" / "rig.json")
     for name, camera in rig.cameras.items():
@@ -337,6 +342,42 @@ def test_a_folder_with_other_files_is_not_overwritten(dry: Path, tmp_path: Path)
     settings = PictureCalibration(pictures=both(dry), target=POOL_BOARD)
     with pytest.raises(AliceError, match="holds other files"):
         calibrate_pictures(settings, tmp_path / "out", threads=1)
+    (tmp_path / "out" / "calibration.json").write_text("{}")
+    with pytest.raises(AliceError, match=r"such as thesis\.tex"):
+        calibrate_pictures(settings, tmp_path / "out", threads=1)
+    assert (tmp_path / "out" / "thesis.tex").read_text() == "years of work"
+
+
+def test_a_place_that_cannot_be_a_folder_is_refused_at_once(tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("mine")
+    settings = PictureCalibration(pictures={"camera": str(tmp_path)}, target=BOARD)
+    for output, said in ((tmp_path / "taken", "is a file"), (Path(), "folder of its own")):
+        with pytest.raises(AliceError, match=said):
+            calibrate_pictures(settings, output, threads=1)
+    assert (tmp_path / "taken").read_text() == "mine"
+
+
+def test_a_start_is_not_replaced_by_what_it_gives(tmp_path: Path) -> None:
+    (tmp_path / "air").mkdir()
+    write_rig(tmp_path / "air" / "rig.json", built_rig())
+    settings = PictureCalibration(
+        pictures={"camera": "nowhere"}, target=BOARD, start=tmp_path / "air" / "rig.json"
+    )
+    with pytest.raises(AliceError, match="rig of --start"):
+        calibrate_pictures(settings, tmp_path / "air", threads=1)
+    assert (tmp_path / "air" / "rig.json").is_file()
+
+
+@pytest.mark.usefixtures("quick")
+def test_swapped_lists_are_told(
+    dry: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    swapped = {"left": str(dry / "right"), "right": str(dry / "left")}
+    for pictures, told in ((both(dry), 0), (swapped, 1)):
+        settings = PictureCalibration(pictures=pictures, target=POOL_BOARD, lens="k2")
+        calibrate_pictures(settings, tmp_path / "out", threads=1)
+        shown = capsys.readouterr().err
+        assert shown.count("the right camera stands 100 mm to the left of the left one") == told
 
 
 def test_a_rig_carried_to_other_water_says_so() -> None:
