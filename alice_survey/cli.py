@@ -58,12 +58,18 @@ def init(
 def fov(
     lens: Annotated[list[float] | None, typer.Option(help="Focal length, mm.")] = None,
     altitude: Annotated[list[float] | None, typer.Option(help="Of the outer glass, m.")] = None,
-    n_water: Annotated[float | None, typer.Option(help="Index of the water.")] = None,
+    n_water: Annotated[
+        float | None, typer.Option(min=1, max=1.4, help="Index of the water.")
+    ] = None,
     temperature: Annotated[float | None, typer.Option(help="Of the water, C.")] = None,
     salinity: Annotated[float | None, typer.Option(help="Of the water, psu.")] = None,
-    port_distance: Annotated[float | None, typer.Option(help="Pupil to glass, mm.")] = None,
-    glass: Annotated[float | None, typer.Option(help="Thickness of the port, mm.")] = None,
-    n_glass: Annotated[float | None, typer.Option(help="Index of the port.")] = None,
+    port_distance: Annotated[
+        float | None, typer.Option(min=0, max=500, help="Pupil to glass, mm.")
+    ] = None,
+    glass: Annotated[
+        float | None, typer.Option(min=0, max=500, help="Thickness of the port, mm.")
+    ] = None,
+    n_glass: Annotated[float | None, typer.Option(min=1, max=2, help="Index of the port.")] = None,
     rig: Annotated[Path | None, typer.Option(help="A calibrated rig.json instead.")] = None,
     f_number: Annotated[float | None, typer.Option(help="Aperture, 4 for F/4.")] = None,
     coc: Annotated[float, typer.Option(help="Blur circle that is sharp, px.")] = 1.0,
@@ -201,23 +207,30 @@ def calibrate(
         Literal["held", "prior", "free"] | None,
         typer.Option(help="What is done with those of --start; prior where it has sigmas."),
     ] = None,
-    port_distance: Annotated[float | None, typer.Option(min=0, help="First value, mm.")] = None,
-    glass: Annotated[float | None, typer.Option(min=0, help="Thickness, mm.")] = None,
+    port_distance: Annotated[
+        float | None, typer.Option(min=0, max=500, help="Pupil to glass, first value, mm.")
+    ] = None,
+    glass: Annotated[
+        float | None, typer.Option(min=0, max=500, help="Thickness of the port, mm.")
+    ] = None,
     glass_sigma: Annotated[
         float | None, typer.Option(min=1e-4, help="Find the thickness too; known to this, mm.")
     ] = None,
-    n_glass: Annotated[float | None, typer.Option(min=1, max=2, help="1.52 if not given.")] = None,
+    n_glass: Annotated[
+        float | None, typer.Option(min=1, max=2, help="Its index; 1.52 if not given.")
+    ] = None,
     n_glass_sigma: Annotated[
-        float | None, typer.Option(min=1e-7, help="Find the index of the glass too.")
+        float | None, typer.Option(min=1e-7, help="Find this index too; known to this.")
     ] = None,
     n_water: Annotated[
-        float | None, typer.Option(min=1, max=1.4, help="1.34 if not given.")
+        float | None, typer.Option(min=1, max=1.4, help="Index of the water; 1.34 if not given.")
     ] = None,
     n_water_sigma: Annotated[
-        float | None, typer.Option(min=1e-7, help="Find the index of the water too.")
+        float | None, typer.Option(min=1e-7, help="Find this index too; known to this.")
     ] = None,
     carry_to_n: Annotated[
-        float | None, typer.Option(min=1, max=1.4, help="Also write the rig in other water.")
+        float | None,
+        typer.Option(min=1, max=1.4, help="Also write the rig in water of this index."),
     ] = None,
     survey: SurveyFile = None,
     threads: Threads = None,

@@ -145,7 +145,9 @@ def convert(
     ] = None,
     model: Annotated[str, typer.Option(help="To fit: OPENCV or FULL_OPENCV.")] = "OPENCV",
     drop_port: Annotated[bool, typer.Option("--drop-port", help="Cameras as in air.")] = False,
-    drop_covariance: Annotated[bool, typer.Option("--drop-covariance")] = False,
+    drop_covariance: Annotated[
+        bool, typer.Option("--drop-covariance", help="Where OUT cannot hold it.")
+    ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -210,7 +212,9 @@ def tank(
 )
 def uncertainty(
     rig: Annotated[Path, typer.Argument(metavar="RIG", help="rig.json with its covariance.")],
-    ranges: Annotated[list[float] | None, typer.Option("--range", help="Distance, m.")] = None,
+    ranges: Annotated[
+        list[float] | None, typer.Option("--range", help="Distances to look at, m.")
+    ] = None,
     near: Annotated[float, typer.Option(help="Nearest of what poses are found from, m.")] = 1.0,
     far: Annotated[float, typer.Option(help="Farthest, m.")] = 3.0,
     noise: Annotated[float, typer.Option(min=0.0, help="Of a measured coordinate, px.")] = 0.1,

@@ -1,5 +1,6 @@
 """What a calibrated rig's covariance means, as a table for the command line."""
 
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -39,10 +40,13 @@ def uncertainty_report(
     Raises:
         CalibrationError: the rig has no covariance, or the distances are not in order.
     """
-    if not 0 < near_m <= far_m:
+    wrong = [r for r in ranges_m or [] if not 0 < r < math.inf]
+    if wrong:
+        raise CalibrationError(f"--range {wrong[0]:g} m: distances are positive and finite")
+    if not 0 < near_m <= far_m < math.inf:
         raise CalibrationError(
             f"poses are found from {near_m:g} to {far_m:g} m: near must be positive and not beyond "
-            "far"
+            "far, which is finite"
         )
     rig, ranges = read_rig(path), ranges_m or list(RANGES_M)
     parameters = [p for p in rig_parameters(rig) if p.sigma is not None]
