@@ -23,8 +23,8 @@ PORT = ("port_distance_m", "normal_x", "normal_y")
 """What a calibration through a port finds; glass and indices are known better from elsewhere."""
 
 _ONE_WATER = ".n_water"
-_SAME = 1.0 - 0.5e-4
-"""Correlation of what is known of one number twice: both differ by 0.01 sigma."""
+_SAME = 1.0 - 0.5e-6
+"""Correlation of what is known of one number twice: both differ by 0.001 sigma."""
 _OPENCV4 = ("k1", "k2", "p1", "p2")
 LENSES: Mapping[str, tuple[str, ...]] = {
     "pinhole": (),

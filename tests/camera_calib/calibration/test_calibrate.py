@@ -148,7 +148,7 @@ def test_cameras_with_an_index_to_be_found_look_into_one_water() -> None:
     left, right = (camera.n_water for camera in found.cameras.values())
     assert left == pytest.approx(1.342, abs=4 * found.sigmas["left.n_water"])
     assert found.sigmas["left.n_water"] < 5e-4
-    assert abs(left - right) < 0.02 * 0.002
+    assert abs(left - right) < 0.002 * 0.002
     apart = Prior.around(TRUTH, {"left.n_glass": 0.01, "right.n_glass": 0.01}).covariance
     np.testing.assert_allclose(apart, 1e-4 * np.eye(2), rtol=1e-12)
 
