@@ -13,7 +13,7 @@ from alice_survey.artefacts import read_json
 from alice_survey.config import CameraConfig, WaterConfig
 from alice_survey.errors import AliceError, ImageError, WorkspaceError
 from alice_survey.manifest import read_manifest
-from camera_calib.rig import design_rig, write_rig
+from camera_calib.rig import design_rig, read_rig, write_rig
 from reconstruct.import_images import import_images
 
 Draw = Callable[..., Path]
@@ -251,7 +251,7 @@ def test_a_rig_must_be_that_of_the_pictures(tmp_path: Path, draw: Draw) -> None:
     write_rig(tmp_path / "bad.json", design_rig(CameraConfig(), WaterConfig()))
     pair = {"left": tmp_path / "left", "right": tmp_path / "right"}
     import_images(tmp_path / "w", [], **pair, rig=tmp_path / "good.json")
-    assert json.loads((tmp_path / "w" / "images" / "rig.json").read_text())["version"] == 1
+    assert read_rig(tmp_path / "w" / "images" / "rig.json").cameras["left"].width_px == 846
     with pytest.raises(ImageError, match=r"846 x 677 pixels, but the rig.*3384 x 2710"):
         import_images(tmp_path / "w", [], **pair, rig=tmp_path / "bad.json")
     assert (tmp_path / "w" / "images" / "rig.json").exists()  # what was there stays
