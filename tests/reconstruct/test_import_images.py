@@ -1,5 +1,4 @@
 import csv
-import json
 import struct
 from collections.abc import Callable
 from pathlib import Path
