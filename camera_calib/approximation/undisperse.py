@@ -22,6 +22,7 @@ from camera_calib.approximation.dispersion import (
     undisperse,
 )
 from camera_calib.flat_port import FlatPortCamera
+from camera_calib.picture_files import is_cut_short
 from camera_calib.rig import read_rig
 from camera_calib.water import WAVELENGTH_NM
 
@@ -71,6 +72,11 @@ def undisperse_files(
     name = next(iter(cameras)) if camera is None else camera
     if name not in cameras:
         raise CalibrationError(f"{rig}: no camera {name!r}; it has {', '.join(cameras)}")
+    if cameras[name].n_water == 1.0:
+        raise CalibrationError(
+            f"{rig}: {name} is calibrated in air (n_water 1), where colours do not part: give the "
+            "rig under water"
+        )
     channels = channel_cameras(
         cameras[name],
         temperature_c=temperature_c,
@@ -108,6 +114,8 @@ def _targets(pictures: Sequence[Path], folder: Path) -> list[Path]:
 def _undisperse_file(job: _Job) -> Path:
     """Correct one file; the warp is kept from picture to picture."""
     source, target, cameras, range_m = job
+    if is_cut_short(source):
+        raise ImageError(f"{source}: the file is cut short: copy it again, or leave it out")
     stored = cv2.imread(str(source), cv2.IMREAD_UNCHANGED)
     if stored is None:
         raise ImageError(f"{source}: cannot be read as a picture")

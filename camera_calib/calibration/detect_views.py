@@ -12,6 +12,7 @@ from alice_survey.errors import CalibrationError
 from alice_survey.executor import parallel_map
 from camera_calib.calibration.picture_sets import PictureSet
 from camera_calib.calibration.result import Rejection, TargetView
+from camera_calib.picture_files import is_cut_short
 from camera_calib.targets.detect import Detection, detect_with_reasons
 from camera_calib.targets.grow import chessboard_size
 from camera_calib.targets.target import Target
@@ -88,7 +89,7 @@ def _checked(count: int) -> set[int]:
 
 def _look(job: tuple[Path, Target, bool]) -> _Seen:
     path, target, check = job
-    if _is_cut_short(path):
+    if is_cut_short(path):
         return _Seen(size=None, detection=Detection(pixels=None, refused="the file is cut short"))
     picture = cv2.imread(str(path), _READ)
     if picture is None:
@@ -104,19 +105,6 @@ def _look(job: tuple[Path, Target, bool]) -> _Seen:
         grey = picture if picture.dtype == np.uint8 else (picture >> 8).astype(np.uint8)
         board = chessboard_size(grey)
     return _Seen(size=(width, height), detection=detection, board=board)
-
-
-def _is_cut_short(path: Path) -> bool:
-    """Whether a JPEG's data end before its picture does; OpenCV would fill the rest with grey.
-
-    Coded data hold no markers (ITU T.81, B.1.1.5), so that the end of the image must be among what
-    follows the last start of a scan.
-    """
-    if path.suffix.lower() not in (".jpg", ".jpeg") or not path.is_file():
-        return False
-    data = path.read_bytes()
-    scan = data.rfind(b"\xff\xda")
-    return data.startswith(b"\xff\xd8") and scan >= 0 and data.find(b"\xff\xd9", scan) < 0
 
 
 def _one_size(

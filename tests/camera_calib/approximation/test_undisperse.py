@@ -125,3 +125,21 @@ def test_each_fault_is_one_line(tmp_path: Path, rig_path: Path) -> None:
             )
         assert words in str(error.value)
         assert "\n" not in str(error.value)
+
+
+def test_a_picture_that_is_cut_short_is_not_corrected(tmp_path: Path, rig_path: Path) -> None:
+    path = tmp_path / "a.jpg"
+    cv2.imwrite(str(path), noise_picture())
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(AliceError, match=r"a\.jpg: the file is cut short"):
+        undisperse_files([path], tmp_path / "out", rig=rig_path, range_m=2.0, **SEA)
+    assert not (tmp_path / "out" / "a.jpg").exists()
+
+
+def test_a_camera_in_air_has_no_dispersion_to_correct(tmp_path: Path) -> None:
+    write_rig(tmp_path / "air.json", RIG.in_water(1.0))
+    with pytest.raises(AliceError, match="calibrated in air"):
+        undisperse_files(
+            [tmp_path / "a.png"], tmp_path / "out", rig=tmp_path / "air.json", range_m=2.0, **SEA
+        )
