@@ -107,7 +107,9 @@ def fov(
         glass_mm=glass, n_glass=n_glass, pixel_um=pixel, f_number=f_number, coc_px=coc,
         focus_air_m=focus_air, match_sigma_px=match_sigma, blur_px=blur,
     )  # fmt: skip
-    table, data, passed = validation_report(output) if validate else fov_report(options, output)
+    table, data, passed = (
+        validation_report(options, output) if validate else fov_report(options, output)
+    )
     print_result(table, data, as_json)
     raise typer.Exit(0 if passed else 1)
 

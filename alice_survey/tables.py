@@ -97,14 +97,23 @@ def fov_report(options: FovOptions, output: Output) -> tuple[str, Any, bool]:
     return _told(fov_tables(rows, blur), output), data, True
 
 
-def validation_report(output: Output) -> tuple[str, Any, bool]:
-    """The paper's claims on optics, and whether every check that has a rule passed."""
+def validation_report(options: FovOptions, output: Output) -> tuple[str, Any, bool]:
+    """The paper's claims on optics, and whether every check that has a rule passed.
+
+    Raises:
+        ConfigError: an option was given: the claims bring their own lenses, water and altitude.
+    """
     from camera_calib.fov.angles import angle_table
     from camera_calib.fov.paper import paper_settings, validate_paper
     from camera_calib.fov.plot import draw_fov
     from camera_calib.fov.table import FovChoices, fov_table
     from camera_calib.fov.text import as_csv, validation_csv_rows, validation_tables
 
+    if options != FovOptions():
+        raise ConfigError(
+            "--validate checks the paper's own lenses, water and altitude: leave out all options "
+            "but --plot, --csv, --markdown and --json"
+        )
     validation = validate_paper()
     if output.csv is not None:
         _write(output.csv, as_csv(validation_csv_rows(validation)))

@@ -108,6 +108,8 @@ def _targets(pictures: Sequence[Path], folder: Path) -> list[Path]:
             raise ImageError(f"{source}: no such picture")
         if target.exists() and target.samefile(source):
             raise ImageError(f"{source}: would be overwritten; give another folder")
+        if target.exists():
+            raise ImageError(f"{target} exists: give another folder, or remove it")
     return targets
 
 

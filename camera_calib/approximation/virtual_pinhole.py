@@ -119,17 +119,3 @@ def residual_px(
         for d in depths_m
     ]
     return np.stack(rows)
-
-
-def warp_maps(camera: FlatPortCamera, pinhole: VirtualPinhole) -> tuple[Array, Array]:
-    """Where each pixel of the pinhole's picture is found in the camera's picture.
-
-    Returns:
-        x and y in OpenCV's pixels (origin at the first pixel's centre), float32, for `cv2.remap`.
-    """
-    x = np.arange(pinhole.width_px) + 0.5
-    y = np.arange(pinhole.height_px) + 0.5
-    pixels = np.stack(np.meshgrid(x, y), axis=-1)
-    source = camera.project(pinhole.at_depth(pixels, pinhole.working_range_m)) - 0.5
-    source = np.where(np.isfinite(source), source, -10.0).astype(np.float32)
-    return source[..., 0], source[..., 1]

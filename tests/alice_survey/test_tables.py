@@ -107,7 +107,9 @@ def test_files_are_written_or_refused(tmp_path: Path) -> None:
 
 
 def test_validation_prints_checks_claims_and_angles(tmp_path: Path) -> None:
-    text, data, passed = validation_report(Output(csv=tmp_path / "v.csv", plot=tmp_path / "v.svg"))
+    text, data, passed = validation_report(
+        FovOptions(), Output(csv=tmp_path / "v.csv", plot=tmp_path / "v.svg")
+    )
     assert passed
     assert set(data) == {"passed", "rule", "table", "claims", "angles"}
     for words in ("The paper's table", "The paper's further claims", "A flat port against"):
@@ -135,3 +137,8 @@ def test_a_failed_check_exits_with_1(monkeypatch: pytest.MonkeyPatch) -> None:
     shown = CliRunner().invoke(app, ["fov", "--validate"])
     assert shown.exit_code == 1
     assert "FAIL" in shown.output
+
+
+def test_the_papers_claims_take_no_options() -> None:
+    with pytest.raises(ConfigError, match="leave out all options"):
+        validation_report(FovOptions(lens_mm=[8.0]), Output())

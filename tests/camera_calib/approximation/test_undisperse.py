@@ -143,3 +143,11 @@ def test_a_camera_in_air_has_no_dispersion_to_correct(tmp_path: Path) -> None:
         undisperse_files(
             [tmp_path / "a.png"], tmp_path / "out", rig=tmp_path / "air.json", range_m=2.0, **SEA
         )
+
+
+def test_corrected_pictures_are_not_overwritten(tmp_path: Path, rig_path: Path) -> None:
+    path = tmp_path / "a.png"
+    cv2.imwrite(str(path), noise_picture())
+    undisperse_files([path], tmp_path / "out", rig=rig_path, range_m=2.0, **SEA)
+    with pytest.raises(AliceError, match="exists: give another folder"):
+        undisperse_files([path], tmp_path / "out", rig=rig_path, range_m=2.0, **SEA)

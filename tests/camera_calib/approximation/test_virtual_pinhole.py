@@ -1,7 +1,6 @@
 import math
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,7 +10,6 @@ from camera_calib.approximation.virtual_pinhole import (
     VirtualPinhole,
     best_pinhole,
     residual_px,
-    warp_maps,
 )
 from camera_calib.flat_port import FlatPortCamera
 
@@ -121,28 +119,3 @@ def test_at_depth_and_project_are_inverse(
     np.testing.assert_allclose(
         4540.0 * inside[:2] / inside[2] + [1690.0, 1357.0], [x, y], atol=1e-8
     )
-
-
-def test_a_warped_picture_is_what_the_pinhole_sees() -> None:
-    """Pixels that hold their own coordinates on the sea floor, and half a pixel in its place."""
-    camera = behind_port(20, 10, tilt_deg=1.5).reduced(8)
-    pinhole = best_pinhole(camera, 1.5, 2.5)
-    floor = camera.at_depth(camera.pixel_centres(), pinhole.working_range_m)[..., :2]
-    x, y = warp_maps(camera, pinhole)
-
-    warped = cv2.remap(
-        floor.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT,
-        borderValue=(np.nan, np.nan),
-    )  # fmt: skip
-
-    grid = np.stack(
-        np.meshgrid(np.arange(pinhole.width_px) + 0.5, np.arange(pinhole.height_px) + 0.5), axis=-1
-    )
-    expected = pinhole.at_depth(grid, pinhole.working_range_m)[..., :2]
-    inside = np.isfinite(warped).all(axis=-1)
-    # The pinhole's frame is a little wider than what light through the port fills.
-    assert 0.85 < inside.mean() < 1.0
-    pixel_m = pinhole.working_range_m / pinhole.focal_px
-    # OpenCV's remap places samples to 1/32 px; half a pixel too much or too little would be 0.5.
-    assert np.abs(warped - expected)[inside].max() < 0.025 * pixel_m
-    assert x.dtype == np.float32
