@@ -1,4 +1,3 @@
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -12,41 +11,16 @@ from camera_calib.approximation.virtual_pinhole import (
     residual_px,
 )
 from camera_calib.flat_port import FlatPortCamera
+from tests.camera_calib.approximation.ports import STUDY, behind_port
 
-CAMERA = FlatPortCamera(
-    width_px=3384,
-    height_px=2710,
-    fx_px=3388.0,
-    fy_px=3388.0,
-    cx_px=1692.0,
-    cy_px=1355.0,
-)
 DEPTHS_M = np.linspace(1.5, 2.5, 5)
-DESIGNS = [
-    # port mm, glass mm: at the pupil px, at the best point px, shift mm, tilted by 2 degrees px
-    (5, 6, 0.18, 0.014, 1.3, 0.015),
-    (20, 10, 0.92, 0.062, 6.9, 0.068),
-    (50, 15, 2.44, 0.158, 18.0, 0.172),
-    (100, 20, 5.02, 0.313, 38.0, 0.341),
-]
-"""Residual of a fixed warp at 2 m with 0.5 m of relief, from the project's design study."""
-
-
-def behind_port(distance_mm: float, glass_mm: float, tilt_deg: float = 0.0) -> FlatPortCamera:
-    tilt = math.radians(tilt_deg)
-    return replace(
-        CAMERA,
-        port_distance_m=distance_mm / 1e3,
-        glass_thickness_m=glass_mm / 1e3,
-        normal=(math.sin(tilt), 0.0, math.cos(tilt)),
-    )
 
 
 def rms(camera: FlatPortCamera, pinhole: VirtualPinhole) -> float:
     return float(np.sqrt(np.mean(residual_px(camera, pinhole, DEPTHS_M) ** 2)))
 
 
-@pytest.mark.parametrize(("port", "glass", "at_pupil", "best", "shift_mm", "tilted"), DESIGNS)
+@pytest.mark.parametrize(("port", "glass", "at_pupil", "best", "shift_mm", "tilted"), STUDY)
 def test_residuals_are_those_of_the_design_study(
     port: float, glass: float, at_pupil: float, best: float, shift_mm: float, tilted: float
 ) -> None:
