@@ -51,6 +51,7 @@ def residuals_section(judged: Judgement) -> Section:
     """Residuals by picture, place, radius, angle and size."""
     noise = judged.calibration.noise_px
     worst = sorted(judged.pictures, key=lambda p: -p.rms_px)[:_MOST_PICTURES]
+    shown = {(p.view, p.camera) for p in worst}
     rows = [
         (
             p.view,
@@ -62,7 +63,8 @@ def residuals_section(judged: Judgement) -> Section:
             f"{p.range_m:.2f}",
             f"{p.tilt_deg:.0f}",
         )
-        for p in sorted(worst, key=lambda p: (p.view, p.camera))
+        for p in judged.pictures
+        if (p.view, p.camera) in shown
     ]
     left_out = len(judged.pictures) - len(rows)
     rest = f"; the {left_out} that fit best are left out" if left_out else ""
