@@ -1,7 +1,7 @@
 """The command line: each command parses, calls and prints; the work is elsewhere."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -243,20 +243,23 @@ def calibrate(
     From the pool of a survey, or from pictures of a target: chessboard, ChArUco or AprilTag grid.
     Writes the rig with its covariance, the residuals and a report.
     """
-    if left is None and right is None and pictures is None:
-        from alice_survey.survey import run
-
-        result = run(["calibration"], workspace, survey, None, threads)
-    else:
+    places = {"left": left, "right": right, "pictures": pictures, "target": target}
+    settings: dict[str, Any] = {
+        "start": start, "known": intrinsics, "port_distance_mm": port_distance, "glass_mm": glass,
+        "glass_sigma_mm": glass_sigma, "n_glass": n_glass, "n_glass_sigma": n_glass_sigma,
+        "n_water": n_water, "n_water_sigma": n_water_sigma, "carry_to_n": carry_to_n,
+    }  # fmt: skip
+    given = [value for value in (*places.values(), output, *settings.values()) if value is not None]
+    if given or water or lens != "opencv5":
         from camera_calib.calibration.pictures import calibrate_command
 
         result = calibrate_command(
-            left=left, right=right, pictures=pictures, target=target, output=output, lens=lens,
-            water=water, start=start, known=intrinsics, port_distance_mm=port_distance,
-            glass_mm=glass, glass_sigma_mm=glass_sigma, n_glass=n_glass,
-            n_glass_sigma=n_glass_sigma, n_water=n_water, n_water_sigma=n_water_sigma,
-            carry_to_n=carry_to_n, threads=threads,
-        )  # fmt: skip
+            **places, output=output, threads=threads, lens=lens, water=water, **settings
+        )
+    else:
+        from alice_survey.survey import run
+
+        result = run(["calibration"], workspace, survey, None, threads)
     print_result(*result, as_json)
 
 

@@ -94,6 +94,11 @@ def calibrate_command(
     """
     places = {"left": left, "right": right, ONE_CAMERA: pictures}
     given = {camera: place for camera, place in places.items() if place is not None}
+    if not given:
+        raise CalibrationError(
+            "these options are for pictures: give --left and --right, or --pictures; the pool of a "
+            "survey takes none of them"
+        )
     if pictures is not None and len(given) > 1:
         raise CalibrationError("give --left and --right, or --pictures, not both")
     if pictures is None and len(given) == 1:

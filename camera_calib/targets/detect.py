@@ -41,7 +41,6 @@ from camera_calib.targets.target import TAG_BITS, TAG_BORDER_BITS, Target
 __all__ = ["Detection", "as_grey", "chessboard_size", "detect", "detect_with_reasons"]
 
 Picture = NDArray[np.uint8] | NDArray[np.uint16]
-Bools = NDArray[np.bool_]
 
 _FEWEST_POINTS = 6
 _FARTHEST_OFF = 0.2

@@ -188,3 +188,14 @@ def test_status_names_the_next_command(tmp_path: Path) -> None:
     data = json.loads(shown.output)
     assert data["stages"] == dict.fromkeys(LOOP, "missing")
     assert data["next"] == f"alice-survey plan -w {tmp_path}"
+
+
+@pytest.mark.parametrize(
+    "option",
+    [["--target", "chessboard 9x6 25mm"], ["-o", "x"], ["--start", "rig.json"], ["--water"]],
+)
+def test_calibrate_does_not_forget_options_when_pictures_are_missing(
+    option: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown = fails(["calibrate", *option], capsys, monkeypatch)
+    assert "--left and --right, or --pictures" in shown
