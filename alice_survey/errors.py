@@ -19,6 +19,10 @@ class PlanError(AliceError):
     """No plan meets what was asked for."""
 
 
+class VehicleError(AliceError):
+    """A vehicle, its sea or its controller is described wrongly, or cannot do what is asked."""
+
+
 class ImageError(AliceError):
     """Pictures are missing, unreadable or do not fit together."""
 

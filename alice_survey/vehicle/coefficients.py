@@ -1,0 +1,107 @@
+"""Hydrodynamic coefficients by their SNAME names, and the matrices they stand for.
+
+A name is the force or moment, an underscore, and what it is the derivative by: `Y_vdot` (added
+mass), `Y_v` (linear damping), `Y_vv` (of v |v|), `Y_uv` (body lift). Values are as in SNAME:
+derivatives of the force that the water exerts, so that damping and added mass are negative.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from alice_survey.errors import VehicleError
+from alice_survey.frames import Array
+
+FORCES = "XYZKMN"
+MOTIONS = "uvwpqr"
+LIFTS = ("Y_uv", "Z_uw", "M_uw", "N_uv")
+_SYMMETRY = 0.02
+"""Most relative difference of the two names of one added mass, by rounding in a table."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Coefficients:
+    """A named set of hydrodynamic coefficients, SI units (radians)."""
+
+    name: str
+    values: Mapping[str, float]
+    """SNAME name to value; what is not named is zero, but for the mirror of an added mass."""
+
+    def __post_init__(self) -> None:
+        for name, value in self.values.items():
+            if _kind(name) is None:
+                raise VehicleError(
+                    f"coefficient {name!r} is not known; names are like Y_vdot, Y_vv"
+                )
+            if not np.isfinite(value):
+                raise VehicleError(f"coefficient {name} is {value}, not a finite number")
+
+    @cached_property
+    def added_mass(self) -> Array:
+        """M_A, (6, 6), kg and kg m and kg m^2: minus the derivatives, symmetric.
+
+        Raises:
+            VehicleError: two names of one added mass (Y_rdot, N_vdot) differ by more than rounding.
+        """
+        given = self._matrix("dot")
+        matrix = np.zeros((6, 6))
+        for i in range(6):
+            for j in range(i, 6):
+                a, b = given[i, j], given[j, i]
+                both = np.array([value for value in (a, b) if not np.isnan(value)])
+                if len(both) == 2 and abs(a - b) > _SYMMETRY * max(abs(a), abs(b)):
+                    raise VehicleError(
+                        f"{FORCES[i]}_{MOTIONS[j]}dot = {a:g} and {FORCES[j]}_{MOTIONS[i]}dot = "
+                        f"{b:g} are one added mass: make them equal"
+                    )
+                matrix[i, j] = matrix[j, i] = -both.mean() if len(both) else 0.0
+        return matrix
+
+    @cached_property
+    def linear(self) -> Array:
+        """(6, 6) coefficients of nu: force i is sum over j of [i, j] nu_j."""
+        return np.nan_to_num(self._matrix("linear"))
+
+    @cached_property
+    def quadratic(self) -> Array:
+        """(6, 6) coefficients of nu |nu|: force i is sum over j of [i, j] nu_j |nu_j|."""
+        return np.nan_to_num(self._matrix("quadratic"))
+
+    @cached_property
+    def lift(self) -> Array:
+        """(4,) body lift: Y_uv, Z_uw, M_uw, N_uv."""
+        return np.array([self.values.get(name, 0.0) for name in LIFTS])
+
+    def replaced(self, name: str, values: Mapping[str, float]) -> "Coefficients":
+        """Another set with some values replaced or added.
+
+        An added mass replaces its mirror too: a new N_vdot drops the old Y_rdot.
+        """
+        kept = {key: value for key, value in self.values.items() if _mirror(key) not in values}
+        return Coefficients(name=name, values={**kept, **values})
+
+    def _matrix(self, kind: str) -> Array:
+        matrix = np.full((6, 6), np.nan)
+        for name, value in self.values.items():
+            if _kind(name) == kind:
+                matrix[FORCES.index(name[0]), MOTIONS.index(name[2])] = value
+        return matrix
+
+
+def _kind(name: str) -> str | None:
+    """`dot`, `linear`, `quadratic`, `lift`, or None of what is no name."""
+    if name in LIFTS:
+        return "lift"
+    if len(name) < 3 or name[0] not in FORCES or name[1] != "_" or name[2] not in MOTIONS:
+        return None
+    return {"dot": "dot", "": "linear", name[2]: "quadratic"}.get(name[3:])
+
+
+def _mirror(name: str) -> str:
+    """Of an added mass the name with force and motion exchanged; other names as they are."""
+    if _kind(name) != "dot":
+        return name
+    force, motion = FORCES.index(name[0]), MOTIONS.index(name[2])
+    return f"{FORCES[motion]}_{MOTIONS[force]}dot"

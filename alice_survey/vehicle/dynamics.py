@@ -1,0 +1,267 @@
+"""Equations of motion of a submerged vehicle in 6 degrees of freedom.
+
+M nu' + C(nu) nu + D(nu) nu + g(eta) = tau (T. I. Fossen, Handbook of Marine Craft Hydrodynamics and
+Motion Control, 2011, chapter 8), where nu is the velocity relative to the water, in the body frame.
+The state is a vector: position in NED (3), attitude quaternion ned_from_body, xyzw (4), nu (6), and
+the speed of each thruster in revolutions per second.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from alice_survey.frames import Array
+from alice_survey.vehicle.propulsion import Propulsion, add_speed_rates, add_thrust
+from alice_survey.vehicle.sea import Current, current_at
+
+GRAVITY = 9.80665
+STATE = 13
+"""Length of the state without the thrusters."""
+
+
+class Body(NamedTuple):
+    """The rigid body and the water around it, as compiled code sees them."""
+
+    mass: Array
+    """(6, 6) M = M_RB + M_A, symmetric positive definite."""
+    mass_inverse: Array
+    rigid_mass: Array
+    """(6, 6) M_RB, with the water inside the hull."""
+    displaced_kg: float
+    """Mass of the water that hull and water inside displace."""
+    linear: Array
+    """(6, 6) linear damping."""
+    quadratic: Array
+    """(6, 6) quadratic damping."""
+    lift: Array
+    """(4,) Y_uv, Z_uw, M_uw, N_uv."""
+    weight_n: float
+    """In air, without the water inside."""
+    buoyancy_n: float
+    cg: Array
+    """(3,) of the weight, from the centre of buoyancy."""
+
+
+class Plant(NamedTuple):
+    """All that moves: body and thrusters."""
+
+    body: Body
+    propulsion: Propulsion
+
+
+class Scratch(NamedTuple):
+    """Room for intermediate results, so that a step allocates nothing."""
+
+    stages: Array
+    """(5, N) of the Runge-Kutta step."""
+    force: Array
+    """(6,)"""
+    water: Array
+    """(6,) current and its slopes."""
+
+
+def scratch_for(thrusters: int) -> Scratch:
+    """Room for a vehicle with so many thrusters."""
+    return Scratch(np.zeros((5, STATE + thrusters)), np.zeros(6), np.zeros(6))
+
+
+def initial_state(
+    position_ned: Array, attitude_rad: Array, thrusters: int, nu: Array | None = None
+) -> Array:
+    """A state, thrusters at rest.
+
+    Args:
+        position_ned: (3,) metres.
+        attitude_rad: (3,) roll, pitch, heading.
+        thrusters: how many.
+        nu: (6,) velocity relative to the water; at rest if not given.
+    """
+    from alice_survey.frames import rotation_from_attitude
+
+    state = np.zeros(STATE + thrusters)
+    state[:3] = position_ned
+    state[3:7] = rotation_from_attitude(*attitude_rad).as_quat()
+    if nu is not None:
+        state[7:13] = nu
+    return state
+
+
+def coriolis_matrix(mass: Array, nu: Array) -> Array:
+    """C(nu), (6, 6), of an inertia matrix by Kirchhoff's equations; skew to the last bit.
+
+    It holds for M_RB and M_A alike (Fossen 2011, theorem 3.2).
+    """
+    linear, angular = mass[:3] @ nu, mass[3:] @ nu
+    result = np.zeros((6, 6))
+    result[:3, 3:] = result[3:, :3] = -_skew(linear)
+    result[3:, 3:] = -_skew(angular)
+    return result
+
+
+def damping_matrix(body: Body, nu: Array) -> Array:
+    """D(nu), (6, 6): linear and quadratic damping and body lift; D(nu) nu opposes motion."""
+    u = nu[0]
+    lift = np.zeros((6, 6))
+    lift[1, 1], lift[2, 2] = body.lift[0] * abs(u), body.lift[1] * abs(u)
+    lift[4, 2], lift[5, 1] = body.lift[2] * u, body.lift[3] * u
+    matrix: Array = -(body.linear + body.quadratic * np.abs(nu) + lift)
+    return matrix
+
+
+def _skew(a: Array) -> Array:
+    return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def add_damping(body: Body, nu: Array, force: Array) -> None:
+    """Add damping and body lift at a velocity (6,) to a force (6,).
+
+    Lift acts by |u|, its moments by u: going astern the force still opposes the drift, and its
+    centre moves to the other half of the hull.
+    """
+    for i in range(6):
+        total = 0.0
+        for j in range(6):
+            total += (body.linear[i, j] + body.quadratic[i, j] * abs(nu[j])) * nu[j]
+        force[i] += total
+    u, v, w = nu[0], nu[1], nu[2]
+    force[1] += body.lift[0] * abs(u) * v
+    force[2] += body.lift[1] * abs(u) * w
+    force[4] += body.lift[2] * u * w
+    force[5] += body.lift[3] * u * v
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def add_coriolis(body: Body, nu: Array, force: Array) -> None:
+    """Add -C(nu) nu to a force (6,), from the momentum M nu.
+
+    With M = M_RB + M_A and nu relative to the water this is exact in an irrotational current.
+    """
+    mass = body.mass
+    a = b = c = d = e = f = 0.0
+    for j in range(6):
+        a += mass[0, j] * nu[j]
+        b += mass[1, j] * nu[j]
+        c += mass[2, j] * nu[j]
+        d += mass[3, j] * nu[j]
+        e += mass[4, j] * nu[j]
+        f += mass[5, j] * nu[j]
+    u, v, w, p, q, r = nu[0], nu[1], nu[2], nu[3], nu[4], nu[5]
+    force[0] -= q * c - r * b
+    force[1] -= r * a - p * c
+    force[2] -= p * b - q * a
+    force[3] -= v * c - w * b + q * f - r * e
+    force[4] -= w * a - u * c + r * d - p * f
+    force[5] -= u * b - v * a + p * e - q * d
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def derivative(
+    time_s: float,
+    state: Array,
+    command_rps: Array,
+    load: Array,
+    plant: Plant,
+    current: Current,
+    scratch: Scratch,
+    out: Array,
+) -> None:
+    """Rate of change of a state.
+
+    Args:
+        time_s: for the current.
+        state: (13 + n,)
+        command_rps: (n,) speeds asked of the thrusters.
+        load: (6,) other forces and moments on the body, in its frame.
+        plant: the vehicle.
+        current: the water.
+        scratch: room.
+        out: (13 + n,) is written.
+    """
+    body = plant.body
+    nu, force, water = state[7:13], scratch.force, scratch.water
+    x, y, z, s = state[3], state[4], state[5], state[6]
+    r00, r01, r02 = 1 - 2 * (y * y + z * z), 2 * (x * y - z * s), 2 * (x * z + y * s)
+    r10, r11, r12 = 2 * (x * y + z * s), 1 - 2 * (x * x + z * z), 2 * (y * z - x * s)
+    r20, r21, r22 = 2 * (x * z - y * s), 2 * (y * z + x * s), 1 - 2 * (x * x + y * y)
+    current_at(current, time_s, state[2], water)
+
+    u, v, w, p, q, r = nu[0], nu[1], nu[2], nu[3], nu[4], nu[5]
+    out[0] = r00 * u + r01 * v + r02 * w + water[0]
+    out[1] = r10 * u + r11 * v + r12 * w + water[1]
+    out[2] = r20 * u + r21 * v + r22 * w
+    out[3] = 0.5 * (s * p + y * r - z * q)
+    out[4] = 0.5 * (s * q + z * p - x * r)
+    out[5] = 0.5 * (s * r + x * q - y * p)
+    out[6] = -0.5 * (x * p + y * q + z * r)
+
+    for i in range(6):
+        force[i] = load[i]
+    add_thrust(plant.propulsion, state[13:], nu, force)
+    add_damping(body, nu, force)
+    add_coriolis(body, nu, force)
+    # Weight and buoyancy along the body's down, (r20, r21, r22).
+    net, weight = body.weight_n - body.buoyancy_n, body.weight_n
+    gx, gy, gz = body.cg[0], body.cg[1], body.cg[2]
+    force[0] += net * r20
+    force[1] += net * r21
+    force[2] += net * r22
+    force[3] += weight * (gy * r22 - gz * r21)
+    force[4] += weight * (gz * r20 - gx * r22)
+    force[5] += weight * (gx * r21 - gy * r20)
+    # A current that changes along the way: the inertia of the body against its change, helped by
+    # the pressure that speeds up the water itself.
+    along_n, along_e = water[2] + water[4] * out[2], water[3] + water[5] * out[2]
+    if along_n != 0.0 or along_e != 0.0 or water[2] != 0.0 or water[3] != 0.0:
+        ax, ay, az = (
+            r00 * along_n + r10 * along_e,
+            r01 * along_n + r11 * along_e,
+            r02 * along_n + r12 * along_e,
+        )
+        for i in range(6):
+            rigid = body.rigid_mass
+            force[i] -= rigid[i, 0] * ax + rigid[i, 1] * ay + rigid[i, 2] * az
+        force[0] += body.displaced_kg * (r00 * water[2] + r10 * water[3])
+        force[1] += body.displaced_kg * (r01 * water[2] + r11 * water[3])
+        force[2] += body.displaced_kg * (r02 * water[2] + r12 * water[3])
+    for i in range(6):
+        total = 0.0
+        for j in range(6):
+            total += body.mass_inverse[i, j] * force[j]
+        out[7 + i] = total
+    add_speed_rates(plant.propulsion, state[13:], command_rps, out[13:])
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def rk4_step(
+    time_s: float,
+    step_s: float,
+    state: Array,
+    command_rps: Array,
+    load: Array,
+    plant: Plant,
+    current: Current,
+    scratch: Scratch,
+) -> None:
+    """Advance a state (13 + n,), which is overwritten, by the classical Runge-Kutta method."""
+    k, count = scratch.stages, state.shape[0]
+    trial = k[4]
+    derivative(time_s, state, command_rps, load, plant, current, scratch, k[0])
+    for i in range(count):
+        trial[i] = state[i] + 0.5 * step_s * k[0, i]
+    derivative(time_s + 0.5 * step_s, trial, command_rps, load, plant, current, scratch, k[1])
+    for i in range(count):
+        trial[i] = state[i] + 0.5 * step_s * k[1, i]
+    derivative(time_s + 0.5 * step_s, trial, command_rps, load, plant, current, scratch, k[2])
+    for i in range(count):
+        trial[i] = state[i] + step_s * k[2, i]
+    derivative(time_s + step_s, trial, command_rps, load, plant, current, scratch, k[3])
+    for i in range(count):
+        state[i] += step_s / 6.0 * (k[0, i] + 2.0 * (k[1, i] + k[2, i]) + k[3, i])
+    norm = 0.0
+    for i in range(3, 7):
+        norm += state[i] * state[i]
+    norm = norm**0.5
+    for i in range(3, 7):
+        state[i] /= norm

@@ -1,0 +1,78 @@
+"""The vehicles that are known by name: ALICE and the SPARUS II it was built from."""
+
+from alice_survey.errors import VehicleError
+from alice_survey.vehicle.coefficients import Coefficients
+from alice_survey.vehicle.propulsion import Thruster
+from alice_survey.vehicle.vehicle import RigidBody, Vehicle
+
+_ESTIMATED = {
+    "X_udot": -2.806, "Y_vdot": -78.459, "Y_rdot": -8.529, "K_vdot": -0.216, "K_pdot": -0.042,
+    "N_pdot": 0.102, "Z_wdot": -69.536, "M_udot": 0.0321, "M_wdot": 11.253, "M_qdot": -20.963,
+    "N_rdot": -22.537, "X_uu": -7.616, "Y_vv": -214.398, "Z_ww": -214.398, "M_ww": 26.634,
+    "N_vv": -26.17, "K_pp": -0.192, "K_vv": -3.397, "M_qq": -180.682, "N_rr": -180.381,
+    "M_uu": 0.144, "K_rr": 0.753, "Y_uv": -39.71, "Z_uw": -39.71, "M_uw": -8.498, "N_uv": 8.498,
+}  # fmt: skip
+_CFD = {
+    "X_uu": -8.375, "M_uu": 0.9, "Y_vv": -146.95, "K_vv": -6.5, "N_vv": -12.675, "N_rr": -26.377,
+    "K_rr": 0.558, "K_pp": -0.287, "M_qq": -34.551, "Z_ww": -174.525, "M_ww": 11.4,
+    "Y_uv": -35.428, "Z_uw": -35.428, "M_uw": -3.37, "N_uv": 3.37,
+}  # fmt: skip
+_CALIBRATED = {
+    "X_udot": -28.06, "Y_vdot": -23.53, "Y_rdot": -2.559, "Z_wdot": -27.812, "M_wdot": 5.626,
+    "M_qdot": -10.481, "N_rdot": -11.268, "X_uu": -15.23, "Y_vv": -321.597, "Z_ww": -326.169,
+    "M_ww": 0.096, "N_vv": -1.954, "N_rr": -54.114,
+}  # fmt: skip
+
+ESTIMATED = Coefficients(name="estimated", values=_ESTIMATED)
+CFD = ESTIMATED.replaced("cfd", _CFD)
+CALIBRATED = CFD.replaced("calibrated", _CALIBRATED)
+
+
+def _t200(name: str, x_m: float) -> Thruster:
+    return Thruster(
+        name=name, kind="tunnel", position_body_m=(x_m, 0.0, 0.0), direction_body=(0.0, 1.0, 0.0),
+        diameter_m=0.076, kt_forward=0.47, kt_reverse=0.40, kq_forward=0.06, kq_reverse=0.06,
+        handedness=1, most_rps=55.0, dead_band_rps=5.0, time_constant_s=0.15, jet_loss=1.0,
+    )  # fmt: skip
+
+
+def _main(name: str, y_m: float, handedness: int) -> Thruster:
+    return Thruster(
+        name=name, kind="open", position_body_m=(-0.573, y_m, 0.0), direction_body=(1.0, 0.0, 0.0),
+        diameter_m=0.08, kt_forward=0.698, kt_reverse=0.293, kq_forward=0.08, kq_reverse=0.05,
+        handedness=1 if handedness > 0 else -1, most_rps=50.0, dead_band_rps=2.0,
+        time_constant_s=0.8, thrust_deduction=0.1, wake_fraction=0.2, advance_slope=0.4,
+    )  # fmt: skip
+
+
+_HEAVE = Thruster(
+    name="vertical", kind="tunnel", position_body_m=(0.0, 0.0, 0.07),
+    direction_body=(0.0, 0.0, 1.0), diameter_m=0.08, kt_forward=0.537, kt_reverse=0.278,
+    kq_forward=0.06, kq_reverse=0.04, handedness=1, most_rps=50.0, dead_band_rps=2.0,
+    time_constant_s=0.4, jet_loss=1.0,
+)  # fmt: skip
+_RIGID = RigidBody(
+    dry_kg=52.0, buoyancy_kg=52.0, entrained_kg=23.0, cg_body_m=(0.0, 0.0, 0.0365),
+    inertia_kg_m2=(0.52, 7.47, 7.39), entrained_inertia_kg_m2=(0.15, 10.0, 10.0),
+)  # fmt: skip
+
+
+def vehicle(name: str, coefficients: str = "calibrated") -> Vehicle:
+    """A vehicle by its name, `alice` or `sparus2`, with a named set of coefficients.
+
+    Raises:
+        VehicleError: a name is not known.
+    """
+    sets = {"estimated": ESTIMATED, "cfd": CFD, "calibrated": CALIBRATED}
+    if coefficients not in sets:
+        raise VehicleError(f"coefficients {coefficients!r} are not known; known: {', '.join(sets)}")
+    horizontal = (_main("starboard", 0.167, -1), _main("port", -0.167, 1))
+    thrusters = {
+        "alice": (*horizontal, _HEAVE, _t200("bow", 0.86), _t200("stern", -0.76)),
+        "sparus2": (*horizontal, _HEAVE),
+    }
+    if name not in thrusters:
+        raise VehicleError(f"vehicle {name!r} is not known; known: {', '.join(thrusters)}")
+    return Vehicle(
+        name=name, rigid_body=_RIGID, coefficients=sets[coefficients], thrusters=thrusters[name]
+    )

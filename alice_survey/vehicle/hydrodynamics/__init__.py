@@ -1,0 +1,1 @@
+"""Hydrodynamic coefficients from geometry, beside those of the paper."""

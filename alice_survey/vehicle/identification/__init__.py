@@ -1,0 +1,1 @@
+"""Coefficients of a vehicle from the logs of its motion."""

@@ -1,0 +1,18 @@
+"""What the controller is told: the places in the vector of the navigation's estimate."""
+
+NORTH, EAST, DEPTH = 0, 1, 2
+"""Of the body's origin, metres in NED."""
+ROLL, PITCH, HEADING = 3, 4, 5
+"""Radians; heading is not wrapped."""
+U, V, W = 6, 7, 8
+"""Velocity over ground in the body frame, m/s."""
+P, Q, R = 9, 10, 11
+"""Body rates, rad/s."""
+ALTITUDE = 12
+"""Of the followed point (the left port's glass) above the sea floor, metres; NaN without bottom
+lock."""
+ESTIMATE = 13
+"""Length of the vector."""
+
+DIVE, APPROACH, FOLLOW, ASCEND, DONE, ABORT = 0, 1, 2, 3, 4, 5
+"""What the guidance is doing."""

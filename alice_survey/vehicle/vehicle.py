@@ -1,0 +1,114 @@
+"""A vehicle as a value: rigid body, coefficients and thrusters, and what follows from them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from alice_survey.errors import VehicleError
+from alice_survey.frames import Array
+from alice_survey.vehicle.coefficients import Coefficients
+from alice_survey.vehicle.dynamics import GRAVITY, Body, Plant
+from alice_survey.vehicle.propulsion import Thruster, pack
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigidBody:
+    """Mass and its distribution; lengths from the centre of buoyancy, the body's origin."""
+
+    dry_kg: float
+    """Weighed in air, drained."""
+    buoyancy_kg: float
+    """Mass of the water that the drained vehicle displaces."""
+    entrained_kg: float
+    """Water inside the hull that moves along; its weight is carried by its own buoyancy."""
+    cg_body_m: tuple[float, float, float]
+    """Of the drained vehicle."""
+    inertia_kg_m2: tuple[float, float, float]
+    """Of the drained vehicle about its centre of gravity, roll, pitch, yaw."""
+    entrained_cg_body_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    entrained_inertia_kg_m2: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """About its own centre of gravity."""
+
+    @cached_property
+    def mass_matrix(self) -> Array:
+        """M_RB, (6, 6), about the origin (Fossen 2011, 3.44), with the water inside."""
+        total = np.zeros((6, 6))
+        for mass, cg, inertia in (
+            (self.dry_kg, self.cg_body_m, self.inertia_kg_m2),
+            (self.entrained_kg, self.entrained_cg_body_m, self.entrained_inertia_kg_m2),
+        ):
+            x, y, z = cg
+            s = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+            total[:3, :3] += mass * np.eye(3)
+            total[:3, 3:] -= mass * s
+            total[3:, :3] += mass * s
+            total[3:, 3:] += np.diag(inertia) - mass * s @ s
+        return total
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Vehicle:
+    """Everything the equations of motion need to know of a vehicle."""
+
+    name: str
+    rigid_body: RigidBody
+    coefficients: Coefficients
+    thrusters: tuple[Thruster, ...]
+    density_kg_m3: float = 1025.0
+
+    @cached_property
+    def mass(self) -> Array:
+        """M = M_RB + M_A, (6, 6).
+
+        Raises:
+            VehicleError: it is not positive definite.
+        """
+        mass: Array = self.rigid_body.mass_matrix + self.coefficients.added_mass
+        least = float(np.linalg.eigvalsh(mass)[0])
+        if least <= 0:
+            raise VehicleError(
+                f"the inertia matrix of {self.name} with {self.coefficients.name!r} coefficients "
+                f"has the eigenvalue {least:.3g}: an added mass has the wrong sign"
+            )
+        return mass
+
+    @cached_property
+    def plant(self) -> Plant:
+        """For compiled code."""
+        rigid, kinds = self.rigid_body, self.coefficients
+        displaced = rigid.buoyancy_kg + rigid.entrained_kg
+        body = Body(
+            mass=np.ascontiguousarray(self.mass),
+            mass_inverse=np.ascontiguousarray(np.linalg.inv(self.mass)),
+            rigid_mass=np.ascontiguousarray(rigid.mass_matrix),
+            displaced_kg=displaced,
+            linear=kinds.linear,
+            quadratic=kinds.quadratic,
+            lift=kinds.lift,
+            weight_n=rigid.dry_kg * GRAVITY,
+            buoyancy_n=rigid.buoyancy_kg * GRAVITY,
+            cg=np.array(rigid.cg_body_m),
+        )
+        return Plant(body, pack(self.thrusters, self.density_kg_m3, displaced))
+
+    @cached_property
+    def configuration_matrix(self) -> Array:
+        """B, (6, n): wrench = B thrust; the arms, and the torque of propellers at forward speed."""
+        columns = []
+        for thruster in self.thrusters:
+            direction = np.array(thruster.direction_body)
+            moment = np.cross(thruster.position_body_m, direction)
+            reaction = thruster.diameter_m * thruster.kq_forward / thruster.kt_forward
+            columns.append([*direction, *(moment - thruster.handedness * reaction * direction)])
+        return np.array(columns).T
+
+    def with_coefficients(self, coefficients: Coefficients) -> "Vehicle":
+        """The same vehicle with another set."""
+        return replace(self, coefficients=coefficients)
+
+    def without(self, thrusters: Sequence[str]) -> "Vehicle":
+        """The same vehicle with some thrusters taken off."""
+        kept = tuple(t for t in self.thrusters if t.name not in thrusters)
+        return replace(self, thrusters=kept)

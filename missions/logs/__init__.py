@@ -1,0 +1,1 @@
+"""Logs of real and simulated vehicles, in the formats that other tools open."""
