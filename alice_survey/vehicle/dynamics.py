@@ -9,9 +9,9 @@ the speed of each thruster in revolutions per second.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from alice_survey.frames import Array
+from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.propulsion import Propulsion, add_speed_rates, add_thrust
 from alice_survey.vehicle.sea import Current, current_at
 
@@ -113,7 +113,7 @@ def _skew(a: Array) -> Array:
     return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def add_damping(body: Body, nu: Array, force: Array) -> None:
     """Add damping and body lift at a velocity (6,) to a force (6,).
 
@@ -132,7 +132,7 @@ def add_damping(body: Body, nu: Array, force: Array) -> None:
     force[5] += body.lift[3] * u * v
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def add_coriolis(body: Body, nu: Array, force: Array) -> None:
     """Add -C(nu) nu to a force (6,), from the momentum M nu.
 
@@ -156,7 +156,7 @@ def add_coriolis(body: Body, nu: Array, force: Array) -> None:
     force[5] -= u * b - v * a + p * e - q * d
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def derivative(
     time_s: float,
     state: Array,
@@ -233,7 +233,7 @@ def derivative(
     add_speed_rates(plant.propulsion, state[13:], command_rps, out[13:])
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def rk4_step(
     time_s: float,
     step_s: float,

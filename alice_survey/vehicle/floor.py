@@ -4,9 +4,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from alice_survey.frames import Array
+from alice_survey.vehicle.compiled import kernel
 
 
 class FloorGrid(NamedTuple):
@@ -26,7 +26,7 @@ def level_floor(depth_m: float) -> FloorGrid:
     return FloorGrid(0.0, 0.0, 1.0, np.full((2, 2), depth_m))
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def floor_depth(floor: FloorGrid, north_m: float, east_m: float) -> float:
     """Depth of the sea floor at a place, metres."""
     rows, columns = floor.depth_m.shape
@@ -40,7 +40,7 @@ def floor_depth(floor: FloorGrid, north_m: float, east_m: float) -> float:
     return float(north_side + b * (south_side - north_side))
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def floor_range(
     floor: FloorGrid,
     north_m: float,

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from alice_survey.errors import VehicleError
 from alice_survey.frames import Array
+from alice_survey.vehicle.compiled import kernel
 
 
 class Current(NamedTuple):
@@ -90,7 +90,7 @@ class Disturbance:
     correlation_s: float = 2.0
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _bracket(axis: Array, value: float) -> tuple[int, float]:
     """The cell of an axis that holds a value, and how far into it; (0, 0) on a single point."""
     last = axis.shape[0] - 1
@@ -108,7 +108,7 @@ def _bracket(axis: Array, value: float) -> tuple[int, float]:
     return low, (value - axis[low]) / (axis[low + 1] - axis[low])
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def current_at(current: Current, time_s: float, depth_m: float, out: Array) -> None:
     """The current and its slopes.
 
