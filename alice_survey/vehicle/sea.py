@@ -35,7 +35,7 @@ def sheared_current(depth_m: Array, speed_mps_towards_deg: Array) -> Current:
         speed_mps_towards_deg: (Z, 2) speed and direction it flows towards.
     """
     speed, towards = speed_mps_towards_deg[:, 0], np.deg2rad(speed_mps_towards_deg[:, 1])
-    velocity = np.stack([speed * np.cos(towards), speed * np.sin(towards)], axis=1)
+    velocity: Array = np.stack([speed * np.cos(towards), speed * np.sin(towards)], axis=1)
     return checked_current(Current(np.zeros(1), np.asarray(depth_m, np.float64), velocity[None]))
 
 
@@ -56,7 +56,7 @@ def varying_current(
         rng: source of the process.
     """
     step_s = correlation_s / 10.0
-    time_s = np.arange(math.ceil(duration_s / step_s) + 2) * step_s
+    time_s: Array = step_s * np.arange(math.ceil(duration_s / step_s) + 2, dtype=np.float64)
     decay = math.exp(-step_s / correlation_s)
     draws = rng.standard_normal((len(time_s), 2))
     process = np.empty_like(draws)
