@@ -28,28 +28,64 @@ CFD = ESTIMATED.replaced("cfd", _CFD)
 CALIBRATED = CFD.replaced("calibrated", _CALIBRATED)
 
 
+_MERIT = 0.07 / 0.4566**1.5
+"""k_q over k_t^1.5 of a Wageningen B propeller with three blades, blade area ratio 0.718, pitch 1.0,
+in water at rest (k_t 0.4566, k_q 0.0700; T. I. Fossen's MSS toolbox, remus100): 0.227. No torque of
+these propellers could be found: inferred to be as good as that one, both ways. Momentum theory asks
+for 0.090 at least; Stonefish's k_q of 0.01 for a k_t of 0.698 is 0.017."""
+_KT_FALL, _KQ_FALL = (1 - 0.1798 / 0.4566) / 0.6632, (1 - 0.0312 / 0.07) / 0.6632
+"""Share of k_t and k_q lost per advance ratio, of the same propeller (k_t 0.1798 and k_q 0.0312 at
+J = 0.6632): inferred for the others."""
+_EFFICIENCY = 0.55
+"""Shaft over electrical power: a T200 takes 390 W (24 A at 16 V, Blue Robotics) for 51.4 N, which
+by the k_q above is 216 W on the shaft. Inferred for SPARUS II's own thrusters, of which no power is
+published."""
+_WAKE, _DEDUCTION = 0.19, 0.17
+"""Of the twin screws, by J. Holtrop and G. G. J. Mennen, Int. Shipbuilding Progress 29, 1982:
+w = 0.3095 C_B + 10 C_V C_B - 0.23 D / sqrt(B T) and t = 0.325 C_B - 0.1885 D / sqrt(B T), with
+C_B 0.72 (75 L in 1.96 x 0.23 x 0.23 m), C_V 0.006 (ITTC-57 and form factor 1.07 at 0.25 m/s) and
+D 0.08 m. Inferred: it is a regression over ships; Burcher and Rydill's values for submarines,
+which the paper takes, could not be read. Delphin2 (one screw on the axis) has 0.36 and 0.11."""
+_JET_LOSS = 0.27
+"""Delphin2's simulator has exp(-0.35 u^2), u in m/s, for tunnels of 70 mm with jets of 0.883 m/s
+(github.com/Southampton-Maritime-Robotics/DelphinROSv3, the dead reckoner): 0.35 x 0.883^2. Inferred
+to scale with the jet as Palmer has it. His moment arm could not be read: no `jet_centre_m`."""
+_JET_DRAG = (0.565993917435650, 7.608906885747783, 0.056535966126787, 0.896791505996002)
+"""From the same file, of the same group as the paper's source: a hull of 1.96 m and 0.080 m^3 with
+tunnels of 70 mm, nearly ALICE's."""
+
+
+def _kq(kt: float) -> float:
+    return float(_MERIT * kt**1.5)
+
+
 def _t200(name: str, x_m: float) -> Thruster:
     return Thruster(
         name=name, kind="tunnel", position_body_m=(x_m, 0.0, 0.0), direction_body=(0.0, 1.0, 0.0),
-        diameter_m=0.076, kt_forward=0.47, kt_reverse=0.40, kq_forward=0.06, kq_reverse=0.06,
-        handedness=1, most_rps=55.0, dead_band_rps=5.0, time_constant_s=0.15, jet_loss=1.0,
+        diameter_m=0.076, kt_forward=0.47, kt_reverse=0.40, kq_forward=_kq(0.47),
+        kq_reverse=_kq(0.40), handedness=1, most_rps=55.0, dead_band_rps=5.0, time_constant_s=0.15,
+        advance_slope=0.47 * _KT_FALL, torque_slope=_kq(0.47) * _KQ_FALL, jet_loss=_JET_LOSS,
+        jet_drag=_JET_DRAG, efficiency=_EFFICIENCY,
     )  # fmt: skip
 
 
 def _main(name: str, y_m: float, handedness: int) -> Thruster:
     return Thruster(
         name=name, kind="open", position_body_m=(-0.573, y_m, 0.0), direction_body=(1.0, 0.0, 0.0),
-        diameter_m=0.08, kt_forward=0.698, kt_reverse=0.293, kq_forward=0.08, kq_reverse=0.05,
-        handedness=1 if handedness > 0 else -1, most_rps=50.0, dead_band_rps=2.0,
-        time_constant_s=0.8, thrust_deduction=0.1, wake_fraction=0.2, advance_slope=0.4,
+        diameter_m=0.08, kt_forward=0.698, kt_reverse=0.293, kq_forward=_kq(0.698),
+        kq_reverse=_kq(0.293), handedness=1 if handedness > 0 else -1, most_rps=50.0,
+        dead_band_rps=2.0, time_constant_s=0.8, advance_slope=0.698 * _KT_FALL,
+        torque_slope=_kq(0.698) * _KQ_FALL, thrust_deduction=_DEDUCTION, wake_fraction=_WAKE,
+        efficiency=_EFFICIENCY,
     )  # fmt: skip
 
 
 _HEAVE = Thruster(
     name="vertical", kind="tunnel", position_body_m=(0.0, 0.0, 0.07),
     direction_body=(0.0, 0.0, 1.0), diameter_m=0.08, kt_forward=0.537, kt_reverse=0.278,
-    kq_forward=0.06, kq_reverse=0.04, handedness=1, most_rps=50.0, dead_band_rps=2.0,
-    time_constant_s=0.4, jet_loss=1.0,
+    kq_forward=_kq(0.537), kq_reverse=_kq(0.278), handedness=1, most_rps=50.0, dead_band_rps=2.0,
+    time_constant_s=0.4, advance_slope=0.537 * _KT_FALL, torque_slope=_kq(0.537) * _KQ_FALL,
+    jet_loss=_JET_LOSS, jet_drag=_JET_DRAG, efficiency=_EFFICIENCY,
 )  # fmt: skip
 _RIGID = RigidBody(
     dry_kg=52.0, buoyancy_kg=52.0, entrained_kg=23.0, cg_body_m=(0.0, 0.0, 0.0365),

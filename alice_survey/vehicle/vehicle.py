@@ -100,7 +100,8 @@ class Vehicle:
         for thruster in self.thrusters:
             direction = np.array(thruster.direction_body)
             moment = np.cross(thruster.position_body_m, direction)
-            reaction = thruster.diameter_m * thruster.kq_forward / thruster.kt_forward
+            kept = thruster.kt_forward * (1.0 - thruster.thrust_deduction)
+            reaction = thruster.diameter_m * thruster.kq_forward / kept
             columns.append([*direction, *(moment - thruster.handedness * reaction * direction)])
         return np.array(columns).T
 
