@@ -1,0 +1,316 @@
+"""The navigation's tick: measure, predict, weigh, and tell the controller and the log.
+
+The tick is what the closed loop calls. Instruments measure the true state of now, the filter never
+sees it otherwise.
+"""
+
+import math
+
+import numpy as np
+
+from alice_survey.frames import Array
+from alice_survey.vehicle.compiled import kernel
+from alice_survey.vehicle.floor import FloorGrid
+from alice_survey.vehicle.measuring import (
+    drift,
+    measure_depth,
+    measure_dvl,
+    measure_gps,
+    measure_heading,
+    measure_imu,
+    measure_rates,
+    measure_usbl,
+    usbl_sigma,
+)
+from alice_survey.vehicle.navigation_filter import (
+    correct,
+    lever_row,
+    predict,
+    use_beams,
+    use_depth,
+    use_fix,
+    use_heading,
+)
+from alice_survey.vehicle.navigation_state import (
+    ALTITUDE_NOW,
+    ALTITUDE_PING,
+    ALTITUDE_SIGMA,
+    ALTITUDE_TIME,
+    ALTITUDE_VARIANCE,
+    ATTITUDE,
+    BELIEVED,
+    FOLLOWED_DEPTH,
+    GPS_BIAS,
+    GPS_FIX,
+    GPS_USE,
+    GYRO_BIAS,
+    HEADING_TURNS,
+    IMU_PLACE,
+    LATEST,
+    QUATERNION,
+    RANGE,
+    RATES,
+    REJECTED,
+    RELIEF_PINGS,
+    RELIEF_VARIANCE,
+    TRUTH_NOW,
+    USBL_FIX,
+    USBL_USE,
+    USED,
+    VELOCITY,
+    NavigationState,
+    estimation_error,
+    new_navigation,
+)
+from alice_survey.vehicle.rotations import matrix_of, wrapped
+from alice_survey.vehicle.sensors import BEAMS, DVL, FOLLOWED, GPS, IMU, USBL, Sensors
+from alice_survey.vehicle.signals import ALTITUDE, ESTIMATE, HEADING, P, U
+
+__all__ = [
+    "LOG_COLUMNS",
+    "LOG_ROW",
+    "NavigationState",
+    "Sensors",
+    "estimation_error",
+    "log_row",
+    "navigation_tick",
+    "new_navigation",
+]
+
+LOG_COLUMNS = (
+    "north_m", "east_m", "depth_m", "roll_rad", "pitch_rad", "heading_rad",
+    "u_mps", "v_mps", "w_mps", "p_radps", "q_radps", "r_radps", "altitude_m",
+    "sigma_north_m", "sigma_east_m", "sigma_depth_m",
+    "sigma_roll_rad", "sigma_pitch_rad", "sigma_heading_rad", "sigma_altitude_m",
+    "range_1_m", "range_2_m", "range_3_m", "range_4_m",
+    "used_compass", "used_depth", "used_dvl", "used_water", "used_gps", "used_usbl",
+    "rejected_compass", "rejected_depth", "rejected_dvl", "rejected_water", "rejected_gps",
+    "rejected_usbl",
+)  # fmt: skip
+"""Of a row of `log_row`: the estimate in the order of `signals`, sigmas, the latest ping's ranges,
+and how many measurements of each instrument were used and rejected so far."""
+LOG_ROW = len(LOG_COLUMNS)
+LOG_SIGMA, LOG_RANGE, LOG_USED, LOG_REJECTED = 13, 20, 24, 30
+"""Where sigmas, ranges and counts begin in a row."""
+
+
+@kernel
+def navigation_tick(
+    time_s: float,
+    tick: int,
+    dt_s: float,
+    before: Array,
+    now: Array,
+    water_velocity_ned: Array,
+    floor: FloorGrid,
+    suite: Sensors,
+    nav: NavigationState,
+    rng: np.random.Generator,
+    estimate: Array,
+) -> None:
+    """Carry the navigation from the tick before to now.
+
+    Args:
+        time_s: now, for drop-outs and ages.
+        tick: counted from 0, when nothing is predicted and `before` is not looked at.
+        dt_s: since the tick before, and at tick 0 the time to the next.
+        before: (13,) truth then: position NED, quaternion ned_from_body, velocity of the body's
+            origin over ground in NED, body rates.
+        now: (13,) truth now.
+        water_velocity_ned: north and east of the current now come first; the rest is not read.
+        floor: what the DVL hears.
+        suite: the instruments.
+        nav: filter and instruments, overwritten.
+        rng: where noise comes from.
+        estimate: (13,) is written as `signals` has it; the altitude is NaN without bottom lock.
+    """
+    for i in range(nav.innovations.shape[0]):
+        nav.innovations[i] = math.nan
+    matrix_of(now[3:7], nav.turns[TRUTH_NOW])
+    if tick > 0:
+        measure_imu(dt_s, before, now, suite, nav, rng)
+        predict(dt_s, suite, nav)
+        drift(dt_s, suite, nav, rng)
+    else:
+        measure_rates(dt_s, now, suite, nav, rng)
+        matrix_of(nav.nominal[QUATERNION : QUATERNION + 4], nav.turns[BELIEVED])
+    pinged, used = False, False
+    bottom = 0
+    if suite.compass_every > 0 and tick % suite.compass_every == 0:
+        measure_heading(time_s, suite, nav, rng)
+        used |= use_heading(nav, suite)
+    if suite.pressure_every > 0 and tick % suite.pressure_every == 0:
+        measure_depth(time_s, now, suite, nav, rng)
+        used |= use_depth(nav, suite)
+    due = suite.gps_every > 0 and tick % suite.gps_every == 0
+    if due and measure_gps(time_s, now, suite, nav, rng):
+        noise = suite.gps_noise * suite.gps_noise
+        used |= use_fix(nav, suite, GPS_USE, GPS, GPS_FIX, noise, GPS_BIAS)
+    due = suite.usbl_every > 0 and tick % suite.usbl_every == 0
+    if due and measure_usbl(time_s, now, suite, nav, rng):
+        used |= _use_usbl(nav, suite)
+    if suite.dvl_every > 0 and tick % suite.dvl_every == 0:
+        pinged = True
+        ping = tick // suite.dvl_every
+        measure_dvl(time_s, ping, now, water_velocity_ned, floor, suite, nav, rng)
+        bottom = use_beams(nav, suite, False)
+        used |= bottom != 0
+        used |= use_beams(nav, suite, True) != 0
+    if used:
+        correct(nav)
+    _tell(nav, suite, estimate)
+    if pinged and bottom != 0:
+        _hear_altitude(time_s, bottom, nav, suite)
+    _carry_altitude(time_s, nav, suite)
+    estimate[ALTITUDE] = nav.memory[ALTITUDE_NOW]
+    for i in range(ESTIMATE):
+        nav.memory[LATEST + i] = estimate[i]
+
+
+@kernel
+def _use_usbl(nav: NavigationState, suite: Sensors) -> bool:
+    """Weigh the fix of the transponder, as uncertain as its believed distance makes it."""
+    north = lever_row(nav, suite, USBL, 0)
+    east = lever_row(nav, suite, USBL, 1)
+    sigma = usbl_sigma(suite, north, east, lever_row(nav, suite, USBL, 2))
+    return use_fix(nav, suite, USBL_USE, USBL, USBL_FIX, sigma * sigma, -1)
+
+
+@kernel
+def _tell(nav: NavigationState, suite: Sensors, estimate: Array) -> None:
+    """Write the estimate of the body's origin, but for the altitude."""
+    x, turned, memory = nav.nominal, nav.turns[BELIEVED], nav.memory
+    a, b, c = suite.place[IMU, 0], suite.place[IMU, 1], suite.place[IMU, 2]
+    for i in range(3):
+        estimate[i] = x[i] - turned[i, 0] * a - turned[i, 1] * b - turned[i, 2] * c
+        estimate[P + i] = nav.readings[RATES + i] - x[GYRO_BIAS + 1 + i]
+    p, q, r = estimate[P], estimate[P + 1], estimate[P + 2]
+    for i in range(3):
+        estimate[U + i] = turned[0, i] * x[3] + turned[1, i] * x[4] + turned[2, i] * x[5]
+    estimate[U] -= q * c - r * b
+    estimate[U + 1] -= r * a - p * c
+    estimate[U + 2] -= p * b - q * a
+    estimate[3] = math.atan2(turned[2, 1], turned[2, 2])
+    estimate[4] = -math.asin(min(max(turned[2, 0], -1.0), 1.0))
+    heading = math.atan2(turned[1, 0], turned[0, 0])
+    memory[HEADING_TURNS] += wrapped(heading - memory[HEADING_TURNS])
+    estimate[HEADING] = memory[HEADING_TURNS]
+
+
+@kernel
+def _followed_depth(nav: NavigationState, suite: Sensors) -> float:
+    """Believed depth of the followed point, metres."""
+    turned, total = nav.turns[BELIEVED], nav.nominal[2]
+    for i in range(3):
+        total += turned[2, i] * (suite.place[FOLLOWED, i] - suite.place[IMU, i])
+    return float(total)
+
+
+@kernel
+def _hear_altitude(time_s: float, used: int, nav: NavigationState, suite: Sensors) -> None:
+    """Altitude of the followed point from a ping: the mean of the beams, moved by the lever.
+
+    Each range is brought to the vertical by the believed attitude. Over relief the sea floor below
+    the point is not the beams' mean: their spread, averaged over the last seconds, says by how
+    much, a fifth draw about the mean of four. A beam whose velocity was an outlier heard something
+    else than the sea floor. Fewer than three beams tell nothing.
+    """
+    turned, memory = nav.turns[BELIEVED], nav.memory
+    count = 0
+    mean = square = noise = c0 = c1 = c2 = 0.0
+    for i in range(BEAMS):
+        if used >> i & 1 == 0:
+            continue
+        reach = nav.readings[RANGE + i]
+        b0, b1, b2 = suite.beams[i, 0], suite.beams[i, 1], suite.beams[i, 2]
+        down = turned[2, 0] * b0 + turned[2, 1] * b1 + turned[2, 2] * b2
+        height = reach * down
+        count += 1
+        # Welford's running mean and sum of squares.
+        step = height - mean
+        mean += step / count
+        square += step * (height - mean)
+        slope = suite.range_noise_fraction * reach
+        noise += (suite.range_noise * suite.range_noise + slope * slope) * down * down
+        c0, c1, c2 = c0 + reach * b0, c1 + reach * b1, c2 + reach * b2
+    if count < 3:
+        return
+    noise /= count
+    memory[RELIEF_PINGS] += 1.0
+    share = max(1.0 / memory[RELIEF_PINGS], suite.dvl_every * suite.tick_s / suite.relief_memory_s)
+    memory[RELIEF_VARIANCE] += share * (square / (count - 1) - memory[RELIEF_VARIANCE])
+    # From the followed point to the middle of the beams' footprints: what a tilt acts by.
+    a = c0 / count + suite.place[DVL, 0] - suite.place[FOLLOWED, 0]
+    b = c1 / count + suite.place[DVL, 1] - suite.place[FOLLOWED, 1]
+    c = c2 / count + suite.place[DVL, 2] - suite.place[FOLLOWED, 2]
+    lever = 0.0
+    for i in range(3):
+        lever += turned[2, i] * (suite.place[DVL, i] - suite.place[FOLLOWED, i])
+    r0, r1, r2 = turned[2, 0], turned[2, 1], turned[2, 2]
+    tilt = _variance_by_attitude(nav, r2 * b - r1 * c, r0 * c - r2 * a, r1 * a - r0 * b)
+    # The spread holds the ranges' noise, of which the mean keeps a part only.
+    spread = max((1.0 + 1.0 / count) * memory[RELIEF_VARIANCE] - noise, noise / count)
+    memory[ALTITUDE_PING] = mean + lever
+    memory[ALTITUDE_VARIANCE] = spread + tilt
+    memory[ALTITUDE_TIME] = time_s
+    memory[FOLLOWED_DEPTH] = _followed_depth(nav, suite)
+
+
+@kernel
+def _variance_by_attitude(nav: NavigationState, a: float, b: float, c: float) -> float:
+    """Variance of a g by the attitude's covariance, for g = (a, b, c)."""
+    p, t = nav.covariance, ATTITUDE
+    return float(
+        a * a * p[t, t]
+        + b * b * p[t + 1, t + 1]
+        + c * c * p[t + 2, t + 2]
+        + 2.0 * (a * b * p[t, t + 1] + a * c * p[t, t + 2] + b * c * p[t + 1, t + 2])
+    )
+
+
+@kernel
+def _carry_altitude(time_s: float, nav: NavigationState, suite: Sensors) -> None:
+    """Altitude now: the last ping's, less the depth gained since; NaN when that is too long ago."""
+    memory = nav.memory
+    age = time_s - memory[ALTITUDE_TIME]
+    # Not a number before the first ping: then this is false too.
+    if age <= suite.altitude_age_s + 1e-9:
+        gained = _followed_depth(nav, suite) - memory[FOLLOWED_DEPTH]
+        drifted = age * age * nav.covariance[VELOCITY + 2, VELOCITY + 2]
+        memory[ALTITUDE_NOW] = memory[ALTITUDE_PING] - gained
+        memory[ALTITUDE_SIGMA] = math.sqrt(memory[ALTITUDE_VARIANCE] + drifted)
+    else:
+        memory[ALTITUDE_NOW] = math.nan
+        memory[ALTITUDE_SIGMA] = math.nan
+
+
+@kernel
+def log_row(nav: NavigationState, out: Array) -> None:
+    """Write a row of the log, (LOG_ROW,), as `LOG_COLUMNS` names it, of the latest tick.
+
+    Sigmas are of the body's origin, whose position errs by attitude too, and of Euler angles.
+    """
+    p, turned = nav.covariance, nav.turns[BELIEVED]
+    latest = nav.memory[LATEST : LATEST + ESTIMATE]
+    for i in range(ESTIMATE):
+        out[i] = latest[i]
+    a, b, c = nav.memory[IMU_PLACE], nav.memory[IMU_PLACE + 1], nav.memory[IMU_PLACE + 2]
+    t = ATTITUDE
+    for i in range(3):
+        r0, r1, r2 = turned[i, 0], turned[i, 1], turned[i, 2]
+        # Row of R [lever]x: how the origin moves against the IMU when the belief turns.
+        g0, g1, g2 = r1 * c - r2 * b, r2 * a - r0 * c, r0 * b - r1 * a
+        both = g0 * p[i, t] + g1 * p[i, t + 1] + g2 * p[i, t + 2]
+        variance = p[i, i] + 2.0 * both + _variance_by_attitude(nav, g0, g1, g2)
+        out[LOG_SIGMA + i] = math.sqrt(max(variance, 0.0))
+    sine, cosine = math.sin(latest[3]), math.cos(latest[3])
+    slope, level = math.tan(latest[4]), math.cos(latest[4])
+    out[LOG_SIGMA + 3] = math.sqrt(_variance_by_attitude(nav, 1.0, sine * slope, cosine * slope))
+    out[LOG_SIGMA + 4] = math.sqrt(_variance_by_attitude(nav, 0.0, cosine, -sine))
+    out[LOG_SIGMA + 5] = math.sqrt(_variance_by_attitude(nav, 0.0, sine / level, cosine / level))
+    out[LOG_SIGMA + 6] = nav.memory[ALTITUDE_SIGMA]
+    for i in range(BEAMS):
+        out[LOG_RANGE + i] = nav.readings[RANGE + i]
+    for i in range(6):
+        out[LOG_USED + i] = nav.counts[i, USED]
+        out[LOG_REJECTED + i] = nav.counts[i, REJECTED]

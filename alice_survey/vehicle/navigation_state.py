@@ -1,0 +1,204 @@
+"""What the navigation keeps from tick to tick, where each number lies, and how it begins."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from alice_survey.errors import VehicleError
+from alice_survey.frames import Array
+from alice_survey.vehicle.sensors import IMU, Sensors
+from alice_survey.vehicle.signals import ESTIMATE
+
+POSITION, VELOCITY, ATTITUDE, GYRO_BIAS, ACCELEROMETER_BIAS = 0, 3, 6, 9, 12
+HEADING_BIAS, DEPTH_BIAS, DVL_SCALE, DVL_ANGLE, DVL_BIAS, GPS_BIAS, WATER = (
+    15, 16, 17, 18, 19, 21, 23,
+)  # fmt: skip
+"""Where the errors begin in the error state (25,): position and velocity of the IMU in NED, its
+attitude in the body frame, its biases, then the compass's, the depth's, scale and misalignment of
+the DVL, its bias of surge and sway, the GPS's bias of north and east, and the current."""
+ERROR = 25
+QUATERNION = 6
+NOMINAL = ERROR + 1
+"""Length of the nominal state: as the error state, with a quaternion (4) for the attitude (3), so
+that what follows the attitude lies one place further on."""
+HIDDEN = WATER - GYRO_BIAS
+"""How many true errors the instruments have; `hidden[i]` is estimated by error `GYRO_BIAS + i`."""
+
+TURN, PUSH, RATES, HEADING, DEPTH, RANGE, BEAM, WATER_BEAM = 0, 3, 6, 9, 10, 11, 15, 19
+DVL_VELOCITY, WATER_VELOCITY, GPS_FIX, USBL_FIX = 23, 26, 29, 31
+HEADING_TIME, DEPTH_TIME, DVL_TIME, WATER_TIME, GPS_TIME, USBL_TIME = 33, 34, 35, 36, 37, 38
+"""Where each instrument's latest reading lies in `readings`, and when it was taken:
+increments of angle (3) and velocity (3) over the tick, rates (3), heading, depth, ranges (4) and
+velocities (4) along the beams, velocities through the water (4), bottom and water velocity in the
+body frame at the DVL (3 each), north and east of the GPS antenna and of the transponder (2 each).
+NaN where nothing was measured."""
+READINGS = 39
+
+COMPASS_USE, DEPTH_USE, DVL_USE, WATER_USE, GPS_USE, USBL_USE = 0, 1, 2, 3, 4, 5
+"""Rows of `counts`."""
+USED, REJECTED, RUN, WIDENED = 0, 1, 2, 3
+"""Columns of `counts`: scalars used and rejected, rejected in a row by now, and how often so many
+in a row made the filter doubt itself."""
+INNOVATIONS = 14
+"""Compass, depth, DVL (4), water (4), GPS (2), USBL (2): places in `innovations`."""
+INNOVATION_AT = (0, 1, 2, 6, 10, 12)
+"""The place of each instrument's first."""
+
+HEADING_TURNS, ALTITUDE_PING, ALTITUDE_TIME, ALTITUDE_VARIANCE, FOLLOWED_DEPTH = 0, 1, 2, 3, 4
+RELIEF_VARIANCE, RELIEF_PINGS, ALTITUDE_NOW, ALTITUDE_SIGMA = 5, 6, 7, 8
+IMU_PLACE, LATEST = 9, 12
+MEMORY = LATEST + ESTIMATE
+"""Places in `memory`: the heading not wrapped; altitude of the followed point, its time, variance
+and depth at the last ping; the beams' spread; altitude and its sigma now; where the IMU is on the
+body (3); the latest estimate, as `signals` has it (13)."""
+
+TRUTH_BEFORE, TRUTH_NOW, BELIEVED = 0, 1, 2
+"""Rows of `turns`."""
+ROW, GAIN, CORRECTION, EXTRA = 0, 1, 2, 3
+"""Rows of `scratch`; EXTRA has two."""
+
+
+class NavigationState(NamedTuple):
+    """Filter, hidden errors of the instruments, and latest readings; overwritten tick by tick."""
+
+    nominal: Array
+    """(26,) what is believed."""
+    covariance: Array
+    """(25, 25) of truth minus belief."""
+    hidden: Array
+    """(14,) the instruments' true biases, scale and misalignment."""
+    readings: Array
+    innovations: Array
+    """(14,) the tick's innovations over their standard deviations, NaN where none was due."""
+    memory: Array
+    counts: Array
+    """(6, 4) integers."""
+    scratch: Array
+    """(5, 25)"""
+    turns: Array
+    """(3, 3, 3) rotation matrices."""
+
+
+def new_navigation(sensors: Sensors, truth: Array, rng: np.random.Generator) -> NavigationState:
+    """Begin at a fix: draw the instruments' errors, and an estimate that errs as they do.
+
+    The position comes from the GPS and shares its bias, heading and depth likewise from compass and
+    pressure; the covariance says so. Velocity is that of a vehicle believed at rest if it is, and
+    errs by a DVL's noise.
+
+    Args:
+        sensors: the instruments.
+        truth: (13,) position NED, quaternion, velocity over ground NED, body rates.
+        rng: where all errors come from.
+
+    Raises:
+        VehicleError: truth is no finite state.
+    """
+    from scipy.spatial.transform import Rotation
+
+    from alice_survey.frames import rotation_from_attitude
+
+    if truth.shape != (13,) or not np.all(np.isfinite(truth)):
+        raise VehicleError("navigation begins at a state that is no finite (13,) vector")
+    covariance = initial_covariance(sensors)
+    hidden_sigma = np.sqrt(np.diag(covariance)[GYRO_BIAS:WATER])
+    hidden = hidden_sigma * rng.standard_normal(HIDDEN)
+    bias_of = {i: hidden[i - GYRO_BIAS] for i in range(GYRO_BIAS, WATER)}
+    attitude = Rotation.from_quat(truth[3:7])
+    rates, lever = truth[10:13], sensors.place[IMU]
+
+    nominal = np.zeros(NOMINAL)
+    fix_error = np.array([bias_of[GPS_BIAS], bias_of[GPS_BIAS + 1], bias_of[DEPTH_BIAS]])
+    fix_noise = np.array([sensors.gps_noise, sensors.gps_noise, sensors.pressure_noise])
+    nominal[:3] = truth[:3] + attitude.apply(lever)
+    nominal[:3] += fix_error + fix_noise * rng.standard_normal(3)
+    nominal[3:6] = truth[7:10] + attitude.apply(np.cross(rates, lever))
+    nominal[3:6] += _velocity_sigma(sensors) * rng.standard_normal(3)
+    tilt = sensors.tilt_sigma * rng.standard_normal(2)
+    turn = bias_of[HEADING_BIAS] + sensors.compass_noise * rng.standard_normal()
+    # The compass errs about the vertical, the tilt about the level axes of the body.
+    believed = rotation_from_attitude(0.0, 0.0, turn) * attitude * Rotation.from_rotvec([*tilt, 0])
+    nominal[QUATERNION : QUATERNION + 4] = believed.as_quat()
+    # In the body frame the vertical leans by roll and pitch.
+    down = believed.inv().apply([0.0, 0.0, 1.0])
+    heading_variance = sensors.compass_bias_sigma**2 + sensors.compass_noise**2
+    block = slice(ATTITUDE, ATTITUDE + 3)
+    covariance[block, block] = np.diag([sensors.tilt_sigma**2, sensors.tilt_sigma**2, 0.0])
+    covariance[block, block] += heading_variance * np.outer(down, down)
+    covariance[block, HEADING_BIAS] = -(sensors.compass_bias_sigma**2) * down
+    covariance[HEADING_BIAS, block] = covariance[block, HEADING_BIAS]
+    memory = np.full(MEMORY, np.nan)
+    rotation = believed.as_matrix()
+    memory[HEADING_TURNS] = math.atan2(rotation[1, 0], rotation[0, 0])
+    memory[RELIEF_VARIANCE] = memory[RELIEF_PINGS] = 0.0
+    memory[IMU_PLACE : IMU_PLACE + 3] = lever
+    return NavigationState(
+        nominal=nominal,
+        covariance=covariance,
+        hidden=hidden,
+        readings=np.full(READINGS, np.nan),
+        innovations=np.full(INNOVATIONS, np.nan),
+        memory=memory,
+        counts=np.zeros((6, 4), dtype=np.int64),
+        scratch=np.zeros((5, ERROR)),
+        turns=np.zeros((3, 3, 3)),
+    )
+
+
+def initial_covariance(sensors: Sensors) -> Array:
+    """(25, 25) at the start, of a level vehicle.
+
+    A fix that errs by bias and noise leaves a position that errs the other way: truth minus belief
+    is minus the bias minus the noise.
+    """
+    sigma = np.zeros(ERROR)
+    sigma[GYRO_BIAS : GYRO_BIAS + 3] = sensors.gyro_bias_sigma
+    sigma[ACCELEROMETER_BIAS : ACCELEROMETER_BIAS + 3] = sensors.accelerometer_bias_sigma
+    sigma[HEADING_BIAS] = sensors.compass_bias_sigma
+    sigma[DEPTH_BIAS] = sensors.pressure_bias_sigma
+    sigma[DVL_SCALE], sigma[DVL_ANGLE] = sensors.scale_sigma, sensors.misalignment_sigma
+    sigma[DVL_BIAS : DVL_BIAS + 2] = sensors.dvl_bias_sigma
+    sigma[GPS_BIAS : GPS_BIAS + 2] = sensors.gps_bias_sigma
+    sigma[WATER : WATER + 2] = sensors.water_sigma
+    sigma[VELOCITY : VELOCITY + 3] = _velocity_sigma(sensors)
+    covariance = np.diag(sigma**2)
+    for axis, bias, noise in (
+        (POSITION, GPS_BIAS, sensors.gps_noise),
+        (POSITION + 1, GPS_BIAS + 1, sensors.gps_noise),
+        (POSITION + 2, DEPTH_BIAS, sensors.pressure_noise),
+    ):
+        covariance[axis, axis] = covariance[bias, bias] + noise**2
+        covariance[axis, bias] = covariance[bias, axis] = -covariance[bias, bias]
+    return covariance
+
+
+def _velocity_sigma(sensors: Sensors) -> float:
+    """Of each axis at the start: at rest, known to a few of the DVL's pings."""
+    return 2.0 * sensors.beam_noise + sensors.dvl_bias_sigma
+
+
+def estimation_error(
+    navigation: NavigationState, sensors: Sensors, truth: Array, water_ned: Array
+) -> Array:
+    """Truth minus belief, (25,), in the order and frames of the covariance.
+
+    Args:
+        navigation: what is believed.
+        sensors: the instruments.
+        truth: (13,) now.
+        water_ned: (2,) or more: the current now, north and east.
+    """
+    from scipy.spatial.transform import Rotation
+
+    nominal = navigation.nominal
+    attitude = Rotation.from_quat(truth[3:7])
+    lever = sensors.place[IMU]
+    error = np.empty(ERROR)
+    error[:3] = truth[:3] + attitude.apply(lever) - nominal[:3]
+    error[3:6] = truth[7:10] + attitude.apply(np.cross(truth[10:13], lever)) - nominal[3:6]
+    believed = Rotation.from_quat(nominal[QUATERNION : QUATERNION + 4])
+    error[ATTITUDE : ATTITUDE + 3] = (believed.inv() * attitude).as_rotvec()
+    error[GYRO_BIAS:WATER] = navigation.hidden - nominal[GYRO_BIAS + 1 : WATER + 1]
+    error[WATER:] = water_ned[:2] - nominal[WATER + 1 :]
+    return error

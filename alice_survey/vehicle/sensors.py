@@ -1,0 +1,375 @@
+"""What the vehicle carries to know where it is, and how well each instrument measures.
+
+Values are those of instruments a SPARUS II carries or could: an AHRS of the Xsens MTi-300 class, a
+DVL of the 600 kHz to 1 MHz Janus class, a strain-gauge pressure sensor, a GPS receiver, and an
+ultra-short-baseline transponder of the SeaTrac class. Read: the MTi-300 leaflet (Movella 2023:
+gyroscope 0.01 deg/s/sqrt(Hz) and 10 deg/h in run, accelerometer 60 ug/sqrt(Hz) and 15 ug in run,
+roll and pitch 0.2 deg, heading 1 deg rms); the MTi user manual (GPS/INS 1.0 m horizontally); Sea-
+Bird application note 27Druck (0.1 % of full scale); VideoRay on the Nortek DVL (75 m); a maker's
+thread on the Water Linked A50 (0.1 to 1 % in the long run). Other numbers are marked inferred.
+
+Positions are those of the SPARUS II scenario of Stonefish, x from the vertical thruster, as all
+positions on the body here.
+
+Not simulated: the Earth's rotation (0.004 deg/s, hidden in the gyroscope's bias), sensors' latency,
+and a compass error that varies with heading.
+"""
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from alice_survey.errors import VehicleError
+from alice_survey.frames import Array
+from alice_survey.vehicle.dynamics import GRAVITY
+
+Place = tuple[float, float, float]
+
+IMU, DVL, PRESSURE, GPS, USBL, FOLLOWED = 0, 1, 2, 3, 4, 5
+"""Rows of `Sensors.place`."""
+BEAMS = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImuSpec:
+    """Gyroscopes and accelerometers, read as increments over each tick.
+
+    White noise is given by its random walk, a bias by its value at the start and its own walk.
+    """
+
+    position_body_m: Place = (0.364, -0.021, -0.085)
+    gyro_noise_rad_per_sqrt_s: float = math.radians(0.01)
+    gyro_bias_sigma_radps: float = math.radians(0.01)
+    """At the start, after a rest on deck (inferred)."""
+    gyro_bias_walk_radps_per_sqrt_s: float = math.radians(10.0 / 3600.0) / 60.0
+    """Reaches the stability in run after an hour (inferred)."""
+    accelerometer_noise_mps_per_sqrt_s: float = 60e-6 * GRAVITY
+    accelerometer_bias_sigma_mps2: float = GRAVITY * math.radians(0.2)
+    """What the accuracy of roll and pitch at rest amounts to (inferred)."""
+    accelerometer_bias_walk_mps2_per_sqrt_s: float = 15e-6 * GRAVITY / 60.0
+    tilt_sigma_rad: float = math.radians(0.2)
+    """Of roll and of pitch at the start."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompassSpec:
+    """Heading of the AHRS: a slowly varying bias and white noise."""
+
+    rate_hz: float = 10.0
+    noise_rad: float = math.radians(0.3)
+    """Inferred."""
+    bias_sigma_rad: float = math.radians(1.0)
+    bias_correlation_s: float = 3600.0
+    """Inferred."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DvlSpec:
+    """A Doppler velocity log with four beams in Janus arrangement, 45 degrees off the bow."""
+
+    position_body_m: Place = (-0.4145, 0.0, 0.11)
+    rate_hz: float = 5.0
+    beam_angle_rad: float = math.radians(30.0)
+    beam_noise_mps: float = 0.0035
+    """Along a beam at rest, a ping: 5 mm/s horizontally (inferred)."""
+    beam_noise_per_speed: float = 0.002
+    """Added, of the speed over ground (inferred)."""
+    scale_sigma: float = 0.002
+    """Constant: the speed of sound and the beams' angle."""
+    bias_sigma_mps: float = 0.001
+    """Constant, of surge and of sway (inferred)."""
+    misalignment_sigma_rad: float = math.radians(0.2)
+    """Constant, about the vertical, left by calibration (inferred)."""
+    range_noise_m: float = 0.02
+    range_noise_fraction: float = 0.003
+    """Added in squares, of the range (both inferred)."""
+    least_range_m: float = 0.2
+    """Inferred."""
+    most_range_m: float = 75.0
+    most_tilt_rad: float = math.radians(25.0)
+    """Of the instrument's axis from the vertical (inferred)."""
+    ping_loss: float = 0.01
+    beam_loss: float = 0.01
+    """Probabilities of no echo (inferred)."""
+    outlier_probability: float = 0.001
+    """That a beam hears something else, a fish or a second echo (inferred)."""
+    outlier_mps: float = 2.0
+    """Half width of what it then reports."""
+    dropouts_s: tuple[tuple[float, float], ...] = ()
+    """Times (from, to) without any echo."""
+    water_every: int = 5
+    """Every so many pings listen to the water; 0: none does. Without bottom lock all do."""
+    water_noise_mps: float = 0.01
+    """Along a beam (inferred)."""
+    water_least_altitude_m: float = 6.0
+    """The layer must lie clear of the bottom's echo (inferred)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PressureSpec:
+    """Depth from pressure, set to zero at the surface."""
+
+    position_body_m: Place = (0.387, 0.0, -0.033)
+    rate_hz: float = 10.0
+    noise_m: float = 0.01
+    """Inferred."""
+    bias_sigma_m: float = 0.05
+    """A quarter of 0.1 % of 200 m: what the surface does not take away (inferred)."""
+    bias_correlation_s: float = 3600.0
+    """Inferred."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GpsSpec:
+    """Position while the antenna is above water: a slowly varying bias and white noise."""
+
+    position_body_m: Place = (-0.39, 0.0, -0.36)
+    rate_hz: float = 1.0
+    noise_m: float = 0.3
+    """Inferred."""
+    bias_sigma_m: float = 1.0
+    bias_correlation_s: float = 600.0
+    """Inferred."""
+    most_depth_m: float = 0.3
+    """Of the body's origin, with a fix."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class UsblSpec:
+    """Horizontal position by an acoustic transceiver under a boat; off unless it has a rate."""
+
+    position_body_m: Place = (-0.39, 0.0, -0.25)
+    """Of the transponder, on the mast (inferred)."""
+    rate_hz: float = 0.0
+    boat_ned_m: Place = (0.0, 0.0, 1.0)
+    """Of the transceiver."""
+    noise_m: float = 0.5
+    """The boat's own position (inferred)."""
+    noise_fraction: float = 0.0175
+    """Added in squares, of the slant range: 1 degree (SeaTrac class, inferred)."""
+    outlier_probability: float = 0.05
+    """Inferred."""
+    outlier_m: float = 20.0
+    """Half width of an echo's place about the true one (inferred)."""
+    most_range_m: float = 1000.0
+
+
+class Sensors(NamedTuple):
+    """The suite as compiled code sees it; `every` counts ticks, 0 is never."""
+
+    tick_s: float
+    place: Array
+    """(6, 3) of the instruments and of the followed point on the body."""
+    beams: Array
+    """(4, 3) unit vectors in the body frame."""
+    dropouts_s: Array
+    """(K, 2)"""
+    gyro_noise: float
+    gyro_walk: float
+    accelerometer_noise: float
+    accelerometer_walk: float
+    gyro_bias_sigma: float
+    accelerometer_bias_sigma: float
+    tilt_sigma: float
+    compass_every: int
+    compass_noise: float
+    compass_bias_sigma: float
+    compass_bias_s: float
+    pressure_every: int
+    pressure_noise: float
+    pressure_bias_sigma: float
+    pressure_bias_s: float
+    dvl_every: int
+    beam_noise: float
+    beam_noise_per_speed: float
+    scale_sigma: float
+    dvl_bias_sigma: float
+    misalignment_sigma: float
+    range_noise: float
+    range_noise_fraction: float
+    least_range: float
+    most_range: float
+    least_cos_tilt: float
+    ping_loss: float
+    beam_loss: float
+    dvl_outlier_probability: float
+    dvl_outlier: float
+    water_every: int
+    water_noise: float
+    water_least_altitude: float
+    water_sigma: float
+    water_s: float
+    gps_every: int
+    gps_noise: float
+    gps_bias_sigma: float
+    gps_bias_s: float
+    gps_most_depth: float
+    usbl_every: int
+    boat_north: float
+    boat_east: float
+    boat_depth: float
+    usbl_noise: float
+    usbl_noise_fraction: float
+    usbl_outlier_probability: float
+    usbl_outlier: float
+    usbl_most_range: float
+    gate: float
+    altitude_age_s: float
+    relief_memory_s: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorSuite:
+    """All instruments, and how the filter treats them."""
+
+    imu: ImuSpec = field(default_factory=ImuSpec)
+    compass: CompassSpec = field(default_factory=CompassSpec)
+    dvl: DvlSpec = field(default_factory=DvlSpec)
+    pressure: PressureSpec = field(default_factory=PressureSpec)
+    gps: GpsSpec = field(default_factory=GpsSpec)
+    usbl: UsblSpec = field(default_factory=UsblSpec)
+    current_sigma_mps: float = 0.3
+    """Of north and of east each: the filter's belief in currents, a Gauss-Markov process."""
+    current_correlation_s: float = 3600.0
+    gate_sigmas: float = 5.0
+    """A measurement farther from its prediction is not used; by chance 1 in 1.7 million is."""
+    followed_body_m: Place = (0.55, -0.05, 0.08)
+    """The point whose altitude is told: the left port's outer glass."""
+    altitude_age_s: float = 2.0
+    """An altitude whose last ping is older is not told."""
+    relief_memory_s: float = 10.0
+    """Over which the spread of the beams is averaged; their own footprint at survey speed."""
+
+    def pack(self, tick_s: float = 0.05) -> Sensors:
+        """For compiled code.
+
+        Args:
+            tick_s: between calls of the navigation.
+
+        Raises:
+            VehicleError: an instrument's period is no whole number of ticks, or a number is out of
+                its range.
+        """
+        imu, compass, dvl, pressure = self.imu, self.compass, self.dvl, self.pressure
+        gps, usbl = self.gps, self.usbl
+        self._check()
+        return Sensors(
+            tick_s=tick_s,
+            place=np.array(
+                [
+                    imu.position_body_m, dvl.position_body_m, pressure.position_body_m,
+                    gps.position_body_m, usbl.position_body_m, self.followed_body_m,
+                ], dtype=np.float64,
+            ),
+            beams=janus_beams(dvl.beam_angle_rad),
+            dropouts_s=np.array(dvl.dropouts_s, dtype=np.float64).reshape(-1, 2),
+            gyro_noise=imu.gyro_noise_rad_per_sqrt_s,
+            gyro_walk=imu.gyro_bias_walk_radps_per_sqrt_s,
+            accelerometer_noise=imu.accelerometer_noise_mps_per_sqrt_s,
+            accelerometer_walk=imu.accelerometer_bias_walk_mps2_per_sqrt_s,
+            gyro_bias_sigma=imu.gyro_bias_sigma_radps,
+            accelerometer_bias_sigma=imu.accelerometer_bias_sigma_mps2,
+            tilt_sigma=imu.tilt_sigma_rad,
+            compass_every=_ticks("compass", compass.rate_hz, tick_s),
+            compass_noise=compass.noise_rad,
+            compass_bias_sigma=compass.bias_sigma_rad,
+            compass_bias_s=compass.bias_correlation_s,
+            pressure_every=_ticks("pressure sensor", pressure.rate_hz, tick_s),
+            pressure_noise=pressure.noise_m,
+            pressure_bias_sigma=pressure.bias_sigma_m,
+            pressure_bias_s=pressure.bias_correlation_s,
+            dvl_every=_ticks("DVL", dvl.rate_hz, tick_s),
+            beam_noise=dvl.beam_noise_mps,
+            beam_noise_per_speed=dvl.beam_noise_per_speed,
+            scale_sigma=dvl.scale_sigma,
+            dvl_bias_sigma=dvl.bias_sigma_mps,
+            misalignment_sigma=dvl.misalignment_sigma_rad,
+            range_noise=dvl.range_noise_m,
+            range_noise_fraction=dvl.range_noise_fraction,
+            least_range=dvl.least_range_m,
+            most_range=dvl.most_range_m,
+            least_cos_tilt=math.cos(dvl.most_tilt_rad),
+            ping_loss=dvl.ping_loss,
+            beam_loss=dvl.beam_loss,
+            dvl_outlier_probability=dvl.outlier_probability,
+            dvl_outlier=dvl.outlier_mps,
+            water_every=dvl.water_every,
+            water_noise=dvl.water_noise_mps,
+            water_least_altitude=dvl.water_least_altitude_m,
+            water_sigma=self.current_sigma_mps,
+            water_s=self.current_correlation_s,
+            gps_every=_ticks("GPS", gps.rate_hz, tick_s),
+            gps_noise=gps.noise_m,
+            gps_bias_sigma=gps.bias_sigma_m,
+            gps_bias_s=gps.bias_correlation_s,
+            gps_most_depth=gps.most_depth_m,
+            usbl_every=_ticks("USBL", usbl.rate_hz, tick_s),
+            boat_north=usbl.boat_ned_m[0],
+            boat_east=usbl.boat_ned_m[1],
+            boat_depth=usbl.boat_ned_m[2],
+            usbl_noise=usbl.noise_m,
+            usbl_noise_fraction=usbl.noise_fraction,
+            usbl_outlier_probability=usbl.outlier_probability,
+            usbl_outlier=usbl.outlier_m,
+            usbl_most_range=usbl.most_range_m,
+            gate=self.gate_sigmas**2,
+            altitude_age_s=self.altitude_age_s,
+            relief_memory_s=self.relief_memory_s,
+        )  # fmt: skip
+
+    def _check(self) -> None:
+        noises = {
+            "the gyroscopes' noise": self.imu.gyro_noise_rad_per_sqrt_s,
+            "the accelerometers' noise": self.imu.accelerometer_noise_mps_per_sqrt_s,
+            "the compass's noise": self.compass.noise_rad,
+            "the pressure sensor's noise": self.pressure.noise_m,
+            "the DVL's noise": self.dvl.beam_noise_mps,
+            "the DVL's noise in water": self.dvl.water_noise_mps,
+            "the DVL's range noise": self.dvl.range_noise_m,
+            "the GPS's noise": self.gps.noise_m,
+            "the USBL's noise": self.usbl.noise_m,
+            "the compass's correlation time": self.compass.bias_correlation_s,
+            "the pressure sensor's correlation time": self.pressure.bias_correlation_s,
+            "the GPS's correlation time": self.gps.bias_correlation_s,
+            "the current's correlation time": self.current_correlation_s,
+            "gate_sigmas": self.gate_sigmas,
+            "relief_memory_s": self.relief_memory_s,
+        }
+        for name, value in noises.items():
+            if not (value > 0 and math.isfinite(value)):
+                raise VehicleError(f"{name} is {value:g}: the filter needs more than 0")
+        for start, end in self.dvl.dropouts_s:
+            if not start < end:
+                raise VehicleError(f"a DVL drop-out from {start:g} s to {end:g} s ends too early")
+
+
+def janus_beams(angle_rad: float) -> Array:
+    """Directions, (4, 3), of beams so far off the vertical, 45, 135, 225, 315 degrees off the bow.
+
+    Opposite beams are 0 and 2, 1 and 3.
+    """
+    azimuth = np.deg2rad([45.0, 135.0, 225.0, 315.0])
+    return np.column_stack(
+        [
+            math.sin(angle_rad) * np.cos(azimuth),
+            math.sin(angle_rad) * np.sin(azimuth),
+            np.full(BEAMS, math.cos(angle_rad)),
+        ]
+    )
+
+
+def _ticks(name: str, rate_hz: float, tick_s: float) -> int:
+    """Ticks between measurements; 0 at no rate."""
+    if rate_hz == 0:
+        return 0
+    if rate_hz < 0:
+        raise VehicleError(f"the {name}'s rate of {rate_hz:g} Hz is below 0")
+    ticks = 1.0 / (rate_hz * tick_s)
+    if round(ticks) < 1 or abs(ticks - round(ticks)) > 1e-6:
+        raise VehicleError(
+            f"the {name} at {rate_hz:g} Hz measures every {ticks:g} ticks of {tick_s:g} s: choose "
+            f"a rate of {1 / tick_s:g} Hz divided by a whole number"
+        )
+    return round(ticks)
