@@ -1,35 +1,37 @@
-"""The vehicles that are known by name: ALICE and the SPARUS II it was built from."""
+"""The vehicles that are known by name: ALICE and the SPARUS II it was built from.
+
+Sources as in `hydrodynamics.geometry`: "model" is the public model of SPARUS II in Stonefish,
+"Toulon" the model of the same vehicle in the MIR course there (Parameters.m).
+"""
+
+from functools import cache
+from typing import Literal
 
 from alice_survey.errors import VehicleError
 from alice_survey.vehicle.coefficients import Coefficients
+from alice_survey.vehicle.hydrodynamics.entrained import entrained_water
+from alice_survey.vehicle.hydrodynamics.estimate import estimate
+from alice_survey.vehicle.hydrodynamics.geometry import (
+    ALICE,
+    ALICE_PROPELLER_X_M,
+    PROPELLER_X_M,
+    SPARUS2,
+    Geometry,
+)
+from alice_survey.vehicle.hydrodynamics.paper_tables import CALIBRATED, CFD, ESTIMATED
 from alice_survey.vehicle.propulsion import Thruster
 from alice_survey.vehicle.vehicle import RigidBody, Vehicle
 
-_ESTIMATED = {
-    "X_udot": -2.806, "Y_vdot": -78.459, "Y_rdot": -8.529, "K_vdot": -0.216, "K_pdot": -0.042,
-    "N_pdot": 0.102, "Z_wdot": -69.536, "M_udot": 0.0321, "M_wdot": 11.253, "M_qdot": -20.963,
-    "N_rdot": -22.537, "X_uu": -7.616, "Y_vv": -214.398, "Z_ww": -214.398, "M_ww": 26.634,
-    "N_vv": -26.17, "K_pp": -0.192, "K_vv": -3.397, "M_qq": -180.682, "N_rr": -180.381,
-    "M_uu": 0.144, "K_rr": 0.753, "Y_uv": -39.71, "Z_uw": -39.71, "M_uw": -8.498, "N_uv": 8.498,
-}  # fmt: skip
-_CFD = {
-    "X_uu": -8.375, "M_uu": 0.9, "Y_vv": -146.95, "K_vv": -6.5, "N_vv": -12.675, "N_rr": -26.377,
-    "K_rr": 0.558, "K_pp": -0.287, "M_qq": -34.551, "Z_ww": -174.525, "M_ww": 11.4,
-    "Y_uv": -35.428, "Z_uw": -35.428, "M_uw": -3.37, "N_uv": 3.37,
-}  # fmt: skip
-_CALIBRATED = {
-    "X_udot": -28.06, "Y_vdot": -23.53, "Y_rdot": -2.559, "Z_wdot": -27.812, "M_wdot": 5.626,
-    "M_qdot": -10.481, "N_rdot": -11.268, "X_uu": -15.23, "Y_vv": -321.597, "Z_ww": -326.169,
-    "M_ww": 0.096, "N_vv": -1.954, "N_rr": -54.114,
-}  # fmt: skip
-
-ESTIMATED = Coefficients(name="estimated", values=_ESTIMATED)
-CFD = ESTIMATED.replaced("cfd", _CFD)
-CALIBRATED = CFD.replaced("calibrated", _CALIBRATED)
-
+DENSITY = 1025.0
+"""Of sea water, kg/m^3; the paper's tables hold for it."""
+GEOMETRIES = {"alice": ALICE, "sparus2": SPARUS2}
+PAPER_SETS = {"estimated": ESTIMATED, "cfd": CFD, "calibrated": CALIBRATED}
+SETS = (*PAPER_SETS, "computed")
+"""Names of the sets of coefficients: the paper's, and `computed` from the vehicle's geometry. The
+paper's are of ALICE; with `sparus2` they stand for a hull 0.4 m shorter."""
 
 _MERIT = 0.07 / 0.4566**1.5
-"""k_q over k_t^1.5 of a Wageningen B propeller with three blades, blade area ratio 0.718, pitch 1.0,
+"""k_q over k_t^1.5 of a Wageningen B propeller with three blades, blade area ratio 0.718, pitch 1,
 in water at rest (k_t 0.4566, k_q 0.0700; T. I. Fossen's MSS toolbox, remus100): 0.227. No torque of
 these propellers could be found: inferred to be as good as that one, both ways. Momentum theory asks
 for 0.090 at least; Stonefish's k_q of 0.01 for a k_t of 0.698 is 0.017."""
@@ -55,6 +57,11 @@ _JET_DRAG = (0.565993917435650, 7.608906885747783, 0.056535966126787, 0.89679150
 tunnels of 70 mm, nearly ALICE's."""
 
 
+_T200_KT, _T200_KT_REVERSE = 0.472, 0.398
+"""Blue Robotics' charts: 4.48e-6 and 3.78e-6 N per rpm^2 up to some 3400 rpm. At most 56.5 rev/s,
+51.5 N: what it reaches on 16 V."""
+
+
 def _kq(kt: float) -> float:
     return float(_MERIT * kt**1.5)
 
@@ -62,18 +69,19 @@ def _kq(kt: float) -> float:
 def _t200(name: str, x_m: float) -> Thruster:
     return Thruster(
         name=name, kind="tunnel", position_body_m=(x_m, 0.0, 0.0), direction_body=(0.0, 1.0, 0.0),
-        diameter_m=0.076, kt_forward=0.47, kt_reverse=0.40, kq_forward=_kq(0.47),
-        kq_reverse=_kq(0.40), handedness=1, most_rps=55.0, dead_band_rps=5.0, time_constant_s=0.15,
-        advance_slope=0.47 * _KT_FALL, torque_slope=_kq(0.47) * _KQ_FALL, jet_loss=_JET_LOSS,
-        jet_drag=_JET_DRAG, efficiency=_EFFICIENCY,
+        diameter_m=0.076, kt_forward=_T200_KT, kt_reverse=_T200_KT_REVERSE,
+        kq_forward=_kq(_T200_KT), kq_reverse=_kq(_T200_KT_REVERSE), handedness=1,
+        most_rps=56.5, dead_band_rps=5.0, time_constant_s=0.15,
+        advance_slope=_T200_KT * _KT_FALL, torque_slope=_kq(_T200_KT) * _KQ_FALL,
+        jet_loss=_JET_LOSS, jet_drag=_JET_DRAG, efficiency=_EFFICIENCY,
     )  # fmt: skip
 
 
-def _main(name: str, y_m: float, handedness: int) -> Thruster:
+def _main(name: str, x_m: float, y_m: float, handedness: Literal[-1, 1]) -> Thruster:
     return Thruster(
-        name=name, kind="open", position_body_m=(-0.573, y_m, 0.0), direction_body=(1.0, 0.0, 0.0),
+        name=name, kind="open", position_body_m=(x_m, y_m, 0.0), direction_body=(1.0, 0.0, 0.0),
         diameter_m=0.08, kt_forward=0.698, kt_reverse=0.293, kq_forward=_kq(0.698),
-        kq_reverse=_kq(0.293), handedness=1 if handedness > 0 else -1, most_rps=50.0,
+        kq_reverse=_kq(0.293), handedness=handedness, most_rps=50.0,
         dead_band_rps=2.0, time_constant_s=0.8, advance_slope=0.698 * _KT_FALL,
         torque_slope=_kq(0.698) * _KQ_FALL, thrust_deduction=_DEDUCTION, wake_fraction=_WAKE,
         efficiency=_EFFICIENCY,
@@ -87,28 +95,60 @@ _HEAVE = Thruster(
     time_constant_s=0.4, advance_slope=0.537 * _KT_FALL, torque_slope=_kq(0.537) * _KQ_FALL,
     jet_loss=_JET_LOSS, jet_drag=_JET_DRAG, efficiency=_EFFICIENCY,
 )  # fmt: skip
-_RIGID = RigidBody(
-    dry_kg=52.0, buoyancy_kg=52.0, entrained_kg=23.0, cg_body_m=(0.0, 0.0, 0.0365),
-    inertia_kg_m2=(0.52, 7.47, 7.39), entrained_inertia_kg_m2=(0.15, 10.0, 10.0),
-)  # fmt: skip
+
+
+@cache
+def _rigid_body(geometry: Geometry) -> RigidBody:
+    """The dry vehicle and the water inside.
+
+    52 kg weighed, 52.1 kg displaced (paper; Toulon): it floats up by 1 N when nothing holds it. Its
+    centre of gravity is 0.0365 m below the centre of buoyancy (model; Toulon has 0.02) and no
+    further forward: it is trimmed level. Its inertia is the model's of SPARUS II (computed from its
+    parts); ALICE's own is not published, and its dry section is the same.
+    """
+    dry_kg, buoyancy_kg = 52.0, 52.1
+    inside = entrained_water(geometry, buoyancy_kg, DENSITY)
+    return RigidBody(
+        dry_kg=dry_kg,
+        buoyancy_kg=buoyancy_kg,
+        entrained_kg=inside.mass_kg,
+        cg_body_m=(0.0, 0.0, 0.0365),
+        inertia_kg_m2=(0.52, 7.47, 7.39),
+        entrained_cg_body_m=(inside.x_m, 0.0, 0.0),
+        entrained_inertia_kg_m2=inside.inertia_kg_m2,
+    )
+
+
+def _thrusters(name: str) -> tuple[Thruster, ...]:
+    """The surge pair turns in opposite senses, the port one by the right hand (model)."""
+    aft = ALICE_PROPELLER_X_M if name == "alice" else PROPELLER_X_M
+    lateral = (_t200(t.name, t.x_m) for t in GEOMETRIES[name].tunnels if t.axis == "y")
+    return (_main("starboard", aft, 0.167, -1), _main("port", aft, -0.167, 1), _HEAVE, *lateral)
+
+
+@cache
+def _computed(name: str) -> Coefficients:
+    return estimate(GEOMETRIES[name])
 
 
 def vehicle(name: str, coefficients: str = "calibrated") -> Vehicle:
     """A vehicle by its name, `alice` or `sparus2`, with a named set of coefficients.
 
+    Args:
+        name: of the vehicle.
+        coefficients: `estimated`, `cfd` or `calibrated`, the paper's; or `computed` from its shape.
+
     Raises:
         VehicleError: a name is not known.
     """
-    sets = {"estimated": ESTIMATED, "cfd": CFD, "calibrated": CALIBRATED}
-    if coefficients not in sets:
-        raise VehicleError(f"coefficients {coefficients!r} are not known; known: {', '.join(sets)}")
-    horizontal = (_main("starboard", 0.167, -1), _main("port", -0.167, 1))
-    thrusters = {
-        "alice": (*horizontal, _HEAVE, _t200("bow", 0.86), _t200("stern", -0.76)),
-        "sparus2": (*horizontal, _HEAVE),
-    }
-    if name not in thrusters:
-        raise VehicleError(f"vehicle {name!r} is not known; known: {', '.join(thrusters)}")
+    if coefficients not in SETS:
+        raise VehicleError(f"coefficients {coefficients!r} are not known; known: {', '.join(SETS)}")
+    if name not in GEOMETRIES:
+        raise VehicleError(f"vehicle {name!r} is not known; known: {', '.join(GEOMETRIES)}")
     return Vehicle(
-        name=name, rigid_body=_RIGID, coefficients=sets[coefficients], thrusters=thrusters[name]
+        name=name,
+        rigid_body=_rigid_body(GEOMETRIES[name]),
+        coefficients=PAPER_SETS.get(coefficients) or _computed(name),
+        thrusters=_thrusters(name),
+        density_kg_m3=DENSITY,
     )

@@ -29,13 +29,14 @@ _PLAIN = (
 
 @cache
 def alice(coefficients: str = "calibrated") -> Vehicle:
-    """ALICE with propellers in open water: nothing that hull or flow take from them."""
+    """ALICE trimmed neutral, propellers in open water: nothing that hull or flow take from them."""
     full = fleet.vehicle("alice", coefficients)
     plain = tuple(
         Thruster(**{field: getattr(thruster, field) for field in _PLAIN})
         for thruster in full.thrusters
     )
-    return replace(full, thrusters=plain)
+    neutral = replace(full.rigid_body, buoyancy_kg=full.rigid_body.dry_kg)
+    return replace(full, rigid_body=neutral, thrusters=plain)
 
 
 def block(

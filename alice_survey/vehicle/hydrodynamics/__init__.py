@@ -1,1 +1,1 @@
-"""Hydrodynamic coefficients from geometry, beside those of the paper."""
+"""Hydrodynamic coefficients from a vehicle's geometry, and the tables of the paper."""

@@ -1,0 +1,253 @@
+"""Shapes of SPARUS II and ALICE: what the coefficients are computed from.
+
+Body frame: x forward, y starboard, z down, origin at the centre of buoyancy, where the vertical
+thruster sits (paper, section II). Sources:
+
+- "model": the public model of SPARUS II in Stonefish, stonefish_ros, data/scenarios/sparus2.scn
+  and the vertices of data/sparus2/*_phy.obj, whose x = 0 is the vertical thruster.
+- "paper": Gutnik, Avni, Treibitz and Groper (2021). Its figure of dimensions is not legible; what
+  its tables imply is named "inferred", with the rows it follows from.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from alice_survey.errors import VehicleError
+from alice_survey.vehicle.hydrodynamics.outline import Outline
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mast:
+    """The mast: an upright strut of elliptic section on top of the hull."""
+
+    x_m: float
+    """Of its middle."""
+    chord_m: float
+    """Along x; c_m in the paper."""
+    width_m: float
+    """Across; w_m in the paper."""
+    root_z_m: float
+    """Where it leaves the hull; z points down."""
+    height_m: float
+    """h_m in the paper."""
+
+    @property
+    def middle_z_m(self) -> float:
+        """Halfway up: -(d_h + h_m) / 2 in the paper."""
+        return self.root_z_m - self.height_m / 2.0
+
+    @property
+    def volume_m3(self) -> float:
+        """Of the elliptic cylinder."""
+        return math.pi / 4.0 * self.chord_m * self.width_m * self.height_m
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pod:
+    """A horizontal thruster: a motor body that carries the nozzle; two, mirrored."""
+
+    outline: Outline
+    """Seen from outside, nozzle included."""
+    body_diameter_m: float
+    """Of the motor body without the nozzle; d_th in the paper."""
+    y_m: float
+    """Distance of its axis from the middle plane."""
+
+    @property
+    def body_volume_m3(self) -> float:
+        """Solid volume: the motor body as a cylinder; the nozzle is open."""
+        return math.pi / 4.0 * self.body_diameter_m**2 * self.outline.length_m
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mount:
+    """The arm between hull and pod, on either side, at z = 0."""
+
+    aft_x_m: float
+    fore_x_m: float
+    tip_y_m: float
+    """Where it meets the pod's body: the span b of the finned section."""
+    thickness_m: float
+
+    @property
+    def chord_m(self) -> float:
+        """Along x."""
+        return self.fore_x_m - self.aft_x_m
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tunnel:
+    """A thruster's tunnel through the hull."""
+
+    name: str
+    x_m: float
+    axis: Literal["y", "z"]
+    diameter_m: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Geometry:
+    """All that the coefficients follow from."""
+
+    name: str
+    outline: Outline
+    mast: Mast
+    pod: Pod
+    mount: Mount
+    tunnels: tuple[Tunnel, ...]
+
+    @cached_property
+    def envelope_volume_m3(self) -> float:
+        """Of hull, mast and pods, water inside the hull included."""
+        return self.outline.volume_m3 + self.mast.volume_m3 + 2.0 * self.pod.body_volume_m3
+
+    @cached_property
+    def envelope_x_m(self) -> float:
+        """The x of the centre of the envelope."""
+        pods = 2.0 * self.pod.body_volume_m3
+        moment = (
+            self.outline.volume_m3 * self.outline.volume_x_m
+            + self.mast.volume_m3 * self.mast.x_m
+            + pods * self.pod.outline.volume_x_m
+        )
+        return moment / self.envelope_volume_m3
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThrusterSize:
+    """Room that a lateral thruster takes inside the hull."""
+
+    diameter_m: float
+    """Across its nozzle."""
+    length_m: float
+    """Along its axis, with the motor."""
+    shell_m: float
+    """Thickness of the hull around it."""
+
+
+T200_SIZE = ThrusterSize(diameter_m=0.100, length_m=0.113, shell_m=0.003)
+"""Blue Robotics T200 with its nozzle (inferred: outer sizes rounded); shell 3 mm (model)."""
+
+
+def farthest_tunnel_x(
+    outline: Outline, thruster: ThrusterSize, end: Literal["bow", "stern"]
+) -> float:
+    """Farthest x at which a hull still holds a lateral thruster.
+
+    The rule: the thruster, a cylinder lying athwartships at z = 0, stays inside the outline less
+    the shell: r(x + R cos a) - shell >= hypot(L / 2, R sin a) all around its rims.
+
+    Args:
+        outline: of the hull.
+        thruster: what has to fit.
+        end: of the hull.
+
+    Returns:
+        x of the thruster's axis, metres.
+
+    Raises:
+        VehicleError: it fits nowhere.
+    """
+    angle = np.linspace(0.0, 2.0 * np.pi, 721)
+    radius = thruster.diameter_m / 2.0
+    needed = np.hypot(thruster.length_m / 2.0, radius * np.sin(angle)) + thruster.shell_m
+
+    def fits(x_m: float) -> bool:
+        return bool(np.all(outline.radius_at(x_m + radius * np.cos(angle)) >= needed))
+
+    radii = np.array(outline.radius_m)
+    inside = float(np.mean(np.array(outline.x_m)[radii == radii.max()]))
+    if not fits(inside):
+        raise VehicleError(
+            f"a thruster {thruster.diameter_m:g} m across and {thruster.length_m:g} m long does "
+            f"not fit a hull {outline.diameter_m:g} m thick: take a smaller one"
+        )
+    outside = outline.nose_x_m if end == "bow" else outline.tail_x_m
+    for _ in range(60):
+        middle = (inside + outside) / 2.0
+        inside, outside = (middle, outside) if fits(middle) else (inside, middle)
+    return inside
+
+
+_SPARUS2_HULL = Outline(
+    x_m=(
+        -0.734154, -0.722134, -0.706948, -0.676643, -0.623930, -0.555016, -0.500000,
+        0.764586, 0.784872, 0.805726, 0.823562, 0.840801, 0.850143, 0.854092, 0.854530,
+    ),
+    radius_m=(
+        0.0, 0.017104, 0.031838, 0.053842, 0.081666, 0.106123, 0.115000,
+        0.115000, 0.112172, 0.105355, 0.093810, 0.072545, 0.047782, 0.012134, 0.0,
+    ),
+)  # fmt: skip
+"""Radii of the rings of vertices of hull_phy.obj (model): 1.589 m by 0.230 m, as the paper states
+for SPARUS II. A blunt nose of 0.09 m, a cylinder, a tail that tapers over 0.234 m."""
+
+_POD = Outline(
+    x_m=(
+        -0.611691, -0.565670, -0.557542, -0.412740, -0.396122, -0.383270, -0.376656,
+    ),
+    radius_m=(0.052104, 0.059550, 0.033483, 0.033744, 0.031560, 0.021695, 0.0),
+)  # fmt: skip
+"""Rings of thruster_phy.obj (model): a motor body of 0.067 m, a nozzle of 0.119 m around its
+end."""
+
+SPARUS2 = Geometry(
+    name="sparus2",
+    outline=_SPARUS2_HULL,
+    # antenna_phy.obj (model): x -0.4263 to -0.3496, y +/-0.0198, top at z = -0.368.
+    mast=Mast(x_m=-0.388, chord_m=0.0767, width_m=0.0395, root_z_m=-0.115, height_m=0.253),
+    pod=Pod(outline=_POD, body_diameter_m=0.067, y_m=0.166883),
+    # thruster_phy.obj (model): the arm's root runs from x = -0.515 to -0.346, its tip from -0.514
+    # to -0.380; their mean. z +/-0.0188.
+    mount=Mount(aft_x_m=-0.515, fore_x_m=-0.363, tip_y_m=0.1335, thickness_m=0.0375),
+    # The propeller's diameter (model); the tunnel's own is not published.
+    tunnels=(Tunnel(name="vertical", x_m=0.0, axis="z", diameter_m=0.08),),
+)
+
+_ALICE_HULL = _SPARUS2_HULL.stretched(-0.90, 1.06)
+"""Inferred. The paper states 1.6 m, but its tables hold for 1.96 m only: Y_uv = -39.71 gives
+l_h / d_h = 8.52, and M_uw = -8.498 gives x_cp = -0.214 and so x_n = 1.06. Both ends of ALICE were
+rebuilt (a nose with camera and thruster, "completely redesigned" tail), so that the shape of the
+ends is SPARUS II's stretched with the whole. With the ends of SPARUS II unstretched on a longer
+cylinder Y_vv of the hull would be 1.4 % above the paper's, as it is 0.2 %."""
+
+_MOVED_M = -0.472 - SPARUS2.mast.x_m
+"""Inferred. N_pdot / K_vdot = -0.102 / 0.216 puts the mast at x = -0.472; its neighbours on the
+tail section, the pods, are taken to have moved with it."""
+
+ALICE = Geometry(
+    name="alice",
+    outline=_ALICE_HULL,
+    mast=replace(SPARUS2.mast, x_m=-0.472),
+    pod=replace(SPARUS2.pod, outline=_POD.moved(_MOVED_M)),
+    mount=replace(
+        SPARUS2.mount,
+        aft_x_m=SPARUS2.mount.aft_x_m + _MOVED_M,
+        fore_x_m=SPARUS2.mount.fore_x_m + _MOVED_M,
+    ),
+    # "At the farthest possible distance" (paper, section III.A); T200 propellers of 0.076 m.
+    tunnels=(
+        *SPARUS2.tunnels,
+        Tunnel(
+            name="bow",
+            x_m=round(farthest_tunnel_x(_ALICE_HULL, T200_SIZE, "bow"), 3),
+            axis="y",
+            diameter_m=0.076,
+        ),
+        Tunnel(
+            name="stern",
+            x_m=round(farthest_tunnel_x(_ALICE_HULL, T200_SIZE, "stern"), 3),
+            axis="y",
+            diameter_m=0.076,
+        ),
+    ),
+)
+
+PROPELLER_X_M = -0.573
+"""Of the surge propellers of SPARUS II (model)."""
+ALICE_PROPELLER_X_M = round(PROPELLER_X_M + _MOVED_M, 3)
+"""The same of ALICE, moved with the pods."""
