@@ -49,7 +49,7 @@ def allocate_rpi(
     gram, solution, held = scratch.matrices[0], scratch.vectors[0], scratch.states
     for i in range(n):
         held[i] = 1 if upper[i] <= lower[i] else 0
-        thrust[i] = lower[i]
+        thrust[i] = min(max(0.0, lower[i]), upper[i])
     rounds, again = 0, True
     while again:
         rounds, again, m = rounds + 1, False, 0

@@ -159,6 +159,8 @@ DISTRUST = 26
 """(m/s)^-2: see `allocation.preference_weights`."""
 COLUMNS = 27
 
+_STILL_RPS = 1e-9
+"""A propeller slower than this stands; its lag would lead it through the smallest numbers."""
 _REFERENCE_SHARE = 0.03
 """Of the greatest bollard thrust: the jet against which surge is measured in DISTRUST. ALICE's
 laterals give 1.5 N of 49 N each to hold it against 0.1 m/s across (Y_vv 322, 3.2 N)."""
@@ -247,9 +249,9 @@ def add_thrust(propulsion: Propulsion, rps: Array, nu: Array, force: Array) -> N
     u = nu[0]
     for i in range(t.shape[0]):
         n = rps[i]
-        if n == 0.0:
-            continue
         size = abs(n)
+        if size < _STILL_RPS:
+            continue
         along = _inflow(t, i, nu)
         if n > 0.0:
             thrust, torque = t[i, FORWARD] * n, t[i, TORQUE_FORWARD] * n
