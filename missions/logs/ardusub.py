@@ -1,0 +1,423 @@
+"""ArduSub's logs as a logged dive: the on-board log (DataFlash) and the ground station's (tlog).
+
+Which messages hold what: ardupilot.org/sub, "Onboard Message Log Messages", and
+mavlink.io/en/messages/common.html. ArduSub puts its home at the water's surface
+(ArduSub/commands.cpp, set_home_to_current_location), so that heights above home are minus the
+depth; its barometer is zeroed at the surface.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from alice_survey.errors import NavigationError
+from alice_survey.frames import Array, Datum
+from missions.logs.dataflash import Mask, Table, read_dataflash
+from missions.logs.dive import DATED_AFTER_S, LoggedDive, Signal, cleaned, usable_positions
+from missions.logs.tlog import COMPONENT, RECORDED, SYSTEM, read_tlog
+
+_GPS_EPOCH_S = 315964800.0
+"""6 January 1980 in seconds since 1970."""
+_WEEK_S = 604800.0
+_LEAPS = ((1167264018.0, 18.0), (1119744017.0, 17.0), (1025136016.0, 16.0), (0.0, 15.0))
+"""GPS seconds from which GPS was ahead of UTC by so many seconds (IERS Bulletin C: 1 January 2017,
+1 July 2015, 1 July 2012)."""
+_FIX_3D = 3
+_DOWN = 25
+"""ROTATION_PITCH_270: a range finder that looks down."""
+_GOOD = 4
+"""RangeFinder status: in range."""
+_INSTANCE = ("C", "I", "Instance", "id")
+"""Fields that tell one of several cores or sensors."""
+_REBOOT_S = 1.0
+"""A clock since boot that goes back by more has been started again."""
+
+_Tables = Mapping[str, Table]
+_Reader = Callable[[_Tables], tuple[Array, Array] | None]
+"""From tables to times and values; None where a table or a field is missing."""
+
+
+@dataclass(frozen=True)
+class _Source:
+    """One way to get a quantity."""
+
+    message: str
+    read: _Reader
+    note: str = ""
+    """What to know of it when it is used."""
+
+
+def _take(
+    message: str, fields: Sequence[str], scale: float | Sequence[float] = 1.0,
+    keep: Callable[[Table], Mask] | None = None, absent: float | None = None,
+) -> _Reader:  # fmt: skip
+    """Reads fields of a message, times scales; `keep` tells rows to use, `absent` what is NaN."""
+
+    def read(tables: _Tables) -> tuple[Array, Array] | None:
+        table = tables.get(message)
+        if table is None or any(field not in table.columns for field in fields):
+            return None
+        if keep is not None:
+            table = table.rows(keep(table))
+        values = table.stacked(*fields)
+        if absent is not None:
+            values = np.where(values == absent, np.nan, values)
+        return table.columns["time_s"], values * np.asarray(scale)
+
+    return read
+
+
+def _from_origin(message: str) -> _Reader:
+    """Latitude and longitude of north and east from the filter's origin (message ORGN, type 0)."""
+
+    def read(tables: _Tables) -> tuple[Array, Array] | None:
+        table, origin = tables.get(message), tables.get("ORGN")
+        if table is None or origin is None or "PN" not in table.columns:
+            return None
+        rows = np.flatnonzero(origin.columns["Type"] == 0)
+        if not len(rows):
+            return None
+        last = rows[-1]
+        datum = Datum(float(origin.columns["Lat"][last]), float(origin.columns["Lng"][last]))
+        ned = table.stacked("PN", "PE", "PD")
+        return table.columns["time_s"], datum.geodetic_from_ned(ned)[:, :2]
+
+    return read
+
+
+def _has_fix(field: str) -> Callable[[Table], Mask]:
+    return lambda table: table.columns[field] >= _FIX_3D
+
+
+def _sees_down(table: Table) -> Mask:
+    """Rows of a range finder that looks down and is in range."""
+    good: Mask = table.columns["Stat"] == _GOOD
+    if "Orient" in table.columns:
+        good &= table.columns["Orient"] == _DOWN
+    return good
+
+
+_SURFACE = "positions are GPS: they hold at the surface only"
+_BACKUP = "positions are those of the backup attitude filter"
+_BIN: Mapping[str, tuple[_Source, ...]] = {
+    "navigation": (
+        _Source("POS", _take("POS", ("Lat", "Lng"))),
+        _Source("XKF1", _from_origin("XKF1")),
+        _Source("NKF1", _from_origin("NKF1")),
+        _Source("AHR2", _take("AHR2", ("Lat", "Lng")), _BACKUP),
+        _Source("GPS", _take("GPS", ("Lat", "Lng"), keep=_has_fix("Status")), _SURFACE),
+    ),
+    "depth": (
+        _Source("POS", _take("POS", ("RelHomeAlt",), -1.0)),
+        _Source("CTUN", _take("CTUN", ("BAlt",), -1.0)),
+        _Source("XKF1", _take("XKF1", ("PD",))),
+        _Source("NKF1", _take("NKF1", ("PD",))),
+        _Source("BARO", _take("BARO", ("Alt",), -1.0)),
+    ),
+    "attitude": (
+        _Source("ATT", _take("ATT", ("Roll", "Pitch", "Yaw"))),
+        _Source("XKF1", _take("XKF1", ("Roll", "Pitch", "Yaw"))),
+        _Source("NKF1", _take("NKF1", ("Roll", "Pitch", "Yaw"))),
+        _Source("AHR2", _take("AHR2", ("Roll", "Pitch", "Yaw"))),
+    ),
+    "altitude": (_Source("RFND", _take("RFND", ("Dist",), keep=_sees_down)),),
+    "velocity": (
+        _Source("XKF1", _take("XKF1", ("VN", "VE", "VD"))),
+        _Source("NKF1", _take("NKF1", ("VN", "VE", "VD"))),
+    ),
+    "rates": (_Source("RATE", _take("RATE", ("R", "P", "Y"), float(np.deg2rad(1.0)))),),
+    "pwm": (_Source("RCOU", _take("RCOU", [f"C{i}" for i in range(1, 9)])),),
+}
+"""For each role the sources, the best first; degrees, metres, m/s, rad/s."""
+_TLOG: Mapping[str, tuple[_Source, ...]] = {
+    "navigation": (
+        _Source(
+            "GLOBAL_POSITION_INT", _take("GLOBAL_POSITION_INT", ("lat", "lon"), 1e-7)
+        ),
+        _Source(
+            "GPS_RAW_INT",
+            _take("GPS_RAW_INT", ("lat", "lon"), 1e-7, keep=_has_fix("fix_type")), _SURFACE,
+        ),
+    ),
+    "depth": (
+        _Source(
+            "GLOBAL_POSITION_INT", _take("GLOBAL_POSITION_INT", ("relative_alt",), -1e-3)
+        ),
+        _Source("VFR_HUD", _take("VFR_HUD", ("alt",), -1.0)),
+    ),
+    "attitude": (
+        _Source("ATTITUDE", _take("ATTITUDE", ("roll", "pitch", "yaw"), float(np.rad2deg(1.0)))),
+    ),
+    "altitude": (
+        _Source(
+            "DISTANCE_SENSOR",
+            _take(
+                "DISTANCE_SENSOR", ("current_distance",), 1e-2,
+                keep=lambda table: (table.columns["orientation"] == _DOWN)
+                & (table.columns["current_distance"] >= table.columns["min_distance"])
+                & (table.columns["current_distance"] < table.columns["max_distance"]),
+            ),
+        ),
+        _Source("RANGEFINDER", _take("RANGEFINDER", ("distance",), absent=0.0)),
+    ),
+    "velocity": (
+        _Source(
+            "GLOBAL_POSITION_INT", _take("GLOBAL_POSITION_INT", ("vx", "vy", "vz"), 1e-2)
+        ),
+    ),
+    "rates": (
+        _Source("ATTITUDE", _take("ATTITUDE", ("rollspeed", "pitchspeed", "yawspeed"))),
+    ),
+    "pwm": (
+        _Source(
+            "SERVO_OUTPUT_RAW",
+            _take("SERVO_OUTPUT_RAW", [f"servo{i}_raw" for i in range(1, 9)]),
+        ),
+    ),
+}  # fmt: skip
+
+
+def read_ardusub_bin(path: Path, asked: Mapping[str, str]) -> LoggedDive:
+    """Read an on-board log.
+
+    Args:
+        path: a .BIN or a text .log.
+        asked: by role (`dive.ROLES`): which message to use, `NAME` or `NAME[instance]`.
+
+    Raises:
+        NavigationError: it is no such log, or lacks what navigation needs.
+    """
+    lost: Counter[str] = Counter()
+    wanted = {source.message for sources in _BIN.values() for source in sources}
+    tables, present = read_dataflash(path, {*wanted, "GPS", "ORGN", "PARM"}, lost)
+    offset_s, dated = _since_1970(tables)
+    timed = {}
+    for name, table in tables.items():
+        if "TimeUS" in table.columns:
+            time_s = table.columns["TimeUS"] * 1e-6 + offset_s
+            timed[name] = _with_time(table, time_s)
+        elif "TimeMS" in table.columns and name != "GPS":
+            timed[name] = _with_time(table, table.columns["TimeMS"] * 1e-3 + offset_s)
+    return _dive(
+        path, _BIN, asked, timed, present, lost,
+        kind="an on-board log of ArduSub",
+        clock="the vehicle's clock, set by GPS" if dated else "the vehicle's clock since boot",
+        dated=dated,
+        declination_in_log_deg=_declination(tables.get("PARM")),
+    )  # fmt: skip
+
+
+def read_ardusub_tlog(path: Path, asked: Mapping[str, str]) -> LoggedDive:
+    """Read a ground station's log; arguments and errors as of `read_ardusub_bin`."""
+    lost: Counter[str] = Counter()
+    wanted = {source.message for sources in _TLOG.values() for source in sources}
+    tables, present = read_tlog(path, wanted, lost)
+    vehicle = _vehicle(path, tables, present)
+    offset: dict[str, Table] = {}
+    for name, table in tables.items():
+        own = table.rows(table.columns[SYSTEM] == vehicle)
+        if len(own) < len(table):
+            lost[f"{name}: messages of another system than {vehicle:.0f}"] += len(table) - len(own)
+        if len(own):
+            offset[name] = _with_time(own, _tlog_times(own))
+    recorded = np.concatenate([table.columns[RECORDED] for table in tables.values()])
+    return _dive(
+        path, _TLOG, asked, offset, present, lost,
+        kind="a ground station's log of ArduSub",
+        clock="the ground station's clock",
+        dated=bool(np.median(recorded) > DATED_AFTER_S),
+        declination_in_log_deg=None,
+    )  # fmt: skip
+
+
+def _dive(
+    path: Path,
+    sources: Mapping[str, tuple[_Source, ...]],
+    asked: Mapping[str, str],
+    tables: _Tables,
+    present: Sequence[str],
+    lost: Counter[str],
+    *,
+    kind: str,
+    clock: str,
+    dated: bool,
+    declination_in_log_deg: float | None,
+) -> LoggedDive:
+    notes: list[str] = []
+    counted: set[str] = set()
+
+    def signal(role: str) -> Signal | None:
+        own: Counter[str] = Counter()
+        found, note = _signal(path, role, sources[role], asked.get(role), tables, present, own)
+        # What the times of a message cost is counted once, though it serves several roles.
+        if found is not None and found.source not in counted:
+            counted.add(found.source)
+            lost.update(own)
+        if note and note not in notes:
+            notes.append(note)
+        return found
+
+    position = signal("navigation")
+    if position is None:
+        names = ", ".join(source.message for source in sources["navigation"])
+        raise NavigationError(
+            f"{path}: no row holds a position: none of {names}; it has {', '.join(present)}. "
+            "Without GPS, USBL or a DVL the vehicle does not know where it is"
+        )
+    return LoggedDive(
+        kind=kind,
+        clock=clock,
+        dated=dated,
+        position=usable_positions(position, str(path), lost),
+        depth=signal("depth"),
+        attitude=signal("attitude"),
+        altitude=signal("altitude"),
+        altitude_slant=True,
+        velocity_ned=signal("velocity"),
+        rates=signal("rates"),
+        pwm=signal("pwm"),
+        declination_in_log_deg=declination_in_log_deg,
+        lost=dict(lost),
+        notes=tuple(notes),
+    )
+
+
+def _signal(
+    path: Path,
+    role: str,
+    sources: Sequence[_Source],
+    asked: str | None,
+    tables: _Tables,
+    present: Sequence[str],
+    lost: Counter[str],
+) -> tuple[Signal | None, str]:
+    """The best source that the log holds, or the one that is asked for, and its note."""
+    name, _, instance = (asked or "").removesuffix("]").partition("[")
+    known = [source.message for source in sources]
+    if name and name not in known:
+        raise NavigationError(f"{path}: {role} can come from {', '.join(known)}, not {name}")
+    for source in sources:
+        if name and source.message != name:
+            continue
+        table = tables.get(source.message)
+        if table is None:
+            continue
+        one, others = _one_instance(path, role, table, instance, bool(name))
+        if one is None:
+            continue
+        read = source.read({**tables, source.message: one})
+        if read is None or not len(read[0]):
+            continue
+        found = cleaned(source.message, *read, lost)
+        if found is not None:
+            return found, f"{source.note}{others}".strip("; ")
+    if name:
+        raise NavigationError(f"{path}: {asked} gives no {role}; it has {', '.join(present)}")
+    return None, ""
+
+
+def _one_instance(
+    path: Path, role: str, table: Table, asked: str, named: bool
+) -> tuple[Table | None, str]:
+    """The rows of one core or sensor, and a note on the others.
+
+    Cores and GPS receivers count from the one that is used. Which barometer is the depth sensor
+    is not told by its number, so that of several one must be asked for.
+    """
+    field = next((name for name in _INSTANCE if name in table.columns), None)
+    if field is None:
+        return table, ""
+    numbers = np.unique(table.columns[field]).astype(int).tolist()
+    if asked:
+        if not asked.isdigit() or int(asked) not in numbers:
+            raise NavigationError(
+                f"{path}: {table.name} has {', '.join(map(str, numbers))}, not {asked}"
+            )
+        return table.rows(table.columns[field] == int(asked)), ""
+    if len(numbers) == 1:
+        return table, ""
+    if table.name == "BARO":
+        if not named:
+            return None, ""
+        raise NavigationError(
+            f"{path}: BARO has {', '.join(map(str, numbers))}: choose the depth sensor with "
+            f"--topic {role}=BARO[{numbers[-1]}]"
+        )
+    if table.name in ("RFND", "DISTANCE_SENSOR"):
+        return table, ""
+    note = f"; {table.name} {numbers[0]} of {', '.join(map(str, numbers))} is used"
+    return table.rows(table.columns[field] == numbers[0]), note
+
+
+def _with_time(table: Table, time_s: Array) -> Table:
+    return Table(
+        name=table.name,
+        columns={**table.columns, "time_s": time_s},
+        kinds=table.kinds,
+        texts=table.texts,
+    )
+
+
+def _since_1970(tables: _Tables) -> tuple[float, bool]:
+    """What makes UTC of seconds since boot: the median over all GPS fixes; 0 without one."""
+    gps = tables.get("GPS")
+    needed = ("TimeUS", "GMS", "GWk", "Status")
+    if gps is None or any(name not in gps.columns for name in needed):
+        return 0.0, False
+    fixed = gps.rows((gps.columns["Status"] >= _FIX_3D) & (gps.columns["GWk"] > 0))
+    if not len(fixed):
+        return 0.0, False
+    seconds = fixed.columns["GWk"] * _WEEK_S + fixed.columns["GMS"] * 1e-3
+    starts, ahead = np.array(_LEAPS).T
+    leap = ahead[np.argmax(seconds[:, None] >= starts, axis=1)]
+    utc = _GPS_EPOCH_S + seconds - leap
+    return float(np.median(utc - fixed.columns["TimeUS"] * 1e-6)), True
+
+
+def _declination(parameters: Table | None) -> float | None:
+    """What the vehicle added to its compass, degrees; NaN where it took it from its own table."""
+    if parameters is None or "Name" not in parameters.texts:
+        return None
+    values = dict(zip(parameters.texts["Name"], parameters.columns["Value"], strict=True))
+    if values.get("COMPASS_AUTODEC", 0.0) > 0:
+        return float("nan")
+    declination = values.get("COMPASS_DEC")
+    return None if declination is None else float(np.rad2deg(declination))
+
+
+def _vehicle(path: Path, tables: _Tables, present: Sequence[str]) -> float:
+    """The system that tells most of where it is."""
+    for name in ("GLOBAL_POSITION_INT", "GPS_RAW_INT", "ATTITUDE"):
+        if name in tables:
+            systems, counts = np.unique(tables[name].columns[SYSTEM], return_counts=True)
+            return float(systems[np.argmax(counts)])
+    raise NavigationError(
+        f"{path}: no row holds a position: no GLOBAL_POSITION_INT or GPS_RAW_INT; it has "
+        f"{', '.join(present)}"
+    )
+
+
+def _tlog_times(table: Table) -> Array:
+    """Times by the ground station's clock, without the jitter of the link where that can be told.
+
+    A message that carries the vehicle's time since boot has that, plus what the quickest message
+    of one boot took; the others have the time of their recording.
+    """
+    recorded: Array = table.columns[RECORDED]
+    if "time_boot_ms" not in table.columns:
+        return recorded
+    boot = table.columns["time_boot_ms"] * 1e-3
+    session = np.concatenate([[0], np.cumsum(np.diff(boot) < -_REBOOT_S)])
+    # Components of one system may count from boots of their own.
+    if COMPONENT in table.columns:
+        _, component = np.unique(table.columns[COMPONENT], return_inverse=True)
+        if component.max() > 0:
+            return recorded
+    times = np.empty_like(recorded)
+    for number in np.unique(session):
+        rows = session == number
+        times[rows] = boot[rows] + np.min(recorded[rows] - boot[rows])
+    return times

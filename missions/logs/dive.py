@@ -1,0 +1,188 @@
+"""What a vehicle's own log tells of a dive, whatever its format: series of numbers against time."""
+
+import bisect
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.errors import NavigationError
+from alice_survey.frames import Array
+
+ROLES = ("navigation", "depth", "attitude", "altitude")
+"""What of a log may be chosen by name."""
+GAP_S, GAP_INTERVALS = 2.0, 5.0
+"""A gap is longer than both so many seconds and so many median intervals, as in the navigation
+reader of `import-images`."""
+DATED_AFTER_S = 1e8
+"""Times since 1970 before this (March 1973) are a simulation's or a processor's own clock."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Signal:
+    """One or more numbers against time."""
+
+    source: str
+    """Topic or message that it comes from."""
+    time_s: Array
+    """(N,) strictly increasing."""
+    values: Array
+    """(N, k); NaN is not known."""
+
+    @property
+    def longest_gap_s(self) -> float:
+        """Seconds between rows beyond which nothing is interpolated."""
+        if len(self.time_s) < 2:
+            return GAP_S
+        return max(GAP_S, GAP_INTERVALS * float(np.median(np.diff(self.time_s))))
+
+    def at(self, time_s: Array, *, turning: bool = False) -> Array:
+        """Values, (M, k), at other times, interpolated; NaN in gaps and beyond the ends.
+
+        Args:
+            time_s: (M,).
+            turning: whether values are angles in degrees, which turn the short way round.
+        """
+        return np.stack(
+            [self._column_at(column, time_s, turning) for column in self.values.T], axis=1
+        )
+
+    def _column_at(self, values: Array, at_s: Array, turning: bool) -> Array:
+        known = np.isfinite(values)
+        times, values = self.time_s[known], values[known]
+        found = np.full(at_s.shape, np.nan)
+        if not len(times):
+            return found
+        after = np.clip(np.searchsorted(times, at_s), 0, len(times) - 1)
+        before = np.clip(np.searchsorted(times, at_s, side="right") - 1, 0, len(times) - 1)
+        inside = (at_s >= times[0]) & (at_s <= times[-1])
+        inside &= times[after] - times[before] <= self.longest_gap_s
+        smooth = np.unwrap(values, period=360.0) if turning else values
+        found[inside] = np.interp(at_s[inside], times, smooth)
+        return found
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LoggedDive:
+    """A dive as logged; angles in degrees, nothing corrected."""
+
+    kind: str
+    """Format of the log, in words."""
+    clock: str
+    """Whose clock the times are, in words."""
+    dated: bool
+    """Whether times are seconds since 1970, UTC, and not of a clock of their own."""
+    position: Signal
+    """(N, 2) latitude and longitude."""
+    depth: Signal | None = None
+    """(N, 1) below the surface, metres."""
+    attitude: Signal | None = None
+    """(N, 3) roll, pitch, heading."""
+    altitude: Signal | None = None
+    """(N, 1) metres."""
+    altitude_slant: bool = False
+    """Whether `altitude` is a range along the body's down axis, not yet a height."""
+    sigmas: Mapping[str, Signal] = field(default_factory=dict)
+    """(N, 1) by their column in the navigation CSV."""
+    velocity_ned: Signal | None = None
+    """(N, 3) over ground, m/s."""
+    velocity_body: Signal | None = None
+    """(N, 3) u, v, w over ground, m/s."""
+    rates: Signal | None = None
+    """(N, 3) p, q, r, rad/s."""
+    rpm: Signal | None = None
+    """(N, n) of the thrusters `thrusters`."""
+    thrusters: tuple[str, ...] = ()
+    pwm: Signal | None = None
+    """(N, n) microseconds of servo outputs 1 to n."""
+    declination_in_log_deg: float | None = None
+    """What the vehicle itself added to its compass, where the log tells; NaN: it did, by a table
+    of its own."""
+    lost: Mapping[str, int] = field(default_factory=dict)
+    """How many rows or bytes were left out, by reason."""
+    notes: tuple[str, ...] = ()
+
+
+def cleaned(source: str, time_s: Array, values: Array, lost: Counter[str]) -> Signal | None:
+    """A signal of the rows whose times increase, the most that can be kept; None without rows.
+
+    Args:
+        source: topic or message.
+        time_s: (N,) as logged.
+        values: (N, k).
+        lost: counts what is left out; is added to.
+    """
+    time_s = np.asarray(time_s, dtype=np.float64)
+    values = np.asarray(values, dtype=np.float64).reshape(len(time_s), -1)
+    good = np.isfinite(time_s)
+    if not good.all():
+        lost[f"{source}: the time is no number"] += int((~good).sum())
+    time_s, values = time_s[good], values[good]
+    values = np.where(np.isfinite(values), values, np.nan)
+    keep = _increasing(time_s)
+    if len(keep) < len(time_s):
+        lost[f"{source}: the time repeats or goes back"] += len(time_s) - len(keep)
+        time_s, values = time_s[keep], values[keep]
+    known = np.isfinite(values).any(axis=1)
+    if not known.any():
+        return None
+    return Signal(source=source, time_s=time_s, values=values)
+
+
+def _increasing(time_s: Array) -> NDArray[np.intp]:
+    """Rows of the longest strictly increasing subsequence (patience sorting).
+
+    One wild time then costs one row, and not all that follow it.
+    """
+    count = len(time_s)
+    if count < 2 or bool(np.all(np.diff(time_s) > 0)):
+        return np.arange(count)
+    tails: list[float] = []
+    last: list[int] = []
+    before = [-1] * count
+    for i, time in enumerate(time_s.tolist()):
+        place = bisect.bisect_left(tails, time)
+        before[i] = last[place - 1] if place else -1
+        if place == len(tails):
+            tails.append(time)
+            last.append(i)
+        else:
+            tails[place] = time
+            last[place] = i
+    rows, i = [], last[-1]
+    while i >= 0:
+        rows.append(i)
+        i = before[i]
+    return np.array(rows[::-1])
+
+
+def usable_positions(position: Signal | None, source: str, lost: Counter[str]) -> Signal:
+    """The rows of a position signal that can be a place; what is left out is counted.
+
+    Raises:
+        NavigationError: none is left.
+    """
+    if position is not None:
+        latitude, longitude = position.values.T
+        with np.errstate(invalid="ignore"):
+            known = np.isfinite(latitude) & np.isfinite(longitude)
+            inside = (np.abs(latitude) <= 90.0) & (np.abs(longitude) <= 180.0)
+        nowhere = known & (latitude == 0) & (longitude == 0)
+        for reason, rows in (
+            ("the position is no number", ~known),
+            ("the position is beyond the range of latitude and longitude", known & ~inside),
+            ("the position is 0, 0: no fix", nowhere),
+        ):
+            if rows.any():
+                lost[f"{position.source}: {reason}"] += int(rows.sum())
+        good = known & inside & ~nowhere
+        if good.any():
+            return Signal(
+                source=position.source, time_s=position.time_s[good], values=position.values[good]
+            )
+    reasons = "; ".join(f"{count} times {reason}" for reason, count in sorted(lost.items()))
+    raise NavigationError(
+        f"{source}: no row holds a position" + (f" ({reasons})" if reasons else "")
+    )

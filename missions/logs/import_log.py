@@ -1,0 +1,345 @@
+"""`import-log`: a vehicle's own log becomes the navigation CSV that `import-images` reads."""
+
+import itertools
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from alice_survey.artefacts import write_csv
+from alice_survey.errors import NavigationError, warn
+from alice_survey.frames import Array, Datum, rotation_from_attitude
+from missions.logs.corrections import (
+    COLUMNS,
+    Corrections,
+    moment,
+    navigation_table,
+    read_tide,
+    utc_seconds,
+)
+from missions.logs.dive import ROLES, LoggedDive
+
+_DECIMALS = (10, 10, 5, 6, 6, 6, 5, 6, 6, 6, 6, 6)
+"""Of `COLUMNS`: as of the navigation CSV of `fly`."""
+_NAMED = 8
+_MICRO = 1e6
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportOptions:
+    """What `import-log` is asked for."""
+
+    declination_deg: float = 0.0
+    """Added to headings; east is positive."""
+    tide: str = "0"
+    """Height of the water above the level that depths shall count from: metres, or a CSV."""
+    clock_offset_s: float = 0.0
+    """Added to times."""
+    start_s: float | None = None
+    end_s: float | None = None
+    """Seconds from the first position: what is before or after is left out."""
+    topics: Sequence[str] = ()
+    """`ROLE=NAME`, roles as in `dive.ROLES`: which topic or message to use."""
+    datum_deg: tuple[float, float] | None = None
+    """Latitude and longitude of the origin that a bag's odometry counts from."""
+    lever_body_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where on the body (FRD) the logged position is."""
+    altitude_offset_m: float = 0.0
+    """Added to altitudes."""
+    start_utc: str | None = None
+    """When the first position of a log without dates was, ISO 8601."""
+    time_zone: str = "UTC"
+    """Of dates that name none (QGroundControl's CSV)."""
+    vehicle_log: Path | None = None
+    """Where to write the vehicle log, too."""
+
+
+def import_log(
+    path: Path, out: Path, options: ImportOptions | None = None
+) -> tuple[str, dict[str, Any]]:
+    """Write the navigation CSV of a log.
+
+    Times are dates (`time_utc`) where the log has them, else `time_s` as logged. What is left out
+    is counted, by reason, in warnings and in the result.
+
+    Args:
+        path: a bag of ROS 1 or 2, ArduSub's .BIN, .log or .tlog, or a QGroundControl CSV.
+        out: CSV to write.
+        options: what to change, and what to choose.
+
+    Returns:
+        A report as text, and as JSON values.
+
+    Raises:
+        NavigationError: the log cannot be read, holds no position, or an option does not fit it.
+    """
+    asked = options or ImportOptions()
+    dive = read_dive(path, asked)
+    dated = dive.dated or asked.start_utc is not None
+    if asked.start_utc is not None:
+        dive = _dated(dive, asked.start_utc)
+    corrections = Corrections(
+        declination_deg=asked.declination_deg,
+        tide=read_tide(asked.tide, dated=dated),
+        clock_offset_s=asked.clock_offset_s,
+        lever_body_m=asked.lever_body_m,
+        altitude_offset_m=asked.altitude_offset_m,
+    )
+    _warn_of_declination(dive, asked.declination_deg)
+    time_s, columns = navigation_table(_trimmed(dive, asked.start_s, asked.end_s), corrections)
+    complete = np.isfinite(columns["latitude_deg"] + columns["depth_m"])
+    lost = Counter(dict(dive.lost))
+    if not complete.all():
+        reason = "positions without a depth" + (
+            " or an attitude for the lever arm" if any(asked.lever_body_m) else ""
+        )
+        lost[reason] += int((~complete).sum())
+    if not complete.any():
+        raise NavigationError(
+            f"{path}: {len(time_s)} positions, none with a depth"
+            + (" at its time" if dive.depth is not None else ": the log holds none")
+        )
+    time_s = time_s[complete]
+    columns = {name: column[complete] for name, column in columns.items()}
+    write_navigation_csv(out, time_s, columns, dated=dated)
+    if asked.vehicle_log is not None:
+        _write_vehicle_log(asked.vehicle_log, dive, corrections, asked)
+    return _report(path, out, dive, time_s, columns, lost, dated)
+
+
+def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
+    """Read a log of any format that is known, told by its name and content.
+
+    Raises:
+        NavigationError: it is missing, of no known format, or cannot be used.
+    """
+    from missions.logs.ardusub import read_ardusub_bin, read_ardusub_tlog
+    from missions.logs.qgc_csv import read_qgc_csv
+    from missions.logs.ros_bag import BagOptions, is_bag, read_ros_bag
+
+    if not path.exists():
+        raise NavigationError(f"{path}: no such file or folder")
+    asked = _roles(options.topics)
+    suffix = path.suffix.lower()
+    if suffix not in ("", ".bag", ".mcap", ".db3") and options.datum_deg is not None:
+        raise NavigationError("--datum is for the odometry of a bag of ROS: leave it out")
+    if path.is_dir() or is_bag(path):
+        datum = None if options.datum_deg is None else Datum(*options.datum_deg)
+        return read_ros_bag(path, BagOptions(topics=asked, datum=datum))
+    if suffix in (".bin", ".log"):
+        return read_ardusub_bin(path, asked)
+    if suffix == ".tlog":
+        return read_ardusub_tlog(path, asked)
+    if suffix == ".csv":
+        return read_qgc_csv(path, asked, options.time_zone)
+    raise NavigationError(
+        f"{path}: no log that is known: a ROS bag (.bag, .mcap, .db3 or a folder), ArduSub's .BIN, "
+        ".log or .tlog, or QGroundControl's .csv"
+    )
+
+
+def write_navigation_csv(
+    path: Path, time_s: Array, columns: Mapping[str, Array], *, dated: bool
+) -> None:
+    """Write the navigation CSV; positions to 0.01 mm, times to 1 us.
+
+    Args:
+        path: file to write.
+        time_s: (N,) seconds, since 1970 where they are dated.
+        columns: `corrections.COLUMNS`, (N,) each; NaN becomes an empty cell.
+        dated: whether to write dates instead of seconds.
+    """
+    texts = [[_date(t) for t in time_s.tolist()] if dated else [f"{t:.6f}" for t in time_s]]
+    for name, decimals in zip(COLUMNS, _DECIMALS, strict=True):
+        texts.append(["" if math.isnan(v) else f"{v:.{decimals}f}" for v in columns[name].tolist()])
+    write_csv(path, ("time_utc" if dated else "time_s", *COLUMNS), zip(*texts, strict=True))
+
+
+def _date(time_s: float) -> str:
+    micro = round(time_s * _MICRO)
+    date = datetime.fromtimestamp(micro // 1_000_000, UTC).replace(microsecond=micro % 1_000_000)
+    return date.isoformat(timespec="microseconds").replace("+00:00", "Z")
+
+
+def _roles(topics: Sequence[str]) -> dict[str, str]:
+    asked: dict[str, str] = {}
+    for text in topics:
+        role, mark, name = text.partition("=")
+        if not mark or role not in ROLES or not name:
+            raise NavigationError(
+                f"--topic {text!r}: give ROLE=NAME with a role of {', '.join(ROLES)}"
+            )
+        if role in asked:
+            raise NavigationError(f"--topic {role} is given twice")
+        asked[role] = name
+    return asked
+
+
+def _dated(dive: LoggedDive, start_utc: str) -> LoggedDive:
+    """A log without dates, shifted so that its first position is at a moment."""
+    if dive.dated:
+        raise NavigationError("--start-utc is for logs without dates; this one has dates")
+    try:
+        start_s = utc_seconds(start_utc)
+    except ValueError:
+        raise NavigationError(
+            f"--start-utc {start_utc!r} is no date such as 2024-05-01T12:00:00Z"
+        ) from None
+    shift = start_s - float(dive.position.time_s[0])
+    moved: dict[str, Any] = {
+        name: replace(signal, time_s=signal.time_s + shift)
+        for name in (
+            "position", "depth", "attitude", "altitude", "velocity_ned", "velocity_body", "rates",
+            "rpm", "pwm",
+        )
+        if (signal := getattr(dive, name)) is not None
+    }  # fmt: skip
+    moved["sigmas"] = {
+        name: replace(signal, time_s=signal.time_s + shift) for name, signal in dive.sigmas.items()
+    }
+    return replace(dive, **moved)
+
+
+def _trimmed(dive: LoggedDive, start_s: float | None, end_s: float | None) -> LoggedDive:
+    """The positions of a stretch, counted from the first."""
+    position = dive.position
+    since = position.time_s - position.time_s[0]
+    first = 0.0 if start_s is None else start_s
+    last = math.inf if end_s is None else end_s
+    keep = (since >= first) & (since <= last)
+    if not keep.any():
+        raise NavigationError(
+            f"--start {first:g} and --end {last:g} leave nothing of {since[-1]:.1f} s"
+        )
+    return replace(
+        dive,
+        position=replace(position, time_s=position.time_s[keep], values=position.values[keep]),
+    )
+
+
+def _warn_of_declination(dive: LoggedDive, asked_deg: float) -> None:
+    known = dive.declination_in_log_deg
+    if known is None or not asked_deg:
+        return
+    if math.isnan(known):
+        warn("the vehicle added a declination of its own (COMPASS_AUTODEC): yours comes on top")
+    elif known:
+        warn(
+            f"the vehicle added a declination of {known:.2f} degrees (COMPASS_DEC): yours comes on "
+            "top"
+        )
+
+
+def _write_vehicle_log(
+    path: Path, dive: LoggedDive, corrections: Corrections, options: ImportOptions
+) -> None:
+    """The vehicle log (docs/vehicle-logs.md) at the positions' times, from the first position."""
+    from scipy.spatial.transform import Rotation
+
+    from alice_survey.vehicle.log import vehicle_log, write_vehicle_log
+
+    trimmed = _trimmed(dive, options.start_s, options.end_s)
+    # Depths of the log, not of the chart: a vehicle's log knows of no tide.
+    time_s, columns = navigation_table(trimmed, replace(corrections, tide=0.0))
+    at_s = trimmed.position.time_s
+    place = np.stack([columns[name] for name in COLUMNS[:3]], axis=1)
+    known = np.isfinite(place).all(axis=1)
+    position = np.full(place.shape, np.nan)
+    if known.any():
+        datum = Datum(*(float(value) for value in place[known][0, :2]))
+        position[known] = datum.ned_from_geodetic(place[known])
+    angles = np.stack([columns[name] for name in COLUMNS[3:6]], axis=1)
+    upright = np.isfinite(angles).all(axis=1)
+    quaternion = np.full((len(at_s), 4), np.nan)
+    if upright.any():
+        turn = rotation_from_attitude(*np.deg2rad(angles[upright]).T)
+        quaternion[upright] = turn.as_quat(canonical=True)
+    velocity = None if dive.velocity_body is None else dive.velocity_body.at(at_s)
+    if velocity is None and dive.velocity_ned is not None:
+        velocity = np.full((len(at_s), 3), np.nan)
+        logged = dive.velocity_ned.at(at_s)
+        if upright.any():
+            velocity[upright] = Rotation.from_quat(quaternion[upright]).inv().apply(logged[upright])
+    rpm = {} if dive.rpm is None else dict(zip(dive.thrusters, dive.rpm.at(at_s).T, strict=True))
+    others = {}
+    if dive.pwm is not None:
+        others = {f"pwm_{i}_us": column for i, column in enumerate(dive.pwm.at(at_s).T, 1)}
+    log = vehicle_log(
+        np.round(time_s - time_s[0], 6),
+        source=str(path),
+        position_ned=position,
+        quaternion_xyzw=quaternion,
+        velocity_body=velocity,
+        rates_body=None if dive.rates is None else dive.rates.at(at_s),
+        altitude_m=columns["altitude_m"],
+        rpm=rpm,
+    )
+    write_vehicle_log(path, replace(log, others=others))
+
+
+def _report(
+    path: Path,
+    out: Path,
+    dive: LoggedDive,
+    time_s: Array,
+    columns: Mapping[str, Array],
+    lost: Counter[str],
+    dated: bool,
+) -> tuple[str, dict[str, Any]]:
+    """What was read, from where, and what is missing; warns of what was left out and of gaps."""
+    gaps = _gaps(time_s, dive)
+    if lost:
+        warn(f"{path}: left out: " + "; ".join(f"{n} {why}" for why, n in sorted(lost.items())))
+    if gaps:
+        told = ", ".join(f"{length:.1f} s from {moment(start)}" for start, length in gaps[:_NAMED])
+        more = f" and {len(gaps) - _NAMED} more" if len(gaps) > _NAMED else ""
+        warn(f"{path}: {len(gaps)} gaps in the positions: {told}{more}")
+    sources = {
+        "position": dive.position, "depth": dive.depth, "attitude": dive.attitude,
+        "altitude": dive.altitude,
+    }  # fmt: skip
+    named = {role: signal.source for role, signal in sources.items() if signal is not None}
+    filled = {name: int(np.isfinite(column).sum()) for name, column in columns.items()}
+    steps = np.diff(time_s)
+    data: dict[str, Any] = {
+        "log": str(path),
+        "kind": dive.kind,
+        "clock": dive.clock,
+        "dated": dated,
+        "out": str(out),
+        "rows": len(time_s),
+        "start": _date(float(time_s[0])) if dated else float(time_s[0]),
+        "duration_s": float(time_s[-1] - time_s[0]),
+        "median_interval_s": float(np.median(steps)) if len(steps) else None,
+        "sources": named,
+        "filled": filled,
+        "left_out": dict(sorted(lost.items())),
+        "gaps": [{"start_s": start, "length_s": length} for start, length in gaps],
+        "notes": list(dive.notes),
+    }
+    lines = [
+        f"{path}: {dive.kind}, {dive.clock}",
+        f"{out}: {len(time_s)} rows from {moment(float(time_s[0]))}, {data['duration_s']:.1f} s",
+        *(f"  {role} from {source}" for role, source in named.items()),
+    ]
+    empty = [name for name, count in filled.items() if not count]
+    if empty:
+        lines.append(f"  not known: {', '.join(empty)}")
+    lines += [f"  {note}" for note in dive.notes]
+    lines += [f"  left out: {count} {reason}" for reason, count in data["left_out"].items()]
+    if gaps:
+        lines.append(f"  {len(gaps)} gaps, the longest {max(g[1] for g in gaps):.1f} s")
+    if not dated:
+        lines.append("  the log has no dates: pictures are tied to it by --clock-offset alone")
+    return "\n".join(lines), data
+
+
+def _gaps(time_s: Array, dive: LoggedDive) -> list[tuple[float, float]]:
+    """Start and length of steps that nothing is interpolated over."""
+    longest = replace(dive.position, time_s=time_s).longest_gap_s
+    return [(a, b - a) for a, b in itertools.pairwise(time_s.tolist()) if b - a > longest]

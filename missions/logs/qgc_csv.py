@@ -1,0 +1,119 @@
+"""QGroundControl's CSV of telemetry as a logged dive: one row a second by the PC's own clock."""
+
+import csv
+import math
+from collections import Counter
+from collections.abc import Mapping
+from datetime import UTC, datetime, tzinfo
+from pathlib import Path
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
+
+import numpy as np
+
+from alice_survey.errors import NavigationError
+from missions.logs.dive import LoggedDive, cleaned, usable_positions
+
+_TIME = "Timestamp"
+_PLACE = ("gps.lat", "gps.lon")
+_DEPTH = "altitudeRelative"
+_ANGLES = ("roll", "pitch", "heading")
+_ALTITUDES = ("distanceSensor.rotationPitch270", "apmSubInfo.rangefinderDistance")
+"""The first has metres; of the second ArduSub's RANGEFINDER message, metres."""
+_UNKNOWN = ("", "--", "--.--", "nan", "NaN")
+
+
+def read_qgc_csv(path: Path, asked: Mapping[str, str], time_zone: str) -> LoggedDive:
+    """Read a CSV that QGroundControl wrote ("Save CSV log of telemetry data").
+
+    Rows of another number of cells than the header are left out: until a battery is found, QGC
+    writes fewer columns (qgroundcontrol issue 11763).
+
+    Args:
+        path: the file.
+        asked: which column to use for depth or altitude.
+        time_zone: of the PC.
+
+    Raises:
+        NavigationError: it is no such file, or holds no position.
+    """
+    wrong = [role for role in asked if role not in ("depth", "altitude")]
+    if wrong:
+        raise NavigationError(f"--topic {wrong[0]}: of a CSV only depth and altitude can be chosen")
+    zone = _zone(time_zone)
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            header, *rows = [row for row in csv.reader(file) if row] or [[]]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise NavigationError(f"{path}: cannot be read: {error}") from None
+    header = [name.strip() for name in header]
+    if "latitude_deg" in header and _TIME not in header:
+        raise NavigationError(
+            f"{path}: a navigation CSV already: give it to import-images --navigation"
+        )
+    missing = [name for name in (_TIME, *_PLACE) if name not in header]
+    if missing:
+        raise NavigationError(f"{path}: no CSV of QGroundControl: column {missing[0]} is missing")
+    lost: Counter[str] = Counter()
+    whole = [row for row in rows if len(row) == len(header)]
+    if len(whole) < len(rows):
+        lost["rows of another number of cells than the header"] += len(rows) - len(whole)
+    columns = {name: [row[i].strip() for row in whole] for i, name in enumerate(header)}
+    time_s = np.array([_seconds(cell, zone) for cell in columns[_TIME]])
+
+    def numbers(*names: str) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+        return np.array([[_number(cell) for cell in columns[name]] for name in names]).T
+
+    def chosen(role: str, *usual: str) -> str | None:
+        name = asked.get(role)
+        if name is not None and name not in columns:
+            raise NavigationError(f"{path}: no column {name}; it has {', '.join(header)}")
+        return name or next((column for column in usual if column in columns), None)
+
+    depth, altitude = chosen("depth", _DEPTH), chosen("altitude", *_ALTITUDES)
+    have_angles = all(name in columns for name in _ANGLES)
+    nothing: Counter[str] = Counter()
+    heights = None if altitude is None else numbers(altitude)
+    if heights is not None:
+        heights = np.where(heights > 0, heights, np.nan)
+    return LoggedDive(
+        kind="a CSV of QGroundControl",
+        clock=f"the PC's clock, {time_zone}",
+        dated=True,
+        position=usable_positions(
+            cleaned("gps.lat, gps.lon", time_s, numbers(*_PLACE), lost), str(path), lost
+        ),
+        depth=None if depth is None else cleaned(depth, time_s, -numbers(depth), nothing),
+        attitude=cleaned("roll, pitch, heading", time_s, numbers(*_ANGLES), nothing)
+        if have_angles
+        else None,
+        altitude=None if heights is None else cleaned(str(altitude), time_s, heights, nothing),
+        altitude_slant=True,
+        lost=dict(lost),
+        notes=("depth is minus the height above home, which ArduSub puts at the surface",),
+    )
+
+
+def _zone(name: str) -> tzinfo:
+    try:
+        return UTC if name == "UTC" else ZoneInfo(name)
+    except (ZoneInfoNotFoundError, ValueError, OSError):
+        raise NavigationError(
+            f"--time-zone {name!r} is not known; give a name such as Europe/Oslo or UTC"
+        ) from None
+
+
+def _seconds(cell: str, zone: tzinfo) -> float:
+    try:
+        date = datetime.fromisoformat(cell)
+    except ValueError:
+        return math.nan
+    return (date if date.tzinfo is not None else date.replace(tzinfo=zone)).timestamp()
+
+
+def _number(cell: str) -> float:
+    if cell in _UNKNOWN:
+        return math.nan
+    try:
+        return float(cell)
+    except ValueError:
+        return math.nan

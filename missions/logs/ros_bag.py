@@ -1,0 +1,431 @@
+"""A ROS 1 or ROS 2 bag as a logged dive.
+
+Understood are `NavSts` (COLA2's cola2_msgs, and auv_msgs), nav_msgs/Odometry, and sensor_msgs
+NavSatFix with Imu; depth from FluidPressure or a number; altitude from Range; thrusters from
+JointState. Orientations and velocities are ENU and FLU (REP-103) unless the frame's name holds
+`ned`, as in COLA2 and Stonefish.
+"""
+
+import struct
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from alice_survey.errors import NavigationError
+from alice_survey.executor import progress
+from alice_survey.frames import Array, Datum, attitude_from_rotation
+from missions.logs.dive import DATED_AFTER_S, LoggedDive, Signal, cleaned, usable_positions
+from missions.logs.ros_rows import (
+    ANGLES,
+    FIX,
+    IMU,
+    JOINTS,
+    NAV_STS,
+    NED,
+    NUMBERS,
+    ODOMETRY,
+    PLACE,
+    PRESSURE,
+    QUATERNION,
+    RANGE,
+    RATES,
+    ROWS,
+    VARIANCES,
+    VELOCITY,
+)
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+
+_TAKES: Mapping[str, tuple[str, ...]] = {
+    "navigation": (NAV_STS, ODOMETRY, FIX),
+    "depth": (PRESSURE, *NUMBERS, NAV_STS, ODOMETRY),
+    "attitude": (IMU, NAV_STS, ODOMETRY),
+    "altitude": (RANGE, *NUMBERS, NAV_STS),
+}
+"""Types that serve each role, the best first."""
+_TRUTH = ("truth", "ground_truth", "_gt", "/gt")
+_ORIGIN = ("datum", "origin")
+_NOT_ALTITUDE = ("beam", "front", "forward", "fls", "obstacle")
+
+_UNIT = 0.05
+"""How far from 1 the length of a quaternion may be."""
+_SIGMAS: Mapping[str, tuple[tuple[str, ...], float]] = {
+    "sigma_horizontal_m": (VARIANCES[0:2], 1.0),
+    "sigma_depth_m": (VARIANCES[2:3], 1.0),
+    "sigma_attitude_deg": (VARIANCES[3:5], float(np.rad2deg(1.0))),
+    "sigma_heading_deg": (VARIANCES[5:6], float(np.rad2deg(1.0))),
+}
+"""By column of the navigation CSV: which variances make it, and its unit."""
+
+_COLA2 = {
+    "cola2_msgs/msg/DecimalLatLon": "float64 latitude\nfloat64 longitude\n",
+    "cola2_msgs/msg/NED": "float64 north\nfloat64 east\nfloat64 depth\n",
+    "cola2_msgs/msg/RPY": "float32 roll\nfloat32 pitch\nfloat32 yaw\n",
+    "cola2_msgs/msg/NavSts": (
+        "std_msgs/Header header\nDecimalLatLon global_position\nDecimalLatLon origin\n"
+        "NED position\nfloat32 altitude\ngeometry_msgs/Point body_velocity\nRPY orientation\n"
+        "RPY orientation_rate\nNED position_variance\nRPY orientation_variance\n"
+    ),
+}
+"""For bags of ROS 2 before Iron, which hold no definitions."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BagOptions:
+    """What a bag does not tell by itself."""
+
+    topics: Mapping[str, str]
+    """By role (`dive.ROLES`): which topic to use."""
+    datum: Datum | None = None
+    """Origin of an odometry's world."""
+    density_kg_m3: float = 1025.0
+    surface_pressure_pa: float = 101325.0
+    """Both to make a depth of a pressure; the standard atmosphere (ISO 2533)."""
+    gravity_mps2: float = 9.80665
+
+
+@dataclass(frozen=True)
+class _Topic:
+    name: str
+    kind: str
+    """Type without its package."""
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path looks like a bag of ROS."""
+    return path.suffix.lower() in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").is_file()
+
+
+def read_ros_bag(path: Path, options: BagOptions) -> LoggedDive:
+    """Read a bag.
+
+    Args:
+        path: a ROS 1 file, a ROS 2 folder, or the single .mcap or .db3 of one.
+        options: what to use of it.
+
+    Raises:
+        NavigationError: it is no bag, is damaged, or lacks what navigation needs.
+    """
+    with _opened(path) as reader:
+        present = sorted({_Topic(c.topic, c.msgtype.split("/")[-1]) for c in reader.connections},
+                         key=lambda topic: topic.name)  # fmt: skip
+        chosen = _choose(path, present, options.topics)
+        origin = [
+            topic for topic in present
+            if topic.kind == FIX and topic.name.rsplit("/", 1)[-1] in _ORIGIN
+        ]  # fmt: skip
+        if chosen["navigation"].kind == ODOMETRY and options.datum is None and not origin:
+            raise NavigationError(
+                f"{path}: {chosen['navigation'].name} counts from an origin that the bag does not "
+                "tell: give --datum LATITUDE LONGITUDE"
+            )
+        joints = [topic for topic in present if topic.kind == JOINTS]
+        lost: Counter[str] = Counter()
+        series = _collect(reader, {*chosen.values(), *origin, *joints}, lost)
+    return _Reading(path, options, chosen, series, lost).dive(origin, joints)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator["AnyReader"]:
+    """An open reader; what goes wrong while it is open names the file in one line."""
+    from rosbags.highlevel import AnyReader, AnyReaderError
+    from rosbags.rosbag1 import ReaderError as Reader1Error
+    from rosbags.rosbag2 import ReaderError as Reader2Error
+    from rosbags.serde import SerdeError
+    from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+
+    if not path.exists():
+        raise NavigationError(f"{path}: no such file or folder")
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for name, text in _COLA2.items():
+        store.register(get_types_from_msg(text, name))
+    faults = (
+        AnyReaderError, Reader1Error, Reader2Error, SerdeError, TypesysError, OSError, struct.error,
+        ValueError, KeyError, IndexError, AssertionError, EOFError,
+    )  # fmt: skip
+    try:
+        with AnyReader([path], default_typestore=store) as reader:
+            yield reader
+    except NavigationError:
+        raise
+    except faults as error:
+        if path.is_file() and path.open("rb").read(4) == b"\x89HDF":
+            raise NavigationError(
+                f"{path}: a bathymetric attributed grid (HDF5), not a bag of ROS"
+            ) from None
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise NavigationError(
+            f"{path}: cannot be read as a bag of ROS, is it cut off? ({reason}); `rosbag reindex` "
+            "or `ros2 bag reindex` mends a bag whose recording was killed"
+        ) from None
+
+
+def _choose(path: Path, present: Sequence[_Topic], asked: Mapping[str, str]) -> dict[str, _Topic]:
+    """Which topic serves each role; roles that nothing serves are left out."""
+    chosen = {}
+    by_name = {topic.name: topic for topic in present}
+    for role, name in asked.items():
+        topic = by_name.get(name)
+        if topic is None:
+            raise NavigationError(f"{path}: no topic {name}; it has {_listed(present)}")
+        if topic.kind not in _TAKES[role]:
+            raise NavigationError(
+                f"{path}: {name} is {topic.kind}; {role} can come from {', '.join(_TAKES[role])}"
+            )
+        chosen[role] = topic
+    if "navigation" not in chosen:
+        chosen["navigation"] = _navigation(path, present)
+    kind = chosen["navigation"].kind
+    if kind == FIX:
+        for role, kinds in (("depth", (PRESSURE,)), ("attitude", (IMU,))):
+            found = [t for t in present if t.kind in kinds]
+            if role not in chosen and len(found) == 1:
+                chosen[role] = found[0]
+            elif role not in chosen and found:
+                raise NavigationError(
+                    f"{path}: {_listed(found)} could give {role}: choose with --topic {role}=NAME"
+                )
+        if "depth" not in chosen:
+            raise NavigationError(
+                f"{path}: {chosen['navigation'].name} gives no depth, and no topic of "
+                f"{PRESSURE} does: choose one with --topic depth=NAME; it has {_listed(present)}"
+            )
+    if "altitude" not in chosen and kind != NAV_STS:
+        ranges = [
+            t for t in present
+            if t.kind == RANGE and not any(word in t.name.lower() for word in _NOT_ALTITUDE)
+        ]  # fmt: skip
+        if len(ranges) == 1:
+            chosen["altitude"] = ranges[0]
+    return chosen
+
+
+def _navigation(path: Path, present: Sequence[_Topic]) -> _Topic:
+    """The one topic that navigation comes from when none is asked for."""
+    for kind in _TAKES["navigation"]:
+        found = [
+            t for t in present
+            if t.kind == kind
+            and not any(word in t.name.lower() for word in _TRUTH)
+            and t.name.rsplit("/", 1)[-1] not in _ORIGIN
+        ]  # fmt: skip
+        named = [t for t in found if "navig" in t.name.lower()]
+        if len(found) == 1 or len(named) == 1:
+            return found[0] if len(found) == 1 else named[0]
+        if found:
+            raise NavigationError(
+                f"{path}: {_listed(found)} could all be navigation: choose one with "
+                "--topic navigation=NAME"
+            )
+    raise NavigationError(
+        f"{path}: no topic of {', '.join(_TAKES['navigation'])}; it has {_listed(present)}"
+    )
+
+
+def _listed(topics: Sequence[_Topic]) -> str:
+    return ", ".join(f"{topic.name} ({topic.kind})" for topic in topics) or "no topics"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Series:
+    """The messages of one topic as numbers."""
+
+    topic: _Topic
+    time_s: Array
+    """(N,) as logged."""
+    columns: dict[str, Array]
+    """(N,) by name (`ros_rows.ROWS`), or by joint."""
+
+
+def _collect(reader: "AnyReader", wanted: set[_Topic], lost: Counter[str]) -> dict[_Topic, _Series]:
+    """Messages with their times: of the header, else (unset, or no header) of the recording."""
+    kinds = {topic.name: topic for topic in wanted}
+    connections = [c for c in reader.connections if c.topic in kinds]
+    times: dict[str, list[float]] = {name: [] for name in kinds}
+    rows: dict[str, list[Sequence[float]]] = {name: [] for name in kinds}
+    names: dict[str, tuple[str, ...]] = {
+        topic.name: ROWS[topic.kind][0] for topic in wanted if topic.kind in ROWS
+    }
+    total = sum(c.msgcount for c in connections)
+    messages = reader.messages(connections) if connections else iter(())
+    for connection, recorded_ns, raw in progress(messages, "log", total):
+        message: Any = reader.deserialize(raw, connection.msgtype)
+        name = connection.topic
+        stamp = getattr(getattr(message, "header", None), "stamp", None)
+        time_s = recorded_ns * 1e-9
+        if stamp is not None and (stamp.sec or stamp.nanosec):
+            time_s = stamp.sec + stamp.nanosec * 1e-9
+        elif stamp is not None and time_s > DATED_AFTER_S:
+            lost[f"{name}: header times that are not set (those of the recording are used)"] += 1
+        if kinds[name].kind == JOINTS:
+            joints = names.setdefault(name, tuple(message.name))
+            if tuple(message.name) != joints or len(message.velocity) != len(joints):
+                lost[f"{name}: joints without a speed, or not those of the first message"] += 1
+                continue
+            rows[name].append(message.velocity)
+        else:
+            rows[name].append(ROWS[kinds[name].kind][1](message))
+        times[name].append(time_s)
+    found = {}
+    for name, topic in kinds.items():
+        columns = names.get(name, ())
+        table = np.array(rows[name], dtype=np.float64).reshape(-1, len(columns))
+        found[topic] = _Series(
+            topic=topic,
+            time_s=np.array(times[name]),
+            columns={column: table[:, i] for i, column in enumerate(columns)},
+        )
+    return found
+
+
+class _Reading:
+    """The parts of a dive out of the topics of a bag."""
+
+    def __init__(
+        self,
+        path: Path,
+        options: BagOptions,
+        chosen: Mapping[str, _Topic],
+        series: Mapping[_Topic, _Series],
+        lost: Counter[str],
+    ) -> None:
+        self.path, self.options, self.chosen = path, options, chosen
+        self.series, self.lost = series, lost
+        self.notes: list[str] = []
+        self._counted: set[_Topic] = set()
+
+    def dive(self, origin: Sequence[_Topic], joints: Sequence[_Topic]) -> LoggedDive:
+        """Everything that the bag tells."""
+        navigation = self.series[self.chosen["navigation"]]
+        if navigation.topic.kind == ODOMETRY:
+            self._add_geodetic(self._datum(origin))
+        position = usable_positions(self._signal(navigation, PLACE), str(self.path), self.lost)
+        ranged = self.chosen.get("altitude")
+        rpm, thrusters = self._rpm(joints)
+        return LoggedDive(
+            kind="a bag of ROS",
+            clock="the times of the message headers",
+            dated=bool(position.time_s[0] > DATED_AFTER_S),
+            position=position,
+            depth=self._depth(),
+            attitude=self._attitude(),
+            altitude=self._altitude(),
+            altitude_slant=(
+                ranged is not None and ranged.kind == RANGE and not ranged.name.endswith("altitude")
+            ),
+            sigmas=self._sigmas(navigation),
+            velocity_body=self._signal(navigation, VELOCITY),
+            rates=self._signal(navigation, RATES),
+            rpm=rpm,
+            thrusters=thrusters,
+            lost=dict(self.lost),
+            notes=tuple(self.notes),
+        )
+
+    def _signal(self, series: _Series, names: Sequence[str], scale: float = 1.0) -> Signal | None:
+        """A signal of columns, None where the topic lacks them or is empty."""
+        if not len(series.time_s) or any(name not in series.columns for name in names):
+            return None
+        values = scale * np.stack([series.columns[name] for name in names], axis=1)
+        return self._cleaned(series, values)
+
+    def _cleaned(self, series: _Series, values: Array) -> Signal | None:
+        """A signal; what its times cost is counted once for a topic."""
+        lost = Counter() if series.topic in self._counted else self.lost
+        self._counted.add(series.topic)
+        return cleaned(series.topic.name, series.time_s, values, lost)
+
+    def _of(self, role: str) -> _Series:
+        return self.series[self.chosen.get(role, self.chosen["navigation"])]
+
+    def _datum(self, origin: Sequence[_Topic]) -> Datum:
+        if self.options.datum is not None:
+            return self.options.datum
+        fixes = self.series[origin[0]].columns if origin else {}
+        place = [fixes[name][0] for name in (*PLACE, "height") if len(fixes.get(name, ()))]
+        if len(place) < 3 or not np.all(np.isfinite(place)):
+            raise NavigationError(f"{self.path}: {origin[0].name} tells no place: give --datum")
+        return Datum(*(float(value) for value in place))
+
+    def _add_geodetic(self, datum: Datum) -> None:
+        """Latitude, longitude and depth to every odometry, which counts from the datum."""
+        for series in self.series.values():
+            if series.topic.kind == ODOMETRY:
+                ned = np.stack([series.columns[name] for name in NED], axis=1)
+                known = np.isfinite(ned).all(axis=1)
+                place = np.full(ned.shape, np.nan)
+                place[known] = datum.geodetic_from_ned(ned[known])
+                series.columns.update(zip((*PLACE, "depth"), place.T, strict=True))
+
+    def _depth(self) -> Signal | None:
+        series, options = self._of("depth"), self.options
+        if series.topic.kind != PRESSURE:
+            return self._signal(series, ("number",)) or self._signal(series, ("depth",))
+        self.notes.append(
+            f"depth is pressure less {options.surface_pressure_pa:g} Pa, in water of "
+            f"{options.density_kg_m3:g} kg/m^3"
+        )
+        per_metre = options.density_kg_m3 * options.gravity_mps2
+        values = (series.columns["pressure"] - options.surface_pressure_pa) / per_metre
+        return self._cleaned(series, values)
+
+    def _attitude(self) -> Signal | None:
+        series = self._of("attitude")
+        if ANGLES[0] in series.columns:
+            return self._signal(series, ANGLES, scale=float(np.rad2deg(1.0)))
+        if QUATERNION[0] not in series.columns:
+            return None
+        xyzw = np.stack([series.columns[name] for name in QUATERNION], axis=1)
+        good = np.abs(np.linalg.norm(xyzw, axis=1) - 1.0) < _UNIT
+        given = np.isfinite(xyzw).all(axis=1)
+        if (given & ~good).any():
+            self.lost[f"{series.topic.name}: quaternions that are not of length 1"] += int(
+                (given & ~good).sum()
+            )
+        angles = np.full((len(xyzw), 3), np.nan)
+        if good.any():
+            angles[good] = np.rad2deg(attitude_from_rotation(Rotation.from_quat(xyzw[good])))
+        return self._cleaned(series, angles)
+
+    def _altitude(self) -> Signal | None:
+        series = self._of("altitude")
+        name = "number" if "number" in series.columns else "altitude"
+        if name not in series.columns:
+            return None
+        values = series.columns[name]
+        with np.errstate(invalid="ignore"):
+            absent = values <= 0
+        if absent.any():
+            self.lost[f"{series.topic.name}: altitudes not above 0: no bottom"] += int(absent.sum())
+        return self._cleaned(series, np.where(absent, np.nan, values))
+
+    def _sigmas(self, series: _Series) -> dict[str, Signal]:
+        """Standard deviations; a variance that is not positive is not known."""
+        sigmas = {}
+        for column, (names, scale) in _SIGMAS.items():
+            if any(name not in series.columns for name in names):
+                continue
+            variance = np.mean([series.columns[name] for name in names], axis=0)
+            with np.errstate(invalid="ignore"):
+                sigma = scale * np.sqrt(np.where(variance > 0, variance, np.nan))
+            signal = self._cleaned(series, sigma)
+            if signal is not None:
+                sigmas[column] = signal
+        return sigmas
+
+    def _rpm(self, joints: Sequence[_Topic]) -> tuple[Signal | None, tuple[str, ...]]:
+        """Speeds of propellers, where exactly one topic has joints."""
+        if len(joints) > 1:
+            self.notes.append(f"thrusters are left out: {_listed(joints)} all have joints")
+        if len(joints) != 1:
+            return None, ()
+        series = self.series[joints[0]]
+        names = tuple(series.columns)
+        return self._signal(series, names, scale=60.0 / (2.0 * np.pi)) if names else None, names
