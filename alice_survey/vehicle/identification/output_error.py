@@ -1,0 +1,419 @@
+"""The joint fit: parameters whose simulation comes closest to all that was measured.
+
+Output-error least squares (L. Ljung, System Identification, 1999, 3.4 and 7): each window is
+simulated from a start of its own, so that a log in one window is single shooting and one cut into
+many is multiple shooting. The starts are eliminated (variable projection, Golub & Pereyra, Inverse
+Problems 19, 2003): for given parameters each window's start is solved for, and the parameters see
+residuals and slopes with the directions of the start taken out. The sensitivities are exact.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from alice_survey.errors import VehicleError
+from alice_survey.frames import Array
+from alice_survey.vehicle.identification.noise import (
+    autocovariance,
+    correlated_information,
+    noise_sigma,
+)
+from alice_survey.vehicle.identification.parameters import Parameters
+from alice_survey.vehicle.identification.sensitivity import CHANNELS, START, simulate
+from alice_survey.vehicle.identification.slopes import STATES, Physics, scratch_for
+from alice_survey.vehicle.identification.windows import Mask, Window, cut, residual_channels
+from alice_survey.vehicle.log import attitude_of
+
+_SHORT_S = 5.0
+"""Parameters are approached on windows no longer than this: over a short time a simulation stays
+near the measured motion whatever the parameters, so that the fit is led to the right minimum."""
+_START_SIGMA = np.array([0.5] * 3 + [2.0] * 6)
+"""How far, rad, m/s and rad/s, a start may be from the first measured values before it costs one
+sigma: wide, so that it matters only where nothing was measured."""
+_SETTLED = 1e-2
+"""A start is found when what is left to gain is this small beside one sigma squared."""
+_ROUNDS = 4
+"""Most times that the noise is estimated anew."""
+_SAME = 0.02
+"""Relative change of the noise that is none."""
+_LEAST_SIGMA = np.array([1e-6] * CHANNELS)
+"""Noise cannot be estimated smaller: m/s, rad/s, rad."""
+_SINGULAR = 1e-12
+"""Ratio of the information's least to greatest eigenvalue, in units of its diagonal."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulation:
+    """How windows are simulated."""
+
+    longest_step_s: float = 0.025
+    """Rows farther apart are crossed in several steps."""
+    hold: bool = False
+    """Inputs stay until the next row; else they run straight between rows."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Fit:
+    """Parameters and how well they are known."""
+
+    parameters: Parameters
+    values: Array
+    """(P,)"""
+    covariance: Array
+    """(P, P) with the residuals' correlation in time; zero of parameters at a bound."""
+    white_covariance: Array
+    """(P, P) as if the residuals were white: from the Gauss-Newton Hessian alone."""
+    at_bound: Mask
+    """(P,) bool: held by a bound, so without sigma."""
+    channel_sigma: Array
+    """(9,) of the residuals, NaN where nothing was measured."""
+    correlation_s: Array
+    """(9,) time over which residuals hang together: zero if white."""
+    windows: Sequence[Window]
+    starts: Sequence[Array]
+    """(10,) state each window begins with, nu relative to the water."""
+    samples: int
+    evaluations: int
+
+    @property
+    def sigma(self) -> Array:
+        """(P,) NaN of parameters at a bound."""
+        sigma: Array = np.sqrt(np.diag(self.covariance))
+        return np.where(self.at_bound, np.nan, sigma)
+
+    @property
+    def correlation(self) -> Array:
+        """(P, P); NaN of parameters at a bound."""
+        sigma = self.sigma
+        matrix: Array = self.covariance / np.outer(sigma, sigma)
+        return matrix
+
+
+def fit_output_error(
+    windows: Sequence[Window],
+    parameters: Parameters,
+    *,
+    simulation: Simulation | None = None,
+    channel_sigma: Array | None = None,
+    most_evaluations: int = 60,
+) -> Fit:
+    """Fit parameters to windows.
+
+    Args:
+        windows: all with the thrusters of the parameters' vehicle, or all without.
+        parameters: what is free, and where it starts.
+        simulation: steps and inputs.
+        channel_sigma: (9,) noise of velocity over ground, m/s, rates, rad/s, and attitude, rad;
+            estimated from the residuals when not given.
+        most_evaluations: of all windows, in each round.
+
+    Raises:
+        VehicleError: the simulation does not stay finite at the start, the fit does not settle, or
+            the logs do not determine the parameters.
+    """
+    how = simulation or Simulation()
+    sigma = _first_sigma(windows) if channel_sigma is None else channel_sigma
+    lower, upper = parameters.bounds
+    short = [part for window in windows for part in cut(window, _SHORT_S)]
+    approach = _Problem(short, parameters, how, sigma)
+    approach.begin(parameters.start)
+    result = least_squares(
+        approach.residuals, np.clip(parameters.start, lower, upper), approach.jacobian,
+        bounds=(lower, upper), x_scale="jac", ftol=1e-3, xtol=1e-10, gtol=None, max_nfev=20,
+    )  # fmt: skip
+    values, evaluations = result.x, int(result.nfev)
+    problem = _Problem(windows, parameters, how, sigma)
+    for round_ in range(_ROUNDS if channel_sigma is None else 1):
+        last = channel_sigma is not None or round_ > 0
+        problem.begin(values)
+        result = least_squares(
+            problem.residuals, np.clip(values, lower, upper), problem.jacobian,
+            bounds=(lower, upper), x_scale="jac", ftol=1e-8 if last else 1e-4, xtol=1e-10,
+            gtol=None, max_nfev=most_evaluations,
+        )  # fmt: skip
+        evaluations += result.nfev
+        if result.status == 0:
+            raise VehicleError(
+                f"the fit has not settled after {most_evaluations} evaluations: free fewer "
+                "parameters, or start from coefficients that are closer"
+            )
+        values = result.x
+        if channel_sigma is not None:
+            break
+        changed = problem.estimate_sigma(values)
+        if changed < _SAME:
+            break
+    return problem.result(values, result.active_mask != 0, evaluations)
+
+
+class _Problem:
+    """Residuals of all windows with their starts solved for."""
+
+    def __init__(
+        self, windows: Sequence[Window], parameters: Parameters, how: Simulation, sigma: Array
+    ) -> None:
+        self.windows, self.parameters, self.how = windows, parameters, how
+        self.sigma = np.maximum(np.where(np.isfinite(sigma), sigma, 1.0), _LEAST_SIGMA)
+        self.count = len(parameters.names)
+        self.measured = [
+            np.isfinite(residual_channels(w, _blank(w))) & np.ones(CHANNELS, bool) for w in windows
+        ]
+        self.starts = [window.start.copy() for window in windows]
+        self.gains = [np.zeros((START, self.count)) for _ in windows]
+        self.at = parameters.start.copy()
+        columns = self.count + START
+        self.scratch = scratch_for(columns, windows[0].record.rps.shape[1])
+        self.sensitivity = np.zeros((STATES, columns))
+        self.slopes = np.zeros((0, 0))
+
+    def begin(self, values: Array) -> None:
+        """Check that the simulation works where the fit starts."""
+        if not np.all(np.isfinite(self.residuals(values))):
+            raise VehicleError(
+                "the simulation does not stay finite with the coefficients the fit starts from: "
+                "check signs and units of log and vehicle, or use shorter windows"
+            )
+
+    def residuals(self, values: Array) -> Array:
+        """All residuals in sigmas, less what the starts explain; infinite where there are none."""
+        solved = self._solve(values)
+        if solved is None:
+            size = sum(int(m.sum()) for m in self.measured) + START * len(self.windows)
+            return np.full(size, np.inf)
+        residuals, slopes = [], []
+        for i, (residual, slope) in enumerate(solved):
+            by_start = slope[:, self.count :]
+            basis, triangle = np.linalg.qr(by_start)
+            by_parameters = slope[:, : self.count]
+            inner = basis.T @ by_parameters
+            residuals.append(residual - basis @ (basis.T @ residual))
+            slopes.append(by_parameters - basis @ inner)
+            self.gains[i] = np.linalg.solve(triangle, inner)
+        self.at = values.copy()
+        self.slopes = np.concatenate(slopes)
+        return np.concatenate(residuals)
+
+    def jacobian(self, values: Array) -> Array:
+        """Slopes of the residuals."""
+        if not np.array_equal(values, self.at):
+            self.residuals(values)
+        return self.slopes
+
+    def estimate_sigma(self, values: Array) -> float:
+        """Take the noise from the residuals; how much it changed, relative."""
+        sigma = self._channel_sigma(self._by_channel(self.residuals(values)))
+        known = np.isfinite(sigma)
+        new = np.maximum(np.where(known, sigma * self.sigma, 1.0), _LEAST_SIGMA)
+        changed = float(np.max(np.abs(new / self.sigma - 1.0)[known]))
+        self.sigma = new
+        return changed
+
+    def result(self, values: Array, at_bound: Mask, evaluations: int) -> Fit:
+        """What the fit tells, at the values it settled on."""
+        residuals = self.residuals(values)
+        free = np.flatnonzero(~at_bound)
+        information = self.slopes[:, free].T @ self.slopes[:, free]
+        inverse = _inverse(information, [self.parameters.names[k] for k in free])
+        runs, slopes = self._by_channel(residuals), self._by_channel(self.slopes[:, free])
+        meat, times = np.zeros_like(information), np.full(CHANNELS, np.nan)
+        sigma = self._channel_sigma(runs)
+        spread = self._freedom(runs)
+        for channel in range(CHANNELS):
+            if not any(len(run) for run in runs[channel]):
+                continue
+            lags = autocovariance(runs[channel]) * spread
+            meat += correlated_information(slopes[channel], lags)
+            times[channel] = self._step_s(channel) * float(np.sum(lags[1:])) / max(lags[0], 1e-300)
+        meat += self._prior(self.slopes[:, free])
+        covariance, white = (np.zeros((self.count, self.count)) for _ in range(2))
+        covariance[np.ix_(free, free)] = inverse @ meat @ inverse
+        white[np.ix_(free, free)] = inverse
+        return Fit(
+            parameters=self.parameters, values=values, covariance=covariance,
+            white_covariance=white, at_bound=at_bound, channel_sigma=sigma * self.sigma,
+            correlation_s=times, windows=self.windows, starts=list(self.starts),
+            samples=sum(int(m.sum()) for m in self.measured), evaluations=evaluations,
+        )  # fmt: skip
+
+    def _solve(self, values: Array) -> list[tuple[Array, Array]] | None:
+        """Residuals in sigmas and their slopes, window by window; None where there are none."""
+        try:
+            physics = self.parameters.physics(values)
+        except VehicleError:
+            return None  # an inertia that is none: the step was too long
+        solved = []
+        for i, window in enumerate(self.windows):
+            start = _moved(self.starts[i], -self.gains[i] @ (values - self.at))
+            found = self._start(window, i, physics, start)
+            if found is None:
+                found = self._start(window, i, physics, window.start)
+            if found is None:
+                return None
+            self.starts[i], residual, slope = found
+            solved.append((residual, slope))
+        return solved
+
+    def _start(
+        self, window: Window, i: int, physics: Physics, start: Array
+    ) -> tuple[Array, Array, Array] | None:
+        """Gauss-Newton on the start of a window: it, residuals and slopes there."""
+        found = self._simulate(window, i, physics, start)
+        if found is None:
+            return None
+        for _ in range(12):
+            residual, slope = found
+            basis, triangle = np.linalg.qr(slope[:, self.count :])
+            along = basis.T @ residual
+            if along @ along < _SETTLED:
+                break
+            step, share = -np.linalg.solve(triangle, along), 1.0
+            while share > 1e-3:
+                trial = _moved(start, share * step)
+                better = self._simulate(window, i, physics, trial)
+                if better is not None and better[0] @ better[0] < residual @ residual:
+                    start, found = trial, better
+                    break
+                share *= 0.3
+            else:
+                break
+        return (start, *found)
+
+    def _simulate(
+        self, window: Window, i: int, physics: Physics, start: Array
+    ) -> tuple[Array, Array] | None:
+        rows = len(window.record.time_s)
+        states, observed = np.empty((rows, STATES)), np.empty((rows, CHANNELS))
+        slopes = np.empty((rows, CHANNELS, self.count + START))
+        simulate(
+            physics, self.parameters.terms, window.record, start, self.how.longest_step_s,
+            self.how.hold, self.scratch, self.sensitivity, states, observed, slopes,
+        )  # fmt: skip
+        mask = self.measured[i]
+        residual = (residual_channels(window, observed) / self.sigma)[mask]
+        if not np.all(np.isfinite(residual)):
+            return None
+        slope = (slopes / self.sigma[:, None])[mask]
+        prior = np.zeros((START, self.count + START))
+        prior[:, self.count :] = np.diag(1.0 / _START_SIGMA)
+        away = _between(window.start, start) / _START_SIGMA
+        return np.concatenate([residual, away]), np.concatenate([slope, prior])
+
+    def _by_channel(self, table: Array) -> list[list[Array]]:
+        """Rows of residuals or slopes, by channel and window, without those of the priors."""
+        channels: list[list[Array]] = [[] for _ in range(CHANNELS)]
+        begin = 0
+        for mask in self.measured:
+            size = int(mask.sum())
+            part, place = table[begin : begin + size], np.nonzero(mask)[1]
+            for channel in range(CHANNELS):
+                channels[channel].append(part[place == channel])
+            begin += size + START
+        return channels
+
+    def _prior(self, slopes: Array) -> Array:
+        """Information of the starts' priors."""
+        rows, begin = [], 0
+        for mask in self.measured:
+            begin += int(mask.sum()) + START
+            rows.append(slopes[begin - START : begin])
+        table = np.concatenate(rows)
+        return table.T @ table
+
+    def _freedom(self, runs: list[list[Array]]) -> float:
+        """Samples over degrees of freedom: parameters and starts fit some of the noise."""
+        samples = sum(len(run) for channel in runs for run in channel)
+        left = samples - self.count - START * len(self.windows)
+        if left < 0.1 * samples:
+            raise VehicleError(
+                f"{samples} samples for {self.count} parameters and {len(self.windows)} windows "
+                "are too few: use longer windows or free fewer parameters"
+            )
+        return samples / left
+
+    def _channel_sigma(self, runs: list[list[Array]]) -> Array:
+        spread = self._freedom(runs)
+        sigma = np.full(CHANNELS, np.nan)
+        for channel, series in enumerate(runs):
+            values = np.concatenate(series)
+            if len(values):
+                sigma[channel] = np.sqrt(spread * float(values @ values) / len(values))
+        return sigma
+
+    def _step_s(self, channel: int) -> float:
+        """Median time between samples of a channel."""
+        steps = [
+            np.diff(w.record.time_s[m[:, channel]])
+            for w, m in zip(self.windows, self.measured, strict=True)
+        ]
+        together = np.concatenate(steps)
+        return float(np.median(together)) if len(together) else 0.0
+
+
+def _first_sigma(windows: Sequence[Window]) -> Array:
+    """Noise to begin with, (9,): what is left of the channels without their smooth part."""
+    sigma = np.full(CHANNELS, np.nan)
+    attitude = [np.unwrap(_known(attitude_of(w.record.attitude)), axis=0) for w in windows]
+    for channel in range(CHANNELS):
+        table = (
+            [w.measured[:, channel] for w in windows]
+            if channel < 6
+            else [a[:, channel - 6] for a in attitude]
+        )
+        found = [noise_sigma(series) for series in table]
+        known = [value for value in found if np.isfinite(value)]
+        # Where the channel is so smooth that rounding is all there is, a small part of its range.
+        spread = [np.nanstd(series) for series in table if np.any(np.isfinite(series))]
+        if known:
+            sigma[channel] = max(float(np.median(known)), 1e-2 * float(np.median(spread)), 1e-6)
+    return sigma
+
+
+def _known(angles: Array) -> Array:
+    return angles[np.all(np.isfinite(angles), axis=1)]
+
+
+def _blank(window: Window) -> Array:
+    """Observations that are unknown only where the attitude is, (T, 9)."""
+    blank = np.zeros((len(window.measured), CHANNELS))
+    blank[:, 6:] = np.where(np.isfinite(window.record.attitude).all(axis=1), 0.0, np.nan)[:, None]
+    return blank
+
+
+def _moved(start: Array, step: Array) -> Array:
+    """A start (10,) turned about the body's axes and with nu changed by a step (9,)."""
+    moved = start.copy()
+    turned = Rotation.from_quat(start[:4]) * Rotation.from_rotvec(step[:3])
+    quaternion = turned.as_quat()
+    moved[:4] = quaternion if quaternion @ start[:4] >= 0 else -quaternion
+    moved[4:] += step[3:]
+    return moved
+
+
+def _between(first: Array, second: Array) -> Array:
+    """The step (9,) from one start to another."""
+    turn = Rotation.from_quat(first[:4]).inv() * Rotation.from_quat(second[:4])
+    return np.concatenate([turn.as_rotvec(), second[4:] - first[4:]])
+
+
+def _inverse(information: Array, names: Sequence[str]) -> Array:
+    """Inverse of the information.
+
+    Raises:
+        VehicleError: it has none: the parameters that cannot be told apart are named.
+    """
+    scale = np.sqrt(np.diag(information))
+    blind = [name for name, value in zip(names, scale, strict=True) if value == 0]
+    if blind:
+        raise VehicleError(f"the logs tell nothing of {', '.join(blind)}: do not free them")
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    if len(values) and values[0] < _SINGULAR * values[-1]:
+        weight = np.abs(vectors[:, 0])
+        mixed = [name for name, w in zip(names, weight, strict=True) if w > 0.3 * weight.max()]
+        raise VehicleError(
+            f"the logs cannot tell {', '.join(mixed)} apart: free fewer of them, or add manoeuvres"
+        )
+    inverse: Array = (vectors / values) @ vectors.T / np.outer(scale, scale)
+    return inverse

@@ -1,0 +1,220 @@
+"""Stretches of logs that a simulation is compared with."""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.errors import VehicleError, warn
+from alice_survey.frames import Array
+from alice_survey.vehicle.identification.sensitivity import CHANNELS, Record
+from alice_survey.vehicle.identification.slopes import STATES
+from alice_survey.vehicle.log import VehicleLog, segments
+from alice_survey.vehicle.vehicle import Vehicle
+
+Mask = NDArray[np.bool_]
+
+CHANNEL_NAMES = ("u", "v", "w", "p", "q", "r", "roll", "pitch", "heading")
+"""Velocity over ground, m/s; rates, rad/s; attitude about the body's axes, rad."""
+_FEWEST_ROWS = 5
+"""A shorter stretch tells less than its free start asks."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Window:
+    """A stretch of a log, ready to simulate."""
+
+    source: str
+    record: Record
+    measured: Array
+    """(T, 6) velocity over ground and rates, NaN where not measured."""
+    start: Array
+    """(10,) state to begin with: the first attitude, and the first velocity over ground and rates
+    that were measured, zero where none was."""
+
+
+def make_windows(
+    log: VehicleLog,
+    vehicle: Vehicle,
+    *,
+    window_s: float | None = None,
+    gap_s: float | None = None,
+    source: str | None = None,
+) -> list[Window]:
+    """Cut a log into windows; warns of rows that are left out.
+
+    Args:
+        log: with attitude, velocities or rates, and the speeds of all thrusters, their thrusts, or
+            the wrench; the first of these that the log holds is taken. An input that is missing in
+            a row stays what it was.
+        vehicle: whose thrusters they are.
+        window_s: longest duration of a window; whole stretches without gaps if not given.
+        gap_s: longest step that is no gap, see `segments`; also the longest that an input is
+            carried on.
+        source: `rpm`, `thrust` or `wrench`: which input to take, if the log holds several.
+
+    Raises:
+        VehicleError: the log lacks attitude, motion or input, or no stretch is long enough.
+    """
+    _check(log)
+    rps, wrench = inputs(log, vehicle, source)
+    motion = np.concatenate([log.velocity_body, log.rates_body], axis=1)
+    windows, lost = [], 0
+    for part in segments(log, gap_s):
+        known = _held(log.time_s[part], rps[part], wrench[part], gap_s)
+        for piece in _pieces(log.time_s[part], known, window_s):
+            rows = slice(part.start + piece.start, part.start + piece.stop)
+            record = Record(
+                *(
+                    np.ascontiguousarray(table[rows])
+                    for table in (log.time_s, rps, wrench, log.quaternion_xyzw)
+                )
+            )
+            window = _window(log.source, record, motion[rows])
+            if window is None:
+                lost += rows.stop - rows.start
+            else:
+                windows.append(window)
+        lost += int(np.sum(~known))
+    if not windows:
+        raise VehicleError(
+            f"{log.source}: no stretch of {_FEWEST_ROWS} rows has motion, attitude and input"
+        )
+    if lost:
+        warn(
+            f"{log.source}: {lost} of {len(log.time_s)} rows are not used: no input, or a stretch "
+            f"of less than {_FEWEST_ROWS} rows or without motion"
+        )
+    return windows
+
+
+def inputs(log: VehicleLog, vehicle: Vehicle, source: str | None = None) -> tuple[Array, Array]:
+    """Speeds of the vehicle's thrusters, (T, n) rev/s, and a given wrench, (T, 6).
+
+    Of the two the one that the log does not hold has no columns, or is zero. Thrusts act at the
+    thrusters' places along their directions, and are net forces on the vehicle.
+
+    Raises:
+        VehicleError: the log has no such input, or lacks a thruster of the vehicle.
+    """
+    kinds = {
+        "rpm": bool(log.rpm),
+        "thrust": bool(log.thrust_n),
+        "wrench": bool(np.any(np.isfinite(log.wrench))),
+    }
+    chosen = source or next((kind for kind, held in kinds.items() if held), None)
+    if chosen is None or not kinds.get(chosen, False):
+        raise VehicleError(
+            f"{log.source}: has no {chosen or 'input'}: give rpm_NAME, thrust_NAME_n or "
+            "X_n,Y_n,Z_n,K_nm,M_nm,N_nm"
+        )
+    count = len(log.time_s)
+    if chosen == "wrench":
+        return np.zeros((count, 0)), log.wrench.copy()
+    series = log.rpm if chosen == "rpm" else log.thrust_n
+    names = [thruster.name for thruster in vehicle.thrusters]
+    missing = [name for name in names if name not in series]
+    strange = [name for name in series if name not in names]
+    if missing or strange:
+        raise VehicleError(
+            f"{log.source}: thrusters {', '.join(series)} are not those of {vehicle.name}: "
+            f"{', '.join(names) or 'none'}"
+        )
+    table = np.stack([series[name] for name in names], axis=1)
+    if chosen == "rpm":
+        return table / 60.0, np.zeros((count, 6))
+    columns = []
+    for thruster in vehicle.thrusters:
+        direction = np.array(thruster.direction_body)
+        columns.append([*direction, *np.cross(thruster.position_body_m, direction)])
+    return np.zeros((count, 0)), table @ np.array(columns)
+
+
+def cut(window: Window, longest_s: float) -> list[Window]:
+    """A window in equal shorter ones; those that tell nothing are left out."""
+    record = window.record
+    known = np.ones(len(record.time_s), bool)
+    parts = []
+    for piece in _pieces(record.time_s, known, longest_s):
+        short = Record(*(np.ascontiguousarray(table[piece]) for table in record))
+        made = _window(window.source, short, window.measured[piece])
+        if made is not None:
+            parts.append(made)
+    return parts
+
+
+def of_windows(windows: Sequence[Window], vehicle: Vehicle) -> Vehicle:
+    """The vehicle with the thrusters that the windows give speeds of: all, or none."""
+    thrusters = {window.record.rps.shape[1] for window in windows}
+    if len(thrusters) > 1:
+        raise VehicleError("some logs give thruster speeds and others forces: use one kind")
+    return vehicle if thrusters == {len(vehicle.thrusters)} else _without_thrusters(vehicle)
+
+
+def residual_channels(window: Window, observed: Array) -> Array:
+    """Simulated less measured, (T, 9), NaN where nothing was measured."""
+    difference = np.empty((len(observed), CHANNELS))
+    difference[:, :6] = observed[:, :6] - window.measured
+    difference[:, 6:] = observed[:, 6:]
+    return difference
+
+
+def _without_thrusters(vehicle: Vehicle) -> Vehicle:
+    return vehicle.without([thruster.name for thruster in vehicle.thrusters])
+
+
+def _check(log: VehicleLog) -> None:
+    if not np.any(np.isfinite(log.quaternion_xyzw)):
+        raise VehicleError(
+            f"{log.source}: has no attitude: give roll_deg, pitch_deg and heading_deg, or quat_x "
+            "to quat_w"
+        )
+    if not np.any(np.isfinite(log.velocity_body)) and not np.any(np.isfinite(log.rates_body)):
+        raise VehicleError(
+            f"{log.source}: has neither velocities u_mps, v_mps, w_mps nor rates p_rad_s, q_rad_s, "
+            "r_rad_s"
+        )
+
+
+def _held(time_s: Array, rps: Array, wrench: Array, gap_s: float | None) -> Mask:
+    """Fill gaps of the input in place from the row before; (T,) where there is one.
+
+    An input is not carried on for longer than a gap: 10 median steps when not given.
+    """
+    steps = np.diff(time_s)
+    longest = 10 * float(np.median(steps)) if gap_s is None and len(steps) else gap_s or 0.0
+    known = np.all(np.isfinite(rps), axis=1) & np.all(np.isfinite(wrench), axis=1)
+    last = np.maximum.accumulate(np.where(known, np.arange(len(time_s)), -1))
+    fresh: Mask = (last >= 0) & (time_s - time_s[np.maximum(last, 0)] <= longest)
+    for table in (rps, wrench):
+        table[fresh] = table[last[fresh]]
+    return fresh
+
+
+def _pieces(time_s: Array, known: Mask, window_s: float | None) -> list[slice]:
+    """Runs of rows with an input, cut into equal windows no longer than asked."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], known.astype(np.int8), [0]])))
+    pieces = []
+    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        span = time_s[end - 1] - time_s[begin]
+        count = 1 if window_s is None else max(int(np.ceil(span / window_s - 1e-9)), 1)
+        marks = time_s[begin] + span * np.arange(1, count) / count
+        cuts = [begin, *(begin + np.searchsorted(time_s[begin:end], marks)).tolist(), end]
+        pieces += [slice(a, b) for a, b in itertools.pairwise(cuts)]
+    return pieces
+
+
+def _window(source: str, record: Record, measured: Array) -> Window | None:
+    """A stretch; None where it is too short or tells nothing of motion or attitude."""
+    attitudes = np.flatnonzero(np.all(np.isfinite(record.attitude), axis=1))
+    if len(measured) < _FEWEST_ROWS or not len(attitudes) or not np.any(np.isfinite(measured)):
+        return None
+    start = np.zeros(STATES)
+    start[:4] = record.attitude[attitudes[0]]
+    for i, column in enumerate(measured.T):
+        there = np.flatnonzero(np.isfinite(column))
+        if len(there):
+            start[4 + i] = column[there[0]]
+    return Window(source=source, record=record, measured=measured, start=start)
