@@ -217,7 +217,8 @@ def derivative(
     Newton for the bodies, with the velocity over ground:
         M_RB nu_g' + C_RB(nu_g) nu_g = tau - g + F.
     The water's force F holds added mass and damping of the velocity relative to the water, and the
-    push of the pressure that speeds up the water itself, on all of the water that is displaced:
+    push of the pressure that speeds up the water itself, on all of the water that is displaced, at
+    its centre (of that displaced by the drained vehicle the origin):
         F = -M_A nu_r' - C_A(nu_r) nu_r + damping(nu_r) + m_displaced dV/dt.
     A horizontal current that changes with depth alone carries no speed of its own along its slope,
     so that dV/dt of a drop of water is the rate by time at one place.
@@ -234,13 +235,19 @@ def derivative(
 
     rigid = parts(vehicle)
     mass_rigid, mass_added = sum(p.matrix for p in rigid), added_mass(vehicle)
-    displaced = vehicle.rigid_body.buoyancy_kg + vehicle.rigid_body.entrained_kg
     force = load + thrust(vehicle, rps, nu_relative) - restoring(vehicle, eta[3:])
     force = force + damping_force(vehicle, nu_relative)
     force = force - added_coriolis(mass_added, nu_relative) @ nu_relative
     force = force - sum(p.coriolis(nu_ground) for p in rigid) @ nu_ground
     force = force + mass_added @ water_rate
-    force[:3] += displaced * rotation.T @ by_time
+    body = vehicle.rigid_body
+    for displaced, centre in (
+        (body.buoyancy_kg, np.zeros(3)),
+        (body.entrained_kg, np.array(body.entrained_cg_body_m)),
+    ):
+        push = displaced * rotation.T @ by_time
+        force[:3] += push
+        force[3:] += cross_matrix(centre) @ push
     nu_rate = np.linalg.solve(mass_rigid + mass_added, force)
     eta_rate = np.concatenate([ground_ned, attitude_rates_from_body_rates(eta[3:]) @ nu_ground[3:]])
     return eta_rate, nu_rate, lag(vehicle.thrusters, rps, command_rps)

@@ -26,10 +26,12 @@ class Body(NamedTuple):
     mass: Array
     """(6, 6) M = M_RB + M_A, symmetric positive definite."""
     mass_inverse: Array
-    rigid_mass: Array
-    """(6, 6) M_RB, with the water inside the hull."""
-    displaced_kg: float
-    """Mass of the water that hull and water inside displace."""
+    in_current: Array
+    """(6, 6) what holds the body back in a current. Columns 0 to 2: of M_RB, by the acceleration
+    that the vehicle needs to keep up with a current which changes along its way. Columns 3 to 5:
+    the same less the water that is displaced, by the current's acceleration in time, whose pressure
+    pushes the body as it would that water. Nothing but the low weight is left of these three in a
+    neutral vehicle."""
     linear: Array
     """(6, 6) linear damping."""
     quadratic: Array
@@ -210,21 +212,25 @@ def derivative(
     force[3] += weight * (gy * r22 - gz * r21)
     force[4] += weight * (gz * r20 - gx * r22)
     force[5] += weight * (gx * r21 - gy * r20)
-    # A current that changes along the way: the inertia of the body against its change, helped by
-    # the pressure that speeds up the water itself.
-    along_n, along_e = water[2] + water[4] * out[2], water[3] + water[5] * out[2]
+    # A current that changes along the way down, and in time.
+    along_n, along_e = water[4] * out[2], water[5] * out[2]
     if along_n != 0.0 or along_e != 0.0 or water[2] != 0.0 or water[3] != 0.0:
+        held = body.in_current
         ax, ay, az = (
             r00 * along_n + r10 * along_e,
             r01 * along_n + r11 * along_e,
             r02 * along_n + r12 * along_e,
         )
+        tx, ty, tz = (
+            r00 * water[2] + r10 * water[3],
+            r01 * water[2] + r11 * water[3],
+            r02 * water[2] + r12 * water[3],
+        )
         for i in range(6):
-            rigid = body.rigid_mass
-            force[i] -= rigid[i, 0] * ax + rigid[i, 1] * ay + rigid[i, 2] * az
-        force[0] += body.displaced_kg * (r00 * water[2] + r10 * water[3])
-        force[1] += body.displaced_kg * (r01 * water[2] + r11 * water[3])
-        force[2] += body.displaced_kg * (r02 * water[2] + r12 * water[3])
+            force[i] -= (
+                held[i, 0] * ax + held[i, 1] * ay + held[i, 2] * az
+                + held[i, 3] * tx + held[i, 4] * ty + held[i, 5] * tz
+            )  # fmt: skip
     for i in range(6):
         total = 0.0
         for j in range(6):

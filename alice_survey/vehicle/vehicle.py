@@ -39,13 +39,26 @@ class RigidBody:
             (self.dry_kg, self.cg_body_m, self.inertia_kg_m2),
             (self.entrained_kg, self.entrained_cg_body_m, self.entrained_inertia_kg_m2),
         ):
-            x, y, z = cg
-            s = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+            s = _cross_matrix(cg)
             total[:3, :3] += mass * np.eye(3)
             total[:3, 3:] -= mass * s
             total[3:, :3] += mass * s
             total[3:, 3:] += np.diag(inertia) - mass * s @ s
         return total
+
+    @cached_property
+    def displaced(self) -> Array:
+        """(6, 3) momentum, about the origin, of the displaced water by its velocity."""
+        inside = self.entrained_kg
+        return np.vstack([
+            (self.buoyancy_kg + inside) * np.eye(3),
+            inside * _cross_matrix(self.entrained_cg_body_m),
+        ])  # fmt: skip
+
+
+def _cross_matrix(a: tuple[float, float, float]) -> Array:
+    x, y, z = a
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -78,12 +91,12 @@ class Vehicle:
     def plant(self) -> Plant:
         """For compiled code."""
         rigid, kinds = self.rigid_body, self.coefficients
-        displaced = rigid.buoyancy_kg + rigid.entrained_kg
+        displaced_kg = rigid.buoyancy_kg + rigid.entrained_kg
+        inertia = rigid.mass_matrix[:, :3]
         body = Body(
             mass=np.ascontiguousarray(self.mass),
             mass_inverse=np.ascontiguousarray(np.linalg.inv(self.mass)),
-            rigid_mass=np.ascontiguousarray(rigid.mass_matrix),
-            displaced_kg=displaced,
+            in_current=np.ascontiguousarray(np.hstack([inertia, inertia - rigid.displaced])),
             linear=kinds.linear,
             quadratic=kinds.quadratic,
             lift=kinds.lift,
@@ -91,7 +104,7 @@ class Vehicle:
             buoyancy_n=rigid.buoyancy_kg * GRAVITY,
             cg=np.array(rigid.cg_body_m),
         )
-        return Plant(body, pack(self.thrusters, self.density_kg_m3, displaced))
+        return Plant(body, pack(self.thrusters, self.density_kg_m3, displaced_kg))
 
     @cached_property
     def configuration_matrix(self) -> Array:

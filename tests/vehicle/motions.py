@@ -17,7 +17,6 @@ from alice_survey.vehicle.sea import Current, constant_current
 from alice_survey.vehicle.vehicle import RigidBody, Vehicle
 
 Array = NDArray[np.float64]
-SETS = ("estimated", "cfd", "calibrated")
 STILL = constant_current(0.0, 0.0)
 
 

@@ -25,7 +25,6 @@ from alice_survey.vehicle.sea import Current
 from alice_survey.vehicle.vehicle import Vehicle
 from tests import oracles_dynamics as oracle
 from tests.vehicle.motions import (
-    SETS,
     STILL,
     advance,
     alice,
@@ -48,7 +47,7 @@ X, Y, Z, K, M, N = range(7, 13)
 """Places of the accelerations in the rates of a state."""
 
 
-@pytest.mark.parametrize("coefficients", SETS)
+@pytest.mark.parametrize("coefficients", fleet.SETS)
 @pytest.mark.parametrize("name", ["alice", "sparus2"])
 def test_inertia_is_symmetric_and_positive_definite(name: str, coefficients: str) -> None:
     vehicle = fleet.vehicle(name, coefficients)
@@ -57,8 +56,9 @@ def test_inertia_is_symmetric_and_positive_definite(name: str, coefficients: str
     np.testing.assert_allclose(vehicle.plant.body.mass_inverse @ vehicle.mass, np.eye(6), atol=1e-9)
 
 
+@settings(deadline=None)
 @given(nu=VELOCITIES)
-@pytest.mark.parametrize("coefficients", SETS)
+@pytest.mark.parametrize("coefficients", fleet.SETS)
 def test_both_coriolis_matrices_are_skew_and_do_no_work(coefficients: str, nu: Array) -> None:
     vehicle = alice(coefficients)
     for mass in (vehicle.rigid_body.mass_matrix, vehicle.coefficients.added_mass):
@@ -71,6 +71,7 @@ def test_both_coriolis_matrices_are_skew_and_do_no_work(coefficients: str, nu: A
     assert abs(nu @ force) < 1e-12 * (1.0 + np.abs(vehicle.mass).max() * np.linalg.norm(nu) ** 3)
 
 
+@settings(deadline=None)
 @given(nu=VELOCITIES)
 def test_coriolis_kernel_and_matrices_match_the_textbook(nu: Array) -> None:
     vehicle = alice()
@@ -86,8 +87,9 @@ def test_coriolis_kernel_and_matrices_match_the_textbook(nu: Array) -> None:
     np.testing.assert_allclose(matrices, textbook, atol=1e-9)
 
 
+@settings(deadline=None)
 @given(nu=VELOCITIES)
-@pytest.mark.parametrize("coefficients", SETS)
+@pytest.mark.parametrize("coefficients", fleet.SETS)
 def test_damping_kernel_and_matrix_match_the_sum_by_names(coefficients: str, nu: Array) -> None:
     vehicle = alice(coefficients)
     force = np.zeros(6)
@@ -97,11 +99,11 @@ def test_damping_kernel_and_matrix_match_the_sum_by_names(coefficients: str, nu:
     np.testing.assert_allclose(-damping_matrix(vehicle.plant.body, nu) @ nu, by_names, atol=1e-10)
 
 
-@pytest.mark.parametrize("coefficients", SETS)
+@pytest.mark.parametrize("coefficients", fleet.SETS)
 def test_damping_takes_power_at_any_velocity(coefficients: str) -> None:
     """The least of 20,000 draws, over what the diagonal alone takes; a search for it finds
-    0.87, 0.77 and 0.89 of the diagonal's for the paper's three sets (all terms are cubic, so
-    that only the direction of a velocity counts)."""
+    0.87, 0.77 and 0.89 of the diagonal's for the paper's three sets and 0.67 for the computed one
+    (all terms are cubic, so that only the direction of a velocity counts)."""
     vehicle = alice(coefficients)
     diagonal = -np.diag(vehicle.plant.body.quadratic)
     rng = np.random.default_rng(5)
@@ -109,12 +111,13 @@ def test_damping_takes_power_at_any_velocity(coefficients: str) -> None:
     for draw in rng.standard_normal((20_000, 6)) * np.exp(rng.uniform(-4, 1, (20_000, 6))):
         nu = draw / np.cbrt(diagonal)
         shares.append(nu @ damping_matrix(vehicle.plant.body, nu) @ nu / np.sum(np.abs(draw) ** 3))
-    assert 0.7 < min(shares) < 0.95
+    assert 0.6 < min(shares) < 0.95
     assert max(shares) < 10.0
 
 
+@settings(deadline=None)
 @given(nu=VELOCITIES, attitude=ATTITUDES)
-@pytest.mark.parametrize("coefficients", SETS)
+@pytest.mark.parametrize("coefficients", fleet.SETS)
 def test_energy_falls_by_what_damping_takes(
     coefficients: str, nu: Array, attitude: tuple[float, float, float]
 ) -> None:
@@ -134,7 +137,7 @@ def test_energy_falls_by_what_damping_takes(
 
 @settings(max_examples=25, deadline=None)
 @given(nu=VELOCITIES, attitude=ATTITUDES, net_kg=st.sampled_from([-1.0, 0.0, 1.0]))
-@pytest.mark.parametrize("coefficients", SETS)
+@pytest.mark.parametrize("coefficients", fleet.SETS)
 def test_no_motion_gains_energy(
     coefficients: str, nu: Array, attitude: tuple[float, float, float], net_kg: float
 ) -> None:
@@ -308,7 +311,7 @@ def test_body_lift_opposes_drift_and_weathercocks_going_ahead() -> None:
 
 def test_drag_of_the_mast_leans_the_vehicle_over() -> None:
     """The mast is above the origin: in a sway to starboard its drag pushes the top to port."""
-    for coefficients in SETS:
+    for coefficients in fleet.SETS:
         vehicle = alice(coefficients)
         force = np.zeros(6)
         add_damping(vehicle.plant.body, np.array([0, 0.5, 0, 0, 0, 0]), force)

@@ -1,6 +1,7 @@
 """The equations of motion over time: closed forms, currents, and the integration's error."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,10 +15,9 @@ from alice_survey.vehicle import fleet
 from alice_survey.vehicle.dynamics import GRAVITY
 from alice_survey.vehicle.propulsion import add_thrust
 from alice_survey.vehicle.sea import Current, constant_current, sheared_current
-from alice_survey.vehicle.vehicle import Vehicle
+from alice_survey.vehicle.vehicle import RigidBody, Vehicle
 from tests import oracles_dynamics as oracle
 from tests.vehicle.motions import (
-    SETS,
     advance,
     alice,
     attitudes,
@@ -46,7 +46,7 @@ def test_from_rest_the_speed_follows_a_hyperbolic_tangent(axis: int, newtons: fl
     assert states[-1, 7 + axis] == pytest.approx(terminal, rel=0.05)
 
 
-@pytest.mark.parametrize("coefficients", SETS)
+@pytest.mark.parametrize("coefficients", fleet.SETS)
 @pytest.mark.parametrize(("axis", "newtons"), [(0, 0.6), (0, -8.0), (1, 4.0), (2, 5.0), (2, -5.0)])
 def test_terminal_speed_of_the_whole_vehicle(axis: int, newtons: float, coefficients: str) -> None:
     """At u = sqrt(X / |X_uu|) nothing changes any more: the low centre of gravity holds against
@@ -113,7 +113,7 @@ def test_coasting_down_follows_the_hyperbola(axis: int, name: str) -> None:
         np.testing.assert_allclose(states[:, axis] - states[0, axis], run, rtol=1e-8, atol=1e-12)
 
 
-@pytest.mark.parametrize("coefficients", SETS)
+@pytest.mark.parametrize("coefficients", fleet.SETS)
 @pytest.mark.parametrize("axis", [0, 1])
 def test_small_roll_and_pitch_swing_like_a_pendulum(axis: int, coefficients: str) -> None:
     """Omega^2 = W BG (M^-1)_ii: with M^-1, as the body is free to sway and surge meanwhile."""
@@ -219,6 +219,31 @@ def test_water_that_speeds_up_swings_a_low_weight_back() -> None:
     tide = Current(np.array([0.0, 10.0]), np.zeros(1), np.array([[[0.0, 0.0]], [[1.0, 0.0]]]))
     low = block(cg=(0.0, 0.0, 0.03))
     assert rates(low, state_of(low), current=tide)[M] == pytest.approx(-50 * 0.03 * 0.1 / 6.0)
+
+
+def test_water_inside_the_nose_is_carried_where_it_is() -> None:
+    """Water inside the hull is pushed along at its own centre as any other: nothing turns, and the
+    drained part alone lags, by its low centre of gravity."""
+    tide = Current(np.array([0.0, 10.0]), np.zeros(1), np.array([[[0.0, 0.0]], [[0.3, 1.0]]]))
+    flooded = replace(
+        block({"Y_vdot": -70.0}),
+        rigid_body=RigidBody(
+            dry_kg=50.0,
+            buoyancy_kg=50.0,
+            entrained_kg=25.0,
+            cg_body_m=(0.0, 0.0, 0.0),
+            inertia_kg_m2=(1.0, 6.0, 7.0),
+            entrained_cg_body_m=(0.33, -0.02, 0.01),
+        ),
+    )
+    for attitude in ((0.0, 0.0, 0.0), (0.2, -0.3, 1.0)):
+        rate = rates(flooded, state_of(flooded, attitude_rad=attitude), current=tide)
+        np.testing.assert_allclose(rate[7:13], 0.0, atol=1e-15)
+    neutral = alice()
+    rate = rates(neutral, state_of(neutral), current=tide)
+    low = neutral.rigid_body.dry_kg * neutral.rigid_body.cg_body_m[2]
+    wrench = neutral.mass @ rate[7:13]
+    np.testing.assert_allclose(wrench, [0, 0, 0, low * 0.1, -low * 0.03, 0], atol=1e-14)
 
 
 def test_sinking_through_shear_a_vehicle_lags_behind_the_current() -> None:
