@@ -1,0 +1,370 @@
+import csv
+import math
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from alice_survey.errors import NavigationError
+from alice_survey.vehicle.log import read_vehicle_log
+from missions.logs.import_log import ImportOptions, import_log
+from reconstruct.navigation import read_navigation
+from tests.missions.logs.log_files import dataflash_log, dataflash_message, dataflash_text, tlog
+
+# Week 2312 of GPS began on Sunday 28 April 2024; 302418 s into it are 1 May 12:00:18 by GPS, whose
+# clock was 18 s ahead of UTC.
+WEEK, GPS_MS = 2312, 302_418_000
+FIX_UTC = datetime(2024, 5, 1, 12, 0, 0, tzinfo=UTC)
+BOOT_US = 50_000_000
+"""Microseconds since boot at which the vehicle had that fix."""
+LAT, LON = 60.1, 5.25
+
+
+def gps(time_us: int, status: int = 3, week: int = WEEK) -> tuple[Any, ...]:
+    ms = GPS_MS + (time_us - BOOT_US) // 1000
+    return ("GPS", time_us, 0, status, ms, week, 12, 0.8, LAT, LON, 3.0, 0.1, 0.0, 0.0, 0.0, 1)
+
+
+def dive_messages(count: int = 20) -> list[tuple[Any, ...]]:
+    """Row i is 0.1 s after the last; the heading passes through north."""
+    messages: list[tuple[Any, ...]] = [gps(BOOT_US)]
+    for i in range(count):
+        t = BOOT_US + 1_000_000 + i * 100_000
+        yaw = (358.0 + 0.3 * i) % 360.0
+        messages += [
+            ("ATT", t - 20_000, 0.0, 1.5, 0.0, -2.25, 0.0, (yaw - 0.06) % 360.0, 0.0, 0.0, 3),
+            ("POS", t, LAT + 1e-6 * i, LON - 1e-6 * i, 1.0, -(4.0 + 0.25 * i), -99.0),
+            ("RFND", t + 10_000, 0, 2.5, 4, 25),
+            ("RCOU", t + 5_000, *(1500 + 10 * k + i for k in range(8))),
+            ("XKF1", t, 0, 1.5, -2.25, yaw, 0.5, 0.0, 0.1, 0.1, 9.0, 9.0, 9.0, 0.0, 0.0, 0.0, 0.0),
+            ("XKF1", t, 1, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0, 0.0, 0.0, 0.0, 0.0),
+            ("IMU", t + 1_000, 0, 0.1, 0.2, 0.3),
+        ]
+    last = BOOT_US + 1_000_000 + count * 100_000
+    yaw = (358.0 + 0.3 * count) % 360.0
+    messages.append(("ATT", last, 0.0, 1.5, 0.0, -2.25, 0.0, yaw, 0.0, 0.0, 3))
+    return messages
+
+
+def numbers(path: Path, *names: str) -> np.ndarray:
+    with path.open(newline="") as file:
+        return np.array(
+            [[float(row[name] or "nan") for name in names] for row in csv.DictReader(file)]
+        )
+
+
+@pytest.mark.parametrize("form", ["dive.BIN", "dive.log"])
+def test_an_on_board_log_becomes_navigation(tmp_path: Path, form: str) -> None:
+    log = tmp_path / form
+    if form.endswith("BIN"):
+        log.write_bytes(dataflash_log(dive_messages()))
+    else:
+        log.write_text(dataflash_text(dive_messages()))
+
+    _, data = import_log(log, tmp_path / "n.csv")
+
+    assert data["left_out"] == {}
+    assert data["sources"] == {
+        "position": "POS", "depth": "POS", "attitude": "ATT", "altitude": "RFND",
+    }  # fmt: skip
+    read = read_navigation(tmp_path / "n.csv", UTC)
+    assert read.start_utc is not None
+    assert (read.start_utc - FIX_UTC).total_seconds() == pytest.approx(1.0, abs=2e-6)
+    i = np.arange(20)
+    np.testing.assert_allclose(read.time_s, 0.1 * i, atol=2e-6)
+    np.testing.assert_allclose(read.columns["latitude_deg"], LAT + 1e-6 * i, atol=1e-7)
+    np.testing.assert_allclose(read.columns["longitude_deg"], LON - 1e-6 * i, atol=1e-7)
+    np.testing.assert_allclose(read.columns["depth_m"], 4.0 + 0.25 * i, atol=1e-5)
+    # ATT is 20 ms before POS, and its heading as far behind: interpolated through north. ATT holds
+    # hundredths of a degree.
+    np.testing.assert_allclose(read.columns["heading_deg"], (358 + 0.3 * i) % 360, atol=0.011)
+    np.testing.assert_allclose(read.columns["roll_deg"], 1.5, atol=1e-6)
+    np.testing.assert_allclose(read.columns["pitch_deg"], -2.25, atol=1e-6)
+    upright = 2.5 * math.cos(math.radians(1.5)) * math.cos(math.radians(2.25))
+    np.testing.assert_allclose(read.columns["altitude_m"][1:], upright, atol=1e-5)
+
+
+def test_declination_by_hand(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Norway, 3.4 degrees east: a compass that shows 358.0 points to 1.4."""
+    log = tmp_path / "dive.BIN"
+    log.write_bytes(dataflash_log(dive_messages()))
+    import_log(log, tmp_path / "n.csv", ImportOptions(declination_deg=3.4))
+    assert numbers(tmp_path / "n.csv", "heading_deg")[0, 0] == pytest.approx(1.4, abs=0.011)
+    assert not capsys.readouterr().err
+
+    log.write_bytes(dataflash_log([("PARM", 1, "COMPASS_AUTODEC", 1.0), *dive_messages()]))
+    import_log(log, tmp_path / "n.csv", ImportOptions(declination_deg=3.4))
+    assert "COMPASS_AUTODEC" in capsys.readouterr().err
+    log.write_bytes(
+        dataflash_log([("PARM", 1, "COMPASS_DEC", math.radians(2.0)), *dive_messages()])
+    )
+    import_log(log, tmp_path / "n.csv", ImportOptions(declination_deg=3.4))
+    assert "declination of 2.00 degrees" in capsys.readouterr().err
+
+
+def test_tide_by_hand(tmp_path: Path) -> None:
+    """1.2 m of tide above the datum: what is 4 m below the surface is 2.8 m below the datum."""
+    log = tmp_path / "dive.BIN"
+    log.write_bytes(dataflash_log(dive_messages()))
+    import_log(log, tmp_path / "n.csv", ImportOptions(tide="1.2"))
+    assert numbers(tmp_path / "n.csv", "depth_m")[0, 0] == pytest.approx(2.8, abs=1e-5)
+
+    # Rising by 0.6 m in 60 s from 12:00:00 UTC: at the first position, 12:00:01, it is 0.51 m.
+    tides = tmp_path / "tides.csv"
+    tides.write_text("time_utc,height_m\n2024-05-01T12:00:00Z,0.5\n2024-05-01T14:01:00+02:00,1.1\n")
+    import_log(log, tmp_path / "n.csv", ImportOptions(tide=str(tides)))
+    depth = numbers(tmp_path / "n.csv", "depth_m")[:, 0]
+    np.testing.assert_allclose(depth, 4.0 + 0.25 * np.arange(20) - 0.51 - 0.001 * np.arange(20),
+                               atol=2e-5)  # fmt: skip
+
+    tides.write_text("time_utc,height_m\n2024-05-01T12:00:02Z,0.5\n2024-05-01T13:00:00Z,1.1\n")
+    with pytest.raises(NavigationError, match="do not cover the dive, 2024-05-01 12:00:01"):
+        import_log(log, tmp_path / "n.csv", ImportOptions(tide=str(tides)))
+    tides.write_text("time_s,height_m\n0,0.5\n")
+    with pytest.raises(NavigationError, match="column time_utc is missing"):
+        import_log(log, tmp_path / "n.csv", ImportOptions(tide=str(tides)))
+    with pytest.raises(NavigationError, match="neither metres nor a CSV"):
+        import_log(log, tmp_path / "n.csv", ImportOptions(tide="high"))
+
+
+def test_clock_offset_and_trimming(tmp_path: Path) -> None:
+    log = tmp_path / "dive.BIN"
+    log.write_bytes(dataflash_log(dive_messages()))
+    options = ImportOptions(clock_offset_s=-2.5, start_s=0.45, end_s=1.05)
+    import_log(log, tmp_path / "n.csv", options)
+    read = read_navigation(tmp_path / "n.csv", UTC)
+    assert read.start_utc is not None
+    assert (read.start_utc - FIX_UTC).total_seconds() == pytest.approx(1.5 - 2.5, abs=2e-6)
+    np.testing.assert_allclose(read.time_s, 0.1 * np.arange(6), atol=2e-6)
+    with pytest.raises(NavigationError, match=r"leave nothing of 1\.9 s"):
+        import_log(log, tmp_path / "n.csv", ImportOptions(start_s=5.0))
+
+
+def test_a_lever_arm_moves_positions_to_the_body(tmp_path: Path) -> None:
+    """Heading 358, level: what is 1 m ahead of the body has the body 1 m south of it."""
+    log = tmp_path / "dive.BIN"
+    messages = [
+        ("ATT", *m[1:3], 0.0, 0.0, 0.0, *m[6:]) if m[0] == "ATT" else m for m in dive_messages()
+    ]
+    log.write_bytes(dataflash_log(messages))
+    import_log(log, tmp_path / "n.csv", ImportOptions(lever_body_m=(1.0, 0.0, 0.3)))
+    latitude, longitude, depth = numbers(
+        tmp_path / "n.csv", "latitude_deg", "longitude_deg", "depth_m"
+    )[0]
+    # A minute of latitude at 60 degrees is 1856.9 m, of longitude 927.2 m (WGS 84).
+    assert (latitude - LAT) * 60 * 1856.9 == pytest.approx(-math.cos(math.radians(2)), abs=0.01)
+    assert (longitude - LON) * 60 * 927.2 == pytest.approx(math.sin(math.radians(2)), abs=0.01)
+    assert depth == pytest.approx(4.0 - 0.3, abs=1e-4)
+
+
+def test_vehicle_log_has_servo_outputs_and_body_velocity(tmp_path: Path) -> None:
+    log = tmp_path / "dive.BIN"
+    log.write_bytes(dataflash_log(dive_messages()))
+    options = ImportOptions(vehicle_log=tmp_path / "v.csv")
+    import_log(log, tmp_path / "n.csv", options)
+    vehicle = read_vehicle_log(tmp_path / "v.csv")
+    np.testing.assert_allclose(vehicle.time_s, 0.1 * np.arange(20), atol=1e-6)
+    np.testing.assert_allclose(vehicle.others["pwm_3_us"][1:], 1520 + np.arange(1, 20) - 0.05)
+    # North at 0.5 and down at 0.1 m/s, heading 358: nearly all of it ahead, a little to starboard.
+    u, v, w = vehicle.velocity_body[0]
+    assert v == pytest.approx(0.5 * math.sin(math.radians(2.0)), abs=0.005)
+    assert math.hypot(u, v, w) == pytest.approx(math.hypot(0.5, 0.1), abs=1e-6)
+    assert u > 0.49
+
+
+def test_without_gps_the_times_are_those_since_boot(tmp_path: Path) -> None:
+    log = tmp_path / "dive.BIN"
+    log.write_bytes(dataflash_log(m for m in dive_messages() if m[0] != "GPS"))
+    text, data = import_log(log, tmp_path / "n.csv")
+    assert not data["dated"]
+    assert numbers(tmp_path / "n.csv", "time_s")[0, 0] == pytest.approx(51.0, abs=1e-6)
+    assert "--clock-offset" in text
+
+
+def test_filter_positions_count_from_its_origin(tmp_path: Path) -> None:
+    messages = [m for m in dive_messages() if m[0] != "POS"]
+    origin = ("ORGN", BOOT_US, 0, LAT, LON, 0.0)
+    log = tmp_path / "dive.BIN"
+    log.write_bytes(dataflash_log([origin, *messages]))
+    _, data = import_log(log, tmp_path / "n.csv")
+    assert data["sources"]["position"] == "XKF1"
+    assert any("XKF1 0 of 0, 1" in note for note in data["notes"])
+    latitude, depth = numbers(tmp_path / "n.csv", "latitude_deg", "depth_m")[0]
+    assert (latitude - LAT) * 60 * 1856.9 == pytest.approx(9.0, abs=0.01)
+    assert depth == pytest.approx(9.0, abs=1e-6)
+
+
+def test_the_depth_sensor_of_several_is_asked_for(tmp_path: Path) -> None:
+    messages = dive_messages()
+    for i in range(21):
+        t = BOOT_US + 1_000_000 + i * 100_000
+        messages += [("BARO", t, 0, 0.4, 1e5), ("BARO", t, 1, -7.5, 1.7e5)]
+    log = tmp_path / "dive.BIN"
+    log.write_bytes(dataflash_log(messages))
+    with pytest.raises(NavigationError, match=r"choose the depth sensor.*depth=BARO\[1\]"):
+        import_log(log, tmp_path / "n.csv", ImportOptions(topics=("depth=BARO",)))
+    import_log(log, tmp_path / "n.csv", ImportOptions(topics=("depth=BARO[1]",)))
+    np.testing.assert_allclose(numbers(tmp_path / "n.csv", "depth_m"), 7.5, atol=1e-6)
+    with pytest.raises(NavigationError, match="BARO has 0, 1, not 2"):
+        import_log(log, tmp_path / "n.csv", ImportOptions(topics=("depth=BARO[2]",)))
+    with pytest.raises(NavigationError, match="depth can come from POS"):
+        import_log(log, tmp_path / "n.csv", ImportOptions(topics=("depth=SONAR",)))
+
+
+def test_no_position_says_what_there_is(tmp_path: Path) -> None:
+    log = tmp_path / "dive.BIN"
+    log.write_bytes(dataflash_log(m for m in dive_messages() if m[0] in ("ATT", "RFND")))
+    with pytest.raises(NavigationError, match=r"no row holds a position.*it has ATT, RFND"):
+        import_log(log, tmp_path / "n.csv")
+
+
+def test_damage_costs_what_is_damaged_and_is_counted(tmp_path: Path) -> None:
+    whole = dataflash_log(dive_messages())
+    att = dataflash_message("ATT", 1, 0.0, 1.5, 0.0, -2.25, 0.0, 10.0, 0.0, 0.0, 3)
+    log = tmp_path / "dive.BIN"
+    first_pos = whole.index(dataflash_message(*dive_messages()[2]))
+    log.write_bytes(whole[:first_pos] + b"\x00\xa3\x95\xff rubbish" + whole[first_pos:-5])
+    _, data = import_log(log, tmp_path / "n.csv")
+    assert data["rows"] == 20
+    assert data["left_out"] == {
+        "bytes of a message cut off at the end of the file": len(att) - 5,
+        "bytes that are no message": 12,
+    }
+    log.write_bytes(whole[2000:])
+    with pytest.raises(NavigationError, match="no DataFlash log"):
+        import_log(log, tmp_path / "n.csv")
+    log.write_bytes(b"")
+    with pytest.raises(NavigationError, match="no DataFlash log"):
+        import_log(log, tmp_path / "n.csv")
+
+
+def telemetry(count: int = 20, boot_ms: int = 90_000) -> list[tuple[float, Any]]:
+    """What a ground station records: late by 20 ms, now and then by more."""
+    start = FIX_UTC.timestamp()
+    records: list[tuple[float, Any]] = []
+    for i in range(count):
+        t, ms = start + 0.2 * i, boot_ms + 200 * i
+        late = 0.02 + (0.15 if i % 3 == 1 else 0.0)
+        yaw = math.radians(-1.0 + 0.5 * i)
+        records += [
+            (t + late, mavlink.MAVLink_heartbeat_message(12, 3, 81, 0, 3, 3)),
+            (t + late, mavlink.MAVLink_attitude_message(ms, 0.1, -0.05, yaw, 0.01, 0.02, 0.03)),
+            (
+                t + late,
+                mavlink.MAVLink_global_position_int_message(
+                    ms, round(LAT * 1e7) + 10 * i, round(LON * 1e7), 0, -(3000 + 50 * i), 30, -40,
+                    5, 65535,
+                ),
+            ),
+            (
+                t + late,
+                mavlink.MAVLink_distance_sensor_message(ms, 20, 3000, 180 + i, 0, 0, 25, 255),
+            ),
+        ]  # fmt: skip
+    return records
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_ground_stations_log_becomes_navigation(tmp_path: Path, version: int) -> None:
+    log = tmp_path / "dive.tlog"
+    log.write_bytes(tlog(telemetry(), version=version))
+
+    _, data = import_log(log, tmp_path / "n.csv", ImportOptions(vehicle_log=tmp_path / "v.csv"))
+
+    read = read_navigation(tmp_path / "n.csv", UTC)
+    assert read.start_utc is not None
+    assert data["left_out"] == {}
+    # The vehicle's own steps, without the link's jitter.
+    assert (read.start_utc - FIX_UTC).total_seconds() == pytest.approx(0.02, abs=1e-5)
+    i = np.arange(20)
+    np.testing.assert_allclose(read.time_s, 0.2 * i, atol=2e-6)
+    np.testing.assert_allclose(read.columns["latitude_deg"], LAT + 1e-6 * i, atol=1e-9)
+    np.testing.assert_allclose(read.columns["depth_m"], 3.0 + 0.05 * i, atol=1e-5)
+    np.testing.assert_allclose(read.columns["heading_deg"], (-1 + 0.5 * i) % 360, atol=1e-4)
+    upright = math.cos(0.1) * math.cos(0.05)
+    np.testing.assert_allclose(read.columns["altitude_m"], (1.8 + 0.01 * i) * upright, atol=1e-5)
+    vehicle = read_vehicle_log(tmp_path / "v.csv")
+    speed = np.linalg.norm(vehicle.velocity_body, axis=1)
+    np.testing.assert_allclose(speed, math.hypot(0.3, 0.4, 0.05), atol=1e-6)
+    np.testing.assert_allclose(vehicle.rates_body, [[0.01, 0.02, 0.03]] * 20, atol=1e-6)
+
+
+def test_telemetry_of_other_systems_and_damage_are_counted(tmp_path: Path) -> None:
+    records = telemetry()
+    whole = tlog(records)
+    other = tlog(telemetry(2), system=7)
+    broken = bytearray(whole)
+    # A byte of the tenth latitude flips: its checksum fails, and that position is gone.
+    target = tlog([records[4 * 10 + 2]])
+    broken[whole.index(target[8 + 14 : 8 + 24]) + 2] ^= 0x55
+    log = tmp_path / "dive.tlog"
+    log.write_bytes(bytes(broken) + b"\x01" * 37 + other + whole[:20])
+    _, data = import_log(log, tmp_path / "n.csv")
+    assert data["rows"] == 19
+    assert data["left_out"]["GLOBAL_POSITION_INT: the checksum is wrong"] == 1
+    assert data["left_out"]["GLOBAL_POSITION_INT: messages of another system than 1"] == 2
+    assert data["left_out"]["bytes that are no message, or of one that is cut off"] == 57
+
+
+def test_telemetry_without_a_position(tmp_path: Path) -> None:
+    log = tmp_path / "dive.tlog"
+    log.write_bytes(tlog(r for r in telemetry() if r[1].msgname in ("HEARTBEAT", "ATTITUDE")))
+    with pytest.raises(NavigationError, match=r"no row holds a position.*ATTITUDE, HEARTBEAT"):
+        import_log(log, tmp_path / "n.csv")
+    zero = [
+        (t, mavlink.MAVLink_global_position_int_message(i, 0, 0, 0, -1000, 0, 0, 0, 0))
+        for i, (t, _) in enumerate(telemetry(3))
+    ]
+    log.write_bytes(tlog(zero))
+    with pytest.raises(NavigationError, match=r"no row holds a position.*0, 0: no fix"):
+        import_log(log, tmp_path / "n.csv")
+    log.write_bytes(b"not a log at all, but long enough to be looked at")
+    with pytest.raises(NavigationError, match="no MAVLink packet"):
+        import_log(log, tmp_path / "n.csv")
+
+
+QGC_HEADER = (
+    "Timestamp,roll,pitch,heading,altitudeRelative,gps.lat,gps.lon,apmSubInfo.rangefinderDistance\n"
+)
+QGC = """\
+2024-05-01 14:00:00.100,1.0,-2.0,359.0,-3.0,60.1,5.25,2.0
+2024-05-01 14:00:01.100,1.0,-2.0,1.0,-3.5,60.10001,5.25,2.0
+2024-05-01 14:00:02.100,1.0,-2.0
+2024-05-01 14:00:03.100,1.0,-2.0,3.0,-4.5,--.--,--.--,0
+2024-05-01 14:00:04.100,1.0,-2.0,5.0,-5.0,60.10003,5.25,--.--
+"""
+
+
+def test_a_csv_of_qgroundcontrol(tmp_path: Path) -> None:
+    log = tmp_path / "dive.csv"
+    log.write_text(QGC_HEADER + QGC)
+    _, data = import_log(log, tmp_path / "n.csv", ImportOptions(time_zone="Europe/Oslo"))
+    assert data["left_out"] == {
+        "gps.lat, gps.lon: the position is no number": 1,
+        "rows of another number of cells than the header": 1,
+    }
+    read = read_navigation(tmp_path / "n.csv", UTC)
+    assert read.start_utc is not None
+    assert (read.start_utc - FIX_UTC).total_seconds() == pytest.approx(0.1, abs=1e-6)
+    np.testing.assert_allclose(read.columns["depth_m"], [3.0, 3.5, 5.0])
+    np.testing.assert_allclose(read.columns["heading_deg"], [359, 1, 5], atol=1e-6)
+    upright = math.cos(math.radians(1)) * math.cos(math.radians(2))
+    np.testing.assert_allclose(read.columns["altitude_m"][:2], 2.0 * upright, atol=1e-5)
+    assert math.isnan(read.columns["altitude_m"][2])
+
+
+def test_what_is_no_log_is_said(tmp_path: Path) -> None:
+    with pytest.raises(NavigationError, match="no such file"):
+        import_log(tmp_path / "none.BIN", tmp_path / "n.csv")
+    (tmp_path / "a.txt").write_text("hello")
+    with pytest.raises(NavigationError, match="no log that is known"):
+        import_log(tmp_path / "a.txt", tmp_path / "n.csv")
+    (tmp_path / "nav.csv").write_text("time_s,latitude_deg,longitude_deg,depth_m\n")
+    with pytest.raises(NavigationError, match="a navigation CSV already"):
+        import_log(tmp_path / "nav.csv", tmp_path / "n.csv")
+    (tmp_path / "empty.csv").write_text("")
+    with pytest.raises(NavigationError, match="column Timestamp is missing"):
+        import_log(tmp_path / "empty.csv", tmp_path / "n.csv")

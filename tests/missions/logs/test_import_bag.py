@@ -1,0 +1,331 @@
+import csv
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin
+from scipy.spatial.transform import Rotation
+
+from alice_survey.errors import NavigationError
+from alice_survey.frames import Datum, attitude_from_rotation, rotation_from_attitude
+from alice_survey.vehicle.log import read_vehicle_log
+from missions.logs.bag import write_bag
+from missions.logs.import_log import ImportOptions, import_log
+from missions.logs.ros_frames import flipped_quaternion, flipped_world
+from reconstruct.navigation import read_navigation
+from tests.missions.logs.log_files import Bag
+from tests.missions.logs.test_bag import flight
+
+START = 1_650_000_000_000_000_000
+TOPIC = "/sparus2/navigator/navigation"
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def numbers(path: Path, *names: str) -> np.ndarray:
+    return np.array([[float(row[name] or "nan") for name in names] for row in rows_of(path)])
+
+
+def cola2_bag(version: int, count: int = 30) -> Bag:
+    """A vehicle that dives northwards; row i is at i * 0.1 s."""
+    bag = Bag(version)
+    for i in range(count):
+        bag.add_nav_sts(
+            START + i * 100_000_000,
+            (41.7 + 1e-6 * i, 3.03 - 2e-6 * i, 5.0 + 0.01 * i),
+            (0.01 * i, -0.02, 3.1 + 0.01 * i),
+            2.5 + 0.25 * (i % 2),
+        )
+    return bag
+
+
+@pytest.mark.parametrize(
+    ("version", "name", "storage"),
+    [
+        (1, "dive.bag", StoragePlugin.MCAP),
+        (2, "dive", StoragePlugin.MCAP),
+        (2, "dive", StoragePlugin.SQLITE3),
+    ],
+)
+def test_cola2_navigation_becomes_the_navigation_csv(
+    tmp_path: Path, version: int, name: str, storage: StoragePlugin
+) -> None:
+    log = cola2_bag(version).write(tmp_path / name, storage)
+
+    _, data = import_log(log, tmp_path / "navigation.csv")
+
+    read = read_navigation(tmp_path / "navigation.csv", UTC)
+    i = np.arange(30)
+    assert read.start_utc == datetime.fromtimestamp(START / 1e9, UTC)
+    np.testing.assert_allclose(read.time_s, 0.1 * i, atol=2e-6)
+    columns = read.columns
+    np.testing.assert_allclose(columns["latitude_deg"], 41.7 + 1e-6 * i, atol=1e-10)
+    np.testing.assert_allclose(columns["longitude_deg"], 3.03 - 2e-6 * i, atol=1e-10)
+    np.testing.assert_allclose(columns["depth_m"], 5.0 + 0.01 * i, atol=1e-5)
+    # Attitudes are float32 radians in NavSts.
+    np.testing.assert_allclose(columns["roll_deg"], np.rad2deg(0.01 * i), atol=2e-5)
+    np.testing.assert_allclose(columns["pitch_deg"], np.rad2deg(-0.02), atol=2e-5)
+    np.testing.assert_allclose(columns["heading_deg"], np.rad2deg(3.1 + 0.01 * i), atol=2e-5)
+    np.testing.assert_allclose(columns["altitude_m"], 2.5 + 0.25 * (i % 2))
+    # Variances 0.04 and 0.09 m^2 of north and east: their mean, 0.065.
+    np.testing.assert_allclose(columns["sigma_horizontal_m"], np.sqrt(0.065), atol=1e-6)
+    np.testing.assert_allclose(columns["sigma_depth_m"], 0.05, atol=1e-6)
+    np.testing.assert_allclose(
+        columns["sigma_attitude_deg"], np.rad2deg(np.sqrt(2.5e-4)), atol=1e-5
+    )
+    np.testing.assert_allclose(columns["sigma_heading_deg"], np.rad2deg(0.03), atol=1e-5)
+    assert np.isnan(columns["sigma_altitude_m"]).all()
+    assert data["rows"] == 30
+    assert data["left_out"] == {}
+    assert data["sources"]["position"] == TOPIC
+
+
+def test_a_flight_comes_back_from_its_bag(tmp_path: Path) -> None:
+    record = flight()
+    write_bag(tmp_path / "dive", record)
+
+    import_log(
+        tmp_path / "dive",
+        tmp_path / "navigation.csv",
+        ImportOptions(vehicle_log=tmp_path / "vehicle.csv"),
+    )
+
+    read = read_navigation(tmp_path / "navigation.csv", UTC)
+    np.testing.assert_allclose(read.time_s, record.time_s, atol=2e-6)
+    place = np.stack([read.columns[n] for n in ("latitude_deg", "longitude_deg", "depth_m")], 1)
+    ned = record.datum.ned_from_geodetic(place)
+    np.testing.assert_allclose(ned, record.believed.translation, atol=1e-5)
+    angles = np.stack([read.columns[n] for n in ("roll_deg", "pitch_deg", "heading_deg")], 1)
+    expected = np.rad2deg(attitude_from_rotation(record.believed.rotation))
+    np.testing.assert_allclose((angles - expected + 180) % 360 - 180, 0, atol=1e-6)
+    # Ranges are float32 in ROS; row 7 has no bottom.
+    assert record.altitude_m is not None and record.rpm is not None
+    np.testing.assert_allclose(read.columns["altitude_m"][8:], record.altitude_m[8:], atol=1e-5)
+    for name, sigma in (
+        ("sigma_horizontal_m", record.sigma_horizontal_m),
+        ("sigma_depth_m", record.sigma_depth_m),
+        ("sigma_attitude_deg", np.rad2deg(record.sigma_attitude_rad)),
+        ("sigma_heading_deg", np.rad2deg(record.sigma_heading_rad)),
+    ):
+        np.testing.assert_allclose(read.columns[name], sigma, atol=1e-6)
+    vehicle = read_vehicle_log(tmp_path / "vehicle.csv")
+    assert record.believed_velocity is not None
+    np.testing.assert_allclose(vehicle.velocity_body, record.believed_velocity[:, :3], atol=1e-8)
+    np.testing.assert_allclose(vehicle.rates_body, record.believed_velocity[:, 3:], atol=1e-8)
+    np.testing.assert_allclose(vehicle.rpm["starboard"], record.rpm[:, 1], atol=1e-6)
+    moved = record.believed.translation - record.believed.translation[0]
+    np.testing.assert_allclose(vehicle.position_ned[:, :2], moved[:, :2], atol=1e-4)
+
+
+def test_a_simulations_clock_gives_seconds(tmp_path: Path) -> None:
+    write_bag(tmp_path / "dive", flight(start_utc_ns=0))
+    _, data = import_log(tmp_path / "dive", tmp_path / "n.csv")
+    assert not data["dated"]
+    times = numbers(tmp_path / "n.csv", "time_s")[:, 0]
+    np.testing.assert_allclose(times, flight().time_s, atol=1e-6)
+
+    import_log(
+        tmp_path / "dive", tmp_path / "n.csv", ImportOptions(start_utc="2024-05-01T12:00:00Z")
+    )
+    assert rows_of(tmp_path / "n.csv")[1]["time_utc"] == "2024-05-01T12:00:00.100000Z"
+
+
+def test_the_truth_is_not_taken_for_navigation(tmp_path: Path) -> None:
+    write_bag(tmp_path / "dive", flight())
+    _, data = import_log(tmp_path / "dive", tmp_path / "n.csv")
+    assert data["sources"]["position"] == "/alice/navigation/odometry"
+
+
+@pytest.mark.parametrize("frame", ["world_ned", "odom"])
+def test_odometry_in_either_convention(tmp_path: Path, frame: str) -> None:
+    ned = np.array([12.0, -7.0, 4.0])
+    rotation = rotation_from_attitude(0.1, -0.2, 2.0)
+    bag = Bag(2)
+    for i in range(5):
+        xyzw = rotation.as_quat()
+        place, turn, v = ned, xyzw, [0.4, 0.1, -0.05, 0.01, 0.02, 0.03]
+        if frame == "odom":
+            place, turn = flipped_world(ned), flipped_quaternion(xyzw)
+            v = [0.4, -0.1, 0.05, 0.01, -0.02, -0.03]
+        bag.add_odometry(START + i * 10**8, "/vehicle/odom", frame, place, turn, v)
+    log = bag.write(tmp_path / "dive")
+
+    import_log(
+        log,
+        tmp_path / "n.csv",
+        ImportOptions(datum_deg=(41.0, 3.0), vehicle_log=tmp_path / "v.csv"),
+    )
+
+    place = numbers(tmp_path / "n.csv", "latitude_deg", "longitude_deg", "depth_m")
+    np.testing.assert_allclose(Datum(41.0, 3.0).ned_from_geodetic(place)[0], ned, atol=1e-5)
+    angles = numbers(tmp_path / "n.csv", "roll_deg", "pitch_deg", "heading_deg")[0]
+    np.testing.assert_allclose(angles, np.rad2deg([0.1, -0.2, 2.0]), atol=1e-6)
+    vehicle = read_vehicle_log(tmp_path / "v.csv")
+    np.testing.assert_allclose(vehicle.velocity_body[0], [0.4, 0.1, -0.05], atol=1e-9)
+    np.testing.assert_allclose(vehicle.rates_body[0], [0.01, 0.02, 0.03], atol=1e-9)
+
+
+def test_odometry_without_an_origin_asks_for_one(tmp_path: Path) -> None:
+    bag = Bag(2)
+    bag.add_odometry(START, "/odom", "odom", (0, 0, 0), (0, 0, 0, 1))
+    log = bag.write(tmp_path / "dive")
+    with pytest.raises(NavigationError, match="give --datum"):
+        import_log(log, tmp_path / "n.csv")
+
+
+def plain_bag() -> Bag:
+    """GPS, pressure, attitude and a range at rates of their own."""
+    bag = Bag(2)
+    for i in range(21):
+        bag.add_fix(START + i * 10**9, "/gps/fix", (41.0 + 1e-6 * i, 3.0, 48.0), -(i == 20))
+    # 2 m of water of 1025 kg/m^3 at standard gravity, deeper by 1 m in 10 s.
+    for i in range(201):
+        depth = 2.0 + 0.01 * i
+        pressure = 101325.0 + 1025.0 * 9.80665 * depth
+        bag.add_pressure(START + i * 10**8, "/pressure", pressure)
+    turn = flipped_quaternion(
+        rotation_from_attitude(np.deg2rad(30), np.deg2rad(-10), 0.5).as_quat()
+    )
+    for i in range(401):
+        bag.add_imu(START + i * 5 * 10**7, "/imu/data", "imu_link", turn)
+        bag.add_range(START + i * 5 * 10**7, "/sonar/ping", 4.0)
+    return bag
+
+
+def test_plain_sensors_are_brought_together(tmp_path: Path) -> None:
+    log = plain_bag().write(tmp_path / "dive")
+
+    _, data = import_log(log, tmp_path / "n.csv")
+
+    # The last fix says that it is none.
+    assert data["rows"] == 20
+    assert data["left_out"] == {"/gps/fix: the position is no number": 1}
+    depth = numbers(tmp_path / "n.csv", "depth_m")[:, 0]
+    np.testing.assert_allclose(depth, 2.0 + 0.1 * np.arange(20), atol=1e-4)
+    angles = numbers(tmp_path / "n.csv", "roll_deg", "pitch_deg", "heading_deg")
+    np.testing.assert_allclose(angles, [[30, -10, np.rad2deg(0.5)]] * 20, atol=1e-5)
+    altitude = numbers(tmp_path / "n.csv", "altitude_m")[:, 0]
+    expected = 4.0 * np.cos(np.deg2rad(30)) * np.cos(np.deg2rad(10))
+    np.testing.assert_allclose(altitude, expected, atol=1e-5)
+    # Variances 4 and 16: their mean is 10.
+    sigma = numbers(tmp_path / "n.csv", "sigma_horizontal_m")[:, 0]
+    np.testing.assert_allclose(sigma, np.sqrt(10.0), atol=1e-6)
+
+
+def test_a_slant_range_looks_along_the_body() -> None:
+    """The cosine product is the down component of the body's down axis."""
+    for roll, pitch, heading in np.random.default_rng(3).uniform(-1, 1, (20, 3)):
+        down = rotation_from_attitude(roll, pitch, heading).apply([0.0, 0.0, 1.0])[2]
+        assert down == pytest.approx(np.cos(roll) * np.cos(pitch), abs=1e-12)
+
+
+def test_gaps_wild_times_and_missing_values_are_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = Bag(2)
+    stamps = [0, 1, 2, 3, 900, 4, 5, 5, 30, 31, 32]
+    for i, second in enumerate(stamps):
+        place = (float("nan"), 3.0, 5.0) if second == 31 else (41.0 + 1e-6 * second, 3.0, 5.0)
+        place = (0.0, 0.0, 5.0) if second == 2 else place
+        altitude = -1.0 if second == 3 else 2.0 + 0.1 * second
+        bag.add_nav_sts(START + second * 10**9, place, (0.0, 0.0, 0.0), altitude)
+        bag.rows[-1] = (START + i * 10**9, *bag.rows[-1][1:])
+    log = bag.write(tmp_path / "dive")
+
+    text, data = import_log(log, tmp_path / "n.csv")
+
+    assert data["left_out"] == {
+        f"{TOPIC}: altitudes not above 0: no bottom": 1,
+        f"{TOPIC}: the position is 0, 0: no fix": 1,
+        f"{TOPIC}: the position is no number": 1,
+        f"{TOPIC}: the time repeats or goes back": 2,
+    }
+    read = read_navigation(tmp_path / "n.csv", UTC)
+    np.testing.assert_allclose(read.time_s, [0, 1, 3, 4, 5, 30, 32], atol=1e-6)
+    # Interpolated over the short gap, as import-images does, and not the -1 of the log.
+    assert read.columns["altitude_m"][2] == pytest.approx(2.3, abs=1e-5)
+    assert [round(gap["length_s"]) for gap in data["gaps"]] == [25]
+    warned = capsys.readouterr().err
+    assert "2 " + f"{TOPIC}: the time repeats" in warned
+    assert "1 gaps in the positions: 25.0 s from" in warned
+    assert "the longest 25.0 s" in text
+
+
+def test_values_are_not_carried_across_gaps(tmp_path: Path) -> None:
+    """Pressure stops for 8 s: the positions there have no depth, and are left out by number."""
+    bag = plain_bag()
+    bag.rows = [row for row in bag.rows if row[1] != "/pressure" or not 5e9 < row[0] - START < 13e9]
+    log = bag.write(tmp_path / "dive")
+    _, data = import_log(log, tmp_path / "n.csv")
+    assert data["left_out"]["positions without a depth"] == 7
+    assert data["rows"] == 13
+
+
+def test_several_candidates_ask_for_a_choice(tmp_path: Path) -> None:
+    bag = cola2_bag(2)
+    for i in range(5):
+        bag.add_nav_sts(
+            START + i * 10**8, (40.0, 3.0, 1.0), (0.0, 0.0, 0.0), 1.0, topic="/other/navigation"
+        )
+    log = bag.write(tmp_path / "dive")
+    with pytest.raises(NavigationError, match="--topic navigation=NAME"):
+        import_log(log, tmp_path / "n.csv")
+    _, data = import_log(
+        log, tmp_path / "n.csv", ImportOptions(topics=("navigation=/other/navigation",))
+    )
+    assert data["rows"] == 5
+    with pytest.raises(NavigationError, match="no topic /third; it has"):
+        import_log(log, tmp_path / "n.csv", ImportOptions(topics=("navigation=/third",)))
+    with pytest.raises(NavigationError, match="ROLE=NAME"):
+        import_log(log, tmp_path / "n.csv", ImportOptions(topics=("/third",)))
+
+
+def test_a_bag_without_positions_lists_its_topics(tmp_path: Path) -> None:
+    bag = Bag(2)
+    bag.add_range(START, "/sonar", 3.0)
+    log = bag.write(tmp_path / "dive")
+    with pytest.raises(NavigationError, match=r"no topic of NavSts.*it has /sonar \(Range\)"):
+        import_log(log, tmp_path / "n.csv")
+
+
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.6, 0.97, 0.999])
+def test_a_truncated_bag_is_one_clear_line(tmp_path: Path, version: int, share: float) -> None:
+    log = cola2_bag(version, 300).write(tmp_path / ("dive.bag" if version == 1 else "dive"))
+    file = log if version == 1 else log / "dive.mcap"
+    data = file.read_bytes()
+    file.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(NavigationError, match="cut off") as caught:
+        import_log(log, tmp_path / "n.csv")
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "n.csv").exists()
+
+
+def test_a_bathymetric_grid_is_no_bag(shared_data: Path, tmp_path: Path) -> None:
+    grid = next((shared_data / "bathymetry").glob("*.bag"))
+    with pytest.raises(NavigationError, match="bathymetric attributed grid"):
+        import_log(grid, tmp_path / "n.csv")
+
+
+def test_zero_quaternions_are_no_attitude(tmp_path: Path) -> None:
+    bag = Bag(2)
+    for i in range(4):
+        turn = Rotation.identity().as_quat() if i else np.zeros(4)
+        bag.add_odometry(START + i * 10**8, "/odom", "ned", (0, 0, 1), turn)
+    log = bag.write(tmp_path / "dive")
+    _, data = import_log(log, tmp_path / "n.csv", ImportOptions(datum_deg=(41.0, 3.0)))
+    assert data["left_out"] == {"/odom: quaternions that are not of length 1": 1}
+    assert rows_of(tmp_path / "n.csv")[0]["roll_deg"] == ""
+
+
+def test_header_times_count_and_not_those_of_the_recording(tmp_path: Path) -> None:
+    bag = cola2_bag(1, 5)
+    bag.rows = [(stamp + 700_000_000, *rest) for stamp, *rest in bag.rows]
+    log = bag.write(tmp_path / "d.bag")
+    import_log(log, tmp_path / "n.csv")
+    start = datetime.fromtimestamp(START / 1e9, UTC)
+    assert read_navigation(tmp_path / "n.csv", UTC).start_utc == start
