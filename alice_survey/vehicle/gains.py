@@ -1,0 +1,177 @@
+"""Gains of the inner loops, derived from a vehicle by pole placement; nothing is tuned.
+
+Each controlled axis is a mass m with damping d, pushed by thrusters that lag: m a = F - d v,
+T F' = F_wanted - F. With F_wanted / m = -(rate v + place x) its characteristic polynomial is
+T s^3 + (1 + T d/m) s^2 + (d/m + rate) s + place. T. I. Fossen (Handbook of Marine Craft
+Hydrodynamics and Motion Control, 2011, section 12.2, PID by pole placement) has the same without
+the lag: rate = 2 zeta omega - d/m, place = omega^2. Here all three poles are placed: a pair of
+damping ratio zeta and natural frequency omega, and a real one at -a, with a + 2 zeta omega =
+1/T + d/m, the sum that the lag dictates.
+
+The rule for omega: as fast as the lag allows without the real pole becoming the slowest (a = omega,
+hence omega = (1/T + d/m) / (1 + 2 zeta)), but not above a twentieth of the rate of the navigation's
+velocities (K. J. Astrom, B. Wittenmark, Computer-Controlled Systems, 1997, section 2.9, samples 10
+to 30 times within a period of the closed loop). Integral action a tenth as fast: integral =
+place omega / 10 (Fossen 2011, section 12.2.5).
+
+The sway axis is a PID that asks a speed of an inner loop (paper, section VII): the inner gain is the
+critically damped one, 1 / (4 T), or rate if that is less; what rate has beyond it is k_D. The other
+axes need no k_D: their inner gain is rate.
+
+The same numbers serve a speed loop: its proportional gain is rate, its integral gain place.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from alice_survey.errors import VehicleError
+from alice_survey.frames import Array
+from alice_survey.vehicle.dynamics import Body
+from alice_survey.vehicle.propulsion import thrust_limits
+from alice_survey.vehicle.vehicle import Vehicle
+
+SURGE, SWAY, HEAVE, YAW = 0, 1, 2, 3
+"""Rows of `Gains.axes`."""
+DEGREES = (0, 1, 2, 5)
+"""Which of the 6 degrees of freedom each row is."""
+
+MASS, RATE, PLACE, INTEGRAL, INNER, LEAST, MOST, FASTEST, LAG, BANDWIDTH = range(10)
+"""Columns of `Gains.axes`: inertia (kg, kg m^2); rate (1/s), place (1/s^2), integral (1/s^3); inner
+(1/s), the part of rate that the inner speed loop has; least and greatest force or moment; greatest speed asked for (m/s, rad/s); lag (s); bandwidth (rad/s)."""
+
+DAMPING_RATIO = 1.0
+"""Of the placed pair: no overshoot, so that a line beside is not run into."""
+INTEGRAL_SHARE = 0.1
+"""Bandwidth of integral action by that of the loop (Fossen 2011, section 12.2.5)."""
+SAMPLES_PER_PERIOD = 20.0
+STEADY_SHARE = 0.75
+"""Of the greatest force that a steady motion may take; a quarter stays for feedback (inferred)."""
+
+
+class Gains(NamedTuple):
+    """What the inner loops know of the vehicle."""
+
+    body: Body
+    """Inertia and damping, for feed-forward."""
+    axes: Array
+    """(4, 10) rows SURGE, SWAY, HEAVE, YAW; an axis that no thruster moves has zero gains."""
+
+
+def gains_for(
+    vehicle: Vehicle,
+    speed_mps: float,
+    tick_s: float = 0.05,
+    navigation_hz: float = 5.0,
+    most_turn_rad_s: float = math.radians(30.0),
+) -> Gains:
+    """Gains for a vehicle.
+
+    Args:
+        vehicle: inertia, damping, thrusters.
+        speed_mps: of the survey, at which damping is linearised, without drift or turning.
+        tick_s: of the control; half of it is added to the lag (a held value is half a tick old).
+        navigation_hz: rate of the navigation's velocities (DVL).
+        most_turn_rad_s: greatest yaw rate asked for, if the thrusters allow it.
+
+    Raises:
+        VehicleError: surge, heave or yaw cannot be controlled.
+    """
+    plant = vehicle.plant
+    count = len(vehicle.thrusters)
+    lower, upper = np.zeros(count), np.zeros(count)
+    cruise = np.array([speed_mps, 0.0, 0.0, 0.0, 0.0, 0.0])
+    thrust_limits(plant.propulsion, np.ones(count), cruise, lower, upper)
+    configuration = vehicle.configuration_matrix[list(DEGREES)]
+    slowness_s = np.array([thruster.time_constant_s for thruster in vehicle.thrusters])
+    damping = linear_damping(plant.body, cruise)
+    axes = np.zeros((4, 10))
+    fastest_rad_s = 2 * math.pi * navigation_hz / SAMPLES_PER_PERIOD
+    for axis, degree in enumerate(DEGREES):
+        inertia = float(vehicle.mass[degree, degree])
+        least, most = authority(configuration, lower, upper, axis)
+        axes[axis, [MASS, LEAST, MOST]] = inertia, least, most
+        weakest = min(-least, most)
+        if weakest < 1e-6:
+            if axis == SWAY:
+                continue
+            name = ("surge", "sway", "heave", "yaw")[axis]
+            raise VehicleError(
+                f"the thrusters of {vehicle.name} cannot control {name} both ways "
+                f"({least:.2g} to {most:.2g}): it cannot fly a survey"
+            )
+        reach = np.abs(configuration[axis]) * np.minimum(-lower, upper)
+        lag_s = float(reach @ slowness_s / reach.sum()) + tick_s / 2
+        decay = float(damping[degree, degree]) / inertia
+        omega, rate, place = placed(lag_s, decay, fastest_rad_s)
+        axes[axis, [RATE, PLACE]] = rate, place
+        axes[axis, INNER] = min(rate, 1.0 / (4.0 * lag_s)) if axis == SWAY else rate
+        axes[axis, INTEGRAL] = INTEGRAL_SHARE * omega * place
+        axes[axis, FASTEST] = _steady_speed(plant.body, degree, STEADY_SHARE * weakest)
+        axes[axis, [LAG, BANDWIDTH]] = lag_s, omega
+    axes[YAW, FASTEST] = min(axes[YAW, FASTEST], most_turn_rad_s)
+    return Gains(plant.body, axes)
+
+
+def placed(lag_s: float, decay_per_s: float, fastest_rad_s: float) -> tuple[float, float, float]:
+    """Natural frequency, rate gain and place gain of the rule above.
+
+    Args:
+        lag_s: T.
+        decay_per_s: d / m.
+        fastest_rad_s: bound on the natural frequency.
+    """
+    total = 1.0 / lag_s + decay_per_s
+    omega = min(total / (1.0 + 2.0 * DAMPING_RATIO), fastest_rad_s)
+    pair = 2.0 * DAMPING_RATIO * omega
+    real = total - pair
+    rate = lag_s * (pair * real + omega**2) - decay_per_s
+    # Damping beyond what is wanted is left to the water: a negative gain would undo it.
+    return omega, max(rate, 0.0), lag_s * real * omega**2
+
+
+def linear_damping(body: Body, nu: Array) -> Array:
+    """(6, 6) slope of damping and body lift by velocity at a velocity (6,)."""
+    slope = -(body.linear + 2.0 * body.quadratic * np.abs(nu))
+    u, v, w = nu[0], nu[1], nu[2]
+    y_uv, z_uw, m_uw, n_uv = body.lift
+    slope[1, [0, 1]] -= y_uv * np.sign(u) * v, y_uv * abs(u)
+    slope[2, [0, 2]] -= z_uw * np.sign(u) * w, z_uw * abs(u)
+    slope[4, [0, 2]] -= m_uw * w, m_uw * u
+    slope[5, [0, 1]] -= n_uv * v, n_uv * u
+    result: Array = slope
+    return result
+
+
+def authority(configuration: Array, lower: Array, upper: Array, axis: int) -> tuple[float, float]:
+    """Least and greatest force on one axis while the other axes get none: a linear programme.
+
+    Args:
+        configuration: (4, n) force on each axis by thrust.
+        lower: (n,) least thrust.
+        upper: (n,) greatest thrust.
+        axis: row.
+    """
+    from scipy.optimize import linprog
+
+    row = configuration[axis]
+    others = np.delete(configuration, axis, axis=0)
+    ends = []
+    for sense in (1.0, -1.0):
+        found = linprog(
+            sense * row,
+            A_eq=others,
+            b_eq=np.zeros(len(others)),
+            bounds=np.stack([lower, upper], axis=1),
+        )
+        ends.append(float(row @ found.x))
+    return ends[0], ends[1]
+
+
+def _steady_speed(body: Body, degree: int, force: float) -> float:
+    """Speed at which linear and quadratic drag of one degree of freedom take a force."""
+    linear, quadratic = -body.linear[degree, degree], -body.quadratic[degree, degree]
+    if quadratic <= 0.0:
+        return force / linear if linear > 0.0 else math.inf
+    return float((math.sqrt(linear**2 + 4.0 * quadratic * force) - linear) / (2.0 * quadratic))

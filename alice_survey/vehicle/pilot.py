@@ -1,0 +1,61 @@
+"""What the pilot remembers from tick to tick, and what it tells of itself."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from alice_survey.frames import Array
+
+(
+    PHASE, LEG, ALONG, CROSS, WANTED_HEADING, WANTED_SURGE, BY_SWAY, REASON, LINE, WANTED_DEPTH,
+    WANTED_SWAY, AT_SURFACE, PATH_HEADING,
+) = range(13)  # fmt: skip
+"""Columns of a report: phase (signals.py); leg; distance along it, m; how far the followed point is
+to starboard of the path, m; wanted heading, rad; wanted surge over ground, m/s; 1 while the path is
+held by sway, 0 while it is by heading; reason of an abort (safety.py); survey line or -1; wanted
+depth of the body's origin, m; wanted sway over ground, m/s; 1 at the surface after the mission or
+an abort; heading of the path, rad. Phase, leg, distance, the manner of steering and the reason are
+also what the pilot goes by on the next tick."""
+REPORT = 13
+
+(
+    FLOOR, FLOOR_SLOPE, FLOOR_KNOWN, SURGE_SUM, SWAY_SUM_N, SWAY_SUM_E, HEAVE_SUM, YAW_SUM,
+    SETTLED_S, BEST, SINCE_BEST_S, RETURNS, LOST_S, LOW_S, PITCHED_S,
+) = range(15)  # fmt: skip
+"""Places in the memory: the depth, m, that the origin's depth and the altitude add up to, smoothed,
+its slope, m/s, and whether there is one; integrals of the inner loops as speeds, that of sway as a
+vector in NED; the time that depth, or place and heading, are kept; the watchdog's best value and
+its age; returns to the path; how long bottom lock is lost, the altitude too low, the pitch too
+large, s."""
+MEMORY = 15
+
+(
+    REF_SURGE, REF_SWAY, REF_HEAVE, REF_YAW, ACC_SURGE, ACC_SWAY, ACC_HEAVE, ACC_YAW,
+    FULL_SURGE, FULL_SWAY, FULL_HEAVE, FULL_YAW,
+) = range(12)  # fmt: skip
+"""Places in the demand on the inner loops: body velocity that feed-forward is for, m/s and rad/s;
+wanted acceleration; and +1 or -1 where the last wrench was cut at the greatest or least."""
+DEMAND = 12
+
+
+class PilotState(NamedTuple):
+    """Arrays that `steer` writes."""
+
+    memory: Array
+    """(MEMORY,)"""
+    report: Array
+    """(REPORT,)"""
+    demand: Array
+    """(DEMAND,)"""
+    motion: Array
+    """(6,) scratch."""
+    force: Array
+    """(6,) scratch."""
+
+
+def new_pilot() -> PilotState:
+    """A pilot at the start of a mission: about to dive."""
+    memory = np.zeros(MEMORY)
+    memory[BEST] = -math.inf
+    return PilotState(memory, np.zeros(REPORT), np.zeros(DEMAND), np.zeros(6), np.zeros(6))
