@@ -6,7 +6,7 @@ ones beyond reach. Peers are called from Python, as their users do; ours from co
 simulator does, and once more from Python. All are held against each other: BVLS must find the same
 wrench, the pseudo-inverses the same thrust where nothing saturates.
 
-quadprog, a peer that is as fast, is GPL and stays out.
+quadprog, a compiled peer, is GPL and stays out.
 """
 
 import sys

@@ -9,7 +9,7 @@ bounds of thrust (n,), the weights of axes (6,) and of thrusters (n,), and write
 
 An axis of weight 0 is not asked for: of roll and pitch gravity takes care. The others decide what
 is given up when not all can be had, by the square of their weights times the square of the miss.
-A failed thruster has the bounds 0 and 0.
+A failed thruster has the bounds 0 and 0. A wrench that is not a number gives thrusts that are none.
 """
 
 import math

@@ -21,9 +21,9 @@ from alice_survey.vehicle.compiled import kernel
 
 _FREE, _HELD, _FIXED = 0, 1, 2
 """Between its bounds; at one of them for now; at one for good."""
-_RANK = 1e-9
+_RANK = 1e-11
 """Columns shorter than this part of the longest, once the others are taken off, depend on them."""
-_SLOPE = 1e-10
+_SLOPE = 1e-12
 """Gradients below this part of what they are made of are rounding."""
 
 
@@ -123,10 +123,12 @@ def _least_miss(
         # The free ones are done: let go the one whose bound is most in the way.
         size = 0.0
         for k in range(m):
-            size += b[k] * b[k]
+            terms = abs(b[k])
             rest[k] = b[k]
             for i in range(n):
+                terms += abs(a[k, i] * x[i])
                 rest[k] -= a[k, i] * x[i]
+            size += terms * terms
         worst, chosen = 0.0, -1
         for i in range(n):
             gradient[i] = 0.0

@@ -12,7 +12,8 @@ bilinear form of T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion
 section 9.3; u_a = (1 - w) times the speed of the water along the thruster's axis where it sits
 (going astern or turning included). The second holds the paper's thrust deduction t and its
 deflection of tunnel jets by the surge u (A. R. Palmer, PhD thesis, University of Southampton,
-2009). A propeller at rest makes neither thrust nor torque: its drag is the hull's.
+2009; the paper prints sqrt(T_0 / (rho A)), which has no root astern). A propeller at rest makes
+neither thrust nor torque: its drag is the hull's.
 
 A jet that leaves the hull also drags on it,
 
@@ -386,8 +387,3 @@ def electrical_power(propulsion: Propulsion, rps: Array, nu: Array, out: Array) 
         gain = t[i, TORQUE_FORWARD] if n > 0.0 else t[i, TORQUE_REVERSE]
         torque = abs(n) * (gain * n - t[i, TORQUE_ADVANCE] * _inflow(t, i, nu))
         out[i] = t[i, IDLE] + t[i, WATTS] * max(2.0 * math.pi * n * torque, 0.0)
-
-
-def energy_j(time_s: Array, power_w: Array) -> Array:
-    """Electrical energy of each thruster, (n,) J, from its power (T, n) at times (T,)."""
-    return np.asarray(np.trapezoid(power_w, time_s, axis=0))

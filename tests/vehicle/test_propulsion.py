@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from alice_survey.errors import VehicleError
 from alice_survey.vehicle import propulsion as kernels
 from alice_survey.vehicle.fleet import vehicle
-from alice_survey.vehicle.propulsion import Thruster, energy_j, pack, weakened
+from alice_survey.vehicle.propulsion import Thruster, pack, weakened
 from tests import oracles_propulsion as oracles
 from tests.oracles_propulsion import Array
 
@@ -279,13 +279,6 @@ def test_power_at_any_speed_is_that_of_the_textbooks_torque() -> None:
             for t, n in zip(EVERY, rps, strict=True)
         ]
         np.testing.assert_allclose(power, slow, rtol=1e-9)
-
-
-def test_energy_is_power_times_time() -> None:
-    time_s = np.array([0.0, 1.0, 3.0])
-    np.testing.assert_allclose(
-        energy_j(time_s, np.array([[1.0, 5.0], [3.0, 5.0], [3.0, 5.0]])), [8.0, 15.0]
-    )
 
 
 @pytest.mark.parametrize("thruster", ALICE.thrusters, ids=lambda t: t.name)
