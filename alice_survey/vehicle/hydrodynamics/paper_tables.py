@@ -19,8 +19,8 @@ _K_VDOT = (
     "K = -z Y < 0"
 )
 _N_PDOT = (
-    "printed -0.102: rolling to starboard sweeps the mast, above and aft (x < 0), to starboard; "
-    "N = x Y > 0; N_pdot = K_rdot"
+    "printed -0.102: rolling to starboard sweeps the mast to starboard, the water holds it back, "
+    "Y < 0, aft of the origin (x < 0): N = x Y > 0"
 )
 _M_WDOT = (
     "printed negative: M = -x Z, so M_wdot = -(Y_rdot of the same strips) and M_wdot = Z_qdot; "
