@@ -17,6 +17,7 @@ from alice_survey.cli_options import (
     examples,
     print_result,
 )
+from alice_survey.cli_vehicle import app as vehicle_app
 from alice_survey.errors import AliceError
 
 app = typer.Typer(
@@ -30,6 +31,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 app.add_typer(camera_app, name="camera")
+app.add_typer(vehicle_app, name="vehicle")
 
 
 @app.command(epilog=examples("init reef", "run -w reef --scale 4"))
@@ -125,15 +127,42 @@ def plan(workspace: Workspace = WORK, survey: SurveyFile = None, as_json: AsJson
     print_result(*run(["plan"], workspace, survey), as_json)
 
 
-@app.command(epilog=examples("fly -w reef"))
-def fly(workspace: Workspace = WORK, survey: SurveyFile = None, as_json: AsJson = False) -> None:
+@app.command(
+    epilog=examples(
+        "fly -w reef",
+        "fly -w reef --vehicle alice --controller sway --current 0.1@90",
+        "fly -w before --vehicle sparus2 --controller los",
+        "fly -w reef --fail stern --json",
+    )
+)
+def fly(
+    workspace: Workspace = WORK,
+    survey: SurveyFile = None,
+    vehicle: Annotated[
+        Literal["alice", "sparus2"] | None, typer.Option(help="What flies.")
+    ] = None,
+    controller: Annotated[
+        Literal["sway", "los"] | None,
+        typer.Option(help="Heading held on the line, or towards a point ahead on it."),
+    ] = None,
+    current: Annotated[
+        str | None,
+        typer.Option(help="SPEED@DIRECTION it flows towards: m/s, degrees from north."),
+    ] = None,
+    fail: Annotated[
+        list[str] | None, typer.Option(help="A thruster that does not turn: port, stern, ...")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
     """Fly the plan.
 
-    Writes the true track, the trigger times and the navigation log with its errors.
+    The simulated vehicle with its controller, sensors and navigation filter, in a current. Writes
+    the true track, the trigger times, the navigation log, the vehicle's log, and plots.
     """
-    from alice_survey.survey import run
+    from alice_survey.survey import FlightChanges, run
 
-    print_result(*run(["flight"], workspace, survey), as_json)
+    changes = FlightChanges(vehicle=vehicle, controller=controller, current=current, failed=fail)
+    print_result(*run(["flight"], workspace, survey, flight=changes), as_json)
 
 
 @app.command(epilog=examples("image -w reef --scale 4 --threads 2"))

@@ -21,6 +21,7 @@ from alice_survey.seawater import GREEN_NM, n_water
 Jerlov = Literal["I", "II", "III", "1C", "3C", "5C", "7C", "9C"]
 Latitude = Annotated[float, Field(ge=-85, le=85)]
 Longitude = Annotated[float, Field(ge=-180, le=180)]
+Gust = Annotated[float, Field(ge=0, le=1000)]
 
 
 class Config(BaseModel):
@@ -114,23 +115,43 @@ class PlanConfig(Config):
     run_in_m: float = Field(0.5, ge=0.1, le=20)
 
 
-class FlightConfig(Config):
-    """How well the vehicle follows its lines, and how well it knows where it is."""
+class VehicleConfig(Config):
+    """What flies, and how it is steered."""
 
-    rate_hz: float = Field(20.0, ge=10, le=200)
-    track_sigma_m: float = Field(0.05, ge=0, le=5)
-    altitude_sigma_m: float = Field(0.03, ge=0, le=1)
-    heading_sigma_deg: float = Field(1.5, ge=0, le=30)
-    roll_sigma_deg: float = Field(1.5, ge=0, le=30)
-    pitch_sigma_deg: float = Field(1.5, ge=0, le=30)
-    correlation_s: float = Field(8.0, gt=0, le=1000)
-    terrain_smoothing_m: float = Field(1.5, gt=0, le=100)
-    position_bias_sigma_m: float = Field(0.3, ge=0, le=100)
-    position_walk_m_per_sqrt_s: float = Field(0.005, ge=0, le=1)
-    depth_noise_m: float = Field(0.01, ge=0, le=10)
-    altitude_noise_m: float = Field(0.02, ge=0, le=10)
-    attitude_noise_deg: float = Field(0.3, ge=0, le=30)
-    heading_bias_sigma_deg: float = Field(1.0, ge=0, le=30)
+    name: Literal["alice", "sparus2"] = "alice"
+    coefficients: str = "calibrated"
+    controller: Literal["sway", "los"] = "sway"
+    allocation: Literal["exact", "rpi"] = "exact"
+    failed_thrusters: tuple[str, ...] = ()
+
+
+class SeaConfig(Config):
+    """What the water does to the vehicle.
+
+    The current near the sea floor; where `surface_current_mps` is set it changes evenly up to the
+    surface; a slow Gauss-Markov process is added. `current_file` holds a measured series instead.
+    """
+
+    current_mps: float = Field(0.05, ge=0, le=3)
+    current_towards_deg: float = Field(90.0, ge=0, lt=360)
+    surface_current_mps: float | None = Field(None, ge=0, le=3)
+    current_sigma_mps: float = Field(0.01, ge=0, le=1)
+    current_correlation_s: float = Field(300.0, ge=1, le=1e6)
+    current_file: Path | None = None
+    gust_n: tuple[Gust, Gust, Gust] = (0.5, 0.5, 0.5)
+    gust_correlation_s: float = Field(2.0, ge=0.05, le=1000)
+
+
+class NavigationConfig(Config):
+    """How well the vehicle knows where it is; the rest of its instruments is as in `sensors`."""
+
+    gps_bias_m: float = Field(0.03, ge=0, le=100)
+    gps_noise_m: float = Field(0.02, gt=0, le=100)
+    compass_bias_deg: float = Field(0.3, ge=0, le=30)
+    compass_noise_deg: float = Field(0.3, gt=0, le=30)
+    dvl_noise_mps: float = Field(0.0035, gt=0, le=1)
+    dvl_dropouts_s: tuple[tuple[float, float], ...] = ()
+    usbl: bool = False
 
 
 class SeafloorConfig(Config):
@@ -178,7 +199,9 @@ class SurveyConfig(Config):
     camera: CameraConfig = CameraConfig()
     water: WaterConfig = WaterConfig()
     plan: PlanConfig = PlanConfig()
-    flight: FlightConfig = FlightConfig()
+    vehicle: VehicleConfig = VehicleConfig()
+    sea: SeaConfig = SeaConfig()
+    navigation: NavigationConfig = NavigationConfig()
     seafloor: SeafloorConfig = SeafloorConfig()
     imaging: ImagingConfig = ImagingConfig()
     reconstruct: ReconstructConfig = ReconstructConfig()
@@ -239,6 +262,38 @@ def parse_config(settings: dict[str, Any], origin: str) -> SurveyConfig:
         return SurveyConfig.model_validate(settings)
     except ValidationError as error:
         raise ConfigError(f"{origin}: {_one_line(error)}") from None
+
+
+def changed(config: SurveyConfig, section: str, **values: Any) -> SurveyConfig:
+    """A survey with some settings of a section changed; those that are None stay as they are.
+
+    Raises:
+        ConfigError: a value is out of range.
+    """
+    given = {key: value for key, value in values.items() if value is not None}
+    if not given:
+        return config
+    settings = config.model_dump(mode="json", exclude_unset=True)
+    settings[section] = {**settings.get(section, {}), **given}
+    return parse_config(settings, "command line")
+
+
+def parse_current(text: str | None) -> tuple[float | None, float | None]:
+    """Speed, m/s, and direction, degrees, of a current given as `SPEED@DIRECTION`.
+
+    Raises:
+        ConfigError: it is not of that form.
+    """
+    if text is None:
+        return None, None
+    speed, _, direction = text.partition("@")
+    try:
+        return float(speed), float(direction) % 360.0
+    except ValueError:
+        raise ConfigError(
+            f"current {text!r}: give SPEED@DIRECTION, m/s and degrees from north that it flows "
+            "towards, as 0.1@90"
+        ) from None
 
 
 def _one_line(error: ValidationError) -> str:

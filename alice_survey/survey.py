@@ -4,12 +4,13 @@ import contextlib
 import fcntl
 import shutil
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from alice_survey.artefacts import only_checking, read_json, read_stage
-from alice_survey.config import SurveyConfig, load_config
+from alice_survey.config import SurveyConfig, changed, load_config, parse_current
 from alice_survey.errors import AliceError, ConfigError, WorkspaceError
 from alice_survey.executor import default_threads
 from alice_survey.summaries import SUMMARIES
@@ -39,6 +40,31 @@ _COMMANDS = {
     "report": "evaluate",
 }
 _SIMULATED = ("plan", "flight", "pool", "images", "calibration", "report")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlightChanges:
+    """What a command line may change of a flight; None leaves the setting."""
+
+    vehicle: str | None = None
+    controller: str | None = None
+    current: str | None = None
+    """SPEED@DIRECTION."""
+    failed: Sequence[str] | None = None
+
+    def applied(self, config: SurveyConfig) -> SurveyConfig:
+        """The survey with these changes.
+
+        Raises:
+            ConfigError: a value is not allowed.
+        """
+        speed, towards = parse_current(self.current)
+        config = changed(config, "sea", current_mps=speed, current_towards_deg=towards)
+        return changed(
+            config, "vehicle",
+            name=self.vehicle, controller=self.controller, failed_thrusters=self.failed or None,
+        )  # fmt: skip
+
 
 StageWork = Callable[[Path, SurveyConfig, int], bool]
 
@@ -92,6 +118,7 @@ def run(
     survey: Path | None,
     scale: int | None = None,
     threads: int | None = None,
+    flight: FlightChanges | None = None,
 ) -> tuple[str, dict[str, Any]]:
     """Do stages one after the other; those that are up to date are skipped.
 
@@ -101,15 +128,16 @@ def run(
         survey: settings file; None looks for survey.toml in the workspace, then here.
         scale: overrides `imaging.scale`.
         threads: cores to use; None for all.
+        flight: overrides vehicle and sea.
 
     Returns:
         What each stage has found, as text and as JSON values.
     """
     imported = is_imported(workspace)
     config = settings(workspace, survey, needed=not imported)
-    if scale is not None:
-        imaging = config.imaging.model_copy(update={"scale": scale})
-        config = config.model_copy(update={"imaging": imaging})
+    config = changed(config, "imaging", scale=scale)
+    if flight is not None:
+        config = flight.applied(config)
     if imported:
         stages = [stage for stage in stages if stage != "calibration"]
         for stage in stages:

@@ -1,51 +1,60 @@
-"""Fly a plan in simulation: the true track, the triggers and the navigation log."""
+"""Fly a plan in simulation: true track, triggers, navigation log, vehicle log, bag and plots."""
 
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from alice_survey.artefacts import Stage, need_stage, run_stage, write_csv
+from alice_survey.artefacts import Stage, need_stage, run_stage, write_csv, write_json
 from alice_survey.config import SurveyConfig
+from alice_survey.errors import VehicleError, warn
 from alice_survey.executor import progress
 from alice_survey.seafloor.terrain import survey_terrain
 from alice_survey.trajectory import write_track
-from missions.flight_plots import draw_flight
-from missions.navigation import navigate, write_navigation
+from alice_survey.vehicle.log import write_vehicle_log
+from missions.flight import Flight
+from missions.flight_plots import draw_flight, draw_vehicle
+from missions.flight_records import bag_record, believed_log, flight_summary, true_log
+from missions.logs.bag import write_bag
+from missions.navigation import write_navigation
 from missions.plan_file import read_plan
-from missions.track import Flight, fly_plan
+from missions.simulation import floor_grid, simulate_plan
 
 _SEED_STREAM = 20
 TRIGGER_COLUMNS = ("station", "time_s", "line")
 
 
 def run_fly(workspace: Path, config: SurveyConfig, threads: int) -> bool:
-    """Stage `flight`: write triggers.csv, navigation.csv, truth/track.csv and track.png.
+    """Stage `flight`: write triggers, navigation, vehicle logs, a bag, the truth and plots.
 
     Returns:
         True when work was done, False when the flight was up to date.
 
     Raises:
         WorkspaceError: there is no plan.
+        VehicleError: the vehicle took no picture at all; the message says why.
     """
     plan_path = need_stage(workspace, "plan", "plan") / "plan.json"
+    current_file = config.sea.current_file
     stage = Stage(
         name="flight",
-        version=1,
+        version=2,
         settings={
             "seed": config.seed,
-            "flight": config.flight.model_dump(mode="json"),
+            "vehicle": config.vehicle.model_dump(mode="json"),
+            "sea": config.sea.model_dump(mode="json", exclude={"current_file"}),
+            "navigation": config.navigation.model_dump(mode="json"),
             "seafloor": config.seafloor.model_dump(mode="json"),
             "seafloor_depth_m": config.area.seafloor_depth_m,
             "plan": config.plan.model_dump(mode="json"),
             "position_body_m": list(config.camera.position_body_m),
             "dvl_position_body_m": list(config.camera.dvl_position_body_m),
         },
-        inputs=[plan_path],
+        inputs=[plan_path, *([current_file] if current_file is not None else [])],
     )
 
     def work(folder: Path) -> None:
-        for _ in progress(_steps(folder, plan_path, config), "flight", 4):
+        for _ in progress(_steps(folder, plan_path, config), "flight files", 5):
             pass
 
     return run_stage(workspace, stage, work)
@@ -54,18 +63,33 @@ def run_fly(workspace: Path, config: SurveyConfig, threads: int) -> bool:
 def _steps(folder: Path, plan_path: Path, config: SurveyConfig) -> Iterator[str]:
     """Write the files of a flight, and say after each step what is done."""
     plan = read_plan(plan_path)
-    floor = survey_terrain(config, plan.area_ne_m)
+    floor = floor_grid(survey_terrain(config, plan.area_ne_m))
     yield "sea floor"
     rng = np.random.default_rng([config.seed, _SEED_STREAM])
-    flight = fly_plan(plan, config.flight, floor, config.camera.position_body_m, rng)
+    flight = simulate_plan(plan, config, floor, rng)
+    if not len(flight.trigger_s):
+        raise VehicleError(
+            f"{config.vehicle.name} reached no line of the plan ({flight.ending} after "
+            f"{flight.truth.time_s[-1]:.0f} s): change the current, the thrusters or the plan"
+        )
+    if len(flight.trigger_s) < plan.stations:
+        warn(
+            f"{len(flight.trigger_s)} of {plan.stations} stations were reached: the mission "
+            f"was {flight.ending}"
+        )
+    yield "flight"
     write_track(folder / "truth" / "track.csv", flight.truth)
+    write_vehicle_log(folder / "truth" / "vehicle.csv", true_log(flight))
+    yield "truth"
     _write_triggers(folder / "triggers.csv", flight)
-    yield "track"
-    log = navigate(flight.truth, config.flight, floor, config.camera, rng)
-    write_navigation(folder / "navigation.csv", log, plan.datum)
-    yield "navigation"
-    draw_flight(folder / "track.png", plan, flight, log)
-    yield "plot"
+    write_navigation(folder / "navigation.csv", flight.log, plan.datum)
+    write_vehicle_log(folder / "vehicle.csv", believed_log(flight))
+    write_bag(folder / "bag", bag_record(flight))
+    yield "logs"
+    write_json(folder / "flight.json", flight_summary(flight, config))
+    draw_flight(folder / "track.png", flight)
+    draw_vehicle(folder / "vehicle.png", flight)
+    yield "plots"
 
 
 def _write_triggers(path: Path, flight: Flight) -> None:

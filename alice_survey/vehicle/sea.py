@@ -2,13 +2,17 @@
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from alice_survey.errors import VehicleError
 from alice_survey.frames import Array
+from alice_survey.trajectory import read_columns
 from alice_survey.vehicle.compiled import kernel
+
+_COLUMNS = ("time_s", "depth_m", "north_mps", "east_mps")
 
 
 class Current(NamedTuple):
@@ -67,15 +71,46 @@ def varying_current(
     return checked_current(Current(time_s, mean.depth_m, np.array(velocity, dtype=np.float64)))
 
 
+def read_current(path: Path) -> Current:
+    """Read a measured current: CSV with `time_s, depth_m, north_mps, east_mps`, in any order.
+
+    Each depth must be there at each time (an ADCP's bins); one depth, or one time, is enough.
+
+    Raises:
+        NavigationError: the file is missing, lacks a column or holds no number.
+        VehicleError: a depth is missing at a time, or is there twice.
+    """
+    columns = read_columns(path, _COLUMNS)
+    if not len(columns["time_s"]):
+        raise VehicleError(f"{path}: has no rows")
+    times, row = np.unique(columns["time_s"], return_inverse=True)
+    depths, column = np.unique(columns["depth_m"], return_inverse=True)
+    grid = np.full((len(times), len(depths), 2), np.nan)
+    grid[row, column] = np.column_stack([columns["north_mps"], columns["east_mps"]])
+    if len(row) != len(times) * len(depths) or np.isnan(grid).any():
+        raise VehicleError(
+            f"{path}: {len(row)} rows for {len(times)} times and {len(depths)} depths; give each "
+            "depth once at each time"
+        )
+    return checked_current(Current(times, depths, grid))
+
+
 def checked_current(current: Current) -> Current:
     """The current itself.
 
     Raises:
-        VehicleError: times or depths do not increase, or a value is no finite number.
+        VehicleError: times or depths do not increase, or a value is no finite number, or there are
+            not as many values as times and depths.
     """
     for name, axis in (("times", current.time_s), ("depths", current.depth_m)):
-        if not len(axis) or np.any(np.diff(axis) <= 0):
+        if not len(axis) or not np.all(np.isfinite(axis)) or np.any(np.diff(axis) <= 0):
             raise VehicleError(f"the {name} of a current must increase")
+    shape = (len(current.time_s), len(current.depth_m), 2)
+    if current.velocity_ne_mps.shape != shape:
+        raise VehicleError(
+            f"a current has values of shape {current.velocity_ne_mps.shape}; its times and depths "
+            f"ask for {shape}"
+        )
     if not np.all(np.isfinite(current.velocity_ne_mps)):
         raise VehicleError("a current holds a value that is no finite number")
     return current

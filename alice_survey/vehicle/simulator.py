@@ -1,0 +1,356 @@
+"""The closed loop: navigation, guidance, control, allocation and dynamics, tick by tick.
+
+A tick is 0.05 s: the navigation is told what its sensors measure of the true state, the pilot asks
+for a wrench, the allocation turns it into thruster speeds, and the equations of motion advance by
+five Runge-Kutta steps of 10 ms.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from alice_survey.errors import VehicleError
+from alice_survey.frames import Array, attitude_from_rotation
+from alice_survey.vehicle import signals
+from alice_survey.vehicle.allocation import (
+    AXIS_WEIGHTS,
+    AllocationScratch,
+    allocate_exact,
+    allocate_rpi,
+    allocation_scratch,
+    preference_weights,
+)
+from alice_survey.vehicle.compiled import kernel
+from alice_survey.vehicle.dynamics import (
+    STATE,
+    Plant,
+    Scratch,
+    initial_state,
+    rk4_step,
+    scratch_for,
+)
+from alice_survey.vehicle.floor import FloorGrid
+from alice_survey.vehicle.guidance import (
+    REPORT,
+    Gains,
+    Guidance,
+    Path,
+    PilotState,
+    new_pilot,
+    steer,
+)
+from alice_survey.vehicle.navigation import (
+    LOG_ROW,
+    NavigationState,
+    Sensors,
+    log_row,
+    navigation_tick,
+    new_navigation,
+)
+from alice_survey.vehicle.propulsion import electrical_power, speeds_for, thrust_limits
+from alice_survey.vehicle.sea import Current, Disturbance, current_at
+from alice_survey.vehicle.vehicle import Vehicle
+
+TICK_S = 0.05
+STEPS = 5
+"""Runge-Kutta steps in a tick."""
+_CHUNK_TICKS = 1200
+
+
+class Sea(NamedTuple):
+    """What moves the vehicle from outside."""
+
+    current: Current
+    gust_sigma: Array
+    """(6,) N and N m."""
+    gust_decay: float
+    """Correlation of gusts from one tick to the next."""
+
+
+class Allocation(NamedTuple):
+    """How a wrench becomes thrust."""
+
+    exact: bool
+    matrix: Array
+    """B, (6, n)."""
+    axes: Array
+    """(6,) weight of each axis; 0 where none is asked for."""
+    health: Array
+    """(n,) 1 of a sound thruster, 0 of a failed one."""
+    lower: Array
+    upper: Array
+    weights: Array
+    thrust: Array
+    command_rps: Array
+    scratch: AllocationScratch
+
+
+class World(NamedTuple):
+    """State that changes from tick to tick, apart from pilot and navigation."""
+
+    state: Array
+    """(13 + n,) of the dynamics."""
+    before: Array
+    """(13,) truth at the tick before: position, quaternion, velocity over ground in NED, rates."""
+    now: Array
+    gust: Array
+    """(6,)"""
+    load: Array
+    water: Array
+    estimate: Array
+    wrench: Array
+
+
+class Rows(NamedTuple):
+    """What is recorded of each tick, a row each."""
+
+    state: Array
+    truth: Array
+    navigation: Array
+    report: Array
+    wrench: Array
+    command_rps: Array
+    power_w: Array
+
+
+@kernel
+def _tell_truth(world: World, current: Current, time_s: float) -> None:
+    """Write the truth of now from the state of the dynamics."""
+    state, now = world.state, world.now
+    current_at(current, time_s, state[2], world.water)
+    x, y, z, s = state[3], state[4], state[5], state[6]
+    u, v, w = state[7], state[8], state[9]
+    for i in range(7):
+        now[i] = state[i]
+    now[7] = (
+        (1 - 2 * (y * y + z * z)) * u + 2 * (x * y - z * s) * v + 2 * (x * z + y * s) * w
+    ) + world.water[0]
+    now[8] = (
+        2 * (x * y + z * s) * u + (1 - 2 * (x * x + z * z)) * v + 2 * (y * z - x * s) * w
+    ) + world.water[1]
+    now[9] = 2 * (x * z - y * s) * u + 2 * (y * z + x * s) * v + (1 - 2 * (x * x + y * y)) * w
+    for i in range(3):
+        now[10 + i] = state[10 + i]
+
+
+@kernel
+def _fly_ticks(
+    first: int,
+    plant: Plant,
+    sea: Sea,
+    floor: FloorGrid,
+    sensors: Sensors,
+    navigation: NavigationState,
+    path: Path,
+    guidance: Guidance,
+    gains: Gains,
+    pilot: PilotState,
+    allocation: Allocation,
+    world: World,
+    scratch: Scratch,
+    rng: np.random.Generator,
+    rows: Rows,
+) -> int:
+    """Fly ticks until the rows are full or the mission is done; how many were flown."""
+    count, thrusters, flown = rows.state.shape[0], allocation.thrust.shape[0], 0
+    for k in range(count):
+        tick = first + k
+        time_s = tick * TICK_S
+        _tell_truth(world, sea.current, time_s)
+        navigation_tick(
+            time_s, tick, TICK_S, world.before, world.now, world.water, floor, sensors,
+            navigation, rng, world.estimate,
+        )  # fmt: skip
+        steer(time_s, TICK_S, world.estimate, path, guidance, gains, pilot, world.wrench)
+        # The flow past the hull is not measured: the velocity over ground stands for it.
+        known = world.estimate[signals.U : signals.U + 6]
+        lower, upper = allocation.lower, allocation.upper
+        thrust_limits(plant.propulsion, allocation.health, known, lower, upper)
+        preference_weights(plant.propulsion, known[0], allocation.weights)
+        if allocation.exact:
+            allocate_exact(
+                allocation.matrix, world.wrench, lower, upper,
+                allocation.axes, allocation.weights, allocation.thrust, allocation.scratch,
+            )  # fmt: skip
+        else:
+            allocate_rpi(
+                allocation.matrix, world.wrench, lower, upper,
+                allocation.axes, allocation.weights, allocation.thrust, allocation.scratch,
+            )  # fmt: skip
+        speeds_for(plant.propulsion, allocation.thrust, known, allocation.command_rps)
+
+        for i in range(STATE + thrusters):
+            rows.state[k, i] = world.state[i]
+        for i in range(STATE):
+            rows.truth[k, i] = world.now[i]
+        for i in range(6):
+            rows.wrench[k, i] = world.wrench[i]
+        for i in range(thrusters):
+            rows.command_rps[k, i] = allocation.command_rps[i]
+        for i in range(REPORT):
+            rows.report[k, i] = pilot.report[i]
+        electrical_power(
+            plant.propulsion, world.state[STATE:], world.state[7:STATE], rows.power_w[k]
+        )
+        log_row(navigation, rows.navigation[k])
+        flown += 1
+        if pilot.report[0] == signals.DONE:
+            break
+
+        for i in range(STATE):
+            world.before[i] = world.now[i]
+        kept = math.sqrt(1.0 - sea.gust_decay * sea.gust_decay)
+        for i in range(6):
+            world.gust[i] = sea.gust_decay * world.gust[i] + kept * rng.standard_normal()
+            world.load[i] = sea.gust_sigma[i] * world.gust[i]
+        step = TICK_S / STEPS
+        for i in range(STEPS):
+            rk4_step(
+                time_s + i * step, step, world.state, allocation.command_rps, world.load, plant,
+                sea.current, scratch,
+            )  # fmt: skip
+    return flown
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Setup:
+    """All that decides how a mission goes, but for chance."""
+
+    vehicle: Vehicle
+    path: Path
+    guidance: Guidance
+    gains: Gains
+    sensors: Sensors
+    floor: FloorGrid
+    current: Current
+    disturbance: Disturbance
+    exact_allocation: bool = True
+    failed: tuple[str, ...] = ()
+    """Names of thrusters that do not turn."""
+    start_ne_m: tuple[float, float] = (0.0, 0.0)
+    start_heading_rad: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Flown:
+    """A flown mission: rows of T ticks, 0.05 s apart."""
+
+    time_s: Array
+    state: Array
+    """(T, 13 + n) of the dynamics."""
+    truth: Array
+    """(T, 13) position, quaternion, velocity over ground in NED, body rates."""
+    navigation: Array
+    """(T, LOG_ROW) as `navigation.log_row` has it."""
+    report: Array
+    """(T, REPORT) as `guidance` has it."""
+    wrench: Array
+    """(T, 6) that was asked for."""
+    command_rps: Array
+    """(T, n)"""
+    power_w: Array
+    """(T, n) electrical."""
+    thrusters: tuple[str, ...]
+
+    @property
+    def attitude_rad(self) -> Array:
+        """(T, 3) true roll, pitch, heading."""
+        from scipy.spatial.transform import Rotation
+
+        return attitude_from_rotation(Rotation.from_quat(self.truth[:, 3:7]))
+
+    @property
+    def rps(self) -> Array:
+        """(T, n) speeds of the thrusters, rev/s."""
+        return self.state[:, STATE:]
+
+    @property
+    def energy_j(self) -> Array:
+        """(n,) electrical energy of each thruster over the mission."""
+        energy: Array = self.power_w.sum(axis=0) * TICK_S
+        return energy
+
+
+def simulate(setup: Setup, rng: np.random.Generator, *, longest_s: float, label: str) -> Flown:
+    """Fly a mission to its end.
+
+    Args:
+        setup: the mission.
+        rng: source of all noise.
+        longest_s: the mission is broken off then.
+        label: what the progress bar says.
+
+    Raises:
+        VehicleError: a failed thruster is not one of the vehicle's.
+    """
+    from alice_survey.executor import progress
+
+    chunks: list[Rows] = []
+    total = math.ceil(longest_s / TICK_S / _CHUNK_TICKS)
+    for chunk in progress(_chunks(setup, rng, longest_s), label, total):
+        chunks.append(chunk)  # noqa: PERF402  the bar takes an iterator
+    rows = Rows(*(np.concatenate(parts) for parts in zip(*chunks, strict=True)))
+    return Flown(
+        time_s=TICK_S * np.arange(len(rows.state), dtype=np.float64),
+        thrusters=tuple(t.name for t in setup.vehicle.thrusters),
+        **rows._asdict(),
+    )
+
+
+def _chunks(setup: Setup, rng: np.random.Generator, longest_s: float) -> Iterator[Rows]:
+    """Rows of a minute each, until the mission is over."""
+    vehicle, n = setup.vehicle, len(setup.vehicle.thrusters)
+    world = _new_world(setup, n)
+    navigation = new_navigation(setup.sensors, world.now, rng)
+    pilot, allocation, scratch = new_pilot(), _allocation(setup), scratch_for(n)
+    gusts = setup.disturbance
+    sea = Sea(
+        setup.current, np.array(gusts.sigma), math.exp(-TICK_S / max(gusts.correlation_s, 1e-9))
+    )
+    last = math.ceil(longest_s / TICK_S)
+    for first in range(0, last, _CHUNK_TICKS):
+        rows = _new_rows(min(_CHUNK_TICKS, last - first), n)
+        flown = _fly_ticks(
+            first, vehicle.plant, sea, setup.floor, setup.sensors, navigation, setup.path,
+            setup.guidance, setup.gains, pilot, allocation, world, scratch, rng, rows,
+        )  # fmt: skip
+        yield Rows(*(part[:flown] for part in rows))
+        if flown < len(rows.state):
+            return
+
+
+def _new_world(setup: Setup, thrusters: int) -> World:
+    start = np.array([*setup.start_ne_m, 0.0])
+    attitude = np.array([0.0, 0.0, setup.start_heading_rad])
+    world = World(
+        initial_state(start, attitude, thrusters),
+        *(np.zeros(size) for size in (13, 13, 6, 6, 6, signals.ESTIMATE, 6)),
+    )
+    _tell_truth(world, setup.current, 0.0)
+    world.before[:] = world.now
+    return world
+
+
+def _allocation(setup: Setup) -> Allocation:
+    names = [thruster.name for thruster in setup.vehicle.thrusters]
+    for name in setup.failed:
+        if name not in names:
+            raise VehicleError(
+                f"{setup.vehicle.name} has no thruster {name!r}; it has {', '.join(names)}"
+            )
+    n = len(names)
+    health = np.array([float(name not in setup.failed) for name in names])
+    matrix = np.ascontiguousarray(setup.vehicle.configuration_matrix)
+    return Allocation(
+        setup.exact_allocation, matrix, AXIS_WEIGHTS.copy(), health, lower=np.zeros(n),
+        upper=np.zeros(n), weights=np.zeros(n), thrust=np.zeros(n), command_rps=np.zeros(n),
+        scratch=allocation_scratch(n),
+    )  # fmt: skip
+
+
+def _new_rows(count: int, thrusters: int) -> Rows:
+    widths = (STATE + thrusters, STATE, LOG_ROW, REPORT, 6, thrusters, thrusters)
+    return Rows(*(np.zeros((count, width)) for width in widths))

@@ -1,0 +1,112 @@
+"""A flown plan: where the left port was on each line, and when its pictures are taken."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from alice_survey.frames import Array, attitude_from_rotation
+from alice_survey.trajectory import Trajectory
+from alice_survey.vehicle.pilot import CROSS
+from alice_survey.vehicle.simulator import Flown
+from missions.navigation import NavigationLog
+from missions.plan_file import Plan
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Flight:
+    """A flown plan."""
+
+    plan: Plan
+    vehicle: str
+    """Its name."""
+    truth: Trajectory
+    """Of the body origin."""
+    glass_ned: Array
+    """(T, 3) the left port's outer glass."""
+    believed_glass_ned: Array
+    """(T, 3) where navigation had it."""
+    line: Array
+    """(T,) line of the plan that is being flown, -1 between lines; as the pilot believes."""
+    trigger_s: Array
+    """(S,) when each station's pictures are taken."""
+    trigger_line: tuple[int, ...]
+    """(S,) line of the plan of each station."""
+    log: NavigationLog
+    flown: Flown
+    ending: str
+    """Why the flight ended, in words."""
+
+    @cached_property
+    def attitude_rad(self) -> Array:
+        """(T, 3) true roll, pitch, heading."""
+        return attitude_from_rotation(self.truth.ned_from_body.rotation)
+
+    @cached_property
+    def line_errors(self) -> tuple[Array, Array]:
+        """How far the left port's glass and the heading truly are off the line, at each moment.
+
+        Returns:
+            Cross-track error, (T,) metres to starboard, and heading error, (T,) radians; NaN
+            between lines.
+        """
+        heading = np.full(len(self.line), np.nan)
+        for index, line in enumerate(self.plan.lines):
+            rows = self.line == index
+            turned = self.attitude_rad[rows, 2] - line.heading_rad
+            heading[rows] = np.angle(np.exp(1j * turned))
+        return self._cross_track(self.glass_ned), heading
+
+    @cached_property
+    def believed_cross_track(self) -> Array:
+        """(T,) metres: where the vehicle believed the glass to be off the line; NaN between."""
+        return self._cross_track(self.believed_glass_ned)
+
+    @cached_property
+    def route_cross_track(self) -> Array:
+        """(T,) metres: how far the pilot saw the glass to starboard of the route, turns too."""
+        return self.flown.report[:, CROSS]
+
+    def _cross_track(self, glass_ned: Array) -> Array:
+        cross = np.full(len(self.line), np.nan)
+        for index, line in enumerate(self.plan.lines):
+            rows = self.line == index
+            off = glass_ned[rows, :2] - np.array(line.start_ne_m)
+            starboard = [-math.sin(line.heading_rad), math.cos(line.heading_rad)]
+            cross[rows] = off @ np.array(starboard)
+        return cross
+
+
+def trigger_times(
+    plan: Plan, time_s: Array, line: Array, glass_ne: Array
+) -> tuple[Array, tuple[int, ...]]:
+    """When the vehicle believes to pass each station of each line.
+
+    Args:
+        plan: its lines and stations.
+        time_s: (T,)
+        line: (T,) line being flown, -1 between lines.
+        glass_ne: (T, 2) where the vehicle believes the left port's glass to be.
+
+    Returns:
+        (S,) seconds, interpolated between ticks, and the line of each; stations that were never
+        reached are left out.
+    """
+    times: list[Array] = []
+    lines: list[int] = []
+    for index, planned in enumerate(plan.lines):
+        rows = np.flatnonzero(line == index)
+        if not len(rows):
+            continue
+        # The tick before the line is entered brackets its first station, the one after its last.
+        rows = np.arange(max(rows[0] - 1, 0), min(rows[-1] + 2, len(line)))
+        ahead = np.array([math.cos(planned.heading_rad), math.sin(planned.heading_rad)])
+        along = np.maximum.accumulate((glass_ne[rows] - planned.start_ne_m) @ ahead)
+        stations = np.linspace(0.0, planned.length_m, planned.stations)
+        stations = stations[stations <= along[-1]]
+        # Of equal distances, while the vehicle falls back, the first counts.
+        first = np.concatenate([[True], np.diff(along) > 0])
+        times.append(np.interp(stations, along[first], time_s[rows][first]))
+        lines += [index] * len(stations)
+    return np.concatenate([np.empty(0), *times]), tuple(lines)

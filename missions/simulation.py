@@ -1,0 +1,244 @@
+"""A plan, flown by the simulated vehicle over a sea floor."""
+
+import math
+from typing import Protocol
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.config import SeaConfig, SurveyConfig
+from alice_survey.frames import Array, rotation_from_attitude
+from alice_survey.trajectory import Trajectory
+from alice_survey.vehicle import navigation, signals
+from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.floor import FloorGrid
+from alice_survey.vehicle.gains import gains_for
+from alice_survey.vehicle.guidance import Path, path_from_legs, pilot_guidance
+from alice_survey.vehicle.pilot import LINE, PHASE, REASON
+from alice_survey.vehicle.safety import NONE, REASONS, Limits
+from alice_survey.vehicle.sea import (
+    Current,
+    Disturbance,
+    read_current,
+    sheared_current,
+    varying_current,
+)
+from alice_survey.vehicle.sensors import (
+    CompassSpec,
+    DvlSpec,
+    GpsSpec,
+    SensorSuite,
+    UsblSpec,
+)
+from alice_survey.vehicle.simulator import Flown, Setup, simulate
+from missions.flight import Flight, trigger_times
+from missions.navigation import NavigationLog
+from missions.plan_file import Plan
+from missions.route import route_through
+
+_FLOOR_SPACING_M = 0.1
+"""Of the grid that the DVL hears: finer than the spot of a beam."""
+_CLIMB_MPS = 0.1
+"""Slowest dive and ascent that a mission waits for."""
+_PATIENCE = 2.0
+"""A mission is broken off after so many times the time its plan takes."""
+_USBL_HZ = 0.5
+"""A fix every other second: the turn-around of a modem at short range."""
+
+
+class SeaFloor(Protocol):
+    """What a flight needs to know of a sea floor."""
+
+    @property
+    def bounds_ne_m(self) -> tuple[float, float, float, float]:
+        """Least and greatest north, least and greatest east."""
+
+    def depth_at(self, points_ne: Array) -> Array:
+        """Depth, (...), at places (..., 2) within the bounds."""
+
+
+def simulate_plan(
+    plan: Plan, config: SurveyConfig, floor: FloorGrid, rng: np.random.Generator
+) -> Flight:
+    """Fly a plan.
+
+    Args:
+        plan: what to fly.
+        config: vehicle, sea and sensors.
+        floor: the true sea floor.
+        rng: source of all noise.
+
+    Raises:
+        VehicleError: a setting does not fit the vehicle.
+        NavigationError: the file of the current cannot be read.
+    """
+    climb_s = 2.0 * plan.seafloor_depth_m / _CLIMB_MPS
+    longest_s = _PATIENCE * (plan.duration_s + climb_s)
+    setup = mission_setup(plan, config, floor, longest_s, rng)
+    flown = simulate(setup, rng, longest_s=longest_s + climb_s, label="flight")
+    return flight_of(plan, config, setup, flown)
+
+
+def mission_setup(
+    plan: Plan,
+    config: SurveyConfig,
+    floor: FloorGrid,
+    longest_s: float,
+    rng: np.random.Generator,
+) -> Setup:
+    """Vehicle, path, pilot, instruments and sea of a survey.
+
+    Args:
+        plan: what to fly.
+        config: vehicle, sea and sensors.
+        floor: the true sea floor.
+        longest_s: after which the vehicle gives up.
+        rng: for what is drawn once a mission.
+    """
+    craft = vehicle(config.vehicle.name, config.vehicle.coefficients)
+    path = path_of(plan)
+    gains = gains_for(craft, plan.speed_mps)
+    guidance = pilot_guidance(
+        gains,
+        path,
+        config.vehicle.controller,
+        most_depth_m=float(floor.depth_m.max()),
+        point_body_m=config.camera.position_body_m,
+        limits=Limits(0.5 * plan.altitude_m, float(floor.depth_m.max()), longest_s=longest_s),
+    )
+    gust = config.sea.gust_n
+    return Setup(
+        vehicle=craft,
+        path=path,
+        guidance=guidance,
+        gains=gains,
+        sensors=sensors_of(config).pack(),
+        floor=floor,
+        current=current_of(config.sea, plan.seafloor_depth_m, longest_s, rng),
+        disturbance=Disturbance(
+            sigma=(*gust, 0.0, 0.0, 0.0), correlation_s=config.sea.gust_correlation_s
+        ),
+        exact_allocation=config.vehicle.allocation == "exact",
+        failed=config.vehicle.failed_thrusters,
+        start_ne_m=(float(path.start_n[0]), float(path.start_e[0])),
+        start_heading_rad=float(path.heading_rad[0]),
+    )
+
+
+def path_of(plan: Plan) -> Path:
+    """The route of a plan for the pilot."""
+    legs = route_through(plan.lines, plan.turn_radius_m, plan.run_in_m).legs
+    return path_from_legs(
+        [leg.start_ne_m for leg in legs],
+        [leg.heading_rad for leg in legs],
+        [leg.length_m for leg in legs],
+        [leg.curvature_per_m for leg in legs],
+        [leg.line for leg in legs],
+        plan.altitude_m,
+        plan.speed_mps,
+    )
+
+
+def current_of(
+    sea: SeaConfig, seafloor_depth_m: float, duration_s: float, rng: np.random.Generator
+) -> Current:
+    """The current of a survey: measured, or as its settings have it."""
+    if sea.current_file is not None:
+        return read_current(sea.current_file)
+    surface = sea.current_mps if sea.surface_current_mps is None else sea.surface_current_mps
+    mean = sheared_current(
+        np.array([0.0, seafloor_depth_m]),
+        np.array([[speed, sea.current_towards_deg] for speed in (surface, sea.current_mps)]),
+    )
+    if sea.current_sigma_mps == 0.0:
+        return mean
+    return varying_current(mean, sea.current_sigma_mps, sea.current_correlation_s, duration_s, rng)
+
+
+def sensors_of(config: SurveyConfig) -> SensorSuite:
+    """The instruments of a survey."""
+    told = config.navigation
+    return SensorSuite(
+        gps=GpsSpec(bias_sigma_m=told.gps_bias_m, noise_m=told.gps_noise_m),
+        compass=CompassSpec(
+            bias_sigma_rad=math.radians(told.compass_bias_deg),
+            noise_rad=math.radians(told.compass_noise_deg),
+        ),
+        dvl=DvlSpec(
+            position_body_m=config.camera.dvl_position_body_m,
+            beam_noise_mps=told.dvl_noise_mps,
+            dropouts_s=told.dvl_dropouts_s,
+        ),
+        usbl=UsblSpec(rate_hz=_USBL_HZ if told.usbl else 0.0),
+        followed_body_m=config.camera.position_body_m,
+    )
+
+
+def floor_grid(floor: SeaFloor) -> FloorGrid:
+    """A sea floor on a grid for compiled code."""
+    south, north, west, east = floor.bounds_ne_m
+    inset = 1e-6
+    rows = np.arange(south + inset, north - inset, _FLOOR_SPACING_M)
+    columns = np.arange(west + inset, east - inset, _FLOOR_SPACING_M)
+    points = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1)
+    depth = np.ascontiguousarray(floor.depth_at(points))
+    return FloorGrid(float(rows[0]), float(columns[0]), _FLOOR_SPACING_M, depth)
+
+
+def flight_of(plan: Plan, config: SurveyConfig, setup: Setup, flown: Flown) -> Flight:
+    """What a mission's rows mean for its plan."""
+    glass_body = np.array(config.camera.position_body_m)
+    truth = Trajectory(
+        time_s=flown.time_s,
+        ned_from_body=RigidTransform.from_components(
+            flown.truth[:, :3], Rotation.from_quat(flown.truth[:, 3:7])
+        ),
+    )
+    log = navigation_log(flown)
+    believed = log.position_ned + rotation_from_attitude(*log.attitude_rad.T).apply(glass_body)
+    following = flown.report[:, PHASE] == signals.FOLLOW
+    line = np.where(following, flown.report[:, LINE], -1.0)
+    trigger_s, trigger_line = trigger_times(plan, flown.time_s, line, believed[:, :2])
+    reason = int(flown.report[-1, REASON])
+    if reason != NONE:
+        ending = f"aborted: {REASONS[reason]}"
+    elif flown.report[-1, PHASE] == signals.DONE:
+        ending = "complete"
+    else:
+        ending = f"broken off after {flown.time_s[-1]:.0f} s"
+    return Flight(
+        plan=plan,
+        vehicle=setup.vehicle.name,
+        truth=truth,
+        glass_ned=truth.ned_from_body.apply(glass_body),
+        believed_glass_ned=believed,
+        line=line,
+        trigger_s=trigger_s,
+        trigger_line=trigger_line,
+        log=log,
+        flown=flown,
+        ending=ending,
+    )
+
+
+def navigation_log(flown: Flown) -> NavigationLog:
+    """What the navigation believed, tick by tick."""
+    columns = dict(zip(navigation.LOG_COLUMNS, flown.navigation.T, strict=True))
+
+    def table(*names: str) -> Array:
+        return np.stack([columns[name] for name in names], axis=1)
+
+    def rms(*names: str) -> Array:
+        return np.asarray(np.sqrt(np.mean(table(*names) ** 2, axis=1)))
+
+    return NavigationLog(
+        time_s=flown.time_s,
+        position_ned=table("north_m", "east_m", "depth_m"),
+        attitude_rad=table("roll_rad", "pitch_rad", "heading_rad"),
+        altitude_m=columns["altitude_m"],
+        sigma_horizontal_m=rms("sigma_north_m", "sigma_east_m"),
+        sigma_depth_m=columns["sigma_depth_m"],
+        sigma_attitude_rad=rms("sigma_roll_rad", "sigma_pitch_rad"),
+        sigma_heading_rad=columns["sigma_heading_rad"],
+        sigma_altitude_m=columns["sigma_altitude_m"],
+    )
