@@ -1,0 +1,184 @@
+"""Plans flown by the simulated vehicle: the issue's acceptance figures, failures, seas."""
+
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alice_survey.config import SeaConfig, SurveyConfig, parse_config
+from alice_survey.errors import VehicleError
+from alice_survey.vehicle.floor import FloorGrid, level_floor
+from alice_survey.vehicle.sea import current_at
+from camera_calib.rig import design_rig
+from missions.flight import Flight
+from missions.flight_records import flight_summary
+from missions.plan import make_plan
+from missions.plan_file import Plan
+from missions.simulation import current_of, simulate_plan
+
+
+def survey(**changes: object) -> SurveyConfig:
+    return parse_config(
+        {
+            "area": {"length_m": 6.0, "width_m": 4.0, "heading_deg": 20.0, "seafloor_depth_m": 6.0},
+            "sea": {"current_mps": 0.1, "current_towards_deg": 110.0},
+            **changes,
+        },
+        "test",
+    )
+
+
+@lru_cache
+def plan_of(heading_deg: float = 20.0) -> Plan:
+    config = survey()
+    area = config.area.model_copy(update={"heading_deg": heading_deg})
+    config = config.model_copy(update={"area": area})
+    return make_plan(config, design_rig(config.camera, config.water))
+
+
+def fly(config: SurveyConfig, floor: FloorGrid | None = None, seed: int = 1) -> Flight:
+    rng = np.random.default_rng(seed)
+    return simulate_plan(plan_of(), config, floor or level_floor(6.0), rng)
+
+
+@pytest.fixture(scope="module")
+def flight() -> Flight:
+    return fly(survey())
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.nanmean(values**2)))
+
+
+def test_in_a_cross_current_alice_keeps_to_her_lines(flight: Flight) -> None:
+    cross, heading = flight.line_errors
+    assert flight.ending == "complete"
+    assert 0.002 < rms(cross) <= 0.12
+    assert 0.1 < np.rad2deg(rms(heading)) <= 3.0
+    # The control alone, without the error of the navigation, is finer still.
+    assert rms(flight.believed_cross_track) < 0.05
+
+
+def test_roll_stays_below_ten_degrees_in_turns(flight: Flight) -> None:
+    found = flight_summary(flight, survey())
+    assert 0.5 < found["in_turns"]["roll_worst_deg"] < 10.0
+    assert found["in_turns"]["off_route_rms_m"] < 0.3
+
+
+def test_every_station_is_taken_once_and_in_its_place(flight: Flight) -> None:
+    plan = flight.plan
+    assert len(flight.trigger_s) == plan.stations
+    assert np.all(np.diff(flight.trigger_s) > 0)
+    assert flight.trigger_line == tuple(
+        i for i, line in enumerate(plan.lines) for _ in range(line.stations)
+    )
+    planned = np.vstack([line.stations_ne for line in plan.lines])
+    for glass in (flight.believed_glass_ned, flight.glass_ned):
+        taken = np.column_stack(
+            [np.interp(flight.trigger_s, flight.truth.time_s, axis) for axis in glass[:, :2].T]
+        )
+        off = np.linalg.norm(taken - planned, axis=1)
+        assert 0.001 < off.max() < 0.2
+
+
+def test_altitude_is_held_over_a_slope() -> None:
+    north = np.arange(-15.0, 20.0, 0.5)
+    slope = FloorGrid(-15.0, -15.0, 0.5, np.repeat(6.0 + 0.1 * north[:, None], 80, axis=1))
+    flight = fly(survey(), slope)
+    on_line = flight.line >= 0
+    floor = 6.0 + 0.1 * flight.glass_ned[on_line, 0]
+    altitude = floor - flight.glass_ned[on_line, 2]
+    assert flight.ending == "complete"
+    assert abs(altitude.mean() - 2.0) < 0.1
+    assert 0.005 < altitude.std() < 0.15
+
+
+@pytest.mark.parametrize("thruster", ["starboard", "port", "vertical", "bow", "stern"])
+def test_with_one_thruster_failed_the_survey_ends_well_or_says_why(thruster: str) -> None:
+    flight = fly(survey(vehicle={"failed_thrusters": [thruster]}))
+    if flight.ending == "complete":
+        assert len(flight.trigger_s) == plan_of().stations
+        assert rms(flight.line_errors[0]) < 0.5
+    else:
+        assert flight.ending.startswith("aborted: the ")
+        assert len(flight.trigger_s) < plan_of().stations
+    # Without the vertical thruster she cannot dive; with one lateral gone she flies on.
+    if thruster == "vertical":
+        assert "dive" in flight.ending
+
+
+def test_the_original_vehicle_flies_by_heading_alone() -> None:
+    flight = fly(survey(vehicle={"name": "sparus2", "controller": "los"}))
+    assert flight.ending == "complete"
+    assert flight.flown.thrusters == ("starboard", "port", "vertical")
+    assert rms(flight.line_errors[0]) > 3 * rms(fly(survey()).line_errors[0])
+
+
+def test_a_vehicle_without_sway_cannot_be_flown_by_sway() -> None:
+    with pytest.raises(VehicleError, match="controller los"):
+        fly(survey(vehicle={"name": "sparus2"}))
+
+
+def test_the_pseudo_inverse_flies_the_survey_too() -> None:
+    flight = fly(survey(vehicle={"allocation": "rpi"}))
+    assert flight.ending == "complete"
+    assert 0.002 < rms(flight.line_errors[0]) <= 0.12
+
+
+def test_a_loss_of_bottom_lock_is_survived_and_seen_in_the_sigmas() -> None:
+    hold = survey(navigation={"dvl_dropouts_s": [[60.0, 75.0]]})
+    flight, usual = fly(hold), fly(survey())
+    lost = (flight.log.time_s > 63.0) & (flight.log.time_s < 75.0)
+    assert np.all(np.isnan(flight.log.altitude_m[lost]))
+    at = np.flatnonzero(lost)[-1]
+    assert flight.log.sigma_horizontal_m[at] > 1.5 * usual.log.sigma_horizontal_m[at]
+    assert flight.ending == "complete"
+
+
+def test_a_current_too_strong_is_refused_by_the_vehicle() -> None:
+    flight = fly(survey(sea={"current_mps": 2.5, "current_towards_deg": 110.0}))
+    assert flight.ending.startswith("aborted: ")
+    assert len(flight.trigger_s) < plan_of().stations
+
+
+def test_the_current_of_the_settings_flows_as_they_say() -> None:
+    sea = SeaConfig(
+        current_mps=0.1, current_towards_deg=90.0, surface_current_mps=0.5, current_sigma_mps=0.0
+    )
+    current, out = current_of(sea, 20.0, 100.0, np.random.default_rng(1)), np.zeros(6)
+    for depth, speed in ((0.0, 0.5), (10.0, 0.3), (20.0, 0.1), (30.0, 0.1)):
+        current_at(current, 5.0, depth, out)
+        np.testing.assert_allclose(out[:2], [0.0, speed], atol=1e-12)
+
+
+def test_a_slowly_varying_current_has_the_sigma_of_the_settings() -> None:
+    sea = SeaConfig(current_mps=0.1, current_sigma_mps=0.03, current_correlation_s=20.0)
+    current = current_of(sea, 20.0, 40_000.0, np.random.default_rng(1))
+    north = current.velocity_ne_mps[:, 0, 0]
+    assert 0.025 < north.std() < 0.035
+    assert abs(north.mean()) < 0.006
+
+
+def test_a_measured_current_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "adcp.csv"
+    path.write_text(
+        "time_s,depth_m,north_mps,east_mps\n0,2,0.1,0\n0,8,0.0,0\n60,2,0.3,0\n60,8,0.0,0.2\n"
+    )
+    current = current_of(SeaConfig(current_file=path), 20.0, 100.0, np.random.default_rng(1))
+    out = np.zeros(6)
+    current_at(current, 30.0, 5.0, out)
+    np.testing.assert_allclose(out[:2], [0.1, 0.05], atol=1e-12)
+
+    path.write_text("time_s,depth_m,north_mps,east_mps\n0,2,0.1,0\n0,8,0.0,0\n60,2,0.3,0\n")
+    with pytest.raises(VehicleError, match="3 rows for 2 times and 2 depths"):
+        current_of(SeaConfig(current_file=path), 20.0, 100.0, np.random.default_rng(1))
+
+
+def test_a_shear_through_the_water_does_not_throw_the_vehicle_off() -> None:
+    sheared = survey(
+        sea={"current_mps": 0.1, "current_towards_deg": 110.0, "surface_current_mps": 0.3}
+    )
+    flight = fly(sheared)
+    assert flight.ending == "complete"
+    assert 0.002 < rms(flight.line_errors[0]) <= 0.12
