@@ -50,18 +50,28 @@ class _Source:
     """What to know of it when it is used."""
 
 
+@dataclass(frozen=True)
+class _Keep:
+    """Which rows of a message to use."""
+
+    fields: tuple[str, ...]
+    """What `rows` needs."""
+    rows: Callable[[Table], Mask]
+
+
 def _take(
     message: str, fields: Sequence[str], scale: float | Sequence[float] = 1.0,
-    keep: Callable[[Table], Mask] | None = None, absent: float | None = None,
+    keep: _Keep | None = None, absent: float | None = None,
 ) -> _Reader:  # fmt: skip
     """Reads fields of a message, times scales; `keep` tells rows to use, `absent` what is NaN."""
 
     def read(tables: _Tables) -> tuple[Array, Array] | None:
         table = tables.get(message)
-        if table is None or any(field not in table.columns for field in fields):
+        needed = (*fields, *(keep.fields if keep is not None else ()))
+        if table is None or any(field not in table.columns for field in needed):
             return None
         if keep is not None:
-            table = table.rows(keep(table))
+            table = table.rows(keep.rows(table))
         values = table.stacked(*fields)
         if absent is not None:
             values = np.where(values == absent, np.nan, values)
@@ -75,7 +85,11 @@ def _from_origin(message: str) -> _Reader:
 
     def read(tables: _Tables) -> tuple[Array, Array] | None:
         table, origin = tables.get(message), tables.get("ORGN")
-        if table is None or origin is None or "PN" not in table.columns:
+        if table is None or origin is None:
+            return None
+        if any(name not in table.columns for name in ("PN", "PE", "PD")) or any(
+            name not in origin.columns for name in ("Type", "Lat", "Lng")
+        ):
             return None
         rows = np.flatnonzero(origin.columns["Type"] == 0)
         if not len(rows):
@@ -88,8 +102,8 @@ def _from_origin(message: str) -> _Reader:
     return read
 
 
-def _has_fix(field: str) -> Callable[[Table], Mask]:
-    return lambda table: table.columns[field] >= _FIX_3D
+def _has_fix(field: str) -> _Keep:
+    return _Keep((field,), lambda table: table.columns[field] >= _FIX_3D)
 
 
 def _sees_down(table: Table) -> Mask:
@@ -97,6 +111,16 @@ def _sees_down(table: Table) -> Mask:
     good: Mask = table.columns["Stat"] == _GOOD
     if "Orient" in table.columns:
         good &= table.columns["Orient"] == _DOWN
+    return good
+
+
+def _hears_bottom(table: Table) -> Mask:
+    """Rows of DISTANCE_SENSOR that look down and are within what the sensor measures."""
+    distance = table.columns["current_distance"]
+    inside = (distance >= table.columns["min_distance"]) & (
+        distance < table.columns["max_distance"]
+    )
+    good: Mask = inside & (table.columns["orientation"] == _DOWN)
     return good
 
 
@@ -123,7 +147,7 @@ _BIN: Mapping[str, tuple[_Source, ...]] = {
         _Source("NKF1", _take("NKF1", ("Roll", "Pitch", "Yaw"))),
         _Source("AHR2", _take("AHR2", ("Roll", "Pitch", "Yaw"))),
     ),
-    "altitude": (_Source("RFND", _take("RFND", ("Dist",), keep=_sees_down)),),
+    "altitude": (_Source("RFND", _take("RFND", ("Dist",), keep=_Keep(("Stat",), _sees_down))),),
     "velocity": (
         _Source("XKF1", _take("XKF1", ("VN", "VE", "VD"))),
         _Source("NKF1", _take("NKF1", ("VN", "VE", "VD"))),
@@ -156,9 +180,9 @@ _TLOG: Mapping[str, tuple[_Source, ...]] = {
             "DISTANCE_SENSOR",
             _take(
                 "DISTANCE_SENSOR", ("current_distance",), 1e-2,
-                keep=lambda table: (table.columns["orientation"] == _DOWN)
-                & (table.columns["current_distance"] >= table.columns["min_distance"])
-                & (table.columns["current_distance"] < table.columns["max_distance"]),
+                keep=_Keep(
+                    ("orientation", "min_distance", "max_distance"), _hears_bottom
+                ),
             ),
         ),
         _Source("RANGEFINDER", _take("RANGEFINDER", ("distance",), absent=0.0)),
@@ -330,14 +354,15 @@ def _one_instance(
     field = next((name for name in _INSTANCE if name in table.columns), None)
     if field is None:
         return table, ""
-    numbers = np.unique(table.columns[field]).astype(int).tolist()
+    known = table.columns[field][np.isfinite(table.columns[field])]
+    numbers = np.unique(known).astype(int).tolist()
     if asked:
         if not asked.isdigit() or int(asked) not in numbers:
             raise NavigationError(
                 f"{path}: {table.name} has {', '.join(map(str, numbers))}, not {asked}"
             )
         return table.rows(table.columns[field] == int(asked)), ""
-    if len(numbers) == 1:
+    if len(numbers) < 2:
         return table, ""
     if table.name == "BARO":
         if not named:
@@ -379,7 +404,7 @@ def _since_1970(tables: _Tables) -> tuple[float, bool]:
 
 def _declination(parameters: Table | None) -> float | None:
     """What the vehicle added to its compass, degrees; NaN where it took it from its own table."""
-    if parameters is None or "Name" not in parameters.texts:
+    if parameters is None or "Name" not in parameters.texts or "Value" not in parameters.columns:
         return None
     values = dict(zip(parameters.texts["Name"], parameters.columns["Value"], strict=True))
     if values.get("COMPASS_AUTODEC", 0.0) > 0:

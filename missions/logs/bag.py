@@ -131,8 +131,8 @@ def write_bag(path: Path, record: BagRecord) -> int:
     """Write a flight as a ROS 2 bag of MCAP storage: the folder `path`, whole or not at all.
 
     Messages are made one by one in the order of their times, so that memory holds the record and
-    one chunk of the file (1 MiB) only. The bytes depend on the record, on the folder's name and on
-    the version of rosbags, which names itself in the file.
+    one chunk of the file (1 MiB, compressed) only. The bytes depend on the record, on the folder's
+    name and on the versions of rosbags, which names itself in the file, and of zstd.
 
     Args:
         path: folder to write; it must not exist.
@@ -144,7 +144,7 @@ def write_bag(path: Path, record: BagRecord) -> int:
     Raises:
         WorkspaceError: the folder exists, or cannot be written.
     """
-    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
     if path.exists():
         raise WorkspaceError(f"{path} exists already: remove it or choose another name")
@@ -153,7 +153,9 @@ def write_bag(path: Path, record: BagRecord) -> int:
     shutil.rmtree(outer, ignore_errors=True)
     try:
         outer.mkdir(parents=True)
-        with Writer(outer / path.name, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        writer = Writer(outer / path.name, version=9, storage_plugin=StoragePlugin.MCAP)
+        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        with writer:
             for key, value in sorted(record.notes.items()):
                 writer.set_custom_data(key, value)
             messages = Messages()

@@ -18,6 +18,7 @@ COLUMNS = (
     "sigma_altitude_m",
 )  # fmt: skip
 """Of the navigation CSV, after the time."""
+_LONGEST_S = 1e9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +43,8 @@ class Corrections:
         numbers += [self.tide] if isinstance(self.tide, float | int) else []
         if not all(math.isfinite(number) for number in numbers):
             raise NavigationError("declination, tide, offsets and lever arm need finite numbers")
+        if abs(self.clock_offset_s) > _LONGEST_S:
+            raise NavigationError(f"--clock-offset {self.clock_offset_s:g} s is more than 30 years")
         if abs(self.declination_deg) > 180:
             raise NavigationError(
                 f"a declination of {self.declination_deg:g} degrees: give -180 to 180"

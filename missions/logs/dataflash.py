@@ -215,8 +215,9 @@ def _read_text(
     tables = {}
     for name in wanted:
         if rows.get(name):
-            kinds, fields = formats[name]
-            tables[name] = _text_table(name, kinds, fields, rows[name], lost)
+            table = _text_table(name, *formats[name], rows[name], lost)
+            if len(table):
+                tables[name] = table
     return tables, sorted(rows)
 
 

@@ -19,6 +19,9 @@ reader of `import-images`."""
 DATED_AFTER_S = 1e8
 """Times since 1970 before this (March 1973) are a simulation's or a processor's own clock."""
 
+_LATEST_S = 7258118400.0
+"""1 January 2200."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Signal:
@@ -116,9 +119,9 @@ def cleaned(source: str, time_s: Array, values: Array, lost: Counter[str]) -> Si
     """
     time_s = np.asarray(time_s, dtype=np.float64)
     values = np.asarray(values, dtype=np.float64).reshape(len(time_s), -1)
-    good = np.isfinite(time_s)
+    good = np.abs(time_s) < _LATEST_S
     if not good.all():
-        lost[f"{source}: the time is no number"] += int((~good).sum())
+        lost[f"{source}: the time is no number, or after 2200"] += int((~good).sum())
     time_s, values = time_s[good], values[good]
     values = np.where(np.isfinite(values), values, np.nan)
     keep = _increasing(time_s)

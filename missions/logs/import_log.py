@@ -79,6 +79,10 @@ def import_log(
         NavigationError: the log cannot be read, holds no position, or an option does not fit it.
     """
     asked = options or ImportOptions()
+    written = [file for file in (out, asked.vehicle_log) if file is not None]
+    for file in written:
+        if file.resolve() == path.resolve() or written.count(file) > 1:
+            raise NavigationError(f"{file} would be written over: choose another name")
     dive = read_dive(path, asked)
     dated = dive.dated or asked.start_utc is not None
     if asked.start_utc is not None:
@@ -106,9 +110,12 @@ def import_log(
         )
     time_s = time_s[complete]
     columns = {name: column[complete] for name, column in columns.items()}
-    write_navigation_csv(out, time_s, columns, dated=dated)
-    if asked.vehicle_log is not None:
-        _write_vehicle_log(asked.vehicle_log, dive, corrections, asked)
+    try:
+        write_navigation_csv(out, time_s, columns, dated=dated)
+        if asked.vehicle_log is not None:
+            _write_vehicle_log(asked.vehicle_log, dive, corrections, asked)
+    except OSError as error:
+        raise NavigationError(f"{error.filename}: cannot be written: {error.strerror}") from None
     return _report(path, out, dive, time_s, columns, lost, dated)
 
 
@@ -314,12 +321,12 @@ def _report(
         "out": str(out),
         "rows": len(time_s),
         "start": _date(float(time_s[0])) if dated else float(time_s[0]),
-        "duration_s": float(time_s[-1] - time_s[0]),
-        "median_interval_s": float(np.median(steps)) if len(steps) else None,
+        "duration_s": round(float(time_s[-1] - time_s[0]), 6),
+        "median_interval_s": round(float(np.median(steps)), 6) if len(steps) else None,
         "sources": named,
         "filled": filled,
         "left_out": dict(sorted(lost.items())),
-        "gaps": [{"start_s": start, "length_s": length} for start, length in gaps],
+        "gaps": [{"start_s": round(a, 6), "length_s": round(b, 6)} for a, b in gaps],
         "notes": list(dive.notes),
     }
     lines = [

@@ -128,16 +128,19 @@ def read_ros_bag(path: Path, options: BagOptions) -> LoggedDive:
             )
         joints = [topic for topic in present if topic.kind == JOINTS]
         lost: Counter[str] = Counter()
-        series = _collect(reader, {*chosen.values(), *origin, *joints}, lost)
-    return _Reading(path, options, chosen, series, lost).dive(origin, joints)
+        notes: list[str] = []
+        series = _collect(reader, {*chosen.values(), *origin, *joints}, lost, notes)
+    return _Reading(path, options, chosen, series, lost, notes).dive(origin, joints)
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator["AnyReader"]:
     """An open reader; what goes wrong while it is open names the file in one line."""
+    from apsw import Error as SqliteError
     from rosbags.highlevel import AnyReader, AnyReaderError
     from rosbags.rosbag1 import ReaderError as Reader1Error
     from rosbags.rosbag2 import ReaderError as Reader2Error
+    from rosbags.rosbag2.storage_mcap import zstd  # type: ignore[attr-defined]  # by Python's age
     from rosbags.serde import SerdeError
     from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
@@ -146,9 +149,11 @@ def _opened(path: Path) -> Iterator["AnyReader"]:
     store = get_typestore(Stores.ROS2_HUMBLE)
     for name, text in _COLA2.items():
         store.register(get_types_from_msg(text, name))
+    # A damaged file may claim lengths that no memory holds; lz4 raises RuntimeError.
     faults = (
-        AnyReaderError, Reader1Error, Reader2Error, SerdeError, TypesysError, OSError, struct.error,
-        ValueError, KeyError, IndexError, AssertionError, EOFError,
+        AnyReaderError, Reader1Error, Reader2Error, SerdeError, TypesysError, SqliteError,
+        zstd.ZstdError, OSError, struct.error, ValueError, KeyError, IndexError, AssertionError,
+        EOFError, MemoryError, RuntimeError,
     )  # fmt: skip
     try:
         with AnyReader([path], default_typestore=store) as reader:
@@ -244,7 +249,9 @@ class _Series:
     """(N,) by name (`ros_rows.ROWS`), or by joint."""
 
 
-def _collect(reader: "AnyReader", wanted: set[_Topic], lost: Counter[str]) -> dict[_Topic, _Series]:
+def _collect(
+    reader: "AnyReader", wanted: set[_Topic], lost: Counter[str], notes: list[str]
+) -> dict[_Topic, _Series]:
     """Messages with their times: of the header, else (unset, or no header) of the recording."""
     kinds = {topic.name: topic for topic in wanted}
     connections = [c for c in reader.connections if c.topic in kinds]
@@ -253,6 +260,7 @@ def _collect(reader: "AnyReader", wanted: set[_Topic], lost: Counter[str]) -> di
     names: dict[str, tuple[str, ...]] = {
         topic.name: ROWS[topic.kind][0] for topic in wanted if topic.kind in ROWS
     }
+    unset: Counter[str] = Counter()
     total = sum(c.msgcount for c in connections)
     messages = reader.messages(connections) if connections else iter(())
     for connection, recorded_ns, raw in progress(messages, "log", total):
@@ -263,7 +271,7 @@ def _collect(reader: "AnyReader", wanted: set[_Topic], lost: Counter[str]) -> di
         if stamp is not None and (stamp.sec or stamp.nanosec):
             time_s = stamp.sec + stamp.nanosec * 1e-9
         elif stamp is not None and time_s > DATED_AFTER_S:
-            lost[f"{name}: header times that are not set (those of the recording are used)"] += 1
+            unset[name] += 1
         if kinds[name].kind == JOINTS:
             joints = names.setdefault(name, tuple(message.name))
             if tuple(message.name) != joints or len(message.velocity) != len(joints):
@@ -271,8 +279,16 @@ def _collect(reader: "AnyReader", wanted: set[_Topic], lost: Counter[str]) -> di
                 continue
             rows[name].append(message.velocity)
         else:
-            rows[name].append(ROWS[kinds[name].kind][1](message))
+            try:
+                rows[name].append(ROWS[kinds[name].kind][1](message))
+            except AttributeError as error:
+                raise NavigationError(
+                    f"{name}: {connection.msgtype} is not the {kinds[name].kind} that is known: "
+                    f"{error}"
+                ) from None
         times[name].append(time_s)
+    for name, count in sorted(unset.items()):
+        notes.append(f"{name}: {count} headers without a time have that of their recording")
     found = {}
     for name, topic in kinds.items():
         columns = names.get(name, ())
@@ -295,10 +311,10 @@ class _Reading:
         chosen: Mapping[str, _Topic],
         series: Mapping[_Topic, _Series],
         lost: Counter[str],
+        notes: list[str],
     ) -> None:
         self.path, self.options, self.chosen = path, options, chosen
-        self.series, self.lost = series, lost
-        self.notes: list[str] = []
+        self.series, self.lost, self.notes = series, lost, notes
         self._counted: set[_Topic] = set()
 
     def dive(self, origin: Sequence[_Topic], joints: Sequence[_Topic]) -> LoggedDive:

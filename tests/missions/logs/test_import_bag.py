@@ -329,3 +329,24 @@ def test_header_times_count_and_not_those_of_the_recording(tmp_path: Path) -> No
     import_log(log, tmp_path / "n.csv")
     start = datetime.fromtimestamp(START / 1e9, UTC)
     assert read_navigation(tmp_path / "n.csv", UTC).start_utc == start
+
+
+def test_headers_without_a_time_have_that_of_the_recording(tmp_path: Path) -> None:
+    bag = Bag(2)
+    for i in range(3):
+        bag.add_nav_sts(0, (41.0, 3.0, 5.0), (0.0, 0.0, 0.0), 2.0)
+        bag.rows[-1] = (START + i * 10**8, *bag.rows[-1][1:])
+    log = bag.write(tmp_path / "dive")
+    _, data = import_log(log, tmp_path / "n.csv")
+    assert data["notes"] == [f"{TOPIC}: 3 headers without a time have that of their recording"]
+    read = read_navigation(tmp_path / "n.csv", UTC)
+    np.testing.assert_allclose(read.time_s, [0, 0.1, 0.2], atol=2e-6)
+
+
+def test_nothing_is_written_over(tmp_path: Path) -> None:
+    log = cola2_bag(1, 3).write(tmp_path / "d.bag")
+    with pytest.raises(NavigationError, match="written over"):
+        import_log(log, log)
+    options = ImportOptions(vehicle_log=tmp_path / "n.csv")
+    with pytest.raises(NavigationError, match="written over"):
+        import_log(log, tmp_path / "n.csv", options)
