@@ -1,4 +1,6 @@
 import csv
+import sqlite3
+from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -350,3 +352,17 @@ def test_nothing_is_written_over(tmp_path: Path) -> None:
     options = ImportOptions(vehicle_log=tmp_path / "n.csv")
     with pytest.raises(NavigationError, match="written over"):
         import_log(log, tmp_path / "n.csv", options)
+
+
+def test_old_bags_without_definitions_and_lone_files(tmp_path: Path) -> None:
+    """ROS 2 before Iron wrote no definitions; COLA2's own are then taken."""
+    log = cola2_bag(2).write(tmp_path / "dive", StoragePlugin.SQLITE3)
+    file = next(log.glob("*.db3"))
+    with closing(sqlite3.connect(file)) as database, database:
+        assert database.execute("delete from message_definitions").rowcount > 0
+    for path in (log, file):
+        _, data = import_log(path, tmp_path / "n.csv")
+        assert data["rows"] == 30
+        np.testing.assert_allclose(
+            numbers(tmp_path / "n.csv", "depth_m")[:, 0], 5.0 + 0.01 * np.arange(30), atol=1e-5
+        )
