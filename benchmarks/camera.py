@@ -11,15 +11,13 @@ AquaCal needs an environment of its own, as it pins an OpenCV whose files clash 
 
 import argparse
 import json
-import os
-import platform
 import sys
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from benchmarks import camera_calibration, camera_pose, camera_speed
+from benchmarks.machine import heading, load, machine
 
 _PARTS = ("speed", "pose", "calibration")
 
@@ -27,10 +25,9 @@ _PARTS = ("speed", "pose", "calibration")
 def main() -> None:
     """Measure, print, and say which goals are missed."""
     options = _options()
-    report: dict[str, Any] = {"machine": _machine(), "quick": options.quick}
-    print(f"{report['machine']['processor']}, {report['machine']['cores']} cores")
-    print(", ".join(f"{name} {number}" for name, number in report["machine"]["versions"].items()))
-    print(f"load before: {report['machine']['load']}\n", flush=True)
+    packages = ("numpy", "numba", "opencv-contrib-python-headless", "pycolmap")
+    report: dict[str, Any] = {"machine": machine(packages), "quick": options.quick}
+    print(heading(report["machine"]), "\n", flush=True)
     missed: list[str] = []
     if "speed" in options.only:
         rows = camera_speed.measure(
@@ -68,7 +65,7 @@ def main() -> None:
         # With fewer trials the figures themselves scatter too much for the goals.
         missed += [] if options.quick else [miss for mode in modes for miss in mode.misses()]
     report["missed"] = missed
-    print(f"load after: {_load()}")
+    print(f"load after: {load()}")
     if options.json is not None:
         options.json.write_text(json.dumps(report, indent=2) + "\n")
     for miss in missed:
@@ -84,28 +81,6 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--json", type=Path, help="write all figures to this file")
     parser.add_argument("--aquacal", type=Path, help="a Python that can import AquaCal")
     return parser.parse_args()
-
-
-def _machine() -> dict[str, Any]:
-    names = ("numpy", "numba", "opencv-contrib-python-headless", "pycolmap")
-    processor = platform.processor() or platform.machine()
-    information = Path("/proc/cpuinfo")
-    if information.exists():
-        lines = information.read_text().splitlines()
-        processor = next(
-            (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")),
-            processor,
-        )
-    return {
-        "processor": processor,
-        "cores": len(os.sched_getaffinity(0)),
-        "load": _load(),
-        "versions": {"python": platform.python_version(), **{n: version(n) for n in names}},
-    }
-
-
-def _load() -> str:
-    return " ".join(f"{load:.2f}" for load in os.getloadavg()) + " (1, 5, 15 min)"
 
 
 if __name__ == "__main__":

@@ -1,0 +1,37 @@
+"""What a benchmark ran on."""
+
+import os
+import platform
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+
+def machine(packages: Sequence[str]) -> dict[str, Any]:
+    """Processor, cores that may be used, load, and versions of Python and of packages."""
+    processor = platform.processor() or platform.machine()
+    information = Path("/proc/cpuinfo")
+    if information.exists():
+        lines = information.read_text().splitlines()
+        processor = next(
+            (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")),
+            processor,
+        )
+    return {
+        "processor": processor,
+        "cores": len(os.sched_getaffinity(0)),
+        "load": load(),
+        "versions": {"python": platform.python_version(), **{n: version(n) for n in packages}},
+    }
+
+
+def load() -> str:
+    """How busy the machine is."""
+    return " ".join(f"{load:.2f}" for load in os.getloadavg()) + " (1, 5, 15 min)"
+
+
+def heading(about: dict[str, Any]) -> str:
+    """The machine in three lines."""
+    versions = ", ".join(f"{name} {number}" for name, number in about["versions"].items())
+    return f"{about['processor']}, {about['cores']} cores\n{versions}\nload before: {about['load']}"
