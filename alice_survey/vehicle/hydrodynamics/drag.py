@@ -42,8 +42,9 @@ def cylinder_across(fineness: float) -> float:
 def plate_across(aspect: float) -> float:
     """C_d of a rectangular plate across the flow.
 
-    1.10 + 0.02 (a + 1 / a), a fit to Hoerner's (1965, chapter 3) plates up to an aspect ratio of
-    30. On a wall a plate counts with its mirror image: twice its height over its width.
+    1.10 + 0.02 (a + 1 / a), a fit in common use to the plates of Hoerner (1965, chapter 3), up to
+    an aspect ratio of 30; where it comes from could not be read. On a wall a plate counts with its
+    mirror image: twice its height over its width.
     """
     return 1.10 + 0.02 * (aspect + 1.0 / aspect)
 
