@@ -25,12 +25,12 @@ from alice_survey.vehicle.measuring import (
 from alice_survey.vehicle.navigation_filter import (
     correct,
     lever_row,
-    predict,
     use_beams,
     use_depth,
     use_fix,
     use_heading,
 )
+from alice_survey.vehicle.navigation_prediction import predict
 from alice_survey.vehicle.navigation_state import (
     ALTITUDE_NOW,
     ALTITUDE_PING,
@@ -185,11 +185,9 @@ def _tell(nav: NavigationState, suite: Sensors, estimate: Array) -> None:
         estimate[i] = x[i] - turned[i, 0] * a - turned[i, 1] * b - turned[i, 2] * c
         estimate[P + i] = nav.readings[RATES + i] - x[GYRO_BIAS + 1 + i]
     p, q, r = estimate[P], estimate[P + 1], estimate[P + 2]
-    for i in range(3):
-        estimate[U + i] = turned[0, i] * x[3] + turned[1, i] * x[4] + turned[2, i] * x[5]
-    estimate[U] -= q * c - r * b
-    estimate[U + 1] -= r * a - p * c
-    estimate[U + 2] -= p * b - q * a
+    estimate[U] = x[VELOCITY] - q * c + r * b
+    estimate[U + 1] = x[VELOCITY + 1] - r * a + p * c
+    estimate[U + 2] = x[VELOCITY + 2] - p * b + q * a
     estimate[3] = math.atan2(turned[2, 1], turned[2, 2])
     estimate[4] = -math.asin(min(max(turned[2, 0], -1.0), 1.0))
     heading = math.atan2(turned[1, 0], turned[0, 0])
@@ -247,7 +245,7 @@ def _hear_altitude(time_s: float, used: int, nav: NavigationState, suite: Sensor
     for i in range(3):
         lever += turned[2, i] * (suite.place[DVL, i] - suite.place[FOLLOWED, i])
     r0, r1, r2 = turned[2, 0], turned[2, 1], turned[2, 2]
-    tilt = _variance_by_attitude(nav, r2 * b - r1 * c, r0 * c - r2 * a, r1 * a - r0 * b)
+    tilt = _variance(nav, ATTITUDE, r2 * b - r1 * c, r0 * c - r2 * a, r1 * a - r0 * b)
     # The spread holds the ranges' noise, of which the mean keeps a part only.
     spread = max((1.0 + 1.0 / count) * memory[RELIEF_VARIANCE] - noise, noise / count)
     memory[ALTITUDE_PING] = mean + lever
@@ -257,9 +255,9 @@ def _hear_altitude(time_s: float, used: int, nav: NavigationState, suite: Sensor
 
 
 @kernel
-def _variance_by_attitude(nav: NavigationState, a: float, b: float, c: float) -> float:
-    """Variance of a g by the attitude's covariance, for g = (a, b, c)."""
-    p, t = nav.covariance, ATTITUDE
+def _variance(nav: NavigationState, t: int, a: float, b: float, c: float) -> float:
+    """Variance of g . e for g = (a, b, c) and the three errors e that begin at t."""
+    p = nav.covariance
     return float(
         a * a * p[t, t]
         + b * b * p[t + 1, t + 1]
@@ -276,7 +274,8 @@ def _carry_altitude(time_s: float, nav: NavigationState, suite: Sensors) -> None
     # Not a number before the first ping: then this is false too.
     if age <= suite.altitude_age_s + 1e-9:
         gained = _followed_depth(nav, suite) - memory[FOLLOWED_DEPTH]
-        drifted = age * age * nav.covariance[VELOCITY + 2, VELOCITY + 2]
+        turned = nav.turns[BELIEVED]
+        drifted = age * age * _variance(nav, VELOCITY, turned[2, 0], turned[2, 1], turned[2, 2])
         memory[ALTITUDE_NOW] = memory[ALTITUDE_PING] - gained
         memory[ALTITUDE_SIGMA] = math.sqrt(memory[ALTITUDE_VARIANCE] + drifted)
     else:
@@ -301,13 +300,13 @@ def log_row(nav: NavigationState, out: Array) -> None:
         # Row of R [lever]x: how the origin moves against the IMU when the belief turns.
         g0, g1, g2 = r1 * c - r2 * b, r2 * a - r0 * c, r0 * b - r1 * a
         both = g0 * p[i, t] + g1 * p[i, t + 1] + g2 * p[i, t + 2]
-        variance = p[i, i] + 2.0 * both + _variance_by_attitude(nav, g0, g1, g2)
+        variance = p[i, i] + 2.0 * both + _variance(nav, ATTITUDE, g0, g1, g2)
         out[LOG_SIGMA + i] = math.sqrt(max(variance, 0.0))
     sine, cosine = math.sin(latest[3]), math.cos(latest[3])
     slope, level = math.tan(latest[4]), math.cos(latest[4])
-    out[LOG_SIGMA + 3] = math.sqrt(_variance_by_attitude(nav, 1.0, sine * slope, cosine * slope))
-    out[LOG_SIGMA + 4] = math.sqrt(_variance_by_attitude(nav, 0.0, cosine, -sine))
-    out[LOG_SIGMA + 5] = math.sqrt(_variance_by_attitude(nav, 0.0, sine / level, cosine / level))
+    out[LOG_SIGMA + 3] = math.sqrt(_variance(nav, ATTITUDE, 1.0, sine * slope, cosine * slope))
+    out[LOG_SIGMA + 4] = math.sqrt(_variance(nav, ATTITUDE, 0.0, cosine, -sine))
+    out[LOG_SIGMA + 5] = math.sqrt(_variance(nav, ATTITUDE, 0.0, sine / level, cosine / level))
     out[LOG_SIGMA + 6] = nav.memory[ALTITUDE_SIGMA]
     for i in range(BEAMS):
         out[LOG_RANGE + i] = nav.readings[RANGE + i]

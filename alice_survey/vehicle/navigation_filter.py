@@ -1,19 +1,27 @@
-"""The error-state Kalman filter: kernels that predict, weigh one number at a time, and correct.
+"""The error-state Kalman filter: kernels that weigh one number at a time, and correct.
 
 After J. Sola, Quaternion kinematics for the error-state Kalman filter, 2017, with the attitude's
 error in the body frame (truth = belief exp(error)), and measurements as increments of angle and
 velocity, so that prediction is exact but for noise and the course of velocity within a tick. The
-covariance is (25, 25); `navigation_state` says what lies where. Errors of the instruments that do
-not average out are states, else the covariance would promise too much.
+covariance is (25, 25); `navigation_state` says what lies where, and `navigation_prediction` carries
+it over a tick. Errors of the instruments that do not average out are states, else it would promise
+too much.
+
+Three choices keep the covariance honest over hours:
+- The velocity is kept in the body frame. Were it in NED, a ping after a long drop-out would tie it
+  to a heading it says nothing of, and the next, about another velocity, would pass for knowledge.
+- It is kept as the DVL measures it, with the DVL's scale error in it: a ping's row then holds no
+  believed velocity, whose error is in the innovation too. The scale acts where position grows. What
+  it does to accelerations, a part in 500 of them, is process noise.
+- The scale is considered, not estimated (the Schmidt-Kalman filter; R. G. Brown and P. Y. C. Hwang,
+  Introduction to Random Signals and Applied Kalman Filtering): noisy increments as regressors pull
+  a factor towards 0, and over half an hour that drove it off by four of its sigmas.
 """
 
 import math
 
-from alice_survey.frames import Array
 from alice_survey.vehicle.compiled import kernel
-from alice_survey.vehicle.dynamics import GRAVITY
 from alice_survey.vehicle.navigation_state import (
-    ACCELEROMETER_BIAS,
     ATTITUDE,
     BEAM,
     BELIEVED,
@@ -27,20 +35,16 @@ from alice_survey.vehicle.navigation_state import (
     DVL_SCALE,
     DVL_USE,
     ERROR,
-    EXTRA,
     GAIN,
-    GPS_BIAS,
     GYRO_BIAS,
     HEADING,
     HEADING_BIAS,
     INNOVATION_AT,
-    PUSH,
     QUATERNION,
     RATES,
     REJECTED,
     ROW,
     RUN,
-    TURN,
     USED,
     VELOCITY,
     WATER,
@@ -55,181 +59,6 @@ from alice_survey.vehicle.sensors import BEAMS, DVL, IMU, PRESSURE, Sensors
 DOUBT_AFTER = (50, 50, 40, 40, 5, 3)
 """Rejections in a row, of each instrument, after which the filter doubts itself: 5 s of compass and
 depth, 2 s of the DVL, 5 fixes of the GPS, 3 of the USBL. Outliers do not come like that."""
-
-
-@kernel
-def predict(dt_s: float, sensors: Sensors, nav: NavigationState) -> None:
-    """Move belief and covariance on by the IMU's increments in `readings`."""
-    x, readings, turned = nav.nominal, nav.readings, nav.turns[BELIEVED]
-    matrix_of(x[QUATERNION : QUATERNION + 4], turned)
-    a, b, c = (
-        readings[TURN] - x[GYRO_BIAS + 1] * dt_s,
-        readings[TURN + 1] - x[GYRO_BIAS + 2] * dt_s,
-        readings[TURN + 2] - x[GYRO_BIAS + 3] * dt_s,
-    )
-    d, e, f = (
-        readings[PUSH] - x[ACCELEROMETER_BIAS + 1] * dt_s,
-        readings[PUSH + 1] - x[ACCELEROMETER_BIAS + 2] * dt_s,
-        readings[PUSH + 2] - x[ACCELEROMETER_BIAS + 3] * dt_s,
-    )
-    _transition(dt_s, a, b, c, d, e, f, turned, nav)
-    _propagate(dt_s, sensors, nav)
-    for i in range(3):
-        push = turned[i, 0] * d + turned[i, 1] * e + turned[i, 2] * f
-        if i == 2:
-            push += GRAVITY * dt_s
-        x[i] += dt_s * (x[3 + i] + 0.5 * push)
-        x[3 + i] += push
-    angle = nav.scratch[GAIN]
-    angle[0], angle[1], angle[2] = a, b, c
-    turn(x[QUATERNION : QUATERNION + 4], angle)
-    for i, kept in (
-        (HEADING_BIAS, math.exp(-dt_s / sensors.compass_bias_s)),
-        (DEPTH_BIAS, math.exp(-dt_s / sensors.pressure_bias_s)),
-        (GPS_BIAS, math.exp(-dt_s / sensors.gps_bias_s)),
-        (GPS_BIAS + 1, math.exp(-dt_s / sensors.gps_bias_s)),
-        (WATER, math.exp(-dt_s / sensors.water_s)),
-        (WATER + 1, math.exp(-dt_s / sensors.water_s)),
-    ):
-        x[i + 1] *= kept
-    matrix_of(x[QUATERNION : QUATERNION + 4], turned)
-
-
-@kernel
-def _transition(
-    dt_s: float,
-    a: float,
-    b: float,
-    c: float,
-    d: float,
-    e: float,
-    f: float,
-    turned: Array,
-    nav: NavigationState,
-) -> None:
-    """The blocks of the transition that are not the identity, into rows of `scratch`.
-
-    Row EXTRA: velocity by attitude, -R [push]x (9), then velocity by accelerometer bias, -R dt (9).
-    Row EXTRA + 1: attitude by attitude, exp(-angle) (9), then by gyroscope bias,
-    -(I - [angle]x / 2) dt (9) (Sola 2017, 183 and 270; 201 for the half).
-    """
-    move, rotate = nav.scratch[EXTRA], nav.scratch[EXTRA + 1]
-    for i in range(3):
-        r0, r1, r2 = turned[i, 0], turned[i, 1], turned[i, 2]
-        move[3 * i] = r2 * e - r1 * f
-        move[3 * i + 1] = r0 * f - r2 * d
-        move[3 * i + 2] = r1 * d - r0 * e
-        for j in range(3):
-            move[9 + 3 * i + j] = -turned[i, j] * dt_s
-    size2 = a * a + b * b + c * c
-    size = math.sqrt(size2)
-    # exp(-angle) = I - k [angle]x + m [angle]x^2, by series where the angle is next to nothing.
-    k = math.sin(size) / size if size > 1e-4 else 1.0 - size2 / 6.0
-    m = (1.0 - math.cos(size)) / size2 if size > 1e-4 else 0.5 - size2 / 24.0
-    rotate[0], rotate[1], rotate[2] = (
-        1.0 - m * (b * b + c * c),
-        k * c + m * a * b,
-        m * a * c - k * b,
-    )
-    rotate[3], rotate[4], rotate[5] = (
-        m * a * b - k * c,
-        1.0 - m * (a * a + c * c),
-        k * a + m * b * c,
-    )
-    rotate[6], rotate[7], rotate[8] = (
-        k * b + m * a * c,
-        m * b * c - k * a,
-        1.0 - m * (a * a + b * b),
-    )
-    h = 0.5 * dt_s
-    rotate[9], rotate[10], rotate[11] = -dt_s, -h * c, h * b
-    rotate[12], rotate[13], rotate[14] = h * c, -dt_s, -h * a
-    rotate[15], rotate[16], rotate[17] = -h * b, h * a, -dt_s
-
-
-@kernel
-def _propagate(dt_s: float, sensors: Sensors, nav: NavigationState) -> None:
-    """P <- F P F^T + Q, from the blocks of `_transition`.
-
-    F acts on rows; on the transpose it acts once more.
-    """
-    p = nav.covariance
-    _transform_rows(dt_s, sensors, nav)
-    for i in range(ERROR):
-        for j in range(i):
-            p[i, j], p[j, i] = p[j, i], p[i, j]
-    _transform_rows(dt_s, sensors, nav)
-    # Rounding leaves the two halves apart by a last bit.
-    for i in range(ERROR):
-        for j in range(i):
-            mean = 0.5 * (p[i, j] + p[j, i])
-            p[i, j] = p[j, i] = mean
-    push = sensors.accelerometer_noise * sensors.accelerometer_noise * dt_s
-    angle = sensors.gyro_noise * sensors.gyro_noise * dt_s
-    for i in range(3):
-        v = VELOCITY + i
-        p[v, v] += push
-        p[i, v] += 0.5 * dt_s * push
-        p[v, i] += 0.5 * dt_s * push
-        p[i, i] += 0.25 * dt_s * dt_s * push
-        p[ATTITUDE + i, ATTITUDE + i] += angle
-        p[GYRO_BIAS + i, GYRO_BIAS + i] += sensors.gyro_walk * sensors.gyro_walk * dt_s
-        p[ACCELEROMETER_BIAS + i, ACCELEROMETER_BIAS + i] += (
-            sensors.accelerometer_walk * sensors.accelerometer_walk * dt_s
-        )
-    for i, correlation_s, sigma in (
-        (HEADING_BIAS, sensors.compass_bias_s, sensors.compass_bias_sigma),
-        (DEPTH_BIAS, sensors.pressure_bias_s, sensors.pressure_bias_sigma),
-        (GPS_BIAS, sensors.gps_bias_s, sensors.gps_bias_sigma),
-        (GPS_BIAS + 1, sensors.gps_bias_s, sensors.gps_bias_sigma),
-        (WATER, sensors.water_s, sensors.water_sigma),
-        (WATER + 1, sensors.water_s, sensors.water_sigma),
-    ):
-        p[i, i] += -math.expm1(-2.0 * dt_s / correlation_s) * sigma * sigma
-
-
-@kernel
-def _transform_rows(dt_s: float, sensors: Sensors, nav: NavigationState) -> None:
-    """P <- F P."""
-    p, move, rotate = nav.covariance, nav.scratch[EXTRA], nav.scratch[EXTRA + 1]
-    th, gy, ac = ATTITUDE, GYRO_BIAS, ACCELEROMETER_BIAS
-    for i in range(3):
-        m0, m1, m2 = move[3 * i], move[3 * i + 1], move[3 * i + 2]
-        n0, n1, n2 = move[9 + 3 * i], move[10 + 3 * i], move[11 + 3 * i]
-        v = VELOCITY + i
-        for j in range(ERROR):
-            change = (
-                m0 * p[th, j] + m1 * p[th + 1, j] + m2 * p[th + 2, j]
-                + n0 * p[ac, j] + n1 * p[ac + 1, j] + n2 * p[ac + 2, j]
-            )  # fmt: skip
-            p[i, j] += dt_s * (p[v, j] + 0.5 * change)
-            p[v, j] += change
-    for j in range(ERROR):
-        a, b, c = p[th, j], p[th + 1, j], p[th + 2, j]
-        d, e, f = p[gy, j], p[gy + 1, j], p[gy + 2, j]
-        p[th, j] = (
-            rotate[0] * a + rotate[1] * b + rotate[2] * c
-            + rotate[9] * d + rotate[10] * e + rotate[11] * f
-        )  # fmt: skip
-        p[th + 1, j] = (
-            rotate[3] * a + rotate[4] * b + rotate[5] * c
-            + rotate[12] * d + rotate[13] * e + rotate[14] * f
-        )  # fmt: skip
-        p[th + 2, j] = (
-            rotate[6] * a + rotate[7] * b + rotate[8] * c
-            + rotate[15] * d + rotate[16] * e + rotate[17] * f
-        )  # fmt: skip
-    for i, correlation_s in (
-        (HEADING_BIAS, sensors.compass_bias_s),
-        (DEPTH_BIAS, sensors.pressure_bias_s),
-        (GPS_BIAS, sensors.gps_bias_s),
-        (GPS_BIAS + 1, sensors.gps_bias_s),
-        (WATER, sensors.water_s),
-        (WATER + 1, sensors.water_s),
-    ):
-        kept = math.exp(-dt_s / correlation_s)
-        for j in range(ERROR):
-            p[i, j] *= kept
 
 
 @kernel
@@ -253,6 +82,7 @@ def project(nav: NavigationState) -> float:
 def absorb(nav: NavigationState, innovation: float, variance: float) -> None:
     """Correct by one number, whose P h is in row GAIN; the correction gathers in CORRECTION."""
     p, w, error = nav.covariance, nav.scratch[GAIN], nav.scratch[CORRECTION]
+    scale_variance = p[DVL_SCALE, DVL_SCALE]
     inverse = 1.0 / math.sqrt(variance)
     for j in range(ERROR):
         w[j] *= inverse
@@ -263,6 +93,8 @@ def absorb(nav: NavigationState, innovation: float, variance: float) -> None:
         error[i] += factor * scaled
         for j in range(ERROR):
             p[i, j] -= factor * w[j]
+    # Considered: no correction, and what all others know of it stays.
+    error[DVL_SCALE], p[DVL_SCALE, DVL_SCALE] = 0.0, scale_variance
 
 
 @kernel
@@ -396,21 +228,29 @@ def use_beams(nav: NavigationState, sensors: Sensors, through_water: bool) -> in
     p = readings[RATES] - x[GYRO_BIAS + 1]
     q = readings[RATES + 1] - x[GYRO_BIAS + 2]
     r = readings[RATES + 2] - x[GYRO_BIAS + 3]
-    n, e, d = x[3], x[4], x[5]
+    # The water's velocity in the body frame.
+    i0 = i1 = i2 = 0.0
     if through_water:
-        n, e = n - x[WATER + 1], e - x[WATER + 2]
-    # Velocity of the IMU in the body frame, then of the DVL.
-    i0 = turned[0, 0] * n + turned[1, 0] * e + turned[2, 0] * d
-    i1 = turned[0, 1] * n + turned[1, 1] * e + turned[2, 1] * d
-    i2 = turned[0, 2] * n + turned[1, 2] * e + turned[2, 2] * d
-    u, v, w = i0 + q * l2 - r * l1, i1 + r * l0 - p * l2, i2 + p * l1 - q * l0
-    scale, angle = 1.0 + x[DVL_SCALE + 1], x[DVL_ANGLE + 1]
+        n, e = x[WATER + 1], x[WATER + 2]
+        i0 = turned[0, 0] * n + turned[1, 0] * e
+        i1 = turned[0, 1] * n + turned[1, 1] * e
+        i2 = turned[0, 2] * n + turned[1, 2] * e
+    # What the scale multiplies still: the DVL's velocity about the IMU, less the water's.
+    k0, k1, k2 = q * l2 - r * l1 - i0, r * l0 - p * l2 - i1, p * l1 - q * l0 - i2
+    u, v, w = x[VELOCITY] + k0, x[VELOCITY + 1] + k1, x[VELOCITY + 2] + k2
+    angle = x[DVL_ANGLE + 1]
     cosine, sine = math.cos(angle), math.sin(angle)
     along, across = cosine * u + sine * v, cosine * v - sine * u
     sigma = sensors.water_noise
     if not through_water:
         speed = math.sqrt(u * u + v * v + w * w)
         sigma = sensors.beam_noise + sensors.beam_noise_per_speed * speed
+    # Opposite pairs of beams add up to the same but for noise: where they do not, one heard
+    # something else, and after a drop-out the filter could not tell which. No number fails this.
+    odd = readings[first] + readings[first + 2] - readings[first + 1] - readings[first + 3]
+    if odd * odd > sensors.gate * 4.0 * sigma * sigma:
+        nav.counts[instrument, REJECTED] += 1
+        return 0
     gyro_variance = sensors.gyro_noise * sensors.gyro_noise / sensors.tick_s
     used = 0
     for i in range(BEAMS):
@@ -418,28 +258,24 @@ def use_beams(nav: NavigationState, sensors: Sensors, through_water: bool) -> in
         if not math.isfinite(measured):
             continue
         b0, b1, b2 = sensors.beams[i, 0], sensors.beams[i, 1], sensors.beams[i, 2]
-        # The beam as the misalignment turns it, with the scale.
-        c0, c1, c2 = (
-            scale * (cosine * b0 - sine * b1),
-            scale * (sine * b0 + cosine * b1),
-            scale * b2,
-        )
+        # The beam as the misalignment turns it.
+        c0, c1, c2 = cosine * b0 - sine * b1, sine * b0 + cosine * b1, b2
         for j in range(ERROR):
             h[j] = 0.0
-        for j in range(3):
-            h[VELOCITY + j] = turned[j, 0] * c0 + turned[j, 1] * c1 + turned[j, 2] * c2
-        h[ATTITUDE] = c1 * i2 - c2 * i1
-        h[ATTITUDE + 1] = c2 * i0 - c0 * i2
-        h[ATTITUDE + 2] = c0 * i1 - c1 * i0
+        h[VELOCITY], h[VELOCITY + 1], h[VELOCITY + 2] = c0, c1, c2
+        if through_water:
+            h[ATTITUDE] = c2 * i1 - c1 * i2
+            h[ATTITUDE + 1] = c0 * i2 - c2 * i0
+            h[ATTITUDE + 2] = c1 * i0 - c0 * i1
+            for j in range(2):
+                h[WATER + j] = -(turned[j, 0] * c0 + turned[j, 1] * c1 + turned[j, 2] * c2)
         h[GYRO_BIAS] = c1 * l2 - c2 * l1
         h[GYRO_BIAS + 1] = c2 * l0 - c0 * l2
         h[GYRO_BIAS + 2] = c0 * l1 - c1 * l0
-        h[DVL_SCALE] = b0 * along + b1 * across + b2 * w
-        h[DVL_ANGLE] = scale * (b0 * across - b1 * along)
+        h[DVL_SCALE] = c0 * k0 + c1 * k1 + c2 * k2
+        h[DVL_ANGLE] = b0 * across - b1 * along
         h[DVL_BIAS], h[DVL_BIAS + 1] = b0, b1
-        if through_water:
-            h[WATER], h[WATER + 1] = -h[VELOCITY], -h[VELOCITY + 1]
-        believed = scale * h[DVL_SCALE] + b0 * x[DVL_BIAS + 1] + b1 * x[DVL_BIAS + 2]
+        believed = b0 * (along + x[DVL_BIAS + 1]) + b1 * (across + x[DVL_BIAS + 2]) + b2 * w
         # The rate's noise acts by the same lever as the gyroscopes' bias.
         arm = h[GYRO_BIAS] ** 2 + h[GYRO_BIAS + 1] ** 2 + h[GYRO_BIAS + 2] ** 2
         noise = sigma * sigma + gyro_variance * arm

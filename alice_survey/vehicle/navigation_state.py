@@ -14,9 +14,10 @@ POSITION, VELOCITY, ATTITUDE, GYRO_BIAS, ACCELEROMETER_BIAS = 0, 3, 6, 9, 12
 HEADING_BIAS, DEPTH_BIAS, DVL_SCALE, DVL_ANGLE, DVL_BIAS, GPS_BIAS, WATER = (
     15, 16, 17, 18, 19, 21, 23,
 )  # fmt: skip
-"""Where the errors begin in the error state (25,): position and velocity of the IMU in NED, its
-attitude in the body frame, its biases, then the compass's, the depth's, scale and misalignment of
-the DVL, its bias of surge and sway, the GPS's bias of north and east, and the current."""
+"""Where the errors begin in the error state (25,): position of the IMU in NED, its velocity over
+ground with the DVL's scale error in it and its attitude, both in the body frame, its biases, then
+the compass's, the depth's, scale and misalignment of the DVL, its bias of surge and sway, the GPS's
+bias of north and east, the current."""
 ERROR = 25
 QUATERNION = 6
 NOMINAL = ERROR + 1
@@ -55,8 +56,11 @@ body (3); the latest estimate, as `signals` has it (13)."""
 
 TRUTH_BEFORE, TRUTH_NOW, BELIEVED = 0, 1, 2
 """Rows of `turns`."""
-ROW, GAIN, CORRECTION, EXTRA = 0, 1, 2, 3
-"""Rows of `scratch`; EXTRA has two."""
+ROW, GAIN, CORRECTION, KEPT, FLOW, BLOCKS, LEVERS = 0, 1, 2, 3, 4, 5, 6
+"""Rows of `scratch`; LEVERS has two."""
+NEW, SUM, FALL, GAINED = 0, 3, 6, 9
+"""Places in row FLOW: the velocity after a tick in the frame before it, the sum of both velocities,
+what gravity adds, and what gravity and push add."""
 
 
 class NavigationState(NamedTuple):
@@ -75,7 +79,7 @@ class NavigationState(NamedTuple):
     counts: Array
     """(6, 4) integers."""
     scratch: Array
-    """(5, 25)"""
+    """(8, 25)"""
     turns: Array
     """(3, 3, 3) rotation matrices."""
 
@@ -113,7 +117,8 @@ def new_navigation(sensors: Sensors, truth: Array, rng: np.random.Generator) -> 
     fix_noise = np.array([sensors.gps_noise, sensors.gps_noise, sensors.pressure_noise])
     nominal[:3] = truth[:3] + attitude.apply(lever)
     nominal[:3] += fix_error + fix_noise * rng.standard_normal(3)
-    nominal[3:6] = truth[7:10] + attitude.apply(np.cross(rates, lever))
+    nominal[3:6] = attitude.inv().apply(truth[7:10]) + np.cross(rates, lever)
+    nominal[3:6] *= 1.0 + bias_of[DVL_SCALE]
     nominal[3:6] += _velocity_sigma(sensors) * rng.standard_normal(3)
     tilt = sensors.tilt_sigma * rng.standard_normal(2)
     turn = bias_of[HEADING_BIAS] + sensors.compass_noise * rng.standard_normal()
@@ -141,7 +146,7 @@ def new_navigation(sensors: Sensors, truth: Array, rng: np.random.Generator) -> 
         innovations=np.full(INNOVATIONS, np.nan),
         memory=memory,
         counts=np.zeros((6, 4), dtype=np.int64),
-        scratch=np.zeros((5, ERROR)),
+        scratch=np.zeros((8, ERROR)),
         turns=np.zeros((3, 3, 3)),
     )
 
@@ -196,7 +201,8 @@ def estimation_error(
     lever = sensors.place[IMU]
     error = np.empty(ERROR)
     error[:3] = truth[:3] + attitude.apply(lever) - nominal[:3]
-    error[3:6] = truth[7:10] + attitude.apply(np.cross(truth[10:13], lever)) - nominal[3:6]
+    velocity = attitude.inv().apply(truth[7:10]) + np.cross(truth[10:13], lever)
+    error[3:6] = (1.0 + navigation.hidden[DVL_SCALE - GYRO_BIAS]) * velocity - nominal[3:6]
     believed = Rotation.from_quat(nominal[QUATERNION : QUATERNION + 4])
     error[ATTITUDE : ATTITUDE + 3] = (believed.inv() * attitude).as_rotvec()
     error[GYRO_BIAS:WATER] = navigation.hidden - nominal[GYRO_BIAS + 1 : WATER + 1]
