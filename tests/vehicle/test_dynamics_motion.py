@@ -290,7 +290,8 @@ def test_runge_kutta_agrees_with_an_adaptive_method(
 
     In open water the largest error over a minute is 1.2e-6 at 10 ms, the simulator's step, and
     2.6e-7 at 5 ms. With all laws thrust has a kink where a propeller in a stream reverses (it falls
-    by |n| u_a), which costs 3.5e-6 and 1.7e-6; a minute without reversals 3.4e-7 and 2.3e-8.
+    by |n| u_a), so that the error hangs on how steps fall about each reversal: up to 1e-5 and 2e-6
+    (3.4e-7 and 2.3e-8 without reversals); `benchmarks.vehicle --only accuracy` has the minute.
     """
     rng = np.random.default_rng(3)
     times = np.arange(0.0, seconds + 1.0, 4.0)
