@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from alice_survey.cli_camera import app as camera_app
+from alice_survey.cli_import import app as import_app
 from alice_survey.cli_options import (
     CONTEXT,
     WORK,
@@ -30,6 +31,7 @@ app = typer.Typer(
     context_settings=CONTEXT,
     rich_markup_mode=None,
 )
+app.add_typer(import_app)
 app.add_typer(camera_app, name="camera")
 app.add_typer(vehicle_app, name="vehicle")
 
@@ -138,9 +140,7 @@ def plan(workspace: Workspace = WORK, survey: SurveyFile = None, as_json: AsJson
 def fly(
     workspace: Workspace = WORK,
     survey: SurveyFile = None,
-    vehicle: Annotated[
-        Literal["alice", "sparus2"] | None, typer.Option(help="What flies.")
-    ] = None,
+    vehicle: Annotated[Literal["alice", "sparus2"] | None, typer.Option(help="What flies.")] = None,
     controller: Annotated[
         Literal["sway", "los"] | None,
         typer.Option(help="Heading held on the line, or towards a point ahead on it."),
@@ -290,48 +290,6 @@ def calibrate(
 
         result = run(["calibration"], workspace, survey, None, threads)
     print_result(*result, as_json)
-
-
-@app.command(
-    name="import-images",
-    epilog=examples(
-        "import-images photos -w reef",
-        "import-images --left cam1 --right cam2 -w reef",
-        "import-images photos --navigation dive.csv --clock-offset -1.5 --masks masks -w reef",
-        "import-images --video GX010001.MP4 --every 0.5 -w reef",
-    ),
-)
-def import_images(
-    folders: Annotated[
-        list[Path] | None, typer.Argument(metavar="DIR...", help="Folders of pictures.")
-    ] = None,
-    left: Annotated[Path | None, typer.Option(help="Pictures of the left camera.")] = None,
-    right: Annotated[Path | None, typer.Option(help="Pictures of the right camera.")] = None,
-    video: Annotated[Path | None, typer.Option(help="A video to take frames from.")] = None,
-    every: Annotated[float, typer.Option(min=0.01, help="Seconds between frames.")] = 1.0,
-    navigation: Annotated[Path | None, typer.Option(help="CSV: time, position, ...")] = None,
-    clock_offset: Annotated[float, typer.Option(help="Seconds to add to picture times.")] = 0.0,
-    time_zone: Annotated[str, typer.Option(help="Of times that name none.")] = "UTC",
-    rig: Annotated[Path | None, typer.Option(help="rig.json of the cameras.")] = None,
-    masks: Annotated[Path | None, typer.Option(help="Folder of masks; black is left out.")] = None,
-    workspace: Workspace = WORK,
-    threads: Threads = None,
-) -> None:
-    """Bring in real pictures.
-
-    Mono or stereo pictures or a video, with a navigation log, GPS from EXIF, or nothing at all.
-    """
-    from alice_survey.executor import default_threads
-    from reconstruct.import_images import import_images as work
-
-    work(
-        workspace, folders or [], left=left, right=right, video=video, every_s=every,
-        navigation=navigation, clock_offset_s=clock_offset, time_zone=time_zone, rig=rig,
-        masks=masks, threads=threads or default_threads(),
-    )  # fmt: skip
-    typer.echo(
-        f"pictures are in {workspace / 'images'}; next: alice-survey reconstruct -w {workspace}"
-    )
 
 
 @app.command(epilog=examples("reconstruct -w reef", "reconstruct -w reef --threads 2 --json"))

@@ -151,7 +151,8 @@ class NavigationConfig(Config):
     compass_noise_deg: float = Field(0.3, gt=0, le=30)
     dvl_noise_mps: float = Field(0.0035, gt=0, le=1)
     dvl_dropouts_s: tuple[tuple[float, float], ...] = ()
-    usbl: bool = False
+    usbl: bool = True
+    usbl_noise_m: float = Field(0.5, gt=0, le=100)
 
 
 class SeafloorConfig(Config):

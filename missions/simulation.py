@@ -97,7 +97,8 @@ def mission_setup(
     """
     craft = vehicle(config.vehicle.name, config.vehicle.coefficients)
     path = path_of(plan)
-    gains = gains_for(craft, plan.speed_mps)
+    # A failed thruster is known to the pilot, who flies as well as the others allow.
+    gains = gains_for(craft.without(config.vehicle.failed_thrusters), plan.speed_mps)
     guidance = pilot_guidance(
         gains,
         path,
@@ -169,7 +170,7 @@ def sensors_of(config: SurveyConfig) -> SensorSuite:
             beam_noise_mps=told.dvl_noise_mps,
             dropouts_s=told.dvl_dropouts_s,
         ),
-        usbl=UsblSpec(rate_hz=_USBL_HZ if told.usbl else 0.0),
+        usbl=UsblSpec(rate_hz=_USBL_HZ if told.usbl else 0.0, noise_m=told.usbl_noise_m),
         followed_body_m=config.camera.position_body_m,
     )
 
