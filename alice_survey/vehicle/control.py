@@ -6,8 +6,6 @@ torque: T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control,
 left to the integrals.
 """
 
-import math
-
 from alice_survey.frames import Array
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.dynamics import add_coriolis, add_damping
@@ -28,12 +26,6 @@ from alice_survey.vehicle.pilot import ACC_SURGE, FULL_SURGE, REF_SURGE, PilotSt
 def clamped(value: float, most: float) -> float:
     """The value within -most and most."""
     return min(max(value, -most), most)
-
-
-@kernel
-def wrapped(angle_rad: float) -> float:
-    """The angle within -pi and pi."""
-    return angle_rad - 2.0 * math.pi * math.floor(angle_rad / (2.0 * math.pi) + 0.5)
 
 
 @kernel

@@ -14,9 +14,9 @@ velocities (K. J. Astrom, B. Wittenmark, Computer-Controlled Systems, 1997, sect
 to 30 times within a period of the closed loop). Integral action a tenth as fast: integral =
 place omega / 10 (Fossen 2011, section 12.2.5).
 
-The sway axis is a PID that asks a speed of an inner loop (paper, section VII): the inner gain is the
-critically damped one, 1 / (4 T), or rate if that is less; what rate has beyond it is k_D. The other
-axes need no k_D: their inner gain is rate.
+The sway axis is a PID that asks a speed of an inner loop (paper, section VII): the inner gain is
+the critically damped one, 1 / (4 T), or rate if that is less; what rate has beyond it is k_D. The
+other axes need no k_D: their inner gain is rate.
 
 The same numbers serve a speed loop: its proportional gain is rate, its integral gain place.
 """
@@ -28,7 +28,7 @@ import numpy as np
 
 from alice_survey.errors import VehicleError
 from alice_survey.frames import Array
-from alice_survey.vehicle.dynamics import Body
+from alice_survey.vehicle.dynamics import Body, coriolis_matrix
 from alice_survey.vehicle.propulsion import thrust_limits
 from alice_survey.vehicle.vehicle import Vehicle
 
@@ -39,7 +39,8 @@ DEGREES = (0, 1, 2, 5)
 
 MASS, RATE, PLACE, INTEGRAL, INNER, LEAST, MOST, FASTEST, LAG, BANDWIDTH = range(10)
 """Columns of `Gains.axes`: inertia (kg, kg m^2); rate (1/s), place (1/s^2), integral (1/s^3); inner
-(1/s), the part of rate that the inner speed loop has; least and greatest force or moment; greatest speed asked for (m/s, rad/s); lag (s); bandwidth (rad/s)."""
+(1/s), the part of rate that the inner speed loop has; least and greatest force or moment; greatest
+speed asked for (m/s, rad/s); lag (s); bandwidth (rad/s)."""
 
 DAMPING_RATIO = 1.0
 """Of the placed pair: no overshoot, so that a line beside is not run into."""
@@ -144,6 +145,17 @@ def linear_damping(body: Body, nu: Array) -> Array:
     return result
 
 
+def linear_coriolis(body: Body, nu: Array) -> Array:
+    """(6, 6) slope of C(nu) nu by velocity at a velocity (6,).
+
+    C(a) b is bilinear, so that the slope's column j is C(e_j) nu + C(nu) e_j.
+    """
+    slope = coriolis_matrix(body.mass, nu)
+    columns = [coriolis_matrix(body.mass, unit) @ nu for unit in np.eye(6)]
+    result: Array = slope + np.array(columns).T
+    return result
+
+
 def authority(configuration: Array, lower: Array, upper: Array, axis: int) -> tuple[float, float]:
     """Least and greatest force on one axis while the other axes get none: a linear programme.
 
@@ -163,7 +175,7 @@ def authority(configuration: Array, lower: Array, upper: Array, axis: int) -> tu
             sense * row,
             A_eq=others,
             b_eq=np.zeros(len(others)),
-            bounds=np.stack([lower, upper], axis=1),
+            bounds=list(zip(lower.tolist(), upper.tolist(), strict=True)),
         )
         ends.append(float(row @ found.x))
     return ends[0], ends[1]

@@ -17,7 +17,7 @@ from alice_survey.vehicle.compiled import kernel
 
 _GAP_M = 1e-3
 _KINK_RAD = 1e-3
-_LEAST_SLANT = 0.3
+LEAST_SLANT = 0.3
 """Least 1 - k e of the projection: towards an arc's centre the path's length per vehicle's way
 grows without bound."""
 
@@ -174,7 +174,7 @@ def advance(
     c, s = math.cos(heading), math.sin(heading)
     ahead = (north_m - n) * c + (east_m - e) * s
     cross = (east_m - e) * c - (north_m - n) * s
-    step = ahead / max(1.0 - k * cross, _LEAST_SLANT)
+    step = ahead / max(1.0 - k * cross, LEAST_SLANT)
     moved = along_m + min(max(step, -most_m), most_m)
     # Before a leg's start only where progress already is there: on the way in.
     moved = max(moved, min(along_m, 0.0))
@@ -185,10 +185,3 @@ def advance(
         moved -= path.length_m[leg]
         leg += 1
     return leg, moved, False
-
-
-@kernel
-def cross_track(path: Path, leg: int, along_m: float, north_m: float, east_m: float) -> float:
-    """How far a place is to starboard of the path's tangent, metres."""
-    n, e, heading, _ = place_at(path, leg, along_m)
-    return (east_m - e) * math.cos(heading) - (north_m - n) * math.sin(heading)

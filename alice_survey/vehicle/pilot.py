@@ -39,6 +39,11 @@ wanted acceleration; and +1 or -1 where the last wrench was cut at the greatest 
 DEMAND = 12
 
 
+(POINT_NORTH, POINT_EAST, SURGE_SPEED, SWAY_SPEED, SINK_SPEED, TURN_SPEED) = range(6)
+"""Places in `point`: where the followed point is, m; its level speed ahead and to starboard over
+ground, the origin's downwards, m/s; and the rate of the heading, rad/s."""
+
+
 class PilotState(NamedTuple):
     """Arrays that `steer` writes."""
 
@@ -48,6 +53,8 @@ class PilotState(NamedTuple):
     """(REPORT,)"""
     demand: Array
     """(DEMAND,)"""
+    point: Array
+    """(6,)"""
     motion: Array
     """(6,) scratch."""
     force: Array
@@ -58,4 +65,7 @@ def new_pilot() -> PilotState:
     """A pilot at the start of a mission: about to dive."""
     memory = np.zeros(MEMORY)
     memory[BEST] = -math.inf
-    return PilotState(memory, np.zeros(REPORT), np.zeros(DEMAND), np.zeros(6), np.zeros(6))
+    report = np.zeros(REPORT)
+    report[WANTED_HEADING] = math.nan
+    report[LINE] = -1.0
+    return PilotState(memory, report, np.zeros(DEMAND), np.zeros(6), np.zeros(6), np.zeros(6))

@@ -66,6 +66,16 @@ class Limits(NamedTuple):
 
 
 @kernel
+def navigates(estimate: Array) -> bool:
+    """Whether the navigation gives all it must: everything but the altitude."""
+    total = 0.0
+    for i in range(ESTIMATE):
+        if i != ALTITUDE:
+            total += estimate[i]
+    return math.isfinite(total)
+
+
+@kernel
 def watch(
     time_s: float,
     dt_s: float,
@@ -88,9 +98,6 @@ def watch(
         NONE, or the reason to abort.
     """
     memory, phase = pilot.memory, pilot.report[PHASE]
-    for i in range(ESTIMATE):
-        if i != ALTITUDE and not math.isfinite(estimate[i]):
-            return NO_NAVIGATION
     if phase != DIVE and phase != APPROACH and phase != FOLLOW:
         return NONE
     altitude = estimate[ALTITUDE]

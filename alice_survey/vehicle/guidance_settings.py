@@ -1,0 +1,244 @@
+"""Settings of the guidance, and how they follow from the vehicle and the path."""
+
+import math
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from alice_survey.errors import VehicleError
+from alice_survey.frames import Array
+from alice_survey.vehicle.gains import (
+    BANDWIDTH,
+    FASTEST,
+    LAG,
+    LEAST,
+    MASS,
+    MOST,
+    PLACE,
+    RATE,
+    STEADY_SHARE,
+    SURGE,
+    SWAY,
+    YAW,
+    Gains,
+    linear_coriolis,
+    linear_damping,
+)
+from alice_survey.vehicle.path import Path
+from alice_survey.vehicle.safety import Limits
+
+LEFT_PORT_BODY_M = (0.55, -0.05, 0.08)
+"""The left port's outer glass, as the default rig has it."""
+HULL_LENGTH_M = 1.6
+"""Of SPARUS II and ALICE (paper, section II)."""
+LOS_DAMPING_RATIO = 0.5
+"""Least of the path loop of `los` (inferred: one overshoot of a sixth)."""
+_LATERAL = [1, 5]
+_LOOK_AHEADS_M = (0.1, 100.0)
+
+
+class Guidance(NamedTuple):
+    """Settings of the guidance; `pilot_guidance` derives those that follow from the vehicle."""
+
+    sway: float
+    """1: the path is held by sway; 0: by heading alone."""
+    point_body_m: Array
+    """(3,) the followed point."""
+    look_ahead_m: float
+    far_m: float
+    """Cross-track error beyond which sway gives way to heading ..."""
+    near_m: float
+    """... until it is below this."""
+    lost_m: float
+    """Cross-track error beyond which the vehicle goes back to where it left the path."""
+    capture_m: float
+    """The way in begins when its start is this near."""
+    way_in_m: float
+    """Straight way before the path's start."""
+    smooth_m: float
+    """The path's heading is averaged this far back and ahead, so that turns begin gently."""
+    brake_mps2: float
+    """Deceleration before turns that need a lower speed."""
+    floor_rate_rad_s: float
+    """Bandwidth at which the altitude follows the terrain."""
+    surface_m: float
+    """Depth of the origin at which the vehicle is at the surface."""
+    limits: Limits
+
+
+def pilot_guidance(
+    gains: Gains,
+    path: Path,
+    controller: Literal["sway", "los"],
+    *,
+    most_depth_m: float,
+    point_body_m: tuple[float, float, float] = LEFT_PORT_BODY_M,
+    look_ahead_m: float | None = None,
+    terrain_smoothing_m: float = 1.5,
+    limits: Limits | None = None,
+) -> Guidance:
+    """Settings for a vehicle and a path.
+
+    Sway gives way to heading half a hull length off the path, where turning towards it begins to
+    cost less than pushing the hull sideways, and takes over again at half of that (inferred).
+
+    Args:
+        gains: of the vehicle.
+        path: its speed and altitude count.
+        controller: `sway` or `los`.
+        most_depth_m: no deeper than this.
+        point_body_m: the followed point.
+        look_ahead_m: of `los`; `shortest_look_ahead_m` when left out.
+        terrain_smoothing_m: relief shorter than this is not followed.
+        limits: for safety; half the path's altitude is the least when left out.
+
+    Raises:
+        VehicleError: the vehicle has no thrusters for sway, or a value is out of range.
+    """
+    axes, speed = gains.axes, path.speed_mps
+    by_sway = controller == "sway"
+    if by_sway and axes[SWAY, FASTEST] == 0.0:
+        raise VehicleError(
+            "the vehicle has no lateral thrusters: fly it with the controller los, not sway"
+        )
+    if look_ahead_m is None:
+        look_ahead_m = shortest_look_ahead_m(gains, speed, point_body_m[0])
+    for name, value in (("look-ahead", look_ahead_m), ("terrain smoothing", terrain_smoothing_m)):
+        if not 0.0 < value < math.inf:
+            raise VehicleError(f"the {name} is {value:g} m: it must be positive")
+    weakest = min(-axes[SURGE, LEAST], axes[SURGE, MOST])
+    return Guidance(
+        sway=float(by_sway),
+        point_body_m=np.array(point_body_m, np.float64),
+        look_ahead_m=look_ahead_m,
+        far_m=0.5 * HULL_LENGTH_M,
+        near_m=0.25 * HULL_LENGTH_M,
+        lost_m=5.0 * HULL_LENGTH_M,
+        capture_m=0.2 if by_sway else 1.0,
+        way_in_m=HULL_LENGTH_M if by_sway else 3.0 * look_ahead_m,
+        smooth_m=speed / float(axes[YAW, BANDWIDTH]),
+        brake_mps2=STEADY_SHARE * weakest / float(axes[SURGE, MASS]),
+        floor_rate_rad_s=2.0 * speed / terrain_smoothing_m,
+        surface_m=0.3,
+        limits=limits or Limits(0.5 * path.altitude_m, most_depth_m),
+    )
+
+
+def los_loop(gains: Gains, speed_mps: float, lever_m: float, look_ahead_m: float) -> Array:
+    """State matrix of `los` about a straight path without drift.
+
+    States: offset of the followed point, m; heading less the path's; sway, m/s; yaw rate; yaw
+    acceleration that the lagging thrusters give. Sway and yaw are those of the hull, coupled.
+
+    Args:
+        gains: of the vehicle.
+        speed_mps: surge.
+        lever_m: how far the followed point is ahead of the origin.
+        look_ahead_m: of the guidance.
+
+    Returns:
+        (5, 5)
+    """
+    nu = np.array([speed_mps, 0.0, 0.0, 0.0, 0.0, 0.0])
+    lateral = np.ix_(_LATERAL, _LATERAL)
+    inverse = np.linalg.inv(gains.body.mass[lateral])
+    slope = linear_damping(gains.body, nu) + linear_coriolis(gains.body, nu)
+    row = gains.axes[YAW]
+    loop = np.zeros((5, 5))
+    loop[0, 1:4] = speed_mps, 1.0, lever_m
+    loop[1, 3] = 1.0
+    loop[2:4, 2:4] = -inverse @ slope[lateral]
+    loop[2:4, 4] = inverse[:, 1] * row[MASS]
+    # Wanted heading -offset / look-ahead, and its rate.
+    asked = -row[RATE] / look_ahead_m * loop[0]
+    asked[[0, 1, 3]] -= row[PLACE] / look_ahead_m, row[PLACE], row[RATE]
+    loop[4] = asked / row[LAG]
+    loop[4, 4] -= 1.0 / row[LAG]
+    return loop
+
+
+def damping_ratio(loop: Array) -> float:
+    """Least damping ratio of a state matrix's modes; negative if one grows."""
+    poles = np.linalg.eigvals(loop)
+    return float(np.min(-poles.real / np.abs(poles)))
+
+
+def shortest_look_ahead_m(gains: Gains, speed_mps: float, lever_m: float) -> float:
+    """The shortest look-ahead with which `los` is damped well enough on a straight path.
+
+    The longer it is, the further does a current hold the vehicle off the path; the shorter, the
+    more does it weave, since a slender hull slips through its turns and takes long to go where it
+    points. For ALICE and SPARUS II it comes to about 1.5 hull lengths, the least of the 1.5 to 2.5
+    lengths that Fossen (2011, section 10.3.2) gives; COLA2's 5.5 m is too long for lines 1 m apart.
+
+    Args:
+        gains: of the vehicle.
+        speed_mps: surge.
+        lever_m: how far the followed point is ahead of the origin.
+
+    Raises:
+        VehicleError: no look-ahead gives that damping.
+    """
+    low, high = _LOOK_AHEADS_M
+
+    def enough(look_ahead_m: float) -> bool:
+        loop = los_loop(gains, speed_mps, lever_m, look_ahead_m)
+        return damping_ratio(loop) >= LOS_DAMPING_RATIO
+
+    if not enough(high):
+        raise VehicleError(
+            f"no look-ahead up to {high:g} m keeps the heading loop from weaving at "
+            f"{speed_mps:g} m/s: raise the speed, or check the vehicle's coefficients"
+        )
+    while high - low > 1e-3:
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if enough(middle) else (middle, high)
+    return high
+
+
+def los_offset_m(
+    look_ahead_m: float,
+    speed_mps: float,
+    across_mps: float,
+    along_mps: float = 0.0,
+    *,
+    over_ground: bool = True,
+) -> float:
+    """Where `los` settles beside a straight path in a steady current, metres to starboard.
+
+    Steady means no turning and no drag across the hull, since nothing would balance it: the sway
+    relative to the water is zero. With t the tangent of the angle from path to heading, the offset
+    is -look_ahead t. The current's part across the hull must be the sway over ground. If surge
+    relative to the water is kept at U, U sin = -across, so that the offset is
+    look_ahead across / sqrt(U^2 - across^2). If surge over ground is kept at U, the speed along the
+    path is U / cos and the sway over ground -U t, whence U t sqrt(1 + t^2) = along t - across;
+    without a current along the path t^2 = (sqrt(1 + 4 (across / U)^2) - 1) / 2.
+
+    Args:
+        look_ahead_m: of the guidance.
+        speed_mps: U, the surge that is kept.
+        across_mps: current to starboard of the path.
+        along_mps: current along the path.
+        over_ground: what U is relative to.
+
+    Returns:
+        NaN where there is no such state, or more than one: the current across is too strong for a
+        speed relative to the water, or the current along is not below U.
+    """
+    if not over_ground:
+        if abs(across_mps) >= speed_mps:
+            return math.nan
+        return look_ahead_m * across_mps / math.sqrt(speed_mps**2 - across_mps**2)
+    if along_mps >= speed_mps:
+        return math.nan
+    if along_mps == 0.0:
+        ratio = across_mps / speed_mps
+        size = math.sqrt(0.5 * (math.sqrt(1.0 + 4.0 * ratio**2) - 1.0))
+        return look_ahead_m * math.copysign(size, across_mps)
+    from scipy.optimize import brentq
+
+    def surplus(t: float) -> float:
+        return speed_mps * t * math.sqrt(1.0 + t * t) - along_mps * t + across_mps
+
+    reach = 1.0 + abs(across_mps) / (speed_mps - max(along_mps, 0.0))
+    return -look_ahead_m * float(brentq(surplus, -reach, reach, xtol=1e-14))

@@ -1,0 +1,332 @@
+"""The manners of steering: to a depth, to a heading, along a path, to a place and stay there.
+
+Each asks the inner loops for velocities and accelerations (`PilotState.demand`). The parts that go
+together are called in the order heave, yaw, surge, sway: surge and sway of the followed point
+depend on the yaw that was asked for.
+"""
+
+import math
+
+from alice_survey.frames import Array
+from alice_survey.vehicle import pilot as told
+from alice_survey.vehicle import signals
+from alice_survey.vehicle.compiled import kernel
+from alice_survey.vehicle.control import (
+    clamped,
+    place_demand,
+    place_sum_step,
+    speed_demand,
+    sum_bound,
+)
+from alice_survey.vehicle.gains import BANDWIDTH, FASTEST, HEAVE, SURGE, SWAY, YAW, Gains
+from alice_survey.vehicle.guidance_settings import Guidance
+from alice_survey.vehicle.path import LEAST_SLANT, Path, heading_at, place_at
+from alice_survey.vehicle.pilot import PilotState
+from alice_survey.vehicle.rotations import wrapped
+from alice_survey.vehicle.safety import restart_watch
+
+DEPTH_KEPT_M = 0.2
+HEADING_KEPT_RAD = math.radians(10.0)
+"""Nearer than these a depth or heading counts as kept, and its integral may learn: further off the
+speed is cut, and an integral would only wind up."""
+_HOVER_M = 2.0
+"""Nearer than this a vehicle with sway hovers towards its goal instead of heading for it."""
+_HOVER_SHARE = 0.25
+"""Bandwidth of keeping place by surge, by that of the surge loop."""
+_STRAIGHT_PER_M = 1e-9
+
+
+@kernel
+def tell_point(estimate: Array, guidance: Guidance, pilot: PilotState) -> None:
+    """Write where the followed point is and how it moves into the pilot's `point`."""
+    p, point = guidance.point_body_m, pilot.point
+    sr, cr = math.sin(estimate[signals.ROLL]), math.cos(estimate[signals.ROLL])
+    sp, cp = math.sin(estimate[signals.PITCH]), math.cos(estimate[signals.PITCH])
+    sy, cy = math.sin(estimate[signals.HEADING]), math.cos(estimate[signals.HEADING])
+    ahead = cp * p[0] + sp * (sr * p[1] + cr * p[2])
+    beside = cr * p[1] - sr * p[2]
+    u, v, w = estimate[signals.U], estimate[signals.V], estimate[signals.W]
+    turn = (sr * estimate[signals.Q] + cr * estimate[signals.R]) / cp
+    # Roll and pitch rates are left out: nothing here can answer them.
+    point[told.POINT_NORTH] = estimate[signals.NORTH] + cy * ahead - sy * beside
+    point[told.POINT_EAST] = estimate[signals.EAST] + sy * ahead + cy * beside
+    point[told.SURGE_SPEED] = cp * u + sp * (sr * v + cr * w) - turn * beside
+    point[told.SWAY_SPEED] = cr * v - sr * w + turn * ahead
+    point[told.SINK_SPEED] = -sp * u + cp * (sr * v + cr * w)
+    point[told.TURN_SPEED] = turn
+
+
+@kernel
+def hear_floor(estimate: Array, dt_s: float, guidance: Guidance, pilot: PilotState) -> None:
+    """Smooth the depth that the origin's depth and the altitude add up to, and its slope.
+
+    A critically damped second-order tracker: it follows a constant slope without lag. Without
+    bottom lock the depth is held and the slope fades.
+    """
+    memory, rate = pilot.memory, guidance.floor_rate_rad_s
+    heard = estimate[signals.DEPTH] + estimate[signals.ALTITUDE]
+    if not math.isfinite(heard):
+        memory[told.FLOOR_SLOPE] *= 1.0 - rate * dt_s
+        return
+    if memory[told.FLOOR_KNOWN] == 0.0:
+        memory[told.FLOOR_KNOWN], memory[told.FLOOR] = 1.0, heard
+        restart_watch(pilot)
+        return
+    surprise = heard - memory[told.FLOOR]
+    memory[told.FLOOR] += dt_s * (memory[told.FLOOR_SLOPE] + 2.0 * rate * surprise)
+    memory[told.FLOOR_SLOPE] += dt_s * rate * rate * surprise
+
+
+@kernel
+def sink_to(
+    depth_m: float, feed_mps: float, estimate: Array, dt_s: float, gains: Gains, pilot: PilotState
+) -> None:
+    """Ask for the heave that takes the origin to a depth, which itself moves at a speed."""
+    memory, demand = pilot.memory, pilot.demand
+    error, most = depth_m - estimate[signals.DEPTH], gains.axes[HEAVE, FASTEST]
+    demand[told.REF_HEAVE], demand[told.ACC_HEAVE] = place_demand(
+        gains,
+        HEAVE,
+        error,
+        pilot.point[told.SINK_SPEED],
+        clamped(feed_mps, 0.5 * most),
+        memory[told.HEAVE_SUM],
+        most,
+    )
+    if abs(error) < DEPTH_KEPT_M:
+        step = place_sum_step(gains, HEAVE, error, demand[told.FULL_HEAVE], dt_s)
+        memory[told.HEAVE_SUM] = clamped(memory[told.HEAVE_SUM] + step, sum_bound(gains, HEAVE))
+    pilot.report[told.WANTED_DEPTH] = depth_m
+
+
+@kernel
+def head_for(
+    heading: float,
+    feed: float,
+    quicken: float,
+    estimate: Array,
+    dt_s: float,
+    gains: Gains,
+    pilot: PilotState,
+) -> float:
+    """Ask for the yaw that takes the heading to a wanted one.
+
+    Args:
+        heading: wanted.
+        feed: its rate.
+        quicken: the rate of that.
+        estimate: (13,)
+        dt_s: the tick.
+        gains: of the inner loops.
+        pilot: is written.
+
+    Returns:
+        Wanted less present heading, within -pi and pi.
+    """
+    memory, demand = pilot.memory, pilot.demand
+    error, most = wrapped(heading - estimate[signals.HEADING]), gains.axes[YAW, FASTEST]
+    demand[told.REF_YAW], accelerate = place_demand(
+        gains, YAW, error, pilot.point[told.TURN_SPEED], feed, memory[told.YAW_SUM], most
+    )
+    demand[told.ACC_YAW] = accelerate + quicken
+    if abs(error) < HEADING_KEPT_RAD:
+        step = place_sum_step(gains, YAW, error, demand[told.FULL_YAW], dt_s)
+        memory[told.YAW_SUM] = clamped(memory[told.YAW_SUM] + step, sum_bound(gains, YAW))
+    pilot.report[told.WANTED_HEADING] = heading
+    return error
+
+
+@kernel
+def surge_at(
+    speed: float, dt_s: float, guidance: Guidance, gains: Gains, pilot: PilotState
+) -> None:
+    """Ask for a surge of the followed point over ground."""
+    memory, demand = pilot.memory, pilot.demand
+    error = speed - pilot.point[told.SURGE_SPEED]
+    demand[told.ACC_SURGE], memory[told.SURGE_SUM] = speed_demand(
+        gains, SURGE, error, demand[told.FULL_SURGE], memory[told.SURGE_SUM], dt_s
+    )
+    demand[told.REF_SURGE] = speed + demand[told.REF_YAW] * guidance.point_body_m[1]
+    pilot.report[told.WANTED_SURGE] = speed
+
+
+@kernel
+def sway_by(
+    offset: float,
+    feed: float,
+    estimate: Array,
+    dt_s: float,
+    guidance: Guidance,
+    gains: Gains,
+    pilot: PilotState,
+) -> None:
+    """Ask for the sway that takes away an offset of the followed point to starboard.
+
+    The integral is kept as a vector in NED and turned into the body (Fossen 2011, section 12.2.7,
+    does so for positioning): what holds against a current is still right after a turn.
+    """
+    memory, demand, heading = pilot.memory, pilot.demand, estimate[signals.HEADING]
+    s, c = math.sin(heading), math.cos(heading)
+    total = c * memory[told.SWAY_SUM_E] - s * memory[told.SWAY_SUM_N]
+    steady, accelerate = place_demand(
+        gains,
+        SWAY,
+        -offset,
+        pilot.point[told.SWAY_SPEED],
+        feed,
+        total,
+        gains.axes[SWAY, FASTEST],
+    )
+    lever = guidance.point_body_m[0]
+    demand[told.REF_SWAY] = steady - lever * demand[told.REF_YAW]
+    demand[told.ACC_SWAY] = accelerate - lever * demand[told.ACC_YAW]
+    pilot.report[told.WANTED_SWAY] = steady
+    if abs(offset) < guidance.far_m:
+        step = place_sum_step(gains, SWAY, -offset, demand[told.FULL_SWAY], dt_s)
+        north, east = memory[told.SWAY_SUM_N] - s * step, memory[told.SWAY_SUM_E] + c * step
+        bound = sum_bound(gains, SWAY)
+        cut = min(1.0, bound / max(math.hypot(north, east), 1e-9))
+        memory[told.SWAY_SUM_N], memory[told.SWAY_SUM_E] = cut * north, cut * east
+
+
+@kernel
+def go_to(
+    goal_n: float,
+    goal_e: float,
+    heading: float,
+    dt_s: float,
+    estimate: Array,
+    path: Path,
+    guidance: Guidance,
+    gains: Gains,
+    pilot: PilotState,
+) -> tuple[float, float]:
+    """Go to a place and stay there, with a heading if the vehicle can sway.
+
+    A vehicle without sway faces its goal and waits until the current has carried it off again.
+
+    Returns:
+        Distance from the goal, and the error of the wanted heading.
+    """
+    now = estimate[signals.HEADING]
+    dn, de = goal_n - pilot.point[told.POINT_NORTH], goal_e - pilot.point[told.POINT_EAST]
+    distance = math.hypot(dn, de)
+    ahead, beside = math.cos(now) * dn + math.sin(now) * de, math.cos(now) * de - math.sin(now) * dn
+    speed = clamped(_HOVER_SHARE * gains.axes[SURGE, BANDWIDTH] * ahead, path.speed_mps)
+    hover = guidance.sway > 0.0 and distance < _HOVER_M
+    if hover:
+        error = head_for(heading, 0.0, 0.0, estimate, dt_s, gains, pilot)
+    elif distance > guidance.capture_m:
+        error = head_for(math.atan2(de, dn), 0.0, 0.0, estimate, dt_s, gains, pilot)
+        speed = path.speed_mps * max(math.cos(error), 0.0)
+    else:
+        facing = pilot.report[told.WANTED_HEADING]
+        if not math.isfinite(facing):
+            facing = heading
+        error = head_for(facing, 0.0, 0.0, estimate, dt_s, gains, pilot)
+    surge_at(speed, dt_s, guidance, gains, pilot)
+    if hover:
+        sway_by(-beside, 0.0, estimate, dt_s, guidance, gains, pilot)
+    pilot.report[told.BY_SWAY] = 1.0 if hover else 0.0
+    return distance, error
+
+
+@kernel
+def follow(
+    leg: int,
+    along: float,
+    dt_s: float,
+    estimate: Array,
+    path: Path,
+    guidance: Guidance,
+    gains: Gains,
+    pilot: PilotState,
+) -> None:
+    """Follow the path from where the progress is."""
+    report, point, now = pilot.report, pilot.point, estimate[signals.HEADING]
+    north, east = point[told.POINT_NORTH], point[told.POINT_EAST]
+    n, e, beta, _ = place_at(path, leg, along)
+    cross = (east - e) * math.cos(beta) - (north - n) * math.sin(beta)
+    # A turn begins before its arc and ends after it: the path's heading averaged over a window.
+    window = guidance.smooth_m
+    back, k_back = heading_at(path, leg, along - window)
+    front, k_front = heading_at(path, leg, along + window)
+    curvature = (front - back) / (2.0 * window)
+    smooth = _mean_heading(path, leg, along, window)
+    speed = _wanted_speed(path, guidance, gains, leg, along, curvature)
+    course = now - beta
+    sine, cosine = math.sin(course), math.cos(course)
+    surge, sway = point[told.SURGE_SPEED], point[told.SWAY_SPEED]
+    slant = max(1.0 - curvature * cross, LEAST_SLANT)
+    pace = min(max(surge * cosine - sway * sine, 0.0), 2.0 * speed) / slant
+    feed = curvature * pace
+    quicken = (k_front - k_back) / (2.0 * window) * pace * pace
+
+    by_sway = report[told.BY_SWAY] > 0.0
+    if by_sway and abs(cross) > guidance.far_m:
+        by_sway = False
+    elif not by_sway and guidance.sway > 0.0 and abs(cross) < guidance.near_m:
+        by_sway = True
+    if by_sway:
+        head_for(smooth, feed, quicken, estimate, dt_s, gains, pilot)
+        surge_at(speed * max(cosine, 0.0), dt_s, guidance, gains, pilot)
+        # The cross-track error as the sway sees it (paper, eq. los_sway_e).
+        sway_by(cross * cosine, -speed * sine, estimate, dt_s, guidance, gains, pilot)
+    else:
+        ahead = guidance.look_ahead_m
+        aim_n, aim_e = n + ahead * math.cos(beta), e + ahead * math.sin(beta)
+        heading = math.atan2(aim_e - east, aim_n - north)
+        # The aim turns as the offset changes: what its heading does is known, not awaited.
+        drift = surge * sine + sway * cosine
+        feed -= ahead * drift / (ahead * ahead + cross * cross)
+        error = head_for(heading + (smooth - beta), feed, quicken, estimate, dt_s, gains, pilot)
+        surge_at(speed * max(math.cos(error), 0.0), dt_s, guidance, gains, pilot)
+    report[told.BY_SWAY] = 1.0 if by_sway else 0.0
+    report[told.CROSS], report[told.PATH_HEADING] = cross, beta
+    report[told.LEG], report[told.ALONG], report[told.LINE] = leg, along, path.line[leg]
+
+
+@kernel
+def _mean_heading(path: Path, leg: int, along_m: float, window_m: float) -> float:
+    """Heading of the path averaged over a window: Simpson's rule on its halves."""
+    a, _ = heading_at(path, leg, along_m - window_m)
+    b, _ = heading_at(path, leg, along_m - 0.5 * window_m)
+    c, _ = heading_at(path, leg, along_m)
+    d, _ = heading_at(path, leg, along_m + 0.5 * window_m)
+    e, _ = heading_at(path, leg, along_m + window_m)
+    return (a + 4.0 * b + 2.0 * c + 4.0 * d + e) / 12.0
+
+
+@kernel
+def _allowed_speed(path: Path, guidance: Guidance, gains: Gains, curvature: float) -> float:
+    """Greatest speed at which a curvature asks for no more yaw and sway than there is.
+
+    While the followed point goes round an arc with its heading along it, the origin, behind it,
+    sways outwards by curvature times speed times the lever.
+    """
+    k = abs(curvature)
+    if k < _STRAIGHT_PER_M:
+        return path.speed_mps
+    speed = min(path.speed_mps, gains.axes[YAW, FASTEST] / k)
+    lever = abs(guidance.point_body_m[0])
+    if guidance.sway > 0.0 and lever > 0.0:
+        speed = min(speed, gains.axes[SWAY, FASTEST] / (k * lever))
+    return float(speed)
+
+
+@kernel
+def _wanted_speed(
+    path: Path, guidance: Guidance, gains: Gains, leg: int, along_m: float, curvature: float
+) -> float:
+    """The speed now, low enough to brake before the turns ahead."""
+    speed = _allowed_speed(path, guidance, gains, curvature)
+    distance = path.length_m[leg] - along_m - guidance.smooth_m
+    reach = path.speed_mps * path.speed_mps / (2.0 * guidance.brake_mps2)
+    following = leg + 1
+    while following < path.length_m.shape[0] and distance < reach:
+        there = _allowed_speed(path, guidance, gains, path.curvature_per_m[following])
+        braking = 2.0 * guidance.brake_mps2 * max(distance, 0.0)
+        speed = min(speed, math.sqrt(there * there + braking))
+        distance += path.length_m[following]
+        following += 1
+    return speed
