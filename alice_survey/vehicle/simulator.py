@@ -50,7 +50,12 @@ from alice_survey.vehicle.navigation import (
     navigation_tick,
     new_navigation,
 )
-from alice_survey.vehicle.propulsion import electrical_power, speeds_for, thrust_limits
+from alice_survey.vehicle.propulsion import (
+    Propulsion,
+    electrical_power,
+    speeds_for,
+    thrust_limits,
+)
 from alice_survey.vehicle.sea import Current, Disturbance, current_at
 from alice_survey.vehicle.vehicle import Vehicle
 
@@ -74,6 +79,8 @@ class Allocation(NamedTuple):
     """How a wrench becomes thrust."""
 
     exact: bool
+    propulsion: Propulsion
+    """As it is believed to be."""
     matrix: Array
     """B, (6, n)."""
     axes: Array
@@ -152,6 +159,7 @@ def _fly_ticks(
     world: World,
     scratch: Scratch,
     rng: np.random.Generator,
+    sea_rng: np.random.Generator,
     rows: Rows,
 ) -> int:
     """Fly ticks until the rows are full or the mission is done; how many were flown."""
@@ -168,8 +176,8 @@ def _fly_ticks(
         # The flow past the hull is not measured: the velocity over ground stands for it.
         known = world.estimate[signals.U : signals.U + 6]
         lower, upper = allocation.lower, allocation.upper
-        thrust_limits(plant.propulsion, allocation.health, known, lower, upper)
-        preference_weights(plant.propulsion, known[0], allocation.weights)
+        thrust_limits(allocation.propulsion, allocation.health, known, lower, upper)
+        preference_weights(allocation.propulsion, known[0], allocation.weights)
         if allocation.exact:
             allocate_exact(
                 allocation.matrix, world.wrench, lower, upper,
@@ -180,7 +188,7 @@ def _fly_ticks(
                 allocation.matrix, world.wrench, lower, upper,
                 allocation.axes, allocation.weights, allocation.thrust, allocation.scratch,
             )  # fmt: skip
-        speeds_for(plant.propulsion, allocation.thrust, known, allocation.command_rps)
+        speeds_for(allocation.propulsion, allocation.thrust, known, allocation.command_rps)
 
         for i in range(STATE + thrusters):
             rows.state[k, i] = world.state[i]
@@ -204,7 +212,7 @@ def _fly_ticks(
             world.before[i] = world.now[i]
         kept = math.sqrt(1.0 - sea.gust_decay * sea.gust_decay)
         for i in range(6):
-            world.gust[i] = sea.gust_decay * world.gust[i] + kept * rng.standard_normal()
+            world.gust[i] = sea.gust_decay * world.gust[i] + kept * sea_rng.standard_normal()
             world.load[i] = sea.gust_sigma[i] * world.gust[i]
         step = TICK_S / STEPS
         for i in range(STEPS):
@@ -230,6 +238,9 @@ class Setup:
     exact_allocation: bool = True
     failed: tuple[str, ...] = ()
     """Names of thrusters that do not turn."""
+    believed: Vehicle | None = None
+    """What the allocation takes the vehicle for, with as many thrusters; the vehicle itself if not
+    given."""
     start_ne_m: tuple[float, float] = (0.0, 0.0)
     start_heading_rad: float = 0.0
 
@@ -274,14 +285,23 @@ class Flown:
         return energy
 
 
-def simulate(setup: Setup, rng: np.random.Generator, *, longest_s: float, label: str) -> Flown:
+def simulate(
+    setup: Setup,
+    rng: np.random.Generator,
+    *,
+    longest_s: float,
+    label: str,
+    sea_rng: np.random.Generator | None = None,
+) -> Flown:
     """Fly a mission to its end.
 
     Args:
         setup: the mission.
         rng: source of all noise.
         longest_s: the mission is broken off then.
-        label: what the progress bar says.
+        label: what the progress bar says; there is none if it is empty.
+        sea_rng: source of the gusts, six numbers a tick, so that vehicles can be flown in the same
+            ones; `rng` if not given.
 
     Raises:
         VehicleError: a failed thruster is not one of the vehicle's.
@@ -290,7 +310,8 @@ def simulate(setup: Setup, rng: np.random.Generator, *, longest_s: float, label:
 
     chunks: list[Rows] = []
     total = math.ceil(longest_s / TICK_S / _CHUNK_TICKS)
-    for chunk in progress(_chunks(setup, rng, longest_s), label, total):
+    flying = _chunks(setup, rng, sea_rng or rng, longest_s)
+    for chunk in progress(flying, label, total) if label else flying:
         chunks.append(chunk)  # noqa: PERF402  the bar takes an iterator
     rows = Rows(*(np.concatenate(parts) for parts in zip(*chunks, strict=True)))
     return Flown(
@@ -300,7 +321,9 @@ def simulate(setup: Setup, rng: np.random.Generator, *, longest_s: float, label:
     )
 
 
-def _chunks(setup: Setup, rng: np.random.Generator, longest_s: float) -> Iterator[Rows]:
+def _chunks(
+    setup: Setup, rng: np.random.Generator, sea_rng: np.random.Generator, longest_s: float
+) -> Iterator[Rows]:
     """Rows of a minute each, until the mission is over."""
     vehicle, n = setup.vehicle, len(setup.vehicle.thrusters)
     world = _new_world(setup, n)
@@ -315,7 +338,8 @@ def _chunks(setup: Setup, rng: np.random.Generator, longest_s: float) -> Iterato
         rows = _new_rows(min(_CHUNK_TICKS, last - first), n)
         flown = _fly_ticks(
             first, vehicle.plant, sea, setup.floor, setup.sensors, navigation, setup.path,
-            setup.guidance, setup.gains, pilot, allocation, world, scratch, rng, rows,
+            setup.guidance, setup.gains, pilot, allocation, world, scratch, rng, sea_rng,
+            rows,
         )  # fmt: skip
         yield Rows(*(part[:flown] for part in rows))
         if flown < len(rows.state):
@@ -343,11 +367,12 @@ def _allocation(setup: Setup) -> Allocation:
             )
     n = len(names)
     health = np.array([float(name not in setup.failed) for name in names])
-    matrix = np.ascontiguousarray(setup.vehicle.configuration_matrix)
+    believed = setup.believed or setup.vehicle
+    matrix = np.ascontiguousarray(believed.configuration_matrix)
     return Allocation(
-        setup.exact_allocation, matrix, AXIS_WEIGHTS.copy(), health, lower=np.zeros(n),
-        upper=np.zeros(n), weights=np.zeros(n), thrust=np.zeros(n), command_rps=np.zeros(n),
-        scratch=allocation_scratch(n),
+        setup.exact_allocation, believed.plant.propulsion, matrix, AXIS_WEIGHTS.copy(), health,
+        lower=np.zeros(n), upper=np.zeros(n), weights=np.zeros(n), thrust=np.zeros(n),
+        command_rps=np.zeros(n), scratch=allocation_scratch(n),
     )  # fmt: skip
 
 
