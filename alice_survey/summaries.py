@@ -21,8 +21,26 @@ def _plan(folder: Path) -> Summary:
 
 
 def _flight(folder: Path) -> Summary:
-    triggers = len((folder / "triggers.csv").read_text().splitlines()) - 1
-    return f"{triggers} triggers; track in {folder / 'track.png'}", {"triggers": triggers}
+    found = read_json(folder / "flight.json")
+    line, turn = found["on_lines"], found["in_turns"]
+    text = (
+        f"{found['vehicle']} with {found['controller']}: {found['ending']}, {found['stations']} of "
+        f"{found['stations_planned']} stations in {found['duration_s'] / 60:.0f} min; on lines "
+        f"{_metres(line['cross_track_rms_m'])} cross-track rms (the control's part "
+        f"{_metres(line['believed_cross_track_rms_m'])}), heading "
+        f"{_degrees(line['heading_rms_deg'])} rms; roll in turns to "
+        f"{_degrees(turn['roll_worst_deg'])}; {sum(found['energy_wh'].values()):.1f} Wh; "
+        f"plots in {folder / 'track.png'} and {folder / 'vehicle.png'}"
+    )
+    return text, found
+
+
+def _metres(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.3f} m"
+
+
+def _degrees(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.1f} deg"
 
 
 def _pictures(folder: Path) -> Summary:

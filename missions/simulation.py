@@ -107,7 +107,10 @@ def mission_setup(
         point_body_m=config.camera.position_body_m,
         limits=Limits(0.5 * plan.altitude_m, float(floor.depth_m.max()), longest_s=longest_s),
     )
-    gust = config.sea.gust_n
+    gust, heading_rad = config.sea.gust_n, float(path.heading_rad[0])
+    # The vehicle is let go where its left port is above the start of the route.
+    glass_ned = rotation_from_attitude(0.0, 0.0, heading_rad).apply(config.camera.position_body_m)
+    start_ne = np.array([path.start_n[0], path.start_e[0]]) - glass_ned[:2]
     return Setup(
         vehicle=craft,
         path=path,
@@ -121,8 +124,8 @@ def mission_setup(
         ),
         exact_allocation=config.vehicle.allocation == "exact",
         failed=config.vehicle.failed_thrusters,
-        start_ne_m=(float(path.start_n[0]), float(path.start_e[0])),
-        start_heading_rad=float(path.heading_rad[0]),
+        start_ne_m=(float(start_ne[0]), float(start_ne[1])),
+        start_heading_rad=heading_rad,
     )
 
 

@@ -53,6 +53,7 @@ _NAVIGATION = (
     "altitude_m", "sigma_horizontal_m", "sigma_depth_m", "sigma_attitude_deg", "sigma_heading_deg",
     "sigma_altitude_m",
 )  # fmt: skip
+_BLANK_WITHOUT_BOTTOM = ("altitude_m", "sigma_altitude_m")
 _ANGLES = ("longitude_deg", "roll_deg", "pitch_deg", "heading_deg")
 
 
@@ -237,7 +238,7 @@ def _read_plan(path: Path) -> dict[str, Any]:
 
 def _believed(path: Path, at_s: Array) -> list[ImageRecord]:
     """What the navigation log says at some times: rows of the manifest that lack their picture."""
-    log = read_columns(path, ("time_s", *_NAVIGATION))
+    log = read_columns(path, ("time_s", *_NAVIGATION), _BLANK_WITHOUT_BOTTOM)
     time_s = log["time_s"]
     if not np.all(np.diff(time_s) > 0):
         raise NavigationError(f"{path}: time_s must increase from row to row")
