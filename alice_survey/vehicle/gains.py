@@ -89,6 +89,7 @@ def gains_for(
     damping = linear_damping(plant.body, cruise)
     axes = np.zeros((4, 10))
     fastest_rad_s = 2 * math.pi * navigation_hz / SAMPLES_PER_PERIOD
+    gyradius_m = math.sqrt(vehicle.mass[5, 5] / vehicle.mass[1, 1])
     for axis, degree in enumerate(DEGREES):
         inertia = float(vehicle.mass[degree, degree])
         least, most = authority(configuration, lower, upper, axis)
@@ -102,8 +103,8 @@ def gains_for(
                 f"the thrusters of {vehicle.name} cannot control {name} both ways "
                 f"({least:.2g} to {most:.2g}): it cannot fly a survey"
             )
-        reach = np.abs(configuration[axis]) * np.minimum(-lower, upper)
-        lag_s = float(reach @ slowness_s / reach.sum()) + tick_s / 2
+        lag_s = effective_lag_s(configuration, lower, upper, slowness_s, axis, gyradius_m)
+        lag_s += tick_s / 2
         decay = float(damping[degree, degree]) / inertia
         omega, rate, place = placed(lag_s, decay, fastest_rad_s)
         axes[axis, [RATE, PLACE]] = rate, place
@@ -179,6 +180,34 @@ def authority(configuration: Array, lower: Array, upper: Array, axis: int) -> tu
         )
         ends.append(float(row @ found.x))
     return ends[0], ends[1]
+
+
+def effective_lag_s(
+    configuration: Array,
+    lower: Array,
+    upper: Array,
+    time_constant_s: Array,
+    axis: int,
+    gyradius_m: float,
+) -> float:
+    """Lag of the force on one axis: the thrusters' time constants, by the part that each plays.
+
+    The thrusts are those of least effort (weighted by their bounds) that push this axis alone; a
+    thruster plays a part by all that it does, as when one cancels the yaw of another.
+
+    Args:
+        configuration: (4, n) force on each axis by thrust.
+        lower: (n,) least thrust.
+        upper: (n,) greatest thrust.
+        time_constant_s: (n,) of the thrusters.
+        axis: row.
+        gyradius_m: by which moments are divided to be compared with forces.
+    """
+    scaled = configuration / np.array([1.0, 1.0, 1.0, gyradius_m])[:, None]
+    strength = np.minimum(-lower, upper)
+    thrust = strength * np.linalg.pinv(scaled * strength)[:, axis]
+    part = np.abs(thrust) * np.linalg.norm(scaled, axis=0)
+    return float(part @ time_constant_s / part.sum())
 
 
 def _steady_speed(body: Body, degree: int, force: float) -> float:

@@ -27,8 +27,13 @@ from alice_survey.vehicle.safety import restart_watch
 
 DEPTH_KEPT_M = 0.2
 HEADING_KEPT_RAD = math.radians(10.0)
-"""Nearer than these a depth or heading counts as kept, and its integral may learn: further off the
-speed is cut, and an integral would only wind up."""
+"""Nearer than these a depth or heading counts as kept."""
+_AT_REST = 0.1
+"""Below this share of the greatest speed an axis is not on its way. Integrals learn while a depth
+or heading is kept, or stays wrong; on the way to a new one they would only wind up."""
+_MOST_SURPRISE_M = 1.0
+"""A greater step of the sea floor is believed at this rate only: it may be a false echo, and a
+ledge is not to be dived from at once."""
 _HOVER_M = 2.0
 """Nearer than this a vehicle with sway hovers towards its goal instead of heading for it."""
 _HOVER_SHARE = 0.25
@@ -72,7 +77,7 @@ def hear_floor(estimate: Array, dt_s: float, guidance: Guidance, pilot: PilotSta
         memory[told.FLOOR_KNOWN], memory[told.FLOOR] = 1.0, heard
         restart_watch(pilot)
         return
-    surprise = heard - memory[told.FLOOR]
+    surprise = clamped(heard - memory[told.FLOOR], _MOST_SURPRISE_M)
     memory[told.FLOOR] += dt_s * (memory[told.FLOOR_SLOPE] + 2.0 * rate * surprise)
     memory[told.FLOOR_SLOPE] += dt_s * rate * rate * surprise
 
@@ -93,7 +98,7 @@ def sink_to(
         memory[told.HEAVE_SUM],
         most,
     )
-    if abs(error) < DEPTH_KEPT_M:
+    if abs(error) < DEPTH_KEPT_M or abs(pilot.point[told.SINK_SPEED]) < _AT_REST * most:
         step = place_sum_step(gains, HEAVE, error, demand[told.FULL_HEAVE], dt_s)
         memory[told.HEAVE_SUM] = clamped(memory[told.HEAVE_SUM] + step, sum_bound(gains, HEAVE))
     pilot.report[told.WANTED_DEPTH] = depth_m
@@ -129,7 +134,8 @@ def head_for(
         gains, YAW, error, pilot.point[told.TURN_SPEED], feed, memory[told.YAW_SUM], most
     )
     demand[told.ACC_YAW] = accelerate + quicken
-    if abs(error) < HEADING_KEPT_RAD:
+    off = abs(pilot.point[told.TURN_SPEED] - feed)
+    if abs(error) < HEADING_KEPT_RAD or off < _AT_REST * most:
         step = place_sum_step(gains, YAW, error, demand[told.FULL_YAW], dt_s)
         memory[told.YAW_SUM] = clamped(memory[told.YAW_SUM] + step, sum_bound(gains, YAW))
     pilot.report[told.WANTED_HEADING] = heading
@@ -281,6 +287,10 @@ def follow(
         feed -= ahead * drift / (ahead * ahead + cross * cross)
         error = head_for(heading + (smooth - beta), feed, quicken, estimate, dt_s, gains, pilot)
         surge_at(speed * max(math.cos(error), 0.0), dt_s, guidance, gains, pilot)
+        if guidance.sway > 0.0:
+            # Lateral thrusters keep the vehicle from slipping sideways, so that it goes where it
+            # heads: else a current could hold it off the path for ever.
+            sway_by(0.0, 0.0, estimate, dt_s, guidance, gains, pilot)
     report[told.BY_SWAY] = 1.0 if by_sway else 0.0
     report[told.CROSS], report[told.PATH_HEADING] = cross, beta
     report[told.LEG], report[told.ALONG], report[told.LINE] = leg, along, path.line[leg]
