@@ -16,6 +16,7 @@ app = typer.Typer()
         "import-images photos -w reef",
         "import-images --left cam1 --right cam2 -w reef",
         "import-images photos --navigation dive.csv --clock-offset -1.5 --masks masks -w reef",
+        "import-images photos --navigation dive.csv --vertical-datum NN2000 -w reef",
         "import-images --video GX010001.MP4 --every 0.5 -w reef",
     ),
 )
@@ -30,6 +31,9 @@ def import_images(
     navigation: Annotated[Path | None, typer.Option(help="CSV: time, position, ...")] = None,
     clock_offset: Annotated[float, typer.Option(help="Seconds to add to picture times.")] = 0.0,
     time_zone: Annotated[str, typer.Option(help="Of times that name none.")] = "UTC",
+    vertical_datum: Annotated[
+        str | None, typer.Option(metavar="NAME", help="What the CSV's depths count from.")
+    ] = None,
     rig: Annotated[Path | None, typer.Option(help="rig.json of the cameras.")] = None,
     masks: Annotated[Path | None, typer.Option(help="Folder of masks; black is left out.")] = None,
     workspace: Workspace = WORK,
@@ -44,8 +48,8 @@ def import_images(
 
     work(
         workspace, folders or [], left=left, right=right, video=video, every_s=every,
-        navigation=navigation, clock_offset_s=clock_offset, time_zone=time_zone, rig=rig,
-        masks=masks, threads=threads or default_threads(),
+        navigation=navigation, clock_offset_s=clock_offset, time_zone=time_zone,
+        vertical_datum=vertical_datum, rig=rig, masks=masks, threads=threads or default_threads(),
     )  # fmt: skip
     typer.echo(
         f"pictures are in {workspace / 'images'}; next: alice-survey reconstruct -w {workspace}"

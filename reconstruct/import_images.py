@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from alice_survey.artefacts import Stage, run_stage, write_json
-from alice_survey.errors import ImageError, WorkspaceError, warn
+from alice_survey.errors import ImageError, NavigationError, WorkspaceError, warn
 from alice_survey.executor import parallel_map, progress
 from alice_survey.frames import Array
 from alice_survey.manifest import ImageRecord, write_manifest
@@ -38,6 +38,7 @@ from reconstruct.pictures import read_mask
 _MONO = "camera"
 _EXIF_SIGMA_M = (3.0, 6.0)
 """Horizontal and vertical sigma of the GPS in a picture's EXIF, which states none."""
+_LOGGED_LEVEL = "sea surface, as in the navigation log"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +65,7 @@ def import_images(
     navigation: Path | None = None,
     clock_offset_s: float = 0.0,
     time_zone: str = "UTC",
+    vertical_datum: str | None = None,
     rig: Path | None = None,
     masks: Path | None = None,
     threads: int = 1,
@@ -84,6 +86,8 @@ def import_images(
         navigation: CSV with time and position (see `read_navigation`).
         clock_offset_s: what to add to the times of pictures to get those of navigation.
         time_zone: of dates that name none, in EXIF and navigation.
+        vertical_datum: name of the level that the depths of navigation count from, such as that of
+            the tide which `import-log` took off; None for the sea surface.
         rig: `rig.json` of the cameras; its lever arm says that navigation is of the body.
         masks: folder of masks (0 = leave out) with the stems of the pictures, or with a folder per
             camera; without it `NAME_mask.png` beside a picture is its mask.
@@ -94,13 +98,14 @@ def import_images(
 
     Raises:
         ImageError: pictures are missing, do not pair, are of different sizes, or too few.
-        NavigationError: the navigation log cannot be used.
+        NavigationError: the navigation log cannot be used, or a level is named without one.
         CalibrationError: the rig file is wrong or not that of the pictures.
     """
     _check_sources(folders, left, right, video, every_s)
     if not np.isfinite(clock_offset_s):
         raise ImageError(f"--clock-offset {clock_offset_s} is no number of seconds")
     zone = find_zone(time_zone)
+    logged_level = _checked_level(vertical_datum, navigation)
     given = [*folders, *(p for p in (left, right, video, navigation, rig, masks) if p is not None)]
     for path in given:
         if not path.exists():
@@ -124,6 +129,7 @@ def import_images(
             "navigation": navigation is not None,
             "clock_offset_s": clock_offset_s,
             "time_zone": time_zone,
+            "vertical_datum": vertical_datum,
             "rig": rig is not None,
             "masks": masks is not None,
         },
@@ -144,7 +150,9 @@ def import_images(
         if video is None:
             notes += _copy_all(entries, partial, threads)
         records = [_record(entry, partial) for entry in entries]
-        records, datum, level = _place(entries, records, log, clock_offset_s, zone, notes)
+        records, datum, level = _place(
+            entries, records, log, logged_level, clock_offset_s, zone, notes
+        )
         records = sorted(records, key=lambda r: (r.station, r.camera))
         write_manifest(partial / "manifest.csv", records)
         if known_rig is not None:
@@ -170,6 +178,20 @@ def _check_sources(
         raise ImageError("give folders of pictures, or --left and --right, or --video: one of them")
     if not every_s > 0:
         raise ImageError(f"--every {every_s}: seconds between frames must be more than 0")
+
+
+def _checked_level(name: str | None, navigation: Path | None) -> str:
+    """What to call the level of logged depths; files that state it give it one line."""
+    if name is None:
+        return _LOGGED_LEVEL
+    if navigation is None:
+        raise NavigationError(
+            f"--vertical-datum {name!r} names the level that a navigation log's depths count from: "
+            "give --navigation too"
+        )
+    if not name.strip() or not name.isprintable():
+        raise NavigationError(f"--vertical-datum {name!r} is no name of one line, such as 'NN2000'")
+    return name.strip()
 
 
 def _mono_name(rig: Rig | None) -> str:
@@ -345,6 +367,7 @@ def _place(
     entries: Sequence[_Entry],
     records: Sequence[ImageRecord],
     log: NavigationLog | None,
+    logged_level: str,
     clock_offset_s: float,
     zone: tzinfo,
     notes: list[str],
@@ -360,7 +383,7 @@ def _place(
         if from_first:
             notes.append("picture times count from the first picture, plus the clock offset")
         records = _with_navigation(records, times, log)
-        level = "sea surface, as in the navigation log"
+        level = logged_level
     else:
         records = _with_gps(records, entries)
         level = "EXIF GPS altitude"

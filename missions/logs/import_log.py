@@ -22,7 +22,7 @@ from missions.logs.corrections import (
     read_tide,
     utc_seconds,
 )
-from missions.logs.dive import ROLES, LoggedDive
+from missions.logs.dive import ROLES, LoggedDive, Signal
 
 _DECIMALS = (10, 10, 5, 6, 6, 6, 5, 6, 6, 6, 6, 6)
 """Of `COLUMNS`: as of the navigation CSV of `fly`."""
@@ -116,7 +116,8 @@ def import_log(
             _write_vehicle_log(asked.vehicle_log, dive, corrections, asked)
     except OSError as error:
         raise NavigationError(f"{error.filename}: cannot be written: {error.strerror}") from None
-    return _report(path, out, dive, time_s, columns, lost, dated)
+    tidal = isinstance(corrections.tide, Signal) or corrections.tide != 0.0
+    return _report(path, out, dive, time_s, columns, lost, dated=dated, tidal=tidal)
 
 
 def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
@@ -296,7 +297,9 @@ def _report(
     time_s: Array,
     columns: Mapping[str, Array],
     lost: Counter[str],
+    *,
     dated: bool,
+    tidal: bool,
 ) -> tuple[str, dict[str, Any]]:
     """What was read, from where, and what is missing; warns of what was left out and of gaps."""
     gaps = _gaps(time_s, dive)
@@ -324,6 +327,7 @@ def _report(
         "duration_s": round(float(time_s[-1] - time_s[0]), 6),
         "median_interval_s": round(float(np.median(steps)), 6) if len(steps) else None,
         "sources": named,
+        "depths_from": "level of the tide" if tidal else "sea surface",
         "filled": filled,
         "left_out": dict(sorted(lost.items())),
         "gaps": [{"start_s": round(a, 6), "length_s": round(b, 6)} for a, b in gaps],
@@ -341,6 +345,11 @@ def _report(
     lines += [f"  left out: {count} {reason}" for reason, count in data["left_out"].items()]
     if gaps:
         lines.append(f"  {len(gaps)} gaps, the longest {max(g[1] for g in gaps):.1f} s")
+    if tidal:
+        lines.append(
+            "  depths count from the level that --tide refers to: tell import-images its name by "
+            "--vertical-datum"
+        )
     if not dated:
         lines.append("  the log has no dates: pictures are tied to it by --clock-offset alone")
     return "\n".join(lines), data

@@ -189,6 +189,25 @@ def test_navigation_is_tied_by_time_zone_and_clock_offset(
     assert "camera/3.jpg" in told
 
 
+@pytest.mark.parametrize(
+    ("given", "stated"),
+    [(None, "sea surface, as in the navigation log"), (" NN2000 (tide) ", "NN2000 (tide)")],
+)
+def test_the_level_of_logged_depths_is_stated(
+    tmp_path: Path, draw: Draw, given: str | None, stated: str
+) -> None:
+    for number in range(2):
+        draw(tmp_path / "in" / f"{number}.jpg", number, time=f"2024:07:01 12:00:0{number}")
+    rows = [[f"2024-07-01T12:00:{s:02d}Z", 60, 5.0, 10 + s] for s in range(5)]
+    nav = navigation(tmp_path / "nav.csv", rows, "time_utc,latitude_deg,longitude_deg,depth_m")
+    import_images(tmp_path / "w", [tmp_path / "in"], navigation=nav, vertical_datum=given)
+    survey = read_json(tmp_path / "w" / "images" / "survey.json")
+    assert survey["vertical_datum"] == stated
+    # The name alone differs: depths stay as logged.
+    records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
+    assert [r.depth_m for r in records] == pytest.approx([10.0, 11.0])
+
+
 def test_masks_come_along(tmp_path: Path, draw: Draw) -> None:
     for number in range(3):
         draw(tmp_path / "in" / f"{number}.png", number)
@@ -283,6 +302,9 @@ def test_every_fault_gives_one_line(tmp_path: Path, draw: Draw) -> None:
         ([three], {"navigation": nav}, "no picture carries a time"),
         ([three], {"time_zone": "Nowhere"}, "time-zone 'Nowhere'"),
         ([three], {"clock_offset_s": float("nan")}, "clock-offset nan"),
+        ([three], {"vertical_datum": "LAT"}, "'LAT' names the level .* give --navigation too"),
+        ([three], {"navigation": nav, "vertical_datum": " "}, "no name of one line"),
+        ([three], {"navigation": nav, "vertical_datum": "a\nb"}, "no name of one line"),
     ]
     for folders, given, message in faults:
         with pytest.raises(AliceError, match=message) as caught:

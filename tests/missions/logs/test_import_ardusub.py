@@ -109,13 +109,16 @@ def test_tide_by_hand(tmp_path: Path) -> None:
     """1.2 m of tide above the datum: what is 4 m below the surface is 2.8 m below the datum."""
     log = tmp_path / "dive.BIN"
     log.write_bytes(dataflash_log(dive_messages()))
-    import_log(log, tmp_path / "n.csv", ImportOptions(tide="1.2"))
+    text, data = import_log(log, tmp_path / "n.csv", ImportOptions(tide="1.2"))
+    assert data["depths_from"] == "level of the tide"
+    assert "--vertical-datum" in text
     assert numbers(tmp_path / "n.csv", "depth_m")[0, 0] == pytest.approx(2.8, abs=1e-5)
 
     # Rising by 0.6 m in 60 s from 12:00:00 UTC: at the first position, 12:00:01, it is 0.51 m.
     tides = tmp_path / "tides.csv"
     tides.write_text("time_utc,height_m\n2024-05-01T12:00:00Z,0.5\n2024-05-01T14:01:00+02:00,1.1\n")
-    import_log(log, tmp_path / "n.csv", ImportOptions(tide=str(tides)))
+    _, data = import_log(log, tmp_path / "n.csv", ImportOptions(tide=str(tides)))
+    assert data["depths_from"] == "level of the tide"
     depth = numbers(tmp_path / "n.csv", "depth_m")[:, 0]
     np.testing.assert_allclose(depth, 4.0 + 0.25 * np.arange(20) - 0.51 - 0.001 * np.arange(20),
                                atol=2e-5)  # fmt: skip
@@ -128,6 +131,10 @@ def test_tide_by_hand(tmp_path: Path) -> None:
         import_log(log, tmp_path / "n.csv", ImportOptions(tide=str(tides)))
     with pytest.raises(NavigationError, match="neither metres nor a CSV"):
         import_log(log, tmp_path / "n.csv", ImportOptions(tide="high"))
+
+    text, data = import_log(log, tmp_path / "n.csv")
+    assert data["depths_from"] == "sea surface"
+    assert "--vertical-datum" not in text
 
 
 def test_clock_offset_and_trimming(tmp_path: Path) -> None:
