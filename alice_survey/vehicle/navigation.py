@@ -244,8 +244,9 @@ def _hear_altitude(time_s: float, used: int, nav: NavigationState, suite: Sensor
     lever = 0.0
     for i in range(3):
         lever += turned[2, i] * (suite.place[DVL, i] - suite.place[FOLLOWED, i])
-    r0, r1, r2 = turned[2, 0], turned[2, 1], turned[2, 2]
-    tilt = _variance(nav, ATTITUDE, r2 * b - r1 * c, r0 * c - r2 * a, r1 * a - r0 * b)
+    north = turned[0, 0] * a + turned[0, 1] * b + turned[0, 2] * c
+    east = turned[1, 0] * a + turned[1, 1] * b + turned[1, 2] * c
+    tilt = _variance(nav, ATTITUDE, east, -north, 0.0)
     # The spread holds the ranges' noise, of which the mean keeps a part only.
     spread = max((1.0 + 1.0 / count) * memory[RELIEF_VARIANCE] - noise, noise / count)
     memory[ALTITUDE_PING] = mean + lever
@@ -294,19 +295,22 @@ def log_row(nav: NavigationState, out: Array) -> None:
     for i in range(ESTIMATE):
         out[i] = latest[i]
     a, b, c = nav.memory[IMU_PLACE], nav.memory[IMU_PLACE + 1], nav.memory[IMU_PLACE + 2]
+    n = turned[0, 0] * a + turned[0, 1] * b + turned[0, 2] * c
+    e = turned[1, 0] * a + turned[1, 1] * b + turned[1, 2] * c
+    d = turned[2, 0] * a + turned[2, 1] * b + turned[2, 2] * c
     t = ATTITUDE
-    for i in range(3):
-        r0, r1, r2 = turned[i, 0], turned[i, 1], turned[i, 2]
-        # Row of R [lever]x: how the origin moves against the IMU when the belief turns.
-        g0, g1, g2 = r1 * c - r2 * b, r2 * a - r0 * c, r0 * b - r1 * a
+    # The origin lies at minus the lever l from the IMU: the error f moves it by -f x l.
+    for i, g0, g1, g2 in ((0, 0.0, -d, e), (1, d, 0.0, -n), (2, -e, n, 0.0)):
         both = g0 * p[i, t] + g1 * p[i, t + 1] + g2 * p[i, t + 2]
         variance = p[i, i] + 2.0 * both + _variance(nav, ATTITUDE, g0, g1, g2)
         out[LOG_SIGMA + i] = math.sqrt(max(variance, 0.0))
-    sine, cosine = math.sin(latest[3]), math.cos(latest[3])
-    slope, level = math.tan(latest[4]), math.cos(latest[4])
-    out[LOG_SIGMA + 3] = math.sqrt(_variance(nav, ATTITUDE, 1.0, sine * slope, cosine * slope))
-    out[LOG_SIGMA + 4] = math.sqrt(_variance(nav, ATTITUDE, 0.0, cosine, -sine))
-    out[LOG_SIGMA + 5] = math.sqrt(_variance(nav, ATTITUDE, 0.0, sine / level, cosine / level))
+    # Of the bow (n, e, d): pitch turns about the level axis across it, roll about itself.
+    n, e, d = turned[0, 0], turned[1, 0], turned[2, 0]
+    level2 = n * n + e * e
+    level = math.sqrt(level2)
+    out[LOG_SIGMA + 3] = math.sqrt(_variance(nav, ATTITUDE, n / level2, e / level2, 0.0))
+    out[LOG_SIGMA + 4] = math.sqrt(_variance(nav, ATTITUDE, -e / level, n / level, 0.0))
+    out[LOG_SIGMA + 5] = math.sqrt(_variance(nav, ATTITUDE, -d * n / level2, -d * e / level2, 1.0))
     out[LOG_SIGMA + 6] = nav.memory[ALTITUDE_SIGMA]
     for i in range(BEAMS):
         out[LOG_RANGE + i] = nav.readings[RANGE + i]

@@ -1,13 +1,15 @@
 """The error-state Kalman filter: kernels that weigh one number at a time, and correct.
 
 After J. Sola, Quaternion kinematics for the error-state Kalman filter, 2017, with the attitude's
-error in the body frame (truth = belief exp(error)), and measurements as increments of angle and
-velocity, so that prediction is exact but for noise and the course of velocity within a tick. The
+error in NED (his global one: truth = exp(error) belief), and measurements as increments of angle
+and velocity, so that prediction is exact but for noise and the course of velocity in a tick. The
 covariance is (25, 25); `navigation_state` says what lies where, and `navigation_prediction` carries
 it over a tick. Errors of the instruments that do not average out are states, else it would promise
 too much.
 
-Three choices keep the covariance honest over hours:
+Four choices keep the covariance honest over hours:
+- The attitude's error is in NED, where heading is one number, and is not reset (see `correct`): no
+  correction of the tilt, repeated at random, makes gravity tell of heading.
 - The velocity is kept in the body frame. Were it in NED, a ping after a long drop-out would tie it
   to a heading it says nothing of, and the next, about another velocity, would pass for knowledge.
 - It is kept as the DVL measures it, with the DVL's scale error in it: a ping's row then holds no
@@ -172,12 +174,19 @@ def lever_row(nav: NavigationState, sensors: Sensors, place: int, axis: int) -> 
     a = sensors.place[place, 0] - sensors.place[IMU, 0]
     b = sensors.place[place, 1] - sensors.place[IMU, 1]
     c = sensors.place[place, 2] - sensors.place[IMU, 2]
-    r0, r1, r2 = turned[axis, 0], turned[axis, 1], turned[axis, 2]
+    n = turned[0, 0] * a + turned[0, 1] * b + turned[0, 2] * c
+    e = turned[1, 0] * a + turned[1, 1] * b + turned[1, 2] * c
+    d = turned[2, 0] * a + turned[2, 1] * b + turned[2, 2] * c
+    # A lever l turned by the error f moves by f x l; along an axis a that is f . (l x a).
     h[axis] = 1.0
-    h[ATTITUDE] = r2 * b - r1 * c
-    h[ATTITUDE + 1] = r0 * c - r2 * a
-    h[ATTITUDE + 2] = r1 * a - r0 * b
-    return float(x[axis] + r0 * a + r1 * b + r2 * c)
+    if axis == 0:
+        h[ATTITUDE + 1], h[ATTITUDE + 2] = d, -e
+        return float(x[0] + n)
+    if axis == 1:
+        h[ATTITUDE], h[ATTITUDE + 2] = -d, n
+        return float(x[1] + e)
+    h[ATTITUDE], h[ATTITUDE + 1] = e, -n
+    return float(x[2] + d)
 
 
 @kernel
@@ -196,9 +205,10 @@ def use_heading(nav: NavigationState, sensors: Sensors) -> bool:
     h, turned = nav.scratch[ROW], nav.turns[BELIEVED]
     for j in range(ERROR):
         h[j] = 0.0
-    level = turned[0, 0] * turned[0, 0] + turned[1, 0] * turned[1, 0]
-    # The Euler rate of heading: (q sin(roll) + r cos(roll)) / cos(pitch).
-    h[ATTITUDE + 1], h[ATTITUDE + 2] = turned[2, 1] / level, turned[2, 2] / level
+    # Of atan2(east, north) of the bow (n, e, d), which the error f moves by f x bow.
+    n, e, d = turned[0, 0], turned[1, 0], turned[2, 0]
+    level = n * n + e * e
+    h[ATTITUDE], h[ATTITUDE + 1], h[ATTITUDE + 2] = -d * n / level, -d * e / level, 1.0
     h[HEADING_BIAS] = 1.0
     believed = math.atan2(turned[1, 0], turned[0, 0]) + nav.nominal[HEADING_BIAS + 1]
     innovation = wrapped(nav.readings[HEADING] - believed)
@@ -264,11 +274,12 @@ def use_beams(nav: NavigationState, sensors: Sensors, through_water: bool) -> in
             h[j] = 0.0
         h[VELOCITY], h[VELOCITY + 1], h[VELOCITY + 2] = c0, c1, c2
         if through_water:
-            h[ATTITUDE] = c2 * i1 - c1 * i2
-            h[ATTITUDE + 1] = c0 * i2 - c2 * i0
-            h[ATTITUDE + 2] = c1 * i0 - c0 * i1
-            for j in range(2):
-                h[WATER + j] = -(turned[j, 0] * c0 + turned[j, 1] * c1 + turned[j, 2] * c2)
+            a = turned[0, 0] * c0 + turned[0, 1] * c1 + turned[0, 2] * c2
+            b = turned[1, 0] * c0 + turned[1, 1] * c1 + turned[1, 2] * c2
+            c = turned[2, 0] * c0 + turned[2, 1] * c1 + turned[2, 2] * c2
+            n, e = x[WATER + 1], x[WATER + 2]
+            h[ATTITUDE], h[ATTITUDE + 1], h[ATTITUDE + 2] = e * c, -n * c, n * b - e * a
+            h[WATER], h[WATER + 1] = -a, -b
         h[GYRO_BIAS] = c1 * l2 - c2 * l1
         h[GYRO_BIAS + 1] = c2 * l0 - c0 * l2
         h[GYRO_BIAS + 2] = c0 * l1 - c1 * l0
@@ -349,33 +360,22 @@ def use_fix(
 def correct(nav: NavigationState) -> None:
     """Move the gathered correction into the belief, and forget it.
 
-    The attitude's error is then counted from a turned frame: P turns along by I - [error]x / 2
-    (Sola 2017, 287).
+    P stays as it is, as in an invariant filter (A. Barrau and S. Bonnabel, The invariant extended
+    Kalman filter as a stable observer, 2017): gravity is what corrects the tilt, and it sees the
+    tilt as it will be counted from the new belief. Sola's reset (314) would let a heading that is
+    off lean on every such correction, and gravity then tell of heading.
     """
-    x, p, error = nav.nominal, nav.covariance, nav.scratch[CORRECTION]
+    x, error = nav.nominal, nav.scratch[CORRECTION]
+    angle, turned = error[ATTITUDE : ATTITUDE + 3], nav.turns[BELIEVED]
     for i in range(ATTITUDE):
         x[i] += error[i]
     for i in range(GYRO_BIAS, ERROR):
         x[i + 1] += error[i]
-    angle = error[ATTITUDE : ATTITUDE + 3]
-    turn(x[QUATERNION : QUATERNION + 4], angle)
-    a, b, c = 0.5 * angle[0], 0.5 * angle[1], 0.5 * angle[2]
-    if a * a + b * b + c * c > 1e-12:
-        t = ATTITUDE
-        for j in range(ERROR):
-            k, m, n = p[t, j], p[t + 1, j], p[t + 2, j]
-            p[t, j], p[t + 1, j], p[t + 2, j] = (
-                k + c * m - b * n,
-                m - c * k + a * n,
-                n + b * k - a * m,
-            )
-        for j in range(ERROR):
-            k, m, n = p[j, t], p[j, t + 1], p[j, t + 2]
-            p[j, t], p[j, t + 1], p[j, t + 2] = (
-                k + c * m - b * n,
-                m - c * k + a * n,
-                n + b * k - a * m,
-            )
+    # A turn f in NED is R^T f in the body frame.
+    local = nav.scratch[GAIN]
+    for i in range(3):
+        local[i] = turned[0, i] * angle[0] + turned[1, i] * angle[1] + turned[2, i] * angle[2]
+    turn(x[QUATERNION : QUATERNION + 4], local)
     for i in range(ERROR):
         error[i] = 0.0
-    matrix_of(x[QUATERNION : QUATERNION + 4], nav.turns[BELIEVED])
+    matrix_of(x[QUATERNION : QUATERNION + 4], turned)

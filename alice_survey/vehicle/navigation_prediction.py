@@ -16,7 +16,6 @@ from alice_survey.vehicle.navigation_state import (
     DEPTH_BIAS,
     DVL_SCALE,
     ERROR,
-    FALL,
     FLOW,
     GAIN,
     GAINED,
@@ -57,8 +56,7 @@ def predict(dt_s: float, sensors: Sensors, nav: NavigationState) -> None:
     for i in range(3):
         angle[i] = readings[TURN + i] - x[GYRO_BIAS + 1 + i] * dt_s
         push = readings[PUSH + i] - x[ACCELEROMETER_BIAS + 1 + i] * dt_s
-        flow[FALL + i] = turned[2, i] * GRAVITY * dt_s
-        flow[GAINED + i] = push + flow[FALL + i]
+        flow[GAINED + i] = push + turned[2, i] * GRAVITY * dt_s
         flow[NEW + i] = x[VELOCITY + i] + flow[GAINED + i]
         flow[SUM + i] = x[VELOCITY + i] + flow[NEW + i]
     _exponential(angle[0], angle[1], angle[2], dt_s, spin)
@@ -75,6 +73,7 @@ def predict(dt_s: float, sensors: Sensors, nav: NavigationState) -> None:
     _transition(dt_s, nav)
     turn(attitude, angle)
     matrix_of(attitude, turned)
+    _turn_by_bias(nav)
     for i, correlation_s in (
         (HEADING_BIAS, sensors.compass_bias_s),
         (DEPTH_BIAS, sensors.pressure_bias_s),
@@ -107,28 +106,38 @@ def _exponential(a: float, b: float, c: float, dt_s: float, out: Array) -> None:
 
 @kernel
 def _transition(dt_s: float, nav: NavigationState) -> None:
-    """The blocks of the transition that need the velocity, before the attitude is moved on.
+    """The blocks of the transition that need the attitude before it is moved on.
 
-    Into row LEVERS: position by each of the two velocities, R dt / 2 (9), position by attitude,
-    -R [v + s]x dt / 2 (9), position by the DVL's scale, -R (v + s) dt / 2 (3).
-    Into row LEVERS + 1: velocity by gyroscope bias, [v']x J (9), with J that of attitude by
-    gyroscope bias.
+    Into row LEVERS: position by each of the two velocities, R dt / 2 (9); velocity by attitude,
+    R^T [g dt]x without its third column, which is 0 (6); half the tick's way, R (v + s) dt / 2 = w
+    (3): position by attitude is -[w]x, by the DVL's scale -w. Into row LEVERS + 1: velocity by
+    gyroscope bias, [v']x J (9), with J as in `_exponential`.
     """
     x, turned, flow = nav.nominal, nav.turns[BELIEVED], nav.scratch[FLOW]
     spin, levers, swing = nav.scratch[BLOCKS], nav.scratch[LEVERS], nav.scratch[LEVERS + 1]
-    h = 0.5 * dt_s
-    a, b, c = flow[SUM], flow[SUM + 1], flow[SUM + 2]
+    h, fall = 0.5 * dt_s, GRAVITY * dt_s
     for i in range(3):
         r0, r1, r2 = h * turned[i, 0], h * turned[i, 1], h * turned[i, 2]
         levers[3 * i], levers[3 * i + 1], levers[3 * i + 2] = r0, r1, r2
-        levers[9 + 3 * i] = r2 * b - r1 * c
-        levers[10 + 3 * i] = r0 * c - r2 * a
-        levers[11 + 3 * i] = r1 * a - r0 * b
-        levers[18 + i] = -(r0 * a + r1 * b + r2 * c)
+        levers[9 + 2 * i], levers[10 + 2 * i] = fall * turned[1, i], -fall * turned[0, i]
+        levers[15 + i] = r0 * flow[SUM] + r1 * flow[SUM + 1] + r2 * flow[SUM + 2]
     u, v, w = x[VELOCITY], x[VELOCITY + 1], x[VELOCITY + 2]
     for j in range(3):
         j0, j1, j2 = spin[9 + j], spin[12 + j], spin[15 + j]
         swing[j], swing[3 + j], swing[6 + j] = v * j2 - w * j1, w * j0 - u * j2, u * j1 - v * j0
+
+
+@kernel
+def _turn_by_bias(nav: NavigationState) -> None:
+    """Attitude by gyroscope bias, R' J (9), behind the others in row LEVERS + 1."""
+    turned, spin, swing = nav.turns[BELIEVED], nav.scratch[BLOCKS], nav.scratch[LEVERS + 1]
+    for i in range(3):
+        for j in range(3):
+            swing[9 + 3 * i + j] = (
+                turned[i, 0] * spin[9 + j]
+                + turned[i, 1] * spin[12 + j]
+                + turned[i, 2] * spin[15 + j]
+            )
 
 
 @kernel
@@ -153,7 +162,7 @@ def _propagate(dt_s: float, sensors: Sensors, nav: NavigationState) -> None:
 
 @kernel
 def _add_noise(dt_s: float, sensors: Sensors, nav: NavigationState) -> None:
-    """Add Q: a turn's noise n moves attitude by -n and velocity by -[v]x n; a push's m velocity.
+    """Add Q: a turn's noise n moves attitude by -R n, velocity by -[v]x n; a push's m velocity.
 
     By the trapezoid half of it reaches the position within the tick. A velocity with the DVL's
     scale in it gains more than the push says: counted as noise, the same for MANOEUVRE_S.
@@ -180,11 +189,11 @@ def _add_noise(dt_s: float, sensors: Sensors, nav: NavigationState) -> None:
             p[i, VELOCITY + j] += both
             p[VELOCITY + j, i] += both
             p[VELOCITY + i, VELOCITY + j] -= angle * x[VELOCITY + i] * x[VELOCITY + j]
-    for i, j, value in (
-        (0, 1, -w), (0, 2, v), (1, 0, w), (1, 2, -u), (2, 0, -v), (2, 1, u),
-    ):  # fmt: skip
-        p[VELOCITY + i, ATTITUDE + j] += angle * value
-        p[ATTITUDE + j, VELOCITY + i] += angle * value
+    for j in range(3):
+        r0, r1, r2 = angle * turned[j, 0], angle * turned[j, 1], angle * turned[j, 2]
+        for i, both in ((0, v * r2 - w * r1), (1, w * r0 - u * r2), (2, u * r1 - v * r0)):
+            p[VELOCITY + i, ATTITUDE + j] += both
+            p[ATTITUDE + j, VELOCITY + i] += both
     for i, sigma in (
         (HEADING_BIAS, sensors.compass_bias_sigma),
         (DEPTH_BIAS, sensors.pressure_bias_sigma),
@@ -201,30 +210,21 @@ def _add_noise(dt_s: float, sensors: Sensors, nav: NavigationState) -> None:
 def _transform_rows(dt_s: float, nav: NavigationState) -> None:
     """P <- F P."""
     p, e, levers = nav.covariance, nav.scratch[BLOCKS], nav.scratch[LEVERS]
-    swing, flow = nav.scratch[LEVERS + 1], nav.scratch[FLOW]
-    g0, g1, g2 = flow[FALL], flow[FALL + 1], flow[FALL + 2]
+    swing = nav.scratch[LEVERS + 1]
+    w0, w1, w2 = levers[15], levers[16], levers[17]
     ve, th, gy, ac = VELOCITY, ATTITUDE, GYRO_BIAS, ACCELEROMETER_BIAS
     for j in range(ERROR):
         t0, t1, t2 = p[th, j], p[th + 1, j], p[th + 2, j]
         b0, b1, b2 = p[gy, j], p[gy + 1, j], p[gy + 2, j]
         v0, v1, v2, c = p[ve, j], p[ve + 1, j], p[ve + 2, j], p[DVL_SCALE, j]
-        # The error of s: of v, of the push, and of gravity by [R^T g dt]x.
-        s0 = v0 - dt_s * p[ac, j] + g1 * t2 - g2 * t1
-        s1 = v1 - dt_s * p[ac + 1, j] + g2 * t0 - g0 * t2
-        s2 = v2 - dt_s * p[ac + 2, j] + g0 * t1 - g1 * t0
+        # The error of s: of v, of the push, and of gravity.
+        s0 = v0 - dt_s * p[ac, j] + levers[9] * t0 + levers[10] * t1
+        s1 = v1 - dt_s * p[ac + 1, j] + levers[11] * t0 + levers[12] * t1
+        s2 = v2 - dt_s * p[ac + 2, j] + levers[13] * t0 + levers[14] * t1
         v0, v1, v2 = v0 + s0, v1 + s1, v2 + s2
-        p[0, j] += (
-            levers[0] * v0 + levers[1] * v1 + levers[2] * v2
-            + levers[9] * t0 + levers[10] * t1 + levers[11] * t2 + levers[18] * c
-        )  # fmt: skip
-        p[1, j] += (
-            levers[3] * v0 + levers[4] * v1 + levers[5] * v2
-            + levers[12] * t0 + levers[13] * t1 + levers[14] * t2 + levers[19] * c
-        )  # fmt: skip
-        p[2, j] += (
-            levers[6] * v0 + levers[7] * v1 + levers[8] * v2
-            + levers[15] * t0 + levers[16] * t1 + levers[17] * t2 + levers[20] * c
-        )  # fmt: skip
+        p[0, j] += levers[0] * v0 + levers[1] * v1 + levers[2] * v2 + w2 * t1 - w1 * t2 - w0 * c
+        p[1, j] += levers[3] * v0 + levers[4] * v1 + levers[5] * v2 + w0 * t2 - w2 * t0 - w1 * c
+        p[2, j] += levers[6] * v0 + levers[7] * v1 + levers[8] * v2 + w1 * t0 - w0 * t1 - w2 * c
         p[ve, j] = e[0] * s0 + e[1] * s1 + e[2] * s2 + swing[0] * b0 + swing[1] * b1 + swing[2] * b2
         p[ve + 1, j] = (
             e[3] * s0 + e[4] * s1 + e[5] * s2 + swing[3] * b0 + swing[4] * b1 + swing[5] * b2
@@ -232,9 +232,9 @@ def _transform_rows(dt_s: float, nav: NavigationState) -> None:
         p[ve + 2, j] = (
             e[6] * s0 + e[7] * s1 + e[8] * s2 + swing[6] * b0 + swing[7] * b1 + swing[8] * b2
         )
-        p[th, j] = e[0] * t0 + e[1] * t1 + e[2] * t2 + e[9] * b0 + e[10] * b1 + e[11] * b2
-        p[th + 1, j] = e[3] * t0 + e[4] * t1 + e[5] * t2 + e[12] * b0 + e[13] * b1 + e[14] * b2
-        p[th + 2, j] = e[6] * t0 + e[7] * t1 + e[8] * t2 + e[15] * b0 + e[16] * b1 + e[17] * b2
+        p[th, j] = t0 + swing[9] * b0 + swing[10] * b1 + swing[11] * b2
+        p[th + 1, j] = t1 + swing[12] * b0 + swing[13] * b1 + swing[14] * b2
+        p[th + 2, j] = t2 + swing[15] * b0 + swing[16] * b1 + swing[17] * b2
     for i in (HEADING_BIAS, DEPTH_BIAS, GPS_BIAS, GPS_BIAS + 1, WATER, WATER + 1):
         kept = nav.scratch[KEPT, i]
         for j in range(ERROR):

@@ -15,9 +15,9 @@ HEADING_BIAS, DEPTH_BIAS, DVL_SCALE, DVL_ANGLE, DVL_BIAS, GPS_BIAS, WATER = (
     15, 16, 17, 18, 19, 21, 23,
 )  # fmt: skip
 """Where the errors begin in the error state (25,): position of the IMU in NED, its velocity over
-ground with the DVL's scale error in it and its attitude, both in the body frame, its biases, then
-the compass's, the depth's, scale and misalignment of the DVL, its bias of surge and sway, the GPS's
-bias of north and east, the current."""
+ground in the body frame with the DVL's scale error in it, its attitude about the axes of NED, its
+biases, then the compass's, the depth's, scale and misalignment of the DVL, its bias of surge and
+sway, the GPS's bias of north and east, the current."""
 ERROR = 25
 QUATERNION = 6
 NOMINAL = ERROR + 1
@@ -58,9 +58,9 @@ TRUTH_BEFORE, TRUTH_NOW, BELIEVED = 0, 1, 2
 """Rows of `turns`."""
 ROW, GAIN, CORRECTION, KEPT, FLOW, BLOCKS, LEVERS = 0, 1, 2, 3, 4, 5, 6
 """Rows of `scratch`; LEVERS has two."""
-NEW, SUM, FALL, GAINED = 0, 3, 6, 9
+NEW, SUM, GAINED = 0, 3, 6
 """Places in row FLOW: the velocity after a tick in the frame before it, the sum of both velocities,
-what gravity adds, and what gravity and push add."""
+and what gravity and push add."""
 
 
 class NavigationState(NamedTuple):
@@ -125,14 +125,14 @@ def new_navigation(sensors: Sensors, truth: Array, rng: np.random.Generator) -> 
     # The compass errs about the vertical, the tilt about the level axes of the body.
     believed = rotation_from_attitude(0.0, 0.0, turn) * attitude * Rotation.from_rotvec([*tilt, 0])
     nominal[QUATERNION : QUATERNION + 4] = believed.as_quat()
-    # In the body frame the vertical leans by roll and pitch.
-    down = believed.inv().apply([0.0, 0.0, 1.0])
-    heading_variance = sensors.compass_bias_sigma**2 + sensors.compass_noise**2
+    level = attitude.as_matrix()[:, :2]
     block = slice(ATTITUDE, ATTITUDE + 3)
-    covariance[block, block] = np.diag([sensors.tilt_sigma**2, sensors.tilt_sigma**2, 0.0])
-    covariance[block, block] += heading_variance * np.outer(down, down)
-    covariance[block, HEADING_BIAS] = -(sensors.compass_bias_sigma**2) * down
-    covariance[HEADING_BIAS, block] = covariance[block, HEADING_BIAS]
+    covariance[block, block] = sensors.tilt_sigma**2 * level @ level.T
+    covariance[ATTITUDE + 2, ATTITUDE + 2] += (
+        sensors.compass_bias_sigma**2 + sensors.compass_noise**2
+    )
+    covariance[ATTITUDE + 2, HEADING_BIAS] = -(sensors.compass_bias_sigma**2)
+    covariance[HEADING_BIAS, ATTITUDE + 2] = -(sensors.compass_bias_sigma**2)
     memory = np.full(MEMORY, np.nan)
     rotation = believed.as_matrix()
     memory[HEADING_TURNS] = math.atan2(rotation[1, 0], rotation[0, 0])
@@ -204,7 +204,7 @@ def estimation_error(
     velocity = attitude.inv().apply(truth[7:10]) + np.cross(truth[10:13], lever)
     error[3:6] = (1.0 + navigation.hidden[DVL_SCALE - GYRO_BIAS]) * velocity - nominal[3:6]
     believed = Rotation.from_quat(nominal[QUATERNION : QUATERNION + 4])
-    error[ATTITUDE : ATTITUDE + 3] = (believed.inv() * attitude).as_rotvec()
+    error[ATTITUDE : ATTITUDE + 3] = (attitude * believed.inv()).as_rotvec()
     error[GYRO_BIAS:WATER] = navigation.hidden - nominal[GYRO_BIAS + 1 : WATER + 1]
     error[WATER:] = water_ned[:2] - nominal[WATER + 1 :]
     return error
