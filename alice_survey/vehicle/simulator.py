@@ -6,8 +6,10 @@ five Runge-Kutta steps of 10 ms.
 """
 
 import math
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path as FilePath
 from typing import NamedTuple
 
 import numpy as np
@@ -308,6 +310,7 @@ def simulate(
     """
     from alice_survey.executor import progress
 
+    _tell_of_compiling()
     chunks: list[Rows] = []
     total = math.ceil(longest_s / TICK_S / _CHUNK_TICKS)
     flying = _chunks(setup, rng, sea_rng or rng, longest_s)
