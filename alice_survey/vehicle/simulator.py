@@ -324,6 +324,14 @@ def simulate(
     )
 
 
+def _tell_of_compiling() -> None:
+    """Say, in one line on standard error, that the first flight after an installation waits."""
+    stats = _fly_ticks.stats  # type: ignore[attr-defined]
+    kept = FilePath(stats.cache_path).glob(f"*{_fly_ticks.__name__}*.nbi")
+    if not stats.cache_hits and not stats.cache_misses and not any(kept):
+        sys.stderr.write("compiling the vehicle's model, once: this takes about a minute\n")
+
+
 def _chunks(
     setup: Setup, rng: np.random.Generator, sea_rng: np.random.Generator, longest_s: float
 ) -> Iterator[Rows]:
