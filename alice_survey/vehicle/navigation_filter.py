@@ -58,9 +58,10 @@ from alice_survey.vehicle.navigation_state import (
 from alice_survey.vehicle.rotations import matrix_of, turn, wrapped
 from alice_survey.vehicle.sensors import BEAMS, DVL, IMU, PRESSURE, Sensors
 
-DOUBT_AFTER = (50, 50, 40, 40, 5, 3)
+DOUBT_AFTER = (50, 50, 40, 40, 6, 6)
 """Rejections in a row, of each instrument, after which the filter doubts itself: 5 s of compass and
-depth, 2 s of the DVL, 5 fixes of the GPS, 3 of the USBL. Outliers do not come like that."""
+depth, 2 s of the DVL, 6 fixes. Outliers do not come like that: of 1 in 20, 6 in a row once in 64
+million."""
 
 
 @kernel

@@ -379,7 +379,7 @@ def test_a_filter_that_is_sure_and_wrong_comes_back() -> None:
     run = fly(sensors, truth, FLOOR, 2, start=nav)
     assert run.horizontal_error()[20] > 30.0
     assert run.nav.counts[USBL_USE, WIDENED] == 1
-    assert run.nav.counts[USBL_USE, REJECTED] == 3
+    assert run.nav.counts[USBL_USE, REJECTED] == 6
     assert run.horizontal_error()[-1] < 3.0 * np.hypot(*run.log[-1, 13:15])
 
 
