@@ -8,7 +8,7 @@ residuals and slopes with the directions of the start taken out. The sensitiviti
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -23,18 +23,27 @@ from alice_survey.vehicle.identification.noise import (
 )
 from alice_survey.vehicle.identification.parameters import Parameters
 from alice_survey.vehicle.identification.sensitivity import CHANNELS, START, simulate
-from alice_survey.vehicle.identification.slopes import STATES, Physics, scratch_for
+from alice_survey.vehicle.identification.slopes import STATES, Physics, scratch_for, with_given
 from alice_survey.vehicle.identification.windows import Mask, Window, cut, residual_channels
 from alice_survey.vehicle.log import attitude_of
 
 _SHORT_S = 5.0
 """Parameters are approached on windows no longer than this: over a short time a simulation stays
 near the measured motion whatever the parameters, so that the fit is led to the right minimum."""
+_ROUGH_STEP_S = 0.1
+"""Steps of the approach."""
 _START_SIGMA = np.array([0.5] * 3 + [2.0] * 6)
 """How far, rad, m/s and rad/s, a start may be from the first measured values before it costs one
 sigma: wide, so that it matters only where nothing was measured."""
 _SETTLED = 1e-2
 """A start is found when what is left to gain is this small beside one sigma squared."""
+_NOTHING = 1e-6
+"""Or as small beside all that is left."""
+_ROUGH_SHARE = 0.1
+"""Of a channel's spread: what counts as one sigma in the approach, where it is not noise."""
+_BLIND = 1e-3
+"""Sigmas by which all residuals together move where a parameter changes by itself, or by 1 if it is
+smaller: a parameter that does less is not seen at all."""
 _ROUNDS = 4
 """Most times that the noise is estimated anew."""
 _SAME = 0.02
@@ -118,13 +127,17 @@ def fit_output_error(
     sigma = _first_sigma(windows) if channel_sigma is None else channel_sigma
     lower, upper = parameters.bounds
     short = [part for window in windows for part in cut(window, _SHORT_S)]
-    approach = _Problem(short, parameters, how, sigma)
+    rough = replace(how, longest_step_s=max(how.longest_step_s, _ROUGH_STEP_S))
+    approach = _Problem(short, parameters, rough, sigma, settled=1.0)
     approach.begin(parameters.start)
     result = least_squares(
         approach.residuals, np.clip(parameters.start, lower, upper), approach.jacobian,
         bounds=(lower, upper), x_scale="jac", ftol=1e-3, xtol=1e-10, gtol=None, max_nfev=20,
     )  # fmt: skip
     values, evaluations = result.x, int(result.nfev)
+    if channel_sigma is None:
+        approach.estimate_sigma(values)
+        sigma = approach.sigma
     problem = _Problem(windows, parameters, how, sigma)
     for round_ in range(_ROUNDS if channel_sigma is None else 1):
         last = channel_sigma is not None or round_ > 0
@@ -146,28 +159,37 @@ def fit_output_error(
         changed = problem.estimate_sigma(values)
         if changed < _SAME:
             break
-    return problem.result(values, result.active_mask != 0, evaluations)
+    held = result.active_mask
+    values = np.where(held < 0, lower, np.where(held > 0, upper, values))
+    return problem.result(values, held != 0, evaluations)
 
 
 class _Problem:
     """Residuals of all windows with their starts solved for."""
 
     def __init__(
-        self, windows: Sequence[Window], parameters: Parameters, how: Simulation, sigma: Array
+        self,
+        windows: Sequence[Window],
+        parameters: Parameters,
+        how: Simulation,
+        sigma: Array,
+        settled: float = _SETTLED,
     ) -> None:
-        self.windows, self.parameters, self.how = windows, parameters, how
+        self.windows, self.parameters, self.how, self.settled = windows, parameters, how, settled
         self.sigma = np.maximum(np.where(np.isfinite(sigma), sigma, 1.0), _LEAST_SIGMA)
         self.count = len(parameters.names)
         self.measured = [
             np.isfinite(residual_channels(w, _blank(w))) & np.ones(CHANNELS, bool) for w in windows
         ]
+        # Of the parameters whose slopes were last asked for: a trial nearby begins from there, so
+        # that it comes back to the same residuals as its step goes to nothing.
         self.starts = [window.start.copy() for window in windows]
         self.gains = [np.zeros((START, self.count)) for _ in windows]
         self.at = parameters.start.copy()
+        self.trial: tuple[Array, list[Array], list[Array], Array] | None = None
         columns = self.count + START
         self.scratch = scratch_for(columns, windows[0].record.rps.shape[1])
         self.sensitivity = np.zeros((STATES, columns))
-        self.slopes = np.zeros((0, 0))
 
     def begin(self, values: Array) -> None:
         """Check that the simulation works where the fit starts."""
@@ -176,6 +198,10 @@ class _Problem:
                 "the simulation does not stay finite with the coefficients the fit starts from: "
                 "check signs and units of log and vehicle, or use shorter windows"
             )
+        reach = np.linalg.norm(self.jacobian(values), axis=0) * np.maximum(np.abs(values), 1.0)
+        names = [n for n, r in zip(self.parameters.names, reach, strict=True) if r < _BLIND]
+        if names:
+            raise VehicleError(f"the logs tell nothing of {', '.join(names)}: do not free them")
 
     def residuals(self, values: Array) -> Array:
         """All residuals in sigmas, less what the starts explain; infinite where there are none."""
@@ -183,24 +209,27 @@ class _Problem:
         if solved is None:
             size = sum(int(m.sum()) for m in self.measured) + START * len(self.windows)
             return np.full(size, np.inf)
-        residuals, slopes = [], []
-        for i, (residual, slope) in enumerate(solved):
+        residuals, slopes, starts, gains = [], [], [], []
+        for start, residual, slope in solved:
             by_start = slope[:, self.count :]
             basis, triangle = np.linalg.qr(by_start)
             by_parameters = slope[:, : self.count]
             inner = basis.T @ by_parameters
             residuals.append(residual - basis @ (basis.T @ residual))
             slopes.append(by_parameters - basis @ inner)
-            self.gains[i] = np.linalg.solve(triangle, inner)
-        self.at = values.copy()
-        self.slopes = np.concatenate(slopes)
+            starts.append(start)
+            gains.append(np.linalg.solve(triangle, inner))
+        self.trial = (values.copy(), starts, gains, np.concatenate(slopes))
         return np.concatenate(residuals)
 
     def jacobian(self, values: Array) -> Array:
-        """Slopes of the residuals."""
-        if not np.array_equal(values, self.at):
+        """Slopes of the residuals; trials begin from here afterwards."""
+        if self.trial is None or not np.array_equal(values, self.trial[0]):
             self.residuals(values)
-        return self.slopes
+        if self.trial is None:
+            raise VehicleError("the simulation does not stay finite")
+        self.at, self.starts, self.gains, slopes = self.trial
+        return slopes
 
     def estimate_sigma(self, values: Array) -> float:
         """Take the noise from the residuals; how much it changed, relative."""
@@ -213,11 +242,11 @@ class _Problem:
 
     def result(self, values: Array, at_bound: Mask, evaluations: int) -> Fit:
         """What the fit tells, at the values it settled on."""
-        residuals = self.residuals(values)
+        residuals, table = self.residuals(values), self.jacobian(values)
         free = np.flatnonzero(~at_bound)
-        information = self.slopes[:, free].T @ self.slopes[:, free]
+        information = table[:, free].T @ table[:, free]
         inverse = _inverse(information, [self.parameters.names[k] for k in free])
-        runs, slopes = self._by_channel(residuals), self._by_channel(self.slopes[:, free])
+        runs, slopes = self._by_channel(residuals), self._by_channel(table[:, free])
         meat, times = np.zeros_like(information), np.full(CHANNELS, np.nan)
         sigma = self._channel_sigma(runs)
         spread = self._freedom(runs)
@@ -227,7 +256,7 @@ class _Problem:
             lags = autocovariance(runs[channel]) * spread
             meat += correlated_information(slopes[channel], lags)
             times[channel] = self._step_s(channel) * float(np.sum(lags[1:])) / max(lags[0], 1e-300)
-        meat += self._prior(self.slopes[:, free])
+        meat += self._prior(table[:, free])
         covariance, white = (np.zeros((self.count, self.count)) for _ in range(2))
         covariance[np.ix_(free, free)] = inverse @ meat @ inverse
         white[np.ix_(free, free)] = inverse
@@ -238,10 +267,10 @@ class _Problem:
             samples=sum(int(m.sum()) for m in self.measured), evaluations=evaluations,
         )  # fmt: skip
 
-    def _solve(self, values: Array) -> list[tuple[Array, Array]] | None:
-        """Residuals in sigmas and their slopes, window by window; None where there are none."""
+    def _solve(self, values: Array) -> list[tuple[Array, Array, Array]] | None:
+        """Starts, residuals in sigmas and slopes, by window; None where there are none."""
         try:
-            physics = self.parameters.physics(values)
+            physics = with_given(self.parameters.physics(values), self.windows[0].given)
         except VehicleError:
             return None  # an inertia that is none: the step was too long
         solved = []
@@ -252,8 +281,7 @@ class _Problem:
                 found = self._start(window, i, physics, window.start)
             if found is None:
                 return None
-            self.starts[i], residual, slope = found
-            solved.append((residual, slope))
+            solved.append(found)
         return solved
 
     def _start(
@@ -267,7 +295,7 @@ class _Problem:
             residual, slope = found
             basis, triangle = np.linalg.qr(slope[:, self.count :])
             along = basis.T @ residual
-            if along @ along < _SETTLED:
+            if along @ along < self.settled + _NOTHING * (residual @ residual):
                 break
             step, share = -np.linalg.solve(triangle, along), 1.0
             while share > 1e-3:
@@ -353,7 +381,7 @@ class _Problem:
 
 
 def _first_sigma(windows: Sequence[Window]) -> Array:
-    """Noise to begin with, (9,): what is left of the channels without their smooth part."""
+    """What counts as one sigma at first, (9,): the noise, or a share of the spread if larger."""
     sigma = np.full(CHANNELS, np.nan)
     attitude = [np.unwrap(_known(attitude_of(w.record.attitude)), axis=0) for w in windows]
     for channel in range(CHANNELS):
@@ -362,12 +390,11 @@ def _first_sigma(windows: Sequence[Window]) -> Array:
             if channel < 6
             else [a[:, channel - 6] for a in attitude]
         )
-        found = [noise_sigma(series) for series in table]
-        known = [value for value in found if np.isfinite(value)]
-        # Where the channel is so smooth that rounding is all there is, a small part of its range.
-        spread = [np.nanstd(series) for series in table if np.any(np.isfinite(series))]
-        if known:
-            sigma[channel] = max(float(np.median(known)), 1e-2 * float(np.median(spread)), 1e-6)
+        table = [series[np.isfinite(series)] for series in table]
+        found = [noise_sigma(series) for series in table if len(series) >= 5]
+        if found:
+            spread = float(np.std(np.concatenate(table)))
+            sigma[channel] = max(float(np.median(found)), _ROUGH_SHARE * spread)
     return sigma
 
 

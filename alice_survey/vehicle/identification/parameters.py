@@ -15,6 +15,7 @@ from alice_survey.vehicle.identification.slopes import (
     BIAS,
     BUOYANCY,
     CURRENT,
+    GAIN,
     LIFT,
     LINEAR,
     QUADRATIC,
@@ -28,12 +29,14 @@ CURRENTS = ("current_north_mps", "current_east_mps")
 NET_BUOYANCY = "net_buoyancy_n"
 TRIMS = ("trim_x_m", "trim_y_m", "trim_z_m")
 BIASES = tuple(f"bias_{m}_{'mps' if i < 3 else 'rad_s'}" for i, m in enumerate(MOTIONS))
-OTHERS = (*CURRENTS, NET_BUOYANCY, *TRIMS, *BIASES)
+GAINS = tuple(f"gain_{force}" for force in FORCES)
+OTHERS = (*CURRENTS, NET_BUOYANCY, *TRIMS, *BIASES, *GAINS)
 """Parameters that are no coefficients: a constant current; buoyancy less weight; where the weight
-acts from the centre of buoyancy (its righting moment only, not the inertia); and constant errors of
-the velocity and rate sensors."""
+acts from the centre of buoyancy (its righting moment only, not the inertia); constant errors of the
+velocity and rate sensors; and factors on the forces and moments that a log gives, where its thrusts
+are no calibrated ones (speeds of thrusters are not scaled: a bollard pull calibrates those)."""
 GROUPS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {"current": CURRENTS, "trim": TRIMS, "bias": BIASES, "buoyancy": (NET_BUOYANCY,)}
+    {"current": CURRENTS, "trim": TRIMS, "bias": BIASES, "buoyancy": (NET_BUOYANCY,), "gain": GAINS}
 )
 """Short names of several parameters."""
 _GREATEST: Mapping[int, float] = MappingProxyType({CURRENT: 5.0, TRIM: 1.0})
@@ -72,6 +75,8 @@ class Parameters:
             kind, i, j = _place(name)
             if kind in (LINEAR, QUADRATIC, ADDED_MASS) and i == j:
                 upper[k] = 0.0
+            elif kind == GAIN:
+                lower[k] = 0.0
             elif kind in _GREATEST:
                 lower[k], upper[k] = -_GREATEST[kind], _GREATEST[kind]
         return lower, upper
@@ -109,6 +114,8 @@ class Parameters:
             np.array([thruster.time_constant_s for thruster in vehicle.thrusters]),
             np.array([others[name] for name in CURRENTS]),
             np.array([others[name] for name in BIASES]),
+            np.array([others[name] for name in GAINS]),
+            np.zeros(6),
         )
 
     def with_names(self, names: Sequence[str]) -> "Parameters":
@@ -123,13 +130,15 @@ class Parameters:
         rigid, body = self.vehicle.rigid_body, self.vehicle.plant.body
         if name == NET_BUOYANCY:
             return float(body.buoyancy_n - body.weight_n)
+        if name in GAINS:
+            return 1.0
         return float(rigid.cg_body_m[TRIMS.index(name)]) if name in TRIMS else 0.0
 
 
 def free_parameters(
     vehicle: Vehicle, names: Sequence[str], fixed: Mapping[str, float] | None = None
 ) -> Parameters:
-    """Parameters by their names, or by the names of groups: current, trim, bias, buoyancy.
+    """Parameters by their names, or by the names of groups: current, trim, bias, buoyancy, gain.
 
     Raises:
         VehicleError: a name is not known, comes twice, or is fixed as well; two names stand for one
@@ -160,6 +169,8 @@ def unit_of(name: str) -> str:
         VehicleError: the name is not known.
     """
     kind, i, j = _place(name)
+    if kind == GAIN:
+        return "1"
     if kind in (CURRENT, TRIM, BUOYANCY, BIAS):
         suffix = name.split("_", 2)[2]
         return {"mps": "m/s", "rad_s": "rad/s", "m": "m", "n": "N"}[suffix]
@@ -178,7 +189,7 @@ def _place(name: str) -> tuple[int, int, int]:
     Raises:
         VehicleError: the name is not known.
     """
-    for kind, group in ((CURRENT, CURRENTS), (TRIM, TRIMS), (BIAS, BIASES)):
+    for kind, group in ((CURRENT, CURRENTS), (TRIM, TRIMS), (BIAS, BIASES), (GAIN, GAINS)):
         if name in group:
             return kind, group.index(name), 0
     if name == NET_BUOYANCY:

@@ -44,6 +44,8 @@ class Record(NamedTuple):
     """(T, 6) given, besides that of the thrusters."""
     attitude: Array
     """(T, 4) measured quaternions, NaN where there is none."""
+    acceleration: Array
+    """(T, 6) of given motions, from each row to the next."""
 
 
 @kernel
@@ -52,7 +54,7 @@ def _stage(
 ) -> None:
     """Write the rates of a state and of its sensitivities into the first of the stages."""
     rate, slopes = scratch.stage[0], scratch.stages[0]
-    rate_of(physics, state, scratch.rps, scratch.load, scratch.force[0], rate)
+    rate_of(physics, state, scratch.rps, scratch.load, scratch.acceleration, scratch.force[0], rate)
     slope_by_state(physics, state, scratch.rps, scratch.load, scratch)
     slope_by_parameters(physics, terms, state, rate[4:10], scratch)
     a, b = scratch.by_state, scratch.by_column
@@ -90,6 +92,8 @@ def _step(
     total, trial = scratch.stage[1], scratch.stage[2]
     totals, trials = scratch.stages[1], scratch.stages[2]
     columns, lags = sensitivity.shape[1], physics.lag_s
+    for j in range(6):
+        scratch.acceleration[j] = record.acceleration[row, j]
     for k in range(4):
         at = begin + step_s * (0.0 if k == 0 else (1.0 if k == 3 else 0.5))
         share = 0.0 if hold else at / span
@@ -235,7 +239,7 @@ def simulate(
             -0.5 * x, -0.5 * y, -0.5 * z,
         )  # fmt: skip
         for i in range(6):
-            sensitivity[4 + i, c + 3 + i] = 1.0
+            sensitivity[4 + i, c + 3 + i] = 1.0 - physics.given[i]
     for row in range(record.time_s.shape[0]):
         observe(
             physics, terms, states[row], sensitivity, record.attitude[row], observed[row],

@@ -4,6 +4,7 @@ The state x is the attitude quaternion ned_from_body, xyzw (4), and nu relative 
 position does not act back on either. The equations are those of `alice_survey.vehicle.dynamics`.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.dynamics import Body, add_coriolis, add_damping
 from alice_survey.vehicle.propulsion import Propulsion, add_thrust
 
-LINEAR, QUADRATIC, LIFT, ADDED_MASS, CURRENT, BUOYANCY, TRIM, BIAS = range(8)
+LINEAR, QUADRATIC, LIFT, ADDED_MASS, CURRENT, BUOYANCY, TRIM, BIAS, GAIN = range(9)
 """Kinds of parameters."""
 STATES = 10
 """Length of the state."""
@@ -41,6 +42,10 @@ class Physics(NamedTuple):
     """(2,) m/s."""
     bias: Array
     """(6,) added to what the velocity and rate sensors tell."""
+    gain: Array
+    """(6,) by which a given wrench is multiplied."""
+    given: Array
+    """(6,) 1 of a motion of nu that follows the log, 0 of one that follows the forces."""
 
 
 class Scratch(NamedTuple):
@@ -62,6 +67,8 @@ class Scratch(NamedTuple):
     """(n,)"""
     load: Array
     """(6,)"""
+    acceleration: Array
+    """(6,)"""
 
 
 def scratch_for(columns: int, thrusters: int) -> Scratch:
@@ -69,7 +76,18 @@ def scratch_for(columns: int, thrusters: int) -> Scratch:
     return Scratch(
         np.zeros((3, 6)), np.zeros((6, 6)), np.zeros((STATES, STATES)), np.zeros((STATES, columns)),
         np.zeros((3, STATES)), np.zeros((3, STATES, columns)), np.zeros(thrusters), np.zeros(6),
+        np.zeros(6),
     )  # fmt: skip
+
+
+def with_given(physics: Physics, given: Sequence[int]) -> Physics:
+    """The same with motions of nu, by their places, that follow the log."""
+    flags = np.zeros(6)
+    flags[list(given)] = 1.0
+    free = np.flatnonzero(flags == 0.0)
+    inverse = np.zeros((6, 6))
+    inverse[np.ix_(free, free)] = np.linalg.inv(physics.body.mass[np.ix_(free, free)])
+    return physics._replace(body=physics.body._replace(mass_inverse=inverse), given=flags)
 
 
 @kernel
@@ -79,7 +97,7 @@ def force_on(physics: Physics, state: Array, rps: Array, load: Array, force: Arr
     x, y, z, s = state[0], state[1], state[2], state[3]
     r20, r21, r22 = 2 * (x * z - y * s), 2 * (y * z + x * s), 1 - 2 * (x * x + y * y)
     for i in range(6):
-        force[i] = load[i]
+        force[i] = physics.gain[i] * load[i]
     add_thrust(physics.propulsion, rps, nu, force)
     add_damping(body, nu, force)
     add_coriolis(body, nu, force)
@@ -95,9 +113,19 @@ def force_on(physics: Physics, state: Array, rps: Array, load: Array, force: Arr
 
 @kernel
 def rate_of(
-    physics: Physics, state: Array, rps: Array, load: Array, force: Array, out: Array
+    physics: Physics,
+    state: Array,
+    rps: Array,
+    load: Array,
+    acceleration: Array,
+    force: Array,
+    out: Array,
 ) -> None:
-    """Write the rate of change, (10,), of a state; force is the one that acts."""
+    """Write the rate of change, (10,), of a state.
+
+    Given motions have the acceleration (6,) that they are given; the others feel it through the
+    inertia that couples them, and answer with the rest of the mass matrix alone. `force` is room.
+    """
     x, y, z, s = state[0], state[1], state[2], state[3]
     p, q, r = state[7], state[8], state[9]
     out[0] = 0.5 * (s * p + y * r - z * q)
@@ -105,8 +133,12 @@ def rate_of(
     out[2] = 0.5 * (s * r + x * q - y * p)
     out[3] = -0.5 * (x * p + y * q + z * r)
     force_on(physics, state, rps, load, force)
+    for j in range(6):
+        if physics.given[j] != 0.0:
+            for i in range(6):
+                force[i] -= physics.body.mass[i, j] * acceleration[j]
     for i in range(6):
-        total = 0.0
+        total = physics.given[i] * acceleration[i]
         for j in range(6):
             total += physics.body.mass_inverse[i, j] * force[j]
         out[4 + i] = total
@@ -260,6 +292,8 @@ def slope_by_parameters(
             force[3] -= v * d2 - w * d1 + q * d5 - r * d4
             force[4] -= w * d0 - u * d2 + r * d3 - p * d5
             force[5] -= u * d1 - v * d0 + p * d4 - q * d3
+        elif kind == GAIN:
+            force[i] = scratch.load[i]
         elif kind == BUOYANCY:
             force[0], force[1], force[2] = -r20, -r21, -r22
         elif i == 0:

@@ -14,6 +14,7 @@ from alice_survey.vehicle.identification.slopes import STATES
 from alice_survey.vehicle.log import VehicleLog, segments
 from alice_survey.vehicle.vehicle import Vehicle
 
+RATE_NAMES = ("p", "q", "r")
 Mask = NDArray[np.bool_]
 
 CHANNEL_NAMES = ("u", "v", "w", "p", "q", "r", "roll", "pitch", "heading")
@@ -30,6 +31,8 @@ class Window:
     record: Record
     measured: Array
     """(T, 6) velocity over ground and rates, NaN where not measured."""
+    given: tuple[int, ...]
+    """Motions of nu, by their places, that follow the log instead of the forces."""
     start: Array
     """(10,) state to begin with: the first attitude, and the first velocity over ground and rates
     that were measured, zero where none was."""
@@ -42,6 +45,7 @@ def make_windows(
     window_s: float | None = None,
     gap_s: float | None = None,
     source: str | None = None,
+    given: Sequence[str] = (),
 ) -> list[Window]:
     """Cut a log into windows; warns of rows that are left out.
 
@@ -54,6 +58,8 @@ def make_windows(
         gap_s: longest step that is no gap, see `segments`; also the longest that an input is
             carried on.
         source: `rpm`, `thrust` or `wrench`: which input to take, if the log holds several.
+        given: rates, of p, q and r, that follow the log instead of the forces, such as those of
+            rolling and pitching that nothing in the log explains; they are not compared then.
 
     Raises:
         VehicleError: the log lacks attitude, motion or input, or no stretch is long enough.
@@ -61,6 +67,8 @@ def make_windows(
     _check(log)
     rps, wrench = inputs(log, vehicle, source)
     motion = np.concatenate([log.velocity_body, log.rates_body], axis=1)
+    places = _given(log, motion, given)
+    acceleration = _accelerations(log.time_s, motion, places)
     windows, lost = [], 0
     for part in segments(log, gap_s):
         known = _held(log.time_s[part], rps[part], wrench[part], gap_s)
@@ -69,10 +77,10 @@ def make_windows(
             record = Record(
                 *(
                     np.ascontiguousarray(table[rows])
-                    for table in (log.time_s, rps, wrench, log.quaternion_xyzw)
+                    for table in (log.time_s, rps, wrench, log.quaternion_xyzw, acceleration)
                 )
             )
-            window = _window(log.source, record, motion[rows])
+            window = _window(log.source, record, motion[rows], places)
             if window is None:
                 lost += rows.stop - rows.start
             else:
@@ -139,7 +147,7 @@ def cut(window: Window, longest_s: float) -> list[Window]:
     parts = []
     for piece in _pieces(record.time_s, known, longest_s):
         short = Record(*(np.ascontiguousarray(table[piece]) for table in record))
-        made = _window(window.source, short, window.measured[piece])
+        made = _window(window.source, short, window.measured[piece], window.given)
         if made is not None:
             parts.append(made)
     return parts
@@ -157,6 +165,7 @@ def residual_channels(window: Window, observed: Array) -> Array:
     """Simulated less measured, (T, 9), NaN where nothing was measured."""
     difference = np.empty((len(observed), CHANNELS))
     difference[:, :6] = observed[:, :6] - window.measured
+    difference[:, list(window.given)] = np.nan
     difference[:, 6:] = observed[:, 6:]
     return difference
 
@@ -176,6 +185,29 @@ def _check(log: VehicleLog) -> None:
             f"{log.source}: has neither velocities u_mps, v_mps, w_mps nor rates p_rad_s, q_rad_s, "
             "r_rad_s"
         )
+
+
+def _given(log: VehicleLog, motion: Array, names: Sequence[str]) -> tuple[int, ...]:
+    """Places in nu of motions that follow the log; their gaps in `motion` are filled in place."""
+    places = []
+    for name in names:
+        if name not in RATE_NAMES:
+            raise VehicleError(f"motion {name!r} cannot be given; of p, q and r each can")
+        place = 3 + RATE_NAMES.index(name)
+        known = np.isfinite(motion[:, place])
+        if not known.any():
+            raise VehicleError(f"{log.source}: has no {name}_rad_s to follow")
+        motion[:, place] = np.interp(log.time_s, log.time_s[known], motion[known, place])
+        places.append(place)
+    return tuple(sorted(set(places)))
+
+
+def _accelerations(time_s: Array, motion: Array, places: tuple[int, ...]) -> Array:
+    """Of given motions, (T, 6), from each row to the next; zero of others and in the last row."""
+    result = np.zeros(motion.shape)
+    for place in places:
+        result[:-1, place] = np.diff(motion[:, place]) / np.diff(time_s)
+    return result
 
 
 def _held(time_s: Array, rps: Array, wrench: Array, gap_s: float | None) -> Mask:
@@ -206,7 +238,7 @@ def _pieces(time_s: Array, known: Mask, window_s: float | None) -> list[slice]:
     return pieces
 
 
-def _window(source: str, record: Record, measured: Array) -> Window | None:
+def _window(source: str, record: Record, measured: Array, given: tuple[int, ...]) -> Window | None:
     """A stretch; None where it is too short or tells nothing of motion or attitude."""
     attitudes = np.flatnonzero(np.all(np.isfinite(record.attitude), axis=1))
     if len(measured) < _FEWEST_ROWS or not len(attitudes) or not np.any(np.isfinite(measured)):
@@ -217,4 +249,4 @@ def _window(source: str, record: Record, measured: Array) -> Window | None:
         there = np.flatnonzero(np.isfinite(column))
         if len(there):
             start[4 + i] = column[there[0]]
-    return Window(source=source, record=record, measured=measured, start=start)
+    return Window(source=source, record=record, measured=measured, given=given, start=start)
