@@ -134,7 +134,7 @@ def plan(workspace: Workspace = WORK, survey: SurveyFile = None, as_json: AsJson
         "fly -w reef",
         "fly -w reef --vehicle alice --controller sway --current 0.1@90",
         "fly -w before --vehicle sparus2 --controller los",
-        "fly -w reef --fail stern --json",
+        "fly -w reef --fail stern --fail bow=0.5 --json",
     )
 )
 def fly(
@@ -150,7 +150,8 @@ def fly(
         typer.Option(help="SPEED@DIRECTION it flows towards: m/s, degrees from north."),
     ] = None,
     fail: Annotated[
-        list[str] | None, typer.Option(help="A thruster that does not turn: port, stern, ...")
+        list[str] | None,
+        typer.Option(help="A thruster that does not turn, or is weak: stern, bow=0.5."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

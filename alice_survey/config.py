@@ -2,6 +2,7 @@
 
 import math
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -21,6 +22,7 @@ from alice_survey.seawater import GREEN_NM, n_water
 Jerlov = Literal["I", "II", "III", "1C", "3C", "5C", "7C", "9C"]
 Latitude = Annotated[float, Field(ge=-85, le=85)]
 Longitude = Annotated[float, Field(ge=-180, le=180)]
+Share = Annotated[float, Field(ge=0, le=1)]
 Gust = Annotated[float, Field(ge=0, le=1000)]
 
 
@@ -122,7 +124,7 @@ class VehicleConfig(Config):
     coefficients: str = "calibrated"
     controller: Literal["sway", "los"] = "sway"
     allocation: Literal["exact", "rpi"] = "exact"
-    failed_thrusters: tuple[str, ...] = ()
+    thruster_health: dict[str, Share] = {}
 
 
 class SeaConfig(Config):
@@ -295,6 +297,27 @@ def parse_current(text: str | None) -> tuple[float | None, float | None]:
             f"current {text!r}: give SPEED@DIRECTION, m/s and degrees from north that it flows "
             "towards, as 0.1@90"
         ) from None
+
+
+def parse_health(texts: Sequence[str] | None) -> dict[str, float] | None:
+    """Thrusters and what is left of them, from `NAME` (nothing) or `NAME=SHARE`; None of none.
+
+    Raises:
+        ConfigError: a share is no number.
+    """
+    if not texts:
+        return None
+    health = {}
+    for text in texts:
+        name, _, share = text.partition("=")
+        try:
+            health[name] = float(share or 0.0)
+        except ValueError:
+            raise ConfigError(
+                f"thruster {text!r}: give NAME, or NAME=SHARE of its thrust that is left, as "
+                "stern=0.5"
+            ) from None
+    return health
 
 
 def _one_line(error: ValidationError) -> str:

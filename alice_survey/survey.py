@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from alice_survey.artefacts import only_checking, read_json, read_stage
-from alice_survey.config import SurveyConfig, changed, load_config, parse_current
+from alice_survey.config import SurveyConfig, changed, load_config, parse_current, parse_health
 from alice_survey.errors import AliceError, ConfigError, WorkspaceError
 from alice_survey.executor import default_threads
 from alice_survey.summaries import SUMMARIES
@@ -51,6 +51,7 @@ class FlightChanges:
     current: str | None = None
     """SPEED@DIRECTION."""
     failed: Sequence[str] | None = None
+    """NAME of a thruster that has failed, or NAME=SHARE that is left of it."""
 
     def applied(self, config: SurveyConfig) -> SurveyConfig:
         """The survey with these changes.
@@ -62,7 +63,8 @@ class FlightChanges:
         config = changed(config, "sea", current_mps=speed, current_towards_deg=towards)
         return changed(
             config, "vehicle",
-            name=self.vehicle, controller=self.controller, failed_thrusters=self.failed or None,
+            name=self.vehicle, controller=self.controller,
+            thruster_health=parse_health(self.failed),
         )  # fmt: skip
 
 

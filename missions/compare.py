@@ -242,7 +242,7 @@ def fly_variant(
     """Fly a plan by a variant, over a level sea floor."""
     config = changed(
         config, "vehicle", name=variant.vehicle, controller=variant.controller,
-        failed_thrusters=variant.failed,
+        thruster_health=dict.fromkeys(variant.failed, 0.0),
     )  # fmt: skip
     config = changed(
         config, "sea", current_mps=case.current_mps, current_towards_deg=case.towards_deg
@@ -268,7 +268,7 @@ def fly_variant(
 def varied(setup: Setup, variant: Variant) -> Setup:
     """A mission with the variant's look-ahead and belief."""
     believed = with_equal_thrust(setup.vehicle) if variant.equal_speeds else setup.vehicle
-    gains = gains_for(believed.without(variant.failed), setup.path.speed_mps)
+    gains = gains_for(believed.weakened(dict.fromkeys(variant.failed, 0.0)), setup.path.speed_mps)
     guidance = pilot_guidance(
         gains,
         setup.path,

@@ -95,7 +95,7 @@ def flight_summary(flight: Flight, config: SurveyConfig) -> dict[str, Any]:
         "controller": config.vehicle.controller,
         "coefficients": config.vehicle.coefficients,
         "allocation": config.vehicle.allocation,
-        "failed_thrusters": list(config.vehicle.failed_thrusters),
+        "thruster_health": config.vehicle.thruster_health,
         "ending": flight.ending,
         "duration_s": float(flown.time_s[-1]),
         "stations": len(flight.trigger_s),

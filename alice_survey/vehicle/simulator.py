@@ -7,14 +7,13 @@ five Runge-Kutta steps of 10 ms.
 
 import math
 import sys
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path as FilePath
 from typing import NamedTuple
 
 import numpy as np
 
-from alice_survey.errors import VehicleError
 from alice_survey.frames import Array, attitude_from_rotation
 from alice_survey.vehicle import signals
 from alice_survey.vehicle.allocation import (
@@ -57,6 +56,7 @@ from alice_survey.vehicle.propulsion import (
     electrical_power,
     speeds_for,
     thrust_limits,
+    weakened,
 )
 from alice_survey.vehicle.sea import Current, Disturbance, current_at
 from alice_survey.vehicle.vehicle import Vehicle
@@ -88,7 +88,7 @@ class Allocation(NamedTuple):
     axes: Array
     """(6,) weight of each axis; 0 where none is asked for."""
     health: Array
-    """(n,) 1 of a sound thruster, 0 of a failed one."""
+    """(n,) 1 of a sound thruster, 0 of a failed one, see `weakened`."""
     lower: Array
     upper: Array
     weights: Array
@@ -238,8 +238,8 @@ class Setup:
     current: Current
     disturbance: Disturbance
     exact_allocation: bool = True
-    failed: tuple[str, ...] = ()
-    """Names of thrusters that do not turn."""
+    health: Mapping[str, float] = field(default_factory=dict)
+    """What a thruster has left of its greatest speed squared: 0 failed; sound if not named."""
     believed: Vehicle | None = None
     """What the allocation takes the vehicle for, with as many thrusters; the vehicle itself if not
     given."""
@@ -306,7 +306,7 @@ def simulate(
             ones; `rng` if not given.
 
     Raises:
-        VehicleError: a failed thruster is not one of the vehicle's.
+        VehicleError: a thruster that is named is not one of the vehicle's.
     """
     from alice_survey.executor import progress
 
@@ -337,6 +337,8 @@ def _chunks(
 ) -> Iterator[Rows]:
     """Rows of a minute each, until the mission is over."""
     vehicle, n = setup.vehicle, len(setup.vehicle.thrusters)
+    plant = vehicle.plant
+    plant = Plant(plant.body, weakened(plant.propulsion, vehicle.health_of(setup.health)))
     world = _new_world(setup, n)
     navigation = new_navigation(setup.sensors, world.now, rng)
     pilot, allocation, scratch = new_pilot(), _allocation(setup), scratch_for(n)
@@ -348,7 +350,7 @@ def _chunks(
     for first in range(0, last, _CHUNK_TICKS):
         rows = _new_rows(min(_CHUNK_TICKS, last - first), n)
         flown = _fly_ticks(
-            first, vehicle.plant, sea, setup.floor, setup.sensors, navigation, setup.path,
+            first, plant, sea, setup.floor, setup.sensors, navigation, setup.path,
             setup.guidance, setup.gains, pilot, allocation, world, scratch, rng, sea_rng,
             rows,
         )  # fmt: skip
@@ -370,14 +372,8 @@ def _new_world(setup: Setup, thrusters: int) -> World:
 
 
 def _allocation(setup: Setup) -> Allocation:
-    names = [thruster.name for thruster in setup.vehicle.thrusters]
-    for name in setup.failed:
-        if name not in names:
-            raise VehicleError(
-                f"{setup.vehicle.name} has no thruster {name!r}; it has {', '.join(names)}"
-            )
-    n = len(names)
-    health = np.array([float(name not in setup.failed) for name in names])
+    n = len(setup.vehicle.thrusters)
+    health = setup.vehicle.health_of(setup.health)
     believed = setup.believed or setup.vehicle
     matrix = np.ascontiguousarray(believed.configuration_matrix)
     return Allocation(

@@ -1,6 +1,6 @@
 """A vehicle as a value: rigid body, coefficients and thrusters, and what follows from them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -122,7 +122,38 @@ class Vehicle:
         """The same vehicle with another set."""
         return replace(self, coefficients=coefficients)
 
+    def health_of(self, left: Mapping[str, float]) -> Array:
+        """Share of its greatest speed squared that each thruster has left, (n,).
+
+        Args:
+            left: by thruster, 0 failed to 1 sound; sound when not named.
+
+        Raises:
+            VehicleError: a thruster is not known.
+        """
+        names = [thruster.name for thruster in self.thrusters]
+        for name in left:
+            if name not in names:
+                raise VehicleError(
+                    f"{self.name} has no thruster {name!r}; it has {', '.join(names)}"
+                )
+        return np.array([left.get(name, 1.0) for name in names])
+
     def without(self, thrusters: Sequence[str]) -> "Vehicle":
         """The same vehicle with some thrusters taken off."""
-        kept = tuple(t for t in self.thrusters if t.name not in thrusters)
+        return self.weakened(dict.fromkeys(thrusters, 0.0))
+
+    def weakened(self, left: Mapping[str, float]) -> "Vehicle":
+        """The same vehicle with weaker thrusters, and without those that have failed.
+
+        Args:
+            left: as in `health_of`.
+
+        Raises:
+            VehicleError: a thruster is not known.
+        """
+        pairs = zip(self.thrusters, self.health_of(left).tolist(), strict=True)
+        kept = tuple(
+            replace(t, most_rps=t.most_rps * share**0.5) for t, share in pairs if share > 0
+        )
         return replace(self, thrusters=kept)

@@ -96,7 +96,7 @@ def test_altitude_is_held_over_a_slope() -> None:
 
 @pytest.mark.parametrize("thruster", ["starboard", "port", "bow", "stern"])
 def test_with_one_thruster_failed_she_still_flies_the_survey(thruster: str) -> None:
-    flight = fly(survey(vehicle={"failed_thrusters": [thruster]}))
+    flight = fly(survey(vehicle={"thruster_health": {thruster: 0.0}}))
     turns = flight.flown.rps[:, flight.flown.thrusters.index(thruster)]
     assert np.all(turns == 0.0)
     assert flight.ending == "complete"
@@ -104,9 +104,19 @@ def test_with_one_thruster_failed_she_still_flies_the_survey(thruster: str) -> N
     assert 0.002 < rms(flight.line_errors[0]) < 0.2
 
 
+def test_weak_thrusters_push_no_more_than_is_left_of_them() -> None:
+    weak = {"bow": 0.3, "starboard": 0.3}
+    flight = fly(survey(vehicle={"thruster_health": weak}))
+    fastest = dict(zip(flight.flown.thrusters, np.abs(flight.flown.rps).max(axis=0), strict=True))
+    assert fastest["bow"] <= 56.5 * 0.3**0.5 + 1e-9
+    assert fastest["starboard"] <= 50.0 * 0.3**0.5 + 1e-9
+    assert flight.ending == "complete"
+    assert 0.002 < rms(flight.line_errors[0]) < 0.12
+
+
 def test_without_the_vertical_thruster_she_cannot_dive_and_says_so() -> None:
     with pytest.raises(VehicleError, match="cannot control heave"):
-        fly(survey(vehicle={"failed_thrusters": ["vertical"]}))
+        fly(survey(vehicle={"thruster_health": {"vertical": 0.0}}))
 
 
 def test_the_original_vehicle_flies_by_heading_alone() -> None:

@@ -23,7 +23,7 @@ STILL = Disturbance()
 GUSTS = Disturbance(sigma=(3.0, 3.0, 3.0, 0.0, 0.0, 0.0))
 
 
-def setup(disturbance: Disturbance = STILL, failed: tuple[str, ...] = ()) -> Setup:
+def setup(disturbance: Disturbance = STILL, failed: str | None = None) -> Setup:
     """A line of 6 m, 2 m above a floor at 5 m."""
     craft = vehicle("alice")
     path = path_from_legs([(0.0, 0.0)], [0.3], [6.0], [0.0], [0], 2.0, 0.2)
@@ -37,7 +37,7 @@ def setup(disturbance: Disturbance = STILL, failed: tuple[str, ...] = ()) -> Set
         floor=level_floor(5.0),
         current=CURRENT,
         disturbance=disturbance,
-        failed=failed,
+        health={} if failed is None else {failed: 0.0},
         start_heading_rad=0.3,
     )
 
@@ -131,12 +131,10 @@ def test_a_mission_that_takes_too_long_is_broken_off_where_it_is() -> None:
 
 def test_an_unknown_thruster_cannot_fail() -> None:
     with pytest.raises(VehicleError, match=r"no thruster 'warp'; it has starboard, port"):
-        simulate(setup(failed=("warp",)), np.random.default_rng(1), longest_s=1.0, label="test")
+        simulate(setup(failed="warp"), np.random.default_rng(1), longest_s=1.0, label="test")
 
 
 def test_a_failed_thruster_does_not_turn() -> None:
-    flown = simulate(
-        setup(failed=("stern",)), np.random.default_rng(1), longest_s=120.0, label="test"
-    )
+    flown = simulate(setup(failed="stern"), np.random.default_rng(1), longest_s=120.0, label="test")
     assert np.all(flown.state[:, STATE + 4] == 0.0)
     assert np.abs(flown.state[:, STATE + 3]).max() > 1.0
