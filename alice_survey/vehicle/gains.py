@@ -109,8 +109,11 @@ def gains_for(
         omega, rate, place = placed(lag_s, decay, fastest_rad_s)
         axes[axis, [RATE, PLACE]] = rate, place
         axes[axis, INNER] = min(rate, 1.0 / (4.0 * lag_s)) if axis == SWAY else rate
-        axes[axis, INTEGRAL] = INTEGRAL_SHARE * omega * place
-        axes[axis, FASTEST] = _steady_speed(plant.body, degree, STEADY_SHARE * weakest)
+        axes[axis, FASTEST] = fastest = _steady_speed(plant.body, degree, STEADY_SHARE * weakest)
+        moving = np.zeros(6)
+        moving[degree] = fastest
+        most_decay = float(linear_damping(plant.body, moving)[degree, degree]) / inertia
+        axes[axis, INTEGRAL] = place * min(INTEGRAL_SHARE * omega, place / (rate + most_decay))
         axes[axis, [LAG, BANDWIDTH]] = lag_s, omega
     axes[YAW, FASTEST] = min(axes[YAW, FASTEST], most_turn_rad_s)
     return Gains(plant.body, axes)

@@ -53,6 +53,8 @@ __all__ = [
 ]  # fmt: skip
 
 _DEPTH_SPEED_KEPT_MPS = 0.05
+_CAUTION_M = 0.5
+"""A dive without sight of the bottom stops this far above the greatest depth."""
 _SETTLE_S = 2.0
 _QUICKEST = 2.0
 """Progress along the path by the wanted speed, at most: a projection may not jump."""
@@ -120,6 +122,8 @@ def steer(
             if phase == ASCEND:
                 report[told.PHASE] = DONE
     write_wrench(gains, pilot, wrench)
+    if guidance.sway == 0.0:
+        wrench[1] = 0.0
 
 
 @kernel
@@ -138,12 +142,12 @@ def _abort(reason: int, estimate: Array, pilot: PilotState) -> None:
 
 @kernel
 def _target_m(path: Path, guidance: Guidance, pilot: PilotState) -> float:
-    """Wanted depth of the origin: as deep as is allowed until the bottom is heard.
+    """Wanted depth of the origin: almost as deep as is allowed until the bottom is heard.
 
     The smoothed sum of depth and altitude holds by how much the followed point is below the origin.
     """
     if pilot.memory[told.FLOOR_KNOWN] == 0.0:
-        return float(guidance.limits.most_depth_m)
+        return float(guidance.limits.most_depth_m - _CAUTION_M)
     return float(pilot.memory[told.FLOOR] - path.altitude_m)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from alice_survey.errors import VehicleError
 from alice_survey.frames import Array
+from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.gains import (
     BANDWIDTH,
     FASTEST,
@@ -34,6 +35,7 @@ HULL_LENGTH_M = 1.6
 LOS_DAMPING_RATIO = 0.5
 """Least of the path loop of `los` (inferred: one overshoot of a sixth)."""
 _LATERAL = [1, 5]
+_STRAIGHT_PER_M = 1e-9
 _LOOK_AHEADS_M = (0.1, 100.0)
 
 
@@ -56,7 +58,8 @@ class Guidance(NamedTuple):
     way_in_m: float
     """Straight way before the path's start."""
     smooth_m: float
-    """The path's heading is averaged this far back and ahead, so that turns begin gently."""
+    """The path's heading is averaged this far back and ahead, so that turns begin gently: as far as
+    the vehicle goes, in the tightest turn, while its heading loop settles."""
     brake_mps2: float
     """Deceleration before turns that need a lower speed."""
     floor_rate_rad_s: float
@@ -107,6 +110,8 @@ def pilot_guidance(
         if not 0.0 < value < math.inf:
             raise VehicleError(f"the {name} is {value:g} m: it must be positive")
     weakest = min(-axes[SURGE, LEAST], axes[SURGE, MOST])
+    tightest = float(np.abs(path.curvature_per_m).max())
+    turning = turning_speed_mps(gains, tightest, abs(point_body_m[0]) if by_sway else 0.0)
     return Guidance(
         sway=float(by_sway),
         point_body_m=np.array(point_body_m, np.float64),
@@ -116,12 +121,35 @@ def pilot_guidance(
         lost_m=5.0 * HULL_LENGTH_M,
         capture_m=0.2 if by_sway else 1.0,
         way_in_m=HULL_LENGTH_M if by_sway else 3.0 * look_ahead_m,
-        smooth_m=speed / float(axes[YAW, BANDWIDTH]),
+        smooth_m=min(speed, turning) / float(axes[YAW, BANDWIDTH]),
         brake_mps2=STEADY_SHARE * weakest / float(axes[SURGE, MASS]),
         floor_rate_rad_s=2.0 * speed / terrain_smoothing_m,
         surface_m=0.3,
         limits=limits or Limits(0.5 * path.altitude_m, most_depth_m),
     )
+
+
+@kernel
+def turning_speed_mps(gains: Gains, curvature_per_m: float, lever_m: float) -> float:
+    """Greatest speed at which a curvature asks for no more yaw and sway than there is.
+
+    While the followed point goes round an arc with its heading along it, the origin, behind it,
+    sways outwards by curvature times speed times the lever.
+
+    Args:
+        gains: of the vehicle.
+        curvature_per_m: of the path, not negative.
+        lever_m: how far the followed point is ahead of the origin; 0 where sway is not controlled.
+
+    Returns:
+        Infinite on a straight.
+    """
+    if curvature_per_m < _STRAIGHT_PER_M:
+        return math.inf
+    speed = gains.axes[YAW, FASTEST] / curvature_per_m
+    if lever_m > 0.0:
+        speed = min(speed, gains.axes[SWAY, FASTEST] / (curvature_per_m * lever_m))
+    return float(speed)
 
 
 def los_loop(gains: Gains, speed_mps: float, lever_m: float, look_ahead_m: float) -> Array:

@@ -7,6 +7,7 @@ from alice_survey.frames import Array
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.pilot import (
     BEST,
+    FLOOR_KNOWN,
     LOST_S,
     LOW_S,
     PHASE,
@@ -33,7 +34,7 @@ REASONS = {
     NONE: "not aborted",
     TOO_LOW: "the altitude stayed below the least that is allowed",
     TOO_STEEP: "the pitch stayed beyond the most that is allowed",
-    NO_BOTTOM: "the DVL lost the bottom for longer than is allowed",
+    NO_BOTTOM: "the DVL did not hear the bottom for longer than is allowed",
     NO_DIVE: "the dive came no nearer to the wanted altitude",
     NO_APPROACH: "the vehicle came no nearer to the start of the path",
     NO_PROGRESS: "the vehicle made no progress along the path",
@@ -124,7 +125,9 @@ def watch(
     if memory[LOST_S] > limits.lost_bottom_s:
         return NO_BOTTOM
     if memory[SINCE_BEST_S] > limits.stuck_s:
-        return NO_DIVE if phase == DIVE else (NO_APPROACH if phase == APPROACH else NO_PROGRESS)
+        if phase == DIVE:
+            return NO_DIVE if memory[FLOOR_KNOWN] > 0.0 else NO_BOTTOM
+        return NO_APPROACH if phase == APPROACH else NO_PROGRESS
     if time_s > limits.longest_s:
         return TOO_LONG
     return NONE

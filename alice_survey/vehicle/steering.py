@@ -19,7 +19,7 @@ from alice_survey.vehicle.control import (
     sum_bound,
 )
 from alice_survey.vehicle.gains import BANDWIDTH, FASTEST, HEAVE, SURGE, SWAY, YAW, Gains
-from alice_survey.vehicle.guidance_settings import Guidance
+from alice_survey.vehicle.guidance_settings import Guidance, turning_speed_mps
 from alice_survey.vehicle.path import LEAST_SLANT, Path, heading_at, place_at
 from alice_survey.vehicle.pilot import PilotState
 from alice_survey.vehicle.rotations import wrapped
@@ -38,7 +38,6 @@ _HOVER_M = 2.0
 """Nearer than this a vehicle with sway hovers towards its goal instead of heading for it."""
 _HOVER_SHARE = 0.25
 """Bandwidth of keeping place by surge, by that of the surge loop."""
-_STRAIGHT_PER_M = 1e-9
 
 
 @kernel
@@ -308,33 +307,17 @@ def _mean_heading(path: Path, leg: int, along_m: float, window_m: float) -> floa
 
 
 @kernel
-def _allowed_speed(path: Path, guidance: Guidance, gains: Gains, curvature: float) -> float:
-    """Greatest speed at which a curvature asks for no more yaw and sway than there is.
-
-    While the followed point goes round an arc with its heading along it, the origin, behind it,
-    sways outwards by curvature times speed times the lever.
-    """
-    k = abs(curvature)
-    if k < _STRAIGHT_PER_M:
-        return path.speed_mps
-    speed = min(path.speed_mps, gains.axes[YAW, FASTEST] / k)
-    lever = abs(guidance.point_body_m[0])
-    if guidance.sway > 0.0 and lever > 0.0:
-        speed = min(speed, gains.axes[SWAY, FASTEST] / (k * lever))
-    return float(speed)
-
-
-@kernel
 def _wanted_speed(
     path: Path, guidance: Guidance, gains: Gains, leg: int, along_m: float, curvature: float
 ) -> float:
     """The speed now, low enough to brake before the turns ahead."""
-    speed = _allowed_speed(path, guidance, gains, curvature)
+    lever = abs(guidance.point_body_m[0]) if guidance.sway > 0.0 else 0.0
+    speed = min(path.speed_mps, turning_speed_mps(gains, abs(curvature), lever))
     distance = path.length_m[leg] - along_m - guidance.smooth_m
     reach = path.speed_mps * path.speed_mps / (2.0 * guidance.brake_mps2)
     following = leg + 1
     while following < path.length_m.shape[0] and distance < reach:
-        there = _allowed_speed(path, guidance, gains, path.curvature_per_m[following])
+        there = turning_speed_mps(gains, abs(path.curvature_per_m[following]), lever)
         braking = 2.0 * guidance.brake_mps2 * max(distance, 0.0)
         speed = min(speed, math.sqrt(there * there + braking))
         distance += path.length_m[following]

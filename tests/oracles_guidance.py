@@ -1,0 +1,143 @@
+"""Slow, obvious twins of the guidance and control kernels."""
+
+import math
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from alice_survey.frames import Array
+from alice_survey.vehicle import gains as g
+from alice_survey.vehicle import pilot as told
+from alice_survey.vehicle import signals
+from alice_survey.vehicle.dynamics import coriolis_matrix, damping_matrix
+from alice_survey.vehicle.gains import Gains
+from alice_survey.vehicle.guidance import Guidance
+from alice_survey.vehicle.path import Path
+
+
+def walked(path: Path, leg: int, along_m: float, steps: int = 20000) -> tuple[Array, float]:
+    """Place and heading on a leg by walking along it in small steps; straight beyond its ends."""
+    on = min(max(along_m, 0.0), path.length_m[leg])
+    middles = (np.arange(steps) + 0.5) * on / steps
+    headings = path.heading_rad[leg] + path.curvature_per_m[leg] * middles
+    place = np.array([path.start_n[leg], path.start_e[leg]])
+    place = place + on / steps * np.array([np.cos(headings).sum(), np.sin(headings).sum()])
+    heading = path.heading_rad[leg] + path.curvature_per_m[leg] * on
+    return place + (along_m - on) * np.array([math.cos(heading), math.sin(heading)]), heading
+
+
+def nearest(path: Path, leg: int, place: Array, count: int = 20001) -> float:
+    """Distance along a leg of its point nearest to a place, by trying many."""
+    along = np.linspace(0.0, path.length_m[leg], count)
+    heading = path.heading_rad[leg] + path.curvature_per_m[leg] * along / 2
+    chord = along * np.sinc(path.curvature_per_m[leg] * along / (2 * math.pi))
+    n = path.start_n[leg] + chord * np.cos(heading) - place[0]
+    e = path.start_e[leg] + chord * np.sin(heading) - place[1]
+    return float(along[np.argmin(n**2 + e**2)])
+
+
+def mean_heading(path: Path, at_m: float, window_m: float, count: int = 20001) -> float:
+    """Heading averaged over a window about a distance along the whole path, by many samples."""
+    begins = np.append(path.begins_m, path.begins_m[-1] + path.length_m[-1])
+    at = np.clip(np.linspace(at_m - window_m, at_m + window_m, count), 0.0, begins[-1])
+    leg = np.clip(np.searchsorted(begins, at, side="right") - 1, 0, len(path.length_m) - 1)
+    headings = path.heading_rad[leg] + path.curvature_per_m[leg] * (at - begins[leg])
+    return float(headings.mean())
+
+
+def point_motion(estimate: Array, guidance: Guidance) -> tuple[Array, Array]:
+    """Place in NED and level velocity (ahead, to starboard) of the followed point.
+
+    The velocity leaves out what roll and pitch rates add.
+    """
+    roll, pitch, heading = estimate[signals.ROLL : signals.HEADING + 1]
+    ned_from_body = Rotation.from_euler("ZYX", [heading, pitch, roll])
+    place = estimate[:3] + ned_from_body.apply(guidance.point_body_m)
+    level_from_body = Rotation.from_euler("ZYX", [0.0, pitch, roll])
+    q, r = estimate[signals.Q], estimate[signals.R]
+    turn = (math.sin(roll) * q + math.cos(roll) * r) / math.cos(pitch)
+    lever = level_from_body.apply(guidance.point_body_m)
+    velocity = level_from_body.apply(estimate[signals.U : signals.W + 1])
+    velocity = velocity + np.cross([0.0, 0.0, turn], lever)
+    return place, velocity[:2]
+
+
+def wrench(gains: Gains, demand: Array) -> Array:
+    """The wrench that a demand stands for, by matrices."""
+    body = gains.body
+    nu, rate = np.zeros(6), np.zeros(6)
+    nu[list(g.DEGREES)] = demand[told.REF_SURGE : told.REF_SURGE + 4]
+    rate[list(g.DEGREES)] = demand[told.ACC_SURGE : told.ACC_SURGE + 4]
+    force = body.mass @ rate + coriolis_matrix(body.mass, nu) @ nu + damping_matrix(body, nu) @ nu
+    force[2] -= body.weight_n - body.buoyancy_n
+    result = np.zeros(6)
+    for axis, degree in enumerate(g.DEGREES):
+        result[degree] = np.clip(force[degree], *gains.axes[axis, [g.LEAST, g.MOST]])
+    return result
+
+
+def follow_demand(
+    estimate: Array, path: Path, guidance: Guidance, gains: Gains, along_m: float
+) -> tuple[Array, float]:
+    """Accelerations of surge, sway and yaw that a pilot without memory asks for on the first leg.
+
+    For a straight first leg, at a distance along it further than the smoothing from its end.
+
+    Returns:
+        (3,) and the cross-track error.
+    """
+    place, (surge, sway) = point_motion(estimate, guidance)
+    start, beta = np.array([path.start_n[0], path.start_e[0]]), path.heading_rad[0]
+    tangent = np.array([math.cos(beta), math.sin(beta)])
+    normal = np.array([-math.sin(beta), math.cos(beta)])
+    cross = float((place[:2] - start) @ normal)
+    heading, roll, pitch = (estimate[i] for i in (signals.HEADING, signals.ROLL, signals.PITCH))
+    q, r = estimate[signals.Q], estimate[signals.R]
+    turn = (math.sin(roll) * q + math.cos(roll) * r) / math.cos(pitch)
+    course = heading - beta
+    sway_row, yaw_row, surge_row = gains.axes[g.SWAY], gains.axes[g.YAW], gains.axes[g.SURGE]
+    by_sway = guidance.sway > 0 and abs(cross) < guidance.near_m
+    if by_sway:
+        wanted, feed = beta, 0.0
+    else:
+        aim = start + (along_m + guidance.look_ahead_m) * tangent
+        wanted = math.atan2(*(aim - place[:2])[::-1])
+        drift = surge * math.sin(course) + sway * math.cos(course)
+        feed = -drift * guidance.look_ahead_m / (guidance.look_ahead_m**2 + cross**2)
+    error = math.remainder(wanted - heading, 2 * math.pi)
+    push = np.clip(yaw_row[g.PLACE] / yaw_row[g.INNER] * error, *yaw_row[g.FASTEST] * PLUS_MINUS)
+    yaw = yaw_row[g.RATE] * (feed + push - turn)
+    if by_sway:
+        speed = path.speed_mps * max(math.cos(course), 0.0)
+        inner = sway_row[g.INNER]
+        k_p, k_d = sway_row[g.PLACE] / inner, sway_row[g.RATE] / inner - 1.0
+        error_v = cross * math.cos(course)  # paper, eq. los_sway_e
+        along_path = -path.speed_mps * math.sin(course)
+        required = along_path - np.clip(k_p * error_v, *sway_row[g.FASTEST] * PLUS_MINUS)
+        required -= k_d * (sway - along_path)
+        sideways = inner * (required - sway) - guidance.point_body_m[0] * yaw
+    else:
+        speed = path.speed_mps * max(math.cos(error), 0.0)
+        sideways = 0.0
+        if guidance.sway > 0:
+            sideways = -sway_row[g.RATE] * sway - guidance.point_body_m[0] * yaw
+    return np.array([surge_row[g.RATE] * (speed - surge), sideways, yaw]), cross
+
+
+PLUS_MINUS = np.array([-1.0, 1.0])
+
+
+def smoothed_floor(heard_m: Array, rate_rad_s: float, dt_s: float) -> Array:
+    """Depths that a critically damped second-order tracker follows, by its transfer function.
+
+    (2 w s + w^2) / (s + w)^2, from rest at the first value, integrated on a ten times finer grid.
+    """
+    from scipy.signal import lsim
+
+    fine = 10
+    steps = (len(heard_m) - 1) * fine + 1
+    time_s = np.arange(steps) * dt_s / fine
+    held = np.repeat(heard_m, fine)[:steps] - heard_m[0]
+    system = ([2 * rate_rad_s, rate_rad_s**2], [1.0, 2 * rate_rad_s, rate_rad_s**2])
+    result: Array = lsim(system, held, time_s)[1][::fine] + heard_m[0]
+    return result
