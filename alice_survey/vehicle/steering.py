@@ -30,7 +30,8 @@ HEADING_KEPT_RAD = math.radians(10.0)
 """Nearer than these a depth or heading counts as kept."""
 _AT_REST = 0.1
 """Below this share of the greatest speed an axis is not on its way. Integrals learn while a depth
-or heading is kept, or stays wrong; on the way to a new one they would only wind up."""
+or heading is kept, or stays wrong, but no faster than at the edge of being kept; on the way to a
+new one they would only wind up."""
 _MOST_SURPRISE_M = 1.0
 """A greater step of the sea floor is believed at this rate only: it may be a false echo, and a
 ledge is not to be dived from at once."""
@@ -98,7 +99,8 @@ def sink_to(
         most,
     )
     if abs(error) < DEPTH_KEPT_M or abs(pilot.point[told.SINK_SPEED]) < _AT_REST * most:
-        step = place_sum_step(gains, HEAVE, error, demand[told.FULL_HEAVE], dt_s)
+        near = clamped(error, DEPTH_KEPT_M)
+        step = place_sum_step(gains, HEAVE, near, demand[told.FULL_HEAVE], dt_s)
         memory[told.HEAVE_SUM] = clamped(memory[told.HEAVE_SUM] + step, sum_bound(gains, HEAVE))
     pilot.report[told.WANTED_DEPTH] = depth_m
 
@@ -135,7 +137,8 @@ def head_for(
     demand[told.ACC_YAW] = accelerate + quicken
     off = abs(pilot.point[told.TURN_SPEED] - feed)
     if abs(error) < HEADING_KEPT_RAD or off < _AT_REST * most:
-        step = place_sum_step(gains, YAW, error, demand[told.FULL_YAW], dt_s)
+        near = clamped(error, HEADING_KEPT_RAD)
+        step = place_sum_step(gains, YAW, near, demand[told.FULL_YAW], dt_s)
         memory[told.YAW_SUM] = clamped(memory[told.YAW_SUM] + step, sum_bound(gains, YAW))
     pilot.report[told.WANTED_HEADING] = heading
     return error

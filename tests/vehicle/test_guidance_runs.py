@@ -186,6 +186,9 @@ def test_no_bottom_within_the_depth_allowed_ends_the_dive() -> None:
     assert rows.phases() == [DIVE, ABORT]
     assert rows.report[-1, told.REASON] == safety.NO_BOTTOM
     assert 39.0 < rows.estimate[:, signals.DEPTH].max() < 40.0
+    # From rest to a depth far away: the speed is the one allowed, and no integral winds up.
+    sinking = np.diff(rows.estimate[400:2000, signals.DEPTH]) / 0.05
+    assert 0.8 < sinking.mean() / flight.gains.axes[g.HEAVE, g.FASTEST] < 1.05
 
 
 @pytest.mark.parametrize("slope", [-0.1, 0.1])
