@@ -168,7 +168,10 @@ def _data(
             "altitude_m": plan.altitude_m,
         },
         "seeds": list(seeds),
-        "variants": {variant.name: asdict(variant) for variant in VARIANTS},
+        "variants": {
+            variant.name: {**asdict(variant), "failed": list(variant.failed)}
+            for variant in VARIANTS
+        },
         "cases": [
             {
                 "current": result.case.name,
