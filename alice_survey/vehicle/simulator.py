@@ -51,6 +51,7 @@ from alice_survey.vehicle.navigation import (
     navigation_tick,
     new_navigation,
 )
+from alice_survey.vehicle.pilot import AT_SURFACE, PHASE
 from alice_survey.vehicle.propulsion import (
     Propulsion,
     electrical_power,
@@ -207,7 +208,7 @@ def _fly_ticks(
         )
         log_row(navigation, rows.navigation[k])
         flown += 1
-        if pilot.report[0] == signals.DONE:
+        if pilot.report[PHASE] == signals.DONE or pilot.report[AT_SURFACE] == 1.0:
             break
 
         for i in range(STATE):
