@@ -18,8 +18,8 @@ import numpy as np
 
 from alice_survey.config import SurveyConfig, changed
 from alice_survey.vehicle.floor import FloorGrid, level_floor
-from alice_survey.vehicle.pilot import PHASE, REASON
-from alice_survey.vehicle.safety import NONE
+from alice_survey.vehicle.pilot.memory import PHASE, REASON
+from alice_survey.vehicle.pilot.safety import NONE
 from alice_survey.vehicle.signals import DONE
 from alice_survey.vehicle.simulator import Setup, simulate
 from camera_calib.rig import design_rig

@@ -22,9 +22,9 @@ from alice_survey.frames import Array
 from alice_survey.vehicle import signals
 from alice_survey.vehicle.dynamics import GRAVITY, STATE
 from alice_survey.vehicle.floor import level_floor
-from alice_survey.vehicle.gains import gains_for
-from alice_survey.vehicle.guidance_settings import pilot_guidance
-from alice_survey.vehicle.pilot import CROSS, PATH_HEADING, PHASE
+from alice_survey.vehicle.pilot.gains import gains_for
+from alice_survey.vehicle.pilot.memory import CROSS, PATH_HEADING, PHASE
+from alice_survey.vehicle.pilot.settings import pilot_guidance
 from alice_survey.vehicle.propulsion import add_thrust
 from alice_survey.vehicle.simulator import Flown, Setup, simulate
 from alice_survey.vehicle.swell import with_swell

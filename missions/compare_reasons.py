@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from alice_survey.vehicle.fleet import vehicle
-from alice_survey.vehicle.guidance_settings import los_offset_m
+from alice_survey.vehicle.pilot.settings import los_offset_m
 from missions.compare import (
     EQUAL,
     IMPROVED,
@@ -119,9 +119,10 @@ def _about_improved(results: Sequence[CaseResult]) -> list[str]:
         )
     reasons.append(
         "The paper's 0.12 m must be what its navigation saw (inferred: it had no other measure), "
-        "and so compares with the smaller figure. Swell, which moves the water to and fro faster "
-        "than the thrusters follow, makes up part of the difference; its height there is not told. "
-        "Hand-set gains and the lag of real instruments, which these lack, are left (inferred)"
+        "and so compares with the smaller figure. Swell, which moves the water to and fro nearly "
+        "as fast as the sway loop can answer, makes up part of the difference; how high it was is "
+        "not told. Gains set by hand and instruments that lag, of which this simulation has "
+        "neither, may be the rest (inferred)"
     )
     return reasons
 
@@ -129,6 +130,7 @@ def _about_improved(results: Sequence[CaseResult]) -> list[str]:
 def _about_roll(results: Sequence[CaseResult]) -> list[str]:
     craft = vehicle("sparus2")
     peaks = [result.summaries[ORIGINAL]["turn_roll_peak_deg"]["mean"] for result in results]
+    alike = [result.summaries[EQUAL]["turn_roll_peak_deg"]["mean"] for result in results]
     torques = [result.summaries[ORIGINAL]["turn_torque_peak_nm"]["mean"] for result in results]
     improved = [result.summaries[IMPROVED]["turn_roll_peak_deg"]["mean"] for result in results]
     low, high = (righting_moment(craft, angle) for angle in PAPER[ORIGINAL]["roll_in_turns_deg"])
@@ -140,7 +142,8 @@ def _about_roll(results: Sequence[CaseResult]) -> list[str]:
     angle = math.degrees(math.asin(min(limit / righting, 1.0)))
     needed_mm = stability_mm * limit / righting_moment(craft, 25.0)
     return [
-        f"roll in turns, original: {span(peaks, 1)} deg (paper 20 to 30). The propellers' torque "
+        f"roll in turns, original: {span(peaks, 1)} deg, with equal and opposite propeller speeds "
+        f"{span(alike, 1)} deg (paper 20 to 30). The propellers' torque "
         f"peaks at {span(torques, 2)} N m; 20 to 30 deg need {low:.1f} to {high:.1f} N m with the "
         f"centre of gravity {stability_mm:.1f} mm below that of buoyancy (public model). Even at "
         f"{60 * abs(most[0]):.0f} rpm, one ahead and one astern, both propellers twist the hull by "
@@ -155,15 +158,16 @@ def _about_surge(results: Sequence[CaseResult]) -> str:
     craft = vehicle("sparus2")
     rps, wrench = opposed_turn(craft, PAPER_TURN_DEG_S)
     drag = -craft.coefficients.quadratic[0, 0]
+    ratio = min(t.kt_reverse / t.kt_forward for t in craft.thrusters if t.kind == "open")
     steady = math.sqrt(max(float(wrench[0]), 0.0) / drag)
-    plain = [r.summaries[ORIGINAL]["turn_surge_worst_mps"]["mean"] for r in results]
-    opposed = [r.summaries[EQUAL]["turn_surge_worst_mps"]["mean"] for r in results]
+    plain = [r.summaries[ORIGINAL]["turn_surge_peak_mps"]["mean"] for r in results]
+    opposed = [r.summaries[EQUAL]["turn_surge_peak_mps"]["mean"] for r in results]
     return (
-        f"surge in turns, at most, original: {span(plain, 2)} m/s; with equal and opposite "
+        f"surge in turns, mean peak, original: {span(plain, 2)} m/s; with equal and opposite "
         f"propeller speeds {span(opposed, 2)} m/s (paper 0.3 to 0.5). Turning at "
         f"{PAPER_TURN_DEG_S:g} deg/s by {60 * rps:.0f} rpm ahead and astern leaves "
         f"{wrench[0]:.1f} N of surge, {steady:.2f} m/s if it lasted: propellers push astern "
-        "0.42 times as hard as ahead. Our allocation knows that and asks for unequal speeds, and "
+        f"{ratio:.2f} times as hard as ahead. Our allocation knows that and asks for unequal speeds, and "
         "our surge loop slows the rest"
     )
 

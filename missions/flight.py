@@ -8,7 +8,7 @@ import numpy as np
 
 from alice_survey.frames import Array, attitude_from_rotation
 from alice_survey.trajectory import Trajectory
-from alice_survey.vehicle.pilot import CROSS
+from alice_survey.vehicle.pilot.memory import CROSS
 from alice_survey.vehicle.simulator import Flown
 from missions.navigation import NavigationLog
 from missions.plan_file import Plan

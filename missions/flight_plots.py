@@ -14,9 +14,10 @@ from matplotlib.transforms import ScaledTranslation
 from scipy.spatial.transform import Rotation
 
 from alice_survey.frames import Array
-from alice_survey.vehicle import navigation, signals
+from alice_survey.vehicle import signals
 from alice_survey.vehicle.fleet import vehicle
-from alice_survey.vehicle.pilot import PHASE, WANTED_SURGE
+from alice_survey.vehicle.navigation import tick as navigation
+from alice_survey.vehicle.pilot.memory import PHASE, WANTED_SURGE
 from alice_survey.vehicle.simulator import Flown
 from missions.flight import Flight
 from missions.flight_records import rpm_of, true_velocity

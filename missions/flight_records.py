@@ -7,9 +7,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.config import SurveyConfig
 from alice_survey.frames import Array, rotation_from_attitude
-from alice_survey.vehicle import navigation, signals
+from alice_survey.vehicle import signals
 from alice_survey.vehicle.log import VehicleLog, vehicle_log
-from alice_survey.vehicle.pilot import PHASE
+from alice_survey.vehicle.navigation import tick as navigation
+from alice_survey.vehicle.pilot.memory import PHASE
 from alice_survey.vehicle.simulator import Flown
 from missions.flight import Flight
 from missions.logs.bag import BagRecord, Samples

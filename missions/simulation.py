@@ -9,26 +9,28 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.config import SeaConfig, SurveyConfig
 from alice_survey.frames import Array, rotation_from_attitude
 from alice_survey.trajectory import Trajectory
-from alice_survey.vehicle import navigation, signals
+from alice_survey.vehicle import signals
 from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.floor import FloorGrid
-from alice_survey.vehicle.gains import gains_for
-from alice_survey.vehicle.guidance import Path, path_from_legs, pilot_guidance
-from alice_survey.vehicle.pilot import LINE, PHASE, REASON
-from alice_survey.vehicle.safety import NONE, REASONS, Limits
+from alice_survey.vehicle.navigation import tick as navigation
+from alice_survey.vehicle.navigation.sensors import (
+    CompassSpec,
+    DvlSpec,
+    GpsSpec,
+    SensorSuite,
+    UsblSpec,
+)
+from alice_survey.vehicle.pilot.gains import gains_for
+from alice_survey.vehicle.pilot.memory import LINE, PHASE, REASON
+from alice_survey.vehicle.pilot.path import Path, path_from_legs
+from alice_survey.vehicle.pilot.safety import NONE, REASONS, Limits
+from alice_survey.vehicle.pilot.settings import pilot_guidance
 from alice_survey.vehicle.sea import (
     Current,
     Disturbance,
     read_current,
     sheared_current,
     varying_current,
-)
-from alice_survey.vehicle.sensors import (
-    CompassSpec,
-    DvlSpec,
-    GpsSpec,
-    SensorSuite,
-    UsblSpec,
 )
 from alice_survey.vehicle.simulator import Flown, Setup, simulate
 from missions.flight import Flight, trigger_times

@@ -6,13 +6,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from alice_survey.frames import Array
-from alice_survey.vehicle import gains as g
-from alice_survey.vehicle import pilot as told
 from alice_survey.vehicle import signals
 from alice_survey.vehicle.dynamics import coriolis_matrix, damping_matrix
-from alice_survey.vehicle.gains import Gains
-from alice_survey.vehicle.guidance import Guidance
-from alice_survey.vehicle.path import Path
+from alice_survey.vehicle.pilot import gains as g
+from alice_survey.vehicle.pilot import memory as told
+from alice_survey.vehicle.pilot.gains import Gains
+from alice_survey.vehicle.pilot.path import Path
+from alice_survey.vehicle.pilot.settings import Guidance
 
 
 def walked(path: Path, leg: int, along_m: float, steps: int = 20000) -> tuple[Array, float]:

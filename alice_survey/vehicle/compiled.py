@@ -22,7 +22,7 @@ def kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Res
     # were compiled into it may have changed: here it is kept as long as the whole package stays.
     # A numba that stores its stamp elsewhere falls back to its own rule, which is enough for a
     # package that is installed and not edited.
-    index = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
+    index: Any = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
     if hasattr(index, "_source_stamp"):
         index._source_stamp = _package_stamp()
     kept: Callable[_Arguments, _Result] = compiled

@@ -16,14 +16,10 @@ import numpy as np
 
 from alice_survey.frames import Array, attitude_from_rotation
 from alice_survey.vehicle import signals
-from alice_survey.vehicle.allocation import (
-    AXIS_WEIGHTS,
-    AllocationScratch,
-    allocate_exact,
-    allocate_rpi,
-    allocation_scratch,
-    preference_weights,
-)
+from alice_survey.vehicle.allocation.exact import allocate_exact
+from alice_survey.vehicle.allocation.preference import AXIS_WEIGHTS, preference_weights
+from alice_survey.vehicle.allocation.rpi import allocate_rpi
+from alice_survey.vehicle.allocation.scratch import AllocationScratch, allocation_scratch
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.dynamics import (
     STATE,
@@ -34,24 +30,14 @@ from alice_survey.vehicle.dynamics import (
     scratch_for,
 )
 from alice_survey.vehicle.floor import FloorGrid
-from alice_survey.vehicle.guidance import (
-    REPORT,
-    Gains,
-    Guidance,
-    Path,
-    PilotState,
-    new_pilot,
-    steer,
-)
-from alice_survey.vehicle.navigation import (
-    LOG_ROW,
-    NavigationState,
-    Sensors,
-    log_row,
-    navigation_tick,
-    new_navigation,
-)
-from alice_survey.vehicle.pilot import AT_SURFACE, PHASE
+from alice_survey.vehicle.navigation.sensors import Sensors
+from alice_survey.vehicle.navigation.state import NavigationState, new_navigation
+from alice_survey.vehicle.navigation.tick import LOG_ROW, log_row, navigation_tick
+from alice_survey.vehicle.pilot.gains import Gains
+from alice_survey.vehicle.pilot.guidance import steer
+from alice_survey.vehicle.pilot.memory import AT_SURFACE, PHASE, REPORT, PilotState, new_pilot
+from alice_survey.vehicle.pilot.path import Path
+from alice_survey.vehicle.pilot.settings import Guidance
 from alice_survey.vehicle.propulsion import (
     Propulsion,
     electrical_power,

@@ -17,7 +17,7 @@ from alice_survey.config import SurveyConfig, changed, parse_config
 from alice_survey.errors import ConfigError
 from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.floor import level_floor
-from alice_survey.vehicle.guidance_settings import los_offset_m
+from alice_survey.vehicle.pilot.settings import los_offset_m
 from alice_survey.vehicle.simulator import Flown, Setup, simulate
 from camera_calib.rig import design_rig
 from missions.compare import (

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from alice_survey.config import parse_config
-from alice_survey.vehicle import navigation
 from alice_survey.vehicle.floor import level_floor
+from alice_survey.vehicle.navigation import tick as navigation
 from camera_calib.rig import design_rig
 from missions import flight_plots
 from missions.flight import Flight

@@ -11,11 +11,12 @@ from alice_survey.vehicle import signals
 from alice_survey.vehicle.dynamics import STATE, rk4_step, scratch_for
 from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.floor import level_floor
-from alice_survey.vehicle.gains import gains_for
-from alice_survey.vehicle.guidance import path_from_legs, pilot_guidance
-from alice_survey.vehicle.pilot import PHASE
+from alice_survey.vehicle.navigation.sensors import SensorSuite
+from alice_survey.vehicle.pilot.gains import gains_for
+from alice_survey.vehicle.pilot.memory import PHASE
+from alice_survey.vehicle.pilot.path import path_from_legs
+from alice_survey.vehicle.pilot.settings import pilot_guidance
 from alice_survey.vehicle.sea import Disturbance, constant_current
-from alice_survey.vehicle.sensors import SensorSuite
 from alice_survey.vehicle.simulator import STEPS, TICK_S, Flown, Setup, simulate
 
 CURRENT = constant_current(0.1, 60.0)

@@ -23,7 +23,8 @@ Four choices keep the covariance honest over hours:
 import math
 
 from alice_survey.vehicle.compiled import kernel
-from alice_survey.vehicle.navigation_state import (
+from alice_survey.vehicle.navigation.sensors import BEAMS, DVL, IMU, PRESSURE, Sensors
+from alice_survey.vehicle.navigation.state import (
     ATTITUDE,
     BEAM,
     BELIEVED,
@@ -56,7 +57,6 @@ from alice_survey.vehicle.navigation_state import (
     NavigationState,
 )
 from alice_survey.vehicle.rotations import matrix_of, turn, wrapped
-from alice_survey.vehicle.sensors import BEAMS, DVL, IMU, PRESSURE, Sensors
 
 DOUBT_AFTER = (50, 50, 40, 40, 6, 6)
 """Rejections in a row, of each instrument, after which the filter doubts itself: 5 s of compass and

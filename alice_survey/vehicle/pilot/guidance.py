@@ -16,26 +16,23 @@ FOLLOW the path; ASCEND; DONE. ABORT, from any phase but the last two, is an asc
 import math
 
 from alice_survey.frames import Array
-from alice_survey.vehicle import pilot as told
 from alice_survey.vehicle import signals
 from alice_survey.vehicle.compiled import kernel
-from alice_survey.vehicle.control import write_wrench
-from alice_survey.vehicle.gains import HEAVE, LEAST, STEADY_SHARE, Gains
-from alice_survey.vehicle.guidance_settings import Guidance, los_offset_m, pilot_guidance
-from alice_survey.vehicle.path import Path, advance, path_from_legs, place_at
-from alice_survey.vehicle.pilot import REPORT, PilotState, new_pilot
-from alice_survey.vehicle.safety import (
+from alice_survey.vehicle.pilot import memory as told
+from alice_survey.vehicle.pilot.control import write_wrench
+from alice_survey.vehicle.pilot.gains import HEAVE, LEAST, STEADY_SHARE, Gains
+from alice_survey.vehicle.pilot.memory import PilotState
+from alice_survey.vehicle.pilot.path import Path, advance, place_at
+from alice_survey.vehicle.pilot.safety import (
     LOST_PATH,
     NO_NAVIGATION,
     NONE,
-    REASONS,
-    Limits,
     navigates,
     restart_watch,
     watch,
 )
-from alice_survey.vehicle.signals import ABORT, APPROACH, ASCEND, DIVE, DONE, FOLLOW
-from alice_survey.vehicle.steering import (
+from alice_survey.vehicle.pilot.settings import Guidance
+from alice_survey.vehicle.pilot.steering import (
     DEPTH_KEPT_M,
     HEADING_KEPT_RAD,
     follow,
@@ -46,11 +43,7 @@ from alice_survey.vehicle.steering import (
     surge_at,
     tell_point,
 )
-
-__all__ = [
-    "REASONS", "REPORT", "Gains", "Guidance", "Limits", "Path", "PilotState", "los_offset_m",
-    "new_pilot", "path_from_legs", "pilot_guidance", "steer",
-]  # fmt: skip
+from alice_survey.vehicle.signals import ABORT, APPROACH, ASCEND, DIVE, DONE, FOLLOW
 
 _DEPTH_SPEED_KEPT_MPS = 0.05
 _CAUTION_M = 0.5

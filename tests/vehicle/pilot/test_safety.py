@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from alice_survey.frames import Array
-from alice_survey.vehicle import gains as g
-from alice_survey.vehicle import pilot as told
-from alice_survey.vehicle import safety, signals
-from alice_survey.vehicle.guidance import steer
-from alice_survey.vehicle.pilot import PilotState, new_pilot
-from alice_survey.vehicle.safety import REASONS, Limits
-from tests.vehicle.pilot_runs import Flight, launch, straight
+from alice_survey.vehicle import signals
+from alice_survey.vehicle.pilot import gains as g
+from alice_survey.vehicle.pilot import memory as told
+from alice_survey.vehicle.pilot import safety
+from alice_survey.vehicle.pilot.guidance import steer
+from alice_survey.vehicle.pilot.memory import PilotState, new_pilot
+from alice_survey.vehicle.pilot.safety import REASONS, Limits
+from tests.vehicle.pilot.pilot_runs import Flight, launch, straight
 
 LIMITS = Limits(1.0, 20.0, math.radians(30.0), 20.0, 90.0, 3.0, 5000.0)
 TICK_S = 0.05

@@ -8,22 +8,22 @@ depend on the yaw that was asked for.
 import math
 
 from alice_survey.frames import Array
-from alice_survey.vehicle import pilot as told
 from alice_survey.vehicle import signals
 from alice_survey.vehicle.compiled import kernel
-from alice_survey.vehicle.control import (
+from alice_survey.vehicle.pilot import memory as told
+from alice_survey.vehicle.pilot.control import (
     clamped,
     place_demand,
     place_sum_step,
     speed_demand,
     sum_bound,
 )
-from alice_survey.vehicle.gains import BANDWIDTH, FASTEST, HEAVE, SURGE, SWAY, YAW, Gains
-from alice_survey.vehicle.guidance_settings import Guidance, turning_speed_mps
-from alice_survey.vehicle.path import LEAST_SLANT, Path, heading_at, place_at
-from alice_survey.vehicle.pilot import PilotState
+from alice_survey.vehicle.pilot.gains import BANDWIDTH, FASTEST, HEAVE, SURGE, SWAY, YAW, Gains
+from alice_survey.vehicle.pilot.memory import PilotState
+from alice_survey.vehicle.pilot.path import LEAST_SLANT, Path, heading_at, place_at
+from alice_survey.vehicle.pilot.safety import restart_watch
+from alice_survey.vehicle.pilot.settings import Guidance, turning_speed_mps
 from alice_survey.vehicle.rotations import wrapped
-from alice_survey.vehicle.safety import restart_watch
 
 DEPTH_KEPT_M = 0.2
 HEADING_KEPT_RAD = math.radians(10.0)

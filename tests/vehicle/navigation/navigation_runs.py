@@ -8,15 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.floor import FloorGrid
-from alice_survey.vehicle.navigation import (
-    LOG_ROW,
-    NavigationState,
-    log_row,
-    navigation_tick,
-    new_navigation,
-)
-from alice_survey.vehicle.navigation_state import GYRO_BIAS, WATER
-from alice_survey.vehicle.sensors import IMU, Sensors
+from alice_survey.vehicle.navigation.sensors import IMU, Sensors
+from alice_survey.vehicle.navigation.state import GYRO_BIAS, WATER, NavigationState, new_navigation
+from alice_survey.vehicle.navigation.tick import LOG_ROW, log_row, navigation_tick
 
 Array = NDArray[np.float64]
 TICK_S = 0.05

@@ -7,12 +7,12 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from alice_survey.frames import Array
-from alice_survey.vehicle import control
-from alice_survey.vehicle import gains as g
-from alice_survey.vehicle import pilot as told
-from alice_survey.vehicle.pilot import new_pilot
+from alice_survey.vehicle.pilot import control
+from alice_survey.vehicle.pilot import gains as g
+from alice_survey.vehicle.pilot import memory as told
+from alice_survey.vehicle.pilot.memory import new_pilot
 from tests import oracles_guidance as oracle
-from tests.vehicle.pilot_runs import gains_of
+from tests.vehicle.pilot.pilot_runs import gains_of
 
 DEMANDS = arrays(np.float64, 8, elements=st.floats(-0.6, 0.6))
 

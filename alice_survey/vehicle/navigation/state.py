@@ -7,7 +7,7 @@ import numpy as np
 
 from alice_survey.errors import VehicleError
 from alice_survey.frames import Array
-from alice_survey.vehicle.sensors import IMU, Sensors
+from alice_survey.vehicle.navigation.sensors import IMU, Sensors
 from alice_survey.vehicle.signals import ESTIMATE
 
 POSITION, VELOCITY, ATTITUDE, GYRO_BIAS, ACCELEROMETER_BIAS = 0, 3, 6, 9, 12

@@ -10,22 +10,25 @@ from hypothesis.extra.numpy import arrays
 
 from alice_survey.errors import VehicleError
 from alice_survey.frames import Array
-from alice_survey.vehicle import gains as g
-from alice_survey.vehicle import pilot as told
 from alice_survey.vehicle import signals
-from alice_survey.vehicle.guidance import Guidance, Path, los_offset_m, pilot_guidance, steer
-from alice_survey.vehicle.guidance_settings import (
+from alice_survey.vehicle.pilot import gains as g
+from alice_survey.vehicle.pilot import memory as told
+from alice_survey.vehicle.pilot.guidance import steer
+from alice_survey.vehicle.pilot.memory import PilotState, new_pilot
+from alice_survey.vehicle.pilot.path import Path, place_at
+from alice_survey.vehicle.pilot.settings import (
     HULL_LENGTH_M,
     LOS_DAMPING_RATIO,
+    Guidance,
     damping_ratio,
     los_loop,
+    los_offset_m,
+    pilot_guidance,
     shortest_look_ahead_m,
 )
-from alice_survey.vehicle.path import place_at
-from alice_survey.vehicle.pilot import PilotState, new_pilot
-from alice_survey.vehicle.steering import hear_floor, tell_point
+from alice_survey.vehicle.pilot.steering import hear_floor, tell_point
 from tests import oracles_guidance as oracle
-from tests.vehicle.pilot_runs import gains_of, launch, lawnmower, straight
+from tests.vehicle.pilot.pilot_runs import gains_of, launch, lawnmower, straight
 
 TICK_S = 0.05
 MOTIONS = arrays(np.float64, 12, elements=st.floats(-1.0, 1.0))

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from alice_survey.frames import Array
-from alice_survey.vehicle import gains as g
-from alice_survey.vehicle import pilot as told
-from alice_survey.vehicle import safety, signals
-from alice_survey.vehicle.guidance import los_offset_m
+from alice_survey.vehicle import signals
+from alice_survey.vehicle.pilot import gains as g
+from alice_survey.vehicle.pilot import memory as told
+from alice_survey.vehicle.pilot import safety
+from alice_survey.vehicle.pilot.settings import los_offset_m
 from alice_survey.vehicle.signals import ABORT, APPROACH, ASCEND, DIVE, DONE, FOLLOW
-from tests.vehicle.pilot_runs import Rows, launch, lawnmower, straight
+from tests.vehicle.pilot.pilot_runs import Rows, launch, lawnmower, straight
 
 
 def rms(values: Array) -> float:

@@ -11,7 +11,15 @@ import numpy as np
 from alice_survey.frames import Array
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.floor import FloorGrid
-from alice_survey.vehicle.measuring import (
+from alice_survey.vehicle.navigation.filter import (
+    correct,
+    lever_row,
+    use_beams,
+    use_depth,
+    use_fix,
+    use_heading,
+)
+from alice_survey.vehicle.navigation.measuring import (
     drift,
     measure_depth,
     measure_dvl,
@@ -22,16 +30,9 @@ from alice_survey.vehicle.measuring import (
     measure_usbl,
     usbl_sigma,
 )
-from alice_survey.vehicle.navigation_filter import (
-    correct,
-    lever_row,
-    use_beams,
-    use_depth,
-    use_fix,
-    use_heading,
-)
-from alice_survey.vehicle.navigation_prediction import predict
-from alice_survey.vehicle.navigation_state import (
+from alice_survey.vehicle.navigation.prediction import predict
+from alice_survey.vehicle.navigation.sensors import BEAMS, DVL, FOLLOWED, GPS, IMU, USBL, Sensors
+from alice_survey.vehicle.navigation.state import (
     ALTITUDE_NOW,
     ALTITUDE_PING,
     ALTITUDE_SIGMA,
@@ -59,23 +60,9 @@ from alice_survey.vehicle.navigation_state import (
     USED,
     VELOCITY,
     NavigationState,
-    estimation_error,
-    new_navigation,
 )
 from alice_survey.vehicle.rotations import matrix_of, wrapped
-from alice_survey.vehicle.sensors import BEAMS, DVL, FOLLOWED, GPS, IMU, USBL, Sensors
 from alice_survey.vehicle.signals import ALTITUDE, ESTIMATE, HEADING, P, U
-
-__all__ = [
-    "LOG_COLUMNS",
-    "LOG_ROW",
-    "NavigationState",
-    "Sensors",
-    "estimation_error",
-    "log_row",
-    "navigation_tick",
-    "new_navigation",
-]
 
 LOG_COLUMNS = (
     "north_m", "east_m", "depth_m", "roll_rad", "pitch_rad", "heading_rad",

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from alice_survey.vehicle.floor import FloorGrid, level_floor
-from alice_survey.vehicle.navigation import LOG_COLUMNS
-from alice_survey.vehicle.sensors import FOLLOWED, DvlSpec, SensorSuite, UsblSpec
-from tests.vehicle.navigation_runs import Array, Run, fly, straight, track
+from alice_survey.vehicle.navigation.sensors import FOLLOWED, DvlSpec, SensorSuite, UsblSpec
+from alice_survey.vehicle.navigation.tick import LOG_COLUMNS
+from tests.vehicle.navigation.navigation_runs import Array, Run, fly, straight, track
 
 RUNS = 50
 DURATION_S = 600.0

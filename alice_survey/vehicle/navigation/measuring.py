@@ -12,7 +12,8 @@ from alice_survey.frames import Array
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.dynamics import GRAVITY
 from alice_survey.vehicle.floor import FloorGrid, floor_range
-from alice_survey.vehicle.navigation_state import (
+from alice_survey.vehicle.navigation.sensors import BEAMS, DVL, GPS, IMU, PRESSURE, USBL, Sensors
+from alice_survey.vehicle.navigation.state import (
     ACCELEROMETER_BIAS,
     BEAM,
     DEPTH,
@@ -44,7 +45,6 @@ from alice_survey.vehicle.navigation_state import (
     NavigationState,
 )
 from alice_survey.vehicle.rotations import matrix_of, turn_between
-from alice_survey.vehicle.sensors import BEAMS, DVL, GPS, IMU, PRESSURE, USBL, Sensors
 
 
 @kernel

@@ -8,7 +8,6 @@ from typing import Literal
 import numpy as np
 
 from alice_survey.frames import Array
-from alice_survey.vehicle import pilot as told
 from alice_survey.vehicle import signals
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.dynamics import (
@@ -19,16 +18,12 @@ from alice_survey.vehicle.dynamics import (
     scratch_for,
 )
 from alice_survey.vehicle.fleet import vehicle
-from alice_survey.vehicle.gains import DEGREES, LAG, Gains, gains_for
-from alice_survey.vehicle.guidance import (
-    Guidance,
-    Path,
-    PilotState,
-    new_pilot,
-    path_from_legs,
-    pilot_guidance,
-    steer,
-)
+from alice_survey.vehicle.pilot import memory as told
+from alice_survey.vehicle.pilot.gains import DEGREES, LAG, Gains, gains_for
+from alice_survey.vehicle.pilot.guidance import steer
+from alice_survey.vehicle.pilot.memory import PilotState, new_pilot
+from alice_survey.vehicle.pilot.path import Path, path_from_legs
+from alice_survey.vehicle.pilot.settings import Guidance, pilot_guidance
 from alice_survey.vehicle.sea import Current, constant_current, current_at
 
 TICK_S = 0.05

@@ -9,17 +9,28 @@ from numpy.random import default_rng
 
 from alice_survey.vehicle import rotations
 from alice_survey.vehicle.floor import FloorGrid, level_floor
-from alice_survey.vehicle.measuring import measure_imu
-from alice_survey.vehicle.navigation import LOG_COLUMNS, LOG_ROW, navigation_tick
-from alice_survey.vehicle.navigation_filter import (
+from alice_survey.vehicle.navigation.filter import (
     correct,
     lever_row,
     use_beams,
     use_depth,
     use_heading,
 )
-from alice_survey.vehicle.navigation_prediction import predict
-from alice_survey.vehicle.navigation_state import (
+from alice_survey.vehicle.navigation.measuring import measure_imu
+from alice_survey.vehicle.navigation.prediction import predict
+from alice_survey.vehicle.navigation.sensors import (
+    GPS,
+    USBL,
+    CompassSpec,
+    DvlSpec,
+    GpsSpec,
+    ImuSpec,
+    PressureSpec,
+    Sensors,
+    SensorSuite,
+    UsblSpec,
+)
+from alice_survey.vehicle.navigation.state import (
     BEAM,
     BELIEVED,
     COMPASS_USE,
@@ -45,20 +56,9 @@ from alice_survey.vehicle.navigation_state import (
     NavigationState,
     new_navigation,
 )
-from alice_survey.vehicle.sensors import (
-    GPS,
-    USBL,
-    CompassSpec,
-    DvlSpec,
-    GpsSpec,
-    ImuSpec,
-    PressureSpec,
-    Sensors,
-    SensorSuite,
-    UsblSpec,
-)
+from alice_survey.vehicle.navigation.tick import LOG_COLUMNS, LOG_ROW, navigation_tick
 from tests import oracles_navigation as oracle
-from tests.vehicle.navigation_runs import TICK_S, Array, fly, straight, track
+from tests.vehicle.navigation.navigation_runs import TICK_S, Array, fly, straight, track
 
 FLOOR = level_floor(15.0)
 TINY = 1e-9

@@ -8,7 +8,7 @@ import numpy as np
 from alice_survey.errors import VehicleError
 from alice_survey.frames import Array
 from alice_survey.vehicle.compiled import kernel
-from alice_survey.vehicle.gains import (
+from alice_survey.vehicle.pilot.gains import (
     BANDWIDTH,
     FASTEST,
     LAG,
@@ -25,8 +25,8 @@ from alice_survey.vehicle.gains import (
     linear_coriolis,
     linear_damping,
 )
-from alice_survey.vehicle.path import Path
-from alice_survey.vehicle.safety import Limits
+from alice_survey.vehicle.pilot.path import Path
+from alice_survey.vehicle.pilot.safety import Limits
 
 LEFT_PORT_BODY_M = (0.55, -0.05, 0.08)
 """The left port's outer glass, as the default rig has it."""

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from alice_survey.frames import Array
 from alice_survey.vehicle.compiled import kernel
-from alice_survey.vehicle.pilot import (
+from alice_survey.vehicle.pilot.memory import (
     BEST,
     FLOOR_KNOWN,
     LOST_S,

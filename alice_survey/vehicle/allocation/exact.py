@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.frames import Array
-from alice_survey.vehicle.allocation_scratch import AllocationScratch
+from alice_survey.vehicle.allocation.scratch import AllocationScratch
 from alice_survey.vehicle.compiled import kernel
 
 _FREE, _HELD, _FIXED = 0, 1, 2

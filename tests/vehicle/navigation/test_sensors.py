@@ -12,8 +12,19 @@ from scipy.spatial.transform import Rotation
 from alice_survey.errors import VehicleError
 from alice_survey.vehicle import rotations
 from alice_survey.vehicle.floor import FloorGrid, level_floor
-from alice_survey.vehicle.measuring import measure_dvl, measure_imu, solve_beams
-from alice_survey.vehicle.navigation_state import (
+from alice_survey.vehicle.navigation.measuring import measure_dvl, measure_imu, solve_beams
+from alice_survey.vehicle.navigation.sensors import (
+    DVL,
+    IMU,
+    CompassSpec,
+    DvlSpec,
+    GpsSpec,
+    PressureSpec,
+    Sensors,
+    SensorSuite,
+    janus_beams,
+)
+from alice_survey.vehicle.navigation.state import (
     BEAM,
     DVL_VELOCITY,
     PUSH,
@@ -25,18 +36,7 @@ from alice_survey.vehicle.navigation_state import (
     NavigationState,
     new_navigation,
 )
-from alice_survey.vehicle.sensors import (
-    DVL,
-    IMU,
-    CompassSpec,
-    DvlSpec,
-    GpsSpec,
-    PressureSpec,
-    Sensors,
-    SensorSuite,
-    janus_beams,
-)
-from tests.vehicle.navigation_runs import TICK_S, Array, fly, straight, track
+from tests.vehicle.navigation.navigation_runs import TICK_S, Array, fly, straight, track
 
 angles = st.floats(-3.0, 3.0)
 vectors = st.tuples(angles, angles, angles).map(np.array)

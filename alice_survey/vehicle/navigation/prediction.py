@@ -8,7 +8,8 @@ import math
 from alice_survey.frames import Array
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.dynamics import GRAVITY
-from alice_survey.vehicle.navigation_state import (
+from alice_survey.vehicle.navigation.sensors import Sensors
+from alice_survey.vehicle.navigation.state import (
     ACCELEROMETER_BIAS,
     ATTITUDE,
     BELIEVED,
@@ -34,7 +35,6 @@ from alice_survey.vehicle.navigation_state import (
     NavigationState,
 )
 from alice_survey.vehicle.rotations import matrix_of, turn
-from alice_survey.vehicle.sensors import Sensors
 
 MANOEUVRE_S = 5.0
 """How long the vehicle accelerates one way: half a turn of ALICE at 17 deg/s (paper, section VII)

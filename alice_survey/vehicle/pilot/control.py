@@ -9,17 +9,8 @@ left to the integrals.
 from alice_survey.frames import Array
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.dynamics import add_coriolis, add_damping
-from alice_survey.vehicle.gains import (
-    INNER,
-    INTEGRAL,
-    LEAST,
-    MASS,
-    MOST,
-    PLACE,
-    RATE,
-    Gains,
-)
-from alice_survey.vehicle.pilot import ACC_SURGE, FULL_SURGE, REF_SURGE, PilotState
+from alice_survey.vehicle.pilot.gains import INNER, INTEGRAL, LEAST, MASS, MOST, PLACE, RATE, Gains
+from alice_survey.vehicle.pilot.memory import ACC_SURGE, FULL_SURGE, REF_SURGE, PilotState
 
 
 @kernel

@@ -1,36 +1,12 @@
-"""Thrust allocation: which thrusters make a wrench, what both solvers share.
-
-Both are told the matrix B (6, n) of `Vehicle.configuration_matrix`, the wrench wanted (6,), the
-bounds of thrust (n,), the weights of axes (6,) and of thrusters (n,), and write the thrust (n,):
-
-- `allocate_exact`: the least weighted miss within the bounds and, of all ways to it, the least
-  weighted thrust (`allocation_exact`);
-- `allocate_rpi`: the redistributed pseudo-inverse of the paper (`allocation_rpi`).
-
-An axis of weight 0 is not asked for: of roll and pitch gravity takes care. The others decide what
-is given up when not all can be had, by the square of their weights times the square of the miss.
-A failed thruster has the bounds 0 and 0. A wrench that is not a number gives thrusts that are none.
-"""
+"""What counts most when a wrench cannot be had whole, and which thrusters are preferred."""
 
 import math
 
 import numpy as np
 
 from alice_survey.frames import Array
-from alice_survey.vehicle.allocation_exact import allocate_exact
-from alice_survey.vehicle.allocation_rpi import allocate_rpi
-from alice_survey.vehicle.allocation_scratch import AllocationScratch, allocation_scratch
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.propulsion import DISTRUST, Propulsion
-
-__all__ = [
-    "AXIS_WEIGHTS",
-    "AllocationScratch",
-    "allocate_exact",
-    "allocate_rpi",
-    "allocation_scratch",
-    "preference_weights",
-]
 
 AXIS_WEIGHTS: Array = np.array([1.0, 3.0, 30.0, 0.0, 0.0, 10.0])
 """What counts most when not all can be had. Heave keeps the vehicle off the sea floor; yaw keeps

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alice_survey.errors import VehicleError
-from alice_survey.vehicle.path import Path, advance, heading_at, path_from_legs, place_at
+from alice_survey.vehicle.pilot.path import Path, advance, heading_at, path_from_legs, place_at
 from tests import oracles_guidance as oracle
-from tests.vehicle.pilot_runs import lawnmower
+from tests.vehicle.pilot.pilot_runs import lawnmower
 
 MOWER = lawnmower(4, 5.0)
 

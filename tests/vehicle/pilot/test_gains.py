@@ -9,11 +9,17 @@ from hypothesis import strategies as st
 
 from alice_survey.errors import VehicleError
 from alice_survey.frames import Array
-from alice_survey.vehicle import gains as g
 from alice_survey.vehicle.dynamics import add_coriolis, add_damping
 from alice_survey.vehicle.fleet import vehicle
-from alice_survey.vehicle.gains import DEGREES, Gains, gains_for, linear_coriolis, linear_damping
-from tests.vehicle.pilot_runs import gains_of
+from alice_survey.vehicle.pilot import gains as g
+from alice_survey.vehicle.pilot.gains import (
+    DEGREES,
+    Gains,
+    gains_for,
+    linear_coriolis,
+    linear_damping,
+)
+from tests.vehicle.pilot.pilot_runs import gains_of
 
 AXES = [("alice", axis) for axis in range(4)] + [("sparus2", axis) for axis in (0, 2, 3)]
 

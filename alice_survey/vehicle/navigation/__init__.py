@@ -1,0 +1,1 @@
+"""Navigation: instruments, and the filter that weighs them."""

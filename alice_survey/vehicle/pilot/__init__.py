@@ -1,0 +1,1 @@
+"""The pilot: path, guidance, inner loops, gains and safety."""
