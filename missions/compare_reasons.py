@@ -167,8 +167,8 @@ def _about_surge(results: Sequence[CaseResult]) -> str:
         f"propeller speeds {span(opposed, 2)} m/s (paper 0.3 to 0.5). Turning at "
         f"{PAPER_TURN_DEG_S:g} deg/s by {60 * rps:.0f} rpm ahead and astern leaves "
         f"{wrench[0]:.1f} N of surge, {steady:.2f} m/s if it lasted: propellers push astern "
-        f"{ratio:.2f} times as hard as ahead. Our allocation knows that and asks for unequal speeds, and "
-        "our surge loop slows the rest"
+        f"{ratio:.2f} times as hard as ahead. Our allocation knows that and asks for unequal "
+        "speeds, and our surge loop slows the rest"
     )
 
 
