@@ -145,7 +145,7 @@ class SeaConfig(Config):
 
 
 class NavigationConfig(Config):
-    """How well the vehicle knows where it is; the rest of its instruments is as in `sensors`."""
+    """How well the vehicle knows where it is; the rest as in `vehicle.navigation.sensors`."""
 
     gps_bias_m: float = Field(0.03, ge=0, le=100)
     gps_noise_m: float = Field(0.02, gt=0, le=100)

@@ -1,6 +1,6 @@
 """The filter's prediction: kernels that carry belief and covariance over a tick.
 
-See `navigation_filter` for what is believed, and why so.
+See `filter` for what is believed, and why so.
 """
 
 import math
