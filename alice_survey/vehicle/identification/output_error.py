@@ -18,8 +18,8 @@ from alice_survey.errors import VehicleError
 from alice_survey.frames import Array
 from alice_survey.vehicle.identification.noise import (
     autocovariance,
-    correlated_information,
     noise_sigma,
+    score_information,
 )
 from alice_survey.vehicle.identification.parameters import Parameters
 from alice_survey.vehicle.identification.sensitivity import CHANNELS, START, simulate
@@ -44,6 +44,8 @@ _ROUGH_SHARE = 0.1
 _BLIND = 1e-3
 """Sigmas by which all residuals together move where a parameter changes by itself, or by 1 if it is
 smaller: a parameter that does less is not seen at all."""
+_HANG = 3.0
+"""Residuals are taken to hang together over so many correlation times, at most half a window."""
 _ROUNDS = 4
 """Most times that the noise is estimated anew."""
 _SAME = 0.02
@@ -72,7 +74,8 @@ class Fit:
     values: Array
     """(P,)"""
     covariance: Array
-    """(P, P) with the residuals' correlation in time; zero of parameters at a bound."""
+    """(P, P) with the residuals' correlation in time and across channels, where they have any; zero
+    of parameters at a bound."""
     white_covariance: Array
     """(P, P) as if the residuals were white: from the Gauss-Newton Hessian alone."""
     at_bound: Mask
@@ -246,19 +249,27 @@ class _Problem:
         free = np.flatnonzero(~at_bound)
         information = table[:, free].T @ table[:, free]
         inverse = _inverse(information, [self.parameters.names[k] for k in free])
-        runs, slopes = self._by_channel(residuals), self._by_channel(table[:, free])
-        meat, times = np.zeros_like(information), np.full(CHANNELS, np.nan)
-        sigma = self._channel_sigma(runs)
-        spread = self._freedom(runs)
-        for channel in range(CHANNELS):
-            if not any(len(run) for run in runs[channel]):
-                continue
-            lags = autocovariance(runs[channel]) * spread
-            meat += correlated_information(slopes[channel], lags)
-            times[channel] = self._step_s(channel) * float(np.sum(lags[1:])) / max(lags[0], 1e-300)
-        meat += self._prior(table[:, free])
+        runs, times = self._by_channel(residuals), np.full(CHANNELS, np.nan)
+        sigma, spread = self._channel_sigma(runs), self._freedom(runs)
+        for channel, series in enumerate(runs):
+            if any(len(run) for run in series):
+                lags = autocovariance(series)
+                times[channel] = self._step_s(channel) * float(np.sum(lags[1:])) / lags[0]
+        coloured = inverse
+        longest_s = float(np.nanmax(times))
+        if longest_s > 0:
+            scores = self._scores(residuals[:, None] * table[:, free])
+            lasting_s = min(_HANG * longest_s, 0.5 * self._window_s())
+            blocks = max(self._row_s() * sum(len(run) for run in scores) / lasting_s, 2.0)
+            meat = score_information(scores, round(lasting_s / self._row_s()))
+            # Few stretches that have nothing to do with one another tell their own spread badly.
+            meat *= spread * blocks / (blocks - 1.0)
+            coloured = inverse @ (meat + self._prior(table[:, free])) @ inverse
+            # By chance it may come out below that of white noise: such luck is not claimed.
+            least = np.sqrt(np.maximum(np.diag(inverse) / np.diag(coloured), 1.0))
+            coloured *= np.outer(least, least)
         covariance, white = (np.zeros((self.count, self.count)) for _ in range(2))
-        covariance[np.ix_(free, free)] = inverse @ meat @ inverse
+        covariance[np.ix_(free, free)] = coloured
         white[np.ix_(free, free)] = inverse
         return Fit(
             parameters=self.parameters, values=values, covariance=covariance,
@@ -340,6 +351,27 @@ class _Problem:
                 channels[channel].append(part[place == channel])
             begin += size + START
         return channels
+
+    def _scores(self, table: Array) -> list[Array]:
+        """Sums of a table's rows by row of the log, (T, P) of each window."""
+        sums, begin = [], 0
+        for mask in self.measured:
+            size = int(mask.sum())
+            rows = np.zeros((len(mask), table.shape[1]))
+            np.add.at(rows, np.nonzero(mask)[0], table[begin : begin + size])
+            sums.append(rows)
+            begin += size + START
+        return sums
+
+    def _window_s(self) -> float:
+        """Median duration of the windows."""
+        spans = [w.record.time_s[-1] - w.record.time_s[0] for w in self.windows]
+        return float(np.median(spans))
+
+    def _row_s(self) -> float:
+        """Median time between rows."""
+        steps = np.concatenate([np.diff(window.record.time_s) for window in self.windows])
+        return float(np.median(steps))
 
     def _prior(self, slopes: Array) -> Array:
         """Information of the starts' priors."""

@@ -47,6 +47,8 @@ JOINT_FREE = ("X_uu", "Y_vv", "Z_ww", "N_rr", "current")
 TWO_STEP_FREE = ("X_udot", "X_uu", "Z_wdot", "Z_ww", "N_rdot", "N_rr")
 """What is free when nothing is said; the second as in the paper's three manoeuvres."""
 _HIGH_CORRELATION = 0.9
+_LASTING = 0.2
+"""Correlation time, by the length of windows, from which their sigmas are not to be trusted."""
 _POOR = 0.25
 """Relative sigma of a coefficient that the logs hardly determine."""
 
@@ -298,6 +300,7 @@ def _remarks(result: _Result) -> list[str]:
         if math.isfinite(value)
     )  # fmt: skip
     lines.append(f"residuals: {sigma}")
+    spans = [w.record.time_s[-1] - w.record.time_s[0] for w in fit.windows]
     white = np.sqrt(np.diag(fit.white_covariance))
     ratio = np.max(np.where(fit.at_bound, 1.0, fit.sigma / np.where(white > 0, white, 1.0)))
     longest = float(np.nanmax(fit.correlation_s))
@@ -306,6 +309,11 @@ def _remarks(result: _Result) -> list[str]:
             f"Residuals hang together (up to {longest:.2g} s): the model misses something or the "
             f"vehicle was pushed unseen. Sigmas allow for it (up to {ratio:.2g} times those of "
             "white noise), but not for what a wrong model shifts."
+        )
+    if longest > _LASTING * float(np.median(spans)):
+        lines.append(
+            f"They hang together over much of the {np.median(spans):.3g} s that are simulated in "
+            "one go: sigmas are too small; simulate shorter stretches (--window)"
         )
     return lines
 

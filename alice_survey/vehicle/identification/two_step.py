@@ -5,7 +5,7 @@ After the bollard pull has settled the thrust, surge, heave and turns are taken 
 averaged over a second so that the rates are those of straight lines through the velocities. Rows
 with little acceleration tell the damping of a motion, those with much its added mass. The paper's
 hand adjusted one coefficient after the other until the curves met; here each is a least-squares
-regression, and both are repeated until they agree.
+regression, and all are repeated until they agree.
 
 It needs no simulation and no start, but it takes measured velocities for true and knows no current:
 noise pulls the coefficients towards zero. The joint fit does neither.
@@ -37,7 +37,7 @@ STEPS = (("surge", "X"), ("heave", "ZM"), ("turns", "NYK"))
 """What is calibrated in turn, and the equations that tell of it."""
 _SMOOTH_S = 1.0
 """Over which the equations are averaged."""
-_PASSES, _AGREED = 30, 1e-6
+_PASSES, _AGREED = 60, 1e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -90,9 +90,9 @@ def calibrate(windows: Sequence[Window], parameters: Parameters) -> TwoStep:
     rows = _smoothed(windows, parameters)
     values, sigma = parameters.start.copy(), np.full(len(parameters.names), np.nan)
     steps = [""] * len(parameters.names)
-    for step, forces in STEPS:
-        for _ in range(_PASSES):
-            before = values.copy()
+    for _ in range(_PASSES):
+        before = values.copy()
+        for step, forces in STEPS:
             for force in forces:
                 places = [k for k, name in enumerate(parameters.names) if name[0] == force]
                 for k in places:
@@ -102,14 +102,14 @@ def calibrate(windows: Sequence[Window], parameters: Parameters) -> TwoStep:
                 for group, much in ((damping, False), (inertial, True)):
                     if group:
                         _regress(rows, parameters, values, sigma, group, much)
-            scale = np.maximum(np.abs(values), 1e-12)
-            if np.max(np.abs(values - before) / scale) < _AGREED:
-                break
-        else:
-            raise VehicleError(
-                f"added mass and damping of {step} do not agree after {_PASSES} passes: free fewer "
-                "of them, or add manoeuvres"
-            )
+        scale = np.maximum(np.abs(values), 1e-12)
+        if np.max(np.abs(values - before) / scale) < _AGREED:
+            break
+    else:
+        raise VehicleError(
+            f"added mass and damping do not agree after {_PASSES} passes: free fewer of them, or "
+            "add manoeuvres"
+        )
     return TwoStep(parameters=parameters, values=values, sigma=sigma, step=tuple(steps))
 
 

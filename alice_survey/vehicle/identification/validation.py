@@ -130,7 +130,8 @@ def validate(
                 )
             )
     return Validation(
-        source=Path(windows[0].source).name, time_s=np.concatenate([w.record.time_s for w in windows]),
+        source=Path(windows[0].source).name,
+        time_s=np.concatenate([w.record.time_s for w in windows]),
         measured=measured, simulated=np.concatenate(simulated), constant=np.concatenate(constant),
         window_s=longest, forecasts=tuple(forecasts),
     )  # fmt: skip

@@ -64,7 +64,10 @@ def fly(
         attitude_rad: to begin with.
     """
     count = len(truth.thrusters)
-    speed, towards = float(np.hypot(*current)), float(np.rad2deg(np.arctan2(current[1], current[0])))
+    speed, towards = (
+        float(np.hypot(*current)),
+        float(np.rad2deg(np.arctan2(current[1], current[0]))),
+    )
     water, scratch = constant_current(speed, towards), scratch_for(count)
     state = initial_state(np.array([0.0, 0.0, 5.0]), np.array(attitude_rad), count)
     rows = round(duration_s / ROW_S)

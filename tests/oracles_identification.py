@@ -1,0 +1,48 @@
+"""Identification a second time: slow, obvious, and by another road."""
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from alice_survey.frames import Array
+from alice_survey.vehicle.dynamics import STATE, derivative, scratch_for
+from alice_survey.vehicle.sea import constant_current
+from alice_survey.vehicle.vehicle import Vehicle
+
+
+def integrated(vehicle: Vehicle, start: Array, rps: Array, at_s: Array, load: Array) -> Array:
+    """States (T, 10), quaternion and nu, by an adaptive solver of the simulator's own equations.
+
+    Thrusters keep their speeds rps (n,); a force and moment (6,) acts besides.
+    """
+    count = len(vehicle.thrusters)
+    scratch, water = scratch_for(count), constant_current(0.0, 0.0)
+
+    def rate(time_s: float, state: Array) -> Array:
+        out = np.zeros(STATE + count)
+        derivative(time_s, state, rps, load, vehicle.plant, water, scratch, out)
+        return out
+
+    state = np.concatenate([np.zeros(3), start, rps])
+    solved = solve_ivp(rate, (at_s[0], at_s[-1]), state, t_eval=at_s, rtol=1e-11, atol=1e-12)
+    return solved.y.T[:, 3:13]
+
+
+def dense_information(run: Array, lags: Array) -> Array:
+    """S^T T S with the Toeplitz matrix T of autocovariances written out."""
+    rows = len(run)
+    matrix = np.zeros((rows, rows))
+    for i in range(rows):
+        for j in range(rows):
+            if abs(i - j) < len(lags):
+                matrix[i, j] = lags[abs(i - j)]
+    return run.T @ matrix @ run
+
+
+def numpy_observation(state: Array, current_ne: Array, bias: Array, attitude: Array) -> Array:
+    """What sensors tell of a state (10,): velocity over ground, rates, attitude error."""
+    from scipy.spatial.transform import Rotation
+
+    ned_from_body = Rotation.from_quat(state[:4])
+    ground = state[4:7] + ned_from_body.inv().apply([*current_ne, 0.0])
+    turn = Rotation.from_quat(attitude).inv() * ned_from_body
+    return np.concatenate([ground + bias[:3], state[7:] + bias[3:], turn.as_rotvec()])
