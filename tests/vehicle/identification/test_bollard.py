@@ -14,15 +14,17 @@ from alice_survey.vehicle.propulsion import add_thrust
 KNOWN = vehicle("alice")
 
 
-def pull_csv(path: Path, noise_n: float, seed: int = 0) -> Path:
-    """Readings of a pair with 0.8 of the model's k_t forward and 1.2 in reverse."""
+def pull_csv(
+    path: Path, noise_n: float, seed: int = 0, factors: tuple[float, float] = (0.8, 1.2)
+) -> Path:
+    """Readings of a pair with shares of the model's k_t forward and in reverse."""
     rng = np.random.default_rng(seed)
     rows = ["thruster,rpm,force_n"]
     for rpm in (-2400, -1800, -1200, -600, 600, 1200, 1800, 2400):
         speeds, force = np.zeros(5), np.zeros(6)
         speeds[:2] = rpm / 60
         add_thrust(KNOWN.plant.propulsion, speeds, np.zeros(6), force)
-        pulled = force[0] * (0.8 if rpm > 0 else 1.2) + rng.normal(0, noise_n)
+        pulled = force[0] * factors[0 if rpm > 0 else 1] + rng.normal(0, noise_n)
         rows.append(f"port+starboard,{rpm},{pulled:.6f}")
     path.write_text("\n".join(rows) + "\n")
     return path
