@@ -132,6 +132,7 @@ class SeaConfig(Config):
 
     The current near the sea floor; where `surface_current_mps` is set it changes evenly up to the
     surface; a slow Gauss-Markov process is added. `current_file` holds a measured series instead.
+    Swell comes on top.
     """
 
     current_mps: float = Field(0.05, ge=0, le=3)
@@ -140,6 +141,9 @@ class SeaConfig(Config):
     current_sigma_mps: float = Field(0.01, ge=0, le=1)
     current_correlation_s: float = Field(300.0, ge=1, le=1e6)
     current_file: Path | None = None
+    swell_m: float = Field(0.0, ge=0, le=20)
+    swell_period_s: float = Field(6.0, ge=1, le=30)
+    swell_towards_deg: float = Field(90.0, ge=0, lt=360)
     gust_n: tuple[Gust, Gust, Gust] = (0.5, 0.5, 0.5)
     gust_correlation_s: float = Field(2.0, ge=0.05, le=1000)
 

@@ -27,7 +27,6 @@ from alice_survey.vehicle.pilot.memory import CROSS, PATH_HEADING, PHASE
 from alice_survey.vehicle.pilot.settings import pilot_guidance
 from alice_survey.vehicle.propulsion import add_thrust
 from alice_survey.vehicle.simulator import Flown, Setup, simulate
-from alice_survey.vehicle.swell import with_swell
 from alice_survey.vehicle.vehicle import Vehicle
 from missions.flight import Flight
 from missions.flight_records import true_velocity
@@ -245,8 +244,10 @@ def fly_variant(
         thruster_health=dict.fromkeys(variant.failed, 0.0),
     )  # fmt: skip
     config = changed(
-        config, "sea", current_mps=case.current_mps, current_towards_deg=case.towards_deg
-    )
+        config, "sea", current_mps=case.current_mps, current_towards_deg=case.towards_deg,
+        swell_m=case.swell_m, swell_period_s=case.swell_s,
+        swell_towards_deg=case.swell_towards_deg % 360.0,
+    )  # fmt: skip
     config = changed(config, "camera", position_body_m=(0.0, 0.0, 0.0))
     sea = config.sea.model_copy(update={"current_file": None})
     config = config.model_copy(update={"sea": sea})
@@ -254,12 +255,6 @@ def fly_variant(
     water = np.random.default_rng([seed, _SEA])
     floor = level_floor(plan.seafloor_depth_m)
     setup = varied(mission_setup(plan, config, floor, longest_s, water), variant)
-    if case.swell_m > 0.0:
-        waves = with_swell(
-            setup.current, case.swell_m, case.swell_s, case.swell_towards_deg,
-            plan.seafloor_depth_m, longest_s,
-        )  # fmt: skip
-        setup = replace(setup, current=waves)
     chance = np.random.default_rng([seed, _CHANCE])
     flown = simulate(setup, chance, longest_s=longest_s, label="", sea_rng=water)
     return setup, flown, flight_of(plan, config, setup, flown)

@@ -33,6 +33,7 @@ from alice_survey.vehicle.sea import (
     varying_current,
 )
 from alice_survey.vehicle.simulator import Flown, Setup, simulate
+from alice_survey.vehicle.swell import with_swell
 from missions.flight import Flight, trigger_times
 from missions.navigation import NavigationLog
 from missions.plan_file import Plan
@@ -148,7 +149,23 @@ def path_of(plan: Plan) -> Path:
 def current_of(
     sea: SeaConfig, seafloor_depth_m: float, duration_s: float, rng: np.random.Generator
 ) -> Current:
-    """The current of a survey: measured, or as its settings have it."""
+    """The current of a survey: measured, or as its settings have it; with its swell."""
+    current = _current_without_swell(sea, seafloor_depth_m, duration_s, rng)
+    if sea.swell_m == 0.0:
+        return current
+    return with_swell(
+        current,
+        sea.swell_m,
+        sea.swell_period_s,
+        sea.swell_towards_deg,
+        seafloor_depth_m,
+        duration_s,
+    )
+
+
+def _current_without_swell(
+    sea: SeaConfig, seafloor_depth_m: float, duration_s: float, rng: np.random.Generator
+) -> Current:
     if sea.current_file is not None:
         return read_current(sea.current_file)
     surface = sea.current_mps if sea.surface_current_mps is None else sea.surface_current_mps

@@ -186,6 +186,23 @@ def test_a_measured_current_is_read(tmp_path: Path) -> None:
         current_of(SeaConfig(current_file=path), 20.0, 100.0, np.random.default_rng(1))
 
 
+def test_swell_moves_the_water_to_and_fro_as_linear_waves_do() -> None:
+    sea = SeaConfig(
+        current_mps=0.1, current_towards_deg=0.0, current_sigma_mps=0.0,
+        swell_m=0.5, swell_period_s=6.0, swell_towards_deg=90.0,
+    )  # fmt: skip
+    current, out = current_of(sea, 15.0, 60.0, np.random.default_rng(1)), np.zeros(6)
+    east = []
+    for time_s in np.arange(0.0, 60.0, 0.25):
+        current_at(current, float(time_s), 13.0, out)
+        east.append(out[1])
+        assert abs(out[0] - 0.1) < 1e-9
+    # omega^2 = g k tanh(k h) at 6 s over 15 m: k = 0.1233 rad/m (solved by hand).
+    expected = np.pi * 0.5 / 6.0 * np.cosh(0.1233 * 2.0) / np.sinh(0.1233 * 15.0)
+    assert 0.98 * expected < max(east) < 1.02 * expected
+    assert abs(np.mean(east)) < 0.01
+
+
 def test_a_shear_through_the_water_does_not_throw_the_vehicle_off() -> None:
     sheared = survey(
         sea={"current_mps": 0.1, "current_towards_deg": 110.0, "surface_current_mps": 0.3}
