@@ -197,8 +197,8 @@ def test_swell_moves_the_water_to_and_fro_as_linear_waves_do() -> None:
         current_at(current, float(time_s), 13.0, out)
         east.append(out[1])
         assert abs(out[0] - 0.1) < 1e-9
-    # omega^2 = g k tanh(k h) at 6 s over 15 m: k = 0.1233 rad/m (solved by hand).
-    expected = np.pi * 0.5 / 6.0 * np.cosh(0.1233 * 2.0) / np.sinh(0.1233 * 15.0)
+    # omega^2 = g k tanh(k h) at 6 s over 15 m: k = 0.11842 rad/m.
+    expected = np.pi * 0.5 / 6.0 * np.cosh(0.11842 * 2.0) / np.sinh(0.11842 * 15.0)
     assert 0.98 * expected < max(east) < 1.02 * expected
     assert abs(np.mean(east)) < 0.01
 
