@@ -15,6 +15,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from alice_survey.errors import VehicleError
+from alice_survey.executor import progress
 from alice_survey.frames import Array
 from alice_survey.vehicle.identification.noise import (
     autocovariance,
@@ -44,6 +45,9 @@ _ROUGH_SHARE = 0.1
 _BLIND = 1e-3
 """Sigmas by which all residuals together move where a parameter changes by itself, or by 1 if it is
 smaller: a parameter that does less is not seen at all."""
+_NOTICED = 2e-3
+"""Change of the sum of squares, in sigmas squared, that ends a fit: a twentieth of a sigma of one
+parameter."""
 _HANG = 3.0
 """Residuals are taken to hang together over so many correlation times, at most half a window."""
 _ROUNDS = 4
@@ -142,13 +146,16 @@ def fit_output_error(
         approach.estimate_sigma(values)
         sigma = approach.sigma
     problem = _Problem(windows, parameters, how, sigma)
-    for round_ in range(_ROUNDS if channel_sigma is None else 1):
-        last = channel_sigma is not None or round_ > 0
+    rounds = (1e2,) * _ROUNDS + (1.0,) if channel_sigma is None else (1.0,)
+    settled = False
+    for looseness in progress(rounds, "fit", len(rounds)):
+        if settled and looseness > 1.0:
+            continue
         problem.begin(values)
         result = least_squares(
             problem.residuals, np.clip(values, lower, upper), problem.jacobian,
-            bounds=(lower, upper), x_scale="jac", ftol=1e-8 if last else 1e-4, xtol=1e-10,
-            gtol=None, max_nfev=most_evaluations,
+            bounds=(lower, upper), x_scale="jac", ftol=looseness * _NOTICED / problem.samples,
+            xtol=1e-10, gtol=None, max_nfev=most_evaluations,
         )  # fmt: skip
         evaluations += result.nfev
         if result.status == 0:
@@ -157,11 +164,8 @@ def fit_output_error(
                 "parameters, or start from coefficients that are closer"
             )
         values = result.x
-        if channel_sigma is not None:
-            break
-        changed = problem.estimate_sigma(values)
-        if changed < _SAME:
-            break
+        if looseness > 1.0:
+            settled = problem.estimate_sigma(values) < _SAME
     held = result.active_mask
     values = np.where(held < 0, lower, np.where(held > 0, upper, values))
     return problem.result(values, held != 0, evaluations)
@@ -186,6 +190,7 @@ class _Problem:
         ]
         # Of the parameters whose slopes were last asked for: a trial nearby begins from there, so
         # that it comes back to the same residuals as its step goes to nothing.
+        self.samples = sum(int(mask.sum()) for mask in self.measured)
         self.starts = [window.start.copy() for window in windows]
         self.gains = [np.zeros((START, self.count)) for _ in windows]
         self.at = parameters.start.copy()
@@ -275,7 +280,7 @@ class _Problem:
             parameters=self.parameters, values=values, covariance=covariance,
             white_covariance=white, at_bound=at_bound, channel_sigma=sigma * self.sigma,
             correlation_s=times, windows=self.windows, starts=list(self.starts),
-            samples=sum(int(m.sum()) for m in self.measured), evaluations=evaluations,
+            samples=self.samples, evaluations=evaluations,
         )  # fmt: skip
 
     def _solve(self, values: Array) -> list[tuple[Array, Array, Array]] | None:
