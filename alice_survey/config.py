@@ -117,6 +117,21 @@ class PlanConfig(Config):
     run_in_m: float = Field(0.5, ge=0.1, le=20)
 
 
+class ThrusterHealth(Config):
+    """Share of its greatest thrust that each thruster has left: 0 failed, 1 sound."""
+
+    starboard: Share = 1.0
+    port: Share = 1.0
+    vertical: Share = 1.0
+    bow: Share = 1.0
+    stern: Share = 1.0
+
+    @property
+    def impaired(self) -> dict[str, float]:
+        """Those that are not sound."""
+        return {name: share for name, share in self.model_dump().items() if share < 1.0}
+
+
 class VehicleConfig(Config):
     """What flies, and how it is steered."""
 
@@ -124,7 +139,7 @@ class VehicleConfig(Config):
     coefficients: str = "calibrated"
     controller: Literal["sway", "los"] = "sway"
     allocation: Literal["exact", "rpi"] = "exact"
-    thruster_health: dict[str, Share] = {}
+    thruster_health: ThrusterHealth = ThrusterHealth()
 
 
 class SeaConfig(Config):

@@ -96,7 +96,7 @@ def flight_summary(flight: Flight, config: SurveyConfig) -> dict[str, Any]:
         "controller": config.vehicle.controller,
         "coefficients": config.vehicle.coefficients,
         "allocation": config.vehicle.allocation,
-        "thruster_health": config.vehicle.thruster_health,
+        "thruster_health": config.vehicle.thruster_health.model_dump(),
         "ending": flight.ending,
         "duration_s": float(flown.time_s[-1]),
         "stations": len(flight.trigger_s),

@@ -101,7 +101,7 @@ def mission_setup(
     craft = vehicle(config.vehicle.name, config.vehicle.coefficients)
     path = path_of(plan)
     # A failed thruster is known to the pilot, who flies as well as the others allow.
-    gains = gains_for(craft.weakened(config.vehicle.thruster_health), plan.speed_mps)
+    gains = gains_for(craft.weakened(config.vehicle.thruster_health.impaired), plan.speed_mps)
     guidance = pilot_guidance(
         gains,
         path,
@@ -126,7 +126,7 @@ def mission_setup(
             sigma=(*gust, 0.0, 0.0, 0.0), correlation_s=config.sea.gust_correlation_s
         ),
         exact_allocation=config.vehicle.allocation == "exact",
-        health=config.vehicle.thruster_health,
+        health=config.vehicle.thruster_health.impaired,
         start_ne_m=(float(start_ne[0]), float(start_ne[1])),
         start_heading_rad=heading_rad,
     )
