@@ -136,7 +136,8 @@ class VehicleConfig(Config):
     """What flies, and how it is steered."""
 
     name: Literal["alice", "sparus2"] = "alice"
-    coefficients: str = "calibrated"
+    coefficients: Literal["estimated", "cfd", "calibrated", "computed"] = "calibrated"
+    coefficients_file: Path | None = None
     controller: Literal["sway", "los"] = "sway"
     allocation: Literal["exact", "rpi"] = "exact"
     thruster_health: ThrusterHealth = ThrusterHealth()
@@ -271,7 +272,17 @@ def load_config(path: Path) -> SurveyConfig:
         settings = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from None
-    return parse_config(settings, str(path))
+    return parse_config(_with_files_beside(settings, path.parent), str(path))
+
+
+def _with_files_beside(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Settings whose relative file names count from the folder of the settings file."""
+    result = dict(settings)
+    for section, key in (("sea", "current_file"), ("vehicle", "coefficients_file")):
+        values = settings.get(section)
+        if isinstance(values, dict) and isinstance(values.get(key), str):
+            result[section] = {**values, key: str(folder / values[key])}
+    return result
 
 
 def parse_config(settings: dict[str, Any], origin: str) -> SurveyConfig:

@@ -35,13 +35,13 @@ def run_fly(workspace: Path, config: SurveyConfig, threads: int) -> bool:
         VehicleError: the vehicle took no picture at all; the message says why.
     """
     plan_path = need_stage(workspace, "plan", "plan") / "plan.json"
-    current_file = config.sea.current_file
+    files = (config.sea.current_file, config.vehicle.coefficients_file)
     stage = Stage(
         name="flight",
         version=2,
         settings={
             "seed": config.seed,
-            "vehicle": config.vehicle.model_dump(mode="json"),
+            "vehicle": config.vehicle.model_dump(mode="json", exclude={"coefficients_file"}),
             "sea": config.sea.model_dump(mode="json", exclude={"current_file"}),
             "navigation": config.navigation.model_dump(mode="json"),
             "seafloor": config.seafloor.model_dump(mode="json"),
@@ -50,7 +50,7 @@ def run_fly(workspace: Path, config: SurveyConfig, threads: int) -> bool:
             "position_body_m": list(config.camera.position_body_m),
             "dvl_position_body_m": list(config.camera.dvl_position_body_m),
         },
-        inputs=[plan_path, *([current_file] if current_file is not None else [])],
+        inputs=[plan_path, *(file for file in files if file is not None)],
     )
 
     def work(folder: Path) -> None:

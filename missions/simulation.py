@@ -6,12 +6,13 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.config import SeaConfig, SurveyConfig
+from alice_survey.config import SeaConfig, SurveyConfig, VehicleConfig
 from alice_survey.frames import Array, rotation_from_attitude
 from alice_survey.trajectory import Trajectory
 from alice_survey.vehicle import signals
 from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.floor import FloorGrid
+from alice_survey.vehicle.identification.files import coefficients_from_file
 from alice_survey.vehicle.navigation import tick as navigation
 from alice_survey.vehicle.navigation.sensors import (
     CompassSpec,
@@ -34,6 +35,7 @@ from alice_survey.vehicle.sea import (
 )
 from alice_survey.vehicle.simulator import Flown, Setup, simulate
 from alice_survey.vehicle.swell import with_swell
+from alice_survey.vehicle.vehicle import Vehicle
 from missions.flight import Flight, trigger_times
 from missions.navigation import NavigationLog
 from missions.plan_file import Plan
@@ -98,7 +100,7 @@ def mission_setup(
         longest_s: after which the vehicle gives up.
         rng: for what is drawn once a mission.
     """
-    craft = vehicle(config.vehicle.name, config.vehicle.coefficients)
+    craft = craft_of(config.vehicle)
     path = path_of(plan)
     # A failed thruster is known to the pilot, who flies as well as the others allow.
     gains = gains_for(craft.weakened(config.vehicle.thruster_health.impaired), plan.speed_mps)
@@ -130,6 +132,18 @@ def mission_setup(
         start_ne_m=(float(start_ne[0]), float(start_ne[1])),
         start_heading_rad=heading_rad,
     )
+
+
+def craft_of(settings: VehicleConfig) -> Vehicle:
+    """The vehicle of a survey, with a named set of coefficients or those of a file.
+
+    Raises:
+        VehicleError: the set is not known, or the file is not one of coefficients.
+    """
+    file = settings.coefficients_file
+    if file is None:
+        return vehicle(settings.name, settings.coefficients)
+    return vehicle(settings.name).with_coefficients(coefficients_from_file(file))
 
 
 def path_of(plan: Plan) -> Path:

@@ -7,7 +7,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from alice_survey.config import AreaConfig, PlanConfig, SurveyConfig, load_config, parse_config
+from alice_survey.config import (
+    AreaConfig,
+    PlanConfig,
+    SurveyConfig,
+    changed,
+    load_config,
+    parse_config,
+    parse_current,
+    parse_health,
+)
 from alice_survey.errors import ConfigError
 from alice_survey.seawater import n_water
 
@@ -217,3 +226,50 @@ def test_defaults_pass_their_own_bounds() -> None:
             assert type(value).model_validate(value.model_dump()) == value
     assert AreaConfig() == SurveyConfig().area
     assert PlanConfig() == SurveyConfig().plan
+
+
+def test_files_named_in_settings_lie_beside_them(tmp_path: Path) -> None:
+    path = tmp_path / "survey.toml"
+    path.write_text(
+        '[sea]\ncurrent_file = "adcp.csv"\n[vehicle]\ncoefficients_file = "/far/found.json"\n'
+    )
+    config = load_config(path)
+    assert config.sea.current_file == tmp_path / "adcp.csv"
+    assert config.vehicle.coefficients_file == Path("/far/found.json")
+
+
+def test_thrusters_have_their_health_by_name() -> None:
+    config = parse_config({"vehicle": {"thruster_health": {"stern": 0.0, "bow": 0.5}}}, "test")
+    assert config.vehicle.thruster_health.impaired == {"stern": 0.0, "bow": 0.5}
+    with pytest.raises(ConfigError, match=r"thruster_health.warp is not a known setting"):
+        parse_config({"vehicle": {"thruster_health": {"warp": 0.0}}}, "test")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"), [("0.1@90", (0.1, 90.0)), ("1@-10", (1.0, 350.0)), (None, (None, None))]
+)
+def test_a_current_is_read_from_its_text(
+    text: str | None, expected: tuple[float | None, float | None]
+) -> None:
+    assert parse_current(text) == expected
+
+
+@pytest.mark.parametrize("text", ["abc", "0.1", "0.1@", "@90", "0.1@north", ""])
+def test_a_current_that_is_none_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match="SPEED@DIRECTION"):
+        parse_current(text)
+
+
+def test_a_changed_setting_is_checked_like_one_in_the_file() -> None:
+    config = parse_config({}, "test")
+    assert changed(config, "sea", current_mps=0.3, current_towards_deg=None).sea.current_mps == 0.3
+    assert changed(config, "sea", current_mps=None) is config
+    with pytest.raises(ConfigError, match=r"command line: sea.current_mps = 9: .*allowed: >= 0"):
+        changed(config, "sea", current_mps=9)
+
+
+def test_weak_thrusters_are_read_from_their_texts() -> None:
+    assert parse_health(["stern", "bow=0.5"]) == {"stern": 0.0, "bow": 0.5}
+    assert parse_health(None) is None
+    with pytest.raises(ConfigError, match="NAME=SHARE"):
+        parse_health(["bow=half"])
