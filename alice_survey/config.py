@@ -141,6 +141,7 @@ class VehicleConfig(Config):
     controller: Literal["sway", "los"] = "sway"
     allocation: Literal["exact", "rpi"] = "exact"
     thruster_health: ThrusterHealth = ThrusterHealth()
+    health_known: bool = True
 
 
 class SeaConfig(Config):

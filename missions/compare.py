@@ -23,7 +23,7 @@ from alice_survey.vehicle import signals
 from alice_survey.vehicle.dynamics import GRAVITY, STATE
 from alice_survey.vehicle.floor import level_floor
 from alice_survey.vehicle.pilot.gains import gains_for
-from alice_survey.vehicle.pilot.memory import CROSS, PATH_HEADING, PHASE
+from alice_survey.vehicle.pilot.memory import CROSS, PHASE
 from alice_survey.vehicle.pilot.settings import pilot_guidance
 from alice_survey.vehicle.propulsion import add_thrust
 from alice_survey.vehicle.simulator import Flown, Setup, simulate
@@ -309,7 +309,7 @@ def figures_of(flight: Flight, vehicle: Vehicle) -> Figures:
     return Figures(
         lines_true_m=_rms(true),
         lines_believed_m=_rms(believed),
-        route_true_m=_rms(true_route_error(flight)[route]),
+        route_true_m=_rms(flight.route_error[route]),
         route_believed_m=_rms(flown.report[route, CROSS]),
         lines_worst_m=_worst(np.abs(true[~np.isnan(true)])),
         heading_rms_deg=_rms(np.rad2deg(heading)),
@@ -342,18 +342,6 @@ def turn_rows(line: Array, following: NDArray[np.bool_]) -> list[slice]:
         if begun > left and known[left - 1] != known[begun]:
             turns.append(slice(left, (begun + ended) // 2))
     return turns
-
-
-def true_route_error(flight: Flight) -> Array:
-    """(T,) how far the followed point truly was to starboard of the route's tangent, metres.
-
-    The pilot's own figure, less the navigation's error across the path.
-    """
-    report = flight.flown.report
-    heading = report[:, PATH_HEADING]
-    off = flight.glass_ned - flight.believed_glass_ned
-    across: Array = off[:, 1] * np.cos(heading) - off[:, 0] * np.sin(heading)
-    return np.asarray(report[:, CROSS] + across)
 
 
 def roll_moment(vehicle: Vehicle, flown: Flown, turns: Sequence[slice]) -> Array:
@@ -426,7 +414,7 @@ def _trace(flight: Flight, flown: Flown) -> Trace:
     return Trace(
         time_s=flown.time_s[rows] - first,
         true_ne=flight.glass_ned[rows, :2],
-        cross_m=true_route_error(flight)[rows],
+        cross_m=flight.route_error[rows],
         roll_deg=np.rad2deg(flight.attitude_rad[rows, 0]),
         surge_mps=true_velocity(flown)[rows, 0],
         line=flight.line[rows],

@@ -8,7 +8,7 @@ import numpy as np
 
 from alice_survey.frames import Array, attitude_from_rotation
 from alice_survey.trajectory import Trajectory
-from alice_survey.vehicle.pilot.memory import CROSS
+from alice_survey.vehicle.pilot.memory import CROSS, PATH_HEADING
 from alice_survey.vehicle.simulator import Flown
 from missions.navigation import NavigationLog
 from missions.plan_file import Plan
@@ -25,6 +25,8 @@ class Flight:
     """Of the body origin."""
     glass_ned: Array
     """(T, 3) the left port's outer glass."""
+    altitude_m: Array
+    """(T,) true, of the left port's glass above the sea floor below it."""
     believed_glass_ned: Array
     """(T, 3) where navigation had it."""
     line: Array
@@ -64,9 +66,38 @@ class Flight:
         return self._cross_track(self.believed_glass_ned)
 
     @cached_property
-    def route_cross_track(self) -> Array:
+    def believed_route_error(self) -> Array:
         """(T,) metres: how far the pilot saw the glass to starboard of the route, turns too."""
         return self.flown.report[:, CROSS]
+
+    @cached_property
+    def route_error(self) -> Array:
+        """(T,) metres: how far the glass truly was to starboard of the route's tangent.
+
+        The pilot's own figure, less the navigation's error across the path.
+        """
+        heading = self.flown.report[:, PATH_HEADING]
+        off = self.glass_ned - self.believed_glass_ned
+        across = off[:, 1] * np.cos(heading) - off[:, 0] * np.sin(heading)
+        return self.believed_route_error + across
+
+    @property
+    def allowed_cross_track_m(self) -> float:
+        """How far off its line a picture may be: two neighbours so far apart just meet."""
+        return 0.5 * (self.plan.footprint_m[0] - self.plan.line_spacing_m)
+
+    @cached_property
+    def stations_off_line(self) -> int:
+        """How many pictures were truly taken farther off their line than is allowed."""
+        places = np.column_stack(
+            [np.interp(self.trigger_s, self.truth.time_s, axis) for axis in self.glass_ned.T[:2]]
+        )
+        count = 0
+        for place, index in zip(places, self.trigger_line, strict=True):
+            line = self.plan.lines[index]
+            starboard = np.array([-math.sin(line.heading_rad), math.cos(line.heading_rad)])
+            count += bool(abs((place - line.start_ne_m) @ starboard) > self.allowed_cross_track_m)
+        return count
 
     def _cross_track(self, glass_ned: Array) -> Array:
         cross = np.full(len(self.line), np.nan)

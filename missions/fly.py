@@ -77,6 +77,12 @@ def _steps(folder: Path, plan_path: Path, config: SurveyConfig) -> Iterator[str]
             f"{len(flight.trigger_s)} of {plan.stations} stations were reached: the mission "
             f"was {flight.ending}"
         )
+    if flight.stations_off_line:
+        warn(
+            f"{flight.stations_off_line} of {len(flight.trigger_s)} pictures were taken more than "
+            f"{flight.allowed_cross_track_m:.2f} m off their lines, where neighbouring lines may "
+            "leave gaps: choose more side_overlap, less current or another controller"
+        )
     yield "flight"
     write_track(folder / "truth" / "track.csv", flight.truth)
     write_vehicle_log(folder / "truth" / "vehicle.csv", true_log(flight))

@@ -11,7 +11,7 @@ from alice_survey.frames import Array, rotation_from_attitude
 from alice_survey.trajectory import Trajectory
 from alice_survey.vehicle import signals
 from alice_survey.vehicle.fleet import vehicle
-from alice_survey.vehicle.floor import FloorGrid
+from alice_survey.vehicle.floor import FloorGrid, floor_depth
 from alice_survey.vehicle.identification.files import coefficients_from_file
 from alice_survey.vehicle.navigation import tick as navigation
 from alice_survey.vehicle.navigation.sensors import (
@@ -102,8 +102,10 @@ def mission_setup(
     """
     craft = craft_of(config.vehicle)
     path = path_of(plan)
-    # A failed thruster is known to the pilot, who flies as well as the others allow.
-    gains = gains_for(craft.weakened(config.vehicle.thruster_health.impaired), plan.speed_mps)
+    # The pilot flies as well as the thrusters allow that he knows to be sound.
+    impaired = config.vehicle.thruster_health.impaired
+    known = impaired if config.vehicle.health_known else {}
+    gains = gains_for(craft.weakened(known), plan.speed_mps)
     guidance = pilot_guidance(
         gains,
         path,
@@ -128,7 +130,8 @@ def mission_setup(
             sigma=(*gust, 0.0, 0.0, 0.0), correlation_s=config.sea.gust_correlation_s
         ),
         exact_allocation=config.vehicle.allocation == "exact",
-        health=config.vehicle.thruster_health.impaired,
+        health=impaired,
+        known_health=known,
         start_ne_m=(float(start_ne[0]), float(start_ne[1])),
         start_heading_rad=heading_rad,
     )
@@ -248,6 +251,7 @@ def flight_of(plan: Plan, config: SurveyConfig, setup: Setup, flown: Flown) -> F
         vehicle=setup.vehicle.name,
         truth=truth,
         glass_ned=truth.ned_from_body.apply(glass_body),
+        altitude_m=_altitude(setup.floor, truth.ned_from_body.apply(glass_body)),
         believed_glass_ned=believed,
         line=line,
         trigger_s=trigger_s,
@@ -256,6 +260,12 @@ def flight_of(plan: Plan, config: SurveyConfig, setup: Setup, flown: Flown) -> F
         flown=flown,
         ending=ending,
     )
+
+
+def _altitude(floor: FloorGrid, points_ned: Array) -> Array:
+    """Height, (T,), of places above the sea floor below them."""
+    depths = [floor_depth(floor, float(n), float(e)) for n, e in points_ned[:, :2]]
+    return np.asarray(np.array(depths) - points_ned[:, 2])
 
 
 def navigation_log(flown: Flown) -> NavigationLog:

@@ -227,6 +227,8 @@ class Setup:
     exact_allocation: bool = True
     health: Mapping[str, float] = field(default_factory=dict)
     """What a thruster has left of its greatest speed squared: 0 failed; sound if not named."""
+    known_health: Mapping[str, float] | None = None
+    """The same as the allocation believes it; as it is if not given."""
     believed: Vehicle | None = None
     """What the allocation takes the vehicle for, with as many thrusters; the vehicle itself if not
     given."""
@@ -360,7 +362,8 @@ def _new_world(setup: Setup, thrusters: int) -> World:
 
 def _allocation(setup: Setup) -> Allocation:
     n = len(setup.vehicle.thrusters)
-    health = setup.vehicle.health_of(setup.health)
+    left = setup.health if setup.known_health is None else setup.known_health
+    health = setup.vehicle.health_of(left)
     believed = setup.believed or setup.vehicle
     matrix = np.ascontiguousarray(believed.configuration_matrix)
     return Allocation(

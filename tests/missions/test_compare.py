@@ -34,7 +34,6 @@ from missions.compare import (
     righting_moment,
     summarised,
     thruster_wrench,
-    true_route_error,
     turn_rows,
     with_equal_thrust,
 )
@@ -126,7 +125,7 @@ def test_on_lines_the_route_error_is_the_line_error(
         cross, _ = flight.line_errors
         on = ~np.isnan(cross)
         assert on.any()
-        np.testing.assert_allclose(true_route_error(flight)[on], cross[on], atol=1e-6)
+        np.testing.assert_allclose(flight.route_error[on], cross[on], atol=1e-6)
 
 
 def test_figures_are_of_what_was_flown(

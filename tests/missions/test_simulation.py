@@ -5,10 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from alice_survey.config import SeaConfig, SurveyConfig, parse_config
 from alice_survey.errors import VehicleError
 from alice_survey.vehicle.floor import FloorGrid, level_floor
+from alice_survey.vehicle.navigation.tick import LOG_COLUMNS
 from alice_survey.vehicle.sea import current_at
 from camera_calib.rig import design_rig
 from missions.flight import Flight
@@ -112,6 +114,48 @@ def test_weak_thrusters_push_no_more_than_is_left_of_them() -> None:
     assert fastest["starboard"] <= 50.0 * 0.3**0.5 + 1e-9
     assert flight.ending == "complete"
     assert 0.002 < rms(flight.line_errors[0]) < 0.12
+
+
+def test_a_thruster_that_fails_unnoticed_leaves_pictures_off_their_lines() -> None:
+    told = fly(survey(vehicle={"thruster_health": {"bow": 0.0}}))
+    dead = survey(vehicle={"thruster_health": {"bow": 0.0}, "health_known": False})
+    untold = fly(dead)
+    assert untold.stations_off_line > told.stations_off_line
+    assert flight_summary(untold, dead)["stations_off_line"] == untold.stations_off_line
+
+
+def test_figures_of_turns_and_altitude_are_true_ones(flight: Flight) -> None:
+    found = flight_summary(flight, survey())
+    on_line = flight.line >= 0
+    # Truth and belief differ by what the navigation errs, no more.
+    np.testing.assert_allclose(
+        flight.route_error[on_line], flight.line_errors[0][on_line], atol=1e-6
+    )
+    assert found["in_turns"]["off_route_rms_m"] > found["in_turns"]["believed_off_route_rms_m"]
+    floor_m = 6.0
+    np.testing.assert_allclose(flight.altitude_m, floor_m - flight.glass_ned[:, 2], atol=1e-9)
+    assert 0.001 < found["on_lines"]["altitude_rms_m"] < 0.12
+    assert 1.7 < found["on_lines"]["altitude_least_m"] < 2.0
+
+
+def test_navigation_is_consistent_in_the_closed_loop() -> None:
+    """Normalised errors of the logged estimate over many missions (Y. Bar-Shalom et al., 2001)."""
+    runs, share = 50, 0.95
+    plan = plan_of()
+    squares = []
+    for seed in range(runs):
+        flown = fly(survey(), seed=seed)
+        rows = np.flatnonzero(flown.line >= 0)[::20]
+        off = flown.log.position_ned[rows] - flown.truth.ned_from_body.translation[rows]
+        columns = dict(zip(LOG_COLUMNS, flown.flown.navigation[rows].T, strict=True))
+        sigma = [columns[f"sigma_{axis}_m"] for axis in ("north", "east", "depth")]
+        squares.append((off / np.stack(sigma, axis=1)) ** 2)
+    epochs = min(len(square) for square in squares)
+    assert epochs > 0.5 * plan.duration_s / 2
+    mean = np.stack([square[:epochs] for square in squares]).mean(axis=0)
+    low, high = chi2.ppf([(1 - share) / 2, (1 + share) / 2], runs) / runs
+    inside = ((mean > low) & (mean < high)).mean(axis=0)
+    assert np.all(inside >= 0.9), inside
 
 
 def test_without_the_vertical_thruster_she_cannot_dive_and_says_so() -> None:
