@@ -28,14 +28,13 @@ from alice_survey.vehicle.pilot.settings import pilot_guidance
 from alice_survey.vehicle.propulsion import add_thrust
 from alice_survey.vehicle.simulator import Flown, Setup, simulate
 from alice_survey.vehicle.vehicle import Vehicle
-from missions.flight import Flight
+from missions.flight import Flight, rms
 from missions.flight_records import true_velocity
 from missions.plan_file import Plan
-from missions.simulation import flight_of, mission_setup
+from missions.simulation import flight_of, longest_mission_s, mission_setup
 
 _CHANCE, _SEA = 40, 41
 """Streams of a seed: instruments, and the water."""
-_PATIENCE, _CLIMB_MPS = 3.0, 0.1
 _TRACE_STEP = 4
 """Ticks from one point of a trace to the next."""
 
@@ -251,7 +250,7 @@ def fly_variant(
     config = changed(config, "camera", position_body_m=(0.0, 0.0, 0.0))
     sea = config.sea.model_copy(update={"current_file": None})
     config = config.model_copy(update={"sea": sea})
-    longest_s = _PATIENCE * (plan.duration_s + 2.0 * plan.seafloor_depth_m / _CLIMB_MPS)
+    longest_s = longest_mission_s(plan)
     water = np.random.default_rng([seed, _SEA])
     floor = level_floor(plan.seafloor_depth_m)
     setup = varied(mission_setup(plan, config, floor, longest_s, water), variant)
@@ -307,13 +306,13 @@ def figures_of(flight: Flight, vehicle: Vehicle) -> Figures:
     torque = np.abs(roll_moment(vehicle, flown, turns))
     between = [int(np.sum(line[rows] < 0)) for rows in turns]
     return Figures(
-        lines_true_m=_rms(true),
-        lines_believed_m=_rms(believed),
-        route_true_m=_rms(flight.route_error[route]),
-        route_believed_m=_rms(flown.report[route, CROSS]),
+        lines_true_m=rms(true),
+        lines_believed_m=rms(believed),
+        route_true_m=rms(flight.route_error[route]),
+        route_believed_m=rms(flown.report[route, CROSS]),
         lines_worst_m=_worst(np.abs(true[~np.isnan(true)])),
-        heading_rms_deg=_rms(np.rad2deg(heading)),
-        line_roll_rms_deg=_rms(roll[line >= 0]),
+        heading_rms_deg=rms(np.rad2deg(heading)),
+        line_roll_rms_deg=rms(roll[line >= 0]),
         turn_roll_peak_deg=_mean(roll_peaks),
         turn_roll_worst_deg=_worst(roll_peaks),
         turn_surge_peak_mps=_mean(surge_peaks),
@@ -322,7 +321,7 @@ def figures_of(flight: Flight, vehicle: Vehicle) -> Figures:
         turn_yaw_peak_deg_s=_mean(_peaks(np.abs(np.rad2deg(velocity[:, 5])), turns)),
         turn_torque_peak_nm=_mean(_peaks(torque, turns)),
         turn_s=_mean(tick_s * np.array(between, np.float64)),
-        navigation_rms_m=_rms(np.linalg.norm(off[route, :2], axis=1)),
+        navigation_rms_m=rms(np.linalg.norm(off[route, :2], axis=1)),
         survey_energy_wh=float(flown.power_w[route].sum()) * tick_s / 3600.0,
         survey_s=float(route.sum()) * tick_s,
         complete=float(flight.ending == "complete"),
@@ -423,11 +422,6 @@ def _trace(flight: Flight, flown: Flown) -> Trace:
 
 def _peaks(values: Array, turns: Sequence[slice]) -> Array:
     return np.array([values[rows].max() for rows in turns])
-
-
-def _rms(values: Array) -> float:
-    known = values[~np.isnan(values)]
-    return float(np.sqrt(np.mean(known**2))) if len(known) else math.nan
 
 
 def _mean(values: Array) -> float:

@@ -141,3 +141,9 @@ def trigger_times(
         times.append(np.interp(stations, along[first], time_s[rows][first]))
         lines += [index] * len(stations)
     return np.concatenate([np.empty(0), *times]), tuple(lines)
+
+
+def rms(values: Array) -> float:
+    """Root mean square of what is known; NaN of nothing."""
+    known = values[~np.isnan(values)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else math.nan

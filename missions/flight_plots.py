@@ -19,7 +19,7 @@ from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.navigation import tick as navigation
 from alice_survey.vehicle.pilot.memory import PHASE, WANTED_SURGE
 from alice_survey.vehicle.simulator import Flown
-from missions.flight import Flight
+from missions.flight import Flight, rms
 from missions.flight_records import rpm_of, true_velocity
 from missions.plan_file import Plan
 
@@ -112,12 +112,6 @@ def true_current(flown: Flown) -> Array:
 def thin(count: int) -> slice:
     """Every n-th of so many points, that a curve stays light."""
     return slice(None, None, max(1, math.ceil(count / _DRAWN)))
-
-
-def rms(values: Array) -> float:
-    """Root mean square of what is known; NaN of nothing."""
-    known = values[~np.isnan(values)]
-    return float(np.sqrt(np.mean(known**2))) if len(known) else math.nan
 
 
 def draw_lines(axes: Axes, plan: Plan) -> None:

@@ -1,5 +1,6 @@
 """A flight as logs that other tools read, and as the figures people ask for."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from alice_survey.vehicle.log import VehicleLog, vehicle_log
 from alice_survey.vehicle.navigation import tick as navigation
 from alice_survey.vehicle.pilot.memory import PHASE
 from alice_survey.vehicle.simulator import Flown
-from missions.flight import Flight
+from missions.flight import Flight, rms
 from missions.logs.bag import BagRecord, Samples
 
 _RANGES = ("range_1_m", "range_2_m", "range_3_m", "range_4_m")
@@ -151,9 +152,9 @@ def _column(flown: Flown, name: str) -> Array:
 
 
 def _rms(values: Array) -> float | None:
-    """Root mean square of what is known; None of nothing."""
-    known = values[~np.isnan(values)]
-    return float(np.sqrt(np.mean(known**2))) if len(known) else None
+    """Root mean square of what is known; None of nothing, which JSON can hold."""
+    found = rms(values)
+    return None if math.isnan(found) else found
 
 
 def _worst(values: Array) -> float | None:

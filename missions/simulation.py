@@ -45,7 +45,7 @@ _FLOOR_SPACING_M = 0.1
 """Of the grid that the DVL hears: finer than the spot of a beam."""
 _CLIMB_MPS = 0.1
 """Slowest dive and ascent that a mission waits for."""
-_PATIENCE = 2.0
+_PATIENCE = 3.0
 """A mission is broken off after so many times the time its plan takes."""
 _USBL_HZ = 0.5
 """A fix every other second: the turn-around of a modem at short range."""
@@ -77,11 +77,16 @@ def simulate_plan(
         VehicleError: a setting does not fit the vehicle.
         NavigationError: the file of the current cannot be read.
     """
-    climb_s = 2.0 * plan.seafloor_depth_m / _CLIMB_MPS
-    longest_s = _PATIENCE * (plan.duration_s + climb_s)
+    longest_s = longest_mission_s(plan)
     setup = mission_setup(plan, config, floor, longest_s, rng)
-    flown = simulate(setup, rng, longest_s=longest_s + climb_s, label="flight")
+    ascent_s = plan.seafloor_depth_m / _CLIMB_MPS
+    flown = simulate(setup, rng, longest_s=longest_s + ascent_s, label="flight")
     return flight_of(plan, config, setup, flown)
+
+
+def longest_mission_s(plan: Plan) -> float:
+    """After how long a mission is broken off."""
+    return _PATIENCE * (plan.duration_s + 2.0 * plan.seafloor_depth_m / _CLIMB_MPS)
 
 
 def mission_setup(

@@ -15,8 +15,8 @@ from alice_survey.vehicle.floor import level_floor
 from alice_survey.vehicle.navigation import tick as navigation
 from camera_calib.rig import design_rig
 from missions import flight_plots
-from missions.flight import Flight
-from missions.flight_plots import draw_flight, draw_vehicle, line_spans, rms, thin, true_current
+from missions.flight import Flight, rms
+from missions.flight_plots import draw_flight, draw_vehicle, line_spans, thin, true_current
 from missions.flight_records import rpm_of
 from missions.plan import make_plan
 from missions.simulation import simulate_plan

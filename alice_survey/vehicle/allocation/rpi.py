@@ -30,7 +30,9 @@ def allocate_rpi(
 
     Each round solves for the thrusters that are not saturated, holds those that came out beyond
     their bounds at the bound, and takes what they give off the wrench. A thruster once held is
-    never let go: when the wrench is not attainable this falls short of what could be had.
+    never let go: when the wrench is not attainable this falls short of what could be had. The paper
+    weighs thrusters alone; here rows are scaled by the axes' weights too, without which it falls
+    shorter still (all weights 1 is the paper's).
 
     Args:
         matrix: (6, n) B, wrench per thrust.

@@ -3,7 +3,7 @@
 After J. Sola, Quaternion kinematics for the error-state Kalman filter, 2017, with the attitude's
 error in NED (his global one: truth = exp(error) belief), and measurements as increments of angle
 and velocity, so that prediction is exact but for noise and the course of velocity in a tick. The
-covariance is (25, 25); `navigation_state` says what lies where, and `navigation_prediction` carries
+covariance is (25, 25); `state` says what lies where, and `prediction` carries
 it over a tick. Errors of the instruments that do not average out are states, else it would promise
 too much.
 
