@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.config import SeaConfig, SurveyConfig, VehicleConfig
+from alice_survey.errors import warn
 from alice_survey.frames import Array, rotation_from_attitude
 from alice_survey.trajectory import Trajectory
 from alice_survey.vehicle import signals
@@ -34,6 +35,7 @@ from alice_survey.vehicle.sea import (
     varying_current,
 )
 from alice_survey.vehicle.simulator import Flown, Setup, simulate
+from alice_survey.vehicle.stability import pitch_divergence_speed_mps
 from alice_survey.vehicle.swell import with_swell
 from alice_survey.vehicle.vehicle import Vehicle
 from missions.flight import Flight, trigger_times
@@ -47,6 +49,8 @@ _CLIMB_MPS = 0.1
 """Slowest dive and ascent that a mission waits for."""
 _PATIENCE = 3.0
 """A mission is broken off after so many times the time its plan takes."""
+_PITCH_MARGIN = 0.8
+"""Share of the speed at which pitch diverges that a plan may have without a warning (inferred)."""
 _USBL_HZ = 0.5
 """A fix every other second: the turn-around of a modem at short range."""
 
@@ -106,6 +110,13 @@ def mission_setup(
         rng: for what is drawn once a mission.
     """
     craft = craft_of(config.vehicle)
+    diverging_mps = pitch_divergence_speed_mps(craft)
+    if plan.speed_mps > _PITCH_MARGIN * diverging_mps:
+        warn(
+            f"the pitch of {craft.name} with {craft.coefficients.name!r} coefficients diverges "
+            f"above {diverging_mps:.2f} m/s and is badly damped at the plan's {plan.speed_mps:g} "
+            "m/s: lower the speed"
+        )
     path = path_of(plan)
     # The pilot flies as well as the thrusters allow that he knows to be sound.
     impaired = config.vehicle.thruster_health.impaired

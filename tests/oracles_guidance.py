@@ -121,9 +121,12 @@ def follow_demand(
         sideways = 0.0
         if guidance.sway > 0:
             sideways = -sway_row[g.RATE] * sway - guidance.point_body_m[0] * yaw
-    return np.array([surge_row[g.RATE] * (speed - surge), sideways, yaw]), cross
+    ahead = surge_row[g.RATE] * (surge_row[g.WEIGHT] * speed - surge)
+    ahead += surge_row[g.PLACE] * TICK_S * (speed - surge)  # learnt in this tick
+    return np.array([ahead, sideways, yaw]), cross
 
 
+TICK_S = 0.05
 PLUS_MINUS = np.array([-1.0, 1.0])
 
 

@@ -120,7 +120,9 @@ def test_a_thruster_that_fails_unnoticed_leaves_pictures_off_their_lines() -> No
     told = fly(survey(vehicle={"thruster_health": {"bow": 0.0}}))
     dead = survey(vehicle={"thruster_health": {"bow": 0.0}, "health_known": False})
     untold = fly(dead)
-    assert untold.stations_off_line > told.stations_off_line
+    # Off their lines, or not taken at all, where the vehicle spins before it has reached the start.
+    on_line = [len(f.trigger_s) - f.stations_off_line for f in (told, untold)]
+    assert on_line[1] < 0.9 * on_line[0]
     assert flight_summary(untold, dead)["stations_off_line"] == untold.stations_off_line
 
 

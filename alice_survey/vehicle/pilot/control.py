@@ -9,7 +9,17 @@ left to the integrals.
 from alice_survey.frames import Array
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.dynamics import add_coriolis, add_damping
-from alice_survey.vehicle.pilot.gains import INNER, INTEGRAL, LEAST, MASS, MOST, PLACE, RATE, Gains
+from alice_survey.vehicle.pilot.gains import (
+    INNER,
+    INTEGRAL,
+    LEAST,
+    MASS,
+    MOST,
+    PLACE,
+    RATE,
+    WEIGHT,
+    Gains,
+)
 from alice_survey.vehicle.pilot.memory import ACC_SURGE, FULL_SURGE, REF_SURGE, PilotState
 
 
@@ -74,14 +84,15 @@ def sum_bound(gains: Gains, axis: int) -> float:
 
 @kernel
 def speed_demand(
-    gains: Gains, axis: int, error: float, full: float, total: float, dt_s: float
+    gains: Gains, axis: int, wanted: float, speed: float, full: float, total: float, dt_s: float
 ) -> tuple[float, float]:
-    """A PI on speed.
+    """A PI on speed whose proportional part sees a share of the wanted speed (gains.py).
 
     Args:
         gains: of all axes.
         axis: row of gains.
-        error: wanted speed less speed.
+        wanted: speed.
+        speed: measured.
         full: +1 or -1 where the force is cut at its greatest or least, else 0.
         total: the integral part, as a speed.
         dt_s: the tick.
@@ -89,11 +100,11 @@ def speed_demand(
     Returns:
         The acceleration, and the new integral.
     """
-    row = gains.axes[axis]
+    row, error = gains.axes[axis], wanted - speed
     if full * error <= 0.0:
         step = row[PLACE] / row[RATE] * error * dt_s
         total = clamped(total + step, sum_bound(gains, axis))
-    return row[RATE] * (error + total), total
+    return row[RATE] * (row[WEIGHT] * wanted - speed + total), total
 
 
 @kernel

@@ -11,14 +11,27 @@ damping ratio zeta and natural frequency omega, and a real one at -a, with a + 2
 The rule for omega: as fast as the lag allows without the real pole becoming the slowest (a = omega,
 hence omega = (1/T + d/m) / (1 + 2 zeta)), but not above a twentieth of the rate of the navigation's
 velocities (K. J. Astrom, B. Wittenmark, Computer-Controlled Systems, 1997, section 2.9, samples 10
-to 30 times within a period of the closed loop). Integral action a tenth as fast: integral =
-place omega / 10 (Fossen 2011, section 12.2.5).
+to 30 times within a period of the closed loop). Integral action is a tenth as fast, integral =
+place omega / 10 (Fossen 2011, section 12.2.5), or slower where the water damps much: integral =
+place^2 / (rate + d/m at the greatest speed of the axis) if that is less, since the loop with lag
+and integral lets less through where damping takes the rate's part.
+
+Yaw is not a bare axis: under way a slender hull slips through its turns, and the sway that this
+gives turns it further (Munk moment) or back. Where the gains above leave a mode of heading, sway,
+yaw rate, lag and integral together damped by less than HEADING_DAMPING at the survey's speed, the
+gains are the nearest to them (by their logarithms, on a grid) that damp enough; if none do, those
+that damp best, unless that is less than LEAST_HEADING_DAMPING. At rest and at half the speed, which
+are passed through, PASSING_DAMPING less is enough.
 
 The sway axis is a PID that asks a speed of an inner loop (paper, section VII): the inner gain is
 the critically damped one, 1 / (4 T), or rate if that is less; what rate has beyond it is k_D. The
 other axes need no k_D: their inner gain is rate.
 
-The same numbers serve a speed loop: its proportional gain is rate, its integral gain place.
+The same numbers serve a speed loop: its proportional gain is rate, its integral gain place. A PI
+has a zero at -place / rate, nearer than its poles, by which it overshoots a wanted speed. The
+proportional part therefore sees only a share of the wanted speed (set-point weighting: K. J.
+Astrom, T. Hagglund, Advanced PID Control, 2006, section 3.4), weight = (place / omega - d/m) /
+rate, which with the feed-forward of drag moves the zero onto a pole at -omega.
 """
 
 import math
@@ -36,17 +49,31 @@ SURGE, SWAY, HEAVE, YAW = 0, 1, 2, 3
 """Rows of `Gains.axes`."""
 DEGREES = (0, 1, 2, 5)
 """Which of the 6 degrees of freedom each row is."""
+_LATERAL = [1, 5]
 
-MASS, RATE, PLACE, INTEGRAL, INNER, LEAST, MOST, FASTEST, LAG, BANDWIDTH = range(10)
+MASS, RATE, PLACE, INTEGRAL, INNER, LEAST, MOST, FASTEST, LAG, BANDWIDTH, WEIGHT = range(11)
 """Columns of `Gains.axes`: inertia (kg, kg m^2); rate (1/s), place (1/s^2), integral (1/s^3); inner
 (1/s), the part of rate that the inner speed loop has; least and greatest force or moment; greatest
-speed asked for (m/s, rad/s); lag (s); bandwidth (rad/s)."""
+speed asked for (m/s, rad/s); lag (s); bandwidth (rad/s); share of a wanted speed that the
+proportional part of a speed loop sees."""
 
 DAMPING_RATIO = 1.0
 """Of the placed pair: no overshoot, so that a line beside is not run into."""
 INTEGRAL_SHARE = 0.1
 """Bandwidth of integral action by that of the loop (Fossen 2011, section 12.2.5)."""
 SAMPLES_PER_PERIOD = 20.0
+LEAST_SAMPLES_PER_PERIOD = 10.0
+"""Of an oscillation in which heading and sway are coupled."""
+HEADING_DAMPING = 0.7
+"""Wanted of every mode of the heading loop (inferred: an overshoot of a twentieth)."""
+LEAST_HEADING_DAMPING = 0.5
+"""Below it a vehicle is not flown (inferred: an overshoot of a sixth)."""
+PASSING_DAMPING = 0.2
+"""By so much less may the heading loop be damped below the survey's speed (inferred)."""
+_RATE_FACTORS = np.geomspace(0.5, 8.0, 49)
+_PLACE_FACTORS = np.geomspace(0.5, 16.0, 61)
+_SLOWER = (0.0, 0.5)
+"""Shares of the survey's speed."""
 STEADY_SHARE = 0.75
 """Of the greatest force that a steady motion may take; a quarter stays for feedback (inferred)."""
 
@@ -57,7 +84,7 @@ class Gains(NamedTuple):
     body: Body
     """Inertia and damping, for feed-forward."""
     axes: Array
-    """(4, 10) rows SURGE, SWAY, HEAVE, YAW; an axis that no thruster moves has zero gains."""
+    """(4, 11) rows SURGE, SWAY, HEAVE, YAW; an axis that no thruster moves has zero gains."""
 
 
 def gains_for(
@@ -77,7 +104,7 @@ def gains_for(
         most_turn_rad_s: greatest yaw rate asked for, if the thrusters allow it.
 
     Raises:
-        VehicleError: surge, heave or yaw cannot be controlled.
+        VehicleError: surge, heave or yaw cannot be controlled, or yaw not damped at that speed.
     """
     plant = vehicle.plant
     count = len(vehicle.thrusters)
@@ -87,7 +114,7 @@ def gains_for(
     configuration = vehicle.configuration_matrix[list(DEGREES)]
     slowness_s = np.array([thruster.time_constant_s for thruster in vehicle.thrusters])
     damping = linear_damping(plant.body, cruise)
-    axes = np.zeros((4, 10))
+    axes = np.zeros((4, 11))
     fastest_rad_s = 2 * math.pi * navigation_hz / SAMPLES_PER_PERIOD
     gyradius_m = math.sqrt(vehicle.mass[5, 5] / vehicle.mass[1, 1])
     for axis, degree in enumerate(DEGREES):
@@ -113,8 +140,23 @@ def gains_for(
         moving = np.zeros(6)
         moving[degree] = fastest
         most_decay = float(linear_damping(plant.body, moving)[degree, degree]) / inertia
-        axes[axis, INTEGRAL] = place * min(INTEGRAL_SHARE * omega, place / (rate + most_decay))
+        if axis == YAW:
+            sampled_rad_s = 2 * math.pi * navigation_hz / LEAST_SAMPLES_PER_PERIOD
+            bare = np.array([rate, place])
+            rate, place, damped = _damped_together(
+                plant.body, speed_mps, bare, lag_s, omega, most_decay, sampled_rad_s
+            )
+            if damped < LEAST_HEADING_DAMPING:
+                raise VehicleError(
+                    f"the yaw loop of {vehicle.name} with {vehicle.coefficients.name!r} "
+                    f"coefficients cannot be damped at {speed_mps:g} m/s (damping ratio "
+                    f"{damped:.2f} at best, {LEAST_HEADING_DAMPING:g} is needed): lower the speed"
+                )
+            axes[axis, [RATE, PLACE, INNER]] = rate, place, rate
+        axes[axis, INTEGRAL] = _integral(rate, place, omega, most_decay)
         axes[axis, [LAG, BANDWIDTH]] = lag_s, omega
+        if rate > 0.0:
+            axes[axis, WEIGHT] = min(max((place / omega - decay) / rate, 0.0), 1.0)
     axes[YAW, FASTEST] = min(axes[YAW, FASTEST], most_turn_rad_s)
     return Gains(plant.body, axes)
 
@@ -134,6 +176,108 @@ def placed(lag_s: float, decay_per_s: float, fastest_rad_s: float) -> tuple[floa
     rate = lag_s * (pair * real + omega**2) - decay_per_s
     # Damping beyond what is wanted is left to the water: a negative gain would undo it.
     return omega, max(rate, 0.0), lag_s * real * omega**2
+
+
+def _integral(rate: float, place: float, omega: float, most_decay: float) -> float:
+    return place * min(INTEGRAL_SHARE * omega, place / (rate + most_decay))
+
+
+def lateral_pair(body: Body, speed_mps: float) -> tuple[Array, Array]:
+    """Sway and yaw rate under way: (v, r)' = A (v, r) + b moment.
+
+    Args:
+        body: of the vehicle.
+        speed_mps: surge; without drift or turning.
+
+    Returns:
+        (2, 2) and (2,)
+    """
+    nu = np.array([speed_mps, 0.0, 0.0, 0.0, 0.0, 0.0])
+    lateral = np.ix_(_LATERAL, _LATERAL)
+    inverse = np.linalg.inv(body.mass[lateral])
+    slope = linear_damping(body, nu) + linear_coriolis(body, nu)
+    pair: Array = -inverse @ slope[lateral]
+    return pair, np.array(inverse[:, 1], np.float64)
+
+
+def heading_loop(body: Body, speed_mps: float, row: Array) -> Array:
+    """State matrix of the heading loop with the sway that it brings about.
+
+    States: integral of heading; heading; sway, m/s; yaw rate; yaw acceleration that the lagging
+    thrusters give.
+
+    Args:
+        body: of the vehicle.
+        speed_mps: surge.
+        row: of yaw in `Gains.axes`.
+
+    Returns:
+        (5, 5)
+    """
+    pair, by_moment = lateral_pair(body, speed_mps)
+    loop = np.zeros((5, 5))
+    loop[0, 1] = loop[1, 3] = 1.0
+    loop[2:4, 2:4] = pair
+    loop[2:4, 4] = by_moment * row[MASS]
+    loop[4, [0, 1, 3]] = -row[[INTEGRAL, PLACE, RATE]] / row[LAG]
+    loop[4, 4] = -1.0 / row[LAG]
+    return loop
+
+
+def damping_ratio(loop: Array) -> float:
+    """Least damping ratio of a state matrix's modes; negative if one grows."""
+    poles = np.linalg.eigvals(loop)
+    return float(np.min(-poles.real / np.abs(poles)))
+
+
+def _damped_together(
+    body: Body,
+    speed_mps: float,
+    bare: Array,
+    lag_s: float,
+    omega: float,
+    most_decay: float,
+    sampled_rad_s: float,
+) -> tuple[float, float, float]:
+    """Rate and place gains of yaw by the rule above, and the least damping ratio that they give.
+
+    Args:
+        body: of the vehicle.
+        speed_mps: of the survey.
+        bare: (2,) gains of the axis by itself.
+        lag_s: of the thrusters.
+        omega: natural frequency placed for the axis by itself.
+        most_decay: greatest d / m.
+        sampled_rad_s: bound on the frequency of a pair of poles.
+    """
+    row = np.zeros(11)
+    row[[MASS, LAG]] = body.mass[5, 5], lag_s
+    factors = np.vstack([
+        [1.0, 1.0],
+        np.stack(np.meshgrid(_RATE_FACTORS, _PLACE_FACTORS), axis=-1).reshape(-1, 2),
+    ])  # fmt: skip
+    # From the nearest on.
+    factors = factors[np.argsort(np.hypot(*np.log(factors).T), kind="stable")]
+    damped = np.full(len(factors), math.inf)
+    gains = bare * factors
+    for share in (1.0, *_SLOWER):
+        loops = np.repeat(heading_loop(body, share * speed_mps, row)[None], len(gains), axis=0)
+        integral = [_integral(rate, place, omega, most_decay) for rate, place in gains]
+        loops[:, 4, 0] = -np.array(integral) / lag_s
+        loops[:, 4, [1, 3]] = -gains[:, ::-1] / lag_s
+        # Without speed sway decays by itself, or not at all; it is not of the loop then.
+        if share == 0.0:
+            loops = loops[:, [[0], [1], [3], [4]], [0, 1, 3, 4]]
+        poles = np.linalg.eigvals(loops)
+        size = np.abs(poles)
+        ratio = (-poles.real / size).min(axis=1)
+        fast = np.any((np.abs(poles.imag) > 0.0) & (size > sampled_rad_s), axis=1)
+        if share < 1.0:
+            ratio += PASSING_DAMPING
+        damped = np.minimum(damped, np.where(fast, -1.0, ratio))
+    enough = np.flatnonzero(damped >= HEADING_DAMPING)
+    best = int(enough[0]) if len(enough) else int(np.argmax(damped))
+    return float(gains[best, 0]), float(gains[best, 1]), float(damped[best])
 
 
 def linear_damping(body: Body, nu: Array) -> Array:

@@ -22,8 +22,8 @@ from alice_survey.vehicle.pilot.gains import (
     SWAY,
     YAW,
     Gains,
-    linear_coriolis,
-    linear_damping,
+    damping_ratio,
+    lateral_pair,
 )
 from alice_survey.vehicle.pilot.path import Path
 from alice_survey.vehicle.pilot.safety import Limits
@@ -34,9 +34,11 @@ HULL_LENGTH_M = 1.6
 """Of SPARUS II and ALICE (paper, section II)."""
 LOS_DAMPING_RATIO = 0.5
 """Least of the path loop of `los` (inferred: one overshoot of a sixth)."""
-_LATERAL = [1, 5]
 _STRAIGHT_PER_M = 1e-9
-_LOOK_AHEADS_M = (0.1, 100.0)
+_LOOK_AHEADS_M = np.geomspace(HULL_LENGTH_M, 100.0, 400)
+SWAY_LOOK_AHEAD_M = 2.5 * HULL_LENGTH_M
+"""Of `sway`, which goes by it only when far off its path, where none is damped well: the longest
+that Fossen (2011, section 10.3.2) gives."""
 
 
 class Guidance(NamedTuple):
@@ -91,12 +93,14 @@ def pilot_guidance(
         controller: `sway` or `los`.
         most_depth_m: no deeper than this.
         point_body_m: the followed point.
-        look_ahead_m: of `los`; `shortest_look_ahead_m` when left out.
+        look_ahead_m: when heading for the path; `shortest_look_ahead_m` when left out, and for
+            `sway`, where there is none, SWAY_LOOK_AHEAD_M.
         terrain_smoothing_m: relief shorter than this is not followed.
         limits: for safety; half the path's altitude is the least when left out.
 
     Raises:
-        VehicleError: the vehicle has no thrusters for sway, or a value is out of range.
+        VehicleError: the vehicle has no thrusters for sway, a value is out of range, or no
+            look-ahead will do for `los`.
     """
     axes, speed = gains.axes, path.speed_mps
     by_sway = controller == "sway"
@@ -105,7 +109,10 @@ def pilot_guidance(
             "the vehicle has no lateral thrusters: fly it with the controller los, not sway"
         )
     if look_ahead_m is None:
-        look_ahead_m = shortest_look_ahead_m(gains, speed, point_body_m[0])
+        found = damped_look_ahead_m(gains, speed, point_body_m[0])
+        if found is None and by_sway:
+            found = SWAY_LOOK_AHEAD_M
+        look_ahead_m = found or shortest_look_ahead_m(gains, speed, point_body_m[0])
     for name, value in (("look-ahead", look_ahead_m), ("terrain smoothing", terrain_smoothing_m)):
         if not 0.0 < value < math.inf:
             raise VehicleError(f"the {name} is {value:g} m: it must be positive")
@@ -167,16 +174,13 @@ def los_loop(gains: Gains, speed_mps: float, lever_m: float, look_ahead_m: float
     Returns:
         (5, 5)
     """
-    nu = np.array([speed_mps, 0.0, 0.0, 0.0, 0.0, 0.0])
-    lateral = np.ix_(_LATERAL, _LATERAL)
-    inverse = np.linalg.inv(gains.body.mass[lateral])
-    slope = linear_damping(gains.body, nu) + linear_coriolis(gains.body, nu)
+    pair, by_moment = lateral_pair(gains.body, speed_mps)
     row = gains.axes[YAW]
     loop = np.zeros((5, 5))
     loop[0, 1:4] = speed_mps, 1.0, lever_m
     loop[1, 3] = 1.0
-    loop[2:4, 2:4] = -inverse @ slope[lateral]
-    loop[2:4, 4] = inverse[:, 1] * row[MASS]
+    loop[2:4, 2:4] = pair
+    loop[2:4, 4] = by_moment * row[MASS]
     # Wanted heading -offset / look-ahead, and its rate.
     asked = -row[RATE] / look_ahead_m * loop[0]
     asked[[0, 1, 3]] -= row[PLACE] / look_ahead_m, row[PLACE], row[RATE]
@@ -185,10 +189,22 @@ def los_loop(gains: Gains, speed_mps: float, lever_m: float, look_ahead_m: float
     return loop
 
 
-def damping_ratio(loop: Array) -> float:
-    """Least damping ratio of a state matrix's modes; negative if one grows."""
-    poles = np.linalg.eigvals(loop)
-    return float(np.min(-poles.real / np.abs(poles)))
+def damped_look_ahead_m(gains: Gains, speed_mps: float, lever_m: float) -> float | None:
+    """As `shortest_look_ahead_m`, but None where there is none."""
+    ratios = np.array([
+        damping_ratio(los_loop(gains, speed_mps, lever_m, float(each))) for each in _LOOK_AHEADS_M
+    ])  # fmt: skip
+    if not np.any(ratios >= LOS_DAMPING_RATIO):
+        return None
+    first = int(np.argmax(ratios >= LOS_DAMPING_RATIO))
+    if first == 0:
+        return HULL_LENGTH_M
+    low, high = float(_LOOK_AHEADS_M[first - 1]), float(_LOOK_AHEADS_M[first])
+    while high - low > 1e-3:
+        middle = 0.5 * (low + high)
+        enough = damping_ratio(los_loop(gains, speed_mps, lever_m, middle)) >= LOS_DAMPING_RATIO
+        low, high = (low, middle) if enough else (middle, high)
+    return high
 
 
 def shortest_look_ahead_m(gains: Gains, speed_mps: float, lever_m: float) -> float:
@@ -196,8 +212,13 @@ def shortest_look_ahead_m(gains: Gains, speed_mps: float, lever_m: float) -> flo
 
     The longer it is, the further does a current hold the vehicle off the path; the shorter, the
     more does it weave, since a slender hull slips through its turns and takes long to go where it
-    points. For ALICE and SPARUS II it comes to about 1.5 hull lengths, the least of the 1.5 to 2.5
-    lengths that Fossen (2011, section 10.3.2) gives; COLA2's 5.5 m is too long for lines 1 m apart.
+    points. Not below the length of the hull: what the linear loop promises there hangs on thrusters
+    that are never at their limits.
+
+    It hangs on the coefficients, by the Munk moment: for SPARUS II at 0.2 m/s, origin followed, it
+    is 2.87 m with `calibrated`, 1.79 with `estimated`, 1.97 with `cfd` and 1.74 with `computed`;
+    with the left port followed 2.23 m and, for the others, the hull's length, 1.6 m. Fossen (2011,
+    section 10.3.2) gives 1.5 to 2.5 lengths; COLA2's 5.5 m is too long for lines 1 m apart.
 
     Args:
         gains: of the vehicle.
@@ -207,21 +228,13 @@ def shortest_look_ahead_m(gains: Gains, speed_mps: float, lever_m: float) -> flo
     Raises:
         VehicleError: no look-ahead gives that damping.
     """
-    low, high = _LOOK_AHEADS_M
-
-    def enough(look_ahead_m: float) -> bool:
-        loop = los_loop(gains, speed_mps, lever_m, look_ahead_m)
-        return damping_ratio(loop) >= LOS_DAMPING_RATIO
-
-    if not enough(high):
+    found = damped_look_ahead_m(gains, speed_mps, lever_m)
+    if found is None:
         raise VehicleError(
-            f"no look-ahead up to {high:g} m keeps the heading loop from weaving at "
-            f"{speed_mps:g} m/s: raise the speed, or check the vehicle's coefficients"
+            f"no look-ahead from {HULL_LENGTH_M:g} to {_LOOK_AHEADS_M[-1]:g} m keeps los from "
+            f"weaving at {speed_mps:g} m/s: lower the speed, or check the vehicle's coefficients"
         )
-    while high - low > 1e-3:
-        middle = 0.5 * (low + high)
-        low, high = (low, middle) if enough(middle) else (middle, high)
-    return high
+    return found
 
 
 def los_offset_m(

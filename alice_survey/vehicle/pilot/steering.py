@@ -150,9 +150,9 @@ def surge_at(
 ) -> None:
     """Ask for a surge of the followed point over ground."""
     memory, demand = pilot.memory, pilot.demand
-    error = speed - pilot.point[told.SURGE_SPEED]
+    now = pilot.point[told.SURGE_SPEED]
     demand[told.ACC_SURGE], memory[told.SURGE_SUM] = speed_demand(
-        gains, SURGE, error, demand[told.FULL_SURGE], memory[told.SURGE_SUM], dt_s
+        gains, SURGE, speed, now, demand[told.FULL_SURGE], memory[told.SURGE_SUM], dt_s
     )
     demand[told.REF_SURGE] = speed + demand[told.REF_YAW] * guidance.point_body_m[1]
     pilot.report[told.WANTED_SURGE] = speed

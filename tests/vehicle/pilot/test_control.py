@@ -118,10 +118,10 @@ def test_speed_integral_is_bounded_by_what_the_thrusters_give() -> None:
     gains = gains_of("alice")
     row, total = gains.axes[g.SURGE], 0.0
     for _ in range(20000):
-        _, total = control.speed_demand(gains, g.SURGE, 1.0, 0.0, total, 0.05)
+        _, total = control.speed_demand(gains, g.SURGE, 1.0, 0.0, 0.0, total, 0.05)
     assert total == pytest.approx(max(-row[g.LEAST], row[g.MOST]) / (row[g.MASS] * row[g.INNER]))
-    held = control.speed_demand(gains, g.SURGE, 1.0, 1.0, 0.1, 0.05)
-    assert held == (pytest.approx(row[g.RATE] * 1.1), 0.1)
+    held = control.speed_demand(gains, g.SURGE, 1.0, 0.2, 1.0, 0.1, 0.05)
+    assert held == (pytest.approx(row[g.RATE] * (row[g.WEIGHT] - 0.2 + 0.1)), 0.1)
 
 
 def test_an_axis_without_thrusters_has_no_integral() -> None:
