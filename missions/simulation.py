@@ -45,6 +45,9 @@ from missions.route import route_through
 
 _FLOOR_SPACING_M = 0.1
 """Of the grid that the DVL hears: finer than the spot of a beam."""
+_BLIND_ALTITUDES = 1.5
+"""A dive without bottom lock stops so many altitudes above the planned sea floor: half an altitude
+is left for a floor that is shallower."""
 _CLIMB_MPS = 0.1
 """Slowest dive and ascent that a mission waits for."""
 _PATIENCE = 3.0
@@ -118,6 +121,8 @@ def mission_setup(
             "m/s: lower the speed"
         )
     path = path_of(plan)
+    # A floor is followed down to two altitudes below the planned one.
+    deepest_m = plan.seafloor_depth_m + plan.altitude_m
     # The pilot flies as well as the thrusters allow that he knows to be sound.
     impaired = config.vehicle.thruster_health.impaired
     known = impaired if config.vehicle.health_known else {}
@@ -126,9 +131,14 @@ def mission_setup(
         gains,
         path,
         config.vehicle.controller,
-        most_depth_m=float(floor.depth_m.max()),
+        most_depth_m=deepest_m,
         point_body_m=config.camera.position_body_m,
-        limits=Limits(0.5 * plan.altitude_m, float(floor.depth_m.max()), longest_s=longest_s),
+        limits=Limits(
+            0.5 * plan.altitude_m,
+            deepest_m,
+            longest_s=longest_s,
+            blind_depth_m=max(plan.seafloor_depth_m - _BLIND_ALTITUDES * plan.altitude_m, 0.0),
+        ),
     )
     gust, heading_rad = config.sea.gust_n, float(path.heading_rad[0])
     # The vehicle is let go where its left port is above the start of the route.

@@ -11,7 +11,10 @@ P, Q, R = 9, 10, 11
 ALTITUDE = 12
 """Of the followed point (the left port's glass) above the sea floor, metres; NaN without bottom
 lock."""
-ESTIMATE = 13
+CLEARANCE = 13
+"""Least height, metres, of hull, port and DVL above the plane that the DVL's beams meet, and of
+the highest of those points above the lowest of the hull, less one sigma; NaN with the altitude."""
+ESTIMATE = 14
 """Length of the vector."""
 
 DIVE, APPROACH, FOLLOW, ASCEND, DONE, ABORT = 0, 1, 2, 3, 4, 5

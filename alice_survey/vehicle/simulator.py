@@ -29,14 +29,23 @@ from alice_survey.vehicle.dynamics import (
     rk4_step,
     scratch_for,
 )
-from alice_survey.vehicle.floor import FloorGrid
-from alice_survey.vehicle.navigation.sensors import Sensors
+from alice_survey.vehicle.floor import FloorGrid, floor_depth
+from alice_survey.vehicle.hull import HULL_BODY_M
+from alice_survey.vehicle.navigation.sensors import DVL, FOLLOWED, Sensors
 from alice_survey.vehicle.navigation.state import NavigationState, new_navigation
 from alice_survey.vehicle.navigation.tick import LOG_ROW, log_row, navigation_tick
 from alice_survey.vehicle.pilot.gains import Gains
 from alice_survey.vehicle.pilot.guidance import steer
-from alice_survey.vehicle.pilot.memory import AT_SURFACE, PHASE, REPORT, PilotState, new_pilot
+from alice_survey.vehicle.pilot.memory import (
+    AT_SURFACE,
+    PHASE,
+    REASON,
+    REPORT,
+    PilotState,
+    new_pilot,
+)
 from alice_survey.vehicle.pilot.path import Path
+from alice_survey.vehicle.pilot.safety import TOUCHED
 from alice_survey.vehicle.pilot.settings import Guidance
 from alice_survey.vehicle.propulsion import (
     Propulsion,
@@ -133,6 +142,24 @@ def _tell_truth(world: World, current: Current, time_s: float) -> None:
 
 
 @kernel
+def _touches(now: Array, sensors: Sensors, floor: FloorGrid) -> bool:
+    """Whether hull, DVL or port is on the sea floor, or in it."""
+    x, y, z, s = now[3], now[4], now[5], now[6]
+    for i in range(len(HULL_BODY_M) + 2):
+        if i < len(HULL_BODY_M):
+            a, b, c = HULL_BODY_M[i]
+        else:
+            k = DVL if i == len(HULL_BODY_M) else FOLLOWED
+            a, b, c = sensors.place[k, 0], sensors.place[k, 1], sensors.place[k, 2]
+        north = (1 - 2 * (y * y + z * z)) * a + 2 * (x * y - z * s) * b + 2 * (x * z + y * s) * c
+        east = 2 * (x * y + z * s) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z - x * s) * c
+        down = 2 * (x * z - y * s) * a + 2 * (y * z + x * s) * b + (1 - 2 * (x * x + y * y)) * c
+        if now[2] + down >= floor_depth(floor, now[0] + north, now[1] + east):
+            return True
+    return False
+
+
+@kernel
 def _fly_ticks(
     first: int,
     plant: Plant,
@@ -151,7 +178,7 @@ def _fly_ticks(
     sea_rng: np.random.Generator,
     rows: Rows,
 ) -> int:
-    """Fly ticks until the rows are full or the mission is done; how many were flown."""
+    """Fly ticks until the rows are full or the mission is over; how many were flown."""
     count, thrusters, flown = rows.state.shape[0], allocation.thrust.shape[0], 0
     for k in range(count):
         tick = first + k
@@ -162,6 +189,9 @@ def _fly_ticks(
             navigation, rng, world.estimate,
         )  # fmt: skip
         steer(time_s, TICK_S, world.estimate, path, guidance, gains, pilot, world.wrench)
+        touched = _touches(world.now, sensors, floor)
+        if touched:
+            pilot.report[PHASE], pilot.report[REASON] = signals.ABORT, TOUCHED
         # The flow past the hull is not measured: the velocity over ground stands for it.
         known = world.estimate[signals.U : signals.U + 6]
         lower, upper = allocation.lower, allocation.upper
@@ -194,7 +224,7 @@ def _fly_ticks(
         )
         log_row(navigation, rows.navigation[k])
         flown += 1
-        if pilot.report[PHASE] == signals.DONE or pilot.report[AT_SURFACE] == 1.0:
+        if touched or pilot.report[PHASE] == signals.DONE or pilot.report[AT_SURFACE] == 1.0:
             break
 
         for i in range(STATE):
@@ -344,7 +374,7 @@ def _chunks(
             rows,
         )  # fmt: skip
         yield Rows(*(part[:flown] for part in rows))
-        if flown < len(rows.state):
+        if flown < len(rows.state) or pilot.report[REASON] == TOUCHED:
             return
 
 

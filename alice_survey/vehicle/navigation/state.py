@@ -48,11 +48,15 @@ INNOVATION_AT = (0, 1, 2, 6, 10, 12)
 
 HEADING_TURNS, ALTITUDE_PING, ALTITUDE_TIME, ALTITUDE_VARIANCE, FOLLOWED_DEPTH = 0, 1, 2, 3, 4
 RELIEF_VARIANCE, RELIEF_PINGS, ALTITUDE_NOW, ALTITUDE_SIGMA = 5, 6, 7, 8
-IMU_PLACE, LATEST = 9, 12
+IMU_PLACE = 9
+SLOPE_NORTH, SLOPE_EAST, SLOPE_VARIANCE, MEAN_SLOPE_NORTH, MEAN_SLOPE_EAST = 12, 13, 14, 15, 16
+MOVED_NORTH, MOVED_EAST, CLEARANCE_PING, CLEARANCE_NOW, LATEST = 17, 18, 19, 20, 21
 MEMORY = LATEST + ESTIMATE
 """Places in `memory`: the heading not wrapped; altitude of the followed point, its time, variance
 and depth at the last ping; the beams' spread; altitude and its sigma now; where the IMU is on the
-body (3); the latest estimate, as `signals` has it (13)."""
+body (3); by how much the floor's depth grows to the north and to the east at the last ping, the
+variance of either, and both averaged; how far the vehicle has gone since; clearance at the last
+ping and now; the latest estimate, as `signals` has it (14)."""
 
 TRUTH_BEFORE, TRUTH_NOW, BELIEVED = 0, 1, 2
 """Rows of `turns`."""
@@ -137,6 +141,7 @@ def new_navigation(sensors: Sensors, truth: Array, rng: np.random.Generator) -> 
     rotation = believed.as_matrix()
     memory[HEADING_TURNS] = math.atan2(rotation[1, 0], rotation[0, 0])
     memory[RELIEF_VARIANCE] = memory[RELIEF_PINGS] = 0.0
+    memory[MEAN_SLOPE_NORTH] = memory[MEAN_SLOPE_EAST] = 0.0
     memory[IMU_PLACE : IMU_PLACE + 3] = lever
     return NavigationState(
         nominal=nominal,

@@ -11,6 +11,7 @@ import numpy as np
 from alice_survey.frames import Array
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.floor import FloorGrid
+from alice_survey.vehicle.hull import HULL_BODY_M
 from alice_survey.vehicle.navigation.filter import (
     correct,
     lever_row,
@@ -40,6 +41,8 @@ from alice_survey.vehicle.navigation.state import (
     ALTITUDE_VARIANCE,
     ATTITUDE,
     BELIEVED,
+    CLEARANCE_NOW,
+    CLEARANCE_PING,
     FOLLOWED_DEPTH,
     GPS_BIAS,
     GPS_FIX,
@@ -48,12 +51,19 @@ from alice_survey.vehicle.navigation.state import (
     HEADING_TURNS,
     IMU_PLACE,
     LATEST,
+    MEAN_SLOPE_EAST,
+    MEAN_SLOPE_NORTH,
+    MOVED_EAST,
+    MOVED_NORTH,
     QUATERNION,
     RANGE,
     RATES,
     REJECTED,
     RELIEF_PINGS,
     RELIEF_VARIANCE,
+    SLOPE_EAST,
+    SLOPE_NORTH,
+    SLOPE_VARIANCE,
     TRUTH_NOW,
     USBL_FIX,
     USBL_USE,
@@ -62,7 +72,7 @@ from alice_survey.vehicle.navigation.state import (
     NavigationState,
 )
 from alice_survey.vehicle.rotations import matrix_of, wrapped
-from alice_survey.vehicle.signals import ALTITUDE, ESTIMATE, HEADING, P, U
+from alice_survey.vehicle.signals import ALTITUDE, CLEARANCE, ESTIMATE, HEADING, P, U
 
 LOG_COLUMNS = (
     "north_m", "east_m", "depth_m", "roll_rad", "pitch_rad", "heading_rad",
@@ -72,13 +82,15 @@ LOG_COLUMNS = (
     "range_1_m", "range_2_m", "range_3_m", "range_4_m",
     "used_compass", "used_depth", "used_dvl", "used_water", "used_gps", "used_usbl",
     "rejected_compass", "rejected_depth", "rejected_dvl", "rejected_water", "rejected_gps",
-    "rejected_usbl",
+    "rejected_usbl", "clearance_m",
 )  # fmt: skip
 """Of a row of `log_row`: the estimate in the order of `signals`, sigmas, the latest ping's ranges,
-and how many measurements of each instrument were used and rejected so far."""
+how many measurements of each instrument were used and rejected so far, and the clearance."""
 LOG_ROW = len(LOG_COLUMNS)
-LOG_SIGMA, LOG_RANGE, LOG_USED, LOG_REJECTED = 13, 20, 24, 30
-"""Where sigmas, ranges and counts begin in a row."""
+LOG_SIGMA, LOG_RANGE, LOG_USED, LOG_REJECTED, LOG_CLEARANCE = 13, 20, 24, 30, 36
+"""Where sigmas, ranges and counts begin in a row, and where the clearance is."""
+_LEAST_SPREAD = 0.01
+"""Of the ends of the beams, by their greatest: a quarter for a square, 0.19 for three corners."""
 
 
 @kernel
@@ -109,7 +121,8 @@ def navigation_tick(
         suite: the instruments.
         nav: filter and instruments, overwritten.
         rng: where noise comes from.
-        estimate: (13,) is written as `signals` has it; the altitude is NaN without bottom lock.
+        estimate: (14,) is written as `signals` has it; altitude and clearance are NaN without
+            bottom lock.
     """
     for i in range(nav.innovations.shape[0]):
         nav.innovations[i] = math.nan
@@ -147,9 +160,10 @@ def navigation_tick(
         correct(nav)
     _tell(nav, suite, estimate)
     if pinged and bottom != 0:
-        _hear_altitude(time_s, bottom, nav, suite)
+        _hear_floor(time_s, bottom, nav, suite)
     _carry_altitude(time_s, nav, suite)
     estimate[ALTITUDE] = nav.memory[ALTITUDE_NOW]
+    estimate[CLEARANCE] = nav.memory[CLEARANCE_NOW]
     for i in range(ESTIMATE):
         nav.memory[LATEST + i] = estimate[i]
 
@@ -192,54 +206,90 @@ def _followed_depth(nav: NavigationState, suite: Sensors) -> float:
 
 
 @kernel
-def _hear_altitude(time_s: float, used: int, nav: NavigationState, suite: Sensors) -> None:
-    """Altitude of the followed point from a ping: the mean of the beams, moved by the lever.
+def _hear_floor(time_s: float, used: int, nav: NavigationState, suite: Sensors) -> None:
+    """Altitude of the followed point and clearance of the hull from a ping: a plane by the beams.
 
-    Each range is brought to the vertical by the believed attitude. Over relief the sea floor below
-    the point is not the beams' mean: their spread, averaged over the last seconds, says by how
-    much, a fifth draw about the mean of four. A beam whose velocity was an outlier heard something
-    else than the sea floor. Fewer than three beams tell nothing.
+    The beams meet the sea floor about the DVL; the followed point is elsewhere. A plane is fitted
+    (least squares) to where they end by the believed attitude, and read below the point. How far
+    relief departs from a plane is not seen by one ping, whose four ends leave a single degree of
+    freedom: what the ends stray from their mean slope of the last seconds says so.
+    A beam whose velocity was an outlier heard something else than the sea floor. Fewer than three
+    beams, or three whose ends lie nearly in line, tell nothing.
     """
-    turned, memory = nav.turns[BELIEVED], nav.memory
+    turned, memory, place = nav.turns[BELIEVED], nav.memory, suite.place
     count = 0
-    mean = square = noise = c0 = c1 = c2 = 0.0
+    noise = sn = se = sd = snn = sne = see = snd = sed = sdd = 0.0
+    highest = math.inf
     for i in range(BEAMS):
         if used >> i & 1 == 0:
             continue
         reach = nav.readings[RANGE + i]
-        b0, b1, b2 = suite.beams[i, 0], suite.beams[i, 1], suite.beams[i, 2]
-        down = turned[2, 0] * b0 + turned[2, 1] * b1 + turned[2, 2] * b2
-        height = reach * down
+        a = reach * suite.beams[i, 0] + place[DVL, 0] - place[FOLLOWED, 0]
+        b = reach * suite.beams[i, 1] + place[DVL, 1] - place[FOLLOWED, 1]
+        c = reach * suite.beams[i, 2] + place[DVL, 2] - place[FOLLOWED, 2]
+        # Where the beam ends, from the followed point.
+        n = turned[0, 0] * a + turned[0, 1] * b + turned[0, 2] * c
+        e = turned[1, 0] * a + turned[1, 1] * b + turned[1, 2] * c
+        d = turned[2, 0] * a + turned[2, 1] * b + turned[2, 2] * c
         count += 1
-        # Welford's running mean and sum of squares.
-        step = height - mean
-        mean += step / count
-        square += step * (height - mean)
-        slope = suite.range_noise_fraction * reach
-        noise += (suite.range_noise * suite.range_noise + slope * slope) * down * down
-        c0, c1, c2 = c0 + reach * b0, c1 + reach * b1, c2 + reach * b2
+        sn, se, sd = sn + n, se + e, sd + d
+        snn, sne, see = snn + n * n, sne + n * e, see + e * e
+        snd, sed, sdd = snd + n * d, sed + e * d, sdd + d * d
+        highest = min(highest, d)
+        down = turned[2, 0] * suite.beams[i, 0] + turned[2, 1] * suite.beams[i, 1]
+        down += turned[2, 2] * suite.beams[i, 2]
+        growth = suite.range_noise_fraction * reach
+        noise += (suite.range_noise * suite.range_noise + growth * growth) * down * down
     if count < 3:
         return
     noise /= count
-    memory[RELIEF_PINGS] += 1.0
-    share = max(1.0 / memory[RELIEF_PINGS], suite.dvl_every * suite.tick_s / suite.relief_memory_s)
-    memory[RELIEF_VARIANCE] += share * (square / (count - 1) - memory[RELIEF_VARIANCE])
-    # From the followed point to the middle of the beams' footprints: what a tilt acts by.
-    a = c0 / count + suite.place[DVL, 0] - suite.place[FOLLOWED, 0]
-    b = c1 / count + suite.place[DVL, 1] - suite.place[FOLLOWED, 1]
-    c = c2 / count + suite.place[DVL, 2] - suite.place[FOLLOWED, 2]
-    lever = 0.0
-    for i in range(3):
-        lever += turned[2, i] * (suite.place[DVL, i] - suite.place[FOLLOWED, i])
-    north = turned[0, 0] * a + turned[0, 1] * b + turned[0, 2] * c
-    east = turned[1, 0] * a + turned[1, 1] * b + turned[1, 2] * c
-    tilt = _variance(nav, ATTITUDE, east, -north, 0.0)
-    # The spread holds the ranges' noise, of which the mean keeps a part only.
-    spread = max((1.0 + 1.0 / count) * memory[RELIEF_VARIANCE] - noise, noise / count)
-    memory[ALTITUDE_PING] = mean + lever
-    memory[ALTITUDE_VARIANCE] = spread + tilt
+    n, e, d = sn / count, se / count, sd / count
+    cnn, cne, cee = snn - n * sn, sne - n * se, see - e * se
+    cnd, ced, cdd = snd - n * sd, sed - e * sd, sdd - d * sd
+    determinant = cnn * cee - cne * cne
+    if determinant < _LEAST_SPREAD * (cnn + cee) * (cnn + cee):
+        return
+    north, east = (cee * cnd - cne * ced) / determinant, (cnn * ced - cne * cnd) / determinant
+    altitude = d - north * n - east * e
+    # Of the plane's depth below the point, by that of a beam's end.
+    doubt = 1.0 / count + (cee * n * n - 2.0 * cne * n * e + cnn * e * e) / determinant
+
+    share = suite.dvl_every * suite.tick_s / suite.relief_memory_s
+    share = max(1.0 / (memory[RELIEF_PINGS] + 1.0), share)
+    freedom = count - 3.0 + 2.0 * (1.0 - share) * (1.0 - share)
+    if freedom > 0.0:
+        memory[RELIEF_PINGS] += 1.0
+        memory[MEAN_SLOPE_NORTH] += share * (north - memory[MEAN_SLOPE_NORTH])
+        memory[MEAN_SLOPE_EAST] += share * (east - memory[MEAN_SLOPE_EAST])
+        gn, ge = memory[MEAN_SLOPE_NORTH], memory[MEAN_SLOPE_EAST]
+        square = cdd - 2.0 * (gn * cnd + ge * ced)
+        square += gn * gn * cnn + 2.0 * gn * ge * cne + ge * ge * cee
+        memory[RELIEF_VARIANCE] += share * (square / freedom - memory[RELIEF_VARIANCE])
+    relief = memory[RELIEF_VARIANCE]
+    # The spread holds the ranges' noise, of which the plane keeps a part only.
+    spread = max((1.0 + doubt) * relief - noise, doubt * noise)
+    # A tilt turns the ends about the point: over a level floor that moves them sideways only.
+    tilt = _variance(nav, ATTITUDE, altitude * east, -altitude * north, 0.0)
+    memory[ALTITUDE_PING], memory[ALTITUDE_VARIANCE] = altitude, spread + tilt
+    memory[SLOPE_NORTH], memory[SLOPE_EAST] = north, east
+    memory[SLOPE_VARIANCE] = max(relief, noise) * (cnn + cee) / determinant
+    memory[MOVED_NORTH] = memory[MOVED_EAST] = 0.0
     memory[ALTITUDE_TIME] = time_s
     memory[FOLLOWED_DEPTH] = _followed_depth(nav, suite)
+
+    clearance, lowest = altitude, 0.0
+    for i in range(len(HULL_BODY_M) + 1):
+        if i < len(HULL_BODY_M):
+            a, b, c = HULL_BODY_M[i]
+        else:
+            a, b, c = place[DVL, 0], place[DVL, 1], place[DVL, 2]
+        a, b, c = a - place[FOLLOWED, 0], b - place[FOLLOWED, 1], c - place[FOLLOWED, 2]
+        n = turned[0, 0] * a + turned[0, 1] * b + turned[0, 2] * c
+        e = turned[1, 0] * a + turned[1, 1] * b + turned[1, 2] * c
+        d = turned[2, 0] * a + turned[2, 1] * b + turned[2, 2] * c
+        clearance = min(clearance, altitude + north * n + east * e - d)
+        lowest = max(lowest, d)
+    memory[CLEARANCE_PING] = min(clearance, highest - lowest)
 
 
 @kernel
@@ -256,19 +306,31 @@ def _variance(nav: NavigationState, t: int, a: float, b: float, c: float) -> flo
 
 @kernel
 def _carry_altitude(time_s: float, nav: NavigationState, suite: Sensors) -> None:
-    """Altitude now: the last ping's, less the depth gained since; NaN when that is too long ago."""
-    memory = nav.memory
+    """Altitude and clearance now, by the last ping's plane; NaN when that is too long ago.
+
+    The depth gained since and the rise of the plane below the way gone since are taken off.
+    """
+    memory, x, turned = nav.memory, nav.nominal, nav.turns[BELIEVED]
     age = time_s - memory[ALTITUDE_TIME]
     # Not a number before the first ping: then this is false too.
     if age <= suite.altitude_age_s + 1e-9:
+        if age > 0.0:
+            # Summed speeds, not places: a fix would move the vehicle along the slope.
+            u, v, w = x[VELOCITY], x[VELOCITY + 1], x[VELOCITY + 2]
+            step = suite.tick_s
+            memory[MOVED_NORTH] += step * (turned[0, 0] * u + turned[0, 1] * v + turned[0, 2] * w)
+            memory[MOVED_EAST] += step * (turned[1, 0] * u + turned[1, 1] * v + turned[1, 2] * w)
+        n, e = memory[MOVED_NORTH], memory[MOVED_EAST]
         gained = _followed_depth(nav, suite) - memory[FOLLOWED_DEPTH]
-        turned = nav.turns[BELIEVED]
+        sinks = memory[SLOPE_NORTH] * n + memory[SLOPE_EAST] * e
         drifted = age * age * _variance(nav, VELOCITY, turned[2, 0], turned[2, 1], turned[2, 2])
-        memory[ALTITUDE_NOW] = memory[ALTITUDE_PING] - gained
+        drifted += memory[SLOPE_VARIANCE] * (n * n + e * e)
+        memory[ALTITUDE_NOW] = memory[ALTITUDE_PING] - gained + sinks
         memory[ALTITUDE_SIGMA] = math.sqrt(memory[ALTITUDE_VARIANCE] + drifted)
+        clearance = memory[CLEARANCE_PING] - gained + min(sinks, 0.0)
+        memory[CLEARANCE_NOW] = clearance - memory[ALTITUDE_SIGMA]
     else:
-        memory[ALTITUDE_NOW] = math.nan
-        memory[ALTITUDE_SIGMA] = math.nan
+        memory[ALTITUDE_NOW] = memory[ALTITUDE_SIGMA] = memory[CLEARANCE_NOW] = math.nan
 
 
 @kernel
@@ -279,8 +341,9 @@ def log_row(nav: NavigationState, out: Array) -> None:
     """
     p, turned = nav.covariance, nav.turns[BELIEVED]
     latest = nav.memory[LATEST : LATEST + ESTIMATE]
-    for i in range(ESTIMATE):
+    for i in range(LOG_SIGMA):
         out[i] = latest[i]
+    out[LOG_CLEARANCE] = latest[CLEARANCE]
     a, b, c = nav.memory[IMU_PLACE], nav.memory[IMU_PLACE + 1], nav.memory[IMU_PLACE + 2]
     n = turned[0, 0] * a + turned[0, 1] * b + turned[0, 2] * c
     e = turned[1, 0] * a + turned[1, 1] * b + turned[1, 2] * c

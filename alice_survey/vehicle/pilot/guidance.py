@@ -10,7 +10,8 @@ glass, for which plans are made.
 A mission's phases (signals.py): DIVE to the altitude, as near to the start as the thrusters can
 stay; APPROACH to the start of a straight way in, however far the current has carried the vehicle;
 FOLLOW the path; ASCEND; DONE. ABORT, from any phase but the last two, is an ascent with a reason
-(safety.py). Without bottom lock the depth is held, until the lock is lost for too long.
+(safety.py). Close to the sea floor the vehicle slows down and climbs. Without bottom lock it stops
+and holds its depth, rising as the floor last did, until the lock is lost for too long.
 """
 
 import math
@@ -27,6 +28,7 @@ from alice_survey.vehicle.pilot.safety import (
     LOST_PATH,
     NO_NAVIGATION,
     NONE,
+    mind_floor,
     navigates,
     restart_watch,
     watch,
@@ -47,7 +49,7 @@ from alice_survey.vehicle.signals import ABORT, APPROACH, ASCEND, DIVE, DONE, FO
 
 _DEPTH_SPEED_KEPT_MPS = 0.05
 _CAUTION_M = 0.5
-"""A dive without sight of the bottom stops this far above the greatest depth."""
+"""A dive without sight of the bottom stops at least this far above the greatest depth."""
 _SETTLE_S = 2.0
 _QUICKEST = 2.0
 """Progress along the path by the wanted speed, at most: a projection may not jump."""
@@ -69,7 +71,7 @@ def steer(
     Args:
         time_s: since the start of the mission.
         dt_s: the tick.
-        estimate: (13,) of the navigation, see signals.py.
+        estimate: (14,) of the navigation, see signals.py.
         path: to follow.
         guidance: settings.
         gains: of the inner loops.
@@ -135,12 +137,13 @@ def _abort(reason: int, estimate: Array, pilot: PilotState) -> None:
 
 @kernel
 def _target_m(path: Path, guidance: Guidance, pilot: PilotState) -> float:
-    """Wanted depth of the origin: almost as deep as is allowed until the bottom is heard.
+    """Wanted depth of the origin: as deep as it may go unseeing until the bottom is heard.
 
     The smoothed sum of depth and altitude holds by how much the followed point is below the origin.
     """
     if pilot.memory[told.FLOOR_KNOWN] == 0.0:
-        return float(guidance.limits.most_depth_m - _CAUTION_M)
+        limits = guidance.limits
+        return float(min(limits.blind_depth_m, limits.most_depth_m - _CAUTION_M))
     return float(pilot.memory[told.FLOOR] - path.altitude_m)
 
 
@@ -172,7 +175,8 @@ def _on_the_way(
 ) -> None:
     """Dive or approach for a tick."""
     memory, report, point = pilot.memory, pilot.report, pilot.point
-    phase, target = report[told.PHASE], _target_m(path, guidance, pilot)
+    phase = report[told.PHASE]
+    target = mind_floor(_target_m(path, guidance, pilot), estimate, guidance.limits, pilot)
     sink_to(target, memory[told.FLOOR_SLOPE], estimate, dt_s, gains, pilot)
     n, e, heading = _goal(path, guidance, pilot)
     distance, error = go_to(n, e, heading, dt_s, estimate, path, guidance, gains, pilot)
@@ -212,7 +216,7 @@ def _on_path(
         point[told.POINT_EAST],
         _QUICKEST * path.speed_mps * dt_s,
     )
-    target = _target_m(path, guidance, pilot)
+    target = mind_floor(_target_m(path, guidance, pilot), estimate, guidance.limits, pilot)
     sink_to(target, memory[told.FLOOR_SLOPE], estimate, dt_s, gains, pilot)
     follow(leg, along, dt_s, estimate, path, guidance, gains, pilot)
     if over:

@@ -22,13 +22,15 @@ REPORT = 13
 (
     FLOOR, FLOOR_SLOPE, FLOOR_KNOWN, SURGE_SUM, SWAY_SUM_N, SWAY_SUM_E, HEAVE_SUM, YAW_SUM,
     SETTLED_S, BEST, SINCE_BEST_S, RETURNS, LOST_S, LOW_S, PITCHED_S,
-) = range(15)  # fmt: skip
+    UNSAFE_S, PACE,
+) = range(17)  # fmt: skip
 """Places in the memory: the depth, m, that the origin's depth and the altitude add up to, smoothed,
 its slope, m/s, and whether there is one; integrals of the inner loops as speeds, that of sway as a
 vector in NED; the time that depth, or place and heading, are kept; the watchdog's best value and
 its age; returns to the path; how long bottom lock is lost, the altitude too low, the pitch too
-large, s."""
-MEMORY = 15
+large, s; how long the clearance is less than half of what is allowed, s; and the share of the
+wanted surge that the sea floor leaves."""
+MEMORY = 17
 
 (
     REF_SURGE, REF_SWAY, REF_HEAVE, REF_YAW, ACC_SURGE, ACC_SWAY, ACC_HEAVE, ACC_YAW,
@@ -64,7 +66,7 @@ class PilotState(NamedTuple):
 def new_pilot() -> PilotState:
     """A pilot at the start of a mission: about to dive."""
     memory = np.zeros(MEMORY)
-    memory[BEST] = -math.inf
+    memory[BEST], memory[PACE] = -math.inf, 1.0
     report = np.zeros(REPORT)
     report[WANTED_HEADING] = math.nan
     report[LINE] = -1.0

@@ -10,14 +10,17 @@ from alice_survey.vehicle.pilot.memory import (
     FLOOR_KNOWN,
     LOST_S,
     LOW_S,
+    PACE,
     PHASE,
     PITCHED_S,
     SINCE_BEST_S,
+    UNSAFE_S,
     PilotState,
 )
 from alice_survey.vehicle.signals import (
     ALTITUDE,
     APPROACH,
+    CLEARANCE,
     DEPTH,
     DIVE,
     ESTIMATE,
@@ -27,12 +30,12 @@ from alice_survey.vehicle.signals import (
 
 (
     NONE, TOO_LOW, TOO_STEEP, NO_BOTTOM, NO_DIVE, NO_APPROACH, NO_PROGRESS, LOST_PATH, TOO_DEEP,
-    TOO_LONG, NO_NAVIGATION,
-) = range(11)  # fmt: skip
+    TOO_LONG, NO_NAVIGATION, TOUCHED,
+) = range(12)  # fmt: skip
 
 REASONS = {
     NONE: "not aborted",
-    TOO_LOW: "the altitude stayed below the least that is allowed",
+    TOO_LOW: "the clearance stayed below the least that is allowed",
     TOO_STEEP: "the pitch stayed beyond the most that is allowed",
     NO_BOTTOM: "the DVL did not hear the bottom for longer than is allowed",
     NO_DIVE: "the dive came no nearer to the wanted altitude",
@@ -42,11 +45,19 @@ REASONS = {
     TOO_DEEP: "the depth exceeded the most that is allowed",
     TOO_LONG: "the mission took longer than is allowed",
     NO_NAVIGATION: "the navigation gave no position",
+    TOUCHED: "the hull touched the sea floor",
 }
 """What the codes of `REASON` in a report mean."""
 
 _WITHIN_S = 1.0
-"""How long altitude or pitch may be out of bounds: outliast a false echo and a wave of pitch."""
+"""How long half the clearance or the pitch may be out of bounds: longer than a false echo and a
+wave of pitch."""
+_KEPT = 1.25
+"""By the least clearance: what guidance rises to keep, and below which the vehicle goes slower, to
+stand still at the least."""
+_STOP_S = 3.0
+"""After the loss of bottom lock, within which the surge is taken back. The lock is reported lost
+two seconds after the last ping, so that the vehicle is at rest some five seconds after it."""
 _STEP_M = 0.1
 """Less than this is no progress."""
 
@@ -55,6 +66,7 @@ class Limits(NamedTuple):
     """Bounds beyond which the vehicle gives up and comes to the surface."""
 
     least_altitude_m: float
+    """Of all parts of the vehicle above the sea floor."""
     most_depth_m: float
     most_pitch_rad: float = math.radians(30.0)
     lost_bottom_s: float = 20.0
@@ -64,16 +76,54 @@ class Limits(NamedTuple):
     """How often the vehicle may be carried off the path and come back."""
     longest_s: float = 86400.0
     """Of the whole mission up to the ascent."""
+    climb_s: float = 10.0
+    """How long the vehicle may take to climb back to the least altitude; below half of it there is
+    no waiting."""
+    blind_depth_m: float = math.inf
+    """How deep the vehicle dives before it hears the bottom; by default almost the most."""
 
 
 @kernel
 def navigates(estimate: Array) -> bool:
-    """Whether the navigation gives all it must: everything but the altitude."""
+    """Whether the navigation gives all it must: everything but altitude and clearance."""
     total = 0.0
     for i in range(ESTIMATE):
-        if i != ALTITUDE:
+        if i != ALTITUDE and i != CLEARANCE:
             total += estimate[i]
     return math.isfinite(total)
+
+
+@kernel
+def _clear_m(estimate: Array) -> float:
+    """Least of altitude and clearance; NaN without bottom lock."""
+    return float(min(estimate[ALTITUDE], estimate[CLEARANCE]))
+
+
+@kernel
+def mind_floor(depth_m: float, estimate: Array, limits: Limits, pilot: PilotState) -> float:
+    """Keep clear of the sea floor: slow down, and climb.
+
+    The pace is 1 where the clearance is at least 1.25 times the least that is allowed and falls to
+    0 at the least. Without bottom lock it falls to 0 in 3 s, but not on the dive, on which
+    bottom lock may not have been found yet.
+
+    Args:
+        depth_m: wanted, of the origin.
+        estimate: (14,) of the navigation.
+        limits: bounds.
+        pilot: its memory's pace is written.
+
+    Returns:
+        A depth, no greater, with at least 1.25 times the least clearance.
+    """
+    memory, least = pilot.memory, limits.least_altitude_m
+    clear = _clear_m(estimate)
+    if not math.isfinite(clear):
+        memory[PACE] = max(0.0, 1.0 - memory[LOST_S] / _STOP_S)
+        return depth_m
+    spare = clear - _KEPT * least
+    memory[PACE] = min(max((clear / least - 1.0) / (_KEPT - 1.0), 0.0), 1.0)
+    return float(min(depth_m, estimate[DEPTH] + spare))
 
 
 @kernel
@@ -90,7 +140,7 @@ def watch(
     Args:
         time_s: since the start of the mission.
         dt_s: the tick.
-        estimate: (13,) of the navigation.
+        estimate: (14,) of the navigation.
         progress_m: what should grow in the phase that the pilot reports.
         limits: bounds.
         pilot: its memory is written.
@@ -101,14 +151,15 @@ def watch(
     memory, phase = pilot.memory, pilot.report[PHASE]
     if phase != DIVE and phase != APPROACH and phase != FOLLOW:
         return NONE
-    altitude = estimate[ALTITUDE]
-    heard = math.isfinite(altitude)
+    clear = _clear_m(estimate)
+    heard = math.isfinite(clear)
     # On the way down the bottom may be out of reach; the watch on the dive's progress covers it.
     memory[LOST_S] = 0.0 if heard or phase == DIVE else memory[LOST_S] + dt_s
     # An altitude that is not heard neither clears nor adds to the suspicion.
     if heard:
-        low = altitude < limits.least_altitude_m
-        memory[LOW_S] = memory[LOW_S] + dt_s if low else 0.0
+        least = limits.least_altitude_m
+        memory[LOW_S] = memory[LOW_S] + dt_s if clear < least else 0.0
+        memory[UNSAFE_S] = memory[UNSAFE_S] + dt_s if clear < 0.5 * least else 0.0
     steep = abs(estimate[PITCH]) > limits.most_pitch_rad
     memory[PITCHED_S] = memory[PITCHED_S] + dt_s if steep else 0.0
     if progress_m > memory[BEST] + _STEP_M:
@@ -116,7 +167,7 @@ def watch(
     else:
         memory[SINCE_BEST_S] += dt_s
 
-    if memory[LOW_S] > _WITHIN_S:
+    if memory[UNSAFE_S] > _WITHIN_S or memory[LOW_S] > limits.climb_s:
         return TOO_LOW
     if memory[PITCHED_S] > _WITHIN_S:
         return TOO_STEEP

@@ -35,6 +35,9 @@ new one they would only wind up."""
 _MOST_SURPRISE_M = 1.0
 """A greater step of the sea floor is believed at this rate only: it may be a false echo, and a
 ledge is not to be dived from at once."""
+_RISE_ON_S = 5.0
+"""Without bottom lock the floor is taken to rise on for so long at full speed: for about as much as
+the vehicle goes on until it is at rest (inferred)."""
 _HOVER_M = 2.0
 """Nearer than this a vehicle with sway hovers towards its goal instead of heading for it."""
 _HOVER_SHARE = 0.25
@@ -66,12 +69,14 @@ def hear_floor(estimate: Array, dt_s: float, guidance: Guidance, pilot: PilotSta
     """Smooth the depth that the origin's depth and the altitude add up to, and its slope.
 
     A critically damped second-order tracker: it follows a constant slope without lag. Without
-    bottom lock the depth is held and the slope fades.
+    bottom lock a floor that rose goes on rising, ever more slowly as the vehicle comes to a stop;
+    the depth of one that fell is held.
     """
     memory, rate = pilot.memory, guidance.floor_rate_rad_s
     heard = estimate[signals.DEPTH] + estimate[signals.ALTITUDE]
     if not math.isfinite(heard):
-        memory[told.FLOOR_SLOPE] *= 1.0 - rate * dt_s
+        memory[told.FLOOR_SLOPE] = min(memory[told.FLOOR_SLOPE], 0.0) * (1.0 - dt_s / _RISE_ON_S)
+        memory[told.FLOOR] += dt_s * memory[told.FLOOR_SLOPE]
         return
     if memory[told.FLOOR_KNOWN] == 0.0:
         memory[told.FLOOR_KNOWN], memory[told.FLOOR] = 1.0, heard
@@ -148,8 +153,9 @@ def head_for(
 def surge_at(
     speed: float, dt_s: float, guidance: Guidance, gains: Gains, pilot: PilotState
 ) -> None:
-    """Ask for a surge of the followed point over ground."""
+    """Ask for a surge of the followed point over ground, as far as the sea floor leaves it."""
     memory, demand = pilot.memory, pilot.demand
+    speed *= memory[told.PACE]
     now = pilot.point[told.SURGE_SPEED]
     demand[told.ACC_SURGE], memory[told.SURGE_SUM] = speed_demand(
         gains, SURGE, speed, now, demand[told.FULL_SURGE], memory[told.SURGE_SUM], dt_s

@@ -11,6 +11,7 @@ from alice_survey.vehicle.floor import FloorGrid
 from alice_survey.vehicle.navigation.sensors import IMU, Sensors
 from alice_survey.vehicle.navigation.state import GYRO_BIAS, WATER, NavigationState, new_navigation
 from alice_survey.vehicle.navigation.tick import LOG_ROW, log_row, navigation_tick
+from alice_survey.vehicle.signals import ESTIMATE
 
 Array = NDArray[np.float64]
 TICK_S = 0.05
@@ -113,7 +114,7 @@ def fly(
     epochs = (count - 1) // every + 1
     run = Run(
         truth=truth,
-        estimate=np.full((count, 13), np.nan),
+        estimate=np.full((count, ESTIMATE), np.nan),
         log=np.full((count, LOG_ROW), np.nan),
         innovations=np.full((count, 14), np.nan),
         nominal=np.full((epochs, 26), np.nan),

@@ -106,7 +106,7 @@ def test_a_run_equals_the_dense_twin() -> None:
     truth[:, 2], truth[:, 9] = 0.28, 0.0
     rng = default_rng(5)
     nav = new_navigation(sensors, truth[0], rng)
-    water, estimate = np.array([0.1, -0.05, 0.0]), np.zeros(13)
+    water, estimate = np.array([0.1, -0.05, 0.0]), np.zeros(14)
     belief, covariance = oracle.from_nominal(nav.nominal), nav.covariance.copy()
     for k in range(len(truth)):
         navigation_tick(
@@ -354,7 +354,7 @@ def test_a_disturbed_compass_is_refused_first_and_then_doubted() -> None:
     for k in range(len(truth)):
         if k == 400:
             nav.hidden[HEADING_BIAS - 9] += np.deg2rad(30.0)
-        estimate = np.zeros(13)
+        estimate = np.zeros(14)
         navigation_tick(
             k * TICK_S, k, TICK_S, truth[max(k - 1, 0)], truth[k], np.zeros(3), FLOOR, sensors,
             nav, rng, estimate,
@@ -414,6 +414,7 @@ def test_the_same_seed_gives_the_same_bytes() -> None:
 def test_a_row_of_the_log_has_a_name_for_each_number() -> None:
     run = fly(SensorSuite().pack(), track(20.0), FLOOR, 5)
     assert LOG_ROW == len(set(LOG_COLUMNS)) == run.log.shape[1]
-    np.testing.assert_array_equal(run.log[:, :13], run.estimate)
+    np.testing.assert_array_equal(run.log[:, :13], run.estimate[:, :13])
+    np.testing.assert_array_equal(run.log[:, -1], run.estimate[:, 13])
     used = run.log[-1, column("used_compass") : column("used_compass") + 6]
     np.testing.assert_array_equal(used, run.nav.counts[:, USED])

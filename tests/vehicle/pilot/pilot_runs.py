@@ -48,6 +48,7 @@ def estimate_truth(state: Array, water: Array, point: Array, floor: Array, out: 
     north = state[0] + r00 * point[0] + r01 * point[1] + r02 * point[2]
     depth = state[2] + r20 * point[0] + r21 * point[1] + r22 * point[2]
     out[12] = floor[0] + floor[1] * north - depth if floor[2] > 0.0 else math.nan
+    out[13] = out[12]
 
 
 @kernel
@@ -67,7 +68,7 @@ def _fly(
     room: Array,
     rows: Array,
 ) -> None:
-    estimate, wrench, water, command = room[:13], room[13:19], room[19:25], room[25:]
+    estimate, wrench, water, command = room[:14], room[14:20], room[20:26], room[26:]
     step = 0.05 / 5
     for k in range(rows.shape[0]):
         time_s = (first + k) * 0.05
@@ -75,10 +76,12 @@ def _fly(
         estimate_truth(state, water, guidance.point_body_m, floor, estimate)
         steer(time_s, 0.05, estimate, path, guidance, gains, pilot, wrench)
         rows[k, 0] = time_s
+        for i in range(14):
+            rows[k, 1 + i] = estimate[i]
         for i in range(13):
-            rows[k, 1 + i], rows[k, 14 + i] = estimate[i], pilot.report[i]
+            rows[k, 15 + i] = pilot.report[i]
         for i in range(6):
-            rows[k, 27 + i] = wrench[i]
+            rows[k, 28 + i] = wrench[i]
         for i in range(5):
             for j in range(6):
                 load[j] = wrench[j] + keep[j] * (load[j] - wrench[j])
@@ -102,7 +105,7 @@ class Flight:
 
     def fly(self, seconds: float) -> "Rows":
         """Fly on."""
-        rows = np.zeros((round(seconds / TICK_S), 33))
+        rows = np.zeros((round(seconds / TICK_S), 34))
         thrusters = len(self.state) - 13
         lag_s = np.zeros(6)
         lag_s[list(DEGREES)] = np.maximum(self.gains.axes[:, LAG] - TICK_S / 2, 0.0)
@@ -110,7 +113,7 @@ class Flight:
         _fly(
             self.ticks, self.state, self.load, self.floor, keep, self.plant, self.current,
             self.path, self.guidance, self.gains, self.pilot, scratch_for(thrusters),
-            np.zeros(25 + thrusters), rows,
+            np.zeros(26 + thrusters), rows,
         )  # fmt: skip
         self.ticks += len(rows)
         return Rows(rows)
@@ -128,15 +131,15 @@ class Rows:
 
     @property
     def estimate(self) -> Array:
-        return self.table[:, 1:14]
+        return self.table[:, 1:15]
 
     @property
     def report(self) -> Array:
-        return self.table[:, 14:27]
+        return self.table[:, 15:28]
 
     @property
     def wrench(self) -> Array:
-        return self.table[:, 27:]
+        return self.table[:, 28:]
 
     def on_lines(self) -> "Rows":
         """The part on survey lines."""

@@ -40,7 +40,7 @@ MIDDLE = np.array([10.0, 0.0, 13.0, 0.0, 0.0, 0.0, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0]
 
 def estimate_of(motion: Array, cross_m: float = 0.0) -> Array:
     """An estimate about the middle of a straight path to the north."""
-    estimate = np.append(MIDDLE + SCALES * motion, 2.0)
+    estimate = np.append(MIDDLE + SCALES * motion, [2.0, 2.0])
     estimate[signals.EAST] += cross_m
     return estimate
 

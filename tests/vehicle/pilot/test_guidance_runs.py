@@ -210,6 +210,17 @@ def test_no_bottom_within_the_depth_allowed_ends_the_dive() -> None:
     assert 0.8 < sinking.mean() / flight.gains.axes[g.HEAVE, g.FASTEST] < 1.05
 
 
+def test_a_blind_dive_goes_no_deeper_than_it_may_unseeing() -> None:
+    flight = launch(straight(40.0))
+    flight.guidance = flight.guidance._replace(
+        limits=flight.guidance.limits._replace(blind_depth_m=12.0)
+    )
+    flight.floor[2] = 0.0
+    rows = flight.fly(150.0)
+    assert rows.phases() == [DIVE, ABORT]
+    assert 11.9 < rows.estimate[:, signals.DEPTH].max() < 12.1
+
+
 @pytest.mark.parametrize("slope", [-0.1, 0.1])
 def test_a_slope_is_followed_without_lag(slope: float) -> None:
     flight = launch(straight(60.0), following=True, slope=slope)

@@ -22,6 +22,7 @@ TICK_S = 0.05
 def calm(altitude_m: float = 2.0, pitch_rad: float = 0.0, depth_m: float = 13.0) -> Array:
     estimate = np.zeros(signals.ESTIMATE)
     estimate[[signals.ALTITUDE, signals.PITCH, signals.DEPTH]] = altitude_m, pitch_rad, depth_m
+    estimate[signals.CLEARANCE] = altitude_m
     return estimate
 
 
@@ -52,8 +53,10 @@ def test_a_calm_mission_goes_on(phase: int) -> None:
 @pytest.mark.parametrize(
     ("estimate", "phase", "speed", "reason", "after_s"),
     [
-        (calm(altitude_m=0.9), signals.FOLLOW, 0.2, safety.TOO_LOW, 1.0),
-        (calm(altitude_m=0.9), signals.DIVE, 0.2, safety.TOO_LOW, 1.0),
+        (calm(altitude_m=0.9), signals.FOLLOW, 0.2, safety.TOO_LOW, 10.0),
+        (calm(altitude_m=0.9), signals.DIVE, 0.2, safety.TOO_LOW, 10.0),
+        (calm(altitude_m=0.49), signals.FOLLOW, 0.2, safety.TOO_LOW, 1.0),
+        (calm(altitude_m=0.49), signals.DIVE, 0.2, safety.TOO_LOW, 1.0),
         (calm(pitch_rad=0.6), signals.FOLLOW, 0.2, safety.TOO_STEEP, 1.0),
         (calm(pitch_rad=-0.6), signals.APPROACH, 0.2, safety.TOO_STEEP, 1.0),
         (calm(altitude_m=math.nan), signals.FOLLOW, 0.2, safety.NO_BOTTOM, 20.0),
@@ -93,7 +96,7 @@ def test_false_echoes_and_gaps_do_not_end_a_mission() -> None:
 def test_echoes_between_gaps_still_tell_of_low_altitude() -> None:
     pilot, reason = pilot_in(signals.FOLLOW), 0
     for k in range(200):
-        altitude = 0.9 if k % 4 == 0 else math.nan
+        altitude = 0.4 if k % 4 == 0 else math.nan
         reason = reason or safety.watch(0.0, TICK_S, calm(altitude), 0.2 * k, LIMITS, pilot)
     assert reason == safety.TOO_LOW
 
@@ -138,12 +141,13 @@ def test_without_navigation_the_vehicle_pushes_itself_up(lost: int) -> None:
 def test_an_abort_takes_the_vehicle_to_the_surface() -> None:
     flight = launch(straight(50.0), following=True, current=(0.1, 90.0))
     flight.fly(20.0)
-    flight.floor[0] -= 1.5  # a rock: 0.5 m below the port
+    flight.floor[0] -= 1.8  # a rock: 0.2 m below the port
     rows = flight.fly(90.0)
     assert rows.phases() == [signals.FOLLOW, signals.ABORT]
     assert rows.report[-1, told.REASON] == safety.TOO_LOW
     low_s = rows.time_s[np.argmax(rows.report[:, told.PHASE] == signals.ABORT)] - rows.time_s[0]
     assert 0.9 < low_s < 1.2
+    assert rows.estimate[:, signals.CLEARANCE].min() > 0.1
     assert rows.report[-1, told.AT_SURFACE] == 1.0
     assert rows.estimate[-1, signals.DEPTH] < 0.3
     # It rises at the speed that is allowed, without turning round.
@@ -152,13 +156,54 @@ def test_an_abort_takes_the_vehicle_to_the_surface() -> None:
     assert np.abs(rows.estimate[:, signals.HEADING]).max() < math.radians(15.0)
 
 
+@pytest.mark.parametrize("part", [signals.ALTITUDE, signals.CLEARANCE])
+def test_either_too_low_stops_the_surge_and_raises_the_vehicle(part: int) -> None:
+    pilot, estimate = pilot_in(signals.FOLLOW), calm()
+    for clear_m, pace, rise_m in ((1.5, 1.0, 0.0), (1.125, 0.5, 0.125), (0.9, 0.0, 0.35)):
+        estimate[part] = clear_m
+        depth = safety.mind_floor(13.0, estimate, LIMITS, pilot)
+        assert depth == pytest.approx(13.0 - rise_m)
+        assert pilot.memory[told.PACE] == pytest.approx(pace)
+
+
+def test_over_a_rock_it_stops_climbs_and_goes_on() -> None:
+    flight = launch(straight(50.0), following=True)
+    flight.fly(20.0)
+    flight.floor[0] -= 1.3  # a rock: 0.7 m below the port
+    rows = flight.fly(60.0)
+    assert rows.phases() == [signals.FOLLOW]
+    assert rows.estimate[:, signals.CLEARANCE].min() > 0.6
+    low = rows.estimate[:, signals.CLEARANCE] < 1.0
+    assert 0.5 < low.sum() * TICK_S < LIMITS.climb_s
+    assert np.all(rows.report[low, told.WANTED_SURGE] == 0.0)
+    assert rows.estimate[-1, signals.ALTITUDE] == pytest.approx(2.0, abs=0.1)
+    assert rows.report[-1, told.WANTED_SURGE] == pytest.approx(0.2)
+
+
+def test_without_the_bottom_it_stops_rises_as_the_floor_did_and_goes_on_when_it_hears() -> None:
+    flight = launch(straight(50.0), following=True, slope=-0.4)
+    flight.fly(60.0)
+    floor = flight.floor.copy()
+    flight.floor[2] = 0.0
+    rows = flight.fly(15.0)
+    north, depth = rows.estimate[:, signals.NORTH], rows.estimate[:, signals.DEPTH]
+    clear = floor[0] + floor[1] * (north + 0.55) - depth - 0.08
+    assert clear.min() > 1.8
+    assert np.ptp(north[200:]) < 0.1
+    assert 0.2 < depth[0] - depth[-1] < 0.7
+    flight.floor[2] = 1.0
+    rows = flight.fly(30.0)
+    assert rows.phases() == [signals.FOLLOW]
+    assert rows.estimate[-1, signals.U] == pytest.approx(0.2, abs=0.02)
+
+
 def test_depth_is_held_while_the_bottom_is_not_heard() -> None:
     flight = launch(straight(50.0), following=True, slope=-0.05)
     flight.fly(60.0)
     flight.floor[2] = 0.0
     rows = flight.fly(21.0)
     held = rows.estimate[(rows.time_s < rows.time_s[0] + 20.0), signals.DEPTH]
-    # The slope that was followed fades; then depth stays.
+    # The rise that was followed fades as the vehicle stops; then depth stays.
     assert np.ptp(held[-100:]) < 0.01
     assert abs(held[-1] - held[0]) < 0.1
     assert rows.report[-1, told.REASON] == safety.NO_BOTTOM
