@@ -67,7 +67,7 @@ def _kq(kt: float) -> float:
 
 
 def _t200(name: str, x_m: float) -> Thruster:
-    """A lateral thruster. Its dead band is 28 of 400 us of command (Blue Robotics), some 4 to 5 rev/s.
+    """A lateral thruster. Its dead band is 28 of 400 us of command (Blue Robotics): 4 to 5 rev/s.
 
     Inferred: a lag of 0.15 s, and propellers that turn by the right hand.
     """
