@@ -186,7 +186,13 @@ def _text(path: Path) -> str | None:
 
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """A path to write to, beside `path`, that replaces it when all went well."""
+    """A path to write to, beside `path`, that replaces it when all went well.
+
+    Raises:
+        WorkspaceError: there is a folder of that name.
+    """
+    if path.is_dir():
+        raise WorkspaceError(f"{path} is a folder: give the name of a file")
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.tmp{os.getpid()}{path.suffix}")
     try:

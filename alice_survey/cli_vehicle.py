@@ -80,7 +80,7 @@ def compare(
     from alice_survey.survey import settings
     from missions.compare_report import compare_report
 
-    config = settings(workspace, survey, needed=False)
+    config = settings(workspace, survey, needed=workspace != WORK)
     text, data = compare_report(
         config, out or workspace / "compare", currents=current or (), swell=swell, seed=seed,
         flights=flights, threads=threads,

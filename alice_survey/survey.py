@@ -11,7 +11,7 @@ from typing import Any
 
 from alice_survey.artefacts import only_checking, read_json, read_stage
 from alice_survey.config import SurveyConfig, changed, load_config, parse_current, parse_health
-from alice_survey.errors import AliceError, ConfigError, WorkspaceError
+from alice_survey.errors import AliceError, ConfigError, WorkspaceError, warn
 from alice_survey.executor import default_threads
 from alice_survey.summaries import SUMMARIES
 
@@ -60,6 +60,9 @@ class FlightChanges:
             ConfigError: a value is not allowed.
         """
         speed, towards = parse_current(self.current)
+        if self.current is not None:  # instead of a measured one
+            sea = config.sea.model_copy(update={"current_file": None})
+            config = config.model_copy(update={"sea": sea})
         config = changed(config, "sea", current_mps=speed, current_towards_deg=towards)
         return changed(
             config, "vehicle",
@@ -138,8 +141,9 @@ def run(
     imported = is_imported(workspace)
     config = settings(workspace, survey, needed=not imported)
     config = changed(config, "imaging", scale=scale)
-    if flight is not None:
+    if flight is not None and flight != FlightChanges():
         config = flight.applied(config)
+        warn("these options hold for this flight alone: to keep them, put them into survey.toml")
     if imported:
         stages = [stage for stage in stages if stage != "calibration"]
         for stage in stages:
@@ -150,6 +154,10 @@ def run(
                 )
     lines, found = [], {}
     with _only_one(workspace):
+        if "flight" in stages and "plan" not in stages:
+            state = _state(workspace, "plan", config, {}, imported)
+            if state.startswith("stale"):
+                warn(f"the plan is {state}; 'alice-survey plan -w {workspace}' renews it")
         for stage in stages:
             done = _work_of(stage)(workspace, config, threads or default_threads())
             text, data = SUMMARIES[stage](workspace / stage)

@@ -82,6 +82,8 @@ def _draw_track(axes: Axes, plan: Plan, outcome: Outcome, labelled: bool) -> Non
 def _draw_strip(axes: Axes, traced: dict[str, Outcome], names: list[str], field: str) -> None:
     for name in names:
         trace = _trace(traced[name])
+        if not len(trace.time_s):  # it never came to the route
+            continue
         share = trace.time_s / trace.time_s[-1]
         values: Array = getattr(trace, field)
         axes.plot(share, values, color=_COLOURS[name], lw=0.8, label=name)

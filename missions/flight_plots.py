@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -149,7 +150,7 @@ def _draw_plan(axes: Axes, plan: Plan) -> None:
 
 def _end_chart(axes: Axes, title: str) -> None:
     axes.set_anchor("N")
-    axes.set_title(title, loc="left", fontsize=12, weight="bold")
+    axes.set_title(textwrap.fill(title, 60), loc="left", fontsize=12, weight="bold")
     axes.legend(
         loc="upper center", bbox_to_anchor=(0.5, 0.0), borderaxespad=4.5, ncol=3, frameon=False,
         fontsize=8,

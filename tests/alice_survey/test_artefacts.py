@@ -16,6 +16,7 @@ from alice_survey.artefacts import (
     only_checking,
     run_stage,
     write_csv,
+    write_json,
 )
 from alice_survey.errors import WorkspaceError
 
@@ -171,3 +172,8 @@ def test_atomic_path_leaves_nothing_behind_on_failure(tmp_path: Path) -> None:
 def test_csv_writes_unknown_values_as_empty_cells(tmp_path: Path) -> None:
     write_csv(tmp_path / "a.csv", ["x", "y"], [[1.5, float("nan")], [None, "t"]])
     assert (tmp_path / "a.csv").read_text() == "x,y\n1.5,\n,t\n"
+
+
+def test_a_folder_is_not_written_over_by_a_file(tmp_path: Path) -> None:
+    with pytest.raises(WorkspaceError, match="is a folder: give the name of a file"):
+        write_json(tmp_path, {})

@@ -125,7 +125,7 @@ def test_init_never_overwrites(
     ("arguments", "said"),
     [
         (["target", "chessboard 9x6 25mm", "-o", "FILE/b.pdf"], "FILE: File exists"),
-        (["target", "chessboard 9x6 25mm", "-o", "FOLDER/d.pdf"], "d.pdf: Is a directory"),
+        (["target", "chessboard 9x6 25mm", "-o", "FOLDER/d.pdf"], "d.pdf is a folder"),
         (["fov", "--rig", "FOLDER"], "FOLDER: Is a directory"),
     ],
 )

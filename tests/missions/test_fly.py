@@ -10,6 +10,7 @@ from alice_survey.config import SurveyConfig, parse_config
 from alice_survey.errors import VehicleError, WorkspaceError
 from alice_survey.frames import interpolate_poses
 from alice_survey.seafloor.terrain import survey_terrain
+from alice_survey.survey import FlightChanges, run
 from alice_survey.trajectory import read_columns, read_track
 from alice_survey.vehicle.log import read_vehicle_log
 from missions.fly import run_fly
@@ -155,3 +156,26 @@ def test_a_vehicle_that_reaches_no_line_says_why(tmp_path: Path) -> None:
     with pytest.raises(VehicleError, match=r"alice reached no line of the plan \(aborted: "):
         run_fly(tmp_path, strong, 1)
     assert not (tmp_path / "flight").exists()
+
+
+def test_a_stale_plan_is_flown_with_a_warning_and_options_are_said_to_be_for_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small = (
+        "[area]\nlength_m = 2.0\nwidth_m = 1.5\nseafloor_depth_m = 5.0\n[seafloor]\ngrid_m = 0.05\n"
+    )
+    (tmp_path / "survey.toml").write_text(small)
+    run(["plan"], tmp_path, None)
+    (tmp_path / "survey.toml").write_text(small + "[plan]\nspeed_mps = 0.25\n")
+    run(["flight"], tmp_path, None, flight=FlightChanges(current="0.1@90"))
+    told = capsys.readouterr().err
+    assert "the plan is stale" in told
+    assert "put them into survey.toml" in told
+
+
+def test_a_current_given_on_the_command_line_replaces_a_measured_one() -> None:
+    measured = survey(sea={"current_file": "adcp.csv", "current_mps": 0.3})
+    changed = FlightChanges(current="0.1@90").applied(measured)
+    assert changed.sea.current_file is None
+    assert changed.sea.current_mps == 0.1
+    assert FlightChanges(vehicle="alice").applied(measured).sea.current_file is not None

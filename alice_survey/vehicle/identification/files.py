@@ -13,9 +13,11 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from alice_survey.artefacts import write_json
 from alice_survey.errors import VehicleError
-from alice_survey.vehicle.coefficients import Coefficients
+from alice_survey.vehicle.coefficients import FORCES, Coefficients
 from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.propulsion import Thruster
 from alice_survey.vehicle.vehicle import RigidBody, Vehicle
@@ -111,7 +113,18 @@ def coefficients_from_file(path: Path) -> Coefficients:
     if not isinstance(values, dict) or not values:
         raise VehicleError(f"{path}: holds no coefficients")
     named = {str(key): _number(path, str(key), value) for key, value in values.items()}
-    return Coefficients(name=str(table.get("name", path.stem)), values=named)
+    try:
+        found = Coefficients(name=str(table.get("name", path.stem)), values=named)
+    except VehicleError as error:
+        raise VehicleError(f"{path}: {error}") from None
+    driving = np.flatnonzero(np.maximum(np.diag(found.linear), np.diag(found.quadratic)) > 0)
+    if len(driving):
+        axis = FORCES[driving[0]]
+        raise VehicleError(
+            f"{path}: the damping of {axis} is positive, which would drive the vehicle: damping is "
+            "negative"
+        )
+    return found
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -199,3 +199,13 @@ def test_missing_inputs_are_held_but_not_for_long(capsys: pytest.CaptureFixture[
     assert (len(first.record.time_s), len(second.record.time_s)) == (40, 10)
     np.testing.assert_array_equal(first.record.rps, 10.0)
     assert "10 of 60 rows are not used" in capsys.readouterr().err
+
+
+def test_damping_must_damp(tmp_path: Path) -> None:
+    path = tmp_path / "found.json"
+    path.write_text('{"X_uu": -14.0, "Y_vv": 300.0}')
+    with pytest.raises(VehicleError, match=r"found.json: the damping of Y is positive"):
+        coefficients_from_file(path)
+    path.write_text('{"a": -14.0}')
+    with pytest.raises(VehicleError, match=r"found.json: coefficient 'a' is not known"):
+        coefficients_from_file(path)
