@@ -6,7 +6,6 @@ Both changes of axes are exact in floating point: they swap and negate component
 """
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from alice_survey.frames import Array
 
@@ -35,8 +34,3 @@ def flipped_quaternion(quaternion_xyzw: Array) -> Array:
     turned = _HALF_ROOT * np.stack([x + y, x - y, w - z, w + z], axis=-1)
     positive: Array = np.where(turned[..., 3:] < 0, -turned, turned)
     return positive
-
-
-def ned_from_body_of(enu_from_flu_xyzw: Array) -> Rotation:
-    """Rotation `ned_from_body` of a ROS orientation, (..., 4)."""
-    return Rotation.from_quat(flipped_quaternion(enu_from_flu_xyzw))
