@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from alice_survey.cli import app
-from alice_survey.errors import ConfigError
+from alice_survey.errors import AliceError
 from alice_survey.vehicle.hydrodynamics.estimate import estimate
 from alice_survey.vehicle.hydrodynamics.geometry import ALICE, SPARUS2
 from alice_survey.vehicle.hydrodynamics.paper_tables import (
@@ -145,11 +145,11 @@ def test_the_text_tells_each_coefficient_and_cites_its_notes() -> None:
 
 @pytest.mark.parametrize(
     ("option", "name", "words"),
-    [("plot", "picture.bmp", "change the suffix"), ("csv", "folder", "cannot be written")],
+    [("plot", "picture.bmp", "change the suffix"), ("csv", "folder", "is a folder")],
 )
 def test_files_that_cannot_be_written_are_told(
     tmp_path: Path, option: str, name: str, words: str
 ) -> None:
     (tmp_path / "folder").mkdir()
-    with pytest.raises(ConfigError, match=words):
+    with pytest.raises(AliceError, match=words):
         coefficients_report(**{option: tmp_path / name})
