@@ -23,6 +23,8 @@ Jerlov = Literal["I", "II", "III", "1C", "3C", "5C", "7C", "9C"]
 Latitude = Annotated[float, Field(ge=-85, le=85)]
 Longitude = Annotated[float, Field(ge=-180, le=180)]
 Share = Annotated[float, Field(ge=0, le=1)]
+Ring = tuple[tuple[float, float], ...]
+GeoRing = tuple[tuple[Latitude, Longitude], ...]
 Gust = Annotated[float, Field(ge=0, le=1000)]
 
 
@@ -33,9 +35,11 @@ class Config(BaseModel):
 
 
 class AreaConfig(Config):
-    """Where to survey: a rectangle whose corner is the datum, or a polygon.
+    """Where to survey and where the vehicle may be.
 
-    The datum is the origin of the local North-East-Down frame, on the sea surface.
+    The shape to survey is one of: a rectangle at the datum, a polygon, a corridor, well-known text,
+    or a file. The datum is the origin of the local North-East-Down frame, on the sea surface; of a
+    shape in geographic or projected coordinates it is the middle unless it is given.
     """
 
     latitude_deg: Latitude = 32.8236
@@ -43,17 +47,48 @@ class AreaConfig(Config):
     length_m: float = Field(15.0, gt=0, le=10_000)
     width_m: float = Field(17.0, gt=0, le=10_000)
     heading_deg: float = Field(0.0, ge=0, lt=360)
-    polygon_ne_m: tuple[tuple[float, float], ...] | None = None
-    polygon_latlon_deg: tuple[tuple[Latitude, Longitude], ...] | None = None
+    datum_at: Literal["corner", "center"] = "corner"
+    polygon_ne_m: Ring | None = None
+    polygon_latlon_deg: GeoRing | None = None
+    corridor_ne_m: Ring | None = None
+    corridor_latlon_deg: GeoRing | None = None
+    corridor_width_m: float = Field(5.0, gt=0, le=1000)
+    wkt: str | None = None
+    file: Path | None = None
+    layer: str | None = None
+    crs: str | None = None
+    no_go_ne_m: tuple[Ring, ...] = ()
+    no_go_latlon_deg: tuple[GeoRing, ...] = ()
+    no_go_file: Path | None = None
+    no_go_clearance_m: float = Field(0.0, ge=0, le=100)
+    allowed_ne_m: Ring | None = None
+    allowed_latlon_deg: GeoRing | None = None
+    allowed_file: Path | None = None
+    turn_margin_m: float | None = Field(None, ge=0, le=1000)
     seafloor_depth_m: float = Field(15.0, gt=0, le=6000)
+    bathymetry_file: Path | None = None
 
     @model_validator(mode="after")
     def _one_shape(self) -> Self:
-        polygons = [p for p in (self.polygon_ne_m, self.polygon_latlon_deg) if p is not None]
-        if len(polygons) > 1:
-            raise ValueError("give polygon_ne_m or polygon_latlon_deg, not both")
-        if polygons and len(polygons[0]) < 3:
-            raise ValueError(f"a polygon needs 3 corners or more, got {len(polygons[0])}")
+        shapes = (
+            "polygon_ne_m", "polygon_latlon_deg", "corridor_ne_m", "corridor_latlon_deg",
+            "wkt", "file",
+        )  # fmt: skip
+        given = [name for name in shapes if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise ValueError(f"give {' or '.join(given)}, not both")
+        for name in ("polygon_ne_m", "polygon_latlon_deg"):
+            corners = getattr(self, name)
+            if corners is not None and len(corners) < 3:
+                raise ValueError(f"a polygon needs 3 corners or more, got {len(corners)}")
+        for name in ("corridor_ne_m", "corridor_latlon_deg"):
+            points = getattr(self, name)
+            if points is not None and len(points) < 2:
+                raise ValueError(f"a corridor needs 2 points or more, got {len(points)}")
+        allowed = ("allowed_ne_m", "allowed_latlon_deg", "allowed_file")
+        given = [name for name in allowed if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise ValueError(f"give {' or '.join(given)}, not both")
         return self
 
 
@@ -108,13 +143,26 @@ class PlanConfig(Config):
     side_overlap: float = Field(0.29, ge=0, le=0.95)
     line_spacing_m: float | None = Field(None, gt=0, le=20)
     line_heading_deg: float | None = Field(None, ge=0, lt=360)
+    overlap_over_relief: bool = False
+    track_error_m: float = Field(0.0, ge=0, le=5)
     cross_lines: int = Field(1, ge=0, le=50)
+    closing_line: bool = True
     margin_m: float = Field(0.0, ge=0, le=50)
+    relief_m: float = Field(0.35, ge=0, le=10)
     allowed_blur_px: float = Field(1.0, gt=0, le=20)
+    yaw_rate_deg_s: float = Field(1.0, ge=0, le=90)
+    roll_pitch_rate_deg_s: float = Field(1.0, ge=0, le=90)
+    sharp_px: float = Field(3.0, gt=0, le=20)
     strobe_lead_s: float = Field(0.0002, ge=0, le=0.1)
+    least_clearance_m: float = Field(1.0, ge=0.1, le=10)
+    steepest_deg: float = Field(20.0, gt=0, le=60)
+    turns: Literal["auto", "arcs", "spot", "sway"] = "auto"
     turn_radius_m: float = Field(0.5, gt=0, le=20)
     turn_rate_limit_deg_s: float = Field(30.0, gt=0, le=180)
     run_in_m: float = Field(0.5, ge=0.1, le=20)
+    home_ne_m: tuple[float, float] | None = None
+    split_dives: bool = True
+    dive_s: float | None = Field(None, gt=0, le=1e6)
 
 
 class ThrusterHealth(Config):
@@ -142,6 +190,9 @@ class VehicleConfig(Config):
     allocation: Literal["exact", "rpi"] = "exact"
     thruster_health: ThrusterHealth = ThrusterHealth()
     health_known: bool = True
+    battery_wh: float = Field(1400.0, gt=0, le=100_000)
+    battery_reserve: float = Field(0.2, ge=0, lt=1)
+    hotel_w: float = Field(60.0, ge=0, le=5000)
 
 
 class SeaConfig(Config):
@@ -276,13 +327,19 @@ def load_config(path: Path) -> SurveyConfig:
     return parse_config(_with_files_beside(settings, path.parent), str(path))
 
 
+_FILES = (
+    ("area", "file"), ("area", "no_go_file"), ("area", "allowed_file"), ("area", "bathymetry_file"),
+    ("sea", "current_file"), ("vehicle", "coefficients_file"),
+)  # fmt: skip
+
+
 def _with_files_beside(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Settings whose relative file names count from the folder of the settings file."""
     result = dict(settings)
-    for section, key in (("sea", "current_file"), ("vehicle", "coefficients_file")):
+    for section, key in _FILES:
         values = settings.get(section)
         if isinstance(values, dict) and isinstance(values.get(key), str):
-            result[section] = {**values, key: str(folder / values[key])}
+            result[section] = {**result[section], key: str(folder / values[key])}
     return result
 
 

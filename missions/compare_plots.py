@@ -12,7 +12,6 @@ from missions.compare import EQUAL, IMPROVED, ORIGINAL, Outcome, Trace
 from missions.compare_reasons import PAPER, CaseResult
 from missions.flight_plots import BAND, draw_lines
 from missions.plan_file import Plan
-from missions.route import route_through
 
 _AROUND_M = 3.2
 """Of the lines, that a map shows: the turns, not the way in."""
@@ -60,7 +59,7 @@ def draw_case(path: Path, plan: Plan, result: CaseResult) -> None:
 
 def _draw_track(axes: Axes, plan: Plan, outcome: Outcome, labelled: bool) -> None:
     draw_lines(axes, plan)
-    route = route_through(plan.lines, plan.turn_radius_m, plan.run_in_m)
+    route = plan.dives[0].route
     way = route.places(np.linspace(0.0, route.length_m, 4000))
     axes.plot(way[:, 1], way[:, 0], color=_WAY, lw=0.8, zorder=1, label="planned route")
     track = _trace(outcome).true_ne

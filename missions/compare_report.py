@@ -91,7 +91,7 @@ def compare_report(
 
 
 def _heading(plan: Plan, config: SurveyConfig, seeds: Sequence[int]) -> str:
-    size = [max(axis) - min(axis) for axis in zip(*plan.area_ne_m, strict=True)]
+    size = [max(axis) - min(axis) for axis in plan.area.corners_ne.T]
     sea = config.sea
     return (
         f"{size[0]:g} x {size[1]:g} m, {len(plan.lines)} lines {plan.line_spacing_m:g} m apart, "

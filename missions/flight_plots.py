@@ -144,8 +144,10 @@ def _sheet(strips: int) -> tuple[Figure, Axes, list[Axes]]:
 
 def _draw_plan(axes: Axes, plan: Plan) -> None:
     draw_lines(axes, plan)
-    corners = [(east, north) for north, east in plan.area_ne_m]
-    axes.add_patch(Outline(corners, fill=False, edgecolor=AREA, lw=1.6, ls="--", label="area"))
+    for index, ring in enumerate(plan.area.rings_ne):
+        label = "area" if index == 0 else None
+        outline = Outline(ring[:, ::-1], fill=False, edgecolor=AREA, lw=1.6, ls="--", label=label)
+        axes.add_patch(outline)
 
 
 def _end_chart(axes: Axes, title: str) -> None:

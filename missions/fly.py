@@ -63,7 +63,7 @@ def run_fly(workspace: Path, config: SurveyConfig, threads: int) -> bool:
 def _steps(folder: Path, plan_path: Path, config: SurveyConfig) -> Iterator[str]:
     """Write the files of a flight, and say after each step what is done."""
     plan = read_plan(plan_path)
-    floor = floor_grid(survey_terrain(config, plan.area_ne_m))
+    floor = floor_grid(survey_terrain(config, plan.area.allowed_corners_ne))
     yield "sea floor"
     rng = np.random.default_rng([config.seed, _SEED_STREAM])
     flight = simulate_plan(plan, config, floor, rng)

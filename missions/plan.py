@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
+import shapely
 from shapely.geometry import Polygon
 
 from alice_survey.artefacts import Stage, run_stage, write_json
@@ -14,12 +15,13 @@ from alice_survey.config import SurveyConfig
 from alice_survey.errors import PlanError, warn
 from alice_survey.frames import Array
 from camera_calib.rig import Rig, design_rig
-from missions.area import area_datum, area_polygon, polygon_corners
-from missions.coverage import covered_share
-from missions.exports import write_geojson, write_lines
+from missions.areas.area import Area, multipolygon
+from missions.areas.shapes import area_datum, area_polygon, polygon_corners
+from missions.coverage.footprints import covered_share
+from missions.exports.geojson import write_geojson, write_lines
 from missions.footprint import Swath, common_swath, joint_swath, overlap, step_for_overlap
-from missions.lines import (
-    Line,
+from missions.imaging.settings import ImagingSettings, imaging_settings, raw_bytes
+from missions.lines.lawnmower import (
     LineSpacing,
     across_range,
     cross_lines,
@@ -27,10 +29,10 @@ from missions.lines import (
     space_lines,
     survey_lines,
 )
-from missions.maps import draw_plan
-from missions.plan_file import Plan, read_plan
-from missions.route import route_through
-from missions.settings import ImagingSettings, imaging_settings, raw_bytes
+from missions.lines.line import Line
+from missions.maps.plan_map import draw_plan
+from missions.plan_file import Dive, Plan, read_plan
+from missions.route.turns import route_through
 
 __all__ = ["Plan", "make_plan", "read_plan", "run_plan"]
 
@@ -46,7 +48,7 @@ def run_plan(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     """
     stage = Stage(
         name="plan",
-        version=1,
+        version=2,
         settings={
             "name": config.name,
             "area": config.area.model_dump(mode="json"),
@@ -111,8 +113,13 @@ def make_plan(config: SurveyConfig, rig: Rig) -> Plan:
         )
     return Plan(
         name=config.name,
-        datum=area_datum(config.area),
-        area_ne_m=tuple((float(n), float(e)) for n, e in polygon_corners(area)),
+        area=Area(
+            datum=area_datum(config.area),
+            survey=multipolygon(area),
+            allowed=multipolygon(area.buffer(3.0, join_style="mitre")),
+            no_go=multipolygon(shapely.MultiPolygon()),
+        ),
+        home_ne_m=route.legs[0].start_ne_m,
         seafloor_depth_m=config.area.seafloor_depth_m,
         altitude_m=wanted.altitude_m,
         speed_mps=wanted.speed_mps,
@@ -126,6 +133,16 @@ def make_plan(config: SurveyConfig, rig: Rig) -> Plan:
         forward_overlap=imaging.forward_overlap,
         side_overlap=side_overlap,
         lines=tuple(lines),
+        dives=(
+            Dive(
+                first_line=0,
+                last_line=len(lines) - 1,
+                route=route,
+                duration_s=route.length_m / wanted.speed_mps,
+                energy_wh=0.0,
+            ),
+        ),
+        energy_wh=0.0,
         turn_radius_m=wanted.turn_radius_m,
         run_in_m=wanted.run_in_m,
         length_m=route.length_m,

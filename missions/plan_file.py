@@ -10,14 +10,52 @@ from typing import Any
 from alice_survey.artefacts import read_json
 from alice_survey.errors import PlanError
 from alice_survey.frames import Datum
-from missions.lines import Line
+from missions.areas.area import Area
+from missions.lines.line import Line
+from missions.route.legs import Leg, Route
 
-_FORMAT = {"format": "alice-survey plan", "version": 1}
+_FORMAT = {"format": "alice-survey plan", "version": 2}
 _NUMBERS = (
     "seafloor_depth_m", "altitude_m", "speed_mps", "interval_s", "exposure_s", "line_spacing_m",
     "station_spacing_m", "forward_overlap", "side_overlap", "turn_radius_m", "run_in_m",
-    "length_m", "duration_s", "coverage",
+    "length_m", "duration_s", "energy_wh", "coverage",
 )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dive:
+    """What is flown on one charge: from home along some lines and home again."""
+
+    first_line: int
+    """Index of the plan's line."""
+    last_line: int
+    """The last one that belongs to it."""
+    route: Route
+    """From home to home; lines count as in the plan."""
+    duration_s: float
+    energy_wh: float
+
+    def to_json(self) -> dict[str, Any]:
+        """The dive as `plan.json` holds it."""
+        return {
+            "first_line": self.first_line,
+            "last_line": self.last_line,
+            "duration_s": self.duration_s,
+            "energy_wh": self.energy_wh,
+            "length_m": self.route.length_m,
+            "legs": [leg.to_json() for leg in self.route.legs],
+        }
+
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> "Dive":
+        """The inverse of `to_json`."""
+        return cls(
+            first_line=int(data["first_line"]),
+            last_line=int(data["last_line"]),
+            route=Route(legs=tuple(Leg.from_json(leg) for leg in data["legs"])),
+            duration_s=float(data["duration_s"]),
+            energy_wh=float(data["energy_wh"]),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,8 +63,9 @@ class Plan:
     """What to fly and how to take pictures; `plan.json`."""
 
     name: str
-    datum: Datum
-    area_ne_m: tuple[tuple[float, float], ...]
+    area: Area
+    home_ne_m: tuple[float, float]
+    """Where the vehicle is launched and taken in."""
     seafloor_depth_m: float
     altitude_m: float
     speed_mps: float
@@ -42,15 +81,24 @@ class Plan:
     side_overlap: float
     """As reached, of one camera's pictures, on the middle row and column."""
     lines: tuple[Line, ...]
+    """In the order of flight."""
+    dives: tuple[Dive, ...]
+    """In the order of flight; together they fly all lines."""
     turn_radius_m: float
     run_in_m: float
     length_m: float
-    """Of the whole way, turns included."""
+    """Of the ways of all dives, turns included."""
     duration_s: float
+    energy_wh: float
     coverage: float
-    """Share of the area that every camera surely sees when the plan is flown exactly."""
+    """Share of the area that every camera sees as often as asked when the plan is flown exactly."""
     details: dict[str, Any]
     """What else a reader may want to know; nothing is computed from it."""
+
+    @property
+    def datum(self) -> Datum:
+        """Origin of the local frame."""
+        return self.area.datum
 
     @property
     def stations(self) -> int:
@@ -66,25 +114,14 @@ class Plan:
                 "latitude_deg": self.datum.latitude_deg,
                 "longitude_deg": self.datum.longitude_deg,
             },
-            "area_ne_m": [list(corner) for corner in self.area_ne_m],
-            "seafloor_depth_m": self.seafloor_depth_m,
-            "altitude_m": self.altitude_m,
-            "speed_mps": self.speed_mps,
-            "interval_s": self.interval_s,
-            "exposure_s": self.exposure_s,
+            "area": self.area.to_json(),
+            "home_ne_m": list(self.home_ne_m),
             "strobe": {"pulse_s": self.strobe_pulse_s, "lead_s": self.strobe_lead_s},
             "footprint_m": list(self.footprint_m),
-            "line_spacing_m": self.line_spacing_m,
-            "station_spacing_m": self.station_spacing_m,
-            "forward_overlap": self.forward_overlap,
-            "side_overlap": self.side_overlap,
-            "lines": [line.to_json() for line in self.lines],
-            "turn_radius_m": self.turn_radius_m,
-            "run_in_m": self.run_in_m,
-            "length_m": self.length_m,
-            "duration_s": self.duration_s,
+            **{name: getattr(self, name) for name in _NUMBERS},
             "stations": self.stations,
-            "coverage": self.coverage,
+            "lines": [line.to_json() for line in self.lines],
+            "dives": [dive.to_json() for dive in self.dives],
             "details": self.details,
         }
 
@@ -99,29 +136,19 @@ def read_plan(path: Path) -> Plan:
     data = read_json(path)
     try:
         if {key: data[key] for key in _FORMAT} != _FORMAT:
-            raise PlanError(f"{path}: is no plan of version {_FORMAT['version']}")
+            raise PlanError(f"{path}: is no plan of version {_FORMAT['version']}; plan again")
         return Plan(
             name=str(data["name"]),
-            datum=Datum(**data["datum"]),
-            area_ne_m=tuple((float(n), float(e)) for n, e in data["area_ne_m"]),
+            area=Area.from_json(data["area"], Datum(**data["datum"])),
+            home_ne_m=(float(data["home_ne_m"][0]), float(data["home_ne_m"][1])),
             strobe_pulse_s=float(data["strobe"]["pulse_s"]),
             strobe_lead_s=float(data["strobe"]["lead_s"]),
             footprint_m=(float(data["footprint_m"][0]), float(data["footprint_m"][1])),
-            lines=tuple(_line(line) for line in data["lines"]),
+            lines=tuple(Line.from_json(line) for line in data["lines"]),
+            dives=tuple(Dive.from_json(dive) for dive in data["dives"]),
             details=dict(data["details"]),
             **{name: float(data[name]) for name in _NUMBERS},
         )
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
         what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
         raise PlanError(f"{path}: {what}") from None
-
-
-def _line(data: dict[str, Any]) -> Line:
-    if data["kind"] not in ("survey", "cross"):
-        raise PlanError(f"a line is of kind {data['kind']!r}; known are survey and cross")
-    return Line(
-        kind=data["kind"],
-        start_ne_m=(float(data["start_ne_m"][0]), float(data["start_ne_m"][1])),
-        end_ne_m=(float(data["end_ne_m"][0]), float(data["end_ne_m"][1])),
-        stations=int(data["stations"]),
-    )

@@ -41,7 +41,6 @@ from alice_survey.vehicle.vehicle import Vehicle
 from missions.flight import Flight, trigger_times
 from missions.navigation import NavigationLog
 from missions.plan_file import Plan
-from missions.route import route_through
 
 _FLOOR_SPACING_M = 0.1
 """Of the grid that the DVL hears: finer than the spot of a beam."""
@@ -177,7 +176,7 @@ def craft_of(settings: VehicleConfig) -> Vehicle:
 
 def path_of(plan: Plan) -> Path:
     """The route of a plan for the pilot."""
-    legs = route_through(plan.lines, plan.turn_radius_m, plan.run_in_m).legs
+    legs = plan.dives[0].route.legs
     return path_from_legs(
         [leg.start_ne_m for leg in legs],
         [leg.heading_rad for leg in legs],

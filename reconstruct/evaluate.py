@@ -22,6 +22,7 @@ from alice_survey.errors import WorkspaceError
 from alice_survey.frames import Array
 from alice_survey.seafloor.terrain import Terrain, read_terrain
 from alice_survey.seafloor.texture import survey_texture
+from missions.plan_file import read_plan
 from reconstruct.alignment import align_rigid, align_similarity
 from reconstruct.evaluate_mosaic import MosaicScore, score_mosaic
 from reconstruct.evaluate_overlap import overlaps_reached
@@ -204,7 +205,7 @@ def run_evaluate(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     stage = Stage(name="report", version=1, settings={"seed": config.seed}, inputs=inputs)
 
     def work(folder: Path) -> None:
-        area_ne = np.array(read_json(plan / "plan.json")["area_ne_m"])
+        area_ne = read_plan(plan / "plan.json").area.rings_ne[0]
         registration = read_json(sparse / "registration.json")
         terrain = read_terrain(truth / "terrain.ply")
         cameras = score_cameras(

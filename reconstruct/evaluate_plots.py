@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from alice_survey.artefacts import atomic_path, read_json
 from alice_survey.frames import Array
+from missions.plan_file import read_plan
 
 if TYPE_CHECKING:
     from reconstruct.evaluate import CameraScore, SurfaceScore
@@ -26,8 +27,8 @@ def plot_track(path: Path, plan_file: Path, cameras: "CameraScore") -> None:
         for line in plan["lines"]:
             (n0, e0), (n1, e1) = line["start_ne_m"], line["end_ne_m"]
             plane.plot([e0, e1], [n0, n1], color="0.75", linewidth=3, zorder=1)
-        area = np.array([*plan["area_ne_m"], plan["area_ne_m"][0]])
-        plane.plot(area[:, 1], area[:, 0], "k--", linewidth=1)
+        for ring in read_plan(plan_file).area.rings_ne:
+            plane.plot(ring[:, 1], ring[:, 0], "k--", linewidth=1)
         dots = plane.scatter(
             places[:, 1], places[:, 0], c=length_mm, s=14, cmap="viridis", zorder=2
         )

@@ -186,7 +186,7 @@ def run_images(workspace: Path, config: SurveyConfig, threads: int) -> bool:
         rig = true_rig(config)
         terrain = folder / "truth" / "terrain.ply"
         if not terrain.with_suffix(".json").exists():
-            survey_terrain(config, planned["area_ne_m"]).write(terrain)
+            survey_terrain(config, planned["within_ne_m"]).write(terrain)
         write_rig(folder / "truth" / "rig.json", rig)
         shoot = _Shoot(
             folder=folder,
@@ -229,11 +229,18 @@ def _read_plan(path: Path) -> dict[str, Any]:
         return {
             "exposure_s": float(data["exposure_s"]),
             "altitude_m": float(data["altitude_m"]),
-            "area_ne_m": [[float(n), float(e)] for n, e in data["area_ne_m"]],
+            "within_ne_m": _corners(data["area"]["allowed"]["coordinates"]),
             "datum": {key: float(data["datum"][key]) for key in ("latitude_deg", "longitude_deg")},
         }
     except (KeyError, TypeError, ValueError) as error:
         raise WorkspaceError(f"{path}: {error!r} is missing or wrong; plan again") from None
+
+
+def _corners(nested: Any) -> list[list[float]]:
+    """All points of the nested lists of a GeoJSON geometry."""
+    if nested and isinstance(nested[0], (int, float)):
+        return [[float(nested[0]), float(nested[1])]]
+    return [point for part in nested for point in _corners(part)]
 
 
 def _believed(path: Path, at_s: Array) -> list[ImageRecord]:

@@ -351,28 +351,27 @@ def build_terrain(
     return Terrain(**{**_fields(terrain), "objects": objects})
 
 
-def survey_terrain(config: SurveyConfig, area_ne_m: Sequence[Sequence[float]]) -> Terrain:
+def survey_terrain(config: SurveyConfig, within_ne_m: Sequence[Sequence[float]] | Array) -> Terrain:
     """The one sea floor of a survey: the same for whoever asks, from the settings alone.
 
     Args:
         config: the survey.
-        area_ne_m: corners of its area, as in `plan.json`.
+        within_ne_m: (N, 2) corners of the area the vehicle may be in, as in `plan.json`.
     """
-    plan = config.plan
-    margin_m = plan.altitude_m + plan.run_in_m + 2.0 * plan.turn_radius_m + plan.margin_m
+    margin_m = config.plan.altitude_m
     return build_terrain(
         config.seafloor,
-        terrain_bounds(area_ne_m, margin_m),
+        terrain_bounds(within_ne_m, margin_m),
         config.area.seafloor_depth_m,
         np.random.default_rng([config.seed, _SEED_STREAM]),
     )
 
 
 def terrain_bounds(
-    area_ne_m: Sequence[Sequence[float]], margin_m: float
+    corners_ne_m: Sequence[Sequence[float]] | Array, margin_m: float
 ) -> tuple[float, float, float, float]:
     """Least and greatest north, least and greatest east of an area and a margin around it."""
-    corners = np.asarray(area_ne_m, dtype=np.float64).reshape(-1, 2)
+    corners = np.asarray(corners_ne_m, dtype=np.float64).reshape(-1, 2)
     low, high = corners.min(axis=0) - margin_m, corners.max(axis=0) + margin_m
     return float(low[0]), float(high[0]), float(low[1]), float(high[1])
 

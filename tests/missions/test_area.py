@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from alice_survey.config import AreaConfig, parse_config
 from alice_survey.errors import AliceError, PlanError
-from missions.area import area_datum, area_polygon, polygon_corners
+from missions.areas.shapes import area_datum, area_polygon, polygon_corners
 
 
 def test_a_rectangle_lies_ahead_and_to_the_right_of_the_datum() -> None:

@@ -82,7 +82,7 @@ def test_each_station_is_within_the_log_and_near_its_plan(workspace: Path) -> No
     glass = poses.apply(np.array(config.camera.position_body_m))
     off = glass[:, :2] - np.vstack([line.stations_ne for line in plan.lines])
     assert 0.005 < np.sqrt((off**2).sum(axis=1).mean()) < 0.2
-    floor = survey_terrain(config, plan.area_ne_m)
+    floor = survey_terrain(config, plan.area.allowed_corners_ne)
     altitude = floor.depth_at(glass[:, :2]) - glass[:, 2]
     assert 1.6 < altitude.min() < altitude.max() < 2.4
     assert abs(altitude.mean() - 2.0) < 0.1

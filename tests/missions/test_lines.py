@@ -12,8 +12,8 @@ from shapely.ops import unary_union
 from alice_survey.config import CameraConfig, WaterConfig
 from alice_survey.errors import PlanError
 from camera_calib.rig import design_rig
-from missions.area import polygon_corners
-from missions.coverage import covered_share
+from missions.areas.shapes import polygon_corners
+from missions.coverage.footprints import covered_share
 from missions.footprint import (
     Swath,
     common_swath,
@@ -21,14 +21,14 @@ from missions.footprint import (
     glass_point_cam,
     level_pose,
 )
-from missions.lines import (
-    Line,
+from missions.lines.lawnmower import (
     across_range,
     cross_lines,
     longer_side_heading,
     space_lines,
     survey_lines,
 )
+from missions.lines.line import Line
 
 RIG = design_rig(CameraConfig(), WaterConfig())
 STEP_M = 0.47

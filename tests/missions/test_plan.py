@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from PIL import Image
 from pyproj import Geod
-from shapely.geometry import Polygon, shape
+from shapely.geometry import shape
 
 from alice_survey.artefacts import read_stage
 from alice_survey.config import SurveyConfig, parse_config
 from alice_survey.errors import AliceError, PlanError
 from camera_calib.rig import design_rig
-from missions.coverage import covered_share, footprint_outline, footprints_ne
+from missions.coverage.footprints import covered_share, footprint_outline, footprints_ne
 from missions.footprint import common_swath
 from missions.plan import Plan, make_plan, read_plan, run_plan
 
@@ -126,12 +126,12 @@ def test_a_margin_widens_what_is_covered() -> None:
     rig = design_rig(config.camera, config.water)
     plan = make_plan(config, rig)
     swath = common_swath(rig, 2.0, plan.station_spacing_m)
-    wide = Polygon(plan.area_ne_m).buffer(0.5, join_style="mitre")
+    wide = plan.area.survey.buffer(0.5, join_style="mitre")
 
     assert covered_share(wide, plan.lines, swath, plan.station_spacing_m) == pytest.approx(1.0)
     narrow = planned(area=SMALL["area"])
     assert covered_share(wide, narrow.lines, swath, plan.station_spacing_m) < 0.999
-    assert plan.area_ne_m == narrow.area_ne_m
+    assert plan.area.survey.equals(narrow.area.survey)
 
 
 @pytest.mark.parametrize("heading_deg", [0.0, 33.0, 90.0, 200.0])

@@ -7,8 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alice_survey.errors import PlanError
-from missions.lines import Line
-from missions.route import Leg, route_through, turn
+from missions.lines.line import Line
+from missions.route.legs import Leg
+from missions.route.turns import route_through, turn
 
 places = st.tuples(st.floats(-10, 10), st.floats(-10, 10))
 angles = st.floats(-math.pi, math.pi)

@@ -9,7 +9,7 @@ from alice_survey.errors import PlanError
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.rig import design_rig
 from missions.footprint import footprint_size_m
-from missions.settings import exposure_for_blur, imaging_settings, paper_rule, raw_bytes
+from missions.imaging.settings import exposure_for_blur, imaging_settings, paper_rule, raw_bytes
 
 
 def camera(n_water: float = 1.34, port: bool = True) -> FlatPortCamera:

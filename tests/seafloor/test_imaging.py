@@ -49,7 +49,8 @@ def fly(workspace: Path, until_s: float = 9.0) -> None:
         write_json(
             folder / "plan.json",
             {
-                "format": "alice-survey plan", "version": 1, "area_ne_m": AREA_NE,
+                "format": "alice-survey plan", "version": 2,
+                "area": {"allowed": {"type": "Polygon", "coordinates": [AREA_NE]}},
                 "datum": {"latitude_deg": 32.8, "longitude_deg": 34.9},
                 "exposure_s": 0.002, "altitude_m": 2.0,
             },

@@ -7,9 +7,9 @@ covered too. Where the area has parts, so has the line.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import shapely
@@ -17,56 +17,12 @@ from shapely.geometry import Polygon
 
 from alice_survey.errors import PlanError
 from alice_survey.frames import Array
-from missions.area import polygon_corners
+from missions.areas.shapes import polygon_corners
 from missions.footprint import Swath
+from missions.lines.line import Line
 
 MOST_STATIONS = 100_000
 _TINY_M = 1e-9
-
-
-@dataclass(frozen=True, kw_only=True)
-class Line:
-    """A straight run at constant speed with pictures at both ends and evenly between.
-
-    Places are of the left port's outer glass.
-    """
-
-    kind: Literal["survey", "cross"]
-    start_ne_m: tuple[float, float]
-    end_ne_m: tuple[float, float]
-    stations: int
-
-    @property
-    def length_m(self) -> float:
-        """From the first to the last picture."""
-        return math.dist(self.start_ne_m, self.end_ne_m)
-
-    @property
-    def heading_rad(self) -> float:
-        """Direction of travel, clockwise from north, in [0, 2 pi)."""
-        north, east = np.subtract(self.end_ne_m, self.start_ne_m)
-        return math.atan2(east, north) % (2 * math.pi)
-
-    @property
-    def stations_ne(self) -> Array:
-        """Where the pictures are taken, (stations, 2)."""
-        t = np.linspace(0.0, 1.0, self.stations)[:, None]
-        places: Array = np.array(self.start_ne_m) * (1 - t) + np.array(self.end_ne_m) * t
-        return places
-
-    def reversed(self) -> "Line":
-        """The same line flown the other way."""
-        return replace(self, start_ne_m=self.end_ne_m, end_ne_m=self.start_ne_m)
-
-    def to_json(self) -> dict[str, Any]:
-        """The line as `plan.json` holds it."""
-        return {
-            "kind": self.kind,
-            "start_ne_m": list(self.start_ne_m),
-            "end_ne_m": list(self.end_ne_m),
-            "heading_deg": round(math.degrees(self.heading_rad), 9) % 360.0,
-            "stations": self.stations,
-        }
 
 
 @dataclass(frozen=True, kw_only=True)

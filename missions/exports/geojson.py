@@ -13,7 +13,7 @@ from alice_survey.artefacts import atomic_path, write_csv
 from alice_survey.executor import progress
 from alice_survey.frames import Array, Datum
 from camera_calib.rig import Rig
-from missions.coverage import footprint_outline, footprints_ne
+from missions.coverage.footprints import footprint_outline, footprints_ne
 from missions.plan_file import Plan
 
 
@@ -54,8 +54,12 @@ def write_geojson(path: Path, plan: Plan, rig: Rig) -> None:
 
 def _features(plan: Plan, rig: Rig) -> Iterator[dict[str, Any]]:
     floor_m, glass_m = plan.seafloor_depth_m, plan.seafloor_depth_m - plan.altitude_m
-    area = _lon_lat(plan.datum, np.array(plan.area_ne_m), floor_m)
-    yield _feature("Polygon", [_ring(area)], {"role": "area", "name": plan.name})
+    for polygon in plan.area.survey.geoms:
+        edges = [
+            _ring(_lon_lat(plan.datum, np.asarray(ring.coords)[:-1, :2], floor_m))
+            for ring in (polygon.exterior, *polygon.interiors)
+        ]
+        yield _feature("Polygon", edges, {"role": "area", "name": plan.name})
     outline = footprint_outline(plan, rig)
     for index, line in enumerate(plan.lines):
         ends = _lon_lat(plan.datum, np.array([line.start_ne_m, line.end_ne_m]), glass_m)

@@ -13,9 +13,8 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Polygon as Outline
 
 from camera_calib.rig import Rig
-from missions.coverage import footprint_outline, footprints_ne
+from missions.coverage.footprints import footprint_outline, footprints_ne
 from missions.plan_file import Plan
-from missions.route import route_through
 
 _AREA, _SURVEY, _CROSS, _WAY = "#c8553d", "#1b4f72", "#6c3483", "#7f8c8d"
 _FOOTPRINT, _PAPER = "#5dade2", "#fbfcfc"
@@ -31,7 +30,7 @@ def draw_plan(path: Path, plan: Plan, rig: Rig) -> None:
         PolyCollection(footprints, facecolors=_FOOTPRINT, edgecolors="none", alpha=alpha, zorder=1)
     )
     _draw_area(axes, plan)
-    route = route_through(plan.lines, plan.turn_radius_m, plan.run_in_m)
+    route = plan.dives[0].route
     way = route.places(np.linspace(0.0, route.length_m, _points(route.length_m)))
     axes.plot(way[:, 1], way[:, 0], color=_WAY, lw=0.9, zorder=3, label="way between lines")
     for kind, colour in (("survey", _SURVEY), ("cross", _CROSS)):
@@ -94,10 +93,13 @@ def _sheet(plan: Plan) -> tuple[Figure, Axes]:
 
 
 def _draw_area(axes: Axes, plan: Plan) -> None:
-    corners = [(east, north) for north, east in plan.area_ne_m]
-    axes.add_patch(
-        Outline(corners, fill=False, edgecolor=_AREA, lw=2.0, ls="--", zorder=6, label="area")
-    )
+    for index, ring in enumerate(plan.area.rings_ne):
+        label = "area" if index == 0 else None
+        axes.add_patch(
+            Outline(
+                ring[:, ::-1], fill=False, edgecolor=_AREA, lw=2, ls="--", zorder=6, label=label
+            )
+        )
 
 
 def _arrow(axes: Axes, start_ne: tuple[float, float], heading_rad: float, length_m: float) -> None:

@@ -10,7 +10,7 @@ from shapely.geometry import Polygon
 from alice_survey.frames import Array
 from camera_calib.rig import Rig
 from missions.footprint import Swath, footprint_ne, level_pose
-from missions.lines import Line
+from missions.lines.line import Line
 from missions.plan_file import Plan
 
 

@@ -7,103 +7,17 @@ run-out, so that the vehicle is steady when pictures begin.
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from alice_survey.errors import PlanError
-from alice_survey.frames import Array
-from missions.lines import Line
+from missions.lines.line import Line
+from missions.route.legs import Leg, Route
 
 _SAME_M = 1e-6
 _TINY_M = 1e-9
 _SAME_RAD = 1e-9
 _FULL = 2 * math.pi
-
-
-@dataclass(frozen=True, kw_only=True)
-class Leg:
-    """A straight or an arc."""
-
-    start_ne_m: tuple[float, float]
-    heading_rad: float
-    """At its start."""
-    length_m: float
-    curvature_per_m: float
-    """Positive to starboard."""
-    line: int
-    """Index of the plan's line, or -1 between lines."""
-
-    def places(self, along_m: Array) -> Array:
-        """Where the path is, (N, 2) north and east, after distances (N,) from the leg's start."""
-        k = self.curvature_per_m
-        turned = self.heading_rad + k * along_m / 2
-        # The chord of an arc points along its mean heading and is sinc(half the angle) as long.
-        chord = along_m * np.sinc(k * along_m / 2 / math.pi)
-        ne: Array = np.array(self.start_ne_m) + chord[:, None] * np.stack(
-            [np.cos(turned), np.sin(turned)], axis=1
-        )
-        return ne
-
-    @property
-    def end_ne_m(self) -> tuple[float, float]:
-        """Where it ends."""
-        north, east = self.places(np.array([self.length_m]))[0]
-        return float(north), float(east)
-
-    @property
-    def end_heading_rad(self) -> float:
-        """Heading at its end."""
-        return self.heading_rad + self.curvature_per_m * self.length_m
-
-
-@dataclass(frozen=True, kw_only=True)
-class Route:
-    """Legs that follow one another without a gap or a kink. Places are of the left port's glass."""
-
-    legs: tuple[Leg, ...]
-
-    @cached_property
-    def starts_m(self) -> Array:
-        """(L + 1,) distance along the route at which each leg starts, and the whole length."""
-        return np.concatenate([[0.0], np.cumsum([leg.length_m for leg in self.legs])])
-
-    @property
-    def length_m(self) -> float:
-        """Of all legs."""
-        return float(self.starts_m[-1])
-
-    def places(self, along_m: Array) -> Array:
-        """Where the route is, (N, 2), at distances (N,); it goes on straight beyond its ends."""
-        result = np.empty((len(along_m), 2))
-        for leg, rows, within_m in self._by_leg(along_m):
-            result[rows] = leg.places(within_m)
-        return result
-
-    def headings_rad(self, along_m: Array) -> Array:
-        """Heading of the route, (N,), at distances (N,); not wrapped within a leg."""
-        result = np.empty(len(along_m))
-        for leg, rows, within_m in self._by_leg(along_m):
-            result[rows] = leg.heading_rad + leg.curvature_per_m * within_m
-        return result
-
-    def _by_leg(self, along_m: Array) -> Iterator[tuple[Leg, NDArray[np.intp], Array]]:
-        """Each leg that is met, the indices of its distances, and these from its start."""
-        starts = self.starts_m
-        index = np.clip(np.searchsorted(starts, along_m, side="right") - 1, 0, len(self.legs) - 1)
-        order = np.argsort(index, kind="stable")
-        cuts = np.searchsorted(index[order], np.arange(len(self.legs) + 1))
-        for i, leg in enumerate(self.legs):
-            rows = order[cuts[i] : cuts[i + 1]]
-            if len(rows):
-                yield leg, rows, along_m[rows] - starts[i]
-
-    def line_starts_m(self) -> dict[int, float]:
-        """Distance along the route at which each line of the plan starts."""
-        starts = zip(self.legs, self.starts_m, strict=False)
-        return {leg.line: float(start) for leg, start in starts if leg.line >= 0}
 
 
 def route_through(lines: Sequence[Line], turn_radius_m: float, run_in_m: float) -> Route:

@@ -1,0 +1,1 @@
+"""Plans in the files that vehicles and planners load."""

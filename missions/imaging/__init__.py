@@ -1,0 +1,1 @@
+"""Imaging settings, each with its equation and the limit that bound it."""

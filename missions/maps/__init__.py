@@ -1,0 +1,1 @@
+"""Maps of a plan: a picture, and a page that works without a network."""

@@ -1,0 +1,1 @@
+"""The way along the lines: turns, ways round no-go zones, what flying costs, dives."""
