@@ -15,7 +15,7 @@ from alice_survey.errors import PlanError
 from alice_survey.frames import Array, Datum
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True)
 class Area:
     """What must be seen, and where the left port's glass may be; metres north and east."""
 
