@@ -18,6 +18,7 @@ from alice_survey.cli_options import (
     examples,
     print_result,
 )
+from alice_survey.cli_plan import app as plan_app
 from alice_survey.cli_vehicle import app as vehicle_app
 from alice_survey.errors import AliceError
 
@@ -31,14 +32,28 @@ app = typer.Typer(
     context_settings=CONTEXT,
     rich_markup_mode=None,
 )
+app.add_typer(plan_app, name="plan")
 app.add_typer(import_app)
 app.add_typer(camera_app, name="camera")
 app.add_typer(vehicle_app, name="vehicle")
 
 
-@app.command(epilog=examples("init reef", "run -w reef --scale 4"))
+@app.command(
+    epilog=examples(
+        "init reef",
+        "init reef --area reef.geojson",
+        "init harbour --example caesarea",
+    )
+)
 def init(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write it into.")],
+    area: Annotated[
+        Path | None,
+        typer.Option(help="GeoJSON, KML, KMZ, GeoPackage, shapefile, WKT or .plan of the area."),
+    ] = None,
+    example: Annotated[
+        Literal["demo", "caesarea"] | None, typer.Option(help="A ready survey instead.")
+    ] = None,
 ) -> None:
     """Write a commented survey.toml.
 
@@ -46,7 +61,8 @@ def init(
     """
     from alice_survey.survey import init_survey
 
-    typer.echo(f"wrote {init_survey(folder)}; next: alice-survey plan -w {folder}")
+    path = init_survey(folder, f"{example or 'survey'}.toml", area)
+    typer.echo(f"wrote {path}; next: alice-survey plan -w {folder}")
 
 
 @app.command(
@@ -116,17 +132,6 @@ def fov(
     )
     print_result(table, data, as_json)
     raise typer.Exit(0 if passed else 1)
-
-
-@app.command(epilog=examples("plan -w reef", "plan -w reef -s other.toml --json"))
-def plan(workspace: Workspace = WORK, survey: SurveyFile = None, as_json: AsJson = False) -> None:
-    """Plan lines and camera settings.
-
-    They image the whole area at the overlap asked for.
-    """
-    from alice_survey.survey import run
-
-    print_result(*run(["plan"], workspace, survey), as_json)
 
 
 @app.command(

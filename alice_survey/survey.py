@@ -2,7 +2,8 @@
 
 import contextlib
 import fcntl
-import shutil
+import json
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -190,22 +191,39 @@ def is_imported(workspace: Path) -> bool:
     return path.is_file() and read_json(path).get("source") == "imported"
 
 
-def init_survey(folder: Path, template: str = "survey.toml") -> Path:
+def init_survey(folder: Path, template: str = "survey.toml", area: Path | None = None) -> Path:
     """Write a commented settings file, never over one that is there.
 
+    Args:
+        folder: where to.
+        template: which.
+        area: a file with the area to survey instead of the template's.
+
     Raises:
-        WorkspaceError: the file exists or the folder cannot be written.
+        WorkspaceError: the file exists, the folder cannot be written, or the area is missing.
     """
+    if area is not None and not area.is_file():
+        raise WorkspaceError(f"{area}: no such file")
     path = folder / "survey.toml"
     if path.exists():
         raise WorkspaceError(f"{path} exists already; edit it, or remove it first")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with resources.as_file(resources.files("alice_survey") / template) as source:
-            shutil.copyfile(source, path)
+        text = (resources.files("alice_survey") / template).read_text(encoding="utf-8")
+        path.write_text(text if area is None else _with_area(text, area), encoding="utf-8")
     except OSError as error:
         raise WorkspaceError(f"{path}: cannot be written: {error.strerror}") from None
     return path
+
+
+def _with_area(text: str, area: Path) -> str:
+    """Settings whose rectangle is replaced by the area of a file."""
+    rectangle = ("latitude_deg", "longitude_deg", "length_m", "width_m", "heading_deg", "datum_at")
+    own = re.compile(rf"^(?=({'|'.join(rectangle)}) = )", re.MULTILINE)
+    named = json.dumps(str(area.resolve()))
+    return re.sub(
+        r"^# file = .*$", lambda _: f"file = {named}", own.sub("# ", text), count=1, flags=re.M
+    )
 
 
 def run_demo(workspace: Path, threads: int | None) -> tuple[str, dict[str, Any]]:
