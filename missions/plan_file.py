@@ -92,6 +92,9 @@ class Plan:
     energy_wh: float
     coverage: float
     """Share of the area that every camera sees as often as asked when the plan is flown exactly."""
+    line_depths_m: tuple[tuple[float, ...], ...] = ()
+    """Depth of the glass at each station of each line, where they follow a bathymetry; empty where
+    the glass keeps its altitude above a level sea floor."""
     details: dict[str, Any]
     """What else a reader may want to know; nothing is computed from it."""
 
@@ -122,6 +125,7 @@ class Plan:
             "stations": self.stations,
             "lines": [line.to_json() for line in self.lines],
             "dives": [dive.to_json() for dive in self.dives],
+            **({"line_depths_m": self.line_depths_m} if self.line_depths_m else {}),
             "details": self.details,
         }
 
@@ -146,6 +150,7 @@ def read_plan(path: Path) -> Plan:
             footprint_m=(float(data["footprint_m"][0]), float(data["footprint_m"][1])),
             lines=tuple(Line.from_json(line) for line in data["lines"]),
             dives=tuple(Dive.from_json(dive) for dive in data["dives"]),
+            line_depths_m=tuple(tuple(map(float, row)) for row in data.get("line_depths_m", ())),
             details=dict(data["details"]),
             **{name: float(data[name]) for name in _NUMBERS},
         )
