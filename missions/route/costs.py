@@ -7,6 +7,11 @@ import numpy as np
 from alice_survey.frames import Array
 
 
+SETTLE_S = 4.0
+"""Until a vehicle that stopped is steady. Inferred: heading and sway loops of ALICE have their poles
+near 1.57 rad/s (`vehicle.pilot.gains`), and three at one place fall to 5 % in 6.3 / 1.57 s."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Costs:
     """Electrical power by course, and what turns take. Compiled code takes the arrays as they are.
@@ -30,26 +35,46 @@ class Costs:
     """That a stop (turn on the spot, sway step) takes beside its motion."""
     sway_mps: float
     """Speed of a sway step."""
+    sway_w: Array
+    """(K,) likewise of a sway step, by its course; infinite of a vehicle that cannot sway."""
+    heave_mps: float
+    """Of descent and ascent, on the spot."""
+    heave_w: float
+    """Mean of both."""
 
     def line_j(self, length_m: float, course_rad: float) -> float:
         """Energy of a straight line."""
-        return length_m / self.speed_mps * _at(self.line_w, course_rad)
+        return length_m / self.speed_mps * power_at(self.line_w, course_rad)
 
     def way_j(self, length_m: float, course_rad: float) -> float:
         """Energy of a straight way between lines."""
-        return length_m / self.speed_mps * _at(self.way_w, course_rad)
+        return length_m / self.speed_mps * power_at(self.way_w, course_rad)
 
     def spot_j(self, turn_rad: float) -> float:
         """Energy of a turn on the spot, with its stop."""
         return self.spot_w * (abs(turn_rad) / self.turn_rate_rad_s + self.settle_s)
+
+    def sway_j(self, length_m: float, course_rad: float) -> float:
+        """Energy of a sway step, with its stop."""
+        moving = length_m / self.sway_mps * power_at(self.sway_w, course_rad)
+        return moving + self.spot_w * self.settle_s
+
+    def dive_j(self, depth_m: float) -> float:
+        """Energy of going down to a depth and up again."""
+        return self.dive_s(depth_m) * self.heave_w
+
+    def dive_s(self, depth_m: float) -> float:
+        """Time of going down to a depth and up again."""
+        return 2.0 * depth_m / self.heave_mps
 
 
 def time_costs(
     speed_mps: float,
     *,
     turn_rate_rad_s: float = np.deg2rad(15.0),
-    settle_s: float = 4.0,
+    settle_s: float = SETTLE_S,
     sway_mps: float = 0.15,
+    heave_mps: float = 0.15,
 ) -> Costs:
     """Costs of 1 W whatever the vehicle does: joules are seconds."""
     return Costs(
@@ -60,12 +85,22 @@ def time_costs(
         turn_rate_rad_s=turn_rate_rad_s,
         settle_s=settle_s,
         sway_mps=sway_mps,
+        sway_w=np.ones(4),
+        heave_mps=heave_mps,
+        heave_w=1.0,
     )
 
 
-def _at(power_w: Array, course_rad: float) -> float:
-    """Power at a course, between the even samples of a full turn."""
+def power_at(power_w: Array, course_rad: float) -> float:
+    """Power at a course, between the even samples of a full turn; infinite beside an infinite one.
+
+    Args:
+        power_w: (K,) from north on.
+        course_rad: any angle.
+    """
     place = course_rad / (2 * np.pi) * len(power_w) % len(power_w)
     low = int(place) % len(power_w)
     share = place - int(place)
+    if share == 0.0:  # nothing of the next one, though it may be infinite
+        return float(power_w[low])
     return float((1 - share) * power_w[low] + share * power_w[(low + 1) % len(power_w)])
