@@ -6,9 +6,8 @@ import numpy as np
 
 from alice_survey.frames import Array
 
-
 SETTLE_S = 4.0
-"""Until a vehicle that stopped is steady. Inferred: heading and sway loops of ALICE have their poles
+"""Until a vehicle that stopped is steady. Inferred: ALICE's heading and sway loops have their poles
 near 1.57 rad/s (`vehicle.pilot.gains`), and three at one place fall to 5 % in 6.3 / 1.57 s."""
 
 
