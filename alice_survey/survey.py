@@ -141,7 +141,7 @@ def run(
     """
     imported = is_imported(workspace)
     config = settings(workspace, survey, needed=not imported)
-    config = changed(config, "imaging", scale=scale)
+    planned = config = changed(config, "imaging", scale=scale)
     if flight is not None and flight != FlightChanges():
         config = flight.applied(config)
         warn("these options hold for this flight alone: to keep them, put them into survey.toml")
@@ -156,7 +156,7 @@ def run(
     lines, found = [], {}
     with _only_one(workspace):
         if "flight" in stages and "plan" not in stages:
-            state = _state(workspace, "plan", config, {}, imported)
+            state = _state(workspace, "plan", planned, {}, imported)
             if state.startswith("stale"):
                 warn(f"the plan is {state}; 'alice-survey plan -w {workspace}' renews it")
         for stage in stages:
