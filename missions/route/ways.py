@@ -1,0 +1,272 @@
+"""Ways inside a polygon with holes: whether a straight stays inside, and the shortest way.
+
+A shortest way bends only at corners that point into the allowed water, and there only round the
+corner (T. Lozano-Perez and M. A. Wesley 1979: visibility graph; H. Rohnert 1986: of it only the
+straights that touch the corners at both ends). So the graph has few nodes and fewer edges. It is
+built when a straight is first blocked; among places in a convex area it never is.
+"""
+
+import math
+from functools import cached_property
+
+import numpy as np
+import shapely
+from numba import njit
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+from shapely.geometry import MultiPolygon
+from shapely.geometry.polygon import orient
+
+from alice_survey.errors import PlanError
+from alice_survey.frames import Array
+from missions.route.fence import TOUCH_M, Fence, fence_of, point_inside, straight_inside
+
+Place = tuple[float, float]
+
+
+class Ways:
+    """The ways inside an allowed area.
+
+    What is outside by no more than `fence.TOUCH_M` counts as inside, so that ways may run along the
+    edge. Between parts that do not touch there is no way.
+    """
+
+    def __init__(self, allowed: MultiPolygon) -> None:
+        """Sort the area's edges; no graph is built yet.
+
+        Args:
+            allowed: x = north, y = east, metres; valid, not empty.
+        """
+        self.allowed = allowed
+        self.fence: Fence = fence_of(allowed)
+        self._from_node: dict[int, tuple[Array, NDArray[np.int32]]] = {}
+
+    def inside(self, points_ne: Array) -> NDArray[np.bool_]:
+        """Which places (N, 2) are inside, (N,)."""
+        points = np.ascontiguousarray(points_ne, dtype=np.float64).reshape(-1, 2)
+        result: NDArray[np.bool_] = _points_inside(self.fence, points)
+        return result
+
+    def contains(self, points_ne: Array) -> NDArray[np.bool_]:
+        """The same as `inside`."""
+        return self.inside(points_ne)
+
+    def free(self, a: Place, b: Place) -> bool:
+        """Whether the straight between two places is inside."""
+        return bool(straight_inside(self.fence, a[0], a[1], b[0], b[1]))
+
+    def free_many(self, starts_ne: Array, ends_ne: Array) -> NDArray[np.bool_]:
+        """Which straights from (N, 2) to (N, 2) are inside, (N,)."""
+        starts = np.ascontiguousarray(starts_ne, dtype=np.float64).reshape(-1, 2)
+        ends = np.ascontiguousarray(ends_ne, dtype=np.float64).reshape(-1, 2)
+        if starts.shape != ends.shape:
+            raise ValueError(f"{len(starts)} starts for {len(ends)} ends")
+        result: NDArray[np.bool_] = _straights_inside(self.fence, starts, ends)
+        return result
+
+    def distance_m(self, a: Place, b: Place) -> float:
+        """Length of the shortest way; inf if there is none."""
+        if self.free(a, b):
+            return math.dist(a, b)
+        return float(self.distances_m(np.array([a]), np.array([b]))[0, 0])
+
+    def distances_m(self, a_ne: Array, b_ne: Array) -> Array:
+        """Lengths of the shortest ways from places (N, 2) to (M, 2), (N, M); inf where none is."""
+        a = np.ascontiguousarray(a_ne, dtype=np.float64).reshape(-1, 2)
+        b = np.ascontiguousarray(b_ne, dtype=np.float64).reshape(-1, 2)
+        distances: Array = _straight_distances(self.fence, a, b)
+        if np.isfinite(distances).all() or len(self._nodes) == 0:
+            return distances
+        blocked_a = np.flatnonzero(np.isinf(distances).any(axis=1))
+        blocked_b = np.flatnonzero(np.isinf(distances).any(axis=0))
+        seen_a, seen_b = self._seen(a[blocked_a]), self._seen(b[blocked_b])
+        used = np.flatnonzero(np.isfinite(seen_a).any(axis=0))
+        between = np.full((len(self._nodes), len(self._nodes)), np.inf)
+        for node in used.tolist():
+            between[node] = self._shortest_from(node)[0]
+        _shorten(distances, blocked_a, blocked_b, seen_a, seen_b, between)
+        return distances
+
+    def path_ne(self, a: Place, b: Place) -> Array:
+        """The shortest way as places (K, 2), from `a` to `b` with the corners it bends at.
+
+        Raises:
+            PlanError: a place is outside, or they are in parts that are not connected.
+        """
+        if self.free(a, b):
+            return np.array([a, b])
+        for place in (a, b):
+            if not point_inside(self.fence, place[0], place[1]):
+                raise PlanError(
+                    f"the place {place[0]:.2f} m north, {place[1]:.2f} m east is outside of the "
+                    "allowed area: move it or widen area.allowed"
+                )
+        best_m, best = math.inf, (-1, -1)
+        if len(self._nodes):
+            seen_a, seen_b = self._seen(np.array([a]))[0], self._seen(np.array([b]))[0]
+            for node in np.flatnonzero(np.isfinite(seen_a)).tolist():
+                through = seen_a[node] + self._shortest_from(node)[0] + seen_b
+                last = int(np.argmin(through))
+                if through[last] < best_m:
+                    best_m, best = float(through[last]), (node, last)
+        if math.isinf(best_m):
+            raise PlanError(
+                f"no way inside the allowed area from {a[0]:.2f} m north, {a[1]:.2f} m east to "
+                f"{b[0]:.2f} m north, {b[1]:.2f} m east: its parts are not connected; widen "
+                "area.allowed or survey the parts one by one"
+            )
+        before = self._shortest_from(best[0])[1]
+        chain = [best[1]]
+        while chain[-1] != best[0]:
+            chain.append(int(before[chain[-1]]))
+        path = np.concatenate([[a], self._nodes[chain[::-1], :2], [b]])
+        moved = np.linalg.norm(np.diff(path, axis=0), axis=1) > TOUCH_M
+        moved[-1] |= not moved.any()
+        kept = np.concatenate([[True], moved])
+        kept[-1] = True
+        if not moved[-1]:
+            kept[np.flatnonzero(kept[:-1])[-1]] = False  # a corner that is the goal itself
+        result: Array = path[kept]
+        return result
+
+    @cached_property
+    def _nodes(self) -> Array:
+        """(V, 6) corners that ways may bend at, the corner before and the one after."""
+        parts = [orient(part) for part in self.allowed.geoms]
+        rings = [ring for part in parts for ring in (part.exterior, *part.interiors)]
+        nodes = []
+        for ring in rings:
+            corners = shapely.get_coordinates(ring)[:-1]
+            before, after = np.roll(corners, 1, axis=0), np.roll(corners, -1, axis=0)
+            # The water is on the left of every ring (x to the right, y up).
+            arriving, leaving = corners - before, after - corners
+            turn = arriving[:, 0] * leaving[:, 1] - arriving[:, 1] * leaving[:, 0]
+            nodes.append(np.concatenate([corners, before, after], axis=1)[turn < 0])
+        return np.ascontiguousarray(np.concatenate(nodes))
+
+    @cached_property
+    def _graph(self) -> csr_array:
+        rows, columns, lengths = _tangents(self.fence, self._nodes)
+        size = len(self._nodes)
+        return csr_array((lengths, (rows, columns)), shape=(size, size))
+
+    def _shortest_from(self, node: int) -> tuple[Array, NDArray[np.int32]]:
+        """Distances from a corner to all, and the corner before each."""
+        if node not in self._from_node:
+            distances, before = dijkstra(
+                self._graph, directed=False, indices=[node], return_predecessors=True
+            )
+            self._from_node[node] = distances[0], before[0]
+        return self._from_node[node]
+
+    def _seen(self, points_ne: Array) -> Array:
+        """(N, V) distances to the corners that can be seen and passed; inf of the others."""
+        seen: Array = _seen(self.fence, self._nodes, np.ascontiguousarray(points_ne))
+        return seen
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _points_inside(fence: Fence, points: Array) -> NDArray[np.bool_]:
+    result = np.empty(points.shape[0], dtype=np.bool_)
+    for i in range(points.shape[0]):
+        result[i] = point_inside(fence, points[i, 0], points[i, 1])
+    return result
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _straights_inside(fence: Fence, starts: Array, ends: Array) -> NDArray[np.bool_]:
+    result = np.empty(starts.shape[0], dtype=np.bool_)
+    for i in range(starts.shape[0]):
+        result[i] = straight_inside(fence, starts[i, 0], starts[i, 1], ends[i, 0], ends[i, 1])
+    return result
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _straight_distances(fence: Fence, a: Array, b: Array) -> Array:
+    """(N, M) lengths of the straights that are inside; inf of the others."""
+    result = np.full((a.shape[0], b.shape[0]), np.inf)
+    for i in range(a.shape[0]):
+        for j in range(b.shape[0]):
+            if straight_inside(fence, a[i, 0], a[i, 1], b[j, 0], b[j, 1]):
+                result[i, j] = math.hypot(b[j, 0] - a[i, 0], b[j, 1] - a[i, 1])
+    return result
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _passes(nodes: Array, i: int, north: float, east: float) -> bool:
+    """Whether a taut way from a place may bend at a corner: both its edges are on one side."""
+    u, v = nodes[i, 0] - north, nodes[i, 1] - east
+    length = math.hypot(u, v)
+    if length <= TOUCH_M:
+        return True
+    one = (u * (nodes[i, 3] - east) - v * (nodes[i, 2] - north)) / length
+    two = (u * (nodes[i, 5] - east) - v * (nodes[i, 4] - north)) / length
+    passes: bool = max(one, two) <= TOUCH_M or min(one, two) >= -TOUCH_M
+    return passes
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _seen(fence: Fence, nodes: Array, points: Array) -> Array:
+    result = np.full((points.shape[0], nodes.shape[0]), np.inf)
+    for i in range(points.shape[0]):
+        n, e = points[i, 0], points[i, 1]
+        for j in range(nodes.shape[0]):
+            if _passes(nodes, j, n, e) and straight_inside(fence, n, e, nodes[j, 0], nodes[j, 1]):
+                result[i, j] = math.hypot(nodes[j, 0] - n, nodes[j, 1] - e)
+    return result
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _tangents(fence: Fence, nodes: Array) -> tuple[NDArray[np.int32], NDArray[np.int32], Array]:
+    """Pairs of corners (each once) whose straight is inside and touches at both, with lengths."""
+    count, room = 0, 4 * nodes.shape[0] + 16
+    rows, columns = np.empty(room, dtype=np.int32), np.empty(room, dtype=np.int32)
+    lengths = np.empty(room)
+    for i in range(nodes.shape[0]):
+        for j in range(i + 1, nodes.shape[0]):
+            if not _passes(nodes, j, nodes[i, 0], nodes[i, 1]):
+                continue
+            if not _passes(nodes, i, nodes[j, 0], nodes[j, 1]):
+                continue
+            if not straight_inside(fence, nodes[i, 0], nodes[i, 1], nodes[j, 0], nodes[j, 1]):
+                continue
+            if count == room:
+                room *= 2
+                rows = np.concatenate((rows, np.empty_like(rows)))
+                columns = np.concatenate((columns, np.empty_like(columns)))
+                lengths = np.concatenate((lengths, np.empty_like(lengths)))
+            rows[count], columns[count] = i, j
+            # Corners of two rings at one place are joined by a way of next to no length.
+            lengths[count] = max(
+                math.hypot(nodes[j, 0] - nodes[i, 0], nodes[j, 1] - nodes[i, 1]), 1e-12
+            )
+            count += 1
+    return rows[:count], columns[:count], lengths[:count]
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _shorten(
+    distances: Array,
+    blocked_a: NDArray[np.intp],
+    blocked_b: NDArray[np.intp],
+    seen_a: Array,
+    seen_b: Array,
+    between: Array,
+) -> None:
+    """Fill the blocked distances with those of the ways over corners."""
+    size = between.shape[0]
+    through = np.empty(size)
+    for i in range(blocked_a.shape[0]):
+        through[:] = np.inf
+        for node in range(size):
+            if seen_a[i, node] < np.inf:
+                for other in range(size):
+                    through[other] = min(through[other], seen_a[i, node] + between[node, other])
+        for j in range(blocked_b.shape[0]):
+            if distances[blocked_a[i], blocked_b[j]] < np.inf:
+                continue
+            best = np.inf
+            for node in range(size):
+                best = min(best, through[node] + seen_b[j, node])
+            distances[blocked_a[i], blocked_b[j]] = best
