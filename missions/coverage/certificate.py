@@ -1,0 +1,313 @@
+"""The certificate of coverage: what all pictures together see of the survey area."""
+
+import math
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.errors import PlanError, warn
+from alice_survey.frames import Array
+from camera_calib.rig import Rig
+from missions.areas.area import Area
+from missions.coverage.raster import (
+    Grid,
+    border_rays_body,
+    count_pictures,
+    footprints_ne,
+    grid_over,
+    inside,
+)
+from missions.coverage.stations import Stations
+from missions.footprint import footprint_size_m
+from missions.lines.pattern import Pattern
+
+_CELLS_PER_FOOTPRINT = 20.0
+_LEAST_CELLS = 40_000
+"""Of a small area, so that its shares are told finely."""
+_MOST_CELLS = 16_000_000
+_TILE = 2048
+"""Cells a side that are worked on at once: about 90 MB for two cameras."""
+_CHUNK = 8192
+"""Stations whose borders are kept at once: about 17 MB for two cameras."""
+
+Counts = NDArray[np.uint16]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Certificate:
+    """What was or will be seen of an area, at the middle of every cell of a grid over it.
+
+    Shares are of the cells whose middle lies in the survey area.
+    """
+
+    area: Area
+    pattern: Pattern
+    cameras: tuple[str, ...]
+    stations: int
+    """At which every camera took a picture."""
+    blind: int
+    """Stations of these whose pictures look past the sea floor: they count as seeing nothing."""
+    grid: Grid
+    inside: NDArray[np.bool_]
+    """(rows, columns) whether the middle of the cell lies in the survey area."""
+    pictures: Counts
+    """(rows, columns) how many pictures of all cameras see it."""
+    least_pictures: Counts
+    """(rows, columns) of the camera that sees it least often."""
+    least_lines: Counts
+    """(rows, columns) lines that see it, of the camera that does so on the fewest."""
+    pairs: Counts
+    """(rows, columns) stations that see it with all cameras at once."""
+    histograms: dict[str, Array]
+    """By camera: share of the area, (N,), that 0, 1, 2, ... of its pictures see."""
+    line_histograms: dict[str, Array]
+    """By camera: share of the area, (N,), that is seen on 0, 1, 2, ... lines."""
+
+    @property
+    def taken(self) -> int:
+        """Pictures of all cameras."""
+        return self.stations * len(self.cameras)
+
+    @property
+    def area_m2(self) -> float:
+        """Of the survey area."""
+        return float(self.area.survey.area)
+
+    @property
+    def at_overlap(self) -> NDArray[np.bool_]:
+        """Where, (rows, columns), the area is covered at the overlap asked for.
+
+        Every camera sees such a place on as many lines, and in as many pictures, as it does
+        everywhere in an endless pattern.
+        """
+        often = self.least_pictures >= self.pattern.passes * self.pattern.pictures
+        covered: NDArray[np.bool_] = often & (self.least_lines >= self.pattern.passes)
+        return covered
+
+    @property
+    def covered_share(self) -> float:
+        """Share of the area that is in at least one picture."""
+        return self._share(self.pictures > 0)
+
+    @property
+    def every_camera_share(self) -> float:
+        """Share of the area that is in at least one picture of every camera."""
+        return self._share(self.least_pictures > 0)
+
+    @property
+    def stereo_share(self) -> float:
+        """Share of the area that all cameras see at once at some station."""
+        return self._share(self.pairs > 0)
+
+    @property
+    def share_at_overlap(self) -> float:
+        """Share of the area that is covered at the overlap asked for."""
+        return self._share(self.at_overlap)
+
+    @property
+    def fewest_pictures(self) -> int:
+        """Of any camera that see any place of the area."""
+        return int(self.least_pictures[self.inside].min())
+
+    @property
+    def fewest_lines(self) -> int:
+        """On which any camera sees any place of the area."""
+        return int(self.least_lines[self.inside].min())
+
+    @property
+    def mean_pictures(self) -> float:
+        """Of all cameras, that see a place of the area."""
+        return float(self.pictures[self.inside].mean())
+
+    def _share(self, mask: NDArray[np.bool_]) -> float:
+        return int(np.count_nonzero(mask & self.inside)) / int(np.count_nonzero(self.inside))
+
+    def to_json(self) -> dict[str, Any]:
+        """The figures, without map and holes."""
+        return {
+            "area_m2": self.area_m2,
+            "cell_m": self.grid.cell_m,
+            "cameras": list(self.cameras),
+            "stations": self.stations,
+            "pictures": self.taken,
+            "stations_without_sea_floor": self.blind,
+            "asked_for": {
+                "lines": self.pattern.passes,
+                "pictures_of_each_camera": self.pattern.passes * self.pattern.pictures,
+            },
+            "covered_share": self.covered_share,
+            "every_camera_share": self.every_camera_share,
+            "stereo_share": self.stereo_share,
+            "share_at_overlap": self.share_at_overlap,
+            "fewest_pictures_of_a_camera": self.fewest_pictures,
+            "fewest_lines": self.fewest_lines,
+            "mean_pictures": self.mean_pictures,
+            "share_by_pictures": {name: _rounded(h) for name, h in self.histograms.items()},
+            "share_by_lines": {name: _rounded(h) for name, h in self.line_histograms.items()},
+        }
+
+
+def certificate(
+    area: Area,
+    rig: Rig,
+    stations: Stations,
+    pattern: Pattern,
+    *,
+    cell_m: float | None = None,
+    threads: int = 1,
+) -> Certificate:
+    """Certify what pictures see of an area.
+
+    Args:
+        area: what must be seen.
+        rig: its cameras, in water.
+        stations: where pictures are taken.
+        pattern: the overlap asked for.
+        cell_m: of the grid; left out, a twentieth of a footprint, less for a small area, and more
+            where that would be over 16 million cells.
+        threads: how many parts of a large area are worked on at once.
+
+    Raises:
+        PlanError: `cell_m` is not positive, or would make too large a grid.
+    """
+    grid = grid_over(area, _cell_m(area, rig, stations, cell_m))
+    mask = inside(area, grid)
+    if not mask.any():  # the area is a sliver between middles of cells
+        raise PlanError(
+            f"an area of {area.survey.area:.3g} m2 holds no point of a grid of {grid.cell_m:.3g} m"
+        )
+    order = np.argsort(stations.line, kind="stable")
+    stations = stations.some(order)
+    rays = border_rays_body(rig)
+    reach_m = _reaches_m(rays, stations)
+    blind = int(np.count_nonzero(np.isnan(reach_m)))
+    names = tuple(rig.cameras)
+    result = {
+        name: np.zeros(grid.shape, np.uint16)
+        for name in ("pictures", "least_pictures", "least_lines", "pairs")
+    }
+
+    def work(tile: tuple[int, int]) -> tuple[list[NDArray[np.intp]], list[NDArray[np.intp]]]:
+        part = grid.part(*tile, _TILE, _TILE)
+        here = (slice(tile[0], tile[0] + part.rows), slice(tile[1], tile[1] + part.columns))
+        within = mask[here]
+        if not within.any():
+            return [], []
+        pictures, lines, pairs = _counts(part, rays, stations.some(_near(part, stations, reach_m)))
+        result["pictures"][here] = np.minimum(pictures.sum(axis=0, dtype=np.uint32), 65535)
+        result["least_pictures"][here] = pictures.min(axis=0)
+        result["least_lines"][here] = lines.min(axis=0)
+        result["pairs"][here] = pairs
+        return (
+            [np.bincount(counts[within]) for counts in pictures],
+            [np.bincount(counts[within]) for counts in lines],
+        )
+
+    tiles = [(i, j) for i in range(0, grid.rows, _TILE) for j in range(0, grid.columns, _TILE)]
+    if threads > 1 and len(tiles) > 1:
+        with ThreadPoolExecutor(threads) as executor:
+            counted = list(executor.map(work, tiles))
+    else:
+        counted = [work(tile) for tile in tiles]
+    worked = [pair for pair in counted if pair[0]]
+    return Certificate(
+        area=area,
+        pattern=pattern,
+        cameras=names,
+        stations=len(stations),
+        blind=blind,
+        grid=grid,
+        inside=mask,
+        histograms={n: _histogram([p[0][i] for p in worked]) for i, n in enumerate(names)},
+        line_histograms={n: _histogram([p[1][i] for p in worked]) for i, n in enumerate(names)},
+        **result,
+    )
+
+
+def _cell_m(area: Area, rig: Rig, stations: Stations, asked_m: float | None) -> float:
+    """The side of a cell.
+
+    Raises:
+        PlanError: the one asked for is not positive or too small.
+    """
+    boxed_m2 = float(area.survey.oriented_envelope.area)
+    least_m = math.sqrt(boxed_m2 / _MOST_CELLS)
+    if asked_m is not None:
+        if not asked_m >= least_m or math.isinf(asked_m):
+            raise PlanError(
+                f"cells of {asked_m:g} m: choose {least_m:.3g} m or more for a grid of "
+                f"{_MOST_CELLS:.0e} cells at most"
+            )
+        return asked_m
+    fine_m = math.sqrt(boxed_m2 / _LEAST_CELLS)
+    altitude_m = float(np.median(stations.altitude_m)) if len(stations) else 0.0
+    if altitude_m > 0:
+        camera = rig.cameras[rig.reference]
+        fine_m = min(fine_m, min(footprint_size_m(camera, altitude_m)) / _CELLS_PER_FOOTPRINT)
+    if fine_m < least_m:
+        warn(
+            f"the certificate's grid has cells of {least_m:.3g} m instead of {fine_m:.3g} m, "
+            f"{_MOST_CELLS / 1e6:.0f} million of them: holes under {1.4 * least_m:.2g} m may be "
+            "missed; certify parts of the area, or choose cell_m"
+        )
+    return max(fine_m, least_m)
+
+
+def _chunks(count: int) -> Iterator[slice]:
+    return (slice(start, start + _CHUNK) for start in range(0, count, _CHUNK))
+
+
+def _borders(rays: tuple[Array, Array], stations: Stations, rows: slice) -> Array:
+    borders: Array = footprints_ne(
+        *rays, stations.glass_ne[rows], stations.altitude_m[rows], stations.attitude_rad[rows]
+    )
+    return borders
+
+
+def _reaches_m(rays: tuple[Array, Array], stations: Stations) -> Array:
+    """How far from the glass, (S,), a station sees; NaN where it looks past the sea floor."""
+    reaches = [np.empty(0)]
+    for rows in _chunks(len(stations)):
+        offsets = _borders(rays, stations, rows) - stations.glass_ne[rows, None, None]
+        reaches.append(np.sqrt((offsets**2).sum(axis=-1).max(axis=(1, 2))))
+    return np.concatenate(reaches)
+
+
+def _near(grid: Grid, stations: Stations, reach_m: Array) -> NDArray[np.bool_]:
+    """Stations, (S,), that may see some of a grid."""
+    half = np.array(grid.shape) / 2
+    off = np.abs(grid.cells_of(stations.glass_ne) - half) - half
+    beyond_m = np.linalg.norm(np.maximum(off, 0.0), axis=1) * grid.cell_m
+    near: NDArray[np.bool_] = beyond_m <= reach_m + 1e-6
+    return near
+
+
+def _counts(
+    grid: Grid, rays: tuple[Array, Array], stations: Stations
+) -> tuple[Counts, Counts, Counts]:
+    """Pictures and lines, (cameras, rows, columns) each, and pairs, (rows, columns)."""
+    shape = (len(rays[0]), *grid.shape)
+    pictures, lines = np.zeros(shape, np.uint16), np.zeros(shape, np.uint16)
+    last, stamp = np.full(shape, -1, np.int32), np.full(grid.shape, -1, np.int32)
+    pairs = np.zeros(grid.shape, np.uint16)
+    for rows in _chunks(len(stations)):
+        cells = grid.cells_of(_borders(rays, stations, rows))
+        count_pictures(cells, stations.line[rows], rows.start, pictures, lines, last, stamp, pairs)
+    return pictures, lines, pairs
+
+
+def _histogram(counts: list[NDArray[np.intp]]) -> Array:
+    """Shares of all cells, from counts of parts of them."""
+    total = np.zeros(max(len(count) for count in counts))
+    for count in counts:
+        total[: len(count)] += count
+    shares: Array = total / total.sum()
+    return shares
+
+
+def _rounded(shares: Array) -> list[float]:
+    return [round(share, 6) for share in shares.tolist()]

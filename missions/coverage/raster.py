@@ -1,0 +1,263 @@
+"""Footprints on a grid of points: which pictures see the middle of each cell, exactly.
+
+Nothing is smeared: a cell counts as seen when its middle lies within a footprint, whose border is
+traced through the flat port. What is found is therefore true at every middle of a cell, and a hole
+that holds a circle of 0.71 cells radius cannot be missed.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import shapely
+from numba import njit
+from numpy.typing import NDArray
+
+from alice_survey.frames import Array
+from camera_calib.rig import Rig
+from missions.areas.area import Area
+from missions.footprint import glass_point_cam
+
+_POINTS_PER_SIDE = 16
+"""Of a footprint's border. Chords of so short arcs leave out less than 1e-4 of its width."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grid:
+    """Square cells in rows along a heading; the cell (0, 0) is at the corner astern to port."""
+
+    origin_ne: tuple[float, float]
+    """That corner, metres."""
+    heading_rad: float
+    """The way in which rows count; columns count to the right of it."""
+    cell_m: float
+    rows: int
+    columns: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.rows, self.columns
+
+    @cached_property
+    def axes(self) -> Array:
+        """(2, 2): north and east of the ways in which rows and columns count."""
+        c, s = math.cos(self.heading_rad), math.sin(self.heading_rad)
+        return np.array([[c, s], [-s, c]])
+
+    def cells_of(self, points_ne: Array) -> Array:
+        """Row and column, (..., 2), of places (..., 2); the middle of a cell is at a half."""
+        cells: Array = (points_ne - np.array(self.origin_ne)) @ self.axes.T / self.cell_m
+        return cells
+
+    def places_of(self, cells: Array) -> Array:
+        """The inverse of `cells_of`."""
+        places: Array = np.array(self.origin_ne) + self.cell_m * (cells @ self.axes)
+        return places
+
+    def part(self, row: int, column: int, rows: int, columns: int) -> "Grid":
+        """Some of its cells, from a row and a column on; what is beyond its ends is left out."""
+        north, east = self.places_of(np.array([float(row), float(column)]))
+        return Grid(
+            origin_ne=(float(north), float(east)),
+            heading_rad=self.heading_rad,
+            cell_m=self.cell_m,
+            rows=min(rows, self.rows - row),
+            columns=min(columns, self.columns - column),
+        )
+
+
+def grid_over(area: Area, cell_m: float) -> Grid:
+    """A grid over the survey area, along the longer side of the smallest rectangle round it.
+
+    A grid that turns with the area gives the same certificate whichever way the area lies.
+    """
+    box = shapely.get_coordinates(shapely.oriented_envelope(area.survey))
+    sides = np.diff(box[:3], axis=0)
+    side = sides[int(np.argmax(np.linalg.norm(sides, axis=1)))]
+    heading = math.atan2(side[1], side[0]) % math.pi
+    heading = 0.0 if math.pi - heading < 1e-12 else heading
+    bare = Grid(origin_ne=(0.0, 0.0), heading_rad=heading, cell_m=cell_m, rows=1, columns=1)
+    corners = bare.cells_of(area.corners_ne)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    # A side of a whole number of cells has so many, whatever the rounding.
+    counts = np.maximum(np.ceil(high - low - 1e-9).astype(int), 1)
+    origin = bare.places_of((low + high - counts) / 2)
+    return Grid(
+        origin_ne=(float(origin[0]), float(origin[1])),
+        heading_rad=heading,
+        cell_m=cell_m,
+        rows=int(counts[0]),
+        columns=int(counts[1]),
+    )
+
+
+def inside(area: Area, grid: Grid) -> NDArray[np.bool_]:
+    """Which middles of cells, (rows, columns), lie in the survey area."""
+    rings = [grid.cells_of(ring) for ring in area.rings_ne]
+    edges = np.concatenate([np.hstack([ring[:-1], ring[1:]]) for ring in rings])
+    mask: NDArray[np.bool_] = _inside(np.ascontiguousarray(edges), grid.rows, grid.columns)
+    return mask
+
+
+def border_rays_body(rig: Rig) -> tuple[Array, Array]:
+    """Where the rays of each picture's border leave the glass, and their ways in water.
+
+    Returns:
+        Points about the left port's outer glass, (cameras, points, 3) metres, and unit rays of the
+        same shape, both in the vehicle's axes.
+    """
+    glass = rig.body_from_cam(rig.reference).apply(glass_point_cam(rig.cameras[rig.reference]))
+    points, rays = [], []
+    for name, camera in rig.cameras.items():
+        body_from_cam = rig.body_from_cam(name)
+        points_cam, rays_cam = camera.unproject(camera.border(_POINTS_PER_SIDE))
+        points.append(body_from_cam.apply(points_cam) - glass)
+        rays.append(body_from_cam.rotation.apply(rays_cam))
+    return np.stack(points), np.stack(rays)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def footprints_ne(
+    points_body: Array, rays_body: Array, glass_ne: Array, altitude_m: Array, attitude_rad: Array
+) -> Array:
+    """Borders of all cameras' pictures on a sea floor that is level below each station.
+
+    Args:
+        points_body: (C, P, 3) from `border_rays_body`.
+        rays_body: (C, P, 3) likewise.
+        glass_ne: (S, 2).
+        altitude_m: (S,) of the glass.
+        attitude_rad: (S, 3) roll, pitch, heading.
+
+    Returns:
+        (S, C, P, 2) north and east; NaN where a ray never reaches the sea floor.
+    """
+    cameras, points = points_body.shape[:2]
+    borders = np.full((len(glass_ne), cameras, points, 2), np.nan)
+    for s in range(len(glass_ne)):
+        cr, sr = math.cos(attitude_rad[s, 0]), math.sin(attitude_rad[s, 0])
+        cp, sp = math.cos(attitude_rad[s, 1]), math.sin(attitude_rad[s, 1])
+        ch, sh = math.cos(attitude_rad[s, 2]), math.sin(attitude_rad[s, 2])
+        # Fossen (2011), eq. 2.18: from body to North-East-Down.
+        nx, ny, nz = ch * cp, ch * sp * sr - sh * cr, ch * sp * cr + sh * sr
+        ex, ey, ez = sh * cp, sh * sp * sr + ch * cr, sh * sp * cr - ch * sr
+        dx, dy, dz = -sp, cp * sr, cp * cr
+        for c in range(cameras):
+            for p in range(points):
+                x, y, z = points_body[c, p, 0], points_body[c, p, 1], points_body[c, p, 2]
+                u, v, w = rays_body[c, p, 0], rays_body[c, p, 1], rays_body[c, p, 2]
+                descent = dx * u + dy * v + dz * w
+                height = altitude_m[s] - (dx * x + dy * y + dz * z)
+                if not (descent > 0.0 and height > 0.0):
+                    continue
+                reach = height / descent
+                x, y, z = x + reach * u, y + reach * v, z + reach * w
+                borders[s, c, p, 0] = glass_ne[s, 0] + nx * x + ny * y + nz * z
+                borders[s, c, p, 1] = glass_ne[s, 1] + ex * x + ey * y + ez * z
+    return borders
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def count_pictures(
+    borders: Array,
+    line: NDArray[np.intp],
+    first: int,
+    pictures: NDArray[np.uint16],
+    lines: NDArray[np.uint16],
+    last: NDArray[np.int32],
+    stamp: NDArray[np.int32],
+    pairs: NDArray[np.uint16],
+) -> None:
+    """Add stations to what has seen the middle of each cell; the counts saturate at 65535.
+
+    A station whose border holds a NaN sees nothing. Stations must come line by line: all of one
+    line before those of the next.
+
+    Args:
+        borders: (S, C, P, 2) of pictures, as rows and columns of the grid.
+        line: (S,) of each station, -1 of none: that counts as a picture, not as a line.
+        first: how many stations were added before.
+        pictures: (C, rows, columns) how many of each camera; added to.
+        lines: (C, rows, columns) how many lines of each camera; added to.
+        last: (C, rows, columns) line that saw it last, -1 at first; kept from call to call.
+        stamp: (rows, columns) picture that saw it last, -1 at first; kept likewise.
+        pairs: (rows, columns) how many stations see it with all cameras at once; added to.
+    """
+    stations, cameras, points = borders.shape[:3]
+    rows, columns = stamp.shape
+    crossing = np.empty((rows, points), np.int32)
+    found = np.zeros(rows, np.int32)
+    for s in range(stations):
+        for c in range(cameras):
+            border = borders[s, c]
+            low, high = math.inf, -math.inf
+            left, right = math.inf, -math.inf
+            whole = True
+            for p in range(points):
+                whole = whole and math.isfinite(border[p, 0]) and math.isfinite(border[p, 1])
+                low, high = min(low, border[p, 0]), max(high, border[p, 0])
+                left, right = min(left, border[p, 1]), max(right, border[p, 1])
+            if not whole or high < 0.0 or low > rows or right < 0.0 or left > columns:
+                continue
+            top = math.ceil(max(low, 0.0) - 0.5)
+            bottom = math.ceil(min(high, float(rows)) - 0.5)
+            for i in range(top, bottom):
+                found[i] = 0
+            for p in range(points):
+                q = p + 1 if p + 1 < points else 0
+                r0, c0, r1, c1 = border[p, 0], border[p, 1], border[q, 0], border[q, 1]
+                if r1 < r0:
+                    r0, c0, r1, c1 = r1, c1, r0, c0
+                # Middles at i + 0.5 with r0 <= i + 0.5 < r1: each corner counts once.
+                start = math.ceil(max(r0, 0.0) - 0.5)
+                for i in range(start, math.ceil(min(r1, float(rows)) - 0.5)):
+                    place = c0 + (i + 0.5 - r0) / (r1 - r0) * (c1 - c0)
+                    column = math.ceil(min(max(place, 0.0), float(columns)) - 0.5)
+                    k = found[i]
+                    while k > 0 and crossing[i, k - 1] > column:
+                        crossing[i, k] = crossing[i, k - 1]
+                        k -= 1
+                    crossing[i, k] = column
+                    found[i] += 1
+            before = (first + s) * cameras + c - 1
+            for i in range(top, bottom):
+                for k in range(0, found[i] - 1, 2):
+                    for j in range(crossing[i, k], crossing[i, k + 1]):
+                        if pictures[c, i, j] < 65535:
+                            pictures[c, i, j] += 1
+                        if line[s] >= 0 and last[c, i, j] != line[s]:
+                            last[c, i, j] = line[s]
+                            if lines[c, i, j] < 65535:
+                                lines[c, i, j] += 1
+                        if c == 0 or stamp[i, j] == before:
+                            stamp[i, j] = before + 1
+                            if c == cameras - 1 and pairs[i, j] < 65535:
+                                pairs[i, j] += 1
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _inside(edges: Array, rows: int, columns: int) -> NDArray[np.bool_]:
+    """Which middles of cells lie within closed rings, by the parity of edges to their left.
+
+    Args:
+        edges: (E, 4) row and column of both ends.
+        rows: of the grid.
+        columns: of the grid.
+    """
+    mask = np.zeros((rows, columns), np.bool_)
+    for e in range(len(edges)):
+        r0, c0, r1, c1 = edges[e]
+        if r1 < r0:
+            r0, c0, r1, c1 = r1, c1, r0, c0
+        start = math.ceil(max(r0, 0.0) - 0.5)
+        for i in range(start, math.ceil(min(r1, float(rows)) - 0.5)):
+            place = c0 + (i + 0.5 - r0) / (r1 - r0) * (c1 - c0)
+            column = math.ceil(min(max(place, 0.0), float(columns)) - 0.5)
+            if column < columns:
+                mask[i, column] = not mask[i, column]
+    for i in range(rows):
+        for j in range(1, columns):
+            mask[i, j] = mask[i, j] != mask[i, j - 1]
+    return mask

@@ -1,0 +1,129 @@
+"""Where pictures were or will be taken: place, height above the sea floor, attitude, line."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.frames import Array, attitude_from_rotation, interpolate_poses
+from camera_calib.rig import Rig
+from missions.footprint import common_swath
+from missions.lines.line import Line
+from missions.lines.pattern import Pattern, pattern
+from missions.plan_file import Plan
+
+if TYPE_CHECKING:
+    from missions.flight import Flight
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Stations:
+    """Moments at which every camera takes a picture, in the order of time."""
+
+    glass_ne: Array
+    """(S, 2) north and east of the left port's outer glass, metres."""
+    altitude_m: Array
+    """(S,) of the left port's outer glass above the sea floor, which is level below it."""
+    attitude_rad: Array
+    """(S, 3) roll, pitch, heading of the vehicle."""
+    line: NDArray[np.intp]
+    """(S,) which pass over the area it belongs to: the plan's line, or -1 between lines."""
+    time_s: Array | None = None
+    """(S,) where it is known."""
+
+    def __post_init__(self) -> None:
+        count = len(self.glass_ne)
+        shapes = {
+            "glass_ne": (count, 2), "altitude_m": (count,), "attitude_rad": (count, 3),
+            "line": (count,), "time_s": (count,),
+        }  # fmt: skip
+        for name, shape in shapes.items():
+            value = getattr(self, name)
+            if value is None:
+                continue
+            if value.shape != shape:
+                raise ValueError(f"stations: {name} has the shape {value.shape}, not {shape}")
+            if not np.all(np.isfinite(value)):
+                raise ValueError(f"stations: {name} holds a value that is not finite")
+
+    def __len__(self) -> int:
+        return len(self.glass_ne)
+
+    def some(self, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> "Stations":
+        """Those of an index or a mask."""
+        return Stations(
+            glass_ne=self.glass_ne[chosen],
+            altitude_m=self.altitude_m[chosen],
+            attitude_rad=self.attitude_rad[chosen],
+            line=self.line[chosen],
+            time_s=None if self.time_s is None else self.time_s[chosen],
+        )
+
+    def and_then(self, other: "Stations") -> "Stations":
+        """These, and those of a later dive; its lines count on, and its times are not kept."""
+        after = int(self.line.max(initial=-1)) + 1
+        return Stations(
+            glass_ne=np.concatenate([self.glass_ne, other.glass_ne]),
+            altitude_m=np.concatenate([self.altitude_m, other.altitude_m]),
+            attitude_rad=np.concatenate([self.attitude_rad, other.attitude_rad]),
+            line=np.concatenate([self.line, np.where(other.line < 0, -1, other.line + after)]),
+        )
+
+    def moved(self, north_m: float, east_m: float) -> "Stations":
+        """The same elsewhere."""
+        return replace(self, glass_ne=self.glass_ne + np.array([north_m, east_m]))
+
+
+def stations_of_lines(lines: Sequence[Line], altitude_m: Array | float) -> Stations:
+    """The stations of lines flown exactly, by a level vehicle.
+
+    Args:
+        lines: with their pictures.
+        altitude_m: of the left port's glass, of all stations or (S,) of each.
+    """
+    counts = [line.stations for line in lines]
+    headings = np.array([line.heading_rad for line in lines])
+    attitude = np.zeros((sum(counts), 3))
+    attitude[:, 2] = np.repeat(headings, counts)
+    return Stations(
+        glass_ne=np.concatenate([np.empty((0, 2)), *(line.stations_ne for line in lines)]),
+        altitude_m=np.array(np.broadcast_to(altitude_m, len(attitude)), dtype=np.float64),
+        attitude_rad=attitude,
+        line=np.repeat(np.arange(len(lines)), counts),
+    )
+
+
+def stations_of_plan(plan: Plan, floor_depth_m: Array | None = None) -> Stations:
+    """The stations of a plan flown exactly.
+
+    Args:
+        plan: it; the glass keeps the plan's altitude.
+        floor_depth_m: (S,) depth of the sea floor below each station, of a plan with depths of its
+            own for its lines: then the altitude is what is left below these.
+    """
+    if floor_depth_m is None or not plan.line_depths_m:
+        return stations_of_lines(plan.lines, plan.altitude_m)
+    depths = np.concatenate([np.asarray(row, dtype=np.float64) for row in plan.line_depths_m])
+    return stations_of_lines(plan.lines, floor_depth_m - depths)
+
+
+def stations_of_flight(flight: "Flight") -> Stations:
+    """Where the pictures of a simulated flight were truly taken."""
+    time_s, at_s = flight.truth.time_s, flight.trigger_s
+    poses = interpolate_poses(time_s, flight.truth.ned_from_body, at_s)
+    glass = [np.interp(at_s, time_s, axis) for axis in flight.glass_ned.T[:2]]
+    return Stations(
+        glass_ne=np.stack(glass, axis=1),
+        altitude_m=np.interp(at_s, time_s, flight.altitude_m),
+        attitude_rad=attitude_from_rotation(poses.rotation).reshape(-1, 3),
+        line=np.array(flight.trigger_line, dtype=np.intp),
+        time_s=at_s,
+    )
+
+
+def plan_pattern(plan: Plan, rig: Rig) -> Pattern:
+    """The pattern that a plan's lines follow."""
+    stereo = common_swath(rig, plan.altitude_m, plan.station_spacing_m)
+    return pattern(stereo, plan.line_spacing_m, plan.station_spacing_m)
