@@ -60,10 +60,12 @@ class AreaConfig(Config):
     no_go_ne_m: tuple[Ring, ...] = ()
     no_go_latlon_deg: tuple[GeoRing, ...] = ()
     no_go_file: Path | None = None
+    no_go_layer: str | None = None
     no_go_clearance_m: float = Field(0.0, ge=0, le=100)
     allowed_ne_m: Ring | None = None
     allowed_latlon_deg: GeoRing | None = None
     allowed_file: Path | None = None
+    allowed_layer: str | None = None
     turn_margin_m: float | None = Field(None, ge=0, le=1000)
     seafloor_depth_m: float = Field(15.0, gt=0, le=6000)
     bathymetry_file: Path | None = None

@@ -1,0 +1,277 @@
+"""Coordinate systems: from those of files and settings to latitude and longitude, then to NED."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from alice_survey.errors import PlanError, warn
+from alice_survey.frames import Array, Datum
+from missions.areas.raw import RawShapes
+
+LOCAL = "local"
+"""In place of a coordinate system: metres east (x) and north (y) of the datum."""
+FARTHEST_M = 20_000.0
+"""From the datum: beyond, a flat local frame is no longer one."""
+_HIGHEST_LATITUDE_DEG = 85.0
+"""Nearer to a pole, headings from north change within an area."""
+_WGS84_ACCURACY_M = 2.0
+"""Of the ensemble of WGS 84's realisations (EPSG datum 6326)."""
+_DATUM_DECIMALS = 6
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalFrame:
+    """The datum's North-East-Down frame, at the depth of the sea floor."""
+
+    datum: Datum
+    seafloor_depth_m: float
+    datum_is_given: bool
+
+    def ne_from_latlon(self, lat_lon: Array) -> Array:
+        """(N, 2) metres north and east of (N, 2) degrees of places on the sea floor."""
+        depth_m = np.full((len(lat_lon), 1), self.seafloor_depth_m)
+        return self.datum.ned_from_geodetic(np.hstack([lat_lon, depth_m]))[:, :2]
+
+    def latlon_from_ne(self, points_ne: Array) -> Array:
+        """The inverse of `ne_from_latlon`, for points at the depth of the sea floor.
+
+        A point of the sea floor is below the datum's horizon by the Earth's curve; three rounds
+        bring the depth to below a micrometre within `FARTHEST_M` (each leaves the square of the
+        distance over the Earth's radius, 1e-5, of the error).
+        """
+        down_m = np.full(len(points_ne), self.seafloor_depth_m)
+        for _ in range(3):
+            found = self.datum.geodetic_from_ned(np.column_stack([points_ne, down_m]))
+            down_m = down_m + (self.seafloor_depth_m - found[:, 2])
+        return self.datum.geodetic_from_ned(np.column_stack([points_ne, down_m]))[:, :2]
+
+    def place(self, point_ne: Array | Sequence[float], *, geographic: bool) -> str:
+        """A point in words; in degrees, too, for shapes that were given so."""
+        north, east = (float(value) for value in point_ne)
+        text = f"north {north + 0.0:.2f} m, east {east + 0.0:.2f} m"
+        if not geographic:
+            return text
+        lat, lon = self.latlon_from_ne(np.array([[north, east]]))[0]
+        return f"{text} ({lat:.7f}, {lon:.7f})"
+
+    def localised(self, raw: RawShapes) -> RawShapes:
+        """Shapes in metres north and east of the datum.
+
+        Raises:
+            PlanError: a corner is no number, or farther than `FARTHEST_M` from the datum.
+        """
+
+        def change(corners: Array, name: str) -> Array:
+            check_finite(corners, raw.origin, name)
+            points_ne = self.ne_from_latlon(corners) if raw.geographic else corners
+            self._check_near(corners, points_ne, raw, name)
+            return points_ne
+
+        return raw.mapped(change, geographic=False)
+
+    def _check_near(self, corners: Array, points_ne: Array, raw: RawShapes, name: str) -> None:
+        if not len(points_ne):
+            return
+        if raw.geographic:
+            far = _distance_m(corners, self.datum)
+        else:
+            far = np.linalg.norm(points_ne, axis=1)
+        if far.max() <= FARTHEST_M:
+            return
+        worst = int(far.argmax())
+        datum = f"({self.datum.latitude_deg:g}, {self.datum.longitude_deg:g})"
+        where = (
+            "" if not raw.geographic else f" at ({corners[worst][0]:.6g}, {corners[worst][1]:.6g})"
+        )
+        if raw.geographic and not self.datum_is_given:
+            advice = "the area is too large, or a corner is wrong"
+        elif raw.geographic and _distance_m(corners[:, ::-1], self.datum).max() <= FARTHEST_M:
+            advice = "latitude and longitude are swapped"
+        elif raw.geographic:
+            advice = "move the datum (latitude_deg, longitude_deg), or check the corner and its crs"
+        else:
+            advice = "move the datum or check the corner"
+        raise PlanError(
+            f"area: {raw.origin}: {name + ', ' if name else ''}corner {worst + 1}{where} is "
+            f"{far.max() / 1e3:.0f} km from the datum {datum}; at most {FARTHEST_M / 1e3:.0f} km: "
+            f"{advice}"
+        )
+
+
+def check_finite(corners: Array, origin: str, name: str) -> None:
+    """Refuse coordinates that are no numbers.
+
+    Raises:
+        PlanError: with the corner's number.
+    """
+    bad = ~np.isfinite(corners).all(axis=1)
+    if bad.any():
+        first = int(bad.argmax())
+        values = ", ".join(f"{value:g}" for value in corners[first])
+        raise PlanError(
+            f"area: {origin}: {name + ', ' if name else ''}corner {first + 1} is ({values}): "
+            "coordinates must be numbers"
+        )
+
+
+def geographic_shapes(raw: RawShapes, crs: Any) -> RawShapes:
+    """Take shapes with x = east (or longitude) and y = north (or latitude) to WGS 84.
+
+    Args:
+        raw: shapes whose coordinates are the file's own x and y.
+        crs: a `pyproj.CRS`.
+
+    Returns:
+        Shapes in latitude and longitude, degrees.
+
+    Raises:
+        PlanError: no transformation is known, or a corner has no place in the system.
+    """
+    from pyproj import Transformer
+    from pyproj.exceptions import ProjError
+
+    flat = crs.to_2d()
+    try:
+        transformer = Transformer.from_crs(flat, "EPSG:4326", always_xy=True, allow_ballpark=False)
+    except ProjError as error:
+        raise PlanError(
+            f"area: {raw.origin}: no transformation from {crs.name} to latitude and longitude is "
+            f"known: {error}"
+        ) from None
+    accuracy_m: list[float] = []
+
+    def change(xy: Array, name: str) -> Array:
+        if not len(xy):
+            return xy
+        check_finite(xy, raw.origin, name)
+        if flat.is_geographic:
+            _check_degrees(xy, raw.origin, name, crs)
+        lon, lat = transformer.transform(xy[:, 0], xy[:, 1])
+        lat_lon = np.column_stack([lat, lon])
+        bad = ~np.isfinite(lat_lon).all(axis=1)
+        if bad.any():
+            first = int(bad.argmax())
+            raise PlanError(
+                f"area: {raw.origin}: {name + ', ' if name else ''}corner {first + 1} at x "
+                f"{xy[first, 0]:.10g}, y {xy[first, 1]:.10g} has no place in {crs.name}: check crs"
+            )
+        accuracy_m.append(float(transformer.get_last_used_operation().accuracy))
+        check_latitudes(lat_lon, raw.origin, name)
+        return lat_lon
+
+    moved = raw.mapped(change, geographic=True)
+    worst_m = max(accuracy_m, default=0.0)
+    if worst_m > _WGS84_ACCURACY_M:
+        warn(
+            f"area: {raw.origin}: positions in {crs.name} are known in WGS 84 to {worst_m:g} m only"
+        )
+    return moved
+
+
+def check_latitudes(lat_lon: Array, origin: str, name: str) -> None:
+    """Refuse what is too near to a pole.
+
+    Raises:
+        PlanError: with the corner.
+    """
+    if not len(lat_lon):
+        return
+    worst = int(np.abs(lat_lon[:, 0]).argmax())
+    if abs(lat_lon[worst, 0]) > _HIGHEST_LATITUDE_DEG:
+        raise PlanError(
+            f"area: {origin}: {name + ', ' if name else ''}corner {worst + 1} is at latitude "
+            f"{lat_lon[worst, 0]:.6g}, longitude {lat_lon[worst, 1]:.6g}; areas are planned up to "
+            f"{_HIGHEST_LATITUDE_DEG:g} degrees north and south: are the two swapped?"
+        )
+
+
+def _check_degrees(lon_lat: Array, origin: str, name: str, crs: Any) -> None:
+    """Refuse longitudes beyond a turn and latitudes beyond a pole.
+
+    Longitudes to 360 are common where an area lies across the date line.
+    """
+    bad = (np.abs(lon_lat[:, 0]) > 360.0) | (np.abs(lon_lat[:, 1]) > 90.0)
+    if not bad.any():
+        return
+    first = int(bad.argmax())
+    lon, lat = lon_lat[first]
+    metres = max(abs(lon), abs(lat)) > 360.0
+    advice = (
+        "these are no degrees: set crs to the system they are in"
+        if metres
+        else "are latitude and longitude swapped?"
+    )
+    raise PlanError(
+        f"area: {origin}: {name + ', ' if name else ''}corner {first + 1} has longitude {lon:.10g} "
+        f"and latitude {lat:.10g} in {crs.name}: {advice}"
+    )
+
+
+def parse_crs(text: str) -> Any:
+    """A `pyproj.CRS` from what a user types: `EPSG:32636`, WKT, PROJ.
+
+    Raises:
+        PlanError: it is unknown, or has no place on Earth.
+    """
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
+    try:
+        crs = CRS.from_user_input(text)
+    except CRSError:
+        shown = text if len(text) <= 60 else f"{text[:57]}..."
+        raise PlanError(
+            f"area: crs = {shown!r} is not known: give a code such as EPSG:32636, EPSG:4326 or "
+            f"{LOCAL!r}"
+        ) from None
+    return usable_crs(crs, "crs")
+
+
+def usable_crs(crs: Any, origin: str) -> Any:
+    """The system itself, when it is a map of the Earth.
+
+    Raises:
+        PlanError: it is local to something, vertical or geocentric.
+    """
+    flat = crs.to_2d()
+    if not (flat.is_geographic or flat.is_projected):
+        raise PlanError(
+            f"area: {origin}: {crs.name} ({crs.type_name}) is no map of the Earth: give a "
+            f"geographic or projected system, or crs = {LOCAL!r} for metres east and north of the "
+            "datum"
+        )
+    return crs
+
+
+def middle(raw: RawShapes) -> Datum:
+    """The middle of the bounds of geographic shapes, rounded so that it can be read and typed."""
+    lat_lon = raw.coordinates
+    lat, lon = lat_lon[:, 0], unwrapped(lat_lon[:, 1], float(lat_lon[0, 1]))
+    centre_lat = (lat.min() + lat.max()) / 2
+    centre_lon = (lon.min() + lon.max()) / 2
+    return Datum(
+        round(float(centre_lat), _DATUM_DECIMALS),
+        round((float(centre_lon) + 180.0) % 360.0 - 180.0, _DATUM_DECIMALS),
+    )
+
+
+def unwrapped(lon_deg: Array, near_deg: float) -> Array:
+    """Longitudes within half a turn of one, so that none jumps at the date line."""
+    turned: Array = near_deg + (np.asarray(lon_deg) - near_deg + 180.0) % 360.0 - 180.0
+    return turned
+
+
+def _distance_m(lat_lon: Array, datum: Datum) -> Array:
+    """(N,) great circle distances on a sphere, good to 0.5 %, to tell near from far."""
+    radius_m = 6_371_000.0
+    lat, lon = np.deg2rad(lat_lon.T)
+    lat_0, lon_0 = math.radians(datum.latitude_deg), math.radians(datum.longitude_deg)
+    haversine = (
+        np.sin((lat - lat_0) / 2) ** 2
+        + np.cos(lat) * math.cos(lat_0) * np.sin((lon - lon_0) / 2) ** 2
+    )
+    distance: Array = 2 * radius_m * np.arcsin(np.sqrt(np.clip(haversine, 0.0, 1.0)))
+    return distance

@@ -1,0 +1,148 @@
+"""Shapes as they were given: rings, lines and points that nobody has checked yet."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from alice_survey.errors import PlanError
+from alice_survey.frames import Array
+
+Ring = Array
+"""(N, 2) corners; the first may or may not be repeated as the last."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RawLine:
+    """A line that stands for a corridor."""
+
+    points: Array
+    """(N, 2)."""
+    width_m: float | None = None
+    """None where its source does not say."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RawShapes:
+    """What one setting or file holds.
+
+    Coordinates are latitude and longitude (degrees, WGS 84) where `geographic`, else north and east
+    of the datum (metres).
+    """
+
+    origin: str
+    """How messages name the source, such as `polygon_ne_m` or `reef.kml`."""
+    geographic: bool
+    polygons: tuple[tuple[Ring, ...], ...] = ()
+    """Of each polygon its outer ring, then its holes."""
+    lines: tuple[RawLine, ...] = ()
+    points: Array
+    """(N, 2)."""
+    no_go: "RawShapes | None" = None
+    """Zones to keep out of that came in the same file."""
+
+    @property
+    def coordinates(self) -> Array:
+        """(N, 2) of everything but the zones to keep out of."""
+        rings = [ring for polygon in self.polygons for ring in polygon]
+        return np.concatenate([*rings, *(line.points for line in self.lines), self.points])
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is neither a polygon, a line nor a point."""
+        return not (self.polygons or self.lines or len(self.points))
+
+    def mapped(
+        self, change: Callable[[Array, str], Array], *, geographic: bool, origin: str | None = None
+    ) -> "RawShapes":
+        """With other coordinates.
+
+        Args:
+            change: takes (N, 2) coordinates and their name, such as `polygon 2, hole 1`.
+            geographic: what they are then.
+            origin: its new name; the old one unless given.
+        """
+        return replace(
+            self,
+            origin=origin or self.origin,
+            geographic=geographic,
+            polygons=tuple(
+                tuple(change(ring, self.ring_name(i, j)) for j, ring in enumerate(rings))
+                for i, rings in enumerate(self.polygons)
+            ),
+            lines=tuple(
+                replace(line, points=change(line.points, self.line_name(i)))
+                for i, line in enumerate(self.lines)
+            ),
+            points=change(self.points, "points"),
+        )
+
+    def ring_name(self, polygon: int, ring: int) -> str:
+        """Such as `polygon 2, hole 1`; empty for the outer ring of the only polygon."""
+        names = [f"polygon {polygon + 1}"] if len(self.polygons) > 1 else []
+        return ", ".join([*names, *([f"hole {ring}"] if ring else [])])
+
+    def line_name(self, line: int) -> str:
+        """Such as `line 2`."""
+        return f"line {line + 1}" if len(self.lines) > 1 else "line"
+
+
+def no_points() -> Array:
+    """(0, 2)."""
+    return np.empty((0, 2))
+
+
+def from_rings(origin: str, rings: Iterable[object], *, geographic: bool) -> RawShapes:
+    """Polygons without holes, of lists of corners."""
+    polygons = tuple((np.asarray(ring, dtype=np.float64).reshape(-1, 2),) for ring in rings)
+    return RawShapes(origin=origin, geographic=geographic, polygons=polygons, points=no_points())
+
+
+def from_geometries(origin: str, geometries: Iterable[BaseGeometry], *, swap: bool) -> RawShapes:
+    """Split geometries, collections too, into polygons, lines and points; heights are left out.
+
+    Args:
+        origin: their source.
+        geometries: valid or not.
+        swap: whether their x is east, so that the two coordinates change places.
+
+    Returns:
+        Shapes that are not geographic yet: the coordinates are the geometries' own.
+
+    Raises:
+        PlanError: a geometry of another kind.
+    """
+    polygons: list[tuple[Ring, ...]] = []
+    lines: list[RawLine] = []
+    points: list[Array] = []
+    order = [1, 0] if swap else [0, 1]
+
+    def corners(geometry: BaseGeometry) -> Array:
+        found: Array = shapely.get_coordinates(geometry)[:, order]
+        return found
+
+    waiting = list(geometries)[::-1]
+    while waiting:
+        geometry = waiting.pop()
+        if geometry is None or geometry.is_empty:
+            continue
+        if geometry.geom_type == "Polygon":
+            rings = shapely.get_rings(geometry).tolist()
+            polygons.append(tuple(corners(ring) for ring in rings))
+        elif geometry.geom_type in ("LineString", "LinearRing"):
+            lines.append(RawLine(points=corners(geometry)))
+        elif geometry.geom_type == "Point":
+            points.append(corners(geometry))
+        elif hasattr(geometry, "geoms"):
+            waiting += list(geometry.geoms)[::-1]
+        else:
+            raise PlanError(f"area: {origin}: a {geometry.geom_type} is no area")
+    return RawShapes(
+        origin=origin,
+        geographic=False,
+        polygons=tuple(polygons),
+        lines=tuple(lines),
+        points=np.concatenate([no_points(), *points]),
+    )

@@ -1,0 +1,229 @@
+"""From settings to the area to survey and the area where the vehicle may be."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import shapely
+from shapely.geometry import LineString, MultiPolygon, Point
+from shapely.geometry.base import BaseGeometry
+
+from alice_survey.config import AreaConfig
+from alice_survey.errors import PlanError, warn
+from alice_survey.frames import Array, Datum
+from missions.areas.area import Area, multipolygon
+from missions.areas.crs import LocalFrame, middle
+from missions.areas.raw import RawShapes
+from missions.areas.repair import (
+    Mended,
+    buffered_line,
+    distinct,
+    mended,
+    widened,
+    without_slivers,
+)
+from missions.areas.shapes import allowed_shapes, no_go_shapes, survey_shapes
+
+_SMALL_SHARE = 1e-6
+_LOCAL_SETTINGS = ("no_go_ne_m", "allowed_ne_m")
+
+
+def survey_area(settings: AreaConfig, *, turn_margin_m: float, margin_m: float = 0.0) -> Area:
+    """What to survey and where the vehicle may be.
+
+    Holes of the survey area and zones to keep out of, widened by `no_go_clearance_m`, are left out
+    of both. Edges are straight between corners, on the sea floor.
+
+    Args:
+        settings: shapes, or the files that hold them.
+        turn_margin_m: how far the vehicle may leave the survey area where the settings say neither
+            that nor an allowed shape.
+        margin_m: what is added to the survey area on every side.
+
+    Raises:
+        PlanError: a shape cannot be used; the message names the source and the place.
+    """
+    raw = survey_shapes(settings)
+    no_go_raw = [*no_go_shapes(settings), *([raw.no_go] if raw.no_go is not None else [])]
+    allowed_raw = allowed_shapes(settings)
+    frame = local_frame(settings, raw)
+    shape = _polygons(raw, frame, settings.corridor_width_m)
+    clearance_m = settings.no_go_clearance_m
+    zones = [(raw.origin, widened(shape.holes, clearance_m))]
+    zones += [(zone.origin, _zone(zone, frame, clearance_m)) for zone in no_go_raw]
+    no_go = _union([zone for _, zone in zones])
+    wanted = widened(shape.solid, margin_m)
+    survey = _less(wanted, no_go)
+    if survey.is_empty:
+        names = " and ".join(name for name, zone in zones if not zone.is_empty)
+        raise PlanError(
+            f"area: the zones to keep out of ({names}) leave nothing of the {wanted.area:.4g} m2 "
+            "to survey: shrink them or lower no_go_clearance_m"
+        )
+    if allowed_raw is None:
+        margin = settings.turn_margin_m if settings.turn_margin_m is not None else turn_margin_m
+        allowed = _less(widened(wanted, margin), no_go)
+    else:
+        if settings.turn_margin_m is not None:
+            warn(f"area: turn_margin_m is not used: {allowed_raw.origin} says where to be")
+        reach = _polygons(allowed_raw, frame, settings.corridor_width_m)
+        allowed = _less(reach.solid, no_go)
+    area = Area(datum=frame.datum, survey=survey, allowed=allowed, no_go=no_go)
+    _check_reach(area, raw, frame, given=None if allowed_raw is None else allowed_raw.origin)
+    return area
+
+
+def local_frame(settings: AreaConfig, raw: RawShapes) -> LocalFrame:
+    """The frame that the area is planned in: at the datum that is set, else at the middle.
+
+    Raises:
+        PlanError: half a datum is set for shapes in degrees.
+    """
+    names = {"latitude_deg", "longitude_deg"}
+    given = names & settings.model_fields_set
+    if raw.geographic and len(given) == 1:
+        (missing,) = names - given
+        raise PlanError(f"area: the datum needs {missing}, too; or leave out {given.pop()}")
+    if given or not raw.geographic:
+        datum = Datum(settings.latitude_deg, settings.longitude_deg)
+    else:
+        datum = middle(raw)
+        local = [name for name in _LOCAL_SETTINGS if getattr(settings, name)]
+        if local:
+            warn(
+                f"area: {' and '.join(local)} count{'s' if len(local) == 1 else ''} from the "
+                f"middle of {raw.origin}, {datum.latitude_deg:.6f}, {datum.longitude_deg:.6f}: set "
+                "latitude_deg and longitude_deg to make that sure"
+            )
+    return LocalFrame(
+        datum=datum,
+        seafloor_depth_m=settings.seafloor_depth_m,
+        datum_is_given=bool(given) or not raw.geographic,
+    )
+
+
+def _polygons(raw: RawShapes, frame: LocalFrame, corridor_width_m: float) -> Mended:
+    """The polygons of a source and the corridors along its lines."""
+    if raw.is_empty or not (raw.polygons or raw.lines):
+        raise PlanError(
+            f"area: {raw.origin}: it holds {_counted(raw)}; an area needs a polygon or a line"
+        )
+    local = frame.localised(raw)
+    shape = mended(local, frame, geographic=raw.geographic)
+    if len(raw.points):
+        warn(f"area: {raw.origin}: {_counted(replace(raw, polygons=(), lines=()))} left out")
+    if not raw.lines:
+        return shape
+    strips = [
+        corridor(line.points, line.width_m or corridor_width_m, local.origin, local.line_name(i))
+        for i, line in enumerate(local.lines)
+    ]
+    if raw.polygons:
+        warn(
+            f"area: {raw.origin}: it holds {_counted(raw)}: lines become corridors "
+            f"{corridor_width_m:g} m wide beside the polygons"
+        )
+    solid = _union([shape.solid, *(multipolygon(strip) for strip in strips)])
+    return Mended(solid=solid, holes=_less(shape.holes, solid))
+
+
+def _zone(raw: RawShapes, frame: LocalFrame, clearance_m: float) -> MultiPolygon:
+    """Where not to be: polygons, lines and points with the clearance around them."""
+    local = frame.localised(raw)
+    marks: list[BaseGeometry] = [LineString(line.points) for line in local.lines]
+    marks += [Point(*point) for point in local.points.tolist()]
+    if marks and clearance_m == 0.0:
+        raise PlanError(
+            f"area: {raw.origin}: it holds {_counted(raw)}: set no_go_clearance_m, how far to keep "
+            "from lines and points"
+        )
+    shape = mended(local, frame, geographic=raw.geographic, overlaps=False)
+    around = [multipolygon(mark.buffer(clearance_m)) for mark in marks]
+    return _union([widened(shape.solid, clearance_m), *around])
+
+
+def _union(shapes: Sequence[MultiPolygon]) -> MultiPolygon:
+    """All of several shapes; a single one stays as it is, corner by corner."""
+    filled = [shape for shape in shapes if not shape.is_empty]
+    if len(filled) <= 1:
+        return filled[0] if filled else MultiPolygon()
+    return multipolygon(shapely.union_all(filled))
+
+
+def _less(shape: MultiPolygon, taken: MultiPolygon) -> MultiPolygon:
+    """A shape without another; it stays as it is, corner by corner, where they do not meet."""
+    if taken.is_empty or not shape.intersects(taken):
+        return shape
+    return without_slivers(multipolygon(shape.difference(taken)))
+
+
+def _counted(raw: RawShapes) -> str:
+    counts = {"polygon": len(raw.polygons), "line": len(raw.lines), "point": len(raw.points)}
+    told = [f"{n} {what}{'s' if n > 1 else ''}" for what, n in counts.items() if n]
+    return " and ".join(told) or "nothing"
+
+
+def _check_reach(area: Area, raw: RawShapes, frame: LocalFrame, *, given: str | None) -> None:
+    """Warn of parts of the survey area outside of the allowed one, and of parts out of reach.
+
+    Raises:
+        PlanError: the two areas have nothing in common.
+    """
+    outside = multipolygon(area.survey.difference(area.allowed))
+    share = outside.area / area.survey.area
+    if share > 1.0 - _SMALL_SHARE:
+        raise PlanError(
+            f"area: {given}: the vehicle may be nowhere in the area to survey, "
+            f"{area.survey.distance(area.allowed):.4g} m from it: check both"
+        )
+    if share > _SMALL_SHARE:
+        largest = max(outside.geoms, key=lambda part: part.area).representative_point()
+        place = frame.place((largest.x, largest.y), geographic=raw.geographic)
+        warn(
+            f"area: {share:.2%} of the area to survey lie outside of {given}, most of it near "
+            f"{place}: only what is seen from inside is covered there"
+        )
+    parts = [part for part in area.allowed.geoms if part.intersects(area.survey)]
+    if len(parts) > 1:
+        gap_m = _widest_gap_m(parts)
+        advice = (
+            f"join them in {given}"
+            if given is not None
+            else f"a turn_margin_m that is {gap_m / 2:.3g} m larger joins them where no zone to "
+            "keep out of lies between, or set an allowed shape"
+        )
+        warn(
+            f"area: the vehicle may be in {len(parts)} parts up to {gap_m:.3g} m apart and cannot "
+            f"pass between them: {advice}"
+        )
+
+
+def _widest_gap_m(parts: Sequence[BaseGeometry]) -> float:
+    """The widest of the gaps to bridge to make all parts one.
+
+    That is the longest edge of their minimum spanning tree (Prim's algorithm).
+    """
+    nearest = np.full(len(parts), math.inf)
+    nearest[0] = 0.0
+    waiting = list(range(len(parts)))
+    widest = 0.0
+    while waiting:
+        i = min(waiting, key=lambda k: nearest[k])
+        waiting.remove(i)
+        widest = max(widest, float(nearest[i]))
+        for k in waiting:
+            nearest[k] = min(nearest[k], parts[i].distance(parts[k]))
+    return widest
+
+
+def corridor(points: Array, width_m: float, origin: str, name: str) -> BaseGeometry:
+    """The strip along a line.
+
+    Raises:
+        PlanError: the line has no length.
+    """
+    apart = distinct(points, closed=False)
+    if len(apart) < 2:
+        raise PlanError(f"area: {origin}: {name}: {len(apart)} distinct points; it needs 2 or more")
+    return buffered_line(apart, width_m)
