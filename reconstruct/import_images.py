@@ -15,7 +15,7 @@ from alice_survey.executor import parallel_map, progress
 from alice_survey.frames import Array
 from alice_survey.manifest import ImageRecord, write_manifest
 from camera_calib.rig import Rig, read_rig, write_rig
-from reconstruct.navigation import (
+from missions.logs.navigation_csv import (
     OPTIONAL,
     POSITION,
     NavigationLog,

@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from alice_survey.errors import NavigationError
 from alice_survey.vehicle.log import read_vehicle_log
 from missions.logs.import_log import ImportOptions, import_log
-from reconstruct.navigation import read_navigation
+from missions.logs.navigation_csv import read_navigation
 from tests.missions.logs.log_files import dataflash_log, dataflash_message, dataflash_text, tlog
 
 # Week 2312 of GPS began on Sunday 28 April 2024; 302418 s into it are 1 May 12:00:18 by GPS, whose

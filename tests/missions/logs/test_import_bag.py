@@ -14,8 +14,8 @@ from alice_survey.frames import Datum, attitude_from_rotation, rotation_from_att
 from alice_survey.vehicle.log import read_vehicle_log
 from missions.logs.bag import write_bag
 from missions.logs.import_log import ImportOptions, import_log
+from missions.logs.navigation_csv import read_navigation
 from missions.logs.ros_frames import flipped_quaternion, flipped_world
-from reconstruct.navigation import read_navigation
 from tests.missions.logs.log_files import Bag
 from tests.missions.logs.test_bag import flight
 
