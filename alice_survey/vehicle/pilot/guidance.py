@@ -34,6 +34,14 @@ from alice_survey.vehicle.pilot.safety import (
     watch,
 )
 from alice_survey.vehicle.pilot.settings import Guidance
+from alice_survey.vehicle.pilot.standing import (
+    brake,
+    leave_stop,
+    must_brake,
+    stand,
+    stands,
+    start_standing,
+)
 from alice_survey.vehicle.pilot.steering import (
     DEPTH_KEPT_M,
     HEADING_KEPT_RAD,
@@ -151,6 +159,11 @@ def _target_m(path: Path, guidance: Guidance, pilot: PilotState) -> float:
 def _goal(path: Path, guidance: Guidance, pilot: PilotState) -> tuple[float, float, float]:
     """North, east and heading where the way in to the path begins."""
     leg, along = int(pilot.report[told.LEG]), pilot.report[told.ALONG]
+    if stands(path, leg):
+        # Here the vehicle goes to the place itself, with the heading it has there.
+        turned = math.copysign(pilot.memory[told.REF], path.turn_rad[leg])
+        n, e, heading, _ = place_at(path, leg, along)
+        return n, e, heading + (turned if path.turn_rad[leg] != 0.0 else path.side_rad[leg])
     n, e, heading, _ = place_at(path, leg, along)
     back = guidance.way_in_m
     return n - back * math.cos(heading), e - back * math.sin(heading), heading
@@ -166,7 +179,12 @@ def _progress_m(estimate: Array, path: Path, guidance: Guidance, pilot: PilotSta
         n, e, _ = _goal(path, guidance, pilot)
         point = pilot.point
         return float(-math.hypot(n - point[told.POINT_NORTH], e - point[told.POINT_EAST]))
-    return float(path.begins_m[int(pilot.report[told.LEG])] + pilot.report[told.ALONG])
+    leg = int(pilot.report[told.LEG])
+    progress = path.begins_m[leg] + pilot.report[told.ALONG]
+    if path.turn_rad[leg] != 0.0:
+        # A radian of a turn on the spot counts as a metre.
+        progress += pilot.memory[told.REF]
+    return float(progress)
 
 
 @kernel
@@ -198,7 +216,9 @@ def _on_the_way(
     if phase == DIVE and memory[told.SETTLED_S] > _SETTLE_S:
         _enter(pilot, APPROACH)
     elif phase == APPROACH and memory[told.SETTLED_S] > (_SETTLE_S if guidance.sway > 0.0 else 0.0):
-        report[told.ALONG] -= guidance.way_in_m
+        memory[told.STANDING] = 0.0
+        if not stands(path, int(report[told.LEG])):
+            report[told.ALONG] -= guidance.way_in_m
         _enter(pilot, FOLLOW)
 
 
@@ -208,17 +228,27 @@ def _on_path(
 ) -> None:
     """Follow the path for a tick."""
     memory, report, point = pilot.memory, pilot.report, pilot.point
-    leg, along, over = advance(
-        path,
-        int(report[told.LEG]),
-        report[told.ALONG],
-        point[told.POINT_NORTH],
-        point[told.POINT_EAST],
-        _QUICKEST * path.speed_mps * dt_s,
-    )
+    leg, along, over = int(report[told.LEG]), report[told.ALONG], False
+    if memory[told.STANDING] == 0.0 and stands(path, leg):
+        start_standing(memory[told.REF], 0.0, pilot)
+    elif memory[told.STANDING] == 0.0:
+        leg, along, over = advance(
+            path,
+            leg,
+            along,
+            point[told.POINT_NORTH],
+            point[told.POINT_EAST],
+            _QUICKEST * path.speed_mps * dt_s,
+        )
+        if must_brake(path, guidance, pilot, leg, along):
+            speed = max(point[told.SURGE_SPEED], 0.0)
+            brake(speed, along, estimate[signals.HEADING], gains, pilot)
     target = mind_floor(_target_m(path, guidance, pilot), estimate, guidance.limits, pilot)
     sink_to(target, memory[told.FLOOR_SLOPE], estimate, dt_s, gains, pilot)
-    follow(leg, along, dt_s, estimate, path, guidance, gains, pilot)
+    if memory[told.STANDING] == 0.0:
+        follow(leg, along, dt_s, estimate, path, guidance, gains, pilot)
+    elif stand(leg, dt_s, estimate, path, guidance, gains, pilot):
+        over = leave_stop(path, estimate[signals.HEADING], pilot)
     if over:
         _enter(pilot, ASCEND)
     elif abs(report[told.CROSS]) > guidance.lost_m:

@@ -36,6 +36,14 @@ LOS_DAMPING_RATIO = 0.5
 """Least of the path loop of `los` (inferred: one overshoot of a sixth)."""
 _STRAIGHT_PER_M = 1e-9
 _LOOK_AHEADS_M = np.geomspace(HULL_LENGTH_M, 100.0, 400)
+SPOT_RAD_S = math.radians(15.0)
+"""Rate of a turn on the spot: half of the fastest that gains.py lets a vehicle ask for (inferred).
+"""
+STEP_MPS = 0.15
+"""Speed of a sway step (inferred: what ALICE swayed at in the paper's turns, section VI)."""
+_RAMP_PERIODS = 2.0
+"""A reference gains its speed in so many times 1 / bandwidth of the loop that follows it: a
+critically damped pair has then done most of what it does (inferred)."""
 SWAY_LOOK_AHEAD_M = 2.5 * HULL_LENGTH_M
 """Of `sway`, which goes by it only when far off its path, where none is damped well: the longest
 that Fossen (2011, section 10.3.2) gives."""
@@ -68,6 +76,16 @@ class Guidance(NamedTuple):
     """Bandwidth at which the altitude follows the terrain."""
     surface_m: float
     """Depth of the origin at which the vehicle is at the surface."""
+    stop_mps2: float
+    """Deceleration into a stop."""
+    spot_rad_s: float
+    """Rate of a turn on the spot."""
+    spot_rad_s2: float
+    """How fast that rate is gained and lost."""
+    step_mps: float
+    """Speed of a sway step."""
+    step_mps2: float
+    """How fast that speed is gained and lost."""
     limits: Limits
 
 
@@ -80,6 +98,8 @@ def pilot_guidance(
     point_body_m: tuple[float, float, float] = LEFT_PORT_BODY_M,
     look_ahead_m: float | None = None,
     terrain_smoothing_m: float = 1.5,
+    spot_rad_s: float = SPOT_RAD_S,
+    step_mps: float = STEP_MPS,
     limits: Limits | None = None,
 ) -> Guidance:
     """Settings for a vehicle and a path.
@@ -96,11 +116,13 @@ def pilot_guidance(
         look_ahead_m: when heading for the path; `shortest_look_ahead_m` when left out, and for
             `sway`, where there is none, SWAY_LOOK_AHEAD_M.
         terrain_smoothing_m: relief shorter than this is not followed.
+        spot_rad_s: greatest rate of turns on the spot; a vehicle that can do less turns slower.
+        step_mps: greatest speed of sway steps, likewise.
         limits: for safety; half the path's altitude is the least when left out.
 
     Raises:
-        VehicleError: the vehicle has no thrusters for sway, a value is out of range, or no
-            look-ahead will do for `los`.
+        VehicleError: the vehicle has no thrusters for sway, or `los` is to fly sway steps; a value
+            is out of range; or no look-ahead will do for `los`.
     """
     axes, speed = gains.axes, path.speed_mps
     by_sway = controller == "sway"
@@ -108,17 +130,29 @@ def pilot_guidance(
         raise VehicleError(
             "the vehicle has no lateral thrusters: fly it with the controller los, not sway"
         )
+    steps = int(np.count_nonzero(path.side_rad))
+    if steps and not by_sway:
+        raise VehicleError(
+            f"the route has {steps} sway steps, which the controller los cannot fly: plan with "
+            "turns = 'spot' or 'arcs', or fly alice with the controller sway"
+        )
     if look_ahead_m is None:
         found = damped_look_ahead_m(gains, speed, point_body_m[0])
         if found is None and by_sway:
             found = SWAY_LOOK_AHEAD_M
         look_ahead_m = found or shortest_look_ahead_m(gains, speed, point_body_m[0])
-    for name, value in (("look-ahead", look_ahead_m), ("terrain smoothing", terrain_smoothing_m)):
+    for name, value, unit in (
+        ("look-ahead", look_ahead_m, "m"),
+        ("terrain smoothing", terrain_smoothing_m, "m"),
+        ("rate of turns on the spot", spot_rad_s, "rad/s"),
+        ("speed of sway steps", step_mps, "m/s"),
+    ):
         if not 0.0 < value < math.inf:
-            raise VehicleError(f"the {name} is {value:g} m: it must be positive")
+            raise VehicleError(f"the {name} is {value:g} {unit}: it must be positive")
     weakest = min(-axes[SURGE, LEAST], axes[SURGE, MOST])
     tightest = float(np.abs(path.curvature_per_m).max())
     turning = turning_speed_mps(gains, tightest, abs(point_body_m[0]) if by_sway else 0.0)
+    spot_rad_s, step_mps = stop_speeds(gains, point_body_m[0], by_sway, spot_rad_s, step_mps)
     return Guidance(
         sway=float(by_sway),
         point_body_m=np.array(point_body_m, np.float64),
@@ -132,8 +166,43 @@ def pilot_guidance(
         brake_mps2=STEADY_SHARE * weakest / float(axes[SURGE, MASS]),
         floor_rate_rad_s=2.0 * speed / terrain_smoothing_m,
         surface_m=0.3,
+        stop_mps2=speed * float(axes[SURGE, BANDWIDTH]) / _RAMP_PERIODS,
+        spot_rad_s=spot_rad_s,
+        spot_rad_s2=spot_rad_s * float(axes[YAW, BANDWIDTH]) / _RAMP_PERIODS,
+        step_mps=step_mps,
+        step_mps2=step_mps * float(axes[SWAY, BANDWIDTH]) / _RAMP_PERIODS,
         limits=limits or Limits(0.5 * path.altitude_m, most_depth_m),
     )
+
+
+def stop_speeds(
+    gains: Gains,
+    lever_m: float,
+    by_sway: bool,
+    spot_rad_s: float = SPOT_RAD_S,
+    step_mps: float = STEP_MPS,
+) -> tuple[float, float]:
+    """Rate of turns on the spot and speed of sway steps that a vehicle can do.
+
+    While it turns about the followed point, the origin sways at the rate times the lever.
+
+    Args:
+        gains: of the vehicle.
+        lever_m: how far the followed point is ahead of the origin.
+        by_sway: whether sway is controlled.
+        spot_rad_s: rate that is wanted.
+        step_mps: speed that is wanted.
+
+    Returns:
+        Both no greater than wanted; the speed is 0 without sway.
+    """
+    rate = min(spot_rad_s, float(gains.axes[YAW, FASTEST]))
+    if not by_sway:
+        return rate, 0.0
+    fastest = float(gains.axes[SWAY, FASTEST])
+    if lever_m != 0.0:
+        rate = min(rate, fastest / abs(lever_m))
+    return rate, min(step_mps, fastest)
 
 
 @kernel

@@ -325,7 +325,9 @@ def _wanted_speed(
     distance = path.length_m[leg] - along_m - guidance.smooth_m
     reach = path.speed_mps * path.speed_mps / (2.0 * guidance.brake_mps2)
     following = leg + 1
-    while following < path.length_m.shape[0] and distance < reach:
+    while (
+        following < path.length_m.shape[0] and distance < reach and path.stop[following - 1] == 0.0
+    ):
         there = turning_speed_mps(gains, abs(path.curvature_per_m[following]), lever)
         braking = 2.0 * guidance.brake_mps2 * max(distance, 0.0)
         speed = min(speed, math.sqrt(there * there + braking))

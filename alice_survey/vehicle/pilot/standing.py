@@ -1,0 +1,303 @@
+"""Stops: coming to rest at a corner, turning on the spot, and stepping aside.
+
+The vehicle follows a reference that is always feasible: a place that moves along the leg, or a
+heading that turns, at a bounded speed and a bounded acceleration, which are fed forward. The place
+is held by surge and sway, the heading by yaw (PIDs on place, control.py). A vehicle without sway
+holds only the part of the place that is along its heading, and drifts with the current across it.
+The reference waits for a vehicle that falls behind.
+"""
+
+import math
+from typing import NamedTuple
+
+from alice_survey.frames import Array
+from alice_survey.vehicle import signals
+from alice_survey.vehicle.compiled import kernel
+from alice_survey.vehicle.pilot import memory as told
+from alice_survey.vehicle.pilot.control import (
+    clamped,
+    place_demand,
+    place_sum_step,
+    sum_bound,
+)
+from alice_survey.vehicle.pilot.gains import SURGE, WEIGHT, Gains
+from alice_survey.vehicle.pilot.memory import PilotState
+from alice_survey.vehicle.pilot.path import Path, place_at
+from alice_survey.vehicle.pilot.safety import restart_watch
+from alice_survey.vehicle.pilot.settings import Guidance
+from alice_survey.vehicle.pilot.steering import head_for, sway_by
+from alice_survey.vehicle.rotations import wrapped
+
+STOP_M = 0.1
+"""A stop is left when the place is kept this well (without sway: along the heading) ..."""
+STOP_RAD = math.radians(3.0)
+"""... its heading this well ..."""
+STOP_MPS = 0.05
+STOP_RAD_S = math.radians(2.0)
+"""... and at these speeds (all inferred: as well as lines are kept)."""
+_WIDEN_S = 5.0
+"""The tolerances grow by their own size in this time: swell and gusts are not waited for."""
+_BEHIND_M = 0.3
+_BEHIND_RAD = math.radians(20.0)
+"""Farther behind than this the reference slows down, and waits at twice of it."""
+_TINY = 1e-12
+
+
+@kernel
+def stands(path: Path, leg: int) -> bool:
+    """Whether a leg is a turn on the spot or a sway step."""
+    return bool(path.turn_rad[leg] != 0.0 or path.side_rad[leg] != 0.0)
+
+
+@kernel
+def must_brake(path: Path, guidance: Guidance, pilot: PilotState, leg: int, along_m: float) -> bool:
+    """Whether a vehicle that goes ahead has to begin to brake for the stop at its leg's end."""
+    if path.stop[leg] == 0.0:
+        return False
+    speed = max(pilot.point[told.SURGE_SPEED], 0.0)
+    return bool(path.length_m[leg] - along_m <= speed * speed / (2.0 * guidance.stop_mps2))
+
+
+@kernel
+def brake(
+    speed_mps: float, along_m: float, heading_rad: float, gains: Gains, pilot: PilotState
+) -> None:
+    """Begin to brake: the reference starts where the vehicle is, as fast as it is.
+
+    The integral of the speed loop holds the share of the speed that its proportional part does not
+    see (gains.py), and what the current takes; only this is wanted of the place's.
+    """
+    memory = pilot.memory
+    held = memory[told.SURGE_SUM] - (1.0 - gains.axes[SURGE, WEIGHT]) * speed_mps
+    memory[told.PLACE_SUM_N] = held * math.cos(heading_rad)
+    memory[told.PLACE_SUM_E] = held * math.sin(heading_rad)
+    start_standing(along_m, speed_mps, pilot)
+
+
+@kernel
+def start_standing(at: float, speed: float, pilot: PilotState) -> None:
+    """Let a reference begin at a place or heading, at a speed."""
+    memory = pilot.memory
+    memory[told.STANDING], memory[told.WAITED_S] = 1.0, 0.0
+    memory[told.REF], memory[told.REF_SPEED] = at, speed
+
+
+@kernel
+def ramp(
+    at: float, speed: float, goal: float, most: float, acceleration: float, dt_s: float
+) -> tuple[float, float, float]:
+    """Move a reference towards its goal for a tick, so that it can still stop there.
+
+    Args:
+        at: where it is, at or before the goal.
+        speed: how fast it goes, not negative.
+        goal: where it shall stop.
+        most: greatest speed.
+        acceleration: greatest, either way.
+        dt_s: the tick.
+
+    Returns:
+        Place and speed after the tick, and the acceleration, which is bounded too.
+    """
+    left = goal - at
+    # Braking from here with the greatest acceleration takes all that is left.
+    stopping = math.sqrt(2.0 * acceleration * max(left, 0.0))
+    # Down no faster than it may, but for the law of stopping, which decides.
+    wanted = max(min(speed + acceleration * dt_s, most), speed - acceleration * dt_s)
+    wanted = min(wanted, stopping)
+    step = wanted * dt_s
+    if step >= left - _TINY:
+        return goal, 0.0, clamped(-speed / dt_s, acceleration)
+    return at + step, wanted, clamped((wanted - speed) / dt_s, acceleration)
+
+
+class Reference(NamedTuple):
+    """Where the followed point and the heading shall be in a tick, and how they move."""
+
+    north_m: float
+    east_m: float
+    course_rad: float
+    """The place moves on this course."""
+    speed_mps: float
+    quicken_mps2: float
+    heading_rad: float
+    turn_rad_s: float
+    quicken_rad_s2: float
+    along_m: float
+    """From the leg's start."""
+    over: bool
+    """Whether it is at the leg's end."""
+
+
+@kernel
+def _turning(
+    leg: int, dt_s: float, estimate: Array, path: Path, guidance: Guidance, pilot: PilotState
+) -> Reference:
+    """Move the heading of a turn on the spot on by a tick."""
+    memory, sense = pilot.memory, math.copysign(1.0, path.turn_rad[leg])
+    n, e, start, _ = place_at(path, leg, 0.0)
+    behind = abs(wrapped(start + sense * memory[told.REF] - estimate[signals.HEADING]))
+    most = guidance.spot_rad_s * _patience(behind / _BEHIND_RAD)
+    goal = abs(path.turn_rad[leg])
+    turned, rate, quicken = ramp(
+        memory[told.REF], memory[told.REF_SPEED], goal, most, guidance.spot_rad_s2, dt_s
+    )
+    memory[told.REF], memory[told.REF_SPEED] = turned, rate
+    heading = start + sense * turned
+    return Reference(
+        n, e, heading, 0.0, 0.0, heading, sense * rate, sense * quicken, 0.0, turned >= goal
+    )
+
+
+@kernel
+def _moving(leg: int, dt_s: float, path: Path, guidance: Guidance, pilot: PilotState) -> Reference:
+    """Move the place on by a tick, ahead into a stop or aside."""
+    memory, point, side = pilot.memory, pilot.point, path.side_rad[leg]
+    n, e, course, _ = place_at(path, leg, memory[told.REF])
+    dn, de = n - point[told.POINT_NORTH], e - point[told.POINT_EAST]
+    behind = math.cos(course) * dn + math.sin(course) * de
+    most = path.speed_mps if side == 0.0 else guidance.step_mps
+    most *= memory[told.PACE] * _patience(behind / _BEHIND_M)
+    acceleration = guidance.stop_mps2 if side == 0.0 else guidance.step_mps2
+    goal = path.length_m[leg]
+    along, speed, quicken = ramp(
+        memory[told.REF], memory[told.REF_SPEED], goal, most, acceleration, dt_s
+    )
+    memory[told.REF], memory[told.REF_SPEED] = along, speed
+    n, e, course, curvature = place_at(path, leg, along)
+    turning = curvature * speed
+    return Reference(
+        n, e, course, speed, quicken, course + side, turning, 0.0, along, along >= goal
+    )
+
+
+@kernel
+def _patience(behind: float) -> float:
+    """Share of a reference's speed: 1 while the vehicle is near, 0 from twice that on."""
+    return min(max(2.0 - behind, 0.0), 1.0)
+
+
+@kernel
+def stand(
+    leg: int,
+    dt_s: float,
+    estimate: Array,
+    path: Path,
+    guidance: Guidance,
+    gains: Gains,
+    pilot: PilotState,
+) -> bool:
+    """Brake, turn on the spot or step aside for a tick.
+
+    Args:
+        leg: that is flown.
+        dt_s: the tick.
+        estimate: (14,) of the navigation.
+        path: legs.
+        guidance: settings.
+        gains: of the inner loops.
+        pilot: is written.
+
+    Returns:
+        Whether the stop is over: the reference is at its end and the vehicle with it, at rest.
+    """
+    memory, report, point = pilot.memory, pilot.report, pilot.point
+    if path.turn_rad[leg] != 0.0:
+        wanted = _turning(leg, dt_s, estimate, path, guidance, pilot)
+    else:
+        wanted = _moving(leg, dt_s, path, guidance, pilot)
+    error = head_for(
+        wanted.heading_rad, wanted.turn_rad_s, wanted.quicken_rad_s2, estimate, dt_s, gains, pilot
+    )
+    ahead, beside = _keep_place(wanted, dt_s, estimate, path, guidance, gains, pilot)
+
+    by_sway = guidance.sway > 0.0
+    report[told.BY_SWAY] = 1.0 if by_sway else 0.0
+    report[told.LEG], report[told.ALONG], report[told.LINE] = leg, wanted.along_m, path.line[leg]
+    report[told.PATH_HEADING] = wanted.course_rad
+    dn, de = point[told.POINT_NORTH] - wanted.north_m, point[told.POINT_EAST] - wanted.east_m
+    report[told.CROSS] = de * math.cos(wanted.course_rad) - dn * math.sin(wanted.course_rad)
+    if not wanted.over:
+        return False
+    memory[told.WAITED_S] += dt_s
+    wide = 1.0 + memory[told.WAITED_S] / _WIDEN_S
+    off, moves = abs(ahead), abs(point[told.SURGE_SPEED])
+    if by_sway:
+        off, moves = math.hypot(ahead, beside), math.hypot(moves, point[told.SWAY_SPEED])
+    return bool(
+        off < STOP_M * wide
+        and moves < STOP_MPS * wide
+        and abs(error) < STOP_RAD * wide
+        and abs(point[told.TURN_SPEED]) < STOP_RAD_S * wide
+    )
+
+
+@kernel
+def _keep_place(
+    wanted: Reference,
+    dt_s: float,
+    estimate: Array,
+    path: Path,
+    guidance: Guidance,
+    gains: Gains,
+    pilot: PilotState,
+) -> tuple[float, float]:
+    """Ask for the surge and sway that keep the followed point at the place of a reference.
+
+    The integral of surge is kept as a vector in NED, as that of sway is (steering.py).
+
+    Returns:
+        How far the place is ahead and to starboard of the followed point.
+    """
+    memory, demand, now = pilot.memory, pilot.demand, estimate[signals.HEADING]
+    s, c = math.sin(now), math.cos(now)
+    dn = wanted.north_m - pilot.point[told.POINT_NORTH]
+    de = wanted.east_m - pilot.point[told.POINT_EAST]
+    ahead, beside = c * dn + s * de, c * de - s * dn
+    cosine, sine = math.cos(wanted.course_rad - now), math.sin(wanted.course_rad - now)
+    pulled, lever = memory[told.PACE] * ahead, guidance.point_body_m[1]
+    total = c * memory[told.PLACE_SUM_N] + s * memory[told.PLACE_SUM_E]
+    steady, accelerate = place_demand(
+        gains,
+        SURGE,
+        pulled,
+        pilot.point[told.SURGE_SPEED],
+        wanted.speed_mps * cosine,
+        total,
+        path.speed_mps,
+    )
+    demand[told.REF_SURGE] = steady + lever * demand[told.REF_YAW]
+    demand[told.ACC_SURGE] = (
+        accelerate + wanted.quicken_mps2 * cosine + lever * demand[told.ACC_YAW]
+    )
+    pilot.report[told.WANTED_SURGE] = steady
+    near = clamped(pulled, STOP_M)
+    step = place_sum_step(gains, SURGE, near, demand[told.FULL_SURGE], dt_s)
+    north, east = memory[told.PLACE_SUM_N] + c * step, memory[told.PLACE_SUM_E] + s * step
+    cut = min(1.0, sum_bound(gains, SURGE) / max(math.hypot(north, east), 1e-9))
+    memory[told.PLACE_SUM_N], memory[told.PLACE_SUM_E] = cut * north, cut * east
+    if guidance.sway > 0.0:
+        sway_by(-beside, wanted.speed_mps * sine, estimate, dt_s, guidance, gains, pilot)
+        demand[told.ACC_SWAY] += wanted.quicken_mps2 * sine
+    return ahead, beside
+
+
+@kernel
+def leave_stop(path: Path, heading_rad: float, pilot: PilotState) -> bool:
+    """Go on to the next leg.
+
+    Returns:
+        Whether there is none: the path is over.
+    """
+    memory, report = pilot.memory, pilot.report
+    following = int(report[told.LEG]) + 1
+    if following == path.length_m.shape[0]:
+        return True
+    report[told.LEG], report[told.ALONG] = following, 0.0
+    start_standing(0.0, 0.0, pilot)
+    if not stands(path, following):
+        memory[told.STANDING] = 0.0
+        north, east = memory[told.PLACE_SUM_N], memory[told.PLACE_SUM_E]
+        memory[told.SURGE_SUM] = north * math.cos(heading_rad) + east * math.sin(heading_rad)
+    restart_watch(pilot)
+    return False
