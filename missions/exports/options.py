@@ -1,0 +1,46 @@
+"""What a vehicle needs said beside the plan."""
+
+from dataclasses import dataclass
+
+from alice_survey.config import CameraConfig
+from alice_survey.errors import PlanError
+from camera_calib.rig import Rig
+from missions.footprint import common_swath
+from missions.plan_file import Plan
+
+_LEAST_TOLERANCE_M = 0.12
+"""The cross-track error that the paper's vehicle holds with its improved controller: a vehicle told
+to pass a place more closely turns back for it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """What a vehicle needs said beside the plan."""
+
+    altimeter_body_m: tuple[float, float, float] = CameraConfig().dvl_position_body_m
+    """The sensor whose altitude the vehicle holds, from its reference point."""
+    pixel_um: float = CameraConfig().pixel_um
+    """Of the sensor; QGroundControl wants its size."""
+    camera_on: str = "camera_trigger/enable"
+    """COLA2: the service (without arguments) that starts pictures."""
+    camera_off: str = "camera_trigger/disable"
+    least_tolerance_m: float = _LEAST_TOLERANCE_M
+
+    def __post_init__(self) -> None:
+        if self.least_tolerance_m <= 0 or self.pixel_um <= 0:
+            raise PlanError("a tolerance and a pixel are larger than 0")
+        if not self.camera_on or not self.camera_off:
+            raise PlanError("name the services that switch pictures on and off")
+
+
+def line_tolerance_m(plan: Plan, rig: Rig, options: Options) -> float:
+    """How far off a line's ends the vehicle may be and the survey still holds.
+
+    Half a step along the line, so that its last picture is taken; across it, half of what
+    neighbouring stereo swaths see more often than the plan wants, so that two lines that err apart
+    leave no gap. Not less than what a vehicle can hold.
+    """
+    stereo = common_swath(rig, plan.altitude_m, plan.station_spacing_m)
+    passes = max(1, int(2 * stereo.half_across_m / plan.line_spacing_m + 1e-9))
+    spare_m = (2 * stereo.half_across_m - passes * plan.line_spacing_m) / 2
+    return max(options.least_tolerance_m, min(plan.station_spacing_m / 2, spare_m))

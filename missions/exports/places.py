@@ -1,0 +1,57 @@
+"""Places of a plan on the ellipsoid."""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import shapely
+from shapely.geometry import MultiPolygon, Polygon
+
+from alice_survey.frames import Array, Datum
+from missions.route.legs import Leg, Route
+
+_ARC_M = 0.02
+"""How far a drawn route may lie off the true one in an arc."""
+
+
+def lat_lon(datum: Datum, points_ne: Array, depth_m: float) -> Array:
+    """Latitudes and longitudes, (N, 2) degrees, of places (N, 2) north and east at one depth."""
+    points_ned = np.column_stack([points_ne, np.full(len(points_ne), depth_m)])
+    return datum.geodetic_from_ned(points_ned)[:, :2]
+
+
+def rings_ne(polygon: Polygon) -> Iterator[Array]:
+    """Outer ring and holes of a polygon, each (N, 2) without the closing corner."""
+    for ring in (polygon.exterior, *polygon.interiors):
+        corners: Array = np.asarray(ring.coords, dtype=np.float64)[:-1, :2]
+        yield corners
+
+
+def polygons(geometry: MultiPolygon) -> list[Polygon]:
+    """The parts, in order."""
+    return list(geometry.geoms)
+
+
+def grown(geometry: MultiPolygon, by_m: float) -> list[Polygon]:
+    """The parts of a geometry grown by a distance, sharp corners kept; shrunk where negative."""
+    parts: list[Polygon] = [
+        part
+        for part in shapely.get_parts(geometry.buffer(by_m, join_style="mitre")).tolist()
+        if part.geom_type == "Polygon" and part.area > 0
+    ]
+    return parts
+
+
+def route_ne(route: Route) -> Array:
+    """Corners of a route, (N, 2); arcs as chords within 2 cm."""
+    rows = [np.array([route.legs[0].start_ne_m])]
+    rows += [leg.places(np.linspace(0.0, leg.length_m, _chords(leg) + 1)[1:])
+             for leg in route.legs if leg.length_m > 0]  # fmt: skip
+    return np.vstack(rows)
+
+
+def _chords(leg: Leg) -> int:
+    if not leg.curvature_per_m:
+        return 1
+    widest_rad = 2 * math.acos(max(0.0, 1.0 - _ARC_M * abs(leg.curvature_per_m)))
+    return max(1, math.ceil(leg.length_m * abs(leg.curvature_per_m) / widest_rad - 1e-9))

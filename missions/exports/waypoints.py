@@ -1,0 +1,300 @@
+"""A dive as way-points: what every format of a mission is written from."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from alice_survey.errors import PlanError
+from alice_survey.frames import Array
+from missions.exports.mount import Mount
+from missions.plan_file import Dive, Plan
+from missions.route.costs import time_costs
+from missions.route.legs import Leg
+
+Kind = Literal["descend", "way", "run-in", "turn", "sway", "line", "surface"]
+"""How a way-point is reached. way: freely. run-in: straight, on the course of the line that
+begins there. turn: by a turn on the spot. sway: sideways. line: along a line. descend, surface:
+straight down and up."""
+
+DEPTH_STEP_M = 0.05
+"""A line's depth is given wherever straight lines between way-points would miss it by more."""
+_CHORD_M = 0.02
+"""How far the chords that stand for an arc may lie off it."""
+_STRAIGHT_RAD = 1e-6
+_TINY_M = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Waypoint:
+    """A place to go to, and what to do there."""
+
+    kind: Kind
+    line: int
+    """Index of the plan's line that ends, goes on or begins here, else -1."""
+    camera: Literal["on", "off"] | None
+    """What to switch pictures to on arrival."""
+    glass_ne_m: tuple[float, float]
+    vehicle_ne_m: tuple[float, float]
+    """Of the vehicle's reference point."""
+    latitude_deg: float
+    """Of the reference point, as `longitude_deg`."""
+    longitude_deg: float
+    glass_latitude_deg: float
+    glass_longitude_deg: float
+    heading_rad: float
+    """Of the vehicle on arrival, in [0, 2 pi)."""
+    depth_m: float
+    """Of the reference point, below the surface."""
+    altitude_m: float
+    """Of the altimeter above the sea floor."""
+    glass_depth_m: float
+    glass_altitude_m: float
+    speed_mps: float
+    hold_s: float
+    """How long to stay: to turn and to settle; 0 where it flies on."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Point:
+    kind: Kind
+    place_ne_m: tuple[float, float]
+    heading_rad: float
+    line: int = -1
+    glass_depth_m: float | None = None
+    hold_s: float = 0.0
+    camera: Literal["on", "off"] | None = None
+
+
+def waypoints(
+    plan: Plan, dive: Dive, mount: Mount, line_depths: Sequence[Array] | None = None
+) -> tuple[Waypoint, ...]:
+    """The way-points of a dive, from the surface to the surface.
+
+    Arcs become chords that lie within 2 cm of them. Between lines the depth is the lesser of those
+    of the lines' ends.
+
+    Args:
+        plan: whose dive it is.
+        dive: one of the plan's.
+        mount: of the camera on the vehicle.
+        line_depths: of each of the plan's lines the glass's depth at its stations, (stations,);
+            without it the plan's own, or its altitude over a level sea floor.
+
+    Raises:
+        PlanError: depths do not fit the lines.
+    """
+    depths = _depths(plan, line_depths)
+    if not dive.route.legs:
+        raise PlanError("a dive has no legs: plan again")
+    points = _switched(list(_points(plan, dive, depths)))
+    points = _with_depths(points, plan, depths)
+    glass_ne = np.array([point.place_ne_m for point in points])
+    headings = np.array([point.heading_rad for point in points])
+    vehicle_ne = mount.vehicle_ne(glass_ne, headings)
+    glass_depths = np.array([point.glass_depth_m for point in points], dtype=np.float64)
+    geodetic = plan.datum.geodetic_from_ned(np.column_stack([vehicle_ne, glass_depths]))
+    glass_geodetic = plan.datum.geodetic_from_ned(np.column_stack([glass_ne, glass_depths]))
+    result = []
+    for i, point in enumerate(points):
+        at_surface = point.kind == "surface"
+        result.append(
+            Waypoint(
+                kind=point.kind,
+                line=point.line,
+                camera=point.camera,
+                glass_ne_m=point.place_ne_m,
+                vehicle_ne_m=(float(vehicle_ne[i, 0]), float(vehicle_ne[i, 1])),
+                latitude_deg=float(geodetic[i, 0]),
+                longitude_deg=float(geodetic[i, 1]),
+                glass_latitude_deg=float(glass_geodetic[i, 0]),
+                glass_longitude_deg=float(glass_geodetic[i, 1]),
+                heading_rad=point.heading_rad % (2 * math.pi),
+                depth_m=0.0 if at_surface else mount.vehicle_depth_m(float(glass_depths[i])),
+                altitude_m=mount.altimeter_altitude_m(plan.altitude_m),
+                glass_depth_m=0.0 if at_surface else float(glass_depths[i]),
+                glass_altitude_m=plan.altitude_m,
+                speed_mps=plan.speed_mps,
+                hold_s=point.hold_s,
+            )
+        )
+    return tuple(result)
+
+
+def all_waypoints(
+    plan: Plan, mount: Mount, line_depths: Sequence[Array] | None = None
+) -> list[tuple[Waypoint, ...]]:
+    """The way-points of each dive."""
+    return [waypoints(plan, dive, mount, line_depths) for dive in plan.dives]
+
+
+def _points(plan: Plan, dive: Dive, line_depths: Sequence[Array] | None) -> Iterator[_Point]:
+    """Where each leg leads, in order."""
+    costs = time_costs(plan.speed_mps)  # the planner's own figures of turning and settling
+    legs = dive.route.legs
+    first = legs[0]
+    yield _Point(
+        kind="descend",
+        place_ne_m=first.start_ne_m,
+        heading_rad=first.heading_rad + first.side_rad,
+        line=-1,
+    )
+    for index, leg in enumerate(legs):
+        following = legs[index + 1] if index + 1 < len(legs) else None
+        heading = leg.end_heading_rad + leg.side_rad
+        if leg.length_m <= _TINY_M:
+            if leg.turn_rad:
+                hold_s = abs(leg.turn_rad) / costs.turn_rate_rad_s + costs.settle_s
+                yield _Point(
+                    kind="turn", place_ne_m=leg.start_ne_m, heading_rad=heading, hold_s=hold_s
+                )
+        elif leg.line >= 0:
+            depths = None if line_depths is None else line_depths[leg.line]
+            yield from _line_points(plan, leg, depths)
+        elif leg.side_rad:
+            yield _Point(
+                kind="sway",
+                place_ne_m=leg.end_ne_m,
+                heading_rad=heading,
+                hold_s=costs.settle_s,
+            )
+        elif leg.curvature_per_m:
+            yield from _arc_points(leg)
+        else:
+            kind: Kind = "run-in" if _leads_to_line(leg, following) else "way"
+            yield _Point(kind=kind, place_ne_m=leg.end_ne_m, heading_rad=heading)
+    last = legs[-1]
+    yield _Point(
+        kind="surface",
+        place_ne_m=last.end_ne_m,
+        heading_rad=last.end_heading_rad + last.side_rad,
+    )
+
+
+def _line_points(plan: Plan, leg: Leg, depths: Array | None) -> Iterator[_Point]:
+    """The end of a line, and places before it where its depth bends."""
+    line = plan.lines[leg.line]
+    if depths is None:
+        yield _Point(
+            kind="line", place_ne_m=leg.end_ne_m, heading_rad=leg.heading_rad, line=leg.line
+        )
+        return
+    along_m = np.linspace(0.0, line.length_m, line.stations)
+    for i in bends(along_m, depths, DEPTH_STEP_M)[1:]:
+        place = line.stations_ne[i]
+        yield _Point(
+            kind="line",
+            place_ne_m=(float(place[0]), float(place[1])),
+            heading_rad=leg.heading_rad,
+            line=leg.line,
+            glass_depth_m=float(depths[i]),
+        )
+
+
+def bends(along_m: Array, depths_m: Array, tolerance_m: float) -> list[int]:
+    """Fewest splits by halving at the worst place, so that straights miss no depth by more.
+
+    The method is D. H. Douglas and T. K. Peucker's (1973), with the vertical distance.
+
+    Args:
+        along_m: (N,) ascending.
+        depths_m: (N,) there.
+        tolerance_m: how far a straight between kept places may miss.
+
+    Returns:
+        Indices that are kept, ascending; the first and the last always.
+    """
+    keep = {0, len(along_m) - 1}
+    open_spans = [(0, len(along_m) - 1)]
+    while open_spans:
+        low, high = open_spans.pop()
+        if high - low < 2:
+            continue
+        span = slice(low, high + 1)
+        straight = np.interp(along_m[span], along_m[[low, high]], depths_m[[low, high]])
+        missed = np.abs(depths_m[span] - straight)
+        worst = int(np.argmax(missed))
+        if missed[worst] > tolerance_m:
+            keep.add(low + worst)
+            open_spans += [(low, low + worst), (low + worst, high)]
+    return sorted(keep)
+
+
+def _arc_points(leg: Leg) -> Iterator[_Point]:
+    """Ends of chords that lie within `_CHORD_M` of an arc."""
+    radius_m = 1.0 / abs(leg.curvature_per_m)
+    # The sagitta of a chord over an angle a is r (1 - cos(a / 2)).
+    widest_rad = 2 * math.acos(max(0.0, 1.0 - _CHORD_M / radius_m))
+    count = max(1, math.ceil(leg.length_m / radius_m / widest_rad - 1e-9))
+    along_m = np.linspace(0.0, leg.length_m, count + 1)[1:]
+    for distance_m, place in zip(along_m, leg.places(along_m), strict=True):
+        yield _Point(
+            kind="way",
+            place_ne_m=(float(place[0]), float(place[1])),
+            heading_rad=leg.heading_rad + leg.curvature_per_m * float(distance_m) + leg.side_rad,
+        )
+
+
+def _leads_to_line(leg: Leg, following: Leg | None) -> bool:
+    if following is None or following.line < 0:
+        return False
+    return abs(math.remainder(leg.heading_rad - following.heading_rad, 2 * math.pi)) < _STRAIGHT_RAD
+
+
+def _switched(points: list[_Point]) -> list[_Point]:
+    """With the camera on where a line begins and off where it ends."""
+    result = list(points)
+    for i, point in enumerate(points):
+        if point.kind != "line":
+            continue
+        if points[i - 1].kind != "line" or points[i - 1].line != point.line:
+            if points[i - 1].kind == "line":  # lines that touch: pictures go on
+                result[i - 1] = replace(result[i - 1], camera=None)
+            else:
+                result[i - 1] = replace(result[i - 1], camera="on", line=point.line)
+        after = points[i + 1] if i + 1 < len(points) else None
+        if after is None or after.line != point.line:
+            result[i] = replace(result[i], camera="off")
+    return result
+
+
+def _with_depths(
+    points: list[_Point], plan: Plan, line_depths: Sequence[Array] | None
+) -> list[_Point]:
+    """With a depth at every place: between lines the less deep of those of the lines next to it."""
+    if line_depths is None:
+        level_m = plan.seafloor_depth_m - plan.altitude_m
+        return [replace(point, glass_depth_m=level_m) for point in points]
+    depths = np.array(
+        [
+            float(line_depths[point.line][0])
+            if point.camera == "on"
+            else (math.nan if point.glass_depth_m is None else point.glass_depth_m)
+            for point in points
+        ]
+    )
+    known = np.flatnonzero(np.isfinite(depths))
+    if not len(known):
+        return _with_depths(points, plan, None)
+    place = np.arange(len(points))
+    after = depths[known[np.clip(np.searchsorted(known, place), 0, len(known) - 1)]]
+    before = depths[known[np.clip(np.searchsorted(known, place, "right") - 1, 0, len(known) - 1)]]
+    levels = np.minimum(before, after)
+    return [replace(p, glass_depth_m=float(d)) for p, d in zip(points, levels, strict=True)]
+
+
+def _depths(plan: Plan, line_depths: Sequence[Array] | None) -> list[Array] | None:
+    """Depths of the glass at each line's stations; None over a level sea floor."""
+    given = plan.line_depths_m if line_depths is None else line_depths
+    if line_depths is None and not plan.line_depths_m:
+        return None
+    depths = [np.asarray(row, dtype=np.float64) for row in given]
+    stations, wanted = [len(row) for row in depths], [line.stations for line in plan.lines]
+    if stations != wanted:
+        raise PlanError(
+            f"depths of {len(stations)} lines with {sum(stations)} stations do not fit a plan of "
+            f"{len(wanted)} lines with {sum(wanted)} stations: plan again"
+        )
+    return depths

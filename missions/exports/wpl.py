@@ -1,0 +1,31 @@
+"""QGC WPL 110, the plain-text missions that ArduSub's ground stations load."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from alice_survey.artefacts import atomic_path
+from missions.exports.mavlink import FRAME_GLOBAL, NAV_WAYPOINT, Item
+from missions.exports.text import degrees
+
+
+def write_wpl(path: Path, home_lat_lon_deg: tuple[float, float], items: Sequence[Item]) -> None:
+    """Write mission items, tab separated, after a row for home.
+
+    The format has no comments: what places and altitudes are of is said beside it, in `about.txt`.
+
+    Args:
+        path: where to.
+        home_lat_lon_deg: where the vehicle is launched, at the surface.
+        items: of one dive.
+    """
+    lat, lon = home_lat_lon_deg
+    home = Item(command=NAV_WAYPOINT, frame=FRAME_GLOBAL, params=(0, 0, 0, 0, lat, lon, 0.0))
+    rows = ["QGC WPL 110"]
+    for index, item in enumerate((home, *items)):
+        *params, lat, lon, altitude = item.params
+        cells = [str(index), str(int(index == 0)), str(item.frame), str(item.command)]
+        cells += [f"{value:.6f}" for value in params]
+        cells += [degrees(lat), degrees(lon), f"{altitude:.4f}", "1"]
+        rows.append("\t".join(cells))
+    with atomic_path(path) as temporary:
+        temporary.write_text("\n".join(rows) + "\n", encoding="ascii", newline="\n")

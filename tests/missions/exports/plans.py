@@ -1,0 +1,155 @@
+"""Plans for tests of exports, made by hand so that they need no planner."""
+
+import math
+from typing import Any
+
+import numpy as np
+from shapely.geometry import MultiPolygon, Polygon
+
+from alice_survey.config import CameraConfig, WaterConfig
+from alice_survey.frames import Datum
+from camera_calib.rig import Rig, design_rig
+from missions.areas.area import Area
+from missions.lines.line import Line
+from missions.plan_file import Dive, Plan
+from missions.route.legs import Leg, Route
+
+DATUM = Datum(latitude_deg=32.8236, longitude_deg=34.9553)
+RIG: Rig = design_rig(CameraConfig(), WaterConfig())
+
+
+def straight(
+    start: tuple[float, float], end: tuple[float, float], line: int = -1, side_rad: float = 0.0
+) -> Leg:
+    course = math.atan2(end[1] - start[1], end[0] - start[0])
+    return Leg(
+        start_ne_m=start, heading_rad=course, length_m=math.dist(start, end), curvature_per_m=0.0,
+        line=line, side_rad=side_rad,
+    )  # fmt: skip
+
+
+def spot(place: tuple[float, float], heading_rad: float, turn_rad: float) -> Leg:
+    return Leg(
+        start_ne_m=place, heading_rad=heading_rad, length_m=0.0, curvature_per_m=0.0, line=-1,
+        turn_rad=turn_rad,
+    )  # fmt: skip
+
+
+def arc(place: tuple[float, float], heading_rad: float, radius_m: float, turn_rad: float) -> Leg:
+    return Leg(
+        start_ne_m=place, heading_rad=heading_rad, length_m=radius_m * abs(turn_rad),
+        curvature_per_m=math.copysign(1 / radius_m, turn_rad), line=-1,
+    )  # fmt: skip
+
+
+def lawnmower_route(lines: list[Line], first: int, home: tuple[float, float]) -> Route:
+    """From home along lines and home again: a turn on the spot at each kink."""
+    legs: list[Leg] = []
+    place, heading = home, None
+
+    def go(end: tuple[float, float], line: int) -> None:
+        nonlocal place, heading
+        if math.dist(place, end) < 1e-9:
+            return
+        leg = straight(place, end, line)
+        if heading is not None:
+            turn = math.remainder(leg.heading_rad - heading, 2 * math.pi)
+            if abs(turn) > 1e-12:
+                legs.append(spot(place, heading, turn))
+        legs.append(leg)
+        place, heading = end, leg.heading_rad
+
+    for index, line in enumerate(lines, start=first):
+        run_in = (
+            line.start_ne_m[0] - 0.5 * math.cos(line.heading_rad),
+            line.start_ne_m[1] - 0.5 * math.sin(line.heading_rad),
+        )
+        go(run_in, -1)
+        go(line.start_ne_m, -1)
+        go(line.end_ne_m, index)
+    go(home, -1)
+    return Route(legs=tuple(legs))
+
+
+def plan_of(
+    lines: list[Line],
+    dives: list[tuple[int, int]],
+    *,
+    datum: Datum = DATUM,
+    home: tuple[float, float] = (-2.0, -2.0),
+    routes: list[Route] | None = None,
+    survey: Polygon | None = None,
+    **changes: Any,
+) -> Plan:
+    """A plan that flies given lines; `dives` holds first and last line of each."""
+    ends = np.array([end for line in lines for end in (line.start_ne_m, line.end_ne_m)])
+    low, high = ends.min(axis=0) - 0.2, ends.max(axis=0) + 0.2
+    box = Polygon([low, (high[0], low[1]), high, (low[0], high[1])])
+    area = box if survey is None else survey
+    holes = MultiPolygon([Polygon(hole) for hole in area.interiors])
+    flown = routes or [
+        lawnmower_route(lines[first : last + 1], first, home) for first, last in dives
+    ]
+    values: dict[str, Any] = {
+        "name": "harbour",
+        "area": Area(
+            datum=datum,
+            survey=MultiPolygon([area]),
+            allowed=MultiPolygon([area.buffer(3.0, join_style="mitre")]),
+            no_go=holes,
+        ),
+        "home_ne_m": home,
+        "seafloor_depth_m": 15.0,
+        "altitude_m": 2.0,
+        "speed_mps": 0.2,
+        "interval_s": 2.3,
+        "exposure_s": 0.003,
+        "strobe_pulse_s": 0.0034,
+        "strobe_lead_s": 0.0002,
+        "footprint_m": (1.441, 1.1749),
+        "line_spacing_m": 1.0,
+        "station_spacing_m": 0.46,
+        "forward_overlap": 0.6,
+        "side_overlap": 0.3,
+        "lines": tuple(lines),
+        "dives": tuple(
+            Dive(
+                first_line=first,
+                last_line=last,
+                route=route,
+                duration_s=route.length_m / 0.2,
+                energy_wh=12.5,
+            )
+            for (first, last), route in zip(dives, flown, strict=True)
+        ),
+        "turn_radius_m": 0.5,
+        "run_in_m": 0.5,
+        "length_m": sum(route.length_m for route in flown),
+        "duration_s": sum(route.length_m for route in flown) / 0.2,
+        "energy_wh": 12.5,
+        "coverage": 1.0,
+        "details": {},
+    }
+    return Plan(**(values | changes))
+
+
+def line(
+    start: tuple[float, float], end: tuple[float, float], kind: Any = "survey", step: float = 0.46
+) -> Line:
+    stations = max(2, math.ceil(math.dist(start, end) / step) + 1)
+    return Line(kind=kind, start_ne_m=start, end_ne_m=end, stations=stations)
+
+
+def small_plan(**changes: Any) -> Plan:
+    """Four lines of 4.6 m, a cross line and a closing line in two dives, about a hole."""
+    lines = []
+    for i in range(4):
+        ends = (0.2, float(i)), (4.8, float(i))
+        lines.append(line(*(ends if i % 2 == 0 else ends[::-1])))
+    lines.append(line((2.5, 3.2), (2.5, -0.2), "cross"))
+    lines.append(line((0.2, 0.0), (4.8, 0.0), "closing"))
+    survey = Polygon(
+        [(-0.1, -0.5), (5.1, -0.5), (5.1, 3.5), (-0.1, 3.5)],
+        [[(2.0, 1.4), (2.0, 1.6), (2.3, 1.6), (2.3, 1.4)]],
+    )
+    return plan_of(lines, [(0, 2), (3, 5)], survey=survey, **changes)
