@@ -82,7 +82,7 @@ def make_plan(config: SurveyConfig, rig: Rig) -> Plan:
     wanted = config.plan
     camera = rig.cameras[rig.reference]
     area = area_polygon(config.area)
-    imaging = imaging_settings(camera, config.camera, wanted)
+    imaging = imaging_settings(rig, config)
     step_m = imaging.station_spacing_m
     stereo = common_swath(rig, wanted.altitude_m, step_m)
     _check_altitude(config, stereo)

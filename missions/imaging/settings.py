@@ -1,36 +1,60 @@
-"""Camera and strobe settings that an altitude, a speed and an overlap ask for."""
+"""Camera and strobe settings that an altitude, a speed and an overlap ask for.
 
-import math
-from dataclasses import asdict, dataclass
+Every number stands as a row (`Setting`) with its equation, its source and the limit that bound it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-from alice_survey.config import CameraConfig, PlanConfig
-from alice_survey.errors import PlanError
-from camera_calib.flat_port import FlatPortCamera
-from camera_calib.fov.table import apparent_distance_m
-from missions.footprint import footprint_size_m, overlap, step_for_overlap
+from alice_survey.config import SurveyConfig
+from camera_calib.rig import Rig
+from camera_calib.water import water_optics
+from missions.footprint import footprint_size_m, overlap
+from missions.imaging.exposure import (
+    BlurRates,
+    blur_rates,
+    exposure_for_blur,
+    exposure_for_rate,
+    exposure_rows,
+)
+from missions.imaging.focus import Focus, focus_rows, plan_focus
+from missions.imaging.footprints import (
+    Spacing,
+    footprint_range,
+    footprint_rows,
+    line_spacing,
+    spacing_rows,
+)
+from missions.imaging.light import LightBudget, light_budget
+from missions.imaging.light_rows import light_rows, scatter_rows, strobe_rows
+from missions.imaging.scatter import scatter, shadows
+from missions.imaging.storage import Storage, raw_bytes, storage_load, storage_rows
+from missions.imaging.strobe import StrobeLoad, strobe_load
+from missions.imaging.table import Setting, settings_table
+from missions.imaging.trigger import (
+    PaperRule,
+    interval_for_overlap_s,
+    paper_rule,
+    too_fast,
+    trigger_rows,
+)
 
-_EXPOSURE_STEP_S = 1e-5
-_INTERVAL_STEP_S = 1e-3
-
-
-@dataclass(frozen=True, kw_only=True)
-class PaperRule:
-    """What the paper's frame rate r = u / (H (1 - O)) gives (its section VII.A).
-
-    It takes the altitude H for the footprint along the track, which holds for no lens of the paper.
-    """
-
-    rate_hz: float
-    interval_s: float
-    wanted_forward_overlap: float
-    forward_overlap: float
-    """What it really gives with this footprint."""
+__all__ = [
+    "ImagingSettings",
+    "PaperRule",
+    "Setting",
+    "exposure_for_blur",
+    "imaging_settings",
+    "line_spacing",
+    "paper_rule",
+    "raw_bytes",
+]
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImagingSettings:
-    """When to expose, for how long, and with how much light."""
+    """When to expose, for how long, with how much light, and how far apart lines lie."""
 
     footprint_across_m: float
     footprint_along_m: float
@@ -38,7 +62,7 @@ class ImagingSettings:
     """The central pixel on the sea floor (paraxial)."""
     exposure_s: float
     blur_px: float
-    """At the centre, from the speed."""
+    """In the worst pixel, from speed and attitude rates in quadrature."""
     interval_s: float
     station_spacing_m: float
     forward_overlap: float
@@ -47,88 +71,107 @@ class ImagingSettings:
     strobe_lead_s: float
     strobe_duty: float
     """Share of the time for which the strobe is lit."""
+    imaging_w: float
+    """Mean power of the strobes from the battery while a line is flown; cameras and recorder are
+    in `vehicle.hotel_w`."""
+    frame_j: float
+    """The same for one trigger."""
     paper_rule: PaperRule
+    spacing: Spacing
+    blur: BlurRates
+    focus: Focus
+    light: LightBudget
+    strobe: StrobeLoad
+    storage: Storage
+    rows: tuple[Setting, ...]
+
+    @property
+    def line_spacing_m(self) -> float:
+        """How far apart lines lie."""
+        return self.spacing.spacing_m
+
+    def table_text(self, more: Sequence[Setting] = ()) -> str:
+        """The table of all settings, and of more rows, in 100 columns."""
+        return settings_table([*self.rows, *more])
 
     def to_json(self) -> dict[str, Any]:
         """All fields as JSON values."""
-        return asdict(self)
+        data = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "rows"}
+        plain = {k: v if isinstance(v, float) else _finite(asdict(v)) for k, v in data.items()}
+        return {**plain, "rows": [row.to_json() for row in self.rows]}
 
 
-def imaging_settings(
-    camera: FlatPortCamera, limits: CameraConfig, plan: PlanConfig
-) -> ImagingSettings:
-    """Exposure, interval and strobe that meet the plan.
+def imaging_settings(rig: Rig, config: SurveyConfig) -> ImagingSettings:
+    """Every setting of cameras, strobes and lines that meets the plan.
 
     Args:
-        camera: the reference camera, in water.
-        limits: what the camera can do.
-        plan: altitude (of the outer glass), speed, overlap and allowed blur.
+        rig: the cameras in water; the first is the reference, whose outer glass the altitude is of.
+        config: plan, camera, water and strobes.
 
     Raises:
-        PlanError: the camera cannot take pictures as fast as the plan needs.
+        PlanError: limits conflict: frame rate, altitude, focus, strobe or track error; the message
+            names both and the cheapest ways out.
     """
-    across_m, along_m = footprint_size_m(camera, plan.altitude_m)
-    pixel_m = apparent_distance_m(camera, plan.altitude_m) / camera.fx_px
-    exposure_s = exposure_for_blur(plan.allowed_blur_px, plan.speed_mps, pixel_m)
-    interval_s = _floor(
-        step_for_overlap(along_m, plan.forward_overlap) / plan.speed_mps, _INTERVAL_STEP_S
-    )
+    plan, limits = config.plan, config.camera
+    camera, altitude_m = rig.cameras[rig.reference], plan.altitude_m
+    along_m = footprint_size_m(camera, altitude_m)[1]
+    interval_s = interval_for_overlap_s(along_m, plan)
     if interval_s < limits.shortest_interval_s:
-        raise PlanError(
-            f"{plan.forward_overlap:.0%} forward overlap at {plan.speed_mps:g} m/s and "
-            f"{plan.altitude_m:g} m altitude needs a picture every {interval_s:.3f} s; the "
-            f"camera's shortest is {limits.shortest_interval_s:g} s: lower speed_mps or "
-            "forward_overlap"
-        )
-    pulse_s = exposure_s + 2 * plan.strobe_lead_s
-    if pulse_s > interval_s:
-        raise PlanError(
-            f"a strobe pulse of {pulse_s:.4f} s (exposure {exposure_s:.4f} s, lead "
-            f"{plan.strobe_lead_s:g} s) does not fit the interval of {interval_s:.3f} s: lower "
-            "strobe_lead_s or allowed_blur_px"
-        )
-    spacing_m = round(interval_s * plan.speed_mps, 9)
+        raise too_fast(camera, limits, plan, along_m)
+    step_m = round(interval_s * plan.speed_mps, 9)
+    prints = footprint_range(rig, plan, step_m)
+    spacing = line_spacing(rig, plan, step_m)
+    rates = blur_rates(rig, plan, altitude_m)
+    exposure_s = exposure_for_rate(plan.allowed_blur_px, rates.combined)
+    focus = plan_focus(camera, limits, plan)
+    optics = water_optics(config.water.jerlov)
+    budget = light_budget(rig, limits, config.imaging, optics, altitude_m, exposure_s)
+    veil = scatter(rig, config.imaging, optics, altitude_m)
+    shade = shadows(rig, config.imaging, altitude_m, plan.relief_m)
+    load = strobe_load(config.imaging, plan, exposure_s, interval_s)
+    storage = storage_load(camera, len(rig.cameras), interval_s)
+    mean = prints.mean
+    rows = (
+        *footprint_rows(prints),
+        *spacing_rows(spacing, plan, prints),
+        *trigger_rows(plan, limits, along_m, prints.top.along_m, interval_s),
+        *exposure_rows(plan, rates, exposure_s, mean.pixel_m),
+        *focus_rows(focus, camera, limits, plan),
+        *light_rows(budget, config.imaging, limits, config.water.jerlov, exposure_s),
+        *scatter_rows(veil, shade),
+        *strobe_rows(load),
+        *storage_rows(storage, limits, interval_s),
+    )
     return ImagingSettings(
-        footprint_across_m=across_m,
-        footprint_along_m=along_m,
-        pixel_m=pixel_m,
+        footprint_across_m=mean.across_m,
+        footprint_along_m=mean.along_m,
+        pixel_m=mean.pixel_m,
         exposure_s=exposure_s,
-        blur_px=plan.speed_mps * exposure_s / pixel_m,
+        blur_px=rates.combined * exposure_s,
         interval_s=interval_s,
-        station_spacing_m=spacing_m,
-        forward_overlap=overlap(along_m, spacing_m),
-        strobe_pulse_s=pulse_s,
+        station_spacing_m=step_m,
+        forward_overlap=overlap(along_m, step_m),
+        strobe_pulse_s=load.pulse_s,
         strobe_lead_s=plan.strobe_lead_s,
-        strobe_duty=pulse_s / interval_s,
+        strobe_duty=load.duty,
+        imaging_w=load.mean_w,
+        frame_j=load.frame_j,
         paper_rule=paper_rule(
-            plan.speed_mps, plan.altitude_m, plan.forward_overlap, footprint_along_m=along_m
+            plan.speed_mps, altitude_m, plan.forward_overlap, footprint_along_m=along_m
         ),
+        spacing=spacing,
+        blur=rates,
+        focus=focus,
+        light=budget,
+        strobe=load,
+        storage=storage,
+        rows=rows,
     )
 
 
-def exposure_for_blur(allowed_blur_px: float, speed_mps: float, pixel_m: float) -> float:
-    """Longest exposure that blurs the central pixel by no more than allowed, in steps of 10 us."""
-    return _floor(allowed_blur_px * pixel_m / speed_mps, _EXPOSURE_STEP_S)
-
-
-def paper_rule(
-    speed_mps: float, altitude_m: float, forward_overlap: float, *, footprint_along_m: float
-) -> PaperRule:
-    """The paper's frame rate and the overlap that it really gives."""
-    rate_hz = speed_mps / (altitude_m * (1.0 - forward_overlap))
-    return PaperRule(
-        rate_hz=rate_hz,
-        interval_s=1.0 / rate_hz,
-        wanted_forward_overlap=forward_overlap,
-        forward_overlap=overlap(footprint_along_m, speed_mps / rate_hz),
-    )
-
-
-def raw_bytes(camera: FlatPortCamera, cameras: int, stations: int) -> int:
-    """Size of all pictures as the sensor gives them, one byte a pixel."""
-    return camera.width_px * camera.height_px * cameras * stations
-
-
-def _floor(value: float, step: float) -> float:
-    """The largest multiple of a step that is not above the value (up to rounding)."""
-    return round(math.floor(value / step + 1e-6) * step, 9)
+def _finite(values: dict[str, Any]) -> dict[str, Any]:
+    """The values with inf and NaN, which JSON does not know, as None."""
+    return {
+        key: None if isinstance(value, float) and not abs(value) < float("inf") else value
+        for key, value in values.items()
+    }
