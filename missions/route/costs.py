@@ -1,11 +1,16 @@
 """What flying costs, by course: electrical power of the whole vehicle along lines and between."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from alice_survey.frames import Array
 
+SPOT_RAD_S = math.radians(15.0)
+"""Rate of a turn on the spot, if the vehicle has the thrust for it; as the pilot flies it."""
+STEP_MPS = 0.15
+"""Speed of a sway step, likewise."""
 SETTLE_S = 4.0
 """Until a vehicle that stopped is steady. Inferred: ALICE's heading and sway loops have their poles
 near 1.57 rad/s (`vehicle.pilot.gains`), and three at one place fall to 5 % in 6.3 / 1.57 s."""
@@ -70,9 +75,9 @@ class Costs:
 def time_costs(
     speed_mps: float,
     *,
-    turn_rate_rad_s: float = np.deg2rad(15.0),
+    turn_rate_rad_s: float = SPOT_RAD_S,
     settle_s: float = SETTLE_S,
-    sway_mps: float = 0.15,
+    sway_mps: float = STEP_MPS,
     heave_mps: float = 0.15,
 ) -> Costs:
     """Costs of 1 W whatever the vehicle does: joules are seconds."""

@@ -1,0 +1,351 @@
+"""Depth of the sea floor from a raster.
+
+A bathymetric attributed grid (BAG), a GeoTIFF, or any other that GDAL reads, in any coordinate
+system; only the part that is needed is read.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import shapely
+from shapely.geometry import MultiPolygon
+
+from alice_survey.errors import PlanError, warn
+from alice_survey.frames import Array, Datum
+
+Sense = Literal["auto", "heights", "depths"]
+"""Of a raster's values: heights are positive up, depths positive down."""
+_MOST_CELLS = 16_000_000
+"""Read at once: 128 MB."""
+_PAD_CELLS = 2
+_EDGE_POINTS = 32
+"""On each side of the bounds, whose straight sides are curves in the raster."""
+_ONE_SIGN = 0.99
+"""Share of cells of one sign from which a raster without a word on it is taken to be of that sign.
+"""
+_MOST_SAMPLES = 1_000_000
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Bathymetry:
+    """Depths at the centres of a raster's cells, in its own coordinate system."""
+
+    name: str
+    """Of the file."""
+    datum: Datum
+    """Of the local frame."""
+    crs: str
+    """WKT of the raster's horizontal coordinate system."""
+    from_pixel: tuple[float, float, float, float, float, float]
+    """(a, b, c, d, e, f): x = a col + b row + c and y = d col + e row + f, where (0.5, 0.5) is the
+    centre of the first cell."""
+    depth_m: Array
+    """(rows, columns) below the vertical datum, positive down; NaN where it is not known."""
+    vertical_datum: str
+    """As the file names it."""
+    reading: str
+    """How the sign was told, in words."""
+
+    @cached_property
+    def cell_m(self) -> float:
+        """Longer side of a cell in the middle of the raster."""
+        rows, columns = self.depth_m.shape
+        middle = np.array([columns / 2, rows / 2])
+        corners = middle + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+        ne = self._ne_from_pixel(corners)
+        return float(max(math.dist(ne[0], ne[1]), math.dist(ne[0], ne[2])))
+
+    @cached_property
+    def known_m(self) -> Array:
+        """(K,) all depths that are known."""
+        depths: Array = self.depth_m.ravel()
+        return np.extract(np.isfinite(depths), depths)
+
+    def depth_at(self, points_ne: Array) -> Array:
+        """Depth, (...), at places (..., 2), bilinear between the centres of cells.
+
+        NaN beyond the outermost centres, and where a cell that counts is not known.
+        """
+        points = np.asarray(points_ne, dtype=np.float64)
+        pixel = self._pixel_from_ne(points.reshape(-1, 2)) - 0.5
+        rows, columns = self.depth_m.shape
+        # A place on the outermost centres must not fall off them by rounding.
+        last = np.array([columns - 1.0, rows - 1.0])
+        inside = np.all((pixel > -1e-6) & (pixel < last + 1e-6), axis=1)
+        pixel = np.clip(np.where(inside[:, None], pixel, 0.0), 0.0, last)
+        col = np.minimum(pixel[:, 0].astype(np.intp), max(columns - 2, 0))
+        row = np.minimum(pixel[:, 1].astype(np.intp), max(rows - 2, 0))
+        along, down = pixel[:, 0] - col, pixel[:, 1] - row
+        total = np.zeros(len(pixel))
+        for d_row, d_col, weight in (
+            (0, 0, (1 - along) * (1 - down)),
+            (0, 1, along * (1 - down)),
+            (1, 0, (1 - along) * down),
+            (1, 1, along * down),
+        ):
+            counts = weight > 1e-6
+            cell = self.depth_m[
+                np.minimum(row + d_row, rows - 1), np.minimum(col + d_col, columns - 1)
+            ]
+            total += np.where(counts, weight * cell, 0.0)
+        depth: Array = np.where(inside, total, np.nan).reshape(points.shape[:-1])
+        return depth
+
+    def _pixel_from_ne(self, points_ne: Array) -> Array:
+        """(N, 2) column and row of places (N, 2) on the sea floor, in the file's own corners."""
+        down = np.full((len(points_ne), 1), self._middle_depth_m)
+        geodetic = self.datum.geodetic_from_ned(np.hstack([points_ne, down]))
+        x, y = self._transformer.transform(geodetic[:, 1], geodetic[:, 0])
+        a, b, c, d, e, f = self.from_pixel
+        x, y, size = np.asarray(x) - c, np.asarray(y) - f, a * e - b * d
+        return np.column_stack([(e * x - b * y) / size, (a * y - d * x) / size])
+
+    def _ne_from_pixel(self, pixel: Array) -> Array:
+        a, b, c, d, e, f = self.from_pixel
+        x = a * pixel[:, 0] + b * pixel[:, 1] + c
+        y = d * pixel[:, 0] + e * pixel[:, 1] + f
+        lon, lat = self._transformer.transform(x, y, direction="INVERSE")
+        depth = np.full(len(pixel), self._middle_depth_m)
+        return self.datum.ned_from_geodetic(np.column_stack([lat, lon, depth]))[:, :2]
+
+    @cached_property
+    def _middle_depth_m(self) -> float:
+        """Of the known part: degrees grow shorter by one part in 10,000 in 600 m of depth."""
+        return float(self.known_m.mean()) if len(self.known_m) else 0.0
+
+    @cached_property
+    def _transformer(self) -> Any:
+        return _transformer(self.crs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AreaDepth:
+    """Depth of the sea floor over an area."""
+
+    mean_m: float
+    shallowest_m: float
+    deepest_m: float
+    known: float
+    """Share of the area where it is known."""
+
+
+def area_depth(bathymetry: Bathymetry, survey: MultiPolygon) -> AreaDepth:
+    """Mean and range of depth over an area, on a grid as fine as the raster's.
+
+    Raises:
+        PlanError: the raster knows nothing of it.
+    """
+    north_0, east_0, north_1, east_1 = survey.bounds
+    count = (north_1 - north_0) * (east_1 - east_0) / bathymetry.cell_m**2
+    step = bathymetry.cell_m * max(1.0, math.sqrt(count / _MOST_SAMPLES))
+    step = min(step, max(north_1 - north_0, east_1 - east_0) / 16)
+    north = np.arange(north_0 + step / 2, north_1, step)
+    east = np.arange(east_0 + step / 2, east_1, step)
+    points = np.stack(np.meshgrid(north, east, indexing="ij"), axis=-1).reshape(-1, 2)
+    points = points[shapely.contains_xy(survey, points[:, 0], points[:, 1])]
+    if not len(points):
+        points = np.array(
+            [[p.x, p.y] for p in (part.representative_point() for part in survey.geoms)]
+        )
+    depth = bathymetry.depth_at(points)
+    known = depth[np.isfinite(depth)]
+    if not len(known):
+        raise PlanError(
+            f"{bathymetry.name}: knows no depth within the survey area; check area.bathymetry_file "
+            "and the area's place"
+        )
+    return AreaDepth(
+        mean_m=float(known.mean()),
+        shallowest_m=float(known.min()),
+        deepest_m=float(known.max()),
+        known=len(known) / len(depth),
+    )
+
+
+def read_bathymetry(
+    path: Path,
+    datum: Datum,
+    *,
+    bounds_ne: tuple[float, float, float, float] | None = None,
+    sense: Sense = "auto",
+    crs: str | None = None,
+) -> Bathymetry:
+    """Read the depths of a raster's first band.
+
+    Args:
+        path: a BAG, GeoTIFF or other raster.
+        datum: of the local frame.
+        bounds_ne: least north and east, greatest north and east, of what is needed, metres; the
+            whole raster if not given.
+        sense: whether values are heights or depths; `auto` goes by the format, the band's name, the
+            tag `positive` of the CF conventions, and else by their sign.
+        crs: of a raster that does not say its own.
+
+    Raises:
+        PlanError: it is no raster, has no coordinate system, does not reach the bounds, has
+            too many cells within them, or its sense cannot be told.
+    """
+    import rasterio
+    from rasterio.errors import RasterioError
+    from rasterio.windows import Window
+
+    try:
+        with rasterio.open(path) as file:
+            if crs is None and file.crs is None:
+                raise PlanError(
+                    f"{path}: names no coordinate system; give area.bathymetry_crs, as EPSG:32636"
+                )
+            flat, vertical = _systems(crs or file.crs.to_wkt(), file)
+            window = _window(path, file, flat, datum, bounds_ne)
+            band = file.read(1, window=Window(*window), masked=True)
+            heights, reading = _sense(path, file, band, sense)
+            scale, offset = file.scales[0], file.offsets[0]
+            a, b, c, d, e, f = tuple(file.transform)[:6]
+    except (RasterioError, OSError) as error:
+        raise PlanError(f"{path}: cannot be read as a raster: {error}") from None
+    values = np.ma.filled(band.astype(np.float64), np.nan) * scale + offset
+    values[~np.isfinite(values)] = np.nan
+    column, row, _, _ = window
+    known = np.isfinite(values).mean() if values.size else 0.0
+    if known == 0.0:
+        raise PlanError(f"{path}: no cell there has a value; check area.bathymetry_file")
+    return Bathymetry(
+        name=path.name,
+        datum=datum,
+        crs=flat,
+        from_pixel=(a, b, c + a * column + b * row, d, e, f + d * column + e * row),
+        depth_m=-values if heights else values,
+        vertical_datum=vertical,
+        reading=reading,
+    )
+
+
+def _transformer(crs: str) -> Any:
+    from pyproj import Transformer
+
+    return Transformer.from_crs("EPSG:4326", crs, always_xy=True)
+
+
+def _systems(crs: str, file: Any) -> tuple[str, str]:
+    """WKT of the horizontal coordinate system, and the name of the vertical datum."""
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
+    try:
+        system = CRS.from_user_input(crs)
+    except CRSError:
+        raise PlanError(f"coordinate system {crs!r} is not known; give one as EPSG:32636") from None
+    vertical = "not named"
+    if system.is_compound:
+        flat, height = system.sub_crs_list[:2]
+        vertical, system = str(height.name), flat
+    else:
+        vertical = _bag_vertical_datum(file) or vertical
+    if not (system.is_projected or system.is_geographic):
+        raise PlanError(f"{file.name}: {system.name!r} is no map or geographic coordinate system")
+    return system.to_wkt(), vertical
+
+
+def _bag_vertical_datum(file: Any) -> str | None:
+    """The code below `verticalDatum` in the metadata of a BAG."""
+    if "xml:BAG" not in file.tag_namespaces():
+        return None
+    import re
+
+    text = " ".join(str(value) for value in file.tags(ns="xml:BAG").values())
+    found = re.search(r"<(?:\w+:)?verticalDatum>.*?<(?:\w+:)?code>\s*([^<]+?)\s*<", text, re.S)
+    if found is None:
+        found = re.search(r'VERT_?(?:CS|CRS|DATUM|_DATUM)?\["([^"]+)"', text)
+    return found.group(1) if found else None
+
+
+def _window(
+    path: Path,
+    file: Any,
+    crs: str,
+    datum: Datum,
+    bounds_ne: tuple[float, float, float, float] | None,
+) -> tuple[int, int, int, int]:
+    """First column and row, and how many of each, that bounds need."""
+    if bounds_ne is None:
+        window = (0, 0, int(file.width), int(file.height))
+    else:
+        north_0, east_0, north_1, east_1 = bounds_ne
+        t = np.linspace(0.0, 1.0, _EDGE_POINTS)
+        north, east = north_0 + t * (north_1 - north_0), east_0 + t * (east_1 - east_0)
+        edge = np.vstack([
+            np.column_stack([north, np.full_like(t, east_0)]),
+            np.column_stack([north, np.full_like(t, east_1)]),
+            np.column_stack([np.full_like(t, north_0), east]),
+            np.column_stack([np.full_like(t, north_1), east]),
+        ])  # fmt: skip
+        geodetic = datum.geodetic_from_ned(np.hstack([edge, np.zeros((len(edge), 1))]))
+        x, y = _transformer(crs).transform(geodetic[:, 1], geodetic[:, 0])
+        columns, rows = ~file.transform * (np.asarray(x), np.asarray(y))
+        if not (np.all(np.isfinite(columns)) and np.all(np.isfinite(rows))):
+            raise PlanError(f"{path}: its coordinate system does not reach the survey area")
+        first_c = max(math.floor(columns.min()) - _PAD_CELLS, 0)
+        first_r = max(math.floor(rows.min()) - _PAD_CELLS, 0)
+        last_c = min(math.ceil(columns.max()) + _PAD_CELLS, file.width)
+        last_r = min(math.ceil(rows.max()) + _PAD_CELLS, file.height)
+        if last_c <= first_c or last_r <= first_r:
+            raise PlanError(
+                f"{path}: does not reach the survey area, which is at columns "
+                f"{columns.min():.0f} to {columns.max():.0f} and rows {rows.min():.0f} to "
+                f"{rows.max():.0f} of its {file.width} x {file.height}: check the "
+                "area's datum and area.bathymetry_file"
+            )
+        window = (first_c, first_r, last_c - first_c, last_r - first_r)
+    cells = window[2] * window[3]
+    if cells > _MOST_CELLS:
+        raise PlanError(
+            f"{path}: {window[2]} x {window[3]} cells are needed, more than {_MOST_CELLS:,}; "
+            "survey less at once, or coarsen the raster (gdalwarp -tr)"
+        )
+    return window
+
+
+def _sense(path: Path, file: Any, band: Any, sense: Sense) -> tuple[bool, str]:
+    """Whether values are heights, and how that was told."""
+    if sense != "auto":
+        return sense == "heights", f"{sense}, as asked"
+    values = band.compressed()
+    values = values[np.isfinite(values)]
+    below = float(np.mean(values < 0)) if len(values) else 0.0
+    heights = _told_sense(file)
+    if heights is None:
+        if _ONE_SIGN > below > 1 - _ONE_SIGN:
+            raise PlanError(
+                f"{path}: {below:.0%} of its values are negative, so that heights cannot be told "
+                "from depths; set area.bathymetry_values to one of them"
+            )
+        told = f"{below:.0%} of its values are negative"
+        return below >= _ONE_SIGN, f"{'heights' if below >= _ONE_SIGN else 'depths'}, since {told}"
+    as_heights, why = heights
+    dry = 1 - below if as_heights else below
+    if len(values) and dry > _ONE_SIGN:
+        other = "depths" if as_heights else "heights"
+        warn(
+            f"{path}: by its {why} nearly all of it ({dry:.0%}) is above water; if its values are "
+            f"{other}, set area.bathymetry_values = '{other}'"
+        )
+    return as_heights, f"{'heights' if as_heights else 'depths'}, by its {why}"
+
+
+def _told_sense(file: Any) -> tuple[bool, str] | None:
+    """Whether values are heights, and what says so."""
+    if file.driver == "BAG":
+        return True, "format (BAG: elevations)"
+    for tags in (file.tags(1), file.tags()):
+        for key, value in tags.items():
+            if key.lower().split("#")[-1] == "positive" and str(value).lower() in ("up", "down"):
+                return str(value).lower() == "up", f"tag {key} = {value}"
+    name = str(file.descriptions[0] or "").lower()
+    for word, heights in (("elevation", True), ("height", True), ("depth", False)):
+        if word in name:
+            return heights, f"band's name {file.descriptions[0]!r}"
+    return None

@@ -1,0 +1,351 @@
+"""What flying takes, by course against the current: from the vehicle's own equations of motion.
+
+Along lines a vehicle that can sway holds its heading and meets the current's part across by sway;
+one that cannot turns into the current until nothing pushes it sideways (it crabs), as all do on the
+way between lines. The thrusts that balance drag, body lift, buoyancy and jets, and the electrical
+power that they take, are those of `alice_survey.vehicle.steady`; to them come the hotel load and,
+on lines, the lights.
+
+Where the numbers of `[vehicle]` come from:
+
+- battery_wh 1400: SPARUS II carries 1.4 kWh of Li-ion cells by its maker's data sheet and by
+  Carreras et al., IEEE Journal of Oceanic Engineering 43(2), 2018. Neither could be read here:
+  inferred. Its endurance could (8 to 10 hours: El Radar and Infobae on the Spanish Navy's two, July
+  2025), and agrees: at 1 m/s the model's thrusters take 87 W, with hotel_w that is 9.5 hours.
+- battery_reserve 0.2: inferred; for ascent, recovery and the ageing of the cells.
+- hotel_w 60: inferred, as the sum of a Jetson TX2 at 15 W (its greater mode, by huggingface.co's
+  list of hardware; 7.4 W was logged with all processors busy, gist TerryTsao/fa30ba54), two cameras
+  at 6 W, a DVL at 10 W, the vehicle's computer at 12 W, and inertial unit, modem, controller of the
+  lights and losses at 11 W. Of these only the Jetson's could be read.
+
+Left out: swell and gusts, which make drag larger on average; a propeller's dead band, below which
+ALICE's lateral thrusters stand still and wait for the error to grow (0.4 N, below 0.1 W).
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.config import SurveyConfig, VehicleConfig
+from alice_survey.errors import PlanError
+from alice_survey.frames import Array
+from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.pilot.gains import STEADY_SHARE
+from alice_survey.vehicle.steady import steady_flight
+from alice_survey.vehicle.vehicle import Vehicle
+from missions.route.costs import SETTLE_S, SPOT_RAD_S, STEP_MPS, Costs
+
+Manner = Literal["held", "crab"]
+"""Of meeting a current from the side: heading held, by sway; or heading turned into it."""
+COURSES = 72
+_HEADINGS = 24
+"""Over which a turn on the spot in a current is averaged."""
+_RATES = np.linspace(1.0, 1.0 / 16.0, 16)
+"""Shares of a greatest rate that are tried, downwards."""
+_MOST_HEAVE_MPS = 0.4
+_FASTER = (0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.75, 1.0, 1.25, 1.5)
+"""Speeds over ground that are tried for a way out, m/s."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Motion:
+    """Straight flight over ground in a current, at N courses."""
+
+    nu: Array
+    """(N, 6) velocity relative to the water, in the body."""
+    crab_rad: Array
+    """(N,) heading less course."""
+    possible: Array
+    """(N,) 1.0, or NaN where the current along the course is not below the speed of a vehicle that
+    crabs: it would have to turn its back on where it goes."""
+
+
+def vehicle_costs(config: SurveyConfig, *, imaging_w: float = 0.0) -> Costs:
+    """What flying takes in the current that is expected.
+
+    Args:
+        config: vehicle, sea and speed of the survey.
+        imaging_w: mean power of strobes while on lines.
+
+    Returns:
+        Powers that are infinite at courses which the vehicle cannot keep with `STEADY_SHARE` of its
+        thrust, the rest being left for control.
+
+    Raises:
+        PlanError: lines cannot be flown both ways on any heading, or not on the one asked for.
+        VehicleError: the vehicle is described wrongly.
+        NavigationError: the file of the current cannot be read.
+    """
+    craft, current, speed = (
+        craft_of(config.vehicle),
+        expected_current(config),
+        config.plan.speed_mps,
+    )
+    courses = _courses()
+    manner = line_manner(config)
+    lines = course_power(craft, courses, speed, current, manner)
+    if not np.any(_both_ways(lines)):
+        raise PlanError(_too_strong(config, craft, current, manner))
+    asked_deg = config.plan.line_heading_deg
+    if asked_deg is not None:
+        there_and_back = math.radians(asked_deg) + np.array([0.0, math.pi])
+        if not np.all(np.isfinite(course_power(craft, there_and_back, speed, current, manner))):
+            raise PlanError(_wrong_heading(config, courses, lines))
+    between = course_power(craft, courses, speed, current, "crab")
+    if manner == "held":  # where it cannot crab it may still hold its heading
+        between = np.where(np.isfinite(between), between, lines)
+    hotel_w = config.vehicle.hotel_w
+    spot_w, turn_rad_s = _spot(craft, config, current)
+    step_mps, step_w = _sway_step(craft, courses, current, manner)
+    heave_mps, heave_w = _heave(craft, current)
+    return Costs(
+        speed_mps=speed,
+        line_w=lines + hotel_w + imaging_w,
+        way_w=between + hotel_w,
+        spot_w=spot_w + hotel_w,
+        turn_rate_rad_s=turn_rad_s,
+        settle_s=SETTLE_S,
+        sway_mps=step_mps,
+        sway_w=step_w + hotel_w,
+        heave_mps=heave_mps,
+        heave_w=heave_w + hotel_w,
+    )
+
+
+def usable_wh(settings: VehicleConfig) -> float:
+    """What a dive may take of a battery."""
+    return settings.battery_wh * (1.0 - settings.battery_reserve)
+
+
+def craft_of(settings: VehicleConfig) -> Vehicle:
+    """The vehicle that a plan counts on: without the thrust that is known to be lost.
+
+    Raises:
+        VehicleError: the set of coefficients is not known, or the file is not one of coefficients.
+    """
+    if settings.coefficients_file is None:
+        craft = vehicle(settings.name, settings.coefficients)
+    else:
+        from alice_survey.vehicle.identification.files import coefficients_from_file
+
+        craft = vehicle(settings.name).with_coefficients(
+            coefficients_from_file(settings.coefficients_file)
+        )
+    lost = settings.thruster_health.impaired if settings.health_known else {}
+    present = {thruster.name for thruster in craft.thrusters}
+    return craft.weakened({name: left for name, left in lost.items() if name in present})
+
+
+def line_manner(config: SurveyConfig) -> Manner:
+    """How lines are flown: held by sway if the vehicle has it and its controller uses it."""
+    sways = np.any(np.abs(craft_of(config.vehicle).configuration_matrix[1]) > 0)
+    return "held" if sways and config.vehicle.controller == "sway" else "crab"
+
+
+def expected_current(config: SurveyConfig) -> Array:
+    """(2,) the current's mean, m/s north and east, at the depth that is flown at.
+
+    Raises:
+        NavigationError: the file of the current cannot be read.
+    """
+    sea = config.sea
+    if sea.current_file is None:
+        towards = math.radians(sea.current_towards_deg)
+        return sea.current_mps * np.array([math.cos(towards), math.sin(towards)])
+    from alice_survey.vehicle.sea import read_current
+
+    current = read_current(sea.current_file)
+    depth_m = config.area.seafloor_depth_m - config.plan.altitude_m
+    means = [
+        float(np.interp(depth_m, current.depth_m, profile))
+        for profile in current.velocity_ne_mps.mean(axis=0).T
+    ]
+    return np.array(means)
+
+
+def motion(courses_rad: Array, speed_mps: float, current_ne_mps: Array, manner: Manner) -> Motion:
+    """Velocity relative to the water of straight flight.
+
+    Crabbing, the heading is that of the velocity relative to the water, so that nothing pushes the
+    hull sideways.
+
+    Args:
+        courses_rad: (N,)
+        speed_mps: over ground.
+        current_ne_mps: (2,) or (N, 2)
+        manner: of meeting what comes from the side.
+    """
+    north, east = np.broadcast_to(current_ne_mps, (len(courses_rad), 2)).T
+    sine, cosine = np.sin(courses_rad), np.cos(courses_rad)
+    ahead = speed_mps - (north * cosine + east * sine)
+    beside = -(east * cosine - north * sine)
+    nu = np.zeros((len(courses_rad), 6))
+    if manner == "held":
+        nu[:, 0], nu[:, 1] = ahead, beside
+        return Motion(nu=nu, crab_rad=np.zeros(len(nu)), possible=np.ones(len(nu)))
+    nu[:, 0] = np.hypot(ahead, beside)
+    return Motion(
+        nu=nu,
+        crab_rad=np.arctan2(beside, ahead),
+        possible=np.where(ahead > 0.0, 1.0, np.nan),
+    )
+
+
+def course_power(
+    craft: Vehicle, courses_rad: Array, speed_mps: float, current_ne_mps: Array, manner: Manner
+) -> Array:
+    """Electrical power of the thrusters, (N,) W; infinite at courses that cannot be kept."""
+    moved = motion(courses_rad, speed_mps, current_ne_mps, manner)
+    return _power(craft, moved.nu, moved.possible)
+
+
+def _power(
+    craft: Vehicle,
+    nu: Array,
+    possible: Array | float = 1.0,
+    nu_rate: Array | None = None,
+    *,
+    slips: bool = False,
+) -> Array:
+    flight = steady_flight(craft, nu, nu_rate, share=STEADY_SHARE, slips=slips)
+    power: Array = flight.power_w * possible
+    return np.where(np.isnan(power), np.inf, power)
+
+
+def _courses(count: int = COURSES) -> Array:
+    return np.linspace(0.0, 2 * math.pi, count, endpoint=False)
+
+
+def _both_ways(power_w: Array) -> NDArray[np.bool_]:
+    """(K / 2,) whether a line can be flown both ways, at each heading from north to south."""
+    half = len(power_w) // 2
+    return np.isfinite(power_w[:half]) & np.isfinite(power_w[half:])
+
+
+def _spot(craft: Vehicle, config: SurveyConfig, current: Array) -> tuple[float, float]:
+    """Power of a turn on the spot, mean over all headings, and the rate that can be had, rad/s.
+
+    A vehicle with sway turns about the left port, so that the hull swings; one without turns about
+    itself and drifts across its heading with the water.
+    """
+    rate = np.repeat(SPOT_RAD_S * _RATES, _HEADINGS)
+    psi = np.tile(_courses(_HEADINGS), len(_RATES))
+    against = np.zeros((len(psi), 6))
+    against[:, 0] = -(np.cos(psi) * current[0] + np.sin(psi) * current[1])
+    nu, nu_rate = against.copy(), np.zeros((len(psi), 6))
+    nu[:, 5] = rate
+    sways = line_manner(config) == "held"
+    if sways:
+        against[:, 1] = np.sin(psi) * current[0] - np.cos(psi) * current[1]
+        forward_m, right_m, _ = config.camera.position_body_m
+        nu[:, 0] = against[:, 0] + rate * right_m
+        nu[:, 1] = against[:, 1] - rate * forward_m
+        nu_rate[:, 1] = -rate * against[:, 0]
+        nu_rate[:, 0] = rate * against[:, 1]
+    power = _power(craft, nu, nu_rate=nu_rate, slips=not sways)
+    power = power.reshape(len(_RATES), _HEADINGS).mean(axis=1)
+    can = np.flatnonzero(np.isfinite(power))
+    if not len(can):
+        return math.inf, SPOT_RAD_S
+    return float(power[can[0]]), float(SPOT_RAD_S * _RATES[can[0]])
+
+
+def _sway_step(
+    craft: Vehicle, courses: Array, current: Array, manner: Manner
+) -> tuple[float, Array]:
+    """Speed of a sway step, and its power by course, mean of a step to port and to starboard."""
+    if manner == "crab":
+        return STEP_MPS, np.full(len(courses), np.inf)
+    still = np.zeros((len(_RATES), 6))
+    still[:, 1] = STEP_MPS * _RATES
+    can = np.flatnonzero(np.isfinite(_power(craft, still)))
+    if not len(can):
+        return STEP_MPS, np.full(len(courses), np.inf)
+    step_mps = float(STEP_MPS * _RATES[can[0]])
+    relative = step_mps * np.stack([np.cos(courses), np.sin(courses)], axis=1) - current
+    powers = []
+    for side in (-math.pi / 2, math.pi / 2):
+        heading = courses + side
+        nu = np.zeros((len(courses), 6))
+        nu[:, 0] = np.cos(heading) * relative[:, 0] + np.sin(heading) * relative[:, 1]
+        nu[:, 1] = np.cos(heading) * relative[:, 1] - np.sin(heading) * relative[:, 0]
+        powers.append(_power(craft, nu))
+    return step_mps, (powers[0] + powers[1]) / 2
+
+
+def _heave(craft: Vehicle, current: Array) -> tuple[float, float]:
+    """Rate of descent and ascent, and their mean power, heading into the current and held there."""
+    rates = np.concatenate([_MOST_HEAVE_MPS * _RATES, -_MOST_HEAVE_MPS * _RATES])
+    nu = np.zeros((len(rates), 6))
+    nu[:, 0], nu[:, 2] = math.hypot(*current), rates
+    power = _power(craft, nu).reshape(2, -1).mean(axis=0)
+    can = np.flatnonzero(np.isfinite(power))
+    if not len(can):
+        raise PlanError(
+            f"{craft.name} cannot dive with the vertical thrust it has left: check "
+            "vehicle.thruster_health"
+        )
+    return float(_MOST_HEAVE_MPS * _RATES[can[0]]), float(power[can[0]])
+
+
+def strongest_current_mps(
+    craft: Vehicle, speed_mps: float, towards_rad: float, manner: Manner, most_mps: float = 3.0
+) -> float:
+    """The strongest current in which lines of some heading can be flown both ways.
+
+    Args:
+        craft: what flies.
+        speed_mps: over ground.
+        towards_rad: direction of the current.
+        manner: of flying lines.
+        most_mps: no stronger than this.
+    """
+    direction = np.array([math.cos(towards_rad), math.sin(towards_rad)])
+    courses = towards_rad + _courses()
+    low, high = 0.0, most_mps
+    for _ in range(12):
+        middle = (low + high) / 2
+        power = course_power(craft, courses, speed_mps, middle * direction, manner)
+        low, high = (middle, high) if np.any(_both_ways(power)) else (low, middle)
+    return low
+
+
+def _too_strong(config: SurveyConfig, craft: Vehicle, current: Array, manner: Manner) -> str:
+    speed, size = config.plan.speed_mps, math.hypot(*current)
+    towards = math.atan2(current[1], current[0])
+    towards_deg = math.degrees(towards) % 360.0
+    held = "held by sway" if manner == "held" else "crabbing"
+    strength = strongest_current_mps(craft, speed, towards, manner)
+    courses = towards + _courses()
+    ways = [f"wait for a current below {strength:.2f} m/s (sea.current_mps)"]
+    fit = [
+        each
+        for each in _FASTER
+        if np.any(_both_ways(course_power(craft, courses, each, current, manner)))
+    ]
+    if fit:
+        nearest = min(fit, key=lambda each: abs(each - speed))
+        ways.append(f"set plan.speed_mps to {nearest:g}")
+    if manner == "crab":
+        ways.append("fly alice with controller = 'sway', which holds lines across a current")
+    return (
+        f"a current of {size:.2f} m/s towards {towards_deg:03.0f} deg is above the strength of "
+        f"{craft.name}: at {speed:g} m/s over ground, {held}, lines can be flown both ways in "
+        f"{strength:.2f} m/s at most; " + ", or ".join(ways)
+    )
+
+
+def _wrong_heading(config: SurveyConfig, courses: Array, lines: Array) -> str:
+    size, towards = config.sea.current_mps, config.sea.current_towards_deg
+    can = np.flatnonzero(_both_ways(lines))
+    asked = config.plan.line_heading_deg or 0.0
+    off = np.abs((np.degrees(courses[can]) - asked + 90.0) % 180.0 - 90.0)
+    nearest = math.degrees(courses[can[int(np.argmin(off))]])
+    return (
+        f"lines on {asked:g} deg cannot be flown both ways at {config.plan.speed_mps:g} m/s over "
+        f"ground in a current of {size:.2f} m/s towards {towards:g} deg: the nearest heading that "
+        f"can is {nearest:.0f} deg; change or leave out plan.line_heading_deg"
+    )
