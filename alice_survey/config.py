@@ -69,6 +69,8 @@ class AreaConfig(Config):
     turn_margin_m: float | None = Field(None, ge=0, le=1000)
     seafloor_depth_m: float = Field(15.0, gt=0, le=6000)
     bathymetry_file: Path | None = None
+    bathymetry_values: Literal["auto", "heights", "depths"] = "auto"
+    bathymetry_crs: str | None = None
 
     @model_validator(mode="after")
     def _one_shape(self) -> Self:
@@ -195,6 +197,7 @@ class VehicleConfig(Config):
     battery_wh: float = Field(1400.0, gt=0, le=100_000)
     battery_reserve: float = Field(0.2, ge=0, lt=1)
     hotel_w: float = Field(60.0, ge=0, le=5000)
+    dive: int | None = Field(None, ge=1)
 
 
 class SeaConfig(Config):

@@ -11,6 +11,7 @@ from alice_survey.frames import Array
 from missions.compare import EQUAL, IMPROVED, ORIGINAL, Outcome, Trace
 from missions.compare_reasons import PAPER, CaseResult
 from missions.flight_plots import BAND, draw_lines
+from missions.flight_route import whole_route
 from missions.plan_file import Plan
 
 _AROUND_M = 3.2
@@ -59,7 +60,7 @@ def draw_case(path: Path, plan: Plan, result: CaseResult) -> None:
 
 def _draw_track(axes: Axes, plan: Plan, outcome: Outcome, labelled: bool) -> None:
     draw_lines(axes, plan)
-    route = plan.dives[0].route
+    route = whole_route(plan)
     way = route.places(np.linspace(0.0, route.length_m, 4000))
     axes.plot(way[:, 1], way[:, 0], color=_WAY, lw=0.8, zorder=1, label="planned route")
     track = _trace(outcome).true_ne

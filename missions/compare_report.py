@@ -62,6 +62,8 @@ def compare_report(
     Raises:
         ConfigError: a current or swell is not of that form, or the folder cannot be written.
     """
+    # Turns that both forms of the vehicle can fly.
+    config = changed(config, "plan", turns="arcs")
     if config.plan.line_spacing_m is None:
         config = changed(config, "plan", line_spacing_m=_PAPER_SPACING_M)
     plan = make_plan(config, design_rig(config.camera, config.water))

@@ -1,5 +1,6 @@
 """A flown plan: where the left port was on each line, and when its pictures are taken."""
 
+import itertools
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,6 +10,7 @@ import numpy as np
 from alice_survey.frames import Array, attitude_from_rotation
 from alice_survey.trajectory import Trajectory
 from alice_survey.vehicle.pilot.memory import CROSS, PATH_HEADING
+from alice_survey.vehicle.pilot.standing import STOP_M
 from alice_survey.vehicle.simulator import Flown
 from missions.navigation import NavigationLog
 from missions.plan_file import Plan
@@ -122,10 +124,12 @@ def trigger_times(
 
     Returns:
         (S,) seconds, interpolated between ticks, and the line of each; stations that were never
-        reached are left out.
+        reached are left out. One at a line's end where the vehicle stops is taken when it leaves
+        the line, since it may come to rest a little before it.
     """
     times: list[Array] = []
     lines: list[int] = []
+    stopping = _stops_at_end(plan)
     for index, planned in enumerate(plan.lines):
         rows = np.flatnonzero(line == index)
         if not len(rows):
@@ -135,12 +139,22 @@ def trigger_times(
         ahead = np.array([math.cos(planned.heading_rad), math.sin(planned.heading_rad)])
         along = np.maximum.accumulate((glass_ne[rows] - planned.start_ne_m) @ ahead)
         stations = np.linspace(0.0, planned.length_m, planned.stations)
-        stations = stations[stations <= along[-1]]
+        stations = stations[stations <= along[-1] + (STOP_M if index in stopping else 0.0)]
         # Of equal distances, while the vehicle falls back, the first counts.
         first = np.concatenate([[True], np.diff(along) > 0])
         times.append(np.interp(stations, along[first], time_s[rows][first]))
         lines += [index] * len(stations)
     return np.concatenate([np.empty(0), *times]), tuple(lines)
+
+
+def _stops_at_end(plan: Plan) -> set[int]:
+    """Lines at whose end the vehicle stops: a turn on the spot or a sway step follows at once."""
+    return {
+        leg.line
+        for dive in plan.dives
+        for leg, following in itertools.pairwise(dive.route.legs)
+        if leg.line >= 0 and (following.turn_rad != 0.0 or following.side_rad != 0.0)
+    }
 
 
 def rms(values: Array) -> float:

@@ -14,6 +14,7 @@ from alice_survey.vehicle.navigation import tick as navigation
 from alice_survey.vehicle.pilot.memory import PHASE
 from alice_survey.vehicle.simulator import Flown
 from missions.flight import Flight, rms
+from missions.flight_route import stations_of_dives
 from missions.logs.bag import BagRecord, Samples
 
 _RANGES = ("range_1_m", "range_2_m", "range_3_m", "range_4_m")
@@ -101,7 +102,8 @@ def flight_summary(flight: Flight, config: SurveyConfig) -> dict[str, Any]:
         "ending": flight.ending,
         "duration_s": float(flown.time_s[-1]),
         "stations": len(flight.trigger_s),
-        "stations_planned": plan.stations,
+        "stations_planned": stations_of_dives(plan),
+        "dives": len(plan.dives),
         "stations_off_line": flight.stations_off_line,
         "allowed_cross_track_m": flight.allowed_cross_track_m,
         "on_lines": {

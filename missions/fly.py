@@ -15,6 +15,7 @@ from alice_survey.vehicle.log import write_vehicle_log
 from missions.flight import Flight
 from missions.flight_plots import draw_flight, draw_vehicle
 from missions.flight_records import bag_record, believed_log, flight_summary, true_log
+from missions.flight_route import one_dive, stations_of_dives
 from missions.logs.bag import write_bag
 from missions.navigation import write_navigation
 from missions.plan_file import read_plan
@@ -38,7 +39,7 @@ def run_fly(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     files = (config.sea.current_file, config.vehicle.coefficients_file)
     stage = Stage(
         name="flight",
-        version=2,
+        version=3,
         settings={
             "seed": config.seed,
             "vehicle": config.vehicle.model_dump(mode="json", exclude={"coefficients_file"}),
@@ -62,7 +63,8 @@ def run_fly(workspace: Path, config: SurveyConfig, threads: int) -> bool:
 
 def _steps(folder: Path, plan_path: Path, config: SurveyConfig) -> Iterator[str]:
     """Write the files of a flight, and say after each step what is done."""
-    plan = read_plan(plan_path)
+    plan = one_dive(read_plan(plan_path), config.vehicle.dive)
+    planned = stations_of_dives(plan)
     floor = floor_grid(survey_terrain(config, plan.area.allowed_corners_ne))
     yield "sea floor"
     rng = np.random.default_rng([config.seed, _SEED_STREAM])
@@ -72,9 +74,9 @@ def _steps(folder: Path, plan_path: Path, config: SurveyConfig) -> Iterator[str]
             f"{config.vehicle.name} reached no line of the plan ({flight.ending} after "
             f"{flight.truth.time_s[-1]:.0f} s): change the current, the thrusters or the plan"
         )
-    if len(flight.trigger_s) < plan.stations:
+    if len(flight.trigger_s) < planned:
         warn(
-            f"{len(flight.trigger_s)} of {plan.stations} stations were reached: the mission "
+            f"{len(flight.trigger_s)} of {planned} stations were reached: the mission "
             f"was {flight.ending}"
         )
     if flight.stations_off_line:

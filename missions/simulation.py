@@ -24,9 +24,8 @@ from alice_survey.vehicle.navigation.sensors import (
 )
 from alice_survey.vehicle.pilot.gains import gains_for
 from alice_survey.vehicle.pilot.memory import LINE, PHASE, REASON
-from alice_survey.vehicle.pilot.path import Path, path_from_legs
 from alice_survey.vehicle.pilot.safety import NONE, REASONS, Limits
-from alice_survey.vehicle.pilot.settings import pilot_guidance
+from alice_survey.vehicle.pilot.settings import SPOT_RAD_S, pilot_guidance
 from alice_survey.vehicle.sea import (
     Current,
     Disturbance,
@@ -39,6 +38,7 @@ from alice_survey.vehicle.stability import pitch_divergence_speed_mps
 from alice_survey.vehicle.swell import with_swell
 from alice_survey.vehicle.vehicle import Vehicle
 from missions.flight import Flight, trigger_times
+from missions.flight_route import path_of, turns_on_the_spot
 from missions.navigation import NavigationLog
 from missions.plan_file import Plan
 
@@ -80,7 +80,7 @@ def simulate_plan(
         rng: source of all noise.
 
     Raises:
-        VehicleError: a setting does not fit the vehicle.
+        VehicleError: a setting does not fit the vehicle, or it cannot fly the plan's sway steps.
         NavigationError: the file of the current cannot be read.
     """
     longest_s = longest_mission_s(plan)
@@ -120,6 +120,13 @@ def mission_setup(
             "m/s: lower the speed"
         )
     path = path_of(plan)
+    turns = turns_on_the_spot(path)
+    if turns and config.vehicle.controller == "los":
+        warn(
+            f"{craft.name} cannot push itself sideways under the controller los: in each of the "
+            f"{turns} turns on the spot it swings off its place and drifts with the current; "
+            "plan.turns = 'arcs' suits it better"
+        )
     # A floor is followed down to two altitudes below the planned one.
     deepest_m = plan.seafloor_depth_m + plan.altitude_m
     # The pilot flies as well as the thrusters allow that he knows to be sound.
@@ -132,6 +139,7 @@ def mission_setup(
         config.vehicle.controller,
         most_depth_m=deepest_m,
         point_body_m=config.camera.position_body_m,
+        spot_rad_s=min(SPOT_RAD_S, math.radians(config.plan.turn_rate_limit_deg_s)),
         limits=Limits(
             0.5 * plan.altitude_m,
             deepest_m,
@@ -139,7 +147,7 @@ def mission_setup(
             blind_depth_m=max(plan.seafloor_depth_m - _BLIND_ALTITUDES * plan.altitude_m, 0.0),
         ),
     )
-    gust, heading_rad = config.sea.gust_n, float(path.heading_rad[0])
+    gust, heading_rad = config.sea.gust_n, float(path.heading_rad[0] + path.side_rad[0])
     # The vehicle is let go where its left port is above the start of the route.
     glass_ned = rotation_from_attitude(0.0, 0.0, heading_rad).apply(config.camera.position_body_m)
     start_ne = np.array([path.start_n[0], path.start_e[0]]) - glass_ned[:2]
@@ -172,20 +180,6 @@ def craft_of(settings: VehicleConfig) -> Vehicle:
     if file is None:
         return vehicle(settings.name, settings.coefficients)
     return vehicle(settings.name).with_coefficients(coefficients_from_file(file))
-
-
-def path_of(plan: Plan) -> Path:
-    """The route of a plan for the pilot."""
-    legs = plan.dives[0].route.legs
-    return path_from_legs(
-        [leg.start_ne_m for leg in legs],
-        [leg.heading_rad for leg in legs],
-        [leg.length_m for leg in legs],
-        [leg.curvature_per_m for leg in legs],
-        [leg.line for leg in legs],
-        plan.altitude_m,
-        plan.speed_mps,
-    )
 
 
 def current_of(
