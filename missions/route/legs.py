@@ -1,23 +1,43 @@
-"""The way as a value: straights, arcs and turns on the spot."""
+"""The way as a value: straights, arcs, turns on the spot and sway steps.
+
+What a vehicle does at each leg, by what its fields say:
+
+- straight (`length_m` > 0, all else 0): it goes ahead along its course at the plan's speed. It
+  stops at the leg's end if a turn on the spot or a sway step follows, and starts from rest if one
+  came before; otherwise it passes both ends at speed.
+- arc (`curvature_per_m` not 0): likewise, on a circle; at most one full turn.
+- turn on the spot (`turn_rad` not 0; length, curvature and side 0): it stands at `start_ne_m`,
+  turns by `turn_rad` from `heading_rad` the way its sign says (positive to starboard), and stands
+  still again. At most half a turn.
+- sway step (`side_rad` exactly +-pi/2; curvature and turn 0): it stands, moves sideways along its
+  course at `Costs.sway_mps` with its heading held at `heading_rad + side_rad`, and stands again:
+  with +pi/2 it moves to port, with -pi/2 to starboard.
+
+`Costs.settle_s` is what each turn on the spot and each sway step takes beside its motion: braking
+before, coming to rest after, and speeding up again.
+"""
 
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.frames import Array
 
+LegKind = Literal["straight", "arc", "spot", "sway"]
 
-@dataclass(frozen=True, kw_only=True)
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class Leg:
-    """A straight, an arc, or a turn on the spot.
+    """A straight, an arc, a turn on the spot or a sway step.
 
-    The vehicle's heading (`heading_rad + side_rad`) is continuous from leg to leg. Its course may
-    change at once where a turn on the spot or a sway step begins or ends: there it stops.
+    The vehicle's heading (`heading_rad + side_rad`) is continuous from leg to leg, but for full
+    turns. Its course may change at once where a turn on the spot or a sway step begins or ends:
+    there it stops.
     """
 
     start_ne_m: tuple[float, float]
@@ -34,6 +54,15 @@ class Leg:
     side_rad: float = 0.0
     """The vehicle's heading less the course: 0 where it goes ahead, +-pi/2 in a sway step."""
 
+    @property
+    def kind(self) -> LegKind:
+        """Which of the four it is."""
+        if self.turn_rad:
+            return "spot"
+        if self.side_rad:
+            return "sway"
+        return "arc" if self.curvature_per_m else "straight"
+
     def places(self, along_m: Array) -> Array:
         """Where the path is, (N, 2) north and east, after distances (N,) from the leg's start."""
         k = self.curvature_per_m
@@ -48,8 +77,11 @@ class Leg:
     @property
     def end_ne_m(self) -> tuple[float, float]:
         """Where it ends."""
-        north, east = self.places(np.array([self.length_m]))[0]
-        return float(north), float(east)
+        half = self.curvature_per_m * self.length_m / 2
+        chord = self.length_m if half == 0.0 else self.length_m * math.sin(half) / half
+        mean = self.heading_rad + half
+        north, east = self.start_ne_m
+        return north + chord * math.cos(mean), east + chord * math.sin(mean)
 
     @property
     def end_heading_rad(self) -> float:
@@ -130,3 +162,33 @@ class Route:
         """Distance along the route at which each line of the plan starts."""
         starts = zip(self.legs, self.starts_m, strict=False)
         return {leg.line: float(start) for leg, start in starts if leg.line >= 0}
+
+    @property
+    def spot_turns(self) -> int:
+        """How often the vehicle turns on the spot."""
+        return sum(leg.turn_rad != 0.0 for leg in self.legs)
+
+    @property
+    def sway_steps(self) -> int:
+        """How often it steps sideways."""
+        return sum(leg.side_rad != 0.0 for leg in self.legs)
+
+    @property
+    def arc_turns(self) -> int:
+        """How often it turns while going ahead: arcs in a row count once."""
+        arcs = [leg.kind == "arc" for leg in self.legs]
+        return sum(arc and not before for before, arc in zip([False, *arcs], arcs, strict=False))
+
+    def polyline_ne(self, step_m: float) -> Array:
+        """The route as places (K, 2), for maps: all ends of legs, and points on the arcs between.
+
+        Args:
+            step_m: along an arc from point to point, at most.
+        """
+        places = [np.array([leg.start_ne_m for leg in self.legs[:1]]).reshape(-1, 2)]
+        for leg in self.legs:
+            if leg.length_m == 0.0:
+                continue
+            steps = math.ceil(leg.length_m / step_m) if leg.curvature_per_m else 1
+            places.append(leg.places(leg.length_m * np.arange(1, steps + 1) / steps))
+        return np.concatenate(places)

@@ -1,150 +1,161 @@
-"""The way through a plan: straight along its lines, and the shortest turns of bounded curvature.
+"""The way through a plan: from home along its lines in order, and home again.
 
-Between lines the vehicle takes the shortest path of straights and arcs of one radius (L. E. Dubins,
-1957; closed forms after A. M. Shkel and V. Lumelsky, 2001). Each line has a straight run-in and
-run-out, so that the vehicle is steady when pictures begin.
+Between two lines the vehicle flies arcs (straight on after the line, a turn of bounded curvature,
+straight on before the next), or stops and turns on the spot, or stops and steps sideways: whichever
+costs least and stays inside the allowed area. Where none of them does, it stops and goes from
+corner to corner of the shortest way inside.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 
-from alice_survey.errors import PlanError
+from alice_survey.errors import PlanError, warn
+from alice_survey.frames import Array
 from missions.lines.line import Line
+from missions.route import joins
+from missions.route.costs import Costs, time_costs
+from missions.route.fence import OPEN_WATER, straight_inside
 from missions.route.legs import Leg, Route
+from missions.route.ways import Ways
 
-_SAME_M = 1e-6
-_TINY_M = 1e-9
-_SAME_RAD = 1e-9
-_FULL = 2 * math.pi
+Turns = Literal["auto", "arcs", "spot", "sway"]
+
+PAPER_SPEED_MPS = 0.2
+"""Gutnik et al. 2021, section VII.A."""
+_WANTED = {"auto": joins.NONE, "arcs": joins.ARCS, "spot": joins.SPOT, "sway": joins.SWAY}
+_FREE = math.nan
 
 
-def route_through(lines: Sequence[Line], turn_radius_m: float, run_in_m: float) -> Route:
+def route_through(
+    lines: Sequence[Line],
+    turn_radius_m: float,
+    run_in_m: float,
+    *,
+    ways: Ways | None = None,
+    costs: Costs | None = None,
+    turns: Turns = "auto",
+    home_ne: tuple[float, float] | None = None,
+    first_line: int = 0,
+) -> Route:
     """The route along all lines in order.
 
     Args:
         lines: in the order of flight.
         turn_radius_m: of every arc.
-        run_in_m: straight before and after each line.
+        run_in_m: straight before each line, and after it where arcs follow; after a stop it is left
+            out where it is not inside the allowed area.
+        ways: inside the allowed area; None: nothing is forbidden.
+        costs: what to keep low; None: time, at the paper's speed.
+        turns: how to turn wherever that is possible; auto: the cheapest way.
+        home_ne: where the route begins and ends; None: at the first line's run-in, and run-out
+            behind the last.
+        first_line: index of the first of these lines in the plan.
 
     Raises:
-        PlanError: there is no line.
+        PlanError: there is no line, a line leaves the allowed area, or two places are in parts of
+            it that are not connected.
     """
     if not lines:
         raise PlanError("there is no line to fly")
-    start = _moved(lines[0].start_ne_m, lines[0], -run_in_m)
-    legs = [_straight(start, lines[0], run_in_m)]
-    for index, line in enumerate(lines):
-        legs.append(
-            Leg(
-                start_ne_m=line.start_ne_m,
-                heading_rad=line.heading_rad,
-                length_m=line.length_m,
-                curvature_per_m=0.0,
-                line=index,
-            )
+    table = np.array([(*x.start_ne_m, *x.end_ne_m, x.heading_rad) for x in lines])
+    fence = OPEN_WATER if ways is None else ways.fence
+    if ways is not None:
+        _check_lines(table, ways, first_line)
+    prices = joins.prices(time_costs(PAPER_SPEED_MPS) if costs is None else costs)
+    wanted = _WANTED[turns]
+    legs, rows, kinds = joins.joined_lines(fence, prices, table, turn_radius_m, run_in_m, wanted)
+    legs[rows, 5] += first_line
+    start, end = table[0, [0, 1, 4]], table[-1, 2:]
+    if home_ne is None:
+        arrival = joins.run_in_start(fence, start, run_in_m)
+        first = _straight(arrival, start[:2], start[2])
+        leaving = end[:2] + run_in_m * np.array([math.cos(end[2]), math.sin(end[2])])
+        if not straight_inside(fence, end[0], end[1], leaving[0], leaving[1]):
+            leaving = end[:2]
+        last = _straight(end[:2], leaving, end[2])
+    else:
+        home = np.array([*home_ne, _FREE])
+        both = []
+        for a, b in ((home, start), (end, home)):
+            kind, way = joins.join(fence, prices, a, b, turn_radius_m, run_in_m, run_in_m, wanted)
+            both.append(_round_corners(ways, a, b, run_in_m) if kind == joins.NONE else way)
+        first, last = both
+    pieces = [first]
+    done = 0
+    for i in np.flatnonzero(kinds == joins.NONE).tolist():
+        pieces.append(legs[done : rows[i + 1]])
+        done = rows[i + 1]
+        pieces.append(_round_corners(ways, table[i, 2:], table[i + 1, [0, 1, 4]], run_in_m))
+    pieces += [legs[done:], last]
+    _warn_of_others(kinds, turns)
+    return Route(legs=_legs(np.concatenate(pieces)))
+
+
+def _check_lines(table: Array, ways: Ways, first_line: int) -> None:
+    outside = np.flatnonzero(~ways.free_many(table[:, :2], table[:, 2:4]))
+    if len(outside):
+        n_0, e_0, n_1, e_1, _ = table[outside[0]]
+        raise PlanError(
+            f"{len(outside)} of {len(table)} lines leave the allowed area, first line "
+            f"{first_line + outside[0]} from {n_0:.2f} m north, {e_0:.2f} m east to {n_1:.2f}, "
+            f"{e_1:.2f}: widen area.allowed"
         )
-        following = lines[index + 1] if index + 1 < len(lines) else None
-        if following is not None and _goes_on(line, following):
-            gap_m = math.dist(line.end_ne_m, following.start_ne_m)
-            legs.append(_straight(line.end_ne_m, line, gap_m))
-            continue
-        legs.append(_straight(line.end_ne_m, line, run_in_m))
-        if following is not None:
-            goal = _moved(following.start_ne_m, following, -run_in_m)
-            legs += turn(
-                legs[-1].end_ne_m, line.heading_rad, goal, following.heading_rad, turn_radius_m
-            )
-            legs.append(_straight(goal, following, run_in_m))
-    return Route(legs=tuple(leg for leg in legs if leg.length_m > _TINY_M))
 
 
-def turn(
-    start_ne_m: tuple[float, float],
-    start_heading_rad: float,
-    goal_ne_m: tuple[float, float],
-    goal_heading_rad: float,
-    radius_m: float,
-) -> list[Leg]:
-    """The shortest path between two places with headings, of straights and arcs of one radius."""
-    north, east = np.subtract(goal_ne_m, start_ne_m) / radius_m
-    distance, bearing = math.hypot(north, east), math.atan2(east, north)
-    alpha = (start_heading_rad - bearing) % _FULL
-    beta = (goal_heading_rad - bearing) % _FULL
-    best: list[Leg] | None = None
-    for turns, lengths in _words(alpha, beta, distance):
-        legs: list[Leg] = []
-        place, heading = start_ne_m, start_heading_rad
-        for sense, length in zip(turns, lengths, strict=True):
-            leg = Leg(
-                start_ne_m=place,
-                heading_rad=heading,
-                length_m=length * radius_m,
-                curvature_per_m=sense / radius_m,
-                line=-1,
-            )
-            legs.append(leg)
-            place, heading = leg.end_ne_m, leg.end_heading_rad
-        total = sum(leg.length_m for leg in legs)
-        if math.dist(place, goal_ne_m) > _SAME_M * (1 + total):
-            continue  # a closed form outside of its domain
-        if best is None or total < sum(leg.length_m for leg in best) - _TINY_M:
-            best = legs
-    if best is None:
-        raise PlanError(f"no turn of radius {radius_m:g} m from {start_ne_m} to {goal_ne_m}")
-    return best
+def _round_corners(ways: Ways | None, end: Array, goal: Array, run_in_m: float) -> Array:
+    """Legs from a line's end to the next, round the corners of the allowed area, (L, 8)."""
+    if ways is None:
+        raise RuntimeError("in open water a direct way is always found")
+    arrival = joins.run_in_start(ways.fence, goal, run_in_m)
+    path = ways.path_ne((float(end[0]), float(end[1])), (float(arrival[0]), float(arrival[1])))
+    legs = np.empty((2 * len(path) + 2, joins.COLUMNS))
+    used, heading = 0, float(end[2])
+    for here, there in zip(path[:-1].tolist(), path[1:].tolist(), strict=True):
+        before = used
+        used = joins.add_straight(legs, used, *here, heading, *there)
+        if used > before:
+            heading = float(legs[used - 1, 2])
+    used = joins.add_spot(legs, used, *arrival.tolist(), heading, float(goal[2]))
+    return np.concatenate([legs[:used], _straight(arrival, goal[:2], goal[2])])
 
 
-def _words(
-    alpha: float, beta: float, distance: float
-) -> Iterator[tuple[tuple[int, int, int], tuple[float, float, float]]]:
-    """Lengths of the six kinds of shortest path, in radii; senses are +1 starboard, -1 port."""
-    for side in (1, -1):  # port is the mirror image of starboard
-        a, b = side * alpha, side * beta
-        sa, ca, sb, cb = math.sin(a), math.cos(a), math.sin(b), math.cos(b)
-        cab = math.cos(a - b)
-        across = math.atan2(cb - ca, distance + sa - sb)
-        square = 2 + distance**2 - 2 * cab + 2 * distance * (sa - sb)
-        if square >= -_TINY_M:
-            straight = math.sqrt(max(square, 0.0))
-            yield (side, 0, side), (_wrap(across - a), straight, _wrap(b - across))
-        cosine = (6 - distance**2 + 2 * cab - 2 * distance * (sa - sb)) / 8
-        if abs(cosine) <= 1:
-            middle = _FULL - math.acos(cosine)
-            first = _wrap(across - a + middle / 2)
-            yield (side, -side, side), (first, middle, _wrap(b - a - first + middle))
-        square = -2 + distance**2 + 2 * cab + 2 * distance * (sa + sb)
-        if square >= -_TINY_M:
-            straight = math.sqrt(max(square, 0.0))
-            across = math.atan2(-ca - cb, distance + sa + sb) - math.atan2(-2.0, straight)
-            yield (side, 0, -side), (_wrap(across - a), straight, _wrap(across - b))
+def _straight(start_ne: Array, end_ne: Array, heading: float) -> Array:
+    """The leg between two places that are ahead of one another, (1, 8); none if they are one."""
+    length = math.dist(start_ne, end_ne)
+    leg = np.array([[*start_ne, heading, length, 0.0, -1.0, 0.0, 0.0]])
+    return leg if length > 1e-9 else leg[:0]
 
 
-def _wrap(angle_rad: float) -> float:
-    """The angle in [0, 2 pi), with 0 for what is a full turn but for rounding."""
-    wrapped = angle_rad % _FULL
-    return 0.0 if _FULL - wrapped < _SAME_RAD else wrapped
-
-
-def _goes_on(line: Line, following: Line) -> bool:
-    """Whether a line lies straight ahead of another."""
-    ahead = np.array([math.cos(line.heading_rad), math.sin(line.heading_rad)])
-    gap = np.subtract(following.start_ne_m, line.end_ne_m)
-    same_way = math.cos(line.heading_rad - following.heading_rad) > 1 - 1e-12
-    return bool(same_way and ahead @ gap >= 0 and abs(ahead[0] * gap[1] - ahead[1] * gap[0]) < 1e-6)
-
-
-def _moved(place: tuple[float, float], line: Line, along_m: float) -> tuple[float, float]:
-    heading = line.heading_rad
-    return place[0] + along_m * math.cos(heading), place[1] + along_m * math.sin(heading)
-
-
-def _straight(place: tuple[float, float], line: Line, length_m: float) -> Leg:
-    return Leg(
-        start_ne_m=place,
-        heading_rad=line.heading_rad,
-        length_m=length_m,
-        curvature_per_m=0.0,
-        line=-1,
+def _legs(table: Array) -> tuple[Leg, ...]:
+    return tuple(
+        Leg(
+            start_ne_m=(north, east),
+            heading_rad=course,
+            length_m=length,
+            curvature_per_m=curvature,
+            line=int(line),
+            turn_rad=turn,
+            side_rad=side,
+        )
+        for north, east, course, length, curvature, line, turn, side in table.tolist()
     )
+
+
+def _warn_of_others(kinds: Array, turns: Turns) -> None:
+    """Tell how many turns are not as asked for."""
+    if turns == "auto":
+        return
+    asked = kinds[kinds != joins.AHEAD]
+    as_wanted = asked == _WANTED[turns]
+    if turns == "spot":
+        as_wanted |= asked == joins.NONE  # round corners, and on the spot at each
+    others = int((~as_wanted).sum())
+    if others:
+        warn(
+            f"{others} of {len(asked)} turns have no room for turns = {turns!r} inside the allowed "
+            "area or are too far for it: the cheapest other way is taken there; widen area.allowed "
+            "or set plan.turns = 'auto'"
+        )

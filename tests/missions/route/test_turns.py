@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 
 from alice_survey.errors import PlanError
 from missions.lines.line import Line
+from missions.route.dubins import turn
 from missions.route.legs import Leg
-from missions.route.turns import route_through, turn
+from missions.route.turns import route_through
 
 places = st.tuples(st.floats(-10, 10), st.floats(-10, 10))
 angles = st.floats(-math.pi, math.pi)

@@ -1,0 +1,373 @@
+"""From one line to the next: arcs, a turn on the spot, or a step sideways, whichever costs least.
+
+Compiled, for plans of many thousand lines. All that is tried here is direct: a way round corners of
+the allowed area is for the caller (`turns.route_through`).
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from alice_survey.frames import Array
+from missions.route.costs import Costs
+from missions.route.dubins import moved, shortest_turn
+from missions.route.fence import Fence, straight_inside
+
+NONE, AHEAD, ARCS, SPOT, SWAY = 0, 1, 2, 3, 4
+"""How two lines are joined; nothing direct, and straight on."""
+
+LONGEST_SWAY_M = 5.0
+"""Of a sway step. Chosen: some line spacings; farther the vehicle had better go ahead, since its
+lateral thrusters and its side's drag are made for correction, not for transit."""
+
+COLUMNS = 8
+"""Of a leg: north, east, course, length, curvature, line, turn, side."""
+_MOST_LEGS = 8
+_TINY = 1e-9
+_SAME_M = 1e-6
+_DEAR_J = 1e15
+"""Beyond any battery: stands for an infinite cost, so that of two such the shorter is chosen."""
+
+
+class Prices(NamedTuple):
+    """`Costs` as compiled code takes them."""
+
+    speed_mps: float
+    way_w: Array
+    spot_w: float
+    turn_rate_rad_s: float
+    settle_s: float
+    sway_mps: float
+    sway_w: Array
+
+
+def prices(costs: Costs) -> Prices:
+    """The part of the costs that the choice of a turn depends on."""
+    return Prices(
+        speed_mps=float(costs.speed_mps),
+        way_w=np.ascontiguousarray(costs.way_w, dtype=np.float64),
+        spot_w=float(costs.spot_w),
+        turn_rate_rad_s=float(costs.turn_rate_rad_s),
+        settle_s=float(costs.settle_s),
+        sway_mps=float(costs.sway_mps),
+        sway_w=np.ascontiguousarray(costs.sway_w, dtype=np.float64),
+    )
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def joined_lines(
+    fence: Fence, prices: Prices, lines: Array, radius: float, run_in: float, wanted: int
+) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
+    """The legs along all lines and between them.
+
+    Args:
+        fence: of the allowed area.
+        prices: what to keep low.
+        lines: (N, 5) north and east of start and end, heading.
+        radius: of arcs.
+        run_in: straight before and, for arcs, after each line.
+        wanted: `ARCS`, `SPOT` or `SWAY`, taken wherever they are possible; `NONE` for the cheapest.
+
+    Returns:
+        (L, 8) legs; (N,) the row of each line's own leg; (N - 1,) how lines are joined, `NONE`
+        where nothing direct stays inside (then there are no legs between the two).
+    """
+    count = lines.shape[0]
+    legs = np.empty((count * (_MOST_LEGS + 1), COLUMNS))
+    rows = np.empty(count, dtype=np.int64)
+    kinds = np.zeros(max(count - 1, 0), dtype=np.int64)
+    used = 0
+    for i in range(count):
+        rows[i] = used
+        length = math.hypot(lines[i, 2] - lines[i, 0], lines[i, 3] - lines[i, 1])
+        used = _add(legs, used, lines[i, 0], lines[i, 1], lines[i, 4], length, 0.0)
+        legs[rows[i], 5] = i
+        if i + 1 < count:
+            end = np.array([lines[i, 2], lines[i, 3], lines[i, 4]])
+            goal = np.array([lines[i + 1, 0], lines[i + 1, 1], lines[i + 1, 4]])
+            kinds[i], made = join(fence, prices, end, goal, radius, run_in, run_in, wanted)
+            legs[used : used + made.shape[0]] = made
+            used += made.shape[0]
+    return legs[:used], rows, kinds
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def join(
+    fence: Fence,
+    prices: Prices,
+    end: Array,
+    goal: Array,
+    radius: float,
+    run_out: float,
+    run_in: float,
+    wanted: int,
+) -> tuple[int, Array]:
+    """The cheapest direct way from the end of a line to the start of the next.
+
+    Args:
+        fence: of the allowed area.
+        prices: what to keep low.
+        end: (3,) north, east, heading at the end of the line; a heading of NaN is free (home).
+        goal: (3,) likewise at the start of the next.
+        radius: of arcs.
+        run_out: straight after the line if arcs follow.
+        run_in: straight before the next line; after a stop only where it is inside.
+        wanted: as of `joined_lines`.
+
+    Returns:
+        How, and (L, 8) legs.
+    """
+    if _goes_on(end, goal) and straight_inside(fence, end[0], end[1], goal[0], goal[1]):
+        ahead = np.empty((1, COLUMNS))
+        gap = math.hypot(goal[0] - end[0], goal[1] - end[1])
+        return AHEAD, ahead[: _add(ahead, 0, end[0], end[1], end[2], gap, 0.0)]
+    arcs_j, arcs = _by_arcs(fence, prices, end, goal, radius, run_out, run_in)
+    if wanted == ARCS and arcs_j < np.inf:
+        return ARCS, arcs
+    spot_j, spot = _on_the_spot(fence, prices, end, goal, run_in)
+    sway_j, sway = _sideways(fence, prices, end, goal, run_in)
+    if wanted == SPOT:
+        # Where the straight is blocked, turns on the spot round the corners are the caller's.
+        return (SPOT if spot_j < np.inf else NONE), spot
+    if wanted == SWAY and sway_j < np.inf:
+        return SWAY, sway
+    if arcs_j < np.inf and arcs_j <= min(spot_j, sway_j):
+        return ARCS, arcs
+    if spot_j < np.inf and spot_j <= sway_j:
+        return SPOT, spot
+    if sway_j < np.inf:
+        return SWAY, sway
+    return NONE, spot
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _by_arcs(
+    fence: Fence,
+    prices: Prices,
+    end: Array,
+    goal: Array,
+    radius: float,
+    run_out: float,
+    run_in: float,
+) -> tuple[float, Array]:
+    """Run-out, the shortest turn, run-in; infinite if it leaves the fence."""
+    legs = np.empty((5, COLUMNS))
+    # Home is left and reached on the course straight to or from the other end.
+    start, arrival = end.copy(), goal.copy()
+    if not math.isnan(end[2]):
+        start[0] += run_out * math.cos(end[2])
+        start[1] += run_out * math.sin(end[2])
+    if not math.isnan(goal[2]):
+        arrival[0] -= run_in * math.cos(goal[2])
+        arrival[1] -= run_in * math.sin(goal[2])
+    bearing = math.atan2(arrival[1] - start[1], arrival[0] - start[0])
+    if math.isnan(end[2]):
+        start[2] = bearing
+    else:
+        if not straight_inside(fence, end[0], end[1], start[0], start[1]):
+            return np.inf, legs[:0]
+    if math.isnan(goal[2]):
+        arrival[2] = bearing
+    else:
+        if not straight_inside(fence, arrival[0], arrival[1], goal[0], goal[1]):
+            return np.inf, legs[:0]
+    pieces = shortest_turn(fence, start, arrival, radius)
+    if pieces[0, 1] == np.inf:
+        return np.inf, legs[:0]
+    used = 0
+    if not math.isnan(end[2]):
+        used = _add(legs, used, end[0], end[1], end[2], run_out, 0.0)
+    north, east, heading = start[0], start[1], start[2]
+    for k in range(3):
+        curvature, length = pieces[k, 0], pieces[k, 1]
+        used = _add(legs, used, north, east, heading, length, curvature)
+        north, east, heading = moved(north, east, heading, curvature, length)
+    if not math.isnan(goal[2]):
+        used = _add(legs, used, arrival[0], arrival[1], arrival[2], run_in, 0.0)
+    return _price(prices, legs[:used]), legs[:used]
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _on_the_spot(
+    fence: Fence, prices: Prices, end: Array, goal: Array, run_in: float
+) -> tuple[float, Array]:
+    """Turn, straight, turn, run-in; infinite if it leaves the fence."""
+    legs = np.empty((4, COLUMNS))
+    arrival = run_in_start(fence, goal, run_in)
+    if not straight_inside(fence, end[0], end[1], arrival[0], arrival[1]):
+        return np.inf, legs[:0]
+    used = add_straight(legs, 0, end[0], end[1], end[2], arrival[0], arrival[1])
+    heading = end[2] if used == 0 else legs[used - 1, 2]
+    used = add_spot(legs, used, arrival[0], arrival[1], heading, goal[2])
+    if not math.isnan(goal[2]):
+        back = math.hypot(goal[0] - arrival[0], goal[1] - arrival[1])
+        used = _add(legs, used, arrival[0], arrival[1], goal[2], back, 0.0)
+    return _price(prices, legs[:used]), legs[:used]
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _sideways(
+    fence: Fence, prices: Prices, end: Array, goal: Array, run_in: float
+) -> tuple[float, Array]:
+    """Ahead, a step sideways, a turn if the headings differ, ahead to the line.
+
+    Infinite if it leaves the fence, the step is too long, or the vehicle would have to go astern.
+    """
+    legs = np.empty((4, COLUMNS))
+    if math.isnan(end[2]) or math.isnan(goal[2]):
+        return np.inf, legs[:0]
+    cos, sin = math.cos(end[2]), math.sin(end[2])
+    along = math.cos(goal[2]) * cos + math.sin(goal[2]) * sin
+    arrival = run_in_start(fence, goal, run_in)
+    last = math.hypot(goal[0] - arrival[0], goal[1] - arrival[1])
+    first = (arrival[0] - end[0]) * cos + (arrival[1] - end[1]) * sin
+    if first < 0.0:
+        # Step at the line's end, and make good for it by another length of run-in.
+        if abs(along) < _TINY:
+            return np.inf, legs[:0]
+        last += first / along
+        if last < 0.0:
+            return np.inf, legs[:0]
+        first = 0.0
+        arrival[0] = goal[0] - last * math.cos(goal[2])
+        arrival[1] = goal[1] - last * math.sin(goal[2])
+    corner_n, corner_e = end[0] + first * cos, end[1] + first * sin
+    step = (arrival[1] - corner_e) * cos - (arrival[0] - corner_n) * sin
+    if abs(step) > LONGEST_SWAY_M or abs(step) < _SAME_M:
+        return np.inf, legs[:0]
+    if not (
+        straight_inside(fence, end[0], end[1], corner_n, corner_e)
+        and straight_inside(fence, corner_n, corner_e, arrival[0], arrival[1])
+        and straight_inside(fence, arrival[0], arrival[1], goal[0], goal[1])
+    ):
+        return np.inf, legs[:0]
+    used = _add(legs, 0, end[0], end[1], end[2], first, 0.0)
+    side = -0.5 * math.pi if step > 0 else 0.5 * math.pi
+    _add(legs, used, corner_n, corner_e, end[2] - side, abs(step), 0.0)
+    legs[used, 7] = side
+    used = add_spot(legs, used + 1, arrival[0], arrival[1], end[2], goal[2])
+    used = _add(legs, used, arrival[0], arrival[1], goal[2], last, 0.0)
+    sway_j = _power(prices.sway_w, end[2] - side)
+    if sway_j == np.inf:
+        return np.inf, legs[:0]
+    return _price(prices, legs[:used]), legs[:used]
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def run_in_start(fence: Fence, goal: Array, run_in: float) -> Array:
+    """Where the run-in to a line begins: at the line itself where there is no room for it."""
+    start = goal[:2].copy()
+    if not math.isnan(goal[2]):
+        start[0] -= run_in * math.cos(goal[2])
+        start[1] -= run_in * math.sin(goal[2])
+        if not straight_inside(fence, start[0], start[1], goal[0], goal[1]):
+            start[:] = goal[:2]
+    return start
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def add_straight(
+    legs: Array, used: int, a_n: float, a_e: float, heading: float, b_n: float, b_e: float
+) -> int:
+    """Turn on the spot towards a place and go there; returns the count of legs."""
+    length = math.hypot(b_n - a_n, b_e - a_e)
+    if length <= _TINY:
+        return used
+    course = math.atan2(b_e - a_e, b_n - a_n)
+    used = add_spot(legs, used, a_n, a_e, heading, course)
+    return int(_add(legs, used, a_n, a_e, course, length, 0.0))
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def add_spot(
+    legs: Array, used: int, north: float, east: float, heading: float, goal_heading: float
+) -> int:
+    """Turn on the spot, if the headings differ and neither is free; returns the count of legs."""
+    turn = goal_heading - heading
+    turn -= 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))
+    if math.isnan(turn) or abs(turn) < _TINY:
+        return used
+    legs[used] = 0.0
+    legs[used, 0], legs[used, 1], legs[used, 2] = north, east, heading
+    legs[used, 5], legs[used, 6] = -1.0, turn
+    return used + 1
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _add(
+    legs: Array,
+    used: int,
+    north: float,
+    east: float,
+    course: float,
+    length: float,
+    curvature: float,
+) -> int:
+    """Add a straight or an arc, unless it is of no length; returns the count of legs."""
+    if length <= _TINY:
+        return used
+    legs[used, 0], legs[used, 1], legs[used, 2] = north, east, course
+    legs[used, 3], legs[used, 4], legs[used, 5] = length, curvature, -1.0
+    legs[used, 6], legs[used, 7] = 0.0, 0.0
+    return used + 1
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _goes_on(end: Array, goal: Array) -> bool:
+    """Whether a line lies straight ahead of another; never of a free heading."""
+    if not math.cos(end[2] - goal[2]) > 1 - 1e-12:
+        return False
+    north, east = goal[0] - end[0], goal[1] - end[1]
+    cos, sin = math.cos(end[2]), math.sin(end[2])
+    return bool(cos * north + sin * east >= 0 and abs(cos * east - sin * north) < _SAME_M)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _price(prices: Prices, legs: Array) -> float:
+    """Energy of legs between lines; never infinite, but dear beyond anything where it were."""
+    total = 0.0
+    for i in range(legs.shape[0]):
+        course, length, curvature = legs[i, 2], legs[i, 3], legs[i, 4]
+        if legs[i, 6] != 0.0:
+            total += prices.spot_w * (abs(legs[i, 6]) / prices.turn_rate_rad_s + prices.settle_s)
+        elif legs[i, 7] != 0.0:
+            total += length / prices.sway_mps * _power(prices.sway_w, course)
+            total += prices.spot_w * prices.settle_s
+        else:
+            mean = _mean_power(prices.way_w, course, course + curvature * length)
+            seconds = length / prices.speed_mps
+            total += seconds * mean if mean < np.inf else _DEAR_J * (1.0 + seconds)
+    return total
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _power(power_w: Array, course: float) -> float:
+    """Power at a course, between the even samples of a full turn."""
+    count = power_w.shape[0]
+    place = course / (2.0 * math.pi) * count
+    low = math.floor(place)
+    share = place - low
+    one, two = power_w[int(low) % count], power_w[(int(low) + 1) % count]
+    value: float = one if share == 0.0 else (1.0 - share) * one + share * two
+    return value
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _mean_power(power_w: Array, start: float, end: float) -> float:
+    """Mean power from a course to another, over the samples passed through."""
+    count = power_w.shape[0]
+    per_rad = count / (2.0 * math.pi)
+    low, high = min(start, end) * per_rad, max(start, end) * per_rad
+    if high - low < 1e-6:
+        return float(_power(power_w, 0.5 * (start + end)))
+    total, place = 0.0, low
+    while place < high:
+        following = min(high, math.floor(place) + 1.0)
+        if following - place > 1e-12:
+            total += (following - place) * _power(power_w, 0.5 * (place + following) / per_rad)
+        place = following
+    mean: float = total / (high - low)
+    return mean
