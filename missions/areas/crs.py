@@ -1,5 +1,6 @@
 """Coordinate systems: from those of files and settings to latitude and longitude, then to NED."""
 
+import contextlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -118,10 +119,10 @@ def check_finite(corners: Array, origin: str, name: str) -> None:
 
 
 def geographic_shapes(raw: RawShapes, crs: Any) -> RawShapes:
-    """Take shapes with x = east (or longitude) and y = north (or latitude) to WGS 84.
+    """Take shapes of any coordinate system to WGS 84.
 
     Args:
-        raw: shapes whose coordinates are the file's own x and y.
+        raw: shapes whose coordinates are y (north, latitude) before x (east, longitude).
         crs: a `pyproj.CRS`.
 
     Returns:
@@ -143,22 +144,24 @@ def geographic_shapes(raw: RawShapes, crs: Any) -> RawShapes:
         ) from None
     accuracy_m: list[float] = []
 
-    def change(xy: Array, name: str) -> Array:
-        if not len(xy):
-            return xy
-        check_finite(xy, raw.origin, name)
+    def change(yx: Array, name: str) -> Array:
+        if not len(yx):
+            return yx
+        check_finite(yx, raw.origin, name)
         if flat.is_geographic:
-            _check_degrees(xy, raw.origin, name, crs)
-        lon, lat = transformer.transform(xy[:, 0], xy[:, 1])
+            _check_degrees(yx, raw.origin, name, crs)
+        lon, lat = transformer.transform(yx[:, 1], yx[:, 0])
         lat_lon = np.column_stack([lat, lon])
         bad = ~np.isfinite(lat_lon).all(axis=1)
         if bad.any():
             first = int(bad.argmax())
             raise PlanError(
                 f"area: {raw.origin}: {name + ', ' if name else ''}corner {first + 1} at x "
-                f"{xy[first, 0]:.10g}, y {xy[first, 1]:.10g} has no place in {crs.name}: check crs"
+                f"{yx[first, 1]:.10g}, y {yx[first, 0]:.10g} has no place in {crs.name}: check crs"
             )
-        accuracy_m.append(float(transformer.get_last_used_operation().accuracy))
+        # PROJ tells of no operation where there is nothing to change.
+        with contextlib.suppress(ProjError):
+            accuracy_m.append(float(transformer.get_last_used_operation().accuracy))
         check_latitudes(lat_lon, raw.origin, name)
         return lat_lon
 
@@ -188,16 +191,16 @@ def check_latitudes(lat_lon: Array, origin: str, name: str) -> None:
         )
 
 
-def _check_degrees(lon_lat: Array, origin: str, name: str, crs: Any) -> None:
+def _check_degrees(lat_lon: Array, origin: str, name: str, crs: Any) -> None:
     """Refuse longitudes beyond a turn and latitudes beyond a pole.
 
     Longitudes to 360 are common where an area lies across the date line.
     """
-    bad = (np.abs(lon_lat[:, 0]) > 360.0) | (np.abs(lon_lat[:, 1]) > 90.0)
+    bad = (np.abs(lat_lon[:, 1]) > 360.0) | (np.abs(lat_lon[:, 0]) > 90.0)
     if not bad.any():
         return
     first = int(bad.argmax())
-    lon, lat = lon_lat[first]
+    lat, lon = lat_lon[first]
     metres = max(abs(lon), abs(lat)) > 360.0
     advice = (
         "these are no degrees: set crs to the system they are in"

@@ -100,16 +100,15 @@ def from_rings(origin: str, rings: Iterable[object], *, geographic: bool) -> Raw
     return RawShapes(origin=origin, geographic=geographic, polygons=polygons, points=no_points())
 
 
-def from_geometries(origin: str, geometries: Iterable[BaseGeometry], *, swap: bool) -> RawShapes:
+def from_geometries(origin: str, geometries: Iterable[BaseGeometry]) -> RawShapes:
     """Split geometries, collections too, into polygons, lines and points; heights are left out.
 
     Args:
         origin: their source.
-        geometries: valid or not.
-        swap: whether their x is east, so that the two coordinates change places.
+        geometries: valid or not, x = east, y = north.
 
     Returns:
-        Shapes that are not geographic yet: the coordinates are the geometries' own.
+        Shapes in the geometries' own coordinates, y (north) before x (east).
 
     Raises:
         PlanError: a geometry of another kind.
@@ -117,10 +116,9 @@ def from_geometries(origin: str, geometries: Iterable[BaseGeometry], *, swap: bo
     polygons: list[tuple[Ring, ...]] = []
     lines: list[RawLine] = []
     points: list[Array] = []
-    order = [1, 0] if swap else [0, 1]
 
     def corners(geometry: BaseGeometry) -> Array:
-        found: Array = shapely.get_coordinates(geometry)[:, order]
+        found: Array = shapely.get_coordinates(geometry)[:, [1, 0]]
         return found
 
     waiting = list(geometries)[::-1]

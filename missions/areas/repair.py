@@ -114,6 +114,10 @@ def distinct(corners: Array, *, closed: bool) -> Array:
     """Leave out points that repeat their predecessor (of a ring, the first one's is the last)."""
     if len(corners) < 2:
         return corners
+    steps = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    if steps.min() >= SAME_PLACE_M:
+        back_m = float(np.linalg.norm(corners[-1] - corners[0]))
+        return corners[:-1] if closed and back_m < SAME_PLACE_M else corners
     kept = [0]
     for i in range(1, len(corners)):
         if np.linalg.norm(corners[i] - corners[kept[-1]]) >= SAME_PLACE_M:
@@ -153,6 +157,9 @@ def _ring_area(ring: Array, name: str, tell: _Teller) -> Polygon | MultiPolygon:
 def _without_spikes(corners: Array, name: str, tell: _Teller) -> Array:
     """Leave out corners where the edge runs straight back over itself."""
     found = corners
+    back, on = np.roll(corners, 1, axis=0) - corners, np.roll(corners, -1, axis=0) - corners
+    if not ((back * on).sum(axis=1) > 0).any():  # no corner is sharp: the usual case, quickly
+        return found
     i = 0
     while len(found) >= 3 and i < len(found):
         before, tip, after = found[i - 1], found[i], found[(i + 1) % len(found)]

@@ -115,14 +115,16 @@ def _polygons(raw: RawShapes, frame: LocalFrame, corridor_width_m: float) -> Men
         warn(f"area: {raw.origin}: {_counted(replace(raw, polygons=(), lines=()))} left out")
     if not raw.lines:
         return shape
+    widths_m = [line.width_m or corridor_width_m for line in local.lines]
     strips = [
-        corridor(line.points, line.width_m or corridor_width_m, local.origin, local.line_name(i))
-        for i, line in enumerate(local.lines)
+        corridor(line.points, width_m, local.origin, local.line_name(i))
+        for i, (line, width_m) in enumerate(zip(local.lines, widths_m, strict=True))
     ]
     if raw.polygons:
+        told = " and ".join(f"{width_m:g} m" for width_m in sorted(set(widths_m)))
         warn(
-            f"area: {raw.origin}: it holds {_counted(raw)}: lines become corridors "
-            f"{corridor_width_m:g} m wide beside the polygons"
+            f"area: {raw.origin}: it holds {_counted(raw)}: lines become corridors of {told} width "
+            "beside the polygons"
         )
     solid = _union([shape.solid, *(multipolygon(strip) for strip in strips)])
     return Mended(solid=solid, holes=_less(shape.holes, solid))

@@ -1,0 +1,323 @@
+"""Areas in files: GeoJSON, KML, KMZ, GeoPackage, shapefile, well-known text, QGroundControl's plan.
+
+GDAL, through pyogrio, reads them; it is loaded only when a file is read. Heights are left out.
+"""
+
+import re
+import tempfile
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from alice_survey.config import AreaConfig
+from alice_survey.errors import PlanError, warn
+from missions.areas.crs import LOCAL, geographic_shapes, parse_crs, usable_crs
+from missions.areas.raw import RawShapes, from_geometries
+from missions.areas.safe import (
+    SHAPEFILE_SIDES,
+    check_kml,
+    check_start,
+    read_bytes,
+    read_geojson,
+    unpacked_kmz,
+    unpacked_shapefiles,
+)
+
+Role = Literal["survey", "no_go", "allowed"]
+_MOST_CORNERS = 200_000
+_SRID = re.compile(r"\s*SRID\s*=\s*(\d+)\s*;", re.IGNORECASE)
+_LAYER_SETTING = {"survey": "layer", "no_go": "no_go_layer", "allowed": "allowed_layer"}
+SUFFIXES = (".geojson", ".json", ".kml", ".kmz", ".gpkg", ".shp", ".zip", ".wkt", ".plan")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Layer:
+    name: str
+    shapes: RawShapes
+    """In the file's own coordinates, y (north) before x (east)."""
+    crs: str | None
+
+
+def area_files(settings: AreaConfig) -> list[Path]:
+    """The files that shapes come from, a shapefile's side files too; those that exist."""
+    files = []
+    for path in (settings.file, settings.no_go_file, settings.allowed_file):
+        if path is None:
+            continue
+        files.append(path)
+        if path.suffix.lower() == ".shp":
+            files += _sides(path)
+    return [path for path in dict.fromkeys(files) if path.exists()]
+
+
+def _sides(path: Path) -> list[Path]:
+    """The files beside a shapefile that belong to it, whatever the case of their endings."""
+    if not path.parent.is_dir():
+        return []
+    return sorted(
+        other
+        for other in path.parent.iterdir()
+        if other.stem == path.stem and other.suffix.lower() in SHAPEFILE_SIDES
+    )
+
+
+def read_area_file(
+    path: Path, layer: str | None, crs: str | None, *, role: Role = "survey"
+) -> RawShapes:
+    """Read the shapes of a file.
+
+    Args:
+        path: a file of one of the kinds in `SUFFIXES`, told by its ending.
+        layer: which of its layers, where several hold shapes.
+        crs: coordinate system for a file that states none; `local` for metres east and north of
+            the datum.
+        role: what the shapes are for.
+
+    Returns:
+        Shapes in latitude and longitude (WGS 84), or north and east where the system is `local`.
+
+    Raises:
+        PlanError: it cannot be read, is of another kind, states no coordinate system while crs is
+            None, holds several layers while layer is None, or coordinates that cannot be.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise PlanError(
+            f"area: {path}: {suffix or 'no ending'!r} is no kind of file that is read; those are "
+            f"{', '.join(SUFFIXES)}"
+        )
+    if suffix == ".plan":
+        from missions.areas.qgc_plan import read_qgc_plan
+
+        return read_qgc_plan(path, layer, role)
+    if suffix == ".wkt":
+        _no_layer(path, layer, role)
+        try:
+            text = read_bytes(path).decode("utf-8-sig")
+        except UnicodeDecodeError:
+            raise PlanError(f"area: {path}: it is no text") from None
+        return read_wkt(path.name, text, crs)
+    chosen = _choose(path, _layers(path, suffix), layer, role)
+    return _placed(path, chosen, crs, role)
+
+
+def read_wkt(origin: str, text: str, crs: str | None) -> RawShapes:
+    """Shapes of well-known text: x before y, as everybody writes it.
+
+    Args:
+        origin: what messages call it.
+        text: a polygon, line, or several; `SRID=32636;` may come before it.
+        crs: system of its coordinates; None or `local`: metres east and north of the datum.
+
+    Raises:
+        PlanError: it is no well-known text, or crs is unknown or contradicts the SRID.
+    """
+    match = _SRID.match(text)
+    if match:
+        text = text[match.end() :]
+        stated = f"EPSG:{match.group(1)}"
+        if crs is not None and parse_crs(stated) != parse_crs(crs):
+            raise PlanError(f"area: {origin}: it says SRID={match.group(1)} and crs is {crs}")
+        crs = stated
+    try:
+        geometry = shapely.from_wkt(text.strip())
+    except shapely.errors.ShapelyError as first:
+        geometry = _closed_wkt(origin, text.strip(), str(first))
+    shapes = from_geometries(origin, [geometry])
+    _check_count(shapes)
+    if shapes.is_empty:
+        raise PlanError(f"area: {origin}: it is empty")
+    if crs is None or crs == LOCAL:
+        return shapes
+    return geographic_shapes(shapes, parse_crs(crs))
+
+
+def _closed_wkt(origin: str, text: str, reason: str) -> BaseGeometry:
+    """Text that shapely refuses; read when only its rings are not closed."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        geometry = shapely.from_wkt(text, on_invalid="fix")
+    if geometry is None:
+        what = reason.strip().splitlines()[0] if reason.strip() else "it cannot be read"
+        raise PlanError(
+            f"area: {origin}: no well-known text such as POLYGON ((0 0, 30 0, 30 20, 0 0)): {what}"
+        )
+    warn(f"area: {origin}: a ring that is not closed is closed")
+    return geometry
+
+
+def _no_layer(path: Path, layer: str | None, role: Role) -> None:
+    if layer is not None:
+        raise PlanError(f"area: {path}: it has no layers: leave out {_LAYER_SETTING[role]}")
+
+
+def _layers(path: Path, suffix: str) -> list[_Layer]:
+    """All layers of a file that GDAL reads, after a look at what it is."""
+    if suffix == ".kmz":
+        with unpacked_kmz(path) as file:
+            check_kml(read_bytes(file), path.name)
+            return _gdal_layers(file, path, "KML")
+    if suffix == ".zip":
+        with unpacked_shapefiles(path) as files:
+            return [found for file in files for found in _gdal_layers(file, path, "ESRI Shapefile")]
+    if suffix == ".kml":
+        check_kml(read_bytes(path), path.name)
+        return _linked_layers([path], "KML")
+    if suffix == ".gpkg":
+        check_start(path, b"SQLite format 3\x00", "GeoPackage")
+        return _linked_layers([path], "GPKG")
+    if suffix == ".shp":
+        check_start(path, b"\x00\x00\x27\x0a", "shapefile")
+        return _linked_layers([path, *_sides(path)], "ESRI Shapefile")
+    data = read_geojson(path)
+    layers = _linked_layers([path], "GeoJSON")
+    if data.get("crs") is not None:
+        return layers
+    # RFC 7946 makes it WGS 84, yet older writers left out other systems: the numbers tell.
+    return [
+        _Layer(name=found.name, shapes=found.shapes, crs=found.crs if _degrees(found) else None)
+        for found in layers
+    ]
+
+
+def _linked_layers(files: Sequence[Path], driver: str) -> list[_Layer]:
+    """The layers of the first of some files that belong together.
+
+    GDAL opens them by links of plain names, since pyogrio takes a `!` or `.zip` in a path for a
+    way into an archive.
+    """
+    stem = re.sub(r"\W", "_", files[0].stem)
+    with tempfile.TemporaryDirectory() as folder:
+        for file in files:
+            link = Path(folder) / (stem + file.suffix.lower())
+            if not link.exists():
+                link.symlink_to(file.resolve())
+        return _gdal_layers(Path(folder) / (stem + files[0].suffix.lower()), files[0], driver)
+
+
+def _degrees(layer: _Layer) -> bool:
+    if layer.shapes.is_empty:
+        return True
+    lat, lon = layer.shapes.coordinates.T
+    return bool((np.abs(lat) <= 360.0).all() and (np.abs(lon) <= 360.0).all())
+
+
+def _gdal_layers(file: Path, shown: Path, driver: str) -> list[_Layer]:
+    """The layers with geometry of a file that lies at `file` and that the user knows as `shown`."""
+    import pyogrio
+    import pyogrio.raw
+    from pyogrio.errors import DataLayerError, DataSourceError
+
+    layers = []
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        try:
+            names = pyogrio.list_layers(file)
+            for i, (name, kind) in enumerate(names.tolist()):
+                if kind is None:
+                    continue
+                info = pyogrio.read_info(file, layer=i)
+                if info["driver"].removeprefix("LIB") != driver:
+                    raise PlanError(f"area: {shown}: no {driver} but {info['driver']}")
+                meta, _, wkb, _ = pyogrio.raw.read(file, layer=i, columns=[], force_2d=True)
+                shapes = _shapes(wkb, shown.name, several=len(names) > 1, layer=str(name))
+                layers.append(_Layer(name=str(name), shapes=shapes, crs=meta["crs"]))
+        except (DataSourceError, DataLayerError) as error:
+            text = str(error).strip().splitlines()[0].replace(str(file), shown.name)
+            raise PlanError(f"area: {shown}: cannot be read: {text}") from None
+    for text in dict.fromkeys(str(w.message).splitlines()[0] for w in told):
+        if not text.startswith("Non closed ring"):  # told with its feature
+            warn(f"area: {shown.name}: {text}")
+    return layers
+
+
+def _shapes(wkb: Sequence[bytes | None], file: str, *, several: bool, layer: str) -> RawShapes:
+    origin = f"{file}, layer {layer}" if several else file
+    geometries = []
+    for i, blob in enumerate(wkb, 1):
+        if blob is None:
+            continue
+        try:
+            geometry = shapely.from_wkb(blob)
+        except shapely.errors.ShapelyError as error:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                geometry = shapely.from_wkb(blob, on_invalid="fix")
+            if geometry is None:
+                raise PlanError(
+                    f"area: {origin}: feature {i}: {str(error).strip().splitlines()[0]}"
+                ) from None
+            warn(f"area: {origin}: feature {i}: a ring that is not closed is closed")
+        geometries.append(geometry)
+    shapes = from_geometries(origin, geometries)
+    _check_count(shapes)
+    return shapes
+
+
+def _check_count(shapes: RawShapes) -> None:
+    count = len(shapes.coordinates)
+    if count > _MOST_CORNERS:
+        raise PlanError(
+            f"area: {shapes.origin}: {count} corners; at most {_MOST_CORNERS}: simplify it, or cut "
+            "out the part to survey"
+        )
+
+
+def _choose(path: Path, layers: list[_Layer], layer: str | None, role: Role) -> _Layer:
+    """The layer that is asked for, or the only one with usable shapes.
+
+    Raises:
+        PlanError: there is none, or there are several to choose from.
+    """
+    setting = _LAYER_SETTING[role]
+    if layer is not None:
+        found = [one for one in layers if one.name == layer]
+        if not found:
+            names = ", ".join(repr(one.name) for one in layers) or "none"
+            raise PlanError(f"area: {path}: no layer {layer!r}; there are {names}: set {setting}")
+        if len(found) > 1:
+            raise PlanError(f"area: {path}: {len(found)} layers are named {layer!r}: rename one")
+        return found[0]
+    usable = [
+        one
+        for one in layers
+        if one.shapes.polygons or one.shapes.lines or (role == "no_go" and len(one.shapes.points))
+    ]
+    if not usable:
+        points = sum(len(one.shapes.points) for one in layers)
+        held = f"{points} point{'s' if points > 1 else ''} only" if points else "no shapes"
+        raise PlanError(f"area: {path}: it holds {held}; an area needs a polygon or a line")
+    if len(usable) > 1:
+        names = ", ".join(repr(one.name) for one in usable)
+        raise PlanError(f"area: {path}: shapes in the layers {names}: set {setting} to one of them")
+    return usable[0]
+
+
+def _placed(path: Path, layer: _Layer, crs: str | None, role: Role) -> RawShapes:
+    """The shapes of a layer in WGS 84, by the file's own system or, without one, by `crs`."""
+    from pyproj import CRS
+
+    own = None if layer.crs is None else CRS.from_user_input(layer.crs)
+    if crs == LOCAL and (own is None or not _is_map(own)):
+        return layer.shapes
+    if own is None or (crs is not None and not _is_map(own)):
+        if crs is None:
+            raise PlanError(
+                f"area: {path}: it does not say its coordinate system: set crs, such as "
+                f"EPSG:32636, or {LOCAL!r} for metres east and north of the datum"
+            )
+        return geographic_shapes(layer.shapes, parse_crs(crs))
+    if crs is not None and role == "survey" and (crs == LOCAL or parse_crs(crs) != own):
+        warn(f"area: {path}: crs = {crs} is not used: the file is in {own.name}")
+    return geographic_shapes(layer.shapes, usable_crs(own, path.name))
+
+
+def _is_map(crs: Any) -> bool:
+    flat = crs.to_2d()
+    return bool(flat.is_geographic or flat.is_projected)
