@@ -1,0 +1,344 @@
+"""Where the pictures of a dive were taken: from its navigation log and the times of its triggers.
+
+Logs are of the body's origin, and so is what `import-log` writes; the cameras' lever arm is in the
+rig. What cannot be used is left out and said, never filled in without a word.
+"""
+
+import csv
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.errors import NavigationError, warn
+from alice_survey.frames import Array, rotation_from_attitude
+from alice_survey.manifest import read_manifest
+from alice_survey.trajectory import read_track
+from camera_calib.rig import Rig
+from missions.coverage.passes import assign_lines
+from missions.coverage.stations import Stations
+from missions.footprint import glass_point_cam
+from missions.logs.navigation_csv import NavigationLog, find_zone, read_navigation
+from missions.plan_file import Plan
+
+_MOST_ALTITUDES = 1.5
+"""Pictures from more planned altitudes than this do not count: their pixels on the sea floor are
+1.5 times as large, and the light is weaker by more than half (inferred: 1.5^-2 = 0.44, before any
+attenuation)."""
+_ELSEWHERE_M = 100.0
+"""A log that stays farther from the area than this is of another place."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Triggers:
+    """When pictures were taken, on the clock of the log."""
+
+    source: str
+    time_s: Array
+    """(T,) increasing."""
+    line: NDArray[np.intp] | None
+    """(T,) of the plan; None where it is not told."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiveRecord:
+    """The stations of a dive, and what was left out."""
+
+    source: str
+    triggers: str
+    stations: Stations
+    triggered: int
+    left_out: dict[str, int]
+    """How many triggers, by reason."""
+    notes: tuple[str, ...]
+    """What was assumed."""
+    gaps: tuple[tuple[float, float], ...]
+    """Start and length of gaps in the log, seconds."""
+
+    def to_json(self) -> dict[str, Any]:
+        """All but the stations."""
+        return {
+            "log": self.source,
+            "triggers": self.triggers,
+            "triggered": self.triggered,
+            "stations": len(self.stations),
+            "left_out": self.left_out,
+            "notes": list(self.notes),
+            "gaps": [{"start_s": start, "length_s": length} for start, length in self.gaps],
+        }
+
+
+def read_dive_record(
+    log: Path, plan: Plan, rig: Rig, *, triggers: Path | None = None, manifest: Path | None = None
+) -> DiveRecord:
+    """Where the pictures of a dive were taken.
+
+    Args:
+        log: a navigation CSV (docs/formats.md), or a folder that `fly` wrote: then its true track.
+        plan: what was to be flown.
+        rig: the cameras.
+        triggers: CSV with `time_s` of each station's pictures, and `line` where it is known.
+        manifest: `images/manifest.csv` in place of triggers.
+
+    Raises:
+        NavigationError: the log or the triggers cannot be used, or are of another place or time.
+    """
+    if triggers is not None and manifest is not None:
+        raise NavigationError("give triggers or a manifest, not both")
+    if log.is_dir():
+        return _simulated(log, plan, rig, triggers)
+    nav = read_navigation(log, find_zone("UTC"))
+    if manifest is not None:
+        when = _triggers_of_manifest(manifest, rig)
+    elif triggers is not None:
+        when = read_triggers(triggers, nav)
+    else:
+        times = np.arange(nav.time_s[0], nav.time_s[-1], plan.interval_s)
+        when = Triggers(
+            source=f"the plan's interval, {plan.interval_s:.3g} s, from the start of the log",
+            time_s=times,
+            line=None,
+        )
+    return _logged(log, nav, when, plan, rig)
+
+
+def read_triggers(path: Path, nav: NavigationLog) -> Triggers:
+    """Times of pictures: `time_s` on the clock of the log, or `time_utc` if the log is dated.
+
+    Raises:
+        NavigationError: it cannot be read, or a time is none or does not follow the one before.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file, skipinitialspace=True)
+            reader.fieldnames = [name.strip() for name in reader.fieldnames or []]
+            rows = [(reader.line_num, row) for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise NavigationError(f"{path}: cannot be read: {error}") from None
+    names = list(reader.fieldnames or [])
+    dated = "time_s" not in names
+    if dated and "time_utc" not in names:
+        raise NavigationError(f"{path}: no column time_s or time_utc; it has {', '.join(names)}")
+    if dated and nav.start_utc is None:
+        raise NavigationError(f"{path} has dates and the log has none: give time_s")
+    times, lines = [], []
+    for number, row in rows:
+        try:
+            times.append(_since_start(row["time_utc"], nav) if dated else float(row["time_s"]))
+            lines.append(int(row["line"]) if "line" in names else -1)
+        except (TypeError, ValueError) as error:
+            raise NavigationError(f"{path} line {number}: {error}") from None
+        if not math.isfinite(times[-1]) or (len(times) > 1 and times[-1] <= times[-2]):
+            raise NavigationError(
+                f"{path} line {number}: time {times[-1]:g} s does not follow the one before"
+            )
+    if not times:
+        raise NavigationError(f"{path}: holds no trigger")
+    return Triggers(
+        source=str(path),
+        time_s=np.array(times),
+        line=np.array(lines, dtype=np.intp) if "line" in names else None,
+    )
+
+
+def _since_start(cell: str, nav: NavigationLog) -> float:
+    from missions.logs.corrections import utc_seconds
+
+    if nav.start_utc is None:
+        raise ValueError("the log has no dates")
+    return utc_seconds(cell) - nav.start_utc.timestamp()
+
+
+def _triggers_of_manifest(path: Path, rig: Rig) -> Triggers:
+    """When each station's pictures were taken, of stations with a picture of every camera."""
+    taken: dict[int, dict[str, float]] = {}
+    for record in read_manifest(path):
+        taken.setdefault(record.station, {})[record.camera] = record.time_s
+    whole = [times for times in taken.values() if set(rig.cameras) <= set(times)]
+    if not whole:
+        raise NavigationError(
+            f"{path}: no station has a picture of each of {', '.join(rig.cameras)}"
+        )
+    if len(whole) < len(taken):
+        warn(f"{path}: {len(taken) - len(whole)} stations lack a camera and do not count")
+    times = np.array([float(np.mean(list(times.values()))) for times in whole])
+    if np.isnan(times).any():
+        raise NavigationError(f"{path}: {int(np.isnan(times).sum())} stations have no time_s")
+    return Triggers(source=str(path), time_s=np.unique(times), line=None)
+
+
+def _simulated(folder: Path, plan: Plan, rig: Rig, triggers: Path | None) -> DiveRecord:
+    """The true stations of a simulated flight; the altitude is what its DVL measured."""
+    nav = read_navigation(folder / "navigation.csv", find_zone("UTC"))
+    when = read_triggers(triggers or folder / "triggers.csv", nav)
+    truth = folder / "truth" / "track.csv"
+    if not truth.is_file():
+        return _logged(folder / "navigation.csv", nav, when, plan, rig)
+    track = read_track(truth)
+    positions, rotation = track.ned_from_body.translation, track.ned_from_body.rotation
+    angles = np.rad2deg(rotation.as_euler("ZYX"))[:, ::-1]
+    geodetic = plan.datum.geodetic_from_ned(positions)
+    altitude = nav.at(track.time_s).get("altitude_m", np.full(len(positions), np.nan))
+    columns = dict(
+        zip(
+            ("latitude_deg", "longitude_deg", "depth_m", "roll_deg", "pitch_deg", "heading_deg"),
+            [*geodetic[:, :2].T, positions[:, 2], *angles.T],
+            strict=True,
+        )
+    )
+    true = NavigationLog(
+        time_s=track.time_s, columns=columns | {"altitude_m": altitude}, start_utc=nav.start_utc
+    )
+    return _logged(truth, true, when, plan, rig)
+
+
+def _logged(path: Path, nav: NavigationLog, triggers: Triggers, plan: Plan, rig: Rig) -> DiveRecord:
+    """Stations of a log at the times of its triggers."""
+    at = nav.at(triggers.time_s)
+    left_out: dict[str, int] = {}
+    notes: list[str] = []
+    beyond = (triggers.time_s < nav.time_s[0]) | (triggers.time_s > nav.time_s[-1])
+    lost = ~np.isfinite(at["latitude_deg"] + at["longitude_deg"] + at["depth_m"])
+    _count(left_out, f"beyond the log ({nav.time_s[0]:.1f} to {nav.time_s[-1]:.1f} s)", beyond)
+    _count(left_out, f"in a gap of the log over {nav.longest_gap_s:.1f} s", lost & ~beyond)
+    kept = np.flatnonzero(~lost)
+    if not len(kept):
+        raise NavigationError(
+            f"{path}: the log has no position at any of {len(triggers.time_s)} triggers "
+            f"({triggers.time_s[0]:.1f} to {triggers.time_s[-1]:.1f} s; the log is of "
+            f"{nav.time_s[0]:.1f} to {nav.time_s[-1]:.1f} s): check the clocks"
+        )
+    at = {name: values[kept] for name, values in at.items()}
+    geodetic = np.column_stack([at["latitude_deg"], at["longitude_deg"], at["depth_m"]])
+    body_ned = plan.datum.ned_from_geodetic(geodetic)
+    attitude = _attitude(nav, at, triggers.time_s[kept], plan, notes)
+    lever = rig.body_from_cam(rig.reference).apply(glass_point_cam(rig.cameras[rig.reference]))
+    glass_ned = body_ned + rotation_from_attitude(*attitude.T).apply(lever)
+    glass_ned[:, 2] = at["depth_m"] + (glass_ned[:, 2] - body_ned[:, 2])
+    altitude = at.get("altitude_m", np.full(len(kept), np.nan)).copy()
+    unknown = ~np.isfinite(altitude)
+    if unknown.any():
+        altitude[unknown] = plan.seafloor_depth_m - glass_ned[unknown, 2]
+        notes.append(
+            f"{int(unknown.sum())} of {len(kept)} stations have no altitude: it is taken from "
+            f"their depth and a sea floor at {plan.seafloor_depth_m:g} m"
+        )
+    stations = Stations(
+        glass_ne=glass_ned[:, :2],
+        altitude_m=altitude,
+        attitude_rad=attitude,
+        line=np.full(len(kept), -1) if triggers.line is None else triggers.line[kept],
+        time_s=triggers.time_s[kept],
+    )
+    _check_place(path, plan, stations)
+    stations = _usable(stations, plan, left_out)
+    if triggers.line is None:
+        stations = replace(stations, line=assign_lines(stations, plan))
+    record = DiveRecord(
+        source=str(path),
+        triggers=triggers.source,
+        stations=stations,
+        triggered=len(triggers.time_s),
+        left_out=left_out,
+        notes=tuple(notes),
+        gaps=_gaps(nav),
+    )
+    _tell(record)
+    return record
+
+
+def _attitude(
+    nav: NavigationLog, at: dict[str, Array], time_s: Array, plan: Plan, notes: list[str]
+) -> Array:
+    """Roll, pitch, heading, (S, 3) radians; level, and along the track, where they are unknown."""
+    nothing = np.full(len(time_s), np.nan)
+    degrees = np.column_stack(
+        [at.get(name, nothing) for name in ("roll_deg", "pitch_deg", "heading_deg")]
+    )
+    tilt_unknown = ~np.isfinite(degrees[:, :2]).all(axis=1)
+    heading_unknown = ~np.isfinite(degrees[:, 2])
+    if tilt_unknown.any():
+        degrees[tilt_unknown, :2] = 0.0
+        notes.append(f"{int(tilt_unknown.sum())} stations have no roll and pitch: taken as level")
+    if heading_unknown.any():
+        ned = plan.datum.ned_from_geodetic(
+            np.column_stack(
+                [nav.columns[name] for name in ("latitude_deg", "longitude_deg")]
+                + [np.zeros(len(nav.time_s))]
+            )
+        )
+        degrees[heading_unknown, 2] = np.rad2deg(
+            _courses(nav.time_s, ned[:, :2], time_s[heading_unknown], plan)
+        )
+        notes.append(
+            f"{int(heading_unknown.sum())} stations have no heading: taken as the course, without "
+            "crab"
+        )
+    return np.deg2rad(degrees)
+
+
+def _courses(log_s: Array, place_ne: Array, time_s: Array, plan: Plan) -> Array:
+    """Course made good, (N,) radians, over the time between two pictures."""
+    half_s = plan.interval_s / 2
+    ends = [
+        np.column_stack([np.interp(t, log_s, axis) for axis in place_ne.T])
+        for t in (time_s - half_s, time_s + half_s)
+    ]
+    moved = ends[1] - ends[0]
+    course: Array = np.arctan2(moved[:, 1], moved[:, 0])
+    return course
+
+
+def _check_place(path: Path, plan: Plan, stations: Stations) -> None:
+    """Refuse a log of another place.
+
+    Raises:
+        NavigationError: it never comes near the area; the message says how far off it is.
+    """
+    import shapely
+
+    away_m = shapely.distance(shapely.points(stations.glass_ne), plan.area.survey)
+    nearest = int(np.argmin(away_m))
+    if away_m[nearest] > _ELSEWHERE_M:
+        latitude, longitude = plan.datum.latitude_deg, plan.datum.longitude_deg
+        raise NavigationError(
+            f"{path}: the log is {away_m[nearest] / 1e3:.3g} km from the area of {plan.name!r} at "
+            f"{latitude:.5f}, {longitude:.5f} at its nearest: give the log of this survey, or its "
+            "plan"
+        )
+
+
+def _usable(stations: Stations, plan: Plan, left_out: dict[str, int]) -> Stations:
+    below = stations.altitude_m <= 0
+    most_m = _MOST_ALTITUDES * plan.altitude_m
+    high = stations.altitude_m > most_m
+    _count(left_out, "at or below the sea floor, by their altitude", below)
+    _count(left_out, f"higher than {most_m:.2g} m above the sea floor", high)
+    return stations.some(~(below | high))
+
+
+def _count(left_out: dict[str, int], reason: str, which: NDArray[np.bool_]) -> None:
+    if which.any():
+        left_out[reason] = int(which.sum())
+
+
+def _gaps(nav: NavigationLog) -> tuple[tuple[float, float], ...]:
+    steps = np.diff(nav.time_s)
+    long = np.flatnonzero(steps > nav.longest_gap_s)
+    return tuple((float(nav.time_s[i]), float(steps[i])) for i in long)
+
+
+def _tell(record: DiveRecord) -> None:
+    """Warn of what was left out and assumed."""
+    for start_s, length_s in record.gaps[:8]:
+        warn(f"{record.source}: a gap of {length_s:.1f} s from {start_s:.1f} s")
+    if len(record.gaps) > 8:
+        warn(f"{record.source}: {len(record.gaps) - 8} more gaps")
+    for reason, count in record.left_out.items():
+        share = count / record.triggered
+        warn(f"{record.source}: {count} of {record.triggered} triggers ({share:.1%}) {reason}")
+    for note in record.notes:
+        warn(f"{record.source}: {note}")

@@ -1,0 +1,153 @@
+"""The side overlap that pictures really have, measured point by point.
+
+Independent of footprints and spacing: points of the sea floor across each picture are projected
+into the pictures of the line beside it through the flat port, and those counted that fall in.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from alice_survey.errors import PlanError
+from alice_survey.frames import Array, rotation_from_attitude
+from camera_calib.flat_port import FlatPortCamera
+from camera_calib.rig import Rig
+from missions.coverage.stations import Stations
+from missions.footprint import glass_point_cam
+
+_POINTS = 1001
+_PARALLEL = math.cos(math.radians(10.0))
+_BESIDE_M = 0.05
+"""Pictures less far aside are of the same line flown twice."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SideOverlap:
+    """Of pictures' width on their middle row, the share that the next line to starboard sees."""
+
+    shares: Array
+    """(N,) of each picture that has a line to starboard of it."""
+    stations: Array
+    """(N,) its index."""
+
+    @property
+    def mean(self) -> float:
+        """Over pictures."""
+        return float(self.shares.mean())
+
+    @property
+    def least(self) -> float:
+        """Of any picture."""
+        return float(self.shares.min())
+
+
+def measured_side_overlap(rig: Rig, stations: Stations, camera: str | None = None) -> SideOverlap:
+    """Measure the side overlap of neighbouring lines.
+
+    Of each picture, 1001 points of the sea floor on its middle row, evenly from its left edge to
+    its right, are projected into the pictures of the nearest parallel line to starboard; the share
+    that is seen there is its overlap. Pictures beyond the ends of that line are left out.
+
+    Args:
+        rig: the cameras, in water.
+        stations: of the pictures, with their lines.
+        camera: whose pictures; left out, the rig's first camera.
+
+    Raises:
+        PlanError: no two lines lie side by side.
+    """
+    name = rig.reference if camera is None else camera
+    lines = [index for index in np.unique(stations.line).tolist() if index >= 0]
+    ways = {index: _direction(stations, index) for index in lines}
+    shares, measured = [], []
+    for index in lines:
+        for s in np.flatnonzero(stations.line == index).tolist():
+            beside = _beside(stations, s, index, ways)
+            if beside is None:
+                continue
+            points = _middle_row(rig, name, stations, s)
+            seen = np.zeros(len(points), dtype=bool)
+            for other in _nearest(stations, s, beside):
+                seen |= _sees(rig, name, stations, other, points)
+            shares.append(float(seen.mean()))
+            measured.append(s)
+    if not shares:
+        raise PlanError("no two lines lie side by side: there is no side overlap to measure")
+    return SideOverlap(shares=np.array(shares), stations=np.array(measured))
+
+
+def _direction(stations: Stations, line: int) -> Array:
+    """Unit vector along a line, north and east, from its first to its last picture."""
+    places = stations.glass_ne[stations.line == line]
+    way = places[-1] - places[0]
+    length = float(np.linalg.norm(way))
+    if length > 0.0:
+        along: Array = way / length
+        return along
+    heading = float(stations.attitude_rad[stations.line == line][0, 2])
+    return np.array([math.cos(heading), math.sin(heading)])
+
+
+def _beside(stations: Stations, s: int, line: int, ways: dict[int, Array]) -> int | None:
+    """The nearest parallel line to starboard of a picture that it does not lie beyond an end of."""
+    ahead = ways[line]
+    starboard = np.array([-ahead[1], ahead[0]])
+    best, best_m = None, math.inf
+    for other, way in ways.items():
+        if other == line or abs(float(way @ ahead)) < _PARALLEL:
+            continue
+        off = stations.glass_ne[stations.line == other] - stations.glass_ne[s]
+        along, across = off @ ahead, off @ starboard
+        near = int(np.argmin(np.abs(along)))
+        if along.min() <= 0.0 <= along.max() and _BESIDE_M < across[near] < best_m:
+            best, best_m = other, float(across[near])
+    return best
+
+
+def _nearest(stations: Stations, s: int, line: int) -> list[int]:
+    """The pictures of a line that are nearest to another picture: three to either side."""
+    rows = np.flatnonzero(stations.line == line)
+    away = np.linalg.norm(stations.glass_ne[rows] - stations.glass_ne[s], axis=1)
+    chosen: list[int] = rows[np.argsort(away, kind="stable")[:6]].tolist()
+    return chosen
+
+
+def _pose(rig: Rig, name: str, stations: Stations, s: int) -> tuple[Array, Array, float]:
+    """Rotation `ned_from_cam` (3, 3), the pupil about the glass (3,), and the altitude."""
+    reference = rig.cameras[rig.reference]
+    glass_body = rig.body_from_cam(rig.reference).apply(glass_point_cam(reference))
+    body_from_cam = rig.body_from_cam(name)
+    ned_from_body = rotation_from_attitude(*stations.attitude_rad[s])
+    rotation: Array = (ned_from_body * body_from_cam.rotation).as_matrix()
+    pupil: Array = ned_from_body.apply(body_from_cam.translation - glass_body)
+    return rotation, pupil, float(stations.altitude_m[s])
+
+
+def _middle_row(rig: Rig, name: str, stations: Stations, s: int) -> Array:
+    """Points on the sea floor, (P, 3) about the datum's vertical with the glass at depth 0."""
+    camera = rig.cameras[name]
+    rotation, pupil, altitude_m = _pose(rig, name, stations, s)
+    ends = np.array([[0.0, camera.height_px / 2], [camera.width_px, camera.height_px / 2]])
+    glass_cam, rays_cam = camera.unproject(ends)
+    starts, rays = glass_cam @ rotation.T + pupil, rays_cam @ rotation.T
+    hits = starts + ((altitude_m - starts[:, 2]) / rays[:, 2])[:, None] * rays
+    share = ((np.arange(_POINTS) + 0.5) / _POINTS)[:, None]
+    points = hits[0] * (1 - share) + hits[1] * share
+    points[:, :2] += stations.glass_ne[s]
+    return points
+
+
+def _sees(rig: Rig, name: str, stations: Stations, s: int, points: Array) -> Array:
+    """Which points fall into a picture, (P,); they lie on the sea floor below it."""
+    camera: FlatPortCamera = rig.cameras[name]
+    rotation, pupil, altitude_m = _pose(rig, name, stations, s)
+    below = np.column_stack(
+        [points[:, :2] - stations.glass_ne[s], np.full(len(points), altitude_m)]
+    )
+    pixels = camera.project((below - pupil) @ rotation)
+    with np.errstate(invalid="ignore"):
+        inside: Array = np.all(
+            (pixels >= 0) & (pixels <= [camera.width_px, camera.height_px]), axis=1
+        )
+    return inside
