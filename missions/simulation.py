@@ -69,7 +69,11 @@ class SeaFloor(Protocol):
 
 
 def simulate_plan(
-    plan: Plan, config: SurveyConfig, floor: FloorGrid, rng: np.random.Generator
+    plan: Plan,
+    config: SurveyConfig,
+    floor: FloorGrid,
+    rng: np.random.Generator,
+    label: str = "flight",
 ) -> Flight:
     """Fly a plan.
 
@@ -78,6 +82,7 @@ def simulate_plan(
         config: vehicle, sea and sensors.
         floor: the true sea floor.
         rng: source of all noise.
+        label: what the progress bar says; there is none if it is empty.
 
     Raises:
         VehicleError: a setting does not fit the vehicle, or it cannot fly the plan's sway steps.
@@ -86,7 +91,7 @@ def simulate_plan(
     longest_s = longest_mission_s(plan)
     setup = mission_setup(plan, config, floor, longest_s, rng)
     ascent_s = plan.seafloor_depth_m / _CLIMB_MPS
-    flown = simulate(setup, rng, longest_s=longest_s + ascent_s, label="flight")
+    flown = simulate(setup, rng, longest_s=longest_s + ascent_s, label=label)
     return flight_of(plan, config, setup, flown)
 
 
