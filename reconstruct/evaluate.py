@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 import rasterio
+import shapely
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
-from shapely import contains_xy
-from shapely.geometry import Polygon
+from shapely.geometry import MultiPolygon
 
 from alice_survey.artefacts import Stage, need_stage, read_json, run_stage, write_csv, write_json
 from alice_survey.config import SurveyConfig
@@ -134,13 +134,13 @@ def score_cameras(estimated: dict[str, RigidTransform], truth: Path, total: int)
 
 
 def score_surface(
-    dem: Path, area_ne: Array, terrain: Terrain, truth_from_world: RigidTransform
+    dem: Path, area: MultiPolygon, terrain: Terrain, truth_from_world: RigidTransform
 ) -> SurfaceScore:
     """Compare every DEM cell of the survey area with the true mesh.
 
     Args:
         dem: heights, positive up, over local east and north.
-        area_ne: (N, 2) corners of the survey area.
+        area: the survey area, x north and y east; its holes count as outside.
         terrain: the truth.
         truth_from_world: alignment from the model's to the true NED.
     """
@@ -157,10 +157,11 @@ def score_surface(
         np.stack([norths, easts, np.full_like(easts, -np.nanmedian(heights))], -1).reshape(-1, 3)
     )
     place = np.where(filled[:, None], points, plane)
-    inside = contains_xy(Polygon(area_ne), place[:, 0], place[:, 1])
+    shapely.prepare(area)
+    inside = shapely.contains_xy(area, place[:, 0], place[:, 1])
     shift_ne = (plane - np.stack([norths, easts, 0 * easts], -1).reshape(-1, 3)).mean(axis=0)[:2]
     cell_m2 = abs(transform.a * transform.e)
-    expected = round(Polygon(area_ne).area / cell_m2)
+    expected = round(area.area / cell_m2)
     used = inside & filled
     misses = np.full(filled.shape, np.nan)
     misses[used] = surface_depth(terrain, points[used, :2]) - points[used, 2]
@@ -202,20 +203,20 @@ def run_evaluate(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     inputs += [mosaic / "mosaic.tif", sparse / "track.csv", sparse / "registration.json"]
     inputs += [plan / "plan.json", workspace / "flight" / "triggers.csv"]
     inputs += [images / "manifest.csv"]
-    stage = Stage(name="report", version=1, settings={"seed": config.seed}, inputs=inputs)
+    stage = Stage(name="report", version=2, settings={"seed": config.seed}, inputs=inputs)
 
     def work(folder: Path) -> None:
-        area_ne = read_plan(plan / "plan.json").area.rings_ne[0]
+        area = read_plan(plan / "plan.json").area.survey
         registration = read_json(sparse / "registration.json")
         terrain = read_terrain(truth / "terrain.ply")
         cameras = score_cameras(
             read_track_poses(sparse / "track.csv"), truth / "poses.csv", registration["total"]
         )
-        surface = score_surface(dense / "dem.tif", area_ne, terrain, cameras.truth_from_world)
+        surface = score_surface(dense / "dem.tif", area, terrain, cameras.truth_from_world)
         painted = score_mosaic(
             mosaic / "mosaic.tif",
             dense / "dem.tif",
-            area_ne,
+            area,
             terrain,
             survey_texture(config),
             cameras.truth_from_world,
@@ -233,8 +234,8 @@ def run_evaluate(workspace: Path, config: SurveyConfig, threads: int) -> bool:
             ),
         )
         plot_track(folder / "track.png", plan / "plan.json", cameras)
-        plot_errors(folder / "errors.png", surface, area_ne)
-        plot_sheet(folder / "sheet.png", workspace, cameras, surface, area_ne)
+        plot_errors(folder / "errors.png", surface, area)
+        plot_sheet(folder / "sheet.png", workspace, cameras, surface, area)
 
     return run_stage(workspace, stage, work)
 

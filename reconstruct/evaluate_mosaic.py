@@ -7,11 +7,11 @@ from typing import Any
 import cv2
 import numpy as np
 import rasterio
+import shapely
 from numpy.typing import NDArray
 from rasterio.windows import Window
 from scipy.spatial.transform import RigidTransform
-from shapely import contains_xy
-from shapely.geometry import Polygon, box
+from shapely.geometry import MultiPolygon, box
 
 from alice_survey.frames import Array
 from alice_survey.seafloor.terrain import Terrain
@@ -55,22 +55,23 @@ class MosaicScore:
 def score_mosaic(
     mosaic: Path,
     dem: Path,
-    area_ne: Array,
+    area: MultiPolygon,
     terrain: Terrain,
     texture: Texture,
     truth_from_world: RigidTransform,
 ) -> MosaicScore:
-    """Compare patches of the mosaic with the true sea floor painted at the same places.
+    """Compare patches of the mosaic with the true sea floor painted at the same transform.
 
     Args:
         mosaic: colour and a last band that is 0 where nothing is known, over local east and north.
         dem: heights the mosaic lies on, positive up.
-        area_ne: (N, 2) corners of the survey area.
+        area: the survey area, x north and y east.
         terrain: true shape.
         texture: true reflectance.
         truth_from_world: alignment from the model's to the true NED.
     """
-    area = area_in_world(area_ne, terrain, truth_from_world)
+    area = area_in_world(area, terrain, truth_from_world)
+    shapely.prepare(area)
     with rasterio.open(mosaic) as source, rasterio.open(dem) as heights:
         transform = source.transform
         windows = _patches(source.height, source.width, transform, area)
@@ -96,13 +97,20 @@ def score_mosaic(
     )
 
 
-def area_in_world(area_ne: Array, terrain: Terrain, truth_from_world: RigidTransform) -> Polygon:
+def area_in_world(
+    area: MultiPolygon, terrain: Terrain, truth_from_world: RigidTransform
+) -> MultiPolygon:
     """The survey area where the model has it: navigation may have shifted and turned the model."""
-    corners = np.column_stack([area_ne, np.full(len(area_ne), terrain.offset_ned[2])])
-    return Polygon(truth_from_world.inv().apply(corners)[:, :2])
+    world_from_truth, depth_m = truth_from_world.inv(), terrain.offset_ned[2]
+
+    def moved(corners_ne: Array) -> Array:
+        corners = np.column_stack([corners_ne, np.full(len(corners_ne), depth_m)])
+        return np.asarray(world_from_truth.apply(corners)[:, :2])
+
+    return MultiPolygon(shapely.transform(area, moved))
 
 
-def _patches(rows: int, columns: int, transform: Any, area: Polygon) -> list[Window]:
+def _patches(rows: int, columns: int, transform: Any, area: MultiPolygon) -> list[Window]:
     """Windows spread over the area, each wholly inside."""
     step = max(_PATCH_PX, int(np.sqrt(rows * columns / _PATCHES)))
     windows = []
@@ -153,7 +161,7 @@ def _shift_px(picture: Array, true: Array) -> NDArray[np.float64] | None:
     return np.array([x, y]) if response > _CLEAR else None
 
 
-def _coverage(source: Any, area: Polygon) -> float:
+def _coverage(source: Any, area: MultiPolygon) -> float:
     """Share of the area that has colour, from an overview of at most 1000 pixels a side."""
     shrink = max(1.0, max(source.height, source.width) / 1000)
     shape = (max(1, int(source.height / shrink)), max(1, int(source.width / shrink)))
@@ -163,4 +171,4 @@ def _coverage(source: Any, area: Polygon) -> float:
     rows, columns = np.nonzero(known)
     east = source.transform.c + (columns + 0.5) * source.transform.a * source.width / shape[1]
     north = source.transform.f + (rows + 0.5) * source.transform.e * source.height / shape[0]
-    return min(1.0, float(contains_xy(area, north, east).sum() * pixel_m2 / area.area))
+    return min(1.0, float(shapely.contains_xy(area, north, east).sum() * pixel_m2 / area.area))

@@ -5,10 +5,11 @@ from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from shapely.geometry import MultiPolygon
 
-from alice_survey.artefacts import atomic_path, read_json
-from alice_survey.frames import Array
+from alice_survey.artefacts import atomic_path
 from missions.plan_file import read_plan
 
 if TYPE_CHECKING:
@@ -19,16 +20,15 @@ _STYLE: dict[str, Any] = {"font.size": 9, "axes.titlesize": 10, "figure.dpi": 11
 
 def plot_track(path: Path, plan_file: Path, cameras: "CameraScore") -> None:
     """Planned lines, camera positions coloured by error, and the error of each picture."""
-    plan = read_json(plan_file)
+    plan = read_plan(plan_file)
     places, length_mm = cameras.positions_ned, 1e3 * np.linalg.norm(cameras.misses_m, axis=1)
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(11, 5.5), layout="constrained")
         plane, strips = figure.subplots(1, 2, width_ratios=[1, 1.2])
-        for line in plan["lines"]:
-            (n0, e0), (n1, e1) = line["start_ne_m"], line["end_ne_m"]
+        for line in plan.lines:
+            (n0, e0), (n1, e1) = line.start_ne_m, line.end_ne_m
             plane.plot([e0, e1], [n0, n1], color="0.75", linewidth=3, zorder=1)
-        for ring in read_plan(plan_file).area.rings_ne:
-            plane.plot(ring[:, 1], ring[:, 0], "k--", linewidth=1)
+        _draw_area(plane, plan.area.survey)
         dots = plane.scatter(
             places[:, 1], places[:, 0], c=length_mm, s=14, cmap="viridis", zorder=2
         )
@@ -44,7 +44,7 @@ def plot_track(path: Path, plan_file: Path, cameras: "CameraScore") -> None:
         _save(figure, path)
 
 
-def plot_errors(path: Path, surface: "SurfaceScore", area_ne: Array) -> None:
+def plot_errors(path: Path, surface: "SurfaceScore", area: MultiPolygon) -> None:
     """Map and histogram of height errors of the surface."""
     figures = surface.to_json()
     limit = max(5.0, 3 * figures["height_median_mm"], figures["height_95_mm"])
@@ -60,8 +60,7 @@ def plot_errors(path: Path, surface: "SurfaceScore", area_ne: Array) -> None:
             cmap="RdBu_r",
             interpolation="nearest",
         )
-        closed = np.vstack([area_ne, area_ne[:1]])
-        plane.plot(closed[:, 1], closed[:, 0], "k--", linewidth=1)
+        _draw_area(plane, area)
         figure.colorbar(image, ax=plane, label="height error (mm)", shrink=0.8)
         plane.set(xlabel="east (m)", ylabel="north (m)", title="Surface less truth")
         plane.set_facecolor("0.85")
@@ -76,10 +75,15 @@ def plot_errors(path: Path, surface: "SurfaceScore", area_ne: Array) -> None:
 
 
 def plot_sheet(
-    path: Path, workspace: Path, cameras: "CameraScore", surface: "SurfaceScore", area_ne: Array
+    path: Path,
+    workspace: Path,
+    cameras: "CameraScore",
+    surface: "SurfaceScore",
+    area: MultiPolygon,
 ) -> None:
     """The picture nearest to the middle of the area, surface, mosaic and error on one sheet."""
-    away = np.linalg.norm(cameras.positions_ned[:, :2] - area_ne.mean(axis=0), axis=1)
+    middle = area.representative_point()
+    away = np.linalg.norm(cameras.positions_ned[:, :2] - [middle.x, middle.y], axis=1)
     pictures = [
         ("A picture", workspace / "images" / cameras.names[int(away.argmin())]),
         ("Surface", workspace / "dense" / "dem.png"),
@@ -99,6 +103,14 @@ def plot_sheet(
         )
         figure.colorbar(image, ax=panels[3], shrink=0.8)
         _save(figure, path)
+
+
+def _draw_area(axes: Axes, area: MultiPolygon) -> None:
+    """Edges of the survey area, holes too."""
+    for part in area.geoms:
+        for ring in (part.exterior, *part.interiors):
+            north, east = np.asarray(ring.coords)[:, :2].T
+            axes.plot(east, north, "k--", linewidth=1)
 
 
 def _read(path: Path) -> Any:
