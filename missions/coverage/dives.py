@@ -277,7 +277,8 @@ def _attitude(
             f"{int(heading_unknown.sum())} stations have no heading: taken as the course, without "
             "crab"
         )
-    return np.deg2rad(degrees)
+    attitude: Array = np.deg2rad(degrees)
+    return attitude
 
 
 def _courses(log_s: Array, place_ne: Array, time_s: Array, plan: Plan) -> Array:
@@ -300,7 +301,7 @@ def _check_place(path: Path, plan: Plan, stations: Stations) -> None:
     """
     import shapely
 
-    away_m = shapely.distance(shapely.points(stations.glass_ne), plan.area.survey)
+    away_m = np.atleast_1d(shapely.distance(shapely.points(stations.glass_ne), plan.area.survey))
     nearest = int(np.argmin(away_m))
     if away_m[nearest] > _ELSEWHERE_M:
         latitude, longitude = plan.datum.latitude_deg, plan.datum.longitude_deg

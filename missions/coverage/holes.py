@@ -111,7 +111,7 @@ def find_holes(certificate: Certificate) -> tuple[Hole, ...]:
     return tuple(sorted(holes, key=lambda hole: (-hole.unseen_m2, -hole.area_m2, hole.place_ne)))
 
 
-def geodetic(geometry: shapely.Geometry, datum: Datum) -> shapely.Geometry:
+def geodetic(geometry: shapely.Geometry, datum: Datum) -> MultiPolygon:
     """A geometry of north and east as longitude and latitude, with outer rings to the left."""
 
     def convert(points_ne: Array) -> Array:

@@ -135,7 +135,8 @@ def _middle_row(rig: Rig, name: str, stations: Stations, s: int) -> Array:
     share = ((np.arange(_POINTS) + 0.5) / _POINTS)[:, None]
     points = hits[0] * (1 - share) + hits[1] * share
     points[:, :2] += stations.glass_ne[s]
-    return points
+    placed: Array = points
+    return placed
 
 
 def _sees(rig: Rig, name: str, stations: Stations, s: int, points: Array) -> Array:

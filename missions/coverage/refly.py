@@ -1,0 +1,74 @@
+"""A plan that flies the holes of a dive again."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import shapely
+from shapely.geometry import MultiPolygon
+
+from alice_survey.config import SurveyConfig
+from alice_survey.errors import PlanError
+from camera_calib.rig import Rig
+from missions.areas.area import Area, multipolygon
+from missions.coverage.certificate import Certificate, certificate
+from missions.coverage.holes import Hole
+from missions.coverage.stations import stations_of_plan
+from missions.lines.fill import lines_over
+from missions.plan_file import Plan
+from missions.route.dives import split_dives
+from missions.route.energy import vehicle_costs
+from missions.route.ways import Ways
+
+
+def refly_plan(
+    plan: Plan, config: SurveyConfig, rig: Rig, flown: Certificate, holes: Sequence[Hole]
+) -> Plan:
+    """Plan short lines over the holes, at the overlap of the plan itself.
+
+    The new plan is whole: `fly`, exports and `plan check` take it as any other. Its survey area is
+    the holes, its allowed area the plan's.
+
+    Args:
+        plan: what was flown.
+        config: the survey, for what the vehicle takes.
+        rig: the cameras.
+        flown: the certificate of what was flown.
+        holes: its holes.
+
+    Raises:
+        PlanError: there are none, or lines over them leave the allowed area.
+    """
+    if not holes:
+        raise PlanError("there is no hole to fly again")
+    area = replace(plan.area, survey=to_see(plan.area, flown, holes))
+    lines = lines_over(area.survey, area, flown.pattern)
+    if not lines:
+        raise PlanError(f"no line inside the allowed area sees any of the {len(holes)} holes")
+    costs = vehicle_costs(config)
+    dives = split_dives(lines, Ways(area.allowed), costs, config, plan.home_ne_m)
+    again = replace(
+        plan,
+        name=f"{plan.name} holes",
+        area=area,
+        lines=tuple(lines),
+        dives=dives,
+        length_m=sum(dive.route.length_m for dive in dives),
+        duration_s=sum(dive.duration_s for dive in dives),
+        energy_wh=sum(dive.energy_wh for dive in dives),
+        line_depths_m=(),
+        details={"refly_of": plan.name, "holes": len(holes), "area_m2": area.survey.area},
+    )
+    seen = certificate(area, rig, stations_of_plan(again), flown.pattern)
+    return replace(again, coverage=seen.share_at_overlap)
+
+
+def to_see(area: Area, flown: Certificate, holes: Sequence[Hole]) -> MultiPolygon:
+    """The holes, and half a cell's diagonal round them, inside of the survey area.
+
+    Where a hole ends between two middles of cells is not known: the whole step counts as missed.
+    """
+    grown = shapely.union_all([hole.outline for hole in holes]).buffer(
+        flown.grid.cell_m / np.sqrt(2.0), join_style="mitre"
+    )
+    return multipolygon(grown.intersection(area.survey))
