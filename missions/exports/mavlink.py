@@ -48,11 +48,11 @@ def mission_items(plan: Plan, points: Sequence[Waypoint], tolerance_m: float) ->
 
 
 def trigger_m(plan: Plan, line: int) -> float:
-    """From picture to picture on a line, rounded down so that its last one is not lost; m."""
+    """From picture to picture on a line, at least 0.1 mm short so that its last is not lost; m."""
     wanted = plan.lines[line]
     if wanted.stations < 2:
         return plan.station_spacing_m
-    return math.floor(wanted.length_m / (wanted.stations - 1) * 1e4 + 1e-6) / 1e4
+    return (math.ceil(wanted.length_m / (wanted.stations - 1) * 1e4 - 1e-6) - 1) / 1e4
 
 
 def _items(plan: Plan, points: Sequence[Waypoint], tolerance_m: float) -> Iterator[Item]:

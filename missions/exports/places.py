@@ -10,8 +10,8 @@ from shapely.geometry import MultiPolygon, Polygon
 from alice_survey.frames import Array, Datum
 from missions.route.legs import Leg, Route
 
-_ARC_M = 0.02
-"""How far a drawn route may lie off the true one in an arc."""
+CHORD_M = 0.02
+"""How far the chords that stand for an arc may lie off it."""
 
 
 def lat_lon(datum: Datum, points_ne: Array, depth_m: float) -> Array:
@@ -45,13 +45,15 @@ def grown(geometry: MultiPolygon, by_m: float) -> list[Polygon]:
 def route_ne(route: Route) -> Array:
     """Corners of a route, (N, 2); arcs as chords within 2 cm."""
     rows = [np.array([route.legs[0].start_ne_m])]
-    rows += [leg.places(np.linspace(0.0, leg.length_m, _chords(leg) + 1)[1:])
+    rows += [leg.places(np.linspace(0.0, leg.length_m, chords(leg) + 1)[1:])
              for leg in route.legs if leg.length_m > 0]  # fmt: skip
     return np.vstack(rows)
 
 
-def _chords(leg: Leg) -> int:
+def chords(leg: Leg) -> int:
+    """How many chords stand for a leg: one for a straight, for an arc within 2 cm of it."""
     if not leg.curvature_per_m:
         return 1
-    widest_rad = 2 * math.acos(max(0.0, 1.0 - _ARC_M * abs(leg.curvature_per_m)))
+    # The sagitta of a chord over an angle a is r (1 - cos(a / 2)).
+    widest_rad = 2 * math.acos(max(0.0, 1.0 - CHORD_M * abs(leg.curvature_per_m)))
     return max(1, math.ceil(leg.length_m * abs(leg.curvature_per_m) / widest_rad - 1e-9))

@@ -15,6 +15,7 @@ import shapely
 from shapely.geometry import Polygon
 
 from alice_survey.artefacts import write_json
+from alice_survey.errors import warn
 from alice_survey.frames import Array
 from camera_calib.rig import Rig
 from missions.exports.mavlink import (
@@ -28,6 +29,7 @@ from missions.exports.mavlink import (
 from missions.exports.mount import Mount
 from missions.exports.options import Options
 from missions.exports.places import grown, lat_lon
+from missions.exports.waypoints import Waypoint
 from missions.plan_file import Plan
 
 _ARDUPILOT, _SUBMARINE = 3, 12
@@ -40,6 +42,7 @@ _MIXED = 0
 def write_qgroundcontrol(
     path: Path,
     plan: Plan,
+    points: Sequence[Waypoint],
     items: Sequence[Item],
     home_lat_lon_deg: tuple[float, float],
     mount: Mount,
@@ -49,17 +52,19 @@ def write_qgroundcontrol(
     Args:
         path: where to.
         plan: what the dive is of.
-        items: of the dive.
+        points: the dive's way-points.
+        items: the same as mission items.
         home_lat_lon_deg: where the vehicle is launched.
         mount: of the camera; the fence is of the vehicle's reference point.
     """
     simple = [_simple(item, index) for index, item in enumerate(items, start=1)]
-    write_json(path, _document(plan, simple, home_lat_lon_deg, mount))
+    write_json(path, _document(plan, points, simple, home_lat_lon_deg, mount))
 
 
 def write_qgroundcontrol_survey(
     path: Path,
     plan: Plan,
+    points: Sequence[Waypoint],
     items: Sequence[Item],
     home_lat_lon_deg: tuple[float, float],
     mount: Mount,
@@ -74,7 +79,7 @@ def write_qgroundcontrol_survey(
     """
     ways = [index for index, item in enumerate(items) if item.frame == FRAME_ABOVE_TERRAIN]
     if not ways:
-        write_qgroundcontrol(path, plan, items, home_lat_lon_deg, mount)
+        write_qgroundcontrol(path, plan, points, items, home_lat_lon_deg, mount)
         return
     first, last = ways[0], ways[-1] + 1
     while last < len(items) and items[last].command == DO_SET_CAM_TRIGG_DIST:
@@ -82,12 +87,16 @@ def write_qgroundcontrol_survey(
     before = [_simple(item, index) for index, item in enumerate(items[:first], start=1)]
     inside = [_simple(item, index) for index, item in enumerate(items[first:last], first + 1)]
     after = [_simple(item, index) for index, item in enumerate(items[last:], start=last + 1)]
-    survey = _survey(plan, inside, items[first:last], rig, options)
-    write_json(path, _document(plan, [*before, survey, *after], home_lat_lon_deg, mount))
+    survey = _survey(plan, points, inside, items[first:last], rig, options)
+    write_json(path, _document(plan, points, [*before, survey, *after], home_lat_lon_deg, mount))
 
 
 def _document(
-    plan: Plan, items: list[dict[str, Any]], home: tuple[float, float], mount: Mount
+    plan: Plan,
+    points: Sequence[Waypoint],
+    items: list[dict[str, Any]],
+    home: tuple[float, float],
+    mount: Mount,
 ) -> dict[str, Any]:
     return {
         "fileType": "Plan",
@@ -103,7 +112,7 @@ def _document(
             "plannedHomePosition": [round(home[0], 10), round(home[1], 10), 0],
             "items": items,
         },
-        "geoFence": {"version": 2, "circles": [], "polygons": _fence(plan, mount)},
+        "geoFence": {"version": 2, "circles": [], "polygons": _fence(plan, points, mount)},
         "rallyPoints": {"version": 2, "points": []},
         "aliceSurvey": {"name": plan.name, "about": mount.about},
     }
@@ -127,21 +136,33 @@ def _simple(item: Item, number: int) -> dict[str, Any]:
     return data
 
 
-def _fence(plan: Plan, mount: Mount) -> list[dict[str, Any]]:
-    """The areas of the glass as those of the vehicle's reference point, a lever arm away."""
-    allowed = grown(plan.area.allowed, mount.reach_m)
-    keep_out = [Polygon(hole) for part in allowed for hole in part.interiors]
-    keep_out += grown(plan.area.no_go, -mount.reach_m)
-    outer = [Polygon(part.exterior) for part in allowed]
-    # A hole of the allowed area is most often a no-go zone: say it once.
-    zones = [
-        zone
-        for index, zone in enumerate(keep_out)
-        if not any(other.buffer(1e-3).contains(zone) for other in keep_out[:index])
-    ]
-    return [_polygon(plan, part, inclusion=True) for part in outer] + [
-        _polygon(plan, part, inclusion=False) for part in zones
-    ]
+def _fence(plan: Plan, points: Sequence[Waypoint], mount: Mount) -> list[dict[str, Any]]:
+    """The areas of the glass as those of the vehicle's reference point, a lever arm away.
+
+    The allowed area grows by the lever arm. A zone to keep out of stays as it is, unless the
+    reference point has to cut its corner to bring the glass along its edge: then it shrinks by the
+    lever arm, which the reference point surely keeps out of.
+    """
+    outer = [Polygon(part.exterior) for part in grown(plan.area.allowed, mount.reach_m)]
+    zones: list[Polygon] = []
+    holes = [Polygon(hole) for part in plan.area.allowed.geoms for hole in part.interiors]
+    for zone in (*holes, *plan.area.no_go.geoms):
+        # A hole of the allowed area is most often a no-go zone: say it once.
+        if not any(other.buffer(1e-3).contains(zone) for other in zones):
+            zones.append(Polygon(zone.exterior))
+    track = shapely.LineString([point.vehicle_ne_m for point in points])
+    fences = [_polygon(plan, part, inclusion=True) for part in outer]
+    for zone in zones:
+        parts = [zone]
+        if zone.intersects(track):
+            parts = grown(shapely.MultiPolygon([zone]), -mount.reach_m)
+            if not parts:
+                warn(
+                    f"a no-go zone of {zone.area:.2f} m2 is left out of the fence: the vehicle's "
+                    f"reference point, {mount.reach_m:.2f} m from the glass, crosses it in a turn"
+                )
+        fences += [_polygon(plan, part, inclusion=False) for part in parts]
+    return fences
 
 
 def _polygon(plan: Plan, polygon: Polygon, *, inclusion: bool) -> dict[str, Any]:
@@ -155,14 +176,20 @@ def _corners(plan: Plan, polygon: Polygon) -> list[list[float]]:
 
 
 def _survey(
-    plan: Plan, inside: list[dict[str, Any]], items: Sequence[Item], rig: Rig, options: Options
+    plan: Plan,
+    points: Sequence[Waypoint],
+    inside: list[dict[str, Any]],
+    items: Sequence[Item],
+    rig: Rig,
+    options: Options,
 ) -> dict[str, Any]:
     ways = [item for item in items if item.frame != FRAME_MISSION]
     parts = plan.area.survey.geoms
     corners = np.vstack([np.asarray(part.exterior.coords)[:, :2] for part in parts])
     outline = parts[0] if len(parts) == 1 else Polygon(_hull(corners))
     heading = plan.lines[0].heading_rad
-    shots = sum(line.stations for line in plan.lines)
+    flown = {point.line for point in points if point.line >= 0}
+    shots = sum(plan.lines[index].stations for index in flown)
     return {
         "type": "ComplexItem",
         "complexItemType": "survey",

@@ -10,6 +10,7 @@ import numpy as np
 from alice_survey.errors import PlanError
 from alice_survey.frames import Array
 from missions.exports.mount import Mount
+from missions.exports.places import chords
 from missions.plan_file import Dive, Plan
 from missions.route.costs import time_costs
 from missions.route.legs import Leg
@@ -21,8 +22,6 @@ straight down and up."""
 
 DEPTH_STEP_M = 0.05
 """A line's depth is given wherever straight lines between way-points would miss it by more."""
-_CHORD_M = 0.02
-"""How far the chords that stand for an arc may lie off it."""
 _STRAIGHT_RAD = 1e-6
 _TINY_M = 1e-6
 
@@ -223,12 +222,8 @@ def bends(along_m: Array, depths_m: Array, tolerance_m: float) -> list[int]:
 
 
 def _arc_points(leg: Leg) -> Iterator[_Point]:
-    """Ends of chords that lie within `_CHORD_M` of an arc."""
-    radius_m = 1.0 / abs(leg.curvature_per_m)
-    # The sagitta of a chord over an angle a is r (1 - cos(a / 2)).
-    widest_rad = 2 * math.acos(max(0.0, 1.0 - _CHORD_M / radius_m))
-    count = max(1, math.ceil(leg.length_m / radius_m / widest_rad - 1e-9))
-    along_m = np.linspace(0.0, leg.length_m, count + 1)[1:]
+    """Ends of chords that stand for an arc."""
+    along_m = np.linspace(0.0, leg.length_m, chords(leg) + 1)[1:]
     for distance_m, place in zip(along_m, leg.places(along_m), strict=True):
         yield _Point(
             kind="way",

@@ -177,7 +177,9 @@ def _cola2_v1(folder: Path, job: _Job) -> list[Path]:
 
 def _qgc(folder: Path, job: _Job) -> list[Path]:
     def write(path: Path, dive: int) -> None:
-        write_qgroundcontrol(path, job.plan, job.items(dive), job.home_lat_lon_deg, job.mount)
+        write_qgroundcontrol(
+            path, job.plan, job.dives[dive], job.items(dive), job.home_lat_lon_deg, job.mount
+        )
 
     return _each_dive(folder, job, "mission_dive{}.plan", write)
 
@@ -185,7 +187,14 @@ def _qgc(folder: Path, job: _Job) -> list[Path]:
 def _qgc_survey(folder: Path, job: _Job) -> list[Path]:
     def write(path: Path, dive: int) -> None:
         write_qgroundcontrol_survey(
-            path, job.plan, job.items(dive), job.home_lat_lon_deg, job.mount, job.rig, job.options
+            path,
+            job.plan,
+            job.dives[dive],
+            job.items(dive),
+            job.home_lat_lon_deg,
+            job.mount,
+            job.rig,
+            job.options,
         )
 
     return _each_dive(folder, job, "survey_dive{}.plan", write)

@@ -1,0 +1,222 @@
+import math
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+
+from camera_calib.rig import Rig
+from missions.exports.mount import mount_of
+from missions.exports.options import Options, line_tolerance_m
+from missions.exports.write import write_exports
+from missions.footprint import common_swath
+from missions.plan_file import Dive, Plan
+from missions.route.legs import Route
+from tests.missions.exports.plans import RIG, arc, line, plan_of, small_plan, spot, straight
+from tests.missions.exports.readers import (
+    Step,
+    local_ne,
+    plans,
+    read_cola2,
+    read_cola2_v1,
+    rigs,
+    turned,
+)
+
+GOLDEN = Path(__file__).parent / "golden"
+MM = 1e-3
+
+
+def golden_plan() -> Plan:
+    """Two lines and all ways to turn: an arc, a turn on the spot, a step sideways."""
+    north = [line((0.0, 0.0), (4.6, 0.0)), line((4.6, 1.0), (0.0, 1.0))]
+    lines = [*north, line((0.0, 1.8), (0.0, 2.6), "fill")]
+    legs = (
+        straight((-0.5, 0.0), (0.0, 0.0)),
+        straight((0.0, 0.0), (4.6, 0.0), 0),
+        straight((4.6, 0.0), (5.1, 0.0)),
+        arc((5.1, 0.0), 0.0, 0.5, math.pi),
+        straight((5.1, 1.0), (4.6, 1.0)),
+        straight((4.6, 1.0), (0.0, 1.0), 1),
+        straight((0.0, 1.0), (0.0, 1.8), side_rad=math.pi / 2),
+        spot((0.0, 1.8), math.pi, -math.pi / 2),
+        straight((0.0, 1.8), (0.0, 2.6), 2),
+    )
+    return plan_of(lines, [(0, 2)], routes=[Route(legs=legs)], home=(-0.5, 0.0))
+
+
+def steps_of(plan: Plan, rig: Rig, number: int = 1) -> list[Step]:
+    with tempfile.TemporaryDirectory() as folder:
+        write_exports(Path(folder), plan, rig, formats=["cola2"])
+        return read_cola2(Path(folder) / f"mission_dive{number}.xml")
+
+
+def place(plan: Plan, step: Step, which: str = "final") -> np.ndarray:
+    latitude, longitude = (float(step.values[f"{which}_{n}"]) for n in ("latitude", "longitude"))
+    return np.array(local_ne(plan.datum, latitude, longitude))
+
+
+@pytest.mark.parametrize(("format_", "name"), [("cola2", "mission"), ("cola2-v1", "mission_v1")])
+def test_missions_are_those_on_file(tmp_path: Path, format_: str, name: str) -> None:
+    write_exports(tmp_path, golden_plan(), RIG, formats=[format_])
+    written = (tmp_path / f"{name}_dive1.xml").read_bytes()
+    assert written == (GOLDEN / f"{name}.xml").read_bytes()
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(plan=plans(), rig=rigs())
+def test_the_glass_flies_every_line(plan: Plan, rig: Rig) -> None:
+    """The reference point's section, moved by the lever arm, is the line of the glass."""
+    glass = rig.body_from_cam("left").apply([0.0, 0.0, 0.03])  # port 20 mm, glass 10 mm
+    for number, dive in enumerate(plan.dives, start=1):
+        on = False
+        flown = []
+        for step in steps_of(plan, rig, number):
+            if on:
+                assert step.kind == "section"
+                flown.append(step)
+            on = step.actions[-1] == "camera_trigger/enable" if step.actions else on
+        assert not on
+        assert len(flown) == dive.last_line - dive.first_line + 1
+        for index, step in enumerate(flown, start=dive.first_line):
+            wanted = plan.lines[index]
+            arm = turned((glass[0], glass[1]), wanted.heading_rad)
+            np.testing.assert_allclose(
+                place(plan, step, "initial") + arm, wanted.start_ne_m, atol=MM
+            )
+            np.testing.assert_allclose(place(plan, step) + arm, wanted.end_ne_m, atol=MM)
+            depth = plan.seafloor_depth_m - plan.altitude_m - glass[2]
+            assert step.values["final_depth"] == pytest.approx(depth, abs=MM)
+            # The DVL, 0.11 m below the origin, measures as much less as it is deeper.
+            altitude = plan.altitude_m + glass[2] - 0.11
+            assert step.values["final_altitude"] == pytest.approx(altitude, abs=MM)
+            assert step.values["heave_mode"] == 1
+            assert step.values["surge_velocity"] == pytest.approx(plan.speed_mps, abs=1e-4)
+
+
+def test_the_way_down_needs_no_altitude_and_the_way_up_ends_at_the_surface() -> None:
+    first, *_, last = steps_of(small_plan(), RIG)
+    assert (first.kind, first.values["heave_mode"]) == ("goto", 2)
+    assert (last.kind, last.values["heave_mode"], last.values["final_depth"]) == ("goto", 0, 0.0)
+    assert not first.values["no_altitude_goes_up"]
+    assert not last.values["no_altitude_goes_up"]
+
+
+def test_turns_on_the_spot_hold_the_glass_and_turn_the_vehicle() -> None:
+    plan = golden_plan()
+    steps = steps_of(plan, RIG)
+    sway, turn = (step for step in steps if step.kind == "park")
+
+    for step, heading, glass in ((sway, math.pi, (0.0, 1.8)), (turn, math.pi / 2, (0.0, 1.8))):
+        assert step.values["use_yaw"]
+        assert abs(math.remainder(float(step.values["final_yaw"]) - heading, 2 * math.pi)) < 1e-6
+        arm = turned((0.55, -0.05), heading)
+        np.testing.assert_allclose(place(plan, step) + arm, glass, atol=MM)
+    # 90 degrees at 15 degrees a second and 4 s to settle.
+    assert turn.values["time"] == pytest.approx(10.0, abs=0.05)
+
+
+def test_an_arc_is_flown_as_chords_that_lie_near_it() -> None:
+    plan = golden_plan()
+    steps = steps_of(plan, RIG)
+    gotos = [step for step in steps if step.kind == "goto"][1:-1]
+    centre = np.array([5.1, 0.5])
+    # On the arc's circle the reference point is 0.55 m behind and 0.05 m to starboard of the glass.
+    radius = math.hypot(0.5 - 0.05, 0.55)
+    on_arc = [s for s in gotos if place(plan, s)[0] > 4.6 + 1e-3]
+
+    distances = [math.dist(place(plan, step), centre) for step in on_arc]
+    assert len(on_arc) >= 6
+    np.testing.assert_allclose(distances[1:], radius, atol=MM)
+    widest = math.pi / len(on_arc)
+    assert 0.5 * (1 - math.cos(widest / 2)) <= 0.02
+
+
+def test_the_tolerance_keeps_neighbouring_lines_together() -> None:
+    plan = small_plan(line_spacing_m=0.8)
+    stereo = common_swath(RIG, 2.0, plan.station_spacing_m)
+    error_m = line_tolerance_m(plan, RIG, Options(least_tolerance_m=0.01))
+
+    # Two lines that err apart by it just meet; here that is less than half a step of 0.46 m.
+    assert 0.8 + 2 * error_m == pytest.approx(2 * stereo.half_across_m)
+    assert 0.2 < error_m < 0.23
+    close = line_tolerance_m(small_plan(line_spacing_m=0.7), RIG, Options(least_tolerance_m=0.01))
+    assert close == pytest.approx(0.23)
+    # Never COLA2's 1.5 m, never less than what a vehicle holds.
+    assert line_tolerance_m(small_plan(line_spacing_m=1.26), RIG, Options()) == 0.12
+    written = [s.values["tolerance_xy"] for s in steps_of(plan, RIG) if s.kind == "section"]
+    assert written == pytest.approx([error_m] * len(written), abs=1e-4)
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(plan=plans())
+def test_version_1_flies_the_same_places(plan: Plan) -> None:
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        write_exports(folder, plan, RIG, formats=["cola2", "cola2-v1"])
+        for number in range(1, len(plan.dives) + 1):
+            new = read_cola2(folder / f"mission_dive{number}.xml")
+            old = read_cola2_v1(folder / f"mission_v1_dive{number}.xml")
+            assert len(new) == len(old)
+            for step, former in zip(new, old, strict=True):
+                key = "final_position" if former.kind == "section" else "position"
+                for axis in ("latitude", "longitude"):
+                    assert step.values[f"final_{axis}"] == former.values[f"{key}.{axis}"]
+                by_altitude = bool(former.values[f"{key}.altitude_mode"])
+                z = step.values["final_altitude" if by_altitude else "final_depth"]
+                assert former.values[f"{key}.z"] == z
+                assert step.actions == former.actions
+                assert former.kind == {"goto": "waypoint"}.get(step.kind, step.kind)
+
+
+def test_names_of_actions_are_the_vehicles_own() -> None:
+    options = Options(camera_on="/rig/start", camera_off="/rig/stop & wait")
+    with tempfile.TemporaryDirectory() as folder:
+        write_exports(Path(folder), small_plan(), RIG, formats=["cola2"], options=options)
+        steps = read_cola2(Path(folder) / "mission_dive1.xml")
+    calls = [action for step in steps for action in step.actions]
+    assert calls == ["/rig/start", "/rig/stop & wait"] * 3
+
+
+def test_a_name_that_would_end_the_comment_does_not(tmp_path: Path) -> None:
+    write_exports(tmp_path, small_plan(name='a<b&"c--> -- -'), RIG, formats=["cola2"])
+    assert len(read_cola2(tmp_path / "mission_dive1.xml")) > 10
+
+
+def test_lines_that_follow_a_bathymetry_bend_where_the_floor_does() -> None:
+    plan = small_plan()
+    ramps = [np.full(line.stations, 13.0) for line in plan.lines]
+    ramps[1] = np.interp(np.arange(plan.lines[1].stations), [0, 4, 10], [12.0, 12.8, 12.9])
+    depths = tuple(tuple(map(float, ramp)) for ramp in ramps)
+    steps = steps_of(small_plan(line_depths_m=depths), RIG)
+    second = [s for s in steps if s.kind == "section" and s.values["final_depth"] < 12.9]
+
+    # A bend at 12.8 m, then the end; the run-in comes in at the line's first depth.
+    assert [s.values["final_depth"] for s in second] == pytest.approx(
+        [12.0 - 0.08, 12.8 - 0.08, 12.9 - 0.08], abs=MM
+    )
+    assert second[1].values["initial_depth"] == pytest.approx(12.0 - 0.08, abs=MM)
+    assert [bool(s.actions) for s in second] == [True, False, True]
+
+
+def test_dives_of_one_line_without_a_run_in() -> None:
+    only = line((0.0, 0.0), (3.0, 0.0))
+    route = Route(legs=(straight((0.0, 0.0), (3.0, 0.0), 0),))
+    plan = plan_of([only], [(0, 0)], routes=[route])
+    assert isinstance(plan.dives[0], Dive)
+    steps = steps_of(plan, RIG)
+    assert [step.kind for step in steps] == ["goto", "section", "goto"]
+    assert steps[0].actions == ["camera_trigger/enable"]
+    assert steps[1].actions == ["camera_trigger/disable"]
+
+
+@settings(max_examples=25, deadline=None)
+@given(rig=rigs())
+def test_the_mount_is_where_the_glass_was_designed(rig: Rig) -> None:
+    mount = mount_of(rig)
+    forward, right = mount.glass_body_m[:2]
+    for heading in (0.0, 1.0, math.pi, -2.0):
+        vehicle = mount.vehicle_ne(np.array([[3.0, 4.0]]), np.array([heading]))[0]
+        np.testing.assert_allclose(vehicle + turned((forward, right), heading), [3, 4], atol=1e-12)
+    assert mount.reach_m == pytest.approx(math.hypot(forward, right))

@@ -1,0 +1,184 @@
+"""KML, GPX and GeoJSON read back by fastkml, gpxpy and GDAL."""
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import gpxpy
+import numpy as np
+import pyogrio
+import pytest
+import shapely
+from fastkml import Folder, Placemark, kml
+from fastkml.utils import find_all
+from hypothesis import HealthCheck, given, settings
+
+from missions.exports.kml import write_kml
+from missions.exports.write import write_exports
+from missions.plan_file import Plan
+from tests.missions.exports.plans import RIG, small_plan
+from tests.missions.exports.readers import local_ne, plans
+
+MM = 1e-3
+WIDE = settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
+
+def clean(name: str) -> str:
+    """A name without what XML 1.0 cannot hold, and as XML reads carriage returns."""
+    held = "".join(
+        c if c in "\t\n\r" or "\x20" <= c <= "\ud7ff" or "\ue000" <= c <= "\ufffd"
+        or c >= "\U00010000" else "\ufffd"
+        for c in name
+    )  # fmt: skip
+    return held.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def ne(plan: Plan, lon_lat: Any) -> np.ndarray:
+    return np.array([local_ne(plan.datum, lat, lon) for lon, lat, *_ in lon_lat])
+
+
+def placemarks(path: Path, folder: str) -> list[Placemark]:
+    document = kml.KML.parse(path)
+    (found,) = [f for f in find_all(document, of_type=Folder) if f.name == folder]
+    return list(find_all(found, of_type=Placemark))
+
+
+@WIDE
+@given(plan=plans())
+def test_kml_in_fastkml(plan: Plan) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        write_exports(Path(folder), plan, RIG, formats=["kml"])
+        path = Path(folder) / "plan.kml"
+        lines, routes = placemarks(path, "Lines"), placemarks(path, "Routes")
+        document = kml.KML.parse(path).features[0]
+    assert (document.name or "").strip() == clean(plan.name).strip()
+    assert len(lines) == len(plan.lines)
+    assert len(routes) == len(plan.dives)
+    for mark, wanted in zip(lines, plan.lines, strict=True):
+        coordinates = mark.geometry.coords
+        np.testing.assert_allclose(
+            ne(plan, coordinates), [wanted.start_ne_m, wanted.end_ne_m], atol=MM
+        )
+        depth = plan.seafloor_depth_m - plan.altitude_m
+        assert [c[2] for c in coordinates] == pytest.approx([-depth] * 2, abs=MM)
+        data = {element.name: element.value for element in mark.extended_data.elements}
+        assert (data["kind"], int(data["stations"])) == (wanted.kind, wanted.stations)
+    for mark, dive in zip(routes, plan.dives, strict=True):
+        places = ne(plan, mark.geometry.coords)
+        length = np.linalg.norm(np.diff(places, axis=0), axis=1).sum()
+        assert length == pytest.approx(dive.route.length_m, rel=1e-4, abs=0.02)
+
+
+def test_kml_has_areas_with_their_holes_and_footprints_when_asked(tmp_path: Path) -> None:
+    plan = small_plan()
+    write_kml(tmp_path / "with.kml", plan, RIG, footprints=True)
+    marks = {mark.name: mark for mark in placemarks(tmp_path / "with.kml", "Areas")}
+    area = marks["survey area"].geometry
+    (wanted,) = plan.area.survey.geoms
+    read = shapely.Polygon(
+        ne(plan, area.exterior.coords), [ne(plan, hole.coords) for hole in area.interiors]
+    )
+    assert read.symmetric_difference(wanted).area < MM
+    assert len(read.interiors) == 1
+    np.testing.assert_allclose(ne(plan, marks["home"].geometry.coords), [[-2, -2]], atol=MM)
+    prints = placemarks(tmp_path / "with.kml", "Footprints")
+    assert len(prints) == plan.stations
+    first = shapely.Polygon(ne(plan, prints[0].geometry.exterior.coords))
+    # 1.44 m by 1.17 m on the middle row and column, less at its corners: a footprint bulges.
+    assert 0.94 * 1.441 * 1.1749 < first.area < 0.98 * 1.441 * 1.1749
+
+
+@WIDE
+@given(plan=plans())
+def test_gpx_in_gpxpy(plan: Plan) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        write_exports(Path(folder), plan, RIG, formats=["gpx"])
+        gpx = gpxpy.parse((Path(folder) / "plan.gpx").read_text(encoding="utf-8"))
+    assert (gpx.name or "").strip() == clean(plan.name).strip()
+    home, *ends = gpx.waypoints
+    assert local_ne(plan.datum, home.latitude, home.longitude) == pytest.approx(
+        plan.home_ne_m, abs=MM
+    )
+    wanted = [end for line in plan.lines for end in (line.start_ne_m, line.end_ne_m)]
+    read = [local_ne(plan.datum, end.latitude, end.longitude) for end in ends]
+    np.testing.assert_allclose(read, wanted, atol=MM)
+    assert len(gpx.routes) == len(plan.dives)
+    for route, dive in zip(gpx.routes, plan.dives, strict=True):
+        places = np.array([local_ne(plan.datum, p.latitude, p.longitude) for p in route.points])
+        length = np.linalg.norm(np.diff(places, axis=0), axis=1).sum()
+        assert length == pytest.approx(dive.route.length_m, rel=1e-4, abs=0.02)
+        floor = plan.seafloor_depth_m - plan.altitude_m
+        assert route.points[1].elevation == pytest.approx(-floor, abs=MM)
+        assert route.points[-1].elevation == 0.0
+
+
+@pytest.mark.parametrize(
+    ("file", "layer", "count"),
+    [
+        ("plan.kml", "Lines", 6),
+        ("plan.kml", "Routes", 2),
+        ("plan.gpx", "routes", 2),
+        ("plan.gpx", "waypoints", 13),
+    ],
+)
+def test_gdal_reads_the_layers_of_kml_and_gpx(
+    tmp_path: Path, file: str, layer: str, count: int
+) -> None:
+    plan = small_plan()
+    write_exports(tmp_path, plan, RIG, formats=["kml", "gpx"])
+    about, _, shapes, _ = pyogrio.raw.read(tmp_path / file, layer=layer)
+    assert about["crs"] == "EPSG:4326"
+    assert len(shapes) == count
+    ends = np.array([end for line in plan.lines for end in (line.start_ne_m, line.end_ne_m)])
+    read = ne(plan, shapely.get_coordinates(shapely.from_wkb(shapes)))
+    if layer == "Lines":
+        np.testing.assert_allclose(read, ends, atol=MM)
+    elif layer == "waypoints":
+        np.testing.assert_allclose(read[1:], ends, atol=MM)
+    else:
+        distances = np.linalg.norm(read[:, None] - ends[None], axis=2).min(axis=0)
+        assert distances.max() < MM
+
+
+@WIDE
+@given(plan=plans())
+def test_geojson_in_gdal(plan: Plan) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        write_exports(Path(folder), plan, RIG, formats=["geojson"])
+        about, _, shapes, columns = pyogrio.raw.read(Path(folder) / "plan.geojson")
+    fields = dict(zip(about["fields"], columns, strict=True))
+    shapes = shapely.from_wkb(shapes)
+    roles = fields["role"]
+
+    def places(role: str) -> np.ndarray:
+        return ne(plan, shapely.get_coordinates(shapes[roles == role]))
+
+    ends = [end for line in plan.lines for end in (line.start_ne_m, line.end_ne_m)]
+    np.testing.assert_allclose(places("line"), ends, atol=MM)
+    stations = np.vstack([line.stations_ne for line in plan.lines])
+    np.testing.assert_allclose(places("station"), stations, atol=MM)
+    np.testing.assert_allclose(places("home"), [plan.home_ne_m], atol=MM)
+    assert list(fields["kind"][roles == "line"]) == [line.kind for line in plan.lines]
+    assert list(fields["dive"][roles == "route"]) == list(range(1, len(plan.dives) + 1))
+    # Every footprint holds the place below its glass.
+    prints = shapes[roles == "footprint"]
+    assert shapely.contains(prints, shapes[roles == "station"]).all()
+    for role, geometry in (("area", plan.area.survey), ("allowed", plan.area.allowed)):
+        (read,) = shapes[roles == role]
+        assert len(read.interiors) == len(geometry.geoms[0].interiors)
+        assert read.exterior.is_ccw
+        np.testing.assert_allclose(
+            shapely.Polygon(ne(plan, read.exterior.coords)).area,
+            shapely.Polygon(geometry.geoms[0].exterior).area,
+            rtol=1e-3,
+        )
+
+
+def test_holes_in_geojson_run_clockwise(tmp_path: Path) -> None:
+    write_exports(tmp_path, small_plan(), RIG, formats=["geojson"])
+    about, _, shapes, columns = pyogrio.raw.read(tmp_path / "plan.geojson")
+    roles = columns[list(about["fields"]).index("role")]
+    (area,), (zone,) = (shapely.from_wkb(shapes[roles == role]) for role in ("area", "no_go"))
+    assert not area.interiors[0].is_ccw
+    assert zone.exterior.is_ccw
+    assert shapely.Polygon(area.interiors[0]).equals(zone)

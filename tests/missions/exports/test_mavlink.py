@@ -1,0 +1,240 @@
+"""WPL 110 read back by pymavlink, QGroundControl plans by MAVSDK's importer."""
+
+import json
+import math
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from mavsdk.component_type import ComponentType
+from mavsdk.mavsdk import Configuration, Mavsdk
+from mavsdk.plugins.mission_raw.mission_raw import MissionRaw
+from pymavlink import mavutil, mavwp
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+from shapely.geometry import Point, Polygon
+
+from camera_calib.rig import Rig
+from missions.exports.write import write_exports
+from missions.plan_file import Plan
+from tests.missions.exports.plans import RIG, line, plan_of, small_plan
+from tests.missions.exports.readers import local_ne, plans, rigs, turned
+
+MM = 1e-3
+Importer = Callable[[str], Any]
+
+
+@pytest.fixture(scope="module")
+def import_plan() -> Iterator[Importer]:
+    """MAVSDK's importer; it wants a vehicle, so it hears one heartbeat and no more."""
+    mavsdk = Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION))
+    mavsdk.add_any_connection("raw://")
+    link = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
+    heart = link.heartbeat_encode(
+        dialect.MAV_TYPE_SUBMARINE, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA, 0, 0, 4
+    )
+    mavsdk.pass_received_raw_bytes(heart.pack(link))
+    system = mavsdk.first_autopilot(10.0)
+    assert system is not None
+    yield MissionRaw(system).import_qgroundcontrol_mission
+    mavsdk.destroy()
+
+
+def read_wpl(path: Path) -> list[Any]:
+    loader = mavwp.MAVWPLoader()
+    loader.load(str(path))
+    return [loader.wp(index) for index in range(loader.count())]
+
+
+def written(plan: Plan, rig: Rig, formats: list[str], folder: Path) -> Path:
+    write_exports(folder, plan, rig, formats=formats)
+    return folder
+
+
+def check_lines(
+    plan: Plan, rig: Rig, dive: int, items: list[dict[str, float]], atol: float
+) -> None:
+    """The camera is on exactly along each line of the glass, and takes all its pictures."""
+    glass = rig.body_from_cam("left").apply([0.0, 0.0, 0.03])
+    first, last = plan.dives[dive].first_line, plan.dives[dive].last_line
+    number, on, place = first, 0.0, np.zeros(2)
+    for item in items:
+        if item["command"] == dialect.MAV_CMD_NAV_WAYPOINT:
+            before, place = place, np.array(local_ne(plan.datum, item["lat"], item["lon"]))
+            if on:
+                wanted = plan.lines[number]
+                arm = turned((glass[0], glass[1]), wanted.heading_rad)
+                np.testing.assert_allclose(before + arm, wanted.start_ne_m, atol=atol)
+                np.testing.assert_allclose(place + arm, wanted.end_ne_m, atol=atol)
+                assert item["frame"] == 10
+                altitude = plan.altitude_m + glass[2] - 0.11
+                assert item["z"] == pytest.approx(altitude, abs=MM)
+                pictures = math.floor(wanted.length_m / on) + 1
+                assert pictures == wanted.stations
+                number += 1
+        elif item["command"] == dialect.MAV_CMD_DO_SET_CAM_TRIGG_DIST:
+            assert bool(item["param1"]) != bool(on)
+            on = item["param1"]
+    assert number == last + 1
+    assert not on
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(plan=plans(), rig=rigs())
+def test_wpl_in_pymavlink(plan: Plan, rig: Rig) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        written(plan, rig, ["wpl"], Path(folder))
+        for dive in range(len(plan.dives)):
+            rows = read_wpl(Path(folder) / f"mission_dive{dive + 1}.waypoints")
+            items = [
+                {"command": w.command, "frame": w.frame, "param1": w.param1, "lat": w.x,
+                 "lon": w.y, "z": w.z} for w in rows
+            ]  # fmt: skip
+            check_lines(plan, rig, dive, items, MM)
+            assert [w.seq for w in rows] == list(range(len(rows)))
+            assert [w.current for w in rows] == [1] + [0] * (len(rows) - 1)
+
+
+@settings(
+    max_examples=15,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
+)
+@given(plan=plans(), rig=rigs())
+@pytest.mark.parametrize("format_", ["qgc", "qgc-survey"])
+def test_plans_in_mavsdk(import_plan: Importer, format_: str, plan: Plan, rig: Rig) -> None:
+    name = {"qgc": "mission", "qgc-survey": "survey"}[format_]
+    with tempfile.TemporaryDirectory() as folder:
+        written(plan, rig, [format_], Path(folder))
+        for dive in range(len(plan.dives)):
+            data = import_plan(str(Path(folder) / f"{name}_dive{dive + 1}.plan"))
+            items = [
+                {"command": m.command, "frame": m.frame, "param1": m.param1, "lat": m.x * 1e-7,
+                 "lon": m.y * 1e-7, "z": m.z} for m in data.mission_items
+            ]  # fmt: skip
+            # MAVLink carries 1e-7 degrees, 11 mm: half of it in each of north and east.
+            check_lines(plan, rig, dive, items, 0.0058)
+
+
+def test_both_plans_and_the_wpl_say_the_same(tmp_path: Path, import_plan: Importer) -> None:
+    plan = small_plan()
+    written(plan, RIG, ["qgc", "qgc-survey", "wpl"], tmp_path)
+    for dive in (1, 2):
+        simple = import_plan(str(tmp_path / f"mission_dive{dive}.plan")).mission_items
+        survey = import_plan(str(tmp_path / f"survey_dive{dive}.plan")).mission_items
+        rows = read_wpl(tmp_path / f"mission_dive{dive}.waypoints")
+        assert [vars(item) for item in simple] == [vars(item) for item in survey]
+        # The first item is home in all; MAVSDK says it in integers.
+        assert [item.command for item in simple] == [row.command for row in rows]
+        for item, row in list(zip(simple, rows, strict=True))[1:]:
+            assert item.frame == row.frame
+            params = [row.param1, row.param2, row.param3, row.param4, row.z]
+            read = [item.param1, item.param2, item.param3, item.param4, item.z]
+            assert read == pytest.approx(params, abs=2e-5)
+            assert (item.x, item.y) == (
+                pytest.approx(row.x * 1e7, abs=1.01), pytest.approx(row.y * 1e7, abs=1.01)
+            )  # fmt: skip
+
+
+def test_the_way_down_is_by_depth_and_stops_short_of_the_charted_floor(tmp_path: Path) -> None:
+    written(small_plan(), RIG, ["wpl"], tmp_path)
+    ways = [
+        row
+        for row in read_wpl(tmp_path / "mission_dive1.waypoints")[1:]
+        if row.command == mavutil.mavlink.MAV_CMD_NAV_WAYPOINT
+    ]
+    # A floor at 15 m, twice 2 m above it, and the reference point 0.08 m above the glass.
+    assert (ways[0].frame, ways[0].z) == (3, pytest.approx(-(15 - 4 - 0.08)))
+    assert (ways[-1].frame, ways[-1].z) == (3, 0.0)
+    assert {row.frame for row in ways[1:-1]} == {10}
+
+
+def test_a_turn_on_the_spot_is_told_its_heading_and_sense(tmp_path: Path) -> None:
+    plan = small_plan()
+    written(plan, RIG, ["wpl"], tmp_path)
+    rows = read_wpl(tmp_path / "mission_dive1.waypoints")
+    turns = [leg for leg in plan.dives[0].route.legs if leg.turn_rad]
+    yaws = [row for row in rows if row.command == mavutil.mavlink.MAV_CMD_CONDITION_YAW]
+    assert len(yaws) == len(turns) > 3
+    for row, leg in zip(yaws, turns, strict=True):
+        assert math.remainder(math.radians(row.param1) - leg.end_heading_rad, math.tau) == (
+            pytest.approx(0.0, abs=1e-6)
+        )
+        assert row.param3 == math.copysign(1, math.remainder(leg.turn_rad, math.tau))
+        assert row.param4 == 0
+
+
+def test_the_fence_holds_the_vehicle_and_keeps_it_out(
+    tmp_path: Path, import_plan: Importer
+) -> None:
+    survey = Polygon(
+        [(-0.1, -0.5), (5.1, -0.5), (5.1, 6.0), (-0.1, 6.0)],
+        [[(1.5, 2.0), (1.5, 4.0), (3.5, 4.0), (3.5, 2.0)]],
+    )
+    lines = [line((0.2, 0.0), (4.8, 0.0)), line((4.8, 1.2), (0.2, 1.2))]
+    plan = plan_of(lines, [(0, 1)], survey=survey)
+    written(plan, RIG, ["qgc"], tmp_path)
+    data = import_plan(str(tmp_path / "mission_dive1.plan"))
+
+    corners: dict[int, list[tuple[float, float]]] = {}
+    for vertex in data.geofence_items:
+        place = local_ne(plan.datum, vertex.x * 1e-7, vertex.y * 1e-7)
+        corners.setdefault(vertex.command, []).append(place)
+    inside = Polygon(corners[dialect.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION])
+    outside = Polygon(corners[dialect.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_EXCLUSION])
+    assert outside.symmetric_difference(Polygon(survey.interiors[0])).area < 0.1
+    # The lever arm of 0.552 m about the area where the glass may be.
+    assert inside.symmetric_difference(survey.buffer(3.552, join_style="mitre")).area < 4.5
+    for item in data.mission_items:
+        if item.command == dialect.MAV_CMD_NAV_WAYPOINT:
+            place = Point(local_ne(plan.datum, item.x * 1e-7, item.y * 1e-7))
+            assert inside.contains(place)
+            assert not outside.contains(place)
+
+
+def test_a_zone_that_the_reference_point_must_cut_is_shrunk_or_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    survey = Polygon(
+        [(-0.1, -0.5), (5.1, -0.5), (5.1, 6.0), (-0.1, 6.0)],
+        [[(2.0, -0.2), (2.0, 0.1), (2.4, 0.1), (2.4, -0.2)]],
+    )
+    plan = plan_of([line((0.2, 0.0), (4.8, 0.0))], [(0, 0)], survey=survey)
+    written(plan, RIG, ["qgc"], tmp_path)
+    data = json.loads((tmp_path / "mission_dive1.plan").read_text())
+    assert [p["inclusion"] for p in data["geoFence"]["polygons"]] == [True]
+    assert "a no-go zone of 0.12 m2 is left out of the fence" in capsys.readouterr().err
+
+
+def test_the_survey_item_has_what_qgroundcontrol_asks_for(tmp_path: Path) -> None:
+    plan = small_plan(name='a<b&"c')
+    written(plan, RIG, ["qgc-survey"], tmp_path)
+    data = json.loads((tmp_path / "survey_dive1.plan").read_text())
+    (survey,) = [item for item in data["mission"]["items"] if item["type"] == "ComplexItem"]
+    calc = survey["TransectStyleComplexItem"]["CameraCalc"]
+
+    assert (data["fileType"], data["version"], data["mission"]["version"]) == ("Plan", 1, 2)
+    assert (data["mission"]["firmwareType"], data["mission"]["vehicleType"]) == (3, 12)
+    assert (survey["complexItemType"], survey["version"]) == ("survey", 5)
+    assert {"angle", "entryLocation", "flyAlternateTransects", "splitConcavePolygons"} < set(survey)
+    assert len(survey["polygon"]) == 4
+    assert data["aliceSurvey"]["name"] == 'a<b&"c'
+    # What QGroundControl reckons with a pinhole is what the camera sees through its port.
+    across = calc["SensorWidth"] / calc["FocalLength"] * calc["DistanceToSurface"]
+    assert across == pytest.approx(plan.footprint_m[0], abs=1e-6)
+    assert across * (1 - calc["SideOverlap"] / 100) == pytest.approx(1.0, abs=1e-4)
+    assert calc["AdjustedFootprintSide"] == 1.0
+    assert survey["TransectStyleComplexItem"]["CameraShots"] == 33
+    numbers = [
+        item["doJumpId"]
+        for entry in data["mission"]["items"]
+        for item in (
+            entry["TransectStyleComplexItem"]["Items"]
+            if entry["type"] == "ComplexItem"
+            else [entry]
+        )
+    ]
+    assert numbers == list(range(1, len(numbers) + 1))
