@@ -58,6 +58,7 @@ class LightBudget:
     """The largest of any channel anywhere in the frame."""
     snr_centre: tuple[float, float, float]
     """Signal over shot and read noise."""
+    snr_median: float
     snr_corner: tuple[float, float, float]
     full_share: float
     """Brightest over full well."""
@@ -199,6 +200,7 @@ def light_budget(
         median_e=median,
         brightest_e=brightest,
         snr_centre=_triple(signal_to_noise(centre, limits.read_noise_e)),
+        snr_median=float(signal_to_noise(np.array(median), limits.read_noise_e)),
         snr_corner=_triple(signal_to_noise(corner, limits.read_noise_e)),
         full_share=brightest / limits.full_well_e,
         gain_db=20.0 * math.log10(MIDDLE_GREY * limits.full_well_e / max(median, 1e-9)),

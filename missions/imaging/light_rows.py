@@ -58,8 +58,8 @@ def light_rows(
             equation="S / sqrt(S + read^2)",
             source="Poisson shot noise and read noise",
             bound_by="electrons",
-            note="at the centre; in the corner "
-            + " / ".join(f"{value:.3g}" for value in budget.snr_corner),
+            note=f"at the centre; of the median pixel {budget.snr_median:.1f}, in the corner "
+            + " / ".join(f"{value:.1f}" for value in budget.snr_corner),
         ),
         Setting(
             group="light",
