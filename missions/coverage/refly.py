@@ -17,7 +17,7 @@ from missions.coverage.stations import stations_of_plan
 from missions.lines.fill import lines_over
 from missions.plan_file import Plan
 from missions.route.dives import split_dives
-from missions.route.energy import vehicle_costs
+from missions.route.energy import usable_wh, vehicle_costs
 from missions.route.ways import Ways
 
 
@@ -46,7 +46,19 @@ def refly_plan(
     if not lines:
         raise PlanError(f"no line inside the allowed area sees any of the {len(holes)} holes")
     costs = vehicle_costs(config)
-    dives = split_dives(lines, Ways(area.allowed), costs, config, plan.home_ne_m)
+    dives = split_dives(
+        lines,
+        ways=Ways(area.allowed),
+        costs=costs,
+        home_ne=plan.home_ne_m,
+        turn_radius_m=plan.turn_radius_m,
+        run_in_m=plan.run_in_m,
+        turns=config.plan.turns,
+        usable_wh=usable_wh(config.vehicle),
+        longest_s=config.plan.dive_s,
+        depth_m=plan.seafloor_depth_m - plan.altitude_m,
+        split=config.plan.split_dives,
+    )
     again = replace(
         plan,
         name=f"{plan.name} holes",

@@ -125,5 +125,34 @@ def stations_of_flight(flight: "Flight") -> Stations:
 
 def plan_pattern(plan: Plan, rig: Rig) -> Pattern:
     """The pattern that a plan's lines follow."""
-    stereo = common_swath(rig, plan.altitude_m, plan.station_spacing_m)
-    return pattern(stereo, plan.line_spacing_m, plan.station_spacing_m)
+    return sure_pattern(rig, plan.altitude_m, plan.line_spacing_m, plan.station_spacing_m)
+
+
+def sure_pattern(rig: Rig, altitude_m: float, spacing_m: float, step_m: float) -> Pattern:
+    """The pattern of lines and pictures that keeps what it promises at the corners of footprints.
+
+    A footprint bulges: its side reaches less far out at the corners than in the middle. A place
+    that `k` pictures of a line shall see must be within reach of the side over `k` steps, so more
+    pictures make a narrower swath. Of all that hold, the one with the most pictures of a place is
+    taken, and of equal ones that with the most lines.
+
+    Args:
+        rig: the cameras; what every one of them sees counts.
+        altitude_m: of the left port's outer glass, the vehicle being level.
+        spacing_m: from line to line.
+        step_m: from picture to picture.
+
+    Raises:
+        PlanError: a picture looks past the sea floor.
+    """
+    whole = pattern(common_swath(rig, altitude_m, step_m), spacing_m, step_m)
+    best = whole
+    most = 0
+    for pictures in range(whole.pictures, 0, -1):
+        swath = common_swath(rig, altitude_m, pictures * step_m)
+        fewer = whole.half_along_m if pictures == whole.pictures else pictures * step_m / 2
+        tried = replace(whole, half_across_m=swath.half_across_m, half_along_m=fewer)
+        held = tried.passes * spacing_m <= 2 * swath.half_across_m + 1e-9
+        if held and (tried.passes * pictures, tried.passes) > (most, best.passes if most else 0):
+            best, most = tried, tried.passes * pictures
+    return best
