@@ -22,6 +22,10 @@ _SLIGHT_M2 = 0.01
 corners. Parts and holes below it are left out."""
 _NO_SIZE_M2 = 1e-4
 _NAMED = 3
+GRID_M = 1e-6
+"""Of corners where polygons are joined or cut: it closes the seams that rounding leaves."""
+_SHARP = 1e3
+"""Mitre limit with which a shape that is widened and narrowed keeps its corners."""
 MITRE_LIMIT = 2.0
 """How far a corner of a widened shape may stand off, in widths: those sharper than 60 degrees are
 cut off (1 / sin 30 degrees = 2)."""
@@ -87,7 +91,9 @@ def mended(raw: RawShapes, frame: LocalFrame, *, geographic: bool, overlaps: boo
             if hole is not None:
                 cuts.append(hole)
         holes += cuts
-        solid = shell.difference(shapely.union_all(cuts)) if cuts else shell
+        solid: BaseGeometry = shell
+        if cuts:
+            solid = shapely.difference(shell, shapely.union_all(cuts), grid_size=GRID_M)
         if solid.area < _SLIGHT_M2 and len(raw.polygons) > 1:
             tell.warn(
                 name,
@@ -99,7 +105,9 @@ def mended(raw: RawShapes, frame: LocalFrame, *, geographic: bool, overlaps: boo
     if raw.polygons and not any(solid.area > 0 for solid in solids):
         raise tell.refuse("", "its holes, or its size, leave nothing")
     solid = _joined(solids, names, tell if overlaps else None)
-    left = shapely.union_all(holes).difference(solid) if holes else MultiPolygon()
+    left: BaseGeometry = MultiPolygon()
+    if holes:
+        left = shapely.difference(shapely.union_all(holes), solid, grid_size=GRID_M)
     return Mended(solid=solid, holes=without_slivers(multipolygon(left)))
 
 
@@ -258,13 +266,19 @@ def _joined(solids: list[BaseGeometry], names: list[str], tell: _Teller | None) 
     if len(solids) <= 1:
         return multipolygon(solids[0]) if solids else MultiPolygon()
     tree = shapely.STRtree(solids)
-    pairs = tree.query(solids, predicate="intersects").T
-    if tell is not None:
-        _tell_overlaps(solids, names, pairs.tolist(), tell)
-    if all(i == j for i, j in pairs.tolist()):
+    near = tree.query(solids, predicate="dwithin", distance=SLIVER_M).T.tolist()
+    if all(i == j for i, j in near):
         return multipolygon(MultiPolygon([p for s in solids for p in multipolygon(s).geoms]))
-    # A micrometre's grid closes the seams between parts that share an edge but for rounding.
-    return multipolygon(shapely.union_all(solids, grid_size=1e-6))
+    if tell is not None:
+        _tell_overlaps(solids, names, near, tell)
+    union = shapely.union_all(solids, grid_size=GRID_M)
+    if all(solids[i].distance(solids[j]) <= GRID_M for i, j in near):
+        return multipolygon(union)
+    if tell is not None:
+        tell.warn("", f"gaps narrower than {SLIVER_M:g} m between its polygons are closed")
+    wider = union.buffer(SLIVER_M / 2, join_style="mitre", mitre_limit=_SHARP)
+    closed = wider.buffer(-SLIVER_M / 2, join_style="mitre", mitre_limit=_SHARP)
+    return multipolygon(closed)
 
 
 def _tell_overlaps(

@@ -16,6 +16,7 @@ from missions.areas.area import Area, multipolygon
 from missions.areas.crs import LocalFrame, middle
 from missions.areas.raw import RawShapes
 from missions.areas.repair import (
+    GRID_M,
     Mended,
     buffered_line,
     distinct,
@@ -150,14 +151,16 @@ def _union(shapes: Sequence[MultiPolygon]) -> MultiPolygon:
     filled = [shape for shape in shapes if not shape.is_empty]
     if len(filled) <= 1:
         return filled[0] if filled else MultiPolygon()
-    return multipolygon(shapely.union_all(filled))
+    return multipolygon(shapely.union_all(filled, grid_size=GRID_M))
 
 
 def _less(shape: MultiPolygon, taken: MultiPolygon) -> MultiPolygon:
     """A shape without another; it stays as it is, corner by corner, where they do not meet."""
     if taken.is_empty or not shape.intersects(taken):
         return shape
-    return without_slivers(multipolygon(shape.difference(taken)))
+    # On a micrometre's grid: edges that coincide but for the last bit make GEOS's later overlays of
+    # the two wrong by whole faces.
+    return without_slivers(multipolygon(shapely.difference(shape, taken, grid_size=GRID_M)))
 
 
 def _counted(raw: RawShapes) -> str:

@@ -1,0 +1,218 @@
+import math
+
+import numpy as np
+import pytest
+import shapely
+from shapely.geometry import MultiPolygon, Polygon
+
+from alice_survey.config import AreaConfig
+from alice_survey.errors import PlanError
+from alice_survey.frames import Datum
+from missions.areas.crs import LocalFrame
+from missions.areas.raw import RawShapes, no_points
+from missions.areas.repair import Mended, mended
+from missions.areas.survey import survey_area
+
+FRAME = LocalFrame(datum=Datum(32.0, 34.0), seafloor_depth_m=15.0, datum_is_given=True)
+SQUARE = ((0, 0), (10, 0), (10, 10), (0, 10))
+
+
+def mend(*polygons: tuple[object, ...]) -> Mended:
+    """Of polygons, each its outer ring and its holes."""
+    raw = RawShapes(
+        origin="test",
+        geographic=False,
+        polygons=tuple(tuple(np.array(ring, float) for ring in rings) for rings in polygons),
+        points=no_points(),
+    )
+    return mended(raw, FRAME, geographic=False)
+
+
+def box(north: float, east: float, height: float, width: float) -> tuple[tuple[float, float], ...]:
+    return (
+        (north, east), (north + height, east), (north + height, east + width), (north, east + width)
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("corners", "words"),
+    [
+        (((0, 0), (10, 10), (10, 0), (0, 10)), "edges cross near north 5.00 m, east 5.00 m"),
+        # The same bow tie with a corner where it crosses.
+        (
+            ((0, 0), (5, 5), (10, 10), (10, 0), (5, 5), (0, 10)),
+            "edges cross near north 5.00 m, east 5.00 m",
+        ),
+        # A pentagram runs twice round its middle.
+        (
+            tuple((10 * math.cos(a), 10 * math.sin(a)) for a in np.arange(5) * math.radians(144)),
+            "edges cross near",
+        ),
+        (((0, 0), (0, 0), (1, 1)), "2 distinct corners"),
+        (((1, 1), (1, 1), (1, 1)), "1 distinct corners"),
+        (((0, 0), (5, 5), (10, 10)), "no size; its corners lie on one line"),
+        (((0, 0), (0, 1e-5), (1e-5, 0)), "distinct corner"),
+        (((0, 0), (4, 0), (4, 4), (4, 0)), "enclose nothing near north 0.00 m, east 0.00 m"),
+    ],
+)
+def test_a_faulty_ring_is_refused_with_its_place(
+    corners: tuple[tuple[float, float], ...], words: str
+) -> None:
+    with pytest.raises(PlanError) as fault:
+        mend((corners,))
+    assert words in str(fault.value)
+    assert "\n" not in str(fault.value)
+
+
+@pytest.mark.parametrize(
+    ("rings", "area_m2", "words"),
+    [
+        (((*SQUARE, (0, 0)),), 100, ""),
+        ((SQUARE[::-1],), 100, ""),
+        (((SQUARE[0], *SQUARE, SQUARE[-1]),), 100, "2 corners repeating the one before"),
+        # Out 5 m and straight back; a spike whose way back goes on farther.
+        (((*SQUARE[:2], (15, 0), (10, 0), *SQUARE[2:]),), 100, "spike of 5 m without width"),
+        (((*SQUARE[:2], (15, 0), *SQUARE[1:]),), 100, "at north 15.00 m, east 0.00 m is cut off"),
+        # A last corner that overshoots the first edge by 4 mm.
+        (
+            ((*SQUARE, (0.0, 5.0), (-0.004, 5.002), (0.004, 5.004)),),
+            100,
+            "edges cross near",
+        ),
+        ((SQUARE, box(4, 4, 2, 2)), 96, ""),
+        ((SQUARE, box(0, 4, 2, 2)), 96, "hole 1: it touches the edge near north 0.00 m"),
+        ((SQUARE, box(-1, 4, 3, 2)), 96, "hole 1: 2 m2 of it lie outside of its polygon"),
+        ((SQUARE, box(20, 4, 3, 2)), 100, "hole 1: it lies outside of its polygon, near north 21"),
+        ((SQUARE, box(4, 4, 0.01, 0.01)), 100, "hole 1: 0.0001 m2 at north 4.00 m, east 4.00 m"),
+        ((SQUARE, box(4, 4, 2, 2), box(5, 5, 2, 2)), 93, ""),
+        # Two rooms that touch in a corner, as one ring.
+        (
+            (((0, 0), (5, 5), (0, 10), (10, 10), (5, 5), (10, 0)),),
+            50,
+            "the edge touches itself at north 5.00 m, east 5.00 m: taken as 2 parts",
+        ),
+        # A hole that hangs on the shell's corner, as one ring.
+        (
+            (((0, 0), (10, 0), (10, 10), (0, 10), (0, 0), (2, 4), (4, 4), (4, 2)),),
+            92,
+            "taken as 1 part with 1 holes",
+        ),
+    ],
+)
+def test_what_is_slightly_wrong_is_mended_and_told(
+    rings: tuple[object, ...], area_m2: float, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shape = mend(rings)
+    assert shape.solid.is_valid
+    assert shape.solid.area == pytest.approx(area_m2, abs=0.02)
+    told = capsys.readouterr().err
+    assert words in told if words else told == ""
+    assert told.count("warning:") == bool(words)
+
+
+def test_parts_are_joined_and_overlaps_told(capsys: pytest.CaptureFixture[str]) -> None:
+    both = mend((SQUARE,), (box(8, 4, 4, 4),))
+    assert both.solid.area == pytest.approx(100 + 16 - 8)
+    assert "polygon 1 and polygon 2 overlap by 8 m2 near north 9.00 m" in capsys.readouterr().err
+    assert mend((SQUARE,), (box(10.02, 0, 5, 10),)).solid.area == pytest.approx(150)
+    assert capsys.readouterr().err == ""
+    gap = mend((SQUARE,), (box(10.005, 0, 5, 10),))
+    assert len(gap.solid.geoms) == 1
+    assert gap.solid.area == pytest.approx(150.05)
+    assert "gaps narrower than 0.01 m between its polygons are closed" in capsys.readouterr().err
+    seam = mend((SQUARE,), (box(10 + 1e-9, 0, 5, 10),))
+    assert len(seam.solid.geoms) == 1
+    assert seam.solid.area == pytest.approx(150)
+    assert capsys.readouterr().err == ""
+
+
+def test_parts_too_small_are_left_out_and_told(capsys: pytest.CaptureFixture[str]) -> None:
+    shape = mend((SQUARE,), (box(20, 0, 0.05, 0.05),))
+    assert shape.solid.equals(MultiPolygon([Polygon(SQUARE)]))
+    assert "polygon 2: 0.0025 m2 at north 20.00 m" in capsys.readouterr().err
+
+
+def test_a_hole_as_large_as_its_polygon_leaves_nothing() -> None:
+    with pytest.raises(PlanError, match="leave nothing"):
+        mend((SQUARE, SQUARE))
+
+
+def inside(point: np.ndarray, ring: np.ndarray) -> bool:
+    """Whether a ray to the north crosses a ring an odd number of times: slow and obvious."""
+    crossings = 0
+    for a, b in zip(ring, np.roll(ring, -1, axis=0), strict=True):
+        if (a[1] > point[1]) != (b[1] > point[1]):
+            north = a[0] + (point[1] - a[1]) / (b[1] - a[1]) * (b[0] - a[0])
+            crossings += north > point[0]
+    return crossings % 2 == 1
+
+
+def star(rng: np.random.Generator, corners: int, middle: np.ndarray, reach_m: float) -> np.ndarray:
+    """A ring that is simple, and mostly concave."""
+    angle = 2 * np.pi * (np.arange(corners) + rng.uniform(0, 0.9, corners)) / corners
+    radius = reach_m * rng.uniform(0.2, 1.0, corners)
+    return middle + np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
+
+
+def test_500_random_polygons_with_holes_keep_what_is_in_and_out(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    rng = np.random.default_rng(20210401)
+    for _ in range(500):
+        reach_m = 10 ** rng.uniform(0.5, 3)
+        shell = star(rng, int(rng.integers(5, 30)), np.zeros(2), reach_m)
+        holes = [
+            star(rng, int(rng.integers(4, 9)), rng.uniform(-0.6, 0.6, 2) * reach_m, reach_m / 5)
+            for _ in range(int(rng.integers(0, 5)))
+        ]
+        wkt = Polygon(shell[:, ::-1], [hole[:, ::-1] for hole in holes]).wkt
+        clearance_m = float(rng.choice([0.0, 0.02 * reach_m]))
+        area = survey_area(
+            AreaConfig(wkt=wkt, no_go_clearance_m=clearance_m), turn_margin_m=0.05 * reach_m
+        )
+        assert area.survey.is_valid
+        assert area.allowed.is_valid
+        for shape in (area.survey, area.allowed):
+            assert shape.intersection(area.no_go).area < 1e-6 * reach_m**2
+        assert area.survey.difference(area.allowed).area < 1e-6 * reach_m**2
+        if clearance_m:
+            continue
+        for point in rng.uniform(-reach_m, reach_m, (8, 2)):
+            place = shapely.Point(point)
+            if area.survey.boundary.distance(place) < 0.02:
+                continue
+            wanted = inside(point, shell) and not any(inside(point, hole) for hole in holes)
+            assert area.survey.contains(place) == wanted
+    capsys.readouterr()
+
+
+def test_500_rings_of_random_corners_are_planned_or_refused_with_a_place(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    rng = np.random.default_rng(5)
+    refused = 0
+    for _ in range(500):
+        # On a coarse grid, so that corners repeat, edges overlap, and holes touch.
+        polygons = [
+            Polygon(rng.integers(0, 5, (int(rng.integers(3, 7)), 2)), [
+                rng.integers(0, 5, (int(rng.integers(3, 5)), 2))
+                for _ in range(int(rng.integers(0, 2)))
+            ])
+            for _ in range(int(rng.integers(1, 3)))
+        ]  # fmt: skip
+        try:
+            area = survey_area(AreaConfig(wkt=MultiPolygon(polygons).wkt), turn_margin_m=1.0)
+        except PlanError as error:
+            assert "\n" not in str(error)
+            assert (
+                "north" in str(error) or "distinct corners" in str(error) or "leave" in str(error)
+            )
+            refused += 1
+            continue
+        assert area.survey.is_valid
+        assert area.survey.area >= 0.01
+        hull = shapely.union_all([polygon.convex_hull for polygon in polygons])
+        hull_ne = shapely.transform(hull, lambda xy: xy[:, ::-1])
+        assert area.survey.difference(hull_ne.buffer(0.01)).area < 1e-6
+    assert 100 < refused < 480
+    capsys.readouterr()
