@@ -1,0 +1,357 @@
+"""How deep the glass goes over a known sea floor: as low as altitude, clearance and slope allow.
+
+At each station the highest floor within reach of the vehicle and of its pictures counts. The glass
+is to be the plan's altitude above that, or higher: the deepest profile that is nowhere deeper and
+whose slope is nowhere steeper than the vehicle can follow is
+
+    z(s) = min over t of (w(t) + g |s - t|)
+
+with the wanted depth w and the slope g: the lower envelope of cones. A pass forward and a pass back
+find it exactly on the samples (P. F. Felzenszwalb and D. P. Huttenlocher, Distance Transforms of
+Sampled Functions, Theory of Computing 8, 2012). Where the floor is steeper than the vehicle can
+follow, the altitude rises.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from alice_survey.errors import PlanError, warn
+from alice_survey.frames import Array
+from missions.areas.bathymetry import Bathymetry
+from missions.lines.line import Line
+from missions.route.legs import Route
+
+NOSE_M, TAIL_M = 0.8545, 0.734
+"""Ends of the hull from its centre of buoyancy (public model of SPARUS II in Stonefish)."""
+HALF_BREADTH_M = 0.226
+"""To the outer edge of the thruster pods (the same model)."""
+_CHUNK = 200_000
+_PER_CELL = 2.0
+"""Places looked at per cell of the bathymetry, each way."""
+_FINEST_M = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reach:
+    """How far from the glass the sea floor counts: of the hull, or of the pictures if farther."""
+
+    ahead_m: float
+    astern_m: float
+    beside_m: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class TerrainLimits:
+    """What a profile has to keep."""
+
+    altitude_m: float
+    """Wanted, of the glass above the highest floor within reach."""
+    least_clearance_m: float
+    """No altitude is lower."""
+    steepest_rad: float
+    """Slope that the vehicle follows."""
+
+    def __post_init__(self) -> None:
+        if self.altitude_m < self.least_clearance_m:
+            raise PlanError(
+                f"altitude_m {self.altitude_m:g} is less than least_clearance_m "
+                f"{self.least_clearance_m:g}: raise plan.altitude_m or lower plan.least_clearance_m"
+            )
+        if not 0 < self.steepest_rad < math.pi / 2:
+            raise PlanError(
+                f"a slope of {math.degrees(self.steepest_rad):g} deg cannot be followed"
+            )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DepthProfile:
+    """Depth of the glass along a way."""
+
+    along_m: Array
+    """(S,) distance from the start, increasing."""
+    depth_m: Array
+    """(S,) of the glass."""
+    highest_floor_m: Array
+    """(S,) depth of the highest floor within reach."""
+    floor_m: Array
+    """(S,) depth of the floor below the glass."""
+
+    @property
+    def altitude_m(self) -> Array:
+        """(S,) of the glass above the floor below it."""
+        return self.floor_m - self.depth_m
+
+    @property
+    def clearance_m(self) -> Array:
+        """(S,) of the glass above the highest floor within reach."""
+        return self.highest_floor_m - self.depth_m
+
+    @property
+    def slopes_rad(self) -> Array:
+        """(S - 1,) of the profile, positive downwards."""
+        slopes: Array = np.arctan2(np.diff(self.depth_m), np.diff(self.along_m))
+        return slopes
+
+
+def reach_of(glass_body_m: Sequence[float], half_swath_m: float, half_along_m: float) -> Reach:
+    """The reach of a hull and of the pictures.
+
+    Args:
+        glass_body_m: place of the glass in the body.
+        half_swath_m: what pictures see to the farther side of a line.
+        half_along_m: what a picture sees ahead or astern, the farther.
+    """
+    forward_m, right_m = float(glass_body_m[0]), float(glass_body_m[1])
+    return Reach(
+        ahead_m=max(NOSE_M - forward_m, half_along_m),
+        astern_m=max(TAIL_M + forward_m, half_along_m),
+        beside_m=max(HALF_BREADTH_M + abs(right_m), half_swath_m),
+    )
+
+
+def envelope(along_m: Array, wanted_m: Array, slope: float) -> Array:
+    """The deepest profile that is nowhere deeper than wanted and nowhere steeper than a slope.
+
+    Args:
+        along_m: (S,) increasing.
+        wanted_m: (S,) depths.
+        slope: metres down per metre along, positive.
+
+    Returns:
+        (S,) depths.
+    """
+    # A cone from the left, w(t) + g (s - t), is least where w(t) - g t is.
+    from_left = np.minimum.accumulate(wanted_m - slope * along_m) + slope * along_m
+    back = np.minimum.accumulate((wanted_m + slope * along_m)[::-1])[::-1]
+    profile: Array = np.minimum(from_left, back - slope * along_m)
+    return profile
+
+
+def highest_floor(
+    bathymetry: Bathymetry, points_ne: Array, headings_rad: Array, reach: Reach
+) -> Array:
+    """Depth, (N,), of the highest floor within reach of a vehicle at places and headings.
+
+    Args:
+        bathymetry: of the sea floor.
+        points_ne: (N, 2) of the glass.
+        headings_rad: (N,)
+        reach: how far the floor counts.
+
+    Returns:
+        NaN where the floor is not known everywhere within reach.
+    """
+    finest = max(bathymetry.cell_m / _PER_CELL, _FINEST_M)
+    ahead = _spread(-reach.astern_m, reach.ahead_m, finest)
+    beside = _spread(-reach.beside_m, reach.beside_m, finest)
+    offsets = np.stack(np.meshgrid(ahead, beside, indexing="ij"), axis=-1).reshape(-1, 2)
+    highest = np.empty(len(points_ne))
+    rows = max(_CHUNK // len(offsets), 1)
+    for start in range(0, len(points_ne), rows):
+        block = slice(start, start + rows)
+        sine, cosine = np.sin(headings_rad[block]), np.cos(headings_rad[block])
+        axes = np.array([[cosine, sine], [-sine, cosine]])  # ahead and beside, north and east
+        places = points_ne[block, None] + np.einsum("oa,axn->nox", offsets, axes)
+        # The least of numbers with a NaN among them is NaN: unknown floor is no floor to fly over.
+        highest[block] = bathymetry.depth_at(places).min(axis=1)
+    return highest
+
+
+def depth_profile(
+    bathymetry: Bathymetry,
+    along_m: Array,
+    points_ne: Array,
+    headings_rad: Array,
+    reach: Reach,
+    limits: TerrainLimits,
+    name: str,
+) -> DepthProfile:
+    """The profile along a way.
+
+    Args:
+        bathymetry: of the sea floor.
+        along_m: (S,) distances, increasing.
+        points_ne: (S, 2) where the way is.
+        headings_rad: (S,) of the vehicle.
+        reach: how far the floor counts; as far along as the samples are apart at least.
+        limits: to keep.
+        name: of the way, for errors.
+
+    Raises:
+        PlanError: the floor is not known somewhere, or the glass would leave the water.
+    """
+    gap = float(np.diff(along_m).max(initial=0.0))
+    reach = Reach(
+        ahead_m=max(reach.ahead_m, gap),
+        astern_m=max(reach.astern_m, gap),
+        beside_m=reach.beside_m,
+    )
+    highest = highest_floor(bathymetry, points_ne, headings_rad, reach)
+    unknown = np.flatnonzero(np.isnan(highest))
+    if len(unknown):
+        north, east = points_ne[unknown[0]]
+        raise PlanError(
+            f"{bathymetry.name} does not know the sea floor near {name}, "
+            f"{along_m[unknown[0]]:.1f} m along ({north:.1f} m north, {east:.1f} m east; {len(unknown)} of {len(highest)} "
+            "places): survey less, or give a bathymetry without gaps"
+        )
+    depth = envelope(along_m, highest - limits.altitude_m, math.tan(limits.steepest_rad))
+    dry = np.flatnonzero(depth <= 0.0)
+    if len(dry):
+        at = int(dry[np.argmin(depth[dry])])
+        raise PlanError(
+            f"{name}, {along_m[at]:.1f} m along: the glass would be {-depth[at]:.2f} m above the "
+            f"surface over a sea floor at {highest[at]:.2f} m: lower plan.altitude_m, raise "
+            "plan.steepest_deg or leave the place out"
+        )
+    return DepthProfile(
+        along_m=along_m,
+        depth_m=depth,
+        highest_floor_m=highest,
+        floor_m=bathymetry.depth_at(points_ne),
+    )
+
+
+def line_profiles(
+    lines: Sequence[Line], bathymetry: Bathymetry, reach: Reach, limits: TerrainLimits
+) -> list[DepthProfile]:
+    """The profile along each line, at its stations.
+
+    Raises:
+        PlanError: as `depth_profile`.
+    """
+    return [
+        depth_profile(
+            bathymetry,
+            np.linspace(0.0, line.length_m, line.stations),
+            line.stations_ne,
+            np.full(line.stations, line.heading_rad),
+            reach,
+            limits,
+            f"line {index}",
+        )
+        for index, line in enumerate(lines)
+    ]
+
+
+def line_depths(
+    lines: Sequence[Line], bathymetry: Bathymetry, reach: Reach, limits: TerrainLimits
+) -> list[Array]:
+    """Depth of the glass at each station of each line, as `line_profiles`."""
+    return [profile.depth_m for profile in line_profiles(lines, bathymetry, reach, limits)]
+
+
+def route_profile(
+    route: Route, bathymetry: Bathymetry, reach: Reach, limits: TerrainLimits, step_m: float
+) -> DepthProfile:
+    """The profile along a whole route, turns included.
+
+    Args:
+        route: what is flown.
+        bathymetry: of the sea floor.
+        reach: how far the floor counts; all round where the vehicle turns.
+        limits: to keep.
+        step_m: between samples.
+
+    Raises:
+        PlanError: as `depth_profile`.
+    """
+    farthest = max(reach.ahead_m, reach.astern_m)
+    all_round = Reach(ahead_m=farthest, astern_m=farthest, beside_m=max(farthest, reach.beside_m))
+    along = np.linspace(0.0, route.length_m, max(math.ceil(route.length_m / step_m), 1) + 1)
+    return depth_profile(
+        bathymetry,
+        along,
+        route.places(along),
+        route.headings_rad(along),
+        all_round,
+        limits,
+        "the way",
+    )
+
+
+def terrain_report(
+    lines: Sequence[Line],
+    profiles: Sequence[DepthProfile],
+    limits: TerrainLimits,
+    *,
+    relief_m: float,
+    spacing_m: float,
+    step_m: float,
+    extent_m: Callable[[float], tuple[float, float]],
+) -> tuple[str, dict[str, Any]]:
+    """What following the terrain comes to, and a warning where pictures suffer.
+
+    Args:
+        lines: of the plan.
+        profiles: of each.
+        limits: that they keep.
+        relief_m: what the imaging settings allow for beyond the planned altitude.
+        spacing_m: of the lines.
+        step_m: of the pictures.
+        extent_m: footprint across and along at an altitude.
+    """
+    altitude = np.concatenate([profile.altitude_m for profile in profiles])
+    low, high = float(altitude.min()), float(altitude.max())
+    floor_slopes = [_floor_slope(profile) for profile in profiles]
+    slopes = [_steepest(profile.slopes_rad) for profile in profiles]
+    climbing = [int(np.sum(p.clearance_m > limits.altitude_m + 1e-6)) for p in profiles]
+    highest_on = int(np.argmax([profile.altitude_m.max() for profile in profiles]))
+    worst = profiles[highest_on]
+    at_m = float(worst.along_m[int(np.argmax(worst.altitude_m))])
+    across, along = extent_m(low)
+    rows = [
+        {
+            "line": index,
+            "altitude_m": [float(p.altitude_m.min()), float(p.altitude_m.max())],
+            "depth_m": [float(p.depth_m.min()), float(p.depth_m.max())],
+            "steepest_deg": math.degrees(slopes[index]),
+            "steepest_floor_deg": math.degrees(floor_slopes[index]),
+            "raised_stations": climbing[index],
+        }
+        for index, p in enumerate(profiles)
+    ]
+    data: dict[str, Any] = {
+        "altitude_m": [low, high],
+        "least_clearance_m": float(min(p.clearance_m.min() for p in profiles)),
+        "steepest_deg": math.degrees(max(slopes)),
+        "steepest_floor_deg": math.degrees(max(floor_slopes)),
+        "raised_stations": sum(climbing),
+        "highest": {"line": highest_on, "along_m": at_m, "altitude_m": high},
+        "least_side_overlap": 1.0 - spacing_m / across,
+        "least_forward_overlap": 1.0 - step_m / along,
+        "coarsest_pixel": high / limits.altitude_m,
+        "lines": rows,
+    }
+    if high > limits.altitude_m + relief_m:
+        warn(
+            f"line {highest_on}, {at_m:.1f} m along: the sea floor falls away faster than "
+            f"{math.degrees(limits.steepest_rad):g} deg, so that pictures are taken from "
+            f"{high:.2f} m, beyond altitude_m + relief_m = {limits.altitude_m + relief_m:g} m: "
+            "raise plan.steepest_deg or plan.relief_m, or turn the lines along the slope"
+        )
+    text = (
+        f"terrain: altitude {low:.2f} to {high:.2f} m above the floor (wanted "
+        f"{limits.altitude_m:g} m above the highest within reach), steepest floor "
+        f"{data['steepest_floor_deg']:.1f} deg, steepest way {data['steepest_deg']:.1f} deg of "
+        f"{math.degrees(limits.steepest_rad):g}; {data['raised_stations']} of {len(altitude)} "
+        f"stations higher for the slope; least side overlap {data['least_side_overlap']:.1%}, "
+        f"coarsest pixels {data['coarsest_pixel']:.2f} times those at altitude_m"
+    )
+    return text, data
+
+
+def _spread(low: float, high: float, finest: float) -> Array:
+    return np.linspace(low, high, max(math.ceil((high - low) / finest), 1) + 1)
+
+
+def _steepest(slopes_rad: Array) -> float:
+    return float(np.abs(slopes_rad).max(initial=0.0))
+
+
+def _floor_slope(profile: DepthProfile) -> float:
+    return _steepest(np.arctan2(np.diff(profile.floor_m), np.diff(profile.along_m)))
