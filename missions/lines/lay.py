@@ -1,0 +1,420 @@
+"""Lay the lines of a survey in order of flight.
+
+Survey lines lie on one grid of offsets over the whole area; cross lines tie them together; a
+closing line goes back over the begin of the first, so that the end of the track is tied to its
+beginning; fill lines see what the pattern cannot because a no-go zone cuts it. Cells of survey
+lines and cross lines are one tour, from home and home again.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.errors import PlanError
+from alice_survey.frames import Array
+from missions.areas.area import Area
+from missions.lines import cells, hops, rows, tour
+from missions.lines.fill import fill_table
+from missions.lines.line import Line, LineKind
+from missions.lines.pattern import Pattern
+from missions.lines.site import Site
+from missions.route.costs import Costs
+from missions.route.ways import Ways
+
+MOST_STATIONS = 100_000
+"""Most stations of a plan. Chosen: days of flight, and terabytes of pictures."""
+KINDS: tuple[LineKind, ...] = ("survey", "cross", "closing", "fill")
+SURVEY, CROSS, CLOSING, FILL = range(len(KINDS))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Laid:
+    """Lines in order of flight as arrays, and what flying them costs."""
+
+    table: Array
+    """(L, 5) north and east of start and end, course."""
+    steps: NDArray[np.int64]
+    """(L,) from picture to picture."""
+    kinds: NDArray[np.int64]
+    """(L,) indices of `KINDS`."""
+    lines_j: float
+    hops_j: float
+    """From home, between lines and home again."""
+
+    @property
+    def energy_j(self) -> float:
+        """Of the whole flight."""
+        return self.lines_j + self.hops_j
+
+    def lines(self) -> list[Line]:
+        """The lines as values."""
+        # Rounded far below all rounding of positions, so that level places read level.
+        places = (np.round(self.table[:, :4], 12) + 0.0).tolist()
+        return [
+            Line(kind=KINDS[kind], start_ne_m=(p[0], p[1]), end_ne_m=(p[2], p[3]), stations=n + 1)
+            for p, n, kind in zip(places, self.steps.tolist(), self.kinds.tolist(), strict=True)
+        ]
+
+
+def lay_lines(
+    area: Area,
+    heading_rad: float,
+    pattern: Pattern,
+    ways: Ways,
+    costs: Costs,
+    home_ne: tuple[float, float],
+    *,
+    cross_lines: int,
+    closing_line: bool,
+    most_stations: int = MOST_STATIONS,
+) -> list[Line]:
+    """Lay all lines of a survey.
+
+    Args:
+        area: what must be seen, and where lines may be.
+        heading_rad: of the survey lines; they are flown to and fro, from the better end.
+        pattern: how far apart lines and pictures are, and what they see.
+        ways: inside the allowed area.
+        costs: what the order of the lines keeps low.
+        home_ne: where the flight begins and ends.
+        cross_lines: how many across the survey lines, in every part of the area.
+        closing_line: whether the begin of the first line is flown again at the end.
+        most_stations: that a plan may have.
+
+    Returns:
+        Lines in the order of flight. No line leaves the allowed area.
+
+    Raises:
+        PlanError: there are too many stations, no line can be flown, or there is no way inside the
+            allowed area between two lines.
+    """
+    check_size(area, pattern, most_stations)
+    result = laid(
+        Site.of(area),
+        heading_rad,
+        pattern,
+        ways,
+        hops.prices_of(costs),
+        home_ne,
+        cross_lines=cross_lines,
+        closing_line=closing_line,
+    )
+    stations = int(result.steps.sum()) + len(result.steps)
+    if stations > most_stations:
+        raise _too_many(area, pattern, stations, most_stations)
+    return result.lines()
+
+
+def check_size(area: Area, pattern: Pattern, most_stations: int = MOST_STATIONS) -> None:
+    """Refuse an area that is much too large before lines are laid.
+
+    Raises:
+        PlanError: it needs more than twice as many stations.
+    """
+    stations = area.survey.area / (pattern.spacing_m * pattern.step_m)
+    if stations > 2 * most_stations:
+        raise _too_many(area, pattern, stations, most_stations)
+
+
+def laid(
+    site: Site,
+    heading_rad: float,
+    pattern: Pattern,
+    ways: Ways,
+    prices: hops.Prices,
+    home_ne: tuple[float, float],
+    *,
+    cross_lines: int,
+    closing_line: bool,
+) -> Laid:
+    """As `lay_lines`, as arrays and with the cost."""
+    pieces, offsets, cuts = survey_pieces(site, heading_rad, pattern)
+    if len(pieces) == 0:
+        raise PlanError(
+            f"no line of heading {math.degrees(heading_rad):.1f} deg can be flown: the allowed "
+            "area lets none come near the area to survey: widen area.allowed"
+        )
+    ends = _ends_ne(pieces, offsets, heading_rad)
+    follower = cells.followers(pieces)
+    follower, links_m = _linked(ends, follower, ways, pattern.spacing_m)
+    begins, listed = cells.chains(follower)
+    corners, exits = cells.cell_corners(begins, listed, ends, heading_rad)
+    inner = cells.cell_costs(prices, begins, listed, ends, heading_rad, links_m)
+    steps = pieces[:, 3].astype(np.int64)
+    survey_count, survey_cells = len(pieces), len(inner)
+    if cross_lines:
+        across = _cross(site, heading_rad, pattern, cross_lines)
+        alone = np.arange(len(across.steps) + 1)
+        course = heading_rad + math.pi / 2
+        more, leaving = cells.cell_corners(alone, alone[:-1], across.ends, course)
+        unlinked = np.zeros((len(across.steps), 2))
+        costs = cells.cell_costs(prices, alone, alone[:-1], across.ends, course, unlinked)
+        corners, exits = np.concatenate([corners, more]), np.concatenate([exits, leaving])
+        inner = np.concatenate([inner, costs])
+        begins = np.concatenate([begins, begins[-1] + alone[1:]])
+        listed = np.concatenate([listed, survey_count + alone[:-1]])
+        ends, steps = np.concatenate([ends, across.ends]), np.concatenate([steps, across.steps])
+    home = np.array(home_ne, dtype=np.float64)
+    first_steps = steps[_piece_at(begins, listed)].ravel()
+    closed = _closings(corners, first_steps, ends, _piece_at(begins, listed).ravel())
+    closes = closing_line and survey_count > 1
+    order = _tour(
+        corners, exits, inner, ways, prices, home, closed if closes else None, survey_cells
+    )
+    flown = cells.flown(order, begins, listed)
+    table = _table(ends, flown, heading_rad, survey_count)
+    steps = steps[flown[:, 0]]
+    kinds = np.where(flown[:, 0] < survey_count, SURVEY, CROSS).astype(np.int64)
+    if closes:
+        table = np.concatenate([table, closed.table[order[:1]]])
+        steps = np.concatenate([steps, closed.steps[order[:1]]])
+        kinds = np.append(kinds, CLOSING)
+    fills = fill_table(site, heading_rad, pattern, pieces, offsets, cuts)
+    if len(fills):
+        table, steps, kinds = _inserted(fills, table, steps, kinds, home, ways, prices)
+    ways_m = ways_between(table, home, ways)
+    if np.isinf(ways_m).any():
+        raise _not_connected(table, home, ways_m)
+    parts = hops.flight_parts_j(prices, home, table, ways_m)
+    return Laid(
+        table=table, steps=steps, kinds=kinds, lines_j=float(parts[0]), hops_j=float(parts[1])
+    )
+
+
+def survey_pieces(site: Site, heading_rad: float, pattern: Pattern) -> tuple[Array, Array, Array]:
+    """Pieces of the rows over the survey area, offsets of the rows, and cuts: see `rows.lay_rows`."""
+    survey = rows.to_uv(site.survey, heading_rad)
+    allowed = rows.to_uv(site.allowed, heading_rad)
+    low, high = float(survey[:, 1].min()), float(survey[:, 1].max())
+    offsets = rows.row_offsets(low, high, pattern.spacing_m, pattern.edge_m, pattern.passes)
+    pieces, cuts = rows.lay_rows(
+        survey,
+        allowed,
+        offsets,
+        # A point needs its `passes` nearest lines, and the last of them is this far at most.
+        pattern.passes * pattern.spacing_m / 2,
+        pattern.overhang_m,
+        pattern.step_m,
+        max(1, pattern.pictures - 1),
+    )
+    return pieces, offsets, cuts
+
+
+def ways_between(table: Array, home: Array, ways: Ways) -> Array:
+    """Lengths, (L + 1,), of the ways before, between and after lines; inf where there is none."""
+    starts = np.concatenate([home[None], table[:, 2:4]])
+    goals = np.concatenate([table[:, :2], home[None]])
+    return _way_lengths(starts, goals, ways)
+
+
+def _way_lengths(starts: Array, goals: Array, ways: Ways) -> Array:
+    """Lengths, (N,), of ways from (N, 2) to (N, 2)."""
+    lengths: Array = np.hypot(*(goals - starts).T)
+    for i in np.flatnonzero(~ways.free_many(starts, goals)).tolist():
+        lengths[i] = ways.distances_m(starts[i : i + 1], goals[i : i + 1])[0, 0]
+    return lengths
+
+
+def _ends_ne(pieces: Array, offsets: Array, heading_rad: float) -> Array:
+    """North and east of begin and end of every piece, (P, 4)."""
+    c, s = math.cos(heading_rad), math.sin(heading_rad)
+    across = offsets[pieces[:, 0].astype(np.intp)]
+    begin, end = pieces[:, 1], pieces[:, 2]
+    return np.stack(
+        [
+            begin * c - across * s,
+            begin * s + across * c,
+            end * c - across * s,
+            end * s + across * c,
+        ],
+        axis=1,
+    )
+
+
+def _linked(
+    ends: Array, follower: NDArray[np.int64], ways: Ways, spacing_m: float
+) -> tuple[NDArray[np.int64], Array]:
+    """Ways between pieces and their followers; cells are cut where they go far round.
+
+    Returns:
+        (P,) followers that are left, and (P, 2) ways from begin to begin and from end to end.
+    """
+    links_m = np.zeros((len(ends), 2))
+    linked = np.flatnonzero(follower >= 0)
+    if len(linked) == 0:
+        return follower, links_m
+    starts = ends[linked].reshape(-1, 2)
+    goals = ends[follower[linked]].reshape(-1, 2)
+    links_m[linked] = _way_lengths(starts, goals, ways).reshape(-1, 2)
+    straight = np.hypot(*(goals - starts).T).reshape(-1, 2)
+    # Two spacings of detour are worth a choice of the tour.
+    far = linked[(links_m[linked] > straight + 2 * spacing_m).any(axis=1)]
+    follower = follower.copy()
+    follower[far] = -1
+    return follower, links_m
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Single:
+    """Lines that are no part of the grid."""
+
+    ends: Array
+    """(N, 4) north and east of begin and end."""
+    steps: NDArray[np.int64]
+
+
+def _cross(site: Site, heading_rad: float, pattern: Pattern, count: int) -> _Single:
+    """Lines across the survey lines, evenly over the length of every part of the area."""
+    course = heading_rad + math.pi / 2
+    allowed = rows.to_uv(site.allowed, course)
+    ends, steps = [], []
+    for part in site.parts:
+        survey = rows.to_uv(part, course)
+        if float(np.ptp(survey[:, [0, 2]])) < pattern.spacing_m:
+            continue  # one survey line has nothing to be tied to
+        low, high = float(survey[:, 1].min()), float(survey[:, 1].max())
+        offsets = low + (high - low) * np.arange(1, count + 1) / (count + 1)
+        pieces, _ = rows.lay_rows(
+            survey,
+            allowed,
+            offsets,
+            min(pattern.step_m, pattern.spacing_m) / 2,
+            pattern.overhang_m,
+            pattern.step_m,
+            max(1, pattern.pictures - 1),
+        )
+        ends.append(_ends_ne(pieces, offsets, course))
+        steps.append(pieces[:, 3].astype(np.int64))
+    if not ends:
+        return _Single(ends=np.empty((0, 4)), steps=np.empty(0, np.int64))
+    return _Single(ends=np.concatenate(ends), steps=np.concatenate(steps))
+
+
+def _piece_at(begins: NDArray[np.int64], listed: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The piece at each corner of each cell, (C, 4)."""
+    first, last = listed[begins[:-1]], listed[begins[1:] - 1]
+    return np.stack([first, first, last, last], axis=1)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Closings:
+    """The closing line of a flight that begins at a corner."""
+
+    table: Array
+    """(4C, 5) north and east of start and end, course."""
+    steps: NDArray[np.int64]
+
+
+def _closings(
+    corners: Array, steps: NDArray[np.int64], ends: Array, piece: NDArray[np.int64]
+) -> _Closings:
+    """From the middle of the line that is flown first back to its start."""
+    flat = corners.reshape(-1, 3)
+    half = (steps + 1) // 2
+    length = np.hypot(ends[piece, 2] - ends[piece, 0], ends[piece, 3] - ends[piece, 1])
+    along = length * half / steps
+    middle = flat[:, :2] + along[:, None] * np.stack(
+        [np.cos(flat[:, 2]), np.sin(flat[:, 2])], axis=1
+    )
+    back = flat[:, 2] + math.pi
+    return _Closings(table=np.concatenate([middle, flat[:, :2], back[:, None]], axis=1), steps=half)
+
+
+def _tour(
+    corners: Array,
+    exits: NDArray[np.int64],
+    inner: Array,
+    ways: Ways,
+    prices: hops.Prices,
+    home: Array,
+    closed: _Closings | None,
+    survey_cells: int,
+) -> NDArray[np.int64]:
+    """The order of cells: corners of entry, counted through."""
+    size = len(inner)
+    enter = corners.reshape(-1, 3)
+    leave = enter + np.array([0.0, 0.0, math.pi])
+    exits = (exits + cells.CORNERS * np.arange(size)[:, None]).ravel()
+    inner = inner.ravel()
+    at_home = np.array([[*home, np.nan]])
+    places = enter[:, :2]
+    home_m = ways.distances_m(home[None], places)
+    between_m = ways.distances_m(places, places)
+    start = hops.hops_j(prices, at_home, enter, home_m)[0]
+    over = hops.hops_j(prices, leave, enter, between_m)
+    plain = np.ascontiguousarray(hops.hops_j(prices, leave, at_home, home_m.T)[:, 0])
+    if closed is None:
+        if size <= tour.EXACT:
+            order = tour.exact_tour(over, exits, inner, start, plain[None], False)[1]
+        else:
+            order = tour.nearest_tour(over, exits, inner, start)
+            order = tour.improved_tour(order, over, exits, inner, start, plain, 0)
+        return np.asarray(order)
+    start[cells.CORNERS * survey_cells :] = np.inf
+
+    def finishes(first: NDArray[np.int64]) -> Array:
+        """Cost after the last cell, (F, 4C), of flights that begin at corners (F,)."""
+        line = closed.table[first]
+        to_m = ways.distances_m(places, line[:, :2])
+        to = hops.hops_j(prices, leave, line[:, [0, 1, 4]], to_m)
+        on = hops.hops_j(prices, line[:, 2:5], at_home, home_m[:, first].T)
+        flown = np.array(
+            [hops.line_j(prices, math.dist(x[:2], x[2:4]), x[4]) for x in line.tolist()]
+        )
+        return np.ascontiguousarray(to.T + (flown[:, None] + on))
+
+    if size <= tour.EXACT:
+        finish = np.zeros((len(enter), len(enter)))
+        able = np.flatnonzero(np.isfinite(start) & np.isfinite(inner))
+        finish[able] = finishes(able)
+        order = tour.exact_tour(over, exits, inner, start, finish, True)[1]
+    else:
+        order = tour.nearest_tour(over, exits, inner, start)
+        order = tour.improved_tour(order, over, exits, inner, start, plain, 0)
+        # Now that it is known where the flight begins, so is where it ends.
+        finish_j = finishes(order[:1])[0]
+        order = tour.improved_tour(order, over, exits, inner, start, finish_j, 1)
+    return np.asarray(order)
+
+
+def _table(ends: Array, flown: NDArray[np.int64], heading_rad: float, survey_count: int) -> Array:
+    """Lines in order of flight, (L, 5) north and east of start and end, course."""
+    piece, back = flown[:, 0], flown[:, 1] == 1
+    places = ends[piece]
+    places = np.where(back[:, None], places[:, [2, 3, 0, 1]], places)
+    course = heading_rad + np.where(piece < survey_count, 0.0, math.pi / 2)
+    return np.concatenate([places, (course + np.where(back, math.pi, 0.0))[:, None]], axis=1)
+
+
+def _inserted(
+    fills: Array,
+    table: Array,
+    steps: NDArray[np.int64],
+    kinds: NDArray[np.int64],
+    home: Array,
+    ways: Ways,
+    prices: hops.Prices,
+) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
+    """Fly fill lines, (F, 6) a table with steps, each where its detour costs least."""
+    return table, steps, kinds
+
+
+def _not_connected(table: Array, home: Array, ways_m: Array) -> PlanError:
+    i = int(np.flatnonzero(np.isinf(ways_m))[0])
+    north_0, east_0 = table[i - 1, 2:4] if i else home
+    north_1, east_1 = table[i, :2] if i < len(table) else home
+    return PlanError(
+        f"no way inside the allowed area from {north_0:.2f} m north, {east_0:.2f} m east to "
+        f"{north_1:.2f}, {east_1:.2f}: its parts are not connected; widen area.allowed or survey "
+        "the parts one by one"
+    )
+
+
+def _too_many(area: Area, pattern: Pattern, stations: float, most: int) -> PlanError:
+    return PlanError(
+        f"an area of {area.survey.area:.0f} m2 with lines {pattern.spacing_m:.3g} m apart and a "
+        f"picture every {pattern.step_m:.3g} m needs about {stations:.2g} stations, more than "
+        f"{most}: split the area, fly higher or lower the overlaps"
+    )

@@ -1,0 +1,271 @@
+"""The order of cells: from home through every cell once, and home again.
+
+Few cells are ordered exactly, by dynamic programming over the sets of cells flown (M. Held and
+R. M. Karp 1962) with the corner at which each is entered. Many are ordered by going to the nearest,
+then improving: stretches of the tour are reversed, cells are moved, and corners of entry are chosen
+anew by dynamic programming along the tour, until nothing gains.
+"""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from alice_survey.frames import Array
+from missions.lines.cells import CORNERS
+
+EXACT = 8
+"""Most cells that are ordered exactly."""
+_ROUNDS = 200
+_GAIN = 1e-9
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def exact_tour(
+    hops: Array, exits: NDArray[np.int64], inner: Array, start: Array, finish: Array, each: bool
+) -> tuple[float, NDArray[np.int64]]:
+    """The cheapest tour.
+
+    Corners are counted through: corner k of cell c is 4 c + k.
+
+    Args:
+        hops: (4C, 4C) cost from leaving at a corner to entering at another.
+        exits: (4C,) corner where a cell is left that is entered at a corner.
+        inner: (4C,) cost of a cell by the corner of entry; inf where it cannot be entered.
+        start: (4C,) cost to enter first at a corner; inf where the tour may not begin.
+        finish: (4C, 4C) cost after leaving at a corner, by the corner first entered.
+        each: whether `finish` depends on the corner first entered; else its first row holds.
+
+    Returns:
+        Cost, and (C,) the corners of entry in order.
+    """
+    corners = inner.size
+    cells = corners // CORNERS
+    sets = 1 << cells
+    best, best_tour = np.inf, np.zeros(cells, np.int64)
+    costs = np.empty((sets, corners))
+    before = np.empty((sets, corners), np.int64)
+    for only in range(corners if each else 1):
+        if each and not (start[only] < np.inf and inner[only] < np.inf):
+            continue
+        costs[:] = np.inf
+        for y in range(corners):
+            if not each or y == only:
+                costs[1 << (y // CORNERS), y] = start[y] + inner[y]
+        for flown in range(1, sets):
+            for y in range(corners):
+                if costs[flown, y] == np.inf:
+                    continue
+                for z in range(corners):
+                    joined = flown | (1 << (z // CORNERS))
+                    if joined == flown:
+                        continue
+                    cost = costs[flown, y] + hops[exits[y], z] + inner[z]
+                    if cost < costs[joined, z]:
+                        costs[joined, z] = cost
+                        before[joined, z] = y
+        for y in range(corners):
+            cost = costs[sets - 1, y] + finish[only, exits[y]]
+            if cost < best:
+                best = cost
+                last, flown = y, sets - 1
+                for i in range(cells - 1, -1, -1):
+                    best_tour[i] = last
+                    following = last
+                    last = before[flown, following]
+                    flown ^= 1 << (following // CORNERS)
+    return best, best_tour
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _link(
+    tour: NDArray[np.int64],
+    i: int,
+    j: int,
+    hops: Array,
+    exits: NDArray[np.int64],
+    start: Array,
+    finish: Array,
+) -> float:
+    """Cost from place i of the tour to place j; -1 is home before it, its size home after it."""
+    if i < 0:
+        return start[tour[j]] if j < tour.size else 0.0
+    if j >= tour.size:
+        return finish[exits[tour[i]]]
+    cost: float = hops[exits[tour[i]], tour[j]]
+    return cost
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def tour_cost(
+    tour: NDArray[np.int64],
+    hops: Array,
+    exits: NDArray[np.int64],
+    inner: Array,
+    start: Array,
+    finish: Array,
+) -> float:
+    """Cost of a tour; arguments as of `improved_tour`."""
+    cost = 0.0
+    for i in range(-1, tour.size):
+        cost += _link(tour, i, i + 1, hops, exits, start, finish)
+        if i >= 0:
+            cost += inner[tour[i]]
+    return cost
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def nearest_tour(
+    hops: Array, exits: NDArray[np.int64], inner: Array, start: Array
+) -> NDArray[np.int64]:
+    """From home always on to the cell that is reached with least cost; arguments as below."""
+    corners = inner.size
+    cells = corners // CORNERS
+    flown = np.zeros(cells, np.int64)
+    tour = np.zeros(cells, np.int64)
+    for i in range(cells):
+        best, chosen = np.inf, -1
+        for y in range(corners):
+            if flown[y // CORNERS] or inner[y] == np.inf:
+                continue
+            cost = start[y] if i == 0 else hops[exits[tour[i - 1]], y]
+            if cost < best:
+                best, chosen = cost, y
+        tour[i] = chosen
+        flown[chosen // CORNERS] = 1
+    return tour
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _reenter(
+    tour: NDArray[np.int64],
+    hops: Array,
+    exits: NDArray[np.int64],
+    inner: Array,
+    start: Array,
+    finish: Array,
+    fixed: int,
+) -> None:
+    """Choose the corners of entry along a tour anew, exactly, in place."""
+    cells = tour.size
+    costs = np.full((cells, CORNERS), np.inf)
+    before = np.zeros((cells, CORNERS), np.int64)
+    for i in range(cells):
+        first = tour[i] // CORNERS * CORNERS
+        for k in range(CORNERS):
+            y = first + k
+            if inner[y] == np.inf or (i < fixed and y != tour[i]):
+                continue
+            if i == 0:
+                costs[i, k] = start[y] + inner[y]
+                continue
+            previous = tour[i - 1] // CORNERS * CORNERS
+            for j in range(CORNERS):
+                cost = costs[i - 1, j] + hops[exits[previous + j], y] + inner[y]
+                if cost < costs[i, k]:
+                    costs[i, k] = cost
+                    before[i, k] = j
+    best, k = np.inf, tour[cells - 1] % CORNERS
+    for j in range(CORNERS):
+        y = tour[cells - 1] // CORNERS * CORNERS + j
+        if costs[cells - 1, j] + finish[exits[y]] < best:
+            best, k = costs[cells - 1, j] + finish[exits[y]], j
+    for i in range(cells - 1, -1, -1):
+        tour[i] = tour[i] // CORNERS * CORNERS + k
+        k = before[i, k]
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def improved_tour(
+    tour: NDArray[np.int64],
+    hops: Array,
+    exits: NDArray[np.int64],
+    inner: Array,
+    start: Array,
+    finish: Array,
+    fixed: int,
+) -> NDArray[np.int64]:
+    """Improve a tour until no reversal, no move and no other corner of entry gains.
+
+    Args:
+        tour: (C,) corners of entry in order.
+        hops: as of `exact_tour`.
+        exits: likewise.
+        inner: likewise.
+        start: likewise.
+        finish: (4C,) cost after leaving last at a corner.
+        fixed: how many cells at its begin stay as they are, 0 or 1.
+    """
+    tour = tour.copy()
+    cells = tour.size
+    ahead = np.zeros(cells)
+    back = np.zeros(cells)
+    for _ in range(_ROUNDS):
+        _reenter(tour, hops, exits, inner, start, finish, fixed)
+        gained = False
+        for i in range(fixed, cells):
+            if i == fixed or gained:
+                ahead[0], back[0] = inner[tour[0]], inner[exits[tour[0]]]
+                for j in range(1, cells):
+                    one, two = tour[j - 1], tour[j]
+                    ahead[j] = ahead[j - 1] + hops[exits[one], two] + inner[two]
+                    back[j] = back[j - 1] + hops[two, exits[one]] + inner[exits[two]]
+            enter_i = _link(tour, i - 1, i, hops, exits, start, finish)
+            best, best_j, kind, corner = -_GAIN, -1, 0, 0
+            for j in range(i, cells):
+                # Fly i to j the other way round.
+                one, two = tour[i], tour[j]
+                leave_j = _link(tour, j, j + 1, hops, exits, start, finish)
+                ahead_ij = ahead[j] - ahead[i] + inner[one]
+                back_ij = back[j] - back[i] + inner[exits[one]]
+                enter = start[exits[two]] if i == 0 else hops[exits[tour[i - 1]], exits[two]]
+                leave = finish[one] if j + 1 == cells else hops[one, tour[j + 1]]
+                change = enter + back_ij + leave - enter_i - ahead_ij - leave_j
+                if change < best:
+                    best, best_j, kind = change, j, 1
+            # Fly i elsewhere.
+            leave_i = _link(tour, i, i + 1, hops, exits, start, finish)
+            if i == 0 and cells > 1:
+                closed = start[tour[1]]
+            elif i + 1 == cells:
+                closed = finish[exits[tour[i - 1]]] if i > 0 else 0.0
+            else:
+                closed = hops[exits[tour[i - 1]], tour[i + 1]]
+            saved = enter_i + inner[tour[i]] + leave_i - closed
+            for j in range(fixed - 1, cells):
+                if j == i or j == i - 1:
+                    continue
+                broken = _link(tour, j, j + 1, hops, exits, start, finish)
+                first = tour[i] // CORNERS * CORNERS
+                for k in range(CORNERS):
+                    y = first + k
+                    if inner[y] == np.inf:
+                        continue
+                    enter = start[y] if j < 0 else hops[exits[tour[j]], y]
+                    leave = finish[exits[y]] if j + 1 == cells else hops[exits[y], tour[j + 1]]
+                    change = enter + inner[y] + leave - broken - saved
+                    if change < best:
+                        best, best_j, kind, corner = change, j, 2, y
+            if best_j < 0:
+                continue
+            if best >= -_GAIN:
+                continue
+            gained = True
+            if kind == 1:
+                low, high = i, best_j
+                while low < high:
+                    tour[low], tour[high] = exits[tour[high]], exits[tour[low]]
+                    low += 1
+                    high -= 1
+                if low == high:
+                    tour[low] = exits[tour[low]]
+            elif best_j < i:
+                for j in range(i, best_j + 1, -1):
+                    tour[j] = tour[j - 1]
+                tour[best_j + 1] = corner
+            else:
+                for j in range(i, best_j):
+                    tour[j] = tour[j + 1]
+                tour[best_j] = corner
+        if not gained:
+            break
+    return tour
