@@ -60,7 +60,7 @@ def prices(costs: Costs) -> Prices:
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def joined_lines(
     fence: Fence, prices: Prices, lines: Array, radius: float, run_in: float, wanted: int
-) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
+) -> tuple[Array, NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
     """The legs along all lines and between them.
 
     Args:
@@ -73,12 +73,14 @@ def joined_lines(
 
     Returns:
         (L, 8) legs; (N,) the row of each line's own leg; (N - 1,) how lines are joined, `NONE`
-        where nothing direct stays inside (then there are no legs between the two).
+        where nothing direct stays inside (then there are no legs between the two); (N - 1,) whether
+        a way round corners should be compared.
     """
     count = lines.shape[0]
     legs = np.empty((count * (_MOST_LEGS + 1), COLUMNS))
     rows = np.empty(count, dtype=np.int64)
     kinds = np.zeros(max(count - 1, 0), dtype=np.int64)
+    detours = np.zeros(max(count - 1, 0), dtype=np.bool_)
     used = 0
     for i in range(count):
         rows[i] = used
@@ -88,10 +90,12 @@ def joined_lines(
         if i + 1 < count:
             end = np.array([lines[i, 2], lines[i, 3], lines[i, 4]])
             goal = np.array([lines[i + 1, 0], lines[i + 1, 1], lines[i + 1, 4]])
-            kinds[i], made = join(fence, prices, end, goal, radius, run_in, run_in, wanted)
+            kinds[i], made, detours[i] = join(
+                fence, prices, end, goal, radius, run_in, run_in, wanted
+            )
             legs[used : used + made.shape[0]] = made
             used += made.shape[0]
-    return legs[:used], rows, kinds
+    return legs[:used], rows, kinds, detours
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -104,7 +108,7 @@ def join(
     run_out: float,
     run_in: float,
     wanted: int,
-) -> tuple[int, Array]:
+) -> tuple[int, Array, bool]:
     """The cheapest direct way from the end of a line to the start of the next.
 
     Args:
@@ -118,29 +122,30 @@ def join(
         wanted: as of `joined_lines`.
 
     Returns:
-        How, and (L, 8) legs.
+        How; (L, 8) legs; whether a way round corners should be compared, since the straight is
+        blocked and nothing else was asked for.
     """
     if _goes_on(end, goal) and straight_inside(fence, end[0], end[1], goal[0], goal[1]):
         ahead = np.empty((1, COLUMNS))
         gap = math.hypot(goal[0] - end[0], goal[1] - end[1])
-        return AHEAD, ahead[: _add(ahead, 0, end[0], end[1], end[2], gap, 0.0)]
+        return AHEAD, ahead[: _add(ahead, 0, end[0], end[1], end[2], gap, 0.0)], False
     arcs_j, arcs = _by_arcs(fence, prices, end, goal, radius, run_out, run_in)
     if wanted == ARCS and arcs_j < np.inf:
-        return ARCS, arcs
+        return ARCS, arcs, False
     spot_j, spot = _on_the_spot(fence, prices, end, goal, run_in)
     sway_j, sway = _sideways(fence, prices, end, goal, run_in)
+    blocked = spot_j == np.inf
     if wanted == SPOT:
-        # Where the straight is blocked, turns on the spot round the corners are the caller's.
-        return (SPOT if spot_j < np.inf else NONE), spot
+        return (NONE if blocked else SPOT), spot, blocked
     if wanted == SWAY and sway_j < np.inf:
-        return SWAY, sway
+        return SWAY, sway, False
     if arcs_j < np.inf and arcs_j <= min(spot_j, sway_j):
-        return ARCS, arcs
-    if spot_j < np.inf and spot_j <= sway_j:
-        return SPOT, spot
+        return ARCS, arcs, blocked
+    if not blocked and spot_j <= sway_j:
+        return SPOT, spot, False
     if sway_j < np.inf:
-        return SWAY, sway
-    return NONE, spot
+        return SWAY, sway, blocked
+    return NONE, spot, True
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -187,7 +192,7 @@ def _by_arcs(
         north, east, heading = moved(north, east, heading, curvature, length)
     if not math.isnan(goal[2]):
         used = _add(legs, used, arrival[0], arrival[1], arrival[2], run_in, 0.0)
-    return _price(prices, legs[:used]), legs[:used]
+    return price(prices, legs[:used]), legs[:used]
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -205,7 +210,7 @@ def _on_the_spot(
     if not math.isnan(goal[2]):
         back = math.hypot(goal[0] - arrival[0], goal[1] - arrival[1])
         used = _add(legs, used, arrival[0], arrival[1], goal[2], back, 0.0)
-    return _price(prices, legs[:used]), legs[:used]
+    return price(prices, legs[:used]), legs[:used]
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -253,7 +258,7 @@ def _sideways(
     sway_j = _power(prices.sway_w, end[2] - side)
     if sway_j == np.inf:
         return np.inf, legs[:0]
-    return _price(prices, legs[:used]), legs[:used]
+    return price(prices, legs[:used]), legs[:used]
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -290,6 +295,7 @@ def add_spot(
     turn -= 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))
     if math.isnan(turn) or abs(turn) < _TINY:
         return used
+    turn = min(max(turn, -math.pi), math.pi)  # but for rounding it is
     legs[used] = 0.0
     legs[used, 0], legs[used, 1], legs[used, 2] = north, east, heading
     legs[used, 5], legs[used, 6] = -1.0, turn
@@ -326,7 +332,7 @@ def _goes_on(end: Array, goal: Array) -> bool:
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def _price(prices: Prices, legs: Array) -> float:
+def price(prices: Prices, legs: Array) -> float:
     """Energy of legs between lines; never infinite, but dear beyond anything where it were."""
     total = 0.0
     for i in range(legs.shape[0]):

@@ -66,7 +66,9 @@ def route_through(
         _check_lines(table, ways, first_line)
     prices = joins.prices(time_costs(PAPER_SPEED_MPS) if costs is None else costs)
     wanted = _WANTED[turns]
-    legs, rows, kinds = joins.joined_lines(fence, prices, table, turn_radius_m, run_in_m, wanted)
+    legs, rows, kinds, detours = joins.joined_lines(
+        fence, prices, table, turn_radius_m, run_in_m, wanted
+    )
     legs[rows, 5] += first_line
     start, end = table[0, [0, 1, 4]], table[-1, 2:]
     if home_ne is None:
@@ -80,15 +82,24 @@ def route_through(
         home = np.array([*home_ne, _FREE])
         both = []
         for a, b in ((home, start), (end, home)):
-            kind, way = joins.join(fence, prices, a, b, turn_radius_m, run_in_m, run_in_m, wanted)
-            both.append(_round_corners(ways, a, b, run_in_m) if kind == joins.NONE else way)
+            kind, way, detour = joins.join(
+                fence, prices, a, b, turn_radius_m, run_in_m, run_in_m, wanted
+            )
+            if detour and ways is not None:
+                way, _ = _cheaper(kind, way, _round_corners(ways, a, b, run_in_m), prices)
+            both.append(way)
         first, last = both
     pieces = [first]
     done = 0
-    for i in np.flatnonzero(kinds == joins.NONE).tolist():
-        pieces.append(legs[done : rows[i + 1]])
+    for i in np.flatnonzero(detours).tolist():
+        if ways is None:
+            continue  # in open water nothing is blocked
+        after = rows[i] + 1
+        pieces.append(legs[done:after])
         done = rows[i + 1]
-        pieces.append(_round_corners(ways, table[i, 2:], table[i + 1, [0, 1, 4]], run_in_m))
+        way = _round_corners(ways, table[i, 2:], table[i + 1, [0, 1, 4]], run_in_m)
+        way, kinds[i] = _cheaper(kinds[i], legs[after:done], way, prices)
+        pieces.append(way)
     pieces += [legs[done:], last]
     _warn_of_others(kinds, turns)
     return Route(legs=_legs(np.concatenate(pieces)))
@@ -105,10 +116,17 @@ def _check_lines(table: Array, ways: Ways, first_line: int) -> None:
         )
 
 
-def _round_corners(ways: Ways | None, end: Array, goal: Array, run_in_m: float) -> Array:
+def _cheaper(
+    kind: int, direct: Array, round_corners: Array, prices: joins.Prices
+) -> tuple[Array, int]:
+    """The direct way, if there is one, or that round corners; and which."""
+    if kind != joins.NONE and joins.price(prices, direct) <= joins.price(prices, round_corners):
+        return direct, kind
+    return round_corners, joins.NONE
+
+
+def _round_corners(ways: Ways, end: Array, goal: Array, run_in_m: float) -> Array:
     """Legs from a line's end to the next, round the corners of the allowed area, (L, 8)."""
-    if ways is None:
-        raise RuntimeError("in open water a direct way is always found")
     arrival = joins.run_in_start(ways.fence, goal, run_in_m)
     path = ways.path_ne((float(end[0]), float(end[1])), (float(arrival[0]), float(arrival[1])))
     legs = np.empty((2 * len(path) + 2, joins.COLUMNS))

@@ -1,102 +1,269 @@
 import math
+import time
 from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from shapely.geometry import MultiPolygon, box
 
 from alice_survey.errors import PlanError
+from missions.areas.area import multipolygon
 from missions.lines.line import Line
-from missions.route.dubins import turn
-from missions.route.legs import Leg
-from missions.route.turns import route_through
+from missions.route.cost import route_cost
+from missions.route.costs import Costs, time_costs
+from missions.route.fence import TOUCH_M
+from missions.route.joins import LONGEST_SWAY_M
+from missions.route.legs import Route
+from missions.route.turns import Turns, route_through
+from missions.route.ways import Ways
+from tests.oracles_route import farthest_outside_m, lawn, total_m
+from tests.strategies_areas import areas, places_in
 
-places = st.tuples(st.floats(-10, 10), st.floats(-10, 10))
-angles = st.floats(-math.pi, math.pi)
+MODES: tuple[Turns, ...] = ("auto", "arcs", "spot", "sway")
 
 
 def line(start: tuple[float, float], end: tuple[float, float]) -> Line:
     return Line(kind="survey", start_ne_m=start, end_ne_m=end, stations=5)
 
 
-def length(legs: list[Leg]) -> float:
-    return sum(leg.length_m for leg in legs)
+def check_joints(route: Route) -> None:
+    """No gap, a heading without a jump, and a kink of the course only where the vehicle stops."""
+    for leg in route.legs:
+        if leg.turn_rad:
+            assert leg.length_m == leg.curvature_per_m == leg.side_rad == 0.0
+            assert abs(leg.turn_rad) <= math.pi
+        elif leg.side_rad:
+            assert abs(leg.side_rad) == math.pi / 2
+            assert leg.curvature_per_m == 0.0
+            assert leg.length_m <= LONGEST_SWAY_M
+        assert leg.length_m > 0.0 or leg.turn_rad
+    for before, after in pairwise(route.legs):
+        assert math.dist(before.end_ne_m, after.start_ne_m) < 1e-6
+        arriving = before.end_heading_rad + before.side_rad
+        leaving = after.heading_rad + after.side_rad
+        assert abs(math.remainder(arriving - leaving, 2 * math.pi)) < 1e-6
+        if all(leg.kind in ("straight", "arc") for leg in (before, after)):
+            kink = math.remainder(before.end_heading_rad - after.heading_rad, 2 * math.pi)
+            assert abs(kink) < 1e-6
 
 
-@settings(deadline=None, max_examples=200)
-@given(start=places, goal=places, first=angles, last=angles, radius_m=st.floats(0.2, 3.0))
-def test_a_turn_arrives_without_a_gap_or_a_kink(
-    start: tuple[float, float],
-    goal: tuple[float, float],
-    first: float,
-    last: float,
+def random_lines(area: MultiPolygon, ways: Ways, seed: int, count: int) -> list[Line]:
+    """Lines inside one part of an area; none if it has too little room."""
+    places = places_in(area, np.random.default_rng(seed), 40)
+    lines: list[Line] = []
+    for a, b in zip(places[::2].tolist(), places[1::2].tolist(), strict=True):
+        start, end = (a[0], a[1]), (b[0], b[1])
+        if math.dist(start, end) < 0.2 or not ways.free(start, end):
+            continue
+        if lines and math.isinf(ways.distance_m(lines[0].start_ne_m, start)):
+            continue
+        lines.append(line(start, end))
+    return lines[:count]
+
+
+@settings(deadline=None, max_examples=80)
+@given(
+    area=areas(),
+    seed=st.integers(0, 2**32 - 1),
+    turns=st.sampled_from(MODES),
+    radius_m=st.floats(0.2, 1.5),
+    run_in_m=st.floats(0.1, 1.0),
+    from_home=st.booleans(),
+)
+def test_a_route_stays_inside_and_never_jumps(
+    area: MultiPolygon,
+    seed: int,
+    turns: Turns,
     radius_m: float,
+    run_in_m: float,
+    from_home: bool,
 ) -> None:
-    legs = turn(start, first, goal, last, radius_m)
+    ways = Ways(area)
+    lines = random_lines(area, ways, seed, 6)
+    assume(len(lines) > 1)
+    home = lines[-1].stations_ne[2].tolist() if from_home else None
 
-    assert legs[0].start_ne_m == start
-    assert legs[0].heading_rad == first
-    for before, after in pairwise(legs):
-        assert math.dist(before.end_ne_m, after.start_ne_m) < 1e-9
-        assert math.cos(before.end_heading_rad - after.heading_rad) > 1 - 1e-12
-    assert math.dist(legs[-1].end_ne_m, goal) < 1e-5
-    assert math.cos(legs[-1].end_heading_rad - last) > 1 - 1e-9
-    assert all(abs(leg.curvature_per_m) <= 1 / radius_m * (1 + 1e-12) for leg in legs)
-    assert length(legs) >= math.dist(start, goal) - 1e-9
+    route = route_through(
+        lines,
+        radius_m,
+        run_in_m,
+        ways=ways,
+        turns=turns,
+        home_ne=None if home is None else (home[0], home[1]),
+    )
+
+    check_joints(route)
+    assert farthest_outside_m(area, route) <= 1.01 * TOUCH_M
+    flown = [leg for leg in route.legs if leg.line >= 0]
+    assert [leg.line for leg in flown] == list(range(len(lines)))
+    for leg, wanted in zip(flown, lines, strict=True):
+        assert leg.start_ne_m == wanted.start_ne_m
+        assert math.dist(leg.end_ne_m, wanted.end_ne_m) < 1e-9
+    if home is not None:
+        assert math.dist(route.legs[0].start_ne_m, home) < 1e-9
+        assert math.dist(route.legs[-1].end_ne_m, home) < 1e-6
 
 
-@settings(deadline=None, max_examples=60)
-@given(start=places, goal=places, first=angles, last=angles)
-def test_a_turn_is_as_long_either_way_round(
-    start: tuple[float, float], goal: tuple[float, float], first: float, last: float
+@settings(deadline=None, max_examples=40)
+@given(area=areas(), seed=st.integers(0, 2**32 - 1), sway_w=st.floats(0.1, 10.0))
+def test_auto_is_as_cheap_as_any_way_of_turning(
+    area: MultiPolygon, seed: int, sway_w: float
 ) -> None:
-    there = length(turn(start, first, goal, last, 1.0))
-    back = length(turn(goal, last + math.pi, start, first + math.pi, 1.0))
-    assert there == pytest.approx(back, abs=1e-5)
+    ways = Ways(area)
+    lines = random_lines(area, ways, seed, 5)
+    assume(len(lines) > 1)
+    rng = np.random.default_rng(seed)
+    costs = uneven_costs(rng, sway_w)
+
+    prices = {
+        turns: route_cost(
+            route_through(lines, 0.5, 0.3, ways=ways, costs=costs, turns=turns), costs
+        )[0]
+        for turns in MODES
+    }
+    assert prices["auto"] <= min(prices.values()) * (1 + 1e-9)
 
 
-@settings(deadline=None, max_examples=60)
-@given(start=places, goal=places, first=angles, last=angles)
-def test_no_path_of_straights_and_arcs_by_trial_is_shorter(
-    start: tuple[float, float], goal: tuple[float, float], first: float, last: float
-) -> None:
-    """Slow twin: tangents of every pair of turning circles, by geometry in the plane."""
-    best = math.inf
-    for one in (1, -1):
-        for two in (1, -1):
-            c1 = np.array(start) + one * np.array([-math.sin(first), math.cos(first)])
-            c2 = np.array(goal) + two * np.array([-math.sin(last), math.cos(last)])
-            apart, bearing = math.dist(c1, c2), math.atan2(*(c2 - c1)[::-1])
-            if one == two:
-                course, straight = bearing, apart
-            elif apart >= 2:
-                course = bearing + one * math.asin(2 / apart)
-                straight = math.sqrt(apart**2 - 4)
-            else:
-                continue
-            arcs = (one * (course - first)) % (2 * math.pi) + (two * (last - course)) % (
-                2 * math.pi
-            )
-            best = min(best, arcs + straight)
-
-    assert length(turn(start, first, goal, last, 1.0)) <= best + 1e-5
+def uneven_costs(rng: np.random.Generator, sway_w: float) -> Costs:
+    even = time_costs(0.2)
+    values = {name: getattr(even, name) for name in even.__dataclass_fields__}
+    powers = {
+        "line_w": rng.uniform(50, 150, 36),
+        "way_w": rng.uniform(50, 150, 36),
+        "spot_w": float(rng.uniform(30, 100)),
+        "sway_w": sway_w * rng.uniform(50, 150, 36),
+    }
+    return Costs(**(values | powers))
 
 
-def test_known_turns() -> None:
-    u_turn = turn((0.0, 0.0), 0.0, (0.0, 1.0), math.pi, 0.5)
-    assert length(u_turn) == pytest.approx(math.pi / 2)
+@pytest.mark.parametrize("turns", MODES)
+def test_turns_are_flown_as_asked(turns: Turns, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = lawn(6, 10.0, 1.0)
+    route = route_through(lines, 0.5, 0.5, turns=turns)
 
-    ahead = turn((0.0, 0.0), 0.3, (math.cos(0.3), math.sin(0.3)), 0.3, 0.5)
-    assert length(ahead) == pytest.approx(1.0)
+    counts = (route.arc_turns, route.spot_turns, route.sway_steps)
+    assert (
+        counts
+        == {"auto": (5, 0, 0), "arcs": (5, 0, 0), "spot": (0, 10, 0), "sway": (0, 5, 5)}[turns]
+    )
+    assert capsys.readouterr().err == ""
+    check_joints(route)
 
-    wide = turn((0.0, 0.0), 0.0, (0.0, 5.0), math.pi, 0.5)
-    assert length(wide) == pytest.approx(math.pi / 2 + 4.0)
 
-    # Too close for a U-turn: out, round and back, a bulb of three arcs.
-    bulb = turn((0.0, 0.0), 0.0, (0.0, 0.6), math.pi, 0.5)
-    swing = math.acos((1 + 0.6) / 2)
-    assert length(bulb) == pytest.approx(0.5 * (math.pi + 4 * swing))
+def test_a_sway_step_keeps_the_heading_and_then_turns() -> None:
+    route = route_through(lawn(2, 10.0, 1.0), 0.5, 0.5, turns="sway")
+
+    kinds = [(leg.kind, leg.line) for leg in route.legs]
+    assert kinds == [
+        ("straight", -1), ("straight", 0), ("straight", -1), ("sway", -1), ("spot", -1),
+        ("straight", -1), ("straight", 1), ("straight", -1),
+    ]  # fmt: skip
+    step = route.legs[3]
+    assert step.heading_rad == pytest.approx(math.pi / 2)  # east, to starboard of north
+    assert step.side_rad == -math.pi / 2
+    assert step.length_m == pytest.approx(1.0)
+    assert abs(route.legs[4].turn_rad) == pytest.approx(math.pi)
+
+    # Lines one way: no turn; a next line that begins earlier: it steps at once and runs in longer.
+    same = route_through([line((0, 0), (5, 0)), line((6, -1), (9, -1))], 0.5, 0.5, turns="sway")
+    assert (same.sway_steps, same.spot_turns) == (1, 0)
+    assert same.legs[3].side_rad == math.pi / 2
+    early = route_through([line((0, 0), (9, 0)), line((5, 1), (0, 1))], 0.5, 0.5, turns="sway")
+    assert [leg.kind for leg in early.legs[1:5]] == ["straight", "sway", "spot", "straight"]
+    assert early.legs[4].length_m == pytest.approx(4.0)
+    check_joints(same)
+    check_joints(early)
+
+
+def test_what_has_no_room_is_flown_otherwise_and_told(capsys: pytest.CaptureFixture[str]) -> None:
+    lines = lawn(5, 10.0, 1.0)
+    tight = Ways(multipolygon(box(0.0, -0.1, 10.0, 4.1)))
+
+    route = route_through(lines, 0.5, 0.5, ways=tight, turns="arcs")
+
+    assert route.arc_turns == 0
+    assert route.spot_turns + route.sway_steps >= 8
+    assert farthest_outside_m(tight.allowed, route) <= TOUCH_M
+    warned = capsys.readouterr().err
+    assert "4 of 4 turns have no room for turns = 'arcs'" in warned
+    assert warned.count("\n") == 1
+
+    far = route_through(lawn(3, 10.0, LONGEST_SWAY_M + 0.1), 0.5, 0.5, turns="sway")
+    assert far.sway_steps == 0
+    assert "2 of 2 turns" in capsys.readouterr().err
+
+    auto = route_through(lines, 0.5, 0.5, ways=tight)
+    assert auto.arc_turns == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_a_vehicle_without_sway_never_steps() -> None:
+    even = time_costs(0.2)
+    values = {name: getattr(even, name) for name in even.__dataclass_fields__}
+    costs = Costs(**(values | {"sway_w": np.full(4, np.inf)}))
+    tight = Ways(multipolygon(box(0.0, -0.1, 10.0, 4.1)))
+    for turns in MODES:
+        route = route_through(lawn(5, 10, 1.0), 0.5, 0.5, ways=tight, costs=costs, turns=turns)
+        assert route.sway_steps == 0
+
+
+def test_the_way_between_lines_goes_round_a_hole() -> None:
+    area = multipolygon(box(-3, -3, 23, 13).difference(box(8, 2, 12, 8)))
+    ways = Ways(area)
+    lines = [line((0.0, 5.0), (7.0, 5.0)), line((13.0, 5.0), (20.0, 5.0))]
+
+    for turns in MODES:
+        route = route_through(lines, 0.5, 0.5, ways=ways, turns=turns, home_ne=(-2.0, -2.0))
+        check_joints(route)
+        assert farthest_outside_m(area, route) <= TOUCH_M
+        between = route.starts_m[next(i for i, leg in enumerate(route.legs) if leg.line == 1)]
+        between -= route.line_starts_m()[0] + 7.0
+        shortest = ways.distance_m((7.0, 5.0), (12.5, 5.0)) + 0.5
+        assert between == pytest.approx(shortest)
+    # A part of the line beyond the hole is no more straight on than any other line.
+    assert route_through(lines, 0.5, 0.5).spot_turns == 0
+
+
+def test_home_is_left_towards_the_first_line_and_come_back_to() -> None:
+    lines = lawn(2, 10.0, 1.0)
+    route = route_through(lines, 0.5, 0.5, home_ne=(-5.0, 0.0))
+
+    assert route.legs[0].start_ne_m == (-5.0, 0.0)
+    assert route.legs[0].heading_rad == pytest.approx(0.0)
+    assert math.dist(route.legs[-1].end_ne_m, (-5.0, 0.0)) < 1e-9
+    assert total_m([leg for leg in route.legs if leg.line < 0][:2]) == pytest.approx(5.0)
+
+
+def test_what_cannot_be_flown_is_told_in_one_line() -> None:
+    apart = multipolygon(box(-1, -1, 11, 3)).union(box(-1, 5, 11, 9))
+    ways = Ways(multipolygon(apart))
+    lines = [line((0.0, 0.0), (9.0, 0.0)), line((9.0, 6.0), (0.0, 6.0))]
+    with pytest.raises(PlanError, match=r"9.00 m north, 0.00 m east to .* not connected"):
+        route_through(lines, 0.5, 0.5, ways=ways)
+    with pytest.raises(PlanError, match="1 of 1 lines leave the allowed area, first line 3"):
+        route_through([line((0.0, 0.0), (0.0, 8.0))], 0.5, 0.5, ways=ways, first_line=3)
+    with pytest.raises(PlanError, match=r"20.00 m north, 0.00 m east is outside"):
+        route_through(lines[:1], 0.5, 0.5, ways=ways, home_ne=(20.0, 0.0))
+
+
+def test_ten_thousand_lines_take_less_than_half_a_second() -> None:
+    ways = Ways(multipolygon(box(-3, -3, 23, 10_003)))
+    seconds = {}
+    for count in (300, 3000, 10_000):
+        lines = lawn(count, 20.0, 1.0)
+        best = math.inf
+        for _ in range(3):
+            began = time.process_time()
+            route = route_through(lines, 0.5, 0.5, ways=ways)
+            best = min(best, time.process_time() - began)
+        seconds[count] = best
+        assert route.arc_turns == count - 1
+        # Run-in, line and run-out of each, and half circles between.
+        assert route.length_m == pytest.approx(21.0 * count + (count - 1) * math.pi / 2)
+    assert seconds[10_000] < 0.5
+    assert seconds[10_000] < 3 * seconds[3000] / 3000 * 10_000
 
 
 def test_a_route_is_continuous_and_keeps_its_lines() -> None:

@@ -1,0 +1,164 @@
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from shapely.geometry import LineString, Point
+
+from missions.route.cost import leg_costs, mean_power, route_cost
+from missions.route.costs import Costs, time_costs
+from missions.route.joins import COLUMNS, price, prices
+from missions.route.legs import Leg, Route
+from missions.route.turns import route_through
+from tests.oracles_route import lawn, route_cost_by_steps, sampled_leg
+
+angles = st.floats(-7.0, 7.0)
+lengths = st.floats(0.01, 30.0)
+places = st.tuples(st.floats(-1e4, 1e4), st.floats(-1e4, 1e4))
+
+
+@st.composite
+def legs(draw: st.DrawFn) -> Leg:
+    kind = draw(st.sampled_from(["straight", "arc", "spot", "sway"]))
+    start, heading, length = draw(places), draw(angles), draw(lengths)
+    if kind == "spot":
+        turn = draw(st.floats(0.01, math.pi)) * draw(st.sampled_from([-1, 1]))
+        return leg(start, heading, 0.0, turn=turn)
+    if kind == "sway":
+        side = draw(st.sampled_from([-1, 1])) * math.pi / 2
+        return leg(start, heading, min(length, 3.0), side=side)
+    if kind == "arc":
+        curvature = draw(st.floats(0.1, 4.0)) * draw(st.sampled_from([-1, 1]))
+        return leg(start, heading, min(length, 6.2 / abs(curvature)), curvature=curvature)
+    return leg(start, heading, length, line=draw(st.integers(-1, 9)))
+
+
+def leg(
+    start: tuple[float, float],
+    heading: float,
+    length: float,
+    *,
+    curvature: float = 0.0,
+    line: int = -1,
+    turn: float = 0.0,
+    side: float = 0.0,
+) -> Leg:
+    return Leg(
+        start_ne_m=start,
+        heading_rad=heading,
+        length_m=length,
+        curvature_per_m=curvature,
+        line=line,
+        turn_rad=turn,
+        side_rad=side,
+    )
+
+
+@given(one=legs())
+def test_a_leg_comes_back_from_json_as_it_was(one: Leg) -> None:
+    assert Leg.from_json(json.loads(json.dumps(one.to_json()))) == one
+
+
+@given(one=legs())
+def test_a_leg_ends_where_its_circle_does(one: Leg) -> None:
+    if one.length_m == 0.0:
+        assert one.end_ne_m == one.start_ne_m
+        return
+    expected, _ = sampled_leg(one, 9)
+    assert math.dist(one.end_ne_m, expected[-1]) < 1e-8
+    if one.curvature_per_m:
+        np.testing.assert_allclose(
+            one.places(np.linspace(0.0, one.length_m, 9)), expected, atol=1e-8
+        )
+
+
+def uneven(seed: int, *, closed: bool = False) -> Costs:
+    rng = np.random.default_rng(seed)
+    even = time_costs(0.25)
+    values = {name: getattr(even, name) for name in even.__dataclass_fields__}
+    way_w = rng.uniform(50, 150, 24)
+    if closed:
+        way_w[3:6] = np.inf
+    powers = {
+        "line_w": rng.uniform(50, 150, 36),
+        "way_w": way_w,
+        "spot_w": 40.0,
+        "sway_w": rng.uniform(50, 150, 12),
+    }
+    return Costs(**(values | powers))
+
+
+@settings(deadline=None)
+@given(many=st.lists(legs(), min_size=1, max_size=6), seed=st.integers(0, 1000))
+def test_a_route_costs_what_its_legs_do(many: list[Leg], seed: int) -> None:
+    route, costs = Route(legs=tuple(many)), uneven(seed)
+    joules, seconds = route_cost(route, costs)
+
+    expected_j, expected_s = route_cost_by_steps(route, costs, 0.002)
+
+    assert seconds == pytest.approx(expected_s, rel=1e-12)
+    assert joules == pytest.approx(expected_j, rel=1e-4)
+    legs_j, legs_s = leg_costs(route, costs)
+    assert legs_j.sum() == pytest.approx(joules) and legs_s.sum() == pytest.approx(seconds)
+    # What compiled code compares ways between lines by.
+    ways = [one for one in many if one.line < 0]
+    table = np.array(
+        [
+            (
+                *one.start_ne_m, one.heading_rad, one.length_m, one.curvature_per_m, one.line,
+                one.turn_rad, one.side_rad,
+            )
+            for one in ways
+        ]
+    ).reshape(-1, COLUMNS)  # fmt: skip
+    expected = route_cost(Route(legs=tuple(ways)), costs)[0]
+    assert price(prices(costs), table) == pytest.approx(expected, rel=1e-9)
+
+
+def test_time_is_what_even_costs_count() -> None:
+    route = route_through(lawn(4, 10.0, 1.0), 0.5, 0.5, turns="sway")
+    joules, seconds = route_cost(route, time_costs(0.2, turn_rate_rad_s=0.5, settle_s=3.0))
+    assert joules == pytest.approx(seconds)
+    sway_mps = time_costs(0.2).sway_mps
+    # Four lines with run-in and run-out; three steps of 1 m and half turns, two stops each.
+    expected = 4 * 11.0 / 0.2 + 3 * (1.0 / sway_mps + math.pi / 0.5 + 2 * 3.0)
+    assert seconds == pytest.approx(expected)
+    assert route_cost(Route(legs=()), time_costs(0.2)) == (0.0, 0.0)
+
+
+def test_no_way_on_a_course_that_cannot_be_flown() -> None:
+    costs = uneven(1, closed=True)
+    shut = 4 * 2 * math.pi / 24
+    for start, end, open_water in ((shut, shut, False), (0.0, 0.5, True), (0.0, 2.0, False)):
+        mean = mean_power(costs.way_w, np.array([start]), np.array([end]))[0]
+        assert math.isfinite(mean) == open_water
+
+
+def test_a_polyline_follows_the_route() -> None:
+    route = route_through(lawn(5, 10.0, 1.0), 0.5, 0.5)
+    places = route.polyline_ne(0.05)
+    fine = route.polyline_ne(0.005)
+
+    assert len(places) < 5 * 40
+    assert LineString(places).length == pytest.approx(route.length_m, rel=1e-3)
+    on_route = LineString(fine)
+    assert max(on_route.distance(Point(place)) for place in places) < 1e-5
+    np.testing.assert_allclose(places[[0, -1]], [route.legs[0].start_ne_m, route.legs[-1].end_ne_m])
+
+
+def test_turns_and_steps_are_counted() -> None:
+    turns = [
+        leg((0, 0), 0, 1.0, line=0),
+        leg((1, 0), 0, 0.0, turn=1.0),
+        leg((1, 0), 1.0 + math.pi / 2, 2.0, side=-math.pi / 2),
+        leg((1, 0), 1.0, 0.5, curvature=1.0),
+        leg((1, 0), 1.5, 0.5, curvature=-1.0),
+        leg((1, 0), 1.0, 0.5),
+        leg((1, 0), 1.0, 0.5, curvature=2.0),
+    ]
+    route = Route(legs=tuple(turns))
+    assert (route.spot_turns, route.sway_steps, route.arc_turns) == (1, 1, 2)
+    assert [one.kind for one in turns[:4]] == ["straight", "spot", "sway", "arc"]
+    assert route.length_m == pytest.approx(5.0)

@@ -1,0 +1,194 @@
+import math
+import time
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from shapely.geometry import LineString, MultiPolygon, Point, Polygon, box
+
+from alice_survey.errors import PlanError
+from missions.areas.area import multipolygon
+from missions.route.fence import OPEN_WATER, TOUCH_M, arc_inside, straight_inside
+from missions.route.legs import Leg
+from missions.route.ways import Ways
+from tests.oracles_route import sampled_leg, shortest_way_m
+from tests.strategies_areas import areas, places_in
+
+seeds = st.integers(0, 2**32 - 1)
+RING = multipolygon(box(0, 0, 100, 50).difference(box(40, 10, 60, 40)))
+
+
+@settings(deadline=None, max_examples=60)
+@given(area=areas(), seed=seeds)
+def test_straights_are_inside_as_shapely_finds(area: MultiPolygon, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    low_n, low_e, high_n, high_e = area.bounds
+    anywhere = rng.uniform((low_n - 1, low_e - 1), (high_n + 1, high_e + 1), (40, 2))
+    places = np.concatenate([anywhere, places_in(area, rng, 40)])
+    starts, ends = places[rng.permutation(80)], places[rng.permutation(80)]
+    ways = Ways(area)
+
+    free = ways.free_many(starts, ends)
+
+    straights = shapely.linestrings(np.stack([starts, ends], axis=1))
+    # Whatever lies in the area is free, and nothing is that leaves it by more than is allowed.
+    certainly = shapely.covers(area, straights)
+    perhaps = shapely.covers(area.buffer(1.01 * TOUCH_M, join_style="mitre"), straights)
+    assert not np.any(certainly & ~free)
+    assert not np.any(free & ~perhaps)
+    np.testing.assert_array_equal(ways.free_many(ends, starts), free)
+    points = shapely.points(places)
+    np.testing.assert_array_equal(ways.inside(places), shapely.distance(area, points) <= TOUCH_M)
+
+
+@settings(deadline=None, max_examples=60)
+@given(area=areas(), seed=seeds)
+def test_ways_are_as_short_as_by_trying_all_corners(area: MultiPolygon, seed: int) -> None:
+    places = places_in(area, np.random.default_rng(seed), 6)
+    ways = Ways(area)
+
+    distances = ways.distances_m(places, places)
+
+    np.testing.assert_allclose(distances, distances.T, atol=1e-9)
+    for i in range(3):
+        a, b = tuple(places[i].tolist()), tuple(places[i + 3].tolist())
+        expected = shortest_way_m(area, a, b)
+        assert distances[i, i + 3] == pytest.approx(expected, abs=1e-5)
+        assert ways.distance_m(a, b) == pytest.approx(expected, abs=1e-5)
+        if math.isinf(expected):
+            with pytest.raises(PlanError, match="not connected"):
+                ways.path_ne(a, b)
+            continue
+        path = ways.path_ne(a, b)
+        assert tuple(path[0]) == a and tuple(path[-1]) == b
+        assert ways.free_many(path[:-1], path[1:]).all()
+        lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
+        assert lengths.sum() == pytest.approx(expected, abs=1e-5)
+        assert len(lengths) == 1 or lengths.min() > TOUCH_M
+    straight = np.linalg.norm(places[:, None] - places[None], axis=2)
+    assert np.all(distances >= straight - 1e-12)
+    # No detour over a third place is shorter.
+    over = (distances[:, :, None] + distances[None]).min(axis=1)
+    assert np.all(distances <= over + 1e-6)
+
+
+@settings(deadline=None, max_examples=80)
+@given(
+    area=areas(),
+    seed=seeds,
+    heading=st.floats(-4, 7),
+    radius=st.floats(0.2, 5),
+    side=st.sampled_from([-1, 1]),
+    turned=st.floats(0.01, 6.28),
+)
+def test_arcs_are_inside_as_their_samples_are(
+    area: MultiPolygon, seed: int, heading: float, radius: float, side: int, turned: float
+) -> None:
+    fence = Ways(area).fence
+    for place in places_in(area, np.random.default_rng(seed), 8).tolist():
+        leg = Leg(
+            start_ne_m=(place[0], place[1]),
+            heading_rad=heading,
+            length_m=radius * turned,
+            curvature_per_m=side / radius,
+            line=-1,
+        )
+        inside = arc_inside(fence, *place, heading, leg.curvature_per_m, leg.length_m)
+
+        places, bend = sampled_leg(leg, 300)
+        track = LineString(places)
+        if inside:
+            assert area.buffer(TOUCH_M + bend).covers(track)
+        else:
+            assert not area.buffer(-bend - 1e-9).covers(track)
+
+
+def test_touching_is_allowed_up_to_a_micrometre() -> None:
+    ways = Ways(RING)
+    along = [((0.0, 0.0), (100.0, 0.0)), ((40.0, 0.0), (40.0, 50.0)), ((0.0, 10.0), (100.0, 10.0))]
+    for a, b in along:
+        shift = np.array([b[1] - a[1], b[0] - a[0]]) / math.dist(a, b)
+        for sign in (-1, 1):
+            near = sign * 0.5e-6 * shift
+            assert ways.free(tuple(a + near), tuple(b + near))
+    assert ways.free((40 + 0.9e-6, 0.0), (40 + 0.9e-6, 50.0))
+    assert not ways.free((40 + 1.1e-6, 0.0), (40 + 1.1e-6, 50.0))
+    assert not ways.free((-1.1e-6, 0.0), (50.0, 0.0))
+    assert ways.inside(np.array([[-0.9e-6, 3.0], [-1.1e-6, 3.0]])).tolist() == [True, False]
+
+
+def test_arcs_may_graze_an_edge() -> None:
+    fence = Ways(RING).fence
+    # A circle of 10 m radius round (30, 25) touches the hole at north 40.
+    for off, allowed in ((0.0, True), (0.4e-6, True), (-1e-3, True), (1.1e-6, False)):
+        assert arc_inside(fence, 20.0 + off, 25.0, math.pi / 2, -0.1, 20 * math.pi) == allowed
+    # Straights of no curvature are as straights.
+    assert arc_inside(fence, 0.0, 0.0, 0.0, 0.0, 100.0)
+    assert not arc_inside(fence, 0.0, 25.0, 0.0, 0.0, 100.0)
+
+
+def test_the_way_round_a_box_is_known() -> None:
+    ways = Ways(RING)
+    assert ways.distance_m((10.0, 25.0), (90.0, 25.0)) == pytest.approx(
+        2 * math.hypot(30, 15) + 20, abs=1e-12
+    )
+    path = ways.path_ne((10.0, 20.0), (90.0, 20.0))
+    np.testing.assert_allclose(path, [[10, 20], [40, 10], [60, 10], [90, 20]])
+    # From corner to corner no place comes twice.
+    np.testing.assert_allclose(
+        ways.path_ne((40.0, 10.0), (60.0, 40.0)), [[40, 10], [60, 10], [60, 40]]
+    )
+    np.testing.assert_allclose(ways.path_ne((3.0, 3.0), (3.0, 3.0)), [[3, 3], [3, 3]])
+
+
+def test_parts_that_are_apart_have_no_way() -> None:
+    ways = Ways(multipolygon(shapely.union_all([box(0, 0, 5, 5), box(6, 0, 9, 5)])))
+    distances = ways.distances_m(np.array([[1.0, 1.0]]), np.array([[4.0, 4.0], [7.0, 1.0]]))
+    assert distances[0, 0] == pytest.approx(math.sqrt(18))
+    assert math.isinf(distances[0, 1])
+    with pytest.raises(PlanError, match=r"1.00 m east to 7.00 m north.*not connected") as fault:
+        ways.path_ne((1.0, 1.0), (7.0, 1.0))
+    assert "\n" not in str(fault.value)
+    with pytest.raises(PlanError, match=r"5.50 m north.*outside"):
+        ways.path_ne((1.0, 1.0), (5.5, 1.0))
+
+
+def test_open_water_has_no_edge() -> None:
+    assert straight_inside(OPEN_WATER, -1e6, 0.0, 1e6, 5.0)
+    assert arc_inside(OPEN_WATER, -1e6, 0.0, 0.3, 0.1, 50.0)
+
+
+def coast(corners: int, seed: int) -> MultiPolygon:
+    """A coast-like polygon: a rough ring about 90 m across."""
+    rng = np.random.default_rng(seed)
+    smooth = np.convolve(rng.normal(size=corners + 20), np.ones(20) / 5, "valid")[:corners]
+    reach = 45 + 3 * smooth + rng.normal(size=corners) * 0.6
+    angles = np.linspace(0, 2 * math.pi, corners, endpoint=False)
+    return multipolygon(
+        Polygon(reach[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1))
+    )
+
+
+def test_a_coast_of_500_corners_takes_some_tens_of_milliseconds() -> None:
+    area = coast(500, 1)
+    places = places_in(area, np.random.default_rng(2), 60)
+    Ways(area).distances_m(places[:2], places[2:4])  # compiles
+
+    best = math.inf
+    for _ in range(3):
+        began = time.process_time()
+        ways = Ways(area)
+        distances = ways.distances_m(places, places)
+        best = min(best, time.process_time() - began)
+
+    assert np.isfinite(distances).all()
+    assert (distances > np.linalg.norm(places[:, None] - places[None], axis=2) + 1e-9).any()
+    assert best < 0.15
+
+
+def test_a_convex_area_needs_no_graph() -> None:
+    ways = Ways(multipolygon(Point(0, 0).buffer(20)))
+    assert ways.distance_m((-10.0, 0.0), (10.0, 3.0)) == pytest.approx(math.hypot(20, 3))
+    assert "_graph" not in vars(ways)

@@ -1,0 +1,117 @@
+"""Slow, obvious twins of ways, turns and costs of routes: shapely, all pairs, dense sampling."""
+
+import heapq
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry import LineString, MultiPolygon
+
+from missions.lines.line import Line
+from missions.route.costs import Costs, power_at
+from missions.route.legs import Leg, Route
+
+Array = NDArray[np.float64]
+
+
+def shortest_way_m(allowed: MultiPolygon, a: tuple[float, float], b: tuple[float, float]) -> float:
+    """Dijkstra over the straights between all corners and both places that shapely finds inside."""
+    wider = allowed.buffer(1e-6)
+    places = np.concatenate([[a, b], np.unique(shapely.get_coordinates(allowed), axis=0)])
+    one, two = np.triu_indices(len(places), 1)
+    straights = shapely.linestrings(np.stack([places[one], places[two]], axis=1))
+    shapely.prepare(wider)
+    free = shapely.covers(wider, straights)
+    lengths = np.linalg.norm(places[one] - places[two], axis=1)
+    ways: list[list[tuple[int, float]]] = [[] for _ in places]
+    for i, j, length in zip(one[free].tolist(), two[free].tolist(), lengths[free], strict=True):
+        ways[i].append((j, float(length)))
+        ways[j].append((i, float(length)))
+    reached = {0: 0.0}
+    queue = [(0.0, 0)]
+    while queue:
+        so_far, place = heapq.heappop(queue)
+        if place == 1:
+            return so_far
+        if so_far > reached[place]:
+            continue
+        for other, length in ways[place]:
+            if so_far + length < reached.get(other, math.inf):
+                reached[other] = so_far + length
+                heapq.heappush(queue, (so_far + length, other))
+    return math.inf
+
+
+def sampled_leg(leg: Leg, samples: int) -> tuple[Array, float]:
+    """Places along a leg, and how far it may be from the straights between them."""
+    if leg.curvature_per_m == 0.0:
+        ahead = np.array([math.cos(leg.heading_rad), math.sin(leg.heading_rad)])
+        return np.array([leg.start_ne_m, leg.start_ne_m + leg.length_m * ahead]), 0.0
+    radius = 1 / abs(leg.curvature_per_m)
+    side = math.copysign(1.0, leg.curvature_per_m)
+    right = np.array([-math.sin(leg.heading_rad), math.cos(leg.heading_rad)])
+    centre = np.array(leg.start_ne_m) + side * radius * right
+    swept = leg.length_m / radius * np.linspace(0.0, 1.0, samples)
+    angles = math.atan2(*(-side * right)[::-1]) + side * swept
+    places = centre + radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return places, radius * (1 - math.cos(swept[-1] / (samples - 1) / 2))
+
+
+def farthest_outside_m(allowed: MultiPolygon, route: Route, samples: int = 400) -> float:
+    """How far a route leaves the allowed area at most, by shapely; 0 if it does not."""
+    worst = 0.0
+    for leg in route.legs:
+        if leg.length_m == 0.0:
+            places, bend = np.array([leg.start_ne_m]), 0.0
+            outside = shapely.points(places[0])
+        else:
+            places, bend = sampled_leg(leg, samples)
+            outside = LineString(places).difference(allowed)
+        if outside.is_empty:
+            continue
+        corners = shapely.points(shapely.get_coordinates(outside))
+        # The straights between samples cut an arc's inside by up to `bend`.
+        worst = max(worst, float(shapely.distance(allowed, corners).max()) - bend)
+    return worst
+
+
+def route_cost_by_steps(route: Route, costs: Costs, step_m: float) -> tuple[float, float]:
+    """Energy and time, leg after leg, arcs in short steps of one course each."""
+    joules = seconds = 0.0
+    for leg in route.legs:
+        if leg.turn_rad:
+            joules += costs.spot_j(leg.turn_rad)
+            seconds += abs(leg.turn_rad) / costs.turn_rate_rad_s + costs.settle_s
+            continue
+        if leg.side_rad:
+            joules += costs.sway_j(leg.length_m, leg.heading_rad)
+            seconds += leg.length_m / costs.sway_mps + costs.settle_s
+            continue
+        power_w = costs.line_w if leg.line >= 0 else costs.way_w
+        steps = max(1, math.ceil(leg.length_m / step_m)) if leg.curvature_per_m else 1
+        for k in range(steps):
+            course = leg.heading_rad + leg.curvature_per_m * leg.length_m * (k + 0.5) / steps
+            joules += leg.length_m / steps / costs.speed_mps * power_at(power_w, course)
+        seconds += leg.length_m / costs.speed_mps
+    return joules, seconds
+
+
+def lawn(count: int, length_m: float, spacing_m: float) -> list[Line]:
+    """Lines north and south, side by side."""
+    lines = [
+        Line(
+            kind="survey",
+            start_ne_m=(0.0, i * spacing_m),
+            end_ne_m=(length_m, i * spacing_m),
+            stations=20,
+        )
+        for i in range(count)
+    ]
+    return [line if i % 2 == 0 else line.reversed() for i, line in enumerate(lines)]
+
+
+def total_m(legs: Sequence[Leg]) -> float:
+    """Length of legs."""
+    return sum(leg.length_m for leg in legs)
