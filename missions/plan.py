@@ -5,40 +5,61 @@ Altitude and all places are of the left port's outer glass.
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-import shapely
-from shapely.geometry import Polygon
+import numpy as np
+import shapely.ops
+from shapely.geometry import Point
 
-from alice_survey.artefacts import Stage, run_stage, write_json
+from alice_survey.artefacts import Stage, run_stage
 from alice_survey.config import SurveyConfig
 from alice_survey.errors import PlanError, warn
-from alice_survey.frames import Array
 from camera_calib.rig import Rig, design_rig
-from missions.areas.area import Area, multipolygon
-from missions.areas.shapes import area_datum, area_polygon, polygon_corners
-from missions.coverage.footprints import covered_share
-from missions.exports.geojson import write_geojson, write_lines
-from missions.footprint import Swath, common_swath, joint_swath, overlap, step_for_overlap
+from missions.areas.area import Area
+from missions.areas.bathymetry import Bathymetry, area_depth, read_bathymetry
+from missions.areas.files import area_files
+from missions.areas.survey import survey_area
+from missions.coverage.certificate import Certificate, certificate
+from missions.coverage.stations import Stations, stations_of_plan
+from missions.footprint import Swath, common_swath, joint_swath
 from missions.imaging.settings import ImagingSettings, imaging_settings, raw_bytes
-from missions.lines.lawnmower import (
-    LineSpacing,
-    across_range,
-    cross_lines,
-    longer_side_heading,
-    space_lines,
-    survey_lines,
-)
+from missions.lines.lawnmower import longer_side_heading
+from missions.lines.lay import lay_lines
 from missions.lines.line import Line
-from missions.maps.plan_map import draw_plan
-from missions.plan_file import Dive, Plan, read_plan
-from missions.route.turns import route_through
+from missions.lines.pattern import Pattern, pattern
+from missions.plan_file import Plan, read_plan
+from missions.plan_rows import plan_rows
+from missions.route.costs import Costs
+from missions.route.dives import split_dives
+from missions.route.energy import usable_wh, vehicle_costs
+from missions.route.terrain import TerrainLimits, line_depths, reach_of
+from missions.route.ways import Ways
 
-__all__ = ["Plan", "make_plan", "read_plan", "run_plan"]
+__all__ = ["Plan", "Planned", "make_plan", "plan_survey", "read_plan", "run_plan"]
+
+_ENOUGH = 0.999
+"""Share of the area that is to be covered at the overlap asked for; below, the plan warns."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Planned:
+    """A plan and what led to it."""
+
+    plan: Plan
+    imaging: ImagingSettings
+    costs: Costs
+    certificate: Certificate
+    sweep: Any
+    """How the direction of the lines was found; None where it was given."""
+    bathymetry: Bathymetry | None
+    table: str
+    """Every setting with its equation, source and limit, for people."""
 
 
 def run_plan(workspace: Path, config: SurveyConfig, threads: int) -> bool:
-    """Stage `plan`: write plan.json, plan.geojson, lines.csv and map.png.
+    """Stage `plan`: write plan.json, its certificate, settings, maps and missions for vehicles.
 
     Returns:
         True when work was done, False when the plan was up to date.
@@ -46,30 +67,38 @@ def run_plan(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     Raises:
         PlanError: no plan meets the settings.
     """
+    files = [config.area.bathymetry_file, config.sea.current_file, config.vehicle.coefficients_file]
     stage = Stage(
         name="plan",
-        version=2,
+        version=3,
         settings={
             "name": config.name,
-            "area": config.area.model_dump(mode="json"),
-            "camera": config.camera.model_dump(mode="json"),
-            "water": config.water.model_dump(mode="json"),
-            "plan": config.plan.model_dump(mode="json"),
+            **{
+                name: getattr(config, name).model_dump(mode="json")
+                for name in ("area", "camera", "water", "plan", "vehicle", "sea")
+            },
+            "strobes": config.imaging.model_dump(
+                mode="json", include={"strobe_lumens", "strobe_beam_deg", "strobes_body_m"}
+            ),
         },
+        inputs=[*area_files(config.area), *(file for file in files if file is not None)],
     )
 
     def work(folder: Path) -> None:
+        from missions.plan_record import write_planned
+
         rig = design_rig(config.camera, config.water)
-        plan = make_plan(config, rig)
-        write_json(folder / "plan.json", plan.to_json())
-        write_geojson(folder / "plan.geojson", plan, rig)
-        write_lines(folder / "lines.csv", plan)
-        draw_plan(folder / "map.png", plan, rig)
+        write_planned(folder, plan_survey(config, rig), config, rig)
 
     return run_stage(workspace, stage, work)
 
 
 def make_plan(config: SurveyConfig, rig: Rig) -> Plan:
+    """Plan a survey; as `plan_survey`, the plan alone."""
+    return plan_survey(config, rig).plan
+
+
+def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
     """Plan a survey.
 
     Args:
@@ -80,47 +109,46 @@ def make_plan(config: SurveyConfig, rig: Rig) -> Plan:
         PlanError: no plan meets the settings; the message names the numbers.
     """
     wanted = config.plan
-    camera = rig.cameras[rig.reference]
-    area = area_polygon(config.area)
+    _check_turns(config)
     imaging = imaging_settings(rig, config)
     step_m = imaging.station_spacing_m
     stereo = common_swath(rig, wanted.altitude_m, step_m)
-    _check_altitude(config, stereo)
-    _check_turns(config)
-    polygon = area.buffer(wanted.margin_m, join_style="mitre") if wanted.margin_m else area
-    heading = _heading(config, area)
-    low, high = across_range(polygon, heading)
-    _check_smallest(area, imaging)
-    spacing = space_lines(
-        high - low,
-        stereo,
-        largest_m=min(
-            step_for_overlap(imaging.footprint_across_m, wanted.side_overlap),
-            2 * stereo.half_across_m,
-        ),
-        exact_m=wanted.line_spacing_m,
+    told = pattern(stereo, imaging.line_spacing_m, step_m)
+    area = survey_area(
+        config.area, turn_margin_m=_turn_margin_m(config, told), margin_m=wanted.margin_m
     )
-    side_overlap = overlap(imaging.footprint_across_m, spacing.spacing_m)
-    _warn_of_spacing(config, spacing, side_overlap, stereo)
-    lines = _all_lines(config, polygon, heading, spacing, step_m)
-    route = route_through(lines, wanted.turn_radius_m, wanted.run_in_m)
-    stations = sum(line.stations for line in lines)
-    coverage = covered_share(area, lines, stereo, step_m)
-    if coverage < 0.999 and spacing.spacing_m <= 2 * stereo.half_across_m:
-        warn(
-            f"every camera surely sees only {coverage:.1%} of the area: a picture every "
-            f"{step_m:.3g} m leaves gaps at its corners, raise forward_overlap"
-        )
-    return Plan(
+    bathymetry = _bathymetry(config, area)
+    _check_smallest(area, imaging)
+    _warn_of_spacing(config, imaging, stereo)
+    depth_m = _depth_m(config, area, bathymetry)
+    _check_depth(config, depth_m)
+    ways, home = Ways(area.allowed), _home(config, area)
+    costs = vehicle_costs(config, imaging_w=imaging.imaging_w)
+    ties = {"cross_lines": wanted.cross_lines, "closing_line": wanted.closing_line}
+    sweep = None
+    if wanted.line_heading_deg is None:
+        heading = longer_side_heading(area.survey.convex_hull)
+    else:
+        heading = math.radians(wanted.line_heading_deg)
+    lines = lay_lines(area, heading, told, ways, costs, home, **ties)
+    dives = split_dives(
+        lines,
+        ways=ways,
+        costs=costs,
+        home_ne=home,
+        turn_radius_m=wanted.turn_radius_m,
+        run_in_m=wanted.run_in_m,
+        turns=wanted.turns,
+        usable_wh=usable_wh(config.vehicle),
+        longest_s=math.inf if wanted.dive_s is None else wanted.dive_s,
+        depth_m=depth_m - wanted.altitude_m,
+        split=wanted.split_dives,
+    )
+    plan = Plan(
         name=config.name,
-        area=Area(
-            datum=area_datum(config.area),
-            survey=multipolygon(area),
-            allowed=multipolygon(area.buffer(3.0, join_style="mitre")),
-            no_go=multipolygon(shapely.MultiPolygon()),
-        ),
-        home_ne_m=route.legs[0].start_ne_m,
-        seafloor_depth_m=config.area.seafloor_depth_m,
+        area=area,
+        home_ne_m=home,
+        seafloor_depth_m=depth_m,
         altitude_m=wanted.altitude_m,
         speed_mps=wanted.speed_mps,
         interval_s=imaging.interval_s,
@@ -128,91 +156,133 @@ def make_plan(config: SurveyConfig, rig: Rig) -> Plan:
         strobe_pulse_s=imaging.strobe_pulse_s,
         strobe_lead_s=imaging.strobe_lead_s,
         footprint_m=(imaging.footprint_across_m, imaging.footprint_along_m),
-        line_spacing_m=spacing.spacing_m,
+        line_spacing_m=told.spacing_m,
         station_spacing_m=step_m,
         forward_overlap=imaging.forward_overlap,
-        side_overlap=side_overlap,
+        side_overlap=imaging.spacing.side_overlap,
         lines=tuple(lines),
-        dives=(
-            Dive(
-                first_line=0,
-                last_line=len(lines) - 1,
-                route=route,
-                duration_s=route.length_m / wanted.speed_mps,
-                energy_wh=0.0,
-            ),
-        ),
-        energy_wh=0.0,
+        dives=dives,
         turn_radius_m=wanted.turn_radius_m,
         run_in_m=wanted.run_in_m,
-        length_m=route.length_m,
-        duration_s=route.length_m / wanted.speed_mps,
-        coverage=coverage,
-        details={
-            "imaging": imaging.to_json(),
-            "area_m2": area.area,
-            "wanted_forward_overlap": wanted.forward_overlap,
-            "wanted_side_overlap": wanted.side_overlap,
-            "stereo_swath_m": stereo.across_m,
-            "stereo_side_overlap": _stereo_side_overlap(stereo, spacing.spacing_m),
-            "mosaic_swath_m": joint_swath(rig, wanted.altitude_m, step_m).across_m,
-            "turn_rate_deg_s": math.degrees(wanted.speed_mps / wanted.turn_radius_m),
-            "pictures": stations * len(rig.cameras),
-            "raw_bytes": raw_bytes(camera, len(rig.cameras), stations),
-            "raw_bytes_per_s": raw_bytes(camera, len(rig.cameras), 1) / imaging.interval_s,
-        },
+        length_m=sum(dive.route.length_m for dive in dives),
+        duration_s=sum(dive.duration_s for dive in dives),
+        energy_wh=sum(dive.energy_wh for dive in dives),
+        coverage=math.nan,
+        line_depths_m=_line_depths(lines, config, stereo, bathymetry),
+        details={},
     )
-
-
-def _heading(config: SurveyConfig, area: Polygon) -> float:
-    if config.plan.line_heading_deg is not None:
-        return math.radians(config.plan.line_heading_deg)
-    return longer_side_heading(area)
-
-
-def _all_lines(
-    config: SurveyConfig, polygon: Polygon, heading: float, spacing: LineSpacing, step_m: float
-) -> list[Line]:
-    """Survey lines, from the end nearest to the area's first corner, then cross lines."""
-    lines = survey_lines(polygon, heading, spacing, step_m)
-    if config.plan.line_heading_deg is None:
-        corner = polygon_corners(polygon)[0]
-        other = survey_lines(polygon, heading + math.pi, spacing, step_m)
-        if _reach(other, corner) < _reach(lines, corner) - 1e-6:
-            lines = other
-    crossing = cross_lines(
-        polygon, lines[0].heading_rad, config.plan.cross_lines, step_m, lines[-1].end_ne_m
-    )
-    return lines + crossing
-
-
-def _reach(lines: Sequence[Line], corner: Array) -> float:
-    return math.dist(lines[0].start_ne_m, corner)
-
-
-def _stereo_side_overlap(stereo: Swath, spacing_m: float) -> float:
-    """Least overlap of neighbouring stereo swaths: headings alternate, so like sides meet."""
-    return max(0.0, (2 * stereo.half_across_m - spacing_m) / stereo.across_m)
-
-
-def _check_altitude(config: SurveyConfig, stereo: Swath) -> None:
-    plan, depth_m = config.plan, config.area.seafloor_depth_m
-    if plan.altitude_m >= depth_m:
-        raise PlanError(
-            f"altitude_m {plan.altitude_m:g} is not below the surface over a sea floor at "
-            f"{depth_m:g} m: lower plan.altitude_m or check area.seafloor_depth_m"
+    seen = certificate(area, rig, _stations(plan, bathymetry), told)
+    if seen.share_at_overlap < _ENOUGH:
+        warn(
+            f"{1 - seen.share_at_overlap:.2%} of the area gets less overlap than asked for, and "
+            f"{1 - seen.every_camera_share:.2%} is not seen by every camera: look at map.png, and "
+            "give the vehicle more room, or raise the overlaps"
         )
-    if stereo.half_across_m <= 0:
+    details = _details(imaging, sweep, stereo, rig, config)
+    finished = replace(plan, coverage=seen.share_at_overlap, details=details)
+    return Planned(
+        plan=finished,
+        imaging=imaging,
+        costs=costs,
+        certificate=seen,
+        sweep=sweep,
+        bathymetry=bathymetry,
+        table=imaging.table_text(plan_rows(finished, seen, sweep, config, rig)),
+    )
+
+
+def _turn_margin_m(config: SurveyConfig, told: Pattern) -> float:
+    """Room around the area for the widest turn: run-out, and a loop of three quarters of a turn."""
+    plan = config.plan
+    outside = max(told.overhang_m, told.edge_m, 0.0) + max(told.spacing_m, told.step_m) / 2
+    return outside + plan.run_in_m + 3.0 * plan.turn_radius_m
+
+
+def _home(config: SurveyConfig, area: Area) -> tuple[float, float]:
+    """Where dives begin and end: as set, or the first corner of the area, or close to it.
+
+    Raises:
+        PlanError: it is not where the vehicle may be.
+    """
+    given = config.plan.home_ne_m
+    if given is None:
+        corner = Point(area.rings_ne[0][0])
+        nearest, _ = shapely.ops.nearest_points(area.allowed, corner)
+        return round(float(nearest.x), 9), round(float(nearest.y), 9)
+    away_m = float(area.allowed.distance(Point(given)))
+    if away_m > 1e-6:
         raise PlanError(
-            f"at {plan.altitude_m:g} m altitude the cameras, {config.camera.baseline_m:g} m apart, "
-            "have no view in common on both sides of a line: raise plan.altitude_m"
+            f"home at north {given[0]:g}, east {given[1]:g} m is {away_m:.1f} m outside of where "
+            "the vehicle may be: move plan.home_ne_m, or widen area.turn_margin_m or area.allowed"
+        )
+    return given
+
+
+def _bathymetry(config: SurveyConfig, area: Area) -> Bathymetry | None:
+    file = config.area.bathymetry_file
+    if file is None:
+        return None
+    reach_m = 4.0 * config.plan.altitude_m
+    south, west, north, east = area.allowed.bounds
+    bounds = (south - reach_m, west - reach_m, north + reach_m, east + reach_m)
+    return read_bathymetry(file, area.datum, bounds_ne=bounds)
+
+
+def _depth_m(config: SurveyConfig, area: Area, bathymetry: Bathymetry | None) -> float:
+    """Mean depth of the sea floor, as set or as the bathymetry has it."""
+    set_m = config.area.seafloor_depth_m
+    if bathymetry is None:
+        return set_m
+    found = area_depth(bathymetry, area.survey)
+    if abs(found.mean_m - set_m) > max(0.5, 0.05 * set_m):
+        warn(
+            f"{bathymetry.name}: the sea floor of the area is {found.mean_m:.2f} m deep in the "
+            f"mean, area.seafloor_depth_m is {set_m:g}: the former is planned with; set the latter "
+            "to it, for light and refraction"
+        )
+    return found.mean_m
+
+
+def _line_depths(
+    lines: Sequence[Line], config: SurveyConfig, stereo: Swath, bathymetry: Bathymetry | None
+) -> tuple[tuple[float, ...], ...]:
+    """Depth of the glass at each station of each line, over a bathymetry."""
+    if bathymetry is None:
+        return ()
+    wanted = config.plan
+    limits = TerrainLimits(
+        altitude_m=wanted.altitude_m,
+        least_clearance_m=wanted.least_clearance_m,
+        steepest_rad=math.radians(wanted.steepest_deg),
+    )
+    across_m = max(stereo.port_m, stereo.starboard_m)
+    along_m = max(stereo.ahead_m, stereo.astern_m)
+    reach = reach_of(config.camera.position_body_m, across_m, along_m)
+    depths = line_depths(lines, bathymetry, reach, limits)
+    return tuple(tuple(round(float(d), 4) for d in row) for row in depths)
+
+
+def _stations(plan: Plan, bathymetry: Bathymetry | None) -> Stations:
+    """Where pictures are taken when the plan is flown exactly."""
+    if bathymetry is None:
+        return stations_of_plan(plan)
+    return stations_of_plan(
+        plan, bathymetry.depth_at(np.vstack([x.stations_ne for x in plan.lines]))
+    )
+
+
+def _check_depth(config: SurveyConfig, depth_m: float) -> None:
+    if config.plan.altitude_m >= depth_m:
+        raise PlanError(
+            f"altitude_m {config.plan.altitude_m:g} is not below the surface over a sea floor at "
+            f"{depth_m:g} m: lower plan.altitude_m or check area.seafloor_depth_m"
         )
 
 
 def _check_turns(config: SurveyConfig) -> None:
     plan = config.plan
     rate_deg_s = math.degrees(plan.speed_mps / plan.turn_radius_m)
-    if rate_deg_s > plan.turn_rate_limit_deg_s:
+    if plan.turns in ("auto", "arcs") and rate_deg_s > plan.turn_rate_limit_deg_s:
         raise PlanError(
             f"turns of {plan.turn_radius_m:g} m radius at {plan.speed_mps:g} m/s need "
             f"{rate_deg_s:.0f} deg/s; turn_rate_limit_deg_s is {plan.turn_rate_limit_deg_s:g}: "
@@ -220,9 +290,9 @@ def _check_turns(config: SurveyConfig) -> None:
         )
 
 
-def _check_smallest(area: Polygon, imaging: ImagingSettings) -> None:
+def _check_smallest(area: Area, imaging: ImagingSettings) -> None:
     least_m = min(imaging.footprint_across_m, imaging.footprint_along_m)
-    north_0, east_0, north_1, east_1 = area.bounds
+    north_0, east_0, north_1, east_1 = area.survey.bounds
     diagonal_m = math.hypot(north_1 - north_0, east_1 - east_0)
     if diagonal_m < least_m:
         raise PlanError(
@@ -231,22 +301,35 @@ def _check_smallest(area: Polygon, imaging: ImagingSettings) -> None:
         )
 
 
-def _warn_of_spacing(
-    config: SurveyConfig, spacing: LineSpacing, side_overlap: float, stereo: Swath
-) -> None:
-    if spacing.count < 2:
-        return
-    if spacing.spacing_m > 2 * stereo.half_across_m:
+def _warn_of_spacing(config: SurveyConfig, imaging: ImagingSettings, stereo: Swath) -> None:
+    spacing_m, reached = imaging.line_spacing_m, imaging.spacing.side_overlap
+    if spacing_m > 2 * stereo.half_across_m:
         warn(
-            f"lines {spacing.spacing_m:g} m apart leave gaps of "
-            f"{spacing.spacing_m - 2 * stereo.half_across_m:.2f} m in stereo; at most "
+            f"lines {spacing_m:g} m apart leave gaps of "
+            f"{spacing_m - 2 * stereo.half_across_m:.2f} m in stereo; at most "
             f"{2 * stereo.half_across_m:.2f} m apart do not"
         )
-    if side_overlap < config.plan.side_overlap - 1e-9:
-        wanted_m = step_for_overlap(
-            spacing.spacing_m / (1 - side_overlap), config.plan.side_overlap
-        )
+    if reached < config.plan.side_overlap - 1e-9:
+        needed_m = imaging.footprint_across_m * (1 - config.plan.side_overlap)
         warn(
-            f"lines {spacing.spacing_m:g} m apart overlap by {side_overlap:.1%}, less than the "
-            f"{config.plan.side_overlap:.1%} asked for, which needs {wanted_m:.3f} m"
+            f"lines {spacing_m:g} m apart overlap by {reached:.1%}, less than the "
+            f"{config.plan.side_overlap:.1%} asked for, which needs {needed_m:.3f} m"
         )
+
+
+def _details(
+    imaging: ImagingSettings, sweep: Any, stereo: Swath, rig: Rig, config: SurveyConfig
+) -> dict[str, Any]:
+    plan = config.plan
+    camera = rig.cameras[rig.reference]
+    return {
+        "imaging": imaging.to_json(),
+        "heading": None if sweep is None else sweep.to_json(),
+        "wanted_forward_overlap": plan.forward_overlap,
+        "wanted_side_overlap": plan.side_overlap,
+        "stereo_swath_m": stereo.across_m,
+        "stereo_side_overlap": imaging.spacing.stereo_overlap,
+        "mosaic_swath_m": joint_swath(rig, plan.altitude_m, imaging.station_spacing_m).across_m,
+        "turn_rate_deg_s": math.degrees(plan.speed_mps / plan.turn_radius_m),
+        "raw_bytes_per_s": raw_bytes(camera, len(rig.cameras), 1) / imaging.interval_s,
+    }

@@ -1,84 +1,100 @@
-"""The map of a plan."""
+"""The map of a plan: area, no-go zones, lines, footprints, overlap, current, bathymetry."""
 
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import shapely
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from matplotlib.patches import Polygon as Outline
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path as Outline
+from matplotlib.transforms import Affine2D
 
+from alice_survey.config import SeaConfig
+from alice_survey.errors import PlanError
+from alice_survey.frames import Array
 from camera_calib.rig import Rig
+from missions.areas.bathymetry import Bathymetry
+from missions.coverage.certificate import Certificate
 from missions.coverage.footprints import footprint_outline, footprints_ne
 from missions.plan_file import Plan
 
-_AREA, _SURVEY, _CROSS, _WAY = "#c8553d", "#1b4f72", "#6c3483", "#7f8c8d"
-_FOOTPRINT, _PAPER = "#5dade2", "#fbfcfc"
+_AREA, _WAY, _NO_GO, _ALLOWED = "#c8553d", "#7f8c8d", "#b03a2e", "#566573"
+_LINES = {"survey": "#1b4f72", "cross": "#6c3483", "closing": "#117a65", "fill": "#b9770e"}
+_FOOTPRINT, _PAPER = "#2e86c1", "#fbfcfc"
+_MOST_FOOTPRINTS = 3000
+"""Beyond, single footprints are no longer seen: the count of pictures shows what they cover."""
+_PDF_DATE = {"CreationDate": None, "ModDate": None}
+SUFFIXES = (".png", ".pdf", ".svg")
 
 
-def draw_plan(path: Path, plan: Plan, rig: Rig) -> None:
-    """Draw area, lines, footprints and the way, east to the right, north up."""
+def draw_plan(
+    path: Path,
+    plan: Plan,
+    rig: Rig,
+    certificate: Certificate | None = None,
+    bathymetry: Bathymetry | None = None,
+    sea: SeaConfig | None = None,
+) -> None:
+    """Draw a plan, east to the right, north up, as PNG, PDF or SVG.
+
+    Args:
+        path: its suffix says what to write.
+        plan: what to draw.
+        rig: its first camera's footprints are drawn.
+        certificate: how many pictures see each place.
+        bathymetry: contours to draw.
+        sea: its mean current near the sea floor is shown.
+
+    Raises:
+        PlanError: the suffix is not known.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise PlanError(f"{path}: maps are written as {', '.join(SUFFIXES)}: change the suffix")
     figure, axes = _sheet(plan)
-    outline = footprint_outline(plan, rig)
-    footprints = [shape[:, ::-1] for line in plan.lines for shape in footprints_ne(line, outline)]
-    alpha = 0.16 if len(footprints) < 2000 else 0.06
-    axes.add_collection(
-        PolyCollection(footprints, facecolors=_FOOTPRINT, edgecolors="none", alpha=alpha, zorder=1)
-    )
+    around = [np.asarray(shapely.get_coordinates(plan.area.survey))[:, ::-1]]
+    if certificate is not None:
+        _draw_counts(figure, axes, certificate)
+    around.append(_draw_footprints(axes, plan, rig, faint=certificate is not None))
     _draw_area(axes, plan)
-    route = plan.dives[0].route
-    way = route.places(np.linspace(0.0, route.length_m, _points(route.length_m)))
-    axes.plot(way[:, 1], way[:, 0], color=_WAY, lw=0.9, zorder=3, label="way between lines")
-    for kind, colour in (("survey", _SURVEY), ("cross", _CROSS)):
-        lines = [line for line in plan.lines if line.kind == kind]
-        ends = [(line.start_ne_m[::-1], line.end_ne_m[::-1]) for line in lines]
-        if ends:
-            label = f"{len(ends)} {kind} line{'s' if len(ends) > 1 else ''}"
-            axes.add_collection(
-                LineCollection(ends, colors=colour, linewidths=1.6, zorder=4, label=label)
-            )
-            places = np.vstack([line.stations_ne for line in lines])
-            size = 9.0 if len(footprints) < 300 else 3.0
-            axes.scatter(places[:, 1], places[:, 0], s=size, color=colour, zorder=5, lw=0)
-    for line in plan.lines:
-        _arrow(axes, line.start_ne_m, line.heading_rad, line.length_m)
-    start = way[0]
-    axes.plot(start[1], start[0], "o", ms=9, mfc="#27ae60", mec="white", zorder=7, label="start")
-    axes.plot(way[-1, 1], way[-1, 0], "s", ms=8, mfc="#c0392b", mec="white", zorder=7, label="end")
+    around.append(_draw_route(axes, plan))
+    _draw_lines(axes, plan)
+    points = np.vstack(around)
+    _frame(axes, points)
+    if bathymetry is not None:
+        _draw_bathymetry(axes, bathymetry)
+    _furniture(axes, points)
+    if sea is not None and sea.current_mps > 0 and sea.current_file is None:
+        _draw_current(axes, sea)
     handles, labels = axes.get_legend_handles_labels()
-    footprint = Outline([(0, 0)], facecolor=_FOOTPRINT, alpha=0.5)
-    figure.legend(
-        [*handles, footprint],
-        [*labels, "footprints (left camera)"],
-        loc="lower center",
-        ncol=4,
-        frameon=False,
-        fontsize=8,
-    )
-    around = np.vstack([way[:, ::-1], *footprints])
-    _frame(axes, around)
-    _furniture(axes, around)
+    figure.legend(handles, labels, loc="lower center", ncol=4, frameon=False, fontsize=8)
     axes.set_title(plan.name, loc="left", fontsize=13, weight="bold")
     axes.set_title(_summary(plan), loc="right", fontsize=8, color="#444444")
-    _save(figure, path)
+    kind = path.suffix.lower()
+    metadata = (
+        {"Software": None} if kind == ".png" else _PDF_DATE if kind == ".pdf" else {"Date": None}
+    )
+    figure.savefig(path, dpi=130, metadata=metadata)
 
 
 def _summary(plan: Plan) -> str:
-    minutes = plan.duration_s / 60
+    dives = f"{len(plan.dives)} dives, " if len(plan.dives) > 1 else ""
     return (
-        f"{plan.stations} stations every {plan.interval_s:.2f} s, {plan.length_m:.0f} m, "
-        f"{minutes:.0f} min at {plan.speed_mps:g} m/s\n"
+        f"{plan.stations} stations every {plan.interval_s:.2f} s, {plan.length_m:.0f} m, {dives}"
+        f"{plan.duration_s / 60:.0f} min at {plan.speed_mps:g} m/s, {plan.energy_wh:.0f} Wh\n"
         f"altitude {plan.altitude_m:g} m, overlap {plan.forward_overlap:.0%} forward, "
-        f"{plan.side_overlap:.0%} side, lines {plan.line_spacing_m:.2f} m apart"
+        f"{plan.side_overlap:.0%} side, lines {plan.line_spacing_m:.2f} m apart, "
+        f"{plan.coverage:.1%} covered as asked"
     )
 
 
 def _sheet(plan: Plan) -> tuple[Figure, Axes]:
-    layout = ConstrainedLayoutEngine(rect=(0, 0.07, 1, 0.9))
+    layout = ConstrainedLayoutEngine(rect=(0, 0.08, 1, 0.9))
     figure = Figure(figsize=(8.5, 8.5), facecolor="white", layout=layout)
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
@@ -92,18 +108,119 @@ def _sheet(plan: Plan) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def _draw_area(axes: Axes, plan: Plan) -> None:
-    for index, ring in enumerate(plan.area.rings_ne):
-        label = "area" if index == 0 else None
-        axes.add_patch(
-            Outline(
-                ring[:, ::-1], fill=False, edgecolor=_AREA, lw=2, ls="--", zorder=6, label=label
+def _draw_counts(figure: Figure, axes: Axes, certificate: Certificate) -> None:
+    """How many pictures see each place, in steps that the eye can tell apart."""
+    grid = certificate.grid
+    seen = np.ma.masked_array(certificate.pictures, ~certificate.inside)
+    most = max(int(np.percentile(certificate.pictures[certificate.inside], 99.5)), 2)
+    edges = np.unique(np.round(np.linspace(1, most + 1, min(most, 8) + 1)))
+    # Rows of the grid count along its heading, columns to the right of it.
+    turned = Affine2D().scale(grid.cell_m).rotate(-grid.heading_rad)
+    turned = turned.translate(grid.origin_ne[1], grid.origin_ne[0])
+    image = axes.imshow(
+        seen,
+        origin="lower",
+        extent=(0, grid.columns, 0, grid.rows),
+        transform=turned + axes.transData,
+        cmap="GnBu",
+        norm=BoundaryNorm([0, *edges], 256),
+        alpha=0.75,
+        interpolation="nearest",
+        zorder=0.5,
+    )
+    bar = figure.colorbar(image, ax=axes, shrink=0.6, pad=0.02)
+    bar.set_label("pictures of all cameras that see it", fontsize=8)
+    bar.ax.tick_params(labelsize=8)
+
+
+def _draw_footprints(axes: Axes, plan: Plan, rig: Rig, *, faint: bool) -> Array:
+    """Footprints of the first camera; returns their points, east before north."""
+    outline = footprint_outline(plan, rig)
+    shapes = [shape[:, ::-1] for line in plan.lines for shape in footprints_ne(line, outline)]
+    points: Array = np.vstack(shapes)
+    if len(shapes) <= _MOST_FOOTPRINTS:
+        axes.add_collection(
+            PolyCollection(
+                shapes,
+                facecolors="none" if faint else _FOOTPRINT,
+                edgecolors=_FOOTPRINT if faint else "none",
+                linewidths=0.35,
+                alpha=0.35 if faint else 0.16,
+                zorder=1,
+                label="footprints (left camera)",
             )
         )
+    return points
+
+
+def _draw_area(axes: Axes, plan: Plan) -> None:
+    area = plan.area
+    _patch(axes, area.survey, facecolor="none", edgecolor=_AREA, lw=2.0, zorder=6, label="area")
+    _patch(
+        axes, area.allowed, facecolor="none", edgecolor=_ALLOWED, lw=0.9, ls=":", zorder=2,
+        label="the vehicle may be within",
+    )  # fmt: skip
+    _patch(
+        axes, area.no_go, facecolor="#f5b7b1", edgecolor=_NO_GO, hatch="xxx", lw=1.0, alpha=0.55,
+        zorder=5, label="no-go zone",
+    )  # fmt: skip
+
+
+def _patch(axes: Axes, shape: shapely.MultiPolygon, label: str, **style: object) -> None:
+    rings = [
+        np.asarray(ring.coords)[:, 1::-1]
+        for polygon in shape.geoms
+        for ring in (polygon.exterior, *polygon.interiors)
+    ]
+    if rings:
+        outline = Outline.make_compound_path(*(Outline(ring, closed=True) for ring in rings))
+        axes.add_patch(PathPatch(outline, label=label, **style))
+
+
+def _draw_route(axes: Axes, plan: Plan) -> Array:
+    """The ways of all dives; returns their points, east before north."""
+    points = []
+    for index, dive in enumerate(plan.dives):
+        route = dive.route
+        way = route.places(np.linspace(0.0, route.length_m, _points(route.length_m)))
+        axes.plot(
+            way[:, 1], way[:, 0], color=_WAY, lw=0.9, zorder=3,
+            label="way between lines" if index == 0 else None,
+        )  # fmt: skip
+        points.append(way[:, ::-1])
+    north, east = plan.home_ne_m
+    axes.plot(east, north, "D", ms=9, mfc="#27ae60", mec="white", zorder=8, ls="", label="home")
+    for index, dive in enumerate(plan.dives[1:], start=2):
+        line = plan.lines[dive.first_line]
+        axes.annotate(
+            f"dive {index}", line.start_ne_m[::-1], fontsize=8, weight="bold", zorder=9,
+            bbox={"boxstyle": "round,pad=0.2", "fc": "white", "ec": _WAY, "lw": 0.6},
+        )  # fmt: skip
+    return np.vstack(points)
+
+
+def _draw_lines(axes: Axes, plan: Plan) -> None:
+    size = 9.0 if plan.stations < 300 else 3.0 if plan.stations < 20_000 else 0.3
+    for kind, colour in _LINES.items():
+        lines = [line for line in plan.lines if line.kind == kind]
+        if not lines:
+            continue
+        ends = [(line.start_ne_m[::-1], line.end_ne_m[::-1]) for line in lines]
+        label = f"{len(ends)} {kind} line{'s' if len(ends) > 1 else ''}"
+        axes.add_collection(
+            LineCollection(ends, colors=colour, linewidths=1.6, zorder=4, label=label)
+        )
+        places = np.vstack([line.stations_ne for line in lines])
+        axes.scatter(places[:, 1], places[:, 0], s=size, color=colour, zorder=5, lw=0)
+    if len(plan.lines) <= 200:
+        for line in plan.lines:
+            _arrow(axes, line.start_ne_m, line.heading_rad, line.length_m)
 
 
 def _arrow(axes: Axes, start_ne: tuple[float, float], heading_rad: float, length_m: float) -> None:
     """An arrow head at a third of a line, so that the direction of travel is seen."""
+    if length_m == 0.0:
+        return
     ahead = np.array([math.sin(heading_rad), math.cos(heading_rad)])
     tip = np.array(start_ne[::-1]) + ahead * length_m * 0.36
     axes.annotate(
@@ -115,14 +232,46 @@ def _arrow(axes: Axes, start_ne: tuple[float, float], heading_rad: float, length
     )
 
 
-def _frame(axes: Axes, points_xy: Any) -> None:
+def _draw_bathymetry(axes: Axes, bathymetry: Bathymetry) -> None:
+    """Contours of depth over what the axes show."""
+    (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
+    easts, norths = np.linspace(west, east, 240), np.linspace(south, north, 240)
+    grid = np.stack(np.meshgrid(norths, easts, indexing="ij"), axis=-1)
+    depth = bathymetry.depth_at(grid.reshape(-1, 2)).reshape(grid.shape[:2])
+    known = depth[np.isfinite(depth)]
+    if len(known) and np.ptp(known) > 0.01:
+        lines = axes.contour(easts, norths, depth, 10, colors="#5d6d7e", linewidths=0.6, zorder=1.5)
+        axes.clabel(lines, fontsize=7, fmt="%g m")
+
+
+def _draw_current(axes: Axes, sea: SeaConfig) -> None:
+    """An arrow in the upper left corner that points where the current flows."""
+    towards = math.radians(sea.current_towards_deg)
+    half = 0.04 * np.array([math.sin(towards), math.cos(towards)])
+    middle = np.array([0.075, 0.93])
+    axes.annotate(
+        "",
+        xy=tuple((middle + half).tolist()),
+        xytext=tuple((middle - half).tolist()),
+        xycoords="axes fraction",
+        arrowprops={"arrowstyle": "-|>", "color": "#2471a3", "lw": 2.2, "mutation_scale": 15},
+        zorder=9,
+    )
+    axes.text(
+        0.075, 0.865, f"current\n{sea.current_mps:g} m/s", transform=axes.transAxes, ha="center",
+        va="top", fontsize=7.5, color="#1a5276", zorder=9,
+        bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.7},
+    )  # fmt: skip
+
+
+def _frame(axes: Axes, points_xy: Array) -> None:
     low, high = points_xy.min(axis=0), points_xy.max(axis=0)
     margin = 0.06 * float(max(high - low))
     axes.set_xlim(low[0] - margin, high[0] + margin)
     axes.set_ylim(low[1] - 2.0 * margin, high[1] + margin)
 
 
-def _furniture(axes: Axes, points_xy: Any) -> None:
+def _furniture(axes: Axes, points_xy: Array) -> None:
     """A north arrow and a scale bar."""
     size = float(max(points_xy.max(axis=0) - points_xy.min(axis=0)))
     bar = _round_length(size / 5)
@@ -151,7 +300,3 @@ def _round_length(length_m: float) -> float:
 
 def _points(length_m: float) -> int:
     return int(min(max(length_m / 0.02, 200), 200_000))
-
-
-def _save(figure: Figure, path: Path) -> None:
-    figure.savefig(path, dpi=130, metadata={"Software": None})
