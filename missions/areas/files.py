@@ -126,7 +126,8 @@ def read_wkt(origin: str, text: str, crs: str | None) -> RawShapes:
             raise PlanError(f"area: {origin}: it says SRID={match.group(1)} and crs is {crs}")
         crs = stated
     try:
-        geometry = shapely.from_wkt(text.strip())
+        with np.errstate(invalid="ignore"):  # NaN is told with its corner later
+            geometry = shapely.from_wkt(text.strip())
     except shapely.errors.ShapelyError as first:
         geometry = _closed_wkt(origin, text.strip(), str(first))
     shapes = from_geometries(origin, [geometry])
@@ -244,7 +245,8 @@ def _shapes(wkb: Sequence[bytes | None], file: str, *, several: bool, layer: str
         if blob is None:
             continue
         try:
-            geometry = shapely.from_wkb(blob)
+            with np.errstate(invalid="ignore"):
+                geometry = shapely.from_wkb(blob)
         except shapely.errors.ShapelyError as error:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")

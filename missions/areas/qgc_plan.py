@@ -5,12 +5,13 @@ Keys as in QGroundControl's developer guide, "Plan File Format": complex items h
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from alice_survey.errors import PlanError, warn
+from alice_survey.errors import PlanError
 from alice_survey.frames import Array
 from missions.areas.crs import check_finite, check_latitudes
 from missions.areas.raw import RawLine, RawShapes, no_points
@@ -57,22 +58,12 @@ def read_qgc_plan(
         )
     if role != "survey":
         return found
-    if not layers["inclusion"].is_empty and chosen == "mission":
-        warn(
-            f"area: {path}: its inclusion fence is not used; to stay inside it set allowed_file to "
-            "this file"
-        )
+    fence = ""
+    if chosen == "mission" and not layers["inclusion"].is_empty:
+        fence = "its inclusion fence is not used; to stay inside it set allowed_file to the file"
     exclusion = layers["exclusion"]
-    if exclusion.is_empty or chosen == "exclusion":
-        return found
-    return RawShapes(
-        origin=origin,
-        geographic=True,
-        polygons=found.polygons,
-        lines=found.lines,
-        points=found.points,
-        no_go=exclusion,
-    )
+    zones = exclusion if chosen != "exclusion" and not exclusion.is_empty else None
+    return replace(found, no_go=zones, unused_fence=fence)
 
 
 def _mission(data: dict[str, Any], origin: str) -> RawShapes:

@@ -42,6 +42,8 @@ class RawShapes:
     """(N, 2)."""
     no_go: "RawShapes | None" = None
     """Zones to keep out of that came in the same file."""
+    unused_fence: str = ""
+    """What to tell of a fence in the same file where no allowed area is set."""
 
     @property
     def coordinates(self) -> Array:

@@ -2,8 +2,10 @@
 
 import contextlib
 import json
+import lzma
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -201,7 +203,7 @@ def _member(archive: zipfile.ZipFile, name: str, path: Path) -> bytes:
     """A file of an archive; no more than the size it states, which was checked."""
     try:
         return archive.read(name)
-    except (zipfile.BadZipFile, OSError, EOFError, ValueError, RuntimeError, NotImplementedError):
+    except (zipfile.BadZipFile, zlib.error, lzma.LZMAError, OSError, EOFError, RuntimeError):
         raise PlanError(
             f"area: {path}: {name!r} in it is broken, encrypted or packed in an unknown way"
         ) from None

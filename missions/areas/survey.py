@@ -65,6 +65,8 @@ def survey_area(settings: AreaConfig, *, turn_margin_m: float, margin_m: float =
     if allowed_raw is None:
         margin = settings.turn_margin_m if settings.turn_margin_m is not None else turn_margin_m
         allowed = _less(widened(wanted, margin), no_go)
+        if raw.unused_fence:
+            warn(f"area: {raw.origin}: {raw.unused_fence}")
     else:
         if settings.turn_margin_m is not None:
             warn(f"area: turn_margin_m is not used: {allowed_raw.origin} says where to be")

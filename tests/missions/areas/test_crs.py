@@ -1,0 +1,162 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pyproj import CRS, Geod, Transformer
+from shapely.geometry import Polygon
+
+from alice_survey.config import AreaConfig
+from alice_survey.errors import PlanError
+from alice_survey.frames import Datum
+from missions.areas.area import Area
+from missions.areas.crs import LocalFrame, geographic_shapes, parse_crs
+from missions.areas.raw import from_geometries
+from missions.areas.survey import survey_area
+
+WGS84 = Geod(ellps="WGS84")
+
+
+def area_of(wkt: str, crs: str, **more: object) -> Area:
+    settings = AreaConfig.model_validate({"wkt": wkt, "crs": crs, **more})
+    return survey_area(settings, turn_margin_m=3.0)
+
+
+@given(
+    latitude_deg=st.floats(-85, 85),
+    longitude_deg=st.floats(-180, 180),
+    depth_m=st.floats(1, 6000),
+    north_m=st.floats(-14_000, 14_000),
+    east_m=st.floats(-14_000, 14_000),
+)
+def test_places_on_the_sea_floor_come_back(
+    latitude_deg: float, longitude_deg: float, depth_m: float, north_m: float, east_m: float
+) -> None:
+    frame = LocalFrame(
+        datum=Datum(latitude_deg, longitude_deg), seafloor_depth_m=depth_m, datum_is_given=True
+    )
+    point = np.array([[north_m, east_m]])
+    again = frame.ne_from_latlon(frame.latlon_from_ne(point))
+    np.testing.assert_allclose(again, point, atol=1e-6)
+
+
+# UTM north and south, a Transverse Mercator with east last in its definition, Lambert's conic,
+# Mercator across the date line, polar stereographic, and degrees in either order of axes.
+@pytest.mark.parametrize(
+    ("crs", "latitude_deg", "longitude_deg"),
+    [
+        ("EPSG:32636", 32.82, 34.95),
+        ("EPSG:32760", -45.0, 179.9999),
+        ("EPSG:2193", -41.3, 174.8),
+        ("EPSG:3035", 50.0, 10.0),
+        ("EPSG:3832", 10.0, 180.0),
+        ("EPSG:3995", 82.0, 30.0),
+        ("EPSG:4326", 32.82, 34.95),
+        ("OGC:CRS84", 32.82, 34.95),
+        ("+proj=aeqd +lat_0=32.8 +lon_0=35 +datum=WGS84", 32.82, 34.95),
+    ],
+)
+def test_any_system_comes_back_within_a_millimetre(
+    crs: str, latitude_deg: float, longitude_deg: float
+) -> None:
+    frame = LocalFrame(
+        datum=Datum(latitude_deg, longitude_deg), seafloor_depth_m=15.0, datum_is_given=True
+    )
+    wanted = np.array([[0, 0], [80, 10], [70, 90], [10, 60]], float)
+    lat, lon = frame.latlon_from_ne(wanted).T
+    x, y = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(lon, lat)
+    wkt = Polygon(np.column_stack([x, y])).wkt
+    area = area_of(wkt, crs, latitude_deg=latitude_deg, longitude_deg=longitude_deg)
+    (polygon,) = area.survey.geoms
+    np.testing.assert_allclose(np.asarray(polygon.exterior.coords)[:-1], wanted, atol=1e-3)
+
+
+@settings(max_examples=50)
+@given(
+    latitude_deg=st.floats(-84, 84),
+    longitude_deg=st.floats(-180, 180),
+    size_m=st.floats(10, 4000),
+    turn_deg=st.floats(0, 90),
+)
+def test_areas_are_those_on_the_ellipsoid(
+    latitude_deg: float, longitude_deg: float, size_m: float, turn_deg: float
+) -> None:
+    azimuths = turn_deg + np.arange(5) * 72.0
+    start = (np.full(5, longitude_deg), np.full(5, latitude_deg))
+    lon, lat, _ = WGS84.fwd(*start, azimuths, np.full(5, size_m))
+    expected_m2 = abs(WGS84.polygon_area_perimeter(lon, lat)[0])
+    # At 1 m depth, so that what the Earth's roundness takes from areas below is 3e-7.
+    settings = AreaConfig(
+        polygon_latlon_deg=tuple(zip(lat, lon, strict=True)), seafloor_depth_m=1.0
+    )
+    area = survey_area(settings, turn_margin_m=3.0)
+    assert area.survey.area == pytest.approx(expected_m2, rel=1e-4)
+
+
+def test_the_datum_of_an_area_across_the_date_line_is_its_middle() -> None:
+    corners = np.array([[179.999, 10.0], [-179.998, 10.0], [-179.998, 10.001], [179.999, 10.001]])
+    plain = area_of(Polygon(corners).wkt, "EPSG:4326")
+    assert plain.datum == Datum(10.0005, -179.9995)
+    east = corners.copy()
+    east[:, 0] %= 360.0
+    assert area_of(Polygon(east).wkt, "EPSG:4326").survey.area == pytest.approx(plain.survey.area)
+    halves = (
+        "MULTIPOLYGON (((179.999 10, 180 10, 180 10.001, 179.999 10.001, 179.999 10)),"
+        "((-180 10, -179.998 10, -179.998 10.001, -180 10.001, -180 10)))"
+    )
+    joined = area_of(halves, "EPSG:4326")
+    assert len(joined.survey.geoms) == 1
+    assert joined.survey.area == pytest.approx(plain.survey.area, rel=1e-6)
+    width_m = WGS84.inv(179.999, 10.0, -179.998, 10.0)[2]
+    assert plain.survey.bounds[3] - plain.survey.bounds[1] == pytest.approx(width_m, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("wkt", "crs", "words"),
+    [
+        ("POLYGON ((0 86, 0.01 86, 0.01 86.1, 0 86))", "EPSG:4326", "corner 3 is at latitude 86.1"),
+        ("POLYGON ((32 134, 32 134.1, 32.1 134, 32 134))", "EPSG:4326", "swapped?"),
+        (
+            "POLYGON ((7e5 3.6e6, 7.1e5 3.6e6, 7.1e5 3.61e6, 7e5 3.6e6))",
+            "EPSG:4326",
+            "corner 1 has longitude 700000 and latitude 3600000 in WGS 84: these are no degrees",
+        ),
+        ("POLYGON ((0 0, 1e30 0, 0 1, 0 0))", "EPSG:32636", "no place in WGS 84 / UTM zone 36N"),
+        ("POLYGON ((0 0, 1 0, 0 1, 0 0))", "EPSG:999999", "crs = 'EPSG:999999' is not known"),
+        ("POLYGON ((0 0, 1 0, 0 1, 0 0))", "EPSG:5773", "is no map of the Earth"),
+        ("POLYGON ((0 0, 1 0, 0 1, 0 0))", "EPSG:4978", "is no map of the Earth"),
+        ("POLYGON ((0 0, 1 0, nan 1, 0 0))", "EPSG:32636", "corner 3 is (1, nan)"),
+    ],
+)
+def test_coordinates_that_cannot_be_are_refused_with_the_corner(
+    wkt: str, crs: str, words: str
+) -> None:
+    with pytest.raises(PlanError) as fault:
+        area_of(wkt, crs)
+    assert words in str(fault.value)
+    assert "\n" not in str(fault.value)
+
+
+def test_a_system_that_is_badly_tied_to_wgs84_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    shape = from_geometries("old.wkt", [Polygon([(24.0, 38.0), (24.001, 38.0), (24.0, 38.001)])])
+    found = geographic_shapes(shape, parse_crs("EPSG:4230"))
+    # ED50 lies some 150 m off WGS 84 in Greece.
+    lat, lon = found.polygons[0][0][0]
+    off_m = WGS84.inv(lon, lat, 24.0, 38.0)[2]
+    assert 100 < off_m < 250
+    assert "positions in ED50 are known in WGS 84 to" in capsys.readouterr().err
+    geographic_shapes(shape, CRS("EPSG:4258"))
+    assert capsys.readouterr().err == ""
+
+
+def test_depth_moves_corners_together_as_the_earth_is_round() -> None:
+    corners = tuple((lat, lon) for lat, lon in ((32.0, 34.0), (32.01, 34.0), (32.0, 34.01)))
+    shallow, deep = (
+        survey_area(
+            AreaConfig(polygon_latlon_deg=corners, seafloor_depth_m=depth_m), turn_margin_m=3.0
+        ).survey.area
+        for depth_m in (10.0, 4010.0)
+    )
+    assert deep / shallow == pytest.approx((1 - 4000 / 6.371e6) ** 2, rel=1e-5)
+    assert math.isfinite(deep)

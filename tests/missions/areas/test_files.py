@@ -1,0 +1,345 @@
+import json
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyogrio.raw
+import pytest
+import shapely
+from pyproj import Transformer
+from shapely.geometry import LineString, Point, Polygon
+from shapely.geometry.base import BaseGeometry
+
+from alice_survey.config import AreaConfig
+from alice_survey.errors import PlanError
+from missions.areas import safe
+from missions.areas.area import Area
+from missions.areas.files import area_files, read_area_file
+from missions.areas.survey import survey_area
+
+SITE = Polygon(
+    [(700000, 3640000), (700030, 3640000), (700030, 3640020), (700015, 3640010), (700000, 3640020)],
+    [[(700004, 3640003), (700009, 3640003), (700006, 3640008)]],
+)
+"""30 x 20 m with a bay and a hole, UTM zone 36 north."""
+TO_DEGREES = Transformer.from_crs("EPSG:32636", "EPSG:4326", always_xy=True)
+
+
+def in_degrees(geometry: BaseGeometry) -> Any:
+    return shapely.transform(
+        geometry, lambda xy: np.column_stack(TO_DEGREES.transform(xy[:, 0], xy[:, 1]))
+    )
+
+
+def write(
+    path: Path,
+    geometries: Sequence[BaseGeometry],
+    driver: str,
+    crs: str | None = "EPSG:32636",
+    **more: Any,
+) -> Path:
+    """By GDAL itself."""
+    pyogrio.raw.write(
+        path,
+        shapely.to_wkb(np.array(geometries, dtype=object)),
+        [np.arange(len(geometries))],
+        ["number"],
+        geometry_type=more.pop("geometry_type", "Unknown"),
+        crs=crs,
+        driver=driver,
+        **more,
+    )
+    return path
+
+
+def zipped(path: Path, members: dict[str, Path | bytes]) -> Path:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            archive.writestr(name, content if isinstance(content, bytes) else content.read_bytes())
+    return path
+
+
+def shapefile(folder: Path, name: str = "site") -> Path:
+    return write(folder / f"{name}.shp", [SITE], "ESRI Shapefile", geometry_type="Polygon")
+
+
+def area_of(**settings: object) -> Area:
+    return survey_area(AreaConfig.model_validate(settings), turn_margin_m=3.0)
+
+
+def refusal(**settings: object) -> str:
+    with pytest.raises(PlanError) as fault:
+        area_of(**settings)
+    assert "\n" not in str(fault.value)
+    return str(fault.value)
+
+
+@pytest.fixture(scope="module")
+def wanted() -> Area:
+    return area_of(wkt=SITE.wkt, crs="EPSG:32636")
+
+
+def make(kind: str, folder: Path) -> Path:
+    if kind == "geojson":
+        return write(folder / "a.geojson", [in_degrees(SITE)], "GeoJSON", "EPSG:4326",
+                     layer_options={"COORDINATE_PRECISION": "11"})  # fmt: skip
+    if kind == "geojson with crs":
+        return write(folder / "a.json", [SITE], "GeoJSON")
+    if kind == "gpkg":
+        return write(folder / "a.gpkg", [SITE], "GPKG")
+    if kind == "shp":
+        return shapefile(folder)
+    if kind == "shp.zip":
+        site = shapefile(folder)
+        sides = {f"x/{p.name}": p for p in folder.glob("site.*")}
+        return zipped(folder / f"{site.stem}.shp.zip", sides)
+    if kind == "kml":
+        return write(folder / "a.kml", [in_degrees(SITE)], "KML", "EPSG:4326")
+    if kind == "kmz":
+        kml = write(folder / "b.kml", [in_degrees(SITE)], "KML", "EPSG:4326")
+        return zipped(folder / "a.kmz", {"doc.kml": kml, "files/photo.jpg": b"no picture"})
+    file = folder / "a.wkt"
+    file.write_text(f"SRID=32636;{SITE.wkt}\n")
+    return file
+
+
+KINDS = ["geojson", "geojson with crs", "gpkg", "shp", "shp.zip", "kml", "kmz", "wkt"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_kind_of_file_gives_the_same_area(kind: str, tmp_path: Path, wanted: Area) -> None:
+    plain = tmp_path / "plain"
+    plain.mkdir()
+    file = make(kind, plain)
+    # Names that pyogrio would take for a way into an archive.
+    folder = plain.rename(tmp_path / "a!b.zip")
+    for side in folder.glob(f"{file.stem}.*"):
+        side.rename(folder / f"Site of 2021!{side.suffix}")
+    area = area_of(file=folder / f"Site of 2021!{file.suffix}")
+    assert area.datum == wanted.datum
+    assert area.survey.symmetric_difference(wanted.survey).area < 1e-3
+    assert shapely.hausdorff_distance(area.survey, wanted.survey) < 1e-3
+    assert area.no_go.area == pytest.approx(12.5, abs=0.01)
+
+
+def test_the_files_of_an_area_are_known_with_their_side_files(tmp_path: Path) -> None:
+    site = shapefile(tmp_path)
+    other = make("kml", tmp_path)
+    settings = AreaConfig(file=site, no_go_file=other, allowed_file=other)
+    assert {file.name for file in area_files(settings)} == {
+        "site.shp", "site.shx", "site.dbf", "site.prj", "site.cpg", "a.kml"
+    }  # fmt: skip
+    assert len(area_files(settings)) == 6
+    assert area_files(AreaConfig()) == []
+
+
+def test_a_file_without_a_system_is_read_by_crs_or_refused(tmp_path: Path, wanted: Area) -> None:
+    site = shapefile(tmp_path)
+    site.with_suffix(".prj").unlink()
+    assert "set crs, such as EPSG:32636, or 'local'" in refusal(file=site)
+    area = area_of(file=site, crs="EPSG:32636")
+    assert area.survey.symmetric_difference(wanted.survey).area < 1e-3
+    local = shapely.transform(SITE, lambda xy: xy - [700000, 3640000])
+    plain = write(
+        tmp_path / "plain.shp", [local], "ESRI Shapefile", "EPSG:32636", geometry_type="Polygon"
+    )
+    plain.with_suffix(".prj").unlink()
+    assert area_of(file=plain, crs="local").survey.bounds == pytest.approx((0, 0, 20, 30))
+
+
+def test_geojson_in_metres_that_does_not_say_so_needs_crs(tmp_path: Path, wanted: Area) -> None:
+    file = tmp_path / "old.geojson"
+    file.write_text(shapely.to_geojson(SITE))
+    assert "set crs" in refusal(file=file)
+    assert area_of(file=file, crs="EPSG:32636").survey.area == pytest.approx(wanted.survey.area)
+
+
+def test_a_crs_that_the_file_contradicts_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    area_of(file=make("gpkg", tmp_path), crs="EPSG:32637")
+    assert "crs = EPSG:32637 is not used: the file is in WGS 84 / UTM" in capsys.readouterr().err
+
+
+def test_a_wrong_system_lands_far_from_the_datum(tmp_path: Path) -> None:
+    site = shapefile(tmp_path)
+    site.with_suffix(".prj").unlink()
+    told = refusal(file=site, crs="EPSG:32637", latitude_deg=32.88, longitude_deg=35.14)
+    assert "km from the datum (32.88, 35.14)" in told
+    assert "check the corner and its crs" in told
+
+
+def test_layers_are_chosen_by_name(tmp_path: Path, wanted: Area) -> None:
+    file = write(tmp_path / "chart.gpkg", [SITE], "GPKG", layer="reef")
+    write(file, [SITE.buffer(5)], "GPKG", layer="permit", append=True)
+    write(file, [Point(700020, 3640003)], "GPKG", layer="buoys", append=True)
+    assert "shapes in the layers 'permit', 'reef': set layer" in refusal(
+        file=file
+    ) or "shapes in the layers 'reef', 'permit': set layer" in refusal(file=file)
+    assert "no layer 'wreck'; there are" in refusal(file=file, layer="wreck")
+    area = area_of(
+        file=file, layer="reef", allowed_file=file, allowed_layer="permit",
+        no_go_file=file, no_go_layer="buoys", no_go_clearance_m=1.0,
+    )  # fmt: skip
+    assert area.allowed.area > wanted.survey.area
+    # The hole (12.5 m2, 15.6 m round) and the disc about the buoy, each 1 m wider.
+    assert len(area.no_go.geoms) == 2
+    hole, disc = sorted((part.area for part in area.no_go.geoms), reverse=True)
+    assert disc == pytest.approx(np.pi, rel=0.02)
+    assert 12.5 + 15.6 < hole < 12.5 + 15.6 + 8
+    assert "set no_go_layer" in refusal(file=file, layer="reef", no_go_file=file)
+
+
+def test_mixed_shapes_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = LineString([(700020, 3640003), (700060, 3640003)])
+    file = write(tmp_path / "mixed.gpkg", [SITE, line, Point(700000, 3640000)], "GPKG")
+    area = area_of(file=file, corridor_width_m=4.0)
+    told = capsys.readouterr().err
+    assert "it holds 1 polygon and 1 line and 1 point: lines become corridors of 4 m" in told
+    assert "1 point left out" in told
+    assert len(area.survey.geoms) == 1
+    assert area.survey.area == pytest.approx(SITE.union(line.buffer(2, cap_style="flat")).area,
+                                             rel=2e-3)  # fmt: skip
+    buoys = write(tmp_path / "buoys.gpkg", [Point(700000, 3640000)], "GPKG")
+    assert "it holds 1 point only" in refusal(file=buoys)
+
+
+def test_a_ring_that_is_not_closed_is_closed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "open.geojson"
+    ring = [[34.95, 32.82, -7.0], [34.951, 32.82, -7.0], [34.951, 32.821, -7.0]]
+    file.write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
+    area = area_of(file=file)
+    assert capsys.readouterr().err == (
+        "warning: area: open.geojson: feature 1: a ring that is not closed is closed\n"
+    )
+    closed = [(lat, lon) for lon, lat, _ in ring]
+    assert area.survey.area == pytest.approx(area_of(polygon_latlon_deg=closed).survey.area)
+
+
+BOMB = (
+    '<!DOCTYPE kml [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;">]>'
+    '<kml xmlns="http://www.opengis.net/kml/2.2"><Document><name>&b;</name></Document></kml>'
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.kml", BOMB.encode(), "line 1: a KML with a DOCTYPE is not read"),
+        ("a.kml", ('<?xml version="1.0" encoding="UTF-16"?>' + BOMB).encode("utf-16"), "DOCTYPE"),
+        ("a.kml", b"<OGRVRTDataSource/>", "its first element is 'OGRVRTDataSource'"),
+        ("a.kml", b"<kml><Document>", "no KML"),
+        ("a.kml", b'<kml xmlns="http://www.opengis.net/kml/2.2"/>', "cannot be read"),
+        (
+            "a.kml",
+            b'<kml xmlns="http://www.opengis.net/kml/2.2"><Document/></kml>',
+            "it holds no shapes",
+        ),
+        ("a.geojson", b"<OGRVRTDataSource/>", "no JSON, line 1"),
+        ("a.geojson", b'{"type": "Topology"}', "its type is 'Topology'"),
+        ("a.geojson", b'{"type": ["Polygon"]}', "no GeoJSON"),
+        ("a.geojson", b'{"type": "Polygon", "coordinates": [[[NaN, 0]]]}', "it holds NaN"),
+        ("a.geojson", b"[" * 100_000, "no JSON that can be read"),
+        ("a.geojson", b"\xff\xfe\xfd", "no JSON"),
+        ("a.geojson", b'{"type": "FeatureCollection", "features": []}', "it holds no shapes"),
+        ("a.gpkg", b"<OGRVRTDataSource/>", "no GeoPackage"),
+        ("a.gpkg", b"SQLite format 3\x00 and then nothing", "cannot be read"),
+        ("a.shp", b"<OGRVRTDataSource/>", "no shapefile"),
+        ("a.shp", b"\x00\x00\x27\x0a" + bytes(96), "cannot be read"),
+        ("a.zip", b"PK no", "no zip archive"),
+        ("a.kmz", b"", "it is empty"),
+        ("a.wkt", b"\xff", "it is no text"),
+        ("a.wkt", b"POLYGON (0 0", "no well-known text"),
+        ("a.dxf", b"0", "'.dxf' is no kind of file that is read"),
+    ],
+)
+def test_files_that_are_not_what_they_say_are_refused(
+    name: str, content: bytes, words: str, tmp_path: Path
+) -> None:
+    file = tmp_path / name
+    file.write_bytes(content)
+    assert words in refusal(file=file)
+
+
+def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:
+    assert "no such file" in refusal(file=tmp_path / "none.kml")
+    (tmp_path / "folder.shp").mkdir()
+    assert "it is no file" in refusal(file=tmp_path / "folder.shp")
+    assert "no such file" in refusal(file=Path("/vsicurl/http:/localhost/a.geojson"))
+
+
+def test_names_in_an_archive_lead_nowhere(tmp_path: Path, wanted: Area) -> None:
+    site = shapefile(tmp_path)
+    members: dict[str, Path | bytes] = {f"../../{p.name}": p for p in tmp_path.glob("site.*")}
+    inner = tmp_path / "deep" / "er"
+    inner.mkdir(parents=True)
+    file = zipped(inner / "out.shp.zip", members)
+    site.unlink()
+    before = sorted(tmp_path.rglob("*"))
+    assert area_of(file=file).survey.area == pytest.approx(wanted.survey.area, abs=1e-6)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_archives_that_swell_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kml = make("kml", tmp_path)
+    bomb = zipped(tmp_path / "bomb.kmz", {"doc.kml": kml, "padding.bin": bytes(3_000_000)})
+    assert bomb.stat().st_size < 20_000
+    monkeypatch.setattr(safe, "LARGEST_BYTES", 1_000_000)
+    assert "2 files of 3 MB in it; at most" in refusal(file=bomb)
+    many = zipped(tmp_path / "many.kmz", {f"{i}.txt": b"" for i in range(1001)})
+    assert "1001 files" in refusal(file=many)
+    monkeypatch.setattr(safe, "LARGEST_BYTES", 10)
+    assert "at most 0 MB" in refusal(file=kml)
+
+
+def test_archives_without_the_one_file_are_refused(tmp_path: Path) -> None:
+    kml = make("kml", tmp_path)
+    assert "0 KML files" in refusal(file=zipped(tmp_path / "a.kmz", {"a.txt": b"x"}))
+    two = zipped(tmp_path / "b.kmz", {"a.kml": kml, "b.kml": kml})
+    assert "2 KML files" in refusal(file=two)
+    assert "no .shp in it" in refusal(file=zipped(tmp_path / "c.zip", {"a.kml": kml}))
+    site = shapefile(tmp_path)
+    same = zipped(tmp_path / "d.zip", {"a/site.shp": site, "b/site.shp": site})
+    assert "two shapefiles in it have one name" in refusal(file=same)
+    one = zipped(tmp_path / "e.kmz", {"doc.kml": kml})
+    broken = bytearray(one.read_bytes())
+    broken[60:80] = bytes(20)
+    one.write_bytes(broken)
+    assert "'doc.kml' in it is broken" in refusal(file=one)
+
+
+def test_several_shapefiles_in_a_zip_are_layers(tmp_path: Path, wanted: Area) -> None:
+    shapefile(tmp_path, "reef")
+    shapefile(tmp_path, "other")
+    members: dict[str, Path | bytes] = {
+        p.name: p for name in ("reef", "other") for p in tmp_path.glob(f"{name}.*")
+    }
+    file = zipped(tmp_path / "both.zip", members)
+    assert "shapes in the layers 'other', 'reef'" in refusal(file=file)
+    area = area_of(file=file, layer="reef")
+    assert area.survey.area == pytest.approx(wanted.survey.area, abs=1e-6)
+
+
+def test_too_many_corners_are_refused(tmp_path: Path) -> None:
+    angle = np.linspace(0, 2 * np.pi, 200_002)
+    ring = Polygon(np.column_stack([50 * np.cos(angle), 50 * np.sin(angle)]))
+    file = tmp_path / "coast.wkt"
+    file.write_text(ring.wkt)
+    assert "corners; at most 200000" in refusal(file=file)
+
+
+def test_reading_gives_degrees_whatever_the_file(tmp_path: Path) -> None:
+    shapes = read_area_file(make("gpkg", tmp_path), None, None)
+    assert shapes.geographic
+    expected = shapely.get_coordinates(in_degrees(SITE))[:, ::-1]
+    np.testing.assert_allclose(shapes.coordinates, expected, atol=1e-9)
+
+
+def test_wkt_whose_srid_contradicts_crs_is_refused() -> None:
+    assert "SRID=4326 and crs is EPSG:32636" in refusal(
+        wkt="SRID=4326;POLYGON ((0 0, 1 0, 1 1, 0 0))", crs="EPSG:32636"
+    )

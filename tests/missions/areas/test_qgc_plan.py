@@ -1,0 +1,142 @@
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import shapely
+
+from alice_survey.config import AreaConfig
+from alice_survey.errors import PlanError
+from missions.areas.area import Area
+from missions.areas.survey import survey_area
+
+POLYGON = [[32.82, 34.95], [32.821, 34.95], [32.821, 34.951], [32.82, 34.951]]
+
+
+def plan_of(**fence: Any) -> dict[str, Any]:
+    return {
+        "fileType": "Plan",
+        "version": 1,
+        "groundStation": "QGroundControl",
+        "geoFence": {"version": 2, "polygons": [], "circles": [], **fence},
+        "mission": {
+            "version": 2,
+            "items": [
+                {"type": "SimpleItem", "command": 22, "params": [0, 0, 0, None, 0, 0, 0]},
+                {"type": "ComplexItem", "complexItemType": "survey", "polygon": POLYGON},
+            ],
+        },
+    }
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Any:
+    def to_file(data: Any) -> Path:
+        path = tmp_path / "site.plan"
+        path.write_text(json.dumps(data))
+        return path
+
+    return to_file
+
+
+def area_of(**settings: object) -> Area:
+    return survey_area(AreaConfig.model_validate(settings), turn_margin_m=3.0)
+
+
+def test_the_polygon_of_a_survey_item_is_the_area(write: Any) -> None:
+    direct = area_of(polygon_latlon_deg=POLYGON)
+    assert area_of(file=write(plan_of())).survey.equals(direct.survey)
+
+
+def test_corridor_and_structure_items(write: Any) -> None:
+    plan = plan_of()
+    plan["mission"]["items"] = [
+        {
+            "type": "ComplexItem",
+            "complexItemType": "CorridorScan",
+            "CorridorWidth": 8,
+            "polyline": [[32.82, 34.95], [32.821, 34.95]],
+        }
+    ]
+    corridor = area_of(file=write(plan), corridor_width_m=3.0)
+    length_m = 110.9  # of a thousandth of a degree of latitude at 33 degrees
+    assert corridor.survey.area == pytest.approx(8 * length_m, rel=1e-3)
+    plan["mission"]["items"] = [
+        {"type": "ComplexItem", "complexItemType": "StructureScan", "polygon": POLYGON}
+    ]
+    structure = area_of(file=write(plan))
+    assert structure.survey.equals(area_of(polygon_latlon_deg=POLYGON).survey)
+
+
+def test_fences_keep_out_and_in(write: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    fence_in = [[32.8195, 34.9495], [32.8215, 34.9495], [32.8215, 34.9515], [32.8195, 34.9515]]
+    path = write(
+        plan_of(
+            polygons=[{"inclusion": True, "polygon": fence_in, "version": 1}],
+            circles=[
+                {
+                    "inclusion": False,
+                    "circle": {"center": [32.8205, 34.9505], "radius": 10.0},
+                    "version": 1,
+                }
+            ],
+        )
+    )
+    whole = area_of(polygon_latlon_deg=POLYGON)
+    area = area_of(file=path)
+    assert "set allowed_file to the file" in capsys.readouterr().err
+    # A polygon of 64 corners around the circle: no place in it is left to the vehicle.
+    circle_m2 = 64 * math.tan(math.pi / 64) * 10.0**2
+    assert area.no_go.area == pytest.approx(circle_m2, rel=1e-4)
+    assert area.survey.area == pytest.approx(whole.survey.area - circle_m2, rel=1e-6)
+    assert area.no_go.buffer(1e-4).contains(shapely.Point(0, 0).buffer(10.0, 128))
+    inside = area_of(file=path, allowed_file=path)
+    assert capsys.readouterr().err == ""
+    assert inside.allowed.area == pytest.approx(4 * whole.survey.area - circle_m2, rel=1e-3)
+    kept_out = area_of(polygon_latlon_deg=POLYGON, no_go_file=path)
+    assert kept_out.survey.area == pytest.approx(area.survey.area, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"fileType": "Rally"}, "its fileType is not 'Plan'"),
+        ({"mission": {"items": []}}, "no shapes in its layer 'mission'"),
+        ({"mission": {"items": 3}}, "mission.items is not as QGroundControl writes it"),
+        (
+            {"mission": {"items": [{"complexItemType": "survey", "polygon": [[1]]}]}},
+            "item 1 (survey) is not as QGroundControl writes it",
+        ),
+        (
+            {"mission": {"items": [{"complexItemType": "survey", "polygon": [[135, 1]] * 3}]}},
+            "item 1 (survey), corner 1 is at latitude 135",
+        ),
+        (
+            {
+                "mission": {
+                    "items": [
+                        {"complexItemType": "CorridorScan", "polyline": POLYGON, "CorridorWidth": 0}
+                    ]
+                }
+            },
+            "CorridorWidth is 0; it must be above 0",
+        ),
+        ({"geoFence": {"polygons": [{"polygon": POLYGON}]}}, "geoFence.polygons 1 is not"),
+    ],
+)
+def test_a_plan_that_cannot_be_is_refused(write: Any, change: dict[str, Any], words: str) -> None:
+    with pytest.raises(PlanError) as fault:
+        area_of(file=write({**plan_of(), **change}))
+    assert words in str(fault.value)
+    assert "\n" not in str(fault.value)
+
+
+def test_another_layer_can_be_asked_for(write: Any) -> None:
+    fence = {"inclusion": True, "polygon": POLYGON, "version": 1}
+    path = write({**plan_of(polygons=[fence]), "mission": {"items": []}})
+    assert area_of(file=path, layer="inclusion").survey.area > 1000
+    with pytest.raises(PlanError, match="there are some in inclusion"):
+        area_of(file=path)
+    with pytest.raises(PlanError, match="not 'fence'"):
+        area_of(file=path, layer="fence")
