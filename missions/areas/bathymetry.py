@@ -100,9 +100,7 @@ class Bathymetry:
         down = np.full((len(points_ne), 1), self._middle_depth_m)
         geodetic = self.datum.geodetic_from_ned(np.hstack([points_ne, down]))
         x, y = self._transformer.transform(geodetic[:, 1], geodetic[:, 0])
-        a, b, c, d, e, f = self.from_pixel
-        x, y, size = np.asarray(x) - c, np.asarray(y) - f, a * e - b * d
-        return np.column_stack([(e * x - b * y) / size, (a * y - d * x) / size])
+        return _pixels(self.from_pixel, np.asarray(x), np.asarray(y))
 
     def _ne_from_pixel(self, pixel: Array) -> Array:
         a, b, c, d, e, f = self.from_pixel
@@ -224,6 +222,13 @@ def read_bathymetry(
     )
 
 
+def _pixels(from_pixel: tuple[float, ...], x: Array, y: Array) -> Array:
+    """(N, 2) column and row of places in the raster's own coordinates."""
+    a, b, c, d, e, f = from_pixel
+    right, up, size = x - c, y - f, a * e - b * d
+    return np.column_stack([(e * right - b * up) / size, (a * up - d * right) / size])
+
+
 def _transformer(crs: str) -> Any:
     from pyproj import Transformer
 
@@ -285,7 +290,8 @@ def _window(
         ])  # fmt: skip
         geodetic = datum.geodetic_from_ned(np.hstack([edge, np.zeros((len(edge), 1))]))
         x, y = _transformer(crs).transform(geodetic[:, 1], geodetic[:, 0])
-        columns, rows = ~file.transform * (np.asarray(x), np.asarray(y))
+        pixels = _pixels(tuple(file.transform)[:6], np.asarray(x), np.asarray(y))
+        columns, rows = pixels.T
         if not (np.all(np.isfinite(columns)) and np.all(np.isfinite(rows))):
             raise PlanError(f"{path}: its coordinate system does not reach the survey area")
         first_c = max(math.floor(columns.min()) - _PAD_CELLS, 0)

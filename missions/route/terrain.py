@@ -196,8 +196,9 @@ def depth_profile(
         north, east = points_ne[unknown[0]]
         raise PlanError(
             f"{bathymetry.name} does not know the sea floor near {name}, "
-            f"{along_m[unknown[0]]:.1f} m along ({north:.1f} m north, {east:.1f} m east; {len(unknown)} of {len(highest)} "
-            "places): survey less, or give a bathymetry without gaps"
+            f"{along_m[unknown[0]]:.1f} m along ({north:.1f} m north, {east:.1f} m east; "
+            f"{len(unknown)} of {len(highest)} places): survey less, or give a bathymetry without "
+            "gaps"
         )
     depth = envelope(along_m, highest - limits.altitude_m, math.tan(limits.steepest_rad))
     dry = np.flatnonzero(depth <= 0.0)

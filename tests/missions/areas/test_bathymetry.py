@@ -1,0 +1,287 @@
+"""Rasters of depth: signs, coordinate systems, windows, and what lies between cells."""
+
+import itertools
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+import shapely
+from pyproj import Transformer
+from rasterio.transform import Affine, from_origin
+
+from alice_survey.errors import PlanError
+from alice_survey.frames import Array, Datum
+from missions.areas import bathymetry as module
+from missions.areas.bathymetry import Bathymetry, area_depth, read_bathymetry
+from tests.oracles_energy import bilinear
+
+DATUM = Datum(32.8236, 34.9553)
+UTM = "EPSG:32636"
+
+
+def _written(
+    path: Path,
+    values: Array,
+    *,
+    crs: str | None = UTM,
+    cell_m: float = 2.0,
+    description: str | None = None,
+    transform: Affine | None = None,
+    nodata: float | None = None,
+    tags: dict[str, str] | None = None,
+) -> Path:
+    """A GeoTIFF whose first cell's outer corner is 20 m north-west of the datum."""
+    x, y = Transformer.from_crs("EPSG:4326", UTM, always_xy=True).transform(34.9553, 32.8236)
+    with rasterio.open(
+        path, "w", driver="GTiff", height=values.shape[0], width=values.shape[1], count=1,
+        dtype="float64", crs=crs, nodata=nodata,
+        transform=transform or from_origin(x - 20.0, y + 20.0, cell_m, cell_m),
+    ) as file:  # fmt: skip
+        file.write(values, 1)
+        if description:
+            file.set_band_description(1, description)
+        if tags:
+            file.update_tags(1, **tags)
+    return path
+
+
+def _xy(t: Affine, column: Array, row: Array) -> tuple[Array, Array]:
+    return t.a * column + t.b * row + t.c, t.d * column + t.e * row + t.f
+
+
+def _plane(rows: int = 20, columns: int = 24) -> Array:
+    row, column = np.mgrid[0:rows, 0:columns]
+    return 15.0 + 0.05 * column + 0.03 * row
+
+
+def test_heights_and_depths_are_told_apart_and_read_alike(tmp_path: Path) -> None:
+    depths = _plane()
+    by_depth = read_bathymetry(_written(tmp_path / "d.tif", depths), DATUM)
+    by_height = read_bathymetry(_written(tmp_path / "h.tif", -depths), DATUM)
+    points = np.random.default_rng(1).uniform(-15, 15, (50, 2))
+
+    assert by_depth.reading.startswith("depths, since 0%")
+    assert by_height.reading.startswith("heights, since 100%")
+    np.testing.assert_array_equal(by_depth.depth_at(points), by_height.depth_at(points))
+    assert np.all(by_depth.depth_at(points) > 14)
+
+
+@pytest.mark.parametrize(
+    ("options", "reading"),
+    [
+        ({"description": "Elevation"}, "heights, by its band's name"),
+        ({"description": "depth below MSL"}, "depths, by its band's name"),
+        ({"tags": {"positive": "up"}}, "heights, by its tag"),
+        ({"tags": {"z#positive": "down"}}, "depths, by its tag"),
+    ],
+)
+def test_metadata_goes_before_the_sign(
+    tmp_path: Path, options: dict[str, object], reading: str
+) -> None:
+    mixed = _plane() - 15.5  # some negative, some positive: a shore
+
+    found = read_bathymetry(_written(tmp_path / "m.tif", mixed, **options), DATUM)  # type: ignore[arg-type]
+
+    assert found.reading.startswith(reading)
+    sign = -1.0 if "heights" in reading else 1.0
+    np.testing.assert_allclose(found.depth_m, sign * mixed)
+
+
+def test_a_shore_without_a_word_on_its_sign_is_asked_about(tmp_path: Path) -> None:
+    path = _written(tmp_path / "m.tif", _plane() - 15.5)
+    with pytest.raises(PlanError, match=r"of its values are negative.*area\.bathymetry_values"):
+        read_bathymetry(path, DATUM)
+    depths = read_bathymetry(path, DATUM, sense="depths").depth_m
+    np.testing.assert_array_equal(read_bathymetry(path, DATUM, sense="heights").depth_m, -depths)
+
+
+def test_a_sea_floor_above_water_is_warned_of(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    read_bathymetry(_written(tmp_path / "m.tif", _plane(), description="elevation"), DATUM)
+    assert "100%) is above water" in capsys.readouterr().err
+
+
+def test_depth_is_bilinear_between_centres_of_cells(tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    values = rng.uniform(10, 20, (12, 17))
+    values[5, 6] = -9999.0
+    found = read_bathymetry(_written(tmp_path / "r.tif", values, nodata=-9999.0), DATUM)
+    values[5, 6] = np.nan
+    points = rng.uniform(-30, 30, (400, 2))
+    lon_lat = DATUM.geodetic_from_ned(np.column_stack([points, np.full(400, 15.0)]))
+    x, y = Transformer.from_crs("EPSG:4326", UTM, always_xy=True).transform(
+        lon_lat[:, 1], lon_lat[:, 0]
+    )
+    a, _, c, _, e, f = found.from_pixel
+
+    depth = found.depth_at(points)
+
+    expected = [
+        bilinear(values, (px - c) / a - 0.5, (py - f) / e - 0.5)
+        for px, py in zip(x, y, strict=True)
+    ]
+    np.testing.assert_allclose(depth, expected, atol=1e-5)
+    assert 0.1 < np.isnan(depth).mean() < 0.9
+
+
+def test_next_to_a_gap_nothing_is_known_and_on_a_centre_beside_it_all(tmp_path: Path) -> None:
+    values = _plane()
+    values[7, 8] = np.nan
+    found = read_bathymetry(_written(tmp_path / "g.tif", values), DATUM)
+
+    def at(column: float, row: float) -> float:
+        ne = found._ne_from_pixel(np.array([[column + 0.5, row + 0.5]]))
+        return float(found.depth_at(ne)[0])
+
+    assert math.isnan(at(7.5, 7.0))
+    assert math.isnan(at(8.0, 7.9))
+    assert at(7.0, 7.0) == pytest.approx(values[7, 7], abs=1e-5)
+    assert math.isnan(at(-0.1, 3.0))
+    assert at(0.0, 3.0) == pytest.approx(values[3, 0], abs=1e-5)
+    assert at(23.0, 19.0) == pytest.approx(values[19, 23], abs=1e-5)
+
+
+@pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:3857", "EPSG:32635", "EPSG:2039"])
+def test_any_coordinate_system_gives_the_same_floor(tmp_path: Path, crs: str) -> None:
+    """A plane of latitude and longitude, written in other systems on their own grids."""
+    to_crs = Transformer.from_crs("EPSG:4326", crs, always_xy=True)
+    x0, y0 = to_crs.transform(34.9553, 32.8236)
+    x1, y1 = to_crs.transform(34.9554, 32.8237)
+    cell = max(abs(x1 - x0), abs(y1 - y0)) / 8
+    transform = from_origin(x0 - 25 * cell, y0 + 25 * cell, cell, cell)
+    column, row = np.meshgrid(np.arange(50) + 0.5, np.arange(50) + 0.5)
+    x, y = _xy(transform, column, row)
+    lon, lat = to_crs.transform(x, y, direction="INVERSE")
+    values = 20 + 3e3 * (np.asarray(lon) - 34.9553) - 2e3 * (np.asarray(lat) - 32.8236)
+    found = read_bathymetry(
+        _written(tmp_path / "p.tif", values, crs=crs, transform=transform), DATUM
+    )
+    points = np.random.default_rng(3).uniform(-15, 15, (100, 2))
+    geodetic = DATUM.geodetic_from_ned(np.column_stack([points, np.full(100, 20.0)]))
+
+    depth = found.depth_at(points)
+
+    expected = 20 + 3e3 * (geodetic[:, 1] - 34.9553) - 2e3 * (geodetic[:, 0] - 32.8236)
+    np.testing.assert_allclose(depth, expected, atol=1e-5)
+    assert 0.5 < found.cell_m < 3.0
+
+
+def test_a_raster_turned_on_its_side_reads_alike(tmp_path: Path) -> None:
+    x, y = Transformer.from_crs("EPSG:4326", UTM, always_xy=True).transform(34.9553, 32.8236)
+    cos, sin = 1.5 * math.cos(math.radians(30)), 1.5 * math.sin(math.radians(30))
+    turned = Affine(cos, sin, x - 20 * (cos + sin), sin, -cos, y - 20 * (sin - cos))
+    column, row = np.meshgrid(np.arange(40) + 0.5, np.arange(40) + 0.5)
+    east, north = _xy(turned, column, row)
+    values = 12 + 0.1 * (np.asarray(east) - x) + 0.04 * (np.asarray(north) - y)
+    found = read_bathymetry(_written(tmp_path / "t.tif", values, transform=turned), DATUM)
+    points = np.random.default_rng(4).uniform(-12, 12, (60, 2))
+    geodetic = DATUM.geodetic_from_ned(np.column_stack([points, np.full(60, 12.0)]))
+    px, py = Transformer.from_crs("EPSG:4326", UTM, always_xy=True).transform(
+        geodetic[:, 1], geodetic[:, 0]
+    )
+
+    np.testing.assert_allclose(
+        found.depth_at(points), 12 + 0.1 * (px - x) + 0.04 * (py - y), atol=1e-6
+    )
+
+
+def test_only_the_window_is_read_and_says_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = np.random.default_rng(5).uniform(10, 20, (400, 500))
+    path = _written(tmp_path / "w.tif", values)
+    bounds = (-60.0, 30.0, -40.0, 70.0)
+    points = np.random.default_rng(6).uniform([-60, 30], [-40, 70], (200, 2))
+
+    window = read_bathymetry(path, DATUM, bounds_ne=bounds)
+
+    whole = read_bathymetry(path, DATUM)
+    np.testing.assert_allclose(window.depth_at(points), whole.depth_at(points), atol=1e-5)
+    assert np.all(np.isfinite(window.depth_at(points)))
+    assert 20 * 10 < window.depth_m.size < 40 * 30
+    monkeypatch.setattr(module, "_MOST_CELLS", 10_000)
+    assert read_bathymetry(path, DATUM, bounds_ne=bounds).depth_m.shape == window.depth_m.shape
+    with pytest.raises(PlanError, match=r"500 x 400 cells are needed, more than 10,000"):
+        read_bathymetry(path, DATUM)
+
+
+def test_faults_say_what_to_change(tmp_path: Path) -> None:
+    path = _written(tmp_path / "f.tif", _plane())
+    with pytest.raises(PlanError, match="does not reach the survey area"):
+        read_bathymetry(path, DATUM, bounds_ne=(500.0, 500.0, 600.0, 600.0))
+    with pytest.raises(PlanError, match="cannot be read as a raster"):
+        read_bathymetry(tmp_path / "missing.tif", DATUM)
+    with pytest.raises(PlanError, match="is not known"):
+        read_bathymetry(path, DATUM, crs="EPSG:999999")
+    with pytest.raises(PlanError, match="no cell there has a value"):
+        read_bathymetry(_written(tmp_path / "e.tif", np.full((5, 5), np.nan)), DATUM)
+    nameless = _written(tmp_path / "n.tif", _plane(), crs=None)
+    with pytest.raises(PlanError, match=r"names no coordinate system.*area\.bathymetry_crs"):
+        read_bathymetry(nameless, DATUM)
+    named = read_bathymetry(nameless, DATUM, crs=UTM)
+    np.testing.assert_array_equal(named.depth_m, _plane())
+
+
+def test_the_vertical_datum_is_named(tmp_path: Path) -> None:
+    flat = read_bathymetry(_written(tmp_path / "f.tif", _plane()), DATUM)
+    high = read_bathymetry(_written(tmp_path / "v.tif", _plane(), crs=UTM + "+5714"), DATUM)
+    assert flat.vertical_datum == "not named"
+    assert high.vertical_datum == "MSL height"
+
+
+def test_depth_over_an_area_is_the_mean_of_what_is_known(tmp_path: Path) -> None:
+    found = read_bathymetry(_written(tmp_path / "a.tif", _plane()), DATUM)
+    square = shapely.MultiPolygon([shapely.box(-10, -10, 10, 10)])
+    wide = shapely.MultiPolygon([shapely.box(-10, -10, 10, 60)])
+
+    inside, over = area_depth(found, square), area_depth(found, wide)
+
+    middle = float(found.depth_at(np.array([[0.0, 0.0]]))[0])
+    assert inside.mean_m == pytest.approx(middle, abs=0.01)
+    corners = found.depth_at(np.array(list(itertools.product((-10.0, 10.0), repeat=2))))
+    assert corners.min() - 1e-9 <= inside.shallowest_m < inside.mean_m < inside.deepest_m
+    assert inside.deepest_m <= corners.max() + 1e-9
+    assert inside.known == 1.0
+    assert 0.4 < over.known < 0.6  # the raster reaches 27 m east of the datum
+    with pytest.raises(PlanError, match="knows no depth within the survey area"):
+        area_depth(found, shapely.MultiPolygon([shapely.box(100, 100, 110, 110)]))
+
+
+@pytest.fixture(scope="module")
+def real(shared_data: Path) -> tuple[Path, Datum]:
+    """A real BAG and a place within it."""
+    path = next((shared_data / "bathymetry").glob("*.bag"))
+    lon, lat = Transformer.from_crs("EPSG:32602", "EPSG:4326", always_xy=True).transform(
+        621_500.0, 7_244_800.0
+    )
+    return path, Datum(lat, lon)
+
+
+def test_a_real_grid_reads_as_its_notes_say(real: tuple[Path, Datum]) -> None:
+    """1478 x 1707 cells of 2 m, 1,157,306 valid, -52.96 to -50.99 m."""
+    path, datum = real
+    whole = read_bathymetry(path, datum)
+    assert whole.depth_m.shape == (1478, 1707)
+    assert len(whole.known_m) == 1_157_306
+    assert whole.known_m.min() == pytest.approx(50.99, abs=0.005)
+    assert whole.known_m.max() == pytest.approx(52.96, abs=0.005)
+    assert whole.vertical_datum == "Mean Sea Level"
+    assert whole.cell_m == pytest.approx(2.0, abs=0.002)
+    assert "BAG" in whole.reading
+
+
+def test_a_window_of_a_real_grid_equals_gdals_own_samples(real: tuple[Path, Datum]) -> None:
+    path, datum = real
+    window: Bathymetry = read_bathymetry(path, datum, bounds_ne=(-150.0, -150.0, 150.0, 150.0))
+    centres = window._ne_from_pixel(np.array([[20.5, 30.5], [70.5, 11.5], [50.5, 50.5]]))
+    geodetic = datum.geodetic_from_ned(np.column_stack([centres, np.full(3, 51.7)]))
+    x, y = Transformer.from_crs("EPSG:4326", "EPSG:32602", always_xy=True).transform(
+        geodetic[:, 1], geodetic[:, 0]
+    )
+    with rasterio.open(path) as file:
+        heights = [float(value[0]) for value in file.sample(zip(x, y, strict=True))]
+    np.testing.assert_allclose(window.depth_at(centres), -np.array(heights), atol=1e-5)
+    assert window.depth_m.size < 180 * 180
