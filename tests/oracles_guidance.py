@@ -126,6 +126,72 @@ def follow_demand(
     return np.array([ahead, sideways, yaw]), cross
 
 
+def trapezoid(goal: float, most: float, acceleration: float, time_s: float) -> tuple[float, float]:
+    """Place and speed of a thing that goes from rest to rest as fast as it may, in closed form."""
+    top = min(most, math.sqrt(goal * acceleration))
+    gaining_s = top / acceleration
+    total_s = goal / top + gaining_s
+    if time_s <= 0.0:
+        return 0.0, 0.0
+    if time_s < gaining_s:
+        return acceleration * time_s**2 / 2, acceleration * time_s
+    if time_s < total_s - gaining_s:
+        return top * (time_s - gaining_s / 2), top
+    if time_s < total_s:
+        left_s = total_s - time_s
+        return goal - acceleration * left_s**2 / 2, acceleration * left_s
+    return goal, 0.0
+
+
+def standing_demand(
+    estimate: Array,
+    guidance: Guidance,
+    gains: Gains,
+    speed_mps: float,
+    place: Array,
+    velocity: Array,
+    acceleration: Array,
+    turning: Array,
+) -> Array:
+    """Accelerations of surge, sway and yaw that follow a moving place and a turning heading.
+
+    Args:
+        estimate: (14,) of the navigation.
+        guidance: settings, with sway.
+        gains: of the inner loops.
+        speed_mps: of the path.
+        place: (2,) wanted of the followed point, north and east.
+        velocity: (2,) of the place.
+        acceleration: (2,) of the place.
+        turning: (3,) wanted heading, its rate, and the rate of that.
+
+    Returns:
+        (3,)
+    """
+    point, (surge, sway) = point_motion(estimate, guidance)
+    heading, roll, pitch = (estimate[i] for i in (signals.HEADING, signals.ROLL, signals.PITCH))
+    q, r = estimate[signals.Q], estimate[signals.R]
+    turn = (math.sin(roll) * q + math.cos(roll) * r) / math.cos(pitch)
+    hull = np.array([
+        [math.cos(heading), math.sin(heading)], [-math.sin(heading), math.cos(heading)]
+    ])  # fmt: skip
+    off, feed, quicken = hull @ (place - point[:2]), hull @ velocity, hull @ acceleration
+    angle = math.remainder(turning[0] - heading, 2 * math.pi)
+
+    def pid(axis: int, error: float, rate: float, wanted: float, most: float) -> float:
+        row = gains.axes[axis]
+        inner = row[g.INNER]
+        asked = wanted + np.clip(row[g.PLACE] / inner * error, -most, most)
+        asked += (row[g.RATE] / inner - 1.0) * (wanted - rate)
+        return float(inner * (asked - rate))
+
+    yaw = turning[2] + pid(g.YAW, angle, turn, turning[1], gains.axes[g.YAW, g.FASTEST])
+    ahead = quicken[0] + pid(g.SURGE, off[0], surge, feed[0], speed_mps)
+    aside = quicken[1] + pid(g.SWAY, off[1], sway, feed[1], gains.axes[g.SWAY, g.FASTEST])
+    lever = guidance.point_body_m
+    return np.array([ahead + lever[1] * yaw, aside - lever[0] * yaw, yaw])
+
+
 TICK_S = 0.05
 PLUS_MINUS = np.array([-1.0, 1.0])
 

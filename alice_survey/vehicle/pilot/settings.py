@@ -133,8 +133,8 @@ def pilot_guidance(
     steps = int(np.count_nonzero(path.side_rad))
     if steps and not by_sway:
         raise VehicleError(
-            f"the route has {steps} sway steps, which the controller los cannot fly: plan with "
-            "turns = 'spot' or 'arcs', or fly alice with the controller sway"
+            f"the route has {steps} sway step{'s' if steps > 1 else ''}, which the controller los "
+            "cannot fly: plan with turns = 'spot' or 'arcs', or fly alice with the controller sway"
         )
     if look_ahead_m is None:
         found = damped_look_ahead_m(gains, speed, point_body_m[0])

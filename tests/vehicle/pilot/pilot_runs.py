@@ -1,6 +1,7 @@
 """A small closed loop for the pilot: true state, exact wrench with its lag, full dynamics."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Literal
@@ -186,6 +187,28 @@ def lawnmower(lines: int, length_m: float, speed_mps: float = 0.2, run_m: float 
             heading += way * math.pi
     start, headings, length, curvature, line = zip(*legs, strict=True)
     return path_from_legs(start, headings, length, curvature, line, 2.0, speed_mps)
+
+
+Move = tuple[str, float] | tuple[str, float, int]
+
+
+def with_stops(moves: Sequence[Move], heading_rad: float = 0.0, speed_mps: float = 0.2) -> Path:
+    """A path of moves: ("go", m) with a line's index if it is one, ("spot", rad), ("step", m)."""
+    place, heading = np.zeros(2), heading_rad
+    rows = []
+    for kind, amount, *line in moves:
+        turn = amount if kind == "spot" else 0.0
+        side = -math.copysign(math.pi / 2, amount) if kind == "step" else 0.0
+        length = 0.0 if kind == "spot" else abs(amount)
+        rows.append(
+            (tuple(place), heading - side, length, 0.0, line[0] if line else -1, turn, side)
+        )
+        place = place + length * np.array([math.cos(heading - side), math.sin(heading - side)])
+        heading += turn
+    start, headings, lengths, curvature, lines, turns, sides = zip(*rows, strict=True)
+    return path_from_legs(
+        start, headings, lengths, curvature, lines, 2.0, speed_mps, turns, sides
+    )  # fmt: skip
 
 
 def launch(

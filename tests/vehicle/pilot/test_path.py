@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from alice_survey.errors import VehicleError
 from alice_survey.vehicle.pilot.path import Path, advance, heading_at, path_from_legs, place_at
 from tests import oracles_guidance as oracle
-from tests.vehicle.pilot.pilot_runs import lawnmower
+from tests.vehicle.pilot.pilot_runs import lawnmower, with_stops
 
 MOWER = lawnmower(4, 5.0)
 
@@ -133,6 +133,62 @@ def test_headings_of_legs_are_continuous_however_they_are_wrapped() -> None:
         0.2,
     )
     np.testing.assert_allclose(np.diff(wrapped.heading_rad), np.diff(MOWER.heading_rad), atol=1e-9)
+
+
+STOPS = with_stops([
+    ("go", 3.0, 0), ("spot", math.pi / 2), ("go", 1.0), ("step", 2.0), ("step", -1.0),
+    ("spot", -2.0), ("go", 3.0, 1),
+])  # fmt: skip
+
+
+def test_the_heading_goes_on_through_stops_though_the_course_kinks() -> None:
+    course = STOPS.heading_rad + STOPS.curvature_per_m * STOPS.length_m + STOPS.turn_rad
+    heading = STOPS.heading_rad + STOPS.side_rad
+    np.testing.assert_allclose(heading[1:], (course + STOPS.side_rad)[:-1], atol=1e-12)
+    assert STOPS.stop.tolist() == [1, 1, 1, 1, 1, 1, 0]
+    # A step to starboard is flown with the course to the right of the heading.
+    assert STOPS.side_rad[3] == pytest.approx(-math.pi / 2)
+    ends, _ = zip(*(oracle.walked(STOPS, i, STOPS.length_m[i]) for i in range(6)), strict=True)
+    starts = np.stack([STOPS.start_n, STOPS.start_e], axis=1)[1:]
+    np.testing.assert_allclose(ends, starts, atol=1e-9)
+
+
+def test_a_path_without_stops_has_none() -> None:
+    assert not MOWER.stop.any()
+    assert not MOWER.turn_rad.any()
+    assert not MOWER.side_rad.any()
+
+
+def test_progress_does_not_pass_a_stop_and_headings_do_not_look_beyond() -> None:
+    leg, along, over = 0, 2.9, False
+    for _ in range(50):
+        leg, along, over = advance(STOPS, leg, along, 9.0, 0.0, 0.05)
+    assert (leg, along, over) == (0, 3.0, False)
+    assert heading_at(STOPS, 0, 3.7) == (0.0, 0.0)
+    assert heading_at(STOPS, 2, -0.4) == (pytest.approx(math.pi / 2), 0.0)
+    assert heading_at(STOPS, 2, 1.4) == (pytest.approx(math.pi / 2), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"turn_rad": [0.0, 1.0, 0.0]}, "goes 1 m: a turn on the spot has no length"),
+        ({"side_rad": [0.0, 1.0, 0.0]}, "57.3 deg off its course"),
+        ({"side_rad": [0.0, math.pi / 2, 0.0]}, r" 90\.00 deg off the end of leg 0"),
+        ({"length_m": [5.0, 0.0, 5.0]}, "least 0 m"),
+        ({"turn_rad": [0.0, 1.0]}, "not equally long"),
+        ({"side_rad": [0.0, math.nan, 0.0]}, "no finite number"),
+    ],
+)
+def test_stops_that_make_no_sense_are_refused(change: dict[str, object], message: str) -> None:
+    good: dict[str, object] = {
+        "start_ne_m": [(0.0, 0.0), (5.0, 0.0), (6.0, 0.0)], "heading_rad": [0.0, 0.0, 0.0],
+        "length_m": [5.0, 1.0, 5.0], "curvature_per_m": [0.0, 0.0, 0.0], "line": [0, -1, 1],
+        "altitude_m": 2.0, "speed_mps": 0.2,
+    }  # fmt: skip
+    path_from_legs(**good)  # type: ignore[arg-type]
+    with pytest.raises(VehicleError, match=message):
+        path_from_legs(**{**good, **change})  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,162 @@
+"""What of a plan is flown: dives, one or all, with stops between straight ways."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alice_survey.config import SurveyConfig, parse_config
+from alice_survey.errors import PlanError, VehicleError
+from alice_survey.vehicle import signals
+from alice_survey.vehicle.floor import level_floor
+from alice_survey.vehicle.pilot.memory import LEG, PHASE
+from missions.flight import Flight
+from missions.flight_records import flight_summary
+from missions.flight_route import one_dive, path_of, stations_of_dives, whole_route
+from missions.fly import run_fly
+from missions.plan_file import Plan
+from missions.simulation import longest_mission_s, simulate_plan
+from tests.missions.flown_plans import plan_of, walk
+
+FIRST = walk(
+    (0.0, 0.0), 0.0,
+    [("go", 1.0), ("line", 4.0, 0), ("go", 0.5), ("step", 1.0), ("spot", 180.0), ("go", 0.5),
+     ("line", 4.0, 1), ("go", 1.0), ("spot", 90.0), ("go", 1.0)],
+)  # fmt: skip
+"""Up, a step to starboard, about, and back; home from the east."""
+SECOND = walk(
+    (0.0, 0.0), 90.0,
+    [("go", 2.0), ("spot", -90.0), ("go", 1.0), ("line", 4.0, 2), ("spot", 90.0), ("spot", 90.0),
+     ("go", 5.0), ("spot", 90.0), ("go", 2.0)],
+)  # fmt: skip
+"""The third line ends in a turn on the spot."""
+PLAN = plan_of([FIRST, SECOND])
+
+
+def survey(**changes: object) -> SurveyConfig:
+    return parse_config(
+        {
+            "area": {"seafloor_depth_m": 6.0},
+            "sea": {"current_mps": 0.1, "current_towards_deg": 110.0},
+            **changes,
+        },
+        "test",
+    )
+
+
+def fly(plan: Plan, config: SurveyConfig) -> Flight:
+    return simulate_plan(plan, config, level_floor(6.0), np.random.default_rng(1))
+
+
+@pytest.fixture(scope="module")
+def flight() -> Flight:
+    return fly(PLAN, survey())
+
+
+def test_dives_join_at_home_by_a_turn_on_the_spot() -> None:
+    legs = whole_route(PLAN).legs
+    count = len(FIRST.legs)
+    assert legs[:count] == FIRST.legs
+    assert legs[count + 1 :] == SECOND.legs
+    between = legs[count]
+    np.testing.assert_allclose(between.start_ne_m, (0.0, 0.0), atol=1e-12)
+    # Home from the east is a course of 270 degrees; the second dive begins at 90.
+    assert (between.length_m, between.line) == (0.0, -1)
+    assert abs(between.turn_rad) == pytest.approx(math.pi)
+    path = path_of(PLAN)
+    assert path.line[path.line >= 0].tolist() == [0.0, 1.0, 2.0]
+
+
+def test_one_dive_is_the_plan_with_that_dive_alone() -> None:
+    second = one_dive(PLAN, 2)
+    assert whole_route(second).legs == SECOND.legs
+    assert second.lines == PLAN.lines
+    assert (stations_of_dives(second), stations_of_dives(PLAN)) == (6, 18)
+    assert second.duration_s == PLAN.dives[1].duration_s
+    assert longest_mission_s(second) < longest_mission_s(PLAN)
+    assert one_dive(PLAN, None) is PLAN
+
+
+@pytest.mark.parametrize(("dive", "held"), [(0, "dives 1 to 2"), (3, "dives 1 to 2")])
+def test_a_dive_that_the_plan_has_not_is_refused(dive: int, held: str) -> None:
+    with pytest.raises(PlanError, match=f"dive {dive} is asked for; the plan has {held}"):
+        one_dive(PLAN, dive)
+    with pytest.raises(PlanError, match="the plan has 1 dive:"):
+        one_dive(plan_of([FIRST]), 2)
+
+
+def test_all_dives_are_flown_in_one_mission_from_home_to_home(flight: Flight) -> None:
+    assert flight.ending == "complete"
+    assert len(flight.trigger_s) == PLAN.stations == 18
+    assert flight.trigger_line == (*[0] * 6, *[1] * 6, *[2] * 6)
+    assert np.all(np.diff(flight.trigger_s) > 0)
+    np.testing.assert_allclose(flight.glass_ned[0, :2], PLAN.home_ne_m, atol=1e-9)
+    following = flight.flown.report[:, PHASE] == signals.FOLLOW
+    assert np.linalg.norm(flight.glass_ned[following][-1, :2] - PLAN.home_ne_m) < 0.3
+    found = flight_summary(flight, survey())
+    assert (found["dives"], found["stations_planned"]) == (2, 18)
+
+
+def test_pictures_are_taken_in_their_places_at_a_line_that_ends_in_a_stop(flight: Flight) -> None:
+    planned = np.vstack([line.stations_ne for line in PLAN.lines])
+    taken = np.column_stack(
+        [
+            np.interp(flight.trigger_s, flight.truth.time_s, axis)
+            for axis in flight.believed_glass_ned[:, :2].T
+        ]
+    )
+    off = np.linalg.norm(taken - planned, axis=1)
+    assert 0.001 < off.max() < 0.15
+
+
+def test_stops_are_made_where_they_are_planned(flight: Flight) -> None:
+    """By the navigation: where the vehicle turns on the spot, and how it steps aside."""
+    path, leg = path_of(PLAN), flight.flown.report[:, LEG]
+    following = flight.flown.report[:, PHASE] == signals.FOLLOW
+    for i in np.flatnonzero(path.turn_rad):
+        rows = following & (leg == i)
+        away = flight.believed_glass_ned[rows, :2] - [path.start_n[i], path.start_e[i]]
+        assert 0.001 < np.linalg.norm(away, axis=1).max() < 0.2
+    (step,) = np.flatnonzero(path.side_rad)
+    rows = following & (leg == step)
+    heading = np.rad2deg(flight.attitude_rad[rows, 2] - path.heading_rad[step])
+    np.testing.assert_allclose(heading, np.rad2deg(path.side_rad[step]), atol=4.0)
+
+
+def test_one_dive_is_flown_alone() -> None:
+    flown = fly(one_dive(PLAN, 2), survey())
+    assert flown.ending == "complete"
+    assert set(flown.trigger_line) == {2}
+    assert np.flatnonzero(~np.isnan(flown.line_errors[0])).size > 100
+    found = flight_summary(flown, survey())
+    assert (found["dives"], found["stations_planned"], found["stations"]) == (1, 6, 6)
+
+
+def test_a_vehicle_without_sway_turns_on_the_spot_with_a_warning_but_cannot_step(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    config = survey(vehicle={"name": "sparus2", "controller": "los"})
+    with pytest.raises(VehicleError, match=r"1 sway step, .*turns = 'spot' or 'arcs'"):
+        fly(PLAN, config)
+    capsys.readouterr()
+    flown = fly(one_dive(PLAN, 2), config)
+    assert "drifts with the current" in capsys.readouterr().err
+    assert flown.ending == "complete"
+    assert len(flown.trigger_s) == 6
+
+
+def test_the_settings_choose_the_dive(tmp_path: Path) -> None:
+    from alice_survey.artefacts import write_json
+
+    folder = tmp_path / "plan"
+    folder.mkdir()
+    write_json(folder / "plan.json", PLAN.to_json())
+    write_json(folder / "stage.json", {})
+    config = survey(vehicle={"dive": 2}, seafloor={"grid_m": 0.05})
+    assert run_fly(tmp_path, config, 1)
+    found = json.loads((tmp_path / "flight" / "flight.json").read_text())
+    assert (found["stations"], found["stations_planned"]) == (6, 6)
+    with pytest.raises(PlanError, match="dive 3 is asked for"):
+        run_fly(tmp_path, survey(vehicle={"dive": 3}, seafloor={"grid_m": 0.05}), 1)
