@@ -102,7 +102,7 @@ def test_the_compiled_dynamics_stay_as_they_are_at_the_steady_thrust() -> None:
 
 
 def test_thrust_is_what_the_exact_allocation_gives() -> None:
-    """Of the wrench that the thrusts themselves make; jets' drag and torques at speed come on top."""
+    """Of the wrench that the thrusts make; jets' drag and torques at speed come on top."""
     nu = _planar()
     flight = steady_flight(ALICE, nu)
     plant, n = ALICE.plant, 5

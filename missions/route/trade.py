@@ -1,0 +1,218 @@
+"""The trade of line direction against the current: in words, numbers and a picture."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from alice_survey.config import SurveyConfig
+from alice_survey.frames import Array
+from alice_survey.vehicle.steady import drag_power
+from missions.route.energy import (
+    Manner,
+    course_power,
+    craft_of,
+    expected_current,
+    line_manner,
+    motion,
+    usable_wh,
+    vehicle_costs,
+)
+
+_J_PER_WH = 3600.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Way:
+    """One way to lay and fly lines; means of flying them there and back."""
+
+    name: str
+    drag_w: float
+    """What damping takes from the hull, without body lift."""
+    lift_w: float
+    """What body lift takes from it besides."""
+    thrusters_w: float
+    """Electrical; infinite if it cannot be flown both ways."""
+    line_w: float
+    """Of the whole vehicle."""
+    crab_deg: float
+    """Heading off the course."""
+
+    def to_json(self) -> dict[str, Any]:
+        """As numbers; None where it cannot be flown."""
+        return {
+            key: (value if isinstance(value, str) or math.isfinite(value) else None)
+            for key, value in vars(self).items()
+        }
+
+
+def three_ways(config: SurveyConfig, *, imaging_w: float = 0.0) -> tuple[Way, Way, Way]:
+    """Lines along the current, across it held by sway, and across it crabbing.
+
+    Args:
+        config: of the survey.
+        imaging_w: mean power of strobes while on lines.
+    """
+    craft, current = craft_of(config.vehicle), expected_current(config)
+    speed, towards = config.plan.speed_mps, math.atan2(current[1], current[0])
+    body = craft.plant.body
+    bare = body._replace(lift=np.zeros(4))
+    other_w = config.vehicle.hotel_w + imaging_w
+    cases: tuple[tuple[str, float, Manner], ...] = (
+        ("along the current", 0.0, "held"),
+        ("across, held by sway", math.pi / 2, "held"),
+        ("across, crabbing", math.pi / 2, "crab"),
+    )
+    ways = []
+    for name, off, manner in cases:
+        courses = towards + off + np.array([0.0, math.pi])
+        moved = motion(courses, speed, current, manner)
+        drag = float(drag_power(bare, moved.nu).mean())
+        thrusters = float(course_power(craft, courses, speed, current, manner).mean())
+        ways.append(
+            Way(
+                name=name,
+                drag_w=drag,
+                lift_w=float(drag_power(body, moved.nu).mean()) - drag,
+                thrusters_w=thrusters,
+                line_w=thrusters + other_w,
+                crab_deg=math.degrees(float(np.abs(moved.crab_rad).mean())),
+            )
+        )
+    return ways[0], ways[1], ways[2]
+
+
+def both_ways_w(power_w: Array) -> Array:
+    """(K / 2,) mean power of lines flown there and back, by heading from north to south."""
+    half = len(power_w) // 2
+    mean: Array = (power_w[:half] + power_w[half:]) / 2
+    return mean
+
+
+def energy_report(config: SurveyConfig, *, imaging_w: float = 0.0) -> tuple[str, dict[str, Any]]:
+    """What line direction costs in the expected current.
+
+    Args:
+        config: of the survey.
+        imaging_w: mean power of strobes while on lines.
+
+    Returns:
+        A table, and its numbers.
+
+    Raises:
+        PlanError: lines cannot be flown in that current.
+    """
+    costs = vehicle_costs(config, imaging_w=imaging_w)
+    current = expected_current(config)
+    size, towards_deg = math.hypot(*current), math.degrees(math.atan2(current[1], current[0])) % 360
+    ways = three_ways(config, imaging_w=imaging_w)
+    mean_w = both_ways_w(costs.line_w)
+    headings_deg = np.arange(len(mean_w)) * (180.0 / len(mean_w))
+    finite = np.where(np.isfinite(mean_w), mean_w, -np.inf)
+    best, worst = int(np.argmin(mean_w)), int(np.argmax(finite))
+    battery_wh = usable_wh(config.vehicle)
+    hours = battery_wh / float(mean_w[best])
+    flown = "held by sway" if line_manner(config) == "held" else "crabbing"
+    rows = [
+        f"  {way.name:22s}{way.drag_w:8.2f}{way.lift_w:8.2f}{_watts(way.thrusters_w):>12s}"
+        f"{_watts(way.line_w):>9s}{way.crab_deg:8.0f}"
+        for way in ways
+    ]
+    text = "\n".join(
+        [
+            f"energy: {config.vehicle.name} at {costs.speed_mps:g} m/s over ground in a current of "
+            f"{size:.2f} m/s towards {towards_deg:03.0f} deg, lines {flown}",
+            f"  {'lines, there and back':22s}{'drag W':>8s}{'lift W':>8s}{'thrusters W':>12s}"
+            f"{'total W':>9s}{'crab':>8s}",
+            *rows,
+            f"  least on {headings_deg[best]:.0f} deg ({mean_w[best]:.1f} W), most on "
+            f"{headings_deg[worst]:.0f} deg ({mean_w[worst]:.1f} W); hotel load "
+            f"{config.vehicle.hotel_w:g} W, lights {imaging_w:.1f} W",
+            f"  {battery_wh:.0f} Wh to use: {hours:.1f} h, "
+            f"{hours * 3.6 * costs.speed_mps:.1f} km of lines on the best heading",
+        ]
+    )
+    data = {
+        "current_mps": size,
+        "current_towards_deg": towards_deg,
+        "speed_mps": costs.speed_mps,
+        "lines": flown,
+        "ways": [way.to_json() for way in ways],
+        "best_heading_deg": float(headings_deg[best]),
+        "best_w": float(mean_w[best]),
+        "worst_heading_deg": float(headings_deg[worst]),
+        "worst_w": float(mean_w[worst]),
+        "usable_wh": battery_wh,
+        "hours": hours,
+        "line_m": hours * 3600.0 * costs.speed_mps,
+        "hotel_w": config.vehicle.hotel_w,
+        "imaging_w": imaging_w,
+    }
+    return text, data
+
+
+def draw_trade(path: Path, config: SurveyConfig, *, imaging_w: float = 0.0) -> None:
+    """Draw the power of the thrusters on lines and between, by course.
+
+    Args:
+        path: of a picture, PNG or PDF.
+        config: of the survey.
+        imaging_w: mean power of strobes while on lines.
+
+    Raises:
+        PlanError: lines cannot be flown in that current.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    costs, current = vehicle_costs(config, imaging_w=imaging_w), expected_current(config)
+    hotel_w, size = config.vehicle.hotel_w, math.hypot(*current)
+    towards = math.atan2(current[1], current[0])
+    figure = Figure(figsize=(6.4, 6.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot(projection="polar")
+    axes.set_theta_zero_location("N")
+    axes.set_theta_direction(-1)
+    lines_w, way_w = costs.line_w - hotel_w - imaging_w, costs.way_w - hotel_w
+    _draw_course(axes, lines_w, "C0", f"on lines ({_manner_text(config)})")
+    _draw_course(axes, way_w, "C1", "between lines")
+    mean_w = both_ways_w(lines_w)
+    _draw_course(axes, np.concatenate([mean_w, mean_w]), "C0", "lines, there and back", "--")
+    seen = np.concatenate([lines_w, way_w])
+    most = float(seen[np.isfinite(seen)].max())
+    axes.set_ylim(0.0, 1.05 * most)
+    axes.set_rlabel_position((math.degrees(towards) + 45.0) % 360.0)
+    if size > 0.0:
+        axes.annotate(
+            "", xy=(towards, 0.45 * most), xytext=(towards + math.pi, 0.45 * most),
+            arrowprops={"arrowstyle": "-|>", "color": "0.45", "lw": 1.6},
+        )  # fmt: skip
+        axes.text(
+            towards, 0.5 * most, f"current\n{size:.2f} m/s", color="0.35", ha="center", va="center",
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.5},
+        )  # fmt: skip
+    axes.set_title(
+        f"Electrical power of {config.vehicle.name}'s thrusters, W, by course\n"
+        f"{costs.speed_mps:g} m/s over ground; hotel load {hotel_w:g} W comes on top",
+        fontsize=10,
+    )
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, -0.16), ncols=3, fontsize=8, frameon=False)
+    figure.savefig(path, dpi=130, metadata={"Software": None} if path.suffix == ".png" else None)
+
+
+def _draw_course(axes: Any, power_w: Array, colour: str, label: str, style: str = "-") -> None:
+    course = np.linspace(0.0, 2 * math.pi, len(power_w) + 1)
+    closed = np.append(power_w, power_w[0])
+    axes.plot(
+        course, np.where(np.isfinite(closed), closed, np.nan), style, color=colour, label=label
+    )
+
+
+def _manner_text(config: SurveyConfig) -> str:
+    return "heading held" if line_manner(config) == "held" else "crabbing"
+
+
+def _watts(power_w: float) -> str:
+    return f"{power_w:.2f}" if math.isfinite(power_w) else "cannot"
