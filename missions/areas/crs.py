@@ -92,7 +92,10 @@ class LocalFrame:
         elif raw.geographic and _distance_m(corners[:, ::-1], self.datum).max() <= FARTHEST_M:
             advice = "latitude and longitude are swapped"
         elif raw.geographic:
-            advice = "move the datum (latitude_deg, longitude_deg), or check the corner and its crs"
+            advice = (
+                "move the datum (latitude_deg, longitude_deg) or leave it out, or check the corner "
+                "and its crs"
+            )
         else:
             advice = "move the datum or check the corner"
         raise PlanError(
