@@ -1,0 +1,171 @@
+"""Slow, obvious twins of what pictures see of an area, and surveys with known coverage."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import shapely
+from scipy.spatial.transform import RigidTransform
+from shapely.geometry import MultiPolygon, Polygon
+
+from alice_survey.config import CameraConfig, WaterConfig
+from alice_survey.frames import Array, Datum, rotation_from_attitude
+from camera_calib.rig import Rig, design_rig
+from missions.areas.area import Area, multipolygon
+from missions.coverage.certificate import Certificate
+from missions.coverage.stations import Stations
+from missions.footprint import footprint_ne, glass_point_cam
+from missions.lines.line import Line
+from missions.plan_file import Dive, Plan
+from missions.route.legs import Leg, Route
+
+DATUM = Datum(32.8236, 34.9553)
+_FLOOR_M = 50.0
+
+
+def area_of(shape: shapely.Geometry, margin_m: float = 3.0) -> Area:
+    """An area with room to turn."""
+    return Area(
+        datum=DATUM,
+        survey=multipolygon(shape),
+        allowed=multipolygon(shape.buffer(margin_m, join_style="mitre")),
+        no_go=MultiPolygon(),
+    )
+
+
+def pinhole_rig(across_m: float, along_m: float, baseline_m: float | None = None) -> Rig:
+    """One or two pinholes in air whose pictures are so large from 1 m: rectangles, no bulge."""
+    both = design_rig(
+        CameraConfig(
+            width_px=1000, height_px=round(1000 * along_m / across_m), pixel_um=1.0,
+            focal_mm=1.0 / across_m, port_distance_m=0.0, glass_thickness_m=0.0,
+            n_glass=1.0, baseline_m=baseline_m or 0.1, position_body_m=(0.0, 0.0, 0.0),
+        ),
+        WaterConfig(n_water=1.0),
+    )  # fmt: skip
+    if baseline_m is not None:
+        return both
+    return replace(
+        both,
+        cameras={"left": both.cameras["left"]},
+        cam_from_rig={"left": both.cam_from_rig["left"]},
+    )
+
+
+def stations_at(places_ne: Any, altitude_m: float = 1.0, **others: Any) -> Stations:
+    """Level stations headed north, each on a line of its own if no lines are given."""
+    places = np.asarray(places_ne, dtype=np.float64).reshape(-1, 2)
+    given = {
+        "attitude_rad": np.zeros((len(places), 3)),
+        "line": np.arange(len(places)),
+        "altitude_m": np.full(len(places), altitude_m),
+    }
+    return Stations(glass_ne=places, **(given | others))
+
+
+def footprint_polygons(rig: Rig, stations: Stations) -> dict[str, list[Polygon]]:
+    """Each camera's footprint at each station, by poses and rays, one after the other."""
+    reference = rig.cameras[rig.reference]
+    glass_body = rig.body_from_cam(rig.reference).apply(glass_point_cam(reference))
+    polygons: dict[str, list[Polygon]] = {name: [] for name in rig.cameras}
+    for place, altitude_m, attitude in zip(
+        stations.glass_ne, stations.altitude_m, stations.attitude_rad, strict=True
+    ):
+        glass_ned = np.array([*place, _FLOOR_M - altitude_m])
+        ned_from_body = rotation_from_attitude(*attitude)
+        body_ned = glass_ned - ned_from_body.apply(glass_body)
+        pose = RigidTransform.from_components(body_ned, ned_from_body)
+        for name, camera in rig.cameras.items():
+            border = footprint_ne(camera, pose * rig.body_from_cam(name), _FLOOR_M)
+            polygons[name].append(Polygon(border) if np.isfinite(border).all() else Polygon())
+    return polygons
+
+
+def counts_at(points_ne: Array, rig: Rig, stations: Stations) -> dict[str, Any]:
+    """How many pictures and lines of each camera see points (N, 2), and how many pairs."""
+    polygons = footprint_polygons(rig, stations)
+    seen = {
+        name: np.array([shapely.contains_xy(shape, points_ne) for shape in shapes])
+        for name, shapes in polygons.items()
+    }
+    lines = {}
+    for name, by_station in seen.items():
+        of_lines = [
+            by_station[stations.line == line].any(axis=0)
+            for line in np.unique(stations.line)
+            if line >= 0
+        ]
+        lines[name] = np.sum(of_lines, axis=0) if of_lines else np.zeros(len(points_ne), dtype=int)
+    return {
+        "pictures": {name: by_station.sum(axis=0) for name, by_station in seen.items()},
+        "lines": lines,
+        "pairs": np.all(list(seen.values()), axis=0).sum(axis=0),
+    }
+
+
+def middles_ne(certificate: Certificate) -> Array:
+    """Middles of all cells, (rows, columns, 2), from the corner and the axes."""
+    grid = certificate.grid
+    ahead = np.array([np.cos(grid.heading_rad), np.sin(grid.heading_rad)])
+    right = np.array([-ahead[1], ahead[0]])
+    row, column = np.meshgrid(np.arange(grid.rows), np.arange(grid.columns), indexing="ij")
+    middles: Array = (
+        np.array(grid.origin_ne)
+        + (row[..., None] + 0.5) * grid.cell_m * ahead
+        + (column[..., None] + 0.5) * grid.cell_m * right
+    )
+    return middles
+
+
+def lawnmower(
+    north_m: float, east_m: float, spacing_m: float, step_m: float, over_m: float = 0.0
+) -> list[Line]:
+    """Lines to and fro along north over a box at the origin, and `over_m` beyond it all round."""
+    steps = int(np.ceil((north_m + 2 * over_m) / step_m))
+    count = int(np.ceil((east_m + 2 * over_m) / spacing_m)) + 1
+    south = (north_m - steps * step_m) / 2
+    west = (east_m - (count - 1) * spacing_m) / 2
+    lines = []
+    for i in range(count):
+        east = west + i * spacing_m
+        line = Line(
+            kind="survey",
+            start_ne_m=(south, east),
+            end_ne_m=(south + steps * step_m, east),
+            stations=steps + 1,
+        )
+        lines.append(line.reversed() if i % 2 else line)
+    return lines
+
+
+def plan_of(area: Area, lines: list[Line], **others: Any) -> Plan:
+    """A plan of lines, straight from each to the next."""
+    legs = []
+    for index, line in enumerate(lines):
+        legs.append(_straight(line.start_ne_m, line.end_ne_m, index))
+        if index + 1 < len(lines):
+            legs.append(_straight(line.end_ne_m, lines[index + 1].start_ne_m, -1))
+    route = Route(legs=tuple(legs))
+    values: dict[str, Any] = {
+        "name": "known", "area": area, "home_ne_m": lines[0].start_ne_m,
+        "seafloor_depth_m": 15.0, "altitude_m": 2.0, "speed_mps": 0.2, "interval_s": 2.3,
+        "exposure_s": 0.001, "strobe_pulse_s": 0.002, "strobe_lead_s": 0.0002,
+        "footprint_m": (1.44, 1.15), "line_spacing_m": 1.0, "station_spacing_m": 0.46,
+        "forward_overlap": 0.6, "side_overlap": 0.3, "lines": tuple(lines),
+        "turn_radius_m": 0.5, "run_in_m": 0.5, "length_m": route.length_m,
+        "duration_s": route.length_m / 0.2, "energy_wh": 10.0, "coverage": 1.0, "details": {},
+    }  # fmt: skip
+    values |= others
+    dive = Dive(
+        first_line=0, last_line=len(lines) - 1, route=route, duration_s=values["duration_s"],
+        energy_wh=values["energy_wh"],
+    )  # fmt: skip
+    return Plan(dives=(dive,), **values)
+
+
+def _straight(start: tuple[float, float], end: tuple[float, float], line: int) -> Leg:
+    north, east = end[0] - start[0], end[1] - start[1]
+    return Leg(
+        start_ne_m=start, heading_rad=float(np.arctan2(east, north)),
+        length_m=float(np.hypot(north, east)), curvature_per_m=0.0, line=line,
+    )  # fmt: skip
