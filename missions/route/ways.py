@@ -82,11 +82,24 @@ class Ways:
         blocked_b = np.flatnonzero(np.isinf(distances).any(axis=0))
         seen_a, seen_b = self._seen(a[blocked_a]), self._seen(b[blocked_b])
         used = np.flatnonzero(np.isfinite(seen_a).any(axis=0))
-        between = np.full((len(self._nodes), len(self._nodes)), np.inf)
-        for node in used.tolist():
-            between[node] = self._shortest_from(node)[0]
-        _shorten(distances, blocked_a, blocked_b, seen_a, seen_b, between)
+        seen_a = np.ascontiguousarray(seen_a[:, used])
+        _shorten(distances, blocked_a, blocked_b, seen_a, seen_b, self._between(used))
         return distances
+
+    def lengths_m(self, starts_ne: Array, ends_ne: Array) -> Array:
+        """Lengths, (N,), of the shortest ways from (N, 2) to (N, 2); inf where none is."""
+        starts = np.ascontiguousarray(starts_ne, dtype=np.float64).reshape(-1, 2)
+        ends = np.ascontiguousarray(ends_ne, dtype=np.float64).reshape(-1, 2)
+        blocked = np.flatnonzero(~self.free_many(starts, ends))
+        lengths: Array = np.hypot(*(ends - starts).T)
+        lengths[blocked] = np.inf
+        if len(blocked) == 0 or len(self._nodes) == 0:
+            return lengths
+        seen_a, seen_b = self._seen(starts[blocked]), self._seen(ends[blocked])
+        used = np.flatnonzero(np.isfinite(seen_a).any(axis=0))
+        seen_a = np.ascontiguousarray(seen_a[:, used])
+        lengths[blocked] = _over_corners(seen_a, seen_b, self._between(used))
+        return lengths
 
     def path_ne(self, a: Place, b: Place) -> Array:
         """The shortest way as places (K, 2), from `a` to `b` with the corners it bends at.
@@ -105,18 +118,18 @@ class Ways:
         best_m, best = math.inf, (-1, -1)
         if len(self._nodes):
             seen_a, seen_b = self._seen(np.array([a]))[0], self._seen(np.array([b]))[0]
-            for node in np.flatnonzero(np.isfinite(seen_a)).tolist():
-                through = seen_a[node] + self._shortest_from(node)[0] + seen_b
-                last = int(np.argmin(through))
-                if through[last] < best_m:
-                    best_m, best = float(through[last]), (node, last)
+            used = np.flatnonzero(np.isfinite(seen_a))
+            through = seen_a[used, None] + self._between(used) + seen_b
+            if through.size:
+                first, last = np.unravel_index(int(np.argmin(through)), through.shape)
+                best_m, best = float(through[first, last]), (int(used[first]), int(last))
         if math.isinf(best_m):
             raise PlanError(
                 f"no way inside the allowed area from {a[0]:.2f} m north, {a[1]:.2f} m east to "
                 f"{b[0]:.2f} m north, {b[1]:.2f} m east: its parts are not connected; widen "
                 "area.allowed or survey the parts one by one"
             )
-        before = self._shortest_from(best[0])[1]
+        before = self._from_node[best[0]][1]
         chain = [best[1]]
         while chain[-1] != best[0]:
             chain.append(int(before[chain[-1]]))
@@ -151,14 +164,16 @@ class Ways:
         size = len(self._nodes)
         return csr_array((lengths, (rows, columns)), shape=(size, size))
 
-    def _shortest_from(self, node: int) -> tuple[Array, NDArray[np.int32]]:
-        """Distances from a corner to all, and the corner before each."""
-        if node not in self._from_node:
+    def _between(self, nodes: NDArray[np.intp]) -> Array:
+        """(U, V) lengths of the shortest ways from some corners to all; they are kept."""
+        new = [node for node in nodes.tolist() if node not in self._from_node]
+        if new:
             distances, before = dijkstra(
-                self._graph, directed=False, indices=[node], return_predecessors=True
+                self._graph, directed=False, indices=new, return_predecessors=True
             )
-            self._from_node[node] = distances[0], before[0]
-        return self._from_node[node]
+            self._from_node |= dict(zip(new, zip(distances, before, strict=True), strict=True))
+        rows = [self._from_node[node][0] for node in nodes.tolist()]
+        return np.array(rows).reshape(len(rows), len(self._nodes))
 
     def _seen(self, points_ne: Array) -> Array:
         """(N, V) distances to the corners that can be seen and passed; inf of the others."""
@@ -254,12 +269,21 @@ def _shorten(
     seen_b: Array,
     between: Array,
 ) -> None:
-    """Fill the blocked distances with those of the ways over corners."""
-    size = between.shape[0]
+    """Fill the blocked distances with those of the ways over corners.
+
+    Args:
+        distances: (N, M) to fill.
+        blocked_a: (A,) rows with something blocked.
+        blocked_b: (B,) columns likewise.
+        seen_a: (A, U) to the corners that any of them sees.
+        seen_b: (B, V) to all corners.
+        between: (U, V)
+    """
+    size = between.shape[1]
     through = np.empty(size)
     for i in range(blocked_a.shape[0]):
         through[:] = np.inf
-        for node in range(size):
+        for node in range(between.shape[0]):
             if seen_a[i, node] < np.inf:
                 for other in range(size):
                     through[other] = min(through[other], seen_a[i, node] + between[node, other])
@@ -270,3 +294,17 @@ def _shorten(
             for node in range(size):
                 best = min(best, through[node] + seen_b[j, node])
             distances[blocked_a[i], blocked_b[j]] = best
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _over_corners(seen_a: Array, seen_b: Array, between: Array) -> Array:
+    """(N,) lengths of ways over corners; arguments as of `_shorten`, row by row."""
+    result = np.full(seen_a.shape[0], np.inf)
+    for i in range(seen_a.shape[0]):
+        for last in range(seen_b.shape[1]):
+            if seen_b[i, last] == np.inf:
+                continue
+            for first in range(seen_a.shape[1]):
+                length = seen_a[i, first] + between[first, last] + seen_b[i, last]
+                result[i] = min(result[i], length)
+    return result

@@ -52,6 +52,9 @@ def test_ways_are_as_short_as_by_trying_all_corners(area: MultiPolygon, seed: in
     distances = ways.distances_m(places, places)
 
     np.testing.assert_allclose(distances, distances.T, atol=1e-9)
+    np.testing.assert_allclose(
+        ways.lengths_m(places, places[::-1]), np.diag(distances[:, ::-1]), rtol=1e-12
+    )
     for i in range(3):
         a, b = tuple(places[i].tolist()), tuple(places[i + 3].tolist())
         expected = shortest_way_m(area, a, b)
