@@ -7,11 +7,22 @@ from `altitude_m - relief_m` (the top of the relief) to `altitude_m + relief_m`.
 import math
 from dataclasses import dataclass
 
+import numpy as np
+from shapely.affinity import translate
+
 from alice_survey.config import PlanConfig
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.fov.table import apparent_distance_m
 from camera_calib.rig import Rig
-from missions.footprint import Swath, common_swath, footprint_size_m, overlap, step_for_overlap
+from missions.footprint import (
+    camera_swath,
+    common_swath,
+    footprint_polygon,
+    footprint_size_m,
+    level_pose,
+    overlap,
+    step_for_overlap,
+)
 from missions.imaging.conflicts import Way, conflict
 from missions.imaging.table import Setting
 
@@ -61,6 +72,11 @@ class Spacing:
     other."""
     side_overlap_worst: float
     """Both at once."""
+    side_overlap_area: float
+    """Share of the area of one camera's picture that the picture abeam on the next line sees too,
+    at the mean altitude. Less than on the middle row: through a port a footprint bulges."""
+    side_overlap_swath: float
+    """The same of what one camera surely sees on a line, between its pictures."""
     stereo_overlap: float
     """Least overlap of neighbouring stereo swaths at the mean altitude."""
 
@@ -168,7 +184,7 @@ def line_spacing(rig: Rig, plan: PlanConfig, step_m: float) -> Spacing:
     if swath.half_across_m <= 0:
         raise _no_common_view(rig, plan, plan.altitude_m, step_m)
     if plan.line_spacing_m is not None:
-        return _spacing(prints, swath, plan, plan.line_spacing_m, "line_spacing_m")
+        return _spacing(rig, prints, plan, plan.line_spacing_m, "line_spacing_m", step_m)
     print_, where = prints.mean, "side_overlap"
     if plan.overlap_over_relief:
         print_, where = prints.top, "side_overlap at the top of the relief"
@@ -185,13 +201,23 @@ def line_spacing(rig: Rig, plan: PlanConfig, step_m: float) -> Spacing:
         raise _too_far_off_track(rig, plan, print_, widest_m, step_m)
     if plan.track_error_m > 0:
         bound_by += " and track_error_m"
-    mean_swath = common_swath(rig, plan.altitude_m, step_m)
-    return _spacing(prints, mean_swath, plan, spacing_m, bound_by)
+    return _spacing(rig, prints, plan, spacing_m, bound_by, step_m)
 
 
 def _spacing(
-    prints: FootprintRange, swath: Swath, plan: PlanConfig, spacing_m: float, bound_by: str
+    rig: Rig,
+    prints: FootprintRange,
+    plan: PlanConfig,
+    spacing_m: float,
+    bound_by: str,
+    step_m: float,
 ) -> Spacing:
+    """All overlaps that a spacing gives."""
+    camera, swath = rig.cameras[rig.reference], common_swath(rig, plan.altitude_m, step_m)
+    one = camera_swath(rig, rig.reference, plan.altitude_m, step_m)
+    pose = level_pose(camera, np.zeros(2), plan.altitude_m, plan.altitude_m, 0.0)
+    picture = footprint_polygon(camera, pose, plan.altitude_m)
+    abeam = translate(picture, yoff=spacing_m)
     apart_m = spacing_m + 2 * plan.track_error_m
     return Spacing(
         spacing_m=spacing_m,
@@ -200,6 +226,8 @@ def _spacing(
         side_overlap_top=overlap(prints.top.across_m, spacing_m),
         side_overlap_off_track=overlap(prints.mean.across_m, apart_m),
         side_overlap_worst=overlap(prints.top.across_m, apart_m),
+        side_overlap_area=picture.intersection(abeam).area / picture.area,
+        side_overlap_swath=overlap(one.across_m, spacing_m),
         stereo_overlap=max(0.0, (2 * swath.half_across_m - spacing_m) / swath.across_m),
     )
 
@@ -326,7 +354,9 @@ def spacing_rows(spacing: Spacing, plan: PlanConfig, prints: FootprintRange) -> 
             source=_GEOMETRY,
             bound_by="line spacing",
             note=f"at the mean / over the top of the relief / there with lines each "
-            f"{plan.track_error_m:g} m off (track_error_m)",
+            f"{plan.track_error_m:g} m off (track_error_m). All on the middle row; footprints "
+            f"bulge through a port: by area whole pictures share {spacing.side_overlap_area:.1%}, "
+            f"and the swaths that lines surely see {spacing.side_overlap_swath:.1%}, at the mean",
         ),
         Setting(
             group="footprint and lines",

@@ -4,6 +4,7 @@ A trigger's time is the middle of its exposure, as everywhere in a survey. The s
 the cameras open and goes out after they close, by its lead.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -77,7 +78,7 @@ def trigger_edges(exposure_s: float, lead_s: float) -> Edges:
     Raises:
         PlanError: the exposure is shorter than 1 us or the lead negative.
     """
-    exposure_us, lead_us = round(exposure_s * _US), -round(-lead_s * _US // 1)
+    exposure_us, lead_us = round(exposure_s * _US), math.ceil(lead_s * _US - 1e-6)
     before = exposure_us // 2
     after = exposure_us - before
     return Edges(
