@@ -7,6 +7,7 @@ rig. What cannot be used is left out and said, never filled in without a word.
 import csv
 import math
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -145,11 +146,11 @@ def read_triggers(path: Path, nav: NavigationLog) -> Triggers:
 
 
 def _since_start(cell: str, nav: NavigationLog) -> float:
-    from missions.logs.corrections import utc_seconds
-
+    """Seconds of a date, UTC where it names no zone, since the log's first row."""
     if nav.start_utc is None:
         raise ValueError("the log has no dates")
-    return utc_seconds(cell) - nav.start_utc.timestamp()
+    date = datetime.fromisoformat(cell.strip())
+    return ((date if date.tzinfo else date.replace(tzinfo=UTC)) - nav.start_utc).total_seconds()
 
 
 def _triggers_of_manifest(path: Path, rig: Rig) -> Triggers:

@@ -1,0 +1,317 @@
+import csv
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+
+from alice_survey.artefacts import write_csv
+from alice_survey.config import CameraConfig, WaterConfig
+from alice_survey.errors import NavigationError
+from alice_survey.frames import Array, rotation_from_attitude
+from alice_survey.manifest import ImageRecord, write_manifest
+from alice_survey.trajectory import Trajectory, write_track
+from camera_calib.rig import design_rig
+from missions.coverage.dives import read_dive_record
+from missions.coverage.passes import assign_lines
+from missions.coverage.stations import Stations, stations_of_plan
+from missions.footprint import glass_point_cam
+from missions.navigation import NavigationLog, write_navigation
+from tests.oracles_coverage import DATUM, area_of, lawnmower, plan_of
+
+RIG = design_rig(CameraConfig(), WaterConfig())
+LEVER = RIG.body_from_cam("left").apply(glass_point_cam(RIG.cameras["left"]))
+LINES = lawnmower(6.0, 3.0, 1.0, 0.46, over_m=0.5)
+PLAN = plan_of(area_of(shapely.box(0, 0, 6, 3)), LINES)
+DEPTH_M = PLAN.seafloor_depth_m - PLAN.altitude_m
+
+
+def leaning_flight() -> tuple[Array, Stations]:
+    """Times 2.3 s apart, and the plan's stations flown with some roll, pitch and altitude."""
+    exact = stations_of_plan(PLAN)
+    rng = np.random.default_rng(5)
+    tilt = np.deg2rad(rng.normal(0, 3, (len(exact), 2)))
+    attitude = np.column_stack([tilt, exact.attitude_rad[:, 2]])
+    time_s = 100.0 + PLAN.interval_s * np.arange(len(exact))
+    flown = replace(
+        exact,
+        attitude_rad=attitude,
+        altitude_m=rng.uniform(1.8, 2.2, len(exact)),
+        time_s=time_s,
+    )
+    return time_s, flown
+
+
+def log_of(flown: Stations) -> NavigationLog:
+    """The navigation log of a body whose left port's glass is at the stations."""
+    attitude, count = flown.attitude_rad, len(flown)
+    glass = np.column_stack([flown.glass_ne, PLAN.seafloor_depth_m - flown.altitude_m])
+    ones = np.ones(count)
+    assert flown.time_s is not None
+    return NavigationLog(
+        time_s=flown.time_s,
+        position_ned=glass - rotation_from_attitude(*attitude.T).apply(LEVER),
+        attitude_rad=attitude,
+        altitude_m=flown.altitude_m,
+        sigma_horizontal_m=0.1 * ones,
+        sigma_depth_m=0.01 * ones,
+        sigma_attitude_rad=0.001 * ones,
+        sigma_heading_rad=0.01 * ones,
+        sigma_altitude_m=0.02 * ones,
+    )
+
+
+@pytest.fixture
+def dive(tmp_path: Path) -> tuple[Path, Path, Stations]:
+    """A navigation CSV, its triggers, and the stations they were made of."""
+    time_s, flown = leaning_flight()
+    write_navigation(tmp_path / "nav.csv", log_of(flown), DATUM)
+    write_triggers(tmp_path / "triggers.csv", time_s, flown.line)
+    return tmp_path / "nav.csv", tmp_path / "triggers.csv", flown
+
+
+def write_triggers(path: Path, time_s: Array, line: Array | None = None) -> None:
+    header = ("station", "time_s") if line is None else ("station", "time_s", "line")
+    columns = [np.arange(len(time_s)), time_s] + ([] if line is None else [line])
+    write_csv(path, header, [list(row) for row in zip(*columns, strict=True)])
+
+
+def edited(path: Path, out: Path, change: dict[str, str], rows: slice = slice(None)) -> Path:
+    """The log with columns set to a text in some rows."""
+    with path.open(newline="") as file:
+        table = list(csv.DictReader(file))
+    for row in table[rows]:
+        row.update(change)
+    write_csv(out, list(table[0]), [list(row.values()) for row in table])
+    return out
+
+
+def assert_alike(found: Stations, expected: Stations, place_m: float = 2e-5) -> None:
+    np.testing.assert_allclose(found.glass_ne, expected.glass_ne, atol=place_m)
+    np.testing.assert_allclose(found.altitude_m, expected.altitude_m, atol=2e-5)
+    np.testing.assert_allclose(
+        np.exp(1j * found.attitude_rad), np.exp(1j * expected.attitude_rad), atol=1e-7
+    )
+    np.testing.assert_array_equal(found.line, expected.line)
+
+
+def test_a_log_gives_back_where_its_pictures_were_taken(
+    dive: tuple[Path, Path, Stations], capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, triggers, flown = dive
+
+    record = read_dive_record(log, PLAN, RIG, triggers=triggers)
+
+    assert_alike(record.stations, flown)
+    assert (record.triggered, record.left_out, record.notes) == (len(flown), {}, ())
+    assert capsys.readouterr().err == ""
+
+
+def test_lines_are_found_where_triggers_name_none(
+    dive: tuple[Path, Path, Stations], tmp_path: Path
+) -> None:
+    log, _, flown = dive
+    assert flown.time_s is not None
+    write_triggers(tmp_path / "bare.csv", flown.time_s)
+    assert_alike(read_dive_record(log, PLAN, RIG, triggers=tmp_path / "bare.csv").stations, flown)
+
+    # Without triggers the plan's interval counts from the start of the log.
+    record = read_dive_record(log, PLAN, RIG)
+    assert "interval" in record.triggers
+    assert_alike(record.stations, flown.some(np.arange(len(flown) - 1)))
+
+
+def test_a_manifest_stands_for_triggers(
+    dive: tuple[Path, Path, Stations],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    log, _, flown = dive
+    assert flown.time_s is not None
+    records = [
+        ImageRecord(image=f"{camera}/{i}.png", camera=camera, station=i, time_s=time)
+        for i, time in enumerate(flown.time_s.tolist())
+        for camera in ("left", "right")
+        if (camera, i) != ("right", 4)
+    ]
+    write_manifest(tmp_path / "manifest.csv", records)
+
+    record = read_dive_record(log, PLAN, RIG, manifest=tmp_path / "manifest.csv")
+
+    kept = np.delete(np.arange(len(flown)), 4)
+    assert_alike(record.stations, flown.some(kept))
+    assert "1 stations lack a camera" in capsys.readouterr().err
+    with pytest.raises(NavigationError, match="not both"):
+        read_dive_record(log, PLAN, RIG, triggers=log, manifest=log)
+
+
+def test_triggers_in_a_gap_and_beyond_the_log_are_counted(
+    dive: tuple[Path, Path, Stations], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, triggers, flown = dive
+    with log.open(newline="") as file:
+        rows = list(csv.reader(file))
+    gappy = tmp_path / "gappy.csv"
+    # Rows every 2.3 s: nothing is interpolated over more than 5 of these.
+    write_csv(gappy, rows[0], [*rows[1:11], *rows[31:-3]])
+
+    record = read_dive_record(gappy, PLAN, RIG, triggers=triggers)
+
+    count = len(flown)
+    assert_alike(record.stations, flown.some(np.r_[0:10, 30 : count - 3]))
+    assert list(record.left_out.values()) == [3, 20]
+    assert record.gaps[0] == pytest.approx((100.0 + 9 * 2.3, 21 * 2.3))
+    told = capsys.readouterr().err
+    assert "a gap of 48.3 s from 120.7 s" in told
+    assert f"20 of {count} triggers ({20 / count:.1%}) in a gap of the log" in told
+    assert f"3 of {count} triggers ({3 / count:.1%}) beyond the log" in told
+
+
+def test_a_log_without_altitude_uses_depth_and_sea_floor(
+    dive: tuple[Path, Path, Stations], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, triggers, flown = dive
+    blind = edited(log, tmp_path / "blind.csv", {"altitude_m": ""})
+
+    record = read_dive_record(blind, PLAN, RIG, triggers=triggers)
+
+    assert_alike(record.stations, flown)  # the test's sea floor is level at the plan's depth
+    assert f"{len(flown)} of {len(flown)} stations have no altitude" in record.notes[0]
+    assert "sea floor at 15 m" in capsys.readouterr().err
+
+
+def test_a_log_without_attitude_is_level_along_its_track(
+    dive: tuple[Path, Path, Stations], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, triggers, flown = dive
+    bare = edited(log, tmp_path / "bare.csv", {"roll_deg": "", "pitch_deg": "", "heading_deg": ""})
+
+    record = read_dive_record(bare, PLAN, RIG, triggers=triggers)
+
+    assert np.all(record.stations.attitude_rad[:, :2] == 0.0)
+    away = record.stations.attitude_rad[:, 2] - flown.attitude_rad[:, 2]
+    inner = np.ones(len(flown), dtype=bool)
+    ends = np.flatnonzero(np.diff(flown.line))
+    inner[[0, *ends, *(ends + 1), -1]] = False  # there the course is that of the way to the next
+    assert np.abs(np.angle(np.exp(1j * away[inner]))).max() < math.radians(6.0)
+    told = capsys.readouterr().err
+    assert "no roll and pitch: taken as level" in told
+    assert "no heading: taken as the course" in told
+
+
+def test_nan_rows_are_left_out_by_their_line(
+    dive: tuple[Path, Path, Stations], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, triggers, flown = dive
+    spoilt = edited(log, tmp_path / "spoilt.csv", {"latitude_deg": "nan"}, slice(12, 14))
+
+    record = read_dive_record(spoilt, PLAN, RIG, triggers=triggers)
+
+    # The log is interpolated over so short a stretch.
+    assert len(record.stations) == len(flown)
+    assert_alike(record.stations.some(np.arange(12)), flown.some(np.arange(12)))
+    assert "line 14: latitude_deg is nan" in capsys.readouterr().err
+
+
+def test_pictures_from_high_above_and_from_below_do_not_count(
+    dive: tuple[Path, Path, Stations], tmp_path: Path
+) -> None:
+    log, triggers, flown = dive
+    high = edited(log, tmp_path / "a.csv", {"altitude_m": "3.01"}, slice(0, 5))
+    strange = edited(high, tmp_path / "b.csv", {"altitude_m": "-0.2"}, slice(5, 7))
+
+    record = read_dive_record(strange, PLAN, RIG, triggers=triggers)
+
+    assert_alike(record.stations, flown.some(np.arange(7, len(flown))))
+    assert sorted(record.left_out.values()) == [2, 5]
+
+
+def test_logs_of_elsewhere_or_another_time_are_refused(
+    dive: tuple[Path, Path, Stations], tmp_path: Path
+) -> None:
+    log, triggers, flown = dive
+    away = edited(log, tmp_path / "away.csv", {"latitude_deg": "32.9236"})
+    with pytest.raises(NavigationError, match=r"11\.1 km from the area of 'known'"):
+        read_dive_record(away, PLAN, RIG, triggers=triggers)
+
+    assert flown.time_s is not None
+    write_triggers(tmp_path / "late.csv", flown.time_s + 1e6)
+    with pytest.raises(NavigationError, match=r"no position at any of .* check the clocks"):
+        read_dive_record(log, PLAN, RIG, triggers=tmp_path / "late.csv")
+    write_triggers(tmp_path / "back.csv", flown.time_s[::-1])
+    with pytest.raises(NavigationError, match=r"line 3: time .* does not follow"):
+        read_dive_record(log, PLAN, RIG, triggers=tmp_path / "back.csv")
+    (tmp_path / "none.csv").write_text("station,when\n0,1\n")
+    with pytest.raises(NavigationError, match="no column time_s or time_utc; it has station"):
+        read_dive_record(log, PLAN, RIG, triggers=tmp_path / "none.csv")
+    (tmp_path / "dates.csv").write_text("time_utc\n2024-05-01T12:00:00Z\n")
+    with pytest.raises(NavigationError, match="has dates and the log has none"):
+        read_dive_record(log, PLAN, RIG, triggers=tmp_path / "dates.csv")
+
+
+def test_dates_of_triggers_count_from_the_log(
+    dive: tuple[Path, Path, Stations], tmp_path: Path
+) -> None:
+    log, _, flown = dive
+    with log.open(newline="") as file:
+        rows = list(csv.reader(file))
+    start = np.datetime64("2024-05-01T12:00:00.000")
+    dates = [f"{start + np.timedelta64(2300 * i, 'ms')}Z" for i in range(len(flown))]
+    dated = tmp_path / "dated.csv"
+    write_csv(
+        dated, ["time_utc", *rows[0][1:]],
+        [[date, *row[1:]] for date, row in zip(dates, rows[1:], strict=True)],
+    )  # fmt: skip
+    lines = flown.line.tolist()
+    write_csv(tmp_path / "t.csv", ["time_utc", "line"], list(zip(dates, lines, strict=True)))
+
+    record = read_dive_record(dated, PLAN, RIG, triggers=tmp_path / "t.csv")
+
+    assert_alike(record.stations, flown)
+
+
+def test_a_simulated_flight_counts_by_its_true_track(tmp_path: Path) -> None:
+    time_s, flown = leaning_flight()
+    log = log_of(flown)
+    believed = replace(log, position_ned=log.position_ned + np.array([3.0, 0.0, 0.5]))
+    write_navigation(tmp_path / "navigation.csv", believed, DATUM)
+    write_triggers(tmp_path / "triggers.csv", time_s, flown.line)
+    track = Trajectory(
+        time_s=time_s,
+        ned_from_body=_poses(log.position_ned, rotation_from_attitude(*log.attitude_rad.T)),
+    )
+    write_track(tmp_path / "truth" / "track.csv", track)
+
+    assert_alike(read_dive_record(tmp_path, PLAN, RIG).stations, flown)
+    drifted = read_dive_record(tmp_path / "navigation.csv", PLAN, RIG).stations
+    assert np.all(drifted.glass_ne[:, 0] - flown.glass_ne[: len(drifted), 0] > 2.9)
+
+
+def _poses(positions: Array, rotation: object) -> object:
+    from scipy.spatial.transform import RigidTransform
+
+    return RigidTransform.from_components(positions, rotation)
+
+
+def test_pictures_off_the_plan_are_lines_of_their_own_when_straight() -> None:
+    """A straight run across, between lines too far off, and single pictures in a turn."""
+    exact = stations_of_plan(PLAN)
+    run = np.column_stack([np.full(5, 3.0), np.linspace(6.0, 8.0, 5)])
+    turning = np.column_stack([np.linspace(20, 21, 4), np.full(4, 20.0)])
+    headings = np.concatenate([np.full(5, math.pi / 2), [0.0, 1.5, 3.0, 4.5]])
+    others = Stations(
+        glass_ne=np.concatenate([exact.glass_ne, run, turning]),
+        altitude_m=np.full(len(exact) + 9, 2.0),
+        attitude_rad=np.concatenate(
+            [exact.attitude_rad, np.column_stack([np.zeros((9, 2)), headings])]
+        ),
+        line=np.full(len(exact) + 9, -1),
+    )
+
+    lines = assign_lines(others, PLAN)
+
+    np.testing.assert_array_equal(lines[: len(exact)], exact.line)
+    np.testing.assert_array_equal(lines[-9:-4], len(LINES))
+    np.testing.assert_array_equal(lines[-4:], -1)
