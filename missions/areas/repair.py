@@ -165,29 +165,28 @@ def _ring_area(ring: Array, name: str, tell: _Teller) -> Polygon | MultiPolygon:
 def _without_spikes(corners: Array, name: str, tell: _Teller) -> Array:
     """Leave out corners where the edge runs straight back over itself."""
     found = corners
-    back, on = np.roll(corners, 1, axis=0) - corners, np.roll(corners, -1, axis=0) - corners
-    if not ((back * on).sum(axis=1) > 0).any():  # no corner is sharp: the usual case, quickly
-        return found
-    i = 0
-    while len(found) >= 3 and i < len(found):
-        before, tip, after = found[i - 1], found[i], found[(i + 1) % len(found)]
-        back, on = before - tip, after - tip
-        shorter, longer = sorted((back, on), key=np.linalg.norm)
-        along = float(shorter @ longer) / float(np.linalg.norm(longer))
-        off = abs(float(shorter[0] * longer[1] - shorter[1] * longer[0])) / float(
-            np.linalg.norm(longer)
-        )
-        if along <= 0 or off >= SAME_PLACE_M:
-            i += 1
-            continue
+    while len(found) >= 3:
+        spikes = _spike_lengths_m(found)
+        if not spikes.any():
+            break
+        tip = int(spikes.argmax())
         tell.warn(
             name,
-            f"a spike of {np.linalg.norm(shorter):.3g} m without width at {tell.at(tip)} is cut "
-            "off",
+            f"a spike of {spikes[tip]:.3g} m without width at {tell.at(found[tip])} is cut off",
         )
-        found = distinct(np.delete(found, i, axis=0), closed=True)
-        i = max(i - 2, 0)
+        found = distinct(np.delete(found, tip, axis=0), closed=True)
     return found
+
+
+def _spike_lengths_m(corners: Array) -> Array:
+    """(N,) lengths of the shorter edges at corners whose two edges lie on one another, else 0."""
+    back = np.roll(corners, 1, axis=0) - corners
+    on = np.roll(corners, -1, axis=0) - corners
+    back_m, on_m = np.linalg.norm(back, axis=1), np.linalg.norm(on, axis=1)
+    off_m = np.abs(back[:, 0] * on[:, 1] - back[:, 1] * on[:, 0]) / np.maximum(back_m, on_m)
+    folded = ((back * on).sum(axis=1) > 0) & (off_m < SAME_PLACE_M)
+    lengths: Array = np.where(folded, np.minimum(back_m, on_m), 0.0)
+    return lengths
 
 
 def _uncrossed(polygon: Polygon, name: str, tell: _Teller) -> Polygon | MultiPolygon:
