@@ -187,18 +187,18 @@ def draw_trade(path: Path, config: SurveyConfig, *, imaging_w: float = 0.0) -> N
     if size > 0.0:
         axes.annotate(
             "", xy=(towards, 0.45 * most), xytext=(towards + math.pi, 0.45 * most),
-            arrowprops={"arrowstyle": "-|>", "color": "0.45", "lw": 1.6},
+            arrowprops={"arrowstyle": "-|>", "color": "0.35", "lw": 1.8}, zorder=5,
         )  # fmt: skip
         axes.text(
-            towards, 0.5 * most, f"current\n{size:.2f} m/s", color="0.35", ha="center", va="center",
-            bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.5},
+            towards, 0.72 * most, f"current\n{size:.2f} m/s", color="0.35", ha="center",
+            va="center", bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.5},
         )  # fmt: skip
     axes.set_title(
         f"Electrical power of {config.vehicle.name}'s thrusters, W, by course\n"
         f"{costs.speed_mps:g} m/s over ground; hotel load {hotel_w:g} W comes on top",
         fontsize=10,
     )
-    axes.legend(loc="lower center", bbox_to_anchor=(0.5, -0.16), ncols=3, fontsize=8, frameon=False)
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, -0.17), ncols=3, fontsize=8, frameon=False)
     figure.savefig(path, dpi=130, metadata={"Software": None} if path.suffix == ".png" else None)
 
 

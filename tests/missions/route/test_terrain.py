@@ -1,0 +1,280 @@
+"""The profile of the glass over a known sea floor."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pyproj import Transformer
+
+from alice_survey.errors import PlanError
+from alice_survey.frames import Array, Datum
+from missions.areas.bathymetry import Bathymetry, read_bathymetry
+from missions.lines.line import Line
+from missions.route.legs import Leg, Route
+from missions.route.terrain import (
+    Reach,
+    TerrainLimits,
+    depth_profile,
+    envelope,
+    highest_floor,
+    line_depths,
+    line_profiles,
+    reach_of,
+    route_profile,
+    terrain_report,
+)
+from tests.oracles_energy import envelope as slow_envelope
+from tests.oracles_energy import highest_within
+
+DATUM = Datum(32.8236, 34.9553)
+REACH = reach_of((0.55, -0.05, 0.08), 0.7, 0.6)
+LIMITS = TerrainLimits(altitude_m=2.0, least_clearance_m=1.0, steepest_rad=math.radians(20.0))
+
+
+def _floor(values: Array, cell_m: float = 0.5) -> Bathymetry:
+    """A raster in UTM whose middle is at the datum."""
+    x, y = Transformer.from_crs("EPSG:4326", "EPSG:32636", always_xy=True).transform(
+        DATUM.longitude_deg, DATUM.latitude_deg
+    )
+    rows, columns = values.shape
+    west, north = x - columns / 2 * cell_m, y + rows / 2 * cell_m
+    return Bathymetry(
+        name="floor.tif",
+        datum=DATUM,
+        crs="EPSG:32636",
+        from_pixel=(cell_m, 0.0, west, 0.0, -cell_m, north),
+        depth_m=values,
+        vertical_datum="not named",
+        reading="depths",
+    )
+
+
+def _eastings(size: int = 160, cell_m: float = 0.5) -> Array:
+    return np.broadcast_to((np.arange(size) + 0.5 - size / 2) * cell_m, (size, size))
+
+
+def _line(start: tuple[float, float], end: tuple[float, float], stations: int = 61) -> Line:
+    return Line(kind="survey", start_ne_m=start, end_ne_m=end, stations=stations)
+
+
+profiles = st.integers(2, 40).flatmap(
+    lambda n: st.tuples(
+        st.lists(st.floats(0.01, 3.0), min_size=n, max_size=n),
+        st.lists(st.floats(1.0, 30.0), min_size=n, max_size=n),
+        st.floats(0.01, 3.0),
+    )
+)
+
+
+@given(profiles)
+@settings(max_examples=60, deadline=None)
+def test_the_envelope_is_the_deepest_that_keeps_depth_and_slope(
+    case: tuple[list[float], list[float], float],
+) -> None:
+    steps, wanted, slope = case
+    along, wanted_m = np.cumsum(steps), np.array(wanted)
+
+    found = envelope(along, wanted_m, slope)
+
+    np.testing.assert_allclose(found, slow_envelope(along, wanted_m, slope), atol=1e-9)
+    assert np.all(found <= wanted_m + 1e-9)
+    assert np.all(np.abs(np.diff(found)) <= slope * np.diff(along) + 1e-9)
+    # Each sample is held by a wanted depth: none could be deeper by itself.
+    held = np.isclose(found, wanted_m, atol=1e-9)
+    reached = (
+        np.abs(found[:, None] - found[None]) >= slope * np.abs(along[:, None] - along[None]) - 1e-9
+    )
+    assert np.all((reached & held[None]).any(axis=1))
+
+
+def test_a_level_floor_is_followed_at_the_altitude() -> None:
+    floor = _floor(np.full((160, 160), 12.0))
+    profile = line_profiles([_line((0.0, -20.0), (0.0, 20.0))], floor, REACH, LIMITS)[0]
+    np.testing.assert_allclose(profile.depth_m, 10.0, atol=1e-12)
+    np.testing.assert_allclose(profile.altitude_m, 2.0, atol=1e-12)
+    np.testing.assert_allclose(profile.slopes_rad, 0.0, atol=1e-12)
+
+
+def test_a_slope_is_followed_above_its_highest_within_reach() -> None:
+    """Along a slope of 0.2 the hull's nose or tail is over the highest floor."""
+    floor = _floor(14.0 - 0.2 * _eastings())  # shoaling to the east
+    up, down = line_profiles(
+        [_line((0.0, -15.0), (0.0, 15.0)), _line((0.0, 15.0), (0.0, -15.0))], floor, REACH, LIMITS
+    )
+    # UTM's grid is turned by 1.1 deg and its scale is 0.9996 to 1 here.
+    assert up.altitude_m == pytest.approx(2.0 + 0.2 * REACH.ahead_m, abs=0.02)
+    assert down.altitude_m == pytest.approx(2.0 + 0.2 * REACH.astern_m, abs=0.02)
+    assert up.clearance_m == pytest.approx(2.0, abs=1e-9)
+    assert np.degrees(up.slopes_rad) == pytest.approx(-math.degrees(math.atan(0.2)), abs=0.05)
+    assert np.degrees(down.slopes_rad) == pytest.approx(math.degrees(math.atan(0.2)), abs=0.05)
+
+
+def test_before_a_cliff_the_glass_climbs_at_the_steepest_slope() -> None:
+    cliff = np.where(_eastings() > 0.0, 8.0, 14.0)
+    floor = _floor(cliff)
+    profile = line_profiles([_line((0.0, -30.0), (0.0, 30.0), stations=121)], floor, REACH, LIMITS)[
+        0
+    ]
+    east = profile.along_m - 30.0
+    steep = math.tan(LIMITS.steepest_rad)
+    top = east > -REACH.ahead_m + 0.6
+    np.testing.assert_allclose(profile.depth_m[top], 6.0, atol=1e-9)
+    far = east < -REACH.ahead_m - 6.0 / steep - 1.0
+    assert far.sum() > 5
+    np.testing.assert_allclose(profile.depth_m[far], 12.0, atol=1e-9)
+    climb = (profile.depth_m > 6.0 + 1e-9) & (profile.depth_m < 12.0 - 1e-9)
+    assert climb.sum() > 20
+    assert np.abs(profile.slopes_rad).max() == pytest.approx(LIMITS.steepest_rad, abs=1e-9)
+    assert profile.clearance_m.min() >= 2.0 - 1e-9
+    assert profile.altitude_m.max() > 7.0  # at the foot of the cliff
+
+
+@pytest.mark.parametrize(("rough_m", "off_m"), [(0.02, 0.01), (0.4, 0.3)])
+def test_the_highest_floor_is_found_by_looking_everywhere(rough_m: float, off_m: float) -> None:
+    """Two places a cell may pass beside a peak, by less than the floor changes in half a cell."""
+    rng = np.random.default_rng(7)
+    floor = _floor(12.0 - 0.1 * _eastings() + rng.normal(0.0, rough_m, (160, 160)))
+    places, headings = rng.uniform(-10, 10, (6, 2)), rng.uniform(0, 6.28, 6)
+
+    found = highest_floor(floor, places, headings, REACH)
+
+    exact = [
+        highest_within(
+            floor.depth_at, place.tolist(), heading, REACH.ahead_m, REACH.astern_m,
+            REACH.beside_m, 0.05,
+        )
+        for place, heading in zip(places, headings, strict=True)
+    ]  # fmt: skip
+    np.testing.assert_allclose(found, exact, atol=off_m)
+
+
+def test_clearance_holds_between_stations_over_a_rough_floor() -> None:
+    """Brute force: every 2 cm of the way, straight between stations, over the floor below it."""
+    rng = np.random.default_rng(8)
+    coarse = rng.uniform(8.0, 14.0, (12, 12))
+    rows = np.linspace(0, 11, 160)
+    smooth = np.array([np.interp(rows, np.arange(12), column) for column in coarse.T]).T
+    smooth = np.array([np.interp(rows, np.arange(12), row) for row in smooth])
+    floor = _floor(smooth)
+    for heading in (0.0, 0.7, 2.0):
+        ahead = np.array([math.cos(heading), math.sin(heading)])
+        line = _line(tuple(-25 * ahead), tuple(25 * ahead), stations=101)
+        profile = line_profiles([line], floor, REACH, LIMITS)[0]
+        fine = np.arange(0.0, 50.0, 0.02)
+        glass = np.interp(fine, profile.along_m, profile.depth_m)
+        places = -25 * ahead + fine[:, None] * ahead
+        clearance = floor.depth_at(places) - glass
+        assert clearance.min() >= LIMITS.altitude_m - 0.02
+        assert np.abs(profile.slopes_rad).max() <= LIMITS.steepest_rad + 1e-9
+        assert clearance.min() < LIMITS.altitude_m + 0.6  # and it is not simply far above
+
+
+def test_limits_that_cannot_be_kept_name_the_place() -> None:
+    values = np.full((160, 160), 12.0)
+    values[80:84, 90:94] = np.nan
+    with pytest.raises(PlanError, match=r"floor\.tif does not know.* near line 1, .* m along"):
+        line_depths(
+            [_line((20.0, -20.0), (20.0, 20.0)), _line((-1.0, -20.0), (-1.0, 20.0))],
+            _floor(values), REACH, LIMITS,
+        )  # fmt: skip
+    shoal = np.full((160, 160), 12.0)
+    shoal[:, 100:110] = 1.5
+    with pytest.raises(PlanError, match=r"line 0, .* m along: the glass would be 0\.50 m above"):
+        line_depths([_line((0.0, -20.0), (0.0, 20.0))], _floor(shoal), REACH, LIMITS)
+    with pytest.raises(PlanError, match=r"altitude_m 0\.8 is less than least_clearance_m 1"):
+        TerrainLimits(altitude_m=0.8, least_clearance_m=1.0, steepest_rad=0.3)
+
+
+def test_depths_are_one_a_station() -> None:
+    lines = [_line((0.0, -20.0), (0.0, 20.0), 81), _line((1.0, 20.0), (1.0, -20.0), 7)]
+    depths = line_depths(lines, _floor(14.0 + 0.05 * _eastings()), REACH, LIMITS)
+    assert [len(depth) for depth in depths] == [81, 7]
+
+
+def test_stations_far_apart_see_all_between_them() -> None:
+    """A ridge between two stations 10 m apart is flown over by both."""
+    ridge = np.where(np.abs(_eastings()) < 1.0, 9.0, 12.0)
+    sparse = line_profiles([_line((0.0, -15.0), (0.0, 15.0), 4)], _floor(ridge), REACH, LIMITS)[0]
+    np.testing.assert_allclose(sparse.depth_m, [10.0, 7.0, 7.0, 10.0], atol=1e-9)
+
+
+def test_a_route_is_followed_through_its_turns() -> None:
+    floor = _floor(14.0 - 0.1 * _eastings())
+    there = Leg(
+        start_ne_m=(0.0, -10.0), heading_rad=math.pi / 2, length_m=20.0, curvature_per_m=0.0, line=0
+    )
+    turn = Leg(
+        start_ne_m=there.end_ne_m, heading_rad=math.pi / 2, length_m=math.pi / 2,
+        curvature_per_m=2.0, line=-1,
+    )  # fmt: skip
+    back = replace(there, start_ne_m=turn.end_ne_m, heading_rad=turn.end_heading_rad, line=1)
+    route = Route(legs=(there, turn, back))
+    profile = route_profile(route, floor, REACH, LIMITS, 0.25)
+    assert profile.along_m[-1] == pytest.approx(route.length_m)
+    assert np.abs(profile.slopes_rad).max() <= LIMITS.steepest_rad + 1e-9
+    assert profile.clearance_m.min() == pytest.approx(2.0, abs=1e-9)
+
+
+def test_the_report_names_where_pictures_are_taken_from_too_high(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    lines = [_line((5.0, -30.0), (5.0, 30.0), 121), _line((0.0, -30.0), (0.0, 30.0), 121)]
+    values = np.full((160, 160), 9.0)
+    values[76:90, :80] = 14.0  # a hole west of the middle, under the second line
+    floor = _floor(values)
+    profiles = line_profiles(lines, floor, REACH, LIMITS)
+
+    text, data = terrain_report(
+        lines, profiles, LIMITS, relief_m=0.35, spacing_m=1.0, step_m=0.46,
+        extent_m=lambda altitude: (0.71 * altitude, 0.58 * altitude),
+    )  # fmt: skip
+
+    assert data["highest"]["line"] == 1
+    assert data["altitude_m"][0] == pytest.approx(2.0, abs=1e-9)
+    assert 2.4 < data["altitude_m"][1] <= 7.0
+    assert data["least_side_overlap"] == pytest.approx(1 - 1.0 / 1.42, abs=1e-9)
+    assert 70 < data["steepest_floor_deg"] < 90
+    assert data["steepest_deg"] == pytest.approx(20.0, abs=1e-6)
+    assert data["lines"][0]["raised_stations"] == 0 < data["lines"][1]["raised_stations"]
+    assert "line 1, " in capsys.readouterr().err
+    assert "stations higher for the slope" in text
+    # Allowing for that relief, nothing is to be warned of.
+    terrain_report(
+        lines, profiles, LIMITS, relief_m=10.0, spacing_m=1.0, step_m=0.46,
+        extent_m=lambda altitude: (0.71 * altitude, 0.58 * altitude),
+    )  # fmt: skip
+    assert not capsys.readouterr().err
+
+
+def test_the_reach_is_of_hull_or_pictures_whichever_is_farther() -> None:
+    near = reach_of((0.55, -0.05, 0.08), 0.1, 0.1)
+    far = reach_of((0.55, -0.05, 0.08), 2.0, 3.0)
+    assert near == Reach(
+        ahead_m=pytest.approx(0.3045), astern_m=pytest.approx(1.284), beside_m=pytest.approx(0.276)
+    )
+    assert far == Reach(ahead_m=3.0, astern_m=3.0, beside_m=2.0)
+
+
+def test_a_real_sea_floor_is_followed(shared_data: Path) -> None:
+    path = next((shared_data / "bathymetry").glob("*.bag"))
+    lon, lat = Transformer.from_crs("EPSG:32602", "EPSG:4326", always_xy=True).transform(
+        621_500.0, 7_244_800.0
+    )
+    datum = Datum(lat, lon)
+    floor = read_bathymetry(path, datum, bounds_ne=(-120.0, -120.0, 120.0, 120.0))
+    lines = [_line((north, -100.0), (north, 100.0), 401) for north in np.arange(-3.0, 4.0).tolist()]
+    found = line_profiles(lines, floor, REACH, LIMITS)
+    for line, profile in zip(lines, found, strict=True):
+        fine = np.linspace(0.0, 200.0, 4001)
+        places = np.column_stack([np.full(4001, line.start_ne_m[0]), fine - 100.0])
+        clearance = floor.depth_at(places) - np.interp(fine, profile.along_m, profile.depth_m)
+        assert 2.0 - 0.01 <= clearance.min() < 2.3
+        assert np.abs(profile.slopes_rad).max() <= LIMITS.steepest_rad + 1e-9
+    whole = depth_profile(
+        floor, found[0].along_m, lines[0].stations_ne, np.full(401, math.pi / 2), REACH, LIMITS, "x"
+    )
+    np.testing.assert_array_equal(whole.depth_m, found[0].depth_m)
