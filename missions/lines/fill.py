@@ -1,7 +1,346 @@
-"""Fill lines."""
+"""Fill lines: short lines that see what a pattern cannot, or what a dive left out.
+
+What must be seen is cut into small patches. Patches near one another are a cluster. For a cluster
+lines are tried along the survey lines, across them, along the edges of the allowed area near by and
+along the cluster itself, at many offsets; the line that sees most for its length is flown, until
+next to nothing is left (the greedy rule for covering a set; V. Chvatal 1979).
+"""
+
+import heapq
+import math
+from collections.abc import Sequence
 
 import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from shapely.geometry import MultiPolygon
+
+from alice_survey.frames import Array
+from missions.areas.area import Area
+from missions.lines.line import Line
+from missions.lines.pattern import Pattern
+from missions.lines.rows import rooms, to_uv
+from missions.lines.site import Site, edges_of
+from missions.lines.unseen import (
+    LENGTH,
+    LINES,
+    PICTURES,
+    WIDTH,
+    U,
+    V,
+    all_patches,
+    pictures_of,
+    unseen,
+)
+
+LEFT_SHARE = 0.0003
+"""Share of the area that may be left: the least share that matters where 99.9 % is asked for."""
+_HOP_STEPS = 10.0
+"""A line more costs about as much as this many steps of line more. Chosen: with pictures half a
+metre apart, a stop and two turns at 0.2 m/s."""
+_OFFSETS = 16
+_EDGES = 4
+_TINY_M = 1e-9
 
 
-def fill_table(*a):
-    return np.empty((0, 6))
+def fill_table(
+    site: Site,
+    heading_rad: float,
+    pattern: Pattern,
+    pieces: Array,
+    offsets: Array,
+    cuts: Array,
+) -> Array:
+    """Lines that see what the rows of a pattern cannot.
+
+    Args:
+        site: the area.
+        heading_rad: of the rows.
+        pattern: what lines see. Of one that leaves gaps of itself nothing is filled.
+        pieces: from `rows.lay_rows`.
+        offsets: of the rows.
+        cuts: from `rows.lay_rows`.
+
+    Returns:
+        (F, 6) north and east of start and end, course, steps.
+    """
+    if len(cuts) == 0 or _has_gaps(pattern):
+        return np.empty((0, 6))
+    survey = to_uv(site.survey, heading_rad)
+    patches = unseen(survey, pattern, offsets, pieces, cuts, _finest_m(pattern))
+    left_m2 = LEFT_SHARE * site.area_m2
+    return _cover(patches, heading_rad, site.allowed, pattern, left_m2)
+
+
+def lines_over(pieces: MultiPolygon, area: Area, pattern: Pattern) -> list[Line]:
+    """Lay short lines that see given pieces as often as a pattern asks for.
+
+    Args:
+        pieces: what must be seen; x = north, y = east, metres.
+        area: where lines may be.
+        pattern: what lines see, and how often a place must be seen.
+
+    Returns:
+        Lines of kind fill, in no special order (`lay.ordered` puts them in one); none over what
+        cannot be seen from the allowed area.
+    """
+    if pieces.is_empty:
+        return []
+    edges = edges_of(pieces)
+    spans = edges[:, 2:] - edges[:, :2]
+    longest = spans[int(np.argmax(np.hypot(*spans.T)))]
+    heading_rad = math.atan2(longest[1], longest[0])
+    patches = all_patches(to_uv(edges, heading_rad), _finest_m(pattern))
+    left_m2 = LEFT_SHARE * float(pieces.area)
+    table = _cover(patches, heading_rad, edges_of(area.allowed), pattern, left_m2)
+    places = (np.round(table[:, :4], 12) + 0.0).tolist()
+    return [
+        Line(kind="fill", start_ne_m=(p[0], p[1]), end_ne_m=(p[2], p[3]), stations=int(n) + 1)
+        for p, n in zip(places, table[:, 5].tolist(), strict=True)
+    ]
+
+
+def _has_gaps(pattern: Pattern) -> bool:
+    across = 2 * pattern.half_across_m < pattern.spacing_m * (1 - _TINY_M)
+    return across or 2 * pattern.half_along_m < pattern.step_m * (1 - _TINY_M)
+
+
+def _finest_m(pattern: Pattern) -> float:
+    """Of patches: a few to what a line sees."""
+    return min(pattern.half_across_m, pattern.half_along_m) / 4
+
+
+def _cover(
+    patches: Array, heading_rad: float, allowed: Array, pattern: Pattern, left_m2: float
+) -> Array:
+    """Lines, (F, 6), that see patches, (N, 6) in the frame of lines of a heading."""
+    areas = patches[:, LENGTH] * patches[:, WIDTH]
+    total = float(areas.sum())
+    if total <= left_m2:
+        return np.empty((0, 6))
+    size_m = 2 * max(pattern.half_across_m, pattern.half_along_m)
+    clusters = _clusters(patches[:, [U, V]], size_m)
+    queue: list[tuple[float, int, Array]] = []
+    courses = []
+    for number, cluster in enumerate(clusters):
+        turned = to_uv(allowed, heading_rad)
+        courses.append(heading_rad + _directions(patches[cluster], turned, size_m))
+        _offer(queue, number, patches[cluster], heading_rad, courses[-1], allowed, pattern)
+    lines = []
+    while queue and total > left_m2:
+        _, number, line = heapq.heappop(queue)
+        chosen = patches[clusters[number]]
+        total -= float((chosen[:, LENGTH] * chosen[:, WIDTH]).sum())
+        counts = _seen_by(chosen, _line_uv(line, heading_rad), pattern)
+        if counts.any():
+            lines.append(line)
+            patches[clusters[number], LINES] += counts > 0
+            patches[clusters[number], PICTURES] += counts
+            lacking = patches[clusters[number], LINES] < pattern.passes
+            lacking |= patches[clusters[number], PICTURES] < pattern.passes * pattern.pictures
+            clusters[number] = clusters[number][lacking]
+        left = patches[clusters[number]]
+        total += float((left[:, LENGTH] * left[:, WIDTH]).sum())
+        if counts.any() and len(left):
+            _offer(queue, number, left, heading_rad, courses[number], allowed, pattern)
+    return np.array(lines) if lines else np.empty((0, 6))
+
+
+def _offer(
+    queue: list[tuple[float, int, Array]],
+    number: int,
+    patches: Array,
+    heading_rad: float,
+    courses: Array,
+    allowed: Array,
+    pattern: Pattern,
+) -> None:
+    """Queue the best line for a cluster, if there is any."""
+    best_score, best = 0.0, np.empty(0)
+    places = _turned(patches[:, [U, V]], -heading_rad)
+    for course in courses.tolist():
+        # A patch counts as seen where its middle and the most of it are: half its smaller side.
+        local = np.concatenate(
+            [_turned(places, course), (patches[:, LENGTH] * patches[:, WIDTH])[:, None]], axis=1
+        )
+        reach = _patch_reach(patches, heading_rad - course)
+        score, offset, begin, end, steps = _best_line(
+            np.ascontiguousarray(local[np.argsort(local[:, 0])]),
+            float(reach[0]),
+            float(reach[1]),
+            _try_offsets(local[:, 1], pattern.half_across_m - float(reach[1])),
+            to_uv(allowed, course),
+            pattern.half_across_m,
+            pattern.half_along_m,
+            pattern.overhang_m,
+            pattern.step_m,
+            max(1, pattern.pictures - 1),
+        )
+        if score > best_score:
+            ends = _turned(np.array([[begin, offset], [end, offset]]), -course).ravel()
+            best_score, best = score, np.array([*ends, course, steps])
+    if best_score > 0.0:
+        heapq.heappush(queue, (-best_score, number, best))
+
+
+def _try_offsets(v: Array, half_m: float) -> Array:
+    """Offsets from which lines may see many patches: sides of their swath at patches, and these."""
+    picked = np.linspace(0, len(v) - 1, min(_OFFSETS, len(v))).round().astype(np.intp)
+    spread = np.sort(v)[picked]
+    half = max(half_m, 0.0) - _TINY_M
+    return np.unique(np.concatenate([spread - half, spread, spread + half]))
+
+
+def _patch_reach(patches: Array, turn_rad: float) -> Array:
+    """Half the size of the largest patch along and across lines turned against it, (2,)."""
+    c, s = abs(math.cos(turn_rad)), abs(math.sin(turn_rad))
+    length, width = patches[:, LENGTH] / 2, patches[:, WIDTH] / 2
+    return np.array([float((c * length + s * width).max()), float((s * length + c * width).max())])
+
+
+def _turned(points: Array, heading_rad: float) -> Array:
+    """Points (N, 2) in the frame of lines of a heading."""
+    c, s = math.cos(heading_rad), math.sin(heading_rad)
+    result: Array = points @ np.array([[c, -s], [s, c]])
+    return result
+
+
+def _line_uv(line: Array, heading_rad: float) -> Array:
+    """Ends of a line, (4,), in the frame of lines of a heading, and its steps, (5,)."""
+    return np.append(_turned(line[:4].reshape(2, 2), heading_rad).ravel(), line[5])
+
+
+def _seen_by(patches: Array, line: Array, pattern: Pattern) -> NDArray[np.int64]:
+    """How many pictures of a line see the middles of patches, (N,)."""
+    ahead = math.atan2(line[3] - line[1], line[2] - line[0])
+    local = _turned(patches[:, [U, V]] - line[:2], ahead)
+    length = math.hypot(line[2] - line[0], line[3] - line[1])
+    near = np.abs(local[:, 1]) <= pattern.half_across_m + _TINY_M
+    counts = np.zeros(len(patches), np.int64)
+    for i in np.flatnonzero(near).tolist():
+        counts[i] = pictures_of(0.0, length, line[4], local[i, 0], pattern.half_along_m)
+    return counts
+
+
+def _clusters(points: Array, size_m: float) -> list[NDArray[np.intp]]:
+    """Indices of points that are joined by cells of a grid that touch."""
+    cell = np.floor(points / size_m).astype(np.int64)
+    cells, owner = np.unique(cell, axis=0, return_inverse=True)
+    owner = owner.ravel()
+    number = {(int(a), int(b)): i for i, (a, b) in enumerate(cells)}
+    group = np.full(len(cells), -1)
+    groups = 0
+    for first in range(len(cells)):
+        if group[first] >= 0:
+            continue
+        group[first], todo = groups, [first]
+        while todo:
+            a, b = (int(x) for x in cells[todo.pop()])
+            for c in (-1, 0, 1):
+                for d in (-1, 0, 1):
+                    other = number.get((a + c, b + d), -1)
+                    if other >= 0 and group[other] < 0:
+                        group[other] = groups
+                        todo.append(other)
+        groups += 1
+    order = np.argsort(group[owner], kind="stable")
+    return np.split(order, np.searchsorted(group[owner][order], np.arange(1, groups)))
+
+
+def _directions(patches: Array, allowed: Array, near_m: float) -> Array:
+    """Directions, from the frame's, in which lines over patches may be good; radians."""
+    low = patches[:, [U, V]].min(axis=0) - near_m
+    high = patches[:, [U, V]].max(axis=0) + near_m
+    directions = [0.0, math.pi / 2]
+    if len(patches) > 1:
+        spread = np.cov(patches[:, [U, V]].T, aweights=patches[:, LENGTH] * patches[:, WIDTH])
+        directions.append(math.atan2(2 * spread[0, 1], spread[0, 0] - spread[1, 1]) / 2)
+    beside = (np.minimum(allowed[:, :2], allowed[:, 2:]) < high).all(axis=1)
+    beside &= (np.maximum(allowed[:, :2], allowed[:, 2:]) > low).all(axis=1)
+    spans = np.clip(allowed[beside, 2:], low, high) - np.clip(allowed[beside, :2], low, high)
+    along = np.arctan2(*(allowed[beside, 2:] - allowed[beside, :2]).T[::-1]) % math.pi
+    longest = np.argsort(-np.hypot(*spans.T), kind="stable")[:_EDGES]
+    return np.array(_different([*directions, *along[longest].tolist()]))
+
+
+def _different(directions: Sequence[float]) -> list[float]:
+    """Directions of lines that differ by more than a hundredth of a radian."""
+    kept: list[float] = []
+    for direction in directions:
+        apart = [abs((direction - k + math.pi / 2) % math.pi - math.pi / 2) for k in kept]
+        if all(a > 0.01 for a in apart):
+            kept.append(direction)
+    return kept
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _best_line(
+    points: Array,
+    reach_along: float,
+    reach_across: float,
+    offsets: Array,
+    allowed: Array,
+    half_across: float,
+    half_along: float,
+    overhang: float,
+    step: float,
+    least_steps: int,
+) -> tuple[float, float, float, float, int]:
+    """The line that sees most for its length.
+
+    Args:
+        points: (N, 3) u, v and worth of places, by u.
+        reach_along: half the size of what a point stands for, along.
+        reach_across: likewise across.
+        offsets: (O,) ascending, to try.
+        allowed: (A, 4) u, v of the edges of the allowed area.
+        half_across: what a line sees.
+        half_along: what a picture sees.
+        overhang: of a line over what it must see.
+        step: most from picture to picture.
+        least_steps: of a line.
+
+    Returns:
+        Worth per metre (0: no line sees anything), offset, begin, end, steps.
+    """
+    begins, counts, found = rooms(allowed, offsets)
+    hop = _HOP_STEPS * step
+    best, best_v, best_begin, best_end, best_steps = 0.0, 0.0, 0.0, 0.0, 0
+    for i in range(offsets.size):
+        v = offsets[i]
+        for r in range(begins[i], begins[i] + counts[i]):
+            room_begin, room_end = found[r, 0], found[r, 1]
+            if room_end - room_begin < 1e-3:
+                continue
+            first, last, gain = np.nan, np.nan, 0.0
+            for k in range(points.shape[0] + 1):
+                ends = k == points.shape[0]
+                if not ends:
+                    if abs(points[k, 1] - v) > max(half_across - reach_across, 0.0) + _TINY_M:
+                        continue
+                    u = points[k, 0]
+                    if u < room_begin - half_along or u > room_end + half_along:
+                        continue
+                    if gain == 0.0:
+                        first = u
+                    elif u - last > hop:
+                        ends = True
+                if ends and gain > 0.0:
+                    begin = max(room_begin, first - reach_along - overhang)
+                    end = min(room_end, last + reach_along + overhang)
+                    if end < begin:
+                        begin = end = min(max((begin + end) / 2, room_begin), room_end)
+                    steps = max(least_steps, math.ceil((end - begin) / step - _TINY_M))
+                    lack = steps * step - (end - begin)
+                    begin = max(room_begin, begin - lack / 2)
+                    end = min(room_end, begin + steps * step)
+                    begin = max(room_begin, end - steps * step)
+                    score = gain / (end - begin + hop)
+                    if score > best:
+                        best, best_v = score, v
+                        best_begin, best_end, best_steps = begin, end, steps
+                    first, gain = points[min(k, points.shape[0] - 1), 0], 0.0
+                if k < points.shape[0]:
+                    last = points[k, 0]
+                    gain += points[k, 2]
+    return best, best_v, best_begin, best_end, best_steps

@@ -155,6 +155,24 @@ def hops_j(prices: Prices, leave: Array, enter: Array, ways_m: Array) -> Array:
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
+def chain_j(prices: Prices, leave: Array, enter: Array, ways_m: Array) -> Array:
+    """Energies of single hops, (N,) joules; arguments (N, 3), (N, 3) and (N,), as of `hops_j`."""
+    energies = np.empty(leave.shape[0])
+    for i in range(leave.shape[0]):
+        energies[i] = hop_j(
+            prices,
+            leave[i, 0],
+            leave[i, 1],
+            leave[i, 2],
+            enter[i, 0],
+            enter[i, 1],
+            enter[i, 2],
+            ways_m[i],
+        )
+    return energies
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
 def flight_parts_j(prices: Prices, home: Array, lines: Array, ways_m: Array) -> Array:
     """Energy of flying lines in order, from home and home again.
 

@@ -7,6 +7,7 @@ lines and cross lines are one tour, from home and home again.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -107,6 +108,35 @@ def lay_lines(
     return result.lines()
 
 
+def ordered(
+    lines: Sequence[Line], ways: Ways, costs: Costs, home_ne: tuple[float, float]
+) -> list[Line]:
+    """Any lines in the order, and each in the direction, that costs least.
+
+    Raises:
+        PlanError: there is no way inside the allowed area between two of them.
+    """
+    if not lines:
+        return []
+    ends = np.array([(*line.start_ne_m, *line.end_ne_m) for line in lines])
+    prices, home = hops.prices_of(costs), np.array(home_ne, dtype=np.float64)
+    corners, inner = np.zeros((len(lines), cells.CORNERS, 3)), np.full((len(lines), 4), np.inf)
+    for i, line in enumerate(lines):
+        corners[i] = [[*line.start_ne_m, line.heading_rad]] * cells.CORNERS
+        corners[i, 1] = [*line.end_ne_m, line.heading_rad + math.pi]
+        inner[i, :2] = [hops.line_j(prices, line.length_m, x) for x in corners[i, :2, 2]]
+    exits = np.tile([1, 0, 1, 0], (len(lines), 1))
+    order = _tour(corners, exits, inner, ways, prices, home, None, len(lines))
+    back = order % cells.CORNERS == 1
+    table = ends[order // cells.CORNERS]
+    table = np.where(back[:, None], table[:, [2, 3, 0, 1]], table)
+    ways_m = ways_between(table, home, ways)
+    if np.isinf(ways_m).any():
+        raise _not_connected(table, home, ways_m)
+    chosen = zip(order.tolist(), back.tolist(), strict=True)
+    return [lines[i // 4].reversed() if b else lines[i // 4] for i, b in chosen]
+
+
 def check_size(area: Area, pattern: Pattern, most_stations: int = MOST_STATIONS) -> None:
     """Refuse an area that is much too large before lines are laid.
 
@@ -184,7 +214,7 @@ def laid(
 
 
 def survey_pieces(site: Site, heading_rad: float, pattern: Pattern) -> tuple[Array, Array, Array]:
-    """Pieces of the rows over the survey area, offsets of the rows, and cuts: see `rows.lay_rows`."""
+    """Pieces of the rows over the survey area, offsets of the rows, and cuts; `rows.lay_rows`."""
     survey = rows.to_uv(site.survey, heading_rad)
     allowed = rows.to_uv(site.allowed, heading_rad)
     low, high = float(survey[:, 1].min()), float(survey[:, 1].max())
@@ -397,8 +427,40 @@ def _inserted(
     ways: Ways,
     prices: hops.Prices,
 ) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
-    """Fly fill lines, (F, 6) a table with steps, each where its detour costs least."""
+    """Fly fill lines, (F, 6) a table and steps, each where its detour costs least."""
+    ways_m = ways_between(table, home, ways)
+    at_home = np.array([[*home, np.nan]])
+    for fill in fills:
+        leave = np.concatenate([at_home, table[:, 2:5]])
+        enter = np.concatenate([table[:, [0, 1, 4]], at_home])
+        over_j = hops.chain_j(prices, leave, enter, ways_m)
+        both = np.array([fill[:5], [*fill[2:4], *fill[:2], fill[4] + math.pi]])
+        begins, ends = np.ascontiguousarray(both[:, [0, 1, 4]]), np.ascontiguousarray(both[:, 2:5])
+        # No detour is less than one by straight ways, so the search ends early.
+        least_j = hops.hops_j(prices, leave, begins, _straights(leave, begins))
+        least_j = least_j + hops.hops_j(prices, ends, enter, _straights(ends, enter)).T
+        least_j -= over_j[:, None]
+        best_j, best, place, best_m = np.inf, both[0], 0, np.zeros(2)
+        for index in np.argsort(least_j, axis=None, kind="stable").tolist():
+            i, turned = divmod(index, 2)
+            if least_j[i, turned] >= best_j:
+                break
+            there, then = np.stack([leave[i], ends[turned]]), np.stack([begins[turned], enter[i]])
+            detour_m = _way_lengths(there[:, :2], then[:, :2], ways)
+            detour_j = hops.chain_j(prices, there, then, detour_m).sum() - over_j[i]
+            if detour_j < best_j:
+                best_j, best, place, best_m = detour_j, both[turned], i, detour_m
+        table = np.insert(table, place, best, axis=0)
+        steps = np.insert(steps, place, int(fill[5]))
+        kinds = np.insert(kinds, place, FILL)
+        ways_m = np.concatenate([ways_m[:place], best_m, ways_m[place + 1 :]])
     return table, steps, kinds
+
+
+def _straights(a: Array, b: Array) -> Array:
+    """Distances, (N, M), between places."""
+    distances: Array = np.hypot(a[:, None, 0] - b[:, 0], a[:, None, 1] - b[:, 1])
+    return distances
 
 
 def _not_connected(table: Array, home: Array, ways_m: Array) -> PlanError:
