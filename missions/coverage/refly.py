@@ -15,6 +15,7 @@ from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.holes import Hole
 from missions.coverage.stations import stations_of_plan
 from missions.lines.fill import lines_over
+from missions.lines.lay import ordered
 from missions.plan_file import Plan
 from missions.route.dives import split_dives
 from missions.route.energy import usable_wh, vehicle_costs
@@ -45,10 +46,11 @@ def refly_plan(
     lines = lines_over(area.survey, area, flown.pattern)
     if not lines:
         raise PlanError(f"no line inside the allowed area sees any of the {len(holes)} holes")
-    costs = vehicle_costs(config)
+    costs, ways = vehicle_costs(config), Ways(area.allowed)
+    lines = ordered(lines, ways, costs, plan.home_ne_m)
     dives = split_dives(
         lines,
-        ways=Ways(area.allowed),
+        ways=ways,
         costs=costs,
         home_ne=plan.home_ne_m,
         turn_radius_m=plan.turn_radius_m,

@@ -17,12 +17,11 @@ from camera_calib.rig import design_rig
 from missions.coverage.dives import read_dive_record
 from missions.coverage.passes import assign_lines
 from missions.coverage.stations import Stations, stations_of_plan
-from missions.footprint import glass_point_cam
-from missions.navigation import NavigationLog, write_navigation
+from missions.navigation import write_navigation
+from tests.missions.coverage.logs import log_of, write_triggers
 from tests.oracles_coverage import DATUM, area_of, lawnmower, plan_of
 
 RIG = design_rig(CameraConfig(), WaterConfig())
-LEVER = RIG.body_from_cam("left").apply(glass_point_cam(RIG.cameras["left"]))
 LINES = lawnmower(6.0, 3.0, 1.0, 0.46, over_m=0.5)
 PLAN = plan_of(area_of(shapely.box(0, 0, 6, 3)), LINES)
 DEPTH_M = PLAN.seafloor_depth_m - PLAN.altitude_m
@@ -44,38 +43,13 @@ def leaning_flight() -> tuple[Array, Stations]:
     return time_s, flown
 
 
-def log_of(flown: Stations) -> NavigationLog:
-    """The navigation log of a body whose left port's glass is at the stations."""
-    attitude, count = flown.attitude_rad, len(flown)
-    glass = np.column_stack([flown.glass_ne, PLAN.seafloor_depth_m - flown.altitude_m])
-    ones = np.ones(count)
-    assert flown.time_s is not None
-    return NavigationLog(
-        time_s=flown.time_s,
-        position_ned=glass - rotation_from_attitude(*attitude.T).apply(LEVER),
-        attitude_rad=attitude,
-        altitude_m=flown.altitude_m,
-        sigma_horizontal_m=0.1 * ones,
-        sigma_depth_m=0.01 * ones,
-        sigma_attitude_rad=0.001 * ones,
-        sigma_heading_rad=0.01 * ones,
-        sigma_altitude_m=0.02 * ones,
-    )
-
-
 @pytest.fixture
 def dive(tmp_path: Path) -> tuple[Path, Path, Stations]:
     """A navigation CSV, its triggers, and the stations they were made of."""
     time_s, flown = leaning_flight()
-    write_navigation(tmp_path / "nav.csv", log_of(flown), DATUM)
+    write_navigation(tmp_path / "nav.csv", log_of(flown, PLAN, RIG), DATUM)
     write_triggers(tmp_path / "triggers.csv", time_s, flown.line)
     return tmp_path / "nav.csv", tmp_path / "triggers.csv", flown
-
-
-def write_triggers(path: Path, time_s: Array, line: Array | None = None) -> None:
-    header = ("station", "time_s") if line is None else ("station", "time_s", "line")
-    columns = [np.arange(len(time_s)), time_s] + ([] if line is None else [line])
-    write_csv(path, header, [list(row) for row in zip(*columns, strict=True)])
 
 
 def edited(path: Path, out: Path, change: dict[str, str], rows: slice = slice(None)) -> Path:
@@ -274,7 +248,7 @@ def test_dates_of_triggers_count_from_the_log(
 
 def test_a_simulated_flight_counts_by_its_true_track(tmp_path: Path) -> None:
     time_s, flown = leaning_flight()
-    log = log_of(flown)
+    log = log_of(flown, PLAN, RIG)
     believed = replace(log, position_ned=log.position_ned + np.array([3.0, 0.0, 0.5]))
     write_navigation(tmp_path / "navigation.csv", believed, DATUM)
     write_triggers(tmp_path / "triggers.csv", time_s, flown.line)

@@ -1,0 +1,39 @@
+"""Navigation logs and triggers of dives whose stations are known."""
+
+from pathlib import Path
+
+import numpy as np
+
+from alice_survey.artefacts import write_csv
+from alice_survey.frames import Array, rotation_from_attitude
+from camera_calib.rig import Rig
+from missions.coverage.stations import Stations
+from missions.footprint import glass_point_cam
+from missions.navigation import NavigationLog
+from missions.plan_file import Plan
+
+
+def log_of(flown: Stations, plan: Plan, rig: Rig) -> NavigationLog:
+    """The navigation log of a body whose left port's glass is at the stations."""
+    attitude, ones = flown.attitude_rad, np.ones(len(flown))
+    lever = rig.body_from_cam(rig.reference).apply(glass_point_cam(rig.cameras[rig.reference]))
+    glass = np.column_stack([flown.glass_ne, plan.seafloor_depth_m - flown.altitude_m])
+    assert flown.time_s is not None
+    return NavigationLog(
+        time_s=flown.time_s,
+        position_ned=glass - rotation_from_attitude(*attitude.T).apply(lever),
+        attitude_rad=attitude,
+        altitude_m=flown.altitude_m,
+        sigma_horizontal_m=0.1 * ones,
+        sigma_depth_m=0.01 * ones,
+        sigma_attitude_rad=0.001 * ones,
+        sigma_heading_rad=0.01 * ones,
+        sigma_altitude_m=0.02 * ones,
+    )
+
+
+def write_triggers(path: Path, time_s: Array, line: Array | None = None) -> None:
+    """Write `triggers.csv`, with lines where they are known."""
+    header = ("station", "time_s") if line is None else ("station", "time_s", "line")
+    columns = [np.arange(len(time_s)), time_s] + ([] if line is None else [line])
+    write_csv(path, header, [list(row) for row in zip(*columns, strict=True)])

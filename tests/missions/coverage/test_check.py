@@ -1,0 +1,177 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+import shapely
+
+from alice_survey.artefacts import Stage, run_stage, write_json
+from alice_survey.config import SurveyConfig
+from alice_survey.errors import NavigationError, PlanError, WorkspaceError
+from camera_calib.rig import design_rig
+from missions.coverage.certificate import certificate
+from missions.coverage.check import check_report
+from missions.coverage.holes import find_holes
+from missions.coverage.refly import refly_plan
+from missions.coverage.stations import Stations, plan_pattern, stations_of_plan
+from missions.lines.line import Line
+from missions.navigation import write_navigation
+from missions.plan_file import Plan, read_plan
+from missions.route.ways import Ways
+from tests.missions.coverage.logs import log_of, write_triggers
+from tests.oracles_coverage import DATUM, area_of, lawnmower, plan_of
+
+CONFIG = SurveyConfig()
+RIG = design_rig(CONFIG.camera, CONFIG.water)
+MISSING = 3
+
+
+def survey(shape: shapely.Geometry) -> Plan:
+    """A plan over a shape within the box from 0 to 8 and 6 m, with a metre of lines beyond."""
+    area = area_of(shape)
+    return plan_of(area, lawnmower(8.0, 6.0, 1.0, 0.46, over_m=1.0))
+
+
+def without(plan: Plan, index: int) -> Stations:
+    stations = stations_of_plan(plan)
+    return stations.some(stations.line != index)
+
+
+def workspace_of(folder: Path, plan: Plan) -> Path:
+    stage = Stage(name="plan", version=1, settings={})
+    run_stage(folder, stage, lambda part: write_json(part / "plan.json", plan.to_json()))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def checked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Plan, str, dict]:
+    """A dive on which one line was not flown."""
+    plan = survey(shapely.box(0, 0, 8, 6))
+    workspace = workspace_of(tmp_path_factory.mktemp("dive"), plan)
+    flown = without(plan, MISSING)
+    flown = replace(flown, time_s=50.0 + plan.interval_s * np.arange(len(flown)))
+    write_navigation(workspace / "nav.csv", log_of(flown, plan, RIG), DATUM)
+    write_triggers(workspace / "triggers.csv", flown.time_s, flown.line)
+    text, data = check_report(
+        workspace, CONFIG, workspace / "nav.csv", triggers=workspace / "triggers.csv"
+    )
+    return workspace, plan, text, data
+
+
+def test_a_dive_is_told_beside_its_plan(checked: tuple[Path, Plan, str, dict]) -> None:
+    workspace, plan, text, data = checked
+    exact = certificate(plan.area, RIG, stations_of_plan(plan), plan_pattern(plan, RIG))
+    seen = certificate(plan.area, RIG, without(plan, MISSING), plan_pattern(plan, RIG))
+
+    assert data["planned"]["share_at_overlap"] == exact.share_at_overlap == 1.0
+    assert data["flown"]["share_at_overlap"] == pytest.approx(seen.share_at_overlap, abs=1e-4)
+    assert 0.8 < seen.share_at_overlap < 0.95
+    assert len(data["holes"]) == 1
+    assert data["holes"][0]["size_m"][0] == pytest.approx(8.0, abs=0.05)
+    assert data["holes_m2"] == pytest.approx((1 - seen.share_at_overlap) * 48.0, rel=0.01)
+    assert f"{seen.share_at_overlap:.2%}" in text
+    assert "1 hole," in text
+    assert f"{data['holes'][0]['latitude_deg']:.7f}" in text
+    written = json.loads((workspace / "check" / "certificate.json").read_text())
+    assert written == {key: data[key] for key in written}
+
+
+def test_the_map_and_the_outlines_lie_where_the_hole_is(
+    checked: tuple[Path, Plan, str, dict],
+) -> None:
+    workspace, plan, _, data = checked
+    with rasterio.open(workspace / "check" / "coverage.tif") as raster:
+        assert raster.crs.to_epsg() == DATUM.utm_epsg
+        bands = dict(zip(raster.descriptions, raster.read(), strict=True))
+        pictures = bands["pictures of all cameras"]
+        within = pictures != raster.nodata
+        pixel_m2 = raster.res[0] * raster.res[1]
+        row, column = np.argwhere(within & (pictures == 0)).mean(axis=0)
+        x, y = raster.transform * (column + 0.5, row + 0.5)
+        lon, lat = rasterio.warp.transform(raster.crs, "EPSG:4326", [x], [y])
+    assert within.sum() * pixel_m2 == pytest.approx(48.0, rel=0.02)
+    assert (within & (pictures == 0)).sum() * pixel_m2 == pytest.approx(data["unseen_m2"], rel=0.03)
+    middle = DATUM.ned_from_geodetic(np.array([[lat[0], lon[0], 0.0]]))[0, :2]
+    np.testing.assert_allclose(middle, [4.0, plan.lines[MISSING].start_ne_m[1]], atol=0.15)
+
+    holes = json.loads((workspace / "check" / "holes.geojson").read_text())
+    ring = shapely.get_coordinates(shapely.geometry.shape(holes["features"][0]["geometry"]))
+    ned = DATUM.ned_from_geodetic(np.column_stack([ring[:, [1, 0]], np.zeros(len(ring))]))
+    outline = shapely.Polygon(ned[:, :2])
+    assert outline.area == pytest.approx(data["holes_m2"], rel=0.02)
+    assert (workspace / "check" / "coverage.png").stat().st_size > 20_000
+
+
+def test_the_plan_for_the_holes_is_whole_and_closes_them(
+    checked: tuple[Path, Plan, str, dict],
+) -> None:
+    workspace, plan, text, data = checked
+    again = read_plan(workspace / "check" / "refly" / "plan" / "plan.json")
+
+    assert all(isinstance(line, Line) for line in again.lines)
+    assert again.stations < 0.5 * plan.stations
+    assert again.coverage >= 0.999
+    assert again.coverage == data["refly"]["coverage"]
+    assert again.dives[0].first_line == 0
+    assert again.dives[-1].last_line == len(again.lines) - 1
+    assert again.duration_s > again.length_m / plan.speed_mps
+    assert again.energy_wh > 0
+    ways = Ways(plan.area.allowed)
+    for dive in again.dives:
+        places = dive.route.places(np.arange(0.0, dive.route.length_m, 0.02))
+        assert ways.contains(places).all()
+    # Both dives together leave nothing.
+    both = without(plan, MISSING).and_then(stations_of_plan(again))
+    seen = certificate(plan.area, RIG, both, plan_pattern(plan, RIG))
+    assert seen.share_at_overlap >= 0.9999
+    assert "to fly the holes again" in text
+    assert (workspace / "check" / "refly" / "exports" / "about.txt").is_file()
+
+
+def test_holes_by_a_no_go_zone_and_of_several_lines_are_closed() -> None:
+    shape = shapely.box(0, 0, 8, 6) - shapely.box(3.5, 2.0, 4.5, 3.6)
+    plan = survey(shape)
+    lines = stations_of_plan(plan).line
+    flown = stations_of_plan(plan).some((lines != 1) & (lines != 6))
+    pattern = plan_pattern(plan, RIG)
+    first = certificate(plan.area, RIG, flown, pattern)
+    holes = find_holes(first)
+    assert len(holes) == 2
+
+    again = refly_plan(plan, CONFIG, RIG, first, holes)
+
+    both = certificate(plan.area, RIG, flown.and_then(stations_of_plan(again)), pattern)
+    assert both.share_at_overlap >= 0.9995
+    with pytest.raises(PlanError, match="no hole"):
+        refly_plan(plan, CONFIG, RIG, first, ())
+
+
+def test_a_complete_dive_leaves_no_plan(tmp_path: Path) -> None:
+    plan = survey(shapely.box(0, 0, 8, 6))
+    workspace = workspace_of(tmp_path, plan)
+    flown = stations_of_plan(plan)
+    flown = replace(flown, time_s=plan.interval_s * np.arange(len(flown)))
+    write_navigation(tmp_path / "nav.csv", log_of(flown, plan, RIG), DATUM)
+    write_triggers(tmp_path / "t.csv", flown.time_s, flown.line)
+
+    text, data = check_report(
+        workspace, CONFIG, tmp_path / "nav.csv", triggers=tmp_path / "t.csv", out=tmp_path / "out"
+    )
+
+    assert "no holes" in text
+    assert data["flown"]["share_at_overlap"] == 1.0
+    assert "refly" not in data
+    assert not (tmp_path / "out" / "refly").exists()
+    assert json.loads((tmp_path / "out" / "holes.geojson").read_text())["features"] == []
+
+
+def test_what_is_missing_is_named(tmp_path: Path) -> None:
+    with pytest.raises(WorkspaceError, match="alice-survey plan"):
+        check_report(tmp_path, CONFIG, tmp_path / "nav.csv")
+    workspace_of(tmp_path, survey(shapely.box(0, 0, 8, 6)))
+    with pytest.raises(WorkspaceError, match="alice-survey fly"):
+        check_report(tmp_path, CONFIG)
+    with pytest.raises(NavigationError, match="cannot be read"):
+        check_report(tmp_path, CONFIG, tmp_path / "nav.csv")
