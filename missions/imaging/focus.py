@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from alice_survey.config import CameraConfig, PlanConfig
-from alice_survey.errors import PlanError, warn
+from alice_survey.errors import PlanError
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.fov.focus import FocusedLens, apparent_depths, apparent_distance_m
 from camera_calib.water import WAVELENGTH_NM
@@ -56,8 +56,6 @@ class Focus:
 def plan_focus(camera: FlatPortCamera, limits: CameraConfig, plan: PlanConfig) -> Focus:
     """Focus and aperture over the relief.
 
-    Warns where the f-number as set leaves the relief unsharp and a larger one would not.
-
     Args:
         camera: the reference camera, in water.
         limits: lens, sensor and f-number.
@@ -86,12 +84,6 @@ def plan_focus(camera: FlatPortCamera, limits: CameraConfig, plan: PlanConfig) -
     largest = limits.f_number * plan.sharp_px / airy_px
     if needed > largest:
         raise _cannot_focus(camera, limits, plan, needed, largest)
-    if needed > limits.f_number * (1 + 1e-9):
-        warn(
-            f"relief of +-{plan.relief_m:g} m at {plan.altitude_m:g} m blurs {blur_px:.1f} px at "
-            f"F/{limits.f_number:g}: set camera.f_number to {_up(needed):g} for sharp_px "
-            f"{plan.sharp_px:g}"
-        )
     depths = apparent_depths(camera, np.array([[camera.cx_px, camera.cy_px]]))
     near, far = depths.sharp_altitudes_m(lens, plan.sharp_px)
     return Focus(
@@ -105,6 +97,17 @@ def plan_focus(camera: FlatPortCamera, limits: CameraConfig, plan: PlanConfig) -
         f_number_diffraction=largest,
         airy_px=airy_px,
         papers_depth_px=_coc_for_depth_px(camera, limits, mean_m, _PAPER_DEPTH_M),
+    )
+
+
+def too_open(focus: Focus, limits: CameraConfig, plan: PlanConfig) -> str:
+    """What to say where the f-number as set leaves the relief unsharp; empty where it does not."""
+    if focus.f_number_needed <= limits.f_number * (1 + 1e-9):
+        return ""
+    return (
+        f"relief of +-{plan.relief_m:g} m at {plan.altitude_m:g} m blurs {focus.blur_px:.1f} px at "
+        f"F/{limits.f_number:g}: set camera.f_number to {_up(focus.f_number_needed):g} for "
+        f"sharp_px {plan.sharp_px:g}"
     )
 
 

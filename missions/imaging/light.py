@@ -35,6 +35,9 @@ LENS_TRANSMITTANCE = 0.9
 MIDDLE_GREY = 0.2
 """Share of full scale, linear, that the median is brought to; as in the simulator."""
 
+LEAST_SNR = 5.0
+"""Below it detail of a pixel drowns (Rose 1948, J. Opt. Soc. Am. 38, 196)."""
+
 Spectrum = Literal["planck", "even"]
 
 _PLANCK_J_S, _LIGHT_M_S, _BOLTZMANN_J_K = 6.62607015e-34, 299_792_458.0, 1.380649e-23
@@ -213,6 +216,18 @@ def signal_to_noise(electrons: Array, read_noise_e: float) -> Array:
     """Mean over standard deviation: Poisson's shot noise and the read noise."""
     ratio: Array = electrons / np.sqrt(electrons + read_noise_e**2)
     return ratio
+
+
+def too_dark(budget: LightBudget) -> str:
+    """What to say where the median pixel drowns in noise; empty where it does not."""
+    if budget.snr_median >= LEAST_SNR:
+        return ""
+    return f"too dark, signal to noise {budget.snr_median:.1f} of {LEAST_SNR:g}"
+
+
+def light_for_snr_e(snr: float, read_noise_e: float) -> float:
+    """Electrons that have a signal to noise: the inverse of `signal_to_noise`."""
+    return (snr**2 + math.sqrt(snr**4 + 4.0 * snr**2 * read_noise_e**2)) / 2.0
 
 
 def _triple(values: Array) -> tuple[float, float, float]:

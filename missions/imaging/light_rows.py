@@ -81,7 +81,8 @@ def light_rows(
             source=_LIGHT,
             bound_by="depth of field",
             note=f"for the brightest pixel in {exposure_s * 1e3:.3g} ms; or "
-            f"{budget.half_full_exposure_s * 1e3:.3g} ms at F/{limits.f_number:g}",
+            f"{budget.half_full_exposure_s * 1e3:.3g} ms at F/{limits.f_number:g}"
+            + ("; no common lens opens so far" if budget.half_full_f_number < 1.2 else ""),
         ),
     ]
 

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from alice_survey.config import SurveyConfig
+from alice_survey.errors import warn
 from camera_calib.rig import Rig
 from camera_calib.water import water_optics
 from missions.footprint import footprint_size_m, overlap
@@ -18,15 +19,22 @@ from missions.imaging.exposure import (
     exposure_for_rate,
     exposure_rows,
 )
-from missions.imaging.focus import Focus, focus_rows, plan_focus
+from missions.imaging.focus import Focus, focus_rows, plan_focus, too_open
 from missions.imaging.footprints import (
+    FootprintRange,
     Spacing,
     footprint_range,
     footprint_rows,
     line_spacing,
     spacing_rows,
 )
-from missions.imaging.light import LightBudget, light_budget
+from missions.imaging.light import (
+    LEAST_SNR,
+    LightBudget,
+    light_budget,
+    light_for_snr_e,
+    too_dark,
+)
 from missions.imaging.light_rows import light_rows, scatter_rows, strobe_rows
 from missions.imaging.scatter import scatter, shadows
 from missions.imaging.storage import Storage, raw_bytes, storage_load, storage_rows
@@ -64,6 +72,8 @@ class ImagingSettings:
     blur_px: float
     """In the worst pixel, from speed and attitude rates in quadrature."""
     interval_s: float
+    shortest_interval_s: float
+    """Of camera and trigger controller."""
     station_spacing_m: float
     forward_overlap: float
     """As reached, on the middle column."""
@@ -101,12 +111,16 @@ class ImagingSettings:
         return {**plain, "rows": [row.to_json() for row in self.rows]}
 
 
-def imaging_settings(rig: Rig, config: SurveyConfig) -> ImagingSettings:
+def imaging_settings(rig: Rig, config: SurveyConfig, *, quiet: bool = False) -> ImagingSettings:
     """Every setting of cameras, strobes and lines that meets the plan.
+
+    Warns of what will be poor: an aperture too open, too little light, gaps over the relief, a
+    cable too slow.
 
     Args:
         rig: the cameras in water; the first is the reference, whose outer glass the altitude is of.
         config: plan, camera, water and strobes.
+        quiet: without the warnings.
 
     Raises:
         PlanError: limits conflict: frame rate, altitude, focus, strobe or track error; the message
@@ -142,6 +156,15 @@ def imaging_settings(rig: Rig, config: SurveyConfig) -> ImagingSettings:
         *strobe_rows(load),
         *storage_rows(storage, limits, interval_s),
     )
+    if not quiet:
+        for text in (
+            too_open(focus, limits, plan),
+            _dark(budget, config),
+            _gaps(spacing, prints, step_m),
+            _slow_cable(storage, interval_s),
+        ):
+            if text:
+                warn(text)
     return ImagingSettings(
         footprint_across_m=mean.across_m,
         footprint_along_m=mean.along_m,
@@ -149,6 +172,7 @@ def imaging_settings(rig: Rig, config: SurveyConfig) -> ImagingSettings:
         exposure_s=exposure_s,
         blur_px=rates.combined * exposure_s,
         interval_s=interval_s,
+        shortest_interval_s=limits.shortest_interval_s,
         station_spacing_m=step_m,
         forward_overlap=overlap(along_m, step_m),
         strobe_pulse_s=load.pulse_s,
@@ -166,6 +190,41 @@ def imaging_settings(rig: Rig, config: SurveyConfig) -> ImagingSettings:
         strobe=load,
         storage=storage,
         rows=rows,
+    )
+
+
+def _dark(budget: LightBudget, config: SurveyConfig) -> str:
+    """What to do about too little light; empty where there is enough."""
+    fault = too_dark(budget)
+    if not fault:
+        return ""
+    read_noise_e = config.camera.read_noise_e
+    times = light_for_snr_e(LEAST_SNR, read_noise_e) / budget.median_e
+    return (
+        f"pictures will be {fault} in Jerlov {config.water.jerlov} water: {times:.1f} times the "
+        "light is missing; lower altitude_m or speed_mps, or raise allowed_blur_px or the aperture"
+    )
+
+
+def _gaps(spacing: Spacing, prints: FootprintRange, step_m: float) -> str:
+    """Where the top of the relief is not seen by neighbours; empty where all is."""
+    across, along = prints.top.across_m - spacing.spacing_m, prints.top.along_m - step_m
+    if min(across, along) >= 0:
+        return ""
+    between = "lines" if across < along else "pictures"
+    return (
+        f"over the top of the relief, {prints.top.altitude_m:.2f} m below the glass, {between} "
+        f"leave gaps of {-min(across, along):.2f} m: raise the overlap, or set overlap_over_relief"
+    )
+
+
+def _slow_cable(storage: Storage, interval_s: float) -> str:
+    """Where one cable cannot carry all cameras; empty where it can."""
+    if 1.0 / interval_s <= storage.shared_link_hz:
+        return ""
+    return (
+        f"{1 / interval_s:.3g} triggers a second are more than the {storage.shared_link_hz:.3g} "
+        "that one Gigabit cable carries of all cameras: give each a cable of its own"
     )
 
 

@@ -12,9 +12,10 @@ from camera_calib.rig import design_rig
 from camera_calib.text_table import text_table
 from missions.imaging.conflicts import Way, conflict
 from missions.imaging.footprints import footprint_at
+from missions.imaging.light import too_dark
 from missions.imaging.settings import ImagingSettings, imaging_settings
 from missions.imaging.solve_dive import DiveArea, area_for_dive, dive_of_energy_s
-from missions.imaging.solve_lens import LensOption, in_focus, lenses_for_resolution, too_dark
+from missions.imaging.solve_lens import LensOption, in_focus, lenses_for_resolution
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,8 +120,8 @@ def _rate_option(config: SurveyConfig, rate_hz: float, lens_mm: float) -> RateOp
     try:
         moved = plan.model_copy(update={"speed_mps": speed})
         changed = in_focus(config.model_copy(update={"camera": camera, "plan": moved}))
-        settings = imaging_settings(rig, changed)
-        why = too_dark(settings)
+        settings = imaging_settings(rig, changed, quiet=True)
+        why = too_dark(settings.light)
     except AliceError as error:
         why = str(error).split(": ")[0]
     return RateOption(

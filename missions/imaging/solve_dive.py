@@ -39,7 +39,7 @@ def area_for_dive(config: SurveyConfig, dive_s: float) -> DiveArea:
     from missions.route.costs import time_costs
 
     rig = design_rig(config.camera, config.water)
-    settings, plan = imaging_settings(rig, config), config.plan
+    settings, plan = imaging_settings(rig, config, quiet=True), config.plan
     costs = time_costs(plan.speed_mps)
     dive_down_s = costs.dive_s(config.area.seafloor_depth_m - plan.altitude_m)
     spacing = settings.line_spacing_m
@@ -79,7 +79,7 @@ def dive_of_energy_s(config: SurveyConfig, dive_wh: float) -> tuple[float, float
     from missions.route.energy import vehicle_costs
 
     rig = design_rig(config.camera, config.water)
-    costs = vehicle_costs(config, imaging_w=imaging_settings(rig, config).imaging_w)
+    costs = vehicle_costs(config, imaging_w=imaging_settings(rig, config, quiet=True).imaging_w)
     watts = float(np.mean(costs.line_w[np.isfinite(costs.line_w)]))
     return dive_wh * 3600.0 / watts, watts
 

@@ -12,10 +12,9 @@ from camera_calib.rig import design_rig
 from missions.imaging.conflicts import Way, conflict
 from missions.imaging.focus import largest_f_number, needed_f_number
 from missions.imaging.footprints import altitude_for_pixel_m, footprint_at, pixel_on_floor_m
-from missions.imaging.settings import ImagingSettings, imaging_settings
+from missions.imaging.light import LEAST_SNR, light_for_snr_e, too_dark
+from missions.imaging.settings import imaging_settings
 
-_ROSE = 5.0
-"""Signal to noise below which detail of a pixel drowns (Rose 1948, J. Opt. Soc. Am. 38, 196)."""
 _HIGHEST_M = 10.0
 
 
@@ -85,10 +84,10 @@ def _lens_option(config: SurveyConfig, resolution_mm: float, lens_mm: float) -> 
     plan = config.plan.model_copy(update={"altitude_m": altitude, "line_spacing_m": None})
     changed = in_focus(config.model_copy(update={"camera": camera, "plan": plan}))
     try:
-        settings = imaging_settings(rig, changed)
+        settings = imaging_settings(rig, changed, quiet=True)
     except AliceError as error:
         return _no_option(lens_mm, altitude, resolution_mm, str(error).split(": ")[0])
-    why = too_dark(settings)
+    why = too_dark(settings.light)
     return LensOption(
         lens_mm=lens_mm,
         altitude_m=altitude,
@@ -115,12 +114,6 @@ def in_focus(config: SurveyConfig) -> SurveyConfig:
     if not camera.f_number < needed <= largest_f_number(camera, plan.sharp_px):
         return config
     return config.model_copy(update={"camera": camera.model_copy(update={"f_number": needed})})
-
-
-def too_dark(settings: ImagingSettings) -> str:
-    """Why the light does not do; empty where it does."""
-    snr = settings.light.snr_median
-    return "" if snr >= _ROSE else f"too dark, signal to noise {snr:.1f} of {_ROSE:g}"
 
 
 def _no_option(lens_mm: float, altitude_m: float, pixel_mm: float, why: str) -> LensOption:
@@ -202,10 +195,8 @@ def _more_light(config: SurveyConfig, options: list[LensOption]) -> list[Way]:
     for option in options:
         if math.isnan(option.snr):
             continue
-        read2 = config.camera.read_noise_e**2
-        enough_e = (_ROSE**2 + math.sqrt(_ROSE**4 + 4 * _ROSE**2 * read2)) / 2
-        short_e = (option.snr**2 + math.sqrt(option.snr**4 + 4 * option.snr**2 * read2)) / 2
-        times = enough_e / short_e
+        noise_e = config.camera.read_noise_e
+        times = light_for_snr_e(LEAST_SNR, noise_e) / light_for_snr_e(option.snr, noise_e)
         blur_px = math.ceil(100 * config.plan.allowed_blur_px * times) / 100
         ways.append(
             Way(

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from alice_survey.errors import PlanError
 from camera_calib.fov.table import FovChoices, fov_table
-from missions.imaging.focus import largest_f_number, needed_f_number, plan_focus
+from missions.imaging.focus import largest_f_number, needed_f_number, plan_focus, too_open
 from tests.missions.imaging.surveys import survey
 from tests.oracles_imaging import blur_circle_px
 
@@ -73,12 +73,13 @@ def test_diffraction_of_green_light_at_f4() -> None:
     assert largest_f_number(config.camera, 3.0) == pytest.approx(8.56, abs=0.01)
 
 
-def test_an_aperture_that_is_too_open_is_warned_of(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_aperture_that_is_too_open_is_told_what_to_set() -> None:
     rig, config = survey(plan={"altitude_m": 1.2})
-    plan_focus(rig.cameras["left"], config.camera, config.plan)
-    needed = needed_f_number(rig.cameras["left"], config.camera, config.plan)
-    told = math.ceil(10 * needed) / 10
-    assert f"set camera.f_number to {told:g}" in capsys.readouterr().err
+    focus = plan_focus(rig.cameras["left"], config.camera, config.plan)
+    told = math.ceil(10 * needed_f_number(rig.cameras["left"], config.camera, config.plan)) / 10
+    assert f"set camera.f_number to {told:g}" in too_open(focus, config.camera, config.plan)
+    closed = config.camera.model_copy(update={"f_number": told})
+    assert not too_open(plan_focus(rig.cameras["left"], closed, config.plan), closed, config.plan)
 
 
 def test_a_lens_that_cannot_focus_gets_ways_out_that_work() -> None:

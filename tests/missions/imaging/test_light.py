@@ -17,6 +17,7 @@ from missions.imaging.light import (
     floor_radiance,
     lens_falloff,
     light_budget,
+    light_for_snr_e,
     signal_to_noise,
     watts_per_lumen,
 )
@@ -135,6 +136,9 @@ def test_signal_to_noise_is_poissons_and_the_readers() -> None:
     draws = rng.poisson(200.0, 200_000) + 12.0 * rng.standard_normal(200_000)
     expected = draws.mean() / draws.std()
     assert signal_to_noise(np.array(200.0), 12.0) == pytest.approx(expected, rel=0.01)
+    for electrons in (3.0, 200.0, 9000.0):
+        ratio = float(signal_to_noise(np.array(electrons), 12.0))
+        assert light_for_snr_e(ratio, 12.0) == pytest.approx(electrons)
 
 
 def test_shadows_follow_from_similar_triangles() -> None:

@@ -1,5 +1,6 @@
 import json
 import time
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -123,6 +124,30 @@ def test_a_strobe_pulse_that_does_not_fit_is_told() -> None:
     plan = {"speed_mps": 1.0, "forward_overlap": 0.9, "strobe_lead_s": 0.1}
     with pytest.raises(PlanError, match=r"strobe pulse of 0\.2004 s"):
         imaging_settings(*survey(plan=plan))
+
+
+@pytest.mark.parametrize(
+    ("sections", "words"),
+    [
+        ({"plan": {"altitude_m": 1.2}}, "set camera.f_number to"),
+        ({"water": {"jerlov": "9C"}}, "times the light is missing"),
+        ({"plan": {"line_spacing_m": 1.4}}, "lines leave gaps of 0.21 m"),
+        ({"plan": {"forward_overlap": 0.0}}, "pictures leave gaps of 0.20 m"),
+        ({"plan": {"forward_overlap": 0.9, "speed_mps": 1.0}}, "a cable of its own"),
+    ],
+)
+def test_what_will_be_poor_is_warned_of(
+    sections: dict[str, Any], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    imaging_settings(*survey(**sections), quiet=True)
+    assert capsys.readouterr().err == ""
+    imaging_settings(*survey(**sections))
+    assert words in capsys.readouterr().err
+
+
+def test_the_papers_mission_is_not_warned_of(capsys: pytest.CaptureFixture[str]) -> None:
+    imaging_settings(*survey(plan={"line_spacing_m": 1.0}))
+    assert capsys.readouterr().err == ""
 
 
 def test_exposure_grows_with_altitude() -> None:

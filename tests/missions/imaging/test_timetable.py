@@ -8,7 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from alice_survey.errors import PlanError
+from missions.imaging.settings import imaging_settings
 from missions.imaging.timetable import HEADER, trigger_edges, trigger_table, write_timetable
+from tests.missions.imaging.surveys import survey
 
 
 @given(
@@ -65,13 +67,15 @@ def test_an_exposure_of_nothing_is_refused() -> None:
 
 
 def test_the_file_holds_absolute_and_relative_edges(tmp_path: Path) -> None:
-    rows = trigger_table([3600.0, 3602.35], 2.01e-3, 0.0002, 0.1)
-    write_timetable(tmp_path / "triggers.csv", rows)
+    settings = imaging_settings(*survey())
+    write_timetable(tmp_path / "triggers.csv", [3600.0, 3602.35], settings)
     with (tmp_path / "triggers.csv").open() as file:
         read = list(csv.DictReader(file))
     assert tuple(read[0]) == HEADER
     assert read[1]["trigger_us"] == "3602350000"
     for line in read:
+        open_us = int(line["camera_close_us"]) - int(line["camera_open_us"])
+        assert open_us == round(settings.exposure_s * 1e6)
         for edge in ("strobe_on", "camera_open", "camera_close", "strobe_off"):
             relative = int(line[f"{edge}_rel_us"])
             assert int(line[f"{edge}_us"]) == int(line["trigger_us"]) + relative
