@@ -177,20 +177,8 @@ def _check_reach(area: Area, raw: RawShapes, frame: LocalFrame, *, given: str | 
     Raises:
         PlanError: the two areas have nothing in common.
     """
-    outside = multipolygon(area.survey.difference(area.allowed))
-    share = outside.area / area.survey.area
-    if share > 1.0 - _SMALL_SHARE:
-        raise PlanError(
-            f"area: {given}: the vehicle may be nowhere in the area to survey, "
-            f"{area.survey.distance(area.allowed):.4g} m from it: check both"
-        )
-    if share > _SMALL_SHARE:
-        largest = max(outside.geoms, key=lambda part: part.area).representative_point()
-        place = frame.place((largest.x, largest.y), geographic=raw.geographic)
-        warn(
-            f"area: {share:.2%} of the area to survey lie outside of {given}, most of it near "
-            f"{place}: only what is seen from inside is covered there"
-        )
+    if given is not None:
+        _check_inside(area, raw, frame, given)
     parts = [part for part in area.allowed.geoms if part.intersects(area.survey)]
     if len(parts) > 1:
         gap_m = _widest_gap_m(parts)
@@ -203,6 +191,23 @@ def _check_reach(area: Area, raw: RawShapes, frame: LocalFrame, *, given: str | 
         warn(
             f"area: the vehicle may be in {len(parts)} parts up to {gap_m:.3g} m apart and cannot "
             f"pass between them: {advice}"
+        )
+
+
+def _check_inside(area: Area, raw: RawShapes, frame: LocalFrame, given: str) -> None:
+    outside = _less(area.survey, area.allowed)
+    share = outside.area / area.survey.area
+    if share > 1.0 - _SMALL_SHARE:
+        raise PlanError(
+            f"area: {given}: the vehicle may be nowhere in the area to survey, "
+            f"{area.survey.distance(area.allowed):.4g} m from it: check both"
+        )
+    if share > _SMALL_SHARE:
+        largest = max(outside.geoms, key=lambda part: part.area).representative_point()
+        place = frame.place((largest.x, largest.y), geographic=raw.geographic)
+        warn(
+            f"area: {share:.2%} of the area to survey lie outside of {given}, most of it near "
+            f"{place}: only what is seen from inside is covered there"
         )
 
 
