@@ -12,7 +12,6 @@ from pathlib import Path
 
 from alice_survey.artefacts import write_csv
 from alice_survey.errors import PlanError
-from missions.imaging.settings import ImagingSettings
 
 _US = 1_000_000
 HEADER = (
@@ -132,20 +131,8 @@ def trigger_table(
     return rows
 
 
-def write_timetable(path: Path, times_s: Sequence[float], settings: ImagingSettings) -> None:
-    """Write the time table of some triggers as CSV with the columns `HEADER`.
-
-    Args:
-        path: of the file.
-        times_s: as `trigger_table`.
-        settings: of the plan.
-
-    Raises:
-        PlanError: as `trigger_table`.
-    """
-    table = trigger_table(
-        times_s, settings.exposure_s, settings.strobe_lead_s, settings.shortest_interval_s
-    )
+def write_timetable(path: Path, rows: Sequence[TriggerRow]) -> None:
+    """Write a time table as CSV with the columns `HEADER`."""
     write_csv(
         path,
         HEADER,
@@ -155,6 +142,6 @@ def write_timetable(path: Path, times_s: Sequence[float], settings: ImagingSetti
                 row.camera_close_us, row.strobe_off_us, row.edges.strobe_on_us,
                 row.edges.camera_open_us, row.edges.camera_close_us, row.edges.strobe_off_us,
             ]
-            for row in table
+            for row in rows
         ],
     )  # fmt: skip

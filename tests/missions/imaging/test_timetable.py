@@ -68,7 +68,13 @@ def test_an_exposure_of_nothing_is_refused() -> None:
 
 def test_the_file_holds_absolute_and_relative_edges(tmp_path: Path) -> None:
     settings = imaging_settings(*survey())
-    write_timetable(tmp_path / "triggers.csv", [3600.0, 3602.35], settings)
+    rows = trigger_table(
+        [3600.0, 3602.35],
+        settings.exposure_s,
+        settings.strobe_lead_s,
+        settings.shortest_interval_s,
+    )
+    write_timetable(tmp_path / "triggers.csv", rows)
     with (tmp_path / "triggers.csv").open() as file:
         read = list(csv.DictReader(file))
     assert tuple(read[0]) == HEADER
