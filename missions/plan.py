@@ -3,6 +3,7 @@
 Altitude and all places are of the left port's outer glass.
 """
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -178,7 +179,8 @@ def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
             f"{1 - seen.every_camera_share:.2%} is not seen by every camera: look at map.png, and "
             "give the vehicle more room, or raise the overlaps"
         )
-    details = _details(imaging, sweep, stereo, rig, config)
+    told_more = _details(imaging, sweep, stereo, rig, config)
+    details = json.loads(json.dumps(told_more))  # as they are read back
     finished = replace(plan, coverage=seen.share_at_overlap, details=details)
     return Planned(
         plan=finished,
