@@ -140,6 +140,7 @@ def fov(
         "fly -w reef --vehicle alice --controller sway --current 0.1@90",
         "fly -w before --vehicle sparus2 --controller los",
         "fly -w reef --fail stern --fail bow=0.5 --json",
+        "fly -w reef --dive 2",
     )
 )
 def fly(
@@ -158,6 +159,9 @@ def fly(
         list[str] | None,
         typer.Option(help="A thruster that does not turn, or is weak: stern, bow=0.5."),
     ] = None,
+    dive: Annotated[
+        int | None, typer.Option(min=1, help="Fly this dive of the plan; all when not given.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Fly the plan.
@@ -167,7 +171,9 @@ def fly(
     """
     from alice_survey.survey import FlightChanges, run
 
-    changes = FlightChanges(vehicle=vehicle, controller=controller, current=current, failed=fail)
+    changes = FlightChanges(
+        vehicle=vehicle, controller=controller, current=current, failed=fail, dive=dive
+    )
     print_result(*run(["flight"], workspace, survey, flight=changes), as_json)
 
 

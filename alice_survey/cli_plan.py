@@ -44,9 +44,9 @@ def plan(
     and missions that vehicles load; prints every setting with the equation and the limit behind it.
     """
     if context.invoked_subcommand is None:
-        from alice_survey.survey import run
+        from alice_survey.survey import plan_report
 
-        print_result(*run(["plan"], workspace, survey), as_json)
+        print_result(*plan_report(workspace, survey), as_json)
 
 
 @app.command(

@@ -53,6 +53,8 @@ class FlightChanges:
     """SPEED@DIRECTION."""
     failed: Sequence[str] | None = None
     """NAME of a thruster that has failed, or NAME=SHARE that is left of it."""
+    dive: int | None = None
+    """The one to fly, from 1 on."""
 
     def applied(self, config: SurveyConfig) -> SurveyConfig:
         """The survey with these changes.
@@ -68,7 +70,7 @@ class FlightChanges:
         return changed(
             config, "vehicle",
             name=self.vehicle, controller=self.controller,
-            thruster_health=parse_health(self.failed),
+            thruster_health=parse_health(self.failed), dive=self.dive,
         )  # fmt: skip
 
 
@@ -165,6 +167,13 @@ def run(
             found[stage] = {"done": done, **data}
             lines.append(f"{stage}: {text}" if done else f"{stage}: (up to date) {text}")
     return "\n".join(lines), found
+
+
+def plan_report(workspace: Path, survey: Path | None) -> tuple[str, dict[str, Any]]:
+    """Plan a survey, and tell every setting with its equation, source and limit."""
+    text, found = run(["plan"], workspace, survey)
+    table = (workspace / "plan" / "settings.txt").read_text(encoding="utf-8")
+    return f"{table}\n{text}", found
 
 
 def settings(workspace: Path, survey: Path | None, *, needed: bool) -> SurveyConfig:

@@ -76,8 +76,9 @@ def run_plan(workspace: Path, config: SurveyConfig, threads: int) -> bool:
             "name": config.name,
             **{
                 name: getattr(config, name).model_dump(mode="json")
-                for name in ("area", "camera", "water", "plan", "vehicle", "sea")
+                for name in ("area", "camera", "water", "plan", "sea")
             },
+            "vehicle": config.vehicle.model_dump(mode="json", exclude={"dive"}),
             "strobes": config.imaging.model_dump(
                 mode="json", include={"strobe_lumens", "strobe_beam_deg", "strobes_body_m"}
             ),
