@@ -16,8 +16,8 @@ def _plan(folder: Path) -> Summary:
         f"{len(plan['lines'])} lines, {plan['stations']} stations, {plan['length_m']:.0f} m, "
         f"{plan['duration_s'] / 60:.0f} min, {plan['energy_wh']:.0f} Wh in {dives} "
         f"dive{'s' if dives > 1 else ''}; overlap {plan['forward_overlap']:.0%} forward, "
-        f"{plan['side_overlap']:.0%} side, {plan['coverage']:.1%} covered as asked; a picture every "
-        f"{plan['interval_s']:.2f} s, exposed {1e3 * plan['exposure_s']:.2g} ms; map in "
+        f"{plan['side_overlap']:.0%} side, {plan['coverage']:.1%} covered as asked; a picture "
+        f"every {plan['interval_s']:.2f} s, exposed {1e3 * plan['exposure_s']:.2g} ms; map in "
         f"{folder / 'map.png'}, files for vehicles in {folder / 'exports'}"
     )
     return text, plan

@@ -78,6 +78,8 @@ def run_plan(workspace: Path, config: SurveyConfig, threads: int) -> bool:
                 name: getattr(config, name).model_dump(mode="json")
                 for name in ("area", "camera", "water", "plan", "sea")
             },
+            # Of a shape in degrees the middle is the datum unless one is set, to whatever value.
+            "datum_given": sorted({"latitude_deg", "longitude_deg"} & config.area.model_fields_set),
             "vehicle": config.vehicle.model_dump(mode="json", exclude={"dive"}),
             "strobes": config.imaging.model_dump(
                 mode="json", include={"strobe_lumens", "strobe_beam_deg", "strobes_body_m"}

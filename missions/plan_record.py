@@ -19,6 +19,8 @@ from missions.route.costs import Costs
 if TYPE_CHECKING:
     from missions.plan import Planned
 
+_SAME_S = 1e-3
+
 
 def write_planned(folder: Path, planned: "Planned", config: SurveyConfig, rig: Rig) -> None:
     """Write a plan.
@@ -58,12 +60,17 @@ def write_triggers(folder: Path, plan: Plan, costs: Costs, config: SurveyConfig)
 
 
 def station_times_s(plan: Plan, dive: Dive, costs: Costs) -> list[float]:
-    """When the stations of a dive are passed, seconds from its start, when it is flown exactly."""
+    """When pictures are taken on a dive that is flown exactly, seconds from its start.
+
+    Where a line begins at the very place where the one before has ended, one picture serves both.
+    """
     _, took_s = leg_costs(dive.route, costs)
     starts_s = costs.settle_s + np.concatenate([[0.0], np.cumsum(took_s)])
     times: list[float] = []
     for index, leg in enumerate(dive.route.legs):
         if leg.line >= 0:
             stations = plan.lines[leg.line].stations
-            times += np.linspace(starts_s[index], starts_s[index + 1], stations).tolist()
+            passed = np.linspace(starts_s[index], starts_s[index + 1], stations).tolist()
+            again = bool(times) and passed[0] - times[-1] < _SAME_S
+            times += passed[1:] if again else passed
     return times

@@ -240,7 +240,7 @@ def _on_path(
             point[told.POINT_EAST],
             _QUICKEST * path.speed_mps * dt_s,
         )
-        if must_brake(path, guidance, pilot, leg, along):
+        if must_brake(path, guidance, gains, pilot, leg, along):
             speed = max(point[told.SURGE_SPEED], 0.0)
             brake(speed, along, estimate[signals.HEADING], gains, pilot)
     target = mind_floor(_target_m(path, guidance, pilot), estimate, guidance.limits, pilot)

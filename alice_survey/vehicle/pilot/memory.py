@@ -23,8 +23,8 @@ REPORT = 13
     FLOOR, FLOOR_SLOPE, FLOOR_KNOWN, SURGE_SUM, SWAY_SUM_N, SWAY_SUM_E, HEAVE_SUM, YAW_SUM,
     SETTLED_S, BEST, SINCE_BEST_S, RETURNS, LOST_S, LOW_S, PITCHED_S,
     UNSAFE_S, PACE, STANDING, REF, REF_SPEED, WAITED_S,
-    PLACE_SUM_N, PLACE_SUM_E,
-) = range(23)  # fmt: skip
+    PLACE_SUM_N, PLACE_SUM_E, RAMP, RAMP_SPEED,
+) = range(25)  # fmt: skip
 """Places in the memory: the depth, m, that the origin's depth and the altitude add up to, smoothed,
 its slope, m/s, and whether there is one; integrals of the inner loops as speeds, that of sway as a
 vector in NED; the time that depth, or place and heading, are kept; the watchdog's best value and
@@ -32,9 +32,9 @@ its age; returns to the path; how long bottom lock is lost, the altitude too low
 large, s; how long the clearance is less than half of what is allowed, s; the share of the wanted
 surge that the sea floor leaves; 1 while the vehicle follows a place that moves along the leg or a
 heading that turns on the spot (standing.py), how far these have got, m or rad, and how fast; how
-long it waits at the leg's end, s; and the integral, as a speed, of keeping that place by surge, a
-vector in NED."""
-MEMORY = 23
+long it waits at the leg's end, s; the integral, as a speed, of keeping that place by surge, a vector
+in NED; and the place or heading, and its speed, that thrusters without lag would be at."""
+MEMORY = 25
 
 (
     REF_SURGE, REF_SWAY, REF_HEAVE, REF_YAW, ACC_SURGE, ACC_SWAY, ACC_HEAVE, ACC_YAW,

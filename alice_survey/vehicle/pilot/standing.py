@@ -1,7 +1,10 @@
 """Stops: coming to rest at a corner, turning on the spot, and stepping aside.
 
-The vehicle follows a reference that is always feasible: a place that moves along the leg, or a
-heading that turns, at a bounded speed and a bounded acceleration, which are fed forward. The place
+The vehicle follows a reference: a place that moves along the leg, or a heading that turns. A ramp
+of bounded speed and acceleration goes ahead of it; its acceleration is fed forward, and the
+reference is what thrusters that lag make of it, v' = (ramp's v - v) / lag, so that a vehicle as it
+is thought to be follows without an error. Over a whole leg that is as far as the ramp goes, and
+lag v farther where it begins at a speed v. The place
 is held by surge and sway, the heading by yaw (PIDs on place, control.py). A vehicle without sway
 holds only the part of the place that is along its heading, and drifts with the current across it.
 The reference waits for a vehicle that falls behind.
@@ -20,7 +23,7 @@ from alice_survey.vehicle.pilot.control import (
     place_sum_step,
     sum_bound,
 )
-from alice_survey.vehicle.pilot.gains import SURGE, WEIGHT, Gains
+from alice_survey.vehicle.pilot.gains import LAG, SURGE, SWAY, WEIGHT, YAW, Gains
 from alice_survey.vehicle.pilot.memory import PilotState
 from alice_survey.vehicle.pilot.path import Path, place_at
 from alice_survey.vehicle.pilot.safety import restart_watch
@@ -50,12 +53,15 @@ def stands(path: Path, leg: int) -> bool:
 
 
 @kernel
-def must_brake(path: Path, guidance: Guidance, pilot: PilotState, leg: int, along_m: float) -> bool:
+def must_brake(
+    path: Path, guidance: Guidance, gains: Gains, pilot: PilotState, leg: int, along_m: float
+) -> bool:
     """Whether a vehicle that goes ahead has to begin to brake for the stop at its leg's end."""
     if path.stop[leg] == 0.0:
         return False
     speed = max(pilot.point[told.SURGE_SPEED], 0.0)
-    return bool(path.length_m[leg] - along_m <= speed * speed / (2.0 * guidance.stop_mps2))
+    braking = speed * speed / (2.0 * guidance.stop_mps2) + speed * gains.axes[SURGE, LAG]
+    return bool(path.length_m[leg] - along_m <= braking)
 
 
 @kernel
@@ -72,6 +78,7 @@ def brake(
     memory[told.PLACE_SUM_N] = held * math.cos(heading_rad)
     memory[told.PLACE_SUM_E] = held * math.sin(heading_rad)
     start_standing(along_m, speed_mps, pilot)
+    memory[told.RAMP] += gains.axes[SURGE, LAG] * speed_mps
 
 
 @kernel
@@ -80,6 +87,7 @@ def start_standing(at: float, speed: float, pilot: PilotState) -> None:
     memory = pilot.memory
     memory[told.STANDING], memory[told.WAITED_S] = 1.0, 0.0
     memory[told.REF], memory[told.REF_SPEED] = at, speed
+    memory[told.RAMP], memory[told.RAMP_SPEED] = at, speed
 
 
 @kernel
@@ -130,8 +138,34 @@ class Reference(NamedTuple):
 
 
 @kernel
+def _move_on(
+    goal: float, most: float, acceleration: float, lag_s: float, dt_s: float, pilot: PilotState
+) -> float:
+    """Move ramp and reference on by a tick.
+
+    Returns:
+        The acceleration to feed forward.
+    """
+    memory = pilot.memory
+    memory[told.RAMP], memory[told.RAMP_SPEED], quicken = ramp(
+        memory[told.RAMP], memory[told.RAMP_SPEED], goal, most, acceleration, dt_s
+    )
+    speed = memory[told.REF_SPEED]
+    speed += min(dt_s / lag_s, 1.0) * (memory[told.RAMP_SPEED] - speed)
+    memory[told.REF_SPEED] = speed
+    memory[told.REF] = min(memory[told.REF] + speed * dt_s, goal)
+    return quicken
+
+
+@kernel
 def _turning(
-    leg: int, dt_s: float, estimate: Array, path: Path, guidance: Guidance, pilot: PilotState
+    leg: int,
+    dt_s: float,
+    estimate: Array,
+    path: Path,
+    guidance: Guidance,
+    gains: Gains,
+    pilot: PilotState,
 ) -> Reference:
     """Move the heading of a turn on the spot on by a tick."""
     memory, sense = pilot.memory, math.copysign(1.0, path.turn_rad[leg])
@@ -139,18 +173,17 @@ def _turning(
     behind = abs(wrapped(start + sense * memory[told.REF] - estimate[signals.HEADING]))
     most = guidance.spot_rad_s * _patience(behind / _BEHIND_RAD)
     goal = abs(path.turn_rad[leg])
-    turned, rate, quicken = ramp(
-        memory[told.REF], memory[told.REF_SPEED], goal, most, guidance.spot_rad_s2, dt_s
-    )
-    memory[told.REF], memory[told.REF_SPEED] = turned, rate
-    heading = start + sense * turned
-    return Reference(
-        n, e, heading, 0.0, 0.0, heading, sense * rate, sense * quicken, 0.0, turned >= goal
-    )
+    lag_s = gains.axes[YAW, LAG]
+    quicken = sense * _move_on(goal, most, guidance.spot_rad_s2, lag_s, dt_s, pilot)
+    heading, rate = start + sense * memory[told.REF], sense * memory[told.REF_SPEED]
+    over = goal - memory[told.REF] < 0.5 * STOP_RAD and memory[told.RAMP] >= goal
+    return Reference(n, e, heading, 0.0, 0.0, heading, rate, quicken, 0.0, over)
 
 
 @kernel
-def _moving(leg: int, dt_s: float, path: Path, guidance: Guidance, pilot: PilotState) -> Reference:
+def _moving(
+    leg: int, dt_s: float, path: Path, guidance: Guidance, gains: Gains, pilot: PilotState
+) -> Reference:
     """Move the place on by a tick, ahead into a stop or aside."""
     memory, point, side = pilot.memory, pilot.point, path.side_rad[leg]
     n, e, course, _ = place_at(path, leg, memory[told.REF])
@@ -159,15 +192,14 @@ def _moving(leg: int, dt_s: float, path: Path, guidance: Guidance, pilot: PilotS
     most = path.speed_mps if side == 0.0 else guidance.step_mps
     most *= memory[told.PACE] * _patience(behind / _BEHIND_M)
     acceleration = guidance.stop_mps2 if side == 0.0 else guidance.step_mps2
+    lag_s = gains.axes[SURGE if side == 0.0 else SWAY, LAG]
     goal = path.length_m[leg]
-    along, speed, quicken = ramp(
-        memory[told.REF], memory[told.REF_SPEED], goal, most, acceleration, dt_s
-    )
-    memory[told.REF], memory[told.REF_SPEED] = along, speed
+    quicken = _move_on(goal, most, acceleration, lag_s, dt_s, pilot)
+    along, speed = memory[told.REF], memory[told.REF_SPEED]
     n, e, course, curvature = place_at(path, leg, along)
-    turning = curvature * speed
+    over = goal - along < 0.5 * STOP_M and memory[told.RAMP] >= goal
     return Reference(
-        n, e, course, speed, quicken, course + side, turning, 0.0, along, along >= goal
+        n, e, course, speed, quicken, course + side, curvature * speed, 0.0, along, over
     )
 
 
@@ -203,9 +235,9 @@ def stand(
     """
     memory, report, point = pilot.memory, pilot.report, pilot.point
     if path.turn_rad[leg] != 0.0:
-        wanted = _turning(leg, dt_s, estimate, path, guidance, pilot)
+        wanted = _turning(leg, dt_s, estimate, path, guidance, gains, pilot)
     else:
-        wanted = _moving(leg, dt_s, path, guidance, pilot)
+        wanted = _moving(leg, dt_s, path, guidance, gains, pilot)
     error = head_for(
         wanted.heading_rad, wanted.turn_rad_s, wanted.quicken_rad_s2, estimate, dt_s, gains, pilot
     )
