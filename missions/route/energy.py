@@ -45,7 +45,8 @@ _HEADINGS = 24
 """Over which a turn on the spot in a current is averaged."""
 _RATES = np.linspace(1.0, 1.0 / 16.0, 16)
 """Shares of a greatest rate that are tried, downwards."""
-_MOST_HEAVE_MPS = 0.4
+_HEAVES_MPS = np.linspace(0.5, 0.01, 50)
+"""Rates of descent that are tried."""
 _FASTER = (0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.75, 1.0, 1.25, 1.5)
 """Speeds over ground that are tried for a way out, m/s."""
 
@@ -278,7 +279,7 @@ def _sway_step(
 
 def _heave(craft: Vehicle, current: Array) -> tuple[float, float]:
     """Rate of descent and ascent, and their mean power, heading into the current and held there."""
-    rates = np.concatenate([_MOST_HEAVE_MPS * _RATES, -_MOST_HEAVE_MPS * _RATES])
+    rates = np.concatenate([_HEAVES_MPS, -_HEAVES_MPS])
     nu = np.zeros((len(rates), 6))
     nu[:, 0], nu[:, 2] = math.hypot(*current), rates
     power = _power(craft, nu).reshape(2, -1).mean(axis=0)
@@ -288,7 +289,7 @@ def _heave(craft: Vehicle, current: Array) -> tuple[float, float]:
             f"{craft.name} cannot dive with the vertical thrust it has left: check "
             "vehicle.thruster_health"
         )
-    return float(_MOST_HEAVE_MPS * _RATES[can[0]]), float(power[can[0]])
+    return float(_HEAVES_MPS[can[0]]), float(power[can[0]])
 
 
 def strongest_current_mps(

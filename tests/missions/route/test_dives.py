@@ -1,0 +1,159 @@
+"""Lines parted into dives: fewest, then least energy, each within battery and time."""
+
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from alice_survey.errors import PlanError
+from missions.lines.line import Line
+from missions.plan_file import Dive
+from missions.route.cost import route_cost
+from missions.route.costs import Costs, time_costs
+from missions.route.dives import split_dives
+from missions.route.turns import route_through
+from missions.route.ways import Ways
+from tests.oracles_energy import best_parting
+
+HOME = (-1.0, -2.0)
+WAYS = Ways(shapely.MultiPolygon([shapely.box(-6, -6, 60, 40)]))
+COSTS = time_costs(0.2)
+"""1 W whatever it does: Wh are hours."""
+
+
+def _lines(count: int, length_m: float = 12.0, spacing_m: float = 1.0) -> list[Line]:
+    """To and fro along east, one beside the other."""
+    lines = []
+    for i in range(count):
+        ends = [(i * spacing_m, 0.0), (i * spacing_m, length_m)][:: 1 if i % 2 == 0 else -1]
+        lines.append(Line(kind="survey", start_ne_m=ends[0], end_ne_m=ends[1], stations=25))
+    return lines
+
+
+def _split(lines: list[Line], usable_wh: float, **options: Any) -> tuple[Dive, ...]:
+    settings: dict[str, Any] = {
+        "ways": WAYS, "costs": COSTS, "home_ne": HOME, "turn_radius_m": 0.5, "run_in_m": 0.5,
+        "turns": "auto", "longest_s": None, "depth_m": 3.0, "split": True,
+    }  # fmt: skip
+    return split_dives(lines, usable_wh=usable_wh, **(settings | options))
+
+
+def _of_dive(lines: list[Line], first: int, last: int, costs: Costs = COSTS) -> tuple[float, float]:
+    """A dive's energy and time, by its own route."""
+    route = route_through(lines[first : last + 1], 0.5, 0.5, ways=WAYS, costs=costs, home_ne=HOME)
+    energy, time = route_cost(route, costs)
+    return energy + costs.dive_j(3.0), time + costs.dive_s(3.0)
+
+
+def test_what_fits_is_one_dive_from_home_to_home() -> None:
+    lines = _lines(6)
+    (dive,) = _split(lines, 10.0)
+    energy, time = _of_dive(lines, 0, 5)
+    assert (dive.first_line, dive.last_line) == (0, 5)
+    assert dive.energy_wh == pytest.approx(energy / 3600)
+    assert dive.duration_s == pytest.approx(time)
+    assert dive.route.legs[0].start_ne_m == pytest.approx(HOME)
+    assert dive.route.legs[-1].end_ne_m == pytest.approx(HOME, abs=1e-6)
+
+
+@given(
+    count=st.integers(2, 9),
+    energy=st.floats(1.02, 6.0),
+    time=st.none() | st.floats(1.02, 6.0),
+    lengths=st.lists(st.floats(2.0, 25.0), min_size=9, max_size=9),
+)
+@settings(max_examples=40, deadline=None)
+def test_no_parting_is_better(
+    count: int, energy: float, time: float | None, lengths: list[float]
+) -> None:
+    """Against all partings of up to nine lines, by dives' own routes."""
+    lines = [_lines(count, length)[i] for i, length in enumerate(lengths[:count])]
+    alone = np.array([_of_dive(lines, i, i) for i in range(count)])
+    usable_j, longest_s = energy * alone[:, 0].max(), time and time * alone[:, 1].max()
+    known: dict[tuple[int, int], tuple[float, float]] = {}
+
+    def cost(first: int, last: int) -> tuple[float, float]:
+        if (first, last) not in known:
+            known[first, last] = _of_dive(lines, first, last)
+        return known[first, last]
+
+    dives = _split(lines, usable_j / 3600, longest_s=longest_s)
+
+    best = best_parting(count, cost, usable_j, np.inf if longest_s is None else longest_s)
+    assert best is not None
+    assert len(dives) == best[0]
+    assert sum(dive.energy_wh for dive in dives) * 3600 == pytest.approx(best[1], rel=1e-9)
+    assert [d.first_line for d in dives] == [0, *(d.last_line + 1 for d in dives[:-1])]
+    assert dives[-1].last_line == count - 1
+    for dive in dives:
+        assert dive.energy_wh * 3600 <= usable_j * (1 + 1e-9)
+        assert longest_s is None or dive.duration_s <= longest_s * (1 + 1e-9)
+        numbers = [leg.line for leg in dive.route.legs if leg.line >= 0]
+        assert numbers == list(range(dive.first_line, dive.last_line + 1))
+
+
+def test_ways_home_round_a_hole_count_whole() -> None:
+    """Home behind a wall: dives are no longer than what their routes take."""
+    wall = shapely.box(3, -5.9, 3.2, 30)
+    ways = Ways(shapely.MultiPolygon([shapely.box(-6, -6, 60, 40).difference(wall)]))
+    lines = [
+        Line(kind="survey", start_ne_m=(n, 0.0), end_ne_m=(n, 12.0), stations=25)
+        for n in (4.0, 5.0, 6.0, 7.0)
+    ]
+    dives = _split(lines, 0.18, ways=ways, home_ne=(0.0, 5.0))
+    assert len(dives) > 1
+    assert all(dive.energy_wh <= 0.18 for dive in dives)
+    for dive in dives:
+        along = np.linspace(0.0, dive.route.length_m, 2000)
+        assert ways.contains(dive.route.places(along)).all()
+        assert dive.route.length_m > 12 + 2 * 15  # round the end of the wall, there and back
+
+
+def test_a_line_that_fits_no_dive_is_named() -> None:
+    lines = [*_lines(3), *_lines(1, 36.0)]
+    with pytest.raises(PlanError) as caught:
+        _split(lines, 0.09)
+    text = str(caught.value)
+    assert text.startswith("line 3 of 36 m takes 0")
+    assert "home_ne_m" in text and "battery_wh" in text
+    assert "\n" not in text
+    with pytest.raises(PlanError, match=r"plan\.dive_s of \d+ s"):
+        _split(lines, 1e6, longest_s=300.0)
+
+
+def test_without_splitting_it_says_how_much_fits() -> None:
+    lines = _lines(12)
+    whole, part = _of_dive(lines, 0, 11), _of_dive(lines, 0, 4)
+    with pytest.raises(PlanError) as caught:
+        _split(lines, 1.001 * part[0] / 3600, split=False, costs=COSTS)
+    text = str(caught.value)
+    assert "the first 5 lines fit (60 m, 42%)" in text
+    dives = len(_split(lines, 1.001 * part[0] / 3600))
+    assert f"split_dives = true ({dives} dives)" in text
+    assert text.count(", or ") == 2  # three ways out
+    with pytest.raises(PlanError, match=rf"plan\.dive_s = {int(np.ceil(whole[1]))}"):
+        _split(lines, 1e6, longest_s=part[1] + 1, split=False)
+
+
+def test_a_course_against_too_much_current_is_refused() -> None:
+    line_w = np.ones(8)
+    line_w[1:4] = np.inf  # eastwards
+    costs = Costs(**{**vars(COSTS), "line_w": line_w})
+    with pytest.raises(PlanError, match=r"line 0 of 4 .* on course 90 deg is against a current"):
+        _split(_lines(4), 10.0, costs=costs)
+
+
+def test_thousands_of_lines_are_parted_quickly() -> None:
+    """2,000 lines in some six dives."""
+    ways = Ways(shapely.MultiPolygon([shapely.box(-6, -6, 2010, 40)]))
+    lines = _lines(2000)
+    _split(lines[:3], 1e-1, ways=ways)  # compiled
+    begun = time.process_time()
+    dives = _split(lines, 10.0, ways=ways)
+    assert time.process_time() - begun < 3.0
+    assert 5 <= len(dives) <= 12
+    assert sum(d.last_line - d.first_line + 1 for d in dives) == 2000

@@ -1,0 +1,294 @@
+"""What flying takes by course: the vehicle's own equations, and the trade against the current."""
+
+import json
+import math
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from alice_survey.config import SurveyConfig
+from alice_survey.errors import PlanError
+from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.steady import steady_flight
+from missions.route.costs import power_at, time_costs
+from missions.route.energy import (
+    course_power,
+    craft_of,
+    expected_current,
+    line_manner,
+    motion,
+    strongest_current_mps,
+    usable_wh,
+    vehicle_costs,
+)
+from missions.route.trade import draw_trade, energy_report, three_ways
+
+
+def _config(current: float = 0.1, towards: float = 90.0, **sections: Any) -> SurveyConfig:
+    sea = {"current_mps": current, "current_towards_deg": towards, **sections.pop("sea", {})}
+    return SurveyConfig.model_validate({"sea": sea, **sections})
+
+
+def test_the_trade_of_three_ways() -> None:
+    """0.2 m/s over ground in 0.1 m/s, calibrated coefficients: the figures that are known.
+
+    Drag by X_uu 15.23 and Y_vv 321.6 alone: mean of 0.1 and 0.3 m/s; 0.2 ahead and 0.1 across; and
+    the hypotenuse, with the heading 26.6 deg into the current.
+    """
+    along, sway, crab = three_ways(_config())
+    assert along.drag_w == pytest.approx(15.23 * (0.3**3 + 0.1**3) / 2, rel=1e-9)
+    assert sway.drag_w == pytest.approx(15.23 * 0.2**3 + 321.597 * 0.1**3, rel=1e-9)
+    assert crab.drag_w == pytest.approx(15.23 * math.hypot(0.2, 0.1) ** 3, rel=1e-9)
+    assert [round(way.drag_w, 2) for way in (along, sway, crab)] == [0.21, 0.44, 0.17]
+    assert round(crab.crab_deg) == 27
+    # Body lift takes more of a hull that goes askew, and of none that does not.
+    assert sway.lift_w == pytest.approx(35.428 * 0.2 * 0.1**2, rel=1e-9)
+    assert along.lift_w == crab.lift_w == pytest.approx(0.0, abs=1e-12)
+    # Of the electrical power little comes out again as drag's: the propellers turn slowly, yaw is
+    # held against the Munk moment, and buoyancy is held down.
+    for way in (along, sway, crab):
+        assert 5 * way.drag_w < way.thrusters_w < 30 * way.drag_w
+        assert way.line_w == pytest.approx(way.thrusters_w + 60.0)
+    assert crab.thrusters_w < along.thrusters_w < sway.thrusters_w / 2
+
+
+def test_motion_keeps_its_course_over_ground() -> None:
+    courses = np.linspace(0, 2 * np.pi, 19)
+    current = np.array([0.07, -0.05])
+    for manner in ("held", "crab"):
+        moved = motion(courses, 0.2, current, manner)  # type: ignore[arg-type]
+        heading = courses + moved.crab_rad
+        north = moved.nu[:, 0] * np.cos(heading) - moved.nu[:, 1] * np.sin(heading) + current[0]
+        east = moved.nu[:, 0] * np.sin(heading) + moved.nu[:, 1] * np.cos(heading) + current[1]
+        np.testing.assert_allclose(north, 0.2 * np.cos(courses), atol=1e-12)
+        np.testing.assert_allclose(east, 0.2 * np.sin(courses), atol=1e-12)
+        if manner == "crab":
+            assert np.abs(moved.nu[:, 1:]).max() == 0.0
+        else:
+            assert np.abs(moved.crab_rad).max() == 0.0
+
+
+def test_crabbing_ends_where_the_current_along_outruns_the_vehicle() -> None:
+    courses = np.radians([0.0, 59.0, 61.0, 180.0])
+    possible = motion(courses, 0.2, np.array([0.4, 0.0]), "crab").possible
+    # 0.4 cos(60 deg) = 0.2.
+    assert np.isnan(possible).tolist() == [True, True, False, False]
+
+
+def test_costs_turn_with_the_current() -> None:
+    """The vehicle is no compass: turning the current by 40 deg turns the costs by 8 samples."""
+    one, other = vehicle_costs(_config(towards=90.0)), vehicle_costs(_config(towards=130.0))
+    for name in ("line_w", "way_w", "sway_w"):
+        np.testing.assert_allclose(
+            getattr(other, name), np.roll(getattr(one, name), 8), rtol=1e-6, err_msg=name
+        )
+    assert other.heave_w == pytest.approx(one.heave_w)
+    assert other.spot_w == pytest.approx(one.spot_w, rel=1e-2)
+
+
+def test_costs_add_hotel_and_lights_where_they_burn() -> None:
+    bare = vehicle_costs(_config(vehicle={"hotel_w": 0.0}))
+    lit = vehicle_costs(_config(vehicle={"hotel_w": 50.0}), imaging_w=7.0)
+    np.testing.assert_allclose(lit.line_w, bare.line_w + 57.0)
+    np.testing.assert_allclose(lit.way_w, bare.way_w + 50.0)
+    np.testing.assert_allclose(lit.sway_w, bare.sway_w + 50.0)
+    assert lit.spot_w == pytest.approx(bare.spot_w + 50.0)
+    assert lit.heave_w == pytest.approx(bare.heave_w + 50.0)
+
+
+def test_without_a_current_all_courses_are_alike_and_ways_are_as_lines() -> None:
+    costs = vehicle_costs(_config(0.0))
+    np.testing.assert_allclose(costs.line_w, costs.line_w[0], rtol=1e-12)
+    np.testing.assert_allclose(costs.way_w, costs.line_w, rtol=1e-12)
+    nu = np.zeros((1, 6))
+    nu[0, 0] = 0.2
+    ahead = steady_flight(vehicle("alice"), nu).power_w[0]
+    assert costs.line_w[0] == pytest.approx(60.0 + ahead)
+
+
+def test_power_between_samples_is_near_that_of_its_own_course() -> None:
+    config = _config()
+    costs, craft = vehicle_costs(config), craft_of(config.vehicle)
+    courses = np.random.default_rng(1).uniform(0, 2 * np.pi, 50)
+    exact = course_power(craft, courses, 0.2, expected_current(config), "held") + 60.0
+    near = [power_at(costs.line_w, course) for course in courses]
+    np.testing.assert_allclose(near, exact, rtol=3e-3)
+
+
+def test_power_beside_a_course_that_cannot_be_kept_is_infinite() -> None:
+    power = np.array([1.0, 2.0, np.inf, 4.0])
+    assert power_at(power, math.pi / 4) == pytest.approx(1.5)
+    assert power_at(power, math.pi / 2) == 2.0  # on the sample itself
+    assert power_at(power, 0.6 * math.pi) == math.inf
+    assert power_at(power, -math.pi / 4) == pytest.approx(2.5)
+
+
+def test_sparus_crabs_its_lines_and_cannot_step() -> None:
+    config = _config(vehicle={"name": "sparus2"})
+    costs = vehicle_costs(config)
+    assert line_manner(config) == "crab"
+    np.testing.assert_allclose(costs.line_w, costs.way_w)
+    assert np.all(np.isinf(costs.sway_w))
+    assert math.isfinite(costs.spot_w)
+    assert line_manner(_config(vehicle={"controller": "los"})) == "crab"
+    assert line_manner(_config()) == "held"
+
+
+def test_where_it_cannot_crab_a_vehicle_with_sway_still_goes() -> None:
+    """With 0.3 m/s from behind it would have to turn its back."""
+    costs = vehicle_costs(_config(0.3, 0.0))
+    assert np.all(np.isfinite(costs.way_w))
+    np.testing.assert_allclose(costs.way_w[0], costs.line_w[0])
+    crabbing = vehicle_costs(_config(0.3, 0.0, vehicle={"name": "sparus2"}))
+    ahead = np.cos(np.arange(72) * 2 * np.pi / 72) * 0.3 < 0.2
+    np.testing.assert_array_equal(np.isfinite(crabbing.way_w), ahead)
+    # Lines across are flown both ways, lines along are not.
+    assert math.isfinite(crabbing.line_w[18]) and math.isinf(crabbing.line_w[0])
+
+
+def test_turning_on_the_spot_costs_more_in_a_current_and_about_the_glass() -> None:
+    still, moved = vehicle_costs(_config(0.0)), vehicle_costs(_config(0.15))
+    about_itself = vehicle_costs(_config(0.0, camera={"position_body_m": (0.0, 0.0, 0.08)}))
+    assert 60.0 < about_itself.spot_w < still.spot_w < moved.spot_w
+    assert still.turn_rate_rad_s == pytest.approx(math.radians(15.0))
+    lame = vehicle_costs(_config(0.1, vehicle={"thruster_health": {"bow": 0.0}}))
+    assert 0.0 < lame.turn_rate_rad_s < still.turn_rate_rad_s
+
+
+def test_a_descent_is_as_fast_as_three_quarters_of_the_thrust_allow() -> None:
+    """Going up is the vertical thruster's weaker way; buoyancy helps with 1 N."""
+    costs = vehicle_costs(_config(0.0))
+    rates = np.linspace(0.1, 0.4, 3001)
+    rps, thruster = math.sqrt(0.75) * 50.0, vehicle("alice").thrusters[2]
+    thrust = 1025.0 * 0.08**3 * rps * (0.278 * 0.08 * rps - thruster.advance_slope * rates)
+    most = rates[thrust + 0.1 * 9.80665 > 326.169 * rates**2].max()
+    assert most - 0.0101 <= costs.heave_mps <= most
+    assert costs.dive_s(13.0) == pytest.approx(26.0 / costs.heave_mps)
+    assert costs.dive_j(13.0) == pytest.approx(costs.dive_s(13.0) * costs.heave_w)
+
+
+def test_a_current_above_the_vehicles_strength_is_refused_with_ways_out() -> None:
+    with pytest.raises(PlanError) as caught:
+        vehicle_costs(_config(2.0))
+    text = str(caught.value)
+    assert "a current of 2.00 m/s towards 090 deg is above the strength of alice" in text
+    strength = strongest_current_mps(vehicle("alice"), 0.2, math.pi / 2, "held")
+    assert f"in {strength:.2f} m/s at most" in text
+    assert "\n" not in text and "sea.current_mps" in text
+    assert vehicle_costs(_config(strength - 0.01)).line_w.min() < math.inf
+    with pytest.raises(PlanError, match="above the strength"):
+        vehicle_costs(_config(strength + 0.01))
+
+
+def test_a_crabbing_vehicle_is_told_of_sway_and_of_speed() -> None:
+    config = _config(0.9, vehicle={"name": "sparus2"}, plan={"speed_mps": 0.1})
+    strength = strongest_current_mps(vehicle("sparus2"), 0.1, math.pi / 2, "crab")
+    if strength > 0.9:  # across the current it crabs at nearly 90 deg
+        vehicle_costs(config)
+    with pytest.raises(PlanError, match=r"crabbing.*fly alice with controller = 'sway'"):
+        vehicle_costs(_config(2.9, vehicle={"name": "sparus2"}))
+
+
+def test_a_heading_that_cannot_be_flown_is_refused_with_the_nearest_that_can() -> None:
+    def config(heading: float) -> SurveyConfig:
+        return _config(0.3, 0.0, vehicle={"name": "sparus2"}, plan={"line_heading_deg": heading})
+
+    with pytest.raises(PlanError, match=r"lines on 10 deg .* nearest heading that can is 50 deg"):
+        vehicle_costs(config(10.0))  # 0.3 cos(48.2 deg) = 0.2
+    assert math.isfinite(vehicle_costs(config(55.0)).spot_w)
+
+
+def test_known_failures_count_and_unknown_ones_do_not() -> None:
+    health = {"thruster_health": {"bow": 0.0}}
+    sound, lame = vehicle_costs(_config()), vehicle_costs(_config(vehicle=health))
+    unknown = vehicle_costs(_config(vehicle={**health, "health_known": False}))
+    assert lame.line_w[0] > sound.line_w[0] + 5.0
+    np.testing.assert_array_equal(unknown.line_w, sound.line_w)
+
+
+def test_a_measured_current_counts_by_its_mean_at_depth(tmp_path: Path) -> None:
+    rows = ["time_s,depth_m,north_mps,east_mps"]
+    for second, north in ((0, 0.0), (60, 0.2)):
+        rows += [f"{second},5,{north + 0.4},0.02", f"{second},15,{north},0.06"]
+    path = tmp_path / "current.csv"
+    path.write_text("\n".join(rows) + "\n")
+    config = _config(sea={"current_file": str(path)}, area={"seafloor_depth_m": 12.0})
+    # At 10 m, half way: mean of 0.3 and 0.1 + ... north, 0.04 east.
+    np.testing.assert_allclose(expected_current(config), [0.3, 0.04], atol=1e-12)
+
+
+def test_endurance_agrees_with_the_makers() -> None:
+    """8 to 10 hours are published of SPARUS II; at 1 m/s the whole battery lasts as long."""
+    config = _config(0.0, vehicle={"name": "sparus2"}, plan={"speed_mps": 1.0})
+    costs = vehicle_costs(config)
+    assert 8.0 < config.vehicle.battery_wh / costs.way_w[0] < 10.0
+    assert usable_wh(config.vehicle) == pytest.approx(0.8 * config.vehicle.battery_wh)
+
+
+def test_the_report_says_what_the_numbers_say() -> None:
+    text, data = energy_report(_config(0.1, 60.0), imaging_w=3.0)
+    assert data["best_heading_deg"] == 60.0
+    assert data["worst_heading_deg"] == 150.0
+    assert data["best_w"] < data["worst_w"]
+    assert data["hours"] == pytest.approx(1120.0 / data["best_w"])
+    assert [way["name"] for way in data["ways"]] == [
+        "along the current", "across, held by sway", "across, crabbing",
+    ]  # fmt: skip
+    for way in data["ways"]:
+        assert f"{way['drag_w']:8.2f}" in text
+    assert "towards 060 deg" in text and "lights 3.0 W" in text
+    assert max(len(line) for line in text.splitlines()) <= 100
+    unable, told = energy_report(_config(0.1, vehicle={"name": "sparus2"}))
+    assert told["ways"][1]["thrusters_w"] is None
+    assert "cannot" in unable
+    json.dumps(told, allow_nan=False)
+
+
+def test_the_picture_of_the_trade_is_drawn(tmp_path: Path) -> None:
+    draw_trade(tmp_path / "trade.png", _config())
+    with Image.open(tmp_path / "trade.png") as picture:
+        pixels = np.asarray(picture.convert("RGB"), dtype=float)
+    assert min(pixels.shape[:2]) > 500
+    blue = (pixels[..., 2] > 150) & (pixels[..., 0] < 80)
+    assert 500 < blue.sum() < 0.1 * blue.size
+    draw_trade(tmp_path / "again.png", _config())
+    assert (tmp_path / "again.png").read_bytes() == (tmp_path / "trade.png").read_bytes()
+
+
+def test_costs_are_quick_once_warm() -> None:
+    config = _config()
+    vehicle_costs(config)
+    times = []
+    for _ in range(5):
+        begun = time.perf_counter()
+        vehicle_costs(config)
+        times.append(time.perf_counter() - begun)
+    assert min(times) < 0.06
+
+
+def test_costs_compile_nothing() -> None:
+    """A cold start pays for no kernel of the simulator."""
+    code = (
+        "from numba.core import event\n"
+        "from alice_survey.config import SurveyConfig\n"
+        "from missions.route.energy import vehicle_costs\n"
+        "with event.install_recorder('numba:compile') as seen:\n"
+        "    vehicle_costs(SurveyConfig())\n"
+        "import sys; print(len(seen.buffer), 'missions.simulation' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["0", "False"]
+
+
+def test_seconds_stand_for_joules() -> None:
+    costs = time_costs(0.2, sway_mps=0.1, heave_mps=0.2)
+    assert costs.line_j(10.0, 1.0) == costs.way_j(10.0, 2.0) == pytest.approx(50.0)
+    assert costs.sway_j(1.0, 0.0) == pytest.approx(10.0 + costs.settle_s)
+    assert costs.spot_j(-costs.turn_rate_rad_s) == pytest.approx(1.0 + costs.settle_s)
+    assert costs.dive_j(10.0) == costs.dive_s(10.0) == pytest.approx(100.0)
