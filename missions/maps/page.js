@@ -25,7 +25,7 @@ function degrees(value, ahead, astern) {
 
 function latLon(geo, n, e) {
   const [lat, lon] = geodetic(geo, n, e);
-  return degrees(lat, "N", "S") + "  " + degrees(lon, "E", "W");
+  return degrees(lat, "N", "S") + "  " + degrees((lon + 540) % 360 - 180, "E", "W");
 }
 
 /* 1, 2 or 5 times a power of ten, not above a length. */
@@ -165,7 +165,8 @@ function start() {
     ctx.setTransform(view.ratio, 0, 0, view.ratio, 0, 0);
     ctx.fillStyle = "#fbfcfc";
     ctx.fillRect(0, 0, view.width, view.height);
-    if (layers.grid) paintGrid();
+    const grid = gridValues();
+    if (layers.grid) paintGrid(grid);
     if (counts && (layers.counts || layers.missed)) paintCounts();
     if (layers.contours) paintContours();
     if (layers.foot) paintFootprints();
@@ -178,6 +179,7 @@ function start() {
     if (layers.area) paintArea("survey", {colour: COLOURS.area, width: 2.2, dash: [8, 4]});
     paintHome();
     paintHover();
+    if (layers.grid) paintGridLabels(grid);
     paintMeasure();
     paintFurniture();
   }
@@ -239,30 +241,53 @@ function start() {
     ctx.stroke();
   }
 
-  function paintGrid() {
+  /* The grid's values within view, and how to write them. */
+  function gridValues() {
     const step = roundLength(110 / view.scale);
     const [high, left] = place(0, 0);
     const [low, right] = place(view.width, view.height);
+    const digits = step < 1 ? (step < 0.1 ? 2 : 1) : 0;
+    const between = (from, to) => {
+      const values = [];
+      for (let k = Math.ceil(from / step); k * step < to; k++) values.push(k * step);
+      return values;
+    };
+    return {norths: between(low, high), easts: between(left, right), digits};
+  }
+
+  function paintGrid({norths, easts}) {
     ctx.strokeStyle = "#e6ebee";
     ctx.lineWidth = 1;
-    ctx.fillStyle = "#93a1aa";
-    ctx.font = "10.5px sans-serif";
     ctx.beginPath();
-    const digits = step < 1 ? (step < 0.1 ? 2 : 1) : 0;
-    for (let e = Math.ceil(left / step) * step; e < right; e += step) {
+    easts.forEach((e) => {
       ctx.moveTo(Math.round(x(e)) + 0.5, 0);
       ctx.lineTo(Math.round(x(e)) + 0.5, view.height);
-      if (x(e) > 60 && x(e) < view.width - 60) ctx.fillText(e.toFixed(digits) + " m E", x(e) + 3, 12);
-    }
-    for (let n = Math.ceil(low / step) * step; n < high; n += step) {
+    });
+    norths.forEach((n) => {
       ctx.moveTo(0, Math.round(y(n)) + 0.5);
       ctx.lineTo(view.width, Math.round(y(n)) + 0.5);
-      const label = n.toFixed(digits) + " m N";
-      if (y(n) > 70 && y(n) < view.height - 44) {
-        ctx.fillText(label, view.width - ctx.measureText(label).width - 5, y(n) - 3);
-      }
-    }
+    });
     ctx.stroke();
+  }
+
+  function paintGridLabels({norths, easts, digits}) {
+    ctx.font = "10.5px sans-serif";
+    ctx.lineWidth = 3;
+    ctx.lineJoin = "round";
+    ctx.strokeStyle = "rgba(255,255,255,.85)";
+    ctx.fillStyle = "#71808a";
+    const write = (text, px, py) => {
+      ctx.strokeText(text, px, py);
+      ctx.fillText(text, px, py);
+    };
+    easts.forEach((e) => {
+      if (x(e) > 60 && x(e) < view.width - 60) write(e.toFixed(digits) + " m E", x(e) + 3, 12);
+    });
+    norths.forEach((n) => {
+      const text = n.toFixed(digits) + " m N";
+      if (y(n) < 90 || y(n) > view.height - 44) return;
+      write(text, view.width - ctx.measureText(text).width - 5, y(n) - 3);
+    });
   }
 
   function paintCounts() {
@@ -524,7 +549,8 @@ function start() {
       parts.push(latLon(data.geo, pointer[0], pointer[1]));
       parts.push(pointer[0].toFixed(2) + " m N, " + pointer[1].toFixed(2) + " m E");
       const seen = countAt(pointer);
-      if (seen) parts.push("seen in " + seen.pictures + " pictures from " + seen.lines + " lines");
+      if (seen) parts.push("pictures: " + seen.pictures + " (from " + seen.lines
+        + (seen.lines === 1 ? " line)" : " lines)"));
     }
     if (measuring) parts.push(measured.length > 1 ? "measured " + metres(total) : "click to measure");
     read.textContent = parts.join("   ·   ") || "Move the pointer over the map.";
