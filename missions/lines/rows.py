@@ -25,6 +25,7 @@ _SHORTEST_M = 1e-3
 _EVEN = 1e-9
 
 
+@njit(cache=True)  # type: ignore[untyped-decorator]
 def to_uv(edges_ne: Array, heading_rad: float) -> Array:
     """Turn edges into the frame of the lines.
 
@@ -36,8 +37,11 @@ def to_uv(edges_ne: Array, heading_rad: float) -> Array:
         (E, 4) u and v of both ends.
     """
     c, s = math.cos(heading_rad), math.sin(heading_rad)
-    turn = np.array([[c, -s], [s, c]])
-    uv: Array = np.ascontiguousarray((edges_ne.reshape(-1, 2) @ turn).reshape(-1, 4))
+    uv = np.empty_like(edges_ne)
+    for e in range(edges_ne.shape[0]):
+        for k in (0, 2):
+            uv[e, k] = c * edges_ne[e, k] + s * edges_ne[e, k + 1]
+            uv[e, k + 1] = c * edges_ne[e, k + 1] - s * edges_ne[e, k]
     return uv
 
 
@@ -53,8 +57,8 @@ def row_offsets(low_m: float, high_m: float, spacing_m: float, edge_m: float, pa
     """
     steps = math.ceil((high_m - low_m + 2 * edge_m) / spacing_m - _EVEN)
     steps = max(steps, passes - 1, 0)
-    offsets: Array = (low_m + high_m) / 2 + spacing_m * (np.arange(steps + 1) - steps / 2)
-    return offsets
+    places = np.arange(steps + 1, dtype=np.float64) - steps / 2
+    return (low_m + high_m) / 2 + spacing_m * places
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -305,18 +309,19 @@ def lay_rows(
             begin = reach[k, 0]
             while p < laid and pieces[p, 2] < begin:
                 p += 1
-            j = p
-            while True:
+            j, lacking = p, True
+            while lacking:
                 end = reach[k, 1] if j == laid else min(reach[k, 1], pieces[j, 1])
-                if end > begin + TOUCH_M or (j == laid and begin == reach[k, 0] == reach[k, 1]):
+                # A wish may be a single place; then it is met or it is not.
+                if end > begin + TOUCH_M or (end == begin == reach[k, 0] == reach[k, 1]):
+                    if j < laid and pieces[j, 1] <= begin:
+                        break
                     if cut == cuts.shape[0]:
                         cuts = np.concatenate((cuts, np.empty_like(cuts)))
                     cuts[cut, 0], cuts[cut, 1], cuts[cut, 2] = i, begin, end
                     cut += 1
-                if j == laid or pieces[j, 1] >= reach[k, 1]:
-                    break
-                begin = max(begin, pieces[j, 2])
-                j += 1
-                if begin >= reach[k, 1]:
-                    break
+                lacking = j < laid and pieces[j, 2] < reach[k, 1]
+                if lacking:
+                    begin = max(begin, pieces[j, 2])
+                    j += 1
     return pieces[:laid].copy(), cuts[:cut].copy()

@@ -1,0 +1,288 @@
+"""The heading of survey lines that costs least.
+
+Two answers. For the total width of all cells it is exact: over a turn, the width across a direction
+is half the sum of every edge's extent across it, so it is concave between the directions of edges
+and least along one of them (rotating calipers carry this from convex areas, M. I. Shamos 1978, to
+any area: W. H. Huang 2001 takes the same sum over cells).
+
+For the full cost no formula is known: it jumps where a line more is needed, and turns, transits and
+the current have their say. A cheap estimate (energy of all pieces of lines, and of a turn to each)
+is taken at many headings, at the directions of edges and just where the number of lines jumps; the
+full cost at the best of these, then again near the best of all.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numba import njit
+
+from alice_survey.errors import PlanError
+from alice_survey.frames import Array
+from missions.areas.area import Area
+from missions.lines import cells, hops, rows
+from missions.lines.lay import check_size, laid
+from missions.lines.pattern import Pattern
+from missions.lines.site import Site
+from missions.route.costs import Costs
+from missions.route.ways import Ways
+
+_ESTIMATES = 1800
+"""Headings at which the cost is estimated, a tenth of a degree apart, if lines are few."""
+_FEW_ROWS = 400
+_LEAST_ESTIMATES = 360
+_SPREAD = 45
+"""Headings at which the full cost is taken whatever the estimate says."""
+_BEST = 24
+"""Best estimates at which it is taken."""
+_REFINED = 4
+"""Best full costs near which it is taken again."""
+_NEAR_RAD = math.radians(2.0)
+_BESIDE_RAD = 1e-9
+"""A jump is left on the side of fewer lines by this."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sweep:
+    """The best heading of survey lines; they are flown to and fro, so headings are in [0, pi)."""
+
+    heading_rad: float
+    cost_j: float
+    """Of the whole flight from home to home, as lines are ordered (`missions.lines.hops`)."""
+    width_heading_rad: float
+    """Where the total width of all cells is least."""
+    width_m: float
+    """That width: how many lines are needed, times their spacing."""
+    candidates: tuple[tuple[float, float], ...]
+    """Heading, rad, and full cost, J, wherever that was taken, by heading."""
+
+
+def best_heading(
+    area: Area,
+    pattern: Pattern,
+    ways: Ways,
+    costs: Costs,
+    home_ne: tuple[float, float],
+    *,
+    cross_lines: int,
+    closing_line: bool,
+) -> Sweep:
+    """Search the heading at which all lines cost least; arguments as of `lay.lay_lines`.
+
+    Raises:
+        PlanError: the area is too large, or cannot be flown at any heading.
+    """
+    check_size(area, pattern)
+    site, prices = Site.of(area), hops.prices_of(costs)
+    width_heading, width = least_width(site.survey)
+    found: dict[float, float] = {}
+    faults: list[PlanError] = []
+
+    def take(headings: Array) -> None:
+        for heading in np.unique(headings % math.pi).tolist():
+            if heading in found:
+                continue
+            try:
+                found[heading] = laid(
+                    site,
+                    heading,
+                    pattern,
+                    ways,
+                    prices,
+                    home_ne,
+                    cross_lines=cross_lines,
+                    closing_line=closing_line,
+                ).energy_j
+            except PlanError as fault:
+                faults.append(fault)
+
+    headings = _headings(area, site, pattern)
+    estimates = estimate_j(site, headings, pattern, prices, cross_lines)
+    take(np.append(np.arange(_SPREAD) * math.pi / _SPREAD, width_heading))
+    take(_best(headings, estimates, _BEST, math.radians(0.3)))
+    for heading in sorted(found, key=lambda x: found[x])[:_REFINED]:
+        apart = np.abs((headings - heading + math.pi / 2) % math.pi - math.pi / 2)
+        near = apart < _NEAR_RAD
+        take(_best(headings[near], estimates[near], _REFINED, math.radians(0.05)))
+        take(heading + math.radians(0.1) * np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0]))
+    if not found:
+        raise faults[0]
+    best = min(found, key=lambda x: (found[x], x))
+    return Sweep(
+        heading_rad=best,
+        cost_j=found[best],
+        width_heading_rad=width_heading,
+        width_m=width,
+        candidates=tuple(sorted(found.items())),
+    )
+
+
+def full_cost_j(
+    area: Area,
+    heading_rad: float,
+    pattern: Pattern,
+    ways: Ways,
+    costs: Costs,
+    home_ne: tuple[float, float],
+    *,
+    cross_lines: int,
+    closing_line: bool,
+) -> float:
+    """Energy of the flight through all lines of a heading; arguments as of `lay.lay_lines`.
+
+    Raises:
+        PlanError: they cannot be flown.
+    """
+    return laid(
+        Site.of(area),
+        heading_rad,
+        pattern,
+        ways,
+        hops.prices_of(costs),
+        home_ne,
+        cross_lines=cross_lines,
+        closing_line=closing_line,
+    ).energy_j
+
+
+def least_width(edges: Array) -> tuple[float, float]:
+    """The direction, in [0, pi), across which all cells together are narrowest, and that width.
+
+    Args:
+        edges: (E, 4) north and east of both ends of every edge of the area.
+    """
+    spans = edges[:, 2:] - edges[:, :2]
+    directions = np.unique(np.arctan2(spans[:, 1], spans[:, 0]) % math.pi)
+    widths = widths_m(edges, directions)
+    least = int(np.argmin(np.round(widths, 9)))
+    return float(directions[least]), float(widths[least])
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def widths_m(edges: Array, headings: Array) -> Array:
+    """Total width, (H,), of all cells across directions (H,)."""
+    widths = np.zeros(headings.size)
+    for i in range(headings.size):
+        c, s = math.cos(headings[i]), math.sin(headings[i])
+        for e in range(edges.shape[0]):
+            widths[i] += abs(c * (edges[e, 3] - edges[e, 1]) - s * (edges[e, 2] - edges[e, 0])) / 2
+    return widths
+
+
+def estimate_j(
+    site: Site, headings: Array, pattern: Pattern, prices: hops.Prices, cross_lines: int
+) -> Array:
+    """Energy, (H,), of all pieces of lines and of a turn to each, at headings (H,)."""
+    turn_j = hops.hop_j(prices, 0.0, 0.0, 0.0, 0.0, pattern.spacing_m, math.pi, pattern.spacing_m)
+    estimates: Array = _estimates(
+        site.survey,
+        site.allowed,
+        headings,
+        pattern.spacing_m,
+        pattern.edge_m,
+        pattern.passes,
+        pattern.overhang_m,
+        pattern.step_m,
+        max(1, pattern.pictures - 1),
+        prices,
+        turn_j,
+        cross_lines,
+    )
+    return estimates
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _estimates(
+    survey: Array,
+    allowed: Array,
+    headings: Array,
+    spacing: float,
+    edge: float,
+    passes: int,
+    overhang: float,
+    step: float,
+    least_steps: int,
+    prices: hops.Prices,
+    turn_j: float,
+    cross_lines: int,
+) -> Array:
+    result = np.empty(headings.size)
+    for i in range(headings.size):
+        heading = headings[i]
+        turned, room = rows.to_uv(survey, heading), rows.to_uv(allowed, heading)
+        low, high = turned[:, 1].min(), turned[:, 1].max()
+        count = max(math.ceil((high - low + 2 * edge) / spacing - 1e-9), passes - 1, 0) + 1
+        offsets = (low + high) / 2 + spacing * (np.arange(count) - (count - 1) / 2)
+        pieces, _ = rows.lay_rows(
+            turned, room, offsets, passes * spacing / 2, overhang, step, least_steps
+        )
+        ahead = hops.line_j(prices, 1.0, heading)
+        back = hops.line_j(prices, 1.0, heading + math.pi)
+        length = 0.0
+        for p in range(pieces.shape[0]):
+            length += pieces[p, 2] - pieces[p, 1]
+        parts = cells.chains(cells.followers(pieces))[0].size - 1
+        across = hops.line_j(prices, (high - low) * cross_lines, heading + math.pi / 2)
+        # From cell to cell the way is some turns long.
+        turns = pieces.shape[0] + 2 * parts
+        result[i] = length * (ahead + back) / 2 + across + turns * turn_j
+    return result
+
+
+def _headings(area: Area, site: Site, pattern: Pattern) -> Array:
+    """Headings worth an estimate: evenly spread, along edges, and where the row count jumps."""
+    hull = shapely.get_coordinates(area.survey.convex_hull)
+    north_0, east_0, north_1, east_1 = area.survey.bounds
+    rows_most = math.hypot(north_1 - north_0, east_1 - east_0) / pattern.spacing_m
+    count = int(np.clip(_ESTIMATES * _FEW_ROWS / rows_most, _LEAST_ESTIMATES, _ESTIMATES))
+    even = np.arange(count) * math.pi / count
+    spans = site.survey[:, 2:] - site.survey[:, :2]
+    longest = np.argsort(-np.hypot(*spans.T), kind="stable")[:count]
+    edges = np.arctan2(spans[longest, 1], spans[longest, 0]) % math.pi
+    jumps = _jumps(hull, pattern)
+    if len(jumps) > count:
+        jumps = jumps[np.linspace(0, len(jumps) - 1, count).astype(np.intp)]
+    return np.unique(np.concatenate([even, edges, jumps]))
+
+
+def _jumps(hull: Array, pattern: Pattern) -> Array:
+    """Headings next to those at which the number of rows changes, on the side of fewer.
+
+    Between two directions of the convex hull's edges the same two corners are outermost; the width
+    is their distance times the sine of the angle between it and the heading.
+
+    Args:
+        hull: (N, 2) corners, closed.
+        pattern: of the lines.
+    """
+    spans = np.diff(hull, axis=0)
+    turns = np.unique(np.arctan2(spans[:, 1], spans[:, 0]) % math.pi)
+    found = []
+    for begin, end in zip(turns, np.append(turns[1:], turns[0] + math.pi), strict=True):
+        middle = (begin + end) / 2
+        across = hull @ np.array([-math.sin(middle), math.cos(middle)])
+        north, east = hull[int(np.argmax(across))] - hull[int(np.argmin(across))]
+        distance, bearing = math.hypot(north, east), math.atan2(east, north)
+        least = (np.arange(1, distance / pattern.spacing_m + 2)) * pattern.spacing_m
+        sine = (least - 2 * pattern.edge_m) / max(distance, 1e-9)
+        angle = np.arcsin(sine[(sine > 0) & (sine < 1)])
+        # The width grows from 0 on at the bearing, up to a quarter turn from it, and falls again.
+        for heading in (bearing + angle - _BESIDE_RAD, bearing - angle + _BESIDE_RAD):
+            inside = begin + (heading - begin) % math.pi
+            found.append(inside[inside <= end] % math.pi)
+    return np.concatenate(found)
+
+
+def _best(headings: Array, estimates: Array, count: int, apart_rad: float) -> Array:
+    """The headings of the least estimates, none within `apart_rad` of a better one."""
+    chosen: list[float] = []
+    for i in np.argsort(estimates, kind="stable").tolist():
+        heading = float(headings[i])
+        if all(
+            abs((heading - c + math.pi / 2) % math.pi - math.pi / 2) >= apart_rad for c in chosen
+        ):
+            chosen.append(heading)
+            if len(chosen) == count:
+                break
+    return np.array(chosen)
