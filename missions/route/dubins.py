@@ -57,7 +57,7 @@ def turn(
     return legs
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def moved(
     north: float, east: float, heading: float, curvature: float, length: float
 ) -> tuple[float, float, float]:
@@ -71,7 +71,7 @@ def moved(
     )
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def shortest_turn(fence: Fence, start: Array, goal: Array, radius: float) -> Array:
     """The shortest path of the six kinds that stays inside.
 
@@ -113,7 +113,7 @@ def shortest_turn(fence: Fence, start: Array, goal: Array, radius: float) -> Arr
     return best
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _words(start: Array, goal: Array, radius: float) -> Array:
     """(6, 7) senses (+1 starboard, 0 straight, -1 port), lengths and their sum in radii.
 
@@ -148,7 +148,7 @@ def _words(start: Array, goal: Array, radius: float) -> Array:
     return words
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _put(
     words: Array,
     row: int,
@@ -164,7 +164,7 @@ def _put(
     words[row, 6] = first + middle + last
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _wrap(angle: float) -> float:
     """The angle in [0, 2 pi), with 0 for what is a full turn but for rounding."""
     wrapped = angle % _FULL

@@ -79,24 +79,27 @@ def fence_of(allowed: MultiPolygon) -> Fence:
 
 
 def _edges(corners: Array) -> Array:
-    return np.concatenate([corners[:-1], corners[1:]], axis=1)
+    """(E, 4) of a ring, without those of no length."""
+    edges = np.concatenate([corners[:-1], corners[1:]], axis=1)
+    kept: Array = edges[(edges[:, 0] != edges[:, 2]) | (edges[:, 1] != edges[:, 3])]
+    return kept
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _row(fence: Fence, north: float) -> int:
     """The grid's row at a north, the first or last one beyond the grid."""
     row = math.floor((north - fence.north_m) * fence.rows_per_m)
     return min(max(row, 0), fence.rows - 1)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _column(fence: Fence, east: float) -> int:
     """The grid's column at an east, the first or last one beyond the grid."""
     column = math.floor((east - fence.east_m) * fence.columns_per_m)
     return min(max(column, 0), fence.columns - 1)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _columns_met(
     fence: Fence, row: int, a_n: float, a_e: float, b_n: float, b_e: float
 ) -> tuple[int, int]:
@@ -119,7 +122,7 @@ def _columns_met(
     )
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _sorted_into_cells(fence: Fence) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Lists of the edges that each cell, padded, holds a part of."""
     firsts = np.zeros(fence.rows * fence.columns + 1, dtype=np.int32)
@@ -145,7 +148,7 @@ def _sorted_into_cells(fence: Fence) -> tuple[NDArray[np.int32], NDArray[np.int3
     return firsts, listed
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _encloses(fence: Fence, north: float, east: float) -> bool:
     """Whether a ray to the east meets the edges an odd number of times."""
     row, odd = _row(fence, north), False
@@ -161,7 +164,7 @@ def _encloses(fence: Fence, north: float, east: float) -> bool:
     return odd
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _at_edge(fence: Fence, north: float, east: float, touch_m: float) -> bool:
     """Whether an edge is within reach, which is at most `TOUCH_M`."""
     cell = _row(fence, north) * fence.columns + _column(fence, east)
@@ -175,7 +178,18 @@ def _at_edge(fence: Fence, north: float, east: float, touch_m: float) -> bool:
     return False
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _sort(values: Array, count: int) -> None:
+    """Sort the first few values in place; numba's own sort takes a second to compile."""
+    for i in range(1, count):
+        value, k = values[i], i
+        while k > 0 and values[k - 1] > value:
+            values[k] = values[k - 1]
+            k -= 1
+        values[k] = value
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def point_inside(fence: Fence, north: float, east: float) -> bool:
     """Whether a place is inside or no more than `TOUCH_M` outside."""
     if fence.edges.shape[0] == 0:
@@ -184,7 +198,7 @@ def point_inside(fence: Fence, north: float, east: float) -> bool:
     return inside
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def straight_inside(fence: Fence, a_n: float, a_e: float, b_n: float, b_e: float) -> bool:
     """Whether all of a straight is inside or no more than `TOUCH_M` outside.
 
@@ -242,7 +256,7 @@ def straight_inside(fence: Fence, a_n: float, a_e: float, b_n: float, b_e: float
                 return True  # no edge is met: all of it is where its middle is
             cuts = np.empty(count)
     cuts[0], cuts[1] = 0.0, 1.0
-    cuts.sort()
+    _sort(cuts, cuts.shape[0])
     for i in range(cuts.shape[0] - 1):
         middle = 0.5 * (cuts[i] + cuts[i + 1])
         if _encloses(fence, a_n + middle * u, a_e + middle * v):
@@ -255,7 +269,7 @@ def straight_inside(fence: Fence, a_n: float, a_e: float, b_n: float, b_e: float
     return True
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def arc_inside(
     fence: Fence, north: float, east: float, heading: float, curvature: float, length: float
 ) -> bool:
@@ -316,8 +330,7 @@ def arc_inside(
                 if abs(math.hypot(end_n, end_e) - radius) <= 2 * TOUCH_M:
                     cuts[count] = (side * (math.atan2(end_e, end_n) - ahead)) % _FULL
                     count += 1
-    cuts = cuts[:count]
-    cuts.sort()
+    _sort(cuts, count)
     for i in range(count - 1):
         if cuts[i + 1] > swept:
             break

@@ -57,7 +57,7 @@ def prices(costs: Costs) -> Prices:
     )
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def joined_lines(
     fence: Fence, prices: Prices, lines: Array, radius: float, run_in: float, wanted: int
 ) -> tuple[Array, NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
@@ -81,6 +81,7 @@ def joined_lines(
     rows = np.empty(count, dtype=np.int64)
     kinds = np.zeros(max(count - 1, 0), dtype=np.int64)
     detours = np.zeros(max(count - 1, 0), dtype=np.bool_)
+    end, goal = np.empty(3), np.empty(3)
     used = 0
     for i in range(count):
         rows[i] = used
@@ -88,17 +89,19 @@ def joined_lines(
         used = _add(legs, used, lines[i, 0], lines[i, 1], lines[i, 4], length, 0.0)
         legs[rows[i], 5] = i
         if i + 1 < count:
-            end = np.array([lines[i, 2], lines[i, 3], lines[i, 4]])
-            goal = np.array([lines[i + 1, 0], lines[i + 1, 1], lines[i + 1, 4]])
+            end[0], end[1], end[2] = lines[i, 2], lines[i, 3], lines[i, 4]
+            goal[0], goal[1], goal[2] = lines[i + 1, 0], lines[i + 1, 1], lines[i + 1, 4]
             kinds[i], made, detours[i] = join(
                 fence, prices, end, goal, radius, run_in, run_in, wanted
             )
-            legs[used : used + made.shape[0]] = made
-            used += made.shape[0]
+            for k in range(made.shape[0]):
+                for column in range(COLUMNS):
+                    legs[used, column] = made[k, column]
+                used += 1
     return legs[:used], rows, kinds, detours
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def join(
     fence: Fence,
     prices: Prices,
@@ -148,7 +151,7 @@ def join(
     return NONE, spot, True
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _by_arcs(
     fence: Fence,
     prices: Prices,
@@ -161,7 +164,9 @@ def _by_arcs(
     """Run-out, the shortest turn, run-in; infinite if it leaves the fence."""
     legs = np.empty((5, COLUMNS))
     # Home is left and reached on the course straight to or from the other end.
-    start, arrival = end.copy(), goal.copy()
+    start, arrival = np.empty(3), np.empty(3)
+    for k in range(3):
+        start[k], arrival[k] = end[k], goal[k]
     if not math.isnan(end[2]):
         start[0] += run_out * math.cos(end[2])
         start[1] += run_out * math.sin(end[2])
@@ -169,15 +174,10 @@ def _by_arcs(
         arrival[0] -= run_in * math.cos(goal[2])
         arrival[1] -= run_in * math.sin(goal[2])
     bearing = math.atan2(arrival[1] - start[1], arrival[0] - start[0])
-    if math.isnan(end[2]):
-        start[2] = bearing
-    else:
-        if not straight_inside(fence, end[0], end[1], start[0], start[1]):
-            return np.inf, legs[:0]
-    if math.isnan(goal[2]):
-        arrival[2] = bearing
-    else:
-        if not straight_inside(fence, arrival[0], arrival[1], goal[0], goal[1]):
+    for known, place in ((end, start), (goal, arrival)):
+        if math.isnan(known[2]):
+            place[2] = bearing
+        elif not straight_inside(fence, known[0], known[1], place[0], place[1]):
             return np.inf, legs[:0]
     pieces = shortest_turn(fence, start, arrival, radius)
     if pieces[0, 1] == np.inf:
@@ -195,25 +195,25 @@ def _by_arcs(
     return price(prices, legs[:used]), legs[:used]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _on_the_spot(
     fence: Fence, prices: Prices, end: Array, goal: Array, run_in: float
 ) -> tuple[float, Array]:
     """Turn, straight, turn, run-in; infinite if it leaves the fence."""
     legs = np.empty((4, COLUMNS))
-    arrival = run_in_start(fence, goal, run_in)
-    if not straight_inside(fence, end[0], end[1], arrival[0], arrival[1]):
+    north, east = run_in_start(fence, goal, run_in)
+    if not straight_inside(fence, end[0], end[1], north, east):
         return np.inf, legs[:0]
-    used = add_straight(legs, 0, end[0], end[1], end[2], arrival[0], arrival[1])
+    used = add_straight(legs, 0, end[0], end[1], end[2], north, east)
     heading = end[2] if used == 0 else legs[used - 1, 2]
-    used = add_spot(legs, used, arrival[0], arrival[1], heading, goal[2])
+    used = add_spot(legs, used, north, east, heading, goal[2])
     if not math.isnan(goal[2]):
-        back = math.hypot(goal[0] - arrival[0], goal[1] - arrival[1])
-        used = _add(legs, used, arrival[0], arrival[1], goal[2], back, 0.0)
+        back = math.hypot(goal[0] - north, goal[1] - east)
+        used = _add(legs, used, north, east, goal[2], back, 0.0)
     return price(prices, legs[:used]), legs[:used]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _sideways(
     fence: Fence, prices: Prices, end: Array, goal: Array, run_in: float
 ) -> tuple[float, Array]:
@@ -226,9 +226,9 @@ def _sideways(
         return np.inf, legs[:0]
     cos, sin = math.cos(end[2]), math.sin(end[2])
     along = math.cos(goal[2]) * cos + math.sin(goal[2]) * sin
-    arrival = run_in_start(fence, goal, run_in)
-    last = math.hypot(goal[0] - arrival[0], goal[1] - arrival[1])
-    first = (arrival[0] - end[0]) * cos + (arrival[1] - end[1]) * sin
+    north, east = run_in_start(fence, goal, run_in)
+    last = math.hypot(goal[0] - north, goal[1] - east)
+    first = (north - end[0]) * cos + (east - end[1]) * sin
     if first < 0.0:
         # Step at the line's end, and make good for it by another length of run-in.
         if abs(along) < _TINY:
@@ -237,43 +237,41 @@ def _sideways(
         if last < 0.0:
             return np.inf, legs[:0]
         first = 0.0
-        arrival[0] = goal[0] - last * math.cos(goal[2])
-        arrival[1] = goal[1] - last * math.sin(goal[2])
+        north = goal[0] - last * math.cos(goal[2])
+        east = goal[1] - last * math.sin(goal[2])
     corner_n, corner_e = end[0] + first * cos, end[1] + first * sin
-    step = (arrival[1] - corner_e) * cos - (arrival[0] - corner_n) * sin
+    step = (east - corner_e) * cos - (north - corner_n) * sin
     if abs(step) > LONGEST_SWAY_M or abs(step) < _SAME_M:
         return np.inf, legs[:0]
-    if not (
-        straight_inside(fence, end[0], end[1], corner_n, corner_e)
-        and straight_inside(fence, corner_n, corner_e, arrival[0], arrival[1])
-        and straight_inside(fence, arrival[0], arrival[1], goal[0], goal[1])
-    ):
-        return np.inf, legs[:0]
+    track = ((end[0], end[1]), (corner_n, corner_e), (north, east), (goal[0], goal[1]))
+    for i in range(3):
+        one, two = track[i], track[i + 1]
+        if not straight_inside(fence, one[0], one[1], two[0], two[1]):
+            return np.inf, legs[:0]
     used = _add(legs, 0, end[0], end[1], end[2], first, 0.0)
     side = -0.5 * math.pi if step > 0 else 0.5 * math.pi
     _add(legs, used, corner_n, corner_e, end[2] - side, abs(step), 0.0)
     legs[used, 7] = side
-    used = add_spot(legs, used + 1, arrival[0], arrival[1], end[2], goal[2])
-    used = _add(legs, used, arrival[0], arrival[1], goal[2], last, 0.0)
+    used = add_spot(legs, used + 1, north, east, end[2], goal[2])
+    used = _add(legs, used, north, east, goal[2], last, 0.0)
     sway_j = _power(prices.sway_w, end[2] - side)
     if sway_j == np.inf:
         return np.inf, legs[:0]
     return price(prices, legs[:used]), legs[:used]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def run_in_start(fence: Fence, goal: Array, run_in: float) -> Array:
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def run_in_start(fence: Fence, goal: Array, run_in: float) -> tuple[float, float]:
     """Where the run-in to a line begins: at the line itself where there is no room for it."""
-    start = goal[:2].copy()
-    if not math.isnan(goal[2]):
-        start[0] -= run_in * math.cos(goal[2])
-        start[1] -= run_in * math.sin(goal[2])
-        if not straight_inside(fence, start[0], start[1], goal[0], goal[1]):
-            start[:] = goal[:2]
-    return start
+    if math.isnan(goal[2]):
+        return goal[0], goal[1]
+    north, east = goal[0] - run_in * math.cos(goal[2]), goal[1] - run_in * math.sin(goal[2])
+    if straight_inside(fence, north, east, goal[0], goal[1]):
+        return north, east
+    return goal[0], goal[1]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def add_straight(
     legs: Array, used: int, a_n: float, a_e: float, heading: float, b_n: float, b_e: float
 ) -> int:
@@ -286,7 +284,7 @@ def add_straight(
     return int(_add(legs, used, a_n, a_e, course, length, 0.0))
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def add_spot(
     legs: Array, used: int, north: float, east: float, heading: float, goal_heading: float
 ) -> int:
@@ -296,13 +294,13 @@ def add_spot(
     if math.isnan(turn) or abs(turn) < _TINY:
         return used
     turn = min(max(turn, -math.pi), math.pi)  # but for rounding it is
-    legs[used] = 0.0
     legs[used, 0], legs[used, 1], legs[used, 2] = north, east, heading
-    legs[used, 5], legs[used, 6] = -1.0, turn
+    legs[used, 3], legs[used, 4], legs[used, 5] = 0.0, 0.0, -1.0
+    legs[used, 6], legs[used, 7] = turn, 0.0
     return used + 1
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _add(
     legs: Array,
     used: int,
@@ -321,7 +319,7 @@ def _add(
     return used + 1
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _goes_on(end: Array, goal: Array) -> bool:
     """Whether a line lies straight ahead of another; never of a free heading."""
     if not math.cos(end[2] - goal[2]) > 1 - 1e-12:
@@ -331,7 +329,7 @@ def _goes_on(end: Array, goal: Array) -> bool:
     return bool(cos * north + sin * east >= 0 and abs(cos * east - sin * north) < _SAME_M)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def price(prices: Prices, legs: Array) -> float:
     """Energy of legs between lines; never infinite, but dear beyond anything where it were."""
     total = 0.0
@@ -349,7 +347,7 @@ def price(prices: Prices, legs: Array) -> float:
     return total
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _power(power_w: Array, course: float) -> float:
     """Power at a course, between the even samples of a full turn."""
     count = power_w.shape[0]
@@ -361,7 +359,7 @@ def _power(power_w: Array, course: float) -> float:
     return value
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _mean_power(power_w: Array, start: float, end: float) -> float:
     """Mean power from a course to another, over the samples passed through."""
     count = power_w.shape[0]

@@ -72,7 +72,7 @@ def route_through(
     legs[rows, 5] += first_line
     start, end = table[0, [0, 1, 4]], table[-1, 2:]
     if home_ne is None:
-        arrival = joins.run_in_start(fence, start, run_in_m)
+        arrival = np.array(joins.run_in_start(fence, start, run_in_m))
         first = _straight(arrival, start[:2], start[2])
         leaving = end[:2] + run_in_m * np.array([math.cos(end[2]), math.sin(end[2])])
         if not straight_inside(fence, end[0], end[1], leaving[0], leaving[1]):
@@ -127,7 +127,7 @@ def _cheaper(
 
 def _round_corners(ways: Ways, end: Array, goal: Array, run_in_m: float) -> Array:
     """Legs from a line's end to the next, round the corners of the allowed area, (L, 8)."""
-    arrival = joins.run_in_start(ways.fence, goal, run_in_m)
+    arrival = np.array(joins.run_in_start(ways.fence, goal, run_in_m))
     path = ways.path_ne((float(end[0]), float(end[1])), (float(arrival[0]), float(arrival[1])))
     legs = np.empty((2 * len(path) + 2, joins.COLUMNS))
     used, heading = 0, float(end[2])

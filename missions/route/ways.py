@@ -146,7 +146,9 @@ class Ways:
     @cached_property
     def _nodes(self) -> Array:
         """(V, 6) corners that ways may bend at, the corner before and the one after."""
-        parts = [orient(part) for part in self.allowed.geoms]
+        # Of corners that are as good as one, the turn cannot be told.
+        single = shapely.remove_repeated_points(self.allowed, 0.1 * TOUCH_M)
+        parts = [orient(part) for part in single.geoms]
         rings = [ring for part in parts for ring in (part.exterior, *part.interiors)]
         nodes = []
         for ring in rings:
@@ -181,7 +183,7 @@ class Ways:
         return seen
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _points_inside(fence: Fence, points: Array) -> NDArray[np.bool_]:
     result = np.empty(points.shape[0], dtype=np.bool_)
     for i in range(points.shape[0]):
@@ -189,7 +191,7 @@ def _points_inside(fence: Fence, points: Array) -> NDArray[np.bool_]:
     return result
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _straights_inside(fence: Fence, starts: Array, ends: Array) -> NDArray[np.bool_]:
     result = np.empty(starts.shape[0], dtype=np.bool_)
     for i in range(starts.shape[0]):
@@ -197,7 +199,7 @@ def _straights_inside(fence: Fence, starts: Array, ends: Array) -> NDArray[np.bo
     return result
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _straight_distances(fence: Fence, a: Array, b: Array) -> Array:
     """(N, M) lengths of the straights that are inside; inf of the others."""
     result = np.full((a.shape[0], b.shape[0]), np.inf)
@@ -208,7 +210,7 @@ def _straight_distances(fence: Fence, a: Array, b: Array) -> Array:
     return result
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _passes(nodes: Array, i: int, north: float, east: float) -> bool:
     """Whether a taut way from a place may bend at a corner: both its edges are on one side."""
     u, v = nodes[i, 0] - north, nodes[i, 1] - east
@@ -221,7 +223,7 @@ def _passes(nodes: Array, i: int, north: float, east: float) -> bool:
     return passes
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _seen(fence: Fence, nodes: Array, points: Array) -> Array:
     result = np.full((points.shape[0], nodes.shape[0]), np.inf)
     for i in range(points.shape[0]):
@@ -232,7 +234,7 @@ def _seen(fence: Fence, nodes: Array, points: Array) -> Array:
     return result
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _tangents(fence: Fence, nodes: Array) -> tuple[NDArray[np.int32], NDArray[np.int32], Array]:
     """Pairs of corners (each once) whose straight is inside and touches at both, with lengths."""
     count, room = 0, 4 * nodes.shape[0] + 16
@@ -248,9 +250,11 @@ def _tangents(fence: Fence, nodes: Array) -> tuple[NDArray[np.int32], NDArray[np
                 continue
             if count == room:
                 room *= 2
-                rows = np.concatenate((rows, np.empty_like(rows)))
-                columns = np.concatenate((columns, np.empty_like(columns)))
-                lengths = np.concatenate((lengths, np.empty_like(lengths)))
+                old = rows, columns, lengths
+                rows, columns = np.empty(room, dtype=np.int32), np.empty(room, dtype=np.int32)
+                lengths = np.empty(room)
+                for k in range(count):
+                    rows[k], columns[k], lengths[k] = old[0][k], old[1][k], old[2][k]
             rows[count], columns[count] = i, j
             # Corners of two rings at one place are joined by a way of next to no length.
             lengths[count] = max(
@@ -260,7 +264,7 @@ def _tangents(fence: Fence, nodes: Array) -> tuple[NDArray[np.int32], NDArray[np
     return rows[:count], columns[:count], lengths[:count]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _shorten(
     distances: Array,
     blocked_a: NDArray[np.intp],
@@ -296,7 +300,7 @@ def _shorten(
             distances[blocked_a[i], blocked_b[j]] = best
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _over_corners(seen_a: Array, seen_b: Array, between: Array) -> Array:
     """(N,) lengths of ways over corners; arguments as of `_shorten`, row by row."""
     result = np.full(seen_a.shape[0], np.inf)

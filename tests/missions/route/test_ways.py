@@ -146,6 +146,17 @@ def test_the_way_round_a_box_is_known() -> None:
     np.testing.assert_allclose(ways.path_ne((3.0, 3.0), (3.0, 3.0)), [[3, 3], [3, 3]])
 
 
+def test_corners_given_twice_are_one() -> None:
+    hole = [(40, 10), (40, 10), (60, 10), (60 + 1e-9, 10), (60, 10 + 1e-9), (60, 40), (40, 40)]
+    area = Polygon([(0, 0), (100, 0), (100, 0), (100, 50), (0, 50)], [hole])
+    ways = Ways(multipolygon(area))
+    distance_m = ways.distance_m((10.0, 25.0), (90.0, 25.0))
+    assert distance_m == pytest.approx(2 * math.hypot(30, 15) + 20, abs=1e-6)
+    assert ways.inside(np.array([[100.0, 0.0], [60.0, 10.0], [50.0, 20.0]])).tolist() == [
+        True, True, False
+    ]  # fmt: skip
+
+
 def test_parts_that_are_apart_have_no_way() -> None:
     ways = Ways(multipolygon(shapely.union_all([box(0, 0, 5, 5), box(6, 0, 9, 5)])))
     distances = ways.distances_m(np.array([[1.0, 1.0]]), np.array([[4.0, 4.0], [7.0, 1.0]]))
