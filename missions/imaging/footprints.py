@@ -30,6 +30,8 @@ _PORT = (
     "exact flat port: Snell's law at both faces of the glass (camera_calib.flat_port); paraxial "
     "pixel: D = d + g/n_glass + a/n_water"
 )
+LEAST_ALTITUDE_M = 0.3
+"""Of the glass over any ground; `plan.altitude_m` allows no less either."""
 _GEOMETRY = "geometry of level footprints"
 
 
@@ -118,15 +120,17 @@ def top_altitude_m(plan: PlanConfig) -> float:
     """Altitude over the top of the relief.
 
     Raises:
-        PlanError: the relief reaches the glass.
+        PlanError: the relief comes nearer to the glass than `LEAST_ALTITUDE_M`.
     """
     top_m = plan.altitude_m - plan.relief_m
-    if top_m > 0:
+    if top_m >= LEAST_ALTITUDE_M - 1e-9:
         return top_m
     safe_m = math.ceil(10 * (plan.relief_m + plan.least_clearance_m)) / 10
-    flat_m = math.floor(100 * plan.altitude_m / 2) / 100
+    flat_m = math.floor(100 * (plan.altitude_m - LEAST_ALTITUDE_M) + 1e-9) / 100
+    leaves = "runs aground" if top_m <= 0 else f"leaves {top_m:.2f} m over its top"
     raise conflict(
-        f"{plan.altitude_m:g} m altitude over relief of +-{plan.relief_m:g} m runs aground",
+        f"{plan.altitude_m:g} m altitude over relief of +-{plan.relief_m:g} m {leaves}; "
+        f"{LEAST_ALTITUDE_M:g} m is the least",
         ("altitude_m", "relief_m"),
         [
             Way(
@@ -136,7 +140,7 @@ def top_altitude_m(plan: PlanConfig) -> float:
                 cost=safe_m / plan.altitude_m - 1.0,
             ),
             Way(
-                change=f"relief_m {flat_m:g} or less, where the site is as flat as that",
+                change=f"relief_m {flat_m:g}, where the site is as flat as that",
                 price="a wrong guess ends the dive",
                 cost=1.0 - flat_m / plan.relief_m,
             ),
@@ -153,7 +157,8 @@ def footprint_range(rig: Rig, plan: PlanConfig, step_m: float) -> FootprintRange
     """Footprints over the relief.
 
     Raises:
-        PlanError: the relief reaches the glass, or part of a picture looks past the sea floor.
+        PlanError: the relief comes too near to the glass, or part of a picture looks past the sea
+            floor.
     """
     top, bottom = top_altitude_m(plan), plan.altitude_m + plan.relief_m
     return FootprintRange(

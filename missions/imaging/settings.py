@@ -160,6 +160,7 @@ def imaging_settings(rig: Rig, config: SurveyConfig, *, quiet: bool = False) -> 
         for text in (
             too_open(focus, limits, plan),
             _dark(budget, config),
+            _near(config),
             _gaps(spacing, prints, step_m),
             _slow_cable(storage, interval_s),
         ):
@@ -203,6 +204,19 @@ def _dark(budget: LightBudget, config: SurveyConfig) -> str:
     return (
         f"pictures will be {fault} in Jerlov {config.water.jerlov} water: {times:.1f} times the "
         "light is missing; lower altitude_m or speed_mps, or raise allowed_blur_px or the aperture"
+    )
+
+
+def _near(config: SurveyConfig) -> str:
+    """Where the top of the relief comes nearer than is wanted of charted ground; else empty."""
+    plan = config.plan
+    top_m = plan.altitude_m - plan.relief_m
+    if top_m >= plan.least_clearance_m:
+        return ""
+    return (
+        f"relief of +-{plan.relief_m:g} m comes within {top_m:.2f} m of the glass; "
+        f"least_clearance_m is {plan.least_clearance_m:g}: raise altitude_m to "
+        f"{plan.relief_m + plan.least_clearance_m:g}"
     )
 
 

@@ -6,12 +6,12 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from alice_survey.config import SurveyConfig
-from alice_survey.errors import AliceError, ConfigError
+from alice_survey.errors import AliceError, ConfigError, PlanError
 from camera_calib.fov.table import json_row
 from camera_calib.rig import design_rig
 from camera_calib.text_table import text_table
 from missions.imaging.conflicts import Way, conflict
-from missions.imaging.footprints import footprint_at
+from missions.imaging.footprints import altitude_for_pixel_m, footprint_at, pixel_on_floor_m
 from missions.imaging.light import too_dark
 from missions.imaging.settings import ImagingSettings, imaging_settings
 from missions.imaging.solve_dive import DiveArea, area_for_dive, dive_of_energy_s
@@ -91,20 +91,50 @@ def speeds_for_rate(
     Raises:
         PlanError: cameras or trigger are slower than the rate.
     """
-    shortest = config.camera.shortest_interval_s
-    if rate_hz > 1.0 / shortest * (1 + 1e-9):
-        raise conflict(
-            f"{rate_hz:g} pictures a second",
-            ("the rate asked for", "camera.shortest_interval_s"),
-            [
-                Way(
-                    change=f"a rate of {1 / shortest:g} Hz",
-                    price=f"{1 / shortest / rate_hz:.0%} of the speed that the rate would allow",
-                    cost=1.0 - 1.0 / shortest / rate_hz,
-                )
-            ],
-        )
+    if rate_hz > 1.0 / config.camera.shortest_interval_s * (1 + 1e-9):
+        raise _too_often(config, rate_hz)
     return [_rate_option(config, rate_hz, lens) for lens in lenses]
+
+
+def _too_often(config: SurveyConfig, rate_hz: float) -> PlanError:
+    """The rate is beyond cameras or trigger: slower, or as fast with less overlap or higher."""
+    plan, most_hz = config.plan, 1.0 / config.camera.shortest_interval_s
+    share = most_hz / rate_hz
+    ways = [
+        Way(
+            change=f"a rate of {most_hz:g} Hz",
+            price=f"{share:.0%} of the speed that {rate_hz:g} Hz would allow",
+            cost=1.0 / share - 1.0,
+        )
+    ]
+    reached = 1.0 - (1.0 - plan.forward_overlap) / share
+    if reached > 0:
+        shown = math.floor(1000 * reached) / 1000
+        ways.append(
+            Way(
+                change=f"{most_hz:g} Hz and forward_overlap {shown:g} instead of "
+                f"{plan.forward_overlap:g}",
+                price=f"the same speed, a point is seen {1 / (1 - shown):.1f} instead of "
+                f"{1 / (1 - plan.forward_overlap):.1f} times on a line",
+                cost=1.0 - share,
+            )
+        )
+    own = design_rig(config.camera, config.water).cameras["left"]
+    pixel_m = pixel_on_floor_m(own, plan.altitude_m)
+    higher_m = math.ceil(100 * altitude_for_pixel_m(own, pixel_m / share)) / 100
+    ways.append(
+        Way(
+            change=f"{most_hz:g} Hz and altitude_m {higher_m:g} instead of {plan.altitude_m:g}",
+            price=f"the same speed, a pixel grows {1 / share:.2f} times",
+            cost=(1.0 / share) ** 2 - 1.0,
+        )
+    )
+    return conflict(
+        f"{rate_hz:g} pictures a second are more than the {most_hz:g} that cameras and trigger "
+        "take",
+        ("the rate asked for", "camera.shortest_interval_s"),
+        ways,
+    )
 
 
 def _rate_option(config: SurveyConfig, rate_hz: float, lens_mm: float) -> RateOption:

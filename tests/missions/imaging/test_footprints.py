@@ -125,6 +125,7 @@ def test_altitude_and_pixel_are_inverse(pixel_mm: float) -> None:
     ("plan", "first", "second"),
     [
         ({"altitude_m": 0.5, "relief_m": 0.6}, "altitude_m", "relief_m"),
+        ({"altitude_m": 0.6, "relief_m": 0.35}, "altitude_m", "relief_m"),
         ({"track_error_m": 0.6}, "side_overlap", "track_error_m"),
         ({"altitude_m": 0.3, "relief_m": 0.0}, "camera.baseline_m", "altitude_m"),
     ],

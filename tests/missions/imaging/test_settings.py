@@ -130,6 +130,7 @@ def test_a_strobe_pulse_that_does_not_fit_is_told() -> None:
     ("sections", "words"),
     [
         ({"plan": {"altitude_m": 1.2}}, "set camera.f_number to"),
+        ({"plan": {"altitude_m": 1.2}}, "comes within 0.85 m of the glass"),
         ({"water": {"jerlov": "9C"}}, "times the light is missing"),
         ({"plan": {"line_spacing_m": 1.4}}, "lines leave gaps of 0.21 m"),
         ({"plan": {"forward_overlap": 0.0}}, "pictures leave gaps of 0.20 m"),

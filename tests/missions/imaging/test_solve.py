@@ -10,6 +10,7 @@ from missions.imaging.settings import imaging_settings
 from missions.imaging.solve import solve_report, speeds_for_rate
 from missions.imaging.solve_dive import area_for_dive, turn_s
 from missions.imaging.solve_lens import lenses_for_resolution
+from missions.plan import make_plan
 from tests.missions.imaging.surveys import survey
 
 
@@ -98,6 +99,16 @@ def test_a_fixed_rate_gives_the_speed_that_overlaps_as_asked() -> None:
 def test_a_rate_beyond_the_trigger_is_refused() -> None:
     with pytest.raises(PlanError, match=r"conflicts with camera\.shortest_interval_s"):
         speeds_for_rate(survey()[1], 14.0, (12.5,))
+
+
+def test_the_planner_takes_about_as_long_for_the_area_of_a_dive() -> None:
+    config = survey(plan={"side_overlap": 0.45})[1]
+    side_m = area_for_dive(config, 3600.0).side_m
+    rig, square = survey(
+        plan={"side_overlap": 0.45, "closing_line": False},
+        area={"length_m": side_m, "width_m": side_m},
+    )
+    assert make_plan(square, rig).duration_s == pytest.approx(3600.0, rel=0.05)
 
 
 def test_the_report_tells_what_was_asked() -> None:
