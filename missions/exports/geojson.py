@@ -30,11 +30,11 @@ def write_geojson(path: Path, plan: Plan, rig: Rig) -> None:
         count += len(plan.lines) + len(plan.dives) + 2 * plan.stations
         features = progress(_features(plan, rig), "plan features", count)
         for index, feature in enumerate(features):
-            file.write((",\n" if index else "") + json.dumps(feature, allow_nan=False))
+            file.write((",\n" if index else "") + feature)
         file.write("\n]}\n")
 
 
-def _features(plan: Plan, rig: Rig) -> Iterator[dict[str, Any]]:
+def _features(plan: Plan, rig: Rig) -> Iterator[str]:
     floor_m, glass_m = plan.seafloor_depth_m, plan.seafloor_depth_m - plan.altitude_m
     yield from _areas(plan, "area", plan.area.survey)
     yield from _areas(plan, "allowed", plan.area.allowed)
@@ -60,22 +60,33 @@ def _features(plan: Plan, rig: Rig) -> Iterator[dict[str, Any]]:
 
 def _stations(
     plan: Plan, rig: Rig, dive_of: dict[int, int], floor_m: float, glass_m: float
-) -> Iterator[dict[str, Any]]:
+) -> Iterator[str]:
+    """Stations and footprints; put together as text, since there may be 100,000 of them."""
     outline = footprint_outline(plan, rig)
+    if not shapely.LinearRing(outline[:, ::-1]).is_ccw:  # east before north, as in the file
+        outline = outline[::-1]
     per_ring = len(outline)
     station = 0
     for index, line in enumerate(plan.lines):
-        places = _lon_lat(plan.datum, line.stations_ne, glass_m)
-        rings = _lon_lat(plan.datum, footprints_ne(line, outline).reshape(-1, 2), floor_m)
+        places = _texts(plan.datum, line.stations_ne, glass_m)
+        corners = _texts(plan.datum, footprints_ne(line, outline).reshape(-1, 2), floor_m)
+        dive = json.dumps(dive_of.get(index))
         for i, place in enumerate(places):
-            about = {"station": station, "line": index, "dive": dive_of.get(index)}
-            yield _feature("Point", place, {"role": "station", **about})
-            ring = _ring(rings[i * per_ring : (i + 1) * per_ring], hole=False)
-            yield _feature("Polygon", [ring], {"role": "footprint", **about})
+            about = f'"station": {station}, "line": {index}, "dive": {dive}'
+            yield (
+                f'{{"type": "Feature", "properties": {{"role": "station", {about}}}, '
+                f'"geometry": {{"type": "Point", "coordinates": {place}}}}}'
+            )
+            ring = corners[i * per_ring : (i + 1) * per_ring]
+            closed = ", ".join((*ring, ring[0]))
+            yield (
+                f'{{"type": "Feature", "properties": {{"role": "footprint", {about}}}, '
+                f'"geometry": {{"type": "Polygon", "coordinates": [[{closed}]]}}}}'
+            )
             station += 1
 
 
-def _areas(plan: Plan, role: str, geometry: MultiPolygon) -> Iterator[dict[str, Any]]:
+def _areas(plan: Plan, role: str, geometry: MultiPolygon) -> Iterator[str]:
     for polygon in polygons(geometry):
         edges = [
             _ring(_lon_lat(plan.datum, ring, plan.seafloor_depth_m), hole=index > 0)
@@ -84,9 +95,10 @@ def _areas(plan: Plan, role: str, geometry: MultiPolygon) -> Iterator[dict[str, 
         yield _feature("Polygon", edges, {"role": role, "name": plan.name})
 
 
-def _feature(kind: str, coordinates: Any, properties: dict[str, Any]) -> dict[str, Any]:
+def _feature(kind: str, coordinates: Any, properties: dict[str, Any]) -> str:
     geometry = {"type": kind, "coordinates": coordinates}
-    return {"type": "Feature", "properties": properties, "geometry": geometry}
+    feature = {"type": "Feature", "properties": properties, "geometry": geometry}
+    return json.dumps(feature, allow_nan=False)
 
 
 def _ring(lon_lat: list[list[float]], *, hole: bool) -> list[list[float]]:
@@ -98,3 +110,8 @@ def _ring(lon_lat: list[list[float]], *, hole: bool) -> list[list[float]]:
 def _lon_lat(datum: Datum, points_ne: Array, depth_m: float) -> list[list[float]]:
     rows = lat_lon(datum, points_ne, depth_m)
     return [[round(float(lon), 10), round(float(lat), 10)] for lat, lon in rows]
+
+
+def _texts(datum: Datum, points_ne: Array, depth_m: float) -> list[str]:
+    """Each place as a JSON array of longitude and latitude."""
+    return [f"[{lon:.10f}, {lat:.10f}]" for lat, lon in lat_lon(datum, points_ne, depth_m).tolist()]

@@ -375,7 +375,8 @@ function start() {
         ctx.lineTo(x(line.e1), y(line.n1));
       });
       ctx.strokeStyle = COLOURS[kind];
-      ctx.lineWidth = lines.length > 2000 ? 0.7 : 1.7;
+      /* Lines too close to be told apart become a light tint. */
+      ctx.lineWidth = Math.min(1.7, Math.max(0.2, 0.3 * data.spacing * view.scale));
       ctx.stroke();
     });
     lines.forEach((line) => {

@@ -121,7 +121,7 @@ def _facts(plan: Plan, rig: Rig) -> str:
         ("pictures", f"{plan.stations * len(rig.cameras)}"),
         ("every", f"{plan.interval_s:.2f} s"),
         ("exposure", f"{plan.exposure_s * 1000:.2f} ms"),
-        ("overlap", f"{plan.forward_overlap:.0%} × {plan.side_overlap:.0%}"),
+        ("overlap", f"{100 * plan.forward_overlap:.0f} / {100 * plan.side_overlap:.0f} %"),
         ("covered", f"{plan.coverage:.2%}"),
         ("way", f"{plan.length_m:.0f} m"),
         ("time", f"{minutes:.0f} min" if minutes < 180 else f"{minutes / 60:.1f} h"),

@@ -83,6 +83,7 @@ def page_data(
         "routes": [_path(LineString(route_ne(dive.route)), detail_m) for dive in plan.dives],
         "outline": _mm(outline),
         "across": plan.footprint_m[0],
+        "spacing": plan.line_spacing_m,
         "camera": rig.reference,
         "contours": [] if bathymetry is None else _contours(bathymetry, extent, detail_m),
         "current": {"mps": sea.current_mps, "towards_deg": sea.current_towards_deg}
