@@ -241,10 +241,7 @@ def ways_between(table: Array, home: Array, ways: Ways) -> Array:
 
 def _way_lengths(starts: Array, goals: Array, ways: Ways) -> Array:
     """Lengths, (N,), of ways from (N, 2) to (N, 2)."""
-    lengths: Array = np.hypot(*(goals - starts).T)
-    for i in np.flatnonzero(~ways.free_many(starts, goals)).tolist():
-        lengths[i] = ways.distances_m(starts[i : i + 1], goals[i : i + 1])[0, 0]
-    return lengths
+    return ways.lengths_m(starts, goals)
 
 
 def _ends_ne(pieces: Array, offsets: Array, heading_rad: float) -> Array:

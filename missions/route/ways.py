@@ -48,10 +48,6 @@ class Ways:
         result: NDArray[np.bool_] = _points_inside(self.fence, points)
         return result
 
-    def contains(self, points_ne: Array) -> NDArray[np.bool_]:
-        """The same as `inside`."""
-        return self.inside(points_ne)
-
     def free(self, a: Place, b: Place) -> bool:
         """Whether the straight between two places is inside."""
         return bool(straight_inside(self.fence, a[0], a[1], b[0], b[1]))
