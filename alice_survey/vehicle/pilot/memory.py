@@ -32,8 +32,8 @@ its age; returns to the path; how long bottom lock is lost, the altitude too low
 large, s; how long the clearance is less than half of what is allowed, s; the share of the wanted
 surge that the sea floor leaves; 1 while the vehicle follows a place that moves along the leg or a
 heading that turns on the spot (standing.py), how far these have got, m or rad, and how fast; how
-long it waits at the leg's end, s; the integral, as a speed, of keeping that place by surge, a vector
-in NED; and the place or heading, and its speed, that thrusters without lag would be at."""
+long it waits at the leg's end, s; the integral, as a speed, of keeping that place by surge, a
+vector in NED; and the place or heading, and its speed, that thrusters without lag would be at."""
 MEMORY = 25
 
 (

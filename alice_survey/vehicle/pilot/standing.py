@@ -3,11 +3,11 @@
 The vehicle follows a reference: a place that moves along the leg, or a heading that turns. A ramp
 of bounded speed and acceleration goes ahead of it; its acceleration is fed forward, and the
 reference is what thrusters that lag make of it, v' = (ramp's v - v) / lag, so that a vehicle as it
-is thought to be follows without an error. Over a whole leg that is as far as the ramp goes, and
-lag v farther where it begins at a speed v. The place
-is held by surge and sway, the heading by yaw (PIDs on place, control.py). A vehicle without sway
-holds only the part of the place that is along its heading, and drifts with the current across it.
-The reference waits for a vehicle that falls behind.
+is thought to be follows without an error. Over a whole leg the reference goes as far as the ramp,
+and by lag times v farther where it begins at a speed v. The place is held by surge and sway, the
+heading by yaw (PIDs on place, control.py). A vehicle without sway holds only the part of the place
+that is along its heading, and drifts with the current across it. The reference waits for a vehicle
+that falls behind.
 """
 
 import math

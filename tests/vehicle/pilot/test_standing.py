@@ -12,7 +12,7 @@ from alice_survey.errors import VehicleError
 from alice_survey.frames import Array
 from alice_survey.vehicle import signals
 from alice_survey.vehicle.pilot import memory as told
-from alice_survey.vehicle.pilot.gains import FASTEST, SWAY, YAW
+from alice_survey.vehicle.pilot.gains import FASTEST, LAG, SURGE, SWAY, YAW
 from alice_survey.vehicle.pilot.guidance import steer
 from alice_survey.vehicle.pilot.memory import new_pilot
 from alice_survey.vehicle.pilot.path import Path
@@ -100,7 +100,11 @@ def test_a_tick_of_a_stop_asks_for_what_its_twin_asks(
     speed = share * fastest
     pilot.report[[told.PHASE, told.LEG, told.ALONG]] = signals.FOLLOW, leg, progress
     pilot.memory[[told.STANDING, told.REF, told.REF_SPEED]] = 1.0, progress, speed
-    after, rate, quicken = ramp(progress, speed, goal, fastest, slowing, TICK_S)
+    pilot.memory[[told.RAMP, told.RAMP_SPEED]] = progress, speed
+    _, rate, quicken = ramp(progress, speed, goal, fastest, slowing, TICK_S)
+    # What thrusters that lag make of it.
+    rate = speed + (rate - speed) * TICK_S / gains.axes[(SURGE, SWAY, YAW)[leg], LAG]
+    after = min(progress + rate * TICK_S, goal)
     start, course = np.array([path.start_n[leg], path.start_e[leg]]), path.heading_rad[leg]
     ahead = np.array([math.cos(course), math.sin(course)])
     if leg == 2:
@@ -221,7 +225,7 @@ def test_a_stop_is_left_though_the_sea_does_not_let_the_vehicle_rest() -> None:
     path, guidance, gains = SPOTS, guidance_of(SPOTS), gains_of("alice")
     pilot, wrench = new_pilot(), np.zeros(6)
     pilot.report[[told.PHASE, told.LEG]] = signals.FOLLOW, 1
-    pilot.memory[[told.STANDING, told.REF]] = 1.0, QUARTER
+    pilot.memory[[told.STANDING, told.REF, told.RAMP]] = 1.0, QUARTER, QUARTER
     estimate = np.zeros(signals.ESTIMATE)
     # The port 0.25 m beyond its place, for ever.
     estimate[[signals.NORTH, signals.EAST]] = 3.25 - 0.05, -0.55
