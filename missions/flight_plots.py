@@ -4,15 +4,18 @@ import itertools
 import math
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Polygon as Outline
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path as Path2D
 from matplotlib.transforms import ScaledTranslation
 from scipy.spatial.transform import Rotation
+from shapely.geometry import MultiPolygon
 
 from alice_survey.frames import Array
 from alice_survey.vehicle import signals
@@ -22,11 +25,14 @@ from alice_survey.vehicle.pilot.memory import PHASE, WANTED_SURGE
 from alice_survey.vehicle.simulator import Flown
 from missions.flight import Flight, rms
 from missions.flight_records import rpm_of, true_velocity
+from missions.flight_route import whole_route
 from missions.plan_file import Plan
 
 PLAN, TRUE, NAV, AREA, BAND = "#95a5a6", "#1b4f72", "#ca6f1e", "#c8553d", "#eaf2f8"
 _ROLL, _PITCH, _GRID = "#884ea0", "#229954", "#e5e8e8"
 _THRUSTERS = ("#1b4f72", "#ca6f1e", "#229954", "#884ea0", "#c0392b", "#7f8c8d")
+_ALLOWED, _HOME = "#566573", "#27ae60"
+_WAY_POINTS = 4000
 _DRAWN = 20_000
 """Most points of a curve."""
 _SPREAD_SIGMAS = 2.0
@@ -143,11 +149,30 @@ def _sheet(strips: int) -> tuple[Figure, Axes, list[Axes]]:
 
 
 def _draw_plan(axes: Axes, plan: Plan) -> None:
+    """Lines and ways, the survey area with its holes, where the vehicle may be, and home."""
     draw_lines(axes, plan)
-    for index, ring in enumerate(plan.area.rings_ne):
-        label = "area" if index == 0 else None
-        outline = Outline(ring[:, ::-1], fill=False, edgecolor=AREA, lw=1.6, ls="--", label=label)
-        axes.add_patch(outline)
+    route = whole_route(plan)
+    way = route.places(np.linspace(0.0, route.length_m, _WAY_POINTS))
+    axes.plot(way[:, 1], way[:, 0], color=PLAN, lw=0.8, zorder=1, label="planned way")
+    area = plan.area
+    _outline(axes, area.survey, "area", edgecolor=AREA, lw=1.6, ls="--", fill=False)
+    _outline(axes, area.allowed, "may be within", edgecolor=_ALLOWED, lw=0.9, ls=":", fill=False)
+    _outline(
+        axes, area.no_go, "no-go zone", facecolor="#f5b7b1", edgecolor=AREA, hatch="xxx", alpha=0.5
+    )
+    north, east = plan.home_ne_m
+    axes.plot(east, north, "D", ms=7, mfc=_HOME, mec="white", zorder=6, ls="", label="home")
+
+
+def _outline(axes: Axes, shape: MultiPolygon, label: str, **style: Any) -> None:
+    rings = [
+        Path2D(np.asarray(ring.coords)[:, 1::-1], closed=True)
+        for polygon in shape.geoms
+        for ring in (polygon.exterior, *polygon.interiors)
+    ]
+    if rings:
+        whole = Path2D.make_compound_path(*rings)
+        axes.add_patch(PathPatch(whole, label=label, zorder=2, **style))
 
 
 def _end_chart(axes: Axes, title: str) -> None:
