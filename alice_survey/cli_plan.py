@@ -71,9 +71,8 @@ def solve(
 
     Altitude and lens for a resolution, the area that fits a dive, or the speed for a frame rate.
     """
-    from missions.imaging.solve import solve_report
-
     from alice_survey.survey import settings
+    from missions.imaging.solve import solve_report
 
     config = settings(workspace, survey, needed=False)
     print_result(
@@ -136,9 +135,8 @@ def check(
 
     Lists the holes in coverage and overlap, draws them, and writes a plan that flies them again.
     """
-    from missions.coverage.check import check_report
-
     from alice_survey.survey import settings
+    from missions.coverage.check import check_report
 
     config = settings(workspace, survey, needed=False)
     print_result(
@@ -180,8 +178,7 @@ def current(
 
     Power by the direction of lines: along the current, across it by sway, or crabbing.
     """
-    from missions.route.energy import energy_report
-
     from alice_survey.survey import settings
+    from missions.route.trade import energy_report
 
     print_result(*energy_report(settings(workspace, survey, needed=False), plot), as_json)

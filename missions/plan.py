@@ -26,10 +26,10 @@ from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.stations import Stations, stations_of_plan
 from missions.footprint import Swath, common_swath, joint_swath
 from missions.imaging.settings import ImagingSettings, imaging_settings, raw_bytes
-from missions.lines.lawnmower import longer_side_heading
 from missions.lines.lay import lay_lines
 from missions.lines.line import Line
 from missions.lines.pattern import Pattern, pattern
+from missions.lines.sweep import Sweep, best_heading
 from missions.plan_file import Plan, read_plan
 from missions.plan_rows import plan_rows
 from missions.route.costs import Costs
@@ -52,7 +52,7 @@ class Planned:
     imaging: ImagingSettings
     costs: Costs
     certificate: Certificate
-    sweep: Any
+    sweep: Sweep | None
     """How the direction of the lines was found; None where it was given."""
     bathymetry: Bathymetry | None
     table: str
@@ -128,13 +128,30 @@ def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
     _check_depth(config, depth_m)
     ways, home = Ways(area.allowed), _home(config, area)
     costs = vehicle_costs(config, imaging_w=imaging.imaging_w)
-    ties = {"cross_lines": wanted.cross_lines, "closing_line": wanted.closing_line}
     sweep = None
     if wanted.line_heading_deg is None:
-        heading = longer_side_heading(area.survey.convex_hull)
+        sweep = best_heading(
+            area,
+            told,
+            ways,
+            costs,
+            home,
+            cross_lines=wanted.cross_lines,
+            closing_line=wanted.closing_line,
+        )
+        heading = sweep.heading_rad
     else:
         heading = math.radians(wanted.line_heading_deg)
-    lines = lay_lines(area, heading, told, ways, costs, home, **ties)
+    lines = lay_lines(
+        area,
+        heading,
+        told,
+        ways,
+        costs,
+        home,
+        cross_lines=wanted.cross_lines,
+        closing_line=wanted.closing_line,
+    )
     dives = split_dives(
         lines,
         ways=ways,
@@ -230,7 +247,13 @@ def _bathymetry(config: SurveyConfig, area: Area) -> Bathymetry | None:
     reach_m = 4.0 * config.plan.altitude_m
     south, west, north, east = area.allowed.bounds
     bounds = (south - reach_m, west - reach_m, north + reach_m, east + reach_m)
-    return read_bathymetry(file, area.datum, bounds_ne=bounds)
+    return read_bathymetry(
+        file,
+        area.datum,
+        bounds_ne=bounds,
+        sense=config.area.bathymetry_values,
+        crs=config.area.bathymetry_crs,
+    )
 
 
 def _depth_m(config: SurveyConfig, area: Area, bathymetry: Bathymetry | None) -> float:
@@ -323,13 +346,13 @@ def _warn_of_spacing(config: SurveyConfig, imaging: ImagingSettings, stereo: Swa
 
 
 def _details(
-    imaging: ImagingSettings, sweep: Any, stereo: Swath, rig: Rig, config: SurveyConfig
+    imaging: ImagingSettings, sweep: Sweep | None, stereo: Swath, rig: Rig, config: SurveyConfig
 ) -> dict[str, Any]:
     plan = config.plan
     camera = rig.cameras[rig.reference]
     return {
         "imaging": imaging.to_json(),
-        "heading": None if sweep is None else sweep.to_json(),
+        "heading": None if sweep is None else _sweep_json(sweep),
         "wanted_forward_overlap": plan.forward_overlap,
         "wanted_side_overlap": plan.side_overlap,
         "stereo_swath_m": stereo.across_m,
@@ -337,4 +360,13 @@ def _details(
         "mosaic_swath_m": joint_swath(rig, plan.altitude_m, imaging.station_spacing_m).across_m,
         "turn_rate_deg_s": math.degrees(plan.speed_mps / plan.turn_radius_m),
         "raw_bytes_per_s": raw_bytes(camera, len(rig.cameras), 1) / imaging.interval_s,
+    }
+
+
+def _sweep_json(sweep: Sweep) -> dict[str, float]:
+    return {
+        "heading_deg": math.degrees(sweep.heading_rad),
+        "cost_j": sweep.cost_j,
+        "least_width_heading_deg": math.degrees(sweep.width_heading_rad),
+        "least_width_m": sweep.width_m,
     }

@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 from alice_survey.config import SurveyConfig
 from camera_calib.rig import Rig
 from missions.coverage.certificate import Certificate
 from missions.imaging.settings import raw_bytes
 from missions.imaging.table import Setting
+from missions.lines.sweep import Sweep
 from missions.plan_file import Plan
 from missions.route.energy import usable_wh
 
@@ -16,7 +16,7 @@ _GROUP = "LINES AND DIVES"
 
 
 def plan_rows(
-    plan: Plan, seen: Certificate, sweep: Any, config: SurveyConfig, rig: Rig
+    plan: Plan, seen: Certificate, sweep: Sweep | None, config: SurveyConfig, rig: Rig
 ) -> tuple[Setting, ...]:
     """What the plan comes to.
 
@@ -35,7 +35,7 @@ def plan_rows(
     )
 
 
-def _line_rows(plan: Plan, sweep: Any) -> Sequence[Setting]:
+def _line_rows(plan: Plan, sweep: Sweep | None) -> Sequence[Setting]:
     counts = dict.fromkeys(("survey", "cross", "closing", "fill"), 0)
     for line in plan.lines:
         counts[line.kind] += 1

@@ -73,8 +73,8 @@ def draw_plan(
         _draw_current(axes, sea)
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="lower center", ncol=4, frameon=False, fontsize=8)
-    axes.set_title(plan.name, loc="left", fontsize=13, weight="bold")
-    axes.set_title(_summary(plan), loc="right", fontsize=8, color="#444444")
+    figure.text(0.02, 0.985, plan.name, fontsize=13, weight="bold", va="top")
+    figure.text(0.98, 0.985, _summary(plan), fontsize=8, color="#444444", va="top", ha="right")
     kind = path.suffix.lower()
     metadata = (
         {"Software": None} if kind == ".png" else _PDF_DATE if kind == ".pdf" else {"Date": None}
@@ -94,7 +94,7 @@ def _summary(plan: Plan) -> str:
 
 
 def _sheet(plan: Plan) -> tuple[Figure, Axes]:
-    layout = ConstrainedLayoutEngine(rect=(0, 0.08, 1, 0.9))
+    layout = ConstrainedLayoutEngine(rect=(0, 0.08, 1, 0.87))
     figure = Figure(figsize=(8.5, 8.5), facecolor="white", layout=layout)
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
