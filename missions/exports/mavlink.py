@@ -57,15 +57,21 @@ def trigger_m(plan: Plan, line: int) -> float:
 
 def _items(plan: Plan, points: Sequence[Waypoint], tolerance_m: float) -> Iterator[Item]:
     rate_deg_s = math.degrees(time_costs(plan.speed_mps).turn_rate_rad_s)
-    yield _command(DO_CHANGE_SPEED, 1, plan.speed_mps, -1)  # over ground; throttle as it is
+    speed = _command(DO_CHANGE_SPEED, 1, plan.speed_mps, -1)  # over ground; throttle as it is
+    yield speed
     heading_deg = math.degrees(points[0].heading_rad)
     for index, point in enumerate(points):
         following = points[index + 1].kind if index + 1 < len(points) else "surface"
-        if point.kind == "turn":
-            turned = math.remainder(math.degrees(point.heading_rad) - heading_deg, 360.0)
-            to_deg = math.degrees(point.heading_rad)
-            yield _command(CONDITION_YAW, to_deg, rate_deg_s, 1 if turned >= 0 else -1)
-        heading_deg = math.degrees(point.heading_rad)
+        to_deg = math.degrees(point.heading_rad)
+        if point.kind in ("turn", "sway"):
+            # The first command after a way-point is done before the next way begins, which turns
+            # the vehicle along it; only the second can give it another heading (ArduPilot,
+            # AP_Mission and ModeAuto::auto_wp_start). So the speed is said again before it.
+            if points[index - 1].camera is None:
+                yield speed
+            turned = math.remainder(to_deg - heading_deg, 360.0)
+            yield _command(CONDITION_YAW, to_deg % 360.0, rate_deg_s, 1 if turned >= 0 else -1)
+        heading_deg = to_deg
         # A place without a stay is passed in a curve; the least stay that can be said is 1 s.
         stays_s = max(math.ceil(point.hold_s), 1 if following in _FROM_REST else 0)
         yield _waypoint(plan, point, stays_s, tolerance_m)

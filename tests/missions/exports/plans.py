@@ -153,3 +153,21 @@ def small_plan(**changes: Any) -> Plan:
         [[(2.0, 1.4), (2.0, 1.6), (2.3, 1.6), (2.3, 1.4)]],
     )
     return plan_of(lines, [(0, 2), (3, 5)], survey=survey, **changes)
+
+
+def golden_plan() -> Plan:
+    """Two lines and all ways to turn: an arc, a turn on the spot, a step sideways."""
+    north = [line((0.0, 0.0), (4.6, 0.0)), line((4.6, 1.0), (0.0, 1.0))]
+    lines = [*north, line((0.0, 1.8), (0.0, 2.6), "fill")]
+    legs = (
+        straight((-0.5, 0.0), (0.0, 0.0)),
+        straight((0.0, 0.0), (4.6, 0.0), 0),
+        straight((4.6, 0.0), (5.1, 0.0)),
+        arc((5.1, 0.0), 0.0, 0.5, math.pi),
+        straight((5.1, 1.0), (4.6, 1.0)),
+        straight((4.6, 1.0), (0.0, 1.0), 1),
+        straight((0.0, 1.0), (0.0, 1.8), side_rad=math.pi / 2),
+        spot((0.0, 1.8), math.pi, -math.pi / 2),
+        straight((0.0, 1.8), (0.0, 2.6), 2),
+    )
+    return plan_of(lines, [(0, 2)], routes=[Route(legs=legs)], home=(-0.5, 0.0))

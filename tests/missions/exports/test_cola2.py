@@ -13,7 +13,7 @@ from missions.exports.write import write_exports
 from missions.footprint import common_swath
 from missions.plan_file import Dive, Plan
 from missions.route.legs import Route
-from tests.missions.exports.plans import RIG, arc, line, plan_of, small_plan, spot, straight
+from tests.missions.exports.plans import RIG, golden_plan, line, plan_of, small_plan, straight
 from tests.missions.exports.readers import (
     Step,
     local_ne,
@@ -26,24 +26,6 @@ from tests.missions.exports.readers import (
 
 GOLDEN = Path(__file__).parent / "golden"
 MM = 1e-3
-
-
-def golden_plan() -> Plan:
-    """Two lines and all ways to turn: an arc, a turn on the spot, a step sideways."""
-    north = [line((0.0, 0.0), (4.6, 0.0)), line((4.6, 1.0), (0.0, 1.0))]
-    lines = [*north, line((0.0, 1.8), (0.0, 2.6), "fill")]
-    legs = (
-        straight((-0.5, 0.0), (0.0, 0.0)),
-        straight((0.0, 0.0), (4.6, 0.0), 0),
-        straight((4.6, 0.0), (5.1, 0.0)),
-        arc((5.1, 0.0), 0.0, 0.5, math.pi),
-        straight((5.1, 1.0), (4.6, 1.0)),
-        straight((4.6, 1.0), (0.0, 1.0), 1),
-        straight((0.0, 1.0), (0.0, 1.8), side_rad=math.pi / 2),
-        spot((0.0, 1.8), math.pi, -math.pi / 2),
-        straight((0.0, 1.8), (0.0, 2.6), 2),
-    )
-    return plan_of(lines, [(0, 2)], routes=[Route(legs=legs)], home=(-0.5, 0.0))
 
 
 def steps_of(plan: Plan, rig: Rig, number: int = 1) -> list[Step]:

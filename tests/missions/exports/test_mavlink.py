@@ -1,5 +1,6 @@
 """WPL 110 read back by pymavlink, QGroundControl plans by MAVSDK's importer."""
 
+import itertools
 import json
 import math
 import tempfile
@@ -20,7 +21,7 @@ from shapely.geometry import Point, Polygon
 from camera_calib.rig import Rig
 from missions.exports.write import write_exports
 from missions.plan_file import Plan
-from tests.missions.exports.plans import RIG, line, plan_of, small_plan
+from tests.missions.exports.plans import RIG, golden_plan, line, plan_of, small_plan
 from tests.missions.exports.readers import local_ne, plans, rigs, turned
 
 MM = 1e-3
@@ -165,6 +166,19 @@ def test_a_turn_on_the_spot_is_told_its_heading_and_sense(tmp_path: Path) -> Non
         )
         assert row.param3 == math.copysign(1, math.remainder(leg.turn_rad, math.tau))
         assert row.param4 == 0
+    # ArduPilot does the first command after a way-point before the next way begins, and beginning
+    # turns the vehicle along it: a heading must be the second.
+    for before, row in itertools.pairwise(rows):
+        if row.command == mavutil.mavlink.MAV_CMD_CONDITION_YAW:
+            assert before.command != mavutil.mavlink.MAV_CMD_NAV_WAYPOINT
+
+
+def test_a_step_sideways_keeps_the_heading(tmp_path: Path) -> None:
+    written(golden_plan(), RIG, ["wpl"], tmp_path)
+    rows = read_wpl(tmp_path / "mission_dive1.waypoints")
+    yaws = [row for row in rows if row.command == mavutil.mavlink.MAV_CMD_CONDITION_YAW]
+    assert [row.param1 for row in yaws] == pytest.approx([180.0, 90.0], abs=1e-6)
+    assert [row.param3 for row in yaws] == [1, -1]
 
 
 def test_the_fence_holds_the_vehicle_and_keeps_it_out(
