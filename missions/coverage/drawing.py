@@ -139,7 +139,7 @@ def _figures(certificate: Certificate, holes: Sequence[Hole]) -> str:
 def _sheet(area: Area) -> tuple[Figure, Axes]:
     figure = Figure(
         figsize=(9.0, 8.2), facecolor="white",
-        layout=ConstrainedLayoutEngine(rect=(0, 0.085, 1, 0.915)),
+        layout=ConstrainedLayoutEngine(rect=(0, 0.085, 1, 0.9)),
     )  # fmt: skip
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()

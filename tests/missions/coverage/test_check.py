@@ -89,8 +89,8 @@ def test_the_map_and_the_outlines_lie_where_the_hole_is(
         within = pictures != raster.nodata
         pixel_m2 = raster.res[0] * raster.res[1]
         row, column = np.argwhere(within & (pictures == 0)).mean(axis=0)
-        x, y = raster.transform * (column + 0.5, row + 0.5)
-        lon, lat = rasterio.warp.transform(raster.crs, "EPSG:4326", [x], [y])
+        x, y = raster.xy(row, column)
+        lon, lat = rasterio.warp.transform(raster.crs, "EPSG:4326", [float(x)], [float(y)])
     assert within.sum() * pixel_m2 == pytest.approx(48.0, rel=0.02)
     assert (within & (pictures == 0)).sum() * pixel_m2 == pytest.approx(data["unseen_m2"], rel=0.03)
     middle = DATUM.ned_from_geodetic(np.array([[lat[0], lon[0], 0.0]]))[0, :2]
