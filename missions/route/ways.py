@@ -42,7 +42,7 @@ class Ways:
         self.fence: Fence = fence_of(allowed)
         self._from_node: dict[int, tuple[Array, NDArray[np.int32]]] = {}
 
-    def inside(self, points_ne: Array) -> NDArray[np.bool_]:
+    def contains(self, points_ne: Array) -> NDArray[np.bool_]:
         """Which places (N, 2) are inside, (N,)."""
         points = np.ascontiguousarray(points_ne, dtype=np.float64).reshape(-1, 2)
         result: NDArray[np.bool_] = _points_inside(self.fence, points)

@@ -40,7 +40,7 @@ def test_straights_are_inside_as_shapely_finds(area: MultiPolygon, seed: int) ->
     assert not np.any(free & ~perhaps)
     np.testing.assert_array_equal(ways.free_many(ends, starts), free)
     points = shapely.points(places)
-    np.testing.assert_array_equal(ways.inside(places), shapely.distance(area, points) <= TOUCH_M)
+    np.testing.assert_array_equal(ways.contains(places), shapely.distance(area, points) <= TOUCH_M)
 
 
 @settings(deadline=None, max_examples=60)
@@ -119,7 +119,7 @@ def test_touching_is_allowed_up_to_a_micrometre() -> None:
     assert ways.free((40 + 0.9e-6, 0.0), (40 + 0.9e-6, 50.0))
     assert not ways.free((40 + 1.1e-6, 0.0), (40 + 1.1e-6, 50.0))
     assert not ways.free((-1.1e-6, 0.0), (50.0, 0.0))
-    assert ways.inside(np.array([[-0.9e-6, 3.0], [-1.1e-6, 3.0]])).tolist() == [True, False]
+    assert ways.contains(np.array([[-0.9e-6, 3.0], [-1.1e-6, 3.0]])).tolist() == [True, False]
 
 
 def test_arcs_may_graze_an_edge() -> None:
@@ -152,7 +152,7 @@ def test_corners_given_twice_are_one() -> None:
     ways = Ways(multipolygon(area))
     distance_m = ways.distance_m((10.0, 25.0), (90.0, 25.0))
     assert distance_m == pytest.approx(2 * math.hypot(30, 15) + 20, abs=1e-6)
-    assert ways.inside(np.array([[100.0, 0.0], [60.0, 10.0], [50.0, 20.0]])).tolist() == [
+    assert ways.contains(np.array([[100.0, 0.0], [60.0, 10.0], [50.0, 20.0]])).tolist() == [
         True, True, False
     ]  # fmt: skip
 
