@@ -122,7 +122,8 @@ def hop_j(
         aside = straight_m / prices.sway_mps * power_at(prices.sway_w, bearing)
         aside += prices.spot_w * prices.settle_s + _spot_j(prices, course_1 - course_0)
         energy = min(energy, aside)
-    return energy
+    total: float = energy
+    return total
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]

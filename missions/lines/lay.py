@@ -377,7 +377,7 @@ def _tour(
             order = tour.exact_tour(over, exits, inner, start, plain[None], False)[1]
         else:
             order = tour.nearest_tour(over, exits, inner, start)
-            order = tour.improved_tour(order, over, exits, inner, start, plain, 0)
+            order = tour.good_tour(over, exits, inner, start, plain, order, 0)
         return np.asarray(order)
     start[cells.CORNERS * survey_cells :] = np.inf
 
@@ -399,10 +399,10 @@ def _tour(
         order = tour.exact_tour(over, exits, inner, start, finish, True)[1]
     else:
         order = tour.nearest_tour(over, exits, inner, start)
-        order = tour.improved_tour(order, over, exits, inner, start, plain, 0)
+        order = tour.good_tour(over, exits, inner, start, plain, order, 0)
         # Now that it is known where the flight begins, so is where it ends.
         finish_j = finishes(order[:1])[0]
-        order = tour.improved_tour(order, over, exits, inner, start, finish_j, 1)
+        order = tour.good_tour(over, exits, inner, start, finish_j, order, 1)
     return np.asarray(order)
 
 

@@ -14,6 +14,7 @@ import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from alice_survey.frames import Array
 
@@ -98,7 +99,7 @@ def united(pairs: Array, first: int, last: int) -> int:
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def stretches(edges: Array, levels: Array) -> tuple[Array, Array]:
+def stretches(edges: Array, levels: Array) -> tuple[NDArray[np.int64], Array]:
     """The stretches of level lines that lie in an area, by even and odd crossings.
 
     Args:
@@ -137,7 +138,9 @@ def stretches(edges: Array, levels: Array) -> tuple[Array, Array]:
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def reaches(edges: Array, offsets: Array, half_m: float) -> tuple[Array, Array, Array]:
+def reaches(
+    edges: Array, offsets: Array, half_m: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """Project an area within strips on u.
 
     Args:
@@ -198,7 +201,7 @@ def reaches(edges: Array, offsets: Array, half_m: float) -> tuple[Array, Array, 
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def rooms(edges: Array, offsets: Array) -> tuple[Array, Array, Array]:
+def rooms(edges: Array, offsets: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """Where lines may be flown: the stretches of rows that lie in an area or follow its edge.
 
     Args:

@@ -35,7 +35,7 @@ class Site:
 def edges_of(polygons: MultiPolygon) -> Array:
     """Both ends, (E, 4) north and east, of every edge of every ring."""
     coordinates, ring_of = shapely.get_coordinates(
-        shapely.get_rings(polygons.geoms), return_index=True
+        shapely.get_rings(list(polygons.geoms)), return_index=True
     )
     both = np.concatenate([coordinates[:-1], coordinates[1:]], axis=1)
     edges: Array = np.ascontiguousarray(both[ring_of[:-1] == ring_of[1:]], dtype=np.float64)

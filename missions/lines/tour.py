@@ -3,7 +3,8 @@
 Few cells are ordered exactly, by dynamic programming over the sets of cells flown (M. Held and
 R. M. Karp 1962) with the corner at which each is entered. Many are ordered by going to the nearest,
 then improving: stretches of the tour are reversed, cells are moved, and corners of entry are chosen
-anew by dynamic programming along the tour, until nothing gains.
+anew by dynamic programming along the tour, until nothing gains; then it is shaken and improved
+again.
 """
 
 import numpy as np
@@ -17,6 +18,9 @@ EXACT = 8
 """Most cells that are ordered exactly."""
 _ROUNDS = 200
 _GAIN = 1e-9
+_SHAKES = 60
+"""Most shakes of a tour; of very many cells fewer, since each then takes longer."""
+_SHAKEN = 1200
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -87,11 +91,13 @@ def _link(
     finish: Array,
 ) -> float:
     """Cost from place i of the tour to place j; -1 is home before it, its size home after it."""
+    cost: float = 0.0
     if i < 0:
-        return start[tour[j]] if j < tour.size else 0.0
-    if j >= tour.size:
-        return finish[exits[tour[i]]]
-    cost: float = hops[exits[tour[i]], tour[j]]
+        cost = start[tour[j]]
+    elif j >= tour.size:
+        cost = finish[exits[tour[i]]]
+    else:
+        cost = hops[exits[tour[i]], tour[j]]
     return cost
 
 
@@ -224,11 +230,12 @@ def improved_tour(
                     best, best_j, kind = change, j, 1
             # Fly i elsewhere.
             leave_i = _link(tour, i, i + 1, hops, exits, start, finish)
+            closed = 0.0
             if i == 0 and cells > 1:
                 closed = start[tour[1]]
-            elif i + 1 == cells:
-                closed = finish[exits[tour[i - 1]]] if i > 0 else 0.0
-            else:
+            elif i > 0 and i + 1 == cells:
+                closed = finish[exits[tour[i - 1]]]
+            elif i > 0:
                 closed = hops[exits[tour[i - 1]], tour[i + 1]]
             saved = enter_i + inner[tour[i]] + leave_i - closed
             for j in range(fixed - 1, cells):
@@ -269,3 +276,50 @@ def improved_tour(
         if not gained:
             break
     return tour
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def good_tour(
+    hops: Array,
+    exits: NDArray[np.int64],
+    inner: Array,
+    start: Array,
+    finish: Array,
+    first: NDArray[np.int64],
+    fixed: int,
+) -> NDArray[np.int64]:
+    """A good tour of many cells: improved, shaken and improved again, the best is kept.
+
+    A shake swaps two neighbouring stretches (the double bridge of O. Martin, S. W. Otto and
+    E. W. Felten 1991), which no reversal or move undoes. Its places are a fixed sequence.
+
+    Args:
+        hops: as of `improved_tour`.
+        exits: likewise.
+        inner: likewise.
+        start: likewise.
+        finish: likewise.
+        first: (C,) tour to begin with.
+        fixed: as of `improved_tour`.
+    """
+    best = improved_tour(first, hops, exits, inner, start, finish, fixed)
+    cells = first.size
+    if cells - fixed < 4:
+        return best
+    cost = tour_cost(best, hops, exits, inner, start, finish)
+    number = 1
+    cuts = np.empty(3, np.int64)
+    for _ in range(min(_SHAKES, _SHAKEN // cells)):
+        for k in range(3):
+            # Numerical Recipes' linear congruence; its high bits serve.
+            number = (1664525 * number + 1013904223) % 4294967296
+            cuts[k] = fixed + (number >> 16) % (cells - fixed + 1)
+        cuts.sort()
+        shaken = np.concatenate(
+            (best[: cuts[0]], best[cuts[1] : cuts[2]], best[cuts[0] : cuts[1]], best[cuts[2] :])
+        )
+        shaken = improved_tour(shaken, hops, exits, inner, start, finish, fixed)
+        other = tour_cost(shaken, hops, exits, inner, start, finish)
+        if other < cost - _GAIN:
+            best, cost = shaken, other
+    return best

@@ -1,0 +1,261 @@
+import dataclasses
+import math
+import time
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from shapely.geometry import MultiPolygon, Point, Polygon, box
+
+from alice_survey.errors import PlanError
+from missions.lines.hops import flight_parts_j, prices_of
+from missions.lines.lay import lay_lines, ordered, ways_between
+from missions.lines.line import Line
+from missions.lines.pattern import Pattern
+from missions.lines.sweep import full_cost_j
+from missions.route.costs import Costs, time_costs
+from missions.route.ways import Ways
+from tests.oracles_lines import (
+    ELL,
+    ELL_WITH_HOLES,
+    PATTERNS,
+    STEREO,
+    area_of,
+    areas,
+    as_string,
+    flight_by_hand,
+    points_in,
+    random_area,
+    seen_enough,
+)
+
+COURSES = np.arange(16) * 2 * np.pi / 16
+CURRENT = dataclasses.replace(
+    time_costs(0.2),
+    line_w=80 + 40 * np.cos(COURSES - 1) ** 2 + 20 * np.cos(COURSES - 2),
+    way_w=70 + 20 * np.cos(COURSES - 2),
+    spot_w=60.0,
+    sway_w=90 + 30 * np.cos(COURSES - 2),
+)
+
+
+def lay(
+    survey: Polygon | MultiPolygon,
+    heading: float = 0.0,
+    pattern: Pattern = STEREO,
+    *,
+    margin_m: float = 3.0,
+    cross_lines: int = 1,
+    closing_line: bool = True,
+    costs: Costs | None = None,
+) -> list[Line]:
+    area = area_of(survey, margin_m)
+    home = area.allowed.representative_point()
+    return lay_lines(
+        area,
+        heading,
+        pattern,
+        Ways(area.allowed),
+        time_costs(0.2) if costs is None else costs,
+        (home.x, home.y),
+        cross_lines=cross_lines,
+        closing_line=closing_line,
+    )
+
+
+def across(line: Line, heading: float) -> float:
+    north, east = line.start_ne_m
+    return -math.sin(heading) * north + math.cos(heading) * east
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    survey=areas,
+    heading=st.floats(0, 6.28),
+    pattern=st.sampled_from(PATTERNS),
+    margin_m=st.sampled_from([0.5, 3.0]),
+    cross_lines=st.integers(0, 2),
+    closing_line=st.booleans(),
+)
+def test_lines_of_any_area_cover_it_and_stay_inside(
+    survey: MultiPolygon,
+    heading: float,
+    pattern: Pattern,
+    margin_m: float,
+    cross_lines: int,
+    closing_line: bool,
+) -> None:
+    area = area_of(survey, margin_m)
+    assume(survey.area > 0.3 and len(area.allowed.geoms) == 1)
+    lines = lay(
+        survey,
+        heading,
+        pattern,
+        margin_m=margin_m,
+        cross_lines=cross_lines,
+        closing_line=closing_line,
+    )
+
+    fence = area.allowed.buffer(1e-6)
+    assert all(fence.contains(as_string(line)) for line in lines)
+    assert all(line.length_m <= (line.stations - 1) * pattern.step_m + 1e-9 for line in lines)
+    points = points_in(survey, 5000)
+    main = [line for line in lines if line.kind in ("survey", "fill")]
+    # Dense points count the boxes that pictures see: an oracle that knows nothing of rows.
+    assert seen_enough(main, points, pattern).mean() >= 0.999
+    grid = [line for line in lines if line.kind == "survey"]
+    offsets = np.array([across(line, heading) for line in grid]) / pattern.spacing_m
+    np.testing.assert_allclose(
+        (offsets - offsets[0] + 0.5) % 1.0, 0.5, atol=1e-9 / pattern.spacing_m
+    )
+    once = [line for line in lines if line.kind != "closing"]
+    assert len({frozenset([line.start_ne_m, line.end_ne_m]) for line in once}) == len(once)
+    closing = [line for line in lines if line.kind == "closing"]
+    assert len(closing) == int(closing_line and len(grid) > 1)
+    if closing:
+        assert closing[0].end_ne_m == pytest.approx(grid[0].start_ne_m, abs=1e-9)
+        middle = (grid[0].length_m + grid[0].length_m / (grid[0].stations - 1)) / 2
+        assert 0 < closing[0].length_m <= middle + 1e-9
+
+
+def test_five_hundred_areas_never_crash_and_never_leave_the_allowed_area() -> None:
+    unreachable = 0
+    for seed in range(500):
+        rng = np.random.default_rng([77, seed])
+        survey = random_area(rng)
+        area = area_of(survey, float(rng.choice([0.0, 0.5, 3.0])))
+        home = area.allowed.representative_point()
+        try:
+            lines = lay_lines(
+                area,
+                float(rng.uniform(0, 7)),
+                PATTERNS[seed % 3],
+                Ways(area.allowed),
+                time_costs(0.2),
+                (home.x, home.y),
+                cross_lines=int(rng.integers(3)),
+                closing_line=bool(rng.integers(2)),
+            )
+        except PlanError as error:
+            assert "not connected" in str(error) or "can be flown" in str(error)
+            unreachable += 1
+            continue
+        fence = area.allowed.buffer(1e-6)
+        assert lines
+        assert all(fence.contains(as_string(line)) for line in lines)
+    assert 0 < unreachable < 250
+
+
+def test_a_rectangle_is_flown_to_and_fro_from_home() -> None:
+    lines = lay(box(0, 0, 15, 17), math.pi / 2, cross_lines=0, closing_line=False)
+    assert len(lines) == 15
+    headings = np.array([line.heading_rad for line in lines])
+    np.testing.assert_allclose(np.abs(np.cos(np.diff(headings)) + 1), 0, atol=1e-9)
+    norths = np.array([line.start_ne_m[0] for line in lines])
+    np.testing.assert_allclose(np.abs(np.diff(norths)), 1.0, atol=1e-9)
+
+
+def test_every_part_is_tied_by_cross_lines() -> None:
+    parts = MultiPolygon([box(0, 0, 6, 6), box(10, 0, 18, 7)])
+    lines = lay(parts, 0.0, margin_m=4.0, cross_lines=2)
+    crossing = [as_string(line) for line in lines if line.kind == "cross"]
+    for part in parts.geoms:
+        own = [line for line in crossing if line.distance(part) == 0]
+        assert len(own) == 2
+        rows = [as_string(line) for line in lines if line.kind == "survey"]
+        for row in [row for row in rows if row.intersection(part).length > 1]:
+            assert all(row.crosses(line) for line in own)
+
+
+@pytest.mark.parametrize("costs", [time_costs(0.2), CURRENT])
+def test_the_cost_is_that_of_the_lines_flown_by_hand(costs: Costs) -> None:
+    area = area_of(ELL_WITH_HOLES)
+    ways, home = Ways(area.allowed), (-2.0, -2.0)
+    kinds = {"cross_lines": 1, "closing_line": True}
+    lines = lay_lines(area, 0.4, STEREO, ways, costs, home, **kinds)
+    cost = full_cost_j(area, 0.4, STEREO, ways, costs, home, **kinds)
+    assert flight_by_hand(lines, ways.distance_m, costs, home) == pytest.approx(cost, rel=1e-6)
+
+
+def test_the_order_is_better_than_rows_one_after_the_other() -> None:
+    """The old way flew every row over all parts before the next row."""
+    area = area_of(ELL_WITH_HOLES)
+    ways, home, prices = Ways(area.allowed), (0.0, 0.0), prices_of(time_costs(0.2))
+    lines = lay(ELL_WITH_HOLES, 0.0, cross_lines=0, closing_line=False)
+    rows = sorted(lines, key=lambda x: (round(across(x, 0.0), 6), x.start_ne_m))
+    plain = [line if i % 2 else line.reversed() for i, line in enumerate(rows)]
+    mine, old = (
+        flight_parts_j(
+            prices,
+            np.array(home),
+            table := np.array([(*x.start_ne_m, *x.end_ne_m, x.heading_rad) for x in some]),
+            ways_between(table, np.array(home), ways),
+        )[1]
+        for some in (lines, plain)
+    )
+    assert mine < 0.8 * old
+
+
+def test_any_lines_are_put_in_order() -> None:
+    area = area_of(box(0, 0, 20, 20))
+    ways, costs, home = Ways(area.allowed), time_costs(0.2), (0.0, 0.0)
+    rng = np.random.default_rng(4)
+    lines = [
+        Line(kind="fill", start_ne_m=(a, b), end_ne_m=(a + 1, b + c / 5), stations=9)
+        for a, b, c in rng.uniform(2, 15, (12, 3)).tolist()
+    ]
+    for some in (lines[:5], lines):
+        sorted_lines = ordered(some, ways, costs, home)
+        ends = {frozenset([x.start_ne_m, x.end_ne_m]) for x in sorted_lines}
+        assert ends == {frozenset([x.start_ne_m, x.end_ne_m]) for x in some}
+        mine = flight_by_hand(sorted_lines, ways.distance_m, costs, home)
+        assert mine < flight_by_hand(some, ways.distance_m, costs, home)
+
+
+def test_parts_without_a_way_between_are_refused() -> None:
+    with pytest.raises(PlanError, match="not connected"):
+        lay(MultiPolygon([box(0, 0, 5, 5), box(20, 0, 25, 5)]), margin_m=1.0)
+
+
+def test_too_many_stations_are_refused() -> None:
+    with pytest.raises(PlanError, match=r"stations, more than 100000: split the area"):
+        lay(box(0, 0, 1000, 1000))
+
+
+def test_an_area_away_from_the_allowed_water_is_refused() -> None:
+    area = dataclasses.replace(
+        area_of(box(0, 0, 5, 5)), allowed=MultiPolygon([box(50, 50, 60, 60)])
+    )
+    with pytest.raises(PlanError, match="come near the area"):
+        lay_lines(
+            area, 0.0, STEREO, Ways(area.allowed), time_costs(0.2), (55.0, 55.0),
+            cross_lines=0, closing_line=False,
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("survey", [ELL, Point(0, 0).buffer(0.2), box(0, 0, 40, 0.02)])
+def test_the_smallest_areas_have_a_line_too(survey: Polygon) -> None:
+    for heading in (0.0, 0.3, math.pi / 2):
+        lines = lay(survey, heading)
+        assert seen_enough(lines, points_in(survey, 500), STEREO).all()
+        assert all(line.length_m > 0 for line in lines)
+
+
+def test_the_same_area_gives_the_same_lines() -> None:
+    assert lay(ELL_WITH_HOLES, 0.7) == lay(ELL_WITH_HOLES, 0.7)
+
+
+def test_ten_thousand_rows_take_about_a_second() -> None:
+    """A bound that only a quadratic method misses, even on a busy machine."""
+    wide = Pattern(spacing_m=1.0, step_m=8.0, half_across_m=0.6, half_along_m=4.5)
+    area = area_of(box(0, 0, 40, 9_999))
+    ways, seconds = Ways(area.allowed), []
+    for _ in range(2):
+        began = time.process_time()
+        lines = lay_lines(
+            area, 0.0, wide, ways, time_costs(0.2), (0.0, 0.0), cross_lines=0, closing_line=False
+        )
+        seconds.append(time.process_time() - began)
+    assert len(lines) == 9_999
+    assert min(seconds) < 3.0

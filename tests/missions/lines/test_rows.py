@@ -1,0 +1,141 @@
+import math
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from shapely.geometry import MultiPolygon, box
+
+from alice_survey.frames import Array
+from missions.areas.area import multipolygon
+from missions.lines.rows import lay_rows, reaches, rooms, row_offsets, to_uv
+from missions.lines.site import edges_of
+from tests.oracles_lines import areas, reaches_by_shapely
+
+
+def spans(begins: Array, counts: Array, found: Array, row: int) -> Array:
+    return found[begins[row] : begins[row] + counts[row]]
+
+
+def turned(survey: shapely.Geometry, heading: float) -> Array:
+    return to_uv(edges_of(multipolygon(survey)), heading)
+
+
+@settings(deadline=None, max_examples=60)
+@given(survey=areas, heading=st.floats(0, 6.28), half_m=st.floats(0.1, 1.0))
+def test_a_row_reaches_as_far_as_the_area_in_its_strip(
+    survey: MultiPolygon, heading: float, half_m: float
+) -> None:
+    edges = turned(survey, heading)
+    offsets = row_offsets(edges[:, 1].min(), edges[:, 1].max(), 1.0, 0.0, 1)
+    found = reaches(edges, offsets, half_m)
+    for row, offset in enumerate(offsets.tolist()):
+        mine = spans(*found, row)
+        oracle = reaches_by_shapely(survey, heading, offset, half_m)
+        # Where parts come within a hair of each other the two may split them differently.
+        joined = shapely.union_all([box(a - 1e-5, 0, b + 1e-5, 1) for a, b in mine.tolist()])
+        wanted = shapely.union_all([box(a - 1e-5, 0, b + 1e-5, 1) for a, b in oracle])
+        assert joined.symmetric_difference(wanted).area < 1e-4
+
+
+@settings(deadline=None, max_examples=60)
+@given(survey=areas, heading=st.floats(0, 6.28), share=st.floats(0.01, 0.99))
+def test_rooms_are_where_a_row_is_inside(
+    survey: MultiPolygon, heading: float, share: float
+) -> None:
+    edges = turned(survey, heading)
+    low, high = edges[:, 1].min(), edges[:, 1].max()
+    offset = low + share * (high - low)
+    found = spans(*rooms(edges, np.array([offset])), 0)
+    local = shapely.affinity.rotate(survey, -heading, origin=(0, 0), use_radians=True)
+    u = np.linspace(*local.bounds[::2], 400)
+    inside = shapely.contains_xy(local, u, np.full(400, offset))
+    near = shapely.distance(local.boundary, shapely.points(u, offset)) < 1e-6
+    mine = ((u[:, None] >= found[:, 0]) & (u[:, None] <= found[:, 1])).any(axis=1)
+    assert (mine == inside)[~near].all()
+
+
+def test_a_row_may_follow_the_edge_of_the_allowed_area_on_either_side() -> None:
+    edges = turned(box(0, 0, 10, 5), 0.0)
+    begins, counts, found = rooms(edges, np.array([0.0, 5.0]))
+    assert counts.tolist() == [1, 1]
+    np.testing.assert_allclose(found[begins[:2]], [[0, 10], [0, 10]], atol=1e-6)
+    _, counts, _ = rooms(edges, np.array([-1e-3, 5.0 + 1e-3]))
+    assert counts.tolist() == [0, 0]
+
+
+@given(
+    width=st.floats(0, 100),
+    edge=st.floats(-1, 2),
+    spacing=st.floats(0.2, 3),
+    passes=st.integers(1, 4),
+)
+def test_rows_are_the_fewest_that_reach_over_both_sides(
+    width: float, edge: float, spacing: float, passes: int
+) -> None:
+    offsets = row_offsets(-width / 2 + 7, width / 2 + 7, spacing, edge, passes)
+    assert offsets.mean() == pytest.approx(7, abs=1e-9)
+    np.testing.assert_allclose(np.diff(offsets), spacing, atol=1e-12)
+    span = offsets[-1] - offsets[0]
+    assert len(offsets) >= passes
+    assert len(offsets) == passes or span - spacing < width + 2 * edge
+    assert span >= width + 2 * edge - 1e-6
+
+
+def lay(
+    survey: shapely.Geometry, allowed: shapely.Geometry, **changes: float
+) -> tuple[Array, Array]:
+    wanted = {"half_m": 0.5, "overhang_m": 0.2, "step_m": 0.5, "least_steps": 1} | changes
+    offsets = np.array([0.5])
+    return lay_rows(turned(survey, 0.0), turned(allowed, 0.0), offsets, *wanted.values())
+
+
+def test_a_piece_is_whole_steps_long_where_there_is_room() -> None:
+    pieces, cuts = lay(box(0, 0, 10.2, 1), box(-5, -5, 20, 5))
+    np.testing.assert_allclose(pieces, [[0, -0.4, 10.6, 22]], atol=1e-9)
+    assert len(cuts) == 0
+
+
+def test_a_piece_without_room_has_shorter_steps() -> None:
+    pieces, cuts = lay(box(0, 0, 10.2, 1), box(-0.2, -5, 10.4, 5))
+    np.testing.assert_allclose(pieces, [[0, -0.2, 10.4, 22]], atol=1e-9)
+    assert len(cuts) == 0
+
+
+def test_a_no_go_zone_parts_a_piece_and_is_told() -> None:
+    allowed = box(-5, -5, 20, 5).difference(box(4, -1, 6, 2))
+    pieces, cuts = lay(box(0, 0, 10, 1), allowed)
+    assert len(pieces) == 2
+    assert pieces[0, 2] == pytest.approx(4)
+    assert pieces[1, 1] == pytest.approx(6)
+    np.testing.assert_allclose(cuts, [[0, 4, 6]], atol=1e-9)
+
+
+def test_pieces_less_than_two_steps_apart_become_one_where_that_is_allowed() -> None:
+    survey = box(0, 0, 4, 1).union(box(5.2, 0, 9, 1))
+    wide = box(-5, -5, 20, 5)
+    assert len(lay(survey, wide)[0]) == 1
+    assert len(lay(survey, wide.difference(box(4.4, -1, 4.6, 2)))[0]) == 2
+    assert len(lay(survey, wide, step_m=0.3)[0]) == 2
+
+
+def test_the_least_piece_is_as_long_as_its_pictures_ask_for() -> None:
+    pieces, _ = lay(box(0, 0, 0.1, 1), box(-5, -5, 20, 5), overhang_m=-0.2, least_steps=3)
+    np.testing.assert_allclose(pieces, [[0, 0.05 - 0.75, 0.05 + 0.75, 3]], atol=1e-9)
+
+
+def test_a_wish_for_a_single_place_that_cannot_be_met_is_told() -> None:
+    """Two spots, each to be seen by one picture; one of them lies in a no-go zone."""
+    survey = box(0, 0, 0.2, 1).union(box(8, 0, 8.2, 1))
+    allowed = box(-5, -5, 20, 5).difference(box(-2, -5, 2, 5))
+    pieces, cuts = lay(survey, allowed, overhang_m=-0.2)
+    assert len(pieces) == 1
+    np.testing.assert_allclose(cuts, [[0, 0.1, 0.1]], atol=1e-9)
+
+
+def test_lines_at_a_distance_do_not_count_what_only_touches_their_strip() -> None:
+    edges = turned(box(0, 1.0, 10, 3), 0.0)
+    _, counts, _ = reaches(edges, np.array([0.5, 3.5]), 0.5)
+    assert counts.tolist() == [0, 0]
+    assert math.isclose(reaches(edges, np.array([0.6]), 0.5)[2][0, 1], 10)
