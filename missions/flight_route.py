@@ -5,6 +5,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+import shapely
+from shapely.geometry import LineString, Point
 
 from alice_survey.errors import PlanError
 from alice_survey.vehicle.pilot.path import Path, path_from_legs
@@ -12,6 +14,7 @@ from missions.plan_file import Plan
 from missions.route.legs import Leg, Route
 
 _SAME_RAD = 1e-6
+_TOUCH_M = 1e-6
 
 
 def one_dive(plan: Plan, dive: int | None) -> Plan:
@@ -93,3 +96,19 @@ def path_of(plan: Plan) -> Path:
 def turns_on_the_spot(path: Path) -> int:
     """How many there are."""
     return int(np.count_nonzero(path.turn_rad))
+
+
+def room_behind_m(plan: Plan, path: Path, most_m: float) -> float:
+    """How far the vehicle may go back from the path's start, to come in straight.
+
+    Args:
+        plan: whose allowed area counts.
+        path: its first leg's course.
+        most_m: as far as it wants to.
+    """
+    start = np.array([path.start_n[0], path.start_e[0]])
+    course = float(path.heading_rad[0])
+    end = start - most_m * np.array([math.cos(course), math.sin(course)])
+    inside = LineString([start, end]).intersection(plan.area.allowed.buffer(_TOUCH_M))
+    parts = [part for part in shapely.get_parts(inside) if part.distance(Point(start)) <= _TOUCH_M]
+    return min(most_m, max((float(part.length) for part in parts), default=0.0))

@@ -38,7 +38,7 @@ from alice_survey.vehicle.stability import pitch_divergence_speed_mps
 from alice_survey.vehicle.swell import with_swell
 from alice_survey.vehicle.vehicle import Vehicle
 from missions.flight import Flight, trigger_times
-from missions.flight_route import path_of, turns_on_the_spot
+from missions.flight_route import path_of, room_behind_m, turns_on_the_spot
 from missions.navigation import NavigationLog
 from missions.plan_file import Plan
 
@@ -151,6 +151,9 @@ def mission_setup(
             longest_s=longest_s,
             blind_depth_m=max(plan.seafloor_depth_m - _BLIND_ALTITUDES * plan.altitude_m, 0.0),
         ),
+    )
+    guidance = guidance._replace(
+        way_in_m=min(guidance.way_in_m, room_behind_m(plan, path, guidance.way_in_m))
     )
     gust, heading_rad = config.sea.gust_n, float(path.heading_rad[0] + path.side_rad[0])
     # The vehicle is let go where its left port is above the start of the route.

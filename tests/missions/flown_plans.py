@@ -45,7 +45,7 @@ def plan_of(routes: Sequence[Route], stations: int = 6, turn_radius_m: float = 0
         Line(kind="survey", start_ne_m=leg.start_ne_m, end_ne_m=leg.end_ne_m, stations=stations)
         for leg in legs
     )
-    area = MultiPolygon([box(-1.0, -1.0, 8.0, 5.0)])
+    area, allowed = (MultiPolygon([box(-m, -m, 7.0 + m, 4.0 + m)]) for m in (1.0, 5.0))
     dives = []
     for route in routes:
         indices = [leg.line for leg in route.legs if leg.line >= 0]
@@ -62,7 +62,7 @@ def plan_of(routes: Sequence[Route], stations: int = 6, turn_radius_m: float = 0
     return Plan(
         name="by hand",
         area=Area(
-            datum=Datum(latitude_deg=32.8, longitude_deg=34.9), survey=area, allowed=area,
+            datum=Datum(latitude_deg=32.8, longitude_deg=34.9), survey=area, allowed=allowed,
             no_go=MultiPolygon(),
         ),
         home_ne_m=routes[0].legs[0].start_ne_m,

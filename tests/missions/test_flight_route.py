@@ -2,10 +2,12 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from shapely.geometry import MultiPolygon, Polygon, box
 
 from alice_survey.config import SurveyConfig, parse_config
 from alice_survey.errors import PlanError, VehicleError
@@ -14,7 +16,13 @@ from alice_survey.vehicle.floor import level_floor
 from alice_survey.vehicle.pilot.memory import LEG, PHASE
 from missions.flight import Flight
 from missions.flight_records import flight_summary
-from missions.flight_route import one_dive, path_of, stations_of_dives, whole_route
+from missions.flight_route import (
+    one_dive,
+    path_of,
+    room_behind_m,
+    stations_of_dives,
+    whole_route,
+)
 from missions.fly import run_fly
 from missions.plan_file import Plan
 from missions.simulation import longest_mission_s, simulate_plan
@@ -132,6 +140,31 @@ def test_one_dive_is_flown_alone() -> None:
     assert np.flatnonzero(~np.isnan(flown.line_errors[0])).size > 100
     found = flight_summary(flown, survey())
     assert (found["dives"], found["stations_planned"], found["stations"]) == (1, 6, 6)
+
+
+@pytest.mark.parametrize(
+    ("allowed", "room"),
+    [
+        (box(-3.0, -3.0, 8.0, 5.0), 1.6),
+        (box(-0.5, -3.0, 8.0, 5.0), 0.5),
+        (box(0.0, -3.0, 8.0, 5.0), 0.0),
+        # Beyond a no-go zone there is no room.
+        (box(-3.0, -3.0, 8.0, 5.0).difference(box(-1.2, -1.0, -0.7, 1.0)), 0.7),
+    ],
+)
+def test_the_way_in_stays_where_the_vehicle_may_be(allowed: Polygon, room: float) -> None:
+    area = replace(PLAN.area, allowed=MultiPolygon([allowed]))
+    fenced = replace(PLAN, area=area)
+    assert room_behind_m(fenced, path_of(fenced), 1.6) == pytest.approx(room, abs=1e-5)
+
+
+def test_a_vehicle_at_the_fence_begins_without_a_way_in() -> None:
+    fence = MultiPolygon([box(0.0, -3.0, 8.0, 5.0)])
+    flown = fly(replace(PLAN, area=replace(PLAN.area, allowed=fence)), survey())
+    assert flown.ending == "complete"
+    following = flown.flown.report[:, PHASE] == signals.FOLLOW
+    # But for what control and navigation err.
+    assert -0.3 < flown.glass_ned[following, 0].min() < 0.0
 
 
 def test_a_vehicle_without_sway_turns_on_the_spot_with_a_warning_but_cannot_step(
