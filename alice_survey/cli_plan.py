@@ -179,6 +179,9 @@ def current(
     Power by the direction of lines: along the current, across it by sway, or crabbing.
     """
     from alice_survey.survey import settings
-    from missions.route.trade import energy_report
+    from missions.route.trade import draw_trade, energy_report
 
-    print_result(*energy_report(settings(workspace, survey, needed=False), plot), as_json)
+    config = settings(workspace, survey, needed=False)
+    print_result(*energy_report(config), as_json)
+    if plot is not None:
+        draw_trade(plot, config)

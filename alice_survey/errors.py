@@ -1,6 +1,11 @@
 """Known faults: one line that says what is wrong, with the numbers and what to change."""
 
+import contextlib
 import sys
+from collections.abc import Iterator
+from contextvars import ContextVar
+
+_listeners: ContextVar[tuple[list[str], ...]] = ContextVar("listeners", default=())
 
 
 class AliceError(Exception):
@@ -42,3 +47,16 @@ class ReconstructionError(AliceError):
 def warn(text: str) -> None:
     """Tell the user, in one line on standard error, of something that work goes on without."""
     sys.stderr.write(f"warning: {text}\n")
+    for told in _listeners.get():
+        told.append(text)
+
+
+@contextlib.contextmanager
+def heard() -> Iterator[list[str]]:
+    """Also keep what is warned of meanwhile, to write it down."""
+    told: list[str] = []
+    token = _listeners.set((*_listeners.get(), told))
+    try:
+        yield told
+    finally:
+        _listeners.reset(token)

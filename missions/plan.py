@@ -16,7 +16,7 @@ from shapely.geometry import Point
 
 from alice_survey.artefacts import Stage, run_stage
 from alice_survey.config import SurveyConfig
-from alice_survey.errors import PlanError, warn
+from alice_survey.errors import PlanError, heard, warn
 from camera_calib.rig import Rig, design_rig
 from missions.areas.area import Area
 from missions.areas.bathymetry import Bathymetry, area_depth, read_bathymetry
@@ -26,6 +26,7 @@ from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.stations import Stations, stations_of_plan
 from missions.footprint import Swath, common_swath, joint_swath
 from missions.imaging.settings import ImagingSettings, imaging_settings, raw_bytes
+from missions.imaging.table import Setting
 from missions.lines.lay import lay_lines
 from missions.lines.line import Line
 from missions.lines.pattern import Pattern, pattern
@@ -55,8 +56,10 @@ class Planned:
     sweep: Sweep | None
     """How the direction of the lines was found; None where it was given."""
     bathymetry: Bathymetry | None
-    table: str
-    """Every setting with its equation, source and limit, for people."""
+    warnings: tuple[str, ...]
+    """What the plan was warned of."""
+    rows: tuple[Setting, ...]
+    """Every setting with its equation, source and limit."""
 
 
 def run_plan(workspace: Path, config: SurveyConfig, threads: int) -> bool:
@@ -112,6 +115,12 @@ def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
     Raises:
         PlanError: no plan meets the settings; the message names the numbers.
     """
+    with heard() as warnings:
+        planned = _plan_survey(config, rig)
+    return replace(planned, warnings=tuple(warnings))
+
+
+def _plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
     wanted = config.plan
     _check_turns(config)
     imaging = imaging_settings(rig, config)
@@ -209,7 +218,8 @@ def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
         certificate=seen,
         sweep=sweep,
         bathymetry=bathymetry,
-        table=imaging.table_text(plan_rows(finished, seen, sweep, config, rig)),
+        warnings=(),
+        rows=(*imaging.rows, *plan_rows(finished, seen, sweep, config, rig)),
     )
 
 

@@ -9,8 +9,10 @@ from alice_survey.artefacts import write_json
 from alice_survey.config import SurveyConfig
 from camera_calib.rig import Rig
 from missions.exports.options import Options
-from missions.exports.write import write_exports
+from missions.exports.write import about_file, write_exports
+from missions.imaging.table import settings_table
 from missions.imaging.timetable import trigger_table, write_timetable
+from missions.maps.page import Link, write_page
 from missions.maps.plan_map import draw_plan
 from missions.plan_file import Dive, Plan
 from missions.route.cost import leg_costs
@@ -34,13 +36,25 @@ def write_planned(folder: Path, planned: "Planned", config: SurveyConfig, rig: R
     plan = planned.plan
     write_json(folder / "plan.json", plan.to_json())
     write_json(folder / "certificate.json", planned.certificate.to_json())
-    (folder / "settings.txt").write_text(planned.table + "\n", encoding="utf-8")
+    table = settings_table(planned.rows)
+    (folder / "settings.txt").write_text(table + "\n", encoding="utf-8")
     write_triggers(folder, plan, planned.costs, config)
     draw_plan(folder / "map.png", plan, rig, planned.certificate, planned.bathymetry, config.sea)
     options = Options(
         altimeter_body_m=config.camera.dvl_position_body_m, pixel_um=config.camera.pixel_um
     )
-    write_exports(folder / "exports", plan, rig, options=options)
+    files = write_exports(folder / "exports", plan, rig, options=options)
+    write_page(
+        folder / "plan.html",
+        plan,
+        rig,
+        planned.certificate,
+        planned.rows,
+        bathymetry=planned.bathymetry,
+        sea=config.sea,
+        warnings=planned.warnings,
+        links=[Link(href=f"exports/{file.name}", about=about_file(file)) for file in files],
+    )
 
 
 def write_triggers(folder: Path, plan: Plan, costs: Costs, config: SurveyConfig) -> None:

@@ -237,6 +237,7 @@ _WRITERS: dict[Format, Callable[[Path, _Job], list[Path]]] = {
 _ABOUT = (
     ("mission_v1_dive", "COLA2 mission, version 1"),
     ("survey_dive", "QGroundControl plan for ArduSub, its lines as one survey item"),
+    ("about.txt", "what the files hold, and how"),
     (".xml", "COLA2 mission, version 2.0 (SPARUS II)"),
     (".plan", "QGroundControl plan for ArduSub"),
     (".waypoints", "QGC WPL 110 mission for ArduSub"),
@@ -249,7 +250,8 @@ _ABOUT = (
 )
 
 
-def _kind(file: Path) -> str:
+def about_file(file: Path) -> str:
+    """What a file that `write_exports` wrote is, in words."""
     return next(about for part, about in _ABOUT if part in file.name)
 
 
@@ -266,7 +268,7 @@ def _write_about(path: Path, job: _Job, files: Sequence[Path]) -> Path:
         f"COLA2 actions: {job.options.camera_on} starts pictures, {job.options.camera_off} stops "
         "them: name them as your vehicle does.",
         "",
-        *(f"{file.name}: {_kind(file)}" for file in files),
+        *(f"{file.name}: {about_file(file)}" for file in files),
     ]
     with atomic_path(path) as temporary:
         temporary.write_text("\n".join(text) + "\n", encoding="utf-8", newline="\n")
