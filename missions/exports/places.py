@@ -42,18 +42,21 @@ def grown(geometry: MultiPolygon, by_m: float) -> list[Polygon]:
     return parts
 
 
-def route_ne(route: Route) -> Array:
-    """Corners of a route, (N, 2); arcs as chords within 2 cm."""
+def route_ne(route: Route, chord_m: float = CHORD_M) -> Array:
+    """Corners of a route, (N, 2); arcs as chords that lie within a distance of them."""
     rows = [np.array([route.legs[0].start_ne_m])]
-    rows += [leg.places(np.linspace(0.0, leg.length_m, chords(leg) + 1)[1:])
-             for leg in route.legs if leg.length_m > 0]  # fmt: skip
+    rows += [
+        leg.places(np.linspace(0.0, leg.length_m, chords(leg, chord_m) + 1)[1:])
+        for leg in route.legs
+        if leg.length_m > 0
+    ]
     return np.vstack(rows)
 
 
-def chords(leg: Leg) -> int:
-    """How many chords stand for a leg: one for a straight, for an arc within 2 cm of it."""
+def chords(leg: Leg, chord_m: float = CHORD_M) -> int:
+    """How many chords stand for a leg: one for a straight."""
     if not leg.curvature_per_m:
         return 1
     # The sagitta of a chord over an angle a is r (1 - cos(a / 2)).
-    widest_rad = 2 * math.acos(max(0.0, 1.0 - CHORD_M * abs(leg.curvature_per_m)))
+    widest_rad = 2 * math.acos(max(0.0, 1.0 - chord_m * abs(leg.curvature_per_m)))
     return max(1, math.ceil(leg.length_m * abs(leg.curvature_per_m) / widest_rad - 1e-9))

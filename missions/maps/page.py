@@ -249,7 +249,8 @@ def _settings(rows: Sequence[Setting]) -> str:
         )
     listed = "".join(f"<li>{escape(source)}</li>" for source in sources)
     return (
-        '<section class="card"><h2>Settings and why</h2><div class="scroll"><table><thead><tr>'
+        '<section class="card"><h2>Settings and why</h2><div class="scroll">'
+        '<table class="settings"><thead><tr>'
         '<th scope="col">setting</th><th scope="col">value</th>'
         '<th scope="col">equation [source]</th><th scope="col">bound by</th></tr></thead>'
         f'<tbody>{"".join(body)}</tbody></table></div><ol class="sources">{listed}</ol></section>'

@@ -80,7 +80,9 @@ def page_data(
             ]
             for index, line in enumerate(plan.lines)
         ],
-        "routes": [_path(LineString(route_ne(dive.route)), detail_m) for dive in plan.dives],
+        "routes": [
+            _path(LineString(route_ne(dive.route, detail_m)), detail_m) for dive in plan.dives
+        ],
         "outline": _mm(outline),
         "across": plan.footprint_m[0],
         "spacing": plan.line_spacing_m,

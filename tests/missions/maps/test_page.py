@@ -15,9 +15,11 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from pyproj import CRS, Transformer
 
 from alice_survey.config import SeaConfig
 from alice_survey.frames import Datum
+from missions.areas.bathymetry import Bathymetry
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.stations import plan_pattern, stations_of_plan
 from missions.imaging.table import Setting
@@ -289,3 +291,43 @@ def test_a_plan_without_extras_has_no_layers_for_them(tmp_path: Path) -> None:
     assert "1 survey line" in layers
     for name in ("depth", "current", "no-go zones", "dive 1", "less than the overlap asked for"):
         assert name not in layers
+
+
+def test_contours_of_a_plane_are_straight_and_where_they_should_be() -> None:
+    """Depths on a raster in UTM, 0.1 m deeper with every metre north."""
+    plan = small_plan()
+    epsg = CRS.from_epsg(plan.datum.utm_epsg)
+    to_utm = Transformer.from_crs("EPSG:4326", epsg, always_xy=True)
+    x, y = to_utm.transform(plan.datum.longitude_deg, plan.datum.latitude_deg)
+    cells = 60
+    columns, rows = np.meshgrid(np.arange(cells) + 0.5, np.arange(cells) + 0.5)
+    place_x, place_y = x - 30 + columns, y + 30 - rows
+    lon, lat = to_utm.transform(place_x, place_y, direction="INVERSE")
+    geodetic = np.column_stack([lat.ravel(), lon.ravel(), np.full(cells**2, 15.0)])
+    north = plan.datum.ned_from_geodetic(geodetic)[:, 0]
+    bathymetry = Bathymetry(
+        name="plane",
+        datum=plan.datum,
+        crs=epsg.to_wkt(),
+        from_pixel=(1.0, 0.0, x - 30, 0.0, -1.0, y + 30),
+        depth_m=(15.0 + 0.1 * north).reshape(cells, cells),
+        vertical_datum="none",
+        reading="depths",
+    )
+    data = page_data(plan, RIG, None, bathymetry, None)
+
+    depths = [contour["depth"] for contour in data["contours"]]
+    # 10.2 m from south to north are 1.02 m of depth: steps of 0.2 m.
+    assert np.allclose(np.diff(depths), 0.2)
+    assert 5 <= len(depths) <= 6
+    for contour in data["contours"]:
+        (path,) = contour["paths"]
+        points = np.array(path).reshape(-1, 2) / 1000
+        assert points[:, 0] == pytest.approx((contour["depth"] - 15.0) / 0.1, abs=0.01)
+        assert np.ptp(points[:, 1]) == pytest.approx(data["extent"][3] - data["extent"][1], abs=0.1)
+
+
+def test_a_level_floor_has_no_contours_and_a_still_sea_no_arrow() -> None:
+    data = page_data(small_plan(), RIG, None, None, SeaConfig(current_mps=0.0))
+    assert data["contours"] == []
+    assert data["current"] is None
