@@ -95,6 +95,9 @@ def export_report(
     formats: Sequence[str] | None = None,
     out: Path | None = None,
     config: SurveyConfig | None = None,
+    *,
+    camera_on: str | None = None,
+    camera_off: str | None = None,
 ) -> tuple[str, dict[str, Any]]:
     """`alice-survey plan export`: write a finished plan in the formats of vehicles and maps.
 
@@ -104,6 +107,8 @@ def export_report(
         out: folder to write to; None for `exports` beside the plan.
         config: the survey, for where camera and altimeter are; None for the settings that the plan
             was made with, which lie beside it.
+        camera_on: COLA2's service that starts pictures; None for the default of `Options`.
+        camera_off: the one that stops them.
 
     Returns:
         What to print, and the same as JSON values.
@@ -115,8 +120,11 @@ def export_report(
     plan = read_plan(path)
     survey = config if config is not None else _config_beside(path)
     rig = design_rig(survey.camera, survey.water)
+    names = {"camera_on": camera_on, "camera_off": camera_off}
     options = Options(
-        altimeter_body_m=survey.camera.dvl_position_body_m, pixel_um=survey.camera.pixel_um
+        altimeter_body_m=survey.camera.dvl_position_body_m,
+        pixel_um=survey.camera.pixel_um,
+        **{key: name for key, name in names.items() if name is not None},
     )
     folder = path.parent / "exports" if out is None else out
     files = write_exports(folder, plan, rig, formats=formats, options=options)

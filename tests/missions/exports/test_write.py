@@ -103,6 +103,10 @@ def test_the_report_takes_the_mount_from_the_settings_of_the_plan(tmp_path: Path
     assert "+0.700 m forward, -0.100 m right" in (folder / "exports" / "about.txt").read_text()
     json.dumps(about)
 
+    export_report(folder, ["cola2"], tmp_path / "named", camera_on="/rig/go")
+    named = (tmp_path / "named" / "about.txt").read_text()
+    assert "/rig/go starts pictures, camera_trigger/disable stops them" in named
+
 
 def test_depths_that_do_not_fit_the_lines_are_refused(tmp_path: Path) -> None:
     plan = small_plan()
