@@ -120,11 +120,12 @@ def export_report(
     plan = read_plan(path)
     survey = config if config is not None else _config_beside(path)
     rig = design_rig(survey.camera, survey.water)
-    names = {"camera_on": camera_on, "camera_off": camera_off}
+    default = Options()
     options = Options(
         altimeter_body_m=survey.camera.dvl_position_body_m,
         pixel_um=survey.camera.pixel_um,
-        **{key: name for key, name in names.items() if name is not None},
+        camera_on=default.camera_on if camera_on is None else camera_on,
+        camera_off=default.camera_off if camera_off is None else camera_off,
     )
     folder = path.parent / "exports" if out is None else out
     files = write_exports(folder, plan, rig, formats=formats, options=options)
