@@ -93,7 +93,8 @@ def route_cost_by_steps(route: Route, costs: Costs, step_m: float) -> tuple[floa
         steps = max(1, math.ceil(leg.length_m / step_m)) if leg.curvature_per_m else 1
         for k in range(steps):
             course = leg.heading_rad + leg.curvature_per_m * leg.length_m * (k + 0.5) / steps
-            joules += leg.length_m / steps / costs.speed_mps * power_at(power_w, course)
+            extra_w = costs.arc_extra_w if leg.curvature_per_m and leg.line < 0 else 0.0
+            joules += leg.length_m / steps / costs.speed_mps * (power_at(power_w, course) + extra_w)
         seconds += leg.length_m / costs.speed_mps
     return joules, seconds
 

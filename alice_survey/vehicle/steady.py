@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from alice_survey.frames import Array
 from alice_survey.vehicle.dynamics import Body
@@ -41,6 +40,8 @@ BALANCED = (0, 1, 2, 5)
 _ROUNDS = 60
 _MISS_N = 1e-9
 """A wrench that is missed by no more, N and N m, is met."""
+_RANK = 1e-9
+"""Of the greatest: what is smaller is rounding."""
 _FAINT_N = 1e-12
 """A jet weaker than this is none."""
 _MOST_EXPONENT = 9.0
@@ -89,11 +90,12 @@ def steady_flight(
     configuration = vehicle.configuration_matrix
     asked = [axis for axis in BALANCED if np.any(np.abs(configuration[axis]) > 1e-12)]
     target, spent = wanted[:, asked].copy(), np.zeros(len(nu), dtype=bool)
-    weights = preference(table, nu[:, 0])
+    matrix = configuration[asked]
+    inverse, spare = _inverse(matrix, preference(table, nu[:, 0]))
+    lower, upper = limits(table, nu, share)
     rps = np.zeros((len(nu), len(table)))
     for _ in range(_ROUNDS):
-        lower, upper = limits(table, nu, share)
-        thrust = _least_thrust(configuration[asked], target, weights, lower, upper)
+        thrust = _least_thrust(matrix, inverse, spare, target, lower, upper)
         spent = np.any(np.isnan(thrust), axis=1)
         rps = speeds_of(table, np.where(spent[:, None], 0.0, thrust), nu)
         miss = (wanted - thruster_wrench(table, rps, nu))[:, asked]
@@ -215,8 +217,25 @@ def _inflow(table: Array, nu: Array) -> Array:
     return inflow
 
 
+def _inverse(matrix: Array, weights: Array) -> tuple[Array, Array]:
+    """What gives the thrust of least weighted square for a wrench, and what thrust makes none.
+
+    Args:
+        matrix: (m, n) wrench per thrust.
+        weights: (N, n) of thrust squared.
+
+    Returns:
+        (N, n, m) thrust per wrench, and (k, n) thrusts that make no wrench.
+    """
+    _, singular, rows = np.linalg.svd(matrix)
+    rank = int(np.sum(singular > _RANK * singular[0])) if singular.size else 0
+    scale = 1.0 / np.sqrt(weights)
+    inverse: Array = scale[:, :, None] * np.linalg.pinv(matrix * scale[:, None, :], rcond=_RANK)
+    return inverse, rows[rank:]
+
+
 def _least_thrust(
-    matrix: Array, wrench: Array, weights: Array, lower: Array, upper: Array
+    matrix: Array, inverse: Array, spare: Array, wrench: Array, lower: Array, upper: Array
 ) -> Array:
     """Thrust of least weighted square that makes a wrench within its bounds.
 
@@ -225,32 +244,24 @@ def _least_thrust(
 
     Args:
         matrix: (m, n) wrench per thrust.
+        inverse: as from `_inverse`.
+        spare: likewise.
         wrench: (N, m)
-        weights: (N, n) of thrust squared.
         lower: (N, n)
         upper: (N, n)
 
     Returns:
         (N, n), NaN where no thrust within the bounds makes the wrench.
     """
-    _, singular, rows = np.linalg.svd(matrix)
-    rank = int(np.sum(singular > 1e-9 * singular[0])) if singular.size else 0
-    spare = rows[rank:]
-    scale = 1.0 / np.sqrt(weights)
-    inverse = np.linalg.pinv(matrix * scale[:, None, :], rcond=1e-9)
-    thrust: Array = scale * np.einsum("knm,km->kn", inverse, wrench)
-    made: NDArray[np.bool_] = np.all(
-        np.abs(thrust @ matrix.T - wrench) <= 1e-9 * (1.0 + np.abs(wrench)), axis=1
-    )
+    thrust: Array = np.einsum("knm,km->kn", inverse, wrench)
+    made = np.all(np.abs(thrust @ matrix.T - wrench) <= _RANK * (1.0 + np.abs(wrench)), axis=1)
     if len(spare) == 1:
         way = spare[0]
-        moves = np.abs(way) > 1e-9
-        ends = np.stack(
-            [(lower - thrust)[:, moves] / way[moves], (upper - thrust)[:, moves] / way[moves]]
-        )
+        moves = np.abs(way) > _RANK
+        ends = np.stack([(lower - thrust)[:, moves], (upper - thrust)[:, moves]]) / way[moves]
         least, most = ends.min(axis=0).max(axis=1), ends.max(axis=0).min(axis=1)
         step = np.clip(0.0, least, np.maximum(most, least))
         thrust = thrust + step[:, None] * way
-    slack = 1e-9 * (1.0 + np.abs(upper) + np.abs(lower))
+    slack = _RANK * (1.0 + np.abs(upper) + np.abs(lower))
     within = np.all((thrust >= lower - slack) & (thrust <= upper + slack), axis=1)
     return np.where((made & within)[:, None], thrust, np.nan)

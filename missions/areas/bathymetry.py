@@ -22,6 +22,8 @@ Sense = Literal["auto", "heights", "depths"]
 _MOST_CELLS = 16_000_000
 """Read at once: 128 MB."""
 _PAD_CELLS = 2
+_SAME_CELL = 1e-6
+"""A place so near a centre, in cells, is on it."""
 _EDGE_POINTS = 32
 """On each side of the bounds, whose straight sides are curves in the raster."""
 _ONE_SIGN = 0.99
@@ -71,15 +73,32 @@ class Bathymetry:
         NaN beyond the outermost centres, and where a cell that counts is not known.
         """
         points = np.asarray(points_ne, dtype=np.float64)
-        pixel = self._pixel_from_ne(points.reshape(-1, 2)) - 0.5
+        pixel = self._pixel_from_ne(points.reshape(-1, 2))
+        return self._depth_of_pixel(pixel).reshape(points.shape[:-1])
+
+    def depth_about(self, points_ne: Array, offsets_ne: Array) -> Array:
+        """Depth, (N, M), at short offsets (N, M, 2) from places (N, 2), both metres.
+
+        As `depth_at`, but the raster's frame is taken to be straight over the offsets: its scale
+        and direction are those in the middle of the places, true to 1e-4 of an offset over some
+        kilometres.
+        """
+        middle = (points_ne.min(axis=0) + points_ne.max(axis=0)) / 2
+        steps = self._pixel_from_ne(middle + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
+        per_metre = steps[1:] - steps[0]
+        pixel = self._pixel_from_ne(points_ne)[:, None] + offsets_ne @ per_metre
+        return self._depth_of_pixel(pixel.reshape(-1, 2)).reshape(offsets_ne.shape[:-1])
+
+    def _depth_of_pixel(self, pixel: Array) -> Array:
+        pixel = pixel - 0.5
         rows, columns = self.depth_m.shape
         # A place on the outermost centres must not fall off them by rounding.
         last = np.array([columns - 1.0, rows - 1.0])
-        inside = np.all((pixel > -1e-6) & (pixel < last + 1e-6), axis=1)
+        inside = np.all((pixel > -_SAME_CELL) & (pixel < last + _SAME_CELL), axis=1)
         pixel = np.clip(np.where(inside[:, None], pixel, 0.0), 0.0, last)
         col = np.minimum(pixel[:, 0].astype(np.intp), max(columns - 2, 0))
         row = np.minimum(pixel[:, 1].astype(np.intp), max(rows - 2, 0))
-        along, down = pixel[:, 0] - col, pixel[:, 1] - row
+        along, down = _snapped(pixel[:, 0] - col), _snapped(pixel[:, 1] - row)
         total = np.zeros(len(pixel))
         for d_row, d_col, weight in (
             (0, 0, (1 - along) * (1 - down)),
@@ -87,12 +106,11 @@ class Bathymetry:
             (1, 0, (1 - along) * down),
             (1, 1, along * down),
         ):
-            counts = weight > 1e-6
             cell = self.depth_m[
                 np.minimum(row + d_row, rows - 1), np.minimum(col + d_col, columns - 1)
             ]
-            total += np.where(counts, weight * cell, 0.0)
-        depth: Array = np.where(inside, total, np.nan).reshape(points.shape[:-1])
+            total += np.where(weight > 0.0, weight * cell, 0.0)
+        depth: Array = np.where(inside, total, np.nan)
         return depth
 
     def _pixel_from_ne(self, points_ne: Array) -> Array:
@@ -220,6 +238,12 @@ def read_bathymetry(
         vertical_datum=vertical,
         reading=reading,
     )
+
+
+def _snapped(share: Array) -> Array:
+    """Places between two centres, with those on a centre by rounding put on it."""
+    ends = np.where(share > 1.0 - _SAME_CELL, 1.0, share)
+    return np.where(share < _SAME_CELL, 0.0, ends)
 
 
 def _pixels(from_pixel: tuple[float, ...], x: Array, y: Array) -> Array:

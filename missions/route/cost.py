@@ -45,6 +45,7 @@ def leg_costs(route: Route, costs: Costs) -> tuple[Array, Array]:
         mean_power(costs.line_w, course, end_course),
         mean_power(costs.way_w, course, end_course),
     )
+    power = power + np.where((line < 0) & (curvature != 0.0), costs.arc_extra_w, 0.0)
     power = np.where(sway, mean_power(costs.sway_w, course, course), power)
     power = np.where(spot, costs.spot_w, power)
     settle = np.where(spot | sway, costs.settle_s, 0.0)

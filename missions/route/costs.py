@@ -33,6 +33,8 @@ class Costs:
     """(K,) likewise between lines."""
     spot_w: float
     """While it turns or waits on the spot."""
+    arc_extra_w: float
+    """What an arc takes beyond `way_w`: the hull behind the glass swings, and the yaw is damped."""
     turn_rate_rad_s: float
     """On the spot."""
     settle_s: float
@@ -86,6 +88,7 @@ def time_costs(
         line_w=np.ones(4),
         way_w=np.ones(4),
         spot_w=1.0,
+        arc_extra_w=0.0,
         turn_rate_rad_s=turn_rate_rad_s,
         settle_s=settle_s,
         sway_mps=sway_mps,

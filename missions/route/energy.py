@@ -100,6 +100,7 @@ def vehicle_costs(config: SurveyConfig, *, imaging_w: float = 0.0) -> Costs:
         between = np.where(np.isfinite(between), between, lines)
     hotel_w = config.vehicle.hotel_w
     spot_w, turn_rad_s = _spot(craft, config, current)
+    arc_w, pace = _arc(craft, config, current)
     step_mps, step_w = _sway_step(craft, courses, current, manner)
     heave_mps, heave_w = _heave(craft, current)
     return Costs(
@@ -107,6 +108,7 @@ def vehicle_costs(config: SurveyConfig, *, imaging_w: float = 0.0) -> Costs:
         line_w=lines + hotel_w + imaging_w,
         way_w=between + hotel_w,
         spot_w=spot_w + hotel_w,
+        arc_extra_w=(arc_w + hotel_w) / pace - _known_mean(between) - hotel_w,
         turn_rate_rad_s=turn_rad_s,
         settle_s=SETTLE_S,
         sway_mps=step_mps,
@@ -226,32 +228,84 @@ def _both_ways(power_w: Array) -> NDArray[np.bool_]:
     return np.isfinite(power_w[:half]) & np.isfinite(power_w[half:])
 
 
-def _spot(craft: Vehicle, config: SurveyConfig, current: Array) -> tuple[float, float]:
-    """Power of a turn on the spot, mean over all headings, and the rate that can be had, rad/s.
+def _turning(
+    config: SurveyConfig, current: Array, headings: Array, speed_mps: Array, rate_rad_s: Array
+) -> tuple[Array, Array]:
+    """Velocity relative to the water, and its rate, while the vehicle turns.
 
-    A vehicle with sway turns about the left port, so that the hull swings; one without turns about
-    itself and drifts across its heading with the water.
+    With sway the left port's glass goes ahead at the speed, and the hull swings about it. Without,
+    the vehicle goes ahead itself and drifts across its heading with the water.
+
+    Args:
+        config: of the survey.
+        current: (2,) m/s north and east.
+        headings: (N,)
+        speed_mps: (N,) ahead over ground.
+        rate_rad_s: (N,) of yaw.
+
+    Returns:
+        (N, 6) each.
     """
-    rate = np.repeat(SPOT_RAD_S * _RATES, _HEADINGS)
-    psi = np.tile(_courses(_HEADINGS), len(_RATES))
-    against = np.zeros((len(psi), 6))
-    against[:, 0] = -(np.cos(psi) * current[0] + np.sin(psi) * current[1])
-    nu, nu_rate = against.copy(), np.zeros((len(psi), 6))
-    nu[:, 5] = rate
-    sways = line_manner(config) == "held"
-    if sways:
-        against[:, 1] = np.sin(psi) * current[0] - np.cos(psi) * current[1]
+    nu, nu_rate = np.zeros((len(headings), 6)), np.zeros((len(headings), 6))
+    ahead = -(np.cos(headings) * current[0] + np.sin(headings) * current[1])
+    nu[:, 0], nu[:, 5] = speed_mps + ahead, rate_rad_s
+    if line_manner(config) == "held":
+        beside = np.sin(headings) * current[0] - np.cos(headings) * current[1]
         forward_m, right_m, _ = config.camera.position_body_m
-        nu[:, 0] = against[:, 0] + rate * right_m
-        nu[:, 1] = against[:, 1] - rate * forward_m
-        nu_rate[:, 1] = -rate * against[:, 0]
-        nu_rate[:, 0] = rate * against[:, 1]
-    power = _power(craft, nu, nu_rate=nu_rate, slips=not sways)
-    power = power.reshape(len(_RATES), _HEADINGS).mean(axis=1)
-    can = np.flatnonzero(np.isfinite(power))
+        nu[:, 0] += rate_rad_s * right_m
+        nu[:, 1] = beside - rate_rad_s * forward_m
+        # The current, fixed over ground, turns in the body.
+        nu_rate[:, 0], nu_rate[:, 1] = rate_rad_s * beside, -rate_rad_s * ahead
+    return nu, nu_rate
+
+
+def _turning_power(
+    craft: Vehicle, config: SurveyConfig, current: Array, speeds_mps: Array, rates_rad_s: Array
+) -> Array:
+    """Power, (N,), of turning at speeds and rates (N,), mean over all headings."""
+    nu, nu_rate = _turning(
+        config,
+        current,
+        np.tile(_courses(_HEADINGS), len(speeds_mps)),
+        np.repeat(speeds_mps, _HEADINGS),
+        np.repeat(rates_rad_s, _HEADINGS),
+    )
+    power = _power(craft, nu, nu_rate=nu_rate, slips=line_manner(config) == "crab")
+    means: Array = power.reshape(-1, _HEADINGS).mean(axis=1)
+    return means
+
+
+def _spot(craft: Vehicle, config: SurveyConfig, current: Array) -> tuple[float, float]:
+    """Power on the spot, of turning through a quarter and settling; and the rate of turning."""
+    rates = SPOT_RAD_S * np.append(_RATES, 0.0)
+    power = _turning_power(craft, config, current, np.zeros(len(rates)), rates)
+    can = np.flatnonzero(np.isfinite(power[:-1]))
     if not len(can):
         return math.inf, SPOT_RAD_S
-    return float(power[can[0]]), float(SPOT_RAD_S * _RATES[can[0]])
+    rate = float(rates[can[0]])
+    turning_s = math.pi / 2 / rate
+    joules = power[can[0]] * turning_s + power[-1] * SETTLE_S
+    return float(joules / (turning_s + SETTLE_S)), rate
+
+
+def _arc(craft: Vehicle, config: SurveyConfig, current: Array) -> tuple[float, float]:
+    """Power on an arc of the plan's radius, and the share of the plan's speed it is flown at.
+
+    Mean of both senses and all courses.
+    """
+    speeds = config.plan.speed_mps * _RATES
+    rates = speeds / config.plan.turn_radius_m
+    both = np.concatenate([rates, -rates])
+    power = _turning_power(craft, config, current, np.tile(speeds, 2), both)
+    power = power.reshape(2, -1).mean(axis=0)
+    can = np.flatnonzero(np.isfinite(power))
+    if not len(can):
+        return math.inf, 1.0
+    return float(power[can[0]]), float(_RATES[can[0]])
+
+
+def _known_mean(power_w: Array) -> float:
+    return float(power_w[np.isfinite(power_w)].mean())
 
 
 def _sway_step(

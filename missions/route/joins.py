@@ -38,6 +38,7 @@ class Prices(NamedTuple):
     speed_mps: float
     way_w: Array
     spot_w: float
+    arc_extra_w: float
     turn_rate_rad_s: float
     settle_s: float
     sway_mps: float
@@ -50,6 +51,7 @@ def prices(costs: Costs) -> Prices:
         speed_mps=float(costs.speed_mps),
         way_w=np.ascontiguousarray(costs.way_w, dtype=np.float64),
         spot_w=float(costs.spot_w),
+        arc_extra_w=float(costs.arc_extra_w),
         turn_rate_rad_s=float(costs.turn_rate_rad_s),
         settle_s=float(costs.settle_s),
         sway_mps=float(costs.sway_mps),
@@ -342,6 +344,8 @@ def price(prices: Prices, legs: Array) -> float:
             total += prices.spot_w * prices.settle_s
         else:
             mean = _mean_power(prices.way_w, course, course + curvature * length)
+            if curvature != 0.0:
+                mean += prices.arc_extra_w
             seconds = length / prices.speed_mps
             total += seconds * mean if mean < np.inf else _DEAR_J * (1.0 + seconds)
     return total

@@ -155,9 +155,9 @@ def highest_floor(
         block = slice(start, start + rows)
         sine, cosine = np.sin(headings_rad[block]), np.cos(headings_rad[block])
         axes = np.array([[cosine, sine], [-sine, cosine]])  # ahead and beside, north and east
-        places = points_ne[block, None] + np.einsum("oa,axn->nox", offsets, axes)
+        about = np.einsum("oa,axn->nox", offsets, axes)
         # The least of numbers with a NaN among them is NaN: unknown floor is no floor to fly over.
-        highest[block] = bathymetry.depth_at(places).min(axis=1)
+        highest[block] = bathymetry.depth_about(points_ne[block], about).min(axis=1)
     return highest
 
 
@@ -347,7 +347,10 @@ def terrain_report(
 
 
 def _spread(low: float, high: float, finest: float) -> Array:
-    return np.linspace(low, high, max(math.ceil((high - low) / finest), 1) + 1)
+    """Places from low to high, 0 among them, no farther apart than the finest."""
+    below = np.linspace(low, 0.0, max(math.ceil(-low / finest), 1) + 1)
+    above = np.linspace(0.0, high, max(math.ceil(high / finest), 1) + 1)
+    return np.concatenate([below, above[1:]])
 
 
 def _steepest(slopes_rad: Array) -> float:

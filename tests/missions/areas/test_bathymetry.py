@@ -144,6 +144,15 @@ def test_next_to_a_gap_nothing_is_known_and_on_a_centre_beside_it_all(tmp_path: 
     assert at(23.0, 19.0) == pytest.approx(values[19, 23], abs=1e-5)
 
 
+def test_offsets_are_looked_up_as_places_of_their_own(tmp_path: Path) -> None:
+    rng = np.random.default_rng(9)
+    found = read_bathymetry(_written(tmp_path / "o.tif", rng.uniform(10, 11, (20, 24))), DATUM)
+    places, offsets = rng.uniform(-14, 14, (30, 2)), rng.uniform(-2, 2, (30, 7, 2))
+    apart = found.depth_at(places[:, None] + offsets)
+    np.testing.assert_allclose(found.depth_about(places, offsets), apart, atol=1e-4)
+    assert np.isfinite(apart).mean() > 0.9
+
+
 @pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:3857", "EPSG:32635", "EPSG:2039"])
 def test_any_coordinate_system_gives_the_same_floor(tmp_path: Path, crs: str) -> None:
     """A plane of latitude and longitude, written in other systems on their own grids."""

@@ -85,6 +85,7 @@ def uneven(seed: int, *, closed: bool = False) -> Costs:
         "line_w": rng.uniform(50, 150, 36),
         "way_w": way_w,
         "spot_w": 40.0,
+        "arc_extra_w": 30.0,
         "sway_w": rng.uniform(50, 150, 12),
     }
     return Costs(**(values | powers))

@@ -272,7 +272,8 @@ def test_a_real_sea_floor_is_followed(shared_data: Path) -> None:
         fine = np.linspace(0.0, 200.0, 4001)
         places = np.column_stack([np.full(4001, line.start_ne_m[0]), fine - 100.0])
         clearance = floor.depth_at(places) - np.interp(fine, profile.along_m, profile.depth_m)
-        assert 2.0 - 0.01 <= clearance.min() < 2.3
+        assert 2.0 - 0.005 <= clearance.min() < 2.3
+        assert profile.altitude_m.min() >= 2.0 - 1e-6
         assert np.abs(profile.slopes_rad).max() <= LIMITS.steepest_rad + 1e-9
     whole = depth_profile(
         floor, found[0].along_m, lines[0].stations_ne, np.full(401, math.pi / 2), REACH, LIMITS, "x"
