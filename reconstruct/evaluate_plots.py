@@ -22,8 +22,9 @@ def plot_track(path: Path, plan_file: Path, cameras: "CameraScore") -> None:
     """Planned lines, camera positions coloured by error, and the error of each picture."""
     plan = read_plan(plan_file)
     places, length_mm = cameras.positions_ned, 1e3 * np.linalg.norm(cameras.misses_m, axis=1)
+    south, west, north, east = plan.area.survey.bounds
     with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(11, 5.5), layout="constrained")
+        figure = Figure(figsize=_size(east - west, north - south), layout="constrained")
         plane, strips = figure.subplots(1, 2, width_ratios=[1, 1.2])
         for line in plan.lines:
             (n0, e0), (n1, e1) = line.start_ne_m, line.end_ne_m
@@ -50,7 +51,7 @@ def plot_errors(path: Path, surface: "SurfaceScore", area: MultiPolygon) -> None
     limit = max(5.0, 3 * figures["height_median_mm"], figures["height_95_mm"])
     west, east, south, north = surface.extent_m
     with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(11, 5.5), layout="constrained")
+        figure = Figure(figsize=_size(east - west, north - south), layout="constrained")
         plane, bars = figure.subplots(1, 2, width_ratios=[1.3, 1])
         image = plane.imshow(
             1e3 * surface.map_m,
@@ -103,6 +104,11 @@ def plot_sheet(
         )
         figure.colorbar(image, ax=panels[3], shrink=0.8)
         _save(figure, path)
+
+
+def _size(width_m: float, height_m: float) -> tuple[float, float]:
+    """Of a figure with a map beside something else, inches: higher where the map is."""
+    return 11.0, 5.5 * min(max(0.9 * height_m / width_m, 1.0), 1.7)
 
 
 def _draw_area(axes: Axes, area: MultiPolygon) -> None:
