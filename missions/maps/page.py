@@ -23,6 +23,7 @@ from missions.maps.page_data import page_data
 from missions.plan_file import Plan
 
 _HERE = Path(__file__).parent
+_SCRIPTS = ("page_plan.js", "page_draw.js", "page_layers.js", "page.js")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +64,7 @@ def write_page(
     # Within a script only "</" and "<!--" could end or change it.
     held = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     style = (_HERE / "page.css").read_text(encoding="utf-8")
-    script = (_HERE / "page.js").read_text(encoding="utf-8")
+    script = page_script()
     policy = (
         f"default-src 'none'; img-src data:; style-src '{_hash(style)}'; "
         f"script-src '{_hash(script)}'; base-uri 'none'; form-action 'none'"
@@ -89,6 +90,11 @@ def write_page(
     ]
     with atomic_path(path) as temporary:
         temporary.write_text("\n".join(part for part in parts if part), encoding="utf-8")
+
+
+def page_script() -> str:
+    """The page's script: its parts in the order in which they build on one another."""
+    return "\n".join((_HERE / name).read_text(encoding="utf-8") for name in _SCRIPTS)
 
 
 def _hash(text: str) -> str:
