@@ -231,7 +231,7 @@ def _line_too_long(lines: Sequence[Line], sums: _Sums, limits: Limits, depth_m: 
     line, (energy, time) = lines[worst], each[worst]
     ways = []
     if energy > limits.energy_j:
-        ways.append(f"a battery with {energy / _J_PER_WH:.0f} Wh to use (vehicle.battery_wh)")
+        ways.append(f"a battery with {_wh(energy)} to use (vehicle.battery_wh)")
     if time > limits.time_s:
         ways.append(f"plan.dive_s of {time:.0f} s")
     ways += ["plan.home_ne_m nearer to it", "shorter lines (plan.line_heading_deg, or parts)"]
@@ -257,7 +257,7 @@ def _too_large(
     if parted is not None:
         ways.append(f"split_dives = true ({len(parted)} dives)")
     if energy_j > limits.energy_j:
-        ways.append(f"a battery with {energy_j / _J_PER_WH:.0f} Wh to use (vehicle.battery_wh)")
+        ways.append(f"a battery with {_wh(energy_j)} to use (vehicle.battery_wh)")
     if time_s > limits.time_s:
         ways.append(f"plan.dive_s = {math.ceil(time_s)}")
     ways.append(f"survey the {share:.0%} of it that fit")
@@ -269,9 +269,14 @@ def _too_large(
 
 
 def _numbers(energy_j: float, time_s: float) -> str:
-    return f"{energy_j / _J_PER_WH:.0f} Wh and {time_s / 3600.0:.2f} h"
+    return f"{_wh(energy_j)} and {time_s / 3600.0:.2f} h"
 
 
 def _allowed(limits: Limits) -> str:
     longest = f" and {limits.time_s / 3600.0:.2f} h" if math.isfinite(limits.time_s) else ""
-    return f"{limits.energy_j / _J_PER_WH:.0f} Wh{longest}"
+    return f"{_wh(limits.energy_j)}{longest}"
+
+
+def _wh(energy_j: float) -> str:
+    value = energy_j / _J_PER_WH
+    return f"{value:.0f} Wh" if value >= 100.0 else f"{value:.3g} Wh"

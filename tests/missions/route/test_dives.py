@@ -118,7 +118,9 @@ def test_a_line_that_fits_no_dive_is_named() -> None:
     with pytest.raises(PlanError) as caught:
         _split(lines, 0.09)
     text = str(caught.value)
-    assert text.startswith("line 3 of 36 m takes 0")
+    alone = _of_dive(lines, 3, 3)[0] / 3600
+    assert text.startswith(f"line 3 of 36 m takes {alone:.3g} Wh")
+    assert "a dive has 0.09 Wh" in text
     assert "home_ne_m" in text and "battery_wh" in text
     assert "\n" not in text
     with pytest.raises(PlanError, match=r"plan\.dive_s of \d+ s"):
