@@ -1,12 +1,14 @@
 """`alice-survey plan check`: what a dive has seen, where holes are left, and a plan for these."""
 
+import hashlib
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from alice_survey.artefacts import need_stage, write_json
+from alice_survey.artefacts import Stage, need_stage, run_stage, write_json
 from alice_survey.config import SurveyConfig
 from alice_survey.errors import PlanError, warn
 from camera_calib.rig import Rig, design_rig, read_rig
@@ -121,7 +123,7 @@ def check_report(
     """Check a dive, write what is found, and plan the holes again.
 
     Writes `certificate.json`, `coverage.png`, `coverage.tif`, `holes.geojson`; where holes are left
-    `refly/` with a plan of its own; after simulated flights `hole_probability.png`.
+    `refly/`, a workspace with a plan of its own; after simulated flights `hole_probability.png`.
 
     Args:
         workspace: as of `check_log`.
@@ -150,6 +152,9 @@ def check_report(
             workspace, config, path, triggers=triggers, manifest=manifest, threads=cores
         )
     folder = workspace / "check" if out is None else out
+    (folder / "hole_probability.png").unlink(missing_ok=True)  # of an earlier check
+    if not check.holes and (folder / "refly").exists():
+        warn(f"{folder / 'refly'} is of an earlier check: there are no holes now")
     data = check.to_json()
     text = _told(check)
     again = _write_refly(folder, check, config) if check.holes else None
@@ -180,7 +185,7 @@ def _write(folder: Path, check: Check, data: dict[str, Any]) -> None:
 
 
 def _write_refly(folder: Path, check: Check, config: SurveyConfig) -> dict[str, Any] | None:
-    """Plan the holes again, and write the plan and its exports; None where that cannot be done."""
+    """Plan the holes again, as a workspace to fly in; None where that cannot be done."""
     from missions.coverage.refly import refly_plan
     from missions.exports.write import write_exports
 
@@ -190,8 +195,24 @@ def _write_refly(folder: Path, check: Check, config: SurveyConfig) -> dict[str, 
     except PlanError as error:
         warn(f"the holes cannot be planned again: {error}")
         return None
-    write_json(refly / "plan" / "plan.json", plan.to_json())
-    write_exports(refly / "exports", plan, check.rig)
+    values = plan.to_json()
+    text = json.dumps(values, sort_keys=True)
+    stage = Stage(
+        name="plan",
+        version=1,
+        settings={
+            "camera": config.camera.model_dump(mode="json"),
+            "water": config.water.model_dump(mode="json"),
+            "refly_of": check.plan.name,
+            "plan": hashlib.blake2b(text.encode(), digest_size=16).hexdigest(),
+        },
+    )
+
+    def work(part: Path) -> None:
+        write_json(part / "plan.json", values)
+        write_exports(part / "exports", plan, check.rig)
+
+    run_stage(refly, stage, work)
     return {
         "folder": str(refly),
         "lines": len(plan.lines),

@@ -31,6 +31,8 @@ _SEEN = LinearSegmentedColormap.from_list("seen", ["#d6eaf8", "#5dade2", "#1f618
 _RISK = LinearSegmentedColormap.from_list("risk", ["#e8f8f5", "#f7dc6f", "#e67e22", "#78281f"])
 _LONGEST_PX = 1400
 _NUMBERED = 12
+_CLASSES = 12
+"""At most, of counts that are told apart."""
 
 
 def draw_certificate(
@@ -53,7 +55,8 @@ def draw_certificate(
         again: lines that fly the holes again.
     """
     most = int(np.percentile(certificate.pictures[certificate.inside], 99.5))
-    steps = np.unique(np.linspace(1, max(most, 1) + 1, min(max(most, 1), 12) + 1).astype(int))
+    width = math.ceil(max(most, 1) / _CLASSES)
+    steps = np.arange(1, most + 2 * width, width)
     colours = [_NONE, *(_SEEN(i / max(len(steps) - 2, 1)) for i in range(len(steps) - 1))]
     colour_map = ListedColormap(colours).with_extremes(bad=(0, 0, 0, 0), over=colours[-1])
     figure, axes = _sheet(certificate.area)

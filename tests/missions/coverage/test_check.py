@@ -127,7 +127,7 @@ def test_the_plan_for_the_holes_is_whole_and_closes_them(
     seen = certificate(plan.area, RIG, both, plan_pattern(plan, RIG))
     assert seen.share_at_overlap >= 0.9999
     assert "to fly the holes again" in text
-    assert (workspace / "check" / "refly" / "exports" / "about.txt").is_file()
+    assert (workspace / "check" / "refly" / "plan" / "exports" / "about.txt").is_file()
 
 
 def test_holes_by_a_no_go_zone_and_of_several_lines_are_closed() -> None:
