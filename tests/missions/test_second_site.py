@@ -1,0 +1,51 @@
+"""The paper's second site: its settings plan and fly the whole of it."""
+
+from importlib import resources
+
+import numpy as np
+import pytest
+
+from alice_survey.config import SurveyConfig, load_config
+from alice_survey.seafloor.terrain import survey_terrain
+from camera_calib.rig import design_rig
+from missions.plan import make_plan
+from missions.plan_file import Plan
+from missions.simulation import floor_grid, simulate_plan
+
+
+@pytest.fixture(scope="module")
+def config() -> SurveyConfig:
+    with resources.as_file(resources.files("alice_survey") / "caesarea.toml") as path:
+        return load_config(path)
+
+
+@pytest.fixture(scope="module")
+def plan(config: SurveyConfig) -> Plan:
+    return make_plan(config, design_rig(config.camera, config.water))
+
+
+def test_it_is_the_site_of_the_paper(plan: Plan) -> None:
+    """10 x 30 m at 8 m depth, flown at 3 m altitude (Gutnik et al. 2021, section VII)."""
+    assert plan.area.survey.area == pytest.approx(300.0, rel=1e-6)
+    edges = np.linalg.norm(np.diff(plan.area.rings_ne[0], axis=0), axis=1)
+    np.testing.assert_allclose(sorted(edges), [10.0, 10.0, 30.0, 30.0], rtol=1e-6)
+    assert (plan.seafloor_depth_m, plan.altitude_m, plan.speed_mps) == (8.0, 3.0, 0.2)
+    assert plan.coverage >= 0.999
+    assert len(plan.dives) == 1
+
+
+def test_it_is_flown_over_its_rocks(config: SurveyConfig, plan: Plan) -> None:
+    coarse = config.seafloor.model_copy(update={"grid_m": 0.05})
+    rough = config.model_copy(update={"seafloor": coarse})
+    terrain = survey_terrain(rough, plan.area.allowed_corners_ne)
+    # Large rocks: they stick out of the sand by decimetres.
+    assert 0.3 < -terrain.depths.min() < 1.0
+    assert 0.05 < (terrain.material > 0.5).mean() < 0.3
+    flight = simulate_plan(plan, config, floor_grid(terrain), np.random.default_rng(1))
+    assert flight.ending == "complete"
+    assert len(flight.trigger_s) == plan.stations
+    assert flight.stations_off_line == 0
+    cross = flight.line_errors[0]
+    assert 0.005 < np.sqrt(np.nanmean(cross**2)) < 0.12
+    on_line = flight.line >= 0
+    assert 2.0 < flight.altitude_m[on_line].min() < flight.altitude_m[on_line].max() < 3.8
