@@ -76,7 +76,8 @@ def vehicle_costs(config: SurveyConfig, *, imaging_w: float = 0.0) -> Costs:
         thrust, the rest being left for control.
 
     Raises:
-        PlanError: lines cannot be flown both ways on any heading, or not on the one asked for.
+        PlanError: lines cannot be flown both ways on any heading, or not on the one asked for, or
+            the vehicle cannot turn from one line to the next.
         VehicleError: the vehicle is described wrongly.
         NavigationError: the file of the current cannot be read.
     """
@@ -88,7 +89,8 @@ def vehicle_costs(config: SurveyConfig, *, imaging_w: float = 0.0) -> Costs:
     courses = _courses()
     manner = line_manner(config)
     lines = course_power(craft, courses, speed, current, manner)
-    if not np.any(_both_ways(lines)):
+    spot_w, turn_rad_s = _spot(craft, config, current)
+    if not np.any(_both_ways(lines)) or not math.isfinite(spot_w):
         raise PlanError(_too_strong(config, craft, current, manner))
     asked_deg = config.plan.line_heading_deg
     if asked_deg is not None:
@@ -99,7 +101,6 @@ def vehicle_costs(config: SurveyConfig, *, imaging_w: float = 0.0) -> Costs:
     if manner == "held":  # where it cannot crab it may still hold its heading
         between = np.where(np.isfinite(between), between, lines)
     hotel_w = config.vehicle.hotel_w
-    spot_w, turn_rad_s = _spot(craft, config, current)
     arc_w, pace = _arc(craft, config, current)
     step_mps, step_w = _sway_step(craft, courses, current, manner)
     heave_mps, heave_w = _heave(craft, current)
@@ -346,26 +347,29 @@ def _heave(craft: Vehicle, current: Array) -> tuple[float, float]:
     return float(_HEAVES_MPS[can[0]]), float(power[can[0]])
 
 
-def strongest_current_mps(
-    craft: Vehicle, speed_mps: float, towards_rad: float, manner: Manner, most_mps: float = 3.0
-) -> float:
-    """The strongest current in which lines of some heading can be flown both ways.
+def strongest_current_mps(config: SurveyConfig, towards_rad: float, most_mps: float = 3.0) -> float:
+    """The strongest current in which a survey can be flown: lines both ways, and turns on the spot.
 
     Args:
-        craft: what flies.
-        speed_mps: over ground.
+        config: of the survey; its own current does not count.
         towards_rad: direction of the current.
-        manner: of flying lines.
         most_mps: no stronger than this.
     """
+    craft = craft_of(config.vehicle)
     direction = np.array([math.cos(towards_rad), math.sin(towards_rad)])
-    courses = towards_rad + _courses()
     low, high = 0.0, most_mps
-    for _ in range(12):
+    for _ in range(10):
         middle = (low + high) / 2
-        power = course_power(craft, courses, speed_mps, middle * direction, manner)
-        low, high = (middle, high) if np.any(_both_ways(power)) else (low, middle)
+        flies = _can_fly(craft, config, middle * direction, config.plan.speed_mps)
+        low, high = (middle, high) if flies else (low, middle)
     return low
+
+
+def _can_fly(craft: Vehicle, config: SurveyConfig, current: Array, speed_mps: float) -> bool:
+    # Nothing favours a heading but the current itself: along it, across it, and between.
+    courses = math.atan2(current[1], current[0]) + _courses()
+    lines = course_power(craft, courses, speed_mps, current, line_manner(config))
+    return bool(np.any(_both_ways(lines))) and math.isfinite(_spot(craft, config, current)[0])
 
 
 def _too_strong(config: SurveyConfig, craft: Vehicle, current: Array, manner: Manner) -> str:
@@ -373,14 +377,9 @@ def _too_strong(config: SurveyConfig, craft: Vehicle, current: Array, manner: Ma
     towards = math.atan2(current[1], current[0])
     towards_deg = math.degrees(towards) % 360.0
     held = "held by sway" if manner == "held" else "crabbing"
-    strength = strongest_current_mps(craft, speed, towards, manner)
-    courses = towards + _courses()
+    strength = strongest_current_mps(config, towards)
     ways = [f"wait for a current below {strength:.2f} m/s (sea.current_mps)"]
-    fit = [
-        each
-        for each in _FASTER
-        if np.any(_both_ways(course_power(craft, courses, each, current, manner)))
-    ]
+    fit = [each for each in _FASTER if _can_fly(craft, config, current, each)]
     if fit:
         nearest = min(fit, key=lambda each: abs(each - speed))
         ways.append(f"set plan.speed_mps to {nearest:g}")
@@ -388,8 +387,8 @@ def _too_strong(config: SurveyConfig, craft: Vehicle, current: Array, manner: Ma
         ways.append("fly alice with controller = 'sway', which holds lines across a current")
     return (
         f"a current of {size:.2f} m/s towards {towards_deg:03.0f} deg is above the strength of "
-        f"{craft.name}: at {speed:g} m/s over ground, {held}, lines can be flown both ways in "
-        f"{strength:.2f} m/s at most; " + ", or ".join(ways)
+        f"{craft.name}: at {speed:g} m/s over ground, {held}, lines can be flown both ways, with "
+        f"turns between them, in {strength:.2f} m/s at most; " + ", or ".join(ways)
     )
 
 
