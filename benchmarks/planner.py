@@ -1,0 +1,222 @@
+"""The planner beside its peers: areas of 100 to 10,000 rows, and the search for the best heading.
+
+    .venv/bin/python -m benchmarks.planner [--quick] [--angles] [--json FILE]
+
+All planners lay lines over the same areas with the same spacing and angle; one meter measures all.
+A peer is left out above 300 rows where it would take minutes. Ends with exit code 1 when a goal is
+missed. `--angles` compares the heading that is found with the best of 3,600, at full cost.
+"""
+
+import argparse
+import json
+import math
+import sys
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.machine import heading, load, machine
+from benchmarks.planner_areas import planned_area, shapes
+from benchmarks.planner_peers import MARGIN_M, PATTERN, PLANNERS, Measured, measured, own_plan
+from missions.lines.sweep import best_heading, full_cost_j
+from missions.route.costs import time_costs
+from missions.route.ways import Ways
+
+_ROWS = (100, 300, 3_000, 10_000)
+_MOST_PEER_ROWS = 300
+_ANGLE_ROWS = 30
+_ANGLES = 3600
+_COVERED = 0.999
+_SAME_SHARE = 1e-4
+"""Shares this close are one: two of the meter's points."""
+_ANGLE_GOAL = 1.005
+_N_LOG_N = 1.15
+"""Exponent of n log n between 100 and 10,000 rows is 1.15: log(200) / log(100)."""
+_GOALS_S = {("L, two holes", 300): 0.020}
+_LARGEST_S = (10_000, 1.0)
+_HEAD = (
+    "| area | rows | planner | time, ms | path, m | turns | covered | outside, m | in holes, m "
+    "| time ratio | path ratio |\n" + "|---" * 11 + "|"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Angle:
+    """The heading that is found beside the best of many."""
+
+    area: str
+    seconds: float
+    cost_s: float
+    best_s: float
+    """Of the sampled headings."""
+    width_m: float
+    sampled_width_m: float
+    """Least of the sampled headings."""
+
+    @property
+    def ratio(self) -> float:
+        """Cost that is found over the best sampled."""
+        return self.cost_s / self.best_s
+
+
+def main() -> None:
+    """Measure, print, and say which goals are missed."""
+    options = _options()
+    packages = ("numpy", "numba", "shapely", "coverage-path-planner", "opencoverage")
+    report: dict[str, Any] = {"machine": machine(packages)}
+    print(heading(report["machine"]), "\n", flush=True)
+    missed: list[str] = []
+    if options.angles:
+        angles = _angles(options.quick)
+        print(_angle_table(angles), "\n", flush=True)
+        report["angles"] = [asdict(row) for row in angles]
+        missed += [
+            f"{row.area}: heading costs {row.ratio:.4f} of the best sampled"
+            for row in angles
+            if row.ratio > _ANGLE_GOAL
+        ]
+        missed += [
+            f"{row.area}: width {row.width_m:.6f} m > {row.sampled_width_m:.6f} m sampled"
+            for row in angles
+            if row.width_m > row.sampled_width_m + 1e-9
+        ]
+    else:
+        table = {}
+        print(_HEAD, flush=True)
+        for rows in _ROWS[: 2 if options.quick else None]:
+            for name, shape in shapes().items():
+                results = _compared(planned_area(shape, rows, PATTERN.spacing_m, MARGIN_M), rows)
+                table[name, rows] = results
+                print(_rows_table(name, rows, results), flush=True)
+                missed += _missed(name, rows, results)
+        report["plans"] = [
+            {"area": name, "rows": rows, **asdict(row)}
+            for (name, rows), results in table.items()
+            for row in results
+        ]
+        report["growth"] = growth = _growth(table)
+        print("\nTime grows as rows to the power of:", growth)
+        missed += [f"{name}: time grows as rows^{g}" for name, g in growth.items() if g > _N_LOG_N]
+    report["missed"] = missed
+    print(f"load after: {load()}")
+    if options.json is not None:
+        options.json.write_text(json.dumps(report, indent=2) + "\n")
+    for miss in missed:
+        print(f"missed: {miss}")
+    sys.exit(1 if missed else 0)
+
+
+def _compared(area: Any, rows: int) -> list[Measured]:
+    repeats = 5 if rows <= _MOST_PEER_ROWS else 2
+    planners = PLANNERS if rows <= _MOST_PEER_ROWS else {"alice-survey": own_plan}
+    return [measured(name, plan(area, repeats), area) for name, plan in planners.items()]
+
+
+def _missed(name: str, rows: int, results: list[Measured]) -> list[str]:
+    own, where = results[0], f"{name}, {rows} rows"
+    missed = []
+    if own.covered < _COVERED:
+        missed.append(f"{where}: covers {own.covered:.4%}")
+    if own.outside_m > 0 or own.holes_m > 0:
+        missed.append(f"{where}: {own.outside_m:.3g} m outside, {own.holes_m:.3g} m in holes")
+    limit_s = _GOALS_S.get((name, rows), _LARGEST_S[1] if rows == _LARGEST_S[0] else math.inf)
+    if own.seconds > limit_s:
+        missed.append(f"{where}: {1e3 * own.seconds:.0f} ms > {1e3 * limit_s:.0f} ms")
+    missed += [
+        f"{where}: {own.path_m:.0f} m of way, {peer.planner} {peer.path_m:.0f} m"
+        for peer in results[1:]
+        if _as_good(peer, own) and own.path_m > peer.path_m
+    ]
+    return missed
+
+
+def _as_good(peer: Measured, own: Measured) -> bool:
+    """Whether a peer's plan may be flown and sees as much, so that lengths may be compared.
+
+    Lines that end where their own middle meets the edge are shorter, and leave its corners unseen.
+    """
+    return peer.covered >= own.covered - _SAME_SHARE and peer.outside_m + peer.holes_m == 0
+
+
+def _growth(table: dict[tuple[str, int], list[Measured]]) -> dict[str, float]:
+    """Exponent of the time of the most rows over the fewest, by area."""
+    names = {name for name, _ in table}
+    counts = sorted({rows for _, rows in table})
+    few, many = counts[0], counts[-1]
+    return {
+        name: round(
+            math.log(table[name, many][0].seconds / table[name, few][0].seconds)
+            / math.log(many / few),
+            3,
+        )
+        for name in sorted(names)
+    }
+
+
+def _angles(quick: bool) -> list[Angle]:
+    costs, home = time_costs(0.2), (0.0, 0.0)
+    kinds = {"cross_lines": 1, "closing_line": True}
+    found = []
+    for name, shape in shapes().items():
+        area = planned_area(shape, 12 if quick else _ANGLE_ROWS, PATTERN.spacing_m, MARGIN_M)
+        ways = Ways(area.allowed)
+        for _ in range(2):
+            began = time.perf_counter()
+            sweep = best_heading(area, PATTERN, ways, costs, home, **kinds)
+            seconds = time.perf_counter() - began
+        headings = np.arange(_ANGLES) * math.pi / _ANGLES
+        sampled = [full_cost_j(area, h, PATTERN, ways, costs, home, **kinds) for h in headings]
+        edges = np.concatenate([np.diff(ring, axis=0) for ring in area.rings_ne])
+        across = np.abs(
+            edges[:, 1] * np.cos(headings)[:, None] - edges[:, 0] * np.sin(headings)[:, None]
+        )
+        found.append(
+            Angle(
+                area=name,
+                seconds=seconds,
+                cost_s=sweep.cost_j,
+                best_s=min(sampled),
+                width_m=sweep.width_m,
+                sampled_width_m=float(across.sum(axis=1).min() / 2),
+            )
+        )
+        print(f"{name}: {found[-1].ratio:.4f}", flush=True)
+    return found
+
+
+def _angle_table(rows: list[Angle]) -> str:
+    lines = [
+        f"| area | search, ms | cost, s | best of {_ANGLES:,}, s | ratio | width, m | sampled, m |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    lines += [
+        f"| {row.area} | {1e3 * row.seconds:.0f} | {row.cost_s:.0f} | {row.best_s:.0f} "
+        f"| {row.ratio:.4f} | {row.width_m:.3f} | {row.sampled_width_m:.3f} |"
+        for row in rows
+    ]
+    return "\n".join(lines)
+
+
+def _rows_table(name: str, rows: int, results: list[Measured]) -> str:
+    own = results[0]
+    return "\n".join(
+        f"| {name} | {rows:,} | {row.planner} | {1e3 * row.seconds:.2f} | {row.path_m:,.0f} "
+        f"| {row.turns:,} | {row.covered:.3%} | {row.outside_m:.3g} | {row.holes_m:.3g} "
+        f"| {own.seconds / row.seconds:.2f} | {own.path_m / row.path_m:.4f} |"
+        for row in results
+    )
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description="Benchmarks of the planner.")
+    parser.add_argument("--quick", action="store_true", help="fewer rows, smaller areas")
+    parser.add_argument("--angles", action="store_true", help="search headings, not lines")
+    parser.add_argument("--json", type=Path, help="write all figures to this file")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,225 @@
+"""The planner and its peers on the same areas, and one meter for all of them.
+
+coverage-path-planner 1.4.0 (its package names no licence) and opencoverage 0.2.0 (MIT) are run as
+they come and nothing of them is shipped. Both plan at a fixed angle with a fixed spacing.
+"""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TypeVar
+
+import coverage_path_planner
+import numpy as np
+import opencoverage
+import shapely
+from shapely.geometry import LineString, Polygon
+
+from alice_survey.frames import Array
+from missions.areas.area import Area
+from missions.lines.lay import lay_lines
+from missions.lines.line import Line
+from missions.lines.pattern import Pattern
+from missions.route.costs import time_costs
+from missions.route.turns import route_through
+from missions.route.ways import Ways
+
+PATTERN = Pattern(spacing_m=1.0, step_m=0.47, half_across_m=0.6, half_along_m=0.57)
+"""Lines 1 m apart, near the paper's stereo pair at 2 m."""
+HEADING_RAD = math.pi / 2
+MARGIN_M = 3.0
+_SPEED_MPS = 0.2
+_TURN_RADIUS_M = 0.5
+_RUN_IN_M = 0.5
+_POINTS = 20_000
+_ALL = 10**12
+_Result = TypeVar("_Result")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Way:
+    """A plan as the meter takes it."""
+
+    seconds: float
+    """To plan it, once warm: lines, their order, and how they are joined."""
+    seen: Array
+    """(S, 4) lines, x and y of both ends: straights along the heading that was asked for. What is
+    seen in turns and on the way between lines is no part of a pattern, whoever flies it."""
+    path: Array
+    """(K, 2) the whole way, from the first line's start to the last one's end."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """What the meter says of a plan."""
+
+    planner: str
+    seconds: float
+    path_m: float
+    turns: int
+    """Corners of the way by more than a degree."""
+    covered: float
+    """Share of the area."""
+    outside_m: float
+    """Of the way, outside of the allowed area and not in holes."""
+    holes_m: float
+    """Of the way, in holes."""
+
+
+def own_plan(area: Area, repeats: int) -> Way:
+    """This planner: lines, order, and the route with its turns. The area's ways are sorted anew."""
+    best = math.inf
+    for _ in range(repeats + 1):
+        began = time.perf_counter()
+        ways = Ways(area.allowed)
+        lines = own_lines(area, ways)
+        route_through(lines, _TURN_RADIUS_M, _RUN_IN_M, ways=ways, costs=time_costs(_SPEED_MPS))
+        best = min(best, time.perf_counter() - began)
+    places = [lines[0].start_ne_m]
+    for before, after in pairwise([*lines, None]):
+        places.append(before.end_ne_m)
+        if after is not None:
+            places += ways.path_ne(before.end_ne_m, after.start_ne_m)[1:].tolist()
+    return Way(
+        seconds=best,
+        seen=np.array([(*line.start_ne_m, *line.end_ne_m) for line in lines]),
+        path=np.array(places),
+    )
+
+
+def own_lines(area: Area, ways: Ways) -> list[Line]:
+    """Survey lines alone, from the area's first corner, as the peers lay them."""
+    home = area.survey.geoms[0].exterior.coords[0]
+    return lay_lines(
+        area,
+        HEADING_RAD,
+        PATTERN,
+        ways,
+        time_costs(_SPEED_MPS),
+        (home[0], home[1]),
+        cross_lines=0,
+        closing_line=False,
+        most_stations=_ALL,
+    )
+
+
+def coverage_path_plan(area: Area, repeats: int) -> Way:
+    """coverage-path-planner: lines only, half a spacing from the border, its own best setting."""
+    polygon = area.survey.geoms[0]
+
+    def work() -> Array:
+        # Planning changes what it is given: a second run with the same settings lays no lines.
+        settings = coverage_path_planner.PathSettings()
+        settings.pattern, settings.offset, settings.angle = "lines", PATTERN.spacing_m, HEADING_RAD
+        settings.distanceToBorder = 0.0  # its first line is half a spacing further in
+        settings.borderLaps = settings.exclusionsBorderLaps = 0
+        settings.mowArea = True
+        settings.mowBorder = settings.mowExclusionsBorder = False
+        environment = coverage_path_planner.Environment(_peer_polygon(polygon.exterior))
+        for ring in polygon.interiors:
+            environment.addObstacle(_peer_polygon(ring))
+        start = coverage_path_planner.Point(*polygon.exterior.coords[0])
+        result = coverage_path_planner.PathService().computeFullTask(environment, settings, start)
+        return np.array([(point.x, point.y) for point in result.path.getPoints()])[1:]
+
+    seconds, path = _timed(work, repeats)
+    return Way(seconds=seconds, seen=_lines_of(path), path=path)
+
+
+def opencoverage_plan(area: Area, repeats: int) -> Way:
+    """opencoverage: back and forth; it knows no holes but its sections of lines do."""
+    camera = opencoverage.PinholeCamera(
+        pixel_size_mm=0.001,
+        focal_length_mm=10.0,
+        sensor_width_mm=PATTERN.spacing_m,
+        sensor_height_mm=1.0,
+        capture_rate_s=1.0,
+    )
+    vehicle = opencoverage.UAV(min_height=1.0, max_height=500.0, survey_velocity=1.0)
+    seconds, mission = _timed(
+        lambda: opencoverage.plan(
+            polygon=area.survey.geoms[0],
+            uav=vehicle,
+            camera=camera,
+            pattern="back_forth",
+            lateral_overlap=0.0,
+            forward_overlap=0.0,
+            target="altitude",
+            target_value=10.0,
+        ),
+        repeats,
+    )
+    path = np.array(mission.path)
+    return Way(seconds=seconds, seen=_lines_of(path), path=path)
+
+
+PLANNERS: dict[str, Callable[[Area, int], Way]] = {
+    "alice-survey": own_plan,
+    "coverage-path-planner": coverage_path_plan,
+    "opencoverage": opencoverage_plan,
+}
+
+
+def measured(planner: str, way: Way, area: Area) -> Measured:
+    """Measure a plan, whoever made it: by points in boxes, and by clipping its way."""
+    path = LineString(way.path)
+    beyond = path.difference(area.allowed.buffer(1e-6))
+    in_holes = beyond.intersection(area.no_go).length
+    sides = np.diff(way.path, axis=0)
+    sides = sides[np.hypot(*sides.T) > 1e-9]
+    courses = np.arctan2(sides[:, 1], sides[:, 0])
+    turned = np.abs((np.diff(courses) + math.pi) % (2 * math.pi) - math.pi)
+    return Measured(
+        planner=planner,
+        seconds=way.seconds,
+        path_m=path.length,
+        turns=int((turned > math.radians(1.0)).sum()),
+        covered=covered_share(area, way.seen),
+        outside_m=beyond.length - in_holes,
+        holes_m=in_holes,
+    )
+
+
+def covered_share(area: Area, seen: Array) -> float:
+    """Share of some thousand random points of the area that a straight sees, with its swath."""
+    rng = np.random.default_rng(1)
+    x_0, y_0, x_1, y_1 = area.survey.bounds
+    points = rng.uniform((x_0, y_0), (x_1, y_1), (4 * _POINTS, 2))
+    points = points[shapely.contains_xy(area.survey, points[:, 0], points[:, 1])][:_POINTS]
+    ahead = seen[:, 2:] - seen[:, :2]
+    length = np.hypot(*ahead.T)
+    seen, ahead, length = seen[length > 1e-6], ahead[length > 1e-6], length[length > 1e-6]
+    ahead = ahead / length[:, None]
+    along, aside = PATTERN.half_along_m * ahead, PATTERN.half_across_m * ahead[:, ::-1]
+    aside = aside * np.array([-1.0, 1.0])
+    begin, end = seen[:, :2] - along, seen[:, 2:] + along
+    boxes = shapely.polygons(
+        np.stack([begin - aside, end - aside, end + aside, begin + aside], axis=1)
+    )
+    hit = shapely.STRtree(boxes).query(shapely.points(points), predicate="intersects")[0]
+    return len(np.unique(hit)) / len(points)
+
+
+def _lines_of(path: Array) -> Array:
+    """Lines, (S, 4), of a way: its straights within a degree of the heading."""
+    straights = np.concatenate([path[:-1], path[1:]], axis=1)
+    north, east = (path[1:] - path[:-1]).T
+    off = (np.arctan2(east, north) - HEADING_RAD + math.pi / 2) % math.pi - math.pi / 2
+    return straights[np.abs(off) < math.radians(1.0)]
+
+
+def _timed(work: Callable[[], _Result], repeats: int) -> tuple[float, _Result]:
+    """The least time of some runs after a first one, and the result."""
+    result, best = work(), math.inf
+    for _ in range(repeats):
+        began = time.perf_counter()
+        result = work()
+        best = min(best, time.perf_counter() - began)
+    return best, result
+
+
+def _peer_polygon(ring: shapely.LinearRing) -> "coverage_path_planner.Polygon":
+    corners = Polygon(ring).exterior.coords[:-1]
+    return coverage_path_planner.Polygon([coverage_path_planner.Point(*c) for c in corners])
