@@ -17,7 +17,7 @@ from alice_survey.frames import Array
 from missions.lines.line import Line
 from missions.route import joins
 from missions.route.costs import Costs, time_costs
-from missions.route.fence import OPEN_WATER, straight_inside
+from missions.route.fence import OPEN_WATER, TOUCH_M, Fence, straight_inside
 from missions.route.legs import Leg, Route
 from missions.route.ways import Ways
 
@@ -55,15 +55,14 @@ def route_through(
         first_line: index of the first of these lines in the plan.
 
     Raises:
-        PlanError: there is no line, a line leaves the allowed area, or two places are in parts of
-            it that are not connected.
+        PlanError: there is no line, a line has no length or leaves the allowed area, or two places
+            are in parts of it that are not connected.
     """
     if not lines:
         raise PlanError("there is no line to fly")
     table = np.array([(*x.start_ne_m, *x.end_ne_m, x.heading_rad) for x in lines])
     fence = OPEN_WATER if ways is None else ways.fence
-    if ways is not None:
-        _check_lines(table, ways, first_line)
+    _check_lines(table, ways, first_line)
     prices = joins.prices(time_costs(PAPER_SPEED_MPS) if costs is None else costs)
     wanted = _WANTED[turns]
     legs, rows, kinds, detours = joins.joined_lines(
@@ -72,23 +71,13 @@ def route_through(
     legs[rows, 5] += first_line
     start, end = table[0, [0, 1, 4]], table[-1, 2:]
     if home_ne is None:
-        arrival = np.array(joins.run_in_start(fence, start, run_in_m))
-        first = _straight(arrival, start[:2], start[2])
-        leaving = end[:2] + run_in_m * np.array([math.cos(end[2]), math.sin(end[2])])
-        if not straight_inside(fence, end[0], end[1], leaving[0], leaving[1]):
-            leaving = end[:2]
-        last = _straight(end[:2], leaving, end[2])
+        first, last = _run_in(fence, start, run_in_m), _run_out(fence, end, run_in_m)
     else:
         home = np.array([*home_ne, _FREE])
-        both = []
-        for a, b in ((home, start), (end, home)):
-            kind, way, detour = joins.join(
-                fence, prices, a, b, turn_radius_m, run_in_m, run_in_m, wanted
-            )
-            if detour and ways is not None:
-                way, _ = _cheaper(kind, way, _round_corners(ways, a, b, run_in_m), prices)
-            both.append(way)
-        first, last = both
+        first, last = (
+            _single(ways, prices, a, b, turn_radius_m, run_in_m, wanted)
+            for a, b in ((home, start), (end, home))
+        )
     pieces = [first]
     done = 0
     for i in np.flatnonzero(detours).tolist():
@@ -105,7 +94,12 @@ def route_through(
     return Route(legs=_legs(np.concatenate(pieces)))
 
 
-def _check_lines(table: Array, ways: Ways, first_line: int) -> None:
+def _check_lines(table: Array, ways: Ways | None, first_line: int) -> None:
+    short = np.flatnonzero(np.hypot(*(table[:, 2:4] - table[:, :2]).T) <= TOUCH_M)
+    if len(short):
+        raise PlanError(f"line {first_line + short[0]} begins where it ends: give it two places")
+    if ways is None:
+        return
     outside = np.flatnonzero(~ways.free_many(table[:, :2], table[:, 2:4]))
     if len(outside):
         n_0, e_0, n_1, e_1, _ = table[outside[0]]
@@ -114,6 +108,39 @@ def _check_lines(table: Array, ways: Ways, first_line: int) -> None:
             f"{first_line + outside[0]} from {n_0:.2f} m north, {e_0:.2f} m east to {n_1:.2f}, "
             f"{e_1:.2f}: widen area.allowed"
         )
+
+
+def _run_in(fence: Fence, start: Array, run_in_m: float) -> Array:
+    """The leg before the first line, where there is room for it."""
+    arrival = np.array(joins.run_in_start(fence, start, run_in_m))
+    return _straight(arrival, start[:2], start[2])
+
+
+def _run_out(fence: Fence, end: Array, run_out_m: float) -> Array:
+    """The leg after the last line, where there is room for it."""
+    leaving = end[:2] + run_out_m * np.array([math.cos(end[2]), math.sin(end[2])])
+    leg = _straight(end[:2], leaving, end[2])
+    return leg if straight_inside(fence, end[0], end[1], leaving[0], leaving[1]) else leg[:0]
+
+
+def _single(
+    ways: Ways | None,
+    prices: joins.Prices,
+    end: Array,
+    goal: Array,
+    turn_radius_m: float,
+    run_in_m: float,
+    wanted: int,
+) -> Array:
+    """The way from home or to it, (L, 8)."""
+    fence = OPEN_WATER if ways is None else ways.fence
+    kind, way, detour = joins.join(
+        fence, prices, end, goal, turn_radius_m, run_in_m, run_in_m, wanted
+    )
+    if detour and ways is not None:
+        way, _ = _cheaper(kind, way, _round_corners(ways, end, goal, run_in_m), prices)
+    result: Array = way
+    return result
 
 
 def _cheaper(

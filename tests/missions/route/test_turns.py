@@ -242,6 +242,8 @@ def test_what_cannot_be_flown_is_told_in_one_line() -> None:
     lines = [line((0.0, 0.0), (9.0, 0.0)), line((9.0, 6.0), (0.0, 6.0))]
     with pytest.raises(PlanError, match=r"9.00 m north, 0.00 m east to .* not connected"):
         route_through(lines, 0.5, 0.5, ways=ways)
+    with pytest.raises(PlanError, match="line 1 begins where it ends"):
+        route_through([lines[0], line((1.0, 1.0), (1.0, 1.0))], 0.5, 0.5)
     with pytest.raises(PlanError, match="1 of 1 lines leave the allowed area, first line 3"):
         route_through([line((0.0, 0.0), (0.0, 8.0))], 0.5, 0.5, ways=ways, first_line=3)
     with pytest.raises(PlanError, match=r"20.00 m north, 0.00 m east is outside"):
