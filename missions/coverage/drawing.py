@@ -65,8 +65,10 @@ def draw_certificate(
         image, extent=extent, origin="lower", cmap=colour_map, interpolation="nearest",
         norm=BoundaryNorm([0, *steps], len(colours)), zorder=1,
     )  # fmt: skip
-    bar = figure.colorbar(drawn, ax=axes, shrink=0.7, pad=0.02, ticks=[0.5, *steps[:-1] + 0.5])
-    bar.ax.set_yticklabels(["0", *(_class(a, b) for a, b in itertools.pairwise(steps))])
+    bar = figure.colorbar(
+        drawn, ax=axes, shrink=0.7, pad=0.02, ticks=[0.5, *(steps[:-1] + steps[1:]) / 2]
+    )
+    bar.ax.set_yticklabels(["0", *(_class(a, b) for a, b in itertools.pairwise(steps.tolist()))])
     bar.ax.tick_params(length=0, labelsize=8)
     bar.set_label("pictures of all cameras", fontsize=9)
     _outline(axes, certificate.area.survey, _AREA, 1.4, "survey area")
