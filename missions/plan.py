@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from missions.areas.files import area_files
 from missions.areas.survey import survey_area
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.stations import Stations, stations_of_plan
-from missions.footprint import Swath, common_swath, joint_swath
+from missions.footprint import Swath, common_swath, footprint_size_m, joint_swath
 from missions.imaging.settings import ImagingSettings, imaging_settings, raw_bytes
 from missions.imaging.table import Setting
 from missions.lines.lay import lay_lines
@@ -36,7 +37,7 @@ from missions.plan_rows import plan_rows
 from missions.route.costs import Costs
 from missions.route.dives import split_dives
 from missions.route.energy import usable_wh, vehicle_costs
-from missions.route.terrain import TerrainLimits, line_depths, reach_of
+from missions.route.terrain import TerrainLimits, line_profiles, reach_of, terrain_report
 from missions.route.ways import Ways
 
 __all__ = ["Plan", "Planned", "make_plan", "plan_survey", "read_plan", "run_plan"]
@@ -56,6 +57,8 @@ class Planned:
     sweep: Sweep | None
     """How the direction of the lines was found; None where it was given."""
     bathymetry: Bathymetry | None
+    terrain: str
+    """How lines follow the bathymetry; empty without one."""
     warnings: tuple[str, ...]
     """What the plan was warned of."""
     rows: tuple[Setting, ...]
@@ -174,6 +177,7 @@ def _plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
         depth_m=depth_m - wanted.altitude_m,
         split=wanted.split_dives,
     )
+    terrain = _terrain(lines, config, rig, stereo, told, bathymetry)
     plan = Plan(
         name=config.name,
         area=area,
@@ -198,7 +202,7 @@ def _plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
         duration_s=sum(dive.duration_s for dive in dives),
         energy_wh=sum(dive.energy_wh for dive in dives),
         coverage=math.nan,
-        line_depths_m=_line_depths(lines, config, stereo, bathymetry),
+        line_depths_m=terrain.depths_m,
         details={},
     )
     seen = certificate(area, rig, _stations(plan, bathymetry), told)
@@ -208,7 +212,7 @@ def _plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
             f"{1 - seen.every_camera_share:.2%} is not seen by every camera: look at map.png, and "
             "give the vehicle more room, or raise the overlaps"
         )
-    told_more = _details(imaging, sweep, stereo, rig, config)
+    told_more = _details(imaging, sweep, stereo, rig, config) | {"terrain": terrain.figures}
     details = json.loads(json.dumps(told_more))  # as they are read back
     finished = replace(plan, coverage=seen.share_at_overlap, details=details)
     return Planned(
@@ -219,6 +223,7 @@ def _plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
         sweep=sweep,
         bathymetry=bathymetry,
         warnings=(),
+        terrain=terrain.text,
         rows=(*imaging.rows, *plan_rows(finished, seen, sweep, config, rig)),
     )
 
@@ -281,12 +286,22 @@ def _depth_m(config: SurveyConfig, area: Area, bathymetry: Bathymetry | None) ->
     return found.mean_m
 
 
-def _line_depths(
-    lines: Sequence[Line], config: SurveyConfig, stereo: Swath, bathymetry: Bathymetry | None
-) -> tuple[tuple[float, ...], ...]:
-    """Depth of the glass at each station of each line, over a bathymetry."""
+@dataclass(frozen=True, kw_only=True)
+class _Terrain:
+    """How lines follow a bathymetry."""
+
+    depths_m: tuple[tuple[float, ...], ...] = ()
+    """Of the glass, at each station of each line."""
+    text: str = ""
+    figures: dict[str, Any] | None = None
+
+
+def _terrain(
+    lines: Sequence[Line], config: SurveyConfig, rig: Rig, stereo: Swath, told: Pattern,
+    bathymetry: Bathymetry | None,
+) -> _Terrain:  # fmt: skip
     if bathymetry is None:
-        return ()
+        return _Terrain()
     wanted = config.plan
     limits = TerrainLimits(
         altitude_m=wanted.altitude_m,
@@ -296,8 +311,18 @@ def _line_depths(
     across_m = max(stereo.port_m, stereo.starboard_m)
     along_m = max(stereo.ahead_m, stereo.astern_m)
     reach = reach_of(config.camera.position_body_m, across_m, along_m)
-    depths = line_depths(lines, bathymetry, reach, limits)
-    return tuple(tuple(round(float(d), 4) for d in row) for row in depths)
+    profiles = line_profiles(lines, bathymetry, reach, limits)
+    text, figures = terrain_report(
+        lines,
+        profiles,
+        limits,
+        relief_m=wanted.relief_m,
+        spacing_m=told.spacing_m,
+        step_m=told.step_m,
+        extent_m=partial(footprint_size_m, rig.cameras[rig.reference]),
+    )
+    depths = tuple(tuple(round(float(d), 4) for d in p.depth_m) for p in profiles)
+    return _Terrain(depths_m=depths, text=text, figures=figures)
 
 
 def _stations(plan: Plan, bathymetry: Bathymetry | None) -> Stations:

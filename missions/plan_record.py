@@ -36,7 +36,7 @@ def write_planned(folder: Path, planned: "Planned", config: SurveyConfig, rig: R
     plan = planned.plan
     write_json(folder / "plan.json", plan.to_json())
     write_json(folder / "certificate.json", planned.certificate.to_json())
-    table = settings_table(planned.rows)
+    table = "\n\n".join(filter(None, (settings_table(planned.rows), planned.terrain)))
     (folder / "settings.txt").write_text(table + "\n", encoding="utf-8")
     write_triggers(folder, plan, planned.costs, config)
     draw_plan(folder / "map.png", plan, rig, planned.certificate, planned.bathymetry, config.sea)
