@@ -285,6 +285,8 @@ def _state(
             return f"stale ({need} is {before[need].split()[0]})"
     if imported and stage == "images":
         return "up to date"
+    if stage == "plan" and "refly_of" in (read_stage(workspace / stage) or {})["settings"]:
+        return "up to date"  # what was made for the holes of a dive has no settings of its own
     try:
         with only_checking():
             stale = _work_of(stage)(workspace, config, 1)

@@ -24,13 +24,13 @@ from missions.areas.bathymetry import Bathymetry, area_depth, read_bathymetry
 from missions.areas.files import area_files
 from missions.areas.survey import survey_area
 from missions.coverage.certificate import Certificate, certificate
-from missions.coverage.stations import Stations, stations_of_plan
+from missions.coverage.stations import Stations, stations_of_plan, sure_pattern
 from missions.footprint import Swath, common_swath, footprint_size_m, joint_swath
 from missions.imaging.settings import ImagingSettings, imaging_settings, raw_bytes
 from missions.imaging.table import Setting
 from missions.lines.lay import lay_lines
 from missions.lines.line import Line
-from missions.lines.pattern import Pattern, pattern
+from missions.lines.pattern import Pattern
 from missions.lines.sweep import Sweep, best_heading
 from missions.plan_file import Plan, read_plan
 from missions.plan_rows import plan_rows
@@ -129,7 +129,7 @@ def _plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
     imaging = imaging_settings(rig, config)
     step_m = imaging.station_spacing_m
     stereo = common_swath(rig, wanted.altitude_m, step_m)
-    told = pattern(stereo, imaging.line_spacing_m, step_m)
+    told = sure_pattern(rig, wanted.altitude_m, imaging.line_spacing_m, step_m)
     area = survey_area(
         config.area, turn_margin_m=_turn_margin_m(config, told), margin_m=wanted.margin_m
     )
