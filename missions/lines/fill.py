@@ -159,7 +159,6 @@ def _offer(
     best_score, best = 0.0, np.empty(0)
     places = _turned(patches[:, [U, V]], -heading_rad)
     for course in courses.tolist():
-        # A patch counts as seen where its middle and the most of it are: half its smaller side.
         local = np.concatenate(
             [_turned(places, course), (patches[:, LENGTH] * patches[:, WIDTH])[:, None]], axis=1
         )
@@ -211,14 +210,20 @@ def _line_uv(line: Array, heading_rad: float) -> Array:
 
 
 def _seen_by(patches: Array, line: Array, pattern: Pattern) -> NDArray[np.int64]:
-    """How many pictures of a line see the middles of patches, (N,)."""
+    """How many pictures of a line see patches, (N,): all of their width, and both their ends."""
     ahead = math.atan2(line[3] - line[1], line[2] - line[0])
     local = _turned(patches[:, [U, V]] - line[:2], ahead)
     length = math.hypot(line[2] - line[0], line[3] - line[1])
-    near = np.abs(local[:, 1]) <= pattern.half_across_m + _TINY_M
+    c, s = abs(math.cos(ahead)), abs(math.sin(ahead))
+    along = (c * patches[:, LENGTH] + s * patches[:, WIDTH]) / 2
+    aside = (s * patches[:, LENGTH] + c * patches[:, WIDTH]) / 2
+    near = np.abs(local[:, 1]) + aside <= pattern.half_across_m + 2 * _TINY_M
     counts = np.zeros(len(patches), np.int64)
     for i in np.flatnonzero(near).tolist():
-        counts[i] = pictures_of(0.0, length, line[4], local[i, 0], pattern.half_along_m)
+        counts[i] = min(
+            pictures_of(0.0, length, line[4], local[i, 0] + side * along[i], pattern.half_along_m)
+            for side in (-1, 1)
+        )
     return counts
 
 
@@ -319,7 +324,8 @@ def _best_line(
                     if abs(points[k, 1] - v) > max(half_across - reach_across, 0.0) + _TINY_M:
                         continue
                     u = points[k, 0]
-                    if u < room_begin - half_along or u > room_end + half_along:
+                    reach = half_along - reach_along
+                    if u < room_begin - reach or u > room_end + reach:
                         continue
                     if gain == 0.0:
                         first = u

@@ -35,6 +35,8 @@ def unseen(
     Returns:
         (N, 6) patches.
     """
+    if len(cuts) == 0:
+        return np.empty((0, 6))
     firsts = np.searchsorted(pieces[:, 0], np.arange(len(offsets) + 1))
     cut_firsts = np.searchsorted(cuts[:, 0], np.arange(len(offsets) + 1))
     rows = np.unique(cuts[:, 0]).astype(np.intp)

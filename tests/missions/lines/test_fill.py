@@ -1,0 +1,143 @@
+import math
+
+import numpy as np
+import pytest
+import shapely
+import shapely.affinity
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from shapely.geometry import MultiPolygon, box
+
+from missions.areas.area import multipolygon
+from missions.lines.fill import fill_table, lines_over
+from missions.lines.lay import survey_pieces
+from missions.lines.line import Line
+from missions.lines.pattern import Pattern
+from missions.lines.rows import to_uv
+from missions.lines.site import Site
+from missions.lines.unseen import LENGTH, WIDTH, U, V, unseen
+from tests.oracles_lines import (
+    ELL_WITH_HOLES,
+    PATTERNS,
+    STEREO,
+    area_of,
+    areas,
+    as_string,
+    points_in,
+    seen_enough,
+)
+
+
+def pieces_as_lines(pieces: np.ndarray, offsets: np.ndarray) -> list[Line]:
+    """Pieces of heading north."""
+    return [
+        Line(
+            kind="survey",
+            start_ne_m=(a, offsets[int(i)]),
+            end_ne_m=(b, offsets[int(i)]),
+            stations=int(n) + 1,
+        )
+        for i, a, b, n in pieces.tolist()
+    ]
+
+
+@settings(deadline=None, max_examples=40)
+@given(survey=areas, pattern=st.sampled_from(PATTERNS), margin_m=st.sampled_from([0.0, 3.0]))
+def test_what_a_pattern_leaves_unseen_is_found(
+    survey: MultiPolygon, pattern: Pattern, margin_m: float
+) -> None:
+    """Against dense points whose pictures are counted one by one."""
+    assume(survey.area > 0.3)
+    area = area_of(survey, margin_m)
+    pieces, offsets, cuts = survey_pieces(Site.of(area), 0.0, pattern)
+    assume(len(pieces) > 0)
+    patches = unseen(to_uv(Site.of(area).survey, 0.0), pattern, offsets, pieces, cuts, 0.15)
+
+    points = points_in(survey, 8000)
+    lacking = ~seen_enough(pieces_as_lines(pieces, offsets), points, pattern)
+    found = float((patches[:, LENGTH] * patches[:, WIDTH]).sum())
+    # The points are as many as resolve this share of the area.
+    assert found == pytest.approx(lacking.mean() * survey.area, abs=0.01 * survey.area)
+    half = patches[:, [LENGTH, WIDTH]] / 2
+    middles = patches[:, [U, V]]
+    boxes = shapely.box(*(middles - half).T, *(middles + half).T)
+    assert shapely.area(boxes).sum() == pytest.approx(found)
+    inside = shapely.contains_xy(survey.buffer(1e-6), middles[:, 0], middles[:, 1])
+    assert inside.all()
+
+
+def test_an_area_without_cuts_is_not_filled() -> None:
+    area = area_of(box(0, 0, 12, 9))
+    site = Site.of(area)
+    pieces, offsets, cuts = survey_pieces(site, 0.3, STEREO)
+    assert len(cuts) == 0
+    assert len(fill_table(site, 0.3, STEREO, pieces, offsets, cuts)) == 0
+
+
+def test_a_strip_beside_a_no_go_zone_is_filled_with_one_line() -> None:
+    """Rows run at offsets 0.5, 1.5, ...; the zone's side at 3.2 cuts the row of 3.5 off."""
+    area = area_of(box(0, 0, 20, 10).difference(box(6, 3.2, 14, 6.8)))
+    site = Site.of(area)
+    pieces, offsets, cuts = survey_pieces(site, 0.0, STEREO)
+    fills = fill_table(site, 0.0, STEREO, pieces, offsets, cuts)
+
+    # The rows of 2.5 and 7.5 see to 3.1 and from 6.9: a strip of 0.1 m is left at each side.
+    assert len(fills) == 2
+    for north_0, east_0, north_1, east_1, _, steps in fills.tolist():
+        assert east_0 == pytest.approx(east_1, abs=1e-9)
+        side = 3.2 if east_0 < 5 else 6.8
+        # It sees all of the strip from where it may be.
+        assert (2.6 <= east_0 <= 3.2) if side == 3.2 else (6.8 <= east_0 <= 7.4)
+        length = abs(north_1 - north_0)
+        assert 6.5 < length < 9.5
+        assert length / steps <= STEREO.step_m + 1e-9
+
+
+def test_a_pattern_with_gaps_of_its_own_is_not_filled() -> None:
+    sparse = Pattern(spacing_m=2.0, step_m=0.47, half_across_m=0.6, half_along_m=0.57)
+    site = Site.of(area_of(ELL_WITH_HOLES))
+    pieces, offsets, cuts = survey_pieces(site, 0.0, sparse)
+    assert len(cuts) > 0
+    assert len(fill_table(site, 0.0, sparse, pieces, offsets, cuts)) == 0
+
+
+@settings(deadline=None, max_examples=25)
+@given(
+    seed=st.integers(0, 10**6),
+    pattern=st.sampled_from(PATTERNS),
+    turn=st.floats(0, math.pi),
+)
+def test_lines_over_pieces_see_them(seed: int, pattern: Pattern, turn: float) -> None:
+    """Pieces as a dive leaves them: some strips and spots anywhere in the area."""
+    rng = np.random.default_rng(seed)
+    area = area_of(box(0, 0, 20, 15).difference(box(8, 6, 11, 9)), 2.0)
+    spots = [
+        box(n, e, n + rng.uniform(0.1, 4), e + rng.uniform(0.1, 0.8))
+        for n, e in rng.uniform(1, 15, (4, 2))
+    ]
+    turned = shapely.affinity.rotate(MultiPolygon(spots[:1]), turn, use_radians=True)
+    pieces = multipolygon(shapely.union_all([*spots, turned]).intersection(area.survey))
+    assume(pieces.area > 0.1)
+    lines = lines_over(pieces, area, pattern)
+
+    fence = area.allowed.buffer(1e-6)
+    assert all(fence.contains(as_string(line)) for line in lines)
+    assert {line.kind for line in lines} == {"fill"}
+    assert seen_enough(lines, points_in(pieces, 3000), pattern).mean() >= 0.999
+    assert all(line.length_m <= (line.stations - 1) * pattern.step_m + 1e-9 for line in lines)
+    assert sum(line.length_m for line in lines) < 60 * pattern.passes
+
+
+def test_lines_over_a_long_strip_are_one_line_along_it() -> None:
+    area = area_of(box(0, 0, 30, 30))
+    strip = shapely.affinity.rotate(box(5, 14, 25, 14.8), 30)
+    lines = lines_over(multipolygon(strip), area, STEREO)
+    assert len(lines) == 1
+    assert abs(math.sin(lines[0].heading_rad - math.radians(30))) < 1e-3
+    assert lines[0].length_m == pytest.approx(20, abs=0.8)
+
+
+def test_nothing_is_laid_over_nothing_or_where_nothing_may_be() -> None:
+    area = area_of(box(0, 0, 10, 10))
+    assert lines_over(MultiPolygon(), area, STEREO) == []
+    assert lines_over(MultiPolygon([box(50, 50, 52, 52)]), area, STEREO) == []

@@ -1,0 +1,92 @@
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from shapely.geometry import MultiPolygon, Polygon, box
+
+from alice_survey.errors import PlanError
+from missions.lines.site import Site
+from missions.lines.sweep import best_heading, full_cost_j, least_width, widths_m
+from missions.route.costs import Costs, time_costs
+from missions.route.ways import Ways
+from tests.oracles_lines import ELL, STEREO, area_of, areas
+
+ALONG = np.arange(16) * 2 * np.pi / 16
+NORTHWARD = dataclasses.replace(
+    time_costs(0.2), line_w=1 + 2 * np.sin(ALONG) ** 2, way_w=np.ones(16), sway_w=np.ones(16)
+)
+"""A current along north: courses across it cost thrice as much."""
+QUAD = Polygon([(0, 0), (9, 2), (12, 9), (-1, 8)])
+
+
+@settings(deadline=None, max_examples=60)
+@given(survey=areas, heading=st.floats(0, math.pi))
+def test_no_direction_is_narrower_than_the_least_width(
+    survey: MultiPolygon, heading: float
+) -> None:
+    edges = Site(
+        survey=np.concatenate(
+            [_edges(r) for p in survey.geoms for r in (p.exterior, *p.interiors)]
+        ),
+        allowed=np.empty((0, 4)),
+        parts=(),
+        area_m2=1.0,
+    ).survey
+    best, width = least_width(edges)
+    sampled = widths_m(edges, np.append(np.arange(720) * math.pi / 720, heading))
+    assert width <= sampled.min() + 1e-9
+    assert widths_m(edges, np.array([best]))[0] == pytest.approx(width, abs=1e-9)
+
+
+def _edges(ring: Polygon) -> np.ndarray:
+    corners = np.array(ring.coords)
+    return np.concatenate([corners[:-1], corners[1:]], axis=1)
+
+
+def test_the_width_of_a_convex_area_is_that_between_its_outermost_corners() -> None:
+    edges, corners = _edges(QUAD.exterior), np.array(QUAD.exterior.coords)
+    for heading in np.linspace(0, math.pi, 50):
+        across = corners @ np.array([-math.sin(heading), math.cos(heading)])
+        assert widths_m(edges, np.array([heading]))[0] == pytest.approx(np.ptp(across), abs=1e-12)
+
+
+@pytest.mark.parametrize("costs", [time_costs(0.2), NORTHWARD])
+@pytest.mark.parametrize("shape", [QUAD, ELL, box(0, 0, 15, 17)])
+def test_no_sampled_heading_is_much_better(shape: Polygon, costs: Costs) -> None:
+    area = area_of(shape)
+    ways, home = Ways(area.allowed), (0.0, 0.0)
+    sweep = best_heading(area, STEREO, ways, costs, home, cross_lines=1, closing_line=True)
+    sampled = [
+        full_cost_j(area, h, STEREO, ways, costs, home, cross_lines=1, closing_line=True)
+        for h in (np.arange(400) + 0.123) * math.pi / 400
+    ]
+    assert sweep.cost_j <= 1.005 * min(sampled)
+    assert sweep.cost_j == min(cost for _, cost in sweep.candidates)
+    again = full_cost_j(
+        area, sweep.heading_rad, STEREO, ways, costs, home, cross_lines=1, closing_line=True
+    )
+    assert again == pytest.approx(sweep.cost_j, rel=1e-12)
+    assert max(sampled) > 1.02 * sweep.cost_j
+
+
+def test_lines_turn_into_the_current() -> None:
+    area = area_of(box(0, 0, 15, 17))
+    ways = Ways(area.allowed)
+    kinds = {"cross_lines": 0, "closing_line": False}
+    calm = best_heading(area, STEREO, ways, time_costs(0.2), (0.0, 0.0), **kinds)
+    current = best_heading(area, STEREO, ways, NORTHWARD, (0.0, 0.0), **kinds)
+    assert abs(math.sin(calm.heading_rad)) > 0.99
+    assert abs(math.sin(current.heading_rad)) < 0.1
+    assert calm.width_m == pytest.approx(15)
+
+
+def test_headings_that_cannot_be_flown_are_told() -> None:
+    parts = area_of(MultiPolygon([box(0, 0, 5, 5), box(20, 0, 25, 5)]), 1.0)
+    with pytest.raises(PlanError, match="not connected"):
+        best_heading(
+            parts, STEREO, Ways(parts.allowed), time_costs(0.2), (0.0, 0.0),
+            cross_lines=0, closing_line=False,
+        )  # fmt: skip
