@@ -302,7 +302,7 @@ def good_tour(
         first: (C,) tour to begin with.
         fixed: as of `improved_tour`.
     """
-    best = improved_tour(first, hops, exits, inner, start, finish, fixed)
+    best: NDArray[np.int64] = improved_tour(first, hops, exits, inner, start, finish, fixed)
     cells = first.size
     if cells - fixed < 4:
         return best
