@@ -41,7 +41,7 @@ def pieces_as_lines(pieces: np.ndarray, offsets: np.ndarray) -> list[Line]:
     ]
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=25)
 @given(survey=areas, pattern=st.sampled_from(PATTERNS), margin_m=st.sampled_from([0.0, 3.0]))
 def test_what_a_pattern_leaves_unseen_is_found(
     survey: MultiPolygon, pattern: Pattern, margin_m: float

@@ -69,7 +69,7 @@ def across(line: Line, heading: float) -> float:
     return -math.sin(heading) * north + math.cos(heading) * east
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=40)
 @given(
     survey=areas,
     heading=st.floats(0, 6.28),
