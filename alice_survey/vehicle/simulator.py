@@ -6,14 +6,13 @@ five Runge-Kutta steps of 10 ms.
 """
 
 import math
-import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path as FilePath
 from typing import NamedTuple
 
 import numpy as np
 
+from alice_survey.compiled import tell_of_compiling
 from alice_survey.frames import Array, attitude_from_rotation
 from alice_survey.vehicle import signals
 from alice_survey.vehicle.allocation.exact import allocate_exact
@@ -329,7 +328,7 @@ def simulate(
     """
     from alice_survey.executor import progress
 
-    _tell_of_compiling()
+    tell_of_compiling(_fly_ticks, "the vehicle's model, once: this takes about a minute")
     chunks: list[Rows] = []
     total = math.ceil(longest_s / TICK_S / _CHUNK_TICKS)
     flying = _chunks(setup, rng, sea_rng or rng, longest_s)
@@ -341,14 +340,6 @@ def simulate(
         thrusters=tuple(t.name for t in setup.vehicle.thrusters),
         **rows._asdict(),
     )
-
-
-def _tell_of_compiling() -> None:
-    """Say, in one line on standard error, that the first flight after an installation waits."""
-    stats = _fly_ticks.stats  # type: ignore[attr-defined]
-    kept = FilePath(stats.cache_path).glob(f"*{_fly_ticks.__name__}*.nbi")
-    if not stats.cache_hits and not stats.cache_misses and not any(kept):
-        sys.stderr.write("compiling the vehicle's model, once: this takes about a minute\n")
 
 
 def _chunks(

@@ -9,9 +9,9 @@ first or last line, and the number of its lines says where it is left.
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from alice_survey.compiled import compiled
 from alice_survey.frames import Array
 from missions.lines.hops import Prices, hop_j, line_j
 
@@ -20,7 +20,7 @@ CORNERS = 4
 last line. Of a cell of one line, 0 and 1 only."""
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def followers(pieces: Array) -> NDArray[np.int64]:
     """The piece of the next row that goes on a piece's cell.
 
@@ -60,7 +60,7 @@ def followers(pieces: Array) -> NDArray[np.int64]:
     return follower
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def chains(follower: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Sort pieces by cell.
 
@@ -91,7 +91,7 @@ def chains(follower: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.i
     return begins[: cells + 1].copy(), listed
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def cell_corners(
     begins: NDArray[np.int64], listed: NDArray[np.int64], ends: Array, course: float
 ) -> tuple[Array, NDArray[np.int64]]:
@@ -125,7 +125,7 @@ def cell_corners(
     return corners, exits
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def cell_costs(
     prices: Prices,
     begins: NDArray[np.int64],
@@ -181,7 +181,7 @@ def cell_costs(
     return costs
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def flown(
     tour: NDArray[np.int64], begins: NDArray[np.int64], listed: NDArray[np.int64]
 ) -> NDArray[np.int64]:

@@ -11,10 +11,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from shapely.geometry import MultiPolygon
 
+from alice_survey.compiled import compiled
 from alice_survey.frames import Array
 from missions.areas.area import Area
 from missions.lines.line import Line
@@ -278,7 +278,7 @@ def _different(directions: Sequence[float]) -> list[float]:
     return kept
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _best_line(
     points: Array,
     reach_along: float,

@@ -11,8 +11,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from alice_survey.compiled import compiled
 from alice_survey.frames import Array
 from missions.route.costs import Costs
 from missions.route.joins import LONGEST_SWAY_M
@@ -54,7 +54,7 @@ def _finite(power_w: Array) -> Array:
     return np.minimum(np.ascontiguousarray(power_w, dtype=np.float64), NOWHERE_J)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def power_at(power_w: Array, course_rad: float) -> float:
     """Power at a course, between the even samples of a full turn from north."""
     count = power_w.size
@@ -66,14 +66,14 @@ def power_at(power_w: Array, course_rad: float) -> float:
     return power
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def line_j(prices: Prices, length_m: float, course_rad: float) -> float:
     """Energy of a straight line, J."""
     energy: float = length_m / prices.speed_mps * power_at(prices.line_w, course_rad)
     return energy
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _spot_j(prices: Prices, turn_rad: float) -> float:
     """Energy of a turn on the spot, with its stop; nothing of no turn."""
     turn = abs((turn_rad + math.pi) % (2 * math.pi) - math.pi)
@@ -83,7 +83,7 @@ def _spot_j(prices: Prices, turn_rad: float) -> float:
     return energy
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def hop_j(
     prices: Prices,
     north_0: float,
@@ -126,7 +126,7 @@ def hop_j(
     return total
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def hops_j(prices: Prices, leave: Array, enter: Array, ways_m: Array) -> Array:
     """Energies of all hops from some ends to some starts.
 
@@ -155,7 +155,7 @@ def hops_j(prices: Prices, leave: Array, enter: Array, ways_m: Array) -> Array:
     return energies
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def chain_j(prices: Prices, leave: Array, enter: Array, ways_m: Array) -> Array:
     """Energies of single hops, (N,) joules; arguments (N, 3), (N, 3) and (N,), as of `hops_j`."""
     energies = np.empty(leave.shape[0])
@@ -173,7 +173,7 @@ def chain_j(prices: Prices, leave: Array, enter: Array, ways_m: Array) -> Array:
     return energies
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def flight_parts_j(prices: Prices, home: Array, lines: Array, ways_m: Array) -> Array:
     """Energy of flying lines in order, from home and home again.
 

@@ -13,9 +13,9 @@ its outline covers.
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from alice_survey.compiled import compiled
 from alice_survey.frames import Array
 
 TOUCH_M = 1e-7
@@ -26,7 +26,7 @@ _SHORTEST_M = 1e-3
 _EVEN = 1e-9
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def to_uv(edges_ne: Array, heading_rad: float) -> Array:
     """Turn edges into the frame of the lines.
 
@@ -62,7 +62,7 @@ def row_offsets(low_m: float, high_m: float, spacing_m: float, edge_m: float, pa
     return (low_m + high_m) / 2 + spacing_m * places
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def sort_pairs(pairs: Array, first: int, last: int) -> None:
     """Sort rows first to last - 1 of (N, 2) by their first column, in place (shell sort)."""
     gap = 1
@@ -81,7 +81,7 @@ def sort_pairs(pairs: Array, first: int, last: int) -> None:
         gap //= 3
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def united(pairs: Array, first: int, last: int) -> int:
     """Unite intervals in rows first to last - 1 of (N, 2), in place; returns how many are left."""
     if last <= first:
@@ -98,7 +98,7 @@ def united(pairs: Array, first: int, last: int) -> int:
     return top - first + 1
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def stretches(edges: Array, levels: Array) -> tuple[NDArray[np.int64], Array]:
     """The stretches of level lines that lie in an area, by even and odd crossings.
 
@@ -137,7 +137,7 @@ def stretches(edges: Array, levels: Array) -> tuple[NDArray[np.int64], Array]:
     return starts, found
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def reaches(
     edges: Array, offsets: Array, half_m: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
@@ -200,7 +200,7 @@ def reaches(
     return begins, counts, found
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def rooms(edges: Array, offsets: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """Where lines may be flown: the stretches of rows that lie in an area or follow its edge.
 
@@ -229,7 +229,7 @@ def rooms(edges: Array, offsets: Array) -> tuple[NDArray[np.int64], NDArray[np.i
     return begins, counts, found
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def lay_rows(
     survey: Array,
     allowed: Array,

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from numba import njit
 
+from alice_survey.compiled import compiled
 from alice_survey.errors import PlanError
 from alice_survey.frames import Array
 from missions.areas.area import Area
@@ -159,7 +159,7 @@ def least_width(edges: Array) -> tuple[float, float]:
     return float(directions[least]), float(widths[least])
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def widths_m(edges: Array, headings: Array) -> Array:
     """Total width, (H,), of all cells across directions (H,)."""
     widths = np.zeros(headings.size)
@@ -192,7 +192,7 @@ def estimate_j(
     return estimates
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _estimates(
     survey: Array,
     allowed: Array,

@@ -8,9 +8,9 @@ again.
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from alice_survey.compiled import compiled
 from alice_survey.frames import Array
 from missions.lines.cells import CORNERS
 
@@ -23,7 +23,7 @@ _SHAKES = 60
 _SHAKEN = 1200
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def exact_tour(
     hops: Array, exits: NDArray[np.int64], inner: Array, start: Array, finish: Array, each: bool
 ) -> tuple[float, NDArray[np.int64]]:
@@ -80,7 +80,7 @@ def exact_tour(
     return best, best_tour
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _link(
     tour: NDArray[np.int64],
     i: int,
@@ -101,7 +101,7 @@ def _link(
     return cost
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def tour_cost(
     tour: NDArray[np.int64],
     hops: Array,
@@ -119,7 +119,7 @@ def tour_cost(
     return cost
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def nearest_tour(
     hops: Array, exits: NDArray[np.int64], inner: Array, start: Array
 ) -> NDArray[np.int64]:
@@ -141,7 +141,7 @@ def nearest_tour(
     return tour
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _reenter(
     tour: NDArray[np.int64],
     hops: Array,
@@ -180,7 +180,7 @@ def _reenter(
         k = before[i, k]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def improved_tour(
     tour: NDArray[np.int64],
     hops: Array,
@@ -278,7 +278,7 @@ def improved_tour(
     return tour
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def good_tour(
     hops: Array,
     exits: NDArray[np.int64],

@@ -7,9 +7,9 @@ lines' swaths. On the middle of each strip the parts that are seen too seldom ar
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from alice_survey.compiled import compiled
 from alice_survey.frames import Array
 from missions.lines.pattern import Pattern
 from missions.lines.rows import stretches, united
@@ -103,7 +103,7 @@ def _strips(sides: Array, low: Array, high: Array, finest_m: float) -> tuple[Arr
     return np.repeat(begins, parts) + (part + 0.5) * thin, thin
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def pictures_of(begin: float, end: float, steps: float, u: float, half_along: float) -> int:
     """How many of the pictures of a piece see a place beside it."""
     step = (end - begin) / max(steps, 1.0)
@@ -114,7 +114,7 @@ def pictures_of(begin: float, end: float, steps: float, u: float, half_along: fl
     return max(0, last - first + 1)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _patches(
     survey: Array,
     levels: Array,

@@ -8,8 +8,8 @@ six that stays out of it is taken.
 import math
 
 import numpy as np
-from numba import njit
 
+from alice_survey.compiled import compiled_ieee
 from alice_survey.errors import PlanError
 from alice_survey.frames import Array
 from missions.route.fence import OPEN_WATER, Fence, arc_inside
@@ -57,7 +57,7 @@ def turn(
     return legs
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def moved(
     north: float, east: float, heading: float, curvature: float, length: float
 ) -> tuple[float, float, float]:
@@ -71,7 +71,7 @@ def moved(
     )
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def shortest_turn(fence: Fence, start: Array, goal: Array, radius: float) -> Array:
     """The shortest path of the six kinds that stays inside.
 
@@ -113,7 +113,7 @@ def shortest_turn(fence: Fence, start: Array, goal: Array, radius: float) -> Arr
     return best
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _words(start: Array, goal: Array, radius: float) -> Array:
     """(6, 7) senses (+1 starboard, 0 straight, -1 port), lengths and their sum in radii.
 
@@ -148,7 +148,7 @@ def _words(start: Array, goal: Array, radius: float) -> Array:
     return words
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _put(
     words: Array,
     row: int,
@@ -164,7 +164,7 @@ def _put(
     words[row, 6] = first + middle + last
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _wrap(angle: float) -> float:
     """The angle in [0, 2 pi), with 0 for what is a full turn but for rounding."""
     wrapped = angle % _FULL

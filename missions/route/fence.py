@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
-from numba import njit
 from numpy.typing import NDArray
 from shapely.geometry import MultiPolygon
 
+from alice_survey.compiled import compiled_ieee
 from alice_survey.frames import Array
 
 TOUCH_M = 1e-6
@@ -85,21 +85,21 @@ def _edges(corners: Array) -> Array:
     return kept
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _row(fence: Fence, north: float) -> int:
     """The grid's row at a north, the first or last one beyond the grid."""
     row = math.floor((north - fence.north_m) * fence.rows_per_m)
     return min(max(row, 0), fence.rows - 1)
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _column(fence: Fence, east: float) -> int:
     """The grid's column at an east, the first or last one beyond the grid."""
     column = math.floor((east - fence.east_m) * fence.columns_per_m)
     return min(max(column, 0), fence.columns - 1)
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _columns_met(
     fence: Fence, row: int, a_n: float, a_e: float, b_n: float, b_e: float
 ) -> tuple[int, int]:
@@ -122,7 +122,7 @@ def _columns_met(
     )
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _sorted_into_cells(fence: Fence) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Lists of the edges that each cell, padded, holds a part of."""
     firsts = np.zeros(fence.rows * fence.columns + 1, dtype=np.int32)
@@ -148,7 +148,7 @@ def _sorted_into_cells(fence: Fence) -> tuple[NDArray[np.int32], NDArray[np.int3
     return firsts, listed
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _encloses(fence: Fence, north: float, east: float) -> bool:
     """Whether a ray to the east meets the edges an odd number of times."""
     row, odd = _row(fence, north), False
@@ -164,7 +164,7 @@ def _encloses(fence: Fence, north: float, east: float) -> bool:
     return odd
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _at_edge(fence: Fence, north: float, east: float, touch_m: float) -> bool:
     """Whether an edge is within reach, which is at most `TOUCH_M`."""
     cell = _row(fence, north) * fence.columns + _column(fence, east)
@@ -178,7 +178,7 @@ def _at_edge(fence: Fence, north: float, east: float, touch_m: float) -> bool:
     return False
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _sort(values: Array, count: int) -> None:
     """Sort the first few values in place; numba's own sort takes a second to compile."""
     for i in range(1, count):
@@ -189,7 +189,7 @@ def _sort(values: Array, count: int) -> None:
         values[k] = value
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def point_inside(fence: Fence, north: float, east: float) -> bool:
     """Whether a place is inside or no more than `TOUCH_M` outside."""
     if fence.edges.shape[0] == 0:
@@ -198,7 +198,7 @@ def point_inside(fence: Fence, north: float, east: float) -> bool:
     return inside
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def straight_inside(fence: Fence, a_n: float, a_e: float, b_n: float, b_e: float) -> bool:
     """Whether all of a straight is inside or no more than `TOUCH_M` outside.
 
@@ -269,7 +269,7 @@ def straight_inside(fence: Fence, a_n: float, a_e: float, b_n: float, b_e: float
     return True
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def arc_inside(
     fence: Fence, north: float, east: float, heading: float, curvature: float, length: float
 ) -> bool:

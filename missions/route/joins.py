@@ -8,9 +8,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from alice_survey.compiled import compiled_ieee
 from alice_survey.frames import Array
 from missions.route.costs import Costs
 from missions.route.dubins import moved, shortest_turn
@@ -59,7 +59,7 @@ def prices(costs: Costs) -> Prices:
     )
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def joined_lines(
     fence: Fence, prices: Prices, lines: Array, radius: float, run_in: float, wanted: int
 ) -> tuple[Array, NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
@@ -103,7 +103,7 @@ def joined_lines(
     return legs[:used], rows, kinds, detours
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def join(
     fence: Fence,
     prices: Prices,
@@ -153,7 +153,7 @@ def join(
     return NONE, spot, True
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _by_arcs(
     fence: Fence,
     prices: Prices,
@@ -197,7 +197,7 @@ def _by_arcs(
     return price(prices, legs[:used]), legs[:used]
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _on_the_spot(
     fence: Fence, prices: Prices, end: Array, goal: Array, run_in: float
 ) -> tuple[float, Array]:
@@ -215,7 +215,7 @@ def _on_the_spot(
     return price(prices, legs[:used]), legs[:used]
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _sideways(
     fence: Fence, prices: Prices, end: Array, goal: Array, run_in: float
 ) -> tuple[float, Array]:
@@ -262,7 +262,7 @@ def _sideways(
     return price(prices, legs[:used]), legs[:used]
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def run_in_start(fence: Fence, goal: Array, run_in: float) -> tuple[float, float]:
     """Where the run-in to a line begins: at the line itself where there is no room for it."""
     if math.isnan(goal[2]):
@@ -273,7 +273,7 @@ def run_in_start(fence: Fence, goal: Array, run_in: float) -> tuple[float, float
     return goal[0], goal[1]
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def add_straight(
     legs: Array, used: int, a_n: float, a_e: float, heading: float, b_n: float, b_e: float
 ) -> int:
@@ -286,7 +286,7 @@ def add_straight(
     return int(_add(legs, used, a_n, a_e, course, length, 0.0))
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def add_spot(
     legs: Array, used: int, north: float, east: float, heading: float, goal_heading: float
 ) -> int:
@@ -302,7 +302,7 @@ def add_spot(
     return used + 1
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _add(
     legs: Array,
     used: int,
@@ -321,7 +321,7 @@ def _add(
     return used + 1
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _goes_on(end: Array, goal: Array) -> bool:
     """Whether a line lies straight ahead of another; never of a free heading."""
     if not math.cos(end[2] - goal[2]) > 1 - 1e-12:
@@ -331,7 +331,7 @@ def _goes_on(end: Array, goal: Array) -> bool:
     return bool(cos * north + sin * east >= 0 and abs(cos * east - sin * north) < _SAME_M)
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def price(prices: Prices, legs: Array) -> float:
     """Energy of legs between lines; never infinite, but dear beyond anything where it were."""
     total = 0.0
@@ -351,7 +351,7 @@ def price(prices: Prices, legs: Array) -> float:
     return total
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _power(power_w: Array, course: float) -> float:
     """Power at a course, between the even samples of a full turn."""
     count = power_w.shape[0]
@@ -363,7 +363,7 @@ def _power(power_w: Array, course: float) -> float:
     return value
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _mean_power(power_w: Array, start: float, end: float) -> float:
     """Mean power from a course to another, over the samples passed through."""
     count = power_w.shape[0]

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from alice_survey.errors import PlanError, warn
 from alice_survey.frames import Array
@@ -160,10 +161,11 @@ def _round_corners(ways: Ways, end: Array, goal: Array, run_in_m: float) -> Arra
     used, heading = 0, float(end[2])
     for here, there in zip(path[:-1].tolist(), path[1:].tolist(), strict=True):
         before = used
-        used = joins.add_straight(legs, used, *here, heading, *there)
+        used = joins.add_straight(legs, used, here[0], here[1], heading, there[0], there[1])
         if used > before:
             heading = float(legs[used - 1, 2])
-    used = joins.add_spot(legs, used, *arrival.tolist(), heading, float(goal[2]))
+    north, east = arrival.tolist()
+    used = joins.add_spot(legs, used, north, east, heading, float(goal[2]))
     return np.concatenate([legs[:used], _straight(arrival, goal[:2], goal[2])])
 
 
@@ -189,7 +191,7 @@ def _legs(table: Array) -> tuple[Leg, ...]:
     )
 
 
-def _warn_of_others(kinds: Array, turns: Turns) -> None:
+def _warn_of_others(kinds: NDArray[np.intp], turns: Turns) -> None:
     """Tell how many turns are not as asked for."""
     if turns == "auto":
         return

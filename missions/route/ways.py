@@ -11,13 +11,13 @@ from functools import cached_property
 
 import numpy as np
 import shapely
-from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from shapely.geometry import MultiPolygon
 from shapely.geometry.polygon import orient
 
+from alice_survey.compiled import compiled_ieee
 from alice_survey.errors import PlanError
 from alice_survey.frames import Array
 from missions.route.fence import TOUCH_M, Fence, fence_of, point_inside, straight_inside
@@ -179,7 +179,7 @@ class Ways:
         return seen
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _points_inside(fence: Fence, points: Array) -> NDArray[np.bool_]:
     result = np.empty(points.shape[0], dtype=np.bool_)
     for i in range(points.shape[0]):
@@ -187,7 +187,7 @@ def _points_inside(fence: Fence, points: Array) -> NDArray[np.bool_]:
     return result
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _straights_inside(fence: Fence, starts: Array, ends: Array) -> NDArray[np.bool_]:
     result = np.empty(starts.shape[0], dtype=np.bool_)
     for i in range(starts.shape[0]):
@@ -195,7 +195,7 @@ def _straights_inside(fence: Fence, starts: Array, ends: Array) -> NDArray[np.bo
     return result
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _straight_distances(fence: Fence, a: Array, b: Array) -> Array:
     """(N, M) lengths of the straights that are inside; inf of the others."""
     result = np.full((a.shape[0], b.shape[0]), np.inf)
@@ -206,7 +206,7 @@ def _straight_distances(fence: Fence, a: Array, b: Array) -> Array:
     return result
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _passes(nodes: Array, i: int, north: float, east: float) -> bool:
     """Whether a taut way from a place may bend at a corner: both its edges are on one side."""
     u, v = nodes[i, 0] - north, nodes[i, 1] - east
@@ -219,7 +219,7 @@ def _passes(nodes: Array, i: int, north: float, east: float) -> bool:
     return passes
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _seen(fence: Fence, nodes: Array, points: Array) -> Array:
     result = np.full((points.shape[0], nodes.shape[0]), np.inf)
     for i in range(points.shape[0]):
@@ -230,7 +230,7 @@ def _seen(fence: Fence, nodes: Array, points: Array) -> Array:
     return result
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _tangents(fence: Fence, nodes: Array) -> tuple[NDArray[np.int32], NDArray[np.int32], Array]:
     """Pairs of corners (each once) whose straight is inside and touches at both, with lengths."""
     count, room = 0, 4 * nodes.shape[0] + 16
@@ -260,7 +260,7 @@ def _tangents(fence: Fence, nodes: Array) -> tuple[NDArray[np.int32], NDArray[np
     return rows[:count], columns[:count], lengths[:count]
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _shorten(
     distances: Array,
     blocked_a: NDArray[np.intp],
@@ -296,7 +296,7 @@ def _shorten(
             distances[blocked_a[i], blocked_b[j]] = best
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _over_corners(seen_a: Array, seen_b: Array, between: Array) -> Array:
     """(N,) lengths of ways over corners; arguments as of `_shorten`, row by row."""
     result = np.full(seen_a.shape[0], np.inf)
