@@ -24,6 +24,11 @@ from reconstruct.lens import Lens
 
 _FEW_MATCHES = 12
 """Matches that suffice in a second try, when the first one lost pictures (COLMAP: 15 to 100)."""
+_REPAIRS = 3
+_COLLAPSED = 0.05
+"""Share of the usual depth below which a point lies in the camera."""
+_MOST_COLLAPSED = 0.1
+"""Share of a frame's points; the sea floor never comes so near."""
 _LEAST_ANGLE_DEG = 6.0
 """Of the first pair: nadir pictures with 60 % overlap rarely reach COLMAP's 16 degrees."""
 
@@ -196,8 +201,58 @@ def _map_once(
         ),
     )
     models = [pycolmap.Reconstruction(model) for model in found.values()]
+    models = [_repaired(model, scratch, options) for model in models]
     shutil.rmtree(scratch)
     return sorted(models, key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
+
+
+def _repaired(
+    model: pycolmap.Reconstruction, scratch: Path, options: pycolmap.IncrementalPipelineOptions
+) -> pycolmap.Reconstruction:
+    """A model whose collapsed stations are taken out and registered anew from the others.
+
+    The first pair is of arbitrary scale; now and then the adjustment shrinks its baseline to
+    nothing, with its points in the cameras' common centre, where every ray meets them. The stereo
+    points of one of both then carry the model on, and the other stays where it is.
+    """
+    for attempt in range(_REPAIRS):
+        collapsed = collapsed_frames(model)
+        if not collapsed or len(collapsed) >= model.num_reg_frames() - 1:
+            return model
+        for frame in collapsed:
+            model.deregister_frame(frame)
+        begun, output = scratch / f"begun{attempt}", scratch / f"repaired{attempt}"
+        begun.mkdir()
+        output.mkdir()
+        model.write(begun)
+        found = pycolmap.incremental_mapping(
+            scratch / "database.db", scratch, output, options, input_path=begun
+        )
+        if found:
+            model = max(found.values(), key=lambda m: m.num_reg_images())
+    return model
+
+
+def collapsed_frames(model: pycolmap.Reconstruction) -> list[int]:
+    """Frames many of whose points lie in their cameras' own centres."""
+    depths: dict[int, list[Array]] = {}
+    for image in model.images.values():
+        if not image.has_pose:
+            continue
+        seen = [p.point3D_id for p in image.points2D if p.has_point3D()]
+        if seen:
+            points = np.array([model.points3D[i].xyz for i in seen])
+            pose = image.cam_from_world()
+            depth = (points @ np.asarray(pose.rotation.matrix()).T + pose.translation)[:, 2]
+            depths.setdefault(image.frame_id, []).append(depth)
+    if not depths:
+        return []
+    usual = float(np.median(np.concatenate([np.concatenate(rows) for rows in depths.values()])))
+    return [
+        frame
+        for frame, rows in depths.items()
+        if np.mean(np.concatenate(rows) < _COLLAPSED * usual) > _MOST_COLLAPSED
+    ]
 
 
 def largest(

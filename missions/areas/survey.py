@@ -73,7 +73,11 @@ def survey_area(settings: AreaConfig, *, turn_margin_m: float, margin_m: float =
         reach = _polygons(allowed_raw, frame, settings.corridor_width_m)
         allowed = _less(reach.solid, no_go)
     area = Area(datum=frame.datum, survey=survey, allowed=allowed, no_go=no_go)
-    _check_reach(area, raw, frame, given=None if allowed_raw is None else allowed_raw.origin)
+    if allowed_raw is None:
+        _check_parts(area, margin_m=margin)
+    else:
+        _check_inside(area, raw, frame, allowed_raw.origin)
+        _check_parts(area, given=allowed_raw.origin)
     return area
 
 
@@ -171,21 +175,21 @@ def _counted(raw: RawShapes) -> str:
     return " and ".join(told) or "nothing"
 
 
-def _check_reach(area: Area, raw: RawShapes, frame: LocalFrame, *, given: str | None) -> None:
-    """Warn of parts of the survey area outside of the allowed one, and of parts out of reach.
+def _check_parts(area: Area, *, margin_m: float = 0.0, given: str = "") -> None:
+    """Warn of parts of the allowed area that are out of reach of each other.
 
-    Raises:
-        PlanError: the two areas have nothing in common.
+    Args:
+        area: to check.
+        margin_m: by which the allowed area is wider than the survey area.
+        given: what says where the vehicle may be, where it is not that margin.
     """
-    if given is not None:
-        _check_inside(area, raw, frame, given)
     parts = [part for part in area.allowed.geoms if part.intersects(area.survey)]
     if len(parts) > 1:
         gap_m = _widest_gap_m(parts)
         advice = (
             f"join them in {given}"
-            if given is not None
-            else f"a turn_margin_m that is {gap_m / 2:.3g} m larger joins them where no zone to "
+            if given
+            else f"turn_margin_m = {_joining_m(margin_m, gap_m):g} joins them where no zone to "
             "keep out of lies between, or set an allowed shape"
         )
         warn(
@@ -194,7 +198,17 @@ def _check_reach(area: Area, raw: RawShapes, frame: LocalFrame, *, given: str | 
         )
 
 
+def _joining_m(margin_m: float, gap_m: float) -> float:
+    """The margin at which parts that are a gap apart meet, up to the next decimetre."""
+    return math.ceil(10.0 * (margin_m + gap_m / 2) - 1e-6) / 10.0
+
+
 def _check_inside(area: Area, raw: RawShapes, frame: LocalFrame, given: str) -> None:
+    """Warn of parts of the survey area outside of the allowed one.
+
+    Raises:
+        PlanError: the two areas have nothing in common.
+    """
     outside = _less(area.survey, area.allowed)
     share = outside.area / area.survey.area
     if share > 1.0 - _SMALL_SHARE:

@@ -144,7 +144,8 @@ def _no_lens(config: SurveyConfig, resolution_mm: float, options: list[LensOptio
             )
     ways += _more_light(config, options)
     lowest, highest = (f(option.altitude_m for option in options) for f in (min, max))
-    if highest < least:
+    # At no distance in front of the port there is no lens to scale.
+    if 0.0 < highest < least:
         lens = max(option.lens_mm for option in options)
         longer = math.ceil(10 * lens * least / highest) / 10
         ways.append(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from alice_survey.errors import PlanError
 from alice_survey.frames import Array
 from missions.areas.area import Area
-from missions.lines import cells, hops, rows, tour
+from missions.lines import cells, cross, hops, rows, tour
 from missions.lines.fill import fill_table
 from missions.lines.line import Line, LineKind
 from missions.lines.pattern import Pattern
@@ -80,7 +80,8 @@ def lay_lines(
         ways: inside the allowed area.
         costs: what the order of the lines keeps low.
         home_ne: where the flight begins and ends.
-        cross_lines: how many across the survey lines, in every part of the area.
+        cross_lines: how many across the survey lines, over every block of them; more where some
+            would stay uncrossed (`missions.lines.cross`); 0: none.
         closing_line: whether the begin of the first line is flown again at the end.
         most_stations: that a plan may have.
 
@@ -175,7 +176,7 @@ def laid(
     steps = pieces[:, 3].astype(np.int64)
     survey_count, survey_cells = len(pieces), len(inner)
     if cross_lines:
-        across = _cross(site, heading_rad, pattern, cross_lines)
+        across = _cross(site, heading_rad, pattern, pieces, offsets, cross_lines)
         alone = np.arange(len(across.steps) + 1)
         course = heading_rad + math.pi / 2
         more, leaving = cells.cell_corners(alone, alone[:-1], across.ends, course)
@@ -292,31 +293,27 @@ class _Single:
     steps: NDArray[np.int64]
 
 
-def _cross(site: Site, heading_rad: float, pattern: Pattern, count: int) -> _Single:
-    """Lines across the survey lines, evenly over the length of every part of the area."""
-    course = heading_rad + math.pi / 2
-    allowed = rows.to_uv(site.allowed, course)
-    ends, steps = [], []
-    for part in site.parts:
-        survey = rows.to_uv(part, course)
-        if float(np.ptp(survey[:, [0, 2]])) < pattern.spacing_m:
-            continue  # one survey line has nothing to be tied to
-        low, high = float(survey[:, 1].min()), float(survey[:, 1].max())
-        offsets = low + (high - low) * np.arange(1, count + 1) / (count + 1)
-        pieces, _ = rows.lay_rows(
-            survey,
-            allowed,
-            offsets,
-            min(pattern.step_m, pattern.spacing_m) / 2,
-            pattern.overhang_m,
-            pattern.step_m,
-            max(1, pattern.pictures - 1),
-        )
-        ends.append(_ends_ne(pieces, offsets, course))
-        steps.append(pieces[:, 3].astype(np.int64))
-    if not ends:
-        return _Single(ends=np.empty((0, 4)), steps=np.empty(0, np.int64))
-    return _Single(ends=np.concatenate(ends), steps=np.concatenate(steps))
+def _cross(
+    site: Site, heading_rad: float, pattern: Pattern, pieces: Array, offsets: Array, count: int
+) -> _Single:
+    """Lines across the survey lines, so that each of these is crossed."""
+    found = cross.cross_table(
+        pieces,
+        offsets,
+        rows.to_uv(site.allowed, heading_rad),
+        pattern.step_m,
+        max(1, pattern.pictures - 1),
+        count,
+    )
+    c, s = math.cos(heading_rad), math.sin(heading_rad)
+    along, low, high = found[:, 0], found[:, 1], found[:, 2]
+    ends = [
+        along * c - low * s,
+        along * s + low * c,
+        along * c - high * s,
+        along * s + high * c,
+    ]
+    return _Single(ends=np.stack(ends, axis=1), steps=found[:, 3].astype(np.int64))
 
 
 def _piece_at(begins: NDArray[np.int64], listed: NDArray[np.int64]) -> NDArray[np.int64]:

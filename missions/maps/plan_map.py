@@ -30,6 +30,10 @@ _INK = "#17202a"
 _MOST_ARROWS = 500
 _MOST_FOOTPRINTS = 3000
 """Beyond, single footprints are no longer seen: the count of pictures shows what they cover."""
+_ALLOWED_BEYOND = 0.3
+"""Share of the map by which the allowed area may be larger than all else and is still shown whole.
+"""
+_LEAST_MAP_IN = 2.2
 _PDF_DATE = {"CreationDate": None, "ModDate": None}
 SUFFIXES = (".png", ".pdf", ".svg")
 
@@ -64,9 +68,10 @@ def draw_plan(
     around.append(_draw_footprints(axes, plan, rig, faint=certificate is not None))
     _draw_area(axes, plan)
     around.append(_draw_route(axes, plan))
-    _draw_lines(axes, plan)
     points = np.vstack(around)
-    _frame(axes, points)
+    _frame(axes, points, plan)
+    _fit_sheet(figure, axes)
+    _draw_lines(axes, plan)
     if bathymetry is not None:
         _draw_bathymetry(axes, bathymetry)
     _furniture(axes, points)
@@ -202,6 +207,9 @@ def _draw_route(axes: Axes, plan: Plan) -> Array:
 
 def _draw_lines(axes: Axes, plan: Plan) -> None:
     size = 9.0 if plan.stations < 300 else 3.0 if plan.stations < 20_000 else 0.3
+    # Lines and dots leave two thirds of the space between lines to what they cover.
+    widest = max(plan.line_spacing_m * _points_per_metre(axes) / 3.0, 0.25)
+    size = min(size, widest**2)
     for kind, colour in _LINES.items():
         lines = [line for line in plan.lines if line.kind == kind]
         if not lines:
@@ -209,7 +217,7 @@ def _draw_lines(axes: Axes, plan: Plan) -> None:
         ends = [(line.start_ne_m[::-1], line.end_ne_m[::-1]) for line in lines]
         label = f"{len(ends)} {kind} line{'s' if len(ends) > 1 else ''}"
         axes.add_collection(
-            LineCollection(ends, colors=colour, linewidths=1.6, zorder=4, label=label)
+            LineCollection(ends, colors=colour, linewidths=min(1.6, widest), zorder=4, label=label)
         )
         places = np.vstack([line.stations_ne for line in lines])
         axes.scatter(places[:, 1], places[:, 0], s=size, color=colour, zorder=5, lw=0)
@@ -221,8 +229,12 @@ def _arrows(plan: Plan) -> list[Array]:
     """An arrow head at a third of each line, so that the direction of travel is seen."""
     north_0, east_0, north_1, east_1 = plan.area.survey.bounds
     size = 0.011 * max(north_1 - north_0, east_1 - east_0)
+    # Of many lines each so-many-th, an odd number: neighbours fly opposite ways.
+    apart = 2 * int(size / plan.line_spacing_m) + 1
     heads = []
-    for line in plan.lines:
+    for index, line in enumerate(plan.lines):
+        if line.kind == "survey" and index % apart:
+            continue
         ahead = np.array([math.sin(line.heading_rad), math.cos(line.heading_rad)])
         right = np.array([ahead[1], -ahead[0]])
         tip = np.array(line.start_ne_m[::-1]) + ahead * (line.length_m / 3 + size)
@@ -244,30 +256,55 @@ def _draw_bathymetry(axes: Axes, bathymetry: Bathymetry) -> None:
 
 
 def _draw_current(axes: Axes, sea: SeaConfig) -> None:
-    """An arrow in the upper left corner that points where the current flows."""
+    """An arrow below the area that points where the current flows."""
+    (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
+    # In metres: in shares of the axes, which are seldom square, it would point elsewhere.
+    size = max(east - west, north - south)
     towards = math.radians(sea.current_towards_deg)
-    half = 0.04 * np.array([math.sin(towards), math.cos(towards)])
-    middle = np.array([0.075, 0.93])
+    half = 0.035 * size * np.array([math.sin(towards), math.cos(towards)])
+    middle = np.array([east - 0.06 * size, south + 0.05 * size])
     axes.annotate(
         "",
         xy=tuple((middle + half).tolist()),
         xytext=tuple((middle - half).tolist()),
-        xycoords="axes fraction",
         arrowprops={"arrowstyle": "-|>", "color": "#2471a3", "lw": 2.2, "mutation_scale": 15},
         zorder=9,
     )
     axes.text(
-        0.075, 0.865, f"current\n{sea.current_mps:g} m/s", transform=axes.transAxes, ha="center",
-        va="top", fontsize=7.5, color="#1a5276", zorder=9,
+        middle[0] - 0.045 * size, middle[1], f"current\n{sea.current_mps:g} m/s", ha="right",
+        va="center", fontsize=7.5, color="#1a5276", zorder=9,
         bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.7},
     )  # fmt: skip
 
 
-def _frame(axes: Axes, points_xy: Array) -> None:
+def _frame(axes: Axes, points_xy: Array, plan: Plan) -> None:
+    """Show all points, and the allowed area with them unless it is much larger."""
     low, high = points_xy.min(axis=0), points_xy.max(axis=0)
+    south, west, north, east = plan.area.allowed.bounds
+    beyond = max(low[0] - west, low[1] - south, east - high[0], north - high[1])
+    if beyond < _ALLOWED_BEYOND * float(max(high - low)):
+        low, high = np.minimum(low, [west, south]), np.maximum(high, [east, north])
     margin = 0.06 * float(max(high - low))
     axes.set_xlim(low[0] - margin, high[0] + margin)
     axes.set_ylim(low[1] - 2.0 * margin, high[1] + margin)
+
+
+def _fit_sheet(figure: Figure, axes: Axes) -> None:
+    """Make the sheet as high as the map, so that a long area leaves no empty page."""
+    (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
+    width_in, height_in = figure.get_size_inches()
+    left, bottom, width, height = axes.get_position(original=True).bounds
+    below_in, above_in = bottom * height_in, (1.0 - bottom - height) * height_in
+    map_in = width * width_in * (north - south) / (east - west)
+    map_in = min(max(map_in, _LEAST_MAP_IN), height * height_in)
+    sheet_in = below_in + map_in + above_in
+    figure.set_size_inches(width_in, sheet_in)
+    axes.set_position((left, below_in / sheet_in, width, map_in / sheet_in))
+    for bar in figure.axes[1:]:
+        x, _, bar_width, _ = bar.get_position(original=True).bounds
+        bar.set_position(
+            (x, (below_in + 0.15 * map_in) / sheet_in, bar_width, 0.7 * map_in / sheet_in)
+        )
 
 
 def _furniture(axes: Axes, points_xy: Array) -> None:
@@ -295,6 +332,15 @@ def _round_length(length_m: float) -> float:
     """1, 2 or 5 times a power of ten, not above a length."""
     power = 10.0 ** math.floor(math.log10(length_m))
     return float(max(step * power for step in (1, 2, 5) if step * power <= length_m))
+
+
+def _points_per_metre(axes: Axes) -> float:
+    """Of the printed map; a point is 1/72 inch."""
+    (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
+    width_in, height_in = axes.get_figure().get_size_inches()
+    box = axes.get_position(original=True)
+    inches = min(box.width * width_in / (east - west), box.height * height_in / (north - south))
+    return float(72.0 * inches)
 
 
 def _points(length_m: float) -> int:

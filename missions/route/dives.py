@@ -231,13 +231,13 @@ def _line_too_long(lines: Sequence[Line], sums: _Sums, limits: Limits, depth_m: 
     line, (energy, time) = lines[worst], each[worst]
     ways = []
     if energy > limits.energy_j:
-        ways.append(f"a battery with {_wh(energy)} to use (vehicle.battery_wh)")
+        ways.append(f"a battery with {_wh(energy)} above its reserve (vehicle.battery_wh)")
     if time > limits.time_s:
         ways.append(f"plan.dive_s of {time:.0f} s")
     ways += ["plan.home_ne_m nearer to it", "shorter lines (plan.line_heading_deg, or parts)"]
     return (
-        f"line {worst} of {line.length_m:.0f} m takes {_numbers(energy, time)} by itself, with the "
-        f"way from home and back and {depth_m:.0f} m down and up, but a dive has "
+        f"line {worst}, {line.length_m:.0f} m long, takes {_numbers(energy, time)} by itself, with "
+        f"the way from home and back and {depth_m:.0f} m down and up, but a dive has "
         f"{_allowed(limits)}"
         + (f" ({len(over)} lines are too long)" if len(over) > 1 else "")
         + f": it needs {', or '.join(ways)}"
@@ -257,10 +257,10 @@ def _too_large(
     if parted is not None:
         ways.append(f"split_dives = true ({len(parted)} dives)")
     if energy_j > limits.energy_j:
-        ways.append(f"a battery with {_wh(energy_j)} to use (vehicle.battery_wh)")
+        ways.append(f"a battery with {_wh(energy_j)} above its reserve (vehicle.battery_wh)")
     if time_s > limits.time_s:
         ways.append(f"plan.dive_s = {math.ceil(time_s)}")
-    ways.append(f"survey the {share:.0%} of it that fit")
+    ways.append(f"survey no more than the {share:.0%} that fit")
     return (
         f"{len(lines)} lines take {_numbers(energy_j, time_s)}, but one dive has "
         f"{_allowed(limits)}: the first {last + 1} lines fit ({done:.0f} m, {share:.0%}); "

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from alice_survey.config import SurveyConfig
+from alice_survey.errors import PlanError
 from alice_survey.frames import Array
 from alice_survey.vehicle.steady import drag_power
 from missions.route.energy import (
@@ -22,6 +23,7 @@ from missions.route.energy import (
 )
 
 _J_PER_WH = 3600.0
+_SUFFIXES = (".png", ".pdf", ".svg")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,13 +159,17 @@ def draw_trade(path: Path, config: SurveyConfig, *, imaging_w: float = 0.0) -> N
     """Draw the power of the thrusters on lines and between, by course.
 
     Args:
-        path: of a picture, PNG or PDF.
+        path: of a picture, PNG, PDF or SVG.
         config: of the survey.
         imaging_w: mean power of strobes while on lines.
 
     Raises:
-        PlanError: lines cannot be flown in that current.
+        PlanError: lines cannot be flown in that current, or the picture cannot be written.
     """
+    if path.suffix.lower() not in _SUFFIXES:
+        raise PlanError(
+            f"{path}: pictures are written as {', '.join(_SUFFIXES)}: change the suffix"
+        )
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

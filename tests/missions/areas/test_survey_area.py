@@ -142,7 +142,7 @@ def test_parts_out_of_reach_are_told_with_the_margin_that_joins_them(
     apart = area_of(wkt=wkt)
     assert len(apart.allowed.geoms) == 2
     assert "2 parts up to 14 m apart" in (told := capsys.readouterr().err)
-    assert "turn_margin_m that is 7 m larger" in told
+    assert "turn_margin_m = 10 joins them" in told
     joined = area_of(wkt=wkt, turn_margin_m=3.0 + 7.0)
     assert len(joined.allowed.geoms) == 1
     assert capsys.readouterr().err == ""

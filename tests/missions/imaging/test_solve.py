@@ -54,6 +54,15 @@ def test_resolutions_beyond_all_lenses_are_refused(resolution_mm: float) -> None
     assert len(str(fault.value).splitlines()) <= 4
 
 
+def test_no_lens_of_negative_length_is_proposed() -> None:
+    """Pixels smaller than the port itself allows put the altitude behind the glass."""
+    _, config = survey()
+    with pytest.raises(PlanError) as fault:
+        lenses_for_resolution(config, 0.001, (12.5, 25.0))
+    assert "a lens of about" not in str(fault.value)
+    assert "coarser" in str(fault.value)
+
+
 @pytest.mark.parametrize("dive_s", [600.0, 3600.0, 20_000.0])
 def test_the_area_of_a_dive_takes_the_dive(dive_s: float) -> None:
     _, config = survey(plan={"side_overlap": 0.45})

@@ -280,6 +280,11 @@ def test_the_picture_of_the_trade_is_drawn(tmp_path: Path) -> None:
     assert (tmp_path / "again.png").read_bytes() == (tmp_path / "trade.png").read_bytes()
 
 
+def test_a_picture_of_the_trade_of_unknown_kind_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(PlanError, match=r"trade\.xyz: .*change the suffix"):
+        draw_trade(tmp_path / "trade.xyz", _config())
+
+
 def test_costs_are_quick_once_warm() -> None:
     config = _config()
     vehicle_costs(config)
