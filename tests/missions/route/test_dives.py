@@ -1,7 +1,7 @@
-import re
 
 """Lines parted into dives: fewest, then least energy, each within battery and time."""
 
+import re
 import time
 from typing import Any
 
