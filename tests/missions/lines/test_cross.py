@@ -1,0 +1,140 @@
+import itertools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from shapely.geometry import MultiPolygon, Polygon, box
+
+from missions.lines.cross import LEAST_STEPS, stabs
+from missions.lines.lay import lay_lines
+from missions.lines.line import Line
+from missions.lines.pattern import Pattern
+from missions.route.costs import time_costs
+from missions.route.ways import Ways
+from tests.oracles_lines import PATTERNS, STEREO, area_of, areas, as_string
+
+ARMS = Polygon([(0, 0), (30, 0), (30, 12), (14, 12), (14, 26), (0, 26)])
+HOLES = Polygon([(6, 6), (10, 5), (11, 9), (7, 10)]), box(20, 3, 23, 7)
+
+
+def lay(
+    survey: Polygon | MultiPolygon, heading: float, pattern: Pattern, cross_lines: int
+) -> list[Line]:
+    area = area_of(survey)
+    home = area.allowed.representative_point()
+    return lay_lines(
+        area,
+        heading,
+        pattern,
+        Ways(area.allowed),
+        time_costs(0.2),
+        (home.x, home.y),
+        cross_lines=cross_lines,
+        closing_line=False,
+    )
+
+
+def of_kind(lines: list[Line], kind: str) -> list[Line]:
+    return [line for line in lines if line.kind == kind]
+
+
+def beside(a: Line, b: Line, spacing_m: float) -> bool:
+    """Whether survey lines lie side by side, one spacing apart, for more than a point."""
+    c, s = math.cos(a.heading_rad), math.sin(a.heading_rad)
+    turned = np.array([[c, -s], [s, c]])
+    one, two = (np.array([x.start_ne_m, x.end_ne_m]) @ turned for x in (a, b))
+    if abs(abs(one[0, 1] - two[0, 1]) - spacing_m) > 1e-6:
+        return False
+    return bool(
+        min(one[:, 0].max(), two[:, 0].max()) > max(one[:, 0].min(), two[:, 0].min()) + 1e-6
+    )
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    survey=areas,
+    heading=st.floats(0, math.pi),
+    pattern=st.sampled_from(PATTERNS),
+    cross_lines=st.integers(0, 3),
+)
+def test_every_survey_line_with_a_neighbour_is_crossed(
+    survey: MultiPolygon, heading: float, pattern: Pattern, cross_lines: int
+) -> None:
+    assume(survey.area > 0.3 and len(area_of(survey).allowed.geoms) == 1)
+    lines = lay(survey, heading, pattern, cross_lines)
+    crossing, grid = of_kind(lines, "cross"), of_kind(lines, "survey")
+    if cross_lines == 0:
+        assert not crossing
+        return
+    for line in grid:
+        if line.stations - 1 < LEAST_STEPS:
+            continue
+        if any(beside(line, other, pattern.spacing_m) for other in grid):
+            assert any(as_string(line).distance(as_string(x)) < 1e-6 for x in crossing)
+    for line in crossing:
+        turn = math.cos(line.heading_rad - heading)
+        assert abs(turn) < 1e-9
+        assert any(as_string(line).distance(as_string(x)) < 1e-6 for x in grid)
+
+
+@pytest.mark.parametrize("heading", [0.0, 0.4, math.pi / 2])
+def test_all_arms_of_an_area_are_tied_together(heading: float) -> None:
+    """Lines that cross one another are one net; one cross line left an arm of this area out."""
+    survey = ARMS.difference(HOLES[0]).difference(HOLES[1])
+    lines = lay(survey, heading, STEREO, 1)
+    grid, crossing = of_kind(lines, "survey"), of_kind(lines, "cross")
+    net, left = [as_string(crossing[0])], [as_string(x) for x in (*grid, *crossing[1:])]
+    while True:
+        tied = [x for x in left if any(x.distance(y) < 1e-6 for y in net)]
+        if not tied:
+            break
+        net += tied
+        left = [x for x in left if x not in tied]
+    assert not left
+    assert len(crossing) <= 5
+
+
+def test_a_rectangle_has_the_cross_lines_asked_for_evenly() -> None:
+    for count in (1, 2, 4):
+        crossing = of_kind(lay(box(0, 0, 20, 9), 0.0, STEREO, count), "cross")
+        norths = sorted(line.start_ne_m[0] for line in crossing)
+        assert len(norths) == count
+        np.testing.assert_allclose(norths, np.linspace(norths[0], norths[-1], count))
+        assert np.mean(norths) == pytest.approx(10)
+        assert norths[0] == pytest.approx(20 / (count + 1), abs=0.5)
+        for line in crossing:
+            assert 8 <= line.length_m <= 8 + STEREO.step_m
+
+
+def test_cross_lines_are_moved_rather_than_added() -> None:
+    """A notch, where the one cross line would lie, cuts the rows of one side: its place moves."""
+    notched = box(0, 0, 20, 10).difference(box(8, 6, 12, 10))
+    two = of_kind(lay(notched, 0.0, STEREO, 2), "cross")
+    assert len(two) == 2
+    moved = box(0, 0, 20, 10).union(box(0, 10, 3, 14))
+    one = of_kind(lay(moved, 0.0, STEREO, 1), "cross")
+    assert len(one) == 1
+    assert one[0].start_ne_m[0] < 3.6
+    assert one[0].length_m > 12
+
+
+@settings(max_examples=100)
+@given(st.lists(st.tuples(st.integers(0, 12), st.integers(0, 4)), min_size=1, max_size=7))
+def test_the_fewest_places_meet_all_intervals(spans: list[tuple[int, int]]) -> None:
+    intervals = np.array([(a, a + b) for a, b in spans], dtype=np.float64)
+    found = stabs(intervals)
+    for place in (found[:, 0], found.mean(axis=1), found[:, 1]):
+        met = (intervals[:, :1] <= place) & (place <= intervals[:, 1:])
+        assert met.any(axis=1).all()
+    ends = sorted({float(x) for x in intervals[:, 1]})
+    fewest = next(
+        count
+        for count in range(1, len(ends) + 1)
+        if any(
+            all(any(a <= p <= b for p in places) for a, b in intervals)
+            for places in itertools.combinations(ends, count)
+        )
+    )
+    assert len(found) == fewest
