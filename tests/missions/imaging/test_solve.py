@@ -11,6 +11,7 @@ from missions.imaging.solve import solve_report, speeds_for_rate
 from missions.imaging.solve_dive import area_for_dive, turn_s
 from missions.imaging.solve_lens import lenses_for_resolution
 from missions.plan import make_plan
+from missions.route.costs import SETTLE_S
 from tests.missions.imaging.surveys import survey
 
 
@@ -83,8 +84,8 @@ def test_turns_are_half_circles_where_lines_are_wide_apart() -> None:
     assert turn_s(config, 1.0 - 1e-9) == pytest.approx(turn_s(config, 1.0), abs=1e-3)
     assert turn_s(config, 0.0) == pytest.approx((7 / 3 * math.pi * 0.5 + 0.5) / 0.2)
     _, spot = survey(plan={"turns": "spot"})
-    # Two right angles at 15 deg/s, 4 s each to settle.
-    assert turn_s(spot, 1.0) == pytest.approx(2 * (6.0 + 4.0) + 1.0 / 0.2 + 0.5 / 0.2)
+    # Two right angles at 15 deg/s, and what each stop takes besides.
+    assert turn_s(spot, 1.0) == pytest.approx(2 * (6.0 + SETTLE_S) + 1.0 / 0.2 + 0.5 / 0.2)
     _, auto = survey()
     assert turn_s(auto, 1.0) == min(turn_s(config, 1.0), turn_s(spot, 1.0))
 
