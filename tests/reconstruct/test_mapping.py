@@ -14,6 +14,7 @@ from reconstruct.lens import flat_port_lens
 from reconstruct.mapping import (
     Mapped,
     as_transform,
+    collapsed_frames,
     map_calibrated,
     model_baseline,
     scale_model,
@@ -205,6 +206,45 @@ def oblique_scene(camera: pycolmap.Camera, rng: np.random.Generator) -> Scene:
         ids=ids,
         pairs=pairs,
     )
+
+
+def collapse(model: pycolmap.Reconstruction, frame: int, onto: int) -> None:
+    """Put a frame onto another, and what both saw into their common centre."""
+    pose = model.frames[onto].rig_from_world
+    model.frames[frame].rig_from_world = pose
+    centre = pose.inverse().translation
+    for point in model.points3D.values():
+        frames = {model.images[e.image_id].frame_id for e in point.track.elements}
+        if frame in frames:
+            point.xyz = centre
+
+
+def test_a_station_that_collapsed_onto_another_is_registered_anew(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As COLMAP's adjustment of a first pair of arbitrary scale leaves it now and then."""
+    mapper, begun_from = pycolmap.incremental_mapping, []
+
+    def collapsing(database, images, output, options, **rest):  # type: ignore[no-untyped-def]
+        begun_from.append(rest.get("input_path"))
+        found = mapper(database, images, output, options, **rest)
+        if len(begun_from) == 1:
+            for number, model in found.items():
+                assert collapsed_frames(model) == []
+                collapse(model, 3, onto=4)
+                assert 3 in collapsed_frames(model)
+                model.write(Path(output) / str(number))
+        return found
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", collapsing)
+    scene = make_scene(lines=1, stations=7, points=5000, noise_px=0.3)
+    mapped = mapped_scene(scene)
+
+    assert len(begun_from) == 2
+    assert begun_from[1] is not None
+    assert mapped.model.num_reg_images() == len(scene.records)
+    assert collapsed_frames(mapped.model) == []
+    assert 1e-5 < camera_rms(mapped, scene) < 0.01
 
 
 def test_scaling_moves_rig_and_points_alike() -> None:

@@ -1,4 +1,3 @@
-
 """Lines parted into dives: fewest, then least energy, each within battery and time."""
 
 import re
