@@ -60,3 +60,12 @@ def heard() -> Iterator[list[str]]:
         yield told
     finally:
         _listeners.reset(token)
+
+
+def why(error: Exception) -> str:
+    """What went wrong with a file, without numbers of the operating system."""
+    if isinstance(error, FileNotFoundError):
+        return "no such file"
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror.lower()
+    return str(error)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.artefacts import write_csv
-from alice_survey.errors import NavigationError
+from alice_survey.errors import NavigationError, why
 from alice_survey.frames import Array, attitude_from_rotation, rotation_from_attitude
 
 TRACK_COLUMNS = (
@@ -83,7 +83,7 @@ def read_columns(
                 for i, row in enumerate(reader, 2)
             ]
     except (OSError, UnicodeDecodeError) as error:
-        raise NavigationError(f"{path}: cannot be read: {error}") from None
+        raise NavigationError(f"{path}: cannot be read: {why(error)}") from None
     values = np.asarray(table, dtype=np.float64).reshape(-1, len(required))
     return {name: values[:, i] for i, name in enumerate(required)}
 

@@ -94,7 +94,8 @@ def check_log(
         plan.area, rig, record.stations, pattern, cell_m=planned.grid.cell_m, threads=threads
     )
     if flown.blind:
-        warn(f"{flown.blind} stations look past the sea floor: they count as seeing nothing")
+        they = "station looks" if flown.blind == 1 else "stations look"
+        warn(f"{flown.blind} {they} past the sea floor: counted as seeing nothing")
     return Check(
         plan=plan, rig=rig, record=record, planned=planned, flown=flown, holes=find_holes(flown)
     )
@@ -238,7 +239,8 @@ def _fly_often(
     folder.mkdir(parents=True, exist_ok=True)
     draw_risk(
         folder / "hole_probability.png", check.plan.area, result.planned.grid,
-        result.hole_probability, f"{check.plan.name}: holes in {flights} simulated flights",
+        result.hole_probability,
+        f"{check.plan.name}: holes in {flights} simulated flight{_s(flights)}",
         _told_flights(result).strip(),
     )  # fmt: skip
     return result
@@ -264,6 +266,7 @@ def _told(check: Check) -> str:
             f"  left out: {count} ({count / record.triggered:.1%}) {reason}"
             for reason, count in record.left_out.items()
         ),
+        *_told_way(record),
         *(f"  {note}" for note in record.notes),
         f"{check.plan.name}: {flown.area_m2:.1f} m2, cameras {', '.join(flown.cameras)} "
         f"({check.rig.source}), judged every {100 * flown.grid.cell_m:.1f} cm",
@@ -275,6 +278,15 @@ def _told(check: Check) -> str:
         *_told_holes(check.holes),
     ]
     return "\n".join(lines)
+
+
+def _told_way(record: DiveRecord) -> list[str]:
+    if not record.on_way:
+        return []
+    return [
+        f"  on the way down and up: {record.on_way} ({record.on_way / record.triggered:.1%}), "
+        "before the first and after the last picture on a line"
+    ]
 
 
 def _told_holes(holes: Sequence[Hole]) -> list[str]:
@@ -303,7 +315,8 @@ def _told_holes(holes: Sequence[Hole]) -> list[str]:
 
 def _told_refly(again: dict[str, Any]) -> str:
     return (
-        f"\nto fly the holes again: {again['lines']} lines, {again['stations']} stations, "
+        f"\nto fly the holes again: {again['lines']} line{_s(again['lines'])}, "
+        f"{again['stations']} station{_s(again['stations'])}, "
         f"{again['length_m']:.0f} m, {again['duration_s'] / 60:.0f} min in {again['dives']} "
         f"dive{_s(again['dives'])}; then {again['coverage']:.2%} of them are at that overlap: "
         f"{again['folder']}"
@@ -316,9 +329,10 @@ def _told_flights(result: MonteCarlo) -> str:
     worst = float(result.to_json()["greatest_hole_probability"])
     complete = result.endings.get("complete", 0)
     return (
-        f"\n{result.flights} simulated flights, {complete} complete: at the overlap asked for "
-        f"{share['p50']:.2%} ({share['p05']:.2%} in the worst twentieth), in at least one picture "
-        f"{seen['p50']:.2%} ({seen['p05']:.2%});\nthe place that is missed most is missed in "
+        f"\n{result.flights} simulated flight{_s(result.flights)}, {complete} complete: at the "
+        f"overlap asked for {share['p50']:.2%} ({share['p05']:.2%} in the worst twentieth), in at "
+        f"least one picture {seen['p50']:.2%} ({seen['p05']:.2%});\n"
+        f"the place that is missed most is missed in "
         f"{math.ceil(100 * worst)} % of flights"
     )
 

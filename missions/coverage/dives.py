@@ -14,21 +14,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.errors import NavigationError, warn
+from alice_survey.errors import NavigationError, warn, why
 from alice_survey.frames import Array, rotation_from_attitude
 from alice_survey.manifest import read_manifest
 from alice_survey.trajectory import read_track
 from camera_calib.rig import Rig
 from missions.coverage.passes import assign_lines
-from missions.coverage.stations import Stations
+from missions.coverage.stations import MOST_ALTITUDES, Stations
 from missions.footprint import glass_point_cam
 from missions.logs.navigation_csv import NavigationLog, find_zone, read_navigation
 from missions.plan_file import Plan
 
-_MOST_ALTITUDES = 1.5
-"""Pictures from more planned altitudes than this do not count: their pixels on the sea floor are
-1.5 times as large, and the light is weaker by more than half (inferred: 1.5^-2 = 0.44, before any
-attenuation)."""
 _ELSEWHERE_M = 100.0
 """A log that stays farther from the area than this is of another place."""
 
@@ -54,6 +50,9 @@ class DiveRecord:
     triggered: int
     left_out: dict[str, int]
     """How many triggers, by reason."""
+    on_way: int
+    """Triggers high above the sea floor before the first and after the last picture on a line: on
+    the way down and up, where none was to be taken."""
     notes: tuple[str, ...]
     """What was assumed."""
     gaps: tuple[tuple[float, float], ...]
@@ -67,6 +66,7 @@ class DiveRecord:
             "triggered": self.triggered,
             "stations": len(self.stations),
             "left_out": self.left_out,
+            "on_way": self.on_way,
             "notes": list(self.notes),
             "gaps": [{"start_s": start, "length_s": length} for start, length in self.gaps],
         }
@@ -91,7 +91,7 @@ def read_dive_record(
         raise NavigationError("give triggers or a manifest, not both")
     if log.is_dir():
         return _simulated(log, plan, rig, triggers)
-    nav = read_navigation(log, find_zone("UTC"))
+    nav = _read_log(log)
     if manifest is not None:
         when = _triggers_of_manifest(manifest, rig)
     elif triggers is not None:
@@ -106,6 +106,20 @@ def read_dive_record(
     return _logged(log, nav, when, plan, rig)
 
 
+def _read_log(path: Path) -> NavigationLog:
+    """A log that spans some time.
+
+    Raises:
+        NavigationError: it cannot be used, or has one row.
+    """
+    nav = read_navigation(path, find_zone("UTC"))
+    if len(nav.time_s) < 2:
+        raise NavigationError(
+            f"{path}: fewer than 2 rows in order of time: give a log whose time increases"
+        )
+    return nav
+
+
 def read_triggers(path: Path, nav: NavigationLog) -> Triggers:
     """Times of pictures: `time_s` on the clock of the log, or `time_utc` if the log is dated.
 
@@ -118,7 +132,7 @@ def read_triggers(path: Path, nav: NavigationLog) -> Triggers:
             reader.fieldnames = [name.strip() for name in reader.fieldnames or []]
             rows = [(reader.line_num, row) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise NavigationError(f"{path}: cannot be read: {error}") from None
+        raise NavigationError(f"{path}: cannot be read: {why(error)}") from None
     names = list(reader.fieldnames or [])
     dated = "time_s" not in names
     if dated and "time_utc" not in names:
@@ -164,7 +178,9 @@ def _triggers_of_manifest(path: Path, rig: Rig) -> Triggers:
             f"{path}: no station has a picture of each of {', '.join(rig.cameras)}"
         )
     if len(whole) < len(taken):
-        warn(f"{path}: {len(taken) - len(whole)} stations lack a camera and do not count")
+        lacking = len(taken) - len(whole)
+        they = "station lacks" if lacking == 1 else "stations lack"
+        warn(f"{path}: {lacking} {they} a camera: left out")
     times = np.array([float(np.mean(list(times.values()))) for times in whole])
     if np.isnan(times).any():
         raise NavigationError(f"{path}: {int(np.isnan(times).sum())} stations have no time_s")
@@ -173,7 +189,7 @@ def _triggers_of_manifest(path: Path, rig: Rig) -> Triggers:
 
 def _simulated(folder: Path, plan: Plan, rig: Rig, triggers: Path | None) -> DiveRecord:
     """The true stations of a simulated flight; the altitude is what its DVL measured."""
-    nav = read_navigation(folder / "navigation.csv", find_zone("UTC"))
+    nav = _read_log(folder / "navigation.csv")
     when = read_triggers(triggers or folder / "triggers.csv", nav)
     truth = folder / "truth" / "track.csv"
     if not truth.is_file():
@@ -213,9 +229,10 @@ def _logged(path: Path, nav: NavigationLog, triggers: Triggers, plan: Plan, rig:
             f"{nav.time_s[0]:.1f} to {nav.time_s[-1]:.1f} s): check the clocks"
         )
     at = {name: values[kept] for name, values in at.items()}
+    time_s = triggers.time_s[kept]
     geodetic = np.column_stack([at["latitude_deg"], at["longitude_deg"], at["depth_m"]])
     body_ned = plan.datum.ned_from_geodetic(geodetic)
-    attitude = _attitude(nav, at, triggers.time_s[kept], plan, notes)
+    attitude = _attitude(nav, at, time_s, plan, notes)
     lever = rig.body_from_cam(rig.reference).apply(glass_point_cam(rig.cameras[rig.reference]))
     glass_ned = body_ned + rotation_from_attitude(*attitude.T).apply(lever)
     glass_ned[:, 2] = at["depth_m"] + (glass_ned[:, 2] - body_ned[:, 2])
@@ -232,18 +249,24 @@ def _logged(path: Path, nav: NavigationLog, triggers: Triggers, plan: Plan, rig:
         altitude_m=altitude,
         attitude_rad=attitude,
         line=np.full(len(kept), -1) if triggers.line is None else triggers.line[kept],
-        time_s=triggers.time_s[kept],
+        time_s=time_s,
     )
     _check_place(path, plan, stations)
-    stations = _usable(stations, plan, left_out)
+    high, below = _unusable(stations, plan)
+    stations = stations.some(~(high | below))
     if triggers.line is None:
         stations = replace(stations, line=assign_lines(stations, plan))
+    on_way = high & _outside_lines(time_s, stations)
+    most_m = MOST_ALTITUDES * plan.altitude_m
+    _count(left_out, "at or below the sea floor, by their altitude", below)
+    _count(left_out, f"higher than {most_m:.2g} m above the sea floor", high & ~on_way)
     record = DiveRecord(
         source=str(path),
         triggers=triggers.source,
         stations=stations,
         triggered=len(triggers.time_s),
         left_out=left_out,
+        on_way=int(on_way.sum()),
         notes=tuple(notes),
         gaps=_gaps(nav),
     )
@@ -313,13 +336,18 @@ def _check_place(path: Path, plan: Plan, stations: Stations) -> None:
         )
 
 
-def _usable(stations: Stations, plan: Plan, left_out: dict[str, int]) -> Stations:
-    below = stations.altitude_m <= 0
-    most_m = _MOST_ALTITUDES * plan.altitude_m
-    high = stations.altitude_m > most_m
-    _count(left_out, "at or below the sea floor, by their altitude", below)
-    _count(left_out, f"higher than {most_m:.2g} m above the sea floor", high)
-    return stations.some(~(below | high))
+def _unusable(stations: Stations, plan: Plan) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """(S,) whether stations are too high above the sea floor, and whether they are not above it."""
+    return stations.altitude_m > MOST_ALTITUDES * plan.altitude_m, stations.altitude_m <= 0
+
+
+def _outside_lines(time_s: Array, stations: Stations) -> NDArray[np.bool_]:
+    """(N,) whether times are before the first or after the last station on a line."""
+    if stations.time_s is None or not np.any(stations.line >= 0):
+        return np.zeros(len(time_s), dtype=bool)
+    on_line_s = stations.time_s[stations.line >= 0]
+    outside: NDArray[np.bool_] = (time_s < on_line_s.min()) | (time_s > on_line_s.max())
+    return outside
 
 
 def _count(left_out: dict[str, int], reason: str, which: NDArray[np.bool_]) -> None:
@@ -334,13 +362,8 @@ def _gaps(nav: NavigationLog) -> tuple[tuple[float, float], ...]:
 
 
 def _tell(record: DiveRecord) -> None:
-    """Warn of what was left out and assumed."""
+    """Warn of gaps; what was left out and assumed stands in the report of who reads the record."""
     for start_s, length_s in record.gaps[:8]:
         warn(f"{record.source}: a gap of {length_s:.1f} s from {start_s:.1f} s")
     if len(record.gaps) > 8:
         warn(f"{record.source}: {len(record.gaps) - 8} more gaps")
-    for reason, count in record.left_out.items():
-        share = count / record.triggered
-        warn(f"{record.source}: {count} of {record.triggered} triggers ({share:.1%}) {reason}")
-    for note in record.notes:
-        warn(f"{record.source}: {note}")

@@ -17,6 +17,11 @@ from missions.plan_file import Plan
 if TYPE_CHECKING:
     from missions.flight import Flight
 
+MOST_ALTITUDES = 1.5
+"""Pictures from more planned altitudes than this do not count: their pixels on the sea floor are
+1.5 times as large, and the light is weaker by more than half (inferred: 1.5^-2 = 0.44, before any
+attenuation)."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Stations:

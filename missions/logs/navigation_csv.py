@@ -10,7 +10,7 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
 
-from alice_survey.errors import NavigationError, warn
+from alice_survey.errors import NavigationError, warn, why
 from alice_survey.frames import Array
 
 POSITION = ("latitude_deg", "longitude_deg", "depth_m")
@@ -105,7 +105,7 @@ def read_navigation(path: Path, zone: tzinfo) -> NavigationLog:
             reader.fieldnames = header
             rows = [(reader.line_num, row) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise NavigationError(f"{path}: cannot be read: {error}") from None
+        raise NavigationError(f"{path}: cannot be read: {why(error)}") from None
     time_name = next((name for name in ("time_s", "time_utc") if name in header), None)
     if time_name is None:
         raise NavigationError(f"{path}: no column time_s or time_utc; it has {', '.join(header)}")
@@ -116,7 +116,7 @@ def read_navigation(path: Path, zone: tzinfo) -> NavigationLog:
     start: datetime | None = None
     times: list[float] = []
     table: list[list[float]] = []
-    faults: list[str] = []
+    faults: list[tuple[int, str]] = []
     for line, row in rows:
         try:
             date = _date(row[time_name], zone) if time_name == "time_utc" else None
@@ -126,28 +126,46 @@ def read_navigation(path: Path, zone: tzinfo) -> NavigationLog:
             time = since.total_seconds() if since is not None else _number(row, time_name)
             position = [_number(row, name) for name in POSITION]
         except ValueError as error:
-            faults.append(f"line {line}: {error}")
+            faults.append((line, str(error)))
             continue
         if times and time <= times[-1]:
-            faults.append(f"line {line}: its time does not follow that of the row before")
+            faults.append((line, "time does not follow that of the row before"))
             continue
         rest = []
         for name in names[len(POSITION) :]:
             try:
                 rest.append(_number(row, name) if (row[name] or "").strip() else math.nan)
             except ValueError as error:
-                faults.append(f"line {line}: {error} (that value only)")
+                faults.append((line, f"{error} (that value only)"))
                 rest.append(math.nan)
         times.append(time)
         table.append([*position, *rest])
     if faults:
-        more = f" and {len(faults) - _NAMED} more" if len(faults) > _NAMED else ""
-        warn(f"{path}: left out {'; '.join(faults[:_NAMED])}{more}")
+        told = _by_ranges(faults)
+        more = f" and {len(told) - _NAMED} more" if len(told) > _NAMED else ""
+        warn(f"{path}: left out {'; '.join(told[:_NAMED])}{more}")
     if not times:
         raise NavigationError(f"{path}: no row with a time and a position")
     values = np.array(table)
     columns = {name: values[:, i] for i, name in enumerate(names)}
     return NavigationLog(time_s=np.array(times), columns=columns, start_utc=start)
+
+
+def _by_ranges(faults: Sequence[tuple[int, str]]) -> list[str]:
+    """Faults by line, in order: one text for lines that follow one another with the same fault."""
+    ranges: list[tuple[int, int, str]] = []
+    latest: dict[str, int] = {}
+    for line, fault in faults:
+        index = latest.get(fault)
+        if index is not None and ranges[index][1] == line - 1:
+            ranges[index] = (ranges[index][0], line, fault)
+        else:
+            latest[fault] = len(ranges)
+            ranges.append((line, line, fault))
+    return [
+        f"line {first}: {fault}" if first == last else f"lines {first} to {last}: {fault}"
+        for first, last, fault in ranges
+    ]
 
 
 def _number(row: dict[str, str | None], name: str) -> float:

@@ -173,5 +173,5 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
     workspace_of(tmp_path, survey(shapely.box(0, 0, 8, 6)))
     with pytest.raises(WorkspaceError, match="alice-survey fly"):
         check_report(tmp_path, CONFIG)
-    with pytest.raises(NavigationError, match="cannot be read"):
+    with pytest.raises(NavigationError, match=r"nav\.csv: cannot be read: no such file$"):
         check_report(tmp_path, CONFIG, tmp_path / "nav.csv")

@@ -55,7 +55,21 @@ def test_bad_rows_are_left_out_and_named(
     assert told.count("\n") == 1
     for line, what in ((3, "latitude_deg is nan"), (4, "depth_m is 'x'"), (5, "heading_deg is nan"),
                        (6, "does not follow"), (7, "latitude_deg is 97")):  # fmt: skip
-        assert f"line {line}: {what}" in told.replace("its time ", "")
+        assert f"line {line}: {what}" in told.replace("time does", "does")
+
+
+def test_rows_of_one_fault_are_told_as_ranges(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = [f"{t},{'nan' if 10 <= t < 50 else 60},5,1,{'x' if t in (5, 6, 8) else 0},2"
+            for t in range(60)]  # fmt: skip
+    read_navigation(log_file(tmp_path, *rows, "3,60,5,1,0,2"), UTC)
+    assert capsys.readouterr().err.split("left out ")[1].strip().split("; ") == [
+        "lines 7 to 8: heading_deg is 'x', not a number (that value only)",
+        "line 10: heading_deg is 'x', not a number (that value only)",
+        "lines 12 to 51: latitude_deg is nan",
+        "line 62: time does not follow that of the row before",
+    ]
 
 
 def test_dates_obey_their_own_zone_else_the_one_given(tmp_path: Path) -> None:
