@@ -421,6 +421,8 @@ def _one_line(error: ValidationError) -> str:
             faults.append(f"{key} is not a known setting{_nearest(fault['loc'])}")
         elif fault["type"] == "value_error":
             faults.append(f"{key}: {fault['ctx']['error']}")
+        elif fault["loc"] == ("name",) and fault["type"] == "string_pattern_mismatch":
+            faults.append(f"name = {_shown(fault['input'])}: use letters, digits, spaces, . _ -")
         else:
             faults.append(f"{key} = {_shown(fault['input'])}: {_requirement(fault)}")
     return "; ".join(faults)

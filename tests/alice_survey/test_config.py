@@ -72,7 +72,7 @@ def test_settings_of_a_file_are_read(tmp_path: Path) -> None:
         ({"camera": {"position_body_m": [1, 2]}}, ["camera.position_body_m"]),
         ({"seed": -1}, ["seed = -1", ">= 0"]),
         ({"name": ""}, ["name = ''"]),
-        ({"name": "a/b"}, ["name = 'a/b'"]),
+        ({"name": "a/b"}, ["name = 'a/b': use letters, digits, spaces, . _ -"]),
         ({"plan": 3}, ["plan = 3"]),
         ({"plan": [1, 2]}, ["plan"]),
     ],
