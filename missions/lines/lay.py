@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.compiled import tell_of_compiling
 from alice_survey.errors import PlanError
 from alice_survey.frames import Array
 from missions.areas.area import Area
@@ -92,6 +93,7 @@ def lay_lines(
         PlanError: there are too many stations, no line can be flown, or there is no way inside the
             allowed area between two lines.
     """
+    tell_of_planner()
     check_size(area, pattern, most_stations)
     result = laid(
         Site.of(area),
@@ -138,6 +140,11 @@ def ordered(
     return [lines[i // 4].reversed() if b else lines[i // 4] for i, b in chosen]
 
 
+def tell_of_planner() -> None:
+    """Say that the first plan after an installation waits until the planner is compiled."""
+    tell_of_compiling(hops.flight_parts_j, "the planner, once: this takes 40 s to a minute")
+
+
 def check_size(area: Area, pattern: Pattern, most_stations: int = MOST_STATIONS) -> None:
     """Refuse an area that is much too large before lines are laid.
 
@@ -159,8 +166,12 @@ def laid(
     *,
     cross_lines: int,
     closing_line: bool,
+    quick: bool = False,
 ) -> Laid:
-    """As `lay_lines`, as arrays and with the cost."""
+    """As `lay_lines`, as arrays and with the cost.
+
+    Quick is without fill lines, and with an order of many cells that is improved, but not shaken.
+    """
     pieces, offsets, cuts = survey_pieces(site, heading_rad, pattern)
     if len(pieces) == 0:
         raise PlanError(
@@ -192,7 +203,7 @@ def laid(
     closed = _closings(corners, first_steps, ends, _piece_at(begins, listed).ravel())
     closes = closing_line and survey_count > 1
     order = _tour(
-        corners, exits, inner, ways, prices, home, closed if closes else None, survey_cells
+        corners, exits, inner, ways, prices, home, closed if closes else None, survey_cells, quick
     )
     flown = cells.flown(order, begins, listed)
     table = _table(ends, flown, heading_rad, survey_count)
@@ -202,7 +213,7 @@ def laid(
         table = np.concatenate([table, closed.table[order[:1]]])
         steps = np.concatenate([steps, closed.steps[order[:1]]])
         kinds = np.append(kinds, CLOSING)
-    fills = fill_table(site, heading_rad, pattern, pieces, offsets, cuts)
+    fills = cuts[:0] if quick else fill_table(site, heading_rad, pattern, pieces, offsets, cuts)
     if len(fills):
         table, steps, kinds = _inserted(fills, table, steps, kinds, home, ways, prices)
     ways_m = ways_between(table, home, ways)
@@ -355,8 +366,15 @@ def _tour(
     home: Array,
     closed: _Closings | None,
     survey_cells: int,
+    quick: bool = False,
 ) -> NDArray[np.int64]:
     """The order of cells: corners of entry, counted through."""
+
+    def improved(first: NDArray[np.int64], finish: Array, fixed: int) -> NDArray[np.int64]:
+        if quick:
+            return tour.improved_tour(first, over, exits, inner, start, finish, fixed)
+        return tour.good_tour(over, exits, inner, start, finish, first, fixed)
+
     size = len(inner)
     enter = corners.reshape(-1, 3)
     leave = enter + np.array([0.0, 0.0, math.pi])
@@ -374,7 +392,7 @@ def _tour(
             order = tour.exact_tour(over, exits, inner, start, plain[None], False)[1]
         else:
             order = tour.nearest_tour(over, exits, inner, start)
-            order = tour.good_tour(over, exits, inner, start, plain, order, 0)
+            order = improved(order, plain, 0)
         return np.asarray(order)
     start[cells.CORNERS * survey_cells :] = np.inf
 
@@ -396,10 +414,10 @@ def _tour(
         order = tour.exact_tour(over, exits, inner, start, finish, True)[1]
     else:
         order = tour.nearest_tour(over, exits, inner, start)
-        order = tour.good_tour(over, exits, inner, start, plain, order, 0)
+        order = improved(order, plain, 0)
         # Now that it is known where the flight begins, so is where it ends.
         finish_j = finishes(order[:1])[0]
-        order = tour.good_tour(over, exits, inner, start, finish_j, order, 1)
+        order = improved(order, finish_j, 1)
     return np.asarray(order)
 
 

@@ -7,22 +7,28 @@ any area: W. H. Huang 2001 takes the same sum over cells).
 
 For the full cost no formula is known: it jumps where a line more is needed, and turns, transits and
 the current have their say. A cheap estimate (energy of all pieces of lines, and of a turn to each)
-is taken at many headings, at the directions of edges and just where the number of lines jumps; the
-full cost at the best of these, then again near the best of all.
+is taken at many headings, at the directions of edges and just where the number of lines jumps; at
+the best of these a close one (the tour is only improved, and fill lines are left out, which take
+most of the time and differ little between good headings), then again near the best of all; the full
+cost at the best of those.
 """
 
 import math
+import time
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 import shapely
 
 from alice_survey.compiled import compiled
 from alice_survey.errors import PlanError
+from alice_survey.executor import progress
 from alice_survey.frames import Array
 from missions.areas.area import Area
 from missions.lines import cells, hops, rows
-from missions.lines.lay import check_size, laid
+from missions.lines.lay import check_size, laid, tell_of_planner
 from missions.lines.pattern import Pattern
 from missions.lines.site import Site
 from missions.route.costs import Costs
@@ -33,11 +39,19 @@ _ESTIMATES = 1800
 _FEW_ROWS = 400
 _LEAST_ESTIMATES = 360
 _SPREAD = 45
-"""Headings at which the full cost is taken whatever the estimate says."""
+"""Headings at which the close cost is taken whatever the estimate says."""
 _BEST = 24
 """Best estimates at which it is taken."""
 _REFINED = 4
-"""Best full costs near which it is taken again."""
+"""Best close costs near which they are taken again."""
+_BESIDE = (-3.0, -2.0, -1.0, 1.0, 2.0, 3.0)
+"""Tenths of a degree beside these at which they are."""
+_FULL = 16
+"""Best close costs at which the full cost is taken."""
+_MOST = _SPREAD + 1 + _BEST + _REFINED * (_REFINED + len(_BESIDE)) + _FULL
+_TIMED = 10
+"""Costs after which is known how long all will take."""
+_WORTH_SHOWING_S = 2.0
 _NEAR_RAD = math.radians(2.0)
 _BESIDE_RAD = 1e-9
 """A jump is left on the side of fewer lines by this."""
@@ -73,18 +87,20 @@ def best_heading(
     Raises:
         PlanError: the area is too large, or cannot be flown at any heading.
     """
+    tell_of_planner()
     check_size(area, pattern)
     site, prices = Site.of(area), hops.prices_of(costs)
     width_heading, width = least_width(site.survey)
+    close: dict[float, float] = {}
     found: dict[float, float] = {}
     faults: list[PlanError] = []
 
-    def take(headings: Array) -> None:
+    def take(costs_j: dict[float, float], headings: Array) -> Iterator[float]:
         for heading in np.unique(headings % math.pi).tolist():
-            if heading in found:
+            if heading in costs_j:
                 continue
             try:
-                found[heading] = laid(
+                costs_j[heading] = laid(
                     site,
                     heading,
                     pattern,
@@ -93,22 +109,29 @@ def best_heading(
                     home_ne,
                     cross_lines=cross_lines,
                     closing_line=closing_line,
+                    quick=costs_j is close,
                 ).energy_j
             except PlanError as fault:
                 faults.append(fault)
+            yield heading
 
-    headings = _headings(area, site, pattern)
-    estimates = estimate_j(site, headings, pattern, prices, cross_lines)
-    take(np.append(np.arange(_SPREAD) * math.pi / _SPREAD, width_heading))
-    take(_best(headings, estimates, _BEST, math.radians(0.3)))
-    for heading in sorted(found, key=lambda x: found[x])[:_REFINED]:
-        apart = np.abs((headings - heading + math.pi / 2) % math.pi - math.pi / 2)
-        near = apart < _NEAR_RAD
-        take(_best(headings[near], estimates[near], _REFINED, math.radians(0.05)))
-        take(heading + math.radians(0.1) * np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0]))
+    def search() -> Iterator[float]:
+        headings = _headings(area, site, pattern)
+        estimates = estimate_j(site, headings, pattern, prices, cross_lines)
+        yield from take(close, np.append(np.arange(_SPREAD) * math.pi / _SPREAD, width_heading))
+        yield from take(close, _best(headings, estimates, _BEST, math.radians(0.3)))
+        for heading in _least(close, _REFINED):
+            apart = np.abs((headings - heading + math.pi / 2) % math.pi - math.pi / 2)
+            near = apart < _NEAR_RAD
+            best = _best(headings[near], estimates[near], _REFINED, math.radians(0.05))
+            yield from take(close, best)
+            yield from take(close, heading + math.radians(0.1) * np.array(_BESIDE))
+        yield from take(found, np.array(_least(close, _FULL)))
+
+    _run(search())
     if not found:
         raise faults[0]
-    best = min(found, key=lambda x: (found[x], x))
+    best = _least(found, 1)[0]
     return Sweep(
         heading_rad=best,
         cost_j=found[best],
@@ -116,6 +139,21 @@ def best_heading(
         width_m=width,
         candidates=tuple(sorted(found.items())),
     )
+
+
+def _least(costs_j: dict[float, float], count: int) -> list[float]:
+    """The cheapest headings."""
+    return sorted(costs_j, key=lambda x: (costs_j[x], x))[:count]
+
+
+def _run(search: Iterator[float]) -> None:
+    """Go through a search; one that will take long shows how far it is."""
+    began = time.monotonic()
+    done = sum(1 for _ in islice(search, _TIMED))
+    if (time.monotonic() - began) * _MOST / _TIMED > _WORTH_SHOWING_S:
+        search = progress(search, "headings tried", _MOST - done)
+    for _ in search:
+        pass
 
 
 def full_cost_j(

@@ -1,5 +1,7 @@
 import dataclasses
+import itertools
 import math
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ from missions.lines.site import Site
 from missions.lines.sweep import best_heading, full_cost_j, least_width, widths_m
 from missions.route.costs import Costs, time_costs
 from missions.route.ways import Ways
-from tests.oracles_lines import ELL, STEREO, area_of, areas
+from tests.oracles_lines import ELL, ELL_WITH_HOLES, STEREO, area_of, areas
 
 ALONG = np.arange(16) * 2 * np.pi / 16
 NORTHWARD = dataclasses.replace(
@@ -90,3 +92,34 @@ def test_headings_that_cannot_be_flown_are_told() -> None:
             parts, STEREO, Ways(parts.allowed), time_costs(0.2), (0.0, 0.0),
             cross_lines=0, closing_line=False,
         )  # fmt: skip
+
+
+def test_the_search_over_areas_with_fill_lines_finds_as_good_a_heading() -> None:
+    """The search leaves fill lines out until it compares the best headings."""
+    area = area_of(ELL_WITH_HOLES)
+    ways, home = Ways(area.allowed), (-2.0, -2.0)
+    kinds = {"cross_lines": 1, "closing_line": True}
+    sweep = best_heading(area, STEREO, ways, time_costs(0.2), home, **kinds)
+    sampled = [
+        full_cost_j(area, h, STEREO, ways, time_costs(0.2), home, **kinds)
+        for h in (np.arange(120) + 0.3) * math.pi / 120
+    ]
+    assert sweep.cost_j <= 1.005 * min(sampled)
+    assert max(sampled) > 1.02 * sweep.cost_j
+
+
+def test_a_search_that_takes_long_shows_how_far_it_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    area = area_of(QUAD)
+    arguments = area, STEREO, Ways(area.allowed), time_costs(0.2), (0.0, 0.0)
+    monkeypatch.setattr("missions.lines.sweep.time.monotonic", _ticks(1e-6).__next__)
+    best_heading(*arguments, cross_lines=0, closing_line=False)
+    assert "headings tried" not in capsys.readouterr().err
+    monkeypatch.setattr("missions.lines.sweep.time.monotonic", _ticks(5.0).__next__)
+    best_heading(*arguments, cross_lines=0, closing_line=False)
+    assert "headings tried" in capsys.readouterr().err
+
+
+def _ticks(step_s: float) -> Iterator[float]:
+    return itertools.count(0.0, step_s)
