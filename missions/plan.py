@@ -24,7 +24,12 @@ from missions.areas.bathymetry import Bathymetry, area_depth, read_bathymetry
 from missions.areas.files import area_files
 from missions.areas.survey import survey_area
 from missions.coverage.certificate import Certificate, certificate
-from missions.coverage.stations import Stations, stations_of_plan, sure_pattern
+from missions.coverage.stations import (
+    MOST_ALTITUDES,
+    Stations,
+    stations_of_plan,
+    sure_pattern,
+)
 from missions.footprint import Swath, common_swath, footprint_size_m, joint_swath
 from missions.imaging.settings import ImagingSettings, imaging_settings, raw_bytes
 from missions.imaging.table import Setting
@@ -37,7 +42,14 @@ from missions.plan_rows import plan_rows
 from missions.route.costs import Costs
 from missions.route.dives import split_dives
 from missions.route.energy import usable_wh, vehicle_costs
-from missions.route.terrain import TerrainLimits, line_profiles, reach_of, terrain_report
+from missions.route.terrain import (
+    HALF_BREADTH_M,
+    TAIL_M,
+    TerrainLimits,
+    line_profiles,
+    reach_of,
+    terrain_report,
+)
 from missions.route.ways import Ways
 
 __all__ = ["Plan", "Planned", "make_plan", "plan_survey", "read_plan", "run_plan"]
@@ -136,6 +148,7 @@ def _plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
     bathymetry = _bathymetry(config, area)
     _check_smallest(area, imaging)
     _warn_of_spacing(config, imaging, stereo)
+    _warn_of_zones(config, area)
     depth_m = _depth_m(config, area, bathymetry)
     _check_depth(config, depth_m)
     ways, home = Ways(area.allowed), _home(config, area)
@@ -236,21 +249,24 @@ def _turn_margin_m(config: SurveyConfig, told: Pattern) -> float:
 
 
 def _home(config: SurveyConfig, area: Area) -> tuple[float, float]:
-    """Where dives begin and end: as set, or the first corner of the area, or close to it.
+    """Where dives begin and end: as set, or the area's corner nearest the datum, or close to it.
 
     Raises:
         PlanError: it is not where the vehicle may be.
     """
     given = config.plan.home_ne_m
     if given is None:
-        corner = Point(area.rings_ne[0][0])
-        nearest, _ = shapely.ops.nearest_points(area.allowed, corner)
+        corners = area.corners_ne
+        # Of corners as far from the datum the most southerly, then the most westerly.
+        distance = np.round(np.hypot(corners[:, 0], corners[:, 1]), 6)
+        rank = np.lexsort((corners[:, 1], corners[:, 0], distance))
+        nearest, _ = shapely.ops.nearest_points(area.allowed, Point(corners[rank[0]]))
         return round(float(nearest.x), 9), round(float(nearest.y), 9)
     away_m = float(area.allowed.distance(Point(given)))
     if away_m > 1e-6:
         raise PlanError(
             f"home at north {given[0]:g}, east {given[1]:g} m is {away_m:.1f} m outside of where "
-            "the vehicle may be: move plan.home_ne_m, or widen area.turn_margin_m or area.allowed"
+            "the vehicle may be: move plan.home_ne_m, or widen area.turn_margin_m or the allowed area"
         )
     return given
 
@@ -277,7 +293,8 @@ def _depth_m(config: SurveyConfig, area: Area, bathymetry: Bathymetry | None) ->
     if bathymetry is None:
         return set_m
     found = area_depth(bathymetry, area.survey)
-    if abs(found.mean_m - set_m) > max(0.5, 0.05 * set_m):
+    told = "seafloor_depth_m" in config.area.model_fields_set
+    if told and abs(found.mean_m - set_m) > max(0.5, 0.05 * set_m):
         warn(
             f"{bathymetry.name}: the sea floor of the area is {found.mean_m:.2f} m deep in the "
             f"mean, area.seafloor_depth_m is {set_m:g}: the former is planned with; set the latter "
@@ -329,9 +346,18 @@ def _stations(plan: Plan, bathymetry: Bathymetry | None) -> Stations:
     """Where pictures are taken when the plan is flown exactly."""
     if bathymetry is None:
         return stations_of_plan(plan)
-    return stations_of_plan(
-        plan, bathymetry.depth_at(np.vstack([x.stations_ne for x in plan.lines]))
-    )
+    places = np.vstack([line.stations_ne for line in plan.lines])
+    stations = stations_of_plan(plan, bathymetry.depth_at(places))
+    # As for a dive: from too high a place, what is seen is not what was asked for.
+    near = stations.altitude_m <= MOST_ALTITUDES * plan.altitude_m
+    if not near.all():
+        warn(
+            f"{np.count_nonzero(~near)} of {len(near)} pictures are taken from more than "
+            f"{MOST_ALTITUDES:g} times altitude_m, where the terrain is too steep to follow: they "
+            "do not count as coverage; raise steepest_deg, turn the lines along the slope "
+            "(line_heading_deg), or survey the steep part apart"
+        )
+    return stations.some(np.flatnonzero(near))
 
 
 def _check_depth(config: SurveyConfig, depth_m: float) -> None:
@@ -360,7 +386,20 @@ def _check_smallest(area: Area, imaging: ImagingSettings) -> None:
     if diagonal_m < least_m:
         raise PlanError(
             f"area: {diagonal_m:.2g} m across is less than one picture of "
-            f"{imaging.footprint_across_m:.2f} x {imaging.footprint_along_m:.2f} m: nothing to plan"
+            f"{imaging.footprint_across_m:.2f} x {imaging.footprint_along_m:.2f} m: nothing to "
+            "plan; plan.margin_m adds its surroundings"
+        )
+
+
+def _warn_of_zones(config: SurveyConfig, area: Area) -> None:
+    """The allowed area holds the camera: the hull behind it reaches farther."""
+    forward_m, right_m = config.camera.position_body_m[:2]
+    behind_m = math.hypot(TAIL_M + forward_m, HALF_BREADTH_M + abs(right_m))
+    if not area.no_go.is_empty and config.area.no_go_clearance_m < behind_m:
+        warn(
+            f"the camera is kept {config.area.no_go_clearance_m:g} m off the no-go zones, the hull "
+            f"reaches {behind_m:.1f} m from it and navigation errs on top: raise "
+            "area.no_go_clearance_m unless the zones have room around what they keep off"
         )
 
 

@@ -107,7 +107,7 @@ def _check_lines(table: Array, ways: Ways | None, first_line: int) -> None:
         raise PlanError(
             f"{len(outside)} of {len(table)} lines leave the allowed area, first line "
             f"{first_line + outside[0]} from {n_0:.2f} m north, {e_0:.2f} m east to {n_1:.2f}, "
-            f"{e_1:.2f}: widen area.allowed"
+            f"{e_1:.2f}: give it more room: area.turn_margin_m, or a wider allowed area"
         )
 
 
@@ -203,6 +203,6 @@ def _warn_of_others(kinds: NDArray[np.intp], turns: Turns) -> None:
     if others:
         warn(
             f"{others} of {len(asked)} turns have no room for turns = {turns!r} inside the allowed "
-            "area or are too far for it: the cheapest other way is taken there; widen area.allowed "
-            "or set plan.turns = 'auto'"
+            "area or are too far for it: the cheapest other way is taken there; widen "
+            "area.turn_margin_m or set plan.turns = 'auto'"
         )

@@ -109,7 +109,7 @@ class Ways:
             if not point_inside(self.fence, place[0], place[1]):
                 raise PlanError(
                     f"the place {place[0]:.2f} m north, {place[1]:.2f} m east is outside of the "
-                    "allowed area: move it or widen area.allowed"
+                    "allowed area: move it, or widen area.turn_margin_m or the allowed area"
                 )
         best_m, best = math.inf, (-1, -1)
         if len(self._nodes):
@@ -123,7 +123,7 @@ class Ways:
             raise PlanError(
                 f"no way inside the allowed area from {a[0]:.2f} m north, {a[1]:.2f} m east to "
                 f"{b[0]:.2f} m north, {b[1]:.2f} m east: its parts are not connected; widen "
-                "area.allowed or survey the parts one by one"
+                "the allowed area (area.turn_margin_m), or survey the parts one by one"
             )
         before = self._from_node[best[0]][1]
         chain = [best[1]]
