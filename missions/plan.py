@@ -266,7 +266,7 @@ def _home(config: SurveyConfig, area: Area) -> tuple[float, float]:
     if away_m > 1e-6:
         raise PlanError(
             f"home at north {given[0]:g}, east {given[1]:g} m is {away_m:.1f} m outside of where "
-            "the vehicle may be: move plan.home_ne_m, or widen area.turn_margin_m or the allowed area"
+            "the vehicle may be: move plan.home_ne_m, or widen area.turn_margin_m or allowed area"
         )
     return given
 

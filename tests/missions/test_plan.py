@@ -162,15 +162,16 @@ def test_lines_take_the_heading_they_are_given(heading_deg: float) -> None:
     assert plan.coverage == pytest.approx(1.0, abs=1e-9)
 
 
-def test_the_first_line_starts_at_the_first_corner() -> None:
+def test_the_first_line_starts_at_home_the_corner_nearest_the_datum() -> None:
     for corners in (
         [[0, 0], [20, 0], [20, 10], [0, 10]],
         [[20, 10], [0, 10], [0, 0], [20, 0]],
-        [[20, 0], [20, 10], [0, 10], [0, 0]],
+        [[20, 2], [20, 10], [1, 10], [1, 2]],
     ):
         plan = planned(area={"polygon_ne_m": corners})
+        assert plan.home_ne_m == tuple(min(corners))
         starts = [math.dist(plan.lines[0].start_ne_m, corner) for corner in corners]
-        assert starts[0] == min(starts)
+        assert corners[int(np.argmin(starts))] == min(corners)
 
 
 def test_without_forward_overlap_the_certificate_shows_the_gaps(
