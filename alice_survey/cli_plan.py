@@ -156,15 +156,32 @@ def check(
 def export(
     workspace: Workspace = WORK,
     formats: Annotated[
-        list[str] | None, typer.Option("--format", help="Which; all when not given.")
+        list[str] | None,
+        typer.Option(
+            "--format",
+            help="cola2, cola2-v1, qgc, qgc-survey, wpl, kml, gpx, geojson, csv; all if none.",
+        ),
     ] = None,
+    camera_on: Annotated[
+        str | None, typer.Option(help="COLA2's service that starts pictures.")
+    ] = None,
+    camera_off: Annotated[str | None, typer.Option(help="The one that stops them.")] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Folder to write.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Write a plan in files that vehicles and planners load."""
     from missions.exports.write import export_report
 
-    print_result(*export_report(workspace / "plan" / "plan.json", formats, output), as_json)
+    print_result(
+        *export_report(
+            workspace / "plan" / "plan.json",
+            formats,
+            output,
+            camera_on=camera_on,
+            camera_off=camera_off,
+        ),
+        as_json,
+    )
 
 
 @app.command(epilog=examples("plan current -w reef", "plan current -w reef --plot trade.png"))

@@ -33,6 +33,8 @@ def _flight(folder: Path) -> Summary:
         f"{_metres(line['believed_cross_track_rms_m'])}), heading "
         f"{_degrees(line['heading_rms_deg'])} rms; roll in turns to "
         f"{_degrees(turn['roll_worst_deg'])}; {sum(found['energy_wh'].values()):.1f} Wh; "
+        f"{found['coverage']['share_at_overlap']:.1%} of the area covered as asked, "
+        f"{found['coverage']['every_camera_share']:.1%} seen by every camera; "
         f"plots in {folder / 'track.png'} and {folder / 'vehicle.png'}"
     )
     return text, found

@@ -13,6 +13,9 @@ from alice_survey.vehicle.log import VehicleLog, vehicle_log
 from alice_survey.vehicle.navigation import tick as navigation
 from alice_survey.vehicle.pilot.memory import PHASE
 from alice_survey.vehicle.simulator import Flown
+from camera_calib.rig import design_rig
+from missions.coverage.certificate import certificate
+from missions.coverage.stations import plan_pattern, stations_of_flight
 from missions.flight import Flight, rms
 from missions.flight_route import stations_of_dives
 from missions.logs.bag import BagRecord, Samples
@@ -130,6 +133,21 @@ def flight_summary(flight: Flight, config: SurveyConfig) -> dict[str, Any]:
         "navigation_error_rms_m": _rms(np.linalg.norm(off[following, :2], axis=1)),
         "power_mean_w": float(flown.power_w.sum(axis=1).mean()),
         "energy_wh": dict(zip(flown.thrusters, energy_wh.tolist(), strict=True)),
+        "coverage": _coverage(flight, config),
+    }
+
+
+def _coverage(flight: Flight, config: SurveyConfig) -> dict[str, float]:
+    """What the pictures of the true track see of the whole area; `plan check` tells more."""
+    if not len(flight.trigger_s):
+        return {"covered_share": 0.0, "every_camera_share": 0.0, "share_at_overlap": 0.0}
+    rig = design_rig(config.camera, config.water)
+    wanted = plan_pattern(flight.plan, rig)
+    seen = certificate(flight.plan.area, rig, stations_of_flight(flight), wanted)
+    return {
+        "covered_share": seen.covered_share,
+        "every_camera_share": seen.every_camera_share,
+        "share_at_overlap": seen.share_at_overlap,
     }
 
 

@@ -39,7 +39,7 @@ def run_fly(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     files = (config.sea.current_file, config.vehicle.coefficients_file)
     stage = Stage(
         name="flight",
-        version=3,
+        version=4,
         settings={
             "seed": config.seed,
             "vehicle": config.vehicle.model_dump(mode="json", exclude={"coefficients_file"}),

@@ -103,7 +103,8 @@ def test_with_one_thruster_failed_she_still_flies_the_survey(thruster: str) -> N
     assert np.all(turns == 0.0)
     assert flight.ending == "complete"
     assert len(flight.trigger_s) == plan_of().stations
-    assert 0.002 < rms(flight.line_errors[0]) < 0.2
+    # Without the bow thruster a line's first metres are spent on getting back to it after a turn.
+    assert 0.002 < rms(flight.line_errors[0]) < 0.3
 
 
 def test_weak_thrusters_push_no_more_than_is_left_of_them() -> None:
