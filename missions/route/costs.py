@@ -1,10 +1,12 @@
 """What flying costs, by course: electrical power of the whole vehicle along lines and between."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from alice_survey.errors import PlanError
 from alice_survey.frames import Array
 
 SPOT_RAD_S = math.radians(15.0)
@@ -48,6 +50,8 @@ class Costs:
     """Of descent and ascent, on the spot."""
     heave_w: float
     """Mean of both."""
+    refused: Callable[[str], PlanError] | None = field(default=None, compare=False, repr=False)
+    """The error that says, of a leg in words, that the current forbids it, with the ways out."""
 
     def line_j(self, length_m: float, course_rad: float) -> float:
         """Energy of a straight line."""

@@ -115,7 +115,7 @@ def split_dives(
     down_and_up = costs.dive_j(depth_m), costs.dive_s(depth_m)
     whole = routed(0, len(lines) - 1)
     legs = np.stack(leg_costs(whole, costs))
-    _check_flyable(whole, legs[0], lines)
+    _check_flyable(whole, legs[0], lines, costs)
     energy_j, time_s = legs.sum(axis=1) + down_and_up
     if limits.hold(energy_j, time_s):
         return (_dive(0, len(lines) - 1, whole, float(energy_j), float(time_s)),)
@@ -144,17 +144,19 @@ def _dive(first: int, last: int, route: Route, energy_j: float, time_s: float) -
     )
 
 
-def _check_flyable(route: Route, energy_j: Array, lines: Sequence[Line]) -> None:
+def _check_flyable(route: Route, energy_j: Array, lines: Sequence[Line], costs: Costs) -> None:
     stopped = np.flatnonzero(~np.isfinite(energy_j))
     if not len(stopped):
         return
     leg = route.legs[int(stopped[0])]
     what = f"line {leg.line} of {len(lines)}" if leg.line >= 0 else "the way between lines"
-    raise PlanError(
+    where = (
         f"{what} at {leg.start_ne_m[0]:.1f} m north, {leg.start_ne_m[1]:.1f} m east on course "
-        f"{math.degrees(leg.heading_rad) % 360.0:.0f} deg is against a current that the vehicle "
-        "cannot meet: change plan.line_heading_deg or plan.speed_mps, or wait for less current"
+        f"{math.degrees(leg.heading_rad) % 360.0:.0f} deg cannot be flown"
     )
+    if costs.refused is not None:
+        raise costs.refused(where)
+    raise PlanError(f"{where}: its cost is infinite")
 
 
 def _sums(whole: Route, legs: Array, alone: Sequence[Route], costs: Costs, depth_m: float) -> _Sums:

@@ -24,6 +24,7 @@ ALICE's lateral thrusters stand still and wait for the error to grow (0.4 N, bel
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -47,8 +48,6 @@ _RATES = np.linspace(1.0, 1.0 / 16.0, 16)
 """Shares of a greatest rate that are tried, downwards."""
 _HEAVES_MPS = np.linspace(0.5, 0.01, 50)
 """Rates of descent that are tried."""
-_FASTER = (0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.75, 1.0, 1.25, 1.5)
-"""Speeds over ground that are tried for a way out, m/s."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -88,18 +87,20 @@ def vehicle_costs(config: SurveyConfig, *, imaging_w: float = 0.0) -> Costs:
     )
     courses = _courses()
     manner = line_manner(config)
-    lines = course_power(craft, courses, speed, current, manner)
+    lines, between = course_powers(config)
     spot_w, turn_rad_s = _spot(craft, config, current)
+    refused = partial(_refused, config)
     if not np.any(_both_ways(lines)) or not math.isfinite(spot_w):
-        raise PlanError(_too_strong(config, craft, current, manner))
+        raise refused("")
     asked_deg = config.plan.line_heading_deg
-    if asked_deg is not None:
-        there_and_back = math.radians(asked_deg) + np.array([0.0, math.pi])
-        if not np.all(np.isfinite(course_power(craft, there_and_back, speed, current, manner))):
-            raise PlanError(_wrong_heading(config, courses, lines))
-    between = course_power(craft, courses, speed, current, "crab")
-    if manner == "held":  # where it cannot crab it may still hold its heading
-        between = np.where(np.isfinite(between), between, lines)
+    if asked_deg is not None and not _flies_heading(craft, config, current, asked_deg):
+        can_deg = np.degrees(courses[np.flatnonzero(_both_ways(lines))])
+        off_deg = np.abs((can_deg - asked_deg + 90.0) % 180.0 - 90.0)
+        nearest_deg = can_deg[int(np.argmin(off_deg))]
+        raise refused(
+            f"lines on {asked_deg:g} deg cannot be flown both ways (the nearest that can are on "
+            f"{nearest_deg:.0f} deg)"
+        )
     hotel_w = config.vehicle.hotel_w
     arc_w, pace = _arc(craft, config, current)
     step_mps, step_w = _sway_step(craft, courses, current, manner)
@@ -116,7 +117,45 @@ def vehicle_costs(config: SurveyConfig, *, imaging_w: float = 0.0) -> Costs:
         sway_w=step_w + hotel_w,
         heave_mps=heave_mps,
         heave_w=heave_w + hotel_w,
+        refused=refused,
     )
+
+
+def course_powers(config: SurveyConfig) -> tuple[Array, Array]:
+    """Power of the thrusters on lines and between, (COURSES,) W each, by course from north.
+
+    Infinite at courses that cannot be kept.
+    """
+    craft, current, speed = (
+        craft_of(config.vehicle),
+        expected_current(config),
+        config.plan.speed_mps,
+    )
+    lines = course_power(craft, _courses(), speed, current, line_manner(config))
+    return lines, _between(craft, config, current, _courses())
+
+
+def _between(craft: Vehicle, config: SurveyConfig, current: Array, courses: Array) -> Array:
+    power = course_power(craft, courses, config.plan.speed_mps, current, "crab")
+    if line_manner(config) == "crab":
+        return power
+    # Where it cannot crab it may still hold its heading.
+    held = course_power(craft, courses, config.plan.speed_mps, current, "held")
+    return np.where(np.isfinite(power), power, held)
+
+
+def _flies_heading(
+    craft: Vehicle, config: SurveyConfig, current: Array, heading_deg: float
+) -> bool:
+    there_and_back = math.radians(heading_deg) + np.array([0.0, math.pi])
+    power = course_power(craft, there_and_back, config.plan.speed_mps, current, line_manner(config))
+    return bool(np.all(np.isfinite(power)))
+
+
+def _refused(config: SurveyConfig, what: str) -> PlanError:
+    from missions.route.strength import too_strong  # only then: it tries much
+
+    return too_strong(config, what)
 
 
 def usable_wh(settings: VehicleConfig) -> float:
@@ -366,40 +405,31 @@ def strongest_current_mps(config: SurveyConfig, towards_rad: float, most_mps: fl
 
 
 def _can_fly(craft: Vehicle, config: SurveyConfig, current: Array, speed_mps: float) -> bool:
-    # Nothing favours a heading but the current itself: along it, across it, and between.
-    courses = math.atan2(current[1], current[0]) + _courses()
-    lines = course_power(craft, courses, speed_mps, current, line_manner(config))
+    lines = course_power(craft, _courses(), speed_mps, current, line_manner(config))
     return bool(np.any(_both_ways(lines))) and math.isfinite(_spot(craft, config, current)[0])
 
 
-def _too_strong(config: SurveyConfig, craft: Vehicle, current: Array, manner: Manner) -> str:
-    speed, size = config.plan.speed_mps, math.hypot(*current)
-    towards = math.atan2(current[1], current[0])
-    towards_deg = math.degrees(towards) % 360.0
-    held = "held by sway" if manner == "held" else "crabbing"
-    strength = strongest_current_mps(config, towards)
-    ways = [f"wait for a current below {strength:.2f} m/s (sea.current_mps)"]
-    fit = [each for each in _FASTER if _can_fly(craft, config, current, each)]
-    if fit:
-        nearest = min(fit, key=lambda each: abs(each - speed))
-        ways.append(f"set plan.speed_mps to {nearest:g}")
-    if manner == "crab":
-        ways.append("fly alice with controller = 'sway', which holds lines across a current")
-    return (
-        f"a current of {size:.2f} m/s towards {towards_deg:03.0f} deg is above the strength of "
-        f"{craft.name}: at {speed:g} m/s over ground, {held}, lines can be flown both ways, with "
-        f"turns between them, in {strength:.2f} m/s at most; " + ", or ".join(ways)
-    )
+def flies_everywhere(config: SurveyConfig, current_ne_mps: Array) -> bool:
+    """Whether any survey can be flown in a current, whatever way between lines it takes.
 
+    That is: lines both ways, on the heading asked for if there is one; all courses between lines;
+    turns on the spot; descent and ascent.
 
-def _wrong_heading(config: SurveyConfig, courses: Array, lines: Array) -> str:
-    size, towards = config.sea.current_mps, config.sea.current_towards_deg
-    can = np.flatnonzero(_both_ways(lines))
-    asked = config.plan.line_heading_deg or 0.0
-    off = np.abs((np.degrees(courses[can]) - asked + 90.0) % 180.0 - 90.0)
-    nearest = math.degrees(courses[can[int(np.argmin(off))]])
-    return (
-        f"lines on {asked:g} deg cannot be flown both ways at {config.plan.speed_mps:g} m/s over "
-        f"ground in a current of {size:.2f} m/s towards {towards:g} deg: the nearest heading that "
-        f"can is {nearest:.0f} deg; change or leave out plan.line_heading_deg"
-    )
+    Args:
+        config: of the survey; its own current does not count.
+        current_ne_mps: (2,)
+    """
+    craft, asked_deg = craft_of(config.vehicle), config.plan.line_heading_deg
+    downstream = math.atan2(current_ne_mps[1], current_ne_mps[0])
+    between = _between(craft, config, current_ne_mps, downstream + _courses())
+    if not np.all(np.isfinite(between)) or not _can_fly(
+        craft, config, current_ne_mps, config.plan.speed_mps
+    ):
+        return False
+    if asked_deg is not None and not _flies_heading(craft, config, current_ne_mps, asked_deg):
+        return False
+    try:
+        _heave(craft, current_ne_mps)
+    except PlanError:
+        return False
+    return True

@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 
 from alice_survey.config import SurveyConfig
-from alice_survey.errors import PlanError
+from alice_survey.errors import PlanError, why
 from alice_survey.frames import Array
 from alice_survey.vehicle.steady import drag_power
 from missions.route.energy import (
     Manner,
     course_power,
+    course_powers,
     craft_of,
     expected_current,
     line_manner,
     motion,
     usable_wh,
-    vehicle_costs,
 )
 
 _J_PER_WH = 3600.0
@@ -103,19 +103,22 @@ def energy_report(config: SurveyConfig, *, imaging_w: float = 0.0) -> tuple[str,
     Returns:
         A table, and its numbers.
 
-    Raises:
-        PlanError: lines cannot be flown in that current.
+    Courses that cannot be flown have no power: "-" in the table, None in the numbers.
     """
-    costs = vehicle_costs(config, imaging_w=imaging_w)
+    lines_w = course_powers(config)[0] + config.vehicle.hotel_w + imaging_w
+    speed = config.plan.speed_mps
     current = expected_current(config)
     size, towards_deg = math.hypot(*current), math.degrees(math.atan2(current[1], current[0])) % 360
     ways = three_ways(config, imaging_w=imaging_w)
-    mean_w = both_ways_w(costs.line_w)
+    mean_w = both_ways_w(lines_w)
     headings_deg = np.arange(len(mean_w)) * (180.0 / len(mean_w))
-    finite = np.where(np.isfinite(mean_w), mean_w, -np.inf)
-    best, worst = int(np.argmin(mean_w)), int(np.argmax(finite))
+    flyable = np.flatnonzero(np.isfinite(mean_w))
     battery_wh = usable_wh(config.vehicle)
-    hours = battery_wh / float(mean_w[best])
+    range_text, range_data = _range(headings_deg[flyable], mean_w[flyable], battery_wh, speed)
+    if len(flyable) < len(mean_w):
+        range_text.append(
+            f"  lines can be flown both ways on {len(flyable)} of {len(mean_w)} headings"
+        )
     flown = "held by sway" if line_manner(config) == "held" else "crabbing"
     rows = [
         f"  {way.name:22s}{way.drag_w:8.2f}{way.lift_w:8.2f}{_watts(way.thrusters_w):>12s}"
@@ -124,35 +127,74 @@ def energy_report(config: SurveyConfig, *, imaging_w: float = 0.0) -> tuple[str,
     ]
     text = "\n".join(
         [
-            f"energy: {config.vehicle.name} at {costs.speed_mps:g} m/s over ground in a current of "
+            f"energy: {config.vehicle.name} at {speed:g} m/s over ground in a current of "
             f"{size:.2f} m/s towards {towards_deg:03.0f} deg, lines {flown}",
             f"  {'lines, there and back':22s}{'drag W':>8s}{'lift W':>8s}{'thrusters W':>12s}"
             f"{'total W':>9s}{'crab':>8s}",
             *rows,
-            f"  least on {headings_deg[best]:.0f} deg ({mean_w[best]:.1f} W), most on "
-            f"{headings_deg[worst]:.0f} deg ({mean_w[worst]:.1f} W); hotel load "
-            f"{config.vehicle.hotel_w:g} W, lights {imaging_w:.1f} W",
-            f"  {battery_wh:.0f} Wh to use: {hours:.1f} h, "
-            f"{hours * 3.6 * costs.speed_mps:.1f} km of lines on the best heading",
+            f"  in the totals: hotel load {config.vehicle.hotel_w:g} W, lights {imaging_w:.1f} W",
+            *range_text,
         ]
     )
     data = {
         "current_mps": size,
         "current_towards_deg": towards_deg,
-        "speed_mps": costs.speed_mps,
+        "speed_mps": speed,
         "lines": flown,
         "ways": [way.to_json() for way in ways],
-        "best_heading_deg": float(headings_deg[best]),
-        "best_w": float(mean_w[best]),
-        "worst_heading_deg": float(headings_deg[worst]),
-        "worst_w": float(mean_w[worst]),
+        **range_data,
+        "headings": len(mean_w),
+        "headings_flyable": len(flyable),
         "usable_wh": battery_wh,
-        "hours": hours,
-        "line_m": hours * 3600.0 * costs.speed_mps,
         "hotel_w": config.vehicle.hotel_w,
         "imaging_w": imaging_w,
     }
     return text, data
+
+
+def _range(
+    headings_deg: Array, mean_w: Array, battery_wh: float, speed_mps: float
+) -> tuple[list[str], dict[str, float | None]]:
+    """Best and worst of the headings that can be flown, and how far the battery reaches."""
+    names = ("best_heading_deg", "best_w", "worst_heading_deg", "worst_w", "hours", "line_m")
+    if not len(mean_w):
+        return [], dict.fromkeys(names)
+    best, worst = int(np.argmin(mean_w)), int(np.argmax(mean_w))
+    hours = battery_wh / float(mean_w[best])
+    line_m = hours * 3600.0 * speed_mps
+    text = [
+        f"  least on {headings_deg[best]:.0f} deg ({mean_w[best]:.1f} W), most on "
+        f"{headings_deg[worst]:.0f} deg ({mean_w[worst]:.1f} W)",
+        f"  {battery_wh:.0f} Wh to use: {hours:.1f} h, {line_m / 1e3:.1f} km of lines on the best "
+        "heading",
+    ]
+    values = (headings_deg[best], mean_w[best], headings_deg[worst], mean_w[worst], hours, line_m)
+    return text, {name: float(value) for name, value in zip(names, values, strict=True)}
+
+
+def current_report(config: SurveyConfig, plot: Path | None) -> tuple[str, dict[str, Any]]:
+    """`alice-survey plan current`: what the current costs, with the survey's own strobes.
+
+    Args:
+        config: of the survey.
+        plot: picture to draw, PNG, PDF or SVG; None for none.
+
+    Returns:
+        As of `energy_report`.
+
+    Raises:
+        PlanError: cameras and strobes cannot do what is asked, or the picture cannot be written.
+    """
+    from camera_calib.rig import design_rig
+    from missions.imaging.settings import imaging_settings
+
+    rig = design_rig(config.camera, config.water)
+    imaging_w = imaging_settings(rig, config, quiet=True).imaging_w
+    text, data = energy_report(config, imaging_w=imaging_w)
+    if plot is None:
+        return text, data
+    draw_trade(plot, config, imaging_w=imaging_w)
+    return f"{text}\n{plot}", {**data, "plot": str(plot)}
 
 
 def draw_trade(path: Path, config: SurveyConfig, *, imaging_w: float = 0.0) -> None:
@@ -164,7 +206,7 @@ def draw_trade(path: Path, config: SurveyConfig, *, imaging_w: float = 0.0) -> N
         imaging_w: mean power of strobes while on lines.
 
     Raises:
-        PlanError: lines cannot be flown in that current, or the picture cannot be written.
+        PlanError: the picture cannot be written.
     """
     if path.suffix.lower() not in _SUFFIXES:
         raise PlanError(
@@ -173,7 +215,7 @@ def draw_trade(path: Path, config: SurveyConfig, *, imaging_w: float = 0.0) -> N
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    costs, current = vehicle_costs(config, imaging_w=imaging_w), expected_current(config)
+    (lines_w, way_w), current = course_powers(config), expected_current(config)
     hotel_w, size = config.vehicle.hotel_w, math.hypot(*current)
     towards = math.atan2(current[1], current[0])
     figure = Figure(figsize=(6.4, 6.4), layout="constrained")
@@ -181,13 +223,18 @@ def draw_trade(path: Path, config: SurveyConfig, *, imaging_w: float = 0.0) -> N
     axes = figure.add_subplot(projection="polar")
     axes.set_theta_zero_location("N")
     axes.set_theta_direction(-1)
-    lines_w, way_w = costs.line_w - hotel_w - imaging_w, costs.way_w - hotel_w
     _draw_course(axes, lines_w, "C0", f"on lines ({_manner_text(config)})")
     _draw_course(axes, way_w, "C1", "between lines")
     mean_w = both_ways_w(lines_w)
     _draw_course(axes, np.concatenate([mean_w, mean_w]), "C0", "lines, there and back", "--")
     seen = np.concatenate([lines_w, way_w])
-    most = float(seen[np.isfinite(seen)].max())
+    if not np.any(np.isfinite(seen)):
+        axes.set_yticklabels([])
+        axes.text(
+            0.5, 0.7, "no course can be flown\nin this current", transform=axes.transAxes,
+            ha="center", bbox={"facecolor": "white", "edgecolor": "none"},
+        )  # fmt: skip
+    most = float(np.max(seen[np.isfinite(seen)], initial=1.0))
     axes.set_ylim(0.0, 1.05 * most)
     axes.set_rlabel_position((math.degrees(towards) + 45.0) % 360.0)
     if size > 0.0:
@@ -201,11 +248,16 @@ def draw_trade(path: Path, config: SurveyConfig, *, imaging_w: float = 0.0) -> N
         )  # fmt: skip
     axes.set_title(
         f"Electrical power of {config.vehicle.name}'s thrusters, W, by course\n"
-        f"{costs.speed_mps:g} m/s over ground; hotel load {hotel_w:g} W comes on top",
+        f"{config.plan.speed_mps:g} m/s over ground; on top come {hotel_w:g} W of hotel load and "
+        f"{imaging_w:.1f} W of lights",
         fontsize=10,
     )
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, -0.17), ncols=3, fontsize=8, frameon=False)
-    figure.savefig(path, dpi=130, metadata={"Software": None} if path.suffix == ".png" else None)
+    metadata = {"Software": None} if path.suffix.lower() == ".png" else None
+    try:
+        figure.savefig(path, dpi=130, metadata=metadata)
+    except OSError as error:
+        raise PlanError(f"{path}: cannot be written: {why(error)}") from None
 
 
 def _draw_course(axes: Any, power_w: Array, colour: str, label: str, style: str = "-") -> None:
@@ -221,4 +273,4 @@ def _manner_text(config: SurveyConfig) -> str:
 
 
 def _watts(power_w: float) -> str:
-    return f"{power_w:.2f}" if math.isfinite(power_w) else "cannot"
+    return f"{power_w:.2f}" if math.isfinite(power_w) else "-"

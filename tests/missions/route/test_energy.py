@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import subprocess
 import sys
 import time
@@ -17,18 +18,24 @@ from alice_survey.errors import PlanError
 from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.pilot import settings as pilot
 from alice_survey.vehicle.steady import steady_flight
+from camera_calib.rig import design_rig
+from missions.imaging.settings import imaging_settings
+from missions.lines.line import Line
 from missions.route.costs import SPOT_RAD_S, STEP_MPS, power_at, time_costs
+from missions.route.dives import split_dives
 from missions.route.energy import (
     course_power,
     craft_of,
     expected_current,
+    flies_everywhere,
     line_manner,
     motion,
     strongest_current_mps,
     usable_wh,
     vehicle_costs,
 )
-from missions.route.trade import draw_trade, energy_report, three_ways
+from missions.route.strength import held_current_mps, too_strong
+from missions.route.trade import current_report, draw_trade, energy_report, three_ways
 
 
 def _config(current: float = 0.1, towards: float = 90.0, **sections: Any) -> SurveyConfig:
@@ -197,30 +204,83 @@ def test_a_current_above_the_vehicles_strength_is_refused_with_ways_out() -> Non
     assert "a current of 2.00 m/s towards 090 deg is above the strength of alice" in text
     strength = strongest_current_mps(_config(), math.pi / 2)
     assert 0.3 < strength < 0.6  # turning, she is beam on: 300 N (m/s)^-2 against two T200
-    assert f"in {strength:.2f} m/s at most" in text
-    assert "\n" not in text and "sea.current_mps" in text
-    assert math.isfinite(vehicle_costs(_config(strength - 0.005)).spot_w)
+    held = float(re.search(r"the ([\d.]+) m/s that alice holds", text)[1])  # type: ignore[index]
+    assert strength - 0.015 < held <= strength
+    assert f"wait for a current of {held:.2f} m/s" in text
+    assert math.isfinite(vehicle_costs(_config(held)).spot_w)
     with pytest.raises(PlanError, match="above the strength"):
         vehicle_costs(_config(strength + 0.005))
 
 
-def test_a_crabbing_vehicle_is_told_of_sway() -> None:
-    config = _config(2.9, vehicle={"name": "sparus2"})
-    with pytest.raises(PlanError, match=r"crabbing.*fly alice with controller = 'sway'"):
-        vehicle_costs(config)
-    strength = strongest_current_mps(config, math.pi / 2)
-    assert math.isfinite(
-        vehicle_costs(_config(strength - 0.01, vehicle={"name": "sparus2"})).spot_w
-    )
+def _changed(config: SurveyConfig, way: str) -> SurveyConfig:
+    """The survey with the settings that a way out names."""
+    sections: dict[str, dict[str, Any]] = config.model_dump()
+    if waited := re.search(r"wait for a current of ([\d.]+) m/s", way):
+        sections["sea"]["current_mps"] = float(waited[1])
+    for section, key, value in re.findall(r"(\w+)\.(\w+) (?:= )?'?([\w.]+)", way):
+        if key in ("speed_mps", "line_heading_deg"):
+            sections[section][key] = None if value == "out" else float(value)
+        elif section == "vehicle":
+            sections[section][key] = value
+    return SurveyConfig.model_validate(sections)
+
+
+@pytest.mark.parametrize(
+    ("config", "least"),
+    [
+        (_config(0.5), 3),
+        (_config(0.9), 1),
+        (_config(0.3, 20.0, vehicle={"name": "sparus2"}), 3),
+        (_config(0.3, 0.0, vehicle={"name": "sparus2"}, plan={"line_heading_deg": 10.0}), 3),
+        (_config(0.3, vehicle={"controller": "los"}), 3),
+    ],
+)
+def test_ways_out_of_a_current_work(config: SurveyConfig, least: int) -> None:
+    text = str(too_strong(config, ""))
+    head, *ways = text.splitlines()
+    assert least <= len(ways) <= 3
+    assert f"{config.sea.current_mps:.2f} m/s" in head
+    for way in ways:
+        changed = _changed(config, way)
+        assert changed != config
+        costs = vehicle_costs(changed)
+        assert np.all(np.isfinite(costs.way_w))
+        assert np.any(np.isfinite(costs.line_w[:36]) & np.isfinite(costs.line_w[36:]))
+
+
+def test_what_is_held_is_the_most_that_flies() -> None:
+    """A vehicle that crabs holds less than its speed: going downstream it would turn its back."""
+    config = _config(vehicle={"name": "sparus2"})
+    downstream = np.array([math.cos(0.3), math.sin(0.3)])
+    assert held_current_mps(config, 0.9 * downstream) == pytest.approx(0.2, abs=0.0101)
+    assert held_current_mps(config, 0.1 * downstream) == pytest.approx(0.1)
+    held = held_current_mps(_config(), downstream)
+    assert flies_everywhere(_config(), held * downstream)
+    assert not flies_everywhere(_config(), (held + 0.02) * downstream)
+
+
+def test_a_vehicle_without_thrust_is_not_told_of_the_current() -> None:
+    with pytest.raises(PlanError, match=r"^alice cannot fly .* conflicts with the thrust it has"):
+        vehicle_costs(_config(0.0, vehicle={"thruster_health": {"vertical": 0.0}}))
 
 
 def test_a_heading_that_cannot_be_flown_is_refused_with_the_nearest_that_can() -> None:
     def config(heading: float) -> SurveyConfig:
         return _config(0.3, 0.0, vehicle={"name": "sparus2"}, plan={"line_heading_deg": heading})
 
-    with pytest.raises(PlanError, match=r"lines on 10 deg .* nearest heading that can is 50 deg"):
+    with pytest.raises(PlanError, match=r"lines on 10 deg .* nearest that can are on 50 deg"):
         vehicle_costs(config(10.0))  # 0.3 cos(48.2 deg) = 0.2
     assert math.isfinite(vehicle_costs(config(55.0)).spot_w)
+
+
+def test_a_way_between_lines_that_cannot_be_flown_is_told_with_the_current() -> None:
+    costs = vehicle_costs(_config(0.3, 0.0, vehicle={"name": "sparus2"}))
+    line = Line(kind="survey", start_ne_m=(0.0, 0.0), end_ne_m=(0.0, 5.0), stations=5)
+    with pytest.raises(PlanError, match=r"in a current of 0\.30 m/s towards 000 deg: .* 0\.19 m/s"):
+        split_dives(
+            [line], ways=None, costs=costs, home_ne=(-5.0, 0.0), turn_radius_m=0.5, run_in_m=0.5,
+            turns="auto", usable_wh=1000.0, longest_s=None, depth_m=10.0, split=True,
+        )  # fmt: skip
 
 
 def test_known_failures_count_and_unknown_ones_do_not() -> None:
@@ -265,7 +325,7 @@ def test_the_report_says_what_the_numbers_say() -> None:
     assert max(len(line) for line in text.splitlines()) <= 100
     unable, told = energy_report(_config(0.1, vehicle={"name": "sparus2"}))
     assert told["ways"][1]["thrusters_w"] is None
-    assert "cannot" in unable
+    assert re.search(r"held by sway .* -  +-  ", unable)
     json.dumps(told, allow_nan=False)
 
 
@@ -278,6 +338,36 @@ def test_the_picture_of_the_trade_is_drawn(tmp_path: Path) -> None:
     assert 500 < blue.sum() < 0.1 * blue.size
     draw_trade(tmp_path / "again.png", _config())
     assert (tmp_path / "again.png").read_bytes() == (tmp_path / "trade.png").read_bytes()
+
+
+def test_the_trade_is_shown_where_nothing_can_be_flown(tmp_path: Path) -> None:
+    text, data = energy_report(_config(2.0))
+    assert "on 0 of 36 headings" in text
+    assert data["best_w"] is data["hours"] is None
+    assert [way["thrusters_w"] for way in data["ways"]] == [None] * 3
+    assert [way["drag_w"] > 100.0 for way in data["ways"]] == [True] * 3
+    json.dumps(data, allow_nan=False)
+    draw_trade(tmp_path / "none.png", _config(2.0))
+    assert (tmp_path / "none.png").stat().st_size > 10_000
+
+    part, some = energy_report(_config(0.3, 0.0, vehicle={"name": "sparus2"}))
+    # Within 48.2 deg of the current it cannot go downstream: 0.3 cos(48.2 deg) = 0.2.
+    assert some["headings_flyable"] == 17
+    assert "on 17 of 36 headings" in part
+    assert 50.0 <= some["best_heading_deg"] <= 130.0
+
+
+def test_the_current_is_reported_with_the_surveys_own_lights(tmp_path: Path) -> None:
+    config = _config()
+    lights_w = imaging_settings(design_rig(config.camera, config.water), config).imaging_w
+    assert lights_w > 0.1
+    text, data = current_report(config, tmp_path / "trade.png")
+    assert data["imaging_w"] == lights_w
+    assert data["best_w"] == pytest.approx(energy_report(config)[1]["best_w"] + lights_w)
+    assert text.endswith("trade.png") and (tmp_path / "trade.png").is_file()
+    assert "plot" not in current_report(config, None)[1]
+    with pytest.raises(PlanError, match="cannot be written: no such file"):
+        current_report(config, tmp_path / "none" / "trade.png")
 
 
 def test_a_picture_of_the_trade_of_unknown_kind_is_refused(tmp_path: Path) -> None:
