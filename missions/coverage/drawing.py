@@ -31,6 +31,12 @@ _SEEN = LinearSegmentedColormap.from_list("seen", ["#d6eaf8", "#5dade2", "#1f618
 _RISK = LinearSegmentedColormap.from_list("risk", ["#e8f8f5", "#f7dc6f", "#e67e22", "#78281f"])
 _LONGEST_PX = 1400
 _NUMBERED = 12
+_WIDTH_IN, _LEAST_WIDTH_IN, _HEAD_IN, _FOOT_IN = 9.0, 6.6, 0.95, 0.72
+"""Of the sheet, and its least; of title and axis label; of legend and figures below the map."""
+_MAP_IN, _LEAST_MAP_IN, _MOST_MAP_IN = 7.55, 2.2, 8.2
+"""Width of a map between its labels and the colours' bar, and its least and greatest height."""
+_MARGIN = 0.06
+"""Around the area, of its longer side."""
 _CLASSES = 12
 """At most, of counts that are told apart."""
 
@@ -94,9 +100,7 @@ def draw_certificate(
         )
     _furniture(figure, axes, certificate.area)
     axes.set_title(title, loc="left", fontsize=12, weight="bold")
-    figure.text(
-        0.012, 0.012, _figures(certificate, holes), fontsize=8.5, color="#333333", va="bottom"
-    )
+    _foot(figure, _figures(certificate, holes))
     figure.savefig(path, dpi=130, metadata=_plain(path))
 
 
@@ -120,7 +124,7 @@ def draw_risk(
     _no_go(axes, area)
     _furniture(figure, axes, area)
     axes.set_title(title, loc="left", fontsize=12, weight="bold")
-    figure.text(0.012, 0.012, text, fontsize=8.5, color="#333333", va="bottom")
+    _foot(figure, text)
     figure.savefig(path, dpi=130, metadata=_plain(path))
 
 
@@ -131,20 +135,29 @@ def _class(low: int, following: int) -> str:
 def _figures(certificate: Certificate, holes: Sequence[Hole]) -> str:
     pattern = certificate.pattern
     asked = pattern.passes * pattern.pictures
+    holes_text = f"{len(holes)} hole" if len(holes) == 1 else f"{len(holes)} holes"
     return (
         f"{certificate.stations} stations, {certificate.taken} pictures; seen "
         f"{certificate.covered_share:.2%}, in stereo {certificate.stereo_share:.2%}, at the "
         f"overlap asked for {certificate.share_at_overlap:.2%}\n(that is {pattern.passes} "
         f"line{'s' if pattern.passes > 1 else ''} and {asked} pictures of each camera); "
-        f"{len(holes)} holes, {sum(hole.area_m2 for hole in holes):.2f} m²; "
+        f"{holes_text}, {sum(hole.area_m2 for hole in holes):.2f} m²; "
         f"grid {100 * certificate.grid.cell_m:.1f} cm"
     )
 
 
 def _sheet(area: Area) -> tuple[Figure, Axes]:
+    south, west, north, east = area.survey.bounds
+    margin = 2 * _MARGIN * max(north - south, east - west)
+    tall = (north - south + margin) / (east - west + margin)
+    map_in = min(max(_MAP_IN * tall, _LEAST_MAP_IN), _MOST_MAP_IN)
+    wide_in = min(max(map_in / tall + _WIDTH_IN - _MAP_IN, _LEAST_WIDTH_IN), _WIDTH_IN)
+    high_in = _FOOT_IN + map_in + _HEAD_IN
     figure = Figure(
-        figsize=(9.0, 8.2), facecolor="white",
-        layout=ConstrainedLayoutEngine(rect=(0, 0.085, 1, 0.9)),
+        figsize=(wide_in, high_in), facecolor="white",
+        layout=ConstrainedLayoutEngine(
+            rect=(0, _FOOT_IN / high_in, 1, 1 - (_FOOT_IN + 0.05) / high_in)
+        ),
     )  # fmt: skip
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
@@ -224,20 +237,26 @@ def _number(axes: Axes, hole: Hole, number: int) -> None:
     )  # fmt: skip
 
 
+def _foot(figure: Figure, text: str) -> None:
+    figure.text(
+        0.012, 0.1 / figure.get_figheight(), text, fontsize=8.5, color="#333333", va="bottom"
+    )
+
+
 def _furniture(figure: Figure, axes: Axes, area: Area) -> None:
     """Limits, legend and a north arrow."""
     south, west, north, east = area.survey.bounds
-    margin = 0.06 * max(north - south, east - west)
+    margin = _MARGIN * max(north - south, east - west)
     axes.set_xlim(west - margin, east + margin)
     axes.set_ylim(south - margin, north + margin)
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(
-        handles, labels, loc="lower center", bbox_to_anchor=(0.5, 0.052), ncol=5, frameon=False,
-        fontsize=8,
+        handles, labels, loc="lower center", ncol=5, frameon=False, fontsize=8,
+        bbox_to_anchor=(0.5, 0.43 / figure.get_figheight()),
     )  # fmt: skip
     axes.annotate(
-        "N", xy=(0.975, 0.99), xytext=(0.975, 0.915), xycoords="axes fraction", ha="center",
-        va="center", fontsize=10, weight="bold", zorder=9,
+        "N", xy=(0.975, 0.99), xytext=(0, -28), xycoords="axes fraction",
+        textcoords="offset points", ha="center", va="center", fontsize=10, weight="bold", zorder=9,
         arrowprops={"arrowstyle": "-|>", "color": "black", "lw": 1.4},
     )  # fmt: skip
 

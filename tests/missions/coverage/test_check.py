@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import rasterio
 import shapely
+from PIL import Image
 
 from alice_survey.artefacts import Stage, run_stage, write_json
 from alice_survey.config import SurveyConfig
@@ -101,7 +102,11 @@ def test_the_map_and_the_outlines_lie_where_the_hole_is(
     ned = DATUM.ned_from_geodetic(np.column_stack([ring[:, [1, 0]], np.zeros(len(ring))]))
     outline = shapely.Polygon(ned[:, :2])
     assert outline.area == pytest.approx(data["holes_m2"], rel=0.02)
-    assert (workspace / "check" / "coverage.png").stat().st_size > 20_000
+    with Image.open(workspace / "check" / "coverage.png") as drawn:
+        ink = np.asarray(drawn.convert("L")) < 200
+    rows = np.flatnonzero(ink.any(axis=1))
+    assert ink.mean() > 0.05
+    assert rows[0] < 0.04 * len(ink) and rows[-1] > 0.96 * len(ink)  # no empty bands
 
 
 def test_the_plan_for_the_holes_is_whole_and_closes_them(
