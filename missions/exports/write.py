@@ -132,8 +132,8 @@ def export_report(
     tolerance_m = line_tolerance_m(plan, rig, options)
     text = "\n".join(
         [
-            f"{folder}: {len(files)} files of {plan.stations} stations in {len(plan.dives)} dives, "
-            f"tolerance {tolerance_m:.3f} m",
+            f"{folder}: {counted(len(files), 'file')} of {counted(plan.stations, 'station')} in "
+            f"{counted(len(plan.dives), 'dive')}, tolerance {tolerance_m:.3f} m",
             *(f"  {file.name:<24}{file.stat().st_size / 1000:>9.1f} kB" for file in files),
         ]
     )
@@ -264,11 +264,16 @@ def about_file(file: Path) -> str:
     return next(about for part, about in _ABOUT if part in file.name)
 
 
+def counted(number: int, what: str) -> str:
+    """A number of things, in the singular where it is one."""
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
 def _write_about(path: Path, job: _Job, files: Sequence[Path]) -> Path:
     """What the files are, and of which point of the vehicle."""
     text = [
-        f"{job.plan.name}: plan of {len(job.plan.lines)} lines, {job.plan.stations} stations, "
-        f"{len(job.dives)} dive(s)",
+        f"{job.plan.name}: plan of {counted(len(job.plan.lines), 'line')}, "
+        f"{counted(job.plan.stations, 'station')}, {counted(len(job.dives), 'dive')}",
         "",
         f"Missions (.xml, .plan, .waypoints): {job.mount.about}",
         "Maps and tables (.kml, .gpx, .geojson, .csv): places are of the left port's glass; "

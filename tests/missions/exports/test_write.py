@@ -11,7 +11,7 @@ from alice_survey.config import parse_config
 from alice_survey.errors import PlanError
 from missions.exports.options import Options
 from missions.exports.waypoints import DEPTH_STEP_M, bends
-from missions.exports.write import FORMATS, export_report, write_exports
+from missions.exports.write import FORMATS, counted, export_report, write_exports
 from tests.missions.exports.plans import RIG, small_plan
 from tests.missions.exports.readers import local_ne
 
@@ -100,7 +100,9 @@ def test_the_report_takes_the_mount_from_the_settings_of_the_plan(tmp_path: Path
     assert len(about["files"]) == 6
     assert text.splitlines()[0].startswith(f"{folder / 'exports'}: 6 files of 64 stations in 2")
     assert text.splitlines()[1:] == given.splitlines()[1:]
-    assert "+0.700 m forward, -0.100 m right" in (folder / "exports" / "about.txt").read_text()
+    told = (folder / "exports" / "about.txt").read_text()
+    assert "+0.700 m forward, -0.100 m right" in told
+    assert "plan of 6 lines, 64 stations, 2 dives\n" in told
     json.dumps(about)
 
     export_report(folder, ["cola2"], tmp_path / "named", camera_on="/rig/go")
@@ -131,3 +133,8 @@ def test_bends_keep_every_depth_within_the_tolerance() -> None:
         assert len(kept) < 60
     slope = np.linspace(0.0, 5.0, 40)
     assert bends(slope, 0.3 * slope, DEPTH_STEP_M) == [0, 39]
+
+
+@pytest.mark.parametrize(("number", "told"), [(0, "0 dives"), (1, "1 dive"), (2, "2 dives")])
+def test_one_is_told_in_the_singular(number: int, told: str) -> None:
+    assert counted(number, "dive") == told
