@@ -15,7 +15,7 @@ from missions.imaging.footprints import altitude_for_pixel_m, footprint_at, pixe
 from missions.imaging.light import too_dark
 from missions.imaging.settings import ImagingSettings, imaging_settings
 from missions.imaging.solve_dive import DiveArea, area_for_dive, dive_of_energy_s
-from missions.imaging.solve_lens import LensOption, in_focus, lenses_for_resolution
+from missions.imaging.solve_lens import LensOption, in_focus, lenses_for_resolution, with_lens
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,8 @@ def solve_report(
         config: all else of the plan.
         resolution_mm: size of a pixel on the sea floor at the mean altitude: find altitude and
             lens.
-        dive_s: time of a dive: find the area that fits.
+        dive_s: time of a dive: find the area that fits; with a resolution, at its altitude and
+            lens.
         dive_wh: energy of a dive: likewise, at the mean power of flying lines.
         rate_hz: pictures a second: find the speed.
         lenses: focal lengths at hand, mm.
@@ -61,18 +62,22 @@ def solve_report(
     """
     parts: list[str] = []
     data: dict[str, Any] = {}
+    dived = config
     if resolution_mm is not None:
         options = lenses_for_resolution(config, resolution_mm, lenses)
         parts.append(_lens_text(options, resolution_mm))
         data["lenses"] = [json_row(asdict(option)) for option in options]
+        dived = with_lens(config, options[0])
     if dive_s is not None:
-        area = area_for_dive(config, dive_s)
-        parts.append(_area_text(area))
+        area = area_for_dive(dived, dive_s)
+        parts.append(_area_text(area, dived))
         data["dive"] = asdict(area)
     if dive_wh is not None:
-        seconds, watts = dive_of_energy_s(config, dive_wh)
-        area = area_for_dive(config, seconds)
-        parts.append(f"{dive_wh:g} Wh last {seconds:.0f} s at {watts:.0f} W\n{_area_text(area)}")
+        seconds, watts = dive_of_energy_s(dived, dive_wh)
+        area = area_for_dive(dived, seconds)
+        parts.append(
+            f"{dive_wh:g} Wh last {seconds:.0f} s at {watts:.0f} W\n{_area_text(area, dived)}"
+        )
         data["energy"] = {"dive_wh": dive_wh, "mean_w": watts, **asdict(area)}
     if rate_hz is not None:
         rates = speeds_for_rate(config, rate_hz, lenses)
@@ -194,12 +199,12 @@ def _lens_text(options: list[LensOption], resolution_mm: float) -> str:
     ])  # fmt: skip
 
 
-def _area_text(area: DiveArea) -> str:
+def _area_text(area: DiveArea, config: SurveyConfig) -> str:
     return (
         f"a dive of {area.dive_s:g} s holds {area.area_m2:.0f} m2, such as {area.side_m:.1f} x "
         f"{area.side_m:.1f} m: {area.lines} lines {area.line_spacing_m:.3g} m apart at "
         f"{area.speed_mps:g} m/s, {area.cross_lines} across, turns of {area.turn_s:.0f} s, descent "
-        "and ascent"
+        f"and ascent; {config.camera.focal_mm:g} mm lens at {config.plan.altitude_m:.2f} m"
     )
 
 

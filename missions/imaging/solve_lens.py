@@ -106,6 +106,15 @@ def _lens_option(config: SurveyConfig, resolution_mm: float, lens_mm: float) -> 
     )
 
 
+def with_lens(config: SurveyConfig, option: LensOption) -> SurveyConfig:
+    """The survey with a lens, its aperture, and the altitude it needs; lines as then follows."""
+    camera = config.camera.model_copy(
+        update={"focal_mm": option.lens_mm, "f_number": option.f_number}
+    )
+    plan = config.plan.model_copy(update={"altitude_m": option.altitude_m, "line_spacing_m": None})
+    return config.model_copy(update={"camera": camera, "plan": plan})
+
+
 def in_focus(config: SurveyConfig) -> SurveyConfig:
     """The same with the aperture closed as far as the relief needs, if diffraction allows it."""
     camera, plan = config.camera, config.plan

@@ -32,6 +32,20 @@ def test_a_resolution_gives_the_altitude_whose_pixel_it_is() -> None:
     assert "too dark" in other.why
 
 
+def test_a_dive_at_a_resolution_is_solved_at_its_altitude() -> None:
+    _, config = survey()
+    text, data = solve_report(config, resolution_mm=0.33, dive_s=1800.0)
+    best = data["lenses"][0]
+    assert data["dive"]["line_spacing_m"] == pytest.approx(best["spacing_m"])
+    _, lower = survey(
+        plan={"altitude_m": best["altitude_m"]},
+        camera={"focal_mm": best["lens_mm"], "f_number": best["f_number"]},
+    )
+    assert data["dive"]["area_m2"] == pytest.approx(area_for_dive(lower, 1800.0).area_m2)
+    assert data["dive"]["area_m2"] < 0.9 * area_for_dive(config, 1800.0).area_m2
+    assert f"at {best['altitude_m']:.2f} m" in text.split("\n\n")[1]
+
+
 def test_ways_out_of_a_resolution_that_is_too_fine_work() -> None:
     _, config = survey()
     with pytest.raises(PlanError) as fault:
