@@ -111,7 +111,7 @@ def energy_report(config: SurveyConfig, *, imaging_w: float = 0.0) -> tuple[str,
     size, towards_deg = math.hypot(*current), math.degrees(math.atan2(current[1], current[0])) % 360
     ways = three_ways(config, imaging_w=imaging_w)
     mean_w = both_ways_w(lines_w)
-    headings_deg = np.arange(len(mean_w)) * (180.0 / len(mean_w))
+    headings_deg: Array = np.linspace(0.0, 180.0, len(mean_w), endpoint=False)
     flyable = np.flatnonzero(np.isfinite(mean_w))
     battery_wh = usable_wh(config.vehicle)
     range_text, range_data = _range(headings_deg[flyable], mean_w[flyable], battery_wh, speed)
