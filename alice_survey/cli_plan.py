@@ -196,9 +196,7 @@ def current(
     Power by the direction of lines: along the current, across it by sway, or crabbing.
     """
     from alice_survey.survey import settings
-    from missions.route.trade import draw_trade, energy_report
+    from missions.route.trade import current_report
 
     config = settings(workspace, survey, needed=False)
-    print_result(*energy_report(config), as_json)
-    if plot is not None:
-        draw_trade(plot, config)
+    print_result(*current_report(config, plot), as_json)

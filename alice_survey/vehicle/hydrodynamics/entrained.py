@@ -13,7 +13,6 @@ the wet sections displace some of it, and the sections reach a little further.)
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
 
 from alice_survey.errors import VehicleError
 from alice_survey.frames import Array
@@ -47,6 +46,8 @@ def entrained_water(geometry: Geometry, buoyancy_kg: float, density: float) -> E
     Raises:
         VehicleError: the envelope has no room for it, or the bulkheads would cross.
     """
+    from scipy.optimize import brentq  # here: few plans need it, and it takes its time to load
+
     water_m3 = geometry.envelope_volume_m3 - buoyancy_kg / density
     if water_m3 < 0:
         raise VehicleError(
