@@ -137,8 +137,8 @@ def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
 
 def _plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
     wanted = config.plan
-    _check_turns(config)
     imaging = imaging_settings(rig, config)
+    _check_turns(config)
     step_m = imaging.station_spacing_m
     stereo = common_swath(rig, wanted.altitude_m, step_m)
     told = sure_pattern(rig, wanted.altitude_m, imaging.line_spacing_m, step_m)

@@ -194,7 +194,7 @@ def test_without_forward_overlap_the_certificate_shows_the_gaps(
             "no view in common",
         ),
         ({"plan": {"home_ne_m": [50.0, 0.0]}}, "outside of where the vehicle may be"),
-        ({"plan": {"speed_mps": 2.0, "forward_overlap": 0.95}}, "lower speed_mps"),
+        ({"plan": {"speed_mps": 2.0, "forward_overlap": 0.95}}, "pictures a second"),
         ({"plan": {"speed_mps": 0.4, "turn_radius_m": 0.5}}, "46 deg/s"),
     ],
 )
