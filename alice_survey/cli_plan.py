@@ -184,6 +184,24 @@ def export(
     )
 
 
+@app.command(name="map", epilog=examples("plan map -w reef -o map.pdf"))
+def draw_map(
+    output: Annotated[Path, typer.Option("-o", "--output", help="A .pdf, .svg or .png file.")],
+    workspace: Workspace = WORK,
+    survey: SurveyFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Draw the map of a plan for print.
+
+    Area, zones, lines, footprints, how many pictures see each place, current, bathymetry.
+    """
+    from alice_survey.survey import settings
+    from missions.maps.redraw import map_report
+
+    config = settings(workspace, survey, needed=False)
+    print_result(*map_report(workspace / "plan" / "plan.json", config, output), as_json)
+
+
 @app.command(epilog=examples("plan current -w reef", "plan current -w reef --plot trade.png"))
 def current(
     workspace: Workspace = WORK,

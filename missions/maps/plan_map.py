@@ -3,6 +3,7 @@
 import math
 from pathlib import Path
 
+import matplotlib as mpl
 import numpy as np
 import shapely
 from matplotlib.axes import Axes
@@ -87,7 +88,8 @@ def draw_plan(
     )
     # Packing a PNG harder takes longer than all the rest of its writing.
     packing = {"pil_kwargs": {"compress_level": 2}} if kind == ".png" else {}
-    figure.savefig(path, dpi=130, metadata=metadata, **packing)
+    with mpl.rc_context({"svg.hashsalt": plan.name}):  # names within an SVG are random otherwise
+        figure.savefig(path, dpi=130, metadata=metadata, **packing)
 
 
 def _summary(plan: Plan) -> str:

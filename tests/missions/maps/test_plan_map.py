@@ -13,9 +13,11 @@ from matplotlib.figure import Figure
 from PIL import Image
 from shapely.geometry import MultiPolygon
 
-from alice_survey.config import SeaConfig
+from alice_survey.config import SeaConfig, parse_config
 from alice_survey.errors import PlanError
 from missions.maps.plan_map import draw_plan
+from missions.maps.redraw import map_report
+from missions.plan import run_plan
 from missions.plan_file import Plan
 from tests.missions.exports.plans import RIG, line, plan_of, small_plan
 
@@ -107,3 +109,19 @@ def test_the_allowed_area_is_whole_on_the_map_unless_it_is_much_larger(
 def test_an_unknown_suffix_is_refused(tmp_path: Path) -> None:
     with pytest.raises(PlanError, match="change the suffix"):
         draw_plan(tmp_path / "map.xyz", small_plan(), RIG)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "start"), [(".pdf", b"%PDF"), (".svg", b"<?xml"), (".png", b"\x89PNG")]
+)
+def test_a_finished_plan_is_drawn_anew_for_print(tmp_path: Path, suffix: str, start: bytes) -> None:
+    config = parse_config({"area": {"length_m": 4.0, "width_m": 3.0}}, "test")
+    run_plan(tmp_path, config, 1)
+    plan = tmp_path / "plan" / "plan.json"
+    drawn = [tmp_path / name / f"map{suffix}" for name in "ab"]
+    for out in drawn:
+        map_report(plan, config, out)
+    assert drawn[0].read_bytes().startswith(start)
+    assert drawn[0].read_bytes() == drawn[1].read_bytes()
+    with pytest.raises(PlanError, match="change the suffix"):
+        map_report(plan, config, tmp_path / "map.bmp")
