@@ -12,6 +12,7 @@ from missions.exports.options import Options, line_tolerance_m
 from missions.exports.write import write_exports
 from missions.footprint import common_swath
 from missions.plan_file import Dive, Plan
+from missions.route.costs import SETTLE_S
 from missions.route.legs import Route
 from tests.missions.exports.plans import RIG, golden_plan, line, plan_of, small_plan, straight
 from tests.missions.exports.readers import (
@@ -95,8 +96,8 @@ def test_turns_on_the_spot_hold_the_glass_and_turn_the_vehicle() -> None:
         assert abs(math.remainder(float(step.values["final_yaw"]) - heading, 2 * math.pi)) < 1e-6
         arm = turned((0.55, -0.05), heading)
         np.testing.assert_allclose(place(plan, step) + arm, glass, atol=MM)
-    # 90 degrees at 15 degrees a second and 4 s to settle.
-    assert turn.values["time"] == pytest.approx(10.0, abs=0.05)
+    # 90 degrees at 15 degrees a second, and what a stop takes.
+    assert turn.values["time"] == pytest.approx(6.0 + SETTLE_S, abs=0.05)
 
 
 def test_an_arc_is_flown_as_chords_that_lie_near_it() -> None:

@@ -123,7 +123,10 @@ def test_lines_over_pieces_see_them(seed: int, pattern: Pattern, turn: float) ->
     fence = area.allowed.buffer(1e-6)
     assert all(fence.contains(as_string(line)) for line in lines)
     assert {line.kind for line in lines} == {"fill"}
-    assert seen_enough(lines, points_in(pieces, 3000), pattern).mean() >= 0.999
+    # What may be left is a share of the whole area, whatever the pieces are of it.
+    unseen = 1.0 - seen_enough(lines, points_in(pieces, 3000), pattern).mean()
+    assert unseen * pieces.area <= 0.0004 * area.survey.area
+    assert unseen < 0.02
     assert all(line.length_m <= (line.stations - 1) * pattern.step_m + 1e-9 for line in lines)
     assert sum(line.length_m for line in lines) < 60 * pattern.passes
 
