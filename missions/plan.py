@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import shapely.ops
+from pydantic import BaseModel
 from shapely.geometry import Point
 
 from alice_survey.artefacts import Stage, run_stage
@@ -86,24 +87,23 @@ def run_plan(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     Raises:
         PlanError: no plan meets the settings.
     """
-    files = [config.area.bathymetry_file, config.sea.current_file, config.vehicle.coefficients_file]
+    apart = [config.area.bathymetry_file, config.sea.current_file, config.vehicle.coefficients_file]
     stage = Stage(
         name="plan",
         version=3,
         settings={
             "name": config.name,
             **{
-                name: getattr(config, name).model_dump(mode="json")
-                for name in ("area", "camera", "water", "plan", "sea")
+                name: _without_paths(getattr(config, name))
+                for name in ("area", "camera", "water", "plan", "sea", "vehicle")
             },
             # Of a shape in degrees the middle is the datum unless one is set, to whatever value.
             "datum_given": sorted({"latitude_deg", "longitude_deg"} & config.area.model_fields_set),
-            "vehicle": config.vehicle.model_dump(mode="json", exclude={"dive"}),
             "strobes": config.imaging.model_dump(
                 mode="json", include={"strobe_lumens", "strobe_beam_deg", "strobes_body_m"}
             ),
         },
-        inputs=[*area_files(config.area), *(file for file in files if file is not None)],
+        inputs=[*area_files(config.area), *(file for file in apart if file is not None)],
     )
 
     def work(folder: Path) -> None:
@@ -113,6 +113,15 @@ def run_plan(workspace: Path, config: SurveyConfig, threads: int) -> bool:
         write_planned(folder, plan_survey(config, rig), config, rig)
 
     return run_stage(workspace, stage, work)
+
+
+def _without_paths(section: BaseModel) -> dict[str, Any]:
+    """What a section says; of files their names alone, so that a survey may be moved."""
+    told = section.model_dump(mode="json", exclude={"dive"})
+    return {
+        key: value.name if isinstance(value := getattr(section, key), Path) else told[key]
+        for key in told
+    }
 
 
 def make_plan(config: SurveyConfig, rig: Rig) -> Plan:
