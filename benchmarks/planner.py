@@ -157,12 +157,14 @@ def _growth(table: dict[tuple[str, int], list[Measured]]) -> dict[str, float]:
 
 
 def _angles(quick: bool) -> list[Angle]:
-    costs, home = time_costs(0.2), (0.0, 0.0)
+    costs = time_costs(0.2)
     kinds = {"cross_lines": 1, "closing_line": True}
     found = []
     for name, shape in shapes().items():
         area = planned_area(shape, 12 if quick else _ANGLE_ROWS, PATTERN.spacing_m, MARGIN_M)
         ways = Ways(area.allowed)
+        north, east = area.rings_ne[0][0]
+        home = (float(north), float(east))
         for _ in range(2):
             began = time.perf_counter()
             sweep = best_heading(area, PATTERN, ways, costs, home, **kinds)
