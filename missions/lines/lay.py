@@ -176,7 +176,7 @@ def laid(
     if len(pieces) == 0:
         raise PlanError(
             f"no line of heading {math.degrees(heading_rad):.1f} deg can be flown: the allowed "
-            "area lets none come near the area to survey: widen area.turn_margin_m or it"
+            "area lets none come near the area to survey: widen area.turn_margin_m or the allowed area"
         )
     ends = _ends_ne(pieces, offsets, heading_rad)
     follower = cells.followers(pieces)
@@ -481,8 +481,8 @@ def _not_connected(table: Array, home: Array, ways_m: Array) -> PlanError:
     north_1, east_1 = table[i, :2] if i < len(table) else home
     return PlanError(
         f"no way inside the allowed area from {north_0:.2f} m north, {east_0:.2f} m east to "
-        f"{north_1:.2f}, {east_1:.2f}: its parts are not connected; widen area.turn_margin_m or survey "
-        "the parts one by one"
+        f"{north_1:.2f}, {east_1:.2f}: its parts are not connected; widen area.turn_margin_m or "
+        "survey the parts one by one"
     )
 
 
