@@ -176,7 +176,7 @@ def laid(
     if len(pieces) == 0:
         raise PlanError(
             f"no line of heading {math.degrees(heading_rad):.1f} deg can be flown: the allowed "
-            "area lets none come near the area to survey: widen area.turn_margin_m or the allowed area"
+            "area lets none come near the area to survey: widen it, or area.turn_margin_m"
         )
     ends = _ends_ne(pieces, offsets, heading_rad)
     follower = cells.followers(pieces)
