@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-from shapely.geometry import Polygon
 
 from alice_survey.config import AreaConfig
 from alice_survey.frames import Array
@@ -84,8 +83,3 @@ def _rectangle(settings: AreaConfig) -> Array:
     right = settings.width_m * np.array([-math.sin(heading), math.cos(heading)])
     corners: Array = np.array([0 * along, along, along + right, right])
     return corners if settings.datum_at == "corner" else corners - (along + right) / 2
-
-
-def polygon_corners(polygon: Polygon) -> Array:
-    """The outer corners of a polygon, (N, 2) north and east, not closed."""
-    return np.asarray(polygon.exterior.coords, dtype=np.float64)[:-1, :2]

@@ -386,24 +386,6 @@ def _heave(craft: Vehicle, current: Array) -> tuple[float, float]:
     return float(_HEAVES_MPS[can[0]]), float(power[can[0]])
 
 
-def strongest_current_mps(config: SurveyConfig, towards_rad: float, most_mps: float = 3.0) -> float:
-    """The strongest current in which a survey can be flown: lines both ways, and turns on the spot.
-
-    Args:
-        config: of the survey; its own current does not count.
-        towards_rad: direction of the current.
-        most_mps: no stronger than this.
-    """
-    craft = craft_of(config.vehicle)
-    direction = np.array([math.cos(towards_rad), math.sin(towards_rad)])
-    low, high = 0.0, most_mps
-    for _ in range(10):
-        middle = (low + high) / 2
-        flies = _can_fly(craft, config, middle * direction, config.plan.speed_mps)
-        low, high = (middle, high) if flies else (low, middle)
-    return low
-
-
 def _can_fly(craft: Vehicle, config: SurveyConfig, current: Array, speed_mps: float) -> bool:
     lines = course_power(craft, _courses(), speed_mps, current, line_manner(config))
     return bool(np.any(_both_ways(lines))) and math.isfinite(_spot(craft, config, current)[0])

@@ -23,7 +23,6 @@ from alice_survey.errors import PlanError, warn
 from alice_survey.frames import Array
 from missions.areas.bathymetry import Bathymetry
 from missions.lines.line import Line
-from missions.route.legs import Route
 
 NOSE_M, TAIL_M = 0.8545, 0.734
 """Ends of the hull from its centre of buoyancy (public model of SPARUS II in Stonefish)."""
@@ -237,42 +236,6 @@ def line_profiles(
         )
         for index, line in enumerate(lines)
     ]
-
-
-def line_depths(
-    lines: Sequence[Line], bathymetry: Bathymetry, reach: Reach, limits: TerrainLimits
-) -> list[Array]:
-    """Depth of the glass at each station of each line, as `line_profiles`."""
-    return [profile.depth_m for profile in line_profiles(lines, bathymetry, reach, limits)]
-
-
-def route_profile(
-    route: Route, bathymetry: Bathymetry, reach: Reach, limits: TerrainLimits, step_m: float
-) -> DepthProfile:
-    """The profile along a whole route, turns included.
-
-    Args:
-        route: what is flown.
-        bathymetry: of the sea floor.
-        reach: how far the floor counts; all round where the vehicle turns.
-        limits: to keep.
-        step_m: between samples.
-
-    Raises:
-        PlanError: as `depth_profile`.
-    """
-    farthest = max(reach.ahead_m, reach.astern_m)
-    all_round = Reach(ahead_m=farthest, astern_m=farthest, beside_m=max(farthest, reach.beside_m))
-    along = np.linspace(0.0, route.length_m, max(math.ceil(route.length_m / step_m), 1) + 1)
-    return depth_profile(
-        bathymetry,
-        along,
-        route.places(along),
-        route.headings_rad(along),
-        all_round,
-        limits,
-        "the way",
-    )
 
 
 def terrain_report(

@@ -1,7 +1,6 @@
 """The profile of the glass over a known sea floor."""
 
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,17 +13,14 @@ from alice_survey.errors import PlanError
 from alice_survey.frames import Array, Datum
 from missions.areas.bathymetry import Bathymetry, read_bathymetry
 from missions.lines.line import Line
-from missions.route.legs import Leg, Route
 from missions.route.terrain import (
     Reach,
     TerrainLimits,
     depth_profile,
     envelope,
     highest_floor,
-    line_depths,
     line_profiles,
     reach_of,
-    route_profile,
     terrain_report,
 )
 from tests.oracles_energy import envelope as slow_envelope
@@ -177,22 +173,22 @@ def test_limits_that_cannot_be_kept_name_the_place() -> None:
     values = np.full((160, 160), 12.0)
     values[80:84, 90:94] = np.nan
     with pytest.raises(PlanError, match=r"floor\.tif does not know.* near line 1, .* m along"):
-        line_depths(
+        line_profiles(
             [_line((20.0, -20.0), (20.0, 20.0)), _line((-1.0, -20.0), (-1.0, 20.0))],
             _floor(values), REACH, LIMITS,
         )  # fmt: skip
     shoal = np.full((160, 160), 12.0)
     shoal[:, 100:110] = 1.5
     with pytest.raises(PlanError, match=r"line 0, .* m along: the glass would be 0\.50 m above"):
-        line_depths([_line((0.0, -20.0), (0.0, 20.0))], _floor(shoal), REACH, LIMITS)
+        line_profiles([_line((0.0, -20.0), (0.0, 20.0))], _floor(shoal), REACH, LIMITS)
     with pytest.raises(PlanError, match=r"altitude_m 0\.8 is less than least_clearance_m 1"):
         TerrainLimits(altitude_m=0.8, least_clearance_m=1.0, steepest_rad=0.3)
 
 
 def test_depths_are_one_a_station() -> None:
     lines = [_line((0.0, -20.0), (0.0, 20.0), 81), _line((1.0, 20.0), (1.0, -20.0), 7)]
-    depths = line_depths(lines, _floor(14.0 + 0.05 * _eastings()), REACH, LIMITS)
-    assert [len(depth) for depth in depths] == [81, 7]
+    found = line_profiles(lines, _floor(14.0 + 0.05 * _eastings()), REACH, LIMITS)
+    assert [len(profile.depth_m) for profile in found] == [81, 7]
 
 
 def test_stations_far_apart_see_all_between_them() -> None:
@@ -200,23 +196,6 @@ def test_stations_far_apart_see_all_between_them() -> None:
     ridge = np.where(np.abs(_eastings()) < 1.0, 9.0, 12.0)
     sparse = line_profiles([_line((0.0, -15.0), (0.0, 15.0), 4)], _floor(ridge), REACH, LIMITS)[0]
     np.testing.assert_allclose(sparse.depth_m, [10.0, 7.0, 7.0, 10.0], atol=1e-9)
-
-
-def test_a_route_is_followed_through_its_turns() -> None:
-    floor = _floor(14.0 - 0.1 * _eastings())
-    there = Leg(
-        start_ne_m=(0.0, -10.0), heading_rad=math.pi / 2, length_m=20.0, curvature_per_m=0.0, line=0
-    )
-    turn = Leg(
-        start_ne_m=there.end_ne_m, heading_rad=math.pi / 2, length_m=math.pi / 2,
-        curvature_per_m=2.0, line=-1,
-    )  # fmt: skip
-    back = replace(there, start_ne_m=turn.end_ne_m, heading_rad=turn.end_heading_rad, line=1)
-    route = Route(legs=(there, turn, back))
-    profile = route_profile(route, floor, REACH, LIMITS, 0.25)
-    assert profile.along_m[-1] == pytest.approx(route.length_m)
-    assert np.abs(profile.slopes_rad).max() <= LIMITS.steepest_rad + 1e-9
-    assert profile.clearance_m.min() == pytest.approx(2.0, abs=1e-9)
 
 
 def test_the_report_names_where_pictures_are_taken_from_too_high(
