@@ -338,7 +338,7 @@ def scale(
     workspace: Workspace = WORK,
 ) -> None:
     """Scale a model by a known length."""
-    from reconstruct.scale import scale_model
+    from reconstruct.sparse.scale import scale_model
 
     typer.echo(scale_model(workspace, points, length))
 

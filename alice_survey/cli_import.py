@@ -44,7 +44,7 @@ def import_images(
     Mono or stereo pictures or a video, with a navigation log, GPS from EXIF, or nothing at all.
     """
     from alice_survey.executor import default_threads
-    from reconstruct.import_images import import_images as work
+    from reconstruct.pictures.importing import import_images as work
 
     work(
         workspace, folders or [], left=left, right=right, video=video, every_s=every,

@@ -101,19 +101,19 @@ def _work_of(stage: str) -> StageWork:
 
             return run_calibrate
         case "sparse":
-            from reconstruct.sparse import run_sparse
+            from reconstruct.sparse.run import run_sparse
 
             return run_sparse
         case "dense":
-            from reconstruct.dense import run_dense
+            from reconstruct.dense.run import run_dense
 
             return run_dense
         case "mosaic":
-            from reconstruct.mosaic import run_mosaic
+            from reconstruct.mosaic.run import run_mosaic
 
             return run_mosaic
         case "report":
-            from reconstruct.evaluate import run_evaluate
+            from reconstruct.evaluate.run import run_evaluate
 
             return run_evaluate
         case _:

@@ -36,8 +36,8 @@ def features(picture: Path) -> list[tuple[str, float, float]]:
     """Normalising a picture and finding features, against COLMAP's SIFT on the CPU."""
     import pycolmap
 
-    from reconstruct.features import find_features
-    from reconstruct.normalise import normalise
+    from reconstruct.matching.features import find_features
+    from reconstruct.pictures.normalise import normalise
 
     settings = SurveyConfig().reconstruct
 

@@ -18,8 +18,8 @@ from pyproj import Transformer
 from scipy.spatial import cKDTree
 
 from alice_survey.frames import Array
-from reconstruct.alignment import align_similarity
 from reconstruct.model import read_frame
+from reconstruct.sparse.alignment import align_similarity
 
 _POINTS = 40_000
 _ROUNDS = 40

@@ -24,7 +24,7 @@ from rasterio.windows import Window
 
 from alice_survey.artefacts import atomic_path
 from alice_survey.frames import Array, Datum
-from reconstruct.dem import DemGrid
+from reconstruct.dense.dem import DemGrid
 from reconstruct.model import WorldFrame
 
 BLOCK = 256

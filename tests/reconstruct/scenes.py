@@ -9,7 +9,7 @@ from alice_survey.config import CameraConfig, WaterConfig
 from alice_survey.frames import Array, Datum, rotation_from_attitude
 from alice_survey.manifest import ImageRecord
 from camera_calib.rig import Rig, design_rig
-from reconstruct.matching import PairMatches
+from reconstruct.matching.matches import PairMatches
 
 DATUM = Datum(32.8236, 34.9553)
 SEAFLOOR_M = 15.0

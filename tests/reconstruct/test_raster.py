@@ -6,7 +6,7 @@ import pytest
 import rasterio
 from pyproj import Transformer
 
-from reconstruct.dem import DemGrid
+from reconstruct.dense.dem import DemGrid
 from reconstruct.raster import crs_of, hillshade, local_crs, preview_dem, tiled_raster, tiles_of
 from tests.oracles_dense import DATUM, FRAME
 

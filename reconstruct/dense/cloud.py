@@ -1,0 +1,178 @@
+"""The coloured point cloud: points of all views, averaged within small cubes, as a PLY file."""
+
+import math
+import shutil
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from alice_survey.artefacts import write_json
+from reconstruct.dense.dem import DemGrid, bin_points, sorted_ranks
+from reconstruct.dense.points import Points
+from reconstruct.model import WorldFrame
+
+Float32 = NDArray[np.float32]
+
+VERTEX = np.dtype(
+    [
+        ("x", "<f4"), ("y", "<f4"), ("z", "<f4"),
+        ("nx", "<f4"), ("ny", "<f4"), ("nz", "<f4"),
+        ("red", "u1"), ("green", "u1"), ("blue", "u1"),
+        ("sigma", "<f4"),
+    ]
+)  # fmt: skip
+"""One point: x east, y north, z up from the cloud's offset, normal, colour, standard deviation."""
+_PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def thin(
+    starts: NDArray[np.int64],
+    order: NDArray[np.int64],
+    enu: Float32,
+    normals: Float32,
+    colours: NDArray[np.uint8],
+    sigmas: Float32,
+    edge: float,
+) -> tuple[Float32, Float32]:
+    """Average the points of each cube, weighted by their certainty.
+
+    Args:
+        starts: (C + 1,) where the points of each column of cubes start in `order`.
+        order: (M,) point numbers sorted by column.
+        enu: (N, 3) east, north, up, by point number.
+        normals: (N, 3) unit vectors; points with NaN are left out.
+        colours: (N, 3) RGB.
+        sigmas: (N,) standard deviations.
+        edge: of the cubes; a column's cubes start at whole multiples of it.
+
+    Returns:
+        (K, 9) means of position, normal (not of unit length) and colour, and (K,) standard
+        deviations, column by column from below. A standard deviation is the weighted mean of those
+        of the points, since points of one cube mostly come from the same few matches and err
+        together.
+    """
+    mean = np.empty((order.size, 9), np.float32)
+    sigma = np.empty(order.size, np.float32)
+    sums = np.zeros(9)
+    cubes = 0
+    for column in range(starts.size - 1):
+        inside = order[starts[column] : starts[column + 1]]
+        levels = np.empty(inside.size, np.int64)
+        for i in range(inside.size):
+            levels[i] = math.floor(enu[inside[i], 2] / edge)
+        ranks = sorted_ranks(levels)
+        first = 0
+        while first < ranks.size:
+            level = levels[ranks[first]]
+            sums[:] = 0.0
+            weights, deviation = 0.0, 0.0
+            while first < ranks.size and levels[ranks[first]] == level:
+                point = inside[ranks[first]]
+                first += 1
+                if math.isnan(normals[point, 0]):
+                    continue
+                w = 1.0 / (sigmas[point] * sigmas[point])
+                weights += w
+                deviation += w * sigmas[point]
+                for k in range(3):
+                    sums[k] += w * enu[point, k]
+                    sums[3 + k] += w * normals[point, k]
+                    sums[6 + k] += w * colours[point, k]
+            if weights > 0.0:
+                for k in range(9):
+                    mean[cubes, k] = sums[k] / weights
+                sigma[cubes] = deviation / weights
+                cubes += 1
+    return mean[:cubes], sigma[:cubes]
+
+
+def thinned_points(grid: DemGrid, points: Points) -> NDArray[Any]:
+    """One vertex for every cube over a grid's cells that holds points.
+
+    Args:
+        grid: columns of cubes; points outside of it are left out, and those without normal.
+        points: in the coordinates of the grid, which are those of the vertices.
+
+    Returns:
+        (M,) records of `VERTEX`, by rows from the north, columns from the west, and from below.
+    """
+    starts, order = bin_points(
+        points.enu, grid.north, grid.west, grid.cell, grid.rows, grid.columns
+    )
+    mean, sigma = thin(
+        starts, order, points.enu, points.normals, points.colours, points.sigmas, grid.cell
+    )
+    vertices = np.empty(len(mean), VERTEX)
+    vertices["x"], vertices["y"], vertices["z"] = mean[:, :3].T
+    length = np.maximum(np.linalg.norm(mean[:, 3:6], axis=1), 1e-6)
+    vertices["nx"], vertices["ny"], vertices["nz"] = mean[:, 3:6].T / length
+    vertices["red"], vertices["green"], vertices["blue"] = np.rint(mean[:, 6:9]).T
+    vertices["sigma"] = sigma
+    return vertices
+
+
+def voxel_edge(cell: float, cells: int, most_points: int) -> float:
+    """Edge of the cubes: a cell, or more where that many cells would give too many points."""
+    return cell * max(1.0, math.sqrt(cells / most_points))
+
+
+def write_ply(
+    path: Path, parts: Iterable[NDArray[Any]], offset_enu: Sequence[float], frame: WorldFrame
+) -> int:
+    """Write a binary PLY from parts that are dropped once written.
+
+    Returns:
+        How many points were written.
+    """
+    body = path.with_suffix(".body")
+    count = 0
+    with body.open("wb") as file:
+        for part in parts:
+            file.write(part.tobytes())
+            count += len(part)
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment offset_east_north_up {' '.join(repr(float(o)) for o in offset_enu)}",
+        f"comment frame {frame.name}, unit {frame.unit}, x east, y north, z up",
+        f"comment vertical datum: {frame.vertical_datum}",
+        f"element vertex {count}",
+        *(f"property {_PLY_TYPES[VERTEX[name].str]} {name}" for name in VERTEX.names or ()),
+        "end_header",
+    ]
+    with path.open("wb") as file, body.open("rb") as source:
+        file.write(("\n".join(header) + "\n").encode("ascii", "replace"))
+        shutil.copyfileobj(source, file)
+    body.unlink()
+    return count
+
+
+def write_cloud_json(
+    path: Path, count: int, offset_enu: Sequence[float], edge: float, frame: WorldFrame
+) -> None:
+    """Write what the PLY cannot say."""
+    from reconstruct.raster import crs_of
+
+    crs = crs_of(frame)
+    write_json(
+        path,
+        {
+            "format": "alice-survey cloud",
+            "version": 1,
+            "points": count,
+            "axes": ["east", "north", "up"],
+            "offset_east_north_up": [float(o) for o in offset_enu],
+            "frame": frame.name,
+            "scaled": frame.scaled,
+            "unit": frame.unit,
+            "crs": None if crs is None else crs.to_wkt(),
+            "vertical_datum": frame.vertical_datum,
+            "thinned_to": edge,
+            "notes": list(frame.notes),
+        },
+    )

@@ -1,0 +1,447 @@
+"""The dense surface: depth of every view, fused into a DEM and a coloured point cloud.
+
+Steps, each over independent views or tiles and through files, so that memory stays bounded:
+prepare pictures, find each view's depth with a few partners, let neighbours confirm it, fuse tiles.
+"""
+
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.artefacts import Stage, need_stage, run_stage, write_json
+from alice_survey.config import ReconstructConfig, SurveyConfig
+from alice_survey.errors import ReconstructionError, warn
+from alice_survey.executor import parallel_map
+from alice_survey.frames import Array
+from reconstruct.dense.cloud import voxel_edge, write_cloud_json, write_ply
+from reconstruct.dense.dem import FILL_CELLS, DemGrid, grid_over, round_cell
+from reconstruct.dense.depth import pair_depth
+from reconstruct.dense.fusion import GATE_SIGMAS, count_witnesses, merge_depths
+from reconstruct.dense.points import pinhole_of
+from reconstruct.dense.probe import find_conditions, open_pictures, shrunk
+from reconstruct.dense.rectify import scaled_view
+from reconstruct.dense.stereo_pairs import choose_pairs, in_frame, points_of_views
+from reconstruct.dense.tiles import Tile, ViewSummary, fuse_tile, tile_tasks
+from reconstruct.dense.view_store import ViewStore
+from reconstruct.model import SparseModel, View, WorldFrame, read_model
+from reconstruct.mosaic.light import (
+    LightSamples,
+    at_nodes,
+    compare_light,
+    joined_samples,
+    low_pass,
+    solve_light,
+    write_light,
+)
+from reconstruct.pictures.normalise import normalise
+from reconstruct.raster import preview_dem, tiled_raster
+
+CELL_PIXELS = 2.5
+"""Side of a DEM cell in mean ground pixels of the pictures as matched, unless depth is coarser."""
+_WITNESSES = 8
+"""Neighbouring views that a view's depth is held against."""
+_MOST_CELLS = 4_000_000_000
+_MOST_POINTS = 40_000_000
+_BOUND_PERCENT = 0.1
+"""Share of a view's points left out on each of its four sides, so that none strays far off."""
+_LIGHT_LATTICE = 28
+"""Pixels along a picture's width at which the light of views is compared."""
+_LEAST_PIXELS = 100
+"""A view with fewer pixels of confirmed depth is left out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PrepareTask:
+    """One picture to undistort, shrink and even out."""
+
+    workspace: Path
+    store: ViewStore
+    index: int
+    image: str
+    size_px: tuple[int, int]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DepthTask:
+    """One view to find depth for."""
+
+    store: ViewStore
+    index: int
+    view: View
+    partners: tuple[tuple[int, View], ...]
+    points_world: Array
+    match_sigma_px: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckTask:
+    """One view whose depth the neighbours are asked about."""
+
+    store: ViewStore
+    index: int
+    view: View
+    neighbours: tuple[tuple[int, View], ...]
+
+
+def run_dense(workspace: Path, config: SurveyConfig, threads: int) -> bool:
+    """Find the surface of a finished sparse model and write `dense/`.
+
+    Returns:
+        True when done, False when nothing had changed.
+
+    Raises:
+        ReconstructionError: the views do not overlap, or no depth was found.
+        WorkspaceError: a stage is missing.
+    """
+    need_stage(workspace, "images", "image")
+    sparse = need_stage(workspace, "sparse", "reconstruct")
+    model = read_model(sparse)
+    settings = config.reconstruct.model_dump(
+        mode="json", include={"dense_scale", "dense_partners", "dem_cell_m"}
+    )
+    stage = Stage(
+        name="dense",
+        version=1,
+        settings=settings,
+        inputs=[sparse, *picture_files(workspace, sparse, model)],
+        resumes=True,
+    )
+
+    def work(folder: Path) -> None:
+        build_surface(workspace, model, folder, config.reconstruct, threads)
+
+    return run_stage(workspace, stage, work)
+
+
+def picture_files(workspace: Path, sparse: Path, model: SparseModel) -> list[Path]:
+    """The registered pictures and their masks."""
+    from alice_survey.artefacts import read_json
+
+    images = workspace / "images"
+    about = read_json(sparse / "cameras.json")["images"]
+    names = [view.image for view in model.views]
+    masks = [about[name]["mask"] for name in names if about[name].get("mask")]
+    return [images / name for name in [*names, *masks]]
+
+
+def build_surface(
+    workspace: Path,
+    model: SparseModel,
+    folder: Path,
+    settings: ReconstructConfig,
+    threads: int,
+) -> None:
+    """Do the work of the stage in a folder; see `run_dense`."""
+    store = ViewStore(folder / "scratch")
+    store.folder.mkdir(parents=True, exist_ok=True)
+    partners = choose_pairs(model, settings.dense_partners)
+    points = list(_points_in_sight(model))
+    conditions = find_conditions(
+        workspace, model.views, partners, points, settings.dense_scale, threads
+    )
+    views = [scaled_view(view, conditions.scale) for view in model.views]
+    prepare = [
+        PrepareTask(
+            workspace=workspace,
+            store=store,
+            index=index,
+            image=view.image,
+            size_px=(view.width_px, view.height_px),
+        )
+        for index, view in enumerate(views)
+    ]
+    _drain(parallel_map(prepare_view, prepare, threads=threads, label="even out pictures"))
+    depths = [
+        DepthTask(
+            store=store,
+            index=index,
+            view=views[index],
+            partners=tuple((pair.partner, views[pair.partner]) for pair in pairs),
+            points_world=points[index],
+            match_sigma_px=conditions.match_sigma_px,
+        )
+        for index, pairs in enumerate(partners)
+    ]
+    _drain(parallel_map(view_depth, depths, threads=threads, label="match"))
+    checks = [
+        CheckTask(
+            store=store,
+            index=index,
+            view=views[index],
+            neighbours=tuple((n, views[n]) for n in neighbours),
+        )
+        for index, neighbours in enumerate(_neighbours(model))
+    ]
+    summaries = list(parallel_map(check_view, checks, threads=threads, label="cross-check"))
+    grid = surface_grid(summaries, settings.dem_cell_m, model.frame)
+    offset = _offset(grid, summaries)
+    edge = voxel_edge(grid.cell, grid.rows * grid.columns, _MOST_POINTS)
+    light = solve_light(
+        joined_samples([summary.light for summary in summaries]),
+        np.stack([summary.nodes for summary in summaries]),
+        [view.image for view in views],
+        [view.camera for view in views],
+    )
+    write_light(folder / "light.json", light)
+    tasks = tile_tasks(store, grid, views, summaries, light, offset, edge)
+    tiles = parallel_map(fuse_tile, tasks, threads=threads, label="fuse")
+    count = write_ply(
+        folder / "cloud.ply", _write_rasters(folder, grid, model.frame, tiles), offset, model.frame
+    )
+    if count == 0:
+        raise ReconstructionError(
+            f"no depth was confirmed by a second view in {len(views)} pictures; they need more "
+            "overlap, sharper texture or better positions"
+        )
+    write_cloud_json(folder / "cloud.json", count, offset, edge, model.frame)
+    write_json(
+        folder / "surface.json",
+        {
+            "format": "alice-survey surface",
+            "version": 1,
+            "matching_scale": conditions.scale,
+            "match_sigma_px": conditions.match_sigma_px,
+            "cell": grid.cell,
+            "unit": model.frame.unit,
+            "rows": grid.rows,
+            "columns": grid.columns,
+            "frame": model.frame.name,
+            "vertical_datum": model.frame.vertical_datum,
+            "pairs": sum(len(pairs) for pairs in partners),
+            "gaps_bridged_cells": FILL_CELLS,
+            "notes": list(model.frame.notes),
+        },
+    )
+    preview_dem(folder / "dem.tif", folder / "dem.png")
+    shutil.rmtree(store.folder)
+
+
+def prepare_view(task: PrepareTask) -> None:
+    """Keep a picture's colour, evened-out grey and validity at the size of matching."""
+    if task.store.has(task.index, "grey"):
+        return
+    colour, valid = shrunk(open_pictures(task.workspace), task.image, task.size_px)
+    task.store.save(task.index, "colour", colour)
+    task.store.save(task.index, "valid", valid)
+    task.store.save(task.index, "low", low_pass(colour, valid))
+    task.store.save(task.index, "grey", normalise(colour))
+
+
+def view_depth(task: DepthTask) -> None:
+    """Match a view with its partners and merge what they say."""
+    store = task.store
+    if store.has(task.index, "agreeing"):
+        return
+    shape = (task.view.height_px, task.view.width_px)
+    depths, sigmas = [], []
+    for number, partner in task.partners:
+        found = pair_depth(
+            task.view,
+            partner,
+            np.asarray(store.load(task.index, "grey")),
+            np.asarray(store.load(number, "grey")),
+            np.asarray(store.load(task.index, "valid")),
+            np.asarray(store.load(number, "valid")),
+            task.points_world,
+            task.match_sigma_px,
+        )
+        if found is not None:
+            depths.append(found[0])
+            sigmas.append(found[1])
+    if depths:
+        depth, sigma, agreeing = merge_depths(np.stack(depths), np.stack(sigmas), GATE_SIGMAS)
+    else:
+        depth = np.full(shape, np.nan, np.float32)
+        sigma, agreeing = depth, np.zeros(shape, np.uint8)
+    store.save(task.index, "depth", depth)
+    store.save(task.index, "sigma", sigma)
+    store.save(task.index, "agreeing", agreeing)
+
+
+def check_view(task: CheckTask) -> ViewSummary:
+    """Keep the depths that two independent matches support.
+
+    A depth stays where the partners that agree and the neighbouring views that find the same
+    surface number two or more, and no more views see through it than confirm it.
+    """
+    store, view = task.store, task.view
+    depth = np.asarray(store.load(task.index, "depth"))
+    sigma = np.asarray(store.load(task.index, "sigma"))
+    confirmed = np.asarray(store.load(task.index, "agreeing")).astype(np.int16)
+    refuted = np.zeros_like(confirmed)
+    supported = np.zeros_like(confirmed)
+    for number, other in task.neighbours:
+        other_from_ref = other.world_from_cam.inv() * view.world_from_cam
+        seen, through = count_witnesses(
+            depth,
+            sigma,
+            pinhole_of(view),
+            np.ascontiguousarray(other_from_ref.as_matrix()[:3]),
+            np.asarray(store.load(number, "depth")),
+            np.asarray(store.load(number, "sigma")),
+            pinhole_of(other),
+            GATE_SIGMAS,
+        )
+        supported += seen
+        refuted += through
+    kept = np.isfinite(depth) & (confirmed + supported >= 2) & (refuted <= supported)
+    rows, columns = np.nonzero(kept)
+    nodes = at_nodes(np.asarray(store.load(task.index, "low")))
+    if len(rows) < _LEAST_PIXELS:
+        store.save(task.index, "kept", np.zeros_like(kept))
+        return ViewSummary(
+            bounds=None,
+            up=np.nan,
+            footprint=np.nan,
+            sigma=np.nan,
+            light=joined_samples([]),
+            nodes=nodes,
+        )
+    points = _world_points(view, depth, rows, columns)
+    low, high = np.percentile(points[:, :2], [_BOUND_PERCENT, 100 - _BOUND_PERCENT], axis=0)
+    beyond = (points[:, :2] < low) | (points[:, :2] > high)
+    kept[rows, columns] = ~beyond.any(axis=1)
+    store.save(task.index, "kept", kept)
+    return ViewSummary(
+        bounds=(float(low[0]), float(low[1]), float(high[0]), float(high[1])),
+        up=float(-np.median(points[:, 2])),
+        footprint=float(np.median(depth[kept]) / np.sqrt(view.fx_px * view.fy_px)),
+        sigma=float(np.median(sigma[kept])),
+        light=_shared_light(task, points, rows, columns),
+        nodes=nodes,
+    )
+
+
+def _shared_light(
+    task: CheckTask, points: Array, rows: NDArray[np.int64], columns: NDArray[np.int64]
+) -> LightSamples:
+    """Compare the light of a view and its neighbours on a lattice of its pixels."""
+    step = max(1, task.view.width_px // _LIGHT_LATTICE)
+    chosen = (rows % step == 0) & (columns % step == 0)
+    spots = points[chosen]
+    size = np.array([task.view.width_px, task.view.height_px])
+    here = (np.stack([columns[chosen], rows[chosen]], axis=1) + 0.5) / size
+    own = np.asarray(task.store.load(task.index, "low"))
+    parts = []
+    for number, other in task.neighbours:
+        seen = in_frame(other, spots)
+        there = other.project(spots[seen]) / [other.width_px, other.height_px]
+        parts.append(
+            compare_light(
+                (task.index, number),
+                (own, np.asarray(task.store.load(number, "low"))),
+                (here[seen].astype(np.float32), there.astype(np.float32)),
+            )
+        )
+    return joined_samples(parts)
+
+
+def surface_grid(
+    summaries: Sequence[ViewSummary], cell: float | None, frame: WorldFrame
+) -> DemGrid:
+    """The grid over all points.
+
+    Raises:
+        ReconstructionError: no view has depth, or the grid would be too large.
+    """
+    bounds = [s.bounds for s in summaries if s.bounds is not None]
+    if not bounds:
+        raise ReconstructionError(
+            f"no depth was confirmed by a second view in {len(summaries)} pictures; they need "
+            "more overlap, sharper texture or better positions"
+        )
+    if cell is not None and not frame.scaled:
+        warn("reconstruct.dem_cell_m is taken in model units: the model has no scale")
+    footprint = float(np.nanmedian([s.footprint for s in summaries]))
+    sigma = float(np.nanmedian([s.sigma for s in summaries]))
+    size = cell or round_cell(max(CELL_PIXELS * footprint, 1.5 * sigma))
+    grid = grid_over(bounds, size)
+    if grid.rows * grid.columns > _MOST_CELLS:
+        raise ReconstructionError(
+            f"cells of {size} {frame.unit} would make a grid of {grid.rows} x {grid.columns}; "
+            "raise reconstruct.dem_cell_m"
+        )
+    return grid
+
+
+def _world_points(
+    view: View, depth: NDArray[np.float32], rows: NDArray[np.int64], columns: NDArray[np.int64]
+) -> Array:
+    z = depth[rows, columns].astype(np.float64)
+    x = (columns + 0.5 - view.cx_px) / view.fx_px * z
+    y = (rows + 0.5 - view.cy_px) / view.fy_px * z
+    points: Array = view.world_from_cam.apply(np.stack([x, y, z], axis=1))
+    return points
+
+
+def _points_in_sight(model: SparseModel) -> Iterator[Array]:
+    """Per view the points it observed and those of others that fall into its frame."""
+    for view, own in zip(model.views, points_of_views(model), strict=True):
+        if len(own) == 0:
+            yield own
+            continue
+        centre = view.world_from_cam.translation
+        farthest = np.linalg.norm(own - centre, axis=1).max()
+        others = model.points_world[in_frame(view, model.points_world)]
+        yield others[np.linalg.norm(others - centre, axis=1) <= 1.2 * farthest]
+
+
+def _neighbours(model: SparseModel) -> list[list[int]]:
+    """For each view the others that share most sparse points with it, then the nearest."""
+    views = len(model.views)
+    from scipy.sparse import coo_matrix
+
+    points, numbers = model.observations.T
+    seen = coo_matrix(
+        (np.ones(len(points), np.float32), (numbers, points)),
+        shape=(views, len(model.points_world)),
+    ).tocsr()
+    shared = (seen @ seen.T).tolil()
+    shared.setdiag(0)
+    found = []
+    for view in range(views):
+        columns = np.array(shared.rows[view], dtype=np.int64)
+        counts = np.array(shared.data[view], dtype=np.float64)
+        order = np.lexsort((columns, -counts))
+        found.append([int(n) for n in columns[order][:_WITNESSES] if counts.size])
+    return found
+
+
+def _offset(grid: DemGrid, summaries: Sequence[ViewSummary]) -> tuple[float, float, float]:
+    """Whole numbers near the middle of the cloud: east, north, up."""
+    up = float(np.nanmedian([s.up for s in summaries]))
+    east = float(grid.east_of(grid.columns / 2))
+    north = float(grid.north_of(grid.rows / 2))
+    return (float(np.round(east)), float(np.round(north)), float(np.round(up)))
+
+
+def _write_rasters(
+    folder: Path, grid: DemGrid, frame: WorldFrame, tiles: Iterator[Tile]
+) -> Iterator[NDArray[Any]]:
+    """Write the tiles' rasters and hand their cloud points on."""
+    datum = frame.vertical_datum
+    texts = (
+        f"height above {datum}, positive up ({frame.unit})",
+        f"standard deviation of the height ({frame.unit})",
+        "views that the height rests on; 0 where a small gap was bridged",
+    )
+    with (
+        tiled_raster(folder / "dem.tif", grid, frame, "float32", np.nan, texts[0]) as dem,
+        tiled_raster(folder / "sigma.tif", grid, frame, "float32", np.nan, texts[1]) as sigma,
+        tiled_raster(folder / "count.tif", grid, frame, "uint16", None, texts[2]) as count,
+    ):
+        for tile in tiles:
+            dem.write(tile.height, 1, window=tile.window)
+            sigma.write(tile.sigma, 1, window=tile.window)
+            count.write(tile.count, 1, window=tile.window)
+            yield tile.vertices
+
+
+def _drain(results: Iterator[None]) -> None:
+    for _ in results:
+        pass

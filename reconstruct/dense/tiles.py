@@ -1,0 +1,175 @@
+"""Fusing the points of all views, tile by tile, into cells of the DEM and points of the cloud."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rasterio.windows import Window
+
+from alice_survey.frames import Array
+from reconstruct.dense.cloud import thinned_points
+from reconstruct.dense.dem import (
+    FILL_CELLS,
+    STRAY_CELLS,
+    DemGrid,
+    fill_gaps,
+    fuse_points,
+    without_strays,
+)
+from reconstruct.dense.points import joined, points_in_box
+from reconstruct.dense.view_store import ViewStore
+from reconstruct.model import View
+from reconstruct.mosaic.light import LightModel, LightSamples
+from reconstruct.raster import tiles_of
+
+_TILE_CELLS = 256
+_WORST_CELLS = 1.0
+"""Depths less certain than this many cells are left out: rig stereo from afar, mostly."""
+_RIM = FILL_CELLS + STRAY_CELLS
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewSummary:
+    """Where the points of a view lie."""
+
+    bounds: tuple[float, float, float, float] | None
+    """South, west, north, east; None where no depth was found."""
+    up: float
+    """Median height of its points."""
+    footprint: float
+    """Side of a pixel on the ground."""
+    sigma: float
+    """Median standard deviation of its depth."""
+    light: LightSamples
+    """What it and its neighbours show of the same spots."""
+    nodes: Array
+    """What it shows at the nodes of the light model; see `light.at_nodes`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TileTask:
+    """One tile of the grid to fuse."""
+
+    store: ViewStore
+    window: Window
+    grid: DemGrid
+    """Of the tile with its rim."""
+    rim: tuple[int, int, int, int]
+    """Cells around the tile, top, bottom, left, right, that only serve to judge and fill."""
+    views: tuple[tuple[int, View], ...]
+    light: LightModel
+    offset_enu: tuple[float, float, float]
+    edge: float
+    """Of the cubes to which the cloud is thinned."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Tile:
+    """A fused tile."""
+
+    window: Window
+    height: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    count: NDArray[np.uint16]
+    vertices: NDArray[Any]
+
+
+def tile_tasks(
+    store: ViewStore,
+    grid: DemGrid,
+    views: Sequence[View],
+    summaries: Sequence[ViewSummary],
+    light: LightModel,
+    offset_enu: tuple[float, float, float],
+    edge: float,
+) -> list[TileTask]:
+    """Tiles in the order of the file's rows, each with the views whose points may fall in it."""
+    tasks = []
+    for window in tiles_of(grid, _TILE_CELLS):
+        row, column = int(window.row_off), int(window.col_off)
+        rows, columns = int(window.height), int(window.width)
+        rim = (
+            min(_RIM, row),
+            min(_RIM, grid.rows - row - rows),
+            min(_RIM, column),
+            min(_RIM, grid.columns - column - columns),
+        )
+        part = grid.window(
+            row - rim[0], column - rim[2], rows + rim[0] + rim[1], columns + rim[2] + rim[3]
+        )
+        south, east = float(part.north_of(part.rows)), float(part.east_of(part.columns))
+        seeing = []
+        for index, summary in enumerate(summaries):
+            if summary.bounds is None:
+                continue
+            s, w, n, e = summary.bounds
+            beside = s >= part.north or n <= south
+            if not (beside or w >= east or e <= part.west):
+                seeing.append((index, views[index]))
+        tasks.append(
+            TileTask(
+                store=store,
+                window=window,
+                grid=part,
+                rim=rim,
+                views=tuple(seeing),
+                light=light,
+                offset_enu=offset_enu,
+                edge=edge,
+            )
+        )
+    return tasks
+
+
+def fuse_tile(task: TileTask) -> Tile:
+    """Fuse the points of all views in a tile into cells and cloud points."""
+    offset = np.array(task.offset_enu)
+    grid = task.grid.moved(-offset[0], -offset[1])
+    box = (
+        grid.west,
+        float(grid.east_of(grid.columns)),
+        float(grid.north_of(grid.rows)),
+        grid.north,
+    )
+    store = task.store
+    parts = []
+    for index, view in task.views:
+        sigma = np.asarray(store.load(index, "sigma"))
+        parts.append(
+            points_in_box(
+                view,
+                index,
+                np.asarray(store.load(index, "depth")),
+                sigma,
+                np.asarray(store.load(index, "kept")) & (sigma <= _WORST_CELLS * grid.cell),
+                np.asarray(store.load(index, "colour")),
+                task.light.factors(view.camera, view.image),
+                offset,
+                box,
+            )
+        )
+    points = joined(parts)
+    height, sigma, count = fuse_points(grid, points)
+    stray = ~without_strays(height)
+    height[stray], sigma[stray], count[stray] = np.nan, np.nan, 0
+    height, sigma = fill_gaps(height, sigma, FILL_CELLS)
+    top, bottom, left, right = task.rim
+    inner = (slice(top, grid.rows - bottom), slice(left, grid.columns - right))
+    own = grid.window(top, left, grid.rows - top - bottom, grid.columns - left - right)
+    columns = DemGrid(
+        west=own.west,
+        north=own.north,
+        cell=task.edge,
+        rows=math.ceil(own.rows * own.cell / task.edge - 1e-9),
+        columns=math.ceil(own.columns * own.cell / task.edge - 1e-9),
+    )
+    return Tile(
+        window=task.window,
+        height=(height[inner] + offset[2]).astype(np.float32),
+        sigma=sigma[inner],
+        count=count[inner],
+        vertices=thinned_points(columns, points),
+    )

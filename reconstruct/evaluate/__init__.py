@@ -1,0 +1,1 @@
+"""Scores: against the truth, a reference, another model or an earlier survey."""

@@ -1,0 +1,1 @@
+"""How pixels as taken and those of the ideal pinholes of a model belong together."""

@@ -1,0 +1,112 @@
+"""The COLMAP database that the mapper reads: cameras, rig, stations, keypoints and matches."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.frames import Array
+from alice_survey.manifest import ImageRecord
+from reconstruct.matching.matches import PairMatches
+
+VerifiedPair = tuple[int, int, PairMatches]
+"""Indices of two pictures and what they share."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Observations:
+    """What the mapper is given."""
+
+    images: Sequence[ImageRecord]
+    cameras: Mapping[str, pycolmap.Camera]
+    """By name; the first is the reference of the rig."""
+    pixels: Sequence[Array]
+    """Keypoints of every picture, (N, 2)."""
+    pairs: Sequence[VerifiedPair]
+
+
+def write_database(
+    path: Path, seen: Observations, cam_from_rig: Mapping[str, RigidTransform] | None
+) -> None:
+    """Write a new database; picture i of `seen` gets the id i + 1.
+
+    Args:
+        path: must not exist.
+        seen: pictures, keypoints and matches.
+        cam_from_rig: poses of all cameras on one rig, or None: then every camera moves by itself.
+    """
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        sensors = {}
+        for number, (name, camera) in enumerate(seen.cameras.items(), 1):
+            camera.camera_id = number
+            database.write_camera(camera, use_camera_id=True)
+            sensors[name] = camera.sensor_id
+        rig_of = _write_rigs(database, sensors, cam_from_rig)
+        for number, record in enumerate(seen.images, 1):
+            image = pycolmap.Image(
+                name=record.image, camera_id=sensors[record.camera].id, image_id=number
+            )
+            database.write_image(image, use_image_id=True)
+            database.write_keypoints(number, seen.pixels[number - 1].astype(np.float32))
+        for number, members in enumerate(_frames(seen.images, cam_from_rig is not None), 1):
+            frame = pycolmap.Frame(frame_id=number, rig_id=rig_of[seen.images[members[0]].camera])
+            for member in members:
+                sensor = sensors[seen.images[member].camera]
+                frame.add_data_id(pycolmap.data_t(sensor, member + 1))
+            database.write_frame(frame, use_frame_id=True)
+        for i, j, pair in seen.pairs:
+            _write_pair(database, i + 1, j + 1, pair)
+
+
+def rigid3d(pose: RigidTransform) -> pycolmap.Rigid3d:
+    """A scipy transform as COLMAP's."""
+    rotation = pycolmap.Rotation3d(pose.rotation.as_quat())
+    return pycolmap.Rigid3d(rotation, np.asarray(pose.translation))
+
+
+def _write_rigs(
+    database: pycolmap.Database,
+    sensors: Mapping[str, pycolmap.sensor_t],
+    cam_from_rig: Mapping[str, RigidTransform] | None,
+) -> dict[str, int]:
+    if cam_from_rig is None:
+        for number, sensor in enumerate(sensors.values(), 1):
+            rig = pycolmap.Rig(rig_id=number)
+            rig.add_ref_sensor(sensor)
+            database.write_rig(rig, use_rig_id=True)
+        return {name: number for number, name in enumerate(sensors, 1)}
+    rig = pycolmap.Rig(rig_id=1)
+    reference = next(iter(sensors))
+    rig_from_reference = cam_from_rig[reference].inv()
+    for name, sensor in sensors.items():
+        if name == reference:
+            rig.add_ref_sensor(sensor)
+        else:
+            rig.add_sensor(sensor, rigid3d(cam_from_rig[name] * rig_from_reference))
+    database.write_rig(rig, use_rig_id=True)
+    return dict.fromkeys(sensors, 1)
+
+
+def _frames(images: Sequence[ImageRecord], one_rig: bool) -> Iterable[list[int]]:
+    if not one_rig:
+        return [[i] for i in range(len(images))]
+    stations: dict[int, list[int]] = {}
+    for i, record in enumerate(images):
+        stations.setdefault(record.station, []).append(i)
+    return [stations[s] for s in sorted(stations)]
+
+
+def _write_pair(database: pycolmap.Database, first: int, second: int, pair: PairMatches) -> None:
+    if pair.geometry is None:
+        return
+    matrices = {k: v for k, v in pair.geometry.items() if k != "config" and v is not None}
+    geometry = pycolmap.TwoViewGeometry(
+        config=pycolmap.TwoViewGeometryConfiguration(pair.geometry["config"]),
+        inlier_matches=pair.matches,
+        **matrices,
+    )
+    database.write_matches(first, second, pair.matches)
+    database.write_two_view_geometry(first, second, geometry)

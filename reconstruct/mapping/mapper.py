@@ -1,0 +1,298 @@
+"""Incremental mapping with COLMAP: one model of ideal pinholes, on one rigid rig if there is one.
+
+The mapper runs on one core, so that the same input gives the same bytes whatever the number of
+threads; only work on single pictures and pairs is spread.
+"""
+
+import shutil
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pycolmap
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.errors import ReconstructionError
+from alice_survey.frames import Array
+from alice_survey.manifest import ImageRecord
+from reconstruct.lenses.lens import Lens
+from reconstruct.mapping.database import Observations, write_database
+
+_FEW_MATCHES = 12
+"""Matches that suffice in a second try, when the first one lost pictures (COLMAP: 15 to 100)."""
+_REPAIRS = 3
+_COLLAPSED = 0.05
+"""Share of the usual depth below which a point lies in the camera."""
+_MOST_COLLAPSED = 0.1
+"""Share of a frame's points; the sea floor never comes so near."""
+_LEAST_ANGLE_DEG = 6.0
+"""Of the first pair: nadir pictures with 60 % overlap rarely reach COLMAP's 16 degrees."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Mapped:
+    """The largest model that the pictures gave."""
+
+    model: pycolmap.Reconstruction
+    lenses: Mapping[str, Lens]
+    """By camera, for the cameras of the model."""
+    models: tuple[int, ...]
+    """Pictures in each model found, most first; all but the first were dropped."""
+    scaled: bool
+    """Lengths are metres, since the rig is known."""
+    baseline: float
+    """Distance between the first two pinhole centres, in units of the model; NaN for one camera."""
+    rig_factor: float
+    """By what the model was multiplied to give the rig its known (or unit) size back."""
+    notes: tuple[str, ...] = ()
+    """What a reader of the result must know."""
+
+
+def map_calibrated(
+    seen: Observations,
+    cam_from_rig: Mapping[str, RigidTransform],
+    lenses: Mapping[str, Lens],
+    folder: Path,
+    seed: int,
+) -> Mapped:
+    """Map with cameras and rig held constant: the rig gives the scale.
+
+    Args:
+        seen: pinhole cameras, keypoints as the pinholes see them, matches.
+        cam_from_rig: poses of the flat-port cameras on the rig.
+        lenses: between those cameras and their pinholes, whose centres they shift.
+        folder: for scratch files.
+        seed: of the mapper.
+    """
+    pinhole_from_rig = {
+        name: lenses[name].pinhole_from_cam * cam_from_rig[name] for name in seen.cameras
+    }
+    found = run_mapper(seen, pinhole_from_rig, folder, seed, free="nothing")
+    model = largest(found, seen.images)
+    known = _baseline(list(pinhole_from_rig.values())[:2])
+    factor = 1.0
+    if len(seen.cameras) > 1:
+        factor = known / model_baseline(model)
+        if abs(factor - 1.0) > 1e-12:
+            scale_model(model, factor)
+    return Mapped(
+        model=model,
+        lenses=lenses,
+        models=sizes(found),
+        scaled=len(seen.cameras) > 1,
+        baseline=known,
+        rig_factor=factor,
+    )
+
+
+def as_transform(pose: Any) -> RigidTransform:
+    """A COLMAP pose as scipy's."""
+    return RigidTransform.from_components(
+        np.asarray(pose.translation), Rotation.from_quat(np.asarray(pose.rotation.quat))
+    )
+
+
+def model_baseline(model: pycolmap.Reconstruction) -> float:
+    """Distance between the first two cameras of the model's rig; NaN without one."""
+    for rig in model.rigs.values():
+        for _, sensor_from_rig in sorted(
+            rig.non_ref_sensors.items(), key=lambda item: int(item[0].id)
+        ):
+            return float(np.linalg.norm(sensor_from_rig.translation))
+    return float("nan")
+
+
+def scale_model(model: pycolmap.Reconstruction, factor: float) -> None:
+    """Multiply all lengths of a model, its rig's too, in place."""
+    rigs = {rig_id: _sensor_poses(rig) for rig_id, rig in model.rigs.items()}
+    model.transform(pycolmap.Sim3d(factor, pycolmap.Rotation3d(), np.zeros(3)))
+    for rig_id, poses in rigs.items():
+        for sensor, pose in poses.items():
+            now = model.rigs[rig_id].sensor_from_rig(sensor).translation
+            if not np.allclose(now, factor * pose, rtol=1e-9, atol=0):
+                raise RuntimeError("COLMAP did not scale the rig with the model")
+
+
+def _sensor_poses(rig: Any) -> dict[Any, Array]:
+    return {s: np.array(p.translation) for s, p in rig.non_ref_sensors.items()}
+
+
+def run_mapper(
+    seen: Observations,
+    cam_from_rig: Mapping[str, RigidTransform] | None,
+    folder: Path,
+    seed: int,
+    *,
+    free: Literal["nothing", "distortion", "all"],
+) -> list[pycolmap.Reconstruction]:
+    """Map incrementally; with lower demands once more if that loses pictures.
+
+    Args:
+        seen: cameras, keypoints, matches.
+        cam_from_rig: poses of the cameras on one rig, which are held constant; None: every camera
+            moves by itself.
+        folder: for scratch files.
+        seed: of the mapper.
+        free: what of the cameras is refined besides their poses.
+
+    Returns:
+        All models, largest first.
+    """
+    found = _map_once(seen, cam_from_rig, folder, _options(cam_from_rig, seed, free))
+    if not found or found[0].num_reg_images() < len(seen.images):
+        options = _options(cam_from_rig, seed, free)
+        options.min_num_matches = _FEW_MATCHES
+        options.mapper.abs_pose_min_num_inliers = _FEW_MATCHES
+        options.mapper.init_min_num_inliers = 3 * _FEW_MATCHES
+        options.triangulation.ignore_two_view_tracks = False
+        again = _map_once(seen, cam_from_rig, folder, options)
+        if again and (not found or again[0].num_reg_images() > found[0].num_reg_images()):
+            return again
+    return found
+
+
+def _options(
+    cam_from_rig: Mapping[str, RigidTransform] | None,
+    seed: int,
+    free: Literal["nothing", "distortion", "all"],
+) -> pycolmap.IncrementalPipelineOptions:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
+    options.num_threads = options.mapper.num_threads = 1
+    options.extract_colors = False
+    options.min_model_size = 3
+    options.mapper.init_min_tri_angle = _LEAST_ANGLE_DEG
+    options.ba_refine_sensor_from_rig = False
+    if cam_from_rig is not None:
+        # A station at the end of a line may share with its neighbour only what the two pictures
+        # of one station saw: such points carry it.
+        options.triangulation.ignore_two_view_tracks = False
+        # The first pair is of arbitrary scale, in which the rig does not fit; what it failed to
+        # triangulate within a station is tried again once the scale has settled.
+        options.triangulation.re_min_ratio = 0.9
+    options.ba_refine_focal_length = free == "all"
+    options.mapper.abs_pose_refine_focal_length = free == "all"
+    options.ba_refine_extra_params = free != "nothing"
+    options.mapper.abs_pose_refine_extra_params = free != "nothing"
+    return options
+
+
+def _map_once(
+    seen: Observations,
+    cam_from_rig: Mapping[str, RigidTransform] | None,
+    folder: Path,
+    options: pycolmap.IncrementalPipelineOptions,
+) -> list[pycolmap.Reconstruction]:
+    pycolmap.logging.minloglevel = 2
+    scratch = folder / "mapper"
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir(parents=True)
+    write_database(scratch / "database.db", seen, cam_from_rig)
+    total = len({r.station for r in seen.images}) if cam_from_rig else len(seen.images)
+    found = _with_bar(
+        "mapping",
+        total,
+        lambda step: pycolmap.incremental_mapping(
+            scratch / "database.db", scratch, scratch, options, next_image_callback=step
+        ),
+    )
+    models = [pycolmap.Reconstruction(model) for model in found.values()]
+    models = [_repaired(model, scratch, options) for model in models]
+    shutil.rmtree(scratch)
+    return sorted(models, key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
+
+
+def _repaired(
+    model: pycolmap.Reconstruction, scratch: Path, options: pycolmap.IncrementalPipelineOptions
+) -> pycolmap.Reconstruction:
+    """A model whose collapsed stations are taken out and registered anew from the others.
+
+    The first pair is of arbitrary scale; now and then the adjustment shrinks its baseline to
+    nothing, with its points in the cameras' common centre, where every ray meets them. The stereo
+    points of one of both then carry the model on, and the other stays where it is.
+    """
+    for attempt in range(_REPAIRS):
+        collapsed = collapsed_frames(model)
+        if not collapsed or len(collapsed) >= model.num_reg_frames() - 1:
+            return model
+        for frame in collapsed:
+            model.deregister_frame(frame)
+        begun, output = scratch / f"begun{attempt}", scratch / f"repaired{attempt}"
+        begun.mkdir()
+        output.mkdir()
+        model.write(begun)
+        found = pycolmap.incremental_mapping(
+            scratch / "database.db", scratch, output, options, input_path=begun
+        )
+        if found:
+            model = max(found.values(), key=lambda m: m.num_reg_images())
+    return model
+
+
+def collapsed_frames(model: pycolmap.Reconstruction) -> list[int]:
+    """Frames many of whose points lie in their cameras' own centres."""
+    depths: dict[int, list[Array]] = {}
+    for image in model.images.values():
+        if not image.has_pose:
+            continue
+        seen = [p.point3D_id for p in image.points2D if p.has_point3D()]
+        if seen:
+            points = np.array([model.points3D[i].xyz for i in seen])
+            pose = image.cam_from_world()
+            depth = (points @ np.asarray(pose.rotation.matrix()).T + pose.translation)[:, 2]
+            depths.setdefault(image.frame_id, []).append(depth)
+    if not depths:
+        return []
+    usual = float(np.median(np.concatenate([np.concatenate(rows) for rows in depths.values()])))
+    return [
+        frame
+        for frame, rows in depths.items()
+        if np.mean(np.concatenate(rows) < _COLLAPSED * usual) > _MOST_COLLAPSED
+    ]
+
+
+def largest(
+    models: Sequence[pycolmap.Reconstruction], images: Sequence[ImageRecord]
+) -> pycolmap.Reconstruction:
+    """The model with the most pictures.
+
+    Raises:
+        ReconstructionError: there is none.
+    """
+    if not models:
+        raise ReconstructionError(
+            f"no model: no two of the {len(images)} pictures share enough of the same spots; "
+            "check that they overlap, or raise max_features under [reconstruct] in survey.toml"
+        )
+    return models[0]
+
+
+def sizes(models: Sequence[pycolmap.Reconstruction]) -> tuple[int, ...]:
+    """Pictures in each model."""
+    return tuple(int(model.num_reg_images()) for model in models)
+
+
+def _baseline(cam_from_rig: Sequence[RigidTransform]) -> float:
+    if len(cam_from_rig) < 2:
+        return float("nan")
+    first, second = cam_from_rig
+    return float(np.linalg.norm((second * first.inv()).translation))
+
+
+def _with_bar(label: str, total: int, work: Callable[[Callable[[], None]], Any]) -> Any:
+    """Do work that reports every step, with a bar that shows how far it is."""
+    if not sys.stderr.isatty():
+        started = time.monotonic()
+        result = work(lambda: None)
+        sys.stderr.write(f"{label}: done in {time.monotonic() - started:.1f} s\n")
+        return result
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True)) as bar:
+        task = bar.add_task(label, total=total)
+        return work(lambda: bar.advance(task))

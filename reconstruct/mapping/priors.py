@@ -1,0 +1,131 @@
+"""A last adjustment that lets positions of navigation straighten what pictures alone let bend.
+
+A single line of pictures, calibrated and on a rigid rig, still bows slowly along its length;
+navigation does not. COLMAP's adjustment with position priors first fits the model to the priors by
+a similarity, and would so take the scale from navigation: here the priors are made to agree with
+the model's scale beforehand, and the rig's known baseline is put back afterwards.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+
+from alice_survey.errors import warn
+from alice_survey.frames import Array, Datum, rotation_from_attitude
+from alice_survey.manifest import ImageRecord
+from camera_calib.rig import Rig
+from reconstruct.lenses.lens import Lens
+from reconstruct.mapping.mapper import Mapped, model_baseline, scale_model
+from reconstruct.matching.pairs import positions_ned
+
+_LEAST_STATIONS = 5
+_WORST_GROWTH = 1.05
+"""Priors may raise the mean reprojection error by this factor at most, else they are not used."""
+
+
+def pinhole_positions(
+    records: Sequence[ImageRecord], rig: Rig, lenses: Mapping[str, Lens], datum: Datum
+) -> tuple[Array, Array]:
+    """Where navigation says that the pinholes' centres were.
+
+    Returns:
+        (N, 3) positions in NED and their sigmas, both metres; NaN where position, attitude or a
+        sigma is unknown.
+    """
+    bodies = positions_ned(records, datum)
+    positions, sigmas = np.full((len(records), 3), np.nan), np.full((len(records), 3), np.nan)
+    for i, record in enumerate(records):
+        sigma = np.array(
+            [record.sigma_horizontal_m, record.sigma_horizontal_m, record.sigma_depth_m]
+        )
+        turn = np.deg2rad(max(record.sigma_attitude_deg, record.sigma_heading_deg))
+        if not (record.has_position and record.has_attitude and np.all(sigma > 0) and turn > 0):
+            continue
+        attitude = np.deg2rad([record.roll_deg, record.pitch_deg, record.heading_deg])
+        body_from_pinhole = (
+            rig.body_from_cam(record.camera) * lenses[record.camera].pinhole_from_cam.inv()
+        )
+        lever = body_from_pinhole.translation
+        positions[i] = bodies[i] + rotation_from_attitude(*attitude).apply(lever)
+        sigmas[i] = np.hypot(sigma, turn * np.linalg.norm(lever))
+    return positions, sigmas
+
+
+def refine_with_positions(
+    mapped: Mapped, records: Sequence[ImageRecord], positions: Array, sigmas: Array
+) -> Mapped:
+    """Adjust a model on a known rig once more, with robust position priors.
+
+    Args:
+        mapped: model whose scale comes from the rig; picture i of `records` has the id i + 1.
+        records: pictures.
+        positions: (N, 3) of the pinholes' centres in NED; NaN where unknown.
+        sigmas: (N, 3), likewise.
+
+    Returns:
+        The adjusted model in a new gauge; the one given where positions are too few or disagree
+        with the pictures.
+    """
+    model = pycolmap.Reconstruction(mapped.model)
+    known = [
+        number
+        for number, image in sorted(model.images.items())
+        if image.has_pose and np.isfinite(positions[number - 1] + sigmas[number - 1]).all()
+    ]
+    if len({records[number - 1].station for number in known}) < _LEAST_STATIONS:
+        return mapped
+    told = positions[[number - 1 for number in known]]
+    # The adjuster's constructor aligns the model with the priors robustly, outliers left out: its
+    # scale is taken out of the priors, so that the second one changes it no more.
+    trial = pycolmap.Reconstruction(model)
+    _adjuster(trial, _priors(trial, known, told, sigmas))
+    middle = told.mean(axis=0)
+    told = middle + (told - middle) * mapped.baseline / model_baseline(trial)
+    summary = _adjuster(model, _priors(model, known, told, sigmas)).solve()
+    model.update_point_3d_errors()
+    before = mapped.model.compute_mean_reprojection_error()
+    after = model.compute_mean_reprojection_error()
+    if not (summary.is_solution_usable() and after <= _WORST_GROWTH * before):
+        warn(
+            f"positions of navigation disagree with the pictures (reprojection {before:.2f} px "
+            f"without, {after:.2f} px with them): they place the model but do not shape it"
+        )
+        return mapped
+    factor = mapped.baseline / model_baseline(model)
+    scale_model(model, factor)
+    return replace(mapped, model=model, rig_factor=mapped.rig_factor * factor)
+
+
+def _priors(
+    model: pycolmap.Reconstruction, known: Sequence[int], told: Array, sigmas: Array
+) -> list[pycolmap.PosePrior]:
+    return [
+        pycolmap.PosePrior(
+            pose_prior_id=number,
+            corr_data_id=model.images[number].data_id,
+            position=position,
+            position_covariance=np.diag(sigmas[number - 1] ** 2),
+            coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
+        )
+        for number, position in zip(known, told, strict=True)
+    ]
+
+
+def _adjuster(
+    model: pycolmap.Reconstruction, priors: Sequence[pycolmap.PosePrior]
+) -> pycolmap.BundleAdjuster:
+    config = pycolmap.BundleAdjustmentConfig()
+    for number, image in sorted(model.images.items()):
+        if image.has_pose:
+            config.add_image(number)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_sensor_from_rig = False
+    options.refine_focal_length = options.refine_extra_params = False
+    options.ceres.solver_options.num_threads = 1
+    prior_options = pycolmap.PosePriorBundleAdjustmentOptions()
+    prior_options.alignment_ransac.random_seed = 1
+    prior_options.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    return pycolmap.create_pose_prior_bundle_adjuster(options, prior_options, config, priors, model)

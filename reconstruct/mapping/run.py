@@ -1,0 +1,319 @@
+"""The long part of the sparse stage: features, matches and the model, in its own gauge.
+
+It writes `mapping/`: `model/` (COLMAP, ideal pinholes), `cameras.json`, `mapping.json`. An
+interrupted run goes on with the features it has.
+"""
+
+import hashlib
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from alice_survey.artefacts import Stage, run_stage, write_json
+from alice_survey.config import SurveyConfig
+from alice_survey.errors import ImageError, WorkspaceError, warn
+from alice_survey.executor import parallel_map
+from alice_survey.frames import Datum
+from alice_survey.manifest import ImageRecord
+from camera_calib.rig import Rig
+from reconstruct.lenses.lens import Lens, flat_port_lens
+from reconstruct.mapping.database import Observations, VerifiedPair
+from reconstruct.mapping.mapper import Mapped, map_calibrated
+from reconstruct.mapping.priors import pinhole_positions, refine_with_positions
+from reconstruct.mapping.self_calibration import SIMPLE, map_self_calibrated
+from reconstruct.mapping.working_range import Distances, find_distances
+from reconstruct.matching.features import find_features, load_features, save_features
+from reconstruct.matching.matches import (
+    PairTask,
+    as_seen,
+    camera_text,
+    coarse_matches,
+    match_pair,
+)
+from reconstruct.matching.pairs import choose_pairs
+from reconstruct.pictures.files import exif_focal_px
+from reconstruct.pictures.normalise import normalise
+from reconstruct.pictures.undistorted import read_colour, read_mask
+
+RATIO = 0.8
+"""Largest distance of a match over that of the second nearest descriptor."""
+_LEAST_COARSE = 10
+"""Coarse matches from which a pair is matched fully."""
+_NAMED = 8
+"""Pictures named in a warning."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """What a workspace gives to the mapping."""
+
+    images: Path
+    """Folder of the pictures."""
+    records: tuple[ImageRecord, ...]
+    rig: Rig | None
+    datum: Datum | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class _FeatureTask:
+    picture: Path
+    mask: Path | None
+    target: Path
+    scale: float
+    most: int
+
+
+def run_mapping(
+    workspace: Path, inputs: Inputs, files: Sequence[Path], config: SurveyConfig, threads: int
+) -> bool:
+    """Write `mapping/`.
+
+    Args:
+        workspace: folder of the survey.
+        inputs: pictures and what is known of them.
+        files: what `inputs` was read from, and the pictures.
+        config: settings.
+        threads: how many processes.
+
+    Returns:
+        Whether there was anything to do.
+    """
+    settings = config.reconstruct
+    stage = Stage(
+        name="mapping",
+        version=1,
+        settings={
+            "seed": config.seed,
+            **settings.model_dump(
+                mode="json", include={"feature_scale", "max_features", "working_range_m"}
+            ),
+        },
+        inputs=files,
+        resumes=True,
+    )
+
+    def work(partial: Path) -> None:
+        features = _find_all(inputs, partial / "features", config, threads)
+        lenses, distances = _lenses(inputs, features, config, threads)
+        cameras, exif_focal = _cameras(inputs, lenses)
+        pairs = _match_all(inputs, features, cameras, lenses, config.seed, threads)
+        seen = Observations(
+            images=inputs.records,
+            cameras=cameras,
+            pixels=[
+                as_seen(load_features(path).pixels, lenses.get(record.camera))
+                for record, path in zip(inputs.records, features, strict=True)
+            ],
+            pairs=pairs,
+        )
+        if inputs.rig is not None:
+            poses = {name: inputs.rig.cam_from_rig[name] for name in cameras}
+            mapped = map_calibrated(seen, poses, lenses, partial, config.seed)
+            if inputs.datum is not None and mapped.scaled:
+                told = pinhole_positions(inputs.records, inputs.rig, lenses, inputs.datum)
+                mapped = refine_with_positions(mapped, inputs.records, *told)
+        else:
+            mapped = map_self_calibrated(seen, exif_focal, partial, config.seed)
+        _write(partial, inputs, mapped, distances)
+        shutil.rmtree(partial / "features")
+
+    return run_stage(workspace, stage, work)
+
+
+def extract(task: _FeatureTask) -> int:
+    """Find and save the features of one picture, unless they are there; how many there are."""
+    if not task.target.exists():
+        grey = normalise(read_colour(task.picture))
+        mask = None if task.mask is None else read_mask(task.mask, (grey.shape[1], grey.shape[0]))
+        found = find_features(grey, mask, scale=task.scale, most=task.most)
+        save_features(task.target, found)
+    return len(load_features(task.target).pixels)
+
+
+def _find_all(inputs: Inputs, folder: Path, config: SurveyConfig, threads: int) -> list[Path]:
+    """Files of features, in the order of the pictures."""
+    targets = [folder / f"{i:06d}.npz" for i in range(len(inputs.records))]
+    tasks = [
+        _FeatureTask(
+            picture=inputs.images / record.image,
+            mask=inputs.images / record.mask if record.mask else None,
+            target=target,
+            scale=config.reconstruct.feature_scale,
+            most=config.reconstruct.max_features,
+        )
+        for record, target in zip(inputs.records, targets, strict=True)
+    ]
+    folder.mkdir(parents=True, exist_ok=True)
+    counts = list(parallel_map(extract, tasks, threads=threads, label="features"))
+    poor = [r.image for r, n in zip(inputs.records, counts, strict=True) if n < 100]
+    if poor:
+        warn(f"{len(poor)} pictures have fewer than 100 features: {named(poor)}")
+    return targets
+
+
+def _lenses(
+    inputs: Inputs, features: Sequence[Path], config: SurveyConfig, threads: int
+) -> tuple[dict[str, Lens], Distances | None]:
+    """The pinholes that stand in for calibrated cameras; none without a rig."""
+    if inputs.rig is None:
+        return {}, None
+    distances = find_distances(
+        inputs.records,
+        features,
+        inputs.rig,
+        given_m=config.reconstruct.working_range_m,
+        ratio=RATIO,
+        threads=threads,
+    )
+    lenses: dict[str, Lens] = {
+        name: flat_port_lens(inputs.rig.cameras[name], distances.near_m, distances.far_m)
+        for name in _camera_names(inputs)
+    }
+    return lenses, distances
+
+
+def _cameras(
+    inputs: Inputs, lenses: Mapping[str, Lens]
+) -> tuple[dict[str, pycolmap.Camera], set[str]]:
+    """COLMAP's cameras: pinholes of a rig, else first guesses to calibrate from.
+
+    Also the names of those whose focal length EXIF states.
+    """
+    cameras, stated = {}, set()
+    for name in _camera_names(inputs):
+        if name in lenses:
+            cameras[name] = lenses[name].pinhole.colmap
+            continue
+        first = inputs.images / next(r.image for r in inputs.records if r.camera == name)
+        height, width = read_colour(first).shape[:2]
+        focal = exif_focal_px(first, width, height)
+        if np.isfinite(focal):
+            stated.add(name)
+        else:  # from COLMAP's table of cameras, else 1.2 times the longer side
+            focal = pycolmap.infer_camera_from_image(first).mean_focal_length()
+        cameras[name] = pycolmap.Camera(
+            model=SIMPLE,
+            width=width,
+            height=height,
+            params=[focal, width / 2, height / 2, 0.0, 0.0],
+            # EXIF knows nothing of water and of crops: pairs are verified without it.
+            has_prior_focal_length=False,
+        )
+    return cameras, stated
+
+
+def _camera_names(inputs: Inputs) -> list[str]:
+    """Names of the cameras that took pictures, the rig's reference (or the first) first."""
+    taken = dict.fromkeys(sorted({r.camera for r in inputs.records}))
+    if inputs.rig is None:
+        return list(taken)
+    strange = [name for name in taken if name not in inputs.rig.cameras]
+    if strange:
+        raise WorkspaceError(
+            f"camera {strange[0]!r} of the pictures is not in the rig, which has "
+            f"{', '.join(inputs.rig.cameras)}"
+        )
+    return [name for name in inputs.rig.cameras if name in taken]
+
+
+def _match_all(
+    inputs: Inputs,
+    features: Sequence[Path],
+    cameras: Mapping[str, pycolmap.Camera],
+    lenses: Mapping[str, Lens],
+    seed: int,
+    threads: int,
+) -> list[VerifiedPair]:
+    sure, maybe = choose_pairs(inputs.records, inputs.rig, inputs.datum)
+    looks = [PairTask(first=features[i], second=features[j], ratio=RATIO) for i, j in maybe]
+    counts = parallel_map(coarse_matches, looks, threads=threads, label="choosing pairs")
+    likely = [pair for pair, n in zip(maybe, counts, strict=True) if n >= _LEAST_COARSE]
+    pairs = sorted([*sure, *likely])
+    texts = {name: camera_text(camera) for name, camera in cameras.items()}
+    names = [record.camera for record in inputs.records]
+    tasks = [
+        PairTask(
+            first=features[i],
+            second=features[j],
+            ratio=RATIO,
+            cameras=(texts[names[i]], texts[names[j]]),
+            lenses=(lenses.get(names[i]), lenses.get(names[j])),
+            seed=seed,
+        )
+        for i, j in pairs
+    ]
+    found = parallel_map(match_pair, tasks, threads=threads, label="matching")
+    return [
+        (i, j, matches)
+        for (i, j), matches in zip(pairs, found, strict=True)
+        if matches.geometry is not None
+    ]
+
+
+def _write(partial: Path, inputs: Inputs, mapped: Mapped, distances: Distances | None) -> None:
+    model = mapped.model
+    registered = {image.name for image in model.images.values() if image.has_pose}
+    lost = [r.image for r in inputs.records if r.image not in registered]
+    if lost:
+        others = f" ({len(mapped.models) - 1} smaller models were dropped)"
+        warn(
+            f"{len(lost)} of {len(inputs.records)} pictures are not in the model"
+            f"{others if len(mapped.models) > 1 else ''}: {named(lost)}"
+        )
+    (partial / "model").mkdir(exist_ok=True)
+    model.write_binary(partial / "model")
+    write_json(
+        partial / "cameras.json",
+        {
+            "cameras": {name: lens.to_json() for name, lens in mapped.lenses.items()},
+            "images": {
+                r.image: {"camera": r.camera, "station": r.station, "mask": r.mask}
+                for r in inputs.records
+                if r.image in registered
+            },
+        },
+    )
+    content = b"".join(p.read_bytes() for p in sorted((partial / "model").iterdir()))
+    write_json(
+        partial / "mapping.json",
+        {
+            "registered": len(registered),
+            "total": len(inputs.records),
+            "models": list(mapped.models),
+            "scaled": mapped.scaled,
+            "baseline": mapped.baseline if np.isfinite(mapped.baseline) else None,
+            "rig_factor": mapped.rig_factor,
+            "distances": None if distances is None else vars(distances),
+            "gauge": hashlib.blake2b(content, digest_size=16).hexdigest(),
+            "notes": list(mapped.notes),
+        },
+    )
+
+
+def named(images: Sequence[str]) -> str:
+    """The first few names of a list."""
+    rest = len(images) - _NAMED
+    return ", ".join(images[:_NAMED]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def check_sizes(inputs: Inputs) -> None:
+    """Check that the first picture of every camera is as large as the rig says.
+
+    Raises:
+        ImageError: it is not.
+    """
+    if inputs.rig is None:
+        return
+    for name in _camera_names(inputs):
+        first = next(r.image for r in inputs.records if r.camera == name)
+        height, width = read_colour(inputs.images / first).shape[:2]
+        camera = inputs.rig.cameras[name]
+        if (width, height) != (camera.width_px, camera.height_px):
+            raise ImageError(
+                f"{inputs.images / first}: {width} x {height} pixels, but the rig's camera {name} "
+                f"has {camera.width_px} x {camera.height_px}: give the rig file of these pictures"
+            )

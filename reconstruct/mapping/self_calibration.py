@@ -1,0 +1,213 @@
+"""Mapping without a calibration: cameras, and the rig of two, are found from the pictures.
+
+Pictures that look straight down on a flat floor hardly tell focal length from distance, so nothing
+is freed that they do not determine: the mapper gets a simple lens, a focal length that EXIF states
+is kept unless the pictures contradict it, and the full lens model is accepted only where it comes
+out sane.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.errors import warn
+from alice_survey.manifest import ImageRecord
+from reconstruct.lenses.lens import Lens, self_calibrated_lens
+from reconstruct.mapping.database import Observations
+from reconstruct.mapping.mapper import (
+    Mapped,
+    as_transform,
+    largest,
+    model_baseline,
+    run_mapper,
+    scale_model,
+    sizes,
+)
+
+SIMPLE, FULL = "RADIAL", "OPENCV"
+"""COLMAP's lens models while mapping and in the last adjustment."""
+_LEAST_STATIONS = 3
+"""Stations with both cameras from which a rig is taken."""
+_CONTRADICTION = 1.05
+"""EXIF's focal length goes when freeing it lowers the mean reprojection error by this factor."""
+_LARGEST_ASPECT, _LARGEST_TANGENTIAL = 0.03, 0.03
+"""Bounds of a sane lens: difference of the two focal lengths, tangential distortion."""
+_LEAST_FULL = 8
+"""Pictures of a camera from which the full lens model is tried."""
+
+
+def map_self_calibrated(
+    seen: Observations, exif_focal: Collection[str], folder: Path, seed: int
+) -> Mapped:
+    """Map with cameras calibrated from the pictures; two cameras become one rigid rig.
+
+    Two cameras are first mapped freely. The mean of their relative poses is the rig of a second
+    mapping that holds it constant, after which one adjustment refines that one rig with all else.
+    The baseline is then the model's unit of length.
+
+    Args:
+        seen: cameras to start from (`SIMPLE`), keypoints as found, matches.
+        exif_focal: cameras whose focal length EXIF states.
+        folder: for scratch files.
+        seed: of the mapper.
+    """
+    known = set(exif_focal) == set(seen.cameras)
+    found = run_mapper(seen, None, folder, seed, free="distortion" if known else "all")
+    if known and (not found or found[0].num_reg_images() < len(seen.images)):
+        freed = run_mapper(seen, None, folder, seed, free="all")
+        if freed and (not found or freed[0].num_reg_images() > found[0].num_reg_images()):
+            found, known = freed, False
+    model = largest(found, seen.images)
+    notes: list[str] = []
+    cam_from_rig = None
+    if len(seen.cameras) == 2:
+        cam_from_rig = rig_from_model(model, seen.images, list(seen.cameras))
+        if cam_from_rig is None:
+            notes.append("fewer than 3 stations have both cameras: mapped without a rig")
+            warn(notes[0])
+    if cam_from_rig is not None:
+        cameras = {
+            name: pycolmap.Camera(model.cameras[number].todict())
+            for number, name in enumerate(seen.cameras, 1)
+            if number in model.cameras
+        }
+        second = replace(seen, cameras={**seen.cameras, **cameras})
+        found = run_mapper(
+            second, cam_from_rig, folder, seed, free="distortion" if known else "all"
+        )
+        model = largest(found, seen.images)
+    model, kept = calibrate_fully(model, keep_focal=known)
+    if known:
+        notes.append(
+            "focal length as EXIF states it" if kept else "focal length from the pictures, not EXIF"
+        )
+    baseline, factor = float("nan"), 1.0
+    if cam_from_rig is not None:
+        factor, baseline = 1.0 / model_baseline(model), 1.0
+        scale_model(model, factor)
+        notes.append(
+            "the stereo rig calibrated itself; unless scaled, its baseline is the unit of length"
+        )
+    lenses: dict[str, Lens] = {
+        name: self_calibrated_lens(model.cameras[number])
+        for number, name in enumerate(seen.cameras, 1)
+        if number in model.cameras
+    }
+    _to_pinholes(model, list(seen.cameras), lenses)
+    return Mapped(
+        model=model,
+        lenses=lenses,
+        models=sizes(found),
+        scaled=False,
+        baseline=baseline,
+        rig_factor=factor,
+        notes=tuple(notes),
+    )
+
+
+def rig_from_model(
+    model: pycolmap.Reconstruction, images: Sequence[ImageRecord], cameras: Sequence[str]
+) -> dict[str, RigidTransform] | None:
+    """The mean pose of the second camera in the first's frame, over the stations that have both.
+
+    Returns:
+        `cam_from_rig` of both, or None where fewer than 3 stations have both.
+    """
+    poses: dict[int, dict[str, RigidTransform]] = {}
+    for number, record in enumerate(images, 1):
+        if number in model.images and model.images[number].has_pose:
+            pose = as_transform(model.images[number].cam_from_world())
+            poses.setdefault(record.station, {})[record.camera] = pose
+    first, second = cameras
+    relative = [p[second] * p[first].inv() for _, p in sorted(poses.items()) if len(p) == 2]
+    if len(relative) < _LEAST_STATIONS:
+        return None
+    turns = Rotation.concatenate([r.rotation for r in relative])
+    shifts = np.stack([r.translation for r in relative])
+    for _ in range(2):  # a station that went astray must not turn the rig
+        away = (turns * turns.mean().inv()).magnitude()
+        keep = np.flatnonzero(away <= 3.0 * np.median(away) + 1e-9)
+        turns, shifts = turns[keep], shifts[keep]
+    mean = RigidTransform.from_components(np.median(shifts, axis=0), turns.mean())
+    return {first: RigidTransform.identity(), second: mean}
+
+
+def calibrate_fully(
+    model: pycolmap.Reconstruction, *, keep_focal: bool
+) -> tuple[pycolmap.Reconstruction, bool]:
+    """Refine everything, the one rig included, with the full lens model where it comes out sane.
+
+    Args:
+        model: with lenses of the model `SIMPLE`; not changed.
+        keep_focal: keep the focal lengths, unless freeing them explains the pictures better.
+
+    Returns:
+        The refined model, and whether its focal lengths were kept.
+    """
+    freed = _best_lens(model, focal=True)
+    if not keep_focal:
+        return freed, False
+    held = _best_lens(model, focal=False)
+    gain = held.compute_mean_reprojection_error() / freed.compute_mean_reprojection_error()
+    return (held, True) if gain < _CONTRADICTION else (freed, False)
+
+
+def _best_lens(model: pycolmap.Reconstruction, *, focal: bool) -> pycolmap.Reconstruction:
+    simple = pycolmap.Reconstruction(model)
+    _adjust(simple, focal=focal)
+    counts = {
+        number: sum(i.camera_id == number and i.has_pose for i in model.images.values())
+        for number in model.cameras
+    }
+    if min(counts.values()) < _LEAST_FULL:
+        return simple
+    full = pycolmap.Reconstruction(simple)
+    for camera in full.cameras.values():
+        f, cx, cy, k1, k2 = camera.params
+        camera.model = FULL
+        camera.params = [f, f, cx, cy, k1, k2, 0.0, 0.0]
+    _adjust(full, focal=focal)
+    for camera in full.cameras.values():
+        fx, fy, _, _, _, _, p1, p2 = camera.params
+        sane = (
+            abs(fx / fy - 1.0) <= _LARGEST_ASPECT and max(abs(p1), abs(p2)) <= _LARGEST_TANGENTIAL
+        )
+        if not sane:
+            return simple
+    return full
+
+
+def _adjust(model: pycolmap.Reconstruction, *, focal: bool) -> None:
+    config = pycolmap.BundleAdjustmentConfig()
+    for number, image in sorted(model.images.items()):
+        if image.has_pose:
+            config.add_image(number)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_focal_length = focal
+    options.ceres.solver_options.num_threads = 1
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    model.update_point_3d_errors()
+
+
+def _to_pinholes(
+    model: pycolmap.Reconstruction, names: Sequence[str], lenses: dict[str, Lens]
+) -> None:
+    """Make the model one of ideal pinholes, in place."""
+    of_camera = {n: lenses[name] for n, name in enumerate(names, 1) if name in lenses}
+    for image in model.images.values():
+        lens, points = of_camera[image.camera_id], image.points2D
+        ideal = lens.to_pinhole(np.array([p.xy for p in points]).reshape(-1, 2))
+        for point, xy in zip(points, ideal, strict=True):
+            point.xy = xy if np.all(np.isfinite(xy)) else np.full(2, -1e6)
+    for number, lens in of_camera.items():
+        camera, pinhole = model.cameras[number], lens.pinhole.colmap
+        camera.model = pinhole.model
+        camera.width, camera.height = pinhole.width, pinhole.height
+        camera.params = pinhole.params
+    model.update_point_3d_errors()

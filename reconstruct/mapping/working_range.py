@@ -1,0 +1,158 @@
+"""How far the sea floor is from the cameras: it decides where the warp to a pinhole is exact."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.errors import ReconstructionError, warn
+from alice_survey.executor import parallel_map
+from alice_survey.frames import Array
+from alice_survey.manifest import ImageRecord
+from camera_calib.flat_port import FlatPortCamera
+from camera_calib.rig import Rig
+from reconstruct.matching.features import load_features
+from reconstruct.matching.matches import match_descriptors
+
+_STATIONS = 24
+"""Stations looked at, spread evenly."""
+_FEATURES = 3000
+_LEAST_POINTS = 50
+_LARGEST_GAP_PX = 2.0
+"""Rays of a match pass each other by at most this many pixels."""
+_NEAR, _FAR = 0.75, 1.5
+"""Nearest and farthest distances over the working range, when only the latter is known."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Distances:
+    """Distances of the sea floor from the entrance pupils along the axes."""
+
+    near_m: float
+    far_m: float
+    source: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class _StereoTask:
+    first: Path
+    second: Path
+    cameras: tuple[FlatPortCamera, FlatPortCamera]
+    second_from_first: RigidTransform
+    ratio: float
+
+
+def find_distances(
+    records: Sequence[ImageRecord],
+    features: Sequence[Path],
+    rig: Rig,
+    *,
+    given_m: float | None,
+    ratio: float,
+    threads: int,
+) -> Distances:
+    """Distances from the setting, else from stereo matches, else from the altitudes measured.
+
+    Args:
+        records: pictures.
+        features: file of features of every picture.
+        rig: calibrated cameras.
+        given_m: working range set by the user.
+        ratio: for matching.
+        threads: how many processes.
+
+    Raises:
+        ReconstructionError: none of the three is there.
+    """
+    if given_m is not None:
+        return Distances(near_m=_NEAR * given_m, far_m=_FAR * given_m, source="working_range_m")
+    tasks = _stereo_tasks(records, features, rig, ratio)
+    depths = np.concatenate([np.zeros(0), *parallel_map(
+        stereo_depths, tasks, threads=threads, label="working range"
+    )])  # fmt: skip
+    if len(depths) >= _LEAST_POINTS:
+        near, far = np.percentile(depths, [2.0, 98.0])
+        return Distances(near_m=float(near), far_m=float(far), source="stereo")
+    altitudes = np.array([r.altitude_m for r in records])
+    if np.isfinite(altitudes).any():
+        reference = rig.cameras[rig.reference]
+        glass = reference.port_distance_m + reference.glass_thickness_m
+        middle = float(np.nanmedian(altitudes)) + glass
+        if tasks:
+            warn(f"{len(depths)} points in stereo matches: the altitude sets the working range")
+        return Distances(near_m=_NEAR * middle, far_m=_FAR * middle, source="altitude")
+    raise ReconstructionError(
+        f"the distance to the sea floor is not known ({len(depths)} points in stereo matches, no "
+        "altitude): set working_range_m under [reconstruct] in survey.toml"
+    )
+
+
+def stereo_depths(task: _StereoTask) -> Array:
+    """Depths of the matches of one stereo pair along the first camera's axis, exactly refracted."""
+    a, b = load_features(task.first), load_features(task.second)
+    matches = match_descriptors(a.descriptors[:_FEATURES], b.descriptors[:_FEATURES], task.ratio)
+    first, second = task.cameras
+    start_a, ray_a = first.unproject(a.pixels[matches[:, 0]])
+    start_b, ray_b = second.unproject(b.pixels[matches[:, 1]])
+    first_from_second = task.second_from_first.inv()
+    start_b, ray_b = first_from_second.apply(start_b), first_from_second.rotation.apply(ray_b)
+    along_a, gap = ray_passes(start_a, ray_a, start_b, ray_b)
+    depth: Array = start_a[:, 2] + along_a * ray_a[:, 2]
+    focal = first.n_water * first.fx_px
+    with np.errstate(invalid="ignore"):
+        good = (along_a > 0) & (gap * focal < _LARGEST_GAP_PX * depth)
+    return depth[good]
+
+
+def ray_passes(start_a: Array, ray_a: Array, start_b: Array, ray_b: Array) -> tuple[Array, Array]:
+    """Where rays pass nearest to each other.
+
+    Args:
+        start_a: (N, 3) points of the first rays.
+        ray_a: (N, 3) unit directions.
+        start_b: (N, 3), likewise of the second.
+        ray_b: (N, 3).
+
+    Returns:
+        Distance along the first ray, (N,), and least distance between the two, (N,), metres; NaN
+        where rays are parallel.
+    """
+    between = start_b - start_a
+    cosine = (ray_a * ray_b).sum(axis=1)
+    sine2 = 1.0 - cosine**2
+    sine2 = np.where(sine2 > 1e-9, sine2, np.nan)
+    to_a, to_b = (between * ray_a).sum(axis=1), (between * ray_b).sum(axis=1)
+    along_a = (to_a - cosine * to_b) / sine2
+    along_b = (cosine * to_a - to_b) / sine2
+    gap = np.linalg.norm(between + along_b[:, None] * ray_b - along_a[:, None] * ray_a, axis=1)
+    return along_a, gap
+
+
+def _stereo_tasks(
+    records: Sequence[ImageRecord], features: Sequence[Path], rig: Rig, ratio: float
+) -> list[_StereoTask]:
+    stations: dict[int, dict[str, int]] = {}
+    for i, record in enumerate(records):
+        stations.setdefault(record.station, {})[record.camera] = i
+    names = list(rig.cameras)[:2]
+    pairs = [
+        [members[name] for name in names]
+        for _, members in sorted(stations.items())
+        if len(names) == 2 and all(name in members for name in names)
+    ]
+    if not pairs:
+        return []
+    step = max(1, len(pairs) // _STATIONS)
+    poses: Mapping[str, RigidTransform] = rig.cam_from_rig
+    return [
+        _StereoTask(
+            first=features[i],
+            second=features[j],
+            cameras=(rig.cameras[names[0]], rig.cameras[names[1]]),
+            second_from_first=poses[names[1]] * poses[names[0]].inv(),
+            ratio=ratio,
+        )
+        for i, j in pairs[::step]
+    ]

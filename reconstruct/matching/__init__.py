@@ -1,0 +1,1 @@
+"""Features of pictures, the pairs worth matching, and the matches that one geometry explains."""

@@ -1,0 +1,468 @@
+"""Real pictures into a workspace: checked, named, timed and placed; the stage `images/`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime, tzinfo
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from alice_survey.artefacts import Stage, run_stage, write_json
+from alice_survey.errors import ImageError, NavigationError, WorkspaceError, warn
+from alice_survey.executor import parallel_map, progress
+from alice_survey.frames import Array
+from alice_survey.manifest import ImageRecord, write_manifest
+from camera_calib.rig import Rig, read_rig, write_rig
+from missions.logs.navigation_csv import (
+    OPTIONAL,
+    POSITION,
+    NavigationLog,
+    find_zone,
+    read_navigation,
+    warn_of_gaps,
+)
+from reconstruct.pictures.files import (
+    PictureFacts,
+    bits_used,
+    copy_picture,
+    find_pictures,
+    inspect,
+    safe_name,
+    target_suffix,
+    to_utc,
+)
+from reconstruct.pictures.undistorted import read_mask
+
+_MONO = "camera"
+_EXIF_SIGMA_M = (3.0, 6.0)
+"""Horizontal and vertical sigma of the GPS in a picture's EXIF, which states none."""
+_LOGGED_LEVEL = "sea surface, as in the navigation log"
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Entry:
+    """One picture on its way in."""
+
+    source: Path
+    camera: str
+    station: int
+    facts: PictureFacts
+    image: str = ""
+    mask: Path | None = None
+    video_time_s: float | None = None
+
+
+def import_images(
+    workspace: Path,
+    folders: Sequence[Path],
+    *,
+    left: Path | None = None,
+    right: Path | None = None,
+    video: Path | None = None,
+    every_s: float = 1.0,
+    navigation: Path | None = None,
+    clock_offset_s: float = 0.0,
+    time_zone: str = "UTC",
+    vertical_datum: str | None = None,
+    rig: Path | None = None,
+    masks: Path | None = None,
+    threads: int = 1,
+) -> bool:
+    """Write `images/` from pictures of one camera, of a stereo pair, or from a video.
+
+    A picture that cannot be decoded to its end is left out with a warning; the other picture of its
+    stereo station stays. Where each picture was taken comes from the navigation log, else from
+    GPS in EXIF, else from nothing: then the model will have neither scale nor CRS.
+
+    Args:
+        workspace: folder of the survey.
+        folders: folders of one camera's pictures, in order.
+        left: pictures of the left camera, paired with the right ones in order of their names.
+        right: pictures of the right camera.
+        video: a video to take frames from.
+        every_s: seconds between frames.
+        navigation: CSV with time and position (see `read_navigation`).
+        clock_offset_s: what to add to the times of pictures to get those of navigation.
+        time_zone: of dates that name none, in EXIF and navigation.
+        vertical_datum: name of the level that the depths of navigation count from, such as that of
+            the tide which `import-log` took off; None for the sea surface.
+        rig: `rig.json` of the cameras; its lever arm says that navigation is of the body.
+        masks: folder of masks (0 = leave out) with the stems of the pictures, or with a folder per
+            camera; without it `NAME_mask.png` beside a picture is its mask.
+        threads: how many processes.
+
+    Returns:
+        Whether there was anything to do.
+
+    Raises:
+        ImageError: pictures are missing, do not pair, are of different sizes, or too few.
+        NavigationError: the navigation log cannot be used, or a level is named without one.
+        CalibrationError: the rig file is wrong or not that of the pictures.
+    """
+    _check_sources(folders, left, right, video, every_s)
+    if not np.isfinite(clock_offset_s):
+        raise ImageError(f"--clock-offset {clock_offset_s} is no number of seconds")
+    zone = find_zone(time_zone)
+    logged_level = _checked_level(vertical_datum, navigation)
+    given = [*folders, *(p for p in (left, right, video, navigation, rig, masks) if p is not None)]
+    for path in given:
+        if not path.exists():
+            raise ImageError(f"{path}: no such file or folder")
+    for path in given:
+        if path.resolve().is_relative_to((workspace / "images").resolve()):
+            raise WorkspaceError(f"{path} is inside {workspace / 'images'}, which is written anew")
+    for simulated in (workspace / "images" / "truth", workspace / "pool" / "truth"):
+        if simulated.exists():
+            raise WorkspaceError(
+                f"{workspace} holds a simulated survey, whose rig is not that of real pictures: "
+                "choose another workspace with -w"
+            )
+    stage = Stage(
+        name="images",
+        version=1,
+        settings={
+            "folders": len(folders),
+            "stereo": left is not None,
+            "every_s": every_s if video is not None else None,
+            "navigation": navigation is not None,
+            "clock_offset_s": clock_offset_s,
+            "time_zone": time_zone,
+            "vertical_datum": vertical_datum,
+            "rig": rig is not None,
+            "masks": masks is not None,
+        },
+        inputs=given,
+    )
+
+    def work(partial: Path) -> None:
+        notes: list[str] = []
+        log = None if navigation is None else read_navigation(navigation, zone)
+        known_rig = None if rig is None else read_rig(rig)
+        if video is not None:
+            entries = _take_frames(video, every_s, partial, _mono_name(known_rig))
+        else:
+            entries = _find_entries(folders, left, right, known_rig, threads)
+        _check_entries(entries, known_rig)
+        entries = _named(entries)
+        entries = [replace(e, mask=_mask_of(e, masks, left is not None)) for e in entries]
+        if video is None:
+            notes += _copy_all(entries, partial, threads)
+        records = [_record(entry, partial) for entry in entries]
+        records, datum, level = _place(
+            entries, records, log, logged_level, clock_offset_s, zone, notes
+        )
+        records = sorted(records, key=lambda r: (r.station, r.camera))
+        write_manifest(partial / "manifest.csv", records)
+        if known_rig is not None:
+            write_rig(partial / "rig.json", known_rig)
+        write_json(
+            partial / "survey.json",
+            {"source": "imported", "datum": datum, "vertical_datum": level, "notes": notes},
+        )
+
+    return run_stage(workspace, stage, work)
+
+
+def _check_sources(
+    folders: Sequence[Path],
+    left: Path | None,
+    right: Path | None,
+    video: Path | None,
+    every_s: float,
+) -> None:
+    if (left is None) != (right is None):
+        raise ImageError("stereo pictures need both --left and --right")
+    if sum([bool(folders), left is not None, video is not None]) != 1:
+        raise ImageError("give folders of pictures, or --left and --right, or --video: one of them")
+    if not every_s > 0:
+        raise ImageError(f"--every {every_s}: seconds between frames must be more than 0")
+
+
+def _checked_level(name: str | None, navigation: Path | None) -> str:
+    """What to call the level of logged depths; files that state it give it one line."""
+    if name is None:
+        return _LOGGED_LEVEL
+    if navigation is None:
+        raise NavigationError(
+            f"--vertical-datum {name!r} names the level that a navigation log's depths count from: "
+            "give --navigation too"
+        )
+    if not name.strip() or not name.isprintable():
+        raise NavigationError(f"--vertical-datum {name!r} is no name of one line, such as 'NN2000'")
+    return name.strip()
+
+
+def _mono_name(rig: Rig | None) -> str:
+    return _MONO if rig is None else rig.reference
+
+
+def _find_entries(
+    folders: Sequence[Path], left: Path | None, right: Path | None, rig: Rig | None, threads: int
+) -> list[_Entry]:
+    if left is not None and right is not None:
+        sides = {"left": find_pictures(left), "right": find_pictures(right)}
+        if len(sides["left"]) != len(sides["right"]):
+            raise ImageError(
+                f"{len(sides['left'])} pictures in {left} but {len(sides['right'])} in {right}: "
+                "they are paired in order of their names, so every picture needs its partner"
+            )
+    else:
+        sides = {_mono_name(rig): [path for folder in folders for path in find_pictures(folder)]}
+    listed = [
+        (camera, station, path)
+        for camera, paths in sides.items()
+        for station, path in enumerate(paths)
+    ]
+    paths = [path for _, _, path in listed]
+    facts = parallel_map(inspect, paths, threads=threads, label="checking pictures")
+    entries = []
+    for (camera, station, path), known in zip(listed, facts, strict=True):
+        if known.fault:
+            warn(f"{path} is left out: {known.fault}")
+            continue
+        entries.append(_Entry(source=path, camera=camera, station=station, facts=known))
+    return entries
+
+
+def _check_entries(entries: Sequence[_Entry], rig: Rig | None) -> None:
+    if len({entry.station for entry in entries}) < 2:
+        count = len(entries)
+        raise ImageError(
+            f"{count} usable picture{'s' * (count != 1)}: a model needs pictures from 2 or more "
+            "places that overlap"
+        )
+    for camera in dict.fromkeys(entry.camera for entry in entries):
+        own = [e for e in entries if e.camera == camera]
+        first = own[0].facts
+        for entry in own:
+            facts = entry.facts
+            if (facts.width_px, facts.height_px) != (first.width_px, first.height_px):
+                raise ImageError(
+                    f"{entry.source} has {facts.width_px} x {facts.height_px} pixels, but "
+                    f"{own[0].source.name} of the same camera has {first.width_px} x "
+                    f"{first.height_px}: import pictures of one size only"
+                )
+        if rig is None:
+            continue
+        if camera not in rig.cameras:
+            raise ImageError(f"the rig has no camera {camera!r}, only {', '.join(rig.cameras)}")
+        model = rig.cameras[camera]
+        if (model.width_px, model.height_px) != (first.width_px, first.height_px):
+            raise ImageError(
+                f"{own[0].source} has {first.width_px} x {first.height_px} pixels, but the rig's "
+                f"camera {camera} has {model.width_px} x {model.height_px}"
+            )
+
+
+def _named(entries: Sequence[_Entry]) -> list[_Entry]:
+    """Names below `images/`: the camera's folder and a safe, unique form of the file's own name."""
+    taken: set[str] = set()
+    named = []
+    for entry in entries:
+        if entry.image:
+            named.append(entry)
+            continue
+        stem = safe_name(entry.source.stem)
+        suffix = target_suffix(entry.source, _bits(entries, entry.camera))
+        image, copy = f"{safe_name(entry.camera)}/{stem}{suffix}", 1
+        while image.lower() in taken:
+            copy += 1
+            image = f"{safe_name(entry.camera)}/{stem}_{copy}{suffix}"
+        taken.add(image.lower())
+        named.append(replace(entry, image=image))
+    return named
+
+
+def _bits(entries: Sequence[_Entry], camera: str) -> int:
+    return bits_used(max(e.facts.highest for e in entries if e.camera == camera))
+
+
+def _mask_of(entry: _Entry, masks: Path | None, stereo: bool) -> Path | None:
+    stem = entry.source.stem
+    names = [f"{stem}.png", f"{stem}_mask.png", f"{stem}.jpg", f"{stem}.tif"]
+    if masks is None:
+        places = [entry.source.with_name(f"{stem}_mask.png")]
+    else:
+        places = [masks / entry.camera / name for name in names]
+        if not stereo:
+            places += [masks / name for name in names]
+    found = next((path for path in places if path.is_file()), None)
+    if found is not None:
+        read_mask(found, (entry.facts.width_px, entry.facts.height_px))
+    return found
+
+
+def _copy_all(entries: Sequence[_Entry], partial: Path, threads: int) -> list[str]:
+    bits = {camera: _bits(entries, camera) for camera in {e.camera for e in entries}}
+    tasks = [(entry.source, partial / entry.image, bits[entry.camera]) for entry in entries]
+    for _ in parallel_map(_copy, tasks, threads=threads, label="copying pictures"):
+        pass
+    return [
+        f"pictures of camera {camera} held {count} bits; the upper 8 were kept"
+        for camera, count in sorted(bits.items())
+        if count > 8
+    ]
+
+
+def _copy(task: tuple[Path, Path, int]) -> None:
+    copy_picture(*task)
+
+
+def _take_frames(video: Path, every_s: float, partial: Path, camera: str) -> list[_Entry]:
+    """Write a frame every so many seconds as PNG."""
+    capture = cv2.VideoCapture(str(video))
+    if not capture.isOpened():
+        raise ImageError(f"{video}: no video that can be read")
+    entries: list[_Entry] = []
+    try:
+        total = max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
+        rate = capture.get(cv2.CAP_PROP_FPS)
+        rate = rate if np.isfinite(rate) and rate > 0 else 0.0
+        count = 0
+        for _ in progress(iter(capture.grab, False), "video frames", total or None):
+            time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
+            if count and not time_s > 0 and rate:
+                time_s = count / rate
+            count += 1
+            if time_s + 1e-6 < len(entries) * every_s:
+                continue
+            good, pixels = capture.retrieve()
+            if not good:
+                warn(f"{video}: the frame at {time_s:.2f} s is left out: it cannot be decoded")
+                continue
+            image = f"{safe_name(camera)}/{safe_name(video.stem)}_{len(entries):06d}.png"
+            (partial / image).parent.mkdir(parents=True, exist_ok=True)
+            if not cv2.imwrite(str(partial / image), pixels):
+                raise ImageError(f"{partial / image}: cannot be written")
+            facts = PictureFacts(path=video, width_px=pixels.shape[1], height_px=pixels.shape[0])
+            entries.append(
+                _Entry(
+                    source=video.with_name(Path(image).name),
+                    camera=camera,
+                    station=len(entries),
+                    facts=facts,
+                    image=image,
+                    video_time_s=time_s,
+                )
+            )
+    finally:
+        capture.release()
+    return entries
+
+
+def _record(entry: _Entry, partial: Path) -> ImageRecord:
+    mask = ""
+    if entry.mask is not None:
+        mask = f"masks/{Path(entry.image).with_suffix('.png').as_posix()}"
+        usable = read_mask(entry.mask, (entry.facts.width_px, entry.facts.height_px))
+        (partial / mask).parent.mkdir(parents=True, exist_ok=True)
+        if not cv2.imwrite(str(partial / mask), usable.astype(np.uint8) * 255):
+            raise ImageError(f"{partial / mask}: cannot be written")
+    return ImageRecord(image=entry.image, camera=entry.camera, station=entry.station, mask=mask)
+
+
+def _place(
+    entries: Sequence[_Entry],
+    records: Sequence[ImageRecord],
+    log: NavigationLog | None,
+    logged_level: str,
+    clock_offset_s: float,
+    zone: tzinfo,
+    notes: list[str],
+) -> tuple[list[ImageRecord], dict[str, float] | None, str]:
+    """Give records their times and positions; also the datum and the level of depths."""
+    times, from_first = _times(entries, log, clock_offset_s, zone)
+    records = [replace(r, time_s=float(t)) for r, t in zip(records, times, strict=True)]
+    if log is not None:
+        if not np.isfinite(times).any():
+            raise ImageError(
+                "no picture carries a time (EXIF DateTimeOriginal), so navigation cannot be tied"
+            )
+        if from_first:
+            notes.append("picture times count from the first picture, plus the clock offset")
+        records = _with_navigation(records, times, log)
+        level = logged_level
+    else:
+        records = _with_gps(records, entries)
+        level = "EXIF GPS altitude"
+    placed = [r for r in records if r.has_position]
+    if not placed:
+        if log is not None:
+            raise ImageError(
+                f"no picture was taken while navigation was logged: pictures at "
+                f"{np.nanmin(times):.1f} to {np.nanmax(times):.1f} s, log at {log.time_s[0]:.1f} "
+                f"to {log.time_s[-1]:.1f} s; check --clock-offset and --time-zone"
+            )
+        notes.append("no positions: no CRS, and unscaled unless a rig or a known length scales it")
+        return list(records), None, "none"
+    if log is None:
+        notes.append("positions from EXIF GPS, of unknown accuracy")
+    first = placed[0]
+    datum = {"latitude_deg": first.latitude_deg, "longitude_deg": first.longitude_deg}
+    return list(records), datum, level
+
+
+def _times(
+    entries: Sequence[_Entry], log: NavigationLog | None, clock_offset_s: float, zone: tzinfo
+) -> tuple[Array, bool]:
+    """Seconds of every picture on the clock of navigation (else since the first), NaN if unknown.
+
+    Also whether they count from the first picture though there is a log (which then has no dates).
+    """
+    if all(e.video_time_s is not None for e in entries):
+        times = np.array([e.video_time_s for e in entries], dtype=np.float64)
+        return times + clock_offset_s, False
+    dates = [
+        None if e.facts.time_local is None else to_utc(e.facts.time_local, zone) for e in entries
+    ]
+    known = [date for date in dates if date is not None]
+    if not known:
+        return np.full(len(entries), np.nan), False
+    start: datetime = min(known)
+    from_first = log is not None and log.start_utc is None
+    if log is not None and log.start_utc is not None:
+        start = log.start_utc
+    seconds = [np.nan if d is None else (d - start).total_seconds() for d in dates]
+    return np.array(seconds) + clock_offset_s, from_first
+
+
+def _with_navigation(
+    records: Sequence[ImageRecord], times: Array, log: NavigationLog
+) -> list[ImageRecord]:
+    found = log.at(times)
+    complete = np.isfinite(sum(found[name] for name in POSITION))
+    warn_of_gaps([r.image for r in records], times, np.where(complete, 1.0, np.nan), log)
+    names = [name for name in (*POSITION, *OPTIONAL) if name in found]
+    placed = []
+    for i, record in enumerate(records):
+        values: dict[str, Any] = {name: float(found[name][i]) for name in names}
+        placed.append(replace(record, **values) if complete[i] else record)
+    return placed
+
+
+def _with_gps(records: Sequence[ImageRecord], entries: Sequence[_Entry]) -> list[ImageRecord]:
+    placed, lost = [], []
+    for record, entry in zip(records, entries, strict=True):
+        facts = entry.facts
+        place = (facts.latitude_deg, facts.longitude_deg, facts.altitude_m)
+        if any(value is None for value in place):
+            lost.append(record.image)
+            placed.append(record)
+            continue
+        latitude, longitude, altitude = (float(v) for v in place if v is not None)
+        placed.append(
+            replace(
+                record,
+                latitude_deg=latitude,
+                longitude_deg=longitude,
+                depth_m=-altitude,
+                sigma_horizontal_m=_EXIF_SIGMA_M[0],
+                sigma_depth_m=_EXIF_SIGMA_M[1],
+            )
+        )
+    if lost and len(lost) < len(records):
+        more = f" and {len(lost) - 8} more" if len(lost) > 8 else ""
+        warn(f"{len(lost)} pictures have no complete GPS in EXIF: {', '.join(lost[:8])}{more}")
+    return placed

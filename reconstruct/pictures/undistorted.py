@@ -1,0 +1,170 @@
+"""Pictures as the ideal pinholes of the sparse model see them: for dense stereo and mosaics."""
+
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.artefacts import read_json
+from alice_survey.errors import ImageError, WorkspaceError
+from alice_survey.frames import Array
+from reconstruct.lenses.lens import Lens, lens_from_json
+from reconstruct.pictures.normalise import Grey, normalise
+
+Colour = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+_ROWS = 256
+"""Rows of a warp computed at a time, which bounds its memory."""
+
+
+def read_colour(path: Path) -> Colour:
+    """Read a picture as (H, W, 3) BGR bytes, pixels as stored (an EXIF orientation is not obeyed).
+
+    Raises:
+        ImageError: it is missing or cannot be decoded.
+    """
+    picture = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if picture is None:
+        raise ImageError(f"{path}: missing, or no picture that can be decoded")
+    colour: Colour = picture
+    return colour
+
+
+def read_mask(path: Path, size: tuple[int, int]) -> Mask:
+    """Read a mask, (H, W): True where the picture may be used.
+
+    Args:
+        path: a picture that is 0 where its partner is to be left out.
+        size: width and height it must have.
+
+    Raises:
+        ImageError: it is missing, cannot be decoded or is of another size.
+    """
+    mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    if mask is None:
+        raise ImageError(f"{path}: missing, or no mask that can be decoded")
+    if mask.shape[::-1] != size:
+        raise ImageError(
+            f"{path}: mask of {mask.shape[1]} x {mask.shape[0]} pixels for a picture of "
+            f"{size[0]} x {size[1]}"
+        )
+    return np.asarray(mask > 0)
+
+
+def undistortion_maps(lens: Lens) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Where each pixel of the pinhole's picture lies in the picture as taken.
+
+    Returns:
+        x and y in OpenCV's pixels (the first pixel's centre is 0, 0) for `cv2.remap`; -10 where the
+        camera does not see what the pinhole would.
+    """
+    width, height = lens.pinhole.width_px, lens.pinhole.height_px
+    x = np.empty((height, width), np.float32)
+    y = np.empty((height, width), np.float32)
+    columns = np.arange(width) + 0.5
+    for top in range(0, height, _ROWS):
+        rows = np.arange(top, min(top + _ROWS, height)) + 0.5
+        pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+        source = _where_invertible(lens, pixels) - 0.5
+        source = np.where(np.isfinite(source), source, -10.0).reshape(len(rows), width, 2)
+        x[top : top + _ROWS], y[top : top + _ROWS] = source[..., 0], source[..., 1]
+    return x, y
+
+
+def _where_invertible(lens: Lens, pixels: Array) -> Array:
+    """Pixels as taken; NaN beyond the radius at which a polynomial distortion folds back."""
+    taken = lens.from_pinhole(pixels)
+    inside = np.all((taken >= -1) & (taken <= np.array(lens.size_px) + 1.0), axis=1)
+    back = np.full_like(taken, np.nan)
+    back[inside] = lens.to_pinhole(taken[inside])
+    with np.errstate(invalid="ignore"):
+        folded = ~(np.linalg.norm(back - pixels, axis=1) < 0.5)
+    return np.where((inside & folded)[:, None], np.nan, taken)
+
+
+class Pictures:
+    """Pictures of a workspace without refraction and distortion, computed when asked for.
+
+    The warps of all cameras are kept (8 bytes a pixel each); pictures are not.
+    """
+
+    def __init__(self, images: Path, lenses: dict[str, Lens], cameras: dict[str, str]) -> None:
+        """Use `open`; `cameras` names the camera of every picture below the folder `images`."""
+        self._images = images
+        self._lenses = lenses
+        self._cameras = cameras
+        self._masks: dict[str, str] = {}
+        self._maps = lru_cache(maxsize=None)(lambda camera: undistortion_maps(lenses[camera]))
+        self._inside = lru_cache(maxsize=None)(self._camera_inside)
+
+    @classmethod
+    def open(cls, workspace: Path) -> "Pictures":
+        """The pictures of a workspace whose `sparse/` is finished.
+
+        Raises:
+            WorkspaceError: `sparse/cameras.json` is missing or wrong.
+        """
+        return cls.from_json(workspace / "images", workspace / "sparse" / "cameras.json")
+
+    @classmethod
+    def from_json(cls, images: Path, cameras_json: Path) -> "Pictures":
+        """As `open`, from the folder of the pictures and a file of cameras."""
+        data = read_json(cameras_json)
+        try:
+            lenses = {name: lens_from_json(lens) for name, lens in data["cameras"].items()}
+            pictures = cls(images, lenses, {n: i["camera"] for n, i in data["images"].items()})
+            pictures._masks = {n: i["mask"] for n, i in data["images"].items() if i["mask"]}
+        except (KeyError, TypeError, AttributeError) as error:
+            raise WorkspaceError(f"{cameras_json}: lacks {error}") from None
+        return pictures
+
+    def lens(self, image: str) -> Lens:
+        """The lens of the camera that took a picture.
+
+        Raises:
+            WorkspaceError: no picture of that name is in the model.
+        """
+        try:
+            return self._lenses[self._cameras[image]]
+        except KeyError:
+            raise WorkspaceError(f"no picture {image!r} in sparse/cameras.json") from None
+
+    def colour(self, image: str) -> Colour:
+        """A picture as its pinhole sees it, (H, W, 3) BGR; black where there is nothing.
+
+        Raises:
+            ImageError: the file is missing, cannot be decoded or is of another size.
+        """
+        lens, path = self.lens(image), self._images / image
+        taken = read_colour(path)
+        if taken.shape[1::-1] != lens.size_px:
+            raise ImageError(
+                f"{path}: {taken.shape[1]} x {taken.shape[0]} pixels, but its camera has "
+                f"{lens.size_px[0]} x {lens.size_px[1]}"
+            )
+        x, y = self._maps(self._cameras[image])
+        warped: Colour = cv2.remap(taken, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
+        return np.where(self._inside(self._cameras[image])[..., None], warped, np.uint8(0))
+
+    def grey(self, image: str) -> Grey:
+        """A picture as its pinhole sees it, (H, W), of even light and contrast."""
+        return normalise(self.colour(image))
+
+    def valid(self, image: str) -> Mask:
+        """Where `colour` shows something that may be used, (H, W)."""
+        lens = self.lens(image)
+        inside: Mask = self._inside(self._cameras[image])
+        if image not in self._masks:
+            return inside.copy()
+        taken = read_mask(self._images / self._masks[image], lens.size_px)
+        x, y = self._maps(self._cameras[image])
+        warped = cv2.remap(taken.astype(np.uint8), x, y, cv2.INTER_NEAREST)
+        mask: Mask = inside & (warped > 0)
+        return mask
+
+    def _camera_inside(self, camera: str) -> Mask:
+        width, height = self._lenses[camera].size_px
+        x, y = self._maps(camera)
+        return np.asarray((x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1))

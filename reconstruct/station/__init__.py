@@ -1,0 +1,1 @@
+"""One stereo station by itself: a cloud, a mesh, and lengths between picked pixels."""

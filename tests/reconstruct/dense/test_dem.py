@@ -1,0 +1,137 @@
+import math
+
+import numpy as np
+import pytest
+
+from reconstruct.dense.dem import (
+    DemGrid,
+    bin_points,
+    fill_gaps,
+    fuse_cells,
+    fuse_points,
+    grid_over,
+    round_cell,
+    without_strays,
+)
+from reconstruct.dense.points import Points
+from tests.oracles_dense import fused
+
+
+def points(enu: np.ndarray, sigmas: np.ndarray, views: np.ndarray) -> Points:
+    return Points(
+        enu=enu.astype(np.float32),
+        normals=np.zeros_like(enu, dtype=np.float32),
+        colours=np.zeros((len(enu), 3), np.uint8),
+        sigmas=sigmas.astype(np.float32),
+        views=views.astype(np.int32),
+    )
+
+
+def test_grid_covers_its_boxes_on_whole_cells():
+    grid = grid_over([(-1.23, 0.31, 2.0, 1.0), (0.0, -0.42, 1.1, 0.9)], 0.1)
+    assert grid.west == pytest.approx(-0.5)
+    assert grid.north == pytest.approx(2.0)
+    assert (grid.rows, grid.columns) == (33, 15)
+    assert grid.east_of(grid.columns) == pytest.approx(1.0)
+    assert grid.north_of(grid.rows) == pytest.approx(-1.3)
+    moved = grid.moved(10.0, -5.0).window(3, 2, 4, 5)
+    assert moved.west == pytest.approx(9.7)
+    assert moved.north == pytest.approx(-3.3)
+
+
+@pytest.mark.parametrize(
+    ("length", "cell"), [(0.004417, 0.0044), (0.0996, 0.1), (2.345, 2.3), (123.4, 120.0)]
+)
+def test_cells_have_two_digits(length: float, cell: float):
+    assert round_cell(length) == pytest.approx(cell)
+
+
+def test_bin_points_equals_a_dictionary_of_cells():
+    rng = np.random.default_rng(1)
+    enu = rng.uniform(-1, 4, (500, 3)).astype(np.float32)
+    starts, order = bin_points(enu, 3.0, 0.0, 0.5, 6, 5)
+    cells: dict[int, list[int]] = {n: [] for n in range(30)}
+    for number, (east, north, _) in enumerate(enu.tolist()):
+        row, column = math.floor((3.0 - north) / 0.5), math.floor(east / 0.5)
+        if 0 <= row < 6 and 0 <= column < 5:
+            cells[row * 5 + column].append(number)
+    for cell, members in cells.items():
+        assert order[starts[cell] : starts[cell + 1]].tolist() == members
+    assert 0 < len(order) < 500
+
+
+def test_fuse_cells_equals_its_slow_twin():
+    rng = np.random.default_rng(2)
+    sizes = rng.integers(0, 12, 80)
+    starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+    heights = rng.normal(0, 0.01, starts[-1]).astype(np.float32)
+    heights[rng.random(len(heights)) < 0.1] += np.float32(0.4)
+    sigmas = rng.uniform(0.002, 0.02, len(heights)).astype(np.float32)
+    views = np.concatenate([np.sort(rng.integers(0, 4, n)) for n in sizes]).astype(np.int32)
+
+    height, sigma, count = fuse_cells(starts, heights, sigmas, views, 3.0)
+
+    for cell, size in enumerate(sizes):
+        part = slice(starts[cell], starts[cell + 1])
+        if size == 0:
+            assert np.isnan(height[cell])
+            assert count[cell] == 0
+            continue
+        h, s, n = fused(heights[part], sigmas[part], views[part], 3.0)
+        np.testing.assert_allclose(height[cell], h, atol=2e-6)
+        np.testing.assert_allclose(sigma[cell], s, rtol=1e-3)
+        assert count[cell] == n
+
+
+def test_heights_are_up_and_rows_go_south():
+    grid = DemGrid(west=0.0, north=2.0, cell=1.0, rows=2, columns=2)
+    enu = np.array([[0.5, 1.5, -10.0], [1.5, 1.5, -11.0], [0.5, 0.5, -12.0]])
+    height, _, count = fuse_points(grid, points(enu, np.full(3, 0.01), np.arange(3)))
+    np.testing.assert_allclose(height[[0, 0, 1], [0, 1, 0]], [-10, -11, -12])
+    assert np.isnan(height[1, 1])
+    assert count.tolist() == [[1, 1], [1, 0]]
+
+
+def test_a_few_outliers_do_not_move_a_cell():
+    rng = np.random.default_rng(3)
+    grid = DemGrid(west=0.0, north=1.0, cell=1.0, rows=1, columns=1)
+    enu = np.column_stack([rng.uniform(0.1, 0.9, (60, 2)), rng.normal(5.0, 0.003, 60)])
+    clean, sigma, _ = fuse_points(grid, points(enu, np.full(60, 0.003), np.arange(60) // 10))
+    enu[::6, 2] += 0.3
+    dirty, _, _ = fuse_points(grid, points(enu, np.full(60, 0.003), np.arange(60) // 10))
+    assert abs(dirty[0, 0] - clean[0, 0]) < 0.001
+    assert abs(clean[0, 0] - 5.0) < 3 * sigma[0, 0]
+    assert 0.0005 < sigma[0, 0] < 0.003  # six views, each 3 mm
+
+
+def test_small_gaps_are_bridged_on_the_plane_and_large_ones_stay():
+    rows, columns = np.mgrid[:30, :40]
+    plane = (0.1 * rows - 0.05 * columns + 3.0).astype(np.float32)
+    holed = plane.copy()
+    holed[5:8, 5:8] = np.nan
+    holed[12:26, 15:30] = np.nan
+    sigma = np.where(np.isnan(holed), np.nan, 0.01).astype(np.float32)
+
+    height, doubt = fill_gaps(holed, sigma, 3)
+
+    np.testing.assert_allclose(height[5:8, 5:8], plane[5:8, 5:8], atol=1e-5)
+    assert (doubt[5:8, 5:8] > 0.01).all()
+    assert np.isnan(height[16:22, 19:26]).all()
+    known = ~np.isnan(holed)
+    np.testing.assert_array_equal(height[known], holed[known])
+
+
+def test_nothing_is_added_beyond_the_edge():
+    height = np.full((20, 20), np.nan, np.float32)
+    height[:, :10] = 1.0
+    filled, _ = fill_gaps(height, np.where(np.isnan(height), np.nan, 0.01).astype(np.float32), 3)
+    assert np.isnan(filled[:, 10:]).all()
+
+
+def test_strays_go_and_a_sheet_with_its_edge_stays():
+    height = np.full((40, 40), np.nan, np.float32)
+    height[:, :20] = 1.0
+    height[30:32, 33:35] = 5.0
+    kept = without_strays(height)
+    assert kept[5:35, :20].all()
+    assert not kept[:, 20:].any()

@@ -1,0 +1,114 @@
+import cv2
+import numpy as np
+import pytest
+
+from reconstruct.dense.depth import match, pair_depth, unrounded, without_mixed
+from reconstruct.pictures.normalise import normalise
+from tests.oracles_dense import (
+    DEPTH_M,
+    Scene,
+    flat,
+    hits,
+    render,
+    sloped_with_step,
+    speckle,
+    stereo_views,
+)
+
+
+def shifted(shift_px: float, height: int = 120, width: int = 260) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(8)
+    noise = cv2.GaussianBlur(rng.normal(size=(height, width)).astype(np.float32), (0, 0), 1.2)
+    left = np.clip(128 + 120 * noise, 0, 255)
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    right = cv2.remap(left, x + np.float32(shift_px), y, cv2.INTER_CUBIC)
+    return np.rint(left).astype(np.uint8), np.clip(np.rint(right), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("shift_px", [7.0, 7.25, 7.5, 7.75])
+def test_match_finds_a_shift_to_a_twentieth_of_a_pixel(shift_px: float):
+    left, right = shifted(shift_px)
+    found = match(left, right, 16)[10:-10, 40:-20]
+    assert np.isfinite(found).mean() > 0.9
+    assert abs(np.nanmedian(found) - shift_px) < 0.1
+
+
+def test_match_is_unbiased_over_all_fractions():
+    errors = []
+    for shift_px in 7.0 + np.arange(16) / 16:
+        left, right = shifted(float(shift_px))
+        errors.append(np.nanmean(match(left, right, 16)[10:-10, 40:-20]) - shift_px)
+    assert abs(np.mean(errors)) < 0.012  # rounding left alone gives 0.031
+    assert np.std(errors) > 1e-4  # sub-pixel offsets do differ from the truth
+
+
+def test_an_even_area_gets_no_disparity():
+    left, right = shifted(7.0)
+    left[:, 100:180], right[:, 93:173] = 128, 128
+    found = match(left, right, 16)
+    assert not np.isfinite(found[15:-15, 112:168]).any()
+    assert np.isfinite(found[15:-15, 200:240]).mean() > 0.9
+
+
+@pytest.mark.parametrize("shift_px", [0.4, 15.3])
+def test_a_match_at_the_end_of_the_search_is_not_believed(shift_px: float):
+    left, right = shifted(shift_px)
+    found = match(left, right, 16)[10:-10, 40:-20]
+    assert np.isfinite(found).mean() < 0.05
+
+
+def test_unrounded_undoes_truncation_towards_zero():
+    true = 80 + np.linspace(-7.9, 7.9, 100_001)  # sixteenths around five whole pixels
+    fixed = (80 + np.trunc(true - 80 + 0.5)).astype(np.int16)
+    assert np.mean(fixed - true) == pytest.approx(0.5, abs=0.05)
+    assert np.mean(unrounded(fixed) - true) == pytest.approx(0.0, abs=0.01)
+
+
+def test_mixed_pixels_go_on_both_sides_of_a_step_and_slopes_stay():
+    disparity = np.full((9, 12), 20.0, np.float32)
+    disparity[:, 6:] = 25.0
+    kept = np.isfinite(without_mixed(disparity))
+    assert not kept[:, 5:7].any()
+    assert kept[:, :5].all()
+    assert kept[:, 7:].all()
+    slope = np.tile(np.arange(12, dtype=np.float32) * 0.9, (9, 1))
+    assert np.isfinite(without_mixed(slope)).all()
+
+
+@pytest.mark.parametrize("heading_deg", [0.0, 130.0])
+def test_depth_of_a_slope_with_a_step(heading_deg: float):
+    scene = Scene(depth_of=sloped_with_step, paint=speckle())
+    views = stereo_views(np.array([0.1, 0.45]), np.array([0.3, 0.4]), heading_deg)
+    one, other = views[0], views[1]
+    greys = [normalise(render(v, scene)) for v in (one, other)]
+    everywhere = np.ones(greys[0].shape, bool)
+    rng = np.random.default_rng(1)
+    place = rng.uniform(-0.3, 0.9, (200, 2))
+    points = np.column_stack([place, sloped_with_step(*place.T)])
+
+    depth, sigma = pair_depth(one, other, *greys, everywhere, everywhere, points, 0.3)
+
+    true = one.world_from_cam.inv().apply(hits(one, scene).reshape(-1, 3))[:, 2]
+    error = depth - true.reshape(depth.shape)
+    known = np.isfinite(depth)
+    assert known.mean() > 0.5
+    assert 0.0005 < np.sqrt(np.nanmean(error**2)) < 0.015
+    assert np.nanmedian(np.abs(error)) < np.nanmedian(sigma)
+    assert abs(np.nanmedian(error)) < 0.0015
+
+
+def test_masked_pixels_get_no_depth():
+    scene = Scene(depth_of=flat, paint=speckle())
+    one, other, *_ = stereo_views(np.array([0.0, 0.35]), np.array([0.0, 0.0]), 0.0)
+    greys = [normalise(render(v, scene)) for v in (one, other)]
+    everywhere = np.ones(greys[0].shape, bool)
+    masked = everywhere.copy()
+    masked[:, :200] = False
+    points = np.array([[0.1, 0.1, DEPTH_M + 0.05], [0.0, 0.2, DEPTH_M - 0.05]] * 3)
+    here, _ = pair_depth(one, other, *greys, masked, everywhere, points, 0.3)
+    there, _ = pair_depth(one, other, *greys, everywhere, masked, points, 0.3)
+    free, _ = pair_depth(one, other, *greys, everywhere, everywhere, points, 0.3)
+    assert np.isfinite(free[:, :200]).any()
+    assert not np.isfinite(here[:, :200]).any()
+    assert np.isfinite(here[:, 210:]).any()
+    assert np.isfinite(there).sum() < 0.7 * np.isfinite(free).sum()

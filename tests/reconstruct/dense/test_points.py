@@ -1,0 +1,110 @@
+import numpy as np
+import pytest
+
+from reconstruct.dense.points import enu_from_cam, joined, points_in_box
+from tests.oracles_dense import Scene, hits, position_code, sloped_with_step, stereo_views
+
+EVERYWHERE = (-100.0, 100.0, -100.0, 100.0)
+SCENE = Scene(
+    depth_of=lambda n, e: 12.0 + 0.2 * n - 0.1 * e + 0.0 * n * e,
+    paint=position_code,
+)
+OFFSET = np.array([3.0, -2.0, -12.0])
+
+
+def depth_of(view, scene=SCENE) -> np.ndarray:
+    cam = view.world_from_cam.inv().apply(hits(view, scene).reshape(-1, 3))
+    return cam[:, 2].reshape(view.height_px, view.width_px).astype(np.float32)
+
+
+def gathered(view, box=EVERYWHERE, factors=None, depth=None):
+    depth = depth_of(view) if depth is None else depth
+    colour = np.zeros((*depth.shape, 3), np.uint8)
+    colour[...] = (100, 50, 20)
+    return points_in_box(
+        view,
+        7,
+        depth,
+        np.full_like(depth, 0.01),
+        np.isfinite(depth),
+        colour,
+        np.ones((2, 2, 3), np.float32) if factors is None else factors,
+        OFFSET,
+        box,
+    )
+
+
+def test_points_lie_where_the_rays_hit():
+    view = stereo_views(np.array([0.2]), np.array([0.1]))[0]
+    points = gathered(view)
+    world = hits(view, SCENE).reshape(-1, 3)
+    enu = np.column_stack([world[:, 1], world[:, 0], -world[:, 2]]) - OFFSET
+    np.testing.assert_allclose(points.enu, enu, atol=2e-6)
+    assert (points.views == 7).all()
+    np.testing.assert_array_equal(points.colours[0], [20, 50, 100])
+
+
+def test_normals_are_those_of_the_plane_and_point_to_the_camera():
+    view = stereo_views(np.array([0.2]), np.array([0.1]))[0]
+    normals = gathered(view).normals
+    known = np.isfinite(normals).all(axis=1)
+    assert known.mean() > 0.95
+    # depth = 12 + 0.2 n - 0.1 e, so up = -12 - 0.2 n + 0.1 e with normal (-0.1, 0.2, 1)
+    expected = np.array([-0.1, 0.2, 1.0]) / np.linalg.norm([0.1, 0.2, 1.0])
+    np.testing.assert_allclose(normals[known], np.tile(expected, (known.sum(), 1)), atol=2e-3)
+
+
+def test_boxes_share_no_point_and_miss_none():
+    view = stereo_views(np.array([0.2]), np.array([0.1]))[0]
+    everything = gathered(view)
+    middle = float(np.median(everything.enu[:, 0]))
+    west = gathered(view, (-100.0, middle, -100.0, 100.0))
+    east = gathered(view, (middle, 100.0, -100.0, 100.0))
+    assert len(west.enu) + len(east.enu) == len(everything.enu)
+    assert min(len(west.enu), len(east.enu)) > 1000
+    assert west.enu[:, 0].max() <= middle <= east.enu[:, 0].max()
+
+
+def test_unknown_depth_gives_no_point_and_no_normal_beside_it():
+    view = stereo_views(np.array([0.2]), np.array([0.1]))[0]
+    depth = depth_of(view)
+    depth[100:110, 50:60] = np.nan
+    points = gathered(view, depth=depth)
+    assert len(points.enu) == depth.size - 100
+    rim = 4 * (view.width_px + view.height_px) - 16
+    assert (~np.isfinite(points.normals[:, 0])).sum() == pytest.approx(rim + 80, abs=2)
+
+
+def test_colours_take_the_factors_of_their_place():
+    view = stereo_views(np.array([0.2]), np.array([0.1]))[0]
+    factors = np.ones((2, 2, 3), np.float32)
+    factors[:, 1] = 2.0
+    colours = gathered(view, factors=factors).colours.reshape(view.height_px, view.width_px, 3)
+    np.testing.assert_allclose(colours[:, 0, 2], 100, atol=1)
+    np.testing.assert_allclose(colours[:, -1, 2], 200, atol=1)
+    np.testing.assert_allclose(colours[:, view.width_px // 2, 0], 30, atol=1)
+
+
+def test_joined_keeps_order_and_nothing_joins_to_nothing():
+    view = stereo_views(np.array([0.2]), np.array([0.1]))[0]
+    part = gathered(view, (-100.0, float(np.median(gathered(view).enu[:, 0])), -100, 100))
+    both = joined([part, part])
+    assert len(both.enu) == 2 * len(part.enu)
+    np.testing.assert_array_equal(both.enu[len(part.enu) :], part.enu)
+    assert len(joined([]).enu) == 0
+
+
+def test_enu_turns_the_frame_right_side_up():
+    view = stereo_views(np.array([0.2]), np.array([0.1]))[0]
+    matrix = enu_from_cam(view, np.zeros(3))
+    np.testing.assert_allclose(np.linalg.det(matrix[:, :3]), 1.0)
+    centre = view.world_from_cam.translation
+    np.testing.assert_allclose(matrix[:, 3], [centre[1], centre[0], -centre[2]])
+    assert matrix[2, 2] < -0.99  # a nadir camera looks down
+
+
+def test_a_step_has_points_on_both_levels():
+    view = stereo_views(np.array([0.3]), np.array([0.35]))[0]
+    scene = Scene(depth_of=sloped_with_step, paint=position_code)
+    up = gathered(view, depth=depth_of(view, scene)).enu[:, 2]
+    assert np.ptp(up) > 0.1

@@ -1,0 +1,119 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from reconstruct.dense.rectify import depth_in_reference, rect_pixels, rectify, scaled_view
+from reconstruct.model import View
+
+
+def view(centre: list[float], rotvec: list[float], focal: float = 400.0) -> View:
+    return View(
+        image="a",
+        camera="left",
+        station=0,
+        width_px=320,
+        height_px=240,
+        fx_px=focal,
+        fy_px=1.01 * focal,
+        cx_px=163.0,
+        cy_px=118.0,
+        world_from_cam=RigidTransform.from_components(centre, Rotation.from_rotvec(rotvec)),
+    )
+
+
+def transfer(homography: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    rows = np.column_stack([pixels, np.ones(len(pixels))]) @ homography.T
+    return rows[:, :2] / rows[:, 2:]
+
+
+@given(
+    bearing=st.floats(0, 2 * np.pi),
+    forward=st.floats(-0.1, 0.1),
+    turns=st.lists(st.floats(-0.15, 0.15), min_size=6, max_size=6),
+)
+@settings(max_examples=40, deadline=None)
+def test_any_pair_matches_on_rows_with_disparity_focal_times_base_over_range(
+    bearing: float, forward: float, turns: list[float]
+):
+    base = [0.4 * np.cos(bearing), 0.4 * np.sin(bearing), forward]
+    one, other = view([0, 0, 0], turns[:3]), view(base, turns[3:], focal=380.0)
+    rng = np.random.default_rng(4)
+    points = np.column_stack([rng.uniform(-0.5, 0.5, (60, 2)), rng.uniform(1.7, 2.2, 60)])
+
+    pair = rectify(one, other, points)
+
+    assert pair is not None
+    left = transfer(pair.rect_from_reference, one.project(points))
+    right = transfer(pair.rect_from_partner, other.project(points))
+    np.testing.assert_allclose(left[:, 1], right[:, 1], atol=1e-6)
+    disparity = left[:, 0] - right[:, 0]
+    inner = (disparity > 0) & (disparity < pair.disparities_px)
+    assert inner.all()  # the search holds every point
+    reach = pair.range_from_disparity(disparity.astype(np.float32))
+    sight = (points - one.world_from_cam.translation) @ _axis(one, other)
+    np.testing.assert_allclose(reach, sight, rtol=1e-5)
+
+
+def _axis(one: View, other: View) -> np.ndarray:
+    base = other.world_from_cam.translation - one.world_from_cam.translation
+    base = base / np.linalg.norm(base)
+    sight = sum(v.world_from_cam.rotation.apply([0.0, 0, 1]) for v in (one, other))
+    sight = sight - (sight @ base) * base
+    return sight / np.linalg.norm(sight)
+
+
+def test_depth_map_of_a_plane_comes_back():
+    one, other = view([0, 0, 0], [0.05, -0.03, 0.4]), view([0.1, 0.35, 0.02], [0.0, 0.06, 0.3])
+    rng = np.random.default_rng(4)
+    points = np.column_stack([rng.uniform(-0.5, 0.5, (60, 2)), np.full(60, 2.0)])
+    pair = rectify(one, other, points)
+    assert pair is not None
+    # true disparity of the plane z = 2 at every virtual pixel
+    inverse = np.linalg.inv(pair.rect_from_reference)
+    grid = np.stack(np.meshgrid(np.arange(pair.width_px), np.arange(pair.height_px)), -1) + 0.5
+    pixels = transfer(inverse, grid.reshape(-1, 2).astype(float))
+    rays = one.world_from_cam.rotation.apply(
+        np.column_stack(
+            [
+                (pixels[:, 0] - one.cx_px) / one.fx_px,
+                (pixels[:, 1] - one.cy_px) / one.fy_px,
+                np.ones(len(pixels)),
+            ]
+        )
+    )
+    world = rays * (2.0 / rays[:, 2:])
+    right = transfer(pair.rect_from_partner, other.project(world))
+    disparity = (grid.reshape(-1, 2)[:, 0] - right[:, 0]).reshape(grid.shape[:2])
+
+    depth = depth_in_reference(one, pair, disparity.astype(np.float32))
+
+    x, y = rect_pixels(one, pair)
+    inside = (x > 1) & (y > 1) & (x < pair.width_px - 2) & (y < pair.height_px - 2)
+    assert inside.mean() > 0.3
+    grid_x, grid_y = np.meshgrid(np.arange(320) + 0.5, np.arange(240) + 0.5)
+    rays = np.stack([(grid_x - 163.0) / 400.0, (grid_y - 118.0) / 404.0, np.ones((240, 320))], -1)
+    down = one.world_from_cam.rotation.apply(rays.reshape(-1, 3))[:, 2].reshape(240, 320)
+    np.testing.assert_allclose((depth * down)[inside], 2.0, atol=1e-3)
+
+
+def test_no_pair_along_the_line_of_sight_or_face_to_face():
+    points = np.array([[0.0, 0.0, 2.0], [0.1, 0.1, 2.1]])
+    assert rectify(view([0, 0, 0], [0, 0, 0]), view([0, 0, 0.4], [0, 0, 0]), points) is None
+    assert rectify(view([0, 0, 0], [0, 0, 0]), view([0.4, 0, 0], [0, np.pi, 0]), points) is None
+
+
+def test_scaled_view_sees_the_same_places_at_half_the_pixels():
+    full = view([0, 0, 0], [0.1, 0, 0])
+    points = np.array([[0.1, 0.2, 2.0], [-0.3, 0.1, 1.8]])
+    half = scaled_view(full, 0.5)
+    np.testing.assert_allclose(half.project(points), full.project(points) / 2, atol=1e-12)
+    assert (half.width_px, half.height_px) == (160, 120)
+    assert scaled_view(full, 1.0) is full
+
+
+@pytest.mark.parametrize("behind", [-1.0, -0.1])
+def test_points_behind_the_reference_bound_nothing(behind: float):
+    pair = view([0, 0, 0], [0, 0, 0]), view([0.3, 0, 0], [0, 0, 0])
+    assert rectify(*pair, np.array([[0.0, 0.0, behind]])) is None

@@ -1,0 +1,151 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+
+from alice_survey.artefacts import read_json
+from alice_survey.config import ReconstructConfig, SurveyConfig
+from alice_survey.errors import ReconstructionError, WorkspaceError
+from reconstruct.dense.run import run_dense
+from tests.oracles_dense import (
+    DEPTH_M,
+    Scene,
+    flat,
+    position_code,
+    sloped_with_step,
+    sparse_model,
+    speckle,
+    stereo_views,
+    write_workspace,
+)
+
+SCENE = Scene(depth_of=sloped_with_step, paint=speckle())
+CONFIG = SurveyConfig(reconstruct=ReconstructConfig(dense_partners=3))
+
+
+def survey_views() -> list:
+    """Two lines, half a metre apart, of three stereo stations each."""
+    along, aside = np.meshgrid([-0.05, 0.3, 0.65], [0.1, 0.6])
+    return stereo_views(along.ravel(), aside.ravel(), heading_deg=0.0)
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("survey")
+    write_workspace(folder, sparse_model(survey_views(), SCENE), SCENE)
+    assert run_dense(folder, CONFIG, 1)
+    return folder
+
+
+def read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Values, and north and east of the cells' centres."""
+    with rasterio.open(path) as raster:
+        values, t = raster.read(1).astype(np.float64), raster.transform
+    rows, columns = np.mgrid[: values.shape[0], : values.shape[1]] + 0.5
+    return values, t.f + rows * t.e, t.c + columns * t.a
+
+
+def middle(north: np.ndarray, east: np.ndarray) -> np.ndarray:
+    """Where several stations look, the rim of the block left out by no one."""
+    return (north > -0.2) & (north < 0.8) & (east > -0.2) & (east < 0.9)
+
+
+def test_surface_agrees_with_the_truth_edges_included(workspace: Path):
+    height, north, east = read(workspace / "dense" / "dem.tif")
+    here = middle(north, east)
+    assert np.isfinite(height[here]).mean() > 0.97
+    error = (height + sloped_with_step(north, east))[here]
+    error = error[np.isfinite(error)]
+    assert 2e-4 < np.median(np.abs(error)) < 1.5e-3  # a pixel is 4.7 mm, nothing is exact
+    assert abs(np.median(error)) < 8e-4
+    # the block's sides, 0.1 m high, fill a cell's width around 1.6 m of rim
+    assert np.mean(np.abs(error) > 0.01) < 0.03
+    assert np.sqrt(np.mean(error**2)) < 0.012
+
+
+def test_heights_are_positive_up_and_the_block_stands_out(workspace: Path):
+    height, north, east = read(workspace / "dense" / "dem.tif")
+    top = (np.abs(north - 0.3) < 0.17) & (np.abs(east - 0.35) < 0.17)
+    foot = (np.abs(north - 0.3) < 0.17) & (np.abs(east - 0.65) < 0.06)
+    slope = -(0.08 * north - 0.05 * east)
+    rise = np.nanmedian((height - slope)[top]) - np.nanmedian((height - slope)[foot])
+    assert rise == pytest.approx(0.1, abs=0.0015)
+    assert np.nanmedian(height) == pytest.approx(-DEPTH_M, abs=0.1)
+
+
+def test_sigma_is_an_honest_bound(workspace: Path):
+    height, north, east = read(workspace / "dense" / "dem.tif")
+    sigma, _, _ = read(workspace / "dense" / "sigma.tif")
+    count, _, _ = read(workspace / "dense" / "count.tif")
+    flat_part = middle(north, east) & (np.abs(north - 0.3) > 0.25) & (count > 0)
+    error = (height + sloped_with_step(north, east))[flat_part]
+    ratio = np.sqrt(np.mean(np.clip(error / sigma[flat_part], -5, 5) ** 2))
+    assert 0.15 < ratio < 1.2
+    np.testing.assert_array_equal(np.isfinite(height), np.isfinite(sigma))
+    assert (count[~np.isfinite(height)] == 0).all()
+    assert np.median(count[flat_part]) > 4
+
+
+def test_cloud_lies_on_the_surface_with_normals_up(workspace: Path):
+    import open3d as o3d
+
+    about = read_json(workspace / "dense" / "cloud.json")
+    cloud = o3d.t.io.read_point_cloud(str(workspace / "dense" / "cloud.ply"))
+    enu = cloud.point.positions.numpy() + np.array(about["offset_east_north_up"])
+    assert len(enu) == about["points"] > 20_000
+    error = enu[:, 2] + sloped_with_step(enu[:, 1], enu[:, 0])
+    assert np.median(np.abs(error)) < 0.003
+    normals = cloud.point.normals.numpy()
+    level = np.abs(enu[:, 1] - 0.3) > 0.3
+    expected = np.array([-0.05, 0.08, 1.0]) / np.linalg.norm([0.05, 0.08, 1.0])
+    np.testing.assert_allclose(np.median(normals[level], axis=0), expected, atol=0.02)
+    assert cloud.point.sigma.numpy().min() > 0
+
+
+def test_scratch_is_gone_and_files_are_there(workspace: Path):
+    names = {path.name for path in (workspace / "dense").iterdir()}
+    assert names == {
+        "dem.tif",
+        "sigma.tif",
+        "count.tif",
+        "dem.png",
+        "cloud.ply",
+        "cloud.json",
+        "light.json",
+        "surface.json",
+        "stage.json",
+    }
+
+
+def test_a_second_run_does_nothing(workspace: Path):
+    assert not run_dense(workspace, CONFIG, 1)
+
+
+@pytest.mark.slow
+def test_bytes_do_not_depend_on_the_number_of_processes(workspace: Path, tmp_path: Path):
+    other = tmp_path / "again"
+    other.mkdir()
+    for name in ("images", "sparse"):
+        (other / name).symlink_to(workspace / name)
+    assert run_dense(other, CONFIG, 2)
+    for name in ("dem.tif", "sigma.tif", "count.tif", "cloud.ply", "surface.json", "light.json"):
+        assert (other / "dense" / name).read_bytes() == (workspace / "dense" / name).read_bytes()
+
+
+def test_pictures_without_texture_give_one_line(tmp_path: Path):
+    grey = Scene(depth_of=flat, paint=lambda n, e: np.full((*n.shape, 3), 90.0))
+    views = stereo_views(np.array([0.0, 0.3]), np.array([0.0, 0.0]))
+    write_workspace(tmp_path, sparse_model(views, grey), grey)
+    with pytest.raises(ReconstructionError, match="no depth was confirmed") as caught:
+        run_dense(tmp_path, CONFIG, 1)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "dense").exists()
+
+
+def test_a_workspace_without_model_says_which_command_makes_one(tmp_path: Path):
+    scene = Scene(depth_of=flat, paint=position_code)
+    write_workspace(tmp_path, sparse_model(stereo_views(np.zeros(1), np.zeros(1)), scene), scene)
+    (tmp_path / "sparse" / "stage.json").unlink()
+    with pytest.raises(WorkspaceError, match="reconstruct"):
+        run_dense(tmp_path, CONFIG, 1)

@@ -1,0 +1,62 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.errors import ReconstructionError
+from reconstruct.dense.stereo_pairs import choose_pairs, points_of_views
+from tests.oracles_dense import Scene, flat, position_code, sparse_model, stereo_views
+
+SCENE = Scene(depth_of=flat, paint=position_code)
+
+
+def line(stations: int = 5) -> list:
+    along = 0.4 * np.arange(stations)
+    return stereo_views(along, np.zeros(stations), heading_deg=0.0)
+
+
+def test_rig_partner_comes_first_then_neighbours_ahead_and_astern():
+    model = sparse_model(line(), SCENE)
+    middle = next(n for n, v in enumerate(model.views) if v.image == "left/002.png")
+
+    pairs = choose_pairs(model, per_view=3)[middle]
+
+    partners = [model.views[pair.partner] for pair in pairs]
+    assert partners[0].image == "right/002.png"
+    assert {partner.station for partner in partners[1:]} == {1, 3}
+    assert pairs[0].base_to_height == pytest.approx(0.05, rel=0.05)
+    assert all(0.15 < pair.base_to_height < 0.3 for pair in pairs[1:])
+    assert all(0.5 < pair.overlap < 0.8 for pair in pairs[1:])
+
+
+def test_never_more_partners_than_asked_and_none_twice():
+    model = sparse_model(line(), SCENE)
+    for most in (1, 2, 4):
+        for pairs in choose_pairs(model, per_view=most):
+            partners = [pair.partner for pair in pairs]
+            assert 1 <= len(partners) <= most
+            assert len(set(partners)) == len(partners)
+
+
+def test_points_of_views_are_those_observed():
+    model = sparse_model(line(3), SCENE)
+    for number, points in enumerate(points_of_views(model)):
+        own = [p for p, v in model.observations if v == number]
+        np.testing.assert_array_equal(points, model.points_world[own])
+
+
+def test_one_picture_gives_one_line():
+    model = sparse_model(line(1)[:1], SCENE)
+    with pytest.raises(ReconstructionError, match="none of 1 registered pictures") as caught:
+        choose_pairs(model)
+    assert "\n" not in str(caught.value)
+
+
+def test_pictures_too_far_apart_give_one_line():
+    views = line(2)
+    model = sparse_model([views[0], views[1]], SCENE)
+    away = RigidTransform.from_translation([30.0, 0.0, 0.0])
+    far = replace(model.views[1], world_from_cam=away * model.views[1].world_from_cam)
+    with pytest.raises(ReconstructionError, match="overlap"):
+        choose_pairs(replace(model, views=(model.views[0], far)))

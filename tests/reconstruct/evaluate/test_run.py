@@ -1,0 +1,200 @@
+"""The score measures the error that was put in, and nothing else."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+import shapely
+from rasterio.transform import from_origin
+from scipy.spatial.transform import RigidTransform, Rotation
+from shapely.geometry import MultiPolygon, Polygon
+
+from alice_survey.artefacts import write_csv
+from alice_survey.config import SeafloorConfig
+from alice_survey.errors import WorkspaceError
+from alice_survey.frames import Datum
+from alice_survey.seafloor.terrain import Terrain, build_terrain
+from missions.areas.area import Area
+from missions.lines.line import Line, LineKind
+from missions.plan_file import Dive, Plan
+from missions.route.legs import Leg, Route
+from reconstruct.evaluate.mosaic import area_in_world
+from reconstruct.evaluate.overlap import neighbours
+from reconstruct.evaluate.run import score_cameras, score_surface
+from reconstruct.evaluate.truth import surface_depth, surface_distance
+
+HOLE = [(1.0, 0.8), (1.6, 0.8), (1.6, 1.4), (1.0, 1.4)]
+AREA = MultiPolygon([
+    Polygon([(0.5, 0.5), (2.0, 0.5), (2.0, 2.0), (0.5, 2.0)], [HOLE]),
+    Polygon([(2.3, 0.5), (2.9, 0.5), (2.9, 2.0)]),
+])  # fmt: skip
+"""Two parts, one with a hole."""
+CELL = 0.02
+SHIFT = RigidTransform.from_components([0.3, -0.2, 0.05], Rotation.from_rotvec([0, 0, 0.02]))
+
+
+@pytest.fixture(scope="module")
+def terrain() -> Terrain:
+    config = SeafloorConfig(relief_m=0.2, grid_m=0.02, rocks_per_m2=0.3, amphora=False)
+    return build_terrain(config, (-1.0, 4.0, -1.0, 4.0), 10.0, np.random.default_rng(1))
+
+
+def write_dem(
+    path: Path, terrain: Terrain, error_m: float, holes: float, elsewhere_m: float | None = None
+) -> None:
+    """The true surface as a model sees it whose world is shifted by SHIFT, with an error.
+
+    Outside of the area the error is `elsewhere_m`, if that is given.
+    """
+    north, east = np.arange(3.4, -0.6, -CELL) - CELL / 2, np.arange(-0.6, 3.4, CELL) + CELL / 2
+    norths, easts = np.meshgrid(north, east, indexing="ij")
+    world = np.stack([norths, easts, np.zeros_like(norths)], axis=-1).reshape(-1, 3)
+    true = SHIFT.apply(world)
+    depth = surface_depth(terrain, true[:, :2]) - SHIFT.translation[2]
+    outside = ~shapely.contains_xy(AREA, true[:, 0], true[:, 1])
+    errors = np.where(outside, error_m if elsewhere_m is None else elsewhere_m, error_m)
+    heights = (-depth + errors).reshape(norths.shape)
+    heights[np.random.default_rng(2).random(heights.shape) < holes] = np.nan
+    with rasterio.open(
+        path, "w", driver="GTiff", width=len(east), height=len(north), count=1, dtype="float64",
+        transform=from_origin(-0.6, 3.4, CELL, CELL), nodata=np.nan,
+    ) as target:  # fmt: skip
+        target.write(heights, 1)
+
+
+def test_a_true_surface_scores_zero(terrain: Terrain, tmp_path: Path) -> None:
+    write_dem(tmp_path / "dem.tif", terrain, 0.0, 0.0)
+    score = score_surface(tmp_path / "dem.tif", AREA, terrain, SHIFT)
+    assert score.completeness > 0.99
+    assert np.abs(score.height_m).max() < 1e-5
+    assert score.distance_m.max() < 1e-5
+
+
+def test_an_error_and_holes_are_measured(terrain: Terrain, tmp_path: Path) -> None:
+    write_dem(tmp_path / "dem.tif", terrain, 0.012, 0.25)
+    score = score_surface(tmp_path / "dem.tif", AREA, terrain, SHIFT)
+    figures = score.to_json()
+    assert figures["height_rms_mm"] == pytest.approx(12.0, abs=0.01)
+    assert 8.0 < figures["distance_rms_mm"] < 12.0
+    assert score.completeness == pytest.approx(0.75, abs=0.02)
+    assert np.all(score.distance_m <= np.abs(score.height_m) + 1e-6)
+
+
+def test_holes_and_the_gap_between_parts_are_not_scored(terrain: Terrain, tmp_path: Path) -> None:
+    write_dem(tmp_path / "dem.tif", terrain, 0.003, 0.0, elsewhere_m=0.5)
+    score = score_surface(tmp_path / "dem.tif", AREA, terrain, SHIFT)
+    # 2.25 - 0.36 in the part with the hole, 0.45 in the triangle, m2.
+    assert score.cells == pytest.approx(2.34 / CELL**2, rel=0.01)
+    assert score.completeness > 0.98
+    np.testing.assert_allclose(score.height_m, 0.003, atol=1e-5)
+
+
+def test_the_area_moves_with_the_model(terrain: Terrain) -> None:
+    moved = area_in_world(AREA, terrain, SHIFT)
+    assert moved.area == pytest.approx(AREA.area, rel=1e-9)
+    assert [len(part.interiors) for part in moved.geoms] == [1, 0]
+    for there, here in zip(shapely.get_coordinates(moved), shapely.get_coordinates(AREA),
+                           strict=True):  # fmt: skip
+        back = SHIFT.apply([there[0], there[1], terrain.offset_ned[2]])[:2]
+        np.testing.assert_allclose(back, here, atol=1e-9)
+
+
+def plan_with(lines: list[Line]) -> Plan:
+    area = Area(
+        datum=Datum(latitude_deg=32.8, longitude_deg=34.9), survey=AREA, allowed=AREA,
+        no_go=MultiPolygon(),
+    )  # fmt: skip
+    leg = Leg(
+        start_ne_m=(0.0, 0.0), heading_rad=0.0, length_m=1.0, curvature_per_m=0.0, line=0
+    )  # fmt: skip
+    dive = Dive(
+        first_line=0, last_line=len(lines) - 1, route=Route(legs=(leg,)), duration_s=5.0,
+        energy_wh=1.0,
+    )  # fmt: skip
+    return Plan(
+        name="lines", area=area, home_ne_m=(0.0, 0.0), seafloor_depth_m=10.0, altitude_m=2.0,
+        speed_mps=0.2, interval_s=1.0, exposure_s=0.003, strobe_pulse_s=0.003, strobe_lead_s=0.0,
+        footprint_m=(1.4, 1.15), line_spacing_m=1.0, station_spacing_m=0.4, forward_overlap=0.6,
+        side_overlap=0.3, lines=tuple(lines), dives=(dive,), turn_radius_m=0.5, run_in_m=0.5,
+        length_m=1.0, duration_s=5.0, energy_wh=1.0, coverage=1.0, details={},
+    )  # fmt: skip
+
+
+def line_at(
+    along: tuple[float, float], across_m: float, heading_rad: float, kind: LineKind = "survey"
+) -> Line:
+    ahead = np.array([math.cos(heading_rad), math.sin(heading_rad)])
+    start, end = (a * ahead + across_m * np.array([-ahead[1], ahead[0]]) for a in along)
+    return Line(
+        kind=kind, start_ne_m=(start[0], start[1]), end_ne_m=(end[0], end[1]), stations=20
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("heading_rad", [0.0, 1.1, 4.0])
+def test_neighbours_are_the_lines_beside_not_the_next_ones(heading_rad: float) -> None:
+    lines = [
+        line_at((0.0, 10.0), 0.0, heading_rad),
+        line_at((12.0, 20.0), 1.0, heading_rad),  # of another cell, ahead
+        line_at((0.0, 10.0), 2.0, heading_rad),
+        line_at((9.0, 2.0), 1.0, heading_rad),  # between, the other way
+        line_at((0.0, 10.0), 1.0, heading_rad, "fill"),
+        line_at((0.0, 10.0), -1.0, heading_rad + math.pi / 2, "cross"),
+    ]
+    found = {(i, j): strip for i, j, strip in neighbours(plan_with(lines))}
+    assert set(found) == {(0, 3), (2, 3)}
+    ahead = np.array([math.cos(heading_rad), math.sin(heading_rad)])
+    for strip in found.values():
+        along = np.array(strip.exterior.coords) @ ahead
+        np.testing.assert_allclose([along.min(), along.max()], [2.0, 9.0], atol=1e-9)
+
+
+def test_distance_of_a_point_above_a_level_floor() -> None:
+    config = SeafloorConfig(relief_m=0.0, grid_m=0.05, rocks_per_m2=0.0, amphora=False)
+    flat = build_terrain(config, (-1.0, 1.0, -1.0, 1.0), 10.0, np.random.default_rng(1))
+    points = np.array([[0.0, 0.0, 9.7], [0.2, 0.1, 10.4]])
+    np.testing.assert_allclose(surface_distance(flat, points), [0.3, 0.4], atol=1e-5)
+    np.testing.assert_allclose(surface_depth(flat, points[:, :2]), [10.0, 10.0], atol=1e-5)
+    assert np.isnan(surface_depth(flat, np.array([[5.0, 0.0]]))).all()
+
+
+def write_truth(path: Path, poses: dict[str, RigidTransform]) -> None:
+    header = ("image", "north_m", "east_m", "depth_m", "qx", "qy", "qz", "qw")
+    rows = [[n, *p.translation, *p.rotation.as_quat()] for n, p in poses.items()]
+    write_csv(path, header, rows)
+
+
+def test_cameras_are_aligned_without_scale(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    truth = {
+        f"left/{i:03d}.png": RigidTransform.from_components(
+            rng.uniform(-2, 2, 3), Rotation.random(rng=rng)
+        )
+        for i in range(30)
+    }
+    write_truth(tmp_path / "poses.csv", truth)
+    world = {name: SHIFT.inv() * pose for name, pose in truth.items()}
+
+    exact = score_cameras(world, tmp_path / "poses.csv", 31)
+    grown = {
+        name: RigidTransform.from_components(1.002 * p.translation, p.rotation)
+        for name, p in world.items()
+    }
+    large = score_cameras(grown, tmp_path / "poses.csv", 31)
+
+    assert exact.rms_m < 1e-9
+    assert exact.turns_deg.max() < 1e-5
+    assert abs(exact.scale_error) < 1e-9
+    assert (exact.registered, exact.total) == (30, 31)
+    assert large.scale_error == pytest.approx(0.002, rel=1e-6)
+    places = np.stack([p.translation for p in truth.values()])
+    spread = np.sqrt(((places - places.mean(axis=0)) ** 2).sum(axis=1).mean())
+    assert large.rms_m == pytest.approx(0.002 * spread, rel=1e-2)
+
+
+def test_two_cameras_cannot_be_aligned(tmp_path: Path) -> None:
+    truth = {f"{i}.png": RigidTransform.from_translation([i, 0, 0]) for i in range(2)}
+    write_truth(tmp_path / "poses.csv", truth)
+    with pytest.raises(WorkspaceError, match="3 or more"):
+        score_cameras(truth, tmp_path / "poses.csv", 2)

@@ -1,0 +1,311 @@
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pycolmap
+import pytest
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.errors import ReconstructionError
+from reconstruct.lenses.lens import flat_port_lens
+from reconstruct.mapping.database import Observations
+from reconstruct.mapping.mapper import (
+    Mapped,
+    as_transform,
+    collapsed_frames,
+    map_calibrated,
+    model_baseline,
+    scale_model,
+)
+from reconstruct.mapping.priors import pinhole_positions, refine_with_positions
+from reconstruct.mapping.self_calibration import map_self_calibrated
+from reconstruct.matching.matches import as_seen
+from reconstruct.sparse.alignment import align_rigid, align_similarity
+from tests.reconstruct.scenes import DATUM, Scene, make_scene
+
+
+def seen_by_pinholes(scene: Scene) -> tuple[Observations, dict]:
+    lenses = {name: flat_port_lens(c, 1.75, 2.35) for name, c in scene.rig.cameras.items()}
+    seen = Observations(
+        images=scene.records,
+        cameras={name: lens.pinhole.colmap for name, lens in lenses.items()},
+        pixels=[
+            as_seen(p, lenses[r.camera]) for p, r in zip(scene.pixels, scene.records, strict=True)
+        ],
+        pairs=scene.pairs,
+    )
+    return seen, lenses
+
+
+def mapped_scene(scene: Scene, rig_scale: float = 1.0) -> Mapped:
+    seen, lenses = seen_by_pinholes(scene)
+    poses = {
+        name: RigidTransform.from_components(rig_scale * pose.translation, pose.rotation)
+        for name, pose in scene.rig.cam_from_rig.items()
+    }
+    with TemporaryDirectory() as folder:
+        return map_calibrated(seen, poses, lenses, Path(folder), 1)
+
+
+def pupils(mapped: Mapped, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    found, true = [], []
+    for number, image in sorted(mapped.model.images.items()):
+        if image.has_pose:
+            record = scene.records[number - 1]
+            pose = as_transform(image.cam_from_world()).inv()
+            lens = mapped.lenses[record.camera]
+            found.append((pose * lens.pinhole_from_cam).translation)
+            true.append(scene.ned_from_cam[number - 1].translation)
+    return np.array(found), np.array(true)
+
+
+def camera_rms(mapped: Mapped, scene: Scene) -> float:
+    found, true = pupils(mapped, scene)
+    return float(np.sqrt(((align_rigid(found, true).apply(found) - true) ** 2).sum(axis=1).mean()))
+
+
+@cache
+def block() -> Scene:
+    return make_scene(points=8000, noise_px=0.3)
+
+
+@cache
+def block_mapped() -> Mapped:
+    return mapped_scene(block())
+
+
+def test_without_noise_only_the_warp_is_left() -> None:
+    """The warp is exact at one range; relief of 0.16 m leaves a fraction of a millimetre."""
+    scene = make_scene(lines=2, stations=5, points=6000)
+    mapped = mapped_scene(scene)
+    assert mapped.models[0] == len(scene.records)
+    assert camera_rms(mapped, scene) < 0.4e-3
+    found, true = pupils(mapped, scene)
+    assert align_similarity(found, true).scale == pytest.approx(1.0, abs=4e-4)
+    assert mapped.model.compute_mean_reprojection_error() < 0.01
+
+
+def test_noise_of_a_third_of_a_pixel_costs_millimetres() -> None:
+    scene, mapped = block(), block_mapped()
+    assert mapped.models[0] == len(scene.records)
+    assert 0.2e-3 < camera_rms(mapped, scene) < 4e-3
+    assert 0.2 < mapped.model.compute_mean_reprojection_error() < 0.4
+    found, true = pupils(mapped, scene)
+    assert abs(align_similarity(found, true).scale - 1.0) < 2e-3
+
+
+def test_the_scale_is_that_of_the_rig() -> None:
+    """A rig told twice as large gives a model twice as large: nothing else sets the scale."""
+    scene = make_scene(lines=1, stations=6, points=4000, noise_px=0.1)
+    found, true = pupils(mapped_scene(scene, rig_scale=2.0), scene)
+    assert align_similarity(found, true).scale == pytest.approx(0.5, rel=5e-3)
+
+
+def test_the_rig_is_held_constant_and_the_cameras_too() -> None:
+    scene, mapped = block(), block_mapped()
+    model = mapped.model
+    assert mapped.baseline == pytest.approx(0.1, rel=1e-12)
+    assert model_baseline(model) == pytest.approx(0.1, rel=1e-9)
+    lefts = {scene.records[n - 1].station: n for n in model.images if n % 2 == 1}
+    for number in lefts.values():
+        left = as_transform(model.images[number].cam_from_world())
+        right = as_transform(model.images[number + 1].cam_from_world())
+        np.testing.assert_allclose((right * left.inv()).translation, [-0.1, 0, 0], atol=1e-9)
+    for name, number in (("left", 1), ("right", 2)):
+        expected = mapped.lenses[name].pinhole
+        focal, _, cx, cy = model.cameras[number].params
+        assert (focal, cx, cy) == (expected.focal_px, expected.cx_px, expected.cy_px)
+
+
+def test_mapping_twice_gives_the_same_bytes(tmp_path: Path) -> None:
+    scene = make_scene(lines=1, stations=5, points=3000, noise_px=0.3)
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        mapped_scene(scene).model.write_binary(tmp_path / name)
+    for file in sorted((tmp_path / "a").iterdir()):
+        assert file.read_bytes() == (tmp_path / "b" / file.name).read_bytes()
+
+
+def test_self_calibration_finds_focal_length_distortion_and_rig() -> None:
+    """In plain air, with tilted views: what comes out must be what went in."""
+    rng = np.random.default_rng(2)
+    truth = pycolmap.Camera(
+        model="OPENCV", width=800, height=600,
+        params=[760.0, 760.0, 400.0, 300.0, -0.08, 0.03, 0.0, 0.0],
+    )  # fmt: skip
+    scene = oblique_scene(truth, rng)
+    start = pycolmap.Camera(model="RADIAL", width=800, height=600, params=[960.0, 400, 300, 0, 0])
+    seen = Observations(
+        images=scene.records,
+        cameras={"left": start, "right": pycolmap.Camera(start.todict())},
+        pixels=scene.pixels,
+        pairs=scene.pairs,
+    )
+    with TemporaryDirectory() as folder:
+        mapped = map_self_calibrated(seen, (), Path(folder), 1)
+    assert mapped.models[0] == len(scene.records)
+    assert not mapped.scaled
+    assert mapped.baseline == 1.0
+    assert model_baseline(mapped.model) == pytest.approx(1.0, rel=1e-9)
+    for lens in mapped.lenses.values():
+        assert lens.params[0] == pytest.approx(760, rel=0.01)
+        assert lens.params[4] == pytest.approx(-0.08, abs=0.02)
+    found, true = pupils(mapped, scene)
+    fit = align_similarity(found, true)
+    misses = np.linalg.norm(fit.apply(found) - true, axis=1)
+    assert np.sqrt((misses**2).mean()) < 0.01
+    assert fit.scale == pytest.approx(0.2, rel=0.02)  # metres in a baseline
+    assert mapped.model.compute_mean_reprojection_error() < 0.4
+    for camera in mapped.model.cameras.values():
+        assert camera.model_name == "PINHOLE"
+
+
+def oblique_scene(camera: pycolmap.Camera, rng: np.random.Generator) -> Scene:
+    """Eight stereo stations 0.2 m wide around a bumpy floor, looking at its middle."""
+    from scipy.spatial.transform import Rotation
+
+    from alice_survey.manifest import ImageRecord
+    from reconstruct.matching.matches import PairMatches
+
+    points = np.column_stack([rng.uniform(-1.6, 1.6, (700, 2)), rng.uniform(-0.25, 0.25, 700)])
+    records, poses, pixels, ids = [], [], [], []
+    right_from_left = RigidTransform.from_components(
+        [-0.2, 0.0, 0.0], Rotation.from_rotvec([0.0, 0.03, 0.01])
+    )
+    for station in range(8):
+        angle = 0.35 * station
+        place = np.array([1.6 * np.cos(angle), 1.6 * np.sin(angle), -2.0])
+        forward = -place / np.linalg.norm(place)
+        side = np.cross(forward, [0.0, 0.0, -1.0])
+        side /= np.linalg.norm(side)
+        rotation = Rotation.from_matrix(np.column_stack([side, np.cross(forward, side), forward]))
+        left = RigidTransform.from_components(place, rotation)
+        for name, pose in (("left", left), ("right", left * right_from_left.inv())):
+            local = pose.inv().apply(points)
+            seen = np.asarray(camera.img_from_cam(local))
+            inside = np.all((seen > 0) & (seen < [800, 600]), axis=1) & (local[:, 2] > 0.3)
+            ids.append(np.flatnonzero(inside))
+            pixels.append(seen[inside] + rng.normal(0, 0.2, (int(inside.sum()), 2)))
+            poses.append(pose)
+            records.append(ImageRecord(image=f"{name}/{station}.png", camera=name, station=station))
+    pairs = []
+    for i in range(len(ids)):
+        for j in range(i + 1, len(ids)):
+            _, a, b = np.intersect1d(ids[i], ids[j], return_indices=True)
+            if len(a) >= 30 and abs(records[i].station - records[j].station) <= 3:
+                matches = np.stack([a, b], axis=1).astype(np.uint32)
+                geometry = {"config": 3, "E": None, "F": None, "H": None}
+                pairs.append((i, j, PairMatches(matches=matches, geometry=geometry)))
+    return Scene(
+        rig=make_scene(lines=1, stations=1, points=1).rig,
+        records=records,
+        ned_from_cam=poses,
+        points_ned=points,
+        pixels=pixels,
+        ids=ids,
+        pairs=pairs,
+    )
+
+
+def collapse(model: pycolmap.Reconstruction, frame: int, onto: int) -> None:
+    """Put a frame onto another, and what both saw into their common centre."""
+    pose = model.frames[onto].rig_from_world
+    model.frames[frame].rig_from_world = pose
+    centre = pose.inverse().translation
+    for point in model.points3D.values():
+        frames = {model.images[e.image_id].frame_id for e in point.track.elements}
+        if frame in frames:
+            point.xyz = centre
+
+
+def test_a_station_that_collapsed_onto_another_is_registered_anew(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As COLMAP's adjustment of a first pair of arbitrary scale leaves it now and then."""
+    mapper, begun_from = pycolmap.incremental_mapping, []
+
+    def collapsing(database, images, output, options, **rest):  # type: ignore[no-untyped-def]
+        begun_from.append(rest.get("input_path"))
+        found = mapper(database, images, output, options, **rest)
+        if len(begun_from) == 1:
+            for number, model in found.items():
+                assert collapsed_frames(model) == []
+                collapse(model, 3, onto=4)
+                assert 3 in collapsed_frames(model)
+                model.write(Path(output) / str(number))
+        return found
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", collapsing)
+    scene = make_scene(lines=1, stations=7, points=5000, noise_px=0.3)
+    mapped = mapped_scene(scene)
+
+    assert len(begun_from) == 2
+    assert begun_from[1] is not None
+    assert mapped.model.num_reg_images() == len(scene.records)
+    assert collapsed_frames(mapped.model) == []
+    assert 1e-5 < camera_rms(mapped, scene) < 0.01
+
+
+def test_scaling_moves_rig_and_points_alike() -> None:
+    model = pycolmap.Reconstruction(block_mapped().model)
+    before = {i: p.xyz.copy() for i, p in model.points3D.items()}
+    scale_model(model, 2.5)
+    assert model_baseline(model) == pytest.approx(0.25, rel=1e-9)
+    for i, xyz in before.items():
+        np.testing.assert_allclose(model.points3D[i].xyz, 2.5 * xyz, rtol=1e-9, atol=1e-12)
+
+
+def test_pictures_that_share_nothing_give_one_clear_line(tmp_path: Path) -> None:
+    scene = make_scene(lines=1, stations=3, points=300)
+    seen, lenses = seen_by_pinholes(scene)
+    alone = Observations(images=seen.images, cameras=seen.cameras, pixels=seen.pixels, pairs=[])
+    with pytest.raises(ReconstructionError, match="no two of the 6 pictures"):
+        map_calibrated(alone, scene.rig.cam_from_rig, lenses, tmp_path, 1)
+
+
+@cache
+def strip() -> tuple[Scene, Mapped]:
+    scene = make_scene(lines=1, stations=30, points=12000, noise_px=0.3)
+    return scene, mapped_scene(scene)
+
+
+def test_navigation_tells_where_pinholes_were() -> None:
+    scene, mapped = strip()
+    positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.lenses, DATUM)
+    true = np.stack(
+        [
+            (pose * mapped.lenses[r.camera].pinhole_from_cam.inv()).translation
+            for pose, r in zip(scene.ned_from_cam, scene.records, strict=True)
+        ]
+    )
+    # attitude noise of 0.1 degrees on a lever arm of 0.55 m
+    assert np.linalg.norm(positions - true, axis=1).max() < 5e-3
+    assert np.all(sigmas[:, 0] > 0.3)
+    assert np.all(sigmas < 0.32)
+
+
+@pytest.mark.parametrize("jump_m", [0.0, 8.0])
+def test_positions_straighten_a_long_line_but_leave_its_scale(jump_m: float) -> None:
+    scene, mapped = strip()
+    positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.lenses, DATUM)
+    told = positions + np.array([0.4, -0.3, 0.05])
+    told[6:8] += [jump_m, 0.0, 0.0]  # one station whose position is wrong
+    told = told.mean(axis=0) + 1.02 * (told - told.mean(axis=0))  # 2 % too long
+    refined = refine_with_positions(mapped, scene.records, told, sigmas)
+    assert refined is not mapped
+    assert model_baseline(refined.model) == pytest.approx(0.1, rel=1e-9)
+    assert camera_rms(refined, scene) < 0.8 * camera_rms(mapped, scene)
+    found, true = pupils(refined, scene)
+    assert abs(align_similarity(found, true).scale - 1.0) < 2e-3
+
+
+def test_positions_that_contradict_the_pictures_are_not_used() -> None:
+    scene, mapped = strip()
+    positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.lenses, DATUM)
+    wrong = positions + np.repeat(np.random.default_rng(1).normal(0, 2.0, (30, 3)), 2, axis=0)
+    refined = refine_with_positions(mapped, scene.records, wrong, sigmas * 1e-3)
+    assert camera_rms(refined, scene) < 2 * camera_rms(mapped, scene)
+    assert model_baseline(refined.model) == pytest.approx(0.1, rel=1e-9)
+    few = np.where(np.arange(60)[:, None] < 6, positions, np.nan)
+    assert refine_with_positions(mapped, scene.records, few, sigmas) is mapped

@@ -1,0 +1,72 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alice_survey.errors import ReconstructionError
+from reconstruct.mapping.working_range import find_distances, ray_passes
+from reconstruct.matching.features import Features, save_features
+from tests.reconstruct.scenes import ALTITUDE_M, Scene, make_scene
+
+
+def features_of(scene: Scene, folder: Path) -> list[Path]:
+    """Features whose descriptors tell which point they show."""
+    codes = np.random.default_rng(0).integers(0, 90, (len(scene.points_ned), 128))
+    paths = []
+    for i, (pixels, ids) in enumerate(zip(scene.pixels, scene.ids, strict=True)):
+        features = Features(
+            pixels=pixels,
+            scale_px=np.ones(len(ids), np.float32),
+            descriptors=codes[ids].astype(np.uint8),
+        )
+        paths.append(folder / f"{i}.npz")
+        save_features(paths[-1], features)
+    return paths
+
+
+def test_stereo_matches_tell_the_distance(tmp_path: Path) -> None:
+    scene = make_scene(lines=1, stations=4, points=2500, noise_px=0.2)
+    paths = features_of(scene, tmp_path)
+    found = find_distances(scene.records, paths, scene.rig, given_m=None, ratio=0.8, threads=1)
+    depths = np.concatenate(
+        [
+            pose.inv().apply(scene.points_ned[ids])[:, 2]
+            for pose, ids in zip(scene.ned_from_cam, scene.ids, strict=True)
+        ]
+    )
+    near, far = np.percentile(depths, [2, 98])
+    assert found.source == "stereo"
+    assert found.near_m == pytest.approx(near, abs=0.02)
+    assert found.far_m == pytest.approx(far, abs=0.02)
+
+
+def test_a_given_range_and_the_altitude_stand_in(tmp_path: Path) -> None:
+    scene = make_scene(lines=1, stations=2, points=10)
+    paths = features_of(scene, tmp_path)
+    arguments = (scene.records, paths, scene.rig)
+    given = find_distances(*arguments, given_m=3.0, ratio=0.8, threads=1)
+    assert 2 / (1 / given.near_m + 1 / given.far_m) == pytest.approx(3.0)
+    measured = find_distances(*arguments, given_m=None, ratio=0.8, threads=1)
+    assert measured.source == "altitude"
+    assert 2 / (1 / measured.near_m + 1 / measured.far_m) == pytest.approx(ALTITUDE_M + 0.03)
+    blind = [replace(r, altitude_m=np.nan) for r in scene.records]
+    with pytest.raises(ReconstructionError, match="set working_range_m"):
+        find_distances(blind, paths, scene.rig, given_m=None, ratio=0.8, threads=1)
+
+
+def test_rays_pass_where_they_were_built_to() -> None:
+    rng = np.random.default_rng(1)
+    target = rng.normal(0, 1, (30, 3)) + np.array([0, 0, 5])
+    start_a = rng.normal(0, 0.1, (30, 3))
+    start_b = rng.normal(0, 0.1, (30, 3)) + np.array([0.5, 0, 0])
+    ray_a, ray_b = target - start_a, target - start_b
+    reach = np.linalg.norm(ray_a, axis=1)
+    ray_a, ray_b = (r / np.linalg.norm(r, axis=1, keepdims=True) for r in (ray_a, ray_b))
+    lift = np.cross(ray_a, ray_b)
+    lift *= 0.01 / np.linalg.norm(lift, axis=1, keepdims=True)
+    along, gap = ray_passes(start_a, ray_a, start_b + lift, ray_b)
+    np.testing.assert_allclose(along, reach, rtol=1e-9)
+    np.testing.assert_allclose(gap, 0.01, rtol=1e-6)
+    parallel = ray_passes(start_a[:1], ray_a[:1], start_b[:1], ray_a[:1])
+    assert np.isnan(parallel[0]).all()

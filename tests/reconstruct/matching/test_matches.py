@@ -1,0 +1,134 @@
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from reconstruct.matching.features import Features, load_features, save_features
+from reconstruct.matching.matches import (
+    PairTask,
+    camera_from_text,
+    camera_text,
+    coarse_matches,
+    match_descriptors,
+    match_pair,
+)
+from tests.oracles_matching import match_slowly
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    n=st.integers(1, 25),
+    m=st.integers(2, 25),
+    ratio=st.floats(0.5, 0.99),
+    block=st.sampled_from([1, 7, 1000]),
+    seed=st.integers(0, 1000),
+)
+def test_matches_equal_those_of_the_slow_twin(
+    n: int, m: int, ratio: float, block: int, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    a = rng.integers(0, 256, (n, 8)).astype(np.uint8)
+    b = rng.integers(0, 256, (m, 8)).astype(np.uint8)
+    b[: min(n, m) // 2] = a[: min(n, m) // 2]  # some true matches
+    found = match_descriptors(a, b, ratio, block)
+    np.testing.assert_array_equal(found, match_slowly(a, b, ratio))
+
+
+def test_products_of_full_descriptors_are_exact() -> None:
+    """Blocks of any size must give the same matches: float32 sums of bytes have no rounding."""
+    rng = np.random.default_rng(1)
+    a = rng.integers(0, 256, (300, 128)).astype(np.uint8)
+    b = np.clip(a[::-1].astype(int) + rng.integers(-30, 31, a.shape), 0, 255).astype(np.uint8)
+    whole = match_descriptors(a, b, 0.9)
+    assert len(whole) > 250
+    np.testing.assert_array_equal(whole, match_descriptors(a, b, 0.9, block=13))
+    exact = (a.astype(np.int64) @ b.T.astype(np.int64)).astype(np.float64)
+    np.testing.assert_array_equal(a.astype(np.float32) @ b.T.astype(np.float32), exact)
+
+
+@pytest.mark.parametrize(("n", "m"), [(0, 5), (5, 0), (5, 1)])
+def test_too_few_descriptors_give_no_match(n: int, m: int) -> None:
+    assert match_descriptors(
+        np.zeros((n, 128), np.uint8), np.zeros((m, 128), np.uint8), 0.8
+    ).shape == (0, 2)
+
+
+def two_views(tmp_path: Path, outliers: int) -> tuple[PairTask, int]:
+    """Features of 120 points seen by two cameras, and wrong ones with equal descriptors."""
+    rng = np.random.default_rng(2)
+    camera = pycolmap.Camera(
+        model="PINHOLE", width=800, height=600, params=[900, 900, 400, 300],
+        has_prior_focal_length=True,
+    )  # fmt: skip
+    points = np.column_stack([rng.uniform(-0.7, 0.7, (120, 2)), rng.uniform(2.2, 2.8, 120)])
+    first, second = camera.img_from_cam(points), camera.img_from_cam(points - [0.3, 0.05, 0.1])
+    wrong = rng.uniform(0, 600, (2, outliers, 2))
+    descriptors = rng.integers(0, 90, (120 + outliers, 128)).astype(np.uint8)
+    for name, pixels in (("a", [first, wrong[0]]), ("b", [second, wrong[1]])):
+        features = Features(
+            pixels=np.concatenate(pixels),
+            scale_px=np.ones(120 + outliers, np.float32),
+            descriptors=descriptors,
+        )
+        save_features(tmp_path / f"{name}.npz", features)
+    text = camera_text(camera)
+    task = PairTask(
+        first=tmp_path / "a.npz", second=tmp_path / "b.npz", ratio=0.8, cameras=(text, text), seed=3
+    )
+    return task, 120
+
+
+def test_geometry_keeps_true_matches_and_drops_false_ones(tmp_path: Path) -> None:
+    task, true = two_views(tmp_path, outliers=60)
+    found = match_pair(task)
+    assert found.geometry is not None
+    right = int((found.matches[:, 0] < true).sum())
+    assert right >= 0.97 * true
+    assert len(found.matches) - right <= 4
+    again = match_pair(task)
+    np.testing.assert_array_equal(found.matches, again.matches)
+
+
+def test_pictures_without_a_common_spot_share_nothing(tmp_path: Path) -> None:
+    rng = np.random.default_rng(7)
+    for name in ("c", "d"):
+        features = Features(
+            pixels=rng.uniform(0, 600, (200, 2)),
+            scale_px=np.ones(200, np.float32),
+            descriptors=rng.integers(0, 90, (200, 128)).astype(np.uint8),
+        )
+        save_features(tmp_path / f"{name}.npz", features)
+    text = "PINHOLE 800 600 1 900.0 900.0 400.0 300.0"
+    task = PairTask(
+        first=tmp_path / "c.npz", second=tmp_path / "d.npz", ratio=0.8, cameras=(text, text)
+    )
+    assert coarse_matches(task) < 10
+    assert match_pair(task).geometry is None
+
+
+def test_a_camera_survives_text() -> None:
+    camera = pycolmap.Camera(
+        model="OPENCV",
+        width=800,
+        height=600,
+        params=[900.123456789, 901, 400, 300, 0.1, -0.2, 0, 1e-9],
+    )
+    again = camera_from_text(camera_text(camera))
+    assert again.model == camera.model
+    np.testing.assert_array_equal(again.params, camera.params)
+    assert again.has_prior_focal_length == camera.has_prior_focal_length
+
+
+def test_features_written_anew_are_read_anew(tmp_path: Path) -> None:
+    """One process may map a workspace twice with other settings."""
+    task, _ = two_views(tmp_path, outliers=0)
+    many = match_pair(task)
+    whole = load_features(task.first)
+    few = Features(
+        pixels=whole.pixels[:40], scale_px=whole.scale_px[:40], descriptors=whole.descriptors[:40]
+    )
+    save_features(task.first, few)
+    assert 30 <= len(match_pair(task).matches) <= 40 < len(many.matches)

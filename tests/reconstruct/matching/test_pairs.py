@@ -1,0 +1,117 @@
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from alice_survey.manifest import ImageRecord
+from reconstruct.matching.pairs import NEIGHBOURS, choose_pairs, footprints, neighbours
+from tests.reconstruct.scenes import ALTITUDE_M, DATUM, make_scene
+
+
+def mono(count: int) -> list[ImageRecord]:
+    return [ImageRecord(image=f"{i}.png", camera="camera", station=i) for i in range(count)]
+
+
+def stereo(count: int) -> list[ImageRecord]:
+    return [
+        ImageRecord(image=f"{side}/{i}.png", camera=side, station=i)
+        for side in ("left", "right")
+        for i in range(count)
+    ]
+
+
+def test_neighbours_of_stereo_stations_cross_the_cameras() -> None:
+    records = stereo(3)
+    names = {tuple(sorted((records[i].image, records[j].image))) for i, j in neighbours(records, 1)}
+    assert ("left/0.png", "right/0.png") in names
+    assert ("left/0.png", "right/1.png") in names
+    assert ("left/1.png", "right/0.png") in names
+    assert not any({"left/0.png", "right/2.png"} == set(pair) for pair in names)
+    assert len(names) == 3 + 2 * 4
+
+
+def test_gaps_in_station_numbers_do_not_part_neighbours() -> None:
+    records = [replace(r, station=10 * r.station) for r in mono(4)]
+    assert neighbours(records, 1) == {(0, 1), (1, 2), (2, 3)}
+
+
+def test_few_pictures_without_navigation_are_all_looked_at() -> None:
+    sure, maybe = choose_pairs(mono(20), None, None)
+    assert set(sure) == neighbours(mono(20), NEIGHBOURS)
+    assert set(sure) | set(maybe) == set(itertools.combinations(range(20), 2))
+    assert not set(sure) & set(maybe)
+
+
+def test_many_pictures_without_navigation_are_matched_in_order_only() -> None:
+    sure, maybe = choose_pairs(mono(200), None, None)
+    assert len(sure) == sum(200 - d for d in range(1, NEIGHBOURS + 1))
+    assert maybe == []
+
+
+def test_many_pictures_with_positions_get_their_nearest() -> None:
+    side = 10
+    records = []
+    for i in range(side * side):
+        row, column = divmod(i, side)
+        column = column if row % 2 == 0 else side - 1 - column
+        latitude, longitude, depth = DATUM.geodetic_from_ned(
+            np.array([[row * 10.0, column * 10.0, -80]])
+        )[0]
+        records.append(
+            replace(mono(i + 1)[i], latitude_deg=latitude, longitude_deg=longitude, depth_m=depth)
+        )
+    sure, maybe = choose_pairs(records, None, DATUM)
+    pairs = set(sure) | set(maybe)
+    across = [(i, 2 * side - 1 - i) for i in range(side)]  # the next line, side by side
+    assert all(pair in pairs for pair in across)
+    assert (0, side * side - 1) not in pairs
+    assert len(pairs) < 25 * len(records)
+
+
+def test_footprints_have_the_size_of_the_exact_port_camera() -> None:
+    scene = make_scene(points=50)
+    level = [replace(r, roll_deg=0.0, pitch_deg=0.0, heading_deg=0.0) for r in scene.records[:2]]
+    left, right = footprints(level, scene.rig, DATUM)
+    camera = scene.rig.cameras["left"]
+    depth = ALTITUDE_M + camera.port_distance_m + camera.glass_thickness_m
+    corners = camera.at_depth(camera.border(8), depth)
+    across, along = np.ptp(corners[:, 0]), np.ptp(corners[:, 1])
+    south, west, north, east = left.bounds
+    assert north - south == pytest.approx(along, abs=2e-3)
+    assert east - west == pytest.approx(across, abs=2e-3)
+    assert right.centroid.y - left.centroid.y == pytest.approx(scene.rig.baseline_m, abs=1e-3)
+    assert right.centroid.x - left.centroid.x == pytest.approx(0.0, abs=1e-3)
+
+
+def test_pairs_by_footprint_are_those_that_share_the_sea_floor() -> None:
+    scene = make_scene(points=6000)
+    sure, maybe = choose_pairs(scene.records, scene.rig, DATUM)
+    shared = {
+        (i, j): len(np.intersect1d(scene.ids[i], scene.ids[j]))
+        for i, j in itertools.combinations(range(len(scene.records)), 2)
+    }
+    chosen = set(sure) | set(maybe)
+    records = scene.records
+    one_camera = {p for p in shared if records[p[0]].camera == records[p[1]].camera}
+    stations = {p for p in shared if records[p[0]].station == records[p[1]].station}
+    assert {pair for pair, n in shared.items() if n > 60} & one_camera <= chosen
+    assert stations <= set(sure)
+    assert chosen <= one_camera | stations
+    assert all(shared[pair] > 20 for pair in sure)
+    nothing = {pair for pair, n in shared.items() if n == 0}
+    assert len(chosen & nothing) <= 0.02 * len(nothing)
+
+
+def test_pictures_without_navigation_are_tied_to_their_neighbours() -> None:
+    scene = make_scene(points=50)
+    lost = 6
+    records = [replace(r, latitude_deg=np.nan) if r.station == lost else r for r in scene.records]
+    sure, _ = choose_pairs(records, scene.rig, DATUM)
+    partners = {
+        records[k].station
+        for pair in sure
+        for k in pair
+        if lost in {records[i].station for i in pair}
+    }
+    assert partners >= set(range(lost - NEIGHBOURS, lost + NEIGHBOURS + 1))

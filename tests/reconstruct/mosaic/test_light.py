@@ -1,0 +1,160 @@
+import numpy as np
+import pytest
+
+from reconstruct.mosaic.light import (
+    GRID,
+    LightSamples,
+    at_nodes,
+    at_places,
+    compare_light,
+    joined_samples,
+    low_pass,
+    read_light,
+    solve_light,
+    write_light,
+)
+
+IMAGES = [f"left/{n}.png" for n in range(9)]
+UNKNOWN = np.full((len(IMAGES), *GRID, 3), np.nan)
+NODES_X, NODES_Y = np.meshgrid(np.linspace(0, 1, GRID[1]), np.linspace(0, 1, GRID[0]))
+
+
+def pattern(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Logarithm of a lamp that falls off from a point beside the middle."""
+    return -1.2 * ((x - 0.45) ** 2 + (y - 0.6) ** 2)
+
+
+def samples(noise: float = 0.02, outliers: float = 0.0, lines: int = 3, count: int = 400):
+    """Nine pictures in lines that overlap on all sides, over a sea floor of random colour."""
+    rng = np.random.default_rng(3)
+    gains = rng.normal(0, 0.1, len(IMAGES))
+    parts = []
+    places = [(n % (9 // lines), n // (9 // lines)) for n in range(9)]
+    for a in range(len(IMAGES)):
+        for b in range(len(IMAGES)):
+            along, aside = places[b][0] - places[a][0], places[b][1] - places[a][1]
+            if a == b or abs(along) > 2 or abs(aside) > 1:
+                continue
+            here = rng.uniform(0, 1, (count, 2))
+            there = here - [0.6 * aside, 0.4 * along]
+            seen = ((there > 0) & (there < 1)).all(axis=1)
+            here, there = here[seen], there[seen]
+            ground = rng.normal(4.2, 0.4, (len(here), 3))
+            one = ground + (pattern(*here.T) + gains[a])[:, None]
+            two = ground + (pattern(*there.T) + gains[b])[:, None]
+            two = two + rng.normal(0, noise, two.shape)
+            two[rng.random(len(two)) < outliers] += 0.8
+            parts.append(
+                LightSamples(
+                    views=np.tile(np.array([a, b], np.int32), (len(here), 1)),
+                    places=np.stack([here, there], axis=1).astype(np.float32),
+                    levels=np.stack([one, two], axis=1).astype(np.float32),
+                )
+            )
+    return gains, joined_samples(parts)
+
+
+def misfit(found: np.ndarray) -> float:
+    """Rms of a pattern against the truth, but for slopes, which gains along lines could undo."""
+    error = found - pattern(NODES_X, NODES_Y)
+    error = error - error.mean()
+    for slope in (NODES_X - 0.5, NODES_Y - 0.5):
+        error = error - slope * (error * slope).sum() / (slope**2).sum()
+    return float(np.sqrt((error**2).mean()))
+
+
+@pytest.mark.parametrize("outliers", [0.0, 0.1])
+def test_overlaps_alone_tell_the_lamp_from_the_sea_floor(outliers: float):
+    gains, found = samples(outliers=outliers)
+    light = solve_light(found, UNKNOWN, IMAGES, ["left"] * len(IMAGES))
+    for channel in range(3):
+        assert 1e-4 < misfit(light.patterns["left"][..., channel]) < 0.03
+    assert misfit(np.zeros(GRID)) > 0.1
+    assert np.std([light.gains[n][0] for n in IMAGES]) == pytest.approx(np.std(gains), rel=0.6)
+
+
+def test_the_median_picture_tells_what_a_single_line_cannot():
+    _, found = samples(lines=1)
+    rng = np.random.default_rng(9)
+    shown = pattern(NODES_X, NODES_Y)[None, ..., None] + rng.normal(4.2, 0.1, (9, *GRID, 3))
+    alone = solve_light(found, UNKNOWN, IMAGES, ["left"] * len(IMAGES)).patterns["left"][..., 1]
+    helped = solve_light(found, shown, IMAGES, ["left"] * len(IMAGES)).patterns["left"][..., 1]
+    assert misfit(alone) > 0.06
+    assert misfit(helped) < 0.04
+
+
+def test_corrected_views_of_a_spot_agree_better_than_raw_ones():
+    _, found = samples()
+    light = solve_light(found, UNKNOWN, IMAGES, ["left"] * len(IMAGES))
+    raw, even = [], []
+    for (a, b), places, levels in zip(found.views, found.places, found.levels, strict=True):
+        lift = [
+            np.log(at_places(light.factors("left", IMAGES[n]), place[None])[0])
+            for n, place in ((a, places[0]), (b, places[1]))
+        ]
+        raw.append(levels[0] - levels[1])
+        even.append(levels[0] + lift[0] - levels[1] - lift[1])
+    assert np.std(even) < 0.35 * np.std(raw)
+    assert np.std(even) > 0.01  # the noise stays
+
+
+def test_even_light_is_left_as_it_is_but_for_the_common_white():
+    rng = np.random.default_rng(1)
+    ground = rng.normal(4.2, 0.4, (900, 3)).astype(np.float32)
+    places = rng.uniform(0, 1, (900, 2, 2)).astype(np.float32)
+    views = rng.integers(0, 9, (900, 2)).astype(np.int32)
+    cameras = ["left", "right", "left"] * 3
+    same = LightSamples(views=views, places=places, levels=np.stack([ground, ground], axis=1))
+    light = solve_light(same, UNKNOWN, IMAGES, cameras)
+    for image, camera in zip(IMAGES, cameras, strict=True):
+        factors = light.factors(camera, image)
+        np.testing.assert_allclose(factors, np.broadcast_to(light.white, factors.shape), rtol=1e-5)
+
+
+def test_without_overlap_nothing_is_changed():
+    light = solve_light(joined_samples([]), UNKNOWN, IMAGES, ["left"] * len(IMAGES))
+    np.testing.assert_allclose(light.factors("left", IMAGES[0]), 1.0)
+
+
+def test_low_pass_leaves_out_what_is_not_valid():
+    colour = np.full((270, 338, 3), 100, np.uint8)
+    valid = np.ones((270, 338), bool)
+    colour[:, :60], valid[:, :60] = 0, False
+    low = low_pass(colour, valid)
+    assert low.shape[1] == 108
+    np.testing.assert_allclose(low[:, 20:], 100, atol=1e-3)
+
+
+def test_places_run_from_edge_to_edge():
+    ramp = np.tile(np.arange(50, dtype=np.float32)[:, None, None] + 0.5, (1, 40, 3))
+    places = np.array([[0.5, 0.5], [0.5, 0.1]], np.float32)
+    np.testing.assert_allclose(at_places(ramp, places)[:, 0], [25.0, 5.0], atol=0.02)
+
+
+def test_dark_and_burnt_spots_tell_nothing():
+    grey = np.full((40, 50, 3), 80, np.float32)
+    half = grey.copy()
+    half[:, :25] = 255
+    places = np.column_stack([np.linspace(0.05, 0.95, 50), np.full(50, 0.5)]).astype(np.float32)
+    compared = compare_light((3, 4), (grey, half), (places, places))
+    assert 20 <= len(compared.views) <= 26
+    assert (compared.places[:, 0, 0] > 0.45).all()
+
+
+def test_light_file_round_trip(tmp_path):
+    _, found = samples()
+    light = solve_light(found, UNKNOWN, IMAGES, ["left"] * len(IMAGES))
+    write_light(tmp_path / "light.json", light)
+    again = read_light(tmp_path / "light.json")
+    np.testing.assert_allclose(again.patterns["left"], light.patterns["left"], atol=1e-5)
+    np.testing.assert_allclose(again.white, light.white, atol=1e-5)
+    assert list(again.gains) == IMAGES
+
+
+def test_nodes_take_the_picture_and_leave_out_the_dark():
+    low = np.full((80, 108, 3), 90, np.float32)
+    low[:, :40] = 1.0
+    nodes = at_nodes(low)
+    assert nodes.shape == (*GRID, 3)
+    np.testing.assert_allclose(nodes[:, -3:], np.log(90), rtol=1e-6)
+    assert np.isnan(nodes[:, :3]).all()

@@ -1,0 +1,86 @@
+import numpy as np
+import pytest
+
+from reconstruct.dense.points import enu_from_cam, pinhole_of
+from reconstruct.mosaic.ortho import look_up, visible_cells
+from tests.oracles_dense import sees, stereo_views
+
+
+def hills() -> np.ndarray:
+    rows, columns = np.mgrid[:40, :50]
+    height = 0.8 * np.sin(rows / 9.0 + 0.4) + 0.7 * np.cos(columns / 8.0)
+    return height.astype(np.float32)
+
+
+@pytest.mark.parametrize("camera", [(0.2, -0.2, 1.8), (-1.0, -3.9, 2.0), (4.9, 1.0, 1.7)])
+def test_visible_cells_equal_a_walk_along_the_sight_line(camera: tuple[float, float, float]):
+    height, cell, tolerance = hills(), 0.1, 0.15
+    place = np.array(camera)
+    visible = visible_cells(height, place, 0.0, 0.0, cell, tolerance)
+    clear = doubtful = 0
+    for row in range(0, 40, 3):
+        for column in range(0, 50, 3):
+            rise = sees(height, place, cell, row, column)
+            if abs(rise - tolerance) < 0.1:  # cells are steps: the two walks meet others of them
+                doubtful += 1
+                continue
+            clear += 1
+            assert visible[row, column] == (rise < tolerance), (row, column, rise)
+    assert clear > 2 * doubtful
+    assert 0.2 < visible.mean() < 0.98
+
+
+def test_a_wall_hides_what_is_behind_it_and_not_itself():
+    height = np.zeros((21, 60), np.float32)
+    height[:, 30] = 1.0
+    # camera 2 m up over column 10: its line over the wall reaches the ground 20 cells behind
+    visible = visible_cells(height, np.array([1.05, -1.05, 2.0]), 0.0, 0.0, 0.1, 0.01)
+    assert visible[10, :31].all()
+    assert not visible[10, 31:49].any()
+    assert visible[10, 52:].all()
+
+
+def test_unknown_cells_are_neither_seen_nor_in_the_way():
+    height = np.zeros((21, 60), np.float32)
+    height[:, 30] = np.nan
+    visible = visible_cells(height, np.array([1.05, -1.05, 2.0]), 0.0, 0.0, 0.1, 0.01)
+    assert not visible[:, 30].any()
+    assert visible[:, 31:].all()
+
+
+def test_look_up_projects_as_the_view_does_and_prefers_its_middle():
+    view = stereo_views(np.array([0.0]), np.array([0.0]))[0]
+    camera = enu_from_cam(view, np.zeros(3))
+    rotation = camera[:, :3].T
+    cam_from_enu = np.ascontiguousarray(np.column_stack([rotation, -rotation @ camera[:, 3]]))
+    height = np.full((90, 100), -12.0, np.float32)
+    height[40, 50] = np.nan
+    seen = np.ones((200, 200), bool)
+    pixel, first = 0.02, (-1.0, 0.9)
+    x, y, quality = look_up(
+        height,
+        seen,
+        (0.0, 0.0),
+        1.0,
+        cam_from_enu,
+        pinhole_of(view),
+        (view.width_px, view.height_px),
+        first,
+        pixel,
+        2.0,
+    )
+    rows, columns = np.mgrid[:90, :100]
+    world = np.stack(
+        [first[1] - rows * pixel, first[0] + columns * pixel, np.full(rows.shape, 12.0)], axis=-1
+    )
+    pixels = view.project(world.reshape(-1, 3)).reshape(90, 100, 2)
+    inside = quality > 0
+    np.testing.assert_allclose(x[inside], pixels[inside][:, 0] - 0.5, atol=2e-3)
+    np.testing.assert_allclose(y[inside], pixels[inside][:, 1] - 0.5, atol=2e-3)
+    border = np.minimum(pixels, [view.width_px, view.height_px] - pixels).min(axis=-1)
+    expected = (border > 2.0) & np.isfinite(height)
+    np.testing.assert_array_equal(inside, expected)
+    assert 0.2 < inside.mean() < 1.0
+    best = np.unravel_index(np.argmax(quality), quality.shape)
+    assert border[best] > 0.95 * border.max()
+    assert not (quality * ~expected).any()

@@ -1,0 +1,166 @@
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+
+from alice_survey.artefacts import read_json, write_json
+from alice_survey.config import ReconstructConfig, SurveyConfig
+from alice_survey.errors import ReconstructionError
+from reconstruct.dense.dem import DemGrid
+from reconstruct.mosaic.light import GRID, LightModel, write_light
+from reconstruct.mosaic.run import run_mosaic
+from reconstruct.raster import tiled_raster
+from tests.oracles_dense import (
+    DEPTH_M,
+    FRAME,
+    PERIOD_M,
+    Scene,
+    position_code,
+    sparse_model,
+    stereo_views,
+    write_workspace,
+)
+
+CELL_M, PIXEL_M = 0.012, 0.005
+CONFIG = SurveyConfig(reconstruct=ReconstructConfig(mosaic_pixel_m=PIXEL_M))
+
+
+def terraced(north: np.ndarray, east: np.ndarray) -> np.ndarray:
+    """A slope: warps that forget the height are off by up to 60 mm."""
+    return DEPTH_M + 0.15 * north - 0.1 * east
+
+
+SCENE = Scene(depth_of=terraced, paint=position_code)
+
+
+def write_surface(folder: Path, images: list[str], gains: np.ndarray | None = None) -> None:
+    """The true DEM over the middle of the survey, and light that needs no correction."""
+    dense = folder / "dense"
+    dense.mkdir()
+    grid = DemGrid(west=-0.6, north=0.9, cell=CELL_M, rows=125, columns=110)
+    columns, rows = np.meshgrid(np.arange(grid.columns) + 0.5, np.arange(grid.rows) + 0.5)
+    height = -terraced(grid.north_of(rows), grid.east_of(columns))
+    height[100:, 90:] = np.nan
+    with tiled_raster(dense / "dem.tif", grid, FRAME, "float32", np.nan, "height") as raster:
+        raster.write(height.astype(np.float32), 1)
+    gains = np.zeros((len(images), 3)) if gains is None else gains
+    light = LightModel(
+        patterns={camera: np.zeros((*GRID, 3)) for camera in ("left", "right")},
+        gains=dict(zip(images, gains, strict=True)),
+        white=np.ones(3),
+    )
+    write_light(dense / "light.json", light)
+    write_json(dense / "cloud.json", {"points": 1})
+    write_json(dense / "stage.json", {})
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("mosaic")
+    views = stereo_views(np.array([-0.2, 0.2, 0.6]), np.array([0.0, 0.05, 0.0]), heading_deg=30.0)
+    write_workspace(folder, sparse_model(views, SCENE), SCENE)
+    write_surface(folder, [view.image for view in views])
+    assert run_mosaic(folder, CONFIG, 1)
+    return folder
+
+
+def read(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """RGBA (4, H, W), and north and east of the pixels' centres."""
+    with rasterio.open(folder / "mosaic" / "mosaic.tif") as raster:
+        values, t = raster.read().astype(np.float64), raster.transform
+    rows, columns = np.mgrid[: values.shape[1], : values.shape[2]] + 0.5
+    return values, t.f + rows * t.e, t.c + columns * t.a
+
+
+def test_every_pixel_shows_its_own_coordinates(workspace: Path):
+    rgba, north, east = read(workspace)
+    known = rgba[3] > 0
+    assert known.mean() > 0.6
+    expected = position_code(north, east)
+    levels_per_m = 100 * 2 * np.pi / PERIOD_M
+    for band, channel in ((2, 0), (1, 1)):
+        error = (rgba[band] - expected[..., channel])[known]
+        # rms of the slope of a sine is its largest over the root of two
+        error_m = np.sqrt(np.mean(error**2)) / (levels_per_m / np.sqrt(2))
+        assert 1e-5 < error_m < 0.1 * PIXEL_M
+        assert np.abs(error).max() < 40
+    assert np.abs(rgba[0] - 128)[known].max() <= 2
+
+
+def test_a_shift_of_half_a_pixel_would_show(workspace: Path):
+    rgba, north, east = read(workspace)
+    known = rgba[3] > 0
+    exact = np.mean((rgba[2] - position_code(north, east)[..., 0])[known] ** 2)
+    moved = np.mean((rgba[2] - position_code(north, east + PIXEL_M / 2)[..., 0])[known] ** 2)
+    assert moved > 4 * exact
+
+
+def test_nothing_is_painted_where_the_surface_is_unknown(workspace: Path):
+    rgba, north, east = read(workspace)
+    hole = (north < 0.9 - 100 * CELL_M - CELL_M) & (east > -0.6 + 90 * CELL_M + CELL_M)
+    assert hole.sum() > 100
+    assert (rgba[3][hole] == 0).all()
+    assert (rgba[:3][:, rgba[3] == 0] == 0).all()
+
+
+def test_it_is_a_cloud_optimised_rgba_with_overviews(workspace: Path):
+    with rasterio.open(workspace / "mosaic" / "mosaic.tif") as raster:
+        assert raster.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+        assert raster.count == 4
+        assert raster.colorinterp[3] == rasterio.enums.ColorInterp.alpha
+        assert "Azimuthal" in raster.crs.to_wkt()
+        assert raster.tags()["VERTICAL_DATUM"] == "sea surface"
+        size = raster.width, raster.height
+    about = read_json(workspace / "mosaic" / "mosaic.json")
+    assert (about["width_px"], about["height_px"]) == size
+    assert 0.6 < about["covered"] < 1.0
+    thumbnail = cv2.imread(str(workspace / "mosaic" / "mosaic.png"), cv2.IMREAD_UNCHANGED)
+    assert thumbnail.shape == (size[1], size[0], 4)
+
+
+def test_source_names_the_picture_nearest_to_straight_above(workspace: Path):
+    with rasterio.open(workspace / "mosaic" / "mosaic_source.tif") as raster:
+        source = raster.read(1)
+    rgba, north, east = read(workspace)
+    np.testing.assert_array_equal(source > 0, rgba[3] > 0)
+    names = read_json(workspace / "mosaic" / "mosaic.json")["pictures"]
+    at = np.unravel_index(np.argmin((north - 0.6) ** 2 + east**2), north.shape)
+    assert names[source[at] - 1].endswith("002.png")
+    assert len(np.unique(source[source > 0])) >= 4
+
+
+def test_bytes_do_not_change(workspace: Path, tmp_path: Path):
+    for name in ("images", "sparse", "dense"):
+        (tmp_path / name).symlink_to(workspace / name)
+    assert run_mosaic(tmp_path, CONFIG, 1)
+    for name in ("mosaic.tif", "mosaic_source.tif", "mosaic.png", "mosaic.json"):
+        same = (tmp_path / "mosaic" / name).read_bytes()
+        assert same == (workspace / "mosaic" / name).read_bytes()
+    assert not run_mosaic(tmp_path, CONFIG, 1)
+
+
+def test_gains_of_pictures_leave_no_seam(tmp_path: Path):
+    plain = Scene(depth_of=terraced, paint=lambda n, e: np.full((*n.shape, 3), 100.0))
+    views = stereo_views(np.array([-0.2, 0.2, 0.6]), np.array([0.0, 0.05, 0.0]), heading_deg=30.0)
+    write_workspace(tmp_path, sparse_model(views, plain), plain)
+    gains = np.log(np.linspace(0.7, 1.3, len(views)))
+    for view, gain in zip(views, gains, strict=True):
+        path = tmp_path / "images" / view.image
+        picture = cv2.imread(str(path)).astype(np.float64) * np.exp(gain)
+        cv2.imwrite(str(path), np.rint(picture).astype(np.uint8))
+    write_surface(tmp_path, [view.image for view in views], np.tile(gains[:, None], (1, 3)))
+    assert run_mosaic(tmp_path, CONFIG, 1)
+    rgba, _, _ = read(tmp_path)
+    painted = rgba[:3][:, rgba[3] > 0]
+    np.testing.assert_allclose(painted, 100, atol=2)
+
+
+def test_no_picture_over_the_surface_gives_one_line(tmp_path: Path):
+    views = stereo_views(np.array([30.0, 30.4]), np.array([0.0, 0.0]))
+    write_workspace(tmp_path, sparse_model(views, SCENE), SCENE)
+    write_surface(tmp_path, [view.image for view in views])
+    with pytest.raises(ReconstructionError, match="no picture sees") as caught:
+        run_mosaic(tmp_path, CONFIG, 1)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,401 @@
+import csv
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from alice_survey.artefacts import read_json
+from alice_survey.config import CameraConfig, WaterConfig
+from alice_survey.errors import AliceError, ImageError, WorkspaceError
+from alice_survey.manifest import read_manifest
+from camera_calib.rig import design_rig, read_rig, write_rig
+from reconstruct.pictures.importing import import_images
+
+Draw = Callable[..., Path]
+
+
+@pytest.fixture
+def draw() -> Draw:
+    """Write a picture whose bytes depend on its number, with EXIF where a time is given."""
+
+    def one(
+        path: Path,
+        number: int = 0,
+        size: tuple[int, int] = (64, 48),
+        time: str | None = None,
+        gps: tuple[float, float, float] | None = None,
+    ) -> Path:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        pixels = np.random.default_rng(number).integers(0, 256, (size[1], size[0], 3))
+        image, exif = Image.fromarray(pixels.astype(np.uint8)), Image.Exif()
+        if time is not None:
+            exif.get_ifd(0x8769)[0x9003] = time
+        if gps is not None:
+            latitude, longitude, altitude = gps
+
+            def angle(value: float) -> tuple[float, float, float]:
+                value = abs(value)
+                minutes = value % 1 * 60
+                return (int(value), int(minutes), minutes % 1 * 60)
+
+            exif.get_ifd(0x8825).update(
+                {
+                    1: "N" if latitude >= 0 else "S",
+                    2: angle(latitude),
+                    3: "E" if longitude >= 0 else "W",
+                    4: angle(longitude),
+                    5: b"\x00" if altitude >= 0 else b"\x01",
+                    6: abs(altitude),
+                }
+            )
+        image.save(path, exif=exif)
+        return path
+
+    return one
+
+
+def test_pictures_of_one_camera_keep_their_bytes_and_order(tmp_path: Path, draw: Draw) -> None:
+    source = tmp_path / "in"
+    for number, name in enumerate(["b10.jpg", "b9.jpg", "a.PNG"]):
+        draw(source / name, number)
+    (source / "notes.txt").write_text("no picture")
+    (source / ".hidden.jpg").write_bytes(b"x")
+    assert import_images(tmp_path / "w", [source])
+    images = tmp_path / "w" / "images"
+    records = read_manifest(images / "manifest.csv")
+    assert [r.image for r in records] == ["camera/a.png", "camera/b9.jpg", "camera/b10.jpg"]
+    assert [r.station for r in records] == [0, 1, 2]
+    for record, name in zip(records, ["a.PNG", "b9.jpg", "b10.jpg"], strict=True):
+        assert (images / record.image).read_bytes() == (source / name).read_bytes()
+    survey = read_json(images / "survey.json")
+    assert survey["source"] == "imported"
+    assert survey["datum"] is None
+    assert any("unscaled" in note for note in survey["notes"])
+    assert not import_images(tmp_path / "w", [source])
+    draw(source / "c.jpg", 9)
+    assert import_images(tmp_path / "w", [source])
+
+
+def test_stereo_pictures_pair_in_order(tmp_path: Path, draw: Draw) -> None:
+    for number in range(3):
+        draw(tmp_path / "port" / f"p{number}.png", number)
+        draw(tmp_path / "star" / f"s{number + 5}.png", number + 10)
+    import_images(tmp_path / "w", [], left=tmp_path / "port", right=tmp_path / "star")
+    records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
+    assert [(r.image, r.station) for r in records] == [
+        (f"{side}/{letter}{n + first}.png", n)
+        for n in range(3)
+        for side, letter, first in (("left", "p", 0), ("right", "s", 5))
+    ]
+
+
+def test_a_corrupt_picture_is_left_out_and_its_partner_stays(
+    tmp_path: Path, draw: Draw, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for side in ("left", "right"):
+        for number in range(4):
+            draw(tmp_path / side / f"{number}.jpg", number, size=(200, 150))
+    whole = (tmp_path / "left" / "1.jpg").read_bytes()
+    (tmp_path / "left" / "1.jpg").write_bytes(whole[: len(whole) * 2 // 3])  # truncated
+    (tmp_path / "right" / "2.jpg").write_bytes(b"no picture at all")
+    (tmp_path / "right" / "3.jpg").write_bytes(b"")
+    import_images(tmp_path / "w", [], left=tmp_path / "left", right=tmp_path / "right")
+    told = capsys.readouterr().err
+    for name in ("left/1.jpg", "right/2.jpg", "right/3.jpg"):
+        assert any(name in line and "left out" in line for line in told.splitlines())
+    records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
+    kept = [(r.camera, r.station) for r in records]
+    assert kept == [("left", 0), ("right", 0), ("right", 1), ("left", 2), ("left", 3)]
+
+
+def test_a_truncated_png_is_corrupt_too(
+    tmp_path: Path, draw: Draw, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for number in range(3):
+        path = draw(tmp_path / "in" / f"{number}.png", number, size=(200, 150))
+    path.write_bytes(path.read_bytes()[:-3000])
+    import_images(tmp_path / "w", [tmp_path / "in"])
+    assert "2.png is left out" in capsys.readouterr().err
+    assert len(read_manifest(tmp_path / "w" / "images" / "manifest.csv")) == 2
+
+
+def test_sixteen_bits_become_eight_by_one_gain_per_camera(tmp_path: Path) -> None:
+    """12 bits of sensor in 16 of file: the upper 8 of the 12 are kept, the same in each picture."""
+    rng = np.random.default_rng(1)
+    dim = rng.integers(0, 300, (40, 50, 3)).astype(np.uint16)
+    bright = rng.integers(0, 4096, (40, 50, 3)).astype(np.uint16)
+    (tmp_path / "in").mkdir()
+    cv2.imwrite(str(tmp_path / "in" / "a.tiff"), dim)
+    cv2.imwrite(str(tmp_path / "in" / "b.png"), bright)
+    import_images(tmp_path / "w", [tmp_path / "in"])
+    images = tmp_path / "w" / "images"
+    np.testing.assert_array_equal(cv2.imread(str(images / "camera" / "a.png")), dim >> 4)
+    np.testing.assert_array_equal(cv2.imread(str(images / "camera" / "b.png")), bright >> 4)
+    assert any("12 bits" in note for note in read_json(images / "survey.json")["notes"])
+
+
+def test_gps_of_exif_gives_positions_and_a_datum(tmp_path: Path, draw: Draw) -> None:
+    places = [(-33.5, 151.25, 12.5), (-33.5001, 151.2501, 13.0), (-33.5002, 151.25, -2.0)]
+    for number, place in enumerate(places):
+        draw(
+            tmp_path / "in" / f"{number}.jpg", number, time=f"2024:03:01 10:00:0{number}", gps=place
+        )
+    import_images(tmp_path / "w", [tmp_path / "in"])
+    images = tmp_path / "w" / "images"
+    for record, (latitude, longitude, altitude) in zip(
+        read_manifest(images / "manifest.csv"), places, strict=True
+    ):
+        assert record.latitude_deg == pytest.approx(latitude, abs=1e-6)
+        assert record.longitude_deg == pytest.approx(longitude, abs=1e-6)
+        assert record.depth_m == pytest.approx(-altitude)
+        assert record.time_s == pytest.approx(record.station)
+    survey = read_json(images / "survey.json")
+    assert survey["vertical_datum"] == "EXIF GPS altitude"
+    assert survey["datum"]["latitude_deg"] == pytest.approx(-33.5, abs=1e-6)
+
+
+def navigation(path: Path, rows: list[list[object]], header: str) -> Path:
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(header.split(","))
+        writer.writerows(rows)
+    return path
+
+
+def test_navigation_is_tied_by_time_zone_and_clock_offset(
+    tmp_path: Path, draw: Draw, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for number, second in enumerate([0, 4, 8, 50]):
+        draw(tmp_path / "in" / f"{number}.jpg", number, time=f"2024:07:01 12:00:{second:02d}")
+    rows = [[f"2024-07-01T10:00:{s:02d}Z", 60 + s * 1e-5, 5.0, 10 + s, 90.0] for s in range(15)]
+    nav = navigation(
+        tmp_path / "nav.csv", rows, "time_utc,latitude_deg,longitude_deg,depth_m,heading_deg"
+    )
+    import_images(
+        tmp_path / "w", [tmp_path / "in"],
+        navigation=nav, clock_offset_s=2.5, time_zone="Europe/Oslo",
+    )  # fmt: skip
+    records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
+    assert [r.time_s for r in records] == [2.5, 6.5, 10.5, 52.5]
+    assert [r.depth_m for r in records[:3]] == pytest.approx([12.5, 16.5, 20.5])
+    assert records[1].heading_deg == pytest.approx(90)
+    assert not records[3].has_position
+    told = capsys.readouterr().err
+    assert "1 pictures get no navigation" in told
+    assert "camera/3.jpg" in told
+
+
+@pytest.mark.parametrize(
+    ("given", "stated"),
+    [(None, "sea surface, as in the navigation log"), (" NN2000 (tide) ", "NN2000 (tide)")],
+)
+def test_the_level_of_logged_depths_is_stated(
+    tmp_path: Path, draw: Draw, given: str | None, stated: str
+) -> None:
+    for number in range(2):
+        draw(tmp_path / "in" / f"{number}.jpg", number, time=f"2024:07:01 12:00:0{number}")
+    rows = [[f"2024-07-01T12:00:{s:02d}Z", 60, 5.0, 10 + s] for s in range(5)]
+    nav = navigation(tmp_path / "nav.csv", rows, "time_utc,latitude_deg,longitude_deg,depth_m")
+    import_images(tmp_path / "w", [tmp_path / "in"], navigation=nav, vertical_datum=given)
+    survey = read_json(tmp_path / "w" / "images" / "survey.json")
+    assert survey["vertical_datum"] == stated
+    # The name alone differs: depths stay as logged.
+    records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
+    assert [r.depth_m for r in records] == pytest.approx([10.0, 11.0])
+
+
+def test_masks_come_along(tmp_path: Path, draw: Draw) -> None:
+    for number in range(3):
+        draw(tmp_path / "in" / f"{number}.png", number)
+    beside, apart = np.full((48, 64), 255, np.uint8), np.zeros((48, 64), np.uint8)
+    beside[:10] = 0
+    apart[:, 32:] = 7
+    cv2.imwrite(str(tmp_path / "in" / "1_mask.png"), beside)
+    import_images(tmp_path / "w", [tmp_path / "in"])
+    images = tmp_path / "w" / "images"
+    records = read_manifest(images / "manifest.csv")
+    assert [bool(r.mask) for r in records] == [False, True, False]
+    np.testing.assert_array_equal(cv2.imread(str(images / records[1].mask), 0), beside)
+    (tmp_path / "masks").mkdir()
+    cv2.imwrite(str(tmp_path / "masks" / "2.png"), apart)
+    import_images(tmp_path / "w", [tmp_path / "in"], masks=tmp_path / "masks")
+    records = read_manifest(images / "manifest.csv")
+    assert [bool(r.mask) for r in records] == [False, False, True]
+    np.testing.assert_array_equal(cv2.imread(str(images / records[2].mask), 0), (apart > 0) * 255)
+
+
+def test_names_stay_inside_and_apart(tmp_path: Path, draw: Draw) -> None:
+    draw(tmp_path / "one" / "-x..jpg", 0)
+    draw(tmp_path / "one" / "a b;c.jpg", 1)
+    draw(tmp_path / "two" / "A b;c.JPG", 2)
+    (tmp_path / "two" / "link.jpg").symlink_to(tmp_path / "one" / "a b;c.jpg")
+    (tmp_path / "two" / "folder.jpg").mkdir()
+    import_images(tmp_path / "w", [tmp_path / "one", tmp_path / "two"])
+    images = tmp_path / "w" / "images"
+    names = [r.image for r in read_manifest(images / "manifest.csv")]
+    assert names == [
+        "camera/-x.jpg", "camera/a_b_c.jpg", "camera/A_b_c_2.jpg", "camera/link.jpg",
+    ]  # fmt: skip
+    assert not any(path.is_symlink() for path in images.rglob("*"))
+    assert (images / "camera" / "link.jpg").read_bytes() == (
+        tmp_path / "one" / "a b;c.jpg"
+    ).read_bytes()
+
+
+def test_frames_of_a_video_are_taken_at_their_times(tmp_path: Path) -> None:
+    path = tmp_path / "dive.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10.0, (64, 48))
+    for frame in range(30):
+        writer.write(np.full((48, 64, 3), 8 * frame, np.uint8))
+    writer.release()
+    import_images(tmp_path / "w", [], video=path, every_s=0.5, clock_offset_s=100.0)
+    images = tmp_path / "w" / "images"
+    records = read_manifest(images / "manifest.csv")
+    assert [r.time_s for r in records] == pytest.approx([100, 100.5, 101, 101.5, 102, 102.5])
+    levels = [cv2.imread(str(images / r.image)).mean() for r in records]
+    assert levels == pytest.approx([0, 40, 80, 120, 160, 200], abs=6)
+
+
+def test_a_rig_must_be_that_of_the_pictures(tmp_path: Path, draw: Draw) -> None:
+    for side in ("left", "right"):
+        for number in range(2):
+            draw(tmp_path / side / f"{number}.png", number, size=(846, 677))
+    small = CameraConfig(width_px=846, height_px=677, pixel_um=14.76)
+    write_rig(tmp_path / "good.json", design_rig(small, WaterConfig()))
+    write_rig(tmp_path / "bad.json", design_rig(CameraConfig(), WaterConfig()))
+    pair = {"left": tmp_path / "left", "right": tmp_path / "right"}
+    import_images(tmp_path / "w", [], **pair, rig=tmp_path / "good.json")
+    assert read_rig(tmp_path / "w" / "images" / "rig.json").cameras["left"].width_px == 846
+    with pytest.raises(ImageError, match=r"846 x 677 pixels, but the rig.*3384 x 2710"):
+        import_images(tmp_path / "w", [], **pair, rig=tmp_path / "bad.json")
+    assert (tmp_path / "w" / "images" / "rig.json").exists()  # what was there stays
+
+
+def test_every_fault_gives_one_line(tmp_path: Path, draw: Draw) -> None:
+    (tmp_path / "empty").mkdir()
+    draw(tmp_path / "one" / "0.jpg")
+    for number in range(3):
+        draw(tmp_path / "three" / f"{number}.jpg", number)
+        draw(tmp_path / "sizes" / f"{number}.jpg", number, size=(64, 48 + (number == 2)))
+    (tmp_path / "no.mp4").write_bytes(b"no video")
+    nav = navigation(
+        tmp_path / "nav.csv", [[0, 60, 5, 3], [1, 60, 5, 3]],
+        "time_s,latitude_deg,longitude_deg,depth_m",
+    )  # fmt: skip
+    w, three = tmp_path / "w", tmp_path / "three"
+    faults: list[tuple[list[Path], dict[str, object], str]] = [
+        ([tmp_path / "empty"], {}, "empty: holds no pictures"),
+        ([tmp_path / "one"], {}, "1 usable picture: a model needs"),
+        ([tmp_path / "sizes"], {}, "2.jpg has 64 x 49 pixels, but 0.jpg .* 64 x 48"),
+        ([tmp_path / "absent"], {}, "absent: no such file or folder"),
+        ([tmp_path / "nav.csv"], {}, "nav.csv: cannot be read"),
+        ([], {}, "give folders of pictures"),
+        ([three], {"left": three, "right": three}, "one of them"),
+        ([], {"left": three}, "need both --left and --right"),
+        ([], {"left": three, "right": tmp_path / "one"}, "3 pictures in .* but 1 in"),
+        ([], {"video": tmp_path / "no.mp4"}, "no video that can be read"),
+        ([], {"video": tmp_path / "no.mp4", "every_s": 0.0}, "must be more than 0"),
+        ([three], {"navigation": nav}, "no picture carries a time"),
+        ([three], {"time_zone": "Nowhere"}, "time-zone 'Nowhere'"),
+        ([three], {"clock_offset_s": float("nan")}, "clock-offset nan"),
+        ([three], {"vertical_datum": "LAT"}, "'LAT' names the level .* give --navigation too"),
+        ([three], {"navigation": nav, "vertical_datum": " "}, "no name of one line"),
+        ([three], {"navigation": nav, "vertical_datum": "a\nb"}, "no name of one line"),
+    ]
+    for folders, given, message in faults:
+        with pytest.raises(AliceError, match=message) as caught:
+            import_images(w, folders, **given)  # type: ignore[arg-type]
+        assert "\n" not in str(caught.value)
+    assert not (w / "images").exists()
+
+
+@pytest.mark.parametrize("stage", ["images", "pool"])
+def test_a_simulated_survey_is_not_mixed_with_real_pictures(
+    tmp_path: Path, draw: Draw, stage: str
+) -> None:
+    truth = tmp_path / "w" / stage / "truth"
+    truth.mkdir(parents=True)
+    for number in range(2):
+        draw(tmp_path / "in" / f"{number}.jpg", number)
+    with pytest.raises(WorkspaceError, match="simulated survey"):
+        import_images(tmp_path / "w", [tmp_path / "in"])
+    assert truth.is_dir()
+
+
+def test_a_navigation_log_of_another_day_is_refused(tmp_path: Path, draw: Draw) -> None:
+    for number in range(2):
+        draw(tmp_path / "in" / f"{number}.jpg", number, time=f"2024:07:01 12:00:0{number}")
+    rows = [[f"2024-07-02T12:00:{s:02d}Z", 60, 5.0, 10] for s in range(9)]
+    nav = navigation(tmp_path / "nav.csv", rows, "time_utc,latitude_deg,longitude_deg,depth_m")
+    with pytest.raises(ImageError, match=r"no picture was taken while navigation was logged"):
+        import_images(tmp_path / "w", [tmp_path / "in"], navigation=nav)
+
+
+def test_one_or_two_processes_write_the_same(tmp_path: Path, draw: Draw) -> None:
+    for number in range(4):
+        draw(tmp_path / "in" / f"{number}.jpg", number)
+    for threads in (1, 2):
+        import_images(tmp_path / f"w{threads}", [tmp_path / "in"], threads=threads)
+    one, two = tmp_path / "w1" / "images", tmp_path / "w2" / "images"
+    for file in sorted(p for p in one.rglob("*") if p.is_file() and p.name != "stage.json"):
+        assert file.read_bytes() == (two / file.relative_to(one)).read_bytes()
+
+
+def write_dng(path: Path, mosaic: np.ndarray) -> None:
+    """A minimal RAW file: a 16-bit RGGB mosaic with the tags that LibRaw needs."""
+    height, width = mosaic.shape
+    texts = {271: b"Alice\0", 272: b"Test\0", 50708: b"Alice Test\0"}
+    rationals = {50721: [1, 0, 0, 0, 1, 0, 0, 0, 1], 50728: [1, 1, 1]}
+    plain = {
+        254: (4, [0]), 256: (4, [width]), 257: (4, [height]), 258: (3, [16]), 259: (3, [1]),
+        262: (3, [32803]), 274: (3, [1]), 277: (3, [1]), 278: (4, [height]),
+        279: (4, [2 * width * height]), 33421: (3, [2, 2]), 33422: (1, [0, 1, 1, 2]),
+        50706: (1, [1, 4, 0, 0]), 50714: (3, [0]), 50717: (3, [65535]), 50778: (3, [21]),
+    }  # fmt: skip
+    tags = sorted([273, *texts, *rationals, *plain])
+    start = 8 + 2 + 12 * len(tags) + 4
+    extra, entries = b"", b""
+    for tag in tags:
+        if tag in texts:
+            kind, count, data = 2, len(texts[tag]), texts[tag]
+        elif tag in rationals:
+            kind = 10 if tag == 50721 else 5
+            count = len(rationals[tag])
+            data = b"".join(struct.pack("<iI", v, 1) for v in rationals[tag])
+        else:
+            kind, values = plain.get(tag, (4, [0]))
+            count, data = len(values), struct.pack(f"<{len(values)}{' BsHI'[kind]}", *values)
+            if tag == 273:
+                data = b"PIXL"
+        if len(data) > 4:
+            offset, extra = start + len(extra), extra + data + b"\0" * (len(data) % 2)
+            data = struct.pack("<I", offset)
+        entries += struct.pack("<HHI", tag, kind, count) + data.ljust(4, b"\0")
+    entries = entries.replace(b"PIXL", struct.pack("<I", start + len(extra)))
+    header = b"II*\0" + struct.pack("<IH", 8, len(tags))
+    path.write_bytes(header + entries + b"\0" * 4 + extra + mosaic.astype("<u2").tobytes())
+
+
+def test_raw_pictures_are_developed_alike(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One gain for all: a picture half as bright stays darker, by the same curve."""
+    (tmp_path / "in").mkdir()
+    x = np.arange(128) + np.zeros((96, 1))
+    for name, level in (("a", 1.0), ("b", 0.5)):
+        write_dng(tmp_path / "in" / f"{name}.dng", level * (8000 + 250 * x))
+    (tmp_path / "in" / "c.dng").write_bytes(b"II*\0 broken")
+    import_images(tmp_path / "w", [tmp_path / "in"])
+    assert "c.dng is left out" in capsys.readouterr().err
+    images = tmp_path / "w" / "images"
+    bright, dim = (cv2.imread(str(images / "camera" / f"{n}.png"), 0) for n in "ab")
+    assert bright.shape == (96, 128)
+    inner = (slice(10, -10), slice(10, -10))
+    assert np.all(np.diff(bright[inner].mean(axis=0)) > -0.5)
+    light = ((bright[inner] / 255.0 + 0.099) / 1.099) ** (1 / 0.45)  # BT.709 undone
+    expected = 255.0 * (1.099 * (light / 2) ** 0.45 - 0.099)
+    assert np.abs(dim[inner] - expected).max() < 2.0

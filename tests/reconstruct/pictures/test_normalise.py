@@ -1,0 +1,66 @@
+import numpy as np
+import pytest
+
+from reconstruct.pictures.normalise import even_light, normalise
+
+
+def textured(height: int = 240, width: int = 320, seed: int = 1) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return rng.normal(1.0, 0.1, (height, width)).clip(0.5, 1.5)
+
+
+def lamp(height: int = 240, width: int = 320) -> np.ndarray:
+    y, x = np.mgrid[:height, :width]
+    radius2 = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / (0.6 * width) ** 2
+    return np.exp(-2.0 * radius2)
+
+
+def test_lamp_light_is_divided_out() -> None:
+    texture, light = textured(), lamp()
+    picture = np.rint(150.0 * texture * light).astype(np.uint8)
+    assert light.max() / light.min() > 4
+
+    ratio = even_light(picture)
+
+    inner = (slice(20, -20), slice(20, -20))
+    tiles = ratio[inner].reshape(5, 40, 7, 40).mean(axis=(1, 3))
+    assert tiles.min() > 0.97
+    assert tiles.max() < 1.03
+    assert np.corrcoef(ratio[inner].ravel(), texture[inner].ravel())[0, 1] > 0.99
+
+
+@pytest.mark.parametrize("gain", [0.5, 0.9, 1.1])
+def test_exposure_does_not_matter(gain: float) -> None:
+    scene = 100.0 * textured()
+    one = even_light(np.rint(scene).astype(np.uint8))
+    other = even_light(np.rint(gain * scene).astype(np.uint8))
+    assert np.abs(one - other).mean() < 0.01
+
+
+def test_a_dark_frame_stays_quiet() -> None:
+    dark = np.random.default_rng(2).poisson(0.3, (120, 160)).astype(np.uint8)
+    ratio = even_light(dark)
+    assert np.isfinite(ratio).all()
+    assert ratio.mean() < 0.2  # not blown up to the contrast of a lit picture
+    assert even_light(np.zeros((50, 60), np.uint8)).max() == 0
+
+
+def test_colour_and_grey_of_the_same_picture_agree_and_input_is_kept() -> None:
+    grey = np.rint(120 * textured() * lamp()).clip(0, 255).astype(np.uint8)
+    colour = np.repeat(grey[..., None], 3, axis=2)
+    kept = colour.copy()
+    np.testing.assert_array_equal(normalise(colour), normalise(grey))
+    np.testing.assert_array_equal(colour, kept)
+    assert normalise(grey).dtype == np.uint8
+
+
+def test_contrast_of_rims_comes_nearer_to_that_of_the_middle() -> None:
+    texture, light = textured() - 1, lamp()
+    haze = 20.0 + 120.0 * light * (1 + texture * light)
+    grey = normalise(np.rint(haze).clip(0, 255).astype(np.uint8)).astype(float)
+    middle, rim = (slice(100, 140), slice(140, 180)), (slice(100, 140), slice(20, 60))
+    detail = 120.0 * texture * light**2
+    before = detail[rim].std() / detail[middle].std()
+    after = grey[rim].std() / grey[middle].std()
+    assert before < 0.35
+    assert 1.25 * before < after < 1.1

@@ -1,0 +1,162 @@
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from alice_survey.artefacts import write_json
+from alice_survey.errors import ImageError, WorkspaceError
+from camera_calib.flat_port import FlatPortCamera
+from reconstruct.lenses.lens import (
+    ColmapLens,
+    FlatPortLens,
+    Lens,
+    flat_port_lens,
+    lens_from_json,
+    self_calibrated_lens,
+)
+from reconstruct.pictures.undistorted import Pictures, read_mask, undistortion_maps
+
+WIDTH, HEIGHT = 320, 240
+
+
+def port_lens() -> FlatPortLens:
+    camera = FlatPortCamera(
+        width_px=WIDTH, height_px=HEIGHT, fx_px=300.0, fy_px=301.0, cx_px=158.0, cy_px=121.0,
+        k1=-0.15, k2=0.05, p1=1e-3, p2=-5e-4, port_distance_m=0.02, glass_thickness_m=0.01,
+        normal=(np.sin(0.02), 0.0, np.cos(0.02)),
+    )  # fmt: skip
+    return flat_port_lens(camera, 1.5, 2.5)
+
+
+def opencv_lens(k1: float = -0.3) -> ColmapLens:
+    return self_calibrated_lens(
+        pycolmap.Camera(
+            model="OPENCV", width=WIDTH, height=HEIGHT,
+            params=[280.0, 282.0, 161.0, 118.0, k1, 0.1, 1e-3, 5e-4],
+        )
+    )  # fmt: skip
+
+
+LENSES = pytest.mark.parametrize("lens", [port_lens(), opencv_lens()], ids=["port", "opencv"])
+
+
+@LENSES
+def test_pixels_come_back(lens: Lens) -> None:
+    x, y = np.meshgrid(np.linspace(20, WIDTH - 20, 9), np.linspace(20, HEIGHT - 20, 7))
+    taken = np.stack([x, y], axis=-1).reshape(-1, 2)
+    np.testing.assert_allclose(lens.from_pinhole(lens.to_pinhole(taken)), taken, atol=1e-6)
+
+
+@LENSES
+def test_a_lens_survives_json(lens: Lens) -> None:
+    import json
+
+    again = lens_from_json(json.loads(json.dumps(lens.to_json())))
+    assert again == lens
+
+
+def test_the_port_lens_sees_points_at_the_working_range_as_its_pinhole() -> None:
+    lens = port_lens()
+    rng = np.random.default_rng(1)
+    z = lens.virtual.working_range_m
+    points = np.column_stack([rng.uniform(-0.6, 0.6, (50, 2)), np.full(50, z)])
+    ideal = lens.to_pinhole(lens.camera.project(points))
+    moved = lens.pinhole_from_cam.apply(points)
+    expected = lens.pinhole.colmap.img_from_cam(moved)
+    np.testing.assert_allclose(ideal, expected, atol=1e-6)
+
+
+def test_a_barrel_lens_keeps_its_field_of_view() -> None:
+    lens = opencv_lens(-0.3)
+    assert lens.pinhole.width_px > WIDTH
+    middle = lens.to_pinhole(np.array([[0.0, 118.0], [WIDTH, 118.0]]))
+    assert middle[0, 0] > -1
+    assert middle[1, 0] < lens.pinhole.width_px + 1
+
+
+@LENSES
+def test_warped_pictures_carry_their_own_coordinates(lens: Lens, tmp_path: Path) -> None:
+    """A picture whose grey levels are its coordinates shows where every warped pixel came from."""
+    x, y = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    coded = np.stack([x * 0.75, y, np.zeros_like(x)], axis=-1).astype(np.float32)
+    pictures = workspace_of(tmp_path, lens, np.rint(coded).astype(np.uint8))
+    warped, valid = pictures.colour("camera/a.png"), pictures.valid("camera/a.png")
+    pinhole = lens.pinhole
+    assert warped.shape == (pinhole.height_px, pinhole.width_px, 3)
+    rows, columns = np.nonzero(valid)
+    source = lens.from_pinhole(np.stack([columns, rows], axis=1) + 0.5) - 0.5
+    inner = np.all((source > 2) & (source < [WIDTH - 3, HEIGHT - 3]), axis=1)
+    assert inner.mean() > 0.9
+    shown = warped[rows, columns, :2][inner].astype(float) / [0.75, 1.0]
+    assert np.abs(shown - source[inner]).max() < 1.5
+    assert np.abs((shown - source[inner]).mean(axis=0)).max() < 0.05
+    assert warped[~valid].max(initial=0) == 0
+
+
+def test_pixels_beyond_the_fold_of_a_polynomial_are_not_valid() -> None:
+    camera = pycolmap.Camera(
+        model="RADIAL", width=WIDTH, height=HEIGHT, params=[200.0, 160.0, 120.0, -0.35, 0.02]
+    )
+    lens = self_calibrated_lens(camera)
+    x, y = undistortion_maps(lens)
+    seen = (x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT)
+    rows, columns = np.nonzero(seen)
+    radius = (
+        np.hypot(columns + 0.5 - lens.pinhole.cx_px, rows + 0.5 - lens.pinhole.cy_px)
+        / lens.pinhole.focal_px
+    )
+    # r (1 + k1 r^2 + k2 r^4) turns back where 1 + 3 k1 r^2 + 5 k2 r^4 = 0
+    fold = np.sqrt(min(r.real for r in np.roots([5 * 0.02, 3 * -0.35, 1]) if r.real > 0))
+    pixel = 1.0 / lens.pinhole.focal_px
+    assert fold - 5 * pixel < radius.max() < fold + pixel
+
+
+def workspace_of(tmp_path: Path, lens: Lens, picture: np.ndarray, mask: str = "") -> Pictures:
+    (tmp_path / "images" / "camera").mkdir(parents=True)
+    (tmp_path / "sparse").mkdir()
+    cv2.imwrite(str(tmp_path / "images" / "camera" / "a.png"), picture)
+    write_json(
+        tmp_path / "sparse" / "cameras.json",
+        {
+            "cameras": {"camera": lens.to_json()},
+            "images": {"camera/a.png": {"camera": "camera", "station": 0, "mask": mask}},
+        },
+    )
+    return Pictures.open(tmp_path)
+
+
+def test_masks_follow_the_warp(tmp_path: Path) -> None:
+    lens = port_lens()
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, :100] = 0
+    pictures = workspace_of(tmp_path, lens, np.full((HEIGHT, WIDTH, 3), 90, np.uint8), "m.png")
+    cv2.imwrite(str(tmp_path / "images" / "m.png"), mask)
+    valid = pictures.valid("camera/a.png")
+    edge = lens.to_pinhole(np.array([[100.0, y] for y in (40.0, 120.0, 200.0)]))
+    for x, y in edge:
+        assert not valid[int(y), int(x) - 3]
+        assert valid[int(y), int(x) + 3]
+
+
+def test_grey_is_normalised_and_as_large_as_colour(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    dim = rng.integers(5, 25, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+    pictures = workspace_of(tmp_path, opencv_lens(), dim)
+    grey = pictures.grey("camera/a.png")
+    assert grey.shape == pictures.colour("camera/a.png").shape[:2]
+    assert grey[50:-50, 50:-50].mean() > 60
+
+
+def test_faults_name_the_file(tmp_path: Path) -> None:
+    pictures = workspace_of(tmp_path, port_lens(), np.zeros((10, 20, 3), np.uint8), "m.png")
+    with pytest.raises(ImageError, match=r"a\.png: 20 x 10 pixels.*320 x 240"):
+        pictures.colour("camera/a.png")
+    with pytest.raises(ImageError, match=r"m\.png: missing"):
+        pictures.valid("camera/a.png")
+    with pytest.raises(WorkspaceError, match="no picture 'x'"):
+        pictures.colour("x")
+    cv2.imwrite(str(tmp_path / "m.png"), np.zeros((4, 5), np.uint8))
+    with pytest.raises(ImageError, match="mask of 5 x 4 pixels"):
+        read_mask(tmp_path / "m.png", (20, 10))
