@@ -6,14 +6,12 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.config import SeaConfig, SurveyConfig, VehicleConfig
+from alice_survey.config import SeaConfig, SurveyConfig
 from alice_survey.errors import warn
 from alice_survey.frames import Array, rotation_from_attitude
 from alice_survey.trajectory import Trajectory
 from alice_survey.vehicle import signals
-from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.floor import FloorGrid, floor_depth
-from alice_survey.vehicle.identification.files import coefficients_from_file
 from alice_survey.vehicle.navigation import tick as navigation
 from alice_survey.vehicle.navigation.sensors import (
     CompassSpec,
@@ -36,11 +34,11 @@ from alice_survey.vehicle.sea import (
 from alice_survey.vehicle.simulator import Flown, Setup, simulate
 from alice_survey.vehicle.stability import pitch_divergence_speed_mps
 from alice_survey.vehicle.swell import with_swell
-from alice_survey.vehicle.vehicle import Vehicle
 from missions.flight import Flight, trigger_times
 from missions.flight_route import path_of, room_behind_m, turns_on_the_spot
 from missions.navigation import NavigationLog
 from missions.plan_file import Plan
+from missions.route.energy import sound_craft_of
 
 _FLOOR_SPACING_M = 0.1
 """Of the grid that the DVL hears: finer than the spot of a beam."""
@@ -116,7 +114,7 @@ def mission_setup(
         longest_s: after which the vehicle gives up.
         rng: for what is drawn once a mission.
     """
-    craft = craft_of(config.vehicle)
+    craft = sound_craft_of(config.vehicle)
     diverging_mps = pitch_divergence_speed_mps(craft)
     if plan.speed_mps > _PITCH_MARGIN * diverging_mps:
         warn(
@@ -176,18 +174,6 @@ def mission_setup(
         start_ne_m=(float(start_ne[0]), float(start_ne[1])),
         start_heading_rad=heading_rad,
     )
-
-
-def craft_of(settings: VehicleConfig) -> Vehicle:
-    """The vehicle of a survey, with a named set of coefficients or those of a file.
-
-    Raises:
-        VehicleError: the set is not known, or the file is not one of coefficients.
-    """
-    file = settings.coefficients_file
-    if file is None:
-        return vehicle(settings.name, settings.coefficients)
-    return vehicle(settings.name).with_coefficients(coefficients_from_file(file))
 
 
 def current_of(

@@ -34,6 +34,7 @@ from alice_survey.config import SurveyConfig, VehicleConfig
 from alice_survey.errors import PlanError
 from alice_survey.frames import Array
 from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.identification.files import coefficients_from_file
 from alice_survey.vehicle.pilot.gains import STEADY_SHARE
 from alice_survey.vehicle.steady import steady_flight
 from alice_survey.vehicle.vehicle import Vehicle
@@ -163,20 +164,25 @@ def usable_wh(settings: VehicleConfig) -> float:
     return settings.battery_wh * (1.0 - settings.battery_reserve)
 
 
+def sound_craft_of(settings: VehicleConfig) -> Vehicle:
+    """The vehicle of a survey with all its thrust, a named set of coefficients or those of a file.
+
+    Raises:
+        VehicleError: the set is not known, or the file is not one of coefficients.
+    """
+    file = settings.coefficients_file
+    if file is None:
+        return vehicle(settings.name, settings.coefficients)
+    return vehicle(settings.name).with_coefficients(coefficients_from_file(file))
+
+
 def craft_of(settings: VehicleConfig) -> Vehicle:
     """The vehicle that a plan counts on: without the thrust that is known to be lost.
 
     Raises:
-        VehicleError: the set of coefficients is not known, or the file is not one of coefficients.
+        VehicleError: as `sound_craft_of`.
     """
-    if settings.coefficients_file is None:
-        craft = vehicle(settings.name, settings.coefficients)
-    else:
-        from alice_survey.vehicle.identification.files import coefficients_from_file
-
-        craft = vehicle(settings.name).with_coefficients(
-            coefficients_from_file(settings.coefficients_file)
-        )
+    craft = sound_craft_of(settings)
     lost = settings.thruster_health.impaired if settings.health_known else {}
     present = {thruster.name for thruster in craft.thrusters}
     return craft.weakened({name: left for name, left in lost.items() if name in present})
