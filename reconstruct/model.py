@@ -10,6 +10,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.artefacts import read_json, write_json
 from alice_survey.frames import Array, Datum
+from reconstruct.lenses.lens import lens_from_json
+from reconstruct.lenses.range_shift import RangeShift, no_shift, range_shift
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,14 +49,37 @@ class View:
     cx_px: float
     cy_px: float
     world_from_cam: RigidTransform
+    shift: RangeShift | None = None
+    """What the warp of the picture leaves of the port's refraction; None without a port."""
 
     def project(self, points_world: Array) -> Array:
-        """Pixels (N, 2) of points (N, 3); NaN behind the camera."""
+        """Pixels (N, 2) at which the warped picture shows points (N, 3); NaN behind the camera."""
+        ideal = self.project_ideal(points_world)
+        if self.shift is None:
+            return ideal
+        return self.shift.warped(ideal, self.world_from_cam.inv().apply(points_world)[:, 2])
+
+    def project_ideal(self, points_world: Array) -> Array:
+        """Pixels (N, 2) at which the ideal pinhole sees points (N, 3); NaN behind the camera."""
         points = self.world_from_cam.inv().apply(points_world)
         z = np.where(points[:, 2:] > 0, points[:, 2:], np.nan)
         focal, centre = np.array([self.fx_px, self.fy_px]), np.array([self.cx_px, self.cy_px])
         pixels: Array = focal * points[:, :2] / z + centre
         return pixels
+
+    def at_depth(self, pixels: Array, depth: Array) -> Array:
+        """World points (N, 3) that the warped picture shows at pixels (N, 2) and depths (N,)."""
+        ideal = pixels if self.shift is None else self.shift.ideal(pixels, depth)
+        focal, centre = np.array([self.fx_px, self.fy_px]), np.array([self.cx_px, self.cy_px])
+        sideways = (ideal - centre) / focal * depth[:, None]
+        points: Array = self.world_from_cam.apply(np.column_stack([sideways, depth]))
+        return points
+
+    @property
+    def shift_arguments(self) -> tuple[NDArray[np.float64], float, float, float]:
+        """What kernels that look through the port take; a field of zeros without one."""
+        shift = self.shift or no_shift(self.width_px, self.height_px)
+        return shift.arguments
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -105,7 +130,10 @@ def read_model(sparse: Path) -> SparseModel:
     """Read the model of a finished `sparse/` stage."""
     import pycolmap
 
-    cameras = read_json(sparse / "cameras.json")["images"]
+    stored = read_json(sparse / "cameras.json")
+    cameras = stored["images"]
+    frame = read_frame(sparse / "frame.json")
+    shifts = _shifts(stored, frame)
     model = pycolmap.Reconstruction(sparse / "model")
     images = sorted(
         (i for i in model.images.values() if i.has_pose), key=lambda image: str(image.name)
@@ -130,6 +158,7 @@ def read_model(sparse: Path) -> SparseModel:
                 cx_px=cx,
                 cy_px=cy,
                 world_from_cam=pose.inv(),
+                shift=shifts.get(cameras[image.name]["camera"]),
             )
         )
     view_of = {image.image_id: index for index, image in enumerate(images)}
@@ -140,8 +169,19 @@ def read_model(sparse: Path) -> SparseModel:
         for element in model.points3D[point_id].track.elements
     ]
     return SparseModel(
-        frame=read_frame(sparse / "frame.json"),
+        frame=frame,
         views=tuple(views),
         points_world=np.array([model.points3D[i].xyz for i in ids]).reshape(-1, 3),
         observations=np.array(rows, dtype=np.int64).reshape(-1, 2),
     )
+
+
+def _shifts(stored: dict[str, Any], frame: WorldFrame) -> dict[str, RangeShift]:
+    """By camera; none for cameras without a port, and none where lengths are not known."""
+    if not frame.scaled:
+        return {}
+    return {
+        name: range_shift(lens_from_json(lens))
+        for name, lens in stored["cameras"].items()
+        if lens["kind"] == "flat_port"
+    }

@@ -67,6 +67,7 @@ def scaled_view(view: View, scale: float) -> View:
         cx_px=view.cx_px * sx,
         fy_px=view.fy_px * sy,
         cy_px=view.cy_px * sy,
+        shift=None if view.shift is None else view.shift.scaled(sx, sy),
     )
 
 
