@@ -96,6 +96,9 @@ class AreaConfig(Config):
         return self
 
 
+PortTilt = Annotated[float, Field(ge=-15, le=15)]
+
+
 class CameraConfig(Config):
     """The stereo pair as designed: two Manta G-917 behind flat ports (paper, section III.B)."""
 
@@ -107,6 +110,7 @@ class CameraConfig(Config):
     baseline_m: float = Field(0.1, gt=0, le=2)
     port_distance_m: float = Field(0.02, ge=0, le=0.5)
     glass_thickness_m: float = Field(0.01, ge=0, le=0.5)
+    port_tilt_deg: tuple[PortTilt, PortTilt] = (0.0, 0.0)
     n_glass: float = Field(1.52, ge=1, le=2)
     position_body_m: tuple[float, float, float] = (0.55, -0.05, 0.08)
     dvl_position_body_m: tuple[float, float, float] = (-0.4145, 0.0, 0.11)

@@ -121,6 +121,7 @@ def design_rig(camera: CameraConfig, water: WaterConfig, scale: int = 1) -> Rig:
         scale: pixels are this many times larger.
     """
     focal_px = camera.focal_mm * 1e3 / camera.pixel_um
+    sideways = np.sin(np.deg2rad(camera.port_tilt_deg))
     one = FlatPortCamera(
         width_px=camera.width_px,
         height_px=camera.height_px,
@@ -132,6 +133,7 @@ def design_rig(camera: CameraConfig, water: WaterConfig, scale: int = 1) -> Rig:
         glass_thickness_m=camera.glass_thickness_m,
         n_glass=camera.n_glass,
         n_water=water.n_water,
+        normal=(*map(float, sideways), float(np.sqrt(1.0 - sideways @ sideways))),
     ).reduced(scale)
     x, y, z = camera.position_body_m
     pupil = (x, y, z - camera.port_distance_m - camera.glass_thickness_m)

@@ -70,5 +70,5 @@ def _built(camera: FlatPortCamera, rng: np.random.Generator) -> FlatPortCamera:
 
 
 def _tilted(camera: FlatPortCamera, rng: np.random.Generator) -> FlatPortCamera:
-    x, y = rng.uniform(-TILT_TOLERANCE, TILT_TOLERANCE, 2)
+    x, y = camera.normal[:2] + rng.uniform(-TILT_TOLERANCE, TILT_TOLERANCE, 2)
     return camera.with_parameters({"normal_x": float(x), "normal_y": float(y)})

@@ -132,7 +132,8 @@ def _without_holes(field: Array) -> Array:
         return field
     from scipy.ndimage import distance_transform_edt
 
-    nearest: Any = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    find: Any = distance_transform_edt
+    nearest = find(~known, return_distances=False, return_indices=True)
     filled: Array = field[tuple(nearest)]
     return filled
 
