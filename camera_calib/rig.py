@@ -121,7 +121,7 @@ def design_rig(camera: CameraConfig, water: WaterConfig, scale: int = 1) -> Rig:
         scale: pixels are this many times larger.
     """
     focal_px = camera.focal_mm * 1e3 / camera.pixel_um
-    sideways = np.sin(np.deg2rad(camera.port_tilt_deg))
+    x, y = (float(np.sin(np.deg2rad(tilt))) for tilt in camera.port_tilt_deg)
     one = FlatPortCamera(
         width_px=camera.width_px,
         height_px=camera.height_px,
@@ -133,10 +133,10 @@ def design_rig(camera: CameraConfig, water: WaterConfig, scale: int = 1) -> Rig:
         glass_thickness_m=camera.glass_thickness_m,
         n_glass=camera.n_glass,
         n_water=water.n_water,
-        normal=(*map(float, sideways), float(np.sqrt(1.0 - sideways @ sideways))),
+        normal=(x, y, float(np.sqrt(1.0 - x * x - y * y))),
     ).reduced(scale)
-    x, y, z = camera.position_body_m
-    pupil = (x, y, z - camera.port_distance_m - camera.glass_thickness_m)
+    ahead, right, down = camera.position_body_m
+    pupil = (ahead, right, down - camera.port_distance_m - camera.glass_thickness_m)
     return Rig(
         cameras={"left": one, "right": one},
         cam_from_rig={
