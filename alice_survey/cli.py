@@ -20,6 +20,8 @@ from alice_survey.cli_options import (
     print_result,
 )
 from alice_survey.cli_plan import app as plan_app
+from alice_survey.cli_reconstruct import app as model_app
+from alice_survey.cli_reconstruct import reconstruct_app
 from alice_survey.cli_vehicle import app as vehicle_app
 from alice_survey.errors import AliceError
 
@@ -35,6 +37,8 @@ app = typer.Typer(
 )
 app.add_typer(plan_app, name="plan")
 app.add_typer(import_app)
+app.add_typer(reconstruct_app, name="reconstruct")
+app.add_typer(model_app)
 app.add_typer(camera_app, name="camera")
 app.add_typer(vehicle_app, name="vehicle")
 
@@ -303,60 +307,6 @@ def calibrate(
 
         result = run(["calibration"], workspace, survey, None, threads)
     print_result(*result, as_json)
-
-
-@app.command(epilog=examples("reconstruct -w reef", "reconstruct -w reef --threads 2 --json"))
-def reconstruct(
-    workspace: Workspace = WORK,
-    survey: SurveyFile = None,
-    threads: Threads = None,
-    as_json: AsJson = False,
-) -> None:
-    """Turn pictures into a model.
-
-    Camera track, DEM, point cloud and orthomosaic.
-    """
-    from alice_survey.survey import RECONSTRUCT, run
-
-    print_result(*run(RECONSTRUCT, workspace, survey, None, threads), as_json)
-
-
-@app.command(
-    epilog=examples(
-        "scale -w reef --points '0,0,0 1.2,0,0.1' --length 0.5",
-        "scale -w reef --points 'left/001.png:512,300 left/001.png:930,312' --length 0.5",
-    )
-)
-def scale(
-    points: Annotated[
-        str,
-        typer.Option(
-            help="Two points: 'x,y,z x,y,z', or spots in pictures, 'IMAGE:x,y IMAGE:x,y'."
-        ),
-    ],
-    length: Annotated[float, typer.Option(min=1e-6, help="Their true distance, m.")],
-    workspace: Workspace = WORK,
-) -> None:
-    """Scale a model by a known length."""
-    from reconstruct.sparse.scale import scale_model
-
-    typer.echo(scale_model(workspace, points, length))
-
-
-@app.command(epilog=examples("evaluate -w reef", "evaluate -w reef --json"))
-def evaluate(
-    workspace: Workspace = WORK,
-    survey: SurveyFile = None,
-    threads: Threads = None,
-    as_json: AsJson = False,
-) -> None:
-    """Score a simulated survey.
-
-    Camera track, surface and mosaic against the truth.
-    """
-    from alice_survey.survey import run
-
-    print_result(*run(["report"], workspace, survey, None, threads), as_json)
 
 
 @app.command(name="run", epilog=examples("run -w reef --scale 4"))
