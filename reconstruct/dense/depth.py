@@ -122,7 +122,7 @@ def pair_depth(
     inside = _valid(valid_reference, pair.rect_from_reference, pair)
     disparity[~inside] = np.nan
     _drop_outside(disparity, _valid(valid_partner, pair.rect_from_partner, pair))
-    depth = depth_in_reference(reference, pair, without_mixed(disparity))
+    depth, _ = depth_in_reference(reference, partner, pair, without_mixed(disparity))
     sigma = depth * depth * np.float32(match_sigma_px / (pair.focal_px * pair.baseline))
     return depth, sigma
 

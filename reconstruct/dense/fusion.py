@@ -11,6 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from alice_survey.frames import Array
+from reconstruct.dense.sight import KernelLens, pixel_at, slope_at
 
 Float32 = NDArray[np.float32]
 
@@ -84,11 +85,11 @@ def merge_depths(
 def count_witnesses(
     depth: Float32,
     sigma: Float32,
-    ray_from_pixel: Array,
+    lens: KernelLens,
     other_from_ref: Array,
     other_depth: Float32,
     other_sigma: Float32,
-    other_pinhole: Array,
+    other_lens: KernelLens,
     gate: float,
 ) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
     """See which depths another view confirms and which it sees through.
@@ -96,11 +97,11 @@ def count_witnesses(
     Args:
         depth: (H, W) of the reference.
         sigma: (H, W) of it.
-        ray_from_pixel: (4,) fx, fy, cx, cy of the reference, px.
+        lens: of the reference.
         other_from_ref: (3, 4) transform of points from the reference camera to the other.
         other_depth: (h, w) of the other view.
         other_sigma: (h, w) of it.
-        other_pinhole: (4,) fx, fy, cx, cy of the other view, px.
+        other_lens: of the other view.
         gate: largest difference in standard deviations of the difference.
 
     Returns:
@@ -111,20 +112,19 @@ def count_witnesses(
     confirmed = np.zeros((height, width), np.int8)
     refuted = np.zeros((height, width), np.int8)
     for row in range(height):
-        y = (row + 0.5 - ray_from_pixel[3]) / ray_from_pixel[1]
         for column in range(width):
             z = depth[row, column]
             if math.isnan(z):
                 continue
-            x = (column + 0.5 - ray_from_pixel[2]) / ray_from_pixel[0]
+            x, y = slope_at(lens, column + 0.5, row + 0.5, 1.0 / z)
             t = other_from_ref
             a = z * (t[0, 0] * x + t[0, 1] * y + t[0, 2]) + t[0, 3]
             b = z * (t[1, 0] * x + t[1, 1] * y + t[1, 2]) + t[1, 3]
             c = z * (t[2, 0] * x + t[2, 1] * y + t[2, 2]) + t[2, 3]
             if c <= 0.0:
                 continue
-            u = math.floor(other_pinhole[0] * a / c + other_pinhole[2])
-            v = math.floor(other_pinhole[1] * b / c + other_pinhole[3])
+            at_x, at_y = pixel_at(other_lens, a, b, c)
+            u, v = math.floor(at_x), math.floor(at_y)
             if u < 0 or v < 0 or u >= other_depth.shape[1] or v >= other_depth.shape[0]:
                 continue
             there = other_depth[v, u]

@@ -8,6 +8,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from alice_survey.frames import Array
+from reconstruct.dense.sight import KernelLens, lens_of, slope_at
+from reconstruct.dense.sight import pinhole_of as pinhole_of  # the mosaic takes it from here
 from reconstruct.model import View
 
 Float32 = NDArray[np.float32]
@@ -31,11 +33,6 @@ class Points:
     """(N,) standard deviations of the depth."""
     views: NDArray[np.int32]
     """(N,) number of the view, in ascending order."""
-
-
-def pinhole_of(view: View) -> Array:
-    """(4,) fx, fy, cx, cy of a view, px."""
-    return np.array([view.fx_px, view.fy_px, view.cx_px, view.cy_px])
 
 
 def enu_from_cam(view: View, offset_enu: Array) -> Array:
@@ -71,7 +68,7 @@ def points_in_box(
     """
     transform = enu_from_cam(view, offset_enu)
     enu, normals, colours, sigmas = gather(
-        depth, sigma, kept, colour, factors, pinhole_of(view), transform, np.array(box)
+        depth, sigma, kept, colour, factors, lens_of(view), transform, np.array(box)
     )
     return Points(
         enu=enu,
@@ -109,7 +106,7 @@ def gather(
     kept: NDArray[np.bool_],
     colour: NDArray[np.uint8],
     factors: Float32,
-    pinhole: Array,
+    lens: KernelLens,
     enu_from_cam: Array,
     box: Array,
 ) -> tuple[Float32, Float32, NDArray[np.uint8], Float32]:
@@ -121,7 +118,7 @@ def gather(
         kept: (H, W) which pixels to take.
         colour: (H, W, 3) BGR.
         factors: (rows, columns, 3) at nodes spread over the picture, BGR.
-        pinhole: (4,) fx, fy, cx, cy, px.
+        lens: of the view.
         enu_from_cam: (3, 4) transform.
         box: (4,) west, east, south, north.
 
@@ -134,12 +131,11 @@ def gather(
     pixels = np.empty((height * width, 2), np.int32)
     count = 0
     for row in range(height):
-        y = (row + 0.5 - pinhole[3]) / pinhole[1]
         for column in range(width):
             if not kept[row, column]:
                 continue
-            x = (column + 0.5 - pinhole[2]) / pinhole[0]
             z = depth[row, column]
+            x, y = slope_at(lens, column + 0.5, row + 0.5, 1.0 / z)
             east = z * (t[0, 0] * x + t[0, 1] * y + t[0, 2]) + t[0, 3]
             north = z * (t[1, 0] * x + t[1, 1] * y + t[1, 2]) + t[1, 3]
             if east < box[0] or east >= box[1] or north <= box[2] or north > box[3]:
@@ -153,7 +149,7 @@ def gather(
     normals = np.full((count, 3), np.nan, np.float32)
     colours = np.empty((count, 3), np.uint8)
     sigmas = np.empty(count, np.float32)
-    a, b = np.empty(3), np.empty(3)
+    a, b, other = np.empty(3), np.empty(3), np.empty(3)
     for i in range(count):
         row, column = pixels[i, 0], pixels[i, 1]
         sigmas[i] = sigma[row, column]
@@ -170,20 +166,18 @@ def gather(
             )
             level = colour[row, column, k] * (above * (1 - p) + below * p)
             colours[i, 2 - k] = min(255, int(level + 0.5))
-        up, down, left, right = row - 2, row + 2, column - 2, column + 2
+        up, down = row - _REACH, row + _REACH
+        left, right = column - _REACH, column + _REACH
         if up < 0 or left < 0 or down >= height or right >= width:
             continue
-        x = (column + 0.5 - pinhole[2]) / pinhole[0]
-        y = (row + 0.5 - pinhole[3]) / pinhole[1]
-        step_x, step_y = _REACH / pinhole[0], _REACH / pinhole[1]
-        z_l, z_r = depth[row, left], depth[row, right]
-        z_u, z_d = depth[up, column], depth[down, column]
-        a[0] = (x + step_x) * z_r - (x - step_x) * z_l
-        a[1] = y * (z_r - z_l)
-        a[2] = z_r - z_l
-        b[0] = x * (z_d - z_u)
-        b[1] = (y + step_y) * z_d - (y - step_y) * z_u
-        b[2] = z_d - z_u
+        _spot(depth, lens, row, right, a)
+        _spot(depth, lens, row, left, other)
+        for k in range(3):
+            a[k] -= other[k]
+        _spot(depth, lens, down, column, b)
+        _spot(depth, lens, up, column, other)
+        for k in range(3):
+            b[k] -= other[k]
         n0 = b[1] * a[2] - b[2] * a[1]
         n1 = b[2] * a[0] - b[0] * a[2]
         n2 = b[0] * a[1] - b[1] * a[0]
@@ -193,3 +187,11 @@ def gather(
         for k in range(3):
             normals[i, k] = (t[k, 0] * n0 + t[k, 1] * n1 + t[k, 2] * n2) / length
     return enu[:count].copy(), normals, colours, sigmas
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _spot(depth: Float32, lens: KernelLens, row: int, column: int, spot: Array) -> None:
+    """Write the point (3,) of a pixel, in the camera, into `spot`; NaN where unknown."""
+    z = depth[row, column]
+    x, y = slope_at(lens, column + 0.5, row + 0.5, 1.0 / z)
+    spot[0], spot[1], spot[2] = x * z, y * z, z

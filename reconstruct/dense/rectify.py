@@ -10,14 +10,18 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from alice_survey.frames import Array
+from reconstruct.dense.sight import KernelLens, lens_of, slope_at
 from reconstruct.model import View
 
 _LEAST_COSINE = 0.75
 """Of the angle by which a view may be turned."""
+_ROUNDS = 2
+"""Of depth and the port's shift, which depends on it."""
 _HALF = 0.5
 """OpenCV counts pixels from the first pixel's centre, the model from its outer corner."""
 
@@ -37,8 +41,9 @@ class Rectification:
     """Disparity of a match that lies in the same column of both virtual pictures."""
     disparities_px: int
     """How many whole disparities from `disparity_offset_px` on are to be searched."""
-    cosine: Array
-    """(3,) row that takes rays of the reference (x, y, 1) to their share along the virtual axis."""
+    cosines: Array
+    """(2, 3) rows that take rays (x, y, 1) of reference and partner to their shares along the
+    virtual axis."""
 
     def range_from_disparity(self, disparity_px: NDArray[np.float32]) -> NDArray[np.float32]:
         """Distance along the virtual optical axis; NaN stays NaN."""
@@ -97,8 +102,7 @@ def rectify(reference: View, partner: View, points_world: Array) -> Rectificatio
     # a picture turned by t is stretched by cos(t)^-3 in area at its middle: undo it on average
     stretch = float(np.prod([(s @ z_axis) ** -1.5 for s in sights])) ** 0.5
     focal = (reference.fx_px + reference.fy_px) / 2.0 / stretch
-    turn = (world_from_rect.inv() * reference.world_from_cam.rotation).as_matrix()
-    homographies, boxes = [], []
+    homographies, boxes, cosines = [], [], []
     for view in (reference, partner):
         rotation = (world_from_rect.inv() * view.world_from_cam.rotation).as_matrix()
         homography = np.diag([focal, focal, 1.0]) @ rotation @ np.linalg.inv(intrinsics(view))
@@ -108,6 +112,7 @@ def rectify(reference: View, partner: View, points_world: Array) -> Rectificatio
             return None
         corners = corners[:, :2] / corners[:, 2:]
         homographies.append(homography)
+        cosines.append(rotation[2])
         boxes.append((corners.min(axis=0), corners.max(axis=0)))
 
     depth = (points_world - reference.world_from_cam.translation) @ z_axis
@@ -140,7 +145,7 @@ def rectify(reference: View, partner: View, points_world: Array) -> Rectificatio
         baseline=baseline,
         disparity_offset_px=offset,
         disparities_px=count,
-        cosine=turn[2],
+        cosines=np.array(cosines),
     )
 
 
@@ -158,43 +163,132 @@ def warp(
     return warped
 
 
-def rect_pixels(reference: View, rectification: Rectification) -> tuple[Array, Array]:
-    """Where each pixel of the reference lies in its virtual picture.
-
-    Returns:
-        x and y, (H, W) float32, in OpenCV's pixels, for `cv2.remap`.
-    """
-    x = np.arange(reference.width_px) + _HALF
-    y = np.arange(reference.height_px) + _HALF
-    h = rectification.rect_from_reference
-    grid_x, grid_y = np.meshgrid(x, y)
-    w = h[2, 0] * grid_x + h[2, 1] * grid_y + h[2, 2]
-    rect_x = (h[0, 0] * grid_x + h[0, 1] * grid_y + h[0, 2]) / w - _HALF
-    rect_y = (h[1, 0] * grid_x + h[1, 1] * grid_y + h[1, 2]) / w - _HALF
-    return rect_x.astype(np.float32), rect_y.astype(np.float32)
-
-
 def depth_in_reference(
-    reference: View, rectification: Rectification, disparity_px: NDArray[np.float32]
-) -> NDArray[np.float32]:
+    reference: View,
+    partner: View,
+    rectification: Rectification,
+    disparity_px: NDArray[np.float32],
+) -> tuple[NDArray[np.float32], float]:
     """Take a disparity map of the virtual picture to depth along the reference's own axis.
 
     Args:
         reference: the view.
+        partner: the other view of the pair.
         rectification: of the pair.
         disparity_px: (h, w) of the virtual left picture, NaN where unknown.
 
     Returns:
-        (H, W) depth, NaN where any of the four virtual pixels around is unknown.
+        (H, W) depth, NaN where any of the four virtual pixels around is unknown; and by how many
+        virtual pixels, rms, the two exact rays of the matches pass each other, which a match along
+        a row cannot see (0 without a port).
     """
-    x, y = rect_pixels(reference, rectification)
-    disparity = cv2.remap(
-        disparity_px, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan
+    corner = np.array([[1.0, 0, _HALF], [0, 1, _HALF], [0, 0, 1]])
+    depth, squares, count = triangulate(
+        disparity_px,
+        (reference.height_px, reference.width_px),
+        lens_of(reference),
+        lens_of(partner),
+        np.linalg.inv(corner) @ rectification.rect_from_reference,
+        np.linalg.inv(corner) @ rectification.rect_from_partner,
+        rectification.cosines,
+        rectification.focal_px * rectification.baseline,
+        rectification.disparity_offset_px,
     )
-    reach = rectification.range_from_disparity(disparity)
-    rays_x = (np.arange(reference.width_px) + _HALF - reference.cx_px) / reference.fx_px
-    rays_y = (np.arange(reference.height_px) + _HALF - reference.cy_px) / reference.fy_px
-    c = rectification.cosine
-    share = c[0] * rays_x[None, :] + c[1] * rays_y[:, None] + c[2]
-    depth: NDArray[np.float32] = (reach / share).astype(np.float32)
-    return depth
+    return depth, float(np.sqrt(squares / max(count, 1)))
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def triangulate(
+    disparity_px: NDArray[np.float32],
+    shape: tuple[int, int],
+    reference: KernelLens,
+    partner: KernelLens,
+    rect_from_reference: Array,
+    rect_from_partner: Array,
+    cosines: Array,
+    focal_baseline: float,
+    offset_px: float,
+) -> tuple[NDArray[np.float32], float, int]:
+    """Depth of every pixel from the two refracted rays of its match.
+
+    A match says which pixels p and q of the two warped pictures show one spot. Where the pinholes
+    see it depends on its depth, which the pair of pinhole pixels tells: two rounds, of which each
+    gains the ratio of the port's shift to the disparity (under 0.01), settle it.
+
+    Args:
+        disparity_px: (h, w) of the virtual left picture, NaN where unknown.
+        shape: rows and columns of the reference.
+        reference: its lens.
+        partner: its lens.
+        rect_from_reference: (3, 3) from the model's pixels to the virtual picture's array indices.
+        rect_from_partner: (3, 3) likewise.
+        cosines: as in `Rectification`.
+        focal_baseline: of the virtual pictures.
+        offset_px: of the disparity.
+
+    Returns:
+        (H, W) depth, NaN where unknown; the sum of squares of the rows by which rays pass each
+        other; how many pixels it sums.
+    """
+    rows, columns = disparity_px.shape
+    height, width = shape
+    depth = np.full(shape, np.nan, np.float32)
+    squares, count = 0.0, 0
+    h, g = rect_from_reference, rect_from_partner
+    back = np.linalg.inv(g)
+    for row in range(height):
+        y = row + 0.5
+        for column in range(width):
+            x = column + 0.5
+            w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
+            left = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w
+            level = (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w
+            if not (0.0 <= left < columns - 1 and 0.0 <= level < rows - 1):
+                continue
+            i, j = int(level), int(left)
+            b, a = level - i, left - j
+            above = (1 - a) * disparity_px[i, j] + a * disparity_px[i, j + 1]
+            below = (1 - a) * disparity_px[i + 1, j] + a * disparity_px[i + 1, j + 1]
+            disparity = (1 - b) * above + b * below
+            if not disparity + offset_px > 0.0:  # NaN as well
+                continue
+            right = left - disparity
+            w = back[2, 0] * right + back[2, 1] * level + back[2, 2]
+            u = (back[0, 0] * right + back[0, 1] * level + back[0, 2]) / w
+            v = (back[1, 0] * right + back[1, 1] * level + back[1, 2]) / w
+            reach = focal_baseline / (disparity + offset_px)
+            z, across = 0.0, 0.0
+            for last in range(_ROUNDS + 1):
+                px, py, share = _pinhole_ray(reference, cosines[0], x, y, reach)
+                z = reach / share
+                if last == _ROUNDS:
+                    break
+                qx, qy, _ = _pinhole_ray(partner, cosines[1], u, v, reach)
+                w = h[2, 0] * px + h[2, 1] * py + h[2, 2]
+                here = (h[0, 0] * px + h[0, 1] * py + h[0, 2]) / w
+                across = (h[1, 0] * px + h[1, 1] * py + h[1, 2]) / w
+                w = g[2, 0] * qx + g[2, 1] * qy + g[2, 2]
+                there = (g[0, 0] * qx + g[0, 1] * qy + g[0, 2]) / w
+                across -= (g[1, 0] * qx + g[1, 1] * qy + g[1, 2]) / w
+                reach = focal_baseline / (here - there + offset_px)
+            if z > 0.0:
+                depth[row, column] = z
+                squares += across * across
+                count += 1
+    return depth, squares, count
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _pinhole_ray(
+    lens: KernelLens, cosine: Array, x: float, y: float, reach: float
+) -> tuple[float, float, float]:
+    """The pinhole's pixel of what a warped pixel shows at a reach along the virtual axis.
+
+    The last value is the share of the ray (slopes, 1) along that axis.
+    """
+    pinhole, _ = lens
+    plain = cosine[2] + cosine[0] * (x - pinhole[2]) / pinhole[0]
+    plain += cosine[1] * (y - pinhole[3]) / pinhole[1]
+    a, b = slope_at(lens, x, y, plain / reach)
+    share = cosine[0] * a + cosine[1] * b + cosine[2]
+    return a * pinhole[0] + pinhole[2], b * pinhole[1] + pinhole[3], share

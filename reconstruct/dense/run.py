@@ -22,9 +22,9 @@ from reconstruct.dense.cloud import voxel_edge, write_cloud_json, write_ply
 from reconstruct.dense.dem import FILL_CELLS, DemGrid, grid_over, round_cell
 from reconstruct.dense.depth import pair_depth
 from reconstruct.dense.fusion import GATE_SIGMAS, count_witnesses, merge_depths
-from reconstruct.dense.points import pinhole_of
 from reconstruct.dense.probe import find_conditions, open_pictures, shrunk
 from reconstruct.dense.rectify import scaled_view
+from reconstruct.dense.sight import lens_of
 from reconstruct.dense.stereo_pairs import choose_pairs, in_frame, points_of_views
 from reconstruct.dense.tiles import Tile, ViewSummary, fuse_tile, tile_tasks
 from reconstruct.dense.view_store import ViewStore
@@ -280,11 +280,11 @@ def check_view(task: CheckTask) -> ViewSummary:
         seen, through = count_witnesses(
             depth,
             sigma,
-            pinhole_of(view),
+            lens_of(view),
             np.ascontiguousarray(other_from_ref.as_matrix()[:3]),
             np.asarray(store.load(number, "depth")),
             np.asarray(store.load(number, "sigma")),
-            pinhole_of(other),
+            lens_of(other),
             GATE_SIGMAS,
         )
         supported += seen
@@ -372,11 +372,8 @@ def surface_grid(
 def _world_points(
     view: View, depth: NDArray[np.float32], rows: NDArray[np.int64], columns: NDArray[np.int64]
 ) -> Array:
-    z = depth[rows, columns].astype(np.float64)
-    x = (columns + 0.5 - view.cx_px) / view.fx_px * z
-    y = (rows + 0.5 - view.cy_px) / view.fy_px * z
-    points: Array = view.world_from_cam.apply(np.stack([x, y, z], axis=1))
-    return points
+    pixels: Array = np.column_stack([columns, rows]).astype(np.float64) + 0.5
+    return view.at_depth(pixels, depth[rows, columns].astype(np.float64))
 
 
 def _points_in_sight(model: SparseModel) -> Iterator[Array]:

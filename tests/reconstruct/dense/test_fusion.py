@@ -4,9 +4,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform
 
 from reconstruct.dense.fusion import count_witnesses, merge_depths
+from reconstruct.lenses.range_shift import no_shift
 from tests.oracles_dense import merged
 
-PINHOLE = np.array([50.0, 50.0, 10.0, 8.0])
+LENS = (np.array([50.0, 50.0, 10.0, 8.0]), no_shift(20, 16).arguments)
 NOWHERE = np.full((16, 20), np.nan, np.float32)
 
 
@@ -55,7 +56,7 @@ def witness(shift_m: float) -> tuple[np.ndarray, np.ndarray]:
     other_from_ref = RigidTransform.from_translation([-0.1, 0.0, 0.0]).as_matrix()[:3]
     there = np.full_like(depth, 2.0 + shift_m)
     return count_witnesses(
-        depth, sigma, PINHOLE, np.ascontiguousarray(other_from_ref), there, sigma, PINHOLE, 3.0
+        depth, sigma, LENS, np.ascontiguousarray(other_from_ref), there, sigma, LENS, 3.0
     )
 
 

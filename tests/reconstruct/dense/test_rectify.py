@@ -1,10 +1,17 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from reconstruct.dense.rectify import depth_in_reference, rect_pixels, rectify, scaled_view
+from alice_survey.config import CameraConfig, WaterConfig
+from alice_survey.frames import BODY_FROM_NADIR_CAM
+from camera_calib.rig import design_rig
+from reconstruct.dense.rectify import depth_in_reference, rectify, scaled_view
+from reconstruct.lenses.lens import flat_port_lens
+from reconstruct.lenses.range_shift import range_shift
 from reconstruct.model import View
 
 
@@ -87,11 +94,15 @@ def test_depth_map_of_a_plane_comes_back():
     right = transfer(pair.rect_from_partner, other.project(world))
     disparity = (grid.reshape(-1, 2)[:, 0] - right[:, 0]).reshape(grid.shape[:2])
 
-    depth = depth_in_reference(one, pair, disparity.astype(np.float32))
+    depth, across = depth_in_reference(one, other, pair, disparity.astype(np.float32))
 
-    x, y = rect_pixels(one, pair)
-    inside = (x > 1) & (y > 1) & (x < pair.width_px - 2) & (y < pair.height_px - 2)
+    inside = np.isfinite(depth)
+    assert across < 1e-4
     assert inside.mean() > 0.3
+    x, y = np.moveaxis(transfer(pair.rect_from_reference, _pixels(one)), 1, 0)
+    size = [pair.width_px, pair.height_px]
+    reached = ((x > 1) & (y > 1) & (x < size[0] - 1) & (y < size[1] - 1)).reshape(240, 320)
+    assert inside[reached].all()
     grid_x, grid_y = np.meshgrid(np.arange(320) + 0.5, np.arange(240) + 0.5)
     rays = np.stack([(grid_x - 163.0) / 400.0, (grid_y - 118.0) / 404.0, np.ones((240, 320))], -1)
     down = one.world_from_cam.rotation.apply(rays.reshape(-1, 3))[:, 2].reshape(240, 320)
@@ -117,3 +128,74 @@ def test_scaled_view_sees_the_same_places_at_half_the_pixels():
 def test_points_behind_the_reference_bound_nothing(behind: float):
     pair = view([0, 0, 0], [0, 0, 0]), view([0.3, 0, 0], [0, 0, 0])
     assert rectify(*pair, np.array([[0.0, 0.0, behind]])) is None
+
+
+def _pixels(one: View) -> np.ndarray:
+    """(N, 2) middles of all pixels, row by row."""
+    x, y = np.meshgrid(np.arange(one.width_px) + 0.5, np.arange(one.height_px) + 0.5)
+    return np.column_stack([x.ravel(), y.ravel()])
+
+
+def port_view(centre: list[float], rpy_deg: list[float]) -> View:
+    """A nadir camera 100 mm behind a port that is tilted by 2 degrees."""
+    rig = design_rig(CameraConfig(port_distance_m=0.1), WaterConfig(), scale=8)
+    tilt = np.deg2rad(2.0)
+    camera = replace(rig.cameras[rig.reference], normal=(np.sin(tilt), 0.0, np.cos(tilt)))
+    lens = flat_port_lens(camera, 1.5, 2.5)
+    turn = Rotation.from_euler("xyz", rpy_deg, degrees=True)
+    return View(
+        image="a",
+        camera="left",
+        station=0,
+        width_px=lens.pinhole.width_px,
+        height_px=lens.pinhole.height_px,
+        fx_px=lens.pinhole.focal_px,
+        fy_px=lens.pinhole.focal_px,
+        cx_px=lens.pinhole.cx_px,
+        cy_px=lens.pinhole.cy_px,
+        world_from_cam=RigidTransform.from_components(centre, turn * BODY_FROM_NADIR_CAM),
+        shift=range_shift(lens),
+    )
+
+
+def sea_floor(points: np.ndarray) -> np.ndarray:
+    """Depth (N,) under points: half a metre of relief, smooth."""
+    return 2.0 + 0.25 * np.sin(2.5 * points[:, 0]) * np.cos(1.5 * points[:, 1] + 0.4)
+
+
+def spots(view: View, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """World points of the sea floor that the warped picture shows at pixels, and their depth."""
+    depth = np.full(len(pixels), 2.0)
+    for _ in range(40):
+        points = view.at_depth(pixels, depth)
+        depth = depth + (sea_floor(points) - points[:, 2])
+    return points, depth
+
+
+@pytest.mark.parametrize("base_m", [0.1, 0.5])
+def test_depth_through_a_tilted_port_is_exact(base_m: float):
+    one, other = (
+        port_view([0, 0, 0], [1.0, -2.0, 30.0]),
+        port_view([base_m, 0.1, 0.02], [-1, 1, 28]),
+    )
+    points, true = spots(one, _pixels(one))
+    pair = rectify(one, other, points)
+    assert pair is not None
+    grid = np.stack(np.meshgrid(np.arange(pair.width_px), np.arange(pair.height_px)), -1) + 0.5
+    grid = grid.reshape(-1, 2)
+    seen, _ = spots(one, transfer(np.linalg.inv(pair.rect_from_reference), grid))
+    right = transfer(pair.rect_from_partner, other.project(seen))
+    disparity = (grid - right)[:, 0].reshape(pair.height_px, pair.width_px).astype(np.float32)
+    rows_apart_px = np.sqrt(np.mean((grid - right)[:, 1] ** 2))
+
+    depth, across_px = depth_in_reference(one, other, pair, disparity)
+    views = [replace(view, shift=None) for view in (one, other)]
+    central, none_px = depth_in_reference(*views, pair, disparity)
+
+    known = np.isfinite(depth)
+    assert known.mean() > 0.3
+    assert np.abs(depth.ravel() - true)[known.ravel()].max() < 1e-5
+    without = np.sqrt(np.mean((central.ravel() - true)[known.ravel()] ** 2))
+    assert 3e-4 < without < 0.05
+    assert across_px == pytest.approx(rows_apart_px, rel=0.2)
+    assert none_px < 1e-4
