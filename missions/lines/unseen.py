@@ -1,7 +1,8 @@
 """What parallel lines leave unseen, exactly along them and by thin strips across.
 
-Strips lie between all offsets at which something changes: corners of the area, and sides of the
-lines' swaths. On the middle of each strip the parts that are seen too seldom are found exactly.
+Strips lie between all offsets at which something changes: corners of the area, sides of the lines'
+swaths, and where the area's edge crosses an end of what is seen beside a gap. On the middle of each
+strip the parts that are seen too seldom are found exactly.
 """
 
 import math
@@ -42,7 +43,12 @@ def unseen(
     rows = np.unique(cuts[:, 0]).astype(np.intp)
     low, high = offsets[rows] - pattern.half_across_m, offsets[rows] + pattern.half_across_m
     sides = np.concatenate(
-        [offsets - pattern.half_across_m, offsets + pattern.half_across_m, survey[:, 1]]
+        [
+            offsets - pattern.half_across_m,
+            offsets + pattern.half_across_m,
+            survey[:, 1],
+            _corners(survey, offsets, cuts, pattern.half_across_m, pattern.half_along_m),
+        ]
     )
     # Places between the outer sides of two cut rows' swaths that neither sees have no patches.
     levels, widths = _strips(np.unique(sides), low, high, finest_m)
@@ -101,6 +107,33 @@ def _strips(sides: Array, low: Array, high: Array, finest_m: float) -> tuple[Arr
     part = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
     thin = np.repeat(widths / parts, parts)
     return np.repeat(begins, parts) + (part + 0.5) * thin, thin
+
+
+@compiled
+def _corners(
+    survey: Array, offsets: Array, cuts: Array, half_across: float, half_along: float
+) -> Array:
+    """Offsets, (N,), where the area's edge crosses an end of what is seen beside a cut.
+
+    There what is unseen has a corner: without them the middle of a strip may miss most of it.
+    """
+    found = np.empty(64)
+    used = 0
+    for c in range(cuts.shape[0]):
+        middle = offsets[int(cuts[c, 0])]
+        for u in (cuts[c, 1] + half_along, cuts[c, 2] - half_along):
+            for e in range(survey.shape[0]):
+                u0, v0, u1, v1 = survey[e]
+                if (u0 < u) == (u1 < u):
+                    continue
+                v = v0 + (u - u0) / (u1 - u0) * (v1 - v0)
+                if abs(v - middle) >= half_across:
+                    continue
+                if used == found.size:
+                    found = np.concatenate((found, np.empty_like(found)))
+                found[used] = v
+                used += 1
+    return found[:used].copy()
 
 
 @compiled

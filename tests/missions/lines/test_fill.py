@@ -66,6 +66,22 @@ def test_what_a_pattern_leaves_unseen_is_found(
     assert inside.all()
 
 
+def test_corners_left_unseen_of_an_oblique_strip_are_found_whatever_the_size_of_patches() -> None:
+    """Where it passes from row to row, corners are left that are thinner than patches."""
+    strip = shapely.affinity.rotate(box(0, 0, 19.1, 0.13), -7.2, origin=(0, 0))
+    pattern = Pattern(spacing_m=1.2, step_m=1.0, half_across_m=0.61, half_along_m=0.57)
+    site = Site.of(area_of(strip, 0.5))
+    pieces, offsets, cuts = survey_pieces(site, 0.0, pattern)
+    points = points_in(strip, 400_000)
+    lacking = ~seen_enough(pieces_as_lines(pieces, offsets), points, pattern)
+    lacking_m2 = float(lacking.mean() * strip.area)
+    assert 0.001 < lacking_m2 / strip.area < 0.002
+    for finest_m in (0.15, 0.03, 0.001):
+        patches = unseen(to_uv(site.survey, 0.0), pattern, offsets, pieces, cuts, finest_m)
+        found_m2 = float((patches[:, LENGTH] * patches[:, WIDTH]).sum())
+        assert found_m2 == pytest.approx(lacking_m2, rel=0.03)
+
+
 def test_an_area_without_cuts_is_not_filled() -> None:
     area = area_of(box(0, 0, 12, 9))
     site = Site.of(area)
