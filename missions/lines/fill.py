@@ -67,8 +67,10 @@ def fill_table(
     if len(cuts) == 0 or _has_gaps(pattern):
         return np.empty((0, 6))
     survey = to_uv(site.survey, heading_rad)
-    patches = unseen(survey, pattern, offsets, pieces, cuts, _finest_m(pattern))
     left_m2 = LEFT_SHARE * site.area_m2
+    # No single patch may be worth more than what may be left.
+    finest_m = min(_finest_m(pattern), math.sqrt(left_m2))
+    patches = unseen(survey, pattern, offsets, pieces, cuts, finest_m)
     return _cover(patches, heading_rad, site.allowed, pattern, left_m2)
 
 
