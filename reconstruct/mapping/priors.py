@@ -17,6 +17,7 @@ from alice_survey.frames import Array, Datum, rotation_from_attitude
 from alice_survey.manifest import ImageRecord
 from camera_calib.rig import Rig
 from reconstruct.lenses.lens import Lens
+from reconstruct.mapping.bundle import Adjust, adjust_freely, all_pictures, held_options
 from reconstruct.mapping.mapper import Mapped, model_baseline, scale_model
 from reconstruct.matching.pairs import positions_ned
 
@@ -53,6 +54,33 @@ def pinhole_positions(
     return positions, sigmas
 
 
+def adjuster(
+    records: Sequence[ImageRecord], rig: Rig, lenses: Mapping[str, Lens], datum: Datum | None
+) -> Adjust:
+    """How to adjust models of these pictures: with positions where they are told and agree.
+
+    Args:
+        records: pictures; number i has the id i + 1 in the model.
+        rig: cameras.
+        lenses: by camera.
+        datum: of the positions; None where there are none.
+    """
+    if datum is None:
+        return adjust_freely
+    told = pinhole_positions(records, rig, lenses, datum)
+    agree = True
+
+    def adjust(mapped: Mapped) -> Mapped:
+        nonlocal agree
+        if not (mapped.scaled and agree):
+            return adjust_freely(mapped)
+        refined = refine_with_positions(mapped, records, *told)
+        agree = refined is not mapped
+        return refined if agree else adjust_freely(mapped)
+
+    return adjust
+
+
 def refine_with_positions(
     mapped: Mapped, records: Sequence[ImageRecord], positions: Array, sigmas: Array
 ) -> Mapped:
@@ -69,12 +97,8 @@ def refine_with_positions(
         with the pictures.
     """
     model = pycolmap.Reconstruction(mapped.model)
-    known = [
-        number
-        for number, image in sorted(model.images.items())
-        if image.has_pose and np.isfinite(positions[number - 1] + sigmas[number - 1]).all()
-    ]
-    if len({records[number - 1].station for number in known}) < _LEAST_STATIONS:
+    known = _one_a_station(model, positions, sigmas)
+    if len(known) < _LEAST_STATIONS:
         return mapped
     told = positions[[number - 1 for number in known]]
     # The adjuster's constructor aligns the model with the priors robustly, outliers left out: its
@@ -98,6 +122,16 @@ def refine_with_positions(
     return replace(mapped, model=model, rig_factor=mapped.rig_factor * factor)
 
 
+def _one_a_station(model: pycolmap.Reconstruction, positions: Array, sigmas: Array) -> list[int]:
+    """Pictures whose positions are told: one of each frame, since navigation measured it once."""
+    known: dict[int, int] = {}
+    for number, image in sorted(model.images.items()):
+        told = positions[number - 1] + sigmas[number - 1]
+        if image.has_pose and np.isfinite(told).all():
+            known.setdefault(image.frame_id, number)
+    return sorted(known.values())
+
+
 def _priors(
     model: pycolmap.Reconstruction, known: Sequence[int], told: Array, sigmas: Array
 ) -> list[pycolmap.PosePrior]:
@@ -116,16 +150,9 @@ def _priors(
 def _adjuster(
     model: pycolmap.Reconstruction, priors: Sequence[pycolmap.PosePrior]
 ) -> pycolmap.BundleAdjuster:
-    config = pycolmap.BundleAdjustmentConfig()
-    for number, image in sorted(model.images.items()):
-        if image.has_pose:
-            config.add_image(number)
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.refine_sensor_from_rig = False
-    options.refine_focal_length = options.refine_extra_params = False
-    options.ceres.solver_options.num_threads = 1
     prior_options = pycolmap.PosePriorBundleAdjustmentOptions()
     prior_options.alignment_ransac.random_seed = 1
     prior_options.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    return pycolmap.create_pose_prior_bundle_adjuster(options, prior_options, config, priors, model)
+    return pycolmap.create_pose_prior_bundle_adjuster(
+        held_options(), prior_options, all_pictures(model), priors, model
+    )

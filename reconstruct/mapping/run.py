@@ -23,7 +23,8 @@ from camera_calib.rig import Rig
 from reconstruct.lenses.lens import Lens, flat_port_lens
 from reconstruct.mapping.database import Observations, VerifiedPair
 from reconstruct.mapping.mapper import Mapped, map_calibrated
-from reconstruct.mapping.priors import pinhole_positions, refine_with_positions
+from reconstruct.mapping.priors import adjuster
+from reconstruct.mapping.refraction import Convergence, refract
 from reconstruct.mapping.self_calibration import SIMPLE, map_self_calibrated
 from reconstruct.mapping.working_range import Distances, find_distances
 from reconstruct.matching.features import find_features, load_features, save_features
@@ -113,12 +114,12 @@ def run_mapping(
         if inputs.rig is not None:
             poses = {name: inputs.rig.cam_from_rig[name] for name in cameras}
             mapped = map_calibrated(seen, poses, lenses, partial, config.seed)
-            if inputs.datum is not None and mapped.scaled:
-                told = pinhole_positions(inputs.records, inputs.rig, lenses, inputs.datum)
-                mapped = refine_with_positions(mapped, inputs.records, *told)
+            adjust = adjuster(inputs.records, inputs.rig, lenses, inputs.datum)
+            mapped, refracted = refract(mapped, seen, partial, adjust, poses)
         else:
             mapped = map_self_calibrated(seen, exif_focal, partial, config.seed)
-        _write(partial, inputs, mapped, distances)
+            refracted = None
+        _write(partial, inputs, mapped, distances, refracted)
         shutil.rmtree(partial / "features")
 
     return run_stage(workspace, stage, work)
@@ -254,7 +255,13 @@ def _match_all(
     ]
 
 
-def _write(partial: Path, inputs: Inputs, mapped: Mapped, distances: Distances | None) -> None:
+def _write(
+    partial: Path,
+    inputs: Inputs,
+    mapped: Mapped,
+    distances: Distances | None,
+    refracted: Convergence | None,
+) -> None:
     model = mapped.model
     registered = {image.name for image in model.images.values() if image.has_pose}
     lost = [r.image for r in inputs.records if r.image not in registered]
@@ -288,6 +295,7 @@ def _write(partial: Path, inputs: Inputs, mapped: Mapped, distances: Distances |
             "baseline": mapped.baseline if np.isfinite(mapped.baseline) else None,
             "rig_factor": mapped.rig_factor,
             "distances": None if distances is None else vars(distances),
+            "refraction": None if refracted is None else vars(refracted),
             "gauge": hashlib.blake2b(content, digest_size=16).hexdigest(),
             "notes": list(mapped.notes),
         },

@@ -1,0 +1,60 @@
+"""COLMAP's bundle adjustment as this house uses it: poses and points move, rig and cameras do not.
+
+It runs on one thread, since sums of several threads are not the same twice, and takes full
+Gauss-Newton steps, since it starts near its end: COLMAP's own first trust region costs ten
+times the iterations along a block's weak directions.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+
+from reconstruct.mapping.mapper import Mapped
+
+Adjust = Callable[[Mapped], Mapped]
+"""Adjusts a model, rig and cameras held; the one given is not changed."""
+
+_TRUST = 1e12
+"""First radius of the trust region: no bound."""
+_TOLERANCE = 1e-9
+"""Relative change of the cost at which an adjustment ends."""
+
+
+def held_options() -> pycolmap.BundleAdjustmentOptions:
+    """Options that hold cameras and rig."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_sensor_from_rig = False
+    options.refine_focal_length = options.refine_extra_params = False
+    solver = options.ceres.solver_options
+    solver.num_threads = 1
+    solver.initial_trust_region_radius = _TRUST
+    solver.function_tolerance = _TOLERANCE
+    return options
+
+
+def all_pictures(model: pycolmap.Reconstruction) -> pycolmap.BundleAdjustmentConfig:
+    """The part of a model to adjust: all of it."""
+    config = pycolmap.BundleAdjustmentConfig()
+    for number, image in sorted(model.images.items()):
+        if image.has_pose:
+            config.add_image(number)
+    return config
+
+
+def adjust_freely(mapped: Mapped) -> Mapped:
+    """Adjust all poses and points, without priors.
+
+    A rig fixes the scale, so that one station's pose is all that is held; else two pictures are.
+    """
+    model = pycolmap.Reconstruction(mapped.model)
+    config = all_pictures(model)
+    if np.isfinite(mapped.baseline):
+        config.set_constant_rig_from_world_pose(min(model.reg_frame_ids()))
+    else:
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(held_options(), config, model).solve()
+    model.update_point_3d_errors()
+    return replace(mapped, model=model)

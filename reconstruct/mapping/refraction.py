@@ -1,0 +1,316 @@
+"""Exact flat-port refraction with COLMAP's own adjustment of ideal pinholes.
+
+COLMAP knows no refractive camera. The mapper's keypoints are warped to pinholes, exact at one
+working depth; once a point's depth z before the pinhole's centre is known, where an ideal pinhole
+sees the spot is known too (see `reconstruct.lenses.range_shift`):
+
+    ideal = warped + A(warped) (1/z - 1/z0).
+
+Keypoints are put there and the model is adjusted, until neither moves. What it converges to is the
+model that explains the pixels as taken through the port. Without a port A is zero, and nothing
+changes.
+"""
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.errors import warn
+from alice_survey.frames import Array
+from reconstruct.lenses.lens import FlatPortLens, Lens
+from reconstruct.lenses.range_shift import field_of
+from reconstruct.mapping.bundle import Adjust, adjust_freely
+from reconstruct.mapping.database import Observations, write_database
+from reconstruct.mapping.mapper import Mapped, as_transform
+
+SETTLED_PX = 1e-4
+"""Keypoints that move less have converged."""
+_ROUNDS = 6
+_UNMOVED_PX = 1e-6
+"""Keypoints that move less are not written anew."""
+_NEAREST, _FARTHEST = 0.2, 20.0
+"""Depths of spots over the working depth; beyond, a point is wrong and is left to the filter."""
+_WRONG_SIGMAS, _LEAST_WRONG_PX, _MOST_WRONG_PX = 5.0, 1.0, 4.0
+"""An observation that misses by so many sigmas of the usual miss is wrong; nothing below the first
+bound is called wrong, all beyond the second (COLMAP's) is."""
+_RAYLEIGH_MEDIAN = 1.1774
+"""Median length of a plane vector whose components have unit sigma."""
+_LEAST_ANGLE_DEG = 1.5
+"""Between the rays of a point (COLMAP's)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Convergence:
+    """How the keypoints came to rest."""
+
+    moved_px: tuple[float, ...]
+    """Largest shift of a keypoint in every round."""
+    corrected_px: float
+    """Root mean square of the whole shift from the warped keypoints."""
+    removed: int
+    """Observations that the exact keypoints showed to be wrong."""
+    added: int
+    """Observations that they let in."""
+
+    @property
+    def settled(self) -> bool:
+        """Whether the last shift was negligible."""
+        return bool(self.moved_px) and self.moved_px[-1] < SETTLED_PX
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Picture:
+    """Keypoints of one picture, and what the port does to them."""
+
+    warped: Array
+    """(N, 2)."""
+    field: Array
+    """(N, 2) A at every keypoint, px m; zero where it is not known."""
+    working_m: float
+    """z0, at which the warp is exact; infinite without a port."""
+
+    def ideal(self, at: NDArray[np.intp], depth_m: Array) -> Array:
+        """Where the pinhole sees the spots of some keypoints, (M, 2), from their depths (M,)."""
+        metres = np.clip(depth_m, _NEAREST * self.working_m, _FARTHEST * self.working_m)
+        shift = self.field[at] * (1.0 / metres - 1.0 / self.working_m)[:, None]
+        ideal: Array = self.warped[at] + shift
+        return ideal
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Tracks:
+    """Which keypoints show which points."""
+
+    point_ids: NDArray[np.int64]
+    """(P,) sorted."""
+    keypoints: Mapping[int, NDArray[np.intp]]
+    """By picture: (M,) indices of keypoints that have a point, and of their points."""
+    points: Mapping[int, NDArray[np.intp]]
+
+
+class Keypoints:
+    """The keypoints of a model as warped, and their exact places for the model's depths."""
+
+    def __init__(self, mapped: Mapped, seen: Observations) -> None:
+        """Trace every keypoint through its port, once.
+
+        Args:
+            mapped: picture i of `seen` has the id i + 1 and its keypoints in the same order.
+            seen: keypoints as warped.
+        """
+        self._pictures = {
+            number: _picture(mapped.lenses[seen.images[number - 1].camera], seen.pixels[number - 1])
+            for number, image in sorted(mapped.model.images.items())
+            if image.has_pose
+        }
+        self._now = {number: p.warped.copy() for number, p in self._pictures.items()}
+        self._tracks = _tracks(mapped.model)
+
+    def look_again(self, model: pycolmap.Reconstruction) -> None:
+        """Learn which keypoints have a point, after that changed."""
+        self._tracks = _tracks(model)
+
+    @property
+    def through_ports(self) -> bool:
+        """Whether there is anything to correct."""
+        return any(np.isfinite(p.working_m) for p in self._pictures.values())
+
+    def metres_per_unit(self, model: pycolmap.Reconstruction) -> float:
+        """Metres in a unit of a model without scale, whose median depth is the working depth."""
+        working = [p.working_m for p in self._pictures.values() if np.isfinite(p.working_m)]
+        depths = np.concatenate(list(self._depths(model).values()))
+        return float(np.median(working) / np.median(depths))
+
+    def correct(
+        self, model: pycolmap.Reconstruction, metres_per_unit: float
+    ) -> tuple[float, float]:
+        """Put the keypoints that have a point where the pinholes see it, in place.
+
+        Args:
+            model: to change.
+            metres_per_unit: its scale.
+
+        Returns:
+            The largest move, and the root mean square of the whole shift, pixels.
+        """
+        largest, squares, count = 0.0, 0.0, 0
+        for number, depth in self._depths(model).items():
+            picture, at = self._pictures[number], self._tracks.keypoints[number]
+            if not (np.isfinite(picture.working_m) and len(at)):
+                continue
+            ideal = picture.ideal(at, depth * metres_per_unit)
+            largest = max(largest, self._put(model, number, at, ideal))
+            squares += float(((ideal - picture.warped[at]) ** 2).sum())
+            count += len(at)
+        return largest, float(np.sqrt(squares / count)) if count else 0.0
+
+    def correct_unseen(self, model: pycolmap.Reconstruction, metres_per_unit: float) -> None:
+        """Move the keypoints that have no point by the depth of the nearest one that has."""
+        from scipy.spatial import KDTree
+
+        for number, depth in self._depths(model).items():
+            picture, at = self._pictures[number], self._tracks.keypoints[number]
+            rest = np.setdiff1d(np.arange(len(picture.warped)), at)
+            if not (np.isfinite(picture.working_m) and len(at) and len(rest)):
+                continue
+            _, nearest = KDTree(picture.warped[at]).query(picture.warped[rest])
+            self._put(model, number, rest, picture.ideal(rest, depth[nearest] * metres_per_unit))
+
+    def _put(
+        self, model: pycolmap.Reconstruction, number: int, at: NDArray[np.intp], ideal: Array
+    ) -> float:
+        now, points = self._now[number], model.images[number].points2D
+        moved = np.linalg.norm(ideal - now[at], axis=1)
+        far = np.flatnonzero(moved > _UNMOVED_PX)
+        now[at[far]] = ideal[far]
+        for i, xy in zip(at[far].tolist(), ideal[far], strict=True):
+            points[i].xy = xy
+        return float(moved.max())
+
+    def _depths(self, model: pycolmap.Reconstruction) -> dict[int, Array]:
+        """Of the keypoints that have a point, before the pinholes' centres, by picture."""
+        xyz = np.array([model.points3D[i].xyz for i in self._tracks.point_ids.tolist()])
+        depths: dict[int, Array] = {}
+        for number, rows in self._tracks.points.items():
+            cam_from_world = as_transform(model.images[number].cam_from_world())
+            depths[number] = cam_from_world.apply(xyz[rows])[:, 2] if len(rows) else np.zeros(0)
+        return depths
+
+
+def refract(
+    mapped: Mapped,
+    seen: Observations,
+    folder: Path,
+    adjust: Adjust = adjust_freely,
+    cam_from_rig: Mapping[str, RigidTransform] | None = None,
+) -> tuple[Mapped, Convergence]:
+    """Make a model exact that was mapped from keypoints warped at one working depth.
+
+    Keypoints are corrected and the model adjusted, in turns, until the keypoints rest. After the
+    first turn observations are judged again: the wrong go, and those that the warp kept out come
+    in.
+
+    Args:
+        mapped: picture i of `seen` has the id i + 1.
+        seen: keypoints as warped, and the matches from which tracks are completed.
+        folder: for scratch files.
+        adjust: how to adjust, such as with priors.
+        cam_from_rig: poses of the flat-port cameras on one rig; None without one.
+
+    Returns:
+        The exact model, and how the keypoints came to rest.
+    """
+    keypoints = Keypoints(mapped, seen)
+    if not keypoints.through_ports:
+        mapped = adjust(mapped)
+        return mapped, Convergence(moved_px=(0.0,), corrected_px=0.0, removed=0, added=0)
+    notes = mapped.notes
+    if not mapped.scaled:
+        notes = (
+            *notes,
+            "refraction through the port removed for a median distance of the working range",
+        )
+    model = pycolmap.Reconstruction(mapped.model)
+    moves: list[float] = []
+    removed = added = 0
+    corrected = 0.0
+    while len(moves) < _ROUNDS:
+        scale = 1.0 if mapped.scaled else keypoints.metres_per_unit(model)
+        moved, corrected = keypoints.correct(model, scale)
+        moves.append(moved)
+        if len(moves) > 2 and moved < SETTLED_PX:
+            break
+        mapped = adjust(replace(mapped, model=model, notes=notes))
+        model = pycolmap.Reconstruction(mapped.model)
+        if len(moves) == 1:
+            keypoints.correct_unseen(model, scale)
+            removed, added = _judge_again(model, seen, folder, _pinholes(mapped, cam_from_rig))
+            keypoints.look_again(model)
+    model.update_point_3d_errors()
+    found = Convergence(moved_px=tuple(moves), corrected_px=corrected, removed=removed, added=added)
+    if not found.settled:
+        warn(
+            f"refraction did not settle in {_ROUNDS} rounds: keypoints still move by "
+            f"{moves[-1]:.2g} px; check the port's distance and the working range"
+        )
+    return replace(mapped, model=model), found
+
+
+def _pinholes(
+    mapped: Mapped, cam_from_rig: Mapping[str, RigidTransform] | None
+) -> dict[str, RigidTransform] | None:
+    if cam_from_rig is None:
+        return None
+    return {
+        name: mapped.lenses[name].pinhole_from_cam * pose for name, pose in cam_from_rig.items()
+    }
+
+
+def _judge_again(
+    model: pycolmap.Reconstruction,
+    seen: Observations,
+    folder: Path,
+    cam_from_rig: Mapping[str, RigidTransform] | None,
+) -> tuple[int, int]:
+    """Take wrong observations out and complete tracks, in place; how many went and came."""
+    before = model.compute_num_observations()
+    limit = _wrong_px(model)
+    if seen.pairs:
+        scratch = folder / "refraction"
+        shutil.rmtree(scratch, ignore_errors=True)
+        scratch.mkdir(parents=True)
+        write_database(scratch / "database.db", seen, cam_from_rig)
+        with pycolmap.Database.open(scratch / "database.db") as database:
+            cache = pycolmap.DatabaseCache.create(database, pycolmap.DatabaseCacheOptions())
+        graph = cache.correspondence_graph
+        manager = pycolmap.ObservationManager(model, graph)
+        options = pycolmap.IncrementalTriangulatorOptions()
+        options.ignore_two_view_tracks = False
+        options.complete_max_reproj_error = options.merge_max_reproj_error = limit
+        options.random_seed = 1
+        triangulator = pycolmap.IncrementalTriangulator(graph, model, manager)
+        triangulator.complete_all_tracks(options)
+        triangulator.merge_all_tracks(options)
+        shutil.rmtree(scratch)
+    else:
+        manager = pycolmap.ObservationManager(model)
+    added = model.compute_num_observations() - before
+    removed = manager.filter_all_points3D(limit, _LEAST_ANGLE_DEG)
+    return int(removed), int(added)
+
+
+def _wrong_px(model: pycolmap.Reconstruction) -> float:
+    """From how large a miss an observation is wrong."""
+    model.update_point_3d_errors()
+    errors = np.array([point.error for point in model.points3D.values()])
+    sigma = float(np.median(errors)) / _RAYLEIGH_MEDIAN
+    return float(np.clip(_WRONG_SIGMAS * sigma, _LEAST_WRONG_PX, _MOST_WRONG_PX))
+
+
+def _tracks(model: pycolmap.Reconstruction) -> _Tracks:
+    ids = np.sort(np.fromiter(model.points3D.keys(), dtype=np.int64, count=len(model.points3D)))
+    keypoints, points = {}, {}
+    for number, image in sorted(model.images.items()):
+        if not image.has_pose:
+            continue
+        keypoints[number] = np.array(image.get_observation_point2D_idxs(), dtype=np.intp)
+        mine = [p.point3D_id for p in image.get_observation_points2D()]
+        points[number] = np.searchsorted(ids, np.array(mine, dtype=np.int64))
+    return _Tracks(point_ids=ids, keypoints=keypoints, points=points)
+
+
+def _picture(lens: Lens, warped: Array) -> _Picture:
+    if not isinstance(lens, FlatPortLens):
+        return _Picture(warped=warped, field=np.zeros_like(warped), working_m=np.inf)
+    field = field_of(lens, warped)
+    return _Picture(
+        warped=warped,
+        field=np.where(np.isfinite(field), field, 0.0),
+        working_m=lens.virtual.working_range_m - lens.virtual.centre_z_m,
+    )
