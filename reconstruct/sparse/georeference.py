@@ -1,40 +1,147 @@
 """Where a model lies in the world: fitted to navigation, or levelled where there is none."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from scipy.optimize import least_squares
+from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.errors import warn
-from alice_survey.frames import Array, Datum, rotation_from_attitude
+from alice_survey.frames import Array, Datum
 from alice_survey.manifest import ImageRecord
-from reconstruct.matching.pairs import positions_ned
 from reconstruct.sparse.alignment import Similarity
+from reconstruct.sparse.channels import (
+    GROUPS,
+    MOUNT,
+    PARAMETERS,
+    PLACE,
+    SCALE,
+    STRETCH,
+    TURN,
+    Epochs,
+    Equations,
+    equations,
+    read_epochs,
+)
+from reconstruct.sparse.placement import (
+    NO_EXTRA,
+    Estimate,
+    Extra,
+    Lasting,
+    estimate,
+    without_gross_errors,
+)
 
 _LEVEL_SIGMA_DEG = 10.0
 """How far from level the sea floor's mean plane may be, where no attitude was measured."""
-_SIGMA_HORIZONTAL_M = 3.0
-_SIGMA_DEPTH_M = 3.0
-_SIGMA_ATTITUDE_DEG = 2.0
-_SIGMA_HEADING_DEG = 5.0
-"""Used where navigation states no sigma."""
 _TRIMS = 5
 """Rounds of leaving out what stands off the mean plane."""
+_ROBUST_STEPS = 30
+_ROBUST_SIGMAS = 2.0
+"""Beyond so many sigmas the first placement lets a misfit pull no more than in proportion."""
+_STEPS = 6
+_SETTLED_SIGMAS = 0.01
+_LEAST_BOUND = 1e-9
+_STRETCH = 0.005
+"""Of positions reckoned from a Doppler log: makers and users say 0.1 to 1 % (as in
+`vehicle.navigation.sensors`)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Fit:
-    """A model placed by navigation."""
+    """A model placed by navigation, and how well."""
 
     ned_from_model: Similarity
     used: int
-    """Pictures with a position."""
+    """Stations with a position that took part."""
+    left_out: Mapping[str, int]
+    """By group of channels, readings that the rest contradicts."""
     rms_m: Array
-    """(3,) north, east, down misses of the positions, root mean square."""
+    """(3,) north, east, down misses of the positions that took part, root mean square."""
     free_scale: float
     """Scale that a similarity would choose: 1 where navigation agrees with the known scale."""
+    free_scale_sigma: float
+    middle_ned: Array
+    """(3,) middle of the camera track, about which the covariance's rotation and scale act."""
+    covariance: Array
+    """(7, 7) of rotation about north, east, down (rad), shift north, east, down of the middle (m),
+    and the logarithm of the scale."""
+    lasting: Mapping[str, Lasting]
+    """By group, how navigation's errors last."""
+    time_unit: str
+    mount_sigma_deg: float
+
+    @property
+    def sigma_position_m(self) -> Array:
+        """(3,) of the middle of the track, north, east and down."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)[3:6]))
+
+    @property
+    def sigma_tilt_deg(self) -> Array:
+        """(2,) of rotation about north and about east."""
+        return np.asarray(np.rad2deg(np.sqrt(np.diag(self.covariance)[:2])))
+
+    @property
+    def sigma_heading_deg(self) -> float:
+        """Of rotation about down."""
+        return float(np.rad2deg(np.sqrt(self.covariance[2, 2])))
+
+    @property
+    def sigma_scale(self) -> float:
+        """Of the logarithm of the scale, 0 where it is held."""
+        return float(np.sqrt(self.covariance[SCALE, SCALE]))
+
+    def to_json(self) -> dict[str, Any]:
+        """What `georeference.json` says."""
+        tilts, axes = np.linalg.eigh(self.covariance[:2, :2])
+        axis = np.rad2deg(np.arctan2(axes[1, 1], axes[0, 1])) % 180.0
+        north, east, down = self.sigma_position_m.tolist()
+        return {
+            "format": "alice-survey georeference",
+            "version": 1,
+            "method": _METHOD,
+            "stations": self.used,
+            "left_out": dict(self.left_out),
+            "rms_north_m": float(self.rms_m[0]),
+            "rms_east_m": float(self.rms_m[1]),
+            "rms_depth_m": float(self.rms_m[2]),
+            "sigma_north_m": north,
+            "sigma_east_m": east,
+            "sigma_depth_m": down,
+            "sigma_heading_deg": self.sigma_heading_deg,
+            "sigma_tilt_deg": float(np.rad2deg(np.sqrt(tilts.mean()))),
+            "sigma_tilt_north_deg": float(self.sigma_tilt_deg[0]),
+            "sigma_tilt_east_deg": float(self.sigma_tilt_deg[1]),
+            "largest_tilt_deg": float(np.rad2deg(np.sqrt(tilts[1]))),
+            "largest_tilt_axis_deg": float(axis),
+            "sigma_scale": self.sigma_scale,
+            "scale_of_navigation": self.free_scale,
+            "scale_of_navigation_sigma": self.free_scale_sigma,
+            "mount_sigma_deg": self.mount_sigma_deg,
+            "middle_ned_m": self.middle_ned.tolist(),
+            "covariance": self.covariance.tolist(),
+            "covariance_order": [
+                "rotation_north_rad", "rotation_east_rad", "rotation_down_rad",
+                "north_m", "east_m", "down_m", "log_scale",
+            ],
+            "errors": {
+                group: {
+                    f"correlation_{'s' if self.time_unit == 's' else 'stations'}": how.tau,
+                    "white_share": how.white,
+                    "constant_share": how.constant,
+                    "sigma_factor": how.factor,
+                }
+                for group, how in self.lasting.items()
+            },
+        }  # fmt: skip
+
+
+_METHOD = (
+    "generalised least squares; errors of navigation as first-order Gauss-Markov processes of the "
+    "stated sigmas, correlation times and white shares by restricted maximum likelihood"
+)
 
 
 def level(points: Array, centres: Array) -> Similarity:
@@ -69,6 +176,10 @@ def level(points: Array, centres: Array) -> Similarity:
     return Similarity(scale=1.0, rotation=rotation, translation=-rotation.apply(middle))
 
 
+ExtraOf = Callable[[Similarity, Array], Extra]
+"""Equations beside navigation's at a placement, whose rotation acts about a point (3,)."""
+
+
 def fit_navigation(
     records: Sequence[ImageRecord],
     model_from_cam: Sequence[RigidTransform],
@@ -77,8 +188,11 @@ def fit_navigation(
     levelled: Similarity,
     *,
     known_scale: float | None,
+    mount_sigma_deg: float = 0.0,
+    scale_sigma: float = 0.0,
+    control: ExtraOf | None = None,
 ) -> Fit | None:
-    """Fit a model to the positions and attitudes of navigation, weighted and robustly.
+    """Fit a model to the positions and attitudes of navigation.
 
     Args:
         records: registered pictures.
@@ -89,105 +203,190 @@ def fit_navigation(
         levelled: `level` of the model; where no attitude is known it keeps the model from turning
             about a straight track, with a sigma of 10 degrees.
         known_scale: metres in a unit of the model, or None: then the scale is fitted too.
+        mount_sigma_deg: of the rotation of the mount about each axis of the body.
+        scale_sigma: relative, of a known scale; above 0 the scale is fitted about it.
+        control: equations of control points and bars.
 
     Returns:
         The fit; None, after a warning, where positions are too few or too close together.
     """
-    problem = _problem(records, model_from_cam, body_from_cam, datum)
-    if problem is None:
+    epochs = read_epochs(records, model_from_cam, body_from_cam, datum)
+    if epochs is None:
         return None
-    start = _start(problem, levelled, known_scale)
+    start = _start(epochs, levelled, known_scale)
     if start is None:
         return None
-    fixed = _solve(problem, start, levelled, free=known_scale is None)
-    free = fixed if known_scale is None else _solve(problem, fixed, levelled, free=True)
-    misses = problem.positions(fixed) - problem.measured_ned
-    return Fit(
-        ned_from_model=fixed,
-        used=len(problem.measured_ned),
-        rms_m=np.sqrt((misses**2).mean(axis=0)),
-        free_scale=free.scale / fixed.scale if known_scale is not None else 1.0,
+    free = [0, 1, 2, 3, 4, 5]
+    if known_scale is None or scale_sigma > 0:
+        free.append(SCALE)
+    task = _Task(
+        epochs=epochs,
+        levelled=levelled,
+        known_scale=known_scale,
+        scale_sigma=scale_sigma,
+        mount_sigma_rad=np.deg2rad(mount_sigma_deg),
+        control=control,
     )
+    return task.fit(start, free)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Problem:
-    centres: Array
-    """(N, 3) camera centres in the model."""
-    model_from_body: Rotation
-    """(N,) attitudes in the model."""
-    levers: Array
-    """(N, 3) body origin less camera centre, in the body frame, metres."""
-    measured_ned: Array
-    position_sigma_m: Array
-    ned_from_body: Rotation
-    has_attitude: Array
-    attitude_sigma: Array
-    """(N, 3) radians about north, east and down."""
+class _Task:
+    epochs: Epochs
+    levelled: Similarity
+    known_scale: float | None
+    scale_sigma: float
+    mount_sigma_rad: float
+    control: ExtraOf | None
 
-    def positions(self, ned_from_model: Similarity) -> Array:
-        """Body origins in NED, (N, 3)."""
-        arms = (ned_from_model.rotation * self.model_from_body).apply(self.levers)
-        moved: Array = ned_from_model.apply(self.centres) + arms
-        return moved
+    def fit(self, start: Similarity, free: list[int]) -> Fit:
+        """From a rough placement to the final one."""
+        epochs = self.epochs
+        place = self._robust(start, free)
+        found = equations(epochs, place, self._middle(place))
+        used = without_gross_errors(found.misfit, epochs.known)
+        solved_for = [*free, *self._nuisances()]
+        for _ in range(_STEPS):
+            middle = self._middle(place)
+            found = equations(epochs, place, middle)
+            got = self._estimate(found, place, middle, used, solved_for)
+            place = _moved(place, got.change, middle)
+            sigma = np.sqrt(np.diag(got.covariance))[free]
+            if np.all(np.abs(got.change[free]) <= _SETTLED_SIGMAS * sigma):
+                break
+        middle = self._middle(place)
+        scaled = got
+        if SCALE not in free:
+            found = equations(epochs, place, middle)
+            scaled = self._estimate(found, place, middle, got.used, [*solved_for, SCALE])
+        return self._report(place, middle, got, scaled, held=SCALE not in free)
+
+    def _report(
+        self, place: Similarity, middle: Array, got: Estimate, scaled: Estimate, *, held: bool
+    ) -> Fit:
+        epochs = self.epochs
+        kept = got.used[epochs.moment, 0]
+        misses = (epochs.positions(place) - epochs.measured_ned)[kept]
+        lost = epochs.known & ~got.used
+        first = {group: k for k, group in zip((0, 2, 3, 5), GROUPS, strict=True)}
+        return Fit(
+            ned_from_model=place,
+            used=int(got.used[:, 0].sum()),
+            left_out={group: int(lost[:, k].sum()) for group, k in first.items()},
+            rms_m=np.sqrt((misses**2).mean(axis=0)) if len(misses) else np.full(3, np.nan),
+            free_scale=float(np.exp(scaled.change[SCALE])) if held else 1.0,
+            free_scale_sigma=float(np.sqrt(scaled.covariance[SCALE, SCALE])),
+            middle_ned=middle,
+            covariance=got.covariance[:PLACE, :PLACE],
+            lasting=got.lasting,
+            time_unit="s" if epochs.timed else "stations",
+            mount_sigma_deg=float(np.rad2deg(self.mount_sigma_rad)),
+        )
+
+    def _middle(self, place: Similarity) -> Array:
+        middle: Array = place.apply(self.epochs.centres).mean(axis=0)
+        return middle
+
+    def _nuisances(self) -> list[int]:
+        found = [p for p, bound in self._frame_bounds().items() if bound > _LEAST_BOUND]
+        if self.mount_sigma_rad > 0 and self.epochs.has_attitude:
+            found += range(MOUNT.start, MOUNT.stop)
+        return found
+
+    def _frame_bounds(self) -> dict[int, float]:
+        """How navigation's own frame may be turned and stretched within its positions' sigmas.
+
+        Positions that were reckoned along a wrong heading are turned as a whole by its error; to
+        take their turn for a second, independent reading of the heading would count one error
+        twice as if it were two. Likewise a log's velocities are all wrong by one factor.
+        """
+        if not self.epochs.has_attitude:
+            return {}
+        plan = self.epochs.measured_ned[:, :2]
+        radius = float(np.sqrt(plan.var(axis=0).sum()))
+        sigma = float(np.median(self.epochs.sigma[:, 0]))
+        bound = sigma / radius if radius > sigma else 1.0
+        return {TURN: bound, STRETCH: min(bound, _STRETCH)}
+
+    def _estimate(
+        self,
+        found: Equations,
+        place: Similarity,
+        middle: Array,
+        used: NDArray[np.bool_],
+        free: list[int],
+    ) -> Estimate:
+        return estimate(
+            self.epochs.time,
+            found,
+            used,
+            free,
+            self._extra(place, middle),
+            frame_bounds=self._frame_bounds(),
+        )
+
+    def _extra(self, place: Similarity, middle: Array) -> Extra:
+        misfits, rows = [NO_EXTRA.misfit], [NO_EXTRA.jacobian]
+        if not self.epochs.has_attitude:
+            down = place.rotation.apply(self.levelled.rotation.inv().apply([0.0, 0.0, 1.0]))
+            sigma = np.deg2rad(_LEVEL_SIGMA_DEG)
+            tilt = np.zeros((2, PARAMETERS))
+            tilt[0, 1], tilt[0, 2] = down[2], -down[1]
+            tilt[1, 0], tilt[1, 2] = -down[2], down[0]
+            misfits.append(down[:2] / sigma)
+            rows.append(tilt / sigma)
+        if self.known_scale is not None and self.scale_sigma > 0:
+            scale = np.zeros((1, PARAMETERS))
+            scale[0, SCALE] = 1.0 / self.scale_sigma
+            misfits.append(np.log([place.scale / self.known_scale]) / self.scale_sigma)
+            rows.append(scale)
+        if self.mount_sigma_rad > 0:
+            mount = np.zeros((3, PARAMETERS))
+            mount[:, MOUNT] = np.eye(3) / self.mount_sigma_rad
+            misfits.append(np.zeros(3))
+            rows.append(mount)
+        if self.control is not None:
+            more = self.control(place, middle)
+            misfits.append(more.misfit)
+            rows.append(more.jacobian)
+        return Extra(misfit=np.concatenate(misfits), jacobian=np.concatenate(rows))
+
+    def _robust(self, place: Similarity, free: list[int]) -> Similarity:
+        """A placement that a few wrong readings hardly move: readings as independent, soft L1."""
+        for _ in range(_ROBUST_STEPS):
+            middle = self._middle(place)
+            found, extra = equations(self.epochs, place, middle), self._extra(place, middle)
+            known = self.epochs.known
+            misfit = np.concatenate([found.misfit[known], extra.misfit])
+            rows = np.concatenate([found.jacobian[known], extra.jacobian])[:, free]
+            weight = (1.0 + (misfit / _ROBUST_SIGMAS) ** 2) ** -0.25
+            size = np.linalg.norm(rows, axis=0)
+            size = np.where(size > 0, size, 1.0)
+            step = -np.linalg.lstsq(weight[:, None] * rows / size, weight * misfit)[0] / size
+            change = np.zeros(PARAMETERS)
+            change[free] = step
+            place = _moved(place, change, middle)
+            if np.all(np.abs(step) * size < 1e-6):
+                break
+        return place
 
 
-def _problem(
-    records: Sequence[ImageRecord],
-    model_from_cam: Sequence[RigidTransform],
-    body_from_cam: Mapping[str, RigidTransform],
-    datum: Datum,
-) -> _Problem | None:
-    chosen = [i for i, r in enumerate(records) if r.has_position]
-    if not chosen:
-        return None
-    rows = [records[i] for i in chosen]
-    levers = [body_from_cam[r.camera] for r in rows]
-    attitudes = np.array([[r.roll_deg, r.pitch_deg, r.heading_deg] for r in rows])
-    known = np.isfinite(attitudes).all(axis=1)
-
-    def sigma(values: Sequence[float], default: float) -> Array:
-        array = np.array(values)
-        return np.where(array > 0, array, default)
-
-    horizontal = sigma([r.sigma_horizontal_m for r in rows], _SIGMA_HORIZONTAL_M)
-    tilt = np.deg2rad(sigma([r.sigma_attitude_deg for r in rows], _SIGMA_ATTITUDE_DEG))
-    return _Problem(
-        centres=np.stack([model_from_cam[i].translation for i in chosen]),
-        model_from_body=Rotation.concatenate(
-            [
-                model_from_cam[i].rotation * lever.rotation.inv()
-                for i, lever in zip(chosen, levers, strict=True)
-            ]
-        ),
-        levers=np.stack([-lever.translation for lever in levers]),
-        measured_ned=positions_ned(rows, datum),
-        position_sigma_m=np.stack(
-            [horizontal, horizontal, sigma([r.sigma_depth_m for r in rows], _SIGMA_DEPTH_M)], axis=1
-        ),
-        ned_from_body=rotation_from_attitude(
-            *np.deg2rad(np.where(known[:, None], attitudes, 0.0)).T
-        ),
-        has_attitude=known,
-        attitude_sigma=np.stack(
-            [
-                tilt,
-                tilt,
-                np.deg2rad(sigma([r.sigma_heading_deg for r in rows], _SIGMA_HEADING_DEG)),
-            ],
-            axis=1,
-        ),
-    )
+def _moved(place: Similarity, change: Array, middle: Array) -> Similarity:
+    """A placement after a small change of its first seven parameters about a point."""
+    turn, grow = Rotation.from_rotvec(change[:3]), float(np.exp(change[SCALE]))
+    shift = middle + grow * turn.apply(place.translation - middle) + change[3:6]
+    return Similarity(scale=place.scale * grow, rotation=turn * place.rotation, translation=shift)
 
 
-def _start(problem: _Problem, levelled: Similarity, known_scale: float | None) -> Similarity | None:
+def _start(epochs: Epochs, levelled: Similarity, known_scale: float | None) -> Similarity | None:
     """A first placement: from attitudes, else from the levelled model and the positions' plan."""
-    measured, count = problem.measured_ned, len(problem.measured_ned)
+    measured, count = epochs.measured_ned, len(epochs.time)
     spread = float(np.sqrt(measured[:, :2].var(axis=0).sum()))
-    need = float(np.median(problem.position_sigma_m[:, 0]))
-    flat = levelled.apply(problem.centres)
-    if not problem.has_attitude.any() or known_scale is None:
-        least = 2 if problem.has_attitude.any() else 3
+    need = float(np.median(epochs.sigma[:, 0]))
+    flat = levelled.apply(epochs.centres)
+    has = epochs.known[epochs.moment, 3]
+    if not has.any() or known_scale is None:
+        least = 2 if has.any() else 3
         if count < least or spread <= need:
             warn(
                 f"{count} positions spread over {spread:.2f} m at a sigma of {need:.2f} m do not "
@@ -197,48 +396,12 @@ def _start(problem: _Problem, levelled: Similarity, known_scale: float | None) -
     a = (flat[:, :2] - flat[:, :2].mean(axis=0)) @ [1.0, 1j]
     b = (measured[:, :2] - measured[:, :2].mean(axis=0)) @ [1.0, 1j]
     turn = complex(np.vdot(a, b) / max(float(np.vdot(a, a).real), 1e-300))
-    if problem.has_attitude.any():
-        some = np.flatnonzero(problem.has_attitude)
-        rotation = (problem.ned_from_body[some] * problem.model_from_body[some].inv()).mean()
+    if has.any():
+        some = np.flatnonzero(has)
+        rotation = (epochs.ned_from_body[some] * epochs.model_from_body[some].inv()).mean()
     else:
         rotation = Rotation.from_rotvec([0.0, 0.0, np.angle(turn)]) * levelled.rotation
     scale = abs(turn) if known_scale is None else known_scale
     start = Similarity(scale=scale, rotation=rotation, translation=np.zeros(3))
-    shift = np.median(measured - problem.positions(start), axis=0)
+    shift = np.median(measured - epochs.positions(start), axis=0)
     return Similarity(scale=scale, rotation=rotation, translation=shift)
-
-
-def _solve(problem: _Problem, start: Similarity, levelled: Similarity, *, free: bool) -> Similarity:
-    some = np.flatnonzero(problem.has_attitude)
-    down_model = levelled.rotation.inv().apply([0.0, 0.0, 1.0])
-
-    def placed(x: Array) -> Similarity:
-        return Similarity(
-            scale=start.scale * float(np.exp(x[6])) if free else start.scale,
-            rotation=Rotation.from_rotvec(x[:3]) * start.rotation,
-            translation=start.translation + x[3:6],
-        )
-
-    def misses(x: Array) -> Array:
-        now = placed(x)
-        parts = [(problem.positions(now) - problem.measured_ned) / problem.position_sigma_m]
-        if len(some):
-            turned = now.rotation * problem.model_from_body[some]
-            off = (turned * problem.ned_from_body[some].inv()).as_rotvec()
-            parts.append(off / problem.attitude_sigma[some])
-        else:
-            tilt = now.rotation.apply(down_model)[:2] / np.deg2rad(_LEVEL_SIGMA_DEG)
-            parts.append(np.r_[tilt, 0.0][None])
-        return np.concatenate(parts).ravel()
-
-    found = least_squares(
-        misses,
-        np.zeros(7 if free else 6),
-        x_scale="jac",
-        loss="soft_l1",
-        f_scale=2.0,
-        xtol=1e-14,
-        ftol=1e-14,
-        gtol=1e-14,
-    )
-    return placed(found.x)

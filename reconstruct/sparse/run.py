@@ -25,12 +25,19 @@ from reconstruct.mapping.mapper import as_transform, model_baseline
 from reconstruct.mapping.run import Inputs, check_sizes, run_mapping
 from reconstruct.model import WorldFrame, write_frame
 from reconstruct.sparse.alignment import Similarity
+from reconstruct.sparse.covariance import (
+    PlaceCovariance,
+    placed_covariances,
+    write_covariances,
+)
 from reconstruct.sparse.georeference import Fit, fit_navigation, level
 from reconstruct.sparse.track import (
     TrackRow,
     read_track_poses,
     track_rows,
+    track_sigmas,
     write_track_csv,
+    write_track_geojson,
     write_track_tum,
 )
 
@@ -38,6 +45,8 @@ __all__ = ["read_track_poses", "run_sparse"]
 
 SCALE_FILE = "scale.json"
 """In the workspace: one known length, as `scale_model` writes it."""
+_PLACE_ONLY = "place; no model covariance"
+"""What the covariances of poses consist of."""
 
 
 def run_sparse(workspace: Path, config: SurveyConfig, threads: int) -> bool:
@@ -65,7 +74,7 @@ def run_sparse(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     described = [f for f in files if f.suffix in (".csv", ".json")]
     stage = Stage(
         name="sparse",
-        version=1,
+        version=2,
         settings={},
         inputs=[mapping, *described, *([scale_file] if scale_file.is_file() else [])],
     )
@@ -133,9 +142,22 @@ def _place(workspace: Path, partial: Path, inputs: Inputs, survey: Mapping[str, 
     model.export_PLY(partial / "sparse.ply")
     shutil.copyfile(workspace / "mapping" / "cameras.json", partial / "cameras.json")
     write_frame(partial / "frame.json", placed.frame)
-    rows = track_rows(model, of_name, lenses, placed.frame)
-    write_track_csv(partial / "track.csv", rows, placed.frame)
+    rig = inputs.rig
+    mounts = {} if rig is None else {n: rig.body_from_cam(n).rotation for n in rig.cameras}
+    rows = track_rows(model, of_name, lenses, placed.frame, mounts)
+    covariances = None
+    if placed.fit is not None:
+        where = RigidTransform.concatenate([row.world_from_cam for row in rows])
+        place = PlaceCovariance(middle=placed.fit.middle_ned, covariance=placed.fit.covariance)
+        covariances = placed_covariances(where, place)
+        names = [row.image for row in rows]
+        write_covariances(partial / "track_covariance.npz", names, covariances, _PLACE_ONLY)
+        write_json(partial / "georeference.json", placed.fit.to_json())
+    sigmas = track_sigmas(rows, covariances)
+    write_track_csv(partial / "track.csv", rows, placed.frame, sigmas)
     write_track_tum(partial / "track.tum", rows)
+    if placed.frame.datum is not None:
+        write_track_geojson(partial / "track.geojson", rows, placed.frame, sigmas)
     write_json(partial / "registration.json", _registration(model, mapping, placed, rows))
 
 
@@ -244,13 +266,5 @@ def _registration(
         "scale_source": placed.scale_source,
         "world_per_mapping_unit": placed.world_from_model.scale,
         "working_range": mapping["distances"],
-        "georeference": None
-        if fit is None
-        else {
-            "positions": fit.used,
-            "rms_north_m": float(fit.rms_m[0]),
-            "rms_east_m": float(fit.rms_m[1]),
-            "rms_depth_m": float(fit.rms_m[2]),
-            "scale_of_navigation": fit.free_scale,
-        },
+        "georeference": None if fit is None else fit.to_json(),
     }
