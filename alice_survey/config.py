@@ -265,13 +265,18 @@ class ImagingConfig(Config):
 class ReconstructConfig(Config):
     """How pictures become a model."""
 
-    feature_scale: float = Field(1.0, gt=0.05, le=1)
+    feature_scale: float | None = Field(None, gt=0.05, le=1)
     max_features: int = Field(8000, ge=200, le=50_000)
     working_range_m: float | None = Field(None, gt=0, le=100)
     dense_scale: float | None = Field(None, gt=0.05, le=1)
     dense_partners: int = Field(4, ge=1, le=12)
     dem_cell_m: float | None = Field(None, gt=0, le=10)
     mosaic_pixel_m: float | None = Field(None, gt=0, le=10)
+    mesh_triangles: int | None = Field(None, ge=100, le=50_000_000)
+    mesh_error_px: float = Field(0.25, ge=0.01, le=10)
+    mesh_page_px: int = Field(8192, ge=512, le=16_384)
+    colour: Literal["even", "water", "raw"] = "even"
+    dispersion: Literal["auto", "on", "off"] = "auto"
 
 
 class SurveyConfig(Config):

@@ -15,3 +15,79 @@ def match_slowly(a: np.ndarray, b: np.ndarray, ratio: float) -> np.ndarray:
         if distance[i, j] < ratio**2 * min(others):
             matches.append((i, j))
     return np.array(matches, dtype=np.uint32).reshape(-1, 2)
+
+
+def track_references_slowly(
+    pairs: list[tuple[int, int, np.ndarray]], starts: np.ndarray
+) -> np.ndarray:
+    """Walk each track node by node and take its best connected feature."""
+    links: dict[int, set[int]] = {n: set() for n in range(int(starts[-1]))}
+    for i, j, matches in pairs:
+        for a, b in matches.astype(int):
+            links[starts[i] + a].add(int(starts[j] + b))
+            links[starts[j] + b].add(int(starts[i] + a))
+    reference = np.full(len(links), -1)
+    for begin in links:
+        if reference[begin] >= 0:
+            continue
+        track, open_nodes = {begin}, [begin]
+        while open_nodes:
+            for other in links[open_nodes.pop()] - track:
+                track.add(other)
+                open_nodes.append(other)
+        best = min(track, key=lambda n: (-len(links[n]), n))
+        reference[list(track)] = best
+    return reference
+
+
+def align_slowly(
+    first: np.ndarray,
+    second: np.ndarray,
+    reference: np.ndarray,
+    pixel: np.ndarray,
+    affine: np.ndarray,
+    radius: int,
+    sigma: float,
+) -> np.ndarray:
+    """Least squares over position, affine warp, gain and offset by a general solver."""
+    from scipy.ndimage import map_coordinates
+    from scipy.optimize import least_squares
+
+    steps = np.arange(-radius, radius + 1.0)
+    v, u = (x.ravel() for x in np.meshgrid(steps, steps, indexing="ij"))
+    weight = np.exp(-(u**2 + v**2) / (4 * sigma**2))  # the root of the weight of squares
+
+    def level(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return map_coordinates(picture.astype(float), [y - 0.5, x - 0.5], order=3)
+
+    wanted = level(first, reference[0] + u, reference[1] + v)
+
+    def misses(unknowns: np.ndarray) -> np.ndarray:
+        x, y, a, b, c, d, gain, offset = unknowns
+        seen = level(second, x + a * u + b * v, y + c * u + d * v)
+        return weight * (gain * seen + offset - wanted)
+
+    start = np.concatenate([pixel, affine.ravel(), [1.0, 0.0]])
+    return least_squares(misses, start, x_scale=[1, 1, 0.1, 0.1, 0.1, 0.1, 0.1, 10]).x[:2]
+
+
+def match_near_slowly(
+    a: np.ndarray,
+    b: np.ndarray,
+    ratio: float,
+    searched: np.ndarray,
+) -> np.ndarray:
+    """As `match_slowly`, among the pairs of features that a (N, M) table allows."""
+    far = np.iinfo(np.int64).max
+    distance = np.full(searched.shape, far)
+    for i, j in np.argwhere(searched):
+        distance[i, j] = int(((a[i].astype(int) - b[j].astype(int)) ** 2).sum())
+    matches = []
+    for i in range(len(a)):
+        if searched[i].sum() < 2:
+            continue
+        j = int(np.argmin(distance[i]))
+        others = [distance[i, k] for k in np.flatnonzero(searched[i]) if k != j]
+        if int(np.argmin(distance[:, j])) == i and distance[i, j] < ratio**2 * min(others):
+            matches.append((i, j))
+    return np.array(matches, dtype=np.uint32).reshape(-1, 2)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from alice_survey.artefacts import Stage, run_stage, write_json
+from alice_survey.artefacts import Stage, atomic_path, run_stage, write_json
 from alice_survey.config import SurveyConfig
 from alice_survey.errors import ImageError, WorkspaceError, warn
 from alice_survey.executor import parallel_map
@@ -36,6 +36,7 @@ from reconstruct.matching.matches import (
     match_pair,
 )
 from reconstruct.matching.pairs import choose_pairs
+from reconstruct.matching.refinement import refine_tracks
 from reconstruct.pictures.files import exif_focal_px
 from reconstruct.pictures.normalise import normalise
 from reconstruct.pictures.undistorted import read_colour, read_mask
@@ -64,7 +65,7 @@ class _FeatureTask:
     picture: Path
     mask: Path | None
     target: Path
-    scale: float
+    scale: float | None
     most: int
 
 
@@ -86,7 +87,7 @@ def run_mapping(
     settings = config.reconstruct
     stage = Stage(
         name="mapping",
-        version=1,
+        version=2,
         settings={
             "seed": config.seed,
             **settings.model_dump(
@@ -102,12 +103,18 @@ def run_mapping(
         lenses, distances = _lenses(inputs, features, config, threads)
         cameras, exif_focal = _cameras(inputs, lenses)
         pairs = _match_all(inputs, features, cameras, lenses, config.seed, threads)
+        refined = refine_tracks(
+            features,
+            [_grey_file(path) for path in features],
+            [(i, j, pair.matches) for i, j, pair in pairs],
+            threads=threads,
+        )
         seen = Observations(
             images=inputs.records,
             cameras=cameras,
             pixels=[
-                as_seen(load_features(path).pixels, lenses.get(record.camera))
-                for record, path in zip(inputs.records, features, strict=True)
+                as_seen(pixels, lenses.get(record.camera))
+                for record, pixels in zip(inputs.records, refined.pixels, strict=True)
             ],
             pairs=pairs,
         )
@@ -131,8 +138,15 @@ def extract(task: _FeatureTask) -> int:
         grey = normalise(read_colour(task.picture))
         mask = None if task.mask is None else read_mask(task.mask, (grey.shape[1], grey.shape[0]))
         found = find_features(grey, mask, scale=task.scale, most=task.most)
+        with atomic_path(_grey_file(task.target)) as temporary, temporary.open("wb") as file:
+            np.save(file, grey)
         save_features(task.target, found)
     return len(load_features(task.target).pixels)
+
+
+def _grey_file(features: Path) -> Path:
+    """Where the evened picture lies beside its features."""
+    return features.with_suffix(".npy")
 
 
 def _find_all(inputs: Inputs, folder: Path, config: SurveyConfig, threads: int) -> list[Path]:

@@ -14,6 +14,11 @@ _CONTRAST = 0.01
 """SIFT's contrast threshold: a quarter of the usual, since sediment has little."""
 _CELLS = 16
 """Cells along the longer side over which features are spread."""
+_MOST_MPX = 2.5
+"""Of a picture in which features are looked for, unless a scale is set (see `detection_scale`)."""
+_SUPPORT = 1.5
+"""Diameters around a feature within which a mask must leave the picture free: three sigmas of the
+blur at which it was found."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,19 +37,23 @@ def find_features(
     grey: NDArray[np.uint8],
     mask: NDArray[np.bool_] | None,
     *,
-    scale: float,
+    scale: float | None,
     most: int,
 ) -> Features:
     """Find SIFT features.
 
+    Features are left out where a mask comes so near that its border would be part of them.
+
     Args:
         grey: (H, W) normalised picture.
         mask: (H, W) where features may be, or None.
-        scale: the picture is reduced by this much first, at most 1.
+        scale: the picture is reduced by this much first, at most 1; None: see `detection_scale`.
         most: how many to keep, evenly over the picture.
     """
     height, width = grey.shape
     small = grey
+    if scale is None:
+        scale = detection_scale((width, height))
     if scale < 1.0:
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
         small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
@@ -57,9 +66,10 @@ def find_features(
     sizes = np.array([k.size for k in keypoints], dtype=np.float64)
     response = np.array([k.response for k in keypoints], dtype=np.float64)
     if mask is not None:
+        free_px = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 3)
         columns = np.clip(pixels[:, 0].astype(int), 0, width - 1)
         rows = np.clip(pixels[:, 1].astype(int), 0, height - 1)
-        usable = np.flatnonzero(mask[rows, columns])
+        usable = np.flatnonzero(free_px[rows, columns] > _SUPPORT * steps.mean() * sizes)
     else:
         usable = np.arange(len(pixels))
     chosen = usable[spread(pixels[usable], sizes[usable], response[usable], (width, height), most)]
@@ -76,6 +86,16 @@ def find_features(
         scale_px=np.array([k.size for k in picked], dtype=np.float32) * np.float32(steps.mean()),
         descriptors=root_sift(sift_descriptors),
     )
+
+
+def detection_scale(size: tuple[int, int]) -> float:
+    """By how much a picture of some width and height is reduced before features are looked for.
+
+    SIFT doubles a picture first. Large pictures have more features than are kept, and the largest
+    are kept, so that those of the first octaves cost most of the time and are thrown away; what
+    the reduction costs in position, the refinement along the tracks gives back.
+    """
+    return float(min(1.0, np.sqrt(1e6 * _MOST_MPX / (size[0] * size[1]))))
 
 
 def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -21,6 +21,18 @@ from reconstruct.matching.features import Features, load_features
 Matches = NDArray[np.uint32]
 _BLOCK = 1024
 _COARSE_FEATURES = 800
+_PROBE_FEATURES = 1500
+"""Largest features of both pictures whose matches predict where all others are."""
+_WORTH_PROBING = 2
+"""Products of a full match over those of the probe, from which prediction saves time."""
+_LEAST_PROBED = 30
+"""Verified matches of the probe below which nothing is predicted."""
+_CELLS_ALONG = 12
+"""Cells along the longer side of a picture that share one prediction."""
+_SLACK = 2.0
+"""Radius of the search over the largest miss of the prediction at the probe's own matches."""
+_LEAST_RADIUS = 0.02
+"""Of the search, as a share of the picture's longer side."""
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -81,6 +93,61 @@ def match_descriptors(
     rows = np.arange(len(a))
     clear = first < ratio * ratio * second
     good = rows[clear & (best_b[best] == rows)]
+    return np.stack([good, best[good]], axis=1).astype(np.uint32)
+
+
+def match_near(
+    a: Features, b: Features, ratio: float, predicted: Array, radius_px: float, cell_px: float
+) -> Matches:
+    """As `match_descriptors`, but features of b are sought only near where those of a are expected.
+
+    Features of a share the search of their cell: all of b within `radius_px` of the bounding box of
+    the cell's expected places.
+
+    Args:
+        a: features of the first picture.
+        b: of the second.
+        ratio: as of `match_descriptors`; among the features searched.
+        predicted: (N, 2) where the features of a are expected in the second picture.
+        radius_px: how far from there they may be.
+        cell_px: side of the cells of the first picture.
+
+    Returns:
+        (K, 2) indices into a and b, by rising index into a.
+    """
+    if not len(a.pixels) or len(b.pixels) < 2:
+        return np.zeros((0, 2), np.uint32)
+    right = b.descriptors.astype(np.float32)
+    norms_b = (right**2).sum(axis=1)
+    best = np.zeros(len(a.pixels), np.int64)
+    first = np.full(len(a.pixels), np.inf, np.float32)
+    second = np.full(len(a.pixels), np.inf, np.float32)
+    best_b = np.full(len(b.pixels), -1, np.int64)
+    nearest_b = np.full(len(b.pixels), np.inf, np.float32)
+    cells = (a.pixels // cell_px).astype(np.int64)
+    number = cells[:, 1] * (cells[:, 0].max() + 1) + cells[:, 0]
+    order = np.argsort(number, kind="stable")
+    for rows in np.split(order, np.flatnonzero(np.diff(number[order])) + 1):
+        low, high = predicted[rows].min(axis=0) - radius_px, predicted[rows].max(axis=0) + radius_px
+        near = np.flatnonzero(((b.pixels >= low) & (b.pixels <= high)).all(axis=1))
+        if len(near) < 2:
+            continue
+        left = a.descriptors[rows].astype(np.float32)
+        cell_best, cell_best_b = np.zeros(len(rows), np.int64), best_b[near]
+        cell_first, cell_second = first[rows], second[rows]
+        cell_nearest = nearest_b[near]
+        before = cell_nearest.copy()
+        _best_two(
+            left @ right[near].T, (left**2).sum(axis=1), norms_b[near], cell_best, cell_first,
+            cell_second, cell_best_b, cell_nearest, 0,
+        )  # fmt: skip
+        best[rows], first[rows], second[rows] = near[cell_best], cell_first, cell_second
+        closer = cell_nearest < before
+        best_b[near[closer]] = rows[cell_best_b[closer]]
+        nearest_b[near] = cell_nearest
+    rows = np.arange(len(a.pixels))
+    clear = first < ratio * ratio * second
+    good = rows[clear & (best_b[best] == rows) & np.isfinite(first)]
     return np.stack([good, best[good]], axis=1).astype(np.uint32)
 
 
@@ -145,9 +212,80 @@ def camera_from_text(text: str) -> pycolmap.Camera:
 
 
 def match_pair(task: PairTask) -> PairMatches:
-    """Match two pictures and keep what one two-view geometry explains."""
+    """Match two pictures and keep what one two-view geometry explains.
+
+    Where there are many features, the largest are matched first; what their geometry says of the
+    rest narrows the search. Where they do not agree on one, all are compared with all.
+    """
     a, b = _features(task.first), _features(task.second)
-    matches = match_descriptors(a.descriptors, b.descriptors, task.ratio)
+    seen = as_seen(a.pixels, task.lenses[0]), as_seen(b.pixels, task.lenses[1])
+    probe = min(len(a.pixels), _PROBE_FEATURES) * min(len(b.pixels), _PROBE_FEATURES)
+    matches = None
+    if len(a.pixels) * len(b.pixels) >= _WORTH_PROBING * probe:
+        matches = _guided(task, a, b, seen)
+    if matches is None:
+        matches = match_descriptors(a.descriptors, b.descriptors, task.ratio)
+    return _verified(task, seen, matches)
+
+
+def _guided(task: PairTask, a: Features, b: Features, seen: tuple[Array, Array]) -> Matches | None:
+    """Matches where those of the largest features predict them; None where they predict nothing."""
+    few = match_descriptors(
+        a.descriptors[:_PROBE_FEATURES], b.descriptors[:_PROBE_FEATURES], task.ratio
+    )
+    probed = _verified(task, seen, few).matches
+    if len(probed) < _LEAST_PROBED:
+        return None
+    at, there = a.pixels[probed[:, 0]], b.pixels[probed[:, 1]]
+    long_side = float(a.pixels.max())
+    homography = fit_homography(at, there)
+    miss = np.linalg.norm(apply_homography(homography, at) - there, axis=1)
+    radius = max(_SLACK * float(miss.max()), _LEAST_RADIUS * long_side)
+    predicted = apply_homography(homography, a.pixels)
+    if not np.isfinite(predicted).all() or radius > long_side / 3:
+        return None
+    return match_near(a, b, task.ratio, predicted, radius, long_side / _CELLS_ALONG)
+
+
+def fit_homography(first: Array, second: Array) -> Array:
+    """The (3, 3) homography of least algebraic error (Hartley 1997) that takes first to second.
+
+    Args:
+        first: (N, 2) pixels, at least four.
+        second: (N, 2).
+    """
+    scaled, norms = [], []
+    for points in (first, second):
+        centre = points.mean(axis=0)
+        size = max(float(np.sqrt(((points - centre) ** 2).sum(axis=1).mean() / 2)), 1e-9)
+        norms.append(np.array([[1 / size, 0, -centre[0] / size], [0, 1 / size, -centre[1] / size],
+                               [0, 0, 1]]))  # fmt: skip
+        scaled.append((points - centre) / size)
+    (x, y), (u, v) = scaled[0].T, scaled[1].T
+    one, nil = np.ones_like(x), np.zeros_like(x)
+    rows = np.concatenate(
+        [
+            np.column_stack([x, y, one, nil, nil, nil, -u * x, -u * y, -u]),
+            np.column_stack([nil, nil, nil, x, y, one, -v * x, -v * y, -v]),
+        ]
+    )
+    middle = np.linalg.eigh(rows.T @ rows)[1][:, 0].reshape(3, 3)
+    found: Array = np.linalg.inv(norms[1]) @ middle @ norms[0]
+    return found
+
+
+def apply_homography(homography: Array, pixels: Array) -> Array:
+    """Pixels (N, 2) through a homography; NaN at and beyond its horizon."""
+    moved = np.column_stack([pixels, np.ones(len(pixels))]) @ homography.T
+    middle = np.array([*pixels.mean(axis=0), 1.0]) @ homography.T
+    ahead = moved[:, 2] * middle[2] > 0
+    w = np.where(ahead, moved[:, 2], np.nan)
+    found: Array = moved[:, :2] / w[:, None]
+    return found
+
+
+def _verified(task: PairTask, seen: tuple[Array, Array], matches: Matches) -> PairMatches:
+    """What one geometry explains of matches, pixels as the cameras of the model see them."""
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = task.seed
     # A strip's overlap lies along the border and moves by one shift, as a watermark would.
@@ -156,9 +294,9 @@ def match_pair(task: PairTask) -> PairMatches:
         return PairMatches(matches=matches[:0], geometry=None)
     geometry = pycolmap.estimate_two_view_geometry(
         camera_from_text(task.cameras[0]),
-        as_seen(a.pixels, task.lenses[0]),
+        seen[0],
         camera_from_text(task.cameras[1]),
-        as_seen(b.pixels, task.lenses[1]),
+        seen[1],
         matches,
         options,
     )

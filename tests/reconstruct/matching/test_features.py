@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from reconstruct.matching.features import (
+    detection_scale,
     find_features,
     load_features,
     root_sift,
@@ -55,6 +56,28 @@ def test_masked_parts_get_no_features() -> None:
     found = find_features(blobs(centres), mask, scale=1.0, most=100)
     assert len(found.pixels) > 0
     assert found.pixels[:, 0].max() < 80
+
+
+def test_features_keep_away_from_the_border_of_a_mask() -> None:
+    """The mask's own edge, such as that of a gripper, must not become part of a feature."""
+    sigma = 4.0
+    centres = np.array([[40.0, 60.0], [40.0 + 2 * sigma, 20.0]])
+    mask = np.ones((120, 160), bool)
+    mask[:, 52:] = False
+    found = find_features(blobs(centres, sigma=sigma), mask, scale=1.0, most=100)
+    whole = find_features(blobs(centres, sigma=sigma), None, scale=1.0, most=100)
+    assert np.linalg.norm(nearest(whole.pixels, centres[1]) - centres[1]) < 0.1
+    assert np.linalg.norm(nearest(found.pixels, centres[0]) - centres[0]) > 0.1 or len(found.pixels)
+    reach = 52.0 - found.pixels[:, 0]
+    assert np.all(reach > 1.4 * found.scale_px)
+    assert len(found.pixels) < len(whole.pixels)
+
+
+@pytest.mark.parametrize(
+    ("size", "scale"), [((846, 677), 1.0), ((1600, 1200), 1.0), ((3384, 2710), 0.522)]
+)
+def test_only_large_pictures_are_reduced(size: tuple[int, int], scale: float) -> None:
+    assert detection_scale(size) == pytest.approx(scale, abs=0.001)
 
 
 def test_a_blank_picture_has_no_features() -> None:

@@ -6,16 +6,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from reconstruct.matching import matches as matching
 from reconstruct.matching.features import Features, load_features, save_features
 from reconstruct.matching.matches import (
     PairTask,
+    apply_homography,
     camera_from_text,
     camera_text,
     coarse_matches,
+    fit_homography,
     match_descriptors,
+    match_near,
     match_pair,
 )
-from tests.oracles_matching import match_slowly
+from tests.oracles_matching import match_near_slowly, match_slowly
 
 
 @settings(deadline=None, max_examples=40)
@@ -132,3 +136,105 @@ def test_features_written_anew_are_read_anew(tmp_path: Path) -> None:
     )
     save_features(task.first, few)
     assert 30 <= len(match_pair(task).matches) <= 40 < len(many.matches)
+
+
+def random_features(rng: np.random.Generator, count: int, size: int = 8) -> Features:
+    return Features(
+        pixels=rng.uniform(0, 100, (count, 2)),
+        scale_px=np.ones(count, np.float32),
+        descriptors=rng.integers(0, 256, (count, size)).astype(np.uint8),
+    )
+
+
+@settings(deadline=None, max_examples=40)
+@given(n=st.integers(1, 25), m=st.integers(2, 25), radius=st.floats(5, 60), seed=st.integers(0, 99))
+def test_narrowed_matches_equal_those_of_the_slow_twin(
+    n: int, m: int, radius: float, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    a, b = random_features(rng, n), random_features(rng, m)
+    b.descriptors[: min(n, m) // 2] = a.descriptors[: min(n, m) // 2]
+    predicted = a.pixels + np.array([3.0, -2.0])
+    cell = 30.0
+    searched = np.zeros((n, m), bool)
+    for i in range(n):
+        mates = np.all(a.pixels // cell == a.pixels[i] // cell, axis=1)
+        low, high = predicted[mates].min(axis=0) - radius, predicted[mates].max(axis=0) + radius
+        searched[i] = ((b.pixels >= low) & (b.pixels <= high)).all(axis=1)
+    found = match_near(a, b, 0.9, predicted, radius, cell)
+    slow = match_near_slowly(a.descriptors, b.descriptors, 0.9, searched)
+    np.testing.assert_array_equal(found, slow)
+
+
+def test_a_search_without_bounds_is_the_full_one() -> None:
+    rng = np.random.default_rng(8)
+    a, b = random_features(rng, 200), random_features(rng, 180)
+    b.descriptors[:120] = a.descriptors[40:160]
+    found = match_near(a, b, 0.9, a.pixels, 1e4, 17.0)
+    full = match_descriptors(a.descriptors, b.descriptors, 0.9)
+    assert len(full) >= 100
+    np.testing.assert_array_equal(found, full)
+
+
+def test_homographies_come_back_from_exact_matches() -> None:
+    rng = np.random.default_rng(9)
+    truth = np.array([[1.05, 0.1, 30.0], [-0.08, 0.96, -12.0], [2e-5, -3e-5, 1.0]])
+    first = rng.uniform(0, 3000, (40, 2))
+    second = apply_homography(truth, first)
+    np.testing.assert_allclose(
+        apply_homography(fit_homography(first, second), first), second, atol=1e-6
+    )
+    horizon = np.array([[1, 0, 0], [0, 1, 0], [-1e-3, 0, 1]])
+    places = np.column_stack([[100.0, 200.0, 300.0, 1500.0], np.zeros(4)])
+    moved = apply_homography(horizon, places)
+    np.testing.assert_array_equal(np.isnan(moved[:, 0]), [False, False, False, True])
+
+
+def repeated_texture(tmp_path: Path, alike: int) -> tuple[PairTask, int]:
+    """3000 true points, of which `alike` have a double elsewhere that looks the same to a few."""
+    rng = np.random.default_rng(11)
+    camera = pycolmap.Camera(
+        model="PINHOLE", width=3000, height=2400, params=[3000, 3000, 1500, 1200],
+        has_prior_focal_length=True,
+    )  # fmt: skip
+    points = np.column_stack([rng.uniform(-0.8, 0.8, (3000, 2)), rng.uniform(1.9, 2.1, 3000)])
+    first, second = camera.img_from_cam(points), camera.img_from_cam(points - [0.3, 0.05, 0.0])
+    descriptors = rng.integers(0, 90, (3000, 128)).astype(np.int64)
+    doubles = rng.permutation(np.arange(1500, 3000))[:alike]
+    descriptors[doubles[: alike // 2]] = descriptors[doubles[alike // 2 :]]
+    for name, pixels in (("a", first), ("b", second)):
+        noise = rng.integers(-4, 5, descriptors.shape)
+        features = Features(
+            pixels=pixels,
+            scale_px=np.ones(3000, np.float32),
+            descriptors=np.clip(descriptors + noise, 0, 255).astype(np.uint8),
+        )
+        save_features(tmp_path / f"{name}.npz", features)
+    text = camera_text(camera)
+    return PairTask(
+        first=tmp_path / "a.npz", second=tmp_path / "b.npz", ratio=0.8, cameras=(text, text)
+    ), 3000
+
+
+def test_prediction_finds_what_looks_alike_and_loses_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task, _ = repeated_texture(tmp_path, alike=800)
+    guided = match_pair(task)
+    monkeypatch.setattr(matching, "_WORTH_PROBING", np.inf)
+    full = match_pair(task)
+    assert np.all(guided.matches[:, 0] == guided.matches[:, 1])
+    assert len(full.matches) >= 2000
+    assert len(guided.matches) >= len(full.matches) + 200
+
+
+def test_where_the_largest_features_agree_on_nothing_all_are_compared(tmp_path: Path) -> None:
+    """Only the smaller half of the features is common to both pictures."""
+    task, _ = repeated_texture(tmp_path, alike=0)
+    b = load_features(task.second)
+    strange = b.descriptors.copy()
+    strange[:1500] = np.random.default_rng(12).integers(0, 90, (1500, 128))
+    save_features(task.second, Features(pixels=b.pixels, scale_px=b.scale_px, descriptors=strange))
+    found = match_pair(task)
+    assert len(found.matches) >= 1300
+    assert found.matches.min() >= 1500

@@ -1,0 +1,376 @@
+"""Positions of features made consistent along their tracks, to a few hundredths of a pixel.
+
+SIFT places each feature by itself, with an error of a quarter pixel or more. What the mapping needs
+is that all pictures of a track mean the same spot, whichever. So one observation of every track is
+its reference, and the patch around it is aligned in all other pictures of the track by least
+squares (Gruen 1985), in the inverse compositional form (Baker & Matthews 2004): an affine warp with
+a gain and an offset of the grey level. The warp starts from the matches around.
+"""
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from alice_survey.executor import parallel_map
+from alice_survey.frames import Array
+from reconstruct.matching.features import load_features
+from reconstruct.matching.matches import Matches
+
+_RADIUS = 7
+"""Of a patch, pixels."""
+_SIGMA = 5.0
+"""Of the weight that falls towards the border of a patch, pixels."""
+_STEPS = 12
+_SETTLED_PX = 0.005
+_FARTHEST_PX = 3.0
+"""A position that wants to move by more has found something else, and stays."""
+_LEAST_CORRELATION = 0.7
+_LEAST_SUPPORT = 6
+_SUPPORT = 12
+"""Matches around a feature from which its first affine warp is estimated."""
+_UNKNOWNS = 8
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Partner:
+    """Features of one picture whose references all lie in another."""
+
+    grey: Path
+    nodes: NDArray[np.int64]
+    """(N,) their numbers over all pictures."""
+    reference: Array
+    """(N, 2) pixels in the picture of the references."""
+    pixels: Array
+    """(N, 2)."""
+    support: tuple[Array, Array]
+    """(M, 2) pixels of verified matches, in the picture of the references and in this one."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Task:
+    grey: Path
+    partners: tuple[_Partner, ...]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Refined:
+    """Features after refinement."""
+
+    pixels: list[Array]
+    """By picture, (N, 2): all features, moved or not."""
+    tracked: int
+    """Observations that have a reference in another picture."""
+    moved: int
+    """Those that were aligned with it."""
+
+
+def refine_tracks(
+    features: Sequence[Path],
+    greys: Sequence[Path],
+    pairs: Sequence[tuple[int, int, Matches]],
+    *,
+    threads: int,
+) -> Refined:
+    """Align every observation of a track with the track's reference.
+
+    The reference is the observation that was matched with most others. An observation stays where
+    it is if its patch does not resemble that of the reference, or wants to go far.
+
+    Args:
+        features: files of the features of every picture.
+        greys: files of the evened pictures, (H, W) bytes as `numpy.save` writes them.
+        pairs: indices of two pictures and (K, 2) verified matches.
+        threads: how many processes.
+    """
+    pixels = [load_features(path).pixels for path in features]
+    starts = np.concatenate([[0], np.cumsum([len(p) for p in pixels])]).astype(np.int64)
+    reference = track_references(pairs, starts)
+    tasks = _tasks(pixels, starts, reference, pairs, greys)
+    together = np.concatenate([np.zeros((0, 2)), *pixels])
+    tracked = moved = 0
+    for nodes, found in parallel_map(align, tasks, threads=threads, label="sub-pixel positions"):
+        good = np.isfinite(found[:, 0])
+        together[nodes[good]] = found[good]
+        tracked += len(nodes)
+        moved += int(good.sum())
+    return Refined(
+        pixels=[together[a:b] for a, b in itertools.pairwise(starts)],
+        tracked=tracked,
+        moved=moved,
+    )
+
+
+def track_references(
+    pairs: Sequence[tuple[int, int, Matches]], starts: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """For every feature, that of its track with most direct matches; the first among equals.
+
+    Args:
+        pairs: indices of two pictures and matches.
+        starts: (P + 1,) number of the first feature of every picture, features counted over all.
+
+    Returns:
+        (N,) numbers; a feature without a match is its own reference.
+    """
+    count = int(starts[-1])
+    links = [m.astype(np.int64) + starts[[i, j]] for i, j, m in pairs]
+    edges = np.concatenate([np.zeros((0, 2), np.int64), *links])
+    degree = np.bincount(edges.ravel(), minlength=count)
+    graph = coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), (count, count))
+    label = connected_components(graph, directed=False)[1]
+    order = np.lexsort((np.arange(count), -degree, label))
+    first = np.flatnonzero(np.r_[True, np.diff(label[order]) != 0][:count])
+    reference: NDArray[np.int64] = order[first][label].astype(np.int64)
+    return reference
+
+
+def _tasks(
+    pixels: Sequence[Array],
+    starts: NDArray[np.int64],
+    reference: NDArray[np.int64],
+    pairs: Sequence[tuple[int, int, Matches]],
+    greys: Sequence[Path],
+) -> list[_Task]:
+    """One task for each picture that has references."""
+    nodes = np.flatnonzero(reference != np.arange(len(reference)))
+    picture = np.searchsorted(starts, nodes, side="right") - 1
+    of_reference = np.searchsorted(starts, reference[nodes], side="right") - 1
+    nodes, picture, of_reference = (
+        x[picture != of_reference] for x in (nodes, picture, of_reference)
+    )
+    order = np.lexsort((nodes, picture, of_reference))
+    nodes, picture, of_reference = nodes[order], picture[order], of_reference[order]
+    matched = {(i, j): m for i, j, m in pairs}
+    changes = np.flatnonzero((np.diff(picture) != 0) | (np.diff(of_reference) != 0)) + 1
+    partners: dict[int, list[_Partner]] = {}
+    for members in np.split(np.arange(len(nodes)), changes):
+        if not len(members):
+            continue
+        r, j = int(of_reference[members[0]]), int(picture[members[0]])
+        mine = nodes[members]
+        at = pixels[r][reference[mine] - starts[r]], pixels[j][mine - starts[j]]
+        support = at
+        if (min(r, j), max(r, j)) in matched:
+            pair = matched[min(r, j), max(r, j)]
+            columns = (0, 1) if r < j else (1, 0)
+            support = pixels[r][pair[:, columns[0]]], pixels[j][pair[:, columns[1]]]
+        if len(support[0]) >= _LEAST_SUPPORT:
+            partners.setdefault(r, []).append(
+                _Partner(grey=greys[j], nodes=mine, reference=at[0], pixels=at[1], support=support)
+            )
+    return [_Task(grey=greys[r], partners=tuple(partners[r])) for r in sorted(partners)]
+
+
+def align(task: _Task) -> tuple[NDArray[np.int64], Array]:
+    """Numbers of features and their aligned positions (N, 2); NaN where they are to stay."""
+    first = np.asarray(np.load(task.grey, mmap_mode="c"))
+    found = []
+    for partner in task.partners:
+        second = np.asarray(np.load(partner.grey, mmap_mode="c"))
+        affine = affine_from_neighbours(*partner.support, partner.reference)
+        moved = align_patches(first, second, partner.reference, partner.pixels, affine)
+        found.append(moved)
+    return np.concatenate([p.nodes for p in task.partners]), np.concatenate(found)
+
+
+def affine_from_neighbours(first: Array, second: Array, at: Array) -> Array:
+    """Affine maps, (N, 2, 2), that the matches around places of the first picture agree on best.
+
+    Args:
+        first: (M, 2) pixels of matches in the first picture.
+        second: (M, 2) in the second.
+        at: (N, 2) places in the first picture.
+    """
+    around = KDTree(first).query(at, k=min(_SUPPORT, len(first)))[1]
+    around = around.reshape(len(at), -1)
+    source, target = first[around], second[around]
+    source = source - source.mean(axis=1, keepdims=True)
+    target = target - target.mean(axis=1, keepdims=True)
+    square = np.einsum("nki,nkj->nij", source, source)
+    # where neighbours are in one line they say nothing across it: there nothing is stretched
+    square = square + np.eye(2) * (1e-3 * np.trace(square, axis1=1, axis2=2)[:, None, None] + 1e-6)
+    mixed = np.einsum("nki,nkj->nij", source, target)
+    solved: Array = np.linalg.solve(square, mixed).transpose(0, 2, 1)
+    return np.ascontiguousarray(solved)
+
+
+def align_patches(
+    first: NDArray[np.uint8],
+    second: NDArray[np.uint8],
+    reference: Array,
+    pixels: Array,
+    affine: Array,
+) -> Array:
+    """Positions in the second picture of what the first shows at others.
+
+    Args:
+        first: (H, W) grey levels.
+        second: (H2, W2) grey levels.
+        reference: (N, 2) pixels of the first picture.
+        pixels: (N, 2) first guesses in the second.
+        affine: (N, 2, 2) how steps from `reference` map to steps from `pixels`.
+
+    Returns:
+        (N, 2); NaN where the patch leaves a picture, does not converge or does not resemble.
+    """
+    found: Array = _align(
+        first, second, np.ascontiguousarray(reference), np.ascontiguousarray(pixels), affine
+    )
+    return found
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _cubic(picture: Any, x: float, y: float) -> float:
+    """Grey level by cubic convolution (Keys 1981); the first pixel's centre is 0, 0."""
+    column, row = math.floor(x), math.floor(y)
+    p, q = x - column, y - row
+    a = ((-0.5 * p + 1.0) * p - 0.5) * p
+    b = (1.5 * p - 2.5) * p * p + 1.0
+    c = ((-1.5 * p + 2.0) * p + 0.5) * p
+    d = (0.5 * p - 0.5) * p * p
+    rows = (
+        ((-0.5 * q + 1.0) * q - 0.5) * q,
+        (1.5 * q - 2.5) * q * q + 1.0,
+        ((-1.5 * q + 2.0) * q + 0.5) * q,
+        (0.5 * q - 0.5) * q * q,
+    )
+    level = 0.0
+    for k in range(4):
+        r = row - 1 + k
+        level += rows[k] * (
+            a * picture[r, column - 1] + b * picture[r, column]
+            + c * picture[r, column + 1] + d * picture[r, column + 2]
+        )  # fmt: skip
+    return level
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _template(
+    picture: Any, x: float, y: float, patch: Any, weights: Any, levels: Any, slopes: Any
+) -> None:
+    """Grey levels of the reference's patch, and how they change with the unknowns."""
+    side = 2 * _RADIUS + 3
+    for i in range(side):
+        for j in range(side):
+            patch[i, j] = _cubic(picture, x + j - _RADIUS - 1, y + i - _RADIUS - 1)
+    k = 0
+    for i in range(1, side - 1):
+        for j in range(1, side - 1):
+            u, v = j - _RADIUS - 1.0, i - _RADIUS - 1.0
+            gx = 0.5 * (patch[i, j + 1] - patch[i, j - 1])
+            gy = 0.5 * (patch[i + 1, j] - patch[i - 1, j])
+            levels[k] = patch[i, j]
+            weights[k] = math.exp(-0.5 * (u * u + v * v) / (_SIGMA * _SIGMA))
+            slopes[k, 0], slopes[k, 1] = gx, gy
+            slopes[k, 2], slopes[k, 3] = gx * u, gx * v
+            slopes[k, 4], slopes[k, 5] = gy * u, gy * v
+            slopes[k, 6], slopes[k, 7] = patch[i, j], 1.0
+            k += 1
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _inside(picture: Any, x: float, y: float, margin: float) -> bool:
+    return bool(
+        x >= margin
+        and y >= margin
+        and x < picture.shape[1] - margin - 1
+        and y < picture.shape[0] - margin - 1
+    )
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _compare(
+    picture: Any, x: float, y: float, m: Any, weights: Any, levels: Any, slopes: Any, right: Any
+) -> float:
+    """Fill the right-hand side; the weighted correlation of the patches, -2 beyond the picture."""
+    right[:] = 0.0
+    total = sum_a = sum_b = sum_aa = sum_bb = sum_ab = 0.0
+    k = 0
+    for i in range(-_RADIUS, _RADIUS + 1):
+        for j in range(-_RADIUS, _RADIUS + 1):
+            at_x = x + m[0, 0] * j + m[0, 1] * i
+            at_y = y + m[1, 0] * j + m[1, 1] * i
+            if not _inside(picture, at_x, at_y, 2.0):
+                return -2.0
+            level, weight = _cubic(picture, at_x, at_y), weights[k]
+            miss = weight * (level - levels[k])
+            for n in range(_UNKNOWNS):
+                right[n] += slopes[k, n] * miss
+            total += weight
+            sum_a += weight * levels[k]
+            sum_b += weight * level
+            sum_aa += weight * levels[k] * levels[k]
+            sum_bb += weight * level * level
+            sum_ab += weight * levels[k] * level
+            k += 1
+    spread = (sum_aa - sum_a * sum_a / total) * (sum_bb - sum_b * sum_b / total)
+    return float((sum_ab - sum_a * sum_b / total) / math.sqrt(max(spread, 1e-9)))
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _align(first: Any, second: Any, reference: Any, pixels: Any, affine: Any) -> Any:
+    count = (2 * _RADIUS + 1) ** 2
+    patch = np.empty((2 * _RADIUS + 3, 2 * _RADIUS + 3))
+    weights, levels = np.empty(count), np.empty(count)
+    slopes = np.empty((count, _UNKNOWNS))
+    square, right = np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty(_UNKNOWNS)
+    turn, m = np.empty((2, 2)), np.empty((2, 2))
+    found = np.full(pixels.shape, np.nan)
+    for point in range(len(pixels)):
+        x, y = reference[point, 0] - 0.5, reference[point, 1] - 0.5
+        if not _inside(first, x, y, _RADIUS + 3.0):
+            continue
+        _template(first, x, y, patch, weights, levels, slopes)
+        square[:] = 0.0
+        for k in range(count):
+            for n in range(_UNKNOWNS):
+                for o in range(n + 1):
+                    square[n, o] += weights[k] * slopes[k, n] * slopes[k, o]
+        for n in range(_UNKNOWNS):
+            for o in range(n):
+                square[o, n] = square[n, o]
+            # a patch without texture must not divide by zero; 1e-9 moves nothing else
+            square[n, n] += 1e-9 * square[n, n] + 1e-9
+        inverse = np.linalg.inv(square)
+        x, y = pixels[point, 0] - 0.5, pixels[point, 1] - 0.5
+        m[:] = affine[point]
+        settled = False
+        for _ in range(_STEPS):
+            correlation = _compare(second, x, y, m, weights, levels, slopes, right)
+            if correlation < -1.5:
+                break
+            step = inverse @ right
+            gain = 1.0 + step[6]
+            if not gain > 0.1:
+                break
+            step[:6] /= gain
+            # the second picture shows the reference moved by `step`: undo that in the warp
+            a, b, c, d = 1.0 + step[2], step[3], step[4], 1.0 + step[5]
+            area = a * d - b * c
+            if not area > 0.2:
+                break
+            turn[0, 0], turn[0, 1] = d / area, -b / area
+            turn[1, 0], turn[1, 1] = -c / area, a / area
+            m[:] = m @ turn
+            go_x = m[0, 0] * step[0] + m[0, 1] * step[1]
+            go_y = m[1, 0] * step[0] + m[1, 1] * step[1]
+            x, y = x - go_x, y - go_y
+            away_x, away_y = x + 0.5 - pixels[point, 0], y + 0.5 - pixels[point, 1]
+            if not away_x * away_x + away_y * away_y <= _FARTHEST_PX * _FARTHEST_PX:
+                break
+            if go_x * go_x + go_y * go_y < _SETTLED_PX * _SETTLED_PX:
+                settled = correlation >= _LEAST_CORRELATION
+                break
+        if settled:
+            found[point, 0], found[point, 1] = x + 0.5, y + 0.5
+    return found

@@ -1,0 +1,157 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from reconstruct.matching.features import Features, save_features
+from reconstruct.matching.refinement import (
+    affine_from_neighbours,
+    align_patches,
+    refine_tracks,
+    track_references,
+)
+from tests.oracles_matching import align_slowly, track_references_slowly
+
+SIZE = (150, 120)
+
+
+class Texture:
+    """A smooth random picture that is known between its pixels too."""
+
+    def __init__(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        self.waves = rng.normal(0, 0.35, (60, 2))
+        self.phases = rng.uniform(0, 2 * np.pi, 60)
+
+    def at(self, points: np.ndarray) -> np.ndarray:
+        return 120 + 6 * np.cos(points @ self.waves.T + self.phases).sum(axis=-1)
+
+    def picture(
+        self, affine: np.ndarray, shift: np.ndarray, gain: float = 1.0, noise: float = 0.0
+    ) -> np.ndarray:
+        """What a camera sees that shows the texture's p at pixel `affine @ p + shift`."""
+        x, y = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
+        points = (np.stack([x, y], axis=-1) - shift) @ np.linalg.inv(affine).T
+        levels = gain * self.at(points) + 8
+        levels = levels + np.random.default_rng(1).normal(0, noise, levels.shape)
+        return np.rint(levels).clip(0, 255).astype(np.uint8)
+
+
+AFFINE = np.array([[0.95, 0.21], [-0.17, 1.08]])
+SHIFT = np.array([7.3, 12.6])
+
+
+def spots(count: int, seed: int = 2) -> np.ndarray:
+    return np.random.default_rng(seed).uniform([30, 35], [115, 85], (count, 2))
+
+
+def test_patches_are_aligned_to_hundredths_of_a_pixel() -> None:
+    texture, reference = Texture(0), spots(60)
+    first = texture.picture(np.eye(2), np.zeros(2), noise=2.0)
+    second = texture.picture(AFFINE, SHIFT, gain=0.7, noise=2.0)
+    truth = reference @ AFFINE.T + SHIFT
+    guess = truth + np.random.default_rng(3).normal(0, 0.5, truth.shape)
+    start = AFFINE @ [[1.04, -0.05], [0.04, 0.97]]
+    found = align_patches(first, second, reference, guess, np.broadcast_to(start, (60, 2, 2)))
+    kept = np.isfinite(found[:, 0])
+    assert kept.mean() > 0.95
+    miss = np.sqrt(((found - truth)[kept] ** 2).mean())
+    assert 1e-4 < miss < 0.04  # the noise leaves something
+
+
+def test_alignment_equals_a_general_solver() -> None:
+    texture, reference = Texture(4), spots(6)
+    first = texture.picture(np.eye(2), np.zeros(2), noise=1.0)
+    second = texture.picture(AFFINE, SHIFT, gain=0.8, noise=1.0)
+    guess = reference @ AFFINE.T + SHIFT + [0.4, -0.3]
+    found = align_patches(first, second, reference, guess, np.broadcast_to(AFFINE, (6, 2, 2)))
+    slow = [
+        align_slowly(first, second, r, g, AFFINE, radius=7, sigma=5.0)
+        for r, g in zip(reference, guess, strict=True)
+    ]
+    # the two interpolate differently
+    np.testing.assert_allclose(found, slow, atol=0.03)
+
+
+def test_what_does_not_resemble_stays() -> None:
+    reference = spots(20)
+    first = Texture(0).picture(np.eye(2), np.zeros(2))
+    other = Texture(9).picture(np.eye(2), np.zeros(2))
+    blank = np.full_like(first, 90)
+    same = np.broadcast_to(np.eye(2), (20, 2, 2))
+    assert np.isnan(align_patches(first, other, reference, reference, same)).all(axis=1).sum() >= 19
+    assert np.isnan(align_patches(first, blank, reference, reference, same)).all()
+    assert np.isnan(align_patches(blank, first, reference, reference, same)).all()
+    border = np.array([[4.0, 60.0], [60.0, 117.0]])
+    assert np.isnan(align_patches(first, first, border, border, same[:2])).all()
+    # 6 px off: the right place is beyond what a position may move
+    guess = reference + np.array([6.0, 0.0])
+    far = align_patches(first, first, reference, guess, same)
+    moved = np.linalg.norm(far - guess, axis=1)
+    assert moved[np.isfinite(moved)].max(initial=0.0) <= 3.0
+
+
+def test_affine_maps_come_back_from_matches() -> None:
+    first = spots(40)
+    found = affine_from_neighbours(first, first @ AFFINE.T + SHIFT, first[:5])
+    np.testing.assert_allclose(found, np.broadcast_to(AFFINE, (5, 2, 2)), atol=0.01)
+    line = np.column_stack([np.arange(20.0), np.full(20, 3.0)])
+    assert np.isfinite(affine_from_neighbours(line, line + 1.0, line[:3])).all()
+
+
+@settings(deadline=None, max_examples=50)
+@given(seed=st.integers(0, 10_000), matches=st.integers(0, 12))
+def test_references_equal_those_of_the_slow_twin(seed: int, matches: int) -> None:
+    rng = np.random.default_rng(seed)
+    sizes = rng.integers(0, 8, 4)
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    pairs = []
+    for i in range(4):
+        for j in range(i + 1, 4):
+            count = min(matches, sizes[i], sizes[j])
+            chosen = [rng.permutation(sizes[k])[:count] for k in (i, j)]
+            pairs.append((i, j, np.stack(chosen, axis=1).astype(np.uint32)))
+    np.testing.assert_array_equal(
+        track_references(pairs, starts), track_references_slowly(pairs, starts)
+    )
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_tracks_mean_one_spot_in_all_pictures(tmp_path: Path, threads: int) -> None:
+    """Three pictures whose features are off by 0.4 px, the third matched with the second only."""
+    texture, points = Texture(5), spots(50)
+    views = [
+        (np.eye(2), np.zeros(2)), (AFFINE, SHIFT), (np.diag([1.1, 0.9]), np.array([-8.0, 6.0]))
+    ]  # fmt: skip
+    rng = np.random.default_rng(6)
+    features, greys, first_guess = [], [], []
+    for k, (affine, shift) in enumerate(views):
+        guess = points @ affine.T + shift + rng.normal(0, 0.4, points.shape)
+        lonely = np.array([[70.0, 60.0]])
+        features.append(tmp_path / f"{k}.npz")
+        greys.append(tmp_path / f"{k}.npy")
+        first_guess.append(np.concatenate([guess, lonely]))
+        save_features(
+            features[k],
+            Features(
+                pixels=first_guess[k],
+                scale_px=np.ones(51, np.float32),
+                descriptors=np.zeros((51, 128), np.uint8),
+            ),
+        )
+        np.save(greys[k], texture.picture(affine, shift, noise=1.0))
+    same = np.repeat(np.arange(50, dtype=np.uint32)[:, None], 2, axis=1)
+    found = refine_tracks(features, greys, [(0, 1, same), (1, 2, same)], threads=threads)
+    assert found.tracked == 100
+    assert found.moved >= 95
+    spot = [
+        (pixels[:50] - shift) @ np.linalg.inv(affine).T
+        for pixels, (affine, shift) in zip(found.pixels, views, strict=True)
+    ]
+    np.testing.assert_array_equal(found.pixels[1], first_guess[1])  # the reference of all
+    for k in (0, 2):
+        gap = np.linalg.norm(spot[k] - spot[1], axis=1)
+        assert np.median(gap) < 0.05
+        np.testing.assert_array_equal(found.pixels[k][50], [70.0, 60.0])
