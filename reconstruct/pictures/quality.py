@@ -1,0 +1,333 @@
+"""How good the pictures of a survey are: sharpness, exposure, contrast, noise and overlap.
+
+Every picture is measured by itself, then held against the survey: what lies far from the median of
+all is listed with the reason. Nothing is left out of the reconstruction because of it.
+"""
+
+import math
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.artefacts import read_stage, write_csv
+from alice_survey.errors import ImageError, why
+from alice_survey.executor import parallel_map
+from alice_survey.manifest import ImageRecord, read_manifest
+from reconstruct.pictures.files import decode
+from reconstruct.pictures.normalise import even_light
+from reconstruct.pictures.undistorted import read_mask
+
+NAN = math.nan
+MOST_BRIGHT = 0.25
+"""Share of burnt-out pixels from which a picture is bad by itself."""
+MOST_DARK = 0.5
+"""Share of black pixels from which a picture is bad by itself."""
+OUTLIER_SIGMAS = 4.0
+"""Robust standard deviations from the survey's median from which a picture stands out ..."""
+OUTLIER_FACTOR = 1.6
+"""... if it is also worse by this factor: in an even survey small differences are no fault."""
+
+_BLOCK_PX = 48
+_SMOOTHEST_PERCENT = 10
+"""Blocks so smooth show hardly anything but noise."""
+_MAD_TO_SIGMA = 1.4826
+_SHARED_POINTS = 15
+"""Common points of the model from which two pictures count as overlapping."""
+_FINE_PX, _MID_PX, _COARSE_PX = 1.0, 2.0, 5.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureQuality:
+    """One picture. NaN (an empty cell) where it could not be read or there is no model."""
+
+    image: str
+    camera: str
+    station: int
+    sharpness: float = NAN
+    """Detail of 1 px over detail of 2 to 5 px, noise taken off: blur lowers it, haze does not."""
+    contrast: float = NAN
+    """Relative amplitude of detail of 2 to 5 px: haze, defocus and darkness lower it."""
+    veil: float = NAN
+    """Darkest level of a neighbourhood over its mean: nears 1 where water scatters light back."""
+    brightness: float = NAN
+    """Median grey level, 0 to 1."""
+    dark_share: float = NAN
+    """Share of pixels that are black in all channels."""
+    bright_share: float = NAN
+    """Share of pixels that are burnt out in a channel."""
+    noise: float = NAN
+    """Standard deviation of the grey level where the picture is smoothest, 0 to 1."""
+    points: float = NAN
+    """Points of the sparse model that it shows; 0 when it is not registered."""
+    partners: float = NAN
+    """Pictures of other stations that show enough of the same points."""
+    overlap: float = NAN
+    """Share of its points that the best of those shows too."""
+    reasons: tuple[str, ...] = field(default=())
+
+    @property
+    def flagged(self) -> bool:
+        """Whether anything is wrong with it."""
+        return bool(self.reasons)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasureTask:
+    """One picture to read and measure."""
+
+    images: Path
+    record: ImageRecord
+
+
+def measure_file(task: MeasureTask) -> PictureQuality:
+    """Read and measure one picture; a file that cannot be used gives the reason, never an error."""
+    record = task.record
+    known = {"image": record.image, "camera": record.camera, "station": record.station}
+    try:
+        path = task.images / record.image
+        pixels = decode(path) if path.is_file() else None
+        if pixels is None:
+            raise ImageError("no such file")
+        mask = None
+        if record.mask:
+            mask = read_mask(task.images / record.mask, (pixels.shape[1], pixels.shape[0]))
+        return PictureQuality(**known, **measure(pixels, mask))
+    except (ImageError, OSError) as error:
+        text = why(error).removeprefix(f"{task.images / record.image}: ")
+        return PictureQuality(**known, reasons=(f"unreadable: {text}",))
+
+
+def measure(pixels: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> dict[str, float]:
+    """The figures of `PictureQuality` that come from pixels.
+
+    Detail is measured in blocks of the picture divided by its blurred background (so that uneven
+    lamps do not count), and the median block stands for the picture (so that a fish does not).
+
+    Args:
+        pixels: (H, W) or (H, W, 3) BGR, 8 or 16 bits.
+        mask: (H, W) True where the picture may be used.
+
+    Raises:
+        ImageError: too little is left outside of the mask.
+    """
+    full = float(np.iinfo(pixels.dtype).max)
+    eight = (pixels.astype(np.float32) * (255.0 / full)).round().astype(np.uint8)
+    grey = cv2.cvtColor(eight, cv2.COLOR_BGR2GRAY) if eight.ndim == 3 else eight
+    use = np.ones(grey.shape, dtype=np.bool_) if mask is None else mask
+    blocks = _whole_blocks(use)
+    if not blocks.any():
+        raise ImageError(
+            f"no block of {_BLOCK_PX} px is free of the mask: nothing of it can be measured"
+        )
+    ratio = even_light(eight)
+    noise = _noise(ratio, blocks)
+    fine = ratio - cv2.GaussianBlur(ratio, (0, 0), _FINE_PX)
+    band = cv2.GaussianBlur(ratio, (0, 0), _MID_PX) - cv2.GaussianBlur(ratio, (0, 0), _COARSE_PX)
+    fine_energy = float(np.median(_per_block(fine**2)[blocks])) - _fine_gain() * noise**2
+    band_energy = float(np.median(_per_block(band**2)[blocks]))
+    level = grey.astype(np.float32) / 255.0
+    mean = _per_block(level)[blocks]
+    channels = eight.reshape(*grey.shape, -1)[use]
+    smooth = cv2.GaussianBlur(level, (0, 0), _FINE_PX)  # the darkest pixel is otherwise noise
+    darkest = _blocks_of(smooth).min(axis=(1, 3))[blocks]
+    return {
+        "sharpness": math.sqrt(max(fine_energy, 0.0) / band_energy) if band_energy > 0 else 0.0,
+        "contrast": math.sqrt(band_energy),
+        "veil": float(np.median(darkest / np.maximum(mean, 1e-3))),
+        "brightness": float(np.median(level[use])),
+        "dark_share": float((channels.max(axis=1) <= 2).mean()),
+        "bright_share": float((channels.max(axis=1) >= 254).mean()),
+        "noise": _noise(level, blocks),
+    }
+
+
+def _blocks_of(values: NDArray[Any]) -> NDArray[Any]:
+    """(rows, block, columns, block) view of a picture, its remainder cut off."""
+    rows, columns = max(values.shape[0] // _BLOCK_PX, 1), max(values.shape[1] // _BLOCK_PX, 1)
+    height, width = min(_BLOCK_PX, values.shape[0]), min(_BLOCK_PX, values.shape[1])
+    return values[: rows * height, : columns * width].reshape(rows, height, columns, width)
+
+
+def _per_block(values: NDArray[np.float32]) -> NDArray[np.float64]:
+    means: NDArray[np.float64] = _blocks_of(values).mean(axis=(1, 3), dtype=np.float64)
+    return means
+
+
+def _whole_blocks(use: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    whole: NDArray[np.bool_] = _blocks_of(use).all(axis=(1, 3))
+    return whole
+
+
+def _noise(values: NDArray[np.float32], blocks: NDArray[np.bool_]) -> float:
+    """Standard deviation of white noise, from the smoothest blocks.
+
+    The mask of Immerkaer (1996, "Fast noise variance estimation") is blind to planes and edges
+    along the axes; its gain for white noise is 6.
+    """
+    mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32) / 6.0
+    residual = np.abs(cv2.filter2D(values, cv2.CV_32F, mask, borderType=cv2.BORDER_REFLECT))
+    per_block = _per_block(residual)[blocks] * math.sqrt(math.pi / 2)
+    return float(np.percentile(per_block, _SMOOTHEST_PERCENT))
+
+
+def _fine_gain() -> float:
+    """Variance that the filter of the finest detail leaves of white noise of variance 1."""
+    spike = np.zeros((33, 33), dtype=np.float32)
+    spike[16, 16] = 1.0
+    return float(((spike - cv2.GaussianBlur(spike, (0, 0), _FINE_PX)) ** 2).sum())
+
+
+def judge(found: Sequence[PictureQuality]) -> list[PictureQuality]:
+    """Add the reasons: limits that hold for any picture, and what stands out of the survey.
+
+    Medians are those of a picture's own camera: two cameras may have unlike lenses and lamps.
+    """
+    from dataclasses import replace
+
+    by_camera: dict[str, list[PictureQuality]] = defaultdict(list)
+    for quality in found:
+        by_camera[quality.camera].append(quality)
+    spreads = {
+        camera: {name: _middle(pictures, name) for name in ("sharpness", "contrast", "brightness")}
+        for camera, pictures in by_camera.items()
+    }
+    return [replace(q, reasons=q.reasons + _reasons(q, spreads[q.camera])) for q in found]
+
+
+def _middle(pictures: Sequence[PictureQuality], name: str) -> tuple[float, float]:
+    """Median and robust standard deviation of the logarithm of a figure, over readable pictures."""
+    values = np.array([getattr(p, name) for p in pictures])
+    values = np.log(np.maximum(values[np.isfinite(values)], 1e-6))
+    if not values.size:
+        return NAN, NAN
+    middle = float(np.median(values))
+    return middle, _MAD_TO_SIGMA * float(np.median(np.abs(values - middle)))
+
+
+def _reasons(quality: PictureQuality, spreads: dict[str, tuple[float, float]]) -> tuple[str, ...]:
+    if math.isnan(quality.sharpness):
+        return ()
+    reasons = []
+    if quality.bright_share > MOST_BRIGHT:
+        reasons.append(f"overexposed: {quality.bright_share:.0%} of its pixels are burnt out")
+    if quality.dark_share > MOST_DARK:
+        reasons.append(f"underexposed: {quality.dark_share:.0%} of its pixels are black")
+    for name, word in (("sharpness", "blurred"), ("contrast", "hazy"), ("brightness", "dark")):
+        middle, sigma = spreads[name]
+        below = middle - math.log(max(getattr(quality, name), 1e-6))
+        if below > max(OUTLIER_SIGMAS * sigma, math.log(OUTLIER_FACTOR)):
+            reasons.append(f"{word}: {name} is {math.exp(-below):.2f} of the survey's median")
+    if quality.points == 0:
+        reasons.append("not registered in the model")
+    elif quality.partners == 0:
+        reasons.append("overlaps no picture of another station")
+    return tuple(reasons)
+
+
+def add_overlap(found: Sequence[PictureQuality], sparse: Path) -> list[PictureQuality]:
+    """Add what the sparse model says about points and overlap with other stations."""
+    from dataclasses import replace
+
+    from reconstruct.model import read_model
+
+    model = read_model(sparse)
+    seen: dict[int, list[int]] = defaultdict(list)
+    for point, view in model.observations:
+        seen[int(point)].append(int(view))
+    points: Counter[int] = Counter()
+    shared: dict[int, Counter[int]] = defaultdict(Counter)
+    for views in seen.values():
+        points.update(views)
+        for one in views:
+            shared[one].update(
+                v for v in views if model.views[v].station != model.views[one].station
+            )
+    index = {view.image: i for i, view in enumerate(model.views)}
+    filled = []
+    for quality in found:
+        i = index.get(quality.image)
+        if i is None:
+            filled.append(replace(quality, points=0.0, partners=0.0, overlap=0.0))
+            continue
+        counts = shared[i].values()
+        filled.append(
+            replace(
+                quality,
+                points=float(points[i]),
+                partners=float(sum(count >= _SHARED_POINTS for count in counts)),
+                overlap=max(counts, default=0) / max(points[i], 1),
+            )
+        )
+    return filled
+
+
+def quality_report(workspace: Path, threads: int) -> tuple[str, dict[str, Any]]:
+    """Measure all pictures of a workspace and write `quality/quality.csv` and `quality.png`.
+
+    Args:
+        workspace: with `images/manifest.csv`; a finished `sparse/` adds the overlaps.
+        threads: processes that read pictures.
+
+    Returns:
+        The list of flagged pictures as text, and figures as JSON values.
+
+    Raises:
+        ImageError: there is no manifest, or it names no picture.
+    """
+    from reconstruct.pictures.quality_sheet import plot_quality
+
+    images = workspace / "images"
+    records = read_manifest(images / "manifest.csv")
+    if not records:
+        raise ImageError(f"{images / 'manifest.csv'} names no picture")
+    tasks = [MeasureTask(images=images, record=record) for record in records]
+    found = list(parallel_map(measure_file, tasks, threads=threads, label="picture quality"))
+    if read_stage(workspace / "sparse") is not None:
+        found = add_overlap(found, workspace / "sparse")
+    found = judge(found)
+    folder = workspace / "quality"
+    write_csv(folder / "quality.csv", _HEADER, (_row(quality) for quality in found))
+    plot_quality(folder / "quality.png", images, found)
+    return _text(found, folder), _figures(found)
+
+
+_NUMBERS = tuple(f.name for f in fields(PictureQuality) if f.type in (float, "float"))
+_HEADER = ("image", "camera", "station", *_NUMBERS, "reasons")
+
+
+def _row(quality: PictureQuality) -> list[Any]:
+    numbers = [getattr(quality, name) for name in _NUMBERS]
+    cells = ["" if math.isnan(number) else f"{number:.6g}" for number in numbers]
+    return [
+        quality.image, quality.camera, quality.station, *cells, "; ".join(quality.reasons)
+    ]  # fmt: skip
+
+
+def _text(found: Sequence[PictureQuality], folder: Path) -> str:
+    flagged = [quality for quality in found if quality.flagged]
+    lines = [f"{q.image}: {'; '.join(q.reasons)}" for q in flagged]
+    lines.append(
+        f"{len(found)} pictures, {len(flagged)} to look at (all are still used where they can be); "
+        f"{folder / 'quality.csv'}"
+    )
+    return "\n".join(lines)
+
+
+def _figures(found: Sequence[PictureQuality]) -> dict[str, Any]:
+    medians = {}
+    for name in _NUMBERS:
+        values = np.array([getattr(q, name) for q in found])
+        if np.isfinite(values).any():
+            medians[name] = round(float(np.nanmedian(values)), 6)
+    return {
+        "pictures": len(found),
+        "unreadable": sum(math.isnan(q.sharpness) for q in found),
+        "flagged": [{"image": q.image, "reasons": list(q.reasons)} for q in found if q.flagged],
+        "median": medians,
+    }

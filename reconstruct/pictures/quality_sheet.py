@@ -1,0 +1,102 @@
+"""A sheet of the quality of a survey's pictures: figures in their order, and the worst ones."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from alice_survey.artefacts import atomic_path
+from alice_survey.errors import ImageError
+from reconstruct.pictures.files import decode
+from reconstruct.pictures.quality import PictureQuality
+
+_MOST_SHOWN = 8
+_ACROSS = 4
+_THUMBNAIL_PX = 420
+_STYLE: dict[str, Any] = {"font.size": 8, "axes.titlesize": 8, "figure.dpi": 110}
+_STRIPS = (
+    ("sharpness", "sharpness"),
+    ("contrast", "contrast"),
+    ("veil", "veil"),
+    ("brightness", "brightness"),
+)
+
+
+def plot_quality(path: Path, images: Path, found: Sequence[PictureQuality]) -> None:
+    """Draw figures of all pictures in their order, and thumbnails of the worst with the reason.
+
+    Args:
+        path: PNG to write.
+        images: folder of the pictures.
+        found: all pictures, judged.
+    """
+    worst = worst_first(found)[:_MOST_SHOWN]
+    rows = -(-len(worst) // _ACROSS)
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(12, 4.2 + 2.6 * rows), layout="constrained")
+        upper, *lower = np.atleast_1d(
+            figure.subfigures(1 + bool(rows), 1, height_ratios=[4.2, 2.6 * rows][: 1 + bool(rows)])
+        )
+        _strips(upper, found)
+        if lower:
+            panels = lower[0].subplots(rows, _ACROSS, squeeze=False).ravel()
+            for panel in panels:
+                panel.axis("off")
+            for panel, quality in zip(panels, worst, strict=False):
+                _thumbnail(panel, images, quality)
+        with atomic_path(path) as temporary:
+            figure.savefig(temporary, metadata={"Software": None})
+
+
+def worst_first(found: Sequence[PictureQuality]) -> list[PictureQuality]:
+    """Flagged pictures: unreadable ones, then those with the most reasons, then by sharpness."""
+    flagged = [quality for quality in found if quality.flagged]
+    return sorted(
+        flagged,
+        key=lambda q: (not np.isnan(q.sharpness), -len(q.reasons), q.sharpness, q.image),
+    )
+
+
+def _strips(figure: Any, found: Sequence[PictureQuality]) -> None:
+    axes = figure.subplots(len(_STRIPS), 1, sharex=True)
+    cameras = sorted({quality.camera for quality in found})
+    order = np.arange(len(found))
+    flagged = np.array([quality.flagged for quality in found])
+    for axis, (name, label) in zip(axes, _STRIPS, strict=True):
+        values = np.array([getattr(quality, name) for quality in found])
+        for camera in cameras:
+            own = np.array([quality.camera == camera for quality in found])
+            axis.plot(order[own], values[own], ".", markersize=4, label=camera)
+        axis.plot(order[flagged], values[flagged], "o", mfc="none", mec="tab:red", markersize=8)
+        axis.set_ylabel(label)
+        axis.set_ylim(bottom=0)
+        axis.grid(alpha=0.3)
+    axes[0].set_title(f"{len(found)} pictures in their order; {flagged.sum()} ringed to look at")
+    axes[0].legend(loc="upper right", ncols=len(cameras))
+    axes[-1].set_xlabel("picture")
+
+
+def _thumbnail(panel: Axes, images: Path, quality: PictureQuality) -> None:
+    panel.set_title(
+        f"{quality.image}\n" + "\n".join(_short(r) for r in quality.reasons), loc="left"
+    )
+    try:
+        pixels = decode(images / quality.image)
+    except (ImageError, OSError):
+        panel.text(0.5, 0.5, "cannot be shown", ha="center", va="center", color="0.4")
+        return
+    if pixels.dtype == np.uint16:
+        pixels = (pixels >> 8).astype(np.uint8)
+    shrink = _THUMBNAIL_PX / max(pixels.shape[:2])
+    small = cv2.resize(pixels, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    colours = cv2.COLOR_GRAY2RGB if small.ndim == 2 else cv2.COLOR_BGR2RGB
+    panel.imshow(cv2.cvtColor(small, colours))
+
+
+def _short(reason: str) -> str:
+    return reason if len(reason) <= 46 else reason[:45] + "…"
