@@ -1,0 +1,161 @@
+"""Where every patch of a mesh lies in the pages of its texture."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.frames import Array
+from reconstruct.mesh.labels import Charts
+from reconstruct.mesh.topology import Triangles
+
+PADDING_PX = 8
+"""Pixels around a patch that continue its picture: mipmaps down to an eighth mix nothing else."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Wedges:
+    """The corners of faces: one for each vertex and patch that meets it."""
+
+    vertex: NDArray[np.int64]
+    """(W,) its vertex."""
+    chart: NDArray[np.int32]
+    """(W,) its patch."""
+    triangles: Triangles
+    """(T, 3) wedges of every face."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Atlas:
+    """Pages, and where patches lie in them."""
+
+    sizes: tuple[tuple[int, int], ...]
+    """Width and height of every page, px."""
+    page: NDArray[np.int32]
+    """(C,) page of every patch."""
+    corner: NDArray[np.int64]
+    """(C, 2) pixel of the page at the first pixel of the patch's box, padding included."""
+    source: NDArray[np.int64]
+    """(C, 2) pixel of the picture (as scaled) at the same place; may be negative."""
+    box: NDArray[np.int64]
+    """(C, 2) width and height of the box, padding included."""
+    scale: float
+    """By which pictures are shrunk for the texture; 1 keeps them."""
+
+    def place(self, pixels: Array, chart: NDArray[np.int32]) -> Array:
+        """Pixels (W, 2) of pictures, in each one's patch, to pixels of the patches' pages."""
+        placed: Array = pixels * self.scale - self.source[chart] + self.corner[chart]
+        return placed
+
+    def uv(self, placed: Array, chart: NDArray[np.int32]) -> Array:
+        """Pixels (W, 2) of pages as u to the right and v upwards, 0 to 1."""
+        size = np.array(self.sizes, dtype=np.float64)[self.page[chart]]
+        uv: Array = placed / size
+        uv[:, 1] = 1.0 - uv[:, 1]
+        return uv
+
+
+def make_wedges(triangles: Triangles, charts: Charts) -> Wedges:
+    """The wedges of a mesh, by patch and vertex."""
+    chart = np.repeat(charts.chart.astype(np.int64), 3)
+    count = int(triangles.max(initial=-1)) + 1
+    key, wedge = np.unique(chart * count + triangles.reshape(-1), return_inverse=True)
+    return Wedges(
+        vertex=key % count,
+        chart=(key // count).astype(np.int32),
+        triangles=wedge.reshape(-1, 3).astype(np.int32),
+    )
+
+
+def make_atlas(pixels: Array, wedges: Wedges, count: int, page_px: int, most_pages: int) -> Atlas:
+    """Pack the boxes of all patches into pages.
+
+    Args:
+        pixels: (W, 2) of every wedge in its picture.
+        wedges: of the mesh.
+        count: of patches.
+        page_px: side of a page.
+        most_pages: the texture is made coarser until it needs no more.
+    """
+    low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+    np.minimum.at(low, wedges.chart, pixels)
+    np.maximum.at(high, wedges.chart, pixels)
+    widest = float((high - low).max(initial=1.0))
+    scale = min(1.0, (page_px - 2 * PADDING_PX - 2) / widest)
+    while True:
+        source = np.floor(low * scale).astype(np.int64) - PADDING_PX
+        box = np.ceil(high * scale).astype(np.int64) + PADDING_PX - source
+        page, corner = pack(box, page_px)
+        pages = int(page.max(initial=0)) + 1
+        if pages <= most_pages:
+            break
+        scale *= 0.95 * float(np.sqrt(most_pages / pages))
+    if pages == 1:  # the smallest page that does
+        side = 256
+        while side < page_px:
+            if side >= box.max(initial=0):
+                trial_page, trial = pack(box, side)
+                if trial_page.max(initial=0) == 0:
+                    page, corner, page_px = trial_page, trial, side
+                    break
+            side *= 2
+    sizes = []
+    for number in range(pages):
+        mine = page == number
+        used = int((corner[mine, 1] + box[mine, 1]).max(initial=1))
+        sizes.append((page_px, -(-used // 4) * 4))
+    return Atlas(sizes=tuple(sizes), page=page, corner=corner, source=source, box=box, scale=scale)
+
+
+def pack(boxes: NDArray[np.int64], side: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Put boxes onto square pages along their skyline, tallest first, each as low as it goes.
+
+    Args:
+        boxes: (C, 2) widths and heights, none over `side`.
+        side: of a page.
+
+    Returns:
+        Page (C,) and corner (C, 2) of every box; no two of a page overlap.
+    """
+    page = np.zeros(len(boxes), np.int32)
+    corner = np.zeros((len(boxes), 2), np.int64)
+    skylines: list[list[tuple[int, int]]] = []
+    for box in np.lexsort((np.arange(len(boxes)), -boxes[:, 0], -boxes[:, 1])):
+        width, height = int(boxes[box, 0]), int(boxes[box, 1])
+        for number in range(len(skylines) + 1):
+            if number == len(skylines):
+                skylines.append([(0, 0)])
+            found = _lowest(skylines[number], width, side)
+            if found is not None and found[1] + height <= side:
+                x, y = found
+                page[box], corner[box] = number, (x, y)
+                skylines[number] = _raised(skylines[number], x, x + width, y + height)
+                break
+    return page, corner
+
+
+def _lowest(skyline: Sequence[tuple[int, int]], width: int, side: int) -> tuple[int, int] | None:
+    """Leftmost of the lowest places for a width; a skyline lists where steps start, and levels."""
+    best: tuple[int, int] | None = None
+    for first, (x, _) in enumerate(skyline):
+        if x + width > side:
+            break
+        level = 0
+        for start, y in skyline[first:]:
+            if start >= x + width:
+                break
+            level = max(level, y)
+        if best is None or level < best[1]:
+            best = (x, level)
+    return best
+
+
+def _raised(
+    skyline: Sequence[tuple[int, int]], west: int, east: int, level: int
+) -> list[tuple[int, int]]:
+    """The skyline once what is between two places stands at a level."""
+    under = [y for x, y in skyline if x <= east][-1]
+    kept = [(x, y) for x, y in skyline if x < west]
+    beyond = [(x, y) for x, y in skyline if x > east]
+    return [*kept, (west, level), (east, under), *beyond]

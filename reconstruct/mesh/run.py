@@ -1,0 +1,169 @@
+"""The textured mesh: a surface through the cloud, painted by the views that see it best."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from alice_survey.artefacts import Stage, need_stage, read_json, run_stage, write_json
+from alice_survey.config import ReconstructConfig, SurveyConfig
+from alice_survey.errors import warn
+from alice_survey.frames import Array
+from reconstruct.dense.run import picture_files
+from reconstruct.dense.stereo_pairs import points_of_views
+from reconstruct.mesh.cloud_file import open_cloud
+from reconstruct.mesh.formats import GLB_AXES, write_glb, write_mesh_ply, write_obj
+from reconstruct.mesh.labels import choose_views, make_charts
+from reconstruct.mesh.preview import render_oblique
+from reconstruct.mesh.surface import TRIM_STEPS, Mesh, mesh_cloud
+from reconstruct.mesh.texture import Textured, colours_of_cloud, paint
+from reconstruct.mesh.topology import face_areas
+from reconstruct.mesh.visibility import find_candidates, save_geometry
+from reconstruct.model import SparseModel, WorldFrame, read_model
+from reconstruct.mosaic.light import read_light
+from reconstruct.raster import write_png
+
+MOST_TRIANGLES = 4_000_000
+"""Where the settings name no number."""
+_LIFT_STEPS = 0.5
+"""Height over the surface, in spacings of the cloud, at which lines of sight start."""
+
+
+def run_mesh(workspace: Path, config: SurveyConfig, threads: int) -> bool:
+    """Mesh and texture a finished surface and write `mesh/`.
+
+    Returns:
+        True when done, False when nothing had changed.
+
+    Raises:
+        ReconstructionError: the cloud carries no surface.
+        WorkspaceError: a stage is missing.
+    """
+    need_stage(workspace, "images", "image")
+    sparse = need_stage(workspace, "sparse", "reconstruct")
+    dense = need_stage(workspace, "dense", "reconstruct")
+    model = read_model(sparse)
+    settings = config.reconstruct.model_dump(
+        mode="json", include={"mesh_triangles", "mesh_error_px", "mesh_page_px"}
+    )
+    stage = Stage(
+        name="mesh",
+        version=1,
+        settings=settings,
+        inputs=[
+            sparse,
+            dense / "cloud.ply",
+            dense / "cloud.json",
+            dense / "light.json",
+            *picture_files(workspace, sparse, model),
+        ],
+    )
+
+    def work(folder: Path) -> None:
+        build_mesh(workspace, model, folder, config.reconstruct, threads)
+
+    return run_stage(workspace, stage, work)
+
+
+def build_mesh(
+    workspace: Path, model: SparseModel, folder: Path, settings: ReconstructConfig, threads: int
+) -> None:
+    """Do the work of the stage in a folder; see `run_mesh`."""
+    dense = workspace / "dense"
+    about = read_json(dense / "cloud.json")
+    light = read_light(dense / "light.json")
+    offset = np.array(about["offset_east_north_up"])
+    step, pixel = float(about["thinned_to"]), ground_pixel(model)
+    views = [view for view in model.views if view.image in light.gains]
+    cloud = open_cloud(dense / "cloud.ply")
+    mesh = mesh_cloud(
+        cloud,
+        step,
+        settings.mesh_error_px * pixel,
+        settings.mesh_triangles or MOST_TRIANGLES,
+        threads,
+    )
+    scratch = folder / "scratch"
+    scratch.mkdir(exist_ok=True)
+    save_geometry(scratch / "mesh.npz", mesh.vertices, mesh.triangles, offset)
+    candidates = find_candidates(
+        scratch / "mesh.npz", len(mesh.triangles), workspace, views, _LIFT_STEPS * step, threads
+    )
+    label = choose_views(mesh.vertices, mesh.triangles, candidates)
+    del candidates
+    textured = paint(
+        folder,
+        mesh.vertices,
+        mesh.triangles,
+        offset,
+        make_charts(mesh.vertices, mesh.triangles, label),
+        views,
+        workspace,
+        light,
+        colours_of_cloud(cloud, mesh.vertices, step),
+        plain_pixel=pixel,
+        page_px=settings.mesh_page_px,
+        threads=threads,
+    )
+    shutil.rmtree(scratch)
+    facts = mesh_facts(mesh, textured, offset, step, model.frame)
+    if facts["textured_share"] < 0.5:
+        warn(
+            f"only {facts['textured_share']:.0%} of the mesh is seen whole by a picture; the rest "
+            "has the colours of the cloud"
+        )
+    write_mesh(folder, textured, facts)
+
+
+def write_mesh(folder: Path, mesh: Textured, facts: dict[str, Any]) -> None:
+    """Write `mesh.glb`, `.obj`, `.mtl`, `.ply`, `.json` and `.png` beside the pages."""
+    offset = " ".join(repr(value) for value in facts["offset_east_north_up"])
+    comments = [
+        f"offset_east_north_up {offset}",
+        f"frame {facts['frame']}, unit {facts['unit']}, x east, y north, z up",
+        f"vertical datum: {facts['vertical_datum']}",
+    ]
+    write_glb(folder / "mesh.glb", mesh, {**facts, "axes": GLB_AXES})
+    write_obj(folder / "mesh.obj", mesh, comments)
+    triangles = mesh.wedges.vertex[mesh.wedges.triangles].astype(np.int32)
+    write_mesh_ply(folder / "mesh.ply", mesh.vertices, triangles, mesh.colours, comments)
+    write_json(folder / "mesh.json", facts)
+    write_png(folder / "mesh.png", render_oblique(mesh))
+
+
+def mesh_facts(
+    mesh: Mesh, textured: Textured, offset_enu: Array, step: float, frame: WorldFrame
+) -> dict[str, Any]:
+    """What the files cannot say."""
+    area = face_areas(mesh.vertices, mesh.triangles)
+    return {
+        "format": "alice-survey mesh",
+        "version": 1,
+        "triangles": len(mesh.triangles),
+        "vertices": len(mesh.vertices),
+        "area": round(float(area.sum()), 6),
+        "textured_share": round(float(area[textured.label >= 0].sum() / area.sum()), 6),
+        "patches": int(textured.wedges.chart.max()) + 1,
+        "pages": [page.name for page in textured.pages],
+        "texture_scale": round(textured.scale, 6),
+        "spacing": step,
+        "gaps_bridged": 2 * TRIM_STEPS * step,
+        "decimation_error": mesh.error,
+        "unit": frame.unit,
+        "frame": frame.name,
+        "vertical_datum": frame.vertical_datum,
+        "axes": {"obj_ply": ["east", "north", "up"], "glb": GLB_AXES},
+        "offset_east_north_up": [float(value) for value in offset_enu],
+        "notes": list(frame.notes),
+    }
+
+
+def ground_pixel(model: SparseModel) -> float:
+    """Median over the views of the side of a pixel on the ground."""
+    sides = [
+        np.median(view.world_from_cam.inv().apply(points)[:, 2]) / np.sqrt(view.fx_px * view.fy_px)
+        for view, points in zip(model.views, points_of_views(model), strict=True)
+        if len(points)
+    ]
+    return float(np.median(sides))

@@ -1,0 +1,132 @@
+"""Clean triangle meshes: every edge has one or two faces, every vertex one fan of them."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from alice_survey.frames import Array
+
+Triangles = NDArray[np.int32]
+
+
+def edges_of(triangles: Triangles) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Edges of a mesh.
+
+    Returns:
+        (E, 2) vertex numbers, the smaller first, in ascending order; and for each of the 3 T sides
+        (side s of triangle t, from corner s to the next, is 3 t + s) the number of its edge.
+    """
+    sides = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1).reshape(-1, 2)
+    sides = np.sort(sides.astype(np.int64), axis=1)
+    base = int(sides.max(initial=0)) + 1
+    key, edge = np.unique(sides[:, 0] * base + sides[:, 1], return_inverse=True)
+    return np.stack([key // base, key % base], axis=1), edge.reshape(-1)
+
+
+def triangulated(vertices: Array, quads: NDArray[np.int32]) -> Triangles:
+    """Quadrilaterals cut along their shorter diagonal."""
+    corners = vertices[quads]
+    first = np.linalg.norm(corners[:, 0] - corners[:, 2], axis=1)
+    second = np.linalg.norm(corners[:, 1] - corners[:, 3], axis=1)
+    turned = np.where((second < first)[:, None], np.roll(quads, -1, axis=1), quads)
+    return np.ascontiguousarray(turned[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3))
+
+
+def without_folds(vertices: Array, triangles: Triangles) -> Triangles:
+    """Triangles less those without area and those at edges that more than two share."""
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    longest = np.maximum(np.maximum(_square(b - a), _square(c - b)), _square(a - c))
+    sound = _square(normal) > (1e-6 * longest) ** 2
+    triangles = triangles[sound & (np.ptp(np.sort(triangles, 1), axis=1) > 0)]
+    while True:
+        edges, edge = edges_of(triangles)
+        crowded = np.bincount(edge, minlength=len(edges)) > 2
+        bad = crowded[edge].reshape(-1, 3).any(axis=1)
+        if not bad.any():
+            return triangles
+        triangles = triangles[~bad]
+
+
+def split_fans(vertices: Array, triangles: Triangles) -> tuple[Array, Triangles, NDArray[np.int64]]:
+    """Give each fan of triangles around a vertex a vertex of its own; drop unused vertices.
+
+    Returns:
+        Vertices, triangles, and of which vertex each is a copy.
+    """
+    edges, edge = edges_of(triangles)
+    order = np.argsort(edge, kind="stable")
+    first = order[np.searchsorted(edge[order], np.arange(len(edges)))]
+    count = np.bincount(edge, minlength=len(edges))
+    twin = np.where(count == 2, order[np.minimum(
+        np.searchsorted(edge[order], np.arange(len(edges))) + 1, max(len(order) - 1, 0)
+    )], -1)  # fmt: skip
+    shared = twin >= 0
+    one, other = first[shared], twin[shared]
+    corner = np.arange(triangles.size)
+    end = corner // 3 * 3 + (corner + 1) % 3
+    flat = triangles.reshape(-1)
+    # the two triangles of an edge join their corners at either end of it
+    same = flat[one] == flat[other]
+    rows = np.concatenate([one, end[one]])
+    columns = np.concatenate([np.where(same, other, end[other]), np.where(same, end[other], other)])
+    graph = coo_array((np.ones(len(rows), np.int8), (rows, columns)), (flat.size, flat.size))
+    total, fan = connected_components(graph, directed=False)
+    source = np.empty(total, np.int64)
+    source[fan] = flat
+    order = np.argsort(source, kind="stable")  # keep the order of the vertices
+    place = np.empty(total, np.int32)
+    place[order] = np.arange(total, dtype=np.int32)
+    split: Triangles = np.asarray(place[fan], np.int32).reshape(-1, 3)
+    return vertices[source[order]], split, source[order]
+
+
+def component_areas(vertices: Array, triangles: Triangles) -> tuple[NDArray[np.int32], Array]:
+    """Number of the connected part of every triangle (through edges), and the parts' areas."""
+    edges, edge = edges_of(triangles)
+    count = len(triangles)
+    face = np.arange(3 * count) // 3
+    graph = coo_array(
+        (np.ones(3 * count, np.int8), (face, count + edge)),
+        (count + len(edges), count + len(edges)),
+    )
+    total, part = connected_components(graph, directed=False)
+    own = part[:count].astype(np.int32)
+    area = np.bincount(own, weights=face_areas(vertices, triangles), minlength=total)
+    return own, area
+
+
+def face_areas(vertices: Array, triangles: Triangles) -> Array:
+    """(T,) in squared units of length."""
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    areas: Array = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return areas
+
+
+def face_normals(vertices: Array, triangles: Triangles) -> Array:
+    """(T, 3) unit normals; 0 of a triangle without area."""
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    unit: Array = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    return unit
+
+
+def vertex_normals(vertices: Array, triangles: Triangles) -> Array:
+    """(V, 3) unit normals weighted by the area of the faces around."""
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    total = np.stack(
+        [
+            np.bincount(triangles.ravel(), np.repeat(normal[:, k], 3), len(vertices))
+            for k in range(3)
+        ],
+        axis=1,
+    )
+    unit: Array = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
+    return unit
+
+
+def _square(vectors: Array) -> Array:
+    square: Array = (vectors * vectors).sum(axis=1)
+    return square

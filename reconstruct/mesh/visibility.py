@@ -1,0 +1,227 @@
+"""Which views see which faces, and how well."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.executor import parallel_map
+from alice_survey.frames import Array
+from reconstruct.mesh.topology import Triangles, face_normals
+from reconstruct.model import View
+from reconstruct.pictures.undistorted import Pictures
+
+CANDIDATES = 8
+"""Views kept for a face."""
+_RIM_PX = 3.0
+"""Pixels at the edges of a picture that are not used."""
+_LEAST_COSINE = 0.15
+"""Between the normal of a face and the line of sight."""
+_BLOCK = 512
+"""Vertices that are held against a view's frame at once."""
+_MARGIN = 0.1
+"""Of the frame, for what a port bends."""
+_SHRINK = 0.8
+"""Rays to the corners of a face start so far from its middle to the corner."""
+_ENU_TO_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+@dataclass(frozen=True, kw_only=True)
+class SightTask:
+    """One view to find the faces of."""
+
+    mesh: Path
+    """File of `save_geometry`."""
+    workspace: Path
+    number: int
+    view: View
+    lift: float
+    """How far over the surface lines of sight start, in the unit of the vertices."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sight:
+    """Faces that one view sees."""
+
+    number: int
+    faces: NDArray[np.int32]
+    quality: NDArray[np.float32]
+    """(N,) pixels a unit of length, less towards the rim of the picture."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Candidates:
+    """The best views of every face, best first."""
+
+    views: NDArray[np.int32]
+    """(T, CANDIDATES); -1 where there are no more."""
+    quality: NDArray[np.float32]
+    """(T, CANDIDATES); 0 where there are no more."""
+
+
+def to_world(points_enu: Array, offset_enu: Array) -> Array:
+    """Points (N, 3) of a mesh, east, north, up from an offset, in the world frame of views."""
+    world: Array = (points_enu + offset_enu) @ _ENU_TO_NED.T
+    return world
+
+
+def save_geometry(path: Path, vertices: Array, triangles: Triangles, offset_enu: Array) -> None:
+    """Keep a mesh where processes find it."""
+    np.savez(path, vertices=vertices, triangles=triangles, offset=offset_enu)
+
+
+def find_candidates(
+    mesh: Path, faces: int, workspace: Path, views: Sequence[View], lift: float, threads: int
+) -> Candidates:
+    """The best views of every face.
+
+    Args:
+        mesh: file of `save_geometry`.
+        faces: how many it has.
+        workspace: with the pictures.
+        views: to choose from.
+        lift: see `SightTask`.
+        threads: processes.
+    """
+    tasks = [
+        SightTask(mesh=mesh, workspace=workspace, number=number, view=view, lift=lift)
+        for number, view in enumerate(views)
+    ]
+    numbers = np.full((faces, CANDIDATES), -1, np.int32)
+    quality = np.zeros((faces, CANDIDATES), np.float32)
+    for sight in parallel_map(see_faces, tasks, threads=threads, label="lines of sight"):
+        mine, rows = sight.quality, sight.faces
+        worst = quality[rows, -1] < mine
+        rows, mine = rows[worst], mine[worst]
+        quality[rows, -1], numbers[rows, -1] = mine, sight.number
+        order = np.argsort(-quality[rows], axis=1, kind="stable")
+        quality[rows] = np.take_along_axis(quality[rows], order, axis=1)
+        numbers[rows] = np.take_along_axis(numbers[rows], order, axis=1)
+    return Candidates(views=numbers, quality=quality)
+
+
+def see_faces(task: SightTask) -> Sight:
+    """The faces that a view sees whole, unmasked, from their front."""
+    vertices, triangles, offset, scene, spheres = _geometry(task.mesh)
+    view = task.view
+    near = vertices_near(view, vertices, spheres, offset)
+    valid = _pictures(task.workspace).valid(view.image)
+    pixels = np.full((len(vertices), 2), np.nan)
+    pixels[near] = view.project(to_world(vertices[near], offset))
+    inside = usable_pixels(pixels, valid)
+    faces = np.flatnonzero(inside[triangles].all(axis=1))
+    return Sight(
+        number=task.number,
+        **_quality(vertices, triangles, faces, pixels, view, offset, scene, task.lift),
+    )
+
+
+def vertices_near(
+    view: View, vertices: Array, spheres: tuple[Array, Array], offset_enu: Array
+) -> NDArray[np.intp]:
+    """Numbers of the vertices in blocks that may reach into a view's frame."""
+    centres, radii = spheres
+    points = view.world_from_cam.inv().apply(to_world(centres, offset_enu))
+    low = np.array([-view.cx_px / view.fx_px, -view.cy_px / view.fy_px])
+    high = low + np.array([view.width_px / view.fx_px, view.height_px / view.fy_px])
+    reach = _MARGIN * (high - low)
+    near = points[:, 2] > -radii
+    for axis in range(2):
+        for slope, sign in ((high[axis] + reach[axis], 1.0), (low[axis] - reach[axis], -1.0)):
+            beyond = sign * (points[:, axis] - slope * points[:, 2]) / np.hypot(1.0, slope)
+            near &= beyond < radii
+    blocks = np.flatnonzero(near)
+    numbers = (blocks[:, None] * _BLOCK + np.arange(_BLOCK)).reshape(-1)
+    return numbers[numbers < len(vertices)]
+
+
+def block_spheres(vertices: Array) -> tuple[Array, Array]:
+    """Centres (B, 3) and radii (B,) of spheres around every `_BLOCK` vertices."""
+    starts = np.arange(0, len(vertices), _BLOCK)
+    low = np.minimum.reduceat(vertices, starts)
+    high = np.maximum.reduceat(vertices, starts)
+    return 0.5 * (low + high), 0.5 * np.linalg.norm(high - low, axis=1)
+
+
+def usable_pixels(pixels: Array, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Whether pixels (N, 2) lie inside of a picture, off its rim, where it may be used."""
+    height, width = valid.shape
+    with np.errstate(invalid="ignore"):
+        high = np.array([width, height]) - _RIM_PX
+        inside = np.asarray(((pixels >= _RIM_PX) & (pixels <= high)).all(axis=1))
+    at = np.floor(pixels[inside]).astype(np.intp)
+    inside[inside] = valid[at[:, 1], at[:, 0]]
+    return inside
+
+
+def _quality(
+    vertices: Array,
+    triangles: Triangles,
+    faces: NDArray[np.intp],
+    pixels: Array,
+    view: View,
+    offset: Array,
+    scene: Any,
+    lift: float,
+) -> dict[str, Any]:
+    import open3d as o3d
+
+    camera = view.world_from_cam.translation @ _ENU_TO_NED - offset
+    corners = vertices[triangles[faces]]
+    middle = corners.mean(axis=1)
+    normal = face_normals(vertices, triangles[faces])
+    sight = camera - middle
+    distance = np.linalg.norm(sight, axis=1)
+    cosine = (normal * sight).sum(axis=1) / np.maximum(distance, 1e-30)
+    p = pixels[triangles[faces]]
+    a, b = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
+    area_px = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    e, f = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = 0.5 * np.linalg.norm(np.cross(e, f), axis=1)
+    facing = (cosine > _LEAST_COSINE) & (area > 0)
+    towards = middle[:, None] * (1 - _SHRINK) + corners * _SHRINK
+    spots = np.concatenate([middle[:, None], towards], axis=1)
+    spots = spots[facing] + lift * normal[facing][:, None]
+    away = camera - spots
+    reach = np.linalg.norm(away, axis=2, keepdims=True)
+    rays = np.concatenate([spots, away / reach], axis=2).astype(np.float32)
+    hidden = np.zeros(rays.shape[:2], np.bool_)
+    if len(rays):
+        hit = scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()
+        hidden = hit < reach[..., 0]
+    seen = np.flatnonzero(facing)[~hidden.any(axis=1)]
+    size = np.array([view.width_px, view.height_px])
+    inset = np.minimum(p[seen], size - p[seen]).min(axis=(1, 2)) / (0.5 * size.min())
+    taper = np.clip(inset, 0.02, 1.0)
+    return {
+        "faces": faces[seen].astype(np.int32),
+        "quality": (np.sqrt(area_px[seen] / area[seen]) * np.sqrt(taper)).astype(np.float32),
+    }
+
+
+@lru_cache(maxsize=1)
+def _geometry(path: Path) -> tuple[Array, Triangles, Array, Any, tuple[Array, Array]]:
+    with np.load(path) as data:
+        vertices, triangles, offset = data["vertices"], data["triangles"], data["offset"]
+    return vertices, triangles, offset, ray_scene(vertices, triangles), block_spheres(vertices)
+
+
+def ray_scene(vertices: Array, triangles: Triangles) -> Any:
+    """A mesh as an Open3D `RaycastingScene`."""
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    scene.add_triangles(
+        o3d.core.Tensor(np.ascontiguousarray(vertices, dtype=np.float32)),
+        o3d.core.Tensor(np.ascontiguousarray(triangles, dtype=np.uint32)),
+    )
+    return scene
+
+
+@lru_cache(maxsize=1)
+def _pictures(workspace: Path) -> Pictures:
+    return Pictures.open(workspace)
