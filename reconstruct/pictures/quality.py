@@ -7,7 +7,7 @@ all is listed with the reason. Nothing is left out of the reconstruction because
 import math
 from collections import Counter, defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,7 @@ _MAD_TO_SIGMA = 1.4826
 _SHARED_POINTS = 15
 """Common points of the model from which two pictures count as overlapping."""
 _FINE_PX, _MID_PX, _COARSE_PX = 1.0, 2.0, 5.0
+_JUDGED = ("sharpness", "contrast", "brightness", "veil")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +89,7 @@ class MeasureTask:
 def measure_file(task: MeasureTask) -> PictureQuality:
     """Read and measure one picture; a file that cannot be used gives the reason, never an error."""
     record = task.record
-    known = {"image": record.image, "camera": record.camera, "station": record.station}
+    bare = PictureQuality(image=record.image, camera=record.camera, station=record.station)
     try:
         path = task.images / record.image
         pixels = decode(path) if path.is_file() else None
@@ -97,10 +98,11 @@ def measure_file(task: MeasureTask) -> PictureQuality:
         mask = None
         if record.mask:
             mask = read_mask(task.images / record.mask, (pixels.shape[1], pixels.shape[0]))
-        return PictureQuality(**known, **measure(pixels, mask))
+        figures: dict[str, Any] = dict(measure(pixels, mask))
+        return replace(bare, **figures)
     except (ImageError, OSError) as error:
         text = why(error).removeprefix(f"{task.images / record.image}: ")
-        return PictureQuality(**known, reasons=(f"unreadable: {text}",))
+        return replace(bare, reasons=(f"unreadable: {text}",))
 
 
 def measure(pixels: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> dict[str, float]:
@@ -119,7 +121,7 @@ def measure(pixels: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> dict
     full = float(np.iinfo(pixels.dtype).max)
     eight = (pixels.astype(np.float32) * (255.0 / full)).round().astype(np.uint8)
     grey = cv2.cvtColor(eight, cv2.COLOR_BGR2GRAY) if eight.ndim == 3 else eight
-    use = np.ones(grey.shape, dtype=np.bool_) if mask is None else mask
+    use: NDArray[np.bool_] = np.ones(grey.shape, dtype=np.bool_) if mask is None else mask
     blocks = _whole_blocks(use)
     if not blocks.any():
         raise ImageError(
@@ -188,13 +190,11 @@ def judge(found: Sequence[PictureQuality]) -> list[PictureQuality]:
 
     Medians are those of a picture's own camera: two cameras may have unlike lenses and lamps.
     """
-    from dataclasses import replace
-
     by_camera: dict[str, list[PictureQuality]] = defaultdict(list)
     for quality in found:
         by_camera[quality.camera].append(quality)
     spreads = {
-        camera: {name: _middle(pictures, name) for name in ("sharpness", "contrast", "brightness")}
+        camera: {name: _middle(pictures, name) for name in _JUDGED}
         for camera, pictures in by_camera.items()
     }
     return [replace(q, reasons=q.reasons + _reasons(q, spreads[q.camera])) for q in found]
@@ -218,7 +218,10 @@ def _reasons(quality: PictureQuality, spreads: dict[str, tuple[float, float]]) -
         reasons.append(f"overexposed: {quality.bright_share:.0%} of its pixels are burnt out")
     if quality.dark_share > MOST_DARK:
         reasons.append(f"underexposed: {quality.dark_share:.0%} of its pixels are black")
-    for name, word in (("sharpness", "blurred"), ("contrast", "hazy"), ("brightness", "dark")):
+    veil, veil_sigma = spreads["veil"]
+    veiled = math.log(max(quality.veil, 1e-6)) > veil + OUTLIER_SIGMAS * veil_sigma
+    pale = "hazy" if veiled and quality.bright_share <= MOST_BRIGHT else "pale"
+    for name, word in (("sharpness", "blurred"), ("contrast", pale), ("brightness", "dark")):
         middle, sigma = spreads[name]
         below = middle - math.log(max(getattr(quality, name), 1e-6))
         if below > max(OUTLIER_SIGMAS * sigma, math.log(OUTLIER_FACTOR)):
@@ -232,8 +235,6 @@ def _reasons(quality: PictureQuality, spreads: dict[str, tuple[float, float]]) -
 
 def add_overlap(found: Sequence[PictureQuality], sparse: Path) -> list[PictureQuality]:
     """Add what the sparse model says about points and overlap with other stations."""
-    from dataclasses import replace
-
     from reconstruct.model import read_model
 
     model = read_model(sparse)

@@ -74,11 +74,16 @@ def _strips(figure: Any, found: Sequence[PictureQuality]) -> None:
             axis.plot(order[own], values[own], ".", markersize=4, label=camera)
         axis.plot(order[flagged], values[flagged], "o", mfc="none", mec="tab:red", markersize=8)
         axis.set_ylabel(label)
-        axis.set_ylim(bottom=0)
+        gone = np.isnan(values)
+        axis.plot(order[gone], np.zeros(gone.sum()), "x", color="tab:red", clip_on=False)
+        axis.set_ylim(0, 1.15 * np.nanmax(values, initial=1e-3))
         axis.grid(alpha=0.3)
-    axes[0].set_title(f"{len(found)} pictures in their order; {flagged.sum()} ringed to look at")
-    axes[0].legend(loc="upper right", ncols=len(cameras))
+    axes[0].set_title(
+        f"{len(found)} pictures in their order; {flagged.sum()} to look at (crosses: unreadable)"
+    )
+    axes[0].legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=len(cameras), frameon=False)
     axes[-1].set_xlabel("picture")
+    axes[-1].xaxis.get_major_locator().set_params(integer=True)
 
 
 def _thumbnail(panel: Axes, images: Path, quality: PictureQuality) -> None:
@@ -99,4 +104,4 @@ def _thumbnail(panel: Axes, images: Path, quality: PictureQuality) -> None:
 
 
 def _short(reason: str) -> str:
-    return reason if len(reason) <= 46 else reason[:45] + "…"
+    return reason if len(reason) <= 54 else reason[:53] + "…"
