@@ -17,7 +17,7 @@ from alice_survey.frames import Array, Datum, rotation_from_attitude
 from alice_survey.manifest import ImageRecord
 from camera_calib.rig import Rig
 from reconstruct.lenses.lens import Lens
-from reconstruct.mapping.bundle import Adjust, adjust_freely, all_pictures, held_options
+from reconstruct.mapping.bundle import adjust_freely, all_pictures, held_options
 from reconstruct.mapping.mapper import Mapped, model_baseline, scale_model
 from reconstruct.matching.pairs import positions_ned
 
@@ -54,31 +54,42 @@ def pinhole_positions(
     return positions, sigmas
 
 
-def adjuster(
-    records: Sequence[ImageRecord], rig: Rig, lenses: Mapping[str, Lens], datum: Datum | None
-) -> Adjust:
-    """How to adjust models of these pictures: with positions where they are told and agree.
+class NavigationAdjuster:
+    """Adjusts models with the positions of navigation, where they are told and agree."""
 
-    Args:
-        records: pictures; number i has the id i + 1 in the model.
-        rig: cameras.
-        lenses: by camera.
-        datum: of the positions; None where there are none.
-    """
-    if datum is None:
-        return adjust_freely
-    told = pinhole_positions(records, rig, lenses, datum)
-    agree = True
+    def __init__(
+        self,
+        records: Sequence[ImageRecord],
+        rig: Rig,
+        lenses: Mapping[str, Lens],
+        datum: Datum | None,
+    ) -> None:
+        """What navigation says.
 
-    def adjust(mapped: Mapped) -> Mapped:
-        nonlocal agree
-        if not (mapped.scaled and agree):
-            return adjust_freely(mapped)
-        refined = refine_with_positions(mapped, records, *told)
-        agree = refined is not mapped
-        return refined if agree else adjust_freely(mapped)
+        Args:
+            records: pictures; number i has the id i + 1 in the model.
+            rig: cameras.
+            lenses: by camera.
+            datum: of the positions; None where there are none.
+        """
+        self._records = records
+        self._told = None if datum is None else pinhole_positions(records, rig, lenses, datum)
+        self._used = False
 
-    return adjust
+    def __call__(self, mapped: Mapped) -> Mapped:
+        """The adjusted model."""
+        if self._told is not None and mapped.scaled:
+            refined = refine_with_positions(mapped, self._records, *self._told)
+            self._used = refined is not mapped
+            if self._used:
+                return refined
+            self._told = None  # said once
+        return adjust_freely(mapped)
+
+    @property
+    def sigmas(self) -> Array | None:
+        """(N, 3) of the positions that shaped the last model, along its axes; None without."""
+        return self._told[1] if self._used and self._told is not None else None
 
 
 def refine_with_positions(
@@ -97,6 +108,8 @@ def refine_with_positions(
         with the pictures.
     """
     model = pycolmap.Reconstruction(mapped.model)
+    model.update_point_3d_errors()
+    before = model.compute_mean_reprojection_error()
     known = _one_a_station(model, positions, sigmas)
     if len(known) < _LEAST_STATIONS:
         return mapped
@@ -109,7 +122,6 @@ def refine_with_positions(
     told = middle + (told - middle) * mapped.baseline / model_baseline(trial)
     summary = _adjuster(model, _priors(model, known, told, sigmas)).solve()
     model.update_point_3d_errors()
-    before = mapped.model.compute_mean_reprojection_error()
     after = model.compute_mean_reprojection_error()
     if not (summary.is_solution_usable() and after <= _WORST_GROWTH * before):
         warn(

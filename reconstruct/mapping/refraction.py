@@ -18,16 +18,16 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.errors import warn
 from alice_survey.frames import Array
 from reconstruct.lenses.lens import FlatPortLens, Lens
 from reconstruct.lenses.range_shift import field_of
+from reconstruct.mapping.arrays import Indices, observed
 from reconstruct.mapping.bundle import Adjust, adjust_freely
 from reconstruct.mapping.database import Observations, write_database
-from reconstruct.mapping.mapper import Mapped, as_transform
+from reconstruct.mapping.mapper import Mapped
 
 SETTLED_PX = 1e-4
 """Keypoints that move less have converged."""
@@ -75,23 +75,12 @@ class _Picture:
     working_m: float
     """z0, at which the warp is exact; infinite without a port."""
 
-    def ideal(self, at: NDArray[np.intp], depth_m: Array) -> Array:
+    def ideal(self, at: Indices, depth_m: Array) -> Array:
         """Where the pinhole sees the spots of some keypoints, (M, 2), from their depths (M,)."""
         metres = np.clip(depth_m, _NEAREST * self.working_m, _FARTHEST * self.working_m)
         shift = self.field[at] * (1.0 / metres - 1.0 / self.working_m)[:, None]
         ideal: Array = self.warped[at] + shift
         return ideal
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Tracks:
-    """Which keypoints show which points."""
-
-    point_ids: NDArray[np.int64]
-    """(P,) sorted."""
-    keypoints: Mapping[int, NDArray[np.intp]]
-    """By picture: (M,) indices of keypoints that have a point, and of their points."""
-    points: Mapping[int, NDArray[np.intp]]
 
 
 class Keypoints:
@@ -110,11 +99,11 @@ class Keypoints:
             if image.has_pose
         }
         self._now = {number: p.warped.copy() for number, p in self._pictures.items()}
-        self._tracks = _tracks(mapped.model)
+        self._seen = observed(mapped.model)
 
     def look_again(self, model: pycolmap.Reconstruction) -> None:
         """Learn which keypoints have a point, after that changed."""
-        self._tracks = _tracks(model)
+        self._seen = observed(model)
 
     @property
     def through_ports(self) -> bool:
@@ -124,8 +113,7 @@ class Keypoints:
     def metres_per_unit(self, model: pycolmap.Reconstruction) -> float:
         """Metres in a unit of a model without scale, whose median depth is the working depth."""
         working = [p.working_m for p in self._pictures.values() if np.isfinite(p.working_m)]
-        depths = np.concatenate(list(self._depths(model).values()))
-        return float(np.median(working) / np.median(depths))
+        return float(np.median(working) / np.median(self._depths(model)))
 
     def correct(
         self, model: pycolmap.Reconstruction, metres_per_unit: float
@@ -140,11 +128,13 @@ class Keypoints:
             The largest move, and the root mean square of the whole shift, pixels.
         """
         largest, squares, count = 0.0, 0.0, 0
-        for number, depth in self._depths(model).items():
-            picture, at = self._pictures[number], self._tracks.keypoints[number]
+        depths = metres_per_unit * self._depths(model)
+        for n, number in enumerate(self._seen.pictures.tolist()):
+            picture, rows = self._pictures[number], self._seen.of(n)
+            at = self._seen.keypoint[rows]
             if not (np.isfinite(picture.working_m) and len(at)):
                 continue
-            ideal = picture.ideal(at, depth * metres_per_unit)
+            ideal = picture.ideal(at, depths[rows])
             largest = max(largest, self._put(model, number, at, ideal))
             squares += float(((ideal - picture.warped[at]) ** 2).sum())
             count += len(at)
@@ -154,17 +144,17 @@ class Keypoints:
         """Move the keypoints that have no point by the depth of the nearest one that has."""
         from scipy.spatial import KDTree
 
-        for number, depth in self._depths(model).items():
-            picture, at = self._pictures[number], self._tracks.keypoints[number]
+        depths = metres_per_unit * self._depths(model)
+        for n, number in enumerate(self._seen.pictures.tolist()):
+            picture, rows = self._pictures[number], self._seen.of(n)
+            at = self._seen.keypoint[rows]
             rest = np.setdiff1d(np.arange(len(picture.warped)), at)
             if not (np.isfinite(picture.working_m) and len(at) and len(rest)):
                 continue
             _, nearest = KDTree(picture.warped[at]).query(picture.warped[rest])
-            self._put(model, number, rest, picture.ideal(rest, depth[nearest] * metres_per_unit))
+            self._put(model, number, rest, picture.ideal(rest, depths[rows][nearest]))
 
-    def _put(
-        self, model: pycolmap.Reconstruction, number: int, at: NDArray[np.intp], ideal: Array
-    ) -> float:
+    def _put(self, model: pycolmap.Reconstruction, number: int, at: Indices, ideal: Array) -> float:
         now, points = self._now[number], model.images[number].points2D
         moved = np.linalg.norm(ideal - now[at], axis=1)
         far = np.flatnonzero(moved > _UNMOVED_PX)
@@ -173,13 +163,9 @@ class Keypoints:
             points[i].xy = xy
         return float(moved.max())
 
-    def _depths(self, model: pycolmap.Reconstruction) -> dict[int, Array]:
-        """Of the keypoints that have a point, before the pinholes' centres, by picture."""
-        xyz = np.array([model.points3D[i].xyz for i in self._tracks.point_ids.tolist()])
-        depths: dict[int, Array] = {}
-        for number, rows in self._tracks.points.items():
-            cam_from_world = as_transform(model.images[number].cam_from_world())
-            depths[number] = cam_from_world.apply(xyz[rows])[:, 2] if len(rows) else np.zeros(0)
+    def _depths(self, model: pycolmap.Reconstruction) -> Array:
+        """Of the keypoints that have a point, before the pinholes' centres."""
+        depths: Array = self._seen.in_cameras(model, self._seen.points(model))[:, 2]
         return depths
 
 
@@ -265,6 +251,7 @@ def _judge_again(
         scratch = folder / "refraction"
         shutil.rmtree(scratch, ignore_errors=True)
         scratch.mkdir(parents=True)
+        pycolmap.logging.minloglevel = 2
         write_database(scratch / "database.db", seen, cam_from_rig)
         with pycolmap.Database.open(scratch / "database.db") as database:
             cache = pycolmap.DatabaseCache.create(database, pycolmap.DatabaseCacheOptions())
@@ -291,18 +278,6 @@ def _wrong_px(model: pycolmap.Reconstruction) -> float:
     errors = np.array([point.error for point in model.points3D.values()])
     sigma = float(np.median(errors)) / _RAYLEIGH_MEDIAN
     return float(np.clip(_WRONG_SIGMAS * sigma, _LEAST_WRONG_PX, _MOST_WRONG_PX))
-
-
-def _tracks(model: pycolmap.Reconstruction) -> _Tracks:
-    ids = np.sort(np.fromiter(model.points3D.keys(), dtype=np.int64, count=len(model.points3D)))
-    keypoints, points = {}, {}
-    for number, image in sorted(model.images.items()):
-        if not image.has_pose:
-            continue
-        keypoints[number] = np.array(image.get_observation_point2D_idxs(), dtype=np.intp)
-        mine = [p.point3D_id for p in image.get_observation_points2D()]
-        points[number] = np.searchsorted(ids, np.array(mine, dtype=np.int64))
-    return _Tracks(point_ids=ids, keypoints=keypoints, points=points)
 
 
 def _picture(lens: Lens, warped: Array) -> _Picture:

@@ -23,9 +23,10 @@ from camera_calib.rig import Rig
 from reconstruct.lenses.lens import Lens, flat_port_lens
 from reconstruct.mapping.database import Observations, VerifiedPair
 from reconstruct.mapping.mapper import Mapped, map_calibrated
-from reconstruct.mapping.priors import adjuster
+from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import Convergence, refract
 from reconstruct.mapping.self_calibration import SIMPLE, map_self_calibrated
+from reconstruct.mapping.uncertainty import save_uncertainty
 from reconstruct.mapping.working_range import Distances, find_distances
 from reconstruct.matching.features import find_features, load_features, save_features
 from reconstruct.matching.matches import (
@@ -121,11 +122,13 @@ def run_mapping(
         if inputs.rig is not None:
             poses = {name: inputs.rig.cam_from_rig[name] for name in cameras}
             mapped = map_calibrated(seen, poses, lenses, partial, config.seed)
-            adjust = adjuster(inputs.records, inputs.rig, lenses, inputs.datum)
+            adjust = NavigationAdjuster(inputs.records, inputs.rig, lenses, inputs.datum)
             mapped, refracted = refract(mapped, seen, partial, adjust, poses)
+            sigmas = adjust.sigmas
         else:
             mapped = map_self_calibrated(seen, exif_focal, partial, config.seed)
-            refracted = None
+            refracted, sigmas = None, None
+        save_uncertainty(partial, mapped, inputs.records, sigmas)
         _write(partial, inputs, mapped, distances, refracted)
         shutil.rmtree(partial / "features")
 

@@ -41,20 +41,26 @@ def make_scene(
     noise_px: float = 0.0,
     bias_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
     port_distance_m: float = 0.02,
+    port_tilt_deg: tuple[float, float] = (0.0, 0.0),
+    scale: int = 4,
+    relief_m: float = 0.16,
     seed: int = 5,
 ) -> Scene:
-    """Fly lawnmower lines 1 m apart over relief of about 0.3 m and look at random points.
+    """Fly lawnmower lines 1 m apart over sines of relief and look at random points.
+
+    Relief reaches `relief_m` above and below the mean; pixels are `scale` times those of the
+    camera, which noise in pixels refers to.
 
     Navigation is the truth plus a constant bias and 0.1 degrees of attitude noise.
     """
     rng = np.random.default_rng(seed)
-    camera = CameraConfig(port_distance_m=port_distance_m)
-    rig = design_rig(camera, WaterConfig(), scale=4)
+    camera = CameraConfig(port_distance_m=port_distance_m, port_tilt_deg=port_tilt_deg)
+    rig = design_rig(camera, WaterConfig(), scale=scale)
     length = 0.55 * stations
     north = rng.uniform(-1.5, length + 1.5, points)
     east = rng.uniform(-1.5, lines + 0.5, points)
     relief = 0.1 * np.sin(2.1 * north) + 0.06 * np.cos(3.3 * east + north)
-    points_ned = np.stack([north, east, SEAFLOOR_M + relief], axis=1)
+    points_ned = np.stack([north, east, SEAFLOOR_M + relief * relief_m / 0.16], axis=1)
     records, poses, pixels, ids = [], [], [], []
     for station in range(lines * stations):
         line, step = divmod(station, stations)

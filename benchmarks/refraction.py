@@ -1,0 +1,151 @@
+"""What refraction through a flat port costs, by how it is taken: tracks whose truth is known.
+
+    python benchmarks/refraction.py [--stations 48] [--points 3000] [--oracle]
+
+For port distances of 20 and 50 mm and tilts of 0 and 2 degrees it states the rms of points and
+cameras after rigid alignment: ours, an exact refractive adjustment (slow: minutes), the warp to one
+working depth alone, and COLMAP's self-calibrated OPENCV model of the pixels as taken.
+"""
+
+import argparse
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pycolmap
+
+from alice_survey.frames import Array
+from reconstruct.lenses.lens import self_calibrated_lens
+from reconstruct.mapping.bundle import adjust_freely, all_pictures, held_options
+from reconstruct.mapping.mapper import Mapped
+from reconstruct.mapping.refraction import refract
+from reconstruct.sparse.alignment import align_rigid
+from tests.oracles_refraction import adjust_through_ports
+from tests.reconstruct.scenes import Scene, make_scene
+from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_scene
+
+NOISE_PX, RELIEF_M = 0.3, 0.3
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--stations", type=int, default=48)
+    parser.add_argument("--points", type=int, default=3000)
+    parser.add_argument("--oracle", action="store_true")
+    asked = parser.parse_args()
+    print(f"{'port mm':>8}{'tilt':>6}  {'method':<12}{'points mm':>10}{'cameras mm':>12}{'s':>7}")
+    for port_m in (0.02, 0.05):
+        for tilt_deg in (0.0, 2.0):
+            lines = 4
+            scene = make_scene(
+                lines=lines,
+                stations=asked.stations // lines,
+                points=asked.points,
+                noise_px=NOISE_PX,
+                port_distance_m=port_m,
+                port_tilt_deg=(tilt_deg, 0.0),
+                scale=1,
+                relief_m=RELIEF_M,
+            )
+            for method, points, cameras, seconds in rows(scene, with_oracle=asked.oracle):
+                print(
+                    f"{1e3 * port_m:8.0f}{tilt_deg:6.0f}  {method:<12}{1e3 * points:10.3f}"
+                    f"{1e3 * cameras:12.3f}{seconds:7.1f}",
+                    flush=True,
+                )
+
+
+def rows(scene: Scene, *, with_oracle: bool) -> Sequence[tuple[str, float, float, float]]:
+    """Method, rms of points and of cameras, metres, and seconds."""
+    seen, lenses = warped_scene(scene)
+    start = near_truth(scene, seen, lenses, np.random.default_rng(1))
+    found = []
+    began = time.monotonic()
+    with TemporaryDirectory() as folder:
+        ours, _ = refract(start, seen, Path(folder))
+    found.append(_row("ours", ours, scene, began))
+    if with_oracle:
+        began = time.monotonic()
+        found.append(_oracle_row(ours, scene, began))
+    began = time.monotonic()
+    found.append(_row("warp only", adjust_freely(start), scene, began))
+    began = time.monotonic()
+    found.append(_row("OPENCV", self_calibrated_opencv(scene), scene, began))
+    return found
+
+
+def self_calibrated_opencv(scene: Scene) -> Mapped:
+    """COLMAP's adjustment of the pixels as taken, with OPENCV lenses freed and the true rig."""
+    seen, lenses = warped_scene(scene)
+    rig = scene.rig
+    cameras = {
+        name: pycolmap.Camera(
+            model="OPENCV",
+            width=camera.width_px,
+            height=camera.height_px,
+            params=[
+                camera.fx_px * camera.n_water,
+                camera.fy_px * camera.n_water,
+                camera.cx_px,
+                camera.cy_px,
+                0.0,
+                0.0,
+                0.0,
+                0.0,
+            ],
+        )
+        for name, camera in rig.cameras.items()
+    }
+    plain = replace(seen, cameras=cameras, pixels=scene.pixels)
+    start = near_truth(scene, plain, lenses, np.random.default_rng(1))
+    model = start.model
+    options = held_options()
+    options.refine_focal_length = options.refine_extra_params = True
+    config = all_pictures(model)
+    config.set_constant_rig_from_world_pose(min(model.reg_frame_ids()))
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    shifted = {
+        name: self_calibrated_lens(model.cameras[number]) for number, name in enumerate(cameras, 1)
+    }
+    return replace(start, lenses=shifted)
+
+
+def _row(name: str, mapped: Mapped, scene: Scene, began: float) -> tuple[str, float, float, float]:
+    seconds = time.monotonic() - began
+    pupils, true_pupils, points, true_points = pupils_and_points(mapped, scene)
+    return name, rigid_rms(points, true_points), rigid_rms(pupils, true_pupils), seconds
+
+
+def _oracle_row(ours: Mapped, scene: Scene, began: float) -> tuple[str, float, float, float]:
+    ids = np.array(sorted(ours.model.points3D)) - 1
+    rig = scene.rig
+    references = [
+        pose
+        for pose, record in zip(scene.ned_from_cam, scene.records, strict=True)
+        if record.camera == rig.reference
+    ]
+    poses, points = adjust_through_ports(scene, references, scene.points_ned[ids], ids)
+    pupils = np.array(
+        [(poses[r.station] * rig.cam_from_rig[r.camera].inv()).translation for r in scene.records]
+    )
+    truth = np.array([pose.translation for pose in scene.ned_from_cam])
+    seconds = time.monotonic() - began
+    return (
+        "exact",
+        rigid_rms(points, scene.points_ned[ids]),
+        rigid_rms(pupils, truth),
+        seconds,
+    )
+
+
+def rigid_rms(found: Array, true: Array) -> float:
+    """Root mean square distance after rigid alignment."""
+    return float(np.sqrt(((align_rigid(found, true).apply(found) - true) ** 2).sum(axis=1).mean()))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,313 @@
+"""Normal equations of a block of pictures: what pixels say of stations, points and a shared rig.
+
+Every pixel depends on the pose of one station, on one point, and perhaps on a few parameters that
+all share. With R, c the pose `world_from_rig` and X the point, the pixel depends on
+R^T (X - c) only, so that with P its slopes by X those by a small rotation about the axes of the
+world (R' = exp(turn) R) and by a motion of c are P [X - c]x and -P. Points are eliminated one by
+one (Schur complement; Triggs et al. 2000, "Bundle adjustment: a modern synthesis", section 6),
+which leaves a block-sparse system of the stations with a border of what is shared.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.sparse import bsr_matrix, csc_matrix
+
+from alice_survey.frames import Array
+
+POSE = 6
+"""Parameters of a station: turn about the axes of the world, then motion of its origin."""
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sights:
+    """Linearised observations, sorted by point."""
+
+    starts: Indices
+    """(P + 1,) where the observations of every point begin."""
+    station: Indices
+    """(O,) index of the station."""
+    by_point: Array
+    """(O, 2, 3) slopes of the pixel by the point in the world."""
+    arm: Array
+    """(O, 3) from the station's origin to the point, in the world."""
+    by_shared: Array
+    """(O, 2, G) slopes by what all share; G may be 0."""
+    miss: Array
+    """(O, 2) found pixel less the one observed."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reduced:
+    """The normal equations of stations and of what is shared, the points eliminated."""
+
+    pointers: Indices
+    """(F + 1,) and (B,): the blocks of every station's row, and their columns, sorted."""
+    columns: Indices
+    blocks: Array
+    """(B, 6, 6)."""
+    border: Array
+    """(6 F, G) between stations and what is shared."""
+    shared: Array
+    """(G, G)."""
+    slope: Array
+    """(6 F,) gradient by the stations."""
+    shared_slope: Array
+    """(G,)."""
+    point_inverse: Array
+    """(P, 3, 3) covariance of the points where all else is known."""
+
+    @property
+    def matrix(self) -> csc_matrix:
+        """(6 F, 6 F) of the stations."""
+        size = POSE * (len(self.pointers) - 1)
+        blocks = (self.blocks, self.columns, self.pointers)
+        return csc_matrix(bsr_matrix(blocks, shape=(size, size), blocksize=(POSE, POSE)))
+
+
+def reduce_points(sights: Sights, stations: int) -> Reduced:
+    """Eliminate the points.
+
+    Args:
+        sights: observations; every point needs two that see it from apart.
+        stations: F, how many there are.
+    """
+    meets = np.eye(stations, dtype=np.bool_)
+    _mark(sights.starts, sights.station, meets)
+    rows, columns = np.nonzero(meets)
+    pointers = np.searchsorted(rows, np.arange(stations + 1)).astype(np.int64)
+    columns = columns.astype(np.int64)
+    blocks, border, shared, slope, shared_slope, inverse = _reduce(
+        sights.starts, sights.station, sights.by_point, sights.arm, sights.by_shared, sights.miss,
+        pointers, columns,
+    )  # fmt: skip
+    return Reduced(
+        pointers=pointers,
+        columns=columns,
+        blocks=blocks,
+        border=border.reshape(POSE * stations, -1),
+        shared=shared,
+        slope=slope.ravel(),
+        shared_slope=shared_slope,
+        point_inverse=inverse,
+    )
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _mark(starts: Indices, station: Indices, meets: NDArray[np.bool_]) -> None:
+    """Mark the pairs of stations that see a point in common, in place."""
+    for p in range(starts.shape[0] - 1):
+        for a in range(starts[p], starts[p + 1]):
+            for b in range(starts[p], starts[p + 1]):
+                meets[station[a], station[b]] = True
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def find_block(pointers: Indices, columns: Indices, row: int, column: int) -> int:
+    """Where a block stands among those of its row; it must be there."""
+    low, high = pointers[row], pointers[row + 1]
+    while low < high:
+        middle = (low + high) // 2
+        if columns[middle] < column:
+            low = middle + 1
+        else:
+            high = middle
+    return int(low)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def by_pose(by_point: Array, arm: Array, out: Array) -> None:
+    """Slopes (2, 6) of one pixel by its station's pose, from those by the point."""
+    x, y, z = arm[0], arm[1], arm[2]
+    for row in range(2):
+        u, v, w = by_point[row, 0], by_point[row, 1], by_point[row, 2]
+        out[row, 0] = v * z - w * y
+        out[row, 1] = w * x - u * z
+        out[row, 2] = u * y - v * x
+        out[row, 3], out[row, 4], out[row, 5] = -u, -v, -w
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _invert(m: Array, out: Array) -> None:
+    """The inverse of a symmetric 3 x 3 matrix; NaN where it has none."""
+    a, b, c, d, e, f = m[0, 0], m[0, 1], m[0, 2], m[1, 1], m[1, 2], m[2, 2]
+    aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
+    determinant = a * aa + b * bb + c * cc
+    scale = 1.0 / determinant if determinant > 0.0 else np.nan
+    out[0, 0], out[0, 1], out[0, 2] = aa * scale, bb * scale, cc * scale
+    out[1, 0], out[1, 1], out[1, 2] = out[0, 1], (a * f - c * c) * scale, (b * c - a * e) * scale
+    out[2, 0], out[2, 1], out[2, 2] = out[0, 2], out[1, 2], (a * d - b * b) * scale
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _reduce(
+    starts: Indices, station: Indices, by_point: Array, arm: Array, by_shared: Array, miss: Array,
+    pointers: Indices, columns: Indices,
+) -> tuple[Array, Array, Array, Array, Array, Array]:  # fmt: skip
+    points, stations, count = starts.shape[0] - 1, pointers.shape[0] - 1, by_shared.shape[2]
+    longest = 0
+    for p in range(points):
+        longest = max(longest, starts[p + 1] - starts[p])
+    blocks = np.zeros((columns.shape[0], 6, 6))
+    border, shared = np.zeros((stations, 6, count)), np.zeros((count, count))
+    slope, shared_slope = np.zeros((stations, 6)), np.zeros(count)
+    inverse = np.empty((points, 3, 3))
+    pose = np.empty((longest, 2, 6))
+    cross, gain = np.empty((longest, 6, 3)), np.empty((longest, 6, 3))
+    together, solved = np.empty((3, count)), np.empty((3, count))
+    own, pull = np.empty((3, 3)), np.empty(3)
+    for p in range(points):
+        first, end = starts[p], starts[p + 1]
+        own[:], pull[:], together[:] = 0.0, 0.0, 0.0
+        for o in range(first, end):
+            for row in range(2):
+                for i in range(3):
+                    s = by_point[o, row, i]
+                    pull[i] += s * miss[o, row]
+                    for j in range(3):
+                        own[i, j] += s * by_point[o, row, j]
+                    for g in range(count):
+                        together[i, g] += s * by_shared[o, row, g]
+        _invert(own, inverse[p])
+        back = inverse[p]
+        for i in range(3):
+            for g in range(count):
+                solved[i, g] = 0.0
+                for j in range(3):
+                    solved[i, g] += back[i, j] * together[j, g]
+        for o in range(first, end):
+            k = o - first
+            by_pose(by_point[o], arm[o], pose[k])
+            for i in range(6):
+                for j in range(3):
+                    cross[k, i, j] = (
+                        pose[k, 0, i] * by_point[o, 0, j] + pose[k, 1, i] * by_point[o, 1, j]
+                    )
+            for i in range(6):
+                for j in range(3):
+                    gain[k, i, j] = (
+                        cross[k, i, 0] * back[0, j]
+                        + cross[k, i, 1] * back[1, j]
+                        + cross[k, i, 2] * back[2, j]
+                    )
+        for o in range(first, end):
+            k, s = o - first, station[o]
+            at = find_block(pointers, columns, s, s)
+            for i in range(6):
+                for j in range(6):
+                    blocks[at, i, j] += (
+                        pose[k, 0, i] * pose[k, 0, j] + pose[k, 1, i] * pose[k, 1, j]
+                    )
+                value = pose[k, 0, i] * miss[o, 0] + pose[k, 1, i] * miss[o, 1]
+                for j in range(3):
+                    value -= gain[k, i, j] * pull[j]
+                slope[s, i] += value
+                for g in range(count):
+                    value = pose[k, 0, i] * by_shared[o, 0, g] + pose[k, 1, i] * by_shared[o, 1, g]
+                    for j in range(3):
+                        value -= gain[k, i, j] * together[j, g]
+                    border[s, i, g] += value
+            for other in range(first, end):
+                m = other - first
+                at = find_block(pointers, columns, s, station[other])
+                for i in range(6):
+                    for j in range(6):
+                        blocks[at, i, j] -= (
+                            gain[k, i, 0] * cross[m, j, 0]
+                            + gain[k, i, 1] * cross[m, j, 1]
+                            + gain[k, i, 2] * cross[m, j, 2]
+                        )
+            for g in range(count):
+                for h in range(count):
+                    shared[g, h] += (
+                        by_shared[o, 0, g] * by_shared[o, 0, h]
+                        + by_shared[o, 1, g] * by_shared[o, 1, h]
+                    )
+                shared_slope[g] += by_shared[o, 0, g] * miss[o, 0] + by_shared[o, 1, g] * miss[o, 1]
+        for g in range(count):
+            for j in range(3):
+                shared_slope[g] -= solved[j, g] * pull[j]
+                for h in range(count):
+                    shared[g, h] -= together[j, g] * solved[j, h]
+    return blocks, border, shared, slope, shared_slope, inverse
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def moved_points(
+    starts: Indices, station: Indices, by_point: Array, arm: Array, by_shared: Array, miss: Array,
+    inverse: Array, steps: Array, shared_step: Array,
+) -> Array:  # fmt: skip
+    """How far every point moves, (P, 3), where stations take steps (F, 6)."""
+    points = starts.shape[0] - 1
+    moved = np.empty((points, 3))
+    pose, pull = np.empty((2, 6)), np.empty(3)
+    for p in range(points):
+        pull[:] = 0.0
+        for o in range(starts[p], starts[p + 1]):
+            by_pose(by_point[o], arm[o], pose)
+            for row in range(2):
+                value = miss[o, row]
+                for i in range(6):
+                    value += pose[row, i] * steps[station[o], i]
+                for g in range(shared_step.shape[0]):
+                    value += by_shared[o, row, g] * shared_step[g]
+                for i in range(3):
+                    pull[i] -= by_point[o, row, i] * value
+        for i in range(3):
+            moved[p, i] = (
+                inverse[p, i, 0] * pull[0] + inverse[p, i, 1] * pull[1] + inverse[p, i, 2] * pull[2]
+            )
+    return moved
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def point_covariances(
+    starts: Indices, station: Indices, by_point: Array, arm: Array, inverse: Array,
+    pointers: Indices, columns: Indices, blocks: Array,
+) -> Array:  # fmt: skip
+    """Covariance of every point, (P, 3, 3), from those of its stations.
+
+    With G = -V^-1 W^T what a point does when its stations move: V^-1 + G C G^T.
+
+    Args:
+        starts: as `Sights`; so `station`, `by_point` and `arm`.
+        station: (O,).
+        by_point: (O, 2, 3).
+        arm: (O, 3).
+        inverse: (P, 3, 3) V^-1.
+        pointers: pattern of `blocks`, as in `Reduced`.
+        columns: likewise.
+        blocks: (B, 6, 6) covariances between the stations that see a point in common.
+    """
+    points = starts.shape[0] - 1
+    found = inverse.copy()
+    longest = 0
+    for p in range(points):
+        longest = max(longest, starts[p + 1] - starts[p])
+    follow, pose = np.empty((longest, 3, 6)), np.empty((2, 6))
+    for p in range(points):
+        first, end = starts[p], starts[p + 1]
+        for o in range(first, end):
+            by_pose(by_point[o], arm[o], pose)
+            for i in range(3):
+                for j in range(6):
+                    value = 0.0
+                    for k in range(3):
+                        value += inverse[p, i, k] * (
+                            by_point[o, 0, k] * pose[0, j] + by_point[o, 1, k] * pose[1, j]
+                        )
+                    follow[o - first, i, j] = value
+        for a in range(first, end):
+            for b in range(first, end):
+                at = find_block(pointers, columns, station[a], station[b])
+                for i in range(3):
+                    for j in range(6):
+                        value = 0.0
+                        for k in range(6):
+                            value += follow[a - first, i, k] * blocks[at, k, j]
+                        for k in range(3):
+                            found[p, i, k] += value * follow[b - first, k, j]
+    return found

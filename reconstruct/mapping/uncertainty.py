@@ -1,0 +1,308 @@
+"""How well a model's stations and points are known: `mapping/covariance.npz`.
+
+The covariance is that of the last adjustment: the inverse of its normal equations, scaled by the
+variance of the keypoints that its residuals show (the a-posteriori variance factor). A model of
+pictures has no place of its own, so that what is stated is its shape: the covariance of what is
+left when all stations together are laid onto the truth by a rigid motion (and by a scale, where
+nothing fixes that) with the least squares error (the inner constraints of a free network; Baarda's
+S-transformation, 1973). Where the whole lies in the world is for the georeference to say.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from scipy.sparse import csc_matrix, diags_array
+from scipy.sparse.linalg import splu
+from scipy.spatial.transform import Rotation
+
+from alice_survey.errors import ReconstructionError, warn
+from alice_survey.frames import Array
+from alice_survey.manifest import ImageRecord
+from reconstruct.mapping.arrays import Indices, Observed, observed
+from reconstruct.mapping.mapper import Mapped, as_transform
+from reconstruct.mapping.normal_equations import (
+    POSE,
+    Reduced,
+    Sights,
+    point_covariances,
+    reduce_points,
+)
+
+_CHUNK = 32
+"""Stations whose columns of the inverse are in memory at a time."""
+_LEAST_POINTS = 4
+"""A station that sees fewer points has no covariance (NaN)."""
+_TURN_INFORMATION = 1.0
+"""1/rad^2 of a station whose position is told: a line of stations does not tell its own roll."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Uncertainty:
+    """Covariances in units of the model, in its own axes."""
+
+    frames: Indices
+    """(F,) ids of COLMAP's frames, ascending."""
+    stations: Indices
+    """(F,) their stations."""
+    images: tuple[str, ...]
+    """(F,) the picture of each frame's reference camera (of its first, where that took none)."""
+    frame_cov: Array
+    """(F, 6, 6): turn, radians about the model's axes (`R' = exp(turn) R` for `world_from_rig`),
+    then position of the rig's origin, the centre of the reference pinhole."""
+    point_ids: Indices
+    """(P,) ids of COLMAP's points, ascending."""
+    point_cov: Array
+    """(P, 3, 3)."""
+    sigma_px: float
+    """Of one coordinate of a keypoint, from the residuals."""
+
+
+def estimate(
+    mapped: Mapped, records: Sequence[ImageRecord], position_sigmas: Array | None
+) -> Uncertainty:
+    """Covariances of an adjusted model of ideal pinholes with held rig and lenses.
+
+    Args:
+        mapped: adjusted; picture i of `records` has the id i + 1.
+        records: pictures.
+        position_sigmas: (N, 3) of the pictures' told positions along the model's axes, NaN where
+            none took part in the adjustment; None for an adjustment without.
+
+    Raises:
+        ReconstructionError: the model is too small to tell.
+    """
+    model = mapped.model
+    seen = observed(model)
+    frames = np.array(sorted({model.images[int(n)].frame_id for n in seen.pictures}), np.int64)
+    sights, order = sights_of(model, seen, frames)
+    scale_free = not np.isfinite(mapped.baseline)
+    spare = 2 * len(order) - 3 * len(seen.point_ids) - POSE * len(frames) + 6 + int(scale_free)
+    if spare < 1 or len(frames) < 2:
+        raise ReconstructionError(
+            f"{len(order)} observations of {len(seen.point_ids)} points from {len(frames)} "
+            "stations do not tell how well they are known"
+        )
+    variance = float((sights.miss**2).sum() / spare)
+    reduced = reduce_points(sights, len(frames))
+    centres = _centres(model, frames)
+    told = _told(model, frames, position_sigmas)
+    counts = np.bincount(sights.station, minlength=len(frames))
+    loose = counts < _LEAST_POINTS
+    gauge = _Gauge(centres, float(np.median(np.linalg.norm(sights.arm, axis=1))), scale_free)
+    blocks = _inverse_blocks(reduced, variance, told, gauge, loose)
+    rows = np.repeat(np.arange(len(frames)), np.diff(reduced.pointers))
+    own = np.flatnonzero(rows == reduced.columns)
+    points = point_covariances(
+        sights.starts, sights.station, sights.by_point, sights.arm,
+        reduced.point_inverse, reduced.pointers, reduced.columns, blocks,
+    )  # fmt: skip
+    points += (variance - 1.0) * reduced.point_inverse
+    first = _first_pictures(model, seen, frames)
+    return Uncertainty(
+        frames=frames,
+        stations=np.array([records[n - 1].station for n in first], dtype=np.int64),
+        images=tuple(records[n - 1].image for n in first),
+        frame_cov=blocks[own],
+        point_ids=seen.point_ids,
+        point_cov=points,
+        sigma_px=float(np.sqrt(variance)),
+    )
+
+
+def save_uncertainty(
+    folder: Path,
+    mapped: Mapped,
+    records: Sequence[ImageRecord],
+    position_sigmas: Array | None = None,
+) -> None:
+    """Write `covariance.npz` of a model (see `estimate`), with a warning where it cannot be."""
+    try:
+        found = estimate(mapped, records, position_sigmas)
+    except ReconstructionError as error:
+        warn(f"no covariance: {error}")
+        return
+    write_uncertainty(folder / "covariance.npz", found)
+
+
+def write_uncertainty(path: Path, found: Uncertainty) -> None:
+    """Write `covariance.npz`: fields of `Uncertainty`; points as float32."""
+    np.savez(
+        path,
+        frames=found.frames,
+        stations=found.stations,
+        images=np.array(found.images),
+        cov=found.frame_cov,
+        point_ids=found.point_ids,
+        point_cov=found.point_cov.astype(np.float32),
+        sigma_px=np.array(found.sigma_px),
+    )
+
+
+def read_uncertainty(path: Path) -> Uncertainty:
+    """Read `covariance.npz`."""
+    with np.load(path, allow_pickle=False) as data:
+        return Uncertainty(
+            frames=data["frames"],
+            stations=data["stations"],
+            images=tuple(str(name) for name in data["images"]),
+            frame_cov=data["cov"],
+            point_ids=data["point_ids"],
+            point_cov=data["point_cov"].astype(np.float64),
+            sigma_px=float(data["sigma_px"]),
+        )
+
+
+def sights_of(
+    model: pycolmap.Reconstruction, seen: Observed, frames: Indices
+) -> tuple[Sights, Indices]:
+    """The observations of a model of pinholes, linearised.
+
+    Returns:
+        Observations sorted by point, and which of `seen` they are.
+    """
+    points = seen.points(model)
+    local, pixels = seen.in_cameras(model, points), seen.pixels(model)
+    order = np.argsort(seen.point, kind="stable")
+    station, by_point = np.empty(len(order), np.int64), np.empty((len(order), 2, 3))
+    miss = np.empty((len(order), 2))
+    centres = _centres(model, frames)
+    for n, number in enumerate(seen.pictures.tolist()):
+        image, rows = model.images[number], seen.of(n)
+        fx, fy, cx, cy = image.camera.params
+        x, y, z = local[rows].T
+        zero = np.zeros_like(z)
+        slopes = np.stack([fx / z, zero, -fx * x / z**2, zero, fy / z, -fy * y / z**2], axis=-1)
+        turn = as_transform(image.cam_from_world()).rotation.as_matrix()
+        by_point[rows] = slopes.reshape(-1, 2, 3) @ turn
+        miss[rows] = np.column_stack([fx * x / z + cx, fy * y / z + cy]) - pixels[rows]
+        station[rows] = np.searchsorted(frames, image.frame_id)
+    counts = np.bincount(seen.point, minlength=len(points))
+    sights = Sights(
+        starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        station=station[order],
+        by_point=by_point[order],
+        arm=(points[seen.point] - centres[station])[order],
+        by_shared=np.zeros((len(order), 2, 0)),
+        miss=miss[order],
+    )
+    return sights, order.astype(np.int64)
+
+
+class _Gauge:
+    """Motions of a whole block that pictures do not see."""
+
+    def __init__(self, centres: Array, depth: float, scale_free: bool) -> None:
+        """Of stations at (F, 3); `depth`, a usual one, weighs turns against positions."""
+        arms = centres - centres.mean(axis=0)
+        count = len(arms)
+        self.motions = np.zeros((count, POSE, 7 if scale_free else 6))
+        for axis in range(3):
+            unit = np.eye(3)[axis]
+            self.motions[:, :3, axis] = unit
+            self.motions[:, 3:, axis] = np.cross(unit, arms)
+            self.motions[:, 3:, 3 + axis] = unit
+        if scale_free:
+            self.motions[:, 3:, 6] = arms
+        self.weights = np.tile([depth**2] * 3 + [1.0] * 3, count)
+        flat = self.flat
+        self.spread = np.linalg.inv(flat.T @ (self.weights[:, None] * flat))
+        far = int(np.argmax(np.linalg.norm(arms - arms[0], axis=1)))
+        self.held = list(range(POSE))
+        if scale_free:
+            along = int(np.argmax(np.abs(arms[far] - arms[0])))
+            self.held.append(POSE * far + 3 + along)
+
+    @property
+    def flat(self) -> Array:
+        """(6 F, 6 or 7)."""
+        return self.motions.reshape(-1, self.motions.shape[2])
+
+
+def _inverse_blocks(
+    reduced: Reduced,
+    variance: float,
+    told: Array | None,
+    gauge: _Gauge,
+    loose: NDArray[np.bool_],
+) -> Array:
+    """Covariances (B, 6, 6) between stations that see a point in common, without the gauge."""
+    matrix = csc_matrix(reduced.matrix / variance)
+    size = matrix.shape[0]
+    free = np.repeat(~loose, POSE)
+    if told is None:
+        free[gauge.held] = False
+    else:
+        matrix = csc_matrix(matrix + diags_array(told.ravel()))
+    kept = np.flatnonzero(free)
+    cut: Any = matrix[kept][:, kept]
+    factor_of: Any = splu
+    factor = factor_of(
+        csc_matrix(cut), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )  # fmt: skip
+
+    def solve(right: Array) -> Array:
+        solution = np.zeros_like(right)
+        solution[kept] = factor.solve(np.ascontiguousarray(right[kept]))
+        return solution
+
+    flat, spread = gauge.flat, gauge.spread
+    weighed = gauge.weights[:, None] * flat
+    along = solve(weighed)
+    middle = spread @ (weighed.T @ along) @ spread
+    count = size // POSE
+    blocks = np.empty_like(reduced.blocks)
+    motions, along = gauge.motions, along.reshape(count, POSE, -1)
+    for first in range(0, count, _CHUNK):
+        last = min(first + _CHUNK, count)
+        right = np.zeros((size, POSE * (last - first)))
+        right[POSE * first + np.arange(right.shape[1]), np.arange(right.shape[1])] = 1.0
+        columns = solve(right).reshape(count, POSE, last - first, POSE)
+        for s in range(first, last):
+            rows = slice(int(reduced.pointers[s]), int(reduced.pointers[s + 1]))
+            others = reduced.columns[rows]
+            plain = columns[others, :, s - first, :].swapaxes(1, 2)
+            blocks[rows] = (
+                plain
+                - motions[s] @ spread @ along[others].swapaxes(1, 2)
+                - along[s] @ spread @ motions[others].swapaxes(1, 2)
+                + motions[s] @ middle @ motions[others].swapaxes(1, 2)
+            )
+            blocks[rows][loose[others] | loose[s]] = np.nan
+    return blocks
+
+
+def _told(model: pycolmap.Reconstruction, frames: Indices, sigmas: Array | None) -> Array | None:
+    """(F, 6) information of told positions; None where there are none."""
+    if sigmas is None:
+        return None
+    told = np.zeros((len(frames), POSE))
+    for number, image in sorted(model.images.items()):
+        if not image.has_pose:
+            continue
+        row = int(np.searchsorted(frames, image.frame_id))
+        if np.isfinite(sigmas[number - 1]).all() and not told[row].any():
+            told[row] = [*[_TURN_INFORMATION] * 3, *(1.0 / sigmas[number - 1] ** 2)]
+    return told if told.any() else None
+
+
+def _centres(model: pycolmap.Reconstruction, frames: Indices) -> Array:
+    """Origins of the rigs in the world, (F, 3)."""
+    poses: list[Any] = [model.frames[int(f)].rig_from_world for f in frames]
+    turns = Rotation.from_quat(np.array([p.rotation.quat for p in poses]))
+    return -turns.inv().apply(np.array([p.translation for p in poses]))
+
+
+def _first_pictures(model: pycolmap.Reconstruction, seen: Observed, frames: Indices) -> list[int]:
+    """The picture of the reference camera of every frame, else its first."""
+    chosen: dict[int, tuple[bool, int]] = {}
+    for number in seen.pictures.tolist():
+        image = model.images[number]
+        rank = (not image.is_ref_in_frame(), number)
+        chosen[image.frame_id] = min(rank, chosen.get(image.frame_id, rank))
+    return [chosen[int(f)][1] for f in frames]

@@ -1,0 +1,135 @@
+"""A refractive bundle adjustment as plain as can be: the twin of what the mapping does in turns."""
+
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.sparse import csr_matrix
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.frames import Array
+from reconstruct.mapping.mapper import as_transform
+from reconstruct.mapping.normal_equations import Sights
+from reconstruct.mapping.uncertainty import Uncertainty
+from tests.reconstruct.scenes import Scene
+
+
+def adjust_through_ports(
+    scene: Scene, ned_from_rig: list[RigidTransform], points: Array, point_ids: Array
+) -> tuple[list[RigidTransform], Array]:
+    """All stations but the first, and all points, from the pixels as taken, through the ports.
+
+    Args:
+        scene: rig, pixels, and which point they show.
+        ned_from_rig: where stations start; the first stays.
+        points: (P, 3) where points start.
+        point_ids: (P,) their numbers in the scene, sorted.
+
+    Returns:
+        `ned_from_rig` of all stations, and the points.
+    """
+    stations = len(ned_from_rig)
+    names = [record.camera for record in scene.records]
+    station_of = [record.station for record in scene.records]
+    rows = []
+    for ids in scene.ids:
+        at = np.minimum(np.searchsorted(point_ids, ids), len(point_ids) - 1)
+        rows.append((at, point_ids[at] == ids))
+
+    def unpack(x: Array) -> tuple[list[RigidTransform], Array]:
+        steps = x[: 6 * (stations - 1)].reshape(-1, 6)
+        poses = [ned_from_rig[0]]
+        for pose, step in zip(ned_from_rig[1:], steps, strict=True):
+            turn = Rotation.from_rotvec(step[:3]) * pose.rotation
+            poses.append(RigidTransform.from_components(pose.translation + step[3:], turn))
+        return poses, points + x[6 * (stations - 1) :].reshape(-1, 3)
+
+    def misses(x: Array) -> Array:
+        poses, places = unpack(x)
+        out = []
+        for picture, (at, known) in enumerate(rows):
+            cam_from_ned = scene.rig.cam_from_rig[names[picture]] * poses[station_of[picture]].inv()
+            camera = scene.rig.cameras[names[picture]]
+            local = cam_from_ned.apply(places[at[known]])
+            out.append((camera.project(local) - scene.pixels[picture][known]).ravel())
+        return np.concatenate(out)
+
+    columns, lines, line = [], [], 0
+    for picture, (at, known) in enumerate(rows):
+        for point in at[known]:
+            touched = [6 * (stations - 1) + 3 * point + k for k in range(3)]
+            if station_of[picture] > 0:
+                touched += [6 * (station_of[picture] - 1) + k for k in range(6)]
+            for _ in range(2):
+                columns += touched
+                lines += [line] * len(touched)
+                line += 1
+    size = 6 * (stations - 1) + 3 * len(points)
+    pattern = csr_matrix((np.ones(len(lines)), (lines, columns)), shape=(line, size))
+    x = np.zeros(size)
+    for _ in range(6):  # lsmr stops early along weak directions; a new start goes on
+        found = least_squares(
+            misses, x, jac="3-point", jac_sparsity=pattern, x_scale="jac", tr_solver="lsmr",
+            tr_options={"atol": 1e-14, "btol": 1e-14, "maxiter": 1000},
+            ftol=1e-14, xtol=1e-14, gtol=1e-14, max_nfev=30,
+        )  # fmt: skip
+        settled = float(np.abs(found.x - x).max()) < 1e-7
+        x = found.x
+        if settled:
+            break
+    return unpack(x)
+
+
+def dense_normal_equations(sights: Sights, stations: int) -> tuple[Array, Array]:
+    """J^T J and J^T r of stations, points and shared parameters, in that order, from a full J."""
+    points, count = len(sights.starts) - 1, sights.by_shared.shape[2]
+    size = 6 * stations + 3 * points + count
+    jacobian = np.zeros((2 * len(sights.station), size))
+    for point in range(points):
+        for o in range(sights.starts[point], sights.starts[point + 1]):
+            x, y, z = sights.arm[o]
+            cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+            rows, first = slice(2 * o, 2 * o + 2), 6 * int(sights.station[o])
+            # R^T (X - c) with R' = exp(turn) R moves by R^T (X - c) x turn.
+            jacobian[rows, first : first + 3] = sights.by_point[o] @ cross
+            jacobian[rows, first + 3 : first + 6] = -sights.by_point[o]
+            at = 6 * stations + 3 * point
+            jacobian[rows, at : at + 3] = sights.by_point[o]
+            jacobian[rows, size - count :] = sights.by_shared[o]
+    return jacobian.T @ jacobian, jacobian.T @ sights.miss.ravel()
+
+
+def laid_onto(
+    model: Any,
+    found: Uncertainty,
+    true_stations: list[RigidTransform],
+    true_points: Array,
+    depth: float,
+) -> tuple[Array, Array]:
+    """Errors of stations, (F, 6), and points, (P, 3), once the block lies on the truth.
+
+    The block is moved as a whole, to first order, so that the sum of squares of the stations'
+    position errors and of `depth` times their turns is least. Point i + 1 of the model is point i.
+    """
+    poses = [as_transform(model.frames[int(f)].rig_from_world).inv() for f in found.frames]
+    turns = np.array(
+        [
+            (a.rotation * b.rotation.inv()).as_rotvec()
+            for a, b in zip(poses, true_stations, strict=True)
+        ]
+    )
+    true = np.array([b.translation for b in true_stations])
+    misses = np.array([a.translation for a in poses]) - true
+    points = np.array([model.points3D[int(i)].xyz for i in found.point_ids])
+    expected = true_points[found.point_ids - 1]
+    middle = true.mean(axis=0)
+    rows, right = [], []
+    for arm, turn, miss in zip(true - middle, turns, misses, strict=True):
+        x, y, z = arm
+        by_turn = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])
+        rows += [depth * np.eye(3, 6), np.hstack([by_turn, np.eye(3)])]
+        right += [depth * turn, miss]
+    motion = np.linalg.lstsq(np.vstack(rows), np.concatenate(right), rcond=None)[0]
+    moved = misses - motion[3:] - np.cross(motion[:3], true - middle)
+    away = points - expected - motion[3:] - np.cross(motion[:3], expected - middle)
+    return np.hstack([turns - motion[:3], moved]), away

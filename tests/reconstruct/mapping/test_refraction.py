@@ -1,0 +1,190 @@
+"""Refraction taken through COLMAP, against the truth and against an exact refractive adjustment."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from alice_survey.frames import Array
+from reconstruct.lenses.range_shift import range_shift
+from reconstruct.mapping.bundle import adjust_freely
+from reconstruct.mapping.mapper import Mapped, model_baseline
+from reconstruct.mapping.priors import NavigationAdjuster
+from reconstruct.mapping.refraction import SETTLED_PX, Convergence, refract
+from reconstruct.sparse.alignment import align_rigid, align_similarity
+from tests.oracles_refraction import adjust_through_ports
+from tests.reconstruct.scenes import DATUM, Scene, make_scene
+from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_scene
+
+PORTS = [(0.02, 0.0), (0.02, 2.0), (0.05, 0.0), (0.05, 2.0)]
+
+
+@cache
+def scene_at(port_m: float, tilt_deg: float, noise_px: float = 0.3) -> Scene:
+    return make_scene(
+        lines=2,
+        stations=4,
+        points=500,
+        noise_px=noise_px,
+        port_distance_m=port_m,
+        port_tilt_deg=(tilt_deg, 0.0),
+        scale=1,
+        relief_m=0.3,
+    )
+
+
+@cache
+def started(port_m: float, tilt_deg: float, noise_px: float = 0.3) -> tuple[Mapped, object]:
+    scene = scene_at(port_m, tilt_deg, noise_px)
+    seen, lenses = warped_scene(scene)
+    return near_truth(scene, seen, lenses, np.random.default_rng(1)), seen
+
+
+def exact(scene: Scene, start: tuple[Mapped, object], folder: Path) -> tuple[Mapped, Convergence]:
+    return refract(start[0], start[1], folder)
+
+
+def rigid_rms(found: Array, true: Array) -> float:
+    return float(np.sqrt(((align_rigid(found, true).apply(found) - true) ** 2).sum(axis=1).mean()))
+
+
+@pytest.mark.parametrize(("port_m", "tilt_deg"), PORTS)
+def test_without_noise_nothing_is_left_of_the_port(
+    port_m: float, tilt_deg: float, tmp_path: Path
+) -> None:
+    scene, start = scene_at(port_m, tilt_deg, 0.0), started(port_m, tilt_deg, 0.0)
+    mapped, found = exact(scene, start, tmp_path)
+    pupils, true_pupils, points, true_points = pupils_and_points(mapped, scene)
+    assert rigid_rms(points, true_points) < 0.01e-3
+    assert rigid_rms(pupils, true_pupils) < 0.01e-3
+    assert abs(align_similarity(points, true_points).scale - 1.0) < 1e-6
+    assert found.settled
+    assert found.moved_px[0] > 100 * SETTLED_PX
+    warp_only = adjust_freely(start[0])
+    _, _, bent, _ = pupils_and_points(warp_only, scene)
+    assert rigid_rms(bent, true_points) > 0.05e-3, "what was to be corrected was there"
+
+
+@pytest.mark.parametrize(("port_m", "tilt_deg"), PORTS)
+def test_with_noise_points_are_those_of_an_exact_refractive_adjustment(
+    port_m: float, tilt_deg: float, tmp_path: Path
+) -> None:
+    scene, start = scene_at(port_m, tilt_deg), started(port_m, tilt_deg)
+    mapped, _ = exact(scene, start, tmp_path)
+    _, _, points, true_points = pupils_and_points(mapped, scene)
+    ids = np.array(sorted(mapped.model.points3D)) - 1
+    stations = [
+        pose
+        for pose, record in zip(scene.ned_from_cam, scene.records, strict=True)
+        if record.camera == scene.rig.reference
+    ]
+    _, oracle = adjust_through_ports(scene, stations, scene.points_ned[ids], ids)
+    ours, best = rigid_rms(points, true_points), rigid_rms(oracle, true_points)
+    assert 0.9 * best < ours < 1.05 * best
+    assert rigid_rms(points, oracle) < 0.25 * best
+    assert 0.5e-3 < best < 5e-3
+
+
+def test_keypoints_end_where_the_field_of_the_lens_says(tmp_path: Path) -> None:
+    """The later stages read the model through `RangeShift`: both must agree."""
+    scene, start = scene_at(0.05, 2.0), started(0.05, 2.0)
+    mapped, _ = exact(scene, start, tmp_path)
+    for number, image in mapped.model.images.items():
+        shift = range_shift(mapped.lenses[scene.records[number - 1].camera])
+        at = image.get_observation_point2D_idxs()
+        warped = start[1].pixels[number - 1][at]
+        points = [mapped.model.points3D[p.point3D_id].xyz for p in image.get_observation_points2D()]
+        depth = np.array([(image.cam_from_world() * p)[2] for p in points])
+        ideal = np.array([p.xy for p in image.get_observation_points2D()])
+        np.testing.assert_allclose(ideal, shift.ideal(warped, depth), atol=2e-3)
+
+
+def test_a_camera_in_plain_air_is_left_as_it_is(tmp_path: Path) -> None:
+    """Zero distance, zero thickness: a pinhole. The same code, and no pixel moves."""
+    scene = make_scene(lines=1, stations=4, points=300, noise_px=0.2, port_distance_m=0.02)
+    cameras = {
+        name: replace(camera, port_distance_m=0.0, glass_thickness_m=0.0, n_water=1.0)
+        for name, camera in scene.rig.cameras.items()
+    }
+    scene = replace(scene, rig=replace(scene.rig, cameras=cameras))
+    pixels = [
+        cameras[r.camera].project(pose.inv().apply(scene.points_ned[ids]))
+        for r, pose, ids in zip(scene.records, scene.ned_from_cam, scene.ids, strict=True)
+    ]
+    scene = replace(scene, pixels=pixels)
+    seen, lenses = warped_scene(scene)
+    start = near_truth(scene, seen, lenses, np.random.default_rng(1))
+    mapped, found = refract(start, seen, tmp_path)
+    assert max(found.moved_px) < 1e-6
+    assert found.corrected_px < 1e-6
+    _, _, points, true_points = pupils_and_points(mapped, scene)
+    assert rigid_rms(points, true_points) < 1e-6
+
+
+def test_wrong_matches_go_and_right_ones_stay(tmp_path: Path) -> None:
+    scene = scene_at(0.05, 0.0)
+    rng = np.random.default_rng(4)
+    pixels = [p.copy() for p in scene.pixels]
+    spoiled = 0
+    for rows in pixels:
+        bad = rng.choice(len(rows), 2, replace=False)
+        rows[bad] += rng.choice([-1.0, 1.0], (2, 2)) * rng.uniform(25, 40, (2, 2))
+        spoiled += 2
+    wrong = replace(scene, pixels=pixels)
+    seen, lenses = warped_scene(wrong)
+    start = near_truth(wrong, seen, lenses, np.random.default_rng(1))
+    mapped, found = refract(start, seen, tmp_path)
+    total = start.model.compute_num_observations()
+    assert spoiled <= found.removed < spoiled + 0.25 * total
+    _, _, points, true_points = pupils_and_points(mapped, wrong)
+    assert rigid_rms(points, true_points) < 4e-3
+
+
+def test_with_matches_lost_observations_come_back(tmp_path: Path) -> None:
+    """A track that lost a picture's keypoint gets it back, at its exact place."""
+    scene, start = scene_at(0.05, 0.0), started(0.05, 0.0)
+    seen = replace(start[1], pairs=scene.pairs)
+    model = pycolmap.Reconstruction(start[0].model)
+    for point in list(model.points3D)[::3]:
+        track = model.points3D[point].track.elements
+        if len(track) > 4:
+            model.delete_observation(track[-1].image_id, track[-1].point2D_idx)
+    lost = start[0].model.compute_num_observations() - model.compute_num_observations()
+    assert lost > 10
+    _, found = refract(
+        replace(start[0], model=model), seen, tmp_path, cam_from_rig=scene.rig.cam_from_rig
+    )
+    assert found.added == pytest.approx(lost, abs=0.1 * lost)
+    assert not list(tmp_path.iterdir()), "scratch is cleared"
+
+
+def test_navigation_takes_part_and_the_rig_keeps_the_scale(tmp_path: Path) -> None:
+    scene, start = scene_at(0.05, 2.0), started(0.05, 2.0)
+    adjust = NavigationAdjuster(scene.records, scene.rig, start[0].lenses, DATUM)
+    assert adjust.sigmas is None
+    mapped, found = refract(start[0], start[1], tmp_path, adjust)
+    assert found.settled
+    assert adjust.sigmas is not None
+    assert model_baseline(mapped.model) == pytest.approx(start[0].baseline, rel=1e-9)
+    _, _, points, true_points = pupils_and_points(mapped, scene)
+    assert rigid_rms(points, true_points) < 3e-3
+    assert np.abs((points - true_points).mean(axis=0)).max() < 0.5, "the model is in NED"
+
+
+def test_a_model_without_scale_takes_it_from_the_working_range(tmp_path: Path) -> None:
+    """Lengths in units of 3 m, said to be unscaled: the same shape comes out, and a note."""
+    scene, start = scene_at(0.05, 0.0, 0.0), started(0.05, 0.0, 0.0)
+    model = pycolmap.Reconstruction(start[0].model)
+    model.transform(pycolmap.Sim3d(1.0 / 3.0, pycolmap.Rotation3d(), np.zeros(3)))
+    unscaled = replace(start[0], model=model, scaled=False)
+    mapped, found = refract(unscaled, start[1], tmp_path)
+    assert found.settled
+    assert any("working range" in note for note in mapped.notes)
+    _, _, points, true_points = pupils_and_points(mapped, scene)
+    fit = align_similarity(points, true_points)
+    misses = np.linalg.norm(fit.apply(points) - true_points, axis=1)
+    assert np.sqrt((misses**2).mean()) < 0.3e-3, "the median depth is near the working range"
+    assert fit.scale == pytest.approx(3.0, rel=1e-3)

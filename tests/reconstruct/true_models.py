@@ -1,0 +1,152 @@
+"""COLMAP models of synthetic scenes that start near the truth, without a mapper."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pycolmap
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.frames import Array
+from reconstruct.lenses.lens import Lens, flat_port_lens
+from reconstruct.mapping.database import Observations, rigid3d
+from reconstruct.mapping.mapper import Mapped, as_transform
+from reconstruct.matching.matches import as_seen
+from tests.reconstruct.scenes import Scene
+
+POSE_ERROR = (2e-3, 5e-3)
+"""Sigmas of rotations, rad, and positions, m, from which models start."""
+
+
+def warped_scene(
+    scene: Scene, near_m: float = 1.75, far_m: float = 2.35
+) -> tuple[Observations, dict[str, Lens]]:
+    """A scene as pinholes see it that are exact at one working depth."""
+    lenses: dict[str, Lens] = {
+        name: flat_port_lens(camera, near_m, far_m) for name, camera in scene.rig.cameras.items()
+    }
+    seen = Observations(
+        images=scene.records,
+        cameras={name: lens.pinhole.colmap for name, lens in lenses.items()},
+        pixels=[
+            as_seen(p, lenses[r.camera]) for p, r in zip(scene.pixels, scene.records, strict=True)
+        ],
+        pairs=(),
+    )
+    return seen, lenses
+
+
+def near_truth(
+    scene: Scene,
+    seen: Observations,
+    lenses: Mapping[str, Lens],
+    rng: np.random.Generator,
+    error: tuple[float, float] = POSE_ERROR,
+) -> Mapped:
+    """A model of all stations and all points seen twice, a little away from the truth.
+
+    Point i of the scene has the id i + 1. Stereo rigs are as told by the scene.
+    """
+    pinhole_from_rig = {
+        name: lenses[name].pinhole_from_cam * pose for name, pose in scene.rig.cam_from_rig.items()
+    }
+    model = _without_poses(scene, seen, pinhole_from_rig)
+    reference = scene.rig.reference
+    for number, record in enumerate(scene.records, 1):
+        if record.camera != reference:
+            continue
+        true = scene.ned_from_cam[number - 1] * lenses[reference].pinhole_from_cam.inv()
+        moved = true * RigidTransform.from_exp_coords(
+            np.concatenate([rng.normal(0, error[0], 3), rng.normal(0, error[1], 3)])
+        )
+        frame = model.images[number].frame_id
+        model.frames[frame].rig_from_world = rigid3d(moved.inv())
+        model.register_frame(frame)
+    tracks: dict[int, list[tuple[int, int]]] = {}
+    for picture, ids in enumerate(scene.ids, 1):
+        for keypoint, point in enumerate(ids.tolist()):
+            tracks.setdefault(point, []).append((picture, keypoint))
+    for point, track in sorted(tracks.items()):
+        if len(track) < 2:
+            continue
+        xyz = scene.points_ned[point] + rng.normal(0, error[1], 3)
+        model.add_point3D_with_id(
+            point + 1,
+            pycolmap.Point3D(
+                xyz=xyz, track=pycolmap.Track([pycolmap.TrackElement(*e) for e in track])
+            ),
+        )
+    return Mapped(
+        model=model,
+        lenses=lenses,
+        models=(len(seen.images),),
+        scaled=True,
+        baseline=model_baseline_of(pinhole_from_rig),
+        rig_factor=1.0,
+    )
+
+
+def _without_poses(
+    scene: Scene, seen: Observations, pinhole_from_rig: Mapping[str, RigidTransform]
+) -> pycolmap.Reconstruction:
+    """Cameras, rig, stations and keypoints; the reference camera's is each station's first."""
+    model = pycolmap.Reconstruction()
+    rig = pycolmap.Rig(rig_id=1)
+    rig_from_reference = pinhole_from_rig[scene.rig.reference].inv()
+    sensors = {}
+    for number, (name, camera) in enumerate(seen.cameras.items(), 1):
+        camera.camera_id = number
+        model.add_camera(camera)
+        sensors[name] = camera.sensor_id
+        if name == scene.rig.reference:
+            rig.add_ref_sensor(camera.sensor_id)
+        else:
+            rig.add_sensor(camera.sensor_id, rigid3d(pinhole_from_rig[name] * rig_from_reference))
+    model.add_rig(rig)
+    for station in sorted({record.station for record in scene.records}):
+        frame = pycolmap.Frame(frame_id=station + 1, rig_id=1)
+        for number, record in enumerate(scene.records, 1):
+            if record.station == station:
+                frame.add_data_id(pycolmap.data_t(sensors[record.camera], number))
+        model.add_frame(frame)
+    for number, record in enumerate(scene.records, 1):
+        keypoints = [pycolmap.Point2D(xy) for xy in seen.pixels[number - 1]]
+        model.add_image(
+            pycolmap.Image(
+                name=record.image,
+                image_id=number,
+                camera_id=sensors[record.camera].id,
+                frame_id=record.station + 1,
+                points2D=pycolmap.Point2DList(keypoints),
+            )
+        )
+    return model
+
+
+def true_stations(scene: Scene, mapped: Mapped) -> list[RigidTransform]:
+    """`ned_from_rig` of every station, at the reference pinhole."""
+    reference = scene.rig.reference
+    rig_from_cam = mapped.lenses[reference].pinhole_from_cam
+    return [
+        pose * rig_from_cam.inv()
+        for pose, record in zip(scene.ned_from_cam, scene.records, strict=True)
+        if record.camera == reference
+    ]
+
+
+def model_baseline_of(pinhole_from_rig: Mapping[str, RigidTransform]) -> float:
+    """Distance between the two pinholes."""
+    first, second = pinhole_from_rig.values()
+    return float(np.linalg.norm((second * first.inv()).translation))
+
+
+def pupils_and_points(mapped: Mapped, scene: Scene) -> tuple[Array, Array, Array, Array]:
+    """Entrance pupils found and true, (N, 3), and points found and true, (P, 3)."""
+    found, true = [], []
+    for number, image in sorted(mapped.model.images.items()):
+        lens = mapped.lenses[scene.records[number - 1].camera]
+        pose = as_transform(image.cam_from_world()).inv() * lens.pinhole_from_cam
+        found.append(pose.translation)
+        true.append(scene.ned_from_cam[number - 1].translation)
+    ids = sorted(mapped.model.points3D)
+    points = np.array([mapped.model.points3D[i].xyz for i in ids])
+    return np.array(found), np.array(true), points, scene.points_ned[np.array(ids) - 1]
