@@ -3,10 +3,11 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.frames import Array
 from alice_survey.manifest import ImageRecord
@@ -67,6 +68,13 @@ def rigid3d(pose: RigidTransform) -> pycolmap.Rigid3d:
     return pycolmap.Rigid3d(rotation, np.asarray(pose.translation))
 
 
+def as_transform(pose: Any) -> RigidTransform:
+    """A COLMAP pose as scipy's."""
+    return RigidTransform.from_components(
+        np.asarray(pose.translation), Rotation.from_quat(np.asarray(pose.rotation.quat))
+    )
+
+
 def _write_rigs(
     database: pycolmap.Database,
     sensors: Mapping[str, pycolmap.sensor_t],
@@ -88,6 +96,11 @@ def _write_rigs(
             rig.add_sensor(sensor, rigid3d(cam_from_rig[name] * rig_from_reference))
     database.write_rig(rig, use_rig_id=True)
     return dict.fromkeys(sensors, 1)
+
+
+def station_frames(images: Sequence[ImageRecord]) -> dict[int, int]:
+    """Stations by the id that their frames have in a database with one rig."""
+    return dict(enumerate(sorted({record.station for record in images}), 1))
 
 
 def _frames(images: Sequence[ImageRecord], one_rig: bool) -> Iterable[list[int]]:

@@ -12,6 +12,7 @@ from reconstruct.lenses.lens import flat_port_lens
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import (
     Mapped,
+    Method,
     as_transform,
     collapsed_frames,
     map_calibrated,
@@ -38,14 +39,14 @@ def seen_by_pinholes(scene: Scene) -> tuple[Observations, dict]:
     return seen, lenses
 
 
-def mapped_scene(scene: Scene, rig_scale: float = 1.0) -> Mapped:
+def mapped_scene(scene: Scene, rig_scale: float = 1.0, method: Method = "auto") -> Mapped:
     seen, lenses = seen_by_pinholes(scene)
     poses = {
         name: RigidTransform.from_components(rig_scale * pose.translation, pose.rotation)
         for name, pose in scene.rig.cam_from_rig.items()
     }
     with TemporaryDirectory() as folder:
-        return map_calibrated(seen, poses, lenses, Path(folder), 1)
+        return map_calibrated(seen, poses, lenses, Path(folder), 1, method=method)
 
 
 def pupils(mapped: Mapped, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -238,7 +239,7 @@ def test_a_station_that_collapsed_onto_another_is_registered_anew(
 
     monkeypatch.setattr(pycolmap, "incremental_mapping", collapsing)
     scene = make_scene(lines=1, stations=7, points=5000, noise_px=0.3)
-    mapped = mapped_scene(scene)
+    mapped = mapped_scene(scene, method="incremental")
 
     assert len(begun_from) == 2
     assert begun_from[1] is not None

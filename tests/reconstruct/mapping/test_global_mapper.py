@@ -1,0 +1,210 @@
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pycolmap
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from reconstruct.mapping.database import Observations
+from reconstruct.mapping.mapper import Mapped, faults_of, map_calibrated
+from reconstruct.mapping.pose_graph import average_poses, station_groups
+from reconstruct.mapping.stations import Link, link_stations, stereo_points
+from tests.reconstruct.mapping.test_mapper import camera_rms, seen_by_pinholes
+from tests.reconstruct.scenes import Scene, make_scene
+
+
+def pinhole_rig(scene: Scene, lenses: dict) -> dict:
+    return {n: lenses[n].pinhole_from_cam * p for n, p in scene.rig.cam_from_rig.items()}
+
+
+def station_poses(scene: Scene) -> dict[int, RigidTransform]:
+    """ned_from_rig by station."""
+    return {
+        r.station: pose * scene.rig.cam_from_rig[r.camera]
+        for r, pose in zip(scene.records, scene.ned_from_cam, strict=True)
+    }
+
+
+def mapped_by(scene: Scene, method: str, threads: int = 1) -> Mapped:
+    seen, lenses = seen_by_pinholes(scene)
+    with TemporaryDirectory() as folder:
+        return map_calibrated(
+            seen,
+            scene.rig.cam_from_rig,
+            lenses,
+            Path(folder),
+            1,
+            method=method,  # type: ignore[arg-type]
+            threads=threads,
+        )
+
+
+def ring(rng: np.random.Generator, noise: float = 0.0) -> tuple[list[Link], list[RigidTransform]]:
+    """Twelve stations, each linked to the next three, with exact or noisy relative poses."""
+    poses = [
+        RigidTransform.from_components(
+            rng.normal(0, 3, 3), Rotation.from_rotvec(rng.normal(0, 1.0, 3))
+        )
+        for _ in range(12)
+    ]
+    links = []
+    for a in range(12):
+        for step in (1, 2, 3):
+            b = (a + step) % 12
+            error = RigidTransform.from_components(
+                rng.normal(0, noise, 3), Rotation.from_rotvec(rng.normal(0, noise, 3))
+            )
+            links.append(linked(a, b, error * poses[b] * poses[a].inv()))
+    return links, poses
+
+
+def linked(a: int, b: int, pose: RigidTransform) -> Link:
+    return Link(
+        first=a, second=b, second_from_first=pose, inliers=100, share=0.9,
+        turn_variance=1e-6, shift_variance=4e-6,
+    )  # fmt: skip
+
+
+def misses(links: list[Link], poses: list[RigidTransform]) -> np.ndarray:
+    """Errors (rotation in rad, position) after moving both to the first station's frame."""
+    found = average_poses(links)
+    rows = []
+    for k in range(1, len(poses)):
+        error = (found[k] * found[0].inv()) * (poses[k] * poses[0].inv()).inv()
+        rows.append([error.rotation.magnitude(), np.linalg.norm(error.translation)])
+    return np.array(rows)
+
+
+def test_exact_links_give_back_exact_poses() -> None:
+    links, poses = ring(np.random.default_rng(1))
+    assert misses(links, poses).max() < 1e-9
+
+
+def test_averaging_beats_the_links_and_ignores_a_wrong_one() -> None:
+    noise = 2e-3
+    links, poses = ring(np.random.default_rng(2), noise)
+    clean = misses(links, poses)[:, 0]
+    assert 0.1 * noise < np.sqrt((clean**2).mean()) < 2.0 * noise
+    turned = Rotation.from_rotvec([0.0, 0.0, 1.0])
+    wrong = links[4].second_from_first
+    links[4] = linked(
+        links[4].first,
+        links[4].second,
+        RigidTransform.from_components(wrong.translation + 1.0, turned * wrong.rotation),
+    )
+    spoiled = misses(links, poses)[:, 0]
+    assert np.abs(spoiled - clean).max() < 2.0 * noise
+
+
+def test_groups_without_a_link_stay_apart() -> None:
+    links, _ = ring(np.random.default_rng(3))
+    far = linked(40, 41, RigidTransform.identity())
+    assert station_groups([*links, far]) == [list(range(12)), [40, 41]]
+    with pytest.raises(ValueError, match="more than one group"):
+        average_poses([*links, far])
+
+
+def test_stereo_points_lie_where_the_floor_is() -> None:
+    scene = make_scene(lines=1, stations=2, points=2500)
+    seen, lenses = seen_by_pinholes(scene)
+    found = stereo_points(seen, pinhole_rig(scene, lenses))
+    poses = station_poses(scene)
+    for record, points, ids in zip(scene.records, found, scene.ids, strict=True):
+        known = np.isfinite(points[:, 0])
+        assert known.mean() > 0.7
+        true = poses[record.station].inv().apply(scene.points_ned[ids[known]])
+        # The warp is exact at one range only: up to 3 mm of range are left by the relief.
+        assert np.abs(points[known] - true).max() < 4e-3
+
+
+def test_links_are_the_true_relative_poses() -> None:
+    scene = make_scene(lines=2, stations=4, points=5000, noise_px=0.1)
+    seen, lenses = seen_by_pinholes(scene)
+    links = link_stations(seen, pinhole_rig(scene, lenses), 1, 1)
+    poses = station_poses(scene)
+    assert {(k.first, k.second) for k in links} | {(k.second, k.first) for k in links} >= {
+        (k, k + 1) for k in range(3)
+    }
+    strong = [link for link in links if link.inliers > 250]
+    assert len(strong) >= 6
+    for link in strong:
+        true = poses[link.second].inv() * poses[link.first]
+        error = link.second_from_first * true.inv()
+        assert error.rotation.magnitude() < 0.02
+        assert np.linalg.norm(error.translation) < 0.04
+
+
+def test_global_mapping_is_as_good_as_incremental() -> None:
+    scene = make_scene(lines=3, stations=5, points=7000, noise_px=0.3)
+    at_once, one_by_one = mapped_by(scene, "global"), mapped_by(scene, "incremental")
+    assert at_once.models == one_by_one.models == (30,)
+    assert "global mapping" in at_once.notes[0]
+    assert "incremental mapping" in one_by_one.notes[0]
+    assert 0.2e-3 < camera_rms(at_once, scene) < 1.2 * camera_rms(one_by_one, scene)
+    errors = [m.model.compute_mean_reprojection_error() for m in (at_once, one_by_one)]
+    assert errors[0] == pytest.approx(errors[1], rel=0.02)
+
+
+def test_threads_do_not_change_a_byte(tmp_path: Path) -> None:
+    scene = make_scene(lines=2, stations=4, points=3500, noise_px=0.3)
+    for threads in (1, 2):
+        (tmp_path / str(threads)).mkdir()
+        mapped_by(scene, "auto", threads).model.write_binary(tmp_path / str(threads))
+    for file in sorted((tmp_path / "1").iterdir()):
+        assert file.read_bytes() == (tmp_path / "2" / file.name).read_bytes()
+
+
+def test_a_fall_back_is_told(monkeypatch: pytest.MonkeyPatch, capsys) -> None:  # type: ignore[no-untyped-def]
+    from reconstruct.mapping import mapper
+
+    scene = make_scene(lines=1, stations=5, points=3000, noise_px=0.2)
+    monkeypatch.setattr(mapper, "map_globally", lambda *_: [])
+    mapped = mapped_by(scene, "auto")
+    assert mapped.models[0] == 10
+    told = "global mapping found no model: incremental mapping instead, with 10 of 10 pictures"
+    assert told in mapped.notes
+    assert told in capsys.readouterr().err
+
+
+def test_a_model_that_lost_pictures_is_not_sound() -> None:
+    scene = make_scene(lines=1, stations=4, points=2500, noise_px=0.2)
+    model = mapped_by(scene, "global").model
+    assert faults_of([model], 8) == []
+    model.deregister_frame(2)
+    assert faults_of([model], 8) == ["lost 2 of 8 pictures"]
+    assert faults_of([], 8) == ["found no model"]
+
+
+def test_the_scale_is_the_rigs_whatever_the_first_guess() -> None:
+    """COLMAP's own gauge keeps the length between two cameras, and so a wrong scale."""
+    from reconstruct.mapping.global_mapper import adjust
+    from reconstruct.mapping.mapper import _options
+
+    scene = make_scene(lines=2, stations=4, points=4000, noise_px=0.1)
+    mapped = mapped_by(scene, "global")
+    model = pycolmap.Reconstruction(mapped.model)
+    for frame in model.frames.values():  # the same turn, but centres and points 3 % farther out
+        pose = frame.rig_from_world
+        frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, 1.03 * pose.translation)
+    for point in model.points3D.values():
+        point.xyz = 1.03 * point.xyz
+    adjust(model, _options(scene.rig.cam_from_rig, 1, "nothing"), tolerance=1e-8)
+    centres = [
+        np.array([m.images[n].projection_center() for n in sorted(m.images)])
+        for m in (mapped.model, model)
+    ]
+    spans = [np.linalg.norm(c[0] - c[-2]) for c in centres]
+    assert spans[1] == pytest.approx(spans[0], rel=2e-4)
+
+
+def test_pictures_without_matches_are_left_out_and_counted() -> None:
+    scene = make_scene(lines=1, stations=6, points=3500, noise_px=0.2)
+    seen, lenses = seen_by_pinholes(scene)
+    alone = {10, 11}
+    pairs = [p for p in seen.pairs if not (alone & {p[0], p[1]}) or {p[0], p[1]} == alone]
+    cut = Observations(images=seen.images, cameras=seen.cameras, pixels=seen.pixels, pairs=pairs)
+    with TemporaryDirectory() as folder:
+        mapped = map_calibrated(cut, scene.rig.cam_from_rig, lenses, Path(folder), 1)
+    assert mapped.models[0] == 10
+    assert "lost 2 of 12 pictures" in mapped.notes[0]
