@@ -16,7 +16,7 @@ from shapely.geometry import MultiPolygon, box
 from alice_survey.frames import Array
 from alice_survey.seafloor.terrain import Terrain
 from alice_survey.seafloor.texture import Texture
-from reconstruct.evaluate.truth import surface_material
+from reconstruct.evaluate.truth import surface_depth, surface_material
 
 _PATCH_PX = 96
 _PATCHES = 400
@@ -32,6 +32,10 @@ class MosaicScore:
     """Patches looked at."""
     shifts_m: Array
     """(N, 2) east and north by which the mosaic is off, where the match was clear."""
+    points_world: Array
+    """(N, 3) middles of those patches in the model."""
+    points_true: Array
+    """(N, 3) where what they show truly is, NED."""
     pixel_m: float
     coverage: float
     """Share of the survey area that the mosaic shows."""
@@ -43,10 +47,12 @@ class MosaicScore:
             "coverage": round(self.coverage, 4),
             "patches": self.patches,
             "clear_patches": len(self.shifts_m),
+            "clear_share": round(len(self.shifts_m) / max(self.patches, 1), 4),
         }
         if len(self.shifts_m):
             length_mm = 1e3 * np.linalg.norm(self.shifts_m, axis=1)
             figures["position_rms_mm"] = round(float(np.sqrt(np.mean(length_mm**2))), 3)
+            figures["position_rms_px"] = round(1e-3 * figures["position_rms_mm"] / self.pixel_m, 4)
             figures["position_median_mm"] = round(float(np.median(length_mm)), 3)
             figures["position_95_mm"] = round(float(np.percentile(length_mm, 95)), 3)
         return figures
@@ -71,11 +77,12 @@ def score_mosaic(
         truth_from_world: alignment from the model's to the true NED.
     """
     area = area_in_world(area, terrain, truth_from_world)
+    half = _PATCH_PX // 2 - 1
     shapely.prepare(area)
     with rasterio.open(mosaic) as source, rasterio.open(dem) as heights:
         transform = source.transform
         windows = _patches(source.height, source.width, transform, area)
-        shifts = []
+        shifts, middles, true_places = [], [], []
         for window in windows:
             picture = source.read(window=window)
             if picture[-1].min() == 0:
@@ -86,12 +93,21 @@ def score_mosaic(
             places = truth_from_world.apply(points)[:, :2]
             true = _painted(terrain, texture, places, transform.a)
             shift = _shift_px(picture[:-1].mean(axis=0), true)
-            if shift is not None:
-                shifts.append(shift * [transform.a, transform.e])
+            if shift is None:
+                continue
+            shifts.append(shift * [transform.a, transform.e])
+            middle = points.reshape(_PATCH_PX, _PATCH_PX, 3)[half:-half, half:-half].mean((0, 1))
+            middles.append(middle)
+            back = middle - [shifts[-1][1], shifts[-1][0], 0.0]
+            true_places.append(truth_from_world.apply(back)[:2])
         coverage = _coverage(source, area)
+    true_ne = np.array(true_places).reshape(-1, 2)
+    depth = surface_depth(terrain, true_ne) if len(true_ne) else np.empty(0)
     return MosaicScore(
         patches=len(windows),
         shifts_m=np.array(shifts).reshape(-1, 2),
+        points_world=np.array(middles).reshape(-1, 3),
+        points_true=np.column_stack([true_ne, depth]),
         pixel_m=float(transform.a),
         coverage=coverage,
     )

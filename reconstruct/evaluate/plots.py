@@ -13,7 +13,8 @@ from alice_survey.artefacts import atomic_path
 from missions.plan_file import read_plan
 
 if TYPE_CHECKING:
-    from reconstruct.evaluate.run import CameraScore, SurfaceScore
+    from reconstruct.evaluate.cameras import CameraScore
+    from reconstruct.evaluate.surface import SurfaceScore
 
 _STYLE: dict[str, Any] = {"font.size": 9, "axes.titlesize": 10, "figure.dpi": 110}
 

@@ -121,7 +121,7 @@ def measure(pixels: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> dict
     full = float(np.iinfo(pixels.dtype).max)
     eight = (pixels.astype(np.float32) * (255.0 / full)).round().astype(np.uint8)
     grey = cv2.cvtColor(eight, cv2.COLOR_BGR2GRAY) if eight.ndim == 3 else eight
-    use: NDArray[np.bool_] = np.ones(grey.shape, dtype=np.bool_) if mask is None else mask
+    use = np.full(grey.shape, True) if mask is None else mask
     blocks = _whole_blocks(use)
     if not blocks.any():
         raise ImageError(
@@ -162,8 +162,7 @@ def _per_block(values: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def _whole_blocks(use: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    whole: NDArray[np.bool_] = _blocks_of(use).all(axis=(1, 3))
-    return whole
+    return np.asarray(_blocks_of(use).all(axis=(1, 3)))
 
 
 def _noise(values: NDArray[np.float32], blocks: NDArray[np.bool_]) -> float:

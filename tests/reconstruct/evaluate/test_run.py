@@ -20,9 +20,10 @@ from missions.areas.area import Area
 from missions.lines.line import Line, LineKind
 from missions.plan_file import Dive, Plan
 from missions.route.legs import Leg, Route
+from reconstruct.evaluate.cameras import score_cameras
 from reconstruct.evaluate.mosaic import area_in_world
 from reconstruct.evaluate.overlap import neighbours
-from reconstruct.evaluate.run import score_cameras, score_surface
+from reconstruct.evaluate.surface import score_surface
 from reconstruct.evaluate.truth import surface_depth, surface_distance
 
 HOLE = [(1.0, 0.8), (1.6, 0.8), (1.6, 1.4), (1.0, 1.4)]
@@ -80,6 +81,36 @@ def test_an_error_and_holes_are_measured(terrain: Terrain, tmp_path: Path) -> No
     assert 8.0 < figures["distance_rms_mm"] < 12.0
     assert score.completeness == pytest.approx(0.75, abs=0.02)
     assert np.all(score.distance_m <= np.abs(score.height_m) + 1e-6)
+
+
+def test_sigmas_stations_and_ground_pixels_are_held_against_the_error(
+    terrain: Terrain, tmp_path: Path
+) -> None:
+    write_dem(tmp_path / "dem.tif", terrain, 0.004, 0.0)
+    with rasterio.open(tmp_path / "dem.tif") as source:
+        profile, shape = source.profile, source.shape
+    with rasterio.open(tmp_path / "sigma.tif", "w", **profile) as target:
+        target.write(np.full(shape, 0.002), 1)
+
+    def western_half(points_ned: np.ndarray) -> np.ndarray:
+        return np.where(points_ned[:, 1] < 1.25, 3, 2)
+
+    score = score_surface(
+        tmp_path / "dem.tif", AREA, terrain, SHIFT, sigma=tmp_path / "sigma.tif",
+        stations=western_half,
+    )  # fmt: skip
+    figures = score.to_json(0.0015)
+    assert figures["error_over_sigma"]["rms"] == pytest.approx(2.0, abs=0.01)
+    assert figures["error_over_sigma"]["within_1_sigma"] == 0
+    assert figures["volume"]["mean_height_error_mm"] == pytest.approx(4.0, abs=0.01)
+    assert abs(figures["doming"]["dome_mm"]) < 0.01
+    well = figures["seen_from_3_stations"]
+    west = shapely.intersection(AREA, shapely.box(0, 0, 4, 1.25)).area
+    assert well["share"] == pytest.approx(west / AREA.area, abs=0.04)
+    assert well["completeness"] > 0.98
+    # 4 mm in height are less in distance where the surface is steep, and 2.67 ground pixels.
+    assert figures["completeness_within_px"]["3"] > 0.98
+    assert figures["completeness_within_px"]["1"] < 0.1
 
 
 def test_holes_and_the_gap_between_parts_are_not_scored(terrain: Terrain, tmp_path: Path) -> None:

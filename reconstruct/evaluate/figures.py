@@ -1,0 +1,150 @@
+"""Figures that every score needs: spreads, the bend of a block, lengths and volumes."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from alice_survey.frames import Array
+
+MAD_TO_SIGMA = 1.4826
+"""Standard deviation of a normal distribution over the median of its absolute values."""
+
+_BLOCKS = 10
+"""Blocks along the longer side over which errors are averaged before a bend is fitted."""
+_LEAST_SHARE = 0.25
+"""Of the fullest block that a block must hold to count."""
+_LEAST_BLOCKS = 12
+_PAIRS = 4000
+
+
+def rms(values: Array) -> float:
+    """Root mean square; NaN of nothing."""
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else math.nan
+
+
+def rounded(value: float, digits: int) -> float | None:
+    """For JSON, which has no NaN: None instead."""
+    return round(float(value), digits) if math.isfinite(value) else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Doming:
+    """The bend of a model: a paraboloid fitted to its height errors."""
+
+    dome_m: float
+    """Middle of the block over its rim, after tilt and shift are taken off; NaN when too few."""
+    sigma_m: float
+    bend_m: float
+    """The same along the direction of the strongest bend: a trough as well as a dome."""
+    radius_m: float
+    """Of the rim."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Figures in millimetres."""
+        return {
+            "dome_mm": rounded(1e3 * self.dome_m, 3),
+            "sigma_mm": rounded(1e3 * self.sigma_m, 3),
+            "strongest_bend_mm": rounded(1e3 * self.bend_m, 3),
+            "radius_m": rounded(self.radius_m, 3),
+        }
+
+
+def fit_doming(places_m: Array, errors_m: Array) -> Doming:
+    """Fit `error = a + b x + c y + d x^2 + e x y + f y^2` over medians of square blocks.
+
+    Medians keep outliers out. Errors of neighbouring cells go together, so that cells would promise
+    too small a sigma; it comes from how the blocks scatter about the paraboloid. The curvature of a
+    fitted paraboloid is the measure of doming of James & Robson (2014) and Refrax (2026).
+
+    Args:
+        places_m: (N, 2) where the errors are.
+        errors_m: (N,) height errors, positive where the model is too high.
+    """
+    unknown = Doming(dome_m=math.nan, sigma_m=math.nan, bend_m=math.nan, radius_m=math.nan)
+    if len(places_m) < _LEAST_BLOCKS:
+        return unknown
+    corner, far = places_m.min(axis=0), places_m.max(axis=0)
+    side = max(float((far - corner).max()) / _BLOCKS, 1e-12)
+    block = np.minimum(((places_m - corner) / side).astype(np.int64), _BLOCKS - 1)
+    number = block[:, 0] * _BLOCKS + block[:, 1]
+    order = np.argsort(number, kind="stable")
+    starts = np.flatnonzero(np.diff(number[order], prepend=-1))
+    parts = np.split(order, starts[1:])
+    fullest = max(len(part) for part in parts)
+    parts = [part for part in parts if len(part) >= _LEAST_SHARE * fullest]
+    if len(parts) < _LEAST_BLOCKS:
+        return unknown
+    middles = np.array([places_m[part].mean(axis=0) for part in parts])
+    centre = middles.mean(axis=0)
+    radius = float(np.linalg.norm(middles - centre, axis=1).max())
+    x, y = ((middles - centre) / radius).T
+    design = np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
+    level, values = errors_m, np.zeros(6)
+    for _ in range(2):  # of a tilted block the median is not at the mean place: level it first
+        level = level - values[0] - (places_m - centre) @ (values[1:3] / radius)
+        medians = np.array([np.median(level[part]) for part in parts])
+        values, _, rank, _ = np.linalg.lstsq(design, medians, rcond=None)
+        if rank < design.shape[1]:  # all blocks on one line or circle
+            return unknown
+    residual = medians - design @ values
+    variance = float(residual @ residual) / (len(parts) - design.shape[1])
+    covariance = variance * np.linalg.inv(design.T @ design)
+    mean = np.array([0, 0, 0, 0.5, 0, 0.5])
+    bends = np.linalg.eigvalsh([[values[3], values[4] / 2], [values[4] / 2, values[5]]])
+    return Doming(
+        dome_m=-float(mean @ values),
+        sigma_m=math.sqrt(float(mean @ covariance @ mean)),
+        bend_m=-float(bends[np.abs(bends).argmax()]),
+        radius_m=radius,
+    )
+
+
+def compare_lengths(found: Array, true: Array, rng: np.random.Generator) -> dict[str, Any]:
+    """Lengths between random pairs of points, which no alignment can hide.
+
+    Args:
+        found: (N, 3) points of the model, metres.
+        true: (N, 3) the same points in truth.
+        rng: draws the pairs.
+
+    Returns:
+        Error of the scale (least squares over all lengths, ppm) and of the lengths; empty of fewer
+        than 3 points.
+    """
+    if len(found) < 3:
+        return {}
+    pairs = rng.integers(0, len(found), (_PAIRS, 2))
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    lengths = np.linalg.norm(found[pairs[:, 0]] - found[pairs[:, 1]], axis=1)
+    truth = np.linalg.norm(true[pairs[:, 0]] - true[pairs[:, 1]], axis=1)
+    error = lengths - truth
+    return {
+        "points": len(found),
+        "scale_error_ppm": round(1e6 * float(lengths @ truth / (truth @ truth) - 1), 1),
+        "rms_mm": round(1e3 * rms(error), 3),
+        "rms_ppm_of_length": round(1e6 * rms(error / np.maximum(truth, 1e-9)), 1),
+        "mean_length_m": round(float(truth.mean()), 3),
+    }
+
+
+def compare_volumes(height_m: Array, true_height_m: Array, cell_m2: float) -> dict[str, Any]:
+    """Volume between the surface and a level plane near its lowest point, over the same cells.
+
+    Args:
+        height_m: (N,) of the model.
+        true_height_m: (N,).
+        cell_m2: area of a cell.
+    """
+    if not len(height_m):
+        return {}
+    plane = float(np.percentile(true_height_m, 1))
+    true = float((true_height_m - plane).sum()) * cell_m2
+    error = float((height_m - true_height_m).sum()) * cell_m2
+    return {
+        "true_l": round(1e3 * true, 3),
+        "error_l": round(1e3 * error, 3),
+        "error_percent": rounded(100 * error / true if true > 0 else math.nan, 4),
+        "mean_height_error_mm": round(1e3 * error / (len(height_m) * cell_m2), 4),
+    }

@@ -1,0 +1,222 @@
+"""How well the surface of a simulated survey fits the true sea floor, cell by cell."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+import shapely
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+from shapely.geometry import MultiPolygon
+
+from alice_survey.frames import Array
+from alice_survey.seafloor.terrain import Terrain
+from reconstruct.evaluate.figures import (
+    MAD_TO_SIGMA,
+    compare_volumes,
+    fit_doming,
+    rms,
+    rounded,
+)
+from reconstruct.evaluate.truth import surface_depth, surface_distance
+
+GOOD_M = 0.01
+"""A cell counts as accurate when its distance from the true surface is below this."""
+WITHIN_PX = (1, 2, 3, 5)
+"""Ground pixels within which completeness is told."""
+LEAST_STATIONS = 3
+"""Cells seen from so many stations are scored on their own as well."""
+
+_LATTICE = 4
+"""Stations are counted for every fourth cell of every fourth row; the cells around take that."""
+_STRIP_CELLS = 400_000
+
+CountStations = Callable[[Array], NDArray[np.int64]]
+"""Stations that see (N, 3) points of the true surface."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SurfaceScore:
+    """How well the surface fits, over all cells of the survey area."""
+
+    cells: int
+    """Cells in the area, filled or not."""
+    cell_m: float
+    places_ne: Array
+    """(N, 2) aligned north and east of each filled cell."""
+    distance_m: Array
+    """(N,) distance of each filled cell from the nearest point of the true surface."""
+    height_m: Array
+    """(N,) height of each filled cell less the true height straight below or above it."""
+    true_height_m: Array
+    """(N,) the latter, positive up."""
+    sigma_m: Array | None
+    """(N,) standard deviation that the model states; None when it states none."""
+    stations: NDArray[np.int64] | None
+    """(N,) stations that see the true surface there; None when not counted."""
+    cells_seen_well: int
+    """Cells in the area, filled or not, that `LEAST_STATIONS` see."""
+    map_m: Array
+    """(rows, columns) of `height_m`; NaN where there is no cell."""
+    extent_m: tuple[float, float, float, float]
+    """West, east, south, north edges of the map, moved (not turned) to the true frame."""
+
+    @property
+    def completeness(self) -> float:
+        """Share of the area's cells that are filled."""
+        return len(self.distance_m) / self.cells
+
+    def to_json(self, ground_pixel_m: float | None = None) -> dict[str, Any]:
+        """Figures in millimetres, and in ground pixels where one is given."""
+        distance, height = 1e3 * self.distance_m, 1e3 * self.height_m
+        figures: dict[str, Any] = {
+            "cells": self.cells,
+            "completeness": round(self.completeness, 4),
+            "accurate_share": round(float((self.distance_m < GOOD_M).sum() / self.cells), 4),
+            **_spread("distance", distance),
+            "distance_max_mm": rounded(_percentile(distance, 100), 3),
+            "height_rms_mm": rounded(rms(height), 3),
+            "height_median_mm": rounded(_median(height), 3),
+            "height_95_mm": rounded(_percentile(np.abs(height), 95), 3),
+            "doming": fit_doming(self.places_ne, self.height_m).to_json(),
+            "volume": compare_volumes(
+                self.true_height_m + self.height_m, self.true_height_m, self.cell_m**2
+            ),
+        }
+        if ground_pixel_m is not None:
+            figures["ground_pixel_mm"] = round(1e3 * ground_pixel_m, 4)
+            figures["completeness_within_px"] = {
+                str(px): round(float((self.distance_m < px * ground_pixel_m).sum() / self.cells), 4)
+                for px in WITHIN_PX
+            }
+        if self.stations is not None:
+            well = self.stations >= LEAST_STATIONS
+            figures[f"seen_from_{LEAST_STATIONS}_stations"] = {
+                "cells": self.cells_seen_well,
+                "share": round(self.cells_seen_well / self.cells, 4),
+                "completeness": rounded(float(well.sum()) / max(self.cells_seen_well, 1), 4),
+                **_spread("distance", distance[well]),
+            }
+        if self.sigma_m is not None:
+            stated = self.sigma_m > 0
+            ratio = self.height_m[stated] / self.sigma_m[stated]
+            figures["error_over_sigma"] = {
+                "rms": rounded(rms(ratio), 3),
+                "robust": rounded(MAD_TO_SIGMA * _median(np.abs(ratio)), 3),
+                "within_1_sigma": rounded(float(np.mean(np.abs(ratio) < 1)), 4),
+                "within_2_sigma": rounded(float(np.mean(np.abs(ratio) < 2)), 4),
+                "median_sigma_mm": rounded(1e3 * _median(self.sigma_m[stated]), 3),
+            }
+        return figures
+
+
+def _median(values: Array) -> float:
+    return float(np.median(values)) if len(values) else float("nan")
+
+
+def _percentile(values: Array, percent: float) -> float:
+    return float(np.percentile(values, percent)) if len(values) else float("nan")
+
+
+def _spread(name: str, values_mm: Array) -> dict[str, Any]:
+    return {
+        f"{name}_rms_mm": rounded(rms(values_mm), 3),
+        f"{name}_median_mm": rounded(_median(values_mm), 3),
+        f"{name}_95_mm": rounded(_percentile(values_mm, 95), 3),
+    }
+
+
+def score_surface(
+    dem: Path,
+    area: MultiPolygon,
+    terrain: Terrain,
+    truth_from_world: RigidTransform,
+    *,
+    sigma: Path | None = None,
+    stations: CountStations | None = None,
+) -> SurfaceScore:
+    """Compare every DEM cell of the survey area with the true mesh.
+
+    Args:
+        dem: heights, positive up, over local east and north.
+        area: the survey area, x north and y east; its holes count as outside.
+        terrain: the truth.
+        truth_from_world: alignment from the model's to the true NED.
+        sigma: standard deviations of the heights, on the same grid.
+        stations: counts the stations that see points of the true surface.
+    """
+    with rasterio.open(dem) as source:
+        heights = source.read(1).astype(np.float64)
+        transform = source.transform
+    sigmas = None
+    if sigma is not None:
+        with rasterio.open(sigma) as source:
+            sigmas = source.read(1).astype(np.float64).ravel()
+    rows, columns = heights.shape
+    east = transform.c + (np.arange(columns) + 0.5) * transform.a
+    north = transform.f + (np.arange(rows) + 0.5) * transform.e
+    easts, norths = np.meshgrid(east, north)
+    level = np.stack([norths, easts, 0 * easts], -1).reshape(-1, 3)
+    filled = np.isfinite(heights).ravel()
+    points = truth_from_world.apply(level - [0, 0, 1] * heights.reshape(-1, 1))
+    plane = truth_from_world.apply(level - [0, 0, np.nanmedian(heights)])
+    place = np.where(filled[:, None], points, plane)
+    shapely.prepare(area)
+    inside = shapely.contains_xy(area, place[:, 0], place[:, 1])
+    shift_ne = (plane - level).mean(axis=0)[:2]
+    cell_m2 = abs(transform.a * transform.e)
+    used = np.flatnonzero(inside & filled)
+    depth, distance = np.empty(len(used)), np.empty(len(used))
+    for start in range(0, len(used), _STRIP_CELLS):  # ray casting needs much memory a ray
+        part = slice(start, start + _STRIP_CELLS)
+        depth[part] = surface_depth(terrain, points[used[part], :2])
+        distance[part] = surface_distance(terrain, points[used[part]])
+    misses = np.full(filled.shape, np.nan)
+    misses[used] = depth - points[used, 2]
+    seen = None
+    if stations is not None:
+        seen = _stations_of_cells(place[:, :2], inside, (rows, columns), terrain, stations)
+    return SurfaceScore(
+        cells=max(round(area.area / cell_m2), int(inside.sum())),
+        cell_m=float(transform.a),
+        places_ne=points[used, :2],
+        distance_m=distance,
+        height_m=misses[used],
+        true_height_m=-depth,
+        sigma_m=None if sigmas is None else sigmas[used],
+        stations=None if seen is None else seen[used],
+        cells_seen_well=0 if seen is None else int((seen[inside] >= LEAST_STATIONS).sum()),
+        map_m=misses.reshape(heights.shape),
+        extent_m=(
+            transform.c + shift_ne[1],
+            transform.c + columns * transform.a + shift_ne[1],
+            transform.f + rows * transform.e + shift_ne[0],
+            transform.f + shift_ne[0],
+        ),
+    )
+
+
+def _stations_of_cells(
+    places_ne: Array,
+    inside: NDArray[np.bool_],
+    shape: tuple[int, int],
+    terrain: Terrain,
+    stations: CountStations,
+) -> NDArray[np.int64]:
+    """(cells,) stations that see the true surface at each cell, from a lattice of cells."""
+    row, column = np.divmod(np.flatnonzero(inside), shape[1])
+    across = -(-shape[1] // _LATTICE)
+    node = (row // _LATTICE) * across + column // _LATTICE
+    nodes, first, of_cell = np.unique(node, return_index=True, return_inverse=True)
+    places = places_ne[inside][first]
+    found = np.zeros(len(nodes), dtype=np.int64)
+    for start in range(0, len(nodes), _STRIP_CELLS):
+        part = slice(start, start + _STRIP_CELLS)
+        depth = surface_depth(terrain, places[part])
+        found[part] = stations(np.column_stack([places[part], depth]))
+    seen = np.zeros(len(inside), dtype=np.int64)
+    seen[inside] = found[of_cell]
+    return seen

@@ -1,0 +1,85 @@
+"""Doming, lengths and volumes give back what was put in, with sigmas that hold."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import Rotation
+
+from reconstruct.evaluate.figures import compare_lengths, compare_volumes, fit_doming
+
+
+def places(rng: np.random.Generator, count: int = 20_000) -> np.ndarray:
+    return rng.uniform([-3, 5], [3, 9], (count, 2))
+
+
+def test_the_height_of_a_dome_is_found_whatever_tilt_and_shift() -> None:
+    xy = places(np.random.default_rng(1))
+    radius2 = ((xy - [0, 7]) ** 2).sum(axis=1)
+    flat = 0.3 + 0.02 * xy[:, 0] - 0.01 * xy[:, 1]
+    found = fit_doming(xy, flat - 0.004 * radius2)
+    # Blocks of medians end half a block before the edge.
+    assert found.radius_m == pytest.approx(math.hypot(3, 2), rel=0.12)
+    assert found.dome_m == pytest.approx(0.004 * found.radius_m**2, rel=0.02)
+    assert fit_doming(xy, flat).dome_m == pytest.approx(0, abs=1e-6)
+    bowl = fit_doming(xy, flat + 0.004 * radius2)
+    assert bowl.dome_m == pytest.approx(-found.dome_m, rel=1e-3)
+
+
+def test_a_trough_is_no_dome_but_is_told() -> None:
+    xy = places(np.random.default_rng(2))
+    saddle = fit_doming(xy, 0.003 * ((xy[:, 0]) ** 2 - (xy[:, 1] - 7) ** 2))
+    assert abs(saddle.dome_m) < 0.02 * 0.003 * saddle.radius_m**2
+    assert abs(saddle.bend_m) == pytest.approx(0.003 * saddle.radius_m**2, rel=0.05)
+
+
+def test_outliers_do_not_bend_a_model() -> None:
+    rng = np.random.default_rng(3)
+    xy = places(rng)
+    errors = 0.001 * rng.normal(size=len(xy))
+    wild = rng.random(len(xy)) < 0.1
+    errors[wild] += rng.uniform(0, 0.5, wild.sum())
+    assert abs(fit_doming(xy, errors).dome_m) < 0.001
+
+
+def test_sigma_of_the_dome_holds_for_errors_that_go_together() -> None:
+    rows, columns = np.mgrid[:120, :120] * 0.05
+    xy = np.column_stack([rows.ravel(), columns.ravel()])
+    ratios = []
+    for seed in range(60):
+        noise = gaussian_filter(np.random.default_rng(seed).normal(size=(120, 120)), 3)
+        found = fit_doming(xy, 1e-3 * noise.ravel())
+        ratios.append(found.dome_m / found.sigma_m)
+    assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.4
+
+
+def test_a_dome_of_too_little_is_unknown() -> None:
+    few = fit_doming(np.zeros((5, 2)), np.zeros(5))
+    assert math.isnan(few.dome_m)
+    assert few.to_json()["dome_mm"] is None
+    line = np.column_stack([np.linspace(0, 5, 500), np.zeros(500)])
+    assert math.isnan(fit_doming(line, np.zeros(500)).dome_m)
+
+
+def test_lengths_find_scale_and_noise_and_nothing_in_a_moved_model() -> None:
+    rng = np.random.default_rng(4)
+    true = rng.uniform(0, 5, (300, 3))
+    turned = Rotation.random(rng=rng).apply(true) + np.array([10, -4, 2])
+    exact = compare_lengths(turned, true, np.random.default_rng(5))
+    assert abs(exact["scale_error_ppm"]) < 0.1
+    assert exact["rms_mm"] == 0
+    grown = compare_lengths(1.0005 * turned, true, np.random.default_rng(5))
+    assert grown["scale_error_ppm"] == pytest.approx(500, abs=0.5)
+    noisy = compare_lengths(true + 1e-3 * rng.normal(size=true.shape), true, rng)
+    assert noisy["rms_mm"] == pytest.approx(math.sqrt(2), rel=0.1)
+    assert compare_lengths(true[:2], true[:2], rng) == {}
+
+
+def test_the_volume_of_a_ramp_and_of_a_lift() -> None:
+    height = np.linspace(0.0, 1.0, 10_001) - 20
+    found = compare_volumes(height + 0.002, height, 0.01)
+    assert found["true_l"] == pytest.approx(1e3 * (0.5 - 0.01) * 10_001 * 0.01, rel=1e-3)
+    assert found["error_l"] == pytest.approx(1e3 * 0.002 * 10_001 * 0.01, rel=1e-6)
+    assert found["mean_height_error_mm"] == pytest.approx(2.0)
+    assert found["error_percent"] == pytest.approx(100 * 0.002 / 0.49, rel=1e-2)

@@ -1,0 +1,104 @@
+"""Stations that see a place, and the scores of a mesh, against closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform
+from shapely import contains_xy
+from shapely.geometry import MultiPolygon, box
+
+from alice_survey.config import CameraConfig, SeafloorConfig, WaterConfig
+from alice_survey.seafloor.terrain import Terrain, build_terrain
+from camera_calib.rig import Rig, design_rig
+from missions.footprint import footprint_polygon, level_pose
+from reconstruct.evaluate.mesh import distance_from_mesh, score_mesh, spread_over
+from reconstruct.evaluate.stations import count_stations, ground_pixel_m
+from reconstruct.evaluate.truth import surface_depth
+
+DEPTH_M = 10.0
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return design_rig(CameraConfig(), WaterConfig(), scale=8)
+
+
+def floor(rocks: float = 0.0) -> Terrain:
+    config = SeafloorConfig(relief_m=0.0, grid_m=0.02, rocks_per_m2=rocks, amphora=False)
+    return build_terrain(config, (-2.0, 2.0, -2.0, 2.0), DEPTH_M, np.random.default_rng(1))
+
+
+def poses_at(rig: Rig, norths: list[float]) -> dict[str, RigidTransform]:
+    camera = rig.cameras["left"]
+    return {
+        f"left/{i}.png": level_pose(camera, np.array([n, 0.0]), 2.0, DEPTH_M, 0.0)
+        for i, n in enumerate(norths)
+    }
+
+
+def test_counts_are_those_of_the_exact_footprints(rig: Rig) -> None:
+    terrain = floor()
+    poses = poses_at(rig, [-0.6, 0.0, 0.6])
+    pictures = {name: ("left", i) for i, name in enumerate(poses)}
+    ne = np.random.default_rng(2).uniform(-1.8, 1.8, (4000, 2))
+    points = np.column_stack([ne, np.full(len(ne), DEPTH_M)])
+    found = count_stations(points, rig, pictures, poses, terrain)
+    polygons = [footprint_polygon(rig.cameras["left"], pose, DEPTH_M) for pose in poses.values()]
+    expected = sum(contains_xy(p, ne[:, 0], ne[:, 1]).astype(int) for p in polygons)
+    assert set(found) == {0, 1, 2}
+    assert (found == expected).mean() > 0.995  # the polygon has straight sides, the frame has not
+
+
+def test_both_cameras_of_a_station_count_once(rig: Rig) -> None:
+    poses = poses_at(rig, [0.0, 0.0])
+    pictures = {"left/0.png": ("left", 7), "left/1.png": ("left", 7)}
+    middle = np.array([[0.0, 0.0, DEPTH_M], [np.nan, 0, 0]])
+    np.testing.assert_array_equal(count_stations(middle, rig, pictures, poses, floor()), [1, 0])
+
+
+def test_what_an_object_hides_is_not_seen(rig: Rig) -> None:
+    rocky = floor(rocks=3.0)
+    poses = poses_at(rig, [0.0])
+    pictures = {"left/0.png": ("left", 0)}
+    ne = np.random.default_rng(3).uniform(-0.4, 0.4, (3000, 2))
+    above = np.column_stack([ne, surface_depth(rocky, ne)])
+    below = above + np.array([0, 0, 0.05])  # under the surface: the surface itself stands before it
+    assert count_stations(above, rig, pictures, poses, rocky).mean() > 0.95
+    assert count_stations(below, rig, pictures, poses, rocky).mean() == 0
+
+
+def test_the_ground_pixel_is_range_over_focal_length_in_water(rig: Rig) -> None:
+    poses = poses_at(rig, [0.0, 0.5])
+    camera = rig.cameras["left"]
+    pupil_m = DEPTH_M - poses["left/0.png"].translation[2]
+    pixel = ground_pixel_m(rig, dict.fromkeys(poses, "left"), poses, floor())
+    assert pixel == pytest.approx(pupil_m / (camera.fx_px * camera.n_water), rel=1e-5)
+
+
+SQUARE = np.array([[-1.0, -1, 10], [1, -1, 10], [1, 1, 10], [-1, 1, 10]])
+FACES = np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def test_points_are_spread_evenly_over_a_mesh() -> None:
+    points = spread_over(SQUARE, FACES, 40_000, np.random.default_rng(4))
+    counts, *_ = np.histogram2d(points[:, 0], points[:, 1], bins=4, range=[[-1, 1], [-1, 1]])
+    assert counts.sum() == 40_000
+    np.testing.assert_allclose(counts, 2500, rtol=0.1)
+
+
+def test_distance_from_a_square_is_exact() -> None:
+    points = np.array([[0.0, 0, 9.5], [2.0, 0, 10.0], [2, 2, 10]])
+    found = distance_from_mesh(SQUARE, FACES, points)
+    np.testing.assert_allclose(found, [0.5, 1.0, math.sqrt(2)], atol=1e-6)
+
+
+def test_a_lifted_half_of_a_mesh_scores_its_lift_and_half_complete() -> None:
+    half = SQUARE * [0.5, 1, 1] + [0.5, 0, -0.004]  # north 0 to 1, 4 mm too high
+    area = MultiPolygon([box(-1, -1, 1, 1)])
+    figures = score_mesh(
+        half, FACES, area, floor(), RigidTransform.identity(), 0.002, np.random.default_rng(5)
+    )
+    assert figures["distance_rms_mm"] == pytest.approx(4.0, abs=0.01)
+    assert figures["completeness_within_px"]["1"] == 0
+    assert figures["completeness_within_px"]["5"] == pytest.approx(0.5, abs=0.02)
