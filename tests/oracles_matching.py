@@ -91,3 +91,15 @@ def match_near_slowly(
         if int(np.argmin(distance[:, j])) == i and distance[i, j] < ratio**2 * min(others):
             matches.append((i, j))
     return np.array(matches, dtype=np.uint32).reshape(-1, 2)
+
+
+def vlad_slowly(descriptors: np.ndarray, words: np.ndarray) -> np.ndarray:
+    """Sum what each descriptor is off its nearest word, word by word, one at a time."""
+    sums = np.zeros(words.shape)
+    for row in descriptors.astype(float):
+        nearest = int(np.argmin(((words - row) ** 2).sum(axis=1)))
+        sums[nearest] += row - words[nearest]
+    for k in range(len(sums)):
+        length = np.linalg.norm(sums[k])
+        sums[k] = sums[k] / length if length > 0 else 0.0
+    return sums.ravel()

@@ -36,16 +36,19 @@ from reconstruct.matching.matches import (
     coarse_matches,
     match_pair,
 )
-from reconstruct.matching.pairs import choose_pairs
+from reconstruct.matching.pairs import SMALL_SET, choose_pairs, placed_pictures
 from reconstruct.matching.refinement import refine_tracks
+from reconstruct.matching.retrieval import alike_pairs
 from reconstruct.pictures.files import exif_focal_px
-from reconstruct.pictures.normalise import normalise
+from reconstruct.pictures.normalise import normalise, read_deep
 from reconstruct.pictures.undistorted import read_colour, read_mask
 
 RATIO = 0.8
 """Largest distance of a match over that of the second nearest descriptor."""
 _LEAST_COARSE = 10
 """Coarse matches from which a pair is matched fully."""
+_ALIKE = 12
+"""Pictures that look most like one that navigation does not place, which get a coarse look."""
 _NAMED = 8
 """Pictures named in a warning."""
 
@@ -92,7 +95,7 @@ def run_mapping(
         settings={
             "seed": config.seed,
             **settings.model_dump(
-                mode="json", include={"feature_scale", "max_features", "working_range_m"}
+                mode="json", include={"feature_scale", "max_features", "working_range_m", "mapper"}
             ),
         },
         inputs=files,
@@ -121,7 +124,15 @@ def run_mapping(
         )
         if inputs.rig is not None:
             poses = {name: inputs.rig.cam_from_rig[name] for name in cameras}
-            mapped = map_calibrated(seen, poses, lenses, partial, config.seed)
+            mapped = map_calibrated(
+                seen,
+                poses,
+                lenses,
+                partial,
+                config.seed,
+                method=settings.mapper,
+                threads=threads,
+            )
             adjust = NavigationAdjuster(inputs.records, inputs.rig, lenses, inputs.datum)
             mapped, refracted = refract(mapped, seen, partial, adjust, poses)
             sigmas = adjust.sigmas
@@ -138,7 +149,7 @@ def run_mapping(
 def extract(task: _FeatureTask) -> int:
     """Find and save the features of one picture, unless they are there; how many there are."""
     if not task.target.exists():
-        grey = normalise(read_colour(task.picture))
+        grey = normalise(read_deep(task.picture))
         mask = None if task.mask is None else read_mask(task.mask, (grey.shape[1], grey.shape[0]))
         found = find_features(grey, mask, scale=task.scale, most=task.most)
         with atomic_path(_grey_file(task.target)) as temporary, temporary.open("wb") as file:
@@ -246,7 +257,12 @@ def _match_all(
     seed: int,
     threads: int,
 ) -> list[VerifiedPair]:
-    sure, maybe = choose_pairs(inputs.records, inputs.rig, inputs.datum)
+    placed = placed_pictures(inputs.records, inputs.rig, inputs.datum)
+    lost = [i for i in range(len(inputs.records)) if i not in placed]
+    alike: list[tuple[int, int]] = []
+    if len(inputs.records) > SMALL_SET:
+        alike = alike_pairs(features, lost, _ALIKE, seed=seed, threads=threads)
+    sure, maybe = choose_pairs(inputs.records, inputs.rig, inputs.datum, alike)
     looks = [PairTask(first=features[i], second=features[j], ratio=RATIO) for i, j in maybe]
     counts = parallel_map(coarse_matches, looks, threads=threads, label="choosing pairs")
     likely = [pair for pair, n in zip(maybe, counts, strict=True) if n >= _LEAST_COARSE]

@@ -1,7 +1,7 @@
 """Which pictures to match: by their footprints, by their order, or by a first coarse look."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -24,43 +24,68 @@ _NEAREST = 20
 """Pictures nearest by navigation that get a coarse look when footprints are not known."""
 _LEAST_OVERLAP = 0.05
 _SURE_OVERLAP = 0.3
+_SECTORS = 6
+"""Directions in which a picture looks for partners, for each side of its survey line and across."""
+_PER_SECTOR = 2
+_LOOKS = 12
+"""Partners of every picture that get a coarse look."""
+_SIGMAS = 2.0
+"""Standard deviations of the distance of two pictures up to which they get a coarse look."""
 
 
 def choose_pairs(
-    records: Sequence[ImageRecord], rig: Rig | None, datum: Datum | None
+    records: Sequence[ImageRecord],
+    rig: Rig | None,
+    datum: Datum | None,
+    alike: Sequence[Pair] = (),
 ) -> tuple[list[Pair], list[Pair]]:
     """Pairs to match fully, and pairs to match only if a coarse look finds something.
 
     With a rig, positions, attitudes and altitudes: pairs of one camera whose footprints overlap
     (those across the cameras add nothing that the pairs within the stations do not link already:
-    on a simulated survey half the pairs gave the same 0.7 mm). With positions only: the nearest
-    pictures. Without either: neighbours in order, and every other pair where the pictures are few.
-    Pictures of one station are always matched.
+    on a simulated survey half the pairs gave the same 0.7 mm). Of many, every picture chooses the
+    best conditioned in all directions (`well_conditioned`), so that the work for a picture does not
+    grow with the survey nor with the times that a place was visited. With positions only: the
+    nearest pictures. Without either: neighbours in order, pictures that look alike, and every other
+    pair where the pictures are few. Pictures of one station are always matched.
 
     Args:
         records: pictures.
         rig: calibrated cameras, when known.
         datum: origin of local coordinates; None without positions.
+        alike: pairs that look alike, for pictures that navigation says nothing about.
     """
     sure = neighbours(records, 0)
     maybe: set[Pair] = set()
-    placed: set[int] = set()
+    placed = placed_pictures(records, rig, datum)
     if datum is not None and rig is not None:
         posed = [i for i, r in enumerate(records) if _has_pose(r)]
         near, touching = _overlapping([records[i] for i in posed], rig, datum)
         sure |= {(posed[i], posed[j]) for i, j in near}
         maybe |= {(posed[i], posed[j]) for i, j in touching}
-        placed = set(posed)
     elif datum is not None and len(records) > SMALL_SET:
         maybe |= _nearest(records, datum)
         sure |= neighbours(records, 1)
-        placed = {i for i, r in enumerate(records) if r.has_position}
     if len(placed) < len(records):
         in_order = neighbours(records, NEIGHBOURS)
         sure |= {(i, j) for i, j in in_order if i not in placed or j not in placed}
+        maybe |= {(i, j) for i, j in alike if i not in placed or j not in placed}
         if len(records) <= SMALL_SET:
             maybe |= set(itertools.combinations(range(len(records)), 2))
     return sorted(sure), sorted(maybe - sure)
+
+
+def placed_pictures(
+    records: Sequence[ImageRecord], rig: Rig | None, datum: Datum | None
+) -> set[int]:
+    """Pictures whose partners navigation names."""
+    if datum is None:
+        return set()
+    if rig is not None:
+        return {i for i, r in enumerate(records) if _has_pose(r)}
+    if len(records) > SMALL_SET:
+        return {i for i, r in enumerate(records) if r.has_position}
+    return set()
 
 
 def neighbours(records: Sequence[ImageRecord], reach: int) -> set[Pair]:
@@ -128,19 +153,85 @@ def _overlapping(
     records: Sequence[ImageRecord], rig: Rig, datum: Datum
 ) -> tuple[set[Pair], set[Pair]]:
     polygons = footprints(records, rig, datum)
-    tree = STRtree(polygons)
-    sure, maybe = set(), set()
-    for i, polygon in enumerate(polygons):
+    wider = [p.buffer(_reach_m(r)) for p, r in zip(polygons, records, strict=True)]
+    centres = np.array([p.centroid.coords[0] if not p.is_empty else (np.nan, np.nan)
+                        for p in polygons]).reshape(-1, 2)  # fmt: skip
+    sure: dict[Pair, float] = {}
+    maybe: dict[Pair, float] = {}
+    tree = STRtree(wider)
+    for i, polygon in enumerate(wider):
         for j in sorted(int(k) for k in tree.query(polygon) if k > i):
             if records[i].camera != records[j].camera:
                 continue
-            smaller = min(polygon.area, polygons[j].area)
-            overlap = polygon.intersection(polygons[j]).area / smaller if smaller > 0 else 0.0
+            overlap = _overlap(polygons[i], polygons[j])
             if overlap >= _SURE_OVERLAP:
-                sure.add((i, j))
-            elif overlap >= _LEAST_OVERLAP:
-                maybe.add((i, j))
-    return sure, maybe
+                sure[i, j] = overlap
+            elif _overlap(polygon, wider[j]) >= _LEAST_OVERLAP:
+                maybe[i, j] = overlap
+    headings = np.array([r.heading_deg for r in records])
+    apart = {p: float(np.linalg.norm(centres[p[0]] - centres[p[1]])) for p in (*sure, *maybe)}
+    return well_conditioned(sure, centres, headings), nearest_each(maybe, apart, _LOOKS)
+
+
+def _overlap(first: Polygon, second: Polygon) -> float:
+    """Share of the smaller footprint that the other covers."""
+    smaller = min(first.area, second.area)
+    return float(first.intersection(second).area / smaller) if smaller > 0 else 0.0
+
+
+def _reach_m(record: ImageRecord) -> float:
+    """By how much a footprint is widened; 0 where no sigma is known.
+
+    Two together make up the uncertainty of their distance, the root of two of that of one.
+    """
+    tilt = np.deg2rad(record.sigma_attitude_deg) * record.altitude_m
+    return float(
+        _SIGMAS / np.sqrt(2.0) * np.hypot(*np.nan_to_num([record.sigma_horizontal_m, tilt]))
+    )
+
+
+def well_conditioned(
+    overlaps: Mapping[Pair, float], centres: Array, headings_deg: Array
+) -> set[Pair]:
+    """The best partners of every picture in all directions, on lines along and across its own.
+
+    A partner is good for its overlap times its distance: far ones see heights under a wide angle,
+    near ones share many spots, and a picture of the same place from the same place tells nothing
+    new. The partner of most overlap is kept too: it carries the track on.
+
+    Args:
+        overlaps: share of the footprint in common, by pair.
+        centres: (N, 2) of the footprints.
+        headings_deg: (N,).
+    """
+    partners: dict[int, list[tuple[int, float]]] = {}
+    for (i, j), overlap in overlaps.items():
+        partners.setdefault(i, []).append((j, overlap))
+        partners.setdefault(j, []).append((i, overlap))
+    chosen = set()
+    for i, found in sorted(partners.items()):
+        kept = {max(found, key=lambda item: (item[1], -item[0]))[0]}
+        sectors: dict[tuple[int, bool], list[tuple[float, int]]] = {}
+        for j, overlap in found:
+            north, east = centres[j] - centres[i]
+            bearing = np.rad2deg(np.arctan2(east, north)) - headings_deg[i]
+            sector = round(bearing / (360.0 / _SECTORS)) % _SECTORS
+            across = abs(np.sin(np.deg2rad(headings_deg[j] - headings_deg[i]))) > np.sqrt(0.5)
+            goodness = overlap * float(np.hypot(north, east))
+            sectors.setdefault((sector, bool(across)), []).append((-goodness, j))
+        for members in sectors.values():
+            kept |= {j for _, j in sorted(members)[:_PER_SECTOR]}
+        chosen |= {(min(i, j), max(i, j)) for j in kept}
+    return chosen
+
+
+def nearest_each(pairs: Iterable[Pair], apart: Mapping[Pair, float], most: int) -> set[Pair]:
+    """Pairs that are among the nearest few of either picture."""
+    partners: dict[int, list[tuple[float, Pair]]] = {}
+    for pair in pairs:
+        for i in pair:
+            partners.setdefault(i, []).append((apart[pair], pair))
+    return {pair for found in partners.values() for _, pair in sorted(found)[:most]}
 
 
 def _nearest(records: Sequence[ImageRecord], datum: Datum) -> set[Pair]:

@@ -5,31 +5,56 @@ by the strongly blurred picture removes the first, local histogram equalisation 
 balance has no place here: it amplifies the noise of the weakest channel and costs matches.
 """
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Grey = NDArray[np.uint8]
+from alice_survey.errors import ImageError
 
-_FLOOR = 4.0
-"""Grey levels below which a background counts as dark: noise there is not blown up further."""
+Grey = NDArray[np.uint8]
+Deep = NDArray[np.uint8] | NDArray[np.uint16]
+
+_FLOOR = {np.dtype(np.uint8): 4.0, np.dtype(np.uint16): 64.0}
+"""Grey levels below which a background counts as dark: noise there is not blown up further. Of 16
+bits, those of a camera that fills 12 are meant."""
 _BACKGROUND_SHARE = 1 / 24
 """Sigma of the background's blur as a share of the picture's longer side."""
 _CLIP = 3.0
 _TILES = 8
 
 
-def even_light(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
+def read_deep(path: Path) -> Deep:
+    """Read a picture for matching, (H, W) or (H, W, 3) BGR, with the 8 or 16 bits that it has.
+
+    Raises:
+        ImageError: it is missing, cannot be decoded, or its levels are not of 8 or 16 bits.
+    """
+    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    picture = cv2.imread(str(path), flags)
+    if picture is None:
+        raise ImageError(f"{path}: missing, or no picture that can be decoded")
+    if picture.dtype not in _FLOOR:
+        raise ImageError(
+            f"{path}: levels of type {picture.dtype}: convert the picture to 8 or 16 bits"
+        )
+    deep: Deep = picture
+    return deep
+
+
+def even_light(picture: Deep) -> NDArray[np.float32]:
     """Divide a picture by its blurred background.
 
     Args:
-        picture: (H, W) grey or (H, W, 3) BGR.
+        picture: (H, W) grey or (H, W, 3) BGR, of 8 or 16 bits.
 
     Returns:
         (H, W) ratio of the grey level to its surroundings; 1 on average, and near 0 to 1 where the
         surroundings are dark.
     """
     grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) if picture.ndim == 3 else picture
+    floor = np.float32(_FLOOR[picture.dtype])
     grey = grey.astype(np.float32)
     height, width = grey.shape
     sigma = max(width, height) * _BACKGROUND_SHARE
@@ -41,15 +66,15 @@ def even_light(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
     )
     small = cv2.GaussianBlur(small, (0, 0), sigma / shrink, borderType=cv2.BORDER_REFLECT)
     background = cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR)
-    ratio: NDArray[np.float32] = grey / np.maximum(background, np.float32(_FLOOR))
+    ratio: NDArray[np.float32] = grey / np.maximum(background, floor)
     return ratio
 
 
-def normalise(picture: NDArray[np.uint8]) -> Grey:
+def normalise(picture: Deep) -> Grey:
     """A grey picture of even light and contrast, for matching.
 
     Args:
-        picture: (H, W) grey or (H, W, 3) BGR.
+        picture: (H, W) grey or (H, W, 3) BGR, of 8 or 16 bits.
 
     Returns:
         (H, W) grey levels.

@@ -5,7 +5,14 @@ import numpy as np
 import pytest
 
 from alice_survey.manifest import ImageRecord
-from reconstruct.matching.pairs import NEIGHBOURS, choose_pairs, footprints, neighbours
+from reconstruct.matching.pairs import (
+    NEIGHBOURS,
+    choose_pairs,
+    footprints,
+    nearest_each,
+    neighbours,
+    well_conditioned,
+)
 from tests.reconstruct.scenes import ALTITUDE_M, DATUM, make_scene
 
 
@@ -86,7 +93,8 @@ def test_footprints_have_the_size_of_the_exact_port_camera() -> None:
 
 def test_pairs_by_footprint_are_those_that_share_the_sea_floor() -> None:
     scene = make_scene(points=6000)
-    sure, maybe = choose_pairs(scene.records, scene.rig, DATUM)
+    certain = [replace(r, sigma_horizontal_m=0.0, sigma_attitude_deg=0.0) for r in scene.records]
+    sure, maybe = choose_pairs(certain, scene.rig, DATUM)
     shared = {
         (i, j): len(np.intersect1d(scene.ids[i], scene.ids[j]))
         for i, j in itertools.combinations(range(len(scene.records)), 2)
@@ -95,7 +103,8 @@ def test_pairs_by_footprint_are_those_that_share_the_sea_floor() -> None:
     records = scene.records
     one_camera = {p for p in shared if records[p[0]].camera == records[p[1]].camera}
     stations = {p for p in shared if records[p[0]].station == records[p[1]].station}
-    assert {pair for pair, n in shared.items() if n > 60} & one_camera <= chosen
+    # a third of a picture's points
+    assert {pair for pair, n in shared.items() if n > 250} & one_camera <= chosen
     assert stations <= set(sure)
     assert chosen <= one_camera | stations
     assert all(shared[pair] > 20 for pair in sure)
@@ -115,3 +124,75 @@ def test_pictures_without_navigation_are_tied_to_their_neighbours() -> None:
         if lost in {records[i].station for i in pair}
     }
     assert partners >= set(range(lost - NEIGHBOURS, lost + NEIGHBOURS + 1))
+
+
+def partners_each(records: list[ImageRecord]) -> tuple[float, int]:
+    """Mean and largest number of partners of a picture, coarse looks included."""
+    scene = make_scene(points=1)
+    sure, maybe = choose_pairs(records, scene.rig, DATUM)
+    count = np.bincount(np.ravel([*sure, *maybe]), minlength=len(records))
+    return float(count.mean()), int(count.max())
+
+
+def test_partners_of_a_picture_do_not_grow_with_the_survey() -> None:
+    mean = {
+        lines: partners_each(make_scene(lines=lines, stations=10, points=1).records)[0]
+        for lines in (5, 20)
+    }
+    assert 4 < mean[5] < 20
+    assert mean[20] < 1.1 * mean[5]
+
+
+def test_partners_of_a_picture_do_not_grow_with_visits_to_the_place() -> None:
+    scene = make_scene(points=1)
+    visits = [
+        replace(r, station=r.station + 1000 * visit, image=f"{visit}/{r.image}")
+        for visit in range(6)
+        for r in scene.records
+    ]
+    once, _ = partners_each(scene.records)
+    often, most = partners_each(visits)
+    # six directions on lines along and across, two in each, chosen by either of the two
+    assert once < often < 2 * (2 * 6 * 2 + 12)
+    assert most < len(visits) / 4
+
+
+def test_every_direction_keeps_a_partner() -> None:
+    """In a crowd to the north, the one partner to the east must not be lost."""
+    rng = np.random.default_rng(8)
+    crowd = np.column_stack([rng.uniform(0.1, 0.8, 30), rng.uniform(-0.02, 0.02, 30)])
+    centres = np.concatenate([[[0.0, 0.0]], crowd, [[0.0, 0.5]]])
+    overlaps = {(0, j): 0.9 - 0.8 * float(np.hypot(*centres[j])) for j in range(1, 31)}
+    overlaps[0, 31] = 0.35
+    chosen = well_conditioned(overlaps, centres, np.zeros(32))
+    # what the others choose among one partner is kept as well, hence only picture 0 is asked
+    assert (0, 31) in chosen
+    assert max(overlaps, key=overlaps.__getitem__) in chosen
+
+
+def test_uncertain_navigation_widens_the_search() -> None:
+    scene = make_scene(points=1)
+    found = []
+    for sigma in (0.0, 0.5):
+        records = [replace(r, sigma_horizontal_m=sigma) for r in scene.records]
+        sure, maybe = choose_pairs(records, scene.rig, DATUM)
+        found.append((set(sure), set(maybe)))
+    assert found[0][0] == found[1][0]
+    assert len(found[1][1]) > len(found[0][1])
+
+
+def test_looks_go_to_the_nearest() -> None:
+    apart = {(0, j): float(j) for j in range(1, 10)} | {(10, 11): 99.0}
+    assert nearest_each(apart, apart, 1) == {(0, j) for j in range(1, 10)} | {(10, 11)}
+    star = {(i, j): float(abs(i - j)) for i in range(20) for j in range(i + 1, 20)}
+    assert nearest_each(star, star, 1) == {(i, i + 1) for i in range(19)}
+
+
+def test_pictures_that_look_alike_get_a_look_where_navigation_is_silent() -> None:
+    sure, maybe = choose_pairs(mono(200), None, None, [(3, 150), (4, 5)])
+    assert maybe == [(3, 150)]
+    assert (4, 5) in sure
+    scene = make_scene(points=1)
+    assert choose_pairs(scene.records, scene.rig, DATUM, [(0, 39)]) == choose_pairs(
+        scene.records, scene.rig, DATUM
+    )

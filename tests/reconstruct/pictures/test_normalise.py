@@ -1,7 +1,11 @@
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 
-from reconstruct.pictures.normalise import even_light, normalise
+from alice_survey.errors import ImageError
+from reconstruct.pictures.normalise import even_light, normalise, read_deep
 
 
 def textured(height: int = 240, width: int = 320, seed: int = 1) -> np.ndarray:
@@ -64,3 +68,31 @@ def test_contrast_of_rims_comes_nearer_to_that_of_the_middle() -> None:
     after = grey[rim].std() / grey[middle].std()
     assert before < 0.35
     assert 1.25 * before < after < 1.1
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+def test_dim_pictures_of_16_bits_keep_their_contrast(tmp_path: Path, suffix: str) -> None:
+    """A picture that fills a hundredth of its range has 2 grey levels in 8 bits."""
+    scene = textured() * lamp()
+    taken = np.rint(0.01 * 65535 * scene).astype(np.uint16)
+    path = tmp_path / f"dim.{suffix}"
+    assert cv2.imwrite(str(path), taken)
+    deep = read_deep(path)
+    np.testing.assert_array_equal(deep, taken)
+    bright = normalise(np.rint(150 * scene).astype(np.uint8)).astype(float)
+    inner = (slice(60, -60), slice(80, -80))
+
+    def likeness(grey: np.ndarray) -> float:
+        return float(np.corrcoef(grey[inner].ravel(), bright[inner].ravel())[0, 1])
+
+    assert likeness(normalise(deep)) > 0.97
+    assert likeness(normalise((taken >> 8).astype(np.uint8))) < 0.9
+    assert normalise(deep).dtype == np.uint8
+
+
+def test_pictures_that_cannot_be_read_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ImageError, match=r"none\.png"):
+        read_deep(tmp_path / "none.png")
+    assert cv2.imwrite(str(tmp_path / "float.tif"), np.ones((9, 9), np.float32))
+    with pytest.raises(ImageError, match="float32"):
+        read_deep(tmp_path / "float.tif")
