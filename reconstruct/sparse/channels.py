@@ -118,6 +118,27 @@ def read_epochs(
     )
 
 
+def without_navigation(
+    records: Sequence[ImageRecord], model_from_cam: Sequence[RigidTransform]
+) -> Epochs:
+    """Epochs of a model of which navigation says nothing."""
+    stations = sorted({r.station for r in records})
+    number = {station: k for k, station in enumerate(stations)}
+    count, identity = len(records), Rotation.identity(len(records))
+    return Epochs(
+        time=np.arange(float(len(stations))),
+        timed=False,
+        moment=np.array([number[r.station] for r in records]),
+        centres=np.stack([pose.translation for pose in model_from_cam]),
+        model_from_body=identity,
+        levers=np.zeros((count, 3)),
+        measured_ned=np.zeros((count, 3)),
+        ned_from_body=identity,
+        sigma=np.ones((len(stations), 6)),
+        known=np.zeros((len(stations), 6), dtype=bool),
+    )
+
+
 def _sigmas(rows: Sequence[ImageRecord]) -> Array:
     def stated(values: Sequence[float], default: float) -> Array:
         array = np.array(values)

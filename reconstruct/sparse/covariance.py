@@ -9,10 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.artefacts import atomic_path
 from alice_survey.frames import Array
+from reconstruct.mapping.uncertainty import Uncertainty
+from reconstruct.sparse.alignment import Similarity
 from reconstruct.sparse.channels import attitude_axes, cross_matrices
 
 POSE_ORDER = (
@@ -40,6 +43,44 @@ def placed_covariances(poses: RigidTransform, place: PlaceCovariance) -> Array:
     jacobian[:, 3:, :3] = np.eye(3)
     found: Array = jacobian @ place.covariance @ np.swapaxes(jacobian, 1, 2)
     return found
+
+
+def shape_covariances(
+    poses: RigidTransform,
+    stations: NDArray[np.int64],
+    reference: NDArray[np.bool_],
+    found: Uncertainty,
+    world_from_model: Similarity,
+) -> Array:
+    """What the model's own shape leaves unsure of poses, (N, 6, 6); NaN where it does not say.
+
+    Args:
+        poses: (N,) of the pictures in the world.
+        stations: (N,) theirs.
+        reference: (N,) whether a picture is that whose pose `found` tells.
+        found: covariances of the stations, in the model's axes and unit.
+        world_from_model: the model's place.
+    """
+    turn = world_from_model.rotation.as_matrix()
+    # There: turn, then position; here: position, then turn.
+    move = np.zeros((6, 6))
+    move[:3, 3:] = world_from_model.scale * turn
+    move[3:, :3] = turn
+    of_station = dict(zip(found.stations.tolist(), found.frame_cov, strict=True))
+    origins = {
+        int(s): p
+        for s, p, first in zip(stations, poses.translation, reference, strict=True)
+        if first
+    }
+    result = np.full((len(stations), 6, 6), np.nan)
+    for i, (station, place) in enumerate(zip(stations.tolist(), poses.translation, strict=True)):
+        if station not in of_station or station not in origins:
+            continue
+        arm = np.eye(6)
+        arm[:3, 3:] = -cross_matrices((place - origins[station])[None])[0]
+        jacobian = arm @ move
+        result[i] = jacobian @ of_station[station] @ jacobian.T
+    return result
 
 
 def attitude_sigmas_deg(ned_from_body: Rotation, covariances: Array) -> Array:

@@ -24,6 +24,7 @@ from reconstruct.sparse.channels import (
     Equations,
     equations,
     read_epochs,
+    without_navigation,
 )
 from reconstruct.sparse.placement import (
     NO_EXTRA,
@@ -230,10 +231,44 @@ def fit_navigation(
     return task.fit(start, free)
 
 
+def fit_control(
+    records: Sequence[ImageRecord],
+    model_from_cam: Sequence[RigidTransform],
+    start: Similarity,
+    control: ExtraOf,
+    *,
+    known_scale: float | None,
+    scale_sigma: float,
+) -> Fit:
+    """Place a model by control points alone.
+
+    Args:
+        records: registered pictures.
+        model_from_cam: pose of each picture's camera in the model.
+        start: a placement near the right one.
+        control: equations of three or more points that are not on one line.
+        known_scale: metres in a unit of the model, or None: then the scale is fitted too.
+        scale_sigma: relative, of a known scale.
+    """
+    free = [0, 1, 2, 3, 4, 5]
+    if known_scale is None or scale_sigma > 0:
+        free.append(SCALE)
+    task = _Task(
+        epochs=without_navigation(records, model_from_cam),
+        levelled=None,
+        known_scale=known_scale,
+        scale_sigma=scale_sigma,
+        mount_sigma_rad=0.0,
+        control=control,
+    )
+    return task.fit(start, free)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Task:
     epochs: Epochs
-    levelled: Similarity
+    levelled: Similarity | None
+    """None where control holds the model level."""
     known_scale: float | None
     scale_sigma: float
     mount_sigma_rad: float
@@ -327,7 +362,7 @@ class _Task:
 
     def _extra(self, place: Similarity, middle: Array) -> Extra:
         misfits, rows = [NO_EXTRA.misfit], [NO_EXTRA.jacobian]
-        if not self.epochs.has_attitude:
+        if self.levelled is not None and not self.epochs.has_attitude:
             down = place.rotation.apply(self.levelled.rotation.inv().apply([0.0, 0.0, 1.0]))
             sigma = np.deg2rad(_LEVEL_SIGMA_DEG)
             tilt = np.zeros((2, PARAMETERS))

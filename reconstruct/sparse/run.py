@@ -6,31 +6,33 @@ it in world coordinates, so that a new scale or georeference does not repeat the
 
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.artefacts import Stage, need_stage, read_json, run_stage, write_json
-from alice_survey.config import SurveyConfig
-from alice_survey.errors import ImageError, ReconstructionError
-from alice_survey.frames import Datum
-from alice_survey.manifest import ImageRecord, read_manifest
+from alice_survey.config import ReconstructConfig, SurveyConfig
+from alice_survey.errors import ImageError
+from alice_survey.frames import Array, Datum
+from alice_survey.manifest import read_manifest
 from camera_calib.rig import Rig, read_rig
-from reconstruct.lenses.lens import Lens, lens_from_json
-from reconstruct.mapping.mapper import as_transform, model_baseline
+from reconstruct.lenses.lens import lens_from_json
+from reconstruct.mapping.database import as_transform
+from reconstruct.mapping.mapper import model_baseline
 from reconstruct.mapping.run import Inputs, check_sizes, run_mapping
-from reconstruct.model import WorldFrame, write_frame
-from reconstruct.sparse.alignment import Similarity
+from reconstruct.mapping.uncertainty import read_uncertainty
+from reconstruct.model import write_frame
+from reconstruct.sparse.control_file import control_files
 from reconstruct.sparse.covariance import (
     PlaceCovariance,
     placed_covariances,
+    shape_covariances,
     write_covariances,
 )
-from reconstruct.sparse.georeference import Fit, fit_navigation, level
+from reconstruct.sparse.place import SCALE_FILE, Placed, Placing, find_place
 from reconstruct.sparse.track import (
     TrackRow,
     read_track_poses,
@@ -41,12 +43,7 @@ from reconstruct.sparse.track import (
     write_track_tum,
 )
 
-__all__ = ["read_track_poses", "run_sparse"]
-
-SCALE_FILE = "scale.json"
-"""In the workspace: one known length, as `scale_model` writes it."""
-_PLACE_ONLY = "place; no model covariance"
-"""What the covariances of poses consist of."""
+__all__ = ["SCALE_FILE", "read_track_poses", "run_sparse"]
 
 
 def run_sparse(workspace: Path, config: SurveyConfig, threads: int) -> bool:
@@ -75,12 +72,17 @@ def run_sparse(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     stage = Stage(
         name="sparse",
         version=2,
-        settings={},
-        inputs=[mapping, *described, *([scale_file] if scale_file.is_file() else [])],
+        settings={"mount_sigma_deg": config.reconstruct.mount_sigma_deg},
+        inputs=[
+            mapping,
+            *described,
+            *([scale_file] if scale_file.is_file() else []),
+            *control_files(workspace),
+        ],
     )
 
     def work(partial: Path) -> None:
-        _place(workspace, partial, inputs, survey)
+        _place(workspace, partial, inputs, survey, config.reconstruct)
 
     return run_stage(workspace, stage, work) or mapped
 
@@ -107,17 +109,13 @@ def read_inputs(workspace: Path) -> tuple[Inputs, dict[str, Any], list[Path]]:
     return inputs, survey, files
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Placed:
-    """A model's place in the world."""
-
-    world_from_model: Similarity
-    frame: WorldFrame
-    fit: Fit | None
-    scale_source: str
-
-
-def _place(workspace: Path, partial: Path, inputs: Inputs, survey: Mapping[str, Any]) -> None:
+def _place(
+    workspace: Path,
+    partial: Path,
+    inputs: Inputs,
+    survey: Mapping[str, Any],
+    settings: ReconstructConfig,
+) -> None:
     mapping = read_json(workspace / "mapping" / "mapping.json")
     cameras = read_json(workspace / "mapping" / "cameras.json")
     lenses = {name: lens_from_json(lens) for name, lens in cameras["cameras"].items()}
@@ -129,10 +127,20 @@ def _place(workspace: Path, partial: Path, inputs: Inputs, survey: Mapping[str, 
         if image.has_pose
     }
     names = sorted(poses)
-    records = [of_name[name] for name in names]
-    pinholes = [poses[name] for name in names]
-    levers = body_from_pinhole(inputs.rig, lenses)
-    placed = _find_place(workspace, model, records, pinholes, levers, inputs, survey, mapping)
+    placed = find_place(
+        Placing(
+            workspace=workspace,
+            model=model,
+            records=[of_name[name] for name in names],
+            pinholes=[poses[name] for name in names],
+            lenses=lenses,
+            rig=inputs.rig,
+            datum=inputs.datum,
+            survey=survey,
+            mapping=mapping,
+            settings=settings,
+        )
+    )
 
     move = placed.world_from_model
     rotation = pycolmap.Rotation3d(move.rotation.as_quat())
@@ -142,113 +150,57 @@ def _place(workspace: Path, partial: Path, inputs: Inputs, survey: Mapping[str, 
     model.export_PLY(partial / "sparse.ply")
     shutil.copyfile(workspace / "mapping" / "cameras.json", partial / "cameras.json")
     write_frame(partial / "frame.json", placed.frame)
-    rig = inputs.rig
-    mounts = {} if rig is None else {n: rig.body_from_cam(n).rotation for n in rig.cameras}
-    rows = track_rows(model, of_name, lenses, placed.frame, mounts)
-    covariances = None
-    if placed.fit is not None:
-        where = RigidTransform.concatenate([row.world_from_cam for row in rows])
-        place = PlaceCovariance(middle=placed.fit.middle_ned, covariance=placed.fit.covariance)
-        covariances = placed_covariances(where, place)
-        names = [row.image for row in rows]
-        write_covariances(partial / "track_covariance.npz", names, covariances, _PLACE_ONLY)
-        write_json(partial / "georeference.json", placed.fit.to_json())
+    rows = track_rows(model, of_name, lenses, placed.frame, _mounts(inputs.rig))
+    covariances = _covariances(workspace, partial, placed, rows)
     sigmas = track_sigmas(rows, covariances)
     write_track_csv(partial / "track.csv", rows, placed.frame, sigmas)
     write_track_tum(partial / "track.tum", rows)
     if placed.frame.datum is not None:
         write_track_geojson(partial / "track.geojson", rows, placed.frame, sigmas)
+    if placed.fit is not None:
+        write_json(partial / "georeference.json", placed.fit.to_json())
+    if placed.control is not None:
+        score = placed.control.score(move, located=placed.located)
+        write_json(partial / "control.json", score)
     write_json(partial / "registration.json", _registration(model, mapping, placed, rows))
 
 
-def body_from_pinhole(rig: Rig | None, lenses: Mapping[str, Lens]) -> dict[str, RigidTransform]:
-    """Lever arms of the pinholes, metres; the identity without a rig, when navigation is theirs."""
-    if rig is None:
-        return dict.fromkeys(lenses, RigidTransform.identity())
-    return {
-        name: rig.body_from_cam(name) * lens.pinhole_from_cam.inv() for name, lens in lenses.items()
-    }
+def _mounts(rig: Rig | None) -> dict[str, Rotation]:
+    return {} if rig is None else {name: rig.body_from_cam(name).rotation for name in rig.cameras}
 
 
-def _find_place(
-    workspace: Path,
-    model: pycolmap.Reconstruction,
-    records: Sequence[ImageRecord],
-    pinholes: Sequence[RigidTransform],
-    levers: Mapping[str, RigidTransform],
-    inputs: Inputs,
-    survey: Mapping[str, Any],
-    mapping: Mapping[str, Any],
-) -> _Placed:
-    points = np.array([p.xyz for _, p in sorted(model.points3D.items())]).reshape(-1, 3)
-    if len(points) < 3:
-        raise ReconstructionError(f"the model has {len(points)} points only")
-    centres = np.stack([p.translation for p in _by_station(records, pinholes)])
-    levelled = level(points, centres)
-    known = _known_scale(workspace, mapping)
-    notes = [*survey.get("notes", []), *mapping["notes"]]
-    fit = None
-    if inputs.datum is not None:
-        fit = fit_navigation(
-            records,
-            pinholes,
-            levers,
-            inputs.datum,
-            levelled,
-            known_scale=None if known is None else known[0],
+def _covariances(
+    workspace: Path, partial: Path, placed: Placed, rows: Sequence[TrackRow]
+) -> Array | None:
+    """Of all poses in the world; written as far as known, None where their place is not known."""
+    poses = RigidTransform.concatenate([row.world_from_cam for row in rows])
+    names, parts = [row.image for row in rows], []
+    total = np.zeros((len(rows), 6, 6))
+    if placed.fit is not None:
+        fit = placed.fit
+        place = PlaceCovariance(middle=fit.middle_ned, covariance=fit.covariance)
+        total = total + placed_covariances(poses, place)
+        parts.append("place")
+    path = workspace / "mapping" / "covariance.npz"
+    if path.is_file():
+        found = read_uncertainty(path)
+        reference = np.isin(names, found.images)
+        stations = np.array([row.station for row in rows], dtype=np.int64)
+        total = total + shape_covariances(
+            poses, stations, reference, found, placed.world_from_model
         )
-    if fit is not None and inputs.datum is not None:
-        source = "scale from navigation" if known is None else known[1]
-        frame = WorldFrame(
-            name="ned",
-            datum=inputs.datum,
-            scaled=True,
-            vertical_datum=str(survey["vertical_datum"]),
-            notes=(*notes, source),
-        )
-        return _Placed(
-            world_from_model=fit.ned_from_model, frame=frame, fit=fit, scale_source=source
-        )
-    factor, source = (1.0, "unscaled") if known is None else known
-    notes.append("unscaled, no CRS" if known is None else f"{source}; no CRS")
-    frame = WorldFrame(
-        name="model",
-        datum=None,
-        scaled=known is not None,
-        vertical_datum="mean plane of the sea floor in the pictures",
-        notes=tuple(notes),
-    )
-    place = replace(levelled, scale=factor, translation=factor * levelled.translation)
-    return _Placed(world_from_model=place, frame=frame, fit=None, scale_source=source)
-
-
-def _known_scale(workspace: Path, mapping: Mapping[str, Any]) -> tuple[float, str] | None:
-    """Metres in a unit of the mapped model and how they are known; None where they are not."""
-    if mapping["scaled"]:
-        return 1.0, "scale from the calibrated rig"
-    path = workspace / SCALE_FILE
-    if not path.is_file():
-        return None
-    scale = read_json(path)
-    if scale.get("gauge") != mapping["gauge"]:
-        raise ReconstructionError(
-            f"{path} measures an earlier model: remove it, run 'alice-survey reconstruct', and "
-            "measure the known length again with 'alice-survey scale'"
-        )
-    return float(scale["metres_per_unit"]), "scaled by one known length"
-
-
-def _by_station(
-    records: Sequence[ImageRecord], poses: Sequence[RigidTransform]
-) -> list[RigidTransform]:
-    order = sorted(range(len(records)), key=lambda i: (records[i].station, records[i].image))
-    return [poses[i] for i in order]
+        parts.append("shape of the model")
+    else:
+        parts.append("no model covariance")
+    if placed.fit is not None or path.is_file():
+        write_covariances(partial / "track_covariance.npz", names, total, "; ".join(parts))
+    return None if placed.fit is None else total
 
 
 def _registration(
     model: pycolmap.Reconstruction,
     mapping: Mapping[str, Any],
-    placed: _Placed,
+    placed: Placed,
     rows: Sequence[TrackRow],
 ) -> dict[str, Any]:
     baseline = model_baseline(model)

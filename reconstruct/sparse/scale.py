@@ -15,7 +15,7 @@ from alice_survey.errors import ReconstructionError
 from alice_survey.frames import Array
 from reconstruct.model import SparseModel, View, read_model
 from reconstruct.pictures.undistorted import Pictures
-from reconstruct.sparse.run import SCALE_FILE
+from reconstruct.sparse.place import SCALE_FILE
 
 _NEIGHBOURS = 15
 """Model points from which the surface at a pixel is taken."""

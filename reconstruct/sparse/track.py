@@ -14,7 +14,7 @@ from alice_survey.errors import WorkspaceError
 from alice_survey.frames import BODY_FROM_NADIR_CAM, Array, attitude_from_rotation
 from alice_survey.manifest import ImageRecord
 from reconstruct.lenses.lens import Lens
-from reconstruct.mapping.mapper import as_transform
+from reconstruct.mapping.database import as_transform
 from reconstruct.model import WorldFrame
 from reconstruct.sparse.covariance import attitude_sigmas_deg
 
