@@ -82,6 +82,15 @@ def _mosaic(folder: Path) -> Summary:
     return text, found
 
 
+def _mesh(folder: Path) -> Summary:
+    found = read_json(folder / "mesh.json")
+    text = (
+        f"{found['triangles']} triangles, {found['textured_share']:.0%} textured, in "
+        f"{folder / 'mesh.glb'}"
+    )
+    return text, found
+
+
 def _report(folder: Path) -> Summary:
     found = read_json(folder / "report.json")
     rows = [
@@ -100,6 +109,7 @@ SUMMARIES: dict[str, Callable[[Path], Summary]] = {
     "sparse": _sparse,
     "dense": _dense,
     "mosaic": _mosaic,
+    "mesh": _mesh,
     "report": _report,
 }
 """By stage: takes its folder."""

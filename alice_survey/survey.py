@@ -16,8 +16,8 @@ from alice_survey.errors import AliceError, ConfigError, WorkspaceError, warn
 from alice_survey.executor import default_threads
 from alice_survey.summaries import SUMMARIES
 
-LOOP = ("plan", "flight", "pool", "images", "calibration", "sparse", "dense", "mosaic", "report")
-RECONSTRUCT = ("calibration", "sparse", "dense", "mosaic")
+RECONSTRUCT = ("calibration", "sparse", "dense", "mosaic", "mesh")
+LOOP = ("plan", "flight", "pool", "images", *RECONSTRUCT, "report")
 _NEEDS = {
     "plan": (),
     "flight": ("plan",),
@@ -27,7 +27,8 @@ _NEEDS = {
     "sparse": ("images", "calibration"),
     "dense": ("sparse",),
     "mosaic": ("dense",),
-    "report": ("mosaic",),
+    "mesh": ("dense",),
+    "report": ("mosaic", "mesh"),
 }
 _COMMANDS = {
     "plan": "plan",
@@ -38,6 +39,7 @@ _COMMANDS = {
     "sparse": "reconstruct",
     "dense": "reconstruct",
     "mosaic": "reconstruct",
+    "mesh": "reconstruct",
     "report": "evaluate",
 }
 _SIMULATED = ("plan", "flight", "pool", "images", "calibration", "report")
@@ -112,6 +114,10 @@ def _work_of(stage: str) -> StageWork:
             from reconstruct.mosaic.run import run_mosaic
 
             return run_mosaic
+        case "mesh":
+            from reconstruct.mesh.run import run_mesh
+
+            return run_mesh
         case "report":
             from reconstruct.evaluate.run import run_evaluate
 
@@ -245,6 +251,7 @@ def run_demo(workspace: Path, threads: int | None) -> tuple[str, dict[str, Any]]
         ("a picture", "images/left/000000.png"),
         ("the surface", "dense/dem.png"),
         ("the mosaic", "mosaic/mosaic.png"),
+        ("the mesh", "mesh/mesh.png"),
         ("the errors", "report/errors.png"),
         ("the track", "report/track.png"),
     ]

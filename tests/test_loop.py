@@ -88,7 +88,7 @@ def test_truth_is_not_read_by_reconstruct(undisturbed: Path, tmp_path: Path) -> 
     """Without the truth beside the pictures the reconstruction is the same, to the byte."""
     workspace = tmp_path / "blind"
     shutil.copytree(undisturbed, workspace)
-    for stage in ("sparse", "dense", "mosaic", "report", "calibration"):
+    for stage in ("sparse", "dense", "mosaic", "mesh", "report", "calibration"):
         shutil.rmtree(workspace / stage)
     shutil.rmtree(workspace / "images" / "truth")
     shutil.rmtree(workspace / "flight" / "truth")
@@ -97,7 +97,7 @@ def test_truth_is_not_read_by_reconstruct(undisturbed: Path, tmp_path: Path) -> 
     subprocess.run([*command, "--threads", "1"], check=True, capture_output=True)
     seen, whole = results(workspace), results(undisturbed)
     for name in seen:
-        if name.split("/")[0] in {"calibration", "sparse", "dense", "mosaic"}:
+        if name.split("/")[0] in {"calibration", "sparse", "dense", "mosaic", "mesh"}:
             assert seen[name] == whole[name], name
 
 
