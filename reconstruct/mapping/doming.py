@@ -1,0 +1,343 @@
+"""Whether a model is bent: its cameras against navigation's depth, and its scale against the rig.
+
+Near-parallel views bend a model like a dome while every reprojection error stays small (James &
+Robson 2014, "Mitigating systematic error in topographic models derived from UAV and ground-based
+image networks"). A pressure sensor does not bend, so that the curvature of a paraboloid fitted to
+camera heights less navigation's heights measures it; and a stereo rig carries its own yardstick to
+every station.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.errors import warn
+from alice_survey.frames import Array, rotation_from_attitude
+from alice_survey.manifest import ImageRecord
+from camera_calib.rig import Rig
+from reconstruct.lenses.lens import Lens
+from reconstruct.mapping.database import as_transform
+from reconstruct.mapping.working_range import ray_passes
+
+_LEAST_STATIONS = 8
+"""A paraboloid has six coefficients."""
+_THIN = 0.1
+"""Width over length of a block below which it has no curvature across."""
+_SIGMAS = 3.0
+_ROUNDS = 10
+_TUNING = 2.385
+"""Of Cauchy's weights, for 95 % efficiency with normal errors (Rey 1983)."""
+_LEAST_STEREO_POINTS = 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bend:
+    """Curvature of a block along one of its axes."""
+
+    curvature_per_m: float
+    """Second derivative of the model's height error: positive where ends are too high."""
+    sigma_per_m: float
+    length_m: float
+    """Of the block along the axis."""
+
+    @property
+    def sag_m(self) -> float:
+        """By how much the middle is off against the ends: `curvature * length^2 / 8`."""
+        return self.curvature_per_m * self.length_m**2 / 8.0
+
+    @property
+    def sag_sigma_m(self) -> float:
+        """Its standard deviation."""
+        return self.sigma_per_m * self.length_m**2 / 8.0
+
+    def significant(self, pixel_m: float) -> bool:
+        """Whether it is beyond its noise and larger than a ground pixel."""
+        return abs(self.sag_m) > max(_SIGMAS * self.sag_sigma_m, pixel_m)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScaleTrend:
+    """How the model's scale, against the rig's baseline, varies over a block."""
+
+    mean: float
+    """Lengths of the model over those of its stations' own stereo; 1 when they agree."""
+    range: float
+    """Largest less smallest value of the fitted paraboloid over the stations."""
+    range_sigma: float
+
+    @property
+    def significant(self) -> bool:
+        """Whether it is beyond its noise."""
+        return self.range > _SIGMAS * self.range_sigma
+
+
+@dataclass(frozen=True, kw_only=True)
+class Doming:
+    """What speaks for or against a bent model; what could not be measured is None."""
+
+    along: Bend | None
+    across: Bend | None
+    """Perpendicular to the block's longest axis; None for a single line."""
+    scale: ScaleTrend | None
+    pixel_m: float
+    """Ground pixel."""
+
+    def to_json(self) -> dict[str, object]:
+        """For `mapping.json`."""
+        bends: dict[str, object] = {
+            name: None
+            if bend is None
+            else {**vars(bend), "sag_m": bend.sag_m, "sag_sigma_m": bend.sag_sigma_m}
+            for name, bend in (("along", self.along), ("across", self.across))
+        }
+        scale = None if self.scale is None else vars(self.scale)
+        return {**bends, "scale": scale, "pixel_m": self.pixel_m, "notes": self.notes()}
+
+    def notes(self) -> list[str]:
+        """A line for every significant bend."""
+        return [
+            f"the model is bent {name} the block: {1e3 * bend.sag_m:+.1f} +/- "
+            f"{1e3 * bend.sag_sigma_m:.1f} mm over {bend.length_m:.1f} m against navigation's "
+            "depth; fly cross lines, or give navigation a smaller sigma_depth_m if it deserves it"
+            for name, bend in (("along", self.along), ("across", self.across))
+            if bend is not None and bend.significant(self.pixel_m)
+        ]
+
+
+def measure_doming(
+    model: pycolmap.Reconstruction,
+    records: Sequence[ImageRecord],
+    positions: Array | None,
+    sigmas: Array | None,
+    rotations: Mapping[int, Rotation],
+) -> Doming:
+    """Measure how bent a model is, and warn where that is significant.
+
+    Args:
+        model: in metres; picture i of `records` has the id i + 1.
+        records: pictures.
+        positions: (N, 3) of the pinholes' centres in NED, as navigation has them; NaN where
+            unknown; None without navigation.
+        sigmas: (N, 3), likewise.
+        rotations: `ned_from_pinhole` by picture's index, as navigation has it.
+    """
+    pixel = ground_pixel(model)
+    down = down_of(model, rotations)
+    reference = _references(model)
+    numbers = sorted(reference.values())
+    centres = np.array([model.images[n].projection_center() for n in numbers]).reshape(-1, 3)
+    along = across = None
+    if positions is not None and sigmas is not None and len(numbers):
+        rows = np.array(numbers) - 1
+        told, sigma = positions[rows], sigmas[rows]
+        known = np.isfinite(told + sigma).all(axis=1)
+        along, across = bend_of(centres[known], told[known, 2], sigma[known, 2], down)
+    found = Doming(
+        along=along,
+        across=across,
+        scale=scale_trend(model, reference, down),
+        pixel_m=pixel,
+    )
+    for note in found.notes():
+        warn(note)
+    return found
+
+
+def bend_of(
+    centres: Array, depths_m: Array, sigmas_m: Array, down: Array
+) -> tuple[Bend | None, Bend | None]:
+    """Curvature of camera heights less navigation's heights, along and across the block.
+
+    A quadratic in the block's principal axes is fitted robustly (Cauchy's weights); sigmas are
+    those of the depths or, where larger, of the fit's residuals. Errors of depth are taken as
+    independent between stations.
+
+    Args:
+        centres: (N, 3) of one camera per station in the model's frame, metres.
+        depths_m: (N,) as navigation has them.
+        sigmas_m: (N,) of those.
+        down: (3,) unit vector in the model's frame.
+
+    Returns:
+        Along and across; None where stations are too few or lie in one line.
+    """
+    if len(centres) < _LEAST_STATIONS:
+        return None, None
+    plane, sizes = _principal(centres, down)
+    heights = depths_m - centres @ down  # of the model, above where navigation has it
+    wide = sizes[1] > _THIN * sizes[0]
+    design = _quadratic(plane, wide=wide)
+    if not np.linalg.matrix_rank(design) == design.shape[1] < len(design):
+        return None, None
+    fitted, covariance = _robust_fit(design, heights, sigmas_m)
+    bends = [
+        Bend(
+            curvature_per_m=float(fitted[k]),
+            sigma_per_m=float(np.sqrt(covariance[k, k])),
+            length_m=float(size),
+        )
+        for k, size in zip((2, 4), sizes, strict=True)
+        if k < len(fitted)
+    ]
+    return bends[0], bends[1] if wide else None
+
+
+def scale_trend(
+    model: pycolmap.Reconstruction, reference: Mapping[int, int], down: Array
+) -> ScaleTrend | None:
+    """The model's scale at every station against that station's stereo, as a trend over the block.
+
+    Args:
+        model: on one rig.
+        reference: picture by frame.
+        down: (3,) unit vector in the model's frame.
+
+    Returns:
+        None where too few stations have points that both their cameras show.
+    """
+    local = [
+        (model.images[reference[frame]].projection_center(), *told)
+        for frame in sorted(reference)
+        if (told := _station_scale(model, frame)) is not None
+    ]
+    if len(local) < _LEAST_STATIONS:
+        return None
+    centres = np.array([row[0] for row in local])
+    scale, sigma = np.array([row[1:] for row in local]).T
+    plane, sizes = _principal(centres, down)
+    design = _quadratic(plane, wide=sizes[1] > _THIN * sizes[0])
+    if not np.linalg.matrix_rank(design) == design.shape[1] < len(design):
+        return None
+    fitted, covariance = _robust_fit(design, scale, sigma)
+    values = design @ fitted
+    between = design[np.argmax(values)] - design[np.argmin(values)]
+    return ScaleTrend(
+        mean=float(np.average(scale, weights=sigma**-2.0)),
+        range=float(np.ptp(values)),
+        range_sigma=float(np.sqrt(between @ covariance @ between)),
+    )
+
+
+def navigation_rotations(
+    records: Sequence[ImageRecord], rig: Rig, lenses: Mapping[str, Lens]
+) -> dict[int, Rotation]:
+    """`ned_from_pinhole` by picture's index, where navigation has attitudes."""
+    return {
+        i: rotation_from_attitude(*np.deg2rad([r.roll_deg, r.pitch_deg, r.heading_deg]))
+        * (rig.body_from_cam(r.camera) * lenses[r.camera].pinhole_from_cam.inv()).rotation
+        for i, r in enumerate(records)
+        if r.has_attitude
+    }
+
+
+def down_of(model: pycolmap.Reconstruction, rotations: Mapping[int, Rotation]) -> Array:
+    """Down in the model's frame: by navigation's attitudes, else the mean way that cameras look."""
+    posed = [n for n in sorted(model.images) if model.images[n].has_pose]
+    told = [n for n in posed if n - 1 in rotations]
+    rows = [
+        as_transform(model.images[n].cam_from_world())
+        .rotation.inv()
+        .apply(rotations[n - 1].inv().apply([0.0, 0.0, 1.0]) if told else [0.0, 0.0, 1.0])
+        for n in told or posed
+    ]
+    mean = np.median(np.array(rows), axis=0)
+    unit: Array = mean / np.linalg.norm(mean)
+    return unit
+
+
+def ground_pixel(model: pycolmap.Reconstruction) -> float:
+    """Median size of a pixel on the ground, in units of the model; NaN without points."""
+    rows = []
+    for number in sorted(model.images):
+        image = model.images[number]
+        if image.has_pose:
+            depth = _depths(model, image, _ids(image))
+            if len(depth):
+                rows.append(np.median(depth) / model.cameras[image.camera_id].mean_focal_length())
+    return float(np.median(rows)) if rows else float("nan")
+
+
+def _references(model: pycolmap.Reconstruction) -> dict[int, int]:
+    """The first posed picture of every frame."""
+    found: dict[int, int] = {}
+    for number in sorted(model.images):
+        if model.images[number].has_pose:
+            found.setdefault(model.images[number].frame_id, number)
+    return found
+
+
+def _principal(centres: Array, down: Array) -> tuple[Array, Array]:
+    """Horizontal places about their middle in principal axes, (N, 2), and extents, (2,)."""
+    flat = centres - centres.mean(axis=0)
+    flat = flat - np.outer(flat @ down, down)
+    axes = np.linalg.svd(flat, full_matrices=False)[2][:2]
+    plane = flat @ axes.T
+    return plane, np.ptp(plane, axis=0)
+
+
+def _quadratic(plane: Array, *, wide: bool) -> Array:
+    """Columns 1, u, u^2 / 2 and, if wide, v, v^2 / 2, u v."""
+    u, v = plane.T
+    columns = [np.ones(len(u)), u, u**2 / 2]
+    return np.column_stack([*columns, v, v**2 / 2, u * v] if wide else columns)
+
+
+def _robust_fit(design: Array, values: Array, sigmas: Array) -> tuple[Array, Array]:
+    """Coefficients and their covariance."""
+    weight = np.ones(len(values))
+    for _ in range(_ROUNDS):
+        root = np.sqrt(weight) / sigmas
+        fitted = np.linalg.lstsq(root[:, None] * design, root * values, rcond=None)[0]
+        left = (values - design @ fitted) / sigmas
+        spread = max(1.4826 * float(np.median(np.abs(left))), 1e-12)
+        weight = 1.0 / (1.0 + (left / (_TUNING * spread)) ** 2)
+    free = len(values) - design.shape[1]
+    root = np.sqrt(weight) / sigmas
+    variance = float((weight * left**2).sum() / max(weight.sum() * free / len(values), 1e-12))
+    normal = (root[:, None] * design).T @ (root[:, None] * design)
+    return fitted, np.linalg.inv(normal) * max(1.0, variance)
+
+
+def _station_scale(model: pycolmap.Reconstruction, frame: int) -> tuple[float, float] | None:
+    """Depths of a frame's points over their depths by its first two cameras alone, and sigma."""
+    numbers = sorted(d.id for d in model.frames[frame].image_ids if model.images[d.id].has_pose)[:2]
+    if len(numbers) < 2:
+        return None
+    first, second = (model.images[n] for n in numbers)
+    seen = [{p.point3D_id: p.xy for p in i.points2D if p.has_point3D()} for i in (first, second)]
+    both = sorted(seen[0].keys() & seen[1].keys())
+    if len(both) < _LEAST_STEREO_POINTS:
+        return None
+    poses = [as_transform(i.cam_from_world()) for i in (first, second)]
+    first_from_second = poses[0] * poses[1].inv()
+    starts, rays = [], []
+    for image, pixels, pose in (
+        (first, seen[0], RigidTransform.identity()),
+        (second, seen[1], first_from_second),
+    ):
+        at_one = model.cameras[image.camera_id].cam_from_img(np.array([pixels[i] for i in both]))
+        ray = np.column_stack([at_one, np.ones(len(both))])
+        ray = pose.rotation.apply(ray / np.linalg.norm(ray, axis=1, keepdims=True))
+        starts.append(np.broadcast_to(pose.translation, ray.shape))
+        rays.append(ray)
+    along, _ = ray_passes(starts[0], rays[0], starts[1], rays[1])
+    # Noise of pixels is that of 1 / depth: its mean, unlike that of depths, is not pulled away.
+    ratio = _depths(model, first, both) / (along * rays[0][:, 2])
+    ratio = ratio[np.isfinite(ratio)]
+    spread = 1.4826 * float(np.median(np.abs(ratio - np.median(ratio))))
+    return float(np.median(ratio)), max(1.2533 * spread / np.sqrt(len(ratio)), 1e-9)
+
+
+def _ids(image: pycolmap.Image) -> list[int]:
+    return [p.point3D_id for p in image.points2D if p.has_point3D()]
+
+
+def _depths(model: pycolmap.Reconstruction, image: pycolmap.Image, ids: Sequence[int]) -> Array:
+    points = np.array([model.points3D[i].xyz for i in ids]).reshape(-1, 3)
+    if len(points):
+        points = as_transform(image.cam_from_world()).apply(points)
+    depth: Array = points[:, 2]
+    return depth
