@@ -23,6 +23,8 @@ _FIRST_ANGLE_DEG = 3.0
 """Largest angle between a ray and its point at the first triangulation."""
 _ROBUST_PX = 4.0
 """From which residuals count less in the first adjustment."""
+_NO_BOUND = 1e12
+"""Radius of the trust region."""
 
 
 def map_globally(
@@ -103,7 +105,7 @@ def adjust(
     tolerance: float,
     robust_px: float | None = None,
 ) -> None:
-    """Adjust a whole model in place with no gauge fixed, so that a rig sets its scale.
+    """Adjust a whole model of a rig in place; nothing but the rig sets its scale.
 
     COLMAP's mappers hold two cameras of different frames where they are: with a rig that holds a
     length as well, which then stays as it was (0.5 % off on a 24-station scene).
@@ -117,6 +119,7 @@ def adjust(
     config = pycolmap.BundleAdjustmentConfig()
     for number in sorted(model.reg_image_ids()):
         config.add_image(number)
+    config.set_constant_rig_from_world_pose(min(model.reg_frame_ids()))
     adjustment = options.get_global_bundle_adjustment()
     adjustment.print_summary = False
     if robust_px is not None:
@@ -125,6 +128,8 @@ def adjust(
     solver = adjustment.ceres.solver_options
     solver.num_threads = 1
     solver.function_tolerance = tolerance
+    if robust_px is None:  # near its end: full Gauss-Newton steps, since weak directions are many
+        solver.initial_trust_region_radius = _NO_BOUND
     pycolmap.create_default_bundle_adjuster(adjustment, config, model).solve()
 
 

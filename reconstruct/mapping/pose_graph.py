@@ -9,6 +9,7 @@ gives every link its length, positions are as linear as rotations.
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.sparse.linalg import splu
@@ -17,6 +18,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.frames import Array
 from reconstruct.mapping.stations import Link
 
+Indices = NDArray[np.int64]
 _ROUNDS = 8
 _LEAST_ANGLE_RAD = 1e-3
 _LEAST_LENGTH = 1e-3
@@ -61,7 +63,7 @@ def average_poses(links: Sequence[Link]) -> Mapping[int, RigidTransform]:
     return {name: poses[k] for k, name in enumerate(names)}
 
 
-def _numbered(links: Sequence[Link]) -> tuple[list[int], tuple[Array, Array]]:
+def _numbered(links: Sequence[Link]) -> tuple[list[int], tuple[Indices, Indices]]:
     names = sorted({s for link in links for s in (link.first, link.second)})
     number = {name: k for k, name in enumerate(names)}
     first = np.array([number[link.first] for link in links], dtype=np.int64)
@@ -70,7 +72,7 @@ def _numbered(links: Sequence[Link]) -> tuple[list[int], tuple[Array, Array]]:
 
 
 def _along_tree(
-    count: int, first: Array, second: Array, relative: RigidTransform, weight: Array
+    count: int, first: Indices, second: Indices, relative: RigidTransform, weight: Array
 ) -> tuple[int, RigidTransform]:
     """Chain the most precise links from the best linked station: (root, rig_from_world)."""
     strength = np.bincount(first, weight, count) + np.bincount(second, weight, count)
@@ -89,7 +91,7 @@ def _along_tree(
 
 
 def _average_rotations(
-    start: Rotation, first: Array, second: Array, relative: Rotation, weight: Array, root: int
+    start: Rotation, first: Indices, second: Indices, relative: Rotation, weight: Array, root: int
 ) -> Rotation:
     turned = start
     for _ in range(_ROUNDS):
@@ -104,7 +106,7 @@ def _average_rotations(
 
 
 def _average_centres(
-    centres: Array, first: Array, second: Array, steps: Array, weight: Array, root: int
+    centres: Array, first: Indices, second: Indices, steps: Array, weight: Array, root: int
 ) -> Array:
     floor = _LEAST_LENGTH * float(np.median(np.linalg.norm(steps, axis=1)))
     for _ in range(_ROUNDS):
@@ -124,7 +126,7 @@ def _trust(residuals: Array, floor: float) -> Array:
 
 
 def _solve(
-    count: int, first: Array, second: Array, wanted: Array, weight: Array, root: int
+    count: int, first: Indices, second: Indices, wanted: Array, weight: Array, root: int
 ) -> Array:
     """Least squares of `x[second] - x[first] = wanted` with `x[root] = 0`; (count, 3)."""
     rows = np.arange(len(first))

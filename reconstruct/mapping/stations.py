@@ -11,12 +11,13 @@ from functools import partial
 
 import numpy as np
 import pycolmap
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.executor import parallel_map
 from alice_survey.frames import Array
-from reconstruct.mapping.database import Observations, as_transform, rigid3d
+from reconstruct.mapping.database import Observations
 from reconstruct.mapping.working_range import ray_passes
+from reconstruct.matching.matches import Matches
 
 _LARGEST_GAP_PX = 3.0
 """By which the two rays of a stereo point may miss each other, as seen from the cameras."""
@@ -54,6 +55,16 @@ class _Resection:
     points: Array
     pixels: Array
     cameras: tuple[int, ...]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Answer:
+    """The second station's rig as the first sees it; covariance of turn, then shift."""
+
+    quaternion: Array
+    shift: Array
+    inliers: int
+    covariance: Array
 
 
 def stereo_points(
@@ -117,15 +128,20 @@ def link_stations(
     resect = partial(
         _resect_all,
         cameras=[seen.cameras[name].todict() for name in names],
-        cam_from_rig=[cam_from_rig[name] for name in names],
+        # Numbers, not poses, go to and from processes: unpickling a pose rounds it once more.
+        cam_from_rig=[
+            (cam_from_rig[n].rotation.as_quat(), cam_from_rig[n].translation) for n in names
+        ],
         seed=seed,
     )
     found = parallel_map(resect, blocks, threads=threads, label="linking stations")
-    return [link for block in found for link in block if link is not None]
+    answers = [answer for block in found for answer in block]
+    links = [_link(*pair) for pair in zip(tasks, answers, strict=True)]
+    return [link for link in links if link is not None]
 
 
 def _rays(
-    seen: Observations, picture: int, rows: Array, cam_from_rig: RigidTransform
+    seen: Observations, picture: int, rows: Matches, cam_from_rig: RigidTransform
 ) -> tuple[Array, Array]:
     """Starts and unit directions in the rig's frame, (N, 3) each."""
     camera = seen.cameras[seen.images[picture].camera]
@@ -141,7 +157,7 @@ def _resections(
     seen: Observations, points: Sequence[Array], names: Sequence[str]
 ) -> Iterable[_Resection]:
     """Of the two ways to resect one station from another, the one with more points."""
-    shared: dict[tuple[int, int], list[tuple[int, int, Array]]] = {}
+    shared: dict[tuple[int, int], list[tuple[int, int, Matches]]] = {}
     for i, j, pair in seen.pairs:
         a, b = seen.images[i].station, seen.images[j].station
         if a == b or pair.geometry is None:
@@ -168,7 +184,7 @@ def _collect(
     seen: Observations,
     points: Sequence[Array],
     names: Sequence[str],
-    rows: Sequence[tuple[int, int, Array]],
+    rows: Sequence[tuple[int, int, Matches]],
 ) -> tuple[Array, Array, Array]:
     """Points of the first station, pixels of the second, and the cameras of those."""
     known, pixels, cameras = [], [], []
@@ -188,9 +204,9 @@ def _collect(
 def _resect_all(
     tasks: Sequence[_Resection],
     cameras: Sequence[Mapping[str, object]],
-    cam_from_rig: Sequence[RigidTransform],
+    cam_from_rig: Sequence[tuple[Array, Array]],
     seed: int,
-) -> list[Link | None]:
+) -> list[_Answer | None]:
     ransac = pycolmap.RANSACOptions()
     ransac.max_error = _LARGEST_ERROR_PX
     ransac.min_inlier_ratio = _LEAST_SHARE
@@ -199,30 +215,42 @@ def _resect_all(
     refine = pycolmap.AbsolutePoseRefinementOptions()
     refine.print_summary = False
     made = [pycolmap.Camera(dict(camera)) for camera in cameras]
-    poses = [rigid3d(pose) for pose in cam_from_rig]
-    links: list[Link | None] = []
+    poses = [pycolmap.Rigid3d(pycolmap.Rotation3d(quat), shift) for quat, shift in cam_from_rig]
+    answers: list[_Answer | None] = []
     for task in tasks:
         found = pycolmap.estimate_and_refine_generalized_absolute_pose(
             task.pixels, task.points, task.cameras, poses, made, ransac, refine, True
         )
-        links.append(None if found is None else _link(task, found))
-    return links
+        if found is None:
+            answers.append(None)
+            continue
+        pose = found["rig_from_world"]
+        answers.append(
+            _Answer(
+                quaternion=np.array(pose.rotation.quat),
+                shift=np.array(pose.translation),
+                inliers=int(found["num_inliers"]),
+                covariance=np.array(found["covariance"], float),
+            )
+        )
+    return answers
 
 
-def _link(task: _Resection, found: Mapping[str, object]) -> Link | None:
-    inliers = int(found["num_inliers"])  # type: ignore[call-overload]
-    share = inliers / len(task.points)
-    if inliers < _LEAST_INLIERS or share < _LEAST_SHARE:
+def _link(task: _Resection, found: _Answer | None) -> Link | None:
+    if found is None:
         return None
-    covariance = np.asarray(found["covariance"], float)
-    turn, shift = np.trace(covariance[:3, :3]), np.trace(covariance[3:, 3:])
-    if not (turn > 0 and shift > 0 and np.isfinite(turn + shift)):
+    share = found.inliers / len(task.points)
+    turn, shift = np.trace(found.covariance[:3, :3]), np.trace(found.covariance[3:, 3:])
+    known = turn > 0 and shift > 0 and np.isfinite(turn + shift)
+    if found.inliers < _LEAST_INLIERS or share < _LEAST_SHARE or not known:
         return None
     return Link(
         first=task.first,
         second=task.second,
-        second_from_first=as_transform(found["rig_from_world"]),
-        inliers=inliers,
+        second_from_first=RigidTransform.from_components(
+            found.shift, Rotation.from_quat(found.quaternion)
+        ),
+        inliers=found.inliers,
         share=share,
         turn_variance=float(turn),
         shift_variance=float(shift),
