@@ -1,0 +1,174 @@
+"""A known mound between two surveys is found where it is, as large as it is, and nothing else."""
+
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from rasterio.transform import from_origin
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.artefacts import write_json
+from alice_survey.errors import ReconstructionError, WorkspaceError
+from alice_survey.frames import Datum
+from reconstruct.evaluate.against import compare_elevations, evaluate_against
+from reconstruct.evaluate.elevation import Elevation, enu_from_enu
+from reconstruct.evaluate.height_registration import register_heights, rough_shifts
+from reconstruct.model import WorldFrame, write_frame
+
+CELL, SIDE = 0.02, 200
+MOUND_M, WIDTH_M, AT = 0.02, 0.15, (1.5, 2.2)
+MOUND_M3 = MOUND_M * 2 * math.pi * WIDTH_M**2
+AWAY = RigidTransform.from_components([0.12, -0.2, 0.05], Rotation.from_rotvec([2e-3, -3e-3, 0.01]))
+"""Where the earlier survey's georeference is wrong."""
+STILL = RigidTransform.identity()
+
+
+def relief(east: np.ndarray, north: np.ndarray, mound_m: float) -> np.ndarray:
+    wave = 0.05 * np.sin(2 * np.pi * east / 0.9 + 0.5 * np.sin(north))
+    wave += 0.04 * np.cos(2 * np.pi * (north + 0.3 * east) / 1.3)
+    hills = 0.1 * np.exp(-((east - 2) ** 2 + (north - 1) ** 2) / 0.3)
+    hills -= 0.07 * np.exp(-((east - 1) ** 2 + (north - 3) ** 2) / 0.5)
+    away2 = (east - AT[0]) ** 2 + (north - AT[1]) ** 2
+    return wave + hills + mound_m * np.exp(-away2 / (2 * WIDTH_M**2))
+
+
+def survey(
+    seed: int, world_from_own: RigidTransform, mound_m: float, sigma_m: float = 0.001
+) -> Elevation:
+    """The relief as a survey sees it whose frame lies askew, with white noise."""
+    east = (np.arange(SIDE) + 0.5) * CELL
+    easts, norths = np.meshgrid(east, 4.0 - (np.arange(SIDE) + 0.5) * CELL)
+    height = relief(easts, norths, mound_m)
+    for _ in range(20):  # the height at which a vertical of the survey's frame meets the relief
+        world = world_from_own.apply(np.stack([easts, norths, height], -1).reshape(-1, 3))
+        height = height + (relief(*world[:, :2].T, mound_m) - world[:, 2]).reshape(height.shape)
+    noise = sigma_m * np.random.default_rng(seed).normal(size=height.shape)
+    return Elevation(
+        height=height + noise, sigma=np.full(height.shape, sigma_m), west=0.0, north=4.0, cell=CELL
+    )
+
+
+def test_a_mound_is_measured_within_its_sigma_and_nothing_else_changes() -> None:
+    ratios = []
+    for seed in range(5):
+        now, before = survey(seed, STILL, MOUND_M), survey(100 + seed, AWAY, 0.0)
+        change, fit = compare_elevations(now, before, STILL)
+        (region,) = change.regions
+        assert (region.east_m, region.north_m) == pytest.approx(AT, abs=0.03)
+        assert region.volume_m3 == pytest.approx(MOUND_M3, rel=0.05)
+        ratios.append((region.volume_m3 - MOUND_M3) / region.sigma_m3)
+        figures = change.to_json()
+        # Heights between cells are means of noisy cells: fewer than 5 % exceed what cells would.
+        assert 0.01 < figures["unchanged"]["share_significant"] < 0.06
+        left = AWAY.inv() * fit.fixed_from_moving
+        assert np.rad2deg(left.rotation.magnitude()) < 0.02
+        miss = left.apply(fit.centre) - fit.centre
+        assert np.abs(miss).max() < 1e-3
+    assert np.sqrt(np.mean(np.square(ratios))) < 2.0
+    assert MOUND_M3 / region.sigma_m3 > 50
+
+
+def test_the_same_ground_shows_no_change_and_chance_share_of_significant_cells() -> None:
+    change, _ = compare_elevations(survey(1, STILL, 0.0), survey(2, STILL, 0.0), STILL)
+    assert change.regions == ()
+    figures = change.to_json()
+    assert 0.03 < figures["unchanged"]["share_significant"] < 0.06
+    assert figures["unchanged"]["difference_over_sigma_rms"] == pytest.approx(1.0, abs=0.1)
+    assert (figures["gained"]["volume_l"], figures["lost"]["volume_l"]) == (0, 0)
+
+
+def test_what_was_dug_away_is_lost_not_gained() -> None:
+    change, _ = compare_elevations(survey(3, STILL, 0.0), survey(4, STILL, MOUND_M), STILL)
+    figures = change.to_json()
+    assert figures["gained"]["regions"] == 0
+    assert figures["lost"]["volume_l"] == pytest.approx(-1e3 * MOUND_M3, rel=0.05)
+
+
+def test_a_far_shift_is_found_among_ripples() -> None:
+    far = RigidTransform.from_translation([0.8, -0.6, 1.0])
+    now, before = survey(5, STILL, 0.0), survey(6, far, 0.0)
+    shifts = np.array(rough_shifts(now, before, STILL))
+    assert np.linalg.norm(shifts - [0.8, -0.6], axis=1).min() < 0.05
+    fit = register_heights(now, before, STILL)
+    np.testing.assert_allclose(fit.fixed_from_moving.translation, [0.8, -0.6, 1.0], atol=5e-3)
+
+
+def test_surveys_of_different_places_are_refused() -> None:
+    elsewhere = RigidTransform.from_translation([50.0, 0, 0])
+    before = survey(8, STILL, 0.0)
+    hole = Elevation(
+        height=np.where(np.arange(SIDE) < 5, before.height, np.nan), sigma=before.sigma,
+        west=0.0, north=4.0, cell=CELL,
+    )  # fmt: skip
+    with pytest.raises(ReconstructionError, match="overlap"):
+        register_heights(hole, Elevation(
+            height=np.where(np.arange(SIDE) > 195, before.height, np.nan), sigma=before.sigma,
+            west=0.0, north=4.0, cell=CELL), elsewhere)  # fmt: skip
+
+
+def test_heights_between_cells_are_exact_on_a_plane() -> None:
+    rows, columns = np.mgrid[:20, :30]
+    plane = Elevation(
+        height=0.1 * columns - 0.2 * rows, sigma=np.ones((20, 30)), west=5.0, north=7.0, cell=0.5
+    )
+    rng = np.random.default_rng(9)
+    places = np.column_stack([rng.uniform(5.25, 19.7, 50), rng.uniform(-2.7, 6.75, 50)])
+    expected = 0.1 * ((places[:, 0] - 5) / 0.5 - 0.5) - 0.2 * ((7 - places[:, 1]) / 0.5 - 0.5)
+    np.testing.assert_allclose(plane.at(plane.height, places), expected, atol=1e-12)
+    assert np.isnan(plane.at(plane.height, np.array([[4.9, 5.0], [6.0, 7.4]]))).all()
+
+
+def test_frames_of_two_datums_agree_on_the_place_of_a_point() -> None:
+    one, other = Datum(32.8236, 34.9553), Datum(32.8240, 34.9549, 1.5)
+    point = np.array([[12.0, -7.0, -15.0]])
+    lat_lon = other.geodetic_from_ned(np.column_stack([point[:, 1], point[:, 0], -point[:, 2]]))
+    ned = one.ned_from_geodetic(lat_lon)
+    moved = enu_from_enu(one, other).apply(point)
+    # Latitudes and longitudes come back to 0.01 mm, a fiftieth of a pixel on the sea floor.
+    np.testing.assert_allclose(moved, ned[:, [1, 0, 2]] * [1, 1, -1], rtol=0, atol=5e-5)
+
+
+def write_survey(folder: Path, elevation: Elevation, datum: Datum | None) -> Path:
+    """The files of a workspace that a comparison reads."""
+    for name in ("dense", "sparse"):
+        (folder / name).mkdir(parents=True)
+        write_json(folder / name / "stage.json", {"digest": "-"})
+    frame = WorldFrame(
+        name="ned" if datum else "model", datum=datum, scaled=datum is not None,
+        vertical_datum="test",
+    )  # fmt: skip
+    write_frame(folder / "sparse" / "frame.json", frame)
+    for name, values in (("dem", elevation.height), ("sigma", elevation.sigma)):
+        with rasterio.open(
+            folder / "dense" / f"{name}.tif", "w", driver="GTiff", width=SIDE, height=SIDE, count=1,
+            dtype="float32", transform=from_origin(0, 4, CELL, CELL), nodata=np.nan,
+        ) as target:  # fmt: skip
+            target.write(values.astype(np.float32), 1)
+    return folder
+
+
+def test_the_command_writes_maps_that_say_what_the_text_says(tmp_path: Path) -> None:
+    datum = Datum(32.8236, 34.9553)
+    now = write_survey(tmp_path / "now", survey(10, STILL, MOUND_M), datum)
+    before = write_survey(tmp_path / "before", survey(11, AWAY, 0.0), datum)
+    text, figures = evaluate_against(now, before)
+    assert "gained 2.8" in text
+    np.testing.assert_allclose(
+        figures["registration"]["turn_deg"], np.rad2deg(AWAY.rotation.as_rotvec()), atol=0.02
+    )
+    folder = now / "against" / "before"
+    with rasterio.open(folder / "difference.tif") as source:
+        difference = source.read(1)
+        row, column = source.index(*AT)
+        assert difference[row - 2 : row + 3, column - 2 : column + 3].mean() == pytest.approx(
+            MOUND_M, rel=0.1
+        )
+    with rasterio.open(folder / "significance.tif") as source:
+        assert source.read(1)[row, column] > 8
+    assert cv2.imread(str(folder / "change.png")).shape[1] > 1000
+    bare = write_survey(tmp_path / "bare", survey(12, STILL, 0.0), None)
+    with pytest.raises(WorkspaceError, match="not georeferenced"):
+        evaluate_against(now, bare)
