@@ -293,7 +293,9 @@ class _Task:
         scaled = got
         if SCALE not in free:
             found = equations(epochs, place, middle)
-            scaled = self._estimate(found, place, middle, got.used, [*solved_for, SCALE])
+            scaled = self._estimate(
+                found, place, middle, got.used, [*solved_for, SCALE], lasting=got.lasting
+            )
         return self._report(place, middle, got, scaled, held=SCALE not in free)
 
     def _report(
@@ -350,6 +352,7 @@ class _Task:
         middle: Array,
         used: NDArray[np.bool_],
         free: list[int],
+        lasting: Mapping[str, Lasting] | None = None,
     ) -> Estimate:
         return estimate(
             self.epochs.time,
@@ -358,6 +361,7 @@ class _Task:
             free,
             self._extra(place, middle),
             frame_bounds=self._frame_bounds(),
+            lasting=lasting,
         )
 
     def _extra(self, place: Similarity, middle: Array) -> Extra:

@@ -19,10 +19,10 @@ from alice_survey.frames import Array
 from reconstruct.sparse.channels import GROUP_OF, GROUPS, PARAMETERS, Equations
 from reconstruct.sparse.correlated import LEAST_WHITE, lasting_share, surprise, whiten
 
-_WHITE = (LEAST_WHITE, 1e-3, 1e-2, 0.1, 0.4, 0.8)
+_WHITE = (LEAST_WHITE, 3e-3, 0.05, 0.3, 0.8, 0.97)
 _CONSTANT = (0.0, 0.5, 0.75, 0.9)
 """The varying part's variance goes down by halves: what is not known of a variance is its size."""
-_TAUS = 12
+_TAUS = 10
 _SHORTEST_STEPS, _LONGEST_SPANS = 0.2, 30.0
 """Correlation times looked at: from so many median time steps to so many lengths of the survey."""
 _GROSS_SIGMAS = 5.0
@@ -84,6 +84,7 @@ def estimate(
     extra: Extra = NO_EXTRA,
     *,
     frame_bounds: Mapping[int, float],
+    lasting: Mapping[str, Lasting] | None = None,
 ) -> Estimate:
     """Solve for the parameters, the lasting of errors and the readings to leave out.
 
@@ -96,11 +97,17 @@ def estimate(
         extra: further equations.
         frame_bounds: sigmas of the nuisances of navigation's own frame (turn, stretch) if its
             position errors lasted throughout; they shrink as those average out.
+        lasting: how errors last, where that is known: then no reading is left out either, and the
+            covariance is that of this way alone.
     """
     problem = _Problem(
         time=time, found=found, free=np.array(free), extra=extra, frame_bounds=frame_bounds
     )
     used = used & np.isfinite(found.misfit)
+    if lasting is not None:
+        parameters, spread = problem.total(used, lasting).solve()
+        change, covariance = _filled(problem, parameters, spread)
+        return Estimate(change=change, covariance=covariance, lasting=lasting, used=used)
     lasting = {
         group: Lasting(tau=float(np.ptp(time)) or 1.0, white=0.1)
         for group in GROUPS
@@ -170,7 +177,8 @@ class _Problem:
     free: NDArray[np.int64]
     extra: Extra
     frame_bounds: Mapping[int, float]
-    cache: dict[Any, list[tuple[Array, float, int]]] = field(default_factory=dict)
+    cache: dict[Any, _Normal] = field(default_factory=dict)
+    stacks: dict[Any, tuple[Array, Array, Array, Array]] = field(default_factory=dict)
 
     def group(self, group: str, used: NDArray[np.bool_], lasting: Lasting) -> _Normal:
         """Normal equations of one group.
@@ -178,27 +186,54 @@ class _Problem:
         A constant error of variance c adds `c 1 1'` to the covariance matrix: its inverse is that
         of the varying part less a product (Sherman & Morrison 1950).
         """
+        key = (group, used.tobytes(), lasting.tau, lasting.white, lasting.constant)
+        if key not in self.cache:
+            self.cache[key] = self._unscaled(group, used, lasting)
+        found, square = self.cache[key], lasting.factor**2
+        return _Normal(
+            matrix=found.matrix / square,
+            vector=found.vector / square,
+            square=found.square / square,
+            log_det=found.log_det + found.rows * float(np.log(square)),
+            rows=found.rows,
+        )
+
+    def groups(
+        self, group: str, used: NDArray[np.bool_], choices: Sequence[Lasting]
+    ) -> tuple[Array, Array, Array, Array]:
+        """The same of many choices of one factor: matrices, vectors, squares, log dets."""
+        key = (group, used.tobytes(), len(choices))
+        if key not in self.stacks:
+            parts = [self.group(group, used, replace(c, factor=1.0)) for c in choices]
+            self.stacks[key] = (
+                np.stack([part.matrix for part in parts]),
+                np.stack([part.vector for part in parts]),
+                np.array([part.square for part in parts]),
+                np.array([part.log_det for part in parts]),
+            )
+        matrix, vector, misfit, log_det = self.stacks[key]
+        square = choices[0].factor ** 2
+        rows = int(used[:, _channels(group)].sum())
+        return matrix / square, vector / square, misfit / square, log_det + rows * np.log(square)
+
+    def _unscaled(self, group: str, used: NDArray[np.bool_], lasting: Lasting) -> _Normal:
         size = len(self.free)
         total = _Normal(
             matrix=np.zeros((size, size)), vector=np.zeros(size), square=0.0, log_det=0.0, rows=0
         )
-        factor = lasting.factor
-        key = (group, used.tobytes(), lasting.tau, lasting.white, lasting.constant)
-        if key not in self.cache:
-            self.cache[key] = [
-                self._products(channel, used[:, channel], lasting)
-                for channel in _channels(group)
-                if used[:, channel].any()
-            ]
-        for product, log_det, count in self.cache[key]:
+        for channel in _channels(group):
+            rows = used[:, channel]
+            if not rows.any():
+                continue
+            product, log_det, count = self._products(channel, rows, lasting)
             ones = product[-1]
-            kept = (product - np.outer(ones, ones) / (1.0 + ones[-1])) / factor**2
+            kept = product - np.outer(ones, ones) / (1.0 + ones[-1])
             total = total.plus(
                 _Normal(
                     matrix=kept[:-2, :-2],
                     vector=kept[:-2, -2],
                     square=float(kept[-2, -2]),
-                    log_det=log_det + 2.0 * count * float(np.log(factor)) + np.log1p(ones[-1]),
+                    log_det=log_det + float(np.log1p(ones[-1])),
                     rows=count,
                 )
             )
@@ -301,11 +336,9 @@ def _scores(
     for name, how in now.items():
         if name != group:
             others = others.plus(problem.group(name, used, how))
-    parts = [problem.group(group, used, choice) for choice in choices]
-    matrix = others.matrix + np.stack([part.matrix for part in parts])
-    vector = others.vector + np.stack([part.vector for part in parts])
-    square = np.array([part.square for part in parts])
-    size = np.sqrt(np.diagonal(others.matrix + parts[0].matrix))
+    matrix, vector, square, own = problem.groups(group, used, choices)
+    matrix, vector = others.matrix + matrix, others.vector + vector
+    size = np.sqrt(np.diagonal(matrix[0]))
     size = np.where(size > 0, size, 1.0)
     scaled = matrix / np.outer(size, size)
     sign, log_det = np.linalg.slogdet(scaled)
@@ -313,8 +346,7 @@ def _scores(
     scores = np.full(len(choices), -np.inf)
     change = np.linalg.solve(scaled[usable], (vector[usable] / size)[..., None])[..., 0]
     gained = np.einsum("ki,ki->k", change, vector[usable] / size)
-    own = np.array([part.log_det for part in parts])[usable]
-    scores[usable] = -0.5 * (own + log_det[usable] + square[usable] - gained)
+    scores[usable] = -0.5 * (own[usable] + log_det[usable] + square[usable] - gained)
     return scores
 
 
@@ -391,6 +423,11 @@ def _averaged(
     mean = changes.mean(axis=0)
     spread = (changes - mean).T @ (changes - mean) / len(changes)
     covariance = np.mean([c for _, c in solutions], axis=0) + spread
+    return _filled(problem, mean, covariance)
+
+
+def _filled(problem: _Problem, mean: Array, covariance: Array) -> tuple[Array, Array]:
+    """With zeros for what is held."""
     full, matrix = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
     full[problem.free] = mean
     matrix[np.ix_(problem.free, problem.free)] = covariance

@@ -1,0 +1,30 @@
+"""Slow, obvious twins of the kernels that weigh errors which last."""
+
+import numpy as np
+
+from alice_survey.frames import Array
+
+
+def covariance_matrix(time: Array, sigma: Array, tau: float, white: float) -> Array:
+    """(N, N) correlations of errors over their sigmas, pair by pair along the chain between them."""
+    count = len(time)
+    matrix = np.eye(count)
+    for i in range(count):
+        for j in range(i + 1, count):
+            kept = 1.0
+            for k in range(i, j):
+                kept *= np.exp(-(time[k + 1] - time[k]) / tau)
+                kept *= min(sigma[k], sigma[k + 1]) / max(sigma[k], sigma[k + 1])
+            matrix[i, j] = matrix[j, i] = (1.0 - white) * kept
+    return matrix
+
+
+def surprises(matrix: Array, values: Array) -> Array:
+    """(N,) each value less what the others predict, over the sigma of that, by partitioning."""
+    found = np.empty(len(values))
+    for i in range(len(values)):
+        others = np.arange(len(values)) != i
+        weights = np.linalg.solve(matrix[np.ix_(others, others)], matrix[others, i])
+        spread = matrix[i, i] - weights @ matrix[others, i]
+        found[i] = (values[i] - weights @ values[others]) / np.sqrt(spread)
+    return found
