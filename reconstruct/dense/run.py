@@ -6,7 +6,8 @@ prepare pictures, find each view's depth with a few partners, let neighbours con
 
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,9 @@ from reconstruct.dense.depth import pair_depth
 from reconstruct.dense.fusion import GATE_SIGMAS, count_witnesses, merge_depths
 from reconstruct.dense.probe import find_conditions, open_pictures, shrunk
 from reconstruct.dense.rectify import scaled_view
+from reconstruct.dense.refine import Look, prepared, refine
 from reconstruct.dense.sight import lens_of
-from reconstruct.dense.stereo_pairs import choose_pairs, in_frame, points_of_views
+from reconstruct.dense.stereo_pairs import StereoPair, choose_pairs, in_frame, points_of_views
 from reconstruct.dense.tiles import Tile, ViewSummary, fuse_tile, tile_tasks
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.model import SparseModel, View, WorldFrame, read_model
@@ -51,6 +53,11 @@ _BOUND_PERCENT = 0.1
 """Share of a view's points left out on each of its four sides, so that none strays far off."""
 _LIGHT_LATTICE = 28
 """Pixels along a picture's width at which the light of views is compared."""
+_LOOKS = 6
+"""Neighbours by which depth is refined."""
+_DOUBTERS = 12
+_DOUBT_STEP = 7
+"""Views, and pixels between the pixels of each, by which the doubt is told."""
 _LEAST_PIXELS = 100
 """A view with fewer pixels of confirmed depth is left out."""
 
@@ -79,6 +86,16 @@ class DepthTask:
 
 
 @dataclass(frozen=True, kw_only=True)
+class RefineTask:
+    """One view whose depth is to be made exact."""
+
+    store: ViewStore
+    index: int
+    view: View
+    others: tuple[tuple[int, View], ...]
+
+
+@dataclass(frozen=True, kw_only=True)
 class CheckTask:
     """One view whose depth the neighbours are asked about."""
 
@@ -86,6 +103,8 @@ class CheckTask:
     index: int
     view: View
     neighbours: tuple[tuple[int, View], ...]
+    doubt: float
+    """By which the standard deviations of refined depths are taken."""
 
 
 def run_dense(workspace: Path, config: SurveyConfig, threads: int) -> bool:
@@ -106,7 +125,7 @@ def run_dense(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     )
     stage = Stage(
         name="dense",
-        version=1,
+        version=2,
         settings=settings,
         inputs=[sparse, *picture_files(workspace, sparse, model)],
         resumes=True,
@@ -168,15 +187,29 @@ def build_surface(
         for index, pairs in enumerate(partners)
     ]
     _drain(parallel_map(view_depth, depths, threads=threads, label="match"))
+    neighbours = _neighbours(model)
+    refine_tasks = [
+        RefineTask(
+            store=store,
+            index=index,
+            view=views[index],
+            others=tuple((n, views[n]) for n in _looked_at(partners[index], neighbours[index])),
+        )
+        for index in range(len(views))
+    ]
+    _drain(parallel_map(refine_view, refine_tasks, threads=threads, label="refine"))
     checks = [
         CheckTask(
             store=store,
             index=index,
             view=views[index],
-            neighbours=tuple((n, views[n]) for n in neighbours),
+            neighbours=tuple((n, views[n]) for n in neighbours[index]),
+            doubt=1.0,
         )
-        for index, neighbours in enumerate(_neighbours(model))
+        for index in range(len(views))
     ]
+    doubt = find_doubt(checks, threads)
+    checks = [replace(check, doubt=doubt) for check in checks]
     summaries = list(parallel_map(check_view, checks, threads=threads, label="cross-check"))
     grid = surface_grid(summaries, settings.dem_cell_m, model.frame)
     offset = _offset(grid, summaries)
@@ -188,7 +221,7 @@ def build_surface(
         [view.camera for view in views],
     )
     write_light(folder / "light.json", light)
-    tasks = tile_tasks(store, grid, views, summaries, light, offset, edge)
+    tasks = tile_tasks(store, grid, views, summaries, light, offset, edge, doubt)
     tiles = parallel_map(fuse_tile, tasks, threads=threads, label="fuse")
     count = write_ply(
         folder / "cloud.ply", _write_rasters(folder, grid, model.frame, tiles), offset, model.frame
@@ -206,6 +239,8 @@ def build_surface(
             "version": 1,
             "matching_scale": conditions.scale,
             "match_sigma_px": conditions.match_sigma_px,
+            "refined_with": _LOOKS,
+            "sigma_factor": round(doubt, 3),
             "cell": grid.cell,
             "unit": model.frame.unit,
             "rows": grid.rows,
@@ -222,14 +257,26 @@ def build_surface(
 
 
 def prepare_view(task: PrepareTask) -> None:
-    """Keep a picture's colour, evened-out grey and validity at the size of matching."""
-    if task.store.has(task.index, "grey"):
+    """Keep a picture's colour and validity at the size of matching."""
+    store = task.store
+    if store.has(task.index, "low"):
         return
     colour, valid = shrunk(open_pictures(task.workspace), task.image, task.size_px)
-    task.store.save(task.index, "colour", colour)
-    task.store.save(task.index, "valid", valid)
-    task.store.save(task.index, "low", low_pass(colour, valid))
-    task.store.save(task.index, "grey", normalise(colour))
+    store.save_colour(task.index, colour)
+    store.save_mask(task.index, "valid", valid)
+    store.save(task.index, "low", low_pass(colour, valid))
+
+
+@lru_cache(maxsize=8)
+def _evened(store: ViewStore, index: int) -> NDArray[np.uint8]:
+    """A picture of even light and contrast."""
+    return normalise(store.load_bright(index))
+
+
+@lru_cache(maxsize=8)
+def _look(store: ViewStore, index: int, width: int) -> tuple[NDArray[Any], ...]:
+    """Contrast, spline and validity of a picture."""
+    return prepared(store.load_bright(index), store.load_mask(index, "valid", width))
 
 
 def view_depth(task: DepthTask) -> None:
@@ -243,10 +290,10 @@ def view_depth(task: DepthTask) -> None:
         found = pair_depth(
             task.view,
             partner,
-            np.asarray(store.load(task.index, "grey")),
-            np.asarray(store.load(number, "grey")),
-            np.asarray(store.load(task.index, "valid")),
-            np.asarray(store.load(number, "valid")),
+            _evened(store, task.index),
+            _evened(store, number),
+            store.load_mask(task.index, "valid", task.view.width_px),
+            store.load_mask(number, "valid", partner.width_px),
             task.points_world,
             task.match_sigma_px,
         )
@@ -258,42 +305,105 @@ def view_depth(task: DepthTask) -> None:
     else:
         depth = np.full(shape, np.nan, np.float32)
         sigma, agreeing = depth, np.zeros(shape, np.uint8)
-    store.save(task.index, "depth", depth)
-    store.save(task.index, "sigma", sigma)
+    store.save_depth(task.index, "depth", depth, sigma)
     store.save(task.index, "agreeing", agreeing)
 
 
-def check_view(task: CheckTask) -> ViewSummary:
-    """Keep the depths that two independent matches support.
+def refine_view(task: RefineTask) -> None:
+    """Make a view's depth exact by all of its neighbours at once, and fill its gaps."""
+    store = task.store
+    if store.has(task.index, "fine"):
+        return
+    looks = []
+    for number, view in ((task.index, task.view), *task.others):
+        contrast, spline, valid = _look(store, number, view.width_px)
+        looks.append(Look(view=view, contrast=contrast, spline=spline, valid=valid))
+    depth, _ = store.load_depth(task.index, "depth")
+    refined = refine(looks[0], depth, looks[1:])
+    agreeing = np.asarray(store.load(task.index, "agreeing"))
+    support = np.where(np.isfinite(depth), np.maximum(agreeing, refined.seen), refined.seen)
+    store.save(task.index, "seen", support.astype(np.uint8))
+    store.save_depth(task.index, "fine", refined.depth, refined.sigma)
+    store.drop(task.index, "agreeing")
+    store.drop(task.index, "depth")
+    store.drop(task.index, "depth.sigma")
 
-    A depth stays where the partners that agree and the neighbouring views that find the same
-    surface number two or more, and no more views see through it than confirm it.
+
+def find_doubt(checks: Sequence[CheckTask], threads: int) -> float:
+    """How far refined depths of neighbouring views differ, in standard deviations as stated.
+
+    What the noise of pictures cannot tell (detail finer than the window, poses, calibration) shows
+    where views differ. The median over some views spread over the survey; at least 1.
+    """
+    step = max(1, len(checks) // _DOUBTERS)
+    spreads = list(parallel_map(disagreement, checks[::step], threads=threads, label="compare"))
+    told = [spread for spread in spreads if np.isfinite(spread)]
+    return max(1.0, float(np.median(told))) if told else 1.0
+
+
+def disagreement(task: CheckTask) -> float:
+    """Scatter of a view's depths against its neighbours', in standard deviations; NaN if none."""
+    depth, sigma = task.store.load_depth(task.index, "fine")
+    lattice = np.zeros(depth.shape, np.bool_)
+    lattice[_DOUBT_STEP // 2 :: _DOUBT_STEP, _DOUBT_STEP // 2 :: _DOUBT_STEP] = True
+    rows, columns = np.nonzero(lattice & np.isfinite(depth))
+    points = _world_points(task.view, depth, rows, columns)
+    parts = []
+    for number, other in task.neighbours:
+        there, doubt = task.store.load_depth(number, "fine")
+        seen = in_frame(other, points)
+        at = np.floor(other.project(points[seen])).astype(np.int64)
+        z = other.world_from_cam.inv().apply(points[seen])[:, 2]
+        other_z, other_sigma = there[at[:, 1], at[:, 0]], doubt[at[:, 1], at[:, 0]]
+        own = sigma[rows, columns][seen]
+        parts.append((other_z - z) / np.hypot(own, other_sigma))
+    apart = np.concatenate(parts) if parts else np.empty(0)
+    apart = apart[np.isfinite(apart)]
+    return 1.4826 * float(np.median(np.abs(apart))) if len(apart) >= _LEAST_PIXELS else np.nan
+
+
+def _looked_at(pairs: Sequence[StereoPair], neighbours: Sequence[int]) -> list[int]:
+    """Views to refine depth with: the partners, then those that share most."""
+    chosen = [pair.partner for pair in pairs]
+    if not chosen:
+        return []
+    chosen += [n for n in neighbours if n not in chosen]
+    return chosen[:_LOOKS]
+
+
+def check_view(task: CheckTask) -> ViewSummary:
+    """Keep the depths that two independent looks support.
+
+    A depth stays where the neighbours whose windows look alike (or the partners that agree) and the
+    neighbouring views that find the same surface number two or more, and no more views see through
+    it than confirm it.
     """
     store, view = task.store, task.view
-    depth = np.asarray(store.load(task.index, "depth"))
-    sigma = np.asarray(store.load(task.index, "sigma"))
-    confirmed = np.asarray(store.load(task.index, "agreeing")).astype(np.int16)
-    refuted = np.zeros_like(confirmed)
-    supported = np.zeros_like(confirmed)
+    depth, sigma = store.load_depth(task.index, "fine")
+    sigma *= np.float32(task.doubt)
+    alike = np.asarray(store.load(task.index, "seen")).astype(np.int16)
+    refuted = np.zeros_like(alike)
+    supported = np.zeros_like(alike)
     for number, other in task.neighbours:
         other_from_ref = other.world_from_cam.inv() * view.world_from_cam
+        other_depth, other_sigma = store.load_depth(number, "fine")
         seen, through = count_witnesses(
             depth,
             sigma,
             lens_of(view),
             np.ascontiguousarray(other_from_ref.as_matrix()[:3]),
-            np.asarray(store.load(number, "depth")),
-            np.asarray(store.load(number, "sigma")),
+            other_depth,
+            other_sigma * np.float32(task.doubt),
             lens_of(other),
             GATE_SIGMAS,
         )
         supported += seen
         refuted += through
-    kept = np.isfinite(depth) & (confirmed + supported >= 2) & (refuted <= supported)
+    kept = np.isfinite(depth) & (alike + supported >= 2) & (refuted <= supported)
     rows, columns = np.nonzero(kept)
     nodes = at_nodes(np.asarray(store.load(task.index, "low")))
     if len(rows) < _LEAST_PIXELS:
-        store.save(task.index, "kept", np.zeros_like(kept))
+        store.save_mask(task.index, "kept", np.zeros_like(kept))
         return ViewSummary(
             bounds=None,
             up=np.nan,
@@ -306,7 +416,7 @@ def check_view(task: CheckTask) -> ViewSummary:
     low, high = np.percentile(points[:, :2], [_BOUND_PERCENT, 100 - _BOUND_PERCENT], axis=0)
     beyond = (points[:, :2] < low) | (points[:, :2] > high)
     kept[rows, columns] = ~beyond.any(axis=1)
-    store.save(task.index, "kept", kept)
+    store.save_mask(task.index, "kept", kept)
     return ViewSummary(
         bounds=(float(low[0]), float(low[1]), float(high[0]), float(high[1])),
         up=float(-np.median(points[:, 2])),

@@ -64,6 +64,8 @@ class TileTask:
     offset_enu: tuple[float, float, float]
     edge: float
     """Of the cubes to which the cloud is thinned."""
+    doubt: float
+    """By which the standard deviations of refined depths are taken."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,6 +87,7 @@ def tile_tasks(
     light: LightModel,
     offset_enu: tuple[float, float, float],
     edge: float,
+    doubt: float,
 ) -> list[TileTask]:
     """Tiles in the order of the file's rows, each with the views whose points may fall in it."""
     tasks = []
@@ -119,6 +122,7 @@ def tile_tasks(
                 light=light,
                 offset_enu=offset_enu,
                 edge=edge,
+                doubt=doubt,
             )
         )
     return tasks
@@ -137,15 +141,18 @@ def fuse_tile(task: TileTask) -> Tile:
     store = task.store
     parts = []
     for index, view in task.views:
-        sigma = np.asarray(store.load(index, "sigma"))
+        depth, sigma = store.load_depth(index, "fine")
+        sigma *= np.float32(task.doubt)
+        with np.errstate(invalid="ignore"):
+            sure = sigma <= _WORST_CELLS * grid.cell
         parts.append(
             points_in_box(
                 view,
                 index,
-                np.asarray(store.load(index, "depth")),
+                depth,
                 sigma,
-                np.asarray(store.load(index, "kept")) & (sigma <= _WORST_CELLS * grid.cell),
-                np.asarray(store.load(index, "colour")),
+                store.load_mask(index, "kept", view.width_px) & sure,
+                store.load_colour(index),
                 task.light.factors(view.camera, view.image),
                 offset,
                 box,

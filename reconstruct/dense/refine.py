@@ -1,0 +1,357 @@
+"""Depth made exact where several pictures look alike: multi-view least-squares matching.
+
+All neighbours are warped onto the reference through its present depth map, pixel by pixel, so that
+windows follow slopes and bends of the surface. What then differs between warped and reference is
+explained by one correction of the inverse depth in a window around each pixel (Lucas & Kanade 1981,
+"An iterative image registration technique"), the same for all neighbours: each sees it along its
+own epipolar line. Sums over windows are filters over the picture, so that the work does not depend
+on the window's size. The correction is repeated until it is small; since each pixel's window is
+warped by the newest depths around it, repetition restores detail that a single window would blur
+(Le Besnerais & Champagnat 2005, "Dense optical flow by iterative local window registration").
+
+The same sums tell how sure a depth is: the curvature of the misfit along the inverse depth, and
+the noise that remains between pictures.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from alice_survey.frames import Array
+from reconstruct.dense.sight import KernelLens, lens_of, pixel_at, slope_at
+from reconstruct.model import View
+
+Float32 = NDArray[np.float32]
+
+_CONTRAST_SIGMA_PX = 8.0
+"""Of the Gaussian window in which pictures are brought to zero mean and unit contrast."""
+_LEAST_CONTRAST = 1.5
+"""Grey levels of noise that are not blown up to full contrast."""
+_WINDOW_SIGMA_PX = 1.25
+"""Of the Gaussian window that is compared. Wider ones blur the surface, narrower ones are noisier;
+the noise is averaged when views are fused, the blur is not."""
+_ROUNDS = 2
+_GAP_ROUNDS = 3
+_REACHES_PX = (2.0, 6.0)
+_LEAST_KNOWN = 0.05
+"""Share of a blurring window that must be known for a gap to be continued into."""
+_ALIKE = 0.5
+"""Correlation from which two windows look alike."""
+_LEAST_SHARE = 0.4
+"""Of a window's weight that a neighbour must see."""
+_OUTLYING = 2.5
+"""Deviations beyond which a pixel counts less than half."""
+_LONGEST_STEP_PX = 1.0
+"""Of a round, along the epipolar line of the neighbour that moves most."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Look:
+    """A picture ready to be compared."""
+
+    view: View
+    contrast: Float32
+    """(H, W) of zero mean and unit variance around every pixel."""
+    spline: Float32
+    """(H, W) coefficients of the cubic B-spline through it."""
+    valid: NDArray[np.bool_]
+    """(H, W) which pixels may be used."""
+
+
+def prepared(
+    grey: NDArray[np.uint8], valid: NDArray[np.bool_]
+) -> tuple[Float32, Float32, NDArray[np.bool_]]:
+    """Contrast, spline and validity of a picture (H, W), as `Look` has them."""
+    contrast = even_contrast(grey.astype(np.float32))
+    spline = ndimage.spline_filter(contrast, order=3, output=np.float32, mode="mirror")
+    return contrast, spline, valid
+
+
+def even_contrast(grey: Float32) -> Float32:
+    """A picture less its local mean, over its local deviation."""
+    mean = _blur(grey, _CONTRAST_SIGMA_PX)
+    rest: Float32 = grey - mean
+    variance = _blur(rest * rest, _CONTRAST_SIGMA_PX) + np.float32(_LEAST_CONTRAST**2)
+    even: Float32 = rest * (variance ** np.float32(-0.5))
+    return even
+
+
+def _blur(picture: Float32, sigma_px: float) -> Float32:
+    blurred: Float32 = cv2.GaussianBlur(picture, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT)
+    return blurred
+
+
+@njit(cache=True, fastmath={"contract", "reassoc", "nsz", "arcp"})  # type: ignore[untyped-decorator]
+def compare(
+    inverse_depth: Float32,
+    reference: Float32,
+    lens: KernelLens,
+    spline: Float32,
+    valid: NDArray[np.bool_],
+    other_lens: KernelLens,
+    other_from_ref: Array,
+) -> tuple[Float32, Float32, Float32]:
+    """Warp a neighbour onto the reference through its depth.
+
+    Args:
+        inverse_depth: (H, W) along the reference's axis, NaN where unknown.
+        reference: (H, W) contrast.
+        lens: of the reference.
+        spline: (h, w) B-spline coefficients of the neighbour's contrast.
+        valid: (h, w) of the neighbour.
+        other_lens: of the neighbour.
+        other_from_ref: (3, 4) transform of points.
+
+    Returns:
+        (H, W) reference less warped neighbour; the warped neighbour's change per unit of inverse
+        depth; and how many of its pixels one unit moves. NaN where it does not see the spot.
+    """
+    height, width = inverse_depth.shape
+    rows, columns = spline.shape
+    rest = np.full((height, width), np.nan, np.float32)
+    slope = np.full((height, width), np.nan, np.float32)
+    speed = np.full((height, width), np.nan, np.float32)
+    pinhole = other_lens[0]
+    t = other_from_ref
+    for row in range(height):
+        for column in range(width):
+            w = inverse_depth[row, column]
+            if not w > 0.0:
+                continue
+            x, y = slope_at(lens, column + 0.5, row + 0.5, w)
+            a = t[0, 0] * x + t[0, 1] * y + t[0, 2]
+            b = t[1, 0] * x + t[1, 1] * y + t[1, 2]
+            c = t[2, 0] * x + t[2, 1] * y + t[2, 2]
+            deep = c + w * t[2, 3]
+            if deep <= 0.0:
+                continue
+            u, v = pixel_at(other_lens, (a + w * t[0, 3]) / w, (b + w * t[1, 3]) / w, deep / w)
+            u -= 0.5
+            v -= 0.5
+            j, i = math.floor(u), math.floor(v)
+            if j < 1 or i < 1 or j >= columns - 2 or i >= rows - 2:
+                continue
+            if not (valid[i, j] and valid[i + 1, j + 1] and valid[i, j + 1] and valid[i + 1, j]):
+                continue
+            p, q = u - j, v - i
+            a0, a1, a2, a3 = _weights(p)
+            b0, b1, b2, b3 = _slopes(p)
+            value, right, down = 0.0, 0.0, 0.0
+            across, changes = _weights(q), _slopes(q)
+            for m in range(4):
+                k = i - 1 + m
+                c0, c1 = spline[k, j - 1], spline[k, j]
+                c2, c3 = spline[k, j + 1], spline[k, j + 2]
+                line = a0 * c0 + a1 * c1 + a2 * c2 + a3 * c3
+                value += across[m] * line
+                down += changes[m] * line
+                right += across[m] * (b0 * c0 + b1 * c1 + b2 * c2 + b3 * c3)
+            du = pinhole[0] * (t[0, 3] * c - a * t[2, 3]) / (deep * deep)
+            dv = pinhole[1] * (t[1, 3] * c - b * t[2, 3]) / (deep * deep)
+            rest[row, column] = reference[row, column] - value
+            slope[row, column] = right * du + down * dv
+            speed[row, column] = math.sqrt(du * du + dv * dv)
+    return rest, slope, speed
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _weights(t: float) -> tuple[float, float, float, float]:
+    """The four weights of a cubic B-spline at a share t of the way from the second node."""
+    s = 1.0 - t
+    return (
+        s * s * s / 6.0,
+        (3.0 * t * t * t - 6.0 * t * t + 4.0) / 6.0,
+        (3.0 * s * s * s - 6.0 * s * s + 4.0) / 6.0,
+        t * t * t / 6.0,
+    )
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _slopes(t: float) -> tuple[float, float, float, float]:
+    """How these weights change with t."""
+    s = 1.0 - t
+    return -0.5 * s * s, 1.5 * t * t - 2.0 * t, 2.0 * s - 1.5 * s * s, 0.5 * t * t
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Refined:
+    """Depth of a view where pictures agree, arrays of (H, W)."""
+
+    depth: Float32
+    """NaN where unknown, or where no neighbour looks alike."""
+    sigma: Float32
+    """Standard deviation from what differs between the pictures, NaN where unknown."""
+    likeness: Float32
+    """Correlation of the window with its neighbours, their mean weighted as they were used."""
+    seen: NDArray[np.uint8]
+    """How many neighbours look alike there."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Sums:
+    """What all neighbours say of a correction of the inverse depth, (H, W) each."""
+
+    pull: Float32
+    curvature: Float32
+    speed: Float32
+    """Pixels per unit of inverse depth, of the neighbour that moves most."""
+    likeness: Float32
+    seen: NDArray[np.uint8]
+
+
+def refine(reference: Look, depth: Float32, others: Sequence[Look]) -> Refined:
+    """Correct a depth map by all neighbours at once, and continue it into its gaps.
+
+    A pixel without depth starts from the smooth continuation of those around it. It keeps what is
+    found only where at least two neighbours look alike.
+
+    Args:
+        reference: whose depth it is.
+        depth: (H, W) along its axis, NaN where unknown.
+        others: neighbours to compare with.
+    """
+    known = np.isfinite(depth)
+    inverse = continued((1.0 / depth).astype(np.float32))
+    gap = np.isfinite(inverse) & ~known
+    if gap.any():
+        side = 2 * round(3 * _WINDOW_SIGMA_PX) + 1
+        around = cv2.dilate(gap.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+        for _ in range(_GAP_ROUNDS):
+            part = np.where(around, inverse, np.float32(np.nan))
+            inverse = np.where(gap, _stepped(part, _sums(reference, part, others)), inverse)
+    for _ in range(_ROUNDS):
+        sums = _sums(reference, inverse, others)
+        inverse = _stepped(inverse, sums)
+    found = (sums.curvature > 0) & (sums.likeness >= _ALIKE)
+    found &= known | (sums.seen >= 2)
+    unknown = np.float32(np.nan)
+    refined: Float32 = np.where(found, np.float32(1.0) / inverse, unknown)
+    root: Float32 = np.sqrt(np.where(found, sums.curvature, unknown))
+    return Refined(
+        depth=refined,
+        sigma=refined * refined / root,
+        likeness=sums.likeness,
+        seen=sums.seen,
+    )
+
+
+def continued(inverse: Float32) -> Float32:
+    """Inverse depths (H, W), their gaps filled up to some pixels from what is known."""
+    known = np.isfinite(inverse)
+    filled: Float32 = inverse
+    for sigma_px in _REACHES_PX:
+        weight = _blur(known.astype(np.float32), sigma_px)
+        mean = _blur(np.where(known, inverse, np.float32(0)), sigma_px)
+        near = ~np.isfinite(filled) & (weight > _LEAST_KNOWN)
+        smooth = mean / np.maximum(weight, np.float32(1e-6))
+        filled = np.where(near, smooth, filled)
+    return filled
+
+
+def _stepped(inverse: Float32, sums: _Sums) -> Float32:
+    """Inverse depths moved to where the pictures agree best, held back where little pulls.
+
+    The one who holds back is a prior of one pixel's deviation along the longest epipolar line.
+    """
+    hold = np.maximum(sums.speed, np.float32(1e-6)) ** 2
+    reach = _LONGEST_STEP_PX / np.maximum(sums.speed, np.float32(1e-6))
+    moved: Float32 = inverse + np.clip(sums.pull / (sums.curvature + hold), -reach, reach)
+    return moved
+
+
+def _sums(reference: Look, inverse: Float32, others: Sequence[Look]) -> _Sums:
+    shape = inverse.shape
+    pull, curvature, speed = (np.zeros(shape, np.float32) for _ in range(3))
+    likeness, seen = np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
+    lens = lens_of(reference.view)
+    samples = np.float32(4.0 * np.pi * _WINDOW_SIGMA_PX**2)  # one over the sum of squared weights
+    mean = _blur(reference.contrast, _WINDOW_SIGMA_PX)
+    spread = _blur(reference.contrast**2, _WINDOW_SIGMA_PX) - mean * mean
+    for other in others:
+        other_from_ref = other.view.world_from_cam.inv() * reference.view.world_from_cam
+        rest, slope, fast = compare(
+            inverse,
+            reference.contrast,
+            lens,
+            other.spline,
+            other.valid,
+            lens_of(other.view),
+            np.ascontiguousarray(other_from_ref.as_matrix()[:3]),
+        )
+        known = np.isfinite(rest) & reference.valid
+        sample = rest[::3, ::3][known[::3, ::3]]
+        if sample.size == 0:
+            continue
+        noise = max(np.float32(1.4826 * np.median(np.abs(sample))), np.float32(1e-3))
+        products = _products(rest, slope, known, noise * np.float32(_OUTLYING))
+        weight, r, g, rg, gg, rr = (_blur(product, _WINDOW_SIGMA_PX) for product in products)
+        _add(
+            (weight, r, g, rg, gg, rr), spread, fast, known, noise, samples,
+            (pull, curvature, speed, likeness, seen),
+        )  # fmt: skip
+    with np.errstate(invalid="ignore"):
+        likeness = likeness / curvature
+    return _Sums(pull=pull, curvature=curvature, speed=speed, likeness=likeness, seen=seen)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _products(
+    rest: Float32, slope: Float32, known: NDArray[np.bool_], outlying: float
+) -> tuple[Float32, Float32, Float32, Float32, Float32, Float32]:
+    """Weights, falling with the square of what is left (Cauchy), and weighted products."""
+    shape = rest.shape
+    weight, r = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    g, rg = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    gg, rr = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    for i in range(shape[0]):
+        for j in range(shape[1]):
+            if not known[i, j]:
+                continue
+            a, b = rest[i, j], slope[i, j]
+            w = 1.0 / (1.0 + (a / outlying) ** 2)
+            weight[i, j] = w
+            r[i, j], g[i, j] = w * a, w * b
+            rg[i, j], gg[i, j], rr[i, j] = w * a * b, w * b * b, w * a * a
+    return weight, r, g, rg, gg, rr
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _add(
+    sums: tuple[Float32, Float32, Float32, Float32, Float32, Float32],
+    spread: Float32,
+    fast: Float32,
+    known: NDArray[np.bool_],
+    noise: float,
+    samples: float,
+    totals: tuple[Float32, Float32, Float32, Float32, NDArray[np.uint8]],
+) -> None:
+    """Add one neighbour's normal equations to the totals, each over the variance it leaves.
+
+    Means over the window are taken out, so that brightness does not count; a window that hardly
+    looks alike (occluded, moved) counts little.
+    """
+    weight, r, g, rg, gg, rr = sums
+    pull, curvature, speed, likeness, seen = totals
+    for i in range(known.shape[0]):
+        for j in range(known.shape[1]):
+            share = weight[i, j]
+            if not known[i, j] or share < _LEAST_SHARE:
+                continue
+            cross = rg[i, j] - r[i, j] * g[i, j] / share
+            square = gg[i, j] - g[i, j] * g[i, j] / share
+            misfit = rr[i, j] / share - (r[i, j] / share) ** 2
+            alike = 1.0 - 0.5 * misfit / max(spread[i, j], 1e-3)
+            trust = min(max(alike, 0.05), 1.0)
+            certainty = samples * trust * trust / max(misfit, 0.1 * noise * noise)
+            pull[i, j] += certainty * cross
+            curvature[i, j] += certainty * square
+            likeness[i, j] += certainty * square * alike
+            speed[i, j] = max(speed[i, j], fast[i, j])
+            if alike >= _ALIKE:
+                seen[i, j] += 1
