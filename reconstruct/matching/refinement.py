@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -35,6 +36,8 @@ _SETTLED_PX = 0.005
 _FARTHEST_PX = 3.0
 """A position that wants to move by more has found something else, and stays."""
 _LEAST_CORRELATION = 0.7
+_LEVELS = 3
+"""Pictures tried: the whole, its half and its quarter."""
 _LEAST_SUPPORT = 6
 _SUPPORT = 12
 """Matches around a feature from which its first affine warp is estimated."""
@@ -178,9 +181,34 @@ def align(task: _Task) -> tuple[NDArray[np.int64], Array]:
     for partner in task.partners:
         second = np.asarray(np.load(partner.grey, mmap_mode="c"))
         affine = affine_from_neighbours(*partner.support, partner.reference)
-        moved = align_patches(first, second, partner.reference, partner.pixels, affine)
-        found.append(moved)
+        found.append(align_coarser(first, second, partner.reference, partner.pixels, affine))
     return np.concatenate([p.nodes for p in task.partners]), np.concatenate(found)
+
+
+def align_coarser(
+    first: NDArray[np.uint8],
+    second: NDArray[np.uint8],
+    reference: Array,
+    pixels: Array,
+    affine: Array,
+) -> Array:
+    """As `align_patches`; what fails is tried again on halved pictures, and again on halved ones.
+
+    Noisy and blurred pictures show little within a few pixels: wider patches there resemble.
+    """
+    found = np.full(pixels.shape, np.nan)
+    for level in range(_LEVELS):
+        open_ = np.isnan(found[:, 0])
+        if not open_.any():
+            break
+        if level:
+            first, second = (cv2.pyrDown(p) for p in (first, second))
+        # the halves' first pixel is centred on that of the whole
+        scale = 2.0**level
+        start, guess = ((p[open_] - 0.5) / scale + 0.5 for p in (reference, pixels))
+        moved = align_patches(first, second, start, guess, affine[open_])
+        found[open_] = (moved - 0.5) * scale + 0.5
+    return found
 
 
 def affine_from_neighbours(first: Array, second: Array, at: Array) -> Array:

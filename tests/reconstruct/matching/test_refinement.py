@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from reconstruct.matching.features import Features, save_features
 from reconstruct.matching.refinement import (
     affine_from_neighbours,
+    align_coarser,
     align_patches,
     refine_tracks,
     track_references,
@@ -155,3 +156,19 @@ def test_tracks_mean_one_spot_in_all_pictures(tmp_path: Path, threads: int) -> N
         gap = np.linalg.norm(spot[k] - spot[1], axis=1)
         assert np.median(gap) < 0.05
         np.testing.assert_array_equal(found.pixels[k][50], [70.0, 60.0])
+
+
+def test_what_noise_hides_is_aligned_on_smaller_pictures() -> None:
+    texture, reference = Texture(0), spots(40)
+    first = texture.picture(np.eye(2), np.zeros(2), noise=30.0)
+    second = texture.picture(AFFINE, SHIFT)
+    second = np.random.default_rng(7).normal(second, 30.0).clip(0, 255).astype(np.uint8)
+    truth = reference @ AFFINE.T + SHIFT
+    guess = truth + np.random.default_rng(3).normal(0, 0.6, truth.shape)
+    affine = np.broadcast_to(AFFINE, (40, 2, 2))
+    whole = align_patches(first, second, reference, guess, affine)
+    found = align_coarser(first, second, reference, guess, affine)
+    kept = np.isfinite(found[:, 0])
+    assert np.isfinite(whole[:, 0]).mean() < 0.3
+    assert kept.mean() > 0.8
+    assert 0.02 < np.sqrt(((found - truth)[kept] ** 2).mean()) < 0.35
