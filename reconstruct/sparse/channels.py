@@ -183,14 +183,13 @@ def equations(epochs: Epochs, place: Similarity, middle_ned: Array) -> Equations
     away = positions - positions.mean(axis=0)
     jacobian[:, :2, STRETCH] = -away[:, :2]
     jacobian[:, 0, TURN], jacobian[:, 1, TURN] = away[:, 1], -away[:, 0]
-    # Errors of roll, pitch and heading turn about the axes of these angles: one of heading must
-    # not pass for one of roll where the vehicle leans.
-    measured = epochs.ned_from_body
-    angles_from_ned = np.linalg.inv(attitude_axes(measured))
-    turns = (attitudes * measured.inv()).as_rotvec()
-    misfit[:, 3:] = np.einsum("nij,nj->ni", angles_from_ned, turns)
+    # Angle by angle: an error of heading must not pass for one of roll where the vehicle leans, nor
+    # a wrong heading spoil the tilt that was read with it.
+    told, found = (r.as_euler("ZYX")[:, ::-1] for r in (epochs.ned_from_body, attitudes))
+    misfit[:, 3:] = (found - told + np.pi) % (2.0 * np.pi) - np.pi
+    angles_from_ned = np.linalg.pinv(attitude_axes(attitudes))
     jacobian[:, 3:, :3] = angles_from_ned
-    jacobian[:, 3:, MOUNT] = angles_from_ned @ measured.as_matrix()
+    jacobian[:, 3:, MOUNT] = angles_from_ned @ attitudes.as_matrix()
     moments = len(epochs.time)
     shared = np.bincount(epochs.moment, minlength=moments).astype(np.float64)
     mean_misfit, mean_jacobian = np.zeros((moments, 6)), np.zeros((moments, 6, PARAMETERS))
