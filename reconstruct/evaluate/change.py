@@ -122,7 +122,7 @@ def find_change(now: Elevation, before: Elevation, fit: HeightFit) -> Change:
     shape = now.height.shape
     difference, sigma = np.full(shape, np.nan), np.full(shape, np.nan)
     registration = np.full(shape, np.nan)
-    down, right = np.gradient(now.height, now.cell)
+    down, right = list(np.gradient(now.height, now.cell))
     for row in range(shape[0]):  # row by row: memory stays that of the maps
         columns = np.flatnonzero(now.known[row])
         if not columns.size:

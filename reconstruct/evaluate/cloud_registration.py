@@ -1,0 +1,160 @@
+"""Lay a cloud on another by the distance of its points from the other's surface.
+
+Point-to-plane closest points (Chen & Medioni 1992) with Tukey's weights, coarse to fine, for a
+rigid motion or with a free scale: Open3D's has no scale in that form.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from alice_survey.errors import ReconstructionError
+from alice_survey.frames import Array
+from reconstruct.evaluate.figures import MAD_TO_SIGMA
+from reconstruct.sparse.alignment import Similarity
+
+_TUKEY = 4.685
+_NEIGHBOURS = 12
+_SAMPLES = (8_000, 40_000)
+_ROUNDS = 60
+_STILL = 1e-3
+"""Of the spacing of the reference: motion of the cloud's rim at which the adjustment settles."""
+_LEAST_PAIRS = 200
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Surface:
+    """A cloud that knows the plane through the neighbours of each point."""
+
+    points: Array
+    """(N, 3)."""
+    tree: cKDTree
+
+    @classmethod
+    def of(cls, points: Array) -> "Surface":
+        """From (N, 3) points."""
+        return cls(points=points, tree=cKDTree(points))
+
+    @property
+    def spacing(self) -> float:
+        """Median distance of a point from the nearest other one."""
+        some = self.points[:: max(1, len(self.points) // 5000)]
+        return float(np.median(self.tree.query(some, k=2)[0][:, 1]))
+
+    def planes_at(self, points: Array) -> tuple[Array, Array, Array]:
+        """The planes through the neighbours of the points nearest to (N, 3) others.
+
+        Returns:
+            Middles, (N, 3); unit normals, (N, 3); and distances, (N,), of the nearest point.
+        """
+        middles, normals = np.empty_like(points), np.empty_like(points)
+        nearest = np.empty(len(points))
+        for start in range(0, len(points), 50_000):
+            part = slice(start, start + 50_000)
+            distance, index = self.tree.query(points[part], k=_NEIGHBOURS)
+            around = self.points[index]
+            middles[part] = around.mean(axis=1)
+            offset = around - middles[part, None]
+            covariance = np.einsum("nki,nkj->nij", offset, offset)
+            normals[part] = np.linalg.eigh(covariance)[1][:, :, 0]
+            nearest[part] = distance[:, 0]
+        return middles, normals, nearest
+
+    def distance(self, points: Array) -> tuple[Array, Array]:
+        """Signed distance of (N, 3) points from the local plane, and distance of the nearest point.
+
+        The plane makes the reference's own spacing not count; it is positive above the surface.
+        """
+        middles, normals, nearest = self.planes_at(points)
+        normals = normals * np.where(normals[:, 2:] < 0, -1.0, 1.0)
+        return np.einsum("ni,ni->n", points - middles, normals), nearest
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CloudFit:
+    """How a cloud lies on the reference."""
+
+    reference_from_cloud: Similarity
+    scale_sigma: float
+    """0 where the scale was held."""
+    spread: float
+    """Robust standard deviation of the distances from the reference's planes."""
+    rounds: int
+
+
+def register_cloud(
+    cloud: Array, reference: Surface, start: Similarity, *, free_scale: bool,
+    rng: np.random.Generator,
+) -> CloudFit:  # fmt: skip
+    """Adjust where a cloud lies on a reference.
+
+    Args:
+        cloud: (N, 3) points.
+        reference: that stays.
+        start: from the cloud to the reference, such as the georeferences give.
+        free_scale: adjust the scale too.
+        rng: draws points of the cloud.
+
+    Raises:
+        ReconstructionError: hardly any point finds a partner.
+    """
+    fit = None
+    for count in _SAMPLES:
+        sample = cloud[rng.choice(len(cloud), min(count, len(cloud)), replace=False)]
+        fit = _adjust(sample, reference, start, free_scale=free_scale)
+        start = fit.reference_from_cloud
+    assert fit is not None  # noqa: S101 - for the type checker: _SAMPLES is not empty
+    return fit
+
+
+def _adjust(
+    cloud: Array, reference: Surface, start: Similarity, *, free_scale: bool
+) -> CloudFit:  # fmt: skip
+    pose, spacing = start, reference.spacing
+    unknowns = 7 if free_scale else 6
+    low, high = reference.points.min(axis=0), reference.points.max(axis=0)
+    for done in range(1, _ROUNDS + 1):  # noqa: B007 - told in the result
+        moved = pose.apply(cloud)
+        middles, normals, nearest = reference.planes_at(moved)
+        inside = np.all((moved[:, :2] >= low[:2]) & (moved[:, :2] <= high[:2]), axis=1)
+        # Beyond the rim of the reference the nearest plane says nothing
+        limit = 3 * MAD_TO_SIGMA * np.median(nearest[inside]) + spacing if inside.any() else 0.0
+        paired = np.flatnonzero(inside & (nearest <= limit))
+        if len(paired) < _LEAST_PAIRS:
+            raise ReconstructionError(
+                f"{len(paired)} points of the cloud lie near the reference; {_LEAST_PAIRS} are "
+                "needed: they show different places, or the georeference is far off"
+            )
+        points, normal = moved[paired], normals[paired]
+        miss = np.einsum("ni,ni->n", points - middles[paired], normal)
+        spread = max(MAD_TO_SIGMA * float(np.median(np.abs(miss))), 1e-12)
+        weight = np.clip(1 - (miss / (_TUKEY * spread)) ** 2, 0, None) ** 2
+        centre = points.mean(axis=0)
+        rim = float(np.linalg.norm(points - centre, axis=1).max())
+        arm = (points - centre) / rim
+        slopes = np.column_stack(
+            [np.cross(arm, normal), normal, np.einsum("ni,ni->n", arm, normal)]
+        )
+        slopes = slopes[:, :unknowns]
+        system = slopes.T @ (weight[:, None] * slopes)
+        system += 1e-9 * np.trace(system) * np.eye(unknowns)
+        move = -np.linalg.solve(system, slopes.T @ (weight * miss))
+        pose = _moved(pose, centre, move, rim)
+        if np.abs(move).max() < _STILL * spacing:
+            break
+    variance = spread**2 * np.linalg.inv(system)
+    scale_sigma = pose.scale * float(np.sqrt(variance[6, 6])) / rim if free_scale else 0.0
+    return CloudFit(reference_from_cloud=pose, scale_sigma=scale_sigma, spread=spread, rounds=done)
+
+
+def _moved(pose: Similarity, centre: Array, move: Array, rim: float) -> Similarity:
+    """A pose followed by a small turn, shift and stretch about a centre."""
+    turn = Rotation.from_rotvec(move[:3] / rim)
+    stretch = 1.0 + (float(move[6]) / rim if len(move) == 7 else 0.0)
+    return Similarity(
+        scale=stretch * pose.scale,
+        rotation=turn * pose.rotation,
+        translation=centre + move[3:6] + stretch * turn.apply(pose.translation - centre),
+    )

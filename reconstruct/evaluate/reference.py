@@ -1,0 +1,246 @@
+"""A survey against somebody else's cloud or elevation model of the same place."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.artefacts import need_stage, read_json, write_json
+from alice_survey.errors import WorkspaceError
+from alice_survey.frames import Array
+from reconstruct.evaluate.cloud_files import read_own_cloud, read_reference
+from reconstruct.evaluate.cloud_registration import CloudFit, Surface, register_cloud
+from reconstruct.evaluate.figures import fit_doming, rms, rounded
+from reconstruct.model import SparseModel, read_model
+from reconstruct.sparse.alignment import Similarity
+
+WITHIN_PX = (1, 2, 3, 5)
+
+_COMPARED = 300_000
+_COVER_SPACINGS = 4.0
+"""Side of the squares in which a cloud counts as covering the ground, in its own spacings."""
+_NAVIGATION = "navigation"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Distances:
+    """Points of one cloud from the surface of another, where that one covers the ground."""
+
+    points: Array
+    """(N, 3) of the first."""
+    signed_m: Array
+    """(N,) from the plane through the nearest points of the other; positive above."""
+    nearest_m: Array
+    """(N,) from the nearest point of the other."""
+    covered_share: float
+    """Share of the first cloud's points where the other covers the ground."""
+
+    def to_json(self, pixel_m: float) -> dict[str, Any]:
+        """Figures in metres and ground pixels."""
+        away = np.abs(self.signed_m)
+        figures: dict[str, Any] = {
+            "points": len(away),
+            "covered_share": round(self.covered_share, 4),
+            "median_signed_m": rounded(float(np.median(self.signed_m)), 5),
+            "nearest_point_median_m": rounded(float(np.median(self.nearest_m)), 5),
+        }
+        for name, value in (
+            ("median", float(np.median(away))),
+            ("rms", rms(away)),
+            ("95", float(np.percentile(away, 95))),
+        ):
+            figures[f"{name}_m"] = rounded(value, 5)
+            figures[f"{name}_px"] = rounded(value / pixel_m, 3)
+        return figures
+
+
+def distances(points: Array, surface: Surface, rng: np.random.Generator) -> Distances:
+    """Distances of a cloud from a surface, both ways to be called.
+
+    Args:
+        points: (N, 3) of the first cloud, registered; of many a sample is compared.
+        surface: the other cloud.
+        rng: draws the sample.
+
+    Raises:
+        WorkspaceError: the two cover no common ground.
+    """
+    if len(points) > _COMPARED:
+        points = points[np.sort(rng.choice(len(points), _COMPARED, replace=False))]
+    covered = covers(surface, points)
+    if not covered.any():
+        raise WorkspaceError("the survey and the reference cover no common ground")
+    signed, nearest = surface.distance(points[covered])
+    return Distances(
+        points=points[covered],
+        signed_m=signed,
+        nearest_m=nearest,
+        covered_share=float(covered.mean()),
+    )
+
+
+def covers(surface: Surface, points: Array) -> NDArray[np.bool_]:
+    """Whether a square of the plan under each of (N, 3) points holds points of a surface."""
+    side = _COVER_SPACINGS * surface.spacing
+    low = surface.points[:, :2].min(axis=0)
+    own = np.floor((surface.points[:, :2] - low) / side).astype(np.int64)
+    shape = own.max(axis=0) + 1
+    full = np.zeros(shape, dtype=np.bool_)
+    full[own[:, 0], own[:, 1]] = True
+    cell = np.floor((points[:, :2] - low) / side).astype(np.int64)
+    inside = np.all((cell >= 0) & (cell < shape), axis=1)
+    found = np.zeros(len(points), dtype=np.bool_)
+    found[inside] = full[cell[inside, 0], cell[inside, 1]]
+    return found
+
+
+def ground_pixel_of(model: SparseModel) -> float:
+    """Median side of a pixel on the surface, from the points that each view sees."""
+    pixels = []
+    for index, view in enumerate(model.views):
+        seen = model.observations[model.observations[:, 1] == index, 0]
+        if len(seen):
+            depth = view.world_from_cam.inv().apply(model.points_world[seen])[:, 2]
+            pixels.append(depth / (0.5 * (view.fx_px + view.fy_px)))
+    return float(np.median(np.concatenate(pixels)))
+
+
+def evaluate_reference(
+    workspace: Path,
+    reference: Path,
+    *,
+    free_scale: bool | None = None,
+    out: Path | None = None,
+    seed: int = 1,
+) -> tuple[str, dict[str, Any]]:
+    """Compare the cloud of a workspace with a LAZ, LAS, PLY or GeoTIFF of the same place.
+
+    Both are brought together by their georeferences, then by closest points: rigidly where the
+    scale of the survey was observed (rig, bar, control points), with a free scale that is
+    reported where it comes from navigation or is not known. Writes `reference.json` and
+    `reference.png` into `reference/` of the workspace, or `out`.
+
+    Args:
+        workspace: with a finished surface.
+        reference: the file.
+        free_scale: overrules where the scale is held.
+        out: folder to write to.
+        seed: of the points drawn.
+
+    Returns:
+        A few lines of text, and figures as JSON values.
+
+    Raises:
+        WorkspaceError: something is missing, or the survey has no georeference.
+        ReconstructionError: the two show different places.
+    """
+    from reconstruct.evaluate.reference_plot import plot_reference
+
+    sparse = need_stage(workspace, "sparse", "reconstruct")
+    model = read_model(sparse)
+    if model.frame.datum is None:
+        raise WorkspaceError(
+            f"{workspace} is not georeferenced: a reference is compared where the georeference "
+            "puts it; give positions in the manifest or control points"
+        )
+    source = read_json(sparse / "registration.json")["scale_source"] or "no scale"
+    if free_scale is None:
+        free_scale = not model.frame.scaled or _NAVIGATION in source
+    rng = np.random.default_rng(seed)
+    own = read_own_cloud(workspace)
+    theirs, placed = read_reference(reference, model.frame.datum)
+    surface = Surface.of(theirs)
+    start = lifted(own, surface)
+    fit = register_cloud(own, surface, start, free_scale=free_scale, rng=rng)
+    moved = fit.reference_from_cloud.apply(own)
+    pixel_m = ground_pixel_of(model) * fit.reference_from_cloud.scale
+    ours = distances(moved, surface, rng)
+    back = distances(theirs, Surface.of(moved), rng)
+    figures = {
+        "format": "alice-survey reference",
+        "version": 1,
+        "reference": str(reference),
+        "reference_has_coordinate_system": placed,
+        "ground_pixel_m": rounded(pixel_m, 6),
+        "registration": _registration(fit, own, free_scale=free_scale, source=source),
+        "survey_to_reference": ours.to_json(pixel_m),
+        "reference_to_survey": back.to_json(pixel_m),
+        "completeness_within_px": _completeness(back, pixel_m, all_of_it=False),
+        "completeness_of_whole_reference_within_px": _completeness(back, pixel_m, all_of_it=True),
+        "doming": fit_doming(ours.points[:, :2], ours.signed_m).to_json(),
+    }
+    folder = out or workspace / "reference"
+    folder.mkdir(parents=True, exist_ok=True)
+    plot_reference(folder / "reference.png", ours, back, pixel_m)
+    write_json(folder / "reference.json", figures)
+    return _text(figures, folder), figures
+
+
+def lifted(own: Array, surface: Surface) -> Similarity:
+    """Where both cover the ground their median heights are made equal: datums often differ.
+
+    Where they share no ground the middles are laid on each other.
+    """
+    from scipy.spatial.transform import Rotation
+
+    covered = covers(surface, own)
+    if covered.any():
+        _, nearest = _flat_nearest(surface, own[covered])
+        shift = np.array([0.0, 0.0, float(np.median(surface.points[nearest, 2] - own[covered, 2]))])
+    else:
+        shift = np.median(surface.points, axis=0) - np.median(own, axis=0)
+    return Similarity(scale=1.0, rotation=Rotation.identity(), translation=shift)
+
+
+def _flat_nearest(surface: Surface, points: Array) -> tuple[Array, NDArray[np.int64]]:
+    from scipy.spatial import cKDTree
+
+    step = max(1, len(points) // 20_000)
+    distance, index = cKDTree(surface.points[:, :2]).query(points[::step, :2])
+    return distance, np.repeat(index, step)[: len(points)]
+
+
+def _completeness(back: Distances, pixel_m: float, *, all_of_it: bool) -> dict[str, float]:
+    """Share of the reference's points within some ground pixels of the survey's surface."""
+    share = back.covered_share if all_of_it else 1.0
+    return {
+        str(px): round(share * float(np.mean(np.abs(back.signed_m) < px * pixel_m)), 4)
+        for px in WITHIN_PX
+    }
+
+
+def _registration(fit: CloudFit, own: Array, *, free_scale: bool, source: str) -> dict[str, Any]:
+    pose, middle = fit.reference_from_cloud, own.mean(axis=0)
+    shift = pose.apply(middle[None])[0] - middle
+    return {
+        "transform": "similarity" if free_scale else "rigid",
+        "scale_source": source,
+        "scale": round(pose.scale, 7),
+        "scale_sigma": round(fit.scale_sigma, 7),
+        "shift_east_north_up_m": [round(float(v), 4) for v in shift],
+        "turn_deg": [round(float(v), 4) for v in np.rad2deg(pose.rotation.as_rotvec())],
+        "spread_m": round(fit.spread, 5),
+        "rounds": fit.rounds,
+    }
+
+
+def _text(figures: dict[str, Any], folder: Path) -> str:
+    ours, back = figures["survey_to_reference"], figures["reference_to_survey"]
+    fit = figures["registration"]
+    dome = figures["doming"]
+    bend = (
+        "" if dome["dome_mm"] is None else f"; dome {dome['dome_mm']:.1f} +/- {dome['sigma_mm']} mm"
+    )
+    scale = f", scale {fit['scale']:.5f}" if fit["transform"] == "similarity" else ""
+    return "\n".join([
+        f"survey to reference: median {ours['median_m']:.4f} m ({ours['median_px']:.2f} ground "
+        f"pixels), rms {ours['rms_m']:.4f} m, 95 % below {ours['95_m']:.4f} m",
+        f"reference to survey: median {back['median_m']:.4f} m ({back['median_px']:.2f}), rms "
+        f"{back['rms_m']:.4f} m; {figures['completeness_within_px']['3']:.1%} within 3 pixels "
+        f"where the survey covers it ({back['covered_share']:.1%}){bend}",
+        f"registered ({fit['transform']}{scale}) by {fit['shift_east_north_up_m']} m east, north, "
+        "up",
+        f"map in {folder / 'reference.png'}",
+    ])  # fmt: skip

@@ -1,0 +1,63 @@
+"""A picture of how a survey differs from a reference."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+
+from alice_survey.artefacts import atomic_path
+from alice_survey.frames import Array
+
+if TYPE_CHECKING:
+    from reconstruct.evaluate.reference import Distances
+
+_STYLE: dict[str, Any] = {"font.size": 8, "axes.titlesize": 9, "figure.dpi": 110}
+_CELLS = 320
+"""Cells of the map along its longer side."""
+
+
+def plot_reference(path: Path, ours: "Distances", back: "Distances", pixel_m: float) -> None:
+    """Map of the survey's signed distance from the reference, and both cumulative shares."""
+    limit = max(float(np.percentile(np.abs(ours.signed_m), 95)), 1e-9)
+    values, extent = mean_map(ours.points[:, :2], ours.signed_m, _CELLS)
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(13, 5.6), layout="constrained")
+        plane, curve = figure.subplots(1, 2, width_ratios=[1.3, 1])
+        plane.set_facecolor("0.85")
+        image = plane.imshow(
+            values, extent=extent, vmin=-limit, vmax=limit, cmap="RdBu_r", interpolation="nearest"
+        )
+        figure.colorbar(image, ax=plane, label="survey above reference (m)", shrink=0.8)
+        plane.set(xlabel="east (m)", ylabel="north (m)", title="Survey less reference")
+        for one, name in ((ours, "survey to reference"), (back, "reference to survey")):
+            away = np.sort(np.abs(one.signed_m))[:: max(1, len(one.signed_m) // 2000)]
+            curve.plot(away / pixel_m, np.linspace(0, 1, len(away)), label=name)
+        curve.axvline(2, color="0.6", linestyle=":", label="2 ground pixels")
+        curve.set(xlim=(0, max(6.0, 2 * limit / pixel_m)), ylim=(0, 1))
+        curve.set(xlabel="distance (ground pixels)", ylabel="share of points below")
+        curve.set_title(
+            f"median {np.median(np.abs(ours.signed_m)):.3g} m, ground pixel {pixel_m:.3g} m"
+        )
+        curve.grid(alpha=0.3)
+        curve.legend(loc="lower right")
+        with atomic_path(path) as temporary:
+            figure.savefig(temporary, metadata={"Software": None})
+
+
+def mean_map(
+    places_en: Array, values: Array, cells: int
+) -> tuple[Array, tuple[float, float, float, float]]:
+    """Means of values at (N, 2) places on a grid, rows from north; and its extent for a plot."""
+    low, high = places_en.min(axis=0), places_en.max(axis=0)
+    side = max(float((high - low).max()) / cells, 1e-12)
+    column = ((places_en[:, 0] - low[0]) / side).astype(np.int64)
+    row = ((high[1] - places_en[:, 1]) / side).astype(np.int64)
+    shape = (int(row.max()) + 1, int(column.max()) + 1)
+    place = row * shape[1] + column
+    count = np.bincount(place, minlength=shape[0] * shape[1])
+    total = np.bincount(place, values, minlength=shape[0] * shape[1])
+    mean = np.where(count > 0, total / np.maximum(count, 1), np.nan).reshape(shape)
+    west, north = float(low[0]), float(high[1])
+    return mean, (west, west + shape[1] * side, north - shape[0] * side, north)

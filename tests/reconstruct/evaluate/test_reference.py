@@ -1,0 +1,206 @@
+"""A survey is laid on a reference of any kind, and its distance from it is what was put in."""
+
+from pathlib import Path
+
+import laspy
+import numpy as np
+import open3d as o3d
+import pytest
+import rasterio
+from pyproj import CRS, Transformer
+from rasterio.transform import from_origin
+from scipy.spatial.transform import Rotation
+
+from alice_survey.errors import ReconstructionError, WorkspaceError
+from alice_survey.frames import Datum
+from reconstruct.evaluate.cloud_files import read_reference
+from reconstruct.evaluate.cloud_registration import Surface, register_cloud
+from reconstruct.evaluate.reference import covers, distances, lifted
+from reconstruct.evaluate.reference_plot import mean_map
+from reconstruct.sparse.alignment import Similarity
+
+DATUM = Datum(46.8426, -91.9946)
+UTM = 32615
+
+
+def ground(rng: np.random.Generator, count: int, lift_m: float = 0.0) -> np.ndarray:
+    """Points on a hilly ground of 20 x 20 m."""
+    xy = rng.uniform(-10, 10, (count, 2))
+    z = 0.8 * np.sin(xy[:, 0] / 2.1) + 0.6 * np.cos(xy[:, 1] / 1.7 + xy[:, 0] / 5)
+    return np.column_stack([xy, z + 160 + lift_m])
+
+
+def moved(scale: float) -> Similarity:
+    """Where the survey truly lies on the reference, about their middle."""
+    turn = Rotation.from_rotvec([0.004, -0.006, 0.01])
+    middle = np.array([0.0, 0.0, 160.0])
+    shift = np.array([0.15, -0.1, 0.3])
+    return Similarity(
+        scale=scale, rotation=turn, translation=middle + shift - scale * turn.apply(middle)
+    )
+
+
+def undone(pose: Similarity, points: np.ndarray) -> np.ndarray:
+    return pose.rotation.inv().apply(points - pose.translation) / pose.scale
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.013])
+def test_a_known_motion_and_scale_are_found(scale: float) -> None:
+    rng = np.random.default_rng(1)
+    reference = Surface.of(ground(rng, 40_000))
+    true = moved(scale)
+    own = undone(true, ground(rng, 30_000))
+    fit = register_cloud(own, reference, lifted(own, reference), free_scale=scale != 1.0, rng=rng)
+    left = np.linalg.norm(fit.reference_from_cloud.apply(own) - true.apply(own), axis=1)
+    assert left.max() < 0.01
+    assert fit.reference_from_cloud.scale == pytest.approx(scale, abs=4e-4)
+    assert (fit.scale_sigma == 0.0) == (scale == 1.0)
+
+
+def test_the_rigid_fit_is_that_of_open3d() -> None:
+    rng = np.random.default_rng(2)
+    points, own = ground(rng, 20_000), undone(moved(1.0), ground(rng, 8_000))
+    points[:, 2] += 0.01 * rng.normal(size=len(points))
+    reference = Surface.of(points)
+    fit = register_cloud(own, reference, lifted(own, reference), free_scale=False, rng=rng)
+    target, source = (o3d.geometry.PointCloud(o3d.utility.Vector3dVector(p)) for p in (points, own))
+    target.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(12))
+    start = np.eye(4)
+    start[:3, 3] = lifted(own, reference).translation
+    theirs = o3d.pipelines.registration.registration_icp(
+        source, target, 1.0, start,
+        o3d.pipelines.registration.TransformationEstimationPointToPlane(),
+        o3d.pipelines.registration.ICPConvergenceCriteria(max_iteration=100),
+    )  # fmt: skip
+    expected = own @ theirs.transformation[:3, :3].T + theirs.transformation[:3, 3]
+    assert np.abs(fit.reference_from_cloud.apply(own) - expected).max() < 0.01
+
+
+def test_what_differs_does_not_pull_the_fit() -> None:
+    rng = np.random.default_rng(3)
+    reference = Surface.of(ground(rng, 40_000))
+    own = ground(rng, 30_000)
+    changed = (own[:, 0] > 4) & (own[:, 1] > 4)  # 9 %
+    own[changed, 2] += 0.7
+    fit = register_cloud(own, reference, lifted(own, reference), free_scale=True, rng=rng)
+    still = own[~changed]
+    assert np.abs(fit.reference_from_cloud.apply(still) - still).max() < 0.02
+
+
+def test_distances_are_the_lift_whatever_the_spacing() -> None:
+    rng = np.random.default_rng(4)
+    sparse, dense = ground(rng, 8_000), ground(rng, 40_000, lift_m=0.05)
+    ours = distances(dense, Surface.of(sparse), rng)
+    back = distances(sparse, Surface.of(dense), rng)
+    assert np.median(ours.signed_m) == pytest.approx(0.05, rel=0.15)
+    assert np.median(back.signed_m) == pytest.approx(-0.05, rel=0.15)
+    figures = ours.to_json(0.02)
+    assert figures["median_px"] == pytest.approx(2.5, rel=0.15)
+    assert figures["nearest_point_median_m"] > 1.3 * figures["median_m"]
+
+
+def test_only_common_ground_is_compared() -> None:
+    rng = np.random.default_rng(5)
+    whole = ground(rng, 40_000)
+    half = Surface.of(whole[whole[:, 0] < 0])
+    covered = covers(half, whole)
+    assert covered[whole[:, 0] < -0.5].mean() > 0.97
+    assert not covered[whole[:, 0] > 0.5].any()
+    assert distances(whole, half, rng).covered_share == pytest.approx(0.5, abs=0.03)
+    with pytest.raises(WorkspaceError, match="no common ground"):
+        distances(whole + np.array([100.0, 0, 0]), half, rng)
+
+
+def test_a_cloud_far_away_is_refused() -> None:
+    rng = np.random.default_rng(6)
+    reference = Surface.of(ground(rng, 5_000))
+    start = Similarity(
+        scale=1.0, rotation=Rotation.identity(), translation=np.array([60.0, 0.0, 0.0])
+    )
+    with pytest.raises(ReconstructionError, match="different places"):
+        register_cloud(ground(rng, 5_000), reference, start, free_scale=False, rng=rng)
+
+
+def utm(points: np.ndarray) -> np.ndarray:
+    """Local east, north, up of the datum in UTM and heights."""
+    lat_lon = DATUM.geodetic_from_ned(np.column_stack([points[:, 1], points[:, 0], -points[:, 2]]))
+    east, north = Transformer.from_crs(4326, UTM, always_xy=True).transform(
+        lat_lon[:, 1], lat_lon[:, 0]
+    )
+    return np.column_stack([east, north, -lat_lon[:, 2]])
+
+
+@pytest.mark.parametrize("kind", ["laz", "las"])
+def test_a_cloud_in_utm_comes_back_to_local_metres(tmp_path: Path, kind: str) -> None:
+    points = ground(np.random.default_rng(7), 3_000)
+    there = utm(points)
+    header = laspy.LasHeader(point_format=3, version="1.4")
+    header.offsets, header.scales = np.floor(there.min(axis=0)), [1e-4] * 3
+    header.add_crs(CRS.from_epsg(UTM))
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = there.T
+    cloud.write(str(tmp_path / f"c.{kind}"))
+    found, placed = read_reference(tmp_path / f"c.{kind}", DATUM)
+    assert placed
+    np.testing.assert_allclose(found, points, atol=3e-4)
+
+
+def test_our_own_ply_keeps_its_offset(tmp_path: Path) -> None:
+    points = ground(np.random.default_rng(8), 500)
+    offset = np.array([400_000.0, 5_000_000.0, 100.0])
+    lines = [
+        "ply", "format binary_little_endian 1.0",
+        "comment offset_east_north_up 400000.0 5000000.0 100.0", "element vertex 500",
+        *(f"property float {axis}" for axis in "xyz"), "end_header", "",
+    ]  # fmt: skip
+    body = points.astype("<f4").tobytes()
+    (tmp_path / "c.ply").write_bytes("\n".join(lines).encode() + body)
+    found, placed = read_reference(tmp_path / "c.ply", DATUM)
+    assert not placed
+    np.testing.assert_allclose(found, points + offset, atol=1e-4)
+
+
+def test_cells_of_an_elevation_model_are_points_at_their_middles(tmp_path: Path) -> None:
+    corner = utm(np.array([[-5.0, 5.0, 0.0]]))[0]
+    height = np.arange(400, dtype=np.float32).reshape(20, 20) / 100
+    height[3, 4] = -9999
+    with rasterio.open(
+        tmp_path / "dem.tif", "w", driver="GTiff", width=20, height=20, count=1, dtype="float32",
+        crs=UTM, transform=from_origin(corner[0], corner[1], 0.5, 0.5), nodata=-9999,
+    ) as target:  # fmt: skip
+        target.write(height, 1)
+    found, placed = read_reference(tmp_path / "dem.tif", DATUM)
+    assert placed
+    assert len(found) == 399
+    # The first cell's middle lies a quarter of a metre in; UTM is turned and stretched a little.
+    np.testing.assert_allclose(found[0], [-4.75, 4.75, 0.0], atol=0.02)
+    assert found[-1, 2] == pytest.approx(3.99, abs=1e-4)
+
+
+def test_files_that_are_no_reference_say_why(tmp_path: Path) -> None:
+    with pytest.raises(WorkspaceError, match="no such file"):
+        read_reference(tmp_path / "none.laz", DATUM)
+    for name, text in (("c.txt", "LAZ, LAS, PLY or GeoTIFF"), ("c.laz", "cannot be read"),
+                       ("c.tif", "cannot be read"), ("c.ply", "0 points")):  # fmt: skip
+        (tmp_path / name).write_bytes(b"nothing of the kind")
+        with pytest.raises(WorkspaceError, match=text):
+            read_reference(tmp_path / name, DATUM)
+
+
+def test_a_map_of_means_is_exact() -> None:
+    places = np.array([[0.1, 3.9], [0.2, 3.8], [3.9, 0.1]])
+    means, extent = mean_map(places, np.array([1.0, 3.0, 5.0]), 4)
+    assert means[0, 0] == 2.0
+    assert np.nanmax(means) == 5.0
+    assert np.isfinite(means).sum() == 2
+    assert extent[0] == 0.1
+    assert extent[3] == 3.9
+
+
+def test_a_real_cloud_is_read_in_local_metres(shared_data: Path) -> None:
+    datum = Datum(46.842607083333334, -91.99455988888889)
+    points, placed = read_reference(shared_data / "brighton_beach" / "model.laz", datum)
+    assert placed
+    assert len(points) == 940_393
+    assert np.abs(points[:, :2]).max() < 120
+    assert 150 < points[:, 2].min() < points[:, 2].max() < 175
