@@ -81,17 +81,17 @@ def triangulate_and_adjust(
     rough = _triangulated(cache, rig_from_world, _wide(options))
     rough.filter_points(_filter(options, _FIRST_ERROR_PX))
     model = rough.reconstruction
-    adjust(model, options, tolerance=1e-3, robust_px=_ROBUST_PX)
+    adjust(model, options, tolerance=1e-2, robust_px=_ROBUST_PX)
     # Anew, since the first poses joined what they should not, and left out what they should not.
     poses = {f: as_transform(model.frames[f].rig_from_world) for f in model.reg_frame_ids()}
     mapper = _triangulated(cache, poses, options.get_triangulation())
     model = mapper.reconstruction
-    for tolerance in (1e-4, 1e-6):
-        adjust(model, options, tolerance=tolerance)
-        mapper.complete_and_merge_tracks(options.get_triangulation())
+    adjust(model, options, tolerance=1e-4)
+    mapper.complete_and_merge_tracks(options.get_triangulation())
+    # What a plain adjustment had to please must not have bent it: filter, then adjust once more.
+    for tolerance in (1e-5, 1e-8):
         mapper.filter_points(options.get_mapper())
-    adjust(model, options, tolerance=1e-7)
-    mapper.filter_points(options.get_mapper())
+        adjust(model, options, tolerance=tolerance)
     mapper.filter_frames(options.get_mapper())
     mapper.end_reconstruction(False)
     model.update_point_3d_errors()

@@ -25,8 +25,10 @@ _LARGEST_ERROR_PX = 12.0
 """Of a resection: stereo depths are noisy, and show as parallax from the next station."""
 _LEAST_INLIERS = 15
 _LEAST_SHARE = 0.25
-_ENOUGH = 600
+_ENOUGH = 300
 """Points that a resection takes; more add time but little accuracy before the adjustment."""
+_PARTNERS = 6
+"""Stations that each is linked with: those that share most with it. Others add time, not shape."""
 _BLOCK = 32
 """Pairs of stations in one task, so that sending them costs little."""
 
@@ -166,7 +168,8 @@ def _resections(
             shared.setdefault((b, a), []).append((j, i, pair.matches[:, ::-1]))
         else:
             shared.setdefault((a, b), []).append((i, j, pair.matches))
-    for (a, b), rows in sorted(shared.items()):
+    for a, b in _best_pairs({ends: sum(len(m) for _, _, m in r) for ends, r in shared.items()}):
+        rows = shared[a, b]
         there = _collect(seen, points, names, rows)
         back = _collect(seen, points, names, [(j, i, m[:, ::-1]) for i, j, m in rows])
         first, second, best = (b, a, back) if len(back[0]) > len(there[0]) else (a, b, there)
@@ -178,6 +181,33 @@ def _resections(
                 pixels=best[1],
                 cameras=tuple(int(c) for c in best[2]),
             )
+
+
+def _best_pairs(matches: Mapping[tuple[int, int], int]) -> list[tuple[int, int]]:
+    """Every station's best partners, and what else joins all that can be joined; ascending.
+
+    Args:
+        matches: of pairs of stations.
+    """
+    ordered = sorted(matches, key=lambda ends: (-matches[ends], ends))
+    partners = dict.fromkeys((station for ends in ordered for station in ends), 0)
+    group = {station: station for station in partners}
+
+    def root(station: int) -> int:
+        while group[station] != station:
+            group[station] = group[group[station]]
+            station = group[station]
+        return station
+
+    chosen = []
+    for a, b in ordered:
+        joins = root(a) != root(b)
+        if joins or min(partners[a], partners[b]) < _PARTNERS:
+            chosen.append((a, b))
+            group[root(a)] = root(b)
+            partners[a] += 1
+            partners[b] += 1
+    return sorted(chosen)
 
 
 def _collect(
@@ -211,7 +241,8 @@ def _resect_all(
     ransac.max_error = _LARGEST_ERROR_PX
     ransac.min_inlier_ratio = _LEAST_SHARE
     ransac.random_seed = seed
-    ransac.max_num_trials = 2000
+    ransac.min_num_trials, ransac.max_num_trials = 30, 1000
+    ransac.confidence = 0.999
     refine = pycolmap.AbsolutePoseRefinementOptions()
     refine.print_summary = False
     made = [pycolmap.Camera(dict(camera)) for camera in cameras]
