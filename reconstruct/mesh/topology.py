@@ -94,7 +94,8 @@ def component_areas(vertices: Array, triangles: Triangles) -> tuple[NDArray[np.i
     total, part = connected_components(graph, directed=False)
     own = part[:count].astype(np.int32)
     area = np.bincount(own, weights=face_areas(vertices, triangles), minlength=total)
-    return own, area
+    areas: Array = np.asarray(area, dtype=np.float64)
+    return own, areas
 
 
 def face_areas(vertices: Array, triangles: Triangles) -> Array:

@@ -1,0 +1,435 @@
+"""Lengths and areas between picked pixels, with their standard deviations.
+
+In the folder of a pair a pixel's depth is matched anew by least squares; in a reconstructed
+workspace its exact ray is cut with the DEM, or with the ray of a second picture. What is known of
+the calibration moves all points together: its covariance is carried through the exact
+triangulation, so that an error of the baseline scales a length and leaves its points side by side.
+"""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.artefacts import need_stage, read_json
+from alice_survey.errors import ReconstructionError, WorkspaceError
+from alice_survey.frames import Array
+from camera_calib.rig import Rig, read_rig
+from reconstruct.dense.rectify import scaled_view
+from reconstruct.lenses.lens import FlatPortLens, Lens, lens_from_json
+from reconstruct.model import View, read_model
+from reconstruct.pictures.undistorted import Pictures
+from reconstruct.station.pair import open_pair, read_depth, to_axes
+from reconstruct.station.precise import precise_depth
+from reconstruct.station.solve import Optics, calibration_slopes, stereo_rig
+
+_NUMBER = r"(-?\d+(?:\.\d+)?)"
+_PIXEL = re.compile(rf"(?:(?P<image>[^=]+?):)?{_NUMBER},{_NUMBER}")
+_TWO_PICTURES_SIGMA_PX = 0.5
+"""Of a spot picked in two pictures, where no sigma of picking is given."""
+_CELL_STEPS = 0.5
+"""Of a ray's march over the DEM, in cells."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pick:
+    """A pixel as taken."""
+
+    image: str | None
+    x: float
+    y: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Located:
+    """Points and how well they are known."""
+
+    points: Array
+    """(N, 3), metres."""
+    own: Array
+    """(N, 3, 3) covariance that each point has of its own."""
+    shared: Array
+    """(P, N, 3) how all move with parameters of covariance `parameters`."""
+    parameters: Array
+    """(P, P)."""
+    axes: tuple[str, str, str]
+    notes: tuple[str, ...]
+
+    def sigma(self, figure: Callable[[Array], float]) -> tuple[float, float]:
+        """Standard deviations of a figure of the points: of their own, and of what they share."""
+        slope = np.zeros_like(self.points)
+        step = 1e-6 * max(1.0, float(np.abs(self.points).max()))
+        for n, axis in np.ndindex(*self.points.shape):
+            ends = []
+            for sign in (1.0, -1.0):
+                moved = self.points.copy()
+                moved[n, axis] += sign * step
+                ends.append(figure(moved))
+            slope[n, axis] = (ends[0] - ends[1]) / (2 * step)
+        own = float(np.einsum("ni,nij,nj->", slope, self.own, slope))
+        along = np.einsum("pni,ni->p", self.shared, slope)
+        return np.sqrt(max(own, 0.0)), np.sqrt(max(float(along @ self.parameters @ along), 0.0))
+
+
+def measure(
+    folder: Path, points: str, *, pick_sigma_px: float = 0.0, n_water_sigma: float = 0.0
+) -> tuple[str, dict[str, Any]]:
+    """Measure between picked pixels.
+
+    Args:
+        folder: of a pair (`pair.json`), or a reconstructed workspace.
+        points: two or more, with blanks between: `x,y` in the left picture of a pair as taken;
+            `IMAGE:x,y` in a workspace, or `IMAGE:x,y=IMAGE:x,y` where two pictures show the spot.
+            Pixels count from the outer corner of the first, whose centre is 0.5,0.5.
+        pick_sigma_px: standard deviation with which pixels were picked.
+        n_water_sigma: of the index of the water, where the rig's covariance does not name it.
+
+    Returns:
+        Text for the terminal, and figures: distances from point to point, their sum, and with
+        three or more points the closed polygon's area.
+
+    Raises:
+        ReconstructionError: the points cannot be read, or one has no depth.
+        WorkspaceError: the folder is neither a pair nor a reconstructed workspace.
+    """
+    picks = parse_picks(points)
+    if (folder / "pair.json").is_file():
+        located = _in_pair(folder, picks, pick_sigma_px, n_water_sigma)
+    elif (folder / "sparse").is_dir():
+        located = _in_workspace(folder, picks, pick_sigma_px)
+    else:
+        raise WorkspaceError(
+            f"{folder}: neither the folder of a pair (pair.json) nor a reconstructed workspace "
+            "(sparse/)"
+        )
+    return _told(points.split(), located)
+
+
+def parse_picks(points: str) -> list[tuple[Pick, ...]]:
+    """Read points as `measure` takes them.
+
+    Raises:
+        ReconstructionError: fewer than two, or one of another form.
+    """
+    found = []
+    for word in points.split():
+        spots = []
+        for part in word.split("="):
+            match = _PIXEL.fullmatch(part)
+            if match is None:
+                raise ReconstructionError(
+                    f"point {word!r}: give x,y or IMAGE:x,y or IMAGE:x,y=IMAGE:x,y"
+                )
+            spots.append(Pick(image=match["image"], x=float(match[2]), y=float(match[3])))
+        if len(spots) > 2:
+            raise ReconstructionError(f"point {word!r}: at most two pictures can show a spot")
+        found.append(tuple(spots))
+    if len(found) < 2:
+        raise ReconstructionError(f"{len(found)} points; two or more are needed to measure")
+    return found
+
+
+def polyline(points: Array) -> float:
+    """Length of the line through points (N, 3)."""
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
+def polygon_area(points: Array) -> float:
+    """Area of the closed polygon through points (N, 3): the length of its vector area."""
+    local = points - points.mean(axis=0)
+    return 0.5 * float(np.linalg.norm(np.cross(local, np.roll(local, -1, axis=0)).sum(axis=0)))
+
+
+def _told(words: list[str], located: Located) -> tuple[str, dict[str, Any]]:
+    lines, segments = [], []
+    count = len(located.points)
+
+    def entry(figure: Callable[[Array], float], unit: str) -> dict[str, float]:
+        own, shared = located.sigma(figure)
+        return {
+            f"value_{unit}": figure(located.points),
+            f"sigma_{unit}": float(np.hypot(own, shared)),
+            f"sigma_of_pixels_{unit}": own,
+            f"sigma_of_calibration_{unit}": shared,
+        }
+
+    for n in range(count - 1):
+        told = entry(lambda p, n=n: polyline(p[n : n + 2]), "m")  # type: ignore[misc]
+        segments.append({"from": words[n], "to": words[n + 1], **told})
+        lines.append(
+            f"{words[n]} to {words[n + 1]}: {1e3 * told['value_m']:.2f} mm, sigma "
+            f"{1e3 * told['sigma_m']:.2f} mm ({1e3 * told['sigma_of_pixels_m']:.2f} of pixels, "
+            f"{1e3 * told['sigma_of_calibration_m']:.2f} of calibration)"
+        )
+    data: dict[str, Any] = {
+        "format": "alice-survey measure",
+        "version": 1,
+        "points": [
+            {
+                "pixel": word,
+                **dict(zip((f"{a}_m" for a in located.axes), map(float, p), strict=True)),
+                "sigma_m": float(np.sqrt(np.trace(c))),
+            }
+            for word, p, c in zip(words, located.points, located.own, strict=True)
+        ],
+        "distances": segments,
+        "notes": list(located.notes),
+    }
+    if count > 2:
+        data["length"] = entry(polyline, "m")
+        data["area"] = entry(polygon_area, "m2")
+        lines.append(
+            f"length of the line: {1e3 * data['length']['value_m']:.2f} mm, sigma "
+            f"{1e3 * data['length']['sigma_m']:.2f} mm"
+        )
+        lines.append(
+            f"area of the polygon: {1e4 * data['area']['value_m2']:.3f} cm2, sigma "
+            f"{1e4 * data['area']['sigma_m2']:.3f} cm2"
+        )
+    lines.extend(f"note: {note}" for note in located.notes)
+    return "\n".join(lines), data
+
+
+def _in_pair(
+    folder: Path, picks: list[tuple[Pick, ...]], pick_sigma_px: float, n_water_sigma: float
+) -> Located:
+    about = read_json(folder / "pair.json")
+    rig = read_rig(folder / "rig.json")
+    lenses = [lens_from_json(lens) for lens in about["lenses"]]
+    first, second = lenses
+    if not isinstance(first, FlatPortLens) or not isinstance(second, FlatPortLens):
+        raise WorkspaceError(f"{folder / 'pair.json'}: its lenses are not those of a rig")
+    optics = Optics(rig=stereo_rig(rig), lenses=(first, second))
+    for pick in picks:
+        if len(pick) > 1 or pick[0].image is not None:
+            raise ReconstructionError("points of a pair are x,y in its left picture")
+    taken = np.array([[p[0].x, p[0].y] for p in picks])
+    _check_inside(taken, first, about["left"])
+    views = tuple(scaled_view(view, about["scale"]) for view in optics.views)
+    paths = tuple(folder / name for name in about["pictures"])
+    names, pictures = open_pair(optics, (paths[0], paths[1]))
+    greys = [_grey(pictures, n, v) for n, v in zip(names, views, strict=True)]
+    depth_map = read_depth(folder)
+    view = views[0]
+    ratio = np.array([view.width_px, view.height_px]) / [
+        first.pinhole.width_px, first.pinhole.height_px
+    ]  # fmt: skip
+    pixels = first.to_pinhole(taken) * ratio
+    found = precise_depth((views[0], views[1]), (greys[0], greys[1]), depth_map, pixels)
+    lost = np.flatnonzero(~np.isfinite(found.depth))
+    if len(lost):
+        x, y = taken[lost[0]]
+        raise ReconstructionError(
+            f"pixel {x:g},{y:g}: the right picture does not show the same there (no texture, "
+            "hidden, or outside); pick another close by"
+        )
+    points = view.at_depth(pixels, found.depth)
+    sigma = found.sigma * about["inflation"]
+    step = 1e-3 * found.depth
+    along = (view.at_depth(pixels, found.depth + step) - points) / step[:, None]
+    own = (sigma**2)[:, None, None] * along[:, :, None] * along[:, None, :]
+    for axis in range(2):
+        moved = first.to_pinhole(taken + np.eye(2)[axis]) * ratio
+        aside = (view.at_depth(moved, found.depth) - points) * pick_sigma_px
+        own = own + aside[:, :, None] * aside[:, None, :]
+    both = np.stack([taken, optics.rig.pixels(points)[1]])
+    shared, parameters = _calibration(rig, both, n_water_sigma)
+    flip = np.diag([1.0, -1.0, -1.0])
+    notes = [f"rig: {rig.source}"]
+    if not len(parameters):
+        notes.append("the rig tells no covariance: sigmas are those of the pixels alone")
+    return Located(
+        points=to_axes(points),
+        own=flip @ own @ flip,
+        shared=shared @ flip,
+        parameters=parameters,
+        axes=("right", "up", "back"),
+        notes=tuple(notes),
+    )
+
+
+def _calibration(rig: Rig, pixels: Array, n_water_sigma: float) -> tuple[Array, Array]:
+    """Slopes (P, N, 3) of points by what is known of a rig, and the covariance of that."""
+    slopes, matrix = np.zeros((0, pixels.shape[1], 3)), np.zeros((0, 0))
+    if rig.covariance is not None:
+        slopes, used = calibration_slopes(rig, pixels, rig.covariance.sigmas)
+        matrix = rig.covariance.matrix[np.ix_(used, used)]
+    named = () if rig.covariance is None else rig.covariance.parameters
+    if n_water_sigma > 0 and not any(name.endswith(".n_water") for name in named):
+        names = list(rig.cameras)[:2]
+        water, _ = calibration_slopes(rig, pixels, {f"{n}.n_water": n_water_sigma for n in names})
+        slopes = np.concatenate([slopes, water.sum(axis=0, keepdims=True)])
+        wider = np.zeros((len(matrix) + 1, len(matrix) + 1))
+        wider[:-1, :-1], wider[-1, -1] = matrix, n_water_sigma**2
+        matrix = wider
+    return slopes, matrix
+
+
+def _grey(pictures: Pictures, name: str, view: View) -> NDArray[np.float32]:
+    colour = pictures.colour(name)
+    size = (view.width_px, view.height_px)
+    if colour.shape[1::-1] != size:
+        colour = cv2.resize(colour, size, interpolation=cv2.INTER_AREA)
+    grey: NDArray[np.float32] = cv2.cvtColor(colour, cv2.COLOR_BGR2GRAY).astype(np.float32)
+    return grey
+
+
+def _check_inside(taken: Array, lens: Lens, name: str) -> None:
+    for x, y in taken:
+        if not (0 <= x <= lens.size_px[0] and 0 <= y <= lens.size_px[1]):
+            raise ReconstructionError(
+                f"pixel {x:g},{y:g} is outside of {name} ({lens.size_px[0]} x {lens.size_px[1]})"
+            )
+
+
+def _in_workspace(workspace: Path, picks: list[tuple[Pick, ...]], pick_sigma_px: float) -> Located:
+    sparse = need_stage(workspace, "sparse", "reconstruct")
+    model = read_model(sparse)
+    if not model.frame.scaled:
+        raise ReconstructionError("the model has no scale: lengths in it are not metres")
+    pictures = Pictures.open(workspace)
+    views = {view.image: view for view in model.views}
+    points, own, notes = [], [], []
+    surface = None
+    for pick in picks:
+        rays = []
+        for spot in pick:
+            if spot.image is None or spot.image not in views:
+                raise ReconstructionError(
+                    f"{spot.image!r} is no registered picture: name one of {len(views)}, such as "
+                    f"{next(iter(views))}:100,100"
+                )
+            lens = pictures.lens(spot.image)
+            _check_inside(np.array([[spot.x, spot.y]]), lens, spot.image)
+            rays.append((views[spot.image], lens, np.array([spot.x, spot.y])))
+        if len(rays) == 2:
+            point, covariance = _crossed(rays, pick_sigma_px or _TWO_PICTURES_SIGMA_PX)
+        else:
+            surface = surface or _Surface(need_stage(workspace, "dense", "reconstruct"))
+            point, covariance = _on_surface(surface, *rays[0], pick_sigma_px)
+        points.append(point)
+        own.append(covariance)
+    notes.append("sigmas count pixels and surface, not the scale and bend of the whole model")
+    turn = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    return Located(
+        points=np.stack(points) @ turn,
+        own=turn @ np.stack(own) @ turn,
+        shared=np.zeros((0, len(points), 3)),
+        parameters=np.zeros((0, 0)),
+        axes=("east", "north", "up"),
+        notes=tuple(notes),
+    )
+
+
+def _ray(view: View, lens: Lens, taken: Array) -> tuple[Array, Array]:
+    """A point and the unit direction of the straight ray in water of one pixel as taken."""
+    pixel = lens.to_pinhole(taken[None])
+    near, far = (view.at_depth(pixel, np.array([depth]))[0] for depth in (1.0, 2.0))
+    direction: Array = (far - near) / np.linalg.norm(far - near)
+    return near, direction
+
+
+def _crossed(rays: list[tuple[View, Lens, Array]], sigma_px: float) -> tuple[Array, Array]:
+    """The point nearest to two rays, and its covariance."""
+    from camera_calib.triangulate import nearest_to_rays
+
+    def solve(taken: list[Array]) -> Array:
+        ends = [_ray(v, lens, t) for (v, lens, _), t in zip(rays, taken, strict=True)]
+        start, direction = (np.stack([e[k] for e in ends])[:, None] for k in range(2))
+        solved: Array = nearest_to_rays(start, direction)[0]
+        return solved
+
+    taken = [ray[2] for ray in rays]
+    point = solve(taken)
+    if not np.isfinite(point).all():
+        raise ReconstructionError("the rays of a spot in two pictures are parallel: pick again")
+    covariance = np.zeros((3, 3))
+    for ray in range(2):
+        for axis in range(2):
+            moved = [t.copy() for t in taken]
+            moved[ray][axis] += 0.5
+            slope = (solve(moved) - point) / 0.5 * sigma_px
+            covariance += np.outer(slope, slope)
+    for view, _, spot in rays:
+        if view.world_from_cam.inv().apply(point)[2] <= 0:
+            raise ReconstructionError(
+                f"{view.image}:{spot[0]:g},{spot[1]:g}: the two rays meet behind the camera"
+            )
+    return point, covariance
+
+
+class _Surface:
+    """The DEM and its standard deviation."""
+
+    def __init__(self, dense: Path) -> None:
+        import rasterio
+
+        with rasterio.open(dense / "dem.tif") as raster:
+            self.height = raster.read(1).astype(np.float32)
+            self.transform = raster.transform
+        with rasterio.open(dense / "sigma.tif") as raster:
+            self.sigma = raster.read(1).astype(np.float32)
+        self.cell = float(self.transform.a)
+        self.low, self.high = float(np.nanmin(self.height)), float(np.nanmax(self.height))
+
+    def at(self, raster: NDArray[np.float32], points_ned: Array) -> Array:
+        """Bilinear values (N,) under points; NaN outside."""
+        x = (points_ned[:, 1] - self.transform.c) / self.cell - 0.5
+        y = (self.transform.f - points_ned[:, 0]) / self.cell - 0.5
+        return np.concatenate(
+            [
+                cv2.remap(
+                    raster,
+                    x[i : i + 30_000].astype(np.float32)[:, None],
+                    y[i : i + 30_000].astype(np.float32)[:, None],
+                    cv2.INTER_LINEAR,
+                    borderMode=cv2.BORDER_CONSTANT,
+                    borderValue=np.nan,
+                )[:, 0]
+                for i in range(0, len(x), 30_000)
+            ]
+        ).astype(np.float64)
+
+    def hit(self, start: Array, direction: Array, lift: float = 0.0) -> Array | None:
+        """Where a ray first meets the surface, raised by a height; None where it does not."""
+        down = float(direction[2])
+        if down <= 1e-6:
+            return None
+        first = max(0.0, (-self.high - lift - self.cell - start[2]) / down)
+        last = (-self.low - lift + self.cell - start[2]) / down
+        along = np.arange(first, last + self.cell, _CELL_STEPS * self.cell)
+        points = start + along[:, None] * direction
+        over = -points[:, 2] - self.at(self.height, points) - lift
+        crossed = np.flatnonzero((over[:-1] > 0) & (over[1:] <= 0))
+        if not len(crossed):
+            return None
+        n = crossed[0]
+        share = over[n] / (over[n] - over[n + 1])
+        met: Array = points[n] + share * (points[n + 1] - points[n])
+        return met
+
+
+def _on_surface(
+    surface: _Surface, view: View, lens: Lens, taken: Array, sigma_px: float
+) -> tuple[Array, Array]:
+    start, direction = _ray(view, lens, taken)
+    point = surface.hit(start, direction)
+    if point is None:
+        raise ReconstructionError(
+            f"{view.image}:{taken[0]:g},{taken[1]:g}: its ray meets no known surface; pick another "
+            "pixel, or the spot in two pictures as IMAGE:x,y=IMAGE:x,y"
+        )
+    sigma = float(surface.at(surface.sigma, point[None])[0])
+    raised = surface.hit(start, direction, lift=sigma)
+    moves = [raised - point if raised is not None else sigma * direction]
+    for axis in range(2):
+        beside = surface.hit(*_ray(view, lens, taken + np.eye(2)[axis]))
+        if beside is not None:
+            moves.append((beside - point) * sigma_px)
+    covariance = sum((np.outer(m, m) for m in moves), np.zeros((3, 3)))
+    return point, covariance
