@@ -9,13 +9,14 @@ fall-off across a single line, is taken from the median of all pictures, in whic
 out; it weighs the more, the more pictures there are. No picture is stretched by itself.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array, vstack
 
@@ -32,9 +33,13 @@ _MISFIT = 0.1
 """Difference of logarithms above which two views of a spot count less (shadow, gloss, mismatch)."""
 _NODE_SIGMA, _BEND_SIGMA, _GAIN_SIGMA = 2.0, 0.05, 0.3
 """Expected size of m at a node, of its second difference, and of g; logarithms."""
-_SAMPLES_PER_FACT = 20.0
+SAMPLES_PER_FACT = 20.0
 """Samples of one pair of pictures that together tell as much as one independent one."""
 _ROUNDS = 6
+_FALL_OFF_SIGMA = 4.0
+"""Expected logarithm of the light lost over the middle range."""
+_DENSE_UNKNOWNS = 1500
+"""More are solved for with sparse matrices."""
 _SCENE_SIGMA = 0.5
 """Spread of the sea floor's own logarithmic brightness from picture to picture."""
 _FEWEST_PICTURES = 6
@@ -55,18 +60,24 @@ class LightSamples:
     """(N, 2, 2) where each sees the spot: x and y over the picture's width and height."""
     levels: NDArray[np.float32]
     """(N, 2, 3) logarithm of the low-passed BGR levels."""
+    ranges: NDArray[np.float32] | None = None
+    """(N, 2) distances at which the views see the spots; None where they shall not count."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LightModel:
     """What to divide colours by."""
 
-    patterns: dict[str, Array]
+    patterns: Mapping[str, Array]
     """Per camera (rows, columns, 3): logarithm of the light at the nodes, BGR."""
-    gains: dict[str, Array]
+    gains: Mapping[str, Array]
     """Per picture (3,): logarithm of its light, BGR."""
     white: Array
     """(3,) factors, the same for all pictures, that take the cast of water and light away."""
+    fall_off: Array = field(default_factory=lambda: np.zeros(3))
+    """(3,) by how much the logarithm of light falls for each unit of range."""
+    middle_range: float = 0.0
+    """Range at which patterns and gains hold."""
 
     def factors(self, camera: str, image: str) -> NDArray[np.float32]:
         """(rows, columns, 3) factors at the nodes that take a picture's BGR to even light."""
@@ -94,15 +105,38 @@ def low_pass(colour: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.
     return low
 
 
-def at_places(picture: NDArray[np.float32], places: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Bilinear values (N, 3) of a picture at places (N, 2) given over its width and height."""
+def at_places(
+    picture: NDArray[np.float32], places: NDArray[np.float32], channels: int = 3
+) -> NDArray[np.float32]:
+    """Bilinear values (N, channels) of a picture at places (N, 2) over its width and height."""
     height, width = picture.shape[:2]
-    x = (places[:, 0] * width - 0.5).astype(np.float32).reshape(-1, 1)
-    y = (places[:, 1] * height - 0.5).astype(np.float32).reshape(-1, 1)
-    found: NDArray[np.float32] = cv2.remap(
-        picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
-    return found.reshape(-1, 3)
+    x = places[:, 0] * np.float32(width) - np.float32(0.5)
+    y = places[:, 1] * np.float32(height) - np.float32(0.5)
+    picture = np.ascontiguousarray(picture, np.float32).reshape(height, width, channels)
+    found: NDArray[np.float32] = bilinear(picture, x.astype(np.float32), y.astype(np.float32))
+    return found
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def bilinear(
+    picture: NDArray[np.float32], x: NDArray[np.float32], y: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Values (N, channels) of a picture (H, W, channels) at columns and rows, edges repeated.
+
+    `cv2.remap` rounds places to 1/32 of a pixel, which shows as steps in smooth light.
+    """
+    height, width, channels = picture.shape
+    found = np.empty((len(x), channels), np.float32)
+    for n in range(len(x)):
+        u = min(max(x[n], np.float32(0.0)), np.float32(width - 1))
+        v = min(max(y[n], np.float32(0.0)), np.float32(height - 1))
+        left, top = min(int(u), width - 2), min(int(v), height - 2)
+        p, q = u - np.float32(left), v - np.float32(top)
+        for c in range(channels):
+            above = picture[top, left, c] * (1 - p) + picture[top, left + 1, c] * p
+            below = picture[top + 1, left, c] * (1 - p) + picture[top + 1, left + 1, c] * p
+            found[n, c] = above * (1 - q) + below * q
+    return found
 
 
 def compare_light(
@@ -128,8 +162,10 @@ def compare_light(
 
 
 def joined_samples(parts: Sequence[LightSamples]) -> LightSamples:
-    """Samples of several pairs as one."""
+    """Samples of several pairs as one; their ranges count when all parts have some."""
+    ranges = [p.ranges for p in parts if p.ranges is not None]
     return LightSamples(
+        ranges=np.concatenate(ranges) if ranges and len(ranges) == len(parts) else None,
         views=np.concatenate([np.empty((0, 2), np.int32), *(p.views for p in parts)]),
         places=np.concatenate([np.empty((0, 2, 2), np.float32), *(p.places for p in parts)]),
         levels=np.concatenate([np.empty((0, 2, 3), np.float32), *(p.levels for p in parts)]),
@@ -148,14 +184,35 @@ def solve_light(
         images: names of the views, by number.
         cameras: their cameras.
     """
+    even = solve_patterns(samples, nodes, images, cameras)
+    return replace(even, white=_white(samples, even, images, cameras))
+
+
+def solve_patterns(
+    samples: LightSamples,
+    nodes: Array,
+    images: Sequence[str],
+    cameras: Sequence[str],
+    gain_sigma: float = _GAIN_SIGMA,
+) -> LightModel:
+    """As `solve_light`, with a white of 1; the fall-off with range too where samples have it.
+
+    Args:
+        samples: see `solve_light`.
+        nodes: see `solve_light`.
+        images: see `solve_light`.
+        cameras: see `solve_light`.
+        gain_sigma: expected size of the logarithm of a picture's own light.
+    """
     names = sorted(set(cameras))
     count_nodes = GRID[0] * GRID[1]
-    unknowns = count_nodes * len(names) + len(images)
+    unknowns = count_nodes * len(names) + len(images) + 1
     camera_of = np.array([names.index(camera) for camera in cameras])
     count = len(samples.views)
+    middle = 0.0
     design = csr_array((count, unknowns))
     for side, sign in ((0, 1.0), (1, -1.0)):
-        columns, weights = _node_weights(samples.places[:, side])
+        columns, weights = node_weights(samples.places[:, side])
         columns = columns + count_nodes * camera_of[samples.views[:, side]][:, None]
         gain = count_nodes * len(names) + samples.views[:, side]
         columns = np.concatenate([columns, gain[:, None]], axis=1)
@@ -163,7 +220,16 @@ def solve_light(
         rows = np.repeat(np.arange(count), columns.shape[1])
         part = csr_array((sign * weights.ravel(), (rows, columns.ravel())), (count, unknowns))
         design = design + part
-    prior = _prior(len(names), len(images))
+    if samples.ranges is not None and count:
+        middle = float(np.median(samples.ranges))
+        farther = (samples.ranges[:, 0] - samples.ranges[:, 1]).astype(np.float64)
+        rows = np.arange(count)
+        design = design + csr_array(
+            (-farther, (rows, np.full(count, unknowns - 1))), (count, unknowns)
+        )
+    prior = _prior(
+        len(names), len(images), gain_sigma, _FALL_OFF_SIGMA / middle if middle > 0 else 1.0
+    )
     pull, pulled = _typical(nodes, camera_of, len(names), unknowns)
     solution = np.zeros((unknowns, 3))
     for channel in range(3):
@@ -171,28 +237,34 @@ def solve_light(
         x = np.zeros(unknowns)
         for _ in range(_ROUNDS):
             misfit = np.abs(target - design @ x)
-            weight = 1.0 / np.maximum(misfit, _MISFIT) / _MISFIT / _SAMPLES_PER_FACT
+            weight = 1.0 / np.maximum(misfit, _MISFIT) / _MISFIT / SAMPLES_PER_FACT
             weighted = diags_array(weight) @ design
-            normal = (weighted.T @ design + prior).toarray() + np.diag(pull[:, channel])
-            x = np.linalg.solve(normal, weighted.T @ target + pulled[:, channel])
+            normal = weighted.T @ design + prior + diags_array(pull[:, channel])
+            x = _solved(normal, weighted.T @ target + pulled[:, channel])
         solution[:, channel] = x
     patterns = solution[: count_nodes * len(names)].reshape(len(names), *GRID, 3)
     patterns = patterns - patterns.mean(axis=(0, 1, 2))
-    gains = solution[count_nodes * len(names) :]
+    gains = solution[count_nodes * len(names) : -1]
     gains = gains - gains.mean(axis=0)
-    even = LightModel(
+    return LightModel(
         patterns=dict(zip(names, patterns, strict=True)),
         gains=dict(zip(images, gains, strict=True)),
         white=np.ones(3),
-    )
-    return LightModel(
-        patterns=even.patterns,
-        gains=even.gains,
-        white=_white(samples, even, images, cameras),
+        fall_off=solution[-1],
+        middle_range=middle,
     )
 
 
-def _node_weights(places: NDArray[np.float32]) -> tuple[NDArray[np.int64], Array]:
+def _solved(normal: Any, right: Array) -> Array:
+    if len(right) <= _DENSE_UNKNOWNS:
+        return np.linalg.solve(normal.toarray(), right)
+    from scipy.sparse.linalg import spsolve
+
+    solution: Array = spsolve(normal.tocsc(), right)
+    return solution
+
+
+def node_weights(places: NDArray[np.float32]) -> tuple[NDArray[np.int64], Array]:
     """The four nodes around each place and their bilinear weights, (N, 4) each."""
     rows, columns = GRID
     x = np.clip(places[:, 0].astype(np.float64), 0, 1) * (columns - 1)
@@ -206,7 +278,7 @@ def _node_weights(places: NDArray[np.float32]) -> tuple[NDArray[np.int64], Array
     return nodes, weights
 
 
-def _prior(cameras: int, views: int) -> Any:
+def _prior(cameras: int, views: int, gain_sigma: float, fall_off_sigma: float) -> Any:
     rows, columns = GRID
     number = np.arange(rows * columns).reshape(rows, columns)
     triples = np.concatenate(
@@ -216,7 +288,7 @@ def _prior(cameras: int, views: int) -> Any:
         ]
     )
     nodes = rows * columns
-    unknowns = nodes * cameras + views
+    unknowns = nodes * cameras + views + 1
     parts = []
     for camera in range(cameras):
         at = np.repeat(np.arange(len(triples)), 3)
@@ -224,9 +296,11 @@ def _prior(cameras: int, views: int) -> Any:
         parts.append(
             csr_array((bend, (at, (triples + camera * nodes).ravel())), (len(triples), unknowns))
         )
-    size = np.concatenate(
-        [np.full(nodes * cameras, 1.0 / _NODE_SIGMA), np.full(views, 1.0 / _GAIN_SIGMA)]
-    )
+    size = np.concatenate([
+        np.full(nodes * cameras, 1.0 / _NODE_SIGMA),
+        np.full(views, 1.0 / gain_sigma),
+        [1.0 / fall_off_sigma],
+    ])  # fmt: skip
     parts.append(csr_array((size, (np.arange(unknowns), np.arange(unknowns)))))
     root = vstack(parts).tocsr()
     return root.T @ root
@@ -279,7 +353,7 @@ def _white(
     if not len(samples.views):
         return np.ones(3)
     first = samples.views[:, 0]
-    nodes, weights = _node_weights(samples.places[:, 0])
+    nodes, weights = node_weights(samples.places[:, 0])
     level = np.empty((len(first), 3))
     for number in np.unique(first):
         mine = first == number

@@ -1,4 +1,4 @@
-"""Which view paints which pixel of the mosaic: projection, sight lines and quality."""
+"""Where a view shows each point of a surface, how well, and what it shows there: kernels."""
 
 import math
 
@@ -7,13 +7,23 @@ from numba import njit
 from numpy.typing import NDArray
 
 from alice_survey.frames import Array
+from reconstruct.lenses.range_shift import field_at, warped_pixel
 
 Float32 = NDArray[np.float32]
+
+_TAPS = 8
+_FRACTIONS = 1024
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def visible_cells(
-    height: Float32, camera_enu: Array, west: float, north: float, cell: float, tolerance: float
+    height: Float32,
+    camera_enu: Array,
+    west: float,
+    north: float,
+    cell: float,
+    tolerance: float,
+    part: tuple[int, int, int, int],
 ) -> NDArray[np.bool_]:
     """Which cells of a DEM a camera sees over the DEM itself.
 
@@ -27,9 +37,11 @@ def visible_cells(
         north: north coordinate of the first row's outer edge.
         cell: side of a cell.
         tolerance: in the unit of height.
+        part: first row, last row and one, first column, last column and one of the cells to ask
+            for; all of the DEM may hide them.
 
     Returns:
-        (H, W); False where the height is unknown.
+        (H, W); False where the height is unknown and beyond the part.
     """
     rows, columns = height.shape
     visible = np.zeros((rows, columns), np.bool_)
@@ -40,8 +52,8 @@ def visible_cells(
                 top = height[row, column]
     camera_column = (camera_enu[0] - west) / cell - 0.5
     camera_row = (north - camera_enu[1]) / cell - 0.5
-    for row in range(rows):
-        for column in range(columns):
+    for row in range(part[0], part[1]):
+        for column in range(part[2], part[3]):
             h = height[row, column]
             if math.isnan(h) or h >= camera_enu[2]:
                 continue
@@ -71,16 +83,20 @@ def look_up(
     cells_per_pixel: float,
     cam_from_enu: Array,
     pinhole: Array,
+    shift: tuple[Array, float, float, float],
+    taken_nodes: Array,
     size: tuple[int, int],
     first_enu: tuple[float, float],
     pixel: float,
     rim: float,
-) -> tuple[Float32, Float32, Float32]:
-    """Where a view sees each pixel of a tile, and how well.
+) -> tuple[Float32, Float32, Float32, Float32]:
+    """Where the picture as taken shows each pixel of a tile, and how well.
 
-    The quality is the distance from the rim of the picture (1 in the middle, 0 at the rim) times
-    the cosine of the angle to the vertical over the distance squared, so that the middle of near,
-    steep views wins.
+    A point goes to the ideal pinhole, from there by its depth to the warped picture
+    (`warped_pixel`, exact for a flat port) and through the lens to the picture as taken, so that
+    colours are resampled once. The quality is the distance from the rim of the picture (1 in the
+    middle, 0 at the rim) times the cosine of the angle to the vertical over the distance squared,
+    so that the middle of near, steep views wins.
 
     Args:
         height: (H, W) up at the pixels' centres, NaN where unknown.
@@ -89,20 +105,26 @@ def look_up(
         cells_per_pixel: side of a pixel over side of a cell.
         cam_from_enu: (3, 4) transform to the camera.
         pinhole: (4,) fx, fy, cx, cy, px.
-        size: width and height of the picture, px.
+        shift: `View.shift_arguments`.
+        taken_nodes: (rows, columns, 2) pixels as taken at nodes spread evenly over the warped
+            picture; NaN where there are none.
+        size: width and height of the picture as taken, px.
         first_enu: east and north of the first pixel's centre.
         pixel: side of a pixel.
         rim: pixels of the picture at its edges that are not used.
 
     Returns:
-        (H, W) x and y in OpenCV's pixels (-1 where not seen) and the quality (0 where not seen).
+        (H, W) x and y in OpenCV's pixels (-1 where not seen), the quality (0 where not seen) and
+        the distance from the pinhole's centre (NaN where not seen).
     """
     rows, columns = height.shape
     x = np.full((rows, columns), -1.0, np.float32)
     y = np.full((rows, columns), -1.0, np.float32)
     quality = np.zeros((rows, columns), np.float32)
+    ranges = np.full((rows, columns), np.nan, np.float32)
     t = cam_from_enu
     half = 0.5 * min(size[0], size[1])
+    nodes, width_px, height_px, inverse_working = shift
     for row in range(rows):
         north = first_enu[1] - row * pixel
         cell_row = round(first_cell[0] + row * cells_per_pixel)
@@ -123,10 +145,15 @@ def look_up(
                 continue
             a = t[0, 0] * east + t[0, 1] * north + t[0, 2] * up + t[0, 3]
             b = t[1, 0] * east + t[1, 1] * north + t[1, 2] * up + t[1, 3]
-            u = pinhole[0] * a / c + pinhole[2]
-            v = pinhole[1] * b / c + pinhole[3]
+            u, v = warped_pixel(
+                nodes, width_px, height_px, inverse_working,
+                pinhole[0] * a / c + pinhole[2], pinhole[1] * b / c + pinhole[3], 1.0 / c,
+            )  # fmt: skip
+            if u < 0.0 or v < 0.0 or u > width_px or v > height_px:
+                continue
+            u, v = field_at(taken_nodes, width_px, height_px, u, v)
             inset = min(min(u, size[0] - u), min(v, size[1] - v)) - rim
-            if inset <= 0.0:
+            if not inset > 0.0:  # NaN as well
                 continue
             distance = math.sqrt(a * a + b * b + c * c)
             # the camera's height over the point, along the third row of enu_from_cam
@@ -136,4 +163,67 @@ def look_up(
             x[row, column] = u - 0.5
             y[row, column] = v - 0.5
             quality[row, column] = inset / half * cosine / (distance * distance)
-    return x, y, quality
+            ranges[row, column] = distance
+    return x, y, quality, ranges
+
+
+def lanczos_weights() -> Float32:
+    """(fractions, taps) of Lanczos' kernel of 4 lobes, each row with the sum 1.
+
+    Row n is for a place n / fractions beyond the fourth of the eight samples.
+    """
+    fraction = np.arange(_FRACTIONS + 1) / _FRACTIONS
+    offset = fraction[:, None] - (np.arange(_TAPS) - (_TAPS // 2 - 1))
+    weights = np.sinc(offset) * np.sinc(offset / (_TAPS // 2))
+    rows: Float32 = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
+    return rows
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def sample_lanczos(
+    picture: NDArray[np.uint8], table: Float32, weights: Float32, x: Float32, y: Float32,
+    first: int, last: int, out: Float32,
+) -> None:  # fmt: skip
+    """Values of a picture at places, linear light, by Lanczos' kernel; edges are repeated.
+
+    `cv2.remap` rounds places to 1/32 px; this one to 1/1024.
+
+    Args:
+        picture: (H, W, 3).
+        table: (256,) light of each level.
+        weights: `lanczos_weights`.
+        x: (h, w) columns, the first pixel's centre is 0; negative where nothing is wanted.
+        y: (h, w) rows.
+        first: channel to start with.
+        last: channel before which to stop.
+        out: (h, w, 3), changed in place in those channels where something is wanted.
+    """
+    rows, columns = x.shape
+    high, wide = picture.shape[0] - 1, picture.shape[1] - 1
+    taps = weights.shape[1]
+    steps = weights.shape[0] - 1
+    for row in range(rows):
+        for column in range(columns):
+            px, py = x[row, column], y[row, column]
+            if px < 0.0:
+                continue
+            left, top = math.floor(px), math.floor(py)
+            across = weights[round((px - left) * steps)]
+            down = weights[round((py - top) * steps)]
+            left -= taps // 2 - 1
+            top -= taps // 2 - 1
+            inside = left >= 0 and top >= 0 and left + taps <= wide + 1 and top + taps <= high + 1
+            for channel in range(first, last):
+                total = np.float32(0.0)
+                for j in range(taps):
+                    line = np.float32(0.0)
+                    if inside:
+                        for i in range(taps):
+                            line += across[i] * table[picture[top + j, left + i, channel]]
+                    else:
+                        r = min(max(top + j, 0), high)
+                        for i in range(taps):
+                            at = min(max(left + i, 0), wide)
+                            line += across[i] * table[picture[r, at, channel]]
+                    total += down[j] * line
+                out[row, column, channel] = max(total, np.float32(0.0))

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from reconstruct.dense.points import enu_from_cam, pinhole_of
+from reconstruct.model import View
 from reconstruct.mosaic.ortho import look_up, visible_cells
 from tests.oracles_dense import sees, stereo_views
 
@@ -16,7 +17,7 @@ def hills() -> np.ndarray:
 def test_visible_cells_equal_a_walk_along_the_sight_line(camera: tuple[float, float, float]):
     height, cell, tolerance = hills(), 0.1, 0.15
     place = np.array(camera)
-    visible = visible_cells(height, place, 0.0, 0.0, cell, tolerance)
+    visible = visible_cells(height, place, 0.0, 0.0, cell, tolerance, (0, 40, 0, 50))
     clear = doubtful = 0
     for row in range(0, 40, 3):
         for column in range(0, 50, 3):
@@ -34,7 +35,9 @@ def test_a_wall_hides_what_is_behind_it_and_not_itself():
     height = np.zeros((21, 60), np.float32)
     height[:, 30] = 1.0
     # camera 2 m up over column 10: its line over the wall reaches the ground 20 cells behind
-    visible = visible_cells(height, np.array([1.05, -1.05, 2.0]), 0.0, 0.0, 0.1, 0.01)
+    visible = visible_cells(
+        height, np.array([1.05, -1.05, 2.0]), 0.0, 0.0, 0.1, 0.01, (0, 21, 0, 60)
+    )
     assert visible[10, :31].all()
     assert not visible[10, 31:49].any()
     assert visible[10, 52:].all()
@@ -43,9 +46,17 @@ def test_a_wall_hides_what_is_behind_it_and_not_itself():
 def test_unknown_cells_are_neither_seen_nor_in_the_way():
     height = np.zeros((21, 60), np.float32)
     height[:, 30] = np.nan
-    visible = visible_cells(height, np.array([1.05, -1.05, 2.0]), 0.0, 0.0, 0.1, 0.01)
+    visible = visible_cells(
+        height, np.array([1.05, -1.05, 2.0]), 0.0, 0.0, 0.1, 0.01, (0, 21, 0, 60)
+    )
     assert not visible[:, 30].any()
     assert visible[:, 31:].all()
+
+
+def straight_nodes(view: View) -> np.ndarray:
+    """A lens that changes nothing."""
+    x, y = np.linspace(0, view.width_px, 5), np.linspace(0, view.height_px, 4)
+    return np.stack(np.meshgrid(x, y), axis=-1)
 
 
 def test_look_up_projects_as_the_view_does_and_prefers_its_middle():
@@ -57,13 +68,16 @@ def test_look_up_projects_as_the_view_does_and_prefers_its_middle():
     height[40, 50] = np.nan
     seen = np.ones((200, 200), bool)
     pixel, first = 0.02, (-1.0, 0.9)
-    x, y, quality = look_up(
+    nodes = straight_nodes(view)
+    x, y, quality, ranges = look_up(
         height,
         seen,
         (0.0, 0.0),
         1.0,
         cam_from_enu,
         pinhole_of(view),
+        view.shift_arguments,
+        nodes,
         (view.width_px, view.height_px),
         first,
         pixel,
@@ -77,6 +91,9 @@ def test_look_up_projects_as_the_view_does_and_prefers_its_middle():
     inside = quality > 0
     np.testing.assert_allclose(x[inside], pixels[inside][:, 0] - 0.5, atol=2e-3)
     np.testing.assert_allclose(y[inside], pixels[inside][:, 1] - 0.5, atol=2e-3)
+    away = np.linalg.norm(world - view.world_from_cam.translation, axis=-1)
+    np.testing.assert_allclose(ranges[inside], away[inside], rtol=1e-6)
+    assert np.isnan(ranges[~inside]).all()
     border = np.minimum(pixels, [view.width_px, view.height_px] - pixels).min(axis=-1)
     expected = (border > 2.0) & np.isfinite(height)
     np.testing.assert_array_equal(inside, expected)

@@ -1,0 +1,338 @@
+"""From what a picture shows to what the sea floor reflects: one model for the whole survey.
+
+Light that reaches the camera is that of the sea floor, weakened, and that which the water throws
+back (Akkaynak & Treibitz 2018, "A revised underwater image formation model"; the direct and the
+backscattered light have coefficients of their own):
+
+    I = J exp(m(camera, place) + g(picture) - b (z - z0)) + A(camera, place)
+
+with z the distance, per channel, in linear light. m, g and b follow from pairs of views of one spot
+(`light`). A is the light of the darkest pixels that each place of the picture ever shows (dark
+pixels, as in Akkaynak & Treibitz 2019, "Sea-thru"; a robust additive map of the survey, as in
+Koeser et al. 2021), times a share per channel that the pairs themselves tell: of two views of a
+bright and of a dark spot a wrong A fits at most one.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.frames import Array
+from reconstruct.mosaic.facts import PictureFacts
+from reconstruct.mosaic.light import (
+    GRID,
+    SAMPLES_PER_FACT,
+    LightModel,
+    LightSamples,
+    bilinear,
+    node_weights,
+    solve_patterns,
+)
+
+Float32 = NDArray[np.float32]
+Colour = Literal["even", "water", "raw"]
+
+_FEWEST_PICTURES = 12
+"""Of a camera, for the darkest pixels of a place to be dark."""
+_DARK_QUANTILE = 0.15
+"""Of the pictures' darkest light at a place, which a few black outliers do not move."""
+_GAIN_SIGMA = 1.0
+"""Expected size of the logarithm of a picture's own light: a stop and a half either way."""
+_SHARES = np.linspace(0.0, 1.0, 6)
+_MOST_SAMPLES = 20_000
+"""Of those that the share of the additive light is found from."""
+_LARGEST_SIGMA = 0.25
+"""Of a share that is believed."""
+_LEAST_LEFT = 0.05
+"""Share of the light that stays at least when the water's is taken away."""
+_LARGEST_LIFT = 30.0
+_BRIGHT_LIGHT, _BRIGHT_PERCENT = 0.68, 98.0
+_MIDDLE_LIGHT = 0.22
+_NORM = 6.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ColourModel:
+    """What turns the linear light of pictures into that of the sea floor."""
+
+    light: LightModel
+    added: Mapping[str, Array]
+    """Per camera (rows, columns, 3): light that the water adds at the nodes, BGR."""
+    shares: Array
+    """(3,) of the darkest pixels' light that is taken to be the water's; 0 where it is not told."""
+    share_sigmas: Array
+    """(3,)."""
+    notes: tuple[str, ...]
+
+    def corrected(
+        self, light: Float32, camera: str, image: str, places: tuple[Float32, Float32],
+        ranges: Float32,
+    ) -> Float32:  # fmt: skip
+        """The sea floor's light, (H, W, 3) BGR.
+
+        Args:
+            light: (H, W, 3) that the picture shows.
+            camera: that took it.
+            image: its name.
+            places: (H, W) each, x and y over the picture's width and height.
+            ranges: (H, W); NaN where not known.
+        """
+        model = self.light
+        lift = np.exp(-(model.patterns[camera] + model.gains[image]))
+        lift = np.clip(lift, 1.0 / _LARGEST_LIFT, _LARGEST_LIFT) * model.white
+        at_nodes = np.concatenate([lift, self.added[camera]], axis=2).astype(np.float32)
+        x, y = (
+            (p * np.float32(n - 1)).astype(np.float32).ravel()
+            for p, n in zip(places, (GRID[1], GRID[0]), strict=True)
+        )
+        found = bilinear(np.ascontiguousarray(at_nodes), x, y).reshape(*light.shape[:2], 6)
+        left = np.maximum(light - found[..., 3:], np.float32(_LEAST_LEFT) * light)
+        result: Float32 = left * found[..., :3]
+        if model.fall_off.any():
+            beyond = np.nan_to_num(ranges - np.float32(model.middle_range))
+            for channel in range(3):
+                fall_off = np.float32(model.fall_off[channel])
+                result[..., channel] *= np.clip(np.exp(fall_off * beyond), 0.2, 5.0)
+        return result
+
+    def to_json(self) -> dict[str, Any]:
+        """What was found, for `mosaic.json`."""
+        return {
+            "white_blue_green_red": [float(w) for w in self.light.white],
+            "fall_off_per_unit_blue_green_red": [float(b) for b in self.light.fall_off],
+            "middle_range": float(self.light.middle_range),
+            "added_light_share_blue_green_red": [float(s) for s in self.shares],
+            "added_light_share_sigma_blue_green_red": [
+                float(s) if np.isfinite(s) else None for s in self.share_sigmas
+            ],
+        }
+
+
+def solve_colour(
+    wanted: Colour,
+    samples: LightSamples,
+    facts: Sequence[PictureFacts],
+    images: Sequence[str],
+    cameras: Sequence[str],
+) -> ColourModel:
+    """Find the model from spots that two views see.
+
+    Args:
+        wanted: `raw`: pictures as they are; `even`: without m, g and b; `water`: without A too.
+        samples: linear light; its logarithm and ranges.
+        facts: of all pictures.
+        images: their names.
+        cameras: and cameras.
+    """
+    names = sorted(set(cameras))
+    nothing: Mapping[str, Array] = {name: np.zeros((*GRID, 3)) for name in names}
+    if wanted == "raw":
+        light = LightModel(
+            patterns=nothing, gains={image: np.zeros(3) for image in images}, white=np.ones(3)
+        )
+        return ColourModel(
+            light=light, added=nothing, shares=np.zeros(3), share_sigmas=np.full(3, np.nan),
+            notes=("colours: as the pictures show them",),
+        )  # fmt: skip
+    nodes = np.stack([fact.nodes for fact in facts])
+    added, shares, sigmas = nothing, np.zeros(3), np.full(3, np.nan)
+    notes = []
+    if wanted == "water":
+        added, shares, sigmas, note = _added(samples, nodes, facts, images, cameras)
+        notes.append(note)
+    cleaned = without(samples, added, cameras)
+    patterns = solve_patterns(
+        cleaned, _nodes_without(nodes, added, cameras), images, cameras, _GAIN_SIGMA
+    )
+    model = ColourModel(
+        light=patterns, added=added, shares=shares, share_sigmas=sigmas, notes=()
+    )  # fmt: skip
+    white = _white(cleaned, model, images, cameras)
+    notes.append(
+        "colours: light of lamp, lens and range evened out over the survey; one factor per colour "
+        "for the whole survey makes what is bright in it neutral and puts 2 % of it above, half of "
+        "it at most at, a middle brightness; sRGB"
+    )
+    return replace(model, light=replace(patterns, white=white), notes=tuple(notes))
+
+
+def without(
+    samples: LightSamples, added: Mapping[str, Array], cameras: Sequence[str]
+) -> LightSamples:
+    """Samples less the light that the water adds; where too little is left they are dropped."""
+    light = np.exp(samples.levels.astype(np.float64))
+    water = sampled(samples, added, cameras)
+    left = light - water
+    kept = (left > _LEAST_LEFT * light).all(axis=(1, 2))
+    return LightSamples(
+        views=samples.views[kept],
+        places=samples.places[kept],
+        levels=np.log(left[kept]).astype(np.float32),
+        ranges=None if samples.ranges is None else samples.ranges[kept],
+    )
+
+
+def sampled(samples: LightSamples, maps: Mapping[str, Array], cameras: Sequence[str]) -> Array:
+    """(N, 2, 3) values of maps over the pictures where both views see the spots."""
+    names = sorted(maps)
+    stacked = np.stack([maps[name].reshape(-1, 3) for name in names])
+    camera_of = np.array([names.index(camera) for camera in cameras])
+    values = np.empty((len(samples.views), 2, 3))
+    for side in range(2):
+        at, weights = node_weights(samples.places[:, side])
+        found = stacked[camera_of[samples.views[:, side]][:, None], at]
+        values[:, side] = (found * weights[..., None]).sum(axis=1)
+    return values
+
+
+def _nodes_without(nodes: Array, added: Mapping[str, Array], cameras: Sequence[str]) -> Array:
+    water = np.stack([added[camera] for camera in cameras])
+    left = np.exp(nodes) - water
+    with np.errstate(invalid="ignore"):
+        usable = left > _LEAST_LEFT * np.exp(nodes)
+    return np.where(usable, np.log(np.where(usable, left, 1.0)), np.nan)
+
+
+def darkest(facts: Sequence[PictureFacts], cameras: Sequence[str]) -> dict[str, Array] | None:
+    """Per camera (rows, columns, 3) light of the darkest that each place shows; None if too few."""
+    maps = {}
+    for name in sorted(set(cameras)):
+        mine = np.stack(
+            [f.dark for f, camera in zip(facts, cameras, strict=True) if camera == name]
+        )
+        if (np.isfinite(mine).sum(axis=0) < _FEWEST_PICTURES).any():
+            return None
+        level = np.nanquantile(mine, _DARK_QUANTILE, axis=0).astype(np.float32)
+        # light in water is smooth; a node may hold what was never dark there
+        level = np.minimum(level, cv2.medianBlur(level, 3))
+        maps[name] = cv2.GaussianBlur(level, (0, 0), 0.7).astype(np.float64)
+    return maps
+
+
+def _added(
+    samples: LightSamples,
+    nodes: Array,
+    facts: Sequence[PictureFacts],
+    images: Sequence[str],
+    cameras: Sequence[str],
+) -> tuple[Mapping[str, Array], Array, Array, str]:
+    """The water's light, its share of the darkest pixels' per channel with sigma, and a note."""
+    nothing = {name: np.zeros((*GRID, 3)) for name in sorted(set(cameras))}
+    unknown = np.full(3, np.nan)
+    dark = darkest(facts, cameras)
+    if dark is None:
+        note = (
+            f"colours: fewer than {_FEWEST_PICTURES} pictures of a camera show each place of it; "
+            "no light of the water taken away"
+        )
+        return nothing, np.zeros(3), unknown, note
+    thin = samples if len(samples.views) <= _MOST_SAMPLES else _thinned(samples)
+    cost = np.empty((len(_SHARES), 3))
+    for n, share in enumerate(_SHARES):
+        maps = {name: share * level for name, level in dark.items()}
+        cost[n] = _misfit(thin, maps, nodes, images, cameras)
+    shares, sigmas = np.zeros(3), unknown.copy()
+    for channel in range(3):
+        shares[channel], sigmas[channel] = _lowest(cost[:, channel])
+    told = sigmas <= _LARGEST_SIGMA
+    if not told.all():
+        words = ", ".join(f"{s:.2f}" for s in sigmas)
+        note = (
+            f"colours: overlaps do not tell the water's light (sigma of its share {words} for "
+            "blue, green, red); none taken away"
+        )
+        return nothing, np.zeros(3), sigmas, note
+    note = (
+        "colours: light that the water adds taken away: what the darkest pixels at each place of "
+        "the pictures show, times a share per colour that overlaps tell"
+    )
+    return {name: shares * level for name, level in dark.items()}, shares, sigmas, note
+
+
+def _thinned(samples: LightSamples) -> LightSamples:
+    step = -(-len(samples.views) // _MOST_SAMPLES)
+    return LightSamples(
+        views=samples.views[::step],
+        places=samples.places[::step],
+        levels=samples.levels[::step],
+        ranges=None if samples.ranges is None else samples.ranges[::step],
+    )
+
+
+def _misfit(
+    samples: LightSamples,
+    added: Mapping[str, Array],
+    nodes: Array,
+    images: Sequence[str],
+    cameras: Sequence[str],
+) -> Array:
+    """(3,) twice the negative logarithm of the likelihood of an additive light, robust.
+
+    Of two views I1 = M1 J + A1 and I2 = M2 J + A2 the difference (I1 - A1) M2 - (I2 - A2) M1 holds
+    only noise, whose size is that of I and does not shrink as A grows.
+    """
+    light = np.exp(samples.levels.astype(np.float64))
+    left = light - sampled(samples, added, cameras)
+    clean = without(samples, added, cameras)
+    model = solve_patterns(
+        clean, _nodes_without(nodes, added, cameras), images, cameras, _GAIN_SIGMA
+    )
+    factor = sampled(samples, model.patterns, cameras)
+    gains = np.stack([model.gains[image] for image in images])
+    factor = factor + gains[samples.views]
+    if samples.ranges is not None:
+        factor = factor - (samples.ranges - model.middle_range)[..., None] * model.fall_off
+    factor = np.exp(factor)
+    rest = left[:, 0] * factor[:, 1] - left[:, 1] * factor[:, 0]
+    size = np.hypot(light[:, 0] * factor[:, 1], light[:, 1] * factor[:, 0])
+    rest = rest / size
+    return np.asarray(_robust_cost(rest))
+
+
+def _robust_cost(rest: Array) -> Array:
+    """(3,) for errors of Laplace's distribution, whose size the rest itself tells."""
+    size = np.abs(rest)
+    mean = np.minimum(size, 4.0 * np.median(size, axis=0)).mean(axis=0) + 1e-9
+    return np.asarray(2.0 * len(rest) / SAMPLES_PER_FACT * np.log(mean))
+
+
+def _lowest(cost: Array) -> tuple[float, float]:
+    """Where a parabola through the costs of `_SHARES` is lowest between 0 and 1, and its sigma."""
+    best = int(np.clip(np.argmin(cost), 1, len(cost) - 2))
+    step = _SHARES[1] - _SHARES[0]
+    curve = (cost[best - 1] - 2.0 * cost[best] + cost[best + 1]) / step**2
+    if not curve > 0:
+        curve = max(curve, np.polyfit(_SHARES, cost, 2)[0] * 2.0)
+    if not curve > 0:
+        return 0.0, float("inf")
+    slope = (cost[best + 1] - cost[best - 1]) / (2.0 * step)
+    at = float(np.clip(_SHARES[best] - slope / curve, 0.0, 1.0))
+    return at, float(np.sqrt(2.0 / curve))
+
+
+def _white(
+    samples: LightSamples, model: ColourModel, images: Sequence[str], cameras: Sequence[str]
+) -> Array:
+    """Factors that make what is bright neutral, and the survey light without burning out.
+
+    The cast is the 6-norm of each colour, between the mean (grey world, which paints a lawn
+    purple) and the largest value ("shades of gray", Finlayson & Trezzi 2004).
+    """
+    if not len(samples.views):
+        return np.ones(3)
+    light = model.light
+    gains = np.stack([light.gains[image] for image in images])
+    lift = -(sampled(samples, light.patterns, cameras) + gains[samples.views])[:, 0]
+    if samples.ranges is not None:
+        lift = lift + (samples.ranges[:, :1] - light.middle_range) * light.fall_off
+    level = np.exp(samples.levels[:, 0] + lift)
+    cast = (level**_NORM).mean(axis=0) ** (1.0 / _NORM)
+    neutral = cast.mean() / cast
+    grey = (level * neutral).mean(axis=1)
+    bright, middle = np.percentile(grey, _BRIGHT_PERCENT), np.median(grey)
+    white: Array = neutral * min(_BRIGHT_LIGHT / bright, _MIDDLE_LIGHT / middle)
+    return white

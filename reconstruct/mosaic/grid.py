@@ -1,0 +1,222 @@
+"""Pixels of the mosaic, its tiles, the views that reach each, and the surface below them."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from rasterio.windows import Window
+
+from alice_survey.errors import ReconstructionError, warn
+from alice_survey.frames import Array
+from reconstruct.dense.dem import DemGrid
+from reconstruct.dense.points import enu_from_cam
+from reconstruct.dense.stereo_pairs import points_of_views
+from reconstruct.model import SparseModel, View, WorldFrame
+from reconstruct.raster import tiles_of
+
+Float32 = NDArray[np.float32]
+
+CELL_PX = 8
+"""Pixels a side of the cells on which views are compared and seams are laid."""
+ALIGNED_PX = 2 * CELL_PX
+"""Blocks are a whole number of these, so that they share the pixels of their pyramids."""
+_MOST_PIXELS = 4_000_000_000
+_FLATTEST_SLOPE = 5.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Footprints:
+    """What each view may see between the lowest and the highest cell of the DEM."""
+
+    boxes: Array
+    """(V, 4) west, east, south, north; infinite for views that reach the horizon."""
+    reach: Array
+    """(V,) how far off, on the ground, the DEM may hide something from a view."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Block:
+    """A part of the mosaic and the views that may see it."""
+
+    window: Window
+    """Of the mosaic, in its pixels, a margin included; it may reach beyond the mosaic's edges."""
+    core: Window
+    """The part of the mosaic that this block is to fill."""
+    grid: DemGrid
+    """Of the window's pixels."""
+    views: tuple[int, ...]
+    """Numbers of views."""
+    reach: float
+    """How far off, on the ground, the DEM may hide something in the window."""
+
+
+def mosaic_grid(raster: rasterio.DatasetReader, pixel: float, frame: WorldFrame) -> DemGrid:
+    """Pixels over the whole of the DEM; larger ones than wanted where there would be too many."""
+    transform = raster.transform
+    width, height = raster.width * transform.a, -raster.height * transform.e
+    while width * height / pixel**2 > _MOST_PIXELS:
+        warn(
+            f"pixels of {pixel} {frame.unit} would make a mosaic of "
+            f"{width * height / pixel**2 / 1e9:.0f} Gpx; they are doubled"
+        )
+        pixel *= 2.0
+    return DemGrid(
+        west=transform.c,
+        north=transform.f,
+        cell=pixel,
+        rows=int(np.ceil(height / pixel)),
+        columns=int(np.ceil(width / pixel)),
+    )
+
+
+def footprints(views: tuple[View, ...], heights: tuple[float, float]) -> Footprints:
+    """Boxes on the ground of all views, for a DEM between two heights."""
+    found = [_footprint(view, heights) for view in views]
+    boxes = np.array([box for box, _ in found]).reshape(-1, 4)
+    slopes = np.array([slope for _, slope in found])
+    return Footprints(boxes=boxes, reach=slopes * (heights[1] - heights[0]))
+
+
+def _footprint(
+    view: View, heights: tuple[float, float]
+) -> tuple[tuple[float, float, float, float], float]:
+    """What a view sees between two heights, and its flattest line of sight (ground per height)."""
+    camera = enu_from_cam(view, np.zeros(3))
+    w, h = view.width_px, view.height_px
+    corners = np.array([[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]]) - [view.cx_px, view.cy_px]
+    rays = np.column_stack([corners / [view.fx_px, view.fy_px], np.ones(4)]) @ camera[:, :3].T
+    if (rays[:, 2] > -0.2 * np.linalg.norm(rays[:, :2], axis=1)).any():
+        return (-np.inf, np.inf, -np.inf, np.inf), _FLATTEST_SLOPE
+    slope = float((np.linalg.norm(rays[:, :2], axis=1) / -rays[:, 2]).max())
+    centre = camera[:, 3]
+    reach = [(centre[2] - height) / -rays[:, 2:] for height in heights]
+    ground = np.concatenate([centre[:2] + r * rays[:, :2] for r in reach])
+    (west, south), (east, north) = ground.min(axis=0), ground.max(axis=0)
+    return (float(west), float(east), float(south), float(north)), slope
+
+
+def blocks_of(grid: DemGrid, seen: Footprints, size: int, margin: int) -> list[Block]:
+    """Blocks row by row, each with the views whose footprint reaches it.
+
+    Args:
+        grid: of the mosaic.
+        seen: by its views.
+        size: pixels a side of a core.
+        margin: pixels around it.
+    """
+    blocks = []
+    for core in tiles_of(grid, size):
+        window = Window(
+            core.col_off - margin,
+            core.row_off - margin,
+            _aligned(core.width) + 2 * margin,
+            _aligned(core.height) + 2 * margin,
+        )
+        part = grid.window(window.row_off, window.col_off, window.height, window.width)
+        east, south = float(part.east_of(part.columns)), float(part.north_of(part.rows))
+        b = seen.boxes
+        reaching = np.flatnonzero(
+            (b[:, 0] < east) & (b[:, 1] > part.west) & (b[:, 2] < part.north) & (b[:, 3] > south)
+        )
+        reach = float(seen.reach[reaching].max(initial=0.0))
+        blocks.append(
+            Block(
+                window=window,
+                core=core,
+                grid=part,
+                views=tuple(int(n) for n in reaching),
+                reach=min(reach, 512 * grid.cell),
+            )
+        )
+    return blocks
+
+
+def coarse(grid: DemGrid) -> DemGrid:
+    """The cells of a grid of pixels; its size is a whole number of them."""
+    return DemGrid(
+        west=grid.west,
+        north=grid.north,
+        cell=grid.cell * CELL_PX,
+        rows=grid.rows // CELL_PX,
+        columns=grid.columns // CELL_PX,
+    )
+
+
+def cells_over(pixels: int) -> int:
+    """Cells that cover a number of pixels."""
+    return -(-pixels // CELL_PX)
+
+
+def _aligned(pixels: int) -> int:
+    return -(-int(pixels) // ALIGNED_PX) * ALIGNED_PX
+
+
+def mean_pixel(model: SparseModel) -> float:
+    """Median over the views of the side of a pixel on the ground."""
+    sides = []
+    for view, points in zip(model.views, points_of_views(model), strict=True):
+        if len(points):
+            depth = view.world_from_cam.inv().apply(points)[:, 2]
+            sides.append(np.median(depth) / np.sqrt(view.fx_px * view.fy_px))
+    return float(np.median(sides))
+
+
+def height_range(raster: rasterio.DatasetReader) -> tuple[float, float]:
+    """Lowest and highest cell of a DEM.
+
+    Raises:
+        ReconstructionError: it has no cell.
+    """
+    low, high = np.inf, -np.inf
+    for block in _blocks(raster):
+        if np.isfinite(block).any():
+            low, high = min(low, float(np.nanmin(block))), max(high, float(np.nanmax(block)))
+    if low > high:
+        raise ReconstructionError(f"{raster.name} has no cell with a height to paint on")
+    return low, high
+
+
+def _blocks(raster: rasterio.DatasetReader) -> Iterator[Float32]:
+    for _, window in raster.block_windows(1):
+        yield raster.read(1, window=window)
+
+
+def dem_around(
+    raster: rasterio.DatasetReader, grid: DemGrid, reach: float
+) -> tuple[Float32, DemGrid]:
+    """The DEM of a grid and as far around it as something may hide it."""
+    transform = raster.transform
+    cell = transform.a
+    margin = int(np.ceil(reach / cell)) + 2
+    left = max(0, int((grid.west - transform.c) / cell) - margin)
+    top = max(0, int((transform.f - grid.north) / cell) - margin)
+    right = int(np.ceil((grid.west + grid.columns * grid.cell - transform.c) / cell)) + margin
+    bottom = int(np.ceil((transform.f - grid.north + grid.rows * grid.cell) / cell)) + margin
+    right, bottom = min(raster.width, right), min(raster.height, bottom)
+    heights = raster.read(1, window=Window(left, top, right - left, bottom - top))
+    around = DemGrid(
+        west=transform.c + left * cell,
+        north=transform.f - top * cell,
+        cell=cell,
+        rows=bottom - top,
+        columns=right - left,
+    )
+    return heights, around
+
+
+def height_at_pixels(dem: Float32, around: DemGrid, grid: DemGrid) -> Float32:
+    """Bilinear heights at the centres of a grid's pixels; NaN where a cell around is unknown.
+
+    At the outer edge of the DEM the last cell's height holds for the half cell beyond its centre;
+    farther out nothing is known.
+    """
+    columns = (grid.east_of(np.arange(grid.columns) + 0.5) - around.west) / around.cell - 0.5
+    rows = (around.north - grid.north_of(np.arange(grid.rows) + 0.5)) / around.cell - 0.5
+    x, y = np.meshgrid(columns.astype(np.float32), rows.astype(np.float32))
+    height: Float32 = cv2.remap(dem, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    height[:, (columns < -0.5) | (columns > around.columns - 0.5)] = np.nan
+    height[(rows < -0.5) | (rows > around.rows - 0.5)] = np.nan
+    return height

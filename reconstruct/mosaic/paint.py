@@ -1,0 +1,547 @@
+"""Tasks of the mosaic: compare light, lay seams, paint tiles. Each works on one block."""
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from rasterio.windows import Window
+
+from reconstruct.dense.dem import DemGrid
+from reconstruct.lenses.lens import FlatPortLens
+from reconstruct.model import View
+from reconstruct.mosaic.blend import Blend, Part
+from reconstruct.mosaic.colour import ColourModel
+from reconstruct.mosaic.facts import SmallCopies, encoded, linear_table, telling
+from reconstruct.mosaic.grid import ALIGNED_PX, CELL_PX, Block, coarse, dem_around
+from reconstruct.mosaic.light import LightSamples, at_places, joined_samples
+from reconstruct.mosaic.ortho import lanczos_weights, sample_lanczos
+from reconstruct.mosaic.seams import candidates, choose_views
+from reconstruct.mosaic.sight import (
+    Ground,
+    Optics,
+    Seen,
+    Surface,
+    Water,
+    camera_optics,
+    channel_optics,
+    see,
+)
+from reconstruct.pictures.undistorted import Pictures
+
+Float32 = NDArray[np.float32]
+
+_CACHED_BYTES = 130_000_000
+"""Pictures as taken that each process keeps."""
+_BROAD_POWER = 3
+"""Power of quality that weighs views in the broadest band."""
+_LARGEST_CHANGE = 3.0
+"""Factor by which broad tones of a view are changed at most to meet its neighbours'."""
+_FEW_PX = 16
+"""Cells on which light is compared lie at least this far apart."""
+_PAIRS = 6
+"""Other views with which one is compared at a spot, at most."""
+_SHARP = (0.4, 1.1)
+"""Least and largest factor of quality for a picture less or more sharp than the median one."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Survey:
+    """What all tasks share; it travels to each process once a task."""
+
+    workspace: Path
+    scratch: Path
+    scaled: bool
+    water: Water | None
+    """Of the port's dispersion; None where channels are not told apart."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SeenView:
+    """A view and what the survey knows of its picture."""
+
+    number: int
+    view: View
+    sharpness: float
+    """Over the survey's median."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LightTask:
+    """A block on which to compare what views show."""
+
+    survey: Survey
+    block: Block
+    views: tuple[SeenView, ...]
+    step_px: int
+    """Distance of spots."""
+    most: int
+    """Samples to return at most."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Look:
+    """How a view sees the cells of a box of a block."""
+
+    entry: SeenView
+    sight: Seen
+    box: tuple[slice, slice]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Shown:
+    """Spots of a lattice that a view shows; arrays of N rows."""
+
+    number: int
+    spots: NDArray[np.intp]
+    places: Float32
+    levels: Float32
+    ranges: Float32
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PaintTask:
+    """A block to lay seams in, or to paint."""
+
+    survey: Survey
+    block: Block
+    views: tuple[SeenView, ...]
+    colour: ColourModel
+    even: bool
+    """Broad tones are made to meet."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Labels:
+    """Views of a block's cells."""
+
+    block: Block
+    label: NDArray[np.uint16]
+    """(rows, columns) of the core's cells: number of the view plus one; 0 where none sees."""
+    pictures: NDArray[np.uint16]
+    """(rows, columns) how many pictures see the cell."""
+    stations: NDArray[np.uint16]
+    """(rows, columns) how many stations do."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Painted:
+    """A painted tile."""
+
+    window: Window
+    rgba: NDArray[np.uint8]
+    """(4, H, W)."""
+    source: NDArray[np.uint16]
+    """(H, W) number of the view plus one; 0 where nothing is known."""
+
+
+def compare_block(task: LightTask) -> LightSamples:
+    """Samples of light on a lattice of spots, in linear light."""
+    tools = _tools(task.survey)
+    surface = _ground(task.survey, task.block).surface(_lattice(task.block.grid, task.step_px))
+    if not np.isfinite(surface.height).any():
+        return joined_samples([])
+    seen = []
+    for entry in task.views:
+        optics = tools.optics(entry.view)
+        sight = see(entry.view, optics, surface)
+        spots = np.flatnonzero(sight.quality.ravel() > 0)
+        copy = tools.small.load(entry.view.image)
+        across, down = sight.places(optics.size_px)
+        places = np.column_stack([across.ravel()[spots], down.ravel()[spots]])
+        levels = at_places(copy.broad, places)
+        usable = telling(levels) & (at_places(copy.valid[..., None], places, 1)[:, 0] > 0.9)
+        seen.append(
+            _Shown(
+                number=entry.number,
+                spots=spots[usable],
+                places=places[usable],
+                levels=np.log(levels[usable]),
+                ranges=sight.range.ravel()[spots[usable]],
+            )
+        )
+    parts = []
+    for i, one in enumerate(seen):
+        for other in seen[i + 1 :]:
+            _, a, b = np.intersect1d(
+                one.spots, other.spots, assume_unique=True, return_indices=True
+            )
+            if not len(a):
+                continue
+            parts.append(
+                LightSamples(
+                    views=np.tile(np.array([[one.number, other.number]], np.int32), (len(a), 1)),
+                    places=np.stack([one.places[a], other.places[b]], axis=1),
+                    levels=np.stack([one.levels[a], other.levels[b]], axis=1),
+                    ranges=np.stack([one.ranges[a], other.ranges[b]], axis=1),
+                )
+            )
+    found = joined_samples(parts)
+    if len(found.views) <= task.most:
+        return found
+    rng = np.random.default_rng([task.block.core.row_off, task.block.core.col_off])
+    kept = np.sort(rng.choice(len(found.views), task.most, replace=False))
+    return LightSamples(
+        views=found.views[kept],
+        places=found.places[kept],
+        levels=found.levels[kept],
+        ranges=None if found.ranges is None else found.ranges[kept],
+    )
+
+
+def label_block(task: PaintTask) -> Labels:
+    """Choose the view of each cell of a block."""
+    block = task.block
+    inner = _inner(block)
+    rows, columns = block.grid.rows // CELL_PX, block.grid.columns // CELL_PX
+    label = np.zeros((rows, columns), np.uint16)
+    pictures, stations = np.zeros_like(label), np.zeros_like(label)
+    surface = _ground(task.survey, block).surface(coarse(block.grid))
+    looks = _looks(task, surface) if np.isfinite(surface.height).any() else []
+    if looks:
+        tools = _tools(task.survey)
+        quality = np.zeros((len(looks), rows, columns), np.float32)
+        by_station: dict[int, NDArray[np.bool_]] = {}
+        for row, found in enumerate(looks):
+            quality[row][found.box] = found.sight.quality
+            pictures += quality[row] > 0
+            seen = by_station.setdefault(found.entry.view.station, np.zeros(label.shape, bool))
+            seen |= quality[row] > 0
+        stations = np.sum(list(by_station.values()), axis=0, dtype=np.uint16)
+        numbers = np.array([found.entry.number for found in looks], np.int32)
+        number, share, row_of = candidates(quality, numbers)
+        colours = np.zeros((*number.shape, 3), np.float32)
+        for row, found in enumerate(looks):
+            used = ((row_of == row) & (number >= 0))[found.box]
+            if used.any():
+                at = np.nonzero(used)
+                shown = _logarithm(_small_light(task, tools, found, broad=False))
+                colours[found.box][at] = shown[at[0], at[1]]
+        chosen = choose_views(number, share, colours)
+        known = chosen >= 0
+        taken = np.take_along_axis(number, np.maximum(chosen, 0)[..., None], axis=2)[..., 0]
+        label = np.where(known, taken + 1, 0).astype(np.uint16)
+    return Labels(
+        block=block, label=label[inner], pictures=pictures[inner], stations=stations[inner]
+    )
+
+
+def paint_tile(task: PaintTask) -> Painted:
+    """Paint one tile with the views that the survey's seams give it."""
+    block, tools = task.block, _tools(task.survey)
+    grid = block.grid
+    empty = _unknown(block)
+    label = _labels(task.survey, block)
+    if not label.any():
+        return empty
+    ground = _ground(task.survey, block)
+    cells = ground.surface(coarse(grid))
+    looks = _looks(task, cells)
+    changes = _changes(task, tools, looks, cells.height.shape)
+    surface = ground.surface(grid)
+    wanted = cv2.resize(label, (grid.columns, grid.rows), interpolation=cv2.INTER_NEAREST)
+    wanted[~np.isfinite(surface.height)] = 0
+    blend = Blend(grid.rows, grid.columns)
+    source = np.zeros((grid.rows, grid.columns), np.uint16)
+    open_pixels = wanted > 0
+    sights = {}
+    order = np.unique(label[label > 0])
+    entries = {found.entry.number: found.entry for found in looks}
+    masks = {}
+    for value in order:  # pixels of a cell that its view does not see go to the best that does
+        entry = entries.get(int(value) - 1)
+        if entry is None:
+            continue
+        part = _box(cv2.dilate((label == value).astype(np.uint8), np.ones((17, 17), np.uint8)) > 0)
+        sight = _sight_of(task, entry, surface.part(*part))
+        sights[int(value)] = (part, sight)
+        masks[int(value)] = (wanted[part] == value) & (sight.quality > 0)
+        source[part][masks[int(value)]] = value
+    left = open_pixels & (source == 0)
+    if left.any():
+        best = np.zeros(left.shape, np.float32)
+        for value, (part, sight) in sights.items():
+            better = left[part] & (sight.quality > best[part])
+            best[part][better] = sight.quality[better]
+            source[part][better] = value
+    for value, (part, sight) in sights.items():
+        taken = source[part] == value
+        if not taken.any():
+            continue
+        entry = entries[value - 1]
+        colour = _colours(task, tools, entry, sight, surface, part, changes.get(entry.number))
+        blend.add(
+            Part(
+                row=part[0].start,
+                column=part[1].start,
+                colour=colour,
+                valid=sight.quality > 0,
+                taken=taken,
+            )
+        )
+    margin = block.core.row_off - block.window.row_off
+    inner = (
+        slice(margin, margin + block.core.height),
+        slice(margin, margin + block.core.width),
+    )
+    source = source[inner]
+    known = source > 0
+    levels = np.rint(np.clip(blend.result()[inner], 0, 255)).astype(np.uint8)
+    rgba = np.zeros((4, *known.shape), np.uint8)
+    rgba[:3] = np.where(known[..., None], levels[..., ::-1], 0).transpose(2, 0, 1)
+    rgba[3] = np.where(known, 255, 0)
+    return Painted(window=block.core, rgba=rgba, source=source)
+
+
+def _unknown(block: Block) -> Painted:
+    shape = (block.core.height, block.core.width)
+    return Painted(
+        window=block.core,
+        rgba=np.zeros((4, *shape), np.uint8),
+        source=np.zeros(shape, np.uint16),
+    )
+
+
+def _box(used: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """Pixels of a box of cells around those that are used, on whole aligned pixels."""
+    parts = []
+    for axis, count in ((1, used.shape[0]), (0, used.shape[1])):
+        at = np.flatnonzero(used.any(axis=axis))
+        step = ALIGNED_PX // CELL_PX
+        first = int(at[0]) // step * step
+        last = min(-(-(int(at[-1]) + 1) // step) * step, count)
+        parts.append(slice(first * CELL_PX, last * CELL_PX))
+    return parts[0], parts[1]
+
+
+def _lattice(grid: DemGrid, step_px: int) -> DemGrid:
+    return DemGrid(
+        west=grid.west,
+        north=grid.north,
+        cell=grid.cell * step_px,
+        rows=-(-grid.rows // step_px),
+        columns=-(-grid.columns // step_px),
+    )
+
+
+def _ground(survey: Survey, block: Block) -> Ground:
+    with rasterio.open(survey.workspace / "dense" / "dem.tif") as raster:
+        return Ground(*dem_around(raster, block.grid, block.reach))
+
+
+def _looks(task: PaintTask, surface: Surface) -> list[_Look]:
+    """How all views see a block's cells; quality takes sharpness and light in, masks leave out."""
+    tools = _tools(task.survey)
+    looks = []
+    for entry in task.views:
+        optics = tools.optics(entry.view)
+        sight = see(entry.view, optics, surface)
+        if not sight.quality.any():
+            continue
+        box = _bounding(sight.quality > 0)
+        sight = Seen(
+            x=sight.x[box], y=sight.y[box], quality=sight.quality[box], range=sight.range[box]
+        )
+        across, down = sight.places(optics.size_px)
+        copy = tools.small.load(entry.view.image)
+        quality = sight.quality * np.float32(np.clip(entry.sharpness, *_SHARP))
+        # dark rims are noisy: their light, where it is less than the middle one, counts as distance
+        pattern = task.colour.light.patterns[entry.view.camera]
+        light = np.exp(np.minimum(pattern.mean(axis=2), 0.0)).astype(np.float32)
+        places = np.column_stack([across.ravel(), down.ravel()])
+        quality *= at_places(light[..., None], places, 1).reshape(quality.shape)
+        if not copy.whole:
+            valid = at_places(copy.valid[..., None], places, 1).reshape(quality.shape)
+            quality[valid < 0.999] = 0
+        if quality.any():
+            looks.append(_Look(entry=entry, sight=replace(sight, quality=quality), box=box))
+    return looks
+
+
+def _bounding(used: NDArray[np.bool_]) -> tuple[slice, slice]:
+    rows, columns = np.flatnonzero(used.any(axis=1)), np.flatnonzero(used.any(axis=0))
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+
+
+def _small_light(task: PaintTask, tools: "_Tools", found: _Look, *, broad: bool) -> Float32:
+    """Corrected light of a view's small copy at the cells of its box, (h, w, 3)."""
+    view, sight = found.entry.view, found.sight
+    copy = tools.small.load(view.image)
+    across, down = sight.places(tools.optics(view).size_px)
+    places = np.column_stack([across.ravel(), down.ravel()])
+    shape = (*sight.quality.shape, 3)
+    shown = at_places(copy.broad if broad else copy.detail, places).reshape(shape)
+    return task.colour.corrected(shown, view.camera, view.image, (across, down), sight.range)
+
+
+def _logarithm(light: Float32) -> Float32:
+    found: Float32 = np.log(np.maximum(light, np.float32(1e-3)))
+    return found
+
+
+def _changes(
+    task: PaintTask, tools: "_Tools", looks: list[_Look], shape: tuple[int, ...]
+) -> dict[int, tuple[Float32, tuple[slice, slice]]]:
+    """Per view factors (h, w, 3) at the cells of a box that take its broad tones to the mean."""
+    if not task.even or not looks:
+        return {}
+    best = np.zeros(shape, np.float32)
+    for found in looks:
+        best[found.box] = np.maximum(best[found.box], found.sight.quality)
+    total = np.zeros((*shape, 3), np.float32)
+    weight = np.zeros(shape, np.float32)
+    tones = []
+    for found in looks:
+        tone = _logarithm(_small_light(task, tools, found, broad=True))
+        share = found.sight.quality / np.maximum(best[found.box], np.float32(1e-30))
+        share = share**_BROAD_POWER
+        total[found.box] += share[..., None] * tone
+        weight[found.box] += share
+        tones.append(tone)
+    mean = total / np.maximum(weight, np.float32(1e-12))[..., None]
+    limit = np.float32(np.log(_LARGEST_CHANGE))
+    changes = {}
+    for found, tone in zip(looks, tones, strict=True):
+        seen = found.sight.quality > 0
+        change = np.clip(mean[found.box] - tone, -limit, limit) * seen[..., None]
+        # cells that the view does not see take the change of those beside them
+        near = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), 1.5)
+        spread = cv2.GaussianBlur(change, (0, 0), 1.5).reshape(change.shape)
+        spread = spread / np.maximum(near, np.float32(1e-3))[..., None]
+        factor = np.exp(np.where(seen[..., None], change, spread))
+        changes[found.entry.number] = (factor.astype(np.float32), found.box)
+    return changes
+
+
+def _sight_of(task: PaintTask, entry: SeenView, surface: Surface) -> Seen:
+    """How a view sees pixels, its mask applied exactly."""
+    tools = _tools(task.survey)
+    sight = see(entry.view, tools.optics(entry.view), surface)
+    usable = tools.usable(entry.view.image)
+    if usable is not None and sight.quality.any():
+        inside = cv2.remap(
+            usable.astype(np.uint8) * np.uint8(255), sight.x, sight.y, cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT,
+        )  # fmt: skip
+        sight = replace(sight, quality=np.where(inside < 255, np.float32(0), sight.quality))
+    return sight
+
+
+def _colours(
+    task: PaintTask,
+    tools: "_Tools",
+    entry: SeenView,
+    sight: Seen,
+    surface: Surface,
+    part: tuple[slice, slice],
+    change: tuple[Float32, tuple[slice, slice]] | None,
+) -> Float32:
+    """Corrected colours of a view at the pixels of a box, levels, BGR."""
+    view = entry.view
+    picture = tools.picture(view.image)
+    light = np.zeros((*sight.quality.shape, 3), np.float32)
+    x = np.where(sight.quality > 0, sight.x, np.float32(-1))
+    channels = tools.channels(view)
+    if channels is None:
+        sample_lanczos(picture, tools.table, tools.weights, x, sight.y, 0, 3, light)
+    else:
+        local = surface.part(*part)
+        for channel, optics in enumerate(channels):
+            own = see(view, optics, local)
+            seen = (own.quality > 0) & (sight.quality > 0)
+            own_x = np.where(seen, own.x, np.where(sight.quality > 0, sight.x, np.float32(-1)))
+            own_y = np.where(seen, own.y, sight.y)
+            sample_lanczos(
+                picture, tools.table, tools.weights, own_x, own_y, channel, channel + 1, light
+            )
+    places = sight.places(tools.optics(view).size_px)
+    light = task.colour.corrected(light, view.camera, view.image, places, sight.range)
+    if change is not None:
+        # bilinear between the centres of cells
+        factor, box = change
+        at_x = (np.arange(part[1].start, part[1].stop) + 0.5) / CELL_PX - 0.5 - box[1].start
+        at_y = (np.arange(part[0].start, part[0].stop) + 0.5) / CELL_PX - 0.5 - box[0].start
+        x_map, y_map = np.meshgrid(at_x.astype(np.float32), at_y.astype(np.float32))
+        light *= cv2.remap(factor, x_map, y_map, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return encoded(light)
+
+
+def _inner(block: Block) -> tuple[slice, slice]:
+    """Cells of the core within the block's."""
+    margin = (block.core.row_off - block.window.row_off) // CELL_PX
+    rows = -(-block.core.height // CELL_PX)
+    columns = -(-block.core.width // CELL_PX)
+    return slice(margin, margin + rows), slice(margin, margin + columns)
+
+
+def label_path(scratch: Path) -> Path:
+    """File of the survey's labels, (rows, columns) of cells."""
+    return scratch / "labels.npy"
+
+
+def _labels(survey: Survey, block: Block) -> NDArray[np.uint16]:
+    """Labels of a block's cells; 0 beyond the mosaic."""
+    stored = np.load(label_path(survey.scratch), mmap_mode="r")
+    rows, columns = block.grid.rows // CELL_PX, block.grid.columns // CELL_PX
+    top, left = block.window.row_off // CELL_PX, block.window.col_off // CELL_PX
+    label = np.zeros((rows, columns), np.uint16)
+    r0, c0 = max(0, top), max(0, left)
+    r1, c1 = min(stored.shape[0], top + rows), min(stored.shape[1], left + columns)
+    label[r0 - top : r1 - top, c0 - left : c1 - left] = stored[r0:r1, c0:c1]
+    return label
+
+
+class _Tools:
+    """What a process keeps between tasks."""
+
+    def __init__(self, workspace: Path, scratch: Path, scaled: bool, water: Water | None) -> None:
+        self._pictures = Pictures.open(workspace)
+        self.small = SmallCopies(scratch)
+        self.table = linear_table()
+        self.weights = lanczos_weights()
+        self._water, self._scaled = water, scaled
+        self._optics: dict[str, Optics] = {}
+        self._channels: dict[str, tuple[Optics, ...]] = {}
+        self._kept: dict[str, NDArray[np.uint8]] = {}
+
+    def optics(self, view: View) -> Optics:
+        """Of a view's camera (its green channel)."""
+        if view.camera not in self._optics:
+            self._optics[view.camera] = camera_optics(self._pictures.lens(view.image), self._scaled)
+        return self._optics[view.camera]
+
+    def channels(self, view: View) -> tuple[Optics, ...] | None:
+        """Of a view's channels, BGR; None where they share one."""
+        lens = self._pictures.lens(view.image)
+        if self._water is None or not isinstance(lens, FlatPortLens):
+            return None
+        if view.camera not in self._channels:
+            self._channels[view.camera] = channel_optics(lens, self._water, self._scaled)
+        return self._channels[view.camera]
+
+    def usable(self, image: str) -> NDArray[np.bool_] | None:
+        """Mask of a picture as taken."""
+        return self._pictures.usable(image)
+
+    def picture(self, image: str) -> NDArray[np.uint8]:
+        """A picture as taken; the last few stay in memory."""
+        if image in self._kept:
+            self._kept[image] = self._kept.pop(image)  # now the last to go
+            return self._kept[image]
+        taken = self._pictures.taken(image)
+        while len(self._kept) >= max(1, _CACHED_BYTES // taken.nbytes):
+            del self._kept[next(iter(self._kept))]
+        self._kept[image] = taken
+        return taken
+
+
+def _tools(survey: Survey) -> _Tools:
+    return _kept_tools(survey.workspace, survey.scratch, survey.scaled, survey.water)
+
+
+@lru_cache(maxsize=1)
+def _kept_tools(workspace: Path, scratch: Path, scaled: bool, water: Water | None) -> _Tools:
+    return _Tools(workspace, scratch, scaled, water)

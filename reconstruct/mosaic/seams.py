@@ -1,0 +1,169 @@
+"""Where one view ends and the next begins: seams laid where neighbours agree.
+
+Each cell of the survey takes one of the few views that see it best. The energy is the sum over
+cells of the loss of quality, and over neighbouring cells that take different views of a cost that
+grows with how much those two views differ there, so that seams go around what the views show
+differently: edges of objects, shadows, things that move. It is lowered by sequential
+tree-reweighted message passing (Kolmogorov 2006, TPAMI 28(10)), which takes a data term and many
+views in the same sweep and for two views comes close to the minimal cut.
+"""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+
+MOST_VIEWS = 6
+"""Candidates of a cell."""
+LEAST_SHARE = 0.3
+"""Of the best quality that a candidate must have."""
+_SWEEPS = 24
+_SEAM_COST = 0.1
+"""Of a seam along one cell where views agree, in logarithms of quality lost in one cell."""
+_DIFFERENCE_COST = 10.0
+"""Of a seam along one cell where views differ by a factor of e."""
+_MOST_DIFFERENCE = 1.0
+
+
+def candidates(
+    qualities: Float32, views: NDArray[np.int32]
+) -> tuple[NDArray[np.int32], Float32, NDArray[np.int64]]:
+    """The best views of each cell.
+
+    Args:
+        qualities: (V, H, W), 0 where a view does not see a cell.
+        views: (V,) their numbers.
+
+    Returns:
+        (H, W, K) numbers, -1 where there are fewer, best first; (H, W, K) qualities over the best;
+        and (H, W, K) rows of `qualities`.
+    """
+    kept = min(MOST_VIEWS, len(views))
+    order = np.argsort(-qualities, axis=0, kind="stable")[:kept]
+    best = np.take_along_axis(qualities, order, axis=0)
+    share = best / np.maximum(best[:1], np.float32(1e-30))
+    number = np.where((best > 0) & (share >= LEAST_SHARE), views[order], -1)
+    return (
+        np.ascontiguousarray(number.transpose(1, 2, 0)).astype(np.int32),
+        np.ascontiguousarray(share.transpose(1, 2, 0)),
+        np.ascontiguousarray(order.transpose(1, 2, 0)),
+    )
+
+
+def choose_views(number: NDArray[np.int32], share: Float32, colours: Float32) -> NDArray[np.int32]:
+    """Index of the candidate that each cell takes, (H, W); -1 where it has none.
+
+    Args:
+        number: (H, W, K) views, -1 where there are fewer.
+        share: (H, W, K) quality over the best one's.
+        colours: (H, W, K, 3) logarithm of what they show there.
+    """
+    own = np.where(number >= 0, -np.log(np.maximum(share, 1e-6)), np.inf).astype(np.float32)
+    chosen: NDArray[np.int32] = _trws(number, own, colours, _SWEEPS)
+    return chosen
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def seam_cost(
+    number_p: NDArray[np.int32], number_q: NDArray[np.int32], colours_p: Float32,
+    colours_q: Float32, a: int, b: int,
+) -> float:  # fmt: skip
+    """Cost between neighbouring cells of which one takes its candidate a, the other its b.
+
+    Args:
+        number_p: (K,) candidates of the one.
+        number_q: (K,) of the other.
+        colours_p: (K, 3) what they show.
+        colours_q: (K, 3).
+        a: index.
+        b: index.
+    """
+    if number_p[a] == number_q[b]:
+        return 0.0
+    total = 0.0
+    for side in range(2):
+        # how much the two views differ in one of the cells; unknown counts as most
+        difference = _MOST_DIFFERENCE
+        if side == 0:
+            for k in range(len(number_p)):
+                if number_p[k] == number_q[b]:
+                    difference = 0.0
+                    for c in range(3):
+                        difference += abs(colours_p[a, c] - colours_p[k, c]) / 3.0
+        else:
+            for k in range(len(number_q)):
+                if number_q[k] == number_p[a]:
+                    difference = 0.0
+                    for c in range(3):
+                        difference += abs(colours_q[b, c] - colours_q[k, c]) / 3.0
+        total += min(difference, _MOST_DIFFERENCE)
+    return _SEAM_COST + _DIFFERENCE_COST * 0.5 * total
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _trws(
+    number: NDArray[np.int32], own: Float32, colours: Float32, sweeps: int
+) -> NDArray[np.int32]:
+    rows, columns, most = number.shape
+    # edges[r, c, 0] to the right, [1] downwards; messages into a cell from left, up, right, down
+    edges = np.zeros((rows, columns, 2, most, most), np.float32)
+    count = np.zeros((rows, columns), np.int32)
+    for r in range(rows):
+        for c in range(columns):
+            while count[r, c] < most and number[r, c, count[r, c]] >= 0:
+                count[r, c] += 1
+    for r in range(rows):
+        for c in range(columns):
+            for way in range(2):
+                s, d = r + way, c + 1 - way
+                if s >= rows or d >= columns:
+                    continue
+                for a in range(count[r, c]):
+                    for b in range(count[s, d]):
+                        edges[r, c, way, a, b] = seam_cost(
+                            number[r, c], number[s, d], colours[r, c], colours[s, d], a, b
+                        )
+    messages = np.zeros((rows, columns, 4, most), np.float32)
+    chosen = np.full((rows, columns), -1, np.int32)
+    total = np.zeros(most)
+    for sweep in range(sweeps):
+        forward = sweep % 2 == 0
+        for i in range(rows * columns):
+            at = i if forward else rows * columns - 1 - i
+            r, c = at // columns, at % columns
+            n = count[r, c]
+            if n == 0:
+                continue
+            for a in range(n):
+                total[a] = own[r, c, a]
+                for side in range(4):
+                    total[a] += messages[r, c, side, a]
+            for way in range(2):
+                s, d = (r + way, c + 1 - way) if forward else (r - way, c - 1 + way)
+                if s < 0 or d < 0 or s >= rows or d >= columns or count[s, d] == 0:
+                    continue
+                came = (2 + way) if forward else way
+                into = way if forward else 2 + way
+                least = np.inf
+                for b in range(count[s, d]):
+                    low = np.inf
+                    for a in range(n):
+                        pair = edges[r, c, way, a, b] if forward else edges[s, d, way, b, a]
+                        low = min(low, 0.5 * total[a] - messages[r, c, came, a] + pair)
+                    messages[s, d, into, b] = low
+                    least = min(least, low)
+                for b in range(count[s, d]):
+                    messages[s, d, into, b] -= least
+    for r in range(rows):
+        for c in range(columns):
+            lowest = np.inf
+            for a in range(count[r, c]):
+                cost = own[r, c, a] + messages[r, c, 2, a] + messages[r, c, 3, a]
+                if c > 0 and chosen[r, c - 1] >= 0:
+                    cost += edges[r, c - 1, 0, chosen[r, c - 1], a]
+                if r > 0 and chosen[r - 1, c] >= 0:
+                    cost += edges[r - 1, c, 1, chosen[r - 1, c], a]
+                if cost < lowest:
+                    lowest, chosen[r, c] = cost, a
+    return chosen

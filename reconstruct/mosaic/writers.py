@@ -1,0 +1,119 @@
+"""Files of the mosaic: cloud-optimised colours, source pictures, coverage, a small picture."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import rasterio
+import rasterio.shutil
+from numpy.typing import NDArray
+from rasterio.windows import Window
+
+from alice_survey.errors import ReconstructionError
+from reconstruct.dense.dem import DemGrid
+from reconstruct.model import WorldFrame
+from reconstruct.mosaic.grid import CELL_PX, cells_over
+from reconstruct.mosaic.paint import Labels, Painted
+from reconstruct.raster import BLOCK, crs_of, frame_tags, transform_of, write_png
+
+_THUMBNAIL_PX = 1600
+
+
+def write_tiles(
+    rough: Path,
+    source: Path,
+    grid: DemGrid,
+    frame: WorldFrame,
+    tiles: Iterator[Painted],
+    names: list[str],
+) -> float:
+    """Write colours and sources as they come; return the share of pixels that have colour.
+
+    Raises:
+        ReconstructionError: none has.
+    """
+    shared = _profile(grid, frame)
+    painted = 0
+    with (
+        rasterio.open(
+            rough, "w", count=4, dtype="uint8", photometric="RGB", alpha="yes", **shared
+        ) as colours,
+        rasterio.open(source, "w", count=1, dtype="uint16", **shared) as sources,
+    ):
+        colours.update_tags(**frame_tags(frame))
+        sources.update_tags(**frame_tags(frame), PICTURES=json.dumps(names))
+        sources.set_band_description(1, "picture that painted the pixel, from 1; 0 is none")
+        for tile in tiles:
+            colours.write(tile.rgba, window=tile.window)
+            sources.write(tile.source, 1, window=tile.window)
+            painted += int((tile.rgba[3] > 0).sum())
+    if painted == 0:
+        raise ReconstructionError("no picture sees any cell of dense/dem.tif; redo 'dense'")
+    return painted / (grid.rows * grid.columns)
+
+
+def write_labels(
+    labels: Path, coverage: Path, grid: DemGrid, frame: WorldFrame, blocks: Iterator[Labels]
+) -> None:
+    """Write the view of each cell, and a raster of how many pictures and stations see it."""
+    rows, columns = cells_over(grid.rows), cells_over(grid.columns)
+    cells = DemGrid(
+        west=grid.west, north=grid.north, cell=grid.cell * CELL_PX, rows=rows, columns=columns
+    )
+    stored = np.lib.format.open_memmap(labels, "w+", np.uint16, (rows, columns))
+    with rasterio.open(
+        coverage, "w", count=2, dtype="uint16", predictor=2, **_profile(cells, frame)
+    ) as raster:
+        raster.update_tags(**frame_tags(frame))
+        raster.set_band_description(1, "pictures that see the cell")
+        raster.set_band_description(2, "stations that see the cell")
+        for block in blocks:
+            top, left = block.block.core.row_off // CELL_PX, block.block.core.col_off // CELL_PX
+            high, wide = block.label.shape
+            stored[top : top + high, left : left + wide] = block.label
+            window = Window(left, top, wide, high)
+            raster.write(np.stack([block.pictures, block.stations]), window=window)
+    stored.flush()
+
+
+def _profile(grid: DemGrid, frame: WorldFrame) -> dict[str, object]:
+    return {
+        "driver": "GTiff",
+        "width": grid.columns,
+        "height": grid.rows,
+        "crs": crs_of(frame),
+        "transform": transform_of(grid),
+        "tiled": True,
+        "blockxsize": BLOCK,
+        "blockysize": BLOCK,
+        "compress": "deflate",
+        "zlevel": 1,
+        "bigtiff": "if_safer",
+    }
+
+
+def cloud_optimised(rough: Path, final: Path) -> None:
+    """Copy a GeoTIFF with overviews in the layout of a COG."""
+    rasterio.shutil.copy(
+        rough,
+        final,
+        driver="COG",
+        compress="DEFLATE",
+        predictor="YES",
+        overview_resampling="AVERAGE",
+        blocksize=512,
+        bigtiff="IF_SAFER",
+        num_threads="1",
+    )
+
+
+def thumbnail(mosaic: Path, picture: Path) -> None:
+    """Write a small copy, unknown pixels transparent."""
+    with rasterio.open(mosaic) as raster:
+        shrink = max(1.0, max(raster.width, raster.height) / _THUMBNAIL_PX)
+        shape = (4, max(1, int(raster.height / shrink)), max(1, int(raster.width / shrink)))
+        small: NDArray[np.uint8] = raster.read(
+            out_shape=shape, resampling=rasterio.enums.Resampling.average
+        )
+    write_png(picture, np.ascontiguousarray(small[[2, 1, 0, 3]].transpose(1, 2, 0)))

@@ -1,0 +1,59 @@
+"""Slow, obvious twins of the mosaic's kernels."""
+
+import itertools
+import math
+
+import numpy as np
+
+from alice_survey.frames import Array
+
+
+def lanczos_at(picture: Array, x: float, y: float) -> Array:
+    """One place of `sample_lanczos`, in a picture of light (H, W, 3)."""
+
+    def weight(t: float) -> float:
+        return float(np.sinc(t) * np.sinc(t / 4)) if abs(t) < 4 else 0.0
+
+    left, top = math.floor(x), math.floor(y)
+    total, norm = np.zeros(picture.shape[2]), 0.0
+    for row in range(top - 3, top + 5):
+        for column in range(left - 3, left + 5):
+            r = min(max(row, 0), picture.shape[0] - 1)
+            c = min(max(column, 0), picture.shape[1] - 1)
+            w = weight(x - column) * weight(y - row)
+            total, norm = total + w * picture[r, c], norm + w
+    return np.maximum(total / norm, 0.0)
+
+
+def labels_energy(number: Array, share: Array, colours: Array, chosen: Array) -> float:
+    """What `choose_views` lowers, by its definition."""
+    total = 0.0
+    rows, columns = chosen.shape
+    for r, c in np.ndindex(rows, columns):
+        a = chosen[r, c]
+        total -= math.log(share[r, c, a])
+        for s, d in ((r + 1, c), (r, c + 1)):
+            if s >= rows or d >= columns:
+                continue
+            b = chosen[s, d]
+            if number[r, c, a] == number[s, d, b]:
+                continue
+            differ = 0.0
+            for own, mine, other in (((r, c), a, number[s, d, b]), ((s, d), b, number[r, c, a])):
+                found = np.flatnonzero(number[own] == other)
+                gap = 1.0
+                if len(found):
+                    gap = float(np.abs(colours[own][mine] - colours[own][found[0]]).mean())
+                differ += min(gap, 1.0)
+            total += 0.1 + 10.0 * 0.5 * differ
+    return total
+
+
+def lowest_energy(number: Array, share: Array, colours: Array) -> float:
+    """The least energy of all labellings of a small grid."""
+    rows, columns, most = number.shape
+    least = math.inf
+    for labels in itertools.product(range(most), repeat=rows * columns):
+        chosen = np.array(labels).reshape(rows, columns)
+        least = min(least, labels_energy(number, share, colours, chosen))
+    return least

@@ -1,0 +1,32 @@
+import numpy as np
+
+from reconstruct.mosaic.blend import Blend, Part
+
+
+def test_one_view_comes_out_as_it_went_in() -> None:
+    rng = np.random.default_rng(1)
+    colour = rng.uniform(0, 255, (64, 96, 3)).astype(np.float32)
+    valid = np.ones((64, 96), bool)
+    valid[:, 70:] = False
+    blend = Blend(96, 128)
+    blend.add(Part(row=16, column=32, colour=colour, valid=valid, taken=valid))
+    found = blend.result()[16:80, 32:128]
+    np.testing.assert_allclose(found[valid], colour[valid], atol=2e-3)
+
+
+def test_a_step_between_two_views_becomes_a_slope_and_detail_stays() -> None:
+    rng = np.random.default_rng(2)
+    fine = rng.normal(0, 10, (128, 128, 1)).astype(np.float32) * np.ones(3, np.float32)
+    left = np.zeros((128, 128), bool)
+    left[:, :64] = True
+    everywhere = np.ones_like(left)
+    blend = Blend(128, 128)
+    blend.add(Part(row=0, column=0, colour=fine + 100, valid=everywhere, taken=left))
+    blend.add(Part(row=0, column=0, colour=fine + 140, valid=everywhere, taken=~left))
+    rest = (blend.result() - fine)[..., 0].mean(axis=0)
+    assert abs(rest[:8].mean() - 100) < 1
+    assert abs(rest[-8:].mean() - 140) < 1
+    steps = np.diff(rest)
+    assert steps.min() > -0.5
+    assert steps.max() < 8
+    np.testing.assert_allclose(blend.result() - rest[None, :, None], fine, atol=0.6)

@@ -1,0 +1,64 @@
+import numpy as np
+
+from reconstruct.mosaic.seams import candidates, choose_views
+from tests.oracles_mosaic import labels_energy, lowest_energy
+
+
+def random_problem(seed: int, rows: int, columns: int, most: int) -> tuple[np.ndarray, ...]:
+    rng = np.random.default_rng(seed)
+    number = np.stack([rng.permutation(most + 1)[:most] for _ in range(rows * columns)]).reshape(
+        rows, columns, most
+    )
+    share = rng.uniform(0.3, 1.0, (rows, columns, most))
+    colours = rng.normal(0, 0.2, (rows, columns, most, 3))
+    return number.astype(np.int32), share.astype(np.float32), colours.astype(np.float32)
+
+
+def test_labels_are_close_to_the_best_of_all() -> None:
+    excess = []
+    for seed in range(12):
+        number, share, colours = random_problem(seed, 3, 3, 2)
+        chosen = choose_views(number, share, colours)
+        found = labels_energy(number, share, colours, chosen)
+        best = lowest_energy(number, share, colours)
+        assert found >= best - 1e-4
+        excess.append(found / best - 1)
+    assert np.mean(excess) < 0.03
+    assert max(excess) < 0.2
+
+
+def test_a_seam_goes_around_what_two_views_show_differently() -> None:
+    rows, columns = 24, 40
+    east = np.arange(columns) / columns
+    qualities = np.stack([np.tile(1.2 - east, (rows, 1)), np.tile(0.2 + east, (rows, 1))])
+    qualities = qualities.astype(np.float32)
+    number, share, row_of = candidates(qualities, np.array([7, 9], np.int32))
+    thing = np.zeros((rows, columns), bool)
+    thing[8:16, 16:26] = True  # astride the line at which the qualities are equal
+    shown = np.zeros((2, rows, columns, 3), np.float32)
+    shown[1][thing] = 0.8
+    index = np.arange(rows)[:, None, None], np.arange(columns)[None, :, None]
+    chosen = choose_views(number, share, shown[row_of, index[0], index[1]])
+    label = np.take_along_axis(number, chosen[..., None], axis=2)[..., 0]
+    assert set(np.unique(label)) == {7, 9}
+    assert len(np.unique(label[8:16, 16:26])) == 1
+    assert (label[:, :8] == 7).all()
+    assert (label[:, -8:] == 9).all()
+    plain = choose_views(number, share, np.zeros_like(shown[row_of, index[0], index[1]]))
+    assert (plain == 0).mean() > 0.9
+
+
+def test_cells_that_no_view_sees_have_none_and_few_candidates_are_kept() -> None:
+    rng = np.random.default_rng(2)
+    qualities = rng.uniform(0, 1, (9, 6, 7)).astype(np.float32)
+    qualities[:, 2, 3] = 0
+    numbers = np.arange(20, 29, dtype=np.int32)
+    number, share, row_of = candidates(qualities, numbers)
+    assert number.shape == (6, 7, 6)
+    assert (number[2, 3] == -1).all()
+    known = number >= 0
+    assert share[known].min() >= 0.3
+    np.testing.assert_array_equal(numbers[row_of][known], number[known])
+    chosen = choose_views(number, share, np.zeros((*number.shape, 3), np.float32))
+    assert chosen[2, 3] == -1
+    assert (chosen >= 0).sum() == 41
