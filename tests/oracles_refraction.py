@@ -8,7 +8,7 @@ from scipy.sparse import csr_matrix
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.frames import Array
-from reconstruct.mapping.mapper import as_transform
+from reconstruct.mapping.database import as_transform
 from reconstruct.mapping.normal_equations import Sights
 from reconstruct.mapping.uncertainty import Uncertainty
 from tests.reconstruct.scenes import Scene

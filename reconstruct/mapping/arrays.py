@@ -7,7 +7,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from alice_survey.frames import Array
-from reconstruct.mapping.mapper import as_transform
+from reconstruct.mapping.database import as_transform
 
 Indices = NDArray[np.int64]
 

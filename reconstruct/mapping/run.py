@@ -26,6 +26,7 @@ from reconstruct.mapping.mapper import Mapped, map_calibrated
 from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import Convergence, refract
 from reconstruct.mapping.self_calibration import SIMPLE, map_self_calibrated
+from reconstruct.mapping.survey_rig import refine_rig
 from reconstruct.mapping.uncertainty import save_uncertainty
 from reconstruct.mapping.working_range import Distances, find_distances
 from reconstruct.matching.features import find_features, load_features, save_features
@@ -95,7 +96,15 @@ def run_mapping(
         settings={
             "seed": config.seed,
             **settings.model_dump(
-                mode="json", include={"feature_scale", "max_features", "working_range_m", "mapper"}
+                mode="json",
+                include={
+                    "feature_scale",
+                    "max_features",
+                    "working_range_m",
+                    "mapper",
+                    "refine_port",
+                    "refine_rig",
+                },
             ),
         },
         inputs=files,
@@ -135,6 +144,18 @@ def run_mapping(
             )
             adjust = NavigationAdjuster(inputs.records, inputs.rig, lenses, inputs.datum)
             mapped, refracted = refract(mapped, seen, partial, adjust, poses)
+            if settings.refine_port or settings.refine_rig:
+                mapped, refracted, adjust = refine_rig(
+                    mapped,
+                    seen,
+                    inputs.rig,
+                    distances,
+                    adjust,
+                    inputs.datum,
+                    partial,
+                    port=settings.refine_port,
+                    pose=settings.refine_rig,
+                )
             sigmas = adjust.sigmas
         else:
             mapped = map_self_calibrated(seen, exif_focal, partial, config.seed)

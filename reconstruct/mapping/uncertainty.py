@@ -24,7 +24,8 @@ from alice_survey.errors import ReconstructionError, warn
 from alice_survey.frames import Array
 from alice_survey.manifest import ImageRecord
 from reconstruct.mapping.arrays import Indices, Observed, observed
-from reconstruct.mapping.mapper import Mapped, as_transform
+from reconstruct.mapping.database import as_transform
+from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.normal_equations import (
     POSE,
     Reduced,

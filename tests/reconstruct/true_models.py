@@ -8,8 +8,8 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.frames import Array
 from reconstruct.lenses.lens import Lens, flat_port_lens
-from reconstruct.mapping.database import Observations, rigid3d
-from reconstruct.mapping.mapper import Mapped, as_transform
+from reconstruct.mapping.database import Observations, as_transform, rigid3d
+from reconstruct.mapping.mapper import Mapped
 from reconstruct.matching.matches import as_seen
 from tests.reconstruct.scenes import Scene
 

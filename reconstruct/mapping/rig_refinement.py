@@ -1,0 +1,500 @@
+"""Port, water and rig refined from the survey's own pictures, through the exact flat-port cameras.
+
+An adjustment of stations, points and the rig's parameters, each parameter within what calibration
+knew of it: the covariance of `rig.json`, or wide bounds where it has none. What is asked for is
+free; what the calibration was unsure of besides (focal lengths, say) moves with it within its
+covariance, since holding that would push its errors into what is asked for.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.sparse import csc_matrix, diags_array
+from scipy.sparse.linalg import splu
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.errors import ReconstructionError, warn
+from alice_survey.frames import Array
+from camera_calib.calibration.freedom import POSE as TURN_AND_SHIFT
+from camera_calib.calibration.freedom import Prior, pose_names, value
+from camera_calib.flat_port import PARAMETERS, FlatPortCamera, pose_jacobian
+from camera_calib.rig import Covariance, Rig
+from reconstruct.lenses.lens import Lens
+from reconstruct.mapping.arrays import Indices, observed
+from reconstruct.mapping.database import Observations, as_transform
+from reconstruct.mapping.mapper import Mapped
+from reconstruct.mapping.normal_equations import POSE, Reduced, Sights, moved_points, reduce_points
+
+_MOST_OBSERVATIONS = 200_000
+"""More tell little more of so few parameters; whole points are left out evenly."""
+_PORT_SIGMAS = {"port_distance_m": 0.02, "normal_x": 0.05, "normal_y": 0.05, "n_water": 0.005}
+_RIG_SIGMAS = dict(zip(TURN_AND_SHIFT, [0.02] * 3 + [0.005] * 3, strict=True))
+"""What is known of parameters that no calibration tells: next to nothing."""
+_LEVER = ("lever.x_m", "lever.y_m", "lever.z_m")
+"""The body's origin in the rig's frame."""
+_LEVER_SIGMA_M = 0.05
+_MOST_LASTING = 0.98
+"""Correlation of navigation's errors from one station to the next."""
+_BASELINE_SIGMA_M = 1e-7
+"""Of an uncalibrated baseline: it is the scale, which no picture tells."""
+_TURN_INFORMATION = 1.0
+"""1/rad^2 of a station whose position is told: a line of stations does not tell its own roll."""
+_ROUNDS = 20
+_SETTLED = 1e-3
+"""Steps of all parameters, in their sigmas, at which the adjustment ends."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RigFit:
+    """A refined rig and how well it is known."""
+
+    rig: Rig
+    """With the covariance of all that was adjusted; the lever arm is its `body_from_rig`."""
+    parameters: tuple[str, ...]
+    before: Array
+    """(G,) values, in the parameters' units."""
+    after: Array
+    prior_sigmas: Array
+    covariance: Array
+    """(G, G)."""
+    sigma_px: float
+    """Of one coordinate of a keypoint."""
+    observations: int
+    stations: tuple[RigidTransform, ...]
+    """`world_from_rig` at the reference camera's entrance pupil, by ascending frame."""
+    points: Array
+    """(P, 3) of those points that took part."""
+    point_ids: Indices
+
+    def to_json(self) -> dict[str, Any]:
+        """What `port.json` says."""
+        sigmas = np.sqrt(np.diag(self.covariance))
+        scale = 1.0 / np.where(sigmas > 0, sigmas, np.inf)
+        return {
+            "parameters": list(self.parameters),
+            "before": self.before.tolist(),
+            "after": self.after.tolist(),
+            "prior_sigmas": self.prior_sigmas.tolist(),
+            "sigmas": sigmas.tolist(),
+            "correlation": (self.covariance * np.outer(scale, scale)).tolist(),
+            "sigma_px": self.sigma_px,
+            "observations": self.observations,
+            "stations": len(self.stations),
+        }
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Told:
+    """Positions of the body's origin by navigation, in the model's frame."""
+
+    positions: Array
+    """(F, 3) by ascending frame; NaN where unknown."""
+    sigmas: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Pixels:
+    """Observations, sorted by point."""
+
+    starts: Indices
+    station: Indices
+    camera: Indices
+    taken: Array
+    """(O, 2) pixels of the pictures as taken."""
+    point: Indices
+
+    @property
+    def points(self) -> int:
+        return len(self.starts) - 1
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _State:
+    """One guess of all unknowns."""
+
+    cameras: tuple[FlatPortCamera, ...]
+    cam_from_rig: tuple[RigidTransform, ...]
+    turns: Array
+    """(F, 3, 3) `world_from_rig`, and (F, 3) where the rig's origins are."""
+    centres: Array
+    points: Array
+    lever: Array
+
+
+def fit_rig(
+    mapped: Mapped,
+    seen: Observations,
+    rig: Rig,
+    *,
+    port: bool,
+    pose: bool,
+    told: Told | None = None,
+) -> RigFit:
+    """Refine a rig from a finished model.
+
+    Args:
+        mapped: exact model on the rig; picture i of `seen` has the id i + 1.
+        seen: keypoints as warped by the model's lenses.
+        rig: as calibrated or designed.
+        port: free distance and normal of the ports and the water's index.
+        pose: free the poses of the cameras on the rig, and the lever arm where positions are told.
+        told: positions of the body.
+
+    Raises:
+        ReconstructionError: the survey does not determine what is asked for.
+    """
+    names = list(seen.cameras)
+    frames = np.array(
+        sorted({i.frame_id for i in mapped.model.images.values() if i.has_pose}), dtype=np.int64
+    )
+    pixels, ids = _chosen(mapped, seen, names, frames)
+    prior = _prior(rig, names, port=port, pose=pose)
+    fields = prior.parameters
+    told = told if pose else None
+    information = np.zeros((len(fields) + 3 * (told is not None),) * 2)
+    information[: len(fields), : len(fields)] = prior.information
+    if told is not None:
+        information[-3:, -3:] = np.eye(3) / _LEVER_SIGMA_M**2
+    _hold_baseline(information, fields, rig, names)
+    state = _start(mapped, rig, names, frames, ids)
+    told = None if told is None else _lasting(told, state)
+    first = _values(state, fields, names, lever=told is not None)
+    drift = np.zeros(len(first))
+    variance = np.nan
+    for _ in range(_ROUNDS):
+        sights = _sights(state, pixels, fields, names, lever=told is not None)
+        now = float((sights.miss**2).sum()) / _spare(pixels, len(frames), len(first))
+        variance = now if np.isnan(variance) else min(variance, now)
+        step = _step(sights, state, variance, information, drift, told)
+        state = _moved(state, pixels, step, sights, fields, names)
+        drift = drift + step.shared
+        if np.all(np.abs(step.shared) < _SETTLED * np.sqrt(np.diag(step.covariance))):
+            break
+    else:
+        warn(f"the rig's refinement did not settle in {_ROUNDS} rounds: trust it with care")
+    parameters = (*fields, *(_LEVER if told is not None else ()))
+    after = _values(state, fields, names, lever=told is not None)
+    return RigFit(
+        rig=_as_rig(rig, names, state, fields, step.covariance, told is not None),
+        parameters=parameters,
+        before=first,
+        after=after,
+        prior_sigmas=np.sqrt(np.diag(_inverse(information))),
+        covariance=step.covariance,
+        sigma_px=float(np.sqrt(variance)),
+        observations=len(pixels.station),
+        stations=tuple(
+            RigidTransform.from_components(c, Rotation.from_matrix(r))
+            for r, c in zip(state.turns, state.centres, strict=True)
+        ),
+        points=state.points,
+        point_ids=ids,
+    )
+
+
+def _lasting(told: Told, state: _State) -> Told:
+    """Sigmas that count how long navigation errs the same way.
+
+    Errors that last tell less than as many new ones: a first-order process with the correlation r
+    from one station to the next widens the sigma of a mean by sqrt((1 + r) / (1 - r)).
+    """
+    known = np.flatnonzero(np.isfinite(told.positions + told.sigmas).all(axis=1))
+    bodies = state.centres[known] + state.turns[known] @ state.lever
+    off = told.positions[known] - bodies
+    off = off - off.mean(axis=0)
+    spread = np.maximum((off**2).sum(axis=0), 1e-12)
+    lasting = np.clip((off[1:] * off[:-1]).sum(axis=0) / spread, 0.0, _MOST_LASTING)
+    return replace(told, sigmas=told.sigmas * np.sqrt((1.0 + lasting) / (1.0 - lasting)))
+
+
+def _spare(pixels: _Pixels, stations: int, shared: int) -> int:
+    spare = 2 * len(pixels.station) - 3 * pixels.points - POSE * stations
+    if spare < 10 * shared:
+        raise ReconstructionError(
+            f"{len(pixels.station)} observations of {pixels.points} points from {stations} "
+            f"stations do not determine {shared} parameters of the rig: leave refine_port and "
+            "refine_rig off"
+        )
+    return spare
+
+
+def _prior(rig: Rig, names: Sequence[str], *, port: bool, pose: bool) -> Prior:
+    """What is known beforehand of what may move."""
+    known: tuple[str, ...] = ()
+    if rig.covariance is not None:
+        known = tuple(n for n in rig.covariance.parameters if n.split(".")[0] in names)
+    wide: dict[str, float] = {}
+    if port:
+        for name in names:
+            camera = rig.cameras[name]
+            if camera.port_distance_m + camera.glass_thickness_m > 0:
+                wide |= {f"{name}.{field}": sigma for field, sigma in _PORT_SIGMAS.items()}
+    if pose:
+        wide |= {
+            name: _RIG_SIGMAS[name.split(".")[1]]
+            for name in pose_names(rig)
+            if name.split(".")[0] in names
+        }
+    wide = {name: sigma for name, sigma in wide.items() if name not in known}
+    loose = Prior.around(rig, wide)
+    return Prior.of_rig(rig, known).and_also(loose) if known else loose
+
+
+def _hold_baseline(
+    information: Array, fields: Sequence[str], rig: Rig, names: Sequence[str]
+) -> None:
+    """Keep the length of a baseline that no calibration measured, in place."""
+    known = rig.sigmas
+    for name in names:
+        at = [
+            fields.index(n)
+            for n in (f"{name}.{axis}" for axis in TURN_AND_SHIFT[3:])
+            if n in fields
+        ]
+        if len(at) < 3 or f"{name}.x_m" in known:
+            continue
+        along = rig.cam_from_rig[name].translation
+        along = along / np.linalg.norm(along)
+        information[np.ix_(at, at)] += np.outer(along, along) / _BASELINE_SIGMA_M**2
+
+
+def _chosen(
+    mapped: Mapped, seen: Observations, names: Sequence[str], frames: Indices
+) -> tuple[_Pixels, Indices]:
+    """The observations that take part, and the ids of their points."""
+    model, found = mapped.model, observed(mapped.model)
+    camera, station = np.empty(len(found.point), np.int64), np.empty(len(found.point), np.int64)
+    taken = np.empty((len(found.point), 2))
+    for n, number in enumerate(found.pictures.tolist()):
+        rows, record = found.of(n), seen.images[number - 1]
+        lens: Lens = mapped.lenses[record.camera]
+        taken[rows] = lens.from_pinhole(seen.pixels[number - 1][found.keypoint[rows]])
+        camera[rows] = names.index(record.camera)
+        station[rows] = np.searchsorted(frames, model.images[number].frame_id)
+    every = -(-len(found.point) // _MOST_OBSERVATIONS)
+    lost = np.unique(found.point[~np.isfinite(taken).all(axis=1)])
+    kept = (found.point % every == 0) & ~np.isin(found.point, lost)
+    order = np.flatnonzero(kept)
+    order = order[np.argsort(found.point[order], kind="stable")]
+    points, inverse = np.unique(found.point[order], return_inverse=True)
+    starts = np.concatenate([[0], np.cumsum(np.bincount(inverse, minlength=len(points)))])
+    pixels = _Pixels(
+        starts=starts.astype(np.int64),
+        station=station[order],
+        camera=camera[order],
+        taken=taken[order],
+        point=inverse.astype(np.int64),
+    )
+    return pixels, found.point_ids[points]
+
+
+def _start(mapped: Mapped, rig: Rig, names: Sequence[str], frames: Indices, ids: Indices) -> _State:
+    model, pinhole_from_cam = mapped.model, mapped.lenses[names[0]].pinhole_from_cam
+    reference = rig.cam_from_rig[names[0]]
+    poses = [
+        as_transform(model.frames[int(f)].rig_from_world).inv() * pinhole_from_cam for f in frames
+    ]
+    return _State(
+        cameras=tuple(rig.cameras[name] for name in names),
+        cam_from_rig=tuple(rig.cam_from_rig[name] * reference.inv() for name in names),
+        turns=np.array([p.rotation.as_matrix() for p in poses]),
+        centres=np.array([p.translation for p in poses]),
+        points=np.array([model.points3D[i].xyz for i in ids.tolist()]).reshape(-1, 3),
+        lever=np.asarray((reference * rig.body_from_rig.inv()).translation),
+    )
+
+
+def _values(state: _State, fields: Sequence[str], names: Sequence[str], *, lever: bool) -> Array:
+    now = Rig(
+        cameras=dict(zip(names, state.cameras, strict=True)),
+        cam_from_rig=dict(zip(names, state.cam_from_rig, strict=True)),
+        body_from_rig=RigidTransform.identity(),
+        source="",
+    )
+    values = [value(now, name) for name in fields]
+    return np.array([*values, *(state.lever if lever else [])])
+
+
+def _sights(
+    state: _State, pixels: _Pixels, fields: Sequence[str], names: Sequence[str], *, lever: bool
+) -> Sights:
+    """The observations linearised; those that no light explains count nothing."""
+    count = len(fields) + 3 * lever
+    arm = state.points[pixels.point] - state.centres[pixels.station]
+    by_point = np.zeros((len(arm), 2, 3))
+    by_shared, miss = np.zeros((len(arm), 2, count)), np.zeros((len(arm), 2))
+    for c, name in enumerate(names):
+        rows = np.flatnonzero(pixels.camera == c)
+        turns = state.turns[pixels.station[rows]]
+        pose = state.cam_from_rig[c]
+        turned = np.einsum("nij,ni->nj", turns, arm[rows]) @ pose.rotation.as_matrix().T
+        found, by_cam, by_parameter = state.cameras[c].project_jacobian(turned + pose.translation)
+        sees = np.isfinite(found).all(axis=1)
+        rows, by_cam, by_parameter = rows[sees], by_cam[sees], by_parameter[sees]
+        by_rig = by_cam @ pose.rotation.as_matrix()
+        by_point[rows] = by_rig @ turns[sees].transpose(0, 2, 1)
+        miss[rows] = found[sees] - pixels.taken[rows]
+        by_pose = pose_jacobian(by_cam, turned[sees])
+        for g, field in enumerate(fields):
+            camera, parameter = field.split(".")
+            if camera != name:
+                continue
+            if parameter in PARAMETERS:
+                by_shared[rows, :, g] = by_parameter[:, :, PARAMETERS.index(parameter)]
+            else:
+                by_shared[rows, :, g] = by_pose[:, :, TURN_AND_SHIFT.index(parameter)]
+    return Sights(
+        starts=pixels.starts, station=pixels.station, by_point=by_point, arm=arm,
+        by_shared=by_shared, miss=miss,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Step:
+    stations: Array
+    shared: Array
+    covariance: Array
+    reduced: Reduced
+
+
+def _step(
+    sights: Sights,
+    state: _State,
+    variance: float,
+    information: Array,
+    drift: Array,
+    told: Told | None,
+) -> _Step:
+    """One Gauss-Newton step of stations and shared parameters, and the covariance of the latter."""
+    count = len(state.centres)
+    reduced = reduce_points(sights, count)
+    shared = reduced.shared / variance + information
+    pull = reduced.shared_slope / variance + information @ drift
+    border, slope = reduced.border / variance, reduced.slope / variance
+    matrix = csc_matrix(reduced.matrix / variance)
+    free = np.ones(POSE * count, dtype=np.bool_)
+    if told is None:
+        free[:POSE] = False
+    else:
+        extra = np.zeros((count, POSE, POSE))
+        for s in np.flatnonzero(np.isfinite(told.positions + told.sigmas).all(axis=1)).tolist():
+            arm = state.turns[s] @ state.lever
+            x, y, z = arm
+            rows = np.hstack([[[0, z, -y], [-z, 0, x], [y, -x, 0]], np.eye(3), state.turns[s]])
+            rows = rows / told.sigmas[s][:, None]
+            off = (state.centres[s] + arm - told.positions[s]) / told.sigmas[s]
+            extra[s] = rows[:, :POSE].T @ rows[:, :POSE]
+            extra[s][[0, 1, 2], [0, 1, 2]] += _TURN_INFORMATION
+            at = slice(POSE * s, POSE * s + POSE)
+            border[at, -3:] += rows[:, :POSE].T @ rows[:, POSE:]
+            slope[at] += rows[:, :POSE].T @ off
+            shared[-3:, -3:] += rows[:, POSE:].T @ rows[:, POSE:]
+            pull[-3:] += rows[:, POSE:].T @ off
+        matrix = csc_matrix(matrix + _block_diagonal(extra))
+    kept = np.flatnonzero(free)
+    cut: Any = matrix[kept][:, kept]
+    factor_of: Any = splu
+    factor = factor_of(
+        csc_matrix(cut), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )  # fmt: skip
+    back = np.zeros_like(border)
+    back[kept] = factor.solve(np.ascontiguousarray(border[kept]))
+    plain = np.zeros_like(slope)
+    plain[kept] = factor.solve(slope[kept])
+    covariance = _inverse(shared - border.T @ back)
+    moved = -covariance @ (pull - border.T @ plain)
+    return _Step(
+        stations=(-plain - back @ moved).reshape(count, POSE),
+        shared=moved,
+        covariance=covariance,
+        reduced=reduced,
+    )
+
+
+def _inverse(matrix: Array) -> Array:
+    """Of a symmetric matrix whose parameters have many units."""
+    scale = 1.0 / np.sqrt(np.diag(matrix))
+    inverse: Array = np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale)
+    return (inverse + inverse.T) / 2.0
+
+
+def _block_diagonal(blocks: Array) -> Any:
+    """Sparse, from (F, 6, 6)."""
+    from scipy.sparse import block_diag
+
+    return block_diag(list(blocks), format="csc") if len(blocks) else diags_array([])
+
+
+def _moved(
+    state: _State,
+    pixels: _Pixels,
+    step: _Step,
+    sights: Sights,
+    fields: Sequence[str],
+    names: Sequence[str],
+) -> _State:
+    points = moved_points(
+        sights.starts, sights.station, sights.by_point, sights.arm, sights.by_shared, sights.miss,
+        step.reduced.point_inverse, step.stations, step.shared,
+    )  # fmt: skip
+    cameras, poses = list(state.cameras), list(state.cam_from_rig)
+    for c, name in enumerate(names):
+        changes: dict[str, float] = {}
+        motion = np.zeros(POSE)
+        for g, field in enumerate(fields):
+            camera, parameter = field.split(".")
+            if camera != name:
+                continue
+            if parameter in PARAMETERS:
+                low = {"port_distance_m": 0.0, "n_water": 1.0}.get(parameter, -np.inf)
+                changes[parameter] = max(low, cameras[c].parameter(parameter) + step.shared[g])
+            else:
+                motion[TURN_AND_SHIFT.index(parameter)] = step.shared[g]
+        cameras[c] = cameras[c].with_parameters(changes)
+        poses[c] = RigidTransform.from_components(
+            poses[c].translation + motion[3:],
+            Rotation.from_rotvec(motion[:3]) * poses[c].rotation,
+        )
+    turns = Rotation.from_rotvec(step.stations[:, :3]).as_matrix() @ state.turns
+    lever = state.lever + step.shared[-3:] if len(step.shared) > len(fields) else state.lever
+    return _State(
+        cameras=tuple(cameras),
+        cam_from_rig=tuple(poses),
+        turns=turns,
+        centres=state.centres + step.stations[:, 3:],
+        points=state.points + points,
+        lever=lever,
+    )
+
+
+def _as_rig(
+    rig: Rig,
+    names: Sequence[str],
+    state: _State,
+    fields: Sequence[str],
+    covariance: Array,
+    lever: bool,
+) -> Rig:
+    reference = rig.cam_from_rig[names[0]]
+    cameras = {**rig.cameras, **dict(zip(names, state.cameras, strict=True))}
+    moved: Mapping[str, RigidTransform] = {
+        name: pose * reference for name, pose in zip(names, state.cam_from_rig, strict=True)
+    }
+    body_from_rig = rig.body_from_rig
+    if lever:
+        rig_from_body = reference * body_from_rig.inv()
+        body_from_rig = (
+            RigidTransform.from_components(state.lever, rig_from_body.rotation).inv() * reference
+        )
+    count = len(fields)
+    return replace(
+        rig,
+        cameras=cameras,
+        cam_from_rig={**rig.cam_from_rig, **moved},
+        body_from_rig=body_from_rig,
+        source=f"{rig.source}; refined from the survey",
+        covariance=Covariance(parameters=tuple(fields), matrix=covariance[:count, :count]),
+    )

@@ -1,0 +1,143 @@
+"""The rig refined from the survey, and the model anew on it: settings `refine_port`, `refine_rig`.
+
+It writes `port.json` (values, sigmas, correlation) and `rig.json` (the refined rig) beside the
+model.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.artefacts import write_json
+from alice_survey.errors import ReconstructionError
+from alice_survey.frames import Array, Datum
+from camera_calib.rig import Rig, write_rig
+from reconstruct.lenses.lens import FlatPortLens, Lens, flat_port_lens
+from reconstruct.mapping.database import Observations, rigid3d
+from reconstruct.mapping.mapper import Mapped, model_baseline
+from reconstruct.mapping.priors import NavigationAdjuster
+from reconstruct.mapping.refraction import Convergence, refract
+from reconstruct.mapping.rig_refinement import RigFit, Told, fit_rig
+from reconstruct.mapping.working_range import Distances
+from reconstruct.matching.matches import as_seen
+from reconstruct.matching.pairs import positions_ned
+
+
+def refine_rig(
+    mapped: Mapped,
+    seen: Observations,
+    rig: Rig,
+    distances: Distances | None,
+    adjust: NavigationAdjuster,
+    datum: Datum | None,
+    folder: Path,
+    *,
+    port: bool,
+    pose: bool,
+) -> tuple[Mapped, Convergence, NavigationAdjuster]:
+    """Refine a rig from a finished model and make the model anew on it.
+
+    Args:
+        mapped: exact model on the rig; picture i of `seen` has the id i + 1.
+        seen: keypoints as warped by the model's lenses.
+        rig: as calibrated or designed.
+        distances: for which the new lenses are the best.
+        adjust: that adjusted the model.
+        datum: of the positions of navigation.
+        folder: where `port.json` and `rig.json` go.
+        port: refine ports and water.
+        pose: refine the poses of the cameras and the lever arm.
+
+    Returns:
+        The model on the refined rig, how its keypoints came to rest, and what adjusted it.
+
+    Raises:
+        ReconstructionError: the model has no scale, or the survey does not tell what is asked for.
+    """
+    if not mapped.scaled or distances is None:
+        raise ReconstructionError(
+            "refine_port and refine_rig need two cameras, whose known baseline gives the scale: "
+            "turn them off under [reconstruct] in survey.toml"
+        )
+    told = None
+    if datum is not None and adjust.sigmas is not None:
+        told = told_positions(mapped.model, seen, datum)
+    fit = fit_rig(mapped, seen, rig, port=port, pose=pose, told=told)
+    lenses: dict[str, Lens] = {
+        name: flat_port_lens(fit.rig.cameras[name], distances.near_m, distances.far_m)
+        for name in seen.cameras
+    }
+    again = on_rig(mapped, seen, fit, lenses)
+    adjust = NavigationAdjuster(seen.images, fit.rig, lenses, datum)
+    poses = {name: fit.rig.cam_from_rig[name] for name in seen.cameras}
+    refined, convergence = refract(again[0], again[1], folder, adjust, poses)
+    write_json(folder / "port.json", fit.to_json())
+    write_rig(folder / "rig.json", fit.rig)
+    return refined, convergence, adjust
+
+
+def on_rig(
+    mapped: Mapped, seen: Observations, fit: RigFit, lenses: dict[str, Lens]
+) -> tuple[Mapped, Observations]:
+    """A model and its keypoints for refined lenses, as warped."""
+    model = pycolmap.Reconstruction(mapped.model)
+    names = list(seen.cameras)
+    pixels = [
+        as_seen(_taken(mapped.lenses[record.camera], rows), lenses[record.camera])
+        for record, rows in zip(seen.images, seen.pixels, strict=True)
+    ]
+    pinhole_from_rig: dict[str, RigidTransform] = {
+        name: lenses[name].pinhole_from_cam * fit.rig.cam_from_rig[name] for name in names
+    }
+    rig_from_reference = pinhole_from_rig[names[0]].inv()
+    for number, name in enumerate(names, 1):
+        camera = model.cameras[number]
+        camera.params = lenses[name].pinhole.colmap.params
+        if number > 1:
+            for rig in model.rigs.values():
+                rig.set_sensor_from_rig(
+                    camera.sensor_id, rigid3d(pinhole_from_rig[name] * rig_from_reference)
+                )
+    frames = sorted({i.frame_id for i in model.images.values() if i.has_pose})
+    for frame, station in zip(frames, fit.stations, strict=True):
+        pose = lenses[names[0]].pinhole_from_cam * station.inv()
+        model.frames[frame].rig_from_world = rigid3d(pose)
+    for point, xyz in zip(fit.point_ids.tolist(), fit.points, strict=True):
+        model.points3D[point].xyz = xyz
+    for number, image in model.images.items():
+        for point, xy in zip(image.points2D, pixels[number - 1], strict=True):
+            point.xy = xy
+    notes = (*mapped.notes, "rig and port refined from the survey's own pictures")
+    return (
+        replace(mapped, model=model, lenses=lenses, baseline=model_baseline(model), notes=notes),
+        replace(
+            seen,
+            pixels=pixels,
+            cameras={name: lenses[name].pinhole.colmap for name in names},
+        ),
+    )
+
+
+def told_positions(model: pycolmap.Reconstruction, seen: Observations, datum: Datum) -> Told:
+    """Where navigation says that the body's origin was, by ascending frame."""
+    bodies = positions_ned(seen.images, datum)
+    frames = sorted({i.frame_id for i in model.images.values() if i.has_pose})
+    positions, sigmas = np.full((len(frames), 3), np.nan), np.full((len(frames), 3), np.nan)
+    for number, image in sorted(model.images.items(), reverse=True):
+        if image.has_pose:
+            record, row = seen.images[number - 1], frames.index(image.frame_id)
+            positions[row] = bodies[number - 1]
+            level = record.sigma_horizontal_m
+            sigmas[row] = [level, level, record.sigma_depth_m]
+    sigmas[~(sigmas > 0).all(axis=1)] = np.nan
+    return Told(positions=positions, sigmas=sigmas)
+
+
+def _taken(lens: Lens, warped: Array) -> Array:
+    """Pixels of the picture as taken; those that the lens did not reach stay out of reach."""
+    if not isinstance(lens, FlatPortLens):
+        raise ReconstructionError("refine_port and refine_rig need a calibrated rig")
+    return lens.from_pinhole(warped)

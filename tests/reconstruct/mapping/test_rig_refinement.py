@@ -1,0 +1,244 @@
+"""What a survey says of its own rig, against the truth."""
+
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.errors import ReconstructionError
+from camera_calib.calibration.freedom import value
+from camera_calib.rig import Covariance, Rig, read_rig
+from reconstruct.lenses.lens import FlatPortLens, Lens, flat_port_lens
+from reconstruct.mapping.arrays import observed
+from reconstruct.mapping.database import Observations, as_transform
+from reconstruct.mapping.mapper import Mapped, model_baseline
+from reconstruct.mapping.priors import NavigationAdjuster
+from reconstruct.mapping.refraction import refract
+from reconstruct.mapping.rig_refinement import RigFit, Told, fit_rig
+from reconstruct.mapping.survey_rig import on_rig, refine_rig
+from reconstruct.mapping.working_range import Distances
+from reconstruct.sparse.alignment import align_rigid
+from tests.reconstruct.scenes import DATUM, Scene, make_scene
+from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_scene
+
+NOISE_PX = 0.3
+TURN_SIGMA = 3e-4
+
+
+@cache
+def clean() -> Scene:
+    return make_scene(lines=2, stations=5, points=1500, scale=1, port_distance_m=0.05, relief_m=0.3)
+
+
+def noisy(seed: int) -> Scene:
+    rng = np.random.default_rng(seed)
+    return replace(clean(), pixels=[p + rng.normal(0, NOISE_PX, p.shape) for p in clean().pixels])
+
+
+def modelled(scene: Scene, rig: Rig, folder: Path) -> tuple[Mapped, Observations]:
+    """The model that pictures of a scene give to who believes in another rig."""
+    believed = replace(scene, rig=rig)
+    seen, lenses = warped_scene(believed)
+    start = near_truth(believed, seen, lenses, np.random.default_rng(1))
+    return refract(start, seen, folder)[0], seen
+
+
+def nearer(rig: Rig, by_m: float) -> Rig:
+    """The same with shorter ports."""
+    cameras = {
+        name: replace(c, port_distance_m=c.port_distance_m - by_m)
+        for name, c in rig.cameras.items()
+    }
+    return replace(rig, cameras=cameras)
+
+
+def errors_in_sigmas(fit: RigFit, true: Rig) -> np.ndarray:
+    misses = fit.after - [value(true, name) for name in fit.parameters]
+    return misses / np.sqrt(np.diag(fit.covariance))
+
+
+def test_a_wrong_port_comes_back_within_its_sigmas(tmp_path: Path) -> None:
+    draws = []
+    for seed in range(8):
+        scene = noisy(seed)
+        wrong = nearer(scene.rig, 0.003)
+        mapped, seen = modelled(scene, wrong, tmp_path)
+        fit = fit_rig(mapped, seen, wrong, port=True, pose=False)
+        assert fit.sigma_px == pytest.approx(NOISE_PX, rel=0.08)
+        draws.append(errors_in_sigmas(fit, scene.rig))
+    assert np.abs(draws).max() < 4.0
+    assert 0.7 < np.sqrt((np.array(draws) ** 2).mean()) < 1.4
+    assert fit.parameters[:4] == (
+        "left.port_distance_m", "left.normal_x", "left.normal_y", "left.n_water"
+    )  # fmt: skip
+    left, right = (c.n_water for c in fit.rig.cameras.values())
+    assert left == pytest.approx(right, abs=1e-5), "both look into the same water"
+
+
+def test_without_noise_port_water_and_rig_are_found_exactly(tmp_path: Path) -> None:
+    wrong = nearer(clean().rig, 0.003)
+    wrong = replace(
+        wrong,
+        cameras={
+            name: c.with_parameters({"n_water": 1.342, "normal_x": 0.004})
+            for name, c in wrong.cameras.items()
+        },
+    )
+    mapped, seen = modelled(clean(), wrong, tmp_path)
+    fit = fit_rig(mapped, seen, wrong, port=True, pose=False)
+    for name in fit.parameters:
+        # The wide prior still pulls a little; it is worth a tiny part of the sigma.
+        sigma = fit.rig.sigmas[name]
+        assert value(fit.rig, name) == pytest.approx(
+            value(clean().rig, name), abs=0.2 * sigma + 1e-9
+        )
+    assert fit.sigma_px < 0.02
+
+
+def test_a_turned_camera_is_turned_back_and_the_baseline_stays(tmp_path: Path) -> None:
+    scene = noisy(3)
+    pose = scene.rig.cam_from_rig["right"]
+    turned = RigidTransform.from_components(
+        pose.translation, Rotation.from_rotvec([1e-3, -8e-4, 5e-4]) * pose.rotation
+    )
+    wrong = replace(scene.rig, cam_from_rig={**scene.rig.cam_from_rig, "right": turned})
+    mapped, seen = modelled(scene, wrong, tmp_path)
+    fit = fit_rig(mapped, seen, wrong, port=False, pose=True)
+    assert np.abs(errors_in_sigmas(fit, scene.rig)[[0, 1, 2, 4, 5]]).max() < 4.0
+    found = fit.rig.cam_from_rig["right"].rotation * pose.rotation.inv()
+    assert found.magnitude() < 0.3 * turned.rotation.magnitude()
+    assert fit.rig.baseline_m == pytest.approx(scene.rig.baseline_m, rel=1e-3)
+
+
+def test_calibrated_parameters_move_within_their_covariance(tmp_path: Path) -> None:
+    """A principal point that calibration had wrong by one sigma is not blamed on the rig."""
+    scene = noisy(4)
+    names = ("right.cx_px", "right.rx_rad", "right.ry_rad", "right.rz_rad")
+    covariance = np.diag(np.array([1.0, TURN_SIGMA, TURN_SIGMA, TURN_SIGMA]) ** 2)
+    right = scene.rig.cameras["right"]
+    wrong = replace(
+        scene.rig,
+        cameras={**scene.rig.cameras, "right": replace(right, cx_px=right.cx_px + 1.0)},
+        covariance=Covariance(parameters=names, matrix=covariance),
+    )
+    mapped, seen = modelled(scene, wrong, tmp_path)
+    fit = fit_rig(mapped, seen, wrong, port=False, pose=True)
+    assert set(names) <= set(fit.parameters)
+    np.testing.assert_allclose(
+        [fit.prior_sigmas[fit.parameters.index(n)] for n in names], np.sqrt(np.diag(covariance))
+    )
+    assert np.all(
+        [fit.rig.sigmas[n] <= 1.0001 * np.sqrt(covariance[i, i]) for i, n in enumerate(names)]
+    )
+    shared = [fit.parameters.index(n) for n in names]
+    assert np.abs(errors_in_sigmas(fit, scene.rig)[shared]).max() < 4.0
+
+
+def test_the_lever_arm_follows_from_turning_about(tmp_path: Path) -> None:
+    """Lines flown both ways tell where navigation's origin sits; how deep, they cannot tell."""
+    scene = noisy(5)
+    mapped, seen = modelled(scene, scene.rig, tmp_path)
+    rng = np.random.default_rng(2)
+    ned_from_body = [
+        pose * scene.rig.body_from_cam("left").inv() for pose in scene.ned_from_cam[::2]
+    ]
+    told = Told(
+        positions=np.array([p.translation for p in ned_from_body]) + rng.normal(0, 0.01, (10, 3)),
+        sigmas=np.full((10, 3), 0.01),
+    )
+    true = scene.rig.body_from_rig
+    moved = RigidTransform.from_components(
+        true.translation + np.array([0.03, -0.02, 0]), true.rotation
+    )
+    fit = fit_rig(
+        mapped, seen, replace(scene.rig, body_from_rig=moved), port=False, pose=True, told=told
+    )
+    sigmas = np.sqrt(np.diag(fit.covariance))[-3:]
+    truth = true.inv().translation
+    assert np.all(np.abs(fit.after[-3:] - truth) < 4 * sigmas)
+    assert np.all(sigmas[:2] < 0.015)
+    assert sigmas[2] > 0.02
+    np.testing.assert_allclose(fit.rig.body_from_rig.inv().translation, fit.after[-3:], atol=1e-12)
+
+
+def test_the_model_is_made_anew_on_the_refined_rig(tmp_path: Path) -> None:
+    scene = noisy(6)
+    wrong = nearer(scene.rig, 0.01)
+    mapped, seen = modelled(scene, wrong, tmp_path)
+    adjust = NavigationAdjuster(scene.records, wrong, mapped.lenses, DATUM)
+    mapped = adjust(mapped)
+    distances = Distances(near_m=1.75, far_m=2.35, source="test")
+    refined, found, again = refine_rig(
+        mapped, seen, wrong, distances, adjust, DATUM, tmp_path, port=True, pose=False
+    )
+    assert found.settled
+    assert again.sigmas is not None
+    assert refined.baseline == pytest.approx(model_baseline(refined.model), rel=1e-9)
+    written = read_rig(tmp_path / "rig.json")
+    said = json.loads((tmp_path / "port.json").read_text())
+    assert said["parameters"][0] == "left.port_distance_m"
+    assert written.cameras["left"].port_distance_m == pytest.approx(said["after"][0])
+    left = refined.lenses["left"]
+    assert isinstance(left, FlatPortLens)
+    assert left.camera == written.cameras["left"]
+    assert np.diag(said["correlation"]) == pytest.approx(1.0)
+    _, _, points, true_points = pupils_and_points(refined, scene)
+    away = align_rigid(points, true_points).apply(points) - true_points
+    assert np.sqrt((away**2).sum(axis=1).mean()) < 3e-3
+    assert refined.model.compute_mean_reprojection_error() < 0.45
+
+
+def test_the_same_rig_gives_the_same_model(tmp_path: Path) -> None:
+    """New lenses of an unchanged rig: nothing moves."""
+    scene = noisy(7)
+    mapped, seen = modelled(scene, scene.rig, tmp_path)
+    frames = sorted(mapped.model.frames)
+    ids = observed(mapped.model).point_ids
+    fit = RigFit(
+        rig=scene.rig,
+        parameters=(),
+        before=np.zeros(0),
+        after=np.zeros(0),
+        prior_sigmas=np.zeros(0),
+        covariance=np.zeros((0, 0)),
+        sigma_px=NOISE_PX,
+        observations=0,
+        stations=tuple(
+            as_transform(mapped.model.frames[f].rig_from_world).inv()
+            * mapped.lenses["left"].pinhole_from_cam
+            for f in frames
+        ),
+        points=np.array([mapped.model.points3D[int(i)].xyz for i in ids]),
+        point_ids=ids,
+    )
+    lenses: dict[str, Lens] = {
+        name: flat_port_lens(c, 1.75, 2.35) for name, c in scene.rig.cameras.items()
+    }
+    same, warped = on_rig(mapped, seen, fit, lenses)
+    for before, after in zip(seen.pixels, warped.pixels, strict=True):
+        np.testing.assert_allclose(after, before, atol=1e-6)
+    for number, image in mapped.model.images.items():
+        np.testing.assert_allclose(
+            same.model.images[number].cam_from_world().matrix(),
+            image.cam_from_world().matrix(),
+            atol=1e-12,
+        )
+
+
+def test_too_little_is_refused(tmp_path: Path) -> None:
+    scene = noisy(0)
+    mapped, seen = modelled(scene, scene.rig, tmp_path)
+    for point in sorted(mapped.model.points3D)[12:]:
+        mapped.model.delete_point3D(point)
+    with pytest.raises(ReconstructionError, match="12 points"):
+        fit_rig(mapped, seen, scene.rig, port=True, pose=True)
+    adjust = NavigationAdjuster(scene.records, scene.rig, mapped.lenses, None)
+    with pytest.raises(ReconstructionError, match="two cameras"):
+        refine_rig(
+            replace(mapped, scaled=False), seen, scene.rig, None, adjust, None, tmp_path,
+            port=True, pose=False,
+        )  # fmt: skip
