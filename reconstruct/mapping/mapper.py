@@ -24,6 +24,7 @@ from reconstruct.lenses.lens import Lens
 from reconstruct.mapping.database import Observations, write_database
 from reconstruct.mapping.database import as_transform as as_transform
 from reconstruct.mapping.global_mapper import adjust, map_globally
+from reconstruct.mapping.merge import merge_models, report_left_out
 
 Method = Literal["auto", "global", "incremental"]
 """How a calibrated rig is mapped; `auto`: globally, and incrementally where that fails."""
@@ -103,7 +104,7 @@ def map_calibrated(
         scaled=len(seen.cameras) > 1,
         baseline=known,
         rig_factor=factor,
-        notes=tuple(notes),
+        notes=(*notes, *report_left_out(found)),
     )
 
 
@@ -249,14 +250,14 @@ def run_mapper(
     Returns:
         All models, largest first.
     """
-    found = _map_once(seen, cam_from_rig, folder, _options(cam_from_rig, seed, free))
+    found = _map_once(seen, cam_from_rig, folder, _options(cam_from_rig, seed, free), free)
     if not found or found[0].num_reg_images() < len(seen.images):
         options = _options(cam_from_rig, seed, free)
         options.min_num_matches = _FEW_MATCHES
         options.mapper.abs_pose_min_num_inliers = _FEW_MATCHES
         options.mapper.init_min_num_inliers = 3 * _FEW_MATCHES
         options.triangulation.ignore_two_view_tracks = False
-        again = _map_once(seen, cam_from_rig, folder, options)
+        again = _map_once(seen, cam_from_rig, folder, options, free)
         if again and (not found or again[0].num_reg_images() > found[0].num_reg_images()):
             return again
     return found
@@ -297,6 +298,7 @@ def _map_once(
     cam_from_rig: Mapping[str, RigidTransform] | None,
     folder: Path,
     options: pycolmap.IncrementalPipelineOptions,
+    free: Literal["nothing", "distortion", "all"],
 ) -> list[pycolmap.Reconstruction]:
     pycolmap.logging.minloglevel = 2
     scratch = folder / "mapper"
@@ -313,10 +315,11 @@ def _map_once(
     )
     models = [pycolmap.Reconstruction(model) for model in found.values()]
     models = [_repaired(model, scratch, options) for model in models]
-    if cam_from_rig is not None:
+    if cam_from_rig is not None and free == "nothing":
         for model in models:
             adjust(model, options, tolerance=1e-7)
             model.update_point_3d_errors()
+        models = merge_models(_sorted(models), scratch / "database.db", options)
     shutil.rmtree(scratch)
     return _sorted(models)
 

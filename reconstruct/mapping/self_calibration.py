@@ -27,6 +27,7 @@ from reconstruct.mapping.mapper import (
     scale_model,
     sizes,
 )
+from reconstruct.mapping.merge import report_left_out
 
 SIMPLE, FULL = "RADIAL", "OPENCV"
 """COLMAP's lens models while mapping and in the last adjustment."""
@@ -105,7 +106,7 @@ def map_self_calibrated(
         scaled=False,
         baseline=baseline,
         rig_factor=factor,
-        notes=tuple(notes),
+        notes=(*notes, *report_left_out(found)),
     )
 
 
