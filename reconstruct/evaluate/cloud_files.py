@@ -127,7 +127,8 @@ def _local(points: Array, crs: str, datum: Datum) -> Array:
     ).transform(points[:, 0], points[:, 1])
     depth = datum.height_m - points[:, 2]
     ned = datum.ned_from_geodetic(np.column_stack([latitude, longitude, depth]))
-    return ned[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
+    enu: Array = ned[:, [1, 0, 2]] * np.array([1.0, 1.0, -1.0])
+    return enu
 
 
 def read_own_cloud(workspace: Path) -> Array:

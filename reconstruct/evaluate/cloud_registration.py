@@ -41,7 +41,7 @@ class Surface:
     def spacing(self) -> float:
         """Median distance of a point from the nearest other one."""
         some = self.points[:: max(1, len(self.points) // 5000)]
-        return float(np.median(self.tree.query(some, k=2)[0][:, 1]))
+        return float(np.median(self.tree.query(some, k=[2])[0]))
 
     def planes_at(self, points: Array) -> tuple[Array, Array, Array]:
         """The planes through the neighbours of the points nearest to (N, 3) others.
@@ -53,13 +53,13 @@ class Surface:
         nearest = np.empty(len(points))
         for start in range(0, len(points), 50_000):
             part = slice(start, start + 50_000)
-            distance, index = self.tree.query(points[part], k=_NEIGHBOURS)
+            found, index = self.tree.query(points[part], k=_NEIGHBOURS)
             around = self.points[index]
             middles[part] = around.mean(axis=1)
             offset = around - middles[part, None]
             covariance = np.einsum("nki,nkj->nij", offset, offset)
             normals[part] = np.linalg.eigh(covariance)[1][:, :, 0]
-            nearest[part] = distance[:, 0]
+            nearest[part] = np.asarray(found)[:, 0]
         return middles, normals, nearest
 
     def distance(self, points: Array) -> tuple[Array, Array]:

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from alice_survey.artefacts import need_stage, read_json, write_json
 from alice_survey.errors import WorkspaceError
@@ -183,23 +185,14 @@ def lifted(own: Array, surface: Surface) -> Similarity:
 
     Where they share no ground the middles are laid on each other.
     """
-    from scipy.spatial.transform import Rotation
-
     covered = covers(surface, own)
     if covered.any():
-        _, nearest = _flat_nearest(surface, own[covered])
-        shift = np.array([0.0, 0.0, float(np.median(surface.points[nearest, 2] - own[covered, 2]))])
+        below = own[covered][:: max(1, int(covered.sum()) // 20_000)]
+        _, nearest = cKDTree(surface.points[:, :2]).query(below[:, :2])
+        shift = np.array([0.0, 0.0, float(np.median(surface.points[nearest, 2] - below[:, 2]))])
     else:
         shift = np.median(surface.points, axis=0) - np.median(own, axis=0)
     return Similarity(scale=1.0, rotation=Rotation.identity(), translation=shift)
-
-
-def _flat_nearest(surface: Surface, points: Array) -> tuple[Array, NDArray[np.int64]]:
-    from scipy.spatial import cKDTree
-
-    step = max(1, len(points) // 20_000)
-    distance, index = cKDTree(surface.points[:, :2]).query(points[::step, :2])
-    return distance, np.repeat(index, step)[: len(points)]
 
 
 def _completeness(back: Distances, pixel_m: float, *, all_of_it: bool) -> dict[str, float]:
