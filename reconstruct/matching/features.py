@@ -14,7 +14,7 @@ _CONTRAST = 0.01
 """SIFT's contrast threshold: a quarter of the usual, since sediment has little."""
 _CELLS = 16
 """Cells along the longer side over which features are spread."""
-_MOST_MPX = 2.5
+_MOST_MPX = 1.5
 """Of a picture in which features are looked for, unless a scale is set (see `detection_scale`)."""
 _SUPPORT = 1.5
 """Diameters around a feature within which a mask must leave the picture free: three sigmas of the

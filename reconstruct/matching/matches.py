@@ -31,6 +31,8 @@ _CELLS_ALONG = 12
 """Cells along the longer side of a picture that share one prediction."""
 _SLACK = 2.0
 """Radius of the search over the largest miss of the prediction at the probe's own matches."""
+_FALSE = 4.0
+"""Misses over the median from which a match of the probe is taken for false; relief stays below."""
 _LEAST_RADIUS = 0.02
 """Of the search, as a share of the picture's longer side."""
 
@@ -130,7 +132,7 @@ def match_near(
     for rows in np.split(order, np.flatnonzero(np.diff(number[order])) + 1):
         low, high = predicted[rows].min(axis=0) - radius_px, predicted[rows].max(axis=0) + radius_px
         near = np.flatnonzero(((b.pixels >= low) & (b.pixels <= high)).all(axis=1))
-        if len(near) < 2:
+        if not len(near):
             continue
         left = a.descriptors[rows].astype(np.float32)
         cell_best, cell_best_b = np.zeros(len(rows), np.int64), best_b[near]
@@ -147,7 +149,8 @@ def match_near(
         nearest_b[near] = cell_nearest
     rows = np.arange(len(a.pixels))
     clear = first < ratio * ratio * second
-    good = rows[clear & (best_b[best] == rows) & np.isfinite(first)]
+    # without a second to compare with, nothing stands out
+    good = rows[clear & (best_b[best] == rows) & np.isfinite(second)]
     return np.stack([good, best[good]], axis=1).astype(np.uint32)
 
 
@@ -240,6 +243,10 @@ def _guided(task: PairTask, a: Features, b: Features, seen: tuple[Array, Array])
     long_side = float(a.pixels.max())
     homography = fit_homography(at, there)
     miss = np.linalg.norm(apply_homography(homography, at) - there, axis=1)
+    # a false match along an epipolar line is as good as any to the geometry
+    near = miss <= _FALSE * np.median(miss)
+    homography = fit_homography(at[near], there[near])
+    miss = np.linalg.norm(apply_homography(homography, at[near]) - there[near], axis=1)
     radius = max(_SLACK * float(miss.max()), _LEAST_RADIUS * long_side)
     predicted = apply_homography(homography, a.pixels)
     if not np.isfinite(predicted).all() or radius > long_side / 3:

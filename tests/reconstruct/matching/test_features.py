@@ -74,7 +74,7 @@ def test_features_keep_away_from_the_border_of_a_mask() -> None:
 
 
 @pytest.mark.parametrize(
-    ("size", "scale"), [((846, 677), 1.0), ((1600, 1200), 1.0), ((3384, 2710), 0.522)]
+    ("size", "scale"), [((846, 677), 1.0), ((1360, 1024), 1.0), ((3384, 2710), 0.404)]
 )
 def test_only_large_pictures_are_reduced(size: tuple[int, int], scale: float) -> None:
     assert detection_scale(size) == pytest.approx(scale, abs=0.001)
