@@ -23,7 +23,7 @@ _BLOCK = 1024
 _COARSE_FEATURES = 800
 _PROBE_FEATURES = 1500
 """Largest features of both pictures whose matches predict where all others are."""
-_WORTH_PROBING = 2
+_WORTH_PROBING = 2.0
 """Products of a full match over those of the probe, from which prediction saves time."""
 _LEAST_PROBED = 30
 """Verified matches of the probe below which nothing is predicted."""
