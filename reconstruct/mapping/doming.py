@@ -15,11 +15,13 @@ import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.errors import warn
-from alice_survey.frames import Array, rotation_from_attitude
+from alice_survey.frames import Array, Datum, rotation_from_attitude
 from alice_survey.manifest import ImageRecord
 from camera_calib.rig import Rig
 from reconstruct.lenses.lens import Lens
 from reconstruct.mapping.database import as_transform
+from reconstruct.mapping.mapper import Mapped
+from reconstruct.mapping.priors import pinhole_positions
 from reconstruct.mapping.working_range import ray_passes
 
 _LEAST_STATIONS = 8
@@ -94,7 +96,12 @@ class Doming:
             for name, bend in (("along", self.along), ("across", self.across))
         }
         scale = None if self.scale is None else vars(self.scale)
-        return {**bends, "scale": scale, "pixel_m": self.pixel_m, "notes": self.notes()}
+        return {
+            **bends,
+            "scale": scale,
+            "pixel_m": self.pixel_m if np.isfinite(self.pixel_m) else None,
+            "notes": self.notes(),
+        }
 
     def notes(self) -> list[str]:
         """A line for every significant bend."""
@@ -144,6 +151,19 @@ def measure_doming(
     for note in found.notes():
         warn(note)
     return found
+
+
+def doming_of_survey(
+    mapped: Mapped, records: Sequence[ImageRecord], rig: Rig | None, datum: Datum | None
+) -> Doming | None:
+    """Measure a mapping's bend with what its survey knows; None without a calibrated rig."""
+    if rig is None or not mapped.scaled:
+        return None
+    positions = sigmas = None
+    if datum is not None:
+        positions, sigmas = pinhole_positions(records, rig, mapped.lenses, datum)
+    rotations = navigation_rotations(records, rig, mapped.lenses)
+    return measure_doming(mapped.model, records, positions, sigmas, rotations)
 
 
 def bend_of(
@@ -298,7 +318,8 @@ def _robust_fit(design: Array, values: Array, sigmas: Array) -> tuple[Array, Arr
     root = np.sqrt(weight) / sigmas
     variance = float((weight * left**2).sum() / max(weight.sum() * free / len(values), 1e-12))
     normal = (root[:, None] * design).T @ (root[:, None] * design)
-    return fitted, np.linalg.inv(normal) * max(1.0, variance)
+    covariance: Array = np.linalg.inv(normal) * max(1.0, variance)
+    return np.asarray(fitted, float), covariance
 
 
 def _station_scale(model: pycolmap.Reconstruction, frame: int) -> tuple[float, float] | None:

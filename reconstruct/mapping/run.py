@@ -22,6 +22,7 @@ from alice_survey.manifest import ImageRecord
 from camera_calib.rig import Rig
 from reconstruct.lenses.lens import Lens, flat_port_lens
 from reconstruct.mapping.database import Observations, VerifiedPair
+from reconstruct.mapping.doming import doming_of_survey
 from reconstruct.mapping.mapper import Mapped, map_calibrated
 from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import Convergence, refract
@@ -338,6 +339,7 @@ def _write(
             },
         },
     )
+    doming = doming_of_survey(mapped, inputs.records, inputs.rig, inputs.datum)
     content = b"".join(p.read_bytes() for p in sorted((partial / "model").iterdir()))
     write_json(
         partial / "mapping.json",
@@ -350,6 +352,7 @@ def _write(
             "rig_factor": mapped.rig_factor,
             "distances": None if distances is None else vars(distances),
             "refraction": None if refracted is None else vars(refracted),
+            "doming": None if doming is None else doming.to_json(),
             "gauge": hashlib.blake2b(content, digest_size=16).hexdigest(),
             "notes": list(mapped.notes),
         },

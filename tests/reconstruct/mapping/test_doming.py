@@ -1,3 +1,5 @@
+import json
+
 import numpy as np
 import pycolmap
 import pytest
@@ -6,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from reconstruct.mapping.doming import (
     Bend,
     bend_of,
+    doming_of_survey,
     down_of,
     ground_pixel,
     measure_doming,
@@ -145,6 +148,17 @@ def test_the_scale_shows_a_model_that_stretches_along_the_block() -> None:
     assert after.range == pytest.approx(0.01, rel=0.25)
     assert after.significant
     assert ground_pixel(model) > 0
+
+
+def test_a_survey_tells_its_bend_in_numbers_that_json_takes() -> None:
+    scene, mapped = block(), block_mapped()
+    found = doming_of_survey(mapped, scene.records, scene.rig, DATUM)
+    assert found is not None and found.across is not None and found.scale is not None
+    told = json.loads(json.dumps(found.to_json(), allow_nan=False))
+    assert told["across"]["sag_m"] == found.across.sag_m
+    assert doming_of_survey(mapped, scene.records, None, None) is None
+    blind = doming_of_survey(mapped, scene.records, scene.rig, None)
+    assert blind is not None and blind.along is None
 
 
 def test_sag_is_that_of_a_parabola() -> None:
