@@ -146,4 +146,5 @@ def read_own_cloud(workspace: Path) -> Array:
     points = np.asarray(cloud.points, dtype=np.float64) + offset
     if len(points) < 100:
         raise ReconstructionError(f"{dense / 'cloud.ply'}: holds {len(points)} points")
-    return points[:: -(-len(points) // _MOST_POINTS)]
+    thinned: Array = points[:: -(-len(points) // _MOST_POINTS)]
+    return thinned
