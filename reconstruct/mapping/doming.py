@@ -307,13 +307,13 @@ def _quadratic(plane: Array, *, wide: bool) -> Array:
 
 def _robust_fit(design: Array, values: Array, sigmas: Array) -> tuple[Array, Array]:
     """Coefficients and their covariance."""
-    weight = np.ones(len(values))
+    weight: Array = np.ones(len(values))
     for _ in range(_ROUNDS):
         root = np.sqrt(weight) / sigmas
         fitted = np.linalg.lstsq(root[:, None] * design, root * values, rcond=None)[0]
         left = (values - design @ fitted) / sigmas
         spread = max(1.4826 * float(np.median(np.abs(left))), 1e-12)
-        weight = 1.0 / (1.0 + (left / (_TUNING * spread)) ** 2)
+        weight = np.asarray(1.0 / (1.0 + (left / (_TUNING * spread)) ** 2), float)
     free = len(values) - design.shape[1]
     root = np.sqrt(weight) / sigmas
     variance = float((weight * left**2).sum() / max(weight.sum() * free / len(values), 1e-12))
