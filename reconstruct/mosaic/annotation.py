@@ -5,10 +5,12 @@ has a world file (six lines: pixel size, turns, and the centre of the first pixe
 `tiles.csv`.
 """
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
+import cv2
 import numpy as np
 import rasterio
 import rasterio.shutil
@@ -144,11 +146,9 @@ def _scale_bar(
     width: int, height: int, pixel: float, unit: str
 ) -> tuple[NDArray[np.uint8], int, int]:
     """A bar of a round length with its text, (h, w, 4) RGBA, and where its first pixel goes."""
-    import cv2
-
-    from reconstruct.dense.dem import round_cell
-
-    length = round_cell(_BAR_SHARE * width * pixel)
+    wanted = _BAR_SHARE * width * pixel
+    decade = 10.0 ** math.floor(math.log10(wanted))
+    length = max(digit * decade for digit in (1, 2, 5) if digit * decade <= wanted * (1 + 1e-9))
     bar_px = max(2, round(length / pixel))
     size = max(0.4, min(width, height) / 1500)
     thick = max(1, round(2 * size))

@@ -58,7 +58,7 @@ class Blend:
             mean = total / np.maximum(share, _NOTHING)[..., None]
             if level < LEVELS:
                 share_next, total_next = cv2.pyrDown(share), cv2.pyrDown(total)
-                band = mean - _expanded(total_next, share_next, (width, height))[0]
+                band = mean - _expanded(total_next, share_next, (width, height))
                 share, total = share_next, total_next
             else:
                 band = mean
@@ -73,19 +73,18 @@ class Blend:
         for level in reversed(range(LEVELS)):
             weight = self._weights[level]
             height, width = weight.shape
-            broad, spread = _expanded(colour, known, (width, height))
+            broad = _expanded(colour, known, (width, height))
+            known = (weight > _NOTHING).astype(np.float32)
             mean = self._bands[level] / np.maximum(weight, _NOTHING)[..., None]
-            colour = (mean + broad).astype(np.float32)
-            known = np.maximum(weight, spread)
-            colour[known <= _NOTHING] = 0.0
-            known = (known > _NOTHING).astype(np.float32)
+            colour = ((mean + broad) * known[..., None]).astype(np.float32)
         return colour
 
 
-def _expanded(total: Float32, share: Float32, size: tuple[int, int]) -> tuple[Float32, Float32]:
-    """Means total / share at twice the size, of what is known alone, and how much that is."""
+def _expanded(total: Float32, share: Float32, size: tuple[int, int]) -> Float32:
+    """Means total / share at twice the size, of what is known alone."""
     known = (share > _NOTHING).astype(np.float32)
     mean = total / np.maximum(share, _NOTHING)[..., None] * known[..., None]
     spread = cv2.pyrUp(known, dstsize=size)
     broad = cv2.pyrUp(mean, dstsize=size) / np.maximum(spread, _NOTHING)[..., None]
-    return broad.astype(np.float32), spread.astype(np.float32)
+    found: Float32 = broad.astype(np.float32)
+    return found

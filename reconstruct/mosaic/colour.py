@@ -47,6 +47,8 @@ _MOST_SAMPLES = 20_000
 """Of those that the share of the additive light is found from."""
 _LARGEST_SIGMA = 0.25
 """Of a share that is believed."""
+_LARGEST_WATER_SIGMA = 0.15
+"""Of the logarithm of colour ratios that the water took, to put them right by it."""
 _LEAST_LEFT = 0.05
 """Share of the light that stays at least when the water's is taken away."""
 _LARGEST_LIFT = 30.0
@@ -104,6 +106,9 @@ class ColourModel:
         return {
             "white_blue_green_red": [float(w) for w in self.light.white],
             "fall_off_per_unit_blue_green_red": [float(b) for b in self.light.fall_off],
+            "fall_off_sigma_blue_green_red": [
+                float(s) if np.isfinite(s) else None for s in self.light.fall_off_sigma
+            ],
             "middle_range": float(self.light.middle_range),
             "added_light_share_blue_green_red": [float(s) for s in self.shares],
             "added_light_share_sigma_blue_green_red": [
@@ -151,11 +156,25 @@ def solve_colour(
     model = ColourModel(
         light=patterns, added=added, shares=shares, share_sigmas=sigmas, notes=()
     )  # fmt: skip
-    white = _white(cleaned, model, images, cameras)
+    neutral = _unweakened(patterns) if wanted == "water" else None
+    white = _white(cleaned, model, images, cameras, neutral)
+    if neutral is None:
+        notes.append(
+            "colours: light of lamp, lens and range evened out over the survey; one factor per "
+            "colour for the whole survey makes what is bright in it neutral"
+        )
+        if wanted == "water":
+            notes.append(
+                "colours: ranges differ too little to tell how much the water weakens each colour"
+            )
+    else:
+        notes.append(
+            "colours: light of lamp, lens and range evened out over the survey; each colour "
+            "strengthened by what the water took over the middle range, as under a white lamp"
+        )
     notes.append(
-        "colours: light of lamp, lens and range evened out over the survey; one factor per colour "
-        "for the whole survey makes what is bright in it neutral and puts 2 % of it above, half of "
-        "it at most at, a middle brightness; sRGB"
+        "brightness: one factor puts the survey's median at most at 22 % and 98 % of it below "
+        "68 % of white; sRGB"
     )
     return replace(model, light=replace(patterns, white=white), notes=tuple(notes))
 
@@ -314,13 +333,34 @@ def _lowest(cost: Array) -> tuple[float, float]:
     return at, float(np.sqrt(2.0 / curve))
 
 
+def _unweakened(light: LightModel) -> Array | None:
+    """(3,) factors, of mean 1, by which the water weakened colours over the middle range.
+
+    Spreading weakens all colours alike, so that only their differences say something of the water.
+
+    Returns:
+        None where the differences are not known well enough.
+    """
+    sigma = np.hypot(light.fall_off_sigma[[0, 2]], light.fall_off_sigma[1]) * light.middle_range
+    if not (light.middle_range > 0 and (sigma < _LARGEST_WATER_SIGMA).all()):
+        return None
+    factors = np.exp(light.fall_off * light.middle_range)
+    unweakened: Array = factors / factors.mean()
+    return unweakened
+
+
 def _white(
-    samples: LightSamples, model: ColourModel, images: Sequence[str], cameras: Sequence[str]
+    samples: LightSamples,
+    model: ColourModel,
+    images: Sequence[str],
+    cameras: Sequence[str],
+    neutral: Array | None,
 ) -> Array:
     """Factors that make what is bright neutral, and the survey light without burning out.
 
-    The cast is the 6-norm of each colour, between the mean (grey world, which paints a lawn
-    purple) and the largest value ("shades of gray", Finlayson & Trezzi 2004).
+    With `neutral` given, colours are multiplied by that instead of being made neutral. The cast is
+    the 6-norm of each colour, between the mean (grey world, which paints a lawn purple) and the
+    largest value ("shades of gray", Finlayson & Trezzi 2004).
     """
     if not len(samples.views):
         return np.ones(3)
@@ -330,8 +370,9 @@ def _white(
     if samples.ranges is not None:
         lift = lift + (samples.ranges[:, :1] - light.middle_range) * light.fall_off
     level = np.exp(samples.levels[:, 0] + lift)
-    cast = (level**_NORM).mean(axis=0) ** (1.0 / _NORM)
-    neutral = cast.mean() / cast
+    if neutral is None:
+        cast = (level**_NORM).mean(axis=0) ** (1.0 / _NORM)
+        neutral = cast.mean() / cast
     grey = (level * neutral).mean(axis=1)
     bright, middle = np.percentile(grey, _BRIGHT_PERCENT), np.median(grey)
     white: Array = neutral * min(_BRIGHT_LIGHT / bright, _MIDDLE_LIGHT / middle)

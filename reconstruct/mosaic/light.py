@@ -76,6 +76,8 @@ class LightModel:
     """(3,) factors, the same for all pictures, that take the cast of water and light away."""
     fall_off: Array = field(default_factory=lambda: np.zeros(3))
     """(3,) by how much the logarithm of light falls for each unit of range."""
+    fall_off_sigma: Array = field(default_factory=lambda: np.full(3, np.inf))
+    """(3,) of it."""
     middle_range: float = 0.0
     """Range at which patterns and gains hold."""
 
@@ -231,7 +233,9 @@ def solve_patterns(
         len(names), len(images), gain_sigma, _FALL_OFF_SIGMA / middle if middle > 0 else 1.0
     )
     pull, pulled = _typical(nodes, camera_of, len(names), unknowns)
-    solution = np.zeros((unknowns, 3))
+    solution, variance = np.zeros((unknowns, 3)), np.full(3, np.inf)
+    last = np.zeros(unknowns)
+    last[-1] = 1.0
     for channel in range(3):
         target = (samples.levels[:, 0, channel] - samples.levels[:, 1, channel]).astype(np.float64)
         x = np.zeros(unknowns)
@@ -242,6 +246,7 @@ def solve_patterns(
             normal = weighted.T @ design + prior + diags_array(pull[:, channel])
             x = _solved(normal, weighted.T @ target + pulled[:, channel])
         solution[:, channel] = x
+        variance[channel] = _solved(normal, last)[-1]
     patterns = solution[: count_nodes * len(names)].reshape(len(names), *GRID, 3)
     patterns = patterns - patterns.mean(axis=(0, 1, 2))
     gains = solution[count_nodes * len(names) : -1]
@@ -251,6 +256,7 @@ def solve_patterns(
         gains=dict(zip(images, gains, strict=True)),
         white=np.ones(3),
         fall_off=solution[-1],
+        fall_off_sigma=np.sqrt(variance),
         middle_range=middle,
     )
 

@@ -5,12 +5,12 @@ from reconstruct.mosaic.blend import Blend, Part
 
 def test_one_view_comes_out_as_it_went_in() -> None:
     rng = np.random.default_rng(1)
-    colour = rng.uniform(0, 255, (64, 96, 3)).astype(np.float32)
-    valid = np.ones((64, 96), bool)
-    valid[:, 70:] = False
-    blend = Blend(96, 128)
+    colour = rng.uniform(0, 255, (128, 144, 3)).astype(np.float32)
+    valid = np.zeros((128, 144), bool)
+    valid[40:80, 45:100] = True
+    blend = Blend(160, 192)
     blend.add(Part(row=16, column=32, colour=colour, valid=valid, taken=valid))
-    found = blend.result()[16:80, 32:128]
+    found = blend.result()[16:144, 32:176]
     np.testing.assert_allclose(found[valid], colour[valid], atol=2e-3)
 
 
