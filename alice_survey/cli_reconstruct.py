@@ -1,5 +1,6 @@
 """The commands that turn pictures into a model, measure in it, and score it."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
