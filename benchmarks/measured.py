@@ -1,0 +1,85 @@
+"""Wall time and peak memory of a command with all its children."""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+_EVERY_S = 0.2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cost:
+    """What a command took."""
+
+    wall_s: float
+    cpu_s: float
+    """Of all its processes: on a busy machine a fairer measure than the wall."""
+    peak_mib: float
+    """Largest sum of the proportional memory of all its processes, seen every 0.2 s."""
+    code: int
+    log: Path
+
+    @property
+    def ok(self) -> bool:
+        """Whether it ended well."""
+        return self.code == 0
+
+    def last_line(self) -> str:
+        """The end of what it said: the error, if there was one."""
+        lines = self.log.read_text(errors="replace").strip().splitlines()
+        return lines[-1][:160] if lines else ""
+
+
+def measured(command: Sequence[str], log: Path, timeout_s: float = 7200.0) -> Cost:
+    """Run a command; what it says goes to a log."""
+    log.parent.mkdir(parents=True, exist_ok=True)
+    before = os.times()
+    started, peak = time.perf_counter(), 0.0
+    with log.open("w") as file:
+        process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
+        while process.poll() is None:
+            peak = max(peak, sum(_memory_mib(pid) for pid in _family(process.pid)))
+            if time.perf_counter() - started > timeout_s:
+                process.kill()
+            time.sleep(_EVERY_S)
+    after = os.times()
+    return Cost(
+        wall_s=time.perf_counter() - started,
+        cpu_s=after.children_user + after.children_system
+        - before.children_user - before.children_system,
+        peak_mib=peak,
+        code=process.returncode,
+        log=log,
+    )  # fmt: skip
+
+
+def _family(root: int) -> list[int]:
+    """A process and all its descendants."""
+    family, waiting = [], [root]
+    while waiting:
+        pid = waiting.pop()
+        family.append(pid)
+        try:
+            for task in Path(f"/proc/{pid}/task").iterdir():
+                waiting += [int(child) for child in (task / "children").read_text().split()]
+        except OSError:
+            continue  # it has ended meanwhile
+    return family
+
+
+def _memory_mib(pid: int) -> float:
+    """Proportional set size: what is shared counts once."""
+    try:
+        text = Path(f"/proc/{pid}/smaps_rollup").read_text()
+    except OSError:
+        return 0.0
+    return next((int(s.split()[1]) / 1024 for s in text.splitlines() if s.startswith("Pss:")), 0.0)
+
+
+def python(*arguments: str) -> list[str]:
+    """A command for this interpreter."""
+    return [sys.executable, *arguments]

@@ -1,0 +1,280 @@
+"""Reconstruction beside stock COLMAP and pyOrthomosaic on the same pictures, in one run.
+
+    .venv/bin/python -m benchmarks.reconstruct --work FOLDER [--data ../shared/data]
+        [--demo WORKSPACE] [--pyorthomosaic PYTHON] [--only peers,growth,haltbrekken,brighton]
+        [--quick]
+
+`peers`: 50 and 100 rendered pictures of the demo (quarter resolution). Wall and processor time,
+peak memory with children, pictures registered, and errors against the truth. Our model is aligned
+rigidly; the others know no scale and are aligned with a free one. COLMAP ends at the sparse model.
+`growth`: our own cost on 50, 100, 200 and 400 pictures at an eighth of the resolution.
+`haltbrekken`, `brighton`: real pictures of the folder given by `--data`; a picture of both
+mosaics side by side, and the distance from another tool's cloud.
+
+pyOrthomosaic (MIT licence, PyPI) is in the extra `bench`; `--pyorthomosaic` names the Python of
+another environment that has it. What is not there is left out, and said.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from benchmarks.machine import heading, machine
+from benchmarks.measured import Cost, measured, python
+from benchmarks.reconstruct_scores import Accuracy, score_ours, score_peer
+from benchmarks.reconstruct_surveys import pictures_of, render, subset, survey_toml
+
+PARTS = ("peers", "growth", "haltbrekken", "brighton")
+_PEERS = Path(__file__).with_name("reconstruct_peers.py")
+_STAGES = ("sparse", "dense", "mosaic")
+_RUN = (
+    "import sys; from pathlib import Path; from alice_survey.survey import settings; "
+    "from reconstruct.{stage}.run import run_{stage}; from alice_survey.executor import "
+    "default_threads; "
+    "w = Path(sys.argv[1]); run_{stage}(w, settings(w, None, needed=False), default_threads())"
+)
+
+
+def ours(workspace: Path, stages: Sequence[str] = _STAGES) -> dict[str, Cost]:
+    """Cost of every stage of ours; ends at the first that fails."""
+    costs = {}
+    for stage in stages:
+        code = _RUN.format(stage=stage)
+        costs[stage] = measured(
+            [*python("-c", code), str(workspace)], workspace / "logs" / f"{stage}.log"
+        )
+        if not costs[stage].ok:
+            break
+    return costs
+
+
+def peer(name: str, interpreter: str, pictures: Path, out: Path) -> Cost:
+    """Cost of another program on a folder of pictures."""
+    command = [interpreter, str(_PEERS), name, str(pictures), str(out)]
+    return measured(command, out.with_suffix(".log"))
+
+
+_HEAD = (
+    f"{'':34} {'wall s':>8} {'cpu s':>8} {'MiB':>7} {'reg.':>5} {'cameras':>8} {'points':>15} "
+    f"{'surface':>15}"
+)
+
+
+def row(name: str, costs: Sequence[Cost], found: Accuracy | None) -> str:
+    """One line of the table; the reason where it failed."""
+    wall, cpu = sum(c.wall_s for c in costs), sum(c.cpu_s for c in costs)
+    line = f"{name:34} {wall:8.1f} {cpu:8.1f} {max(c.peak_mib for c in costs):7.0f}"
+    failed = next((c for c in costs if not c.ok), None)
+    if failed is not None:
+        return f"{line}  failed: {failed.last_line()}"
+    if found is None:
+        return line
+    return (
+        f"{line} {found.registered:5} {found.cameras_mm:8.2f} "
+        f"{found.points_mm:8.2f}/{found.points_median_mm:6.2f} "
+        f"{found.surface_mm:8.2f}/{found.surface_median_mm:6.2f}"
+    )
+
+
+def run_peers(work: Path, demo: Path, interpreter: str | None, counts: Sequence[int]) -> None:
+    """Table of all programs on the same rendered pictures."""
+    for count in counts:
+        part = subset(demo, work / f"peers{count}", count)
+        folder = work / f"peers{count}_pictures"
+        _emptied(folder)
+        pictures_of(part, folder)
+        print(f"\n{count} rendered pictures; errors in mm: rms of cameras; rms/median of points "
+              f"and of cells\n{_HEAD}", flush=True)  # fmt: skip
+        costs = ours(part)
+        found = score_ours(part) if costs["sparse"].ok else None
+        print(row("ours, to the sparse model", [costs["sparse"]], found), flush=True)
+        print(row("ours, to surface and mosaic", list(costs.values()), found), flush=True)
+        for name, python_of in (("colmap", sys.executable), ("pyorthomosaic", interpreter)):
+            if python_of is None:
+                print(f"{name}: not installed; give --pyorthomosaic PYTHON")
+                continue
+            out = _emptied(work / f"peers{count}_{name}")
+            cost = peer(name, python_of, folder, out)
+            accuracy = score_peer(out, part / "images" / "truth") if cost.ok else None
+            print(row(name, [cost], accuracy), flush=True)
+
+
+def run_growth(work: Path, counts: Sequence[int], scale: int) -> None:
+    """Our own cost a picture as surveys grow."""
+    whole = work / f"growth_{max(counts)}"
+    render(whole, survey_toml(max(counts), scale))
+    print(f"\ngrowth, at 1/{scale} of the resolution: seconds a picture (cpu), peak MiB\n"
+          f"{'pictures':>9} " + " ".join(f"{stage:>20}" for stage in _STAGES)
+          + f" {'registered':>11}")  # fmt: skip
+    for count in counts:
+        part = subset(whole, work / f"growth{count}", count)
+        costs = ours(part)
+        cells = [
+            f"{c.wall_s / count:6.2f} ({c.cpu_s / count:5.2f}) {c.peak_mib:6.0f}"
+            if c.ok else f"failed: {c.last_line()}"
+            for c in costs.values()
+        ]  # fmt: skip
+        found = score_ours(part) if costs["sparse"].ok else None
+        registered = "" if found is None else f"{found.registered:6} of {count}"
+        print(f"{count:9} " + " ".join(f"{cell:>20}" for cell in cells) + f" {registered}",
+              flush=True)  # fmt: skip
+
+
+def run_haltbrekken(work: Path, data: Path, interpreter: str | None) -> None:
+    """Real stereo pictures without navigation: both mosaics in one picture."""
+    source, workspace = data / "haltbrekken", _emptied(work / "haltbrekken")
+    arguments = ["--left", str(source / "left"), "--right", str(source / "right")]
+    imported(arguments, workspace)
+    costs = ours(workspace)
+    print(f"\nhaltbrekken, 40 pictures\n{row('ours', list(costs.values()), None)}"
+          f"  {registered(workspace)}", flush=True)  # fmt: skip
+    if interpreter is None:
+        print("pyorthomosaic: not installed; give --pyorthomosaic PYTHON")
+        return
+    pictures = pictures_of(workspace, _emptied(work / "haltbrekken_pictures"))
+    out = _emptied(work / "haltbrekken_pyorthomosaic")
+    cost = peer("pyorthomosaic", interpreter, pictures, out)
+    print(f"{row('pyorthomosaic', [cost], None)}  {peer_registered(out, cost)}")
+    if cost.ok and costs.get("mosaic") is not None and costs["mosaic"].ok:
+        target = work / "haltbrekken_mosaics.png"
+        side_by_side([workspace / "mosaic" / "mosaic.png", out / "orthophoto.tif"], target)
+        print(f"both mosaics: {target}")
+
+
+def run_brighton(work: Path, data: Path, interpreter: str | None) -> None:
+    """Real drone pictures: distance from another tool's cloud."""
+    from reconstruct.evaluate.cloud_files import read_reference
+    from reconstruct.evaluate.cloud_registration import Surface, register_cloud
+    from reconstruct.evaluate.reference import distances, evaluate_reference, lifted
+    from reconstruct.model import read_frame
+
+    source, workspace = data / "brighton_beach", _emptied(work / "brighton_beach")
+    imported([str(source / "images")], workspace)
+    costs = ours(workspace)
+    print(f"\nbrighton_beach, 18 pictures\n{row('ours', list(costs.values()), None)}"
+          f"  {registered(workspace)}", flush=True)  # fmt: skip
+    if not all(cost.ok for cost in costs.values()):
+        return
+    text, _ = evaluate_reference(workspace, source / "model.laz")
+    print(text)
+    if interpreter is None:
+        print("pyorthomosaic: not installed; give --pyorthomosaic PYTHON")
+        return
+    out = _emptied(work / "brighton_pyorthomosaic")
+    cost = peer("pyorthomosaic", interpreter, source / "images", out)
+    print(f"{row('pyorthomosaic', [cost], None)}  {peer_registered(out, cost)}")
+    if not cost.ok:
+        return
+    datum = read_frame(workspace / "sparse" / "frame.json").datum
+    surface = Surface.of(read_reference(source / "model.laz", datum)[0])
+    theirs, placed = read_reference(out / "dsm.tif", datum)
+    rng = np.random.default_rng(1)
+    fit = register_cloud(theirs, surface, lifted(theirs, surface), free_scale=True, rng=rng)
+    away = distances(fit.reference_from_cloud.apply(theirs), surface, rng)
+    print(f"its elevation model to the reference: median {np.median(np.abs(away.signed_m)):.4f} m, "
+          f"scale {fit.reference_from_cloud.scale:.5f}, georeferenced: {placed}")  # fmt: skip
+
+
+def imported(arguments: Sequence[str], workspace: Path) -> None:
+    """Bring real pictures in."""
+    subprocess.run(
+        python("-m", "alice_survey", "import-images", *arguments, "-w", str(workspace)),
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
+
+
+def registered(workspace: Path) -> str:
+    """How many pictures our model holds."""
+    file = workspace / "sparse" / "registration.json"
+    if not file.exists():
+        return ""
+    found = json.loads(file.read_text())
+    return (
+        f"{found['registered']} of {found['total']} registered, "
+        f"{found['mean_reprojection_px']:.3f} px"
+    )
+
+
+def peer_registered(out: Path, cost: Cost) -> str:
+    """How many pictures a peer's model holds."""
+    if not cost.ok:
+        return ""
+    return f"{len(json.loads((out / 'cameras.json').read_text())['centres'])} registered"
+
+
+def side_by_side(files: Sequence[Path], target: Path, height_px: int = 1400) -> None:
+    """Pictures of one height beside each other, transparent parts white."""
+    columns = []
+    for file in files:
+        picture = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        if picture.shape[2] == 4:
+            opaque = picture[..., 3:] > 0
+            picture = np.where(opaque, picture[..., :3], 255).astype(np.uint8)
+            rows, cols = (np.flatnonzero(opaque[..., 0].any(axis=a)) for a in (1, 0))
+            picture = picture[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
+        scale = height_px / picture.shape[0]
+        columns += [cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)]
+        columns += [np.full((columns[-1].shape[0], 24, 3), 255, np.uint8)]
+    cv2.imwrite(str(target), np.hstack(columns[:-1]))
+
+
+def _emptied(folder: Path) -> Path:
+    """A folder that is not there any more."""
+    import shutil
+
+    if folder.exists():
+        shutil.rmtree(folder)
+    return folder
+
+
+def find_pyorthomosaic(given: str | None) -> str | None:
+    """The Python that has pyOrthomosaic, or None."""
+    interpreter = given or sys.executable
+    found = subprocess.run([interpreter, "-c", "import orthomosaic"], capture_output=True)
+    if found.returncode and given:
+        raise SystemExit(f"{given} has no pyOrthomosaic: pip install pyOrthomosaic")
+    return None if found.returncode else interpreter
+
+
+def main() -> None:
+    """Run the parts that are asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--work", type=Path, required=True, help="scratch folder")
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"), help="real pictures")
+    parser.add_argument("--demo", type=Path, help="workspace with rendered demo pictures")
+    parser.add_argument("--pyorthomosaic", help="a Python that has pyOrthomosaic")
+    parser.add_argument("--only", default=",".join(PARTS), help="parts, by commas")
+    parser.add_argument("--quick", action="store_true", help="small surveys, to see that it runs")
+    given = parser.parse_args()
+    parts = given.only.split(",")
+    if unknown := set(parts) - set(PARTS):
+        raise SystemExit(f"no part {min(unknown)!r}; there are {', '.join(PARTS)}")
+    print(heading(machine(["pycolmap", "opencv-contrib-python-headless", "numpy"])))
+    interpreter = find_pyorthomosaic(given.pyorthomosaic)
+    given.work.mkdir(parents=True, exist_ok=True)
+    work = given.work.resolve()
+    if "peers" in parts:
+        demo = given.demo
+        if demo is None:
+            demo = work / "demo"
+            render(demo, survey_toml(20 if given.quick else 116, 8 if given.quick else 4))
+        run_peers(work, demo.resolve(), interpreter, [16] if given.quick else [50, 100])
+    if "growth" in parts:
+        run_growth(work, [12, 24] if given.quick else [50, 100, 200, 400], 8)
+    for name, function in (("haltbrekken", run_haltbrekken), ("brighton", run_brighton)):
+        if name in parts:
+            if (given.data / ("brighton_beach" if name == "brighton" else name)).is_dir():
+                function(work, given.data.resolve(), interpreter)
+            else:
+                print(f"\n{name}: no pictures in {given.data}")
+
+
+if __name__ == "__main__":
+    main()
