@@ -195,6 +195,11 @@ def _small_copy(content: NDArray[np.uint8]) -> SmallCopy:
     return SmallCopy(levels=content, broad=broad)
 
 
+def forget_pictures() -> None:
+    """Let go of the lenses that an earlier run in this process read."""
+    _pictures.cache_clear()
+
+
 @lru_cache(maxsize=1)
 def _pictures(workspace: Path) -> Pictures:
     return Pictures.open(workspace)

@@ -1,7 +1,6 @@
 """Tasks of the mosaic: compare light, lay seams, paint tiles. Each works on one block."""
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -11,31 +10,24 @@ from numpy.typing import NDArray
 from rasterio.windows import Window
 
 from reconstruct.dense.dem import DemGrid
-from reconstruct.lenses.lens import FlatPortLens
 from reconstruct.model import View
 from reconstruct.mosaic.blend import Blend, Part
 from reconstruct.mosaic.colour import ColourModel
-from reconstruct.mosaic.facts import SmallCopies, encoded, linear_table, telling
+from reconstruct.mosaic.facts import encoded, telling
 from reconstruct.mosaic.grid import ALIGNED_PX, CELL_PX, Block, coarse, dem_around
 from reconstruct.mosaic.light import LightSamples, at_places, joined_samples
-from reconstruct.mosaic.ortho import lanczos_weights, sample_lanczos
+from reconstruct.mosaic.ortho import sample_lanczos
 from reconstruct.mosaic.seams import candidates, choose_views
 from reconstruct.mosaic.sight import (
     Ground,
-    Optics,
     Seen,
     Surface,
-    Water,
-    camera_optics,
-    channel_optics,
     see,
 )
-from reconstruct.pictures.undistorted import Pictures
+from reconstruct.mosaic.tools import Survey, Tools, tools_of
 
 Float32 = NDArray[np.float32]
 
-_CACHED_BYTES = 130_000_000
-"""Pictures as taken that each process keeps."""
 _BROAD_POWER = 3
 """Power of quality that weighs views in the broadest band."""
 _LARGEST_CHANGE = 3.0
@@ -46,17 +38,6 @@ _PAIRS = 6
 """Other views with which one is compared at a spot, at most."""
 _SHARP = (0.4, 1.1)
 """Least and largest factor of quality for a picture less or more sharp than the median one."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Survey:
-    """What all tasks share; it travels to each process once a task."""
-
-    workspace: Path
-    scratch: Path
-    scaled: bool
-    water: Water | None
-    """Of the port's dispersion; None where channels are not told apart."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -140,7 +121,7 @@ class Painted:
 
 def compare_block(task: LightTask) -> LightSamples:
     """Samples of light on a lattice of spots, in linear light."""
-    tools = _tools(task.survey)
+    tools = tools_of(task.survey)
     surface = _ground(task.survey, task.block).surface(_lattice(task.block.grid, task.step_px))
     if not np.isfinite(surface.height).any():
         return joined_samples([])
@@ -202,7 +183,7 @@ def label_block(task: PaintTask) -> Labels:
     surface = _ground(task.survey, block).surface(coarse(block.grid))
     looks = _looks(task, surface) if np.isfinite(surface.height).any() else []
     if looks:
-        tools = _tools(task.survey)
+        tools = tools_of(task.survey)
         quality = np.zeros((len(looks), rows, columns), np.float32)
         by_station: dict[int, NDArray[np.bool_]] = {}
         for row, found in enumerate(looks):
@@ -231,7 +212,7 @@ def label_block(task: PaintTask) -> Labels:
 
 def paint_tile(task: PaintTask) -> Painted:
     """Paint one tile with the views that the survey's seams give it."""
-    block, tools = task.block, _tools(task.survey)
+    block, tools = task.block, tools_of(task.survey)
     grid = block.grid
     empty = _unknown(block)
     label = _labels(task.survey, block)
@@ -334,7 +315,7 @@ def _ground(survey: Survey, block: Block) -> Ground:
 
 def _looks(task: PaintTask, surface: Surface) -> list[_Look]:
     """How all views see a block's cells; quality takes sharpness and light in, masks leave out."""
-    tools = _tools(task.survey)
+    tools = tools_of(task.survey)
     looks = []
     for entry in task.views:
         optics = tools.optics(entry.view)
@@ -366,7 +347,7 @@ def _bounding(used: NDArray[np.bool_]) -> tuple[slice, slice]:
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
 
-def _small_light(task: PaintTask, tools: "_Tools", found: _Look, *, broad: bool) -> Float32:
+def _small_light(task: PaintTask, tools: Tools, found: _Look, *, broad: bool) -> Float32:
     """Corrected light of a view's small copy at the cells of its box, (h, w, 3)."""
     view, sight = found.entry.view, found.sight
     copy = tools.small.load(view.image)
@@ -383,7 +364,7 @@ def _logarithm(light: Float32) -> Float32:
 
 
 def _changes(
-    task: PaintTask, tools: "_Tools", looks: list[_Look], shape: tuple[int, ...]
+    task: PaintTask, tools: Tools, looks: list[_Look], shape: tuple[int, ...]
 ) -> dict[int, tuple[Float32, tuple[slice, slice]]]:
     """Per view factors (h, w, 3) at the cells of a box that take its broad tones to the mean."""
     if not task.even or not looks:
@@ -418,7 +399,7 @@ def _changes(
 
 def _sight_of(task: PaintTask, entry: SeenView, surface: Surface) -> Seen:
     """How a view sees pixels, its mask applied exactly."""
-    tools = _tools(task.survey)
+    tools = tools_of(task.survey)
     sight = see(entry.view, tools.optics(entry.view), surface)
     usable = tools.usable(entry.view.image)
     if usable is not None and sight.quality.any():
@@ -432,7 +413,7 @@ def _sight_of(task: PaintTask, entry: SeenView, surface: Surface) -> Seen:
 
 def _colours(
     task: PaintTask,
-    tools: "_Tools",
+    tools: Tools,
     entry: SeenView,
     sight: Seen,
     surface: Surface,
@@ -492,56 +473,3 @@ def _labels(survey: Survey, block: Block) -> NDArray[np.uint16]:
     r1, c1 = min(stored.shape[0], top + rows), min(stored.shape[1], left + columns)
     label[r0 - top : r1 - top, c0 - left : c1 - left] = stored[r0:r1, c0:c1]
     return label
-
-
-class _Tools:
-    """What a process keeps between tasks."""
-
-    def __init__(self, workspace: Path, scratch: Path, scaled: bool, water: Water | None) -> None:
-        self._pictures = Pictures.open(workspace)
-        self.small = SmallCopies(scratch)
-        self.table = linear_table()
-        self.weights = lanczos_weights()
-        self._water, self._scaled = water, scaled
-        self._optics: dict[str, Optics] = {}
-        self._channels: dict[str, tuple[Optics, ...]] = {}
-        self._kept: dict[str, NDArray[np.uint8]] = {}
-
-    def optics(self, view: View) -> Optics:
-        """Of a view's camera (its green channel)."""
-        if view.camera not in self._optics:
-            self._optics[view.camera] = camera_optics(self._pictures.lens(view.image), self._scaled)
-        return self._optics[view.camera]
-
-    def channels(self, view: View) -> tuple[Optics, ...] | None:
-        """Of a view's channels, BGR; None where they share one."""
-        lens = self._pictures.lens(view.image)
-        if self._water is None or not isinstance(lens, FlatPortLens):
-            return None
-        if view.camera not in self._channels:
-            self._channels[view.camera] = channel_optics(lens, self._water, self._scaled)
-        return self._channels[view.camera]
-
-    def usable(self, image: str) -> NDArray[np.bool_] | None:
-        """Mask of a picture as taken."""
-        return self._pictures.usable(image)
-
-    def picture(self, image: str) -> NDArray[np.uint8]:
-        """A picture as taken; the last few stay in memory."""
-        if image in self._kept:
-            self._kept[image] = self._kept.pop(image)  # now the last to go
-            return self._kept[image]
-        taken = self._pictures.taken(image)
-        while len(self._kept) >= max(1, _CACHED_BYTES // taken.nbytes):
-            del self._kept[next(iter(self._kept))]
-        self._kept[image] = taken
-        return taken
-
-
-def _tools(survey: Survey) -> _Tools:
-    return _kept_tools(survey.workspace, survey.scratch, survey.scaled, survey.water)
-
-
-@lru_cache(maxsize=1)
-def _kept_tools(workspace: Path, scratch: Path, scaled: bool, water: Water | None) -> _Tools:
-    return _Tools(workspace, scratch, scaled, water)

@@ -38,13 +38,13 @@ from reconstruct.mosaic.paint import (
     LightTask,
     PaintTask,
     SeenView,
-    Survey,
     compare_block,
     label_block,
     label_path,
     paint_tile,
 )
 from reconstruct.mosaic.sight import Water
+from reconstruct.mosaic.tools import Survey, forget_tools
 from reconstruct.mosaic.writers import cloud_optimised, thumbnail, write_labels, write_tiles
 
 _TILE_PX = 1024
@@ -93,6 +93,7 @@ def build_mosaic(
     workspace: Path, model: SparseModel, folder: Path, config: SurveyConfig, threads: int
 ) -> None:
     """Do the work of the stage in a folder; see `run_mosaic`."""
+    forget_tools()
     settings = config.reconstruct
     threads = min(threads, _MOST_PROCESSES)
     scratch = folder / "scratch"

@@ -1,0 +1,89 @@
+"""What a process keeps between the mosaic's tasks: lenses, small copies, a few pictures."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruct.lenses.lens import FlatPortLens
+from reconstruct.model import View
+from reconstruct.mosaic.facts import SmallCopies, forget_pictures, linear_table
+from reconstruct.mosaic.ortho import lanczos_weights
+from reconstruct.mosaic.sight import Optics, Water, camera_optics, channel_optics
+from reconstruct.pictures.undistorted import Pictures
+
+_CACHED_BYTES = 130_000_000
+"""Pictures as taken that each process keeps."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Survey:
+    """What all tasks share; it travels to each process once a task."""
+
+    workspace: Path
+    scratch: Path
+    scaled: bool
+    water: Water | None
+    """Of the port's dispersion; None where channels are not told apart."""
+
+
+class Tools:
+    """What a process keeps between tasks."""
+
+    def __init__(self, workspace: Path, scratch: Path, scaled: bool, water: Water | None) -> None:
+        self._pictures = Pictures.open(workspace)
+        self.small = SmallCopies(scratch)
+        self.table = linear_table()
+        self.weights = lanczos_weights()
+        self._water, self._scaled = water, scaled
+        self._optics: dict[str, Optics] = {}
+        self._channels: dict[str, tuple[Optics, ...]] = {}
+        self._kept: dict[str, NDArray[np.uint8]] = {}
+
+    def optics(self, view: View) -> Optics:
+        """Of a view's camera (its green channel)."""
+        if view.camera not in self._optics:
+            self._optics[view.camera] = camera_optics(self._pictures.lens(view.image), self._scaled)
+        return self._optics[view.camera]
+
+    def channels(self, view: View) -> tuple[Optics, ...] | None:
+        """Of a view's channels, BGR; None where they share one."""
+        lens = self._pictures.lens(view.image)
+        if self._water is None or not isinstance(lens, FlatPortLens):
+            return None
+        if view.camera not in self._channels:
+            self._channels[view.camera] = channel_optics(lens, self._water, self._scaled)
+        return self._channels[view.camera]
+
+    def usable(self, image: str) -> NDArray[np.bool_] | None:
+        """Mask of a picture as taken."""
+        return self._pictures.usable(image)
+
+    def picture(self, image: str) -> NDArray[np.uint8]:
+        """A picture as taken; the last few stay in memory."""
+        if image in self._kept:
+            self._kept[image] = self._kept.pop(image)  # now the last to go
+            return self._kept[image]
+        taken = self._pictures.taken(image)
+        while len(self._kept) >= max(1, _CACHED_BYTES // taken.nbytes):
+            del self._kept[next(iter(self._kept))]
+        self._kept[image] = taken
+        return taken
+
+
+def tools_of(survey: Survey) -> Tools:
+    """The tools of this process for a survey."""
+    return _kept_tools(survey.workspace, survey.scratch, survey.scaled, survey.water)
+
+
+def forget_tools() -> None:
+    """Let go of what an earlier run in this process kept: its files may have changed."""
+    _kept_tools.cache_clear()
+    forget_pictures()
+
+
+@lru_cache(maxsize=1)
+def _kept_tools(workspace: Path, scratch: Path, scaled: bool, water: Water | None) -> Tools:
+    return Tools(workspace, scratch, scaled, water)
