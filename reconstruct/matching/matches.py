@@ -245,6 +245,8 @@ def _guided(task: PairTask, a: Features, b: Features, seen: tuple[Array, Array])
     miss = np.linalg.norm(apply_homography(homography, at) - there, axis=1)
     # a false match along an epipolar line is as good as any to the geometry
     near = miss <= _FALSE * np.median(miss)
+    if near.sum() < _LEAST_PROBED / 2:  # a fit that does not hold, or has no solution at all
+        return None
     homography = fit_homography(at[near], there[near])
     miss = np.linalg.norm(apply_homography(homography, at[near]) - there[near], axis=1)
     radius = max(_SLACK * float(miss.max()), _LEAST_RADIUS * long_side)
