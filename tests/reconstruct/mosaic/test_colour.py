@@ -1,0 +1,110 @@
+"""Known lamp, water and range, and whether the survey's pictures tell them."""
+
+import numpy as np
+
+from reconstruct.mosaic.colour import ColourModel, solve_colour
+from reconstruct.mosaic.facts import PictureFacts, encoded, linear_table
+from reconstruct.mosaic.light import GRID, LightSamples
+
+IMAGES = [f"left/{n:02d}.png" for n in range(24)]
+CAMERAS = ["left"] * len(IMAGES)
+FALL_OFF = np.array([0.45, 0.5, 0.9])
+"""Blue, green, red, 1/m, spreading included."""
+MIDDLE_M = 2.0
+NODE_X, NODE_Y = np.meshgrid(np.linspace(0, 1, GRID[1]), np.linspace(0, 1, GRID[0]))
+
+
+def lamp(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return np.exp(-1.6 * ((x - 0.45) ** 2 + (y - 0.55) ** 2))[..., None] * [0.9, 1.0, 0.8]
+
+
+def haze(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Backscatter: strongest beside the lamps at the left and right."""
+    return (0.02 + 0.10 * (x - 0.5) ** 2 + 0.02 * y)[..., None] * [1.2, 1.0, 0.4]
+
+
+def shown(albedo: np.ndarray, place: np.ndarray, ranges: np.ndarray) -> np.ndarray:
+    x, y = place[:, 0], place[:, 1]
+    water = np.exp(-(ranges[:, None] - MIDDLE_M) * FALL_OFF)
+    return albedo * lamp(x, y) * water + haze(x, y)
+
+
+def survey(relief_m: float, count: int = 4000) -> tuple[LightSamples, list[PictureFacts]]:
+    rng = np.random.default_rng(4)
+    views = rng.integers(0, len(IMAGES), (count, 2))
+    views = views[views[:, 0] != views[:, 1]].astype(np.int32)
+    places = rng.uniform(0, 1, (len(views), 2, 2))
+    ranges = MIDDLE_M + rng.uniform(-relief_m, relief_m, (len(views), 2))
+    albedo = rng.uniform(0.08, 0.5, (len(views), 1)) * rng.uniform(0.8, 1.2, (len(views), 3))
+    light = np.stack([shown(albedo, places[:, s], ranges[:, s]) for s in range(2)], axis=1)
+    light *= np.exp(rng.normal(0, 0.02, light.shape))
+    samples = LightSamples(
+        views=views,
+        places=places.astype(np.float32),
+        levels=np.log(light).astype(np.float32),
+        ranges=ranges.astype(np.float32),
+    )
+    facts = []
+    for _ in IMAGES:
+        dark = haze(NODE_X, NODE_Y) + 0.004 * rng.uniform(0, 1, (*GRID, 1))
+        mean = 0.27 * rng.lognormal(0, 0.05) * lamp(NODE_X, NODE_Y) + haze(NODE_X, NODE_Y)
+        facts.append(PictureFacts(sharpness=1.0, grey=False, nodes=np.log(mean), dark=dark))
+    return samples, facts
+
+
+def ratios(model: ColourModel, relief_m: float) -> np.ndarray:
+    """Corrected light over the true albedo of spots all over the picture, less its mean; logs."""
+    rng = np.random.default_rng(9)
+    place = rng.uniform(0.05, 0.95, (500, 2))
+    ranges = MIDDLE_M + rng.uniform(-relief_m, relief_m, 500)
+    albedo = rng.uniform(0.08, 0.5, (500, 1)) * rng.uniform(0.8, 1.2, (500, 3))
+    light = shown(albedo, place, ranges).astype(np.float32)[None]
+    at = (place[None, :, 0].astype(np.float32), place[None, :, 1].astype(np.float32))
+    found = model.corrected(light, "left", IMAGES[0], at, ranges[None].astype(np.float32))[0]
+    ratio = np.log(found / albedo)
+    return ratio - ratio.mean(axis=0)
+
+
+def test_water_finds_albedo_ratios_where_even_light_leaves_the_haze() -> None:
+    samples, facts = survey(0.4)
+    water = solve_colour("water", samples, facts, IMAGES, CAMERAS)
+    even = solve_colour("even", samples, facts, IMAGES, CAMERAS)
+    assert (np.abs(water.shares - 1) < 0.2).all()
+    np.testing.assert_allclose(water.light.fall_off, FALL_OFF, atol=0.06)
+    assert ratios(water, 0.4).std() < 0.06
+    assert ratios(even, 0.4).std() > 0.07
+
+
+def test_water_gives_colours_as_under_a_white_lamp() -> None:
+    samples, facts = survey(0.4)
+    water = solve_colour("water", samples, facts, IMAGES, CAMERAS)
+    took = np.exp(FALL_OFF * MIDDLE_M)
+    np.testing.assert_allclose(water.light.white / water.light.white[1], took / took[1], rtol=0.15)
+
+
+def test_without_relief_and_with_few_pictures_it_says_what_it_leaves() -> None:
+    samples, facts = survey(0.0)
+    flat = solve_colour("water", samples, facts, IMAGES, CAMERAS)
+    assert any("ranges differ too little" in note for note in flat.notes)
+    names = IMAGES[:8]
+    kept = (samples.views < 8).all(axis=1)
+    thin = LightSamples(
+        views=samples.views[kept], places=samples.places[kept], levels=samples.levels[kept],
+        ranges=None if samples.ranges is None else samples.ranges[kept],
+    )  # fmt: skip
+    few = solve_colour("water", thin, facts[:8], names, CAMERAS[:8])
+    assert (few.shares == 0).all()
+    assert any("fewer than" in note for note in few.notes)
+
+
+def test_raw_changes_nothing() -> None:
+    samples, facts = survey(0.4, 100)
+    raw = solve_colour("raw", samples, facts, IMAGES, CAMERAS)
+    light = np.random.default_rng(1).uniform(0, 1, (4, 5, 3)).astype(np.float32)
+    at = (np.full((4, 5), 0.3, np.float32), np.full((4, 5), 0.9, np.float32))
+    same = raw.corrected(light, "left", IMAGES[0], at, np.full((4, 5), 3.0, np.float32))
+    np.testing.assert_allclose(same, light, rtol=1e-6)
+
+
+def test_the_srgb_curve_and_its_inverse_agree() -> None:
+    np.testing.assert_allclose(encoded(linear_table()), np.arange(256), atol=0.02)
