@@ -38,7 +38,9 @@ def merged(depths: Array, sigmas: Array, gate: float) -> tuple[float, float, int
     return mean, sum(weights) ** -0.5, len(best)
 
 
-def fused(heights: Array, sigmas: Array, views: Array, gate: float) -> tuple[float, float, int]:
+def fused(
+    heights: Array, sigmas: Array, views: Array, stations: Array, gate: float
+) -> tuple[float, float, int, int]:
     """One cell of `fuse_cells`."""
     weights = 1.0 / np.asarray(sigmas, dtype=np.float64) ** 2
     order = np.argsort(heights, kind="stable")
@@ -51,7 +53,9 @@ def fused(heights: Array, sigmas: Array, views: Array, gate: float) -> tuple[flo
     mean = np.average(h, weights=w)
     variance = np.average((h - mean) ** 2, weights=w)
     formal = sum(w[v == view].mean() for view in np.unique(v))
-    return float(mean), math.sqrt(1 / formal + variance / len(np.unique(v))), len(np.unique(v))
+    used = np.unique(v)
+    sigma = math.sqrt(1 / formal + variance / len(used))
+    return float(mean), sigma, len(used), len(set(stations[used]))
 
 
 def sees(height: Array, camera: Array, cell: float, row: int, column: int) -> float:

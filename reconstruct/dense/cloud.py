@@ -1,8 +1,10 @@
-"""The coloured point cloud: points of all views, averaged within small cubes, as a PLY file."""
+"""The coloured point cloud: points of all views, averaged in small cubes, as PLY and LAZ."""
 
 import math
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,15 @@ VERTEX = np.dtype(
     ]
 )  # fmt: skip
 """One point: x east, y north, z up from the cloud's offset, normal, colour, standard deviation."""
+_LAZ_STEP = 1e-4
+_LAZ_EXTRA = {
+    "nx": "normal, east",
+    "ny": "normal, north",
+    "nz": "normal, up",
+    "sigma": "standard deviation",
+}
+_NO_DATE = date(2000, 1, 1)
+"""The same bytes on every day."""
 _PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
 
 
@@ -150,6 +161,55 @@ def write_ply(
         shutil.copyfileobj(source, file)
     body.unlink()
     return count
+
+
+@contextmanager
+def laz_writer(
+    path: Path, offset_enu: Sequence[float], frame: WorldFrame
+) -> Iterator[Callable[[Iterable[NDArray[Any]]], Iterator[NDArray[Any]]]]:
+    """A LAZ file (1.4, point format 7) that takes parts of `VERTEX` records as they pass.
+
+    Coordinates are east, north and up in steps of 1/10000 of the unit, from the offset that the
+    header tells; colours are 16-bit; normals and sigma are extra dimensions. The projection is that
+    of the rasters where there is one.
+
+    Yields:
+        A function that hands parts on and writes each to the file.
+    """
+    import laspy
+    import pyproj
+
+    from reconstruct.raster import crs_of
+
+    header = laspy.LasHeader(version="1.4", point_format=7)
+    header.offsets = np.asarray(offset_enu, dtype=np.float64)
+    header.scales = np.full(3, _LAZ_STEP)
+    header.creation_date = _NO_DATE
+    header.add_extra_dims(
+        [
+            laspy.ExtraBytesParams(name=name, type="f4", description=text)
+            for name, text in _LAZ_EXTRA.items()
+        ]
+    )
+    crs = crs_of(frame)
+    if crs is not None:
+        header.add_crs(pyproj.CRS.from_wkt(crs.to_wkt()))
+    with laspy.open(path, mode="w", header=header) as file:
+
+        def passed(parts: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
+            for part in parts:
+                if len(part):
+                    points = laspy.ScaleAwarePointRecord.zeros(len(part), header=header)
+                    for axis, name in enumerate("xyz"):
+                        points[name] = part[name].astype(np.float64) + offset_enu[axis]
+                    for name in ("red", "green", "blue"):
+                        points[name] = part[name].astype(np.uint16) * 257
+                    for name in _LAZ_EXTRA:
+                        points[name] = part[name]
+                    file.write_points(points)
+                yield part
+
+        yield passed
 
 
 def write_cloud_json(

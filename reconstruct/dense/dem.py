@@ -88,25 +88,28 @@ def round_cell(length: float) -> float:
     return round(length, digits)
 
 
-def fuse_points(grid: DemGrid, points: Points) -> tuple[Float32, Float32, NDArray[np.uint16]]:
+def fuse_points(
+    grid: DemGrid, points: Points, stations: NDArray[np.int64]
+) -> tuple[Float32, Float32, NDArray[np.uint16], NDArray[np.uint8]]:
     """Give each cell of a grid one height from the points that fall in it.
 
     Args:
         grid: cells, of which points outside are ignored, in the coordinates of the points.
         points: of all views that see the grid.
+        stations: (V,) of every view, by its number.
 
     Returns:
-        Height and standard deviation, NaN in empty cells, and how many views the height rests on;
-        (rows, columns) each.
+        Height and standard deviation, NaN in empty cells, how many views the height rests on, and
+        how many stations (255 stands for more); (rows, columns) each.
     """
     starts, order = bin_points(
         points.enu, grid.north, grid.west, grid.cell, grid.rows, grid.columns
     )
-    height, sigma, count = fuse_cells(
-        starts, points.enu[order, 2], points.sigmas[order], points.views[order], _GATE
+    height, sigma, count, met = fuse_cells(
+        starts, points.enu[order, 2], points.sigmas[order], points.views[order], stations, _GATE
     )
     shape = (grid.rows, grid.columns)
-    return height.reshape(shape), sigma.reshape(shape), count.reshape(shape)
+    return height.reshape(shape), sigma.reshape(shape), count.reshape(shape), met.reshape(shape)
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -174,8 +177,9 @@ def fuse_cells(
     heights: Float32,
     sigmas: Float32,
     views: NDArray[np.int32],
+    stations: NDArray[np.int64],
     gate: float,
-) -> tuple[Float32, Float32, NDArray[np.uint16]]:
+) -> tuple[Float32, Float32, NDArray[np.uint16], NDArray[np.uint8]]:
     """Robust height of each cell: the weighted mean of what lies near the median.
 
     The gate around the median is `gate` times the larger of the scatter (1.4826 MAD) and the
@@ -187,15 +191,18 @@ def fuse_cells(
         heights: (N,) sorted by cell, then by view.
         sigmas: (N,) of the heights.
         views: (N,) of the heights.
+        stations: (V,) of every view, by its number.
         gate: in standard deviations.
 
     Returns:
-        (C,) height and sigma, NaN in empty cells, and number of views used.
+        (C,) height and sigma, NaN in empty cells, and number of views and of stations used (255
+        stands for more).
     """
     cells = starts.size - 1
     height = np.full(cells, np.nan, np.float32)
     sigma = np.full(cells, np.nan, np.float32)
     count = np.zeros(cells, np.uint16)
+    met = np.zeros(cells, np.uint8)
     for cell in range(cells):
         first, last = starts[cell], starts[cell + 1]
         if first == last:
@@ -223,6 +230,7 @@ def fuse_cells(
         reach = gate * max(scatter, sigmas[first + median_at])
         total, weights, squares = 0.0, 0.0, 0.0
         formal, in_view, view_weight, seen, last_view = 0.0, 0, 0.0, 0, -1
+        places, companions = np.empty(values.size, np.int64), 0
         for i in range(values.size):
             if abs(values[i] - median) > reach:
                 continue
@@ -235,6 +243,12 @@ def fuse_cells(
                     formal += view_weight / in_view
                 last_view, in_view, view_weight = views[first + i], 0, 0.0
                 seen += 1
+                place, known = stations[last_view], False
+                for k in range(companions):
+                    known = known or places[k] == place
+                if not known:
+                    places[companions] = place
+                    companions += 1
             in_view += 1
             view_weight += w
         formal += view_weight / in_view
@@ -243,7 +257,8 @@ def fuse_cells(
         height[cell] = median + mean
         sigma[cell] = math.sqrt(1.0 / formal + variance / seen)
         count[cell] = seen
-    return height, sigma, count
+        met[cell] = min(companions, 255)
+    return height, sigma, count, met
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -296,6 +311,23 @@ def fill_gaps(height: Float32, sigma: Float32, reach: int) -> tuple[Float32, Flo
                 filled[row, column] = total / weights
                 filled_sigma[row, column] = doubt
     return filled, filled_sigma
+
+
+def slope_deg(height: Float32, cell: float) -> Float32:
+    """Steepest slope of every cell (H, W), degrees; NaN where a cell or one of eight is unknown.
+
+    Horn's (1981) third-order differences over the eight neighbours.
+    """
+    rise = height.astype(np.float64)
+    padded = np.pad(rise, 1, constant_values=np.nan)
+    above, level, below = padded[:-2], padded[1:-1], padded[2:]
+    right = above[:, 2:] + 2 * level[:, 2:] + below[:, 2:]
+    left = above[:, :-2] + 2 * level[:, :-2] + below[:, :-2]
+    down = below[:, :-2] + 2 * below[:, 1:-1] + below[:, 2:]
+    up = above[:, :-2] + 2 * above[:, 1:-1] + above[:, 2:]
+    steep = np.rad2deg(np.arctan(np.hypot(right - left, down - up) / (8 * cell)))
+    slope: Float32 = np.where(np.isfinite(rise), steep, np.nan).astype(np.float32)
+    return slope
 
 
 def without_strays(height: Float32) -> NDArray[np.bool_]:

@@ -6,6 +6,7 @@ prepare pictures, find each view's depth with a few partners, let neighbours con
 
 import shutil
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -19,7 +20,7 @@ from alice_survey.config import ReconstructConfig, SurveyConfig
 from alice_survey.errors import ReconstructionError, warn
 from alice_survey.executor import parallel_map
 from alice_survey.frames import Array
-from reconstruct.dense.cloud import voxel_edge, write_cloud_json, write_ply
+from reconstruct.dense.cloud import laz_writer, voxel_edge, write_cloud_json, write_ply
 from reconstruct.dense.dem import FILL_CELLS, DemGrid, grid_over, round_cell
 from reconstruct.dense.depth import pair_depth
 from reconstruct.dense.fusion import GATE_SIGMAS, count_witnesses, merge_depths
@@ -223,9 +224,9 @@ def build_surface(
     write_light(folder / "light.json", light)
     tasks = tile_tasks(store, grid, views, summaries, light, offset, edge, doubt)
     tiles = parallel_map(fuse_tile, tasks, threads=threads, label="fuse")
-    count = write_ply(
-        folder / "cloud.ply", _write_rasters(folder, grid, model.frame, tiles), offset, model.frame
-    )
+    parts = _write_rasters(folder, grid, model.frame, tiles)
+    with laz_writer(folder / "cloud.laz", offset, model.frame) as write_laz:
+        count = write_ply(folder / "cloud.ply", write_laz(parts), offset, model.frame)
     if count == 0:
         raise ReconstructionError(
             f"no depth was confirmed by a second view in {len(views)} pictures; they need more "
@@ -531,21 +532,30 @@ def _write_rasters(
     folder: Path, grid: DemGrid, frame: WorldFrame, tiles: Iterator[Tile]
 ) -> Iterator[NDArray[Any]]:
     """Write the tiles' rasters and hand their cloud points on."""
-    datum = frame.vertical_datum
-    texts = (
-        f"height above {datum}, positive up ({frame.unit})",
-        f"standard deviation of the height ({frame.unit})",
-        "views that the height rests on; 0 where a small gap was bridged",
-    )
-    with (
-        tiled_raster(folder / "dem.tif", grid, frame, "float32", np.nan, texts[0]) as dem,
-        tiled_raster(folder / "sigma.tif", grid, frame, "float32", np.nan, texts[1]) as sigma,
-        tiled_raster(folder / "count.tif", grid, frame, "uint16", None, texts[2]) as count,
-    ):
+    unit, nan = frame.unit, float("nan")
+    bands = {
+        "height": ("dem", "float32", nan, f"height above {frame.vertical_datum}, up ({unit})"),
+        "sigma": ("sigma", "float32", nan, f"standard deviation of the height ({unit})"),
+        "slope": ("slope", "float32", nan, "steepest slope (degrees)"),
+        "count": (
+            "count", "uint16", None,
+            "views that the height rests on; 0 where a small gap was bridged",
+        ),
+        "stations": (
+            "stations", "uint8", None,
+            "stations that the height rests on (255: or more); 0 where a small gap was bridged",
+        ),
+    }  # fmt: skip
+    with ExitStack() as files:
+        rasters = {
+            name: files.enter_context(
+                tiled_raster(folder / f"{file}.tif", grid, frame, dtype, nodata, text)
+            )
+            for name, (file, dtype, nodata, text) in bands.items()
+        }
         for tile in tiles:
-            dem.write(tile.height, 1, window=tile.window)
-            sigma.write(tile.sigma, 1, window=tile.window)
-            count.write(tile.count, 1, window=tile.window)
+            for name, raster in rasters.items():
+                raster.write(getattr(tile, name), 1, window=tile.window)
             yield tile.vertices
 
 

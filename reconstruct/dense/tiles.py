@@ -17,6 +17,7 @@ from reconstruct.dense.dem import (
     DemGrid,
     fill_gaps,
     fuse_points,
+    slope_deg,
     without_strays,
 )
 from reconstruct.dense.points import joined, points_in_box
@@ -49,7 +50,7 @@ class ViewSummary:
     """What it shows at the nodes of the light model; see `light.at_nodes`."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class TileTask:
     """One tile of the grid to fuse."""
 
@@ -60,6 +61,8 @@ class TileTask:
     rim: tuple[int, int, int, int]
     """Cells around the tile, top, bottom, left, right, that only serve to judge and fill."""
     views: tuple[tuple[int, View], ...]
+    stations: NDArray[np.int64]
+    """Of every view of the survey."""
     light: LightModel
     offset_enu: tuple[float, float, float]
     edge: float
@@ -75,7 +78,10 @@ class Tile:
     window: Window
     height: NDArray[np.float32]
     sigma: NDArray[np.float32]
+    slope: NDArray[np.float32]
+    """Degrees."""
     count: NDArray[np.uint16]
+    stations: NDArray[np.uint8]
     vertices: NDArray[Any]
 
 
@@ -91,6 +97,7 @@ def tile_tasks(
 ) -> list[TileTask]:
     """Tiles in the order of the file's rows, each with the views whose points may fall in it."""
     tasks = []
+    stations = np.array([view.station for view in views], dtype=np.int64)
     for window in tiles_of(grid, _TILE_CELLS):
         row, column = int(window.row_off), int(window.col_off)
         rows, columns = int(window.height), int(window.width)
@@ -119,6 +126,7 @@ def tile_tasks(
                 grid=part,
                 rim=rim,
                 views=tuple(seeing),
+                stations=stations,
                 light=light,
                 offset_enu=offset_enu,
                 edge=edge,
@@ -159,9 +167,9 @@ def fuse_tile(task: TileTask) -> Tile:
             )
         )
     points = joined(parts)
-    height, sigma, count = fuse_points(grid, points)
+    height, sigma, count, met = fuse_points(grid, points, task.stations)
     stray = ~without_strays(height)
-    height[stray], sigma[stray], count[stray] = np.nan, np.nan, 0
+    height[stray], sigma[stray], count[stray], met[stray] = np.nan, np.nan, 0, 0
     height, sigma = fill_gaps(height, sigma, FILL_CELLS)
     top, bottom, left, right = task.rim
     inner = (slice(top, grid.rows - bottom), slice(left, grid.columns - right))
@@ -177,6 +185,8 @@ def fuse_tile(task: TileTask) -> Tile:
         window=task.window,
         height=(height[inner] + offset[2]).astype(np.float32),
         sigma=sigma[inner],
+        slope=slope_deg(height, grid.cell)[inner],
         count=count[inner],
+        stations=met[inner],
         vertices=thinned_points(columns, points),
     )

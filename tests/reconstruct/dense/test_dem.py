@@ -11,6 +11,7 @@ from reconstruct.dense.dem import (
     fuse_points,
     grid_over,
     round_cell,
+    slope_deg,
     without_strays,
 )
 from reconstruct.dense.points import Points
@@ -69,7 +70,9 @@ def test_fuse_cells_equals_its_slow_twin():
     sigmas = rng.uniform(0.002, 0.02, len(heights)).astype(np.float32)
     views = np.concatenate([np.sort(rng.integers(0, 4, n)) for n in sizes]).astype(np.int32)
 
-    height, sigma, count = fuse_cells(starts, heights, sigmas, views, 3.0)
+    stations = np.array([5, 5, 9, 2])
+
+    height, sigma, count, met = fuse_cells(starts, heights, sigmas, views, stations, 3.0)
 
     for cell, size in enumerate(sizes):
         part = slice(starts[cell], starts[cell + 1])
@@ -77,16 +80,19 @@ def test_fuse_cells_equals_its_slow_twin():
             assert np.isnan(height[cell])
             assert count[cell] == 0
             continue
-        h, s, n = fused(heights[part], sigmas[part], views[part], 3.0)
+        h, s, n, places = fused(heights[part], sigmas[part], views[part], stations, 3.0)
         np.testing.assert_allclose(height[cell], h, atol=2e-6)
         np.testing.assert_allclose(sigma[cell], s, rtol=1e-3)
         assert count[cell] == n
+        assert met[cell] == places
 
 
 def test_heights_are_up_and_rows_go_south():
     grid = DemGrid(west=0.0, north=2.0, cell=1.0, rows=2, columns=2)
     enu = np.array([[0.5, 1.5, -10.0], [1.5, 1.5, -11.0], [0.5, 0.5, -12.0]])
-    height, _, count = fuse_points(grid, points(enu, np.full(3, 0.01), np.arange(3)))
+    height, _, count, _ = fuse_points(
+        grid, points(enu, np.full(3, 0.01), np.arange(3)), np.arange(3)
+    )
     np.testing.assert_allclose(height[[0, 0, 1], [0, 1, 0]], [-10, -11, -12])
     assert np.isnan(height[1, 1])
     assert count.tolist() == [[1, 1], [1, 0]]
@@ -96,9 +102,12 @@ def test_a_few_outliers_do_not_move_a_cell():
     rng = np.random.default_rng(3)
     grid = DemGrid(west=0.0, north=1.0, cell=1.0, rows=1, columns=1)
     enu = np.column_stack([rng.uniform(0.1, 0.9, (60, 2)), rng.normal(5.0, 0.003, 60)])
-    clean, sigma, _ = fuse_points(grid, points(enu, np.full(60, 0.003), np.arange(60) // 10))
+    stations = np.arange(6)
+    clean, sigma, *_ = fuse_points(
+        grid, points(enu, np.full(60, 0.003), np.arange(60) // 10), stations
+    )
     enu[::6, 2] += 0.3
-    dirty, _, _ = fuse_points(grid, points(enu, np.full(60, 0.003), np.arange(60) // 10))
+    dirty, *_ = fuse_points(grid, points(enu, np.full(60, 0.003), np.arange(60) // 10), stations)
     assert abs(dirty[0, 0] - clean[0, 0]) < 0.001
     assert abs(clean[0, 0] - 5.0) < 3 * sigma[0, 0]
     assert 0.0005 < sigma[0, 0] < 0.003  # six views, each 3 mm
@@ -135,3 +144,15 @@ def test_strays_go_and_a_sheet_with_its_edge_stays():
     kept = without_strays(height)
     assert kept[5:35, :20].all()
     assert not kept[:, 20:].any()
+
+
+def test_slope_of_a_plane_is_its_tangent_and_unknown_beside_gaps():
+    rows, columns = np.mgrid[:9, :11]
+    height = (0.3 * 0.01 * columns - 0.4 * 0.01 * rows).astype(np.float32)
+    height[4, 5] = np.nan
+    slope = slope_deg(height, 0.01)
+    unknown = np.ones(height.shape, bool)
+    unknown[1:-1, 1:-1] = False
+    unknown[3:6, 4:7] = True
+    np.testing.assert_array_equal(np.isnan(slope), unknown)
+    np.testing.assert_allclose(slope[~unknown], np.rad2deg(np.arctan(0.5)), rtol=1e-4)

@@ -103,14 +103,47 @@ def test_cloud_lies_on_the_surface_with_normals_up(workspace: Path):
     assert cloud.point.sigma.numpy().min() > 0
 
 
+def test_laz_holds_the_points_of_the_ply_in_the_rasters_projection(workspace: Path):
+    import laspy
+    import open3d as o3d
+
+    about = read_json(workspace / "dense" / "cloud.json")
+    cloud = o3d.t.io.read_point_cloud(str(workspace / "dense" / "cloud.ply"))
+    laz = laspy.read(workspace / "dense" / "cloud.laz")
+    enu = cloud.point.positions.numpy() + np.array(about["offset_east_north_up"])
+    np.testing.assert_allclose(laz.xyz, enu, atol=6e-5)
+    np.testing.assert_array_equal(laz.red // 257, cloud.point.colors.numpy()[:, 0])
+    np.testing.assert_array_equal(laz.nz, cloud.point.normals.numpy()[:, 2])
+    np.testing.assert_array_equal(laz.sigma, cloud.point.sigma.numpy()[:, 0])
+    assert "Azimuthal Equidistant" in laz.header.parse_crs().to_wkt()
+
+
+def test_stations_and_slope(workspace: Path):
+    _, north, east = read(workspace / "dense" / "dem.tif")
+    count, _, _ = read(workspace / "dense" / "count.tif")
+    stations, _, _ = read(workspace / "dense" / "stations.tif")
+    slope, _, _ = read(workspace / "dense" / "slope.tif")
+    assert (stations <= count).all()
+    assert (2 * stations >= count).all()  # a station has two cameras
+    assert np.median(stations[middle(north, east)]) >= 3
+    flat_part = middle(north, east) & (np.abs(north - 0.3) > 0.25)
+    assert np.nanmedian(slope[flat_part]) == pytest.approx(
+        np.rad2deg(np.arctan(np.hypot(0.08, 0.05))), abs=0.5
+    )
+    assert np.nanmax(slope) > 60
+
+
 def test_scratch_is_gone_and_files_are_there(workspace: Path):
     names = {path.name for path in (workspace / "dense").iterdir()}
     assert names == {
         "dem.tif",
         "sigma.tif",
+        "slope.tif",
         "count.tif",
+        "stations.tif",
         "dem.png",
         "cloud.ply",
+        "cloud.laz",
         "cloud.json",
         "light.json",
         "surface.json",
@@ -129,8 +162,9 @@ def test_bytes_do_not_depend_on_the_number_of_processes(workspace: Path, tmp_pat
     for name in ("images", "sparse"):
         (other / name).symlink_to(workspace / name)
     assert run_dense(other, CONFIG, 2)
-    for name in ("dem.tif", "sigma.tif", "count.tif", "cloud.ply", "surface.json", "light.json"):
-        assert (other / "dense" / name).read_bytes() == (workspace / "dense" / name).read_bytes()
+    for path in sorted((workspace / "dense").iterdir()):
+        if path.name != "stage.json":
+            assert (other / "dense" / path.name).read_bytes() == path.read_bytes(), path.name
 
 
 def test_pictures_without_texture_give_one_line(tmp_path: Path):

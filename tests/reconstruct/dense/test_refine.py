@@ -1,0 +1,113 @@
+import cv2
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from reconstruct.dense.refine import Look, compare, continued, prepared, refine
+from reconstruct.dense.sight import lens_of
+from tests.oracles_dense import Scene, hits, render, speckle, stereo_views
+
+SCENE = Scene(
+    depth_of=lambda n, e: 12.0 + 0.06 * np.sin(6 * n) * np.cos(5 * e) + 0.1 * n,
+    paint=speckle(),
+)
+VIEWS = stereo_views(np.array([0.1, 0.45]), np.array([0.3, 0.4]))
+
+
+def looks() -> list[Look]:
+    found = []
+    for view in VIEWS:
+        grey = cv2.cvtColor(render(view, SCENE), cv2.COLOR_BGR2GRAY)
+        contrast, spline, valid = prepared(grey, np.ones(grey.shape, bool))
+        found.append(Look(view=view, contrast=contrast, spline=spline, valid=valid))
+    return found
+
+
+LOOKS = looks()
+
+
+def true_depth() -> np.ndarray:
+    one = VIEWS[0]
+    points = one.world_from_cam.inv().apply(hits(one, SCENE).reshape(-1, 3))
+    return points[:, 2].reshape(one.height_px, one.width_px)
+
+
+def test_compare_equals_its_slow_twin():
+    one, other = LOOKS[0], LOOKS[1]
+    depth = true_depth()
+    move = other.view.world_from_cam.inv() * one.view.world_from_cam
+    rest, slope, speed = compare(
+        (1 / depth).astype(np.float32),
+        one.contrast,
+        lens_of(one.view),
+        other.spline,
+        other.valid,
+        lens_of(other.view),
+        np.ascontiguousarray(move.as_matrix()[:3]),
+    )
+    rows, columns = np.nonzero(np.isfinite(rest))
+    assert len(rows) > 0.5 * rest.size
+    chosen = slice(None, None, 997)
+    rows, columns = rows[chosen], columns[chosen]
+    pixels = np.column_stack([columns, rows]) + 0.5
+
+    def warped(inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        at = other.view.project(one.view.at_depth(pixels, 1 / inverse)) - 0.5
+        value = ndimage.map_coordinates(
+            other.spline.astype(np.float64), at.T[::-1], order=3, prefilter=False
+        )
+        return value, at
+
+    inverse = 1 / depth[rows, columns]
+    value, at = warped(inverse)
+    after, moved = warped(inverse + 1e-6)
+    expected = one.contrast[rows, columns] - value
+    np.testing.assert_allclose(rest[rows, columns], expected, atol=2e-4)
+    np.testing.assert_allclose(slope[rows, columns], (after - value) / 1e-6, rtol=0.02, atol=0.3)
+    fast = np.linalg.norm(moved - at, axis=1) / 1e-6
+    np.testing.assert_allclose(speed[rows, columns], fast, rtol=1e-3)
+
+
+def test_refinement_finds_the_surface_from_a_blurred_start_and_says_how_well():
+    true = true_depth()
+    rng = np.random.default_rng(0)
+    wrong = 0.006 * ndimage.gaussian_filter(rng.normal(size=true.shape), 4) * 12
+    start = (true + wrong).astype(np.float32)
+    found = refine(LOOKS[0], start, LOOKS[1:])
+    known = np.isfinite(found.depth)
+    assert known.mean() > 0.85
+    error = (found.depth - true)[known]
+    before = np.sqrt(np.mean(wrong**2))
+    after = np.sqrt(np.mean(error**2))
+    assert before > 0.004
+    assert 1e-4 < after < 0.4 * before  # 1.5 mm, rims that one neighbour sees included
+    assert 0.3 < 1.4826 * np.median(np.abs(error / found.sigma[known])) < 3.0
+    assert np.median(found.likeness[known]) > 0.9
+
+
+def test_gaps_are_filled_only_where_pictures_agree():
+    true = true_depth().astype(np.float32)
+    start = true.copy()
+    start[100:108, 100:108] = np.nan
+    found = refine(LOOKS[0], start, LOOKS[1:])
+    gap = found.depth[100:108, 100:108]
+    assert np.isfinite(gap).mean() > 0.8
+    assert np.nanmax(np.abs(gap - true[100:108, 100:108])) < 0.01
+    alone = refine(LOOKS[0], start, LOOKS[1:2])  # one neighbour proves nothing
+    assert not np.isfinite(alone.depth[100:108, 100:108]).any()
+    assert np.isfinite(alone.depth).mean() > 0.5
+
+
+def test_a_view_without_neighbours_keeps_no_depth():
+    found = refine(LOOKS[0], true_depth().astype(np.float32), [])
+    assert not np.isfinite(found.depth).any()
+    assert (found.seen == 0).all()
+
+
+def test_continuation_reaches_some_pixels_and_no_farther():
+    inverse = np.full((60, 80), np.nan, np.float32)
+    inverse[:, :30] = 0.5
+    filled = continued(inverse)
+    np.testing.assert_allclose(filled[:, :33], 0.5, rtol=1e-5)
+    assert np.isnan(filled[:, 50:]).all()
+    assert filled[5, 29] == pytest.approx(0.5)

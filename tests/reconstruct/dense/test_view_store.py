@@ -1,0 +1,52 @@
+from pathlib import Path
+
+import numpy as np
+
+from reconstruct.dense.view_store import ViewStore
+
+
+def test_depth_comes_back_within_a_fiftieth_of_a_millimetre(tmp_path: Path):
+    rng = np.random.default_rng(4)
+    depth = rng.uniform(1.3, 3.1, (40, 50)).astype(np.float32)
+    sigma = (10 ** rng.uniform(-5, -1, depth.shape)).astype(np.float32)
+    depth[3, 4], sigma[5, 6] = np.nan, np.nan
+    store = ViewStore(tmp_path)
+
+    store.save_depth(7, "fine", depth, sigma)
+    z, s = store.load_depth(7, "fine")
+
+    unknown = np.zeros(depth.shape, bool)
+    unknown[3, 4] = unknown[5, 6] = True
+    np.testing.assert_array_equal(np.isnan(z), unknown)
+    np.testing.assert_array_equal(np.isnan(s), unknown)
+    assert 1e-6 < np.nanmax(np.abs(z - depth)) < 3.2e-5
+    np.testing.assert_allclose(s[~unknown], sigma[~unknown], rtol=0.026)
+    sizes = [path.stat().st_size for path in tmp_path.iterdir()]
+    assert sum(sizes) < 3 * depth.size + 500
+
+
+def test_nothing_known_stays_unknown(tmp_path: Path):
+    store = ViewStore(tmp_path)
+    nowhere = np.full((4, 5), np.nan, np.float32)
+    store.save_depth(0, "fine", nowhere, nowhere)
+    assert np.isnan(store.load_depth(0, "fine")).all()
+    store.drop(0, "fine")
+    assert not store.has(0, "fine")
+
+
+def test_colours_keep_brightness_and_masks_every_bit(tmp_path: Path):
+    rng = np.random.default_rng(4)
+    rows, columns = np.mgrid[:41, :53]
+    smooth = 120 + 60 * np.sin(np.stack([rows, columns, rows + columns], -1) / 15)
+    colour = np.clip(smooth + rng.normal(0, 20, (41, 53, 1)), 0, 255).astype(np.uint8)
+    mask = rng.random((41, 53)) < 0.5
+    store = ViewStore(tmp_path)
+
+    store.save_colour(1, colour)
+    store.save_mask(1, "kept", mask)
+
+    error = store.load_colour(1).astype(float) - colour
+    assert 0.1 < np.sqrt(np.mean(error**2)) < 4.0
+    np.testing.assert_array_equal(store.load_mask(1, "kept", 53), mask)
+    sizes = sum(path.stat().st_size for path in tmp_path.iterdir())
+    assert sizes < 1.7 * mask.size + 600
