@@ -24,7 +24,7 @@ from reconstruct.dense.rectify import scaled_view
 from reconstruct.lenses.lens import FlatPortLens, Lens, lens_from_json
 from reconstruct.model import View, read_model
 from reconstruct.pictures.undistorted import Pictures
-from reconstruct.station.pair import open_pair, read_depth, to_axes
+from reconstruct.station.pair import pair_samplers, read_depth, to_axes
 from reconstruct.station.precise import precise_depth
 from reconstruct.station.solve import Optics, calibration_slopes, stereo_rig
 
@@ -212,15 +212,14 @@ def _in_pair(
     _check_inside(taken, first, about["left"])
     views = tuple(scaled_view(view, about["scale"]) for view in optics.views)
     paths = tuple(folder / name for name in about["pictures"])
-    names, pictures = open_pair(optics, (paths[0], paths[1]))
-    greys = [_grey(pictures, n, v) for n, v in zip(names, views, strict=True)]
+    greys = pair_samplers(optics, (paths[0], paths[1]), (views[0], views[1]))
     depth_map = read_depth(folder)
     view = views[0]
     ratio = np.array([view.width_px, view.height_px]) / [
         first.pinhole.width_px, first.pinhole.height_px
     ]  # fmt: skip
     pixels = first.to_pinhole(taken) * ratio
-    found = precise_depth((views[0], views[1]), (greys[0], greys[1]), depth_map, pixels)
+    found = precise_depth((views[0], views[1]), greys, depth_map, pixels)
     lost = np.flatnonzero(~np.isfinite(found.depth))
     if len(lost):
         x, y = taken[lost[0]]
@@ -268,15 +267,6 @@ def _calibration(rig: Rig, pixels: Array, n_water_sigma: float) -> tuple[Array, 
         wider[:-1, :-1], wider[-1, -1] = matrix, n_water_sigma**2
         matrix = wider
     return slopes, matrix
-
-
-def _grey(pictures: Pictures, name: str, view: View) -> NDArray[np.float32]:
-    colour = pictures.colour(name)
-    size = (view.width_px, view.height_px)
-    if colour.shape[1::-1] != size:
-        colour = cv2.resize(colour, size, interpolation=cv2.INTER_AREA)
-    grey: NDArray[np.float32] = cv2.cvtColor(colour, cv2.COLOR_BGR2GRAY).astype(np.float32)
-    return grey
 
 
 def _check_inside(taken: Array, lens: Lens, name: str) -> None:

@@ -33,7 +33,7 @@ from reconstruct.pictures.normalise import normalise
 from reconstruct.pictures.undistorted import Pictures, read_colour
 from reconstruct.station.mesh import depth_mesh, write_station_mesh
 from reconstruct.station.plot import plot_pair
-from reconstruct.station.precise import inflation, precise_depth
+from reconstruct.station.precise import Sampler, inflation, precise_depth, sampler
 from reconstruct.station.solve import Optics, matched_points, optics_for, stereo_rig
 
 Float32 = NDArray[np.float32]
@@ -246,10 +246,8 @@ def dense_pair(
             )
         maps.append(found)
     depth = _agreeing(views[0], views[1], maps)
-    linear = [cv2.cvtColor(c, cv2.COLOR_BGR2GRAY).astype(np.float32) for c in colours]
-    match_sigma, factor = _match_sigma(
-        (views[0], views[1]), (linear[0], linear[1]), depth, maps[0][1]
-    )
+    samplers = pair_samplers(optics, pictures, (views[0], views[1]))
+    match_sigma, factor = _match_sigma((views[0], views[1]), samplers, depth, maps[0][1])
     sigma = np.where(
         np.isfinite(depth), maps[0][1] * np.float32(match_sigma / MATCH_SIGMA_PX), np.nan
     )
@@ -274,8 +272,19 @@ def open_pair(optics: Optics, pictures: tuple[Path, Path]) -> tuple[list[str], P
     return names, opened
 
 
+def pair_samplers(
+    optics: Optics, pictures: tuple[Path, Path], views: tuple[View, View]
+) -> tuple[Sampler, Sampler]:
+    """What both views show, for precise matches."""
+    first, second = (
+        sampler(read_colour(path), lens, view)
+        for path, lens, view in zip(pictures, optics.lenses, views, strict=True)
+    )
+    return first, second
+
+
 def _match_sigma(
-    views: tuple[View, View], greys: tuple[Float32, Float32], depth: Float32, sigma: Float32
+    views: tuple[View, View], greys: tuple[Sampler, Sampler], depth: Float32, sigma: Float32
 ) -> tuple[float, float]:
     """How well the dense match of this pair is, px, and by what precise sigmas are too small.
 

@@ -7,7 +7,9 @@ remains at its bottom tell the standard deviation (Gruen 1985, "Adaptive least s
 correlation").
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,9 +18,11 @@ from scipy import ndimage
 
 from alice_survey.errors import ReconstructionError
 from alice_survey.frames import Array
+from reconstruct.lenses.lens import Lens
 from reconstruct.model import View
 
 Float32 = NDArray[np.float32]
+Sampler = Callable[[Array], Array]
 
 _HALF_PX = 7
 """A patch has this many pixels to either side of its middle."""
@@ -29,10 +33,13 @@ _FITTED = 3
 _SLOPE_SIGMA_PX = 10.0
 """Of the Gaussian that takes the slope of the surface from the depth map: wider than a patch, so
 that the noise of the map does not bend it."""
-_LAG_PX = 4
-"""Residuals farther apart are independent."""
+_SPLINE = 5
+_LAG_PX = 1
+"""Residuals farther apart are independent: the noise of a picture as taken is white, and the spline
+between its pixels joins neighbours only."""
 _LEAST_CORRELATION = 0.5
 _LEAST_SAMPLE = 20
+_GROSS_SIGMAS = 5.0
 _ROUNDS = 2
 
 
@@ -52,7 +59,7 @@ class PreciseDepth:
 
 def precise_depth(
     views: tuple[View, View],
-    greys: tuple[Float32, Float32],
+    greys: tuple[Sampler, Sampler],
     depth_map: Float32,
     pixels: Array,
 ) -> PreciseDepth:
@@ -60,7 +67,7 @@ def precise_depth(
 
     Args:
         views: left and right.
-        greys: (H, W) each, as the views see them, linear in light or nearly so.
+        greys: what each view shows at pixels; see `sampler`.
         depth_map: (H, W) of the left view, NaN where unknown: start and slope.
         pixels: (N, 2) of the left view.
     """
@@ -74,7 +81,7 @@ def precise_depth(
     with np.errstate(invalid="ignore"):
         tilt = 1.0 / at_pixels(steady, flat).reshape(len(pixels), -1) - (1.0 / start)[:, None]
     tilt = np.where(np.isfinite(tilt), tilt, 0.0)
-    shown = at_pixels(greys[0], flat).reshape(len(pixels), -1)
+    shown = greys[0](flat).reshape(len(pixels), -1)
     weight = np.exp(-0.5 * (grid**2).sum(axis=1) / (0.5 * _HALF_PX) ** 2)
     inverse = 1.0 / start
     per_px, across = _epipolar(left, right, pixels, start)
@@ -85,7 +92,7 @@ def precise_depth(
             at = inverse[:, None] + (step * per_px)[:, None] + tilt
             with np.errstate(divide="ignore", invalid="ignore"):
                 seen = right.project(left.at_depth(flat, (1.0 / at).reshape(-1)))
-            other = at_pixels(greys[1], seen).reshape(len(pixels), -1)
+            other = greys[1](seen).reshape(len(pixels), -1)
             rest, correlation = _compare(shown, other, weight)
             misfits.append((rest * rest) @ weight)
             fits.append(correlation)
@@ -114,7 +121,7 @@ def precise_depth(
     beside = [
         _compare(
             shown,
-            at_pixels(greys[1], seen + k * _STEP_PX * square).reshape(len(pixels), -1),
+            greys[1](seen + k * _STEP_PX * square).reshape(len(pixels), -1),
             weight,
         )[0]
         for k in (-1.0, 0.0, 1.0)
@@ -140,7 +147,8 @@ def inflation(found: PreciseDepth) -> float:
     """By what the sigmas of many pixels are too small, at least 1.
 
     Aliasing and resampling leave errors that one patch cannot tell. Across the epipolar line the
-    true miss is the same for all (the calibration's): its robust scatter, in stated sigmas, tells.
+    true miss is the same for all (the calibration's): its scatter (rms, gross errors held back), in
+    stated sigmas, tells.
 
     Raises:
         ReconstructionError: too few pixels are matched.
@@ -151,8 +159,8 @@ def inflation(found: PreciseDepth) -> float:
             f"only {len(missed)} of {len(found.depth)} sampled pixels match to a fraction of a "
             "pixel; the pair needs more light or texture"
         )
-    scatter = 1.4826 * float(np.median(np.abs(missed - np.median(missed))))
-    return max(1.0, scatter)
+    away = np.minimum(np.abs(missed - np.median(missed)), _GROSS_SIGMAS)
+    return max(1.0, float(np.sqrt(np.mean(away**2))))
 
 
 def _sigma_px(before: Array, rest: Array, after: Array, bend: Array, weight: Array) -> Array:
@@ -162,6 +170,33 @@ def _sigma_px(before: Array, rest: Array, after: Array, bend: Array, weight: Arr
         scatter = _scatter(weight * rest * 0.5 * (after - before))
         sigma: Array = np.sqrt(scatter * count / (count - _FITTED)) / bend * _STEP_PX
     return sigma
+
+
+def sampler(taken: NDArray[np.uint8], lens: Lens, view: View) -> Sampler:
+    """What a view, perhaps shrunk, shows at pixels (N, 2): grey levels (N,), NaN beyond it.
+
+    The picture is read as taken, by a quintic spline, once: an undistorted copy would be read
+    twice, and cubic convolution pulls matches towards whole pixels by hundredths.
+    """
+    grey = cv2.cvtColor(taken, cv2.COLOR_BGR2GRAY).astype(np.float64)
+    find: Any = ndimage
+    spline = find.spline_filter(grey, order=_SPLINE, mode="mirror")
+    ratio = np.array(
+        [lens.pinhole.width_px / view.width_px, lens.pinhole.height_px / view.height_px]
+    )
+    size = np.array(lens.size_px)
+
+    def at(pixels: Array) -> Array:
+        place = lens.from_pinhole(pixels * ratio)
+        with np.errstate(invalid="ignore"):
+            inside = ((place >= 0) & (place <= size)).all(axis=1)
+        found = np.full(len(place), np.nan)
+        found[inside] = find.map_coordinates(
+            spline, place[inside, ::-1].T - 0.5, order=_SPLINE, mode="mirror", prefilter=False
+        )
+        return found
+
+    return at
 
 
 def at_pixels(picture: Float32, pixels: Array) -> Array:
