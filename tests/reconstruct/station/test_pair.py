@@ -66,7 +66,8 @@ def test_lengths_miss_the_truth_by_what_their_sigmas_of_pixels_say(pair: Path):
     found = np.array([d["value_m"] for d in data["distances"]])
     sigma = np.array([d["sigma_of_pixels_m"] for d in data["distances"]])
     ratio = (found - true) / sigma
-    # the goal is 0.7 to 1.4; 1.42 is measured, since the sigma does not know all along the epipolar line
+    # the goal is 0.7 to 1.4 and 1.42 is measured: some of the error along the epipolar line is
+    # not in the sigma
     assert 0.7 < np.sqrt(np.mean(ratio**2)) < 1.6
     assert np.sqrt(np.mean((found - true) ** 2)) < 1e-3
 
