@@ -15,6 +15,9 @@ from reconstruct.evaluate.height_registration import HeightFit, refine_heights, 
 from reconstruct.model import WorldFrame
 from reconstruct.raster import BLOCK, crs_of, frame_tags, transform_of
 
+_MUCH = 0.5
+"""Share of the ground that is seldom found changed between two surveys."""
+
 
 def compare_elevations(
     now: Elevation, before: Elevation, now_from_before: Any
@@ -73,6 +76,12 @@ def evaluate_against(
     assert frame_before.datum is not None  # noqa: S101
     georeferenced = enu_from_enu(frame.datum, frame_before.datum)
     change, fit = compare_elevations(now, before, georeferenced)
+    share = change.changed.sum() / max(int(np.isfinite(change.difference).sum()), 1)
+    if share > _MUCH:
+        warn(
+            f"{share:.0%} of the common ground differs: if that is not so, one of the models is "
+            f"bent or wrongly scaled, or they are laid on each other wrongly; look at the maps"
+        )
     folder = out or workspace / "against" / earlier.resolve().name
     folder.mkdir(parents=True, exist_ok=True)
     figures = {

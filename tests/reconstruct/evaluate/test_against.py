@@ -11,7 +11,7 @@ from rasterio.transform import from_origin
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.artefacts import write_json
-from alice_survey.errors import ReconstructionError, WorkspaceError
+from alice_survey.errors import ReconstructionError, WorkspaceError, heard
 from alice_survey.frames import Datum
 from reconstruct.evaluate.against import compare_elevations, evaluate_against
 from reconstruct.evaluate.elevation import Elevation, enu_from_enu
@@ -172,3 +172,17 @@ def test_the_command_writes_maps_that_say_what_the_text_says(tmp_path: Path) -> 
     bare = write_survey(tmp_path / "bare", survey(12, STILL, 0.0), None)
     with pytest.raises(WorkspaceError, match="not georeferenced"):
         evaluate_against(now, bare)
+
+
+def test_a_model_that_is_bent_is_warned_of(tmp_path: Path) -> None:
+    datum = Datum(32.8236, 34.9553)
+    flat = survey(13, STILL, 0.0)
+    x, y = np.meshgrid(np.linspace(-1, 1, SIDE), np.linspace(-1, 1, SIDE))
+    bent = Elevation(
+        height=flat.height + 0.05 * (x**2 + y**2), sigma=flat.sigma, west=0.0, north=4.0, cell=CELL
+    )
+    now = write_survey(tmp_path / "now", flat, datum)
+    before = write_survey(tmp_path / "before", bent, datum)
+    with heard() as told:
+        evaluate_against(now, before)
+    assert any("of the common ground differs" in text for text in told)
