@@ -1,6 +1,7 @@
 """Wall time and peak memory of a command with all its children."""
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -41,11 +42,17 @@ def measured(command: Sequence[str], log: Path, timeout_s: float = 7200.0) -> Co
     started, peak = time.perf_counter(), 0.0
     with log.open("w") as file:
         process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
-        while process.poll() is None:
-            peak = max(peak, sum(_memory_mib(pid) for pid in _family(process.pid)))
-            if time.perf_counter() - started > timeout_s:
-                process.kill()
-            time.sleep(_EVERY_S)
+        try:
+            while process.poll() is None:
+                peak = max(peak, sum(_memory_mib(pid) for pid in _family(process.pid)))
+                if time.perf_counter() - started > timeout_s:
+                    break
+                time.sleep(_EVERY_S)
+        finally:
+            if process.poll() is None:
+                for pid in _family(process.pid):
+                    os.kill(pid, signal.SIGTERM)
+                process.wait()
     after = os.times()
     return Cost(
         wall_s=time.perf_counter() - started,
