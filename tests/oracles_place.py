@@ -6,7 +6,7 @@ from alice_survey.frames import Array
 
 
 def covariance_matrix(time: Array, sigma: Array, tau: float, white: float) -> Array:
-    """(N, N) correlations of errors over their sigmas, pair by pair along the chain between them."""
+    """(N, N) correlations of errors over their sigmas, pair by pair along the chain."""
     count = len(time)
     matrix = np.eye(count)
     for i in range(count):

@@ -23,7 +23,8 @@ from reconstruct.lenses.lens import FlatPortLens, Lens
 _COLUMNS = 129
 """Nodes along the picture's width; fewer along its height."""
 _ROUNDS = 5
-"""Of the fixed-point iteration to a warped pixel; each gains 10 at a quarter of the working depth, 100 near it."""
+"""Of the fixed-point iteration to a warped pixel: each gains a factor of 10 at a quarter of the
+working depth, of 100 near it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

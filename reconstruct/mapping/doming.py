@@ -307,19 +307,19 @@ def _quadratic(plane: Array, *, wide: bool) -> Array:
 
 def _robust_fit(design: Array, values: Array, sigmas: Array) -> tuple[Array, Array]:
     """Coefficients and their covariance."""
-    weight: Array = np.ones(len(values))
+    weight = np.ones(len(values))
     for _ in range(_ROUNDS):
         root = np.sqrt(weight) / sigmas
         fitted = np.linalg.lstsq(root[:, None] * design, root * values, rcond=None)[0]
         left = (values - design @ fitted) / sigmas
         spread = max(1.4826 * float(np.median(np.abs(left))), 1e-12)
-        weight = np.asarray(1.0 / (1.0 + (left / (_TUNING * spread)) ** 2), float)
+        weight = np.asarray(1.0 / (1.0 + (left / (_TUNING * spread)) ** 2), np.float64)
     free = len(values) - design.shape[1]
     root = np.sqrt(weight) / sigmas
     variance = float((weight * left**2).sum() / max(weight.sum() * free / len(values), 1e-12))
     normal = (root[:, None] * design).T @ (root[:, None] * design)
-    covariance: Array = np.linalg.inv(normal) * max(1.0, variance)
-    return np.asarray(fitted, float), covariance
+    covariance = np.asarray(np.linalg.inv(normal) * max(1.0, variance), np.float64)
+    return np.asarray(fitted, np.float64), covariance
 
 
 def _station_scale(model: pycolmap.Reconstruction, frame: int) -> tuple[float, float] | None:

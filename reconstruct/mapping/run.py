@@ -321,11 +321,7 @@ def _write(
     registered = {image.name for image in model.images.values() if image.has_pose}
     lost = [r.image for r in inputs.records if r.image not in registered]
     if lost:
-        others = f" ({len(mapped.models) - 1} smaller models were dropped)"
-        warn(
-            f"{len(lost)} of {len(inputs.records)} pictures are not in the model"
-            f"{others if len(mapped.models) > 1 else ''}: {named(lost)}"
-        )
+        warn(f"{len(lost)} of {len(inputs.records)} pictures are not in the model: {named(lost)}")
     (partial / "model").mkdir(exist_ok=True)
     model.write_binary(partial / "model")
     write_json(

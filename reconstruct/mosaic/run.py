@@ -46,6 +46,7 @@ from reconstruct.mosaic.paint import (
 from reconstruct.mosaic.sight import Water
 from reconstruct.mosaic.tools import Survey, forget_tools
 from reconstruct.mosaic.writers import cloud_optimised, thumbnail, write_labels, write_tiles
+from reconstruct.sparse.track_figure import plot_track_over
 
 _TILE_PX = 1024
 _LABEL_PX = 2048
@@ -143,6 +144,7 @@ def build_mosaic(
     covered = write_tiles(rough, folder / "mosaic_source.tif", grid, model.frame, painted, names)
     cloud_optimised(rough, folder / "mosaic.tif")
     thumbnail(folder / "mosaic.tif", folder / "mosaic.png")
+    plot_track_over(folder / "mosaic.tif", workspace / "sparse" / "track.csv", folder / "track.png")
     shutil.rmtree(scratch)
     dem = workspace / "dense" / "dem.tif"
     outlines = parallel_map(

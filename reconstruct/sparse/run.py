@@ -121,6 +121,8 @@ def _place(
     lenses = {name: lens_from_json(lens) for name, lens in cameras["cameras"].items()}
     model = pycolmap.Reconstruction(workspace / "mapping" / "model")
     of_name = {r.image: r for r in inputs.records}
+    refined = workspace / "mapping" / "rig.json"  # where the settings ask for it
+    rig = read_rig(refined) if refined.is_file() else inputs.rig
     poses = {
         image.name: as_transform(image.cam_from_world()).inv()
         for image in model.images.values()
@@ -134,7 +136,7 @@ def _place(
             records=[of_name[name] for name in names],
             pinholes=[poses[name] for name in names],
             lenses=lenses,
-            rig=inputs.rig,
+            rig=rig,
             datum=inputs.datum,
             survey=survey,
             mapping=mapping,
@@ -150,7 +152,7 @@ def _place(
     model.export_PLY(partial / "sparse.ply")
     shutil.copyfile(workspace / "mapping" / "cameras.json", partial / "cameras.json")
     write_frame(partial / "frame.json", placed.frame)
-    rows = track_rows(model, of_name, lenses, placed.frame, _mounts(inputs.rig))
+    rows = track_rows(model, of_name, lenses, placed.frame, _mounts(rig))
     covariances = _covariances(workspace, partial, placed, rows)
     sigmas = track_sigmas(rows, covariances)
     write_track_csv(partial / "track.csv", rows, placed.frame, sigmas)

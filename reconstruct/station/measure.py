@@ -38,7 +38,7 @@ _CELL_STEPS = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class Pick:
-    """A pixel as taken."""
+    """A pixel as taken, from the outer corner of the first."""
 
     image: str | None
     x: float
@@ -85,7 +85,7 @@ def measure(
         folder: of a pair (`pair.json`), or a reconstructed workspace.
         points: two or more, with blanks between: `x,y` in the left picture of a pair as taken;
             `IMAGE:x,y` in a workspace, or `IMAGE:x,y=IMAGE:x,y` where two pictures show the spot.
-            Pixels count from the outer corner of the first, whose centre is 0.5,0.5.
+            Pixels count from 0 at the middle of the first, as viewers show them.
         pick_sigma_px: standard deviation with which pixels were picked.
         n_water_sigma: of the index of the water, where the rig's covariance does not name it.
 
@@ -125,7 +125,8 @@ def parse_picks(points: str) -> list[tuple[Pick, ...]]:
                 raise ReconstructionError(
                     f"point {word!r}: give x,y or IMAGE:x,y or IMAGE:x,y=IMAGE:x,y"
                 )
-            spots.append(Pick(image=match["image"], x=float(match[2]), y=float(match[3])))
+            x, y = float(match[2]) + 0.5, float(match[3]) + 0.5
+            spots.append(Pick(image=match["image"], x=x, y=y))
         if len(spots) > 2:
             raise ReconstructionError(f"point {word!r}: at most two pictures can show a spot")
         found.append(tuple(spots))
@@ -222,7 +223,7 @@ def _in_pair(
     found = precise_depth((views[0], views[1]), greys, depth_map, pixels)
     lost = np.flatnonzero(~np.isfinite(found.depth))
     if len(lost):
-        x, y = taken[lost[0]]
+        x, y = taken[lost[0]] - 0.5
         raise ReconstructionError(
             f"pixel {x:g},{y:g}: the right picture does not show the same there (no texture, "
             "hidden, or outside); pick another close by"
@@ -273,7 +274,8 @@ def _check_inside(taken: Array, lens: Lens, name: str) -> None:
     for x, y in taken:
         if not (0 <= x <= lens.size_px[0] and 0 <= y <= lens.size_px[1]):
             raise ReconstructionError(
-                f"pixel {x:g},{y:g} is outside of {name} ({lens.size_px[0]} x {lens.size_px[1]})"
+                f"pixel {x - 0.5:g},{y - 0.5:g} is outside of {name} "
+                f"({lens.size_px[0]} x {lens.size_px[1]})"
             )
 
 
@@ -411,8 +413,8 @@ def _on_surface(
     point = surface.hit(start, direction)
     if point is None:
         raise ReconstructionError(
-            f"{view.image}:{taken[0]:g},{taken[1]:g}: its ray meets no known surface; pick another "
-            "pixel, or the spot in two pictures as IMAGE:x,y=IMAGE:x,y"
+            f"{view.image}:{taken[0] - 0.5:g},{taken[1] - 0.5:g}: its ray meets no known "
+            "surface; pick another pixel, or the spot in two pictures as IMAGE:x,y=IMAGE:x,y"
         )
     sigma = float(surface.at(surface.sigma, point[None])[0])
     raised = surface.hit(start, direction, lift=sigma)
