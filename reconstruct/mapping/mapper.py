@@ -300,7 +300,6 @@ def _map_once(
     options: pycolmap.IncrementalPipelineOptions,
     free: Literal["nothing", "distortion", "all"],
 ) -> list[pycolmap.Reconstruction]:
-    pycolmap.logging.minloglevel = 2
     scratch = folder / "mapper"
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)

@@ -251,7 +251,6 @@ def _judge_again(
         scratch = folder / "refraction"
         shutil.rmtree(scratch, ignore_errors=True)
         scratch.mkdir(parents=True)
-        pycolmap.logging.minloglevel = 2
         write_database(scratch / "database.db", seen, cam_from_rig)
         with pycolmap.Database.open(scratch / "database.db") as database:
             cache = pycolmap.DatabaseCache.create(database, pycolmap.DatabaseCacheOptions())

@@ -113,6 +113,7 @@ def run_mapping(
     )
 
     def work(partial: Path) -> None:
+        pycolmap.logging.minloglevel = 2  # its own account of every step is for its developers
         features = _find_all(inputs, partial / "features", config, threads)
         lenses, distances = _lenses(inputs, features, config, threads)
         cameras, exif_focal = _cameras(inputs, lenses)
