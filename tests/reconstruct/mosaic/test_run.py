@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 import rasterio
 
-from alice_survey.artefacts import read_json, write_json
+from alice_survey.artefacts import read_json, write_csv, write_json
 from alice_survey.config import ReconstructConfig, SurveyConfig
 from alice_survey.errors import ReconstructionError
 from reconstruct.dense.dem import DemGrid
-from reconstruct.mosaic.light import GRID, LightModel, write_light
+from reconstruct.model import View
 from reconstruct.mosaic.run import run_mosaic
 from reconstruct.raster import tiled_raster
 from tests.oracles_dense import (
@@ -36,8 +36,8 @@ def terraced(north: np.ndarray, east: np.ndarray) -> np.ndarray:
 SCENE = Scene(depth_of=terraced, paint=position_code)
 
 
-def write_surface(folder: Path, images: list[str], gains: np.ndarray | None = None) -> None:
-    """The true DEM over the middle of the survey, and light that needs no correction."""
+def write_surface(folder: Path) -> None:
+    """The true DEM over the middle of the survey."""
     dense = folder / "dense"
     dense.mkdir()
     grid = DemGrid(west=-0.6, north=0.9, cell=CELL_M, rows=125, columns=110)
@@ -46,23 +46,37 @@ def write_surface(folder: Path, images: list[str], gains: np.ndarray | None = No
     height[100:, 90:] = np.nan
     with tiled_raster(dense / "dem.tif", grid, FRAME, "float32", np.nan, "height") as raster:
         raster.write(height.astype(np.float32), 1)
-    gains = np.zeros((len(images), 3)) if gains is None else gains
-    light = LightModel(
-        patterns={camera: np.zeros((*GRID, 3)) for camera in ("left", "right")},
-        gains=dict(zip(images, gains, strict=True)),
-        white=np.ones(3),
-    )
-    write_light(dense / "light.json", light)
     write_json(dense / "cloud.json", {"points": 1})
     write_json(dense / "stage.json", {})
+
+
+def write_track(folder: Path, views: list[View]) -> None:
+    """What the mosaic's figure of the track reads of `sparse/track.csv`."""
+    header = ("image", "station", "time_s", "north_m", "east_m", "depth_m", "qx", "qy", "qz", "qw")
+    write_csv(
+        folder / "sparse" / "track.csv",
+        header,
+        [
+            (view.image, view.station, float(view.station), *view.world_from_cam.translation,
+             *view.world_from_cam.rotation.as_quat())
+            for view in views
+        ],
+    )  # fmt: skip
+
+
+def make_workspace(folder: Path, views: list[View], scene: Scene) -> Path:
+    """All that the mosaic is made of."""
+    write_workspace(folder, sparse_model(views, scene), scene)
+    write_surface(folder)
+    write_track(folder, views)
+    return folder
 
 
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("mosaic")
     views = stereo_views(np.array([-0.2, 0.2, 0.6]), np.array([0.0, 0.05, 0.0]), heading_deg=30.0)
-    write_workspace(folder, sparse_model(views, SCENE), SCENE)
-    write_surface(folder, [view.image for view in views])
+    make_workspace(folder, views, SCENE)
     assert run_mosaic(folder, CONFIG, 1)
     return folder
 
@@ -146,13 +160,12 @@ def test_bytes_do_not_change(workspace: Path, tmp_path: Path):
 def test_gains_of_pictures_leave_no_seam(tmp_path: Path):
     plain = Scene(depth_of=terraced, paint=lambda n, e: np.full((*n.shape, 3), 100.0))
     views = stereo_views(np.array([-0.2, 0.2, 0.6]), np.array([0.0, 0.05, 0.0]), heading_deg=30.0)
-    write_workspace(tmp_path, sparse_model(views, plain), plain)
+    make_workspace(tmp_path, views, plain)
     gains = np.log(np.linspace(0.7, 1.3, len(views)))
     for view, gain in zip(views, gains, strict=True):
         path = tmp_path / "images" / view.image
         picture = cv2.imread(str(path)).astype(np.float64) * np.exp(gain)
         cv2.imwrite(str(path), np.rint(picture).astype(np.uint8))
-    write_surface(tmp_path, [view.image for view in views], np.tile(gains[:, None], (1, 3)))
     assert run_mosaic(tmp_path, EVEN, 1)
     rgba, _, _ = read(tmp_path)
     painted = rgba[:3][:, rgba[3] > 0]
@@ -162,8 +175,7 @@ def test_gains_of_pictures_leave_no_seam(tmp_path: Path):
 
 def test_no_picture_over_the_surface_gives_one_line(tmp_path: Path):
     views = stereo_views(np.array([30.0, 30.4]), np.array([0.0, 0.0]))
-    write_workspace(tmp_path, sparse_model(views, SCENE), SCENE)
-    write_surface(tmp_path, [view.image for view in views])
+    make_workspace(tmp_path, views, SCENE)
     with pytest.raises(ReconstructionError, match="no picture sees") as caught:
         run_mosaic(tmp_path, CONFIG, 1)
     assert "\n" not in str(caught.value)
