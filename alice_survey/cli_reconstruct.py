@@ -1,7 +1,7 @@
 """The commands that turn pictures into a model, measure in it, and score it."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -167,17 +167,75 @@ def scale(
     typer.echo(scale_model(workspace, points, length))
 
 
-@app.command(epilog=examples("evaluate -w reef", "evaluate -w reef --json"))
+@app.command(
+    epilog=examples(
+        "evaluate -w reef",
+        "evaluate -w reef --reference laser.laz",
+        "evaluate -w reef --against last_year --json",
+    )
+)
 def evaluate(
     workspace: Workspace = WORK,
     survey: SurveyFile = None,
+    reference: Annotated[
+        Path | None, typer.Option(help="A cloud (LAZ, LAS, PLY) or DEM (GeoTIFF) instead.")
+    ] = None,
+    free_scale: Annotated[
+        bool | None,
+        typer.Option("--free-scale/--hold-scale", help="Fit the scale to the reference too."),
+    ] = None,
+    against: Annotated[
+        Path | None, typer.Option(help="Workspace of an earlier survey of the site.")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Folder for these two.")
+    ] = None,
     threads: Threads = None,
     as_json: AsJson = False,
 ) -> None:
-    """Score a simulated survey.
+    """Score a survey.
 
-    Camera track, surface and mosaic against the truth.
+    A simulated one against its truth: camera track, surface, mosaic, mesh. A real one against
+    a reference, or against an earlier survey: what has changed, how surely, and its volume.
     """
-    from alice_survey.survey import run
+    if reference is not None:
+        from reconstruct.evaluate.reference import evaluate_reference
 
-    print_result(*run(["report"], workspace, survey, None, threads), as_json)
+        result = evaluate_reference(workspace, reference, free_scale=free_scale, out=output)
+    elif against is not None:
+        from reconstruct.evaluate.against import evaluate_against
+
+        result = evaluate_against(workspace, against, output)
+    else:
+        from alice_survey.survey import run
+
+        result = run(["report"], workspace, survey, None, threads)
+    print_result(*result, as_json)
+
+
+@app.command(
+    epilog=examples(
+        "mosaic-tiles -w reef -o tiles", "mosaic-tiles -w reef -o tiles --side 32767 --kind tif"
+    )
+)
+def mosaic_tiles(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")],
+    workspace: Workspace = WORK,
+    side: Annotated[int, typer.Option(min=256, max=32_767, help="Of a tile, px.")] = 8192,
+    overlap: Annotated[int, typer.Option(min=0, help="Of neighbours, px.")] = 0,
+    kind: Annotated[Literal["png", "jpg", "tif"], typer.Option(help="Format.")] = "png",
+    scale_bar: Annotated[
+        bool, typer.Option("--scale-bar", help="Draw one into every tile.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Cut the mosaic for annotation tools.
+
+    Tiles that TagLab, BIIGLE and others take, each with a world file; tiles.csv lists their scale.
+    """
+    from reconstruct.mosaic.annotation import mosaic_tiles as cut
+
+    result = cut(
+        workspace, output, side_px=side, overlap_px=overlap, kind=kind, scale_bar=scale_bar
+    )
+    print_result(*result, as_json)
