@@ -11,7 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from alice_survey.frames import Array
-from reconstruct.dense.sight import KernelLens, pixel_at, slope_at
+from reconstruct.dense.sight import FAST, KernelLens, pixel_at, slope_at
 
 Float32 = NDArray[np.float32]
 
@@ -19,7 +19,7 @@ GATE_SIGMAS = 3.0
 """Depths that differ by no more than this many standard deviations of their difference agree."""
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
 def merge_depths(
     depths: Float32, sigmas: Float32, gate: float
 ) -> tuple[Float32, Float32, NDArray[np.uint8]]:
@@ -81,7 +81,7 @@ def merge_depths(
     return merged, sigma, agreeing
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
 def count_witnesses(
     depth: Float32,
     sigma: Float32,

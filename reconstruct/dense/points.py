@@ -8,7 +8,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from alice_survey.frames import Array
-from reconstruct.dense.sight import KernelLens, lens_of, slope_at
+from reconstruct.dense.sight import FAST, KernelLens, lens_of, slope_at
 from reconstruct.dense.sight import pinhole_of as pinhole_of  # the mosaic takes it from here
 from reconstruct.model import View
 
@@ -99,7 +99,7 @@ def joined(parts: list[Points]) -> Points:
     )
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
 def gather(
     depth: Float32,
     sigma: Float32,
@@ -189,7 +189,7 @@ def gather(
     return enu[:count].copy(), normals, colours, sigmas
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
 def _spot(depth: Float32, lens: KernelLens, row: int, column: int, spot: Array) -> None:
     """Write the point (3,) of a pixel, in the camera, into `spot`; NaN where unknown."""
     z = depth[row, column]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from alice_survey.frames import Array
-from reconstruct.dense.sight import KernelLens, lens_of, slope_at
+from reconstruct.dense.sight import FAST, KernelLens, field_of, lens_of
 from reconstruct.model import View
 
 _LEAST_COSINE = 0.75
@@ -197,7 +197,7 @@ def depth_in_reference(
     return depth, float(np.sqrt(squares / max(count, 1)))
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
 def triangulate(
     disparity_px: NDArray[np.float32],
     shape: tuple[int, int],
@@ -236,13 +236,16 @@ def triangulate(
     squares, count = 0.0, 0
     h, g = rect_from_reference, rect_from_partner
     back = np.linalg.inv(g)
+    c = cosines
+    pinhole, other = reference[0], partner[0]
+    near, far = reference[1][3], partner[1][3]
     for row in range(height):
         y = row + 0.5
         for column in range(width):
             x = column + 0.5
-            w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
-            left = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w
-            level = (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w
+            w = 1.0 / (h[2, 0] * x + h[2, 1] * y + h[2, 2])
+            left = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) * w
+            level = (h[1, 0] * x + h[1, 1] * y + h[1, 2]) * w
             if not (0.0 <= left < columns - 1 and 0.0 <= level < rows - 1):
                 continue
             i, j = int(level), int(left)
@@ -252,43 +255,37 @@ def triangulate(
             disparity = (1 - b) * above + b * below
             if not disparity + offset_px > 0.0:  # NaN as well
                 continue
-            right = left - disparity
-            w = back[2, 0] * right + back[2, 1] * level + back[2, 2]
-            u = (back[0, 0] * right + back[0, 1] * level + back[0, 2]) / w
-            v = (back[1, 0] * right + back[1, 1] * level + back[1, 2]) / w
-            reach = focal_baseline / (disparity + offset_px)
-            z, across = 0.0, 0.0
-            for last in range(_ROUNDS + 1):
-                px, py, share = _pinhole_ray(reference, cosines[0], x, y, reach)
-                z = reach / share
-                if last == _ROUNDS:
-                    break
-                qx, qy, _ = _pinhole_ray(partner, cosines[1], u, v, reach)
-                w = h[2, 0] * px + h[2, 1] * py + h[2, 2]
-                here = (h[0, 0] * px + h[0, 1] * py + h[0, 2]) / w
-                across = (h[1, 0] * px + h[1, 1] * py + h[1, 2]) / w
-                w = g[2, 0] * qx + g[2, 1] * qy + g[2, 2]
-                there = (g[0, 0] * qx + g[0, 1] * qy + g[0, 2]) / w
-                across -= (g[1, 0] * qx + g[1, 1] * qy + g[1, 2]) / w
-                reach = focal_baseline / (here - there + offset_px)
+            ray = c[0, 2] + c[0, 0] * (x - pinhole[2]) / pinhole[0]
+            ray += c[0, 1] * (y - pinhole[3]) / pinhole[1]
+            shifted = disparity + offset_px  # of the two pinhole pixels
+            across, px, py = 0.0, x, y
+            if near != 0.0 or far != 0.0:
+                right = left - disparity
+                w = 1.0 / (back[2, 0] * right + back[2, 1] * level + back[2, 2])
+                u = (back[0, 0] * right + back[0, 1] * level + back[0, 2]) * w
+                v = (back[1, 0] * right + back[1, 1] * level + back[1, 2]) * w
+                other_ray = c[1, 2] + c[1, 0] * (u - other[2]) / other[0]
+                other_ray += c[1, 1] * (v - other[3]) / other[1]
+                ax, ay = field_of(reference, x, y)
+                bx, by = field_of(partner, u, v)
+                for _ in range(_ROUNDS):
+                    inverse_reach = shifted / focal_baseline
+                    step = ray * inverse_reach - near
+                    px, py = x + ax * step, y + ay * step
+                    step = other_ray * inverse_reach - far
+                    qx, qy = u + bx * step, v + by * step
+                    w = 1.0 / (h[2, 0] * px + h[2, 1] * py + h[2, 2])
+                    here = (h[0, 0] * px + h[0, 1] * py + h[0, 2]) * w
+                    across = (h[1, 0] * px + h[1, 1] * py + h[1, 2]) * w
+                    w = 1.0 / (g[2, 0] * qx + g[2, 1] * qy + g[2, 2])
+                    there = (g[0, 0] * qx + g[0, 1] * qy + g[0, 2]) * w
+                    across -= (g[1, 0] * qx + g[1, 1] * qy + g[1, 2]) * w
+                    shifted = here - there + offset_px
+                ray = c[0, 2] + c[0, 0] * (px - pinhole[2]) / pinhole[0]
+                ray += c[0, 1] * (py - pinhole[3]) / pinhole[1]
+            z = focal_baseline / (shifted * ray)
             if z > 0.0:
                 depth[row, column] = z
                 squares += across * across
                 count += 1
     return depth, squares, count
-
-
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _pinhole_ray(
-    lens: KernelLens, cosine: Array, x: float, y: float, reach: float
-) -> tuple[float, float, float]:
-    """The pinhole's pixel of what a warped pixel shows at a reach along the virtual axis.
-
-    The last value is the share of the ray (slopes, 1) along that axis.
-    """
-    pinhole, _ = lens
-    plain = cosine[2] + cosine[0] * (x - pinhole[2]) / pinhole[0]
-    plain += cosine[1] * (y - pinhole[3]) / pinhole[1]
-    a, b = slope_at(lens, x, y, plain / reach)
-    share = cosine[0] * a + cosine[1] * b + cosine[2]
-    return a * pinhole[0] + pinhole[2], b * pinhole[1] + pinhole[3], share

@@ -24,10 +24,13 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from alice_survey.frames import Array
-from reconstruct.dense.sight import KernelLens, lens_of, pixel_at, slope_at
+from reconstruct.dense.sight import FAST, KernelLens, field_of, lens_of, pixel_at
 from reconstruct.model import View
 
 Float32 = NDArray[np.float32]
+
+_SIXTH, _HALF, _TWO_THIRDS = np.float32(1 / 6), np.float32(0.5), np.float32(2 / 3)
+_ONE, _THREE_HALVES, _TWO = np.float32(1.0), np.float32(1.5), np.float32(2.0)
 
 _CONTRAST_SIGMA_PX = 8.0
 """Of the Gaussian window in which pictures are brought to zero mean and unit contrast."""
@@ -87,11 +90,29 @@ def _blur(picture: Float32, sigma_px: float) -> Float32:
     return blurred
 
 
-@njit(cache=True, fastmath={"contract", "reassoc", "nsz", "arcp"})  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
+def sights(lens: KernelLens, height: int, width: int) -> Float32:
+    """Lines on which the spots of a view's pixels lie, (H, W, 4).
+
+    Slopes x/z, y/z at an inverse depth of zero, and how they change with it.
+    """
+    pinhole, shift = lens
+    lines = np.empty((height, width, 4), np.float32)
+    for row in range(height):
+        for column in range(width):
+            a, b = field_of(lens, column + 0.5, row + 0.5)
+            lines[row, column, 0] = (column + 0.5 - a * shift[3] - pinhole[2]) / pinhole[0]
+            lines[row, column, 1] = (row + 0.5 - b * shift[3] - pinhole[3]) / pinhole[1]
+            lines[row, column, 2] = a / pinhole[0]
+            lines[row, column, 3] = b / pinhole[1]
+    return lines
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
 def compare(
     inverse_depth: Float32,
     reference: Float32,
-    lens: KernelLens,
+    lines: Float32,
     spline: Float32,
     valid: NDArray[np.bool_],
     other_lens: KernelLens,
@@ -102,7 +123,7 @@ def compare(
     Args:
         inverse_depth: (H, W) along the reference's axis, NaN where unknown.
         reference: (H, W) contrast.
-        lens: of the reference.
+        lines: (H, W, 4) of the reference, see `sights`.
         spline: (h, w) B-spline coefficients of the neighbour's contrast.
         valid: (h, w) of the neighbour.
         other_lens: of the neighbour.
@@ -117,14 +138,15 @@ def compare(
     rest = np.full((height, width), np.nan, np.float32)
     slope = np.full((height, width), np.nan, np.float32)
     speed = np.full((height, width), np.nan, np.float32)
-    pinhole = other_lens[0]
+    fx, fy = other_lens[0][0], other_lens[0][1]
     t = other_from_ref
     for row in range(height):
         for column in range(width):
             w = inverse_depth[row, column]
             if not w > 0.0:
                 continue
-            x, y = slope_at(lens, column + 0.5, row + 0.5, w)
+            x = lines[row, column, 0] + w * lines[row, column, 2]
+            y = lines[row, column, 1] + w * lines[row, column, 3]
             a = t[0, 0] * x + t[0, 1] * y + t[0, 2]
             b = t[1, 0] * x + t[1, 1] * y + t[1, 2]
             c = t[2, 0] * x + t[2, 1] * y + t[2, 2]
@@ -139,11 +161,11 @@ def compare(
                 continue
             if not (valid[i, j] and valid[i + 1, j + 1] and valid[i, j + 1] and valid[i + 1, j]):
                 continue
-            p, q = u - j, v - i
+            p, q = np.float32(u - j), np.float32(v - i)
             a0, a1, a2, a3 = _weights(p)
             b0, b1, b2, b3 = _slopes(p)
-            value, right, down = 0.0, 0.0, 0.0
             across, changes = _weights(q), _slopes(q)
+            value, right, down = np.float32(0.0), np.float32(0.0), np.float32(0.0)
             for m in range(4):
                 k = i - 1 + m
                 c0, c1 = spline[k, j - 1], spline[k, j]
@@ -152,31 +174,38 @@ def compare(
                 value += across[m] * line
                 down += changes[m] * line
                 right += across[m] * (b0 * c0 + b1 * c1 + b2 * c2 + b3 * c3)
-            du = pinhole[0] * (t[0, 3] * c - a * t[2, 3]) / (deep * deep)
-            dv = pinhole[1] * (t[1, 3] * c - b * t[2, 3]) / (deep * deep)
+            scale = 1.0 / (deep * deep)
+            du = fx * (t[0, 3] * c - a * t[2, 3]) * scale
+            dv = fy * (t[1, 3] * c - b * t[2, 3]) * scale
             rest[row, column] = reference[row, column] - value
             slope[row, column] = right * du + down * dv
             speed[row, column] = math.sqrt(du * du + dv * dv)
     return rest, slope, speed
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _weights(t: float) -> tuple[float, float, float, float]:
+@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
+def _weights(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.float32]:
     """The four weights of a cubic B-spline at a share t of the way from the second node."""
-    s = 1.0 - t
+    s = _ONE - t
+    u, v = _HALF * t - _ONE, _HALF * s - _ONE
     return (
-        s * s * s / 6.0,
-        (3.0 * t * t * t - 6.0 * t * t + 4.0) / 6.0,
-        (3.0 * s * s * s - 6.0 * s * s + 4.0) / 6.0,
-        t * t * t / 6.0,
+        _SIXTH * s * s * s,
+        t * t * u + _TWO_THIRDS,
+        s * s * v + _TWO_THIRDS,
+        _SIXTH * t * t * t,
     )
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _slopes(t: float) -> tuple[float, float, float, float]:
+@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
+def _slopes(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.float32]:
     """How these weights change with t."""
-    s = 1.0 - t
-    return -0.5 * s * s, 1.5 * t * t - 2.0 * t, 2.0 * s - 1.5 * s * s, 0.5 * t * t
+    s = _ONE - t
+    return (
+        -_HALF * s * s,
+        (_THREE_HALVES * t - _TWO) * t,
+        (_TWO - _THREE_HALVES * s) * s,
+        _HALF * t * t,
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -269,16 +298,16 @@ def _sums(reference: Look, inverse: Float32, others: Sequence[Look]) -> _Sums:
     shape = inverse.shape
     pull, curvature, speed = (np.zeros(shape, np.float32) for _ in range(3))
     likeness, seen = np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
-    lens = lens_of(reference.view)
+    lines = sights(lens_of(reference.view), *shape)
     samples = np.float32(4.0 * np.pi * _WINDOW_SIGMA_PX**2)  # one over the sum of squared weights
     mean = _blur(reference.contrast, _WINDOW_SIGMA_PX)
-    spread = _blur(reference.contrast**2, _WINDOW_SIGMA_PX) - mean * mean
+    spread = _blur(reference.contrast * reference.contrast, _WINDOW_SIGMA_PX) - mean * mean
     for other in others:
         other_from_ref = other.view.world_from_cam.inv() * reference.view.world_from_cam
         rest, slope, fast = compare(
             inverse,
             reference.contrast,
-            lens,
+            lines,
             other.spline,
             other.valid,
             lens_of(other.view),
@@ -300,7 +329,7 @@ def _sums(reference: Look, inverse: Float32, others: Sequence[Look]) -> _Sums:
     return _Sums(pull=pull, curvature=curvature, speed=speed, likeness=likeness, seen=seen)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
 def _products(
     rest: Float32, slope: Float32, known: NDArray[np.bool_], outlying: float
 ) -> tuple[Float32, Float32, Float32, Float32, Float32, Float32]:
@@ -321,7 +350,7 @@ def _products(
     return weight, r, g, rg, gg, rr
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
 def _add(
     sums: tuple[Float32, Float32, Float32, Float32, Float32, Float32],
     spread: Float32,

@@ -9,8 +9,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from alice_survey.frames import Array
-from reconstruct.lenses.range_shift import field_at, ideal_pixel
 from reconstruct.model import View
+
+FAST = {"contract", "reassoc", "nsz", "arcp"}
+"""What the compiler may do to sums and quotients in kernels; NaN and infinity keep their sense."""
 
 KernelLens = tuple[Array, tuple[NDArray[np.float64], float, float, float]]
 """(4,) fx, fy, cx, cy in pixels, and a view's `shift_arguments`."""
@@ -31,15 +33,36 @@ def pinhole_of(view: View) -> Array:
     return np.array([view.fx_px, view.fy_px, view.cx_px, view.cy_px])
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
+def field_of(lens: KernelLens, x: float, y: float) -> tuple[float, float]:
+    """`range_shift.field_at` of a lens, compiled so that loops over pixels share its quotients."""
+    nodes, width_px, height_px, _ = lens[1]
+    rows, columns = nodes.shape[0], nodes.shape[1]
+    u = min(max(x * ((columns - 1) / width_px), 0.0), columns - 1.0)
+    v = min(max(y * ((rows - 1) / height_px), 0.0), rows - 1.0)
+    column, row = min(int(u), columns - 2), min(int(v), rows - 2)
+    p, q = u - column, v - row
+    a, b, c, d = (1 - p) * (1 - q), p * (1 - q), (1 - p) * q, p * q
+    return (
+        a * nodes[row, column, 0] + b * nodes[row, column + 1, 0]
+        + c * nodes[row + 1, column, 0] + d * nodes[row + 1, column + 1, 0],
+        a * nodes[row, column, 1] + b * nodes[row, column + 1, 1]
+        + c * nodes[row + 1, column, 1] + d * nodes[row + 1, column + 1, 1],
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
 def slope_at(lens: KernelLens, x: float, y: float, inverse_depth: float) -> tuple[float, float]:
     """Slopes x/z, y/z of the spot at an inverse depth that the warped picture shows at (x, y)."""
     pinhole, shift = lens
-    u, v = ideal_pixel(shift[0], shift[1], shift[2], shift[3], x, y, inverse_depth)
-    return (u - pinhole[2]) / pinhole[0], (v - pinhole[3]) / pinhole[1]
+    if shift[3] != 0.0:
+        a, b = field_of(lens, x, y)
+        x += a * (inverse_depth - shift[3])
+        y += b * (inverse_depth - shift[3])
+    return (x - pinhole[2]) / pinhole[0], (y - pinhole[3]) / pinhole[1]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
 def pixel_at(lens: KernelLens, x: float, y: float, z: float) -> tuple[float, float]:
     """The warped picture's pixel of a point before the camera (z > 0)."""
     pinhole, shift = lens
@@ -50,6 +73,6 @@ def pixel_at(lens: KernelLens, x: float, y: float, z: float) -> tuple[float, flo
     step = 1.0 / z - shift[3]
     at_x, at_y = u, v
     for _ in range(_ROUNDS):
-        a, b = field_at(shift[0], shift[1], shift[2], at_x, at_y)
+        a, b = field_of(lens, at_x, at_y)
         at_x, at_y = u - a * step, v - b * step
     return at_x, at_y

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.spatial import cKDTree
 
 from alice_survey.errors import ReconstructionError
 from alice_survey.frames import Array
@@ -25,6 +27,10 @@ _LARGEST_TILT = 0.6
 """Largest sine of the angle between a line of sight and the plane square to the baseline."""
 _GOOD_RATIO = (0.15, 0.45)
 _USABLE_RATIO = (0.02, 0.8)
+_MOST_BOUNDING = 4000
+"""Points that bound the depth of a view."""
+_BEYOND = 1.2
+"""Times the farthest point that a view observed: points of others may lie so far away."""
 _LEAST_GAIN = 0.03
 """Share of a view's points that another partner must newly serve to be worth its time."""
 
@@ -57,6 +63,43 @@ def in_frame(view: View, points_world: Array) -> NDArray[np.bool_]:
     return np.asarray(inside.all(axis=1))
 
 
+def points_in_sight(model: SparseModel) -> list[Array]:
+    """Per view the points (N, 3) in its frame, its own and others', that bound its depth.
+
+    Of many every n-th is taken. The work grows with the views, not with views times points.
+    """
+    tree = cKDTree(model.points_world) if len(model.points_world) else None
+    found = []
+    for view, own in zip(model.views, points_of_views(model), strict=True):
+        if tree is None or len(own) == 0:
+            found.append(own)
+            continue
+        centre = view.world_from_cam.translation
+        reach = _BEYOND * np.linalg.norm(own - centre, axis=1).max()
+        near = np.sort(tree.query_ball_point(centre, reach))
+        inside = near[in_frame(view, model.points_world[near])]
+        found.append(model.points_world[inside[:: -(-len(inside) // _MOST_BOUNDING) or 1]])
+    return found
+
+
+def neighbours(model: SparseModel, most: int) -> list[list[int]]:
+    """For each view the others that share most sparse points with it, best first."""
+    views = len(model.views)
+    points, numbers = model.observations.T
+    seen = coo_matrix(
+        (np.ones(len(points), np.float32), (numbers, points)),
+        shape=(views, len(model.points_world)),
+    ).tocsr()
+    shared = (seen @ seen.T).tocsr()
+    found = []
+    for view in range(views):
+        part = slice(shared.indptr[view], shared.indptr[view + 1])
+        others, counts = shared.indices[part], shared.data[part]
+        others, counts = others[others != view], counts[others != view]
+        found.append([int(n) for n in others[np.lexsort((others, -counts))][:most]])
+    return found
+
+
 def choose_pairs(model: SparseModel, per_view: int = 4) -> list[list[StereoPair]]:
     """Choose partners for every view.
 
@@ -77,6 +120,7 @@ def choose_pairs(model: SparseModel, per_view: int = 4) -> list[list[StereoPair]
     """
     sights = [view.world_from_cam.rotation.apply([0.0, 0.0, 1.0]) for view in model.views]
     centres = np.array([view.world_from_cam.translation for view in model.views]).reshape(-1, 3)
+    tree = cKDTree(centres)
     observed = points_of_views(model)
     chosen: list[list[StereoPair]] = []
     for index in range(len(model.views)):
@@ -87,8 +131,7 @@ def choose_pairs(model: SparseModel, per_view: int = 4) -> list[list[StereoPair]
         points = points[:: max(1, len(points) // _SAMPLE)]
         distance = float(np.median(np.linalg.norm(points - centres[index], axis=1)))
         candidates: list[tuple[StereoPair, Array]] = []
-        near = np.linalg.norm(centres - centres[index], axis=1) < _USABLE_RATIO[1] * distance
-        for other in np.flatnonzero(near):
+        for other in sorted(tree.query_ball_point(centres[index], _USABLE_RATIO[1] * distance)):
             base = centres[other] - centres[index]
             if other == index:
                 continue

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from reconstruct.dense.refine import Look, compare, continued, prepared, refine
+from reconstruct.dense.refine import Look, compare, continued, prepared, refine, sights
 from reconstruct.dense.sight import lens_of
 from tests.oracles_dense import Scene, hits, render, speckle, stereo_views
 
@@ -39,7 +39,7 @@ def test_compare_equals_its_slow_twin():
     rest, slope, speed = compare(
         (1 / depth).astype(np.float32),
         one.contrast,
-        lens_of(one.view),
+        sights(lens_of(one.view), *depth.shape),
         other.spline,
         other.valid,
         lens_of(other.view),

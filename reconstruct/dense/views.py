@@ -1,0 +1,287 @@
+"""The work on one view at a time: its picture, its depth, and what its neighbours say of it.
+
+Each step takes a task that travels to another process, reads what earlier steps left in the store,
+and leaves its own there.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.executor import parallel_map
+from alice_survey.frames import Array
+from reconstruct.dense.depth import pair_depth
+from reconstruct.dense.fusion import GATE_SIGMAS, count_witnesses, merge_depths
+from reconstruct.dense.probe import open_pictures, shrunk
+from reconstruct.dense.refine import Look, prepared, refine
+from reconstruct.dense.sight import lens_of
+from reconstruct.dense.stereo_pairs import StereoPair, in_frame
+from reconstruct.dense.tiles import ViewSummary
+from reconstruct.dense.view_store import ViewStore
+from reconstruct.model import View
+from reconstruct.mosaic.light import LightSamples, at_nodes, compare_light, joined_samples, low_pass
+from reconstruct.pictures.normalise import normalise
+
+_BOUND_PERCENT = 0.1
+"""Share of a view's points left out on each of its four sides, so that none strays far off."""
+_LIGHT_LATTICE = 28
+"""Pixels along a picture's width at which the light of views is compared."""
+LOOKS = 6
+"""Neighbours by which depth is refined."""
+_DOUBTERS = 12
+_DOUBT_STEP = 7
+"""Views, and pixels between the pixels of each, by which the doubt is told."""
+_LEAST_PIXELS = 100
+"""A view with fewer pixels of confirmed depth is left out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PrepareTask:
+    """One picture to undistort, shrink and even out."""
+
+    workspace: Path
+    store: ViewStore
+    index: int
+    image: str
+    size_px: tuple[int, int]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DepthTask:
+    """One view to find depth for."""
+
+    store: ViewStore
+    index: int
+    view: View
+    partners: tuple[tuple[int, View], ...]
+    points_world: Array
+    match_sigma_px: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefineTask:
+    """One view whose depth is to be made exact."""
+
+    store: ViewStore
+    index: int
+    view: View
+    others: tuple[tuple[int, View], ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckTask:
+    """One view whose depth the neighbours are asked about."""
+
+    store: ViewStore
+    index: int
+    view: View
+    neighbours: tuple[tuple[int, View], ...]
+    doubt: float
+    """By which the standard deviations of refined depths are taken."""
+
+
+def prepare_view(task: PrepareTask) -> None:
+    """Keep a picture's colour and validity at the size of matching."""
+    store = task.store
+    if store.has(task.index, "low"):
+        return
+    colour, valid = shrunk(open_pictures(task.workspace), task.image, task.size_px)
+    store.save_colour(task.index, colour)
+    store.save_mask(task.index, "valid", valid)
+    store.save(task.index, "low", low_pass(colour, valid))
+
+
+@lru_cache(maxsize=8)
+def _evened(store: ViewStore, index: int) -> NDArray[np.uint8]:
+    """A picture of even light and contrast."""
+    return normalise(store.load_bright(index))
+
+
+@lru_cache(maxsize=8)
+def _look(store: ViewStore, index: int, width: int) -> tuple[NDArray[Any], ...]:
+    """Contrast, spline and validity of a picture."""
+    return prepared(store.load_bright(index), store.load_mask(index, "valid", width))
+
+
+def view_depth(task: DepthTask) -> None:
+    """Match a view with its partners and merge what they say."""
+    store = task.store
+    if store.has(task.index, "agreeing"):
+        return
+    shape = (task.view.height_px, task.view.width_px)
+    depths, sigmas = [], []
+    for number, partner in task.partners:
+        found = pair_depth(
+            task.view,
+            partner,
+            _evened(store, task.index),
+            _evened(store, number),
+            store.load_mask(task.index, "valid", task.view.width_px),
+            store.load_mask(number, "valid", partner.width_px),
+            task.points_world,
+            task.match_sigma_px,
+        )
+        if found is not None:
+            depths.append(found[0])
+            sigmas.append(found[1])
+    if depths:
+        depth, sigma, agreeing = merge_depths(np.stack(depths), np.stack(sigmas), GATE_SIGMAS)
+    else:
+        depth = np.full(shape, np.nan, np.float32)
+        sigma, agreeing = depth, np.zeros(shape, np.uint8)
+    store.save_depth(task.index, "depth", depth, sigma)
+    store.save(task.index, "agreeing", agreeing)
+
+
+def refine_view(task: RefineTask) -> None:
+    """Make a view's depth exact by all of its neighbours at once, and fill its gaps."""
+    store = task.store
+    if store.has(task.index, "fine"):
+        return
+    looks = []
+    for number, view in ((task.index, task.view), *task.others):
+        contrast, spline, valid = _look(store, number, view.width_px)
+        looks.append(Look(view=view, contrast=contrast, spline=spline, valid=valid))
+    depth, _ = store.load_depth(task.index, "depth")
+    refined = refine(looks[0], depth, looks[1:])
+    agreeing = np.asarray(store.load(task.index, "agreeing"))
+    support = np.where(np.isfinite(depth), np.maximum(agreeing, refined.seen), refined.seen)
+    store.save(task.index, "seen", support.astype(np.uint8))
+    store.save_depth(task.index, "fine", refined.depth, refined.sigma)
+    store.drop(task.index, "agreeing")
+    store.drop(task.index, "depth")
+    store.drop(task.index, "depth.sigma")
+
+
+def find_doubt(checks: Sequence[CheckTask], threads: int) -> float:
+    """How far refined depths of neighbouring views differ, in standard deviations as stated.
+
+    What the noise of pictures cannot tell (detail finer than the window, poses, calibration) shows
+    where views differ. The median over some views spread over the survey; at least 1.
+    """
+    step = max(1, len(checks) // _DOUBTERS)
+    spreads = list(parallel_map(disagreement, checks[::step], threads=threads, label="compare"))
+    told = [spread for spread in spreads if np.isfinite(spread)]
+    return max(1.0, float(np.median(told))) if told else 1.0
+
+
+def disagreement(task: CheckTask) -> float:
+    """Scatter of a view's depths against its neighbours', in standard deviations; NaN if none."""
+    depth, sigma = task.store.load_depth(task.index, "fine")
+    lattice = np.zeros(depth.shape, np.bool_)
+    lattice[_DOUBT_STEP // 2 :: _DOUBT_STEP, _DOUBT_STEP // 2 :: _DOUBT_STEP] = True
+    rows, columns = np.nonzero(lattice & np.isfinite(depth))
+    points = _world_points(task.view, depth, rows, columns)
+    parts = []
+    for number, other in task.neighbours:
+        there, doubt = task.store.load_depth(number, "fine")
+        seen = in_frame(other, points)
+        at = np.floor(other.project(points[seen])).astype(np.int64)
+        z = other.world_from_cam.inv().apply(points[seen])[:, 2]
+        other_z, other_sigma = there[at[:, 1], at[:, 0]], doubt[at[:, 1], at[:, 0]]
+        own = sigma[rows, columns][seen]
+        parts.append((other_z - z) / np.hypot(own, other_sigma))
+    apart = np.concatenate(parts) if parts else np.empty(0)
+    apart = apart[np.isfinite(apart)]
+    return 1.4826 * float(np.median(np.abs(apart))) if len(apart) >= _LEAST_PIXELS else np.nan
+
+
+def looked_at(pairs: Sequence[StereoPair], neighbours: Sequence[int]) -> list[int]:
+    """Views to refine depth with: the partners, then those that share most."""
+    chosen = [pair.partner for pair in pairs]
+    if not chosen:
+        return []
+    chosen += [n for n in neighbours if n not in chosen]
+    return chosen[:LOOKS]
+
+
+def check_view(task: CheckTask) -> ViewSummary:
+    """Keep the depths that two independent looks support.
+
+    A depth stays where the neighbours whose windows look alike (or the partners that agree) and the
+    neighbouring views that find the same surface number two or more, and no more views see through
+    it than confirm it.
+    """
+    store, view = task.store, task.view
+    depth, sigma = store.load_depth(task.index, "fine")
+    sigma *= np.float32(task.doubt)
+    alike = np.asarray(store.load(task.index, "seen")).astype(np.int16)
+    refuted = np.zeros_like(alike)
+    supported = np.zeros_like(alike)
+    for number, other in task.neighbours:
+        other_from_ref = other.world_from_cam.inv() * view.world_from_cam
+        other_depth, other_sigma = store.load_depth(number, "fine")
+        seen, through = count_witnesses(
+            depth,
+            sigma,
+            lens_of(view),
+            np.ascontiguousarray(other_from_ref.as_matrix()[:3]),
+            other_depth,
+            other_sigma * np.float32(task.doubt),
+            lens_of(other),
+            GATE_SIGMAS,
+        )
+        supported += seen
+        refuted += through
+    kept = np.isfinite(depth) & (alike + supported >= 2) & (refuted <= supported)
+    rows, columns = np.nonzero(kept)
+    nodes = at_nodes(np.asarray(store.load(task.index, "low")))
+    if len(rows) < _LEAST_PIXELS:
+        store.save_mask(task.index, "kept", np.zeros_like(kept))
+        return ViewSummary(
+            bounds=None,
+            up=np.nan,
+            footprint=np.nan,
+            sigma=np.nan,
+            light=joined_samples([]),
+            nodes=nodes,
+        )
+    points = _world_points(view, depth, rows, columns)
+    low, high = np.percentile(points[:, :2], [_BOUND_PERCENT, 100 - _BOUND_PERCENT], axis=0)
+    beyond = (points[:, :2] < low) | (points[:, :2] > high)
+    kept[rows, columns] = ~beyond.any(axis=1)
+    store.save_mask(task.index, "kept", kept)
+    return ViewSummary(
+        bounds=(float(low[0]), float(low[1]), float(high[0]), float(high[1])),
+        up=float(-np.median(points[:, 2])),
+        footprint=float(np.median(depth[kept]) / np.sqrt(view.fx_px * view.fy_px)),
+        sigma=float(np.median(sigma[kept])),
+        light=_shared_light(task, points, rows, columns),
+        nodes=nodes,
+    )
+
+
+def _shared_light(
+    task: CheckTask, points: Array, rows: NDArray[np.int64], columns: NDArray[np.int64]
+) -> LightSamples:
+    """Compare the light of a view and its neighbours on a lattice of its pixels."""
+    step = max(1, task.view.width_px // _LIGHT_LATTICE)
+    chosen = (rows % step == 0) & (columns % step == 0)
+    spots = points[chosen]
+    size = np.array([task.view.width_px, task.view.height_px])
+    here = (np.stack([columns[chosen], rows[chosen]], axis=1) + 0.5) / size
+    own = np.asarray(task.store.load(task.index, "low"))
+    parts = []
+    for number, other in task.neighbours:
+        seen = in_frame(other, spots)
+        there = other.project(spots[seen]) / [other.width_px, other.height_px]
+        parts.append(
+            compare_light(
+                (task.index, number),
+                (own, np.asarray(task.store.load(number, "low"))),
+                (here[seen].astype(np.float32), there.astype(np.float32)),
+            )
+        )
+    return joined_samples(parts)
+
+
+def _world_points(
+    view: View, depth: NDArray[np.float32], rows: NDArray[np.int64], columns: NDArray[np.int64]
+) -> Array:
+    pixels: Array = np.column_stack([columns, rows]).astype(np.float64) + 0.5
+    return view.at_depth(pixels, depth[rows, columns].astype(np.float64))
