@@ -14,7 +14,7 @@ bright and of a dark spot a wrong A fits at most one.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import cv2
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from alice_survey.frames import Array
 from reconstruct.mosaic.facts import PictureFacts
+from reconstruct.mosaic.finish import LEAST_LEFT, LEAST_RANGE, MOST_RANGE
 from reconstruct.mosaic.light import (
     GRID,
     SAMPLES_PER_FACT,
@@ -49,8 +50,6 @@ _LARGEST_SIGMA = 0.25
 """Of a share that is believed."""
 _LARGEST_WATER_SIGMA = 0.15
 """Of the logarithm of colour ratios that the water took, to put them right by it."""
-_LEAST_LEFT = 0.05
-"""Share of the light that stays at least when the water's is taken away."""
 _LARGEST_LIFT = 30.0
 _BRIGHT_LIGHT, _BRIGHT_PERCENT = 0.68, 98.0
 _MIDDLE_LIGHT = 0.22
@@ -69,12 +68,28 @@ class ColourModel:
     share_sigmas: Array
     """(3,)."""
     notes: tuple[str, ...]
+    black: Array = field(default_factory=lambda: np.zeros(3))
+    """(3,) of the corrected light that is shown as black; white stays white."""
+
+    def nodes(self, camera: str, image: str) -> Float32:
+        """(rows, columns, 6) factors, and light that is taken away before, at the nodes, BGR."""
+        lift = np.exp(-(self.light.patterns[camera] + self.light.gains[image]))
+        lift = np.clip(lift, 1.0 / _LARGEST_LIFT, _LARGEST_LIFT) * self.light.white
+        both: Float32 = np.concatenate([lift, self.added[camera]], axis=2).astype(np.float32)
+        return np.ascontiguousarray(both)
+
+    @property
+    def law(self) -> Float32:
+        """(10,) fall-off and middle range, light that is black, factors: see `finish_colours`."""
+        model = self.light
+        values = [*model.fall_off, model.middle_range, *self.black, *(1.0 / (1.0 - self.black))]
+        return np.array(values, np.float32)
 
     def corrected(
         self, light: Float32, camera: str, image: str, places: tuple[Float32, Float32],
         ranges: Float32,
     ) -> Float32:  # fmt: skip
-        """The sea floor's light, (H, W, 3) BGR.
+        """The sea floor's light, (H, W, 3) BGR, where black is not yet taken away.
 
         Args:
             light: (H, W, 3) that the picture shows.
@@ -84,21 +99,18 @@ class ColourModel:
             ranges: (H, W); NaN where not known.
         """
         model = self.light
-        lift = np.exp(-(model.patterns[camera] + model.gains[image]))
-        lift = np.clip(lift, 1.0 / _LARGEST_LIFT, _LARGEST_LIFT) * model.white
-        at_nodes = np.concatenate([lift, self.added[camera]], axis=2).astype(np.float32)
         x, y = (
             (p * np.float32(n - 1)).astype(np.float32).ravel()
             for p, n in zip(places, (GRID[1], GRID[0]), strict=True)
         )
-        found = bilinear(np.ascontiguousarray(at_nodes), x, y).reshape(*light.shape[:2], 6)
-        left = np.maximum(light - found[..., 3:], np.float32(_LEAST_LEFT) * light)
+        found = bilinear(self.nodes(camera, image), x, y).reshape(*light.shape[:2], 6)
+        left = np.maximum(light - found[..., 3:], LEAST_LEFT * light)
         result: Float32 = left * found[..., :3]
         if model.fall_off.any():
             beyond = np.nan_to_num(ranges - np.float32(model.middle_range))
             for channel in range(3):
                 fall_off = np.float32(model.fall_off[channel])
-                result[..., channel] *= np.clip(np.exp(fall_off * beyond), 0.2, 5.0)
+                result[..., channel] *= np.clip(np.exp(fall_off * beyond), LEAST_RANGE, MOST_RANGE)
         return result
 
     def to_json(self) -> dict[str, Any]:
@@ -186,7 +198,7 @@ def without(
     light = np.exp(samples.levels.astype(np.float64))
     water = sampled(samples, added, cameras)
     left = light - water
-    kept = (left > _LEAST_LEFT * light).all(axis=(1, 2))
+    kept = (left > LEAST_LEFT * light).all(axis=(1, 2))
     return LightSamples(
         views=samples.views[kept],
         places=samples.places[kept],
@@ -212,7 +224,7 @@ def _nodes_without(nodes: Array, added: Mapping[str, Array], cameras: Sequence[s
     water = np.stack([added[camera] for camera in cameras])
     left = np.exp(nodes) - water
     with np.errstate(invalid="ignore"):
-        usable = left > _LEAST_LEFT * np.exp(nodes)
+        usable = left > LEAST_LEFT * np.exp(nodes)
     return np.where(usable, np.log(np.where(usable, left, 1.0)), np.nan)
 
 

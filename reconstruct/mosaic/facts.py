@@ -11,6 +11,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from alice_survey.artefacts import atomic_path
@@ -21,7 +22,9 @@ from reconstruct.pictures.undistorted import Pictures
 Float32 = NDArray[np.float32]
 
 _SMALL_PX = 432
-"""Width of the copies in which views are compared."""
+"""Width of the copies in which views are compared, at most."""
+_LEAST_SHRINK = 4
+"""Half a cell of the mosaic, whose pixels are about as large as those of pictures."""
 DARKEST, BRIGHTEST = 0.001, 0.95
 """Linear light beyond which a broad level tells nothing."""
 _DARK_PERCENT = 0.5
@@ -36,7 +39,7 @@ class PictureFacts:
     """Of one picture."""
 
     sharpness: float
-    """Mean size of its finest detail over its mean level; NaN where it is black."""
+    """Mean size of its Laplacian over its mean level; NaN where it is black."""
     grey: bool
     """Whether its channels are equal."""
     nodes: Array
@@ -101,31 +104,56 @@ def measure_picture(task: tuple[Path, Path, str]) -> PictureFacts:
     taken, usable = pictures.taken(image), pictures.usable(image)
     height, width = taken.shape[:2]
     table = linear_table()
-    shrink = max(1, round(width / _SMALL_PX))
+    shrink = max(_LEAST_SHRINK, round(width / _SMALL_PX))
     size = (max(8, width // shrink), max(8, height // shrink))
-    weight = np.ones((height, width), np.float32) if usable is None else usable.astype(np.float32)
-    small = np.empty((size[1], size[0], 4), np.float32)
-    small[..., 3] = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
+    small = np.ones((size[1], size[0], 4), np.float32)
+    if usable is not None:
+        small[..., 3] = cv2.resize(usable.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     for channel in range(3):
-        light = table[taken[..., channel]] * weight
+        light = cv2.LUT(taken[..., channel], table)
+        light = light if usable is None else light * usable
         total = cv2.resize(light, size, interpolation=cv2.INTER_AREA)
         small[..., channel] = total / np.maximum(small[..., 3], 1e-3)
     levels = np.rint(np.minimum(encoded(small[..., :3]), 255)).astype(np.uint8)
     content = np.dstack([levels, np.rint(255 * small[..., 3]).astype(np.uint8)])
+    copy = _small_copy(content)
     path = small_path(folder, image)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(cv2.imencode(".png", content, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
-    grey = taken[..., 1].astype(np.float32)
-    fine = np.abs(cv2.Laplacian(grey, cv2.CV_32F, ksize=1))
-    mean = float((grey * weight).sum())
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.save(file, copy.levels)
+        np.save(file, copy.broad)
+    green = taken[..., 1]
+    fine, mean = sharp_and_mean(green, np.ones((1, 1), np.bool_) if usable is None else usable)
     return PictureFacts(
-        sharpness=float((fine * weight).sum()) / mean if mean > 0 else float("nan"),
-        grey=bool(
-            (taken[..., 0] == taken[..., 1]).all() and (taken[..., 2] == taken[..., 1]).all()
-        ),
-        nodes=_broad_nodes(_small_copy(content)),
+        sharpness=fine / mean if mean > 0 else float("nan"),
+        grey=bool((taken[..., 0] == green).all() and (taken[..., 2] == green).all()),
+        nodes=_broad_nodes(copy),
         dark=_dark(taken, usable, table),
     )
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def sharp_and_mean(grey: NDArray[np.uint8], usable: NDArray[np.bool_]) -> tuple[float, float]:
+    """Mean size of the Laplacian, and mean level, of the inner pixels that may be used.
+
+    Args:
+        grey: (H, W).
+        usable: (H, W), or (1, 1) for all.
+    """
+    rows, columns = grey.shape
+    whole = usable.shape[0] == 1
+    fine, total, count = 0.0, 0.0, 0  # whole numbers, exact as floats
+    for row in range(1, rows - 1):
+        for column in range(1, columns - 1):
+            if whole or usable[row, column]:
+                here = np.int64(grey[row, column])
+                around = (
+                    np.int64(grey[row - 1, column]) + np.int64(grey[row + 1, column])
+                    + np.int64(grey[row, column - 1]) + np.int64(grey[row, column + 1])
+                )  # fmt: skip
+                fine += float(abs(around - 4 * here))
+                total += float(here)
+                count += 1
+    return fine / max(count, 1), total / max(count, 1)
 
 
 def _broad_nodes(copy: SmallCopy) -> Array:
@@ -145,26 +173,60 @@ def telling(light: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
 def _dark(taken: NDArray[np.uint8], usable: NDArray[np.bool_] | None, table: Float32) -> Array:
     """Darkest light in the cells around nodes."""
     part = taken[::_DARK_STEP, ::_DARK_STEP]
-    mask = None if usable is None else usable[::_DARK_STEP, ::_DARK_STEP]
+    mask = np.ones((1, 1), np.bool_) if usable is None else usable[::_DARK_STEP, ::_DARK_STEP]
     height, width = part.shape[:2]
     rows, columns = GRID
-    dark = np.full((rows, columns, 3), np.nan)
-    y = np.clip(np.rint((np.arange(rows + 1) - 0.5) / (rows - 1) * height), 0, height).astype(int)
+    y = np.clip(np.rint((np.arange(rows + 1) - 0.5) / (rows - 1) * height), 0, height)
     x = np.clip(np.rint((np.arange(columns + 1) - 0.5) / (columns - 1) * width), 0, width)
-    x = x.astype(int)
+    levels = low_levels(part, mask, y.astype(np.int64), x.astype(np.int64), _DARK_PERCENT)
+    return np.where(np.isfinite(levels), np.interp(levels, np.arange(256), table), np.nan)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def low_levels(
+    picture: NDArray[np.uint8], usable: NDArray[np.bool_], y: NDArray[np.int64],
+    x: NDArray[np.int64], percent: float,
+) -> Array:  # fmt: skip
+    """A percentile of the levels in boxes of a picture, (rows, columns, 3).
+
+    Args:
+        picture: (H, W, 3).
+        usable: (H, W), or (1, 1) for all.
+        y: (rows + 1,) edges of the boxes.
+        x: (columns + 1,).
+        percent: of the pixels that are darker.
+
+    Returns:
+        The level that so many pixels are below, as a step; NaN where fewer than 100 may be used.
+    """
+    rows, columns = len(y) - 1, len(x) - 1
+    found = np.full((rows, columns, 3), np.nan)
+    whole = usable.shape[0] == 1
+    counts = np.zeros((3, 256), np.int64)
     for row in range(rows):
         for column in range(columns):
-            at = slice(y[row], y[row + 1]), slice(x[column], x[column + 1])
-            cell = part[at].reshape(-1, 3) if mask is None else part[at][mask[at]]
-            if len(cell) >= 100:
-                level = np.percentile(cell, _DARK_PERCENT, axis=0)
-                dark[row, column] = np.interp(level, np.arange(256), table)
-    return dark
+            counts[:] = 0
+            for r in range(y[row], y[row + 1]):
+                for c in range(x[column], x[column + 1]):
+                    if whole or usable[r, c]:
+                        for k in range(3):
+                            counts[k, picture[r, c, k]] += 1
+            total = counts[0].sum()
+            if total < 100:
+                continue
+            for k in range(3):
+                below = 0
+                for level in range(256):
+                    below += counts[k, level]
+                    if below > percent / 100.0 * (total - 1):
+                        found[row, column, k] = level
+                        break
+    return found
 
 
 def small_path(folder: Path, image: str) -> Path:
     """The file of a picture's small copy."""
-    return folder / f"{image}.small.png"
+    return folder / f"{image}.small"
 
 
 class SmallCopies:
@@ -179,7 +241,8 @@ class SmallCopies:
 
 
 def _read_small(folder: Path, image: str) -> SmallCopy:
-    return _small_copy(cv2.imread(str(small_path(folder, image)), cv2.IMREAD_UNCHANGED))
+    with small_path(folder, image).open("rb") as file:
+        return SmallCopy(levels=np.load(file), broad=np.load(file))
 
 
 def _small_copy(content: NDArray[np.uint8]) -> SmallCopy:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rasterio
 from numpy.typing import NDArray
 from rasterio.warp import transform as to_crs
 
@@ -17,7 +16,6 @@ from alice_survey.artefacts import write_csv, write_json
 from alice_survey.frames import Array
 from reconstruct.dense.dem import DemGrid
 from reconstruct.model import View, WorldFrame
-from reconstruct.mosaic.grid import footprints
 from reconstruct.raster import crs_of
 
 Float32 = NDArray[np.float32]
@@ -103,12 +101,14 @@ def surface_points(view: View, pixels: Array, dem: Float32, grid: DemGrid) -> tu
         farthest = np.maximum((-low - centre[2]) / down * 1.1, 2e-6)
     at = np.full(len(pixels), np.nan)
     before = nearest.copy()
-    for share in np.linspace(0.0, 1.0, _STEPS):
-        depth = nearest + share * (farthest - nearest)
-        below = _above(view, pixels, depth, dem, grid) <= 0  # NaN compares as False
-        fresh = below & np.isnan(at)
-        at[fresh] = depth[fresh]
-        before = np.where(np.isnan(at), depth, before)
+    shares = np.linspace(0.0, 1.0, _STEPS)[:, None]
+    depths = nearest + shares * (farthest - nearest)
+    above = _above(view, np.tile(pixels, (_STEPS, 1)), depths.ravel(), dem, grid)
+    below = above.reshape(depths.shape) <= 0  # NaN compares as False
+    first, met = below.argmax(axis=0), below.any(axis=0)
+    rays = np.arange(len(pixels))
+    at[met] = depths[first, rays][met]
+    before = np.where(met & (first > 0), depths[np.maximum(first - 1, 0), rays], before)
     under = at.copy()
     for _ in range(_HALVINGS):
         middle = 0.5 * (before + under)
@@ -143,28 +143,6 @@ def _above(view: View, pixels: Array, depth: Array, dem: Float32, grid: DemGrid)
         + (dem[bottom, left] * (1 - p) + dem[bottom, right] * p) * q
     )  # fmt: skip
     return np.where(inside, -points[:, 2] - height, np.nan)
-
-
-def footprint_task(task: tuple[Path, View, tuple[float, float]]) -> PictureFootprint:
-    """As `picture_footprint`, on the part of a DEM's file that the view may see.
-
-    Args:
-        task: the file, the view, lowest and highest cell of the DEM.
-    """
-    path, view, heights = task
-    west, east, south, north = footprints((view,), heights).boxes[0]
-    with rasterio.open(path) as raster:
-        t = raster.transform
-        c0 = int(np.clip((west - t.c) / t.a - 2, 0, raster.width))
-        c1 = int(np.clip((east - t.c) / t.a + 3, 0, raster.width))
-        r0 = int(np.clip((t.f - north) / t.a - 2, 0, raster.height))
-        r1 = int(np.clip((t.f - south) / t.a + 3, 0, raster.height))
-        window = rasterio.windows.Window(c0, r0, c1 - c0, r1 - r0)
-        dem = raster.read(1, window=window)
-    grid = DemGrid(
-        west=t.c + c0 * t.a, north=t.f - r0 * t.a, cell=t.a, rows=dem.shape[0], columns=dem.shape[1]
-    )
-    return picture_footprint(view, dem, grid)
 
 
 def write_footprints(

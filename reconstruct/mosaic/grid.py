@@ -1,6 +1,6 @@
 """Pixels of the mosaic, its tiles, the views that reach each, and the surface below them."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -132,6 +132,17 @@ def blocks_of(grid: DemGrid, seen: Footprints, size: int, margin: int) -> list[B
             )
         )
     return blocks
+
+
+def neighbours(blocks: Sequence[Block], count: int) -> list[list[Block]]:
+    """Blocks in squares of a number of them along and across."""
+    tops = sorted({block.core.row_off for block in blocks})
+    lefts = sorted({block.core.col_off for block in blocks})
+    groups: dict[tuple[int, int], list[Block]] = {}
+    for block in blocks:
+        row, column = tops.index(block.core.row_off), lefts.index(block.core.col_off)
+        groups.setdefault((row // count, column // count), []).append(block)
+    return [groups[key] for key in sorted(groups)]
 
 
 def coarse(grid: DemGrid) -> DemGrid:

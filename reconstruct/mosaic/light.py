@@ -12,16 +12,15 @@ out; it weighs the more, the more pictures there are. No picture is stretched by
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, diags_array, vstack
 
 from alice_survey.artefacts import read_json, write_json
 from alice_survey.frames import Array
+from reconstruct.mosaic.light_equations import Equations, Prior, solve_robustly
 
 GRID = (9, 11)
 """Rows and columns of nodes over a picture, first and last on its edges."""
@@ -38,8 +37,6 @@ SAMPLES_PER_FACT = 20.0
 _ROUNDS = 6
 _FALL_OFF_SIGMA = 4.0
 """Expected logarithm of the light lost over the middle range."""
-_DENSE_UNKNOWNS = 1500
-"""More are solved for with sparse matrices."""
 _SCENE_SIGMA = 0.5
 """Spread of the sea floor's own logarithmic brightness from picture to picture."""
 _FEWEST_PICTURES = 6
@@ -207,67 +204,63 @@ def solve_patterns(
         gain_sigma: expected size of the logarithm of a picture's own light.
     """
     names = sorted(set(cameras))
-    count_nodes = GRID[0] * GRID[1]
-    unknowns = count_nodes * len(names) + len(images) + 1
     camera_of = np.array([names.index(camera) for camera in cameras])
-    count = len(samples.views)
     middle = 0.0
-    design = csr_array((count, unknowns))
-    for side, sign in ((0, 1.0), (1, -1.0)):
-        columns, weights = node_weights(samples.places[:, side])
-        columns = columns + count_nodes * camera_of[samples.views[:, side]][:, None]
-        gain = count_nodes * len(names) + samples.views[:, side]
-        columns = np.concatenate([columns, gain[:, None]], axis=1)
-        weights = np.concatenate([weights, np.ones((count, 1))], axis=1)
-        rows = np.repeat(np.arange(count), columns.shape[1])
-        part = csr_array((sign * weights.ravel(), (rows, columns.ravel())), (count, unknowns))
-        design = design + part
-    if samples.ranges is not None and count:
+    if samples.ranges is not None and len(samples.views):
         middle = float(np.median(samples.ranges))
-        farther = (samples.ranges[:, 0] - samples.ranges[:, 1]).astype(np.float64)
-        rows = np.arange(count)
-        design = design + csr_array(
-            (-farther, (rows, np.full(count, unknowns - 1))), (count, unknowns)
+    equations = _equations(samples, camera_of, len(names))
+    bends = _prior(len(names), _FALL_OFF_SIGMA / middle if middle > 0 else 1.0)
+    pull, pulled = _typical(nodes, camera_of, len(names))
+    levels = samples.levels.astype(np.float64)
+    found = [
+        solve_robustly(
+            equations,
+            levels[:, 0, channel] - levels[:, 1, channel],
+            Prior(
+                patterns=bends + np.diag(pull[:, channel]),
+                right=pulled[:, channel],
+                gain=gain_sigma**-2,
+            ),
+            _MISFIT,
+            SAMPLES_PER_FACT,
+            _ROUNDS,
         )
-    prior = _prior(
-        len(names), len(images), gain_sigma, _FALL_OFF_SIGMA / middle if middle > 0 else 1.0
-    )
-    pull, pulled = _typical(nodes, camera_of, len(names), unknowns)
-    solution, variance = np.zeros((unknowns, 3)), np.full(3, np.inf)
-    last = np.zeros(unknowns)
-    last[-1] = 1.0
-    for channel in range(3):
-        target = (samples.levels[:, 0, channel] - samples.levels[:, 1, channel]).astype(np.float64)
-        x = np.zeros(unknowns)
-        for _ in range(_ROUNDS):
-            misfit = np.abs(target - design @ x)
-            weight = 1.0 / np.maximum(misfit, _MISFIT) / _MISFIT / SAMPLES_PER_FACT
-            weighted = diags_array(weight) @ design
-            normal = weighted.T @ design + prior + diags_array(pull[:, channel])
-            x = _solved(normal, weighted.T @ target + pulled[:, channel])
-        solution[:, channel] = x
-        variance[channel] = _solved(normal, last)[-1]
-    patterns = solution[: count_nodes * len(names)].reshape(len(names), *GRID, 3)
+        for channel in range(3)
+    ]
+    solution = np.stack([x for x, _, _ in found], axis=1)
+    gains = np.stack([gain for _, gain, _ in found], axis=1)
+    patterns = solution[:-1].reshape(len(names), *GRID, 3)
     patterns = patterns - patterns.mean(axis=(0, 1, 2))
-    gains = solution[count_nodes * len(names) : -1]
     gains = gains - gains.mean(axis=0)
     return LightModel(
         patterns=dict(zip(names, patterns, strict=True)),
         gains=dict(zip(images, gains, strict=True)),
         white=np.ones(3),
         fall_off=solution[-1],
-        fall_off_sigma=np.sqrt(variance),
+        fall_off_sigma=np.sqrt([variance for _, _, variance in found]),
         middle_range=middle,
     )
 
 
-def _solved(normal: Any, right: Array) -> Array:
-    if len(right) <= _DENSE_UNKNOWNS:
-        return np.linalg.solve(normal.toarray(), right)
-    from scipy.sparse.linalg import spsolve
-
-    solution: Array = spsolve(normal.tocsc(), right)
-    return solution
+def _equations(samples: LightSamples, camera_of: NDArray[np.int64], cameras: int) -> Equations:
+    size = GRID[0] * GRID[1]
+    views = samples.views.astype(np.int64)
+    sides = [node_weights(samples.places[:, side]) for side in range(2)]
+    number = [nodes + size * camera_of[views[:, n]][:, None] for n, (nodes, _) in enumerate(sides)]
+    farther = np.zeros(len(views))
+    if samples.ranges is not None:
+        farther = (samples.ranges[:, 0] - samples.ranges[:, 1]).astype(np.float64)
+    pairs, pair = np.unique(np.sort(views, axis=1), axis=0, return_inverse=True)
+    return Equations(
+        nodes=np.ascontiguousarray(np.concatenate(number, axis=1)),
+        weights=np.ascontiguousarray(np.concatenate([sides[0][1], -sides[1][1]], axis=1)),
+        farther=farther,
+        views=views,
+        pair=pair.ravel().astype(np.int64),
+        pairs=pairs.reshape(-1, 2),
+        patterns=size * cameras,
+        pictures=len(camera_of),
+    )
 
 
 def node_weights(places: NDArray[np.float32]) -> tuple[NDArray[np.int64], Array]:
@@ -284,7 +277,8 @@ def node_weights(places: NDArray[np.float32]) -> tuple[NDArray[np.int64], Array]
     return nodes, weights
 
 
-def _prior(cameras: int, views: int, gain_sigma: float, fall_off_sigma: float) -> Any:
+def _prior(cameras: int, fall_off_sigma: float) -> Array:
+    """Normal matrix of smooth patterns around 0, and of a fall-off, last."""
     rows, columns = GRID
     number = np.arange(rows * columns).reshape(rows, columns)
     triples = np.concatenate(
@@ -293,31 +287,21 @@ def _prior(cameras: int, views: int, gain_sigma: float, fall_off_sigma: float) -
             np.stack([number[:-2], number[1:-1], number[2:]], axis=-1).reshape(-1, 3),
         ]
     )
-    nodes = rows * columns
-    unknowns = nodes * cameras + views + 1
-    parts = []
+    bend = np.zeros((len(triples), rows * columns))
+    np.put_along_axis(bend, triples, np.array([[1.0, -2.0, 1.0]]) / _BEND_SIGMA, axis=1)
+    one = bend.T @ bend + np.eye(rows * columns) / _NODE_SIGMA**2
+    matrix = np.zeros((cameras * len(one) + 1,) * 2)
     for camera in range(cameras):
-        at = np.repeat(np.arange(len(triples)), 3)
-        bend = np.tile([1.0, -2.0, 1.0], len(triples)) / _BEND_SIGMA
-        parts.append(
-            csr_array((bend, (at, (triples + camera * nodes).ravel())), (len(triples), unknowns))
-        )
-    size = np.concatenate([
-        np.full(nodes * cameras, 1.0 / _NODE_SIGMA),
-        np.full(views, 1.0 / gain_sigma),
-        [1.0 / fall_off_sigma],
-    ])  # fmt: skip
-    parts.append(csr_array((size, (np.arange(unknowns), np.arange(unknowns)))))
-    root = vstack(parts).tocsr()
-    return root.T @ root
+        at = slice(camera * len(one), (camera + 1) * len(one))
+        matrix[at, at] = one
+    matrix[-1, -1] = fall_off_sigma**-2
+    return matrix
 
 
-def _typical(
-    nodes: Array, camera_of: NDArray[np.int64], cameras: int, unknowns: int
-) -> tuple[Array, Array]:
-    """Weights, and weights times values, (unknowns, 3), of each camera's median picture."""
-    pull, pulled = np.zeros((unknowns, 3)), np.zeros((unknowns, 3))
+def _typical(nodes: Array, camera_of: NDArray[np.int64], cameras: int) -> tuple[Array, Array]:
+    """Weights, and weights times values, (nodes + 1, 3), of each camera's median picture."""
     size = GRID[0] * GRID[1]
+    pull, pulled = np.zeros((size * cameras + 1, 3)), np.zeros((size * cameras + 1, 3))
     for camera in range(cameras):
         pictures = nodes[camera_of == camera].reshape(-1, size, 3)
         known = np.isfinite(pictures)

@@ -7,12 +7,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from alice_survey.frames import Array
-from reconstruct.lenses.range_shift import field_at, warped_pixel
 
 Float32 = NDArray[np.float32]
 
 _TAPS = 8
 _FRACTIONS = 1024
+_MOST_ROUNDS, _STILL_PX = 5, 1e-3
+"""Of the fixed point that leads through a flat port; each round gains two digits or more."""
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -76,8 +77,27 @@ def visible_cells(
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
+def _at(nodes: Array, across: float, down: float, x: float, y: float) -> tuple[float, float]:
+    """As `field_at`, with the nodes per pixel worked out before."""
+    rows, columns = nodes.shape[0], nodes.shape[1]
+    u = min(max(x * across, 0.0), columns - 1.0)
+    v = min(max(y * down, 0.0), rows - 1.0)
+    column, row = min(int(u), columns - 2), min(int(v), rows - 2)
+    p, q = u - column, v - row
+    d = p * q
+    a, b, c = 1.0 - p - q + d, p - d, q - d
+    return (
+        a * nodes[row, column, 0] + b * nodes[row, column + 1, 0]
+        + c * nodes[row + 1, column, 0] + d * nodes[row + 1, column + 1, 0],
+        a * nodes[row, column, 1] + b * nodes[row, column + 1, 1]
+        + c * nodes[row + 1, column, 1] + d * nodes[row + 1, column + 1, 1],
+    )  # fmt: skip
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
 def look_up(
     height: Float32,
+    wanted: tuple[NDArray[np.bool_], int],
     visible: NDArray[np.bool_],
     first_cell: tuple[float, float],
     cells_per_pixel: float,
@@ -92,14 +112,16 @@ def look_up(
 ) -> tuple[Float32, Float32, Float32, Float32]:
     """Where the picture as taken shows each pixel of a tile, and how well.
 
-    A point goes to the ideal pinhole, from there by its depth to the warped picture
-    (`warped_pixel`, exact for a flat port) and through the lens to the picture as taken, so that
-    colours are resampled once. The quality is the distance from the rim of the picture (1 in the
-    middle, 0 at the rim) times the cosine of the angle to the vertical over the distance squared,
-    so that the middle of near, steep views wins.
+    A point goes to the ideal pinhole, from there by its depth to the warped picture (the fixed
+    point of `warped_pixel`, exact for a flat port, until it moves by less than `_STILL_PX`) and
+    through the lens to the picture as taken, so that colours are resampled once. The quality is the
+    distance from the rim of the picture (1 in the middle, 0 at the rim) times the cosine of the
+    angle to the vertical over the distance squared, so that the middle of near, steep views wins.
 
     Args:
         height: (H, W) up at the pixels' centres, NaN where unknown.
+        wanted: (h, w) whether to look at squares of pixels, and their side; beyond the last
+            square the last one tells.
         visible: cells of the DEM that the view sees.
         first_cell: row and column of the first pixel's centre in `visible` (cell centres whole).
         cells_per_pixel: side of a pixel over side of a cell.
@@ -125,16 +147,28 @@ def look_up(
     t = cam_from_enu
     half = 0.5 * min(size[0], size[1])
     nodes, width_px, height_px, inverse_working = shift
+    squares, side = wanted
+    shifted = False
+    for row in range(nodes.shape[0]):
+        for column in range(nodes.shape[1]):
+            if nodes[row, column, 0] != 0.0 or nodes[row, column, 1] != 0.0:
+                shifted = True
+    across, down = (nodes.shape[1] - 1) / width_px, (nodes.shape[0] - 1) / height_px
+    taken_across = (taken_nodes.shape[1] - 1) / width_px
+    taken_down = (taken_nodes.shape[0] - 1) / height_px
     for row in range(rows):
         north = first_enu[1] - row * pixel
-        cell_row = round(first_cell[0] + row * cells_per_pixel)
+        cell_row = math.floor(first_cell[0] + row * cells_per_pixel + 0.5)
         if cell_row < 0 or cell_row >= visible.shape[0]:
             continue
+        square_row = min(row // side, squares.shape[0] - 1)
         for column in range(columns):
+            if not squares[square_row, min(column // side, squares.shape[1] - 1)]:
+                continue
             up = height[row, column]
             if math.isnan(up):
                 continue
-            cell_column = round(first_cell[1] + column * cells_per_pixel)
+            cell_column = math.floor(first_cell[1] + column * cells_per_pixel + 0.5)
             if cell_column < 0 or cell_column >= visible.shape[1]:
                 continue
             if not visible[cell_row, cell_column]:
@@ -145,13 +179,21 @@ def look_up(
                 continue
             a = t[0, 0] * east + t[0, 1] * north + t[0, 2] * up + t[0, 3]
             b = t[1, 0] * east + t[1, 1] * north + t[1, 2] * up + t[1, 3]
-            u, v = warped_pixel(
-                nodes, width_px, height_px, inverse_working,
-                pinhole[0] * a / c + pinhole[2], pinhole[1] * b / c + pinhole[3], 1.0 / c,
-            )  # fmt: skip
+            inverse = 1.0 / c
+            u0 = pinhole[0] * a * inverse + pinhole[2]
+            v0 = pinhole[1] * b * inverse + pinhole[3]
+            u, v = u0, v0
+            if shifted:
+                step = inverse - inverse_working
+                for _ in range(_MOST_ROUNDS):
+                    du, dv = _at(nodes, across, down, u, v)
+                    moved = abs(u0 - du * step - u) + abs(v0 - dv * step - v)
+                    u, v = u0 - du * step, v0 - dv * step
+                    if not moved > _STILL_PX:
+                        break
             if u < 0.0 or v < 0.0 or u > width_px or v > height_px:
                 continue
-            u, v = field_at(taken_nodes, width_px, height_px, u, v)
+            u, v = _at(taken_nodes, taken_across, taken_down, u, v)
             inset = min(min(u, size[0] - u), min(v, size[1] - v)) - rim
             if not inset > 0.0:  # NaN as well
                 continue
@@ -200,30 +242,41 @@ def sample_lanczos(
     """
     rows, columns = x.shape
     high, wide = picture.shape[0] - 1, picture.shape[1] - 1
-    taps = weights.shape[1]
     steps = weights.shape[0] - 1
     for row in range(rows):
         for column in range(columns):
             px, py = x[row, column], y[row, column]
             if px < 0.0:
                 continue
-            left, top = math.floor(px), math.floor(py)
-            across = weights[round((px - left) * steps)]
-            down = weights[round((py - top) * steps)]
-            left -= taps // 2 - 1
-            top -= taps // 2 - 1
-            inside = left >= 0 and top >= 0 and left + taps <= wide + 1 and top + taps <= high + 1
+            left, top = int(px), int(py)
+            across = weights[int((px - left) * steps + np.float32(0.5))]
+            down = weights[int((py - top) * steps + np.float32(0.5))]
+            left -= _TAPS // 2 - 1
+            top -= _TAPS // 2 - 1
+            inside = left >= 0 and top >= 0 and left + _TAPS <= wide + 1 and top + _TAPS <= high + 1
+            if inside and last - first == 3:
+                blue, green, red = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+                for j in range(_TAPS):
+                    line = picture[top + j]
+                    b, g, r = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+                    for i in range(_TAPS):
+                        b += across[i] * table[line[left + i, 0]]
+                        g += across[i] * table[line[left + i, 1]]
+                        r += across[i] * table[line[left + i, 2]]
+                    blue += down[j] * b
+                    green += down[j] * g
+                    red += down[j] * r
+                out[row, column, 0] = max(blue, np.float32(0.0))
+                out[row, column, 1] = max(green, np.float32(0.0))
+                out[row, column, 2] = max(red, np.float32(0.0))
+                continue
             for channel in range(first, last):
                 total = np.float32(0.0)
-                for j in range(taps):
-                    line = np.float32(0.0)
-                    if inside:
-                        for i in range(taps):
-                            line += across[i] * table[picture[top + j, left + i, channel]]
-                    else:
-                        r = min(max(top + j, 0), high)
-                        for i in range(taps):
-                            at = min(max(left + i, 0), wide)
-                            line += across[i] * table[picture[r, at, channel]]
-                    total += down[j] * line
+                for j in range(_TAPS):
+                    one = np.float32(0.0)
+                    n = min(max(top + j, 0), high)
+                    for i in range(_TAPS):
+                        at = min(max(left + i, 0), wide)
+                        one += across[i] * table[picture[n, at, channel]]
+                    total += down[j] * one
                 out[row, column, channel] = max(total, np.float32(0.0))

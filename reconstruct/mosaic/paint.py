@@ -1,5 +1,6 @@
 """Tasks of the mosaic: compare light, lay seams, paint tiles. Each works on one block."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,7 +14,8 @@ from reconstruct.dense.dem import DemGrid
 from reconstruct.model import View
 from reconstruct.mosaic.blend import Blend, Part
 from reconstruct.mosaic.colour import ColourModel
-from reconstruct.mosaic.facts import encoded, telling
+from reconstruct.mosaic.facts import telling
+from reconstruct.mosaic.finish import finish_colours
 from reconstruct.mosaic.grid import ALIGNED_PX, CELL_PX, Block, coarse, dem_around
 from reconstruct.mosaic.light import LightSamples, at_places, joined_samples
 from reconstruct.mosaic.ortho import sample_lanczos
@@ -32,10 +34,8 @@ _BROAD_POWER = 3
 """Power of quality that weighs views in the broadest band."""
 _LARGEST_CHANGE = 3.0
 """Factor by which broad tones of a view are changed at most to meet its neighbours'."""
-_FEW_PX = 16
-"""Cells on which light is compared lie at least this far apart."""
-_PAIRS = 6
-"""Other views with which one is compared at a spot, at most."""
+_AROUND = np.ones((9, 9), np.uint8)
+"""Cells around those of a view in which it is sampled: as far as the broadest band reaches."""
 _SHARP = (0.4, 1.1)
 """Least and largest factor of quality for a picture less or more sharp than the median one."""
 
@@ -106,6 +106,8 @@ class Labels:
     """(rows, columns) how many pictures see the cell."""
     stations: NDArray[np.uint16]
     """(rows, columns) how many stations do."""
+    tones: Float32
+    """(3, rows, columns) logarithm of the broad light that all views agree on, BGR."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -144,6 +146,7 @@ def compare_block(task: LightTask) -> LightSamples:
                 ranges=sight.range.ravel()[spots[usable]],
             )
         )
+    seen = _thinned(seen, surface.height.size, task)
     parts = []
     for i, one in enumerate(seen):
         for other in seen[i + 1 :]:
@@ -160,17 +163,34 @@ def compare_block(task: LightTask) -> LightSamples:
                     ranges=np.stack([one.ranges[a], other.ranges[b]], axis=1),
                 )
             )
-    found = joined_samples(parts)
-    if len(found.views) <= task.most:
-        return found
+    return joined_samples(parts)
+
+
+def _thinned(seen: list[_Shown], spots: int, task: LightTask) -> list[_Shown]:
+    """Views with as many of the spots, chosen by chance, as give no more samples than wanted."""
+    times = np.zeros(spots, np.int64)
+    for shown in seen:
+        times[shown.spots] += 1
+    pairs = times * (times - 1) // 2
+    if pairs.sum() <= task.most:
+        return seen
     rng = np.random.default_rng([task.block.core.row_off, task.block.core.col_off])
-    kept = np.sort(rng.choice(len(found.views), task.most, replace=False))
-    return LightSamples(
-        views=found.views[kept],
-        places=found.places[kept],
-        levels=found.levels[kept],
-        ranges=None if found.ranges is None else found.ranges[kept],
-    )
+    order = rng.permutation(np.flatnonzero(pairs))
+    kept = np.zeros(spots, np.bool_)
+    kept[order[np.cumsum(pairs[order]) <= task.most]] = True
+    thin = []
+    for shown in seen:
+        at = kept[shown.spots]
+        thin.append(
+            _Shown(
+                number=shown.number,
+                spots=shown.spots[at],
+                places=shown.places[at],
+                levels=shown.levels[at],
+                ranges=shown.ranges[at],
+            )
+        )
+    return thin
 
 
 def label_block(task: PaintTask) -> Labels:
@@ -180,8 +200,9 @@ def label_block(task: PaintTask) -> Labels:
     rows, columns = block.grid.rows // CELL_PX, block.grid.columns // CELL_PX
     label = np.zeros((rows, columns), np.uint16)
     pictures, stations = np.zeros_like(label), np.zeros_like(label)
+    tones = np.zeros((rows, columns, 3), np.float32)
     surface = _ground(task.survey, block).surface(coarse(block.grid))
-    looks = _looks(task, surface) if np.isfinite(surface.height).any() else []
+    looks = _looks(task, surface, task.views) if np.isfinite(surface.height).any() else []
     if looks:
         tools = tools_of(task.survey)
         quality = np.zeros((len(looks), rows, columns), np.float32)
@@ -201,59 +222,64 @@ def label_block(task: PaintTask) -> Labels:
                 at = np.nonzero(used)
                 shown = _logarithm(_small_light(task, tools, found, broad=False))
                 colours[found.box][at] = shown[at[0], at[1]]
+        if task.even:
+            tones = _tones(task, tools, looks, quality)
         chosen = choose_views(number, share, colours)
         known = chosen >= 0
         taken = np.take_along_axis(number, np.maximum(chosen, 0)[..., None], axis=2)[..., 0]
         label = np.where(known, taken + 1, 0).astype(np.uint16)
     return Labels(
-        block=block, label=label[inner], pictures=pictures[inner], stations=stations[inner]
+        block=block,
+        label=label[inner],
+        pictures=pictures[inner],
+        stations=stations[inner],
+        tones=tones[inner].transpose(2, 0, 1),
     )
+
+
+def paint_tiles(tasks: Sequence[PaintTask]) -> list[Painted]:
+    """Paint neighbouring tiles, which share pictures."""
+    return [paint_tile(task) for task in tasks]
 
 
 def paint_tile(task: PaintTask) -> Painted:
     """Paint one tile with the views that the survey's seams give it."""
     block, tools = task.block, tools_of(task.survey)
     grid = block.grid
-    empty = _unknown(block)
-    label = _labels(task.survey, block)
+    label, mean = _read_cells(task.survey, block)
     if not label.any():
-        return empty
+        return _unknown(block)
     ground = _ground(task.survey, block)
     cells = ground.surface(coarse(grid))
-    looks = _looks(task, cells)
-    changes = _changes(task, tools, looks, cells.height.shape)
     surface = ground.surface(grid)
-    wanted = cv2.resize(label, (grid.columns, grid.rows), interpolation=cv2.INTER_NEAREST)
-    wanted[~np.isfinite(surface.height)] = 0
-    blend = Blend(grid.rows, grid.columns)
+    used = [entry for entry in task.views if (label == entry.number + 1).any()]
+    changes = _changes(task, tools, _looks(task, cells, used), mean)
+    named = cv2.resize(label, (grid.columns, grid.rows), interpolation=cv2.INTER_NEAREST)
+    named[~np.isfinite(surface.height)] = 0
     source = np.zeros((grid.rows, grid.columns), np.uint16)
-    open_pixels = wanted > 0
     sights = {}
-    order = np.unique(label[label > 0])
-    entries = {found.entry.number: found.entry for found in looks}
-    masks = {}
-    for value in order:  # pixels of a cell that its view does not see go to the best that does
-        entry = entries.get(int(value) - 1)
-        if entry is None:
-            continue
-        part = _box(cv2.dilate((label == value).astype(np.uint8), np.ones((17, 17), np.uint8)) > 0)
-        sight = _sight_of(task, entry, surface.part(*part))
-        sights[int(value)] = (part, sight)
-        masks[int(value)] = (wanted[part] == value) & (sight.quality > 0)
-        source[part][masks[int(value)]] = value
-    left = open_pixels & (source == 0)
+    for entry in used:  # pixels of a cell that its view does not see go to the best that does
+        value = entry.number + 1
+        wanted = cv2.dilate((label == value).astype(np.uint8), _AROUND) > 0
+        part, box = _box(wanted)
+        sight = _sight_of(task, entry, surface.part(*part), wanted[box])
+        sights[value] = (entry, part, sight, wanted[box])
+        source[part][(named[part] == value) & (sight.quality > 0)] = value
+    left = (named > 0) & (source == 0)
     if left.any():
         best = np.zeros(left.shape, np.float32)
-        for value, (part, sight) in sights.items():
+        for value, (_, part, sight, _) in sights.items():
             better = left[part] & (sight.quality > best[part])
             best[part][better] = sight.quality[better]
             source[part][better] = value
-    for value, (part, sight) in sights.items():
+    blend = Blend(grid.rows, grid.columns)
+    for value, (entry, part, sight, wanted) in sights.items():
         taken = source[part] == value
         if not taken.any():
             continue
-        entry = entries[value - 1]
-        colour = _colours(task, tools, entry, sight, surface, part, changes.get(entry.number))
+        local = surface.part(*part)
+        change = changes.get(entry.number)
+        colour = _colours(task, tools, entry, sight, (local, part, wanted), change)
         blend.add(
             Part(
                 row=part[0].start,
@@ -286,16 +312,19 @@ def _unknown(block: Block) -> Painted:
     )
 
 
-def _box(used: NDArray[np.bool_]) -> tuple[slice, slice]:
-    """Pixels of a box of cells around those that are used, on whole aligned pixels."""
-    parts = []
+def _box(
+    used: NDArray[np.bool_],
+) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+    """The pixels, and the cells, of a box around cells that are used, on whole aligned pixels."""
+    pixels, cells = [], []
     for axis, count in ((1, used.shape[0]), (0, used.shape[1])):
         at = np.flatnonzero(used.any(axis=axis))
         step = ALIGNED_PX // CELL_PX
         first = int(at[0]) // step * step
         last = min(-(-(int(at[-1]) + 1) // step) * step, count)
-        parts.append(slice(first * CELL_PX, last * CELL_PX))
-    return parts[0], parts[1]
+        pixels.append(slice(first * CELL_PX, last * CELL_PX))
+        cells.append(slice(first, last))
+    return (pixels[0], pixels[1]), (cells[0], cells[1])
 
 
 def _lattice(grid: DemGrid, step_px: int) -> DemGrid:
@@ -310,14 +339,14 @@ def _lattice(grid: DemGrid, step_px: int) -> DemGrid:
 
 def _ground(survey: Survey, block: Block) -> Ground:
     with rasterio.open(survey.workspace / "dense" / "dem.tif") as raster:
-        return Ground(*dem_around(raster, block.grid, block.reach))
+        return Ground(*dem_around(raster, block.grid, block.reach), survey.scratch)
 
 
-def _looks(task: PaintTask, surface: Surface) -> list[_Look]:
-    """How all views see a block's cells; quality takes sharpness and light in, masks leave out."""
+def _looks(task: PaintTask, surface: Surface, entries: Sequence[SeenView]) -> list[_Look]:
+    """How views see a block's cells; quality takes sharpness and light in, masks leave out."""
     tools = tools_of(task.survey)
     looks = []
-    for entry in task.views:
+    for entry in entries:
         optics = tools.optics(entry.view)
         sight = see(entry.view, optics, surface)
         if not sight.quality.any():
@@ -363,29 +392,29 @@ def _logarithm(light: Float32) -> Float32:
     return found
 
 
-def _changes(
-    task: PaintTask, tools: Tools, looks: list[_Look], shape: tuple[int, ...]
-) -> dict[int, tuple[Float32, tuple[slice, slice]]]:
-    """Per view factors (h, w, 3) at the cells of a box that take its broad tones to the mean."""
-    if not task.even or not looks:
-        return {}
-    best = np.zeros(shape, np.float32)
-    for found in looks:
-        best[found.box] = np.maximum(best[found.box], found.sight.quality)
-    total = np.zeros((*shape, 3), np.float32)
-    weight = np.zeros(shape, np.float32)
-    tones = []
+def _tones(task: PaintTask, tools: Tools, looks: list[_Look], quality: Float32) -> Float32:
+    """(rows, columns, 3) logarithm of broad light, the mean of all views by their quality."""
+    best: Float32 = quality.max(axis=0)
+    total = np.zeros((*best.shape, 3), np.float32)
+    weight = np.zeros(best.shape, np.float32)
     for found in looks:
         tone = _logarithm(_small_light(task, tools, found, broad=True))
         share = found.sight.quality / np.maximum(best[found.box], np.float32(1e-30))
-        share = share**_BROAD_POWER
+        share = (share**_BROAD_POWER).astype(np.float32)
         total[found.box] += share[..., None] * tone
         weight[found.box] += share
-        tones.append(tone)
     mean = total / np.maximum(weight, np.float32(1e-12))[..., None]
-    limit = np.float32(np.log(_LARGEST_CHANGE))
+    return mean.astype(np.float32)
+
+
+def _changes(
+    task: PaintTask, tools: Tools, looks: list[_Look], mean: Float32
+) -> dict[int, tuple[Float32, tuple[slice, slice]]]:
+    """Per view factors (h, w, 3) at the cells of a box that take its broad tones to the mean."""
     changes = {}
-    for found, tone in zip(looks, tones, strict=True):
+    limit = np.float32(np.log(_LARGEST_CHANGE))
+    for found in looks if task.even else ():
+        tone = _logarithm(_small_light(task, tools, found, broad=True))
         seen = found.sight.quality > 0
         change = np.clip(mean[found.box] - tone, -limit, limit) * seen[..., None]
         # cells that the view does not see take the change of those beside them
@@ -397,10 +426,12 @@ def _changes(
     return changes
 
 
-def _sight_of(task: PaintTask, entry: SeenView, surface: Surface) -> Seen:
-    """How a view sees pixels, its mask applied exactly."""
+def _sight_of(
+    task: PaintTask, entry: SeenView, surface: Surface, wanted: NDArray[np.bool_]
+) -> Seen:
+    """How a view sees the pixels of cells, its mask applied exactly."""
     tools = tools_of(task.survey)
-    sight = see(entry.view, tools.optics(entry.view), surface)
+    sight = see(entry.view, tools.optics(entry.view), surface, (wanted, CELL_PX))
     usable = tools.usable(entry.view.image)
     if usable is not None and sight.quality.any():
         inside = cv2.remap(
@@ -416,12 +447,11 @@ def _colours(
     tools: Tools,
     entry: SeenView,
     sight: Seen,
-    surface: Surface,
-    part: tuple[slice, slice],
+    at: tuple[Surface, tuple[slice, slice], NDArray[np.bool_]],
     change: tuple[Float32, tuple[slice, slice]] | None,
 ) -> Float32:
     """Corrected colours of a view at the pixels of a box, levels, BGR."""
-    view = entry.view
+    view, (local, part, wanted) = entry.view, at
     picture = tools.picture(view.image)
     light = np.zeros((*sight.quality.shape, 3), np.float32)
     x = np.where(sight.quality > 0, sight.x, np.float32(-1))
@@ -429,25 +459,27 @@ def _colours(
     if channels is None:
         sample_lanczos(picture, tools.table, tools.weights, x, sight.y, 0, 3, light)
     else:
-        local = surface.part(*part)
         for channel, optics in enumerate(channels):
-            own = see(view, optics, local)
+            own = see(view, optics, local, (wanted, CELL_PX))
             seen = (own.quality > 0) & (sight.quality > 0)
-            own_x = np.where(seen, own.x, np.where(sight.quality > 0, sight.x, np.float32(-1)))
+            own_x = np.where(seen, own.x, x)
             own_y = np.where(seen, own.y, sight.y)
             sample_lanczos(
                 picture, tools.table, tools.weights, own_x, own_y, channel, channel + 1, light
             )
-    places = sight.places(tools.optics(view).size_px)
-    light = task.colour.corrected(light, view.camera, view.image, places, sight.range)
-    if change is not None:
-        # bilinear between the centres of cells
+    factor, first = np.ones((1, 1, 3), np.float32), (0.0, 0.0)
+    if change is not None:  # bilinear between the centres of cells
         factor, box = change
-        at_x = (np.arange(part[1].start, part[1].stop) + 0.5) / CELL_PX - 0.5 - box[1].start
-        at_y = (np.arange(part[0].start, part[0].stop) + 0.5) / CELL_PX - 0.5 - box[0].start
-        x_map, y_map = np.meshgrid(at_x.astype(np.float32), at_y.astype(np.float32))
-        light *= cv2.remap(factor, x_map, y_map, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return encoded(light)
+        half = 0.5 / CELL_PX - 0.5
+        first = (
+            part[0].start / CELL_PX + half - box[0].start,
+            part[1].start / CELL_PX + half - box[1].start,
+        )
+    finish_colours(
+        light, (x, sight.y), sight.range, task.colour.nodes(view.camera, view.image),
+        task.colour.law, tools.optics(view).size_px, factor, first, 1.0 / CELL_PX, tools.curve,
+    )  # fmt: skip
+    return light
 
 
 def _inner(block: Block) -> tuple[slice, slice]:
@@ -459,17 +491,28 @@ def _inner(block: Block) -> tuple[slice, slice]:
 
 
 def label_path(scratch: Path) -> Path:
-    """File of the survey's labels, (rows, columns) of cells."""
-    return scratch / "labels.npy"
+    """File of the survey's labels by cell."""
+    return scratch / "labels.tif"
 
 
-def _labels(survey: Survey, block: Block) -> NDArray[np.uint16]:
-    """Labels of a block's cells; 0 beyond the mosaic."""
-    stored = np.load(label_path(survey.scratch), mmap_mode="r")
+def tones_path(scratch: Path) -> Path:
+    """File of the survey's broad tones by cell."""
+    return scratch / "tones.tif"
+
+
+def _read_cells(survey: Survey, block: Block) -> tuple[NDArray[np.uint16], Float32]:
+    """Labels (rows, columns), and tones (rows, columns, 3), of a block; 0 beyond the mosaic."""
     rows, columns = block.grid.rows // CELL_PX, block.grid.columns // CELL_PX
     top, left = block.window.row_off // CELL_PX, block.window.col_off // CELL_PX
     label = np.zeros((rows, columns), np.uint16)
-    r0, c0 = max(0, top), max(0, left)
-    r1, c1 = min(stored.shape[0], top + rows), min(stored.shape[1], left + columns)
-    label[r0 - top : r1 - top, c0 - left : c1 - left] = stored[r0:r1, c0:c1]
-    return label
+    tones = np.zeros((rows, columns, 3), np.float32)
+    with rasterio.open(label_path(survey.scratch)) as raster:
+        r0, c0 = max(0, top), max(0, left)
+        r1, c1 = min(raster.height, top + rows), min(raster.width, left + columns)
+        window = Window(c0, r0, c1 - c0, r1 - r0)
+        at = slice(r0 - top, r1 - top), slice(c0 - left, c1 - left)
+        label[at] = raster.read(1, window=window)
+    if label.any():
+        with rasterio.open(tones_path(survey.scratch)) as raster:
+            tones[at] = raster.read(window=window).transpose(1, 2, 0)
+    return label, tones

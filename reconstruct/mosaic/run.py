@@ -22,8 +22,8 @@ from reconstruct.dense.run import picture_files
 from reconstruct.model import SparseModel, read_model
 from reconstruct.mosaic.blend import SUPPORT_PX
 from reconstruct.mosaic.colour import ColourModel, solve_colour
-from reconstruct.mosaic.facts import PictureFacts, measure_picture
-from reconstruct.mosaic.footprints import footprint_task, write_footprints
+from reconstruct.mosaic.facts import PictureFacts
+from reconstruct.mosaic.footprints import write_footprints
 from reconstruct.mosaic.grid import (
     CELL_PX,
     Block,
@@ -32,8 +32,10 @@ from reconstruct.mosaic.grid import (
     height_range,
     mean_pixel,
     mosaic_grid,
+    neighbours,
 )
 from reconstruct.mosaic.light import joined_samples
+from reconstruct.mosaic.measure import MeasureTask, measure_view
 from reconstruct.mosaic.paint import (
     LightTask,
     PaintTask,
@@ -41,7 +43,8 @@ from reconstruct.mosaic.paint import (
     compare_block,
     label_block,
     label_path,
-    paint_tile,
+    paint_tiles,
+    tones_path,
 )
 from reconstruct.mosaic.sight import Water
 from reconstruct.mosaic.tools import Survey, forget_tools
@@ -49,11 +52,13 @@ from reconstruct.mosaic.writers import cloud_optimised, thumbnail, write_labels,
 from reconstruct.sparse.track_figure import plot_track_over
 
 _TILE_PX = 1024
+_GROUP = 2
+"""Tiles along and across that one process paints, since they share pictures."""
 _LABEL_PX = 2048
 _LABEL_MARGIN_PX = 256
 _LIGHT_LATTICE = 24
 """Spots across a picture at which light is compared."""
-_MOST_SAMPLES = 300_000
+_MOST_SAMPLES = 150_000
 _MOST_PROCESSES = 3
 """Each takes up to 0.4 GB; all of them and this one stay below 1.5 GiB."""
 _TEMPERATURE_C, _SALINITY_PSU = 15.0, 35.0
@@ -79,7 +84,7 @@ def run_mosaic(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     )
     stage = Stage(
         name="mosaic",
-        version=2,
+        version=3,
         settings={**settings, "water": config.water.model_dump(mode="json")},
         inputs=[sparse, dense / "dem.tif", *picture_files(workspace, sparse, model)],
     )
@@ -104,14 +109,18 @@ def build_mosaic(
         pixel = settings.mosaic_pixel_m or round_cell(mean_pixel(model))
         grid = mosaic_grid(raster, pixel, model.frame)
     names = [view.image for view in model.views]
-    facts = list(
+    measured = list(
         parallel_map(
-            measure_picture,
-            [(workspace, scratch, name) for name in names],
+            measure_view,
+            [
+                MeasureTask(workspace=workspace, scratch=scratch, view=view, heights=heights)
+                for view in model.views
+            ],
             threads=threads,
             label="measure pictures",
         )
     )
+    facts = [fact for fact, _ in measured]
     water, dispersion = _dispersion(workspace, model, config, all(f.grey for f in facts))
     survey = Survey(workspace=workspace, scratch=scratch, scaled=model.frame.scaled, water=water)
     views = _seen_views(model, facts)
@@ -132,7 +141,7 @@ def build_mosaic(
         ]
 
     write_labels(
-        label_path(scratch),
+        (label_path(scratch), tones_path(scratch)),
         folder / "coverage.tif",
         grid,
         model.frame,
@@ -140,20 +149,14 @@ def build_mosaic(
     )
     tiles = blocks_of(grid, ground, _TILE_PX, SUPPORT_PX)
     rough = scratch / "rough.tif"
-    painted = parallel_map(paint_tile, tasks(tiles), threads=threads, label="mosaic")
+    groups = [tasks(group) for group in neighbours(tiles, _GROUP)]
+    painted = parallel_map(paint_tiles, groups, threads=threads, label="mosaic")
     covered = write_tiles(rough, folder / "mosaic_source.tif", grid, model.frame, painted, names)
-    cloud_optimised(rough, folder / "mosaic.tif")
+    cloud_optimised(rough, folder / "mosaic.tif", threads)
     thumbnail(folder / "mosaic.tif", folder / "mosaic.png")
     plot_track_over(folder / "mosaic.tif", workspace / "sparse" / "track.csv", folder / "track.png")
     shutil.rmtree(scratch)
-    dem = workspace / "dense" / "dem.tif"
-    outlines = parallel_map(
-        footprint_task,
-        [(dem, view, heights) for view in model.views],
-        threads=threads,
-        label="footprints",
-    )
-    write_footprints(folder, model.views, list(outlines), model.frame)
+    write_footprints(folder, model.views, [outline for _, outline in measured], model.frame)
     write_json(
         folder / "mosaic.json",
         {

@@ -1,10 +1,12 @@
 """How a view sees a grid over the surface, straight in the picture as taken."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.artefacts import atomic_path
 from alice_survey.frames import Array
 from camera_calib.approximation.dispersion import channel_cameras
 from camera_calib.water import CHANNELS
@@ -64,44 +66,35 @@ class Seen:
         return across, down
 
 
-class Ground:
-    """A part of the DEM, and what each view sees of it (kept, since it is asked for often)."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Visible:
+    """Cells of the DEM that a view sees over it."""
 
-    def __init__(self, dem: Float32, around: DemGrid) -> None:
-        """`dem` holds the heights of the cells of `around`."""
+    cells: NDArray[np.bool_]
+    west: float
+    """East coordinate of the first column's outer edge."""
+    north: float
+
+
+class Ground:
+    """A part of the DEM, and what each view sees of it."""
+
+    def __init__(self, dem: Float32, around: DemGrid, stored: Path | None = None) -> None:
+        """`dem` holds the heights of the cells of `around`; `stored` what `store_visible` wrote."""
         self.dem = dem
         self.around = around
-        self._visible: dict[str, NDArray[np.bool_]] = {}
-        known = np.isfinite(dem)
-        self._heights = (float(dem[known].min()), float(dem[known].max())) if known.any() else None
+        self._stored = stored
+        self._visible: dict[str, Visible] = {}
 
-    def visible_from(self, view: View) -> NDArray[np.bool_]:
-        """Cells of the DEM that a view sees over it."""
+    def visible_from(self, view: View) -> Visible:
+        """Cells that a view sees; views that nobody stored are asked in this part of the DEM."""
         if view.image not in self._visible:
-            around = self.around
-            self._visible[view.image] = visible_cells(
-                self.dem,
-                enu_from_cam(view, np.zeros(3))[:, 3],
-                around.west,
-                around.north,
-                around.cell,
-                _HIDES_CELLS * around.cell,
-                self._reached(view),
-            )
+            path = None if self._stored is None else visible_path(self._stored, view.image)
+            if path is not None and path.is_file():
+                self._visible[view.image] = _load_visible(path)
+            else:
+                self._visible[view.image] = visible_over(view, self.dem, self.around)
         return self._visible[view.image]
-
-    def _reached(self, view: View) -> tuple[int, int, int, int]:
-        """Rows and columns of the DEM that a view may see."""
-        around = self.around
-        if self._heights is None:
-            return 0, 0, 0, 0
-        west, east, south, north = footprints((view,), self._heights).boxes[0]
-        edge = 2.0 * around.cell
-        rows = (np.array([around.north - north - edge, around.north - south + edge])) / around.cell
-        columns = (np.array([west - edge - around.west, east + edge - around.west])) / around.cell
-        r = np.clip(rows, 0, around.rows).astype(int)
-        c = np.clip(columns, 0, around.columns).astype(int)
-        return int(r[0]), int(r[1]), int(c[0]), int(c[1])
 
     def surface(self, grid: DemGrid) -> "Surface":
         """Heights of a grid on it."""
@@ -124,6 +117,77 @@ class Surface:
             rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start
         )
         return replace(self, grid=grid, height=self.height[rows, columns])
+
+
+def visible_over(view: View, dem: Float32, around: DemGrid) -> Visible:
+    """Cells of a DEM that a view sees over it."""
+    known = np.isfinite(dem)
+    part = (0, 0, 0, 0)
+    if known.any():
+        part = _reached(view, (float(dem[known].min()), float(dem[known].max())), around)
+    cells = visible_cells(
+        dem,
+        enu_from_cam(view, np.zeros(3))[:, 3],
+        around.west,
+        around.north,
+        around.cell,
+        _HIDES_CELLS * around.cell,
+        part,
+    )
+    return Visible(cells=cells, west=around.west, north=around.north)
+
+
+def _reached(
+    view: View, heights: tuple[float, float], around: DemGrid
+) -> tuple[int, int, int, int]:
+    """Rows and columns of a DEM that a view may see."""
+    west, east, south, north = footprints((view,), heights).boxes[0]
+    edge = 2.0 * around.cell
+    rows = (np.array([around.north - north - edge, around.north - south + edge])) / around.cell
+    columns = (np.array([west - edge - around.west, east + edge - around.west])) / around.cell
+    r = np.clip(rows, 0, around.rows).astype(int)
+    c = np.clip(columns, 0, around.columns).astype(int)
+    return int(r[0]), int(r[1]), int(c[0]), int(c[1])
+
+
+def visible_path(folder: Path, image: str) -> Path:
+    """The file of the cells that a view sees."""
+    return folder / f"{image}.seen.npz"
+
+
+def store_visible(folder: Path, view: View, dem: Float32, around: DemGrid) -> None:
+    """Write the cells of a DEM that a view sees, so that no tile has to ask again.
+
+    Args:
+        folder: for the file.
+        view: the view.
+        dem: all of the DEM that the view sees, and that may lie between it and that.
+        around: its cells.
+    """
+    visible = visible_over(view, dem, around)
+    rows, columns = np.flatnonzero(visible.cells.any(axis=1)), np.flatnonzero(visible.cells.any(0))
+    if len(rows):
+        top, left = int(rows[0]), int(columns[0])
+        cells = visible.cells[top : rows[-1] + 1, left : columns[-1] + 1]
+    else:
+        top, left, cells = 0, 0, np.zeros((0, 0), np.bool_)
+    path = visible_path(folder, view.image)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.savez(
+            file,
+            bits=np.packbits(cells),
+            shape=np.array(cells.shape),
+            corner=np.array([around.west + left * around.cell, around.north - top * around.cell]),
+        )
+
+
+def _load_visible(path: Path) -> Visible:
+    with np.load(path) as stored:
+        high, wide = (int(n) for n in stored["shape"])
+        cells = np.unpackbits(stored["bits"], count=high * wide).astype(np.bool_)
+        west, north = (float(v) for v in stored["corner"])
+    return Visible(cells=cells.reshape(high, wide), west=west, north=north)
 
 
 def camera_optics(lens: Lens, scaled: bool) -> Optics:
@@ -151,9 +215,25 @@ def channel_optics(lens: FlatPortLens, water: Water, scaled: bool) -> tuple[Opti
     return found["blue"], found["green"], found["red"]
 
 
-def see(view: View, optics: Optics, surface: Surface) -> Seen:
-    """Look at a surface with a view; what the surface itself hides is not seen."""
-    grid, around = surface.grid, surface.ground.around
+_ALL: tuple[NDArray[np.bool_], int] = (np.ones((1, 1), np.bool_), 1)
+
+
+def see(
+    view: View,
+    optics: Optics,
+    surface: Surface,
+    wanted: tuple[NDArray[np.bool_], int] = _ALL,
+) -> Seen:
+    """Look at a surface with a view; what the surface itself hides is not seen.
+
+    Args:
+        view: the view.
+        optics: of its camera, or of a channel of it.
+        surface: heights.
+        wanted: squares of the surface's grid to look at, and their side in its cells.
+    """
+    grid, cell = surface.grid, surface.ground.around.cell
+    visible = surface.ground.visible_from(view)
     camera = enu_from_cam(view, np.zeros(3))
     east, north = float(grid.east_of(0.5)), float(grid.north_of(0.5))
     rotation = camera[:, :3].T
@@ -161,9 +241,10 @@ def see(view: View, optics: Optics, surface: Surface) -> Seen:
     shift = view.shift_arguments if optics.shift is None else optics.shift.arguments
     x, y, quality, ranges = look_up(
         surface.height,
-        surface.ground.visible_from(view),
-        ((around.north - north) / around.cell - 0.5, (east - around.west) / around.cell - 0.5),
-        grid.cell / around.cell,
+        wanted,
+        visible.cells,
+        ((visible.north - north) / cell - 0.5, (east - visible.west) / cell - 0.5),
+        grid.cell / cell,
         np.ascontiguousarray(cam_from_enu),
         pinhole_of(view),
         shift,

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from reconstruct.lenses.lens import FlatPortLens
 from reconstruct.model import View
 from reconstruct.mosaic.facts import SmallCopies, forget_pictures, linear_table
+from reconstruct.mosaic.finish import curve_by_root
 from reconstruct.mosaic.ortho import lanczos_weights
 from reconstruct.mosaic.sight import Optics, Water, camera_optics, channel_optics
 from reconstruct.pictures.undistorted import Pictures
@@ -37,6 +38,7 @@ class Tools:
         self.small = SmallCopies(scratch)
         self.table = linear_table()
         self.weights = lanczos_weights()
+        self.curve = curve_by_root()
         self._water, self._scaled = water, scaled
         self._optics: dict[str, Optics] = {}
         self._channels: dict[str, tuple[Optics, ...]] = {}

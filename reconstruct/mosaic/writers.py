@@ -25,7 +25,7 @@ def write_tiles(
     source: Path,
     grid: DemGrid,
     frame: WorldFrame,
-    tiles: Iterator[Painted],
+    groups: Iterator[list[Painted]],
     names: list[str],
 ) -> float:
     """Write colours and sources as they come; return the share of pixels that have colour.
@@ -44,37 +44,46 @@ def write_tiles(
         colours.update_tags(**frame_tags(frame))
         sources.update_tags(**frame_tags(frame), PICTURES=json.dumps(names))
         sources.set_band_description(1, "picture that painted the pixel, from 1; 0 is none")
-        for tile in tiles:
-            colours.write(tile.rgba, window=tile.window)
-            sources.write(tile.source, 1, window=tile.window)
-            painted += int((tile.rgba[3] > 0).sum())
+        for group in groups:
+            for tile in group:
+                colours.write(tile.rgba, window=tile.window)
+                sources.write(tile.source, 1, window=tile.window)
+                painted += int((tile.rgba[3] > 0).sum())
     if painted == 0:
         raise ReconstructionError("no picture sees any cell of dense/dem.tif; redo 'dense'")
     return painted / (grid.rows * grid.columns)
 
 
 def write_labels(
-    labels: Path, coverage: Path, grid: DemGrid, frame: WorldFrame, blocks: Iterator[Labels]
+    cells_of: tuple[Path, Path],
+    coverage: Path,
+    grid: DemGrid,
+    frame: WorldFrame,
+    blocks: Iterator[Labels],
 ) -> None:
-    """Write the view of each cell, and a raster of how many pictures and stations see it."""
+    """Write view and tones of each cell, and a raster of how many pictures and stations see it."""
     rows, columns = cells_over(grid.rows), cells_over(grid.columns)
     cells = DemGrid(
         west=grid.west, north=grid.north, cell=grid.cell * CELL_PX, rows=rows, columns=columns
     )
-    stored = np.lib.format.open_memmap(labels, "w+", np.uint16, (rows, columns))
-    with rasterio.open(
-        coverage, "w", count=2, dtype="uint16", predictor=2, **_profile(cells, frame)
-    ) as raster:
+    shared = _profile(cells, frame)
+    with (
+        rasterio.open(cells_of[0], "w", count=1, dtype="uint16", **shared) as labels,
+        rasterio.open(
+            cells_of[1], "w", count=3, dtype="float32", **shared | {"compress": None}
+        ) as tones,
+        rasterio.open(coverage, "w", count=2, dtype="uint16", predictor=2, **shared) as raster,
+    ):
         raster.update_tags(**frame_tags(frame))
         raster.set_band_description(1, "pictures that see the cell")
         raster.set_band_description(2, "stations that see the cell")
         for block in blocks:
             top, left = block.block.core.row_off // CELL_PX, block.block.core.col_off // CELL_PX
             high, wide = block.label.shape
-            stored[top : top + high, left : left + wide] = block.label
             window = Window(left, top, wide, high)
+            labels.write(block.label, 1, window=window)
+            tones.write(block.tones, window=window)
             raster.write(np.stack([block.pictures, block.stations]), window=window)
-    stored.flush()
 
 
 def _profile(grid: DemGrid, frame: WorldFrame) -> dict[str, object]:
@@ -93,18 +102,19 @@ def _profile(grid: DemGrid, frame: WorldFrame) -> dict[str, object]:
     }
 
 
-def cloud_optimised(rough: Path, final: Path) -> None:
+def cloud_optimised(rough: Path, final: Path, threads: int) -> None:
     """Copy a GeoTIFF with overviews in the layout of a COG."""
     rasterio.shutil.copy(
         rough,
         final,
         driver="COG",
         compress="DEFLATE",
+        level=3,
         predictor="YES",
         overview_resampling="AVERAGE",
         blocksize=512,
         bigtiff="IF_SAFER",
-        num_threads="1",
+        num_threads=str(threads),
     )
 
 

@@ -71,6 +71,7 @@ def test_look_up_projects_as_the_view_does_and_prefers_its_middle():
     nodes = straight_nodes(view)
     x, y, quality, ranges = look_up(
         height,
+        (np.ones((1, 1), bool), 1),
         seen,
         (0.0, 0.0),
         1.0,
