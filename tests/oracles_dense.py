@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -11,7 +11,11 @@ import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.artefacts import write_json
+from alice_survey.config import CameraConfig, WaterConfig
 from alice_survey.frames import BODY_FROM_NADIR_CAM, Array, Datum
+from camera_calib.rig import design_rig
+from reconstruct.lenses.lens import flat_port_lens
+from reconstruct.lenses.range_shift import range_shift
 from reconstruct.model import SparseModel, View, WorldFrame, write_frame
 
 DATUM = Datum(32.8236, 34.9553)
@@ -151,6 +155,39 @@ def stereo_views(norths: Array, easts: Array, heading_deg: float = 20.0) -> list
                 )
             )
     return sorted(views, key=lambda view: view.image)
+
+
+def port_view(centre: list[float], rpy_deg: list[float]) -> View:
+    """A nadir camera 100 mm behind a port that is tilted by 2 degrees."""
+    rig = design_rig(CameraConfig(port_distance_m=0.1), WaterConfig(), scale=8)
+    tilt = np.deg2rad(2.0)
+    camera = replace(rig.cameras[rig.reference], normal=(np.sin(tilt), 0.0, np.cos(tilt)))
+    lens = flat_port_lens(camera, 1.5, 2.5)
+    turn = Rotation.from_euler("xyz", rpy_deg, degrees=True)
+    return View(
+        image="a",
+        camera="left",
+        station=0,
+        width_px=lens.pinhole.width_px,
+        height_px=lens.pinhole.height_px,
+        fx_px=lens.pinhole.focal_px,
+        fy_px=lens.pinhole.focal_px,
+        cx_px=lens.pinhole.cx_px,
+        cy_px=lens.pinhole.cy_px,
+        world_from_cam=RigidTransform.from_components(centre, turn * BODY_FROM_NADIR_CAM),
+        shift=range_shift(lens),
+    )
+
+
+def plane_depth(view: View, down: float) -> np.ndarray:
+    """Depth (H, W) at which a view's pixels meet the level plane so far down."""
+    rows, columns = np.mgrid[: view.height_px, : view.width_px]
+    pixels = np.column_stack([columns.ravel(), rows.ravel()]) + 0.5
+    depth = np.full(len(pixels), down)
+    for _ in range(30):
+        points = view.at_depth(pixels, depth)
+        depth = depth + (down - points[:, 2])
+    return depth.reshape(rows.shape).astype(np.float32)
 
 
 def hits(view: View, scene: Scene, oversample: int = 1) -> Array:

@@ -5,9 +5,8 @@ windows follow slopes and bends of the surface. What then differs between warped
 explained by one correction of the inverse depth in a window around each pixel (Lucas & Kanade 1981,
 "An iterative image registration technique"), the same for all neighbours: each sees it along its
 own epipolar line. Sums over windows are filters over the picture, so that the work does not depend
-on the window's size. The correction is repeated until it is small; since each pixel's window is
-warped by the newest depths around it, repetition restores detail that a single window would blur
-(Le Besnerais & Champagnat 2005, "Dense optical flow by iterative local window registration").
+on the window's size (Le Besnerais & Champagnat 2005, "Dense optical flow by iterative local window
+registration"). The correction is repeated where it is large.
 
 The same sums tell how sure a depth is: the curvature of the misfit along the inverse depth, and
 the noise that remains between pictures.
@@ -39,11 +38,14 @@ _LEAST_CONTRAST = 1.5
 _WINDOW_SIGMA_PX = 1.25
 """Of the Gaussian window that is compared. Wider ones blur the surface, narrower ones are noisier;
 the noise is averaged when views are fused, the blur is not."""
-_ROUNDS = 2
-_GAP_ROUNDS = 3
-_REACHES_PX = (2.0, 6.0)
-_LEAST_KNOWN = 0.05
-"""Share of a blurring window that must be known for a gap to be continued into."""
+_CONVERGED_PX = 0.5
+"""A first step below this lands so near that a second round does not lower the error."""
+_WINDOW_PX = 9
+"""Side of the square that holds what counts in the Gaussian window."""
+_STEP_WINDOW_PX = 5
+_STEP_PX = 4.0
+"""Change of disparity in that square from which on a window mixes near and far."""
+_NONE = np.float32(1e6)
 _ALIKE = 0.5
 """Correlation from which two windows look alike."""
 _LEAST_SHARE = 0.4
@@ -234,64 +236,72 @@ class _Sums:
     seen: NDArray[np.uint8]
 
 
-def refine(reference: Look, depth: Float32, others: Sequence[Look]) -> Refined:
-    """Correct a depth map by all neighbours at once, and continue it into its gaps.
+def refine(reference: Look, depth: Float32, sigma: Float32, others: Sequence[Look]) -> Refined:
+    """Correct a depth map by all neighbours at once.
 
-    A pixel without depth starts from the smooth continuation of those around it. It keeps what is
-    found only where at least two neighbours look alike.
+    A window that holds a step of the surface has no single correction: there the depth and its
+    deviation stay as they were.
 
     Args:
         reference: whose depth it is.
         depth: (H, W) along its axis, NaN where unknown.
+        sigma: (H, W) of the depth.
         others: neighbours to compare with.
     """
-    known = np.isfinite(depth)
-    inverse = continued((1.0 / depth).astype(np.float32))
-    gap = np.isfinite(inverse) & ~known
-    if gap.any():
-        side = 2 * round(3 * _WINDOW_SIGMA_PX) + 1
-        around = cv2.dilate(gap.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
-        for _ in range(_GAP_ROUNDS):
-            part = np.where(around, inverse, np.float32(np.nan))
-            inverse = np.where(gap, _stepped(part, _sums(reference, part, others)), inverse)
-    for _ in range(_ROUNDS):
-        sums = _sums(reference, inverse, others)
-        inverse = _stepped(inverse, sums)
-    found = (sums.curvature > 0) & (sums.likeness >= _ALIKE)
-    found &= known | (sums.seen >= 2)
+    inverse = (1.0 / depth).astype(np.float32)
+    first = _sums(reference, inverse, others)
+    moved, step_px = _stepped(inverse, first)
+    sums = first
+    far = (step_px > _CONVERGED_PX).astype(np.uint8)
+    if far.any():  # elsewhere a second round would change little
+        window = np.ones((_WINDOW_PX, _WINDOW_PX), np.uint8)
+        part = np.where(cv2.dilate(far, window) > 0, moved, np.float32(np.nan))
+        second = _sums(reference, part, others)
+        again = np.isfinite(part) & (second.curvature > 0)
+        sums = _chosen(again, second, first)
+        moved = np.where(again, _stepped(part, second)[0], moved)
+    alike = (sums.curvature > 0) & (sums.likeness >= _ALIKE)
+    kept = alike & _has_step(inverse, first.speed)
     unknown = np.float32(np.nan)
-    refined: Float32 = np.where(found, np.float32(1.0) / inverse, unknown)
-    root: Float32 = np.sqrt(np.where(found, sums.curvature, unknown))
+    refined: Float32 = np.where(alike & ~kept, np.float32(1.0) / moved, unknown)
+    root: Float32 = np.sqrt(np.where(alike, sums.curvature, unknown))
     return Refined(
-        depth=refined,
-        sigma=refined * refined / root,
+        depth=np.where(kept, depth, refined),
+        sigma=np.where(kept, sigma, refined * refined / root),
         likeness=sums.likeness,
         seen=sums.seen,
     )
 
 
-def continued(inverse: Float32) -> Float32:
-    """Inverse depths (H, W), their gaps filled up to some pixels from what is known."""
+def _has_step(inverse: Float32, speed: Float32) -> NDArray[np.bool_]:
+    """Where known inverse depths in a window differ by much, in pixels of the farthest move."""
     known = np.isfinite(inverse)
-    filled: Float32 = inverse
-    for sigma_px in _REACHES_PX:
-        weight = _blur(known.astype(np.float32), sigma_px)
-        mean = _blur(np.where(known, inverse, np.float32(0)), sigma_px)
-        near = ~np.isfinite(filled) & (weight > _LEAST_KNOWN)
-        smooth = mean / np.maximum(weight, np.float32(1e-6))
-        filled = np.where(near, smooth, filled)
-    return filled
+    window = np.ones((_STEP_WINDOW_PX, _STEP_WINDOW_PX), np.uint8)
+    high = cv2.dilate(np.where(known, inverse, -_NONE), window)
+    low = cv2.erode(np.where(known, inverse, _NONE), window)
+    return np.asarray(known & ((high - low) * speed > _STEP_PX))
 
 
-def _stepped(inverse: Float32, sums: _Sums) -> Float32:
-    """Inverse depths moved to where the pictures agree best, held back where little pulls.
+def _chosen(mask: NDArray[np.bool_], yes: _Sums, no: _Sums) -> _Sums:
+    return _Sums(
+        pull=np.where(mask, yes.pull, no.pull),
+        curvature=np.where(mask, yes.curvature, no.curvature),
+        speed=np.where(mask, yes.speed, no.speed),
+        likeness=np.where(mask, yes.likeness, no.likeness),
+        seen=np.where(mask, yes.seen, no.seen),
+    )
 
-    The one who holds back is a prior of one pixel's deviation along the longest epipolar line.
+
+def _stepped(inverse: Float32, sums: _Sums) -> tuple[Float32, Float32]:
+    """Inverse depths moved to where the pictures agree best, and by how many pixels at most.
+
+    Where little pulls they are held back, by a prior of one pixel's deviation along the longest
+    epipolar line.
     """
-    hold = np.maximum(sums.speed, np.float32(1e-6)) ** 2
-    reach = _LONGEST_STEP_PX / np.maximum(sums.speed, np.float32(1e-6))
-    moved: Float32 = inverse + np.clip(sums.pull / (sums.curvature + hold), -reach, reach)
-    return moved
+    fast = np.maximum(sums.speed, np.float32(1e-6))
+    reach = _LONGEST_STEP_PX / fast
+    step: Float32 = np.clip(sums.pull / (sums.curvature + fast * fast), -reach, reach)
+    return inverse + step, np.abs(step) * sums.speed
 
 
 def _sums(reference: Look, inverse: Float32, others: Sequence[Look]) -> _Sums:

@@ -20,6 +20,7 @@ from alice_survey.errors import ReconstructionError, warn
 from alice_survey.executor import parallel_map
 from reconstruct.dense.cloud import laz_writer, voxel_edge, write_cloud_json, write_ply
 from reconstruct.dense.dem import FILL_CELLS, DemGrid, grid_over, round_cell
+from reconstruct.dense.pose_part import find_pose_part
 from reconstruct.dense.probe import find_conditions
 from reconstruct.dense.rectify import scaled_view
 from reconstruct.dense.stereo_pairs import choose_pairs, neighbours, points_in_sight
@@ -66,11 +67,16 @@ def run_dense(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     settings = config.reconstruct.model_dump(
         mode="json", include={"dense_scale", "dense_partners", "dem_cell_m"}
     )
+    covariance = workspace / "mapping" / "covariance.npz"
     stage = Stage(
         name="dense",
-        version=2,
+        version=3,
         settings=settings,
-        inputs=[sparse, *picture_files(workspace, sparse, model)],
+        inputs=[
+            sparse,
+            *([covariance] if covariance.is_file() else []),
+            *picture_files(workspace, sparse, model),
+        ],
         resumes=True,
     )
 
@@ -136,7 +142,7 @@ def build_surface(
             store=store,
             index=index,
             view=views[index],
-            others=tuple((n, views[n]) for n in looked_at(partners[index], witnesses[index])),
+            others=tuple((n, views[n]) for n in looked_at(views, index, partners[index])),
         )
         for index in range(len(views))
     ]
@@ -164,7 +170,8 @@ def build_surface(
         [view.camera for view in views],
     )
     write_light(folder / "light.json", light)
-    tasks = tile_tasks(store, grid, views, summaries, light, offset, edge, doubt)
+    pose_part = find_pose_part(workspace, model)
+    tasks = tile_tasks(store, grid, views, summaries, light, offset, edge, doubt, pose_part)
     tiles = parallel_map(fuse_tile, tasks, threads=threads, label="fuse")
     parts = _write_rasters(folder, grid, model.frame, tiles)
     with laz_writer(folder / "cloud.laz", offset, model.frame) as write_laz:

@@ -21,6 +21,7 @@ from reconstruct.dense.dem import (
     without_strays,
 )
 from reconstruct.dense.points import joined, points_in_box
+from reconstruct.dense.pose_part import PosePart, spread_over
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.model import View
 from reconstruct.mosaic.light import LightModel, LightSamples
@@ -69,6 +70,8 @@ class TileTask:
     """Of the cubes to which the cloud is thinned."""
     doubt: float
     """By which the standard deviations of refined depths are taken."""
+    pose_sigmas: Array | None
+    """(m, n) what errors of poses leave unsure of heights, on a lattice over the grid."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,10 +97,13 @@ def tile_tasks(
     offset_enu: tuple[float, float, float],
     edge: float,
     doubt: float,
+    pose_part: PosePart | None,
 ) -> list[TileTask]:
     """Tiles in the order of the file's rows, each with the views whose points may fall in it."""
     tasks = []
     stations = np.array([view.station for view in views], dtype=np.int64)
+    nowhere = (np.inf, np.inf, -np.inf, -np.inf)
+    bounds = np.array([summary.bounds or nowhere for summary in summaries])
     for window in tiles_of(grid, _TILE_CELLS):
         row, column = int(window.row_off), int(window.col_off)
         rows, columns = int(window.height), int(window.width)
@@ -111,14 +117,12 @@ def tile_tasks(
             row - rim[0], column - rim[2], rows + rim[0] + rim[1], columns + rim[2] + rim[3]
         )
         south, east = float(part.north_of(part.rows)), float(part.east_of(part.columns))
-        seeing = []
-        for index, summary in enumerate(summaries):
-            if summary.bounds is None:
-                continue
-            s, w, n, e = summary.bounds
-            beside = s >= part.north or n <= south
-            if not (beside or w >= east or e <= part.west):
-                seeing.append((index, views[index]))
+        beside = (bounds[:, 0] >= part.north) | (bounds[:, 2] <= south)
+        beside |= (bounds[:, 1] >= east) | (bounds[:, 3] <= part.west)
+        seeing = [(index, views[index]) for index in np.flatnonzero(~beside).tolist()]
+        poses = None
+        if pose_part is not None:
+            poses = pose_part.at_nodes(part.north, part.west, part.cell, part.rows, part.columns)
         tasks.append(
             TileTask(
                 store=store,
@@ -131,6 +135,7 @@ def tile_tasks(
                 offset_enu=offset_enu,
                 edge=edge,
                 doubt=doubt,
+                pose_sigmas=poses,
             )
         )
     return tasks
@@ -171,6 +176,9 @@ def fuse_tile(task: TileTask) -> Tile:
     stray = ~without_strays(height)
     height[stray], sigma[stray], count[stray], met[stray] = np.nan, np.nan, 0, 0
     height, sigma = fill_gaps(height, sigma, FILL_CELLS)
+    if task.pose_sigmas is not None:  # once, however many views: they share it
+        shared = spread_over(task.pose_sigmas, grid.rows, grid.columns)
+        sigma = np.hypot(sigma, shared.astype(np.float32))
     top, bottom, left, right = task.rim
     inner = (slice(top, grid.rows - bottom), slice(left, grid.columns - right))
     own = grid.window(top, left, grid.rows - top - bottom, grid.columns - left - right)

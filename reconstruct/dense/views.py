@@ -31,7 +31,7 @@ _BOUND_PERCENT = 0.1
 """Share of a view's points left out on each of its four sides, so that none strays far off."""
 _LIGHT_LATTICE = 28
 """Pixels along a picture's width at which the light of views is compared."""
-LOOKS = 6
+LOOKS = 4
 """Neighbours by which depth is refined."""
 _DOUBTERS = 12
 _DOUBT_STEP = 7
@@ -139,7 +139,7 @@ def view_depth(task: DepthTask) -> None:
 
 
 def refine_view(task: RefineTask) -> None:
-    """Make a view's depth exact by all of its neighbours at once, and fill its gaps."""
+    """Make a view's depth exact by its best neighbours at once."""
     store = task.store
     if store.has(task.index, "fine"):
         return
@@ -147,8 +147,8 @@ def refine_view(task: RefineTask) -> None:
     for number, view in ((task.index, task.view), *task.others):
         contrast, spline, valid = _look(store, number, view.width_px)
         looks.append(Look(view=view, contrast=contrast, spline=spline, valid=valid))
-    depth, _ = store.load_depth(task.index, "depth")
-    refined = refine(looks[0], depth, looks[1:])
+    depth, sigma = store.load_depth(task.index, "depth")
+    refined = refine(looks[0], depth, sigma, looks[1:])
     agreeing = np.asarray(store.load(task.index, "agreeing"))
     support = np.where(np.isfinite(depth), np.maximum(agreeing, refined.seen), refined.seen)
     store.save(task.index, "seen", support.astype(np.uint8))
@@ -191,13 +191,14 @@ def disagreement(task: CheckTask) -> float:
     return 1.4826 * float(np.median(np.abs(apart))) if len(apart) >= _LEAST_PIXELS else np.nan
 
 
-def looked_at(pairs: Sequence[StereoPair], neighbours: Sequence[int]) -> list[int]:
-    """Views to refine depth with: the partners, then those that share most."""
+def looked_at(views: Sequence[View], index: int, pairs: Sequence[StereoPair]) -> list[int]:
+    """Views to refine depth with: partners at other stations, whose baselines tell depth best.
+
+    That of the same station is taken where there are fewer than two others.
+    """
     chosen = [pair.partner for pair in pairs]
-    if not chosen:
-        return []
-    chosen += [n for n in neighbours if n not in chosen]
-    return chosen[:LOOKS]
+    apart = [n for n in chosen if views[n].station != views[index].station]
+    return (apart if len(apart) >= 2 else chosen)[:LOOKS]
 
 
 def check_view(task: CheckTask) -> ViewSummary:

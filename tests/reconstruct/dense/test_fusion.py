@@ -4,8 +4,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform
 
 from reconstruct.dense.fusion import count_witnesses, merge_depths
+from reconstruct.dense.sight import KernelLens, lens_of, pinhole_of
+from reconstruct.dense.stereo_pairs import in_frame
 from reconstruct.lenses.range_shift import no_shift
-from tests.oracles_dense import merged
+from tests.oracles_dense import merged, plane_depth, port_view
 
 LENS = (np.array([50.0, 50.0, 10.0, 8.0]), no_shift(20, 16).arguments)
 NOWHERE = np.full((16, 20), np.nan, np.float32)
@@ -75,3 +77,36 @@ def test_a_plane_behind_refutes_and_one_before_says_nothing():
     confirmed, refuted = witness(-0.1)
     assert not refuted.any()
     assert not confirmed.any()
+
+
+def test_witnesses_through_a_tilted_port_equal_their_slow_twin():
+    """Depth of the other is so noisy that which of its pixels is asked decides the answer."""
+    one, other = port_view([0, 0, 0], [1.0, -2.0, 30.0]), port_view([0.2, 0.1, 0], [-1, 1, 28])
+    depth = plane_depth(one, 1.2)
+    rng = np.random.default_rng(8)
+    there = plane_depth(other, 1.2)
+    there += rng.normal(0, 0.05, there.shape).astype(np.float32)
+    sigma = np.full(depth.shape, 0.01, np.float32)
+    move = other.world_from_cam.inv() * one.world_from_cam
+    rows, columns = np.mgrid[: one.height_px, : one.width_px]
+    pixels = np.column_stack([columns.ravel(), rows.ravel()]) + 0.5
+    points = one.at_depth(pixels, depth.ravel().astype(float))
+    seen = in_frame(other, points).reshape(depth.shape)
+    at = np.floor(other.project(points)).astype(int).reshape(*depth.shape, 2)
+    z = other.world_from_cam.inv().apply(points)[:, 2].reshape(depth.shape)
+    apart = there[at[seen][:, 1], at[seen][:, 0]] - z[seen]
+    reach = 3 * np.hypot(0.01, 0.01)
+
+    def right(first: KernelLens, second: KernelLens) -> float:
+        confirmed, refuted = count_witnesses(
+            depth, sigma, first, np.ascontiguousarray(move.as_matrix()[:3]),
+            there, sigma, second, 3.0,
+        )  # fmt: skip
+        assert not (confirmed & refuted).any()
+        agree = (confirmed[seen] == (np.abs(apart) <= reach)) & (refuted[seen] == (apart > reach))
+        return float(agree.mean())
+
+    assert seen.mean() > 0.4
+    assert right(lens_of(one), lens_of(other)) > 0.999
+    bare = [(pinhole_of(v), no_shift(v.width_px, v.height_px).arguments) for v in (one, other)]
+    assert right(*bare) < 0.95

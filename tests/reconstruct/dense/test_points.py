@@ -1,8 +1,18 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from reconstruct.dense.points import enu_from_cam, joined, points_in_box
-from tests.oracles_dense import Scene, hits, position_code, sloped_with_step, stereo_views
+from tests.oracles_dense import (
+    Scene,
+    hits,
+    plane_depth,
+    port_view,
+    position_code,
+    sloped_with_step,
+    stereo_views,
+)
 
 EVERYWHERE = (-100.0, 100.0, -100.0, 100.0)
 SCENE = Scene(
@@ -108,3 +118,16 @@ def test_a_step_has_points_on_both_levels():
     scene = Scene(depth_of=sloped_with_step, paint=position_code)
     up = gathered(view, depth=depth_of(view, scene)).enu[:, 2]
     assert np.ptp(up) > 0.1
+
+
+def test_points_through_a_tilted_port_lie_where_the_exact_rays_hit():
+    view = port_view([0.2, -0.1, 0.0], [2.0, -1.0, 40.0])
+    depth = plane_depth(view, 1.6)  # far from the range at which the picture is exact
+    points = gathered(view, depth=depth).enu + OFFSET
+    np.testing.assert_allclose(points[:, 2], -1.6, atol=1e-6)
+    rows, columns = np.mgrid[: view.height_px, : view.width_px]
+    pixels = np.column_stack([columns.ravel(), rows.ravel()]) + 0.5
+    back = view.project(points[:, [1, 0, 2]] * [1, 1, -1])
+    np.testing.assert_allclose(back, pixels, atol=2e-3)
+    bare = gathered(replace(view, shift=None), depth=depth).enu + OFFSET
+    assert 5e-4 < np.abs(bare - points).max() < 0.05

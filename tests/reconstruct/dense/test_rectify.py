@@ -6,13 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.config import CameraConfig, WaterConfig
-from alice_survey.frames import BODY_FROM_NADIR_CAM
-from camera_calib.rig import design_rig
 from reconstruct.dense.rectify import depth_in_reference, rectify, scaled_view
-from reconstruct.lenses.lens import flat_port_lens
-from reconstruct.lenses.range_shift import range_shift
 from reconstruct.model import View
+from tests.oracles_dense import port_view
 
 
 def view(centre: list[float], rotvec: list[float], focal: float = 400.0) -> View:
@@ -134,28 +130,6 @@ def _pixels(one: View) -> np.ndarray:
     """(N, 2) middles of all pixels, row by row."""
     x, y = np.meshgrid(np.arange(one.width_px) + 0.5, np.arange(one.height_px) + 0.5)
     return np.column_stack([x.ravel(), y.ravel()])
-
-
-def port_view(centre: list[float], rpy_deg: list[float]) -> View:
-    """A nadir camera 100 mm behind a port that is tilted by 2 degrees."""
-    rig = design_rig(CameraConfig(port_distance_m=0.1), WaterConfig(), scale=8)
-    tilt = np.deg2rad(2.0)
-    camera = replace(rig.cameras[rig.reference], normal=(np.sin(tilt), 0.0, np.cos(tilt)))
-    lens = flat_port_lens(camera, 1.5, 2.5)
-    turn = Rotation.from_euler("xyz", rpy_deg, degrees=True)
-    return View(
-        image="a",
-        camera="left",
-        station=0,
-        width_px=lens.pinhole.width_px,
-        height_px=lens.pinhole.height_px,
-        fx_px=lens.pinhole.focal_px,
-        fy_px=lens.pinhole.focal_px,
-        cx_px=lens.pinhole.cx_px,
-        cy_px=lens.pinhole.cy_px,
-        world_from_cam=RigidTransform.from_components(centre, turn * BODY_FROM_NADIR_CAM),
-        shift=range_shift(lens),
-    )
 
 
 def sea_floor(points: np.ndarray) -> np.ndarray:

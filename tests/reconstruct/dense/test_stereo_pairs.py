@@ -5,7 +5,13 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.errors import ReconstructionError
-from reconstruct.dense.stereo_pairs import choose_pairs, points_of_views
+from reconstruct.dense.stereo_pairs import (
+    choose_pairs,
+    in_frame,
+    neighbours,
+    points_in_sight,
+    points_of_views,
+)
 from tests.oracles_dense import Scene, flat, position_code, sparse_model, stereo_views
 
 SCENE = Scene(depth_of=flat, paint=position_code)
@@ -60,3 +66,25 @@ def test_pictures_too_far_apart_give_one_line():
     far = replace(model.views[1], world_from_cam=away * model.views[1].world_from_cam)
     with pytest.raises(ReconstructionError, match="overlap"):
         choose_pairs(replace(model, views=(model.views[0], far)))
+
+
+def test_points_in_sight_are_all_that_lie_in_the_frame_and_near():
+    model = sparse_model(line(), SCENE, points=900)
+    own = points_of_views(model)
+    for view, points, seen in zip(model.views, points_in_sight(model), own, strict=True):
+        centre = view.world_from_cam.translation
+        away = np.linalg.norm(model.points_world - centre, axis=1)
+        reach = 1.2 * np.linalg.norm(seen - centre, axis=1).max()
+        expected = model.points_world[in_frame(view, model.points_world) & (away <= reach)]
+        np.testing.assert_array_equal(points, expected)
+        assert len(points) >= len(seen)
+
+
+def test_neighbours_share_most_points():
+    model = sparse_model(line(), SCENE)
+    found = neighbours(model, 3)
+    seen = [set(model.observations[model.observations[:, 1] == v, 0]) for v in range(10)]
+    for view, others in enumerate(found):
+        shared = sorted((len(seen[view] & seen[n]) for n in range(10) if n != view), reverse=True)
+        assert [len(seen[view] & seen[n]) for n in others] == shared[:3]
+        assert view not in others

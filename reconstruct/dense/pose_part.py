@@ -1,0 +1,152 @@
+"""How far errors of poses move the surface: the share of its error that fusing views leaves.
+
+Depths of one place from many views err together, since all of them rest on the same poses. How much
+is known at every sparse point: its covariance from the adjustment (`mapping/covariance.npz`), which
+holds poses and pixels together, less what the pixels of its own observations leave with poses held
+(sigma^2 (sum J'J)^-1). The rest is what the poses around it do to a surface there.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from alice_survey.errors import warn
+from alice_survey.frames import Array
+from reconstruct.dense.stereo_pairs import points_of_views
+from reconstruct.model import SparseModel
+
+_COMPANY = 16
+"""Sparse points around a spot of which the median counts: a single one may be a wrong match."""
+_NODE_CELLS = 16
+"""Cells of the DEM between places where it is told."""
+_TOLD = 1e-10
+"""Least determinant of a point's information over the product of its diagonal: above rounding."""
+_SAME = 1e-6
+"""Of the model's size: how far points of the two files may lie apart."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PosePart:
+    """Variances of the surface's height from poses, at sparse points."""
+
+    places: Array
+    """(P, 2) north and east."""
+    variances: Array
+    """(P,) of the height, in the square of the model's unit."""
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.places)
+
+    def at_nodes(self, north: float, west: float, cell: float, rows: int, columns: int) -> Array:
+        """Standard deviations (m, n) on a lattice over a grid of cells, its corners included.
+
+        Args:
+            north: coordinate of the grid's northern edge.
+            west: of its western edge.
+            cell: side of a cell.
+            rows: of cells.
+            columns: of cells.
+        """
+        m, n = (max(2, -(-count // _NODE_CELLS) + 1) for count in (rows, columns))
+        norths = north - np.linspace(0, rows * cell, m)
+        easts = west + np.linspace(0, columns * cell, n)
+        spots = np.stack(np.meshgrid(norths, easts, indexing="ij"), axis=-1).reshape(-1, 2)
+        count = min(_COMPANY, len(self.places))
+        _, near = self._tree.query(spots, k=count)
+        near = np.asarray(near).reshape(len(spots), count)
+        found: Array = np.sqrt(np.median(self.variances[near], axis=1)).reshape(m, n)
+        return found
+
+
+def spread_over(nodes: Array, rows: int, columns: int) -> Array:
+    """A lattice (m, n) whose corners are a grid's at its cells (rows, columns), bilinear."""
+    m, n = nodes.shape
+    y = (np.arange(rows) + 0.5) / rows * (m - 1)
+    x = (np.arange(columns) + 0.5) / columns * (n - 1)
+    i, j = np.minimum(y.astype(int), m - 2), np.minimum(x.astype(int), n - 2)
+    q, p = (y - i)[:, None], (x - j)[None, :]
+    above = nodes[i][:, j] * (1 - p) + nodes[i][:, j + 1] * p
+    below = nodes[i + 1][:, j] * (1 - p) + nodes[i + 1][:, j + 1] * p
+    found: Array = above * (1 - q) + below * q
+    return found
+
+
+def find_pose_part(workspace: Path, model: SparseModel) -> PosePart | None:
+    """What the poses leave unsure of the surface; None, with a warning, where nothing tells it."""
+    path = workspace / "mapping" / "covariance.npz"
+    if not path.is_file():
+        warn("no mapping/covariance.npz: sigma.tif leaves out what errors of poses do to heights")
+        return None
+    from reconstruct.mapping.uncertainty import read_uncertainty
+
+    known = read_uncertainty(path)
+    down = _down_in_mapping(workspace / "mapping" / "model", model, known.point_ids)
+    if down is None:
+        warn("mapping/covariance.npz is not of this model: sigma.tif leaves out errors of poses")
+        return None
+    total = np.einsum("i,nij,j->n", down, known.point_cov, down)
+    own = total - known.sigma_px**2 * noise_of_points(model)
+    seen = np.isfinite(own)
+    if not seen.any():
+        warn("mapping/covariance.npz knows no point: sigma.tif leaves out errors of poses")
+        return None
+    return PosePart(places=model.points_world[seen, :2], variances=np.maximum(own[seen], 0.0))
+
+
+def noise_of_points(model: SparseModel) -> Array:
+    """Variance (P,) of each point's third coordinate for pixels of unit variance, poses held.
+
+    NaN where the observations do not tell the point.
+    """
+    count = len(model.points_world)
+    information = np.zeros((6, count))
+    order = np.argsort(model.observations[:, 1], kind="stable")
+    numbers = model.observations[order, 0]
+    starts = np.searchsorted(model.observations[order, 1], np.arange(1, len(model.views)))
+    for view, points, seen in zip(
+        model.views, np.split(numbers, starts), points_of_views(model), strict=True
+    ):
+        if len(seen) == 0:
+            continue
+        cam_from_world = view.world_from_cam.inv()
+        x, y, z = cam_from_world.apply(seen).T
+        zero = np.zeros_like(z)
+        slopes = np.stack(
+            [view.fx_px / z, zero, -view.fx_px * x / z**2, zero, view.fy_px / z,
+             -view.fy_px * y / z**2], axis=-1,
+        ).reshape(-1, 2, 3) @ cam_from_world.rotation.as_matrix()  # fmt: skip
+        for k, (i, j) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
+            part = (slopes[:, :, i] * slopes[:, :, j]).sum(axis=1)
+            information[k] += np.bincount(points, part, minlength=count)
+    a, b, c, d, e, f = information
+    minor = a * d - b * b
+    whole = minor * f - a * e * e + 2 * b * c * e - c * c * d
+    with np.errstate(divide="ignore", invalid="ignore"):
+        variance: Array = np.where(whole > _TOLD * a * d * f, minor / whole, np.nan)
+    return variance
+
+
+def _down_in_mapping(folder: Path, model: SparseModel, ids: NDArray[np.int64]) -> Array | None:
+    """The world's third axis in the mapping's axes, as long as a unit there is in the world.
+
+    None where the points of the mapping (with these ids) are not those of the placed model.
+    """
+    import pycolmap
+
+    from reconstruct.sparse.alignment import align_similarity
+
+    mapped = pycolmap.Reconstruction(folder).points3D
+    if not 3 <= len(ids) == len(model.points_world) or any(int(i) not in mapped for i in ids):
+        return None
+    points = np.array([mapped[int(i)].xyz for i in ids])
+    move = align_similarity(points, model.points_world)
+    size = np.ptp(model.points_world, axis=0).max()
+    if np.abs(move.apply(points) - model.points_world).max() > _SAME * size:
+        return None
+    down: Array = move.scale * move.rotation.as_matrix()[2]
+    return down
