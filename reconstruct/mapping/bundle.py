@@ -18,7 +18,7 @@ Adjust = Callable[[Mapped], Mapped]
 
 _TRUST = 1e12
 """First radius of the trust region: no bound."""
-_TOLERANCE = 1e-9
+_TOLERANCE = 1e-8
 """Relative change of the cost at which an adjustment ends."""
 
 

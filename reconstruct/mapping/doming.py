@@ -66,6 +66,7 @@ class ScaleTrend:
 
     mean: float
     """Lengths of the model over those of its stations' own stereo; 1 when they agree."""
+    mean_sigma: float
     range: float
     """Largest less smallest value of the fitted paraboloid over the stations."""
     range_sigma: float
@@ -74,6 +75,10 @@ class ScaleTrend:
     def significant(self) -> bool:
         """Whether it is beyond its noise."""
         return self.range > _SIGMAS * self.range_sigma
+
+    def off_by_more_than(self, bound: float) -> bool:
+        """Whether the mean is off by so much and beyond its noise."""
+        return abs(self.mean - 1.0) > max(bound, _SIGMAS * self.mean_sigma)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -234,8 +239,10 @@ def scale_trend(
     fitted, covariance = _robust_fit(design, scale, sigma)
     values = design @ fitted
     between = design[np.argmax(values)] - design[np.argmin(values)]
+    mean, mean_cov = _robust_fit(np.ones((len(scale), 1)), scale, sigma)
     return ScaleTrend(
-        mean=float(np.average(scale, weights=sigma**-2.0)),
+        mean=float(mean[0]),
+        mean_sigma=float(np.sqrt(mean_cov[0, 0])),
         range=float(np.ptp(values)),
         range_sigma=float(np.sqrt(between @ covariance @ between)),
     )

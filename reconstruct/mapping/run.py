@@ -21,6 +21,7 @@ from alice_survey.frames import Datum
 from alice_survey.manifest import ImageRecord
 from camera_calib.rig import Rig
 from reconstruct.lenses.lens import Lens, flat_port_lens
+from reconstruct.mapping.acceptance import check_survey
 from reconstruct.mapping.database import Observations, VerifiedPair
 from reconstruct.mapping.doming import doming_of_survey
 from reconstruct.mapping.mapper import Mapped, map_calibrated
@@ -337,6 +338,13 @@ def _write(
         },
     )
     doming = doming_of_survey(mapped, inputs.records, inputs.rig, inputs.datum)
+    accepted = check_survey(
+        mapped,
+        inputs.records,
+        inputs.rig,
+        inputs.datum,
+        None if doming is None else doming.scale,
+    )
     content = b"".join(p.read_bytes() for p in sorted((partial / "model").iterdir()))
     write_json(
         partial / "mapping.json",
@@ -350,6 +358,7 @@ def _write(
             "distances": None if distances is None else vars(distances),
             "refraction": None if refracted is None else vars(refracted),
             "doming": None if doming is None else doming.to_json(),
+            "acceptance": None if accepted is None else accepted.to_json(),
             "gauge": hashlib.blake2b(content, digest_size=16).hexdigest(),
             "notes": list(mapped.notes),
         },

@@ -15,7 +15,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.executor import parallel_map
 from alice_survey.frames import Array
-from reconstruct.mapping.database import Observations
+from reconstruct.mapping.database import Observations, as_transform
+from reconstruct.mapping.link_refinement import RigSight, refine_link
 from reconstruct.mapping.working_range import ray_passes
 from reconstruct.matching.matches import Matches
 
@@ -245,26 +246,44 @@ def _resect_all(
     ransac.confidence = 0.999
     refine = pycolmap.AbsolutePoseRefinementOptions()
     refine.print_summary = False
+    sight = _sight(cameras, cam_from_rig)
     made = [pycolmap.Camera(dict(camera)) for camera in cameras]
     poses = [pycolmap.Rigid3d(pycolmap.Rotation3d(quat), shift) for quat, shift in cam_from_rig]
     answers: list[_Answer | None] = []
     for task in tasks:
         found = pycolmap.estimate_and_refine_generalized_absolute_pose(
-            task.pixels, task.points, task.cameras, poses, made, ransac, refine, True
+            task.pixels, task.points, task.cameras, poses, made, ransac, refine
         )
         if found is None:
             answers.append(None)
             continue
-        pose = found["rig_from_world"]
+        start = as_transform(found["rig_from_world"])
+        refined = refine_link(task.points, task.pixels, np.array(task.cameras), sight, start)
+        if refined is None:
+            answers.append(None)
+            continue
+        pose, covariance = refined
         answers.append(
             _Answer(
-                quaternion=np.array(pose.rotation.quat),
-                shift=np.array(pose.translation),
+                quaternion=pose.rotation.as_quat(),
+                shift=np.asarray(pose.translation),
                 inliers=int(found["num_inliers"]),
-                covariance=np.array(found["covariance"], float),
+                covariance=covariance,
             )
         )
     return answers
+
+
+def _sight(
+    cameras: Sequence[Mapping[str, object]], cam_from_rig: Sequence[tuple[Array, Array]]
+) -> RigSight:
+    params = np.array([camera["params"] for camera in cameras], float)  # of pinholes
+    return RigSight(
+        focal_px=params[:, :2],
+        centre_px=params[:, 2:],
+        turn=np.array([Rotation.from_quat(quat).as_matrix() for quat, _ in cam_from_rig]),
+        shift=np.array([shift for _, shift in cam_from_rig]),
+    )
 
 
 def _link(task: _Resection, found: _Answer | None) -> Link | None:

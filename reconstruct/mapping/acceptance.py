@@ -1,0 +1,207 @@
+"""Whether a mapping is to be believed: stations against navigation, lengths against the rig.
+
+Both are told, not mended: a station far off navigation may be a jump of navigation as well as a
+wrong pose, and a scale that the rig's own stereo contradicts a wrong rig as well as a bent model.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.errors import warn
+from alice_survey.frames import Array, Datum
+from alice_survey.manifest import ImageRecord
+from camera_calib.rig import Rig
+from reconstruct.mapping.database import as_transform
+from reconstruct.mapping.doming import ScaleTrend
+from reconstruct.mapping.mapper import Mapped, model_baseline
+from reconstruct.mapping.priors import pinhole_positions
+
+FAR_SIGMAS, FAR_M = 5.0, 0.5
+"""A station is off navigation when it misses by more than both."""
+SCALE_BOUND = 1e-3
+"""Relative error of lengths that a known rig must not exceed."""
+_LEAST_STATIONS = 5
+_ROUNDS = 20
+_TUNING = 2.385
+"""Of Cauchy's weights, for 95 % efficiency with normal errors (Rey 1983)."""
+_MEDIAN_SIGMAS = 1.5382
+"""Median length of a vector of three independent unit normal numbers."""
+_NAMED = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class Far:
+    """A station that lies elsewhere than navigation has it."""
+
+    station: int
+    image: str
+    off_m: float
+    sigmas: float
+    """That over what stations usually miss by."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Acceptance:
+    """What speaks against a mapping."""
+
+    checked: int
+    """Stations with a position."""
+    usual_m: float
+    """Of their distances from navigation, one standard deviation by axis, robustly; NaN without."""
+    far: tuple[Far, ...]
+    """The farthest first."""
+    rig_error: float
+    """Relative error of the rig in the finished model; NaN where there is no known rig."""
+    scale: ScaleTrend | None
+    """Of the model against its stations' own stereo."""
+
+    def notes(self) -> list[str]:
+        """A line for every fault."""
+        notes = []
+        if self.far:
+            names = ", ".join(f"{f.image} ({f.off_m:.2f} m)" for f in self.far[:_NAMED])
+            more = len(self.far) - _NAMED
+            notes.append(
+                f"{len(self.far)} of {self.checked} stations lie more than {FAR_SIGMAS:.0f} sigmas "
+                f"and {FAR_M} m from where navigation has them, which others miss by "
+                f"{self.usual_m:.2f} m: {names}{f' and {more} more' if more > 0 else ''}; look at "
+                "these pictures and at navigation's log"
+            )
+        if abs(self.rig_error) > SCALE_BOUND:
+            notes.append(
+                f"the rig's baseline came out {100 * self.rig_error:+.2f} % off the calibrated "
+                "one: lengths are not to be trusted"
+            )
+        scale = self.scale
+        if scale is not None and scale.off_by_more_than(SCALE_BOUND):
+            notes.append(
+                f"lengths are {100 * (scale.mean - 1):+.2f} +/- {100 * scale.mean_sigma:.2f} % off "
+                "what every station's own stereo says: check the rig's calibration"
+            )
+        return notes
+
+    def to_json(self) -> dict[str, object]:
+        """For `mapping.json`."""
+        return {
+            "checked": self.checked,
+            "usual_m": self.usual_m if np.isfinite(self.usual_m) else None,
+            "far": [vars(f) for f in self.far],
+            "rig_error": self.rig_error if np.isfinite(self.rig_error) else None,
+            "notes": self.notes(),
+        }
+
+
+def check_mapping(
+    model: pycolmap.Reconstruction,
+    records: Sequence[ImageRecord],
+    positions: Array | None,
+    sigmas: Array | None,
+    rig_error: float,
+    scale: ScaleTrend | None,
+) -> Acceptance:
+    """Check a finished model on a known rig, and warn of what is wrong.
+
+    Args:
+        model: in metres; picture i of `records` has the id i + 1.
+        records: pictures.
+        positions: (N, 3) of the pinholes' centres in NED, as navigation has them; NaN where
+            unknown; None without navigation.
+        sigmas: (N, 3), likewise.
+        rig_error: relative error of the rig's baseline in the model; NaN without one.
+        scale: of the model against its stations' own stereo.
+    """
+    checked, usual = 0, float("nan")
+    far: tuple[Far, ...] = ()
+    if positions is not None and sigmas is not None:
+        checked, usual, far = _far_stations(model, records, positions, sigmas)
+    found = Acceptance(checked=checked, usual_m=usual, far=far, rig_error=rig_error, scale=scale)
+    for note in found.notes():
+        warn(note)
+    return found
+
+
+def check_survey(
+    mapped: Mapped,
+    records: Sequence[ImageRecord],
+    rig: Rig | None,
+    datum: Datum | None,
+    scale: ScaleTrend | None,
+) -> Acceptance | None:
+    """Check a mapping with what its survey knows; None without a calibrated rig."""
+    if rig is None or not mapped.scaled:
+        return None
+    positions = sigmas = None
+    if datum is not None:
+        positions, sigmas = pinhole_positions(records, rig, mapped.lenses, datum)
+    # What adjustments made of the rig, before its size was put back.
+    rig_error = model_baseline(mapped.model) / (mapped.baseline * mapped.rig_factor) - 1.0
+    return check_mapping(mapped.model, records, positions, sigmas, rig_error, scale)
+
+
+def _far_stations(
+    model: pycolmap.Reconstruction, records: Sequence[ImageRecord], positions: Array, sigmas: Array
+) -> tuple[int, float, tuple[Far, ...]]:
+    first: dict[int, int] = {}
+    for number, image in sorted(model.images.items()):
+        told = np.isfinite(positions[number - 1] + sigmas[number - 1]).all()
+        if image.has_pose and told:
+            first.setdefault(image.frame_id, number)
+    numbers = sorted(first.values())
+    if len(numbers) < _LEAST_STATIONS:
+        return len(numbers), float("nan"), ()
+    rows = np.array(numbers) - 1
+    centres = np.array(
+        [as_transform(model.images[n].cam_from_world()).inv().translation for n in numbers]
+    )
+    off, sigma = misses(centres, positions[rows], sigmas[rows])
+    over = off / sigma
+    found = [
+        Far(
+            station=records[row].station,
+            image=records[row].image,
+            off_m=float(off[k]),
+            sigmas=float(over[k]),
+        )
+        for k, row in enumerate(rows.tolist())
+        if off[k] > FAR_M and over[k] > FAR_SIGMAS
+    ]
+    ordered = tuple(sorted(found, key=lambda f: (-f.off_m, f.station)))
+    return len(numbers), float(np.median(off) / _MEDIAN_SIGMAS), ordered
+
+
+def misses(centres: Array, told: Array, sigmas: Array) -> tuple[Array, Array]:
+    """Distances between places and where they are told to be, after a robust rigid alignment.
+
+    Args:
+        centres: (N, 3) in any frame, metres.
+        told: (N, 3) in NED.
+        sigmas: (N, 3) of those.
+
+    Returns:
+        (N,) distances, and (N,) their usual size by axis: the stated sigma or, where distances are
+        usually larger than it says (drift), as large as they are.
+    """
+    stated = np.sqrt((sigmas**2).mean(axis=1))
+    weight = np.ones(len(centres))
+    off = np.zeros(len(centres))
+    spread = 1.0
+    for _ in range(_ROUNDS):
+        off = np.linalg.norm(_aligned(centres, told, weight / stated**2) - told, axis=1)
+        spread = max(float(np.median(off / stated)) / _MEDIAN_SIGMAS, 1e-9)
+        weight = 1.0 / (1.0 + (off / (_TUNING * spread * stated)) ** 2)
+    return off, stated * max(spread, 1.0)
+
+
+def _aligned(source: Array, target: Array, weight: Array) -> Array:
+    """The source where a rigid motion brings it nearest to the target (Kabsch 1976)."""
+    share = weight / weight.sum()
+    from_middle, to_middle = share @ source, share @ target
+    u, _, vt = np.linalg.svd((target - to_middle).T @ (share[:, None] * (source - from_middle)))
+    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    turn = Rotation.from_matrix(u @ flip @ vt)
+    move = RigidTransform.from_components(to_middle - turn.apply(from_middle), turn)
+    return np.asarray(move.apply(source), np.float64)
