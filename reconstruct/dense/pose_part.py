@@ -38,6 +38,11 @@ class PosePart:
     variances: Array
     """(P,) of the height, in the square of the model's unit."""
 
+    @property
+    def median(self) -> float:
+        """Standard deviation at half of the points or less."""
+        return float(np.sqrt(np.median(self.variances)))
+
     @cached_property
     def _tree(self) -> cKDTree:
         return cKDTree(self.places)

@@ -191,6 +191,7 @@ def build_surface(
             "match_sigma_px": conditions.match_sigma_px,
             "refined_with": LOOKS,
             "sigma_factor": round(doubt, 3),
+            "pose_sigma": None if pose_part is None else float(f"{pose_part.median:.3g}"),
             "cell": grid.cell,
             "unit": model.frame.unit,
             "rows": grid.rows,

@@ -73,7 +73,7 @@ def test_what_pixels_do_is_taken_out_and_the_gauge_does_not_matter(workspace: Pa
     model = read_model(workspace / "sparse")
     part = find_pose_part(workspace, model)
     assert part is not None
-    assert np.median(np.sqrt(part.variances)) == pytest.approx(0.003, rel=1e-3)
+    assert part.median == pytest.approx(0.003, rel=1e-3)
     nodes = part.at_nodes(0.8, -0.4, 0.01, 100, 70)
     assert nodes.shape == (8, 6)
     np.testing.assert_allclose(nodes, 0.003, rtol=0.01)
