@@ -98,7 +98,9 @@ def plot_track_over(mosaic_tif: Path, track_csv: Path, path: Path) -> None:
         )
         axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
         with atomic_path(path) as temporary:
-            figure.savefig(temporary, format="png", metadata={"Software": None})
+            figure.savefig(
+                temporary, format="png", bbox_inches="tight", metadata={"Software": None}
+            )
 
 
 def split_lines(places: Array) -> NDArray[np.int64]:
@@ -179,7 +181,7 @@ def _ellipses(
 
 
 def _read_mosaic(path: Path) -> tuple[Array, tuple[float, float, float, float], str]:
-    """A mosaic reduced, (H, W, 3) from 0 to 1, white where empty; its west, east, south, north."""
+    """A mosaic reduced, (H, W, 3) from 0 to 1, dark where empty; its west, east, south, north."""
     try:
         with rasterio.open(path) as raster:
             shrink = max(1.0, max(raster.width, raster.height) / _LONGEST_PX)
