@@ -15,6 +15,8 @@ from reconstruct.dense.sight import FAST, KernelLens, pixel_at, slope_at
 
 Float32 = NDArray[np.float32]
 
+_SHIFTED = 0.2
+"""Share of half a picture by which no port shifts a pixel: what lies farther out is not seen."""
 GATE_SIGMAS = 3.0
 """Depths that differ by no more than this many standard deviations of their difference agree."""
 
@@ -111,17 +113,23 @@ def count_witnesses(
     height, width = depth.shape
     confirmed = np.zeros((height, width), np.int8)
     refuted = np.zeros((height, width), np.int8)
+    pinhole, t = other_lens[0], other_from_ref
+    middle_x, middle_y = 0.5 * other_depth.shape[1], 0.5 * other_depth.shape[0]
+    reach_x, reach_y = (1 + _SHIFTED) * middle_x, (1 + _SHIFTED) * middle_y
     for row in range(height):
         for column in range(width):
             z = depth[row, column]
             if math.isnan(z):
                 continue
             x, y = slope_at(lens, column + 0.5, row + 0.5, 1.0 / z)
-            t = other_from_ref
             a = z * (t[0, 0] * x + t[0, 1] * y + t[0, 2]) + t[0, 3]
             b = z * (t[1, 0] * x + t[1, 1] * y + t[1, 2]) + t[1, 3]
             c = z * (t[2, 0] * x + t[2, 1] * y + t[2, 2]) + t[2, 3]
             if c <= 0.0:
+                continue
+            at_x = pinhole[0] * a / c + pinhole[2]
+            at_y = pinhole[1] * b / c + pinhole[3]
+            if abs(at_x - middle_x) > reach_x or abs(at_y - middle_y) > reach_y:
                 continue
             at_x, at_y = pixel_at(other_lens, a, b, c)
             u, v = math.floor(at_x), math.floor(at_y)
