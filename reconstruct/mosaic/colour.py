@@ -54,6 +54,13 @@ _LARGEST_LIFT = 30.0
 _BRIGHT_LIGHT, _BRIGHT_PERCENT = 0.68, 98.0
 _MIDDLE_LIGHT = 0.22
 _NORM = 6.0
+_BLACK_QUANTILE = 0.01
+"""Of the darkest half percent of pixels around all places of all pictures."""
+_BLACK_SHARE = 0.6
+"""Of that: the rest keeps detail in shadows."""
+_HIGHEST_BLACK = 0.05
+_FEWEST_DARK = 50
+"""Places, for the dark of a survey to be known."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -121,6 +128,7 @@ class ColourModel:
             "fall_off_sigma_blue_green_red": [
                 float(s) if np.isfinite(s) else None for s in self.light.fall_off_sigma
             ],
+            "black_blue_green_red": [float(b) for b in self.black],
             "middle_range": float(self.light.middle_range),
             "added_light_share_blue_green_red": [float(s) for s in self.shares],
             "added_light_share_sigma_blue_green_red": [
@@ -188,7 +196,69 @@ def solve_colour(
         "brightness: one factor puts the survey's median at most at 22 % and 98 % of it below "
         "68 % of white; sRGB"
     )
-    return replace(model, light=replace(patterns, white=white), notes=tuple(notes))
+    model = replace(model, light=replace(patterns, white=white))
+    black = _black(model, facts, images, cameras)
+    if black.any():
+        grow = _brighter(cleaned, model, images, cameras, black)
+        model = replace(model, light=replace(patterns, white=white * grow), black=black * grow)
+        notes.append(
+            f"contrast: light below {100 * _BLACK_SHARE:.0f} % of what the survey's darkest pixels "
+            "show is black; one straight line from there to white"
+        )
+    return replace(model, notes=tuple(notes))
+
+
+def _black(
+    model: ColourModel,
+    facts: Sequence[PictureFacts],
+    images: Sequence[str],
+    cameras: Sequence[str],
+) -> Array:
+    """(3,) corrected light that is shown as black: a share of what is dark in dark pictures."""
+    dark = []
+    for fact, image, camera in zip(facts, images, cameras, strict=True):
+        nodes = model.nodes(camera, image).astype(np.float64)
+        dark.append(((fact.dark - nodes[..., 3:]) * nodes[..., :3]).reshape(-1, 3))
+    levels = np.concatenate(dark)
+    levels = levels[np.isfinite(levels).all(axis=1)]
+    if len(levels) < _FEWEST_DARK:
+        return np.zeros(3)
+    black: Array = _BLACK_SHARE * np.maximum(np.quantile(levels, _BLACK_QUANTILE, axis=0), 0.0)
+    return np.minimum(black, _HIGHEST_BLACK)
+
+
+def _brighter(
+    samples: LightSamples,
+    model: ColourModel,
+    images: Sequence[str],
+    cameras: Sequence[str],
+    black: Array,
+) -> float:
+    """The factor of light and black that puts bright and middle back where they were."""
+    if not len(samples.views):
+        return 1.0
+    level = _levels(samples, model, images, cameras) * model.light.white
+    grey, dark = level.mean(axis=1), float(black.mean())
+    bright, middle = np.percentile(grey, _BRIGHT_PERCENT), np.median(grey)
+    # factor f with (f level - f dark) / (1 - f dark) = wanted
+    return float(
+        min(
+            wanted / max(found - dark + wanted * dark, 1e-6)
+            for found, wanted in ((bright, _BRIGHT_LIGHT), (middle, _MIDDLE_LIGHT))
+        )
+    )
+
+
+def _levels(
+    samples: LightSamples, model: ColourModel, images: Sequence[str], cameras: Sequence[str]
+) -> Array:
+    """(N, 3) light of the first views of samples, evened out, white not yet balanced."""
+    light = model.light
+    gains = np.stack([light.gains[image] for image in images])
+    lift = -(sampled(samples, light.patterns, cameras) + gains[samples.views])[:, 0]
+    if samples.ranges is not None:
+        lift = lift + (samples.ranges[:, :1] - light.middle_range) * light.fall_off
+    return np.asarray(np.exp(samples.levels[:, 0] + lift))
 
 
 def without(
@@ -376,12 +446,7 @@ def _white(
     """
     if not len(samples.views):
         return np.ones(3)
-    light = model.light
-    gains = np.stack([light.gains[image] for image in images])
-    lift = -(sampled(samples, light.patterns, cameras) + gains[samples.views])[:, 0]
-    if samples.ranges is not None:
-        lift = lift + (samples.ranges[:, :1] - light.middle_range) * light.fall_off
-    level = np.exp(samples.levels[:, 0] + lift)
+    level = _levels(samples, model, images, cameras)
     if neutral is None:
         cast = (level**_NORM).mean(axis=0) ** (1.0 / _NORM)
         neutral = cast.mean() / cast

@@ -232,7 +232,7 @@ def small_path(folder: Path, image: str) -> Path:
 class SmallCopies:
     """Small copies as they are asked for; the last few stay in memory."""
 
-    def __init__(self, folder: Path, kept: int = 128) -> None:
+    def __init__(self, folder: Path, kept: int = 40) -> None:
         self._load = lru_cache(maxsize=kept)(lambda image: _read_small(folder, image))
 
     def load(self, image: str) -> SmallCopy:

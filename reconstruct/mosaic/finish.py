@@ -101,10 +101,19 @@ def finish_colours(
                 shown = max(shown - added, LEAST_LEFT * shown)
                 shown *= lift * (above * (1 - f_q) + below * f_q)
                 if weakened:
-                    farther = math.exp(law[c] * beyond)
-                    shown *= np.float32(max(float(LEAST_RANGE), min(float(MOST_RANGE), farther)))
+                    farther = np.float32(math.exp(law[c] * beyond))
+                    if farther < LEAST_RANGE:
+                        farther = LEAST_RANGE
+                    if farther > MOST_RANGE:
+                        farther = MOST_RANGE
+                    shown *= farther
                 shown = (shown - law[4 + c]) * law[7 + c]
-                root = np.float32(min(math.sqrt(max(shown, 0.0)), top_root)) * _ROOT_STEPS
+                root = np.float32(0.0)
+                if shown > 0.0:
+                    root = np.float32(math.sqrt(shown))
+                if root > top_root:
+                    root = top_root
+                root *= _ROOT_STEPS
                 at = min(int(root), len(curve) - 2)
                 part = root - np.float32(at)
                 light[row, column, c] = curve[at] * (1 - part) + curve[at + 1] * part

@@ -36,6 +36,8 @@ _LARGEST_CHANGE = 3.0
 """Factor by which broad tones of a view are changed at most to meet its neighbours'."""
 _AROUND = np.ones((9, 9), np.uint8)
 """Cells around those of a view in which it is sampled: as far as the broadest band reaches."""
+_REACHED = np.ones((9, 9), np.uint8)
+"""Pixels of a picture that the kernel of `sample_lanczos` reaches."""
 _SHARP = (0.4, 1.1)
 """Least and largest factor of quality for a picture less or more sharp than the median one."""
 
@@ -434,8 +436,10 @@ def _sight_of(
     sight = see(entry.view, tools.optics(entry.view), surface, (wanted, CELL_PX))
     usable = tools.usable(entry.view.image)
     if usable is not None and sight.quality.any():
+        # as far as the kernel reaches, what is masked would colour its surroundings
+        clear = cv2.erode(usable.astype(np.uint8) * np.uint8(255), _REACHED)
         inside = cv2.remap(
-            usable.astype(np.uint8) * np.uint8(255), sight.x, sight.y, cv2.INTER_LINEAR,
+            clear, sight.x, sight.y, cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_CONSTANT,
         )  # fmt: skip
         sight = replace(sight, quality=np.where(inside < 255, np.float32(0), sight.quality))

@@ -5,8 +5,10 @@ are laid survey-wide on small cells; tiles are painted one by one, each colour r
 the picture as taken. No step holds more than one block, so that memory does not grow with the area.
 """
 
+import contextlib
+import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -59,7 +61,8 @@ _LABEL_MARGIN_PX = 256
 _LIGHT_LATTICE = 24
 """Spots across a picture at which light is compared."""
 _MOST_SAMPLES = 150_000
-_MOST_PROCESSES = 3
+_CACHE_MIB = 64
+_MOST_PROCESSES = 2
 """Each takes up to 0.4 GB; all of them and this one stay below 1.5 GiB."""
 _TEMPERATURE_C, _SALINITY_PSU = 15.0, 35.0
 """Of the sea where nobody says; red and blue move by 2 % of their dispersion from 5 to 30 C."""
@@ -84,15 +87,35 @@ def run_mosaic(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     )
     stage = Stage(
         name="mosaic",
-        version=3,
+        version=4,
         settings={**settings, "water": config.water.model_dump(mode="json")},
         inputs=[sparse, dense / "dem.tif", *picture_files(workspace, sparse, model)],
     )
 
     def work(folder: Path) -> None:
-        build_mosaic(workspace, model, folder, config, threads)
+        with _small_caches():
+            build_mosaic(workspace, model, folder, config, threads)
 
     return run_stage(workspace, stage, work)
+
+
+@contextlib.contextmanager
+def _small_caches() -> Iterator[None]:
+    """Have GDAL, here and in processes started meanwhile, keep little of the files it reads.
+
+    Its own choice is 5 % of the machine's memory in each process.
+    """
+    name = "GDAL_CACHEMAX"
+    before = os.environ.get(name)
+    os.environ[name] = str(_CACHE_MIB)
+    try:
+        with rasterio.Env(**{name: _CACHE_MIB << 20}):
+            yield
+    finally:
+        if before is None:
+            os.environ.pop(name, None)
+        else:
+            os.environ[name] = before
 
 
 def build_mosaic(

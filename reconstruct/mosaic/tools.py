@@ -15,7 +15,7 @@ from reconstruct.mosaic.ortho import lanczos_weights
 from reconstruct.mosaic.sight import Optics, Water, camera_optics, channel_optics
 from reconstruct.pictures.undistorted import Pictures
 
-_CACHED_BYTES = 130_000_000
+_CACHED_BYTES = 100_000_000
 """Pictures as taken that each process keeps."""
 
 

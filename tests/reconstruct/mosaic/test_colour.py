@@ -4,6 +4,7 @@ import numpy as np
 
 from reconstruct.mosaic.colour import ColourModel, solve_colour
 from reconstruct.mosaic.facts import PictureFacts, encoded, linear_table
+from reconstruct.mosaic.finish import curve_by_root, finish_colours
 from reconstruct.mosaic.light import GRID, LightSamples
 
 IMAGES = [f"left/{n:02d}.png" for n in range(24)]
@@ -108,3 +109,32 @@ def test_raw_changes_nothing() -> None:
 
 def test_the_srgb_curve_and_its_inverse_agree() -> None:
     np.testing.assert_allclose(encoded(linear_table()), np.arange(256), atol=0.02)
+
+
+def test_one_pass_over_pixels_equals_the_steps_over_pictures() -> None:
+    samples, facts = survey(0.4)
+    model = solve_colour("even", samples, facts, IMAGES, CAMERAS)
+    rng = np.random.default_rng(3)
+    light = rng.uniform(0.01, 0.6, (7, 9, 3)).astype(np.float32)
+    x, y = (rng.uniform(0, n - 1, (7, 9)).astype(np.float32) for n in (640, 480))
+    x[0, 0] = -1
+    ranges = rng.uniform(1.6, 2.4, (7, 9)).astype(np.float32)
+    factor = np.full((3, 3, 3), 1.3, np.float32)
+    places = ((x + np.float32(0.5)) / 640, (y + np.float32(0.5)) / 480)
+    lifted = model.corrected(light, "left", IMAGES[3], places, ranges) * 1.3
+    expected = np.minimum(encoded(((lifted - model.black) / (1 - model.black)).clip(0, 4)), 600)
+    found = light.copy()
+    finish_colours(
+        found, (x, y), ranges, model.nodes("left", IMAGES[3]), model.law, (640, 480), factor,
+        (0.2, 0.1), 0.125, curve_by_root(),
+    )  # fmt: skip
+    np.testing.assert_allclose(found.reshape(-1, 3)[1:], expected.reshape(-1, 3)[1:], atol=0.1)
+    np.testing.assert_array_equal(found[0, 0], light[0, 0])
+
+
+def test_black_leaves_the_order_of_light_and_takes_less_than_the_dark() -> None:
+    samples, facts = survey(0.4)
+    model = solve_colour("even", samples, facts, IMAGES, CAMERAS)
+    assert (model.black > 0).all()
+    assert (model.black < 0.08).all()
+    assert (model.law[7:] > 1).all()

@@ -179,3 +179,39 @@ def test_no_picture_over_the_surface_gives_one_line(tmp_path: Path):
     with pytest.raises(ReconstructionError, match="no picture sees") as caught:
         run_mosaic(tmp_path, CONFIG, 1)
     assert "\n" not in str(caught.value)
+
+
+def small_survey(folder: Path) -> list[View]:
+    plain = Scene(depth_of=terraced, paint=lambda n, e: np.full((*n.shape, 3), 100.0))
+    views = stereo_views(np.array([0.2]), np.array([0.0]), heading_deg=30.0)
+    make_workspace(folder, views, plain)
+    return views
+
+
+def test_a_single_grey_station_gives_a_grey_mosaic(tmp_path: Path):
+    small_survey(tmp_path)
+    assert run_mosaic(tmp_path, EVEN, 1)
+    rgba, _, _ = read(tmp_path)
+    painted = rgba[:3][:, rgba[3] > 0]
+    assert painted.shape[1] > 20_000
+    assert np.ptp(painted, axis=0).max() <= 1
+    assert 60 < np.median(painted) < 200
+
+
+def test_what_a_mask_hides_is_not_painted_and_others_fill_it(tmp_path: Path):
+    views = small_survey(tmp_path)
+    about = read_json(tmp_path / "sparse" / "cameras.json")
+    left = next(view for view in views if view.camera == "left")
+    picture = cv2.imread(str(tmp_path / "images" / left.image))
+    mask = np.full(picture.shape[:2], 255, np.uint8)
+    picture[90:170, 100:220], mask[90:170, 100:220] = (0, 0, 255), 0
+    cv2.imwrite(str(tmp_path / "images" / left.image), picture)
+    cv2.imwrite(str(tmp_path / "images" / "fish.png"), mask)
+    about["images"][left.image]["mask"] = "fish.png"
+    write_json(tmp_path / "sparse" / "cameras.json", about)
+    assert run_mosaic(tmp_path, CONFIG, 1)
+    rgba, north, east = read(tmp_path)
+    known = rgba[3] > 0
+    assert np.abs(rgba[:3][:, known] - 100).max() <= 3
+    middle = (np.hypot(north - 0.2, east) < 0.1) & known
+    assert middle.sum() > 500  # the other camera shows what the fish hides

@@ -1,0 +1,205 @@
+"""The mosaic's memory and time on surveys of growing area, up to a gigapixel.
+
+    .venv/bin/python -m benchmarks.mosaic --work FOLDER [--megapixels 50 200 1000] [--threads N]
+        [--quick]
+
+The survey is synthetic: a few pictures of random texture under many names (hard links), a camera
+without port on straight lines 2 m over waves of 0.1 m, a ground pixel of 1 mm, 60 % and 30 % of
+overlap; sparse model and DEM are written as the earlier stages would. Only the mosaic is timed.
+Memory is the largest sum over the process and all its children (proportional set size). `--quick`
+makes 50 megapixels alone.
+"""
+
+import argparse
+import os
+import shutil
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.artefacts import write_csv, write_json
+from alice_survey.executor import default_threads
+from alice_survey.frames import BODY_FROM_NADIR_CAM, Array, Datum
+from benchmarks.machine import heading, machine
+from benchmarks.measured import Cost, measured, python
+from reconstruct.dense.dem import DemGrid
+from reconstruct.model import WorldFrame, write_frame
+from reconstruct.raster import tiled_raster, tiles_of
+
+PIXEL_M, CELL_M = 0.001, 0.0025
+WIDTH, HEIGHT, FOCAL = 2448, 2048, 2000.0
+ALTITUDE_M, DEPTH_M, WAVES_M = 2.0, 12.0, 0.1
+FORWARD_OVERLAP, SIDE_OVERLAP = 0.6, 0.3
+_FILES = 5
+_PACKAGES = ("numpy", "numba", "opencv-contrib-python-headless", "rasterio")
+_POINTS = 20
+"""Of the sparse model, seen by each picture."""
+_MOST_MIB = 1536.0
+_RUN = (
+    "import sys; from pathlib import Path; from alice_survey.config import ReconstructConfig, "
+    "SurveyConfig; from reconstruct.mosaic.run import run_mosaic; "
+    "run_mosaic(Path(sys.argv[1]), SurveyConfig(reconstruct=ReconstructConfig("
+    f"mosaic_pixel_m={PIXEL_M})), int(sys.argv[2]))"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """One area."""
+
+    megapixels: float
+    pictures: int
+    cost: Cost
+
+
+def depth_of(north: Array, east: Array) -> Array:
+    """Of the sea floor."""
+    waves: Array = DEPTH_M + 0.5 * WAVES_M * (np.sin(1.7 * north) + np.cos(2.3 * east))
+    return waves
+
+
+def write_survey(workspace: Path, megapixels: float, seed: int = 1) -> int:
+    """Write all that the mosaic is made of; return the number of pictures."""
+    side_m = float(np.sqrt(megapixels * 1e6)) * PIXEL_M
+    along = HEIGHT / FOCAL * ALTITUDE_M * (1.0 - FORWARD_OVERLAP)
+    across = WIDTH / FOCAL * ALTITUDE_M * (1.0 - SIDE_OVERLAP)
+    norths = np.arange(0.0, side_m + along, along)
+    easts = np.arange(0.0, side_m + across, across)
+    centres = np.array([(north, east) for east in easts for north in norths])
+    names = [f"left/{n:06d}.jpg" for n in range(len(centres))]
+    _write_pictures(workspace / "images", names, seed)
+    _write_sparse(workspace / "sparse", names, centres)
+    _write_dem(workspace / "dense", side_m)
+    return len(names)
+
+
+def _write_pictures(images: Path, names: list[str], seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    (images / "left").mkdir(parents=True)
+    files = []
+    for number in range(_FILES):
+        light = np.zeros((HEIGHT, WIDTH), np.float32)
+        for size in (8, 32, 128, 512, 1224):
+            noise = rng.normal(size=(size * HEIGHT // WIDTH, size)).astype(np.float32)
+            light += cv2.resize(noise, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+        grey = np.clip(110 + 22 * light, 5, 245)[..., None] * [0.9, 1.0, 0.8]
+        files.append(images / f"texture{number}.jpg")
+        cv2.imwrite(str(files[-1]), grey.astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 92])
+    for n, name in enumerate(names):
+        os.link(files[n % _FILES], images / name)
+    write_json(images / "survey.json", {"source": "synthetic"})
+    write_json(images / "stage.json", {})
+
+
+def _write_sparse(sparse: Path, names: list[str], centres: Array) -> None:
+    frame = WorldFrame(
+        name="ned", datum=Datum(32.8236, 34.9553), scaled=True, vertical_datum="sea surface"
+    )
+    (sparse / "model").mkdir(parents=True)
+    pinhole = {
+        "width_px": WIDTH, "height_px": HEIGHT, "focal_px": FOCAL,
+        "cx_px": WIDTH / 2, "cy_px": HEIGHT / 2,
+    }  # fmt: skip
+    lens = {
+        "kind": "colmap", "model": "PINHOLE", "width_px": WIDTH, "height_px": HEIGHT,
+        "params": [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2], "pinhole": pinhole,
+    }  # fmt: skip
+    images = {name: {"camera": "left", "station": n, "mask": ""} for n, name in enumerate(names)}
+    write_json(sparse / "cameras.json", {"cameras": {"left": lens}, "images": images})
+    write_frame(sparse / "frame.json", frame)
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(
+            camera_id=1, model="PINHOLE", width=WIDTH, height=HEIGHT, params=lens["params"]
+        )
+    )
+    rng = np.random.default_rng(2)
+    rows, tracks = [], []
+    for n, (name, (north, east)) in enumerate(zip(names, centres, strict=True)):
+        turned = Rotation.from_euler("ZYX", rng.normal(0, [2.0, 1.0, 1.0]), degrees=True)
+        centre = np.array([north, east, DEPTH_M - ALTITUDE_M])
+        pose = RigidTransform.from_components(centre, turned * BODY_FROM_NADIR_CAM)
+        rows.append((name, n, float(n), *centre, *pose.rotation.as_quat()))
+        places = centre[:2] + rng.uniform(-0.6, 0.6, (_POINTS, 2))
+        points = np.column_stack([places, depth_of(places[:, 0], places[:, 1])])
+        back = pose.inv()
+        seen = back.apply(points)
+        pixels = FOCAL * seen[:, :2] / seen[:, 2:] + [WIDTH / 2, HEIGHT / 2]
+        image = pycolmap.Image(name=name, camera_id=1, image_id=n + 1)
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in pixels])
+        model.add_image_with_trivial_frame(
+            image, pycolmap.Rigid3d(pycolmap.Rotation3d(back.rotation.as_quat()), back.translation)
+        )
+        tracks += [(point, n + 1, place) for place, point in enumerate(points)]
+    for point, image_id, place in tracks:
+        model.add_point3D(point, pycolmap.Track([pycolmap.TrackElement(image_id, place)]))
+    model.write(str(sparse / "model"))
+    header = ("image", "station", "time_s", "north_m", "east_m", "depth_m", "qx", "qy", "qz", "qw")
+    write_csv(sparse / "track.csv", header, rows)
+    write_json(sparse / "stage.json", {})
+
+
+def _write_dem(dense: Path, side_m: float) -> None:
+    dense.mkdir()
+    cells = int(np.ceil(side_m / CELL_M))
+    grid = DemGrid(west=0.0, north=cells * CELL_M, cell=CELL_M, rows=cells, columns=cells)
+    frame = WorldFrame(
+        name="ned", datum=Datum(32.8236, 34.9553), scaled=True, vertical_datum="sea surface"
+    )
+    with tiled_raster(dense / "dem.tif", grid, frame, "float32", np.nan, "height") as raster:
+        for window in tiles_of(grid, 2048):
+            part = grid.window(window.row_off, window.col_off, window.height, window.width)
+            north = part.north_of(np.arange(part.rows) + 0.5)[:, None]
+            east = part.east_of(np.arange(part.columns) + 0.5)[None]
+            raster.write((-depth_of(north, east)).astype(np.float32), 1, window=window)
+    write_json(dense / "stage.json", {})
+
+
+def measure(work: Path, megapixels: float, threads: int) -> Measured:
+    """Write a survey, paint it and take it away again; its log stays."""
+    workspace = work / f"mosaic_{megapixels:.0f}"
+    if workspace.exists():
+        shutil.rmtree(workspace)
+    pictures = write_survey(workspace, megapixels)
+    log = work / f"mosaic_{megapixels:.0f}.log"
+    cost = measured([*python("-c", _RUN), str(workspace), str(threads)], log)
+    if cost.ok:
+        shutil.copy(workspace / "mosaic" / "mosaic.png", log.with_suffix(".png"))
+        shutil.rmtree(workspace)
+    return Measured(megapixels=megapixels, pictures=pictures, cost=cost)
+
+
+def main() -> int:
+    """Print a line for each area; fail where memory is above the promise."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--work", type=Path, required=True, help="folder for the surveys")
+    parser.add_argument("--megapixels", type=float, nargs="+", default=[50.0, 200.0, 1000.0])
+    parser.add_argument("--threads", type=int, default=default_threads())
+    parser.add_argument("--quick", action="store_true", help="50 megapixels alone")
+    options = parser.parse_args()
+    print(f"{heading(machine(_PACKAGES))}\n")
+    print(f"{'Mpx':>7} {'pictures':>9} {'wall s':>8} {'cpu s':>8} {'cpu s/Mpx':>10} {'MiB':>7}")
+    worst = 0.0
+    for megapixels in [50.0] if options.quick else options.megapixels:
+        found = measure(options.work, megapixels, options.threads)
+        cost = found.cost
+        if not cost.ok:
+            print(f"{megapixels:7.0f} failed: {cost.last_line()}")
+            return 1
+        worst = max(worst, cost.peak_mib)
+        print(
+            f"{megapixels:7.0f} {found.pictures:9} {cost.wall_s:8.1f} {cost.cpu_s:8.1f} "
+            f"{cost.cpu_s / megapixels:10.2f} {cost.peak_mib:7.0f}",
+            flush=True,
+        )
+    print(f"\npeak memory {'below' if worst < _MOST_MIB else 'ABOVE'} {_MOST_MIB:.0f} MiB")
+    return 0 if worst < _MOST_MIB else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
