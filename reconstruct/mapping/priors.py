@@ -22,6 +22,7 @@ from reconstruct.mapping.mapper import Mapped, model_baseline, scale_model
 from reconstruct.matching.pairs import positions_ned
 
 _LEAST_STATIONS = 5
+_LEAST_PIXEL_SIGMA = 1e-3
 _WORST_GROWTH = 1.05
 """Priors may raise the mean reprojection error by this factor at most, else they are not used."""
 
@@ -116,11 +117,12 @@ def refine_with_positions(
     told = positions[[number - 1 for number in known]]
     # The adjuster's constructor aligns the model with the priors robustly, outliers left out: its
     # scale is taken out of the priors, so that the second one changes it no more.
+    pixel = pixel_sigma(model)
     trial = pycolmap.Reconstruction(model)
-    _adjuster(trial, _priors(trial, known, told, sigmas))
+    _adjuster(trial, _priors(trial, known, told, sigmas / pixel), pixel)
     middle = told.mean(axis=0)
     told = middle + (told - middle) * mapped.baseline / model_baseline(trial)
-    summary = _adjuster(model, _priors(model, known, told, sigmas)).solve()
+    summary = _adjuster(model, _priors(model, known, told, sigmas / pixel), pixel).solve()
     model.update_point_3d_errors()
     after = model.compute_mean_reprojection_error()
     if not (summary.is_solution_usable() and after <= _WORST_GROWTH * before):
@@ -159,10 +161,27 @@ def _priors(
     ]
 
 
+def pixel_sigma(model: pycolmap.Reconstruction) -> float:
+    """Standard deviation of one coordinate of a keypoint, from a model's mean residual.
+
+    The mean length of a plane normal vector is sqrt(pi / 2) sigmas; residuals are smaller than
+    errors by what points and stations adapt to.
+    """
+    seen = 2 * model.compute_num_observations()
+    spare = max(seen - 3 * model.num_points3D() - 6 * model.num_reg_frames(), 1)
+    rows = np.array(
+        [[p.error * p.track.length(), p.track.length()] for p in model.points3D.values()]
+    )
+    mean = rows[:, 0].sum() / rows[:, 1].sum() / np.sqrt(np.pi / 2)
+    return max(float(mean * np.sqrt(seen / spare)), _LEAST_PIXEL_SIGMA)
+
+
 def _adjuster(
-    model: pycolmap.Reconstruction, priors: Sequence[pycolmap.PosePrior]
+    model: pycolmap.Reconstruction, priors: Sequence[pycolmap.PosePrior], pixel: float
 ) -> pycolmap.BundleAdjuster:
+    """COLMAP's: it takes pixels to have unit sigma, so that those of `priors` are over `pixel`."""
     prior_options = pycolmap.PosePriorBundleAdjustmentOptions()
+    prior_options.ceres.prior_position_loss_scale *= pixel
     prior_options.alignment_ransac.random_seed = 1
     prior_options.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
     return pycolmap.create_pose_prior_bundle_adjuster(

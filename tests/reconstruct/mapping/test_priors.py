@@ -1,0 +1,29 @@
+import numpy as np
+import pytest
+
+from reconstruct.mapping.bundle import adjust_freely
+from reconstruct.mapping.priors import pinhole_positions, pixel_sigma, refine_with_positions
+from tests.reconstruct.mapping.test_mapper import camera_rms, mapped_scene
+from tests.reconstruct.scenes import DATUM, make_scene
+
+
+def test_vague_positions_do_not_spoil_a_model_of_precise_pixels() -> None:
+    """COLMAP takes pixels to have unit sigma: of 0.05 px they would count 400 times too little."""
+    scene = make_scene(lines=2, stations=5, points=6000, noise_px=0.05, seed=8)
+    mapped = adjust_freely(mapped_scene(scene))
+    assert 0.8 * 0.05 < pixel_sigma(mapped.model) < 1.4 * 0.05
+    positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.lenses, DATUM)
+    station = np.array([r.station for r in scene.records])
+    noise = np.random.default_rng(1).normal(0, 0.1, (station.max() + 1, 3))[station]
+    vague = np.full_like(sigmas, 0.1)
+    refined = refine_with_positions(mapped, scene.records, positions + noise, vague)
+    assert refined is not mapped
+    free = camera_rms(mapped, scene)
+    assert 0.5 * free < camera_rms(refined, scene) < 1.3 * free
+
+
+@pytest.mark.parametrize("noise_px", [0.1, 0.3])
+def test_the_sigma_of_pixels_is_found_from_residuals(noise_px: float) -> None:
+    scene = make_scene(lines=1, stations=5, points=3000, noise_px=noise_px)
+    found = pixel_sigma(adjust_freely(mapped_scene(scene)).model)
+    assert found == pytest.approx(noise_px, rel=0.15)
