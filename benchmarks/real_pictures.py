@@ -1,6 +1,6 @@
 """Real pictures through the two commands a user types, and how the result compares.
 
-    .venv/bin/python benchmarks/real_pictures.py ../shared/data WORKSPACES
+    .venv/bin/python -m benchmarks.real_pictures ../shared/data WORKSPACES
 
 For the drone block the surface is compared with another tool's cloud (`model.laz`) after a
 similarity alignment, since neither has a measured scale.
