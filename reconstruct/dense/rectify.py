@@ -45,11 +45,6 @@ class Rectification:
     """(2, 3) rows that take rays (x, y, 1) of reference and partner to their shares along the
     virtual axis."""
 
-    def range_from_disparity(self, disparity_px: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Distance along the virtual optical axis; NaN stays NaN."""
-        total = disparity_px + np.float32(self.disparity_offset_px)
-        return np.float32(self.focal_px * self.baseline) / total
-
 
 def intrinsics(view: View) -> Array:
     """The (3, 3) matrix that takes rays in the camera to pixels."""

@@ -65,14 +65,6 @@ class RangeShift:
             height_px=self.height_px * sy,
         )
 
-    def in_units(self, units_per_unit: float) -> "RangeShift":
-        """The same where a length of 1 is written as `units_per_unit`."""
-        return replace(
-            self,
-            nodes=self.nodes * units_per_unit,
-            inverse_working=self.inverse_working / units_per_unit,
-        )
-
     @property
     def arguments(self) -> tuple[NDArray[np.float64], float, float, float]:
         """What the kernels `ideal_pixel` and `warped_pixel` take."""

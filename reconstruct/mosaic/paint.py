@@ -1,4 +1,4 @@
-"""Tasks of the mosaic: compare light, lay seams, paint tiles. Each works on one block."""
+"""Tasks of the mosaic: lay seams, paint tiles. Each works on one block."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,14 +10,12 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.windows import Window
 
-from reconstruct.dense.dem import DemGrid
 from reconstruct.model import View
 from reconstruct.mosaic.blend import Blend, Part
 from reconstruct.mosaic.colour import ColourModel
-from reconstruct.mosaic.facts import telling
 from reconstruct.mosaic.finish import finish_colours
 from reconstruct.mosaic.grid import ALIGNED_PX, CELL_PX, Block, coarse, dem_around
-from reconstruct.mosaic.light import LightSamples, at_places, joined_samples
+from reconstruct.mosaic.light import at_places
 from reconstruct.mosaic.ortho import sample_lanczos
 from reconstruct.mosaic.seams import candidates, choose_views
 from reconstruct.mosaic.sight import (
@@ -53,36 +51,12 @@ class SeenView:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class LightTask:
-    """A block on which to compare what views show."""
-
-    survey: Survey
-    block: Block
-    views: tuple[SeenView, ...]
-    step_px: int
-    """Distance of spots."""
-    most: int
-    """Samples to return at most."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _Look:
     """How a view sees the cells of a box of a block."""
 
     entry: SeenView
     sight: Seen
     box: tuple[slice, slice]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Shown:
-    """Spots of a lattice that a view shows; arrays of N rows."""
-
-    number: int
-    spots: NDArray[np.intp]
-    places: Float32
-    levels: Float32
-    ranges: Float32
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -123,78 +97,6 @@ class Painted:
     """(H, W) number of the view plus one; 0 where nothing is known."""
 
 
-def compare_block(task: LightTask) -> LightSamples:
-    """Samples of light on a lattice of spots, in linear light."""
-    tools = tools_of(task.survey)
-    surface = _ground(task.survey, task.block).surface(_lattice(task.block.grid, task.step_px))
-    if not np.isfinite(surface.height).any():
-        return joined_samples([])
-    seen = []
-    for entry in task.views:
-        optics = tools.optics(entry.view)
-        sight = see(entry.view, optics, surface)
-        spots = np.flatnonzero(sight.quality.ravel() > 0)
-        copy = tools.small.load(entry.view.image)
-        across, down = sight.places(optics.size_px)
-        places = np.column_stack([across.ravel()[spots], down.ravel()[spots]])
-        levels = at_places(copy.broad, places)
-        usable = telling(levels) & (at_places(copy.valid[..., None], places, 1)[:, 0] > 0.9)
-        seen.append(
-            _Shown(
-                number=entry.number,
-                spots=spots[usable],
-                places=places[usable],
-                levels=np.log(levels[usable]),
-                ranges=sight.range.ravel()[spots[usable]],
-            )
-        )
-    seen = _thinned(seen, surface.height.size, task)
-    parts = []
-    for i, one in enumerate(seen):
-        for other in seen[i + 1 :]:
-            _, a, b = np.intersect1d(
-                one.spots, other.spots, assume_unique=True, return_indices=True
-            )
-            if not len(a):
-                continue
-            parts.append(
-                LightSamples(
-                    views=np.tile(np.array([[one.number, other.number]], np.int32), (len(a), 1)),
-                    places=np.stack([one.places[a], other.places[b]], axis=1),
-                    levels=np.stack([one.levels[a], other.levels[b]], axis=1),
-                    ranges=np.stack([one.ranges[a], other.ranges[b]], axis=1),
-                )
-            )
-    return joined_samples(parts)
-
-
-def _thinned(seen: list[_Shown], spots: int, task: LightTask) -> list[_Shown]:
-    """Views with as many of the spots, chosen by chance, as give no more samples than wanted."""
-    times = np.zeros(spots, np.int64)
-    for shown in seen:
-        times[shown.spots] += 1
-    pairs = times * (times - 1) // 2
-    if pairs.sum() <= task.most:
-        return seen
-    rng = np.random.default_rng([task.block.core.row_off, task.block.core.col_off])
-    order = rng.permutation(np.flatnonzero(pairs))
-    kept = np.zeros(spots, np.bool_)
-    kept[order[np.cumsum(pairs[order]) <= task.most]] = True
-    thin = []
-    for shown in seen:
-        at = kept[shown.spots]
-        thin.append(
-            _Shown(
-                number=shown.number,
-                spots=shown.spots[at],
-                places=shown.places[at],
-                levels=shown.levels[at],
-                ranges=shown.ranges[at],
-            )
-        )
-    return thin
-
-
 def label_block(task: PaintTask) -> Labels:
     """Choose the view of each cell of a block."""
     block = task.block
@@ -203,7 +105,7 @@ def label_block(task: PaintTask) -> Labels:
     label = np.zeros((rows, columns), np.uint16)
     pictures, stations = np.zeros_like(label), np.zeros_like(label)
     tones = np.zeros((rows, columns, 3), np.float32)
-    surface = _ground(task.survey, block).surface(coarse(block.grid))
+    surface = ground_of(task.survey, block).surface(coarse(block.grid))
     looks = _looks(task, surface, task.views) if np.isfinite(surface.height).any() else []
     if looks:
         tools = tools_of(task.survey)
@@ -251,7 +153,7 @@ def paint_tile(task: PaintTask) -> Painted:
     label, mean = _read_cells(task.survey, block)
     if not label.any():
         return _unknown(block)
-    ground = _ground(task.survey, block)
+    ground = ground_of(task.survey, block)
     cells = ground.surface(coarse(grid))
     surface = ground.surface(grid)
     used = [entry for entry in task.views if (label == entry.number + 1).any()]
@@ -329,17 +231,8 @@ def _box(
     return (pixels[0], pixels[1]), (cells[0], cells[1])
 
 
-def _lattice(grid: DemGrid, step_px: int) -> DemGrid:
-    return DemGrid(
-        west=grid.west,
-        north=grid.north,
-        cell=grid.cell * step_px,
-        rows=-(-grid.rows // step_px),
-        columns=-(-grid.columns // step_px),
-    )
-
-
-def _ground(survey: Survey, block: Block) -> Ground:
+def ground_of(survey: Survey, block: Block) -> Ground:
+    """The surface of a block, and what around it may hide it."""
     with rasterio.open(survey.workspace / "dense" / "dem.tif") as raster:
         return Ground(*dem_around(raster, block.grid, block.reach), survey.scratch)
 

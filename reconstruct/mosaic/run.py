@@ -24,6 +24,7 @@ from reconstruct.dense.run import picture_files
 from reconstruct.model import SparseModel, read_model
 from reconstruct.mosaic.blend import SUPPORT_PX
 from reconstruct.mosaic.colour import ColourModel, solve_colour
+from reconstruct.mosaic.compare import LightTask, compare_block
 from reconstruct.mosaic.facts import PictureFacts
 from reconstruct.mosaic.footprints import write_footprints
 from reconstruct.mosaic.grid import (
@@ -39,10 +40,8 @@ from reconstruct.mosaic.grid import (
 from reconstruct.mosaic.light import joined_samples
 from reconstruct.mosaic.measure import MeasureTask, measure_view
 from reconstruct.mosaic.paint import (
-    LightTask,
     PaintTask,
     SeenView,
-    compare_block,
     label_block,
     label_path,
     paint_tiles,

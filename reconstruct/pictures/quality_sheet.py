@@ -39,12 +39,12 @@ def plot_quality(path: Path, images: Path, found: Sequence[PictureQuality]) -> N
     rows = -(-len(worst) // _ACROSS)
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(12, 4.2 + 2.6 * rows), layout="constrained")
-        upper, *lower = np.atleast_1d(
-            figure.subfigures(1 + bool(rows), 1, height_ratios=[4.2, 2.6 * rows][: 1 + bool(rows)])
-        )
-        _strips(upper, found)
-        if lower:
-            panels = lower[0].subplots(rows, _ACROSS, squeeze=False).ravel()
+        if not rows:
+            _strips(figure, found)
+        else:
+            upper, lower = figure.subfigures(2, 1, height_ratios=[4.2, 2.6 * rows])
+            _strips(upper, found)
+            panels = lower.subplots(rows, _ACROSS, squeeze=False).ravel()
             for panel in panels:
                 panel.axis("off")
             for panel, quality in zip(panels, worst, strict=False):

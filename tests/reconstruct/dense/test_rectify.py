@@ -54,7 +54,7 @@ def test_any_pair_matches_on_rows_with_disparity_focal_times_base_over_range(
     disparity = left[:, 0] - right[:, 0]
     inner = (disparity > 0) & (disparity < pair.disparities_px)
     assert inner.all()  # the search holds every point
-    reach = pair.range_from_disparity(disparity.astype(np.float32))
+    reach = pair.focal_px * pair.baseline / (disparity + pair.disparity_offset_px)
     sight = (points - one.world_from_cam.translation) @ _axis(one, other)
     np.testing.assert_allclose(reach, sight, rtol=1e-5)
 
