@@ -38,11 +38,11 @@ def plot_quality(path: Path, images: Path, found: Sequence[PictureQuality]) -> N
     worst = worst_first(found)[:_MOST_SHOWN]
     rows = -(-len(worst) // _ACROSS)
     with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(12, 4.2 + 2.6 * rows), layout="constrained")
+        figure = Figure(figsize=(12, 5.2 + 2.6 * rows), layout="constrained")
         if not rows:
             _strips(figure, found)
         else:
-            upper, lower = figure.subfigures(2, 1, height_ratios=[4.2, 2.6 * rows])
+            upper, lower = figure.subfigures(2, 1, height_ratios=[5.2, 2.6 * rows])
             _strips(upper, found)
             panels = lower.subplots(rows, _ACROSS, squeeze=False).ravel()
             for panel in panels:
@@ -75,13 +75,14 @@ def _strips(figure: Any, found: Sequence[PictureQuality]) -> None:
         axis.plot(order[flagged], values[flagged], "o", mfc="none", mec="tab:red", markersize=8)
         axis.set_ylabel(label)
         gone = np.isnan(values)
-        axis.plot(order[gone], np.zeros(gone.sum()), "x", color="tab:red", clip_on=False)
+        if gone.any():  # an empty line without clipping has no extent, and no layout
+            axis.plot(order[gone], np.zeros(gone.sum()), "x", color="tab:red", clip_on=False)
         axis.set_ylim(0, 1.15 * np.nanmax(values, initial=1e-3))
         axis.grid(alpha=0.3)
     axes[0].set_title(
         f"{len(found)} pictures in their order; {flagged.sum()} to look at (crosses: unreadable)"
     )
-    axes[0].legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=len(cameras), frameon=False)
+    axes[0].legend(loc="lower right", ncols=len(cameras), frameon=False)
     axes[-1].set_xlabel("picture")
     axes[-1].xaxis.get_major_locator().set_params(integer=True)
 
