@@ -104,7 +104,7 @@ def self_calibrated_opencv(scene: Scene) -> Mapped:
     plain = replace(seen, cameras=cameras, pixels=scene.pixels)
     start = near_truth(scene, plain, lenses, np.random.default_rng(1))
     model = start.model
-    options = held_options()
+    options = held_options(scene.noise_px)
     options.refine_focal_length = options.refine_extra_params = True
     config = all_pictures(model)
     config.set_constant_rig_from_world_pose(min(model.reg_frame_ids()))

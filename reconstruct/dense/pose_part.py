@@ -2,8 +2,8 @@
 
 Depths of one place from many views err together, since all of them rest on the same poses. How much
 is known at every sparse point: its covariance from the adjustment (`mapping/covariance.npz`), which
-holds poses and pixels together, less what the pixels of its own observations leave with poses held
-(sigma^2 (sum J'J)^-1). The rest is what the poses around it do to a surface there.
+holds poses and pixels together, less what the pixels of its own observations leave with poses held.
+The rest is what the poses around it do to a surface there.
 """
 
 from dataclasses import dataclass
@@ -16,15 +16,12 @@ from scipy.spatial import cKDTree
 
 from alice_survey.errors import warn
 from alice_survey.frames import Array
-from reconstruct.dense.stereo_pairs import points_of_views
 from reconstruct.model import SparseModel
 
 _COMPANY = 16
 """Sparse points around a spot of which the median counts: a single one may be a wrong match."""
 _NODE_CELLS = 16
 """Cells of the DEM between places where it is told."""
-_TOLD = 1e-10
-"""Least determinant of a point's information over the product of its diagonal: above rounding."""
 _SAME = 1e-6
 """Of the model's size: how far points of the two files may lie apart."""
 
@@ -94,46 +91,13 @@ def find_pose_part(workspace: Path, model: SparseModel) -> PosePart | None:
     if down is None:
         warn("mapping/covariance.npz is not of this model: sigma.tif leaves out errors of poses")
         return None
-    total = np.einsum("i,nij,j->n", down, known.point_cov, down)
-    own = total - known.sigma_px**2 * noise_of_points(model)
+    poses = known.point_cov - known.point_noise
+    own = np.einsum("i,nij,j->n", down, poses, down)
     seen = np.isfinite(own)
     if not seen.any():
         warn("mapping/covariance.npz knows no point: sigma.tif leaves out errors of poses")
         return None
     return PosePart(places=model.points_world[seen, :2], variances=np.maximum(own[seen], 0.0))
-
-
-def noise_of_points(model: SparseModel) -> Array:
-    """Variance (P,) of each point's third coordinate for pixels of unit variance, poses held.
-
-    NaN where the observations do not tell the point.
-    """
-    count = len(model.points_world)
-    information = np.zeros((6, count))
-    order = np.argsort(model.observations[:, 1], kind="stable")
-    numbers = model.observations[order, 0]
-    starts = np.searchsorted(model.observations[order, 1], np.arange(1, len(model.views)))
-    for view, points, seen in zip(
-        model.views, np.split(numbers, starts), points_of_views(model), strict=True
-    ):
-        if len(seen) == 0:
-            continue
-        cam_from_world = view.world_from_cam.inv()
-        x, y, z = cam_from_world.apply(seen).T
-        zero = np.zeros_like(z)
-        slopes = np.stack(
-            [view.fx_px / z, zero, -view.fx_px * x / z**2, zero, view.fy_px / z,
-             -view.fy_px * y / z**2], axis=-1,
-        ).reshape(-1, 2, 3) @ cam_from_world.rotation.as_matrix()  # fmt: skip
-        for k, (i, j) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
-            part = (slopes[:, :, i] * slopes[:, :, j]).sum(axis=1)
-            information[k] += np.bincount(points, part, minlength=count)
-    a, b, c, d, e, f = information
-    minor = a * d - b * b
-    whole = minor * f - a * e * e + 2 * b * c * e - c * c * d
-    with np.errstate(divide="ignore", invalid="ignore"):
-        variance: Array = np.where(whole > _TOLD * a * d * f, minor / whole, np.nan)
-    return variance
 
 
 def _down_in_mapping(folder: Path, model: SparseModel, ids: NDArray[np.int64]) -> Array | None:

@@ -54,6 +54,15 @@ class Observed:
         ]
         return np.array(rows).reshape(-1, 2)
 
+    def misses(self, model: pycolmap.Reconstruction) -> Array:
+        """Where pinholes see the points less where the keypoints are, (O, 2) pixels."""
+        local = self.in_cameras(model, self.points(model))
+        found = np.empty((len(local), 2))
+        for n, number in enumerate(self.pictures.tolist()):
+            found[self.of(n)] = model.images[number].camera.img_from_cam(local[self.of(n)])
+        missed: Array = found - self.pixels(model)
+        return missed
+
 
 def observed(model: pycolmap.Reconstruction) -> Observed:
     """The observations of a model."""

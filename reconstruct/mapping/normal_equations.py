@@ -8,7 +8,7 @@ one (Schur complement; Triggs et al. 2000, "Bundle adjustment: a modern synthesi
 which leaves a block-sparse system of the stations with a border of what is shared.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -38,6 +38,16 @@ class Sights:
     """(O, 2, G) slopes by what all share; G may be 0."""
     miss: Array
     """(O, 2) found pixel less the one observed."""
+
+    def weighted(self, weights: Array) -> "Sights":
+        """The same with the squares of every observation weighted, (O,)."""
+        root = np.sqrt(weights)[:, None]
+        return replace(
+            self,
+            by_point=root[:, :, None] * self.by_point,
+            by_shared=root[:, :, None] * self.by_shared,
+            miss=root * self.miss,
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

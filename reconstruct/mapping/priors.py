@@ -19,10 +19,10 @@ from camera_calib.rig import Rig
 from reconstruct.lenses.lens import Lens
 from reconstruct.mapping.bundle import adjust_freely, all_pictures, held_options
 from reconstruct.mapping.mapper import Mapped, model_baseline, scale_model
+from reconstruct.mapping.robust import pixel_sigma
 from reconstruct.matching.pairs import positions_ned
 
 _LEAST_STATIONS = 5
-_LEAST_PIXEL_SIGMA = 1e-3
 _WORST_GROWTH = 1.05
 """Priors may raise the mean reprojection error by this factor at most, else they are not used."""
 
@@ -161,21 +161,6 @@ def _priors(
     ]
 
 
-def pixel_sigma(model: pycolmap.Reconstruction) -> float:
-    """Standard deviation of one coordinate of a keypoint, from a model's mean residual.
-
-    The mean length of a plane normal vector is sqrt(pi / 2) sigmas; residuals are smaller than
-    errors by what points and stations adapt to.
-    """
-    seen = 2 * model.compute_num_observations()
-    spare = max(seen - 3 * model.num_points3D() - 6 * model.num_reg_frames(), 1)
-    rows = np.array(
-        [[p.error * p.track.length(), p.track.length()] for p in model.points3D.values()]
-    )
-    mean = rows[:, 0].sum() / rows[:, 1].sum() / np.sqrt(np.pi / 2)
-    return max(float(mean * np.sqrt(seen / spare)), _LEAST_PIXEL_SIGMA)
-
-
 def _adjuster(
     model: pycolmap.Reconstruction, priors: Sequence[pycolmap.PosePrior], pixel: float
 ) -> pycolmap.BundleAdjuster:
@@ -185,5 +170,5 @@ def _adjuster(
     prior_options.alignment_ransac.random_seed = 1
     prior_options.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
     return pycolmap.create_pose_prior_bundle_adjuster(
-        held_options(), prior_options, all_pictures(model), priors, model
+        held_options(pixel), prior_options, all_pictures(model), priors, model
     )

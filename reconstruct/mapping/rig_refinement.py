@@ -19,16 +19,21 @@ from alice_survey.errors import ReconstructionError, warn
 from alice_survey.frames import Array
 from camera_calib.calibration.freedom import POSE as TURN_AND_SHIFT
 from camera_calib.calibration.freedom import Prior, pose_names, value
-from camera_calib.flat_port import PARAMETERS, FlatPortCamera, pose_jacobian
+from camera_calib.flat_port import PARAMETERS
 from camera_calib.rig import Covariance, Rig
-from reconstruct.lenses.lens import Lens
-from reconstruct.mapping.arrays import Indices, observed
-from reconstruct.mapping.database import Observations, as_transform
+from reconstruct.mapping.arrays import Indices
+from reconstruct.mapping.database import Observations
+from reconstruct.mapping.exact_sights import (
+    Pixels,
+    State,
+    choose_pixels,
+    exact_sights,
+    start_state,
+)
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.normal_equations import POSE, Reduced, Sights, moved_points, reduce_points
+from reconstruct.mapping.robust import cauchy_weights, sigma_of, variance_of
 
-_MOST_OBSERVATIONS = 200_000
-"""More tell little more of so few parameters; whole points are left out evenly."""
 _PORT_SIGMAS = {"port_distance_m": 0.02, "normal_x": 0.05, "normal_y": 0.05, "n_water": 0.005}
 _RIG_SIGMAS = dict(zip(TURN_AND_SHIFT, [0.02] * 3 + [0.005] * 3, strict=True))
 """What is known of parameters that no calibration tells: next to nothing."""
@@ -94,35 +99,6 @@ class Told:
     sigmas: Array
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Pixels:
-    """Observations, sorted by point."""
-
-    starts: Indices
-    station: Indices
-    camera: Indices
-    taken: Array
-    """(O, 2) pixels of the pictures as taken."""
-    point: Indices
-
-    @property
-    def points(self) -> int:
-        return len(self.starts) - 1
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _State:
-    """One guess of all unknowns."""
-
-    cameras: tuple[FlatPortCamera, ...]
-    cam_from_rig: tuple[RigidTransform, ...]
-    turns: Array
-    """(F, 3, 3) `world_from_rig`, and (F, 3) where the rig's origins are."""
-    centres: Array
-    points: Array
-    lever: Array
-
-
 def fit_rig(
     mapped: Mapped,
     seen: Observations,
@@ -149,7 +125,7 @@ def fit_rig(
     frames = np.array(
         sorted({i.frame_id for i in mapped.model.images.values() if i.has_pose}), dtype=np.int64
     )
-    pixels, ids = _chosen(mapped, seen, names, frames)
+    pixels, ids = choose_pixels(mapped, seen, names, frames)
     prior = _prior(rig, names, port=port, pose=pose)
     fields = prior.parameters
     told = told if pose else None
@@ -158,14 +134,18 @@ def fit_rig(
     if told is not None:
         information[-3:, -3:] = np.eye(3) / _LEVER_SIGMA_M**2
     _hold_baseline(information, fields, rig, names)
-    state = _start(mapped, rig, names, frames, ids)
+    state = start_state(mapped, rig, names, frames, ids)
     told = None if told is None else _lasting(told, state)
     first = _values(state, fields, names, lever=told is not None)
     drift = np.zeros(len(first))
     variance = np.nan
     for _ in range(_ROUNDS):
-        sights = _sights(state, pixels, fields, names, lever=told is not None)
-        now = float((sights.miss**2).sum()) / _spare(pixels, len(frames), len(first))
+        sights = exact_sights(state, pixels, fields, names, lever=told is not None)
+        left = _spare(pixels, len(frames), len(first)) / (2 * len(pixels.station))
+        seen_by = np.repeat(np.diff(pixels.starts), np.diff(pixels.starts))
+        weights = cauchy_weights(sights.miss, sigma_of(sights.miss, seen_by, len(frames)))
+        now = variance_of(sights.miss, weights, left)
+        sights = sights.weighted(weights)
         variance = now if np.isnan(variance) else min(variance, now)
         step = _step(sights, state, variance, information, drift, told)
         state = _moved(state, pixels, step, sights, fields, names)
@@ -183,7 +163,7 @@ def fit_rig(
         after=after,
         prior_sigmas=np.sqrt(np.diag(_inverse(information))),
         covariance=step.covariance,
-        sigma_px=float(np.sqrt(variance)),
+        sigma_px=float(np.sqrt(variance / weights.mean())),
         observations=len(pixels.station),
         stations=tuple(
             RigidTransform.from_components(c, Rotation.from_matrix(r))
@@ -194,7 +174,7 @@ def fit_rig(
     )
 
 
-def _lasting(told: Told, state: _State) -> Told:
+def _lasting(told: Told, state: State) -> Told:
     """Sigmas that count how long navigation errs the same way.
 
     Errors that last tell less than as many new ones: a first-order process with the correlation r
@@ -209,7 +189,7 @@ def _lasting(told: Told, state: _State) -> Told:
     return replace(told, sigmas=told.sigmas * np.sqrt((1.0 + lasting) / (1.0 - lasting)))
 
 
-def _spare(pixels: _Pixels, stations: int, shared: int) -> int:
+def _spare(pixels: Pixels, stations: int, shared: int) -> int:
     spare = 2 * len(pixels.station) - 3 * pixels.points - POSE * stations
     if spare < 10 * shared:
         raise ReconstructionError(
@@ -260,53 +240,7 @@ def _hold_baseline(
         information[np.ix_(at, at)] += np.outer(along, along) / _BASELINE_SIGMA_M**2
 
 
-def _chosen(
-    mapped: Mapped, seen: Observations, names: Sequence[str], frames: Indices
-) -> tuple[_Pixels, Indices]:
-    """The observations that take part, and the ids of their points."""
-    model, found = mapped.model, observed(mapped.model)
-    camera, station = np.empty(len(found.point), np.int64), np.empty(len(found.point), np.int64)
-    taken = np.empty((len(found.point), 2))
-    for n, number in enumerate(found.pictures.tolist()):
-        rows, record = found.of(n), seen.images[number - 1]
-        lens: Lens = mapped.lenses[record.camera]
-        taken[rows] = lens.from_pinhole(seen.pixels[number - 1][found.keypoint[rows]])
-        camera[rows] = names.index(record.camera)
-        station[rows] = np.searchsorted(frames, model.images[number].frame_id)
-    every = -(-len(found.point) // _MOST_OBSERVATIONS)
-    lost = np.unique(found.point[~np.isfinite(taken).all(axis=1)])
-    kept = (found.point % every == 0) & ~np.isin(found.point, lost)
-    order = np.flatnonzero(kept)
-    order = order[np.argsort(found.point[order], kind="stable")]
-    points, inverse = np.unique(found.point[order], return_inverse=True)
-    starts = np.concatenate([[0], np.cumsum(np.bincount(inverse, minlength=len(points)))])
-    pixels = _Pixels(
-        starts=starts.astype(np.int64),
-        station=station[order],
-        camera=camera[order],
-        taken=taken[order],
-        point=inverse.astype(np.int64),
-    )
-    return pixels, found.point_ids[points]
-
-
-def _start(mapped: Mapped, rig: Rig, names: Sequence[str], frames: Indices, ids: Indices) -> _State:
-    model, pinhole_from_cam = mapped.model, mapped.lenses[names[0]].pinhole_from_cam
-    reference = rig.cam_from_rig[names[0]]
-    poses = [
-        as_transform(model.frames[int(f)].rig_from_world).inv() * pinhole_from_cam for f in frames
-    ]
-    return _State(
-        cameras=tuple(rig.cameras[name] for name in names),
-        cam_from_rig=tuple(rig.cam_from_rig[name] * reference.inv() for name in names),
-        turns=np.array([p.rotation.as_matrix() for p in poses]),
-        centres=np.array([p.translation for p in poses]),
-        points=np.array([model.points3D[i].xyz for i in ids.tolist()]).reshape(-1, 3),
-        lever=np.asarray((reference * rig.body_from_rig.inv()).translation),
-    )
-
-
-def _values(state: _State, fields: Sequence[str], names: Sequence[str], *, lever: bool) -> Array:
+def _values(state: State, fields: Sequence[str], names: Sequence[str], *, lever: bool) -> Array:
     now = Rig(
         cameras=dict(zip(names, state.cameras, strict=True)),
         cam_from_rig=dict(zip(names, state.cam_from_rig, strict=True)),
@@ -315,40 +249,6 @@ def _values(state: _State, fields: Sequence[str], names: Sequence[str], *, lever
     )
     values = [value(now, name) for name in fields]
     return np.array([*values, *(state.lever if lever else [])])
-
-
-def _sights(
-    state: _State, pixels: _Pixels, fields: Sequence[str], names: Sequence[str], *, lever: bool
-) -> Sights:
-    """The observations linearised; those that no light explains count nothing."""
-    count = len(fields) + 3 * lever
-    arm = state.points[pixels.point] - state.centres[pixels.station]
-    by_point = np.zeros((len(arm), 2, 3))
-    by_shared, miss = np.zeros((len(arm), 2, count)), np.zeros((len(arm), 2))
-    for c, name in enumerate(names):
-        rows = np.flatnonzero(pixels.camera == c)
-        turns = state.turns[pixels.station[rows]]
-        pose = state.cam_from_rig[c]
-        turned = np.einsum("nij,ni->nj", turns, arm[rows]) @ pose.rotation.as_matrix().T
-        found, by_cam, by_parameter = state.cameras[c].project_jacobian(turned + pose.translation)
-        sees = np.isfinite(found).all(axis=1)
-        rows, by_cam, by_parameter = rows[sees], by_cam[sees], by_parameter[sees]
-        by_rig = by_cam @ pose.rotation.as_matrix()
-        by_point[rows] = by_rig @ turns[sees].transpose(0, 2, 1)
-        miss[rows] = found[sees] - pixels.taken[rows]
-        by_pose = pose_jacobian(by_cam, turned[sees])
-        for g, field in enumerate(fields):
-            camera, parameter = field.split(".")
-            if camera != name:
-                continue
-            if parameter in PARAMETERS:
-                by_shared[rows, :, g] = by_parameter[:, :, PARAMETERS.index(parameter)]
-            else:
-                by_shared[rows, :, g] = by_pose[:, :, TURN_AND_SHIFT.index(parameter)]
-    return Sights(
-        starts=pixels.starts, station=pixels.station, by_point=by_point, arm=arm,
-        by_shared=by_shared, miss=miss,
-    )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -361,7 +261,7 @@ class _Step:
 
 def _step(
     sights: Sights,
-    state: _State,
+    state: State,
     variance: float,
     information: Array,
     drift: Array,
@@ -429,13 +329,13 @@ def _block_diagonal(blocks: Array) -> Any:
 
 
 def _moved(
-    state: _State,
-    pixels: _Pixels,
+    state: State,
+    pixels: Pixels,
     step: _Step,
     sights: Sights,
     fields: Sequence[str],
     names: Sequence[str],
-) -> _State:
+) -> State:
     points = moved_points(
         sights.starts, sights.station, sights.by_point, sights.arm, sights.by_shared, sights.miss,
         step.reduced.point_inverse, step.stations, step.shared,
@@ -460,7 +360,7 @@ def _moved(
         )
     turns = Rotation.from_rotvec(step.stations[:, :3]).as_matrix() @ state.turns
     lever = state.lever + step.shared[-3:] if len(step.shared) > len(fields) else state.lever
-    return _State(
+    return State(
         cameras=tuple(cameras),
         cam_from_rig=tuple(poses),
         turns=turns,
@@ -473,7 +373,7 @@ def _moved(
 def _as_rig(
     rig: Rig,
     names: Sequence[str],
-    state: _State,
+    state: State,
     fields: Sequence[str],
     covariance: Array,
     lever: bool,

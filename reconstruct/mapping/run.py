@@ -43,7 +43,7 @@ from reconstruct.matching.pairs import SMALL_SET, choose_pairs, placed_pictures
 from reconstruct.matching.refinement import refine_tracks
 from reconstruct.matching.retrieval import alike_pairs
 from reconstruct.pictures.files import exif_focal_px
-from reconstruct.pictures.normalise import normalise, read_deep
+from reconstruct.pictures.normalise import even_light, finely, normalise, read_deep
 from reconstruct.pictures.undistorted import read_colour, read_mask
 
 RATIO = 0.8
@@ -147,8 +147,9 @@ def run_mapping(
             )
             adjust = NavigationAdjuster(inputs.records, inputs.rig, lenses, inputs.datum)
             mapped, refracted = refract(mapped, seen, partial, adjust, poses)
+            rig = inputs.rig
             if settings.refine_port or settings.refine_rig:
-                mapped, refracted, adjust = refine_rig(
+                found = refine_rig(
                     mapped,
                     seen,
                     inputs.rig,
@@ -159,11 +160,13 @@ def run_mapping(
                     port=settings.refine_port,
                     pose=settings.refine_rig,
                 )
+                mapped, refracted, adjust = found.mapped, found.convergence, found.adjust
+                seen, rig = found.seen, found.rig
             sigmas = adjust.sigmas
         else:
             mapped = map_self_calibrated(seen, exif_focal, partial, config.seed)
-            refracted, sigmas = None, None
-        save_uncertainty(partial, mapped, inputs.records, sigmas)
+            refracted, sigmas, rig = None, None, None
+        save_uncertainty(partial, mapped, seen, rig, sigmas)
         _write(partial, inputs, mapped, distances, refracted)
         shutil.rmtree(partial / "features")
 
@@ -173,11 +176,12 @@ def run_mapping(
 def extract(task: _FeatureTask) -> int:
     """Find and save the features of one picture, unless they are there; how many there are."""
     if not task.target.exists():
-        grey = normalise(read_deep(task.picture))
+        picture = read_deep(task.picture)
+        grey = normalise(picture)
         mask = None if task.mask is None else read_mask(task.mask, (grey.shape[1], grey.shape[0]))
         found = find_features(grey, mask, scale=task.scale, most=task.most)
         with atomic_path(_grey_file(task.target)) as temporary, temporary.open("wb") as file:
-            np.save(file, grey)
+            np.save(file, finely(even_light(picture)))
         save_features(task.target, found)
     return len(load_features(task.target).pixels)
 

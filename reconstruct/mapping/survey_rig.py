@@ -4,7 +4,7 @@ It writes `port.json` (values, sigmas, correlation) and `rig.json` (the refined 
 model.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,20 @@ from reconstruct.matching.matches import as_seen
 from reconstruct.matching.pairs import positions_ned
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Refined:
+    """A survey mapped on its own refined rig."""
+
+    mapped: Mapped
+    seen: Observations
+    """Keypoints as warped by the refined rig's lenses."""
+    rig: Rig
+    convergence: Convergence
+    """How the keypoints came to rest."""
+    adjust: NavigationAdjuster
+    """What adjusted the model."""
+
+
 def refine_rig(
     mapped: Mapped,
     seen: Observations,
@@ -37,7 +51,7 @@ def refine_rig(
     *,
     port: bool,
     pose: bool,
-) -> tuple[Mapped, Convergence, NavigationAdjuster]:
+) -> Refined:
     """Refine a rig from a finished model and make the model anew on it.
 
     Args:
@@ -50,9 +64,6 @@ def refine_rig(
         folder: where `port.json` and `rig.json` go.
         port: refine ports and water.
         pose: refine the poses of the cameras and the lever arm.
-
-    Returns:
-        The model on the refined rig, how its keypoints came to rest, and what adjusted it.
 
     Raises:
         ReconstructionError: the model has no scale, or the survey does not tell what is asked for.
@@ -76,7 +87,9 @@ def refine_rig(
     refined, convergence = refract(again[0], again[1], folder, adjust, poses)
     write_json(folder / "port.json", fit.to_json())
     write_rig(folder / "rig.json", fit.rig)
-    return refined, convergence, adjust
+    return Refined(
+        mapped=refined, seen=again[1], rig=fit.rig, convergence=convergence, adjust=adjust
+    )
 
 
 def on_rig(

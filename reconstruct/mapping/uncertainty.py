@@ -1,11 +1,12 @@
 """How well a model's stations and points are known: `mapping/covariance.npz`.
 
-The covariance is that of the last adjustment: the inverse of its normal equations, scaled by the
-variance of the keypoints that its residuals show (the a-posteriori variance factor). A model of
-pictures has no place of its own, so that what is stated is its shape: the covariance of what is
-left when all stations together are laid onto the truth by a rigid motion (and by a scale, where
-nothing fixes that) with the least squares error (the inner constraints of a free network; Baarda's
-S-transformation, 1973). Where the whole lies in the world is for the georeference to say.
+The covariance is that of the last adjustment: the inverse of its weighted normal equations, scaled
+by the variance of the keypoints that its residuals show (see `reconstruct.mapping.robust`), and
+what errors of the calibration add to it. A model of pictures has no place of its own, so that what
+is stated is its shape: the covariance of what is left when all stations together are laid onto the
+truth by a rigid motion (and by a scale, where nothing fixes that) with the least squares error (the
+inner constraints of a free network; Baarda's S-transformation, 1973). Where the whole lies in the
+world is for the georeference to say.
 """
 
 from collections.abc import Sequence
@@ -23,8 +24,11 @@ from scipy.spatial.transform import Rotation
 from alice_survey.errors import ReconstructionError, warn
 from alice_survey.frames import Array
 from alice_survey.manifest import ImageRecord
+from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import Indices, Observed, observed
-from reconstruct.mapping.database import as_transform
+from reconstruct.mapping.calibration_part import CalibrationPart, calibration_part
+from reconstruct.mapping.database import Observations, as_transform
+from reconstruct.mapping.gauge import Gauge
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.normal_equations import (
     POSE,
@@ -33,6 +37,7 @@ from reconstruct.mapping.normal_equations import (
     point_covariances,
     reduce_points,
 )
+from reconstruct.mapping.robust import cauchy_weights, sigma_of, variance_of
 
 _CHUNK = 32
 """Stations whose columns of the inverse are in memory at a time."""
@@ -59,12 +64,17 @@ class Uncertainty:
     """(P,) ids of COLMAP's points, ascending."""
     point_cov: Array
     """(P, 3, 3)."""
+    point_noise: Array
+    """(P, 3, 3): of it, what the noise of the point's own keypoints does; the rest are poses."""
     sigma_px: float
     """Of one coordinate of a keypoint, from the residuals."""
 
 
 def estimate(
-    mapped: Mapped, records: Sequence[ImageRecord], position_sigmas: Array | None
+    mapped: Mapped,
+    records: Sequence[ImageRecord],
+    position_sigmas: Array | None,
+    calibration: CalibrationPart | None = None,
 ) -> Uncertainty:
     """Covariances of an adjusted model of ideal pinholes with held rig and lenses.
 
@@ -73,6 +83,7 @@ def estimate(
         records: pictures.
         position_sigmas: (N, 3) of the pictures' told positions along the model's axes, NaN where
             none took part in the adjustment; None for an adjustment without.
+        calibration: what errors of the rig do; None where nobody knows.
 
     Raises:
         ReconstructionError: the model is too small to tell.
@@ -88,13 +99,17 @@ def estimate(
             f"{len(order)} observations of {len(seen.point_ids)} points from {len(frames)} "
             "stations do not tell how well they are known"
         )
-    variance = float((sights.miss**2).sum() / spare)
+    left = spare / (2 * len(order))
+    seen_by = np.repeat(np.diff(sights.starts), np.diff(sights.starts))
+    weights = cauchy_weights(sights.miss, sigma_of(sights.miss, seen_by, len(frames)))
+    variance = variance_of(sights.miss, weights, left)
+    sights = sights.weighted(weights)
     reduced = reduce_points(sights, len(frames))
     centres = _centres(model, frames)
-    told = _told(model, frames, position_sigmas)
+    told = told_information(model, position_sigmas)
     counts = np.bincount(sights.station, minlength=len(frames))
     loose = counts < _LEAST_POINTS
-    gauge = _Gauge(centres, float(np.median(np.linalg.norm(sights.arm, axis=1))), scale_free)
+    gauge = Gauge(centres, float(np.median(np.linalg.norm(sights.arm, axis=1))), scale_free)
     blocks = _inverse_blocks(reduced, variance, told, gauge, loose)
     rows = np.repeat(np.arange(len(frames)), np.diff(reduced.pointers))
     own = np.flatnonzero(rows == reduced.columns)
@@ -102,28 +117,40 @@ def estimate(
         sights.starts, sights.station, sights.by_point, sights.arm,
         reduced.point_inverse, reduced.pointers, reduced.columns, blocks,
     )  # fmt: skip
-    points += (variance - 1.0) * reduced.point_inverse
+    noise = variance * reduced.point_inverse
+    points += noise - reduced.point_inverse
+    frame_cov = blocks[own]
+    if calibration is not None:
+        shape = calibration.without(gauge)
+        frame_cov = frame_cov + shape.of_stations()
+        points += shape.of_points(seen.points(model))
     first = _first_pictures(model, seen, frames)
     return Uncertainty(
         frames=frames,
         stations=np.array([records[n - 1].station for n in first], dtype=np.int64),
         images=tuple(records[n - 1].image for n in first),
-        frame_cov=blocks[own],
+        frame_cov=frame_cov,
         point_ids=seen.point_ids,
         point_cov=points,
-        sigma_px=float(np.sqrt(variance)),
+        point_noise=noise,
+        sigma_px=float(np.sqrt(variance / weights.mean())),
     )
 
 
 def save_uncertainty(
     folder: Path,
     mapped: Mapped,
-    records: Sequence[ImageRecord],
+    seen: Observations,
+    rig: Rig | None,
     position_sigmas: Array | None = None,
 ) -> None:
     """Write `covariance.npz` of a model (see `estimate`), with a warning where it cannot be."""
     try:
-        found = estimate(mapped, records, position_sigmas)
+        calibration = None
+        if rig is not None:
+            told = told_information(mapped.model, position_sigmas)
+            calibration = calibration_part(mapped, seen, rig, told)
+        found = estimate(mapped, seen.images, position_sigmas, calibration)
     except ReconstructionError as error:
         warn(f"no covariance: {error}")
         return
@@ -140,6 +167,7 @@ def write_uncertainty(path: Path, found: Uncertainty) -> None:
         cov=found.frame_cov,
         point_ids=found.point_ids,
         point_cov=found.point_cov.astype(np.float32),
+        point_noise=found.point_noise.astype(np.float32),
         sigma_px=np.array(found.sigma_px),
     )
 
@@ -154,6 +182,7 @@ def read_uncertainty(path: Path) -> Uncertainty:
             frame_cov=data["cov"],
             point_ids=data["point_ids"],
             point_cov=data["point_cov"].astype(np.float64),
+            point_noise=data["point_noise"].astype(np.float64),
             sigma_px=float(data["sigma_px"]),
         )
 
@@ -194,41 +223,11 @@ def sights_of(
     return sights, order.astype(np.int64)
 
 
-class _Gauge:
-    """Motions of a whole block that pictures do not see."""
-
-    def __init__(self, centres: Array, depth: float, scale_free: bool) -> None:
-        """Of stations at (F, 3); `depth`, a usual one, weighs turns against positions."""
-        arms = centres - centres.mean(axis=0)
-        count = len(arms)
-        self.motions = np.zeros((count, POSE, 7 if scale_free else 6))
-        for axis in range(3):
-            unit = np.eye(3)[axis]
-            self.motions[:, :3, axis] = unit
-            self.motions[:, 3:, axis] = np.cross(unit, arms)
-            self.motions[:, 3:, 3 + axis] = unit
-        if scale_free:
-            self.motions[:, 3:, 6] = arms
-        self.weights = np.tile([depth**2] * 3 + [1.0] * 3, count)
-        flat = self.flat
-        self.spread = np.linalg.inv(flat.T @ (self.weights[:, None] * flat))
-        far = int(np.argmax(np.linalg.norm(arms - arms[0], axis=1)))
-        self.held = list(range(POSE))
-        if scale_free:
-            along = int(np.argmax(np.abs(arms[far] - arms[0])))
-            self.held.append(POSE * far + 3 + along)
-
-    @property
-    def flat(self) -> Array:
-        """(6 F, 6 or 7)."""
-        return self.motions.reshape(-1, self.motions.shape[2])
-
-
 def _inverse_blocks(
     reduced: Reduced,
     variance: float,
     told: Array | None,
-    gauge: _Gauge,
+    gauge: Gauge,
     loose: NDArray[np.bool_],
 ) -> Array:
     """Covariances (B, 6, 6) between stations that see a point in common, without the gauge."""
@@ -278,10 +277,16 @@ def _inverse_blocks(
     return blocks
 
 
-def _told(model: pycolmap.Reconstruction, frames: Indices, sigmas: Array | None) -> Array | None:
-    """(F, 6) information of told positions; None where there are none."""
+def told_information(model: pycolmap.Reconstruction, sigmas: Array | None) -> Array | None:
+    """(F, 6) information of stations whose positions are told; None where there are none.
+
+    Args:
+        model: picture i of `sigmas` has the id i + 1.
+        sigmas: (N, 3) of the pictures' told positions; NaN where none is told.
+    """
     if sigmas is None:
         return None
+    frames = np.array(sorted({i.frame_id for i in model.images.values() if i.has_pose}), np.int64)
     told = np.zeros((len(frames), POSE))
     for number, image in sorted(model.images.items()):
         if not image.has_pose:

@@ -41,7 +41,8 @@ _LEVELS = 3
 _LEAST_SUPPORT = 6
 _SUPPORT = 12
 """Matches around a feature from which its first affine warp is estimated."""
-_UNKNOWNS = 8
+_UNKNOWNS = 10
+"""Shift, affine change, gain, the gain's two slopes, offset."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -303,6 +304,7 @@ def _template(
             slopes[k, 2], slopes[k, 3] = gx * u, gx * v
             slopes[k, 4], slopes[k, 5] = gy * u, gy * v
             slopes[k, 6], slopes[k, 7] = patch[i, j], 1.0
+            slopes[k, 8], slopes[k, 9] = patch[i, j] * u, patch[i, j] * v
             k += 1
 
 

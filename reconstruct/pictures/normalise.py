@@ -21,6 +21,8 @@ _FLOOR = {np.dtype(np.uint8): 4.0, np.dtype(np.uint16): 64.0}
 bits, those of a camera that fills 12 are meant."""
 _BACKGROUND_SHARE = 1 / 24
 """Sigma of the background's blur as a share of the picture's longer side."""
+FINE_LEVEL = 4096.0
+"""Grey level of `finely` where a picture is as bright as around."""
 _CLIP = 3.0
 _TILES = 8
 
@@ -68,6 +70,24 @@ def even_light(picture: Deep) -> NDArray[np.float32]:
     background = cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR)
     ratio: NDArray[np.float32] = grey / np.maximum(background, floor)
     return ratio
+
+
+def finely(ratio: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """An evened picture in levels far finer than the noise, as bent by no tone curve.
+
+    Local equalisation helps descriptors, but its tone curves differ from tile to tile: they move
+    edges by some thousandths of a pixel, alike in every picture, which bends a model.
+
+    Args:
+        ratio: (H, W) of `even_light`.
+
+    Returns:
+        (H, W) levels; `FINE_LEVEL` is the surroundings'.
+    """
+    levels: NDArray[np.uint16] = np.rint(np.clip(ratio * np.float32(FINE_LEVEL), 0, 65535)).astype(
+        np.uint16
+    )
+    return levels
 
 
 def normalise(picture: Deep) -> Grey:

@@ -172,11 +172,15 @@ def test_the_model_is_made_anew_on_the_refined_rig(tmp_path: Path) -> None:
     adjust = NavigationAdjuster(scene.records, wrong, mapped.lenses, DATUM)
     mapped = adjust(mapped)
     distances = Distances(near_m=1.75, far_m=2.35, source="test")
-    refined, found, again = refine_rig(
+    found = refine_rig(
         mapped, seen, wrong, distances, adjust, DATUM, tmp_path, port=True, pose=False
     )
-    assert found.settled
-    assert again.sigmas is not None
+    refined = found.mapped
+    assert found.convergence.settled
+    assert found.adjust.sigmas is not None
+    assert found.rig.covariance is not None
+    for keypoints, before in zip(found.seen.pixels, seen.pixels, strict=True):
+        assert 0.001 < np.abs(keypoints - before).max() < 1.0
     assert refined.baseline == pytest.approx(model_baseline(refined.model), rel=1e-9)
     written = read_rig(tmp_path / "rig.json")
     said = json.loads((tmp_path / "port.json").read_text())

@@ -119,6 +119,7 @@ def test_the_file_gives_back_what_was_written(tmp_path: Path) -> None:
     np.testing.assert_array_equal(back.frame_cov, found.frame_cov)
     np.testing.assert_array_equal(back.stations, found.stations)
     np.testing.assert_allclose(back.point_cov, found.point_cov, rtol=1e-6)
+    np.testing.assert_allclose(back.point_noise, found.point_noise, rtol=1e-6)
     assert back.images == tuple(f"left/{s:06d}.png" for s in range(10))
     assert back.sigma_px == found.sigma_px
     for cov in (*found.frame_cov, *found.point_cov):
@@ -146,7 +147,7 @@ def test_too_small_a_model_is_told_of(tmp_path: Path, capsys: pytest.CaptureFixt
     scene, mapped = drawn(4, tmp_path)
     for point in sorted(mapped.model.points3D)[3:]:
         mapped.model.delete_point3D(point)
-    save_uncertainty(tmp_path, mapped, scene.records)
+    save_uncertainty(tmp_path, mapped, warped_scene(scene)[0], scene.rig)
     assert " 3 points" in capsys.readouterr().err
     assert not (tmp_path / "covariance.npz").exists()
 

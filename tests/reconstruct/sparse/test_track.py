@@ -109,7 +109,7 @@ def test_errors_of_a_station_move_its_other_camera_on_its_arm() -> None:
         Uncertainty(
             frames=np.array([1]), stations=np.array([7]), images=("a",),
             frame_cov=covariance[None], point_ids=np.zeros(0, np.int64),
-            point_cov=np.zeros((0, 3, 3)), sigma_px=0.3,
+            point_cov=np.zeros((0, 3, 3)), point_noise=np.zeros((0, 3, 3)), sigma_px=0.3,
         ),
         place,
     )  # fmt: skip
@@ -119,7 +119,7 @@ def test_errors_of_a_station_move_its_other_camera_on_its_arm() -> None:
         Uncertainty(
             frames=np.array([1]), stations=np.array([7]), images=("a",),
             frame_cov=covariance[None], point_ids=np.zeros(0, np.int64),
-            point_cov=np.zeros((0, 3, 3)), sigma_px=0.3,
+            point_cov=np.zeros((0, 3, 3)), point_noise=np.zeros((0, 3, 3)), sigma_px=0.3,
         ),
         place,
     )  # fmt: skip

@@ -1,0 +1,146 @@
+"""What the calibration leaves unsure of a block's shape.
+
+An adjustment that holds rig and ports takes their errors as nil. They are not: a lens that is off
+by its sigma bends the whole block a little, and every picture more does the same again. To first
+order stations and points move with the rig's parameters as the adjustment's normal equations say
+(implicit function theorem), and the covariance of the calibration moves with them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.sparse import csc_matrix, diags_array
+from scipy.sparse.linalg import splu
+from scipy.spatial import KDTree
+
+from alice_survey.frames import Array
+from camera_calib.rig import Rig
+from reconstruct.mapping.arrays import Indices
+from reconstruct.mapping.database import Observations
+from reconstruct.mapping.exact_sights import choose_pixels, exact_sights, start_state
+from reconstruct.mapping.gauge import Gauge
+from reconstruct.mapping.mapper import Mapped
+from reconstruct.mapping.normal_equations import POSE, Sights, moved_points, reduce_points
+from reconstruct.mapping.robust import cauchy_weights, sigma_of
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CalibrationPart:
+    """How a block moves with the parameters of its rig, and how unsure those are."""
+
+    frames: Indices
+    """(F,) ids of COLMAP's frames, ascending."""
+    stations: Array
+    """(F, 6, G) turns and motions of the stations by the parameters, in the model's axes."""
+    places: Array
+    """(P, 3) points at which the motion is told: enough of them, not all."""
+    points: Array
+    """(P, 3, G)."""
+    covariance: Array
+    """(G, G) of the parameters."""
+
+    def of_stations(self) -> Array:
+        """Covariances (F, 6, 6) of the stations."""
+        return _spread(self.stations, self.covariance)
+
+    def of_points(self, points: Array) -> Array:
+        """Covariances (N, 3, 3) of (N, 3) points: those of the nearest that are told."""
+        nearest = np.asarray(KDTree(self.places).query(points)[1])
+        told, which = np.unique(nearest, return_inverse=True)
+        found: Array = _spread(self.points[told], self.covariance)[which]
+        return found
+
+    def without(self, gauge: Gauge) -> "CalibrationPart":
+        """The same less what a motion of the whole block does, which is no change of its shape."""
+        flat = self.stations.reshape(-1, self.stations.shape[2])
+        whole = gauge.spread @ gauge.flat.T @ (gauge.weights[:, None] * flat)
+        return replace(
+            self,
+            stations=self.stations - gauge.motions @ whole,
+            points=self.points - gauge.of_points(self.places) @ whole,
+        )
+
+
+def _spread(motions: Array, covariance: Array) -> Array:
+    """Covariances (N, k, k) of what moves by (N, k, G)."""
+    spread: Array = motions @ covariance @ motions.swapaxes(1, 2)
+    return spread
+
+
+def calibration_part(
+    mapped: Mapped, seen: Observations, rig: Rig, told: Array | None = None
+) -> CalibrationPart | None:
+    """How a finished model depends on its calibration.
+
+    Args:
+        mapped: exact model on the rig; picture i of `seen` has the id i + 1.
+        seen: keypoints as warped by the model's lenses.
+        rig: with the covariance of its calibration.
+        told: (F, 6) information of the stations' told poses, as in the adjustment; None without.
+
+    Returns:
+        None where the rig states no covariance: then nobody knows.
+    """
+    names = list(seen.cameras)
+    fields = _known(rig, names)
+    if not fields or rig.covariance is None:
+        return None
+    frames = np.array(
+        sorted({i.frame_id for i in mapped.model.images.values() if i.has_pose}), dtype=np.int64
+    )
+    pixels, ids = choose_pixels(mapped, seen, names, frames)
+    state = start_state(mapped, rig, names, frames, ids)
+    sights = exact_sights(state, pixels, fields, names, lever=False)
+    counts = np.repeat(np.diff(pixels.starts), np.diff(pixels.starts))
+    sigma = sigma_of(sights.miss, counts, len(frames))
+    sights = sights.weighted(cauchy_weights(sights.miss, sigma))
+    stations, points = _response(sights, len(frames), sigma**2, told)
+    at = [rig.covariance.parameters.index(name) for name in fields]
+    return CalibrationPart(
+        frames=frames,
+        stations=stations,
+        places=state.points,
+        points=points,
+        covariance=rig.covariance.matrix[np.ix_(at, at)],
+    )
+
+
+def _known(rig: Rig, names: Sequence[str]) -> tuple[str, ...]:
+    if rig.covariance is None:
+        return ()
+    return tuple(n for n in rig.covariance.parameters if n.split(".")[0] in names)
+
+
+def _response(
+    sights: Sights, count: int, variance: float, told: Array | None
+) -> tuple[Array, Array]:
+    """Slopes of stations (F, 6, G) and points (P, 3, G) by what is shared, in some gauge."""
+    reduced = reduce_points(sights, count)
+    matrix = csc_matrix(reduced.matrix / variance)
+    free = np.ones(POSE * count, dtype=np.bool_)
+    if told is None:
+        free[:POSE] = False
+    else:
+        matrix = csc_matrix(matrix + diags_array(told.ravel()))
+    kept = np.flatnonzero(free)
+    cut: Any = matrix[kept][:, kept]
+    factor_of: Any = splu
+    factor = factor_of(
+        csc_matrix(cut), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )  # fmt: skip
+    shared = reduced.border.shape[1]
+    moved = np.zeros((POSE * count, shared))
+    moved[kept] = -factor.solve(np.ascontiguousarray(reduced.border[kept] / variance))
+    stations = moved.reshape(count, POSE, shared)
+    still = np.zeros_like(sights.miss)
+    points = [
+        moved_points(
+            sights.starts, sights.station, sights.by_point, sights.arm, sights.by_shared, still,
+            reduced.point_inverse, np.ascontiguousarray(stations[:, :, g]), np.eye(shared)[g],
+        )
+        for g in range(shared)
+    ]  # fmt: skip
+    return stations, np.stack(points, axis=-1)
