@@ -1,5 +1,4 @@
 import numpy as np
-import pytest
 
 from reconstruct.mapping.bundle import adjust_freely
 from reconstruct.mapping.priors import pinhole_positions, refine_with_positions
@@ -21,10 +20,3 @@ def test_vague_positions_do_not_spoil_a_model_of_precise_pixels() -> None:
     assert refined is not mapped
     free = camera_rms(mapped, scene)
     assert 0.5 * free < camera_rms(refined, scene) < 1.3 * free
-
-
-@pytest.mark.parametrize("noise_px", [0.1, 0.3])
-def test_the_sigma_of_pixels_is_found_from_residuals(noise_px: float) -> None:
-    scene = make_scene(lines=1, stations=5, points=3000, noise_px=noise_px)
-    found = pixel_sigma(adjust_freely(mapped_scene(scene)).model)
-    assert found == pytest.approx(noise_px, rel=0.15)

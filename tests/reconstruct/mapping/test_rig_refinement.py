@@ -180,7 +180,7 @@ def test_the_model_is_made_anew_on_the_refined_rig(tmp_path: Path) -> None:
     assert found.adjust.sigmas is not None
     assert found.rig.covariance is not None
     for keypoints, before in zip(found.seen.pixels, seen.pixels, strict=True):
-        assert 0.001 < np.abs(keypoints - before).max() < 1.0
+        assert 0.01 < np.abs(keypoints - before).max() < 3.0
     assert refined.baseline == pytest.approx(model_baseline(refined.model), rel=1e-9)
     written = read_rig(tmp_path / "rig.json")
     said = json.loads((tmp_path / "port.json").read_text())

@@ -62,6 +62,22 @@ def test_patches_are_aligned_to_hundredths_of_a_pixel() -> None:
     assert 1e-4 < miss < 0.04  # the noise leaves something
 
 
+@pytest.mark.parametrize("slope", [(0.012, 0.0), (0.0, -0.012)])
+def test_light_that_falls_off_across_a_patch_moves_nothing(slope: tuple[float, float]) -> None:
+    """A gain alone leaves a hundredth of a pixel towards the bright side, alike in all patches."""
+    texture, reference = Texture(0), spots(300)
+    first = texture.picture(np.eye(2), np.zeros(2))
+    x, y = np.meshgrid(*(np.arange(n) - n / 2 for n in SIZE))
+    fall = np.exp(slope[0] * x + slope[1] * y)
+    second = np.rint(100 * fall * first).astype(np.uint16)
+    same = np.broadcast_to(np.eye(2), (len(reference), 2, 2))
+    found = align_patches(first, second, reference, reference, same) - reference
+    kept = np.isfinite(found[:, 0])
+    assert kept.mean() > 0.95
+    assert np.abs(np.median(found[kept], axis=0)).max() < 2e-3
+    assert np.abs(found[kept]).max() < 0.05
+
+
 def test_alignment_equals_a_general_solver() -> None:
     texture, reference = Texture(4), spots(6)
     first = texture.picture(np.eye(2), np.zeros(2), noise=1.0)
