@@ -23,6 +23,8 @@ class Cost:
     """Largest sum of the proportional memory of all its processes, seen every 0.2 s."""
     code: int
     log: Path
+    stopped: bool = False
+    """Whether it took longer than it was given."""
 
     @property
     def ok(self) -> bool:
@@ -31,6 +33,8 @@ class Cost:
 
     def last_line(self) -> str:
         """The end of what it said: the error, if there was one."""
+        if self.stopped:
+            return f"stopped after {self.wall_s:.0f} s"
         lines = self.log.read_text(errors="replace").strip().splitlines()
         return lines[-1][:160] if lines else ""
 
@@ -39,13 +43,13 @@ def measured(command: Sequence[str], log: Path, timeout_s: float = 7200.0) -> Co
     """Run a command; what it says goes to a log."""
     log.parent.mkdir(parents=True, exist_ok=True)
     before = os.times()
-    started, peak = time.perf_counter(), 0.0
+    started, peak, late = time.perf_counter(), 0.0, False
     with log.open("w") as file:
         process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
         try:
             while process.poll() is None:
                 peak = max(peak, sum(_memory_mib(pid) for pid in _family(process.pid)))
-                if time.perf_counter() - started > timeout_s:
+                if late := time.perf_counter() - started > timeout_s:
                     break
                 time.sleep(_EVERY_S)
         finally:
@@ -61,6 +65,7 @@ def measured(command: Sequence[str], log: Path, timeout_s: float = 7200.0) -> Co
         peak_mib=peak,
         code=process.returncode,
         log=log,
+        stopped=late,
     )  # fmt: skip
 
 

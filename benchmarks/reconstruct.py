@@ -1,7 +1,7 @@
 """Reconstruction beside stock COLMAP and pyOrthomosaic on the same pictures, in one run.
 
     .venv/bin/python -m benchmarks.reconstruct --work FOLDER [--data ../shared/data]
-        [--demo WORKSPACE] [--pyorthomosaic PYTHON] [--only peers,growth,haltbrekken,brighton]
+        [--demo WORKSPACE] [--pyorthomosaic PYTHON] [--limit SECONDS] [--only peers,growth,haltbrekken,brighton]
         [--quick]
 
 `peers`: 50 and 100 rendered pictures of the demo (quarter resolution). Wall and processor time,
@@ -54,10 +54,10 @@ def ours(workspace: Path, stages: Sequence[str] = _STAGES) -> dict[str, Cost]:
     return costs
 
 
-def peer(name: str, interpreter: str, pictures: Path, out: Path) -> Cost:
+def peer(name: str, interpreter: str, pictures: Path, out: Path, limit_s: float) -> Cost:
     """Cost of another program on a folder of pictures."""
     command = [interpreter, str(_PEERS), name, str(pictures), str(out)]
-    return measured(command, out.with_suffix(".log"))
+    return measured(command, out.with_suffix(".log"), limit_s)
 
 
 _HEAD = (
@@ -82,7 +82,9 @@ def row(name: str, costs: Sequence[Cost], found: Accuracy | None) -> str:
     )
 
 
-def run_peers(work: Path, demo: Path, interpreter: str | None, counts: Sequence[int]) -> None:
+def run_peers(
+    work: Path, demo: Path, interpreter: str | None, counts: Sequence[int], limit_s: float
+) -> None:
     """Table of all programs on the same rendered pictures."""
     for count in counts:
         part = subset(demo, work / f"peers{count}", count)
@@ -100,7 +102,7 @@ def run_peers(work: Path, demo: Path, interpreter: str | None, counts: Sequence[
                 print(f"{name}: not installed; give --pyorthomosaic PYTHON")
                 continue
             out = _emptied(work / f"peers{count}_{name}")
-            cost = peer(name, python_of, folder, out)
+            cost = peer(name, python_of, folder, out, limit_s)
             accuracy = score_peer(out, part / "images" / "truth") if cost.ok else None
             print(row(name, [cost], accuracy), flush=True)
 
@@ -126,7 +128,7 @@ def run_growth(work: Path, counts: Sequence[int], scale: int) -> None:
               flush=True)  # fmt: skip
 
 
-def run_haltbrekken(work: Path, data: Path, interpreter: str | None) -> None:
+def run_haltbrekken(work: Path, data: Path, interpreter: str | None, limit_s: float) -> None:
     """Real stereo pictures without navigation: both mosaics in one picture."""
     source, workspace = data / "haltbrekken", _emptied(work / "haltbrekken")
     arguments = ["--left", str(source / "left"), "--right", str(source / "right")]
@@ -139,7 +141,7 @@ def run_haltbrekken(work: Path, data: Path, interpreter: str | None) -> None:
         return
     pictures = pictures_of(workspace, _emptied(work / "haltbrekken_pictures"))
     out = _emptied(work / "haltbrekken_pyorthomosaic")
-    cost = peer("pyorthomosaic", interpreter, pictures, out)
+    cost = peer("pyorthomosaic", interpreter, pictures, out, limit_s)
     print(f"{row('pyorthomosaic', [cost], None)}  {peer_registered(out, cost)}")
     if cost.ok and costs.get("mosaic") is not None and costs["mosaic"].ok:
         target = work / "haltbrekken_mosaics.png"
@@ -147,7 +149,7 @@ def run_haltbrekken(work: Path, data: Path, interpreter: str | None) -> None:
         print(f"both mosaics: {target}")
 
 
-def run_brighton(work: Path, data: Path, interpreter: str | None) -> None:
+def run_brighton(work: Path, data: Path, interpreter: str | None, limit_s: float) -> None:
     """Real drone pictures: distance from another tool's cloud."""
     from reconstruct.evaluate.cloud_files import read_reference
     from reconstruct.evaluate.cloud_registration import Surface, register_cloud
@@ -167,7 +169,7 @@ def run_brighton(work: Path, data: Path, interpreter: str | None) -> None:
         print("pyorthomosaic: not installed; give --pyorthomosaic PYTHON")
         return
     out = _emptied(work / "brighton_pyorthomosaic")
-    cost = peer("pyorthomosaic", interpreter, source / "images", out)
+    cost = peer("pyorthomosaic", interpreter, source / "images", out, limit_s)
     print(f"{row('pyorthomosaic', [cost], None)}  {peer_registered(out, cost)}")
     if not cost.ok:
         return
@@ -251,6 +253,9 @@ def main() -> None:
     parser.add_argument("--demo", type=Path, help="workspace with rendered demo pictures")
     parser.add_argument("--pyorthomosaic", help="a Python that has pyOrthomosaic")
     parser.add_argument("--only", default=",".join(PARTS), help="parts, by commas")
+    parser.add_argument(
+        "--limit", type=float, default=3600.0, help="seconds that another program may take"
+    )
     parser.add_argument("--quick", action="store_true", help="small surveys, to see that it runs")
     given = parser.parse_args()
     parts = given.only.split(",")
@@ -265,13 +270,14 @@ def main() -> None:
         if demo is None:
             demo = work / "demo"
             render(demo, survey_toml(20 if given.quick else 116, 8 if given.quick else 4))
-        run_peers(work, demo.resolve(), interpreter, [16] if given.quick else [50, 100])
+        counts = [16] if given.quick else [50, 100]
+        run_peers(work, demo.resolve(), interpreter, counts, given.limit)
     if "growth" in parts:
         run_growth(work, [12, 24] if given.quick else [50, 100, 200, 400], 8)
     for name, function in (("haltbrekken", run_haltbrekken), ("brighton", run_brighton)):
         if name in parts:
             if (given.data / ("brighton_beach" if name == "brighton" else name)).is_dir():
-                function(work, given.data.resolve(), interpreter)
+                function(work, given.data.resolve(), interpreter, given.limit)
             else:
                 print(f"\n{name}: no pictures in {given.data}")
 
