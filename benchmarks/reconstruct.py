@@ -1,8 +1,8 @@
 """Reconstruction beside stock COLMAP and pyOrthomosaic on the same pictures, in one run.
 
     .venv/bin/python -m benchmarks.reconstruct --work FOLDER [--data ../shared/data]
-        [--demo WORKSPACE] [--pyorthomosaic PYTHON] [--limit SECONDS] [--only peers,growth,haltbrekken,brighton]
-        [--quick]
+        [--demo WORKSPACE] [--pyorthomosaic PYTHON] [--limit SECONDS]
+        [--only peers,growth,haltbrekken,brighton] [--quick]
 
 `peers`: 50 and 100 rendered pictures of the demo (quarter resolution). Wall and processor time,
 peak memory with children, pictures registered, and errors against the truth. Our model is aligned
