@@ -271,7 +271,7 @@ class ReconstructConfig(Config):
     mapper: Literal["auto", "global", "incremental"] = "auto"
     mount_sigma_deg: float = Field(0.0, ge=0, le=20)
     refine_port: bool = False
-    refine_rig: bool = False
+    refine_rig: Literal["auto", "on", "off"] = "auto"
     dense_scale: float | None = Field(None, gt=0.05, le=1)
     dense_partners: int = Field(4, ge=1, le=12)
     dem_cell_m: float | None = Field(None, gt=0, le=10)

@@ -7,7 +7,7 @@ interrupted run goes on with the features it has.
 import hashlib
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +28,7 @@ from reconstruct.mapping.mapper import Mapped, map_calibrated
 from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import Convergence, refract
 from reconstruct.mapping.self_calibration import SIMPLE, map_self_calibrated
-from reconstruct.mapping.survey_rig import refine_rig
+from reconstruct.mapping.survey_rig import refine_as_set
 from reconstruct.mapping.uncertainty import save_uncertainty
 from reconstruct.mapping.working_range import Distances, find_distances
 from reconstruct.matching.features import find_features, load_features, save_features
@@ -94,7 +94,7 @@ def run_mapping(
     settings = config.reconstruct
     stage = Stage(
         name="mapping",
-        version=2,
+        version=3,
         settings={
             "seed": config.seed,
             **settings.model_dump(
@@ -148,18 +148,12 @@ def run_mapping(
             adjust = NavigationAdjuster(inputs.records, inputs.rig, lenses, inputs.datum)
             mapped, refracted = refract(mapped, seen, partial, adjust, poses)
             rig = inputs.rig
-            if settings.refine_port or settings.refine_rig:
-                found = refine_rig(
-                    mapped,
-                    seen,
-                    inputs.rig,
-                    distances,
-                    adjust,
-                    inputs.datum,
-                    partial,
-                    port=settings.refine_port,
-                    pose=settings.refine_rig,
-                )
+            found = refine_as_set(
+                mapped, seen, rig, distances, adjust, inputs.datum, partial, settings
+            )
+            if isinstance(found, str):
+                mapped = replace(mapped, notes=(*mapped.notes, found))
+            elif found is not None:
                 mapped, refracted, adjust = found.mapped, found.convergence, found.adjust
                 seen, rig = found.seen, found.rig
             sigmas = adjust.sigmas

@@ -4,6 +4,7 @@ It writes `port.json` (values, sigmas, correlation) and `rig.json` (the refined 
 model.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,8 +13,10 @@ import pycolmap
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.artefacts import write_json
+from alice_survey.config import ReconstructConfig
 from alice_survey.errors import ReconstructionError
 from alice_survey.frames import Array, Datum
+from camera_calib.calibration.freedom import pose_names
 from camera_calib.rig import Rig, write_rig
 from reconstruct.lenses.lens import FlatPortLens, Lens, flat_port_lens
 from reconstruct.mapping.database import Observations, rigid3d
@@ -38,6 +41,60 @@ class Refined:
     """How the keypoints came to rest."""
     adjust: NavigationAdjuster
     """What adjusted the model."""
+
+
+def poses_are_calibrated(rig: Rig, names: Sequence[str]) -> bool:
+    """Whether a rig states how well the poses of these cameras on it are known."""
+    moving = [n for n in pose_names(rig) if n.split(".")[0] in names]
+    return bool(moving) and set(moving) <= set(rig.sigmas)
+
+
+def refine_as_set(
+    mapped: Mapped,
+    seen: Observations,
+    rig: Rig,
+    distances: Distances | None,
+    adjust: NavigationAdjuster,
+    datum: Datum | None,
+    folder: Path,
+    settings: ReconstructConfig,
+) -> Refined | str | None:
+    """Refine a rig if the settings or its calibration call for it.
+
+    A calibration that states its covariance leaves the poses on the rig to the survey as well,
+    unless that is turned off: the two together know more than either.
+
+    Args:
+        mapped: exact model on the rig; picture i of `seen` has the id i + 1.
+        seen: keypoints as warped by the model's lenses.
+        rig: as calibrated or designed.
+        distances: for which the new lenses are the best.
+        adjust: that adjusted the model.
+        datum: of the positions of navigation.
+        folder: where `port.json` and `rig.json` go.
+        settings: `refine_port` and `refine_rig`.
+
+    Returns:
+        The survey on its own rig; what kept it from that, where nobody insisted; None where
+        nothing calls for it.
+
+    Raises:
+        ReconstructionError: as `refine_rig`, where the settings insist.
+    """
+    insisted = settings.refine_port or settings.refine_rig == "on"
+    calibrated = poses_are_calibrated(rig, list(seen.cameras))
+    pose = settings.refine_rig == "on" or (settings.refine_rig == "auto" and calibrated)
+    if not (settings.refine_port or pose):
+        return None
+    try:
+        return refine_rig(
+            mapped, seen, rig, distances, adjust, datum, folder,
+            port=settings.refine_port, pose=pose,
+        )  # fmt: skip
+    except ReconstructionError as error:
+        if insisted:
+            raise
+        return f"rig as calibrated: {error}"
 
 
 def refine_rig(
@@ -71,7 +128,7 @@ def refine_rig(
     if not mapped.scaled or distances is None:
         raise ReconstructionError(
             "refine_port and refine_rig need two cameras, whose known baseline gives the scale: "
-            "turn them off under [reconstruct] in survey.toml"
+            'set refine_port = false and refine_rig = "off" in survey.toml'
         )
     told = None
     if datum is not None and adjust.sigmas is not None:

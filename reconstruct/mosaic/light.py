@@ -6,7 +6,9 @@ shows. Two pictures that see one spot share J, so that their difference tells m 
 assumption about the scene (the multiplicative part of Koeser et al. 2021, "Robustly removing deep
 sea lighting effects for visual mapping of abyssal plains"). What overlaps cannot tell, such as the
 fall-off across a single line, is taken from the median of all pictures, in which the scene averages
-out; it weighs the more, the more pictures there are. No picture is stretched by itself.
+out; it weighs the more, the more pictures there are. Along a line a lamp brighter ahead looks like
+pictures that grow darker one by one: there the pictures' own brightness tells, which the sea floor
+changes at random and a drift would not. Where overlaps speak they outweigh both.
 """
 
 from collections.abc import Mapping, Sequence
@@ -41,6 +43,8 @@ _SCENE_SIGMA = 0.5
 """Spread of the sea floor's own logarithmic brightness from picture to picture."""
 _FEWEST_PICTURES = 6
 """Of a camera, for their median to say something."""
+_LEAST_SHOWN = 0.5
+"""Of a picture's nodes, for its brightness to be known."""
 _LARGEST_GAIN = 8.0
 _WHITE_LEVEL, _WHITE_PERCENT = 215.0, 98.0
 _GREY_LEVEL = 128.0
@@ -211,6 +215,7 @@ def solve_patterns(
     equations = _equations(samples, camera_of, len(names))
     bends = _prior(len(names), _FALL_OFF_SIGMA / middle if middle > 0 else 1.0)
     pull, pulled = _typical(nodes, camera_of, len(names))
+    brightness, told = _brightness(nodes, camera_of, len(names))
     levels = samples.levels.astype(np.float64)
     found = [
         solve_robustly(
@@ -219,7 +224,8 @@ def solve_patterns(
             Prior(
                 patterns=bends + np.diag(pull[:, channel]),
                 right=pulled[:, channel],
-                gain=gain_sigma**-2,
+                gain=gain_sigma**-2 + told / _SCENE_SIGMA**2,
+                gain_right=brightness[:, channel] / _SCENE_SIGMA**2,
             ),
             _MISFIT,
             SAMPLES_PER_FACT,
@@ -318,6 +324,27 @@ def _typical(nodes: Array, camera_of: NDArray[np.int64], cameras: int) -> tuple[
                 pull[at, channel] = weight
                 pulled[at, channel] = weight * np.median(values)
     return pull, pulled
+
+
+def _brightness(nodes: Array, camera_of: NDArray[np.int64], cameras: int) -> tuple[Array, Array]:
+    """By how much pictures are brighter than their camera's others, (V, 3); whether told, (V,).
+
+    Only nodes that a camera's pictures have in common are compared.
+    """
+    found, told = np.zeros((len(nodes), 3)), np.zeros(len(nodes))
+    for camera in range(cameras):
+        mine = np.flatnonzero(camera_of == camera)
+        pictures = nodes[mine].reshape(len(mine), -1, 3)
+        usual = np.isfinite(pictures).all(axis=2).sum(axis=0) >= _FEWEST_PICTURES
+        above = pictures[:, usual] - np.nanmedian(pictures[:, usual], axis=0)
+        shown = np.isfinite(above).all(axis=2)
+        known = shown.sum(axis=1) > _LEAST_SHOWN * pictures.shape[1]
+        mean = np.where(shown[..., None], above, 0.0).sum(axis=1)
+        mean = mean / np.maximum(shown.sum(axis=1, keepdims=True), 1)
+        if known.any():
+            found[mine[known]] = mean[known] - mean[known].mean(axis=0)
+            told[mine[known]] = 1.0
+    return found, told
 
 
 def at_nodes(low: NDArray[np.float32]) -> Array:

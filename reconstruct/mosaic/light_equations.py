@@ -50,8 +50,10 @@ class Prior:
     """(P + 1, P + 1) normal matrix of nodes and fall-off."""
     right: Array
     """(P + 1,)."""
-    gain: float
-    """Inverse variance of a picture's gain."""
+    gain: Array
+    """(V,) inverse variance of each picture's gain."""
+    gain_right: Array
+    """(V,) that times the gain expected."""
 
 
 def solve_robustly(
@@ -78,7 +80,7 @@ def solve_robustly(
             misfit, per_fact,
         )  # fmt: skip
         dense = dense + np.triu(dense, 1).T + prior.patterns
-        right = right + prior.right
+        right, right_gains = right + prior.right, right_gains + prior.gain_right
         block = _gains_block(e, own + prior.gain, shared)
         wanted = np.column_stack([mixed.T, right_gains])
         if e.pictures <= _DENSE_PICTURES:

@@ -4,11 +4,14 @@ import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pycolmap
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.config import ReconstructConfig
 from alice_survey.errors import ReconstructionError
 from camera_calib.calibration.freedom import value
 from camera_calib.rig import Covariance, Rig, read_rig
@@ -19,7 +22,7 @@ from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import refract
 from reconstruct.mapping.rig_refinement import RigFit, Told, fit_rig
-from reconstruct.mapping.survey_rig import on_rig, refine_rig
+from reconstruct.mapping.survey_rig import Refined, on_rig, refine_as_set, refine_rig
 from reconstruct.mapping.working_range import Distances
 from reconstruct.sparse.alignment import align_rigid
 from tests.reconstruct.scenes import DATUM, Scene, make_scene
@@ -194,6 +197,49 @@ def test_the_model_is_made_anew_on_the_refined_rig(tmp_path: Path) -> None:
     away = align_rigid(points, true_points).apply(points) - true_points
     assert np.sqrt((away**2).sum(axis=1).mean()) < 3e-3
     assert refined.model.compute_mean_reprojection_error() < 0.45
+
+
+def test_a_calibration_with_sigmas_lets_the_survey_refine_the_rig(tmp_path: Path) -> None:
+    scene = noisy(6)
+    names = ("right.rx_rad", "right.ry_rad", "right.rz_rad", "right.x_m", "right.y_m", "right.z_m")
+    sigmas = np.array([*[TURN_SIGMA] * 3, 1e-5, 1e-4, 1e-4])
+    known = Covariance(parameters=names, matrix=np.diag(sigmas**2))
+    turned = Rotation.from_rotvec([0.0, 1.5 * TURN_SIGMA, 0.0])
+    pose = scene.rig.cam_from_rig["right"]
+    wrong = replace(
+        scene.rig,
+        covariance=known,
+        cam_from_rig={
+            **scene.rig.cam_from_rig,
+            "right": RigidTransform.from_components(pose.translation, turned * pose.rotation),
+        },
+    )
+    mapped, seen = modelled(scene, wrong, tmp_path)
+    adjust = NavigationAdjuster(scene.records, wrong, mapped.lenses, None)
+    distances = Distances(near_m=1.75, far_m=2.35, source="test")
+
+    def refined(rig: Rig, model: Mapped = mapped, **settings: Any) -> Refined | str | None:
+        return refine_as_set(
+            model, seen, rig, distances, adjust, None, tmp_path, ReconstructConfig(**settings)
+        )
+
+    found = refined(wrong)
+    assert isinstance(found, Refined)
+    before, after = (
+        np.sqrt((align_rigid(p, t).apply(p) - t) ** 2).mean()
+        for p, t in (pupils_and_points(m, scene)[2:] for m in (mapped, found.mapped))
+    )
+    assert after < 0.5 * before
+    assert refined(wrong, refine_rig="off") is None
+    assert refined(replace(wrong, covariance=None)) is None
+    few = replace(mapped, model=pycolmap.Reconstruction(mapped.model))
+    for point in sorted(few.model.points3D)[12:]:
+        few.model.delete_point3D(point)
+    said = refined(wrong, few)
+    assert isinstance(said, str)
+    assert "12 points" in said
+    with pytest.raises(ReconstructionError, match="12 points"):
+        refined(wrong, few, refine_rig="on")
 
 
 def test_the_same_rig_gives_the_same_model(tmp_path: Path) -> None:

@@ -55,7 +55,7 @@ def leaning(scene: Scene, share: float, by_px: float) -> Scene:
 
 
 def test_wrong_observations_that_lean_one_way_bend_no_block() -> None:
-    """As the edges of shadows do, which go with the lamps; least squares is off three times as far."""
+    """As the edges of shadows do, which go with the lamps; least squares is thrice as far off."""
     scene = make_scene(lines=3, stations=5, points=6000, noise_px=0.05, seed=3)
     clean = camera_rms(adjust_freely(mapped_scene(scene)), scene)
     wrong = leaning(scene, 0.1, 1.0)

@@ -11,6 +11,7 @@ from reconstruct.mosaic.light import (
     low_pass,
     read_light,
     solve_light,
+    solve_patterns,
     write_light,
 )
 
@@ -81,6 +82,41 @@ def test_the_median_picture_tells_what_a_single_line_cannot():
     helped = solve_light(found, shown, IMAGES, ["left"] * len(IMAGES)).patterns["left"][..., 1]
     assert misfit(alone) > 0.06
     assert misfit(helped) < 0.04
+
+
+def drift_of_a_long_line(seed: int, *, pictures: int = 30) -> float:
+    """Change of the gains from end to end, a stop free each; the truth is none.
+
+    The lamp is brighter ahead; each picture's ground is darker or brighter, and on one side.
+    """
+    rng = np.random.default_rng(seed)
+    images = [f"left/{n}.png" for n in range(pictures)]
+    own = rng.normal(0, 0.2, (pictures, 1, 1))
+    own = own + rng.normal(0, 0.5, (pictures, 1, 1)) * (NODES_Y - 0.5)
+    lamp = pattern(NODES_X, NODES_Y) + 0.4 * (NODES_Y - 0.5)
+    nodes = np.repeat((4.2 + lamp + own)[..., None], 3, axis=-1)
+    parts = []
+    for a in range(pictures - 1):
+        here = rng.uniform([0, 0.3], 1, (280, 2))
+        both = (here, here - [0.0, 0.3])
+        levels = [
+            rng.normal(4.2, 0.02, (280, 3)) + (pattern(*p.T) + 0.4 * p[:, 1])[:, None] for p in both
+        ]
+        parts.append(
+            LightSamples(
+                views=np.tile(np.array([a, a + 1], np.int32), (280, 1)),
+                places=np.stack(both, axis=1).astype(np.float32),
+                levels=np.stack(levels, axis=1).astype(np.float32),
+            )
+        )
+    light = solve_patterns(joined_samples(parts), nodes, images, ["left"] * pictures, 1.0)
+    gains = [light.gains[n][1] for n in images]
+    return float(np.polyfit(np.linspace(0, 1, pictures), gains, 1)[0])
+
+
+def test_a_long_line_does_not_drift_from_bright_to_dark():
+    drifts = [drift_of_a_long_line(seed) for seed in range(6)]
+    assert 0.01 < np.sqrt(np.mean(np.square(drifts))) < 0.6  # 0.8 without their brightness
 
 
 def test_corrected_views_of_a_spot_agree_better_than_raw_ones():
