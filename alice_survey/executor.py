@@ -10,11 +10,14 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sized
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from contextvars import ContextVar
 from typing import TypeVar
 
 _PR_SET_PDEATHSIG = 1
 _WORTH_TELLING_S = 2.0
 _CORES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+_kept: ContextVar[dict[int, ProcessPoolExecutor] | None] = ContextVar("kept", default=None)
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -51,12 +54,35 @@ def parallel_map(
     if threads <= 1:
         yield from progress(map(function, items), label, total)
         return
-    context = multiprocessing.get_context("spawn")
-    with (
-        _one_core_each(),
-        ProcessPoolExecutor(threads, mp_context=context, initializer=_start_worker) as executor,
-    ):
+    kept = _kept.get()
+    if kept is not None:
+        if threads not in kept:
+            kept[threads] = _workers(threads)
+        yield from progress(_in_order(kept[threads], function, items, 3 * threads), label, total)
+        return
+    with _workers(threads) as executor:
         yield from progress(_in_order(executor, function, items, 3 * threads), label, total)
+
+
+@contextlib.contextmanager
+def kept_workers() -> Iterator[None]:
+    """Within this block all calls of `parallel_map` share their processes.
+
+    To start one and to load its libraries takes about two seconds of computing.
+    """
+    kept: dict[int, ProcessPoolExecutor] = {}
+    token = _kept.set(kept)
+    try:
+        yield
+    finally:
+        _kept.reset(token)
+        for pool in kept.values():
+            pool.shutdown(cancel_futures=True)
+
+
+def _workers(threads: int) -> ProcessPoolExecutor:
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(threads, mp_context=context, initializer=_start_worker)
 
 
 def _in_order(
@@ -65,7 +91,8 @@ def _in_order(
     waiting: deque[Future[Result]] = deque()
     try:
         for item in items:
-            waiting.append(executor.submit(function, item))
+            with _one_core_each():  # a process starts when there is something for it to do
+                waiting.append(executor.submit(function, item))
             if len(waiting) >= queued:
                 yield waiting.popleft().result()
         while waiting:

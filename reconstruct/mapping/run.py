@@ -16,7 +16,7 @@ import pycolmap
 from alice_survey.artefacts import Stage, atomic_path, run_stage, write_json
 from alice_survey.config import SurveyConfig
 from alice_survey.errors import ImageError, WorkspaceError, warn
-from alice_survey.executor import parallel_map
+from alice_survey.executor import kept_workers, parallel_map
 from alice_survey.frames import Datum
 from alice_survey.manifest import ImageRecord
 from camera_calib.rig import Rig
@@ -113,6 +113,7 @@ def run_mapping(
         resumes=True,
     )
 
+    @kept_workers()
     def work(partial: Path) -> None:
         pycolmap.logging.minloglevel = 2  # its own account of every step is for its developers
         features = _find_all(inputs, partial / "features", config, threads)

@@ -338,7 +338,7 @@ def _brightness(nodes: Array, camera_of: NDArray[np.int64], cameras: int) -> tup
         usual = np.isfinite(pictures).all(axis=2).sum(axis=0) >= _FEWEST_PICTURES
         above = pictures[:, usual] - np.nanmedian(pictures[:, usual], axis=0)
         shown = np.isfinite(above).all(axis=2)
-        known = shown.sum(axis=1) > _LEAST_SHOWN * pictures.shape[1]
+        known = np.asarray(shown.sum(axis=1)) > _LEAST_SHOWN * pictures.shape[1]
         mean = np.where(shown[..., None], above, 0.0).sum(axis=1)
         mean = mean / np.maximum(shown.sum(axis=1, keepdims=True), 1)
         if known.any():

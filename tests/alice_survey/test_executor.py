@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from alice_survey.executor import parallel_map
+from alice_survey.executor import kept_workers, parallel_map
 
 WORKERS = """
 import os, sys, time
@@ -34,6 +34,29 @@ def test_results_come_in_order(threads: int) -> None:
     assert list(parallel_map(abs, range(-20, 20), threads=threads, label="abs")) == [
         abs(i) for i in range(-20, 20)
     ]
+
+
+def _process(_: int) -> int:
+    time.sleep(0.05)
+    return os.getpid()
+
+
+def test_kept_workers_are_the_same_from_call_to_call_and_end_with_their_block() -> None:
+    with kept_workers():
+        first, second = (
+            set(parallel_map(_process, range(8), threads=2, label="ids")) for _ in range(2)
+        )
+        with pytest.raises(TypeError):
+            list(parallel_map(abs, [1, "a", 2], threads=2, label="abs"))  # type: ignore[list-item]
+        third = set(parallel_map(_process, range(8), threads=2, label="ids"))
+    assert len(first) == 2
+    assert first == second == third
+    for _ in range(100):
+        if not any(Path(f"/proc/{pid}").exists() for pid in first):
+            break
+        time.sleep(0.1)
+    assert not any(Path(f"/proc/{pid}").exists() for pid in first)
+    assert set(parallel_map(_process, range(8), threads=2, label="ids")).isdisjoint(first)
 
 
 def test_a_fault_of_the_work_reaches_the_caller() -> None:
