@@ -337,12 +337,13 @@ def _brightness(nodes: Array, camera_of: NDArray[np.int64], cameras: int) -> tup
         pictures = nodes[mine].reshape(len(mine), -1, 3)
         usual = np.isfinite(pictures).all(axis=2).sum(axis=0) >= _FEWEST_PICTURES
         above = pictures[:, usual] - np.nanmedian(pictures[:, usual], axis=0)
-        shown = np.isfinite(above).all(axis=2)
-        known = np.asarray(shown.sum(axis=1)) > _LEAST_SHOWN * pictures.shape[1]
-        mean = np.where(shown[..., None], above, 0.0).sum(axis=1)
-        mean = mean / np.maximum(shown.sum(axis=1, keepdims=True), 1)
-        if known.any():
-            found[mine[known]] = mean[known] - mean[known].mean(axis=0)
+        shown: NDArray[np.bool_] = np.asarray(np.isfinite(above).all(axis=2))
+        count = np.count_nonzero(shown, axis=1)
+        known = np.flatnonzero(count > _LEAST_SHOWN * pictures.shape[1])
+        if len(known):
+            total = np.where(shown[..., None], above, 0.0).sum(axis=1)
+            mean = total[known] / count[known, None]
+            found[mine[known]] = mean - mean.mean(axis=0)
             told[mine[known]] = 1.0
     return found, told
 
