@@ -2,9 +2,9 @@
 
     .venv/bin/python -m benchmarks.reconstruct --work FOLDER [--data ../shared/data]
         [--demo WORKSPACE] [--pyorthomosaic PYTHON] [--limit SECONDS]
-        [--only peers,growth,haltbrekken,brighton] [--quick]
+        [--only peers,growth,haltbrekken,brighton] [--pictures 50,100] [--quick]
 
-`peers`: 50 and 100 rendered pictures of the demo (quarter resolution). Wall and processor time,
+`peers`: rendered pictures of the demo (quarter resolution), 50 and 100 by default. Wall and processor time,
 peak memory with children, pictures registered, and errors against the truth. Our model is aligned
 rigidly; the others know no scale and are aligned with a free one. COLMAP ends at the sparse model.
 Ours runs on a few pictures first, so that its kernels are compiled, as the others' are.
@@ -258,6 +258,7 @@ def main() -> None:
     parser.add_argument(
         "--limit", type=float, default=3600.0, help="seconds that another program may take"
     )
+    parser.add_argument("--pictures", default="50,100", help="of `peers`, by commas")
     parser.add_argument("--quick", action="store_true", help="small surveys, to see that it runs")
     given = parser.parse_args()
     parts = given.only.split(",")
@@ -272,7 +273,7 @@ def main() -> None:
         if demo is None:
             demo = work / "demo"
             render(demo, survey_toml(20 if given.quick else 116, 8 if given.quick else 4))
-        counts = [16] if given.quick else [50, 100]
+        counts = [16] if given.quick else [int(n) for n in given.pictures.split(",")]
         run_peers(work, demo.resolve(), interpreter, counts, given.limit)
     if "growth" in parts:
         run_growth(work, [12, 24] if given.quick else [50, 100, 200, 400], 8)
