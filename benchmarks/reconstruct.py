@@ -4,9 +4,10 @@
         [--demo WORKSPACE] [--pyorthomosaic PYTHON] [--limit SECONDS]
         [--only peers,growth,haltbrekken,brighton] [--pictures 50,100] [--quick]
 
-`peers`: rendered pictures of the demo (quarter resolution), 50 and 100 by default. Wall and processor time,
-peak memory with children, pictures registered, and errors against the truth. Our model is aligned
-rigidly; the others know no scale and are aligned with a free one. COLMAP ends at the sparse model.
+`peers`: rendered pictures of the demo (quarter resolution), 50 and 100 by default. Wall and
+processor time, peak memory with children, pictures registered, and errors against the truth. Our
+model is aligned rigidly; the others know no scale and are aligned with a free one. COLMAP ends at
+the sparse model.
 Ours runs on a few pictures first, so that its kernels are compiled, as the others' are.
 `growth`: our own cost on 50, 100, 200 and 400 pictures at an eighth of the resolution.
 `haltbrekken`, `brighton`: real pictures of the folder given by `--data`; a picture of both

@@ -28,9 +28,12 @@ from reconstruct.mapping.arrays import Indices, observed
 from reconstruct.mapping.bundle import Adjust, adjust_freely
 from reconstruct.mapping.database import Observations, write_database
 from reconstruct.mapping.mapper import Mapped
+from reconstruct.mapping.robust import pixel_sigma
 
 SETTLED_PX = 1e-4
 """Keypoints that move less have converged."""
+_SETTLED_SIGMAS = 0.05
+"""And so have those that move less than this share of their noise, the farthest of them."""
 _ROUNDS = 6
 _UNMOVED_PX = 1e-6
 """Keypoints that move less are not written anew."""
@@ -57,11 +60,8 @@ class Convergence:
     """Observations that the exact keypoints showed to be wrong."""
     added: int
     """Observations that they let in."""
-
-    @property
-    def settled(self) -> bool:
-        """Whether the last shift was negligible."""
-        return bool(self.moved_px) and self.moved_px[-1] < SETTLED_PX
+    settled: bool
+    """Whether the last shift was negligible."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -175,6 +175,8 @@ def refract(
     folder: Path,
     adjust: Adjust = adjust_freely,
     cam_from_rig: Mapping[str, RigidTransform] | None = None,
+    *,
+    settle: bool = True,
 ) -> tuple[Mapped, Convergence]:
     """Make a model exact that was mapped from keypoints warped at one working depth.
 
@@ -188,6 +190,8 @@ def refract(
         folder: for scratch files.
         adjust: how to adjust, such as with priors.
         cam_from_rig: poses of the flat-port cameras on one rig; None without one.
+        settle: go on until keypoints rest; else end after the first turn, near enough to refine
+            the rig from.
 
     Returns:
         The exact model, and how the keypoints came to rest.
@@ -195,7 +199,8 @@ def refract(
     keypoints = Keypoints(mapped, seen)
     if not keypoints.through_ports:
         mapped = adjust(mapped)
-        return mapped, Convergence(moved_px=(0.0,), corrected_px=0.0, removed=0, added=0)
+        none = Convergence(moved_px=(0.0,), corrected_px=0.0, removed=0, added=0, settled=True)
+        return mapped, none
     notes = mapped.notes
     if not mapped.scaled:
         notes = (
@@ -205,12 +210,14 @@ def refract(
     model = pycolmap.Reconstruction(mapped.model)
     moves: list[float] = []
     removed = added = 0
+    settled = False
     corrected = 0.0
     while len(moves) < _ROUNDS:
         scale = 1.0 if mapped.scaled else keypoints.metres_per_unit(model)
         moved, corrected = keypoints.correct(model, scale)
         moves.append(moved)
-        if len(moves) > 2 and moved < SETTLED_PX:
+        if len(moves) > 2 and moved < max(SETTLED_PX, _SETTLED_SIGMAS * pixel_sigma(model)):
+            settled = True
             break
         mapped = adjust(replace(mapped, model=model, notes=notes))
         model = pycolmap.Reconstruction(mapped.model)
@@ -218,9 +225,17 @@ def refract(
             keypoints.correct_unseen(model, scale)
             removed, added = _judge_again(model, seen, folder, _pinholes(mapped, cam_from_rig))
             keypoints.look_again(model)
+            if not settle:
+                break
     model.update_point_3d_errors()
-    found = Convergence(moved_px=tuple(moves), corrected_px=corrected, removed=removed, added=added)
-    if not found.settled:
+    found = Convergence(
+        moved_px=tuple(moves),
+        corrected_px=corrected,
+        removed=removed,
+        added=added,
+        settled=settled,
+    )
+    if settle and not settled:
         warn(
             f"refraction did not settle in {_ROUNDS} rounds: keypoints still move by "
             f"{moves[-1]:.2g} px; check the port's distance and the working range"

@@ -28,7 +28,7 @@ from reconstruct.mapping.mapper import Mapped, map_calibrated
 from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import Convergence, refract
 from reconstruct.mapping.self_calibration import SIMPLE, map_self_calibrated
-from reconstruct.mapping.survey_rig import refine_as_set
+from reconstruct.mapping.survey_rig import Refined, frees_rig, refine_as_set
 from reconstruct.mapping.uncertainty import save_uncertainty
 from reconstruct.mapping.working_range import Distances, find_distances
 from reconstruct.matching.features import find_features, load_features, save_features
@@ -147,16 +147,18 @@ def run_mapping(
                 threads=threads,
             )
             adjust = NavigationAdjuster(inputs.records, inputs.rig, lenses, inputs.datum)
-            mapped, refracted = refract(mapped, seen, partial, adjust, poses)
-            rig = inputs.rig
-            found = refine_as_set(
-                mapped, seen, rig, distances, adjust, inputs.datum, partial, settings
-            )
-            if isinstance(found, str):
-                mapped = replace(mapped, notes=(*mapped.notes, found))
-            elif found is not None:
-                mapped, refracted, adjust = found.mapped, found.convergence, found.adjust
-                seen, rig = found.seen, found.rig
+            rig, free = inputs.rig, frees_rig(settings, inputs.rig, list(cameras))
+            mapped, refracted = refract(mapped, seen, partial, adjust, poses, settle=not free)
+            if free:
+                found = refine_as_set(
+                    mapped, seen, rig, distances, adjust, inputs.datum, partial, settings
+                )
+                if isinstance(found, Refined):
+                    mapped, refracted, adjust = found.mapped, found.convergence, found.adjust
+                    seen, rig = found.seen, found.rig
+                else:
+                    mapped = replace(mapped, notes=(*mapped.notes, found))
+                    mapped, refracted = refract(mapped, seen, partial, adjust, poses)
             sigmas = adjust.sigmas
         else:
             mapped = map_self_calibrated(seen, exif_focal, partial, config.seed)

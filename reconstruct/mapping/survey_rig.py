@@ -49,6 +49,21 @@ def poses_are_calibrated(rig: Rig, names: Sequence[str]) -> bool:
     return bool(moving) and set(moving) <= set(rig.sigmas)
 
 
+def frees_rig(settings: ReconstructConfig, rig: Rig, names: Sequence[str]) -> bool:
+    """Whether the settings, or the calibration, call for a refinement of the rig.
+
+    A calibration that states its covariance leaves the poses on the rig to the survey as well,
+    unless that is turned off: the two together know more than either.
+    """
+    return settings.refine_port or _frees_poses(settings, rig, names)
+
+
+def _frees_poses(settings: ReconstructConfig, rig: Rig, names: Sequence[str]) -> bool:
+    if settings.refine_rig == "auto":
+        return poses_are_calibrated(rig, names)
+    return settings.refine_rig == "on"
+
+
 def refine_as_set(
     mapped: Mapped,
     seen: Observations,
@@ -58,14 +73,11 @@ def refine_as_set(
     datum: Datum | None,
     folder: Path,
     settings: ReconstructConfig,
-) -> Refined | str | None:
-    """Refine a rig if the settings or its calibration call for it.
-
-    A calibration that states its covariance leaves the poses on the rig to the survey as well,
-    unless that is turned off: the two together know more than either.
+) -> Refined | str:
+    """Refine a rig as far as `frees_rig` calls for it.
 
     Args:
-        mapped: exact model on the rig; picture i of `seen` has the id i + 1.
+        mapped: model on the rig, near its end; picture i of `seen` has the id i + 1.
         seen: keypoints as warped by the model's lenses.
         rig: as calibrated or designed.
         distances: for which the new lenses are the best.
@@ -75,24 +87,19 @@ def refine_as_set(
         settings: `refine_port` and `refine_rig`.
 
     Returns:
-        The survey on its own rig; what kept it from that, where nobody insisted; None where
-        nothing calls for it.
+        The survey on its own rig; what kept it from that, where nobody insisted.
 
     Raises:
         ReconstructionError: as `refine_rig`, where the settings insist.
     """
-    insisted = settings.refine_port or settings.refine_rig == "on"
-    calibrated = poses_are_calibrated(rig, list(seen.cameras))
-    pose = settings.refine_rig == "on" or (settings.refine_rig == "auto" and calibrated)
-    if not (settings.refine_port or pose):
-        return None
+    pose = _frees_poses(settings, rig, list(seen.cameras))
     try:
         return refine_rig(
             mapped, seen, rig, distances, adjust, datum, folder,
             port=settings.refine_port, pose=pose,
         )  # fmt: skip
     except ReconstructionError as error:
-        if insisted:
+        if settings.refine_port or settings.refine_rig == "on":
             raise
         return f"rig as calibrated: {error}"
 

@@ -22,7 +22,7 @@ from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import refract
 from reconstruct.mapping.rig_refinement import RigFit, Told, fit_rig
-from reconstruct.mapping.survey_rig import Refined, on_rig, refine_as_set, refine_rig
+from reconstruct.mapping.survey_rig import Refined, frees_rig, on_rig, refine_as_set, refine_rig
 from reconstruct.mapping.working_range import Distances
 from reconstruct.sparse.alignment import align_rigid
 from tests.reconstruct.scenes import DATUM, Scene, make_scene
@@ -218,7 +218,7 @@ def test_a_calibration_with_sigmas_lets_the_survey_refine_the_rig(tmp_path: Path
     adjust = NavigationAdjuster(scene.records, wrong, mapped.lenses, None)
     distances = Distances(near_m=1.75, far_m=2.35, source="test")
 
-    def refined(rig: Rig, model: Mapped = mapped, **settings: Any) -> Refined | str | None:
+    def refined(rig: Rig, model: Mapped = mapped, **settings: Any) -> Refined | str:
         return refine_as_set(
             model, seen, rig, distances, adjust, None, tmp_path, ReconstructConfig(**settings)
         )
@@ -230,8 +230,12 @@ def test_a_calibration_with_sigmas_lets_the_survey_refine_the_rig(tmp_path: Path
         for p, t in (pupils_and_points(m, scene)[2:] for m in (mapped, found.mapped))
     )
     assert after < 0.5 * before
-    assert refined(wrong, refine_rig="off") is None
-    assert refined(replace(wrong, covariance=None)) is None
+    both, unknown = ["left", "right"], replace(wrong, covariance=None)
+    assert frees_rig(ReconstructConfig(), wrong, both)
+    assert not frees_rig(ReconstructConfig(refine_rig="off"), wrong, both)
+    assert not frees_rig(ReconstructConfig(), unknown, both)
+    assert not frees_rig(ReconstructConfig(), wrong, ["left"])
+    assert frees_rig(ReconstructConfig(refine_rig="on"), unknown, both)
     few = replace(mapped, model=pycolmap.Reconstruction(mapped.model))
     for point in sorted(few.model.points3D)[12:]:
         few.model.delete_point3D(point)
