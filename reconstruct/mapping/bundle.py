@@ -19,9 +19,9 @@ Adjust = Callable[[Mapped], Mapped]
 
 _TRUST = 1e12
 """First radius of the trust region: no bound."""
-_TOLERANCE = 1e-6
+_TOLERANCE = 1e-5
 """Relative change of the cost at which an adjustment ends. The last steps of a robust loss are many
-and small: a hundredth of this moves no camera of a block of 58 stations by more than 0.001 mm."""
+and small."""
 
 
 def held_options(sigma_px: float) -> pycolmap.BundleAdjustmentOptions:
