@@ -33,7 +33,7 @@ def survey_toml(pictures: int, scale: int) -> str:
         pictures: of both cameras.
         scale: divides the camera's resolution.
     """
-    side = (pictures / 116) ** 0.5  # the demo has 116 pictures of 4.5 x 3.7 m
+    side = (1.1 * pictures / 116) ** 0.5  # the demo has 116 pictures of 4.5 x 3.7 m; and a margin
     return f"""name = "benchmark"
 seed = 7
 
