@@ -8,11 +8,9 @@ order stations and points move with the rig's parameters as the adjustment's nor
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.sparse import csc_matrix, diags_array
-from scipy.sparse.linalg import splu
 from scipy.spatial import KDTree
 
 from alice_survey.frames import Array
@@ -22,7 +20,14 @@ from reconstruct.mapping.database import Observations
 from reconstruct.mapping.exact_sights import choose_pixels, exact_sights, start_state
 from reconstruct.mapping.gauge import Gauge
 from reconstruct.mapping.mapper import Mapped
-from reconstruct.mapping.normal_equations import POSE, Sights, moved_points, reduce_points
+from reconstruct.mapping.normal_equations import (
+    LEAST_POINTS,
+    POSE,
+    Sights,
+    moved_points,
+    reduce_points,
+    solver_of,
+)
 from reconstruct.mapping.robust import cauchy_weights, sigma_of
 
 
@@ -119,22 +124,15 @@ def _response(
     """Slopes of stations (F, 6, G) and points (P, 3, G) by what is shared, in some gauge."""
     reduced = reduce_points(sights, count)
     matrix = csc_matrix(reduced.matrix / variance)
-    free = np.ones(POSE * count, dtype=np.bool_)
+    seeing = np.bincount(sights.station, minlength=count) >= LEAST_POINTS
+    free = np.repeat(seeing, POSE)
     if told is None:
         free[:POSE] = False
     else:
         matrix = csc_matrix(matrix + diags_array(told.ravel()))
-    kept = np.flatnonzero(free)
-    cut: Any = matrix[kept][:, kept]
-    factor_of: Any = splu
-    factor = factor_of(
-        csc_matrix(cut), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )  # fmt: skip
+    solve = solver_of(matrix, free)
     shared = reduced.border.shape[1]
-    moved = np.zeros((POSE * count, shared))
-    moved[kept] = -factor.solve(np.ascontiguousarray(reduced.border[kept] / variance))
-    stations = moved.reshape(count, POSE, shared)
+    stations = -solve(reduced.border / variance).reshape(count, POSE, shared)
     still = np.zeros_like(sights.miss)
     points = [
         moved_points(

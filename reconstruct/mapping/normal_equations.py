@@ -8,17 +8,22 @@ one (Schur complement; Triggs et al. 2000, "Bundle adjustment: a modern synthesi
 which leaves a block-sparse system of the stations with a border of what is shared.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import bsr_matrix, csc_matrix
+from scipy.sparse.linalg import splu
 
 from alice_survey.frames import Array
 
 POSE = 6
 """Parameters of a station: turn about the axes of the world, then motion of its origin."""
+LEAST_POINTS = 4
+"""A station that sees fewer is not determined."""
 Indices = NDArray[np.int64]
 
 
@@ -104,6 +109,24 @@ def reduce_points(sights: Sights, stations: int) -> Reduced:
         shared_slope=shared_slope,
         point_inverse=inverse,
     )
+
+
+def solver_of(matrix: csc_matrix, free: NDArray[np.bool_]) -> Callable[[Array], Array]:
+    """A solver of symmetric equations whose unknowns that are not free are held at zero."""
+    kept = np.flatnonzero(free)
+    cut: Any = matrix[kept][:, kept]
+    factor_of: Any = splu
+    factor = factor_of(
+        csc_matrix(cut), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )  # fmt: skip
+
+    def solve(right: Array) -> Array:
+        solution = np.zeros_like(right)
+        solution[kept] = factor.solve(np.ascontiguousarray(right[kept]))
+        return solution
+
+    return solve
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from scipy.sparse import csc_matrix, diags_array
-from scipy.sparse.linalg import splu
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.errors import ReconstructionError, warn
@@ -31,7 +30,14 @@ from reconstruct.mapping.exact_sights import (
     start_state,
 )
 from reconstruct.mapping.mapper import Mapped
-from reconstruct.mapping.normal_equations import POSE, Reduced, Sights, moved_points, reduce_points
+from reconstruct.mapping.normal_equations import (
+    POSE,
+    Reduced,
+    Sights,
+    moved_points,
+    reduce_points,
+    solver_of,
+)
 from reconstruct.mapping.robust import cauchy_weights, sigma_of, variance_of
 
 _PORT_SIGMAS = {"port_distance_m": 0.02, "normal_x": 0.05, "normal_y": 0.05, "n_water": 0.005}
@@ -293,17 +299,8 @@ def _step(
             shared[-3:, -3:] += rows[:, POSE:].T @ rows[:, POSE:]
             pull[-3:] += rows[:, POSE:].T @ off
         matrix = csc_matrix(matrix + _block_diagonal(extra))
-    kept = np.flatnonzero(free)
-    cut: Any = matrix[kept][:, kept]
-    factor_of: Any = splu
-    factor = factor_of(
-        csc_matrix(cut), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )  # fmt: skip
-    back = np.zeros_like(border)
-    back[kept] = factor.solve(np.ascontiguousarray(border[kept]))
-    plain = np.zeros_like(slope)
-    plain[kept] = factor.solve(slope[kept])
+    solve = solver_of(matrix, free)
+    back, plain = solve(border), solve(slope)
     covariance = _inverse(shared - border.T @ back)
     moved = -covariance @ (pull - border.T @ plain)
     return _Step(

@@ -18,7 +18,6 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix, diags_array
-from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from alice_survey.errors import ReconstructionError, warn
@@ -31,18 +30,18 @@ from reconstruct.mapping.database import Observations, as_transform
 from reconstruct.mapping.gauge import Gauge
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.normal_equations import (
+    LEAST_POINTS,
     POSE,
     Reduced,
     Sights,
     point_covariances,
     reduce_points,
+    solver_of,
 )
 from reconstruct.mapping.robust import cauchy_weights, sigma_of, variance_of
 
 _CHUNK = 32
 """Stations whose columns of the inverse are in memory at a time."""
-_LEAST_POINTS = 4
-"""A station that sees fewer points has no covariance (NaN)."""
 _TURN_INFORMATION = 1.0
 """1/rad^2 of a station whose position is told: a line of stations does not tell its own roll."""
 
@@ -108,7 +107,7 @@ def estimate(
     centres = _centres(model, frames)
     told = told_information(model, position_sigmas)
     counts = np.bincount(sights.station, minlength=len(frames))
-    loose = counts < _LEAST_POINTS
+    loose = counts < LEAST_POINTS
     gauge = Gauge(centres, float(np.median(np.linalg.norm(sights.arm, axis=1))), scale_free)
     blocks = _inverse_blocks(reduced, variance, told, gauge, loose)
     rows = np.repeat(np.arange(len(frames)), np.diff(reduced.pointers))
@@ -238,19 +237,7 @@ def _inverse_blocks(
         free[gauge.held] = False
     else:
         matrix = csc_matrix(matrix + diags_array(told.ravel()))
-    kept = np.flatnonzero(free)
-    cut: Any = matrix[kept][:, kept]
-    factor_of: Any = splu
-    factor = factor_of(
-        csc_matrix(cut), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )  # fmt: skip
-
-    def solve(right: Array) -> Array:
-        solution = np.zeros_like(right)
-        solution[kept] = factor.solve(np.ascontiguousarray(right[kept]))
-        return solution
-
+    solve = solver_of(matrix, free)
     flat, spread = gauge.flat, gauge.spread
     weighed = gauge.weights[:, None] * flat
     along = solve(weighed)

@@ -147,3 +147,17 @@ def test_a_rig_without_covariance_adds_nothing(tmp_path: Path) -> None:
     mapped, _ = points_with(scene().rig, tmp_path)
     unknown = replace(scene().rig, covariance=None)
     assert calibration_part(mapped, warped_scene(scene())[0], unknown) is None
+
+
+def test_a_station_that_sees_next_to_nothing_stays(tmp_path: Path) -> None:
+    mapped, _ = points_with(scene().rig, tmp_path)
+    lonely = [9, 10]
+    for point in {
+        p.point3D_id for n in lonely for p in mapped.model.images[n].get_observation_points2D()
+    }:
+        mapped.model.delete_point3D(point)
+    part = calibration_part(mapped, warped_scene(scene())[0], scene().rig)
+    assert part is not None
+    assert np.isfinite(part.stations).all()
+    assert np.all(part.stations[4] == 0)
+    assert np.all(np.abs(np.delete(part.stations, [0, 4], axis=0)).max(axis=(1, 2)) > 0)
