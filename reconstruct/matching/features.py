@@ -15,7 +15,9 @@ _CONTRAST = 0.01
 _CELLS = 16
 """Cells along the longer side over which features are spread."""
 _MOST_MPX = 1.5
-"""Of a picture in which features are looked for, unless a scale is set (see `detection_scale`)."""
+"""Of a picture in which features are looked for, unless a scale is set (see `detection_scales`)."""
+_PIXELS_PER_FEATURE = 100.0
+"""Of a picture of rich texture, with about twice as many features as are wanted."""
 _SUPPORT = 1.5
 """Diameters around a feature within which a mask must leave the picture free: three sigmas of the
 blur at which it was found."""
@@ -47,19 +49,19 @@ def find_features(
     Args:
         grey: (H, W) normalised picture.
         mask: (H, W) where features may be, or None.
-        scale: the picture is reduced by this much first, at most 1; None: see `detection_scale`.
+        scale: the picture is reduced by this much first, at most 1; None: see `detection_scales`.
         most: how many to keep, evenly over the picture.
     """
     height, width = grey.shape
-    small = grey
-    if scale is None:
-        scale = detection_scale((width, height))
-    if scale < 1.0:
-        size = (max(1, round(width * scale)), max(1, round(height * scale)))
-        small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    scales = detection_scales((width, height), most) if scale is None else (scale,)
     # Without the precise upscaling every keypoint lies a quarter pixel towards the origin.
     sift = cv2.SIFT_create(contrastThreshold=_CONTRAST, enable_precise_upscale=True)
-    keypoints = sift.detect(small, None)
+    for tried in scales:
+        size = (max(1, round(width * tried)), max(1, round(height * tried)))
+        small = grey if tried >= 1.0 else cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+        keypoints = sift.detect(small, None)
+        if len(keypoints) >= most:
+            break
     steps = np.array([width / small.shape[1], height / small.shape[0]])
     pixels = np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2)
     pixels = (pixels + 0.5) * steps
@@ -88,14 +90,18 @@ def find_features(
     )
 
 
-def detection_scale(size: tuple[int, int]) -> float:
+def detection_scales(size: tuple[int, int], most: int) -> tuple[float, ...]:
     """By how much a picture of some width and height is reduced before features are looked for.
 
-    SIFT doubles a picture first. Large pictures have more features than are kept, and the largest
-    are kept, so that those of the first octaves cost most of the time and are thrown away; what
-    the reduction costs in position, the refinement along the tracks gives back.
+    SIFT doubles a picture first. Pictures of rich texture have more features than are kept, and the
+    largest are kept, so that those of the first octaves cost most of the time and are thrown away;
+    what the reduction costs in position, the refinement along the tracks gives back. The second
+    scale is for pictures that have too little to show at the first.
     """
-    return float(min(1.0, np.sqrt(1e6 * _MOST_MPX / (size[0] * size[1]))))
+    area = size[0] * size[1]
+    largest = min(1.0, float(np.sqrt(1e6 * _MOST_MPX / area)))
+    first = min(largest, float(np.sqrt(_PIXELS_PER_FEATURE * most / area)))
+    return (first, largest) if first < largest else (largest,)
 
 
 def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from reconstruct.matching.features import (
-    detection_scale,
+    detection_scales,
     find_features,
     load_features,
     root_sift,
@@ -74,10 +74,29 @@ def test_features_keep_away_from_the_border_of_a_mask() -> None:
 
 
 @pytest.mark.parametrize(
-    ("size", "scale"), [((846, 677), 1.0), ((1360, 1024), 1.0), ((3384, 2710), 0.404)]
+    ("size", "most", "scales"),
+    [
+        ((846, 677), 8000, (1.0,)),
+        ((846, 677), 3000, (0.724, 1.0)),
+        ((1360, 1024), 8000, (0.758, 1.0)),
+        ((3384, 2710), 8000, (0.295, 0.404)),
+        ((3384, 2710), 50_000, (0.404,)),
+    ],
 )
-def test_only_large_pictures_are_reduced(size: tuple[int, int], scale: float) -> None:
-    assert detection_scale(size) == pytest.approx(scale, abs=0.001)
+def test_pictures_are_reduced_to_what_the_wanted_features_need(
+    size: tuple[int, int], most: int, scales: tuple[float, ...]
+) -> None:
+    assert detection_scales(size, most) == pytest.approx(scales, abs=0.001)
+
+
+def test_a_picture_with_little_to_show_is_searched_at_full_scale() -> None:
+    rng = np.random.default_rng(1)
+    few = blobs(rng.uniform(20, 380, (40, 2)), (400, 400), sigma=1.2)
+    small = find_features(few, None, scale=0.3, most=900)
+    found = find_features(few, None, scale=None, most=900)
+    whole = find_features(few, None, scale=1.0, most=900)
+    assert len(small.pixels) < len(found.pixels)
+    np.testing.assert_array_equal(found.pixels, whole.pixels)
 
 
 def test_a_blank_picture_has_no_features() -> None:
