@@ -74,6 +74,7 @@ class _FeatureTask:
     target: Path
     scale: float | None
     most: int
+    thrifty: bool
 
 
 def run_mapping(
@@ -176,7 +177,7 @@ def extract(task: _FeatureTask) -> int:
         picture = read_deep(task.picture)
         grey = normalise(picture)
         mask = None if task.mask is None else read_mask(task.mask, (grey.shape[1], grey.shape[0]))
-        found = find_features(grey, mask, scale=task.scale, most=task.most)
+        found = find_features(grey, mask, scale=task.scale, most=task.most, thrifty=task.thrifty)
         with atomic_path(_grey_file(task.target)) as temporary, temporary.open("wb") as file:
             np.save(file, finely(even_light(picture)))
         save_features(task.target, found)
@@ -198,6 +199,7 @@ def _find_all(inputs: Inputs, folder: Path, config: SurveyConfig, threads: int) 
             target=target,
             scale=config.reconstruct.feature_scale,
             most=config.reconstruct.max_features,
+            thrifty=inputs.rig is not None,
         )
         for record, target in zip(inputs.records, targets, strict=True)
     ]

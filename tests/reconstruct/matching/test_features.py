@@ -93,10 +93,15 @@ def test_a_picture_with_little_to_show_is_searched_at_full_scale() -> None:
     rng = np.random.default_rng(1)
     few = blobs(rng.uniform(20, 380, (40, 2)), (400, 400), sigma=1.2)
     small = find_features(few, None, scale=0.3, most=900)
-    found = find_features(few, None, scale=None, most=900)
+    found = find_features(few, None, scale=None, most=900, thrifty=True)
     whole = find_features(few, None, scale=1.0, most=900)
     assert len(small.pixels) < len(found.pixels)
     np.testing.assert_array_equal(found.pixels, whole.pixels)
+    rich = blobs(rng.uniform(0, 400, (900, 2)), (400, 400), sigma=2.5)
+    plain = find_features(rich, None, scale=None, most=100)
+    quick = find_features(rich, None, scale=None, most=100, thrifty=True)
+    assert len(plain.pixels) == len(quick.pixels) == 100
+    assert not np.array_equal(plain.pixels, quick.pixels)
 
 
 def test_a_blank_picture_has_no_features() -> None:
