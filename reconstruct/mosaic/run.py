@@ -19,7 +19,7 @@ import rasterio
 from alice_survey.artefacts import Stage, need_stage, read_json, run_stage, write_json
 from alice_survey.config import SurveyConfig
 from alice_survey.executor import parallel_map
-from reconstruct.dense.dem import round_cell
+from reconstruct.dense.dem import DemGrid, round_cell
 from reconstruct.dense.run import picture_files
 from reconstruct.model import SparseModel, read_model
 from reconstruct.mosaic.blend import SUPPORT_PX
@@ -30,6 +30,7 @@ from reconstruct.mosaic.footprints import write_footprints
 from reconstruct.mosaic.grid import (
     CELL_PX,
     Block,
+    Footprints,
     blocks_of,
     footprints,
     height_range,
@@ -55,8 +56,10 @@ from reconstruct.sparse.track_figure import plot_track_over
 _TILE_PX = 1024
 _GROUP = 2
 """Tiles along and across that one process paints, since they share pictures."""
-_LABEL_PX = 2048
+_LABEL_PX, _LEAST_LABEL_PX = 2048, 512
 _LABEL_MARGIN_PX = 256
+_MOST_LOOKS = 12e6
+"""Views times cells of a block whose seams are solved at once, which take some 30 bytes each."""
 _LIGHT_LATTICE = 24
 """Spots across a picture at which light is compared."""
 _MOST_SAMPLES = 150_000
@@ -86,7 +89,7 @@ def run_mosaic(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     )
     stage = Stage(
         name="mosaic",
-        version=4,
+        version=5,
         settings={**settings, "water": config.water.model_dump(mode="json")},
         inputs=[sparse, dense / "dem.tif", *picture_files(workspace, sparse, model)],
     )
@@ -147,7 +150,7 @@ def build_mosaic(
     survey = Survey(workspace=workspace, scratch=scratch, scaled=model.frame.scaled, water=water)
     views = _seen_views(model, facts)
     ground = footprints(model.views, heights)
-    label_blocks = blocks_of(grid, ground, _LABEL_PX, _LABEL_MARGIN_PX)
+    label_blocks = seam_blocks(grid, ground)
     colour = _solve(model, survey, facts, views, label_blocks, config, threads)
 
     def tasks(blocks: Sequence[Block]) -> list[PaintTask]:
@@ -199,6 +202,17 @@ def build_mosaic(
             "pictures": names,
         },
     )
+
+
+def seam_blocks(grid: DemGrid, ground: Footprints) -> list[Block]:
+    """Blocks whose seams are solved at once: the smaller, the more pictures see each spot."""
+    size = _LABEL_PX
+    while True:
+        blocks = blocks_of(grid, ground, size, _LABEL_MARGIN_PX)
+        looks = max(len(b.views) * b.grid.rows * b.grid.columns // CELL_PX**2 for b in blocks)
+        if looks <= _MOST_LOOKS or size <= _LEAST_LABEL_PX:
+            return blocks
+        size //= 2
 
 
 def _seen_views(model: SparseModel, facts: Sequence[PictureFacts]) -> list[SeenView]:
