@@ -64,6 +64,12 @@ class Observed:
         return missed
 
 
+def frames_of(model: pycolmap.Reconstruction) -> Indices:
+    """Ids of the frames that have a posed picture, ascending."""
+    frames = {image.frame_id for image in model.images.values() if image.has_pose}
+    return np.array(sorted(frames), dtype=np.int64)
+
+
 def observed(model: pycolmap.Reconstruction) -> Observed:
     """The observations of a model."""
     count = len(model.points3D)

@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 
 from alice_survey.frames import Array
 from camera_calib.rig import Rig
-from reconstruct.mapping.arrays import Indices
+from reconstruct.mapping.arrays import Indices, frames_of
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.exact_sights import choose_pixels, exact_sights, start_state
 from reconstruct.mapping.gauge import Gauge
@@ -92,14 +92,11 @@ def calibration_part(
     fields = _known(rig, names)
     if not fields or rig.covariance is None:
         return None
-    frames = np.array(
-        sorted({i.frame_id for i in mapped.model.images.values() if i.has_pose}), dtype=np.int64
-    )
+    frames = frames_of(mapped.model)
     pixels, ids = choose_pixels(mapped, seen, names, frames)
     state = start_state(mapped, rig, names, frames, ids)
     sights = exact_sights(state, pixels, fields, names, lever=False)
-    counts = np.repeat(np.diff(pixels.starts), np.diff(pixels.starts))
-    sigma = sigma_of(sights.miss, counts, len(frames))
+    sigma = sigma_of(sights.miss, sights.seen_by, len(frames))
     sights = sights.weighted(cauchy_weights(sights.miss, sigma))
     stations, points = _response(sights, len(frames), sigma**2, told)
     at = [rig.covariance.parameters.index(name) for name in fields]

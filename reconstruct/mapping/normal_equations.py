@@ -44,6 +44,12 @@ class Sights:
     miss: Array
     """(O, 2) found pixel less the one observed."""
 
+    @property
+    def seen_by(self) -> Indices:
+        """(O,) how many observations each one's point has."""
+        counts: Indices = np.diff(self.starts)
+        return np.repeat(counts, counts)
+
     def weighted(self, weights: Array) -> "Sights":
         """The same with the squares of every observation weighted, (O,)."""
         root = np.sqrt(weights)[:, None]

@@ -42,8 +42,6 @@ _NEAREST, _FARTHEST = 0.2, 20.0
 _WRONG_SIGMAS, _LEAST_WRONG_PX, _MOST_WRONG_PX = 5.0, 1.0, 4.0
 """An observation that misses by so many sigmas of the usual miss is wrong; nothing below the first
 bound is called wrong, all beyond the second (COLMAP's) is."""
-_RAYLEIGH_MEDIAN = 1.1774
-"""Median length of a plane vector whose components have unit sigma."""
 _LEAST_ANGLE_DEG = 1.5
 """Between the rays of a point (COLMAP's)."""
 
@@ -288,10 +286,7 @@ def _judge_again(
 
 def _wrong_px(model: pycolmap.Reconstruction) -> float:
     """From how large a miss an observation is wrong."""
-    model.update_point_3d_errors()
-    errors = np.array([point.error for point in model.points3D.values()])
-    sigma = float(np.median(errors)) / _RAYLEIGH_MEDIAN
-    return float(np.clip(_WRONG_SIGMAS * sigma, _LEAST_WRONG_PX, _MOST_WRONG_PX))
+    return float(np.clip(_WRONG_SIGMAS * pixel_sigma(model), _LEAST_WRONG_PX, _MOST_WRONG_PX))
 
 
 def _picture(lens: Lens, warped: Array) -> _Picture:

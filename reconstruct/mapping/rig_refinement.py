@@ -20,7 +20,7 @@ from camera_calib.calibration.freedom import POSE as TURN_AND_SHIFT
 from camera_calib.calibration.freedom import Prior, pose_names, value
 from camera_calib.flat_port import PARAMETERS
 from camera_calib.rig import Covariance, Rig
-from reconstruct.mapping.arrays import Indices
+from reconstruct.mapping.arrays import Indices, frames_of
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.exact_sights import (
     Pixels,
@@ -128,9 +128,7 @@ def fit_rig(
         ReconstructionError: the survey does not determine what is asked for.
     """
     names = list(seen.cameras)
-    frames = np.array(
-        sorted({i.frame_id for i in mapped.model.images.values() if i.has_pose}), dtype=np.int64
-    )
+    frames = frames_of(mapped.model)
     pixels, ids = choose_pixels(mapped, seen, names, frames)
     prior = _prior(rig, names, port=port, pose=pose)
     fields = prior.parameters
@@ -148,8 +146,8 @@ def fit_rig(
     for _ in range(_ROUNDS):
         sights = exact_sights(state, pixels, fields, names, lever=told is not None)
         left = _spare(pixels, len(frames), len(first)) / (2 * len(pixels.station))
-        seen_by = np.repeat(np.diff(pixels.starts), np.diff(pixels.starts))
-        weights = cauchy_weights(sights.miss, sigma_of(sights.miss, seen_by, len(frames)))
+        sigma = sigma_of(sights.miss, sights.seen_by, len(frames))
+        weights = cauchy_weights(sights.miss, sigma)
         now = variance_of(sights.miss, weights, left)
         sights = sights.weighted(weights)
         variance = now if np.isnan(variance) else min(variance, now)

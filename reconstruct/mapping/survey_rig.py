@@ -19,6 +19,7 @@ from alice_survey.frames import Array, Datum
 from camera_calib.calibration.freedom import pose_names
 from camera_calib.rig import Rig, write_rig
 from reconstruct.lenses.lens import FlatPortLens, Lens, flat_port_lens
+from reconstruct.mapping.arrays import frames_of
 from reconstruct.mapping.database import Observations, rigid3d
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.priors import NavigationAdjuster
@@ -178,7 +179,7 @@ def on_rig(
                 rig.set_sensor_from_rig(
                     camera.sensor_id, rigid3d(pinhole_from_rig[name] * rig_from_reference)
                 )
-    frames = sorted({i.frame_id for i in model.images.values() if i.has_pose})
+    frames = frames_of(model).tolist()
     for frame, station in zip(frames, fit.stations, strict=True):
         pose = lenses[names[0]].pinhole_from_cam * station.inv()
         model.frames[frame].rig_from_world = rigid3d(pose)
@@ -201,7 +202,7 @@ def on_rig(
 def told_positions(model: pycolmap.Reconstruction, seen: Observations, datum: Datum) -> Told:
     """Where navigation says that the body's origin was, by ascending frame."""
     bodies = positions_ned(seen.images, datum)
-    frames = sorted({i.frame_id for i in model.images.values() if i.has_pose})
+    frames = frames_of(model).tolist()
     positions, sigmas = np.full((len(frames), 3), np.nan), np.full((len(frames), 3), np.nan)
     for number, image in sorted(model.images.items(), reverse=True):
         if image.has_pose:

@@ -24,7 +24,7 @@ from alice_survey.errors import ReconstructionError, warn
 from alice_survey.frames import Array
 from alice_survey.manifest import ImageRecord
 from camera_calib.rig import Rig
-from reconstruct.mapping.arrays import Indices, Observed, observed
+from reconstruct.mapping.arrays import Indices, Observed, frames_of, observed
 from reconstruct.mapping.calibration_part import CalibrationPart, calibration_part
 from reconstruct.mapping.database import Observations, as_transform
 from reconstruct.mapping.gauge import Gauge
@@ -89,7 +89,7 @@ def estimate(
     """
     model = mapped.model
     seen = observed(model)
-    frames = np.array(sorted({model.images[int(n)].frame_id for n in seen.pictures}), np.int64)
+    frames = frames_of(model)
     sights, order = sights_of(model, seen, frames)
     scale_free = not np.isfinite(mapped.baseline)
     spare = 2 * len(order) - 3 * len(seen.point_ids) - POSE * len(frames) + 6 + int(scale_free)
@@ -99,8 +99,8 @@ def estimate(
             "stations do not tell how well they are known"
         )
     left = spare / (2 * len(order))
-    seen_by = np.repeat(np.diff(sights.starts), np.diff(sights.starts))
-    weights = cauchy_weights(sights.miss, sigma_of(sights.miss, seen_by, len(frames)))
+    sigma = sigma_of(sights.miss, sights.seen_by, len(frames))
+    weights = cauchy_weights(sights.miss, sigma)
     variance = variance_of(sights.miss, weights, left)
     sights = sights.weighted(weights)
     reduced = reduce_points(sights, len(frames))
@@ -273,7 +273,7 @@ def told_information(model: pycolmap.Reconstruction, sigmas: Array | None) -> Ar
     """
     if sigmas is None:
         return None
-    frames = np.array(sorted({i.frame_id for i in model.images.values() if i.has_pose}), np.int64)
+    frames = frames_of(model)
     told = np.zeros((len(frames), POSE))
     for number, image in sorted(model.images.items()):
         if not image.has_pose:
