@@ -14,17 +14,19 @@ import pycolmap
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.robust import loss_scale, pixel_sigma
 
-Adjust = Callable[[Mapped], Mapped]
-"""Adjusts a model, rig and cameras held; the one given is not changed."""
+Adjust = Callable[[Mapped, float], Mapped]
+"""Adjusts a model, rig and cameras held, to a relative change of the cost; the one given is not
+changed."""
 
 _TRUST = 1e12
 """First radius of the trust region: no bound."""
-_TOLERANCE = 1e-5
-"""Relative change of the cost at which an adjustment ends. The last steps of a robust loss are many
+FULLY, ROUGHLY = 1e-5, 1e-2
+"""Relative change of the cost at which an adjustment ends: for good, and where another
+follows. The last steps of a robust loss are many
 and small: a thousandth of this moves no camera of a block of 58 stations by more than 0.003 mm."""
 
 
-def held_options(sigma_px: float) -> pycolmap.BundleAdjustmentOptions:
+def held_options(sigma_px: float, tolerance: float = FULLY) -> pycolmap.BundleAdjustmentOptions:
     """Options that hold cameras and rig, for keypoints of this sigma and some that are wrong."""
     options = pycolmap.BundleAdjustmentOptions()
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
@@ -35,7 +37,7 @@ def held_options(sigma_px: float) -> pycolmap.BundleAdjustmentOptions:
     solver = options.ceres.solver_options
     solver.num_threads = 1
     solver.initial_trust_region_radius = _TRUST
-    solver.function_tolerance = _TOLERANCE
+    solver.function_tolerance = tolerance
     return options
 
 
@@ -48,7 +50,7 @@ def all_pictures(model: pycolmap.Reconstruction) -> pycolmap.BundleAdjustmentCon
     return config
 
 
-def adjust_freely(mapped: Mapped) -> Mapped:
+def adjust_freely(mapped: Mapped, tolerance: float = FULLY) -> Mapped:
     """Adjust all poses and points, without priors.
 
     A rig fixes the scale, so that one station's pose is all that is held; else two pictures are.
@@ -59,6 +61,8 @@ def adjust_freely(mapped: Mapped) -> Mapped:
         config.set_constant_rig_from_world_pose(min(model.reg_frame_ids()))
     else:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    pycolmap.create_default_bundle_adjuster(held_options(pixel_sigma(model)), config, model).solve()
+    pycolmap.create_default_bundle_adjuster(
+        held_options(pixel_sigma(model), tolerance), config, model
+    ).solve()
     model.update_point_3d_errors()
     return replace(mapped, model=model)

@@ -92,7 +92,7 @@ def triangulate_and_adjust(
     adjust(model, options, tolerance=1e-3)
     mapper.complete_and_merge_tracks(options.get_triangulation())
     mapper.filter_points(options.get_mapper())
-    adjust(model, options, tolerance=1e-6)
+    adjust(model, options, tolerance=1e-3)
     mapper.filter_frames(options.get_mapper())
     mapper.end_reconstruction(False)
     model.update_point_3d_errors()

@@ -17,7 +17,7 @@ from alice_survey.frames import Array, Datum, rotation_from_attitude
 from alice_survey.manifest import ImageRecord
 from camera_calib.rig import Rig
 from reconstruct.lenses.lens import Lens
-from reconstruct.mapping.bundle import adjust_freely, all_pictures, held_options
+from reconstruct.mapping.bundle import FULLY, adjust_freely, all_pictures, held_options
 from reconstruct.mapping.mapper import Mapped, model_baseline, scale_model
 from reconstruct.mapping.robust import pixel_sigma
 from reconstruct.matching.pairs import positions_ned
@@ -77,15 +77,15 @@ class NavigationAdjuster:
         self._told = None if datum is None else pinhole_positions(records, rig, lenses, datum)
         self._used = False
 
-    def __call__(self, mapped: Mapped) -> Mapped:
+    def __call__(self, mapped: Mapped, tolerance: float = FULLY) -> Mapped:
         """The adjusted model."""
         if self._told is not None and mapped.scaled:
-            refined = refine_with_positions(mapped, self._records, *self._told)
+            refined = refine_with_positions(mapped, self._records, *self._told, tolerance=tolerance)
             self._used = refined is not mapped
             if self._used:
                 return refined
             self._told = None  # said once
-        return adjust_freely(mapped)
+        return adjust_freely(mapped, tolerance)
 
     @property
     def sigmas(self) -> Array | None:
@@ -94,7 +94,12 @@ class NavigationAdjuster:
 
 
 def refine_with_positions(
-    mapped: Mapped, records: Sequence[ImageRecord], positions: Array, sigmas: Array
+    mapped: Mapped,
+    records: Sequence[ImageRecord],
+    positions: Array,
+    sigmas: Array,
+    *,
+    tolerance: float = FULLY,
 ) -> Mapped:
     """Adjust a model on a known rig once more, with robust position priors.
 
@@ -103,6 +108,7 @@ def refine_with_positions(
         records: pictures.
         positions: (N, 3) of the pinholes' centres in NED; NaN where unknown.
         sigmas: (N, 3), likewise.
+        tolerance: relative change of the cost at which it ends.
 
     Returns:
         The adjusted model in a new gauge; the one given where positions are too few or disagree
@@ -119,10 +125,12 @@ def refine_with_positions(
     # scale is taken out of the priors, so that the second one changes it no more.
     pixel = pixel_sigma(model)
     trial = pycolmap.Reconstruction(model)
-    _adjuster(trial, _priors(trial, known, told, sigmas / pixel), pixel)
+    _adjuster(trial, _priors(trial, known, told, sigmas / pixel), pixel, tolerance)
     middle = told.mean(axis=0)
     told = middle + (told - middle) * mapped.baseline / model_baseline(trial)
-    summary = _adjuster(model, _priors(model, known, told, sigmas / pixel), pixel).solve()
+    summary = _adjuster(
+        model, _priors(model, known, told, sigmas / pixel), pixel, tolerance
+    ).solve()
     model.update_point_3d_errors()
     after = model.compute_mean_reprojection_error()
     if not (summary.is_solution_usable() and after <= _WORST_GROWTH * before):
@@ -162,7 +170,10 @@ def _priors(
 
 
 def _adjuster(
-    model: pycolmap.Reconstruction, priors: Sequence[pycolmap.PosePrior], pixel: float
+    model: pycolmap.Reconstruction,
+    priors: Sequence[pycolmap.PosePrior],
+    pixel: float,
+    tolerance: float,
 ) -> pycolmap.BundleAdjuster:
     """COLMAP's: it takes pixels to have unit sigma, so that those of `priors` are over `pixel`."""
     prior_options = pycolmap.PosePriorBundleAdjustmentOptions()
@@ -170,5 +181,5 @@ def _adjuster(
     prior_options.alignment_ransac.random_seed = 1
     prior_options.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
     return pycolmap.create_pose_prior_bundle_adjuster(
-        held_options(pixel), prior_options, all_pictures(model), priors, model
+        held_options(pixel, tolerance), prior_options, all_pictures(model), priors, model
     )

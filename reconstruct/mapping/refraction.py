@@ -25,7 +25,7 @@ from alice_survey.frames import Array
 from reconstruct.lenses.lens import FlatPortLens, Lens
 from reconstruct.lenses.range_shift import field_of
 from reconstruct.mapping.arrays import Indices, observed
-from reconstruct.mapping.bundle import Adjust, adjust_freely
+from reconstruct.mapping.bundle import FULLY, ROUGHLY, Adjust, adjust_freely
 from reconstruct.mapping.database import Observations, write_database
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.robust import pixel_sigma
@@ -196,7 +196,7 @@ def refract(
     """
     keypoints = Keypoints(mapped, seen)
     if not keypoints.through_ports:
-        mapped = adjust(mapped)
+        mapped = adjust(mapped, FULLY)
         none = Convergence(moved_px=(0.0,), corrected_px=0.0, removed=0, added=0, settled=True)
         return mapped, none
     notes = mapped.notes
@@ -217,7 +217,7 @@ def refract(
         if len(moves) > 2 and moved < max(SETTLED_PX, _SETTLED_SIGMAS * pixel_sigma(model)):
             settled = True
             break
-        mapped = adjust(replace(mapped, model=model, notes=notes))
+        mapped = adjust(replace(mapped, model=model, notes=notes), FULLY if settle else ROUGHLY)
         model = pycolmap.Reconstruction(mapped.model)
         if len(moves) == 1:
             keypoints.correct_unseen(model, scale)
