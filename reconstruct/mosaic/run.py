@@ -63,7 +63,8 @@ _MOST_LOOKS = 12e6
 _LIGHT_LATTICE = 24
 """Spots across a picture at which light is compared."""
 _MOST_SAMPLES = 150_000
-_CACHE_MIB = 64
+_CACHE_MIB, _WORKER_CACHE_MIB = 48, 16
+"""Of files that GDAL reads and writes: here, and in each other process."""
 _MOST_PROCESSES = 2
 """Each takes up to 0.4 GB; all of them and this one stay below 1.5 GiB."""
 _TEMPERATURE_C, _SALINITY_PSU = 15.0, 35.0
@@ -109,7 +110,7 @@ def _small_caches() -> Iterator[None]:
     """
     name = "GDAL_CACHEMAX"
     before = os.environ.get(name)
-    os.environ[name] = str(_CACHE_MIB)
+    os.environ[name] = str(_WORKER_CACHE_MIB)
     try:
         with rasterio.Env(**{name: _CACHE_MIB << 20}):
             yield
