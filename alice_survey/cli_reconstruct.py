@@ -209,7 +209,7 @@ def evaluate(
     else:
         from alice_survey.survey import run
 
-        result = run(["report"], workspace, survey, None, threads)
+        result = run(["evaluation"], workspace, survey, None, threads)
     print_result(*result, as_json)
 
 

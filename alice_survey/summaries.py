@@ -91,13 +91,13 @@ def _mesh(folder: Path) -> Summary:
     return text, found
 
 
-def _report(folder: Path) -> Summary:
-    found = read_json(folder / "report.json")
+def _evaluation(folder: Path) -> Summary:
+    found = read_json(folder / "score.json")
     rows = [
         (f"{group}.{name}", value) for group, part in found.items() for name, value in part.items()
     ]
     table = "\n".join(f"  {name:44} {value}" for name, value in rows)
-    return f"score in {folder / 'report.json'}\n{table}", found
+    return f"score in {folder / 'score.json'}\n{table}", found
 
 
 SUMMARIES: dict[str, Callable[[Path], Summary]] = {
@@ -110,6 +110,6 @@ SUMMARIES: dict[str, Callable[[Path], Summary]] = {
     "dense": _dense,
     "mosaic": _mosaic,
     "mesh": _mesh,
-    "report": _report,
+    "evaluation": _evaluation,
 }
 """By stage: takes its folder."""

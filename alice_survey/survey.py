@@ -17,7 +17,7 @@ from alice_survey.executor import default_threads
 from alice_survey.summaries import SUMMARIES
 
 RECONSTRUCT = ("calibration", "sparse", "dense", "mosaic", "mesh")
-LOOP = ("plan", "flight", "pool", "images", *RECONSTRUCT, "report")
+LOOP = ("plan", "flight", "pool", "images", *RECONSTRUCT, "evaluation")
 _NEEDS = {
     "plan": (),
     "flight": ("plan",),
@@ -28,7 +28,7 @@ _NEEDS = {
     "dense": ("sparse",),
     "mosaic": ("dense",),
     "mesh": ("dense",),
-    "report": ("mosaic", "mesh"),
+    "evaluation": ("mosaic", "mesh"),
 }
 _COMMANDS = {
     "plan": "plan",
@@ -40,9 +40,9 @@ _COMMANDS = {
     "dense": "reconstruct",
     "mosaic": "reconstruct",
     "mesh": "reconstruct",
-    "report": "evaluate",
+    "evaluation": "evaluate",
 }
-_SIMULATED = ("plan", "flight", "pool", "images", "calibration", "report")
+_SIMULATED = ("plan", "flight", "pool", "images", "calibration", "evaluation")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +118,7 @@ def _work_of(stage: str) -> StageWork:
             from reconstruct.mesh.run import run_mesh
 
             return run_mesh
-        case "report":
+        case "evaluation":
             from reconstruct.evaluate.run import run_evaluate
 
             return run_evaluate
@@ -252,8 +252,8 @@ def run_demo(workspace: Path, threads: int | None) -> tuple[str, dict[str, Any]]
         ("the surface", "dense/dem.png"),
         ("the mosaic", "mosaic/mosaic.png"),
         ("the mesh", "mesh/mesh.png"),
-        ("the errors", "report/errors.png"),
-        ("the track", "report/track.png"),
+        ("the errors", "evaluation/errors.png"),
+        ("the track", "evaluation/track.png"),
     ]
     rows = [f"  {what:12} {workspace / path}" for what, path in pictures]
     return "\n".join([text, "", "Pictures to look at:", *rows]), found

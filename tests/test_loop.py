@@ -73,7 +73,7 @@ def results(workspace: Path) -> dict[str, bytes]:
 
 
 def test_the_small_survey_is_reconstructed(undisturbed: Path) -> None:
-    score = json.loads((undisturbed / "report" / "report.json").read_text())
+    score = json.loads((undisturbed / "evaluation" / "score.json").read_text())
     assert score["cameras"]["registered"] == score["cameras"]["total"] >= 16
     assert 0.05 < score["cameras"]["rms_mm"] < 8
     assert abs(score["cameras"]["scale_error_ppm"]) < 4000
@@ -88,7 +88,7 @@ def test_truth_is_not_read_by_reconstruct(undisturbed: Path, tmp_path: Path) -> 
     """Without the truth beside the pictures the reconstruction is the same, to the byte."""
     workspace = tmp_path / "blind"
     shutil.copytree(undisturbed, workspace)
-    for stage in ("sparse", "dense", "mosaic", "mesh", "report", "calibration"):
+    for stage in ("sparse", "dense", "mosaic", "mesh", "evaluation", "calibration"):
         shutil.rmtree(workspace / stage)
     shutil.rmtree(workspace / "images" / "truth")
     shutil.rmtree(workspace / "flight" / "truth")
@@ -127,7 +127,7 @@ def test_killed_in_every_stage_it_ends_the_same(undisturbed: Path, tmp_path: Pat
 def test_more_threads_give_the_same_numbers(undisturbed: Path, tmp_path: Path) -> None:
     workspace = survey(tmp_path / "two")
     assert start(workspace, threads=2).wait() == 0
-    for name in ("sparse/track.csv", "report/cameras.csv"):
+    for name in ("sparse/track.csv", "evaluation/cameras.csv"):
         one, two = (
             [row.split(",") for row in (w / name).read_text().splitlines()]
             for w in (undisturbed, workspace)

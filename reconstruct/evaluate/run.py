@@ -43,7 +43,7 @@ _SEED_STREAM = 6100
 
 
 def run_evaluate(workspace: Path, config: SurveyConfig, threads: int) -> bool:
-    """Score what `reconstruct` made and write `report/`.
+    """Score what `reconstruct` made and write `evaluation/`.
 
     Returns:
         True when done, False when nothing had changed.
@@ -70,7 +70,7 @@ def run_evaluate(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     has_mesh = read_stage(mesh) is not None
     if has_mesh:
         inputs += [mesh / "mesh.ply", mesh / "mesh.json"]
-    stage = Stage(name="report", version=3, settings={"seed": config.seed}, inputs=inputs)
+    stage = Stage(name="evaluation", version=3, settings={"seed": config.seed}, inputs=inputs)
 
     def work(folder: Path) -> None:
         area = read_plan(plan / "plan.json").area.survey
@@ -98,16 +98,16 @@ def run_evaluate(workspace: Path, config: SurveyConfig, threads: int) -> bool:
             mosaic / "mosaic.tif", dense / "dem.tif", area, terrain, survey_texture(config), moved
         )
         rng = np.random.default_rng([config.seed, _SEED_STREAM])
-        report: dict[str, Any] = {
+        score: dict[str, Any] = {
             "cameras": cameras.to_json(),
             "surface": surface.to_json(pixel_m),
             "mosaic": painted.to_json(),
             "lengths": compare_lengths(painted.points_world, painted.points_true, rng),
         }
         if has_mesh:
-            report["mesh"] = score_mesh(*read_mesh(mesh), area, terrain, moved, pixel_m, rng)
-        report["overlaps"] = _rounded(overlaps_reached(workspace, truth))
-        write_json(folder / "report.json", report)
+            score["mesh"] = score_mesh(*read_mesh(mesh), area, terrain, moved, pixel_m, rng)
+        score["overlaps"] = _rounded(overlaps_reached(workspace, truth))
+        write_json(folder / "score.json", score)
         write_cameras(folder / "cameras.csv", cameras)
         plot_track(folder / "track.png", plan / "plan.json", cameras)
         plot_errors(folder / "errors.png", surface, area)
