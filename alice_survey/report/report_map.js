@@ -1,0 +1,184 @@
+/* The report's map, part 2 of 2: what lies over the pictures, and the controls. */
+
+/* Metres east and north stand where Leaflet has longitude and latitude. */
+function startMap() {
+  const data = JSON.parse(document.getElementById("map-data").textContent);
+  const root = document.getElementById("map");
+  const box = document.getElementById("map-canvas");
+  const readout = document.getElementById("map-readout");
+  const [west, south, east, north] = data.extent;
+  const whole = leaflet.latLngBounds([south, west], [north, east]);
+  root.hidden = false;
+  root.parentElement.classList.add("lives");
+
+  const pixels = data.layers.filter((layer) => layer.kind === "picture").map((layer) => layer.pixel);
+  const span = Math.max(east - west, north - south) || 1;
+  const finest = Math.min(...pixels, span / 500);
+  const still = window.matchMedia("(prefers-reduced-motion: reduce)").matches;
+  const map = new leaflet.Map(box, {
+    crs: leaflet.CRS.Simple, attributionControl: false, zoomControl: false,
+    zoomSnap: 0.25, wheelPxPerZoomLevel: 90, maxZoom: Math.log2(16 / finest),
+    minZoom: Math.log2(60 / span), scrollWheelZoom: false, zoomAnimation: !still,
+    fadeAnimation: false, renderer: leaflet.canvas({tolerance: 6, padding: 0.3}),
+  });
+  map.createPane("pictures").style.zIndex = 200;
+  map.createPane("over").style.zIndex = 300;
+  const showAll = () => map.fitBounds(whole, {padding: [24, 24], animate: !still});
+
+  /* A page that scrolls must not stop at its map: the wheel zooms only what was chosen. */
+  box.addEventListener("focusin", () => map.scrollWheelZoom.enable());
+  box.addEventListener("focusout", () => map.scrollWheelZoom.disable());
+
+  const layers = new Map(data.layers.map((about) => [
+    about.name,
+    about.kind === "picture"
+      ? new Pyramid(about, about.base ? "pictures" : "over")
+      : shapesOf(about),
+  ]));
+
+  function shapesOf(about) {
+    const places = (shape) => shape.map(([e, n]) => [n, e]);
+    const group = leaflet.featureGroup();
+    const dashes = about.dashed ? {dashArray: "7 5"} : {};
+    about.shapes.forEach((shape, index) => {
+      let drawn;
+      if (about.kind === "point") {
+        drawn = leaflet.circleMarker(places(shape)[0], {
+          radius: 5, color: "#fff", weight: 1.5, fillColor: about.colour, fillOpacity: 1,
+        });
+      } else if (about.kind === "polygon") {
+        drawn = leaflet.polygon(places(shape), {
+          color: about.colour, weight: 1.8, fillOpacity: 0.03, ...dashes,
+        });
+      } else {  /* a light rim keeps it readable on dark ground */
+        group.addLayer(leaflet.polyline(places(shape), {
+          color: "#fff", weight: 5, opacity: 0.75, interactive: false,
+        }));
+        drawn = leaflet.polyline(places(shape), {color: about.colour, weight: 2.6, ...dashes});
+      }
+      drawn.survey = {title: about.title, text: about.texts[index] || ""};
+      drawn.on("click", (event) => tell(drawn, event.latlng));
+      group.addLayer(drawn);
+    });
+    group.kind = about.kind;
+    return group;
+  }
+
+  function tell(shape, at) {
+    const content = document.createElement("div");
+    const title = document.createElement("b");
+    title.textContent = shape.survey.title;
+    const text = document.createElement("p");
+    text.textContent = shape.survey.text;
+    content.append(title, text);
+    leaflet.popup({maxWidth: 260, className: "told"}).setLatLng(at).setContent(content).openOn(map);
+  }
+
+  /* What a pointer would choose, for those who have none: the shape nearest to the middle. */
+  function tellMiddle() {
+    const middle = map.getSize().divideBy(2);
+    let best = null;
+    let least = 60;
+    layers.forEach((group) => {
+      if (!group.kind || !map.hasLayer(group)) return;
+      group.eachLayer((shape) => {
+        if (!shape.survey) return;
+        const places = shape.getLatLng ? [shape.getLatLng()] : shape.getLatLngs().flat();
+        places.forEach((place) => {
+          const away = map.latLngToContainerPoint(place).distanceTo(middle);
+          if (away < least) {
+            least = away;
+            best = [shape, place];
+          }
+        });
+      });
+    });
+    if (best) tell(...best);
+    else readout.textContent = "Nothing to tell within 60 px of the middle";
+  }
+
+  function show(name, on) {
+    const layer = layers.get(name);
+    if (on) layer.addTo(map);
+    else layer.remove();
+    ["polygon", "line", "point"].forEach((kind) => layers.forEach((group) => {
+      if (group.kind === kind && map.hasLayer(group)) group.bringToFront();
+    }));
+    const legend = document.getElementById("legend-" + name);
+    if (legend) legend.hidden = !on;
+    note();
+  }
+
+  /* Where the map stands, for the reader and for tests. */
+  function note() {
+    const centre = map.getCenter();
+    box.dataset.east = centre.lng;
+    box.dataset.north = centre.lat;
+    box.dataset.zoom = map.getZoom();
+    layers.forEach((layer) => {
+      if (layer.about && layer.about.base && map.hasLayer(layer)) {
+        box.dataset.base = layer.about.name;
+        box.dataset.level = layer.level;
+      }
+    });
+  }
+
+  const decimals = () => Math.min(4, Math.max(0, Math.ceil(Math.log10(2 ** map.getZoom()))));
+  function read(word, place) {
+    const [e, n] = [place.lng, place.lat].map((v) => v.toFixed(decimals()).replace("-", "−"));
+    readout.textContent = word + e + " " + data.unit + " east, " + n + " " + data.unit + " north";
+  }
+  const readCentre = () => read("Middle: ", map.getCenter());
+
+  const bar = root.querySelector(".bar");
+  function drawBar() {
+    const longest = 130 / 2 ** map.getZoom();
+    const power = 10 ** Math.floor(Math.log10(longest));
+    const length = [5, 2, 1].map((step) => step * power).find((step) => step <= longest * (1 + 1e-9));
+    bar.style.width = length * 2 ** map.getZoom() + "px";
+    bar.firstChild.textContent = lengthText(length, data.unit);
+  }
+
+  map.on("moveend zoomend", () => {
+    note();
+    readCentre();
+    drawBar();
+  });
+  map.on("mousemove", (event) => read("", event.latlng));
+  map.on("mouseout", readCentre);
+  map.fitBounds(whole, {padding: [24, 24], animate: false});
+
+  root.querySelectorAll("input").forEach((input) => {
+    if (input.checked) show(input.value, true);
+    input.addEventListener("change", () => {
+      if (input.type === "radio") {
+        root.querySelectorAll("input[type=radio]").forEach((other) => {
+          if (other !== input) show(other.value, false);
+        });
+      }
+      show(input.value, input.checked);
+    });
+  });
+  const acts = {in: () => map.zoomIn(1), out: () => map.zoomOut(1), all: showAll};
+  root.querySelectorAll("button[data-act]").forEach((button) => {
+    button.addEventListener("click", acts[button.dataset.act]);
+  });
+  box.addEventListener("keydown", (event) => {
+    if (event.target !== box || event.ctrlKey || event.metaKey || event.altKey) return;
+    const act = {0: showAll, Enter: tellMiddle}[event.key];
+    if (!act) return;
+    event.preventDefault();
+    act();
+  });
+  new ResizeObserver(() => map.invalidateSize({pan: false})).observe(box);
+  root.dataset.ready = "";
+}
+
+/* 0.02 m reads as 2 cm. */
+function lengthText(length, unit) {
+  const places = (value) => Number(value.toPrecision(2)).toString();
+  if (unit !== "m" || length >= 1) return places(length) + " " + unit;
+  return length >= 0.01 ? places(length * 100) + " cm" : places(length * 1000) + " mm";
+}
+
+startMap();

@@ -1,0 +1,172 @@
+/* The report's mesh: drawn only when something changed, and only once it was scrolled to. */
+
+const TURN = Math.PI / 24;
+const NEARER = 1.2;
+const WINDS = ["north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west"];
+
+/* East is x, up is y, south is z. */
+async function startMesh(root, canvas) {
+  const view = canvas.parentElement;
+  const renderer = new three.WebGLRenderer({canvas, antialias: true, preserveDrawingBuffer: true});
+  renderer.setPixelRatio(Math.min(2, window.devicePixelRatio || 1));
+  const scene = new three.Scene();
+  scene.background = new three.Color(0xf3f6f8);
+  const lamp = new three.DirectionalLight(0xffffff, 2.6);
+  scene.add(new three.HemisphereLight(0xffffff, 0x8c98a0, 1.1), lamp, lamp.target);
+
+  const model = (await parse(bytesOf("mesh-glb"))).scene;
+  scene.add(model);
+  const ball = new three.Box3().setFromObject(model).getBoundingSphere(new three.Sphere());
+  lamp.position.copy(ball.center).add(new three.Vector3(-1, 0.7, -0.5).multiplyScalar(ball.radius));
+  lamp.target.position.copy(ball.center);
+  const surfaces = [];
+  const grey = new three.MeshLambertMaterial({color: 0xc9c4b8, side: 2});
+  model.traverse((part) => {
+    if (!part.isMesh) return;
+    if (!part.geometry.attributes.normal) part.geometry.computeVertexNormals();
+    surfaces.push([part, part.material]);
+  });
+
+  const camera = new three.PerspectiveCamera(40, 1, ball.radius / 500, ball.radius * 40);
+  const controls = new three.OrbitControls(camera, canvas);
+  controls.minDistance = ball.radius * 0.05;
+  controls.maxDistance = ball.radius * 8;
+  controls.zoomSpeed = 1.2;
+  controls.enableZoom = false;
+  /* A page that scrolls must not stop at its mesh: the wheel zooms only what was chosen. */
+  canvas.addEventListener("focus", () => { controls.enableZoom = true; });
+  canvas.addEventListener("blur", () => { controls.enableZoom = false; });
+  canvas.addEventListener("pointerdown", () => canvas.focus({preventScroll: true}));
+
+  let asked = false;
+  function draw() {
+    if (asked) return;
+    asked = true;
+    requestAnimationFrame(() => {
+      asked = false;
+      renderer.render(scene, camera);
+      note();
+    });
+  }
+
+  function note() {
+    const from = new three.Spherical().setFromVector3(camera.position.clone().sub(controls.target));
+    const compass = (180 - from.theta * 180 / Math.PI + 360) % 360;
+    const above = 90 - from.phi * 180 / Math.PI;
+    canvas.dataset.azimuth = compass.toFixed(3);
+    canvas.dataset.above = above.toFixed(3);
+    canvas.dataset.distance = from.radius.toPrecision(6);
+    document.getElementById("mesh-readout").textContent = above > 88
+      ? "Seen from above"
+      : "Seen from the " + WINDS[Math.round(compass / 45) % 8] + ", " + Math.round(above) + "° above the horizon";
+  }
+
+  function turn(around, over, farther = 1) {
+    const from = new three.Spherical().setFromVector3(camera.position.clone().sub(controls.target));
+    from.theta += around;
+    from.phi = Math.min(Math.PI - 0.01, Math.max(0.01, from.phi + over));
+    from.radius = Math.min(controls.maxDistance, Math.max(controls.minDistance, from.radius * farther));
+    camera.position.setFromSpherical(from).add(controls.target);
+    controls.update();
+    draw();
+  }
+
+  function reset() {
+    const narrow = Math.min(1, camera.aspect);
+    const away = 0.82 * ball.radius / Math.sin(camera.fov * Math.PI / 360) / narrow;
+    controls.target.copy(ball.center);
+    camera.position.setFromSphericalCoords(away, Math.PI / 4, Math.PI / 9).add(ball.center);
+    controls.update();
+    draw();
+  }
+
+  function relief(button) {
+    const on = button.getAttribute("aria-pressed") !== "true";
+    button.setAttribute("aria-pressed", String(on));
+    surfaces.forEach(([part, material]) => { part.material = on ? grey : material; });
+    draw();
+  }
+
+  const acts = {
+    left: () => turn(-TURN, 0), right: () => turn(TURN, 0),
+    up: () => turn(0, -TURN), down: () => turn(0, TURN),
+    nearer: () => turn(0, 0, 1 / NEARER), farther: () => turn(0, 0, NEARER), reset, relief,
+  };
+  const keys = {
+    ArrowLeft: "left", ArrowRight: "right", ArrowUp: "up", ArrowDown: "down",
+    "+": "nearer", "=": "nearer", "-": "farther", 0: "reset",
+  };
+  root.querySelectorAll("button[data-act]").forEach((button) => {
+    button.addEventListener("click", () => acts[button.dataset.act](button));
+  });
+  canvas.addEventListener("keydown", (event) => {
+    if (!keys[event.key] || event.ctrlKey || event.metaKey || event.altKey) return;
+    event.preventDefault();
+    acts[keys[event.key]]();
+  });
+  controls.addEventListener("change", draw);
+  let placed = false;
+  new ResizeObserver(() => {
+    const {clientWidth: width, clientHeight: height} = view;
+    if (!width || !height) return;
+    renderer.setSize(width, height, false);
+    camera.aspect = width / height;
+    camera.updateProjectionMatrix();
+    if (placed) {
+      draw();
+      return;
+    }
+    placed = true;
+    reset();
+  }).observe(view);
+  canvas.addEventListener("webglcontextlost", () => showStill(root, "The browser took its graphics memory back: this is a still picture."));
+}
+
+function bytesOf(id) {
+  const text = atob(document.getElementById(id).textContent);
+  return Uint8Array.from(text, (letter) => letter.charCodeAt(0)).buffer;
+}
+
+/* Textures as pictures, which the page's policy lets in; the loader's own way would fetch them. */
+function parse(bytes) {
+  const loader = new three.GLTFLoader();
+  loader.register((parser) => {
+    parser.textureLoader = new three.TextureLoader(parser.options.manager);
+    return {name: "textures as pictures"};
+  });
+  return loader.parseAsync(bytes, "");
+}
+
+function hasWebgl() {
+  const context = document.createElement("canvas").getContext("webgl2");
+  if (context) context.getExtension("WEBGL_lose_context")?.loseContext();
+  return Boolean(context);
+}
+
+function showStill(root, why) {
+  root.hidden = true;
+  root.parentElement.classList.remove("lives");
+  document.getElementById("mesh-note").textContent = why;
+}
+
+function awaitMesh() {
+  const root = document.getElementById("mesh");
+  const canvas = document.getElementById("mesh-canvas");
+  if (!hasWebgl()) {
+    showStill(root, "This browser has no WebGL, which turning the mesh needs: this is a still picture.");
+    return;
+  }
+  root.hidden = false;
+  root.parentElement.classList.add("lives");
+  const watch = new IntersectionObserver((entries) => {
+    if (!entries.some((entry) => entry.isIntersecting)) return;
+    watch.disconnect();
+    startMesh(root, canvas).then(() => { root.dataset.ready = ""; }, (fault) => {
+      showStill(root, "The mesh cannot be shown here (" + fault.message + "): this is a still picture.");
+      throw fault;
+    });
+  }, {rootMargin: "200px"});
+  watch.observe(root);
+}
+
+awaitMesh();
