@@ -1,8 +1,8 @@
 """Stages of a workspace: folders that appear whole or not at all, skipped while nothing changed.
 
 A stage folder is written as `NAME.partial` and renamed when complete. Its `stage.json` carries the
-stage's version, its settings, a digest of every input file and the time it took; a later run skips
-the stage while all of these still hold.
+stage's version, its settings and a digest of every input file, and a later run skips the stage
+while all of these still hold; also what the work took and the versions of the packages it used.
 """
 
 import contextlib
@@ -18,9 +18,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from alice_survey import progress
 from alice_survey.errors import WorkspaceError
+from alice_survey.resources import Meter, Spent, versions, watched
 
 STAGE_FILE = "stage.json"
+_SPENT_FILE = ".spent"
+"""In an unfinished stage: what it has taken so far."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,37 +76,62 @@ def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], None]) -> bo
         else:
             replaced.rename(final)
     previous = read_stage(final)
-    inputs = digest_inputs(stage.inputs, workspace, previous)
+    with progress.step(f"check what {stage.name} depends on"):
+        inputs = digest_inputs(stage.inputs, workspace, previous)
     digest = _digest_stage(stage, inputs)
     if previous is not None and previous.get("digest") == digest:
         if partial.exists():
             shutil.rmtree(partial)
+        progress.skipped(stage.name)
         return False
 
     marker = partial / ".digest"
-    if partial.exists() and not (stage.resumes and _text(marker) == digest):
+    resumed = stage.resumes and _text(marker) == digest
+    if partial.exists() and not resumed:
         shutil.rmtree(partial)
     partial.mkdir(parents=True, exist_ok=True)
     with atomic_path(marker) as path:
         path.write_text(digest)
-    started = time.monotonic()
-    work(partial)
-    record = {
-        "stage": stage.name,
-        "version": stage.version,
-        "digest": digest,
-        "settings": stage.settings,
-        "inputs": inputs,
-        "took_s": round(time.monotonic() - started, 3),
-    }
-    write_json(partial / STAGE_FILE, record)
-    marker.unlink()
-    if final.exists():
-        final.rename(replaced)
-    partial.rename(final)
-    if replaced.exists():
-        shutil.rmtree(replaced)
+    told = {"resumed": True} if resumed else {}
+    with progress.stage(stage.name, **told) as finish:
+        spent = _measured(partial, work).to_json()
+        record = {
+            "stage": stage.name,
+            "version": stage.version,
+            "digest": digest,
+            "settings": stage.settings,
+            "inputs": inputs,
+            **spent,
+            **told,
+            "versions": versions(),
+        }
+        write_json(partial / STAGE_FILE, record)
+        (partial / _SPENT_FILE).unlink(missing_ok=True)
+        marker.unlink()
+        if final.exists():
+            final.rename(replaced)
+        partial.rename(final)
+        if replaced.exists():
+            shutil.rmtree(replaced)
+        finish(**spent, **told)
     return True
+
+
+def _measured(partial: Path, work: Callable[[Path], None]) -> Spent:
+    """Do a stage's work; what it took, with what was spent on it before it was interrupted."""
+    try:
+        earlier = Spent.from_json(json.loads((partial / _SPENT_FILE).read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError, KeyError):  # a kill may have come before the first
+        earlier = Spent()
+    meter = Meter(time.monotonic)
+
+    def keep(spent: Spent) -> None:
+        with contextlib.suppress(OSError):  # on a full disk the work itself will say so
+            write_json(partial / _SPENT_FILE, spent.after(earlier).to_json())
+
+    with watched(meter, keep):
+        work(partial)
+        return meter.look().after(earlier)
 
 
 def is_current(workspace: Path, stage: Stage) -> bool:

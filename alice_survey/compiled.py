@@ -6,13 +6,14 @@ stores its stamp elsewhere falls back to its own rule, which is enough for a pac
 installed and not edited.
 """
 
-import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 from numba import njit
+
+from alice_survey.errors import note
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -49,7 +50,7 @@ def tell_of_compiling(kernel: Any, what: str) -> None:
     stats = kernel.stats
     kept = Path(stats.cache_path).glob(f"*{kernel.__name__}*.nbi")
     if not stats.cache_hits and not stats.cache_misses and not any(kept):
-        sys.stderr.write(f"compiling {what}\n")
+        note(f"compiling {what}")
 
 
 def _room(function: Callable[..., Any]) -> Path:

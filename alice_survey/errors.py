@@ -2,10 +2,16 @@
 
 import contextlib
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextvars import ContextVar
+from typing import Literal
+
+Level = Literal["note", "warning"]
+Show = Callable[[Level, str], None]
 
 _listeners: ContextVar[tuple[list[str], ...]] = ContextVar("listeners", default=())
+_shows: list[Show] = []
+"""Where notes and warnings go, the last one; to standard error while there is none."""
 
 
 class AliceError(Exception):
@@ -46,9 +52,31 @@ class ReconstructionError(AliceError):
 
 def warn(text: str) -> None:
     """Tell the user, in one line on standard error, of something that work goes on without."""
-    sys.stderr.write(f"warning: {text}\n")
+    _show("warning", text)
     for told in _listeners.get():
         told.append(text)
+
+
+def note(text: str) -> None:
+    """Tell the user, in one line on standard error, why it takes long."""
+    _show("note", text)
+
+
+def _show(level: Level, text: str) -> None:
+    if _shows:
+        _shows[-1](level, text)
+    else:
+        sys.stderr.write(f"warning: {text}\n" if level == "warning" else f"{text}\n")
+
+
+@contextlib.contextmanager
+def shown_by(show: Show) -> Iterator[None]:
+    """Have notes and warnings of all threads shown by a function meanwhile."""
+    _shows.append(show)
+    try:
+        yield
+    finally:
+        _shows.remove(show)
 
 
 @contextlib.contextmanager
@@ -69,3 +97,14 @@ def why(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         return error.strerror.lower()
     return str(error)
+
+
+def known_fault(error: BaseException) -> str | None:
+    """The line that tells the user of a fault which is no bug; None for a bug."""
+    if isinstance(error, AliceError):
+        return str(error)
+    if isinstance(error, OSError):  # a full disk, a folder where a file should be, no permission
+        where = error.filename2 or error.filename
+        text = error.strerror or str(error)
+        return text if where is None else f"{where}: {text}"
+    return None

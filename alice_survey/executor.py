@@ -6,15 +6,19 @@ import multiprocessing
 import os
 import signal
 import sys
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sized
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextvars import ContextVar
-from typing import TypeVar
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
+
+from alice_survey.errors import AliceError, Level, shown_by, warn
+from alice_survey.progress import counted, current, keep_silent, step
 
 _PR_SET_PDEATHSIG = 1
-_WORTH_TELLING_S = 2.0
+_TOLD = "told_in_worker"
 _CORES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 _kept: ContextVar[dict[int, ProcessPoolExecutor] | None] = ContextVar("kept", default=None)
@@ -52,16 +56,17 @@ def parallel_map(
     if total is None and isinstance(items, Sized):
         total = len(items)
     if threads <= 1:
-        yield from progress(map(function, items), label, total)
+        yield from counted(map(function, items), label, total, 1)
         return
     kept = _kept.get()
     if kept is not None:
         if threads not in kept:
             kept[threads] = _workers(threads)
-        yield from progress(_in_order(kept[threads], function, items, 3 * threads), label, total)
+        done = _in_order(kept[threads], function, items, 3 * threads)
+        yield from counted(done, label, total, threads)
         return
-    with _workers(threads) as executor:
-        yield from progress(_in_order(executor, function, items, 3 * threads), label, total)
+    with _ended(_workers(threads)) as pool:
+        yield from counted(_in_order(pool, function, items, 3 * threads), label, total, threads)
 
 
 @contextlib.contextmanager
@@ -74,10 +79,32 @@ def kept_workers() -> Iterator[None]:
     token = _kept.set(kept)
     try:
         yield
+    except BaseException:
+        for pool in kept.values():
+            _end(pool)
+        raise
     finally:
         _kept.reset(token)
-        for pool in kept.values():
-            pool.shutdown(cancel_futures=True)
+    for pool in kept.values():
+        pool.shutdown(cancel_futures=True)
+
+
+@contextlib.contextmanager
+def _ended(pool: ProcessPoolExecutor) -> Iterator[ProcessPoolExecutor]:
+    """Wait for the processes of a pool at the end; where work is broken off, end them at once."""
+    try:
+        yield pool
+    except BaseException:
+        _end(pool)
+        raise
+    pool.shutdown()
+
+
+def _end(pool: ProcessPoolExecutor) -> None:
+    processes = list((pool._processes or {}).values())
+    for process in processes:
+        process.terminate()
+    pool.shutdown(cancel_futures=True)
 
 
 def _workers(threads: int) -> ProcessPoolExecutor:
@@ -85,31 +112,93 @@ def _workers(threads: int) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(threads, mp_context=context, initializer=_start_worker)
 
 
+@dataclass(frozen=True)
+class _Answer(Generic[Result]):
+    """What comes back from another process."""
+
+    result: Result
+    told: list[tuple[Level, str]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Call(Generic[Item, Result]):
+    """A function whose notes and warnings come back with its result."""
+
+    function: Callable[[Item], Result]
+    quiet: bool
+
+    def __call__(self, item: Item) -> _Answer[Result]:
+        told: list[tuple[Level, str]] = []
+
+        def show(level: Level, text: str) -> None:
+            told.append((level, text))
+            if level == "note" and not self.quiet:  # it says why the next minute is long
+                sys.stderr.write(f"{text}\n")
+
+        with shown_by(show):
+            try:
+                return _Answer(self.function(item), told)
+            except Exception as error:
+                vars(error)[_TOLD] = told
+                raise
+
+
 def _in_order(
-    executor: Executor, function: Callable[[Item], Result], items: Iterable[Item], queued: int
+    pool: ProcessPoolExecutor,
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    queued: int,
 ) -> Iterator[Result]:
-    waiting: deque[Future[Result]] = deque()
+    call = _Call(function, current().quiet)
+    waiting: deque[Future[_Answer[Result]]] = deque()
     try:
         for item in items:
-            with _one_core_each():  # a process starts when there is something for it to do
-                waiting.append(executor.submit(function, item))
+            with _as_workers_start():  # a process starts when there is something for it to do
+                waiting.append(pool.submit(call, item))
             if len(waiting) >= queued:
-                yield waiting.popleft().result()
+                yield _result(waiting.popleft())
         while waiting:
-            yield waiting.popleft().result()
+            yield _result(waiting.popleft())
+    except BrokenProcessPool:
+        raise AliceError(
+            "a process that worked for this one was ended from outside, most likely because memory "
+            "ran out: give fewer --threads, or close other programs; the same command goes on from "
+            "here"
+        ) from None
     finally:
         for future in waiting:
             future.cancel()
 
 
+def _result(future: "Future[_Answer[Result]]") -> Result:
+    """What an item gave, once what its work told is told here."""
+    try:
+        answer = future.result()
+    except Exception as error:
+        _tell(vars(error).pop(_TOLD, []))
+        raise
+    _tell(answer.told)
+    return answer.result
+
+
+def _tell(told: list[tuple[Level, str]]) -> None:
+    for level, text in told:
+        if level == "warning":
+            warn(text)
+        else:
+            current().tell("note", text, shown=True)
+
+
 @contextlib.contextmanager
-def _one_core_each() -> Iterator[None]:
-    """Have processes started meanwhile load their numeric libraries for one core each."""
+def _as_workers_start() -> Iterator[None]:
+    """Have processes started meanwhile take one core each, and leave Ctrl-C to this one."""
     before = {name: os.environ.get(name) for name in _CORES}
     os.environ.update(dict.fromkeys(_CORES, "1"))
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         for name, value in before.items():
             if value is None:
                 os.environ.pop(name, None)
@@ -122,25 +211,22 @@ def _start_worker() -> None:
     import cv2
 
     cv2.setNumThreads(1)
+    keep_silent()
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def progress(items: Iterable[Item], label: str, total: int | None = None) -> Iterator[Item]:
-    """Pass items through while a bar on standard error shows how far the work is.
+    """Pass items through while standard error shows how far the work on them is.
 
-    On a terminal the bar moves; elsewhere one line says that work of some seconds is done.
+    Args:
+        items: each of which whoever takes it then works on.
+        label: what is done, in a few words.
+        total: how many items, if that is known.
     """
-    if sys.stderr.isatty():
-        from rich.console import Console
-        from rich.progress import track
-
-        yield from track(items, label, total=total, console=Console(stderr=True))
-        return
-    started, count = time.monotonic(), 0
-    for item in items:
-        count += 1
-        yield item
-    took_s = time.monotonic() - started
-    if took_s > _WORTH_TELLING_S:
-        sys.stderr.write(f"{label}: {count} done in {took_s:.1f} s\n")
+    if total is None and isinstance(items, Sized):
+        total = len(items)
+    with step(label, total) as counter:
+        for item in items:
+            yield item
+            counter.advance()

@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from alice_survey.resources import family_of, memory_mib_of
+
 _EVERY_S = 0.2
 
 
@@ -48,13 +50,13 @@ def measured(command: Sequence[str], log: Path, timeout_s: float = 7200.0) -> Co
         process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
         try:
             while process.poll() is None:
-                peak = max(peak, sum(_memory_mib(pid) for pid in _family(process.pid)))
+                peak = max(peak, sum(memory_mib_of(pid) for pid in family_of(process.pid)))
                 if late := time.perf_counter() - started > timeout_s:
                     break
                 time.sleep(_EVERY_S)
         finally:
             if process.poll() is None:
-                for pid in _family(process.pid):
+                for pid in family_of(process.pid):
                     os.kill(pid, signal.SIGTERM)
                 process.wait()
     after = os.times()
@@ -67,29 +69,6 @@ def measured(command: Sequence[str], log: Path, timeout_s: float = 7200.0) -> Co
         log=log,
         stopped=late,
     )  # fmt: skip
-
-
-def _family(root: int) -> list[int]:
-    """A process and all its descendants."""
-    family, waiting = [], [root]
-    while waiting:
-        pid = waiting.pop()
-        family.append(pid)
-        try:
-            for task in Path(f"/proc/{pid}/task").iterdir():
-                waiting += [int(child) for child in (task / "children").read_text().split()]
-        except OSError:
-            continue  # it has ended meanwhile
-    return family
-
-
-def _memory_mib(pid: int) -> float:
-    """Proportional set size: what is shared counts once."""
-    try:
-        text = Path(f"/proc/{pid}/smaps_rollup").read_text()
-    except OSError:
-        return 0.0
-    return next((int(s.split()[1]) / 1024 for s in text.splitlines() if s.startswith("Pss:")), 0.0)
 
 
 def python(*arguments: str) -> list[str]:
