@@ -18,12 +18,13 @@ from alice_survey.cli_options import (
     Workspace,
     examples,
     print_result,
+    with_sessions,
 )
 from alice_survey.cli_plan import app as plan_app
 from alice_survey.cli_reconstruct import app as model_app
 from alice_survey.cli_reconstruct import reconstruct_app
 from alice_survey.cli_vehicle import app as vehicle_app
-from alice_survey.errors import AliceError
+from alice_survey.errors import AliceError, known_fault
 
 app = typer.Typer(
     name="alice-survey",
@@ -350,6 +351,9 @@ def status(workspace: Workspace = WORK, survey: SurveyFile = None, as_json: AsJs
     print_result(*workspace_status(workspace, survey), as_json)
 
 
+with_sessions(app)
+
+
 def main() -> None:
     """Run the command line; a known fault is one line on standard error and exit code 1."""
     # Modules leave many objects that stay: looking through them again and again for garbage while
@@ -357,11 +361,6 @@ def main() -> None:
     gc.set_threshold(100_000)
     try:
         app()
-    except AliceError as error:
-        typer.echo(f"error: {error}", err=True)
-        raise SystemExit(1) from error
-    except OSError as error:  # a full disk, a folder where a file should be, no permission
-        where = error.filename2 or error.filename
-        text = error.strerror or str(error)
-        typer.echo(f"error: {text}" if where is None else f"error: {where}: {text}", err=True)
+    except (AliceError, OSError) as error:
+        typer.echo(f"error: {known_fault(error)}", err=True)
         raise SystemExit(1) from error

@@ -14,6 +14,7 @@ from alice_survey.artefacts import only_checking, read_json, read_stage
 from alice_survey.config import SurveyConfig, changed, load_config, parse_current, parse_health
 from alice_survey.errors import AliceError, ConfigError, WorkspaceError, warn
 from alice_survey.executor import default_threads
+from alice_survey.progress import part
 from alice_survey.summaries import SUMMARIES
 
 RECONSTRUCT = ("calibration", "sparse", "dense", "mosaic", "mesh")
@@ -167,8 +168,9 @@ def run(
             state = _state(workspace, "plan", planned, {}, imported)
             if state.startswith("stale"):
                 warn(f"the plan is {state}; 'alice-survey plan -w {workspace}' renews it")
-        for stage in stages:
-            done = _work_of(stage)(workspace, config, threads or default_threads())
+        for number, stage in enumerate(stages, 1):
+            with part(stage, number, len(stages)):
+                done = _work_of(stage)(workspace, config, threads or default_threads())
             text, data = SUMMARIES[stage](workspace / stage)
             found[stage] = {"done": done, **data}
             lines.append(f"{stage}: {text}" if done else f"{stage}: (up to date) {text}")
