@@ -23,6 +23,7 @@ from alice_survey.cli_options import (
 from alice_survey.cli_plan import app as plan_app
 from alice_survey.cli_reconstruct import app as model_app
 from alice_survey.cli_reconstruct import reconstruct_app
+from alice_survey.cli_report import app as report_app
 from alice_survey.cli_vehicle import app as vehicle_app
 from alice_survey.errors import AliceError, known_fault
 
@@ -40,6 +41,7 @@ app.add_typer(plan_app, name="plan")
 app.add_typer(import_app)
 app.add_typer(reconstruct_app, name="reconstruct")
 app.add_typer(model_app)
+app.add_typer(report_app)
 app.add_typer(camera_app, name="camera")
 app.add_typer(vehicle_app, name="vehicle")
 
@@ -320,7 +322,8 @@ def run_all(
 ) -> None:
     """Do the whole loop.
 
-    plan, fly, image, calibrate, reconstruct, evaluate: stages that are up to date are skipped.
+    plan, fly, image, calibrate, reconstruct, evaluate, report: stages that are up to date are
+    skipped.
     """
     from alice_survey.survey import LOOP, run
 

@@ -100,6 +100,12 @@ def _evaluation(folder: Path) -> Summary:
     return f"score in {folder / 'score.json'}\n{table}", found
 
 
+def _report(folder: Path) -> Summary:
+    found = read_json(folder / "report.json")
+    said = "\n".join(f"  {question}: {answer}" for question, answer in found["summary"].items())
+    return f"{folder / 'report.html'} and {folder / 'report.pdf'}\n{said}", found
+
+
 SUMMARIES: dict[str, Callable[[Path], Summary]] = {
     "plan": _plan,
     "flight": _flight,
@@ -111,5 +117,6 @@ SUMMARIES: dict[str, Callable[[Path], Summary]] = {
     "mosaic": _mosaic,
     "mesh": _mesh,
     "evaluation": _evaluation,
+    "report": _report,
 }
 """By stage: takes its folder."""

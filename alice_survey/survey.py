@@ -10,15 +10,16 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from alice_survey.artefacts import only_checking, read_json, read_stage
+from alice_survey.artefacts import STAGE_FILE, only_checking, read_json, read_stage
 from alice_survey.config import SurveyConfig, changed, load_config, parse_current, parse_health
+from alice_survey.contents import taken_from
 from alice_survey.errors import AliceError, ConfigError, WorkspaceError, warn
 from alice_survey.executor import default_threads
 from alice_survey.progress import part
 from alice_survey.summaries import SUMMARIES
 
 RECONSTRUCT = ("calibration", "sparse", "dense", "mosaic", "mesh")
-LOOP = ("plan", "flight", "pool", "images", *RECONSTRUCT, "evaluation")
+LOOP = ("plan", "flight", "pool", "images", *RECONSTRUCT, "evaluation", "report")
 _NEEDS = {
     "plan": (),
     "flight": ("plan",),
@@ -30,6 +31,7 @@ _NEEDS = {
     "mosaic": ("dense",),
     "mesh": ("dense",),
     "evaluation": ("mosaic", "mesh"),
+    "report": ("mosaic", "mesh", "evaluation"),
 }
 _COMMANDS = {
     "plan": "plan",
@@ -42,6 +44,7 @@ _COMMANDS = {
     "mosaic": "reconstruct",
     "mesh": "reconstruct",
     "evaluation": "evaluate",
+    "report": "report",
 }
 _SIMULATED = ("plan", "flight", "pool", "images", "calibration", "evaluation")
 
@@ -123,6 +126,10 @@ def _work_of(stage: str) -> StageWork:
             from reconstruct.evaluate.run import run_evaluate
 
             return run_evaluate
+        case "report":
+            from alice_survey.report.run import run_report
+
+            return run_report
         case _:
             raise ValueError(stage)
 
@@ -205,7 +212,10 @@ def settings(workspace: Path, survey: Path | None, *, needed: bool) -> SurveyCon
 def is_imported(workspace: Path) -> bool:
     """Whether the pictures of a workspace are real ones."""
     path = workspace / "images" / "survey.json"
-    return path.is_file() and read_json(path).get("source") == "imported"
+    if not path.is_file():
+        return False
+    with taken_from(path):
+        return bool(read_json(path).get("source") == "imported")
 
 
 def init_survey(folder: Path, template: str = "survey.toml", area: Path | None = None) -> Path:
@@ -258,7 +268,8 @@ def run_demo(workspace: Path, threads: int | None) -> tuple[str, dict[str, Any]]
         ("the track", "evaluation/track.png"),
     ]
     rows = [f"  {what:12} {workspace / path}" for what, path in pictures]
-    return "\n".join([text, "", "Pictures to look at:", *rows]), found
+    page = f"  {'all of it':12} {workspace / 'report' / 'report.html'}"
+    return "\n".join([text, "", "To look at:", *rows, page]), found
 
 
 def workspace_status(workspace: Path, survey: Path | None) -> tuple[str, dict[str, Any]]:
@@ -277,7 +288,8 @@ def workspace_status(workspace: Path, survey: Path | None) -> tuple[str, dict[st
     rows = []
     for stage, state in states.items():
         record = read_stage(workspace / stage)
-        took = f"{record['took_s']:8.1f} s" if record else " " * 10
+        with taken_from(workspace / stage / STAGE_FILE):
+            took = f"{float(record['took_s']):8.1f} s" if record else " " * 10
         rows.append(f"{stage:12} {state:32} {took}")
     after = f"next: {command}" if command else "nothing is left to do"
     return "\n".join([*rows, after]), {"stages": states, "next": command}
@@ -294,7 +306,9 @@ def _state(
             return f"stale ({need} is {before[need].split()[0]})"
     if imported and stage == "images":
         return "up to date"
-    if stage == "plan" and "refly_of" in (read_stage(workspace / stage) or {})["settings"]:
+    with taken_from(workspace / stage / STAGE_FILE):
+        refly = stage == "plan" and "refly_of" in (read_stage(workspace / stage) or {})["settings"]
+    if refly:
         return "up to date"  # what was made for the holes of a dive has no settings of its own
     try:
         with only_checking():

@@ -1,1 +1,1 @@
-"""One page of a survey, for the screen and for print: what was mapped, how well, what to do next."""
+"""One page of a survey, for screen and print: what was mapped, how well, what to do next."""

@@ -76,7 +76,7 @@ class PictureLayer:
     """Level 0 is the coarsest; the last is full: tile x, y at level k covers
     `tile_px * 2**(levels - 1 - k)` full pixels a side."""
     tiles: Mapping[str, bytes]
-    """JPEG, PNG or WebP by "k/x/y"; a tile at the border may be smaller."""
+    """WebP by "k/x/y"; a tile at the border may be smaller."""
     scale: Scale | None = None
     shown: bool = False
     """From the start; of base layers only one can be."""

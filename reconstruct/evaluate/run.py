@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rasterio
 
 from alice_survey.artefacts import (
     Stage,
@@ -23,6 +24,7 @@ from alice_survey.artefacts import (
 )
 from alice_survey.config import SurveyConfig
 from alice_survey.errors import WorkspaceError
+from alice_survey.frames import Array
 from alice_survey.manifest import read_manifest
 from alice_survey.seafloor.terrain import read_terrain
 from alice_survey.seafloor.texture import survey_texture
@@ -70,7 +72,7 @@ def run_evaluate(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     has_mesh = read_stage(mesh) is not None
     if has_mesh:
         inputs += [mesh / "mesh.ply", mesh / "mesh.json"]
-    stage = Stage(name="evaluation", version=3, settings={"seed": config.seed}, inputs=inputs)
+    stage = Stage(name="evaluation", version=4, settings={"seed": config.seed}, inputs=inputs)
 
     def work(folder: Path) -> None:
         area = read_plan(plan / "plan.json").area.survey
@@ -109,11 +111,21 @@ def run_evaluate(workspace: Path, config: SurveyConfig, threads: int) -> bool:
         score["overlaps"] = _rounded(overlaps_reached(workspace, truth))
         write_json(folder / "score.json", score)
         write_cameras(folder / "cameras.csv", cameras)
+        _write_errors(folder / "error.tif", dense / "dem.tif", surface.map_m)
         plot_track(folder / "track.png", plan / "plan.json", cameras)
         plot_errors(folder / "errors.png", surface, area)
         plot_sheet(folder / "sheet.png", workspace, cameras, surface, area)
 
     return run_stage(workspace, stage, work)
+
+
+def _write_errors(path: Path, dem: Path, errors: Array) -> None:
+    """Height less the true height, on the DEM's own grid."""
+    with rasterio.open(dem) as source:
+        profile = source.profile
+    with rasterio.open(path, "w", **profile) as raster:
+        raster.write(errors.astype(np.float32), 1)
+        raster.set_band_description(1, "height less true height (m)")
 
 
 def write_cameras(path: Path, cameras: CameraScore) -> None:

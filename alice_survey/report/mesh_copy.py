@@ -1,0 +1,138 @@
+"""A copy of the mesh that is light enough for a page.
+
+Small meshes keep their triangles and get a smaller texture. Of large ones the page shows the
+elevation model under the mosaic instead: as many cells as a browser turns smoothly.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import rasterio
+from rasterio.enums import Resampling
+
+from alice_survey.frames import Array
+from alice_survey.report.document import Mesh
+from alice_survey.report.held import Held
+from alice_survey.report.pictures import still
+from alice_survey.report.words import count
+
+_MOST_TRIANGLES = 250_000
+_MOST_TEXTURE_PX = 3072
+_MOST_CELLS = 90_000
+_QUALITY = 80
+
+
+def mesh_copy(held: Held, glb: Path) -> Mesh | None:
+    """Write a light copy to `glb`; None where a workspace holds no mesh."""
+    if not held.has("mesh"):
+        return None
+    triangles = int(held.json("mesh/mesh.json")["triangles"])
+    whole = triangles <= _MOST_TRIANGLES
+    scene = _shrunk(held.workspace / "mesh" / "mesh.glb") if whole else _relief(held)
+    glb.write_bytes(scene.export(file_type="glb"))
+    about = (
+        f"{count(triangles, 'triangle')}, texture shrunk for the page."
+        if whole
+        else f"The elevation model under the mosaic, since the mesh's {triangles:,} triangles are "
+        "too many for a page."
+    )
+    return Mesh(
+        glb=glb,
+        about=about,
+        still=still(held.workspace / "mesh" / "mesh.png"),
+        alt="The mesh seen from above and from the side",
+    )
+
+
+def _shrunk(path: Path) -> Any:
+    """The mesh with smaller textures."""
+    import trimesh
+    from PIL import Image
+
+    scene = trimesh.load_scene(path)
+    for part in scene.geometry.values():
+        material = part.visual.material
+        picture = material.baseColorTexture.convert("RGB")
+        shrink = max(picture.size) / _MOST_TEXTURE_PX
+        if shrink > 1.0:
+            size = tuple(max(1, round(side / shrink)) for side in picture.size)
+            picture = picture.resize(size, Image.Resampling.LANCZOS)
+        material.baseColorTexture = _as_jpeg(picture)
+    return scene
+
+
+def _relief(held: Held) -> Any:
+    """The elevation model as triangles under the mosaic."""
+    import trimesh
+    from PIL import Image
+
+    with rasterio.open(held.workspace / "dense" / "dem.tif") as raster:
+        shrink = max(1.0, float(np.sqrt(raster.width * raster.height / _MOST_CELLS)))
+        shape = (max(2, round(raster.height / shrink)), max(2, round(raster.width / shrink)))
+        heights = raster.read(1, out_shape=shape, resampling=Resampling.average)
+        bounds = raster.bounds
+    east = np.linspace(bounds.left, bounds.right, 2 * shape[1] + 1)[1::2]
+    north = np.linspace(bounds.top, bounds.bottom, 2 * shape[0] + 1)[1::2]
+    points, faces, used = grid_mesh(east, north, heights.astype(np.float64))
+    with rasterio.open(held.workspace / "mosaic" / "mosaic.tif") as raster:
+        shrink = max(1.0, max(raster.width, raster.height) / _MOST_TEXTURE_PX)
+        size = (max(1, round(raster.height / shrink)), max(1, round(raster.width / shrink)))
+        bands = raster.read([1, 2, 3], out_shape=(3, *size), resampling=Resampling.average)
+        over = raster.bounds
+    uv = np.column_stack(
+        [
+            (used[:, 0] - over.left) / (over.right - over.left),
+            (used[:, 1] - over.bottom) / (over.top - over.bottom),
+        ]
+    )
+    picture = _as_jpeg(Image.fromarray(np.moveaxis(bands, 0, -1)))
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
+    )
+    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    mesh = trimesh.Trimesh(vertices=points, faces=faces, visual=visual, process=False)
+    return trimesh.Scene(mesh)
+
+
+def grid_mesh(east: Array, north: Array, heights: Array) -> tuple[Array, Array, Array]:
+    """Triangles between the known heights of a grid.
+
+    Args:
+        east: (W,) of the columns.
+        north: (H,) of the rows, falling.
+        heights: (H, W); NaN where unknown.
+
+    Returns:
+        (V, 3) vertices as glTF has them (x east, y up, z south) about their middle, (T, 3) faces,
+        and (V, 2) east and north of the vertices.
+    """
+    known = np.isfinite(heights)
+    number = np.cumsum(known.ravel()).reshape(known.shape) - 1
+    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
+    there = [known[:-1, :-1], known[:-1, 1:], known[1:, :-1], known[1:, 1:]]
+    first = there[0] & there[2] & there[1]
+    second = there[1] & there[2] & there[3]
+    faces = np.concatenate(
+        [
+            np.stack([a, c, b], axis=-1)[first],
+            np.stack([b, c, d], axis=-1)[second],
+        ]
+    )
+    easts, norths = np.meshgrid(east, north)
+    places = np.column_stack([easts[known], norths[known]])
+    up = heights[known]
+    points = np.column_stack([places[:, 0], up, -places[:, 1]])
+    return points - (points.max(axis=0) + points.min(axis=0)) / 2, faces, places
+
+
+def _as_jpeg(picture: Any) -> Any:
+    """A picture that exporters write as JPEG."""
+    import io
+
+    from PIL import Image
+
+    bgr = cv2.cvtColor(np.asarray(picture), cv2.COLOR_RGB2BGR)
+    data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
+    return Image.open(io.BytesIO(data))

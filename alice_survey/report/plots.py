@@ -1,0 +1,257 @@
+"""Plots of a report: readable in print and by the colour-blind, each with its plain words."""
+
+import io
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from alice_survey.frames import Array
+from alice_survey.report.document import Figure
+from alice_survey.report.figures import Figures
+from alice_survey.report.held import Held, number
+from alice_survey.report.words import digits
+
+INKS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+"""Of Okabe and Ito's palette; lines also differ by their marks."""
+_MARKS = ("o", "s", "^", "D", "v", "x")
+_WIDTH_IN = 7.6
+_DPI = 130
+_STYLE = {
+    "font.size": 9.5, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True,
+    "grid.color": "#e3e8eb", "axes.edgecolor": "#7b8a93", "axes.labelcolor": "#22313a",
+    "legend.frameon": False, "axes.axisbelow": True, "svg.hashsalt": "alice-survey",
+}  # fmt: skip
+
+
+def draw(height_in: float, columns: int, paint: Callable[[Sequence[Any]], None]) -> bytes:
+    """A PNG of a row of axes."""
+    import matplotlib as mpl
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure as Sheet
+
+    with mpl.rc_context(_STYLE):
+        sheet = Sheet(figsize=(_WIDTH_IN, height_in), dpi=_DPI, layout="constrained")
+        FigureCanvasAgg(sheet)
+        paint(list(sheet.subplots(1, columns, squeeze=False)[0]))
+        data = io.BytesIO()
+        sheet.savefig(data, format="png", metadata={"Software": None})
+    return data.getvalue()
+
+
+def camera_sigmas(figures: Figures) -> Figure | None:
+    """Stated sigmas of the cameras along the survey, and their true errors where known."""
+    rows = [r for r in figures.held.track if number(r, "sigma_north_m") > 0]
+    if not rows:
+        return None
+    order = np.array([number(row, "station") for row in rows])
+    misses = {r["image"]: r for r in figures.held.rows("evaluation/cameras.csv")}
+
+    def paint(axes: Sequence[Any]) -> None:
+        for axis, ink, mark in zip(("north", "east", "depth"), INKS, _MARKS, strict=False):
+            sigma = [1e2 * number(row, f"sigma_{axis}_m") for row in rows]
+            axes[0].plot(order, sigma, mark, ms=3, color=ink, label=axis)
+        axes[0].set(xlabel="station", ylabel="sigma on the Earth, cm", ylim=(0, None))
+        axes[0].legend()
+        if misses:
+            for axis, ink, mark in zip(("north", "east", "down"), INKS, _MARKS, strict=False):
+                known = [(o, misses[r["image"]]) for o, r in zip(order, rows, strict=True)
+                         if r["image"] in misses]  # fmt: skip
+                axes[1].plot(
+                    [o for o, _ in known],
+                    [1e3 * number(row, f"{axis}_error_m") for _, row in known],
+                    mark, ms=3, color=ink, label=axis,
+                )  # fmt: skip
+            axes[1].set(xlabel="station", ylabel="error within the survey, mm")
+            axes[1].legend()
+
+    return Figure(
+        png=draw(2.9, 2 if misses else 1, paint),
+        title="How well each camera is placed",
+        alt="Standard deviations of camera positions by station"
+        + (", and their errors against the truth" if misses else ""),
+        shows="The model's own standard deviation of every camera, by station. What all cameras "
+        "share is navigation's error of the whole survey."
+        + (" Right: errors after one rigid alignment: what bends the model." if misses else ""),
+        good="No station stands out; errors scatter about zero without a trend.",
+        otherwise="A rise at the ends of lines asks for a line across them; a single station that "
+        "stands out has too few points (see the next plot).",
+    )  # fmt: skip
+
+
+def pictures_used(figures: Figures) -> Figure | None:
+    """Points and reprojection error of each picture."""
+    rows = figures.held.track
+    if not rows:
+        return None
+    points = np.array([number(row, "points") for row in rows])
+    error = np.array([number(row, "reprojection_px") for row in rows])
+
+    def paint(axes: Sequence[Any]) -> None:
+        axes[0].plot(points, ".", ms=4, color=INKS[0])
+        axes[0].set(xlabel="picture", ylabel="points of the model", ylim=(0, None))
+        axes[1].hist(error, bins=30, color=INKS[0], edgecolor="white", linewidth=0.4)
+        axes[1].set(xlabel="mean reprojection error, px", ylabel="pictures")
+
+    return Figure(
+        png=draw(2.6, 2, paint),
+        title="What each picture gives to the model",
+        alt="Points by picture, and a histogram of reprojection errors",
+        shows=f"Points that each picture shares with others (median {np.median(points):.0f}), and "
+        f"how far they miss ({digits(float(np.median(error)), 2)} px median).",
+        good="Hundreds of points everywhere, and errors well below one pixel.",
+        otherwise="Few points: dark, blurred or without overlap; see the list of pictures. Large "
+        "errors in all: the calibration does not fit.",
+    )
+
+
+def heights(figures: Figures) -> Figure | None:
+    """Stated sigmas of the heights, and the errors over them where the truth is known."""
+    values = sampled(figures.held, "dense/sigma.tif")
+    if values is None or not len(values):
+        return None
+    unit = figures.held.unit
+    factor, label = (1e3, "mm") if unit == "m" else (1.0, unit)
+    errors = paired(figures.held, "evaluation/error.tif", "dense/sigma.tif")
+
+    def paint(axes: Sequence[Any]) -> None:
+        shown = factor * values
+        most = float(np.percentile(shown, 99))
+        axes[0].hist(shown, bins=60, range=(0, most), color=INKS[0])
+        axes[0].axvline(float(np.median(shown)), color=INKS[1], label="median")
+        axes[0].set(xlabel=f"stated sigma of a height, {label}", yticks=[])
+        axes[0].legend()
+        if errors is not None:
+            ratio = errors[0] / errors[1]
+            grid = np.linspace(-4, 4, 161)
+            axes[1].hist(ratio, bins=81, range=(-4, 4), density=True, color=INKS[0], label="found")
+            normal = np.exp(-(grid**2) / 2) / np.sqrt(2 * np.pi)
+            axes[1].plot(grid, normal, color=INKS[1], label="as stated")
+            axes[1].set(xlabel="error over its stated sigma", yticks=[])
+            axes[1].legend()
+
+    return Figure(
+        png=draw(2.6, 1 if errors is None else 2, paint),
+        title="How well heights are known",
+        alt="Histogram of the standard deviations of heights"
+        + ("" if errors is None else ", and of errors over them beside the normal curve"),
+        shows="What the survey itself says of its heights, cell by cell: matching, geometry, and "
+        "the cameras' own uncertainty."
+        + ("" if errors is None else " Right: the true errors in those sigmas."),
+        good="The median is below the mosaic's pixel."
+        + ("" if errors is None else " The bars follow the line."),
+        otherwise="See the map of sigmas for where: low overlap, steep rocks, dark places.",
+    )
+
+
+def seen_by(figures: Figures) -> Figure | None:
+    """How many stations see the cells."""
+    values = sampled(figures.held, "dense/stations.tif", counts=True)
+    if values is None or not len(values):
+        return None
+    most = int(np.percentile(values, 99.5))
+    share = np.bincount(np.minimum(values.astype(np.int64), most), minlength=most + 1) / len(values)
+
+    def paint(axes: Sequence[Any]) -> None:
+        inks = [INKS[1] if n < 3 else INKS[0] for n in range(1, most + 1)]
+        axes[0].bar(range(1, most + 1), 100 * share[1:], color=inks)
+        axes[0].set(xlabel="stations that see a spot", ylabel="% of the surface")
+
+    return Figure(
+        png=draw(2.3, 1, paint),
+        title="Overlap reached",
+        alt="Share of the surface by the number of stations that see it",
+        shows=f"Share of the surface by the number of stations that see it; "
+        f"{100 * share[3:].sum():.1f} % is seen by three and more.",
+        good="Hardly anything below three (orange), where heights do not check one another.",
+        otherwise="Plan more forward or side overlap.",
+    )
+
+
+def stage_times(figures: Figures) -> Figure | None:
+    """Time and memory of the stages."""
+    stages = [(name, s) for name, s in figures.held.stages.items() if s.get("took_s") is not None]
+    if not stages:
+        return None
+    names = [name for name, _ in stages][::-1]
+    took = [float(stage["took_s"]) for _, stage in stages][::-1]
+    peaks = [float(stage.get("peak_mib") or np.nan) for _, stage in stages][::-1]
+    told = bool(np.isfinite(peaks).any())
+
+    def paint(axes: Sequence[Any]) -> None:
+        axes[0].barh(names, took, color=INKS[0])
+        axes[0].set(xlabel="time, s")
+        if told:
+            axes[1].barh(names, np.nan_to_num(peaks), color=INKS[2])
+            axes[1].set(xlabel="largest memory, MiB", yticklabels=[])
+
+    return Figure(
+        png=draw(0.9 + 0.24 * len(stages), 2 if told else 1, paint),
+        title="Time and memory",
+        alt="Time and memory of every stage",
+        shows="What each step took on this machine.",
+    )
+
+
+def correlations(names: Sequence[str], matrix: Array) -> Figure:
+    """Of the rig's parameters."""
+
+    def paint(axes: Sequence[Any]) -> None:
+        picture = axes[0].imshow(matrix, cmap="PuOr", vmin=-1, vmax=1)
+        axes[0].set_xticks(range(len(names)), names, rotation=90, fontsize=6)
+        axes[0].set_yticks(range(len(names)), names, fontsize=6)
+        axes[0].grid(visible=False)
+        axes[0].figure.colorbar(picture, ax=axes[0], shrink=0.8, label="correlation")
+
+    pairs = np.abs(np.triu(matrix, 1))
+    i, j = (int(n) for n in np.unravel_index(int(pairs.argmax()), pairs.shape))
+    return Figure(
+        png=draw(5.6, 1, paint),
+        title="Which parameters go together",
+        alt="Matrix of correlations of the rig's parameters",
+        shows=f"Correlations of what was estimated; the strongest is {matrix[i, j]:+.3f}, of "
+        f"{names[i]} with {names[j]}.",
+        good="Pale off the diagonal.",
+        otherwise="Dark pairs are known together, not one by one: no harm to the surface, but do "
+        "not read their values alone.",
+    )
+
+
+_SAMPLES = 400_000
+
+
+def sampled(held: Held, path: str, *, counts: bool = False) -> Array | None:
+    """Known values of a raster, evenly thinned; None where there is no raster."""
+    found = _read(held, path)
+    if found is None:
+        return None
+    values = found.ravel()
+    values = values[values > 0] if counts else values[np.isfinite(values)]
+    thinned: Array = values[:: max(1, len(values) // _SAMPLES)]
+    return thinned
+
+
+def paired(held: Held, first: str, second: str) -> tuple[Array, Array] | None:
+    """Values of two rasters where both are known, likewise."""
+    a, b = _read(held, first), _read(held, second)
+    if a is None or b is None or a.shape != b.shape:
+        return None
+    known = np.flatnonzero(np.isfinite(a).ravel() & (b > 0).ravel())
+    known = known[:: max(1, len(known) // _SAMPLES)]
+    return (a.ravel()[known], b.ravel()[known]) if len(known) else None
+
+
+def _read(held: Held, path: str) -> Array | None:
+    """A raster, every so many cells, so that the largest fits."""
+    import rasterio
+    from rasterio.enums import Resampling
+
+    file = held.file(path)
+    if file is None:
+        return None
+    with rasterio.open(file) as raster:
+        shrink = max(1.0, float(np.sqrt(raster.width * raster.height / 4e6)))
+        shape = (max(1, round(raster.height / shrink)), max(1, round(raster.width / shrink)))
+        values = raster.read(1, out_shape=shape, resampling=Resampling.nearest)
+    whole: Array = values.astype(np.float64)
+    return whole

@@ -1,0 +1,138 @@
+"""The stage `report`: `report.html`, `report.pdf` and `report.json` of whatever is there."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from alice_survey.artefacts import STAGE_FILE, Stage, atomic_path, run_stage, write_json
+from alice_survey.config import SurveyConfig
+from alice_survey.errors import WorkspaceError
+from alice_survey.report import reproduce
+from alice_survey.report.document import PictureLayer, Report, ShapeLayer, SurveyMap
+from alice_survey.report.figures import Figures
+from alice_survey.report.held import LOOSE, Held
+from alice_survey.report.mesh_copy import mesh_copy
+from alice_survey.report.page import render_html
+from alice_survey.report.pdf import write_pdf
+from alice_survey.report.rasters import picture_layers
+from alice_survey.report.sections import sections
+from alice_survey.report.shapes import shape_layers
+from alice_survey.report.summary import facts, summary
+from alice_survey.report.verdicts import verdicts
+
+_READ = (
+    "plan/plan.json", "flight/flight.json", "images/manifest.csv", "calibration/report.json",
+    "mapping/mapping.json", "mapping/port.json", "sparse", "dense/dem.tif", "dense/sigma.tif",
+    "mosaic/mosaic.tif", "mesh/mesh.glb", "evaluation",
+)  # fmt: skip
+"""What a report is made of; what is made with these goes unnamed."""
+
+
+def run_report(workspace: Path, config: SurveyConfig, threads: int) -> bool:
+    """Write `report/` from what the workspace holds.
+
+    Returns:
+        True when done, False when nothing had changed.
+
+    Raises:
+        WorkspaceError: the workspace holds no finished stage.
+    """
+    held = Held.of(workspace)
+    if not held.stages:
+        raise WorkspaceError(
+            f"{workspace} holds nothing to report on: run 'alice-survey plan' or 'import-images'"
+        )
+    inputs = [held.workspace / path for path in _READ]
+    inputs += [file for name in LOOSE for file in sorted((workspace / name).rglob("*.json"))]
+    inputs += sorted((workspace / "quality").glob("*.csv"))
+    stage = Stage(
+        name="report",
+        version=1,
+        settings={},
+        inputs=[path for path in inputs if path.exists()],
+    )
+
+    def work(folder: Path) -> None:
+        report = build_report(held, folder)
+        with atomic_path(folder / "report.html") as path:
+            path.write_text(render_html(report), encoding="utf-8")
+        with atomic_path(folder / "report.pdf") as path:
+            write_pdf(report, path)
+        write_json(folder / "report.json", report.data)
+        if report.mesh is not None:
+            report.mesh.glb.unlink()
+
+    return run_stage(workspace, stage, work)
+
+
+def build_report(held: Held, folder: Path) -> Report:
+    """All that there is to say.
+
+    Args:
+        held: the workspace.
+        folder: for the mesh's light copy.
+    """
+    figures = Figures(held=held)
+    found = verdicts(figures)
+    said, known = summary(figures, found), facts(figures)
+    layers: list[PictureLayer | ShapeLayer] = [*picture_layers(held), *shape_layers(held)]
+    chart = None
+    if layers:
+        chart = SurveyMap(layers=layers, unit=held.unit, origin=_origin(held))
+    mesh = mesh_copy(held, folder / "mesh.glb")
+    parts = list(sections(figures, has_map=chart is not None, has_mesh=mesh is not None))
+    parts.append(reproduce.section(figures))
+    return Report(
+        title=held.name,
+        subtitle=_subtitle(held),
+        summary=said,
+        facts=known,
+        verdicts=[(verdict.level, verdict.text) for verdict in found],
+        sections=parts,
+        map=chart,
+        mesh=mesh,
+        data=_data(figures, found, said, known),
+    )
+
+
+def _subtitle(held: Held) -> str:
+    kind = "simulated survey" if held.simulated else "survey"
+    newest = max((held.workspace / n / STAGE_FILE).stat().st_mtime for n in held.stages)
+    when = datetime.fromtimestamp(newest, UTC).strftime("%Y-%m-%d %H:%M UTC")
+    datum = held.json("sparse/frame.json").get("datum") or held.json("plan/plan.json").get("datum")
+    place = ""
+    if datum:
+        place = f"{datum['latitude_deg']:.5f}, {datum['longitude_deg']:.5f} (WGS 84); "
+    return f"{kind}; {place}last worked on {when}"
+
+
+def _origin(held: Held) -> str:
+    datum = held.json("sparse/frame.json").get("datum") or held.json("plan/plan.json").get("datum")
+    if datum and held.json("sparse/frame.json").get("name", "ned") == "ned":
+        return (
+            f"metres east and north of {datum['latitude_deg']:.7f}, {datum['longitude_deg']:.7f} "
+            "(WGS 84)"
+        )
+    return "the model's own axes"
+
+
+def _data(figures: Figures, found: Any, said: Any, known: Any) -> dict[str, Any]:
+    surface = figures.surface
+    return {
+        "format": "alice-survey report",
+        "version": 1,
+        "name": figures.held.name,
+        "unit": figures.held.unit,
+        "summary": dict(said),
+        "facts": dict(known),
+        "verdicts": [vars(verdict) for verdict in found],
+        "surface": None if surface is None else _finite(vars(surface)),
+        "stages": {
+            name: {key: stage.get(key) for key in ("version", "digest", "took_s")}
+            for name, stage in figures.held.stages.items()
+        },
+    }
+
+
+def _finite(values: dict[str, float]) -> dict[str, float | None]:
+    return {name: value if value == value else None for name, value in values.items()}

@@ -1,0 +1,447 @@
+"""The parts of a report, in the order of a survey: mission, camera, pictures, model, products."""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from alice_survey.report import plots
+from alice_survey.report.document import Figure, Section, Table
+from alice_survey.report.figures import Figures
+from alice_survey.report.held import Held
+from alice_survey.report.pictures import still
+from alice_survey.report.words import count, digits, duration, length, parts, share
+
+_NOT_PARAMETERS = 24
+"""Parameters beyond which a matrix of correlations is not drawn with names."""
+
+
+def sections(figures: Figures, *, has_map: bool, has_mesh: bool) -> Iterator[Section]:
+    """All parts for which there is something."""
+    if has_map:
+        yield _map(figures)
+    held = figures.held
+    if has_mesh:
+        yield _mesh(held)
+    if held.has("evaluation"):
+        yield _truth(figures)
+    if figures.reference or held.earlier:
+        yield _compared(figures)
+    if figures.control:
+        yield _control(figures)
+    if held.has("dense"):
+        yield _surface(figures)
+    if held.has("sparse"):
+        yield _model(figures)
+    if held.has("mapping") or held.has("calibration"):
+        yield _camera(figures)
+    if held.rows("quality/quality.csv"):
+        yield _quality(held)
+    if held.has("plan"):
+        yield _mission(figures)
+
+
+def _map(figures: Figures) -> Section:
+    held = figures.held
+    footprints = held.rows("mosaic/footprints.csv")
+    text = [
+        "Choose what the map shows at its upper right; it moves and zooms with mouse, fingers, or "
+        "the arrow keys and + and -."
+    ]
+    if held.has("plan", "flight"):
+        text.append(
+            "Plan and flown track differ by navigation's error as well as by the vehicle's."
+        )
+    tables = []
+    if footprints:
+        areas = np.array([float(row["area_m2"]) for row in footprints])
+        pixels = np.array([float(row["ground_pixel_m"]) for row in footprints])
+        tables.append(
+            Table(
+                title="Footprints",
+                header=("", "least", "median", "most"),
+                rows=[
+                    ("area of a picture", *(f"{v:.2f} {held.unit}²" for v in _three(areas))),
+                    ("pixel on the floor", *(length(v, held.unit) for v in _three(pixels))),
+                ],
+            )
+        )
+    return Section(name="map", title="Map", text=text, tables=tables, scene="map")
+
+
+def _three(values: Any) -> tuple[float, float, float]:
+    return float(values.min()), float(np.median(values)), float(values.max())
+
+
+def _mesh(held: Held) -> Section:
+    found = held.json("mesh/mesh.json")
+    return Section(
+        name="mesh",
+        title="Mesh",
+        text=[
+            f"{count(found['triangles'], 'triangle')}, {digits(found['area'])} {held.unit}² of "
+            f"surface, {share(found['textured_share'])} of it with texture. The page shows a "
+            "lighter copy; the files are in mesh/."
+        ],
+        scene="mesh",
+    )
+
+
+def _truth(figures: Figures) -> Section:
+    score = figures.truth
+    cameras, surface, mosaic = score["cameras"], score["surface"], score["mosaic"]
+    rows: list[Sequence[str]] = [
+        ("cameras", _mm(cameras["rms_mm"]), _mm(cameras["max_mm"]), "position, worst at right"),
+        ("surface", _mm(surface["distance_rms_mm"]), _mm(surface["distance_max_mm"]),
+         "distance from the true surface, all cells"),
+        ("mosaic", _mm(mosaic["position_rms_mm"]), _mm(mosaic["position_95_mm"]),
+         "position, 95 % at right"),
+        ("lengths", _mm(score["lengths"]["rms_mm"]), "",
+         f"over {length(score['lengths']['mean_length_m'])}"),
+        ("dome", _mm(surface["doming"]["dome_mm"]), "", "bend of the whole surface"),
+    ]  # fmt: skip
+    seen = surface.get("seen_from_3_stations")
+    if seen:
+        rows.insert(
+            2, ("surface, 3 stations and more", _mm(seen["distance_rms_mm"]), "",
+                f"{share(seen['share'])} of the area"),
+        )  # fmt: skip
+    if "mesh" in score:
+        rows.insert(3, ("mesh", _mm(score["mesh"]["distance_rms_mm"]), "", "likewise"))
+    within = surface["completeness_within_px"]
+    return Section(
+        name="truth",
+        title="Error against the truth",
+        text=[
+            "The sea floor was simulated, so that every error is known. The model was moved and "
+            "turned onto the truth by its cameras; its scale was not fitted: it is "
+            f"{parts(1e-6 * cameras['scale_error_ppm'])} off."
+        ],
+        tables=[
+            Table(title="Errors", header=("what", "rms", "worst", "of"), rows=rows),
+            Table(
+                title="Share of the area within so many ground pixels "
+                f"({length(1e-3 * surface['ground_pixel_mm'])}) of the truth",
+                header=[f"{pixels} px" for pixels in within],
+                rows=[[share(value) for value in within.values()]],
+            ),
+        ],
+        figures=_stills(figures.held, [
+            ("evaluation/errors.png", "Where the surface errs",
+             "Map and histogram of height errors.",
+             "Green and pale, without a slope or a dome.",
+             "Errors at the rim come from few pictures; a dome from calibration."),
+        ]),
+    )  # fmt: skip
+
+
+def _mm(value: float | None) -> str:
+    return "" if value is None else length(1e-3 * value)
+
+
+def _compared(figures: Figures) -> Section:
+    tables, stills = [], []
+    found = figures.reference
+    if found:
+        rows = [
+            (what, length(part["median_m"]), length(part["rms_m"]), length(part["95_m"]),
+             share(part["covered_share"]))
+            for what, part in (
+                ("survey to reference", found["survey_to_reference"]),
+                ("reference to survey", found["reference_to_survey"]),
+            )
+        ]  # fmt: skip
+        tables.append(
+            Table(
+                title=f"Distances from {found['reference'].rsplit('/', 1)[-1]}",
+                header=("", "median", "rms", "95 %", "covered"),
+                rows=rows,
+            )
+        )
+        stills.append(
+            ("reference/reference.png", "Distance from the reference",
+             "Signed distance after the registration.", "No slope, no dome.",
+             "A dome or a slope is the survey's, or the registration's.")
+        )  # fmt: skip
+    for name, change in figures.held.earlier:
+        tables.append(
+            Table(
+                title=f"Change since {name}",
+                header=("what", "value"),
+                rows=[(k.replace("_", " "), _plain(v)) for k, v in change.items() if _is_plain(v)],
+            )
+        )
+        stills.append(
+            (f"against/{name}/change.png", f"Change since {name}",
+             "Height less that of the earlier survey, and how sure it is.",
+             "Where nothing has changed, nothing is coloured.", "")
+        )  # fmt: skip
+    return Section(
+        name="compared",
+        title="Against other data",
+        tables=tables,
+        figures=_stills(figures.held, stills),
+    )
+
+
+def _is_plain(value: Any) -> bool:
+    return isinstance(value, (int, float, str)) and not isinstance(value, bool)
+
+
+def _plain(value: Any) -> str:
+    return digits(float(value)) if isinstance(value, float) else str(value)
+
+
+def _control(figures: Figures) -> Section:
+    score = figures.control
+    points: list[Sequence[str]] = [
+        (row["name"], row["use"], str(row["views"]), *(length(row[a]) for a in
+         ("north_m", "east_m", "down_m")), digits(row["misfit_sigmas"], 2))
+        for row in score["points"]
+    ]  # fmt: skip
+    bars: list[Sequence[str]] = [
+        (row["name"], row["use"], length(row["known_m"]), length(row["error_m"]),
+         parts(row["error_relative"]), digits(row["misfit_sigmas"], 2))
+        for row in score["bars"]
+    ]  # fmt: skip
+    tables = []
+    if points:
+        told = ("point", "use", "pictures", "north", "east", "down", "in sigmas")
+        tables.append(Table(title="Points", header=told, rows=points))
+    if bars:
+        columns = ("bar", "use", "length", "error", "relative", "in sigmas")
+        tables.append(Table(title="Scale bars", header=columns, rows=bars))
+    return Section(
+        name="control",
+        title="Control and check points",
+        text=["Those used as check took no part in placing the model."],
+        tables=tables,
+    )
+
+
+def _surface(figures: Figures) -> Section:
+    surface, held = figures.surface, figures.held
+    if surface is None:
+        return Section(name="surface", title="Surface")
+    found = held.json("dense/surface.json")
+    unit = held.unit
+    rows = [
+        ("cell", length(surface.cell, unit)),
+        ("area with a height", f"{digits(surface.area)} {unit}²"),
+        ("relief (99 % of it)", length(surface.high - surface.low, unit)),
+        ("share of the planned area", share(surface.covered)),
+        ("sigma of a height, median", length(surface.sigma_median, unit)),
+        ("of that the cameras' share", length(found.get("pose_sigma"), unit)),
+        ("sigma of a match", f"{digits(found['match_sigma_px'], 2)} px"),
+        ("stations that see a spot, median", f"{surface.stations_median:.0f}"),
+        ("heights count from", found["vertical_datum"]),
+    ]
+    drawn = [plots.heights(figures), plots.seen_by(figures)]
+    return Section(
+        name="surface",
+        title="Surface",
+        tables=[Table(title="Elevation model", header=("what", "value"), rows=rows)],
+        figures=[figure for figure in drawn if figure is not None],
+    )
+
+
+def _model(figures: Figures) -> Section:
+    held = figures.held
+    found, mapping = held.json("sparse/registration.json"), held.json("mapping/mapping.json")
+    rows = [
+        ("pictures", f"{found['registered']} of {found['total']}"),
+        ("points", f"{found['points']:,}"),
+        ("pictures that see a point, mean", digits(found["mean_track_length"])),
+        ("reprojection error, mean", f"{digits(found['mean_reprojection_px'])} px"),
+        ("scale", found["scale_source"]),
+    ]
+    doming = mapping.get("doming") or {}
+    for way in ("along", "across"):
+        bend = doming.get(way)
+        if bend:
+            rows.append(
+                (
+                    f"sag {way} the lines",
+                    f"{length(bend['sag_m'])} +/- {length(bend['sag_sigma_m'])}",
+                )
+            )
+    scale = doming.get("scale")
+    if scale:
+        rows.append(
+            ("scale of the stereo pairs",
+             f"{parts(scale['mean'] - 1.0)} +/- {parts(scale['mean_sigma']).lstrip('+')}")
+        )  # fmt: skip
+    place = found.get("georeference") or {}
+    axes = ("north", "east", "depth")
+    if place:
+        rows += [
+            (f"navigation's residual {axis}", f"{length(place[f'rms_{axis}_m'])} rms")
+            for axis in axes
+        ]
+        rows += [
+            (f"sigma of the whole survey, {axis}", length(place[f"sigma_{axis}_m"]))
+            for axis in axes
+        ]
+        rows.append(("sigma of its heading", f"{digits(place['sigma_heading_deg'], 2)} deg"))
+        rows.append(("sigma of its level", f"{digits(place['sigma_tilt_deg'], 2)} deg"))
+    notes = held.json("sparse/frame.json").get("notes", [])
+    drawn = [plots.camera_sigmas(figures), plots.pictures_used(figures)]
+    return Section(
+        name="model",
+        title="Camera track and points",
+        text=[f"How it was made: {'; '.join(notes)}."] if notes else [],
+        tables=[Table(title="Model", header=("what", "value"), rows=rows)],
+        figures=[figure for figure in drawn if figure is not None],
+    )
+
+
+def _camera(figures: Figures) -> Section:
+    held = figures.held
+    calibrated, refined = held.json("calibration/report.json"), held.json("mapping/port.json")
+    text, tables, drawn = [], [], []
+    if calibrated:
+        text.append(
+            f"Calibrated from {count(calibrated['views'], 'view')}: "
+            f"{digits(calibrated['rms_px'], 2)} px rms. The calibration's own report is "
+            "calibration/report.html."
+        )
+        tables.append(
+            Table(
+                title="Calibration",
+                header=("parameter", "value", "sigma", "unit"),
+                rows=[
+                    (row["name"], f"{row['value']:.8g}", _sigma(row["sigma"]), row["unit"])
+                    for row in calibrated["parameters"]
+                ],
+            )
+        )
+    if refined:
+        names = refined["parameters"]
+        text.append(
+            f"The survey's own pictures refined the rig from {refined['observations']:,} "
+            f"observations at {refined['stations']} stations, within what calibration knew."
+        )
+        columns = ("before", "after", "prior_sigmas", "sigmas")
+        tables.append(
+            Table(
+                title="Rig refined by the survey",
+                header=("parameter", "calibrated", "refined", "sigma before", "sigma after"),
+                rows=[
+                    (name, f"{a:.8g}", f"{b:.8g}", _sigma(before), _sigma(after))
+                    for name, a, b, before, after in zip(
+                        names, *(refined[column] for column in columns), strict=True
+                    )
+                ],
+            )
+        )
+        drawn.append(plots.correlations(names, np.array(refined["correlation"])))
+    elif calibrated:
+        found = held.json("calibration/calibration.json")
+        drawn.append(plots.correlations(found["parameters"], np.array(found["correlation"])))
+    if not calibrated and not refined:
+        cameras = held.json("sparse/cameras.json").get("cameras", {})
+        rows = [
+            (name, str(camera.get("model", camera["kind"])),
+             ", ".join(f"{p:.6g}" for p in camera.get("params", [])))
+            for name, camera in cameras.items()
+        ]  # fmt: skip
+        text.append("The cameras calibrated themselves from the survey's pictures.")
+        tables.append(Table(title="Cameras", header=("camera", "model", "parameters"), rows=rows))
+    return Section(name="camera", title="Camera and rig", text=text, tables=tables, figures=drawn)
+
+
+def _sigma(value: float | None) -> str:
+    if value is None or not math.isfinite(value) or value == 0.0:
+        return "held"
+    return f"{value:.2g}"
+
+
+def _quality(held: Held) -> Section:
+    rows = held.rows("quality/quality.csv")
+    flagged = [row for row in rows if row["reasons"]]
+    table = Table(
+        title="Pictures that stand out",
+        header=("picture", "why"),
+        rows=[(row["image"], row["reasons"]) for row in flagged] or [("none", "")],
+    )
+    return Section(
+        name="quality",
+        title="Quality of the pictures",
+        text=[f"{len(flagged)} of {count(len(rows), 'picture')} stand out; all are used where "
+              "they can be."],
+        tables=[table],
+        figures=_stills(held, [
+            ("quality/quality.png", "Quality along the survey",
+             "Sharpness, contrast, brightness and veil of each picture.",
+             "An even band.", "Look at the pictures named."),
+        ]),
+    )  # fmt: skip
+
+
+def _mission(figures: Figures) -> Section:
+    held = figures.held
+    plan = held.json("plan/plan.json")
+    imaging: dict[str, Any] = plan["details"]["imaging"]
+    rows = [
+        ("altitude, speed", f"{plan['altitude_m']:g} m, {plan['speed_mps']:g} m/s"),
+        ("lines", f"{len(plan['lines'])}, {plan['line_spacing_m']:.2f} m apart"),
+        ("stations", f"{plan['stations']}, {plan['station_spacing_m']:.2f} m apart"),
+        ("overlap", f"{plan['forward_overlap']:.0%} forward, {plan['side_overlap']:.0%} side"),
+        ("a picture every", f"{plan['interval_s']:.2f} s"),
+        ("exposure", f"{1e3 * plan['exposure_s']:.2g} ms"),
+        ("motion blur", f"{imaging['blur_px']:.2f} px"),
+        ("pixel on the floor", length(imaging["pixel_m"])),
+        ("dives, time, energy", f"{len(plan['dives'])}, {duration(plan['duration_s'])}, "
+                                f"{plan['energy_wh']:.1f} Wh"),
+    ]  # fmt: skip
+    tables = [Table(title="Plan", header=("what", "value"), rows=rows)]
+    flight = held.json("flight/flight.json")
+    if flight:
+        line = flight["on_lines"]
+        tables.append(
+            Table(
+                title="Flight",
+                header=("what", "value"),
+                rows=[
+                    ("ending", flight["ending"]),
+                    ("stations", f"{flight['stations']} of {flight['stations_planned']}"),
+                    ("time", duration(flight["duration_s"])),
+                    ("energy", f"{sum(flight['energy_wh'].values()):.1f} Wh"),
+                    ("off the line", f"{length(line['cross_track_rms_m'])} rms"),
+                    ("of that the control's part",
+                     f"{length(line['believed_cross_track_rms_m'])} rms"),
+                    ("error of navigation", f"{length(flight['navigation_error_rms_m'])} rms"),
+                    ("pictured as often as asked", share(flight["coverage"]["share_at_overlap"])),
+                ],
+            )
+        )  # fmt: skip
+    settings = held.file("plan/settings.txt")
+    text = ["Every setting with its equation, source and limit is in plan/settings.txt."]
+    return Section(
+        name="mission",
+        title="Mission",
+        text=text if settings is not None else [],
+        tables=tables,
+        figures=_stills(held, [
+            ("plan/map.png", "The plan", "Area, lines, turns and stations.", "", ""),
+            ("flight/track.png", "Plan and flown track", "Where the vehicle flew, and how far "
+             "it was off its lines.", "The track lies on the lines.",
+             "Check the current, the thrusters and navigation."),
+        ]),
+    )  # fmt: skip
+
+
+def _stills(held: Held, wanted: Sequence[tuple[str, str, str, str, str]]) -> list[Figure]:
+    """Pictures that stages have drawn: path, title, what it shows, good, otherwise."""
+    found = []
+    for path, title, shows, good, otherwise in wanted:
+        file = held.file(path)
+        if file is not None:
+            found.append(
+                Figure(
+                    png=still(file), title=title, alt=shows, shows=shows, good=good,
+                    otherwise=otherwise,
+                )
+            )  # fmt: skip
+    return found

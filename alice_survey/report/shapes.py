@@ -1,0 +1,128 @@
+"""Lines, outlines and points of a survey for its map: plan, flight, cameras, footprints."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from alice_survey.frames import Array, Datum
+from alice_survey.report.document import ShapeLayer
+from alice_survey.report.figures import planned_area
+from alice_survey.report.held import Held, number
+from alice_survey.report.words import length
+
+_BLUE, _ORANGE, _GREEN, _RED, _BLACK = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#333333"
+"""Of Okabe and Ito's palette, which the colour-blind tell apart."""
+_MOST_VERTICES = 4000
+"""Of a track on the map."""
+
+Shape = Sequence[tuple[float, float]]
+
+
+def shape_layers(held: Held) -> Iterator[ShapeLayer]:
+    """All shapes that a workspace holds, the lowest first."""
+    area = planned_area(held)
+    if area is not None:
+        yield ShapeLayer(
+            name="area", title="Area to survey", about="As asked for in the plan.", kind="polygon",
+            shapes=[_pairs(np.array(part.exterior.coords)) for part in area.geoms],
+            colour=_BLACK, dashed=True,
+        )  # fmt: skip
+    footprints = list(_footprints(held))
+    if footprints:
+        yield ShapeLayer(
+            name="footprints", title="Footprints", kind="polygon", colour=_GREEN, shown=False,
+            about="Sea floor that each picture shows.",
+            shapes=[outline for outline, _ in footprints], texts=[text for _, text in footprints],
+        )  # fmt: skip
+    lines = held.json("plan/plan.json").get("lines", [])
+    if lines:
+        yield ShapeLayer(
+            name="plan", title="Plan", about="Survey lines as planned.", kind="line",
+            shapes=[
+                _pairs(np.array([line["start_ne_m"], line["end_ne_m"]])[:, ::-1]) for line in lines
+            ],
+            texts=[f"line {n}, {row['stations']} stations" for n, row in enumerate(lines, 1)],
+            colour=_BLUE, dashed=True,
+        )  # fmt: skip
+    flown = held.rows("flight/truth/track.csv")
+    if flown:
+        places = np.array([[number(row, "east_m"), number(row, "north_m")] for row in flown])
+        step = max(1, len(places) // _MOST_VERTICES)
+        yield ShapeLayer(
+            name="flown", title="Flown", about="Where the vehicle really was (simulated).",
+            kind="line", shapes=[_pairs(places[::step])], colour=_ORANGE,
+        )  # fmt: skip
+    cameras = _cameras(held)
+    if cameras:
+        yield ShapeLayer(
+            name="cameras", title="Cameras", kind="point", colour=_BLUE, shown=not flown,
+            about="Where pictures were taken, from the model.",
+            shapes=[place for place, _ in cameras], texts=[text for _, text in cameras],
+        )  # fmt: skip
+    lost = _lost(held)
+    if lost:
+        yield ShapeLayer(
+            name="lost", title="Lost pictures", kind="point", colour=_RED,
+            about="Pictures that are not in the model, where navigation has them.",
+            shapes=[place for place, _ in lost], texts=[text for _, text in lost],
+        )  # fmt: skip
+
+
+def camera_place(row: Mapping[str, str]) -> Array:
+    """East and north of a row of the track; a model's own y and x stand for them."""
+    names = ("east_m", "north_m") if "east_m" in row else ("y", "x")
+    return np.array([number(row, name) for name in names])
+
+
+def _pairs(east_north: Array) -> list[tuple[float, float]]:
+    return [(round(float(e), 4), round(float(n), 4)) for e, n in east_north]
+
+
+def _cameras(held: Held) -> list[tuple[Shape, str]]:
+    found: list[tuple[Shape, str]] = []
+    for row in held.track:
+        place = camera_place(row)[None]
+        sigma = np.hypot(number(row, "sigma_north_m"), number(row, "sigma_east_m"))
+        text = (
+            f"{row['image']}: {row['points']} points, {number(row, 'reprojection_px'):.2f} px; "
+            f"sigma {length(float(sigma), held.unit)} level"
+        )
+        found.append((_pairs(place), text))
+    return found
+
+
+def _lost(held: Held) -> list[tuple[Shape, str]]:
+    datum = _datum(held)
+    if datum is None or not held.has("sparse"):
+        return []
+    there = {row["image"] for row in held.track}
+    rows = [row for row in held.rows("images/manifest.csv") if row["image"] not in there]
+    rows = [row for row in rows if row.get("latitude_deg") and row.get("longitude_deg")]
+    if not rows:
+        return []
+    places = np.array([[number(r, "latitude_deg"), number(r, "longitude_deg")] for r in rows])
+    ned = datum.ned_from_geodetic(np.column_stack([places, np.zeros(len(rows))]))
+    return [
+        (_pairs(place[None, 1::-1]), f"{row['image']}: not in the model")
+        for place, row in zip(ned, rows, strict=True)
+    ]
+
+
+def _footprints(held: Held) -> Iterator[tuple[Shape, str]]:
+    features = held.json("mosaic/footprints.geojson").get("features", [])
+    datum = _datum(held)
+    for feature in features:
+        facts: dict[str, Any] = feature["properties"]
+        for ring in feature["geometry"]["coordinates"]:
+            corners = np.asarray(ring, dtype=np.float64)
+            if datum is not None and held.json("sparse/frame.json")["name"] == "ned":
+                level = np.column_stack([corners[:, 1::-1], np.zeros(len(corners))])
+                corners = datum.ned_from_geodetic(level)[:, 1::-1]
+            area = f"{float(facts['area_m2']):.2f} {held.unit}²"
+            yield _pairs(corners[:, :2]), f"{facts['image']}: {area}"
+
+
+def _datum(held: Held) -> Datum | None:
+    told = held.json("sparse/frame.json").get("datum")
+    return None if told is None else Datum(**told)

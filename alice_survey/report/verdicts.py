@@ -1,0 +1,292 @@
+"""What is good, what to look at, what is bad: each with its number and what to do about it.
+
+Every limit is one of measurement: a share of what the survey itself says it can resolve (its pixel,
+its sigmas), or what the plan asked for.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from alice_survey.report.document import Level
+from alice_survey.report.figures import Figures
+from alice_survey.report.words import count, length, parts, share
+
+_ORDER = ("bad", "look", "good")
+_SURE_SIGMAS = 3.0
+"""From which a difference is no chance."""
+_HONEST = (0.7, 1.4)
+"""Errors over stated sigmas, root mean square, that are neither bold nor timid."""
+_LEAST_COVERED, _WELL_COVERED = 0.9, 0.99
+_LEAST_REGISTERED = 0.9
+_LEAST_STATIONS = 3.0
+"""That see a spot, for its height to be checked by more than one pair."""
+_NAMED = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """One line."""
+
+    level: Level
+    text: str
+    action: str = ""
+    """What to do, as a sentence; empty where all is well."""
+
+
+def verdicts(figures: Figures) -> list[Verdict]:
+    """All that can be said, the worst first."""
+    found = [
+        *_flight(figures),
+        *_calibration(figures),
+        *_pictures(figures),
+        *_registration(figures),
+        *_scale(figures),
+        *_shape(figures),
+        *_surface(figures),
+        *_truth(figures),
+        *_reference(figures),
+        *_control(figures),
+    ]
+    return sorted(found, key=lambda verdict: _ORDER.index(verdict.level))
+
+
+def _flight(figures: Figures) -> Iterator[Verdict]:
+    flight = figures.held.json("flight/flight.json")
+    if not flight:
+        return
+    text = (
+        f"flight: {flight['stations']} of {flight['stations_planned']} stations, "
+        f"{share(flight['coverage']['share_at_overlap'])} of the area pictured as often as asked"
+    )
+    if flight["ending"] != "complete":
+        yield Verdict(
+            level="bad",
+            text=f"{text}; it ended early: {flight['ending']}",
+            action="Fly what is left: 'alice-survey plan check' writes a plan for it.",
+        )
+    elif flight["coverage"]["share_at_overlap"] < _WELL_COVERED:
+        yield Verdict(
+            level="look",
+            text=text,
+            action="Fly the holes again: 'alice-survey plan check' writes a plan for them.",
+        )
+    else:
+        yield Verdict(level="good", text=text)
+
+
+def _calibration(figures: Figures) -> Iterator[Verdict]:
+    told = figures.held.json("calibration/report.json").get("verdicts", [])
+    worse = [v for v in told if v["level"] != "good"]
+    for verdict in worse:
+        yield Verdict(
+            level=verdict["level"],
+            text=f"calibration: {verdict['text']}",
+            action="Read the calibration's own report, and take more views where it says so.",
+        )
+    if told and not worse:
+        yield Verdict(level="good", text=f"calibration: all {len(told)} checks passed")
+
+
+def _pictures(figures: Figures) -> Iterator[Verdict]:
+    rows = figures.held.rows("quality/quality.csv")
+    flagged = [row for row in rows if row["reasons"]]
+    if flagged:
+        names = "; ".join(f"{row['image']} ({row['reasons']})" for row in flagged[:_NAMED])
+        more = f" and {len(flagged) - _NAMED} more" if len(flagged) > _NAMED else ""
+        yield Verdict(
+            level="look",
+            text=f"pictures: {len(flagged)} of {len(rows)} stand out: {names}{more}",
+            action="Look at these pictures; quality/quality.csv lists them all.",
+        )
+    elif rows:
+        yield Verdict(level="good", text=f"pictures: none of {len(rows)} stands out")
+
+
+def _registration(figures: Figures) -> Iterator[Verdict]:
+    if not figures.held.has("sparse"):
+        return
+    registered, total = figures.registered, figures.total
+    text = f"pictures in the model: {registered} of {total}"
+    if registered == total:
+        yield Verdict(level="good", text=text)
+    else:
+        rare = registered < _LEAST_REGISTERED * total
+        yield Verdict(
+            level="bad" if rare else "look",
+            text=f"{text}; the others share too little with their neighbours",
+            action="Fly with more overlap where pictures were lost (see the map), or with more "
+            "light if they are dark.",
+        )
+    mapping = figures.held.json("mapping/mapping.json")
+    for note in (mapping.get("acceptance") or {}).get("notes", []):
+        yield Verdict(
+            level="look", text=note, action="Look at the stations that the first lines name."
+        )
+    refraction = mapping.get("refraction")
+    if refraction is not None and not refraction["settled"]:
+        yield Verdict(
+            level="bad",
+            text="the refraction of the port did not settle",
+            action="Check the port's distance in rig.json and the working range.",
+        )
+
+
+def _scale(figures: Figures) -> Iterator[Verdict]:
+    found = figures.held.json("sparse/registration.json")
+    if not found:
+        return
+    source = found["scale_source"]
+    if figures.held.unit != "m":
+        yield Verdict(
+            level="bad",
+            text=f"no scale: {source}; all lengths are in arbitrary units",
+            action="Give a rig, a scale bar or positions: 'alice-survey scale' takes a length.",
+        )
+        return
+    place = found.get("georeference") or {}
+    navigation, sigma = place.get("scale_of_navigation"), place.get("scale_of_navigation_sigma")
+    if navigation is None or not sigma or "rig" not in source:
+        yield Verdict(level="good" if "rig" in source else "look", text=source)
+        return
+    off = 1.0 / navigation - 1.0
+    text = f"{source}; navigation's differs by {parts(-off)} +/- {parts(sigma).lstrip('+')}"
+    if abs(off) > _SURE_SIGMAS * sigma:
+        yield Verdict(
+            level="look",
+            text=text,
+            action="Measure a known length in the water: either the rig has moved since its "
+            "calibration, or navigation's scale is off.",
+        )
+    else:
+        yield Verdict(level="good", text=text)
+
+
+def _shape(figures: Figures) -> Iterator[Verdict]:
+    doming = figures.held.json("mapping/mapping.json").get("doming")
+    if not doming:
+        return
+    for note in doming["notes"]:
+        yield Verdict(
+            level="look",
+            text=note,
+            action="Add lines across the others, or refine the rig (refine_rig, refine_port).",
+        )
+    bends = [doming[way] for way in ("along", "across") if doming.get(way)]
+    if bends and not doming["notes"]:
+        worst = max(bends, key=lambda bend: abs(bend["sag_m"]))
+        yield Verdict(
+            level="good",
+            text=f"bend of the model against navigation: {length(worst['sag_m'])} +/- "
+            f"{length(worst['sag_sigma_m'])} over {length(worst['length_m'])}, so none is seen",
+        )
+
+
+def _surface(figures: Figures) -> Iterator[Verdict]:
+    surface = figures.surface
+    if surface is None:
+        return
+    unit = figures.held.unit
+    if math.isfinite(surface.covered):
+        text = f"the surface covers {share(surface.covered)} of the planned area"
+        if surface.covered < _WELL_COVERED:
+            yield Verdict(
+                level="bad" if surface.covered < _LEAST_COVERED else "look",
+                text=text,
+                action="Fly the holes again: the map shows them, and 'alice-survey plan check' "
+                "writes a plan for them.",
+            )
+        else:
+            yield Verdict(level="good", text=text)
+    if math.isfinite(surface.sigma_median):
+        text = (
+            f"heights are good to {length(surface.sigma_median, unit)} (one sigma, median; 95 % of "
+            f"the cells to {length(surface.sigma_95, unit)}), within the survey"
+        )
+        fine = not surface.sigma_median > figures.pixel_m
+        yield Verdict(
+            level="good" if fine else "look",
+            text=text if fine else f"{text}; the mosaic's pixel is {length(figures.pixel_m, unit)}",
+            action="" if fine else "Fly lower or with more overlap for better heights.",
+        )
+    if surface.stations_median < _LEAST_STATIONS:
+        yield Verdict(
+            level="look",
+            text=f"most spots are seen from {surface.stations_median:.0f} stations only, so that "
+            "nothing checks their heights",
+            action="Plan more forward overlap.",
+        )
+
+
+def _truth(figures: Figures) -> Iterator[Verdict]:
+    score = figures.truth
+    if not score:
+        return
+    surface = score["surface"]
+    pixel = surface.get("ground_pixel_mm")
+    miss = surface["distance_rms_mm"]
+    good = pixel is None or miss <= pixel
+    yield Verdict(
+        level="good" if good else "bad",
+        text=f"against the truth: surface {length(1e-3 * miss)} rms, cameras "
+        f"{length(1e-3 * score['cameras']['rms_mm'])} rms, scale "
+        f"{parts(1e-6 * score['cameras']['scale_error_ppm'])}, domed by "
+        f"{length(1e-3 * surface['doming']['dome_mm'])}",
+        action="" if good else "Look where on the map of errors.",
+    )
+    told = (surface.get("error_over_sigma") or {}).get("rms")
+    if told is not None:
+        honest = _HONEST[0] <= told <= _HONEST[1]
+        yield Verdict(
+            level="good" if honest else "look",
+            text=f"heights err by {told:.2f} times their stated sigmas (1 is honest)",
+            action="" if honest else "Multiply the stated sigmas by this factor where it matters.",
+        )
+
+
+def _reference(figures: Figures) -> Iterator[Verdict]:
+    found = figures.reference
+    if not found:
+        return
+    miss = found["survey_to_reference"]
+    yield Verdict(
+        level="good" if miss["median_px"] <= 2.0 else "look",
+        text=f"against {found['reference'].rsplit('/', 1)[-1]}: {length(miss['median_m'])} median "
+        f"({miss['median_px']:.1f} ground pixels), after a {found['registration']['transform']} "
+        "registration",
+        action="" if miss["median_px"] <= 2.0 else "See where in reference/reference.png.",
+    )
+
+
+def _control(figures: Figures) -> Iterator[Verdict]:
+    score = figures.control
+    if not score:
+        return
+    for use, rms in score["rms"].items():
+        if rms.get("points"):
+            level = math.hypot(rms["north_m"], rms["east_m"])
+            yield Verdict(
+                level="good",
+                text=f"{count(rms['points'], 'point')} ({use}): off by {length(level)} level and "
+                f"{length(rms['down_m'])} in depth, rms",
+            )
+        if rms.get("bars"):
+            yield Verdict(
+                level="good",
+                text=f"{count(rms['bars'], 'scale bar')} ({use}): off by "
+                f"{length(rms['length_m'])} rms",
+            )
+    far = [row for row in [*score["points"], *score["bars"]] if row["misfit_sigmas"] > 5.0]
+    for row in far[:_NAMED]:
+        yield Verdict(
+            level="look",
+            text=f"{row['name']} misses by {row['misfit_sigmas']:.1f} of its sigmas",
+            action=f"Check how {row['name']} was picked and measured.",
+        )
+    if score["not_found"]:
+        names = ", ".join(list(score["not_found"])[:_NAMED])
+        yield Verdict(
+            level="look",
+            text=f"not found in the pictures: {names}",
+            action="Pick these by hand in picks.csv.",
+        )
