@@ -58,6 +58,8 @@ class ImageRecord:
         return not math.isnan(self.roll_deg + self.pitch_deg + self.heading_deg)
 
 
+_GREATEST = 1e15
+"""Of any number: whole numbers up to here are exact, and of no quantity is more meant."""
 _TEXT = ("image", "camera", "mask")
 _COLUMNS = tuple(field.name for field in fields(ImageRecord))
 
@@ -75,7 +77,7 @@ def read_manifest(path: Path) -> list[ImageRecord]:
             twice, or a path that leaves its folder.
     """
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file)
             missing = {"image", "camera", "station"} - set(reader.fieldnames or [])
             if missing:
@@ -83,6 +85,8 @@ def read_manifest(path: Path) -> list[ImageRecord]:
             records = [_record(path, line, row) for line, row in enumerate(reader, 2)]
     except OSError as error:
         raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ImageError(f"{path}: no CSV text in UTF-8: {error}") from None
     for name, count in Counter(record.image for record in records).items():
         if count > 1:
             raise ImageError(f"{path}: picture {name} is named twice")
@@ -98,12 +102,15 @@ def _record(path: Path, line: int, row: dict[str, str]) -> ImageRecord:
             continue
         try:
             values[name] = int(cell) if name == "station" else float(cell) if cell else NAN
-        except ValueError:
-            raise ImageError(f"{path} line {line}: {name} is {cell!r}, not a number") from None
-        if math.isinf(float(values[name])):
-            raise ImageError(f"{path} line {line}: {name} is infinite")
+            too_large = abs(float(values[name])) > _GREATEST
+        except (ValueError, OverflowError):
+            raise ImageError(f"{path} line {line}: {name} is {cell!r:.60}, not a number") from None
+        if too_large:
+            raise ImageError(f"{path} line {line}: {name} is {cell!r:.60}: too large")
     for name in ("image", "mask"):
         inside = Path(str(values[name]))
         if inside.is_absolute() or ".." in inside.parts:
             raise ImageError(f"{path} line {line}: {name} {values[name]!r} leaves its folder")
+        if not str(values[name]).isprintable():
+            raise ImageError(f"{path} line {line}: {name} {values[name]!r} is no file's name")
     return ImageRecord(**values)  # type: ignore[arg-type]

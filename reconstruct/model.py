@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.artefacts import read_json, write_json
+from alice_survey.contents import taken_from
 from alice_survey.frames import Array, Datum
 from reconstruct.lenses.lens import lens_from_json
 from reconstruct.lenses.range_shift import RangeShift, no_shift, range_shift
@@ -115,26 +116,64 @@ def write_frame(path: Path, frame: WorldFrame) -> None:
 
 
 def read_frame(path: Path) -> WorldFrame:
-    """Read `frame.json`."""
+    """Read `frame.json`.
+
+    Raises:
+        WorkspaceError: it is missing, or not as it was written.
+    """
     data = read_json(path)
-    return WorldFrame(
-        name=data["name"],
-        datum=None if data["datum"] is None else Datum(**data["datum"]),
-        scaled=data["scaled"],
-        vertical_datum=data["vertical_datum"],
-        notes=tuple(data["notes"]),
-    )
+    with taken_from(path):
+        if data["name"] not in ("ned", "model") or not isinstance(data["scaled"], bool):
+            raise ValueError("name or scaled")
+        texts = (data["vertical_datum"], *data["notes"])
+        if not all(isinstance(text, str) for text in texts):
+            raise ValueError("vertical_datum or notes")
+        return WorldFrame(
+            name=data["name"],
+            datum=None if data["datum"] is None else datum_of(data["datum"]),
+            scaled=data["scaled"],
+            vertical_datum=data["vertical_datum"],
+            notes=tuple(data["notes"]),
+        )
+
+
+def datum_of(data: dict[str, Any]) -> Datum:
+    """The datum of a JSON object.
+
+    Raises:
+        KeyError: it lacks a value.
+        ValueError: it is no place on Earth, or holds something else.
+    """
+    place = float(data["latitude_deg"]), float(data["longitude_deg"])
+    height_m = float(data.get("height_m", 0.0))
+    known = {"latitude_deg", "longitude_deg", "height_m"}
+    if (
+        not (abs(place[0]) <= 90 and abs(place[1]) <= 360 and abs(height_m) < 1e5)
+        or data.keys() - known
+    ):
+        raise ValueError(f"datum {data}")
+    return Datum(*place, height_m)
 
 
 def read_model(sparse: Path) -> SparseModel:
-    """Read the model of a finished `sparse/` stage."""
-    import pycolmap
+    """Read the model of a finished `sparse/` stage.
+
+    Raises:
+        WorkspaceError: a file is missing, or not as it was written.
+        ReconstructionError: the model is damaged.
+    """
+    from reconstruct.model_files import read_reconstruction
 
     stored = read_json(sparse / "cameras.json")
-    cameras = stored["images"]
     frame = read_frame(sparse / "frame.json")
+    model = read_reconstruction(sparse / "model")
+    with taken_from(sparse / "cameras.json"):
+        return _model(stored, frame, model)
+
+
+def _model(stored: dict[str, Any], frame: WorldFrame, model: Any) -> SparseModel:
+    cameras = stored["images"]
     shifts = _shifts(stored, frame)
-    model = pycolmap.Reconstruction(sparse / "model")
     images = sorted(
         (i for i in model.images.values() if i.has_pose), key=lambda image: str(image.name)
     )

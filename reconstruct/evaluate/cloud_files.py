@@ -4,15 +4,20 @@ Coordinates in a projection reach 5,000 km: they are taken to local metres in fl
 anything else is done with them.
 """
 
+import struct
 from pathlib import Path
 
 import numpy as np
 
-from alice_survey.artefacts import need_stage, read_json
+from alice_survey.artefacts import need_stage
 from alice_survey.errors import ReconstructionError, WorkspaceError, why
 from alice_survey.frames import Array, Datum
+from reconstruct.evaluate.ply_points import read_ply_points
 
 _MOST_POINTS = 2_000_000
+_LAS_HEADER = 227
+_COMPRESSED = 0x80
+"""In the point format of a header (LASzip)."""
 
 
 def read_reference(path: Path, datum: Datum | None) -> tuple[Array, bool]:
@@ -40,7 +45,7 @@ def read_reference(path: Path, datum: Datum | None) -> tuple[Array, bool]:
         if kind in (".laz", ".las"):
             points, crs = _read_las(path)
         elif kind == ".ply":
-            points, crs = _read_ply(path), None
+            points, crs = read_ply_points(path, _MOST_POINTS), None
         elif kind in (".tif", ".tiff"):
             points, crs = _read_tiff(path)
         else:
@@ -60,6 +65,7 @@ def _read_las(path: Path) -> tuple[Array, str | None]:
     import laspy
 
     parts = []
+    _check_chunks(path)
     try:
         with laspy.open(path) as file:
             crs = file.header.parse_crs()
@@ -71,27 +77,6 @@ def _read_las(path: Path) -> tuple[Array, str | None]:
         raise ValueError(str(error)) from None
     points = np.concatenate(parts) if parts else np.empty((0, 3))
     return points, None if crs is None else crs.to_wkt()
-
-
-def _read_ply(path: Path) -> Array:
-    import open3d as o3d
-
-    cloud = o3d.io.read_point_cloud(str(path))
-    points = np.asarray(cloud.points, dtype=np.float64)
-    points = points[:: -(-max(len(points), 1) // _MOST_POINTS)]
-    return points + _ply_offset(path)
-
-
-def _ply_offset(path: Path) -> Array:
-    """The offset that our own files state in a comment of their header; none in others."""
-    with path.open("rb") as file:
-        for raw in file:
-            line = raw.decode("ascii", "replace").split()
-            if line[:2] == ["comment", "offset_east_north_up"] and len(line) == 5:
-                return np.array(line[2:], dtype=np.float64)
-            if line[:1] == ["end_header"]:
-                break
-    return np.zeros(3)
 
 
 def _read_tiff(path: Path) -> tuple[Array, str | None]:
@@ -110,6 +95,36 @@ def _read_tiff(path: Path) -> tuple[Array, str | None]:
         north = source.transform.f + x * source.transform.d + y * source.transform.e
         crs = source.crs.to_wkt() if source.crs is not None else None
     return np.column_stack([east, north, height[rows, columns]]), crs
+
+
+def _check_chunks(path: Path) -> None:
+    """Refuse a LAZ file that counts more chunks than it has bytes: its reader ends the program.
+
+    The chunk table's place stands before the first chunk, or, where that is -1, in the last 8 bytes
+    (https://laszip.org, LASzip's "chunk table").
+
+    Raises:
+        ValueError: it does, or the table is beyond its end.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(_LAS_HEADER)
+        if len(head) < _LAS_HEADER:
+            raise ValueError("it is too short for its header")
+        (points_at,) = struct.unpack_from("<I", head, 96)
+        if not head[104] & _COMPRESSED:
+            return
+        file.seek(points_at)
+        (table_at,) = struct.unpack("<q", file.read(8).ljust(8, b"\0"))
+        if table_at == -1:
+            file.seek(size - 8)
+            (table_at,) = struct.unpack("<q", file.read(8))
+        if not points_at < table_at <= size - 8:
+            raise ValueError("its table of chunks is missing: it was cut short")
+        file.seek(table_at + 4)
+        (chunks,) = struct.unpack("<I", file.read(4))
+    if chunks > size:
+        raise ValueError(f"it counts {chunks} chunks in {size} bytes")
 
 
 def _local(points: Array, crs: str, datum: Datum) -> Array:
@@ -138,13 +153,12 @@ def read_own_cloud(workspace: Path) -> Array:
         WorkspaceError: it is not there.
         ReconstructionError: it is empty.
     """
-    import open3d as o3d
-
-    dense = need_stage(workspace, "dense", "reconstruct")
-    offset = np.array(read_json(dense / "cloud.json")["offset_east_north_up"])
-    cloud = o3d.io.read_point_cloud(str(dense / "cloud.ply"))
-    points = np.asarray(cloud.points, dtype=np.float64) + offset
+    cloud = need_stage(workspace, "dense", "reconstruct") / "cloud.ply"
+    try:
+        points = read_ply_points(cloud, _MOST_POINTS)
+    except (OSError, ValueError) as error:
+        raise WorkspaceError(f"{cloud}: cannot be read: {why(error)}") from None
+    points = points[np.isfinite(points).all(axis=1)]
     if len(points) < 100:
-        raise ReconstructionError(f"{dense / 'cloud.ply'}: holds {len(points)} points")
-    thinned: Array = points[:: -(-len(points) // _MOST_POINTS)]
-    return thinned
+        raise ReconstructionError(f"{cloud}: holds {len(points)} points")
+    return points

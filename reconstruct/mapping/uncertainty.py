@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_matrix, diags_array
 from scipy.spatial.transform import Rotation
 
+from alice_survey.contents import read_arrays, taken_from
 from alice_survey.errors import ReconstructionError, warn
 from alice_survey.frames import Array
 from alice_survey.manifest import ImageRecord
@@ -172,14 +173,26 @@ def write_uncertainty(path: Path, found: Uncertainty) -> None:
 
 
 def read_uncertainty(path: Path) -> Uncertainty:
-    """Read `covariance.npz`."""
-    with np.load(path, allow_pickle=False) as data:
+    """Read `covariance.npz`.
+
+    Raises:
+        WorkspaceError: it is missing, or not as it was written.
+    """
+    data = read_arrays(
+        path, "frames", "stations", "images", "cov", "point_ids", "point_cov", "point_noise",
+        "sigma_px",
+    )  # fmt: skip
+    with taken_from(path):
+        frames, points = len(data["frames"]), len(data["point_ids"])
+        shapes = [data[name].shape for name in ("stations", "cov", "point_cov", "point_noise")]
+        if shapes != [(frames,), (frames, 6, 6), (points, 3, 3), (points, 3, 3)]:
+            raise ValueError(f"{frames} frames and {points} points with the shapes {shapes}")
         return Uncertainty(
-            frames=data["frames"],
-            stations=data["stations"],
+            frames=data["frames"].astype(np.int64),
+            stations=data["stations"].astype(np.int64),
             images=tuple(str(name) for name in data["images"]),
-            frame_cov=data["cov"],
-            point_ids=data["point_ids"],
+            frame_cov=data["cov"].astype(np.float64),
+            point_ids=data["point_ids"].astype(np.int64),
             point_cov=data["point_cov"].astype(np.float64),
             point_noise=data["point_noise"].astype(np.float64),
             sigma_px=float(data["sigma_px"]),

@@ -21,6 +21,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from alice_survey.artefacts import read_json, write_json
+from alice_survey.contents import taken_from
 from alice_survey.frames import Array
 from reconstruct.mosaic.light_equations import Equations, Prior, solve_robustly
 
@@ -402,10 +403,22 @@ def write_light(path: Path, light: LightModel) -> None:
 
 
 def read_light(path: Path) -> LightModel:
-    """Read `light.json`."""
+    """Read `light.json`.
+
+    Raises:
+        WorkspaceError: it is missing, or not as it was written.
+    """
     data = read_json(path)
-    return LightModel(
-        patterns={name: np.array(pattern) for name, pattern in data["patterns"].items()},
-        gains={name: np.array(gain) for name, gain in data["gains"].items()},
-        white=np.array(data["white"]),
-    )
+    with taken_from(path):
+        light = LightModel(
+            patterns={n: np.array(p, dtype=np.float64) for n, p in data["patterns"].items()},
+            gains={n: np.array(g, dtype=np.float64) for n, g in data["gains"].items()},
+            white=np.array(data["white"], dtype=np.float64),
+        )
+        triples = [light.white, *light.gains.values()]
+        grids = list(light.patterns.values())
+        if any(t.shape != (3,) for t in triples) or any(g.shape[2:] != (3,) for g in grids):
+            raise ValueError("not of three channels")
+        if not all(np.isfinite(values).all() for values in (*triples, *grids)):
+            raise ValueError("values that are not finite")
+        return light

@@ -15,8 +15,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.artefacts import Stage, need_stage, read_json, run_stage, write_json
 from alice_survey.config import ReconstructConfig, SurveyConfig
+from alice_survey.contents import taken_from
 from alice_survey.errors import ImageError
-from alice_survey.frames import Array, Datum
+from alice_survey.frames import Array
 from alice_survey.manifest import read_manifest
 from camera_calib.rig import Rig, read_rig
 from reconstruct.lenses.lens import lens_from_json
@@ -24,7 +25,7 @@ from reconstruct.mapping.database import as_transform
 from reconstruct.mapping.mapper import model_baseline
 from reconstruct.mapping.run import Inputs, check_sizes, run_mapping
 from reconstruct.mapping.uncertainty import read_uncertainty
-from reconstruct.model import write_frame
+from reconstruct.model import datum_of, write_frame
 from reconstruct.sparse.control_file import control_files
 from reconstruct.sparse.covariance import (
     PlaceCovariance,
@@ -95,13 +96,18 @@ def read_inputs(workspace: Path) -> tuple[Inputs, dict[str, Any], list[Path]]:
     if len(records) < 2:
         raise ImageError(f"{manifest}: {len(records)} pictures; 2 or more make a model")
     survey = read_json(survey_file)
+    with taken_from(survey_file):
+        datum = None if survey.get("datum") is None else datum_of(survey["datum"])
+        texts = [*survey.get("notes", []), *([] if datum is None else [survey["vertical_datum"]])]
+        if not all(isinstance(text, str) for text in texts):
+            raise ValueError("notes or vertical_datum")
     candidates = (workspace / "calibration" / "rig.json", images / "rig.json")
     rig_file = next((path for path in candidates if path.is_file()), None)
     inputs = Inputs(
         images=images,
         records=tuple(records),
         rig=None if rig_file is None else read_rig(rig_file),
-        datum=None if survey.get("datum") is None else Datum(**survey["datum"]),
+        datum=datum,
     )
     check_sizes(inputs)
     files = [manifest, survey_file, *([] if rig_file is None else [rig_file])]

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.artefacts import atomic_path, write_csv, write_json
+from alice_survey.contents import one_line
 from alice_survey.errors import WorkspaceError
 from alice_survey.frames import BODY_FROM_NADIR_CAM, Array, attitude_from_rotation
 from alice_survey.manifest import ImageRecord
@@ -226,6 +227,8 @@ def read_track_poses(path: Path) -> dict[str, RigidTransform]:
             rows = list(csv.DictReader(file))
     except OSError as error:
         raise WorkspaceError(f"{path}: cannot be read: {error.strerror}") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise WorkspaceError(f"{path}: no CSV text in UTF-8: {error}") from None
     poses = {}
     for line, row in enumerate(rows, 2):
         axes = next((a for a in (_NED, _MODEL_SCALED, _MODEL) if a[0] in row), _NED)
@@ -234,5 +237,5 @@ def read_track_poses(path: Path) -> dict[str, RigidTransform]:
             rotation = Rotation.from_quat([float(row[name]) for name in _QUATERNION])
             poses[row["image"]] = RigidTransform.from_components(position, rotation)
         except (KeyError, TypeError, ValueError) as error:
-            raise WorkspaceError(f"{path} line {line}: no pose: {error}") from None
+            raise WorkspaceError(f"{path} line {line}: no pose: {one_line(error)}") from None
     return poses
