@@ -35,8 +35,8 @@ class Remaining:
     Items that are worked on side by side end together: fewer of them than that tell nothing.
     """
 
-    def __init__(self, started_s: float, width: int) -> None:
-        self._started_s, self._width = started_s, width
+    def __init__(self, width: int) -> None:
+        self._width = width
         self._seen: list[tuple[float, int]] = []
 
     def note(self, done: int, now_s: float) -> None:
@@ -55,10 +55,7 @@ class Remaining:
             return 0.0
         since_s, count = self._reference(now_s)
         if done - count < self._width:
-            # Slow items with none to compare to: their start counts as work.
-            if done < self._width or waited_s < 1.0:
-                return None
-            since_s, count = self._started_s, 0
+            return None
         each_s = (last_s - since_s) / (done - count)
         if waited_s > each_s:  # the next one takes longer than those before
             each_s = (now_s - since_s) / (done - count + 1)
@@ -88,7 +85,7 @@ class Step:
         self.counted = total is not None
         self.told_s = self.started_s = clock()
         self._clock = clock
-        self._remaining = Remaining(self.started_s, width)
+        self._remaining = Remaining(width)
 
     def count(self, items: int) -> None:
         """So many more are done."""

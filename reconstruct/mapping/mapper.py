@@ -6,17 +6,16 @@ the same bytes whatever the number of threads; only work on single pictures and 
 """
 
 import shutil
-import sys
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform
 
+from alice_survey import progress
 from alice_survey.errors import ReconstructionError, warn
 from alice_survey.frames import Array
 from alice_survey.manifest import ImageRecord
@@ -305,13 +304,10 @@ def _map_once(
     scratch.mkdir(parents=True)
     write_database(scratch / "database.db", seen, cam_from_rig)
     total = len({r.station for r in seen.images}) if cam_from_rig else len(seen.images)
-    found = _with_bar(
-        "mapping",
-        total,
-        lambda step: pycolmap.incremental_mapping(
-            scratch / "database.db", scratch, scratch, options, next_image_callback=step
-        ),
-    )
+    with progress.step("add pictures to the model", total) as counter:
+        found = pycolmap.incremental_mapping(
+            scratch / "database.db", scratch, scratch, options, next_image_callback=counter.advance
+        )
     models = [pycolmap.Reconstruction(model) for model in found.values()]
     models = [_repaired(model, scratch, options) for model in models]
     if cam_from_rig is not None and free == "nothing":
@@ -398,18 +394,3 @@ def _baseline(cam_from_rig: Sequence[RigidTransform]) -> float:
         return float("nan")
     first, second = cam_from_rig
     return float(np.linalg.norm((second * first.inv()).translation))
-
-
-def _with_bar(label: str, total: int, work: Callable[[Callable[[], None]], Any]) -> Any:
-    """Do work that reports every step, with a bar that shows how far it is."""
-    if not sys.stderr.isatty():
-        started = time.monotonic()
-        result = work(lambda: None)
-        sys.stderr.write(f"{label}: done in {time.monotonic() - started:.1f} s\n")
-        return result
-    from rich.console import Console
-    from rich.progress import Progress
-
-    with Progress(console=Console(stderr=True)) as bar:
-        task = bar.add_task(label, total=total)
-        return work(lambda: bar.advance(task))

@@ -1,0 +1,321 @@
+"""What is told of work: how far, how long still; on a clock that the test turns by hand."""
+
+import io
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alice_survey import progress
+from alice_survey.artefacts import Stage, run_stage
+from alice_survey.display import Lines, Quiet
+from alice_survey.errors import heard, warn
+from alice_survey.events import Event
+from alice_survey.progress import Remaining, Run
+
+
+class Clock:
+    """Stands still until it is turned."""
+
+    def __init__(self) -> None:
+        self.now_s = 1000.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+    def turn(self, seconds: float) -> None:
+        self.now_s += seconds
+
+
+class Kept:
+    """Keeps every event."""
+
+    def __init__(self) -> None:
+        self.events: list[Event] = []
+        self.closed = False
+
+    def hear(self, event: Event) -> None:
+        self.events.append(event)
+
+    def close(self) -> None:
+        self.closed = True
+
+    def named(self, name: str) -> list[Event]:
+        return [event for event in self.events if event.name == name]
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def kept() -> Kept:
+    return Kept()
+
+
+@pytest.fixture
+def run(clock: Clock, kept: Kept) -> Iterator[Run]:
+    """A run whose thread does not tick, so that the test does."""
+    begun = Run(Lines(clock), [kept], clock=clock, wall_clock=clock, ticks=False)
+    with progress.told_to(begun):
+        yield begun
+
+
+def ends_in_order(
+    width: int, count: int, item_s: float, start_s: float, rng: np.random.Generator
+) -> list[float]:
+    """When the items of a queue are handed over, in their order, by so many workers."""
+    free, ends = [start_s] * width, []
+    for _ in range(count):
+        worker = int(np.argmin(free))
+        free[worker] += item_s * rng.uniform(0.8, 1.2)
+        ends.append(free[worker])
+    return list(np.maximum.accumulate(ends))
+
+
+@pytest.mark.parametrize("width", [1, 2, 8])
+@pytest.mark.parametrize("items_per_worker", [5, 40])
+@pytest.mark.parametrize("start_items", [0.0, 3.0, 30.0])
+def test_remaining_time_is_within_a_factor_of_two_from_a_fifth_on(
+    width: int, items_per_worker: int, start_items: float
+) -> None:
+    """Steady work by some workers, after a start that takes as long as many items."""
+    rng = np.random.default_rng([width, items_per_worker])
+    item_s, total = 7.0, width * items_per_worker
+    ends = ends_in_order(width, total, item_s, start_items * item_s, rng)
+    remaining, told = Remaining(width), 0
+    moments = np.arange(0.0, ends[-1], 0.5)
+    done = 0
+    for now_s in moments:
+        while done < total and ends[done] <= now_s:
+            done += 1
+            remaining.note(done, ends[done - 1])
+        if done < 0.2 * total:
+            continue
+        left_s = remaining.left_s(total, now_s)
+        if left_s is None:
+            continue
+        told += 1
+        truth_s = ends[-1] - now_s
+        assert truth_s / 2 - item_s <= left_s <= 2 * truth_s + item_s, (now_s, done)
+    # Something is said as soon as one more than are worked on side by side are done.
+    assert told == np.count_nonzero(moments >= ends[max(width, round(0.2 * total) - 1)])
+
+
+def test_nothing_is_said_before_anything_is_known() -> None:
+    remaining = Remaining(2)
+    assert remaining.left_s(10, 5.0) is None
+    remaining.note(1, 6.0)
+    assert remaining.left_s(10, 6.1) is None
+    remaining.note(2, 6.2)  # its neighbour's end tells of no pace
+    assert remaining.left_s(10, 6.3) is None
+
+
+def test_a_change_of_pace_is_followed() -> None:
+    """A tenth of the items were there already from an interrupted run."""
+    remaining = Remaining(1)
+    for i in range(1, 101):
+        remaining.note(i, 0.01 * i)
+    for i in range(1, 21):
+        remaining.note(100 + i, 1.0 + 2.0 * i)
+    assert remaining.left_s(1000, 41.0) == pytest.approx(880 * 2.0, rel=0.1)
+
+
+def test_remaining_time_falls_between_two_items_and_grows_where_one_is_stuck() -> None:
+    remaining = Remaining(1)
+    for i in range(1, 5):
+        remaining.note(i, 10.0 * i)
+    first, later = remaining.left_s(10, 40.0), remaining.left_s(10, 46.0)
+    assert first == pytest.approx(60.0)
+    assert later == pytest.approx(54.0)
+    stuck = remaining.left_s(10, 240.0)
+    assert stuck is not None
+    assert stuck > 100.0
+
+
+def test_the_record_of_long_work_stays_short() -> None:
+    remaining = Remaining(1)
+    for i in range(1, 100_001):
+        remaining.note(i, 0.01 * i)
+    assert len(remaining._seen) <= 257
+    assert remaining.left_s(200_000, 1000.0) == pytest.approx(1000.0, rel=0.02)
+
+
+def test_steps_are_told_of_in_order_with_their_counts(run: Run, kept: Kept, clock: Clock) -> None:
+    with progress.step("sort", 40) as counter:
+        for _ in range(40):
+            clock.turn(0.2)
+            counter.advance()
+    started, *moved, ended = kept.events
+    assert (started.name, started.total, started.done) == ("step_started", 40, 0)
+    assert (ended.name, ended.done, ended.elapsed_s) == ("step_finished", 40, pytest.approx(8.0))
+    assert ended.facts == {"complete": True}
+    assert {event.name for event in moved} == {"step_progress"}
+    assert [event.done for event in moved] == sorted(event.done or 0 for event in moved)
+    times = [event.time_s for event in moved]
+    assert min(np.diff(times)) >= 0.5  # at most two a second
+    assert len(moved) == 13
+    assert moved[-1].remaining_s == pytest.approx(0.2 * (40 - (moved[-1].done or 0)), abs=0.3)
+
+
+def test_items_are_passed_on_and_counted(run: Run, kept: Kept) -> None:
+    assert list(progress.counted(iter("abc"), "letters", None, 1)) == ["a", "b", "c"]
+    assert kept.events[-1].done == 3
+    assert kept.events[-1].total is None
+
+
+def test_steps_within_steps_keep_their_numbers(run: Run, kept: Kept) -> None:
+    with progress.step("outer"), progress.step("inner"):
+        pass
+    assert [(e.name, e.step, e.step_number) for e in kept.events] == [
+        ("step_started", "outer", 1),
+        ("step_started", "inner", 2),
+        ("step_finished", "inner", 2),
+        ("step_finished", "outer", 1),
+    ]
+    assert kept.events[0].done is None  # nothing is counted
+
+
+def test_a_step_that_fails_is_not_told_as_done(
+    run: Run, kept: Kept, clock: Clock, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail() -> None:
+        clock.turn(9.0)
+        raise ValueError
+
+    with pytest.raises(ValueError), progress.step("break"):
+        fail()
+    assert kept.events[-1].facts == {"complete": False}
+    assert capsys.readouterr().err == ""
+
+
+def test_who_takes_no_more_items_ends_the_step(run: Run, kept: Kept) -> None:
+    items = progress.counted(iter(range(9)), "search", 9, 1)
+    assert next(items) == 0
+    del items
+    assert kept.events[-1].name == "step_finished"
+    assert kept.events[-1].facts == {"complete": True}
+
+
+def test_a_stage_ends_what_was_left_in_it(run: Run, kept: Kept) -> None:
+    items = progress.counted(iter(range(9)), "search", 9, 1)
+    with progress.stage("sparse") as finish:
+        next(items)
+        finish(took_s=1.0, cpu_s=1.0, peak_mib=1.0)
+    assert [event.name for event in kept.events] == [
+        "stage_started", "step_started", "step_finished", "stage_finished",
+    ]  # fmt: skip
+    del items
+    assert len(kept.events) == 4
+
+
+def test_lines_say_what_took_long_and_stay_alive(
+    run: Run, clock: Clock, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with progress.part("sparse", 2, 5), progress.stage("mapping") as finish:
+        with progress.step("short", 3) as counter:
+            counter.advance(3)
+            clock.turn(1.9)
+        with progress.step("matching", 100) as counter:
+            for _ in range(50):
+                clock.turn(1.0)
+                counter.advance()
+                run.tick()
+        with progress.step("adjustment"):
+            clock.turn(3.0)
+        for _ in range(35):  # a part that has no name
+            clock.turn(1.0)
+            run.tick()
+        finish(took_s=125.3, cpu_s=1.0, peak_mib=1.0)
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.splitlines() == [
+        "sparse (2 of 5): mapping",
+        "mapping: matching 29 of 100 after 29 s, about 1 min 11 s left",
+        "matching: 50 done in 50.0 s",
+        "adjustment: done in 3.0 s",
+        "mapping: working for 1 min 25 s",
+        "mapping: done in 2 min 05 s",
+    ]
+
+
+def test_what_hangs_is_told_of_every_five_seconds(run: Run, kept: Kept, clock: Clock) -> None:
+    with progress.step("solve"):
+        for _ in range(20):
+            clock.turn(1.0)
+            run.tick()
+    assert [e.elapsed_s for e in kept.named("step_progress")] == [5.0, 10.0, 15.0, 20.0]
+
+
+def test_a_display_of_warnings_alone(
+    clock: Clock, kept: Kept, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = Run(Quiet(), [kept], clock=clock, wall_clock=clock, quiet=True, ticks=False)
+    with progress.told_to(run), heard() as told, progress.step("long"):
+        clock.turn(100.0)
+        run.tick()
+        warn("it is late")
+    shown = capsys.readouterr()
+    assert (shown.out, shown.err) == ("", "warning: it is late\n")
+    assert told == ["it is late"]
+    assert [event.message for event in kept.named("warning")] == ["it is late"]
+    assert kept.closed
+
+
+def test_standard_error_that_nobody_reads_does_not_stop_the_work(
+    run: Run, kept: Kept, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Gone(io.StringIO):
+        def write(self, text: str) -> int:
+            raise BrokenPipeError(32, "Broken pipe")
+
+    monkeypatch.setattr(sys, "stderr", Gone())
+    warn("one")
+    warn("two")
+    assert [event.message for event in kept.named("warning")] == ["one", "two"]
+
+
+class Full:
+    """A file on a disk that is full after so many events."""
+
+    def __init__(self, room: int) -> None:
+        self.room = room
+
+    def __str__(self) -> str:
+        return "log file run.log"
+
+    def hear(self, event: Event) -> None:
+        self.room -= 1
+        if self.room < 0:
+            raise OSError(28, "No space left on device")
+
+    def close(self) -> None:
+        self.room = -1
+
+
+@pytest.mark.parametrize("room", [0, 1, 5])
+def test_a_full_disk_of_the_log_costs_one_warning(
+    room: int, clock: Clock, kept: Kept, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = Run(Lines(clock), [Full(room), kept], clock=clock, wall_clock=clock, ticks=False)
+    with progress.told_to(run):
+        for name in ("one", "two"):
+            run_stage(
+                tmp_path,
+                Stage(name=name, version=1, settings={}),
+                lambda folder: (folder / "a").write_text("a") and None,
+            )
+    assert [event.message for event in kept.named("warning")] == [
+        "the log file run.log is written no further: no space left on device"
+    ]
+    assert capsys.readouterr().err.count("warning: the log file run.log is written no further") == 1
+    assert len(kept.named("stage_finished")) == 2
+
+
+def test_without_a_run_there_is_one_that_shows(capsys: pytest.CaptureFixture[str]) -> None:
+    with progress.step("quick"):
+        warn("odd")
+    assert capsys.readouterr().err == "warning: odd\n"
