@@ -70,7 +70,7 @@ def _in_session(command: Callable[..., Any]) -> Callable[..., Any]:
     def wrapped(
         *args: Any, quiet: bool, log_file: Path | None, events: Path | None, **kwargs: Any
     ) -> Any:
-        context = next((v for v in kwargs.values() if isinstance(v, typer.Context)), None)
+        context = next((v for v in kwargs.values() if hasattr(v, "invoked_subcommand")), None)
         below = None if context is None else context.invoked_subcommand
         if below is not None:
             if quiet or log_file or events:

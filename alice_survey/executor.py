@@ -101,6 +101,11 @@ def _ended(pool: ProcessPoolExecutor) -> Iterator[ProcessPoolExecutor]:
 
 
 def _end(pool: ProcessPoolExecutor) -> None:
+    """End a pool whatever it is doing.
+
+    What is queued is not cancelled one by one: the thread that tends the pool fails on items that
+    were, when it finds its processes gone.
+    """
     processes = list((pool._processes or {}).values())
     for process in processes:
         process.terminate()
@@ -165,9 +170,6 @@ def _in_order(
             "ran out: give fewer --threads, or close other programs; the same command goes on from "
             "here"
         ) from None
-    finally:
-        for future in waiting:
-            future.cancel()
 
 
 def _result(future: "Future[_Answer[Result]]") -> Result:

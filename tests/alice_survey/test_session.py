@@ -1,0 +1,301 @@
+"""A run of the command line: its options, its files, and how it ends."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from alice_survey import cli, progress
+from alice_survey.cli_options import print_result, with_sessions
+from alice_survey.errors import PlanError, note, warn
+from alice_survey.executor import parallel_map
+
+
+def made(work: Callable[[], None]) -> typer.Typer:
+    """An app of one command, and of a group with one below it."""
+    app, group = typer.Typer(), typer.Typer(invoke_without_command=True)
+
+    @app.command()
+    def work_hard(length: int = 1) -> None:
+        work()
+        print_result(f"done {length}", {"done": length}, as_json=False)
+
+    @group.callback()
+    def whole(context: typer.Context) -> None:
+        if context.invoked_subcommand is None:
+            work()
+
+    @group.command()
+    def below() -> None:
+        work()
+
+    app.add_typer(group, name="group")
+    with_sessions(app)
+    return app
+
+
+def events_of(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_every_command_takes_the_options() -> None:
+    commands = [command for _, command in _all_commands(cli.app)]
+    assert len(commands) > 30
+    for path, command in _all_commands(cli.app):
+        options = set(command.__annotations__)
+        assert {"quiet", "log_file", "events"} <= options, path
+
+
+def _all_commands(app: typer.Typer, *path: str) -> list[tuple[tuple[str, ...], Any]]:
+    found = [((*path, c.name or ""), c.callback) for c in app.registered_commands]
+    for group in app.registered_groups:
+        assert group.typer_instance is not None
+        found += _all_commands(group.typer_instance, *path, group.name or "")
+    return found
+
+
+def test_events_tell_of_a_run_from_its_beginning_to_its_end(tmp_path: Path) -> None:
+    def work() -> None:
+        with progress.step("count", 2) as counter:
+            counter.advance()
+            warn("odd")
+            note("compiling")
+            counter.advance()
+
+    file, log = tmp_path / "events.jsonl", tmp_path / "log"
+    arguments = ["work-hard", "--length", "7", "--events", str(file), "--log-file", str(log)]
+    done = CliRunner().invoke(made(work), arguments)
+    assert (done.exit_code, done.stdout) == (0, "done 7\n")
+    assert done.stderr == "warning: odd\ncompiling\n"
+    found = events_of(file)
+    assert [event["event"] for event in found] == [
+        "run_started", "step_started", "warning", "note", "step_finished", "result", "run_finished",
+    ]  # fmt: skip
+    assert found[0]["versions"].keys() >= {"python", "alice-survey", "numpy", "pycolmap"}
+    assert found[0]["process"] == os.getpid()
+    assert found[-1]["exit_code"] == 0
+    assert [event["time_utc"] for event in found] == sorted(event["time_utc"] for event in found)
+    assert {"INFO", "WARNING"} == set(re.findall(r"Z ([A-Z]+) ", log.read_text()))
+    assert "numpy" in log.read_text()
+
+
+def test_quiet_leaves_the_result_and_the_warnings() -> None:
+    def work() -> None:
+        note("compiling")
+        warn("odd")
+
+    done = CliRunner().invoke(made(work), ["work-hard", "--quiet"])
+    assert (done.exit_code, done.stdout, done.stderr) == (0, "done 1\n", "warning: odd\n")
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "message", "traced"),
+    [
+        (PlanError("no way"), 1, "no way", False),
+        (FileNotFoundError(2, "No such file", "a.txt"), 1, "a.txt: No such file", False),
+        (ZeroDivisionError("by zero"), 1, "ZeroDivisionError: by zero", True),
+        (typer.Exit(3), 3, None, False),
+        (SystemExit(4), 4, None, False),
+    ],
+)
+def test_the_end_of_a_run_is_told(
+    error: BaseException, code: int, message: str | None, traced: bool, tmp_path: Path
+) -> None:
+    def work() -> None:
+        raise error
+
+    file, log = tmp_path / "events", tmp_path / "log"
+    done = CliRunner().invoke(
+        made(work), ["work-hard", "--events", str(file), "--log-file", str(log)]
+    )
+    assert done.exit_code == code
+    *_, before, last = events_of(file)
+    assert (last["event"], last["exit_code"]) == ("run_finished", code)
+    if message is None:
+        assert before["event"] == "run_started"
+    else:
+        assert (before["event"], before["message"]) == ("error", message)
+        assert f"ERROR {message}" in log.read_text()
+    assert ("Traceback" in log.read_text()) == ("traceback" in before) == traced
+
+
+@pytest.mark.parametrize("option", ["--events", "--log-file"])
+@pytest.mark.parametrize("path", ["-", "FOLDER", "FILE/below", "/dev/full"])
+def test_a_file_that_cannot_be_written_ends_the_run_before_it_begins(
+    option: str,
+    path: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("FOLDER").mkdir()
+    Path("FILE").write_text("a file")
+    monkeypatch.setattr(sys, "argv", ["alice-survey", "init", "new", option, path])
+    if path == "/dev/full":  # it opens: the run goes on with a warning
+        _exits(0)
+        assert "is written no further: no space left" in capsys.readouterr().err
+        assert Path("new").exists()
+        return
+    _exits(1)
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 1
+    assert told[0].startswith("error: ")
+    assert not Path("new").exists()
+
+
+def _exits(code: int) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        cli.main()
+    assert (stopped.value.code or 0) == code
+
+
+def test_options_go_behind_the_last_command(tmp_path: Path) -> None:
+    told: list[int] = []
+    app, file = made(lambda: told.append(1)), str(tmp_path / "events")
+    assert CliRunner().invoke(app, ["group", "--events", file, "below"]).exit_code == 2
+    assert not told
+    assert CliRunner().invoke(app, ["group", "below", "--events", file]).exit_code == 0
+    assert CliRunner().invoke(app, ["group", "--events", file]).exit_code == 0
+    assert told == [1, 1]
+    names = [event["event"] for event in events_of(Path(file))]
+    assert names == ["run_started", "run_finished"] * 2
+
+
+def _warns(item: int) -> int:
+    warn(f"item {item} is odd")
+    if item == 2:
+        raise PlanError("item 2 is impossible")
+    return item
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_warnings_of_other_processes_are_told_in_order(
+    threads: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def work() -> None:
+        for _ in parallel_map(_warns, range(3), threads=threads, label="look"):
+            pass
+
+    done = CliRunner().invoke(made(work), ["work-hard", "--events", str(tmp_path / "e")])
+    assert isinstance(done.exception, PlanError)
+    told = [e["message"] for e in events_of(tmp_path / "e") if e["event"] == "warning"]
+    assert told == ["item 0 is odd", "item 1 is odd", "item 2 is odd"]
+    assert done.stderr.splitlines() == [f"warning: {line}" for line in told]
+    assert capfd.readouterr().err == ""  # the other processes say nothing themselves
+
+
+SCRIPT = """
+import hashlib, sys, time
+from pathlib import Path
+import typer
+from alice_survey import session
+from alice_survey.artefacts import Stage, run_stage
+from alice_survey.cli_options import with_sessions
+from alice_survey.executor import parallel_map
+import sleeping
+
+app = typer.Typer()
+
+@app.command()
+def run(kind: str, folder: Path) -> None:
+    def work(partial: Path) -> None:
+        (partial / "half").touch()
+        if kind == "deep":
+            Path(folder, "begun0").touch()
+            hashlib.pbkdf2_hmac("sha256", b"a", b"b", 1_000_000_000)
+        else:
+            list(parallel_map(sleeping.stay, [folder] * 8, threads=2, label="sleep"))
+    run_stage(folder, Stage(name="made", version=1, settings={}), work)
+
+if __name__ == "__main__":
+    session._GRACE_S = 0.5
+    with_sessions(app)
+    app()
+"""
+SLEEPING = """
+import os, time
+from pathlib import Path
+def stay(folder):
+    Path(folder, f"begun{os.getpid()}").touch()
+    time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize(("kind", "workers"), [("parallel", 2), ("deep", 1)])
+def test_ctrl_c_ends_all_processes_and_says_how_to_go_on(
+    kind: str, workers: int, tmp_path: Path
+) -> None:
+    (tmp_path / "sleeping.py").write_text(SLEEPING)
+    (tmp_path / "script.py").write_text(SCRIPT)
+    folder, file = tmp_path / "workspace", tmp_path / "events"
+    folder.mkdir()
+    command = [sys.executable, str(tmp_path / "script.py"), kind, str(folder)]
+    run = subprocess.Popen(
+        [*command, "--events", str(file)],
+        stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    _wait_until(lambda: len(list(folder.glob("begun*"))) == workers)
+    os.killpg(run.pid, signal.SIGINT)  # a terminal sends it to all processes
+    out, told = run.communicate(timeout=20)
+    assert (run.returncode, out) == (130, "")
+    assert told.splitlines() == ["made", "interrupted; the same command goes on from here"]
+    _wait_until(lambda: not _of_session(run.pid))
+    assert [p.name for p in folder.iterdir() if p.is_dir()] == ["made.partial"]
+    *_, before, last = events_of(file)
+    assert (before["event"], before["message"]) == ("error", "interrupted")
+    assert (last["event"], last["exit_code"]) == ("run_finished", 130)
+
+
+def _wait_until(true: Callable[[], bool]) -> None:
+    for _ in range(600):
+        if true():
+            return
+        time.sleep(0.05)
+    pytest.fail("it does not happen")
+
+
+def _of_session(leader: int) -> list[int]:
+    """Processes that still run in the session of one that has ended."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = path.read_text().rsplit(")", 1)[1].split()
+        except OSError:
+            continue
+        if int(fields[3]) == leader and fields[0] != "Z":
+            found.append(int(path.parent.name))
+    return found
+
+
+def test_a_result_that_nobody_reads_is_no_fault() -> None:
+    command = f"{sys.executable} -m alice_survey camera water | true; echo ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    assert done.stderr == ""
+    assert done.stdout in ("1\n", "0\n")
+
+
+def test_a_killed_worker_is_told_in_one_line(tmp_path: Path) -> None:
+    def work() -> None:
+        list(parallel_map(_dies, range(4), threads=2, label="die"))
+
+    done = CliRunner().invoke(made(work), ["work-hard", "--events", str(tmp_path / "e")])
+    assert done.exit_code == 1
+    told = [e["message"] for e in events_of(tmp_path / "e") if e["event"] == "error"]
+    assert len(told) == 1
+    assert "give fewer --threads" in told[0]
+
+
+def _dies(item: int) -> int:
+    os.kill(os.getpid(), signal.SIGKILL)
+    return item
