@@ -20,10 +20,10 @@ changed."""
 
 _TRUST = 1e12
 """First radius of the trust region: no bound."""
-FULLY, ROUGHLY = 1e-5, 1e-2
-"""Relative change of the cost at which an adjustment ends: for good, and where another
-follows. The last steps of a robust loss are many
-and small: a thousandth of this moves no camera of a block of 58 stations by more than 0.003 mm."""
+FULLY, ROUGHLY = 1e-4, 1e-2
+"""Relative changes of the cost at which an adjustment ends: for good, and where another follows.
+The last steps of a robust loss are many and small: of a block of 25 stations, whose cameras err by
+0.22 mm, an end 10,000 times tighter takes 75 more of them and moves no camera by 0.007 mm."""
 
 
 def held_options(sigma_px: float, tolerance: float = FULLY) -> pycolmap.BundleAdjustmentOptions:

@@ -175,12 +175,13 @@ def refract(
     cam_from_rig: Mapping[str, RigidTransform] | None = None,
     *,
     settle: bool = True,
+    near: bool = False,
 ) -> tuple[Mapped, Convergence]:
     """Make a model exact that was mapped from keypoints warped at one working depth.
 
-    Keypoints are corrected and the model adjusted, in turns, until the keypoints rest. After the
-    first turn observations are judged again: the wrong go, and those that the warp kept out come
-    in.
+    Keypoints are corrected and the model adjusted, in turns, until the keypoints rest. Once, when
+    the model is exact enough, observations are judged again: the wrong go, and those that the warp
+    kept out come in.
 
     Args:
         mapped: picture i of `seen` has the id i + 1.
@@ -190,6 +191,7 @@ def refract(
         cam_from_rig: poses of the flat-port cameras on one rig; None without one.
         settle: go on until keypoints rest; else end after the first turn, near enough to refine
             the rig from.
+        near: the model is exact already but for what the rig has moved since: judge at once.
 
     Returns:
         The exact model, and how the keypoints came to rest.
@@ -205,24 +207,32 @@ def refract(
             *notes,
             "refraction through the port removed for a median distance of the working range",
         )
+
+    def judge(model: pycolmap.Reconstruction, scale: float) -> tuple[int, int]:
+        keypoints.correct_unseen(model, scale)
+        counts = _judge_again(model, seen, folder, _pinholes(mapped, cam_from_rig))
+        keypoints.look_again(model)
+        return counts
+
     model = pycolmap.Reconstruction(mapped.model)
     moves: list[float] = []
     removed = added = 0
     settled = False
     corrected = 0.0
+    least = 1 if near else 2
     while len(moves) < _ROUNDS:
         scale = 1.0 if mapped.scaled else keypoints.metres_per_unit(model)
         moved, corrected = keypoints.correct(model, scale)
         moves.append(moved)
-        if len(moves) > 2 and moved < max(SETTLED_PX, _SETTLED_SIGMAS * pixel_sigma(model)):
+        if len(moves) > least and moved < max(SETTLED_PX, _SETTLED_SIGMAS * pixel_sigma(model)):
             settled = True
             break
+        if len(moves) == 1 and near:
+            removed, added = judge(model, scale)
         mapped = adjust(replace(mapped, model=model, notes=notes), FULLY if settle else ROUGHLY)
         model = pycolmap.Reconstruction(mapped.model)
-        if len(moves) == 1:
-            keypoints.correct_unseen(model, scale)
-            removed, added = _judge_again(model, seen, folder, _pinholes(mapped, cam_from_rig))
-            keypoints.look_again(model)
+        if len(moves) == 1 and not near:
+            removed, added = judge(model, scale)
             if not settle:
                 break
     model.update_point_3d_errors()

@@ -53,7 +53,7 @@ _BASELINE_SIGMA_M = 1e-7
 _TURN_INFORMATION = 1.0
 """1/rad^2 of a station whose position is told: a line of stations does not tell its own roll."""
 _ROUNDS = 20
-_SETTLED = 1e-2
+_SETTLED = 3e-2
 """Steps of all parameters, in their sigmas, at which the adjustment ends."""
 
 

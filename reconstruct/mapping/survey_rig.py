@@ -149,7 +149,7 @@ def refine_rig(
     again = on_rig(mapped, seen, fit, lenses)
     adjust = NavigationAdjuster(seen.images, fit.rig, lenses, datum)
     poses = {name: fit.rig.cam_from_rig[name] for name in seen.cameras}
-    refined, convergence = refract(again[0], again[1], folder, adjust, poses)
+    refined, convergence = refract(again[0], again[1], folder, adjust, poses, near=True)
     write_json(folder / "port.json", fit.to_json())
     write_rig(folder / "rig.json", fit.rig)
     return Refined(
