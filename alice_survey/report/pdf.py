@@ -92,8 +92,8 @@ def _styles() -> dict[str, Any]:
         "soft": like("soft", textColor=HexColor(_SOFT), spaceAfter=8),
         "lead": like("lead", fontSize=10.5, leading=15, spaceAfter=5),
         "h2": like(
-            "h2", fontName=bold, fontSize=13.5, leading=17, textColor=HexColor(_BLUE), spaceBefore=14,
-            spaceAfter=5, keepWithNext=1,
+            "h2", fontName=bold, fontSize=13.5, leading=17, textColor=HexColor(_BLUE),
+            spaceBefore=14, spaceAfter=5, keepWithNext=1,
         ),
         "h3": like("h3", fontName=bold, fontSize=10, spaceBefore=8, spaceAfter=2, keepWithNext=1),
         "cell": like("cell", fontSize=7.6, leading=10),
@@ -230,8 +230,6 @@ def _figure(figure: Figure, styles: dict[str, Any], width: float) -> Iterator[An
 def _table(table: Table, styles: dict[str, Any], width: float) -> Iterator[Any]:
     from reportlab.platypus import Paragraph
 
-    if not table.rows:
-        return
     if table.title:
         yield Paragraph(escape(table.title), styles["h3"])
     head = [Paragraph(escape(cell), styles["head"]) for cell in table.header]

@@ -28,7 +28,11 @@ def section(figures: Figures) -> Section:
         title="Time, versions and settings",
         text=list(_words(held)),
         figures=[] if drawn is None else [drawn],
-        tables=[_stages(held), _versions(held), _changed(held), _files(held)],
+        tables=[
+            table
+            for table in (_stages(held), _versions(held), _changed(held), _files(held))
+            if table.rows
+        ],
     )
 
 

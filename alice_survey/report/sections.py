@@ -339,15 +339,15 @@ def _camera(figures: Figures) -> Section:
     elif calibrated:
         found = held.json("calibration/calibration.json")
         drawn.append(plots.correlations(found["parameters"], np.array(found["correlation"])))
-    if not calibrated and not refined:
-        cameras = held.json("sparse/cameras.json").get("cameras", {})
-        rows = [
+    cameras = held.json("sparse/cameras.json").get("cameras", {})
+    if cameras and not calibrated and not refined:
+        text.append("The cameras calibrated themselves from the survey's pictures.")
+        own = [
             (name, str(camera.get("model", camera["kind"])),
              ", ".join(f"{p:.6g}" for p in camera.get("params", [])))
             for name, camera in cameras.items()
         ]  # fmt: skip
-        text.append("The cameras calibrated themselves from the survey's pictures.")
-        tables.append(Table(title="Cameras", header=("camera", "model", "parameters"), rows=rows))
+        tables.append(Table(title="Cameras", header=("camera", "model", "parameters"), rows=own))
     return Section(name="camera", title="Camera and rig", text=text, tables=tables, figures=drawn)
 
 

@@ -21,7 +21,8 @@ def digits(value: float, wanted: int = 3) -> str:
     """With so many digits and never an exponent."""
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
-    places = max(0, wanted - 1 - math.floor(math.log10(abs(value))))
+    rounded = float(f"{value:.{wanted - 1}e}")  # 99.96 has one digit more than it seems
+    places = max(0, wanted - 1 - math.floor(math.log10(abs(rounded))))
     return f"{value:.{places}f}"
 
 

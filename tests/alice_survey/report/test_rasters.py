@@ -1,0 +1,78 @@
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from alice_survey.report.document import PictureLayer
+from alice_survey.report.held import Held
+from alice_survey.report.rasters import mosaic_layer, picture_layers
+from tests.alice_survey.report.tiny import tiny_workspace
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tiny_workspace(tmp_path_factory.mktemp("tiny"))
+
+
+def put_together(layer: PictureLayer, level: int) -> np.ndarray:
+    halvings = layer.levels - 1 - level
+    width, height = layer.width_px, layer.height_px
+    for _ in range(halvings):
+        width, height = (width + 1) // 2, (height + 1) // 2
+    sheet = np.zeros((height, width, 4), np.uint8)
+    for name, data in layer.tiles.items():
+        k, x, y = (int(part) for part in name.split("/"))
+        if k == level:
+            tile = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+            if tile.shape[2] == 3:
+                tile = np.dstack([tile, np.full(tile.shape[:2], 255, np.uint8)])
+            top, left = y * layer.tile_px, x * layer.tile_px
+            sheet[top : top + tile.shape[0], left : left + tile.shape[1]] = tile
+    return sheet
+
+
+def test_the_mosaics_tiles_make_the_mosaic(workspace: Path) -> None:
+    layer = mosaic_layer(workspace / "mosaic" / "mosaic.tif")
+    assert (layer.width_px, layer.height_px, layer.levels) == (400, 600, 2)
+    assert (layer.west_m, layer.north_m, layer.pixel_m) == (0.0, pytest.approx(1.2), 0.002)
+    sheet = put_together(layer, 1)
+    rows, columns = np.mgrid[:600, :400]
+    clear = (rows >= 500) & (columns < 100)
+    assert np.array_equal(sheet[..., 3] < 128, clear)
+    smooth = ~clear & (rows % 256 > 8) & (rows % 256 < 248) & (columns % 256 > 8)
+    smooth &= (columns % 256 < 248) & ((rows < 492) | (columns > 108))
+    assert np.abs(sheet[..., 2].astype(int) - rows % 256)[smooth].max() < 12  # red, BGRA
+    assert np.abs(sheet[..., 1].astype(int) - columns % 256)[smooth].max() < 12
+
+
+def test_a_coarser_level_is_the_mean_of_the_finer(workspace: Path) -> None:
+    layer = mosaic_layer(workspace / "mosaic" / "mosaic.tif")
+    fine, coarse = put_together(layer, 1).astype(float), put_together(layer, 0).astype(float)
+    mean = fine.reshape(300, 2, 200, 2, 4).mean(axis=(1, 3))
+    inner = mean[..., 3] == 255
+    assert np.abs(mean - coarse)[inner][:, :3].mean() < 3.0
+    assert coarse.shape[:2] == (300, 200)
+
+
+def test_a_mosaic_too_large_is_shrunk_and_says_so(workspace: Path) -> None:
+    layer = mosaic_layer(workspace / "mosaic" / "mosaic.tif", most_px=60_000)
+    assert layer.width_px * layer.height_px <= 61_000
+    assert layer.pixel_m * layer.width_px == pytest.approx(0.8)
+    assert "2.0 times" in layer.about
+
+
+def test_numbers_are_coloured_between_limits_that_the_legend_tells(workspace: Path) -> None:
+    layers = {layer.name: layer for layer in picture_layers(Held.of(workspace))}
+    assert list(layers) == ["mosaic", "height", "sigma", "slope", "stations"]
+    assert [name for name, layer in layers.items() if layer.shown] == ["mosaic"]
+    scale = layers["sigma"].scale
+    assert scale is not None
+    assert scale.label == "sigma, mm"
+    assert (scale.low, scale.high) == (0.0, pytest.approx(0.5))
+    assert all(len(colour) == 7 for colour in scale.colours)
+    height = layers["height"].scale
+    assert height is not None
+    assert -10.0 <= height.low < height.high <= -10.0 + 0.25 * 0.8
+    hole = put_together(layers["height"], 0)[105:, :15]
+    assert (hole[..., 3] == 0).all()

@@ -1,0 +1,83 @@
+import json
+import re
+from html import unescape
+from pathlib import Path
+
+import pytest
+from pypdf import PdfReader
+
+from alice_survey.config import SurveyConfig
+from alice_survey.errors import WorkspaceError
+from alice_survey.report.run import run_report
+from tests.alice_survey.report.tiny import tiny_workspace
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    workspace = tiny_workspace(tmp_path_factory.mktemp("tiny"))
+    assert run_report(workspace, SurveyConfig(), 1)
+    return workspace
+
+
+def words(text: str) -> str:
+    return re.sub(r"[\s\u00ad]+", "", text)
+
+
+def test_page_and_pdf_say_the_same(workspace: Path) -> None:
+    page = (workspace / "report" / "report.html").read_text(encoding="utf-8")
+    said = json.loads((workspace / "report" / "report.json").read_text())
+    reader = PdfReader(workspace / "report" / "report.pdf")
+    printed = words("".join(sheet.extract_text() for sheet in reader.pages))
+    shown = words(unescape(re.sub(r"<[^>]*>", " ", page)))
+    sentences = [*said["summary"].values(), *(verdict["text"] for verdict in said["verdicts"])]
+    assert len(sentences) > 6
+    for sentence in sentences:
+        assert words(sentence) in shown, sentence
+        assert words(sentence) in printed, sentence
+    cells = re.findall(r"<(?:td|th|h2|h3)[^>]*>(.*?)</(?:td|th|h2|h3)>", page, re.DOTALL)
+    told = {words(unescape(re.sub(r"<[^>]*>", "", cell))) for cell in cells}
+    assert len(told) > 60
+    missing = {cell for cell in told if cell not in printed}
+    assert missing <= {"Contents", "Verdicts", "Keyfigures"}, missing
+
+
+def test_the_same_workspace_gives_the_same_bytes(workspace: Path) -> None:
+    folder = workspace / "report"
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    (folder / "stage.json").unlink()
+    assert run_report(workspace, SurveyConfig(), 1)
+    for name in ("report.html", "report.pdf", "report.json"):
+        assert (folder / name).read_bytes() == before[name], name
+
+
+def test_a_report_is_made_anew_only_when_something_has_changed(workspace: Path) -> None:
+    assert not run_report(workspace, SurveyConfig(), 1)
+    path = workspace / "sparse" / "registration.json"
+    text = path.read_text()
+    path.write_text(text.replace('"total": 4', '"total": 5'))
+    assert run_report(workspace, SurveyConfig(), 1)
+    assert "4 of 5" in (workspace / "report" / "report.html").read_text()
+    path.write_text(text)
+    assert run_report(workspace, SurveyConfig(), 1)
+
+
+def test_nothing_is_loaded_from_anywhere(workspace: Path) -> None:
+    page = (workspace / "report" / "report.html").read_text(encoding="utf-8")
+    markup = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
+    assert len(markup) > 10_000
+    assert not re.search(r"""(?:src|href)=["'](?:https?:)?//""", markup)
+    assert "default-src 'none'" in page
+
+
+def test_a_plan_alone_is_reported(tmp_path: Path) -> None:
+    workspace = tiny_workspace(tmp_path)
+    for stage in ("images", "mapping", "sparse", "dense", "mosaic"):
+        (workspace / stage / "stage.json").unlink()
+    assert run_report(workspace, SurveyConfig(), 1)
+    said = json.loads((workspace / "report" / "report.json").read_text())["summary"]
+    assert "a plan of 1 line" in said["What was mapped"]
+
+
+def test_an_empty_folder_says_what_to_run(tmp_path: Path) -> None:
+    with pytest.raises(WorkspaceError, match="alice-survey plan"):
+        run_report(tmp_path, SurveyConfig(), 1)

@@ -1,0 +1,103 @@
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from alice_survey.artefacts import write_json
+from alice_survey.report.figures import Figures
+from alice_survey.report.held import Held
+from alice_survey.report.summary import facts, summary
+from alice_survey.report.verdicts import Verdict, verdicts
+from tests.alice_survey.report.tiny import tiny_workspace
+
+
+def judged(workspace: Path) -> tuple[Figures, list[Verdict]]:
+    figures = Figures(held=Held.of(workspace))
+    return figures, verdicts(figures)
+
+
+def level_of(found: list[Verdict], word: str) -> str:
+    levels = [verdict.level for verdict in found if word in verdict.text]
+    assert len(levels) == 1, (word, [verdict.text for verdict in found])
+    return levels[0]
+
+
+def test_a_hole_in_the_planned_area_is_seen_and_named(tmp_path: Path) -> None:
+    figures, found = judged(tiny_workspace(tmp_path))
+    assert level_of(found, "95.8 % of the planned area") == "look"
+    assert "plan check" in summary(figures, found)["What to do next"]
+
+
+@pytest.mark.parametrize(("registered", "level"), [(4, "good"), (3, "bad")])
+def test_lost_pictures_are_told(tmp_path: Path, registered: int, level: str) -> None:
+    _, found = judged(tiny_workspace(tmp_path, sparse={"registered": registered}))
+    assert level_of(found, f"{registered} of 4") == level
+
+
+@pytest.mark.parametrize(("scale", "level"), [(0.99, "look"), (0.999, "good"), (1.01, "look")])
+def test_navigation_that_contradicts_the_rig_is_told(
+    tmp_path: Path, scale: float, level: str
+) -> None:
+    place: dict[str, Any] = {"scale_of_navigation": scale, "scale_of_navigation_sigma": 0.001}
+    axes = {f"{kind}_{axis}_m": 0.1 for kind in ("rms", "sigma") for axis in
+            ("north", "east", "depth")}  # fmt: skip
+    place |= axes | {"sigma_heading_deg": 0.1, "sigma_tilt_deg": 0.1}
+    _, found = judged(tiny_workspace(tmp_path, sparse={"georeference": place}))
+    assert level_of(found, "navigation's differs") == level
+
+
+def test_a_model_without_scale_is_bad_and_says_what_to_do(tmp_path: Path) -> None:
+    figures, found = judged(
+        tiny_workspace(
+            tmp_path, frame={"scaled": False}, sparse={"scale_source": "the model has no scale"}
+        )
+    )
+    assert found[0].level == "bad"
+    assert "no scale" in found[0].text
+    assert "scale bar" in summary(figures, found)["What to do next"]
+    assert any("unit" in value for _, value in facts(figures))
+
+
+@pytest.mark.parametrize(
+    ("miss_mm", "told", "levels"),
+    [(0.5, 1.1, ("good", "good")), (5.0, 1.1, ("bad", "good")), (0.5, 3.4, ("good", "look")),
+     (0.5, 0.3, ("good", "look"))],
+)  # fmt: skip
+def test_errors_are_judged_by_the_pixel_and_by_their_sigmas(
+    tmp_path: Path, miss_mm: float, told: float, levels: tuple[str, str]
+) -> None:
+    workspace = tiny_workspace(tmp_path)
+    write_json(workspace / "evaluation" / "stage.json", {"took_s": 1.0})
+    write_json(workspace / "evaluation" / "score.json", {
+        "cameras": {"rms_mm": 0.3, "scale_error_ppm": 50.0},
+        "surface": {
+            "distance_rms_mm": miss_mm, "ground_pixel_mm": 1.8, "doming": {"dome_mm": 0.1},
+            "error_over_sigma": {"rms": told}, "completeness_within_px": {"3": 0.99},
+        },
+    })  # fmt: skip
+    figures, found = judged(workspace)
+    assert (level_of(found, "against the truth"), level_of(found, "stated sigmas")) == levels
+    assert "Against the truth" in summary(figures, found)["How well"]
+
+
+def test_the_worst_comes_first(tmp_path: Path) -> None:
+    _, found = judged(tiny_workspace(tmp_path, sparse={"registered": 2}))
+    order = [("bad", "look", "good").index(verdict.level) for verdict in found]
+    assert order == sorted(order)
+    assert order[0] == 0
+
+
+def test_every_verdict_that_is_not_good_says_what_to_do(tmp_path: Path) -> None:
+    workspace = tiny_workspace(
+        tmp_path,
+        sparse={"registered": 1, "scale_source": "scale from the calibrated rig"},
+        mapping={
+            "refraction": {"settled": False},
+            "acceptance": {"notes": ["stations lie elsewhere"]},
+            "doming": {"along": None, "across": None, "scale": None, "notes": ["it is bent"]},
+        },
+    )
+    _, found = judged(workspace)
+    asked = [verdict for verdict in found if verdict.level != "good"]
+    assert len(asked) >= 5
+    assert all(verdict.action for verdict in asked)

@@ -1,0 +1,116 @@
+"""A workspace of a few files, as finished stages would leave it: a tilted plane with a hole."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+from rasterio.transform import Affine
+
+from alice_survey.artefacts import write_csv, write_json
+
+CELL_M, ROWS, COLUMNS = 0.01, 120, 80
+HOLE = (slice(100, 120), slice(0, 20))
+"""Of the elevation model: 400 of 9600 cells."""
+SLOPE = 0.25
+"""Rise to the east."""
+SIGMA_M = 0.0005
+
+
+def tiny_workspace(folder: Path, **changes: dict[str, Any]) -> Path:
+    """Write it; `changes` replace values of the JSON files by stage."""
+    stage = {"version": 1, "digest": "0" * 32, "took_s": 3.0, "inputs": {}, "settings": {}}
+    for name in ("plan", "images", "mapping", "sparse", "dense", "mosaic"):
+        write_json(folder / name / "stage.json", {"stage": name, **stage})
+    datum = {"latitude_deg": 32.8, "longitude_deg": 34.9, "height_m": 0.0}
+    write_json(folder / "plan" / "plan.json", _plan(datum) | changes.get("plan", {}))
+    write_json(folder / "images" / "survey.json", {"source": "imported"})
+    write_json(folder / "mapping" / "mapping.json", {
+        "doming": {"along": None, "across": None, "scale": None, "notes": []},
+        "acceptance": {"notes": []}, "refraction": None, **changes.get("mapping", {}),
+    })  # fmt: skip
+    write_json(folder / "sparse" / "frame.json", {
+        "name": "ned", "datum": datum, "scaled": True, "vertical_datum": "sea surface",
+        "notes": ["scale from the calibrated rig"], **changes.get("frame", {}),
+    })  # fmt: skip
+    write_json(folder / "sparse" / "registration.json", {
+        "registered": 4, "total": 4, "points": 1000, "mean_reprojection_px": 0.3,
+        "mean_track_length": 3.5, "scale_source": "scale from the calibrated rig",
+        **changes.get("sparse", {}),
+    })  # fmt: skip
+    _write_track(folder / "sparse" / "track.csv")
+    write_json(folder / "dense" / "surface.json", {
+        "match_sigma_px": 0.2, "pose_sigma": 0.0002, "vertical_datum": "sea surface",
+    })  # fmt: skip
+    _write_rasters(folder / "dense")
+    write_json(
+        folder / "mosaic" / "mosaic.json", {"pixel": 0.002, "width_px": 400, "height_px": 600}
+    )
+    _write_mosaic(folder / "mosaic" / "mosaic.tif")
+    return folder
+
+
+def heights() -> Any:
+    """(ROWS, COLUMNS) of the elevation model."""
+    east = (np.arange(COLUMNS) + 0.5) * CELL_M
+    plane = np.tile(SLOPE * east - 10.0, (ROWS, 1)).astype(np.float32)
+    plane[HOLE] = np.nan
+    return plane
+
+
+def _plan(datum: dict[str, float]) -> dict[str, Any]:
+    north, east = ROWS * CELL_M, COLUMNS * CELL_M
+    ring = [[0.0, 0.0], [north, 0.0], [north, east], [0.0, east], [0.0, 0.0]]
+    imaging = {"blur_px": 0.8, "pixel_m": 0.0005}
+    return {
+        "name": "tiny reef", "datum": datum, "altitude_m": 2.0, "speed_mps": 0.2,
+        "area": {"survey": {"type": "MultiPolygon", "coordinates": [[ring]]}},
+        "line_spacing_m": 1.0, "stations": 2, "station_spacing_m": 0.4, "forward_overlap": 0.6,
+        "side_overlap": 0.3, "interval_s": 2.0, "exposure_s": 0.002, "duration_s": 60.0,
+        "energy_wh": 1.0, "details": {"imaging": imaging}, "dives": [{}],
+        "lines": [{"start_ne_m": [0.1, 0.4], "end_ne_m": [1.1, 0.4], "stations": 2}],
+    }  # fmt: skip
+
+
+def _write_track(path: Path) -> None:
+    header = ("image", "station", "camera", "north_m", "east_m", "depth_m", "points",
+              "reprojection_px", "sigma_north_m", "sigma_east_m", "sigma_depth_m")  # fmt: skip
+    write_csv(path, header, [
+        (f"{camera}/{n}.png", n, camera, 0.3 + 0.4 * n, 0.4, 8.0, 500 + n, 0.3, 0.03, 0.04, 0.05)
+        for n in range(2) for camera in ("left", "right")
+    ])  # fmt: skip
+
+
+def _profile(dtype: str, nodata: float | None) -> dict[str, Any]:
+    return {
+        "driver": "GTiff", "width": COLUMNS, "height": ROWS, "count": 1, "dtype": dtype,
+        "nodata": nodata, "transform": Affine(CELL_M, 0, 0.0, 0, -CELL_M, ROWS * CELL_M),
+        "crs": "EPSG:32636",
+    }  # fmt: skip
+
+
+def _write_rasters(dense: Path) -> None:
+    known = np.isfinite(heights())
+    stations = np.where(known, 4, 0).astype(np.uint8)
+    parts = {
+        "dem": heights(),
+        "sigma": np.where(known, SIGMA_M, np.nan).astype(np.float32),
+        "slope": np.where(known, np.degrees(np.arctan(SLOPE)), np.nan).astype(np.float32),
+    }
+    for name, values in parts.items():
+        with rasterio.open(dense / f"{name}.tif", "w", **_profile("float32", np.nan)) as raster:
+            raster.write(values, 1)
+    with rasterio.open(dense / "stations.tif", "w", **_profile("uint8", None)) as raster:
+        raster.write(stations, 1)
+
+
+def _write_mosaic(path: Path) -> None:
+    profile = _profile("uint8", None) | {
+        "width": 400, "height": 600, "count": 4,
+        "transform": Affine(0.002, 0, 0.0, 0, -0.002, ROWS * CELL_M),
+    }  # fmt: skip
+    rows, columns = np.mgrid[:600, :400]
+    bands = np.stack([rows % 256, columns % 256, 0 * rows + 90, 0 * rows + 255]).astype(np.uint8)
+    bands[3, 500:, :100] = 0
+    with rasterio.open(path, "w", photometric="RGB", alpha="YES", **profile) as raster:
+        raster.write(bands)
