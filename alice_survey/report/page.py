@@ -15,6 +15,7 @@ from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
 
+from alice_survey import progress
 from alice_survey.report.document import Figure, Level, Mesh, Report, Section, Table
 from alice_survey.report.page_map import map_data, map_view
 
@@ -37,6 +38,7 @@ _NUMBER = re.compile(
 _NO_VALUE = {"", "-", "–", "—", "n/a"}
 
 
+@progress.step("write the page")
 def render_html(report: Report) -> str:
     """Write a report as one page; the same report gives the same text.
 

@@ -13,6 +13,8 @@ _STILL_PX = 1000
 """Wanted of the longer side of the still."""
 _MARGIN = 0.04
 """Around all that is drawn, as a share of the longer side."""
+_RIMMED = 20
+"""Outlines up to which each has a light rim, as in `report_map.js`."""
 
 
 def map_data(survey_map: SurveyMap) -> str:
@@ -324,7 +326,7 @@ def _still_shapes(layer: ShapeLayer, place: Any) -> str:
     width = 2 if layer.kind == "polygon" else 3
     casing = (
         f'<path d="{path}" stroke="#fff" stroke-opacity=".8" stroke-width="{width + 3}"/>'
-        if layer.kind == "line"
+        if layer.kind == "line" or len(layer.shapes) <= _RIMMED
         else ""
     )
     return (

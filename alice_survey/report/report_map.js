@@ -1,5 +1,7 @@
 /* The report's map, part 2 of 2: what lies over the pictures, and the controls. */
 
+const RIMMED = 20;
+
 /* Metres east and north stand where Leaflet has longitude and latitude. */
 function startMap() {
   const data = JSON.parse(document.getElementById("map-data").textContent);
@@ -40,22 +42,23 @@ function startMap() {
     const places = (shape) => shape.map(([e, n]) => [n, e]);
     const group = leaflet.featureGroup();
     const dashes = about.dashed ? {dashArray: "7 5"} : {};
+    /* A light rim keeps a shape readable on dark ground; many outlines would drown in it. */
+    const rimmed = about.kind === "line" || (about.kind === "polygon" && about.shapes.length <= RIMMED);
     about.shapes.forEach((shape, index) => {
-      let drawn;
-      if (about.kind === "point") {
-        drawn = leaflet.circleMarker(places(shape)[0], {
-          radius: 5, color: "#fff", weight: 1.5, fillColor: about.colour, fillOpacity: 1,
-        });
-      } else if (about.kind === "polygon") {
-        drawn = leaflet.polygon(places(shape), {
-          color: about.colour, weight: 1.8, fillOpacity: 0.03, ...dashes,
-        });
-      } else {  /* a light rim keeps it readable on dark ground */
-        group.addLayer(leaflet.polyline(places(shape), {
-          color: "#fff", weight: 5, opacity: 0.75, interactive: false,
+      const many = about.kind === "polygon" ? leaflet.polygon : leaflet.polyline;
+      if (rimmed) {
+        group.addLayer(many(places(shape), {
+          color: "#fff", weight: 5, opacity: 0.75, fill: false, interactive: false,
         }));
-        drawn = leaflet.polyline(places(shape), {color: about.colour, weight: 2.6, ...dashes});
       }
+      const drawn = about.kind === "point"
+        ? leaflet.circleMarker(places(shape)[0], {
+          radius: 5, color: "#fff", weight: 1.5, fillColor: about.colour, fillOpacity: 1,
+        })
+        : many(places(shape), {
+          color: about.colour, weight: about.kind === "polygon" ? 1.8 : 2.6, fillOpacity: 0.03,
+          ...dashes,
+        });
       drawn.survey = {title: about.title, text: about.texts[index] || ""};
       drawn.on("click", (event) => tell(drawn, event.latlng));
       group.addLayer(drawn);

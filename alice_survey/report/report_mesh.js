@@ -2,6 +2,7 @@
 
 const TURN = Math.PI / 24;
 const NEARER = 1.2;
+const FILLED = 0.9;
 const WINDS = ["north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west"];
 
 /* East is x, up is y, south is z. */
@@ -16,7 +17,8 @@ async function startMesh(root, canvas) {
 
   const model = (await parse(bytesOf("mesh-glb"))).scene;
   scene.add(model);
-  const ball = new three.Box3().setFromObject(model).getBoundingSphere(new three.Sphere());
+  const box = new three.Box3().setFromObject(model);
+  const ball = box.getBoundingSphere(new three.Sphere());
   lamp.position.copy(ball.center).add(new three.Vector3(-1, 0.7, -0.5).multiplyScalar(ball.radius));
   lamp.target.position.copy(ball.center);
   const surfaces = [];
@@ -40,12 +42,12 @@ async function startMesh(root, canvas) {
 
   let asked = false;
   function draw() {
+    note();
     if (asked) return;
     asked = true;
     requestAnimationFrame(() => {
       asked = false;
       renderer.render(scene, camera);
-      note();
     });
   }
 
@@ -71,11 +73,26 @@ async function startMesh(root, canvas) {
     draw();
   }
 
+  /* As near as the whole box fits, by halving the span of distances. */
   function reset() {
-    const narrow = Math.min(1, camera.aspect);
-    const away = 0.82 * ball.radius / Math.sin(camera.fov * Math.PI / 360) / narrow;
     controls.target.copy(ball.center);
-    camera.position.setFromSphericalCoords(away, Math.PI / 4, Math.PI / 9).add(ball.center);
+    const corners = [...Array(8).keys()].map((i) => new three.Vector3(
+      i & 1 ? box.max.x : box.min.x, i & 2 ? box.max.y : box.min.y, i & 4 ? box.max.z : box.min.z,
+    ));
+    const fits = (away) => {
+      camera.position.setFromSphericalCoords(away, Math.PI / 4, Math.PI / 9).add(ball.center);
+      camera.lookAt(ball.center);
+      camera.updateMatrixWorld();
+      return corners.map((corner) => corner.clone().project(camera))
+        .every(({x, y}) => Math.max(Math.abs(x), Math.abs(y)) < FILLED);
+    };
+    let [near, far] = [1.05 * ball.radius, controls.maxDistance];
+    for (let step = 0; step < 24; step += 1) {
+      const middle = (near + far) / 2;
+      if (fits(middle)) far = middle;
+      else near = middle;
+    }
+    fits(far);
     controls.update();
     draw();
   }

@@ -157,10 +157,12 @@ def sketch_mesh(folder: Path) -> Mesh:
         process=False,
     )
     uv = np.stack([(x + 2) / 4, (1.6 - z) / 3.2], axis=-1).reshape(-1, 2)
-    material = trimesh.visual.material.PBRMaterial(baseColorTexture=seafloor(512, 410))
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorTexture=seafloor(512, 410), metallicFactor=0.0, roughnessFactor=1.0
+    )
     sheet.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
     path = folder / "sketch.glb"
-    path.write_bytes(sheet.export(file_type="glb"))
+    path.write_bytes(sheet.export(file_type="glb", include_normals=False))
     return Mesh(
         glb=path,
         about=f"{len(sheet.faces)} triangles, 4.0 m by 3.2 m.",
