@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from alice_survey import progress
 from alice_survey.artefacts import write_json
 from alice_survey.config import SurveyConfig
 from camera_calib.rig import Rig
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 _SAME_S = 1e-3
 
 
+@progress.step("write plan, maps and missions")
 def write_planned(folder: Path, planned: "Planned", config: SurveyConfig, rig: Rig) -> None:
     """Write a plan.
 

@@ -12,6 +12,7 @@ import numpy as np
 import rasterio
 from rasterio.enums import Resampling
 
+from alice_survey import progress
 from alice_survey.frames import Array
 from alice_survey.report.document import Mesh
 from alice_survey.report.held import Held
@@ -24,6 +25,7 @@ _MOST_CELLS = 90_000
 _QUALITY = 80
 
 
+@progress.step("thin the mesh")
 def mesh_copy(held: Held, glb: Path) -> Mesh | None:
     """Write a light copy to `glb`; None where a workspace holds no mesh."""
     if not held.has("mesh"):

@@ -6,6 +6,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from alice_survey import progress
 from alice_survey.report.document import Figure, Level, PictureLayer, Report, Scale, Section, Table
 
 _MARGIN_MM = 16.0
@@ -22,6 +23,7 @@ _WIDE_CELL = 34
 """Letters from which a column may break its lines."""
 
 
+@progress.step("write the PDF")
 def write_pdf(report: Report, path: Path) -> None:
     """Write a report as A4 pages; the same report gives the same bytes."""
     from reportlab.lib.pagesizes import A4

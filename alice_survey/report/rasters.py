@@ -13,6 +13,7 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.enums import Resampling
 
+from alice_survey import progress
 from alice_survey.frames import Array
 from alice_survey.report.document import PictureLayer, Scale
 from alice_survey.report.held import Held
@@ -48,6 +49,7 @@ class _Numbers:
     shaded: bool = False
 
 
+@progress.step("draw the maps")
 def picture_layers(held: Held) -> Iterator[PictureLayer]:
     """The mosaic and all rasters of numbers that a workspace holds."""
     mosaic = held.file("mosaic/mosaic.tif")

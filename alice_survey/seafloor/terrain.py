@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from alice_survey import progress
 from alice_survey.artefacts import atomic_path, read_json, write_json
 from alice_survey.config import SeafloorConfig, SurveyConfig
 from alice_survey.errors import ConfigError, WorkspaceError
@@ -351,6 +352,7 @@ def build_terrain(
     return Terrain(**{**_fields(terrain), "objects": objects})
 
 
+@progress.step("make the sea floor")
 def survey_terrain(config: SurveyConfig, within_ne_m: Sequence[Sequence[float]] | Array) -> Terrain:
     """The one sea floor of a survey: the same for whoever asks, from the settings alone.
 

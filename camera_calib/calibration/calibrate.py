@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from alice_survey import progress
 from alice_survey.errors import CalibrationError
 from alice_survey.frames import Array
 from camera_calib.calibration.adjust import adjust, stack_views
@@ -126,6 +127,7 @@ def recalibrate(calibration: Calibration, views: Sequence[TargetView]) -> Calibr
     return calibrate(views, calibration.target_points, calibration.rig, freedom, source=source)
 
 
+@progress.step("find cameras")
 def calibrate_in_air(
     views: Sequence[TargetView],
     points: Array,
@@ -156,6 +158,7 @@ def calibrate_in_air(
     return calibrate(views, points, start, Freedom(free=free), source="calibration in air")
 
 
+@progress.step("find cameras and ports")
 def calibrate_through_ports(
     views: Sequence[TargetView],
     points: Array,

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from alice_survey import progress
 from alice_survey.frames import Array
 from camera_calib.calibration.freedom import POSE, value
 from camera_calib.calibration.result import Calibration
@@ -139,6 +140,7 @@ class Judgement:
         return at[0] if at else None
 
 
+@progress.step("judge the calibration")
 def judge(
     calibration: Calibration, held: HeldOut | None, working_range_m: float | None = None
 ) -> Judgement:

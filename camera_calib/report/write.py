@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 
+from alice_survey import progress
 from alice_survey.artefacts import atomic_path, write_json
 from camera_calib.calibration.result import Calibration
 from camera_calib.report.judgement import Judgement, judge
@@ -50,6 +51,7 @@ def write_report(
         path.write_text(render(judged, found), encoding="utf-8")
 
 
+@progress.step("draw the calibration's report")
 def render(judged: Judgement, found: tuple[Verdict, ...]) -> str:
     """The page as text; the same judgement gives the same bytes."""
     calibration = judged.calibration

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey import progress
 from alice_survey.compiled import tell_of_compiling
 from alice_survey.errors import PlanError
 from alice_survey.frames import Array
@@ -60,6 +61,7 @@ class Laid:
         ]
 
 
+@progress.step("lay the lines")
 def lay_lines(
     area: Area,
     heading_rad: float,

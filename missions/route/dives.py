@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from alice_survey import progress
 from alice_survey.errors import PlanError
 from alice_survey.frames import Array
 from missions.lines.line import Line
@@ -63,6 +64,7 @@ class _Sums:
         return float(energy), float(time)
 
 
+@progress.step("route the dives")
 def split_dives(
     lines: Sequence[Line],
     *,

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from alice_survey import progress
 from alice_survey.errors import warn
 from alice_survey.frames import Array
 from reconstruct.model import SparseModel
@@ -78,6 +79,7 @@ def spread_over(nodes: Array, rows: int, columns: int) -> Array:
     return found
 
 
+@progress.step("find what poses add to errors")
 def find_pose_part(workspace: Path, model: SparseModel) -> PosePart | None:
     """What the poses leave unsure of the surface; None, with a warning, where nothing tells it."""
     path = workspace / "mapping" / "covariance.npz"

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.spatial import cKDTree
 
+from alice_survey import progress
 from alice_survey.errors import ReconstructionError
 from alice_survey.frames import Array
 from reconstruct.model import SparseModel, View
@@ -63,6 +64,7 @@ def in_frame(view: View, points_world: Array) -> NDArray[np.bool_]:
     return np.asarray(inside.all(axis=1))
 
 
+@progress.step("find points in sight")
 def points_in_sight(model: SparseModel) -> list[Array]:
     """Per view the points (N, 3) in its frame, its own and others', that bound its depth.
 
@@ -100,6 +102,7 @@ def neighbours(model: SparseModel, most: int) -> list[list[int]]:
     return found
 
 
+@progress.step("choose partners")
 def choose_pairs(model: SparseModel, per_view: int = 4) -> list[list[StereoPair]]:
     """Choose partners for every view.
 

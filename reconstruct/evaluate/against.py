@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import rasterio
 
+from alice_survey import progress
 from alice_survey.artefacts import write_json
 from alice_survey.errors import ReconstructionError, WorkspaceError, warn
 from reconstruct.dense.dem import DemGrid
@@ -19,6 +20,7 @@ _MUCH = 0.5
 """Share of the ground that is seldom found changed between two surveys."""
 
 
+@progress.step("find what has changed")
 def compare_elevations(
     now: Elevation, before: Elevation, now_from_before: Any
 ) -> tuple[Change, HeightFit]:

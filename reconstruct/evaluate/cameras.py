@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from alice_survey import progress
 from alice_survey.errors import WorkspaceError
 from alice_survey.frames import Array
 from reconstruct.evaluate.figures import rms
@@ -55,6 +56,7 @@ class CameraScore:
         }
 
 
+@progress.step("score the cameras")
 def score_cameras(estimated: dict[str, RigidTransform], truth: Path, total: int) -> CameraScore:
     """Compare entrance pupils with the true poses of a simulated survey.
 

@@ -8,6 +8,7 @@ import shapely
 from scipy.spatial.transform import RigidTransform
 from shapely.geometry import MultiPolygon
 
+from alice_survey import progress
 from alice_survey.artefacts import read_json
 from alice_survey.errors import WorkspaceError
 from alice_survey.frames import Array
@@ -35,6 +36,7 @@ def read_mesh(folder: Path) -> tuple[Array, Array]:
     return enu[:, [1, 0, 2]] * [1.0, 1.0, -1.0], np.asarray(mesh.triangles)
 
 
+@progress.step("score the mesh")
 def score_mesh(
     vertices_ned: Array,
     triangles: Array,

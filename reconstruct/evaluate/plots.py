@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from shapely.geometry import MultiPolygon
 
+from alice_survey import progress
 from alice_survey.artefacts import atomic_path
 from missions.plan_file import read_plan
 
@@ -46,6 +47,7 @@ def plot_track(path: Path, plan_file: Path, cameras: "CameraScore") -> None:
         _save(figure, path)
 
 
+@progress.step("draw the errors")
 def plot_errors(path: Path, surface: "SurfaceScore", area: MultiPolygon) -> None:
     """Map and histogram of height errors of the surface."""
     figures = surface.to_json()
@@ -76,6 +78,7 @@ def plot_errors(path: Path, surface: "SurfaceScore", area: MultiPolygon) -> None
         _save(figure, path)
 
 
+@progress.step("draw the summary")
 def plot_sheet(
     path: Path,
     workspace: Path,

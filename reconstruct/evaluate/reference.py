@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from alice_survey import progress
 from alice_survey.artefacts import need_stage, read_json, write_json
 from alice_survey.errors import WorkspaceError
 from alice_survey.frames import Array
@@ -109,6 +110,7 @@ def ground_pixel_of(model: SparseModel) -> float:
     return float(np.median(np.concatenate(pixels)))
 
 
+@progress.step("compare with the reference")
 def evaluate_reference(
     workspace: Path,
     reference: Path,

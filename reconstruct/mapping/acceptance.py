@@ -11,6 +11,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey import progress
 from alice_survey.errors import warn
 from alice_survey.frames import Array, Datum
 from alice_survey.manifest import ImageRecord
@@ -124,6 +125,7 @@ def check_mapping(
     return found
 
 
+@progress.step("judge the model")
 def check_survey(
     mapped: Mapped,
     records: Sequence[ImageRecord],

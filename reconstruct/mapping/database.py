@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey import progress
 from alice_survey.frames import Array
 from alice_survey.manifest import ImageRecord
 from reconstruct.matching.matches import PairMatches
@@ -29,6 +30,7 @@ class Observations:
     pairs: Sequence[VerifiedPair]
 
 
+@progress.step("hand pictures to the mapper")
 def write_database(
     path: Path, seen: Observations, cam_from_rig: Mapping[str, RigidTransform] | None
 ) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey import progress
 from alice_survey.errors import warn
 from alice_survey.frames import Array, Datum, rotation_from_attitude
 from alice_survey.manifest import ImageRecord
@@ -158,6 +159,7 @@ def measure_doming(
     return found
 
 
+@progress.step("look for doming")
 def doming_of_survey(
     mapped: Mapped, records: Sequence[ImageRecord], rig: Rig | None, datum: Datum | None
 ) -> Doming | None:

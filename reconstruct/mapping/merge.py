@@ -7,6 +7,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey import progress
 from alice_survey.errors import warn
 from reconstruct.mapping.database import as_transform
 from reconstruct.mapping.global_mapper import triangulate_and_adjust
@@ -17,6 +18,7 @@ _LARGEST_SPREAD = 0.1
 disagree about where the second model lies in the first."""
 
 
+@progress.step("merge models")
 def merge_models(
     models: Sequence[pycolmap.Reconstruction],
     database: Path,

@@ -15,6 +15,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey import progress
 from alice_survey.frames import Array
 from reconstruct.mapping.stations import Link
 
@@ -36,6 +37,7 @@ def station_groups(links: Sequence[Link]) -> list[list[int]]:
     return sorted(groups, key=lambda group: (-len(group), group[0]))
 
 
+@progress.step("average poses")
 def average_poses(links: Sequence[Link]) -> Mapping[int, RigidTransform]:
     """Poses that agree best with all links.
 

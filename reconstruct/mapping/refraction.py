@@ -20,6 +20,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform
 
+from alice_survey import progress
 from alice_survey.errors import warn
 from alice_survey.frames import Array
 from reconstruct.lenses.lens import FlatPortLens, Lens
@@ -167,6 +168,7 @@ class Keypoints:
         return depths
 
 
+@progress.step("make refraction exact")
 def refract(
     mapped: Mapped,
     seen: Observations,

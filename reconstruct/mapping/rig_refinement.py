@@ -14,6 +14,7 @@ import numpy as np
 from scipy.sparse import csc_matrix, diags_array
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey import progress
 from alice_survey.errors import ReconstructionError, warn
 from alice_survey.frames import Array
 from camera_calib.calibration.freedom import POSE as TURN_AND_SHIFT
@@ -105,6 +106,7 @@ class Told:
     sigmas: Array
 
 
+@progress.step("refine the rig")
 def fit_rig(
     mapped: Mapped,
     seen: Observations,

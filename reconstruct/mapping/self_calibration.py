@@ -14,6 +14,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey import progress
 from alice_survey.errors import warn
 from alice_survey.manifest import ImageRecord
 from reconstruct.lenses.lens import Lens, self_calibrated_lens
@@ -137,6 +138,7 @@ def rig_from_model(
     return {first: RigidTransform.identity(), second: mean}
 
 
+@progress.step("calibrate from the pictures")
 def calibrate_fully(
     model: pycolmap.Reconstruction, *, keep_focal: bool
 ) -> tuple[pycolmap.Reconstruction, bool]:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_matrix, diags_array
 from scipy.spatial.transform import Rotation
 
+from alice_survey import progress
 from alice_survey.contents import read_arrays, taken_from
 from alice_survey.errors import ReconstructionError, warn
 from alice_survey.frames import Array
@@ -137,6 +138,7 @@ def estimate(
     )
 
 
+@progress.step("covariance of the model")
 def save_uncertainty(
     folder: Path,
     mapped: Mapped,

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey import progress
 from alice_survey.frames import Array
 from reconstruct.mesh.labels import Charts
 from reconstruct.mesh.topology import Triangles
@@ -68,6 +69,7 @@ def make_wedges(triangles: Triangles, charts: Charts) -> Wedges:
     )
 
 
+@progress.step("pack patches")
 def make_atlas(pixels: Array, wedges: Wedges, count: int, page_px: int, most_pages: int) -> Atlas:
     """Pack the boxes of all patches into pages.
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from alice_survey import progress
 from alice_survey.frames import Array
 from reconstruct.mesh.topology import Triangles, edges_of, face_normals
 from reconstruct.mesh.visibility import Candidates
@@ -38,6 +39,7 @@ class Charts:
     """(C,) label of every patch."""
 
 
+@progress.step("choose a picture for each face")
 def choose_views(
     vertices: Array, triangles: Triangles, candidates: Candidates
 ) -> NDArray[np.int32]:
@@ -62,6 +64,7 @@ def choose_views(
     return label
 
 
+@progress.step("cut patches")
 def make_charts(vertices: Array, triangles: Triangles, label: NDArray[np.int32]) -> Charts:
     """The connected patches of faces of one label."""
     chart = connected_charts(face_neighbours(vertices, triangles)[0], label)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.linalg import cg
 
+from alice_survey import progress
 from alice_survey.errors import warn
 from alice_survey.frames import Array
 from reconstruct.mesh.atlas import Wedges
@@ -29,6 +30,7 @@ def seam_pairs(wedges: Wedges) -> NDArray[np.int64]:
     return np.stack([order[:-1][same], order[1:][same]], axis=1).astype(np.int64)
 
 
+@progress.step("level colours")
 def level_seams(wedges: Wedges, colours: Array, free: NDArray[np.bool_]) -> Array:
     """Corrections (W, 3) to add to the colours of patches.
 

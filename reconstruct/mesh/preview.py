@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey import progress
 from alice_survey.frames import Array
 from reconstruct.mesh.texture import Textured
 from reconstruct.mesh.topology import face_normals
@@ -20,6 +21,7 @@ _ROWS = 128
 _BACK = 255.0
 
 
+@progress.step("draw the mesh")
 def render_oblique(
     mesh: Textured, *, elevation_deg: float = _ELEVATION_DEG, azimuth_deg: float = _AZIMUTH_DEG
 ) -> NDArray[np.uint8]:

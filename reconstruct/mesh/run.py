@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from alice_survey import progress
 from alice_survey.artefacts import Stage, need_stage, read_json, run_stage, write_json
 from alice_survey.config import ReconstructConfig, SurveyConfig
 from alice_survey.errors import warn
@@ -116,6 +117,7 @@ def build_mesh(
     write_mesh(folder, textured, facts)
 
 
+@progress.step("write the mesh")
 def write_mesh(folder: Path, mesh: Textured, facts: dict[str, Any]) -> None:
     """Write `mesh.glb`, `.obj`, `.mtl`, `.ply`, `.json` and `.png` beside the pages."""
     offset = " ".join(repr(value) for value in facts["offset_east_north_up"])

@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey import progress
 from alice_survey.frames import Array
 from reconstruct.mosaic.facts import PictureFacts
 from reconstruct.mosaic.finish import LEAST_LEFT, LEAST_RANGE, MOST_RANGE
@@ -137,6 +138,7 @@ class ColourModel:
         }
 
 
+@progress.step("even the light")
 def solve_colour(
     wanted: Colour,
     samples: LightSamples,

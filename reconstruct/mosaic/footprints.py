@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rasterio.warp import transform as to_crs
 
+from alice_survey import progress
 from alice_survey.artefacts import write_csv, write_json
 from alice_survey.frames import Array
 from reconstruct.dense.dem import DemGrid
@@ -145,6 +146,7 @@ def _above(view: View, pixels: Array, depth: Array, dem: Float32, grid: DemGrid)
     return np.where(inside, -points[:, 2] - height, np.nan)
 
 
+@progress.step("outline the pictures")
 def write_footprints(
     folder: Path, views: tuple[View, ...], found: list[PictureFootprint], frame: WorldFrame
 ) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey import progress
 from alice_survey.artefacts import atomic_path
 from alice_survey.frames import Array
 from reconstruct.mapping.uncertainty import Uncertainty
@@ -45,6 +46,7 @@ def placed_covariances(poses: RigidTransform, place: PlaceCovariance) -> Array:
     return found
 
 
+@progress.step("covariance of the track")
 def shape_covariances(
     poses: RigidTransform,
     stations: NDArray[np.int64],

@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform
 
+from alice_survey import progress
 from alice_survey.artefacts import read_json
 from alice_survey.config import ReconstructConfig
 from alice_survey.errors import ReconstructionError, WorkspaceError, warn
@@ -71,6 +72,7 @@ class Placing:
     settings: ReconstructConfig
 
 
+@progress.step("place the model")
 def find_place(task: Placing) -> Placed:
     """Place a model.
 

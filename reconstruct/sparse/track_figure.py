@@ -10,6 +10,7 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from alice_survey import progress
 from alice_survey.artefacts import atomic_path
 from alice_survey.errors import WorkspaceError
 from alice_survey.frames import Array
@@ -28,6 +29,7 @@ _COLOURS = (
 )  # fmt: skip
 
 
+@progress.step("draw the track")
 def plot_track_over(mosaic_tif: Path, track_csv: Path, path: Path) -> None:
     """Draw the stations of a track over its mosaic, each line in a colour, with 2-sigma ellipses.
 

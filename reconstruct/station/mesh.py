@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey import progress
 from alice_survey.errors import ReconstructionError
 from alice_survey.frames import Array
 from reconstruct.mesh.atlas import Wedges
@@ -34,6 +35,7 @@ class StationMesh:
     """(T, 3) counter-clockwise seen from the camera."""
 
 
+@progress.step("make the mesh")
 def depth_mesh(
     view: View, depth: NDArray[np.float32], sigma: NDArray[np.float32], most: int
 ) -> StationMesh:

@@ -18,6 +18,7 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.errors import NotGeoreferencedWarning
 
+from alice_survey import progress
 from alice_survey.artefacts import write_json
 from alice_survey.errors import CalibrationError, ImageError, ReconstructionError
 from alice_survey.frames import Array
@@ -181,6 +182,7 @@ def check_sizes(rig: Rig, pictures: tuple[Path, Path]) -> None:
             )
 
 
+@progress.step("match features of the pair")
 def find_optics(
     rig: Rig, pictures: tuple[Path, Path], near_m: float | None, far_m: float | None
 ) -> tuple[Optics, Array]:
@@ -207,6 +209,7 @@ def find_optics(
     return optics_for(stereo, near, far), points[inside]
 
 
+@progress.step("find depth")
 def dense_pair(
     optics: Optics, pictures: tuple[Path, Path], points: Array, scale: float | None
 ) -> PairDepth:
