@@ -35,6 +35,7 @@ _NUMBER = re.compile(
     re.IGNORECASE,
 )
 """With its unit, its sigma or a share: "12.3 mm", "0.4 ± 0.1 %", "3 of 58"."""
+_SHORT_WORD = 8
 _NO_VALUE = {"", "-", "–", "—", "n/a"}
 
 
@@ -229,11 +230,13 @@ def _table(table: Table) -> str:
 
 
 def _numeric_columns(table: Table) -> Iterator[bool]:
-    """Whether all cells with a value are numbers, one answer for each column."""
+    """Whether most cells with a value are numbers, and the rest short words such as "held"."""
     for index in range(len(table.header)):
         cells = [row[index].strip() for row in table.rows]
         values = [cell for cell in cells if cell.lower() not in _NO_VALUE]
-        yield bool(values) and all(_NUMBER.fullmatch(value) for value in values)
+        words = [value for value in values if not _NUMBER.fullmatch(value)]
+        short = all(len(word) <= _SHORT_WORD for word in words)
+        yield short and len(values) > 2 * len(words)
 
 
 def _kind(number: bool) -> str:

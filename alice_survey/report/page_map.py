@@ -227,7 +227,7 @@ def _legend(scale: Scale | None, attributes: str, title: str) -> str:
         for index, colour in enumerate(scale.colours)
     )
     values = "".join(
-        f"<span>{value:.4g}</span>"
+        f"<span>{value:.4g}</span>".replace("-", "−")
         for value in (scale.low, (scale.low + scale.high) / 2, scale.high)
     )
     return (

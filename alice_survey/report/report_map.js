@@ -56,8 +56,8 @@ function startMap() {
           radius: 5, color: "#fff", weight: 1.5, fillColor: about.colour, fillOpacity: 1,
         })
         : many(places(shape), {
-          color: about.colour, weight: about.kind === "polygon" ? 1.8 : 2.6, fillOpacity: 0.03,
-          ...dashes,
+          color: about.colour, weight: about.kind === "line" ? 2.6 : rimmed ? 1.8 : 1,
+          fillOpacity: 0.03, ...dashes,
         });
       drawn.survey = {title: about.title, text: about.texts[index] || ""};
       drawn.on("click", (event) => tell(drawn, event.latlng));
@@ -74,26 +74,25 @@ function startMap() {
     const text = document.createElement("p");
     text.textContent = shape.survey.text;
     content.append(title, text);
-    leaflet.popup({maxWidth: 260, className: "told"}).setLatLng(at).setContent(content).openOn(map);
+    leaflet.popup({minWidth: 110, maxWidth: 260, className: "told"}).setLatLng(at).setContent(content).openOn(map);
   }
 
   /* What a pointer would choose, for those who have none: the shape nearest to the middle. */
   function tellMiddle() {
-    const middle = map.getSize().divideBy(2);
+    const middle = map.containerPointToLayerPoint(map.getSize().divideBy(2));
     let best = null;
     let least = 60;
     layers.forEach((group) => {
       if (!group.kind || !map.hasLayer(group)) return;
       group.eachLayer((shape) => {
         if (!shape.survey) return;
-        const places = shape.getLatLng ? [shape.getLatLng()] : shape.getLatLngs().flat();
-        places.forEach((place) => {
-          const away = map.latLngToContainerPoint(place).distanceTo(middle);
-          if (away < least) {
-            least = away;
-            best = [shape, place];
-          }
-        });
+        const spot = shape.getLatLng
+          ? map.latLngToLayerPoint(shape.getLatLng()) : shape.closestLayerPoint(middle);
+        const away = spot ? spot.distanceTo(middle) : Infinity;
+        if (away < least) {
+          least = away;
+          best = [shape, map.layerPointToLatLng(spot)];
+        }
       });
     });
     if (best) tell(...best);

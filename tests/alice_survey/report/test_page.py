@@ -182,6 +182,15 @@ def test_numbers_stand_to_the_right(report: Report, cell: str, number: bool) -> 
     assert ('<td class="num">' in render_html(plain)) == number
 
 
+def test_a_word_among_numbers_stands_with_them(report: Report) -> None:
+    rows = [["a", "0.12"], ["b", "0.3"], ["c", "held"]]
+    table = Table(title="T", header=["what", "sigma"], rows=rows)
+    plain = replace(
+        report, map=None, mesh=None, sections=[Section(name="t", title="T", tables=[table])]
+    )
+    assert '<td class="num">held</td>' in render_html(plain)
+
+
 def test_committed_libraries_are_those_of_the_lock() -> None:
     lock = json.loads((ROOM / "web" / "package-lock.json").read_text())["packages"]
     wanted = json.loads((ROOM / "web" / "package.json").read_text())["dependencies"]
