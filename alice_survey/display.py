@@ -122,7 +122,7 @@ class Quiet:
 class Lines:
     """A line when a stage begins and ends, when a step has taken long, and every half minute."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, clock: Callable[[], float] = lambda: time.monotonic()) -> None:
         self._clock = clock
         self._written = _Written()
         self._last_s = clock()

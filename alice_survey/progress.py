@@ -129,8 +129,8 @@ class Run:
         display: Display | None,
         sinks: Sequence[Sink] = (),
         *,
-        clock: Clock = time.monotonic,
-        wall_clock: Clock = time.time,
+        clock: Clock = lambda: time.monotonic(),
+        wall_clock: Clock = lambda: time.time(),
         quiet: bool = False,
         ticks: bool = True,
     ) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey import progress
 from alice_survey.errors import PlanError, warn
 from alice_survey.frames import Array
 from camera_calib.rig import Rig
@@ -151,6 +152,7 @@ class Certificate:
         }
 
 
+@progress.step("count the views of each place")
 def certificate(
     area: Area,
     rig: Rig,

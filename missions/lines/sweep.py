@@ -26,6 +26,7 @@ from alice_survey.compiled import compiled
 from alice_survey.errors import PlanError
 from alice_survey.executor import progress
 from alice_survey.frames import Array
+from alice_survey.progress import step
 from missions.areas.area import Area
 from missions.lines import cells, hops, rows
 from missions.lines.lay import check_size, laid, tell_of_planner
@@ -72,6 +73,7 @@ class Sweep:
     """Heading, rad, and full cost, J, wherever that was taken, by heading."""
 
 
+@step("look for the best heading")
 def best_heading(
     area: Area,
     pattern: Pattern,
