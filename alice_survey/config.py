@@ -16,6 +16,7 @@ from pydantic import (
     model_validator,
 )
 
+from alice_survey.contents import one_line
 from alice_survey.errors import ConfigError
 from alice_survey.seawater import GREEN_NM, n_water
 
@@ -340,8 +341,9 @@ def load_config(path: Path) -> SurveyConfig:
         raise ConfigError(f"{path}: cannot be read: {error}") from None
     try:
         settings = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: not valid TOML: {error}") from None
+    # A number of thousands of digits is a ValueError.
+    except (tomllib.TOMLDecodeError, ValueError, RecursionError) as error:
+        raise ConfigError(f"{path}: not valid TOML: {one_line(error)}") from None
     return parse_config(_with_files_beside(settings, path.parent), str(path))
 
 

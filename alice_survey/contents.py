@@ -56,5 +56,10 @@ def read_arrays(path: Path, *names: str) -> dict[str, NDArray[np.generic]]:
 
 def one_line(error: BaseException) -> str:
     """What an exception says, on one line that can be printed; its type where it says nothing."""
-    text = "".join(c if c.isprintable() else " " for c in str(error)) or type(error).__name__
-    return " ".join(text.split())[:_SHOWN]
+    return shown(str(error)) or type(error).__name__
+
+
+def shown(text: str) -> str:
+    """Text of others as a message may hold it: on one line, printable, and not without end."""
+    plain = " ".join("".join(c if c.isprintable() else " " for c in text).split())
+    return plain if len(plain) <= _SHOWN else f"{plain[: _SHOWN - 3]}..."

@@ -1,6 +1,51 @@
-"""Files of pictures, before they are decoded."""
+"""Files of pictures: looked at before they are decoded, and decoded within bounds."""
 
+import struct
+import warnings
+import zlib
 from pathlib import Path
+from typing import Any
+
+import cv2
+from numpy.typing import NDArray
+
+MOST_PIXELS = 128_000_000
+"""Of a picture: 1 GB of 4 channels and 16 bits. A file of a few kilobytes can state any size."""
+PILLOW_FAULTS = (
+    OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, AttributeError,
+    ArithmeticError, MemoryError, EOFError, RuntimeError, struct.error, zlib.error,
+)  # fmt: skip
+"""What Pillow raises of damaged files, by format and version."""
+
+
+def stated_size(path: Path) -> tuple[int, int] | None:
+    """Width and height that a picture's header states; None of a kind that Pillow does not know.
+
+    Of more than Pillow opens at all they are beyond `MOST_PIXELS`, and not exact.
+    """
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path) as image:
+                return image.size
+    except Image.DecompressionBombError:
+        return MOST_PIXELS, MOST_PIXELS
+    except PILLOW_FAULTS:
+        return None
+
+
+def read_pixels(path: Path, flags: int) -> NDArray[Any] | None:
+    """A picture as OpenCV decodes it; None where it cannot, or of more than `MOST_PIXELS`."""
+    width, height = stated_size(path) or (0, 0)
+    if width * height > MOST_PIXELS:
+        return None
+    try:
+        pixels: NDArray[Any] | None = cv2.imread(str(path), flags)
+    except cv2.error:  # memory, or more pixels than OpenCV takes
+        return None
+    return pixels
 
 
 def is_cut_short(path: Path) -> bool:

@@ -23,6 +23,8 @@ from rasterio.transform import Affine
 from rasterio.windows import Window
 
 from alice_survey.artefacts import atomic_path
+from alice_survey.contents import one_line
+from alice_survey.errors import WorkspaceError
 from alice_survey.frames import Array, Datum
 from reconstruct.dense.dem import DemGrid
 from reconstruct.model import WorldFrame
@@ -100,6 +102,22 @@ def tiled_raster(
         yield raster
 
 
+@contextmanager
+def opened_raster(path: Path) -> Iterator[Any]:
+    """A GeoTIFF of a workspace, to read from.
+
+    Raises:
+        WorkspaceError: it is missing or damaged.
+    """
+    if not path.is_file():
+        raise WorkspaceError(f"{path}: no such file")
+    try:
+        with rasterio.open(path, driver="GTiff") as raster:
+            yield raster
+    except (rasterio.errors.RasterioError, MemoryError) as error:
+        raise WorkspaceError(f"{path}: is damaged ({one_line(error)}): make it anew") from None
+
+
 def tiles_of(grid: DemGrid, size: int) -> list[Window]:
     """Windows of a grid, row by row; a multiple of `BLOCK` as size fits the blocks of files."""
     return [
@@ -121,7 +139,7 @@ def hillshade(height: Array, cell: float, exaggeration: float = 1.0) -> Array:
 
 def preview_dem(dem: Path, picture: Path, longest_px: int = 1600) -> None:
     """Write a shaded, coloured picture of a DEM; what is unknown is white."""
-    with rasterio.open(dem) as raster:
+    with opened_raster(dem) as raster:
         shrink = max(1.0, max(raster.width, raster.height) / longest_px)
         shape = (max(2, int(raster.height / shrink)), max(2, int(raster.width / shrink)))
         resampling = rasterio.enums.Resampling.average

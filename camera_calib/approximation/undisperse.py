@@ -22,7 +22,7 @@ from camera_calib.approximation.dispersion import (
     undisperse,
 )
 from camera_calib.flat_port import FlatPortCamera
-from camera_calib.picture_files import is_cut_short
+from camera_calib.picture_files import is_cut_short, read_pixels
 from camera_calib.rig import read_rig
 from camera_calib.water import WAVELENGTH_NM
 
@@ -118,7 +118,7 @@ def _undisperse_file(job: _Job) -> Path:
     source, target, cameras, range_m = job
     if is_cut_short(source):
         raise ImageError(f"{source}: the file is cut short: copy it again, or leave it out")
-    stored = cv2.imread(str(source), cv2.IMREAD_UNCHANGED)
+    stored = read_pixels(source, cv2.IMREAD_UNCHANGED)
     if stored is None:
         raise ImageError(f"{source}: cannot be read as a picture")
     if stored.ndim != 3 or stored.dtype not in (np.uint8, np.uint16):

@@ -12,7 +12,7 @@ from alice_survey.errors import CalibrationError
 from alice_survey.executor import parallel_map
 from camera_calib.calibration.picture_sets import PictureSet
 from camera_calib.calibration.result import Rejection, TargetView
-from camera_calib.picture_files import is_cut_short
+from camera_calib.picture_files import is_cut_short, read_pixels
 from camera_calib.targets.detect import Detection, detect_with_reasons
 from camera_calib.targets.grow import chessboard_size
 from camera_calib.targets.target import Target
@@ -91,7 +91,7 @@ def _look(job: tuple[Path, Target, bool]) -> _Seen:
     path, target, check = job
     if is_cut_short(path):
         return _Seen(size=None, detection=Detection(pixels=None, refused="the file is cut short"))
-    picture = cv2.imread(str(path), _READ)
+    picture = read_pixels(path, _READ)
     if picture is None:
         reason = f"{path.name} cannot be decoded as a picture"
         return _Seen(size=None, detection=Detection(pixels=None, refused=reason))

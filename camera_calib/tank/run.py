@@ -17,7 +17,7 @@ from alice_survey.errors import CalibrationError, warn
 from alice_survey.executor import default_threads, parallel_map
 from alice_survey.frames import Array
 from camera_calib.calibration.freedom import LENSES
-from camera_calib.picture_files import is_cut_short
+from camera_calib.picture_files import is_cut_short, read_pixels
 from camera_calib.rig import write_rig
 from camera_calib.tank.adjust import (
     Refinement,
@@ -298,7 +298,7 @@ def _lens(folder: Path, target: Target, model: str | None, threads: int) -> Sing
 
 def _look(job: tuple[Path, Target]) -> tuple[tuple[int, int], Array | None]:
     path, target = job
-    picture = None if is_cut_short(path) else cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    picture = None if is_cut_short(path) else read_pixels(path, cv2.IMREAD_GRAYSCALE)
     if picture is None:
         raise CalibrationError(f"{path}: cannot be decoded to its end: leave it out")
     height, width = picture.shape

@@ -16,6 +16,7 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from alice_survey.config import AreaConfig
+from alice_survey.contents import one_line, shown
 from alice_survey.errors import PlanError, warn
 from missions.areas.crs import LOCAL, geographic_shapes, parse_crs, usable_crs
 from missions.areas.raw import RawShapes, from_geometries
@@ -122,6 +123,12 @@ def read_wkt(origin: str, text: str, crs: str | None) -> RawShapes:
     if match:
         text = text[match.end() :]
         stated = f"EPSG:{match.group(1)}"
+        try:
+            parse_crs(stated)
+        except PlanError:
+            raise PlanError(
+                f"area: {origin}: SRID={match.group(1)[:20]} is no coordinate system that is known"
+            ) from None
         if crs is not None and parse_crs(stated) != parse_crs(crs):
             raise PlanError(f"area: {origin}: it says SRID={match.group(1)} and crs is {crs}")
         crs = stated
@@ -145,7 +152,7 @@ def _closed_wkt(origin: str, text: str, reason: str) -> BaseGeometry:
         warnings.simplefilter("ignore")
         geometry = shapely.from_wkt(text, on_invalid="fix")
     if geometry is None:
-        what = reason.strip().splitlines()[0] if reason.strip() else "it cannot be read"
+        what = shown(reason) or "it cannot be read"
         raise PlanError(
             f"area: {origin}: no well-known text such as POLYGON ((0 0, 30 0, 30 20, 0 0)): {what}"
         )
@@ -229,8 +236,12 @@ def _gdal_layers(file: Path, shown: Path, driver: str) -> list[_Layer]:
                 meta, _, wkb, _ = pyogrio.raw.read(file, layer=i, columns=[], force_2d=True)
                 shapes = _shapes(wkb, shown.name, several=len(names) > 1, layer=str(name))
                 layers.append(_Layer(name=str(name), shapes=shapes, crs=meta["crs"]))
-        except (DataSourceError, DataLayerError) as error:
-            text = str(error).strip().splitlines()[0].replace(str(file), shown.name)
+        # pyogrio lets names that are no UTF-8 through, and trips over a damaged coordinate system.
+        except (
+            DataSourceError, DataLayerError, UnicodeDecodeError, UnboundLocalError, ValueError,
+            MemoryError,
+        ) as error:  # fmt: skip
+            text = one_line(error).replace(str(file), shown.name)
             raise PlanError(f"area: {shown}: cannot be read: {text}") from None
     for text in dict.fromkeys(str(w.message).splitlines()[0] for w in told):
         if not text.startswith("Non closed ring"):  # told with its feature

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.contents import shown
 from alice_survey.errors import NavigationError, warn, why
 from alice_survey.frames import Array, rotation_from_attitude
 from alice_survey.manifest import read_manifest
@@ -25,6 +26,8 @@ from missions.footprint import glass_point_cam
 from missions.logs.navigation_csv import NavigationLog, find_zone, read_navigation
 from missions.plan_file import Plan
 
+_MOST_TRIGGERS = 1_000_000
+"""More than a month of pictures every 3 s: times or intervals beyond are wrong."""
 _ELSEWHERE_M = 100.0
 """A log that stays farther from the area than this is of another place."""
 
@@ -97,6 +100,12 @@ def read_dive_record(
     elif triggers is not None:
         when = read_triggers(triggers, nav)
     else:
+        span_s = float(nav.time_s[-1] - nav.time_s[0])
+        if not span_s <= _MOST_TRIGGERS * plan.interval_s:
+            raise NavigationError(
+                f"{log}: spans {span_s:.3g} s, over {_MOST_TRIGGERS} pictures every "
+                f"{plan.interval_s:.3g} s: check its times, or give the triggers"
+            )
         times = np.arange(nav.time_s[0], nav.time_s[-1], plan.interval_s)
         when = Triggers(
             source=f"the plan's interval, {plan.interval_s:.3g} s, from the start of the log",
@@ -136,16 +145,18 @@ def read_triggers(path: Path, nav: NavigationLog) -> Triggers:
     names = list(reader.fieldnames or [])
     dated = "time_s" not in names
     if dated and "time_utc" not in names:
-        raise NavigationError(f"{path}: no column time_s or time_utc; it has {', '.join(names)}")
+        raise NavigationError(
+            f"{path}: no column time_s or time_utc; it has {shown(', '.join(names))}"
+        )
     if dated and nav.start_utc is None:
         raise NavigationError(f"{path} has dates and the log has none: give time_s")
     times, lines = [], []
     for number, row in rows:
         try:
             times.append(_since_start(row["time_utc"], nav) if dated else float(row["time_s"]))
-            lines.append(int(row["line"]) if "line" in names else -1)
+            lines.append(_line_number(row["line"]) if "line" in names else -1)
         except (TypeError, ValueError) as error:
-            raise NavigationError(f"{path} line {number}: {error}") from None
+            raise NavigationError(f"{path} line {number}: {shown(str(error))}") from None
         if not math.isfinite(times[-1]) or (len(times) > 1 and times[-1] <= times[-2]):
             raise NavigationError(
                 f"{path} line {number}: time {times[-1]:g} s does not follow the one before"
@@ -157,6 +168,13 @@ def read_triggers(path: Path, nav: NavigationLog) -> Triggers:
         time_s=np.array(times),
         line=np.array(lines, dtype=np.intp) if "line" in names else None,
     )
+
+
+def _line_number(cell: str) -> int:
+    number = int(cell)
+    if abs(number) > _MOST_TRIGGERS:
+        raise ValueError(f"line is {cell:.60}")
+    return number
 
 
 def _since_start(cell: str, nav: NavigationLog) -> float:

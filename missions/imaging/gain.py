@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from alice_survey.errors import ImageError, warn
 from alice_survey.executor import progress
 from alice_survey.frames import Array
-from camera_calib.picture_files import is_cut_short
+from camera_calib.picture_files import is_cut_short, read_pixels
 from camera_calib.text_table import text_table
 from missions.imaging.light import MIDDLE_GREY
 
@@ -181,10 +181,7 @@ def read_linear(file: Path, *, linear: bool) -> Floats | None:
     if is_cut_short(file):
         warn(f"{file}: the file ends early; left out")
         return None
-    try:
-        raw = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        raw = None
+    raw = read_pixels(file, cv2.IMREAD_UNCHANGED)
     if raw is None or raw.dtype not in (np.uint8, np.uint16) or raw.size == 0:
         warn(f"{file}: no picture of 8 or 16 bits, or it is damaged; left out")
         return None

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from alice_survey.contents import shown
 from alice_survey.errors import NavigationError
 from alice_survey.frames import Array, Datum, rotation_from_attitude
 from missions.logs.dive import LoggedDive, Signal
@@ -151,7 +152,7 @@ def read_tide(text: str, *, dated: bool) -> "float | Signal":
     for name in (column, "height_m"):
         if name not in names:
             raise NavigationError(
-                f"{path}: column {name} is missing; it has {', '.join(names)}"
+                f"{path}: column {name} is missing; it has {shown(', '.join(names))}"
                 + ("" if dated else " (the log's times have no date)")
             )
     times, heights = [], []
@@ -178,7 +179,10 @@ def utc_seconds(text: str) -> float:
         ValueError: it is no date.
     """
     date = datetime.fromisoformat(text)
-    return (date if date.tzinfo is not None else date.replace(tzinfo=UTC)).timestamp()
+    try:
+        return (date if date.tzinfo is not None else date.replace(tzinfo=UTC)).timestamp()
+    except OverflowError:  # in the years 1 and 9999
+        raise ValueError(f"{text} is no date of ours") from None
 
 
 def moment(time_s: float) -> str:

@@ -78,6 +78,8 @@ class _Format:
             return f"field type {wrong[0]!r}"
         if len(self.kinds) != len(self.fields):
             return f"{len(self.kinds)} field types for {len(self.fields)} names"
+        if len(set(self.fields)) < len(self.fields) or "" in self.fields:
+            return "fields without a name, or two of one name"
         if self.dtype.itemsize != self.length:
             return f"length {self.length} of fields that take {self.dtype.itemsize}"
         return None

@@ -118,7 +118,8 @@ def cleaned(source: str, time_s: Array, values: Array, lost: Counter[str]) -> Si
         lost: counts what is left out; is added to.
     """
     time_s = np.asarray(time_s, dtype=np.float64)
-    values = np.asarray(values, dtype=np.float64).reshape(len(time_s), -1)
+    values = np.asarray(values, dtype=np.float64)
+    values = values[:, None] if values.ndim == 1 else values
     good = np.abs(time_s) < _LATEST_S
     if not good.all():
         lost[f"{source}: the time is no number, or after 2200"] += int((~good).sum())

@@ -10,6 +10,7 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
 
+from alice_survey.contents import shown
 from alice_survey.errors import NavigationError, warn, why
 from alice_survey.frames import Array
 
@@ -108,10 +109,14 @@ def read_navigation(path: Path, zone: tzinfo) -> NavigationLog:
         raise NavigationError(f"{path}: cannot be read: {why(error)}") from None
     time_name = next((name for name in ("time_s", "time_utc") if name in header), None)
     if time_name is None:
-        raise NavigationError(f"{path}: no column time_s or time_utc; it has {', '.join(header)}")
+        raise NavigationError(
+            f"{path}: no column time_s or time_utc; it has {shown(', '.join(header))}"
+        )
     missing = [name for name in POSITION if name not in header]
     if missing:
-        raise NavigationError(f"{path}: column {missing[0]} is missing; it has {', '.join(header)}")
+        raise NavigationError(
+            f"{path}: column {missing[0]} is missing; it has {shown(', '.join(header))}"
+        )
     names = [*POSITION, *(name for name in OPTIONAL if name in header)]
     start: datetime | None = None
     times: list[float] = []
@@ -185,9 +190,9 @@ def _number(row: dict[str, str | None], name: str) -> float:
 def _date(cell: str | None, zone: tzinfo) -> datetime:
     try:
         date = datetime.fromisoformat((cell or "").strip())
-    except ValueError:
+        return (date.replace(tzinfo=zone) if date.tzinfo is None else date).astimezone(UTC)
+    except (ValueError, OverflowError):  # the latter in the years 1 and 9999
         raise ValueError(f"time_utc is {cell!r}, not a date such as 2024-05-01T12:00:00Z") from None
-    return (date.replace(tzinfo=zone) if date.tzinfo is None else date).astimezone(UTC)
 
 
 def warn_of_gaps(images: Sequence[str], time_s: Array, found: Array, log: NavigationLog) -> None:

@@ -10,6 +10,7 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
 
+from alice_survey.contents import shown
 from alice_survey.errors import NavigationError
 from missions.logs.dive import LoggedDive, cleaned, usable_positions
 
@@ -66,7 +67,7 @@ def read_qgc_csv(path: Path, asked: Mapping[str, str], time_zone: str) -> Logged
     def chosen(role: str, *usual: str) -> str | None:
         name = asked.get(role)
         if name is not None and name not in columns:
-            raise NavigationError(f"{path}: no column {name}; it has {', '.join(header)}")
+            raise NavigationError(f"{path}: no column {name}; it has {shown(', '.join(header))}")
         return name or next((column for column in usual if column in columns), None)
 
     depth, altitude = chosen("depth", _DEPTH), chosen("altitude", *_ALTITUDES)
@@ -105,9 +106,9 @@ def _zone(name: str) -> tzinfo:
 def _seconds(cell: str, zone: tzinfo) -> float:
     try:
         date = datetime.fromisoformat(cell)
-    except ValueError:
+        return (date if date.tzinfo is not None else date.replace(tzinfo=zone)).timestamp()
+    except (ValueError, OverflowError):  # the latter in the years 1 and 9999
         return math.nan
-    return (date if date.tzinfo is not None else date.replace(tzinfo=zone)).timestamp()
 
 
 def _number(cell: str) -> float:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from alice_survey.contents import one_line
 from alice_survey.errors import NavigationError
 from alice_survey.executor import progress
 from alice_survey.frames import Array, Datum, attitude_from_rotation
@@ -153,7 +154,8 @@ def _opened(path: Path) -> Iterator["AnyReader"]:
     faults = (
         AnyReaderError, Reader1Error, Reader2Error, SerdeError, TypesysError, SqliteError,
         zstd.ZstdError, OSError, struct.error, ValueError, KeyError, IndexError, AssertionError,
-        EOFError, MemoryError, RuntimeError,
+        EOFError, MemoryError, RuntimeError, OverflowError, TypeError, AttributeError,
+        RecursionError,
     )  # fmt: skip
     try:
         with AnyReader([path], default_typestore=store) as reader:
@@ -165,7 +167,7 @@ def _opened(path: Path) -> Iterator["AnyReader"]:
             raise NavigationError(
                 f"{path}: a bathymetric attributed grid (HDF5), not a bag of ROS"
             ) from None
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = one_line(error)
         raise NavigationError(
             f"{path}: cannot be read as a bag of ROS, is it cut off? ({reason}); `rosbag reindex` "
             "or `ros2 bag reindex` mends a bag whose recording was killed"

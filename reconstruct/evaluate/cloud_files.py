@@ -4,18 +4,23 @@ Coordinates in a projection reach 5,000 km: they are taken to local metres in fl
 anything else is done with them.
 """
 
+import multiprocessing
 import struct
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
 from alice_survey.artefacts import need_stage
+from alice_survey.contents import one_line
 from alice_survey.errors import ReconstructionError, WorkspaceError, why
 from alice_survey.frames import Array, Datum
 from reconstruct.evaluate.ply_points import read_ply_points
 
 _MOST_POINTS = 2_000_000
-_LAS_HEADER = 227
+_LAS_HEADER = 375
 _COMPRESSED = 0x80
 """In the point format of a header (LASzip)."""
 
@@ -43,15 +48,15 @@ def read_reference(path: Path, datum: Datum | None) -> tuple[Array, bool]:
     kind = path.suffix.lower()
     try:
         if kind in (".laz", ".las"):
-            points, crs = _read_las(path)
+            points, crs = _apart(path) if _check_las(path) else _read_las(path)
         elif kind == ".ply":
             points, crs = read_ply_points(path, _MOST_POINTS), None
         elif kind in (".tif", ".tiff"):
             points, crs = _read_tiff(path)
         else:
             raise WorkspaceError(f"{path}: a reference is a LAZ, LAS, PLY or GeoTIFF file")
-    except (OSError, ValueError, RuntimeError) as error:
-        raise WorkspaceError(f"{path}: cannot be read: {why(error)}") from None
+    except (OSError, ValueError, RuntimeError, MemoryError) as error:
+        raise WorkspaceError(f"{path}: cannot be read: {one_line(error)}") from None
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < 100:
         raise WorkspaceError(f"{path}: holds {len(points)} points; 100 or more are needed")
@@ -61,11 +66,24 @@ def read_reference(path: Path, datum: Datum | None) -> tuple[Array, bool]:
     return _local(points, crs, datum), True
 
 
+def _apart(path: Path) -> tuple[Array, str | None]:
+    """As `_read_las`, in a process of its own: damaged LAZ data can end the one that unpacks them.
+
+    Raises:
+        ValueError: as `_read_las`, or they did.
+    """
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        try:
+            return pool.submit(_read_las, path).result()
+        except BrokenProcessPool:
+            raise ValueError("its points are damaged: they cannot be unpacked") from None
+
+
 def _read_las(path: Path) -> tuple[Array, str | None]:
     import laspy
 
     parts = []
-    _check_chunks(path)
     try:
         with laspy.open(path) as file:
             crs = file.header.parse_crs()
@@ -73,8 +91,12 @@ def _read_las(path: Path) -> tuple[Array, str | None]:
             for chunk in file.chunk_iterator(1_000_000):
                 xyz = np.column_stack([chunk.x, chunk.y, chunk.z]).astype(np.float64)
                 parts.append(xyz[::step])
-    except laspy.LaspyException as error:
-        raise ValueError(str(error)) from None
+    # Neither laspy nor lazrs checks what a header says before it follows it.
+    except (
+        laspy.LaspyException, RuntimeError, struct.error, IndexError, KeyError, TypeError,
+        AttributeError, OverflowError, MemoryError,
+    ) as error:  # fmt: skip
+        raise ValueError(one_line(error)) from None
     points = np.concatenate(parts) if parts else np.empty((0, 3))
     return points, None if crs is None else crs.to_wkt()
 
@@ -97,32 +119,46 @@ def _read_tiff(path: Path) -> tuple[Array, str | None]:
     return np.column_stack([east, north, height[rows, columns]]), crs
 
 
-def _check_chunks(path: Path) -> None:
-    """Refuse a LAZ file that counts more chunks than it has bytes: its reader ends the program.
+def _check_las(path: Path) -> bool:
+    """Refuse a LAS or LAZ file that counts more records or chunks than it has bytes for.
 
-    The chunk table's place stands before the first chunk, or, where that is -1, in the last 8 bytes
-    (https://laszip.org, LASzip's "chunk table").
+    laspy reads on past the end for as many as are counted, and the reader of chunks, which makes
+    room for all of them, ends the program. Offsets are those of ASPRS' LAS 1.4, table 3; the chunk
+    table's place stands before the first chunk or, where that is -1, in the last 8 bytes.
+
+    Returns:
+        Whether its points are packed.
 
     Raises:
-        ValueError: it does, or the table is beyond its end.
+        ValueError: it counts so, or the chunk table is beyond its end.
     """
     size = path.stat().st_size
     with path.open("rb") as file:
-        head = file.read(_LAS_HEADER)
-        if len(head) < _LAS_HEADER:
-            raise ValueError("it is too short for its header")
-        (points_at,) = struct.unpack_from("<I", head, 96)
-        if not head[104] & _COMPRESSED:
-            return
-        file.seek(points_at)
-        (table_at,) = struct.unpack("<q", file.read(8).ljust(8, b"\0"))
-        if table_at == -1:
-            file.seek(size - 8)
-            (table_at,) = struct.unpack("<q", file.read(8))
-        if not points_at < table_at <= size - 8:
-            raise ValueError("its table of chunks is missing: it was cut short")
-        file.seek(table_at + 4)
-        (chunks,) = struct.unpack("<I", file.read(4))
+        head = file.read(_LAS_HEADER).ljust(_LAS_HEADER, b"\0")
+        minor, header_size = head[25], struct.unpack_from("<H", head, 94)[0]
+        points_at, records = struct.unpack_from("<II", head, 96)
+        if header_size + 54 * records > points_at or points_at > size:
+            raise ValueError(f"it counts {records} records before points at {points_at}")
+        if minor >= 4:
+            more_at, more = struct.unpack_from("<QI", head, 235)
+            if more and more_at + 60 * more > size:
+                raise ValueError(f"it counts {more} records after its points")
+        packed = bool(head[104] & _COMPRESSED)
+        if packed:
+            _check_chunks(file, points_at, size)
+    return packed
+
+
+def _check_chunks(file: BinaryIO, points_at: int, size: int) -> None:
+    file.seek(points_at)
+    (table_at,) = struct.unpack("<q", file.read(8).ljust(8, b"\0"))
+    if table_at == -1:
+        file.seek(size - 8)
+        (table_at,) = struct.unpack("<q", file.read(8))
+    if not points_at < table_at <= size - 8:
+        raise ValueError("its table of chunks is missing: it was cut short")
+    file.seek(table_at + 4)
+    (chunks,) = struct.unpack("<I", file.read(4))
     if chunks > size:
         raise ValueError(f"it counts {chunks} chunks in {size} bytes")
 

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import rasterio
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
@@ -12,6 +11,7 @@ from alice_survey.artefacts import need_stage
 from alice_survey.errors import ReconstructionError
 from alice_survey.frames import Array, Datum
 from reconstruct.model import WorldFrame, read_frame
+from reconstruct.raster import opened_raster
 from reconstruct.sparse.alignment import align_rigid
 
 
@@ -76,10 +76,10 @@ def read_elevation(workspace: Path) -> tuple[Elevation, WorldFrame]:
     """
     dense = need_stage(workspace, "dense", "reconstruct")
     frame = read_frame(need_stage(workspace, "sparse", "reconstruct") / "frame.json")
-    with rasterio.open(dense / "dem.tif") as source:
+    with opened_raster(dense / "dem.tif") as source:
         height = source.read(1).astype(np.float64)
         transform = source.transform
-    with rasterio.open(dense / "sigma.tif") as source:
+    with opened_raster(dense / "sigma.tif") as source:
         sigma = source.read(1).astype(np.float64)
     if not np.isfinite(height).any():
         raise ReconstructionError(f"{dense / 'dem.tif'}: holds no height")

@@ -6,7 +6,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import rasterio
 import shapely
 from numpy.typing import NDArray
 from rasterio.windows import Window
@@ -17,6 +16,7 @@ from alice_survey.frames import Array
 from alice_survey.seafloor.terrain import Terrain
 from alice_survey.seafloor.texture import Texture
 from reconstruct.evaluate.truth import surface_depth, surface_material
+from reconstruct.raster import opened_raster
 
 _PATCH_PX = 96
 _PATCHES = 400
@@ -79,7 +79,7 @@ def score_mosaic(
     area = area_in_world(area, terrain, truth_from_world)
     half = _PATCH_PX // 2 - 1
     shapely.prepare(area)
-    with rasterio.open(mosaic) as source, rasterio.open(dem) as heights:
+    with opened_raster(mosaic) as source, opened_raster(dem) as heights:
         transform = source.transform
         windows = _patches(source.height, source.width, transform, area)
         shifts, middles, true_places = [], [], []

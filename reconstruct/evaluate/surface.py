@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rasterio
 import shapely
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
@@ -22,6 +21,7 @@ from reconstruct.evaluate.figures import (
     rounded,
 )
 from reconstruct.evaluate.truth import surface_depth, surface_distance
+from reconstruct.raster import opened_raster
 
 GOOD_M = 0.01
 """A cell counts as accurate when its distance from the true surface is below this."""
@@ -148,12 +148,12 @@ def score_surface(
         sigma: standard deviations of the heights, on the same grid.
         stations: counts the stations that see points of the true surface.
     """
-    with rasterio.open(dem) as source:
+    with opened_raster(dem) as source:
         heights = source.read(1).astype(np.float64)
         transform = source.transform
     sigmas = None
     if sigma is not None:
-        with rasterio.open(sigma) as source:
+        with opened_raster(sigma) as source:
             sigmas = source.read(1).astype(np.float64).ravel()
     rows, columns = heights.shape
     east = transform.c + (np.arange(columns) + 0.5) * transform.a

@@ -12,7 +12,8 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.errors import WorkspaceError
+from alice_survey.contents import one_line
+from alice_survey.errors import CalibrationError, WorkspaceError
 from alice_survey.frames import Array
 from camera_calib.approximation.virtual_pinhole import VirtualPinhole, best_pinhole
 from camera_calib.flat_port import FlatPortCamera, camera_from_json
@@ -219,9 +220,9 @@ def lens_from_json(data: dict[str, Any]) -> Lens:
                 params=tuple(data["params"]),
                 pinhole=Pinhole(**data["pinhole"]),
             )
-    except (KeyError, TypeError) as error:
-        raise WorkspaceError(f"camera of sparse/cameras.json is wrong: {error}") from None
-    raise WorkspaceError(f"camera of sparse/cameras.json is of unknown kind {data['kind']!r}")
+    except (KeyError, TypeError, ValueError, CalibrationError) as error:
+        raise WorkspaceError(f"a camera of cameras.json is wrong: {one_line(error)}") from None
+    raise WorkspaceError(f"a camera of cameras.json is of unknown kind {data['kind']!r:.60}")
 
 
 def _slopes(camera: pycolmap.Camera, pixels: Array) -> Array:

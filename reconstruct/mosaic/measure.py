@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import rasterio
 from rasterio.windows import Window
 
 from reconstruct.dense.dem import DemGrid
@@ -14,6 +13,7 @@ from reconstruct.mosaic.facts import PictureFacts, measure_picture
 from reconstruct.mosaic.footprints import PictureFootprint, picture_footprint
 from reconstruct.mosaic.grid import Float32, footprints
 from reconstruct.mosaic.sight import store_visible
+from reconstruct.raster import opened_raster
 
 _MOST_CELLS = 16_000_000
 """Of the DEM for one view; views that see more, to the horizon, are looked at block by block."""
@@ -44,7 +44,7 @@ def _part_seen(task: MeasureTask) -> tuple[Float32, DemGrid, bool]:
     """The DEM below a view and all that it may see, coarser where that is a lot; whether it is."""
     west, east, south, north = footprints((task.view,), task.heights).boxes[0]
     camera = enu_from_cam(task.view, np.zeros(3))[:, 3]
-    with rasterio.open(task.workspace / "dense" / "dem.tif") as raster:
+    with opened_raster(task.workspace / "dense" / "dem.tif") as raster:
         t = raster.transform
         columns = [min(west, camera[0]), max(east, camera[0])]
         rows = [max(north, camera[1]), min(south, camera[1])]

@@ -25,6 +25,7 @@ from reconstruct.mosaic.sight import (
     see,
 )
 from reconstruct.mosaic.tools import Survey, Tools, tools_of
+from reconstruct.raster import opened_raster
 
 Float32 = NDArray[np.float32]
 
@@ -233,7 +234,7 @@ def _box(
 
 def ground_of(survey: Survey, block: Block) -> Ground:
     """The surface of a block, and what around it may hide it."""
-    with rasterio.open(survey.workspace / "dense" / "dem.tif") as raster:
+    with opened_raster(survey.workspace / "dense" / "dem.tif") as raster:
         return Ground(*dem_around(raster, block.grid, block.reach), survey.scratch)
 
 

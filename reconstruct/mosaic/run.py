@@ -51,6 +51,7 @@ from reconstruct.mosaic.paint import (
 from reconstruct.mosaic.sight import Water
 from reconstruct.mosaic.tools import Survey, forget_tools
 from reconstruct.mosaic.writers import cloud_optimised, thumbnail, write_labels, write_tiles
+from reconstruct.raster import opened_raster
 from reconstruct.sparse.track_figure import plot_track_over
 
 _TILE_PX = 1024
@@ -130,7 +131,7 @@ def build_mosaic(
     threads = min(threads, _MOST_PROCESSES)
     scratch = folder / "scratch"
     scratch.mkdir()
-    with rasterio.open(workspace / "dense" / "dem.tif") as raster:
+    with opened_raster(workspace / "dense" / "dem.tif") as raster:
         heights = height_range(raster)
         pixel = settings.mosaic_pixel_m or round_cell(mean_pixel(model))
         grid = mosaic_grid(raster, pixel, model.frame)

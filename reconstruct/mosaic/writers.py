@@ -15,7 +15,7 @@ from reconstruct.dense.dem import DemGrid
 from reconstruct.model import WorldFrame
 from reconstruct.mosaic.grid import CELL_PX, cells_over
 from reconstruct.mosaic.paint import Labels, Painted
-from reconstruct.raster import BLOCK, crs_of, frame_tags, transform_of, write_png
+from reconstruct.raster import BLOCK, crs_of, frame_tags, opened_raster, transform_of, write_png
 
 _THUMBNAIL_PX = 1600
 
@@ -120,7 +120,7 @@ def cloud_optimised(rough: Path, final: Path, threads: int) -> None:
 
 def thumbnail(mosaic: Path, picture: Path) -> None:
     """Write a small copy, unknown pixels transparent."""
-    with rasterio.open(mosaic) as raster:
+    with opened_raster(mosaic) as raster:
         shrink = max(1.0, max(raster.width, raster.height) / _THUMBNAIL_PX)
         shape = (4, max(1, int(raster.height / shrink)), max(1, int(raster.width / shrink)))
         small: NDArray[np.uint8] = raster.read(

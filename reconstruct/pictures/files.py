@@ -2,6 +2,7 @@
 
 import re
 import shutil
+import warnings
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, timezone, tzinfo
 from fractions import Fraction
@@ -12,7 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.contents import one_line, shown
 from alice_survey.errors import ImageError
+from camera_calib.picture_files import MOST_PIXELS, PILLOW_FAULTS, read_pixels, stated_size
 
 PLAIN = (".jpg", ".jpeg", ".png")
 TIFF = (".tif", ".tiff")
@@ -20,6 +23,8 @@ RAW = (
     ".3fr", ".arw", ".cr2", ".cr3", ".dng", ".erf", ".gpr", ".iiq", ".kdc", ".mef", ".mos", ".mrw",
     ".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f",
 )  # fmt: skip
+_YEARS = range(1970, 2200)
+"""In which a digital camera can have taken a picture."""
 _GPS, _EXIF = 0x8825, 0x8769
 _DATE, _SUBSECOND, _OFFSET, _FOCAL_35 = 0x9003, 0x9291, 0x9011, 0xA405
 
@@ -103,15 +108,14 @@ def decode(path: Path) -> NDArray[Any]:
         ImageError: it cannot be decoded to its end.
     """
     suffix = path.suffix.lower()
+    width, height = stated_size(path) or (0, 0)
+    if width * height > MOST_PIXELS:
+        raise ImageError(f"states over {MOST_PIXELS / 1e6:.0f} million pixels: make it smaller")
     if suffix in RAW:
         return _develop(path)
     if suffix in PLAIN:
         _check_whole(path)
-    flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
-    try:
-        pixels = cv2.imread(str(path), flags)
-    except cv2.error:
-        pixels = None
+    pixels = read_pixels(path, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels is None:
         raise ImageError("cannot be decoded")
     if pixels.dtype not in (np.uint8, np.uint16):
@@ -126,10 +130,11 @@ def _check_whole(path: Path) -> None:
     from PIL import Image
 
     try:
-        with Image.open(path) as image:
+        with warnings.catch_warnings(), Image.open(path) as image:
+            warnings.simplefilter("ignore")
             image.load()
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise ImageError(f"corrupt: {error}".replace(str(path), path.name)) from None
+    except PILLOW_FAULTS as error:
+        raise ImageError(f"corrupt: {one_line(error)}".replace(str(path), path.name)) from None
 
 
 def _develop(path: Path) -> NDArray[Any]:
@@ -142,10 +147,10 @@ def _develop(path: Path) -> NDArray[Any]:
                 output_bps=16, no_auto_bright=True, use_camera_wb=False, use_auto_wb=False,
                 user_flip=0,
             )  # fmt: skip
-    except (rawpy.LibRawError, OSError, ValueError) as error:
+    except (rawpy.LibRawError, OSError, ValueError, MemoryError, RuntimeError) as error:
         text = error.args[0] if error.args else error
-        text = text.decode(errors="replace") if isinstance(text, bytes) else text
-        raise ImageError(f"RAW cannot be developed: {text}") from None
+        text = text.decode(errors="replace") if isinstance(text, bytes) else str(text)
+        raise ImageError(f"RAW cannot be developed: {shown(text)}") from None
     return np.ascontiguousarray(rgb[..., ::-1])
 
 
@@ -155,10 +160,11 @@ def _with_exif(facts: PictureFacts) -> PictureFacts:
     from PIL import Image
 
     try:
-        with Image.open(facts.path) as image:
+        with warnings.catch_warnings(), Image.open(facts.path) as image:
+            warnings.simplefilter("ignore")
             exif = image.getexif()
             details, gps = exif.get_ifd(_EXIF), exif.get_ifd(_GPS)
-    except (OSError, SyntaxError, ValueError, KeyError, TypeError):
+    except PILLOW_FAULTS:
         return facts  # a RAW format that Pillow does not know, or broken tags: pixels suffice
     return replace(
         facts,
@@ -175,13 +181,16 @@ def _time(details: Any, exif: Any) -> datetime | None:
         time = datetime.strptime(str(text).strip("\0 "), "%Y:%m:%d %H:%M:%S")
     except ValueError:
         return None
+    if time.year not in _YEARS:
+        return None
     digits = re.match(r"\d+", str(details.get(_SUBSECOND, "")))
     if digits:
         time += timedelta(seconds=float(f"0.{digits[0]}"))
     zone = re.fullmatch(r"([+-])(\d\d):(\d\d)", str(details.get(_OFFSET, "")).strip("\0 "))
     if zone:
         shift = timedelta(hours=int(zone[2]), minutes=int(zone[3]))
-        time = time.replace(tzinfo=timezone(-shift if zone[1] == "-" else shift))
+        if shift < timedelta(hours=24):
+            time = time.replace(tzinfo=timezone(-shift if zone[1] == "-" else shift))
     return time
 
 
@@ -194,7 +203,8 @@ def _number(value: Any) -> float | None:
 
 
 def _angle(gps: Any, key: int, reference: int, negative: str) -> float | None:
-    parts = [_number(p) for p in gps.get(key, ())]
+    stored = gps.get(key)
+    parts = [_number(p) for p in stored] if isinstance(stored, tuple) else []
     if len(parts) != 3 or any(p is None for p in parts):
         return None
     degrees, minutes, seconds = (float(p or 0.0) for p in parts)
@@ -219,9 +229,10 @@ def exif_focal_px(path: Path, width_px: int, height_px: int) -> float:
     from PIL import Image
 
     try:
-        with Image.open(path) as image:
+        with warnings.catch_warnings(), Image.open(path) as image:
+            warnings.simplefilter("ignore")
             stated = _number(image.getexif().get_ifd(_EXIF).get(_FOCAL_35))
-    except (OSError, SyntaxError, ValueError, KeyError, TypeError):
+    except PILLOW_FAULTS:
         return float("nan")
     if stated is None or not 5 <= stated <= 1000:
         return float("nan")

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.errors import ImageError
+from camera_calib.picture_files import read_pixels
 
 Grey = NDArray[np.uint8]
 Deep = NDArray[np.uint8] | NDArray[np.uint16]
@@ -34,7 +35,7 @@ def read_deep(path: Path) -> Deep:
         ImageError: it is missing, cannot be decoded, or its levels are not of 8 or 16 bits.
     """
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    picture = cv2.imread(str(path), flags)
+    picture = read_pixels(path, flags)
     if picture is None:
         raise ImageError(f"{path}: missing, or no picture that can be decoded")
     if picture.dtype not in _FLOOR:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from alice_survey.artefacts import read_json
 from alice_survey.errors import ImageError, WorkspaceError
 from alice_survey.frames import Array
+from camera_calib.picture_files import read_pixels
 from reconstruct.lenses.lens import Lens, lens_from_json
 from reconstruct.pictures.normalise import Grey, normalise
 
@@ -27,7 +28,7 @@ def read_colour(path: Path) -> Colour:
     Raises:
         ImageError: it is missing or cannot be decoded.
     """
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    picture = read_pixels(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if picture is None:
         raise ImageError(f"{path}: missing, or no picture that can be decoded")
     colour: Colour = picture
@@ -44,7 +45,7 @@ def read_mask(path: Path, size: tuple[int, int]) -> Mask:
     Raises:
         ImageError: it is missing, cannot be decoded or is of another size.
     """
-    mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    mask = read_pixels(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     if mask is None:
         raise ImageError(f"{path}: missing, or no mask that can be decoded")
     if mask.shape[::-1] != size:

@@ -359,12 +359,12 @@ class _Surface:
     """The DEM and its standard deviation."""
 
     def __init__(self, dense: Path) -> None:
-        import rasterio
+        from reconstruct.raster import opened_raster
 
-        with rasterio.open(dense / "dem.tif") as raster:
+        with opened_raster(dense / "dem.tif") as raster:
             self.height = raster.read(1).astype(np.float32)
             self.transform = raster.transform
-        with rasterio.open(dense / "sigma.tif") as raster:
+        with opened_raster(dense / "sigma.tif") as raster:
             self.sigma = raster.read(1).astype(np.float32)
         self.cell = float(self.transform.a)
         self.low, self.high = float(np.nanmin(self.height)), float(np.nanmax(self.height))

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from alice_survey.artefacts import write_json
-from alice_survey.errors import VehicleError
+from alice_survey.contents import one_line, shown
+from alice_survey.errors import VehicleError, why
 from alice_survey.vehicle.coefficients import FORCES, Coefficients
 from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.propulsion import Thruster
@@ -68,10 +69,7 @@ def vehicle_from_file(path: Path) -> Vehicle:
     names = [thruster.name for thruster in made]
     if len(set(names)) < len(names):
         raise VehicleError(f"{path}: two thrusters have one name")
-    coefficients = Coefficients(
-        name=path.stem,
-        values={str(key): _number(path, str(key), value) for key, value in values.items()},
-    )
+    coefficients = _coefficients(path, path.stem, values)
     density = _number(path, "density_kg_m3", table.get("density_kg_m3", 1025.0))
     return Vehicle(
         name=name, rigid_body=body, coefficients=coefficients, thrusters=made,
@@ -112,11 +110,7 @@ def coefficients_from_file(path: Path) -> Coefficients:
         raise VehicleError(f"{path}: format {table['format']!r} is not {COEFFICIENTS_FORMAT!r}")
     if not isinstance(values, dict) or not values:
         raise VehicleError(f"{path}: holds no coefficients")
-    named = {str(key): _number(path, str(key), value) for key, value in values.items()}
-    try:
-        found = Coefficients(name=str(table.get("name", path.stem)), values=named)
-    except VehicleError as error:
-        raise VehicleError(f"{path}: {error}") from None
+    found = _coefficients(path, str(table.get("name", path.stem)), values)
     driving = np.flatnonzero(np.maximum(np.diag(found.linear), np.diag(found.quadratic)) > 0)
     if len(driving):
         axis = FORCES[driving[0]]
@@ -127,12 +121,22 @@ def coefficients_from_file(path: Path) -> Coefficients:
     return found
 
 
+def _coefficients(path: Path, name: str, values: Mapping[str, Any]) -> Coefficients:
+    named = {str(key): _number(path, str(key), value) for key, value in values.items()}
+    try:
+        return Coefficients(name=name, values=named)
+    except VehicleError as error:
+        raise VehicleError(f"{path}: {shown(str(error))}") from None
+
+
 def _read(path: Path) -> dict[str, Any]:
     try:
         text = path.read_text(encoding="utf-8")
         table = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
-    except (OSError, UnicodeDecodeError, ValueError) as error:
-        raise VehicleError(f"{path}: cannot be read: {error}") from None
+    except OSError as error:
+        raise VehicleError(f"{path}: cannot be read: {why(error)}") from None
+    except (ValueError, RecursionError) as error:
+        raise VehicleError(f"{path}: cannot be read: {one_line(error)}") from None
     if not isinstance(table, dict):
         raise VehicleError(f"{path}: holds no table")
     return table
@@ -173,5 +177,8 @@ def _known(path: Path, place: str, table: Mapping[str, Any], names: set[str]) ->
 
 def _number(path: Path, place: str, value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise VehicleError(f"{path}: {place} is {value!r}, not a number")
-    return float(value)
+        raise VehicleError(f"{path}: {place} is {value!r:.60}, not a number")
+    try:
+        return float(value)
+    except OverflowError:
+        raise VehicleError(f"{path}: {place} is too large") from None

@@ -10,7 +10,8 @@ from pydantic import Field, ValidationError
 from scipy.spatial.transform import Rotation
 
 from alice_survey.config import Config
-from alice_survey.errors import VehicleError
+from alice_survey.contents import one_line, shown
+from alice_survey.errors import VehicleError, why
 from alice_survey.frames import Array, rotation_from_attitude
 from alice_survey.vehicle.log import TIME, VehicleLog, log_of_columns, read_number_columns
 
@@ -60,12 +61,14 @@ def read_column_map(path: Path) -> ColumnMap:
     try:
         with path.open("rb") as file:
             found = ColumnMap.model_validate(tomllib.load(file))
-    except (OSError, tomllib.TOMLDecodeError) as error:
-        raise VehicleError(f"{path}: cannot be read: {error}") from None
+    except OSError as error:
+        raise VehicleError(f"{path}: cannot be read: {why(error)}") from None
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
-        raise VehicleError(f"{path}: {place}: {first['msg']}") from None
+        raise VehicleError(f"{path}: {shown(place)}: {first['msg']}") from None
+    except (ValueError, RecursionError) as error:  # no TOML, no text, or a number without end
+        raise VehicleError(f"{path}: cannot be read: {one_line(error)}") from None
     if (found.time is None) == (found.time_step_s is None):
         raise VehicleError(f"{path}: give time, or time_step_s where the rows have no time")
     if found.angles_deg is not None and (found.body, found.world) != ("frd", "ned"):
