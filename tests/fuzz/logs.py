@@ -1,0 +1,299 @@
+"""Logs of vehicles: what `import-log`, `import-images`, `fly`, `plan check` and `identify` read."""
+
+from collections.abc import Callable
+from datetime import UTC
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from alice_survey.config import CameraConfig, WaterConfig
+from tests.fuzz.target import Target
+
+_HERE = Path(__file__).parent
+_START_NS = 1_714_564_800_000_000_000
+
+
+def read_any_log(path: Path) -> object:
+    """As `import-log` until it writes; of a side file, the log in whose folder it is."""
+    from missions.logs.corrections import Corrections, navigation_table
+    from missions.logs.import_log import ImportOptions, read_dive
+
+    log = path.parent if path.parent.name == "bag" else path
+    options = ImportOptions(lever_body_m=(0.1, 0.0, 0.2))
+    dive = read_dive(log, options)
+    return navigation_table(dive, Corrections(lever_body_m=options.lever_body_m))
+
+
+def _bag(folder: Path, version: int, storage: str = "MCAP") -> None:
+    from rosbags.rosbag2 import StoragePlugin
+
+    from tests.missions.logs.log_files import Bag
+
+    bag = Bag(version)
+    for i in range(12):
+        bag.add_nav_sts(
+            _START_NS + i * 10**8, (41.7 + 1e-6 * i, 3.03, 5.0), (0.01, -0.02, 3.1), 2.5
+        )
+        bag.add_range(_START_NS + i * 10**8, "/sonar/ping", 4.0)
+    bag.write(folder / ("a.bag" if version == 1 else "bag"), getattr(StoragePlugin, storage))
+
+
+def _dive() -> list[tuple[object, ...]]:
+    rows: list[tuple[object, ...]] = [
+        ("GPS", 5 * 10**7, 0, 3, 302_418_000, 2312, 12, 0.8, 60.1, 5.25, 3.0, 0.1, 0.0, 0.0, 0.0, 1)
+    ]
+    for i in range(12):
+        t = 51_000_000 + i * 100_000
+        rows += [
+            ("ATT", t - 20_000, 0.0, 1.5, 0.0, -2.25, 0.0, 1.0 + i, 0.0, 0.0, 3),
+            ("POS", t, 60.1 + 1e-6 * i, 5.25, 1.0, -(4.0 + 0.25 * i), -99.0),
+            ("RFND", t + 10_000, 0, 2.5, 4, 25),
+            ("XKF1", t, 0, 1.5, -2.25, 3.0, 0.5, 0.0, 0.1, 0.1, 9.0, 9.0, 9.0, 0.0, 0.0, 0.0, 0.0),
+            ("BARO", t, 0, -3.0, 1e5),
+        ]
+    return rows
+
+
+def _dataflash(folder: Path, name: str) -> None:
+    from tests.missions.logs.log_files import dataflash_log, dataflash_text
+
+    if name.endswith(".log"):
+        (folder / name).write_text(dataflash_text(_dive()))
+    else:
+        (folder / name).write_bytes(dataflash_log(_dive()))
+
+
+def _telemetry(folder: Path) -> None:
+    from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+    from tests.missions.logs.log_files import tlog
+
+    records = []
+    for i in range(12):
+        t, ms = 1.7e9 + 0.2 * i, 90_000 + 200 * i
+        place = (round(60.1e7) + 10 * i, 52_500_000, 0, -(3000 + 50 * i), 30, -40, 5, 65535)
+        records += [
+            (t, mavlink.MAVLink_heartbeat_message(12, 3, 81, 0, 3, 3)),
+            (t, mavlink.MAVLink_attitude_message(ms, 0.1, -0.05, 0.1, 0.01, 0.02, 0.03)),
+            (t, mavlink.MAVLink_global_position_int_message(ms, *place)),
+            (t, mavlink.MAVLink_distance_sensor_message(ms, 20, 3000, 180 + i, 0, 0, 25, 255)),
+        ]
+    (folder / "a.tlog").write_bytes(tlog(records))
+
+
+def _qgc(folder: Path) -> None:
+    rows = [
+        "Timestamp,roll,pitch,heading,altitudeRelative,gps.lat,gps.lon,"
+        "apmSubInfo.rangefinderDistance"
+    ]
+    rows += [
+        f"2024-05-01 14:00:{i:02d}.100,1.0,-2.0,{i}.0,-3.0,60.1{i:03d},5.25,2.0" for i in range(9)
+    ]
+    (folder / "a.csv").write_text("\n".join(rows) + "\n")
+
+
+def navigation_rows(*, dated: bool) -> list[str]:
+    names = "latitude_deg,longitude_deg,depth_m,roll_deg,pitch_deg,heading_deg,altitude_m"
+    rows = [f"{'time_utc' if dated else 'time_s'},{names}"]
+    for i in range(12):
+        time = f"2024-05-01T12:00:{i:02d}Z" if dated else f"{i}.5"
+        rows.append(f"{time},32.8{i:02d},34.95,13.{i},0.1,0.2,{355 + i},2.0")
+    return rows
+
+
+def _written(name: str, rows: Callable[[], list[str]]) -> Callable[[Path], None]:
+    return lambda folder: _write(folder / name, rows())
+
+
+def _write(path: Path, rows: list[str]) -> None:
+    path.write_text("\n".join(rows) + "\n", encoding="utf-8")
+
+
+def read_nav(path: Path) -> object:
+    """As `import-images --navigation`: read, and asked for other moments."""
+    from missions.logs.navigation_csv import read_navigation
+
+    log = read_navigation(path, UTC)
+    return log.at(np.linspace(-5.0, 60.0, 40))
+
+
+def _read_triggers(path: Path) -> object:
+    from missions.coverage.dives import read_triggers
+    from missions.logs.navigation_csv import read_navigation
+
+    return read_triggers(path, read_navigation(path.with_name("n.csv"), UTC))
+
+
+def _triggers(folder: Path) -> None:
+    _write(folder / "n.csv", navigation_rows(dated=True))
+    _write(folder / "t.csv", ["time_utc,line", *(f"2024-05-01T12:00:{i:02d}Z,0" for i in range(9))])
+
+
+def _check_dive(path: Path) -> object:
+    """As `plan check LOG`: the stations of a dive, for a plan."""
+    from camera_calib.rig import design_rig
+    from missions.coverage.dives import read_dive_record
+    from tests.fuzz.workspace import small_plan
+
+    return read_dive_record(path, small_plan(), design_rig(CameraConfig(), WaterConfig()))
+
+
+def _check_log(folder: Path) -> None:
+    rows = ["time_s,latitude_deg,longitude_deg,depth_m,roll_deg,pitch_deg,heading_deg,altitude_m"]
+    rows += [f"{i},{32.8236 + 2e-6 * i:.7f},34.9553,13.0,0,0,{i % 3},2.0" for i in range(40)]
+    _write(folder / "d.csv", rows)
+
+
+def _read_tide(path: Path) -> object:
+    from missions.logs.corrections import read_tide
+
+    return read_tide(str(path), dated=True)
+
+
+def _vehicle_rows() -> list[str]:
+    names = (
+        "time_s,north_m,east_m,depth_m,quat_x,quat_y,quat_z,quat_w,u_mps,v_mps,w_mps,"
+        "p_rad_s,q_rad_s,r_rad_s,rpm_stern"
+    )
+    row = "0.0,0.0,10.0,0,0,0,1,0.2,0,0,0,0,0.01,300"
+    return [names, *(f"{0.1 * i:.1f},{row}" for i in range(20))]
+
+
+def _read_vehicle_log(path: Path) -> object:
+    from alice_survey.vehicle.log import read_vehicle_log, segments
+
+    return segments(read_vehicle_log(path))
+
+
+def _column_map(folder: Path) -> None:
+    _write(
+        folder / "map.toml",
+        [
+            'time = "t"', "time_unit_s = 0.001", 'body = "flu"', 'world = "enu"',
+            'velocity = ["vx", "vy", "vz"]', 'quaternion_xyzw = ["a", "b", "c", "d"]',
+            "[rpm]", 'stern = "m1"',
+        ],
+    )  # fmt: skip
+    _write(
+        folder / "log.csv",
+        ["t,vx,vy,vz,a,b,c,d,m1", *(f"{100 * i},0.2,0,0,0,0,0,1,300" for i in range(9))],
+    )
+
+
+def _read_foreign(path: Path) -> object:
+    from alice_survey.vehicle.identification.foreign import read_column_map, read_foreign_log
+
+    return read_foreign_log(path.with_name("log.csv"), read_column_map(path.with_name("map.toml")))
+
+
+def _read_vehicle(path: Path) -> object:
+    from alice_survey.vehicle.identification.files import speeds_missing, vehicle_from_file
+
+    return vehicle_from_file(path), speeds_missing(path)
+
+
+def _vehicle(folder: Path) -> None:
+    source = _HERE.parent / "vehicle" / "identification" / "bluerov2.toml"
+    (folder / "v.toml").write_bytes(source.read_bytes())
+
+
+def _vehicle_json(folder: Path) -> None:
+    import json
+    import tomllib
+
+    _vehicle(folder)
+    (folder / "v.json").write_text(json.dumps(tomllib.loads((folder / "v.toml").read_text())))
+    (folder / "v.toml").unlink()
+
+
+def _coefficients() -> list[str]:
+    return ["X_u = -4.0", "X_uu = -18.0", "Y_v = -6.0", "X_udot = -5.5", "N_r = -0.1"]
+
+
+def _read_coefficients(path: Path) -> object:
+    from alice_survey.vehicle.identification.files import coefficients_from_file
+
+    return coefficients_from_file(path)
+
+
+def _pulls() -> list[str]:
+    return ["thruster,rpm,force_n", "stern,300,12.5", "stern,-300,-9", "stern,600,50"]
+
+
+def _read_pulls(path: Path) -> object:
+    from alice_survey.vehicle.fleet import vehicle
+    from alice_survey.vehicle.identification.bollard import fit_pulls, read_pulls
+
+    return fit_pulls(read_pulls(path), vehicle("alice"))
+
+
+def _current() -> list[str]:
+    rows = [f"{t},{d},0.1,0.02" for t in (0, 60, 120) for d in (5, 10, 15)]
+    return ["time_s,depth_m,north_mps,east_mps", *rows]
+
+
+def _read_current(path: Path) -> object:
+    from alice_survey.vehicle.sea import read_current
+
+    return read_current(path)
+
+
+def _tide() -> list[str]:
+    return ["time_utc,height_m", *(f"2024-05-01T{h:02d}:00:00Z,0.{h}" for h in range(9))]
+
+
+def _csv(
+    name: str, file: str, rows: Callable[[], list[str]], read: Callable[[Path], object]
+) -> Target:
+    return Target(name=name, syntax="csv", file=file, build=_written(file, rows), read=read)
+
+
+TARGETS = (
+    Target(
+        name="ROS 1 bag", syntax="binary", file="a.bag", build=partial(_bag, version=1),
+        read=read_any_log,
+    ),
+    Target(
+        name="ROS 2 bag, MCAP", syntax="binary", file="bag/bag.mcap",
+        build=partial(_bag, version=2), read=read_any_log,
+    ),
+    Target(
+        name="ROS 2 bag, SQLite", syntax="binary", file="bag/bag.db3",
+        build=partial(_bag, version=2, storage="SQLITE3"), read=read_any_log,
+    ),
+    Target(
+        name="ROS 2 bag, metadata", syntax="text", file="bag/metadata.yaml",
+        build=partial(_bag, version=2), read=read_any_log,
+    ),
+    Target(
+        name="DataFlash .BIN", syntax="binary", file="a.bin",
+        build=partial(_dataflash, name="a.bin"), read=read_any_log,
+    ),
+    Target(
+        name="DataFlash .log", syntax="csv", file="a.log",
+        build=partial(_dataflash, name="a.log"), read=read_any_log,
+    ),
+    Target(name="tlog", syntax="binary", file="a.tlog", build=_telemetry, read=read_any_log),
+    Target(name="QGC CSV", syntax="csv", file="a.csv", build=_qgc, read=read_any_log),
+    _csv("navigation CSV", "n.csv", partial(navigation_rows, dated=False), read_nav),
+    _csv("navigation CSV, dated", "n.csv", partial(navigation_rows, dated=True), read_nav),
+    Target(name="triggers", syntax="csv", file="t.csv", build=_triggers, read=_read_triggers),
+    Target(name="log to check", syntax="csv", file="d.csv", build=_check_log, read=_check_dive),
+    _csv("tide", "tide.csv", _tide, _read_tide),
+    _csv("vehicle log", "v.csv", _vehicle_rows, _read_vehicle_log),
+    Target(
+        name="column map", syntax="toml", file="map.toml", build=_column_map, read=_read_foreign
+    ),
+    Target(name="foreign log", syntax="csv", file="log.csv", build=_column_map, read=_read_foreign),
+    Target(name="vehicle TOML", syntax="toml", file="v.toml", build=_vehicle, read=_read_vehicle),
+    Target(
+        name="vehicle JSON", syntax="json", file="v.json", build=_vehicle_json, read=_read_vehicle
+    ),
+    Target(
+        name="coefficients", syntax="toml", file="c.toml", build=_written("c.toml", _coefficients),
+        read=_read_coefficients,
+    ),
+    _csv("bollard pull", "pull.csv", _pulls, _read_pulls),
+    _csv("current", "current.csv", _current, _read_current),
+)  # fmt: skip

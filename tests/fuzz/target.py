@@ -1,0 +1,26 @@
+"""A reader to be tried: the file that is spoilt, what lies beside it, and how it is read."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.fuzz.mutations import Syntax
+
+
+@dataclass(frozen=True, kw_only=True)
+class Target:
+    """One kind of file, in good order, and its reader."""
+
+    name: str
+    syntax: Syntax
+    """How the file is spoilt."""
+    file: str
+    """Path below the folder that `build` fills."""
+    build: Callable[[Path], None]
+    """Writes a good file, and what its reader needs beside it."""
+    read: Callable[[Path], object]
+    """Takes the path of the file."""
+    examples: int = 20
+    """How often the short form tries it: fewer where one try takes long."""
+    native: bool = False
+    """Mostly read by a compiled library, whose paths an engine does not see."""

@@ -1,0 +1,104 @@
+"""Every reader, with files spoilt by `mutations`: the short form of `campaign`."""
+
+import json
+from pathlib import Path
+from random import Random
+
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+from alice_survey.errors import PlanError, WorkspaceError
+from tests.fuzz.judge import Sandbox, judge
+from tests.fuzz.mutations import MOST_BYTES, mutate
+from tests.fuzz.targets import GROUPS, TARGETS, Trial
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_spoilt_files_are_read_or_refused_in_one_line(name: str, tmp_path: Path) -> None:
+    trial = Trial(TARGETS[name], tmp_path)
+    assert trial.verdict(trial.good).outcome == "value"
+    outcomes: list[str] = []
+
+    @settings(
+        max_examples=trial.target.examples, derandomize=True, database=None,
+        phases=[Phase.generate], suppress_health_check=list(HealthCheck),
+    )  # fmt: skip
+    @given(st.randoms(use_true_random=False))
+    def attempt(rng: Random) -> None:
+        data = mutate(trial.good, trial.target.syntax, rng)
+        verdict = trial.verdict(data)
+        outcomes.append(verdict.outcome)
+        assert verdict.outcome != "fault", f"{verdict.told}\n{verdict.trace}\n{data[:2000]!r}"
+
+    attempt()
+    assert len(outcomes) >= trial.target.examples
+
+
+def test_target_names_are_of_one_target_each() -> None:
+    assert len(TARGETS) == sum(len(targets) for targets in GROUPS.values())
+
+
+@pytest.mark.parametrize("syntax", ["json", "toml", "csv", "text", "binary"])
+def test_mutations_spoil_and_repeat(syntax: str) -> None:
+    good = json.dumps({"a": [1.5, {"b": "c"}], "d": None}).encode() + b"\nx = 1, 2\n" * 20
+    first = [mutate(good, syntax, _random(seed)) for seed in range(200)]  # type: ignore[arg-type]
+    again = [mutate(good, syntax, _random(seed)) for seed in range(200)]  # type: ignore[arg-type]
+    assert first == again
+    assert len(set(first)) > 120
+    assert max(map(len, first)) <= MOST_BYTES
+
+
+def _random(seed: int) -> Random:
+    return Random(seed)  # noqa: S311
+
+
+def _slow(_: Path) -> None:
+    while True:
+        pass
+
+
+def _greedy(_: Path) -> None:
+    assert b"x" * (300 << 20)
+
+
+def _leaking(path: Path) -> None:
+    (path.parent / "more").write_text("x")
+
+
+def _plain(path: Path) -> None:
+    raise KeyError(str(path))
+
+
+def _wordy(_: Path) -> None:
+    raise PlanError("two\nlines")
+
+
+@pytest.mark.parametrize(
+    ("read", "told"),
+    [
+        (_slow, "took over"), (_greedy, "MiB"), (_leaking, "wrote or changed in/more"),
+        (_plain, "KeyError"), (_wordy, "several lines"),
+    ],
+)  # fmt: skip
+def test_the_judge_sees_each_kind_of_fault(read: object, told: str, tmp_path: Path) -> None:
+    sandbox = Sandbox(tmp_path)
+    verdict = judge(
+        read,  # type: ignore[arg-type]
+        sandbox.inside / "file",
+        sandbox,
+        most_bytes=200 << 20,
+        longest_s=0.3,
+    )
+    assert verdict.outcome == "fault"
+    assert told in verdict.told
+
+
+def test_the_judge_takes_a_refusal_for_what_it_is(tmp_path: Path) -> None:
+    def read(path: Path) -> None:
+        raise WorkspaceError(f"{path}: no such file")
+
+    sandbox = Sandbox(tmp_path)
+    (sandbox.inside / "file").write_text("x")
+    assert judge(read, sandbox.inside / "file", sandbox).outcome == "refused"
+    assert judge(lambda path: path, sandbox.inside / "file", sandbox).outcome == "value"
