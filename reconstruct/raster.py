@@ -22,6 +22,7 @@ from rasterio.crs import CRS
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
+from alice_survey import progress
 from alice_survey.artefacts import atomic_path
 from alice_survey.contents import one_line
 from alice_survey.errors import WorkspaceError
@@ -137,6 +138,7 @@ def hillshade(height: Array, cell: float, exaggeration: float = 1.0) -> Array:
     return shade
 
 
+@progress.step("draw the surface")
 def preview_dem(dem: Path, picture: Path, longest_px: int = 1600) -> None:
     """Write a shaded, coloured picture of a DEM; what is unknown is white."""
     with opened_raster(dem) as raster:

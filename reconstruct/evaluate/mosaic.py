@@ -12,6 +12,7 @@ from rasterio.windows import Window
 from scipy.spatial.transform import RigidTransform
 from shapely.geometry import MultiPolygon, box
 
+from alice_survey import progress
 from alice_survey.frames import Array
 from alice_survey.seafloor.terrain import Terrain
 from alice_survey.seafloor.texture import Texture
@@ -58,6 +59,7 @@ class MosaicScore:
         return figures
 
 
+@progress.step("score the mosaic")
 def score_mosaic(
     mosaic: Path,
     dem: Path,

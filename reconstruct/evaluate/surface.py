@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 from shapely.geometry import MultiPolygon
 
+from alice_survey import progress
 from alice_survey.frames import Array
 from alice_survey.seafloor.terrain import Terrain
 from reconstruct.evaluate.figures import (
@@ -129,6 +130,7 @@ def _spread(name: str, values_mm: Array) -> dict[str, Any]:
     }
 
 
+@progress.step("score the surface")
 def score_surface(
     dem: Path,
     area: MultiPolygon,

@@ -20,6 +20,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from alice_survey import progress
 from alice_survey.artefacts import read_json, write_json
 from alice_survey.contents import taken_from
 from alice_survey.frames import Array
@@ -176,6 +177,7 @@ def joined_samples(parts: Sequence[LightSamples]) -> LightSamples:
     )
 
 
+@progress.step("solve the light of all pictures")
 def solve_light(
     samples: LightSamples, nodes: Array, images: Sequence[str], cameras: Sequence[str]
 ) -> LightModel:

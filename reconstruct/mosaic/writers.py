@@ -10,6 +10,7 @@ import rasterio.shutil
 from numpy.typing import NDArray
 from rasterio.windows import Window
 
+from alice_survey import progress
 from alice_survey.errors import ReconstructionError
 from reconstruct.dense.dem import DemGrid
 from reconstruct.model import WorldFrame
@@ -102,6 +103,7 @@ def _profile(grid: DemGrid, frame: WorldFrame) -> dict[str, object]:
     }
 
 
+@progress.step("write the mosaic with overviews")
 def cloud_optimised(rough: Path, final: Path, threads: int) -> None:
     """Copy a GeoTIFF with overviews in the layout of a COG."""
     rasterio.shutil.copy(
@@ -118,6 +120,7 @@ def cloud_optimised(rough: Path, final: Path, threads: int) -> None:
     )
 
 
+@progress.step("draw the mosaic")
 def thumbnail(mosaic: Path, picture: Path) -> None:
     """Write a small copy, unknown pixels transparent."""
     with opened_raster(mosaic) as raster:
