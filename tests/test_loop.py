@@ -42,7 +42,7 @@ FOLDERS = (*LOOP[:5], "mapping", *LOOP[5:])
 def start(workspace: Path, threads: int) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", "alice_survey", "run", "-w", str(workspace)]
     return subprocess.Popen(
-        [*command, "--threads", str(threads)],
+        [*command, "--threads", str(threads), "--events", str(workspace.with_suffix(".jsonl"))],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
@@ -63,10 +63,11 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def results(workspace: Path) -> dict[str, bytes]:
-    """Every file of the finished stages but times and SQLite files."""
+    """Every file of the finished stages but SQLite files, and those that tell how long it took."""
     return {
         str(path.relative_to(workspace)): path.read_bytes()
         for stage in FOLDERS
+        if stage != "report"
         for path in sorted((workspace / stage).rglob("*"))
         if path.is_file() and path.name != "stage.json" and path.suffix != ".db"
     }
@@ -82,6 +83,35 @@ def test_the_small_survey_is_reconstructed(undisturbed: Path) -> None:
     assert score["mosaic"]["coverage"] > 0.9
     assert score["mosaic"]["position_median_mm"] < 8
     assert score["overlaps"]["forward_mean"] == pytest.approx(0.6, abs=0.06)
+
+
+def test_every_stage_is_told_of(undisturbed: Path) -> None:
+    lines = undisturbed.with_suffix(".jsonl").read_text().splitlines()
+    told = [json.loads(line) for line in lines]
+    run = told[: 1 + next(i for i, event in enumerate(told) if event["event"] == "run_finished")]
+    assert run[0]["event"] == "run_started"
+    assert run[-1]["exit_code"] == 0
+    for name in ("stage_started", "stage_finished"):
+        assert [e["stage"] for e in run if e["event"] == name] == list(FOLDERS)
+    titles = [e["message"] for e in run if e["event"] == "stage_started"]
+    assert titles[5:7] == [f"sparse (6 of {len(LOOP)}): mapping", f"sparse (6 of {len(LOOP)})"]
+    for event in run:
+        if event["event"] == "stage_finished":
+            record = json.loads((undisturbed / event["stage"] / "stage.json").read_text())
+            assert {key: record[key] for key in ("took_s", "cpu_s", "peak_mib")} == {
+                key: event[key] for key in ("took_s", "cpu_s", "peak_mib")
+            }
+            assert 50 < record["peak_mib"] < 8000
+            assert 0.02 * record["took_s"] < record["cpu_s"] < 50 * record["took_s"]
+            assert record["versions"]["pycolmap"]
+    begun = {e["step_number"]: e for e in run if e["event"] == "step_started"}
+    ended = {e["step_number"]: e for e in run if e["event"] == "step_finished"}
+    assert begun.keys() == ended.keys()
+    assert len(begun) > 20
+    for number, event in ended.items():
+        assert event["complete"]
+        assert event["step"] == begun[number]["step"]
+        assert event.get("done", 0) <= event.get("total", event.get("done", 0))
 
 
 def test_truth_is_not_read_by_reconstruct(undisturbed: Path, tmp_path: Path) -> None:
