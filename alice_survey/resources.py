@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 _EVERY_S = 1.0
+_TOLD_EVERY_S = 5.0
 _PACKAGES = {
     "alice-survey": "alice-survey",
     "numpy": "numpy",
@@ -83,13 +84,12 @@ class Meter:
 
 
 @contextlib.contextmanager
-def watched(meter: Meter, told: Callable[[Spent], None], every_s: float = 5.0) -> Iterator[None]:
-    """Look at a meter about once a second from a thread of its own, and tell now and then.
+def watched(meter: Meter, told: Callable[[Spent], None]) -> Iterator[None]:
+    """Look at a meter about once a second from a thread of its own, and tell every few seconds.
 
     Args:
         meter: to look at.
         told: called from that thread.
-        every_s: between two calls of `told`.
     """
     stop = threading.Event()
 
@@ -98,7 +98,7 @@ def watched(meter: Meter, told: Callable[[Spent], None], every_s: float = 5.0) -
         while not stop.wait(_EVERY_S):
             spent = meter.look()
             since_s += _EVERY_S
-            if since_s >= every_s:
+            if since_s >= _TOLD_EVERY_S:
                 since_s = 0.0
                 told(spent)
 

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -109,6 +110,68 @@ def test_resumed_work_finds_what_it_left_only_under_the_same_digest(
         else:
             run_stage(tmp_path, attempt, work)
     assert seen == [False, True, False, True]
+
+
+def test_a_stage_records_what_it_took_outside_of_its_digest(tmp_path: Path) -> None:
+    def work(folder: Path) -> None:
+        block = bytearray(64 << 20)
+        started = time.process_time()
+        while time.process_time() - started < 0.2:
+            block[0] ^= 1
+
+    records = []
+    for name in ("one", "two"):
+        run_stage(tmp_path / name, stage([]), work if name == "one" else Work())
+        records.append(json.loads((tmp_path / name / "made" / "stage.json").read_text()))
+    one, two = records
+    assert one["digest"] == two["digest"]
+    assert 0.2 <= one["cpu_s"] < 5.0
+    assert one["took_s"] >= 0.2
+    assert 10 < one["peak_mib"] < 3000
+    assert one["versions"].keys() >= {"alice-survey", "numpy", "opencv", "pycolmap", "numba"}
+    assert "resumed" not in one
+
+
+def test_a_resumed_stage_counts_what_was_spent_before(
+    tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("alice_survey.resources._EVERY_S", 0.01)
+    monkeypatch.setattr("alice_survey.resources._TOLD_EVERY_S", 0.01)
+    spent = tmp_path / "made.partial" / ".spent"
+
+    def broken(folder: Path) -> None:
+        for _ in range(500):
+            if spent.exists():
+                break
+            time.sleep(0.01)
+        raise RuntimeError("broke")
+
+    with pytest.raises(RuntimeError):
+        run_stage(tmp_path, stage([source], resumes=True), broken)
+    before = json.loads(spent.read_text())
+    assert before["took_s"] > 0
+    spent.write_text(json.dumps({**before, "took_s": 1000.0, "cpu_s": 900.0, "peak_mib": 1e6}))
+    run_stage(tmp_path, stage([source], resumes=True), Work())
+    record = json.loads((tmp_path / "made" / "stage.json").read_text())
+    assert record["resumed"] is True
+    assert 1000.0 < record["took_s"] < 1100.0
+    assert 900.0 <= record["cpu_s"] < 1000.0
+    assert record["peak_mib"] == 1e6
+    assert [p.name for p in sorted((tmp_path / "made").iterdir())] == ["result.txt", "stage.json"]
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"took_s": "x"}', '{"took_s": 1}'])
+def test_a_record_of_what_was_spent_that_is_cut_does_no_harm(
+    text: str, tmp_path: Path, source: Path
+) -> None:
+    made = stage([source], resumes=True)
+    with pytest.raises(ZeroDivisionError):
+        run_stage(tmp_path, made, lambda folder: (folder / "a").write_text(str(1 // 0)) and None)
+    (tmp_path / "made.partial" / ".spent").write_text(text)
+    run_stage(tmp_path, made, Work())
+    record = json.loads((tmp_path / "made" / "stage.json").read_text())
+    assert record["resumed"] is True
+    assert record["took_s"] < 100
 
 
 KILLED = """

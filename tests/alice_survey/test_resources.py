@@ -1,0 +1,56 @@
+"""Processor time and memory of a process with all that it has started."""
+
+import os
+import subprocess
+import sys
+import time
+
+from alice_survey.resources import Meter, Spent, cpu_s, family_of, memory_mib_of, versions
+
+BUSY = """
+import sys, time
+block = bytearray(100 << 20)
+for i in range(0, len(block), 4096):
+    block[i] = 1
+started = time.process_time()
+while time.process_time() - started < 0.3:
+    pass
+print("ready", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_descendants_count_while_they_run_and_after_they_ended() -> None:
+    meter = Meter(time.monotonic)
+    child = subprocess.Popen(
+        [sys.executable, "-c", BUSY], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert child.stdout is not None
+    assert child.stdout.readline() == "ready\n"
+    assert child.pid in family_of(os.getpid())
+    during = meter.look()
+    assert 100 < memory_mib_of(child.pid) < 200
+    assert during.peak_mib > memory_mib_of(child.pid)
+    assert 0.3 <= during.cpu_s < 5
+    child.communicate()
+    assert child.pid not in family_of(os.getpid())
+    after = meter.look()
+    assert after.cpu_s >= during.cpu_s
+    assert after.peak_mib >= during.peak_mib
+    assert after.took_s > during.took_s
+    assert memory_mib_of(child.pid) == 0.0
+    assert cpu_s(child.pid) == 0.0
+
+
+def test_what_was_spent_twice_adds_up_but_for_memory() -> None:
+    both = Spent(took_s=1, cpu_s=2, peak_mib=30).after(Spent(took_s=4, cpu_s=5, peak_mib=6))
+    assert both == Spent(took_s=5, cpu_s=7, peak_mib=30)
+    assert Spent.from_json(both.to_json()) == both
+
+
+def test_versions_are_those_that_are_imported() -> None:
+    import numba
+    import numpy as np
+
+    assert versions()["numpy"] == np.__version__
+    assert versions()["numba"] == numba.__version__
