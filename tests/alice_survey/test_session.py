@@ -1,5 +1,6 @@
 """A run of the command line: its options, its files, and how it ends."""
 
+import contextlib
 import json
 import os
 import re
@@ -299,3 +300,54 @@ def test_a_killed_worker_is_told_in_one_line(tmp_path: Path) -> None:
 def _dies(item: int) -> int:
     os.kill(os.getpid(), signal.SIGKILL)
     return item
+
+
+BARS = """
+import time
+import typer
+from alice_survey import progress
+from alice_survey.cli_options import print_result, with_sessions
+from alice_survey.errors import warn
+
+app = typer.Typer()
+
+@app.command()
+def run() -> None:
+    with progress.part("sparse", 2, 5), progress.stage("mapping") as finish:
+        with progress.step("[features]", 10) as counter:
+            for _ in range(10):
+                time.sleep(0.05)
+                counter.advance()
+            warn("few [b]features[/b] in " + "a very long name " * 10)
+        with progress.step("solve"):
+            time.sleep(0.3)
+        finish(took_s=125.0, cpu_s=1.0, peak_mib=1.0)
+    print_result("the result", {}, as_json=False)
+
+with_sessions(app)
+app()
+"""
+
+
+def test_a_terminal_shows_bars_and_is_left_as_it_was(tmp_path: Path) -> None:
+    (tmp_path / "bars.py").write_text(BARS)
+    leader, follower = os.openpty()
+    run = subprocess.Popen(
+        [sys.executable, str(tmp_path / "bars.py")], stdout=subprocess.PIPE, stderr=follower,
+        env={**os.environ, "TERM": "xterm-256color", "COLUMNS": "100", "LINES": "30"},
+    )  # fmt: skip
+    os.close(follower)
+    shown = b""
+    with contextlib.suppress(OSError):  # what reading a terminal gives whose writer has ended
+        while part := os.read(leader, 65536):
+            shown += part
+    os.close(leader)
+    out, _ = run.communicate(timeout=20)
+    assert (run.returncode, out) == (0, b"the result\n")
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown.decode())
+    assert text.startswith("sparse (2 of 5): mapping")
+    assert re.search(r"\[features\] .* [1-9] of 10, \d s, about \d s left", text)
+    assert re.search(r"solve +0 s", text)
+    assert "warning: few [b]features[/b] in a very long name a very long name" in text
+    assert "mapping: done in 2 min 05 s" in text
+    assert shown.count(b"\x1b[?25l") == shown.count(b"\x1b[?25h") == 1  # the cursor is back
