@@ -19,8 +19,11 @@ class ShownStep(Protocol):
 
     label: str
     done: int
-    total: int | None
     counted: bool
+
+    @property
+    def total(self) -> int | None:
+        """How many items are expected; None where that is not known."""
 
     @property
     def elapsed_s(self) -> float:
@@ -238,7 +241,8 @@ def _bars() -> "Progress":
                 return Text(duration(task.elapsed or 0.0))
             count = ""
             if step.counted:
-                count = f"{step.done}, " if step.total is None else f"{step.done} of {step.total}, "
+                total = step.total
+                count = f"{step.done}, " if total is None else f"{step.done} of {total}, "
             left_s = step.remaining_s
             left = "" if left_s is None else f", about {duration(left_s)} left"
             return Text(f"{count}{duration(step.elapsed_s)}{left}")
@@ -248,9 +252,10 @@ def _bars() -> "Progress":
 
         def render(self, task: Task) -> Any:
             step: ShownStep | None = task.fields.get("step")
-            if step is None or step.total is None:
+            total = None if step is None else step.total
+            if step is None or total is None:
                 return Text("")
-            task.completed, task.total = min(step.done, step.total), step.total
+            task.completed, task.total = min(step.done, total), total
             return super().render(task)
 
     return Progress(

@@ -80,7 +80,7 @@ class Step:
     def __init__(
         self, label: str, number: int, total: int | None, width: int, clock: Clock
     ) -> None:
-        self.label, self.number, self.total = label, number, total
+        self.label, self.number, self.expected = label, number, total
         self.done = 0
         self.counted = total is not None
         self.told_s = self.started_s = clock()
@@ -94,6 +94,11 @@ class Step:
         self._remaining.note(self.done, self._clock())
 
     @property
+    def total(self) -> int | None:
+        """How many items are expected, as long as there are no more."""
+        return None if self.expected is None or self.done > self.expected else self.expected
+
+    @property
     def elapsed_s(self) -> float:
         """Since it began."""
         return self._clock() - self.started_s
@@ -101,9 +106,8 @@ class Step:
     @property
     def remaining_s(self) -> float | None:
         """How long it still takes; None where nothing can be said."""
-        if self.total is None or self.done > self.total:
-            return None
-        return self._remaining.left_s(self.total, self._clock())
+        total = self.total
+        return None if total is None else self._remaining.left_s(total, self._clock())
 
 
 class Counter:
@@ -118,7 +122,7 @@ class Counter:
 
     def expect(self, total: int) -> None:
         """So many will be done in all."""
-        self._step.total = total
+        self._step.expected = total
 
 
 class Run:

@@ -89,7 +89,9 @@ def simulate_plan(
     longest_s = longest_mission_s(plan)
     setup = mission_setup(plan, config, floor, longest_s, rng)
     ascent_s = plan.seafloor_depth_m / _CLIMB_MPS
-    flown = simulate(setup, rng, longest_s=longest_s + ascent_s, label=label)
+    flown = simulate(
+        setup, rng, longest_s=longest_s + ascent_s, label=label, expected_s=plan.duration_s
+    )
     return flight_of(plan, config, setup, flown)
 
 

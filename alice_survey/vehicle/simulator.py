@@ -311,6 +311,7 @@ def simulate(
     *,
     longest_s: float,
     label: str,
+    expected_s: float | None = None,
     sea_rng: np.random.Generator | None = None,
 ) -> Flown:
     """Fly a mission to its end.
@@ -320,6 +321,7 @@ def simulate(
         rng: source of all noise.
         longest_s: the mission is broken off then.
         label: what the progress bar says; there is none if it is empty.
+        expected_s: how long the mission will take, for that bar.
         sea_rng: source of the gusts, six numbers a tick, so that vehicles can be flown in the same
             ones; `rng` if not given.
 
@@ -330,7 +332,7 @@ def simulate(
 
     tell_of_compiling(_fly_ticks, "the vehicle's model, once: this takes about a minute")
     chunks: list[Rows] = []
-    total = math.ceil(longest_s / TICK_S / _CHUNK_TICKS)
+    total = math.ceil((expected_s or longest_s) / TICK_S / _CHUNK_TICKS)
     flying = _chunks(setup, rng, sea_rng or rng, longest_s)
     for chunk in progress(flying, label, total) if label else flying:
         chunks.append(chunk)  # noqa: PERF402  the bar takes an iterator

@@ -161,6 +161,15 @@ def test_steps_are_told_of_in_order_with_their_counts(run: Run, kept: Kept, cloc
     assert moved[-1].remaining_s == pytest.approx(0.2 * (40 - (moved[-1].done or 0)), abs=0.3)
 
 
+def test_more_items_than_expected_leave_their_number_open(run: Run, kept: Kept) -> None:
+    with progress.step("fly", 2) as counter:
+        counter.advance(2)
+        assert run._steps[0].remaining_s == 0.0
+        counter.advance()
+        assert run._steps[0].remaining_s is None
+    assert (kept.events[-1].done, kept.events[-1].total) == (3, None)
+
+
 def test_items_are_passed_on_and_counted(run: Run, kept: Kept) -> None:
     assert list(progress.counted(iter("abc"), "letters", None, 1)) == ["a", "b", "c"]
     assert kept.events[-1].done == 3
