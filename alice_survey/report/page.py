@@ -191,7 +191,7 @@ def _figure(figure: Figure) -> str:
     )
     return (
         f'<figure><h3>{escape(figure.title)}</h3><img src="{_png_uri(figure.png)}" '
-        f'width="{width}" height="{height}" decoding="async" alt="{escape(figure.alt)}">'
+        f'width="{width}" height="{height}" alt="{escape(figure.alt)}">'
         f'<figcaption><dl class="reading">{reading}</dl></figcaption></figure>'
     )
 
@@ -270,7 +270,7 @@ def _mesh_view(mesh: Mesh) -> str:
         '<p class="hint">Drag to turn it, or use the arrow keys; two fingers or the right button '
         "move it. Click it, then turn the wheel to come nearer.</p></div>"
         f'<div class="still"><img src="{_png_uri(mesh.still)}" width="{width}" height="{height}" '
-        f'decoding="async" alt="{escape(mesh.alt)}"><p class="hint" id="mesh-note">'
+        f'alt="{escape(mesh.alt)}"><p class="hint" id="mesh-note">'
         "A still picture: the mesh turns in a browser that runs scripts and has WebGL.</p></div>"
         f"<p>{escape(mesh.about)}</p></div>"
     )
