@@ -26,7 +26,7 @@ def facts(figures: Figures) -> list[tuple[str, str]]:
     if figures.held.has("sparse"):
         rows.append(("pictures in the model", f"{figures.registered} of {figures.total}"))
         error = figures.held.json("sparse/registration.json")["mean_reprojection_px"]
-        rows.append(("reprojection error", f"{digits(error, 2)} px mean"))
+        rows.append(("reprojection error", f"{digits(error, 2)} px"))
     if surface is not None:
         rows.append(("area with a height", f"{digits(surface.area)} {unit}²"))
         rows.append(("DEM cell", length(surface.cell, unit)))
