@@ -178,7 +178,8 @@ def run(
         for number, stage in enumerate(stages, 1):
             with part(stage, number, len(stages)):
                 done = _work_of(stage)(workspace, config, threads or default_threads())
-            text, data = SUMMARIES[stage](workspace / stage)
+            with taken_from(workspace / stage):
+                text, data = SUMMARIES[stage](workspace / stage)
             found[stage] = {"done": done, **data}
             lines.append(f"{stage}: {text}" if done else f"{stage}: (up to date) {text}")
     return "\n".join(lines), found

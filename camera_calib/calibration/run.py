@@ -4,6 +4,7 @@ from pathlib import Path
 
 from alice_survey.artefacts import Stage, need_stage, read_json, run_stage
 from alice_survey.config import CameraConfig, SurveyConfig
+from alice_survey.contents import taken_from
 from alice_survey.errors import CalibrationError
 from alice_survey.manifest import read_manifest
 from camera_calib.calibration.calibrate import calibrate_through_ports
@@ -39,12 +40,13 @@ def run_calibrate(workspace: Path, config: SurveyConfig, threads: int) -> bool:
 
     def work(folder: Path) -> None:
         board = read_json(pool / "board.json")
-        target = Target(
-            kind="chessboard",
-            columns=board["columns"],
-            rows=board["rows"],
-            size_m=board["square_m"],
-        )
+        with taken_from(pool / "board.json"):
+            target = Target(
+                kind="chessboard",
+                columns=int(board["columns"]),
+                rows=int(board["rows"]),
+                size_m=float(board["square_m"]),
+            )
         found = detect_views(_pool_pictures(pool), target, threads)
         tell(found)
         start = design_rig(config.camera, config.water, _scale(found.sizes["left"], config.camera))

@@ -107,11 +107,10 @@ def _down_in_mapping(folder: Path, model: SparseModel, ids: NDArray[np.int64]) -
 
     None where the points of the mapping (with these ids) are not those of the placed model.
     """
-    import pycolmap
-
+    from reconstruct.model_files import read_reconstruction
     from reconstruct.sparse.alignment import align_similarity
 
-    mapped = pycolmap.Reconstruction(folder).points3D
+    mapped = read_reconstruction(folder).points3D
     if not 3 <= len(ids) == len(model.points_world) or any(int(i) not in mapped for i in ids):
         return None
     points = np.array([mapped[int(i)].xyz for i in ids])

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from alice_survey.artefacts import Stage, need_stage, run_stage, write_json
 from alice_survey.config import ReconstructConfig, SurveyConfig
+from alice_survey.contents import taken_from
 from alice_survey.errors import ReconstructionError, warn
 from alice_survey.executor import parallel_map
 from reconstruct.dense.cloud import laz_writer, voxel_edge, write_cloud_json, write_ply
@@ -91,9 +92,10 @@ def picture_files(workspace: Path, sparse: Path, model: SparseModel) -> list[Pat
     from alice_survey.artefacts import read_json
 
     images = workspace / "images"
-    about = read_json(sparse / "cameras.json")["images"]
     names = [view.image for view in model.views]
-    masks = [about[name]["mask"] for name in names if about[name].get("mask")]
+    with taken_from(sparse / "cameras.json"):
+        about = read_json(sparse / "cameras.json")["images"]
+        masks = [str(about[name]["mask"]) for name in names if about[name].get("mask")]
     return [images / name for name in [*names, *masks]]
 
 

@@ -10,6 +10,7 @@ from shapely.geometry import MultiPolygon
 
 from alice_survey import progress
 from alice_survey.artefacts import read_json
+from alice_survey.contents import taken_from
 from alice_survey.errors import WorkspaceError
 from alice_survey.frames import Array
 from alice_survey.seafloor.terrain import Terrain
@@ -28,7 +29,9 @@ def read_mesh(folder: Path) -> tuple[Array, Array]:
     """
     import open3d as o3d
 
-    offset = np.array(read_json(folder / "mesh.json")["offset_east_north_up"])
+    with taken_from(folder / "mesh.json"):
+        stated = read_json(folder / "mesh.json")["offset_east_north_up"]
+        offset = np.array([float(value) for value in stated]).reshape(3)
     mesh = o3d.io.read_triangle_mesh(str(folder / "mesh.ply"))
     if not len(mesh.triangles):
         raise WorkspaceError(f"{folder / 'mesh.ply'}: holds no triangles")

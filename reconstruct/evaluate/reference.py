@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey import progress
 from alice_survey.artefacts import need_stage, read_json, write_json
+from alice_survey.contents import taken_from
 from alice_survey.errors import WorkspaceError
 from alice_survey.frames import Array
 from reconstruct.evaluate.cloud_files import read_own_cloud, read_reference
@@ -149,7 +150,8 @@ def evaluate_reference(
             f"{workspace} is not georeferenced: a reference is compared where the georeference "
             "puts it; give positions in the manifest or control points"
         )
-    source = read_json(sparse / "registration.json")["scale_source"] or "no scale"
+    with taken_from(sparse / "registration.json"):
+        source = str(read_json(sparse / "registration.json")["scale_source"] or "no scale")
     if free_scale is None:
         free_scale = not model.frame.scaled or _NAVIGATION in source
     rng = np.random.default_rng(seed)

@@ -23,6 +23,7 @@ from alice_survey.artefacts import (
     write_json,
 )
 from alice_survey.config import SurveyConfig
+from alice_survey.contents import taken_from
 from alice_survey.errors import WorkspaceError
 from alice_survey.frames import Array
 from alice_survey.manifest import read_manifest
@@ -79,11 +80,10 @@ def run_evaluate(workspace: Path, config: SurveyConfig, threads: int) -> bool:
         terrain = read_terrain(truth / "terrain.ply")
         rig, poses = read_rig(truth / "rig.json"), read_true_poses(truth / "poses.csv")
         records = read_manifest(images / "manifest.csv")
-        cameras = score_cameras(
-            read_track_poses(sparse / "track.csv"),
-            truth / "poses.csv",
-            read_json(sparse / "registration.json")["total"],
-        )
+        with taken_from(sparse / "registration.json"):
+            total = int(read_json(sparse / "registration.json")["total"])
+        track = read_track_poses(sparse / "track.csv")
+        cameras = score_cameras(track, truth / "poses.csv", total)
         moved = cameras.truth_from_world
         pixel_m = ground_pixel_m(rig, {r.image: r.camera for r in records}, poses, terrain)
         counter = partial(

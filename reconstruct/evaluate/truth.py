@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.contents import taken_from
 from alice_survey.frames import Array
 from alice_survey.seafloor.terrain import Floats, Terrain
 from alice_survey.trajectory import read_columns
@@ -19,10 +20,10 @@ def read_true_poses(path: Path) -> dict[str, RigidTransform]:
     """`ned_from_cam` (entrance pupil) of every picture, from `poses.csv` of the truth."""
     columns = ("north_m", "east_m", "depth_m", "qx", "qy", "qz", "qw")
     values = np.column_stack(list(read_columns(path, columns).values()))
-    with path.open(newline="", encoding="utf-8") as file:
+    with taken_from(path), path.open(newline="", encoding="utf-8") as file:
         names = [row["image"] for row in csv.DictReader(file)]
-    poses = RigidTransform.from_components(values[:, :3], Rotation.from_quat(values[:, 3:]))
-    return {name: poses[i] for i, name in enumerate(names)}
+        poses = RigidTransform.from_components(values[:, :3], Rotation.from_quat(values[:, 3:]))
+        return {name: poses[i] for i, name in enumerate(names)}
 
 
 def surface_depth(terrain: Terrain, points_ne: Array) -> Array:

@@ -9,6 +9,7 @@ import numpy as np
 from alice_survey import progress
 from alice_survey.artefacts import Stage, need_stage, read_json, run_stage, write_json
 from alice_survey.config import ReconstructConfig, SurveyConfig
+from alice_survey.contents import taken_from
 from alice_survey.errors import warn
 from alice_survey.frames import Array
 from reconstruct.dense.run import picture_files
@@ -74,8 +75,10 @@ def build_mesh(
     dense = workspace / "dense"
     about = read_json(dense / "cloud.json")
     light = read_light(dense / "light.json")
-    offset = np.array(about["offset_east_north_up"])
-    step, pixel = float(about["thinned_to"]), ground_pixel(model)
+    with taken_from(dense / "cloud.json"):
+        offset = np.array([float(v) for v in about["offset_east_north_up"]]).reshape(3)
+        step = float(about["thinned_to"])
+    pixel = ground_pixel(model)
     views = [view for view in model.views if view.image in light.gains]
     cloud = open_cloud(dense / "cloud.ply")
     mesh = mesh_cloud(

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from rasterio.windows import Window
 
 from alice_survey.artefacts import atomic_path, need_stage, read_json, write_csv
+from alice_survey.contents import taken_from
 from alice_survey.errors import ConfigError
 from alice_survey.executor import progress
 
@@ -63,20 +64,22 @@ def mosaic_tiles(
     if not 0 <= overlap_px < side_px:
         raise ConfigError(f"overlap of {overlap_px} px: give 0 to {side_px - 1}, less than a side")
     mosaic = need_stage(workspace, "mosaic", "reconstruct")
-    about = read_json(mosaic / "mosaic.json")
+    with taken_from(mosaic / "mosaic.json"):
+        about = read_json(mosaic / "mosaic.json")
+        unit, pixel = str(about["unit"]), float(about["pixel"])
     folder.mkdir(parents=True, exist_ok=True)
     rows = []
     with rasterio.open(mosaic / "mosaic.tif") as raster:
         windows = list(_windows(raster.width, raster.height, side_px, overlap_px))
         for line, column, window in progress(windows, "tiles", len(windows)):
             name = f"tile_{line:03d}_{column:03d}.{kind}"
-            known = _write_tile(raster, window, folder / name, kind, scale_bar, about["unit"])
+            known = _write_tile(raster, window, folder / name, kind, scale_bar, unit)
             if known == 0:
                 continue
             t = raster.window_transform(window)
             rows.append(
                 (name, window.col_off, window.row_off, window.width, window.height, t.a,
-                 about["unit"], t.c, t.f, round(known / (window.width * window.height), 4),
+                 unit, t.c, t.f, round(known / (window.width * window.height), 4),
                  round(known * t.a**2, 6))
             )  # fmt: skip
     write_csv(folder / "tiles.csv", _HEADER, rows)
@@ -84,10 +87,10 @@ def mosaic_tiles(
         "folder": str(folder),
         "tiles": len(rows),
         "side_px": side_px,
-        "pixel": about["pixel"],
-        "unit": about["unit"],
+        "pixel": pixel,
+        "unit": unit,
     }
-    text = f"{len(rows)} tiles of up to {side_px} px, {about['pixel']} {about['unit']} a pixel"
+    text = f"{len(rows)} tiles of up to {side_px} px, {pixel} {unit} a pixel"
     return f"{text}, in {folder}", data
 
 

@@ -18,6 +18,7 @@ import rasterio
 
 from alice_survey.artefacts import Stage, need_stage, read_json, run_stage, write_json
 from alice_survey.config import SurveyConfig
+from alice_survey.contents import taken_from
 from alice_survey.executor import parallel_map
 from reconstruct.dense.dem import DemGrid, round_cell
 from reconstruct.dense.run import picture_files
@@ -270,8 +271,10 @@ def _dispersion(
 ) -> tuple[Water | None, dict[str, Any]]:
     """The water through which colours are told apart, or None, and what to say about it."""
     wanted = config.reconstruct.dispersion
-    cameras = read_json(workspace / "sparse" / "cameras.json")["cameras"]
-    ports = any(camera["kind"] == "flat_port" for camera in cameras.values())
+    path = workspace / "sparse" / "cameras.json"
+    with taken_from(path):
+        cameras = read_json(path)["cameras"]
+        ports = any(camera["kind"] == "flat_port" for camera in cameras.values())
     reason = ""
     if wanted == "off":
         reason = "switched off"
@@ -298,7 +301,9 @@ def _dispersion(
 
 
 def _simulated(workspace: Path) -> bool:
-    return bool(read_json(workspace / "images" / "survey.json").get("source") == "simulated")
+    path = workspace / "images" / "survey.json"
+    with taken_from(path):
+        return bool(read_json(path).get("source") == "simulated")
 
 
 def _or(value: float | None, default: float) -> float:

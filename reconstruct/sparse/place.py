@@ -12,6 +12,7 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey import progress
 from alice_survey.artefacts import read_json
 from alice_survey.config import ReconstructConfig
+from alice_survey.contents import taken_from
 from alice_survey.errors import ReconstructionError, WorkspaceError, warn
 from alice_survey.frames import Datum
 from alice_survey.manifest import ImageRecord
@@ -251,13 +252,17 @@ def _known_scale(workspace: Path, mapping: Mapping[str, Any]) -> _KnownScale | N
     if not path.is_file():
         return None
     scale = read_json(path)
+    with taken_from(path):
+        metres_per_unit = float(scale["metres_per_unit"])
+        if not 0 < metres_per_unit < float("inf"):
+            raise ValueError(f"metres_per_unit = {metres_per_unit}")
     if scale.get("gauge") != mapping["gauge"]:
         raise ReconstructionError(
             f"{path} measures an earlier model: remove it, run 'alice-survey reconstruct', and "
             "measure the known length again with 'alice-survey scale'"
         )
     return _KnownScale(
-        scale=float(scale["metres_per_unit"]),
+        scale=metres_per_unit,
         source="scaled by one known length",
         sigma=LENGTH_SCALE_SIGMA,
     )

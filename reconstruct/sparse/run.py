@@ -26,6 +26,7 @@ from reconstruct.mapping.mapper import model_baseline
 from reconstruct.mapping.run import Inputs, check_sizes, run_mapping
 from reconstruct.mapping.uncertainty import read_uncertainty
 from reconstruct.model import datum_of, write_frame
+from reconstruct.model_files import read_reconstruction
 from reconstruct.sparse.control_file import control_files
 from reconstruct.sparse.covariance import (
     PlaceCovariance,
@@ -124,8 +125,9 @@ def _place(
 ) -> None:
     mapping = read_json(workspace / "mapping" / "mapping.json")
     cameras = read_json(workspace / "mapping" / "cameras.json")
-    lenses = {name: lens_from_json(lens) for name, lens in cameras["cameras"].items()}
-    model = pycolmap.Reconstruction(workspace / "mapping" / "model")
+    with taken_from(workspace / "mapping" / "cameras.json"):
+        lenses = {name: lens_from_json(lens) for name, lens in cameras["cameras"].items()}
+    model = read_reconstruction(workspace / "mapping" / "model")
     of_name = {r.image: r for r in inputs.records}
     refined = workspace / "mapping" / "rig.json"  # where the settings ask for it
     rig = read_rig(refined) if refined.is_file() else inputs.rig

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.artefacts import need_stage, read_json, write_json
+from alice_survey.contents import taken_from
 from alice_survey.errors import ReconstructionError
 from alice_survey.frames import Array
 from reconstruct.model import SparseModel, View, read_model
@@ -47,7 +48,9 @@ def scale_model(workspace: Path, points: str, length_m: float) -> str:
         raise ReconstructionError(f"--length {length_m}: the true distance must be more than 0 m")
     sparse = need_stage(workspace, "sparse", "reconstruct")
     mapping = read_json(workspace / "mapping" / "mapping.json")
-    if mapping["scaled"]:
+    with taken_from(workspace / "mapping" / "mapping.json"):
+        scaled, gauge = bool(mapping["scaled"]), mapping["gauge"]
+    if scaled:
         raise ReconstructionError("the calibrated rig has scaled this model already")
     tokens = points.split()
     if len(tokens) != 2:
@@ -57,7 +60,9 @@ def scale_model(workspace: Path, points: str, length_m: float) -> str:
     model = read_model(sparse)
     pictures = Pictures.open(workspace)
     first, second = (find_point(token, model, pictures) for token in tokens)
-    world_per_unit = float(read_json(sparse / "registration.json")["world_per_mapping_unit"])
+    with taken_from(sparse / "registration.json"):
+        registration = read_json(sparse / "registration.json")
+        world_per_unit = float(registration["world_per_mapping_unit"])
     distance = float(np.linalg.norm(second - first))
     if not distance > 0:
         raise ReconstructionError(f"the two points are one and the same: {points!r}")
@@ -70,7 +75,7 @@ def scale_model(workspace: Path, points: str, length_m: float) -> str:
             "points": tokens,
             "length_m": length_m,
             "metres_per_unit": metres_per_unit,
-            "gauge": mapping["gauge"],
+            "gauge": gauge,
         },
     )
     return (

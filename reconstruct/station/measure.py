@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.artefacts import need_stage, read_json
+from alice_survey.contents import taken_from
 from alice_survey.errors import ReconstructionError, WorkspaceError
 from alice_survey.frames import Array
 from camera_calib.rig import Rig, read_rig
@@ -201,8 +202,14 @@ def _in_pair(
 ) -> Located:
     about = read_json(folder / "pair.json")
     rig = read_rig(folder / "rig.json")
-    lenses = [lens_from_json(lens) for lens in about["lenses"]]
-    first, second = lenses
+    with taken_from(folder / "pair.json"):
+        first, second = (lens_from_json(lens) for lens in about["lenses"])
+        if not 0.0 < float(about["scale"]) <= 1.0:
+            raise ValueError(f"scale = {about['scale']}")
+        inflation = float(about["inflation"])
+        left, pictures = str(about["left"]), [str(name) for name in about["pictures"]]
+        if any(Path(name).is_absolute() or ".." in Path(name).parts for name in pictures):
+            raise ValueError("pictures outside of its folder")
     if not isinstance(first, FlatPortLens) or not isinstance(second, FlatPortLens):
         raise WorkspaceError(f"{folder / 'pair.json'}: its lenses are not those of a rig")
     optics = Optics(rig=stereo_rig(rig), lenses=(first, second))
@@ -210,9 +217,9 @@ def _in_pair(
         if len(pick) > 1 or pick[0].image is not None:
             raise ReconstructionError("points of a pair are x,y in its left picture")
     taken = np.array([[p[0].x, p[0].y] for p in picks])
-    _check_inside(taken, first, about["left"])
+    _check_inside(taken, first, left)
     views = tuple(scaled_view(view, about["scale"]) for view in optics.views)
-    paths = tuple(folder / name for name in about["pictures"])
+    paths = tuple(folder / name for name in pictures)
     greys = pair_samplers(optics, (paths[0], paths[1]), (views[0], views[1]))
     depth_map = read_depth(folder)
     view = views[0]
@@ -229,7 +236,7 @@ def _in_pair(
             "hidden, or outside); pick another close by"
         )
     points = view.at_depth(pixels, found.depth)
-    sigma = found.sigma * about["inflation"]
+    sigma = found.sigma * inflation
     step = 1e-3 * found.depth
     along = (view.at_depth(pixels, found.depth + step) - points) / step[:, None]
     own = (sigma**2)[:, None, None] * along[:, :, None] * along[:, None, :]
