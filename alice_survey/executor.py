@@ -103,12 +103,12 @@ def _ended(pool: ProcessPoolExecutor) -> Iterator[ProcessPoolExecutor]:
 def _end(pool: ProcessPoolExecutor) -> None:
     """End a pool whatever it is doing.
 
-    What is queued is not cancelled one by one: the thread that tends the pool fails on items that
-    were, when it finds its processes gone.
+    Its processes are killed, since COLMAP's log answers a termination with a stack trace. What is
+    queued is not cancelled one by one: the thread that tends the pool fails on items that were,
+    when it finds its processes gone.
     """
-    processes = list((pool._processes or {}).values())
-    for process in processes:
-        process.terminate()
+    for process in list((pool._processes or {}).values()):
+        process.kill()
     pool.shutdown(cancel_futures=True)
 
 

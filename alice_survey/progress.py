@@ -120,10 +120,6 @@ class Counter:
         """So many more are done."""
         self._run.advance(self._step, items)
 
-    def expect(self, total: int) -> None:
-        """So many will be done in all."""
-        self._step.expected = total
-
 
 class Run:
     """What is going on, and who is told."""
