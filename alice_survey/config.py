@@ -16,7 +16,7 @@ from pydantic import (
     model_validator,
 )
 
-from alice_survey.contents import one_line
+from alice_survey.contents import one_line, shown
 from alice_survey.errors import ConfigError
 from alice_survey.seawater import GREEN_NM, n_water
 
@@ -326,6 +326,11 @@ class SurveyConfig(Config):
         return water.model_copy(update={"n_water": index})
 
 
+_LONGEST = 1_000_000
+_MOST_FAULTS = 8
+"""Told at once."""
+
+
 def load_config(path: Path) -> SurveyConfig:
     """Read `survey.toml`.
 
@@ -339,6 +344,10 @@ def load_config(path: Path) -> SurveyConfig:
         raise ConfigError(f"{path}: no such file; 'alice-survey init DIR' writes one") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read: {error}") from None
+    if len(text) > _LONGEST:
+        raise ConfigError(
+            f"{path}: {len(text) / 1e6:.1f} million characters: no settings file is that long"
+        )
     try:
         settings = tomllib.loads(text)
     # A number of thousands of digits is a ValueError.
@@ -430,8 +439,8 @@ def parse_health(texts: Sequence[str] | None) -> dict[str, float] | None:
 
 def _one_line(error: ValidationError) -> str:
     faults = []
-    for fault in error.errors():
-        key = ".".join(str(part) for part in fault["loc"]) or "settings"
+    for fault in error.errors()[:_MOST_FAULTS]:
+        key = shown(".".join(str(part) for part in fault["loc"])) or "settings"
         if fault["type"] == "extra_forbidden":
             faults.append(f"{key} is not a known setting{_nearest(fault['loc'])}")
         elif fault["type"] == "value_error":
@@ -440,7 +449,8 @@ def _one_line(error: ValidationError) -> str:
             faults.append(f"name = {_shown(fault['input'])}: use letters, digits, spaces, . _ -")
         else:
             faults.append(f"{key} = {_shown(fault['input'])}: {_requirement(fault)}")
-    return "; ".join(faults)
+    more = error.error_count() - len(faults)
+    return "; ".join(faults) + (f"; and {more} more" if more else "")
 
 
 def _shown(value: object) -> str:

@@ -82,7 +82,7 @@ def read_columns(
                 [_number(path, i, row, name, name in may_be_blank) for name in required]
                 for i, row in enumerate(reader, 2)
             ]
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise NavigationError(f"{path}: cannot be read: {why(error)}") from None
     values = np.asarray(table, dtype=np.float64).reshape(-1, len(required))
     return {name: values[:, i] for i, name in enumerate(required)}

@@ -238,6 +238,8 @@ def read_number_columns(path: Path) -> dict[str, Array]:
             raise VehicleError(f"{path} line {line}: {name} is {row[i]!r}, not a finite number")
         else:
             text.append(name)
+    if not columns:
+        raise VehicleError(f"{path}: holds no column of numbers")
     if text:
         warn(f"{path}: columns of text are left out: {', '.join(text)}")
     return columns

@@ -19,6 +19,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey import progress
 from alice_survey.errors import CalibrationError, warn
 from alice_survey.frames import Array
 from camera_calib.calibration.freedom import NO_PRIOR, Prior
@@ -55,6 +56,7 @@ class HeldOut:
     """Calibrated from every other view each; None where a half did not suffice."""
 
 
+@progress.step("hold views out")
 def hold_out(
     views: Sequence[TargetView], calibrate: Calibrate, locate: Locate, every: int = 5
 ) -> HeldOut | None:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.contents import one_line
 from alice_survey.errors import CalibrationError, warn
 from alice_survey.frames import Array
 from camera_calib.tank.interface import Reference
@@ -55,8 +56,8 @@ def read_reference(path: Path, unit: str = "cm") -> Reference:
         entries: Any = json.loads(bare)
         pixels = [[float(entry["camera"][axis]) for axis in "xy"] for entry in entries]
         points = [[float(entry["world"][axis]) for axis in "xyz"] for entry in entries]
-    except (ValueError, KeyError, TypeError) as error:
-        what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
+    except (ValueError, KeyError, TypeError, RecursionError, OverflowError) as error:
+        what = f"lacks {one_line(error)}" if isinstance(error, KeyError) else one_line(error)
         raise CalibrationError(
             f'{path}: {what}; a list of {{"camera": {{"x", "y"}}, "world": {{"x", "y", "z"}}}} '
             "is wanted"

@@ -14,13 +14,17 @@ import numpy as np
 import shapely
 from shapely.geometry import MultiPolygon
 
-from alice_survey.errors import PlanError, warn
+from alice_survey.contents import one_line
+from alice_survey.errors import PlanError, warn, why
 from alice_survey.frames import Array, Datum
 
 Sense = Literal["auto", "heights", "depths"]
 """Of a raster's values: heights are positive up, depths positive down."""
 _MOST_CELLS = 16_000_000
 """Read at once: 128 MB."""
+_LOOKED_AT = 4096
+_EMPTIEST = 5
+"""Cells a byte of a table of points: with some 10 bytes a row, one cell in 50 has a value."""
 _PAD_CELLS = 2
 _SAME_CELL = 1e-6
 """A place so near a centre, in cells, is on it."""
@@ -209,8 +213,10 @@ def read_bathymetry(
     from rasterio.errors import RasterioError
     from rasterio.windows import Window
 
+    _check_kind(path)
     try:
         with rasterio.open(path) as file:
+            _check_filled(path, file)
             if crs is None and file.crs is None:
                 raise PlanError(
                     f"{path}: names no coordinate system; give area.bathymetry_crs, as EPSG:32636"
@@ -221,8 +227,8 @@ def read_bathymetry(
             heights, reading = _sense(path, file, band, sense)
             scale, offset = file.scales[0], file.offsets[0]
             a, b, c, d, e, f = tuple(file.transform)[:6]
-    except (RasterioError, OSError) as error:
-        raise PlanError(f"{path}: cannot be read as a raster: {error}") from None
+    except (RasterioError, OSError, ValueError, MemoryError) as error:
+        raise PlanError(f"{path}: cannot be read as a raster: {one_line(error)}") from None
     values = np.ma.filled(band.astype(np.float64), np.nan) * scale + offset
     values[~np.isfinite(values)] = np.nan
     column, row, _, _ = window
@@ -238,6 +244,44 @@ def read_bathymetry(
         vertical_datum=vertical,
         reading=reading,
     )
+
+
+def _check_kind(path: Path) -> None:
+    """Refuse descriptions of rasters, such as VRT and WMS: GDAL would fetch what they name.
+
+    Raises:
+        PlanError: it is one, or cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            start = file.read(_LOOKED_AT).lstrip(b"\xef\xbb\xbf \t\r\n\0")
+    except OSError as error:
+        raise PlanError(f"{path}: cannot be read as a raster: {why(error)}") from None
+    if start[:1] in (b"<", b"{"):
+        raise PlanError(
+            f"{path}: is no raster but tells of other files: give those, or make one file of them "
+            "(gdal_translate)"
+        )
+
+
+def _check_filled(path: Path, file: Any) -> None:
+    """Refuse a raster that cannot be read in parts, or whose grid its points cannot fill.
+
+    Raises:
+        PlanError: with the size of a part, or of the grid.
+    """
+    rows, columns = file.block_shapes[0]
+    if rows * columns > 4 * _MOST_CELLS:
+        raise PlanError(
+            f"{path}: is stored in blocks of {columns} x {rows} cells, too large to read: store it "
+            "in tiles (gdal_translate -co TILED=YES)"
+        )
+    size = path.stat().st_size
+    if file.driver == "XYZ" and file.width * file.height > _EMPTIEST * size:
+        raise PlanError(
+            f"{path}: its points span {file.width} x {file.height} cells, far more than {size} "
+            "bytes can fill: a coordinate is wrong"
+        )
 
 
 def _snapped(share: Array) -> Array:

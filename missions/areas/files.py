@@ -32,6 +32,7 @@ from missions.areas.safe import (
 
 Role = Literal["survey", "no_go", "allowed"]
 _MOST_CORNERS = 200_000
+_DEEPEST = 20
 _SRID = re.compile(r"\s*SRID\s*=\s*(\d+)\s*;", re.IGNORECASE)
 _LAYER_SETTING = {"survey": "layer", "no_go": "no_go_layer", "allowed": "allowed_layer"}
 SUFFIXES = (".geojson", ".json", ".kml", ".kmz", ".gpkg", ".shp", ".zip", ".wkt", ".plan")
@@ -132,6 +133,8 @@ def read_wkt(origin: str, text: str, crs: str | None) -> RawShapes:
         if crs is not None and parse_crs(stated) != parse_crs(crs):
             raise PlanError(f"area: {origin}: it says SRID={match.group(1)} and crs is {crs}")
         crs = stated
+    if _depth(text) > _DEEPEST:
+        raise PlanError(f"area: {origin}: no well-known text: it nests over {_DEEPEST} brackets")
     try:
         with np.errstate(invalid="ignore"):  # NaN is told with its corner later
             geometry = shapely.from_wkt(text.strip())
@@ -144,6 +147,15 @@ def read_wkt(origin: str, text: str, crs: str | None) -> RawShapes:
     if crs is None or crs == LOCAL:
         return shapes
     return geographic_shapes(shapes, parse_crs(crs))
+
+
+def _depth(text: str) -> int:
+    """How many brackets are open at once; GEOS recurses for each, and ends the program."""
+    deepest = depth = 0
+    for bracket in re.findall(r"[()]", text):
+        depth += 1 if bracket == "(" else -1
+        deepest = max(deepest, depth)
+    return deepest
 
 
 def _closed_wkt(origin: str, text: str, reason: str) -> BaseGeometry:
@@ -184,6 +196,7 @@ def _layers(path: Path, suffix: str) -> list[_Layer]:
         check_start(path, b"\x00\x00\x27\x0a", "shapefile")
         return _linked_layers([path, *_sides(path)], "ESRI Shapefile")
     data = read_geojson(path)
+    _check_places(path.name, data)
     layers = _linked_layers([path], "GeoJSON")
     if data.get("crs") is not None:
         return layers
@@ -207,6 +220,25 @@ def _linked_layers(files: Sequence[Path], driver: str) -> list[_Layer]:
             if not link.exists():
                 link.symlink_to(file.resolve())
         return _gdal_layers(Path(folder) / (stem + files[0].suffix.lower()), files[0], driver)
+
+
+def _check_places(origin: str, data: object) -> None:
+    """Refuse too many corners before GDAL makes shapes of them.
+
+    Raises:
+        PlanError: with their number.
+    """
+    count, waiting = 0, [data]
+    while waiting:
+        one = waiting.pop()
+        if isinstance(one, dict):
+            waiting += one.values()
+        elif isinstance(one, list):
+            if one and isinstance(one[0], int | float):
+                count += 1
+            else:
+                waiting += one
+    _refuse_corners(origin, count)
 
 
 def _degrees(layer: _Layer) -> bool:
@@ -274,10 +306,13 @@ def _shapes(wkb: Sequence[bytes | None], file: str, *, several: bool, layer: str
 
 
 def _check_count(shapes: RawShapes) -> None:
-    count = len(shapes.coordinates)
+    _refuse_corners(shapes.origin, len(shapes.coordinates))
+
+
+def _refuse_corners(origin: str, count: int) -> None:
     if count > _MOST_CORNERS:
         raise PlanError(
-            f"area: {shapes.origin}: {count} corners; at most {_MOST_CORNERS}: simplify it, or cut "
+            f"area: {origin}: {count} corners; at most {_MOST_CORNERS}: simplify it, or cut "
             "out the part to survey"
         )
 
@@ -315,8 +350,14 @@ def _choose(path: Path, layers: list[_Layer], layer: str | None, role: Role) -> 
 def _placed(path: Path, layer: _Layer, crs: str | None, role: Role) -> RawShapes:
     """The shapes of a layer in WGS 84, by the file's own system or, without one, by `crs`."""
     from pyproj import CRS
+    from pyproj.exceptions import CRSError
 
-    own = None if layer.crs is None else CRS.from_user_input(layer.crs)
+    try:
+        own = None if layer.crs is None else CRS.from_user_input(layer.crs)
+    except CRSError as error:
+        raise PlanError(
+            f"area: {path}: its coordinate system cannot be read: {one_line(error)}"
+        ) from None
     if crs == LOCAL and (own is None or not _is_map(own)):
         return layer.shapes
     if own is None or (crs is not None and not _is_map(own)):

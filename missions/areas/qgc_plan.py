@@ -19,6 +19,7 @@ from missions.areas.safe import read_json
 
 LAYERS = ("mission", "inclusion", "exclusion")
 _CIRCLE_CORNERS = 64
+_LARGEST_M = 1e6
 
 
 def read_qgc_plan(
@@ -138,7 +139,7 @@ def _corners(value: Any, origin: str, name: str) -> Array:
     """(N, 2) latitudes and longitudes."""
     try:
         corners = np.array([[float(lat), float(lon)] for lat, lon, *_ in value])
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise _broken(origin, name) from None
     corners = corners.reshape(-1, 2)
     check_finite(corners, origin, name)
@@ -147,8 +148,8 @@ def _corners(value: Any, origin: str, name: str) -> Array:
 
 
 def _number(value: Any, origin: str, name: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
-        raise PlanError(f"area: {origin}: {name} is {value!r}; it must be above 0")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < _LARGEST_M:
+        raise PlanError(f"area: {origin}: {name} is {value!r:.60}; it must be above 0")
     return float(value)
 
 

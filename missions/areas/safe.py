@@ -3,6 +3,7 @@
 import contextlib
 import json
 import lzma
+import struct
 import tempfile
 import zipfile
 import zlib
@@ -72,7 +73,7 @@ def read_json(path: Path) -> Any:
         return json.loads(read_bytes(path), parse_constant=no_number)
     except json.JSONDecodeError as error:
         raise PlanError(f"area: {path}: no JSON, line {error.lineno}: {error.msg}") from None
-    except (UnicodeDecodeError, RecursionError):
+    except (ValueError, RecursionError):  # no text, or a number of thousands of digits
         raise PlanError(f"area: {path}: no JSON that can be read") from None
 
 
@@ -124,7 +125,7 @@ def check_kml(content: bytes, origin: str) -> None:
     parser.StartDoctypeDeclHandler = doctype
     try:
         parser.Parse(content, True)
-    except expat.ExpatError as error:
+    except (expat.ExpatError, LookupError, ValueError) as error:  # an encoding unknown to Python
         raise PlanError(f"area: {origin}: no KML, {error}") from None
     if roots[0].rpartition(":")[2] != "kml":
         raise PlanError(f"area: {origin}: no KML: its first element is {roots[0]!r}")
@@ -186,7 +187,7 @@ def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
     check_file(path)
     try:
         archive = zipfile.ZipFile(path)
-    except (zipfile.BadZipFile, OSError):
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
         raise PlanError(f"area: {path}: no zip archive, or a broken one") from None
     with archive:
         members = archive.infolist()
@@ -203,7 +204,10 @@ def _member(archive: zipfile.ZipFile, name: str, path: Path) -> bytes:
     """A file of an archive; no more than the size it states, which was checked."""
     try:
         return archive.read(name)
-    except (zipfile.BadZipFile, zlib.error, lzma.LZMAError, OSError, EOFError, RuntimeError):
+    except (
+        zipfile.BadZipFile, zlib.error, lzma.LZMAError, OSError, EOFError, RuntimeError, ValueError,
+        KeyError, struct.error, MemoryError,
+    ):  # fmt: skip
         raise PlanError(
             f"area: {path}: {name!r} in it is broken, encrypted or packed in an unknown way"
         ) from None

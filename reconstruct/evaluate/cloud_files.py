@@ -20,6 +20,8 @@ from alice_survey.frames import Array, Datum
 from reconstruct.evaluate.ply_points import read_ply_points
 
 _MOST_POINTS = 2_000_000
+_LARGEST_BLOCK = 64_000_000
+"""Cells that are unpacked at once."""
 _LAS_HEADER = 375
 _COMPRESSED = 0x80
 """In the point format of a header (LASzip)."""
@@ -104,7 +106,12 @@ def _read_las(path: Path) -> tuple[Array, str | None]:
 def _read_tiff(path: Path) -> tuple[Array, str | None]:
     import rasterio
 
-    with rasterio.open(path) as source:
+    with rasterio.open(path, driver="GTiff") as source:
+        rows, columns = source.block_shapes[0]
+        if rows * columns > _LARGEST_BLOCK:
+            raise ValueError(
+                f"it is stored in blocks of {columns} x {rows} cells: store it in tiles"
+            )
         step = max(1, round(np.sqrt(source.height * source.width / _MOST_POINTS)))
         # The nearest cell: a mean would round off what is compared
         shape = (-(-source.height // step), -(-source.width // step))

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 _STYLE: dict[str, Any] = {"font.size": 9, "axes.titlesize": 10, "figure.dpi": 110}
 
 
+@progress.step("draw the track's errors")
 def plot_track(path: Path, plan_file: Path, cameras: "CameraScore") -> None:
     """Planned lines, camera positions coloured by error, and the error of each picture."""
     plan = read_plan(plan_file)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from alice_survey import progress
 from alice_survey.frames import Array
 from alice_survey.seafloor.terrain import Terrain
 from camera_calib.flat_port import FlatPortCamera
@@ -17,6 +18,7 @@ _CLEAR_M = 0.004
 """A ray to the camera starts so far above the surface that it does not hit its own facet."""
 
 
+@progress.step("measure a pixel on the ground")
 def ground_pixel_m(rig: Rig, cameras: Mapping[str, str], poses: Mapping[str, RigidTransform],
                    terrain: Terrain) -> float:  # fmt: skip
     """Median side of a pixel on the true sea floor below the cameras.

@@ -133,7 +133,7 @@ def _check_whole(path: Path) -> None:
         with warnings.catch_warnings(), Image.open(path) as image:
             warnings.simplefilter("ignore")
             image.load()
-    except PILLOW_FAULTS as error:
+    except (*PILLOW_FAULTS, Image.DecompressionBombError) as error:
         raise ImageError(f"corrupt: {one_line(error)}".replace(str(path), path.name)) from None
 
 
@@ -164,7 +164,7 @@ def _with_exif(facts: PictureFacts) -> PictureFacts:
             warnings.simplefilter("ignore")
             exif = image.getexif()
             details, gps = exif.get_ifd(_EXIF), exif.get_ifd(_GPS)
-    except PILLOW_FAULTS:
+    except (*PILLOW_FAULTS, Image.DecompressionBombError):
         return facts  # a RAW format that Pillow does not know, or broken tags: pixels suffice
     return replace(
         facts,
@@ -232,7 +232,7 @@ def exif_focal_px(path: Path, width_px: int, height_px: int) -> float:
         with warnings.catch_warnings(), Image.open(path) as image:
             warnings.simplefilter("ignore")
             stated = _number(image.getexif().get_ifd(_EXIF).get(_FOCAL_35))
-    except PILLOW_FAULTS:
+    except (*PILLOW_FAULTS, Image.DecompressionBombError):
         return float("nan")
     if stated is None or not 5 <= stated <= 1000:
         return float("nan")

@@ -244,7 +244,7 @@ def _rows(path: Path, needed: set[str]) -> Sequence[tuple[int, dict[str, str]]]:
                 (line, {k: (v or "").strip() for k, v in row.items() if isinstance(k, str)})
                 for line, row in enumerate(reader, 2)
             ]
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise WorkspaceError(f"{path}: cannot be read: {error}") from None
 
 

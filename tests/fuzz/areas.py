@@ -107,12 +107,12 @@ def _kmz(folder: Path) -> None:
         archive.writestr("files/readme.txt", "x" * 50)
 
 
-def _shapefile(folder: Path) -> None:
+def build_shapefile(folder: Path) -> None:
     _by_gdal(folder, "a.shp", "ESRI Shapefile")
 
 
 def _zip(folder: Path) -> None:
-    _shapefile(folder)
+    build_shapefile(folder)
     with zipfile.ZipFile(folder / "a.zip", "w") as archive:
         for side in (".shp", ".shx", ".dbf", ".prj"):
             archive.write(folder / f"a{side}", f"site/a{side}")
@@ -184,10 +184,11 @@ TARGETS = (
     _target("WKT", "a.wkt", _of_text("a.wkt", _wkt), syntax="text"),
     _target("QGC plan", "a.plan", _of_text("a.plan", qgc_plan), syntax="json", native=False),
     _target("GeoPackage", "a.gpkg", _geopackage),
-    _target("shapefile", "a.shp", _shapefile),
+    _target("shapefile", "a.shp", build_shapefile),
     *(
         _target(
-            f"shapefile's {side}", f"a{side}", _shapefile, read=partial(read_area, ending=".shp")
+            f"shapefile's {side}", f"a{side}", build_shapefile,
+            read=partial(read_area, ending=".shp"),
         )
         for side in (".shx", ".dbf", ".prj")
     ),

@@ -43,7 +43,7 @@ def _write(name: str, file: str, rig: Callable[[], Rig]) -> Callable[[Path], Non
     return build
 
 
-def _read_calibration(path: Path) -> object:
+def read_calibration(path: Path) -> object:
     """As `camera convert` and `calibrate --from`: of whatever format it looks like."""
     from camera_calib.formats.registry import detect
     from camera_calib.formats.rigs import Reading
@@ -52,7 +52,7 @@ def _read_calibration(path: Path) -> object:
 
 
 def _read_folder(path: Path) -> object:
-    return _read_calibration(path.parent)
+    return read_calibration(path.parent)
 
 
 def _rig_json(folder: Path) -> None:
@@ -61,7 +61,7 @@ def _rig_json(folder: Path) -> None:
     write_rig(folder / "rig.json", small_rig())
 
 
-def _read_rig(path: Path) -> object:
+def read_rig(path: Path) -> object:
     from camera_calib.rig import read_rig
 
     return read_rig(path)
@@ -73,7 +73,7 @@ def _board(folder: Path) -> None:
     write_target(folder / "board.json", parse_target("charuco 12x9 40mm 30mm"))
 
 
-def _read_board(path: Path) -> object:
+def read_board(path: Path) -> object:
     from camera_calib.targets.target import read_target
 
     return read_target(path).points
@@ -87,7 +87,7 @@ def _tank_points(folder: Path) -> None:
     (folder / "cam1_references.json").write_text("// points\n" + json.dumps(rows))
 
 
-def _read_tank_points(path: Path) -> object:
+def read_tank_points(path: Path) -> object:
     from camera_calib.tank.files import read_reference
 
     return read_reference(path, "cm")
@@ -98,7 +98,7 @@ def _tank_rows(folder: Path) -> None:
     (folder / "d.csv").write_text("\n".join([",cam,frame,id,x,y", *rows]) + "\n")
 
 
-def _read_tank_rows(path: Path) -> object:
+def read_tank_rows(path: Path) -> object:
     from camera_calib.tank.files import read_detections
 
     return read_detections(path, ("cam1", "cam2"))
@@ -184,7 +184,7 @@ def read_picture(path: Path) -> object:
     return facts, bits_used(facts.highest), exif_focal_px(path, 48, 32)
 
 
-def _read_for_matching(path: Path) -> object:
+def read_for_matching(path: Path) -> object:
     from missions.imaging.gain import read_linear
     from reconstruct.pictures.normalise import finely, read_deep
     from reconstruct.pictures.undistorted import read_colour
@@ -192,26 +192,26 @@ def _read_for_matching(path: Path) -> object:
     return finely(read_deep(path)), read_colour(path), read_linear(path, linear=False)
 
 
-def _read_mask(path: Path) -> object:
+def read_mask(path: Path) -> object:
     from reconstruct.pictures.undistorted import read_mask
 
     return read_mask(path, _SIZE)
 
 
-def _look_for_board(path: Path) -> object:
+def look_for_board(path: Path) -> object:
     """As `calibrate` does with each picture."""
     from camera_calib.calibration.detect_views import detect_views
     from camera_calib.calibration.picture_sets import PictureSet
     from camera_calib.targets.target import parse_target
 
-    sets = [PictureSet(name="v", paths={"left": path})]
+    sets = [PictureSet(name="v", paths={path.name: path})]
     return detect_views(sets, parse_target("chessboard 9x6 25mm"), 1)
 
 
 def _calibration(
     name: str, syntax: str, file: str, build: Callable[[Path], None], **more: Any
 ) -> Target:
-    read = more.get("read", _read_calibration)
+    read = more.get("read", read_calibration)
     return Target(name=name, syntax=syntax, file=file, build=build, read=read)  # type: ignore[arg-type]
 
 
@@ -221,7 +221,7 @@ def _image(name: str, file: str, build: Callable[[Path], None], **more: Any) -> 
 
 
 TARGETS = (
-    _calibration("rig.json", "json", "rig.json", _rig_json, read=_read_rig),
+    _calibration("rig.json", "json", "rig.json", _rig_json, read=read_rig),
     _calibration("OpenCV YAML", "text", "a.yaml", _write("opencv", "a.yaml", _in_air)),
     _calibration("OpenCV XML", "text", "a.xml", _write("opencv", "a.xml", _in_air)),
     _calibration("Kalibr camchain", "text", "a.yaml", _write("kalibr", "a.yaml", _in_air)),
@@ -249,11 +249,11 @@ TARGETS = (
         "FLATPORT cameras.bin", "binary", "m/cameras.bin",
         _write("flatport", "m/cameras.bin", small_rig), read=_read_folder,
     ),
-    _calibration("target JSON", "json", "board.json", _board, read=_read_board),
+    _calibration("target JSON", "json", "board.json", _board, read=read_board),
     _calibration(
-        "tank points", "json", "cam1_references.json", _tank_points, read=_read_tank_points
+        "tank points", "json", "cam1_references.json", _tank_points, read=read_tank_points
     ),
-    _calibration("tank detections", "csv", "d.csv", _tank_rows, read=_read_tank_rows),
+    _calibration("tank detections", "csv", "d.csv", _tank_rows, read=read_tank_rows),
     _image("JPEG", "a.jpg", partial(_picture, name="a.jpg", mode="RGB")),
     _image("JPEG, CMYK", "a.jpg", partial(_picture, name="a.jpg", mode="CMYK")),
     _image("PNG, 8 bits", "a.png", partial(_picture, name="a.png", mode="RGBA")),
@@ -268,11 +268,11 @@ TARGETS = (
     _image("DNG", "a.dng", dng),
     _image(
         "picture to match, JPEG", "a.jpg", partial(_picture, name="a.jpg", mode="RGB"),
-        read=_read_for_matching,
+        read=read_for_matching,
     ),
     _image(
-        "picture to match, PNG", "a.png", partial(_deep, name="a.png"), read=_read_for_matching
+        "picture to match, PNG", "a.png", partial(_deep, name="a.png"), read=read_for_matching
     ),
-    _image("mask", "a.png", partial(_picture, name="a.png", mode="L"), read=_read_mask),
-    _image("picture of a board", "a.png", _chessboard, read=_look_for_board, examples=2),
+    _image("mask", "a.png", partial(_picture, name="a.png", mode="L"), read=read_mask),
+    _image("picture of a board", "a.png", _chessboard, read=look_for_board, examples=2),
 )  # fmt: skip

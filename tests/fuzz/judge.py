@@ -104,27 +104,22 @@ def judge(
     """Let a reader read a file of the sandbox, and judge what it did."""
     started, before = time.monotonic(), _resident()
     outcome: Literal["value", "refused", "fault"] = "value"
-    told = trace = ""
+    told = trace = place = ""
     try:
         with sandbox.entered(), _bounded(longest_s), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             read(path)
     except AliceError as error:
-        outcome, told = "refused", str(error)
+        outcome, told, place = "refused", str(error), _place(error)
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # a library in Rust that panics raises no Exception
         outcome = "fault"
         told, trace = _signature(error), "".join(traceback.format_exception(error))
     took_s, peak = time.monotonic() - started, max(0, _peak() - before)
-    if outcome == "refused" and "\n" in told:
-        outcome, told = "fault", f"message of several lines: {told.splitlines()[0][:80]}"
-    elif outcome == "refused" and len(told) > LONGEST_MESSAGE:
-        outcome, told = "fault", f"message of over {LONGEST_MESSAGE} characters: {told[:80]}"
-    elif outcome == "refused" and not sandbox.names & set(_NAME.findall(told)):
-        outcome, told = "fault", f"message that names no file: {told[:80]}"
-    elif outcome == "refused" and not told.isprintable():
-        outcome, told = "fault", f"message that cannot be printed: {told[:80]!a}"
+    fault = _misworded(told, sandbox) if outcome == "refused" else ""
+    if fault:
+        trace, outcome, told = told, "fault", f"{fault} in {place}"
     if outcome != "fault" and took_s > longest_s:
         outcome, told = "fault", f"took over {longest_s:g} s"
     if outcome != "fault" and peak > most_bytes:
@@ -158,16 +153,31 @@ def _bounded(longest_s: float) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
+def _misworded(told: str, sandbox: Sandbox) -> str:
+    """What is wrong with the wording of a refusal."""
+    if len(told.splitlines()) > 1 or "\x1b" in told:
+        return "message of several lines"
+    if len(told) > LONGEST_MESSAGE:
+        return f"message of over {LONGEST_MESSAGE} characters"
+    if not sandbox.names & set(_NAME.findall(told)):
+        return "message that names no file"
+    return ""
+
+
 def _signature(error: BaseException) -> str:
     """The exception's type and the last place in the project that it passed."""
     if isinstance(error, TooSlow):
         return str(error)
-    place = ""
+    return f"{type(error).__name__} in {_place(error)}"
+
+
+def _place(error: BaseException) -> str:
+    place = "a library"
     for frame in traceback.extract_tb(error.__traceback__):
         file = Path(frame.filename)
         if file.is_relative_to(_CHECKOUT) and file.relative_to(_CHECKOUT).parts[0] in _ROOMS:
             place = f"{file.relative_to(_CHECKOUT)}:{frame.lineno} {frame.name}"
-    return f"{type(error).__name__} in {place or 'a library'}"
+    return place
 
 
 def _address_space() -> int:

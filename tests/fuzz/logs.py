@@ -1,5 +1,6 @@
 """Logs of vehicles: what `import-log`, `import-images`, `fly`, `plan check` and `identify` read."""
 
+import struct
 from collections.abc import Callable
 from datetime import UTC
 from functools import partial
@@ -22,7 +23,8 @@ def read_any_log(path: Path) -> object:
     log = path.parent if path.parent.name == "bag" else path
     options = ImportOptions(lever_body_m=(0.1, 0.0, 0.2))
     dive = read_dive(log, options)
-    return navigation_table(dive, Corrections(lever_body_m=options.lever_body_m))
+    lever = options.lever_body_m if dive.attitude is not None else (0.0, 0.0, 0.0)
+    return navigation_table(dive, Corrections(lever_body_m=lever))
 
 
 def _bag(folder: Path, version: int, storage: str = "MCAP") -> None:
@@ -118,7 +120,7 @@ def read_nav(path: Path) -> object:
     return log.at(np.linspace(-5.0, 60.0, 40))
 
 
-def _read_triggers(path: Path) -> object:
+def read_triggers(path: Path) -> object:
     from missions.coverage.dives import read_triggers
     from missions.logs.navigation_csv import read_navigation
 
@@ -130,7 +132,7 @@ def _triggers(folder: Path) -> None:
     _write(folder / "t.csv", ["time_utc,line", *(f"2024-05-01T12:00:{i:02d}Z,0" for i in range(9))])
 
 
-def _check_dive(path: Path) -> object:
+def check_dive(path: Path) -> object:
     """As `plan check LOG`: the stations of a dive, for a plan."""
     from camera_calib.rig import design_rig
     from missions.coverage.dives import read_dive_record
@@ -145,7 +147,7 @@ def _check_log(folder: Path) -> None:
     _write(folder / "d.csv", rows)
 
 
-def _read_tide(path: Path) -> object:
+def read_tide(path: Path) -> object:
     from missions.logs.corrections import read_tide
 
     return read_tide(str(path), dated=True)
@@ -160,7 +162,7 @@ def _vehicle_rows() -> list[str]:
     return [names, *(f"{0.1 * i:.1f},{row}" for i in range(20))]
 
 
-def _read_vehicle_log(path: Path) -> object:
+def read_vehicle_log(path: Path) -> object:
     from alice_survey.vehicle.log import read_vehicle_log, segments
 
     return segments(read_vehicle_log(path))
@@ -181,13 +183,41 @@ def _column_map(folder: Path) -> None:
     )
 
 
-def _read_foreign(path: Path) -> object:
+def read_column_map(path: Path) -> object:
+    from alice_survey.vehicle.identification.foreign import read_column_map as read
+
+    return read(path)
+
+
+def swelling_mcap(packed: str, size: int) -> bytes:
+    """A log of one chunk that holds, or where it is not packed states, so many zeros."""
+    import lz4.frame
+    import zstandard
+
+    packers = {"zstd": zstandard.compress, "lz4": lz4.frame.compress}
+    content = packers[packed](bytes(size)) if packed else bytes(100)
+
+    def record(code: int, body: bytes) -> bytes:
+        return struct.pack("<BQ", code, len(body)) + body
+
+    def text(value: str) -> bytes:
+        return struct.pack("<I", len(value)) + value.encode()
+
+    head = record(1, text("ros2") + text("x"))
+    body = struct.pack("<QQQI", 0, 1, size, 0) + text(packed)
+    chunk = record(6, body + struct.pack("<Q", len(content)) + content)
+    end = record(15, struct.pack("<I", 0)) + record(2, struct.pack("<QQI", 0, 0, 0))
+    magic = b"\x89MCAP0\r\n"
+    return magic + head + chunk + end + magic
+
+
+def read_foreign(path: Path) -> object:
     from alice_survey.vehicle.identification.foreign import read_column_map, read_foreign_log
 
     return read_foreign_log(path.with_name("log.csv"), read_column_map(path.with_name("map.toml")))
 
 
-def _read_vehicle(path: Path) -> object:
+def read_vehicle(path: Path) -> object:
     from alice_survey.vehicle.identification.files import speeds_missing, vehicle_from_file
 
     return vehicle_from_file(path), speeds_missing(path)
@@ -211,7 +241,7 @@ def _coefficients() -> list[str]:
     return ["X_u = -4.0", "X_uu = -18.0", "Y_v = -6.0", "X_udot = -5.5", "N_r = -0.1"]
 
 
-def _read_coefficients(path: Path) -> object:
+def read_coefficients(path: Path) -> object:
     from alice_survey.vehicle.identification.files import coefficients_from_file
 
     return coefficients_from_file(path)
@@ -221,11 +251,10 @@ def _pulls() -> list[str]:
     return ["thruster,rpm,force_n", "stern,300,12.5", "stern,-300,-9", "stern,600,50"]
 
 
-def _read_pulls(path: Path) -> object:
-    from alice_survey.vehicle.fleet import vehicle
-    from alice_survey.vehicle.identification.bollard import fit_pulls, read_pulls
+def read_pulls(path: Path) -> object:
+    from alice_survey.vehicle.identification.bollard import read_pulls as read
 
-    return fit_pulls(read_pulls(path), vehicle("alice"))
+    return read(path)
 
 
 def _current() -> list[str]:
@@ -233,7 +262,7 @@ def _current() -> list[str]:
     return ["time_s,depth_m,north_mps,east_mps", *rows]
 
 
-def _read_current(path: Path) -> object:
+def read_current(path: Path) -> object:
     from alice_survey.vehicle.sea import read_current
 
     return read_current(path)
@@ -278,22 +307,22 @@ TARGETS = (
     Target(name="QGC CSV", syntax="csv", file="a.csv", build=_qgc, read=read_any_log),
     _csv("navigation CSV", "n.csv", partial(navigation_rows, dated=False), read_nav),
     _csv("navigation CSV, dated", "n.csv", partial(navigation_rows, dated=True), read_nav),
-    Target(name="triggers", syntax="csv", file="t.csv", build=_triggers, read=_read_triggers),
-    Target(name="log to check", syntax="csv", file="d.csv", build=_check_log, read=_check_dive),
-    _csv("tide", "tide.csv", _tide, _read_tide),
-    _csv("vehicle log", "v.csv", _vehicle_rows, _read_vehicle_log),
+    Target(name="triggers", syntax="csv", file="t.csv", build=_triggers, read=read_triggers),
+    Target(name="log to check", syntax="csv", file="d.csv", build=_check_log, read=check_dive),
+    _csv("tide", "tide.csv", _tide, read_tide),
+    _csv("vehicle log", "v.csv", _vehicle_rows, read_vehicle_log),
     Target(
-        name="column map", syntax="toml", file="map.toml", build=_column_map, read=_read_foreign
+        name="column map", syntax="toml", file="map.toml", build=_column_map, read=read_foreign
     ),
-    Target(name="foreign log", syntax="csv", file="log.csv", build=_column_map, read=_read_foreign),
-    Target(name="vehicle TOML", syntax="toml", file="v.toml", build=_vehicle, read=_read_vehicle),
+    Target(name="foreign log", syntax="csv", file="log.csv", build=_column_map, read=read_foreign),
+    Target(name="vehicle TOML", syntax="toml", file="v.toml", build=_vehicle, read=read_vehicle),
     Target(
-        name="vehicle JSON", syntax="json", file="v.json", build=_vehicle_json, read=_read_vehicle
+        name="vehicle JSON", syntax="json", file="v.json", build=_vehicle_json, read=read_vehicle
     ),
     Target(
         name="coefficients", syntax="toml", file="c.toml", build=_written("c.toml", _coefficients),
-        read=_read_coefficients,
+        read=read_coefficients,
     ),
-    _csv("bollard pull", "pull.csv", _pulls, _read_pulls),
-    _csv("current", "current.csv", _current, _read_current),
+    _csv("bollard pull", "pull.csv", _pulls, read_pulls),
+    _csv("current", "current.csv", _current, read_current),
 )  # fmt: skip

@@ -29,7 +29,7 @@ def _survey(folder: Path, name: str) -> None:
     (folder / "survey.toml").write_text(text, encoding="utf-8")
 
 
-def _read_survey(path: Path) -> object:
+def read_survey(path: Path) -> object:
     from alice_survey.config import load_config
 
     return load_config(path)
@@ -39,7 +39,7 @@ def _plan(folder: Path) -> None:
     (folder / "plan.json").write_text(json.dumps(small_plan().to_json()))
 
 
-def _read_plan(path: Path) -> object:
+def read_plan(path: Path) -> object:
     from missions.plan_file import read_plan
 
     return read_plan(path).to_json()
@@ -60,7 +60,7 @@ def _manifest(folder: Path) -> None:
     write_manifest(folder / "manifest.csv", records)
 
 
-def _read_manifest(path: Path) -> object:
+def read_manifest(path: Path) -> object:
     from alice_survey.manifest import read_manifest
 
     return read_manifest(path)
@@ -76,7 +76,7 @@ def _track(folder: Path) -> None:
     write_track(folder / "track.csv", Trajectory(time_s=np.arange(12.0), ned_from_body=poses))
 
 
-def _read_track(path: Path) -> object:
+def read_track(path: Path) -> object:
     from alice_survey.trajectory import read_track
 
     return read_track(path)
@@ -116,27 +116,27 @@ def sparse(folder: Path) -> None:
     (folder / "track.csv").write_text("\n".join([names, *rows]) + "\n")
 
 
-def _read_sparse(path: Path) -> object:
+def read_sparse(path: Path) -> object:
     """As every stage after the mapping begins."""
     from reconstruct.model import read_model
 
     return read_model(path.parents[1] if path.parent.name == "model" else path.parent)
 
 
-def _read_lenses(path: Path) -> object:
+def read_lenses(path: Path) -> object:
     from reconstruct.pictures.undistorted import Pictures
 
     pictures = Pictures.from_json(path.parent, path)
     return pictures.lens("left/000000.png").size_px
 
 
-def _read_poses(path: Path) -> object:
+def read_poses(path: Path) -> object:
     from reconstruct.sparse.track import read_track_poses
 
     return read_track_poses(path)
 
 
-def _uncertainty(folder: Path) -> None:
+def build_uncertainty(folder: Path) -> None:
     from reconstruct.mapping.uncertainty import Uncertainty, write_uncertainty
 
     found = Uncertainty(
@@ -147,10 +147,16 @@ def _uncertainty(folder: Path) -> None:
     write_uncertainty(folder / "covariance.npz", found)
 
 
-def _read_uncertainty(path: Path) -> object:
+def read_uncertainty(path: Path) -> object:
     from reconstruct.mapping.uncertainty import read_uncertainty
 
     return read_uncertainty(path)
+
+
+def read_frame(path: Path) -> object:
+    from reconstruct.model import read_frame as read
+
+    return read(path)
 
 
 def _json(name: str, value: Callable[[], Any]) -> Callable[[Path], None]:
@@ -166,7 +172,7 @@ def _survey_json() -> dict[str, Any]:
     return {"source": "imported", "datum": datum, "vertical_datum": "sea", "notes": ["x"]}
 
 
-def _read_inputs(path: Path) -> object:
+def read_inputs(path: Path) -> object:
     """As `reconstruct` begins: `images/` of a workspace."""
     from reconstruct.sparse.run import read_inputs
 
@@ -194,7 +200,7 @@ def _record(name: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _read_status(path: Path) -> object:
+def read_status(path: Path) -> object:
     """As `status` does, of a workspace of imported pictures."""
     from alice_survey.survey import workspace_status
 
@@ -209,7 +215,7 @@ def _mosaic_light() -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _read_light(path: Path) -> object:
+def read_light(path: Path) -> object:
     from reconstruct.mosaic.light import read_light
 
     return read_light(path)
@@ -228,7 +234,7 @@ def _control(folder: Path) -> None:
     (folder / "control.csv").write_text("\n".join(rows) + "\n")
 
 
-def _read_control(path: Path) -> object:
+def read_control(path: Path) -> object:
     from reconstruct.sparse.control_file import read_control
 
     control = read_control(path)
@@ -241,7 +247,7 @@ def _picks(folder: Path) -> None:
     (folder / "picks.csv").write_text("\n".join(["image,point,x,y,sigma_px", *rows]) + "\n")
 
 
-def _read_picks(path: Path) -> object:
+def read_picks(path: Path) -> object:
     from reconstruct.sparse.control_file import read_picks
 
     return read_picks(path)
@@ -264,7 +270,7 @@ def _own_cloud(folder: Path) -> None:
     write_ply(folder / "cloud.ply", [rows], (0.0, 0.0, 0.0), frame)
 
 
-def _read_own_cloud(path: Path) -> object:
+def read_own_cloud(path: Path) -> object:
     from reconstruct.mesh.cloud_file import open_cloud
 
     cloud = open_cloud(path)
@@ -278,7 +284,7 @@ def _reference_ply(folder: Path) -> None:
     (folder / "a.ply").write_text("\n".join([*head, *rows]) + "\n")
 
 
-def _reference_las(folder: Path, name: str) -> None:
+def build_las(folder: Path, name: str) -> None:
     import laspy
     from pyproj import CRS
 
@@ -303,7 +309,7 @@ def _reference_dem(folder: Path) -> None:
         file.write(height, 1)
 
 
-def _read_reference(path: Path) -> object:
+def read_reference(path: Path) -> object:
     from reconstruct.evaluate.cloud_files import read_reference
 
     return read_reference(path, _DATUM)
@@ -322,13 +328,13 @@ def _other_survey(folder: Path) -> None:
     _own_cloud(folder / "dense")
 
 
-def _read_other(path: Path) -> object:
+def read_other(path: Path) -> object:
     from reconstruct.evaluate.elevation import read_elevation
 
     return read_elevation(path.parents[1])
 
 
-def _read_other_cloud(path: Path) -> object:
+def read_other_cloud(path: Path) -> object:
     from reconstruct.evaluate.cloud_files import read_own_cloud
 
     return read_own_cloud(path.parents[1])
@@ -343,46 +349,46 @@ def _target(
 
 TARGETS = (
     _target(
-        "survey.toml", "toml", "survey.toml", partial(_survey, name="survey.toml"), _read_survey
+        "survey.toml", "toml", "survey.toml", partial(_survey, name="survey.toml"), read_survey
     ),
     _target(
-        "survey.toml, demo", "toml", "survey.toml", partial(_survey, name="demo.toml"), _read_survey
+        "survey.toml, demo", "toml", "survey.toml", partial(_survey, name="demo.toml"), read_survey
     ),
-    _target("plan.json", "json", "plan.json", _plan, _read_plan),
-    _target("manifest", "csv", "manifest.csv", _manifest, _read_manifest),
-    _target("track.csv of a flight", "csv", "track.csv", _track, _read_track),
+    _target("plan.json", "json", "plan.json", _plan, read_plan),
+    _target("manifest", "csv", "manifest.csv", _manifest, read_manifest),
+    _target("track.csv of a flight", "csv", "track.csv", _track, read_track),
     *(
         _target(
-            f"COLMAP model, {name}", "binary", f"model/{name}", sparse, _read_sparse, native=True
+            f"COLMAP model, {name}", "binary", f"model/{name}", sparse, read_sparse, native=True
         )
         for name in ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
     ),
-    _target("cameras.json", "json", "cameras.json", sparse, _read_sparse),
-    _target("cameras.json, lenses", "json", "cameras.json", sparse, _read_lenses),
-    _target("frame.json", "json", "frame.json", sparse, _read_sparse),
-    _target("track.csv of a model", "csv", "track.csv", sparse, _read_poses),
-    _target("covariance.npz", "binary", "covariance.npz", _uncertainty, _read_uncertainty),
-    _target("survey.json", "json", "images/survey.json", _images, _read_inputs),
-    _target("stage.json", "json", "images/stage.json", _images, _read_status),
-    _target("manifest of pictures", "csv", "images/manifest.csv", _images, _read_inputs),
-    _target("light.json", "json", "light.json", _json("light.json", _mosaic_light), _read_light),
-    _target("control.csv", "csv", "control.csv", _control, _read_control),
-    _target("picks.csv", "csv", "picks.csv", _picks, _read_picks),
-    _target("cloud.ply to mesh", "binary", "cloud.ply", _own_cloud, _read_own_cloud),
-    _target("reference PLY", "text", "a.ply", _reference_ply, _read_reference),
-    _target("reference PLY, binary", "binary", "cloud.ply", _own_cloud, _read_reference),
+    _target("cameras.json", "json", "cameras.json", sparse, read_sparse),
+    _target("cameras.json, lenses", "json", "cameras.json", sparse, read_lenses),
+    _target("frame.json", "json", "frame.json", sparse, read_sparse),
+    _target("track.csv of a model", "csv", "track.csv", sparse, read_poses),
+    _target("covariance.npz", "binary", "covariance.npz", build_uncertainty, read_uncertainty),
+    _target("survey.json", "json", "images/survey.json", _images, read_inputs),
+    _target("stage.json", "json", "images/stage.json", _images, read_status),
+    _target("manifest of pictures", "csv", "images/manifest.csv", _images, read_inputs),
+    _target("light.json", "json", "light.json", _json("light.json", _mosaic_light), read_light),
+    _target("control.csv", "csv", "control.csv", _control, read_control),
+    _target("picks.csv", "csv", "picks.csv", _picks, read_picks),
+    _target("cloud.ply to mesh", "binary", "cloud.ply", _own_cloud, read_own_cloud),
+    _target("reference PLY", "text", "a.ply", _reference_ply, read_reference),
+    _target("reference PLY, binary", "binary", "cloud.ply", _own_cloud, read_reference),
     _target(
-        "reference LAS", "binary", "a.las", partial(_reference_las, name="a.las"), _read_reference,
+        "reference LAS", "binary", "a.las", partial(build_las, name="a.las"), read_reference,
         native=True,
     ),
     _target(
-        "reference LAZ", "binary", "a.laz", partial(_reference_las, name="a.laz"), _read_reference,
+        "reference LAZ", "binary", "a.laz", partial(build_las, name="a.laz"), read_reference,
         native=True, examples=4,
     ),
-    _target("reference DEM", "binary", "a.tif", _reference_dem, _read_reference, native=True),
-    _target("other survey, dem.tif", "binary", "dense/dem.tif", _other_survey, _read_other,
+    _target("reference DEM", "binary", "a.tif", _reference_dem, read_reference, native=True),
+    _target("other survey, dem.tif", "binary", "dense/dem.tif", _other_survey, read_other,
             native=True),
-    _target("other survey, frame.json", "json", "sparse/frame.json", _other_survey, _read_other),
+    _target("other survey, frame.json", "json", "sparse/frame.json", _other_survey, read_other),
     _target("other survey, cloud.ply", "binary", "dense/cloud.ply", _other_survey,
-            _read_other_cloud, native=True),
+            read_other_cloud, native=True),
 )  # fmt: skip

@@ -172,7 +172,7 @@ def _made(path: Path, place: str, kind: Any, table: object, defaults: Mapping[st
 def _known(path: Path, place: str, table: Mapping[str, Any], names: set[str]) -> None:
     strange = next((key for key in table if key not in names), None)
     if strange is not None:
-        raise VehicleError(f"{path}: {place}{strange} is not known; known: {sorted(names)}")
+        raise VehicleError(f"{path}: {place}{shown(strange)} is not known; known: {sorted(names)}")
 
 
 def _number(path: Path, place: str, value: object) -> float:

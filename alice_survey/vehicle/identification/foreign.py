@@ -86,7 +86,7 @@ def read_foreign_log(path: Path, columns: ColumnMap) -> VehicleLog:
 
     def one(name: str) -> Array:
         if name not in table:
-            raise VehicleError(f"{path}: column {name} is missing")
+            raise VehicleError(f"{path}: column {shown(name)} is missing")
         return table[name]
 
     rows = len(next(iter(table.values())))

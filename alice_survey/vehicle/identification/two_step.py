@@ -18,6 +18,7 @@ import numpy as np
 from scipy.signal import fftconvolve, savgol_filter
 from scipy.spatial.transform import Rotation
 
+from alice_survey import progress
 from alice_survey.errors import VehicleError
 from alice_survey.frames import Array
 from alice_survey.vehicle.compiled import kernel
@@ -71,6 +72,7 @@ class _Rows:
     """Rows of each window."""
 
 
+@progress.step("fit in two steps")
 def calibrate(windows: Sequence[Window], parameters: Parameters) -> TwoStep:
     """Calibrate coefficients in turn.
 

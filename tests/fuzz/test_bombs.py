@@ -1,0 +1,395 @@
+"""Files made to harm: small ones that swell, that loop, that climb out of their folder."""
+
+import json
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.fuzz import areas, cameras, logs, workspace
+from tests.fuzz.judge import Sandbox, Verdict, judge
+
+_MANY = 100_000
+
+_LAUGHS = "<!DOCTYPE k [<!ENTITY a0 'ha'>" + "".join(
+    f"<!ENTITY a{i} '{f'&a{i - 1};' * 10}'>" for i in range(1, 12)
+) + "]>\n"  # fmt: skip
+_QUADRATIC = f"<!DOCTYPE k [<!ENTITY a '{'x' * 50_000}'>]>\n"
+_OUTSIDE = "<!DOCTYPE k [<!ENTITY a SYSTEM 'file:///etc/passwd'>]>\n"
+
+
+@pytest.fixture
+def sandbox(tmp_path: Path) -> Sandbox:
+    return Sandbox(tmp_path / "box")
+
+
+def tried(sandbox: Sandbox, name: str, data: bytes | str, read: Callable[[Path], object]) -> str:
+    """The refusal of a file's content; fails where it is none."""
+    verdict = looked_at(sandbox, name, data, read)
+    assert verdict.outcome == "refused", f"{verdict.told}\n{verdict.trace}"
+    return verdict.told
+
+
+def looked_at(
+    sandbox: Sandbox, name: str, data: bytes | str, read: Callable[[Path], object]
+) -> Verdict:
+    path = sandbox.inside / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data.encode() if isinstance(data, str) else data)
+    verdict = judge(read, path, sandbox)
+    assert verdict.outcome != "fault", f"{verdict.told}\n{verdict.trace}"
+    return verdict
+
+
+@pytest.mark.parametrize(
+    ("head", "use"), [(_LAUGHS, "&a11;"), (_QUADRATIC, "&a;" * 20_000), (_OUTSIDE, "&a;")],
+    ids=["billion laughs", "quadratic", "another file"],
+)  # fmt: skip
+def test_entities_of_kml_are_not_expanded(sandbox: Sandbox, head: str, use: str) -> None:
+    told = tried(sandbox, "a.kml", areas.kml(use, head), areas.read_area)
+    assert "DOCTYPE" in told
+    with zipfile.ZipFile(sandbox.inside / "b.kmz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("doc.kml", areas.kml(use, head))
+    data = (sandbox.inside / "b.kmz").read_bytes()
+    assert "DOCTYPE" in tried(sandbox, "b.kmz", data, areas.read_area)
+
+
+@pytest.mark.parametrize("declared", ["DOCTYPE opencv", "ENTITY a 'b'"])
+def test_entities_of_opencv_are_not_expanded(sandbox: Sandbox, declared: str) -> None:
+    data = f"<?xml version='1.0'?><!{declared}><opencv_storage><a>1</a></opencv_storage>"
+    assert "refused" in tried(sandbox, "a.xml", data, cameras.read_calibration)
+
+
+def test_aliases_of_yaml_are_not_expanded(sandbox: Sandbox) -> None:
+    lines = ["a0: &a0 [x]", *(f"a{i}: &a{i} [{f'*a{i - 1},' * 10}]" for i in range(1, 12))]
+    assert "alias" in tried(sandbox, "camchain.yaml", "\n".join(lines), cameras.read_calibration)
+
+
+def zeros(count: int) -> bytes:
+    """So many zeros, packed: pieces of a MiB are packed once and repeated."""
+    packer = zlib.compressobj(9, zlib.DEFLATED, -15)
+    piece = packer.compress(bytes(1 << 20)) + packer.flush(zlib.Z_FULL_FLUSH)
+    return piece * (count >> 20) + zlib.compressobj(9, zlib.DEFLATED, -15).flush()
+
+
+def packed_zip(name: bytes, packed: bytes, size: int) -> bytes:
+    """A zip of one member that states a size."""
+    rest = struct.pack("<HHHHHIIIHH", 20, 0, 8, 0, 0, 0, len(packed), size, len(name), 0)
+    local = b"PK\3\4" + rest + name + packed
+    central = b"PK\1\2\x14\0" + rest + struct.pack("<HHHII", 0, 0, 0, 0, 0) + name
+    end = struct.pack("<4sHHHHIIH", b"PK\5\6", 0, 0, 1, 1, len(central), len(local), 0)
+    return local + central + end
+
+
+@pytest.mark.parametrize("stated", [1 << 30, 1000, 0xFFFFFFF0])
+def test_a_zip_of_a_gigabyte_is_not_unpacked(sandbox: Sandbox, stated: int) -> None:
+    for name, member in (("a.kmz", b"doc.kml"), ("a.zip", b"a.shp")):
+        data = packed_zip(member, zeros(1 << 30), stated)
+        assert len(data) < 2_000_000
+        tried(sandbox, name, data, areas.read_area)
+
+
+@pytest.mark.parametrize(
+    "name", ["../../../evil", "/evil", "..\\..\\evil", "C:\\evil", "a/../../evil", "a\0evil"]
+)
+def test_names_in_archives_do_not_climb(sandbox: Sandbox, name: str) -> None:
+    with zipfile.ZipFile(sandbox.root / "x.kmz", "w") as archive:
+        archive.writestr(f"{name}.kml", areas.kml())
+    data = (sandbox.root / "x.kmz").read_bytes()
+    (sandbox.root / "x.kmz").unlink()
+    looked_at(sandbox, "a.kmz", data, areas.read_area)  # read, into a name of our own
+
+    areas.build_shapefile(sandbox.inside)
+    with zipfile.ZipFile(sandbox.root / "x.zip", "w") as archive:
+        for side in (".shp", ".shx", ".dbf", ".prj"):
+            archive.writestr(f"{name}{side}", (sandbox.inside / f"a{side}").read_bytes())
+    data = (sandbox.root / "x.zip").read_bytes()
+    (sandbox.root / "x.zip").unlink()
+    looked_at(sandbox, "b.zip", data, areas.read_area)
+    assert not Path("/evil.shp").exists()
+
+
+def test_links_in_archives_are_not_followed(sandbox: Sandbox) -> None:
+    link = zipfile.ZipInfo("doc.kml")
+    link.create_system, link.external_attr = 3, 0o120777 << 16
+    with zipfile.ZipFile(sandbox.root / "x.kmz", "w") as archive:
+        archive.writestr(link, "/etc/passwd")
+    data = (sandbox.root / "x.kmz").read_bytes()
+    (sandbox.root / "x.kmz").unlink()
+    assert "no KML" in tried(sandbox, "a.kmz", data, areas.read_area)
+
+
+_JSON = {
+    "a.geojson": areas.read_area, "a.plan": areas.read_area, "rig.json": cameras.read_rig,
+    "cam1_references.json": cameras.read_tank_points, "plan.json": workspace.read_plan,
+    "frame.json": workspace.read_frame, "v.json": logs.read_vehicle,
+    "cameras.json": workspace.read_lenses, "board.json": cameras.read_board,
+    "light.json": workspace.read_light,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", _JSON)
+@pytest.mark.parametrize("piece", ["[", '{"type":', '{"a":[', "[[], "])
+def test_json_nested_100_000_deep(sandbox: Sandbox, name: str, piece: str) -> None:
+    tried(sandbox, name, piece * _MANY, _JSON[name])
+
+
+@pytest.mark.parametrize("name", ["b.yaml", "b.xml", "b.toml", "c.kml", "c.wkt"])
+def test_other_things_nested_100_000_deep(sandbox: Sandbox, name: str) -> None:
+    texts = {
+        "b.yaml": ("a: " + "[" * _MANY, cameras.read_calibration),
+        "b.xml": (
+            "<?xml version='1.0'?><opencv_storage>" + "<a>" * _MANY,
+            cameras.read_calibration,
+        ),
+        "b.toml": ("a = " + "[" * _MANY, workspace.read_survey),
+        "c.kml": ("<kml>" + "<Folder>" * _MANY, areas.read_area),
+        "c.wkt": ("GEOMETRYCOLLECTION (" * _MANY, areas.read_area),
+    }
+    tried(sandbox, name, *texts[name])
+
+
+def test_kml_of_folders_within_folders(sandbox: Sandbox) -> None:
+    for depth in (1000, 30_000):
+        text = "<kml>" + "<Folder>" * depth + "</Folder>" * depth + "</kml>"
+        tried(sandbox, "a.kml", text, areas.read_area)
+
+
+def test_toml_of_a_million_keys(sandbox: Sandbox) -> None:
+    text = "".join(f"k{i} = {i}\n" for i in range(1_000_000))
+    tried(sandbox, "survey.toml", text, workspace.read_survey)
+    text = "".join(f"k{i} = {i}\n" for i in range(20_000))
+    told = tried(sandbox, "survey.toml", text, workspace.read_survey)
+    assert len(told) < 2000
+    assert "more" in told
+
+
+def test_toml_of_one_long_key(sandbox: Sandbox) -> None:
+    tried(sandbox, "survey.toml", "a." * 5000 + "a = 1", workspace.read_survey)
+    tried(sandbox, "map.toml", "a." * 5000 + "a = 1", logs.read_column_map)
+
+
+_TABLES = {
+    "n.csv": logs.read_nav, "manifest.csv": workspace.read_manifest, "d.csv": logs.check_dive,
+    "track.csv": workspace.read_track, "v.csv": logs.read_vehicle_log,
+    "control.csv": workspace.read_control, "q.csv": logs.read_any_log,
+    "tank.csv": cameras.read_tank_rows, "current.csv": logs.read_current,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", _TABLES)
+@pytest.mark.parametrize("piece", ["a", ",", '"', "a,"], ids=["word", "commas", "quotes", "cells"])
+def test_a_line_of_3_mb(sandbox: Sandbox, name: str, piece: str) -> None:
+    data = piece * (3_000_000 // len(piece))
+    tried(sandbox, name, data, _TABLES[name])
+
+
+def test_a_line_of_100_mb(sandbox: Sandbox) -> None:
+    rows = logs.navigation_rows(dated=False)
+    tried(sandbox, "n.csv", rows[0] + "\n" + "1" * 100_000_000, logs.read_nav)
+
+
+def test_a_polygon_of_a_million_corners(sandbox: Sandbox) -> None:
+    angles = np.linspace(0, 2 * np.pi, 1_000_000)
+    ring = np.column_stack([35 + 1e-3 * np.cos(angles), 32 + 1e-3 * np.sin(angles)]).round(9)
+    text = json.dumps({"type": "Polygon", "coordinates": [ring.tolist()]})
+    assert "corners; at most" in tried(sandbox, "a.geojson", text, areas.read_area)
+
+
+def _ring(text: str) -> str:
+    return f'{{"type": "Polygon", "coordinates": [[{text}]]}}'
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[35, 32], [35.001, 32.001], [35.001, 32], [35, 32.001], [35, 32]",
+        "[35, 32], [35.001, 32], [35.0005, 32], [35, 32]",
+        "[35, 32], [35, 32], [35, 32], [35, 32]",
+        "[35, NaN], [35.001, 32.001], [35.001, 32], [35, NaN]",
+        "[35, 1e999], [35.001, 32.001], [35.001, 32], [35, 1e999]",
+        "[1e308, -1e308], [-1e308, 1e308], [1e308, 1e308], [1e308, -1e308]",
+        "[35, 32, 5], [35.001], [35.001, 32]", "[]", "null", "[[[35, 32]]]",
+        "[179.999, 10], [-179.999, 10], [-179.999, 10.001], [179.999, 10.001], [179.999, 10]",
+        "[0, 90], [90, 90], [180, 90], [0, 90]",
+    ],
+)  # fmt: skip
+def test_polygons_that_are_none(sandbox: Sandbox, text: str) -> None:
+    looked_at(sandbox, "a.geojson", _ring(text), areas.read_area)
+
+
+def _png(width: int, height: int, depth: int = 8, colour: int = 2, body: bytes = b"") -> bytes:
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
+
+    head = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
+    parts = chunk(b"IHDR", head) + chunk(b"IDAT", body or zlib.compress(bytes(1000)))
+    return b"\x89PNG\r\n\x1a\n" + parts + chunk(b"IEND", b"")
+
+
+def _tiff(width: int, height: int, bits: int = 16) -> bytes:
+    tags = [(256, width), (257, height), (258, bits), (259, 1), (262, 1), (273, 8), (277, 1),
+            (278, height), (279, 0xFFFFFFFF)]  # fmt: skip
+    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags)
+    return b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + bytes(4)
+
+
+def _jpeg(width: int, height: int, tmp: Path) -> bytes:
+    data = bytearray(cameras.picture(tmp / "seed.jpg").read_bytes())
+    at = data.find(b"\xff\xc0") + 5
+    data[at : at + 4] = struct.pack(">HH", height, width)
+    return bytes(data)
+
+
+_READERS = {
+    "import": cameras.read_picture, "match": cameras.read_for_matching, "mask": cameras.read_mask,
+    "board": cameras.look_for_board,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("reader", _READERS)
+@pytest.mark.parametrize("size", [50_000, 30_000, 12_000])
+def test_pictures_that_state_a_great_size(
+    sandbox: Sandbox, tmp_path: Path, size: int, reader: str
+) -> None:
+    pictures = {
+        "a.png": _png(size, size), "b.png": _png(size, size, 16, 6),
+        "c.tif": _tiff(size, size), "d.jpg": _jpeg(size, size, tmp_path),
+        "e.png": _png(size, size, 1, 0, zeros(size * size // 8)), "f.jpg": _png(size, size),
+        "g.tif": _png(size, size, 16, 6), "h.png": b"P6 %d %d 65535\n" % (size, size),
+        "i.jpg": b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y %d +X %d\n" % (size, size),
+        "j.png": b"BM" + struct.pack("<IIIIiiHHIIiiII", 54, 0, 54, 40, size, size, 1, 24, 0, 0, 0,
+                                     0, 0, 0),
+    }  # fmt: skip
+    for name, data in pictures.items():
+        looked_at(sandbox, name, data, _READERS[reader])
+
+
+@pytest.mark.parametrize("reader", _READERS)
+@pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.tif", "a.dng"])
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"\0", b"\xff\xd8", b"\x89PNG\r\n\x1a\n", b"II*\0\xff\xff\xff\xff", b"GIF89a",
+     b"SIMPLE  = T", b"PK\3\4", b"\0" * 5000, b"<svg/>", b"RIFF\xff\xff\xff\xffWEBPVP8 "],
+)  # fmt: skip
+def test_what_is_no_picture(sandbox: Sandbox, name: str, data: bytes, reader: str) -> None:
+    looked_at(sandbox, name, data, _READERS[reader])
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA", "CMYK", "I;16", "I", "F"])
+@pytest.mark.parametrize("kind", ["png", "tif", "jpg"])
+def test_pictures_of_one_pixel(sandbox: Sandbox, mode: str, kind: str) -> None:
+    from PIL import Image
+
+    try:
+        Image.new(mode, (1, 1)).save(sandbox.inside / f"a.{kind}")
+    except OSError:
+        pytest.skip(f"{kind} has no {mode}")
+    data = (sandbox.inside / f"a.{kind}").read_bytes()
+    for read in _READERS.values():
+        looked_at(sandbox, f"a.{kind}", data, read)
+
+
+@pytest.mark.parametrize(
+    ("tags", "gps"),
+    [
+        ({0x9003: "0001:01:01 00:00:00", 0x9011: "+23:59"}, {}),
+        ({0x9003: "9999:12:31 23:59:59", 0x9011: "-99:99"}, {}),
+        ({0x9003: "2024:05:01 12:00:00", 0x9011: "+99:99", 0x9291: "9" * 400}, {}),
+        ({0x9003: b"\xff\xfe", 0xA405: 65535}, {2: 5.0, 4: (1.0,), 6: "x"}),
+        ({0xA405: 0}, {2: (1e300, 0.0, 0.0), 4: (181.0, 0.0, 0.0), 1: 5, 3: b"\0", 5: 7}),
+        ({}, {2: "N", 4: b"\0\0\0", 6: (1, 0)}),
+    ],
+)  # fmt: skip
+def test_exif_that_lies(sandbox: Sandbox, tags: dict[int, object], gps: dict[int, object]) -> None:
+    from PIL import Image
+
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update(tags)
+    exif.get_ifd(0x8825).update(gps)
+    try:
+        Image.new("RGB", (48, 32)).save(sandbox.inside / "a.jpg", exif=exif)
+    except (ValueError, TypeError, struct.error, OverflowError, AttributeError):
+        pytest.skip("Pillow does not write this")
+    data = (sandbox.inside / "a.jpg").read_bytes()
+    assert looked_at(sandbox, "a.jpg", data, cameras.read_picture).outcome == "value"
+
+
+def test_clouds_of_a_trillion_points(sandbox: Sandbox) -> None:
+    for kind in ("ascii", "binary_little_endian", "binary_big_endian"):
+        head = f"ply\nformat {kind} 1.0\nelement vertex 1000000000000\n"
+        text = head + "".join(f"property double {a}\n" for a in "xyz") + "end_header\n1 2 3\n"
+        assert "cut short" in tried(sandbox, "a.ply", text, workspace.read_reference)
+    workspace.build_las(sandbox.inside, "a.las")
+    good = (sandbox.inside / "a.las").read_bytes()
+    for at, kind in ((100, "<I"), (107, "<I"), (243, "<I"), (247, "<Q"), (96, "<I"), (235, "<Q")):
+        value = (1 << (8 * struct.calcsize(kind) - 1)) - 1
+        data = good[:at] + struct.pack(kind, value) + good[at + struct.calcsize(kind) :]
+        looked_at(sandbox, "a.las", data, workspace.read_reference)
+
+
+def test_packed_points_that_break_their_decoder(sandbox: Sandbox) -> None:
+    """lazrs 0.6 reads out of bounds and ends the process."""
+    workspace.build_las(sandbox.inside, "a.laz")
+    good = (sandbox.inside / "a.laz").read_bytes()
+    data = good[:840] + b"\xff" * 512 + good[1352:]
+    looked_at(sandbox, "a.laz", data, workspace.read_reference)
+
+
+def test_rasters_of_a_trillion_cells(sandbox: Sandbox) -> None:
+    import rasterio
+    from rasterio.transform import from_origin
+
+    path = sandbox.inside / "a.tif"
+    with rasterio.open(
+        path, "w", driver="GTiff", width=1_000_000, height=1_000_000, count=1, dtype="float32",
+        crs="EPSG:4326", transform=from_origin(34.9, 32.9, 2e-7, 2e-7), tiled=True,
+        blockxsize=16384, blockysize=16384, sparse_ok=True, bigtiff="YES",
+    ):  # fmt: skip
+        pass
+    data = path.read_bytes()
+    assert len(data) < 1_000_000
+    looked_at(sandbox, "a.tif", data, areas.read_depths)
+    looked_at(sandbox, "a.tif", data, workspace.read_reference)
+
+
+@pytest.mark.parametrize(
+    "source", ["/etc/passwd", "/vsicurl/http://127.0.0.1:9/a.tif", "../../a.tif"]
+)
+def test_rasters_that_name_other_files_are_not_followed(sandbox: Sandbox, source: str) -> None:
+    text = (
+        '<VRTDataset rasterXSize="20" rasterYSize="20"><SRS>EPSG:4326</SRS>'
+        "<GeoTransform>34.9999,1e-5,0,32.8004,0,-1e-5</GeoTransform>"
+        '<VRTRasterBand dataType="Float32" band="1"><SimpleSource>'
+        f"<SourceFilename>{source}</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"
+    )
+    for name in ("a.vrt", "a.tif"):
+        told = tried(sandbox, name, text, areas.read_depths)
+        assert "other files" in told
+    tried(sandbox, "a.tif", text, workspace.read_reference)
+
+
+def test_arrays_that_state_a_great_size(sandbox: Sandbox) -> None:
+    workspace.build_uncertainty(sandbox.inside)
+    head = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000, 1000000), }".ljust(117)
+    array = b"\x93NUMPY\1\0" + struct.pack("<H", 118) + head + b"\n" + bytes(800)
+    path = sandbox.inside / "covariance.npz"
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    for name in members:
+        with zipfile.ZipFile(path, "w") as archive:
+            for other, content in members.items():
+                archive.writestr(other, array if other == name else content)
+        tried(sandbox, "covariance.npz", path.read_bytes(), workspace.read_uncertainty)
+
+
+@pytest.mark.parametrize("packed", ["zstd", "lz4", ""])
+def test_bags_whose_chunks_swell(sandbox: Sandbox, packed: str) -> None:
+    """An MCAP of under 100 kB whose chunk unpacks to a gigabyte, or says so."""
+    tried(sandbox, "a.mcap", logs.swelling_mcap(packed, 1 << 30), logs.read_any_log)
