@@ -33,6 +33,15 @@ class Table:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Link:
+    """A way to a file or a page on the same server."""
+
+    text: str
+    address: str
+    about: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Section:
     """A part of the report."""
 
@@ -42,6 +51,8 @@ class Section:
     text: Sequence[str] = ()
     figures: Sequence[Figure] = ()
     tables: Sequence[Table] = ()
+    links: Sequence[Link] = ()
+    """Of a served page; print and the report have none."""
     scene: Literal["map", "mesh"] | None = None
     """What the page shows here that moves; print shows a still of it."""
 
@@ -76,12 +87,26 @@ class PictureLayer:
     """Level 0 is the coarsest; the last is full: tile x, y at level k covers
     `tile_px * 2**(levels - 1 - k)` full pixels a side."""
     tiles: Mapping[str, bytes]
-    """WebP by "k/x/y"; a tile at the border may be smaller."""
+    """WebP by "k/x/y"; a tile at the border may be smaller. None where a server gives them."""
+    address: str | None = None
+    """Of a tile on the server that gives the page, with "{}" in place of "k/x/y"."""
+    sizes: Sequence[tuple[int, int, float, float]] | None = None
+    """Columns, rows and a pixel's width and height, metres, of each level, full resolution first;
+    halves, rounded up, where not given."""
     scale: Scale | None = None
     shown: bool = False
     """From the start; of base layers only one can be."""
     base: bool = True
     """Base layers exclude one another; others lie over them."""
+
+    def size(self, level: int) -> tuple[int, int, float, float]:
+        """Columns, rows and a pixel's width and height, metres, of a level."""
+        halvings = self.levels - 1 - level
+        if self.sizes is not None:
+            return self.sizes[halvings]
+        side = 2**halvings
+        pixel = self.pixel_m * side
+        return -(-self.width_px // side), -(-self.height_px // side), pixel, pixel
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,6 +148,8 @@ class Mesh:
     still: bytes
     """PNG for print and for browsers without WebGL."""
     alt: str
+    address: str | None = None
+    """On the server that gives the page, which then does not carry the mesh."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ from html import escape
 from pathlib import Path
 
 from alice_survey import progress
-from alice_survey.report.document import Figure, Level, Mesh, Report, Section, Table
+from alice_survey.report.document import Figure, Level, Link, Mesh, Report, Section, Table
 from alice_survey.report.page_map import map_data, map_view
 
 _HERE = Path(__file__).parent
@@ -54,20 +54,15 @@ def render_html(report: Report) -> str:
             report lacks, a map or a mesh has no section, or a picture is of no kind known here.
     """
     _check(report)
-    style = _read("page.css")
-    styles, scripts, data = [style], list[str](), list[str]()
+    styles, scripts, data = *_carried(report), list[str]()
     if report.map is not None:
-        styles.insert(0, _read("web/vendor_map.css"))
         data.append(map_data(report.map))
-        scripts += [_read(name) for name in _MAP_SCRIPTS]
     if report.mesh is not None:
-        glb = base64.b64encode(report.mesh.glb.read_bytes()).decode("ascii")
-        data.append(f'<script type="text/plain" id="mesh-glb">{glb}</script>')
-        scripts += [_read(name) for name in _MESH_SCRIPTS]
+        data.append(_mesh_data(report.mesh))
     title = escape(report.title)
     parts = [
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">',
-        f'<meta http-equiv="Content-Security-Policy" content="{_policy(styles, scripts)}">',
+        f'<meta http-equiv="Content-Security-Policy" content="{page_policy(report)}">',
         '<meta name="viewport" content="width=device-width,initial-scale=1">',
         '<meta name="referrer" content="no-referrer"><link rel="icon" href="data:,">',
         f"<title>{title}</title>",
@@ -102,13 +97,43 @@ def _read(name: str) -> str:
     return (_HERE / name).read_text(encoding="utf-8")
 
 
-def _policy(styles: Sequence[str], scripts: Sequence[str]) -> str:
-    """A texture of the mesh is a `blob:` of the page itself."""
+def _carried(report: Report) -> tuple[list[str], list[str]]:
+    """The styles and the scripts that its page carries."""
+    styles, scripts = [_read("page.css")], list[str]()
+    if report.map is not None:
+        styles.insert(0, _read("web/vendor_map.css"))
+        scripts += [_read(name) for name in _MAP_SCRIPTS]
+    if report.mesh is not None:
+        scripts += [_read(name) for name in _MESH_SCRIPTS]
+    return styles, scripts
+
+
+def _mesh_data(mesh: Mesh) -> str:
+    if mesh.address is not None:
+        return (
+            f'<script type="text/plain" id="mesh-glb" data-from="{escape(mesh.address)}"></script>'
+        )
+    glb = base64.b64encode(mesh.glb.read_bytes()).decode("ascii")
+    return f'<script type="text/plain" id="mesh-glb">{glb}</script>'
+
+
+def page_policy(report: Report) -> str:
+    """What its page may load, as a content security policy.
+
+    A texture of the mesh is a `blob:` of the page itself. A page that a server gives may load
+    from that server too.
+    """
+    styles, scripts = _carried(report)
+    layers = report.map.layers if report.map is not None else ()
+    tiled = any(getattr(layer, "address", None) is not None for layer in layers)
+    fetched = report.mesh is not None and report.mesh.address is not None
     allowed_styles = " ".join(_hash(text) for text in styles)
     allowed_scripts = " ".join(_hash(text) for text in scripts) or "'none'"
+    pictures = "'self' data: blob:" if tiled else "data: blob:"
+    fetches = "connect-src 'self'; " if fetched else ""
     return (
-        f"default-src 'none'; img-src data: blob:; style-src {allowed_styles}; "
-        f"script-src {allowed_scripts}; base-uri 'none'; form-action 'none'"
+        f"default-src 'none'; img-src {pictures}; style-src {allowed_styles}; "
+        f"script-src {allowed_scripts}; {fetches}base-uri 'none'; form-action 'none'"
     )
 
 
@@ -119,6 +144,8 @@ def _hash(text: str) -> str:
 
 
 def _summary(report: Report) -> str:
+    if not report.summary:
+        return ""
     items = "".join(
         f"<div><dt>{escape(label)}</dt><dd>{escape(text)}</dd></div>"
         for label, text in report.summary.items()
@@ -180,6 +207,8 @@ def _section(section: Section, report: Report) -> str:
         parts.append(_mesh_view(report.mesh))
     parts += [_figure(figure) for figure in section.figures]
     parts += [_table(table) for table in section.tables]
+    if section.links:
+        parts.append(f'<ul class="links">{"".join(map(_link, section.links))}</ul>')
     return "\n".join([*parts, "</section>"])
 
 
@@ -227,6 +256,10 @@ def _table(table: Table) -> str:
         f'<div class="scroll" role="region" tabindex="0" aria-label="{title}">'
         f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table></div></div>"
     )
+
+
+def _link(link: Link) -> str:
+    return f'<li><a href="{escape(link.address)}">{escape(link.text)}</a> {escape(link.about)}</li>'
 
 
 def _numeric_columns(table: Table) -> Iterator[bool]:

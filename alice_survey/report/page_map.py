@@ -37,6 +37,9 @@ def map_data(survey_map: SurveyMap) -> str:
     blocks: list[str] = []
     for index, layer in enumerate(layers):
         if isinstance(layer, PictureLayer):
+            if layer.address is not None:
+                described.append(_picture(layer) | {"address": layer.address})
+                continue
             found, text = _packed(layer.tiles)
             described.append(_picture(layer) | {"block": f"tiles-{index}", "tiles": found})
             blocks.append(f'<script type="text/plain" id="tiles-{index}">{text}</script>')
@@ -156,6 +159,7 @@ def _picture(layer: PictureLayer) -> dict[str, Any]:
         "tile": layer.tile_px,
         "levels": layer.levels,
         "base": layer.base,
+        **({} if layer.sizes is None else {"sizes": [list(size) for size in layer.sizes]}),
     }
 
 
@@ -285,28 +289,33 @@ def _still_picture(layer: PictureLayer, place: Any, px_per_m: float) -> str:
     """The level that comes closest to the still's own resolution, from above."""
     wanted = math.ceil(math.log2(max(1.0, layer.pixel_m * px_per_m * 2 ** (layer.levels - 1))))
     level = min(layer.levels - 1, wanted)
-    step_m = layer.pixel_m * 2 ** (layer.levels - 1 - level)
-    columns = math.ceil(layer.width_px / 2 ** (layer.levels - 1 - level))
-    rows = math.ceil(layer.height_px / 2 ** (layer.levels - 1 - level))
+    columns, rows, east_m, north_m = layer.size(level)
     images = []
-    for name in sorted(layer.tiles):
-        at, column, row = (int(part) for part in name.split("/"))
-        if at != level:
-            continue
-        x, y = place(
-            layer.west_m + column * layer.tile_px * step_m,
-            layer.north_m - row * layer.tile_px * step_m,
-        )
-        width = min(layer.tile_px, columns - column * layer.tile_px) * step_m * px_per_m
-        height = min(layer.tile_px, rows - row * layer.tile_px) * step_m * px_per_m
-        content = layer.tiles[name]
-        text = base64.b64encode(content).decode("ascii")
-        # A little over its border, so that no seam shows.
-        images.append(
-            f'<image x="{x:.2f}" y="{y:.2f}" width="{width + 0.4:.2f}" height="{height + 0.4:.2f}" '
-            f'preserveAspectRatio="none" href="data:image/{picture_kind(content)};base64,{text}"/>'
-        )
+    for row in range(-(-rows // layer.tile_px)):
+        for column in range(-(-columns // layer.tile_px)):
+            address = _tile_address(layer, f"{level}/{column}/{row}")
+            if address is None:
+                continue
+            left, top = column * layer.tile_px, row * layer.tile_px
+            x, y = place(layer.west_m + left * east_m, layer.north_m - top * north_m)
+            width = min(layer.tile_px, columns - left) * east_m * px_per_m
+            height = min(layer.tile_px, rows - top) * north_m * px_per_m
+            # A little over its border, so that no seam shows.
+            images.append(
+                f'<image x="{x:.2f}" y="{y:.2f}" width="{width + 0.4:.2f}" '
+                f'height="{height + 0.4:.2f}" preserveAspectRatio="none" href="{address}"/>'
+            )
     return "".join(images)
+
+
+def _tile_address(layer: PictureLayer, name: str) -> str | None:
+    """Where a page finds a tile, or in what it carries it; None where nothing is."""
+    if layer.address is not None:
+        return escape(layer.address.replace("{}", name))
+    content = layer.tiles.get(name)
+    if content is None:
+        return None
+    return f"data:image/{picture_kind(content)};base64,{base64.b64encode(content).decode('ascii')}"
 
 
 def _still_shapes(layer: ShapeLayer, place: Any) -> str:

@@ -148,6 +148,9 @@ function startMap() {
   });
   map.on("mousemove", (event) => read("", event.latlng));
   map.on("mouseout", readCentre);
+  map.on("tilelost", () => {
+    readout.textContent = "A part of the picture did not come: load this page again";
+  });
   map.fitBounds(whole, {padding: [24, 24], animate: false});
 
   root.querySelectorAll("input").forEach((input) => {

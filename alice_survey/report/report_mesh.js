@@ -15,7 +15,7 @@ async function startMesh(root, canvas) {
   const lamp = new three.DirectionalLight(0xffffff, 2.6);
   scene.add(new three.HemisphereLight(0xffffff, 0x8c98a0, 1.1), lamp, lamp.target);
 
-  const model = (await parse(bytesOf("mesh-glb"))).scene;
+  const model = (await parse(await bytesOf("mesh-glb"))).scene;
   scene.add(model);
   const box = new three.Box3().setFromObject(model);
   const ball = box.getBoundingSphere(new three.Sphere());
@@ -139,8 +139,15 @@ async function startMesh(root, canvas) {
   canvas.addEventListener("webglcontextlost", () => showStill(root, "The browser took its graphics memory back: this is a still picture."));
 }
 
-function bytesOf(id) {
-  const text = atob(document.getElementById(id).textContent);
+/* What the page holds, or its server gives. */
+async function bytesOf(id) {
+  const held = document.getElementById(id);
+  if (held.dataset.from) {
+    const answer = await fetch(held.dataset.from);
+    if (!answer.ok) throw new Error((await answer.text()).trim());
+    return answer.arrayBuffer();
+  }
+  const text = atob(held.textContent);
   return Uint8Array.from(text, (letter) => letter.charCodeAt(0)).buffer;
 }
 

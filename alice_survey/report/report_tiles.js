@@ -1,6 +1,6 @@
-/* The report's map, part 1 of 2: a picture that holds its own pyramid. */
+/* The report's map, part 1 of 2: a picture with a pyramid of tiles. */
 
-/* Shows the level that fits the zoom. A tile is decoded when it comes into view; the tiles of the
+/* Its tiles are the page's own, or a server's. Shows the level that fits the zoom. A tile is decoded when it comes into view; the tiles of the
    level before stay until those of the next are there, so that the map never blinks. */
 const Pyramid = leaflet.Layer.extend({
   initialize(about, pane) {
@@ -46,9 +46,10 @@ const Pyramid = leaflet.Layer.extend({
       if (this._tiles.has(name)) return;
       const tile = leaflet.imageOverlay(this._uri(name), bounds, {pane: this._pane});
       tile.pending = true;
-      tile.on("load error", () => {
+      tile.on("load error", (event) => {
         tile.pending = false;
         this._drop();
+        if (event.type === "error" && this._map) this._map.fire("tilelost");
       });
       this._tiles.set(name, tile);
       tile.addTo(this._map);
@@ -64,24 +65,33 @@ const Pyramid = leaflet.Layer.extend({
   /* Name and bounds of each tile of a level that is in view, or close to it. */
   _inView(halvings) {
     const {about} = this;
-    const step = about.pixel * 2 ** halvings;
-    const columns = Math.ceil(about.width / 2 ** halvings);
-    const rows = Math.ceil(about.height / 2 ** halvings);
+    const [columns, rows, width, height] = this._size(halvings);
     const view = this._map.getBounds().pad(0.1);
-    const side = about.tile * step;
-    const first = (at) => Math.max(0, Math.floor(at / side));
-    const last = (at, pixels) => Math.min(Math.ceil(pixels / about.tile) - 1, Math.floor(at / side));
+    const [wide, high] = [about.tile * width, about.tile * height];
+    const first = (at, side) => Math.max(0, Math.floor(at / side));
+    const last = (at, side, pixels) => Math.min(Math.ceil(pixels / about.tile) - 1, Math.floor(at / side));
+    const [left, right] = [view.getWest() - about.west, view.getEast() - about.west];
+    const [above, below] = [about.north - view.getNorth(), about.north - view.getSouth()];
     const found = new Map();
-    for (let x = first(view.getWest() - about.west); x <= last(view.getEast() - about.west, columns); x += 1) {
-      for (let y = first(about.north - view.getNorth()); y <= last(about.north - view.getSouth(), rows); y += 1) {
+    for (let x = first(left, wide); x <= last(right, wide, columns); x += 1) {
+      for (let y = first(above, high); y <= last(below, high, rows); y += 1) {
         const name = this.level + "/" + x + "/" + y;
-        if (!about.tiles[name]) continue;  /* nothing is there */
-        const east = about.west + Math.min((x + 1) * about.tile, columns) * step;
-        const south = about.north - Math.min((y + 1) * about.tile, rows) * step;
-        found.set(name, [[south, about.west + x * side], [about.north - y * side, east]]);
+        if (about.tiles && !about.tiles[name]) continue;  /* nothing is there */
+        const east = about.west + Math.min((x + 1) * about.tile, columns) * width;
+        const south = about.north - Math.min((y + 1) * about.tile, rows) * height;
+        found.set(name, [[south, about.west + x * wide], [about.north - y * high, east]]);
       }
     }
     return found;
+  },
+
+  /* Columns, rows and a pixel's width and height of a level. */
+  _size(halvings) {
+    const {about} = this;
+    if (about.sizes) return about.sizes[halvings];
+    const side = 2 ** halvings;
+    const pixel = about.pixel * side;
+    return [Math.ceil(about.width / side), Math.ceil(about.height / side), pixel, pixel];
   },
 
   _drop() {
@@ -94,6 +104,7 @@ const Pyramid = leaflet.Layer.extend({
   },
 
   _uri(name) {
+    if (this.about.address) return this.about.address.replace("{}", name);
     if (this._text === null) this._text = document.getElementById(this.about.block).textContent;
     const [at, length, kind] = this.about.tiles[name];
     return "data:image/" + kind + ";base64," + this._text.slice(at, at + length);

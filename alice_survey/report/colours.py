@@ -1,0 +1,190 @@
+"""How rasters look on a map: their words, palettes and limits, the same wherever they are shown."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rasterio.windows import Window
+
+from alice_survey.frames import Array
+from alice_survey.report.document import Scale
+from reconstruct.raster import hillshade
+
+Rgba = NDArray[np.uint8]
+
+MOSAIC_FILE = "mosaic/mosaic.tif"
+MOSAIC_TITLE = "Mosaic"
+MOSAIC_ABOUT = "What the cameras saw, each spot from the picture that sees it best."
+TILE_PX = 512
+_SAMPLED = 2_000_000
+"""Values of a raster that its limits are taken from; of a smaller one all."""
+_THINNED = 4
+"""Of a larger raster's block every so many-th row and column."""
+_WINDOW_PX = 256
+_COLOURS = 9
+"""Of a scale in a legend."""
+_QUALITY = 82
+
+
+@dataclass(frozen=True, kw_only=True)
+class Numbers:
+    """A raster of numbers and how to colour it."""
+
+    file: str
+    name: str
+    title: str
+    about: str
+    palette: str
+    """Of matplotlib: safe for the colour-blind."""
+    limits: Callable[[Array], tuple[float, float]]
+    """Of the colours, from the known values."""
+    factor: float = 1.0
+    """From the raster's unit to the legend's."""
+    label: str = ""
+    shaded: bool = False
+    counted: bool = False
+    """Its numbers are counts: zero is nothing seen."""
+
+    def levels(self, values: Array) -> Array:
+        """Values of the raster in the legend's unit; NaN where nothing is known."""
+        level = self.factor * values.astype(np.float64)
+        return np.where(level > 0, level, np.nan) if self.counted else level
+
+
+def number_rasters(unit: str) -> tuple[Numbers, ...]:
+    """The rasters of numbers that a workspace may hold.
+
+    Args:
+        unit: of its lengths.
+    """
+    small, label = (1e3, "mm") if unit == "m" else (1.0, unit)
+    return (
+        Numbers(
+            file="dense/dem.tif", name="height", title="Height", palette="viridis",
+            about="Height of the sea floor, shaded from the north-west.",
+            limits=_middle, label=f"height, {unit}", shaded=True,
+        ),
+        Numbers(
+            file="dense/sigma.tif", name="sigma", title="Sigma of height", palette="cividis",
+            about="How far off a height may be within the survey, one sigma.",
+            limits=_from_zero, factor=small, label=f"sigma, {label}",
+        ),
+        Numbers(
+            file="evaluation/error.tif", name="error", title="Error of height", palette="PuOr",
+            about="Height less the true height, after a rigid alignment of the cameras.",
+            limits=_around_zero, factor=small, label=f"error, {label}",
+        ),
+        Numbers(
+            file="dense/slope.tif", name="slope", title="Slope", palette="magma",
+            about="Steepness of the sea floor.", limits=_from_zero, label="slope, degrees",
+        ),
+        Numbers(
+            file="dense/stations.tif", name="stations", title="Stations", palette="cividis",
+            about="Stations that see a spot: from 3 on, heights check one another.",
+            limits=_whole, label="stations", counted=True,
+        ),
+    )  # fmt: skip
+
+
+def _middle(values: Array) -> tuple[float, float]:
+    low, high = np.percentile(values, [1, 99])
+    return float(low), float(max(high, low + 1e-9))
+
+
+def _from_zero(values: Array) -> tuple[float, float]:
+    return 0.0, float(max(np.percentile(values, 98), 1e-9))
+
+
+def _around_zero(values: Array) -> tuple[float, float]:
+    most = float(max(np.percentile(np.abs(values), 97), 1e-9))
+    return -most, most
+
+
+def _whole(values: Array) -> tuple[float, float]:
+    return 0.0, float(max(np.ceil(np.percentile(values, 99)), 1.0))
+
+
+def limits_of(raster: Any, numbers: Numbers) -> tuple[float, float]:
+    """Between which values a raster is coloured, in the legend's unit; 0 to 1 where none is known.
+
+    Of a large raster the values of blocks all over it, in an order without a pattern, until there
+    are enough: what it holds in memory does not grow with the raster.
+    """
+    kept, count = list[Array](), 0
+    for values in _sample(raster):
+        level = numbers.levels(values)
+        kept.append(level[np.isfinite(level)])
+        count += len(kept[-1])
+        if count >= _SAMPLED:
+            break
+    return numbers.limits(np.concatenate(kept)) if count else (0.0, 1.0)
+
+
+def _sample(raster: Any) -> Iterator[Array]:
+    step = 1 if raster.width * raster.height <= _SAMPLED else _THINNED
+    columns = -(-raster.width // _WINDOW_PX)
+    blocks = columns * -(-raster.height // _WINDOW_PX)
+    for block in np.random.default_rng(0).permutation(blocks):
+        row, column = divmod(int(block), columns)
+        yield known_values(raster, block_window(raster, column, row, _WINDOW_PX))[::step, ::step]
+
+
+def block_window(raster: Any, column: int, row: int, side: int) -> Window:
+    """A square window of a raster's grid of such squares, cut off at the border."""
+    left, top = column * side, row * side
+    return Window(left, top, min(side, raster.width - left), min(side, raster.height - top))
+
+
+def known_values(raster: Any, window: Window) -> Array:
+    """Values of the first band, float32; NaN where the raster says that it knows none."""
+    values = raster.read(1, window=window, masked=True).astype(np.float32)
+    filled: Array = values.filled(np.nan)
+    return filled
+
+
+def coloured(level: Array, numbers: Numbers, limits: tuple[float, float], pixel: float) -> Rgba:
+    """Numbers as colours; what is not known is clear.
+
+    Args:
+        level: (H, W) in the legend's unit, NaN where unknown.
+        numbers: how to colour them.
+        limits: as `limits_of` gives them.
+        pixel: side of a pixel in the unit of lengths, for the shade.
+    """
+    from matplotlib import colormaps
+
+    low, high = limits
+    known = np.isfinite(level)
+    shares = np.clip((level - low) / (high - low), 0, 1)
+    picture: Rgba = (255 * colormaps[numbers.palette](shares)).astype(np.uint8)
+    if numbers.shaded:
+        flat = np.sqrt(0.5)
+        shade = hillshade(level, pixel) if min(level.shape) > 1 else np.full(level.shape, flat)
+        tinted = picture[..., :3] * (0.25 + 1.05 * np.nan_to_num(shade, nan=flat)[..., None])
+        picture[..., :3] = np.clip(tinted, 0, 255)
+    picture[..., 3] = np.where(known, 255, 0)
+    return picture
+
+
+def scale_of(numbers: Numbers, limits: tuple[float, float]) -> Scale:
+    """The legend."""
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    palette = colormaps[numbers.palette]
+    return Scale(
+        label=numbers.label,
+        low=limits[0],
+        high=limits[1],
+        colours=[to_hex(palette(i / (_COLOURS - 1))) for i in range(_COLOURS)],
+    )
+
+
+def encoded(tile: Rgba) -> bytes:
+    """A tile as WebP."""
+    bgra = cv2.cvtColor(tile, cv2.COLOR_RGBA2BGRA)
+    data: bytes = cv2.imencode(".webp", bgra, [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])[1].tobytes()
+    return data
