@@ -21,6 +21,7 @@ from alice_survey.contents import one_line
 from alice_survey.errors import NavigationError
 from alice_survey.executor import progress
 from alice_survey.frames import Array, Datum, attitude_from_rotation
+from missions.logs.bag_chunks import bounded_chunks
 from missions.logs.dive import DATED_AFTER_S, LoggedDive, Signal, cleaned, usable_positions
 from missions.logs.ros_rows import (
     ANGLES,
@@ -158,7 +159,7 @@ def _opened(path: Path) -> Iterator["AnyReader"]:
         RecursionError,
     )  # fmt: skip
     try:
-        with AnyReader([path], default_typestore=store) as reader:
+        with bounded_chunks(), AnyReader([path], default_typestore=store) as reader:
             yield reader
     except NavigationError:
         raise

@@ -1,6 +1,5 @@
 """Logs of vehicles: what `import-log`, `import-images`, `fly`, `plan check` and `identify` read."""
 
-import struct
 from collections.abc import Callable
 from datetime import UTC
 from functools import partial
@@ -189,26 +188,29 @@ def read_column_map(path: Path) -> object:
     return read(path)
 
 
-def swelling_mcap(packed: str, size: int) -> bytes:
-    """A log of one chunk that holds, or where it is not packed states, so many zeros."""
-    import lz4.frame
-    import zstandard
+def swelling_bag(folder: Path, packed: str, size: int) -> Path:
+    """A navigation log with one message more, of so many zeros, in packed chunks."""
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+    from rosbags.rosbag2 import Writer as Writer2
 
-    packers = {"zstd": zstandard.compress, "lz4": lz4.frame.compress}
-    content = packers[packed](bytes(size)) if packed else bytes(100)
+    from tests.missions.logs.log_files import Bag
 
-    def record(code: int, body: bytes) -> bytes:
-        return struct.pack("<BQ", code, len(body)) + body
-
-    def text(value: str) -> bytes:
-        return struct.pack("<I", len(value)) + value.encode()
-
-    head = record(1, text("ros2") + text("x"))
-    body = struct.pack("<QQQI", 0, 1, size, 0) + text(packed)
-    chunk = record(6, body + struct.pack("<Q", len(content)) + content)
-    end = record(15, struct.pack("<I", 0)) + record(2, struct.pack("<QQI", 0, 0, 0))
-    magic = b"\x89MCAP0\r\n"
-    return magic + head + chunk + end + magic
+    bag = Bag(1 if packed == "bz2" else 2)
+    bag.add_nav_sts(_START_NS, (41.7, 3.03, 5.0), (0.01, -0.02, 3.1), 2.5)
+    if packed == "bz2":
+        path = folder / "a.bag"
+        writer = Writer1(path)
+        writer.set_compression(Writer1.CompressionFormat.BZ2)
+    else:
+        path = folder / "a"
+        writer = Writer2(path, version=9, storage_plugin=StoragePlugin.MCAP)
+        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    with writer:
+        bag.fill(writer)
+        connection = writer.add_connection("/x", "std_msgs/msg/String", typestore=bag.store)
+        writer.write(connection, _START_NS, bytes(size))
+    return path if path.is_file() else path / "a.mcap"
 
 
 def read_foreign(path: Path) -> object:

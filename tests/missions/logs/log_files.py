@@ -186,6 +186,12 @@ class Bag:
                 self._write(bag, self.store.serialize_cdr)
         return path
 
+    def fill(self, bag: Any) -> None:
+        """Write the messages to an open writer."""
+        self._write(
+            bag, self.store.serialize_ros1 if self.version == 1 else self.store.serialize_cdr
+        )
+
     def _write(self, bag: Any, serialize: Any) -> None:
         connections: dict[str, Any] = {}
         for recorded_ns, topic, kind, message in sorted(self.rows, key=lambda row: row[0]):
