@@ -92,13 +92,13 @@ def _truth(figures: Figures) -> Section:
     score = figures.truth
     cameras, surface, mosaic = score["cameras"], score["surface"], score["mosaic"]
     rows: list[Sequence[str]] = [
-        ("cameras", _mm(cameras["rms_mm"]), _mm(cameras["max_mm"]), "position, worst at right"),
+        ("cameras", _mm(cameras["rms_mm"]), _mm(cameras["max_mm"]), "position, rms"),
         ("surface", _mm(surface["distance_rms_mm"]), _mm(surface["distance_max_mm"]),
-         "distance from the true surface, all cells"),
+         "distance from the true surface, rms over all cells"),
         ("mosaic", _mm(mosaic["position_rms_mm"]), _mm(mosaic["position_95_mm"]),
-         "position, 95 % at right"),
+         "position, rms; 95 % are below the larger one"),
         ("lengths", _mm(score["lengths"]["rms_mm"]), "",
-         f"over {length(score['lengths']['mean_length_m'])}"),
+         f"rms, over {length(score['lengths']['mean_length_m'])}"),
         ("dome", _mm(surface["doming"]["dome_mm"]), "", "bend of the whole surface"),
     ]  # fmt: skip
     seen = surface.get("seen_from_3_stations")
@@ -119,7 +119,7 @@ def _truth(figures: Figures) -> Section:
             f"{parts(1e-6 * cameras['scale_error_ppm'])} off."
         ],
         tables=[
-            Table(title="Errors", header=("what", "rms", "worst", "of"), rows=rows),
+            Table(title="Errors", header=("what", "error", "largest", "of"), rows=rows),
             Table(
                 title="Share of the area within so many ground pixels "
                 f"({length(1e-3 * surface['ground_pixel_mm'])}) of the truth",
@@ -130,7 +130,7 @@ def _truth(figures: Figures) -> Section:
         figures=_stills(figures.held, [
             ("evaluation/errors.png", "Where the surface errs",
              "Map and histogram of height errors.",
-             "Green and pale, without a slope or a dome.",
+             "Pale all over, without a slope or a dome.",
              "Errors at the rim come from few pictures; a dome from calibration."),
         ]),
     )  # fmt: skip
