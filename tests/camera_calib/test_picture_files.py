@@ -1,12 +1,15 @@
-"""JPEG files that end too early."""
+"""Picture files that end too early, or state more than they hold."""
 
+import struct
+import zlib
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
-from camera_calib.picture_files import is_cut_short
+from camera_calib.picture_files import MOST_PIXELS, is_cut_short, read_pixels, stated_size
 
 
 @pytest.mark.parametrize("progressive", [False, True])
@@ -28,3 +31,37 @@ def test_other_files_are_left_to_their_decoders(tmp_path: Path) -> None:
     Image.new("L", (8, 8)).save(tmp_path / "b.png")
     for name in ("a.jpg", "b.png", "missing.jpg"):
         assert not is_cut_short(tmp_path / name)
+
+
+def _stating(width: int, height: int) -> bytes:
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        whole = kind + data
+        return struct.pack(">I", len(data)) + whole + struct.pack(">I", zlib.crc32(whole))
+
+    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    body = chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(bytes(1000))) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + body
+
+
+def test_pictures_are_not_decoded_to_more_than_a_bound(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    for side, known in ((11_000, True), (12_000, False), (50_000, False)):
+        path.write_bytes(_stating(side, side))
+        size = stated_size(path)
+        assert size is not None
+        assert (size[0] * size[1] <= MOST_PIXELS) == known
+        assert read_pixels(path, cv2.IMREAD_COLOR) is None
+
+
+def test_pictures_are_read_as_opencv_reads_them(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    pixels = np.random.default_rng(1).integers(0, 65535, (5, 7, 3)).astype(np.uint16)
+    cv2.imwrite(str(path), pixels)
+    read = read_pixels(path, cv2.IMREAD_UNCHANGED)
+    assert read is not None
+    np.testing.assert_array_equal(read, pixels)
+    assert stated_size(path) == (7, 5)
+    for name in ("missing.png", "text.png"):
+        (tmp_path / "text.png").write_text("no picture")
+        assert stated_size(tmp_path / name) is None
+        assert read_pixels(tmp_path / name, cv2.IMREAD_UNCHANGED) is None

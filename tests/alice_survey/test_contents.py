@@ -1,0 +1,58 @@
+"""What is missing or changed in a file of ours ends in one line that names it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alice_survey.contents import one_line, read_arrays, shown, taken_from
+from alice_survey.errors import PlanError, WorkspaceError
+
+FILE = Path("frame.json")
+
+
+@pytest.mark.parametrize(
+    ("take", "told"),
+    [
+        (lambda data: data["b"], "lacks 'b'"),
+        (lambda data: data["a"]["c"], "not as it was written"),
+        (lambda data: float("x\ny"), "could not convert"),
+        (lambda data: float(10**400), "too large"),
+        (lambda data: data.items[0], "not subscriptable"),
+    ],
+)  # fmt: skip
+def test_what_is_not_there_names_the_file(take: object, told: str) -> None:
+    with pytest.raises(WorkspaceError, match=told) as fault, taken_from(FILE):
+        take({"a": [1, 2]})  # type: ignore[operator]
+    assert str(fault.value).startswith("frame.json: ")
+    assert "\n" not in str(fault.value)
+
+
+def test_known_faults_pass_and_the_kind_can_be_chosen() -> None:
+    with pytest.raises(PlanError, match="mine"), taken_from(FILE):
+        raise PlanError("mine")
+    with pytest.raises(PlanError, match="lacks 'x'"), taken_from(FILE, PlanError):
+        raise KeyError("x")
+
+
+def test_text_of_others_is_shown_on_one_line() -> None:
+    assert shown("a\x1b[31m\n b\u202e") == "a [31m b"
+    assert len(shown("x" * 10_000)) == 200
+    assert one_line(EOFError()) == "EOFError"
+
+
+def test_arrays_that_are_missing_or_damaged(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    with pytest.raises(WorkspaceError, match="no such file"):
+        read_arrays(path, "x")
+    np.savez(path, x=np.arange(5), y=np.array([{}], dtype=object))
+    np.testing.assert_array_equal(read_arrays(path, "x")["x"], np.arange(5))
+    with pytest.raises(WorkspaceError, match="lacks z"):
+        read_arrays(path, "x", "z")
+    with pytest.raises(WorkspaceError, match="damaged"):  # an object would be unpickled
+        read_arrays(path, "y")
+    whole = path.read_bytes()
+    for end in (0, 10, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:end])
+        with pytest.raises(WorkspaceError, match=r"a\.npz"):
+            read_arrays(path, "x")
