@@ -9,6 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey import progress
 from alice_survey.errors import CalibrationError
 from alice_survey.frames import Array
 from alice_survey.seafloor.noise import noise
@@ -53,6 +54,7 @@ class PoolBoard:
         return np.array([[low, low, 0], [right, low, 0], [right, bottom, 0], [low, bottom, 0]])
 
 
+@progress.step("place the board")
 def pool_poses(
     board: PoolBoard, rig: Rig, views: int, rng: np.random.Generator
 ) -> list[RigidTransform]:

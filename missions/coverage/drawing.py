@@ -16,6 +16,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from numpy.typing import NDArray
 from shapely.geometry import MultiPolygon
 
+from alice_survey import progress
 from alice_survey.frames import Array
 from missions.areas.area import Area
 from missions.coverage.certificate import Certificate
@@ -41,6 +42,7 @@ _CLASSES = 12
 """At most, of counts that are told apart."""
 
 
+@progress.step("draw the coverage")
 def draw_certificate(
     path: Path,
     certificate: Certificate,

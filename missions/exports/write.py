@@ -7,6 +7,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from alice_survey import progress
 from alice_survey.artefacts import atomic_path, read_stage
 from alice_survey.config import SurveyConfig, parse_config
 from alice_survey.errors import PlanError
@@ -44,6 +45,7 @@ class _Job:
         return mission_items(self.plan, self.dives[dive], self.tolerance_m)
 
 
+@progress.step("write missions for vehicles")
 def write_exports(
     folder: Path,
     plan: Plan,
