@@ -1,5 +1,7 @@
 """Commands that show a survey: the report, and the server for what is too large for one page."""
 
+from typing import Annotated
+
 import typer
 
 from alice_survey.cli_options import (
@@ -31,3 +33,23 @@ def report(
     from alice_survey.survey import run
 
     print_result(*run(["report"], workspace, survey, None, threads), as_json)
+
+
+@app.command(epilog=examples("view -w reef", "view -w reef --port 8000 --no-browser"))
+def view(
+    workspace: Workspace = WORK,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="To listen on; 0 for any that is free.")
+    ] = 0,
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")
+    ] = True,
+) -> None:
+    """Show a survey in a browser, however large.
+
+    Serves map, mesh and files of a workspace to this machine alone, at full resolution, until
+    Ctrl-C. A GIS can open its rasters by their addresses.
+    """
+    from alice_survey.view.run import run_view
+
+    run_view(workspace, port, browser=browser, tell=typer.echo)

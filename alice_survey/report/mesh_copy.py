@@ -34,17 +34,22 @@ def mesh_copy(held: Held, glb: Path) -> Mesh | None:
     whole = triangles <= _MOST_TRIANGLES
     scene = _shrunk(held.workspace / "mesh" / "mesh.glb") if whole else _relief(held)
     glb.write_bytes(scene.export(file_type="glb"))
-    about = (
-        f"{count(triangles, 'triangle')}, texture shrunk for the page."
-        if whole
-        else f"The elevation model under the mosaic, since the mesh's {triangles:,} triangles are "
-        "too many for a page."
-    )
     return Mesh(
         glb=glb,
-        about=about,
+        about=mesh_about(held),
         still=still(held.workspace / "mesh" / "mesh.png"),
         alt="The mesh seen from above and from the side",
+    )
+
+
+def mesh_about(held: Held) -> str:
+    """What the light copy is, in words."""
+    triangles = int(held.json("mesh/mesh.json")["triangles"])
+    if triangles <= _MOST_TRIANGLES:
+        return f"{count(triangles, 'triangle')}, texture shrunk for the page."
+    return (
+        f"The elevation model under the mosaic, since the mesh's {triangles:,} triangles are "
+        "too many for a page."
     )
 
 

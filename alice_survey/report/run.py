@@ -78,7 +78,7 @@ def build_report(held: Held, folder: Path) -> Report:
     layers: list[PictureLayer | ShapeLayer] = [*picture_layers(held), *shape_layers(held)]
     chart = None
     if layers:
-        chart = SurveyMap(layers=layers, unit=held.unit, origin=_origin(held))
+        chart = SurveyMap(layers=layers, unit=held.unit, origin=origin_of(held))
     mesh = mesh_copy(held, folder / "mesh.glb")
     parts = list(sections(figures, has_map=chart is not None, has_mesh=mesh is not None))
     parts.append(reproduce.section(figures))
@@ -106,7 +106,8 @@ def _subtitle(held: Held) -> str:
     return f"{kind}; {place}last worked on {when}"
 
 
-def _origin(held: Held) -> str:
+def origin_of(held: Held) -> str:
+    """Where a map of it counts from, in words."""
     datum = held.json("sparse/frame.json").get("datum") or held.json("plan/plan.json").get("datum")
     if datum and held.json("sparse/frame.json").get("name", "ned") == "ned":
         return (

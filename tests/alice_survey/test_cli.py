@@ -21,7 +21,7 @@ from alice_survey.survey import LOOP, init_survey
 COMMANDS = (
     "init", "fov", "target", "plan", "fly", "image", "calibrate", "import-images", "reconstruct",
     "scale", "evaluate", "run", "demo", "status", "camera", "vehicle", "import-log", "measure",
-    "control", "quality", "mosaic-tiles",
+    "control", "quality", "mosaic-tiles", "report", "view",
 )  # fmt: skip
 PACKAGE = Path(__file__).parents[2] / "alice_survey"
 

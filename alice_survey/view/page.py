@@ -1,0 +1,177 @@
+"""The pages that the server makes: the survey with its map, mesh and files, and lists of files."""
+
+import tempfile
+import threading
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+from urllib.parse import quote
+
+from alice_survey.report.document import (
+    Link,
+    Mesh,
+    PictureLayer,
+    Report,
+    Section,
+    ShapeLayer,
+    SurveyMap,
+)
+from alice_survey.report.held import Held
+from alice_survey.report.mesh_copy import mesh_about, mesh_copy
+from alice_survey.report.page import page_policy, render_html
+from alice_survey.report.pictures import still
+from alice_survey.report.run import origin_of
+from alice_survey.report.shapes import shape_layers
+from alice_survey.report.words import count, length
+from alice_survey.view.layers import PATHS, ChangedError, Layers
+from alice_survey.view.paths import Entry, Workspace
+
+_STILL_PX = 900
+_LINKS = (
+    ("report/report.html", "The report", "what was mapped, how well, what to do next"),
+    ("mosaic/mosaic.tif", "The mosaic", "cloud-optimised GeoTIFF"),
+    ("dense/dem.tif", "The elevation model", "GeoTIFF"),
+    ("dense/cloud.laz", "The point cloud", "LAZ"),
+    ("mesh/mesh.glb", "The mesh", "glTF"),
+    ("sparse/track.csv", "The cameras' track", "CSV"),
+    ("plan/plan.html", "The plan", "an interactive map"),
+)
+LISTING_POLICY = "default-src 'none'; base-uri 'none'; form-action 'none'"
+
+
+class Page:
+    """The survey's page and its mesh, made when asked for and kept while nothing changes."""
+
+    def __init__(self, workspace: Workspace, layers: Layers) -> None:
+        """Take a workspace and its layers."""
+        self._workspace, self._layers = workspace, layers
+        self._lock, self._mesh_lock = threading.Lock(), threading.Lock()
+        self._state, self._page = "", (b"", "")
+        self._mesh_state, self._mesh = "", b""
+
+    def survey(self, host: str) -> tuple[bytes, str]:
+        """The page of the survey as it is now, and its policy.
+
+        Args:
+            host: name and port, as the browser knows this server.
+
+        Raises:
+            WorkspaceError: a file of the workspace is damaged.
+            FileNotFoundError: a stage went away meanwhile.
+        """
+        with self._lock:
+            state = f"{host} {self._workspace.token(*PATHS)}"
+            if self._state != state:
+                report = self._report(host)
+                self._page = render_html(report).encode(), page_policy(report)
+                self._state = state
+            return self._page
+
+    def mesh(self, token: str | None) -> tuple[bytes, str]:
+        """The light copy of the mesh as binary glTF, and the token of the mesh.
+
+        Args:
+            token: of the mesh that the page knows; None for the one that is there.
+
+        Raises:
+            FileNotFoundError: there is no mesh.
+            ChangedError: there is another mesh by now.
+            WorkspaceError: it is damaged.
+        """
+        with self._mesh_lock, self._workspace.opened(("mesh", "mesh.glb")) as file:
+            if token is not None and token != file.token:
+                raise ChangedError
+            if self._mesh_state != file.token:
+                with tempfile.TemporaryDirectory(prefix="alice-survey-") as folder:
+                    path = Path(folder) / "mesh.glb"
+                    if mesh_copy(Held.of(self._workspace.folder), path) is None:
+                        raise FileNotFoundError("mesh")
+                    self._mesh = path.read_bytes()
+                self._mesh_state = file.token
+            return self._mesh, file.token
+
+    def _report(self, host: str) -> Report:
+        held = Held.of(self._workspace.folder)
+        pictures = self._layers.picture_layers()
+        layers: list[PictureLayer | ShapeLayer] = [*pictures, *shape_layers(held)]
+        chart = None
+        if layers:
+            chart = SurveyMap(layers=layers, unit=held.unit, origin=origin_of(held))
+        mesh = self._mesh_view(held)
+        parts = []
+        if chart is not None:
+            parts.append(Section(name="map", title="Map", scene="map"))
+        if mesh is not None:
+            parts.append(Section(name="mesh", title="Mesh", scene="mesh"))
+        parts.append(_files(self._workspace, host))
+        return Report(
+            title=held.name,
+            subtitle=f"{self._workspace.folder}, as it is now",
+            summary={},
+            facts=[(layer.title, _resolution(layer, held.unit)) for layer in pictures[:2]],
+            verdicts=(),
+            sections=parts,
+            map=chart,
+            mesh=mesh,
+        )
+
+    def _mesh_view(self, held: Held) -> Mesh | None:
+        path, picture = held.file("mesh/mesh.glb"), held.file("mesh/mesh.png")
+        if path is None or picture is None:
+            return None
+        with self._workspace.opened(("mesh", "mesh.glb")) as file:
+            token = file.token
+        return Mesh(
+            glb=path,
+            about=mesh_about(held),
+            still=still(picture, _STILL_PX),
+            alt="The mesh seen from above and from the side",
+            address=f"/mesh.glb?v={token}",
+        )
+
+
+def _resolution(layer: PictureLayer, unit: str) -> str:
+    pixel = length(layer.pixel_m, unit)
+    return f"{layer.width_px:,} by {layer.height_px:,} pixels of {pixel}"
+
+
+def _files(workspace: Workspace, host: str) -> Section:
+    links = [Link(text="All files", address="/files/", about="of this workspace")]
+    for path, text, about in _LINKS:
+        try:
+            with workspace.opened(path.split("/")):
+                links.append(Link(text=text, address=f"/files/{path}", about=f"({path}): {about}"))
+        except FileNotFoundError:
+            continue
+    return Section(
+        name="files",
+        title="Files",
+        text=[
+            "A GIS reads rasters from here part by part, without a copy: in QGIS add a raster "
+            f"layer with the protocol HTTP(S) and the address http://{host}/files/mosaic/mosaic.tif"
+        ],
+        links=links,
+    )
+
+
+def listing(names: Sequence[str], entries: Sequence[Entry], more: int) -> tuple[bytes, str]:
+    """A page that lists a folder, and its policy."""
+    title = "/".join(("files", *names))
+    rows = []
+    if names:
+        rows.append('<li><a href="../">..</a></li>')
+    for entry in entries:
+        mark = "/" if entry.is_folder else ""
+        size = "" if entry.is_folder else f" {count(entry.size, 'byte')}"
+        href = escape(quote(entry.name) + mark)
+        rows.append(f'<li><a href="./{href}">{escape(entry.name + mark)}</a>{size}</li>')
+    if more:
+        rows.append(f"<li>and {more:,} more</li>")
+    text = (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width,initial-scale=1">'
+        f'<link rel="icon" href="data:,"><title>{escape(title)}</title></head><body><main>'
+        f'<h1>{escape(title)}</h1><p><a href="/">The survey</a></p><ul>{"".join(rows)}</ul>'
+        "</main></body></html>\n"
+    )
+    return text.encode(), LISTING_POLICY

@@ -1,0 +1,36 @@
+"""The command `view`: serve a workspace until Ctrl-C."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from alice_survey.errors import WorkspaceError
+from alice_survey.report.held import Held
+from alice_survey.view.server import Server
+
+
+def run_view(workspace: Path, port: int, *, browser: bool, tell: Callable[[str], None]) -> None:
+    """Serve a workspace; Ctrl-C ends it as it ends every command.
+
+    Args:
+        workspace: to show.
+        port: to listen on; 0 for any that is free.
+        browser: open one.
+        tell: shows a line.
+
+    Raises:
+        WorkspaceError: there is nothing to show, or the port is taken.
+    """
+    if not Held.of(workspace).stages:
+        raise WorkspaceError(
+            f"{workspace} holds nothing to show: run 'alice-survey plan' or 'import-images'"
+        )
+    server = Server(workspace, port)
+    try:
+        tell(f"{workspace} is shown at {server.url} to this machine alone; Ctrl-C ends it")
+        if browser:
+            import webbrowser
+
+            webbrowser.open(server.url)
+        server.serve_forever()
+    finally:
+        server.server_close()

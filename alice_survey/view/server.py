@@ -1,0 +1,352 @@
+"""The server: who may ask for what, and how it is answered.
+
+It listens on the loopback address and answers GET and HEAD alone. A request whose Host is not this
+server by its address and port is refused, since a page of another site could otherwise reach it
+through a name of its own (DNS rebinding). Nothing allows another site to read an answer.
+"""
+
+import contextlib
+import re
+import socket
+import socketserver
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any, cast
+from urllib.parse import quote
+
+from alice_survey.errors import AliceError, WorkspaceError, known_fault, why
+from alice_survey.view.files import content_type, policy_of, send_part
+from alice_survey.view.layers import NAMES, ChangedError, Layers
+from alice_survey.view.page import Page, listing
+from alice_survey.view.paths import RefusedError, Workspace, names_of
+from alice_survey.view.pyramid import StoppedError
+from alice_survey.view.ranges import Version, answer_to
+
+ADDRESS = "127.0.0.1"
+_MOST_CONNECTIONS = 48
+_IDLE_S = 20.0
+"""After which a connection that says nothing is closed."""
+_BUSY_S = 2.0
+"""That a new connection waits while there are too many."""
+_ENDING_S = 3.0
+"""That answers under way are waited for in the end."""
+_TILE = re.compile(
+    rf"/tiles/({'|'.join(NAMES)})/([0-9]{{1,2}})/([0-9]{{1,6}})/([0-9]{{1,6}})\.webp"
+)
+_VERSION = re.compile(r"v=([0-9a-f-]{1,64})")
+_CHANGED = "the survey was worked on meanwhile: load the page again"
+_KEEP = "private, max-age=86400, immutable"
+"""Of what is asked for with its version."""
+_ASK_AGAIN = "no-cache"
+_NOTHING = "default-src 'none'; sandbox"
+_COMMON = {
+    "X-Content-Type-Options": "nosniff",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Frame-Options": "DENY",
+}
+
+
+class Server(ThreadingHTTPServer):
+    """Serves one workspace until it is shut down."""
+
+    daemon_threads = True
+    block_on_close = False
+    request_queue_size = 64
+
+    def __init__(self, folder: Path, port: int = 0) -> None:
+        """Listen.
+
+        Args:
+            folder: of the workspace.
+            port: 0 for any that is free.
+
+        Raises:
+            WorkspaceError: the port cannot be had.
+        """
+        self.workspace = Workspace(folder)
+        self.stopping = threading.Event()
+        self.layers = Layers(self.workspace, self.stopping)
+        self.page = Page(self.workspace, self.layers)
+        self._slots = threading.BoundedSemaphore(_MOST_CONNECTIONS)
+        self._connections: set[socket.socket] = set()
+        self._connections_lock = threading.Lock()
+        try:
+            super().__init__((ADDRESS, port), Handler)
+        except (OSError, OverflowError) as error:
+            raise WorkspaceError(
+                f"port {port} of {ADDRESS} cannot be had: {why(error)}: give another --port, or none"
+            ) from None
+        port = self.server_address[1]
+        self.hosts = {f"{ADDRESS}:{port}", f"localhost:{port}"}
+        if port == 80:
+            self.hosts |= {ADDRESS, "localhost"}
+
+    @property
+    def url(self) -> str:
+        """Where the survey's page is."""
+        return f"http://{ADDRESS}:{self.server_address[1]}/"
+
+    def server_bind(self) -> None:
+        """Bind, without asking a name server who this machine is."""
+        socketserver.TCPServer.server_bind(self)
+        self.server_name, self.server_port = ADDRESS, self.server_address[1]
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer a connection in a thread of its own, unless there are too many."""
+        if not self._slots.acquire(timeout=_BUSY_S):
+            with contextlib.suppress(OSError):
+                request.settimeout(0.1)
+                request.sendall(b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\n\r\n")
+            self.shutdown_request(request)
+            return
+        with self._connections_lock:
+            self._connections.add(request)
+        try:
+            super().process_request(request, client_address)
+        except BaseException:  # no thread could be started
+            self._forget(request)
+            raise
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Answer one connection."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._forget(request)
+
+    def _forget(self, request: socket.socket) -> None:
+        with self._connections_lock:
+            self._connections.discard(request)
+        self._slots.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A browser that goes away is no fault; a bug is told."""
+        if not isinstance(sys.exception(), (ConnectionError, TimeoutError)):
+            super().handle_error(request, client_address)
+
+    def server_close(self) -> None:
+        """Stop listening, and wait a little for the answers under way."""
+        self.stopping.set()
+        super().server_close()
+        with self._connections_lock:
+            for connection in self._connections:
+                with contextlib.suppress(OSError):
+                    connection.shutdown(socket.SHUT_RD)  # one that waits for a request ends
+        until = time.monotonic() + _ENDING_S
+        while self._connections and time.monotonic() < until:
+            time.sleep(0.01)
+        self.layers.close()
+
+
+class _AnsweredError(Exception):
+    """The answer is a status and a line of text."""
+
+    def __init__(self, status: HTTPStatus, text: str) -> None:
+        super().__init__(text)
+        self.status = status
+
+
+class Handler(BaseHTTPRequestHandler):
+    """Answers the requests of one connection."""
+
+    protocol_version = "HTTP/1.1"
+    timeout = _IDLE_S
+
+    @property
+    def _served(self) -> Server:
+        return cast(Server, self.server)
+
+    def version_string(self) -> str:
+        """What the server calls itself, to this machine's users."""
+        return "alice-survey"
+
+    def parse_request(self) -> bool:
+        """Read a request; one that is refused for how it asks is answered here."""
+        if not super().parse_request():
+            return False
+        try:
+            self._check_request()
+        except _AnsweredError as fault:
+            self.close_connection = True
+            self._tell(fault.status, str(fault))
+            return False
+        return True
+
+    def _check_request(self) -> None:
+        hosts = self.headers.get_all("Host") or []
+        if len(hosts) != 1:
+            raise _AnsweredError(HTTPStatus.BAD_REQUEST, f"{len(hosts)} Host headers, 1 expected")
+        if hosts[0].strip().lower() not in self._served.hosts:
+            raise _AnsweredError(
+                HTTPStatus.MISDIRECTED_REQUEST, f"this is {', '.join(sorted(self._served.hosts))}"
+            )
+        if self.command not in ("GET", "HEAD"):
+            raise _AnsweredError(HTTPStatus.METHOD_NOT_ALLOWED, "GET and HEAD alone are answered")
+        if "Transfer-Encoding" in self.headers or self.headers.get("Content-Length", "0") != "0":
+            raise _AnsweredError(HTTPStatus.BAD_REQUEST, "a request with a body")
+        if not self.path.startswith("/"):
+            raise _AnsweredError(HTTPStatus.BAD_REQUEST, "a request for another server")
+
+    def do_GET(self) -> None:
+        """Answer with a content."""
+        self._begun = False
+        try:
+            self._answer()
+        except _AnsweredError as fault:
+            self._tell(fault.status, str(fault))
+        except RefusedError as fault:
+            self._tell(HTTPStatus.BAD_REQUEST, str(fault))
+        except ChangedError:
+            self._tell(HTTPStatus.CONFLICT, _CHANGED)
+        except StoppedError:
+            self.close_connection = True
+            self._tell(HTTPStatus.SERVICE_UNAVAILABLE, "the server is shut down")
+        except FileNotFoundError:
+            self._tell(HTTPStatus.NOT_FOUND, "nothing is here")
+        except (ConnectionError, TimeoutError):
+            raise
+        except Exception as fault:
+            self.close_connection = True
+            known = known_fault(fault)
+            if not self._begun:
+                self._tell(HTTPStatus.INTERNAL_SERVER_ERROR, known or "a fault of the program")
+            if known is None:
+                raise
+
+    do_HEAD = do_GET  # noqa: N815
+
+    def _answer(self) -> None:
+        path, _, query = self.path.partition("?")
+        asked = _VERSION.fullmatch(query)
+        token = asked.group(1) if asked else None
+        tile = _TILE.fullmatch(path)
+        if path == "/":
+            self._send(*self._made_page(self.headers["Host"].strip()), "text/html; charset=utf-8")
+        elif tile:
+            name, level, x, y = tile.groups()
+            content, found = self._served.layers.tile(name, int(level), int(x), int(y), token)
+            self._send_versioned(content, f"{found}-{level}-{x}-{y}", "image/webp", token)
+        elif path == "/mesh.glb":
+            content, found = self._served.page.mesh(token)
+            self._send_versioned(content, found, "model/gltf-binary", token)
+        elif path == "/files":
+            self._go_to("/files/")
+        elif path.startswith("/files/"):
+            self._send_file(path.removeprefix("/files/"))
+        else:
+            raise FileNotFoundError(path)
+
+    def _made_page(self, host: str) -> tuple[bytes, str]:
+        """The survey's page; a stage that is made anew meanwhile is no damage."""
+        workspace = self._served.workspace
+        before = workspace.token()
+        try:
+            return self._served.page.survey(host)
+        except (AliceError, FileNotFoundError):
+            if workspace.token() == before:
+                raise
+            raise ChangedError from None
+
+    def _send_file(self, path: str) -> None:
+        workspace, names = self._served.workspace, names_of(path)
+        if path == "" or path.endswith("/"):
+            entries, more = workspace.listed(names)
+            self._send(*listing(names, entries, more), "text/html; charset=utf-8")
+            return
+        if workspace.is_folder(names):
+            self._go_to("/files/" + "/".join(quote(name) for name in names) + "/")
+            return
+        with workspace.opened(names) as file:
+            version = Version(token=file.token, modified_s=file.modified_ns / 1e9)
+            given = {name.lower(): text for name, text in self.headers.items()}
+            answer = answer_to(given, file.size, version, is_get=self.command == "GET")
+            headers = {
+                "Content-Type": content_type(names[-1]),
+                "Accept-Ranges": "bytes",
+                "ETag": version.tag,
+                "Last-Modified": version.date,
+            }
+            if answer.status == 206:
+                last = answer.first + answer.count - 1
+                headers["Content-Range"] = f"bytes {answer.first}-{last}/{file.size}"
+            elif answer.status == 416:
+                headers["Content-Range"] = f"bytes */{file.size}"
+            self._begin(answer.status, policy_of(names[-1]), answer.count, _ASK_AGAIN, headers)
+            if self.command == "GET" and answer.count:
+                sent = send_part(self.connection, file, answer.first, answer.count)
+                self.close_connection |= sent < answer.count  # it was cut short meanwhile
+
+    def _send(self, content: bytes, policy: str, kind: str) -> None:
+        """A page that is made anew for every request."""
+        self._begin(200, policy, len(content), _ASK_AGAIN, {"Content-Type": kind})
+        self._write(content)
+
+    def _send_versioned(self, content: bytes, found: str, kind: str, asked: str | None) -> None:
+        headers = {"Content-Type": kind, "ETag": f'"{found}"'}
+        keep = _KEEP if asked is not None else _ASK_AGAIN
+        if self.headers.get("If-None-Match") == headers["ETag"]:
+            self._begin(304, _NOTHING, 0, keep, headers)
+            return
+        self._begin(200, _NOTHING, len(content), keep, headers)
+        self._write(content)
+
+    def _go_to(self, place: str) -> None:
+        self._begin(HTTPStatus.MOVED_PERMANENTLY, _NOTHING, 0, _ASK_AGAIN, {"Location": place})
+
+    def _tell(self, status: HTTPStatus, text: str) -> None:
+        """Answer with a line."""
+        content = f"{text}\n".encode()
+        headers = {"Content-Type": "text/plain; charset=utf-8"}
+        if status == HTTPStatus.METHOD_NOT_ALLOWED:
+            headers["Allow"] = "GET, HEAD"
+        self._begin(status, _NOTHING, len(content), "no-store", headers)
+        self._write(content)
+
+    def _begin(
+        self, status: int, policy: str, length: int, keep: str, headers: Mapping[str, str]
+    ) -> None:
+        self._begun = True
+        self.send_response(status)
+        policy += "; frame-ancestors 'none'"
+        common = {**_COMMON, "Content-Security-Policy": policy, "Cache-Control": keep}
+        if status != HTTPStatus.NOT_MODIFIED:
+            common["Content-Length"] = str(length)
+        if self.close_connection:
+            common["Connection"] = "close"
+        for name, text in (common | dict(headers)).items():
+            self.send_header(name, text)
+        self.end_headers()
+
+    def _write(self, content: bytes) -> None:
+        if self.command != "HEAD":
+            self.wfile.write(content)
+
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+        """Answer what the request's own form forbids, like all else here."""
+        self.close_connection = True
+        self.command = self.command or "GET"
+        self._tell(HTTPStatus(code), message or explain or HTTPStatus(code).phrase)
+
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002
+        """Requests are not told of."""
+
+
+@contextlib.contextmanager
+def serving(folder: Path, port: int = 0) -> Iterator[Server]:
+    """A server that answers in a thread of its own within this block."""
+    server = Server(folder, port)
+    thread = threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True)
+    thread.start()
+    try:
+        yield server
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
