@@ -273,3 +273,19 @@ def test_weak_thrusters_are_read_from_their_texts() -> None:
     assert parse_health(None) is None
     with pytest.raises(ConfigError, match="NAME=SHARE"):
         parse_health(["bow=half"])
+
+
+def test_settings_without_end_are_refused_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "survey.toml"
+    for text, told in (
+        (f"a = {'9' * 5000}", "not valid TOML"),
+        ("a = " + "[" * 100_000, "not valid TOML"),
+        ("\n".join(f"k{i} = 1" for i in range(200)), "and 192 more"),
+        ('"a\\nb" = 1', "a b is not a known setting"),
+        ("#" * 1_000_001, "no settings file is that long"),
+    ):
+        path.write_text(text)
+        with pytest.raises(ConfigError, match=told) as fault:
+            load_config(path)
+        assert "\n" not in str(fault.value)
+        assert len(str(fault.value)) < 2000

@@ -121,3 +121,10 @@ def test_an_empty_track_is_told_in_one_line(tmp_path: Path) -> None:
     path.write_text(",".join(TRACK_COLUMNS) + "\n")
     with pytest.raises(NavigationError, match="no rows"):
         read_track(path)
+
+
+def test_a_cell_without_end_is_told_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "track.csv"
+    path.write_text(",".join(TRACK_COLUMNS) + "\n" + "1" * 200_000)
+    with pytest.raises(NavigationError, match=r"track\.csv: cannot be read"):
+        read_track(path)

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -6,8 +7,17 @@ import pytest
 import rasterio
 from pyproj import Transformer
 
+from alice_survey.errors import WorkspaceError
 from reconstruct.dense.dem import DemGrid
-from reconstruct.raster import crs_of, hillshade, local_crs, preview_dem, tiled_raster, tiles_of
+from reconstruct.raster import (
+    crs_of,
+    hillshade,
+    local_crs,
+    opened_raster,
+    preview_dem,
+    tiled_raster,
+    tiles_of,
+)
 from tests.oracles_dense import DATUM, FRAME
 
 GRID = DemGrid(west=-12.5, north=40.0, cell=0.25, rows=300, columns=420)
@@ -104,3 +114,21 @@ def test_preview_is_white_where_nothing_is_known(tmp_path):
     assert picture.shape == (150, 210, 3)
     assert (picture[:, 155:] == 255).all()
     assert (picture[5:-5, 5:145] < 255).any(axis=2).all()
+
+
+def test_a_damaged_raster_is_told_with_its_name(tmp_path: Path) -> None:
+    path = tmp_path / "dem.tif"
+    with pytest.raises(WorkspaceError, match="no such file"), opened_raster(path):
+        pass
+    with tiled_raster(path, GRID, FRAME, "float32", float("nan"), "height") as raster:
+        raster.write(heights(), 1)
+    with opened_raster(path) as raster:
+        np.testing.assert_array_equal(raster.read(1), heights())
+    whole = path.read_bytes()
+    for end in (0, 100, len(whole) // 2):
+        path.write_bytes(whole[:end])
+        with (
+            pytest.raises(WorkspaceError, match=r"dem\.tif: is damaged"),
+            opened_raster(path) as raster,
+        ):
+            raster.read(1)

@@ -159,3 +159,9 @@ def test_wrong_detections_are_one_line(
 def test_missing_detections_are_told(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match=r"none\.csv: cannot be read"):
         read_detections(tmp_path / "none.csv", CAMERAS)
+
+
+def test_reference_points_nested_without_end(tmp_path: Path) -> None:
+    path = written(tmp_path, "[" * 100_000)
+    with pytest.raises(CalibrationError, match="recursion"):
+        read_reference(path)

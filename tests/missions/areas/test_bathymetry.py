@@ -294,3 +294,26 @@ def test_a_window_of_a_real_grid_equals_gdals_own_samples(real: tuple[Path, Datu
         heights = [float(value[0]) for value in file.sample(zip(x, y, strict=True))]
     np.testing.assert_allclose(window.depth_at(centres), -np.array(heights), atol=1e-5)
     assert window.depth_m.size < 180 * 180
+
+
+def test_a_description_of_other_files_is_not_followed(tmp_path: Path) -> None:
+    real = _written(tmp_path / "real.tif", np.full((20, 20), 15.0))
+    other = tmp_path / "a.tif"
+    other.write_text(
+        '<VRTDataset rasterXSize="20" rasterYSize="20"><VRTRasterBand band="1"><SimpleSource>'
+        f"<SourceFilename>{real}</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"
+    )
+    with pytest.raises(PlanError, match=r"a\.tif: is no raster but tells of other files"):
+        read_bathymetry(other, DATUM)
+    with pytest.raises(PlanError, match="no such file"):
+        read_bathymetry(tmp_path / "none.tif", DATUM)
+
+
+def test_points_that_span_far_more_than_they_fill(tmp_path: Path) -> None:
+    rows = [f"{x} {y} 15" for y in range(20) for x in range(20)]
+    path = tmp_path / "a.xyz"
+    path.write_text("\n".join(rows) + "\n")
+    assert read_bathymetry(path, DATUM, crs=UTM, sense="depths").depth_m.shape == (20, 20)
+    path.write_text("\n".join([*rows, "900000 20 15"]) + "\n")
+    with pytest.raises(PlanError, match="a coordinate is wrong"):
+        read_bathymetry(path, DATUM, crs=UTM, sense="depths")

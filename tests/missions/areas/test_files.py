@@ -343,3 +343,37 @@ def test_wkt_whose_srid_contradicts_crs_is_refused() -> None:
     assert "SRID=4326 and crs is EPSG:32636" in refusal(
         wkt="SRID=4326;POLYGON ((0 0, 1 0, 1 1, 0 0))", crs="EPSG:32636"
     )
+
+
+def test_files_whose_side_files_are_damaged(tmp_path: Path) -> None:
+    shp = shapefile(tmp_path)
+    prj = shp.with_suffix(".prj")
+    whole = prj.read_bytes()
+    for spoilt in (b"PROJCS[", b"\xff\xfe\0", whole.replace(b"6378137.0", b"-1")):
+        prj.write_bytes(spoilt)
+        assert "site.shp" in refusal(file=shp)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "told"),
+    [
+        ("a.wkt", "GEOMETRYCOLLECTION (" * 50_000, "nests over 20 brackets"),
+        ("a.wkt", f"SRID={'9' * 40};POLYGON ((0 0, 1 0, 1 1, 0 0))", "a.wkt: SRID=999"),
+        ("a.geojson", f'{{"type": "Polygon", "coordinates": [[[{"9" * 5000}, 1]]]}}', "no JSON"),
+        ("a.kml", '<?xml version="1.0" encoding="cp99"?><kml/>', "no KML"),
+    ],
+)  # fmt: skip
+def test_text_that_would_harm_its_reader(tmp_path: Path, name: str, text: str, told: str) -> None:
+    (tmp_path / name).write_text(text)
+    assert told in refusal(file=tmp_path / name)
+
+
+def test_archives_packed_in_an_unknown_way(tmp_path: Path) -> None:
+    file = zipped(tmp_path / "a.kmz", {"doc.kml": b"<kml/>"})
+    whole = bytearray(file.read_bytes())
+    at = whole.find(b"PK\1\2")
+    for place, value in ((6, 99), (10, 77), (8, 0x801)):
+        spoilt = bytearray(whole)
+        spoilt[at + place : at + place + 2] = value.to_bytes(2, "little")
+        file.write_bytes(spoilt)
+        assert "a.kmz" in refusal(file=file)

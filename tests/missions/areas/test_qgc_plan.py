@@ -140,3 +140,12 @@ def test_another_layer_can_be_asked_for(write: Any) -> None:
         area_of(file=path)
     with pytest.raises(PlanError, match="not 'fence'"):
         area_of(file=path, layer="fence")
+
+
+def test_numbers_beyond_all_measure_are_refused(write: Any) -> None:
+    item = {"complexItemType": "survey", "polygon": [[10**400, 35.0], *POLYGON[1:]]}
+    with pytest.raises(PlanError, match="not as QGroundControl"):
+        area_of(file=write({**plan_of(), "mission": {"items": [item]}}))
+    item = {"complexItemType": "CorridorScan", "polyline": POLYGON, "CorridorWidth": 1e300}
+    with pytest.raises(PlanError, match="CorridorWidth is 1e"):
+        area_of(file=write({**plan_of(), "mission": {"items": [item]}}))

@@ -319,3 +319,18 @@ def test_pictures_off_the_plan_are_lines_of_their_own_when_straight() -> None:
     np.testing.assert_array_equal(lines[: len(exact)], exact.line)
     np.testing.assert_array_equal(lines[-9:-4], len(LINES))
     np.testing.assert_array_equal(lines[-4:], -1)
+
+
+def test_logs_and_lines_beyond_all_measure(
+    dive: tuple[Path, Path, Stations], tmp_path: Path
+) -> None:
+    log = dive[0]
+    with log.open(newline="") as file:
+        header, *rows = csv.reader(file)
+    rows[-1][header.index("time_s")] = "1e300"
+    write_csv(tmp_path / "long.csv", header, rows)
+    with pytest.raises(NavigationError, match=r"long\.csv: spans 1e\+300 s"):
+        read_dive_record(tmp_path / "long.csv", PLAN, RIG)
+    (tmp_path / "t.csv").write_text(f"time_s,line\n1,{'9' * 30}\n")
+    with pytest.raises(NavigationError, match=r"t\.csv line 2: line is 999"):
+        read_dive_record(log, PLAN, RIG, triggers=tmp_path / "t.csv")

@@ -119,3 +119,19 @@ def test_pictures_without_navigation_are_named(
     assert "1 pictures" in told
     assert "b.jpg" in told
     assert "a.jpg" not in told
+
+
+@pytest.mark.parametrize("date", ["0001-01-01T00:00:00+23:59", "9999-12-31T23:59:59-12:00"])
+def test_dates_that_no_clock_in_utc_shows_are_left_out(
+    tmp_path: Path, date: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    header = HEADER.replace("time_s", "time_utc")
+    rows = [f"{date},60,5,1,0,2", "2024-05-01T12:00:00Z,60,5,1,0,2"]
+    assert len(read_navigation(log_file(tmp_path, *rows, header=header), UTC).time_s) == 1
+    assert "not a date" in capsys.readouterr().err
+
+
+def test_names_of_columns_stay_on_one_line(tmp_path: Path) -> None:
+    with pytest.raises(NavigationError) as fault:
+        read_navigation(log_file(tmp_path, "1,2", header='"a\nb",c'), UTC)
+    assert "\n" not in str(fault.value)

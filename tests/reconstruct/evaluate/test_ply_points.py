@@ -40,7 +40,9 @@ def test_points_of_every_format(tmp_path: Path, kind: str) -> None:
     np.testing.assert_allclose(read_ply_points(path, 1000), XYZ, rtol=1e-15)
     np.testing.assert_allclose(read_ply_points(path, 20), XYZ[::3], rtol=1e-15)
     ply(path, kind, "offset_east_north_up 10 20 -5")
-    np.testing.assert_allclose(read_ply_points(path, 1000), XYZ + np.array([10, 20, -5]), rtol=1e-12)
+    np.testing.assert_allclose(
+        read_ply_points(path, 1000), XYZ + np.array([10, 20, -5]), rtol=1e-12
+    )
 
 
 @pytest.mark.parametrize("kind", FORMATS)

@@ -1,5 +1,6 @@
 """A survey is laid on a reference of any kind, and its distance from it is what was put in."""
 
+import struct
 from pathlib import Path
 
 import laspy
@@ -204,3 +205,35 @@ def test_a_real_cloud_is_read_in_local_metres(shared_data: Path) -> None:
     assert len(points) == 940_393
     assert np.abs(points[:, :2]).max() < 120
     assert 150 < points[:, 2].min() < points[:, 2].max() < 175
+
+
+def test_packed_points_that_are_damaged_are_refused(tmp_path: Path) -> None:
+    """Unpacking them here would end the program."""
+    header = laspy.LasHeader(point_format=3, version="1.4")
+    header.offsets, header.scales = [0.0, 0.0, 0.0], [1e-3] * 3
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = ground(np.random.default_rng(7), 3_000).T
+    path = tmp_path / "c.laz"
+    cloud.write(str(path))
+    whole = path.read_bytes()
+    at = struct.unpack_from("<I", whole, 96)[0] + 8
+    spoilt = [
+        whole[: at + 100] + b"\xff" * 2000 + whole[at + 2100 :],
+        whole[:at] + b"\xff" * 500 + whole[at + 500 :],
+        whole[: len(whole) // 2],
+        whole[: at - 8] + struct.pack("<q", len(whole) - 8) + whole[at:-4] + b"\xff" * 4,
+        whole[:100] + struct.pack("<I", 1 << 31) + whole[104:],
+        whole[:243] + struct.pack("<I", 1 << 31) + whole[247:],
+    ]
+    for data in spoilt:
+        path.write_bytes(data)
+        try:
+            points, _ = read_reference(path, DATUM)
+        except WorkspaceError as error:
+            assert str(path) in str(error)
+            assert "\n" not in str(error)
+        else:  # damage that a decoder cannot see
+            assert np.isfinite(points).all()
+    path.write_bytes(spoilt[2])
+    with pytest.raises(WorkspaceError, match=r"cut short|chunks"):
+        read_reference(path, DATUM)

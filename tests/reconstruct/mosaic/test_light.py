@@ -1,8 +1,10 @@
 import numpy as np
 import pytest
 
+from alice_survey.errors import WorkspaceError
 from reconstruct.mosaic.light import (
     GRID,
+    LightModel,
     LightSamples,
     at_nodes,
     at_places,
@@ -194,3 +196,18 @@ def test_nodes_take_the_picture_and_leave_out_the_dark():
     assert nodes.shape == (*GRID, 3)
     np.testing.assert_allclose(nodes[:, -3:], np.log(90), rtol=1e-6)
     assert np.isnan(nodes[:, :3]).all()
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [('"white": [', '"white": [5, '), ('"gains"', '"gain"'), ("1.0", '"x"')]
+)
+def test_a_light_file_that_was_changed_names_itself(tmp_path, old: str, new: str):
+    light = LightModel(
+        patterns={"left": np.ones((3, 4, 3))}, gains={"a": np.ones(3)}, white=np.ones(3)
+    )
+    write_light(tmp_path / "light.json", light)
+    text = (tmp_path / "light.json").read_text()
+    assert old in text
+    (tmp_path / "light.json").write_text(text.replace(old, new, 1))
+    with pytest.raises(WorkspaceError, match=r"light\.json"):
+        read_light(tmp_path / "light.json")

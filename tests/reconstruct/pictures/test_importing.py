@@ -1,7 +1,9 @@
 import csv
 import struct
 from collections.abc import Callable
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +15,7 @@ from alice_survey.config import CameraConfig, WaterConfig
 from alice_survey.errors import AliceError, ImageError, WorkspaceError
 from alice_survey.manifest import read_manifest
 from camera_calib.rig import design_rig, read_rig, write_rig
+from reconstruct.pictures.files import inspect
 from reconstruct.pictures.importing import import_images
 
 Draw = Callable[..., Path]
@@ -399,3 +402,32 @@ def test_raw_pictures_are_developed_alike(
     light = ((bright[inner] / 255.0 + 0.099) / 1.099) ** (1 / 0.45)  # BT.709 undone
     expected = 255.0 * (1.099 * (light / 2) ** 0.45 - 0.099)
     assert np.abs(dim[inner] - expected).max() < 2.0
+
+
+@pytest.mark.parametrize(
+    ("tags", "taken"),
+    [
+        ({0x9003: "2024:05:01 12:00:00", 0x9011: "+02:00"}, datetime(2024, 5, 1, 10, tzinfo=UTC)),
+        ({0x9003: "2024:05:01 12:00:00", 0x9011: "+99:99"}, datetime(2024, 5, 1, 12)),
+        ({0x9003: "0001:01:01 00:00:00", 0x9011: "+23:59"}, None),
+        ({0x9003: "9999:12:31 23:59:59"}, None),
+    ],
+)  # fmt: skip
+def test_dates_of_exif_that_cannot_be(tmp_path: Path, tags: Any, taken: datetime | None) -> None:
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update(tags)
+    Image.new("RGB", (48, 32)).save(tmp_path / "a.jpg", exif=exif)
+    assert inspect(tmp_path / "a.jpg").time_local == taken
+
+
+def test_positions_of_exif_that_are_no_angles(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif.get_ifd(0x8825).update({2: 5.0, 4: (1.0, 2.0), 6: 3.0})
+    Image.new("RGB", (48, 32)).save(tmp_path / "a.jpg", exif=exif)
+    facts = inspect(tmp_path / "a.jpg")
+    assert (facts.fault, facts.latitude_deg, facts.longitude_deg) == ("", None, None)
+
+
+def test_a_picture_that_states_more_than_can_be_read(tmp_path: Path) -> None:
+    Image.new("1", (13_000, 13_000)).save(tmp_path / "a.png")
+    assert inspect(tmp_path / "a.png").fault == "states over 128 million pixels: make it smaller"

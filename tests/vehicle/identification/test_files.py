@@ -209,3 +209,23 @@ def test_damping_must_damp(tmp_path: Path) -> None:
     path.write_text('{"a": -14.0}')
     with pytest.raises(VehicleError, match=r"found.json: coefficient 'a' is not known"):
         coefficients_from_file(path)
+
+
+def test_numbers_and_nesting_without_end(tmp_path: Path) -> None:
+    path = tmp_path / "v.json"
+    for text in ("[" * 100_000, f'{{"X_uu": {"9" * 400}}}', f'{{"X_uu": {"9" * 5000}}}'):
+        path.write_text(text)
+        with pytest.raises(VehicleError, match=r"v\.json"):
+            coefficients_from_file(path)
+    path = tmp_path / "map.toml"
+    for text in ("a = " + "[" * 100_000, f"time_step_s = {'9' * 5000}", "\xff"):
+        path.write_text(text, encoding="latin-1")
+        with pytest.raises(VehicleError, match=r"map\.toml"):
+            read_column_map(path)
+
+
+def test_a_log_of_texts_alone(tmp_path: Path) -> None:
+    (tmp_path / "map.toml").write_text("time_step_s = 0.1")
+    (tmp_path / "log.csv").write_text("a,b\nx,y\n")
+    with pytest.raises(VehicleError, match=r"log\.csv: holds no column of numbers"):
+        read_foreign_log(tmp_path / "log.csv", read_column_map(tmp_path / "map.toml"))
