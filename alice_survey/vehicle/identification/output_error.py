@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from alice_survey.errors import VehicleError
 from alice_survey.executor import progress
 from alice_survey.frames import Array
+from alice_survey.progress import step as named_step
 from alice_survey.vehicle.identification.noise import (
     autocovariance,
     noise_sigma,
@@ -108,6 +109,7 @@ class Fit:
         return matrix
 
 
+@named_step("fit to the logs")
 def fit_output_error(
     windows: Sequence[Window],
     parameters: Parameters,
