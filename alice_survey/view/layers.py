@@ -134,11 +134,16 @@ class Layers:
             kept = self._kept(key)
             if kept is None:
                 with self._renderers:
-                    kept = self._kept(key) or encoded(painted(raster.pyramid, raster, level, x, y))
+                    kept = self._kept(key) or encoded(_painted(raster, level, x, y))
                 if not raster.file.is_unchanged():
                     raise ChangedError
                 self._keep(key, kept)
             return kept, raster.file.token
+
+    def painted(self, name: str, level: int, x: int, y: int) -> Rgba:
+        """A tile's pixels before they are encoded; see `tile`."""
+        with self._used(name) as raster:
+            return _painted(raster, level, x, y)
 
     def _kept(self, key: tuple[str, ...]) -> bytes | None:
         with self._lock:
@@ -245,12 +250,13 @@ def _file_of(name: str) -> str:
     return numbers.file
 
 
-def painted(pyramid: Pyramid, raster: _Raster, level: int, x: int, y: int) -> Rgba:
+def _painted(raster: _Raster, level: int, x: int, y: int) -> Rgba:
     """A tile's pixels.
 
     Raises:
         FileNotFoundError: there is no such tile.
     """
+    pyramid = raster.pyramid
     finest = len(pyramid.levels) - 1 - level
     if not 0 <= finest < len(pyramid.levels):
         raise FileNotFoundError(f"level {level}")

@@ -79,9 +79,9 @@ class Server(ThreadingHTTPServer):
         self._connections_lock = threading.Lock()
         try:
             super().__init__((ADDRESS, port), Handler)
-        except (OSError, OverflowError) as error:
+        except OSError as error:
             raise WorkspaceError(
-                f"port {port} of {ADDRESS} cannot be had: {why(error)}: give another --port, or none"
+                f"port {port} of {ADDRESS}: {why(error)}: give another --port, or none"
             ) from None
         port = self.server_address[1]
         self.hosts = {f"{ADDRESS}:{port}", f"localhost:{port}"}

@@ -1,0 +1,49 @@
+"""Requests as no browser would send them, byte by byte."""
+
+import socket
+from dataclasses import dataclass
+from http.client import HTTPResponse
+
+from alice_survey.view.server import Server
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reply:
+    status: int
+    headers: dict[str, str]
+    body: bytes
+
+    @property
+    def text(self) -> str:
+        return self.body.decode()
+
+
+def ask(
+    server: Server,
+    path: str,
+    headers: dict[str, str] | None = None,
+    *,
+    method: str = "GET",
+    host: str | None = "",
+) -> Reply:
+    """Send a request whose path is not touched.
+
+    Args:
+        server: to ask.
+        path: as it goes over the wire.
+        headers: beside Host.
+        method: any word.
+        host: the server's own if empty; None for no such header.
+    """
+    port = server.server_address[1]
+    lines = [f"{method} {path} HTTP/1.1", "Connection: close"]
+    if host is not None:
+        lines.append(f"Host: {host or f'127.0.0.1:{port}'}")
+    lines += [f"{name}: {text}" for name, text in (headers or {}).items()]
+    with socket.create_connection(("127.0.0.1", port), timeout=20) as connection:
+        connection.sendall("\r\n".join([*lines, "", ""]).encode("utf-8", "surrogateescape"))
+        response = HTTPResponse(connection, method=method)
+        response.begin()
+        body = response.read()
+        found = {name.lower(): text for name, text in response.getheaders()}
+    return Reply(status=response.status, headers=found, body=body)

@@ -1,0 +1,221 @@
+"""Every level of a raster against the obvious mean, and every tile against its level."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from numpy.typing import NDArray
+from rasterio.transform import Affine
+
+from alice_survey.report.colours import TILE_PX, coloured, limits_of, number_rasters
+from alice_survey.view.layers import ChangedError, Layers
+from alice_survey.view.paths import Workspace
+from alice_survey.view.pyramid import (
+    Pyramid,
+    Reader,
+    read_counts,
+    read_numbers,
+    read_painted,
+    tiles_of_level,
+)
+from tests.alice_survey.report.tiny import tiny_workspace
+
+ROWS, COLUMNS = 1301, 1110
+"""Odd, so that no border falls on a whole pixel of a coarser level."""
+Array = NDArray[Any]
+
+
+def written(path: Path, bands: Array, **more: Any) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    profile = {
+        "driver": "GTiff", "count": len(bands), "height": bands.shape[1], "width": bands.shape[2],
+        "dtype": bands.dtype, "tiled": True, "blockxsize": 256, "blockysize": 256,
+        "compress": "deflate", "transform": Affine(0.01, 0, -3.0, 0, -0.01, 7.0), **more,
+    }  # fmt: skip
+    with rasterio.open(path, "w", **profile) as raster:
+        raster.write(bands)
+    return path
+
+
+def heights() -> Array:
+    rows, columns = np.mgrid[:ROWS, :COLUMNS].astype(np.float32)
+    found = -12 + 0.4 * np.sin(columns / 60) + 0.3 * np.cos(rows / 45) + 1e-4 * rows
+    found[rows + columns < 500] = np.nan
+    found[(rows - 900) ** 2 + (columns - 700) ** 2 < 90**2] = np.nan
+    return found.astype(np.float32)
+
+
+def painting() -> Array:
+    rows, columns = np.mgrid[:ROWS, :COLUMNS]
+    bands = np.stack([rows % 256, columns % 256, (rows + columns) % 256, 255 + 0 * rows])
+    bands[3, rows * 0.7 + columns < 400] = 0
+    return bands.astype(np.uint8)
+
+
+def mean_of_known(values: Array, weight: Array, side: int) -> tuple[Array, Array]:
+    """Over squares, in double precision; beyond the border nothing weighs anything."""
+    high, wide = (-(-length // side) for length in weight.shape)
+    padding = ((0, high * side - weight.shape[0]), (0, wide * side - weight.shape[1]))
+    squares = (high, side, wide, side)
+    shares = np.pad(weight.astype(float), padding).reshape(squares)
+    total = (np.pad(values.astype(float), padding).reshape(squares) * shares).sum(axis=(1, 3))
+    sums = shares.sum(axis=(1, 3))
+    return total / np.where(sums > 0, sums, np.nan), sums / side**2
+
+
+@pytest.mark.parametrize("most_kept_px", [10_000_000, 1])
+def test_levels_are_means_of_what_is_known(tmp_path: Path, most_kept_px: int) -> None:
+    values = heights()
+    path = written(tmp_path / "a.tif", values[None], nodata=np.nan)
+    pyramid = Pyramid(str(path), read_numbers, most_kept_px=most_kept_px)
+    assert [(s.columns, s.rows) for s in pyramid.levels] == [(1110, 1301), (555, 651), (278, 326)]
+    assert [s.east for s in pyramid.levels] == pytest.approx([0.01, 0.02, 0.04])
+    known = np.isfinite(values)
+    for level, size in enumerate(pyramid.levels):
+        part = pyramid.part(level, 0, 0, size.columns, size.rows)
+        mean, cover = mean_of_known(np.where(known, values, 0), known.astype(float), 2**level)
+        np.testing.assert_allclose(part.weight, cover, atol=1e-6)
+        np.testing.assert_allclose(part.values[0][cover > 0], mean[cover > 0], atol=4e-6)
+        inner = pyramid.part(level, 31, 17, size.columns, 203)
+        np.testing.assert_allclose(inner.values, part.values[:, 17:203, 31:], atol=2e-6)
+
+
+def test_counts_of_zero_are_unknown(tmp_path: Path) -> None:
+    counts = np.zeros((1, 600, 600), np.uint8)
+    counts[0, :, 301:] = 4
+    part = Pyramid(str(written(tmp_path / "a.tif", counts)), read_counts).part(1, 0, 0, 300, 300)
+    assert set(part.values[0, :, 150:].ravel()) == {4.0}
+    assert set(part.weight[0]) == {0.0, 0.5, 1.0}
+
+
+def test_a_mosaics_own_levels_are_shown_as_they_are(tmp_path: Path) -> None:
+    bands = painting()
+    plain = written(tmp_path / "plain.tif", bands, photometric="RGB", alpha="YES")
+    cog = tmp_path / "cog.tif"
+    with rasterio.open(plain) as raster:
+        from rasterio.shutil import copy
+
+        copy(raster, cog, driver="COG", blocksize=512, overview_resampling="average")
+    pyramid = Pyramid(str(cog), read_painted)
+    assert [size.own for size in pyramid.levels] == [0, 1, 2]
+    for number in (1, 2):
+        size = pyramid.levels[number]
+        with rasterio.open(cog, overview_level=number - 1) as raster:
+            own = raster.read()
+            assert (size.rows, size.columns) == raster.shape
+        part = pyramid.part(number, 5, 9, size.columns, size.rows)
+        np.testing.assert_array_equal(part.values, own[:3, 9:, 5:])
+        assert size.columns * size.east == pytest.approx(COLUMNS * 0.01)
+        assert size.rows * size.north == pytest.approx(ROWS * 0.01)
+
+
+def test_a_mosaic_without_levels_is_averaged_without_what_is_clear(tmp_path: Path) -> None:
+    bands = painting()
+    path = written(tmp_path / "a.tif", bands, photometric="RGB", alpha="YES")
+    pyramid = Pyramid(str(path), read_painted)
+    part = pyramid.part(1, 0, 0, 555, 651)
+    for band in range(3):
+        mean, cover = mean_of_known(bands[band].astype(float), bands[3] / 255.0, 2)
+        np.testing.assert_allclose(part.values[band][cover > 0], mean[cover > 0], atol=1e-4)
+
+
+def reading(path: Path, numbers: Any) -> Reader:
+    if numbers is None:
+        return read_painted
+    return read_counts if numbers.counted else read_numbers
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A workspace whose rasters take several tiles."""
+    workspace = tiny_workspace(tmp_path_factory.mktemp("layers"))
+    values = heights()
+    seen = np.where(np.isfinite(values), 3, 0).astype(np.uint8)
+    seen[:, 600:] += (seen[:, 600:] > 0).astype(np.uint8)
+    for name, bands in {
+        "dense/dem": values, "dense/sigma": 1e-3 * np.abs(values), "dense/slope": -values,
+        "evaluation/error": 1e-3 * (values + 12), "dense/stations": seen,
+    }.items():  # fmt: skip
+        nodata = np.nan if bands.dtype == np.float32 else None
+        written(workspace / f"{name}.tif", bands[None], nodata=nodata)
+    written(workspace / "mosaic" / "mosaic.tif", painting(), photometric="RGB", alpha="YES")
+    return workspace
+
+
+@pytest.mark.parametrize("name", ["mosaic", "height", "error", "stations"])
+def test_tiles_make_the_whole_level(folder: Path, name: str) -> None:
+    """Pixel by pixel before compression, shade included: no seams, no shift, one colour scale."""
+    layers = Layers(Workspace(folder))
+    shown = {layer.name: layer for layer in layers.picture_layers()}[name]
+    numbers = next((n for n in number_rasters("m") if n.name == name), None)
+    path = folder / ("mosaic/mosaic.tif" if numbers is None else numbers.file)
+    pyramid = Pyramid(str(path), reading(path, numbers))
+    for level in range(shown.levels):
+        size = pyramid.levels[shown.levels - 1 - level]
+        assert shown.size(level) == (size.columns, size.rows, size.east, size.north)
+        part = pyramid.part(shown.levels - 1 - level, 0, 0, size.columns, size.rows)
+        if numbers is None:
+            whole = np.dstack([*np.rint(part.values), np.where(part.weight < 0.5, 0, 255)])
+        else:
+            assert shown.scale is not None
+            with pyramid.opened() as raster:
+                limits = limits_of(raster, numbers)
+            assert limits == (shown.scale.low, shown.scale.high)
+            values = numbers.levels(np.where(part.weight > 0, part.values[0], np.nan))
+            whole = coloured(values, numbers, limits, size.east)
+        columns, rows = tiles_of_level(size)
+        sheet = np.zeros_like(whole)
+        for x in range(columns):
+            for y in range(rows):
+                tile = layers.painted(name, level, x, y)
+                top, left = y * TILE_PX, x * TILE_PX
+                sheet[top : top + tile.shape[0], left : left + tile.shape[1]] = tile
+        # Means may differ in the last bit, and then a colour by one.
+        assert np.abs(sheet.astype(int) - whole).max() <= 1
+        assert (sheet == whole).mean() > 0.999
+    layers.close()
+
+
+def test_encoded_tiles_show_the_rasters_own_pixels(folder: Path) -> None:
+    layers = Layers(Workspace(folder))
+    content, token = layers.tile("mosaic", 2, 1, 2, None)
+    tile = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert tile.shape[:2] == (ROWS - 2 * TILE_PX, TILE_PX)
+    for row, column in ((40, 300), (170, 90), (250, 400)):
+        red, green = tile[row, column, 2], tile[row, column, 1]
+        assert abs(int(red) - (2 * TILE_PX + row) % 256) < 12
+        assert abs(int(green) - (TILE_PX + column) % 256) < 12
+    assert layers.tile("mosaic", 2, 1, 2, token) == (content, token)
+    with pytest.raises(ChangedError):
+        layers.tile("mosaic", 2, 1, 2, "another")
+    for missing in ((3, 0, 0), (2, 3, 0), (2, 0, 3), (-1, 0, 0)):
+        with pytest.raises(FileNotFoundError):
+            layers.tile("mosaic", *missing, None)
+    layers.close()
+
+
+def test_limits_of_a_large_raster_are_close_to_those_of_all_its_values(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    values = np.kron(rng.normal(0, 1, (40, 40)), np.ones((60, 60))).astype(np.float32)
+    values += rng.normal(0, 0.1, values.shape).astype(np.float32)
+    values[:1200, :900] = np.nan
+    numbers = next(n for n in number_rasters("m") if n.name == "height")
+    with rasterio.open(written(tmp_path / "a.tif", values[None], nodata=np.nan)) as raster:
+        limits = limits_of(raster, numbers)
+    expected = np.nanpercentile(values, [1, 99])
+    assert limits == pytest.approx(tuple(expected), abs=0.15)
+
+
+def test_a_raster_of_one_row_and_one_without_a_value(tmp_path: Path) -> None:
+    workspace = tiny_workspace(tmp_path)
+    written(workspace / "dense" / "dem.tif", np.full((1, 1, 700), -3, np.float32), nodata=np.nan)
+    written(workspace / "dense" / "sigma.tif", np.full((1, 9, 7), np.nan, np.float32))
+    layers = Layers(Workspace(workspace))
+    assert layers.painted("height", 0, 0, 0).shape == (1, 350, 4)
+    assert not layers.painted("sigma", 0, 0, 0)[..., 3].any()
+    scale = {layer.name: layer.scale for layer in layers.picture_layers()}["sigma"]
+    assert scale is not None and (scale.low, scale.high) == (0.0, 1.0)
+    layers.close()
