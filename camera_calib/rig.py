@@ -10,6 +10,7 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.artefacts import read_json, write_json
 from alice_survey.config import CameraConfig, WaterConfig
+from alice_survey.contents import one_line
 from alice_survey.errors import CalibrationError
 from alice_survey.frames import BODY_FROM_NADIR_CAM, Array, pose_from_json, pose_to_json
 from camera_calib.flat_port import FlatPortCamera, camera_from_json, numbers
@@ -198,8 +199,8 @@ def read_rig(path: Path) -> Rig:
             source=str(data["source"]),
             covariance=_covariance_from_json(data.get("covariance")),
         )
-    except (KeyError, TypeError, ValueError, CalibrationError) as error:
-        what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
+    except (KeyError, TypeError, ValueError, ArithmeticError, CalibrationError) as error:
+        what = f"lacks {one_line(error)}" if isinstance(error, KeyError) else one_line(error)
         raise CalibrationError(f"{path}: {what}") from None
 
 

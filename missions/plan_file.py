@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from alice_survey.artefacts import read_json
+from alice_survey.contents import one_line, shown
 from alice_survey.errors import PlanError
 from alice_survey.frames import Datum
 from missions.areas.area import Area
@@ -154,6 +155,12 @@ def read_plan(path: Path) -> Plan:
             details=dict(data["details"]),
             **{name: float(data[name]) for name in _NUMBERS},
         )
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
+    except PlanError as error:
+        named = str(error).startswith(str(path))
+        raise PlanError(str(error) if named else f"{path}: {shown(str(error))}") from None
+    except (
+        KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError,
+        RecursionError,
+    ) as error:  # fmt: skip
+        what = f"lacks {one_line(error)}" if isinstance(error, KeyError) else one_line(error)
         raise PlanError(f"{path}: {what}") from None

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from alice_survey.artefacts import write_csv
+from alice_survey.contents import shown
 from alice_survey.errors import VehicleError, warn
 from alice_survey.frames import Array, attitude_from_rotation, rotation_from_attitude
 
@@ -223,7 +224,7 @@ def read_number_columns(path: Path) -> dict[str, Array]:
         raise VehicleError(f"{path}: has no rows")
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise VehicleError(f"{path}: two columns are named {twice!r}")
+        raise VehicleError(f"{path}: two columns are named {twice!r:.60}")
     for line, row in rows:
         if len(row) != len(names):
             raise VehicleError(f"{path} line {line}: {len(row)} fields under {len(names)} names")
@@ -235,13 +236,15 @@ def read_number_columns(path: Path) -> dict[str, Array]:
             columns[name] = np.array(values, dtype=np.float64)
         elif _is_used(name) or any(v is not None and math.isfinite(v) for v in values):
             line, row = rows[bad]
-            raise VehicleError(f"{path} line {line}: {name} is {row[i]!r}, not a finite number")
+            raise VehicleError(
+                f"{path} line {line}: {shown(name)} is {row[i]!r:.60}, not a finite number"
+            )
         else:
             text.append(name)
     if not columns:
         raise VehicleError(f"{path}: holds no column of numbers")
     if text:
-        warn(f"{path}: columns of text are left out: {', '.join(text)}")
+        warn(f"{path}: columns of text are left out: {shown(', '.join(text))}")
     return columns
 
 

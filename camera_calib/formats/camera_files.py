@@ -15,6 +15,7 @@ from pathlib import Path
 import pycolmap
 
 from alice_survey.artefacts import atomic_path
+from alice_survey.contents import shown
 from alice_survey.errors import CalibrationError
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.formats.fields import Fields, read_bytes, read_text
@@ -270,7 +271,7 @@ def _model_name(number: int) -> str | None:
 def _known(where: str, model: str) -> str:
     if model not in MODELS:
         raise CalibrationError(
-            f"{where}: model {model} is not OpenCV's: {', '.join(MODELS)} can be read"
+            f"{where}: model {shown(model)} is not OpenCV's: {', '.join(MODELS)} can be read"
         )
     return model
 

@@ -17,6 +17,8 @@ _LARGEST_BYTES = 1 << 20
 _MOST_PARTS = 5000
 """Lists, mappings and tags. Parsers recurse: this bounds how deep (OpenCV's exhausts memory at some
 hundred thousand levels, and stands 20,000)."""
+_DEEPEST = 20
+"""Lists in lists that hold numbers."""
 _ROTATION_TOLERANCE = 1e-3
 """How far written digits may leave a matrix from a rotation (four decimals and better pass)."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
@@ -130,9 +132,11 @@ class Fields:
         return RigidTransform.from_components(matrix[:3, 3], self.rotation(key, matrix[:3, :3]))
 
 
-def _flat(value: Any) -> list[float] | None:
+def _flat(value: Any, depth: int = 0) -> list[float] | None:
     if isinstance(value, list):
-        parts = [_flat(part) for part in value]
+        if depth > _DEEPEST:
+            return None
+        parts = [_flat(part, depth + 1) for part in value]
         if any(part is None for part in parts):
             return None
         return [number for part in parts if part is not None for number in part]

@@ -95,6 +95,16 @@ def camera_in_air(
     fx, fy, cx, cy = map(float, lens)
     if min(fx, fy) <= 0:
         raise fields.fault(key, f"has focal lengths of {fx:g} and {fy:g} px")
+    try:
+        return _in_air(size, (fx, fy, cx, cy), coefficients)
+    except CalibrationError as error:
+        raise fields.fault(key, f"is of no camera: {error}") from None
+
+
+def _in_air(
+    size: tuple[int, int], lens: tuple[float, float, float, float], coefficients: dict[str, float]
+) -> FlatPortCamera:
+    fx, fy, cx, cy = lens
     return FlatPortCamera(
         width_px=size[0],
         height_px=size[1],

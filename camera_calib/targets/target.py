@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.artefacts import read_json, write_json
+from alice_survey.contents import one_line
 from alice_survey.errors import CalibrationError
 from alice_survey.frames import Array
 
@@ -266,8 +267,8 @@ class Target:
                 ):
                     raise TypeError(f"{key} is {values[key]!r}")
             return cls(**values)
-        except TypeError as error:
-            raise CalibrationError(f"target: its file is wrong: {error}") from None
+        except (TypeError, ArithmeticError) as error:
+            raise CalibrationError(f"target: its file is wrong: {one_line(error)}") from None
 
 
 _COUNTED = {"chessboard": "inner corners", "charuco": "squares", "apriltag": "tags"}
@@ -335,7 +336,7 @@ def read_target(path: Path) -> Target:
     try:
         return Target.from_json(data)
     except CalibrationError as error:
-        raise CalibrationError(f"{path}: {error}") from None
+        raise CalibrationError(f"{path}: {one_line(error)}") from None
 
 
 def write_target(path: Path, target: Target) -> None:

@@ -220,7 +220,7 @@ def lens_from_json(data: dict[str, Any]) -> Lens:
                 params=tuple(data["params"]),
                 pinhole=Pinhole(**data["pinhole"]),
             )
-    except (KeyError, TypeError, ValueError, CalibrationError) as error:
+    except (KeyError, TypeError, ValueError, ArithmeticError, CalibrationError) as error:
         raise WorkspaceError(f"a camera of cameras.json is wrong: {one_line(error)}") from None
     raise WorkspaceError(f"a camera of cameras.json is of unknown kind {data['kind']!r:.60}")
 

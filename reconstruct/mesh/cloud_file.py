@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.contents import shown
 from alice_survey.errors import WorkspaceError
 from alice_survey.frames import Array
 
@@ -117,7 +118,7 @@ def _header(path: Path, lines: Iterator[bytes]) -> tuple[np.dtype[Any], int]:
     if ["format", "binary_little_endian", "1.0"] not in text:
         raise WorkspaceError(f"{path}: only binary little-endian PLY files are read")
     elements = [words for words in text if words[:1] == ["element"]]
-    if not elements or elements[0][1] != "vertex":
+    if not elements or elements[0][1:2] != ["vertex"]:
         raise WorkspaceError(f"{path}: points are not its first element")
     first, fields, inside = elements[0], [], False
     for words in text:
@@ -125,13 +126,18 @@ def _header(path: Path, lines: Iterator[bytes]) -> tuple[np.dtype[Any], int]:
             inside = words is first
         elif inside and words[:1] == ["property"]:
             if len(words) != 3 or words[1] not in _TYPES:
-                raise WorkspaceError(f"{path}: cannot read the property {' '.join(words[1:])!r}")
+                raise WorkspaceError(
+                    f"{path}: cannot read the property {shown(' '.join(words[1:]))!r}"
+                )
             fields.append((words[2], _TYPES[words[1]]))
+    count = first[2] if len(first) == 3 and first[2].isascii() and first[2].isdigit() else ""
+    if not 0 < len(count) < 15 or len({name for name, _ in fields}) < len(fields):
+        raise WorkspaceError(f"{path}: its header is damaged")
     record = np.dtype(fields)
     lacking = [name for name in _NEEDED if name not in (record.names or ())]
     if lacking:
         raise WorkspaceError(f"{path}: its points lack {', '.join(lacking)}")
-    return record, int(first[2])
+    return record, int(count)
 
 
 def _until_end(lines: Iterator[bytes]) -> Iterator[bytes]:
