@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from alice_survey import progress
 from alice_survey.executor import parallel_map
 from alice_survey.frames import Array
 from reconstruct.mesh.atlas import Atlas, Wedges, make_atlas, make_wedges
@@ -417,6 +418,7 @@ def _pictures(workspace: Path) -> Pictures:
     return Pictures.open(workspace)
 
 
+@progress.step("take colours from the cloud")
 def colours_of_cloud(cloud: Any, vertices: Array, reach: float) -> NDArray[np.uint8]:
     """The colours (V, 3), RGB, that the points of a cloud around vertices have on average."""
     from scipy.spatial import cKDTree
