@@ -9,8 +9,10 @@ from typing import Any
 import cv2
 from numpy.typing import NDArray
 
-MOST_PIXELS = 128_000_000
-"""Of a picture: 1 GB of 4 channels and 16 bits. A file of a few kilobytes can state any size."""
+MOST_PIXELS = 110_000_000
+"""Of a picture: 0.9 GB of 4 channels and 16 bits. A file of a few kilobytes can state any size."""
+MOST_PIXELS_JPEG = 160_000_000
+"""Of a JPEG, whose pixels take half as much or less."""
 PILLOW_FAULTS = (
     OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, AttributeError,
     ArithmeticError, MemoryError, EOFError, RuntimeError, struct.error, zlib.error,
@@ -18,28 +20,28 @@ PILLOW_FAULTS = (
 """What Pillow raises of damaged files, by format and version."""
 
 
-def stated_size(path: Path) -> tuple[int, int] | None:
-    """Width and height that a picture's header states; None of a kind that Pillow does not know.
+def pixels_too_many(path: Path) -> int:
+    """The most pixels that are decoded where a picture's header states more, else 0.
 
-    Of more than Pillow opens at all they are beyond `MOST_PIXELS`, and not exact.
+    Also 0 of a kind that Pillow does not know.
     """
     from PIL import Image
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            warnings.simplefilter("ignore")
             with Image.open(path) as image:
-                return image.size
-    except Image.DecompressionBombError:
-        return MOST_PIXELS, MOST_PIXELS
+                most = MOST_PIXELS_JPEG if image.format == "JPEG" else MOST_PIXELS
+                return most if image.width * image.height > most else 0
+    except Image.DecompressionBombError:  # more than Pillow opens at all
+        return MOST_PIXELS_JPEG
     except PILLOW_FAULTS:
-        return None
+        return 0
 
 
 def read_pixels(path: Path, flags: int) -> NDArray[Any] | None:
-    """A picture as OpenCV decodes it; None where it cannot, or of more than `MOST_PIXELS`."""
-    width, height = stated_size(path) or (0, 0)
-    if width * height > MOST_PIXELS:
+    """A picture as OpenCV decodes it; None where it cannot, or of `pixels_too_many`."""
+    if pixels_too_many(path):
         return None
     try:
         pixels: NDArray[Any] | None = cv2.imread(str(path), flags)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from alice_survey.contents import one_line, shown
 from alice_survey.errors import ImageError
-from camera_calib.picture_files import MOST_PIXELS, PILLOW_FAULTS, read_pixels, stated_size
+from camera_calib.picture_files import PILLOW_FAULTS, pixels_too_many, read_pixels
 
 PLAIN = (".jpg", ".jpeg", ".png")
 TIFF = (".tif", ".tiff")
@@ -108,9 +108,8 @@ def decode(path: Path) -> NDArray[Any]:
         ImageError: it cannot be decoded to its end.
     """
     suffix = path.suffix.lower()
-    width, height = stated_size(path) or (0, 0)
-    if width * height > MOST_PIXELS:
-        raise ImageError(f"states over {MOST_PIXELS / 1e6:.0f} million pixels: make it smaller")
+    if most := pixels_too_many(path):
+        raise ImageError(f"states over {most / 1e6:.0f} million pixels: make it smaller")
     if suffix in RAW:
         return _develop(path)
     if suffix in PLAIN:
