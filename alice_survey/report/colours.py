@@ -140,9 +140,10 @@ def block_window(raster: Any, column: int, row: int, side: int) -> Window:
 
 def known_values(raster: Any, window: Window) -> Array:
     """Values of the first band, float32; NaN where the raster says that it knows none."""
-    values = raster.read(1, window=window, masked=True).astype(np.float32)
-    filled: Array = values.filled(np.nan)
-    return filled
+    values: Array = raster.read(1, window=window).astype(np.float32, copy=False)
+    if raster.nodata is not None and np.isfinite(raster.nodata):
+        values[values == np.float32(raster.nodata)] = np.nan
+    return values
 
 
 def coloured(level: Array, numbers: Numbers, limits: tuple[float, float], pixel: float) -> Rgba:

@@ -62,7 +62,8 @@ def read_numbers(raster: Any, window: Window) -> Part:
     """The first band; what it does not know weighs nothing."""
     values = known_values(raster, window)
     known = np.isfinite(values)
-    return Part(values=np.where(known, values, 0)[None], weight=known.astype(np.float32))
+    values[~known] = 0
+    return Part(values=values[None], weight=known.astype(np.float32))
 
 
 def read_counts(raster: Any, window: Window) -> Part:
