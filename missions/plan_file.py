@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from shapely.errors import ShapelyError
+
 from alice_survey.artefacts import read_json
 from alice_survey.contents import one_line, shown
 from alice_survey.errors import PlanError
@@ -160,7 +162,7 @@ def read_plan(path: Path) -> Plan:
         raise PlanError(str(error) if named else f"{path}: {shown(str(error))}") from None
     except (
         KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError,
-        RecursionError,
+        RecursionError, ShapelyError,
     ) as error:  # fmt: skip
         what = f"lacks {one_line(error)}" if isinstance(error, KeyError) else one_line(error)
         raise PlanError(f"{path}: {what}") from None

@@ -34,6 +34,7 @@ MODELS = {
 _REFRACTION = {0: FLATPORT, 1: "DOMEPORT"}
 _NO_REFRACTION = -1
 _PORT_PARAMETERS = 8
+_MOST_PX = 10**7
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,7 +199,9 @@ def _read_text(path: Path) -> list[CameraRecord]:
                 )
             )
         except ValueError as error:
-            raise CalibrationError(f"{where}: {error}") from None
+            raise CalibrationError(f"{where}: {shown(str(error))}") from None
+        if max(abs(records[-1].width_px), abs(records[-1].height_px)) > _MOST_PX:
+            raise CalibrationError(f"{where}: WIDTH or HEIGHT is over {_MOST_PX} px")
     return records
 
 

@@ -177,11 +177,11 @@ def _line_number(cell: str) -> int:
     return number
 
 
-def _since_start(cell: str, nav: NavigationLog) -> float:
+def _since_start(cell: str | None, nav: NavigationLog) -> float:
     """Seconds of a date, UTC where it names no zone, since the log's first row."""
     if nav.start_utc is None:
         raise ValueError("the log has no dates")
-    date = datetime.fromisoformat(cell.strip())
+    date = datetime.fromisoformat((cell or "").strip())
     return ((date if date.tzinfo else date.replace(tzinfo=UTC)) - nav.start_utc).total_seconds()
 
 

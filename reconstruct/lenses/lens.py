@@ -201,6 +201,10 @@ def self_calibrated_lens(camera: pycolmap.Camera) -> ColmapLens:
     )
 
 
+_MOST_PX = 100_000
+"""On a side of a picture: beyond it is no size, but damage."""
+
+
 def lens_from_json(data: dict[str, Any]) -> Lens:
     """The inverse of `Lens.to_json`.
 
@@ -208,6 +212,10 @@ def lens_from_json(data: dict[str, Any]) -> Lens:
         WorkspaceError: it is of no known kind or lacks a value.
     """
     try:
+        sizes = [data["pinhole"], data["camera"] if data["kind"] == "flat_port" else data]
+        for side in (one[name] for one in sizes for name in ("width_px", "height_px")):
+            if not 0 < int(side) <= _MOST_PX:
+                raise ValueError(f"{side} px wide or high")
         if data["kind"] == "flat_port":
             return FlatPortLens(
                 camera=camera_from_json(data["camera"]), virtual=VirtualPinhole(**data["pinhole"])

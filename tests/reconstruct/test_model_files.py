@@ -8,6 +8,7 @@ import pytest
 
 from alice_survey.errors import ReconstructionError, WorkspaceError
 from alice_survey.frames import Datum
+from reconstruct.lenses.lens import lens_from_json
 from reconstruct.model import WorldFrame, read_frame, write_frame
 from reconstruct.model_files import read_reconstruction
 from tests.reconstruct.scenes import make_scene
@@ -80,3 +81,14 @@ def test_a_frame_that_was_changed_names_its_file(tmp_path: Path, old: str, new: 
     path.write_text(text.replace(old, new))
     with pytest.raises(WorkspaceError, match=r"frame\.json"):
         read_frame(path)
+
+
+@pytest.mark.parametrize("side", [0, -5, 10**9, "x", None])
+def test_a_lens_of_impossible_size_is_refused(side: object) -> None:
+    scene = make_scene(lines=1, stations=2, points=10)
+    _, lenses = warped_scene(scene)
+    data = lenses["left"].to_json()
+    assert lens_from_json(data).size_px == lenses["left"].size_px
+    for part in ("pinhole", "camera"):
+        with pytest.raises(WorkspaceError, match=r"cameras\.json"):
+            lens_from_json({**data, part: {**data[part], "width_px": side}})

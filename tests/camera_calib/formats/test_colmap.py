@@ -299,3 +299,10 @@ def test_faults_of_a_rig_configuration_name_the_key(tmp_path: Path) -> None:
     assert "list of one rig" in fault(path)
     path.write_text("{")
     assert "not valid JSON" in fault(path)
+
+
+@pytest.mark.parametrize("size", ["9" * 400, "-5", "1e3", "20000000"])
+def test_a_size_that_no_picture_has_is_refused(tmp_path: Path, size: str) -> None:
+    (tmp_path / "cameras.txt").write_text(f"1 PINHOLE {size} 480 500 500 320 240\n")
+    with pytest.raises(CalibrationError, match=r"cameras\.txt"):
+        read_colmap(tmp_path / "cameras.txt", Reading())

@@ -334,3 +334,11 @@ def test_logs_and_lines_beyond_all_measure(
     (tmp_path / "t.csv").write_text(f"time_s,line\n1,{'9' * 30}\n")
     with pytest.raises(NavigationError, match=r"t\.csv line 2: line is 999"):
         read_dive_record(log, PLAN, RIG, triggers=tmp_path / "t.csv")
+    dated = tmp_path / "dated.csv"
+    start = "2024-05-01T12:00:0"
+    names = ["time_utc", *header[1:]]
+    assert header[0] == "time_s"
+    write_csv(dated, names, [[f"{start}{i}Z", *row[1:]] for i, row in enumerate(rows[:9])])
+    (tmp_path / "u.csv").write_text(f"line,time_utc\n0,{start}1Z\n0\n")
+    with pytest.raises(NavigationError, match=r"u\.csv line 3"):
+        read_dive_record(dated, PLAN, RIG, triggers=tmp_path / "u.csv")

@@ -12,6 +12,7 @@ from alice_survey.errors import PlanError
 from missions.exports.options import Options
 from missions.exports.waypoints import DEPTH_STEP_M, bends
 from missions.exports.write import FORMATS, counted, export_report, write_exports
+from missions.plan_file import read_plan
 from tests.missions.exports.plans import RIG, small_plan
 from tests.missions.exports.readers import local_ne
 
@@ -138,3 +139,21 @@ def test_bends_keep_every_depth_within_the_tolerance() -> None:
 @pytest.mark.parametrize(("number", "told"), [(0, "0 dives"), (1, "1 dive"), (2, "2 dives")])
 def test_one_is_told_in_the_singular(number: int, told: str) -> None:
     assert counted(number, "dive") == told
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('"MultiPolygon"', '"MultiPqlygon"'), ('"stations"', '"station"'),
+        ("15.0", "1" + "0" * 400),
+        ('"survey"', '"dive"'), ('"version": 2', '"version": 3'),
+    ],
+)  # fmt: skip
+def test_a_plan_that_was_changed_names_itself(tmp_path: Path, old: str, new: str) -> None:
+    path = tmp_path / "plan.json"
+    text = json.dumps(small_plan().to_json())
+    assert old in text
+    path.write_text(text.replace(old, new))
+    with pytest.raises(PlanError, match=r"plan\.json") as fault:
+        read_plan(path)
+    assert "\n" not in str(fault.value)
