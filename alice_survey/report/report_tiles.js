@@ -48,8 +48,9 @@ const Pyramid = leaflet.Layer.extend({
       tile.pending = true;
       tile.on("load error", (event) => {
         tile.pending = false;
+        if (!this._map) return;  /* the layer was put away meanwhile */
         this._drop();
-        if (event.type === "error" && this._map) this._map.fire("tilelost");
+        if (event.type === "error") this._map.fire("tilelost");
       });
       this._tiles.set(name, tile);
       tile.addTo(this._map);
