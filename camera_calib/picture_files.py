@@ -9,8 +9,8 @@ from typing import Any
 import cv2
 from numpy.typing import NDArray
 
-MOST_PIXELS = 110_000_000
-"""Of a picture: 0.9 GB of 4 channels and 16 bits. A file of a few kilobytes can state any size."""
+MOST_PIXELS = 104_000_000
+"""Of a picture: 0.8 GB of 4 channels and 16 bits. A file of a few kilobytes can state any size."""
 MOST_PIXELS_JPEG = 160_000_000
 """Of a JPEG, whose pixels take half as much or less."""
 PILLOW_FAULTS = (

@@ -45,6 +45,8 @@ def read_reference(path: Path, datum: Datum | None) -> tuple[Array, bool]:
     Raises:
         WorkspaceError: the file is missing, of another kind, or holds no point.
     """
+    from pyproj.exceptions import ProjError
+
     if not path.is_file():
         raise WorkspaceError(f"{path}: no such file")
     kind = path.suffix.lower()
@@ -65,7 +67,15 @@ def read_reference(path: Path, datum: Datum | None) -> tuple[Array, bool]:
     if crs is None or datum is None:
         centre = np.median(points, axis=0)
         return (points if crs is None else points - centre), False
-    return _local(points, crs, datum), True
+    try:
+        local = _local(points, crs, datum)
+    except ProjError as error:
+        raise WorkspaceError(
+            f"{path}: its coordinate system cannot be used: {one_line(error)}"
+        ) from None
+    if len(local) < 100:
+        raise WorkspaceError(f"{path}: {len(local)} points have a place on Earth; 100 are needed")
+    return local, True
 
 
 def _apart(path: Path) -> tuple[Array, str | None]:
@@ -173,7 +183,8 @@ def _check_chunks(file: BinaryIO, points_at: int, size: int) -> None:
 def _local(points: Array, crs: str, datum: Datum) -> Array:
     """East, north, up of a datum, heights as they are.
 
-    What level they count from is seldom stated; the registration finds the difference.
+    What level these count from is seldom stated; the registration finds the difference. Points that
+    their system puts nowhere on Earth are left out.
     """
     from pyproj import CRS, Transformer
 
@@ -183,8 +194,8 @@ def _local(points: Array, crs: str, datum: Datum) -> Array:
     longitude, latitude = Transformer.from_crs(
         source.to_2d(), "EPSG:4326", always_xy=True
     ).transform(points[:, 0], points[:, 1])
-    depth = datum.height_m - points[:, 2]
-    ned = datum.ned_from_geodetic(np.column_stack([latitude, longitude, depth]))
+    place = np.column_stack([latitude, longitude, datum.height_m - points[:, 2]])
+    ned = datum.ned_from_geodetic(place[np.isfinite(place).all(axis=1)])
     enu: Array = ned[:, [1, 0, 2]] * np.array([1.0, 1.0, -1.0])
     return enu
 

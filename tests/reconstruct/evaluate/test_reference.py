@@ -237,3 +237,16 @@ def test_packed_points_that_are_damaged_are_refused(tmp_path: Path) -> None:
     path.write_bytes(spoilt[2])
     with pytest.raises(WorkspaceError, match=r"cut short|chunks"):
         read_reference(path, DATUM)
+
+
+def test_a_model_in_no_place_on_earth_is_refused(tmp_path: Path) -> None:
+    height = np.arange(400, dtype=np.float32).reshape(20, 20)
+    local = 'LOCAL_CS["mine",UNIT["metre",1],AXIS["x",EAST],AXIS["y",NORTH]]'
+    for crs, corner in ((f"EPSG:{UTM}", (1e30, 1e30)), (local, (0.0, 0.0))):
+        with rasterio.open(
+            tmp_path / "m.tif", "w", driver="GTiff", width=20, height=20, count=1, dtype="float32",
+            crs=crs, transform=from_origin(*corner, 1.0, 1.0),
+        ) as file:  # fmt: skip
+            file.write(height, 1)
+        with pytest.raises(WorkspaceError, match=r"m\.tif.*(place on Earth|coordinate system)"):
+            read_reference(tmp_path / "m.tif", DATUM)
