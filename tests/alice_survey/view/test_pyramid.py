@@ -43,6 +43,7 @@ def written(path: Path, bands: Array, **more: Any) -> Path:
 def heights() -> Array:
     rows, columns = np.mgrid[:ROWS, :COLUMNS].astype(np.float32)
     found = -12 + 0.4 * np.sin(columns / 60) + 0.3 * np.cos(rows / 45) + 1e-4 * rows
+    found += np.random.default_rng(1).normal(0, 0.003, found.shape)
     found[rows + columns < 500] = np.nan
     found[(rows - 900) ** 2 + (columns - 700) ** 2 < 90**2] = np.nan
     return found.astype(np.float32)
