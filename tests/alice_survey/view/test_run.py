@@ -111,7 +111,9 @@ def test_ctrl_c_ends_long_work(tmp_path: Path) -> None:
     answers: list[str] = []
     asked = Thread(target=lambda: answers.append(_told(f"{server.url}tiles/mosaic/0/0/0.webp")))
     asked.start()
-    time.sleep(0.2)
+    while not server._connections:
+        time.sleep(0.02)
+    time.sleep(0.3)  # it reads by now, for seconds
     server.shutdown()
     server.server_close()
     asked.join(5)

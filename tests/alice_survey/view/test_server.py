@@ -369,7 +369,7 @@ def test_many_at_once(server: Server) -> None:
 
     def client(number: int) -> None:
         connection = http.client.HTTPConnection("127.0.0.1", server.server_address[1], timeout=30)
-        for step in range(16):
+        for step in range(10):
             path = paths[(number + step) % len(paths)]
             connection.request("GET", path)
             if connection.getresponse().read() != expected[path]:
@@ -425,7 +425,7 @@ def test_a_stage_made_anew_while_it_is_served(tmp_path: Path) -> None:
         worker.start()
         replies: list[Reply] = []
         try:
-            for _ in range(25):
+            for _ in range(12):
                 replies += [
                     ask(server, "/tiles/height/0/0/0.webp"),
                     ask(server, "/files/dense/dem.tif"),
