@@ -9,6 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pycolmap
 from numba import njit
@@ -33,6 +34,10 @@ _SLACK = 2.0
 """Radius of the search over the largest miss of the prediction at the probe's own matches."""
 _FALSE = 4.0
 """Misses over the median from which a match of the probe is taken for false; relief stays below."""
+_TRIALS = 300
+"""Of the plane through the matches of the probe, most of which are right."""
+_RELIEF = 0.1
+"""Farthest that a match of the probe may be from one plane's, as a share of the longer side."""
 _LEAST_RADIUS = 0.02
 """Of the search, as a share of the picture's longer side."""
 
@@ -236,15 +241,20 @@ def _guided(task: PairTask, a: Features, b: Features, seen: tuple[Array, Array])
     few = match_descriptors(
         a.descriptors[:_PROBE_FEATURES], b.descriptors[:_PROBE_FEATURES], task.ratio
     )
-    probed = _verified(task, seen, few).matches
-    if len(probed) < _LEAST_PROBED:
+    if len(few) < _LEAST_PROBED:
         return None
-    at, there = a.pixels[probed[:, 0]], b.pixels[probed[:, 1]]
+    at, there = a.pixels[few[:, 0]], b.pixels[few[:, 1]]
     long_side = float(a.pixels.max())
-    homography = fit_homography(at, there)
+    homography, _ = cv2.findHomography(
+        at, there, cv2.USAC_DEFAULT, _RELIEF * long_side, None, _TRIALS
+    )
+    if homography is None:
+        return None
     miss = np.linalg.norm(apply_homography(homography, at) - there, axis=1)
-    # a false match along an epipolar line is as good as any to the geometry
-    near = miss <= _FALSE * np.median(miss)
+    close = miss <= _RELIEF * long_side
+    if close.sum() < _LEAST_PROBED:
+        return None
+    near = close & (miss <= _FALSE * np.median(miss[close]))
     if near.sum() < _LEAST_PROBED / 2:  # a fit that does not hold, or has no solution at all
         return None
     homography = fit_homography(at[near], there[near])
