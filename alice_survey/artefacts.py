@@ -159,7 +159,7 @@ def read_stage(folder: Path) -> dict[str, Any] | None:
     """The content of a stage's `stage.json`, or None where no whole stage is."""
     try:
         record = json.loads((folder / STAGE_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
     return record if isinstance(record, dict) else None
 
@@ -174,13 +174,14 @@ def digest_inputs(
     Raises:
         WorkspaceError: an input does not exist.
     """
-    known = dict((previous or {}).get("inputs", {}))
+    told = (previous or {}).get("inputs")
+    known = told if isinstance(told, dict) else {}
     digests: dict[str, list[Any]] = {}
     for path in _files(inputs):
         name = os.path.relpath(path, workspace)
         stat = path.stat()
         old = known.get(name)
-        if old is not None and old[:2] == [stat.st_size, stat.st_mtime_ns]:
+        if isinstance(old, list) and len(old) == 3 and old[:2] == [stat.st_size, stat.st_mtime_ns]:
             digests[name] = old
         else:
             with path.open("rb") as file:
@@ -247,6 +248,8 @@ def read_json(path: Path) -> Any:
         return json.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise WorkspaceError(f"{path}: no such file") from None
+    except OSError as error:
+        raise WorkspaceError(f"{path}: cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError) as error:
         raise WorkspaceError(f"{path}: not valid JSON: {error}") from None
 

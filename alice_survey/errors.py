@@ -17,6 +17,11 @@ _shows: list[Show] = []
 class AliceError(Exception):
     """A fault the user can mend; the command line prints it as one line and exits with 1."""
 
+    def __str__(self) -> str:
+        """The line, without what names in files could do to a terminal."""
+        text = super().__str__()
+        return "".join(c if c.isprintable() or c == "\n" else "\ufffd" for c in text)
+
 
 class ConfigError(AliceError):
     """A setting is missing, unknown or out of range."""

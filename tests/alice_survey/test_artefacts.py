@@ -240,3 +240,25 @@ def test_csv_writes_unknown_values_as_empty_cells(tmp_path: Path) -> None:
 def test_a_folder_is_not_written_over_by_a_file(tmp_path: Path) -> None:
     with pytest.raises(WorkspaceError, match="is a folder: give the name of a file"):
         write_json(tmp_path, {})
+
+
+@pytest.mark.parametrize(
+    "content",
+    ['{"inputs": [1, 2]}', '{"inputs": {"in.txt": 5}}', '{"inputs": {"in.txt": []}}',
+     '{"digest": 3}', "[]", "[" * 100_000, "\x00\xff"],
+)  # fmt: skip
+def test_a_spoilt_stage_file_only_means_that_the_stage_is_made_again(
+    tmp_path: Path, content: str
+) -> None:
+    source = tmp_path / "in.txt"
+    source.write_text("x")
+    stage = Stage(name="made", version=1, settings={}, inputs=[source])
+    (tmp_path / "made").mkdir()
+    (tmp_path / "made" / "stage.json").write_text(content, encoding="latin-1")
+    assert run_stage(tmp_path, stage, lambda folder: (folder / "out").write_text("y"))
+    assert (tmp_path / "made" / "out").read_text() == "y"
+    assert not run_stage(tmp_path, stage, lambda folder: None)
+
+
+def test_a_fault_cannot_write_to_the_terminal() -> None:
+    assert str(WorkspaceError("a\x1b[2Jb\u200f.png: missing")) == "a\ufffd[2Jb\ufffd.png: missing"
