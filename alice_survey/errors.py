@@ -1,6 +1,7 @@
 """Known faults: one line that says what is wrong, with the numbers and what to change."""
 
 import contextlib
+import errno
 import sys
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
@@ -104,6 +105,16 @@ def why(error: Exception) -> str:
     return str(error)
 
 
+_ON = ", and the same command goes on from here"
+_MENDS = {
+    errno.ENOSPC: f": free some of the disk{_ON}",
+    errno.EDQUOT: f": free some of your share of the disk{_ON}",
+    errno.EROFS: ": choose a workspace that can be written, with -w",
+    errno.EACCES: ": take the rights to it, or choose another workspace with -w",
+}
+"""What to do about faults of the system, by their numbers."""
+
+
 def known_fault(error: BaseException) -> str | None:
     """The line that tells the user of a fault which is no bug; None for a bug."""
     if isinstance(error, AliceError):
@@ -111,5 +122,6 @@ def known_fault(error: BaseException) -> str | None:
     if isinstance(error, OSError):  # a full disk, a folder where a file should be, no permission
         where = error.filename2 or error.filename
         text = error.strerror or str(error)
-        return text if where is None else f"{where}: {text}"
+        line = text if where is None else f"{where}: {text}"
+        return line + _MENDS.get(error.errno or 0, "")
     return None
