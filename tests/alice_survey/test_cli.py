@@ -127,7 +127,7 @@ def test_init_never_overwrites(
     [
         (["target", "chessboard 9x6 25mm", "-o", "FILE/b.pdf"], "FILE: File exists"),
         (["target", "chessboard 9x6 25mm", "-o", "FOLDER/d.pdf"], "d.pdf is a folder"),
-        (["fov", "--rig", "FOLDER"], "FOLDER: Is a directory"),
+        (["fov", "--rig", "FOLDER"], "FOLDER: cannot be read: Is a directory"),
     ],
 )
 def test_what_the_file_system_refuses_is_one_line(
