@@ -245,6 +245,7 @@ def test_ctrl_c_ends_all_processes_and_says_how_to_go_on(
     run = subprocess.Popen(
         [*command, "--events", str(file)],
         stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
+        preexec_fn=_heed_ctrl_c,
     )  # fmt: skip
     _wait_until(lambda: len(list(folder.glob("begun*"))) == workers)
     os.killpg(run.pid, signal.SIGINT)  # a terminal sends it to all processes
@@ -256,6 +257,11 @@ def test_ctrl_c_ends_all_processes_and_says_how_to_go_on(
     *_, before, last = events_of(file)
     assert (before["event"], before["message"]) == ("error", "interrupted")
     assert (last["event"], last["exit_code"]) == ("run_finished", 130)
+
+
+def _heed_ctrl_c() -> None:
+    """What a shell starts in the background is deaf to it, and so would be what that starts."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def _wait_until(true: Callable[[], bool]) -> None:
