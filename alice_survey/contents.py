@@ -47,7 +47,7 @@ def read_arrays(path: Path, *names: str) -> dict[str, NDArray[np.generic]]:
             return {name: data[name] for name in names}
     except OSError as error:
         raise WorkspaceError(f"{path}: cannot be read: {why(error)}") from None
-    except (
+    except (  # what zipfile, zlib and the evaluation of an array's header raise
         zipfile.BadZipFile, zlib.error, ValueError, TypeError, EOFError, KeyError, MemoryError,
         NotImplementedError, RuntimeError, SyntaxError,
     ) as error:  # fmt: skip

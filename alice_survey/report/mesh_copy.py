@@ -27,11 +27,13 @@ _QUALITY = 80
 
 @progress.step("thin the mesh")
 def mesh_copy(held: Held, glb: Path) -> Mesh | None:
-    """Write a light copy to `glb`; None where a workspace holds no mesh."""
+    """Write a light copy to `glb`; None where there is no mesh, or one too large and no mosaic."""
     if not held.has("mesh"):
         return None
     triangles = int(held.json("mesh/mesh.json")["triangles"])
     whole = triangles <= _MOST_TRIANGLES
+    if not whole and not held.has("mosaic"):
+        return None
     scene = _shrunk(held.workspace / "mesh" / "mesh.glb") if whole else _relief(held)
     glb.write_bytes(scene.export(file_type="glb"))
     return Mesh(
@@ -61,6 +63,8 @@ def _shrunk(path: Path) -> Any:
     scene = trimesh.load_scene(path)
     for part in scene.geometry.values():
         material = part.visual.material
+        if material.baseColorTexture is None:
+            continue
         picture = material.baseColorTexture.convert("RGB")
         shrink = max(picture.size) / _MOST_TEXTURE_PX
         if shrink > 1.0:

@@ -10,7 +10,6 @@ import numpy as np
 import rasterio
 from rasterio.enums import Resampling
 
-from alice_survey import progress
 from alice_survey.report.colours import (
     MOSAIC_ABOUT,
     MOSAIC_FILE,
@@ -33,7 +32,6 @@ _MOST_COLOURED_PX = 2_000_000
 """Of a layer that shows numbers."""
 
 
-@progress.step("draw the maps")
 def picture_layers(held: Held) -> Iterator[PictureLayer]:
     """The mosaic and all rasters of numbers that a workspace holds."""
     mosaic = held.file(MOSAIC_FILE)

@@ -4,6 +4,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from alice_survey import progress
 from alice_survey.artefacts import STAGE_FILE, Stage, atomic_path, run_stage, write_json
 from alice_survey.config import SurveyConfig
 from alice_survey.errors import WorkspaceError
@@ -21,7 +22,8 @@ from alice_survey.report.summary import facts, summary
 from alice_survey.report.verdicts import verdicts
 
 _READ = (
-    "plan/plan.json", "flight/flight.json", "images/manifest.csv", "calibration/report.json",
+    "survey.toml", "plan/plan.json", "flight/flight.json", "images/manifest.csv",
+    "calibration/report.json",
     "mapping/mapping.json", "mapping/port.json", "sparse", "dense/dem.tif", "dense/sigma.tif",
     "mosaic/mosaic.tif", "mesh/mesh.glb", "evaluation",
 )  # fmt: skip
@@ -75,7 +77,8 @@ def build_report(held: Held, folder: Path) -> Report:
     figures = Figures(held=held)
     found = verdicts(figures)
     said, known = summary(figures, found), facts(figures)
-    layers: list[PictureLayer | ShapeLayer] = [*picture_layers(held), *shape_layers(held)]
+    with progress.step("draw the maps"):
+        layers: list[PictureLayer | ShapeLayer] = [*picture_layers(held), *shape_layers(held)]
     chart = None
     if layers:
         chart = SurveyMap(layers=layers, unit=held.unit, origin=origin_of(held))

@@ -13,9 +13,6 @@ from alice_survey.report.held import Held
 from alice_survey.report.pictures import still
 from alice_survey.report.words import count, digits, duration, length, parts, share
 
-_NOT_PARAMETERS = 24
-"""Parameters beyond which a matrix of correlations is not drawn with names."""
-
 
 def sections(figures: Figures, *, has_map: bool, has_mesh: bool) -> Iterator[Section]:
     """All parts for which there is something."""

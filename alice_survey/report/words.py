@@ -31,9 +31,9 @@ def share(value: float | None) -> str:
     if value is None or not math.isfinite(value):
         return "unknown"
     text = f"{100 * value:.1f}"
-    if text == "100.0" and value < 1.0:
-        text = "more than 99.9"
-    return f"{text.removesuffix('.0') if text == '100.0' else text} %"
+    if text == "100.0":
+        text = "100" if value >= 1.0 else "more than 99.9"
+    return f"{text} %"
 
 
 def parts(value: float | None) -> str:

@@ -27,7 +27,7 @@ _PROBE_FEATURES = 1500
 _WORTH_PROBING = 2.0
 """Products of a full match over those of the probe, from which prediction saves time."""
 _LEAST_PROBED = 30
-"""Verified matches of the probe below which nothing is predicted."""
+"""Matches of the probe near one plane below which nothing is predicted."""
 _CELLS_ALONG = 12
 """Cells along the longer side of a picture that share one prediction."""
 _SLACK = 2.0
@@ -222,8 +222,8 @@ def camera_from_text(text: str) -> pycolmap.Camera:
 def match_pair(task: PairTask) -> PairMatches:
     """Match two pictures and keep what one two-view geometry explains.
 
-    Where there are many features, the largest are matched first; what their geometry says of the
-    rest narrows the search. Where they do not agree on one, all are compared with all.
+    Where there are many features, the largest are matched first; the plane that their matches are
+    near narrows the search. Where they are near none, all are compared with all.
     """
     a, b = _features(task.first), _features(task.second)
     seen = as_seen(a.pixels, task.lenses[0]), as_seen(b.pixels, task.lenses[1])
