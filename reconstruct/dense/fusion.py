@@ -11,7 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from alice_survey.frames import Array
-from reconstruct.dense.sight import FAST, KernelLens, pixel_at, slope_at
+from reconstruct.dense.sight import FAST, KernelLens, pixel_at
 
 Float32 = NDArray[np.float32]
 
@@ -87,7 +87,7 @@ def merge_depths(
 def count_witnesses(
     depth: Float32,
     sigma: Float32,
-    lens: KernelLens,
+    slopes: Float32,
     other_from_ref: Array,
     other_depth: Float32,
     other_sigma: Float32,
@@ -99,7 +99,7 @@ def count_witnesses(
     Args:
         depth: (H, W) of the reference.
         sigma: (H, W) of it.
-        lens: of the reference.
+        slopes: (H, W, 2) of the reference, see `sight.slopes_of`.
         other_from_ref: (3, 4) transform of points from the reference camera to the other.
         other_depth: (h, w) of the other view.
         other_sigma: (h, w) of it.
@@ -121,7 +121,7 @@ def count_witnesses(
             z = depth[row, column]
             if math.isnan(z):
                 continue
-            x, y = slope_at(lens, column + 0.5, row + 0.5, 1.0 / z)
+            x, y = slopes[row, column, 0], slopes[row, column, 1]
             a = z * (t[0, 0] * x + t[0, 1] * y + t[0, 2]) + t[0, 3]
             b = z * (t[1, 0] * x + t[1, 1] * y + t[1, 2]) + t[1, 3]
             c = z * (t[2, 0] * x + t[2, 1] * y + t[2, 2]) + t[2, 3]

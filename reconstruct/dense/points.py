@@ -8,13 +8,17 @@ from numba import njit
 from numpy.typing import NDArray
 
 from alice_survey.frames import Array
-from reconstruct.dense.sight import FAST, KernelLens, lens_of, slope_at
+from reconstruct.dense.sight import FAST, KernelLens, lens_of, slopes_of
 from reconstruct.dense.sight import pinhole_of as pinhole_of  # the mosaic takes it from here
 from reconstruct.model import View
 
 Float32 = NDArray[np.float32]
 
 _ENU_FROM_WORLD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+_BLOCK = 16
+"""Side of a block of pixels whose points are looked at together, pixels."""
+_ROUNDING = 1e-6
+"""Of coordinates as float32, relative; kernels and arrays differ by less."""
 _REACH = 2
 """Normals are spanned by the points this many pixels to either side."""
 
@@ -52,6 +56,7 @@ def points_in_box(
     factors: Float32,
     offset_enu: Array,
     box: tuple[float, float, float, float],
+    blocks: Float32,
 ) -> Points:
     """The kept points of a depth map inside of a box.
 
@@ -65,11 +70,13 @@ def points_in_box(
         factors: (rows, columns, 3) at nodes spread over the picture, by which colours are taken.
         offset_enu: (3,) origin of the points.
         box: west, east, south, north from that origin; a point on the west or north edge is inside.
+        blocks: where the view's points lie, see `block_bounds`.
     """
     transform = enu_from_cam(view, offset_enu)
     enu, normals, colours, sigmas = gather(
-        depth, sigma, kept, colour, factors, lens_of(view), transform, np.array(box)
-    )
+        depth, sigma, kept, colour, factors, lens_of(view), transform, np.array(box),
+        _meeting(blocks, offset_enu, box),
+    )  # fmt: skip
     return Points(
         enu=enu,
         normals=normals,
@@ -77,6 +84,51 @@ def points_in_box(
         sigmas=sigmas,
         views=np.full(len(enu), number, np.int32),
     )
+
+
+def block_bounds(
+    shape: tuple[int, int], rows: NDArray[np.int64], columns: NDArray[np.int64], world: Array
+) -> Float32:
+    """Between which coordinates the points of each block of pixels lie.
+
+    Args:
+        shape: (H, W) of the picture.
+        rows: (N,) of pixels.
+        columns: (N,) likewise.
+        world: (N, 3) their points: north, east, down.
+
+    Returns:
+        (h, w, 4) west, east, south, north, a little wide; west beyond east in an empty block.
+    """
+    bounds = np.empty((-(-shape[0] // _BLOCK), -(-shape[1] // _BLOCK), 4))
+    bounds[..., 0::2], bounds[..., 1::2] = np.inf, -np.inf
+    _widen(bounds, rows, columns, world)
+    margin = _ROUNDING * float(np.abs(world[:, :2]).max(initial=1.0))
+    wide: Float32 = (bounds + margin * np.array([-1.0, 1.0, -1.0, 1.0])).astype(np.float32)
+    return wide
+
+
+def _meeting(
+    blocks: Float32, offset_enu: Array, box: tuple[float, float, float, float]
+) -> NDArray[np.bool_]:
+    """Which blocks may hold points of a box."""
+    west, east = blocks[..., 0] - offset_enu[0], blocks[..., 1] - offset_enu[0]
+    south, north = blocks[..., 2] - offset_enu[1], blocks[..., 3] - offset_enu[1]
+    meeting: NDArray[np.bool_] = (
+        (west <= box[1]) & (east >= box[0]) & (south <= box[3]) & (north >= box[2])
+    )
+    return meeting
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _widen(
+    bounds: Array, rows: NDArray[np.int64], columns: NDArray[np.int64], world: Array
+) -> None:
+    """Widen blocks' bounds by points, in place."""
+    for i in range(rows.shape[0]):
+        block = bounds[rows[i] // _BLOCK, columns[i] // _BLOCK]
+        block[0], block[1] = min(block[0], world[i, 1]), max(block[1], world[i, 1])
+        block[2], block[3] = min(block[2], world[i, 0]), max(block[3], world[i, 0])
 
 
 def joined(parts: list[Points]) -> Points:
@@ -109,6 +161,7 @@ def gather(
     lens: KernelLens,
     enu_from_cam: Array,
     box: Array,
+    meeting: NDArray[np.bool_],
 ) -> tuple[Float32, Float32, NDArray[np.uint8], Float32]:
     """Points, normals, colours (RGB) and standard deviations of pixels whose point is in a box.
 
@@ -121,21 +174,23 @@ def gather(
         lens: of the view.
         enu_from_cam: (3, 4) transform.
         box: (4,) west, east, south, north.
+        meeting: (h, w) blocks of pixels of which any may be in the box.
 
     Returns:
         (N, 3), (N, 3), (N, 3), (N,), row by row; a normal is NaN beside unknown depth.
     """
     height, width = depth.shape
     t = enu_from_cam
+    slopes = slopes_of(depth, lens)
     enu = np.empty((height * width, 3), np.float32)
     pixels = np.empty((height * width, 2), np.int32)
     count = 0
     for row in range(height):
         for column in range(width):
-            if not kept[row, column]:
+            if not (meeting[row // _BLOCK, column // _BLOCK] and kept[row, column]):
                 continue
             z = depth[row, column]
-            x, y = slope_at(lens, column + 0.5, row + 0.5, 1.0 / z)
+            x, y = slopes[row, column, 0], slopes[row, column, 1]
             east = z * (t[0, 0] * x + t[0, 1] * y + t[0, 2]) + t[0, 3]
             north = z * (t[1, 0] * x + t[1, 1] * y + t[1, 2]) + t[1, 3]
             if east < box[0] or east >= box[1] or north <= box[2] or north > box[3]:
@@ -170,12 +225,12 @@ def gather(
         left, right = column - _REACH, column + _REACH
         if up < 0 or left < 0 or down >= height or right >= width:
             continue
-        _spot(depth, lens, row, right, a)
-        _spot(depth, lens, row, left, other)
+        _spot(depth, slopes, row, right, a)
+        _spot(depth, slopes, row, left, other)
         for k in range(3):
             a[k] -= other[k]
-        _spot(depth, lens, down, column, b)
-        _spot(depth, lens, up, column, other)
+        _spot(depth, slopes, down, column, b)
+        _spot(depth, slopes, up, column, other)
         for k in range(3):
             b[k] -= other[k]
         n0 = b[1] * a[2] - b[2] * a[1]
@@ -190,8 +245,7 @@ def gather(
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
-def _spot(depth: Float32, lens: KernelLens, row: int, column: int, spot: Array) -> None:
+def _spot(depth: Float32, slopes: Float32, row: int, column: int, spot: Array) -> None:
     """Write the point (3,) of a pixel, in the camera, into `spot`; NaN where unknown."""
     z = depth[row, column]
-    x, y = slope_at(lens, column + 0.5, row + 0.5, 1.0 / z)
-    spot[0], spot[1], spot[2] = x * z, y * z, z
+    spot[0], spot[1], spot[2] = slopes[row, column, 0] * z, slopes[row, column, 1] * z, z

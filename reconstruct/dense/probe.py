@@ -129,7 +129,12 @@ def shrunk(
     pictures: Pictures, image: str, size_px: tuple[int, int]
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Colour and validity of a picture at a size (width, height)."""
-    colour, valid = pictures.colour(image), pictures.valid(image)
+    return _resized(pictures.colour(image), pictures.valid(image), size_px)
+
+
+def _resized(
+    colour: NDArray[np.uint8], valid: NDArray[np.bool_], size_px: tuple[int, int]
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     if colour.shape[1::-1] == size_px:
         return colour, valid
     small = cv2.resize(valid.astype(np.uint8) * 255, size_px, interpolation=cv2.INTER_AREA)
@@ -139,15 +144,11 @@ def shrunk(
 def probe(task: ProbeTask) -> ProbeResult:
     """Match a view with its partners at every scale."""
     known, spread = [], []
-    for scale in task.scales:
-        views = [scaled_view(view, scale) for view in (task.view, *task.partners)]
-        greys, valids = [], []
-        for view in views:
-            colour, valid = shrunk(
-                open_pictures(task.workspace), view.image, (view.width_px, view.height_px)
-            )
-            greys.append(normalise(colour))
-            valids.append(valid)
+    whole = (task.view, *task.partners)
+    looks = [_looks(task.workspace, view, task.scales) for view in whole]
+    for n, scale in enumerate(task.scales):
+        views = [scaled_view(view, scale) for view in whole]
+        greys, valids = zip(*(look[n] for look in looks), strict=True)
         maps = []
         for number in range(1, len(views)):
             found = pair_depth(
@@ -165,6 +166,20 @@ def probe(task: ProbeTask) -> ProbeResult:
         known.append(float(np.isfinite(maps[0][0]).mean()) if maps else 0.0)
         spread.append(_spread(maps))
     return ProbeResult(known=tuple(known), spread=tuple(spread))
+
+
+def _looks(
+    workspace: Path, view: View, scales: Sequence[float]
+) -> list[tuple[NDArray[np.uint8], NDArray[np.bool_]]]:
+    """An evened picture and its validity at every scale, the picture read once."""
+    pictures = open_pictures(workspace)
+    colour, valid = pictures.colour(view.image), pictures.valid(view.image)
+    found = []
+    for scale in scales:
+        small = scaled_view(view, scale)
+        part, usable = _resized(colour, valid, (small.width_px, small.height_px))
+        found.append((normalise(part), usable))
+    return found
 
 
 def _spread(maps: Sequence[tuple[NDArray[np.float32], NDArray[np.float32]]]) -> float:

@@ -52,14 +52,37 @@ def field_of(lens: KernelLens, x: float, y: float) -> tuple[float, float]:
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
-def slope_at(lens: KernelLens, x: float, y: float, inverse_depth: float) -> tuple[float, float]:
-    """Slopes x/z, y/z of the spot at an inverse depth that the warped picture shows at (x, y)."""
-    pinhole, shift = lens
-    if shift[3] != 0.0:
-        a, b = field_of(lens, x, y)
-        x += a * (inverse_depth - shift[3])
-        y += b * (inverse_depth - shift[3])
-    return (x - pinhole[2]) / pinhole[0], (y - pinhole[3]) / pinhole[1]
+def slopes_of(depth: NDArray[np.float32], lens: KernelLens) -> NDArray[np.float32]:
+    """Slopes x/z, y/z (H, W, 2) of the spots that a warped picture shows; NaN without depth.
+
+    Nodes are blended once a row, so that a pixel takes but one step along it.
+
+    Args:
+        depth: (H, W) of the view.
+        lens: of the view.
+    """
+    pinhole, (nodes, width_px, height_px, inverse_working) = lens
+    height, width = depth.shape
+    rows, columns = nodes.shape[0], nodes.shape[1]
+    slopes = np.empty((height, width, 2), np.float32)
+    line = np.empty((columns, 2))
+    for row in range(height):
+        v = (row + 0.5) * ((rows - 1) / height_px)
+        above = min(int(v), rows - 2)
+        q = v - above
+        for node in range(columns):
+            for k in range(2):
+                line[node, k] = (1 - q) * nodes[above, node, k] + q * nodes[above + 1, node, k]
+        for column in range(width):
+            u = (column + 0.5) * ((columns - 1) / width_px)
+            left = min(int(u), columns - 2)
+            p = u - left
+            step = 1.0 / depth[row, column] - inverse_working
+            x = column + 0.5 + step * ((1 - p) * line[left, 0] + p * line[left + 1, 0])
+            y = row + 0.5 + step * ((1 - p) * line[left, 1] + p * line[left + 1, 1])
+            slopes[row, column, 0] = (x - pinhole[2]) / pinhole[0]
+            slopes[row, column, 1] = (y - pinhole[3]) / pinhole[1]
+    return slopes
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]

@@ -169,6 +169,7 @@ def fuse_tile(task: TileTask) -> Tile:
                 task.light.factors(view.camera, view.image),
                 offset,
                 box,
+                np.asarray(store.load(index, "blocks")),
             )
         )
     points = joined(parts)

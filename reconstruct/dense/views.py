@@ -17,9 +17,10 @@ from alice_survey.executor import parallel_map
 from alice_survey.frames import Array
 from reconstruct.dense.depth import pair_depth
 from reconstruct.dense.fusion import GATE_SIGMAS, count_witnesses, merge_depths
+from reconstruct.dense.points import block_bounds
 from reconstruct.dense.probe import open_pictures, shrunk
 from reconstruct.dense.refine import Look, prepared, refine
-from reconstruct.dense.sight import lens_of
+from reconstruct.dense.sight import lens_of, slopes_of
 from reconstruct.dense.stereo_pairs import StereoPair, in_frame
 from reconstruct.dense.tiles import ViewSummary
 from reconstruct.dense.view_store import ViewStore
@@ -214,13 +215,14 @@ def check_view(task: CheckTask) -> ViewSummary:
     alike = np.asarray(store.load(task.index, "seen")).astype(np.int16)
     refuted = np.zeros_like(alike)
     supported = np.zeros_like(alike)
+    slopes = slopes_of(depth, lens_of(view))
     for number, other in task.neighbours:
         other_from_ref = other.world_from_cam.inv() * view.world_from_cam
         other_depth, other_sigma = store.load_depth(number, "fine")
         seen, through = count_witnesses(
             depth,
             sigma,
-            lens_of(view),
+            slopes,
             np.ascontiguousarray(other_from_ref.as_matrix()[:3]),
             other_depth,
             other_sigma * np.float32(task.doubt),
@@ -247,6 +249,7 @@ def check_view(task: CheckTask) -> ViewSummary:
     beyond = (points[:, :2] < low) | (points[:, :2] > high)
     kept[rows, columns] = ~beyond.any(axis=1)
     store.save_mask(task.index, "kept", kept)
+    store.save(task.index, "blocks", block_bounds(kept.shape, rows, columns, points))
     return ViewSummary(
         bounds=(float(low[0]), float(low[1]), float(high[0]), float(high[1])),
         up=float(-np.median(points[:, 2])),

@@ -7,14 +7,14 @@ import pycolmap
 from numpy.typing import NDArray
 
 from alice_survey.frames import Array
-from reconstruct.mapping.database import as_transform
+from reconstruct.model_files import keypoints_of
 
 Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Observed:
-    """Keypoints that have a point, picture by picture."""
+    """Keypoints that have a point, picture by picture, as they are at one moment."""
 
     pictures: Indices
     """(N,) ids of the registered pictures, ascending."""
@@ -22,45 +22,32 @@ class Observed:
     """(N + 1,) where each picture's observations begin."""
     keypoint: Indices
     """(O,) index among the picture's keypoints."""
+    pixels: Array
+    """(O, 2) where the keypoints are."""
     point: Indices
     """(O,) index among `point_ids`."""
     point_ids: Indices
     """(P,) ascending."""
+    points: Array
+    """(P, 3) in the model's frame."""
+    in_cameras: Array
+    """(O, 3) the observations' points in the frames of their cameras."""
 
     def of(self, number: int) -> slice:
         """The observations of the picture with this index among `pictures`."""
         return slice(int(self.starts[number]), int(self.starts[number + 1]))
 
-    def points(self, model: pycolmap.Reconstruction) -> Array:
-        """Where the points are now, (P, 3)."""
-        return np.array([model.points3D[i].xyz for i in self.point_ids.tolist()]).reshape(-1, 3)
-
-    def in_cameras(self, model: pycolmap.Reconstruction, points: Array) -> Array:
-        """The observations' points in the frames of their cameras, (O, 3)."""
-        found = np.empty((len(self.point), 3))
-        for n, number in enumerate(self.pictures.tolist()):
-            pose = as_transform(model.images[number].cam_from_world())
-            rows = self.of(n)
-            if rows.stop > rows.start:
-                found[rows] = pose.apply(points[self.point[rows]])
-        return found
-
-    def pixels(self, model: pycolmap.Reconstruction) -> Array:
-        """Where the keypoints are, (O, 2)."""
-        rows = [
-            p.xy
-            for number in self.pictures.tolist()
-            for p in model.images[number].get_observation_points2D()
-        ]
-        return np.array(rows).reshape(-1, 2)
+    def row(self, picture: int) -> int:
+        """Index among `pictures` of the one with this id; it must be there."""
+        return int(np.searchsorted(self.pictures, picture))
 
     def misses(self, model: pycolmap.Reconstruction) -> Array:
-        """Where pinholes see the points less where the keypoints are, (O, 2) pixels."""
-        local = self.in_cameras(model, self.points(model))
-        found = np.empty((len(local), 2))
+        """Where the cameras see the points less where the keypoints are, (O, 2) pixels."""
+        found = np.empty((len(self.point), 2))
         for n, number in enumerate(self.pictures.tolist()):
-            found[self.of(n)] = model.images[number].camera.img_from_cam(local[self.of(n)])
-        missed: Array = found - self.pixels(model)
+            rows = self.of(n)
+            found[rows] = model.images[number].camera.img_from_cam(self.in_cameras[rows])
+        missed: Array = found - self.pixels
         return missed
 
 
@@ -71,21 +58,33 @@ def frames_of(model: pycolmap.Reconstruction) -> Indices:
 
 
 def observed(model: pycolmap.Reconstruction) -> Observed:
-    """The observations of a model."""
-    count = len(model.points3D)
-    ids = np.sort(np.fromiter(model.points3D.keys(), dtype=np.int64, count=count))
-    pictures = [n for n, image in sorted(model.images.items()) if image.has_pose]
-    keypoints, points, starts = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [0]
-    for number in pictures:
-        image = model.images[number]
-        keypoints.append(np.array(image.get_observation_point2D_idxs(), dtype=np.int64))
-        mine = [p.point3D_id for p in image.get_observation_points2D()]
-        points.append(np.searchsorted(ids, np.array(mine, dtype=np.int64)).astype(np.int64))
-        starts.append(starts[-1] + len(mine))
+    """The observations of a model as it is now."""
+    poses = {n: i.cam_from_world().matrix() for n, i in model.images.items() if i.has_pose}
+    pictures = np.array(sorted(poses), dtype=np.int64)
+    stored = keypoints_of(model)
+    xyz = dict(model.points3D.items())
+    ids = np.array(sorted(xyz), dtype=np.int64)
+    points = np.array([xyz[i].xyz for i in ids.tolist()]).reshape(-1, 3)
+    # One of no length first, for a model without pictures.
+    keypoint, pixels, point = [np.zeros(0, np.int64)], [np.zeros((0, 2))], [np.zeros(0, np.int64)]
+    local, starts = [np.zeros((0, 3))], [0]
+    for number in pictures.tolist():
+        rows = stored[number]
+        at = np.flatnonzero(rows["point"] >= 0)
+        mine = np.searchsorted(ids, rows["point"][at]).astype(np.int64)
+        keypoint.append(at)
+        pixels.append(rows["xy"][at])
+        point.append(mine)
+        pose = poses[number]
+        local.append(points[mine] @ pose[:, :3].T + pose[:, 3])
+        starts.append(starts[-1] + len(at))
     return Observed(
-        pictures=np.array(pictures, dtype=np.int64),
+        pictures=pictures,
         starts=np.array(starts, dtype=np.int64),
-        keypoint=np.concatenate(keypoints),
-        point=np.concatenate(points),
+        keypoint=np.concatenate(keypoint),
+        pixels=np.concatenate(pixels),
+        point=np.concatenate(point),
         point_ids=ids,
+        points=points,
+        in_cameras=np.concatenate(local),
     )

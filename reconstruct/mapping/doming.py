@@ -20,6 +20,7 @@ from alice_survey.frames import Array, Datum, rotation_from_attitude
 from alice_survey.manifest import ImageRecord
 from camera_calib.rig import Rig
 from reconstruct.lenses.lens import Lens
+from reconstruct.mapping.arrays import Observed, observed
 from reconstruct.mapping.database import as_transform
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.priors import pinhole_positions
@@ -137,7 +138,8 @@ def measure_doming(
         sigmas: (N, 3), likewise.
         rotations: `ned_from_pinhole` by picture's index, as navigation has it.
     """
-    pixel = ground_pixel(model)
+    seen = observed(model)
+    pixel = ground_pixel(model, seen)
     down = down_of(model, rotations)
     reference = _references(model)
     numbers = sorted(reference.values())
@@ -151,7 +153,7 @@ def measure_doming(
     found = Doming(
         along=along,
         across=across,
-        scale=scale_trend(model, reference, down),
+        scale=scale_trend(model, seen, reference, down),
         pixel_m=pixel,
     )
     for note in found.notes():
@@ -213,12 +215,13 @@ def bend_of(
 
 
 def scale_trend(
-    model: pycolmap.Reconstruction, reference: Mapping[int, int], down: Array
+    model: pycolmap.Reconstruction, seen: Observed, reference: Mapping[int, int], down: Array
 ) -> ScaleTrend | None:
     """The model's scale at every station against that station's stereo, as a trend over the block.
 
     Args:
         model: on one rig.
+        seen: its observations.
         reference: picture by frame.
         down: (3,) unit vector in the model's frame.
 
@@ -228,7 +231,7 @@ def scale_trend(
     local = [
         (model.images[reference[frame]].projection_center(), *told)
         for frame in sorted(reference)
-        if (told := _station_scale(model, frame)) is not None
+        if (told := _station_scale(model, seen, frame)) is not None
     ]
     if len(local) < _LEAST_STATIONS:
         return None
@@ -267,9 +270,8 @@ def down_of(model: pycolmap.Reconstruction, rotations: Mapping[int, Rotation]) -
     posed = [n for n in sorted(model.images) if model.images[n].has_pose]
     told = [n for n in posed if n - 1 in rotations]
     rows = [
-        as_transform(model.images[n].cam_from_world())
-        .rotation.inv()
-        .apply(rotations[n - 1].inv().apply([0.0, 0.0, 1.0]) if told else [0.0, 0.0, 1.0])
+        model.images[n].cam_from_world().matrix()[:, :3].T
+        @ (rotations[n - 1].inv().apply([0.0, 0.0, 1.0]) if told else [0.0, 0.0, 1.0])
         for n in told or posed
     ]
     mean = np.median(np.array(rows), axis=0)
@@ -277,15 +279,13 @@ def down_of(model: pycolmap.Reconstruction, rotations: Mapping[int, Rotation]) -
     return unit
 
 
-def ground_pixel(model: pycolmap.Reconstruction) -> float:
+def ground_pixel(model: pycolmap.Reconstruction, seen: Observed) -> float:
     """Median size of a pixel on the ground, in units of the model; NaN without points."""
     rows = []
-    for number in sorted(model.images):
-        image = model.images[number]
-        if image.has_pose:
-            depth = _depths(model, image, _ids(image))
-            if len(depth):
-                rows.append(np.median(depth) / model.cameras[image.camera_id].mean_focal_length())
+    for n, number in enumerate(seen.pictures.tolist()):
+        depth = seen.in_cameras[seen.of(n), 2]
+        if len(depth):
+            rows.append(np.median(depth) / model.images[number].camera.mean_focal_length())
     return float(np.median(rows)) if rows else float("nan")
 
 
@@ -331,43 +331,33 @@ def _robust_fit(design: Array, values: Array, sigmas: Array) -> tuple[Array, Arr
     return np.asarray(fitted, np.float64), covariance
 
 
-def _station_scale(model: pycolmap.Reconstruction, frame: int) -> tuple[float, float] | None:
+def _station_scale(
+    model: pycolmap.Reconstruction, seen: Observed, frame: int
+) -> tuple[float, float] | None:
     """Depths of a frame's points over their depths by its first two cameras alone, and sigma."""
     numbers = sorted(d.id for d in model.frames[frame].image_ids if model.images[d.id].has_pose)[:2]
     if len(numbers) < 2:
         return None
     first, second = (model.images[n] for n in numbers)
-    seen = [{p.point3D_id: p.xy for p in i.points2D if p.has_point3D()} for i in (first, second)]
-    both = sorted(seen[0].keys() & seen[1].keys())
+    theirs = [seen.of(seen.row(n)) for n in numbers]
+    both, *at = np.intersect1d(seen.point[theirs[0]], seen.point[theirs[1]], return_indices=True)
     if len(both) < _LEAST_STEREO_POINTS:
         return None
     poses = [as_transform(i.cam_from_world()) for i in (first, second)]
     first_from_second = poses[0] * poses[1].inv()
     starts, rays = [], []
     for image, pixels, pose in (
-        (first, seen[0], RigidTransform.identity()),
-        (second, seen[1], first_from_second),
+        (first, seen.pixels[theirs[0]][at[0]], RigidTransform.identity()),
+        (second, seen.pixels[theirs[1]][at[1]], first_from_second),
     ):
-        at_one = model.cameras[image.camera_id].cam_from_img(np.array([pixels[i] for i in both]))
+        at_one = image.camera.cam_from_img(pixels)
         ray = np.column_stack([at_one, np.ones(len(both))])
         ray = pose.rotation.apply(ray / np.linalg.norm(ray, axis=1, keepdims=True))
         starts.append(np.broadcast_to(pose.translation, ray.shape))
         rays.append(ray)
     along, _ = ray_passes(starts[0], rays[0], starts[1], rays[1])
     # Noise of pixels is that of 1 / depth: its mean, unlike that of depths, is not pulled away.
-    ratio = _depths(model, first, both) / (along * rays[0][:, 2])
+    ratio = seen.in_cameras[theirs[0]][at[0], 2] / (along * rays[0][:, 2])
     ratio = ratio[np.isfinite(ratio)]
     spread = 1.4826 * float(np.median(np.abs(ratio - np.median(ratio))))
     return float(np.median(ratio)), max(1.2533 * spread / np.sqrt(len(ratio)), 1e-9)
-
-
-def _ids(image: pycolmap.Image) -> list[int]:
-    return [p.point3D_id for p in image.points2D if p.has_point3D()]
-
-
-def _depths(model: pycolmap.Reconstruction, image: pycolmap.Image, ids: Sequence[int]) -> Array:
-    points = np.array([model.points3D[i].xyz for i in ids]).reshape(-1, 3)
-    if len(points):
-        points = as_transform(image.cam_from_world()).apply(points)
-    depth: Array = points[:, 2]
-    return depth

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.frames import Array
@@ -20,6 +21,10 @@ from reconstruct.mapping.database import Observations, as_transform
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.normal_equations import Sights
 
+_SLOPES = (*PARAMETERS, *TURN_AND_SHIFT)
+"""What a camera's pixels depend on: itself, and its place on the rig."""
+_BLOCK = 4096
+"""Observations at a time: what they need beside their results stays in the cache."""
 _MOST_OBSERVATIONS = 200_000
 """More tell little more of so few parameters; whole points are left out evenly."""
 
@@ -131,26 +136,77 @@ def exact_sights(
     by_point = np.zeros((len(arm), 2, 3))
     by_shared, miss = np.zeros((len(arm), 2, count)), np.zeros((len(arm), 2))
     for c, name in enumerate(names):
-        rows = np.flatnonzero(pixels.camera == c)
-        turns = state.turns[pixels.station[rows]]
-        pose = state.cam_from_rig[c]
-        turned = np.einsum("nij,ni->nj", turns, arm[rows]) @ pose.rotation.as_matrix().T
-        found, by_cam, by_parameter = state.cameras[c].project_jacobian(turned + pose.translation)
-        sees = np.isfinite(found).all(axis=1)
-        rows, by_cam, by_parameter = rows[sees], by_cam[sees], by_parameter[sees]
-        by_rig = by_cam @ pose.rotation.as_matrix()
-        by_point[rows] = by_rig @ turns[sees].transpose(0, 2, 1)
-        miss[rows] = found[sees] - pixels.taken[rows]
-        by_pose = pose_jacobian(by_cam, turned[sees])
-        for g, field in enumerate(fields):
-            camera, parameter = field.split(".")
-            if camera != name:
-                continue
-            if parameter in PARAMETERS:
-                by_shared[rows, :, g] = by_parameter[:, :, PARAMETERS.index(parameter)]
-            else:
-                by_shared[rows, :, g] = by_pose[:, :, TURN_AND_SHIFT.index(parameter)]
+        pose, turn = state.cam_from_rig[c], state.cam_from_rig[c].rotation.as_matrix()
+        mine = [(g, f.split(".")[1]) for g, f in enumerate(fields) if f.split(".")[0] == name]
+        source = np.array([_SLOPES.index(parameter) for _, parameter in mine], dtype=np.int64)
+        target = np.array([g for g, _ in mine], dtype=np.int64)
+        every = np.flatnonzero(pixels.camera == c)
+        for first in range(0, len(every), _BLOCK):
+            rows = every[first : first + _BLOCK]
+            turned = _in_rig(arm, rows, pixels.station, state.turns) @ turn.T
+            at, by_cam, by_camera = state.cameras[c].project_jacobian(turned + pose.translation)
+            _put(
+                rows, at, by_cam, turn, state.turns, pixels.station, pixels.taken,
+                np.concatenate([by_camera, pose_jacobian(by_cam, turned)], axis=2),
+                source, target, by_point, by_shared, miss,
+            )  # fmt: skip
     return Sights(
         starts=pixels.starts, station=pixels.station, by_point=by_point, arm=arm,
         by_shared=by_shared, miss=miss,
     )  # fmt: skip
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _in_rig(arm: Array, rows: Indices, station: Indices, turns: Array) -> Array:
+    """Some observations' arms (N, 3) along the axes of their rigs."""
+    found = np.empty((rows.shape[0], 3))
+    for i in range(rows.shape[0]):
+        turn, o = turns[station[rows[i]]], rows[i]
+        for j in range(3):
+            found[i, j] = turn[0, j] * arm[o, 0] + turn[1, j] * arm[o, 1] + turn[2, j] * arm[o, 2]
+    return found
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _put(
+    rows: Indices, at: Array, by_cam: Array, turn: Array, turns: Array, station: Indices,
+    taken: Array, slopes: Array, source: Indices, target: Indices,
+    by_point: Array, by_shared: Array, miss: Array,
+) -> None:  # fmt: skip
+    """Put what one camera tells in its rows, in place; what it does not see stays as it is.
+
+    Args:
+        rows: (N,) observations of the camera.
+        at: (N, 2) where it sees them; NaN where it does not.
+        by_cam: (N, 2, 3) slopes by the point in the camera's frame.
+        turn: (3, 3) rotation of `cam_from_rig`.
+        turns: (F, 3, 3) of `world_from_rig`.
+        station: (O,).
+        taken: (O, 2).
+        slopes: (N, 2, K) by all that the camera may depend on.
+        source: (G',) which of the K are wanted.
+        target: (G',) and where among what is shared they go.
+        by_point: (O, 2, 3) to fill.
+        by_shared: (O, 2, G) likewise.
+        miss: (O, 2) likewise.
+    """
+    cam_from_world = np.empty((3, 3))
+    for i in range(rows.shape[0]):
+        o = rows[i]
+        if not (np.isfinite(at[i, 0]) and np.isfinite(at[i, 1])):
+            continue
+        for k in range(3):
+            for j in range(3):
+                value = 0.0
+                for m in range(3):
+                    value += turn[k, m] * turns[station[o], j, m]
+                cam_from_world[k, j] = value
+        for row in range(2):
+            miss[o, row] = at[i, row] - taken[o, row]
+            u, v, w = by_cam[i, row, 0], by_cam[i, row, 1], by_cam[i, row, 2]
+            for j in range(3):
+                by_point[o, row, j] = (
+                    u * cam_from_world[0, j] + v * cam_from_world[1, j] + w * cam_from_world[2, j]
+                )
+            for g in range(source.shape[0]):
+                by_shared[o, row, target[g]] = slopes[i, row, source[g]]

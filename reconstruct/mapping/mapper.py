@@ -20,6 +20,7 @@ from alice_survey.errors import ReconstructionError, warn
 from alice_survey.frames import Array
 from alice_survey.manifest import ImageRecord
 from reconstruct.lenses.lens import Lens
+from reconstruct.mapping.arrays import observed
 from reconstruct.mapping.database import Observations, write_database
 from reconstruct.mapping.database import as_transform as as_transform
 from reconstruct.mapping.global_mapper import adjust, map_globally
@@ -349,15 +350,11 @@ def _repaired(
 def collapsed_frames(model: pycolmap.Reconstruction) -> list[int]:
     """Frames many of whose points lie in their cameras' own centres."""
     depths: dict[int, list[Array]] = {}
-    for image in model.images.values():
-        if not image.has_pose:
-            continue
-        seen = [p.point3D_id for p in image.points2D if p.has_point3D()]
-        if seen:
-            points = np.array([model.points3D[i].xyz for i in seen])
-            pose = image.cam_from_world()
-            depth = (points @ np.asarray(pose.rotation.matrix()).T + pose.translation)[:, 2]
-            depths.setdefault(image.frame_id, []).append(depth)
+    seen = observed(model)
+    for n, number in enumerate(seen.pictures.tolist()):
+        depth = seen.in_cameras[seen.of(n), 2]
+        if len(depth):
+            depths.setdefault(model.images[number].frame_id, []).append(depth)
     if not depths:
         return []
     usual = float(np.median(np.concatenate([np.concatenate(rows) for rows in depths.values()])))

@@ -244,33 +244,34 @@ def _reduce(
                 for j in range(3):
                     value -= gain[k, i, j] * pull[j]
                 slope[s, i] += value
+                u, v = pose[k, 0, i], pose[k, 1, i]
+                x, y, z = gain[k, i, 0], gain[k, i, 1], gain[k, i, 2]
                 for g in range(count):
-                    value = pose[k, 0, i] * by_shared[o, 0, g] + pose[k, 1, i] * by_shared[o, 1, g]
-                    for j in range(3):
-                        value -= gain[k, i, j] * together[j, g]
-                    border[s, i, g] += value
+                    border[s, i, g] += (
+                        u * by_shared[o, 0, g] + v * by_shared[o, 1, g]
+                        - x * together[0, g] - y * together[1, g] - z * together[2, g]
+                    )  # fmt: skip
             for other in range(first, end):
-                m = other - first
-                at = find_block(pointers, columns, s, station[other])
+                m, block = other - first, blocks[find_block(pointers, columns, s, station[other])]
                 for i in range(6):
+                    x, y, z = gain[k, i, 0], gain[k, i, 1], gain[k, i, 2]
                     for j in range(6):
-                        blocks[at, i, j] -= (
-                            gain[k, i, 0] * cross[m, j, 0]
-                            + gain[k, i, 1] * cross[m, j, 1]
-                            + gain[k, i, 2] * cross[m, j, 2]
-                        )
+                        block[i, j] -= x * cross[m, j, 0] + y * cross[m, j, 1] + z * cross[m, j, 2]
             for g in range(count):
-                for h in range(count):
-                    shared[g, h] += (
-                        by_shared[o, 0, g] * by_shared[o, 0, h]
-                        + by_shared[o, 1, g] * by_shared[o, 1, h]
-                    )
-                shared_slope[g] += by_shared[o, 0, g] * miss[o, 0] + by_shared[o, 1, g] * miss[o, 1]
+                u, v = by_shared[o, 0, g], by_shared[o, 1, g]
+                if u == 0.0 and v == 0.0:  # of another camera
+                    continue
+                for h in range(g + 1):
+                    shared[g, h] += u * by_shared[o, 0, h] + v * by_shared[o, 1, h]
+                shared_slope[g] += u * miss[o, 0] + v * miss[o, 1]
         for g in range(count):
             for j in range(3):
                 shared_slope[g] -= solved[j, g] * pull[j]
-                for h in range(count):
+                for h in range(g + 1):
                     shared[g, h] -= together[j, g] * solved[j, h]
+    for g in range(count):
+        for h in range(g):
+            shared[h, g] = shared[g, h]
     return blocks, border, shared, slope, shared_slope, inverse
 
 

@@ -98,11 +98,6 @@ class Keypoints:
             if image.has_pose
         }
         self._now = {number: p.warped.copy() for number, p in self._pictures.items()}
-        self._seen = observed(mapped.model)
-
-    def look_again(self, model: pycolmap.Reconstruction) -> None:
-        """Learn which keypoints have a point, after that changed."""
-        self._seen = observed(model)
 
     @property
     def through_ports(self) -> bool:
@@ -112,7 +107,7 @@ class Keypoints:
     def metres_per_unit(self, model: pycolmap.Reconstruction) -> float:
         """Metres in a unit of a model without scale, whose median depth is the working depth."""
         working = [p.working_m for p in self._pictures.values() if np.isfinite(p.working_m)]
-        return float(np.median(working) / np.median(self._depths(model)))
+        return float(np.median(working) / np.median(observed(model).in_cameras[:, 2]))
 
     def correct(
         self, model: pycolmap.Reconstruction, metres_per_unit: float
@@ -127,10 +122,11 @@ class Keypoints:
             The largest move, and the root mean square of the whole shift, pixels.
         """
         largest, squares, count = 0.0, 0.0, 0
-        depths = metres_per_unit * self._depths(model)
-        for n, number in enumerate(self._seen.pictures.tolist()):
-            picture, rows = self._pictures[number], self._seen.of(n)
-            at = self._seen.keypoint[rows]
+        seen = observed(model)
+        depths = metres_per_unit * seen.in_cameras[:, 2]
+        for n, number in enumerate(seen.pictures.tolist()):
+            picture, rows = self._pictures[number], seen.of(n)
+            at = seen.keypoint[rows]
             if not (np.isfinite(picture.working_m) and len(at)):
                 continue
             ideal = picture.ideal(at, depths[rows])
@@ -143,10 +139,11 @@ class Keypoints:
         """Move the keypoints that have no point by the depth of the nearest one that has."""
         from scipy.spatial import KDTree
 
-        depths = metres_per_unit * self._depths(model)
-        for n, number in enumerate(self._seen.pictures.tolist()):
-            picture, rows = self._pictures[number], self._seen.of(n)
-            at = self._seen.keypoint[rows]
+        seen = observed(model)
+        depths = metres_per_unit * seen.in_cameras[:, 2]
+        for n, number in enumerate(seen.pictures.tolist()):
+            picture, rows = self._pictures[number], seen.of(n)
+            at = seen.keypoint[rows]
             rest = np.setdiff1d(np.arange(len(picture.warped)), at)
             if not (np.isfinite(picture.working_m) and len(at) and len(rest)):
                 continue
@@ -161,11 +158,6 @@ class Keypoints:
         for i, xy in zip(at[far].tolist(), ideal[far], strict=True):
             points[i].xy = xy
         return float(moved.max())
-
-    def _depths(self, model: pycolmap.Reconstruction) -> Array:
-        """Of the keypoints that have a point, before the pinholes' centres."""
-        depths: Array = self._seen.in_cameras(model, self._seen.points(model))[:, 2]
-        return depths
 
 
 @progress.step("make refraction exact")
@@ -212,9 +204,7 @@ def refract(
 
     def judge(model: pycolmap.Reconstruction, scale: float) -> tuple[int, int]:
         keypoints.correct_unseen(model, scale)
-        counts = _judge_again(model, seen, folder, _pinholes(mapped, cam_from_rig))
-        keypoints.look_again(model)
-        return counts
+        return _judge_again(model, seen, folder, _pinholes(mapped, cam_from_rig))
 
     model = pycolmap.Reconstruction(mapped.model)
     moves: list[float] = []

@@ -28,7 +28,7 @@ from alice_survey.manifest import ImageRecord
 from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import Indices, Observed, frames_of, observed
 from reconstruct.mapping.calibration_part import CalibrationPart, calibration_part
-from reconstruct.mapping.database import Observations, as_transform
+from reconstruct.mapping.database import Observations
 from reconstruct.mapping.gauge import Gauge
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.normal_equations import (
@@ -124,7 +124,7 @@ def estimate(
     if calibration is not None:
         shape = calibration.without(gauge)
         frame_cov = frame_cov + shape.of_stations()
-        points += shape.of_points(seen.points(model))
+        points += shape.of_points(seen.points)
     first = _first_pictures(model, seen, frames)
     return Uncertainty(
         frames=frames,
@@ -209,8 +209,7 @@ def sights_of(
     Returns:
         Observations sorted by point, and which of `seen` they are.
     """
-    points = seen.points(model)
-    local, pixels = seen.in_cameras(model, points), seen.pixels(model)
+    points, local, pixels = seen.points, seen.in_cameras, seen.pixels
     order = np.argsort(seen.point, kind="stable")
     station, by_point = np.empty(len(order), np.int64), np.empty((len(order), 2, 3))
     miss = np.empty((len(order), 2))
@@ -221,7 +220,7 @@ def sights_of(
         x, y, z = local[rows].T
         zero = np.zeros_like(z)
         slopes = np.stack([fx / z, zero, -fx * x / z**2, zero, fy / z, -fy * y / z**2], axis=-1)
-        turn = as_transform(image.cam_from_world()).rotation.as_matrix()
+        turn = image.cam_from_world().matrix()[:, :3]
         by_point[rows] = slopes.reshape(-1, 2, 3) @ turn
         miss[rows] = np.column_stack([fx * x / z + cx, fy * y / z + cy]) - pixels[rows]
         station[rows] = np.searchsorted(frames, image.frame_id)

@@ -10,6 +10,7 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.windows import Window
 
+from alice_survey.resources import release_memory
 from reconstruct.model import View
 from reconstruct.mosaic.blend import Blend, Part
 from reconstruct.mosaic.colour import ColourModel
@@ -144,7 +145,9 @@ def label_block(task: PaintTask) -> Labels:
 
 def paint_tiles(tasks: Sequence[PaintTask]) -> list[Painted]:
     """Paint neighbouring tiles, which share pictures."""
-    return [paint_tile(task) for task in tasks]
+    painted = [paint_tile(task) for task in tasks]
+    release_memory()  # arrays of a tile are of any size, and leave holes
+    return painted
 
 
 def paint_tile(task: PaintTask) -> Painted:

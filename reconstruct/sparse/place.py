@@ -238,7 +238,7 @@ def _scale_source(known: _KnownScale | None, ties: ControlFit) -> str:
     told = " and ".join(
         [
             *([f"{points} control points"] if points > 1 else []),
-            *([f"{bars} known lengths"] if bars else []),
+            *([f"{bars} known length{'s' * (bars > 1)}"] if bars else []),
         ]
     )
     return f"scale from {told}" if known is None else f"{source}, corrected by {told}"

@@ -15,6 +15,7 @@ from alice_survey.errors import WorkspaceError
 from alice_survey.frames import BODY_FROM_NADIR_CAM, Array, attitude_from_rotation
 from alice_survey.manifest import ImageRecord
 from reconstruct.lenses.lens import Lens
+from reconstruct.mapping.arrays import observed
 from reconstruct.mapping.database import as_transform
 from reconstruct.model import WorldFrame
 from reconstruct.sparse.covariance import attitude_sigmas_deg
@@ -67,23 +68,17 @@ def track_rows(
         frame: the world.
         body_from_cam: mount of every camera that has one.
     """
-    points = {i: p.xyz for i, p in model.points3D.items()}
+    seen = observed(model)
+    missed = np.linalg.norm(seen.misses(model), axis=1)
     pupils = {
         name: lens.pinhole_from_cam if frame.scaled else RigidTransform.identity()
         for name, lens in lenses.items()
     }
     rows = []
-    for image in model.images.values():
-        if not image.has_pose:
-            continue
+    for n, number in enumerate(seen.pictures.tolist()):
+        image, misses = model.images[number], missed[seen.of(n)]
         record = records[image.name]
         cam_from_world = as_transform(image.cam_from_world())
-        seen = [p for p in image.points2D if p.has_point3D()]
-        misses = np.array([np.nan])
-        if seen:
-            world = np.array([points[p.point3D_id] for p in seen])
-            found = np.array(image.camera.img_from_cam(cam_from_world.apply(world)))
-            misses = np.linalg.norm(found - np.array([p.xy for p in seen]), axis=1)
         pose = cam_from_world.inv() * pupils[record.camera]
         mount = body_from_cam.get(record.camera, BODY_FROM_NADIR_CAM)
         rows.append(
@@ -93,8 +88,8 @@ def track_rows(
                 camera=record.camera,
                 time_s=record.time_s,
                 world_from_cam=pose,
-                points=len(seen),
-                reprojection_px=float(misses.mean()),
+                points=len(misses),
+                reprojection_px=float(misses.mean()) if len(misses) else float("nan"),
                 world_from_body=pose.rotation * mount.inv(),
             )
         )

@@ -4,7 +4,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform
 
 from reconstruct.dense.fusion import count_witnesses, merge_depths
-from reconstruct.dense.sight import KernelLens, lens_of, pinhole_of
+from reconstruct.dense.sight import KernelLens, lens_of, pinhole_of, slopes_of
 from reconstruct.dense.stereo_pairs import in_frame
 from reconstruct.lenses.range_shift import no_shift
 from tests.oracles_dense import merged, plane_depth, port_view
@@ -58,8 +58,9 @@ def witness(shift_m: float) -> tuple[np.ndarray, np.ndarray]:
     other_from_ref = RigidTransform.from_translation([-0.1, 0.0, 0.0]).as_matrix()[:3]
     there = np.full_like(depth, 2.0 + shift_m)
     return count_witnesses(
-        depth, sigma, LENS, np.ascontiguousarray(other_from_ref), there, sigma, LENS, 3.0
-    )
+        depth, sigma, slopes_of(depth, LENS), np.ascontiguousarray(other_from_ref),
+        there, sigma, LENS, 3.0,
+    )  # fmt: skip
 
 
 def test_the_same_plane_is_confirmed_where_the_other_sees_it():
@@ -99,7 +100,7 @@ def test_witnesses_through_a_tilted_port_equal_their_slow_twin():
 
     def right(first: KernelLens, second: KernelLens) -> float:
         confirmed, refuted = count_witnesses(
-            depth, sigma, first, np.ascontiguousarray(move.as_matrix()[:3]),
+            depth, sigma, slopes_of(depth, first), np.ascontiguousarray(move.as_matrix()[:3]),
             there, sigma, second, 3.0,
         )  # fmt: skip
         assert not (confirmed & refuted).any()

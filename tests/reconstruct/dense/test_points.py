@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reconstruct.dense.points import enu_from_cam, joined, points_in_box
+from reconstruct.dense.points import block_bounds, enu_from_cam, joined, points_in_box
 from tests.oracles_dense import (
     Scene,
     hits,
@@ -31,6 +31,9 @@ def gathered(view, box=EVERYWHERE, factors=None, depth=None):
     depth = depth_of(view) if depth is None else depth
     colour = np.zeros((*depth.shape, 3), np.uint8)
     colour[...] = (100, 50, 20)
+    rows, columns = np.nonzero(np.isfinite(depth))
+    pixels = np.column_stack([columns, rows]) + 0.5
+    world = view.at_depth(pixels, depth[rows, columns].astype(float))
     return points_in_box(
         view,
         7,
@@ -41,6 +44,7 @@ def gathered(view, box=EVERYWHERE, factors=None, depth=None):
         np.ones((2, 2, 3), np.float32) if factors is None else factors,
         OFFSET,
         box,
+        block_bounds(depth.shape, rows, columns, world),
     )
 
 
@@ -73,6 +77,27 @@ def test_boxes_share_no_point_and_miss_none():
     assert len(west.enu) + len(east.enu) == len(everything.enu)
     assert min(len(west.enu), len(east.enu)) > 1000
     assert west.enu[:, 0].max() <= middle <= east.enu[:, 0].max()
+
+
+def test_a_small_box_has_all_its_points_in_the_same_order():
+    for view in (stereo_views(np.array([0.2]), np.array([0.1]))[0], tilted()):
+        depth = plane_depth(view, 1.6)
+        everything = gathered(view, depth=depth)
+        middle = np.median(everything.enu, axis=0)
+        box = (middle[0] - 0.1, middle[0] + 0.07, middle[1] - 0.03, middle[1] + 0.2)
+        part = gathered(view, box, depth=depth)
+        east, north = everything.enu[:, 0].astype(float), everything.enu[:, 1].astype(float)
+        inside = (east >= box[0]) & (east < box[1]) & (north > box[2]) & (north <= box[3])
+        assert 100 < inside.sum() < 0.5 * len(inside)
+        assert abs(len(part.enu) - inside.sum()) <= 2  # of float32 on the very edge
+        same = np.isin(everything.enu[:, 0], part.enu[:, 0])
+        np.testing.assert_array_equal(
+            everything.enu[same & inside], part.enu[: (same & inside).sum()]
+        )
+
+
+def tilted():
+    return port_view([0.2, -0.1, 0.0], [2.0, -1.0, 40.0])
 
 
 def test_unknown_depth_gives_no_point_and_no_normal_beside_it():
@@ -121,7 +146,7 @@ def test_a_step_has_points_on_both_levels():
 
 
 def test_points_through_a_tilted_port_lie_where_the_exact_rays_hit():
-    view = port_view([0.2, -0.1, 0.0], [2.0, -1.0, 40.0])
+    view = tilted()
     depth = plane_depth(view, 1.6)  # far from the range at which the picture is exact
     points = gathered(view, depth=depth).enu + OFFSET
     np.testing.assert_allclose(points[:, 2], -1.6, atol=1e-6)

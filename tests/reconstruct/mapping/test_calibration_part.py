@@ -70,7 +70,7 @@ def points_with(rig: Rig, folder: Path, seed: int = 0) -> tuple[Mapped, Array]:
     believed = replace(scene(seed), rig=rig)
     seen, lenses = warped_scene(believed)
     mapped, _ = refract(near_truth(believed, seen, lenses, np.random.default_rng(1)), seen, folder)
-    return mapped, observed(mapped.model).points(mapped.model)
+    return mapped, observed(mapped.model).points
 
 
 def shape_of(points: Array, true: Array) -> Array:

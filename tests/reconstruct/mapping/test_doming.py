@@ -5,6 +5,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
+from reconstruct.mapping.arrays import observed
 from reconstruct.mapping.doming import (
     Bend,
     bend_of,
@@ -131,7 +132,7 @@ def test_the_scale_shows_a_model_that_stretches_along_the_block() -> None:
     reference = {}
     for n in sorted(model.images):
         reference.setdefault(model.images[n].frame_id, n)
-    before = scale_trend(model, reference, down)
+    before = scale_trend(model, observed(model), reference, down)
     assert before is not None
     assert before.range < 4 * before.range_sigma + 1e-3
     centres = np.array([model.images[n].projection_center() for n in sorted(model.images)])
@@ -143,11 +144,11 @@ def test_the_scale_shows_a_model_that_stretches_along_the_block() -> None:
         share = (point.xyz - middle) @ axis / span
         above = float(point.xyz @ down) - (height - ALTITUDE_M)
         point.xyz = point.xyz + 0.01 * share * above * down
-    after = scale_trend(model, reference, down)
+    after = scale_trend(model, observed(model), reference, down)
     assert after is not None
     assert after.range == pytest.approx(0.01, rel=0.25)
     assert after.significant
-    assert ground_pixel(model) > 0
+    assert ground_pixel(model, observed(model)) > 0
 
 
 def test_a_survey_tells_its_bend_in_numbers_that_json_takes() -> None:
