@@ -95,6 +95,7 @@ def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], None]) -> bo
     told = {"resumed": True} if resumed else {}
     with progress.stage(stage.name, **told) as finish:
         spent = _measured(partial, work).to_json()
+        _check_unchanged(inputs, workspace, stage.name)
         record = {
             "stage": stage.name,
             "version": stage.version,
@@ -179,15 +180,37 @@ def digest_inputs(
     digests: dict[str, list[Any]] = {}
     for path in _files(inputs):
         name = os.path.relpath(path, workspace)
-        stat = path.stat()
-        old = known.get(name)
-        if isinstance(old, list) and len(old) == 3 and old[:2] == [stat.st_size, stat.st_mtime_ns]:
-            digests[name] = old
-        else:
-            with path.open("rb") as file:
-                content = hashlib.file_digest(file, "blake2b").hexdigest()[:32]
-            digests[name] = [stat.st_size, stat.st_mtime_ns, content]
+        digests[name] = _entry(path, known.get(name))
     return digests
+
+
+def _check_unchanged(inputs: Mapping[str, Sequence[Any]], workspace: Path, stage: str) -> None:
+    """Check that files are as they were when their digests were taken.
+
+    Raises:
+        WorkspaceError: one has changed or is gone.
+    """
+    for name, before in inputs.items():
+        path, what = workspace / name, "has changed"
+        try:
+            same = _entry(path, before)[2] == before[2]
+        except OSError:
+            same, what = False, "has gone"
+        if not same:
+            raise WorkspaceError(
+                f"{path} {what} while {stage} was worked on: what was made of it is not kept; run "
+                "the same command again"
+            )
+
+
+def _entry(path: Path, old: object) -> list[Any]:
+    """Size, modification time and digest of a file, which is read only if these differ from old."""
+    stat = path.stat()
+    if isinstance(old, list) and len(old) == 3 and old[:2] == [stat.st_size, stat.st_mtime_ns]:
+        return old
+    with path.open("rb") as file:
+        content = hashlib.file_digest(file, "blake2b").hexdigest()[:32]
+    return [stat.st_size, stat.st_mtime_ns, content]
 
 
 def _files(inputs: Sequence[Path]) -> Iterator[Path]:

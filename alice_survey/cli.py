@@ -25,7 +25,7 @@ from alice_survey.cli_reconstruct import app as model_app
 from alice_survey.cli_reconstruct import reconstruct_app
 from alice_survey.cli_report import app as report_app
 from alice_survey.cli_vehicle import app as vehicle_app
-from alice_survey.errors import AliceError, known_fault
+from alice_survey.errors import known_fault
 
 app = typer.Typer(
     name="alice-survey",
@@ -364,6 +364,9 @@ def main() -> None:
     gc.set_threshold(100_000)
     try:
         app()
-    except (AliceError, OSError) as error:
-        typer.echo(f"error: {known_fault(error)}", err=True)
+    except Exception as error:
+        fault = known_fault(error)
+        if fault is None:
+            raise
+        typer.echo(f"error: {fault}", err=True)
         raise SystemExit(1) from error

@@ -115,10 +115,20 @@ _MENDS = {
 """What to do about faults of the system, by their numbers."""
 
 
+_NO_MEMORY = (
+    "insufficient memory", "out of memory", "cannot allocate memory", "bad_alloc",
+    "failed to map segment",
+)  # fmt: skip
+"""What libraries say whose faults have types of their own, in small letters."""
+
+
 def known_fault(error: BaseException) -> str | None:
     """The line that tells the user of a fault which is no bug; None for a bug."""
     if isinstance(error, AliceError):
         return str(error)
+    said = str(error).lower()
+    if isinstance(error, MemoryError) or any(words in said for words in _NO_MEMORY):
+        return f"memory ran out: give fewer --threads, or close other programs{_ON}"
     if isinstance(error, OSError):  # a full disk, a folder where a file should be, no permission
         where = error.filename2 or error.filename
         text = error.strerror or str(error)

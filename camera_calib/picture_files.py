@@ -43,6 +43,8 @@ def read_pixels(path: Path, flags: int) -> NDArray[Any] | None:
     """A picture as OpenCV decodes it; None where it cannot, or of `pixels_too_many`."""
     if pixels_too_many(path):
         return None
+    # OpenCV's own warnings would stand beside the line that the caller makes of it.
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
     try:
         pixels: NDArray[Any] | None = cv2.imread(str(path), flags)
     except cv2.error:  # memory, or more pixels than OpenCV takes

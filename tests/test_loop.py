@@ -2,12 +2,14 @@
 
 import json
 import os
+import resource
 import shutil
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -131,26 +133,109 @@ def test_truth_is_not_read_by_reconstruct(undisturbed: Path, tmp_path: Path) -> 
             assert seen[name] == whole[name], name
 
 
-def test_killed_in_every_stage_it_ends_the_same(undisturbed: Path, tmp_path: Path) -> None:
+KILLS = 50
+
+
+def wait_for(run: subprocess.Popen[Any], events: Path, seen: int, **facts: str) -> bool:
+    """Wait until a run tells of an event, beyond the bytes seen before; whether it did."""
+    while run.poll() is None:
+        if events.exists():
+            with events.open("rb") as file:
+                file.seek(seen)
+                for line in file.read().split(b"\n")[:-1]:
+                    event = json.loads(line)
+                    if all(event.get(name) == value for name, value in facts.items()):
+                        return True
+        time.sleep(0.005)
+    return False
+
+
+def test_killed_fifty_times_it_ends_the_same(undisturbed: Path, tmp_path: Path) -> None:
+    """At random moments of every stage, four or five times in each."""
     workspace = survey(tmp_path / "killed")
+    events = workspace.with_suffix(".jsonl")
+    took_s = {
+        stage: json.loads((undisturbed / stage / "stage.json").read_text())["took_s"]
+        for stage in FOLDERS
+    }
     rng = np.random.default_rng(5)
-    kills = 0
-    for stage in FOLDERS:
+    killed = dict.fromkeys(FOLDERS, 0)
+    whole_before_kill = 0
+    while sum(killed.values()) < KILLS:
+        stage = FOLDERS[sum(killed.values()) * len(FOLDERS) // KILLS]
+        shutil.rmtree(workspace / stage, ignore_errors=True)  # it had ended before the last kill
+        seen = events.stat().st_size if events.exists() else 0
         run = start(workspace, threads=1)
-        partial = workspace / f"{stage}.partial"
-        while run.poll() is None and not partial.exists() and not (workspace / stage).exists():
-            time.sleep(0.01)
-        time.sleep(rng.uniform(0, 1.5))
+        assert wait_for(run, events, seen, event="stage_started", stage=stage), stage
+        time.sleep(rng.uniform(0, took_s[stage]))
         if run.poll() is None:
             os.killpg(run.pid, signal.SIGKILL)
-            kills += 1
+            killed[stage] += 1
+            whole_before_kill += (workspace / stage).exists()
         run.wait()
-    assert kills >= 7
+    assert min(killed.values()) >= 4
+    assert whole_before_kill < KILLS / 2  # most fell into the work of their stage
     assert start(workspace, threads=1).wait() == 0
     assert not list(workspace.glob("*.partial"))
     again, whole = results(workspace), results(undisturbed)
     assert set(again) == set(whole)
     different = [name for name in whole if again[name] != whole[name]]
+    assert not different
+
+
+LITTLE_MEMORY = 700 << 20
+"""Bytes of data that are enough to start, and too few to reconstruct with."""
+
+
+def reconstruct(
+    workspace: Path, *options: str, most_bytes: int | None = None
+) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "alice_survey", "reconstruct", "-w", str(workspace)]
+
+    def limit() -> None:
+        if most_bytes is not None:
+            resource.setrlimit(resource.RLIMIT_DATA, (most_bytes, most_bytes))
+
+    return subprocess.Popen(
+        [*command, "--threads", "1", "--quiet", *options],
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, preexec_fn=limit,
+    )  # fmt: skip
+
+
+def test_what_goes_wrong_half_way_is_told_in_a_line_and_nothing_is_lost(
+    undisturbed: Path, tmp_path: Path
+) -> None:
+    """A picture that goes, one that changes, and memory that runs out."""
+    workspace, events = tmp_path / "half", tmp_path / "half.jsonl"
+    shutil.copytree(undisturbed, workspace)
+    made = ("mapping", "sparse", "dense", "mosaic", "mesh")
+    for stage in (*made, "evaluation", "report"):
+        shutil.rmtree(workspace / stage)
+    first, *_, last = sorted((workspace / "images" / "right").glob("*.png"))
+    kept = tmp_path / last.name
+    shutil.copy2(last, kept)
+    for step, spoil in (
+        ("features", last.unlink),
+        ("matching", lambda: shutil.copy(first, last)),
+    ):
+        seen = events.stat().st_size if events.exists() else 0
+        run = reconstruct(workspace, "--events", str(events))
+        assert wait_for(run, events, seen, event="step_started", step=step)
+        spoil()
+        line = run.communicate()[1].strip()
+        assert run.returncode == 1
+        assert line.startswith("error: ") and "\n" not in line and last.name in line, line
+        assert not [stage for stage in made if (workspace / stage).exists()]
+        shutil.copy2(kept, last)
+    run = reconstruct(workspace, most_bytes=LITTLE_MEMORY)
+    line = run.communicate()[1].strip()
+    assert run.returncode == 1
+    assert line.startswith("error: memory ran out") and "\n" not in line, line
+    run = reconstruct(workspace)
+    assert (run.communicate()[1].strip(), run.returncode) == ("", 0)
+    again, whole = results(workspace), results(undisturbed)
+    different = [name for name in again if again[name] != whole[name]]
+    assert {name.split("/")[0] for name in again} >= set(made)
     assert not different
 
 

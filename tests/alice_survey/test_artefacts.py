@@ -91,6 +91,31 @@ def test_failed_work_keeps_the_old_result(tmp_path: Path, source: Path) -> None:
     assert [p.name for p in sorted((tmp_path / "made").iterdir())] == ["result.txt", "stage.json"]
 
 
+@pytest.mark.parametrize("change", ["changed", "gone", "touched"])
+def test_an_input_that_changes_under_the_work_is_named_and_nothing_is_lost(
+    tmp_path: Path, source: Path, change: str
+) -> None:
+    run_stage(tmp_path, stage([source]), Work())
+
+    def work(folder: Path) -> None:
+        (folder / "result.txt").write_text("made of two inputs")
+        if change == "gone":
+            source.unlink()
+        else:
+            source.write_text("two" if change == "changed" else "one")
+
+    if change == "touched":
+        assert run_stage(tmp_path, stage([source], value=2), work)
+        return
+    with pytest.raises(WorkspaceError, match=rf"a\.txt has {change} while made was worked on"):
+        run_stage(tmp_path, stage([source], value=2), work)
+    assert (tmp_path / "made" / "result.txt").read_text() == "result"
+    source.write_text("two")
+    again = Work()
+    assert run_stage(tmp_path, stage([source], value=2), again)
+    assert again.done == 1
+
+
 def test_resumed_work_finds_what_it_left_only_under_the_same_digest(
     tmp_path: Path, source: Path
 ) -> None:
