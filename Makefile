@@ -4,12 +4,15 @@ BIN := .venv/bin
 READY := .venv/ready
 WORKSPACE ?= demo
 WORKERS ?= 2
+WORK ?= build/benchmarks
 
-.PHONY: help setup demo test lint types imports check lock clean
+.PHONY: help setup demo test bench docs lint types imports check lock clean
 
 help:
 	@echo "make demo    plan, fly, image, reconstruct and score a small survey into $(WORKSPACE)/"
 	@echo "make test    run the tests"
+	@echo "make bench   run all benchmarks, for hours; table, logs and workspaces go into $(WORK)/"
+	@echo "make docs    build the site of docs/ into build/site/"
 	@echo "make check   lint, types and import rules"
 	@echo "make lock    renew requirements.lock from pyproject.toml"
 
@@ -30,6 +33,12 @@ demo: $(READY)
 test: $(READY)
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
+bench: $(READY)
+	$(BIN)/python -m benchmarks --work $(WORK)
+
+docs: $(READY)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -43,7 +52,7 @@ imports: $(READY)
 check: lint types imports
 
 lock: $(READY)
-	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --extra dev --extra bench \
+	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --extra dev --extra docs --extra bench \
 		--generate-hashes --no-emit-index-url --no-annotate --no-header pyproject.toml -o requirements.lock
 
 clean:

@@ -1,0 +1,226 @@
+"""Files that pages take for granted: made here, before a page's commands run."""
+
+import os
+import resource
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+
+from camera_calib.rig import read_rig, write_rig
+from tests.docs import given_files as files
+from tests.docs.pages import DOCS, script_of
+
+LONGEST_S = 1200.0
+TUTORIAL = "tutorial.md"
+SMALL_PX = 282
+"""Width of pictures that are brought along: small, so that they are soon reconstructed."""
+FEW = (0, 1, 2, 3, 10, 11, 12)
+"""Stations of a line of the tutorial's survey and of the one across it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """What came of a page's commands."""
+
+    folder: Path
+    returncode: int
+    stdout: str
+    stderr: str
+    cpu_s: float
+    """Computing of its commands: what else the machine does is not in it."""
+
+
+class Made:
+    """What takes long to make, made once and only when it is asked for."""
+
+    def __init__(self, folder: Path) -> None:
+        """Have a folder to make it in."""
+        self._folder = folder
+        self.run = cache(self._run)
+
+    def _run(self, page: str) -> Run:
+        """Type the commands of a page; others may look at what they made, not change it."""
+        folder = self._folder / page.removesuffix(".md").replace("/", "-")
+        folder.mkdir()
+        prepare = GIVEN.get(page)
+        if prepare is not None:
+            prepare(folder, self)
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        ended = subprocess.run(
+            ["bash", "-euo", "pipefail", "-c", script_of(DOCS / page)],
+            cwd=folder,
+            env={
+                **os.environ,
+                "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+                "COLUMNS": "120",
+                "BROWSER": "true",  # the command that does nothing
+            },
+            capture_output=True,
+            text=True,
+            timeout=LONGEST_S,
+            preexec_fn=_on_one_core,
+        )
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return Run(
+            folder=folder,
+            returncode=ended.returncode,
+            stdout=ended.stdout,
+            stderr=ended.stderr,
+            cpu_s=after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
+        )
+
+    def after(self, page: str) -> Path:
+        """The folder that the commands of a page leave behind.
+
+        Raises:
+            RuntimeError: they fail; the page's own test tells how.
+        """
+        ran = self.run(page)
+        if ran.returncode != 0:
+            raise RuntimeError(f"the commands of {page} fail")
+        return ran.folder
+
+    @property
+    def reef(self) -> Path:
+        """The workspace of the tutorial, finished to its report."""
+        return self.after(TUTORIAL) / "reef"
+
+    @cached_property
+    def small_rig(self) -> Path:
+        """The rig of that survey for pictures of `SMALL_PX`."""
+        path = self._folder / "small_rig.json"
+        write_rig(path, files.smaller_rig(read_rig(self.reef / "calibration/rig.json"), SMALL_PX))
+        return path
+
+    @property
+    def dive(self) -> Path:
+        """A workspace of a few small pictures with rig and navigation, reconstructed."""
+        return self.after("how-to/own-pictures.md") / "dive"
+
+
+def _on_one_core() -> None:
+    """Work is so little here that starting workers would cost more than they save."""
+    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+
+
+def _reef(folder: Path, made: Made) -> None:
+    shutil.copytree(made.reef, folder / "reef")
+
+
+def _planned(folder: Path, made: Made) -> None:
+    """Only settings: what follows, the page's commands make."""
+    (folder / "reef").mkdir()
+    shutil.copy(made.reef / "survey.toml", folder / "reef")
+
+
+def _cameras(folder: Path, made: Made) -> None:
+    files.boards(folder, air=True)
+    files.boards(folder, air=False)
+
+
+def _certificate(folder: Path, made: Made) -> None:
+    _planned(folder, made)
+    files.navigation(made.reef, folder / "dive.csv", dated=False)
+    shutil.copy(made.reef / "flight/triggers.csv", folder / "t.csv")
+
+
+def _logs(folder: Path, made: Made) -> None:
+    files.vehicle_logs(made.reef, folder)
+    files.photos(made.reef, folder / "photos", FEW, late_s=files.FAST_S)
+
+
+def _few_features(folder: Path) -> None:
+    """Settings for small pictures; a reader's are larger, and need none."""
+    (folder / "survey.toml").write_text("[reconstruct]\nmax_features = 600\n")
+
+
+def _stereo(folder: Path, made: Made) -> None:
+    files.smaller(made.reef, {"left": folder / "cam1", "right": folder / "cam2"}, FEW, SMALL_PX)
+    _few_features(folder)
+
+
+def _own_camera(folder: Path, made: Made) -> None:
+    files.boards(folder, air=False)
+    for name, kind in (("camchain.yaml", "kalibr"), ("stereo.yml", "opencv")):
+        files.calibrated_in_air(folder / name, kind)
+
+
+def _own_vehicle(folder: Path, made: Made) -> None:
+    files.vehicle_logs(made.reef, folder)
+    files.own_logs(folder)
+    (folder / "surveyed").mkdir()
+    shutil.copy(made.reef / "survey.toml", folder / "surveyed")
+    shutil.copytree(made.reef / "plan", folder / "surveyed/plan")
+
+
+def _identified(folder: Path, made: Made) -> None:
+    files.own_logs(folder)
+    (folder / "own.toml").write_text(files.OWN_VEHICLE)
+
+
+def _own_pictures(folder: Path, made: Made) -> None:
+    late_s = files.FAST_S
+    for camera, name in (("left", "cam1"), ("right", "cam2")):
+        files.photos(made.reef, folder / name, FEW, camera=camera, width_px=SMALL_PX, late_s=late_s)
+    files.photos(made.reef, folder / "photos", FEW, late_s=late_s)
+    files.photos(made.reef, folder / "shallow", FEW, gps=True)
+    files.masks(folder / "photos", folder / "masks")
+    files.film(made.reef, folder / "dive.mp4", FEW)
+    files.navigation(made.reef, folder / "navigation.csv", dated=True)
+    shutil.copy(made.small_rig, folder / "rig.json")
+    _few_features(folder)
+
+
+def _no_navigation(folder: Path, made: Made) -> None:
+    """The model that the page on real pictures made, without the length it was told."""
+    shutil.copytree(made.after("real-pictures.md") / "dive", folder / "dive")
+    (folder / "dive/scale.json").unlink()
+    _few_features(folder)
+
+
+def _colour_camera(folder: Path, made: Made) -> None:
+    shutil.copytree(made.dive, folder / "dive")
+    shutil.copytree(made.reef / "images/left", folder / "pictures")
+    shutil.copy(made.reef / "calibration/rig.json", folder)
+
+
+def _big_survey(folder: Path, made: Made) -> None:
+    before = made.after("how-to/own-pictures.md")
+    for name, to in (("cam1", "left"), ("cam2", "right")):
+        shutil.copytree(before / name, folder / to)
+    lines = (before / "navigation.csv").read_text().splitlines(keepends=True)
+    half = len(lines) // 2
+    (folder / "dive1.csv").write_text("".join(lines[:half]))
+    (folder / "dive2.csv").write_text("".join([lines[0], *lines[half:]]))
+    shutil.copy(before / "rig.json", folder)
+    _few_features(folder)
+
+
+def _reconstruction(folder: Path, made: Made) -> None:
+    _reef(folder, made)
+    for side in ("left", "right"):
+        shutil.copy(made.reef / f"images/{side}/000005.png", folder / f"{side}.png")
+    shutil.copy(made.reef / "calibration/rig.json", folder)
+
+
+GIVEN: dict[str, Callable[[Path, Made], None]] = {
+    "how-to/big-survey.md": _big_survey,
+    "how-to/colour-camera.md": _colour_camera,
+    "how-to/no-navigation.md": _no_navigation,
+    "how-to/own-camera.md": _own_camera,
+    "how-to/own-pictures.md": _own_pictures,
+    "how-to/own-vehicle.md": _own_vehicle,
+    "cameras.md": _cameras,
+    "certificate.md": _certificate,
+    "energy.md": _planned,
+    "logs.md": _logs,
+    "real-pictures.md": _stereo,
+    "reconstruction.md": _reconstruction,
+    "vehicle-logs.md": _identified,
+    "view.md": _reef,
+}
+"""By page."""

@@ -1,0 +1,361 @@
+"""Pictures and logs such as readers bring along, made from the pictures and logs of a survey."""
+
+import csv
+import math
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.config import CameraConfig, WaterConfig
+from alice_survey.frames import Array
+from alice_survey.vehicle.identification.files import vehicle_from_file
+from alice_survey.vehicle.log import write_vehicle_log
+from camera_calib.flat_port import FlatPortCamera
+from camera_calib.rig import Rig, design_rig, write_rig
+from camera_calib.targets.pattern import black_rectangles
+from camera_calib.targets.target import Target, parse_target
+from tests.camera_calib.calibration_scenes import board_poses, in_air
+from tests.missions.logs.log_files import Bag, dataflash_log, tlog
+from tests.oracles_targets import BLACK, WALL, WHITE, to_srgb
+from tests.vehicle.identification.manoeuvres import fly, hidden, measured
+
+SAID = datetime(2024, 5, 1, 9, 0, 0, tzinfo=UTC)
+"""When the simulated flight is said to have begun."""
+WEEK, WEEK_BEGAN = 2312, datetime(2024, 4, 28, tzinfo=UTC)
+LEAP_S = 18
+"""GPS time is ahead of UTC by this since 2017."""
+BOARD = "charuco 12x9 40mm 30mm"
+VIEWS = 8
+SHEET_PX_M = 4000
+"""How finely the board is painted."""
+FAST_S = 1.5
+"""By which the clocks of cameras are ahead."""
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def boards(folder: Path, *, air: bool) -> None:
+    """Write `air/` or `pool/`: a board before the designed cameras, at a quarter of their size."""
+    rig = design_rig(CameraConfig(), WaterConfig(), 4)
+    target = parse_target(BOARD)
+    looking = in_air(rig) if air else rig
+    near_m, far_m = (0.6, 1.0) if air else (0.75, 1.1)
+    poses = board_poses(
+        looking,
+        VIEWS,
+        np.random.default_rng(7 if air else 8),
+        near_m=near_m,
+        far_m=far_m,
+        points=target.points,
+    )
+    for name in looking.cameras:
+        place = folder / ("air" if air else "pool") / name
+        place.mkdir(parents=True)
+        for view in range(VIEWS):
+            picture = board_picture(looking, name, poses[view], target)
+            cv2.imwrite(str(place / f"{view:02d}.png"), picture)
+
+
+def board_picture(
+    rig: Rig, name: str, rig_from_target: RigidTransform, target: Target, fine: int = 2
+) -> NDArray[np.uint8]:
+    """(H, W) grey values of a target that a camera sees through its port.
+
+    Args:
+        rig: cameras.
+        name: of the one that looks.
+        rig_from_target: where the target is.
+        target: what is seen.
+        fine: samples along a side of a pixel.
+    """
+    camera = rig.cameras[name]
+    target_from_cam = (rig.cam_from_rig[name] * rig_from_target).inv()
+    y, x = np.mgrid[: camera.height_px * fine, : camera.width_px * fine]
+    pixels = (np.stack([x, y], axis=-1).reshape(-1, 2) + 0.5) / fine
+    origins, rays = camera.unproject(pixels)
+    origins, rays = target_from_cam.apply(origins), target_from_cam.rotation.apply(rays)
+    places_m = (origins - rays * (origins[:, 2:] / rays[:, 2:]))[:, :2]
+    sheet, corner_m = _sheet(target)
+    places = ((places_m - corner_m) * SHEET_PX_M - 0.5).astype(np.float32).reshape(*x.shape, 2)
+    light = cv2.remap(
+        sheet, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=WALL
+    )
+    return to_srgb(cv2.resize(light, None, fx=1 / fine, fy=1 / fine, interpolation=cv2.INTER_AREA))
+
+
+def _sheet(target: Target) -> tuple[NDArray[np.float32], Array]:
+    """The light that a target with its white margin sends, and where its upper left corner is."""
+    margin_m = 0.5 * target.size_m
+    left, top, right, bottom = np.array(target.outline) + margin_m * np.array([-1, -1, 1, 1])
+    size = np.rint(np.array([bottom - top, right - left]) * SHEET_PX_M).astype(int)
+    sheet = np.full(size, WHITE, np.float32)
+    corners = (black_rectangles(target) - np.array([left, top, left, top])) * SHEET_PX_M
+    for x0, y0, x1, y1 in np.rint(corners).astype(int):
+        sheet[y0:y1, x0:x1] = BLACK
+    return sheet, np.array([left, top])
+
+
+def shrunk(picture: NDArray[np.uint8], width_px: int) -> NDArray[np.uint8]:
+    """A picture at another width."""
+    height = round(picture.shape[0] * width_px / picture.shape[1])
+    small = cv2.resize(picture, (width_px, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.uint8)
+
+
+def smaller(reef: Path, folders: dict[str, Path], stations: Iterable[int], width_px: int) -> None:
+    """Write `001.png` ... of some stations of a survey at another size, by camera."""
+    for camera, folder in folders.items():
+        folder.mkdir(parents=True)
+        for number, station in enumerate(stations, start=1):
+            picture = cv2.imread(str(reef / f"images/{camera}/{station:06d}.png"))
+            cv2.imwrite(str(folder / f"{number:03d}.png"), shrunk(picture, width_px))
+
+
+def calibrated_in_air(path: Path, kind: str) -> None:
+    """Write the designed cameras as another tool would that calibrated them in air."""
+    rig = in_air(design_rig(CameraConfig(), WaterConfig(), 4))
+    with tempfile.TemporaryDirectory() as scratch:
+        write_rig(Path(scratch) / "rig.json", rig)
+        subprocess.run(
+            [
+                *(sys.executable, "-m", "alice_survey", "camera", "convert", "-q"),
+                *(f"{scratch}/rig.json", str(path), "--to", kind),
+            ],
+            check=True,
+            capture_output=True,
+        )
+
+
+def smaller_rig(rig: Rig, width_px: int) -> Rig:
+    """The rig of pictures that were shrunk to a width."""
+
+    def smaller_camera(camera: FlatPortCamera) -> FlatPortCamera:
+        height = round(camera.height_px * width_px / camera.width_px)
+        x, y = width_px / camera.width_px, height / camera.height_px
+        return replace(
+            camera, width_px=width_px, height_px=height, fx_px=camera.fx_px * x,
+            fy_px=camera.fy_px * y, cx_px=camera.cx_px * x, cy_px=camera.cy_px * y,
+        )  # fmt: skip
+
+    cameras = {name: smaller_camera(camera) for name, camera in rig.cameras.items()}
+    return replace(rig, cameras=cameras, covariance=None)
+
+
+def photos(
+    reef: Path,
+    folder: Path,
+    stations: Iterable[int],
+    *,
+    camera: str = "left",
+    width_px: int | None = None,
+    late_s: float = 0.0,
+    gps: bool = False,
+) -> None:
+    """Write JPEGs with the time, or with time and place, in EXIF.
+
+    Args:
+        reef: a survey with its pictures.
+        folder: to write.
+        stations: whose pictures.
+        camera: that took them.
+        width_px: another size.
+        late_s: by which its clock is ahead.
+        gps: whether it knew its place.
+    """
+    rows = {
+        int(row["station"]): row
+        for row in rows_of(reef / "images/manifest.csv")
+        if row["camera"] == camera
+    }
+    folder.mkdir(parents=True)
+    for number, station in enumerate(stations, start=1):
+        row, exif = rows[station], Image.Exif()
+        taken = SAID + timedelta(seconds=float(row["time_s"]) + late_s)
+        exif.get_ifd(0x8769).update(
+            {0x9003: f"{taken:%Y:%m:%d %H:%M:%S}", 0x9291: f"{taken.microsecond // 1000:03d}"}
+        )
+        if gps:
+            place = [float(row[name]) for name in ("latitude_deg", "longitude_deg")]
+            exif.get_ifd(0x8825).update(
+                {1: "N", 2: _sexagesimal(place[0]), 3: "E", 4: _sexagesimal(place[1])}
+            )
+        picture = cv2.imread(str(reef / f"images/{camera}/{station:06d}.png"))
+        if width_px is not None:
+            picture = shrunk(picture, width_px)
+        image = Image.fromarray(np.ascontiguousarray(picture[..., ::-1]))
+        image.save(folder / f"DSC{number:04d}.jpg", exif=exif, quality=95)
+
+
+def _sexagesimal(value: float) -> tuple[int, int, float]:
+    minutes = value % 1 * 60
+    return int(value), int(minutes), minutes % 1 * 60
+
+
+def masks(pictures: Path, folder: Path) -> None:
+    """Write masks that leave out the lowest tenth of each picture, where a frame might hang."""
+    folder.mkdir(parents=True)
+    for path in sorted(pictures.iterdir()):
+        with Image.open(path) as picture:
+            mask = np.full((picture.height, picture.width), 255, np.uint8)
+        mask[-len(mask) // 10 :] = 0
+        Image.fromarray(mask).save(folder / f"{path.stem}.png")
+
+
+def film(reef: Path, path: Path, stations: Iterable[int]) -> None:
+    """Write a film of four frames a second."""
+    pictures = [cv2.imread(str(reef / f"images/left/{s:06d}.png")) for s in stations]
+    height, width = pictures[0].shape[:2]
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 4.0, (width, height))
+    for picture in pictures:
+        for _ in range(4):
+            writer.write(picture)
+    writer.release()
+
+
+def navigation(reef: Path, path: Path, *, dated: bool) -> None:
+    """Write the navigation of the flight at 4 Hz, with dates instead of seconds if asked."""
+    rows = rows_of(reef / "flight/navigation.csv")[::5]
+    with path.open("w", newline="") as file:
+        names = list(rows[0])
+        names[0] = "time_utc" if dated else "time_s"
+        writer = csv.DictWriter(file, names)
+        writer.writeheader()
+        for row in rows:
+            seconds = float(row.pop("time_s"))
+            when = (SAID + timedelta(seconds=seconds)).isoformat() if dated else f"{seconds:.3f}"
+            writer.writerow({names[0]: when, **row})
+
+
+def vehicle_logs(reef: Path, folder: Path) -> None:
+    """Write the flight as COLA2, ArduSub and a ground station would have logged it."""
+    rows = [
+        {name: float(value or "nan") for name, value in row.items()}
+        for row in rows_of(reef / "flight/navigation.csv")[::10]
+    ]
+    bag = Bag(1)
+    boot_us = 20_000_000
+    messages: list[tuple[object, ...]] = []
+    records: list[tuple[float, object]] = []
+    for row in rows:
+        now = SAID + timedelta(seconds=row["time_s"])
+        place = (row["latitude_deg"], row["longitude_deg"], row["depth_m"])
+        angles = (row["roll_deg"], row["pitch_deg"], row["heading_deg"])
+        turned = tuple(math.radians(angle) for angle in angles)
+        # A range is along the body's axis.
+        slant_m = row["altitude_m"] / (math.cos(turned[0]) * math.cos(turned[1]))
+        heard = math.isfinite(slant_m)
+        bag.add_nav_sts(
+            round(now.timestamp() * 1e9), place, turned, row["altitude_m"] if heard else -1.0
+        )
+        t = boot_us + round(row["time_s"] * 1e6)
+        if not messages:
+            since_ms = round(((now - WEEK_BEGAN).total_seconds() + LEAP_S) * 1e3)
+            fix = (since_ms, WEEK, 12, 0.8, *place[:2], 0.0, 0.0, 0.0, 0.0, 0.0, 1)
+            messages.append(("GPS", t, 0, 3, *fix))
+        messages += [
+            ("ATT", t, 0.0, angles[0], 0.0, angles[1], 0.0, angles[2] % 360, 0.0, 0.0, 3),
+            ("POS", t, *place[:2], 0.0, -place[2], 0.0),
+            *([("RFND", t, 0, slant_m, 4, 25)] if heard else []),
+        ]
+        ms, at = t // 1000, now.timestamp()
+        whole = (round(place[0] * 1e7), round(place[1] * 1e7), 0, round(-1000 * place[2]))
+        said = (0.2, 0.2, 0, 0, -place[2], 0.0)
+        records += [
+            (at, mavlink.MAVLink_heartbeat_message(12, 3, 81, 0, 3, 3)),
+            (at, mavlink.MAVLink_attitude_message(ms, *turned, 0.0, 0.0, 0.0)),
+            (at, mavlink.MAVLink_global_position_int_message(ms, *whole, 0, 0, 0, 65535)),
+            (at, mavlink.MAVLink_vfr_hud_message(*said)),
+        ]
+    bag.write(folder / "sparus2.bag")
+    (folder / "00000042.BIN").write_bytes(dataflash_log(messages))
+    (folder / "dive.tlog").write_bytes(tlog(records))
+    with (folder / "tides.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["time_utc", "height_m"])
+        for hours, height_m in ((-1, 0.30), (0, 0.22), (1, 0.14)):
+            writer.writerow([(SAID + timedelta(hours=hours)).isoformat(), height_m])
+
+
+def manoeuvres(folder: Path) -> None:
+    """Write `turns.csv` and `second.csv`: manoeuvres of an ALICE with more drag than is known."""
+    truth = hidden({"X_uu": -16.0, "Y_vv": -240.0, "N_rr": -95.0})
+    rng = np.random.default_rng(11)
+    for name, current, seconds in (
+        ("turns.csv", (0.05, -0.03), 40.0),
+        ("second.csv", (0.0, 0.04), 24.0),
+    ):
+        log = measured(fly(truth, duration_s=seconds, current=current), rng)
+        write_vehicle_log(folder / name, log)
+
+
+OWN_VEHICLE = """
+name = "own"
+[rigid_body]
+dry_kg = 30.0
+buoyancy_kg = 30.2
+entrained_kg = 4.0
+cg_body_m = [0.0, 0.0, 0.02]
+inertia_kg_m2 = [0.6, 1.9, 2.1]
+[coefficients]
+X_udot = -4.0
+Y_vdot = -24.0
+Z_wdot = -26.0
+K_pdot = -0.3
+M_qdot = -1.5
+N_rdot = -1.6
+X_uu = -21.0
+Y_vv = -110.0
+Z_ww = -130.0
+K_pp = -2.0
+M_qq = -9.0
+N_rr = -7.0
+[[thrusters]]
+name = "port"
+position_body_m = [-0.4, -0.2, 0.0]
+direction_body = [1.0, 0.0, 0.0]
+diameter_m = 0.076
+kt_forward = 0.47
+kt_reverse = 0.40
+time_constant_s = 0.15
+[[thrusters]]
+name = "starboard"
+position_body_m = [-0.4, 0.2, 0.0]
+direction_body = [1.0, 0.0, 0.0]
+diameter_m = 0.076
+kt_forward = 0.47
+kt_reverse = 0.40
+time_constant_s = 0.15
+"""
+"""A vehicle with two thrusters; what its owner knows of it stands in the page on it."""
+
+
+def own_logs(folder: Path) -> None:
+    """Write `dive1.csv` and `dive2.csv`: surge steps and zigzags of that vehicle."""
+    path = folder / "truth.toml"
+    path.write_text(OWN_VEHICLE)
+    truth = vehicle_from_file(path)
+    path.unlink()
+    rng = np.random.default_rng(12)
+
+    def asked(time_s: float) -> Array:
+        surge = (22.0, 34.0, 14.0, -18.0)[int(time_s // 8.0) % 4]
+        turn = (6.0, -9.0, 0.0)[int(time_s // 5.0) % 3]
+        return np.array([surge + turn, surge - turn])
+
+    for name, seconds, heading_rad in (("dive1.csv", 48.0, 0.4), ("dive2.csv", 30.0, 2.0)):
+        log = fly(truth, duration_s=seconds, asked=asked, attitude_rad=(0.0, 0.0, heading_rad))
+        write_vehicle_log(folder / name, measured(log, rng))

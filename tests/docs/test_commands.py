@@ -1,0 +1,116 @@
+"""What the pages of `docs/` tell a reader to type works as it stands there."""
+
+import shlex
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from alice_survey.cli import app
+from tests.docs import given
+from tests.docs.given import GIVEN, Made
+from tests.docs.pages import (
+    DOCS,
+    fences,
+    mentioned,
+    name_of,
+    pages,
+    script_of,
+)
+
+LANGUAGES = {"bash", "text", "toml", "json", "python", "csv", "math"}
+"""`bash` is run; `text` is what a program prints, or a form that stands for many commands."""
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    return Made(tmp_path_factory.mktemp("made"))
+
+
+def with_commands() -> list[object]:
+    return [
+        pytest.param(page, id=name_of(page), marks=pytest.mark.xdist_group("docs"))
+        for page in pages()
+        if script_of(page)
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", with_commands())
+def test_the_commands_of_a_page_run(page: Path, made: Made) -> None:
+    ran = made.run(name_of(page))
+    sys.stdout.write(f"{name_of(page)}: {ran.cpu_s:.0f} s of computing\n")
+    assert ran.returncode == 0, f"{ran.stdout[-3000:]}\n{ran.stderr[-3000:]}"
+    assert "Traceback" not in ran.stderr
+
+
+def test_files_are_given_to_pages_that_exist() -> None:
+    assert set(GIVEN) <= {name_of(page) for page in pages()}
+
+
+@pytest.mark.parametrize("page", [*pages(), DOCS.parent / "README.md"], ids=lambda page: page.stem)
+def test_commands_that_are_mentioned_exist(page: Path) -> None:
+    for command in mentioned(page.read_text(encoding="utf-8")):
+        check_command(command)
+
+
+def check_command(text: str) -> None:
+    """Follow a command's words into groups, and look for its options."""
+    # Newer typers bring a click of their own, so that its classes cannot be asked for.
+    found: Any = typer.main.get_command(app)
+    options = {o for p in found.params for o in (*p.opts, *p.secondary_opts)} | {"-h", "--help"}
+    for word in shlex.split(text)[1:]:
+        if word in getattr(found, "commands", {}):
+            found = found.commands[word]
+            options |= {o for p in found.params for o in (*p.opts, *p.secondary_opts)}
+        elif word.startswith("-") and not word[1:2].isdigit():
+            option = word.split("=")[0]
+            assert option in options, f"{text!r}: {option} is unknown"
+        elif getattr(found, "commands", {}) and not found.invoke_without_command:
+            pytest.fail(f"{text!r}: no command is called {word!r}")
+
+
+@pytest.mark.parametrize("page", pages(), ids=lambda page: page.stem)
+def test_blocks_are_of_a_kind_that_is_looked_at(page: Path) -> None:
+    """What is not named could hold commands that nobody tries."""
+    for fence in fences(page):
+        assert fence.language in LANGUAGES, f"{name_of(page)} line {fence.line}"
+        if fence.language == "toml":
+            tomllib.loads(fence.text)
+
+
+def test_a_wrong_command_is_found() -> None:
+    for text in ("alice-survey plans", "alice-survey plan --hight 3", "alice-survey camera tanks"):
+        with pytest.raises((AssertionError, pytest.fail.Exception)):
+            check_command(text)
+
+
+def test_a_page_stops_at_its_first_command_that_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = (
+        "- a list\n  ```bash\n  echo one\n  ```\n\n"
+        "```text\nfalse\n```\n\n```bash\nfalse\necho two\n```\n"
+    )
+    (tmp_path / "page.md").write_text(page)
+    monkeypatch.setattr(given, "DOCS", tmp_path)
+    monkeypatch.setattr("tests.docs.pages.DOCS", tmp_path)
+    (tmp_path / "made").mkdir()
+    ran = Made(tmp_path / "made").run("page.md")
+    assert ran.returncode != 0
+    assert ran.stdout.splitlines() == ["### page.md line 3", "one", "### page.md line 11"]
+
+
+def test_commands_are_found_in_blocks_and_in_lines() -> None:
+    content = (
+        "Say `alice-survey init m && alice-survey plan -w m`, or\n"
+        "```text\nalice-survey fly \\\n    -w m  # flies\n```\nand `alice`.\n"
+    )
+    assert [" ".join(command.split()) for command in mentioned(content)] == [
+        "alice-survey fly -w m",
+        "alice-survey init m",
+        "alice-survey plan -w m",
+    ]

@@ -1,0 +1,232 @@
+"""The site of `docs/` builds without a warning, is whole, and needs no network."""
+
+import importlib.util
+import itertools
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import markdown
+import pytest
+import yaml
+from mkdocs.exceptions import PluginError
+
+from tests.alice_survey.report.browser import Heard, chromium
+from tests.docs.pages import DOCS, pages
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("site")]
+ROOT = DOCS.parent
+ROOMS = ("alice_survey", "camera_calib", "missions", "reconstruct")
+SETTINGS = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
+FOREIGN = re.compile(r"^\s*(https?:)?//", re.I)
+NAMES_ONLY = {"canonical", "next", "prev", "license", "author"}
+"""Kinds of `<link>` that a browser does not fetch."""
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Built as `make docs` builds it, into a folder of its own."""
+    folder = tmp_path_factory.mktemp("site")
+    built = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "-d", str(folder)],
+        cwd=ROOT,
+        env={**os.environ, "NO_MKDOCS_2_WARNING": "1", "NO_COLOR": "1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    told = built.stdout + built.stderr
+    assert built.returncode == 0, told[-3000:]
+    assert "WARNING" not in told, told[-3000:]
+    return folder
+
+
+class Fetched(HTMLParser):
+    """What a browser would fetch for a page."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.addresses: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        held = {name: value or "" for name, value in attrs}
+        if tag == "link" and not NAMES_ONLY & set(held.get("rel", "").split()):
+            self.addresses.append(held.get("href", ""))
+        if tag not in ("a", "link"):
+            self.addresses += [held[name] for name in ("src", "data", "poster") if name in held]
+            self.addresses += held.get("srcset", "").split(",")
+        self.addresses += re.findall(r"url\(['\"]?([^'\")]+)", held.get("style", ""))
+
+
+def fetched(page: str) -> list[str]:
+    parser = Fetched()
+    parser.feed(page)
+    return parser.addresses
+
+
+def test_what_a_page_fetches_is_found() -> None:
+    page = (
+        '<link rel="stylesheet" href="https://a/x.css"><a href="https://b/">b</a>'
+        '<script src="//c/y.js"></script><img src="d.png"><link rel="canonical" href="https://e/">'
+        '<p style="background: url(https://f/z.png)">'
+    )
+    foreign = [address for address in fetched(page) if FOREIGN.match(address)]
+    assert foreign == ["https://a/x.css", "//c/y.js", "https://f/z.png"]
+
+
+def test_no_page_names_another_host(site: Path) -> None:
+    held = sorted(site.rglob("*.html"))
+    assert len(held) > len(pages())
+    for page in held:
+        for address in fetched(page.read_text(encoding="utf-8")):
+            assert not FOREIGN.match(address), f"{page.relative_to(site)}: {address}"
+    for sheet in site.rglob("*.css"):
+        text = sheet.read_text(encoding="utf-8")
+        for address in re.findall(r"(?:url\(|@import\s+)['\"]?([^'\")\s]+)", text):
+            assert not FOREIGN.match(address), f"{sheet.relative_to(site)}: {address}"
+
+
+def leaves(branch: Any) -> list[str]:
+    """Pages of a part of `nav`."""
+    if isinstance(branch, str):
+        return [branch]
+    inside = branch.values() if isinstance(branch, dict) else branch
+    return [leaf for part in inside for leaf in leaves(part)]
+
+
+def test_every_page_is_in_the_contents_once_and_was_built(site: Path) -> None:
+    listed = leaves(SETTINGS["nav"])
+    assert sorted(listed) == sorted(str(page.relative_to(DOCS)) for page in pages())
+    for page in listed:
+        text = (site / page).with_suffix(".html").read_text(encoding="utf-8")
+        assert re.search(r"<h1[ >]", text), page
+
+
+def packages() -> list[str]:
+    """Public packages of the four rooms."""
+    found = [init.parent for room in ROOMS for init in (ROOT / room).rglob("__init__.py")]
+    names = [".".join(package.relative_to(ROOT).parts) for package in found]
+    return sorted(name for name in names if "._" not in name)
+
+
+def test_every_package_has_a_page_that_tells_of_each_of_its_modules(site: Path) -> None:
+    assert len(packages()) > 30
+    for package in packages():
+        page = (site / "api" / f"{package}.html").read_text(encoding="utf-8")
+        for module in (ROOT / package.replace(".", "/")).glob("[!_]*.py"):
+            assert f'id="{package}.{module.stem}"' in page, f"{package}: {module.stem}"
+    written = {page.stem for page in (DOCS / "api").glob("*.md")} - {"index"}
+    assert written == set(packages())
+
+
+def test_modules_that_the_theory_names_are_told_of(site: Path) -> None:
+    theory = (site / "theory.html").read_text(encoding="utf-8")
+    named = re.findall(r'href="(api/[^"#]+)#([^"]+)"', theory)
+    assert len(named) > 80
+    for page, module in named:
+        assert f'id="{module}"' in (site / page).read_text(encoding="utf-8"), module
+
+
+def test_formulas_became_mathml(site: Path) -> None:
+    for page in sorted(site.rglob("*.html")):
+        text = page.read_text(encoding="utf-8")
+        assert "arithmatex" not in text, page.relative_to(site)
+        for formula in re.findall(r"<math.*?</math>", text, re.S):
+            assert "\\" not in formula, f"{page.relative_to(site)}: {formula}"
+    theory = (site / "theory.html").read_text(encoding="utf-8")
+    assert theory.count('display="block"') > 50
+    assert "$" not in re.sub(r"<(script|style|code).*?</\1>", "", theory, flags=re.S)
+
+
+_LIST = re.compile(r"(- |\d+\. |\|)")
+_WITHIN = re.compile(r"( *- | *\d+\. |\||#|  )")
+
+
+@pytest.mark.parametrize("page", pages(), ids=lambda page: page.stem)
+def test_lists_and_tables_stand_apart(page: Path) -> None:
+    """Without an empty line before it the site shows a list as running text."""
+    plain = re.sub(r"^ *```.*?^ *```", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+    for before, line in itertools.pairwise(plain.split("\n")):
+        if _LIST.match(line) and before.strip():
+            assert _WITHIN.match(before), line
+
+
+@pytest.fixture(scope="module")
+def hooks() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("hooks_of_docs", DOCS / "hooks.py")
+    assert spec is not None
+    assert spec.loader is not None
+    loaded = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(loaded)
+    return loaded
+
+
+def html_of(text: str, hooks: ModuleType) -> str:
+    """A page as mkdocs makes it of Markdown."""
+    given = [
+        part if isinstance(part, dict) else {part: {}} for part in SETTINGS["markdown_extensions"]
+    ]
+    settings = {name: values for part in given for name, values in part.items()}
+    made = markdown.markdown(text, extensions=list(settings), extension_configs=settings)
+    page = SimpleNamespace(file=SimpleNamespace(src_uri="page.md"))
+    return str(hooks.on_page_content(made, page=page, config=None, files=None))
+
+
+def test_formulas_within_and_between_lines(hooks: ModuleType) -> None:
+    made = html_of("Of $a < b$ follows\n\n$$\n\\frac{a}{b} < 1\n$$\n\nfor $b > 0$.", hooks)
+    assert made.count("<math") == 3
+    assert made.count('display="block"') == 1
+    assert "<mfrac><mrow><mi>a</mi></mrow><mrow><mi>b</mi></mrow></mfrac>" in made
+    assert "$" not in made
+
+
+def test_code_and_prices_are_no_formulas(hooks: ModuleType) -> None:
+    text = "`$a$` costs $5 or 6 $.\n\n```bash\necho $HOME $$ $b$\n```\n\n    $$c$$\n"
+    made = html_of(text, hooks)
+    assert "<math" not in made
+    assert "<code>$a$</code>" in made
+    assert "$$c$$" in made
+
+
+@pytest.mark.parametrize("wrong", [r"$\frok{a}{b}$", r"$\left(a$", "$a_{b$"])
+def test_a_wrong_formula_stops_the_build(wrong: str, hooks: ModuleType) -> None:
+    with pytest.raises(PluginError, match=r"page\.md"):
+        html_of(wrong, hooks)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as started:
+        yield started
+
+
+@pytest.mark.parametrize("width", [1280, 400])
+def test_pages_open_from_disk_and_ask_for_nothing_else(
+    site: Path, browser: Any, width: int
+) -> None:
+    tab = browser.new_page(viewport={"width": width, "height": 900})
+    heard = Heard()
+    heard.listen(tab)
+    for name in ("index.html", "theory.html", "formats.html", "api/missions.lines.html"):
+        tab.goto((site / name).as_uri())
+        assert tab.evaluate("document.documentElement.scrollWidth") <= width, name
+    tab.close()
+    assert heard.complaints == []
+    assert [asked for asked in heard.requests if not asked.startswith(("file:", "data:"))] == []
+
+
+def test_the_search_finds_from_disk(site: Path, browser: Any) -> None:
+    tab = browser.new_page(viewport={"width": 1280, "height": 900})
+    tab.goto((site / "index.html").as_uri())
+    tab.locator(".md-search__input").click()
+    tab.locator(".md-search__input").press_sequentially("altitude", delay=50)
+    first = tab.locator(".md-search-result__link").first
+    first.wait_for(state="visible", timeout=20_000)
+    assert first.get_attribute("href").startswith("file:")
+    tab.close()
