@@ -10,14 +10,14 @@ AquaCal needs an environment of its own, as it pins an OpenCV whose files clash 
 """
 
 import argparse
-import json
 import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from benchmarks import camera_calibration, camera_pose, camera_speed
-from benchmarks.machine import heading, load, machine
+from benchmarks.figures import Findings, add_options, hand_over
+from benchmarks.machine import heading, machine
 
 _PARTS = ("speed", "pose", "calibration")
 
@@ -26,23 +26,17 @@ def main() -> None:
     """Measure, print, and say which goals are missed."""
     options = _options()
     packages = ("numpy", "numba", "opencv-contrib-python-headless", "pycolmap")
-    report: dict[str, Any] = {"machine": machine(packages), "quick": options.quick}
-    print(heading(report["machine"]), "\n", flush=True)
-    missed: list[str] = []
+    about, report, findings = machine(packages), dict[str, Any](), Findings()
+    print(heading(about), "\n", flush=True)
     if "speed" in options.only:
         rows = camera_speed.measure(
             20_000 if options.quick else 100_000, 10 if options.quick else 40, options.aquacal
         )
         print(camera_speed.table(rows), "\n", flush=True)
         if options.aquacal is None:
-            print("AquaCal was not measured: give --aquacal\n", flush=True)
+            findings += Findings(left_out=("AquaCal: give --aquacal PYTHON",))
         report["speed"] = [{**asdict(row), "ratio": row.ratio} for row in rows]
-        for row in rows:
-            missed += [
-                f"{row.what}: {row.ratio:.3g} x {row.peer} < {goal:g}"
-                for goal in row.goals
-                if row.ratio < goal
-            ]
+        findings += Findings(figures=tuple(f for row in rows for f in row.figures()))
     if "pose" in options.only:
         noise = (0.5, 2.0) if options.quick else tuple(camera_pose.PUBLISHED)
         seeds = range(100 if options.quick else 1000)
@@ -52,7 +46,7 @@ def main() -> None:
         )
         print(camera_pose.table(levels), "\n", flush=True)
         report["pose"] = [asdict(level) for level in levels]
-        missed += [miss for level in levels for miss in level.misses()]
+        findings += Findings(figures=tuple(f for level in levels for f in level.figures()))
     if "calibration" in options.only:
         count = 40 if options.quick else 200
         modes = [
@@ -63,22 +57,18 @@ def main() -> None:
         print(camera_calibration.table(modes), "\n", flush=True)
         report["calibration"] = [asdict(mode) for mode in modes]
         # With fewer trials the figures themselves scatter too much for the goals.
-        missed += [] if options.quick else [miss for mode in modes for miss in mode.misses()]
-    report["missed"] = missed
-    print(f"load after: {load()}")
-    if options.json is not None:
-        options.json.write_text(json.dumps(report, indent=2) + "\n")
-    for miss in missed:
-        print(f"missed: {miss}")
-    sys.exit(1 if missed else 0)
+        judged = not options.quick
+        findings += Findings(
+            figures=tuple(f for mode in modes for f in mode.figures(judged=judged))
+        )
+    sys.exit(hand_over(options, about, findings, report))
 
 
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Benchmarks of the camera.")
-    parser.add_argument("--quick", action="store_true", help="fewer points and trials")
+    add_options(parser, quick="fewer points and trials")
     parser.add_argument("--only", nargs="+", choices=_PARTS, default=list(_PARTS))
     parser.add_argument("--threads", type=int, default=1, help="processes for the trials")
-    parser.add_argument("--json", type=Path, help="write all figures to this file")
     parser.add_argument("--aquacal", type=Path, help="a Python that can import AquaCal")
     return parser.parse_args()
 

@@ -21,6 +21,7 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.executor import parallel_map
 from alice_survey.frames import Array
+from benchmarks.figures import Figure, Goal
 from camera_calib.calibration.adjust import cramer_rao, stack_views
 from camera_calib.calibration.calibrate import Intrinsics, calibrate_through_ports
 from camera_calib.calibration.freedom import (
@@ -99,16 +100,35 @@ class Mode:
     trials: int
     parameters: tuple[Parameter, ...]
 
-    def misses(self) -> list[str]:
-        """Parameters that miss a goal, in words."""
+    def figures(self, *, judged: bool) -> list[Figure]:
+        """Errors of ports and rig beside their bounds, and of all parameters by their sigmas.
+
+        Args:
+            judged: whether there are trials enough for goals.
+        """
         low, high = GOAL_OF_SIGMA
-        found = []
-        for p in self.parameters:
-            if p.name in RIG and not p.ratio <= GOAL_OF_BOUND:
-                found.append(f"{self.known}, {p.name}: {p.ratio:.3f} x its bound > {GOAL_OF_BOUND}")
-            if not low <= p.by_sigma <= high:
-                found.append(f"{self.known}, {p.name}: error / sigma {p.by_sigma:.3f}")
-        return found
+        bound_goal = Goal(most=GOAL_OF_BOUND, of="ratio") if judged else None
+        errors = [
+            Figure(
+                name=f"{self.known}: {p.name}, rms error", value=p.rms, unit=_unit(p.name),
+                peer="Cramer-Rao bound", peer_value=p.bound, goal=bound_goal,
+            )
+            for p in self.parameters
+            if p.name in RIG
+        ]  # fmt: skip
+        scores = [
+            Figure(
+                name=f"{self.known}: {p.name}, error over sigma, rms", value=p.by_sigma,
+                unit="sigmas", goal=Goal(least=low, most=high) if judged else None,
+            )
+            for p in self.parameters
+        ]  # fmt: skip
+        calm = [p.ratio_without_luck for p in self.parameters if p.name in RIG]
+        ends = (("least", min(calm)), ("most", max(calm)))
+        return [*errors, *scores] + [
+            Figure(name=f"{self.known}: rms error without luck, {which}", value=end, unit="bounds")
+            for which, end in ends
+        ]
 
 
 @cache
@@ -226,6 +246,12 @@ def table(modes: Sequence[Mode]) -> str:
             line += f" {p.by_sigma:.3f} |"
         lines.append(line)
     return "\n".join(lines)
+
+
+def _unit(name: str) -> str:
+    """Of a parameter, which ends in it."""
+    last = name.rsplit("_", 1)[-1]
+    return last if last in ("m", "rad", "px") else "1"
 
 
 def _in_words(name: str, size: float) -> str:

@@ -27,6 +27,7 @@ import pycolmap
 
 from alice_survey.config import CameraConfig, WaterConfig
 from alice_survey.frames import Array
+from benchmarks.figures import Figure, Goal
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.rig import design_rig
 
@@ -56,6 +57,25 @@ class Row:
     def ratio(self) -> float:
         """Ours over theirs, on one core."""
         return self.ours / self.theirs
+
+    def figures(self) -> list[Figure]:
+        """On one core, and on two where the peer was measured there."""
+        goal = Goal(least=max(self.goals), of="ratio") if self.goals else None
+        unit = "M points/s"
+        found = [
+            Figure(
+                name=self.what, value=self.ours, unit=unit, peer=self.peer,
+                peer_value=self.theirs, goal=goal,
+            )
+        ]  # fmt: skip
+        if self.theirs_two_cores is not None:
+            found.append(
+                Figure(
+                    name=f"{self.what}, two cores", value=self.ours_two_cores, unit=unit,
+                    peer=self.peer, peer_value=self.theirs_two_cores,
+                )
+            )  # fmt: skip
+        return found
 
 
 def lens_camera() -> FlatPortCamera:

@@ -9,7 +9,7 @@ from typing import Any
 
 
 def machine(packages: Sequence[str]) -> dict[str, Any]:
-    """Processor, cores that may be used, load, and versions of Python and of packages."""
+    """Processor, cores that may be used, system, load, versions of Python and of packages."""
     processor = platform.processor() or platform.machine()
     information = Path("/proc/cpuinfo")
     if information.exists():
@@ -21,6 +21,7 @@ def machine(packages: Sequence[str]) -> dict[str, Any]:
     return {
         "processor": processor,
         "cores": len(os.sched_getaffinity(0)),
+        "system": platform.platform(),
         "load": load(),
         "versions": {"python": platform.python_version(), **{n: version(n) for n in packages}},
     }

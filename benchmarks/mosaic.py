@@ -1,7 +1,7 @@
 """The mosaic's memory and time on surveys of growing area, up to a gigapixel.
 
     .venv/bin/python -m benchmarks.mosaic --work FOLDER [--megapixels 50 200 1000] [--threads N]
-        [--quick]
+        [--quick] [--json FILE]
 
 The survey is synthetic: a few pictures of random texture under many names (hard links), a camera
 without port on straight lines 2 m over waves of 0.1 m, a ground pixel of 1 mm, 60 % and 30 % of
@@ -25,6 +25,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.artefacts import write_csv, write_json
 from alice_survey.executor import default_threads
 from alice_survey.frames import BODY_FROM_NADIR_CAM, Array, Datum
+from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
 from benchmarks.measured import Cost, measured, python
 from reconstruct.dense.dem import DemGrid
@@ -55,6 +56,24 @@ class Measured:
     megapixels: float
     pictures: int
     cost: Cost
+
+    def findings(self) -> Findings:
+        """Time and memory, or why there are none."""
+        where, cost = f"{self.megapixels:g} Mpx", self.cost
+        if not cost.ok:
+            return Findings(failed=(f"{where}: {cost.last_line()}",))
+        rows = (
+            ("time", cost.wall_s, "s", None),
+            ("processor time", cost.cpu_s, "s", None),
+            ("processor time a megapixel", cost.cpu_s / self.megapixels, "s", None),
+            ("peak memory", cost.peak_mib, "MiB", Goal(most=_MOST_MIB)),
+        )
+        return Findings(
+            figures=tuple(
+                Figure(name=f"{where}: {what}", value=value, unit=unit, goal=goal)
+                for what, value, unit, goal in rows
+            )
+        )
 
 
 def depth_of(north: Array, east: Array) -> Array:
@@ -180,25 +199,24 @@ def main() -> int:
     parser.add_argument("--work", type=Path, required=True, help="folder for the surveys")
     parser.add_argument("--megapixels", type=float, nargs="+", default=[50.0, 200.0, 1000.0])
     parser.add_argument("--threads", type=int, default=default_threads())
-    parser.add_argument("--quick", action="store_true", help="50 megapixels alone")
+    add_options(parser, quick="50 megapixels alone")
     options = parser.parse_args()
-    print(f"{heading(machine(_PACKAGES))}\n")
+    about, findings = machine(_PACKAGES), Findings()
+    print(f"{heading(about)}\n")
     print(f"{'Mpx':>7} {'pictures':>9} {'wall s':>8} {'cpu s':>8} {'cpu s/Mpx':>10} {'MiB':>7}")
-    worst = 0.0
     for megapixels in [50.0] if options.quick else options.megapixels:
         found = measure(options.work, megapixels, options.threads)
+        findings += found.findings()
         cost = found.cost
         if not cost.ok:
             print(f"{megapixels:7.0f} failed: {cost.last_line()}")
-            return 1
-        worst = max(worst, cost.peak_mib)
+            break
         print(
             f"{megapixels:7.0f} {found.pictures:9} {cost.wall_s:8.1f} {cost.cpu_s:8.1f} "
             f"{cost.cpu_s / megapixels:10.2f} {cost.peak_mib:7.0f}",
             flush=True,
         )
-    print(f"\npeak memory {'below' if worst < _MOST_MIB else 'ABOVE'} {_MOST_MIB:.0f} MiB")
-    return 0 if worst < _MOST_MIB else 1
+    return hand_over(options, about, findings)
 
 
 if __name__ == "__main__":

@@ -4,21 +4,20 @@
 
 All planners lay lines over the same areas with the same spacing and angle; one meter measures all.
 A peer is left out above 300 rows where it would take minutes. Ends with exit code 1 when a goal is
-missed. `--angles` compares the heading that is found with the best of 3,600, at full cost.
+missed. `--angles` compares the heading that is found with the best of many (3,600), at full cost.
 """
 
 import argparse
-import json
 import math
 import sys
 import time
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.machine import heading, load, machine
+from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
+from benchmarks.machine import heading, machine
 from benchmarks.planner_areas import planned_area, shapes
 from benchmarks.planner_peers import MARGIN_M, PATTERN, PLANNERS, Measured, measured, own_plan
 from missions.lines.sweep import best_heading, full_cost_j
@@ -29,6 +28,7 @@ _ROWS = (100, 300, 3_000, 10_000)
 _MOST_PEER_ROWS = 300
 _ANGLE_ROWS = 30
 _ANGLES = 3600
+_QUICK_ANGLE_ROWS, _QUICK_ANGLES = 12, 600
 _COVERED = 0.999
 _SAME_SHARE = 1e-4
 """Shares this close are one: two of the meter's points."""
@@ -55,34 +55,45 @@ class Angle:
     width_m: float
     sampled_width_m: float
     """Least of the sampled headings."""
+    sampled: int
+    """Headings."""
 
     @property
     def ratio(self) -> float:
         """Cost that is found over the best sampled."""
         return self.cost_s / self.best_s
 
+    def figures(self) -> list[Figure]:
+        """Cost and width beside the best sampled ones, and the time of the search."""
+        peer = f"best of {self.sampled:,}"
+        return [
+            Figure(
+                name=f"{self.area}: cost at the heading found", value=self.cost_s, unit="s",
+                peer=peer, peer_value=self.best_s, goal=Goal(most=_ANGLE_GOAL, of="ratio"),
+            ),
+            Figure(
+                name=f"{self.area}: least total width", value=self.width_m, unit="m", peer=peer,
+                peer_value=self.sampled_width_m, goal=Goal(most=self.sampled_width_m + 1e-9),
+            ),
+            Figure(name=f"{self.area}: search for the heading", value=self.seconds, unit="s"),
+        ]  # fmt: skip
+
 
 def main() -> None:
     """Measure, print, and say which goals are missed."""
     options = _options()
     packages = ("numpy", "numba", "shapely", "coverage-path-planner", "opencoverage")
-    report: dict[str, Any] = {"machine": machine(packages)}
-    print(heading(report["machine"]), "\n", flush=True)
-    missed: list[str] = []
+    about, report, figures = machine(packages), dict[str, Any](), list[Figure]()
+    print(heading(about), "\n", flush=True)
     if options.angles:
-        angles = _angles(options.quick)
+        angles = (
+            _angles(_QUICK_ANGLE_ROWS, _QUICK_ANGLES)
+            if options.quick
+            else _angles(_ANGLE_ROWS, _ANGLES)
+        )
         print(_angle_table(angles), "\n", flush=True)
         report["angles"] = [asdict(row) for row in angles]
-        missed += [
-            f"{row.area}: heading costs {row.ratio:.4f} of the best sampled"
-            for row in angles
-            if row.ratio > _ANGLE_GOAL
-        ]
-        missed += [
-            f"{row.area}: width {row.width_m:.6f} m > {row.sampled_width_m:.6f} m sampled"
-            for row in angles
-            if row.width_m > row.sampled_width_m + 1e-9
-        ]
+        figures += [figure for row in angles for figure in row.figures()]
     else:
         table = {}
         print(_HEAD, flush=True)
@@ -91,7 +102,7 @@ def main() -> None:
                 results = _compared(planned_area(shape, rows, PATTERN.spacing_m, MARGIN_M), rows)
                 table[name, rows] = results
                 print(_rows_table(name, rows, results), flush=True)
-                missed += _missed(name, rows, results)
+                figures += _figures(name, rows, results)
         report["plans"] = [
             {"area": name, "rows": rows, **asdict(row)}
             for (name, rows), results in table.items()
@@ -99,14 +110,14 @@ def main() -> None:
         ]
         report["growth"] = growth = _growth(table)
         print("\nTime grows as rows to the power of:", growth)
-        missed += [f"{name}: time grows as rows^{g}" for name, g in growth.items() if g > _N_LOG_N]
-    report["missed"] = missed
-    print(f"load after: {load()}")
-    if options.json is not None:
-        options.json.write_text(json.dumps(report, indent=2) + "\n")
-    for miss in missed:
-        print(f"missed: {miss}")
-    sys.exit(1 if missed else 0)
+        figures += [
+            Figure(
+                name=f"{name}: growth of time", value=g, unit="exponent of rows",
+                goal=Goal(most=_N_LOG_N),
+            )
+            for name, g in growth.items()
+        ]  # fmt: skip
+    sys.exit(hand_over(options, about, Findings(figures=tuple(figures)), report))
 
 
 def _compared(area: Any, rows: int) -> list[Measured]:
@@ -115,22 +126,32 @@ def _compared(area: Any, rows: int) -> list[Measured]:
     return [measured(name, plan(area, repeats), area) for name, plan in planners.items()]
 
 
-def _missed(name: str, rows: int, results: list[Measured]) -> list[str]:
-    own, where = results[0], f"{name}, {rows} rows"
-    missed = []
-    if own.covered < _COVERED:
-        missed.append(f"{where}: covers {own.covered:.4%}")
-    if own.outside_m > 0 or own.holes_m > 0:
-        missed.append(f"{where}: {own.outside_m:.3g} m outside, {own.holes_m:.3g} m in holes")
+def _figures(name: str, rows: int, results: list[Measured]) -> list[Figure]:
+    own, where = results[0], f"{name}, {rows:,} rows"
     limit_s = _GOALS_S.get((name, rows), _LARGEST_S[1] if rows == _LARGEST_S[0] else math.inf)
-    if own.seconds > limit_s:
-        missed.append(f"{where}: {1e3 * own.seconds:.0f} ms > {1e3 * limit_s:.0f} ms")
-    missed += [
-        f"{where}: {own.path_m:.0f} m of way, {peer.planner} {peer.path_m:.0f} m"
-        for peer in results[1:]
-        if _as_good(peer, own) and own.path_m > peer.path_m
+    time_goal = Goal(most=1e3 * limit_s) if math.isfinite(limit_s) else None
+    none = Goal(most=0.0)
+    alone = [
+        Figure(name=f"{where}: time", value=1e3 * own.seconds, unit="ms", goal=time_goal),
+        Figure(name=f"{where}: covered", value=own.covered, unit="1", goal=Goal(least=_COVERED)),
+        Figure(name=f"{where}: way outside", value=own.outside_m, unit="m", goal=none),
+        Figure(name=f"{where}: way in holes", value=own.holes_m, unit="m", goal=none),
+        Figure(name=f"{where}: way", value=own.path_m, unit="m"),
     ]
-    return missed
+    beside = []
+    for peer in results[1:]:
+        beside += [
+            Figure(
+                name=f"{where}: time", value=1e3 * own.seconds, unit="ms", peer=peer.planner,
+                peer_value=1e3 * peer.seconds,
+            ),
+            Figure(
+                name=f"{where}: way", value=own.path_m, unit="m", peer=peer.planner,
+                peer_value=peer.path_m,
+                goal=Goal(most=1.0, of="ratio") if _as_good(peer, own) else None,
+            ),
+        ]  # fmt: skip
+    return [*alone, *beside]
 
 
 def _as_good(peer: Measured, own: Measured) -> bool:
@@ -156,12 +177,12 @@ def _growth(table: dict[tuple[str, int], list[Measured]]) -> dict[str, float]:
     }
 
 
-def _angles(quick: bool) -> list[Angle]:
+def _angles(rows: int, sampled: int) -> list[Angle]:
     costs = time_costs(0.2)
     kinds = {"cross_lines": 1, "closing_line": True}
     found = []
     for name, shape in shapes().items():
-        area = planned_area(shape, 12 if quick else _ANGLE_ROWS, PATTERN.spacing_m, MARGIN_M)
+        area = planned_area(shape, rows, PATTERN.spacing_m, MARGIN_M)
         ways = Ways(area.allowed)
         north, east = area.rings_ne[0][0]
         home = (float(north), float(east))
@@ -169,8 +190,8 @@ def _angles(quick: bool) -> list[Angle]:
             began = time.perf_counter()
             sweep = best_heading(area, PATTERN, ways, costs, home, **kinds)
             seconds = time.perf_counter() - began
-        headings = np.arange(_ANGLES) * math.pi / _ANGLES
-        sampled = [full_cost_j(area, h, PATTERN, ways, costs, home, **kinds) for h in headings]
+        headings = np.arange(sampled) * math.pi / sampled
+        costs_j = [full_cost_j(area, h, PATTERN, ways, costs, home, **kinds) for h in headings]
         edges = np.concatenate([np.diff(ring, axis=0) for ring in area.rings_ne])
         across = np.abs(
             edges[:, 1] * np.cos(headings)[:, None] - edges[:, 0] * np.sin(headings)[:, None]
@@ -180,9 +201,10 @@ def _angles(quick: bool) -> list[Angle]:
                 area=name,
                 seconds=seconds,
                 cost_s=sweep.cost_j,
-                best_s=min(sampled),
+                best_s=min(costs_j),
                 width_m=sweep.width_m,
                 sampled_width_m=float(across.sum(axis=1).min() / 2),
+                sampled=sampled,
             )
         )
         print(f"{name}: {found[-1].ratio:.4f}", flush=True)
@@ -191,7 +213,8 @@ def _angles(quick: bool) -> list[Angle]:
 
 def _angle_table(rows: list[Angle]) -> str:
     lines = [
-        f"| area | search, ms | cost, s | best of {_ANGLES:,}, s | ratio | width, m | sampled, m |",
+        f"| area | search, ms | cost, s | best of {rows[0].sampled:,}, s | ratio | width, m "
+        "| sampled, m |",
         "|---|---|---|---|---|---|---|",
     ]
     lines += [
@@ -214,9 +237,8 @@ def _rows_table(name: str, rows: int, results: list[Measured]) -> str:
 
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Benchmarks of the planner.")
-    parser.add_argument("--quick", action="store_true", help="fewer rows, smaller areas")
+    add_options(parser, quick="fewer rows and headings, smaller areas")
     parser.add_argument("--angles", action="store_true", help="search headings, not lines")
-    parser.add_argument("--json", type=Path, help="write all figures to this file")
     return parser.parse_args()
 
 

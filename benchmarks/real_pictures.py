@@ -1,12 +1,15 @@
 """Real pictures through the two commands a user types, and how the result compares.
 
-    .venv/bin/python -m benchmarks.real_pictures ../shared/data WORKSPACES
+    .venv/bin/python -m benchmarks.real_pictures ../shared/data WORKSPACES [--quick] [--json FILE]
 
 For the drone block the surface is compared with another tool's cloud (`model.laz`) after a
-similarity alignment, since neither has a measured scale.
+similarity alignment, since neither has a measured scale. Workspaces of the same names are made
+anew, so that times are those of the whole. `--quick` reconstructs a few pictures of a third set.
 """
 
+import argparse
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -18,27 +21,43 @@ from pyproj import Transformer
 from scipy.spatial import cKDTree
 
 from alice_survey.frames import Array
+from benchmarks.figures import Figure, Findings, add_options, hand_over
+from benchmarks.machine import heading, machine
 from reconstruct.model import read_frame
 from reconstruct.sparse.alignment import align_similarity
 
 _POINTS = 40_000
 _ROUNDS = 40
+_QUICK_PICTURES = 6
+_PACKAGES = ("numpy", "numba", "opencv-contrib-python-headless", "open3d", "pycolmap")
 
 
-def reconstruct(name: str, arguments: list[str], workspaces: Path) -> Path:
+def reconstruct(name: str, arguments: list[str], workspaces: Path) -> Findings:
     """Import and reconstruct; prints what was registered and how long it took."""
     workspace = workspaces / name
+    if workspace.exists():
+        shutil.rmtree(workspace)
     command = [sys.executable, "-m", "alice_survey"]
     started = time.perf_counter()
-    subprocess.run([*command, "import-images", *arguments, "-w", str(workspace)], check=True)
-    subprocess.run([*command, "reconstruct", "-w", str(workspace)], check=True)
+    for work in (["import-images", *arguments], ["reconstruct"]):
+        code = subprocess.run([*command, *work, "-w", str(workspace)]).returncode
+        if code:
+            return Findings(failed=(f"{name}: {work[0]} ended with exit code {code}",))
     took_s = time.perf_counter() - started
     found = json.loads((workspace / "sparse" / "registration.json").read_text())
     print(
         f"{name}: {found['registered']} of {found['total']} pictures registered, "
         f"{found['mean_reprojection_px']:.3f} px, {found['scale_source']}, {took_s:.0f} s"
     )
-    return workspace
+    registered, total = found["registered"], found["total"]
+    error_px = found["mean_reprojection_px"]
+    return Findings(
+        figures=(
+            Figure(name=f"{name}: registered of {total}", value=registered, unit="pictures"),
+            Figure(name=f"{name}: mean reprojection error", value=error_px, unit="px"),
+            Figure(name=f"{name}: time to mosaic and mesh", value=took_s, unit="s"),
+        )
+    )
 
 
 def cloud_utm(workspace: Path, epsg: int) -> Array:
@@ -86,21 +105,71 @@ def compare(ours: Array, theirs: Array, rng: np.random.Generator) -> dict[str, f
     }
 
 
-def main() -> None:
-    """Run both sets and print the figures."""
-    data, workspaces = Path(sys.argv[1]), Path(sys.argv[2])
-    stereo = data / "haltbrekken"
-    pair = ["--left", str(stereo / "left"), "--right", str(stereo / "right")]
-    reconstruct("haltbrekken", pair, workspaces)
-    drone = data / "brighton_beach"
-    workspace = reconstruct("brighton_beach", [str(drone / "images")], workspaces)
+def beside_cloud(drone: Path, workspace: Path) -> Findings:
+    """Distance from the other tool's cloud; prints it."""
     with laspy.open(drone / "model.laz") as file:
         reference = file.read()
         crs = reference.header.parse_crs()
     theirs = np.column_stack([reference.x, reference.y, reference.z])
     epsg = crs.to_epsg() if crs is not None else read_frame_epsg(workspace)
-    figures = compare(cloud_utm(workspace, epsg), theirs, np.random.default_rng(1))
-    print("brighton_beach against model.laz:", json.dumps(figures, indent=2))
+    found = compare(cloud_utm(workspace, epsg), theirs, np.random.default_rng(1))
+    print(f"{drone.name} against model.laz:", json.dumps(found, indent=2))
+    return Findings(
+        figures=tuple(
+            Figure(
+                name=f"{drone.name}, against another tool's cloud: {key.removesuffix('_m')}",
+                value=value,
+                unit="m" if key.endswith("_m") else "1",
+            )
+            for key, value in found.items()
+        )
+    )
+
+
+def main() -> int:
+    """Run the sets that are there and print the figures."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("data", type=Path, help="folder of the sets")
+    parser.add_argument("workspaces", type=Path, help="folder to work in")
+    add_options(parser, quick=f"{_QUICK_PICTURES} pictures of the smallest set")
+    options = parser.parse_args()
+    about = machine(_PACKAGES)
+    print(f"{heading(about)}\n", flush=True)
+    sets = {"caliterra": run_few} if options.quick else {
+        "haltbrekken": run_stereo, "brighton_beach": run_drone,
+    }  # fmt: skip
+    findings = Findings()
+    for name, run in sets.items():
+        if (options.data / name).is_dir():
+            findings += run(options.data / name, options.workspaces)
+        else:
+            findings += Findings(left_out=(f"{name}: no pictures in {options.data}",))
+    return hand_over(options, about, findings)
+
+
+def run_stereo(source: Path, workspaces: Path) -> Findings:
+    """Underwater stereo, nothing known."""
+    pair = ["--left", str(source / "left"), "--right", str(source / "right")]
+    return reconstruct(source.name, pair, workspaces)
+
+
+def run_drone(source: Path, workspaces: Path) -> Findings:
+    """A drone's block, beside another tool's cloud of it."""
+    findings = reconstruct(source.name, [str(source / "images")], workspaces)
+    if findings.failed:
+        return findings
+    return findings + beside_cloud(source, workspaces / source.name)
+
+
+def run_few(source: Path, workspaces: Path) -> Findings:
+    """The first pictures of a drone's block."""
+    folder = workspaces / f"{source.name}_pictures"
+    if folder.exists():
+        shutil.rmtree(folder)
+    folder.mkdir(parents=True)
+    for picture in sorted((source / "images").iterdir())[:_QUICK_PICTURES]:
+        (folder / picture.name).symlink_to(picture.resolve())
+    return reconstruct(source.name, [str(folder)], workspaces)
 
 
 def read_frame_epsg(workspace: Path) -> int:
@@ -112,4 +181,4 @@ def read_frame_epsg(workspace: Path) -> int:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -2,7 +2,7 @@
 
     .venv/bin/python -m benchmarks.reconstruct --work FOLDER [--data ../shared/data]
         [--demo WORKSPACE] [--pyorthomosaic PYTHON] [--limit SECONDS]
-        [--only peers,growth,haltbrekken,brighton] [--pictures 50,100] [--quick]
+        [--only peers,growth,haltbrekken,brighton] [--pictures 50,100] [--quick] [--json FILE]
 
 `peers`: rendered pictures of the demo (quarter resolution), 50 and 100 by default. Wall and
 processor time, peak memory with children, pictures registered, and errors against the truth. Our
@@ -27,12 +27,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from benchmarks.figures import Figure, Findings, add_options, hand_over
 from benchmarks.machine import heading, machine
 from benchmarks.measured import Cost, measured, python
+from benchmarks.reconstruct_figures import beside_peers, beside_real, grown, of_real
 from benchmarks.reconstruct_scores import Accuracy, score_ours, score_peer
 from benchmarks.reconstruct_surveys import pictures_of, render, subset, survey_toml
 
 PARTS = ("peers", "growth", "haltbrekken", "brighton")
+NO_PYORTHOMOSAIC = "pyorthomosaic: not installed; give --pyorthomosaic PYTHON"
 _PEERS = Path(__file__).with_name("reconstruct_peers.py")
 _STAGES = ("sparse", "dense", "mosaic")
 _RUN = (
@@ -86,8 +89,9 @@ def row(name: str, costs: Sequence[Cost], found: Accuracy | None) -> str:
 
 def run_peers(
     work: Path, demo: Path, interpreter: str | None, counts: Sequence[int], limit_s: float
-) -> None:
+) -> Findings:
     """Table of all programs on the same rendered pictures; ours compiled beforehand."""
+    findings = Findings()
     ours(subset(demo, work / "compiled", 8))
     for count in counts:
         part = subset(demo, work / f"peers{count}", count)
@@ -100,18 +104,25 @@ def run_peers(
         found = score_ours(part) if costs["sparse"].ok else None
         print(row("ours, to the sparse model", [costs["sparse"]], found), flush=True)
         print(row("ours, to surface and mosaic", list(costs.values()), found), flush=True)
+        rivals: dict[str, tuple[Cost | None, Accuracy | None]] = {}
         for name, python_of in (("colmap", sys.executable), ("pyorthomosaic", interpreter)):
             if python_of is None:
-                print(f"{name}: not installed; give --pyorthomosaic PYTHON")
+                print(NO_PYORTHOMOSAIC)
+                findings += Findings(left_out=(f"{count} pictures: {NO_PYORTHOMOSAIC}",))
+                rivals[name] = (None, None)
                 continue
             out = _emptied(work / f"peers{count}_{name}")
             cost = peer(name, python_of, folder, out, limit_s)
             accuracy = score_peer(out, part / "images" / "truth") if cost.ok else None
             print(row(name, [cost], accuracy), flush=True)
+            rivals[name] = (cost, accuracy)
+        findings += beside_peers(count, costs, found, rivals)
+    return findings
 
 
-def run_growth(work: Path, counts: Sequence[int], scale: int) -> None:
+def run_growth(work: Path, counts: Sequence[int], scale: int) -> Findings:
     """Our own cost a picture as surveys grow."""
+    findings = Findings()
     whole = work / f"growth_{max(counts)}"
     render(whole, survey_toml(max(counts), scale))
     print(f"\ngrowth, at 1/{scale} of the resolution: seconds a picture (cpu), peak MiB\n"
@@ -129,9 +140,11 @@ def run_growth(work: Path, counts: Sequence[int], scale: int) -> None:
         registered = "" if found is None else f"{found.registered:6} of {count}"
         print(f"{count:9} " + " ".join(f"{cell:>20}" for cell in cells) + f" {registered}",
               flush=True)  # fmt: skip
+        findings += grown(count, costs, found)
+    return findings
 
 
-def run_haltbrekken(work: Path, data: Path, interpreter: str | None, limit_s: float) -> None:
+def run_haltbrekken(work: Path, data: Path, interpreter: str | None, limit_s: float) -> Findings:
     """Real stereo pictures without navigation: both mosaics in one picture."""
     source, workspace = data / "haltbrekken", _emptied(work / "haltbrekken")
     arguments = ["--left", str(source / "left"), "--right", str(source / "right")]
@@ -139,9 +152,10 @@ def run_haltbrekken(work: Path, data: Path, interpreter: str | None, limit_s: fl
     costs = ours(workspace)
     print(f"\nhaltbrekken, 40 pictures\n{row('ours', list(costs.values()), None)}"
           f"  {registered(workspace)}", flush=True)  # fmt: skip
+    findings = of_real("haltbrekken", workspace, costs)
     if interpreter is None:
-        print("pyorthomosaic: not installed; give --pyorthomosaic PYTHON")
-        return
+        print(NO_PYORTHOMOSAIC)
+        return findings + Findings(left_out=(NO_PYORTHOMOSAIC,))
     pictures = pictures_of(workspace, _emptied(work / "haltbrekken_pictures"))
     out = _emptied(work / "haltbrekken_pyorthomosaic")
     cost = peer("pyorthomosaic", interpreter, pictures, out, limit_s)
@@ -150,9 +164,10 @@ def run_haltbrekken(work: Path, data: Path, interpreter: str | None, limit_s: fl
         target = work / "haltbrekken_mosaics.png"
         side_by_side([workspace / "mosaic" / "mosaic.png", out / "orthophoto.tif"], target)
         print(f"both mosaics: {target}")
+    return findings + beside_real("haltbrekken", costs, "pyorthomosaic", cost)
 
 
-def run_brighton(work: Path, data: Path, interpreter: str | None, limit_s: float) -> None:
+def run_brighton(work: Path, data: Path, interpreter: str | None, limit_s: float) -> Findings:
     """Real drone pictures: distance from another tool's cloud."""
     from reconstruct.evaluate.cloud_files import read_reference
     from reconstruct.evaluate.cloud_registration import Surface, register_cloud
@@ -164,26 +179,40 @@ def run_brighton(work: Path, data: Path, interpreter: str | None, limit_s: float
     costs = ours(workspace)
     print(f"\nbrighton_beach, 18 pictures\n{row('ours', list(costs.values()), None)}"
           f"  {registered(workspace)}", flush=True)  # fmt: skip
-    if not all(cost.ok for cost in costs.values()):
-        return
-    text, _ = evaluate_reference(workspace, source / "model.laz")
+    findings = of_real("brighton", workspace, costs)
+    if findings.failed:
+        return findings
+    text, compared = evaluate_reference(workspace, source / "model.laz")
     print(text)
+    findings += _distance("brighton", compared["survey_to_reference"]["median_m"])
     if interpreter is None:
-        print("pyorthomosaic: not installed; give --pyorthomosaic PYTHON")
-        return
+        print(NO_PYORTHOMOSAIC)
+        return findings + Findings(left_out=(NO_PYORTHOMOSAIC,))
     out = _emptied(work / "brighton_pyorthomosaic")
     cost = peer("pyorthomosaic", interpreter, source / "images", out, limit_s)
     print(f"{row('pyorthomosaic', [cost], None)}  {peer_registered(out, cost)}")
+    findings += beside_real("brighton", costs, "pyorthomosaic", cost)
     if not cost.ok:
-        return
+        return findings
     datum = read_frame(workspace / "sparse" / "frame.json").datum
     surface = Surface.of(read_reference(source / "model.laz", datum)[0])
     theirs, placed = read_reference(out / "dsm.tif", datum)
     rng = np.random.default_rng(1)
     fit = register_cloud(theirs, surface, lifted(theirs, surface), free_scale=True, rng=rng)
     away = distances(fit.reference_from_cloud.apply(theirs), surface, rng)
-    print(f"its elevation model to the reference: median {np.median(np.abs(away.signed_m)):.4f} m, "
+    median_m = float(np.median(np.abs(away.signed_m)))
+    print(f"its elevation model to the reference: median {median_m:.4f} m, "
           f"scale {fit.reference_from_cloud.scale:.5f}, georeferenced: {placed}")  # fmt: skip
+    own_m = compared["survey_to_reference"]["median_m"]
+    return findings + _distance("brighton", own_m, "pyorthomosaic", median_m)
+
+
+def _distance(
+    where: str, own_m: float, peer: str | None = None, peer_m: float | None = None
+) -> Findings:
+    name = f"{where}: median distance from another tool's cloud"
+    figure = Figure(name=name, value=own_m, unit="m", peer=peer, peer_value=peer_m)
+    return Findings(figures=(figure,))
 
 
 def imported(arguments: Sequence[str], workspace: Path) -> None:
@@ -248,7 +277,7 @@ def find_pyorthomosaic(given: str | None) -> str | None:
     return None if found.returncode else interpreter
 
 
-def main() -> None:
+def main() -> int:
     """Run the parts that are asked for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--work", type=Path, required=True, help="scratch folder")
@@ -260,12 +289,13 @@ def main() -> None:
         "--limit", type=float, default=3600.0, help="seconds that another program may take"
     )
     parser.add_argument("--pictures", default="50,100", help="of `peers`, by commas")
-    parser.add_argument("--quick", action="store_true", help="small surveys, to see that it runs")
+    add_options(parser, quick="small surveys, to see that it runs")
     given = parser.parse_args()
     parts = given.only.split(",")
     if unknown := set(parts) - set(PARTS):
         raise SystemExit(f"no part {min(unknown)!r}; there are {', '.join(PARTS)}")
-    print(heading(machine(["pycolmap", "opencv-contrib-python-headless", "numpy"])))
+    about, findings = machine(["pycolmap", "opencv-contrib-python-headless", "numpy"]), Findings()
+    print(heading(about))
     interpreter = find_pyorthomosaic(given.pyorthomosaic)
     given.work.mkdir(parents=True, exist_ok=True)
     work = given.work.resolve()
@@ -275,16 +305,17 @@ def main() -> None:
             demo = work / "demo"
             render(demo, survey_toml(20 if given.quick else 116, 8 if given.quick else 4))
         counts = [16] if given.quick else [int(n) for n in given.pictures.split(",")]
-        run_peers(work, demo.resolve(), interpreter, counts, given.limit)
+        findings += run_peers(work, demo.resolve(), interpreter, counts, given.limit)
     if "growth" in parts:
-        run_growth(work, [12, 24] if given.quick else [50, 100, 200, 400], 8)
+        findings += run_growth(work, [12, 24] if given.quick else [50, 100, 200, 400], 8)
     for name, function in (("haltbrekken", run_haltbrekken), ("brighton", run_brighton)):
         if name in parts:
             if (given.data / ("brighton_beach" if name == "brighton" else name)).is_dir():
-                function(work, given.data.resolve(), interpreter, given.limit)
+                findings += function(work, given.data.resolve(), interpreter, given.limit)
             else:
-                print(f"\n{name}: no pictures in {given.data}")
+                findings += Findings(left_out=(f"{name}: no pictures in {given.data}",))
+    return hand_over(given, about, findings)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

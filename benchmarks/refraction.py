@@ -1,6 +1,7 @@
 """What refraction through a flat port costs, by how it is taken: tracks whose truth is known.
 
-    python -m benchmarks.refraction [--stations 48] [--points 6000] [--oracle]
+    python -m benchmarks.refraction [--stations 48] [--points 6000] [--oracle] [--quick]
+        [--json FILE]
 
 For port distances of 20 and 50 mm and tilts of 0 and 2 degrees it states the rms of points and
 cameras after rigid alignment: ours, the warp to one working depth alone, COLMAP's self-calibrated
@@ -9,6 +10,7 @@ can be (10 minutes a row with 48 stations and 1000 points).
 """
 
 import argparse
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,6 +21,8 @@ import numpy as np
 import pycolmap
 
 from alice_survey.frames import Array
+from benchmarks.figures import Figure, Findings, add_options, hand_over
+from benchmarks.machine import heading, machine
 from reconstruct.lenses.lens import self_calibrated_lens
 from reconstruct.mapping.bundle import adjust_freely, all_pictures, held_options
 from reconstruct.mapping.mapper import Mapped
@@ -29,6 +33,7 @@ from tests.reconstruct.scenes import Scene, make_scene
 from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_scene
 
 NOISE_PX, RELIEF_M = 0.3, 0.3
+_QUICK_STATIONS, _QUICK_POINTS = 12, 800
 
 
 def main() -> None:
@@ -37,27 +42,48 @@ def main() -> None:
     parser.add_argument("--stations", type=int, default=48)
     parser.add_argument("--points", type=int, default=6000)
     parser.add_argument("--oracle", action="store_true")
+    add_options(parser, quick=f"{_QUICK_STATIONS} stations and {_QUICK_POINTS} points")
     asked = parser.parse_args()
+    stations = _QUICK_STATIONS if asked.quick else asked.stations
+    about, figures = machine(("numpy", "scipy", "pycolmap")), list[Figure]()
+    print(f"{heading(about)}\n", flush=True)
     print(f"{'port mm':>8}{'tilt':>6}  {'method':<12}{'points mm':>10}{'cameras mm':>12}{'s':>7}")
     for port_m in (0.02, 0.05):
         for tilt_deg in (0.0, 2.0):
             lines = 4
             scene = make_scene(
                 lines=lines,
-                stations=asked.stations // lines,
-                points=asked.points,
+                stations=stations // lines,
+                points=_QUICK_POINTS if asked.quick else asked.points,
                 noise_px=NOISE_PX,
                 port_distance_m=port_m,
                 port_tilt_deg=(tilt_deg, 0.0),
                 scale=1,
                 relief_m=RELIEF_M,
             )
-            for method, points, cameras, seconds in rows(scene, with_oracle=asked.oracle):
+            found = rows(scene, with_oracle=asked.oracle)
+            figures += _figures(f"port at {1e3 * port_m:g} mm, tilt {tilt_deg:g} deg", found)
+            for method, points, cameras, seconds in found:
                 print(
                     f"{1e3 * port_m:8.0f}{tilt_deg:6.0f}  {method:<12}{1e3 * points:10.3f}"
                     f"{1e3 * cameras:12.3f}{seconds:7.1f}",
                     flush=True,
                 )
+    sys.exit(hand_over(asked, about, Findings(figures=tuple(figures))))
+
+
+def _figures(where: str, found: Sequence[tuple[str, float, float, float]]) -> list[Figure]:
+    """Ours, the first row, beside each of the others."""
+    (_, *own), *others = found
+    whats = (("rms of points", "mm", 1e3), ("rms of cameras", "mm", 1e3), ("time", "s", 1.0))
+    return [
+        Figure(
+            name=f"{where}: {what}", value=scale * ours, unit=unit, peer=peer,
+            peer_value=scale * theirs,
+        )
+        for peer, *values in others
+        for (what, unit, scale), ours, theirs in zip(whats, own, values, strict=True)
+    ]  # fmt: skip
 
 
 def rows(scene: Scene, *, with_oracle: bool) -> Sequence[tuple[str, float, float, float]]:
@@ -104,7 +130,7 @@ def self_calibrated_opencv(scene: Scene) -> Mapped:
     plain = replace(seen, cameras=cameras, pixels=scene.pixels)
     start = near_truth(scene, plain, lenses, np.random.default_rng(1))
     model = start.model
-    options = held_options(scene.noise_px)
+    options = held_options(NOISE_PX)
     options.refine_focal_length = options.refine_extra_params = True
     config = all_pictures(model)
     config.set_constant_rig_from_world_pose(min(model.reg_frame_ids()))

@@ -26,6 +26,7 @@ from alice_survey.vehicle.allocation.scratch import AllocationScratch, allocatio
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.propulsion import thrust_limits
+from benchmarks.figures import Figure, Goal
 from tests.oracles_propulsion import redistributed
 
 _COUNT = 500
@@ -154,6 +155,31 @@ def measure(runs: int) -> list[Row]:
 def _same(what: str, found: Array, expected: Array, limit: float) -> None:
     if not np.abs(found - expected).max() <= limit:
         sys.exit(f"{what} than the exact allocation does")
+
+
+def figures(rows: list[Row]) -> list[Figure]:
+    """The exact allocation alone, beside each of the others, and what each misses."""
+    own = {row.wrenches: row for row in rows if row.solver == "exact"}
+    alone = [
+        Figure(
+            name=f"exact allocation, {kind}", value=row.us, unit="us",
+            goal=None if row.goal_us is None else Goal(most=row.goal_us),
+        )
+        for kind, row in own.items()
+    ]  # fmt: skip
+    beside = [
+        Figure(
+            name=f"exact allocation, {row.wrenches}", value=own[row.wrenches].us, unit="us",
+            peer=row.solver, peer_value=row.us,
+        )
+        for row in rows
+        if row.solver != "exact"
+    ]  # fmt: skip
+    misses = [
+        Figure(name=f"{row.solver}, {row.wrenches}: mean miss", value=row.miss, unit="N, weighted")
+        for row in rows
+    ]
+    return [*alone, *beside, *misses]
 
 
 def table(rows: list[Row]) -> str:

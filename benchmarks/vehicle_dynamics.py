@@ -35,6 +35,7 @@ from alice_survey.vehicle.sea import (
     varying_current,
 )
 from alice_survey.vehicle.vehicle import Vehicle
+from benchmarks.figures import Figure, Goal
 from tests import oracles_dynamics as oracle
 from tests.oracles_propulsion import wrench
 
@@ -64,6 +65,19 @@ class Accuracy:
     attitude_rad: float
     velocity: float
     """m/s and rad/s."""
+
+    def figures(self) -> list[Figure]:
+        """All three."""
+        errors = (
+            ("position", self.position_m, "m"),
+            ("attitude", self.attitude_rad, "rad"),
+            ("velocity", self.velocity, "m/s, rad/s"),
+        )
+        return [
+            Figure(name=f"steps of {self.step_ms:g} ms: largest error of {what}", value=value,
+                   unit=unit)
+            for what, value, unit in errors
+        ]  # fmt: skip
 
 
 @kernel
@@ -344,6 +358,25 @@ def accuracy(seconds: int) -> list[Accuracy]:
             )
         )
     return found
+
+
+def figures(rows: list[Row]) -> list[Figure]:
+    """Ours alone, then beside each twin."""
+    own = {(row.what, row.case): row for row in rows if row.ratio is None}
+    alone = [
+        Figure(
+            name=f"{row.what}: {row.case}", value=row.us, unit="us",
+            goal=None if row.goal_us is None else Goal(most=row.goal_us),
+        )
+        for row in own.values()
+    ]  # fmt: skip
+    beside = [
+        Figure(name=f"{what}: {case}", value=ours.us, unit="us", peer=row.what, peer_value=row.us)
+        for row in rows
+        for (what, case), ours in own.items()
+        if row.ratio is not None and row.case == case and row.what.startswith(what)
+    ]
+    return [*alone, *beside]
 
 
 def table(rows: list[Row]) -> str:

@@ -22,6 +22,7 @@ from alice_survey.vehicle.pilot.memory import PHASE, REASON
 from alice_survey.vehicle.pilot.safety import NONE
 from alice_survey.vehicle.signals import DONE
 from alice_survey.vehicle.simulator import Setup, simulate
+from benchmarks.figures import Figure, Goal
 from camera_calib.rig import design_rig
 from missions.plan import make_plan
 from missions.simulation import mission_setup
@@ -45,6 +46,11 @@ class Row:
         """Real-time factor."""
         return self.simulated_s / self.wall_s
 
+    def figure(self) -> Figure:
+        """The factor and its goal."""
+        goal = Goal(least=self.goal)
+        return Figure(name=self.mission, value=self.factor, unit="times real time", goal=goal)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Start:
@@ -55,6 +61,13 @@ class Start:
     """With nothing compiled before."""
     cached_s: float
     """With the machine code of the process before."""
+
+    def figures(self) -> list[Figure]:
+        """Both waits."""
+        return [
+            Figure(name=f"{self.what}, compiling", value=self.compiling_s, unit="s"),
+            Figure(name=f"{self.what}, compiled before", value=self.cached_s, unit="s"),
+        ]
 
 
 def measure(runs: int) -> list[Row]:

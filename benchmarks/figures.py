@@ -1,0 +1,170 @@
+"""One way for every benchmark to hand its figures over: options, goals, and the JSON they end in.
+
+A file that `--json FILE` writes holds `machine`, `quick`, `figures` (each with `name`, `value`,
+`unit`, `peer`, `peer_value`, `ratio`, `goal`, `met`), `missed` (goals, in words), `failed` (work
+that went wrong), `left_out` (what could not be measured, and why) and, by names of its own, the
+rows that the benchmark prints. What is not a number is null.
+"""
+
+import argparse
+import dataclasses
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from benchmarks.machine import load
+
+
+@dataclass(frozen=True, kw_only=True)
+class Goal:
+    """Bounds of a figure, or of its ratio to a peer's."""
+
+    least: float | None = None
+    most: float | None = None
+    of: Literal["value", "ratio"] = "value"
+
+    def __post_init__(self) -> None:
+        if self.least is None and self.most is None:
+            raise ValueError("a goal needs a bound")
+
+    def __str__(self) -> str:
+        subject = "ratio " if self.of == "ratio" else ""
+        if self.least is None:
+            return f"{subject}<= {self.most:.6g}"
+        if self.most is None:
+            return f"{subject}>= {self.least:.6g}"
+        return f"{subject}{self.least:.6g} to {self.most:.6g}"
+
+    def is_met(self, number: float) -> bool:
+        """Whether a number lies within; NaN never does."""
+        above = self.least is None or number >= self.least
+        return above and (self.most is None or number <= self.most)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figure:
+    """One measured number; name and peer together occur once in a run."""
+
+    name: str
+    value: float
+    unit: str
+    peer: str | None = None
+    """What was measured beside it, in the same run unless it says otherwise."""
+    peer_value: float | None = None
+    goal: Goal | None = None
+
+    def __post_init__(self) -> None:
+        if (self.peer is None) != (self.peer_value is None):
+            raise ValueError(f"{self.name}: a peer has a value, and a value a peer")
+        if self.goal is not None and self.goal.of == "ratio" and self.peer is None:
+            raise ValueError(f"{self.name}: a goal of a ratio needs a peer")
+
+    @property
+    def ratio(self) -> float | None:
+        """The value over the peer's; NaN where that is zero."""
+        if self.peer_value is None:
+            return None
+        return self.value / self.peer_value if self.peer_value else math.nan
+
+    @property
+    def met(self) -> bool | None:
+        """Whether the goal is met; None without one."""
+        if self.goal is None:
+            return None
+        number = self.value if self.goal.of == "value" else self.ratio
+        return number is not None and self.goal.is_met(number)
+
+    def miss(self) -> str:
+        """What it is and should be, in words."""
+        beside = "" if self.ratio is None else f" ({self.ratio:.4g} x {self.peer})"
+        return f"{self.name}: {self.value:.6g} {self.unit}{beside}, goal {self.goal}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Findings:
+    """What a benchmark, or a part of it, has to say."""
+
+    figures: tuple[Figure, ...] = ()
+    failed: tuple[str, ...] = ()
+    """Work that went wrong, in words."""
+    left_out: tuple[str, ...] = ()
+    """What could not be measured, and why."""
+
+    def __add__(self, other: "Findings") -> "Findings":
+        return Findings(
+            figures=self.figures + other.figures,
+            failed=self.failed + other.failed,
+            left_out=self.left_out + other.left_out,
+        )
+
+    @property
+    def missed(self) -> list[str]:
+        """Goals that are missed, in words."""
+        return [figure.miss() for figure in self.figures if figure.met is False]
+
+
+def add_options(parser: argparse.ArgumentParser, quick: str) -> None:
+    """The options that every benchmark has; `quick` tells what `--quick` leaves out."""
+    parser.add_argument("--quick", action="store_true", help=quick)
+    parser.add_argument("--json", type=Path, help="write all figures to this file")
+
+
+def hand_over(
+    options: argparse.Namespace,
+    machine: Mapping[str, Any],
+    findings: Findings,
+    rows: Mapping[str, Any] | None = None,
+) -> int:
+    """Print the load, what was left out, missed and failed; write the figures where asked for.
+
+    Args:
+        options: with those of `add_options`.
+        machine: as `benchmarks.machine.machine` has it, from before the work.
+        findings: all of them.
+        rows: what else to keep, by name.
+
+    Returns:
+        The exit code: 1 when a goal was missed or work failed.
+    """
+    print(f"load after: {load()}")
+    if options.json is not None:
+        report = {
+            "machine": dict(machine),
+            "quick": options.quick,
+            "figures": [_as_row(figure) for figure in findings.figures],
+            "missed": findings.missed,
+            "failed": list(findings.failed),
+            "left_out": list(findings.left_out),
+            **(rows or {}),
+        }
+        options.json.write_text(json.dumps(plain(report), indent=2, allow_nan=False) + "\n")
+    for what in findings.left_out:
+        print(f"left out: {what}")
+    for miss in findings.missed:
+        print(f"missed: {miss}")
+    for failure in findings.failed:
+        print(f"failed: {failure}")
+    return 1 if findings.missed or findings.failed else 0
+
+
+def _as_row(figure: Figure) -> dict[str, Any]:
+    return {
+        **dataclasses.asdict(figure),
+        "ratio": figure.ratio,
+        "goal": None if figure.goal is None else str(figure.goal),
+        "met": figure.met,
+    }
+
+
+def plain(data: Any) -> Any:
+    """The same for JSON, which has no NaN: null."""
+    if isinstance(data, Mapping):
+        return {key: plain(value) for key, value in data.items()}
+    if isinstance(data, (list, tuple)):
+        return [plain(value) for value in data]
+    if isinstance(data, float) and not math.isfinite(data):
+        return None
+    return data

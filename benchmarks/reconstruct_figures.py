@@ -1,0 +1,132 @@
+"""The figures of `benchmarks.reconstruct`: ours beside other programs, or alone where they fail."""
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from benchmarks.figures import Figure, Findings
+from benchmarks.measured import Cost
+from benchmarks.reconstruct_scores import Accuracy
+
+_Numbers = dict[str, tuple[float, str]]
+"""Value and unit by name."""
+_SPARSE_ALONE = ("colmap",)
+"""Programs that end at the sparse model."""
+
+
+def beside_peers(
+    count: int,
+    costs: Mapping[str, Cost],
+    found: Accuracy | None,
+    rivals: Mapping[str, tuple[Cost | None, Accuracy | None]],
+) -> Findings:
+    """Cost and accuracy of ours to where each other program ends.
+
+    Args:
+        count: of pictures.
+        costs: of our stages.
+        found: our accuracy; None where there is no model.
+        rivals: cost and accuracy of others, by name; None where there is no such program.
+    """
+    findings = Findings(failed=failures(f"{count} pictures", costs))
+    for name, (cost, accuracy) in rivals.items():
+        end = "sparse model" if name in _SPARSE_ALONE else "mosaic"
+        stages = [costs["sparse"]] if name in _SPARSE_ALONE else list(costs.values())
+        own = _spent(stages) | _sparse_errors(found)
+        if name not in _SPARSE_ALONE:
+            own |= _surface_errors(found)
+        theirs = {} if cost is None or not cost.ok else _numbers(cost, accuracy)
+        where = f"{count} pictures to the {end}"
+        if all(stage.ok for stage in stages):
+            findings += Findings(figures=tuple(_figures(where, own, name, theirs)))
+        if cost is not None and not cost.ok:
+            findings += Findings(left_out=(f"{where}, {name}: {cost.last_line()}",))
+    return findings
+
+
+def grown(count: int, costs: Mapping[str, Cost], found: Accuracy | None) -> Findings:
+    """Cost of each of our stages a picture."""
+    numbers: _Numbers = {}
+    for stage, cost in costs.items():
+        if cost.ok:
+            numbers[f"{stage}, time a picture"] = (cost.wall_s / count, "s")
+            numbers[f"{stage}, processor time a picture"] = (cost.cpu_s / count, "s")
+            numbers[f"{stage}, peak memory"] = (cost.peak_mib, "MiB")
+    if found is not None:
+        numbers["registered"] = (found.registered, "pictures")
+    where = f"{count} pictures"
+    return Findings(figures=tuple(_figures(where, numbers)), failed=failures(where, costs))
+
+
+def of_real(where: str, workspace: Path, costs: Mapping[str, Cost]) -> Findings:
+    """Cost of ours on real pictures, and what was registered."""
+    numbers = _spent(list(costs.values()))
+    file = workspace / "sparse" / "registration.json"
+    if file.exists():
+        found = json.loads(file.read_text())
+        numbers[f"registered of {found['total']}"] = (found["registered"], "pictures")
+        numbers["mean reprojection error"] = (found["mean_reprojection_px"], "px")
+    failed = failures(where, costs)
+    return Findings(figures=() if failed else tuple(_figures(where, numbers)), failed=failed)
+
+
+def beside_real(where: str, costs: Mapping[str, Cost], name: str, cost: Cost) -> Findings:
+    """Cost of ours beside another program's on real pictures."""
+    if not cost.ok:
+        return Findings(left_out=(f"{where}, {name}: {cost.last_line()}",))
+    if failures(where, costs):
+        return Findings()
+    own, theirs = _spent(list(costs.values())), _spent([cost])
+    return Findings(figures=tuple(_figures(where, own, name, theirs)))
+
+
+def failures(where: str, costs: Mapping[str, Cost]) -> tuple[str, ...]:
+    """Our stages that failed, in words."""
+    return tuple(f"{where}, {s}: {c.last_line()}" for s, c in costs.items() if not c.ok)
+
+
+def _spent(costs: Sequence[Cost]) -> _Numbers:
+    return {
+        "time": (sum(cost.wall_s for cost in costs), "s"),
+        "processor time": (sum(cost.cpu_s for cost in costs), "s"),
+        "peak memory": (max(cost.peak_mib for cost in costs), "MiB"),
+    }
+
+
+def _numbers(cost: Cost, found: Accuracy | None) -> _Numbers:
+    return _spent([cost]) | _sparse_errors(found) | _surface_errors(found)
+
+
+def _sparse_errors(found: Accuracy | None) -> _Numbers:
+    if found is None:
+        return {}
+    return {
+        "registered": (found.registered, "pictures"),
+        "cameras, rms error": (found.cameras_mm, "mm"),
+        "sparse points, rms distance": (found.points_mm, "mm"),
+        "sparse points, median distance": (found.points_median_mm, "mm"),
+    }
+
+
+def _surface_errors(found: Accuracy | None) -> _Numbers:
+    if found is None:
+        return {}
+    return {
+        "surface, rms distance": (found.surface_mm, "mm"),
+        "surface, median distance": (found.surface_median_mm, "mm"),
+    }
+
+
+def _figures(
+    where: str, own: _Numbers, peer: str | None = None, theirs: _Numbers | None = None
+) -> Iterator[Figure]:
+    """All that are numbers; beside the peer's where it has them."""
+    for what, (value, unit) in own.items():
+        other, _ = (theirs or {}).get(what, (math.nan, unit))
+        if math.isfinite(value):
+            beside = peer is not None and math.isfinite(other)
+            yield Figure(
+                name=f"{where}: {what}", value=value, unit=unit,
+                peer=peer if beside else None, peer_value=other if beside else None,
+            )  # fmt: skip

@@ -1,0 +1,341 @@
+"""`python -m benchmarks`: every benchmark hands its figures over alike, and the table tells all."""
+
+import argparse
+import importlib
+import json
+import math
+import subprocess
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks import table
+from benchmarks.figures import Figure, Findings, Goal, hand_over
+from benchmarks.measured import Cost
+from benchmarks.parts import PARTS, SHORT_REPEATS, Part, Settings, chosen
+from benchmarks.reconstruct_figures import beside_peers
+from benchmarks.reconstruct_scores import Accuracy
+from benchmarks.runs import Run, run
+
+ROOT = Path(__file__).parents[1]
+MODULES = sorted({part.module for part in PARTS})
+MACHINE = {
+    "processor": "a processor", "cores": 2, "system": "a system", "load": "0.10 0.20 0.30",
+    "versions": {"python": "3.11", "numpy": "2.0"},
+}  # fmt: skip
+
+
+def test_every_benchmark_that_hands_figures_over_is_a_part() -> None:
+    files = [file for file in (ROOT / "benchmarks").glob("*.py") if file.stem != "figures"]
+    found = sorted(file.stem for file in files if "add_options(parser" in file.read_text())
+
+    assert found == MODULES
+    assert {"camera", "planner", "vehicle", "features", "refraction", "reconstruct", "mosaic",
+            "real_pictures"} == {*MODULES}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_a_benchmark_takes_quick_and_json(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for part in PARTS:
+        if part.module == name and (reason := missing_packages(part)):
+            pytest.skip(reason)
+    monkeypatch.setattr(sys, "argv", [name, "--help"])
+
+    with pytest.raises(SystemExit) as ended:
+        importlib.import_module(f"benchmarks.{name}").main()
+
+    assert ended.value.code == 0
+    text = capsys.readouterr().out
+    assert "--quick" in text
+    assert "--json" in text
+
+
+def missing_packages(part: Part) -> str | None:
+    try:
+        for package in part.packages:
+            importlib.import_module(package)
+    except ImportError as error:
+        return str(error)
+    return None
+
+
+def test_parts_have_names_of_their_own_and_commands_for_one_part() -> None:
+    assert len({part.name for part in PARTS}) == len(PARTS)
+    settings = Settings(work=Path("W"), quick=True, demo=Path("D"), pyorthomosaic="P", aquacal="A")
+    commands = [part.command(settings) for part in PARTS]
+    assert len({tuple(command) for command in commands}) == len(PARTS)
+    assert all(command[-1] == "--quick" for command in commands)
+
+    by_name = {part.name: part.command(Settings(work=Path("W"), demo=Path("D"), aquacal="A"))
+               for part in PARTS}  # fmt: skip
+    assert by_name["camera-speed"] == ["-m", "benchmarks.camera", "--only", "speed",
+                                       "--aquacal", "A"]  # fmt: skip
+    assert by_name["reconstruct-peers"] == [
+        "-m", "benchmarks.reconstruct", "--work", "W/reconstruct-peers", "--only", "peers",
+        "--demo", "D",
+    ]  # fmt: skip
+
+
+def test_parts_are_chosen_by_name_or_module_in_their_order() -> None:
+    assert chosen([]) == list(PARTS)
+    assert [part.name for part in chosen(["vehicle", "camera"])] == [
+        "camera-speed", "camera-pose", "camera-calibration", "vehicle",
+    ]  # fmt: skip
+    with pytest.raises(ValueError, match="no part engine; there are camera, "):
+        chosen(["engine"])
+
+
+def test_short_parts_run_three_times_and_long_ones_once() -> None:
+    repeats = {part.name: part.repeats for part in PARTS}
+    assert SHORT_REPEATS == 3
+    assert repeats["camera-speed"] == 3
+    assert repeats["mosaic"] == 1
+
+
+@pytest.mark.parametrize(
+    ("value", "goal", "met"),
+    [
+        (5.0, Goal(most=5.0), True),
+        (5.1, Goal(most=5.0), False),
+        (0.9, Goal(least=1.0), False),
+        (1.0, Goal(least=0.8, most=1.25), True),
+        (1.3, Goal(least=0.8, most=1.25), False),
+        (3.0, Goal(least=2.0, of="ratio"), False),  # 1.5 times the peer's
+        (4.0, Goal(least=2.0, of="ratio"), True),
+        (math.nan, Goal(most=5.0), False),
+        (9.0, None, None),
+    ],
+)
+def test_a_goal_bounds_a_value_or_a_ratio(
+    value: float, goal: Goal | None, met: bool | None
+) -> None:
+    figure = Figure(name="speed", value=value, unit="m/s", peer="p", peer_value=2.0, goal=goal)
+    assert figure.met is met
+
+
+def test_figures_that_make_no_sense_are_refused() -> None:
+    with pytest.raises(ValueError, match="bound"):
+        Goal()
+    with pytest.raises(ValueError, match="a peer has a value"):
+        Figure(name="speed", value=1.0, unit="m/s", peer="p")
+    with pytest.raises(ValueError, match="needs a peer"):
+        Figure(name="speed", value=1.0, unit="m/s", goal=Goal(most=1.0, of="ratio"))
+
+
+def handed_over(folder: Path, findings: Findings, **rows: Any) -> tuple[int, dict[str, Any]]:
+    file = folder / "figures.json"
+    options = argparse.Namespace(quick=True, json=file)
+    code = hand_over(options, MACHINE, findings, rows)
+    return code, json.loads(file.read_text())
+
+
+def test_figures_are_handed_over_with_what_was_missed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good = Figure(name="time", value=1.0, unit="s", peer="slow", peer_value=4.0,
+                  goal=Goal(most=0.5, of="ratio"))  # fmt: skip
+    bad = Figure(name="memory", value=math.inf, unit="MiB", goal=Goal(most=1536.0))
+
+    code, report = handed_over(tmp_path, Findings(figures=(good, bad)), rows=[{"a": math.nan}])
+
+    assert code == 1
+    assert report["figures"] == [
+        {"name": "time", "value": 1.0, "unit": "s", "peer": "slow", "peer_value": 4.0,
+         "goal": "ratio <= 0.5", "ratio": 0.25, "met": True},
+        {"name": "memory", "value": None, "unit": "MiB", "peer": None, "peer_value": None,
+         "goal": "<= 1536", "ratio": None, "met": False},
+    ]  # fmt: skip
+    assert report["missed"] == ["memory: inf MiB, goal <= 1536"]
+    assert report["rows"] == [{"a": None}]
+    assert report["machine"] == MACHINE
+    assert "missed: memory: inf MiB, goal <= 1536" in capsys.readouterr().out
+    assert handed_over(tmp_path, Findings(figures=(good,), left_out=("x",)))[0] == 0
+    assert handed_over(tmp_path, Findings(failed=("it broke",)))[0] == 1
+
+
+def a_run(folder: Path, *figures: Figure, code: int = 0, **others: Any) -> Run:
+    _, report = handed_over(folder, Findings(figures=figures, **others))
+    log = folder / "run.log"
+    log.write_text("first\nlast words\n")
+    return Run(code=code, wall_s=12.4, load_before="1.00 1.00 1.00 (1, 5, 15 min)",
+               load_after="2.00 1.00 1.00 (1, 5, 15 min)", log=log, report=report)  # fmt: skip
+
+
+def three_runs(folder: Path) -> list[Run]:
+    """Times of 3, 1, 8 s beside 4, 4, 2 s; a speed that falls short once."""
+    times, peers, speeds = (3.0, 1.0, 8.0), (4.0, 4.0, 2.0), (20.0, 30.0, 5.0)
+    return [
+        a_run(
+            folder,
+            Figure(name="time", value=time, unit="s", peer="slow | old", peer_value=peer),
+            Figure(name="time", value=time, unit="s", goal=Goal(most=9.0)),
+            Figure(name="speed", value=speed, unit="m/s", goal=Goal(least=10.0)),
+            code=int(speed < 10),
+        )
+        for time, peer, speed in zip(times, peers, speeds, strict=True)
+    ]
+
+
+def test_repeats_become_median_and_spread(tmp_path: Path) -> None:
+    found = table.outcome("part", "python -m part", three_runs(tmp_path))
+
+    beside, alone, speed = found.figures
+    assert (beside.median, beside.least, beside.most, beside.repeats) == (3.0, 1.0, 8.0, 3)
+    assert (beside.peer, beside.peer_median) == ("slow | old", 4.0)
+    assert beside.ratio == 0.75  # the median of 0.75, 0.25 and 4
+    assert beside.goal is None
+    assert (alone.peer, alone.ratio, alone.goal) == (None, None, "<= 9")
+    assert (alone.met, alone.judged) == (3, 3)
+    assert (speed.met, speed.judged) == (2, 3)
+    assert found.state == table.MISSED
+    assert not found.good
+    assert found.missed == ("speed: 5 m/s, goal >= 10",)
+
+
+def test_without_a_number_there_is_no_median(tmp_path: Path) -> None:
+    figure = Figure(name="error", value=math.nan, unit="mm")
+    (row,) = table.outcome("part", "python", [a_run(tmp_path, figure)]).figures
+    assert (row.median, row.least, row.ratio, row.repeats) == (None, None, None, 0)
+
+
+def test_states_of_parts(tmp_path: Path) -> None:
+    good = a_run(tmp_path, Figure(name="time", value=1.0, unit="s"))
+    died = Run(**{**vars(good), "code": -9, "report": None})
+    odd = Run(**{**vars(good), "code": 3})
+    broke = a_run(tmp_path, failed=("import ended with exit code 1",), code=1)
+    lacking = a_run(tmp_path, left_out=("no pictures in data",))
+
+    def of(*runs: Run) -> tuple[str, str | None]:
+        found = table.outcome("part", "python", runs)
+        return found.state, found.reason
+
+    assert of(good, good) == (table.DONE, None)
+    assert of(good, died) == (table.FAILED, "ended with exit code -9: last words")
+    assert of(odd) == (table.FAILED, "ended with exit code 3 after its figures: last words")
+    assert of(broke) == (table.FAILED, "import ended with exit code 1")
+    assert of(lacking) == (table.LEFT_OUT, "no pictures in data")
+
+
+def test_the_table_tells_all_parts(tmp_path: Path) -> None:
+    died = Run(**{**vars(a_run(tmp_path)), "code": 1, "report": None})
+    outcomes = [
+        table.outcome("first", "python -m benchmarks.first", three_runs(tmp_path)),
+        table.outcome("second", "python -m benchmarks.second", [died]),
+        table.left_out("third", "python -m benchmarks.third", "no pictures in data"),
+    ]
+    about = {"date": "2026-01-02T03:04:05+00:00", "command": "python -m benchmarks --work W",
+             "quick": False, "commit": "abc", "machine": MACHINE}  # fmt: skip
+
+    table.write(tmp_path, about, outcomes)
+
+    lines = (tmp_path / "table.md").read_text().splitlines()
+    for line in (
+        "- 2026-01-02T03:04:05+00:00, by `python -m benchmarks --work W`",
+        "- a processor, 2 cores, a system",
+        "- python 3.11, numpy 2.0",
+        "- sources: abc",
+        "| first | goal missed | 12, 12, 12 | 1.00 1.00 1.00 | 2.00 1.00 1.00 "
+        "| `python -m benchmarks.first` |",
+        "| second | failed: ended with exit code 1: last words | 12 | 1.00 1.00 1.00 "
+        "| 2.00 1.00 1.00 | `python -m benchmarks.second` |",
+        "| third | left out: no pictures in data | - | - | - | `python -m benchmarks.third` |",
+        "| time | 3 | 1 to 8 | s | slow \\| old | 4 | 0.75 | - | - |",
+        "| time | 3 | 1 to 8 | s | - | - | - | <= 9 | yes, 3 of 3 |",
+        "| speed | 20 | 5 to 30 | m/s | - | - | - | >= 10 | NO, 2 of 3 |",
+        "- missed: speed: 5 m/s, goal >= 10",
+    ):
+        assert line in lines, line
+    data = json.loads((tmp_path / "table.json").read_text())
+    assert [part["state"] for part in data["parts"]] == ["goal missed", "failed", "left out"]
+    assert data["parts"][0]["figures"][0] == asdict(outcomes[0].figures[0])
+    assert data["machine"]["cores"] == 2
+
+
+def a_cost(folder: Path, *, code: int = 0) -> Cost:
+    (folder / "cost.log").write_text("no model\n")
+    return Cost(wall_s=6.0, cpu_s=9.0, peak_mib=300.0, code=code, log=folder / "cost.log")
+
+
+def test_a_program_that_fails_or_is_missing_hides_no_figure_of_ours(tmp_path: Path) -> None:
+    cost, broken = a_cost(tmp_path), a_cost(tmp_path, code=1)
+    found = Accuracy(registered=16, cameras_mm=0.5, points_mm=2.0, points_median_mm=1.0,
+                     surface_mm=math.nan, surface_median_mm=3.0)  # fmt: skip
+    costs = {"sparse": cost, "dense": cost, "mosaic": cost}
+
+    all_ran = beside_peers(16, costs, found, {"colmap": (cost, found), "other": (cost, found)})
+    alone = beside_peers(16, costs, found, {"colmap": (broken, None), "other": (None, None)})
+
+    assert all(figure.peer is not None for figure in all_ran.figures)
+    assert [f.name for f in alone.figures] == [f.name for f in all_ran.figures]
+    assert [f.value for f in alone.figures] == [f.value for f in all_ran.figures]
+    assert all(figure.peer is None for figure in alone.figures)
+    assert alone.left_out == ("16 pictures to the sparse model, colmap: no model",)
+    times = {f.name: f.value for f in all_ran.figures if f.name.endswith(": time")}
+    assert times == {"16 pictures to the sparse model: time": 6.0,
+                     "16 pictures to the mosaic: time": 18.0}  # fmt: skip
+    assert not any("surface, rms" in figure.name for figure in all_ran.figures)
+
+    ours_broke = beside_peers(16, {"sparse": broken}, None, {"colmap": (cost, found)})
+    assert ours_broke.figures == ()
+    assert ours_broke.failed == ("16 pictures, sparse: no model",)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(None, "-"), (0.0, "0"), (0.123456, "0.1235"), (1234.5, "1234"), (123456.7, "123,457"),
+     (1e-9, "1e-09")],
+)  # fmt: skip
+def test_numbers_have_four_digits(value: float | None, text: str) -> None:
+    assert table.number(value) == text
+
+
+def test_a_run_keeps_the_log_and_no_figures_of_an_earlier_one(tmp_path: Path) -> None:
+    (tmp_path / "part-1.json").write_text("{}")
+
+    found = run(["-c", "print('hello'); raise SystemExit(4)"], tmp_path, "part-1", lambda _: None)
+
+    assert (found.code, found.report) == (4, None)
+    assert found.log.read_text() == "hello\n"
+    assert found.trouble == "ended with exit code 4: hello"
+
+
+def test_one_part_runs_and_one_is_left_out(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    ran = benchmarks("--work", out, "--quick", "--only", "refraction", "features",
+                     "--data", tmp_path)  # fmt: skip
+
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout.strip() == str(out / "table.md")
+    assert "[2/2] refraction, run 1 of 1: ended after" in ran.stderr
+    features, refraction = json.loads((out / "table.json").read_text())["parts"]
+    assert features["state"] == "left out"
+    assert features["reason"] == f"no pictures in {tmp_path / 'opencv_stereo'}"
+    assert refraction["state"] == "done"
+    assert refraction["command"] == "python -m benchmarks.refraction --quick"
+    cameras = [row for row in refraction["figures"] if row["name"].endswith("rms of cameras")]
+    assert len(cameras) == 8  # of two ports at two tilts, beside two others
+    assert all(0 < row["median"] < 10 and row["unit"] == "mm" for row in cameras)
+    assert all(row["ratio"] < 1 for row in cameras if row["peer"] == "OPENCV")
+    assert "OPENCV" in (out / "logs" / "refraction-1.log").read_text()
+    assert (out / "table.md").read_text().startswith("# Benchmarks\n")
+
+
+def test_a_part_that_does_not_exist_is_an_error(tmp_path: Path) -> None:
+    ran = benchmarks("--work", tmp_path / "out", "--only", "engine")
+    assert ran.returncode == 2
+    assert "no part engine" in ran.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def benchmarks(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "benchmarks", *(str(a) for a in arguments)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
