@@ -10,6 +10,7 @@ import csv
 import hashlib
 import json
 import os
+import re
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -25,6 +26,8 @@ from alice_survey.resources import Meter, Spent, versions, watched
 STAGE_FILE = "stage.json"
 _SPENT_FILE = ".spent"
 """In an unfinished stage: what it has taken so far."""
+_TEMPORARY = re.compile(r"\..+\.tmp\d+(\.[^.]*)?")
+"""Names that `atomic_path` gives."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,6 +93,7 @@ def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], None]) -> bo
     if partial.exists() and not resumed:
         shutil.rmtree(partial)
     partial.mkdir(parents=True, exist_ok=True)
+    _drop_cut_files(partial)
     with atomic_path(marker) as path:
         path.write_text(digest)
     told = {"resumed": True} if resumed else {}
@@ -235,6 +239,13 @@ def _text(path: Path) -> str | None:
         return path.read_text()
     except OSError:
         return None
+
+
+def _drop_cut_files(folder: Path) -> None:
+    """Remove what `atomic_path` was writing to when a kill came."""
+    for path in folder.rglob(".*.tmp*"):
+        if _TEMPORARY.fullmatch(path.name) and path.is_file():
+            path.unlink()
 
 
 @contextlib.contextmanager

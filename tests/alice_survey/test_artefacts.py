@@ -137,6 +137,32 @@ def test_resumed_work_finds_what_it_left_only_under_the_same_digest(
     assert seen == [False, True, False, True]
 
 
+def test_resumed_work_leaves_nothing_of_files_that_a_kill_cut(tmp_path: Path, source: Path) -> None:
+    """A kill runs no `finally`: what `atomic_path` was writing to still lies there."""
+    cut: list[Path] = []
+    kept = ("deep/.hidden.png", "deep/.a.tmp.png", "deep/a.tmp12.png", "deep/.a.tmp12/b.txt")
+
+    def killed(folder: Path) -> None:
+        for name in ("picture.png", "deep/table.tar.gz", "deep/.dotted", "bare"):
+            with atomic_path(folder / name) as temporary:
+                temporary.write_text("whole")
+            temporary.write_text("half")
+            cut.append(temporary)
+        for name in kept:
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_text("whole")
+        raise RuntimeError("killed")
+
+    made = stage([source], resumes=True)
+    with pytest.raises(RuntimeError):
+        run_stage(tmp_path, made, killed)
+    assert all(path.exists() for path in cut)
+    run_stage(tmp_path, made, Work())
+    files = {str(p.relative_to(tmp_path / "made")) for p in (tmp_path / "made").rglob("*")}
+    whole = {"picture.png", "deep/table.tar.gz", "deep/.dotted", "bare", *kept}
+    assert files == {*whole, "deep", "deep/.a.tmp12", "result.txt", "stage.json"}
+
+
 def test_a_stage_records_what_it_took_outside_of_its_digest(tmp_path: Path) -> None:
     def work(folder: Path) -> None:
         block = bytearray(64 << 20)
