@@ -1,9 +1,10 @@
 """What a user sees of a run, on standard error: moving bars on a terminal, else a few lines."""
 
+import contextlib
 import sys
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TextIO, cast
 
 from alice_survey.events import Event, duration, finished, how_far
 
@@ -93,6 +94,25 @@ class _Written:
             sys.stderr.flush()
         except (OSError, ValueError):  # the reader of a pipe has gone: the work goes on
             self._broken = True
+
+
+class _Outlived:
+    """A terminal that may close while the work goes on."""
+
+    def __init__(self, file: TextIO) -> None:
+        self._file = file
+
+    def write(self, text: str) -> int:
+        with contextlib.suppress(OSError, ValueError):
+            self._file.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with contextlib.suppress(OSError, ValueError):
+            self._file.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
 
 
 class Quiet:
@@ -263,7 +283,7 @@ def _bars() -> "Progress":
         TextColumn("{task.description}", markup=False),
         Moving(bar_width=30),
         Far(),
-        console=Console(stderr=True),
+        console=Console(file=cast(TextIO, _Outlived(sys.stderr))),
         transient=True,
         redirect_stdout=False,
         refresh_per_second=8,

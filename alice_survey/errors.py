@@ -68,11 +68,18 @@ def note(text: str) -> None:
     _show("note", text)
 
 
+def say(text: str) -> None:
+    """Write a line on standard error, if anybody still takes it: the work outlives a terminal."""
+    with contextlib.suppress(OSError, ValueError):
+        sys.stderr.write(f"{text}\n")
+        sys.stderr.flush()
+
+
 def _show(level: Level, text: str) -> None:
     if _shows:
         _shows[-1](level, text)
     else:
-        sys.stderr.write(f"warning: {text}\n" if level == "warning" else f"{text}\n")
+        say(f"warning: {text}" if level == "warning" else text)
 
 
 @contextlib.contextmanager

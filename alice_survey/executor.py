@@ -14,7 +14,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
-from alice_survey.errors import AliceError, Level, shown_by, warn
+from alice_survey.errors import AliceError, Level, say, shown_by, warn
 from alice_survey.progress import counted, current, keep_silent, step
 
 _PR_SET_PDEATHSIG = 1
@@ -114,7 +114,11 @@ def _end(pool: ProcessPoolExecutor) -> None:
 
 def _workers(threads: int) -> ProcessPoolExecutor:
     context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(threads, mp_context=context, initializer=_start_worker)
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, ())  # Python's tracker of semaphores lifts it
+    try:
+        return ProcessPoolExecutor(threads, mp_context=context, initializer=_start_worker)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 @dataclass(frozen=True)
@@ -138,7 +142,7 @@ class _Call(Generic[Item, Result]):
         def show(level: Level, text: str) -> None:
             told.append((level, text))
             if level == "note" and not self.quiet:  # it says why the next minute is long
-                sys.stderr.write(f"{text}\n")
+                say(text)
 
         with shown_by(show):
             try:

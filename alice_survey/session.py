@@ -4,24 +4,17 @@ import contextlib
 import errno
 import os
 import platform
-import select
 import shlex
-import signal
-import sys
-import threading
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from alice_survey import signals
 from alice_survey.display import display_on_stderr
-from alice_survey.errors import WorkspaceError, known_fault
+from alice_survey.errors import WorkspaceError, known_fault, say
 from alice_survey.events import EventFile, LogFile
 from alice_survey.progress import Run, told_to
 from alice_survey.resources import versions
-
-INTERRUPTED = 128 + signal.SIGINT
-_GRACE_S = 5.0
-"""Between Ctrl-C and the end of a run that is deep in a library."""
 
 
 @contextlib.contextmanager
@@ -38,12 +31,12 @@ def session(
 
     Raises:
         WorkspaceError: a file cannot be written; nothing is done then.
-        SystemExit: with 130 after Ctrl-C.
+        SystemExit: with 130 after Ctrl-C, 143 or 129 after SIGTERM or SIGHUP.
     """
     run = Run(display_on_stderr(quiet=quiet), _opened(log_file, events), quiet=quiet)
     command = shlex.join(["alice-survey", *arguments])
     told = {"python": platform.python_version(), **versions()}
-    with _answers_ctrl_c(lambda: _finish(run, INTERRUPTED)):
+    with signals.heeded(lambda error: _finish(run, error)):
         try:
             with told_to(run):
                 run.tell(
@@ -59,9 +52,9 @@ def session(
                     raise
                 finally:
                     run.tell("run_finished", exit_code=code)
-        except KeyboardInterrupt:
-            sys.stderr.write(_farewell(run))
-            raise SystemExit(INTERRUPTED) from None
+        except KeyboardInterrupt as error:
+            _bid_farewell(run, error)
+            raise SystemExit(signals.exit_code(error)) from None
 
 
 def _opened(log_file: Path | None, events: Path | None) -> list[LogFile | EventFile]:
@@ -84,8 +77,8 @@ def _opened(log_file: Path | None, events: Path | None) -> list[LogFile | EventF
 def _told_end(run: Run, error: BaseException) -> int:
     """Tell why a run ends early; the exit code it ends with."""
     if isinstance(error, KeyboardInterrupt):
-        run.tell("error", "interrupted")
-        return INTERRUPTED
+        run.tell("error", signals.words(error))
+        return signals.exit_code(error)
     if isinstance(error, SystemExit):
         return error.code if isinstance(error.code, int) else int(error.code is not None)
     code = getattr(error, "exit_code", None)  # of typer's own: an end, or a wrong option
@@ -104,57 +97,14 @@ def _told_end(run: Run, error: BaseException) -> int:
     return 1
 
 
-def _farewell(run: Run) -> str:
+def _bid_farewell(run: Run, error: KeyboardInterrupt) -> None:
     goes_on = "; the same command goes on from here" if run.stages_begun else ""
-    return f"interrupted{goes_on}\n"
+    say(f"{signals.words(error)}{goes_on}")
 
 
-def _finish(run: Run, code: int) -> None:
+def _finish(run: Run, error: KeyboardInterrupt) -> None:
     """End a run whose main thread does not answer."""
-    run.tell("error", "interrupted")
-    run.tell("run_finished", exit_code=code)
+    run.tell("error", signals.words(error))
+    run.tell("run_finished", exit_code=signals.exit_code(error))
     run.close()
-    sys.stderr.write(_farewell(run))
-    sys.stderr.flush()
-
-
-@contextlib.contextmanager
-def _answers_ctrl_c(finish: Callable[[], None]) -> Iterator[None]:
-    """End the process some seconds after Ctrl-C, or at a second one, whatever it is deep in.
-
-    Python raises KeyboardInterrupt only between its own instructions, and an adjustment of a large
-    model may take minutes. What is broken off then is as after a kill, which loses nothing.
-
-    Args:
-        finish: tells of the end.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    reader, writer = os.pipe()
-    os.set_blocking(writer, False)
-    ended = threading.Event()
-
-    def watch() -> None:
-        while (told := os.read(reader, 1)) != b"":
-            if told[0] != signal.SIGINT:
-                continue
-            select.select([reader], [], [], _GRACE_S)  # a second one, or the end, or neither
-            if ended.is_set():
-                return
-            telling = threading.Thread(target=finish, daemon=True)
-            telling.start()
-            telling.join(1.0)  # the main thread may hold what is needed for it
-            os._exit(INTERRUPTED)
-
-    before = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
-    watcher = threading.Thread(target=watch, name="ctrl-c", daemon=True)
-    watcher.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        signal.set_wakeup_fd(before)
-        os.close(writer)
-        watcher.join()
-        os.close(reader)
+    _bid_farewell(run, error)

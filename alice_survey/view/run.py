@@ -5,6 +5,7 @@ from pathlib import Path
 
 from alice_survey.errors import WorkspaceError
 from alice_survey.report.held import Held
+from alice_survey.signals import for_other_programs
 from alice_survey.view.server import Server
 
 
@@ -30,7 +31,8 @@ def run_view(workspace: Path, port: int, *, browser: bool, tell: Callable[[str],
         if browser:
             import webbrowser
 
-            webbrowser.open(server.url)
+            with for_other_programs():
+                webbrowser.open(server.url)
         server.serve_forever()
     finally:
         server.server_close()

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import pty
 import re
 import signal
 import subprocess
@@ -16,7 +17,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from alice_survey import cli, progress
+from alice_survey import cli, progress, signals
 from alice_survey.cli_options import print_result, with_sessions
 from alice_survey.errors import PlanError, note, warn
 from alice_survey.executor import parallel_map
@@ -200,7 +201,7 @@ SCRIPT = """
 import hashlib, sys, time
 from pathlib import Path
 import typer
-from alice_survey import session
+from alice_survey import signals
 from alice_survey.artefacts import Stage, run_stage
 from alice_survey.cli_options import with_sessions
 from alice_survey.executor import parallel_map
@@ -211,6 +212,7 @@ app = typer.Typer()
 @app.command()
 def run(kind: str, folder: Path) -> None:
     def work(partial: Path) -> None:
+        import pycolmap  # whose log has an answer of its own to some signals
         (partial / "half").touch()
         if kind == "deep":
             Path(folder, "begun0").touch()
@@ -220,7 +222,7 @@ def run(kind: str, folder: Path) -> None:
     run_stage(folder, Stage(name="made", version=1, settings={}), work)
 
 if __name__ == "__main__":
-    session._GRACE_S = 0.5
+    signals._GRACE_S = 0.5
     with_sessions(app)
     app()
 """
@@ -228,15 +230,18 @@ SLEEPING = """
 import os, time
 from pathlib import Path
 def stay(folder):
+    import pycolmap
     Path(folder, f"begun{os.getpid()}").touch()
     time.sleep(60)
 """
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize(("kind", "workers"), [("parallel", 2), ("deep", 1)])
-def test_ctrl_c_ends_all_processes_and_says_how_to_go_on(
-    kind: str, workers: int, tmp_path: Path
+def test_a_signal_ends_all_processes_and_says_how_to_go_on(
+    kind: str, workers: int, number: signal.Signals, tmp_path: Path
 ) -> None:
+    """Of Ctrl-C, a scheduler, and a terminal that closes."""
     (tmp_path / "sleeping.py").write_text(SLEEPING)
     (tmp_path / "script.py").write_text(SCRIPT)
     folder, file = tmp_path / "workspace", tmp_path / "events"
@@ -248,15 +253,56 @@ def test_ctrl_c_ends_all_processes_and_says_how_to_go_on(
         preexec_fn=_heed_ctrl_c,
     )  # fmt: skip
     _wait_until(lambda: len(list(folder.glob("begun*"))) == workers)
-    os.killpg(run.pid, signal.SIGINT)  # a terminal sends it to all processes
+    os.killpg(run.pid, number)  # a terminal sends it to all processes
     out, told = run.communicate(timeout=20)
-    assert (run.returncode, out) == (130, "")
-    assert told.splitlines() == ["made", "interrupted; the same command goes on from here"]
+    by = "" if number == signal.SIGINT else f" by {number.name}"
+    assert (run.returncode, out) == (128 + number, "")
+    assert told.splitlines() == ["made", f"interrupted{by}; the same command goes on from here"]
     _wait_until(lambda: not _of_session(run.pid))
     assert [p.name for p in folder.iterdir() if p.is_dir()] == ["made.partial"]
     *_, before, last = events_of(file)
-    assert (before["event"], before["message"]) == ("error", "interrupted")
-    assert (last["event"], last["exit_code"]) == ("run_finished", 130)
+    assert (before["event"], before["message"]) == ("error", f"interrupted{by}")
+    assert (last["event"], last["exit_code"]) == ("run_finished", 128 + number)
+
+
+@pytest.mark.parametrize("outlives", [False, True])
+def test_a_terminal_that_closes_ends_what_was_not_told_to_outlive_it(
+    outlives: bool, tmp_path: Path
+) -> None:
+    """As `nohup` tells it. Either can write to nobody any more."""
+    (tmp_path / "sleeping.py").write_text(SLEEPING.replace("60", "2" if outlives else "60"))
+    (tmp_path / "script.py").write_text(SCRIPT)
+    folder, file = tmp_path / "workspace", tmp_path / "events"
+    folder.mkdir()
+    run, terminal = pty.fork()
+    if run == 0:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN if outlives else signal.SIG_DFL)
+        command = [str(tmp_path / "script.py"), "parallel", str(folder), "--events", str(file)]
+        os.execv(sys.executable, [sys.executable, *command])  # noqa: S606 (a fork's own end)
+    _wait_until(lambda: len(list(folder.glob("begun*"))) == 2)
+    os.close(terminal)
+    _, status = os.waitpid(run, 0)
+    code = 0 if outlives else 129
+    assert os.waitstatus_to_exitcode(status) == code
+    _wait_until(lambda: not _of_session(run))
+    *_, before, last = events_of(file)
+    assert (last["event"], last["exit_code"]) == ("run_finished", code)
+    assert before.get("message") == (None if outlives else "interrupted by SIGHUP")
+    assert (folder / "made" / "half").exists() == outlives
+
+
+def test_other_programs_heed_signals_as_ever() -> None:
+    def masks(_: object = None) -> list[int]:
+        script = "import signal; print(*sorted(signal.pthread_sigmask(signal.SIG_BLOCK, [])))"
+        done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+        return [int(number) for number in done.stdout.split()]
+
+    before = masks()
+    with signals.heeded(lambda _: None):
+        assert set(masks()) == {*before, *signals.ASKING}
+        with signals.for_other_programs():
+            assert masks() == before
+    assert masks() == before
 
 
 def _heed_ctrl_c() -> None:

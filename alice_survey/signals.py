@@ -1,0 +1,153 @@
+"""Signals that ask a run to end: it ends cleanly, and soon, whatever it is deep in."""
+
+import contextlib
+import os
+import select
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from types import FrameType
+from typing import cast
+
+_GRACE_S = 5.0
+"""Between such a signal and the end of a run that is deep in a library."""
+ASKING = frozenset({signal.SIGTERM, signal.SIGHUP})
+"""What a scheduler, a system that shuts down, or a terminal that closes sends."""
+_FORWARD = signal.SIGUSR1
+"""Sent on to the main thread for these: one whose handler COLMAP's log does not replace."""
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal other than that of Ctrl-C has asked the run to end."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+
+
+def exit_code(error: KeyboardInterrupt) -> int:
+    """What a shell expects of a program that a signal has ended."""
+    return 128 + (error.number if isinstance(error, Interrupted) else signal.SIGINT)
+
+
+def words(error: KeyboardInterrupt) -> str:
+    """Tell the user what has ended the run."""
+    if isinstance(error, Interrupted):
+        return f"interrupted by {signal.Signals(error.number).name}"
+    return "interrupted"
+
+
+@contextlib.contextmanager
+def heeded(finish: Callable[[KeyboardInterrupt], None]) -> Iterator[None]:
+    """Within this block Ctrl-C raises KeyboardInterrupt, and what else asks to end `Interrupted`.
+
+    Python raises them only between its own instructions, and an adjustment of a large model may
+    take minutes. Some seconds later, or at a second signal, the process therefore ends whatever it
+    is deep in. What is broken off then is as after a kill, which loses nothing.
+
+    Args:
+        finish: tells of the end where the main thread does not.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    heeding = _Heeding(finish)
+    with _forwards(heeding), _ends_late(heeding):  # threads of the second block what the first does
+        yield
+
+
+@contextlib.contextmanager
+def for_other_programs() -> Iterator[None]:
+    """Within this block start programs that heed the signals which ask as they always do."""
+    blocked = signal.pthread_sigmask(signal.SIG_UNBLOCK, ASKING)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+
+
+class _Heeding:
+    """What came of signals so far."""
+
+    def __init__(self, finish: Callable[[KeyboardInterrupt], None]) -> None:
+        self._finish = finish
+        self.asked: KeyboardInterrupt = KeyboardInterrupt()
+
+    def raise_it(self, number: int, _: FrameType | None) -> None:
+        """In the main thread."""
+        if not isinstance(self.asked, Interrupted):
+            self.asked = Interrupted(number)
+        raise self.asked
+
+    def end(self) -> None:
+        """From any thread."""
+        telling = threading.Thread(target=self._finish, args=(self.asked,), daemon=True)
+        telling.start()
+        telling.join(1.0)  # the main thread may hold what is needed for it
+        os._exit(exit_code(self.asked))
+
+
+@contextlib.contextmanager
+def _ends_late(heeding: _Heeding) -> Iterator[None]:
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    ended = threading.Event()
+
+    def watch() -> None:
+        while (told := os.read(reader, 1)) != b"":
+            if told[0] not in (signal.SIGINT, _FORWARD):
+                continue
+            select.select([reader], [], [], _GRACE_S)  # a second one, or the end, or neither
+            if ended.is_set():
+                return
+            heeding.end()
+
+    before = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+    watcher = threading.Thread(target=watch, name="late end", daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        signal.set_wakeup_fd(before)
+        os.close(writer)
+        watcher.join()
+        os.close(reader)
+
+
+@contextlib.contextmanager
+def _forwards(heeding: _Heeding) -> Iterator[None]:
+    """Take the signals that ask in a thread of its own.
+
+    They are blocked everywhere else, also in processes started within: COLMAP's log answers them
+    with a trace of its stack, in whatever process has loaded it.
+    """
+    asking = {number for number in ASKING if signal.getsignal(number) == signal.SIG_DFL}
+    main = threading.get_ident()
+    ended, ending = threading.Event(), threading.Lock()
+
+    def wait() -> None:
+        while True:
+            number = signal.sigwait(asking)
+            with ending:
+                if ended.is_set():
+                    return
+                heeding.asked = Interrupted(number)
+                signal.pthread_kill(main, _FORWARD)
+
+    handler = signal.signal(_FORWARD, heeding.raise_it)
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, asking)
+    waiter = threading.Thread(target=wait, name="signals", daemon=True)
+    if asking:  # nohup has the system ignore one of them
+        waiter.start()
+    try:
+        yield
+    finally:
+        with ending:
+            ended.set()
+            if asking:
+                signal.pthread_kill(cast(int, waiter.ident), next(iter(asking)))
+        if asking:
+            waiter.join()
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+        signal.signal(_FORWARD, handler)
