@@ -5,6 +5,7 @@ import errno
 import sys
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
+from pathlib import Path
 from typing import Literal
 
 Level = Literal["note", "warning"]
@@ -113,6 +114,7 @@ def why(error: Exception) -> str:
 
 
 _ON = ", and the same command goes on from here"
+_FEWER = f": give fewer --threads, or close other programs{_ON}"
 _MENDS = {
     errno.ENOSPC: f": free some of the disk{_ON}",
     errno.EDQUOT: f": free some of your share of the disk{_ON}",
@@ -129,13 +131,18 @@ _NO_MEMORY = (
 """What libraries say whose faults have types of their own, in small letters."""
 
 
+def memory_shortage(path: Path) -> AliceError:
+    """What to raise where a file is well and there is no room for what it holds."""
+    return AliceError(f"memory ran out while {path} was read{_FEWER}")
+
+
 def known_fault(error: BaseException) -> str | None:
     """The line that tells the user of a fault which is no bug; None for a bug."""
     if isinstance(error, AliceError):
         return str(error)
     said = str(error).lower()
     if isinstance(error, MemoryError) or any(words in said for words in _NO_MEMORY):
-        return f"memory ran out: give fewer --threads, or close other programs{_ON}"
+        return f"memory ran out{_FEWER}"
     if isinstance(error, OSError):  # a full disk, a folder where a file should be, no permission
         where = error.filename2 or error.filename
         text = error.strerror or str(error)

@@ -9,6 +9,8 @@ from typing import Any
 import cv2
 from numpy.typing import NDArray
 
+from alice_survey.errors import memory_shortage
+
 MOST_PIXELS = 104_000_000
 """Of a picture: 0.8 GB of 4 channels and 16 bits. A file of a few kilobytes can state any size."""
 MOST_PIXELS_JPEG = 160_000_000
@@ -40,15 +42,21 @@ def pixels_too_many(path: Path) -> int:
 
 
 def read_pixels(path: Path, flags: int) -> NDArray[Any] | None:
-    """A picture as OpenCV decodes it; None where it cannot, or of `pixels_too_many`."""
+    """A picture as OpenCV decodes it; None where it cannot, or of `pixels_too_many`.
+
+    Raises:
+        AliceError: there is no room for its pixels.
+    """
     if pixels_too_many(path):
         return None
     # OpenCV's own warnings would stand beside the line that the caller makes of it.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
     try:
         pixels: NDArray[Any] | None = cv2.imread(str(path), flags)
-    except cv2.error:  # memory, or more pixels than OpenCV takes
-        return None
+    except cv2.error as error:
+        if error.code == cv2.Error.StsNoMem:
+            raise memory_shortage(path) from None
+        return None  # more pixels than OpenCV takes
     return pixels
 
 
