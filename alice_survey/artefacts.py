@@ -26,8 +26,8 @@ from alice_survey.resources import Meter, Spent, versions, watched
 STAGE_FILE = "stage.json"
 _SPENT_FILE = ".spent"
 """In an unfinished stage: what it has taken so far."""
-_TEMPORARY = re.compile(r"\..+\.tmp\d+(\.[^.]*)?")
-"""Names that `atomic_path` gives."""
+_TEMPORARY = re.compile(r"\..+\.tmp\d+(\..*)?")
+"""Names that `atomic_path` gives, and those that libraries make of them."""
 
 
 @dataclass(frozen=True, kw_only=True)

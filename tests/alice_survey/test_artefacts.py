@@ -147,7 +147,8 @@ def test_resumed_work_leaves_nothing_of_files_that_a_kill_cut(tmp_path: Path, so
             with atomic_path(folder / name) as temporary:
                 temporary.write_text("whole")
             temporary.write_text("half")
-            cut.append(temporary)
+            cut.extend((temporary, temporary.with_name(f"{temporary.name}.ovr.tmp")))
+            cut[-1].write_text("half")
         for name in kept:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_text("whole")
