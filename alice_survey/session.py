@@ -9,7 +9,7 @@ import traceback
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from alice_survey import signals
+from alice_survey import interrupts
 from alice_survey.display import display_on_stderr
 from alice_survey.errors import WorkspaceError, known_fault, say
 from alice_survey.events import EventFile, LogFile
@@ -36,7 +36,7 @@ def session(
     run = Run(display_on_stderr(quiet=quiet), _opened(log_file, events), quiet=quiet)
     command = shlex.join(["alice-survey", *arguments])
     told = {"python": platform.python_version(), **versions()}
-    with signals.heeded(lambda error: _finish(run, error)):
+    with interrupts.heeded(lambda error: _finish(run, error)):
         try:
             with told_to(run):
                 run.tell(
@@ -54,7 +54,7 @@ def session(
                     run.tell("run_finished", exit_code=code)
         except KeyboardInterrupt as error:
             _bid_farewell(run, error)
-            raise SystemExit(signals.exit_code(error)) from None
+            raise SystemExit(interrupts.exit_code(error)) from None
 
 
 def _opened(log_file: Path | None, events: Path | None) -> list[LogFile | EventFile]:
@@ -77,8 +77,8 @@ def _opened(log_file: Path | None, events: Path | None) -> list[LogFile | EventF
 def _told_end(run: Run, error: BaseException) -> int:
     """Tell why a run ends early; the exit code it ends with."""
     if isinstance(error, KeyboardInterrupt):
-        run.tell("error", signals.words(error))
-        return signals.exit_code(error)
+        run.tell("error", interrupts.words(error))
+        return interrupts.exit_code(error)
     if isinstance(error, SystemExit):
         return error.code if isinstance(error.code, int) else int(error.code is not None)
     code = getattr(error, "exit_code", None)  # of typer's own: an end, or a wrong option
@@ -99,12 +99,12 @@ def _told_end(run: Run, error: BaseException) -> int:
 
 def _bid_farewell(run: Run, error: KeyboardInterrupt) -> None:
     goes_on = "; the same command goes on from here" if run.stages_begun else ""
-    say(f"{signals.words(error)}{goes_on}")
+    say(f"{interrupts.words(error)}{goes_on}")
 
 
 def _finish(run: Run, error: KeyboardInterrupt) -> None:
     """End a run whose main thread does not answer."""
-    run.tell("error", signals.words(error))
-    run.tell("run_finished", exit_code=signals.exit_code(error))
+    run.tell("error", interrupts.words(error))
+    run.tell("run_finished", exit_code=interrupts.exit_code(error))
     run.close()
     _bid_farewell(run, error)

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from alice_survey.errors import WorkspaceError
+from alice_survey.interrupts import for_other_programs
 from alice_survey.report.held import Held
-from alice_survey.signals import for_other_programs
 from alice_survey.view.server import Server
 
 

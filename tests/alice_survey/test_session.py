@@ -17,7 +17,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from alice_survey import cli, progress, signals
+from alice_survey import cli, interrupts, progress
 from alice_survey.cli_options import print_result, with_sessions
 from alice_survey.errors import PlanError, note, warn
 from alice_survey.executor import parallel_map
@@ -201,7 +201,7 @@ SCRIPT = """
 import hashlib, sys, time
 from pathlib import Path
 import typer
-from alice_survey import signals
+from alice_survey import interrupts
 from alice_survey.artefacts import Stage, run_stage
 from alice_survey.cli_options import with_sessions
 from alice_survey.executor import parallel_map
@@ -222,7 +222,7 @@ def run(kind: str, folder: Path) -> None:
     run_stage(folder, Stage(name="made", version=1, settings={}), work)
 
 if __name__ == "__main__":
-    signals._GRACE_S = 0.5
+    interrupts._GRACE_S = 0.5
     with_sessions(app)
     app()
 """
@@ -298,9 +298,9 @@ def test_other_programs_heed_signals_as_ever() -> None:
         return [int(number) for number in done.stdout.split()]
 
     before = masks()
-    with signals.heeded(lambda _: None):
-        assert set(masks()) == {*before, *signals.ASKING}
-        with signals.for_other_programs():
+    with interrupts.heeded(lambda _: None):
+        assert set(masks()) == {*before, *interrupts.ASKING}
+        with interrupts.for_other_programs():
             assert masks() == before
     assert masks() == before
 
