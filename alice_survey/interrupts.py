@@ -37,6 +37,14 @@ def words(error: KeyboardInterrupt) -> str:
     return "interrupted"
 
 
+def behind(error: BaseException) -> KeyboardInterrupt | None:
+    """The interruption that led to an error, if one did: libraries in C may make a fault of it."""
+    found: BaseException | None = error
+    while found is not None and not isinstance(found, KeyboardInterrupt):
+        found = found.__cause__ or found.__context__
+    return found
+
+
 @contextlib.contextmanager
 def heeded(finish: Callable[[KeyboardInterrupt], None]) -> Iterator[None]:
     """Within this block Ctrl-C raises KeyboardInterrupt, and what else asks to end `Interrupted`.

@@ -48,7 +48,10 @@ def session(
                     yield
                     code = 0
                 except BaseException as error:
-                    code = _told_end(run, error)
+                    reason = interrupts.behind(error) or error
+                    code = _told_end(run, reason)
+                    if reason is not error:
+                        raise reason from None
                     raise
                 finally:
                     run.tell("run_finished", exit_code=code)

@@ -265,6 +265,25 @@ def test_a_signal_ends_all_processes_and_says_how_to_go_on(
     assert (last["event"], last["exit_code"]) == ("run_finished", 128 + number)
 
 
+def test_ctrl_c_that_a_library_makes_a_fault_of_is_none(tmp_path: Path) -> None:
+    """As numba does while it loads a kernel."""
+
+    def work() -> None:
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt as error:
+            raise SystemError("returned a result with an exception set") from error
+        finally:
+            signal.signal(signal.SIGINT, before)
+
+    done = CliRunner().invoke(made(work), ["work-hard", "--events", str(tmp_path / "e")])
+    assert (done.exit_code, done.stderr) == (130, "interrupted\n")
+    *_, before, last = events_of(tmp_path / "e")
+    assert (before["event"], before["message"]) == ("error", "interrupted")
+    assert (last["event"], last["exit_code"]) == ("run_finished", 130)
+
+
 @pytest.mark.parametrize("outlives", [False, True])
 def test_a_terminal_that_closes_ends_what_was_not_told_to_outlive_it(
     outlives: bool, tmp_path: Path
