@@ -42,7 +42,7 @@ WAVELENGTH_NM = np.array([600.0, 530.0, 460.0])
 
 ASYMMETRY = 0.924
 """Mean cosine of the Henyey-Greenstein phase function: with it 1.7 % of the scattered light goes
-backward, as in Petzold's measurements (1.8 %; Mobley 1994, section 3.10)."""
+backward, as in Petzold's measurements (1.8 %; Mobley 1994)."""
 
 _TABLE_NM = np.linspace(400.0, 700.0, 13)
 _DIFFUSE_PER_M: dict[Jerlov, tuple[float, ...]] = {

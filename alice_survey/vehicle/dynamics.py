@@ -1,7 +1,7 @@
 """Equations of motion of a submerged vehicle in 6 degrees of freedom.
 
 M nu' + C(nu) nu + D(nu) nu + g(eta) = tau (T. I. Fossen, Handbook of Marine Craft Hydrodynamics and
-Motion Control, 2011, chapter 8), where nu is the velocity relative to the water, in the body frame.
+Motion Control, 2011), where nu is the velocity relative to the water, in the body frame.
 The state is a vector: position in NED (3), attitude quaternion ned_from_body, xyzw (4), nu (6), and
 the speed of each thruster in revolutions per second.
 """

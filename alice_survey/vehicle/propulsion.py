@@ -8,8 +8,8 @@ vehicle along the thruster's direction. One law holds for all of them, in all fo
     Q   = rho D^5 k_q n |n| - rho D^4 b |n| u_a     and k_q by b
 
 The first and the third are the paper's with the fall of k_t = k_t0 - a J put in, which gives the
-bilinear form of T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, 2011,
-section 9.3; u_a = (1 - w) times the speed of the water along the thruster's axis where it sits
+bilinear form of T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, 2011;
+u_a = (1 - w) times the speed of the water along the thruster's axis where it sits
 (going astern or turning included). The second holds the paper's thrust deduction t and its
 deflection of tunnel jets by the surge u (A. R. Palmer, PhD thesis, University of Southampton,
 2009; the paper prints sqrt(T_0 / (rho A)), which has no root astern). A propeller at rest makes

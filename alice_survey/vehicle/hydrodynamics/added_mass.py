@@ -12,7 +12,7 @@ from alice_survey.frames import Array
 
 
 def alpha_0(length_m: float, diameter_m: float) -> float:
-    """Lamb's constant of a prolate spheroid along its axis (Fossen 2011, section 6.4; Lamb 1932).
+    """Lamb's constant of a prolate spheroid along its axis (Lamb 1932; Fossen 2011).
 
     alpha_0 = 2 (1 - e^2) / e^3 (1/2 ln((1 + e) / (1 - e)) - e), e = sqrt(1 - (d / l)^2).
     As printed in the paper: e = 1 - (d / l)^2, and (l / 2) ln, a length in a pure number.

@@ -78,7 +78,7 @@ def correlated_information(slopes: Sequence[Array], covariance: Array) -> Array:
     """Sum of S^T T S, (P, P), over runs S, (N_i, P), with the Toeplitz matrix T of a process.
 
     With the residual's autocovariance this is the covariance of S^T e (E. A. Morelli & V. Klein,
-    J. Aircraft 34(1), 1997, on parameter accuracy with coloured residuals).
+    J. Guidance, Control, and Dynamics 20, 1997, on parameter accuracy with coloured residuals).
     """
     width = slopes[0].shape[1]
     total = np.zeros((width, width))

@@ -1,6 +1,6 @@
 """The joint fit: parameters whose simulation comes closest to all that was measured.
 
-Output-error least squares (L. Ljung, System Identification, 1999, 3.4 and 7): each window is
+Output-error least squares (L. Ljung, System Identification, 1999): each window is
 simulated from a start of its own, so that a log in one window is single shooting and one cut into
 many is multiple shooting. The starts are eliminated (variable projection, Golub & Pereyra, Inverse
 Problems 19, 2003): for given parameters each window's start is solved for, and the parameters see

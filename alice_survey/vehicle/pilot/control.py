@@ -1,9 +1,9 @@
 """The inner loops: from wanted velocities and accelerations to a wrench.
 
 Feedback asks for an acceleration; inertia, Coriolis forces and drag turn it into forces (computed
-torque: T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, 2011, section
-13.3), at the wanted motion over ground. The current is not known, so that what it adds to drag is
-left to the integrals.
+torque: T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, 2011), at the
+wanted motion over ground. The current is not known, so that what it adds to drag is left to the
+integrals.
 """
 
 from alice_survey.frames import Array

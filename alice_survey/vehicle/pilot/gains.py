@@ -12,7 +12,7 @@ The rule for omega: as fast as the lag allows without the real pole becoming the
 hence omega = (1/T + d/m) / (1 + 2 zeta)), but not above a twentieth of the rate of the navigation's
 velocities (K. J. Astrom, B. Wittenmark, Computer-Controlled Systems, 1997, section 2.9, samples 10
 to 30 times within a period of the closed loop). Integral action is a tenth as fast, integral =
-place omega / 10 (Fossen 2011, section 12.2.5), or slower where the water damps much: integral =
+place omega / 10 (Fossen 2011, section 12.2), or slower where the water damps much: integral =
 place^2 / (rate + d/m at the greatest speed of the axis) if that is less, since the loop with lag
 and integral lets less through where damping takes the rate's part.
 
@@ -60,7 +60,7 @@ proportional part of a speed loop sees."""
 DAMPING_RATIO = 1.0
 """Of the placed pair: no overshoot, so that a line beside is not run into."""
 INTEGRAL_SHARE = 0.1
-"""Bandwidth of integral action by that of the loop (Fossen 2011, section 12.2.5)."""
+"""Bandwidth of integral action by that of the loop (Fossen 2011, section 12.2)."""
 SAMPLES_PER_PERIOD = 20.0
 LEAST_SAMPLES_PER_PERIOD = 10.0
 """Of an oscillation in which heading and sway are coupled."""

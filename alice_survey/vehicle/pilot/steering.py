@@ -176,7 +176,7 @@ def sway_by(
 ) -> None:
     """Ask for the sway that takes away an offset of the followed point to starboard.
 
-    The integral is kept as a vector in NED and turned into the body (Fossen 2011, section 12.2.7,
+    The integral is kept as a vector in NED and turned into the body (Fossen 2011, section 12.2,
     does so for positioning): what holds against a current is still right after a turn.
     """
     memory, demand, heading = pilot.memory, pilot.demand, estimate[signals.HEADING]
