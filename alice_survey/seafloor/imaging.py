@@ -78,7 +78,7 @@ def run_pool(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     imaging, board = config.imaging, PoolBoard()
     stage = Stage(
         name="pool",
-        version=3,
+        version=4,
         settings={
             "seed": config.seed,
             "camera": config.camera.model_dump(mode="json"),
@@ -159,7 +159,7 @@ def run_images(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     sections = ("camera", "water", "seafloor", "imaging")
     stage = Stage(
         name="images",
-        version=4,
+        version=5,
         settings={
             "seed": config.seed,
             "seafloor_depth_m": config.area.seafloor_depth_m,

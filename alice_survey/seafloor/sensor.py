@@ -74,9 +74,14 @@ def expose(radiance: Floats, sensor: Sensor, rng: np.random.Generator | None) ->
     mean = radiance * np.asarray(sensor.electrons_per_radiance, dtype=np.float32)
     if rng is None:
         return np.minimum(mean, np.float32(sensor.full_well_e))
-    caught = rng.poisson(np.minimum(mean, 4.0 * sensor.full_well_e)).astype(np.float32)
+    read = np.float32(sensor.read_noise_e) * rng.standard_normal(mean.shape, np.float32)
+    caught = np.minimum(mean, np.float32(4.0 * sensor.full_well_e))
+    # How many numbers a draw takes depends on its mean's last digits, which differ from machine to
+    # machine: with a stream for each row, what follows elsewhere is the same.
+    for row, own in zip(caught, rng.spawn(len(caught)), strict=True):
+        row[:] = own.poisson(row)
     np.minimum(caught, np.float32(sensor.full_well_e), out=caught)
-    caught += np.float32(sensor.read_noise_e) * rng.standard_normal(caught.shape, np.float32)
+    caught += read
     return caught
 
 
