@@ -95,7 +95,7 @@ def run_mapping(
     settings = config.reconstruct
     stage = Stage(
         name="mapping",
-        version=3,
+        version=4,
         settings={
             "seed": config.seed,
             **settings.model_dump(

@@ -20,6 +20,7 @@ from camera_calib.calibration.freedom import pose_names
 from camera_calib.rig import Rig, write_rig
 from reconstruct.lenses.lens import FlatPortLens, Lens, flat_port_lens
 from reconstruct.mapping.arrays import frames_of
+from reconstruct.mapping.bundle import move_points
 from reconstruct.mapping.database import Observations, rigid3d
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.priors import NavigationAdjuster
@@ -188,6 +189,8 @@ def on_rig(
     for number, image in model.images.items():
         for point, xy in zip(image.points2D, pixels[number - 1], strict=True):
             point.xy = xy
+    if len(fit.points) < len(model.points3D):  # the others lie where the old rig had them
+        move_points(model, fit.sigma_px)
     notes = (*mapped.notes, "rig and port refined from the survey's own pictures")
     return (
         replace(mapped, model=model, lenses=lenses, baseline=model_baseline(model), notes=notes),

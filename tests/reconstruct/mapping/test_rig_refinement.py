@@ -199,6 +199,36 @@ def test_the_model_is_made_anew_on_the_refined_rig(tmp_path: Path) -> None:
     assert refined.model.compute_mean_reprojection_error() < 0.45
 
 
+def test_points_that_took_no_part_move_along(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A refinement takes some of a large survey's points, and no observation is lost by that."""
+    rng = np.random.default_rng(8)
+    pixels = [p + rng.normal(0, 0.05, p.shape) for p in clean().pixels]
+    scene = replace(clean(), pixels=pixels)
+    turned = Rotation.from_rotvec([0.0, 6e-4, 0.0])
+    pose = scene.rig.cam_from_rig["right"]
+    right = RigidTransform.from_components(pose.translation, turned * pose.rotation)
+    names = ("right.rx_rad", "right.ry_rad", "right.rz_rad", "right.x_m", "right.y_m", "right.z_m")
+    known = Covariance(parameters=names, matrix=np.diag([4e-4, 8e-4, 4e-4, 1e-5, 1e-4, 1e-4]) ** 2)
+    cam_from_rig = {**scene.rig.cam_from_rig, "right": right}
+    wrong = replace(scene.rig, covariance=known, cam_from_rig=cam_from_rig)
+    mapped, seen = modelled(scene, wrong, tmp_path)
+    adjust = NavigationAdjuster(scene.records, wrong, mapped.lenses, None)
+    distances = Distances(near_m=1.75, far_m=2.35, source="test")
+    models = []
+    for most in (200_000, mapped.model.compute_num_observations() // 4):
+        monkeypatch.setattr("reconstruct.mapping.exact_sights._MOST_OBSERVATIONS", most)
+        found = refine_rig(
+            mapped, seen, wrong, distances, adjust, None, tmp_path, port=False, pose=True
+        )
+        before = mapped.model.compute_num_observations()
+        assert found.convergence.removed < 0.01 * before
+        models.append(found.mapped.model)
+    all_points, some = (observed(model) for model in models)
+    assert len(some.point) == pytest.approx(len(all_points.point), rel=0.002)
+
+
 def test_a_calibration_with_sigmas_lets_the_survey_refine_the_rig(tmp_path: Path) -> None:
     scene = noisy(6)
     names = ("right.rx_rad", "right.ry_rad", "right.rz_rad", "right.x_m", "right.y_m", "right.z_m")
