@@ -250,7 +250,7 @@ def test_a_signal_ends_all_processes_and_says_how_to_go_on(
     run = subprocess.Popen(
         [*command, "--events", str(file)],
         stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
-        preexec_fn=_heed_ctrl_c,
+        preexec_fn=_heed,
     )  # fmt: skip
     _wait_until(lambda: len(list(folder.glob("begun*"))) == workers)
     os.killpg(run.pid, number)  # a terminal sends it to all processes
@@ -310,12 +310,13 @@ def test_a_terminal_that_closes_ends_what_was_not_told_to_outlive_it(
     assert (folder / "made" / "half").exists() == outlives
 
 
-def test_other_programs_heed_signals_as_ever() -> None:
+def test_other_programs_heed_signals_as_ever(monkeypatch: pytest.MonkeyPatch) -> None:
     def masks(_: object = None) -> list[int]:
         script = "import signal; print(*sorted(signal.pthread_sigmask(signal.SIG_BLOCK, [])))"
         done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
         return [int(number) for number in done.stdout.split()]
 
+    monkeypatch.setattr(signal, "getsignal", lambda _: signal.SIG_DFL)  # we may be deaf to one
     before = masks()
     with interrupts.heeded(lambda _: None):
         assert set(masks()) == {*before, *interrupts.ASKING}
@@ -324,9 +325,10 @@ def test_other_programs_heed_signals_as_ever() -> None:
     assert masks() == before
 
 
-def _heed_ctrl_c() -> None:
-    """What a shell starts in the background is deaf to it, and so would be what that starts."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+def _heed() -> None:
+    """What a shell starts in the background, or nohup, is deaf, and so is what that starts."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
 
 
 def _wait_until(true: Callable[[], bool]) -> None:
