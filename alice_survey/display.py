@@ -1,11 +1,11 @@
 """What a user sees of a run, on standard error: moving bars on a terminal, else a few lines."""
 
-import contextlib
 import sys
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol, TextIO, cast
 
+from alice_survey.errors import outliving, say
 from alice_survey.events import Event, duration, finished, how_far
 
 if TYPE_CHECKING:
@@ -80,22 +80,6 @@ def _line_of(event: Event) -> str | None:
     return None
 
 
-class _Written:
-    """Whole lines on standard error; when nobody takes them any more, none."""
-
-    def __init__(self) -> None:
-        self._broken = False
-
-    def line(self, text: str) -> None:
-        if self._broken:
-            return
-        try:
-            sys.stderr.write(f"{text}\n")
-            sys.stderr.flush()
-        except (OSError, ValueError):  # the reader of a pipe has gone: the work goes on
-            self._broken = True
-
-
 class _Outlived:
     """A terminal that may close while the work goes on."""
 
@@ -103,12 +87,12 @@ class _Outlived:
         self._file = file
 
     def write(self, text: str) -> int:
-        with contextlib.suppress(OSError, ValueError):
+        with outliving():
             self._file.write(text)
         return len(text)
 
     def flush(self) -> None:
-        with contextlib.suppress(OSError, ValueError):
+        with outliving():
             self._file.flush()
 
     def __getattr__(self, name: str) -> Any:
@@ -118,13 +102,10 @@ class _Outlived:
 class Quiet:
     """Warnings alone."""
 
-    def __init__(self) -> None:
-        self._written = _Written()
-
     def hear(self, event: Event) -> None:
         """Write a warning."""
         if event.name == "warning":
-            self._written.line(f"warning: {event.message}")
+            say(f"warning: {event.message}")
 
     def step_began(self, step: ShownStep) -> None:
         """Say nothing."""
@@ -147,7 +128,6 @@ class Lines:
 
     def __init__(self, clock: Callable[[], float] = lambda: time.monotonic()) -> None:
         self._clock = clock
-        self._written = _Written()
         self._last_s = clock()
 
     def hear(self, event: Event) -> None:
@@ -181,7 +161,7 @@ class Lines:
         """Say nothing."""
 
     def _line(self, text: str) -> None:
-        self._written.line(text)
+        say(text)
         self._last_s = self._clock()
 
 
@@ -192,7 +172,6 @@ class Bars:
         self._bars: Progress | None = None
         self._tasks: dict[int, Any] = {}
         self._stage: Any = None
-        self._written = _Written()
 
     def hear(self, event: Event) -> None:
         """Write what stays; begin the spinner of a stage."""
@@ -200,7 +179,7 @@ class Bars:
         if text is not None and self._bars is not None:
             self._bars.console.print(text, markup=False, highlight=False, soft_wrap=True)
         elif text is not None:
-            self._written.line(text)
+            say(text)
         if event.name == "stage_started":
             self._stage = self._begun().add_task(event.stage or "", total=None)
 

@@ -2,6 +2,8 @@
 
 import contextlib
 import errno
+import os
+import stat
 import sys
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
@@ -70,10 +72,30 @@ def note(text: str) -> None:
 
 
 def say(text: str) -> None:
-    """Write a line on standard error, if anybody still takes it: the work outlives a terminal."""
-    with contextlib.suppress(OSError, ValueError):
+    """Write a line on standard error, if anybody still takes it."""
+    with outliving():
         sys.stderr.write(f"{text}\n")
         sys.stderr.flush()
+
+
+@contextlib.contextmanager
+def outliving() -> Iterator[None]:
+    """Write to standard error within this block: when nobody takes it any more, the work goes on.
+
+    From then on it goes nowhere, and so does standard output if that was the same terminal: what
+    Python cannot flush at its end would otherwise turn success into failure.
+    """
+    try:
+        yield
+    except (OSError, ValueError):
+        with contextlib.suppress(OSError, ValueError, AttributeError):
+            error, output = sys.stderr.fileno(), sys.stdout.fileno()
+            gone, other = os.fstat(error), os.fstat(output)
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, error)
+            if stat.S_ISCHR(gone.st_mode) and gone.st_rdev == other.st_rdev:
+                os.dup2(nowhere, output)
+            os.close(nowhere)
 
 
 def _show(level: Level, text: str) -> None:

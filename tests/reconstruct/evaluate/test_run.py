@@ -80,7 +80,7 @@ def test_an_error_and_holes_are_measured(terrain: Terrain, tmp_path: Path) -> No
     assert figures["height_rms_mm"] == pytest.approx(12.0, abs=0.01)
     assert 8.0 < figures["distance_rms_mm"] < 12.0
     assert score.completeness == pytest.approx(0.75, abs=0.02)
-    assert np.all(score.distance_m <= np.abs(score.height_m) + 1e-6)
+    assert np.all(score.distance_m <= np.abs(score.height_m) + 1e-5)  # depths are of 32 bits
 
 
 def test_sigmas_stations_and_ground_pixels_are_held_against_the_error(
