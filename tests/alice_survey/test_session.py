@@ -311,7 +311,7 @@ def test_a_terminal_that_closes_ends_what_was_not_told_to_outlive_it(
 
 
 def test_other_programs_heed_signals_as_ever(monkeypatch: pytest.MonkeyPatch) -> None:
-    def masks(_: object = None) -> list[int]:
+    def masks() -> list[int]:
         script = "import signal; print(*sorted(signal.pthread_sigmask(signal.SIG_BLOCK, [])))"
         done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
         return [int(number) for number in done.stdout.split()]
