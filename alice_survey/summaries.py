@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from alice_survey.artefacts import read_json
+from alice_survey.base.artefacts import read_json
 
 Summary = tuple[str, dict[str, Any]]
 

@@ -10,12 +10,12 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from alice_survey.artefacts import STAGE_FILE, only_checking, read_json, read_stage
-from alice_survey.config import SurveyConfig, changed, load_config, parse_current, parse_health
-from alice_survey.contents import taken_from
-from alice_survey.errors import AliceError, ConfigError, WorkspaceError, warn
-from alice_survey.executor import default_threads
-from alice_survey.progress import part
+from alice_survey.base.artefacts import STAGE_FILE, only_checking, read_json, read_stage
+from alice_survey.base.config import SurveyConfig, changed, load_config, parse_current, parse_health
+from alice_survey.base.contents import taken_from
+from alice_survey.base.errors import AliceError, ConfigError, WorkspaceError, warn
+from alice_survey.base.executor import default_threads
+from alice_survey.base.run.progress import part
 from alice_survey.summaries import SUMMARIES
 
 RECONSTRUCT = ("calibration", "sparse", "dense", "mosaic", "mesh")
@@ -87,27 +87,27 @@ def _work_of(stage: str) -> StageWork:
     """The function that does a stage; its packages are loaded only now."""
     match stage:
         case "plan":
-            from missions.plan import run_plan
+            from missions.plan.run import run_plan
 
             return run_plan
         case "flight":
-            from missions.fly import run_fly
+            from missions.fly.run import run_fly
 
             return run_fly
         case "pool":
-            from alice_survey.seafloor.imaging import run_pool
+            from missions.acquire.run import run_pool
 
             return run_pool
         case "images":
-            from alice_survey.seafloor.imaging import run_images
+            from missions.acquire.run import run_images
 
             return run_images
         case "calibration":
-            from camera_calib.calibration.run import run_calibrate
+            from camera_calib.calibrate.run import run_calibrate
 
             return run_calibrate
         case "sparse":
-            from reconstruct.sparse.run import run_sparse
+            from reconstruct.placing.run import run_sparse
 
             return run_sparse
         case "dense":

@@ -19,12 +19,11 @@ from functools import cache, partial
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.executor import parallel_map
-from alice_survey.frames import Array
+from alice_survey.base.executor import parallel_map
+from alice_survey.base.frames import Array
 from benchmarks.figures import Figure, Goal
-from camera_calib.calibration.adjust import cramer_rao, stack_views
-from camera_calib.calibration.calibrate import Intrinsics, calibrate_through_ports
-from camera_calib.calibration.freedom import (
+from camera_calib.calibrate.adjust import cramer_rao, stack_views
+from camera_calib.calibrate.freedom import (
     PORT,
     Freedom,
     Prior,
@@ -33,9 +32,10 @@ from camera_calib.calibration.freedom import (
     pose_names,
     value,
 )
-from camera_calib.calibration.normal_equations import Problem
-from camera_calib.calibration.result import TargetView
-from camera_calib.report.uncertainty import baseline_sigma_m
+from camera_calib.calibrate.normal_equations import Problem
+from camera_calib.calibrate.result import TargetView
+from camera_calib.calibrate.solve import Intrinsics, calibrate_through_ports
+from camera_calib.judge.uncertainty import baseline_sigma_m
 from camera_calib.rig import Covariance, Rig
 from tests.camera_calib.calibration_scenes import (
     BOARD,

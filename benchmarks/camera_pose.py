@@ -13,8 +13,8 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.executor import parallel_map
-from alice_survey.frames import Array
+from alice_survey.base.executor import parallel_map
+from alice_survey.base.frames import Array
 from benchmarks.figures import Figure, Goal
 from camera_calib.absolute_pose import Sighting, absolute_pose, pose_information
 from camera_calib.flat_port import FlatPortCamera

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from alice_survey.resources import family_of, memory_mib_of
+from alice_survey.base.run.resources import family_of, memory_mib_of
 
 _EVERY_S, _SURELY_EVERY_S = 0.2, 2.0
 """Between looks at the memory of a command; it takes the kernel 6 ms a process to share it out, so

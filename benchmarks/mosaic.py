@@ -22,15 +22,15 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.artefacts import write_csv, write_json
-from alice_survey.executor import default_threads
-from alice_survey.frames import BODY_FROM_NADIR_CAM, Array, Datum
+from alice_survey.base.artefacts import write_csv, write_json
+from alice_survey.base.executor import default_threads
+from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, Datum
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
 from benchmarks.measured import Cost, measured, python
 from reconstruct.dense.dem import DemGrid
-from reconstruct.model import WorldFrame, write_frame
 from reconstruct.raster import tiled_raster, tiles_of
+from reconstruct.views.model import WorldFrame, write_frame
 
 PIXEL_M, CELL_M = 0.001, 0.0025
 WIDTH, HEIGHT, FOCAL = 2448, 2048, 2000.0
@@ -42,7 +42,7 @@ _POINTS = 20
 """Of the sparse model, seen by each picture."""
 _MOST_MIB = 1536.0
 _RUN = (
-    "import sys; from pathlib import Path; from alice_survey.config import ReconstructConfig, "
+    "import sys; from pathlib import Path; from alice_survey.base.config import ReconstructConfig, "
     "SurveyConfig; from reconstruct.mosaic.run import run_mosaic; "
     "run_mosaic(Path(sys.argv[1]), SurveyConfig(reconstruct=ReconstructConfig("
     f"mosaic_pixel_m={PIXEL_M})), int(sys.argv[2]))"

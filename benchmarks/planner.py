@@ -21,8 +21,8 @@ from benchmarks.machine import heading, machine
 from benchmarks.planner_areas import planned_area, shapes
 from benchmarks.planner_peers import MARGIN_M, PATTERN, PLANNERS, Measured, measured, own_plan
 from missions.lines.sweep import best_heading, full_cost_j
-from missions.route.costs import time_costs
 from missions.route.ways import Ways
+from missions.values.costs import time_costs
 
 _ROWS = (100, 300, 3_000, 10_000)
 _MOST_PEER_ROWS = 300

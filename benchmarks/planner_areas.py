@@ -7,8 +7,8 @@ import shapely
 import shapely.affinity
 from shapely.geometry import MultiPolygon, Polygon, box
 
-from alice_survey.frames import Array, Datum
-from missions.areas.area import Area, multipolygon
+from alice_survey.base.frames import Array, Datum
+from missions.values.area import Area, multipolygon
 
 _COAST_SEED = 5
 _COAST_CORNERS = 500

@@ -17,14 +17,14 @@ import opencoverage
 import shapely
 from shapely.geometry import LineString, Polygon
 
-from alice_survey.frames import Array
-from missions.areas.area import Area
+from alice_survey.base.frames import Array
 from missions.lines.lay import lay_lines
-from missions.lines.line import Line
-from missions.lines.pattern import Pattern
-from missions.route.costs import time_costs
 from missions.route.turns import route_through
 from missions.route.ways import Ways
+from missions.values.area import Area
+from missions.values.costs import time_costs
+from missions.values.line import Line
+from missions.values.pattern import Pattern
 
 PATTERN = Pattern(spacing_m=1.0, step_m=0.47, half_across_m=0.6, half_along_m=0.57)
 """Lines 1 m apart, near the paper's stereo pair at 2 m."""

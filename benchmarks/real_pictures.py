@@ -20,11 +20,11 @@ import numpy as np
 from pyproj import Transformer
 from scipy.spatial import cKDTree
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from benchmarks.figures import Figure, Findings, add_options, hand_over
 from benchmarks.machine import heading, machine
-from reconstruct.model import read_frame
-from reconstruct.sparse.alignment import align_similarity
+from reconstruct.placing.alignment import align_similarity
+from reconstruct.views.model import read_frame
 
 _POINTS = 40_000
 _ROUNDS = 40

@@ -40,7 +40,7 @@ _PEERS = Path(__file__).with_name("reconstruct_peers.py")
 _STAGES = ("sparse", "dense", "mosaic")
 _RUN = (
     "import sys; from pathlib import Path; from alice_survey.survey import settings; "
-    "from reconstruct.{stage}.run import run_{stage}; from alice_survey.executor import "
+    "from reconstruct.{stage}.run import run_{stage}; from alice_survey.base.executor import "
     "default_threads; "
     "w = Path(sys.argv[1]); run_{stage}(w, settings(w, None, needed=False), default_threads())"
 )
@@ -172,7 +172,7 @@ def run_brighton(work: Path, data: Path, interpreter: str | None, limit_s: float
     from reconstruct.evaluate.cloud_files import read_reference
     from reconstruct.evaluate.cloud_registration import Surface, register_cloud
     from reconstruct.evaluate.reference import distances, evaluate_reference, lifted
-    from reconstruct.model import read_frame
+    from reconstruct.views.model import read_frame
 
     source, workspace = data / "brighton_beach", _emptied(work / "brighton_beach")
     imported([str(source / "images")], workspace)

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import rasterio
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from alice_survey.seafloor.terrain import Terrain, read_terrain
 from reconstruct.evaluate.figures import rms
 from reconstruct.evaluate.truth import read_true_poses, surface_distance
-from reconstruct.model import read_model
-from reconstruct.sparse.alignment import Similarity, align_rigid, align_similarity
-from reconstruct.sparse.track import read_track_poses
+from reconstruct.placing.alignment import Similarity, align_rigid, align_similarity
+from reconstruct.placing.track import read_track_poses
+from reconstruct.views.model import read_model
 
 _CELLS = 300_000
 

@@ -6,7 +6,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
-from alice_survey.artefacts import read_stage, write_csv
+from alice_survey.base.artefacts import read_stage, write_csv
 from benchmarks.measured import python
 
 _SIMULATED = ("plan", "fly", "image", "calibrate")

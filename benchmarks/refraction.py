@@ -20,14 +20,14 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pycolmap
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from benchmarks.figures import Figure, Findings, add_options, hand_over
 from benchmarks.machine import heading, machine
-from reconstruct.lenses.lens import self_calibrated_lens
 from reconstruct.mapping.bundle import adjust_freely, all_pictures, held_options
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.refraction import refract
-from reconstruct.sparse.alignment import align_rigid
+from reconstruct.placing.alignment import align_rigid
+from reconstruct.views.lens import self_calibrated_lens
 from tests.oracles_refraction import adjust_through_ports
 from tests.reconstruct.scenes import Scene, make_scene
 from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_scene

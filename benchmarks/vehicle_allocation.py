@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.allocation.exact import allocate_exact
 from alice_survey.vehicle.allocation.preference import AXIS_WEIGHTS
 from alice_survey.vehicle.allocation.rpi import allocate_rpi

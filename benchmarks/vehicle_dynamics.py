@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from alice_survey.vehicle import fleet, propulsion
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.dynamics import (

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.config import SurveyConfig, changed
+from alice_survey.base.config import SurveyConfig, changed
 from alice_survey.vehicle.floor import FloorGrid, level_floor
 from alice_survey.vehicle.pilot.memory import PHASE, REASON
 from alice_survey.vehicle.pilot.safety import NONE
@@ -24,8 +24,8 @@ from alice_survey.vehicle.signals import DONE
 from alice_survey.vehicle.simulator import Setup, simulate
 from benchmarks.figures import Figure, Goal
 from camera_calib.rig import design_rig
-from missions.plan import make_plan
-from missions.simulation import mission_setup
+from missions.fly.simulation import mission_setup
+from missions.plan.run import make_plan
 
 _LONGEST_S = 7200.0
 

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.errors import CalibrationError
-from alice_survey.frames import Array
+from alice_survey.base.errors import CalibrationError
+from alice_survey.base.frames import Array
 from camera_calib import lens, refraction
 
 _FORWARD = (0.0, 0.0, 1.0)

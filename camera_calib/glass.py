@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from alice_survey.errors import ConfigError
-from alice_survey.frames import Array
+from alice_survey.base.errors import ConfigError
+from alice_survey.base.frames import Array
 
 _SELLMEIER: dict[str, tuple[tuple[float, float], ...]] = {
     "bk7": (

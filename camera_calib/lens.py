@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numba import njit
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
 """The same order as OpenCV's vector of distortion coefficients."""

@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 from numpy.typing import NDArray
 
-from alice_survey.errors import memory_shortage
+from alice_survey.base.errors import memory_shortage
 
 MOST_PIXELS = 104_000_000
 """Of a picture: 0.8 GB of 4 channels and 16 bits. A file of a few kilobytes can state any size."""

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import njit
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from camera_calib.lens import distort, distort_slopes, radial, undistort_block
 
 _NEWTON_STEPS = 60

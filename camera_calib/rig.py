@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.artefacts import read_json, write_json
-from alice_survey.config import CameraConfig, WaterConfig
-from alice_survey.contents import one_line
-from alice_survey.errors import CalibrationError
-from alice_survey.frames import BODY_FROM_NADIR_CAM, Array, pose_from_json, pose_to_json
+from alice_survey.base.artefacts import read_json, write_json
+from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.base.contents import one_line
+from alice_survey.base.errors import CalibrationError
+from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, pose_from_json, pose_to_json
 from camera_calib.flat_port import FlatPortCamera, camera_from_json, numbers
 
 _FORMAT = {"format": "alice-survey rig", "version": 2}

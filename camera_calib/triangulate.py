@@ -13,8 +13,8 @@ import numpy as np
 from numba import njit
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.errors import CalibrationError
-from alice_survey.frames import Array
+from alice_survey.base.errors import CalibrationError
+from alice_survey.base.frames import Array
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.lens import distort_slopes
 from camera_calib.refraction import air_tangent

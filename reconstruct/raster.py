@@ -22,13 +22,13 @@ from rasterio.crs import CRS
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
-from alice_survey import progress
-from alice_survey.artefacts import atomic_path
-from alice_survey.contents import one_line
-from alice_survey.errors import WorkspaceError
-from alice_survey.frames import Array, Datum
+from alice_survey.base.artefacts import atomic_path
+from alice_survey.base.contents import one_line
+from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.frames import Array, Datum
+from alice_survey.base.run import progress
 from reconstruct.dense.dem import DemGrid
-from reconstruct.model import WorldFrame
+from reconstruct.views.model import WorldFrame
 
 BLOCK = 256
 """Pixels a side of the blocks of a tiled TIFF."""

@@ -8,16 +8,16 @@ import shapely
 from scipy.spatial.transform import RigidTransform
 from shapely.geometry import MultiPolygon, Polygon
 
-from alice_survey.config import CameraConfig, WaterConfig
-from alice_survey.frames import Array, Datum, rotation_from_attitude
+from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from camera_calib.rig import Rig, design_rig
-from missions.areas.area import Area, multipolygon
 from missions.coverage.certificate import Certificate
 from missions.coverage.stations import Stations
-from missions.footprint import footprint_ne, glass_point_cam
-from missions.lines.line import Line
-from missions.plan_file import Dive, Plan
-from missions.route.legs import Leg, Route
+from missions.values.area import Area, multipolygon
+from missions.values.footprint import footprint_ne, glass_point_cam
+from missions.values.legs import Leg, Route
+from missions.values.line import Line
+from missions.values.plan_file import Dive, Plan
 
 DATUM = Datum(32.8236, 34.9553)
 _FLOOR_M = 50.0

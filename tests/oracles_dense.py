@@ -10,13 +10,13 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.artefacts import write_json
-from alice_survey.config import CameraConfig, WaterConfig
-from alice_survey.frames import BODY_FROM_NADIR_CAM, Array, Datum
+from alice_survey.base.artefacts import write_json
+from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, Datum
 from camera_calib.rig import design_rig
-from reconstruct.lenses.lens import flat_port_lens
-from reconstruct.lenses.range_shift import range_shift
-from reconstruct.model import SparseModel, View, WorldFrame, write_frame
+from reconstruct.views.lens import flat_port_lens
+from reconstruct.views.model import SparseModel, View, WorldFrame, write_frame
+from reconstruct.views.range_shift import range_shift
 
 DATUM = Datum(32.8236, 34.9553)
 FRAME = WorldFrame(

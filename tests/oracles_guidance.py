@@ -5,7 +5,7 @@ import math
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from alice_survey.vehicle import signals
 from alice_survey.vehicle.dynamics import coriolis_matrix, damping_matrix
 from alice_survey.vehicle.pilot import gains as g

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.dynamics import STATE, derivative, scratch_for
 from alice_survey.vehicle.sea import constant_current
 from alice_survey.vehicle.vehicle import Vehicle

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 from shapely.geometry import Polygon
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.rig import Rig
 from tests.oracles_camera import project_by_bisection

@@ -10,11 +10,11 @@ import shapely.affinity
 from hypothesis import strategies as st
 from shapely.geometry import LineString, MultiPolygon, Point, Polygon, box
 
-from alice_survey.frames import Array, Datum
-from missions.areas.area import Area, multipolygon
-from missions.lines.line import Line
-from missions.lines.pattern import Pattern
-from missions.route.costs import Costs, power_at
+from alice_survey.base.frames import Array, Datum
+from missions.values.area import Area, multipolygon
+from missions.values.costs import Costs, power_at
+from missions.values.line import Line
+from missions.values.pattern import Pattern
 
 DATUM = Datum(latitude_deg=32.8, longitude_deg=34.9)
 STEREO = Pattern(spacing_m=1.0, step_m=0.47, half_across_m=0.6, half_along_m=0.57)

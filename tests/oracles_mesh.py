@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.rig import Rig
 

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 
 
 def lanczos_at(picture: Array, x: float, y: float) -> Array:

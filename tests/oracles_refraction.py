@@ -7,7 +7,7 @@ from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from reconstruct.mapping.database import as_transform
 from reconstruct.mapping.normal_equations import Sights
 from reconstruct.mapping.uncertainty import Uncertainty

@@ -9,9 +9,9 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry import LineString, MultiPolygon
 
-from missions.lines.line import Line
-from missions.route.costs import Costs, power_at
-from missions.route.legs import Leg, Route
+from missions.values.costs import Costs, power_at
+from missions.values.legs import Leg, Route
+from missions.values.line import Line
 
 Array = NDArray[np.float64]
 

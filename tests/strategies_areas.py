@@ -8,7 +8,7 @@ import shapely
 from hypothesis import strategies as st
 from shapely.geometry import MultiPolygon, Point, Polygon, box
 
-from missions.areas.area import multipolygon
+from missions.values.area import multipolygon
 
 
 @st.composite

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rasterio.windows import Window
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from alice_survey.report.document import Scale
 from reconstruct.raster import hillshade
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from alice_survey.report.held import Held, number
 
 

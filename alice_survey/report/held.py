@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from alice_survey.artefacts import read_json, read_stage
+from alice_survey.base.artefacts import read_json, read_stage
 
 STAGES = (
     "plan", "flight", "pool", "images", "calibration", "mapping", "sparse", "dense", "mosaic",

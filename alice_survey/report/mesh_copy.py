@@ -12,8 +12,8 @@ import numpy as np
 import rasterio
 from rasterio.enums import Resampling
 
-from alice_survey import progress
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
 from alice_survey.report.document import Mesh
 from alice_survey.report.held import Held
 from alice_survey.report.pictures import still

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
 
-from alice_survey import progress
+from alice_survey.base.run import progress
 from alice_survey.report.document import Figure, Level, Link, Mesh, Report, Section, Table
 from alice_survey.report.page_map import map_data, map_view
 

@@ -6,7 +6,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from alice_survey import progress
+from alice_survey.base.run import progress
 from alice_survey.report.document import Figure, Level, PictureLayer, Report, Scale, Section, Table
 
 _MARGIN_MM = 16.0

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import cv2
 
-from alice_survey.errors import WorkspaceError
+from alice_survey.base.errors import WorkspaceError
 
 _MOST_PX = 1600
 

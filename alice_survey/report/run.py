@@ -4,10 +4,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from alice_survey import progress
-from alice_survey.artefacts import STAGE_FILE, Stage, atomic_path, run_stage, write_json
-from alice_survey.config import SurveyConfig
-from alice_survey.errors import WorkspaceError
+from alice_survey.base.artefacts import STAGE_FILE, Stage, atomic_path, run_stage, write_json
+from alice_survey.base.config import SurveyConfig
+from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.run import progress
 from alice_survey.report import reproduce
 from alice_survey.report.document import PictureLayer, Report, ShapeLayer, SurveyMap
 from alice_survey.report.figures import Figures

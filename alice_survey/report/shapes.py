@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.frames import Array, Datum
+from alice_survey.base.frames import Array, Datum
 from alice_survey.report.document import ShapeLayer
 from alice_survey.report.figures import planned_area
 from alice_survey.report.held import Held, number

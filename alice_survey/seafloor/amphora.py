@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 
 LENGTH_M = 0.6
 BELLY_X_M = 0.34

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.config import SurveyConfig
+from alice_survey.base.config import SurveyConfig
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.rig import Rig, design_rig
 

@@ -9,9 +9,9 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey import progress
-from alice_survey.errors import CalibrationError
-from alice_survey.frames import Array
+from alice_survey.base.errors import CalibrationError
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
 from alice_survey.seafloor.noise import noise
 from alice_survey.seafloor.renderer import camera_rays, ray_bands
 from camera_calib.flat_port import FlatPortCamera

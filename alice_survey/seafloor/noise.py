@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numba import njit
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 
 _U, _F = np.uint32, np.float32
 _PRIME_X, _PRIME_Y, _PRIME_Z = _U(0x8DA6B343), _U(0xD8163841), _U(0xCB1AB31F)

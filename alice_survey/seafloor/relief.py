@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 
 _RIPPLE_LENGTH_M = 0.16
 _RIPPLE_HEIGHT_M = 0.012

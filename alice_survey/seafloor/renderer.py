@@ -15,8 +15,8 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.errors import ImageError
-from alice_survey.frames import Array
+from alice_survey.base.errors import ImageError
+from alice_survey.base.frames import Array
 from alice_survey.seafloor.light import CameraLight, add_direct, backscatter_at
 from alice_survey.seafloor.noise import mix
 from alice_survey.seafloor.terrain import Patch, Terrain

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.config import CameraConfig
-from alice_survey.frames import Array
+from alice_survey.base.config import CameraConfig
+from alice_survey.base.frames import Array
 from camera_calib.water import WAVELENGTH_NM
 
 Floats = NDArray[np.float32]

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from alice_survey import progress
-from alice_survey.artefacts import atomic_path, read_json, write_json
-from alice_survey.config import SeafloorConfig, SurveyConfig
-from alice_survey.errors import ConfigError, WorkspaceError
-from alice_survey.frames import Array
+from alice_survey.base.artefacts import atomic_path, read_json, write_json
+from alice_survey.base.config import SeafloorConfig, SurveyConfig
+from alice_survey.base.errors import ConfigError, WorkspaceError
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
 from alice_survey.seafloor.amphora import BELLY_X_M, LENGTH_M, amphora_mesh
 from alice_survey.seafloor.relief import add_rocks, ground_relief, scatter_rocks, trough_share
 

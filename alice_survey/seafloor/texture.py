@@ -10,8 +10,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from alice_survey.config import SurveyConfig
-from alice_survey.frames import Array
+from alice_survey.base.config import SurveyConfig
+from alice_survey.base.frames import Array
 from alice_survey.seafloor.noise import add_octave, mix, noise, spot
 
 Floats = NDArray[np.float32]

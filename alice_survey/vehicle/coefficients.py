@@ -11,8 +11,8 @@ from functools import cached_property
 
 import numpy as np
 
-from alice_survey.errors import VehicleError
-from alice_survey.frames import Array
+from alice_survey.base.errors import VehicleError
+from alice_survey.base.frames import Array
 
 FORCES = "XYZKMN"
 MOTIONS = "uvwpqr"

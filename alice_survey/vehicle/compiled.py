@@ -6,7 +6,7 @@ from typing import ParamSpec, TypeVar
 
 from numba import njit
 
-from alice_survey.compiled import stamped
+from alice_survey.base.compiled import stamped
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")

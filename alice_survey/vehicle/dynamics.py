@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.propulsion import Propulsion, add_speed_rates, add_thrust
 from alice_survey.vehicle.sea import Current, current_at
@@ -79,7 +79,7 @@ def initial_state(
         thrusters: how many.
         nu: (6,) velocity relative to the water; at rest if not given.
     """
-    from alice_survey.frames import rotation_from_attitude
+    from alice_survey.base.frames import rotation_from_attitude
 
     state = np.zeros(STATE + thrusters)
     state[:3] = position_ned

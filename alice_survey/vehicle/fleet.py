@@ -7,7 +7,7 @@ Sources as in `hydrodynamics.geometry`: "model" is the public model of SPARUS II
 from functools import cache
 from typing import Literal
 
-from alice_survey.errors import VehicleError
+from alice_survey.base.errors import VehicleError
 from alice_survey.vehicle.coefficients import Coefficients
 from alice_survey.vehicle.hydrodynamics.entrained import entrained_water
 from alice_survey.vehicle.hydrodynamics.estimate import estimate

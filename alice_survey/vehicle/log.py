@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from alice_survey.artefacts import write_csv
-from alice_survey.contents import shown
-from alice_survey.errors import VehicleError, warn
-from alice_survey.frames import Array, attitude_from_rotation, rotation_from_attitude
+from alice_survey.base.artefacts import write_csv
+from alice_survey.base.contents import shown
+from alice_survey.base.errors import VehicleError, warn
+from alice_survey.base.frames import Array, attitude_from_rotation, rotation_from_attitude
 
 TIME = "time_s"
 POSITION = ("north_m", "east_m", "depth_m")

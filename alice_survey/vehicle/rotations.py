@@ -2,7 +2,7 @@
 
 import math
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.compiled import kernel
 
 

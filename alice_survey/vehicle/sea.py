@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from alice_survey.errors import VehicleError
-from alice_survey.frames import Array
-from alice_survey.trajectory import read_columns
+from alice_survey.base.errors import VehicleError
+from alice_survey.base.frames import Array
+from alice_survey.base.trajectory import read_columns
 from alice_survey.vehicle.compiled import kernel
 
 _COLUMNS = ("time_s", "depth_m", "north_mps", "east_mps")

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from alice_survey.compiled import tell_of_compiling
-from alice_survey.frames import Array, attitude_from_rotation
+from alice_survey.base.compiled import tell_of_compiling
+from alice_survey.base.frames import Array, attitude_from_rotation
 from alice_survey.vehicle import signals
 from alice_survey.vehicle.allocation.exact import allocate_exact
 from alice_survey.vehicle.allocation.preference import AXIS_WEIGHTS, preference_weights
@@ -328,7 +328,7 @@ def simulate(
     Raises:
         VehicleError: a thruster that is named is not one of the vehicle's.
     """
-    from alice_survey.executor import progress
+    from alice_survey.base.executor import progress
 
     tell_of_compiling(_fly_ticks, "the vehicle's model, once: this takes about a minute")
     chunks: list[Rows] = []

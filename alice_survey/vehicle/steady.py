@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.dynamics import Body
 from alice_survey.vehicle.propulsion import (
     ADVANCE,

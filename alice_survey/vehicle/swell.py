@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 
-from alice_survey.errors import VehicleError
-from alice_survey.frames import Array
+from alice_survey.base.errors import VehicleError
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.dynamics import GRAVITY
 from alice_survey.vehicle.sea import Current, checked_current
 

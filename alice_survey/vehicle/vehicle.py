@@ -6,8 +6,8 @@ from functools import cached_property
 
 import numpy as np
 
-from alice_survey.errors import VehicleError
-from alice_survey.frames import Array
+from alice_survey.base.errors import VehicleError
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.coefficients import Coefficients
 from alice_survey.vehicle.dynamics import GRAVITY, Body, Plant
 from alice_survey.vehicle.propulsion import Thruster, pack

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from rasterio.errors import RasterioError
 
-from alice_survey.contents import one_line
-from alice_survey.errors import WorkspaceError
+from alice_survey.base.contents import one_line
+from alice_survey.base.errors import WorkspaceError
 from alice_survey.report.colours import (
     MOSAIC_ABOUT,
     MOSAIC_FILE,

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import unquote_to_bytes
 
-from alice_survey.artefacts import STAGE_FILE
+from alice_survey.base.artefacts import STAGE_FILE
 from alice_survey.report.held import LOOSE, STAGES
 
 PRODUCTS = (*STAGES, "report", *LOOSE, "check")

@@ -19,7 +19,7 @@ import numpy as np
 import rasterio
 from rasterio.windows import Window
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from alice_survey.report.colours import TILE_PX, known_values
 
 _KEPT_PX = 2_000_000

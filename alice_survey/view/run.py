@@ -3,8 +3,8 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from alice_survey.errors import WorkspaceError
-from alice_survey.interrupts import for_other_programs
+from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.run.interrupts import for_other_programs
 from alice_survey.report.held import Held
 from alice_survey.view.server import Server
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, cast
 from urllib.parse import quote
 
-from alice_survey.errors import AliceError, WorkspaceError, known_fault, why
+from alice_survey.base.errors import AliceError, WorkspaceError, known_fault, why
 from alice_survey.view.files import content_type, policy_of, send_part
 from alice_survey.view.layers import NAMES, ChangedError, Layers
 from alice_survey.view.page import Page, listing

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
-from alice_survey.errors import CalibrationError, ConfigError, ImageError
-from alice_survey.frames import Array
+from alice_survey.base.errors import CalibrationError, ConfigError, ImageError
+from alice_survey.base.frames import Array
+from alice_survey.base.text_table import text_table
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.glass import n_glass
-from camera_calib.text_table import text_table
 from camera_calib.water import CHANNELS, WAVELENGTH_NM, n_water
 
 _REFERENCE = "green"

@@ -7,12 +7,12 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from alice_survey.config import SurveyConfig, load_config
-from alice_survey.errors import CalibrationError, ConfigError
+from alice_survey.base.config import SurveyConfig, load_config
+from alice_survey.base.errors import CalibrationError, ConfigError
+from alice_survey.base.text_table import text_table
 from camera_calib.approximation.residual import Residual, approximations, residual
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.rig import design_rig, read_rig
-from camera_calib.text_table import text_table
 
 _COLOURS = ("#0072b2", "#009e73", "#999999", "#d55e00", "#cc79a7")
 _STYLES = ("-", "-", "--", "--", ":")

@@ -13,8 +13,8 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from alice_survey.errors import CalibrationError, ConfigError
-from alice_survey.frames import Array
+from alice_survey.base.errors import CalibrationError, ConfigError
+from alice_survey.base.frames import Array
 from camera_calib.approximation.virtual_pinhole import VirtualPinhole, best_pinhole
 from camera_calib.flat_port import FlatPortCamera
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from alice_survey.errors import CalibrationError, ImageError
-from alice_survey.executor import parallel_map
+from alice_survey.base.errors import CalibrationError, ImageError
+from alice_survey.base.executor import parallel_map
 from camera_calib.approximation.dispersion import (
     Maps,
     channel_cameras,

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from camera_calib.flat_port import FlatPortCamera
 
 

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import pycolmap
 
-from alice_survey.artefacts import atomic_path
-from alice_survey.contents import shown
-from alice_survey.errors import CalibrationError
+from alice_survey.base.artefacts import atomic_path
+from alice_survey.base.contents import shown
+from alice_survey.base.errors import CalibrationError
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.formats.fields import Fields, read_bytes, read_text
 from camera_calib.formats.opencv_model import camera_in_air, distorts

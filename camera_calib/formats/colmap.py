@@ -15,8 +15,8 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.artefacts import write_json
-from alice_survey.errors import CalibrationError, warn
+from alice_survey.base.artefacts import write_json
+from alice_survey.base.errors import CalibrationError, warn
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.formats.camera_files import (
     MODELS,

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from alice_survey.errors import CalibrationError, warn
+from alice_survey.base.errors import CalibrationError, warn
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.formats.fields import camera_name
 from camera_calib.formats.in_water import Price, in_water

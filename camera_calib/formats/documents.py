@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import yaml
 
-from alice_survey.errors import CalibrationError
+from alice_survey.base.errors import CalibrationError
 from camera_calib.formats.fields import Fields, read_text
 
 

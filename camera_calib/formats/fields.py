@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.errors import CalibrationError
-from alice_survey.frames import Array
+from alice_survey.base.errors import CalibrationError
+from alice_survey.base.frames import Array
 
 _LARGEST_BYTES = 1 << 20
 _MOST_PARTS = 5000

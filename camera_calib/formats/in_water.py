@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.errors import CalibrationError
+from alice_survey.base.errors import CalibrationError
 from camera_calib.approximation.residual import COLMAP_PARAMETERS, Residual, approximations
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.formats.opencv_model import IN_AIR

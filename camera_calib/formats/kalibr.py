@@ -12,8 +12,8 @@ from typing import Any
 import yaml
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.artefacts import atomic_path
-from alice_survey.errors import CalibrationError, warn
+from alice_survey.base.artefacts import atomic_path
+from alice_survey.base.errors import CalibrationError, warn
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.formats.documents import read_yaml
 from camera_calib.formats.fields import Fields

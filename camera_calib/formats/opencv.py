@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.artefacts import atomic_path
-from alice_survey.errors import CalibrationError
+from alice_survey.base.artefacts import atomic_path
+from alice_survey.base.errors import CalibrationError
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.formats.documents import read_storage
 from camera_calib.formats.fields import Fields

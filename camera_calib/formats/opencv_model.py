@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.errors import CalibrationError
-from alice_survey.frames import Array
+from alice_survey.base.errors import CalibrationError
+from alice_survey.base.frames import Array
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.formats.fields import Fields
 from camera_calib.lens import COEFFICIENTS

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.errors import CalibrationError
+from alice_survey.base.errors import CalibrationError
 from camera_calib.formats.fields import read_bytes, read_text
 
 _CAMERA = 0

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.errors import CalibrationError
-from alice_survey.frames import BODY_FROM_NADIR_CAM
+from alice_survey.base.errors import CalibrationError
+from alice_survey.base.frames import BODY_FROM_NADIR_CAM
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.formats.fields import Fields, camera_name
 from camera_calib.rig import Covariance, Rig

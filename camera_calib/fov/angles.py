@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.optimize import brentq
 
-from alice_survey.config import CameraConfig, WaterConfig
-from alice_survey.seawater import n_water as n_water_of_colour
+from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.base.seawater import n_water as n_water_of_colour
 from camera_calib.approximation.virtual_pinhole import best_pinhole, residual_px
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.fov.focus import FocusedLens, apparent_depths, apparent_distance_m

@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from alice_survey.errors import ConfigError
-from alice_survey.frames import Array
+from alice_survey.base.errors import ConfigError
+from alice_survey.base.frames import Array
 from camera_calib.flat_port import FlatPortCamera
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from scipy.optimize import brentq
 
-from alice_survey.config import CameraConfig
+from alice_survey.base.config import CameraConfig
 from camera_calib.fov.angles import AngleRow, angle_of_displacement, angle_table
 from camera_calib.fov.table import MATCH_SIGMA_PX, TRUSTED_FOV_DEG, FovChoices, FovRow, fov_table
 

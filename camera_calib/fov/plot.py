@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from alice_survey.errors import ConfigError
+from alice_survey.base.errors import ConfigError
 from camera_calib.fov.angles import RELIEF, AngleRow
 from camera_calib.fov.paper import PAPER_TABLE
 from camera_calib.fov.table import TRUSTED_FOV_DEG, FovChoices, FovRow

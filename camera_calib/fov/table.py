@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.config import CameraConfig, WaterConfig
-from alice_survey.errors import ConfigError
-from alice_survey.frames import Array
+from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.base.errors import ConfigError
+from alice_survey.base.frames import Array
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.fov.focus import (
     FocusedLens,

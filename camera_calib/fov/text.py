@@ -7,10 +7,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from alice_survey.base.text_table import text_table
 from camera_calib.fov.angles import RELIEF, AngleRow
 from camera_calib.fov.paper import PAPER_RULE, PaperCheck, PaperClaim, Validation
 from camera_calib.fov.table import TRUSTED_FOV_DEG, BlurRow, FovRow
-from camera_calib.text_table import text_table
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from camera_calib.tank.adjust import CAUCHY, Tank
 from camera_calib.tank.files import Detections
 from camera_calib.triangulate import Triangulation

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.contents import one_line
-from alice_survey.errors import CalibrationError, warn
-from alice_survey.frames import Array
+from alice_survey.base.contents import one_line
+from alice_survey.base.errors import CalibrationError, warn
+from alice_survey.base.frames import Array
 from camera_calib.tank.interface import Reference
 
 _HALF_PX = 0.5

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.errors import CalibrationError, warn
-from alice_survey.frames import Array
+from alice_survey.base.errors import CalibrationError, warn
+from alice_survey.base.frames import Array
 from camera_calib.flat_port import PARAMETERS, FlatPortCamera, pose_jacobian
 
 _FEWEST_POINTS = 4

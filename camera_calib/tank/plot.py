@@ -9,7 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from camera_calib.tank.adjust import Tank
 from camera_calib.tank.files import Detections
 from camera_calib.triangulate import Triangulation

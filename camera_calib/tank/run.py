@@ -12,11 +12,18 @@ from typing import Any
 import cv2
 import numpy as np
 
-from alice_survey.artefacts import Stage, read_json, read_stage, run_stage, write_csv, write_json
-from alice_survey.errors import CalibrationError, warn
-from alice_survey.executor import default_threads, parallel_map
-from alice_survey.frames import Array
-from camera_calib.calibration.freedom import LENSES
+from alice_survey.base.artefacts import (
+    Stage,
+    read_json,
+    read_stage,
+    run_stage,
+    write_csv,
+    write_json,
+)
+from alice_survey.base.errors import CalibrationError, warn
+from alice_survey.base.executor import default_threads, parallel_map
+from alice_survey.base.frames import Array
+from camera_calib.calibrate.freedom import LENSES
 from camera_calib.picture_files import is_cut_short, read_pixels
 from camera_calib.rig import write_rig
 from camera_calib.tank.adjust import (

@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from alice_survey.errors import CalibrationError
-from alice_survey.executor import parallel_map
-from alice_survey.frames import Array
-from camera_calib.calibration.freedom import LENSES, intrinsics
+from alice_survey.base.errors import CalibrationError
+from alice_survey.base.executor import parallel_map
+from alice_survey.base.frames import Array
+from camera_calib.calibrate.freedom import LENSES, intrinsics
 from camera_calib.flat_port import PARAMETERS, FlatPortCamera, pose_jacobian
 from camera_calib.lens import COEFFICIENTS
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from camera_calib.text_table import text_table
+from alice_survey.base.text_table import text_table
 
 _POSES = {
     "poses_from_reference_points": "reference points",

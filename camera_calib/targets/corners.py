@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 
 Grey = NDArray[np.uint8] | NDArray[np.float32] | NDArray[np.float64]
 

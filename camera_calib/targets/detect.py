@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from alice_survey.errors import CalibrationError
-from alice_survey.frames import Array
-from camera_calib.calibration.result import Rejection
+from alice_survey.base.errors import CalibrationError
+from alice_survey.base.frames import Array
+from camera_calib.calibrate.result import Rejection
 from camera_calib.targets.corners import (
     ASTRAY,
     FITTED,

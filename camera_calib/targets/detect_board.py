@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from camera_calib.targets.corners import Grey
 from camera_calib.targets.grow import grown_chessboard
 from camera_calib.targets.neighbours import from_neighbours

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from camera_calib.targets.corners import fit_corners
 from camera_calib.targets.neighbours import from_neighbours
 

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 
 _MOST = 24
 _WIDTH = 1.5

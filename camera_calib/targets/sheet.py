@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from alice_survey.artefacts import atomic_path
-from alice_survey.errors import CalibrationError
-from alice_survey.frames import Array
+from alice_survey.base.artefacts import atomic_path
+from alice_survey.base.errors import CalibrationError
+from alice_survey.base.frames import Array
 from camera_calib.targets.pattern import black_rectangles
 from camera_calib.targets.target import Target, parse_target, write_target
 

@@ -26,10 +26,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.artefacts import read_json, write_json
-from alice_survey.contents import one_line
-from alice_survey.errors import CalibrationError
-from alice_survey.frames import Array
+from alice_survey.base.artefacts import read_json, write_json
+from alice_survey.base.contents import one_line
+from alice_survey.base.errors import CalibrationError
+from alice_survey.base.frames import Array
 
 Kind = Literal["chessboard", "charuco", "apriltag"]
 Indices = NDArray[np.intp]

@@ -7,8 +7,8 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from alice_survey.errors import PlanError
-from alice_survey.frames import Array
+from alice_survey.base.errors import PlanError
+from alice_survey.base.frames import Array
 
 Ring = Array
 """(N, 2) corners; the first may or may not be repeated as the last."""

@@ -7,11 +7,11 @@ import shapely
 from shapely.geometry import LineString, MultiPolygon, Point, Polygon
 from shapely.geometry.base import BaseGeometry
 
-from alice_survey.errors import PlanError, warn
-from alice_survey.frames import Array
-from missions.areas.area import multipolygon
+from alice_survey.base.errors import PlanError, warn
+from alice_survey.base.frames import Array
 from missions.areas.crs import LocalFrame
 from missions.areas.raw import RawShapes
+from missions.values.area import multipolygon
 
 SAME_PLACE_M = 1e-3
 """Corners nearer than this are one; a spike is not wider."""

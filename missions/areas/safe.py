@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 from xml.parsers import expat
 
-from alice_survey.errors import PlanError
+from alice_survey.base.errors import PlanError
 
 LARGEST_BYTES = 100_000_000
 """Of a file, and of all that is unpacked from an archive."""

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from alice_survey.config import AreaConfig
-from alice_survey.frames import Array
+from alice_survey.base.config import AreaConfig
+from alice_survey.base.frames import Array
 from missions.areas.raw import RawLine, RawShapes, from_rings, no_points
 
 

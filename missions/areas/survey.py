@@ -9,10 +9,9 @@ import shapely
 from shapely.geometry import LineString, MultiPolygon, Point
 from shapely.geometry.base import BaseGeometry
 
-from alice_survey.config import AreaConfig
-from alice_survey.errors import PlanError, warn
-from alice_survey.frames import Array, Datum
-from missions.areas.area import Area, multipolygon
+from alice_survey.base.config import AreaConfig
+from alice_survey.base.errors import PlanError, warn
+from alice_survey.base.frames import Array, Datum
 from missions.areas.crs import LocalFrame, middle
 from missions.areas.raw import RawShapes
 from missions.areas.repair import (
@@ -25,6 +24,7 @@ from missions.areas.repair import (
     without_slivers,
 )
 from missions.areas.shapes import allowed_shapes, no_go_shapes, survey_shapes
+from missions.values.area import Area, multipolygon
 
 _SMALL_SHARE = 1e-6
 _LOCAL_SETTINGS = ("no_go_ne_m", "allowed_ne_m")

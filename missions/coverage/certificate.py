@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey import progress
-from alice_survey.errors import PlanError, warn
-from alice_survey.frames import Array
+from alice_survey.base.errors import PlanError, warn
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
 from camera_calib.rig import Rig
-from missions.areas.area import Area
 from missions.coverage.raster import (
     Grid,
     border_rays_body,
@@ -23,8 +22,9 @@ from missions.coverage.raster import (
     inside,
 )
 from missions.coverage.stations import Stations
-from missions.footprint import footprint_size_m
-from missions.lines.pattern import Pattern
+from missions.values.area import Area
+from missions.values.footprint import footprint_size_m
+from missions.values.pattern import Pattern
 
 _CELLS_PER_FOOTPRINT = 20.0
 _LEAST_CELLS = 40_000

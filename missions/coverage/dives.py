@@ -14,17 +14,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.contents import shown
-from alice_survey.errors import NavigationError, warn, why
-from alice_survey.frames import Array, rotation_from_attitude
-from alice_survey.manifest import read_manifest
-from alice_survey.trajectory import read_track
+from alice_survey.base.contents import shown
+from alice_survey.base.errors import NavigationError, warn, why
+from alice_survey.base.frames import Array, rotation_from_attitude
+from alice_survey.base.manifest import read_manifest
+from alice_survey.base.trajectory import read_track
 from camera_calib.rig import Rig
 from missions.coverage.passes import assign_lines
 from missions.coverage.stations import MOST_ALTITUDES, Stations
-from missions.footprint import glass_point_cam
 from missions.logs.navigation_csv import NavigationLog, find_zone, read_navigation
-from missions.plan_file import Plan
+from missions.values.footprint import glass_point_cam
+from missions.values.plan_file import Plan
 
 _MOST_TRIGGERS = 1_000_000
 """More than a month of pictures every 3 s: times or intervals beyond are wrong."""

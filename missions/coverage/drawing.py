@@ -16,15 +16,15 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from numpy.typing import NDArray
 from shapely.geometry import MultiPolygon
 
-from alice_survey import progress
-from alice_survey.frames import Array
-from missions.areas.area import Area
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
 from missions.coverage.certificate import Certificate
 from missions.coverage.geofiles import NO_DATA, sampled
 from missions.coverage.holes import Hole
 from missions.coverage.raster import Grid
 from missions.coverage.stations import Stations
-from missions.lines.line import Line
+from missions.values.area import Area
+from missions.values.line import Line
 
 _AREA, _HOLE, _TRACK, _AGAIN = "#17202a", "#c0392b", "#17202a", "#d35400"
 _NONE = "#f5b7b1"

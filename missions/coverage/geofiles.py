@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.artefacts import atomic_path
-from alice_survey.frames import Array
+from alice_survey.base.artefacts import atomic_path
+from alice_survey.base.frames import Array
 from missions.coverage.certificate import Certificate
 from missions.coverage.holes import Hole
 

@@ -8,9 +8,9 @@ import numpy as np
 import shapely
 from shapely.geometry import MultiPolygon, mapping
 
-from alice_survey.frames import Array, Datum
-from missions.areas.area import multipolygon
+from alice_survey.base.frames import Array, Datum
 from missions.coverage.certificate import Certificate
+from missions.values.area import multipolygon
 
 
 @dataclass(frozen=True, kw_only=True)

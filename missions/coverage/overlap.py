@@ -9,12 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alice_survey.errors import PlanError
-from alice_survey.frames import Array, rotation_from_attitude
+from alice_survey.base.errors import PlanError
+from alice_survey.base.frames import Array, rotation_from_attitude
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.rig import Rig
 from missions.coverage.stations import Stations
-from missions.footprint import glass_point_cam
+from missions.values.footprint import glass_point_cam
 
 _POINTS = 1001
 _PARALLEL = math.cos(math.radians(10.0))

@@ -5,9 +5,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from missions.coverage.stations import Stations
-from missions.plan_file import Plan
+from missions.values.plan_file import Plan
 
 _ALIKE_RAD = math.radians(45.0)
 """A vehicle that crabs or yaws by less than this still flies its line (inferred: half way to a line

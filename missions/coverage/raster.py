@@ -14,10 +14,10 @@ import shapely
 from numba import njit
 from numpy.typing import NDArray
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from camera_calib.rig import Rig
-from missions.areas.area import Area
-from missions.footprint import glass_point_cam
+from missions.values.area import Area
+from missions.values.footprint import glass_point_cam
 
 _POINTS_PER_SIDE = 16
 """Of a footprint's border. Chords of so short arcs leave out less than 1e-4 of its width."""

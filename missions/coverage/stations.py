@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.frames import Array, attitude_from_rotation, interpolate_poses
+from alice_survey.base.frames import Array, attitude_from_rotation, interpolate_poses
 from camera_calib.rig import Rig
-from missions.footprint import common_swath
-from missions.lines.line import Line
-from missions.lines.pattern import Pattern, pattern
-from missions.plan_file import Plan
+from missions.values.footprint import common_swath
+from missions.values.line import Line
+from missions.values.pattern import Pattern, pattern
+from missions.values.plan_file import Plan
 
 if TYPE_CHECKING:
-    from missions.flight import Flight
+    from missions.values.flight import Flight
 
 MOST_ALTITUDES = 1.5
 """Pictures from more planned altitudes than this do not count: their pixels on the sea floor are

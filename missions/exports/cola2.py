@@ -14,7 +14,7 @@ from missions.exports.mount import Mount
 from missions.exports.options import Options
 from missions.exports.text import child, degrees, metres, write_xml
 from missions.exports.waypoints import Waypoint
-from missions.plan_file import Plan
+from missions.values.plan_file import Plan
 
 _DEPTH, _ALTITUDE, _BOTH = 0, 1, 2
 """Version 2.0's heave modes. Both: altitude where the altimeter sees the floor, else depth."""

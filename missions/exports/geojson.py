@@ -9,14 +9,14 @@ import numpy as np
 import shapely
 from shapely.geometry import MultiPolygon
 
-from alice_survey.artefacts import atomic_path
-from alice_survey.executor import progress
-from alice_survey.frames import Array, Datum
+from alice_survey.base.artefacts import atomic_path
+from alice_survey.base.executor import progress
+from alice_survey.base.frames import Array, Datum
 from camera_calib.rig import Rig
-from missions.coverage.footprints import footprint_outline, footprints_ne
+from missions.exports.footprints import footprint_outline, footprints_ne
 from missions.exports.places import lat_lon, polygons, rings_ne, route_ne
 from missions.exports.tables import write_lines
-from missions.plan_file import Plan
+from missions.values.plan_file import Plan
 
 __all__ = ["write_geojson", "write_lines"]
 

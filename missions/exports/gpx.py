@@ -9,7 +9,7 @@ import numpy as np
 from missions.exports.places import lat_lon
 from missions.exports.text import child, degrees, metres, write_xml
 from missions.exports.waypoints import Waypoint
-from missions.plan_file import Plan
+from missions.values.plan_file import Plan
 
 _GPX = "http://www.topografix.com/GPX/1/1"
 

@@ -7,12 +7,12 @@ from xml.etree.ElementTree import Element, register_namespace
 import numpy as np
 from shapely.geometry import MultiPolygon
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from camera_calib.rig import Rig
-from missions.coverage.footprints import footprint_outline, footprints_ne
+from missions.exports.footprints import footprint_outline, footprints_ne
 from missions.exports.places import lat_lon, polygons, rings_ne, route_ne
 from missions.exports.text import child, degrees, metres, write_xml
-from missions.plan_file import Plan
+from missions.values.plan_file import Plan
 
 _KML = "http://www.opengis.net/kml/2.2"
 _STYLES = {

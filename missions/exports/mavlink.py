@@ -10,8 +10,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from missions.exports.waypoints import Waypoint
-from missions.plan_file import Plan
-from missions.route.costs import time_costs
+from missions.values.costs import time_costs
+from missions.values.plan_file import Plan
 
 FRAME_GLOBAL, FRAME_MISSION, FRAME_ABOVE_HOME, FRAME_ABOVE_TERRAIN = 0, 2, 3, 10
 NAV_WAYPOINT, CONDITION_YAW, DO_CHANGE_SPEED, DO_SET_CAM_TRIGG_DIST = 16, 115, 178, 206

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alice_survey.config import CameraConfig
-from alice_survey.frames import Array
+from alice_survey.base.config import CameraConfig
+from alice_survey.base.frames import Array
 from camera_calib.rig import Rig
-from missions.footprint import glass_point_cam
+from missions.values.footprint import glass_point_cam
 
 _ALTIMETER_BODY_M: tuple[float, float, float] = CameraConfig().dvl_position_body_m
 

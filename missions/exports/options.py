@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass
 
-from alice_survey.config import CameraConfig
-from alice_survey.errors import PlanError
+from alice_survey.base.config import CameraConfig
+from alice_survey.base.errors import PlanError
 from camera_calib.rig import Rig
-from missions.footprint import common_swath
-from missions.plan_file import Plan
+from missions.values.footprint import common_swath
+from missions.values.plan_file import Plan
 
 _LEAST_TOLERANCE_M = 0.12
 """The cross-track error that the paper's vehicle holds with its improved controller: a vehicle told

@@ -7,8 +7,8 @@ import numpy as np
 import shapely
 from shapely.geometry import MultiPolygon, Polygon
 
-from alice_survey.frames import Array, Datum
-from missions.route.legs import Leg, Route
+from alice_survey.base.frames import Array, Datum
+from missions.values.legs import Leg, Route
 
 CHORD_M = 0.02
 """How far the chords that stand for an arc may lie off it."""

@@ -14,9 +14,9 @@ import numpy as np
 import shapely
 from shapely.geometry import Polygon
 
-from alice_survey.artefacts import write_json
-from alice_survey.errors import warn
-from alice_survey.frames import Array
+from alice_survey.base.artefacts import write_json
+from alice_survey.base.errors import warn
+from alice_survey.base.frames import Array
 from camera_calib.rig import Rig
 from missions.exports.mavlink import (
     DO_SET_CAM_TRIGG_DIST,
@@ -30,7 +30,7 @@ from missions.exports.mount import Mount
 from missions.exports.options import Options
 from missions.exports.places import grown, lat_lon
 from missions.exports.waypoints import Waypoint
-from missions.plan_file import Plan
+from missions.values.plan_file import Plan
 
 _ARDUPILOT, _SUBMARINE = 3, 12
 """MAV_AUTOPILOT_ARDUPILOTMEGA and MAV_TYPE_SUBMARINE."""

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.artefacts import write_csv
+from alice_survey.base.artefacts import write_csv
 from missions.exports.places import lat_lon
 from missions.exports.waypoints import Waypoint
-from missions.plan_file import Plan
+from missions.values.plan_file import Plan
 
 
 def write_lines(path: Path, plan: Plan) -> None:

@@ -7,13 +7,13 @@ from typing import Literal
 
 import numpy as np
 
-from alice_survey.errors import PlanError
-from alice_survey.frames import Array
+from alice_survey.base.errors import PlanError
+from alice_survey.base.frames import Array
 from missions.exports.mount import Mount
 from missions.exports.places import chords
-from missions.plan_file import Dive, Plan
-from missions.route.costs import time_costs
-from missions.route.legs import Leg
+from missions.values.costs import time_costs
+from missions.values.legs import Leg
+from missions.values.plan_file import Dive, Plan
 
 Kind = Literal["descend", "way", "run-in", "turn", "sway", "line", "surface"]
 """How a way-point is reached. way: freely. run-in: straight, on the course of the line that

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from alice_survey.artefacts import atomic_path
+from alice_survey.base.artefacts import atomic_path
 from missions.exports.mavlink import FRAME_GLOBAL, NAV_WAYPOINT, Item
 from missions.exports.text import degrees
 

@@ -7,11 +7,11 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from alice_survey import progress
-from alice_survey.artefacts import atomic_path, read_stage
-from alice_survey.config import SurveyConfig, parse_config
-from alice_survey.errors import PlanError
-from alice_survey.frames import Array
+from alice_survey.base.artefacts import atomic_path, read_stage
+from alice_survey.base.config import SurveyConfig, parse_config
+from alice_survey.base.errors import PlanError
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
 from camera_calib.rig import Rig, design_rig
 from missions.exports.cola2 import write_cola2, write_cola2_v1
 from missions.exports.geojson import write_geojson
@@ -25,7 +25,7 @@ from missions.exports.qgroundcontrol import write_qgroundcontrol, write_qgroundc
 from missions.exports.tables import write_lines, write_stations, write_waypoints
 from missions.exports.waypoints import Waypoint, all_waypoints
 from missions.exports.wpl import write_wpl
-from missions.plan_file import Plan, read_plan
+from missions.values.plan_file import Plan, read_plan
 
 Format = Literal["cola2", "cola2-v1", "qgc", "qgc-survey", "wpl", "kml", "gpx", "geojson", "csv"]
 FORMATS: tuple[Format, ...] = get_args(Format)

@@ -11,8 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.compiled import compiled
-from alice_survey.frames import Array
+from alice_survey.base.compiled import compiled
+from alice_survey.base.frames import Array
 from missions.lines.hops import Prices, hop_j, line_j
 
 CORNERS = 4

@@ -14,11 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from shapely.geometry import MultiPolygon
 
-from alice_survey.compiled import compiled
-from alice_survey.frames import Array
-from missions.areas.area import Area
-from missions.lines.line import Line
-from missions.lines.pattern import Pattern
+from alice_survey.base.compiled import compiled
+from alice_survey.base.frames import Array
 from missions.lines.rows import rooms, to_uv
 from missions.lines.site import Site, edges_of
 from missions.lines.unseen import (
@@ -32,6 +29,9 @@ from missions.lines.unseen import (
     pictures_of,
     unseen,
 )
+from missions.values.area import Area
+from missions.values.line import Line
+from missions.values.pattern import Pattern
 
 LEFT_SHARE = 0.0003
 """Share of the area that may be left: the least share that matters where 99.9 % is asked for."""

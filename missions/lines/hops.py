@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from alice_survey.compiled import compiled
-from alice_survey.frames import Array
-from missions.route.costs import Costs
+from alice_survey.base.compiled import compiled
+from alice_survey.base.frames import Array
 from missions.route.joins import LONGEST_SWAY_M
+from missions.values.costs import Costs
 
 NOWHERE_J = 1e15
 """Beyond any battery: stands for what cannot be flown, so that the rest can still be compared."""

@@ -13,18 +13,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey import progress
-from alice_survey.compiled import tell_of_compiling
-from alice_survey.errors import PlanError
-from alice_survey.frames import Array
-from missions.areas.area import Area
+from alice_survey.base.compiled import tell_of_compiling
+from alice_survey.base.errors import PlanError
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
 from missions.lines import cells, cross, hops, rows, tour
 from missions.lines.fill import fill_table
-from missions.lines.line import Line, LineKind
-from missions.lines.pattern import Pattern
 from missions.lines.site import Site
-from missions.route.costs import Costs
 from missions.route.ways import Ways
+from missions.values.area import Area
+from missions.values.costs import Costs
+from missions.values.line import Line, LineKind
+from missions.values.pattern import Pattern
 
 MOST_STATIONS = 100_000
 """Most stations of a plan. Chosen: days of flight, and terabytes of pictures."""

@@ -15,8 +15,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.compiled import compiled
-from alice_survey.frames import Array
+from alice_survey.base.compiled import compiled
+from alice_survey.base.frames import Array
 
 TOUCH_M = 1e-7
 """Strips are this much narrower at both sides, so that an area that only touches a strip does not

@@ -6,8 +6,8 @@ import numpy as np
 import shapely
 from shapely.geometry import MultiPolygon
 
-from alice_survey.frames import Array
-from missions.areas.area import Area
+from alice_survey.base.frames import Array
+from missions.values.area import Area
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

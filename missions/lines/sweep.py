@@ -22,18 +22,18 @@ from itertools import islice
 import numpy as np
 import shapely
 
-from alice_survey.compiled import compiled
-from alice_survey.errors import PlanError
-from alice_survey.executor import progress
-from alice_survey.frames import Array
-from alice_survey.progress import step
-from missions.areas.area import Area
+from alice_survey.base.compiled import compiled
+from alice_survey.base.errors import PlanError
+from alice_survey.base.executor import progress
+from alice_survey.base.frames import Array
+from alice_survey.base.run.progress import step
 from missions.lines import cells, hops, rows
 from missions.lines.lay import check_size, laid, tell_of_planner
-from missions.lines.pattern import Pattern
 from missions.lines.site import Site
-from missions.route.costs import Costs
 from missions.route.ways import Ways
+from missions.values.area import Area
+from missions.values.costs import Costs
+from missions.values.pattern import Pattern
 
 _ESTIMATES = 1800
 """Headings at which the cost is estimated, a tenth of a degree apart, if lines are few."""

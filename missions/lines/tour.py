@@ -10,8 +10,8 @@ again.
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.compiled import compiled
-from alice_survey.frames import Array
+from alice_survey.base.compiled import compiled
+from alice_survey.base.frames import Array
 from missions.lines.cells import CORNERS
 
 EXACT = 8

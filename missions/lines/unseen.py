@@ -10,10 +10,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.compiled import compiled
-from alice_survey.frames import Array
-from missions.lines.pattern import Pattern
+from alice_survey.base.compiled import compiled
+from alice_survey.base.frames import Array
 from missions.lines.rows import stretches, united
+from missions.values.pattern import Pattern
 
 U, V, LENGTH, WIDTH, LINES, PICTURES = range(6)
 """Columns of a patch: its middle along and across, its size, and how often it is seen."""

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.errors import NavigationError
-from alice_survey.frames import Array, Datum
+from alice_survey.base.errors import NavigationError
+from alice_survey.base.frames import Array, Datum
 from missions.logs.dataflash import Mask, Table, read_dataflash
 from missions.logs.dive import DATED_AFTER_S, LoggedDive, Signal, cleaned, usable_positions
 from missions.logs.tlog import COMPONENT, RECORDED, SYSTEM, read_tlog

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.errors import WorkspaceError
-from alice_survey.executor import progress
-from alice_survey.frames import Array, Datum, rotation_from_attitude
+from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.executor import progress
+from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from missions.logs import messages as kinds
 from missions.logs.messages import Messages, as_nanoseconds
 from missions.logs.ros_frames import flipped_body, flipped_quaternion, flipped_world

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.contents import shown
-from alice_survey.errors import NavigationError
-from alice_survey.frames import Array, Datum, rotation_from_attitude
+from alice_survey.base.contents import shown
+from alice_survey.base.errors import NavigationError
+from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from missions.logs.dive import LoggedDive, Signal
 
 COLUMNS = (

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.errors import NavigationError
-from alice_survey.frames import Array
+from alice_survey.base.errors import NavigationError
+from alice_survey.base.frames import Array
 
 ROLES = ("navigation", "depth", "attitude", "altitude")
 """What of a log may be chosen by name."""

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.artefacts import write_csv
-from alice_survey.errors import NavigationError, warn
-from alice_survey.frames import Array, Datum, rotation_from_attitude
+from alice_survey.base.artefacts import write_csv
+from alice_survey.base.errors import NavigationError, warn
+from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from missions.logs.corrections import (
     COLUMNS,
     Corrections,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore

@@ -10,9 +10,9 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
 
-from alice_survey.contents import shown
-from alice_survey.errors import NavigationError, warn, why
-from alice_survey.frames import Array
+from alice_survey.base.contents import shown
+from alice_survey.base.errors import NavigationError, warn, why
+from alice_survey.base.frames import Array
 
 POSITION = ("latitude_deg", "longitude_deg", "depth_m")
 OPTIONAL = (

@@ -10,8 +10,8 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
 
-from alice_survey.contents import shown
-from alice_survey.errors import NavigationError
+from alice_survey.base.contents import shown
+from alice_survey.base.errors import NavigationError
 from missions.logs.dive import LoggedDive, cleaned, usable_positions
 
 _TIME = "Timestamp"

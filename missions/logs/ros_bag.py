@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from alice_survey.contents import one_line
-from alice_survey.errors import NavigationError
-from alice_survey.executor import progress
-from alice_survey.frames import Array, Datum, attitude_from_rotation
+from alice_survey.base.contents import one_line
+from alice_survey.base.errors import NavigationError
+from alice_survey.base.executor import progress
+from alice_survey.base.frames import Array, Datum, attitude_from_rotation
 from missions.logs.bag_chunks import bounded_chunks
 from missions.logs.dive import DATED_AFTER_S, LoggedDive, Signal, cleaned, usable_positions
 from missions.logs.ros_rows import (

@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from alice_survey.errors import NavigationError
+from alice_survey.base.errors import NavigationError
 from missions.logs.dataflash import Table
 from missions.logs.mavlink import LONGEST, MESSAGES, V1, V2, Message, Packet, packet_at
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from alice_survey.frames import Array
-from missions.route.costs import Costs
-from missions.route.legs import Route
+from alice_survey.base.frames import Array
+from missions.values.costs import Costs
+from missions.values.legs import Route
 
 _FULL = 2 * np.pi
 

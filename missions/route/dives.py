@@ -13,16 +13,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alice_survey import progress
-from alice_survey.errors import PlanError
-from alice_survey.frames import Array
-from missions.lines.line import Line
-from missions.plan_file import Dive
+from alice_survey.base.errors import PlanError
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
 from missions.route.cost import leg_costs
-from missions.route.costs import Costs
-from missions.route.legs import Route
 from missions.route.turns import Turns, route_through
 from missions.route.ways import Ways
+from missions.values.costs import Costs
+from missions.values.legs import Route
+from missions.values.line import Line
+from missions.values.plan_file import Dive
 
 _J_PER_WH = 3600.0
 

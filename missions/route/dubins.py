@@ -9,11 +9,11 @@ import math
 
 import numpy as np
 
-from alice_survey.compiled import compiled_ieee
-from alice_survey.errors import PlanError
-from alice_survey.frames import Array
+from alice_survey.base.compiled import compiled_ieee
+from alice_survey.base.errors import PlanError
+from alice_survey.base.frames import Array
 from missions.route.fence import OPEN_WATER, Fence, arc_inside
-from missions.route.legs import Leg
+from missions.values.legs import Leg
 
 _SAME_M = 1e-6
 _TINY = 1e-9

@@ -30,15 +30,15 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.config import SurveyConfig, VehicleConfig
-from alice_survey.errors import PlanError
-from alice_survey.frames import Array
+from alice_survey.base.config import SurveyConfig, VehicleConfig
+from alice_survey.base.errors import PlanError
+from alice_survey.base.frames import Array
+from alice_survey.vehicle.files import coefficients_from_file
 from alice_survey.vehicle.fleet import vehicle
-from alice_survey.vehicle.identification.files import coefficients_from_file
 from alice_survey.vehicle.pilot.gains import STEADY_SHARE
 from alice_survey.vehicle.steady import steady_flight
 from alice_survey.vehicle.vehicle import Vehicle
-from missions.route.costs import SETTLE_S, SPOT_RAD_S, STEP_MPS, Costs
+from missions.values.costs import SETTLE_S, SPOT_RAD_S, STEP_MPS, Costs
 
 Manner = Literal["held", "crab"]
 """Of meeting a current from the side: heading held, by sway; or heading turned into it."""
@@ -154,7 +154,7 @@ def _flies_heading(
 
 
 def _refused(config: SurveyConfig, what: str) -> PlanError:
-    from missions.route.strength import too_strong  # only then: it tries much
+    from missions.plan.strength import too_strong  # only then: it tries much
 
     return too_strong(config, what)
 

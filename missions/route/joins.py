@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.compiled import compiled_ieee
-from alice_survey.frames import Array
-from missions.route.costs import Costs
+from alice_survey.base.compiled import compiled_ieee
+from alice_survey.base.frames import Array
 from missions.route.dubins import moved, shortest_turn
 from missions.route.fence import Fence, straight_inside
+from missions.values.costs import Costs
 
 NONE, AHEAD, ARCS, SPOT, SWAY = 0, 1, 2, 3, 4
 """How two lines are joined; nothing direct, and straight on."""

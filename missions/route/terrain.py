@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.errors import PlanError, warn
-from alice_survey.frames import Array
+from alice_survey.base.errors import PlanError, warn
+from alice_survey.base.frames import Array
 from missions.areas.bathymetry import Bathymetry
-from missions.lines.line import Line
+from missions.values.line import Line
 
 NOSE_M, TAIL_M = 0.8545, 0.734
 """Ends of the hull from its centre of buoyancy (public model of SPARUS II in Stonefish)."""

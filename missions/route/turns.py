@@ -13,14 +13,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.errors import PlanError, warn
-from alice_survey.frames import Array
-from missions.lines.line import Line
+from alice_survey.base.errors import PlanError, warn
+from alice_survey.base.frames import Array
 from missions.route import joins
-from missions.route.costs import Costs, time_costs
 from missions.route.fence import OPEN_WATER, TOUCH_M, Fence, straight_inside
-from missions.route.legs import Leg, Route
 from missions.route.ways import Ways
+from missions.values.costs import Costs, time_costs
+from missions.values.legs import Leg, Route
+from missions.values.line import Line
 
 Turns = Literal["auto", "arcs", "spot", "sway"]
 

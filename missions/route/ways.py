@@ -17,9 +17,9 @@ from scipy.sparse.csgraph import dijkstra
 from shapely.geometry import MultiPolygon
 from shapely.geometry.polygon import orient
 
-from alice_survey.compiled import compiled_ieee
-from alice_survey.errors import PlanError
-from alice_survey.frames import Array
+from alice_survey.base.compiled import compiled_ieee
+from alice_survey.base.errors import PlanError
+from alice_survey.base.frames import Array
 from missions.route.fence import TOUCH_M, Fence, fence_of, point_inside, straight_inside
 
 Place = tuple[float, float]

@@ -12,10 +12,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from alice_survey.artefacts import write_json
+from alice_survey.base.artefacts import write_json
 from reconstruct.dense.dem import DemGrid, bin_points, sorted_ranks
 from reconstruct.dense.points import Points
-from reconstruct.model import WorldFrame
+from reconstruct.views.model import WorldFrame
 
 Float32 = NDArray[np.float32]
 

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from reconstruct.dense.points import Points
 
 Float32 = NDArray[np.float32]

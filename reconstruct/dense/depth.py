@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from reconstruct.dense.rectify import Rectification, depth_in_reference, rectify, warp
-from reconstruct.model import View
+from reconstruct.views.model import View
 
 MATCH_SIGMA_PX = 0.3
 """Standard deviation of a match that semi-global matching finds, before a survey tells its own."""

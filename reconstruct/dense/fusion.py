@@ -10,8 +10,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from alice_survey.frames import Array
-from reconstruct.dense.sight import FAST, KernelLens, pixel_at
+from alice_survey.base.frames import Array
+from reconstruct.views.sight import FAST, KernelLens, pixel_at
 
 Float32 = NDArray[np.float32]
 

@@ -7,10 +7,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from alice_survey.frames import Array
-from reconstruct.dense.sight import FAST, KernelLens, lens_of, slopes_of
-from reconstruct.dense.sight import pinhole_of as pinhole_of  # the mosaic takes it from here
-from reconstruct.model import View
+from alice_survey.base.frames import Array
+from reconstruct.views.model import View
+from reconstruct.views.sight import FAST, KernelLens, lens_of, slopes_of
+from reconstruct.views.sight import pinhole_of as pinhole_of  # the mosaic takes it from here
 
 Float32 = NDArray[np.float32]
 

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from alice_survey import progress
-from alice_survey.errors import warn
-from alice_survey.frames import Array
-from reconstruct.model import SparseModel
+from alice_survey.base.errors import warn
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
+from reconstruct.views.model import SparseModel
 
 _COMPANY = 16
 """Sparse points around a spot of which the median counts: a single one may be a wrong match."""
@@ -107,8 +107,8 @@ def _down_in_mapping(folder: Path, model: SparseModel, ids: NDArray[np.int64]) -
 
     None where the points of the mapping (with these ids) are not those of the placed model.
     """
-    from reconstruct.model_files import read_reconstruction
-    from reconstruct.sparse.alignment import align_similarity
+    from reconstruct.placing.alignment import align_similarity
+    from reconstruct.views.model_files import read_reconstruction
 
     mapped = read_reconstruction(folder).points3D
     if not 3 <= len(ids) == len(model.points_world) or any(int(i) not in mapped for i in ids):

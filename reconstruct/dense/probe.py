@@ -14,14 +14,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.executor import parallel_map
-from alice_survey.frames import Array
+from alice_survey.base.executor import parallel_map
+from alice_survey.base.frames import Array
 from reconstruct.dense.depth import MATCH_SIGMA_PX, pair_depth
 from reconstruct.dense.rectify import scaled_view
 from reconstruct.dense.stereo_pairs import StereoPair
-from reconstruct.model import View
 from reconstruct.pictures.normalise import normalise
 from reconstruct.pictures.undistorted import Pictures
+from reconstruct.views.model import View
 
 LARGEST_PIXELS = 3_000_000
 """Pictures with more pixels are halved for matching, until they have fewer."""

@@ -14,9 +14,9 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from alice_survey.frames import Array
-from reconstruct.dense.sight import FAST, KernelLens, field_of, lens_of
-from reconstruct.model import View
+from alice_survey.base.frames import Array
+from reconstruct.views.model import View
+from reconstruct.views.sight import FAST, KernelLens, field_of, lens_of
 
 _LEAST_COSINE = 0.75
 """Of the angle by which a view may be turned."""

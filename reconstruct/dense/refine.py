@@ -22,9 +22,9 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from alice_survey.frames import Array
-from reconstruct.dense.sight import FAST, KernelLens, field_of, lens_of, pixel_at
-from reconstruct.model import View
+from alice_survey.base.frames import Array
+from reconstruct.views.model import View
+from reconstruct.views.sight import FAST, KernelLens, field_of, lens_of, pixel_at
 
 Float32 = NDArray[np.float32]
 

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.artefacts import Stage, need_stage, run_stage, write_json
-from alice_survey.config import ReconstructConfig, SurveyConfig
-from alice_survey.contents import taken_from
-from alice_survey.errors import ReconstructionError, warn
-from alice_survey.executor import parallel_map
+from alice_survey.base.artefacts import Stage, need_stage, run_stage, write_json
+from alice_survey.base.config import ReconstructConfig, SurveyConfig
+from alice_survey.base.contents import taken_from
+from alice_survey.base.errors import ReconstructionError, warn
+from alice_survey.base.executor import parallel_map
 from reconstruct.dense.cloud import laz_writer, voxel_edge, write_cloud_json, write_ply
 from reconstruct.dense.dem import FILL_CELLS, DemGrid, grid_over, round_cell
 from reconstruct.dense.pose_part import find_pose_part
@@ -40,9 +40,9 @@ from reconstruct.dense.views import (
     refine_view,
     view_depth,
 )
-from reconstruct.model import SparseModel, WorldFrame, read_model
-from reconstruct.mosaic.light import joined_samples, solve_light, write_light
+from reconstruct.light.solve import joined_samples, solve_light, write_light
 from reconstruct.raster import preview_dem, tiled_raster
+from reconstruct.views.model import SparseModel, WorldFrame, read_model
 
 CELL_PIXELS = 2.5
 """Side of a DEM cell in mean ground pixels of the pictures as matched, unless depth is coarser."""
@@ -89,7 +89,7 @@ def run_dense(workspace: Path, config: SurveyConfig, threads: int) -> bool:
 
 def picture_files(workspace: Path, sparse: Path, model: SparseModel) -> list[Path]:
     """The registered pictures and their masks."""
-    from alice_survey.artefacts import read_json
+    from alice_survey.base.artefacts import read_json
 
     images = workspace / "images"
     names = [view.image for view in model.views]

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.spatial import cKDTree
 
-from alice_survey import progress
-from alice_survey.errors import ReconstructionError
-from alice_survey.frames import Array
-from reconstruct.model import SparseModel, View
+from alice_survey.base.errors import ReconstructionError
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
+from reconstruct.views.model import SparseModel, View
 
 LEAST_POINTS = 8
 """Sparse points that a view must see for its range of depths to be known."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rasterio.windows import Window
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from reconstruct.dense.cloud import thinned_points
 from reconstruct.dense.dem import (
     FILL_CELLS,
@@ -23,9 +23,9 @@ from reconstruct.dense.dem import (
 from reconstruct.dense.points import joined, points_in_box
 from reconstruct.dense.pose_part import PosePart, spread_over
 from reconstruct.dense.view_store import ViewStore
-from reconstruct.model import View
-from reconstruct.mosaic.light import LightModel, LightSamples
+from reconstruct.light.solve import LightModel, LightSamples
 from reconstruct.raster import tiles_of
+from reconstruct.views.model import View
 
 _TILE_CELLS = 256
 _WORST_CELLS = 1.0

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.artefacts import atomic_path
+from alice_survey.base.artefacts import atomic_path
 
 _DEPTH_STEP = 2e-5
 """Relative: depths are rounded by 0.02 mm at most at 2 m, and span a factor of 3.7."""

@@ -13,20 +13,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.executor import parallel_map
-from alice_survey.frames import Array
+from alice_survey.base.executor import parallel_map
+from alice_survey.base.frames import Array
 from reconstruct.dense.depth import pair_depth
 from reconstruct.dense.fusion import GATE_SIGMAS, count_witnesses, merge_depths
 from reconstruct.dense.points import block_bounds
 from reconstruct.dense.probe import open_pictures, shrunk
 from reconstruct.dense.refine import Look, prepared, refine
-from reconstruct.dense.sight import lens_of, slopes_of
 from reconstruct.dense.stereo_pairs import StereoPair, in_frame
 from reconstruct.dense.tiles import ViewSummary
 from reconstruct.dense.view_store import ViewStore
-from reconstruct.model import View
-from reconstruct.mosaic.light import LightSamples, at_nodes, compare_light, joined_samples, low_pass
+from reconstruct.light.solve import LightSamples, at_nodes, compare_light, joined_samples, low_pass
 from reconstruct.pictures.normalise import normalise
+from reconstruct.views.model import View
+from reconstruct.views.sight import lens_of, slopes_of
 
 _BOUND_PERCENT = 0.1
 """Share of a view's points left out on each of its four sides, so that none strays far off."""

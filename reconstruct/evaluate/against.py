@@ -6,15 +6,15 @@ from typing import Any
 import numpy as np
 import rasterio
 
-from alice_survey import progress
-from alice_survey.artefacts import write_json
-from alice_survey.errors import ReconstructionError, WorkspaceError, warn
+from alice_survey.base.artefacts import write_json
+from alice_survey.base.errors import ReconstructionError, WorkspaceError, warn
+from alice_survey.base.run import progress
 from reconstruct.dense.dem import DemGrid
 from reconstruct.evaluate.change import SIGNIFICANT, Change, find_change, without
 from reconstruct.evaluate.elevation import Elevation, enu_from_enu, read_elevation
 from reconstruct.evaluate.height_registration import HeightFit, refine_heights, register_heights
-from reconstruct.model import WorldFrame
 from reconstruct.raster import BLOCK, crs_of, frame_tags, transform_of
+from reconstruct.views.model import WorldFrame
 
 _MUCH = 0.5
 """Share of the ground that is seldom found changed between two surveys."""

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey import progress
-from alice_survey.errors import WorkspaceError
-from alice_survey.frames import Array
+from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
 from reconstruct.evaluate.figures import rms
 from reconstruct.evaluate.truth import read_true_poses
-from reconstruct.sparse.alignment import align_rigid, align_similarity
+from reconstruct.placing.alignment import align_rigid, align_similarity
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

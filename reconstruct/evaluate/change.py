@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import find_objects
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from reconstruct.evaluate.elevation import Elevation
 from reconstruct.evaluate.figures import MAD_TO_SIGMA, rms, rounded
 from reconstruct.evaluate.height_registration import HeightFit

@@ -7,8 +7,8 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from alice_survey.artefacts import atomic_path
-from alice_survey.frames import Array
+from alice_survey.base.artefacts import atomic_path
+from alice_survey.base.frames import Array
 from reconstruct.evaluate.change import SIGNIFICANT, Change
 from reconstruct.evaluate.elevation import Elevation
 from reconstruct.raster import hillshade

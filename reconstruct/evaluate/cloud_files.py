@@ -13,10 +13,10 @@ from typing import BinaryIO
 
 import numpy as np
 
-from alice_survey.artefacts import need_stage
-from alice_survey.contents import one_line
-from alice_survey.errors import ReconstructionError, WorkspaceError, why
-from alice_survey.frames import Array, Datum
+from alice_survey.base.artefacts import need_stage
+from alice_survey.base.contents import one_line
+from alice_survey.base.errors import ReconstructionError, WorkspaceError, why
+from alice_survey.base.frames import Array, Datum
 from reconstruct.evaluate.ply_points import read_ply_points
 
 _MOST_POINTS = 2_000_000

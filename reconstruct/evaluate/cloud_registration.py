@@ -10,10 +10,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from alice_survey.errors import ReconstructionError
-from alice_survey.frames import Array
+from alice_survey.base.errors import ReconstructionError
+from alice_survey.base.frames import Array
 from reconstruct.evaluate.figures import MAD_TO_SIGMA
-from reconstruct.sparse.alignment import Similarity
+from reconstruct.placing.alignment import Similarity
 
 _TUKEY = 4.685
 _NEIGHBOURS = 12

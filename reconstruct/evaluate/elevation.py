@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.artefacts import need_stage
-from alice_survey.errors import ReconstructionError
-from alice_survey.frames import Array, Datum
-from reconstruct.model import WorldFrame, read_frame
+from alice_survey.base.artefacts import need_stage
+from alice_survey.base.errors import ReconstructionError
+from alice_survey.base.frames import Array, Datum
+from reconstruct.placing.alignment import align_rigid
 from reconstruct.raster import opened_raster
-from reconstruct.sparse.alignment import align_rigid
+from reconstruct.views.model import WorldFrame, read_frame
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution over the median of its absolute values."""

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.signal import fftconvolve
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.errors import ReconstructionError
-from alice_survey.frames import Array
+from alice_survey.base.errors import ReconstructionError
+from alice_survey.base.frames import Array
 from reconstruct.evaluate.elevation import Elevation
 from reconstruct.evaluate.figures import MAD_TO_SIGMA
 

@@ -8,11 +8,11 @@ import shapely
 from scipy.spatial.transform import RigidTransform
 from shapely.geometry import MultiPolygon
 
-from alice_survey import progress
-from alice_survey.artefacts import read_json
-from alice_survey.contents import taken_from
-from alice_survey.errors import WorkspaceError
-from alice_survey.frames import Array
+from alice_survey.base.artefacts import read_json
+from alice_survey.base.contents import taken_from
+from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
 from alice_survey.seafloor.terrain import Terrain
 from reconstruct.evaluate.figures import rms, rounded
 from reconstruct.evaluate.truth import surface_depth, surface_distance

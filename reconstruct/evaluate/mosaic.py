@@ -12,8 +12,8 @@ from rasterio.windows import Window
 from scipy.spatial.transform import RigidTransform
 from shapely.geometry import MultiPolygon, box
 
-from alice_survey import progress
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
 from alice_survey.seafloor.terrain import Terrain
 from alice_survey.seafloor.texture import Texture
 from reconstruct.evaluate.truth import surface_depth, surface_material

@@ -12,8 +12,8 @@ from shapely.geometry.base import BaseGeometry
 from shapely.ops import unary_union
 
 from camera_calib.rig import read_rig
-from missions.footprint import footprint_polygon
-from missions.plan_file import Plan, read_plan
+from missions.values.footprint import footprint_polygon
+from missions.values.plan_file import Plan, read_plan
 from reconstruct.evaluate.truth import read_true_poses
 
 _PARALLEL = 1e-3

@@ -9,9 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from shapely.geometry import MultiPolygon
 
-from alice_survey import progress
-from alice_survey.artefacts import atomic_path
-from missions.plan_file import read_plan
+from alice_survey.base.artefacts import atomic_path
+from alice_survey.base.run import progress
+from missions.values.plan_file import read_plan
 
 if TYPE_CHECKING:
     from reconstruct.evaluate.cameras import CameraScore

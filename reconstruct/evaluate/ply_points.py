@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.errors import WorkspaceError
-from alice_survey.frames import Array
+from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.frames import Array
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",

@@ -9,16 +9,16 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from alice_survey import progress
-from alice_survey.artefacts import need_stage, read_json, write_json
-from alice_survey.contents import taken_from
-from alice_survey.errors import WorkspaceError
-from alice_survey.frames import Array
+from alice_survey.base.artefacts import need_stage, read_json, write_json
+from alice_survey.base.contents import taken_from
+from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
 from reconstruct.evaluate.cloud_files import read_own_cloud, read_reference
 from reconstruct.evaluate.cloud_registration import CloudFit, Surface, register_cloud
 from reconstruct.evaluate.figures import fit_doming, rms, rounded
-from reconstruct.model import SparseModel, read_model
-from reconstruct.sparse.alignment import Similarity
+from reconstruct.placing.alignment import Similarity
+from reconstruct.views.model import SparseModel, read_model
 
 WITHIN_PX = (1, 2, 3, 5)
 

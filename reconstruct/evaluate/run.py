@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import rasterio
 
-from alice_survey.artefacts import (
+from alice_survey.base.artefacts import (
     Stage,
     need_stage,
     read_json,
@@ -22,15 +22,15 @@ from alice_survey.artefacts import (
     write_csv,
     write_json,
 )
-from alice_survey.config import SurveyConfig
-from alice_survey.contents import taken_from
-from alice_survey.errors import WorkspaceError
-from alice_survey.frames import Array
-from alice_survey.manifest import read_manifest
+from alice_survey.base.config import SurveyConfig
+from alice_survey.base.contents import taken_from
+from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.frames import Array
+from alice_survey.base.manifest import read_manifest
 from alice_survey.seafloor.terrain import read_terrain
 from alice_survey.seafloor.texture import survey_texture
 from camera_calib.rig import read_rig
-from missions.plan_file import read_plan
+from missions.values.plan_file import read_plan
 from reconstruct.evaluate.cameras import CameraScore, score_cameras
 from reconstruct.evaluate.figures import compare_lengths
 from reconstruct.evaluate.mesh import read_mesh, score_mesh
@@ -40,7 +40,7 @@ from reconstruct.evaluate.plots import plot_errors, plot_sheet, plot_track
 from reconstruct.evaluate.stations import count_stations, ground_pixel_m
 from reconstruct.evaluate.surface import score_surface
 from reconstruct.evaluate.truth import read_true_poses
-from reconstruct.sparse.track import read_track_poses
+from reconstruct.placing.track import read_track_poses
 
 _SEED_STREAM = 6100
 

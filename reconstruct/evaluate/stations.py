@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey import progress
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
 from alice_survey.seafloor.terrain import Terrain
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.rig import Rig

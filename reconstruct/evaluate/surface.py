@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 from shapely.geometry import MultiPolygon
 
-from alice_survey import progress
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
 from alice_survey.seafloor.terrain import Terrain
 from reconstruct.evaluate.figures import (
     MAD_TO_SIGMA,

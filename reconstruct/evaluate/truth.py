@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.contents import taken_from
-from alice_survey.frames import Array
+from alice_survey.base.contents import taken_from
+from alice_survey.base.frames import Array
+from alice_survey.base.trajectory import read_columns
 from alice_survey.seafloor.terrain import Floats, Terrain
-from alice_survey.trajectory import read_columns
 
 _ABOVE_M = 8.0
 """Rays start so far above the mean sea floor: far enough, and near enough for float32."""

@@ -11,10 +11,10 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey import progress
-from alice_survey.errors import warn
-from alice_survey.frames import Array, Datum
-from alice_survey.manifest import ImageRecord
+from alice_survey.base.errors import warn
+from alice_survey.base.frames import Array, Datum
+from alice_survey.base.manifest import ImageRecord
+from alice_survey.base.run import progress
 from camera_calib.rig import Rig
 from reconstruct.mapping.database import as_transform
 from reconstruct.mapping.doming import ScaleTrend

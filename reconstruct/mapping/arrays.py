@@ -6,8 +6,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from alice_survey.frames import Array
-from reconstruct.model_files import keypoints_of
+from alice_survey.base.frames import Array
+from reconstruct.views.model_files import keypoints_of
 
 Indices = NDArray[np.int64]
 

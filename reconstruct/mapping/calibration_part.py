@@ -13,7 +13,7 @@ import numpy as np
 from scipy.sparse import csc_matrix, diags_array
 from scipy.spatial import KDTree
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import Indices, frames_of
 from reconstruct.mapping.database import Observations

@@ -9,9 +9,9 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey import progress
-from alice_survey.frames import Array
-from alice_survey.manifest import ImageRecord
+from alice_survey.base.frames import Array
+from alice_survey.base.manifest import ImageRecord
+from alice_survey.base.run import progress
 from reconstruct.matching.matches import PairMatches
 
 VerifiedPair = tuple[int, int, PairMatches]

@@ -14,17 +14,17 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey import progress
-from alice_survey.errors import warn
-from alice_survey.frames import Array, Datum, rotation_from_attitude
-from alice_survey.manifest import ImageRecord
+from alice_survey.base.errors import warn
+from alice_survey.base.frames import Array, Datum, rotation_from_attitude
+from alice_survey.base.manifest import ImageRecord
+from alice_survey.base.run import progress
 from camera_calib.rig import Rig
-from reconstruct.lenses.lens import Lens
 from reconstruct.mapping.arrays import Observed, observed
 from reconstruct.mapping.database import as_transform
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.priors import pinhole_positions
 from reconstruct.mapping.working_range import ray_passes
+from reconstruct.views.lens import Lens
 
 _LEAST_STATIONS = 8
 """A paraboloid has six coefficients."""

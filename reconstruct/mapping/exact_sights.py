@@ -11,15 +11,15 @@ import numpy as np
 from numba import njit
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.frames import Array
-from camera_calib.calibration.freedom import POSE as TURN_AND_SHIFT
+from alice_survey.base.frames import Array
+from camera_calib.calibrate.freedom import POSE as TURN_AND_SHIFT
 from camera_calib.flat_port import PARAMETERS, FlatPortCamera, pose_jacobian
 from camera_calib.rig import Rig
-from reconstruct.lenses.lens import Lens
 from reconstruct.mapping.arrays import Indices, observed
 from reconstruct.mapping.database import Observations, as_transform
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.normal_equations import Sights
+from reconstruct.views.lens import Lens
 
 _SLOPES = (*PARAMETERS, *TURN_AND_SHIFT)
 """What a camera's pixels depend on: itself, and its place on the rig."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from reconstruct.mapping.normal_equations import POSE
 
 

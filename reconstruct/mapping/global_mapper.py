@@ -13,7 +13,7 @@ from pathlib import Path
 import pycolmap
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey import progress
+from alice_survey.base.run import progress
 from reconstruct.mapping.database import Observations, as_transform, rigid3d, station_frames
 from reconstruct.mapping.pose_graph import average_poses, station_groups
 from reconstruct.mapping.stations import link_stations

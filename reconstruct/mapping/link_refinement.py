@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 
 Indices = NDArray[np.int64]
 _ROUNDS = 10

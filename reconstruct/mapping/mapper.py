@@ -15,16 +15,16 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey import progress
-from alice_survey.errors import ReconstructionError, warn
-from alice_survey.frames import Array
-from alice_survey.manifest import ImageRecord
-from reconstruct.lenses.lens import Lens
+from alice_survey.base.errors import ReconstructionError, warn
+from alice_survey.base.frames import Array
+from alice_survey.base.manifest import ImageRecord
+from alice_survey.base.run import progress
 from reconstruct.mapping.arrays import observed
 from reconstruct.mapping.database import Observations, write_database
 from reconstruct.mapping.database import as_transform as as_transform
 from reconstruct.mapping.global_mapper import adjust, map_globally
 from reconstruct.mapping.merge import merge_models, report_left_out
+from reconstruct.views.lens import Lens
 
 Method = Literal["auto", "global", "incremental"]
 """How a calibrated rig is mapped; `auto`: globally, and incrementally where that fails."""

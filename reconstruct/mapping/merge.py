@@ -7,8 +7,8 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey import progress
-from alice_survey.errors import warn
+from alice_survey.base.errors import warn
+from alice_survey.base.run import progress
 from reconstruct.mapping.database import as_transform
 from reconstruct.mapping.global_mapper import triangulate_and_adjust
 

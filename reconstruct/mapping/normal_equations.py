@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.sparse import bsr_matrix, csc_matrix
 from scipy.sparse.linalg import splu
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 
 POSE = 6
 """Parameters of a station: turn about the axes of the world, then motion of its origin."""

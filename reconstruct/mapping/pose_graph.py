@@ -15,8 +15,8 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey import progress
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
 from reconstruct.mapping.stations import Link
 
 Indices = NDArray[np.int64]

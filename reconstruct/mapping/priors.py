@@ -12,15 +12,15 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 
-from alice_survey.errors import warn
-from alice_survey.frames import Array, Datum, rotation_from_attitude
-from alice_survey.manifest import ImageRecord
+from alice_survey.base.errors import warn
+from alice_survey.base.frames import Array, Datum, rotation_from_attitude
+from alice_survey.base.manifest import ImageRecord
 from camera_calib.rig import Rig
-from reconstruct.lenses.lens import Lens
 from reconstruct.mapping.bundle import FULLY, adjust_freely, all_pictures, held_options
 from reconstruct.mapping.mapper import Mapped, model_baseline, scale_model
 from reconstruct.mapping.robust import pixel_sigma
 from reconstruct.matching.pairs import positions_ned
+from reconstruct.views.lens import Lens
 
 _LEAST_STATIONS = 5
 _WORST_GROWTH = 1.05

@@ -2,7 +2,7 @@
 
 COLMAP knows no refractive camera. The mapper's keypoints are warped to pinholes, exact at one
 working depth; once a point's depth z before the pinhole's centre is known, where an ideal pinhole
-sees the spot is known too (see `reconstruct.lenses.range_shift`):
+sees the spot is known too (see `reconstruct.views.range_shift`):
 
     ideal = warped + A(warped) (1/z - 1/z0).
 
@@ -20,16 +20,16 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey import progress
-from alice_survey.errors import warn
-from alice_survey.frames import Array
-from reconstruct.lenses.lens import FlatPortLens, Lens
-from reconstruct.lenses.range_shift import field_of
+from alice_survey.base.errors import warn
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
 from reconstruct.mapping.arrays import Indices, observed
 from reconstruct.mapping.bundle import FULLY, ROUGHLY, Adjust, adjust_freely
 from reconstruct.mapping.database import Observations, write_database
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.robust import pixel_sigma
+from reconstruct.views.lens import FlatPortLens, Lens
+from reconstruct.views.range_shift import field_of
 
 SETTLED_PX = 1e-4
 """Keypoints that move less have converged."""

@@ -14,11 +14,11 @@ import numpy as np
 from scipy.sparse import csc_matrix, diags_array
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey import progress
-from alice_survey.errors import ReconstructionError, warn
-from alice_survey.frames import Array
-from camera_calib.calibration.freedom import POSE as TURN_AND_SHIFT
-from camera_calib.calibration.freedom import Prior, pose_names, value
+from alice_survey.base.errors import ReconstructionError, warn
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
+from camera_calib.calibrate.freedom import POSE as TURN_AND_SHIFT
+from camera_calib.calibrate.freedom import Prior, pose_names, value
 from camera_calib.flat_port import PARAMETERS
 from camera_calib.rig import Covariance, Rig
 from reconstruct.mapping.arrays import Indices, frames_of

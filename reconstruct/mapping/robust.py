@@ -10,7 +10,7 @@ costs next to nothing where errors are normal.
 import numpy as np
 import pycolmap
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from reconstruct.mapping.arrays import Indices, observed
 
 _RAYLEIGH_MEDIAN = 1.1774

@@ -13,14 +13,13 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from alice_survey.artefacts import Stage, atomic_path, run_stage, write_json
-from alice_survey.config import SurveyConfig
-from alice_survey.errors import ImageError, WorkspaceError, warn
-from alice_survey.executor import kept_workers, parallel_map
-from alice_survey.frames import Datum
-from alice_survey.manifest import ImageRecord
+from alice_survey.base.artefacts import Stage, atomic_path, run_stage, write_json
+from alice_survey.base.config import SurveyConfig
+from alice_survey.base.errors import ImageError, WorkspaceError, warn
+from alice_survey.base.executor import kept_workers, parallel_map
+from alice_survey.base.frames import Datum
+from alice_survey.base.manifest import ImageRecord
 from camera_calib.rig import Rig
-from reconstruct.lenses.lens import Lens, flat_port_lens
 from reconstruct.mapping.acceptance import check_survey
 from reconstruct.mapping.database import Observations, VerifiedPair
 from reconstruct.mapping.doming import doming_of_survey
@@ -45,6 +44,7 @@ from reconstruct.matching.retrieval import alike_pairs
 from reconstruct.pictures.files import exif_focal_px
 from reconstruct.pictures.normalise import even_light, finely, normalise, read_deep
 from reconstruct.pictures.undistorted import read_colour, read_mask
+from reconstruct.views.lens import Lens, flat_port_lens
 
 RATIO = 0.8
 """Largest distance of a match over that of the second nearest descriptor."""

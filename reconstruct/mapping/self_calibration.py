@@ -14,10 +14,9 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey import progress
-from alice_survey.errors import warn
-from alice_survey.manifest import ImageRecord
-from reconstruct.lenses.lens import Lens, self_calibrated_lens
+from alice_survey.base.errors import warn
+from alice_survey.base.manifest import ImageRecord
+from alice_survey.base.run import progress
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import (
     Mapped,
@@ -29,6 +28,7 @@ from reconstruct.mapping.mapper import (
     sizes,
 )
 from reconstruct.mapping.merge import report_left_out
+from reconstruct.views.lens import Lens, self_calibrated_lens
 
 SIMPLE, FULL = "RADIAL", "OPENCV"
 """COLMAP's lens models while mapping and in the last adjustment."""

@@ -13,8 +13,8 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.executor import parallel_map
-from alice_survey.frames import Array
+from alice_survey.base.executor import parallel_map
+from alice_survey.base.frames import Array
 from reconstruct.mapping.database import Observations, as_transform
 from reconstruct.mapping.link_refinement import RigSight, refine_link
 from reconstruct.mapping.working_range import ray_passes

@@ -12,13 +12,12 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.artefacts import write_json
-from alice_survey.config import ReconstructConfig
-from alice_survey.errors import ReconstructionError
-from alice_survey.frames import Array, Datum
-from camera_calib.calibration.freedom import pose_names
+from alice_survey.base.artefacts import write_json
+from alice_survey.base.config import ReconstructConfig
+from alice_survey.base.errors import ReconstructionError
+from alice_survey.base.frames import Array, Datum
+from camera_calib.calibrate.freedom import pose_names
 from camera_calib.rig import Rig, write_rig
-from reconstruct.lenses.lens import FlatPortLens, Lens, flat_port_lens
 from reconstruct.mapping.arrays import frames_of
 from reconstruct.mapping.bundle import move_points
 from reconstruct.mapping.database import Observations, rigid3d
@@ -29,6 +28,7 @@ from reconstruct.mapping.rig_refinement import RigFit, Told, fit_rig
 from reconstruct.mapping.working_range import Distances
 from reconstruct.matching.matches import as_seen
 from reconstruct.matching.pairs import positions_ned
+from reconstruct.views.lens import FlatPortLens, Lens, flat_port_lens
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

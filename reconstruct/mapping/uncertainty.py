@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_matrix, diags_array
 from scipy.spatial.transform import Rotation
 
-from alice_survey import progress
-from alice_survey.contents import read_arrays, taken_from
-from alice_survey.errors import ReconstructionError, warn
-from alice_survey.frames import Array
-from alice_survey.manifest import ImageRecord
+from alice_survey.base.contents import read_arrays, taken_from
+from alice_survey.base.errors import ReconstructionError, warn
+from alice_survey.base.frames import Array
+from alice_survey.base.manifest import ImageRecord
+from alice_survey.base.run import progress
 from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import Indices, Observed, frames_of, observed
 from reconstruct.mapping.calibration_part import CalibrationPart, calibration_part

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.errors import ReconstructionError, warn
-from alice_survey.executor import parallel_map
-from alice_survey.frames import Array
-from alice_survey.manifest import ImageRecord
+from alice_survey.base.errors import ReconstructionError, warn
+from alice_survey.base.executor import parallel_map
+from alice_survey.base.frames import Array
+from alice_survey.base.manifest import ImageRecord
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.rig import Rig
 from reconstruct.matching.features import load_features

@@ -15,9 +15,9 @@ import pycolmap
 from numba import njit
 from numpy.typing import NDArray
 
-from alice_survey.frames import Array
-from reconstruct.lenses.lens import Lens
+from alice_survey.base.frames import Array
 from reconstruct.matching.features import Features, load_features
+from reconstruct.views.lens import Lens
 
 Matches = NDArray[np.uint32]
 _BLOCK = 1024

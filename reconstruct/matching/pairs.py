@@ -9,8 +9,8 @@ from scipy.spatial.transform import RigidTransform
 from shapely import STRtree
 from shapely.geometry import Polygon
 
-from alice_survey.frames import Array, Datum, rotation_from_attitude
-from alice_survey.manifest import ImageRecord
+from alice_survey.base.frames import Array, Datum, rotation_from_attitude
+from alice_survey.base.manifest import ImageRecord
 from camera_calib.rig import Rig
 
 Pair = tuple[int, int]

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey import progress
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
 from reconstruct.mesh.labels import Charts
 from reconstruct.mesh.topology import Triangles
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.contents import shown
-from alice_survey.errors import WorkspaceError
-from alice_survey.frames import Array
+from alice_survey.base.contents import shown
+from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.frames import Array
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",

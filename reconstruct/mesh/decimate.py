@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from reconstruct.mesh.topology import Triangles, edges_of
 
 _MOST_ROUNDS = 60

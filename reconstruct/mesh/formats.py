@@ -14,8 +14,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.artefacts import atomic_path
-from alice_survey.frames import Array
+from alice_survey.base.artefacts import atomic_path
+from alice_survey.base.frames import Array
 from reconstruct.mesh.texture import Textured
 from reconstruct.mesh.topology import vertex_normals
 

@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 
 KERNEL_STEPS = 0.8
 """Standard deviation of the points' Gaussian weight, lattice steps."""

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.linalg import cg
 
-from alice_survey import progress
-from alice_survey.errors import warn
-from alice_survey.frames import Array
+from alice_survey.base.errors import warn
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
 from reconstruct.mesh.atlas import Wedges
 from reconstruct.mesh.topology import edges_of
 

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey import progress
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
 from reconstruct.mesh.texture import Textured
 from reconstruct.mesh.topology import face_normals
 from reconstruct.mesh.visibility import ray_scene

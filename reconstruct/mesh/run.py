@@ -6,14 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey import progress
-from alice_survey.artefacts import Stage, need_stage, read_json, run_stage, write_json
-from alice_survey.config import ReconstructConfig, SurveyConfig
-from alice_survey.contents import taken_from
-from alice_survey.errors import warn
-from alice_survey.frames import Array
+from alice_survey.base.artefacts import Stage, need_stage, read_json, run_stage, write_json
+from alice_survey.base.config import ReconstructConfig, SurveyConfig
+from alice_survey.base.contents import taken_from
+from alice_survey.base.errors import warn
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
 from reconstruct.dense.run import picture_files
 from reconstruct.dense.stereo_pairs import points_of_views
+from reconstruct.light.solve import read_light
 from reconstruct.mesh.cloud_file import open_cloud
 from reconstruct.mesh.formats import GLB_AXES, write_glb, write_mesh_ply, write_obj
 from reconstruct.mesh.labels import choose_views, make_charts
@@ -22,9 +23,8 @@ from reconstruct.mesh.surface import TRIM_STEPS, Mesh, mesh_cloud
 from reconstruct.mesh.texture import Textured, colours_of_cloud, paint
 from reconstruct.mesh.topology import face_areas
 from reconstruct.mesh.visibility import find_candidates, save_geometry
-from reconstruct.model import SparseModel, WorldFrame, read_model
-from reconstruct.mosaic.light import read_light
 from reconstruct.raster import write_png
+from reconstruct.views.model import SparseModel, WorldFrame, read_model
 
 MOST_TRIANGLES = 4_000_000
 """Where the settings name no number."""

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.errors import ReconstructionError
-from alice_survey.executor import parallel_map, progress
-from alice_survey.frames import Array
+from alice_survey.base.errors import ReconstructionError
+from alice_survey.base.executor import parallel_map, progress
+from alice_survey.base.frames import Array
 from reconstruct.mesh.cloud_file import CloudFile
 from reconstruct.mesh.decimate import decimate
 from reconstruct.mesh.implicit import splat, zero_mesh

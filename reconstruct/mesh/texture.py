@@ -11,17 +11,17 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from alice_survey import progress
-from alice_survey.executor import parallel_map
-from alice_survey.frames import Array
+from alice_survey.base.executor import parallel_map
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
+from reconstruct.light.solve import LightModel
 from reconstruct.mesh.atlas import Atlas, Wedges, make_atlas, make_wedges
 from reconstruct.mesh.labels import Charts
 from reconstruct.mesh.levelling import level_seams, seam_pairs
 from reconstruct.mesh.topology import Triangles
 from reconstruct.mesh.visibility import to_world
-from reconstruct.model import View
-from reconstruct.mosaic.light import LightModel
 from reconstruct.pictures.undistorted import Pictures
+from reconstruct.views.model import View
 
 Float32 = NDArray[np.float32]
 _SEAM_SIGMA_PX = 4.0

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.executor import parallel_map
-from alice_survey.frames import Array
+from alice_survey.base.executor import parallel_map
+from alice_survey.base.frames import Array
 from reconstruct.mesh.topology import Triangles, face_normals
-from reconstruct.model import View
 from reconstruct.pictures.undistorted import Pictures
+from reconstruct.views.model import View
 
 CANDIDATES = 8
 """Views kept for a face."""

@@ -17,10 +17,10 @@ import rasterio.shutil
 from numpy.typing import NDArray
 from rasterio.windows import Window
 
-from alice_survey.artefacts import atomic_path, need_stage, read_json, write_csv
-from alice_survey.contents import taken_from
-from alice_survey.errors import ConfigError
-from alice_survey.executor import progress
+from alice_survey.base.artefacts import atomic_path, need_stage, read_json, write_csv
+from alice_survey.base.contents import taken_from
+from alice_survey.base.errors import ConfigError
+from alice_survey.base.executor import progress
 
 LARGEST_SIDE_PX = 32_767
 _STRIP = 512

@@ -21,11 +21,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey import progress
-from alice_survey.frames import Array
-from reconstruct.mosaic.facts import PictureFacts
-from reconstruct.mosaic.finish import LEAST_LEFT, LEAST_RANGE, MOST_RANGE
-from reconstruct.mosaic.light import (
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
+from reconstruct.light.solve import (
     GRID,
     SAMPLES_PER_FACT,
     LightModel,
@@ -34,6 +32,8 @@ from reconstruct.mosaic.light import (
     node_weights,
     solve_patterns,
 )
+from reconstruct.mosaic.facts import PictureFacts
+from reconstruct.mosaic.finish import LEAST_LEFT, LEAST_RANGE, MOST_RANGE
 
 Float32 = NDArray[np.float32]
 Colour = Literal["even", "water", "raw"]

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reconstruct.dense.dem import DemGrid
+from reconstruct.light.solve import LightSamples, at_places, joined_samples
 from reconstruct.mosaic.facts import telling
 from reconstruct.mosaic.grid import Block
-from reconstruct.mosaic.light import LightSamples, at_places, joined_samples
 from reconstruct.mosaic.paint import Float32, SeenView, ground_of
 from reconstruct.mosaic.sight import see
 from reconstruct.mosaic.tools import Survey, tools_of

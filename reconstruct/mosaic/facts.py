@@ -14,9 +14,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from alice_survey.artefacts import atomic_path
-from alice_survey.frames import Array
-from reconstruct.mosaic.light import GRID, at_places
+from alice_survey.base.artefacts import atomic_path
+from alice_survey.base.frames import Array
+from reconstruct.light.solve import GRID, at_places
 from reconstruct.pictures.undistorted import Pictures
 
 Float32 = NDArray[np.float32]

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from rasterio.warp import transform as to_crs
 
-from alice_survey import progress
-from alice_survey.artefacts import write_csv, write_json
-from alice_survey.frames import Array
+from alice_survey.base.artefacts import write_csv, write_json
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
 from reconstruct.dense.dem import DemGrid
-from reconstruct.model import View, WorldFrame
 from reconstruct.raster import crs_of
+from reconstruct.views.model import View, WorldFrame
 
 Float32 = NDArray[np.float32]
 

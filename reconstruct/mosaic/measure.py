@@ -8,12 +8,12 @@ from rasterio.windows import Window
 
 from reconstruct.dense.dem import DemGrid
 from reconstruct.dense.points import enu_from_cam
-from reconstruct.model import View
 from reconstruct.mosaic.facts import PictureFacts, measure_picture
 from reconstruct.mosaic.footprints import PictureFootprint, picture_footprint
 from reconstruct.mosaic.grid import Float32, footprints
 from reconstruct.mosaic.sight import store_visible
 from reconstruct.raster import opened_raster
+from reconstruct.views.model import View
 
 _MOST_CELLS = 16_000_000
 """Of the DEM for one view; views that see more, to the horizon, are looked at block by block."""

@@ -10,13 +10,12 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.windows import Window
 
-from alice_survey.resources import release_memory
-from reconstruct.model import View
+from alice_survey.base.run.resources import release_memory
+from reconstruct.light.solve import at_places
 from reconstruct.mosaic.blend import Blend, Part
 from reconstruct.mosaic.colour import ColourModel
 from reconstruct.mosaic.finish import finish_colours
 from reconstruct.mosaic.grid import ALIGNED_PX, CELL_PX, Block, coarse, dem_around
-from reconstruct.mosaic.light import at_places
 from reconstruct.mosaic.ortho import sample_lanczos
 from reconstruct.mosaic.seams import candidates, choose_views
 from reconstruct.mosaic.sight import (
@@ -27,6 +26,7 @@ from reconstruct.mosaic.sight import (
 )
 from reconstruct.mosaic.tools import Survey, Tools, tools_of
 from reconstruct.raster import opened_raster
+from reconstruct.views.model import View
 
 Float32 = NDArray[np.float32]
 

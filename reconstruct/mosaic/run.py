@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 import rasterio
 
-from alice_survey.artefacts import Stage, need_stage, read_json, run_stage, write_json
-from alice_survey.config import SurveyConfig
-from alice_survey.contents import taken_from
-from alice_survey.executor import parallel_map
+from alice_survey.base.artefacts import Stage, need_stage, read_json, run_stage, write_json
+from alice_survey.base.config import SurveyConfig
+from alice_survey.base.contents import taken_from
+from alice_survey.base.executor import parallel_map
 from reconstruct.dense.dem import DemGrid, round_cell
 from reconstruct.dense.run import picture_files
-from reconstruct.model import SparseModel, read_model
+from reconstruct.light.solve import joined_samples
 from reconstruct.mosaic.blend import SUPPORT_PX
 from reconstruct.mosaic.colour import ColourModel, solve_colour
 from reconstruct.mosaic.compare import LightTask, compare_block
@@ -39,7 +39,6 @@ from reconstruct.mosaic.grid import (
     mosaic_grid,
     neighbours,
 )
-from reconstruct.mosaic.light import joined_samples
 from reconstruct.mosaic.measure import MeasureTask, measure_view
 from reconstruct.mosaic.paint import (
     PaintTask,
@@ -52,8 +51,9 @@ from reconstruct.mosaic.paint import (
 from reconstruct.mosaic.sight import Water
 from reconstruct.mosaic.tools import Survey, forget_tools
 from reconstruct.mosaic.writers import cloud_optimised, thumbnail, write_labels, write_tiles
+from reconstruct.placing.track_figure import plot_track_over
 from reconstruct.raster import opened_raster
-from reconstruct.sparse.track_figure import plot_track_over
+from reconstruct.views.model import SparseModel, read_model
 
 _TILE_PX = 1024
 _GROUP = 2

@@ -6,18 +6,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.artefacts import atomic_path
-from alice_survey.frames import Array
+from alice_survey.base.artefacts import atomic_path
+from alice_survey.base.frames import Array
 from camera_calib.approximation.dispersion import channel_cameras
 from camera_calib.water import CHANNELS
 from reconstruct.dense.dem import DemGrid
 from reconstruct.dense.points import enu_from_cam, pinhole_of
-from reconstruct.lenses.lens import FlatPortLens, Lens
-from reconstruct.lenses.range_shift import RangeShift, range_shift
-from reconstruct.model import View
 from reconstruct.mosaic.grid import Float32, footprints, height_at_pixels
 from reconstruct.mosaic.ortho import look_up, visible_cells
 from reconstruct.pictures.undistorted import taken_nodes
+from reconstruct.views.lens import FlatPortLens, Lens
+from reconstruct.views.model import View
+from reconstruct.views.range_shift import RangeShift, range_shift
 
 _SPACING_PX = 8.0
 """Of nodes between which a lens is bilinear: within 0.001 px for the lenses of such cameras."""

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruct.lenses.lens import FlatPortLens
-from reconstruct.model import View
 from reconstruct.mosaic.facts import SmallCopies, forget_pictures, linear_table
 from reconstruct.mosaic.finish import curve_by_root
 from reconstruct.mosaic.ortho import lanczos_weights
 from reconstruct.mosaic.sight import Optics, Water, camera_optics, channel_optics
 from reconstruct.pictures.undistorted import Pictures
+from reconstruct.views.lens import FlatPortLens
+from reconstruct.views.model import View
 
 _CACHED_BYTES = 100_000_000
 """Pictures as taken that each process keeps."""

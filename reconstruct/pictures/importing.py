@@ -9,11 +9,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from alice_survey.artefacts import Stage, run_stage, write_json
-from alice_survey.errors import ImageError, NavigationError, WorkspaceError, warn
-from alice_survey.executor import parallel_map, progress
-from alice_survey.frames import Array
-from alice_survey.manifest import ImageRecord, write_manifest
+from alice_survey.base.artefacts import Stage, run_stage, write_json
+from alice_survey.base.errors import ImageError, NavigationError, WorkspaceError, warn
+from alice_survey.base.executor import parallel_map, progress
+from alice_survey.base.frames import Array
+from alice_survey.base.manifest import ImageRecord, write_manifest
 from camera_calib.rig import Rig, read_rig, write_rig
 from missions.logs.navigation_csv import (
     OPTIONAL,

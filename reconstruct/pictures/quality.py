@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.artefacts import read_stage, write_csv
-from alice_survey.errors import ImageError, why
-from alice_survey.executor import parallel_map
-from alice_survey.manifest import ImageRecord, read_manifest
+from alice_survey.base.artefacts import read_stage, write_csv
+from alice_survey.base.errors import ImageError, why
+from alice_survey.base.executor import parallel_map
+from alice_survey.base.manifest import ImageRecord, read_manifest
 from reconstruct.pictures.files import decode
 from reconstruct.pictures.normalise import even_light
 from reconstruct.pictures.undistorted import read_mask
@@ -234,7 +234,7 @@ def _reasons(quality: PictureQuality, spreads: dict[str, tuple[float, float]]) -
 
 def add_overlap(found: Sequence[PictureQuality], sparse: Path) -> list[PictureQuality]:
     """Add what the sparse model says about points and overlap with other stations."""
-    from reconstruct.model import read_model
+    from reconstruct.views.model import read_model
 
     model = read_model(sparse)
     seen: dict[int, list[int]] = defaultdict(list)

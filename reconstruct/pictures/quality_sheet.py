@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from alice_survey.artefacts import atomic_path
-from alice_survey.errors import ImageError
+from alice_survey.base.artefacts import atomic_path
+from alice_survey.base.errors import ImageError
 from reconstruct.pictures.files import decode
 from reconstruct.pictures.quality import PictureQuality
 

@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.artefacts import read_json
-from alice_survey.errors import ImageError, WorkspaceError
-from alice_survey.frames import Array
+from alice_survey.base.artefacts import read_json
+from alice_survey.base.errors import ImageError, WorkspaceError
+from alice_survey.base.frames import Array
 from camera_calib.picture_files import read_pixels
-from reconstruct.lenses.lens import Lens, lens_from_json
 from reconstruct.pictures.normalise import Grey, normalise
+from reconstruct.views.lens import Lens, lens_from_json
 
 Colour = NDArray[np.uint8]
 Mask = NDArray[np.bool_]

@@ -16,18 +16,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.artefacts import need_stage, read_json
-from alice_survey.contents import taken_from
-from alice_survey.errors import ReconstructionError, WorkspaceError
-from alice_survey.frames import Array
+from alice_survey.base.artefacts import need_stage, read_json
+from alice_survey.base.contents import taken_from
+from alice_survey.base.errors import ReconstructionError, WorkspaceError
+from alice_survey.base.frames import Array
 from camera_calib.rig import Rig, read_rig
 from reconstruct.dense.rectify import scaled_view
-from reconstruct.lenses.lens import FlatPortLens, Lens, lens_from_json
-from reconstruct.model import View, read_model
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.station.pair import pair_samplers, read_depth, to_axes
 from reconstruct.station.precise import precise_depth
 from reconstruct.station.solve import Optics, calibration_slopes, stereo_rig
+from reconstruct.views.lens import FlatPortLens, Lens, lens_from_json
+from reconstruct.views.model import View, read_model
 
 _NUMBER = r"(-?\d+(?:\.\d+)?)"
 _PIXEL = re.compile(rf"(?:(?P<image>[^=]+?):)?{_NUMBER},{_NUMBER}")

@@ -8,15 +8,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey import progress
-from alice_survey.errors import ReconstructionError
-from alice_survey.frames import Array
+from alice_survey.base.errors import ReconstructionError
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
 from reconstruct.mesh.atlas import Wedges
 from reconstruct.mesh.decimate import decimate
 from reconstruct.mesh.formats import GLB_AXES, write_glb, write_mesh_ply, write_obj
 from reconstruct.mesh.texture import Textured, write_jpeg
 from reconstruct.mesh.topology import Triangles, split_fans, without_folds
-from reconstruct.model import View
+from reconstruct.views.model import View
 
 _MOST_VERTICES = 600_000
 _STEEPEST = 8.0

@@ -18,10 +18,10 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.errors import NotGeoreferencedWarning
 
-from alice_survey import progress
-from alice_survey.artefacts import write_json
-from alice_survey.errors import CalibrationError, ImageError, ReconstructionError
-from alice_survey.frames import Array
+from alice_survey.base.artefacts import write_json
+from alice_survey.base.errors import CalibrationError, ImageError, ReconstructionError
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
 from camera_calib.rig import Rig, read_rig, write_rig
 from reconstruct.dense.cloud import VERTEX, write_ply
 from reconstruct.dense.depth import MATCH_SIGMA_PX, pair_depth
@@ -29,13 +29,13 @@ from reconstruct.dense.probe import matching_scale
 from reconstruct.dense.rectify import scaled_view
 from reconstruct.matching.features import find_features
 from reconstruct.matching.matches import match_descriptors
-from reconstruct.model import View, WorldFrame
 from reconstruct.pictures.normalise import normalise
 from reconstruct.pictures.undistorted import Pictures, read_colour
 from reconstruct.station.mesh import depth_mesh, write_station_mesh
 from reconstruct.station.plot import plot_pair
 from reconstruct.station.precise import Sampler, inflation, precise_depth, sampler
 from reconstruct.station.solve import Optics, matched_points, optics_for, stereo_rig
+from reconstruct.views.model import View, WorldFrame
 
 Float32 = NDArray[np.float32]
 

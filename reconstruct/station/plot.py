@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.artefacts import atomic_path
-from reconstruct.model import View
+from alice_survey.base.artefacts import atomic_path
+from reconstruct.views.model import View
 
 _BARS_M = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from alice_survey.errors import ReconstructionError
-from alice_survey.frames import Array
-from reconstruct.lenses.lens import Lens
-from reconstruct.model import View
+from alice_survey.base.errors import ReconstructionError
+from alice_survey.base.frames import Array
+from reconstruct.views.lens import Lens
+from reconstruct.views.model import View
 
 Float32 = NDArray[np.float32]
 Sampler = Callable[[Array], Array]

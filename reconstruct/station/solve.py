@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.errors import ReconstructionError
-from alice_survey.frames import Array
+from alice_survey.base.errors import ReconstructionError
+from alice_survey.base.frames import Array
 from camera_calib.flat_port import PARAMETERS, FlatPortCamera
 from camera_calib.rig import Rig
 from camera_calib.triangulate import triangulate
-from reconstruct.lenses.lens import FlatPortLens, flat_port_lens
-from reconstruct.lenses.range_shift import range_shift
 from reconstruct.mapping.working_range import ray_passes
-from reconstruct.model import View
+from reconstruct.views.lens import FlatPortLens, flat_port_lens
+from reconstruct.views.model import View
+from reconstruct.views.range_shift import range_shift
 
 _LEAST_POINTS = 50
 _LARGEST_GAP_PX = 2.0
@@ -168,7 +168,7 @@ def calibration_slopes(
 
 
 def _changed(rig: Rig, camera: str, field: str, step: float) -> Rig:
-    """The rig with one parameter moved by a step; see `camera_calib.calibration.freedom`."""
+    """The rig with one parameter moved by a step; see `camera_calib.calibrate.freedom`."""
     if field in PARAMETERS:
         old = rig.cameras[camera]
         new = old.with_parameters({field: old.parameter(field) + step})

@@ -14,8 +14,8 @@ import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from alice_survey.cli import app, main
-from alice_survey.config import SurveyConfig, load_config
+from alice_survey.base.config import SurveyConfig, load_config
+from alice_survey.cli.main import app, main
 from alice_survey.survey import LOOP, init_survey
 
 COMMANDS = (
@@ -43,7 +43,7 @@ def fails(
 def test_help_loads_nothing_heavy() -> None:
     """`--help` answers at once because numeric packages are not even imported."""
     code = (
-        "import sys; from alice_survey.cli import app\n"
+        "import sys; from alice_survey.cli.main import app\n"
         "try: app(['--help'])\n"
         "except SystemExit: pass\n"
         "heavy = {'numpy', 'scipy', 'cv2', 'pycolmap', 'open3d', 'pydantic', 'matplotlib'}\n"

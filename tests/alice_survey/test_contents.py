@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.contents import one_line, read_arrays, shown, taken_from
-from alice_survey.errors import PlanError, WorkspaceError
+from alice_survey.base.contents import one_line, read_arrays, shown, taken_from
+from alice_survey.base.errors import PlanError, WorkspaceError
 
 FILE = Path("frame.json")
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from alice_survey.errors import WorkspaceError
-from alice_survey.events import Event, EventFile, LogFile, duration
+from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.run.events import Event, EventFile, LogFile, duration
 
 MOMENT_S = 1_700_000_000.25
 

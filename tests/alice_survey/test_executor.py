@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from alice_survey.executor import kept_workers, parallel_map
+from alice_survey.base.executor import kept_workers, parallel_map
 
 WORKERS = """
 import os, sys, time
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 import sleeping
-from alice_survey.executor import parallel_map
+from alice_survey.base.executor import parallel_map
 if __name__ == "__main__":
     list(parallel_map(sleeping.stay, [sys.argv[1]] * 8, threads=2, label="sleep"))
 """

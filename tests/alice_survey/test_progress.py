@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey import progress
-from alice_survey.artefacts import Stage, run_stage
-from alice_survey.display import Lines, Quiet
-from alice_survey.errors import heard, warn
-from alice_survey.events import Event
-from alice_survey.progress import Remaining, Run
+from alice_survey.base.artefacts import Stage, run_stage
+from alice_survey.base.errors import heard, warn
+from alice_survey.base.run import progress
+from alice_survey.base.run.display import Lines, Quiet
+from alice_survey.base.run.events import Event
+from alice_survey.base.run.progress import Remaining, Run
 
 
 class Clock:

@@ -5,7 +5,7 @@ import subprocess
 import sys
 import time
 
-from alice_survey.resources import Meter, Spent, cpu_s, family_of, memory_mib_of, versions
+from alice_survey.base.run.resources import Meter, Spent, cpu_s, family_of, memory_mib_of, versions
 
 BUSY = """
 import sys, time

@@ -17,10 +17,11 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from alice_survey import cli, interrupts, progress
-from alice_survey.cli_options import print_result, with_sessions
-from alice_survey.errors import PlanError, note, warn
-from alice_survey.executor import parallel_map
+from alice_survey.base.errors import PlanError, note, warn
+from alice_survey.base.executor import parallel_map
+from alice_survey.base.run import interrupts, progress
+from alice_survey.cli import main as cli
+from alice_survey.cli.options import print_result, with_sessions
 
 
 def made(work: Callable[[], None]) -> typer.Typer:
@@ -201,10 +202,10 @@ SCRIPT = """
 import hashlib, sys, time
 from pathlib import Path
 import typer
-from alice_survey import interrupts
-from alice_survey.artefacts import Stage, run_stage
-from alice_survey.cli_options import with_sessions
-from alice_survey.executor import parallel_map
+from alice_survey.base.run import interrupts
+from alice_survey.base.artefacts import Stage, run_stage
+from alice_survey.cli.options import with_sessions
+from alice_survey.base.executor import parallel_map
 import sleeping
 
 app = typer.Typer()
@@ -378,9 +379,9 @@ def _dies(item: int) -> int:
 BARS = """
 import time
 import typer
-from alice_survey import progress
-from alice_survey.cli_options import print_result, with_sessions
-from alice_survey.errors import warn
+from alice_survey.base.run import progress
+from alice_survey.cli.options import print_result, with_sessions
+from alice_survey.base.errors import warn
 
 app = typer.Typer()
 

@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from alice_survey.cli import app
-from alice_survey.config import CameraConfig, WaterConfig
-from alice_survey.errors import AliceError, ConfigError
-from alice_survey.seawater import n_water
-from alice_survey.tables import FovOptions, Output, fov_report, validation_report
+from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.base.errors import AliceError, ConfigError
+from alice_survey.base.seawater import n_water
+from alice_survey.cli.fov_tables import FovOptions, Output, fov_report, validation_report
+from alice_survey.cli.main import app
 from camera_calib.rig import design_rig, write_rig
 
 QUIET = Output()

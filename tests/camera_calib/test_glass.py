@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from alice_survey.errors import ConfigError
+from alice_survey.base.errors import ConfigError
 from camera_calib.glass import GLASSES, n_glass
 
 LINES_NM = [486.13, 587.56, 656.27]

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.config import CameraConfig, WaterConfig
-from alice_survey.errors import AliceError, CalibrationError
+from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.base.errors import AliceError, CalibrationError
 from camera_calib.rig import Covariance, Rig, design_rig, read_rig, write_rig
 
 CONFIG = CameraConfig(position_body_m=(0.5, -0.06, 0.09))

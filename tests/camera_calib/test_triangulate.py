@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.errors import CalibrationError
+from alice_survey.base.errors import CalibrationError
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.triangulate import _pixel_slopes, nearest_to_rays, reproject, triangulate
 from tests.oracles_interface import (

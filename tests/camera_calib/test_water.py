@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from alice_survey.config import Jerlov
-from alice_survey.errors import ConfigError
+from alice_survey.base.config import Jerlov
+from alice_survey.base.errors import ConfigError
 from camera_calib.water import (
     CHANNELS,
     WAVELENGTH_NM,

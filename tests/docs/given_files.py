@@ -17,18 +17,18 @@ from PIL import Image
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.config import CameraConfig, WaterConfig
-from alice_survey.frames import Array
-from alice_survey.vehicle.identification.files import vehicle_from_file
+from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.base.frames import Array
+from alice_survey.vehicle.files import vehicle_from_file
 from alice_survey.vehicle.log import write_vehicle_log
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.rig import Rig, design_rig, write_rig
 from camera_calib.targets.pattern import black_rectangles
 from camera_calib.targets.target import Target, parse_target
+from tests.alice_survey.vehicle.identification.manoeuvres import fly, hidden, measured
 from tests.camera_calib.calibration_scenes import board_poses, in_air
 from tests.missions.logs.log_files import Bag, dataflash_log, tlog
 from tests.oracles_targets import BLACK, WALL, WHITE, to_srgb
-from tests.vehicle.identification.manoeuvres import fly, hidden, measured
 
 SAID = datetime(2024, 5, 1, 9, 0, 0, tzinfo=UTC)
 """When the simulated flight is said to have begun."""

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import typer
 
-from alice_survey.cli import app
+from alice_survey.cli.main import app
 from tests.docs import given
 from tests.docs.given import GIVEN, Made
 from tests.docs.pages import (

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.config import CameraConfig, WaterConfig
+from alice_survey.base.config import CameraConfig, WaterConfig
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.rig import Rig, design_rig
 from tests.fuzz.target import Target
@@ -185,7 +185,7 @@ def read_picture(path: Path) -> object:
 
 
 def read_for_matching(path: Path) -> object:
-    from missions.imaging.gain import read_linear
+    from missions.exposure.gain import read_linear
     from reconstruct.pictures.normalise import finely, read_deep
     from reconstruct.pictures.undistorted import read_colour
 
@@ -200,8 +200,8 @@ def read_mask(path: Path) -> object:
 
 def look_for_board(path: Path) -> object:
     """As `calibrate` does with each picture."""
-    from camera_calib.calibration.detect_views import detect_views
-    from camera_calib.calibration.picture_sets import PictureSet
+    from camera_calib.calibrate.detect_views import detect_views
+    from camera_calib.calibrate.picture_sets import PictureSet
     from camera_calib.targets.target import parse_target
 
     sets = [PictureSet(name="v", paths={path.name: path})]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.config import CameraConfig, WaterConfig
+from alice_survey.base.config import CameraConfig, WaterConfig
 from tests.fuzz.target import Target
 
 _HERE = Path(__file__).parent
@@ -220,7 +220,7 @@ def read_foreign(path: Path) -> object:
 
 
 def read_vehicle(path: Path) -> object:
-    from alice_survey.vehicle.identification.files import speeds_missing, vehicle_from_file
+    from alice_survey.vehicle.files import speeds_missing, vehicle_from_file
 
     return vehicle_from_file(path), speeds_missing(path)
 
@@ -244,7 +244,7 @@ def _coefficients() -> list[str]:
 
 
 def read_coefficients(path: Path) -> object:
-    from alice_survey.vehicle.identification.files import coefficients_from_file
+    from alice_survey.vehicle.files import coefficients_from_file
 
     return coefficients_from_file(path)
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from alice_survey.errors import PlanError, WorkspaceError
+from alice_survey.base.errors import PlanError, WorkspaceError
 from tests.fuzz.judge import Sandbox, judge
 from tests.fuzz.mutations import MOST_BYTES, mutate
 from tests.fuzz.targets import GROUPS, TARGETS, Trial

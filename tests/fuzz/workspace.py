@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.frames import Datum
-from missions.plan_file import Plan
+from alice_survey.base.frames import Datum
+from missions.values.plan_file import Plan
 from tests.fuzz.target import Target
 
 _DATUM = Datum(46.8426, -91.9946)
@@ -30,7 +30,7 @@ def _survey(folder: Path, name: str) -> None:
 
 
 def read_survey(path: Path) -> object:
-    from alice_survey.config import load_config
+    from alice_survey.base.config import load_config
 
     return load_config(path)
 
@@ -40,13 +40,13 @@ def _plan(folder: Path) -> None:
 
 
 def read_plan(path: Path) -> object:
-    from missions.plan_file import read_plan
+    from missions.values.plan_file import read_plan
 
     return read_plan(path).to_json()
 
 
 def _manifest(folder: Path) -> None:
-    from alice_survey.manifest import ImageRecord, write_manifest
+    from alice_survey.base.manifest import ImageRecord, write_manifest
 
     records = [
         ImageRecord(
@@ -61,7 +61,7 @@ def _manifest(folder: Path) -> None:
 
 
 def read_manifest(path: Path) -> object:
-    from alice_survey.manifest import read_manifest
+    from alice_survey.base.manifest import read_manifest
 
     return read_manifest(path)
 
@@ -69,7 +69,7 @@ def read_manifest(path: Path) -> object:
 def _track(folder: Path) -> None:
     from scipy.spatial.transform import Rotation
 
-    from alice_survey.trajectory import Trajectory, write_track
+    from alice_survey.base.trajectory import Trajectory, write_track
 
     turns = Rotation.from_rotvec(np.linspace([0, 0, 0], [0.1, 0.05, 3.0], 12))
     poses = RigidTransform.from_components(np.linspace([0, 0, 13], [10, 3, 13], 12), turns)
@@ -77,7 +77,7 @@ def _track(folder: Path) -> None:
 
 
 def read_track(path: Path) -> object:
-    from alice_survey.trajectory import read_track
+    from alice_survey.base.trajectory import read_track
 
     return read_track(path)
 
@@ -95,7 +95,7 @@ def _scene() -> tuple[Any, Any]:
 
 def sparse(folder: Path) -> None:
     """A finished `sparse/`: model, cameras, frame, track."""
-    from reconstruct.model import WorldFrame, write_frame
+    from reconstruct.views.model import WorldFrame, write_frame
 
     scene, mapped = _scene()
     (folder / "model").mkdir(exist_ok=True)
@@ -118,7 +118,7 @@ def sparse(folder: Path) -> None:
 
 def read_sparse(path: Path) -> object:
     """As every stage after the mapping begins."""
-    from reconstruct.model import read_model
+    from reconstruct.views.model import read_model
 
     return read_model(path.parents[1] if path.parent.name == "model" else path.parent)
 
@@ -131,7 +131,7 @@ def read_lenses(path: Path) -> object:
 
 
 def read_poses(path: Path) -> object:
-    from reconstruct.sparse.track import read_track_poses
+    from reconstruct.placing.track import read_track_poses
 
     return read_track_poses(path)
 
@@ -154,7 +154,7 @@ def read_uncertainty(path: Path) -> object:
 
 
 def read_frame(path: Path) -> object:
-    from reconstruct.model import read_frame as read
+    from reconstruct.views.model import read_frame as read
 
     return read(path)
 
@@ -174,7 +174,7 @@ def _survey_json() -> dict[str, Any]:
 
 def read_inputs(path: Path) -> object:
     """As `reconstruct` begins: `images/` of a workspace."""
-    from reconstruct.sparse.run import read_inputs
+    from reconstruct.placing.run import read_inputs
 
     return read_inputs(path.parents[1])
 
@@ -216,7 +216,7 @@ def _mosaic_light() -> dict[str, Any]:
 
 
 def read_light(path: Path) -> object:
-    from reconstruct.mosaic.light import read_light
+    from reconstruct.light.solve import read_light
 
     return read_light(path)
 
@@ -235,7 +235,7 @@ def _control(folder: Path) -> None:
 
 
 def read_control(path: Path) -> object:
-    from reconstruct.sparse.control_file import read_control
+    from reconstruct.placing.control_file import read_control
 
     control = read_control(path)
     datum = control.datum() or _DATUM
@@ -248,7 +248,7 @@ def _picks(folder: Path) -> None:
 
 
 def read_picks(path: Path) -> object:
-    from reconstruct.sparse.control_file import read_picks
+    from reconstruct.placing.control_file import read_picks
 
     return read_picks(path)
 
@@ -261,7 +261,7 @@ def points() -> Any:
 
 def _own_cloud(folder: Path) -> None:
     from reconstruct.dense.cloud import VERTEX, write_ply
-    from reconstruct.model import WorldFrame
+    from reconstruct.views.model import WorldFrame
 
     rows = np.zeros(400, VERTEX)
     rows["x"], rows["y"], rows["z"] = points().T

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 
 from shapely.geometry import MultiPolygon, box
 
-from alice_survey.frames import Datum
-from missions.areas.area import Area
-from missions.lines.line import Line
-from missions.plan_file import Dive, Plan
-from missions.route.legs import Leg, Route
+from alice_survey.base.frames import Datum
+from missions.values.area import Area
+from missions.values.legs import Leg, Route
+from missions.values.line import Line
+from missions.values.plan_file import Dive, Plan
 
 Move = tuple[str, float] | tuple[str, float, int]
 """("go", metres), ("line", metres, index), ("spot", degrees), ("step", metres to starboard)."""

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from alice_survey.config import SurveyConfig, parse_config
-from alice_survey.frames import Array
+from alice_survey.base.config import SurveyConfig, parse_config
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.floor import FloorGrid, floor_depth
 from alice_survey.vehicle.hull import HULL_BODY_M
 from alice_survey.vehicle.pilot.safety import REASONS, TOO_LOW
 from camera_calib.rig import design_rig
-from missions.flight import Flight
-from missions.plan import make_plan
-from missions.plan_file import Plan
-from missions.simulation import simulate_plan
+from missions.fly.simulation import simulate_plan
+from missions.plan.run import make_plan
+from missions.values.flight import Flight
+from missions.values.plan_file import Plan
 
 LEAST_M = 1.0
 """Half the altitude of 2 m."""

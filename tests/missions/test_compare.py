@@ -12,15 +12,15 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from alice_survey.cli import app
-from alice_survey.config import SurveyConfig, changed, parse_config
-from alice_survey.errors import ConfigError
+from alice_survey.base.config import SurveyConfig, changed, parse_config
+from alice_survey.base.errors import ConfigError
+from alice_survey.cli.main import app
 from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.floor import level_floor
 from alice_survey.vehicle.pilot.settings import los_offset_m
 from alice_survey.vehicle.simulator import Flown, Setup, simulate
 from camera_calib.rig import design_rig
-from missions.compare import (
+from missions.fly.compare import (
     EQUAL,
     IMPROVED,
     ORIGINAL,
@@ -37,12 +37,12 @@ from missions.compare import (
     turn_rows,
     with_equal_thrust,
 )
-from missions.compare_report import compare_report
-from missions.flight import Flight
-from missions.flight_plots import true_current
-from missions.plan import make_plan
-from missions.plan_file import Plan
-from missions.simulation import mission_setup
+from missions.fly.compare_report import compare_report
+from missions.fly.flight_plots import true_current
+from missions.fly.simulation import mission_setup
+from missions.plan.run import make_plan
+from missions.values.flight import Flight
+from missions.values.plan_file import Plan
 
 STILL = Case(current_mps=0.0, towards_deg=0.0)
 BY_NAME = {variant.name: variant for variant in VARIANTS}

@@ -10,16 +10,16 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from alice_survey.config import parse_config
+from alice_survey.base.config import parse_config
 from alice_survey.vehicle.floor import level_floor
 from alice_survey.vehicle.navigation import tick as navigation
 from camera_calib.rig import design_rig
-from missions import flight_plots
-from missions.flight import Flight, rms
-from missions.flight_plots import draw_flight, draw_vehicle, line_spans, thin, true_current
-from missions.flight_records import rpm_of
-from missions.plan import make_plan
-from missions.simulation import simulate_plan
+from missions.fly import flight_plots
+from missions.fly.flight_plots import draw_flight, draw_vehicle, line_spans, thin, true_current
+from missions.fly.flight_records import rpm_of
+from missions.fly.simulation import simulate_plan
+from missions.plan.run import make_plan
+from missions.values.flight import Flight, rms
 
 CONFIG = parse_config(
     {

@@ -9,23 +9,23 @@ import numpy as np
 import pytest
 from shapely.geometry import MultiPolygon, Polygon, box
 
-from alice_survey.config import SurveyConfig, parse_config
-from alice_survey.errors import PlanError, VehicleError
+from alice_survey.base.config import SurveyConfig, parse_config
+from alice_survey.base.errors import PlanError, VehicleError
 from alice_survey.vehicle import signals
 from alice_survey.vehicle.floor import level_floor
 from alice_survey.vehicle.pilot.memory import LEG, PHASE
-from missions.flight import Flight
-from missions.flight_records import flight_summary
-from missions.flight_route import (
+from missions.fly.flight_records import flight_summary
+from missions.fly.flight_route import (
     one_dive,
     path_of,
     room_behind_m,
     stations_of_dives,
     whole_route,
 )
-from missions.fly import run_fly
-from missions.plan_file import Plan
-from missions.simulation import longest_mission_s, simulate_plan
+from missions.fly.run import run_fly
+from missions.fly.simulation import longest_mission_s, simulate_plan
+from missions.values.flight import Flight
+from missions.values.plan_file import Plan
 from tests.missions.flown_plans import plan_of, walk
 
 FIRST = walk(
@@ -181,7 +181,7 @@ def test_a_vehicle_without_sway_turns_on_the_spot_with_a_warning_but_cannot_step
 
 
 def test_the_settings_choose_the_dive(tmp_path: Path) -> None:
-    from alice_survey.artefacts import write_json
+    from alice_survey.base.artefacts import write_json
 
     folder = tmp_path / "plan"
     folder.mkdir()

@@ -6,15 +6,15 @@ import pytest
 from PIL import Image
 from rosbags.highlevel import AnyReader
 
-from alice_survey.config import SurveyConfig, parse_config
-from alice_survey.errors import VehicleError, WorkspaceError
-from alice_survey.frames import interpolate_poses
+from alice_survey.base.config import SurveyConfig, parse_config
+from alice_survey.base.errors import VehicleError, WorkspaceError
+from alice_survey.base.frames import interpolate_poses
+from alice_survey.base.trajectory import read_columns, read_track
 from alice_survey.seafloor.terrain import survey_terrain
 from alice_survey.survey import FlightChanges, run
-from alice_survey.trajectory import read_columns, read_track
 from alice_survey.vehicle.log import read_vehicle_log
-from missions.fly import run_fly
-from missions.plan import read_plan, run_plan
+from missions.fly.run import run_fly
+from missions.plan.run import read_plan, run_plan
 
 FILES = (
     "triggers.csv", "navigation.csv", "vehicle.csv", "flight.json", "truth/track.csv",

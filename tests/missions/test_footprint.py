@@ -9,11 +9,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from shapely.geometry import LineString, Polygon
 from shapely.ops import unary_union
 
-from alice_survey.config import CameraConfig, WaterConfig
-from alice_survey.errors import PlanError
-from alice_survey.frames import rotation_from_attitude
+from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.base.errors import PlanError
+from alice_survey.base.frames import rotation_from_attitude
 from camera_calib.rig import Rig, design_rig
-from missions.footprint import (
+from missions.values.footprint import (
     camera_swath,
     common_swath,
     footprint_ne,

@@ -10,16 +10,16 @@ from PIL import Image
 from pyproj import Geod
 from shapely.geometry import shape
 
-from alice_survey.artefacts import read_stage
-from alice_survey.config import SurveyConfig, parse_config
-from alice_survey.errors import AliceError, PlanError
+from alice_survey.base.artefacts import read_stage
+from alice_survey.base.config import SurveyConfig, parse_config
+from alice_survey.base.errors import AliceError, PlanError
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import certificate
-from missions.coverage.footprints import footprint_outline, footprints_ne
 from missions.coverage.stations import stations_of_plan
-from missions.footprint import common_swath
-from missions.lines.pattern import pattern
-from missions.plan import Plan, make_plan, read_plan, run_plan
+from missions.exports.footprints import footprint_outline, footprints_ne
+from missions.plan.run import Plan, make_plan, read_plan, run_plan
+from missions.values.footprint import common_swath
+from missions.values.pattern import pattern
 
 
 def survey(**sections: Any) -> SurveyConfig:

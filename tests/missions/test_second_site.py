@@ -5,12 +5,12 @@ from importlib import resources
 import numpy as np
 import pytest
 
-from alice_survey.config import SurveyConfig, load_config
+from alice_survey.base.config import SurveyConfig, load_config
 from alice_survey.seafloor.terrain import survey_terrain
 from camera_calib.rig import design_rig
-from missions.plan import make_plan
-from missions.plan_file import Plan
-from missions.simulation import floor_grid, simulate_plan
+from missions.fly.simulation import floor_grid, simulate_plan
+from missions.plan.run import make_plan
+from missions.values.plan_file import Plan
 
 
 @pytest.fixture(scope="module")

@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from alice_survey.config import SeaConfig, SurveyConfig, parse_config
-from alice_survey.errors import VehicleError
+from alice_survey.base.config import SeaConfig, SurveyConfig, parse_config
+from alice_survey.base.errors import VehicleError
 from alice_survey.vehicle.floor import FloorGrid, level_floor
 from alice_survey.vehicle.navigation.tick import LOG_COLUMNS
 from alice_survey.vehicle.sea import current_at
 from camera_calib.rig import design_rig
-from missions.flight import Flight
-from missions.flight_records import flight_summary
-from missions.plan import make_plan
-from missions.plan_file import Plan
-from missions.simulation import current_of, simulate_plan
+from missions.fly.flight_records import flight_summary
+from missions.fly.simulation import current_of, simulate_plan
+from missions.plan.run import make_plan
+from missions.values.flight import Flight
+from missions.values.plan_file import Plan
 
 
 def survey(**changes: object) -> SurveyConfig:

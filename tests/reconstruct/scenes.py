@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.config import CameraConfig, WaterConfig
-from alice_survey.frames import Array, Datum, rotation_from_attitude
-from alice_survey.manifest import ImageRecord
+from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.base.frames import Array, Datum, rotation_from_attitude
+from alice_survey.base.manifest import ImageRecord
 from camera_calib.rig import Rig, design_rig
 from reconstruct.matching.matches import PairMatches
 

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.errors import ReconstructionError, WorkspaceError
-from alice_survey.frames import Datum
-from reconstruct.lenses.lens import lens_from_json
-from reconstruct.model import WorldFrame, read_frame, write_frame
-from reconstruct.model_files import read_reconstruction
+from alice_survey.base.errors import ReconstructionError, WorkspaceError
+from alice_survey.base.frames import Datum
+from reconstruct.views.lens import lens_from_json
+from reconstruct.views.model import WorldFrame, read_frame, write_frame
+from reconstruct.views.model_files import read_reconstruction
 from tests.reconstruct.scenes import make_scene
 from tests.reconstruct.true_models import near_truth, warped_scene
 

@@ -7,7 +7,7 @@ import pytest
 import rasterio
 from pyproj import Transformer
 
-from alice_survey.errors import WorkspaceError
+from alice_survey.base.errors import WorkspaceError
 from reconstruct.dense.dem import DemGrid
 from reconstruct.raster import (
     crs_of,

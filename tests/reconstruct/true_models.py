@@ -6,11 +6,11 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.frames import Array
-from reconstruct.lenses.lens import Lens, flat_port_lens
+from alice_survey.base.frames import Array
 from reconstruct.mapping.database import Observations, as_transform, rigid3d
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.matching.matches import as_seen
+from reconstruct.views.lens import Lens, flat_port_lens
 from tests.reconstruct.scenes import Scene
 
 POSE_ERROR = (2e-3, 5e-3)

@@ -15,7 +15,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.allocation.scratch import AllocationScratch
 from alice_survey.vehicle.compiled import kernel
 

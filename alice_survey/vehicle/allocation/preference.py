@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.propulsion import DISTRUST, Propulsion
 

@@ -7,7 +7,7 @@ asked for (the paper prints I_3 beside a 6 x 5 matrix).
 
 import math
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.allocation.scratch import AllocationScratch
 from alice_survey.vehicle.compiled import kernel
 

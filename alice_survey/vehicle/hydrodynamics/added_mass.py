@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 
 
 def alpha_0(length_m: float, diameter_m: float) -> float:

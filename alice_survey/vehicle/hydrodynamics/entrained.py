@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alice_survey.errors import VehicleError
-from alice_survey.frames import Array
+from alice_survey.base.errors import VehicleError
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.hydrodynamics.geometry import Geometry
 from alice_survey.vehicle.hydrodynamics.outline import Outline
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.coefficients import FORCES, LIFTS, MOTIONS, Coefficients
 from alice_survey.vehicle.hydrodynamics.geometry import Geometry
 from alice_survey.vehicle.hydrodynamics.lift import body_lift

@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 
-from alice_survey.errors import VehicleError
+from alice_survey.base.errors import VehicleError
 from alice_survey.vehicle.hydrodynamics.outline import Outline
 
 

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from alice_survey.errors import VehicleError
-from alice_survey.frames import Array
+from alice_survey.base.errors import VehicleError
+from alice_survey.base.frames import Array
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 

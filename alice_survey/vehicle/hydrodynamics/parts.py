@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alice_survey.errors import VehicleError
-from alice_survey.frames import Array
+from alice_survey.base.errors import VehicleError
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.hydrodynamics import added_mass, drag
 from alice_survey.vehicle.hydrodynamics.geometry import Geometry, Mast, Mount, Pod, Tunnel
 from alice_survey.vehicle.hydrodynamics.outline import Outline

@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
 
-from alice_survey.errors import ConfigError
+from alice_survey.base.errors import ConfigError
 from alice_survey.vehicle.hydrodynamics import added_mass, drag
 from alice_survey.vehicle.hydrodynamics.entrained import Entrained
 from alice_survey.vehicle.hydrodynamics.geometry import Geometry

@@ -5,15 +5,15 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from alice_survey.artefacts import write_csv
-from alice_survey.errors import ConfigError
+from alice_survey.base.artefacts import write_csv
+from alice_survey.base.errors import ConfigError
+from alice_survey.base.text_table import text_table
 from alice_survey.vehicle.hydrodynamics.entrained import Entrained, entrained_water
 from alice_survey.vehicle.hydrodynamics.estimate import estimate, part_coefficients
 from alice_survey.vehicle.hydrodynamics.geometry import ALICE, Geometry
 from alice_survey.vehicle.hydrodynamics.paper_tables import TABLES, PaperRow
 from alice_survey.vehicle.hydrodynamics.parts import Flow, parts
 from alice_survey.vehicle.hydrodynamics.reasons import Evidence, equation, reason
-from camera_calib.text_table import text_table
 
 CLOSE_PERCENT, NEAR_PERCENT = 1.0, 5.0
 """Differences up to which a row counts as reproduced, and as near."""

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.errors import VehicleError
-from alice_survey.frames import Array
+from alice_survey.base.errors import VehicleError
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.propulsion import Thruster, add_thrust
 from alice_survey.vehicle.vehicle import Vehicle
 

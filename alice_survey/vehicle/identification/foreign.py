@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 from scipy.spatial.transform import Rotation
 
-from alice_survey.config import Config
-from alice_survey.contents import one_line, shown
-from alice_survey.errors import VehicleError, why
-from alice_survey.frames import Array, rotation_from_attitude
+from alice_survey.base.config import Config
+from alice_survey.base.contents import one_line, shown
+from alice_survey.base.errors import VehicleError, why
+from alice_survey.base.frames import Array, rotation_from_attitude
 from alice_survey.vehicle.log import TIME, VehicleLog, log_of_columns, read_number_columns
 
 Three = tuple[str, str, str]

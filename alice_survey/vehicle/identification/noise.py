@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import solve_toeplitz
 from scipy.signal import fftconvolve
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 
 _HIGHEST_ORDER = 20
 _FADED = 1e-3

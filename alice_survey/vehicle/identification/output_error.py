@@ -14,10 +14,10 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from alice_survey.errors import VehicleError
-from alice_survey.executor import progress
-from alice_survey.frames import Array
-from alice_survey.progress import step as named_step
+from alice_survey.base.errors import VehicleError
+from alice_survey.base.executor import progress
+from alice_survey.base.frames import Array
+from alice_survey.base.run.progress import step as named_step
 from alice_survey.vehicle.identification.noise import (
     autocovariance,
     noise_sigma,

@@ -7,8 +7,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from alice_survey.errors import VehicleError
-from alice_survey.frames import Array
+from alice_survey.base.errors import VehicleError
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.coefficients import FORCES, LIFTS, MOTIONS, Coefficients
 from alice_survey.vehicle.identification.slopes import (
     ADDED_MASS,

@@ -8,20 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.errors import VehicleError
-from alice_survey.frames import Array
+from alice_survey.base.errors import VehicleError
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.coefficients import Coefficients
+from alice_survey.vehicle.files import (
+    coefficients_from_file,
+    speeds_missing,
+    vehicle_from,
+    write_coefficients,
+)
 from alice_survey.vehicle.identification.bollard import (
     ThrustCoefficient,
     fit_pulls,
     read_pulls,
     with_thrust,
-)
-from alice_survey.vehicle.identification.files import (
-    coefficients_from_file,
-    speeds_missing,
-    vehicle_from,
-    write_coefficients,
 )
 from alice_survey.vehicle.identification.foreign import read_column_map, read_foreign_log
 from alice_survey.vehicle.identification.output_error import Fit, Simulation, fit_output_error

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.identification.slopes import (
     BIAS,

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.dynamics import Body, add_coriolis, add_damping
 from alice_survey.vehicle.propulsion import Propulsion, add_thrust

@@ -18,9 +18,9 @@ import numpy as np
 from scipy.signal import fftconvolve, savgol_filter
 from scipy.spatial.transform import Rotation
 
-from alice_survey import progress
-from alice_survey.errors import VehicleError
-from alice_survey.frames import Array
+from alice_survey.base.errors import VehicleError
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.identification.noise import autocovariance, correlated_information
 from alice_survey.vehicle.identification.parameters import OTHERS, Parameters

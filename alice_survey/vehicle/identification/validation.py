@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from alice_survey.errors import VehicleError
-from alice_survey.frames import Array
+from alice_survey.base.errors import VehicleError
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.identification.output_error import Simulation
 from alice_survey.vehicle.identification.parameters import Parameters
 from alice_survey.vehicle.identification.sensitivity import CHANNELS, Record, simulate

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.errors import VehicleError, warn
-from alice_survey.frames import Array
+from alice_survey.base.errors import VehicleError, warn
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.identification.sensitivity import CHANNELS, Record
 from alice_survey.vehicle.identification.slopes import STATES
 from alice_survey.vehicle.log import VehicleLog, segments

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.dynamics import GRAVITY
 from alice_survey.vehicle.floor import FloorGrid, floor_range

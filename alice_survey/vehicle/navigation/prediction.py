@@ -5,7 +5,7 @@ See `filter` for what is believed, and why so.
 
 import math
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.dynamics import GRAVITY
 from alice_survey.vehicle.navigation.sensors import Sensors

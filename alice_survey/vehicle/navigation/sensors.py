@@ -21,8 +21,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from alice_survey.errors import VehicleError
-from alice_survey.frames import Array
+from alice_survey.base.errors import VehicleError
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.dynamics import GRAVITY
 
 Place = tuple[float, float, float]

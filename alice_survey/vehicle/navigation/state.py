@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from alice_survey.errors import VehicleError
-from alice_survey.frames import Array
+from alice_survey.base.errors import VehicleError
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.navigation.sensors import IMU, Sensors
 from alice_survey.vehicle.signals import ESTIMATE
 
@@ -105,7 +105,7 @@ def new_navigation(sensors: Sensors, truth: Array, rng: np.random.Generator) -> 
     """
     from scipy.spatial.transform import Rotation
 
-    from alice_survey.frames import rotation_from_attitude
+    from alice_survey.base.frames import rotation_from_attitude
 
     if truth.shape != (13,) or not np.all(np.isfinite(truth)):
         raise VehicleError("navigation begins at a state that is no finite (13,) vector")

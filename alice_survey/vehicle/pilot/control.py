@@ -6,7 +6,7 @@ wanted motion over ground. The current is not known, so that what it adds to dra
 integrals.
 """
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.dynamics import add_coriolis, add_damping
 from alice_survey.vehicle.pilot.gains import (

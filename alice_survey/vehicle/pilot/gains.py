@@ -39,8 +39,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from alice_survey.errors import VehicleError
-from alice_survey.frames import Array
+from alice_survey.base.errors import VehicleError
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.dynamics import Body, coriolis_matrix
 from alice_survey.vehicle.propulsion import thrust_limits
 from alice_survey.vehicle.vehicle import Vehicle

@@ -16,7 +16,7 @@ and holds its depth, rising as the floor last did, until the lock is lost for to
 
 import math
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from alice_survey.vehicle import signals
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.pilot import memory as told

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 
 (
     PHASE, LEG, ALONG, CROSS, WANTED_HEADING, WANTED_SURGE, BY_SWAY, REASON, LINE, WANTED_DEPTH,

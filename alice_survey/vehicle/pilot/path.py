@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from alice_survey.errors import VehicleError
-from alice_survey.frames import Array
+from alice_survey.base.errors import VehicleError
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.compiled import kernel
 
 _GAP_M = 1e-3

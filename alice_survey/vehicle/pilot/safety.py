@@ -3,7 +3,7 @@
 import math
 from typing import NamedTuple
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.pilot.memory import (
     BEST,

@@ -13,7 +13,7 @@ that falls behind.
 import math
 from typing import NamedTuple
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from alice_survey.vehicle import signals
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.pilot import memory as told

@@ -7,7 +7,7 @@ depend on the yaw that was asked for.
 
 import math
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from alice_survey.vehicle import signals
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.pilot import memory as told

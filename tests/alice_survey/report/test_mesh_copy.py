@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from alice_survey.artefacts import write_json
+from alice_survey.base.artefacts import write_json
 from alice_survey.report import mesh_copy as copies
 from alice_survey.report.held import Held
 from alice_survey.report.mesh_copy import grid_mesh, mesh_copy

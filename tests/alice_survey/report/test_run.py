@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from pypdf import PdfReader
 
-from alice_survey.config import SurveyConfig
-from alice_survey.errors import WorkspaceError
+from alice_survey.base.config import SurveyConfig
+from alice_survey.base.errors import WorkspaceError
 from alice_survey.report.run import run_report
 from tests.alice_survey.report.tiny import tiny_workspace
 

@@ -3,7 +3,7 @@ from typing import Any
 
 import pytest
 
-from alice_survey.artefacts import write_json
+from alice_survey.base.artefacts import write_json
 from alice_survey.report.figures import Figures
 from alice_survey.report.held import Held
 from alice_survey.report.summary import facts, summary

@@ -7,7 +7,7 @@ import numpy as np
 import rasterio
 from rasterio.transform import Affine
 
-from alice_survey.artefacts import write_csv, write_json
+from alice_survey.base.artefacts import write_csv, write_json
 
 CELL_M, ROWS, COLUMNS = 0.01, 120, 80
 HOLE = (slice(100, 120), slice(0, 20))

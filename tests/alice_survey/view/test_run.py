@@ -19,7 +19,7 @@ from rasterio.transform import Affine
 from rasterio.windows import Window
 from typer.testing import CliRunner
 
-from alice_survey.cli import app
+from alice_survey.cli.main import app
 from alice_survey.view import run
 from alice_survey.view.server import ADDRESS
 from tests.alice_survey.report.tiny import tiny_workspace

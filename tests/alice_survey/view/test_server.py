@@ -17,7 +17,7 @@ import rasterio
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alice_survey.artefacts import write_json
+from alice_survey.base.artefacts import write_json
 from alice_survey.view import server as serving_module
 from alice_survey.view.server import Server, serving
 from tests.alice_survey.report.tiny import tiny_workspace

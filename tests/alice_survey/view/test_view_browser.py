@@ -9,7 +9,7 @@ import trimesh
 from PIL import Image
 from rasterio.transform import Affine
 
-from alice_survey.artefacts import write_json
+from alice_survey.base.artefacts import write_json
 from alice_survey.view.server import serving
 from tests.alice_survey.report.browser import Heard, chromium
 from tests.alice_survey.report.sketch import encoded, seafloor, sketch_mesh

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.ndimage import shift as shift_picture
 
-from alice_survey.errors import CalibrationError, ConfigError, ImageError
+from alice_survey.base.errors import CalibrationError, ConfigError, ImageError
 from camera_calib.approximation.dispersion import (
     channel_cameras,
     channel_maps,

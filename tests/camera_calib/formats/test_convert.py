@@ -11,9 +11,9 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.cli import main
-from alice_survey.config import CameraConfig, WaterConfig
-from alice_survey.errors import AliceError, CalibrationError
+from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.base.errors import AliceError, CalibrationError
+from alice_survey.cli.main import main
 from camera_calib.formats.convert import convert_files
 from camera_calib.formats.in_water import in_water
 from camera_calib.formats.registry import FORMATS, detect

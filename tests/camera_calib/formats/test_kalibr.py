@@ -10,7 +10,7 @@ import yaml
 from hypothesis import given, settings
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.errors import CalibrationError
+from alice_survey.base.errors import CalibrationError
 from camera_calib.formats.kalibr import read_kalibr, write_kalibr
 from camera_calib.formats.registry import detect
 from camera_calib.formats.rigs import Reading

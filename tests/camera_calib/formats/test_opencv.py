@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.errors import CalibrationError
+from alice_survey.base.errors import CalibrationError
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.formats.opencv import read_opencv, write_opencv
 from camera_calib.formats.rigs import Reading

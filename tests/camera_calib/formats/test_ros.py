@@ -11,7 +11,7 @@ import yaml
 from hypothesis import assume, given, settings
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.errors import CalibrationError
+from alice_survey.base.errors import CalibrationError
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.formats.registry import detect
 from camera_calib.formats.rigs import Reading

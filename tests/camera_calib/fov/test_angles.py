@@ -3,9 +3,9 @@ import math
 import numpy as np
 import pytest
 
-from alice_survey.config import CameraConfig
-from alice_survey.errors import ConfigError
-from alice_survey.seawater import n_water as n_of
+from alice_survey.base.config import CameraConfig
+from alice_survey.base.errors import ConfigError
+from alice_survey.base.seawater import n_water as n_of
 from camera_calib.fov.angles import ANGLES_DEG, angle_of_displacement, angle_table
 
 PORT = CameraConfig()

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from alice_survey.config import CameraConfig, WaterConfig
-from alice_survey.errors import ConfigError
+from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.base.errors import ConfigError
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.fov.focus import FocusedLens, apparent_depths, apparent_distance_m, glass_z_m
 from camera_calib.fov.table import FovChoices, fov_table

@@ -3,7 +3,7 @@ from dataclasses import replace
 
 import pytest
 
-from alice_survey.config import CameraConfig
+from alice_survey.base.config import CameraConfig
 from camera_calib.fov.paper import (
     Validation,
     coc_for_depth_of_field_px,

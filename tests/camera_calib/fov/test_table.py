@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.config import CameraConfig, WaterConfig
-from alice_survey.errors import ConfigError
+from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.base.errors import ConfigError
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.fov.table import (
     MATCH_SIGMA_PX,

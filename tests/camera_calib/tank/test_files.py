@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.errors import CalibrationError
+from alice_survey.base.errors import CalibrationError
 from camera_calib.tank.files import read_detections, read_reference, warn_of_left_out
 
 POINTS = """/* corners // of the tank */

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from alice_survey.errors import CalibrationError
+from alice_survey.base.errors import CalibrationError
 from camera_calib.tank.interface import (
     FixedCamera,
     Reference,

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from alice_survey.cli import app
-from alice_survey.errors import CalibrationError
+from alice_survey.base.errors import CalibrationError
+from alice_survey.cli.main import app
 from camera_calib.rig import read_rig
 from camera_calib.tank.run import TankSettings, misses, run_tank
 from camera_calib.triangulate import triangulate

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from alice_survey.errors import CalibrationError
+from alice_survey.base.errors import CalibrationError
 from camera_calib.targets.detect import detect
 from camera_calib.targets.sheet import BAR_MM, PAPERS_MM, lay_out, print_target, write_sheet
 from camera_calib.targets.target import Target, parse_target

@@ -11,8 +11,8 @@ import shapely
 from pyproj import Transformer
 from rasterio.transform import Affine, from_origin
 
-from alice_survey.errors import PlanError
-from alice_survey.frames import Array, Datum
+from alice_survey.base.errors import PlanError
+from alice_survey.base.frames import Array, Datum
 from missions.areas import bathymetry as module
 from missions.areas.bathymetry import Bathymetry, area_depth, read_bathymetry
 from tests.oracles_energy import bilinear

@@ -7,13 +7,13 @@ from hypothesis import strategies as st
 from pyproj import CRS, Geod, Transformer
 from shapely.geometry import Polygon
 
-from alice_survey.config import AreaConfig
-from alice_survey.errors import PlanError
-from alice_survey.frames import Datum
-from missions.areas.area import Area
+from alice_survey.base.config import AreaConfig
+from alice_survey.base.errors import PlanError
+from alice_survey.base.frames import Datum
 from missions.areas.crs import LocalFrame, geographic_shapes, parse_crs
 from missions.areas.raw import from_geometries
 from missions.areas.survey import survey_area
+from missions.values.area import Area
 
 WGS84 = Geod(ellps="WGS84")
 

@@ -12,12 +12,12 @@ from pyproj import Transformer
 from shapely.geometry import LineString, Point, Polygon
 from shapely.geometry.base import BaseGeometry
 
-from alice_survey.config import AreaConfig
-from alice_survey.errors import PlanError
+from alice_survey.base.config import AreaConfig
+from alice_survey.base.errors import PlanError
 from missions.areas import safe
-from missions.areas.area import Area
 from missions.areas.files import area_files, read_area_file
 from missions.areas.survey import survey_area
+from missions.values.area import Area
 
 SITE = Polygon(
     [(700000, 3640000), (700030, 3640000), (700030, 3640020), (700015, 3640010), (700000, 3640020)],

@@ -6,10 +6,10 @@ from typing import Any
 import pytest
 import shapely
 
-from alice_survey.config import AreaConfig
-from alice_survey.errors import PlanError
-from missions.areas.area import Area
+from alice_survey.base.config import AreaConfig
+from alice_survey.base.errors import PlanError
 from missions.areas.survey import survey_area
+from missions.values.area import Area
 
 POLYGON = [[32.82, 34.95], [32.821, 34.95], [32.821, 34.951], [32.82, 34.951]]
 

@@ -5,9 +5,9 @@ import pytest
 import shapely
 from shapely.geometry import MultiPolygon, Polygon
 
-from alice_survey.config import AreaConfig
-from alice_survey.errors import PlanError
-from alice_survey.frames import Datum
+from alice_survey.base.config import AreaConfig
+from alice_survey.base.errors import PlanError
+from alice_survey.base.frames import Datum
 from missions.areas.crs import LocalFrame
 from missions.areas.raw import RawShapes, no_points
 from missions.areas.repair import Mended, mended

@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from shapely.geometry import Polygon
 
-from alice_survey.config import AreaConfig, parse_config
-from alice_survey.errors import AliceError, PlanError
-from alice_survey.frames import Datum
-from missions.areas.area import Area
+from alice_survey.base.config import AreaConfig, parse_config
+from alice_survey.base.errors import AliceError, PlanError
+from alice_survey.base.frames import Datum
 from missions.areas.survey import survey_area
+from missions.values.area import Area
 
 SQUARE = ((0.0, 0.0), (10.0, 0.0), (10.0, 10.0), (0.0, 10.0))
 

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.artefacts import write_csv
-from alice_survey.frames import Array, rotation_from_attitude
+from alice_survey.base.artefacts import write_csv
+from alice_survey.base.frames import Array, rotation_from_attitude
 from camera_calib.rig import Rig
 from missions.coverage.stations import Stations
-from missions.footprint import glass_point_cam
-from missions.navigation import NavigationLog
-from missions.plan_file import Plan
+from missions.values.footprint import glass_point_cam
+from missions.values.navigation import NavigationLog
+from missions.values.plan_file import Plan
 
 
 def log_of(flown: Stations, plan: Plan, rig: Rig) -> NavigationLog:

@@ -8,16 +8,16 @@ from hypothesis import strategies as st
 from shapely.geometry import Polygon
 from shapely.ops import unary_union
 
-from alice_survey.config import CameraConfig, WaterConfig
-from alice_survey.errors import PlanError
-from alice_survey.frames import Datum
+from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.base.errors import PlanError
+from alice_survey.base.frames import Datum
 from camera_calib.rig import design_rig
-from missions.areas.area import Area
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.holes import find_holes
 from missions.coverage.stations import Stations, stations_of_lines, sure_pattern
-from missions.footprint import footprint_size_m
-from missions.lines.pattern import Pattern
+from missions.values.area import Area
+from missions.values.footprint import footprint_size_m
+from missions.values.pattern import Pattern
 from tests.oracles_coverage import (
     DATUM,
     area_of,

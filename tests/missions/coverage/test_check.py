@@ -8,19 +8,19 @@ import rasterio
 import shapely
 from PIL import Image
 
-from alice_survey.artefacts import Stage, run_stage, write_json
-from alice_survey.config import SurveyConfig
-from alice_survey.errors import NavigationError, PlanError, WorkspaceError
+from alice_survey.base.artefacts import Stage, run_stage, write_json
+from alice_survey.base.config import SurveyConfig
+from alice_survey.base.errors import NavigationError, PlanError, WorkspaceError
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import certificate
-from missions.coverage.check import check_report
 from missions.coverage.holes import find_holes
-from missions.coverage.refly import refly_plan
 from missions.coverage.stations import Stations, plan_pattern, stations_of_plan
-from missions.lines.line import Line
-from missions.navigation import write_navigation
-from missions.plan_file import Plan, read_plan
+from missions.fly.check import check_report
+from missions.fly.refly import refly_plan
 from missions.route.ways import Ways
+from missions.values.line import Line
+from missions.values.navigation import write_navigation
+from missions.values.plan_file import Plan, read_plan
 from tests.missions.coverage.logs import log_of, write_triggers
 from tests.oracles_coverage import DATUM, area_of, lawnmower, plan_of
 

@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 import shapely
 
-from alice_survey.artefacts import write_csv
-from alice_survey.config import CameraConfig, WaterConfig
-from alice_survey.errors import NavigationError
-from alice_survey.frames import Array, rotation_from_attitude
-from alice_survey.manifest import ImageRecord, write_manifest
-from alice_survey.trajectory import Trajectory, write_track
+from alice_survey.base.artefacts import write_csv
+from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.base.errors import NavigationError
+from alice_survey.base.frames import Array, rotation_from_attitude
+from alice_survey.base.manifest import ImageRecord, write_manifest
+from alice_survey.base.trajectory import Trajectory, write_track
 from camera_calib.rig import design_rig
 from missions.coverage.dives import read_dive_record
 from missions.coverage.passes import assign_lines
 from missions.coverage.stations import Stations, stations_of_plan
-from missions.navigation import write_navigation
+from missions.values.navigation import write_navigation
 from tests.missions.coverage.logs import log_of, write_triggers
 from tests.oracles_coverage import DATUM, area_of, lawnmower, plan_of
 

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import shapely
 
-from alice_survey.config import SurveyConfig
-from alice_survey.errors import PlanError
+from alice_survey.base.config import SurveyConfig
+from alice_survey.base.errors import PlanError
 from alice_survey.vehicle.floor import level_floor
 from camera_calib.rig import design_rig
-from missions.coverage.monte_carlo import monte_carlo
-from missions.plan_file import Plan
+from missions.fly.monte_carlo import monte_carlo
 from missions.route.turns import route_through
+from missions.values.plan_file import Plan
 from tests.oracles_coverage import area_of, lawnmower, plan_of
 
 DEPTH_M = 8.0

@@ -3,12 +3,12 @@ import math
 import numpy as np
 import pytest
 
-from alice_survey.config import CameraConfig, WaterConfig
-from alice_survey.errors import PlanError
+from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.base.errors import PlanError
 from camera_calib.rig import Rig, design_rig
 from missions.coverage.overlap import measured_side_overlap
 from missions.coverage.stations import Stations, stations_of_lines
-from missions.footprint import footprint_size_m, step_for_overlap
+from missions.values.footprint import footprint_size_m, step_for_overlap
 from tests.oracles_coverage import lawnmower, pinhole_rig
 
 IDEAL = design_rig(CameraConfig(port_distance_m=0.0, glass_thickness_m=0.0), WaterConfig())

@@ -7,13 +7,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.geometry import Polygon
 
-from alice_survey.config import CameraConfig, WaterConfig
+from alice_survey.base.config import CameraConfig, WaterConfig
 from camera_calib.rig import design_rig
 from missions.coverage import certificate as module
 from missions.coverage.certificate import certificate
 from missions.coverage.raster import Grid, border_rays_body, footprints_ne, grid_over, inside
 from missions.coverage.stations import Stations
-from missions.lines.pattern import Pattern
+from missions.values.pattern import Pattern
 from tests.oracles_coverage import area_of, counts_at, footprint_polygons, middles_ne
 
 RIG = design_rig(CameraConfig(), WaterConfig())

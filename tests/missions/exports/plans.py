@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 from shapely.geometry import MultiPolygon, Polygon
 
-from alice_survey.config import CameraConfig, WaterConfig
-from alice_survey.frames import Datum
+from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.base.frames import Datum
 from camera_calib.rig import Rig, design_rig
-from missions.areas.area import Area
-from missions.lines.line import Line
-from missions.plan_file import Dive, Plan
-from missions.route.legs import Leg, Route
+from missions.values.area import Area
+from missions.values.legs import Leg, Route
+from missions.values.line import Line
+from missions.values.plan_file import Dive, Plan
 
 DATUM = Datum(latitude_deg=32.8236, longitude_deg=34.9553)
 RIG: Rig = design_rig(CameraConfig(), WaterConfig())

@@ -10,10 +10,10 @@ from camera_calib.rig import Rig
 from missions.exports.mount import mount_of
 from missions.exports.options import Options, line_tolerance_m
 from missions.exports.write import write_exports
-from missions.footprint import common_swath
-from missions.plan_file import Dive, Plan
-from missions.route.costs import SETTLE_S
-from missions.route.legs import Route
+from missions.values.costs import SETTLE_S
+from missions.values.footprint import common_swath
+from missions.values.legs import Route
+from missions.values.plan_file import Dive, Plan
 from tests.missions.exports.plans import RIG, golden_plan, line, plan_of, small_plan, straight
 from tests.missions.exports.readers import (
     Step,

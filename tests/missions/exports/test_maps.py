@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 
 from missions.exports.kml import write_kml
 from missions.exports.write import write_exports
-from missions.plan_file import Plan
+from missions.values.plan_file import Plan
 from tests.missions.exports.plans import RIG, small_plan
 from tests.missions.exports.readers import local_ne, plans
 

@@ -20,7 +20,7 @@ from shapely.geometry import Point, Polygon
 
 from camera_calib.rig import Rig
 from missions.exports.write import write_exports
-from missions.plan_file import Plan
+from missions.values.plan_file import Plan
 from tests.missions.exports.plans import RIG, golden_plan, line, plan_of, small_plan
 from tests.missions.exports.readers import local_ne, plans, rigs, turned
 

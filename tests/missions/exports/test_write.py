@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.artefacts import write_json
-from alice_survey.config import parse_config
-from alice_survey.errors import PlanError
+from alice_survey.base.artefacts import write_json
+from alice_survey.base.config import parse_config
+from alice_survey.base.errors import PlanError
 from missions.exports.options import Options
 from missions.exports.waypoints import DEPTH_STEP_M, bends
 from missions.exports.write import FORMATS, counted, export_report, write_exports
-from missions.plan_file import read_plan
+from missions.values.plan_file import read_plan
 from tests.missions.exports.plans import RIG, small_plan
 from tests.missions.exports.readers import local_ne
 

@@ -9,10 +9,10 @@ from shapely.geometry import MultiPolygon, Polygon, box
 
 from missions.lines.cross import LEAST_STEPS, stabs
 from missions.lines.lay import lay_lines
-from missions.lines.line import Line
-from missions.lines.pattern import Pattern
-from missions.route.costs import time_costs
 from missions.route.ways import Ways
+from missions.values.costs import time_costs
+from missions.values.line import Line
+from missions.values.pattern import Pattern
 from tests.oracles_lines import PATTERNS, STEREO, area_of, areas, as_string
 
 ARMS = Polygon([(0, 0), (30, 0), (30, 12), (14, 12), (14, 26), (0, 26)])

@@ -8,14 +8,14 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from shapely.geometry import MultiPolygon, box
 
-from missions.areas.area import multipolygon
 from missions.lines.fill import fill_table, lines_over
 from missions.lines.lay import survey_pieces
-from missions.lines.line import Line
-from missions.lines.pattern import Pattern
 from missions.lines.rows import to_uv
 from missions.lines.site import Site
 from missions.lines.unseen import LENGTH, WIDTH, U, V, unseen
+from missions.values.area import multipolygon
+from missions.values.line import Line
+from missions.values.pattern import Pattern
 from tests.oracles_lines import (
     ELL_WITH_HOLES,
     PATTERNS,

@@ -8,14 +8,14 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from shapely.geometry import MultiPolygon, Point, Polygon, box
 
-from alice_survey.errors import PlanError
+from alice_survey.base.errors import PlanError
 from missions.lines.hops import flight_parts_j, prices_of
 from missions.lines.lay import lay_lines, ordered, ways_between
-from missions.lines.line import Line
-from missions.lines.pattern import Pattern
 from missions.lines.sweep import full_cost_j
-from missions.route.costs import Costs, time_costs
 from missions.route.ways import Ways
+from missions.values.costs import Costs, time_costs
+from missions.values.line import Line
+from missions.values.pattern import Pattern
 from tests.oracles_lines import (
     ELL,
     ELL_WITH_HOLES,

@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.geometry import MultiPolygon, Polygon, box
 
-from alice_survey.errors import PlanError
+from alice_survey.base.errors import PlanError
 from missions.lines.site import Site
 from missions.lines.sweep import best_heading, full_cost_j, least_width, widths_m
-from missions.route.costs import Costs, time_costs
 from missions.route.ways import Ways
+from missions.values.costs import Costs, time_costs
 from tests.oracles_lines import ELL, ELL_WITH_HOLES, STEREO, area_of, areas
 
 ALONG = np.arange(16) * 2 * np.pi / 16

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from alice_survey.errors import NavigationError
+from alice_survey.base.errors import NavigationError
 from alice_survey.vehicle.log import read_vehicle_log
 from missions.logs.import_log import ImportOptions, import_log
 from missions.logs.navigation_csv import read_navigation

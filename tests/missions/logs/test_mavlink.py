@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from alice_survey.errors import NavigationError
+from alice_survey.base.errors import NavigationError
 from missions.logs.mavlink import MESSAGES, Message, Packet, checksum, packet_at
 from missions.logs.tlog import COMPONENT, RECORDED, SYSTEM, packets, read_tlog
 from tests.missions.logs.log_files import tlog

@@ -10,14 +10,14 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alice_survey.errors import PlanError
-from missions.lines.line import Line
-from missions.plan_file import Dive
+from alice_survey.base.errors import PlanError
 from missions.route.cost import route_cost
-from missions.route.costs import Costs, time_costs
 from missions.route.dives import split_dives
 from missions.route.turns import route_through
 from missions.route.ways import Ways
+from missions.values.costs import Costs, time_costs
+from missions.values.line import Line
+from missions.values.plan_file import Dive
 from tests.oracles_energy import best_parting
 
 HOME = (-1.0, -2.0)

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.geometry import box
 
-from alice_survey.errors import PlanError
-from missions.areas.area import multipolygon
+from alice_survey.base.errors import PlanError
 from missions.route.dubins import turn
-from missions.route.legs import Leg
 from missions.route.ways import Ways
+from missions.values.area import multipolygon
+from missions.values.legs import Leg
 
 places = st.tuples(st.floats(-10, 10), st.floats(-10, 10))
 angles = st.floats(-math.pi, math.pi)

@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from alice_survey.config import SurveyConfig
-from alice_survey.errors import PlanError
+from alice_survey.base.config import SurveyConfig
+from alice_survey.base.errors import PlanError
 from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.pilot import settings as pilot
 from alice_survey.vehicle.steady import steady_flight
 from camera_calib.rig import design_rig
-from missions.imaging.settings import imaging_settings
-from missions.lines.line import Line
-from missions.route.costs import SPOT_RAD_S, STEP_MPS, power_at, time_costs
+from missions.exposure.settings import imaging_settings
+from missions.plan.strength import held_current_mps, too_strong
+from missions.plan.trade import current_report, draw_trade, energy_report, three_ways
 from missions.route.dives import split_dives
 from missions.route.energy import (
     course_power,
@@ -33,8 +33,8 @@ from missions.route.energy import (
     usable_wh,
     vehicle_costs,
 )
-from missions.route.strength import held_current_mps, too_strong
-from missions.route.trade import current_report, draw_trade, energy_report, three_ways
+from missions.values.costs import SPOT_RAD_S, STEP_MPS, power_at, time_costs
+from missions.values.line import Line
 
 
 def _config(current: float = 0.1, towards: float = 90.0, **sections: Any) -> SurveyConfig:
@@ -387,11 +387,11 @@ def test_costs_compile_nothing() -> None:
     """A cold start pays for no kernel of the simulator."""
     code = (
         "from numba.core import event\n"
-        "from alice_survey.config import SurveyConfig\n"
+        "from alice_survey.base.config import SurveyConfig\n"
         "from missions.route.energy import vehicle_costs\n"
         "with event.install_recorder('numba:compile') as seen:\n"
         "    vehicle_costs(SurveyConfig())\n"
-        "import sys; print(len(seen.buffer), 'missions.simulation' in sys.modules)"
+        "import sys; print(len(seen.buffer), 'missions.fly.simulation' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["0", "False"]

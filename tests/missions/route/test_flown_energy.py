@@ -5,18 +5,18 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from alice_survey.config import SurveyConfig
+from alice_survey.base.config import SurveyConfig
 from alice_survey.vehicle import signals
 from alice_survey.vehicle.floor import level_floor
 from alice_survey.vehicle.pilot.memory import LEG, PHASE
 from camera_calib.rig import design_rig
-from missions.flight import Flight
-from missions.plan import make_plan
-from missions.plan_file import Plan
+from missions.fly.simulation import simulate_plan
+from missions.plan.run import make_plan
 from missions.route.cost import leg_costs
-from missions.route.costs import power_at
 from missions.route.energy import vehicle_costs
-from missions.simulation import simulate_plan
+from missions.values.costs import power_at
+from missions.values.flight import Flight
+from missions.values.plan_file import Plan
 
 CONFIG = SurveyConfig.model_validate(
     {

@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 from shapely.geometry import LineString, Point
 
 from missions.route.cost import leg_costs, mean_power, route_cost
-from missions.route.costs import Costs, time_costs
 from missions.route.joins import COLUMNS, price, prices
-from missions.route.legs import Leg, Route
 from missions.route.turns import route_through
+from missions.values.costs import Costs, time_costs
+from missions.values.legs import Leg, Route
 from tests.oracles_route import lawn, route_cost_by_steps, sampled_leg
 
 angles = st.floats(-7.0, 7.0)

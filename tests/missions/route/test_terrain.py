@@ -9,10 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyproj import Transformer
 
-from alice_survey.errors import PlanError
-from alice_survey.frames import Array, Datum
+from alice_survey.base.errors import PlanError
+from alice_survey.base.frames import Array, Datum
 from missions.areas.bathymetry import Bathymetry, read_bathymetry
-from missions.lines.line import Line
 from missions.route.terrain import (
     Reach,
     TerrainLimits,
@@ -23,6 +22,7 @@ from missions.route.terrain import (
     reach_of,
     terrain_report,
 )
+from missions.values.line import Line
 from tests.oracles_energy import envelope as slow_envelope
 from tests.oracles_energy import highest_within
 

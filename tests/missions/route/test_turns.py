@@ -8,16 +8,16 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from shapely.geometry import MultiPolygon, box
 
-from alice_survey.errors import PlanError
-from missions.areas.area import multipolygon
-from missions.lines.line import Line
+from alice_survey.base.errors import PlanError
 from missions.route.cost import route_cost
-from missions.route.costs import Costs, time_costs
 from missions.route.fence import TOUCH_M
 from missions.route.joins import LONGEST_SWAY_M
-from missions.route.legs import Route
 from missions.route.turns import Turns, route_through
 from missions.route.ways import Ways
+from missions.values.area import multipolygon
+from missions.values.costs import Costs, time_costs
+from missions.values.legs import Route
+from missions.values.line import Line
 from tests.oracles_route import farthest_outside_m, lawn, total_m
 from tests.strategies_areas import areas, places_in
 

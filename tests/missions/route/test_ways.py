@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.geometry import LineString, MultiPolygon, Point, Polygon, box
 
-from alice_survey.errors import PlanError
-from missions.areas.area import multipolygon
+from alice_survey.base.errors import PlanError
 from missions.route.fence import OPEN_WATER, TOUCH_M, arc_inside, straight_inside
-from missions.route.legs import Leg
 from missions.route.ways import Ways
+from missions.values.area import multipolygon
+from missions.values.legs import Leg
 from tests.oracles_route import sampled_leg, shortest_way_m
 from tests.strategies_areas import areas, places_in
 

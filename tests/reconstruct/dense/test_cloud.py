@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from alice_survey.artefacts import read_json
+from alice_survey.base.artefacts import read_json
 from reconstruct.dense.cloud import VERTEX, thinned_points, voxel_edge, write_cloud_json, write_ply
 from reconstruct.dense.dem import DemGrid
 from reconstruct.dense.points import Points

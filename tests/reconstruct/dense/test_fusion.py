@@ -4,9 +4,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform
 
 from reconstruct.dense.fusion import count_witnesses, merge_depths
-from reconstruct.dense.sight import KernelLens, lens_of, pinhole_of, slopes_of
 from reconstruct.dense.stereo_pairs import in_frame
-from reconstruct.lenses.range_shift import no_shift
+from reconstruct.views.range_shift import no_shift
+from reconstruct.views.sight import KernelLens, lens_of, pinhole_of, slopes_of
 from tests.oracles_dense import merged, plane_depth, port_view
 
 LENS = (np.array([50.0, 50.0, 10.0, 8.0]), no_shift(20, 16).arguments)

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from reconstruct.dense.pose_part import PosePart, find_pose_part, spread_over
 from reconstruct.mapping.uncertainty import Uncertainty, write_uncertainty
-from reconstruct.model import SparseModel, read_model
+from reconstruct.views.model import SparseModel, read_model
 from tests.oracles_dense import Scene, flat, position_code, sparse_model, stereo_views
 from tests.oracles_dense import write_workspace as write
 

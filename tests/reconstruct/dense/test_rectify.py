@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from reconstruct.dense.rectify import depth_in_reference, rectify, scaled_view
-from reconstruct.model import View
+from reconstruct.views.model import View
 from tests.oracles_dense import port_view
 
 

@@ -3,7 +3,7 @@ import numpy as np
 from scipy import ndimage
 
 from reconstruct.dense.refine import Look, compare, prepared, refine, sights
-from reconstruct.dense.sight import lens_of
+from reconstruct.views.sight import lens_of
 from tests.oracles_dense import Scene, hits, render, speckle, stereo_views
 
 SCENE = Scene(

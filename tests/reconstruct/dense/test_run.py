@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import rasterio
 
-from alice_survey.artefacts import read_json
-from alice_survey.config import ReconstructConfig, SurveyConfig
-from alice_survey.errors import ReconstructionError, WorkspaceError
+from alice_survey.base.artefacts import read_json
+from alice_survey.base.config import ReconstructConfig, SurveyConfig
+from alice_survey.base.errors import ReconstructionError, WorkspaceError
 from reconstruct.dense.run import run_dense
 from tests.oracles_dense import (
     DEPTH_M,

@@ -10,13 +10,13 @@ import rasterio
 from rasterio.transform import from_origin
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.artefacts import write_json
-from alice_survey.errors import ReconstructionError, WorkspaceError, heard
-from alice_survey.frames import Datum
+from alice_survey.base.artefacts import write_json
+from alice_survey.base.errors import ReconstructionError, WorkspaceError, heard
+from alice_survey.base.frames import Datum
 from reconstruct.evaluate.against import compare_elevations, evaluate_against
 from reconstruct.evaluate.elevation import Elevation, enu_from_enu
 from reconstruct.evaluate.height_registration import register_heights, rough_shifts
-from reconstruct.model import WorldFrame, write_frame
+from reconstruct.views.model import WorldFrame, write_frame
 
 CELL, SIDE = 0.02, 200
 MOUND_M, WIDTH_M, AT = 0.02, 0.15, (1.5, 2.2)

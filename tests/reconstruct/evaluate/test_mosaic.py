@@ -9,7 +9,7 @@ from rasterio.transform import from_origin
 from scipy.spatial.transform import RigidTransform
 from shapely.geometry import MultiPolygon, box
 
-from alice_survey.config import SeafloorConfig, SurveyConfig
+from alice_survey.base.config import SeafloorConfig, SurveyConfig
 from alice_survey.seafloor.terrain import Terrain, build_terrain
 from alice_survey.seafloor.texture import Texture, survey_texture
 from reconstruct.evaluate.figures import compare_lengths

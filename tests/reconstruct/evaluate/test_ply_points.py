@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.errors import WorkspaceError
+from alice_survey.base.errors import WorkspaceError
 from reconstruct.evaluate.ply_points import read_ply_points
 
 XYZ = np.random.default_rng(2).normal(0, 100, (50, 3))

@@ -12,13 +12,13 @@ from pyproj import CRS, Transformer
 from rasterio.transform import from_origin
 from scipy.spatial.transform import Rotation
 
-from alice_survey.errors import ReconstructionError, WorkspaceError
-from alice_survey.frames import Datum
+from alice_survey.base.errors import ReconstructionError, WorkspaceError
+from alice_survey.base.frames import Datum
 from reconstruct.evaluate.cloud_files import read_reference
 from reconstruct.evaluate.cloud_registration import Surface, register_cloud
 from reconstruct.evaluate.reference import covers, distances, lifted
 from reconstruct.evaluate.reference_plot import mean_map
-from reconstruct.sparse.alignment import Similarity
+from reconstruct.placing.alignment import Similarity
 
 DATUM = Datum(46.8426, -91.9946)
 UTM = 32615

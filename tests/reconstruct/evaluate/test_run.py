@@ -11,15 +11,15 @@ from rasterio.transform import from_origin
 from scipy.spatial.transform import RigidTransform, Rotation
 from shapely.geometry import MultiPolygon, Polygon
 
-from alice_survey.artefacts import write_csv
-from alice_survey.config import SeafloorConfig
-from alice_survey.errors import WorkspaceError
-from alice_survey.frames import Datum
+from alice_survey.base.artefacts import write_csv
+from alice_survey.base.config import SeafloorConfig
+from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.frames import Datum
 from alice_survey.seafloor.terrain import Terrain, build_terrain
-from missions.areas.area import Area
-from missions.lines.line import Line, LineKind
-from missions.plan_file import Dive, Plan
-from missions.route.legs import Leg, Route
+from missions.values.area import Area
+from missions.values.legs import Leg, Route
+from missions.values.line import Line, LineKind
+from missions.values.plan_file import Dive, Plan
 from reconstruct.evaluate.cameras import score_cameras
 from reconstruct.evaluate.mosaic import area_in_world
 from reconstruct.evaluate.overlap import neighbours

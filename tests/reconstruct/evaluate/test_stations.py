@@ -8,10 +8,10 @@ from scipy.spatial.transform import RigidTransform
 from shapely import contains_xy
 from shapely.geometry import MultiPolygon, box
 
-from alice_survey.config import CameraConfig, SeafloorConfig, WaterConfig
+from alice_survey.base.config import CameraConfig, SeafloorConfig, WaterConfig
 from alice_survey.seafloor.terrain import Terrain, build_terrain
 from camera_calib.rig import Rig, design_rig
-from missions.footprint import footprint_polygon, level_pose
+from missions.values.footprint import footprint_polygon, level_pose
 from reconstruct.evaluate.mesh import distance_from_mesh, score_mesh, spread_over
 from reconstruct.evaluate.stations import count_stations, ground_pixel_m
 from reconstruct.evaluate.truth import surface_depth

@@ -6,8 +6,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from reconstruct import model_files
 from reconstruct.mapping.arrays import observed
+from reconstruct.views import model_files
 from tests.reconstruct.mapping.test_mapper import block_mapped
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from camera_calib.rig import Covariance, Rig
 from reconstruct.mapping.arrays import observed
 from reconstruct.mapping.calibration_part import CalibrationPart, calibration_part
@@ -16,7 +16,7 @@ from reconstruct.mapping.gauge import Gauge
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.refraction import refract
 from reconstruct.mapping.uncertainty import estimate, sights_of
-from reconstruct.sparse.alignment import align_rigid
+from reconstruct.placing.alignment import align_rigid
 from tests.oracles_refraction import laid_onto
 from tests.reconstruct.scenes import Scene, make_scene
 from tests.reconstruct.true_models import near_truth, true_stations, warped_scene

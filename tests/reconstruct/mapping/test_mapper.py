@@ -7,8 +7,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.errors import ReconstructionError
-from reconstruct.lenses.lens import flat_port_lens
+from alice_survey.base.errors import ReconstructionError
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import (
     Mapped,
@@ -22,7 +21,8 @@ from reconstruct.mapping.mapper import (
 from reconstruct.mapping.priors import pinhole_positions, refine_with_positions
 from reconstruct.mapping.self_calibration import map_self_calibrated
 from reconstruct.matching.matches import as_seen
-from reconstruct.sparse.alignment import align_rigid, align_similarity
+from reconstruct.placing.alignment import align_rigid, align_similarity
+from reconstruct.views.lens import flat_port_lens
 from tests.reconstruct.scenes import DATUM, Scene, make_scene
 
 
@@ -166,7 +166,7 @@ def oblique_scene(camera: pycolmap.Camera, rng: np.random.Generator) -> Scene:
     """Eight stereo stations 0.2 m wide around a bumpy floor, looking at its middle."""
     from scipy.spatial.transform import Rotation
 
-    from alice_survey.manifest import ImageRecord
+    from alice_survey.base.manifest import ImageRecord
     from reconstruct.matching.matches import PairMatches
 
     points = np.column_stack([rng.uniform(-1.6, 1.6, (700, 2)), rng.uniform(-0.25, 0.25, 700)])

@@ -8,13 +8,13 @@ import numpy as np
 import pycolmap
 import pytest
 
-from alice_survey.frames import Array
-from reconstruct.lenses.range_shift import range_shift
+from alice_survey.base.frames import Array
 from reconstruct.mapping.bundle import adjust_freely
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import SETTLED_PX, Convergence, refract
-from reconstruct.sparse.alignment import align_rigid, align_similarity
+from reconstruct.placing.alignment import align_rigid, align_similarity
+from reconstruct.views.range_shift import range_shift
 from tests.oracles_refraction import adjust_through_ports
 from tests.reconstruct.scenes import DATUM, Scene, make_scene
 from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_scene

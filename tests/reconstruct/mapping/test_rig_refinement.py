@@ -11,11 +11,10 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.config import ReconstructConfig
-from alice_survey.errors import ReconstructionError
-from camera_calib.calibration.freedom import value
+from alice_survey.base.config import ReconstructConfig
+from alice_survey.base.errors import ReconstructionError
+from camera_calib.calibrate.freedom import value
 from camera_calib.rig import Covariance, Rig, read_rig
-from reconstruct.lenses.lens import FlatPortLens, Lens, flat_port_lens
 from reconstruct.mapping.arrays import observed
 from reconstruct.mapping.database import Observations, as_transform
 from reconstruct.mapping.mapper import Mapped, model_baseline
@@ -24,7 +23,8 @@ from reconstruct.mapping.refraction import refract
 from reconstruct.mapping.rig_refinement import RigFit, Told, fit_rig
 from reconstruct.mapping.survey_rig import Refined, frees_rig, on_rig, refine_as_set, refine_rig
 from reconstruct.mapping.working_range import Distances
-from reconstruct.sparse.alignment import align_rigid
+from reconstruct.placing.alignment import align_rigid
+from reconstruct.views.lens import FlatPortLens, Lens, flat_port_lens
 from tests.reconstruct.scenes import DATUM, Scene, make_scene
 from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_scene
 

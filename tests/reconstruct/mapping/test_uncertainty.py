@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.frames import Array
+from alice_survey.base.frames import Array
 from reconstruct.mapping.arrays import observed
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.normal_equations import Sights, moved_points, reduce_points

@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.errors import ReconstructionError
+from alice_survey.base.errors import ReconstructionError
 from reconstruct.mapping.working_range import find_distances, ray_passes
 from reconstruct.matching.features import Features, save_features
 from tests.reconstruct.scenes import ALTITUDE_M, Scene, make_scene

@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from alice_survey.manifest import ImageRecord
+from alice_survey.base.manifest import ImageRecord
 from reconstruct.matching.pairs import (
     NEIGHBOURS,
     choose_pairs,

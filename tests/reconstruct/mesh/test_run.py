@@ -6,16 +6,16 @@ import open3d as o3d
 import pytest
 import trimesh
 
-from alice_survey.artefacts import read_json, write_json
-from alice_survey.config import ReconstructConfig, SurveyConfig
+from alice_survey.base.artefacts import read_json, write_json
+from alice_survey.base.config import ReconstructConfig, SurveyConfig
 from reconstruct.dense.cloud import VERTEX, write_cloud_json, write_ply
+from reconstruct.light.solve import GRID, LightModel, write_light
 from reconstruct.mesh.atlas import pack
 from reconstruct.mesh.decimate import decimate
 from reconstruct.mesh.implicit import splat
 from reconstruct.mesh.run import run_mesh
 from reconstruct.mesh.texture import spread_corners
 from reconstruct.mesh.topology import edges_of
-from reconstruct.mosaic.light import GRID, LightModel, write_light
 from tests.oracles_dense import (
     DEPTH_M,
     FRAME,

@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from reconstruct.light.solve import GRID, LightSamples
 from reconstruct.mosaic.colour import ColourModel, solve_colour
 from reconstruct.mosaic.facts import PictureFacts, encoded, linear_table
 from reconstruct.mosaic.finish import curve_by_root, finish_colours
-from reconstruct.mosaic.light import GRID, LightSamples
 
 IMAGES = [f"left/{n:02d}.png" for n in range(24)]
 CAMERAS = ["left"] * len(IMAGES)

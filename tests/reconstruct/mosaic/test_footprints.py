@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import rasterio
 
-from alice_survey.artefacts import read_json, write_json
-from alice_survey.errors import ConfigError
+from alice_survey.base.artefacts import read_json, write_json
+from alice_survey.base.errors import ConfigError
 from reconstruct.dense.dem import DemGrid
 from reconstruct.mosaic.annotation import mosaic_tiles
 from reconstruct.mosaic.footprints import picture_footprint, surface_points, write_footprints

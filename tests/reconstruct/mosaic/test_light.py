@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from alice_survey.errors import WorkspaceError
-from reconstruct.mosaic.light import (
+from alice_survey.base.errors import WorkspaceError
+from reconstruct.light.solve import (
     GRID,
     LightModel,
     LightSamples,

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from reconstruct.dense.points import enu_from_cam, pinhole_of
-from reconstruct.model import View
 from reconstruct.mosaic.ortho import look_up, visible_cells
+from reconstruct.views.model import View
 from tests.oracles_dense import sees, stereo_views
 
 

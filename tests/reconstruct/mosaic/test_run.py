@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 import rasterio
 
-from alice_survey.artefacts import read_json, write_csv, write_json
-from alice_survey.config import ReconstructConfig, SurveyConfig
-from alice_survey.errors import ReconstructionError
+from alice_survey.base.artefacts import read_json, write_csv, write_json
+from alice_survey.base.config import ReconstructConfig, SurveyConfig
+from alice_survey.base.errors import ReconstructionError
 from reconstruct.dense.dem import DemGrid
-from reconstruct.model import View
 from reconstruct.mosaic.run import run_mosaic
 from reconstruct.raster import tiled_raster
+from reconstruct.views.model import View
 from tests.oracles_dense import (
     DEPTH_M,
     FRAME,

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from alice_survey.artefacts import read_json
-from alice_survey.config import CameraConfig, WaterConfig
-from alice_survey.errors import AliceError, ImageError, WorkspaceError
-from alice_survey.manifest import read_manifest
+from alice_survey.base.artefacts import read_json
+from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.base.errors import AliceError, ImageError, WorkspaceError
+from alice_survey.base.manifest import read_manifest
 from camera_calib.rig import design_rig, read_rig, write_rig
 from reconstruct.pictures.files import inspect
 from reconstruct.pictures.importing import import_images

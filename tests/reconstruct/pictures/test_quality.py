@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from alice_survey.errors import ImageError
-from alice_survey.manifest import ImageRecord, write_manifest
+from alice_survey.base.errors import ImageError
+from alice_survey.base.manifest import ImageRecord, write_manifest
 from reconstruct.pictures.quality import PictureQuality, judge, measure, quality_report
 from reconstruct.pictures.quality_sheet import worst_first
 

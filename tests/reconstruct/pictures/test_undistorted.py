@@ -5,10 +5,11 @@ import numpy as np
 import pycolmap
 import pytest
 
-from alice_survey.artefacts import write_json
-from alice_survey.errors import ImageError, WorkspaceError
+from alice_survey.base.artefacts import write_json
+from alice_survey.base.errors import ImageError, WorkspaceError
 from camera_calib.flat_port import FlatPortCamera
-from reconstruct.lenses.lens import (
+from reconstruct.pictures.undistorted import Pictures, read_mask, undistortion_maps
+from reconstruct.views.lens import (
     ColmapLens,
     FlatPortLens,
     Lens,
@@ -16,7 +17,6 @@ from reconstruct.lenses.lens import (
     lens_from_json,
     self_calibrated_lens,
 )
-from reconstruct.pictures.undistorted import Pictures, read_mask, undistortion_maps
 
 WIDTH, HEIGHT = 320, 240
 

@@ -7,8 +7,13 @@ import open3d as o3d
 import pytest
 import trimesh
 
-from alice_survey.artefacts import read_json
-from alice_survey.errors import CalibrationError, ImageError, ReconstructionError, WorkspaceError
+from alice_survey.base.artefacts import read_json
+from alice_survey.base.errors import (
+    CalibrationError,
+    ImageError,
+    ReconstructionError,
+    WorkspaceError,
+)
 from camera_calib.rig import Covariance, Rig, write_rig
 from reconstruct.station.measure import measure, parse_picks, polygon_area, polyline
 from reconstruct.station.pair import read_depth, reconstruct_pair

@@ -1,0 +1,1 @@
+"""What everything else stands on: errors, frames, settings, stages, files."""

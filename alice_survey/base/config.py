@@ -1,0 +1,495 @@
+"""Settings of a survey: `survey.toml` as frozen sections that refuse what they do not know."""
+
+import math
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+
+from alice_survey.base.contents import one_line, shown
+from alice_survey.base.errors import ConfigError
+from alice_survey.base.seawater import GREEN_NM, n_water
+
+Jerlov = Literal["I", "II", "III", "1C", "3C", "5C", "7C", "9C"]
+Latitude = Annotated[float, Field(ge=-85, le=85)]
+Longitude = Annotated[float, Field(ge=-180, le=180)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Ring = tuple[tuple[float, float], ...]
+GeoRing = tuple[tuple[Latitude, Longitude], ...]
+Gust = Annotated[float, Field(ge=0, le=1000)]
+
+
+class Config(BaseModel):
+    """A settings section: immutable, and an unknown key is an error."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class AreaConfig(Config):
+    """Where to survey and where the vehicle may be.
+
+    The shape to survey is one of: a rectangle at the datum, a polygon, a corridor, well-known text,
+    or a file. The datum is the origin of the local North-East-Down frame, on the sea surface; of a
+    shape in geographic or projected coordinates it is the middle unless it is given.
+    """
+
+    latitude_deg: Latitude = 32.8236
+    longitude_deg: Longitude = 34.9553
+    length_m: float = Field(15.0, gt=0, le=10_000)
+    width_m: float = Field(17.0, gt=0, le=10_000)
+    heading_deg: float = Field(0.0, ge=0, lt=360)
+    datum_at: Literal["corner", "center"] = "corner"
+    polygon_ne_m: Ring | None = None
+    polygon_latlon_deg: GeoRing | None = None
+    corridor_ne_m: Ring | None = None
+    corridor_latlon_deg: GeoRing | None = None
+    corridor_width_m: float = Field(5.0, gt=0, le=1000)
+    wkt: str | None = None
+    file: Path | None = None
+    layer: str | None = None
+    crs: str | None = None
+    no_go_ne_m: tuple[Ring, ...] = ()
+    no_go_latlon_deg: tuple[GeoRing, ...] = ()
+    no_go_file: Path | None = None
+    no_go_layer: str | None = None
+    no_go_clearance_m: float = Field(0.0, ge=0, le=100)
+    allowed_ne_m: Ring | None = None
+    allowed_latlon_deg: GeoRing | None = None
+    allowed_file: Path | None = None
+    allowed_layer: str | None = None
+    turn_margin_m: float | None = Field(None, ge=0, le=1000)
+    seafloor_depth_m: float = Field(15.0, gt=0, le=6000)
+    bathymetry_file: Path | None = None
+    bathymetry_values: Literal["auto", "heights", "depths"] = "auto"
+    bathymetry_crs: str | None = None
+
+    @model_validator(mode="after")
+    def _one_shape(self) -> Self:
+        shapes = (
+            "polygon_ne_m", "polygon_latlon_deg", "corridor_ne_m", "corridor_latlon_deg",
+            "wkt", "file",
+        )  # fmt: skip
+        given = [name for name in shapes if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise ValueError(f"give {' or '.join(given)}, not both")
+        for name in ("polygon_ne_m", "polygon_latlon_deg"):
+            corners = getattr(self, name)
+            if corners is not None and len(corners) < 3:
+                raise ValueError(f"a polygon needs 3 corners or more, got {len(corners)}")
+        for name in ("corridor_ne_m", "corridor_latlon_deg"):
+            points = getattr(self, name)
+            if points is not None and len(points) < 2:
+                raise ValueError(f"a corridor needs 2 points or more, got {len(points)}")
+        allowed = ("allowed_ne_m", "allowed_latlon_deg", "allowed_file")
+        given = [name for name in allowed if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise ValueError(f"give {' or '.join(given)}, not both")
+        return self
+
+
+PortTilt = Annotated[float, Field(ge=-15, le=15)]
+
+
+class CameraConfig(Config):
+    """The stereo pair as designed: two Manta G-917 behind flat ports (paper, section III.B)."""
+
+    width_px: int = Field(3384, ge=64, le=20_000)
+    height_px: int = Field(2710, ge=64, le=20_000)
+    pixel_um: float = Field(3.69, gt=0, le=100)
+    focal_mm: float = Field(12.5, gt=0, le=500)
+    f_number: float = Field(4.0, ge=0.7, le=64)
+    baseline_m: float = Field(0.1, gt=0, le=2)
+    port_distance_m: float = Field(0.02, ge=0, le=0.5)
+    glass_thickness_m: float = Field(0.01, ge=0, le=0.5)
+    port_tilt_deg: tuple[PortTilt, PortTilt] = (0.0, 0.0)
+    n_glass: float = Field(1.52, ge=1, le=2)
+    position_body_m: tuple[float, float, float] = (0.55, -0.05, 0.08)
+    dvl_position_body_m: tuple[float, float, float] = (-0.4145, 0.0, 0.11)
+    shortest_interval_s: float = Field(0.1, gt=0, le=60)
+    quantum_efficiency: float = Field(0.5, gt=0, le=1)
+    full_well_e: float = Field(9000.0, gt=100)
+    read_noise_e: float = Field(12.0, ge=0)
+
+
+class WaterConfig(Config):
+    """The water between port and sea floor.
+
+    Its index of refraction is `n_water`, or follows from temperature and salinity; then
+    `SurveyConfig` sets `n_water` for the depth of its sea floor.
+    """
+
+    n_water: float = Field(1.34, ge=1, le=1.4)
+    jerlov: Jerlov = "II"
+    temperature_c: float | None = Field(None, ge=-2, le=35)
+    salinity_psu: float | None = Field(None, ge=0, le=43)
+    wavelength_nm: float | None = Field(None, ge=380, le=750)
+
+    @model_validator(mode="after")
+    def _both_or_none(self) -> Self:
+        if (self.temperature_c is None) != (self.salinity_psu is None):
+            raise ValueError("give temperature_c and salinity_psu both, or n_water")
+        if self.wavelength_nm is not None and self.temperature_c is None:
+            raise ValueError("wavelength_nm needs temperature_c and salinity_psu")
+        return self
+
+
+class PlanConfig(Config):
+    """How densely the sea floor is imaged."""
+
+    altitude_m: float = Field(2.0, ge=0.3, le=10)
+    speed_mps: float = Field(0.2, gt=0, le=3)
+    forward_overlap: float = Field(0.6, ge=0, le=0.95)
+    side_overlap: float = Field(0.29, ge=0, le=0.95)
+    line_spacing_m: float | None = Field(None, gt=0, le=20)
+    line_heading_deg: float | None = Field(None, ge=0, lt=360)
+    overlap_over_relief: bool = False
+    track_error_m: float = Field(0.0, ge=0, le=5)
+    cross_lines: int = Field(1, ge=0, le=50)
+    closing_line: bool = True
+    margin_m: float = Field(0.0, ge=0, le=50)
+    relief_m: float = Field(0.35, ge=0, le=10)
+    allowed_blur_px: float = Field(1.0, gt=0, le=20)
+    yaw_rate_deg_s: float = Field(1.0, ge=0, le=90)
+    roll_pitch_rate_deg_s: float = Field(1.0, ge=0, le=90)
+    sharp_px: float = Field(3.0, gt=0, le=20)
+    strobe_lead_s: float = Field(0.0002, ge=0, le=0.1)
+    least_clearance_m: float = Field(1.0, ge=0.1, le=10)
+    steepest_deg: float = Field(20.0, gt=0, le=60)
+    turns: Literal["auto", "arcs", "spot", "sway"] = "auto"
+    turn_radius_m: float = Field(0.5, gt=0, le=20)
+    turn_rate_limit_deg_s: float = Field(30.0, gt=0, le=180)
+    run_in_m: float = Field(0.5, ge=0.1, le=20)
+    home_ne_m: tuple[float, float] | None = None
+    split_dives: bool = True
+    dive_s: float | None = Field(None, gt=0, le=1e6)
+
+
+class ThrusterHealth(Config):
+    """Share of its greatest thrust that each thruster has left: 0 failed, 1 sound."""
+
+    starboard: Share = 1.0
+    port: Share = 1.0
+    vertical: Share = 1.0
+    bow: Share = 1.0
+    stern: Share = 1.0
+
+    @property
+    def impaired(self) -> dict[str, float]:
+        """Those that are not sound."""
+        return {name: share for name, share in self.model_dump().items() if share < 1.0}
+
+
+class VehicleConfig(Config):
+    """What flies, and how it is steered."""
+
+    name: Literal["alice", "sparus2"] = "alice"
+    coefficients: Literal["estimated", "cfd", "calibrated", "computed"] = "calibrated"
+    coefficients_file: Path | None = None
+    controller: Literal["sway", "los"] = "sway"
+    allocation: Literal["exact", "rpi"] = "exact"
+    thruster_health: ThrusterHealth = ThrusterHealth()
+    health_known: bool = True
+    battery_wh: float = Field(1400.0, gt=0, le=100_000)
+    battery_reserve: float = Field(0.2, ge=0, lt=1)
+    hotel_w: float = Field(60.0, ge=0, le=5000)
+    dive: int | None = Field(None, ge=1)
+
+
+class SeaConfig(Config):
+    """What the water does to the vehicle.
+
+    The current near the sea floor; where `surface_current_mps` is set it changes evenly up to the
+    surface; a slow Gauss-Markov process is added. `current_file` holds a measured series instead.
+    Swell comes on top.
+    """
+
+    current_mps: float = Field(0.05, ge=0, le=3)
+    current_towards_deg: float = Field(90.0, ge=0, lt=360)
+    surface_current_mps: float | None = Field(None, ge=0, le=3)
+    current_sigma_mps: float = Field(0.01, ge=0, le=1)
+    current_correlation_s: float = Field(300.0, ge=1, le=1e6)
+    current_file: Path | None = None
+    swell_m: float = Field(0.0, ge=0, le=20)
+    swell_period_s: float = Field(6.0, ge=1, le=30)
+    swell_towards_deg: float = Field(90.0, ge=0, lt=360)
+    gust_n: tuple[Gust, Gust, Gust] = (0.5, 0.5, 0.5)
+    gust_correlation_s: float = Field(2.0, ge=0.05, le=1000)
+
+
+class NavigationConfig(Config):
+    """How well the vehicle knows where it is; the rest as in `vehicle.navigation.sensors`."""
+
+    gps_bias_m: float = Field(0.03, ge=0, le=100)
+    gps_noise_m: float = Field(0.02, gt=0, le=100)
+    compass_bias_deg: float = Field(0.3, ge=0, le=30)
+    compass_noise_deg: float = Field(0.3, gt=0, le=30)
+    dvl_noise_mps: float = Field(0.0035, gt=0, le=1)
+    dvl_dropouts_s: tuple[tuple[float, float], ...] = ()
+    usbl: bool = True
+    usbl_noise_m: float = Field(0.5, gt=0, le=100)
+
+
+class SeafloorConfig(Config):
+    """The simulated sea floor."""
+
+    relief_m: float = Field(0.35, ge=0, le=5)
+    grid_m: float = Field(0.01, gt=0, le=1)
+    rocks_per_m2: float = Field(0.5, ge=0, le=20)
+    largest_rock_m: float = Field(0.35, gt=0, le=2)
+    amphora: bool = True
+
+
+class ImagingConfig(Config):
+    """How pictures are taken and rendered."""
+
+    scale: int = Field(1, ge=1, le=16)
+    image_format: Literal["png", "jpg"] = "png"
+    strobe_lumens: float = Field(30_000.0, gt=0)
+    strobe_beam_deg: float = Field(120.0, gt=1, lt=180)
+    strobes_body_m: tuple[tuple[float, float, float], ...] = ((0.75, 0.0, 0.08), (-0.6, 0.0, 0.08))
+    samples: int = Field(2, ge=1, le=8)
+    noise: bool = True
+    range_maps: bool = False
+    pool_views: int = Field(25, ge=8, le=200)
+
+
+class ReconstructConfig(Config):
+    """How pictures become a model."""
+
+    feature_scale: float | None = Field(None, gt=0.05, le=1)
+    max_features: int = Field(8000, ge=200, le=50_000)
+    working_range_m: float | None = Field(None, gt=0, le=100)
+    mapper: Literal["auto", "global", "incremental"] = "auto"
+    mount_sigma_deg: float = Field(0.0, ge=0, le=20)
+    refine_port: bool = False
+    refine_rig: Literal["auto", "on", "off"] = "auto"
+    dense_scale: float | None = Field(None, gt=0.05, le=1)
+    dense_partners: int = Field(4, ge=1, le=12)
+    dem_cell_m: float | None = Field(None, gt=0, le=10)
+    mosaic_pixel_m: float | None = Field(None, gt=0, le=10)
+    mesh_triangles: int | None = Field(None, ge=100, le=50_000_000)
+    mesh_error_px: float = Field(0.25, ge=0.01, le=10)
+    mesh_page_px: int = Field(8192, ge=512, le=16_384)
+    colour: Literal["even", "water", "raw"] = "even"
+    dispersion: Literal["auto", "on", "off"] = "auto"
+
+
+class SurveyConfig(Config):
+    """A whole survey, as `survey.toml` says it."""
+
+    name: str = Field("survey", min_length=1, max_length=80, pattern=r"^[\w .-]+$")
+    seed: int = Field(1, ge=0, lt=2**32)
+    area: AreaConfig = AreaConfig()
+    camera: CameraConfig = CameraConfig()
+    water: WaterConfig = WaterConfig()
+    plan: PlanConfig = PlanConfig()
+    vehicle: VehicleConfig = VehicleConfig()
+    sea: SeaConfig = SeaConfig()
+    navigation: NavigationConfig = NavigationConfig()
+    seafloor: SeafloorConfig = SeafloorConfig()
+    imaging: ImagingConfig = ImagingConfig()
+    reconstruct: ReconstructConfig = ReconstructConfig()
+
+    @field_validator("water")
+    @classmethod
+    def _index_at_the_sea_floor(cls, water: WaterConfig, info: ValidationInfo) -> WaterConfig:
+        area = info.data.get("area")
+        if water.temperature_c is None or water.salinity_psu is None or area is None:
+            return water
+        try:
+            index = float(
+                n_water(
+                    water.temperature_c,
+                    water.salinity_psu,
+                    area.seafloor_depth_m,
+                    water.wavelength_nm or GREEN_NM,
+                )
+            )
+        except ConfigError as error:
+            raise ValueError(str(error)) from None
+        # Settings that were resolved once come back with their own index.
+        if "n_water" in water.model_fields_set and abs(water.n_water - index) > 1e-9:
+            raise ValueError(
+                f"temperature_c and salinity_psu give n_water = {index:.5f}, and n_water = "
+                f"{water.n_water:g} is set too: leave one out"
+            )
+        return water.model_copy(update={"n_water": index})
+
+
+_LONGEST = 1_000_000
+_MOST_FAULTS = 8
+"""Told at once."""
+
+
+def load_config(path: Path) -> SurveyConfig:
+    """Read `survey.toml`.
+
+    Raises:
+        ConfigError: the file is missing, is no TOML, or holds an unknown key or a value out of
+            range; the message names the file, the key, the value and what is allowed.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; 'alice-survey init DIR' writes one") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from None
+    if len(text) > _LONGEST:
+        raise ConfigError(
+            f"{path}: {len(text) / 1e6:.1f} million characters: no settings file is that long"
+        )
+    try:
+        settings = tomllib.loads(text)
+    # A number of thousands of digits is a ValueError.
+    except (tomllib.TOMLDecodeError, ValueError, RecursionError) as error:
+        raise ConfigError(f"{path}: not valid TOML: {one_line(error)}") from None
+    return parse_config(_with_files_beside(settings, path.parent), str(path))
+
+
+_FILES = (
+    ("area", "file"), ("area", "no_go_file"), ("area", "allowed_file"), ("area", "bathymetry_file"),
+    ("sea", "current_file"), ("vehicle", "coefficients_file"),
+)  # fmt: skip
+
+
+def _with_files_beside(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Settings whose relative file names count from the folder of the settings file."""
+    result = dict(settings)
+    for section, key in _FILES:
+        values = settings.get(section)
+        if isinstance(values, dict) and isinstance(values.get(key), str):
+            result[section] = {**result[section], key: str(folder / values[key])}
+    return result
+
+
+def parse_config(settings: dict[str, Any], origin: str) -> SurveyConfig:
+    """Check settings that came from `origin`.
+
+    Raises:
+        ConfigError: as `load_config`.
+    """
+    try:
+        return SurveyConfig.model_validate(settings)
+    except ValidationError as error:
+        raise ConfigError(f"{origin}: {_one_line(error)}") from None
+
+
+def changed(config: SurveyConfig, section: str, **values: Any) -> SurveyConfig:
+    """A survey with some settings of a section changed; those that are None stay as they are.
+
+    Raises:
+        ConfigError: a value is out of range.
+    """
+    given = {key: value for key, value in values.items() if value is not None}
+    if not given:
+        return config
+    settings = config.model_dump(mode="json", exclude_unset=True)
+    settings[section] = {**settings.get(section, {}), **given}
+    return parse_config(settings, "command line")
+
+
+def parse_current(text: str | None) -> tuple[float | None, float | None]:
+    """Speed, m/s, and direction, degrees, of a current given as `SPEED@DIRECTION`.
+
+    Raises:
+        ConfigError: it is not of that form.
+    """
+    if text is None:
+        return None, None
+    speed, _, direction = text.partition("@")
+    try:
+        return float(speed), float(direction) % 360.0
+    except ValueError:
+        raise ConfigError(
+            f"current {text!r}: give SPEED@DIRECTION, m/s and degrees from north that it flows "
+            "towards, as 0.1@90"
+        ) from None
+
+
+def parse_health(texts: Sequence[str] | None) -> dict[str, float] | None:
+    """Thrusters and what is left of them, from `NAME` (nothing) or `NAME=SHARE`; None of none.
+
+    Raises:
+        ConfigError: a share is no number.
+    """
+    if not texts:
+        return None
+    health = {}
+    for text in texts:
+        name, _, share = text.partition("=")
+        try:
+            health[name] = float(share or 0.0)
+        except ValueError:
+            raise ConfigError(
+                f"thruster {text!r}: give NAME, or NAME=SHARE of its thrust that is left, as "
+                "stern=0.5"
+            ) from None
+    return health
+
+
+def _one_line(error: ValidationError) -> str:
+    faults = []
+    for fault in error.errors()[:_MOST_FAULTS]:
+        key = shown(".".join(str(part) for part in fault["loc"])) or "settings"
+        if fault["type"] == "extra_forbidden":
+            faults.append(f"{key} is not a known setting{_nearest(fault['loc'])}")
+        elif fault["type"] == "value_error":
+            faults.append(f"{key}: {fault['ctx']['error']}")
+        elif fault["loc"] == ("name",) and fault["type"] == "string_pattern_mismatch":
+            faults.append(f"name = {_shown(fault['input'])}: use letters, digits, spaces, . _ -")
+        else:
+            faults.append(f"{key} = {_shown(fault['input'])}: {_requirement(fault)}")
+    more = error.error_count() - len(faults)
+    return "; ".join(faults) + (f"; and {more} more" if more else "")
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _requirement(fault: Any) -> str:
+    message = str(fault["msg"])
+    section: type[BaseModel] = SurveyConfig
+    for part in fault["loc"]:
+        if not (isinstance(part, str) and part in section.model_fields):
+            return message
+        field = section.model_fields[part]
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            section = field.annotation
+            continue
+        signs = {"Gt": (">", "gt"), "Ge": (">=", "ge"), "Lt": ("<", "lt"), "Le": ("<=", "le")}
+        bounds = [
+            f"{signs[type(limit).__name__][0]} {getattr(limit, signs[type(limit).__name__][1])}"
+            for limit in field.metadata
+            if type(limit).__name__ in signs
+        ]
+        return f"{message} (allowed: {' and '.join(bounds)})" if bounds else message
+    return message
+
+
+def _nearest(location: tuple[str | int, ...]) -> str:
+    import difflib
+
+    section: type[BaseModel] = SurveyConfig
+    for part in location[:-1]:
+        annotation = section.model_fields[str(part)].annotation
+        if not (isinstance(annotation, type) and issubclass(annotation, BaseModel)):
+            return ""
+        section = annotation
+    close = difflib.get_close_matches(str(location[-1]), section.model_fields, n=1)
+    return (
+        f"; did you mean {close[0]}?" if close else f"; known are {', '.join(section.model_fields)}"
+    )

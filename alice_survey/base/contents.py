@@ -1,0 +1,65 @@
+"""Files that this program wrote, and that a user or a disk may have changed since."""
+
+import contextlib
+import zipfile
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.base.errors import AliceError, WorkspaceError, why
+
+_SHOWN = 200
+
+
+@contextlib.contextmanager
+def taken_from(path: Path, fault: type[AliceError] = WorkspaceError) -> Iterator[None]:
+    """Within this block values are taken from what a file holds.
+
+    Args:
+        path: the file, for the message.
+        fault: what is raised.
+
+    Raises:
+        AliceError: of the type `fault`, where a value is missing or of another kind.
+    """
+    try:
+        yield
+    except KeyError as error:
+        raise fault(f"{path}: lacks {one_line(error)}: it was changed, make it anew") from None
+    except (TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
+        raise fault(f"{path}: is not as it was written ({one_line(error)}): make it anew") from None
+
+
+def read_arrays(path: Path, *names: str) -> dict[str, NDArray[np.generic]]:
+    """Arrays of an `.npz` file.
+
+    Raises:
+        WorkspaceError: it is missing or damaged, or lacks one.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            missing = [name for name in names if name not in data]
+            if missing:
+                raise WorkspaceError(f"{path}: lacks {missing[0]}: it was changed, make it anew")
+            return {name: data[name] for name in names}
+    except OSError as error:
+        raise WorkspaceError(f"{path}: cannot be read: {why(error)}") from None
+    except (  # what zipfile, zlib and the evaluation of an array's header raise
+        zipfile.BadZipFile, zlib.error, ValueError, TypeError, EOFError, KeyError, MemoryError,
+        NotImplementedError, RuntimeError, SyntaxError,
+    ) as error:  # fmt: skip
+        raise WorkspaceError(f"{path}: is damaged ({one_line(error)}): make it anew") from None
+
+
+def one_line(error: BaseException) -> str:
+    """What an exception says, on one line that can be printed; its type where it says nothing."""
+    return shown(str(error)) or type(error).__name__
+
+
+def shown(text: str) -> str:
+    """Text of others as a message may hold it: on one line, printable, and not without end."""
+    plain = " ".join("".join(c if c.isprintable() else " " for c in text).split())
+    return plain if len(plain) <= _SHOWN else f"{plain[: _SHOWN - 3]}..."

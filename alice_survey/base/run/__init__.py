@@ -1,0 +1,1 @@
+"""How a run reports: progress, events, interrupts, resources."""

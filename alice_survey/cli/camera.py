@@ -1,0 +1,229 @@
+"""Commands on cameras behind flat ports: `alice-survey camera ...`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from alice_survey.cli.options import CONTEXT, AsJson, Threads, examples, print_result
+
+app = typer.Typer(
+    help="Look at, convert and judge camera models behind flat ports.",
+    no_args_is_help=True,
+    context_settings=CONTEXT,
+    rich_markup_mode=None,
+)
+
+
+@app.command(
+    epilog=examples(
+        "camera water --temperature 24 --salinity 39 --depth 15",
+        "camera water --jerlov 3C --wavelength 450 --wavelength 520 --json",
+    )
+)
+def water(
+    temperature: Annotated[float, typer.Option(help="Of the water, C.")] = 20.0,
+    salinity: Annotated[float, typer.Option(help="psu; 0 is fresh.")] = 35.0,
+    depth: Annotated[float, typer.Option(help="Below the surface, m.")] = 10.0,
+    jerlov: Annotated[str, typer.Option(help="Type: I, II, III; coastal 1C to 9C.")] = "II",
+    wavelength: Annotated[
+        list[float] | None, typer.Option(help="nm; red, green and blue when not given.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Tell index and attenuation of water."""
+    from camera_calib.water import water_report
+
+    print_result(*water_report(temperature, salinity, depth, jerlov, wavelength), as_json)
+
+
+@app.command(
+    epilog=examples(
+        "camera undisperse images/left/*.png --rig rig.json --range 2 -o corrected/left",
+        "camera undisperse dive/*.jpg --rig rig.json --range 1.5 -o out --material pmma",
+    )
+)
+def undisperse(
+    pictures: Annotated[list[Path], typer.Argument(metavar="PICTURE...", help="In colour.")],
+    rig: Annotated[Path, typer.Option(help="rig.json; its indices hold for green.")],
+    folder: Annotated[Path, typer.Option("-o", "--out", help="Folder for the corrected ones.")],
+    distance: Annotated[float, typer.Option("--range", min=0.0, help="To the scene, m.")],
+    camera: Annotated[str | None, typer.Option(help="Whose; the rig's first if none.")] = None,
+    temperature: Annotated[float, typer.Option(help="Of the water, C.")] = 20.0,
+    salinity: Annotated[float, typer.Option(help="psu; 0 is fresh.")] = 35.0,
+    depth: Annotated[float, typer.Option(help="Below the surface, m.")] = 10.0,
+    material: Annotated[
+        str, typer.Option(help="Port: bk7, fused-silica, sapphire, pmma, polycarbonate.")
+    ] = "bk7",
+    wavelength: Annotated[
+        list[float] | None, typer.Option(help="nm, thrice: of red, green and blue.")
+    ] = None,
+    threads: Threads = None,
+    as_json: AsJson = False,
+) -> None:
+    """Warp red and blue onto green.
+
+    A flat port shows each colour at its own scale: some pixels apart at the edge of the frame.
+    """
+    from alice_survey.base.executor import default_threads
+    from camera_calib.approximation.undisperse import undisperse_files
+
+    text, data = undisperse_files(
+        pictures, folder, rig=rig, camera=camera, range_m=distance, temperature_c=temperature,
+        salinity_psu=salinity, depth_m=depth, glass=material, wavelengths_nm=wavelength,
+        threads=threads or default_threads(),
+    )  # fmt: skip
+    print_result(text, data, as_json)
+
+
+@app.command(
+    epilog=examples(
+        "camera residual --near 1.5 --far 2.5",
+        "camera residual --near 1 --far 3 --rig rig.json --camera left --plot residual.png",
+    )
+)
+def residual(
+    near: Annotated[float, typer.Option(help="Nearest distance, m.")],
+    far: Annotated[float, typer.Option(help="Farthest distance, m.")],
+    survey: Annotated[Path | None, typer.Option("-s", "--survey", help="Its design.")] = None,
+    rig: Annotated[Path | None, typer.Option(help="rig.json; instead of a design.")] = None,
+    camera: Annotated[str | None, typer.Option(help="The rig's first if none.")] = None,
+    exact_at: Annotated[float | None, typer.Option(help="Range of the warp, m.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="PNG, PDF or SVG to draw.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Tell what approximations cost.
+
+    Pixels that pinholes after a warp, and COLMAP's cameras without one, are wrong by through this
+    port. Distances are from the entrance pupil along the axis.
+    """
+    from camera_calib.approximation.report import residual_report
+
+    text, data = residual_report(
+        near, far, survey=survey, rig=rig, camera=camera, working_range_m=exact_at, plot=plot
+    )
+    print_result(text, data, as_json)
+
+
+@app.command(
+    epilog=examples(
+        "camera convert rig.json cameras.xml",
+        "camera convert rig.json model --to colmap --water 1.5 3 --drop-covariance",
+        "camera convert rig.json model --to flatport --drop-covariance",
+        "camera convert camchain.yaml rig.json --port-distance 20 --glass 10 --n-water 1.34",
+        "camera convert intrinsics.yml rig.json --extrinsics extrinsics.yml --image-size 640 480",
+        "camera convert rig.json left.yaml --to ros --camera left --drop-port --drop-covariance",
+    )
+)
+def convert(
+    source: Annotated[Path, typer.Argument(metavar="IN", help="File, or folder of a model.")],
+    target: Annotated[Path, typer.Argument(metavar="OUT", help="File, or folder.")],
+    source_format: Annotated[
+        str | None,
+        typer.Option("--from", metavar="FORMAT", help="Found from the file if not given."),
+    ] = None,
+    target_format: Annotated[
+        str | None,
+        typer.Option("--to", metavar="FORMAT", help="rig, opencv, colmap, flatport, kalibr, ros."),
+    ] = None,
+    image_size: Annotated[
+        tuple[int, int] | None, typer.Option(metavar="W H", help="Pixels, when IN tells none.")
+    ] = None,
+    extrinsics: Annotated[Path | None, typer.Option(help="OpenCV file of R and T.")] = None,
+    unit_m: Annotated[float, typer.Option(help="Metres in one unit of IN's translations.")] = 1.0,
+    camera: Annotated[str | None, typer.Option(help="Only this one.")] = None,
+    names: Annotated[str | None, typer.Option(help="New names, such as left,right.")] = None,
+    port_distance: Annotated[
+        float | None, typer.Option(min=0.0, help="Entrance pupil to inner glass, mm.")
+    ] = None,
+    glass: Annotated[float | None, typer.Option(min=0.0, help="Thickness, mm.")] = None,
+    n_glass: Annotated[float | None, typer.Option(min=1.0, help="Index; 1.52 if new.")] = None,
+    n_water: Annotated[float | None, typer.Option(min=1.0, help="Index of the water.")] = None,
+    water: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="NEAR FAR", help="m: fit cameras without port for these distances."),
+    ] = None,
+    model: Annotated[str, typer.Option(help="To fit: OPENCV or FULL_OPENCV.")] = "OPENCV",
+    drop_port: Annotated[bool, typer.Option("--drop-port", help="Cameras as in air.")] = False,
+    drop_covariance: Annotated[
+        bool, typer.Option("--drop-covariance", help="Where OUT cannot hold it.")
+    ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Convert between tools.
+
+    OpenCV, COLMAP, Refractive COLMAP (flatport), Kalibr, ROS and rig.json; nothing is lost unasked.
+    """
+    from camera_calib.formats.convert import convert_files
+
+    text, data = convert_files(
+        source, target, source_format=source_format, target_format=target_format,
+        image_size=image_size, extrinsics=extrinsics, unit_m=unit_m, camera=camera, names=names,
+        port_distance_mm=port_distance, glass_mm=glass, n_glass=n_glass, n_water=n_water,
+        water=water, model=model, drop_port=drop_port, drop_covariance=drop_covariance,
+        overwrite=overwrite,
+    )  # fmt: skip
+    print_result(text, data, as_json)
+
+
+@app.command(
+    epilog=examples(
+        "camera tank --boards boards --board 'chessboard 9x6 9.35mm' --reference "
+        "cam1_references.json --reference cam2_references.json --detections detections.csv -o tank",
+    )
+)
+def tank(
+    boards: Annotated[list[Path], typer.Option(help="Folder of the board in air; or one each.")],
+    board: Annotated[str, typer.Option(help="Such as 'chessboard 9x6 9.35mm'.")],
+    reference: Annotated[list[Path], typer.Option(help="Points on the interface, per camera.")],
+    detections: Annotated[Path, typer.Option(help="CSV: cam, frame, id, x, y.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write.")],
+    unit: Annotated[str, typer.Option(help="Of the reference's world: m, cm or mm.")] = "cm",
+    n_water: Annotated[float, typer.Option(help="Index of the water.")] = 1.333,
+    glass: Annotated[
+        list[float] | None, typer.Option(help="Wall before it, mm; or one each.")
+    ] = None,
+    n_glass: Annotated[float, typer.Option(help="Index of the walls.")] = 1.52,
+    lens: Annotated[str | None, typer.Option(help="Lens model; chosen when not given.")] = None,
+    frame_offset: Annotated[
+        list[str] | None, typer.Option(metavar="CAMERA=N", help="Added to its frame numbers.")
+    ] = None,
+    refine: Annotated[bool, typer.Option(help="Poses from the detections too.")] = True,
+    threads: Threads = None,
+    as_json: AsJson = False,
+) -> None:
+    """Triangulate what fixed cameras see in a tank.
+
+    Lens from a board in air, poses from points on the flat interface each camera looks through.
+    """
+    from camera_calib.tank.run import TankSettings, run_tank
+
+    settings = TankSettings(
+        boards=tuple(boards), board=board, references=tuple(reference), detections=detections,
+        unit=unit, n_water=n_water, glass_mm=tuple(glass or ()), n_glass=n_glass, lens=lens,
+        frame_offsets=tuple(frame_offset or ()), refine=refine,
+    )  # fmt: skip
+    print_result(*run_tank(settings, out, threads), as_json)
+
+
+@app.command(
+    epilog=examples("camera uncertainty rig.json", "camera uncertainty rig.json --range 2 --json")
+)
+def uncertainty(
+    rig: Annotated[Path, typer.Argument(metavar="RIG", help="rig.json with its covariance.")],
+    ranges: Annotated[
+        list[float] | None, typer.Option("--range", help="Distances to look at, m.")
+    ] = None,
+    near: Annotated[float, typer.Option(help="Nearest of what poses are found from, m.")] = 1.0,
+    far: Annotated[float, typer.Option(help="Farthest, m.")] = 3.0,
+    noise: Annotated[float, typer.Option(min=0.0, help="Of a measured coordinate, px.")] = 0.1,
+    as_json: AsJson = False,
+) -> None:
+    """Tell what a calibration's sigmas mean.
+
+    For pixels over the frame, for triangulated points and for lengths, against distance.
+    """
+    from camera_calib.judge.rig_uncertainty import uncertainty_report
+
+    print_result(*uncertainty_report(rig, ranges, near, far, noise), as_json)

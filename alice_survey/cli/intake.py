@@ -1,0 +1,103 @@
+"""Commands that bring in what real dives recorded: pictures and logs."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from alice_survey.cli.options import WORK, AsJson, Threads, Workspace, examples, print_result
+
+app = typer.Typer()
+
+
+@app.command(
+    name="import-images",
+    epilog=examples(
+        "import-images photos -w reef",
+        "import-images --left cam1 --right cam2 -w reef",
+        "import-images photos --navigation dive.csv --clock-offset -1.5 --masks masks -w reef",
+        "import-images photos --navigation dive.csv --vertical-datum NN2000 -w reef",
+        "import-images --video GX010001.MP4 --every 0.5 -w reef",
+    ),
+)
+def import_images(
+    folders: Annotated[
+        list[Path] | None, typer.Argument(metavar="DIR...", help="Folders of pictures.")
+    ] = None,
+    left: Annotated[Path | None, typer.Option(help="Pictures of the left camera.")] = None,
+    right: Annotated[Path | None, typer.Option(help="Pictures of the right camera.")] = None,
+    video: Annotated[Path | None, typer.Option(help="A video to take frames from.")] = None,
+    every: Annotated[float, typer.Option(min=0.01, help="Seconds between frames.")] = 1.0,
+    navigation: Annotated[Path | None, typer.Option(help="CSV: time, position, ...")] = None,
+    clock_offset: Annotated[float, typer.Option(help="Seconds to add to picture times.")] = 0.0,
+    time_zone: Annotated[str, typer.Option(help="Of times that name none.")] = "UTC",
+    vertical_datum: Annotated[
+        str | None, typer.Option(metavar="NAME", help="What the CSV's depths count from.")
+    ] = None,
+    rig: Annotated[Path | None, typer.Option(help="rig.json of the cameras.")] = None,
+    masks: Annotated[Path | None, typer.Option(help="Folder of masks; black is left out.")] = None,
+    workspace: Workspace = WORK,
+    threads: Threads = None,
+) -> None:
+    """Bring in real pictures.
+
+    Mono or stereo pictures or a video, with a navigation log, GPS from EXIF, or nothing at all.
+    """
+    from alice_survey.base.executor import default_threads
+    from reconstruct.pictures.importing import import_images as work
+
+    work(
+        workspace, folders or [], left=left, right=right, video=video, every_s=every,
+        navigation=navigation, clock_offset_s=clock_offset, time_zone=time_zone,
+        vertical_datum=vertical_datum, rig=rig, masks=masks, threads=threads or default_threads(),
+    )  # fmt: skip
+    typer.echo(
+        f"pictures are in {workspace / 'images'}; next: alice-survey reconstruct -w {workspace}"
+    )
+
+
+@app.command(
+    name="import-log",
+    epilog=examples(
+        "import-log sparus2.bag -o navigation.csv",
+        "import-log 00000042.BIN --declination 3.4 --tide tides.csv -o navigation.csv",
+        "import-log dive.tlog --topic depth=VFR_HUD --vehicle-log vehicle.csv -o navigation.csv",
+    ),
+)
+def import_log(
+    log: Annotated[Path, typer.Argument(help="ROS bag; ArduSub .BIN, .log, .tlog; QGC .csv.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="CSV to write.")],
+    declination: Annotated[float, typer.Option(help="Added to headings, deg; east +.")] = 0.0,
+    tide: Annotated[str, typer.Option(help="Water above the depths' level: m, or a CSV.")] = "0",
+    clock_offset: Annotated[float, typer.Option(help="s; added to the log's times.")] = 0.0,
+    start: Annotated[float | None, typer.Option(help="s after the first position.")] = None,
+    end: Annotated[float | None, typer.Option(help="s after the first position.")] = None,
+    topic: Annotated[
+        list[str] | None, typer.Option(metavar="ROLE=NAME", help="Topic or message to use.")
+    ] = None,
+    datum: Annotated[
+        tuple[float, float] | None, typer.Option(help="Origin of a bag's odometry, deg.")
+    ] = None,
+    lever_arm: Annotated[
+        tuple[float, float, float], typer.Option(help="Of the logged position on the body, m.")
+    ] = (0.0, 0.0, 0.0),
+    altitude_offset: Annotated[float, typer.Option(help="Added to altitudes, m.")] = 0.0,
+    start_utc: Annotated[str | None, typer.Option(help="Date of a log without dates.")] = None,
+    time_zone: Annotated[str, typer.Option(help="Of a CSV's dates.")] = "UTC",
+    vehicle_log: Annotated[Path | None, typer.Option(help="Vehicle log to write, too.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Turn a vehicle's own log into the navigation CSV of import-images.
+
+    ROS 1 and ROS 2 bags (COLA2 and common messages), ArduSub's DataFlash and telemetry logs.
+    """
+    from missions.logs.import_log import ImportOptions
+    from missions.logs.import_log import import_log as work
+
+    options = ImportOptions(
+        declination_deg=declination, tide=tide, clock_offset_s=clock_offset, start_s=start,
+        end_s=end, topics=topic or (), datum_deg=datum, lever_body_m=lever_arm,
+        altitude_offset_m=altitude_offset, start_utc=start_utc, time_zone=time_zone,
+        vehicle_log=vehicle_log,
+    )  # fmt: skip
+    print_result(*work(log, output, options), as_json)

@@ -1,0 +1,372 @@
+"""The command line: each command parses, calls and prints; the work is elsewhere."""
+
+import gc
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+from alice_survey.base.errors import known_fault
+from alice_survey.cli.camera import app as camera_app
+from alice_survey.cli.intake import app as import_app
+from alice_survey.cli.options import (
+    CONTEXT,
+    WORK,
+    AsJson,
+    Scale,
+    SurveyFile,
+    Threads,
+    Workspace,
+    examples,
+    print_result,
+    with_sessions,
+)
+from alice_survey.cli.plan import app as plan_app
+from alice_survey.cli.reconstruct import app as model_app
+from alice_survey.cli.reconstruct import reconstruct_app
+from alice_survey.cli.report import app as report_app
+from alice_survey.cli.vehicle import app as vehicle_app
+
+app = typer.Typer(
+    name="alice-survey",
+    help="Plan, fly, image and reconstruct close-range underwater imaging surveys, and score them.",
+    epilog="A first survey, planned, flown, pictured, reconstructed and scored: alice-survey demo",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings=CONTEXT,
+    rich_markup_mode=None,
+)
+app.add_typer(plan_app, name="plan")
+app.add_typer(import_app)
+app.add_typer(reconstruct_app, name="reconstruct")
+app.add_typer(model_app)
+app.add_typer(report_app)
+app.add_typer(camera_app, name="camera")
+app.add_typer(vehicle_app, name="vehicle")
+
+
+@app.command(
+    epilog=examples(
+        "init reef",
+        "init reef --area reef.geojson",
+        "init harbour --example caesarea",
+    )
+)
+def init(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write it into.")],
+    area: Annotated[
+        Path | None,
+        typer.Option(help="GeoJSON, KML, KMZ, GeoPackage, shapefile, WKT or .plan of the area."),
+    ] = None,
+    example: Annotated[
+        Literal["demo", "caesarea"] | None, typer.Option(help="A ready survey instead.")
+    ] = None,
+) -> None:
+    """Write a commented survey.toml.
+
+    It holds the paper's mission: 15 x 17 m, lines 1 m apart, 2 m altitude, 0.2 m/s.
+    """
+    from alice_survey.survey import init_survey
+
+    path = init_survey(folder, f"{example or 'survey'}.toml", area)
+    typer.echo(f"wrote {path}; next: alice-survey plan -w {folder}")
+
+
+@app.command(
+    epilog=examples(
+        "fov",
+        "fov --lens 12.5 --lens 25 --altitude 1.5 --altitude 2 --n-water 1.345 --json",
+        "fov --lens 12.5 --temperature 22 --salinity 35 --port-distance 30 --glass 12 --coc 2",
+        "fov --focus-air 1.5 --f-number 5.6 --speed 0.2 --speed 0.5 --exposure 1 --exposure 3",
+        "fov --rig calibration/rig.json --altitude 2 --plot fov.png --csv fov.csv",
+        "fov --validate --markdown",
+    )
+)
+def fov(
+    lens: Annotated[list[float] | None, typer.Option(help="Focal length, mm.")] = None,
+    altitude: Annotated[list[float] | None, typer.Option(help="Of the outer glass, m.")] = None,
+    n_water: Annotated[
+        float | None, typer.Option(min=1, max=1.4, help="Index of the water.")
+    ] = None,
+    temperature: Annotated[float | None, typer.Option(help="Of the water, C.")] = None,
+    salinity: Annotated[float | None, typer.Option(help="Of the water, psu.")] = None,
+    port_distance: Annotated[
+        float | None, typer.Option(min=0, max=500, help="Pupil to glass, mm.")
+    ] = None,
+    glass: Annotated[
+        float | None, typer.Option(min=0, max=500, help="Thickness of the port, mm.")
+    ] = None,
+    n_glass: Annotated[float | None, typer.Option(min=1, max=2, help="Index of the port.")] = None,
+    rig: Annotated[Path | None, typer.Option(help="A calibrated rig.json instead.")] = None,
+    f_number: Annotated[float | None, typer.Option(help="Aperture, 4 for F/4.")] = None,
+    coc: Annotated[float, typer.Option(help="Blur circle that is sharp, px.")] = 1.0,
+    focus_air: Annotated[float | None, typer.Option(help="Focus set in air, m.")] = None,
+    pixel: Annotated[float | None, typer.Option(help="Pitch of the sensor, um.")] = None,
+    match_sigma: Annotated[
+        float, typer.Option(min=1e-6, help="Disparity noise of the pair, px.")
+    ] = 0.3,
+    speed: Annotated[list[float] | None, typer.Option(help="Over ground, m/s.")] = None,
+    exposure: Annotated[list[float] | None, typer.Option(help="Shutter or strobe, ms.")] = None,
+    blur: Annotated[float | None, typer.Option(min=1e-6, help="Allowed motion blur, px.")] = None,
+    validate: Annotated[
+        bool, typer.Option("--validate", help="Check what the paper says; exit 1 if it fails.")
+    ] = False,
+    plot: Annotated[Path | None, typer.Option(help="Draw it: .png, .svg or .pdf.")] = None,
+    csv: Annotated[Path | None, typer.Option(help="Write the rows as CSV.")] = None,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown.")] = False,
+    survey: Annotated[
+        Path | None, typer.Option("-s", "--survey", help="Camera, water and plan to take.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Tell field of view and resolution.
+
+    Footprint, pixel, focus, depth of field, stereo and blur through the exact flat port, for any
+    lens, altitude and water. What is not given is the survey's, or else the paper's.
+    """
+    from alice_survey.cli.fov_tables import FovOptions, Output, fov_report, validation_report
+
+    output = Output(markdown=markdown, csv=csv, plot=plot)
+    options = FovOptions(
+        lens_mm=lens or (), altitude_m=altitude or (), speed_mps=speed or (),
+        exposure_ms=exposure or (), survey=survey, rig=rig, n_water=n_water,
+        temperature_c=temperature, salinity_psu=salinity, port_distance_mm=port_distance,
+        glass_mm=glass, n_glass=n_glass, pixel_um=pixel, f_number=f_number, coc_px=coc,
+        focus_air_m=focus_air, match_sigma_px=match_sigma, blur_px=blur,
+    )  # fmt: skip
+    table, data, passed = (
+        validation_report(options, output) if validate else fov_report(options, output)
+    )
+    print_result(table, data, as_json)
+    raise typer.Exit(0 if passed else 1)
+
+
+@app.command(
+    epilog=examples(
+        "fly -w reef",
+        "fly -w reef --vehicle alice --controller sway --current 0.1@90",
+        "fly -w before --vehicle sparus2 --controller los",
+        "fly -w reef --fail stern --fail bow=0.5 --json",
+        "fly -w reef --dive 2",
+    )
+)
+def fly(
+    workspace: Workspace = WORK,
+    survey: SurveyFile = None,
+    vehicle: Annotated[Literal["alice", "sparus2"] | None, typer.Option(help="What flies.")] = None,
+    controller: Annotated[
+        Literal["sway", "los"] | None,
+        typer.Option(help="Heading held on the line, or towards a point ahead on it."),
+    ] = None,
+    current: Annotated[
+        str | None,
+        typer.Option(help="SPEED@DIRECTION it flows towards: m/s, degrees from north."),
+    ] = None,
+    fail: Annotated[
+        list[str] | None,
+        typer.Option(help="A thruster that does not turn, or is weak: stern, bow=0.5."),
+    ] = None,
+    dive: Annotated[
+        int | None, typer.Option(min=1, help="Fly this dive of the plan; all when not given.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Fly the plan.
+
+    The simulated vehicle with its controller, sensors and navigation filter, in a current. Writes
+    the true track, the trigger times, the navigation log, the vehicle's log, and plots.
+    """
+    from alice_survey.survey import FlightChanges, run
+
+    changes = FlightChanges(
+        vehicle=vehicle, controller=controller, current=current, failed=fail, dive=dive
+    )
+    print_result(*run(["flight"], workspace, survey, flight=changes), as_json)
+
+
+@app.command(epilog=examples("image -w reef --scale 4 --threads 2"))
+def image(
+    workspace: Workspace = WORK,
+    survey: SurveyFile = None,
+    scale: Scale = None,
+    threads: Threads = None,
+    as_json: AsJson = False,
+) -> None:
+    """Render the stereo pictures.
+
+    Those of the flight and those of a board in a pool, for the calibration.
+    """
+    from alice_survey.survey import run
+
+    print_result(*run(["pool", "images"], workspace, survey, scale, threads), as_json)
+
+
+@app.command(
+    epilog=examples(
+        'target "charuco 12x9 40mm 30mm" -o board.pdf',
+        'target "chessboard 9x6 25mm" -o board.svg --paper A4',
+        'target "apriltag 6x6 88mm 0.3" -o grid.pdf --paper A1',
+        'target "charuco 12x9 40mm 30mm DICT_5X5_250 legacy" -o board.png --dpi 600',
+    )
+)
+def target(
+    what: Annotated[
+        str, typer.Argument(metavar="TARGET", help="In words, as below, or a target's JSON file.")
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="A .pdf, .svg or .png file.")],
+    paper: Annotated[
+        str | None, typer.Option(help="A4, A3, A2, A1, A0 or letter; as needed if not given.")
+    ] = None,
+    dpi: Annotated[float, typer.Option(min=50, max=2400, help="Of a PNG.")] = 300.0,
+    as_json: AsJson = False,
+) -> None:
+    """Print a calibration target.
+
+    A chessboard (inner corners, square), a ChArUco board (squares, square, marker) or a grid of
+    AprilTags (tags, tag, gap over tag) at true scale, and beside it its JSON file.
+    """
+    from camera_calib.targets.sheet import print_target
+
+    print_result(*print_target(what, output, paper, dpi), as_json)
+
+
+@app.command(
+    epilog=examples(
+        "calibrate -w reef",
+        "calibrate --left 'left*.jpg' --right 'right*.jpg' --target 'chessboard 9x6 25mm' -o air",
+        "calibrate --pictures dry --target 'charuco 12x9 40mm 30mm' --lens rational -o one",
+        "calibrate --left L --right R --target board.json --water --start air/rig.json"
+        " --glass 10 -o pool",
+    )
+)
+def calibrate(
+    workspace: Workspace = WORK,
+    left: Annotated[str | None, typer.Option(help="Folder or 'pattern' of pictures.")] = None,
+    right: Annotated[str | None, typer.Option(help="Those of the right camera.")] = None,
+    pictures: Annotated[str | None, typer.Option(help="Those of a single camera.")] = None,
+    target: Annotated[str | None, typer.Option(help="In words, or target.json.")] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Folder to write.")] = None,
+    lens: Annotated[
+        str, typer.Option(help="pinhole, k1, k2, opencv4, opencv5, rational, prism or full.")
+    ] = "opencv5",
+    water: Annotated[
+        bool, typer.Option("--water/--air", help="Where: under water through ports, or in air.")
+    ] = False,
+    start: Annotated[Path | None, typer.Option(help="rig.json calibrated in air.")] = None,
+    intrinsics: Annotated[
+        Literal["held", "prior", "free"] | None,
+        typer.Option(help="What is done with those of --start; prior where it has sigmas."),
+    ] = None,
+    port_distance: Annotated[
+        float | None, typer.Option(min=0, max=500, help="Pupil to glass, first value, mm.")
+    ] = None,
+    glass: Annotated[
+        float | None, typer.Option(min=0, max=500, help="Thickness of the port, mm.")
+    ] = None,
+    glass_sigma: Annotated[
+        float | None, typer.Option(min=1e-4, help="Find the thickness too; known to this, mm.")
+    ] = None,
+    n_glass: Annotated[
+        float | None, typer.Option(min=1, max=2, help="Its index; 1.52 if not given.")
+    ] = None,
+    n_glass_sigma: Annotated[
+        float | None, typer.Option(min=1e-7, help="Find this index too; known to this.")
+    ] = None,
+    n_water: Annotated[
+        float | None, typer.Option(min=1, max=1.4, help="Index of the water; 1.34 if not given.")
+    ] = None,
+    n_water_sigma: Annotated[
+        float | None, typer.Option(min=1e-7, help="Find this index too; known to this.")
+    ] = None,
+    carry_to_n: Annotated[
+        float | None,
+        typer.Option(min=1, max=1.4, help="Also write the rig in water of this index."),
+    ] = None,
+    survey: SurveyFile = None,
+    threads: Threads = None,
+    as_json: AsJson = False,
+) -> None:
+    """Calibrate cameras, in air or through their ports.
+
+    From the pool of a survey, or from pictures of a target: chessboard, ChArUco or AprilTag grid.
+    Writes the rig with its covariance, the residuals and a report.
+    """
+    places = {"left": left, "right": right, "pictures": pictures, "target": target}
+    settings: dict[str, Any] = {
+        "start": start, "known": intrinsics, "port_distance_mm": port_distance, "glass_mm": glass,
+        "glass_sigma_mm": glass_sigma, "n_glass": n_glass, "n_glass_sigma": n_glass_sigma,
+        "n_water": n_water, "n_water_sigma": n_water_sigma, "carry_to_n": carry_to_n,
+    }  # fmt: skip
+    given = [value for value in (*places.values(), output, *settings.values()) if value is not None]
+    if given or water or lens != "opencv5":
+        from camera_calib.calibrate.pictures import calibrate_command
+
+        result = calibrate_command(
+            **places, output=output, threads=threads, lens=lens, water=water, **settings
+        )
+    else:
+        from alice_survey.survey import run
+
+        result = run(["calibration"], workspace, survey, None, threads)
+    print_result(*result, as_json)
+
+
+@app.command(name="run", epilog=examples("run -w reef --scale 4"))
+def run_all(
+    workspace: Workspace = WORK,
+    survey: SurveyFile = None,
+    scale: Scale = None,
+    threads: Threads = None,
+    as_json: AsJson = False,
+) -> None:
+    """Do the whole loop.
+
+    plan, fly, image, calibrate, reconstruct, evaluate, report: stages that are up to date are
+    skipped.
+    """
+    from alice_survey.survey import LOOP, run
+
+    print_result(*run(LOOP, workspace, survey, scale, threads), as_json)
+
+
+@app.command(epilog=examples("demo", "demo -w demo --threads 2"))
+def demo(
+    workspace: Workspace = Path("demo"), threads: Threads = None, as_json: AsJson = False
+) -> None:
+    """Do the loop on a built-in survey.
+
+    A few metres of sea floor with rocks and an amphora, at a quarter of the resolution.
+    """
+    from alice_survey.survey import run_demo
+
+    print_result(*run_demo(workspace, threads), as_json)
+
+
+@app.command(epilog=examples("status -w reef", "status -w reef --json"))
+def status(workspace: Workspace = WORK, survey: SurveyFile = None, as_json: AsJson = False) -> None:
+    """Say what a workspace holds.
+
+    What is there, what is stale, and what the next command is.
+    """
+    from alice_survey.survey import workspace_status
+
+    print_result(*workspace_status(workspace, survey), as_json)
+
+
+with_sessions(app)
+
+
+def main() -> None:
+    """Run the command line; a known fault is one line on standard error and exit code 1."""
+    # Modules leave many objects that stay: looking through them again and again for garbage while
+    # they are loaded takes a tenth of a command's start.
+    gc.set_threshold(100_000)
+    try:
+        app()
+    except Exception as error:
+        fault = known_fault(error)
+        if fault is None:
+            raise
+        typer.echo(f"error: {fault}", err=True)
+        raise SystemExit(1) from error

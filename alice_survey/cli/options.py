@@ -1,0 +1,97 @@
+"""Options and habits that all commands share."""
+
+import functools
+import inspect
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+CONTEXT = {"help_option_names": ["-h", "--help"]}
+
+Workspace = Annotated[
+    Path, typer.Option("-w", "--workspace", help="Folder that holds the stages of one survey.")
+]
+SurveyFile = Annotated[
+    Path | None,
+    typer.Option(
+        "-s", "--survey", help="Settings; WORKSPACE/survey.toml, then ./survey.toml, if not given."
+    ),
+]
+Threads = Annotated[
+    int | None, typer.Option(min=1, max=256, help="Cores to use; all when not given.")
+]
+Scale = Annotated[
+    int | None,
+    typer.Option(min=1, max=16, help="Divide the resolution of rendered pictures by this."),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON.")]
+Quiet = Annotated[
+    bool, typer.Option("-q", "--quiet", help="Show warnings, errors and the result alone.")
+]
+LogFile = Annotated[
+    Path | None, typer.Option("--log-file", help="Add all that happens, with times, to this file.")
+]
+Events = Annotated[Path | None, typer.Option("--events", help="Add it as JSON lines to this file.")]
+WORK = Path("work")
+_SESSION = {"quiet": Quiet, "log_file": LogFile, "events": Events}
+
+
+def examples(*lines: str) -> str:
+    """An epilog that keeps its lines (the first character tells the formatter not to wrap)."""
+    return "\b\nExamples:\n" + "\n".join(f"  alice-survey {line}" for line in lines)
+
+
+def print_result(table: str, data: Any, as_json: bool) -> None:
+    """Print a command's result as text, or as JSON when asked."""
+    typer.echo(json.dumps(data, indent=2) if as_json else table)
+    from alice_survey.base.run.progress import current
+
+    current().tell("result", table)
+
+
+def with_sessions(app: typer.Typer) -> None:
+    """Give every command of an app the options of a session, and do its work within one."""
+    if app.registered_callback is not None and app.registered_callback.callback is not None:
+        app.registered_callback.callback = _in_session(app.registered_callback.callback)
+    for command in app.registered_commands:
+        if command.callback is not None:
+            command.callback = _in_session(command.callback)
+    for group in app.registered_groups:
+        if group.typer_instance is not None:
+            with_sessions(group.typer_instance)
+
+
+def _in_session(command: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(command)
+    def wrapped(
+        *args: Any, quiet: bool, log_file: Path | None, events: Path | None, **kwargs: Any
+    ) -> Any:
+        context = next((v for v in kwargs.values() if hasattr(v, "invoked_subcommand")), None)
+        below = None if context is None else context.invoked_subcommand
+        if below is not None:
+            if quiet or log_file or events:
+                raise typer.BadParameter(f"--quiet, --log-file and --events go behind '{below}'")
+            return command(*args, **kwargs)
+        from alice_survey.cli.session import session  # here, so that --help stays quick
+
+        with session(sys.argv[1:], quiet=quiet, log_file=log_file, events=events):
+            return command(*args, **kwargs)
+
+    signature = inspect.signature(command)
+    own = [
+        inspect.Parameter(
+            name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=False if name == "quiet" else None,
+            annotation=kind,
+        )
+        for name, kind in _SESSION.items()
+    ]
+    parameters = [*signature.parameters.values(), *own]
+    vars(wrapped)["__signature__"] = signature.replace(parameters=parameters)
+    wrapped.__annotations__ = {**command.__annotations__, **_SESSION}
+    return wrapped

@@ -1,0 +1,220 @@
+"""The `plan` commands: plan a survey, and what goes with it before and after a dive."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from alice_survey.cli.options import (
+    CONTEXT,
+    WORK,
+    AsJson,
+    SurveyFile,
+    Threads,
+    Workspace,
+    examples,
+    print_result,
+)
+
+app = typer.Typer(
+    invoke_without_command=True,
+    context_settings=CONTEXT,
+    rich_markup_mode=None,
+    epilog=examples(
+        "plan -w reef",
+        "plan -w reef -s other.toml --json",
+        "plan solve -w reef --resolution 0.5",
+        "plan gain 'control/*.jpg'",
+        "plan check navigation.csv -w reef",
+        "plan export -w reef --format cola2 --format wpl",
+    ),
+)
+
+
+@app.callback()
+def plan(
+    context: typer.Context,
+    workspace: Workspace = WORK,
+    survey: SurveyFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Plan lines and camera settings.
+
+    They image the whole area at the overlap asked for. Writes the plan with its certificate, maps,
+    and missions that vehicles load; prints every setting with the equation and the limit behind it.
+    """
+    if context.invoked_subcommand is None:
+        from alice_survey.survey import plan_report
+
+        print_result(*plan_report(workspace, survey), as_json)
+
+
+@app.command(
+    epilog=examples(
+        "plan solve -w reef --resolution 0.5",
+        "plan solve -w reef --dive 3600",
+        "plan solve -w reef --rate 0.25 --lens 12.5 --lens 25 --json",
+    )
+)
+def solve(
+    workspace: Workspace = WORK,
+    survey: SurveyFile = None,
+    resolution: Annotated[
+        float | None, typer.Option(min=1e-3, help="Size of a pixel on the sea floor, mm.")
+    ] = None,
+    dive: Annotated[float | None, typer.Option(min=1, help="Length of a dive, s.")] = None,
+    rate: Annotated[float | None, typer.Option(min=1e-3, help="Fixed frame rate, Hz.")] = None,
+    lens: Annotated[list[float] | None, typer.Option(help="Focal lengths at hand, mm.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Find settings from what is given.
+
+    Altitude and lens for a resolution, the area that fits a dive, or the speed for a frame rate.
+    """
+    from alice_survey.survey import settings
+    from missions.exposure.solve import solve_report
+
+    config = settings(workspace, survey, needed=False)
+    print_result(
+        *solve_report(
+            config, resolution_mm=resolution, dive_s=dive, rate_hz=rate, lenses=lens or (12.5, 25.0)
+        ),
+        as_json,
+    )
+
+
+@app.command(
+    epilog=examples("plan gain control", "plan gain 'control/*.png' --present 12 --linear --json")
+)
+def gain(
+    pictures: Annotated[str, typer.Argument(metavar="PICTURES", help="Folder or 'pattern'.")],
+    present: Annotated[float | None, typer.Option(help="Gain they were taken at, dB.")] = None,
+    linear: Annotated[
+        bool, typer.Option("--linear", help="Grey values are linear, not sRGB.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Tell the gain to set.
+
+    From control pictures of a short dive before the survey, as the paper does it.
+    """
+    from missions.exposure.gain import gain_report
+
+    print_result(*gain_report(pictures, present_gain_db=present, linear=linear), as_json)
+
+
+@app.command(
+    epilog=examples(
+        "plan check -w reef",
+        "plan check navigation.csv -w reef",
+        "plan check navigation.csv --triggers triggers.csv -w reef -o checked",
+        "plan check -w reef --monte-carlo 20",
+    )
+)
+def check(
+    log: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="LOG", help="Navigation CSV of a dive; the simulated flight's if not given."
+        ),
+    ] = None,
+    workspace: Workspace = WORK,
+    survey: SurveyFile = None,
+    triggers: Annotated[
+        Path | None,
+        typer.Option(help="CSV with the times of the pictures; the plan's interval if not given."),
+    ] = None,
+    monte_carlo: Annotated[
+        int, typer.Option(min=0, max=10_000, help="Also fly the plan so many times in simulation.")
+    ] = 0,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Folder to write.")] = None,
+    threads: Threads = None,
+    as_json: AsJson = False,
+) -> None:
+    """Check what a dive has seen.
+
+    Lists the holes in coverage and overlap, draws them, and writes a plan that flies them again.
+    """
+    from alice_survey.survey import settings
+    from missions.fly.check import check_report
+
+    config = settings(workspace, survey, needed=False)
+    print_result(
+        *check_report(
+            workspace, config, log,
+            triggers=triggers, out=output, monte_carlo=monte_carlo, threads=threads,
+        ),
+        as_json,
+    )  # fmt: skip
+
+
+@app.command(
+    epilog=examples(
+        "plan export -w reef", "plan export -w reef --format cola2 --format wpl -o to_vehicle"
+    )
+)
+def export(
+    workspace: Workspace = WORK,
+    formats: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--format",
+            help="cola2, cola2-v1, qgc, qgc-survey, wpl, kml, gpx, geojson, csv; all if none.",
+        ),
+    ] = None,
+    camera_on: Annotated[
+        str | None, typer.Option(help="COLA2's service that starts pictures.")
+    ] = None,
+    camera_off: Annotated[str | None, typer.Option(help="The one that stops them.")] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Folder to write.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write a plan in files that vehicles and planners load."""
+    from missions.exports.write import export_report
+
+    print_result(
+        *export_report(
+            workspace / "plan" / "plan.json",
+            formats,
+            output,
+            camera_on=camera_on,
+            camera_off=camera_off,
+        ),
+        as_json,
+    )
+
+
+@app.command(name="map", epilog=examples("plan map -w reef -o map.pdf"))
+def draw_map(
+    output: Annotated[Path, typer.Option("-o", "--output", help="A .pdf, .svg or .png file.")],
+    workspace: Workspace = WORK,
+    survey: SurveyFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Draw the map of a plan for print.
+
+    Area, zones, lines, footprints, how many pictures see each place, current, bathymetry.
+    """
+    from alice_survey.survey import settings
+    from missions.plan.redraw import map_report
+
+    config = settings(workspace, survey, needed=False)
+    print_result(*map_report(workspace / "plan" / "plan.json", config, output), as_json)
+
+
+@app.command(epilog=examples("plan current -w reef", "plan current -w reef --plot trade.png"))
+def current(
+    workspace: Workspace = WORK,
+    survey: SurveyFile = None,
+    plot: Annotated[Path | None, typer.Option(help="PNG, PDF or SVG to draw.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show what the current costs.
+
+    Power by the direction of lines: along the current, across it by sway, or crabbing.
+    """
+    from alice_survey.survey import settings
+    from missions.plan.trade import current_report
+
+    config = settings(workspace, survey, needed=False)
+    print_result(*current_report(config, plot), as_json)

@@ -1,0 +1,55 @@
+"""Commands that show a survey: the report, and the server for what is too large for one page."""
+
+from typing import Annotated
+
+import typer
+
+from alice_survey.cli.options import (
+    CONTEXT,
+    WORK,
+    AsJson,
+    SurveyFile,
+    Threads,
+    Workspace,
+    examples,
+    print_result,
+)
+
+app = typer.Typer(context_settings=CONTEXT, rich_markup_mode=None)
+
+
+@app.command(epilog=examples("report -w reef", "report -w reef --json"))
+def report(
+    workspace: Workspace = WORK,
+    survey: SurveyFile = None,
+    threads: Threads = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write the report of a survey.
+
+    One page that needs no network, and the same as PDF: what was mapped, how well, what to do
+    next; map, mesh, errors, calibration, settings. It tells what the workspace holds so far.
+    """
+    from alice_survey.survey import run
+
+    print_result(*run(["report"], workspace, survey, None, threads), as_json)
+
+
+@app.command(epilog=examples("view -w reef", "view -w reef --port 8000 --no-browser"))
+def view(
+    workspace: Workspace = WORK,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="To listen on; 0 for any that is free.")
+    ] = 0,
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")
+    ] = True,
+) -> None:
+    """Show a survey in a browser, however large.
+
+    Serves map, mesh and files of a workspace to this machine alone, at full resolution, until
+    Ctrl-C. A GIS can open its rasters by their addresses.
+    """
+    from alice_survey.view.run import run_view
+
+    run_view(workspace, port, browser=browser, tell=typer.echo)

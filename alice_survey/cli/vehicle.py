@@ -1,0 +1,141 @@
+"""The `vehicle` commands: its coefficients, how it compares, and what its logs tell of it."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from alice_survey.cli.options import (
+    CONTEXT,
+    WORK,
+    AsJson,
+    SurveyFile,
+    Threads,
+    Workspace,
+    examples,
+    print_result,
+)
+
+app = typer.Typer(
+    help="The vehicle: coefficients from geometry and from logs, and how its two forms compare.",
+    no_args_is_help=True,
+    context_settings=CONTEXT,
+    rich_markup_mode=None,
+)
+
+
+@app.command(
+    epilog=examples(
+        "vehicle coefficients",
+        "vehicle coefficients --csv coefficients.csv --plot coefficients.png",
+        "vehicle coefficients --json",
+    )
+)
+def coefficients(
+    csv: Annotated[Path | None, typer.Option(help="CSV file to write.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="PNG, PDF or SVG to draw.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Compute coefficients from shape, beside the paper's.
+
+    Every row of the paper's three tables of added mass, damping and lift, with the equation, and
+    with the reason where its value does not follow from the vehicle's shape.
+    """
+    from alice_survey.vehicle.hydrodynamics.report import coefficients_report
+
+    print_result(*coefficients_report(csv, plot), as_json)
+
+
+@app.command(
+    epilog=examples(
+        "vehicle compare",
+        "vehicle compare -w reef --current 0.1@90 --current 0.05@0 -o compared",
+        "vehicle compare -s survey.toml --seed 7 --flights 3 --json",
+        "vehicle compare --current 0@0 --swell 0.5@6",
+    )
+)
+def compare(
+    workspace: Workspace = WORK,
+    survey: SurveyFile = None,
+    current: Annotated[
+        list[str] | None,
+        typer.Option(help="SPEED@DIRECTION; across the lines, along, and none if not given."),
+    ] = None,
+    swell: Annotated[
+        str | None, typer.Option(help="HEIGHT@PERIOD of waves across the lines: m, s.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of the first flight.")] = None,
+    flights: Annotated[int, typer.Option(min=1, max=1000, help="Of each, in each current.")] = 5,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Folder; WORKSPACE/compare if not given.")
+    ] = None,
+    threads: Threads = None,
+    as_json: AsJson = False,
+) -> None:
+    """Fly a survey by both configurations in the same sea.
+
+    SPARUS II steering by line of sight, and ALICE holding its lines by sway: cross-track error,
+    roll, speed and energy beside the paper's section VIII, and why they differ.
+    """
+    from alice_survey.survey import settings
+    from missions.fly.compare_report import compare_report
+
+    config = settings(workspace, survey, needed=workspace != WORK)
+    text, data = compare_report(
+        config, out or workspace / "compare", currents=current or (), swell=swell, seed=seed,
+        flights=flights, threads=threads,
+    )  # fmt: skip
+    print_result(text, data, as_json)
+
+
+@app.command(
+    epilog=examples(
+        "vehicle identify surge.csv turns.csv --free X_uu,Y_vv,N_rr,N_rdot,current -o found",
+        "vehicle identify dive.csv --validate second.csv --bollard pull.csv --method two-step",
+        "vehicle identify run1.csv run2.csv --columns columns.toml --vehicle rov.toml "
+        "--given p,q --window 5 --free X_u,X_uu,N_r,N_rr,gain_X,gain_N --validate run3.csv",
+    )
+)
+def identify(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="docs/vehicle-logs.md")],
+    vehicle: Annotated[str, typer.Option(help="alice, sparus2, or a TOML or JSON file.")] = "alice",
+    coefficients: Annotated[
+        str | None, typer.Option(help="Set or file to start from; the vehicle's if not given.")
+    ] = None,
+    validate: Annotated[Path | None, typer.Option(help="Log to foretell.")] = None,
+    bollard: Annotated[Path | None, typer.Option(help="CSV: thruster, rpm, force_n.")] = None,
+    free: Annotated[
+        str | None,
+        typer.Option(help="Such as X_uu,Y_vdot,N_r,Y_uv; current, buoyancy, trim, bias, gain."),
+    ] = None,
+    held: Annotated[
+        list[str] | None, typer.Option(metavar="NAME=VALUE", help="As current_north_mps=0.1.")
+    ] = None,
+    method: Annotated[str, typer.Option(help="joint, or two-step as in the paper.")] = "joint",
+    columns: Annotated[Path | None, typer.Option(help="TOML: what other columns mean.")] = None,
+    given: Annotated[
+        str | None, typer.Option(help="Rates, of p,q,r, that follow the log, not the forces.")
+    ] = None,
+    window: Annotated[
+        float | None, typer.Option(min=0.1, help="s simulated in one go; all if not given.")
+    ] = None,
+    hold_input: Annotated[
+        bool, typer.Option("--hold-input", help="Inputs stay until the next row.")
+    ] = False,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write.")] = Path("identified"),
+    as_json: AsJson = False,
+) -> None:
+    """Identify coefficients from logs of motion.
+
+    Damping, added mass, body lift, a constant current and more, each with its sigma; and how well
+    they foretell another log.
+    """
+    from alice_survey.vehicle.identification.report import IdentifyOptions, identify_report
+
+    options = IdentifyOptions(
+        vehicle=vehicle, coefficients=coefficients, validate=validate, bollard=bollard,
+        free=tuple((free or "").split(",")) if free else (), held=tuple(held or ()),
+        method=method, columns=columns, given=tuple(given.split(",")) if given else (),
+        window_s=window, hold_input=hold_input,
+    )  # fmt: skip
+    print_result(*identify_report(logs, out, options), as_json)

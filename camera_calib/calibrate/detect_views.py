@@ -1,0 +1,150 @@
+"""Find the target in all pictures of a calibration."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from alice_survey.base.errors import CalibrationError
+from alice_survey.base.executor import parallel_map
+from camera_calib.calibrate.picture_sets import PictureSet
+from camera_calib.calibrate.result import Rejection, TargetView
+from camera_calib.picture_files import is_cut_short, read_pixels
+from camera_calib.targets.detect import Detection, detect_with_reasons
+from camera_calib.targets.grow import chessboard_size
+from camera_calib.targets.target import Target
+
+_CHECKED = 3
+_READ = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+
+Size = tuple[int, int]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Detections:
+    """What all pictures show of the target."""
+
+    views: tuple[TargetView, ...]
+    """Those in which a camera saw it."""
+    sizes: Mapping[str, Size]
+    """Width and height of each camera's pictures."""
+    rejections: tuple[Rejection, ...]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Seen:
+    size: Size | None
+    """None where the picture cannot be decoded."""
+    detection: Detection
+    board: Size | None = None
+    """Corners along the longer and the shorter side of the chessboard, where it was looked at."""
+
+
+def detect_views(sets: Sequence[PictureSet], target: Target, threads: int) -> Detections:
+    """Find the target in sets of pictures; what cannot be used is named and left out.
+
+    Args:
+        sets: pictures of one moment each.
+        target: what to look for.
+        threads: cores to use.
+
+    Raises:
+        CalibrationError: a camera has pictures of different sizes, or none that shows the target.
+    """
+    jobs = [
+        (path, target, i in _checked(len(sets)))
+        for i, one in enumerate(sets)
+        for path in one.paths.values()
+    ]
+    found = iter(list(parallel_map(_look, jobs, threads=threads, label="target points")))
+    seen = {(one.name, camera): next(found) for one in sets for camera in one.paths}
+    paths = {(one.name, camera): path for one in sets for camera, path in one.paths.items()}
+    cameras = list(dict.fromkeys(camera for one in sets for camera in one.paths))
+    rejections: list[Rejection] = []
+    for (view, camera), what in seen.items():
+        rejections += what.detection.rejections(view, camera)
+    _check_board(target, list(seen.values()))
+    sizes = {camera: _one_size(camera, seen, paths) for camera in cameras}
+    for camera in cameras:
+        _check_found(camera, target, [s for (_, c), s in seen.items() if c == camera])
+    views = []
+    for one in sets:
+        pixels = {}
+        for camera in one.paths:
+            points = seen[one.name, camera].detection.pixels
+            if points is not None:
+                pixels[camera] = points
+        if pixels:
+            views.append(TargetView(name=one.name, pixels=pixels))
+    return Detections(views=tuple(views), sizes=sizes, rejections=tuple(rejections))
+
+
+def _checked(count: int) -> set[int]:
+    """Numbers of the views in which the size of the board is looked at."""
+    return {(2 * i + 1) * count // (2 * _CHECKED) for i in range(_CHECKED)}
+
+
+def _look(job: tuple[Path, Target, bool]) -> _Seen:
+    path, target, check = job
+    if is_cut_short(path):
+        return _Seen(size=None, detection=Detection(pixels=None, refused="the file is cut short"))
+    picture = read_pixels(path, _READ)
+    if picture is None:
+        reason = f"{path.name} cannot be decoded as a picture"
+        return _Seen(size=None, detection=Detection(pixels=None, refused=reason))
+    height, width = map(int, picture.shape[:2])
+    try:
+        detection = detect_with_reasons(target, picture)
+    except CalibrationError as error:
+        detection = Detection(pixels=None, refused=str(error))
+    board = None
+    if check and target.kind == "chessboard" and detection.pixels is not None:
+        grey = picture if picture.dtype == np.uint8 else (picture >> 8).astype(np.uint8)
+        board = chessboard_size(grey)
+    return _Seen(size=(width, height), detection=detection, board=board)
+
+
+def _one_size(
+    camera: str, seen: Mapping[tuple[str, str], _Seen], paths: Mapping[tuple[str, str], Path]
+) -> Size:
+    sizes = {key: what.size for key, what in seen.items() if key[1] == camera and what.size}
+    if not sizes:
+        first = next(what.detection.refused for key, what in seen.items() if key[1] == camera)
+        raise CalibrationError(f"none of the pictures of {camera} can be read: {first}")
+    counts = Counter(sizes.values()).most_common()
+    if len(counts) > 1:
+        (common, many), (other, few) = counts[:2]
+        odd = next(paths[key].name for key, size in sizes.items() if size == other)
+        raise CalibrationError(
+            f"pictures of {camera} differ in size: {many} of {common[0]} x {common[1]} px, {few} "
+            f"of {other[0]} x {other[1]} px (such as {odd}): give those of one size"
+        )
+    return counts[0][0]
+
+
+def _check_board(target: Target, seen: Sequence[_Seen]) -> None:
+    """A part of a larger chessboard looks like a smaller one, but not like the same part always."""
+    wanted = max(target.columns, target.rows), min(target.columns, target.rows)
+    boards = [what.board for what in seen if what.board is not None]
+    larger = [b for b in boards if b[0] >= wanted[0] and b[1] >= wanted[1] and b != wanted]
+    if len(larger) > len(boards) / 2:
+        (columns, rows), count = Counter(larger).most_common(1)[0]
+        raise CalibrationError(
+            f"the chessboard has {columns}x{rows} inner corners in {count} of {len(boards)} "
+            f"pictures looked at, more than the {target.columns}x{target.rows} of --target: count "
+            "them again"
+        )
+
+
+def _check_found(camera: str, target: Target, seen: Sequence[_Seen]) -> None:
+    looked = [what.detection for what in seen if what.size is not None]
+    if any(detection.pixels is not None for detection in looked):
+        return
+    reasons = Counter(str(detection.refused) for detection in looked).most_common(1)
+    raise CalibrationError(
+        f"the target '{target.description}' was found in none of the {len(looked)} pictures of "
+        f"{camera}; of {reasons[0][1]} of them: {reasons[0][0]}"
+    )

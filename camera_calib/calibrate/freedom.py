@@ -1,0 +1,191 @@
+"""Which parameters of a rig an adjustment may change, and what is known of them beforehand.
+
+A rig's parameters are called `<camera>.<name>`. Names of a camera are those of
+`flat_port.PARAMETERS`; every camera but the reference also has its pose `cam_from_rig`: a rotation
+vector (`rx_rad, ry_rad, rz_rad`) and the translation (`x_m, y_m, z_m`). Small changes, and so
+sigmas, of the rotation are turns about the camera's own axes: R becomes exp(r) R.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from alice_survey.base.errors import CalibrationError
+from alice_survey.base.frames import Array
+from camera_calib.flat_port import PARAMETERS
+from camera_calib.rig import Rig
+
+POSE = ("rx_rad", "ry_rad", "rz_rad", "x_m", "y_m", "z_m")
+"""Of a camera that is not the reference; its rotation first."""
+PINHOLE = ("fx_px", "fy_px", "cx_px", "cy_px")
+PORT = ("port_distance_m", "normal_x", "normal_y")
+"""What a calibration through a port finds; glass and indices are known better from elsewhere."""
+
+_ONE_WATER = ".n_water"
+_SAME = 1.0 - 0.5e-6
+"""Correlation of what is known of one number twice: both differ by 0.001 sigma."""
+_OPENCV4 = ("k1", "k2", "p1", "p2")
+LENSES: Mapping[str, tuple[str, ...]] = {
+    "pinhole": (),
+    "k1": ("k1",),
+    "k2": ("k1", "k2"),
+    "opencv4": _OPENCV4,
+    "opencv5": (*_OPENCV4, "k3"),
+    "rational": (*_OPENCV4, "k3", "k4", "k5", "k6"),
+    "prism": (*_OPENCV4, "k3", "s1", "s2", "s3", "s4"),
+    "full": (*_OPENCV4, "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4"),
+}
+"""Distortion terms by the name of a lens model."""
+
+
+def intrinsics(lens: str) -> tuple[str, ...]:
+    """Focal lengths, centre and distortion terms of a lens model.
+
+    Raises:
+        CalibrationError: no lens model has this name.
+    """
+    if lens not in LENSES:
+        raise CalibrationError(f"no lens model is called {lens!r}: choose {', '.join(LENSES)}")
+    return (*PINHOLE, *LENSES[lens])
+
+
+def all_names(rig: Rig) -> tuple[str, ...]:
+    """Every parameter of a rig, camera by camera, then the poses."""
+    cameras = [f"{camera}.{name}" for camera in rig.cameras for name in PARAMETERS]
+    return (*cameras, *pose_names(rig))
+
+
+def pose_names(rig: Rig) -> tuple[str, ...]:
+    """Parameters of the poses of all cameras but the reference."""
+    return tuple(f"{c}.{name}" for c in rig.cameras if c != rig.reference for name in POSE)
+
+
+def value(rig: Rig, name: str) -> float:
+    """The value of one parameter of a rig."""
+    camera, field = name.split(".")
+    if field in PARAMETERS:
+        return rig.cameras[camera].parameter(field)
+    pose = rig.cam_from_rig[camera]
+    vector = np.concatenate([pose.rotation.as_rotvec(), pose.translation])
+    return float(vector[POSE.index(field)])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Prior:
+    """Normally distributed knowledge of some parameters, from elsewhere than the views."""
+
+    parameters: tuple[str, ...]
+    mean: Array
+    """(K,) in the parameters' units."""
+    covariance: Array
+    """(K, K)."""
+
+    def __post_init__(self) -> None:
+        count = len(self.parameters)
+        if self.mean.shape != (count,) or self.covariance.shape != (count, count):
+            raise CalibrationError(
+                f"prior: {self.mean.shape} means and {self.covariance.shape} covariances for "
+                f"{count} parameters"
+            )
+        sigma = np.sqrt(np.diag(self.covariance))
+        if not (np.all(sigma > 0) and np.all(np.isfinite(self.mean))):
+            raise CalibrationError("prior: a mean is not finite or a sigma not positive")
+        scaled = self.covariance / np.outer(sigma, sigma)
+        if count and np.linalg.eigvalsh(scaled)[0] < 1e-13:
+            raise CalibrationError("prior: its covariance is not positive definite")
+        turns = {name for name in self.parameters if name.endswith(POSE[:3])}
+        for camera in {name.split(".")[0] for name in turns}:
+            if not {f"{camera}.{axis}" for axis in POSE[:3]} <= turns:
+                raise CalibrationError(f"prior: {camera} needs all of {', '.join(POSE[:3])}")
+
+    @property
+    def information(self) -> Array:
+        """(K, K) inverse of the covariance."""
+        scale = 1.0 / np.sqrt(np.diag(self.covariance))
+        weight = np.outer(scale, scale)
+        inverse: Array = np.linalg.inv(self.covariance * weight) * weight
+        return inverse
+
+    @classmethod
+    def around(cls, rig: Rig, sigmas: Mapping[str, float]) -> "Prior":
+        """Each parameter is the rig's value, give or take its sigma, independent of the others.
+
+        Only the indices of the water are one number: all cameras look into the same.
+        """
+        spread = np.array(list(sigmas.values()))
+        water = np.array([name.endswith(_ONE_WATER) for name in sigmas], dtype=bool)
+        alike = np.where(np.outer(water, water), _SAME, 0.0)
+        np.fill_diagonal(alike, 1.0)
+        return cls(
+            parameters=tuple(sigmas),
+            mean=np.array([value(rig, name) for name in sigmas]),
+            covariance=alike * np.outer(spread, spread),
+        )
+
+    @classmethod
+    def of_rig(cls, rig: Rig, names: Iterable[str]) -> "Prior":
+        """What an earlier calibration knows, with its correlations, of those names it found."""
+        if rig.covariance is None:
+            raise CalibrationError(
+                f"the rig ({rig.source}) has no covariance to serve as a prior: calibrate it, or "
+                "hold its parameters or leave them free"
+            )
+        found = rig.covariance.parameters
+        kept = tuple(name for name in names if name in found)
+        at = [found.index(name) for name in kept]
+        return cls(
+            parameters=kept,
+            mean=np.array([value(rig, name) for name in kept]),
+            covariance=rig.covariance.matrix[np.ix_(at, at)],
+        )
+
+    def and_also(self, other: "Prior") -> "Prior":
+        """Both, taken as independent of each other."""
+        twice = set(self.parameters) & set(other.parameters)
+        if twice:
+            raise CalibrationError(f"prior: two are given for {', '.join(sorted(twice))}")
+        first, second = len(self.parameters), len(other.parameters)
+        covariance = np.zeros((first + second, first + second))
+        covariance[:first, :first] = self.covariance
+        covariance[first:, first:] = other.covariance
+        return Prior(
+            parameters=(*self.parameters, *other.parameters),
+            mean=np.concatenate([self.mean, other.mean]),
+            covariance=covariance,
+        )
+
+
+NO_PRIOR = Prior(parameters=(), mean=np.zeros(0), covariance=np.zeros((0, 0)))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Freedom:
+    """What an adjustment may change; every parameter not named is held."""
+
+    free: tuple[str, ...] = ()
+    """Parameters known from the views alone. Those of the prior are adjusted too."""
+    prior: Prior = NO_PRIOR
+
+    def names(self, rig: Rig) -> tuple[str, ...]:
+        """What is adjusted, in the order of `all_names`.
+
+        Raises:
+            CalibrationError: a name is no parameter of the rig.
+        """
+        wanted = {*self.free, *self.prior.parameters}
+        known = all_names(rig)
+        if wanted - set(known):
+            raise CalibrationError(
+                f"the rig has no parameter {', '.join(sorted(wanted - set(known)))}"
+            )
+        return tuple(name for name in known if name in wanted)
+
+
+HELD = Freedom()
+
+
+def of_cameras(rig: Rig, names: Iterable[str]) -> tuple[str, ...]:
+    """The same parameters of every camera of a rig."""
+    fields = tuple(names)
+    return tuple(f"{camera}.{name}" for camera in rig.cameras for name in fields)

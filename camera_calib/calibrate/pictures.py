@@ -1,0 +1,352 @@
+"""Calibrate from pictures of a target: `alice-survey calibrate --left ... --right ...`."""
+
+import contextlib
+import shlex
+import shutil
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from alice_survey.base.artefacts import read_json
+from alice_survey.base.errors import CalibrationError, WorkspaceError, warn
+from alice_survey.base.executor import default_threads
+from camera_calib.calibrate.detect_views import Detections, Size, detect_views
+from camera_calib.calibrate.files import finish, summary, tell
+from camera_calib.calibrate.freedom import intrinsics
+from camera_calib.calibrate.numbering import same_numbering
+from camera_calib.calibrate.picture_sets import find_pictures, pair_pictures
+from camera_calib.calibrate.result import Calibration
+from camera_calib.calibrate.solve import (
+    Intrinsics,
+    blank_camera,
+    calibrate_in_air,
+    calibrate_in_water_alone,
+    calibrate_through_ports,
+    first_cameras,
+)
+from camera_calib.calibrate.told import calibration_text
+from camera_calib.flat_port import FlatPortCamera
+from camera_calib.rig import Rig, read_rig, write_rig
+from camera_calib.targets.target import Target, parse_target
+
+ONE_CAMERA = "camera"
+"""Name of the camera of `--pictures`."""
+_WRITTEN = (
+    "rig.json", "rig_carried.json", "calibration.json", "corners.csv", "report.html", "report.json",
+)  # fmt: skip
+"""By this command; a folder with other files is not replaced."""
+_GUESSED_PORT_M = 0.02
+_FRESH_WATER, _GLASS = 1.34, 1.52
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureCalibration:
+    """What the user says of pictures to calibrate from."""
+
+    pictures: Mapping[str, str]
+    """Folder or pattern by camera; the first is the reference."""
+    target: str
+    """As `parse_target` reads it."""
+    lens: str = "opencv5"
+    water: bool = False
+    """The pictures were taken under water, through the ports."""
+    start: Path | None = None
+    """rig.json of a calibration in air, or an earlier one."""
+    known: Intrinsics | None = None
+    """What is done with the intrinsics of `start`; None: prior if it has a covariance, or held."""
+    port_distance_mm: float | None = None
+    """First value; it is found."""
+    glass_mm: float | None = None
+    """Thickness."""
+    glass_sigma_mm: float | None = None
+    """The thickness is found too, known this well; likewise the indices."""
+    n_glass: float | None = None
+    n_glass_sigma: float | None = None
+    n_water: float | None = None
+    n_water_sigma: float | None = None
+    carry_to_n: float | None = None
+    """Also write the rig in water of this index."""
+
+
+def calibrate_command(
+    left: str | None,
+    right: str | None,
+    pictures: str | None,
+    target: str | None,
+    output: Path | None,
+    threads: int | None,
+    **others: Any,
+) -> tuple[str, dict[str, Any]]:
+    """`calibrate_pictures` from the options of the command line.
+
+    Args:
+        left: folder or pattern of the left camera's pictures.
+        right: the right camera's.
+        pictures: of one camera, instead.
+        target: in words, or the path of its file.
+        output: folder to write.
+        threads: cores to use; None for all.
+        others: further fields of `PictureCalibration`.
+
+    Raises:
+        CalibrationError: options are missing or do not go together, or as of `calibrate_pictures`.
+    """
+    places = {"left": left, "right": right, ONE_CAMERA: pictures}
+    given = {camera: place for camera, place in places.items() if place is not None}
+    if not given:
+        raise CalibrationError(
+            "these options are for pictures: give --left and --right, or --pictures; the pool of a "
+            "survey takes none of them"
+        )
+    if pictures is not None and len(given) > 1:
+        raise CalibrationError("give --left and --right, or --pictures, not both")
+    if pictures is None and len(given) == 1:
+        raise CalibrationError("give both --left and --right, or --pictures for a single camera")
+    if target is None:
+        raise CalibrationError("--target is missing: what is seen, such as 'chessboard 9x6 25mm'")
+    if output is None:
+        raise CalibrationError("-o is missing: the folder to write the calibration into")
+    settings = PictureCalibration(pictures=given, target=target, **others)
+    return calibrate_pictures(settings, output, threads or default_threads())
+
+
+def calibrate_pictures(
+    settings: PictureCalibration, output: Path, threads: int
+) -> tuple[str, dict[str, Any]]:
+    """Calibrate from pictures and write a folder of results.
+
+    Returns:
+        What was found, as text and as JSON values.
+
+    Raises:
+        CalibrationError: the pictures, the target or the settings do not give a calibration.
+    """
+    _check_output(output, settings.start)
+    target = parse_target(settings.target)
+    intrinsics(settings.lens)
+    start = None if settings.start is None else read_rig(settings.start)
+    _check_settings(settings, start)
+    lists = {camera: find_pictures(place) for camera, place in settings.pictures.items()}
+    with _replacing(output) as partial:
+        found = detect_views(pair_pictures(lists), target, threads)
+        tell(found)
+        calibration = finish(partial, _calibrated(settings, found, target, start), found)
+        _check_sides(calibration.rig)
+        if settings.carry_to_n is not None:
+            write_rig(partial / "rig_carried.json", carried(calibration.rig, settings.carry_to_n))
+    verdicts = read_json(output / "report.json")["verdicts"]
+    text = calibration_text(calibration, target, verdicts)
+    return "\n".join([text, *_next(calibration, output, settings)]), summary(calibration)
+
+
+def carried(rig: Rig, n_water: float) -> Rig:
+    """The rig in other water, which says so."""
+    old = next(iter(rig.cameras.values())).n_water
+    return replace(
+        rig.in_water(n_water),
+        source=f"{rig.source}, carried from water of index {old:g} to {n_water:g}",
+    )
+
+
+def _check_settings(settings: PictureCalibration, start: Rig | None) -> None:
+    ports = {
+        "--port-distance": settings.port_distance_mm,
+        "--glass": settings.glass_mm,
+        "--glass-sigma": settings.glass_sigma_mm,
+        "--n-glass": settings.n_glass,
+        "--n-glass-sigma": settings.n_glass_sigma,
+        "--n-water": settings.n_water,
+        "--n-water-sigma": settings.n_water_sigma,
+        "--carry-to-n": settings.carry_to_n,
+        "--intrinsics": settings.known,
+    }
+    if not settings.water:
+        given = [name for name, value in ports.items() if value is not None]
+        if given:
+            raise CalibrationError(f"{', '.join(given)} need --water: pictures in air see no port")
+        return
+    if settings.known in ("held", "prior") and start is None:
+        raise CalibrationError(
+            f"--intrinsics {settings.known} needs --start, the rig.json of a calibration in air"
+        )
+    if settings.glass_mm is None:
+        thin = start is None or all(c.glass_thickness_m == 0.0 for c in start.cameras.values())
+        if thin:
+            raise CalibrationError(
+                "--water needs --glass, the thickness of the port in mm (0 for a thin film)"
+            )
+
+
+def _calibrated(
+    settings: PictureCalibration, found: Detections, target: Target, start: Rig | None
+) -> Calibration:
+    points, lens = target.points, settings.lens
+    cameras = _first(settings, found.sizes, start)
+    known = settings.known
+    if start is not None:
+        start = replace(_matching(start, found.sizes), cameras=cameras)
+        known = known or ("held" if start.covariance is None else "prior")
+    views = found.views
+    if target.is_ambiguous and len(cameras) > 1:
+        near = cameras if start is not None else first_cameras(views, points, cameras, lens)
+        views = tuple(same_numbering(near, views, points, target.symmetries))
+    if not settings.water:
+        return calibrate_in_air(views, points, found.sizes, lens, start)
+    known_to = {
+        "glass_thickness_m": _metres(settings.glass_sigma_mm),
+        "n_glass": settings.n_glass_sigma,
+        "n_water": settings.n_water_sigma,
+    }
+    sigmas = {
+        f"{name}.{parameter}": sigma
+        for name in cameras
+        for parameter, sigma in known_to.items()
+        if sigma is not None
+    }
+    if start is None or known is None:
+        return calibrate_in_water_alone(views, points, cameras, lens, sigmas)
+    return calibrate_through_ports(views, points, start, known, lens, sigmas)
+
+
+def _first(
+    settings: PictureCalibration, sizes: Mapping[str, Size], start: Rig | None
+) -> dict[str, FlatPortCamera]:
+    """Cameras of the start, or blank ones, in air or behind the port that the user names."""
+    if start is not None:
+        given = _matching(start, sizes).cameras
+        prepare = _behind_port if settings.water else _bare
+        return {name: prepare(camera, settings) for name, camera in given.items()}
+    if not settings.water:
+        bare = {"n_water": 1.0, "port_distance_m": 0.0, "glass_thickness_m": 0.0}
+        return {name: blank_camera(size, **bare) for name, size in sizes.items()}
+    port_m, thickness_m = _metres(settings.port_distance_mm), _metres(settings.glass_mm)
+    return {
+        name: blank_camera(
+            size,
+            n_water=_FRESH_WATER if settings.n_water is None else settings.n_water,
+            n_glass=_GLASS if settings.n_glass is None else settings.n_glass,
+            port_distance_m=_GUESSED_PORT_M if port_m is None else port_m,
+            glass_thickness_m=0.0 if thickness_m is None else thickness_m,
+        )
+        for name, size in sizes.items()
+    }
+
+
+def _metres(length_mm: float | None) -> float | None:
+    return None if length_mm is None else length_mm / 1e3
+
+
+def _bare(camera: FlatPortCamera, _: PictureCalibration) -> FlatPortCamera:
+    """A camera out of its housing."""
+    return replace(
+        camera, n_water=1.0, port_distance_m=0.0, glass_thickness_m=0.0, normal=(0.0, 0.0, 1.0)
+    )
+
+
+def _behind_port(camera: FlatPortCamera, settings: PictureCalibration) -> FlatPortCamera:
+    """A camera of the start behind the port and in the water that the user names."""
+    given = {
+        "glass_thickness_m": _metres(settings.glass_mm),
+        "n_glass": settings.n_glass,
+        "n_water": settings.n_water,
+        "port_distance_m": _metres(settings.port_distance_mm),
+    }
+    if settings.n_water is None and camera.n_water == 1.0:
+        given["n_water"] = _FRESH_WATER
+    if settings.port_distance_mm is None and camera.port_distance_m == 0.0:
+        given["port_distance_m"] = _GUESSED_PORT_M
+    return camera.with_parameters({k: v for k, v in given.items() if v is not None})
+
+
+def _matching(start: Rig, sizes: Mapping[str, Size]) -> Rig:
+    """The cameras of a start that are calibrated, if its pictures have the same size."""
+    if not set(sizes) <= set(start.cameras):
+        raise CalibrationError(
+            f"the start has cameras {', '.join(start.cameras)}; pictures are of {', '.join(sizes)}"
+        )
+    for name, size in sizes.items():
+        camera = start.cameras[name]
+        if (camera.width_px, camera.height_px) != size:
+            raise CalibrationError(
+                f"pictures of {name} have {size[0]} x {size[1]} px, the start's camera "
+                f"{camera.width_px} x {camera.height_px}"
+            )
+    names = list(sizes)
+    to_first = start.cam_from_rig[names[0]].inv()
+    return replace(
+        start,
+        cameras={name: start.cameras[name] for name in names},
+        cam_from_rig={name: start.cam_from_rig[name] * to_first for name in names},
+        body_from_rig=start.body_from_cam(names[0]),
+    )
+
+
+def _next(calibration: Calibration, output: Path, settings: PictureCalibration) -> list[str]:
+    """Where the results are, and what to do with them."""
+    rig = shlex.quote(str(output / "rig.json"))
+    lines = [f"rig in {output / 'rig.json'}; read {output / 'report.html'}"]
+    if settings.carry_to_n is not None:
+        lines.append(f"in water of index {settings.carry_to_n:g}: {output / 'rig_carried.json'}")
+    if settings.water:
+        lines.append(f"next: alice-survey camera uncertainty {rig}")
+    else:
+        places = "--pictures P" if ONE_CAMERA in calibration.rig.cameras else "--left L --right R"
+        lines.append(
+            f"next, behind ports, with pictures under water: alice-survey calibrate {places} "
+            f"--target T --water --glass MM --start {rig} -o DIR"
+        )
+    return lines
+
+
+def _check_sides(rig: Rig) -> None:
+    """Tell when the pictures of the two cameras seem to be swapped."""
+    if set(rig.cameras) != {"left", "right"}:
+        return
+    x, y, z = (1e3 * rig.cam_from_rig["right"].inv().translation).tolist()
+    if x < -max(abs(y), abs(z)):
+        warn(
+            f"the right camera stands {-x:.0f} mm to the left of the left one: swap --left and "
+            "--right, unless the cameras hang upside down"
+        )
+
+
+def _check_output(output: Path, start: Path | None) -> None:
+    """Refuse what is no folder of this command, before hours of work and not after.
+
+    Raises:
+        WorkspaceError: it cannot be written or would take something with it.
+    """
+    if not output.name or output.name == "..":
+        raise WorkspaceError(f"-o {output}: name a folder of its own, such as -o air")
+    if not output.exists():
+        return
+    if not output.is_dir():
+        raise WorkspaceError(f"{output} is a file: name a folder with -o")
+    others = sorted(path.name for path in output.iterdir() if path.name not in _WRITTEN)
+    if others:
+        raise WorkspaceError(
+            f"{output} holds other files (such as {others[0]}): choose another folder with -o"
+        )
+    if start is not None and start.resolve().parent == output.resolve():
+        raise WorkspaceError(
+            f"{output} holds the rig of --start, which would be replaced: choose another folder "
+            "with -o"
+        )
+
+
+@contextlib.contextmanager
+def _replacing(output: Path) -> Iterator[Path]:
+    """A folder to write to that takes the place of `output` when all went well."""
+    partial = output.with_name(f"{output.name}.partial")
+    if partial.exists():
+        shutil.rmtree(partial)
+    partial.mkdir(parents=True)
+    try:
+        yield partial
+        if output.exists():
+            shutil.rmtree(output)
+        partial.rename(output)
+    finally:
+        if partial.exists():
+            shutil.rmtree(partial)

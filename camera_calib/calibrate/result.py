@@ -1,0 +1,82 @@
+"""What a calibration is made from and what comes out of it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.base.errors import CalibrationError
+from alice_survey.base.frames import Array
+from camera_calib.calibrate.freedom import HELD, Freedom
+from camera_calib.rig import Rig
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TargetView:
+    """Where the cameras saw the points of a target at one moment."""
+
+    name: str
+    pixels: Mapping[str, Array]
+    """By camera: (N, 2) pixels of the target's N points; NaN rows were not found. A camera that
+    found nothing is absent."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rejection:
+    """A picture, or points of it, that took no part, and why."""
+
+    view: str
+    camera: str
+    points: int
+    """How many; 0 when the whole picture is meant."""
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Calibration:
+    """A calibrated rig, and all that is needed to judge it."""
+
+    rig: Rig
+    """With its covariance."""
+    target_points: Array
+    """(N, 3) in the target's frame, metres."""
+    views: tuple[TargetView, ...]
+    """(V) those adjusted."""
+    rig_from_target: RigidTransform
+    """(V,) poses of the target; the rig's frame is the reference camera's."""
+    residuals_px: Array
+    """(V, cameras, N, 2) projected less measured, cameras in the rig's order; NaN where unseen."""
+    weights: Array
+    """(V, cameras, N) robust weights, 1 for a point that fits; NaN where unseen."""
+    noise_px: float
+    """Standard deviation of one coordinate of a measured point in all pictures, from the
+    residuals."""
+    rejections: tuple[Rejection, ...] = ()
+    warnings: tuple[str, ...] = ()
+    """What the views do not constrain, one line each."""
+    freedom: Freedom = HELD
+    """What of the rig was adjusted, and the prior."""
+    rejected: Array | None = None
+    """(V, cameras, N, 2) measured pixels that took no part; NaN elsewhere."""
+    blur: Array | None = None
+    """(V, cameras) noise of each picture over `noise_px`; None for alike ones."""
+
+    def __post_init__(self) -> None:
+        shape = (len(self.views), len(self.rig.cameras), len(self.target_points), 2)
+        if self.residuals_px.shape != shape or self.weights.shape != shape[:3]:
+            raise CalibrationError(
+                f"calibration: residuals {self.residuals_px.shape}, weights {self.weights.shape}; "
+                f"{shape} wanted"
+            )
+
+    @property
+    def sigma_px(self) -> Array:
+        """(V, cameras) standard deviation of one coordinate in each picture."""
+        alike: Array = np.full(self.residuals_px.shape[:2], self.noise_px)
+        return alike if self.blur is None else alike * self.blur
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square length of the residuals over all pictures."""
+        return float(np.sqrt(np.nanmean((self.residuals_px**2).sum(axis=-1))))

@@ -1,0 +1,345 @@
+"""Calibrate cameras and ports from views of a target: in air, through the ports, or both.
+
+Every mode ends in one adjustment of all cameras over all views (`adjust`); modes differ in what is
+free and where the first values come from. Points that the robust solution misses by a clear
+multiple of the noise are then left out, and named.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.base.errors import CalibrationError
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
+from camera_calib.calibrate.adjust import adjust, stack_views
+from camera_calib.calibrate.advice import advice
+from camera_calib.calibrate.freedom import (
+    PINHOLE,
+    PORT,
+    Freedom,
+    Prior,
+    intrinsics,
+    of_cameras,
+    pose_names,
+)
+from camera_calib.calibrate.observability import unobservable
+from camera_calib.calibrate.outliers import (
+    FEWEST_VIEWS,
+    STEPS,
+    adjust_without_outliers,
+    check_enough,
+    rejected,
+    whole_picture,
+)
+from camera_calib.calibrate.result import Calibration, Rejection, TargetView
+from camera_calib.calibrate.start import first_cam_from_rig, first_focal_px, locate_all, spans
+from camera_calib.flat_port import FlatPortCamera
+from camera_calib.rig import Rig
+
+Intrinsics = Literal["held", "prior", "free"]
+
+_ROUGHLY = 0.1
+"""Sigmas to which values are found that only serve as a start."""
+_LOOSEST_FOCAL = 0.1
+"""Largest sigma of a focal length, as a share of it, that still is a calibration."""
+
+
+def calibrate(
+    views: Sequence[TargetView],
+    points: Array,
+    start: Rig,
+    freedom: Freedom,
+    *,
+    source: str = "calibration",
+) -> Calibration:
+    """Adjust a rig over all views, from a rig near the truth.
+
+    Args:
+        views: where the cameras saw the target.
+        points: (N, 3) the target's points in its own frame, metres.
+        start: near the truth, such as the design; what is not adjusted is taken from it.
+        freedom: what is adjusted.
+        source: how, for the rig's `source`.
+
+    Raises:
+        CalibrationError: too few views, or they do not determine what is free.
+    """
+    usable, rejections = _usable(views, points)
+    _check_served(usable, start)
+    found = locate_all(start, usable, points)
+    for view, pose in zip(usable, found, strict=True):
+        if pose is None:
+            reason = "no pose of the target was found"
+            rejections += [whole_picture(view.name, camera, reason) for camera in view.pixels]
+    alive = [i for i, pose in enumerate(found) if pose is not None]
+    usable = [usable[i] for i in alive]
+    check_enough(len(usable), len(views))
+    pixels = stack_views(usable, start, len(points))
+    poses = RigidTransform.concatenate([pose for pose in found if pose is not None])
+    adjusted, kept, alive_views = adjust_without_outliers(
+        usable, pixels, points, start, poses, freedom
+    )
+    rejections += rejected(usable, pixels, kept, start, adjusted)
+    _check_focal(adjusted.rig, adjusted.rig_from_target)
+    used = np.where(kept[..., None], pixels, np.nan)[alive_views]
+    left_out = np.where(kept[..., None], np.nan, pixels)[alive_views]
+    names = list(start.cameras)
+    final = tuple(
+        TargetView(
+            name=usable[v].name,
+            pixels={
+                name: used[i, c] for c, name in enumerate(names) if np.isfinite(used[i, c]).any()
+            },
+        )
+        for i, v in enumerate(np.flatnonzero(alive_views))
+    )
+    rig = replace(adjusted.rig, source=f"{source} from {len(final)} views")
+    return Calibration(
+        rig=rig,
+        target_points=points,
+        views=final,
+        rig_from_target=adjusted.rig_from_target,
+        residuals_px=adjusted.residuals_px,
+        weights=adjusted.weights,
+        noise_px=adjusted.noise_px,
+        rejections=tuple(rejections),
+        warnings=advice(
+            rig,
+            used,
+            adjusted.residuals_px,
+            (view.name for view in final),
+            adjusted.rig_from_target,
+            adjusted.noise_px,
+        ),
+        freedom=freedom,
+        rejected=left_out,
+        blur=adjusted.blur,
+    )
+
+
+def recalibrate(calibration: Calibration, views: Sequence[TargetView]) -> Calibration:
+    """The same calibration from other views, such as some of its own."""
+    freedom, source = calibration.freedom, "calibration"
+    return calibrate(views, calibration.target_points, calibration.rig, freedom, source=source)
+
+
+@progress.step("find cameras")
+def calibrate_in_air(
+    views: Sequence[TargetView],
+    points: Array,
+    sizes: Mapping[str, tuple[int, int]],
+    lens: str = "opencv5",
+    start: Rig | None = None,
+) -> Calibration:
+    """Intrinsics of each camera alone, then of all with the rig, in air, from nothing.
+
+    Args:
+        views: where the cameras saw the target.
+        points: (N, 3) of the target, metres.
+        sizes: width and height of each camera's pictures; the first is the reference.
+        lens: name of a lens model (`freedom.LENSES`).
+        start: a rig near the truth, where one is known.
+
+    Raises:
+        CalibrationError: too few views, or they do not determine the cameras.
+    """
+    names = intrinsics(lens)
+    if start is None:
+        blank = {
+            name: blank_camera(size, n_water=1.0, port_distance_m=0.0, glass_thickness_m=0.0)
+            for name, size in sizes.items()
+        }
+        start = first_rig(views, points, blank, lens)
+    free = (*of_cameras(start, names), *pose_names(start))
+    return calibrate(views, points, start, Freedom(free=free), source="calibration in air")
+
+
+@progress.step("find cameras and ports")
+def calibrate_through_ports(
+    views: Sequence[TargetView],
+    points: Array,
+    start: Rig,
+    known: Intrinsics,
+    lens: str = "opencv5",
+    sigmas: Mapping[str, float] | None = None,
+) -> Calibration:
+    """Rig and housings in one adjustment: distance and normal of each port, pose of each camera.
+
+    Args:
+        views: where the cameras saw the target, under water.
+        points: (N, 3) of the target, metres.
+        start: cameras calibrated in air, or a design; with glass, water and a guess of the ports.
+        known: whether the cameras' intrinsics are held at the start's, taken with their
+            covariance as a prior, or found anew.
+        lens: name of the lens model that is found anew.
+        sigmas: more parameters that are known about as the start has them, such as
+            `left.glass_thickness_m`, with their standard deviations.
+
+    Raises:
+        CalibrationError: too few views, they do not determine what is free, or the start has no
+            covariance to serve as a prior.
+    """
+    extra = Prior.around(start, sigmas or {})
+    free = [*of_cameras(start, PORT), *pose_names(start)]
+    if known == "free":
+        free += of_cameras(start, intrinsics(lens))
+    if known == "prior":
+        extra = Prior.of_rig(start, of_cameras(start, intrinsics("full"))).and_also(extra)
+    freedom = Freedom(
+        free=tuple(name for name in free if name not in extra.parameters), prior=extra
+    )
+    source = f"calibration through the ports, intrinsics {known},"
+    return calibrate(views, points, start, freedom, source=source)
+
+
+def calibrate_in_water_alone(
+    views: Sequence[TargetView],
+    points: Array,
+    cameras: Mapping[str, FlatPortCamera],
+    lens: str = "opencv5",
+    sigmas: Mapping[str, float] | None = None,
+) -> Calibration:
+    """Rig, housings and intrinsics from views under water, where nothing else exists.
+
+    Args:
+        views: where the cameras saw the target, under water.
+        points: (N, 3) of the target, metres.
+        cameras: blank ones (`blank_camera`) with glass, water and a guess of the port distance.
+        lens: name of a lens model.
+        sigmas: as of `calibrate_through_ports`.
+
+    Raises:
+        CalibrationError: too few views, or they do not determine what is free.
+    """
+    start = first_rig(views, points, cameras, lens)
+    found = calibrate_through_ports(views, points, start, "free", lens, sigmas)
+    return replace(found, warnings=(*found.warnings, *unobservable(found)))
+
+
+def blank_camera(
+    size: tuple[int, int],
+    *,
+    n_water: float,
+    port_distance_m: float,
+    glass_thickness_m: float,
+    n_glass: float = 1.52,
+) -> FlatPortCamera:
+    """A camera of which only its port and the size of its pictures are known."""
+    width, height = size
+    return FlatPortCamera(
+        width_px=width,
+        height_px=height,
+        fx_px=float(width),
+        fy_px=float(width),
+        cx_px=width / 2.0,
+        cy_px=height / 2.0,
+        port_distance_m=port_distance_m,
+        glass_thickness_m=glass_thickness_m,
+        n_glass=n_glass,
+        n_water=n_water,
+    )
+
+
+def first_rig(
+    views: Sequence[TargetView], points: Array, blank: Mapping[str, FlatPortCamera], lens: str
+) -> Rig:
+    """A rig near the truth from nothing but views: each camera alone, then how they stand.
+
+    Raises:
+        CalibrationError: a camera has too few views, or no view joins it to the others.
+    """
+    cameras = first_cameras(views, points, blank, lens)
+    usable, _ = _usable(views, points)
+    return Rig(
+        cameras=cameras,
+        cam_from_rig=first_cam_from_rig(cameras, usable, points),
+        body_from_rig=RigidTransform.identity(),
+        source="first values",
+    )
+
+
+def first_cameras(
+    views: Sequence[TargetView], points: Array, blank: Mapping[str, FlatPortCamera], lens: str
+) -> dict[str, FlatPortCamera]:
+    """Each camera near the truth from its own views, its port held.
+
+    Raises:
+        CalibrationError: a camera has too few views.
+    """
+    usable, _ = _usable(views, points)
+    for name in blank:
+        count = sum(name in view.pixels for view in usable)
+        if count < FEWEST_VIEWS:
+            raise CalibrationError(
+                f"{count} views of the target from {name}; at least {FEWEST_VIEWS} are "
+                "needed: take more, nearer and at more angles"
+            )
+    return {name: _alone(name, camera, usable, points, lens) for name, camera in blank.items()}
+
+
+def _alone(
+    name: str, blank: FlatPortCamera, views: Sequence[TargetView], points: Array, lens: str
+) -> FlatPortCamera:
+    """One camera's intrinsics, its port held: first its focal length and k1, then all."""
+    mine = [
+        TargetView(name=v.name, pixels={name: v.pixels[name]}) for v in views if name in v.pixels
+    ]
+    size = (blank.width_px, blank.height_px)
+    focal_px = first_focal_px([v.pixels[name] for v in mine], points, size) / blank.n_water
+    rig = Rig(
+        cameras={name: replace(blank, fx_px=focal_px, fy_px=focal_px)},
+        cam_from_rig={name: RigidTransform.identity()},
+        body_from_rig=RigidTransform.identity(),
+        source="first values",
+    )
+    wanted = intrinsics(lens)
+    for fields in (PINHOLE, [*PINHOLE, "k1"], wanted):
+        found = zip(mine, locate_all(rig, mine, points), strict=True)
+        located = [(view, pose) for view, pose in found if pose is not None]
+        poses = RigidTransform.concatenate([pose for _, pose in located])
+        freedom = Freedom(free=of_cameras(rig, [f for f in fields if f in wanted]))
+        rig = adjust(
+            [v for v, _ in located], points, rig, poses, freedom, _ROUGHLY, at_most=STEPS
+        ).rig
+    return rig.cameras[name]
+
+
+def _usable(views: Sequence[TargetView], points: Array) -> tuple[list[TargetView], list[Rejection]]:
+    """Views without the pictures that show too little of the target for a pose."""
+    usable, rejections = [], []
+    for view in views:
+        enough = {name: seen for name, seen in view.pixels.items() if spans(seen, points)}
+        rejections += [
+            whole_picture(view.name, name, "shows too little of the target for a pose")
+            for name in view.pixels
+            if name not in enough
+        ]
+        if enough:
+            usable.append(replace(view, pixels=enough))
+    return usable, rejections
+
+
+def _check_served(views: Sequence[TargetView], rig: Rig) -> None:
+    for name in rig.cameras:
+        if views and not any(name in view.pixels for view in views):
+            raise CalibrationError(f"no view shows the target to the camera {name}")
+
+
+def _check_focal(rig: Rig, poses: RigidTransform) -> None:
+    """Refuse what views that face the same way give: a focal length of any size."""
+    for name, sigma in rig.sigmas.items():
+        camera, field = name.split(".")
+        if field not in ("fx_px", "fy_px"):
+            continue
+        share = sigma / rig.cameras[camera].parameter(field)
+        if share > _LOOSEST_FOCAL:
+            normals = poses.rotation.apply([0.0, 0.0, 1.0]).reshape(-1, 3)
+            widest = np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0)))
+            raise CalibrationError(
+                f"{name} is known to {share:.0%} only: the {len(normals)} poses of the target "
+                f"differ by {widest:.1f} deg at most: tilt it by 20 to 40 deg about both axes"
+            )

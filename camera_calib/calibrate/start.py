@@ -1,0 +1,243 @@
+"""First values of a calibration: poses of the target, focal lengths, how cameras stand.
+
+Poses come from the closed form for planar targets (T. Collins, A. Bartoli 2014, "Infinitesimal
+plane-based pose estimation", in OpenCV), with every pixel's exact ray in water in place of a
+pinhole's, and are then refined through the ports.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.base.errors import CalibrationError
+from alice_survey.base.frames import Array
+from camera_calib.calibrate.adjust import adjust
+from camera_calib.calibrate.freedom import HELD
+from camera_calib.calibrate.result import TargetView
+from camera_calib.flat_port import FlatPortCamera
+from camera_calib.rig import Rig
+
+FEWEST_POINTS = 6
+"""That give a pose: six coordinates and some to spare."""
+_THINNEST = 0.02
+"""Least width over length of the seen part of a target: points in one row give no pose."""
+_CLEAR = 2.0
+"""A second pose that misses this many times more than the first is not looked at."""
+_ROUGHLY = 0.3
+"""Sigmas to which poses are found that only serve as a start."""
+_STEPS = 30
+_FOCALS = 0.5 * 1.25 ** np.arange(14)
+"""Focal lengths that are tried, in widths of the picture: 0.5 to 9 (90 to 6 degrees)."""
+
+
+def locate(rig: Rig, view: TargetView, points: Array) -> RigidTransform:
+    """The pose `rig_from_target` of one view, with the rig held.
+
+    Args:
+        rig: calibrated.
+        view: what its cameras saw.
+        points: (N, 3) of the target, metres.
+
+    Raises:
+        CalibrationError: no camera sees enough of the target.
+    """
+    found = locate_all(rig, [view], points, settled=1e-3)[0]
+    if found is None:
+        raise CalibrationError(
+            f"view {view.name}: no pose; {FEWEST_POINTS} points of the target that are not in one "
+            "row must be seen by one camera"
+        )
+    return found
+
+
+def locate_all(
+    rig: Rig, views: Sequence[TargetView], points: Array, settled: float = _ROUGHLY
+) -> list[RigidTransform | None]:
+    """Poses `rig_from_target` of views, with the rig held; None where too little is seen.
+
+    Args:
+        rig: near the truth.
+        views: what its cameras saw.
+        points: (N, 3) of the target, metres.
+        settled: how well, in sigmas of the poses.
+    """
+    guesses = [_guesses(rig, view, points) for view in views]
+    found: list[RigidTransform | None] = [None] * len(views)
+    misses = np.full(len(views), np.inf)
+    for attempt in range(2):
+        at = [v for v, guess in enumerate(guesses) if len(guess) > attempt]
+        if not at:
+            continue
+        start = RigidTransform.concatenate([guesses[v][attempt] for v in at])
+        poses, lengths = _refined(rig, [views[v] for v in at], points, start, settled)
+        for i, v in enumerate(at):
+            if lengths[i] < misses[v]:
+                found[v], misses[v] = poses[i], lengths[i]
+    return found
+
+
+def _refined(
+    rig: Rig,
+    views: Sequence[TargetView],
+    points: Array,
+    start: RigidTransform,
+    settled: float,
+) -> tuple[RigidTransform, Array]:
+    """Poses of least residuals, and the mean robust length of each view's residuals."""
+    adjusted = adjust(views, points, rig, start, HELD, settled, at_most=_STEPS)
+    lengths = np.sqrt((adjusted.residuals_px**2).sum(axis=-1)) * np.sqrt(adjusted.weights)
+    return adjusted.rig_from_target, np.nanmean(lengths.reshape(len(views), -1), axis=1)
+
+
+def _guesses(rig: Rig, view: TargetView, points: Array) -> list[RigidTransform]:
+    """One or two poses of the target from the camera that sees most of it, the better first."""
+    counts = {
+        name: int(np.isfinite(seen).all(axis=1).sum())
+        for name, seen in view.pixels.items()
+        if spans(seen, points)
+    }
+    if not counts:
+        return []
+    best = max(counts, key=lambda name: counts[name])
+    rig_from_cam = rig.cam_from_rig[best].inv()
+    return [rig_from_cam * pose for pose in _poses(rig.cameras[best], view.pixels[best], points)]
+
+
+def spans(pixels: Array, points: Array) -> bool:
+    """Whether the seen points, (N, 2) pixels of (N, 3) points, are enough for a pose."""
+    seen = points[np.isfinite(pixels).all(axis=1)]
+    if len(seen) < FEWEST_POINTS:
+        return False
+    width = np.linalg.svd(seen - seen.mean(axis=0), compute_uv=False)
+    return bool(width[1] > _THINNEST * width[0])
+
+
+def _poses(camera: FlatPortCamera, pixels: Array, points: Array) -> list[RigidTransform]:
+    """Poses `cam_from_target`: rays are taken to start at the point that is nearest to all."""
+    origins, directions = camera.unproject(pixels)
+    known = np.asarray(np.isfinite(np.hstack([directions, pixels])).all(axis=1))
+    if not spans(np.where(known[:, None], pixels, np.nan), points):
+        return []
+    origins, directions = origins[known], directions[known]
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    matrix = across.sum(axis=0) + 1e-9 * len(across) * np.eye(3)
+    centre = np.linalg.solve(matrix, (across @ origins[..., None]).sum(axis=0)[:, 0])
+    return _pinhole_poses(directions[:, :2] / directions[:, 2:], points[known], centre)
+
+
+def _pinhole_poses(tangents: Array, points: Array, centre: Array) -> list[RigidTransform]:
+    planar = float(np.ptp(points[:, 2])) == 0.0
+    flag = cv2.SOLVEPNP_IPPE if planar else cv2.SOLVEPNP_SQPNP
+    try:
+        _, turns, shifts, misses = cv2.solvePnPGeneric(
+            points, np.ascontiguousarray(tangents), np.eye(3), None, flags=flag
+        )
+    except cv2.error:
+        return []
+    poses: list[RigidTransform] = []
+    for turn, shift, miss in zip(turns, shifts, np.ravel(misses), strict=True):
+        clear = poses and miss > _CLEAR * float(np.ravel(misses)[0])
+        if not clear and np.all(np.isfinite(turn)) and np.all(np.isfinite(shift)):
+            place = shift.ravel() + centre
+            poses.append(RigidTransform.from_components(place, Rotation.from_rotvec(turn.ravel())))
+    return poses
+
+
+def first_focal_px(pixels: Sequence[Array], points: Array, size: tuple[int, int]) -> float:
+    """A focal length, within a quarter, that explains views of a target, from nothing.
+
+    The principal point is taken in the middle and the lens without distortion. Of some focal
+    lengths the one is returned for which poses of the target miss least.
+
+    Args:
+        pixels: (N, 2) of each view; NaN where not seen.
+        points: (N, 3) of the target, metres.
+        size: width and height of the pictures.
+
+    Raises:
+        CalibrationError: no view shows enough of the target.
+    """
+    usable = [seen for seen in pixels if spans(seen, points)]
+    if not usable:
+        raise CalibrationError("no view shows enough of the target to start from")
+    middle = np.array(size) / 2.0
+    misses = [
+        np.mean([_homography_miss(seen - middle, points, share * size[0]) for seen in usable])
+        for share in _FOCALS
+    ]
+    return float(_FOCALS[int(np.argmin(misses))] * size[0])
+
+
+def _homography_miss(centred: Array, points: Array, focal_px: float) -> float:
+    """Mean squared miss, px^2, of the best pose under one focal length."""
+    known = np.isfinite(centred).all(axis=1)
+    tangents = centred[known] / focal_px
+    misses = [np.inf]
+    for pose in _pinhole_poses(tangents, points[known], np.zeros(3)):
+        cam = pose.apply(points[known])
+        miss = cam[:, :2] / cam[:, 2:] - tangents
+        misses.append(float((miss**2).sum(axis=1).mean()) * focal_px**2)
+    return min(misses)
+
+
+def first_cam_from_rig(
+    cameras: Mapping[str, FlatPortCamera], views: Sequence[TargetView], points: Array
+) -> dict[str, RigidTransform]:
+    """How cameras stand to the first of them, from the target's poses in each.
+
+    Args:
+        cameras: near the truth.
+        views: what they saw.
+        points: (N, 3) of the target, metres.
+
+    Raises:
+        CalibrationError: no chain of shared views joins a camera to the first.
+    """
+    poses = {name: poses_alone(name, camera, views, points) for name, camera in cameras.items()}
+    names = list(cameras)
+    found = {names[0]: RigidTransform.identity()}
+    while len(found) < len(names):
+        shared = {
+            (known, new): set(poses[known]) & set(poses[new])
+            for known in found
+            for new in names
+            if new not in found
+        }
+        (known, new), both = max(shared.items(), key=lambda item: len(item[1]))
+        if not both:
+            raise CalibrationError(
+                f"no view shows the target to both {known} and {new}: take some that do"
+            )
+        between = RigidTransform.concatenate(
+            [poses[new][v] * poses[known][v].inv() for v in sorted(both)]
+        )
+        found[new] = _middle(between) * found[known]
+    return {name: found[name] for name in names}
+
+
+def poses_alone(
+    name: str, camera: FlatPortCamera, views: Sequence[TargetView], points: Array
+) -> dict[int, RigidTransform]:
+    """Poses of the target in the frame of one camera, by the number of the view."""
+    alone = Rig(
+        cameras={name: camera},
+        cam_from_rig={name: RigidTransform.identity()},
+        body_from_rig=RigidTransform.identity(),
+        source="one camera",
+    )
+    at = [v for v, view in enumerate(views) if name in view.pixels]
+    seen = [replace(views[v], pixels={name: views[v].pixels[name]}) for v in at]
+    found = locate_all(alone, seen, points)
+    return {v: pose for v, pose in zip(at, found, strict=True) if pose is not None}
+
+
+def _middle(poses: RigidTransform) -> RigidTransform:
+    """The pose that differs least from the others, turn and place together."""
+    turns = poses.rotation.as_matrix()
+    apart = np.arccos(np.clip((np.einsum("aij,bij->ab", turns, turns) - 1.0) / 2.0, -1.0, 1.0))
+    places = np.linalg.norm(poses.translation[:, None] - poses.translation, axis=-1)
+    scale = np.median(np.linalg.norm(poses.translation, axis=1)) + 1e-12
+    return poses[int(np.argmin((apart + places / scale).sum(axis=1)))]

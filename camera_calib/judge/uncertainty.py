@@ -1,0 +1,344 @@
+"""What the covariance of a calibrated rig means for pixels, points and lengths.
+
+Everything here is first order: a parameter error d moves a pixel by J d and has the covariance S,
+so the pixel's is J S J^T. The slopes J are the analytic ones of `FlatPortCamera`.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.base.errors import CalibrationError
+from alice_survey.base.frames import Array
+from camera_calib.calibrate.freedom import POSE
+from camera_calib.flat_port import PARAMETERS, FlatPortCamera, pose_jacobian
+from camera_calib.rig import Covariance, Rig
+
+_OVERLAP_GRID = 25
+"""Pixels a side of the reference frame at which the overlap of the cameras is looked for."""
+_EDGE_PX = 1e-6
+"""Beyond rounding: a point on the edge of a frame is in it."""
+
+
+def covariance_of(rig: Rig) -> Covariance:
+    """The rig's covariance.
+
+    Raises:
+        CalibrationError: it has none, or one of parameters that a rig does not have.
+    """
+    if rig.covariance is None:
+        raise CalibrationError(
+            f"the rig ({rig.source}) has no covariance, so nothing can be said of its uncertainty: "
+            "calibrate it"
+        )
+    for name in rig.covariance.parameters:
+        camera, _, field = name.rpartition(".")
+        known = camera in rig.cameras and (
+            field in PARAMETERS or (field in POSE and camera != rig.reference)
+        )
+        if not known:
+            raise CalibrationError(f"the rig's covariance has {name}, which the rig has not")
+    return rig.covariance
+
+
+def camera_slopes(rig: Rig, camera: str, points_cam: Array) -> tuple[Array, Array, Array]:
+    """Project points that are fixed to one camera, with slopes by the rig's parameters.
+
+    Args:
+        rig: with its covariance.
+        camera: which of its cameras.
+        points_cam: (N, 3) in that camera's frame, metres.
+
+    Returns:
+        Pixels (N, 2); slopes by the point (N, 2, 3); by the P parameters of the covariance
+        (N, 2, P), those of poses and of other cameras being 0. NaN where nothing is projected.
+    """
+    pixels, by_point, by_own = rig.cameras[camera].project_jacobian(points_cam)
+    names = covariance_of(rig).parameters
+    by_parameter = np.zeros((*pixels.shape, len(names)))
+    for column, name in enumerate(names):
+        owner, _, field = name.rpartition(".")
+        if owner == camera and field in PARAMETERS:
+            by_parameter[..., column] = by_own[..., PARAMETERS.index(field)]
+    return pixels, by_point, by_parameter
+
+
+def rig_slopes(rig: Rig, camera: str, points_rig: Array) -> tuple[Array, Array, Array]:
+    """As `camera_slopes`, for points (N, 3) fixed to the rig's frame: its pose counts too.
+
+    Rotations are small turns about the camera's axes, as in `freedom`.
+    """
+    pose = rig.cam_from_rig[camera]
+    pixels, by_point, by_parameter = camera_slopes(rig, camera, pose.apply(points_rig))
+    by_pose = pose_jacobian(by_point, pose.rotation.apply(points_rig))
+    for column, name in enumerate(covariance_of(rig).parameters):
+        owner, _, field = name.rpartition(".")
+        if owner == camera and field in POSE:
+            by_parameter[..., column] = by_pose[..., POSE.index(field)]
+    return pixels, by_point @ pose.rotation.as_matrix(), by_parameter
+
+
+def compensation(rig: Rig, camera: str, anchors_cam: Array) -> Array:
+    """How the pose that fits best follows each parameter's error, (6, P).
+
+    A rotation and a translation of the anchors, small, in the camera's frame, chosen so that their
+    projections move least in all. mrcal's reprojection uncertainty does the same with the boards.
+
+    Raises:
+        CalibrationError: the anchors do not hold a pose.
+    """
+    _, by_point, by_parameter = camera_slopes(rig, camera, anchors_cam)
+    seen = np.isfinite(by_parameter).all(axis=(1, 2)) & np.isfinite(by_point).all(axis=(1, 2))
+    by_pose = pose_jacobian(by_point, anchors_cam)[seen].reshape(-1, 6)
+    if len(by_pose) < 6 or np.linalg.matrix_rank(by_pose) < 6:
+        raise CalibrationError(
+            f"{camera}: {int(seen.sum())} points do not hold a pose; at least 3, not on one line, "
+            "are needed"
+        )
+    moved = by_parameter[seen].reshape(len(by_pose), -1)
+    return -taken_up(by_pose, moved)
+
+
+def taken_up(slopes: Array, moved: Array) -> Array:
+    """Unknowns (K, P), the least ones, whose slopes (M, K) come nearest to what moved (M, P)."""
+    inverse = np.linalg.pinv(slopes.T @ slopes, rcond=1e-14, hermitian=True)
+    found: Array = np.asarray(inverse @ (slopes.T @ moved), dtype=np.float64)
+    return found
+
+
+def frame_pixels(camera: FlatPortCamera, columns: int, rows: int) -> Array:
+    """Pixels over the whole frame, edges included, (rows, columns, 2)."""
+    x = np.linspace(0.0, camera.width_px, columns)
+    y = np.linspace(0.0, camera.height_px, rows)
+    return np.stack(np.meshgrid(x, y), axis=-1)
+
+
+def frame_points(camera: FlatPortCamera, ranges_m: tuple[float, ...], grid: int = 9) -> Array:
+    """Points over the frame at some distances, (N, 3) in the camera's frame."""
+    pixels = frame_pixels(camera, grid, grid).reshape(-1, 2)
+    points = np.concatenate([camera.at_depth(pixels, r) for r in ranges_m])
+    kept: Array = points[np.isfinite(points).all(axis=1)]
+    return kept
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ProjectionSigma:
+    """How uncertain a projection is, along its worst direction, px; shaped as the pixels."""
+
+    plain_px: Array
+    """Of a point fixed to the camera: what a rig that measures by itself suffers."""
+    compensated_px: Array
+    """Of a point fixed to what the camera sees, after the pose that fits best took what it can:
+    what pictures suffer whose poses are found from the pictures. mrcal reports this one."""
+
+
+def projection_sigma(
+    rig: Rig, camera: str, pixels: Array, range_m: float, compensating: Array
+) -> ProjectionSigma:
+    """Uncertainty of projection from the calibration alone.
+
+    Args:
+        rig: with its covariance.
+        camera: which camera.
+        pixels: (..., 2) where to look.
+        range_m: distance of the points from the entrance pupil along the axis.
+        compensating: (6, P) from `compensation`; its anchors are best all points of the target that
+            the camera saw.
+    """
+    matrix = covariance_of(rig).matrix
+    flat = pixels.reshape(-1, 2)
+    points = rig.cameras[camera].at_depth(flat, range_m)
+    _, by_point, plain = camera_slopes(rig, camera, points)
+    moved = plain + pose_jacobian(by_point, points) @ compensating
+    shape = pixels.shape[:-1]
+    return ProjectionSigma(
+        plain_px=_worst_sigma(plain, matrix).reshape(shape),
+        compensated_px=_worst_sigma(moved, matrix).reshape(shape),
+    )
+
+
+def _worst_sigma(slopes: Array, matrix: Array) -> Array:
+    """(N,) largest standard deviation in any direction, of (N, D, P) slopes; NaN rows stay."""
+    covariance = slopes @ matrix @ np.swapaxes(slopes, 1, 2)
+    known = np.isfinite(covariance).all(axis=(1, 2))
+    sigma = np.full(len(slopes), np.nan)
+    sigma[known] = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[known])[:, -1], 0.0))
+    return sigma
+
+
+def _triangulation(rig: Rig, points_rig: Array) -> tuple[Array, Array]:
+    """How triangulated points follow the parameters, (N, 3, P), and the pixels, (N, 3, 2C).
+
+    Pixels are held and the point with the least reprojection error is taken: with G the slopes by
+    the point, dp = -(G^T G)^-1 G^T J d. NaN where fewer than two cameras see a point.
+    """
+    by_points, by_parameters, seen = [], [], []
+    for camera, model in rig.cameras.items():
+        pixels, by_point, by_parameter = rig_slopes(rig, camera, points_rig)
+        inside = _in_frame(model, pixels)
+        by_points.append(np.where(inside[:, None, None], by_point, 0.0))
+        by_parameters.append(np.where(inside[:, None, None], by_parameter, 0.0))
+        seen.append(inside)
+    g, j = np.concatenate(by_points, axis=1), np.concatenate(by_parameters, axis=1)
+    known: NDArray[np.bool_] = np.asarray(np.stack(seen).sum(axis=0) >= 2)
+    gain = np.full((len(points_rig), 3, g.shape[1]), np.nan)
+    g_known = g[known]
+    transposed = np.swapaxes(g_known, 1, 2)
+    gain[known] = np.linalg.solve(transposed @ g_known, transposed)
+    return -gain @ j, gain
+
+
+def point_sigmas_m(rig: Rig, points_rig: Array) -> Array:
+    """Standard deviations of triangulated points by calibration alone, (N, 3) along the rig's axes.
+
+    NaN where fewer than two cameras have a point in their frames.
+    """
+    follow, _ = _triangulation(rig, points_rig)
+    variance = np.einsum("nap,pq,naq->na", follow, covariance_of(rig).matrix, follow)
+    sigmas: Array = np.sqrt(np.maximum(variance, 0.0))
+    return sigmas
+
+
+def shape_sigmas_m(rig: Rig, points_rig: Array) -> Array:
+    """As `point_sigmas_m`, after the rigid motion of all points that leaves least: their shape.
+
+    A survey's frame takes up the motion; what is left bends what is measured.
+    """
+    follow, _ = _triangulation(rig, points_rig)
+    known = np.isfinite(follow).all(axis=(1, 2))
+    shape = np.full(points_rig.shape, np.nan)
+    if known.sum() < 3:
+        return shape
+    x, y, z = (points_rig[known] - points_rig[known].mean(axis=0)).T
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    motion = np.stack(
+        [
+            np.stack([zero, z, -y, one, zero, zero], axis=1),
+            np.stack([-z, zero, x, zero, one, zero], axis=1),
+            np.stack([y, -x, zero, zero, zero, one], axis=1),
+        ],
+        axis=1,
+    ).reshape(-1, 6)
+    moved = follow[known].reshape(len(motion), -1)
+    left = (moved - motion @ taken_up(motion, moved)).reshape(-1, 3, moved.shape[1])
+    variance = np.einsum("nap,pq,naq->na", left, covariance_of(rig).matrix, left)
+    shape[known] = np.sqrt(np.maximum(variance, 0.0))
+    return shape
+
+
+def noise_sigmas_m(rig: Rig, points_rig: Array, noise_px: float) -> Array:
+    """Standard deviations (N, 3) of triangulated points by the noise of one pixel coordinate."""
+    _, gain = _triangulation(rig, points_rig)
+    sigmas: Array = noise_px * np.sqrt((gain**2).sum(axis=-1))
+    return sigmas
+
+
+def length_sigmas_m(rig: Rig, starts_rig: Array, ends_rig: Array) -> Array:
+    """Standard deviations (N,) of triangulated distances by calibration alone."""
+    along = ends_rig - starts_rig
+    along = along / np.linalg.norm(along, axis=1, keepdims=True)
+    follow = _triangulation(rig, ends_rig)[0] - _triangulation(rig, starts_rig)[0]
+    slopes = np.einsum("na,nap->np", along, follow)
+    variance = np.einsum("np,pq,nq->n", slopes, covariance_of(rig).matrix, slopes)
+    sigmas: Array = np.sqrt(np.maximum(variance, 0.0))
+    return sigmas
+
+
+def overlap_points(rig: Rig, range_m: float) -> Array:
+    """Points at one distance that at least two cameras have in their frames, (N, 3) in `rig`."""
+    reference = rig.cameras[rig.reference]
+    pixels = frame_pixels(reference, _OVERLAP_GRID, _OVERLAP_GRID).reshape(-1, 2)
+    points = rig.cam_from_rig[rig.reference].inv().apply(reference.at_depth(pixels, range_m))
+    kept: Array = points[_seen_twice(rig, points)]
+    return kept
+
+
+def _in_frame(camera: FlatPortCamera, pixels: Array) -> NDArray[np.bool_]:
+    x, y = pixels[:, 0], pixels[:, 1]
+    right, bottom = camera.width_px + _EDGE_PX, camera.height_px + _EDGE_PX
+    inside: NDArray[np.bool_] = (x >= -_EDGE_PX) & (x <= right) & (y >= -_EDGE_PX) & (y <= bottom)
+    return inside
+
+
+def _seen_twice(rig: Rig, points_rig: Array) -> NDArray[np.bool_]:
+    count = np.zeros(len(points_rig), dtype=int)
+    for camera, model in rig.cameras.items():
+        pixels = model.project(rig.cam_from_rig[camera].apply(points_rig))
+        count += _in_frame(model, pixels)
+    twice: NDArray[np.bool_] = count >= 2
+    return twice
+
+
+@dataclass(frozen=True, kw_only=True)
+class StereoSigma:
+    """What stereo suffers at one distance; NaN where no two cameras see the same."""
+
+    range_m: float
+    point_m: tuple[float, float, float]
+    """Right, down, forward: of a point in the middle of the overlap, by calibration alone."""
+    worst_point_m: float
+    """Forward, anywhere in the overlap, by calibration alone."""
+    worst_shape_m: float
+    """Forward, anywhere in the overlap, after the rigid motion that leaves least."""
+    noise_m: tuple[float, float, float]
+    """Of the same point as `point_m`, by the noise of its pixels alone."""
+    length_m: float
+    """A length across the overlap: 1 m, or what fits."""
+    length_sigma_m: float
+    """Of it, by calibration alone."""
+
+
+def stereo_sigma(rig: Rig, range_m: float, noise_px: float) -> StereoSigma:
+    """Uncertainty of triangulated points and lengths at one distance.
+
+    Args:
+        rig: with its covariance, two cameras or more.
+        range_m: from the reference camera's entrance pupil along its axis.
+        noise_px: standard deviation of one measured coordinate, for comparison.
+    """
+    nothing = (np.nan, np.nan, np.nan)
+    points = overlap_points(rig, range_m)
+    if len(points) < 2:
+        return StereoSigma(
+            range_m=range_m,
+            point_m=nothing,
+            worst_point_m=np.nan,
+            worst_shape_m=np.nan,
+            noise_m=nothing,
+            length_m=np.nan,
+            length_sigma_m=np.nan,
+        )
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    centre = points[np.argmin(np.linalg.norm(points - middle, axis=1))]
+    reach = min(centre[0] - points[:, 0].min(), points[:, 0].max() - centre[0])
+    half = min(0.5, 0.95 * float(reach)) * np.array([1.0, 0.0, 0.0])
+    at_centre, at_all = point_sigmas_m(rig, centre[None])[0], point_sigmas_m(rig, points)
+    noise = noise_sigmas_m(rig, centre[None], noise_px)[0]
+    length = length_sigmas_m(rig, (centre - half)[None], (centre + half)[None])
+    return StereoSigma(
+        range_m=range_m,
+        point_m=(float(at_centre[0]), float(at_centre[1]), float(at_centre[2])),
+        worst_point_m=float(np.nanmax(at_all[:, 2])),
+        worst_shape_m=float(np.nanmax(shape_sigmas_m(rig, points)[:, 2])),
+        noise_m=(float(noise[0]), float(noise[1]), float(noise[2])),
+        length_m=2 * float(half[0]),
+        length_sigma_m=float(length[0]),
+    )
+
+
+def baseline_sigma_m(rig: Rig, camera: str) -> float:
+    """Standard deviation of a camera's distance from the reference camera.
+
+    The distance is the length of the translation of `cam_from_rig`, so rotations do not count.
+    """
+    covariance = covariance_of(rig)
+    translation = rig.cam_from_rig[camera].translation
+    along = translation / np.linalg.norm(translation)
+    slopes = np.zeros(len(covariance.parameters))
+    for column, name in enumerate(covariance.parameters):
+        owner, _, field = name.rpartition(".")
+        if owner == camera and field in POSE[3:]:
+            slopes[column] = along[POSE[3:].index(field)]
+    return math.sqrt(max(float(slopes @ covariance.matrix @ slopes), 0.0))

@@ -1,0 +1,400 @@
+"""Tests of a calibration that its own residuals cannot fake.
+
+- Held-out views: pictures that took no part, posed in the rig; their error against what noise and
+  the rig's covariance predict.
+- Halves: two calibrations from disjoint views, and how far their projections lie apart (mrcal's
+  cross-validation), against what their covariances predict.
+- Lengths: distances on the target, from triangulated points.
+- Homographies: a flat target through a perfect camera is a plane seen by a pinhole; what is left of
+  a homography per picture tells lens and port errors without any truth.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+from scipy.spatial.distance import cdist
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.base.errors import CalibrationError, warn
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
+from camera_calib.calibrate.freedom import NO_PRIOR, Prior
+from camera_calib.calibrate.result import Calibration, TargetView
+from camera_calib.flat_port import FlatPortCamera, pose_jacobian
+from camera_calib.judge.fit_quality import rms_length_px, within_gate
+from camera_calib.judge.uncertainty import (
+    camera_slopes,
+    compensation,
+    covariance_of,
+    rig_slopes,
+    taken_up,
+)
+from camera_calib.rig import Rig
+from camera_calib.triangulate import triangulate
+
+Calibrate = Callable[[Sequence[TargetView]], Calibration]
+Locate = Callable[[Rig, TargetView, Array], RigidTransform]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HeldOut:
+    """Views that took no part in a calibration, and two calibrations from halves of the views."""
+
+    used: Calibration
+    """Without the held-out views."""
+    views: tuple[TargetView, ...]
+    """(H) held out."""
+    rig_from_target: RigidTransform
+    """(H,) their poses, found in the rig of `used`."""
+    residuals_px: Array
+    """(H, cameras, N, 2) projected less measured."""
+    halves: tuple[Rig, Rig] | None
+    """Calibrated from every other view each; None where a half did not suffice."""
+
+
+@progress.step("hold views out")
+def hold_out(
+    views: Sequence[TargetView], calibrate: Calibrate, locate: Locate, every: int = 5
+) -> HeldOut | None:
+    """Calibrate without every n-th view and pose those; calibrate from either half of the views.
+
+    Args:
+        views: those that the calibration kept.
+        calibrate: the calibration to be tested.
+        locate: finds `rig_from_target` of one view in a rig, from the target's points.
+        every: one view in so many is held out.
+
+    Returns:
+        None, with a warning, where too few views are left to calibrate from.
+    """
+    # The middle of each run, so that first and last views, often the odd ones, are used.
+    held = tuple(view for i, view in enumerate(views) if i % every == every // 2)
+    rest = [view for i, view in enumerate(views) if i % every != every // 2]
+    try:
+        used = calibrate(rest)
+    except CalibrationError as error:
+        warn(f"no hold-out test: {len(rest)} of {len(views)} views do not calibrate: {error}")
+        return None
+    placed = []
+    for view in held:
+        try:
+            placed.append((view, locate(used.rig, view, used.target_points)))
+        except CalibrationError as error:
+            warn(f"hold-out test: view {view.name} is left out: {error}")
+    if not placed:
+        warn(f"no hold-out test: none of {len(held)} held-out views could be posed")
+        return None
+    try:
+        halves = (calibrate(views[::2]).rig, calibrate(views[1::2]).rig)
+    except CalibrationError as error:
+        warn(f"no test by halves: half of {len(views)} views does not calibrate: {error}")
+        halves = None
+    return HeldOut(
+        used=used,
+        views=tuple(view for view, _ in placed),
+        rig_from_target=RigidTransform.concatenate([pose for _, pose in placed]),
+        residuals_px=np.stack(
+            [view_residuals(used.rig, view, used.target_points, pose) for view, pose in placed]
+        ),
+        halves=halves,
+    )
+
+
+def view_residuals(
+    rig: Rig, view: TargetView, target_points: Array, rig_from_target: RigidTransform
+) -> Array:
+    """Projected less measured, (cameras, N, 2); NaN where unseen."""
+    points_rig = rig_from_target.apply(target_points)
+    residuals = np.full((len(rig.cameras), len(target_points), 2), np.nan)
+    for c, (camera, model) in enumerate(rig.cameras.items()):
+        if camera in view.pixels:
+            points_cam = rig.cam_from_rig[camera].apply(points_rig)
+            residuals[c] = model.project(points_cam) - view.pixels[camera]
+    return residuals
+
+
+@dataclass(frozen=True, kw_only=True)
+class HoldOutScore:
+    """Held-out views against used ones, outliers set aside. Lengths of residuals."""
+
+    views: int
+    points: int
+    rms_px: float
+    expected_px: float
+    """From the noise, and from the rig's covariance as far as a pose cannot take it up."""
+    used_rms_px: float
+    outliers: int
+
+    def to_json(self) -> dict[str, Any]:
+        """JSON values."""
+        return {
+            "views": self.views,
+            "points": self.points,
+            "rms_px": round(self.rms_px, 5),
+            "expected_px": round(self.expected_px, 5),
+            "used_rms_px": round(self.used_rms_px, 5),
+            "outliers": self.outliers,
+        }
+
+
+def score_hold_out(held: HeldOut) -> HoldOutScore:
+    """Compare held-out residuals with what the calibration without them promises.
+
+    With G the slopes by a view's pose, J those by the rig's parameters and S their covariance, the
+    residuals of a posed view are P (noise + J d), P = 1 - G (G^T G)^-1 G^T.
+    """
+    rig, noise_px = held.used.rig, held.used.noise_px
+    matrix = covariance_of(rig).matrix
+    kept = within_gate(held.residuals_px, noise_px)
+    expected = 0.0
+    for v in range(len(held.views)):
+        points_rig = held.rig_from_target[v].apply(held.used.target_points)
+        by_pose, by_parameter = [], []
+        for c, camera in enumerate(rig.cameras):
+            _, by_point, slopes = rig_slopes(rig, camera, points_rig[kept[v, c]])
+            by_pose.append(pose_jacobian(by_point, points_rig[kept[v, c]]).reshape(-1, 6))
+            by_parameter.append(slopes.reshape(-1, slopes.shape[-1]))
+        g, j = np.concatenate(by_pose), np.concatenate(by_parameter)
+        if len(g) < 6:
+            continue
+        left = j - g @ taken_up(g, j)
+        expected += noise_px**2 * max(len(g) - 6, 0)
+        expected += float(np.einsum("np,pq,nq->", left, matrix, left))
+    points = int(kept.sum())
+    return HoldOutScore(
+        views=len(held.views),
+        points=points,
+        rms_px=rms_length_px(held.residuals_px, noise_px),
+        expected_px=float(np.sqrt(expected / points)) if points else float("nan"),
+        used_rms_px=rms_length_px(held.used.residuals_px, held.used.sigma_px[..., None]),
+        outliers=int(np.isfinite(held.residuals_px[..., 0]).sum()) - points,
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HalvesDifference:
+    """How far two calibrations of one camera project apart, after the best pose."""
+
+    pixels: Array
+    """(R, C, 2) where."""
+    difference_px: Array
+    """(R, C, 2) second less first."""
+    expected_px: Array
+    """(R, C) root mean square length of the difference by both covariances."""
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square length over the frame."""
+        return float(np.sqrt(np.nanmean((self.difference_px**2).sum(axis=-1))))
+
+    @property
+    def expected_rms_px(self) -> float:
+        """What `rms_px` should be, if the covariances are true."""
+        return float(np.sqrt(np.nanmean(self.expected_px**2)))
+
+
+def halves_difference(
+    halves: tuple[Rig, Rig],
+    camera: str,
+    pixels: Array,
+    range_m: float,
+    anchors_cam: Array,
+    prior: Prior = NO_PRIOR,
+) -> HalvesDifference:
+    """Compare two calibrations as mrcal compares models: over the frame, after the best pose.
+
+    An error d of the prior's mean, of information I, moves a calibration of covariance S by S I d.
+    Both halves have the same d, so that most of it does not show: what differs are the errors by
+    noise, S - S I S of each, and (S1 - S2) I d.
+
+    Args:
+        halves: the rigs.
+        camera: which camera.
+        pixels: (R, C, 2) where to look.
+        range_m: distance of the points along the axis.
+        anchors_cam: (A, 3) points in the camera's frame that fix the pose between both.
+        prior: what both calibrations took as known.
+    """
+    first, second = (rig.cameras[camera] for rig in halves)
+    pose = _best_pose(first, second, anchors_cam)
+    flat = pixels.reshape(-1, 2)
+    points = first.at_depth(flat, range_m)
+    variance, shared = np.zeros(len(flat)), np.zeros((len(flat), 2, len(prior.parameters)))
+    for rig, sign in zip(halves, (-1.0, 1.0), strict=True):
+        _, by_point, plain = camera_slopes(rig, camera, points)
+        moved = plain + pose_jacobian(by_point, points) @ compensation(rig, camera, anchors_cam)
+        covariance = covariance_of(rig)
+        at = [covariance.parameters.index(name) for name in prior.parameters]
+        by_prior = moved @ covariance.matrix[:, at]
+        shared += sign * by_prior
+        variance += np.einsum("nap,pq,naq->n", moved, covariance.matrix, moved)
+        variance -= np.einsum("nap,pq,naq->n", by_prior, prior.information, by_prior)
+    variance += np.einsum("nap,pq,naq->n", shared, prior.information, shared)
+    return HalvesDifference(
+        pixels=pixels,
+        difference_px=(second.project(pose.apply(points)) - flat).reshape(pixels.shape),
+        expected_px=np.sqrt(np.maximum(variance, 0.0)).reshape(pixels.shape[:-1]),
+    )
+
+
+def _best_pose(first: FlatPortCamera, second: FlatPortCamera, anchors_cam: Array) -> RigidTransform:
+    """`second_from_first` that makes both project the anchors most alike (Gauss-Newton)."""
+    wanted = first.project(anchors_cam)
+    pose = RigidTransform.identity()
+    for _ in range(10):
+        moved = pose.apply(anchors_cam)
+        pixels, by_point, _ = second.project_jacobian(moved)
+        miss, slopes = wanted - pixels, pose_jacobian(by_point, moved)
+        known = np.isfinite(miss).all(axis=1)
+        step = np.linalg.lstsq(slopes[known].reshape(-1, 6), miss[known].ravel(), rcond=None)[0]
+        small = RigidTransform.from_components(step[3:], Rotation.from_rotvec(step[:3]))
+        pose = small * pose
+        if np.abs(step).max() < 1e-12:
+            break
+    return pose
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LengthErrors:
+    """Distances on the target, triangulated less true."""
+
+    true_m: Array
+    """(L,)"""
+    error_m: Array
+    """(L,)"""
+    bias_m: Array
+    """(L,) expected from the noise of the pixels alone: errors across a length make it longer."""
+    sigma_m: Array
+    """(L,) expected from the noise of the pixels alone."""
+    view: NDArray[np.intp]
+    """(L,) number of the view."""
+    long: NDArray[np.bool_]
+    """(L,) from a point to the farthest seen one; else between neighbours."""
+    range_m: Array
+    """(L,) of the middle, from the reference camera along its axis."""
+
+    def scales(self) -> tuple[NDArray[np.intp], Array, Array]:
+        """By view that has long lengths: its number, relative error, and weight.
+
+        The error is what long lengths have beyond their bias; the weight the inverse of their mean
+        variance.
+        """
+        views = np.unique(self.view[self.long])
+        errors, weights = np.zeros((2, len(views)))
+        for i, v in enumerate(views):
+            at = self.long & (self.view == v)
+            beyond, true = self.error_m[at] - self.bias_m[at], self.true_m[at]
+            errors[i] = beyond @ true / (true @ true)
+            weights[i] = 1.0 / (self.sigma_m[at] ** 2).mean()
+        return views, errors, weights
+
+    def scale_ppm(self) -> tuple[float, float]:
+        """Relative error of the long lengths, and its sigma from the scatter between views.
+
+        NaN where fewer than two views have long lengths.
+        """
+        _, errors, weights = self.scales()
+        count = len(errors)
+        if count < 2:
+            return float("nan"), float("nan")
+        share = weights / weights.sum()
+        mean = float(share @ errors)
+        variance = float(share**2 @ (errors - mean) ** 2) * count / (count - 1)
+        return 1e6 * mean, 1e6 * variance**0.5
+
+    def rms_m(self, long: bool) -> tuple[float, float]:
+        """Rms error of long or of neighbours' lengths, and the expected one; NaN for none."""
+        at = self.long == long
+        if not at.any():
+            return float("nan"), float("nan")
+        return (
+            float(np.sqrt((self.error_m[at] ** 2).mean())),
+            float(np.sqrt((self.sigma_m[at] ** 2 + self.bias_m[at] ** 2).mean())),
+        )
+
+
+def length_errors(
+    rig: Rig,
+    views: Sequence[TargetView],
+    rig_from_target: RigidTransform,
+    residuals_px: Array,
+    target_points: Array,
+    noise_px: Array | float,
+) -> LengthErrors:
+    """Triangulate what two or more cameras saw of each view and compare lengths with the target's.
+
+    With C the covariance of the difference of both points, u the length's direction, L the length
+    and Q = 1 - u u^T, noise gives a length the bias tr(Q C) / 2L and the variance
+    u^T C u + tr((Q C)^2) / 2L^2, to second order.
+
+    Args:
+        rig: calibrated.
+        views: (V) where the cameras saw the target.
+        rig_from_target: (V,) its poses; they only tell the directions of the lengths.
+        residuals_px: (V, cameras, N, 2); outliers among them take no part.
+        target_points: (N, 3).
+        noise_px: standard deviation of one coordinate, of all or of each picture (V, cameras).
+    """
+    near = neighbours(target_points)
+    sigma_px = np.broadcast_to(noise_px, (len(views), len(rig.cameras)))
+    poses = [rig.cam_from_rig[camera] for camera in rig.cameras]
+    back = rig.cam_from_rig[rig.reference]
+    parts: list[tuple[Array, ...]] = []
+    for v, view in enumerate(views):
+        pixels = np.full((len(rig.cameras), len(target_points), 2), np.nan)
+        for c, camera in enumerate(rig.cameras):
+            if camera in view.pixels:
+                pixels[c] = view.pixels[camera]
+        pixels[~within_gate(residuals_px[v], sigma_px[v, :, None])] = np.nan
+        found = triangulate(list(rig.cameras.values()), poses, pixels, sigma_px[v].tolist())
+        seen = np.nonzero(np.isfinite(found.points_world).all(axis=1))[0]
+        if len(seen) < 2:
+            continue
+        far = farthest(target_points, seen)
+        both = near[np.isin(near, seen).all(axis=1)]
+        pairs, long = np.concatenate([both, far]), np.repeat([False, True], [len(both), len(far)])
+        a, b = pairs.T
+        along = target_points[a] - target_points[b]
+        true = np.linalg.norm(along, axis=1)
+        unit = rig_from_target[v].rotation.apply(along / true[:, None])
+        length = np.linalg.norm(found.points_world[a] - found.points_world[b], axis=1)
+        spread = found.covariance[a] + found.covariance[b]
+        lengthwise = np.einsum("na,nab,nb->n", unit, spread, unit)
+        across = (np.eye(3) - unit[:, :, None] * unit[:, None, :]) @ spread
+        bias = np.trace(across, axis1=1, axis2=2) / (2 * true)
+        variance = lengthwise + np.einsum("nab,nba->n", across, across) / (2 * true**2)
+        range_m = back.apply((found.points_world[a] + found.points_world[b]) / 2)[:, 2]
+        number = np.full(len(pairs), v)
+        parts.append((true, length - true, bias, np.sqrt(variance), range_m, number, long))
+    empty = (np.zeros(0),) * 7
+    true, error, bias, sigma, range_m, number, long = (
+        np.concatenate(columns) for columns in zip(*(parts or [empty]), strict=True)
+    )
+    return LengthErrors(
+        true_m=true,
+        error_m=error,
+        bias_m=bias,
+        sigma_m=sigma,
+        range_m=range_m,
+        view=number.astype(np.intp),
+        long=long.astype(bool),
+    )
+
+
+def neighbours(target_points: Array) -> NDArray[np.intp]:
+    """Pairs (K, 2) of points that are nearest to one another, by 1 %."""
+    tree = KDTree(target_points)
+    spacing = float(np.asarray(tree.query(target_points, k=2)[0])[:, 1].min())
+    pairs = tree.query_pairs(1.01 * spacing, output_type="ndarray")
+    return np.asarray(pairs[np.lexsort(pairs.T)], dtype=np.intp).reshape(-1, 2)
+
+
+def farthest(target_points: Array, seen: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Pairs (K, 2): each seen point with the seen one farthest from it, no pair twice."""
+    away = cdist(target_points[seen], target_points[seen]).argmax(axis=1)
+    pairs = np.sort(np.stack([seen, seen[away]], axis=1), axis=1)
+    return np.unique(pairs, axis=0)

@@ -1,0 +1,369 @@
+"""The stages `pool` and `images`: take the pictures of a calibration and of a survey.
+
+A picture that is there already, from a run that was interrupted, is kept: each is written whole or
+not at all, and none depends on another.
+"""
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.base.artefacts import (
+    Stage,
+    atomic_path,
+    need_stage,
+    read_json,
+    run_stage,
+    write_csv,
+    write_json,
+)
+from alice_survey.base.config import SurveyConfig
+from alice_survey.base.errors import ImageError, NavigationError, WorkspaceError
+from alice_survey.base.executor import parallel_map
+from alice_survey.base.frames import Array, interpolate_poses, pose_to_json
+from alice_survey.base.manifest import ImageRecord, write_manifest
+from alice_survey.base.trajectory import Trajectory, read_columns, read_track
+from alice_survey.seafloor.as_built import true_rig
+from alice_survey.seafloor.board import PoolBoard, board_records, pool_poses, render_board
+from alice_survey.seafloor.light import CameraLight, camera_light
+from alice_survey.seafloor.renderer import Scene, flat_floor_radiance, range_map, render
+from alice_survey.seafloor.sensor import Sensor, develop, expose, make_sensor, nominal_gain
+from alice_survey.seafloor.terrain import read_terrain, survey_terrain
+from alice_survey.seafloor.texture import SAND_ALBEDO, survey_texture
+from camera_calib.rig import Rig, read_rig, write_rig
+from camera_calib.water import water_optics
+
+CAMERAS = ("left", "right")
+VERTICAL_DATUM = "sea surface at the datum (simulated)"
+MOMENTS = 16
+"""Poses over one exposure."""
+
+_POOL_STREAM, _POOL_NOISE_STREAM, _NOISE_STREAM = 3500, 3501, 3300
+_POOL_WHITE = 0.6
+"""Share of the full well that a white of full reflectance fills in the pool."""
+_NAVIGATION = (
+    "latitude_deg", "longitude_deg", "depth_m", "roll_deg", "pitch_deg", "heading_deg",
+    "altitude_m", "sigma_horizontal_m", "sigma_depth_m", "sigma_attitude_deg", "sigma_heading_deg",
+    "sigma_altitude_m",
+)  # fmt: skip
+_BLANK_WITHOUT_BOTTOM = ("altitude_m", "sigma_altitude_m")
+_ANGLES = ("longitude_deg", "roll_deg", "pitch_deg", "heading_deg")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Shoot:
+    """What all pictures of a stage share."""
+
+    folder: Path
+    config: SurveyConfig
+    exposure_s: float
+    altitude_m: float
+    stamp: tuple[int, ...] = ()
+    """Size and time of the files that workers read, so that none keeps what has changed."""
+
+
+def run_pool(workspace: Path, config: SurveyConfig, threads: int) -> bool:
+    """Take the stereo pictures of a chessboard in a pool and write `pool/`.
+
+    Returns:
+        True when done, False when nothing had changed.
+    """
+    imaging, board = config.imaging, PoolBoard()
+    stage = Stage(
+        name="pool",
+        version=4,
+        settings={
+            "seed": config.seed,
+            "camera": config.camera.model_dump(mode="json"),
+            "n_water": config.water.n_water,
+            "board": asdict(board),
+            "imaging": imaging.model_dump(
+                mode="json", include={"scale", "image_format", "samples", "noise", "pool_views"}
+            ),
+        },
+        resumes=True,
+    )
+
+    def work(folder: Path) -> None:
+        rig = true_rig(config)
+        rng = np.random.default_rng([config.seed, _POOL_STREAM])
+        poses = pool_poses(board, rig, imaging.pool_views, rng)
+        shown = board_records(rig, poses)
+        shoot = _Shoot(folder=folder, config=config, exposure_s=0.0, altitude_m=0.0)
+        jobs = [
+            (shoot, board, view, camera, pose.as_matrix())
+            for view, by_camera in enumerate(shown)
+            for camera, pose in by_camera.items()
+        ]
+        records = list(parallel_map(_take_board, jobs, threads=threads, label="pool pictures"))
+        write_manifest(folder / "manifest.csv", records)
+        write_json(folder / "board.json", asdict(board))
+        write_rig(folder / "truth" / "rig.json", rig)
+        write_json(
+            folder / "truth" / "boards.json",
+            {
+                "cam_from_board": [
+                    {"station": view, **{name: pose_to_json(p) for name, p in by_camera.items()}}
+                    for view, by_camera in enumerate(shown)
+                ]
+            },
+        )
+
+    return run_stage(workspace, stage, work)
+
+
+def _take_board(job: tuple[_Shoot, PoolBoard, int, str, Array]) -> ImageRecord:
+    shoot, board, view, camera, matrix = job
+    config = shoot.config
+    image = f"{camera}/{view:02d}.{config.imaging.image_format}"
+    record = ImageRecord(image=image, camera=camera, station=view)
+    if (shoot.folder / image).exists():
+        return record
+    one = true_rig(config).cameras[camera]
+    # Large pixels need more rays for the same precision of an edge on the board.
+    samples = config.imaging.samples + (1 if config.imaging.scale > 1 else 0)
+    light = render_board(board, one, RigidTransform.from_matrix(matrix), samples)
+    sensor = make_sensor(config.camera, one.n_water, 1.0, config.imaging.scale)
+    white = _POOL_WHITE * sensor.full_well_e
+    lit = Sensor(
+        electrons_per_radiance=(white, white, white),
+        full_well_e=sensor.full_well_e,
+        read_noise_e=sensor.read_noise_e,
+    )
+    seed = [config.seed, _POOL_NOISE_STREAM, view, CAMERAS.index(camera)]
+    rng = np.random.default_rng(seed) if config.imaging.noise else None
+    _write_picture(shoot.folder / image, develop(expose(light, lit, rng), 1.0 / white))
+    return record
+
+
+def run_images(workspace: Path, config: SurveyConfig, threads: int) -> bool:
+    """Take the pictures of a flown survey and write `images/`.
+
+    Returns:
+        True when done, False when nothing had changed.
+
+    Raises:
+        WorkspaceError: the plan or the flight is missing or lacks a value.
+        NavigationError: a trigger lies outside of the flight, or none is there.
+    """
+    plan, flight = need_stage(workspace, "plan", "plan"), need_stage(workspace, "flight", "fly")
+    triggers, navigation = flight / "triggers.csv", flight / "navigation.csv"
+    track = flight / "truth" / "track.csv"
+    sections = ("camera", "water", "seafloor", "imaging")
+    stage = Stage(
+        name="images",
+        version=5,
+        settings={
+            "seed": config.seed,
+            "seafloor_depth_m": config.area.seafloor_depth_m,
+            "margins": config.plan.model_dump(
+                mode="json", include={"altitude_m", "run_in_m", "turn_radius_m", "margin_m"}
+            ),
+            **{
+                name: getattr(config, name).model_dump(mode="json", exclude={"pool_views"})
+                for name in sections
+            },
+        },
+        inputs=[plan / "plan.json", triggers, navigation, track],
+        resumes=True,
+    )
+
+    def work(folder: Path) -> None:
+        planned = _read_plan(plan / "plan.json")
+        rows = read_columns(triggers, ("station", "time_s"))
+        stations = [(int(s), float(t)) for s, t in zip(*rows.values(), strict=True)]
+        if not stations:
+            raise NavigationError(f"{triggers} holds no trigger: plan a larger area")
+        truth = read_track(track)
+        believed = _believed(navigation, np.array([t for _, t in stations]))
+        rig = true_rig(config)
+        terrain = folder / "truth" / "terrain.ply"
+        if not terrain.with_suffix(".json").exists():
+            survey_terrain(config, planned["within_ne_m"]).write(terrain)
+        write_rig(folder / "truth" / "rig.json", rig)
+        shoot = _Shoot(
+            folder=folder,
+            config=config,
+            exposure_s=planned["exposure_s"],
+            altitude_m=planned["altitude_m"],
+            stamp=(terrain.stat().st_size, terrain.stat().st_mtime_ns),
+        )
+        jobs = _jobs(shoot, stations, truth)
+        images = list(
+            parallel_map(_take, jobs, threads=threads, label="pictures", total=2 * len(stations))
+        )
+        records = [
+            replace(
+                believed[i // 2],
+                image=image,
+                camera=CAMERAS[i % 2],
+                station=stations[i // 2][0],
+            )
+            for i, image in enumerate(images)
+        ]
+        write_manifest(folder / "manifest.csv", records)
+        _write_poses(folder / "truth" / "poses.csv", records, stations, truth, rig)
+        write_json(
+            folder / "survey.json",
+            {
+                "source": "simulated",
+                "datum": planned["datum"],
+                "vertical_datum": VERTICAL_DATUM,
+                "notes": ["pictures are rendered: a simulated sea floor, lit by strobes alone"],
+            },
+        )
+
+    return run_stage(workspace, stage, work)
+
+
+def _read_plan(path: Path) -> dict[str, Any]:
+    data = read_json(path)
+    try:
+        return {
+            "exposure_s": float(data["exposure_s"]),
+            "altitude_m": float(data["altitude_m"]),
+            "within_ne_m": _corners(data["area"]["allowed"]["coordinates"]),
+            "datum": {key: float(data["datum"][key]) for key in ("latitude_deg", "longitude_deg")},
+        }
+    except (KeyError, TypeError, ValueError) as error:
+        raise WorkspaceError(f"{path}: {error!r} is missing or wrong; plan again") from None
+
+
+def _corners(nested: Any) -> list[list[float]]:
+    """All points of the nested lists of a GeoJSON geometry."""
+    if nested and isinstance(nested[0], (int, float)):
+        return [[float(nested[0]), float(nested[1])]]
+    return [point for part in nested for point in _corners(part)]
+
+
+def _believed(path: Path, at_s: Array) -> list[ImageRecord]:
+    """What the navigation log says at some times: rows of the manifest that lack their picture."""
+    log = read_columns(path, ("time_s", *_NAVIGATION), _BLANK_WITHOUT_BOTTOM)
+    time_s = log["time_s"]
+    if not np.all(np.diff(time_s) > 0):
+        raise NavigationError(f"{path}: time_s must increase from row to row")
+    if len(time_s) < 2 or at_s.min() < time_s[0] or at_s.max() > time_s[-1]:
+        raise NavigationError(
+            f"{path} covers {time_s[0]:.2f} to {time_s[-1]:.2f} s, but triggers go from "
+            f"{at_s.min():.2f} to {at_s.max():.2f} s: fly again"
+        )
+    columns = {"time_s": at_s}
+    for name in _NAVIGATION:
+        values = log[name]
+        if name in _ANGLES:  # across north, and across the date line, the short way
+            values = np.rad2deg(np.unwrap(np.deg2rad(values)))
+        columns[name] = np.interp(at_s, time_s, values)
+    columns["heading_deg"] %= 360.0
+    columns["longitude_deg"] = (columns["longitude_deg"] + 180.0) % 360.0 - 180.0
+    nameless = ImageRecord(image="", camera="", station=0)
+    return [
+        replace(nameless, **{name: float(values[i]) for name, values in columns.items()})  # type: ignore[arg-type]
+        for i in range(len(at_s))
+    ]
+
+
+def _jobs(
+    shoot: _Shoot, stations: list[tuple[int, float]], truth: Trajectory
+) -> Iterator[tuple[_Shoot, int, str, Array]]:
+    for station, time_s in stations:
+        body = _poses_over_exposure(truth, time_s, shoot.exposure_s)
+        for camera in CAMERAS:
+            yield shoot, station, camera, body.as_matrix()
+
+
+def _poses_over_exposure(truth: Trajectory, time_s: float, exposure_s: float) -> RigidTransform:
+    """`ned_from_body` at moments spread over an exposure whose middle is the trigger's time.
+
+    The last one, beyond `MOMENTS`, is at that time itself.
+    """
+    spread = np.append((np.arange(MOMENTS) + 0.5) / MOMENTS - 0.5, 0.0)
+    moments = time_s + exposure_s * spread
+    try:
+        return interpolate_poses(truth.time_s, truth.ned_from_body, moments)
+    except ValueError:
+        raise NavigationError(
+            f"the true track covers {truth.time_s[0]:.2f} to {truth.time_s[-1]:.2f} s, but a "
+            f"picture is exposed around {time_s:.2f} s: fly again"
+        ) from None
+
+
+def _take(job: tuple[_Shoot, int, str, Array]) -> str:
+    """Render one picture, unless it is there; returns its path below the folder."""
+    shoot, station, camera, body = job
+    config = shoot.config
+    image = f"{camera}/{station:06d}.{config.imaging.image_format}"
+    ranges = shoot.folder / "truth" / "range" / f"{camera}_{station:06d}.tif"
+    wants_range = config.imaging.range_maps and not ranges.exists()
+    if (shoot.folder / image).exists() and not wants_range:
+        return image
+    scene, rig, lights, sensor, gain = _studio(shoot)
+    one, poses = rig.cameras[camera], RigidTransform.from_matrix(body) * rig.body_from_cam(camera)
+    try:
+        if not (shoot.folder / image).exists():
+            radiance = render(scene, one, lights[camera], poses[:MOMENTS], config.imaging.samples)
+            seed = [config.seed, _NOISE_STREAM, station, CAMERAS.index(camera)]
+            rng = np.random.default_rng(seed) if config.imaging.noise else None
+            picture = develop(expose(radiance, sensor, rng), gain)
+            _write_picture(shoot.folder / image, picture)
+        if wants_range:
+            _write_picture(ranges, range_map(scene, one, poses[MOMENTS]))
+    except ImageError as error:
+        raise ImageError(f"station {station}, {camera} camera: {error}") from None
+    return image
+
+
+@lru_cache(maxsize=1)
+def _studio(shoot: _Shoot) -> tuple[Scene, Rig, dict[str, CameraLight], Sensor, float]:
+    """What a process needs for all of its pictures: sea floor, rig, light, sensor and gain."""
+    config, truth = shoot.config, shoot.folder / "truth"
+    rig, water = read_rig(truth / "rig.json"), water_optics(config.water.jerlov)
+    scene = Scene(terrain=read_terrain(truth / "terrain.ply"), texture=survey_texture(config))
+    reach_m = 2.0 * shoot.altitude_m + 1.0
+    lights = {
+        name: camera_light(camera, rig.body_from_cam(name), config.imaging, water, reach_m)
+        for name, camera in rig.cameras.items()
+    }
+    left = rig.cameras["left"]
+    sensor = make_sensor(config.camera, left.n_water, shoot.exposure_s, config.imaging.scale)
+    pupil_m = shoot.altitude_m + left.port_distance_m + left.glass_thickness_m
+    nominal = flat_floor_radiance(
+        left, lights["left"], pupil_m, SAND_ALBEDO, max(left.width_px // 24, 1)
+    )
+    gain = nominal_gain(nominal * np.asarray(sensor.electrons_per_radiance), sensor)
+    return scene, rig, lights, sensor, gain
+
+
+def _write_poses(
+    path: Path,
+    records: list[ImageRecord],
+    stations: list[tuple[int, float]],
+    truth: Trajectory,
+    rig: Rig,
+) -> None:
+    times = np.repeat([t for _, t in stations], len(CAMERAS))
+    bodies = interpolate_poses(truth.time_s, truth.ned_from_body, times)
+    rows = []
+    for record, ned_from_body in zip(records, bodies, strict=True):
+        pose = ned_from_body * rig.body_from_cam(record.camera)
+        quaternion = pose.rotation.as_quat(canonical=True)
+        rows.append([record.image, *(f"{v:.12f}" for v in (*pose.translation, *quaternion))])
+    header = ("image", "north_m", "east_m", "depth_m", "qx", "qy", "qz", "qw")
+    write_csv(path, header, rows)
+
+
+def _write_picture(path: Path, picture: NDArray[Any]) -> None:
+    options = {
+        ".png": [cv2.IMWRITE_PNG_COMPRESSION, 1],
+        ".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95],
+        ".tif": [],
+    }[path.suffix]
+    with atomic_path(path) as temporary:
+        if not cv2.imwrite(str(temporary), picture, options):
+            raise ImageError(f"{path} cannot be written: is the disk full?")

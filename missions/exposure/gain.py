@@ -1,0 +1,371 @@
+"""The paper's gain procedure: control pictures of a short dive tell the gain to set.
+
+Gain changes brightness, not the light that was caught: where shot and read noise are the limit the
+report says so, and how much light is missing.
+"""
+
+import glob
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.base.errors import ImageError, warn
+from alice_survey.base.executor import progress
+from alice_survey.base.frames import Array
+from alice_survey.base.text_table import text_table
+from camera_calib.picture_files import is_cut_short, read_pixels
+from missions.exposure.light import MIDDLE_GREY
+
+Floats = NDArray[np.float32]
+
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+_ZONES = 5
+"""Zones along each side of the frame: the lens's and the beam's fall-off is told by them."""
+_SAMPLES = 250_000
+"""Pixels of a picture that percentiles are taken of, about."""
+_HIGHLIGHT = 0.9
+"""Share of full scale that the 99.5th percentile of the brightest zone may reach."""
+_ACCEPTABLE_SNR = 10.0
+"""Signal to noise of an acceptable picture (ISO 12232, noise-based speed)."""
+_WHITE, _BLACK = 0.99, 0.002
+"""Linear shares of full scale that count as clipped and as black."""
+_MOST_CLIPPED = 0.5
+_LAPLACE = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])
+_LAPLACE_GAIN = 6.0
+"""Root of the sum of its squares: white noise grows so much (Immerkaer 1996)."""
+_TILE = 32
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureLevels:
+    """Levels of one control picture, linear, as shares of full scale."""
+
+    picture: str
+    median: float
+    """Of the mean of its channels."""
+    dark: float
+    """0.5th percentile."""
+    bright: float
+    """99.5th percentile of the brightest of 5 x 5 zones, of any channel."""
+    clipped: float
+    """Share of its pixels with a channel at full scale."""
+    black: float
+    """Share of its pixels with all channels at zero."""
+    falloff: float
+    """Mean of the four corner zones over the middle zone (medians)."""
+    noise: float
+    """Standard deviation where the picture is smoothest, about its median level."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GainAdvice:
+    """The gain to set, and what it cannot mend."""
+
+    pictures: int
+    skipped: int
+    median: float
+    bright: float
+    clipped: float
+    falloff: float
+    snr: float
+    """Median over noise."""
+    change_db: float
+    present_gain_db: float | None
+    gain_db: float | None
+    """Present gain and change; None where the present one is not known."""
+    target: float
+    bound_by: str
+    """`median`, or `highlights` where these allow no more."""
+    advice: tuple[str, ...]
+    levels: tuple[PictureLevels, ...]
+
+
+def gain_report(
+    pictures: str | Path,
+    *,
+    present_gain_db: float | None = None,
+    linear: bool = False,
+    target: float = MIDDLE_GREY,
+) -> tuple[str, dict[str, Any]]:
+    """The gain to set, as text and as JSON values.
+
+    Args:
+        pictures: a folder, or a pattern such as `control/*.png`.
+        present_gain_db: at which they were taken; the gain is told relative to it when None.
+        linear: grey values are proportional to light; else they follow the sRGB curve.
+        target: share of full scale, linear, that the median is to have.
+
+    Raises:
+        ImageError: no picture can be read, or all are black or white; the message says what to do.
+    """
+    advice = gain_advice(
+        picture_files(pictures), present_gain_db=present_gain_db, linear=linear, target=target
+    )
+    return _told(advice, linear=linear), asdict(advice)
+
+
+def picture_files(pictures: str | Path) -> list[Path]:
+    """Files of pictures in a folder or of a pattern, in order.
+
+    Raises:
+        ImageError: there is none.
+    """
+    folder = Path(pictures)
+    found = (
+        folder.iterdir() if folder.is_dir() else map(Path, glob.glob(str(pictures), recursive=True))  # noqa: PTH207
+    )
+    files = sorted(file for file in found if file.suffix.lower() in _SUFFIXES)
+    if not files:
+        raise ImageError(
+            f"{pictures}: no picture ({', '.join(_SUFFIXES)}): give a folder of control pictures "
+            "or a quoted pattern"
+        )
+    return files
+
+
+def gain_advice(
+    files: Sequence[Path],
+    *,
+    present_gain_db: float | None = None,
+    linear: bool = False,
+    target: float = MIDDLE_GREY,
+) -> GainAdvice:
+    """The gain to set for pictures like these; as `gain_report`."""
+    if not 0.0 < target < _HIGHLIGHT:
+        raise ImageError(f"target {target:g}: a share of full scale between 0 and {_HIGHLIGHT:g}")
+    levels = []
+    for file in progress(files, "control pictures"):
+        picture = read_linear(file, linear=linear)
+        if picture is not None:
+            levels.append(picture_levels(file.name, picture))
+    if not levels:
+        raise ImageError(f"none of {len(files)} control pictures can be read: take them again")
+    median, bright = (
+        float(np.median([getattr(p, k) for p in levels])) for k in ("median", "bright")
+    )
+    clipped = float(np.median([p.clipped for p in levels]))
+    _refuse_useless(levels, median, bright, clipped)
+    by_median, by_highlights = _db(target / max(median, 1e-9)), _db(_HIGHLIGHT / bright)
+    change = min(by_median, by_highlights)
+    snr = float(np.median([p.median / max(p.noise, 1e-9) for p in levels]))
+    return GainAdvice(
+        pictures=len(levels),
+        skipped=len(files) - len(levels),
+        median=median,
+        bright=bright,
+        clipped=clipped,
+        falloff=float(np.median([p.falloff for p in levels])),
+        snr=snr,
+        change_db=change,
+        present_gain_db=present_gain_db,
+        gain_db=None if present_gain_db is None else present_gain_db + change,
+        target=target,
+        bound_by="median" if by_median <= by_highlights else "highlights",
+        advice=tuple(_advice(levels, change, by_median, snr, clipped, present_gain_db)),
+        levels=tuple(levels),
+    )
+
+
+def read_linear(file: Path, *, linear: bool) -> Floats | None:
+    """A picture as shares of full scale proportional to light, (H, W, C); None if unreadable.
+
+    A picture of 16 bits without a value over 4095 is taken for one of 12, with a warning, as is
+    said of each that cannot be read.
+    """
+    if is_cut_short(file):
+        warn(f"{file}: the file ends early; left out")
+        return None
+    raw = read_pixels(file, cv2.IMREAD_UNCHANGED)
+    if raw is None or raw.dtype not in (np.uint8, np.uint16) or raw.size == 0:
+        warn(f"{file}: no picture of 8 or 16 bits, or it is damaged; left out")
+        return None
+    full = 255.0
+    if raw.dtype == np.uint16:
+        full = 65535.0
+        if int(raw.max()) < 4096:
+            warn(f"{file}: no value over 4095: taken for 12 bits")
+            full = 4095.0
+    stacked = raw[:, :, None] if raw.ndim == 2 else raw[:, :, :3]
+    shares = np.minimum(np.arange(int(np.iinfo(raw.dtype).max) + 1) / full, 1.0)
+    table = shares if linear else _from_srgb(shares)
+    picture: Floats = table.astype(np.float32)[stacked]
+    return picture
+
+
+def _from_srgb(encoded: Array) -> Array:
+    """Linear light of sRGB values, 0 to 1 (IEC 61966-2-1)."""
+    linear: Array = np.where(
+        encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4
+    )
+    return linear
+
+
+def _grey(picture: Floats) -> Floats:
+    """Mean of the channels."""
+    channels = picture.shape[2]
+    total = picture[..., 0].copy()
+    for channel in range(1, channels):
+        total += picture[..., channel]
+    return total / np.float32(channels)
+
+
+def picture_levels(name: str, picture: Floats) -> PictureLevels:
+    """Levels of a linear picture (H, W, C)."""
+    step = max(1, math.isqrt(picture.shape[0] * picture.shape[1] // _SAMPLES))
+    thin = picture[::step, ::step]
+    grey = _grey(thin)
+    zones = [
+        [np.percentile(zone, [50.0, 99.5]) for zone in np.array_split(band, _ZONES, axis=1)]
+        for band in np.array_split(grey, _ZONES)
+    ]
+    medians = np.array([[zone[0] for zone in row] for row in zones])
+    row, column = np.unravel_index(int(medians.argmax()), medians.shape)
+    brightest = np.array_split(np.array_split(thin, _ZONES)[row], _ZONES, axis=1)[column]
+    last = _ZONES - 1
+    corners = medians[[0, 0, last, last], [0, last, 0, last]].mean()
+    median = float(np.median(grey))
+    return PictureLevels(
+        picture=name,
+        median=median,
+        dark=float(np.percentile(grey, 0.5)),
+        bright=float(np.percentile(brightest.max(axis=2), 99.5)),
+        clipped=float((thin.max(axis=2) >= _WHITE).mean()),
+        black=float((thin.max(axis=2) <= _BLACK).mean()),
+        falloff=float(corners / max(medians[_ZONES // 2, _ZONES // 2], 1e-9)),
+        noise=noise_sigma(picture),
+    )
+
+
+def noise_sigma(picture: Floats) -> float:
+    """Noise of the mean of a picture's channels, where it is smoothest.
+
+    Immerkaer's operator takes planes of light out; tiles of which the 10th percentile counts keep
+    texture out, which would pass for noise. Shot noise grows with light, so tiles darker than the
+    picture's median are left out.
+    """
+    grey = _grey(picture)
+    rough: Floats = cv2.filter2D(grey, cv2.CV_32F, _LAPLACE)[1:-1, 1:-1]
+    rows, columns = (size // _TILE * _TILE for size in rough.shape)
+    if min(rows, columns) == 0:
+        return float(rough.std() / _LAPLACE_GAIN)
+    tiles = rough[:rows, :columns].reshape(rows // _TILE, _TILE, columns // _TILE, _TILE)
+    light = grey[1 : rows + 1, 1 : columns + 1].reshape(tiles.shape).mean(axis=(1, 3))
+    sigma = np.sqrt((tiles**2).mean(axis=(1, 3))) / _LAPLACE_GAIN
+    return float(np.percentile(sigma[light >= np.median(light)], 10.0))
+
+
+def _refuse_useless(
+    levels: Sequence[PictureLevels], median: float, bright: float, clipped: float
+) -> None:
+    """Stop where the pictures say nothing of the light.
+
+    Raises:
+        ImageError: they are black, or white.
+    """
+    if bright <= 2 * _BLACK:
+        raise ImageError(
+            f"{len(levels)} control pictures are black ({bright:.2%} of full scale in their "
+            "brightest zone): check that the lens is uncovered and the strobe fires within the "
+            "exposure (triggers.csv), then take them again with 12 dB more gain"
+        )
+    if clipped > _MOST_CLIPPED or median >= _WHITE:
+        raise ImageError(
+            f"{len(levels)} control pictures are white ({clipped:.0%} of the pixels are clipped): "
+            "how much too bright cannot be told: lower the gain by 12 dB, or the exposure to a "
+            "quarter, and take them again"
+        )
+
+
+def _advice(
+    levels: Sequence[PictureLevels],
+    change: float,
+    by_median: float,
+    snr: float,
+    clipped: float,
+    present_db: float | None,
+) -> list[str]:
+    """What gain cannot mend."""
+    said = []
+    if by_median > change + 0.05:
+        said.append(
+            f"highlights allow {by_median - change:.1f} dB less than the median asks for: light "
+            "is uneven; move the strobes apart or accept dark edges"
+        )
+    if snr < _ACCEPTABLE_SNR:
+        said.append(
+            f"signal to noise is {snr:.1f}, and gain cannot raise it: light is the limit. "
+            f"{_ACCEPTABLE_SNR:g} takes {(_ACCEPTABLE_SNR / snr) ** 2:.1f} times the light "
+            "(shot noise): open the aperture, expose longer, or go lower"
+        )
+    if present_db is not None and present_db + change < 0:
+        said.append(
+            f"the gain would be {present_db + change:.1f} dB: set 0 dB, and the exposure to "
+            f"{10 ** ((present_db + change) / 20):.2f} of what it is, or close the aperture"
+        )
+    if clipped > 0.01:
+        said.append(
+            f"{clipped:.1%} of the pixels are clipped: the gain told may still be too high; "
+            "check it with new pictures"
+        )
+    spread = [p.median for p in levels]
+    if max(spread) > 2 * max(min(spread), 1e-9):
+        said.append(
+            f"medians go from {min(spread):.1%} to {max(spread):.1%}: the altitude or the ground "
+            "varied; take pictures at the survey's altitude"
+        )
+    return said
+
+
+def _told(advice: GainAdvice, *, linear: bool) -> str:
+    """The report as text."""
+    curve = "linear" if linear else "sRGB curve undone"
+    skipped = f", {advice.skipped} left out" if advice.skipped else ""
+    table = text_table(
+        ("level", "now", "then"),
+        [
+            ("median", f"{advice.median:.2%}", f"{_then(advice.median, advice):.1%}"),
+            (
+                "brightest zone, 99.5 %",
+                f"{advice.bright:.2%}",
+                f"{_then(advice.bright, advice):.1%}",
+            ),
+            ("clipped", f"{advice.clipped:.2%}", "-"),
+            ("corners over middle", f"{advice.falloff:.2f}", "the same"),
+            ("signal to noise", f"{advice.snr:.1f}", "the same"),
+        ],
+    )
+    lines = [
+        f"{advice.pictures} control pictures{skipped} ({curve}; shares of full scale)",
+        table,
+        _verdict(advice),
+        *(f"  - {said}" for said in advice.advice),
+    ]
+    return "\n".join(lines)
+
+
+def _verdict(advice: GainAdvice) -> str:
+    why = (
+        f"the median comes to {advice.target:.0%}"
+        if advice.bound_by == "median"
+        else f"the brightest zone comes to {_HIGHLIGHT:.0%}"
+    )
+    if advice.gain_db is None:
+        return f"change the gain by {advice.change_db:+.1f} dB: {why}"
+    return (
+        f"set the gain to {max(advice.gain_db, 0.0):.1f} dB ({advice.change_db:+.1f} dB from "
+        f"{advice.present_gain_db:g}): {why}"
+    )
+
+
+def _then(level: float, advice: GainAdvice) -> float:
+    return float(min(1.0, level * 10 ** (advice.change_db / 20)))
+
+
+def _db(ratio: float) -> float:
+    return 20.0 * math.log10(ratio)

@@ -1,0 +1,235 @@
+"""Light budget: from the strobes' lumens to electrons in a pixel, channel by channel.
+
+Each strobe sends `I(angle) = I_0 cos(angle)` within its cone, `I_0 = P / (pi sin^2(half cone))`.
+A level floor of reflectance rho (Lambert) at the distances d from a strobe and s along the pixel's
+ray gets `E = sum I cos(in) / d^2 exp(-c d)` and sends back `L = rho E / pi exp(-c s)`. On the way
+to the sensor L falls by `T_port / n^2`; it gives the irradiance `pi L T_lens / (4 N^2) cos^4`.
+
+Assumed: no daylight; the LEDs' spectrum is Planck's at their colour temperature between 400 and
+700 nm (an LED has a blue peak and a gap at 480 nm instead; its lumens are the same); each channel
+takes a third of that range, with the water of its middle, and has the whole quantum efficiency;
+sand as in the simulator. The simulator (`alice_survey.seafloor`) computes the same by ray, with a
+soft edge of the cone and an even spectrum: it is the twin that tests compare with.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from alice_survey.base.config import CameraConfig, ImagingConfig
+from alice_survey.base.frames import Array
+from camera_calib.rig import Rig
+from camera_calib.water import WAVELENGTH_NM, WaterOptics
+from missions.values.footprint import glass_point_cam
+
+FLOOR_REFLECTANCE = np.array([0.40, 0.345, 0.255])
+"""Red, green and blue of bare sand, as `alice_survey.seafloor.texture.SAND_ALBEDO`."""
+STROBE_KELVIN = 4000.0
+"""Gutnik et al. 2021, section III.B."""
+PORT_TRANSMITTANCE = 0.955
+"""Fresnel at square incidence: 0.4 % from water to glass, 4.3 % from glass to air."""
+LENS_TRANSMITTANCE = 0.9
+"""Inferred: coated lens."""
+MIDDLE_GREY = 0.2
+"""Share of full scale, linear, that the median is brought to; as in the simulator."""
+
+LEAST_SNR = 5.0
+"""Below it detail of a pixel drowns (Rose 1948, J. Opt. Soc. Am. 38, 196)."""
+
+Spectrum = Literal["planck", "even"]
+
+_PLANCK_J_S, _LIGHT_M_S, _BOLTZMANN_J_K = 6.62607015e-34, 299_792_458.0, 1.380649e-23
+_LUMENS_PER_WATT = 683.0
+_BANDS_NM = ((600.0, 700.0), (500.0, 600.0), (400.0, 500.0))
+"""Of red, green and blue."""
+_GRID = (13, 11)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LightBudget:
+    """Electrons of a pixel over level sand, and what follows for gain, aperture and exposure."""
+
+    centre_e: tuple[float, float, float]
+    """Red, green and blue, at the middle of the frame."""
+    corner_e: tuple[float, float, float]
+    """In the darkest corner."""
+    median_e: float
+    """Of the mean of the channels over the frame."""
+    brightest_e: float
+    """The largest of any channel anywhere in the frame."""
+    snr_centre: tuple[float, float, float]
+    """Signal over shot and read noise."""
+    snr_median: float
+    snr_corner: tuple[float, float, float]
+    full_share: float
+    """Brightest over full well."""
+    gain_db: float
+    """That brings the median to middle grey of the full scale; 0 dB puts the full well there."""
+    half_full_f_number: float
+    """F-number at which the brightest reaches half the full well, in this exposure."""
+    half_full_exposure_s: float
+    """Exposure at which it does, with this f-number."""
+
+
+def watts_per_lumen(spectrum: Spectrum, kelvin: float = STROBE_KELVIN) -> Array:
+    """Radiant watts in red, green and blue for one lumen, (3,).
+
+    Lumens are `683 integral(P V)`, with the CIE photopic curve as V = 1.019 exp(-285.4 (um -
+    0.559)^2), which holds its integral to 0.1 %.
+
+    Args:
+        spectrum: Planck's between 400 and 700 nm, or even there.
+        kelvin: colour temperature of Planck's.
+    """
+    nm = np.linspace(400.0, 700.0, 601)
+    metres = nm * 1e-9
+    power = np.ones_like(nm)
+    if spectrum == "planck":
+        energy = _PLANCK_J_S * _LIGHT_M_S / (metres * _BOLTZMANN_J_K * kelvin)
+        power = metres**-5 / np.expm1(energy)
+        power /= power.max()
+    photopic = 1.019 * np.exp(-285.4 * (nm * 1e-3 - 0.559) ** 2)
+    lumens = _LUMENS_PER_WATT * np.trapezoid(power * photopic, nm)
+    bands = [(nm >= low) & (nm <= high) for low, high in _BANDS_NM]
+    return np.array([np.trapezoid(power[band], nm[band]) / lumens for band in bands])
+
+
+def cone_intensity(cos_angle: Array, half_beam_rad: float) -> Array:
+    """Intensity over radiant power, 1/sr: Lambert's cosine within a cone."""
+    inside = np.where(cos_angle >= math.cos(half_beam_rad), cos_angle, 0.0)
+    share: Array = inside / (math.pi * math.sin(half_beam_rad) ** 2)
+    return share
+
+
+def floor_radiance(
+    rig: Rig,
+    imaging: ImagingConfig,
+    water: WaterOptics,
+    altitude_m: float,
+    pixels: Array,
+    spectrum: Spectrum = "planck",
+) -> Array:
+    """Radiance in water that level sand sends to the reference camera, W / (m^2 sr).
+
+    Args:
+        rig: with its place on the vehicle.
+        imaging: the strobes; they point straight down.
+        water: of the three channels.
+        altitude_m: of the outer glass.
+        pixels: (..., 2).
+        spectrum: of the strobes.
+
+    Returns:
+        (..., 3) red, green and blue, without the lens's fall-off and the water's own light.
+    """
+    camera = rig.cameras[rig.reference]
+    floor_z = float(glass_point_cam(camera)[2]) + altitude_m
+    outer, directions = camera.unproject(pixels)
+    path = (floor_z - outer[..., 2]) / directions[..., 2]
+    spots = outer + path[..., None] * directions
+    cam_from_body = rig.body_from_cam(rig.reference).inv()
+    strobes = cam_from_body.apply(np.asarray(imaging.strobes_body_m, dtype=np.float64))
+    down = cam_from_body.rotation.apply([0.0, 0.0, 1.0])
+    power = imaging.strobe_lumens * watts_per_lumen(spectrum)
+    half_beam = math.radians(imaging.strobe_beam_deg) / 2
+    irradiance = np.zeros((*path.shape, 3))
+    for strobe in strobes:
+        away = spots - strobe
+        distance = np.linalg.norm(away, axis=-1)
+        cos_beam = away @ down / distance
+        # The floor is level: light meets it at the angle at which it leaves the strobe.
+        falls = cone_intensity(cos_beam, half_beam) * cos_beam / distance**2
+        loss = np.exp(-(distance + path)[..., None] * water.attenuation_per_m)
+        irradiance += falls[..., None] * power * loss
+    radiance: Array = FLOOR_REFLECTANCE / math.pi * irradiance
+    return radiance
+
+
+def electrons_per_radiance(limits: CameraConfig, n_water: float, exposure_s: float) -> Array:
+    """Electrons in a pixel on the axis for 1 W / (m^2 sr) in water, (3,)."""
+    in_air = PORT_TRANSMITTANCE / n_water**2
+    irradiance = math.pi * in_air * LENS_TRANSMITTANCE / (4.0 * limits.f_number**2)
+    energy_j = irradiance * (limits.pixel_um * 1e-6) ** 2 * exposure_s
+    photon_j = _PLANCK_J_S * _LIGHT_M_S / (WAVELENGTH_NM * 1e-9)
+    electrons: Array = limits.quantum_efficiency * energy_j / photon_j
+    return electrons
+
+
+def lens_falloff(rig: Rig, pixels: Array) -> Array:
+    """cos^4 of the angle in air between the axis and the rays of pixels (..., 2)."""
+    camera = rig.cameras[rig.reference]
+    offset = (pixels - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
+    fall: Array = 1.0 / (1.0 + (offset**2).sum(axis=-1)) ** 2
+    return fall
+
+
+def light_budget(
+    rig: Rig,
+    limits: CameraConfig,
+    imaging: ImagingConfig,
+    water: WaterOptics,
+    altitude_m: float,
+    exposure_s: float,
+    spectrum: Spectrum = "planck",
+) -> LightBudget:
+    """Electrons, noise, and the gain, aperture and exposure that follow.
+
+    Args:
+        rig: with its place on the vehicle.
+        limits: lens and sensor.
+        imaging: the strobes.
+        water: of the three channels.
+        altitude_m: of the outer glass.
+        exposure_s: in which the strobes shine.
+        spectrum: of the strobes.
+    """
+    camera = rig.cameras[rig.reference]
+    w, h = float(camera.width_px), float(camera.height_px)
+    columns, rows = np.linspace(0, w, _GRID[0]), np.linspace(0, h, _GRID[1])
+    pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
+    gather = electrons_per_radiance(limits, camera.n_water, exposure_s)
+    radiance = floor_radiance(rig, imaging, water, altitude_m, pixels, spectrum)
+    electrons = radiance * lens_falloff(rig, pixels)[..., None] * gather
+    corners = electrons[[0, 0, -1, -1], [0, -1, 0, -1]]
+    corner = corners[np.argmin(corners.mean(axis=1))]
+    centre = electrons[_GRID[1] // 2, _GRID[0] // 2]
+    median, brightest = float(np.median(electrons.mean(axis=-1))), float(electrons.max())
+    half = 0.5 * limits.full_well_e
+    return LightBudget(
+        centre_e=_triple(centre),
+        corner_e=_triple(corner),
+        median_e=median,
+        brightest_e=brightest,
+        snr_centre=_triple(signal_to_noise(centre, limits.read_noise_e)),
+        snr_median=float(signal_to_noise(np.array(median), limits.read_noise_e)),
+        snr_corner=_triple(signal_to_noise(corner, limits.read_noise_e)),
+        full_share=brightest / limits.full_well_e,
+        gain_db=20.0 * math.log10(MIDDLE_GREY * limits.full_well_e / max(median, 1e-9)),
+        half_full_f_number=limits.f_number * math.sqrt(brightest / half),
+        half_full_exposure_s=exposure_s * half / max(brightest, 1e-9),
+    )
+
+
+def signal_to_noise(electrons: Array, read_noise_e: float) -> Array:
+    """Mean over standard deviation: Poisson's shot noise and the read noise."""
+    ratio: Array = electrons / np.sqrt(electrons + read_noise_e**2)
+    return ratio
+
+
+def too_dark(budget: LightBudget) -> str:
+    """What to say where the median pixel drowns in noise; empty where it does not."""
+    if budget.snr_median >= LEAST_SNR:
+        return ""
+    return f"too dark, signal to noise {budget.snr_median:.1f} of {LEAST_SNR:g}"
+
+
+def light_for_snr_e(snr: float, read_noise_e: float) -> float:
+    """Electrons that have a signal to noise: the inverse of `signal_to_noise`."""
+    return (snr**2 + math.sqrt(snr**4 + 4.0 * snr**2 * read_noise_e**2)) / 2.0
+
+
+def _triple(values: Array) -> tuple[float, float, float]:
+    red, green, blue = (float(v) for v in values)
+    return red, green, blue

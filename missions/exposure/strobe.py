@@ -1,0 +1,151 @@
+"""Strobes as electric loads: pulse, duty cycle, energy, capacitor, heat.
+
+Two arrays of 20 Cree XHP35 LEDs (Gutnik et al. 2021, section III.B), 1500 lm each. Of the LED:
+1354 lm at 1 A and 13.01 V, so 104 lm/W (measured on an XHP35.2 HI, 5000 K, by "koef3",
+budgetlightforum.com, 2024; that ALICE's give the same is inferred), junction to solder point
+1.8 K/W, junction 150 C at most, flux stated at 85 C (Cree's data sheet).
+"""
+
+import math
+from dataclasses import dataclass
+
+from alice_survey.base.config import ImagingConfig, PlanConfig
+from alice_survey.base.errors import PlanError
+from missions.exposure.conflicts import Way, conflict
+
+LEDS = 20
+EFFICACY_LM_W = 1354.0 / 13.01
+DRIVER_EFFICIENCY = 0.9
+"""Inferred: a switched LED driver."""
+LED_KELVIN_PER_WATT = 1.8
+BUS_V, BUS_SAG = 28.0, 0.10
+"""Inferred: a lithium-ion battery of 7 to 8 cells; the sag that its other loads bear."""
+HOUSING_KELVIN_PER_WATT = 0.5
+"""Inferred: 0.02 m^2 of metal in water at 100 W/(m^2 K), the low end of free convection in liquids
+(Incropera, Fundamentals of Heat and Mass Transfer, table 1.1)."""
+WARM_SEA_C, SOLDER_LIMIT_C = 30.0, 85.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class StrobeLoad:
+    """What the strobes ask of the vehicle; powers and energies are electric."""
+
+    count: int
+    pulse_s: float
+    lead_s: float
+    duty: float
+    """Share of the time for which they are lit."""
+    duty_limit: float
+    """At which an LED's solder point reaches its limit in warm water."""
+    lit_w: float
+    """Of one strobe while it is lit, at the LEDs."""
+    frame_j: float
+    """From the battery, for all strobes and one picture."""
+    mean_w: float
+    """From the battery, for all strobes."""
+    peak_a: float
+    """From the battery while all are lit, without a capacitor."""
+    capacitor_f: float
+    """That feeds one pulse of one strobe within `BUS_SAG` of `BUS_V`."""
+    solder_c: float
+    """Of the LEDs in water of `WARM_SEA_C`, in the mean."""
+    junction_c: float
+    """At most: mean of the solder point and the rise of a long pulse."""
+
+
+def strobe_load(
+    imaging: ImagingConfig, plan: PlanConfig, exposure_s: float, interval_s: float
+) -> StrobeLoad:
+    """Pulse and what it takes.
+
+    Raises:
+        PlanError: the strobes would be lit for a larger share of the time than they bear.
+    """
+    pulse_s = exposure_s + 2 * plan.strobe_lead_s
+    lit_w = imaging.strobe_lumens / EFFICACY_LM_W
+    limit = duty_limit(imaging)
+    duty = pulse_s / interval_s
+    if duty > limit:
+        raise _too_long(imaging, plan, exposure_s, interval_s, limit)
+    count = len(imaging.strobes_body_m)
+    frame_j = count * lit_w * pulse_s / DRIVER_EFFICIENCY
+    solder_c = WARM_SEA_C + HOUSING_KELVIN_PER_WATT * lit_w * duty
+    return StrobeLoad(
+        count=count,
+        pulse_s=pulse_s,
+        lead_s=plan.strobe_lead_s,
+        duty=duty,
+        duty_limit=limit,
+        lit_w=lit_w,
+        frame_j=frame_j,
+        mean_w=frame_j / interval_s,
+        peak_a=count * lit_w / DRIVER_EFFICIENCY / BUS_V,
+        capacitor_f=capacitor_f(lit_w * pulse_s / DRIVER_EFFICIENCY),
+        solder_c=solder_c,
+        junction_c=solder_c + LED_KELVIN_PER_WATT * lit_w / LEDS,
+    )
+
+
+def capacitor_f(energy_j: float, volt: float = BUS_V, sag: float = BUS_SAG) -> float:
+    """Capacity that gives an energy while its voltage falls by a share: 2 E / (V^2 - V_low^2)."""
+    return 2.0 * energy_j / (volt**2 * (1.0 - (1.0 - sag) ** 2))
+
+
+def duty_limit(imaging: ImagingConfig) -> float:
+    """Share of the time for which a strobe may be lit; all of its power counts as heat."""
+    lit_w = imaging.strobe_lumens / EFFICACY_LM_W
+    return min(1.0, (SOLDER_LIMIT_C - WARM_SEA_C) / (HOUSING_KELVIN_PER_WATT * lit_w))
+
+
+def _too_long(
+    imaging: ImagingConfig, plan: PlanConfig, exposure_s: float, interval_s: float, limit: float
+) -> PlanError:
+    """The pulse is too long for the interval."""
+    pulse_s, longest_s = exposure_s + 2 * plan.strobe_lead_s, limit * interval_s
+    ways = []
+    if longest_s > exposure_s:
+        lead_s = math.floor((longest_s - exposure_s) / 2 * 1e5) / 1e5
+        ways.append(
+            Way(
+                change=f"strobe_lead_s {lead_s:g} instead of {plan.strobe_lead_s:g}",
+                price="the strobe has less time to reach its brightness",
+                cost=1.0 - lead_s / plan.strobe_lead_s,
+            )
+        )
+    if longest_s > 2 * plan.strobe_lead_s:
+        share = (longest_s - 2 * plan.strobe_lead_s) / exposure_s
+        blur_px = math.floor(100 * plan.allowed_blur_px * share) / 100
+        ways.append(
+            Way(
+                change=f"allowed_blur_px {blur_px:g} instead of {plan.allowed_blur_px:g}",
+                price=f"{share:.2f} of the light: {-20 * math.log10(share):.1f} dB more gain",
+                cost=1.0 - share,
+            )
+        )
+    slower = pulse_s / longest_s
+    reached = 1.0 - (1.0 - plan.forward_overlap) * slower
+    if reached > 0:
+        shown = math.floor(1000 * reached) / 1000
+        ways.append(
+            Way(
+                change=f"forward_overlap {shown:g} instead of {plan.forward_overlap:g}",
+                price=f"a point is seen {1 / (1 - shown):.1f} instead of "
+                f"{1 / (1 - plan.forward_overlap):.1f} times on a line",
+                cost=1.0 - 1.0 / slower,
+            )
+        )
+    lumens = math.floor(imaging.strobe_lumens / slower / 100) * 100
+    ways.append(
+        Way(
+            change=f"strobe_lumens {lumens:g} instead of {imaging.strobe_lumens:g}",
+            price=f"{20 * math.log10(slower):.1f} dB more gain",
+            cost=1.0 - 1.0 / slower,
+        )
+    )
+    return conflict(
+        f"a strobe pulse of {pulse_s:.4f} s (exposure {exposure_s:.4f} s, lead "
+        f"{plan.strobe_lead_s:g} s) every {interval_s:.3f} s lights {pulse_s / interval_s:.0%} of "
+        f"the time; its LEDs bear {limit:.0%} in water of {WARM_SEA_C:g} C",
+        ("strobe pulse", "heat of the strobe"),
+        ways,
+    )

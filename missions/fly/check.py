@@ -1,0 +1,341 @@
+"""`alice-survey plan check`: what a dive has seen, where holes are left, and a plan for these."""
+
+import hashlib
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from alice_survey.base.artefacts import Stage, need_stage, run_stage, write_json
+from alice_survey.base.config import SurveyConfig
+from alice_survey.base.errors import PlanError, warn
+from camera_calib.rig import Rig, design_rig, read_rig
+from missions.coverage.certificate import Certificate, certificate
+from missions.coverage.dives import DiveRecord, read_dive_record
+from missions.coverage.geofiles import write_coverage_tif, write_holes
+from missions.coverage.holes import Hole, find_holes
+from missions.coverage.stations import plan_pattern, stations_of_plan
+from missions.fly.monte_carlo import MonteCarlo, monte_carlo
+from missions.values.plan_file import Plan, read_plan
+
+_LISTED = 20
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Check:
+    """A dive beside its plan."""
+
+    plan: Plan
+    rig: Rig
+    record: DiveRecord
+    planned: Certificate
+    flown: Certificate
+    holes: tuple[Hole, ...]
+    """Of what was flown, worst first."""
+
+    def to_json(self) -> dict[str, Any]:
+        """All figures: `certificate.json`."""
+        return {
+            "format": "alice-survey certificate",
+            "version": 1,
+            "plan": self.plan.name,
+            "rig": self.rig.source,
+            "dive": self.record.to_json(),
+            "planned": self.planned.to_json(),
+            "flown": self.flown.to_json(),
+            "holes_m2": round(sum(hole.area_m2 for hole in self.holes), 6),
+            "unseen_m2": round(sum(hole.unseen_m2 for hole in self.holes), 6),
+            "holes": [hole.to_json() for hole in self.holes],
+        }
+
+
+def check_flight(workspace: Path, config: SurveyConfig) -> Check:
+    """Certify the simulated flight of a workspace by its true track.
+
+    Raises:
+        WorkspaceError: there is no plan or no flight.
+    """
+    flight = need_stage(workspace, "flight", "fly")
+    return check_log(workspace, config, flight)
+
+
+def check_log(
+    workspace: Path,
+    config: SurveyConfig,
+    log: Path,
+    *,
+    triggers: Path | None = None,
+    manifest: Path | None = None,
+    threads: int = 1,
+) -> Check:
+    """Certify a dive by its log.
+
+    Args:
+        workspace: with the plan, and with `calibration/rig.json` or `images/rig.json` where the
+            cameras were calibrated; else they are as designed.
+        config: the survey, for the design of the cameras and the water.
+        log: navigation CSV, or the folder of a simulated flight.
+        triggers: CSV with the times of the pictures.
+        manifest: `images/manifest.csv` in its place.
+        threads: for large areas.
+
+    Raises:
+        WorkspaceError: there is no plan.
+        NavigationError: the log or the triggers cannot be used.
+    """
+    plan = read_plan(need_stage(workspace, "plan", "plan") / "plan.json")
+    rig = rig_of(workspace, config)
+    record = read_dive_record(log, plan, rig, triggers=triggers, manifest=manifest)
+    pattern = plan_pattern(plan, rig)
+    planned = certificate(plan.area, rig, stations_of_plan(plan), pattern, threads=threads)
+    flown = certificate(
+        plan.area, rig, record.stations, pattern, cell_m=planned.grid.cell_m, threads=threads
+    )
+    if flown.blind:
+        they = "station looks" if flown.blind == 1 else "stations look"
+        warn(f"{flown.blind} {they} past the sea floor: counted as seeing nothing")
+    return Check(
+        plan=plan, rig=rig, record=record, planned=planned, flown=flown, holes=find_holes(flown)
+    )
+
+
+def rig_of(workspace: Path, config: SurveyConfig) -> Rig:
+    """The cameras of a workspace in the survey's water: calibrated, or else as designed."""
+    for folder in ("calibration", "images"):
+        path = workspace / folder / "rig.json"
+        if path.is_file():
+            return read_rig(path).in_water(config.water.n_water)
+    return design_rig(config.camera, config.water)
+
+
+def check_report(
+    workspace: Path,
+    config: SurveyConfig,
+    log: Path | None = None,
+    *,
+    triggers: Path | None = None,
+    manifest: Path | None = None,
+    out: Path | None = None,
+    monte_carlo: int = 0,
+    threads: int | None = None,
+) -> tuple[str, dict[str, Any]]:
+    """Check a dive, write what is found, and plan the holes again.
+
+    Writes `certificate.json`, `coverage.png`, `coverage.tif`, `holes.geojson`; where holes are left
+    `refly/`, a workspace with a plan of its own; after simulated flights `hole_probability.png`.
+
+    Args:
+        workspace: as of `check_log`.
+        config: the survey.
+        log: navigation CSV or folder of a simulated flight; left out, the workspace's flight.
+        triggers: as of `check_log`.
+        manifest: as of `check_log`.
+        out: folder to write; left out, `check` in the workspace.
+        monte_carlo: fly the plan so many times in simulation, too.
+        threads: processes.
+
+    Returns:
+        A report as text, and as JSON values.
+
+    Raises:
+        AliceError: a file is missing or cannot be used.
+    """
+    from alice_survey.base.executor import default_threads
+
+    cores = default_threads() if threads is None else threads
+    if log is None and triggers is None and manifest is None:
+        check = check_flight(workspace, config)
+    else:
+        path = need_stage(workspace, "flight", "fly") if log is None else log
+        check = check_log(
+            workspace, config, path, triggers=triggers, manifest=manifest, threads=cores
+        )
+    folder = workspace / "check" if out is None else out
+    (folder / "hole_probability.png").unlink(missing_ok=True)  # of an earlier check
+    if not check.holes and (folder / "refly").exists():
+        warn(f"{folder / 'refly'} is of an earlier check: there are no holes now")
+    data = check.to_json()
+    text = _told(check)
+    again = _write_refly(folder, check, config) if check.holes else None
+    if again is not None:
+        data["refly"] = again
+        text += _told_refly(again)
+    if monte_carlo:
+        flights = _fly_often(folder, check, config, monte_carlo, cores)
+        data["monte_carlo"] = flights.to_json()
+        text += _told_flights(flights)
+    _write(folder, check, data)
+    files = "certificate.json, coverage.png, coverage.tif, holes.geojson"
+    files += ", hole_probability.png" if monte_carlo else ""
+    return f"{text}\n{folder}: {files}", {**data, "folder": str(folder)}
+
+
+def _write(folder: Path, check: Check, data: dict[str, Any]) -> None:
+    from missions.coverage.drawing import draw_certificate
+
+    folder.mkdir(parents=True, exist_ok=True)
+    write_holes(folder / "holes.geojson", check.flown, check.holes)
+    write_coverage_tif(folder / "coverage.tif", check.flown)
+    draw_certificate(
+        folder / "coverage.png", check.flown, check.holes, f"{check.plan.name}: as flown",
+        stations=check.record.stations,
+    )  # fmt: skip
+    write_json(folder / "certificate.json", data)
+
+
+def _write_refly(folder: Path, check: Check, config: SurveyConfig) -> dict[str, Any] | None:
+    """Plan the holes again, as a workspace to fly in; None where that cannot be done."""
+    from missions.exports.write import write_exports
+    from missions.fly.refly import refly_plan
+
+    refly = folder / "refly"
+    try:
+        plan = refly_plan(check.plan, config, check.rig, check.flown, check.holes)
+    except PlanError as error:
+        warn(f"the holes cannot be planned again: {error}")
+        return None
+    values = plan.to_json()
+    text = json.dumps(values, sort_keys=True)
+    stage = Stage(
+        name="plan",
+        version=1,
+        settings={
+            "camera": config.camera.model_dump(mode="json"),
+            "water": config.water.model_dump(mode="json"),
+            "refly_of": check.plan.name,
+            "plan": hashlib.blake2b(text.encode(), digest_size=16).hexdigest(),
+        },
+    )
+
+    def work(part: Path) -> None:
+        write_json(part / "plan.json", values)
+        write_exports(part / "exports", plan, check.rig)
+
+    run_stage(refly, stage, work)
+    return {
+        "folder": str(refly),
+        "lines": len(plan.lines),
+        "stations": plan.stations,
+        "dives": len(plan.dives),
+        "length_m": plan.length_m,
+        "duration_s": plan.duration_s,
+        "energy_wh": plan.energy_wh,
+        "coverage": plan.coverage,
+        "area_m2": plan.area.survey.area,
+    }
+
+
+def _fly_often(
+    folder: Path, check: Check, config: SurveyConfig, flights: int, threads: int
+) -> MonteCarlo:
+    from alice_survey.seafloor.terrain import survey_terrain
+    from missions.coverage.drawing import draw_risk
+    from missions.fly.simulation import floor_grid
+
+    floor = floor_grid(survey_terrain(config, check.plan.area.allowed_corners_ne))
+    result = monte_carlo(check.plan, config, check.rig, floor, flights, threads)
+    folder.mkdir(parents=True, exist_ok=True)
+    draw_risk(
+        folder / "hole_probability.png", check.plan.area, result.planned.grid,
+        result.hole_probability,
+        f"{check.plan.name}: holes in {flights} simulated flight{_s(flights)}",
+        _told_flights(result).strip(),
+    )  # fmt: skip
+    return result
+
+
+def _told(check: Check) -> str:
+    record, planned, flown = check.record, check.planned, check.flown
+    pattern = flown.pattern
+    pictures = pattern.passes * pattern.pictures
+    asked = f"{pattern.passes} line{_s(pattern.passes)}, {pictures} pictures of each camera"
+    rows = [
+        ("in at least one picture", planned.covered_share, flown.covered_share),
+        ("in stereo", planned.stereo_share, flown.stereo_share),
+        (f"at the overlap asked for ({asked})", planned.share_at_overlap, flown.share_at_overlap),
+    ]
+    width = max(len(name) for name, _, _ in rows)
+    altitude = record.stations.altitude_m
+    above = f", {altitude.min():.2f} to {altitude.max():.2f} m above it" if len(altitude) else ""
+    lines = [
+        f"{record.source}: {len(record.stations)} of {record.triggered} triggers over the sea "
+        f"floor{above}; triggers: {record.triggers}",
+        *(
+            f"  left out: {count} ({count / record.triggered:.1%}) {reason}"
+            for reason, count in record.left_out.items()
+        ),
+        *_told_way(record),
+        *(f"  {note}" for note in record.notes),
+        f"{check.plan.name}: {flown.area_m2:.1f} m2, cameras {', '.join(flown.cameras)} "
+        f"({check.rig.source}), judged every {100 * flown.grid.cell_m:.1f} cm",
+        f"  {'':<{width}}  {'planned':>9}  {'flown':>9}",
+        *(f"  {name:<{width}}  {a:>9.2%}  {b:>9.2%}" for name, a, b in rows),
+        f"  {'pictures':<{width}}  {planned.taken:>9}  {flown.taken:>9}",
+        f"  {'fewest pictures of a camera':<{width}}  {planned.fewest_pictures:>9}  "
+        f"{flown.fewest_pictures:>9}",
+        *_told_holes(check.holes),
+    ]
+    return "\n".join(lines)
+
+
+def _told_way(record: DiveRecord) -> list[str]:
+    if not record.on_way:
+        return []
+    return [
+        f"  on the way down and up: {record.on_way} ({record.on_way / record.triggered:.1%}), "
+        "before the first and after the last picture on a line"
+    ]
+
+
+def _told_holes(holes: Sequence[Hole]) -> list[str]:
+    if not holes:
+        return ["no holes"]
+    whole = sum(hole.area_m2 for hole in holes)
+    unseen = sum(hole.unseen_m2 for hole in holes)
+    told = [
+        f"{len(holes)} hole{_s(len(holes))}, {whole:.2f} m2 short of that overlap, of which "
+        f"{unseen:.2f} m2 in no picture; worst first:",
+        f"  {'':>3}  {'area m2':>8}  {'unseen m2':>9}  {'size m':>13}  {'latitude':>12}  "
+        f"{'longitude':>13}  {'north m':>8}  {'east m':>8}",
+    ]
+    for number, hole in enumerate(holes[:_LISTED], 1):
+        size = f"{hole.length_m:.2f} x {hole.width_m:.2f}"
+        told.append(
+            f"  {number:>3}  {hole.area_m2:>8.2f}  {hole.unseen_m2:>9.2f}  {size:>13}  "
+            f"{hole.latitude_deg:>12.7f}  {hole.longitude_deg:>13.7f}  {hole.place_ne[0]:>8.2f}  "
+            f"{hole.place_ne[1]:>8.2f}"
+        )
+    if len(holes) > _LISTED:
+        rest = sum(hole.area_m2 for hole in holes[_LISTED:])
+        told.append(f"  and {len(holes) - _LISTED} more, {rest:.2f} m2 in all (certificate.json)")
+    return told
+
+
+def _told_refly(again: dict[str, Any]) -> str:
+    return (
+        f"\nto fly the holes again: {again['lines']} line{_s(again['lines'])}, "
+        f"{again['stations']} station{_s(again['stations'])}, "
+        f"{again['length_m']:.0f} m, {again['duration_s'] / 60:.0f} min in {again['dives']} "
+        f"dive{_s(again['dives'])}; then {again['coverage']:.2%} of them are at that overlap: "
+        f"{again['folder']}"
+    )
+
+
+def _told_flights(result: MonteCarlo) -> str:
+    share = result.to_json()["share_at_overlap"]
+    seen = result.to_json()["covered_share"]
+    worst = float(result.to_json()["greatest_hole_probability"])
+    complete = result.endings.get("complete", 0)
+    return (
+        f"\n{result.flights} simulated flight{_s(result.flights)}, {complete} complete: at the "
+        f"overlap asked for {share['p50']:.2%} ({share['p05']:.2%} in the worst twentieth), in at "
+        f"least one picture {seen['p50']:.2%} ({seen['p05']:.2%});\n"
+        f"the place that is missed most is missed in "
+        f"{math.ceil(100 * worst)} % of flights"
+    )
+
+
+def _s(count: int) -> str:
+    return "" if count == 1 else "s"

@@ -1,0 +1,432 @@
+"""The paper's section VIII in simulation: one survey, flown before and after the modification.
+
+The original SPARUS II steers by line of sight with two horizontal thrusters; ALICE has two lateral
+thrusters more and holds its lines by sway. All fly the same plan in the same sea: the current and
+the gusts are drawn from a generator of their own, so that vehicles which behave differently still
+meet the same water. The followed point is the body's origin, as in the paper ("the coordinates of
+the vehicle", eq. los_heading), not the left port's glass as in `fly`.
+"""
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.base.config import SurveyConfig, changed
+from alice_survey.base.executor import parallel_map
+from alice_survey.base.frames import Array
+from alice_survey.vehicle import signals
+from alice_survey.vehicle.dynamics import GRAVITY, STATE
+from alice_survey.vehicle.floor import level_floor
+from alice_survey.vehicle.pilot.gains import gains_for
+from alice_survey.vehicle.pilot.memory import CROSS, PHASE
+from alice_survey.vehicle.pilot.settings import pilot_guidance
+from alice_survey.vehicle.propulsion import add_thrust
+from alice_survey.vehicle.simulator import Flown, Setup, simulate
+from alice_survey.vehicle.vehicle import Vehicle
+from missions.fly.flight_records import true_velocity
+from missions.fly.simulation import flight_of, longest_mission_s, mission_setup
+from missions.values.flight import Flight, rms
+from missions.values.plan_file import Plan
+
+_CHANCE, _SEA = 40, 41
+"""Streams of a seed: instruments, and the water."""
+_TRACE_STEP = 4
+"""Ticks from one point of a trace to the next."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variant:
+    """A vehicle and how it is steered."""
+
+    name: str
+    vehicle: Literal["alice", "sparus2"]
+    controller: Literal["sway", "los"]
+    look_ahead_m: float | None = None
+    """Of `los`; derived from the vehicle when left out."""
+    failed: tuple[str, ...] = ()
+    """Thrusters that are left out."""
+    equal_speeds: bool = False
+    """The allocation takes propellers to push astern as well as ahead, so that a turn is made by
+    equal and opposite speeds, as the paper tells of the original (section V)."""
+
+
+ORIGINAL, EQUAL, IMPROVED = "original", "original, equal speeds", "improved"
+COLA2_LOOK_AHEAD_M = 5.5
+"""The default of SPARUS II's own software."""
+VARIANTS = (
+    Variant(name=ORIGINAL, vehicle="sparus2", controller="los"),
+    Variant(name=EQUAL, vehicle="sparus2", controller="los", equal_speeds=True),
+    Variant(
+        name="original, 5.5 m ahead", vehicle="sparus2", controller="los",
+        look_ahead_m=COLA2_LOOK_AHEAD_M,
+    ),
+    Variant(
+        name="equal speeds, 5.5 m ahead", vehicle="sparus2", controller="los", equal_speeds=True,
+        look_ahead_m=COLA2_LOOK_AHEAD_M,
+    ),
+    Variant(
+        name="ALICE, laterals off", vehicle="alice", controller="los", failed=("bow", "stern")
+    ),
+    Variant(name="ALICE by line of sight", vehicle="alice", controller="los"),
+    Variant(name=IMPROVED, vehicle="alice", controller="sway"),
+)  # fmt: skip
+"""What is compared: the two configurations, and what their difference hangs on."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figures:
+    """What came out of one flight; NaN where there is nothing to tell.
+
+    Cross-track errors are rms, of the body's origin: "true" by the true place, "believed" by the
+    navigation's. "Route" is all the way from the first line's run-in to the last line's end, turns
+    included. A turn is counted from the end of a line to the middle of the next, since a vehicle
+    that overshoots still turns on the line; of each turn the peak is taken.
+    """
+
+    lines_true_m: float
+    lines_believed_m: float
+    route_true_m: float
+    route_believed_m: float
+    lines_worst_m: float
+    heading_rms_deg: float
+    line_roll_rms_deg: float
+    turn_roll_peak_deg: float
+    """Mean over turns."""
+    turn_roll_worst_deg: float
+    turn_surge_peak_mps: float
+    turn_surge_worst_mps: float
+    turn_speed_peak_mps: float
+    """Of the horizontal speed: surge and sway."""
+    turn_yaw_peak_deg_s: float
+    turn_torque_peak_nm: float
+    """Roll moment by propellers."""
+    turn_s: float
+    """From the end of one line to the start of the next."""
+    navigation_rms_m: float
+    survey_energy_wh: float
+    """From the run-in to the end of the last line."""
+    survey_s: float
+    complete: float
+    """1 if the mission came to its end."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Trace:
+    """A flight for drawing, every fifth of a second from the start of the route."""
+
+    time_s: Array
+    true_ne: Array
+    """(T, 2)"""
+    cross_m: Array
+    """(T,) true, to starboard of the route."""
+    roll_deg: Array
+    surge_mps: Array
+    line: Array
+    """(T,) -1 between lines."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """A sea: where its current flows, and its swell."""
+
+    current_mps: float
+    towards_deg: float
+    swell_m: float = 0.0
+    """Height of regular waves, trough to crest."""
+    swell_s: float = 6.0
+    swell_towards_deg: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """As the command line takes it."""
+        current = f"{self.current_mps:g}@{self.towards_deg:g}"
+        if self.swell_m == 0.0:
+            return current
+        return f"{current} with swell {self.swell_m:g}@{self.swell_s:g}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """One flight to be made."""
+
+    config: SurveyConfig
+    plan: Plan
+    variant: Variant
+    case: Case
+    seed: int
+    traced: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What a job gives."""
+
+    variant: str
+    case: Case
+    seed: int
+    figures: Figures
+    trace: Trace | None
+    ending: str
+    look_ahead_m: float
+
+
+def default_cases(plan: Plan) -> tuple[Case, ...]:
+    """A current across the lines, one along them, still water, and that with some swell.
+
+    The paper tells nothing of its sea. 0.1 m/s is the current that the improved controller is
+    asked to hold its lines in; 0.5 m and 6 s are a calm day on an open coast (inferred).
+    """
+    along = math.degrees(plan.lines[0].heading_rad)
+    across = round((along + 90.0) % 360.0, 6)
+    still = Case(current_mps=0.0, towards_deg=0.0)
+    return (
+        Case(current_mps=0.1, towards_deg=across),
+        Case(current_mps=0.1, towards_deg=round(along % 360.0, 6)),
+        still,
+        replace(still, swell_m=0.5, swell_s=6.0, swell_towards_deg=across),
+    )
+
+
+def fly_all(
+    config: SurveyConfig,
+    plan: Plan,
+    cases: Sequence[Case],
+    seeds: Sequence[int],
+    threads: int,
+    variants: Sequence[Variant] = VARIANTS,
+) -> Iterator[Outcome]:
+    """Fly each variant in each sea, once a seed; flights of the first seed keep their trace.
+
+    Args:
+        config: sea and instruments; its vehicle and its current's mean are not looked at.
+        plan: what to fly.
+        cases: mean currents.
+        seeds: of the water and of the instruments.
+        threads: processes.
+        variants: what flies.
+    """
+    jobs = [
+        Job(
+            config=config, plan=plan, variant=variant, case=case, seed=seed,
+            traced=seed == seeds[0],
+        )
+        for case in cases for variant in variants for seed in seeds
+    ]  # fmt: skip
+    yield from parallel_map(fly_job, jobs, threads=threads, label="flights")
+
+
+def fly_job(job: Job) -> Outcome:
+    """Make one flight."""
+    setup, flown, flight = fly_variant(job.config, job.plan, job.variant, job.case, job.seed)
+    return Outcome(
+        variant=job.variant.name,
+        case=job.case,
+        seed=job.seed,
+        figures=figures_of(flight, setup.vehicle),
+        trace=_trace(flight, flown) if job.traced else None,
+        ending=flight.ending,
+        look_ahead_m=float(setup.guidance.look_ahead_m),
+    )
+
+
+def fly_variant(
+    config: SurveyConfig, plan: Plan, variant: Variant, case: Case, seed: int
+) -> tuple[Setup, Flown, Flight]:
+    """Fly a plan by a variant, over a level sea floor."""
+    config = changed(
+        config, "vehicle", name=variant.vehicle, controller=variant.controller,
+        thruster_health=dict.fromkeys(variant.failed, 0.0),
+    )  # fmt: skip
+    config = changed(
+        config, "sea", current_mps=case.current_mps, current_towards_deg=case.towards_deg,
+        swell_m=case.swell_m, swell_period_s=case.swell_s,
+        swell_towards_deg=case.swell_towards_deg % 360.0,
+    )  # fmt: skip
+    config = changed(config, "camera", position_body_m=(0.0, 0.0, 0.0))
+    sea = config.sea.model_copy(update={"current_file": None})
+    config = config.model_copy(update={"sea": sea})
+    longest_s = longest_mission_s(plan)
+    water = np.random.default_rng([seed, _SEA])
+    floor = level_floor(plan.seafloor_depth_m)
+    setup = varied(mission_setup(plan, config, floor, longest_s, water), variant)
+    chance = np.random.default_rng([seed, _CHANCE])
+    flown = simulate(setup, chance, longest_s=longest_s, label="", sea_rng=water)
+    return setup, flown, flight_of(plan, config, setup, flown)
+
+
+def varied(setup: Setup, variant: Variant) -> Setup:
+    """A mission with the variant's look-ahead and belief."""
+    believed = with_equal_thrust(setup.vehicle) if variant.equal_speeds else setup.vehicle
+    gains = gains_for(believed.weakened(dict.fromkeys(variant.failed, 0.0)), setup.path.speed_mps)
+    guidance = pilot_guidance(
+        gains,
+        setup.path,
+        variant.controller,
+        most_depth_m=setup.guidance.limits.most_depth_m,
+        point_body_m=(0.0, 0.0, 0.0),
+        look_ahead_m=variant.look_ahead_m,
+        limits=setup.guidance.limits,
+    )
+    return replace(setup, gains=gains, guidance=guidance, believed=believed)
+
+
+def with_equal_thrust(vehicle: Vehicle) -> Vehicle:
+    """The vehicle with propellers beside the hull that push astern as they push ahead."""
+    return replace(
+        vehicle,
+        thrusters=tuple(
+            replace(t, kt_reverse=t.kt_forward, kq_reverse=t.kq_forward) if t.kind == "open" else t
+            for t in vehicle.thrusters
+        ),
+    )
+
+
+def figures_of(flight: Flight, vehicle: Vehicle) -> Figures:
+    """What came out of a flight."""
+    flown, line = flight.flown, flight.line
+    tick_s = float(flown.time_s[1] - flown.time_s[0])
+    following = flown.report[:, PHASE] == signals.FOLLOW
+    reached = np.flatnonzero(following & (line >= 0))
+    ticks = np.arange(len(line))
+    ends = (reached[0], reached[-1]) if len(reached) else (0, -1)
+    route = following & (ticks >= ends[0]) & (ticks <= ends[1])
+    true, heading = flight.line_errors
+    believed = flight.believed_cross_track
+    velocity = true_velocity(flown)
+    roll = np.abs(np.rad2deg(flight.attitude_rad[:, 0]))
+    off = flight.log.position_ned - flight.truth.ned_from_body.translation
+    turns = turn_rows(line, following)
+    speed = np.hypot(velocity[:, 0], velocity[:, 1])
+    roll_peaks, surge_peaks = _peaks(roll, turns), _peaks(velocity[:, 0], turns)
+    torque = np.abs(roll_moment(vehicle, flown, turns))
+    between = [int(np.sum(line[rows] < 0)) for rows in turns]
+    return Figures(
+        lines_true_m=rms(true),
+        lines_believed_m=rms(believed),
+        route_true_m=rms(flight.route_error[route]),
+        route_believed_m=rms(flown.report[route, CROSS]),
+        lines_worst_m=_worst(np.abs(true[~np.isnan(true)])),
+        heading_rms_deg=rms(np.rad2deg(heading)),
+        line_roll_rms_deg=rms(roll[line >= 0]),
+        turn_roll_peak_deg=_mean(roll_peaks),
+        turn_roll_worst_deg=_worst(roll_peaks),
+        turn_surge_peak_mps=_mean(surge_peaks),
+        turn_surge_worst_mps=_worst(surge_peaks),
+        turn_speed_peak_mps=_mean(_peaks(speed, turns)),
+        turn_yaw_peak_deg_s=_mean(_peaks(np.abs(np.rad2deg(velocity[:, 5])), turns)),
+        turn_torque_peak_nm=_mean(_peaks(torque, turns)),
+        turn_s=_mean(tick_s * np.array(between, np.float64)),
+        navigation_rms_m=rms(np.linalg.norm(off[route, :2], axis=1)),
+        survey_energy_wh=float(flown.power_w[route].sum()) * tick_s / 3600.0,
+        survey_s=float(route.sum()) * tick_s,
+        complete=float(flight.ending == "complete"),
+    )
+
+
+def turn_rows(line: Array, following: NDArray[np.bool_]) -> list[slice]:
+    """Ticks of each turn: from the end of a line to the middle of the next."""
+    known = np.where(following & (line >= 0), line, -1.0)
+    on = np.concatenate([[-1.0], known, [-1.0]])
+    edges = np.flatnonzero(np.diff(on) != 0)
+    runs = [
+        (int(first), int(last)) for first, last in itertools.pairwise(edges) if known[first] >= 0
+    ]
+    turns = []
+    for (_, left), (begun, ended) in itertools.pairwise(runs):
+        if begun > left and known[left - 1] != known[begun]:
+            turns.append(slice(left, (begun + ended) // 2))
+    return turns
+
+
+def roll_moment(vehicle: Vehicle, flown: Flown, turns: Sequence[slice]) -> Array:
+    """(T,) moment of the thrusters about the roll axis, N m; NaN but in turns."""
+    moment = np.full(len(flown.time_s), np.nan)
+    for rows in turns:
+        for row in range(rows.start, rows.stop):
+            moment[row] = thruster_wrench(vehicle, flown.rps[row], flown.state[row, 7:STATE])[3]
+    return moment
+
+
+def thruster_wrench(vehicle: Vehicle, rps: Array, nu: Array) -> Array:
+    """(6,) forces and moments of the thrusters at speeds (n,), at a velocity (6,)."""
+    force = np.zeros(6)
+    add_thrust(vehicle.plant.propulsion, rps, nu, force)
+    return force
+
+
+def righting_moment(vehicle: Vehicle, roll_deg: float) -> float:
+    """What holds the vehicle at a roll angle, N m."""
+    rigid = vehicle.rigid_body
+    return rigid.dry_kg * GRAVITY * rigid.cg_body_m[2] * math.sin(math.radians(roll_deg))
+
+
+def opposed_turn(vehicle: Vehicle, rate_deg_s: float) -> tuple[float, Array]:
+    """A steady turn on the spot by equal and opposite speeds of the propellers beside the hull.
+
+    Returns:
+        Their speed, rev/s, and the wrench (6,) that they make.
+    """
+    from scipy.optimize import brentq
+
+    rate = math.radians(rate_deg_s)
+    nu = np.array([0.0, 0.0, 0.0, 0.0, 0.0, rate])
+    body = vehicle.plant.body
+    needed = -(body.linear[5, 5] + body.quadratic[5, 5] * abs(rate)) * rate
+    sides = np.array(
+        [-np.sign(t.position_body_m[1]) if t.kind == "open" else 0.0 for t in vehicle.thrusters]
+    )
+    most = min(t.most_rps for t in vehicle.thrusters if t.kind == "open")
+
+    def surplus(speed: float) -> float:
+        return float(thruster_wrench(vehicle, speed * sides, nu)[5] - needed)
+
+    speed = float(brentq(surplus, 0.0, 4.0 * most))
+    return speed, thruster_wrench(vehicle, speed * sides, nu)
+
+
+def summarised(outcomes: Sequence[Outcome]) -> dict[str, dict[str, float]]:
+    """Mean and extremes of each figure over flights, and the standard deviation of two or more."""
+    columns = {
+        name: np.array([asdict(outcome.figures)[name] for outcome in outcomes])
+        for name in Figures.__dataclass_fields__
+    }
+    summary = {}
+    for name, values in columns.items():
+        summary[name] = {
+            "mean": float(values.mean()),
+            "least": float(values.min()),
+            "most": float(values.max()),
+        }
+        if len(values) > 1:
+            summary[name]["sd"] = float(values.std(ddof=1))
+    return summary
+
+
+def _trace(flight: Flight, flown: Flown) -> Trace:
+    rows = np.flatnonzero(flown.report[:, PHASE] == signals.FOLLOW)[::_TRACE_STEP]
+    first = flown.time_s[rows[0]] if len(rows) else 0.0
+    return Trace(
+        time_s=flown.time_s[rows] - first,
+        true_ne=flight.glass_ned[rows, :2],
+        cross_m=flight.route_error[rows],
+        roll_deg=np.rad2deg(flight.attitude_rad[rows, 0]),
+        surge_mps=true_velocity(flown)[rows, 0],
+        line=flight.line[rows],
+    )
+
+
+def _peaks(values: Array, turns: Sequence[slice]) -> Array:
+    return np.array([values[rows].max() for rows in turns])
+
+
+def _mean(values: Array) -> float:
+    return float(values.mean()) if len(values) else math.nan
+
+
+def _worst(values: Array) -> float:
+    return float(values.max()) if len(values) else math.nan

@@ -1,0 +1,391 @@
+"""Pictures of a flight: how near the plan it came, and what the vehicle did for it."""
+
+import itertools
+import math
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path as Path2D
+from matplotlib.transforms import ScaledTranslation
+from scipy.spatial.transform import Rotation
+from shapely.geometry import MultiPolygon
+
+from alice_survey.base.frames import Array
+from alice_survey.vehicle import signals
+from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.navigation import tick as navigation
+from alice_survey.vehicle.pilot.memory import PHASE, WANTED_SURGE
+from alice_survey.vehicle.simulator import Flown
+from missions.fly.flight_records import rpm_of, true_velocity
+from missions.fly.flight_route import whole_route
+from missions.values.flight import Flight, rms
+from missions.values.plan_file import Plan
+
+PLAN, TRUE, NAV, AREA, BAND = "#95a5a6", "#1b4f72", "#ca6f1e", "#c8553d", "#eaf2f8"
+_ROLL, _PITCH, _GRID = "#884ea0", "#229954", "#e5e8e8"
+_THRUSTERS = ("#1b4f72", "#ca6f1e", "#229954", "#884ea0", "#c0392b", "#7f8c8d")
+_ALLOWED, _HOME = "#566573", "#27ae60"
+_WAY_POINTS = 4000
+_DRAWN = 20_000
+"""Most points of a curve."""
+_SPREAD_SIGMAS = 2.0
+"""The band of the navigation error: 95 % of the time within it."""
+_PHASES = {
+    signals.DIVE: "dive",
+    signals.APPROACH: "approach",
+    signals.FOLLOW: "survey",
+    signals.ASCEND: "ascent",
+    signals.ABORT: "abort",
+}
+
+
+def draw_flight(path: Path, flight: Flight) -> None:
+    """Draw a map of plan, true track and navigation beside strips of the errors."""
+    figure, chart, strips = _sheet(6)
+    _draw_plan(chart, flight.plan)
+    some = thin(len(flight.line))
+    following = flight.flown.report[some, PHASE] == signals.FOLLOW
+    true, believed = flight.glass_ned[some, :2], flight.believed_glass_ned[some, :2]
+    for track, colour, label in (
+        (true, TRUE, "true track of the left port"),
+        (believed, NAV, "where navigation had it"),
+    ):
+        chart.plot(*_only(track, following), color=colour, lw=1.0, label=label)
+        chart.plot(*_only(track, ~following), color=colour, lw=0.7, ls=":")
+    places = np.column_stack(
+        [np.interp(flight.trigger_s, flight.truth.time_s, axis) for axis in flight.glass_ned.T]
+    )
+    chart.scatter(places[:, 1], places[:, 0], s=6, color="black", lw=0, zorder=5, label="pictures")
+    _end_chart(chart, f"{flight.plan.name}: the flight of {flight.vehicle}, {flight.ending}")
+
+    cross, heading = flight.line_errors
+    _draw_cross_track(strips[0], flight, cross)
+    _draw_attitude(strips[1:3], flight, heading)
+    _draw_altitude(strips[3], flight)
+    _draw_navigation_error(strips[4:], flight)
+    _end_strips(figure, strips, flight)
+    figure.savefig(path, dpi=120, metadata={"Software": None})
+
+
+def draw_vehicle(path: Path, flight: Flight) -> None:
+    """Draw the track, coloured by speed, beside strips of speed, roll, thrusters and power."""
+    craft = vehicle(flight.vehicle)
+    lateral = [t.name for t in craft.thrusters if abs(t.direction_body[1]) > 0.5]
+    main = [t.name for t in craft.thrusters if abs(t.direction_body[0]) > 0.5]
+    other = [t.name for t in craft.thrusters if t.name not in (*main, *lateral)]
+    groups = [group for group in (main, lateral, other) if group]
+    figure, chart, strips = _sheet(4 + len(groups))
+    velocity = true_velocity(flight.flown)
+    speed = np.hypot(velocity[:, 0], velocity[:, 1])
+    _draw_plan(chart, flight.plan)
+    _draw_speeds(figure, chart, flight, speed)
+    _end_chart(chart, f"{flight.plan.name}: {flight.vehicle} over the plan")
+
+    _draw_surge(strips[0], flight, velocity[:, 0], speed)
+    _draw_roll(strips[1], flight)
+    for axes, group in zip(strips[2:], groups, strict=False):
+        _draw_thrusters(axes, flight, group)
+    _draw_power(strips[-2], flight)
+    _draw_current(strips[-1], flight)
+    _end_strips(figure, strips, flight)
+    figure.savefig(path, dpi=120, metadata={"Software": None})
+
+
+def line_spans(flight: Flight) -> list[tuple[float, float]]:
+    """When each line was begun and left, seconds."""
+    on = np.concatenate([[-1.0], flight.line, [-1.0]])
+    edges = np.flatnonzero(np.diff(on) != 0)
+    time_s = flight.truth.time_s
+    return [
+        (float(time_s[first]), float(time_s[last - 1]))
+        for first, last in itertools.pairwise(edges)
+        if flight.line[first] >= 0
+    ]
+
+
+def true_current(flown: Flown) -> Array:
+    """(T, 2) current at the vehicle towards north and east: over ground less through the water."""
+    through = Rotation.from_quat(flown.truth[:, 3:7]).apply(flown.state[:, 7:10])
+    return np.asarray((flown.truth[:, 7:10] - through)[:, :2])
+
+
+def thin(count: int) -> slice:
+    """Every n-th of so many points, that a curve stays light."""
+    return slice(None, None, max(1, math.ceil(count / _DRAWN)))
+
+
+def draw_lines(axes: Axes, plan: Plan) -> None:
+    """The planned lines of a map, and how a map of ours looks."""
+    axes.set_aspect("equal")
+    axes.set_facecolor("#fbfcfc")
+    axes.grid(color=_GRID, lw=0.6)
+    axes.set_axisbelow(True)
+    ends = [(line.start_ne_m[::-1], line.end_ne_m[::-1]) for line in plan.lines]
+    axes.add_collection(
+        LineCollection(ends, colors=PLAN, linewidths=3.2, alpha=0.7, label="planned lines")
+    )
+    axes.set_xlabel("east, m")
+    axes.set_ylabel("north, m")
+
+
+def _sheet(strips: int) -> tuple[Figure, Axes, list[Axes]]:
+    """A picture with a map and strips that share their time."""
+    figure = Figure(figsize=(15, 9.5), facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(strips, 2, width_ratios=(1, 1.15))
+    chart = figure.add_subplot(grid[:, 0])
+    first = figure.add_subplot(grid[0, 1])
+    return figure, chart, [
+        first,
+        *(figure.add_subplot(grid[i, 1], sharex=first) for i in range(1, strips)),
+    ]  # fmt: skip
+
+
+def _draw_plan(axes: Axes, plan: Plan) -> None:
+    """Lines and ways, the survey area with its holes, where the vehicle may be, and home."""
+    draw_lines(axes, plan)
+    route = whole_route(plan)
+    way = route.places(np.linspace(0.0, route.length_m, _WAY_POINTS))
+    axes.plot(way[:, 1], way[:, 0], color=PLAN, lw=0.8, zorder=1, label="planned way")
+    area = plan.area
+    _outline(axes, area.survey, "area", edgecolor=AREA, lw=1.6, ls="--", fill=False)
+    _outline(axes, area.allowed, "may be within", edgecolor=_ALLOWED, lw=0.9, ls=":", fill=False)
+    _outline(
+        axes, area.no_go, "no-go zone", facecolor="#f5b7b1", edgecolor=AREA, hatch="xxx", alpha=0.5
+    )
+    north, east = plan.home_ne_m
+    axes.plot(east, north, "D", ms=7, mfc=_HOME, mec="white", zorder=6, ls="", label="home")
+
+
+def _outline(axes: Axes, shape: MultiPolygon, label: str, **style: Any) -> None:
+    rings = [
+        Path2D(np.asarray(ring.coords)[:, 1::-1], closed=True)
+        for polygon in shape.geoms
+        for ring in (polygon.exterior, *polygon.interiors)
+    ]
+    if rings:
+        whole = Path2D.make_compound_path(*rings)
+        axes.add_patch(PathPatch(whole, label=label, zorder=2, **style))
+
+
+def _end_chart(axes: Axes, title: str) -> None:
+    axes.set_anchor("N")
+    axes.set_title(textwrap.fill(title, 60), loc="left", fontsize=12, weight="bold")
+    axes.legend(
+        loc="upper center", bbox_to_anchor=(0.5, 0.0), borderaxespad=4.5, ncol=3, frameon=False,
+        fontsize=8,
+    )  # fmt: skip
+
+
+def _end_strips(figure: Figure, strips: list[Axes], flight: Flight) -> None:
+    """Shade the lines, name the phases, and leave the times to the last strip."""
+    spans = line_spans(flight)
+    for axes in strips:
+        for begin, end in spans:
+            axes.axvspan(begin, end, color=BAND, lw=0, zorder=0)
+        axes.grid(axis="y", color=_GRID, lw=0.5)
+        axes.margins(x=0.005)
+        axes.tick_params(labelsize=8)
+        axes.yaxis.label.set_size(8.5)
+        axes.tick_params(labelbottom=axes is strips[-1])
+    time_s = flight.truth.time_s
+    strips[-1].set_xlabel("time, s (lines shaded)", fontsize=9)
+    strips[0].set_xlim(-0.005 * time_s[-1], 1.005 * time_s[-1])
+    phase = flight.flown.report[:, PHASE]
+    begins = np.concatenate([[0], np.flatnonzero(np.diff(phase)) + 1])
+    for axes in strips:
+        for row in begins[1:]:
+            axes.axvline(time_s[row], color="#aab7b8", lw=0.7, ls="--", zorder=1)
+    ends = np.concatenate([begins[1:], [len(phase)]])
+    for first, last in zip(begins, ends, strict=True):
+        name = _PHASES.get(int(phase[first]))
+        if name is not None and last - first > 0.04 * len(phase):
+            middle = float(time_s[first] + time_s[last - 1]) / 2
+            strips[-1].annotate(
+                name, xy=(middle, 0.0), xycoords=("data", "axes fraction"), xytext=(0, 3),
+                textcoords="offset points", ha="center", fontsize=7.5, color="#34495e",
+            )  # fmt: skip
+    figure.align_ylabels(strips)
+
+
+def _legend(axes: Axes, title: str = "") -> None:
+    """Names of the curves above a strip, to the right, and a title to the left."""
+    axes.legend(
+        loc="lower right", bbox_to_anchor=(1.0, 0.95), ncol=5, fontsize=7.5, frameon=False,
+        borderaxespad=0.0, columnspacing=1.2, handlelength=1.6,
+    )  # fmt: skip
+    if title:
+        axes.set_title(title, loc="left", fontsize=8.5, pad=3)
+
+
+def _only(track: Array, rows: Array) -> tuple[Array, Array]:
+    """East and north of some rows, with gaps where others are."""
+    kept = np.where(rows[:, None], track, np.nan)
+    return kept[:, 1], kept[:, 0]
+
+
+def _draw_cross_track(axes: Axes, flight: Flight, cross: Array) -> None:
+    some = thin(len(cross))
+    t = flight.truth.time_s[some]
+    believed = flight.believed_cross_track
+    axes.plot(t, cross[some], color=TRUE, lw=1.0, label="true")
+    axes.plot(t, believed[some], color=NAV, lw=0.9, label="believed")
+    axes.axhline(0, color="#7f8c8d", lw=0.6)
+    axes.set_ylabel("cross-track, m")
+    known = not np.isnan(cross).all()
+    said = f"on lines {rms(cross):.3f} m rms true, {rms(believed):.3f} m believed"
+    _legend(axes, said if known else "no line was reached")
+
+
+def _draw_attitude(strips: list[Axes], flight: Flight, heading: Array) -> None:
+    some = thin(len(heading))
+    t = flight.truth.time_s[some]
+    attitude = np.rad2deg(flight.attitude_rad[some])
+    degrees = np.rad2deg(heading)
+    strips[0].plot(t, degrees[some], color=TRUE, lw=0.9)
+    strips[0].axhline(0, color="#7f8c8d", lw=0.6)
+    strips[0].set_ylabel("heading error, °")
+    if not np.isnan(heading).all():
+        strips[0].set_title(f"on lines {rms(degrees):.2f}° rms", loc="left", fontsize=8.5, pad=3)
+    strips[1].plot(t, attitude[:, 0], color=_ROLL, lw=0.8, label="roll")
+    strips[1].plot(t, attitude[:, 1], color=_PITCH, lw=0.8, label="pitch")
+    strips[1].axhline(0, color="#7f8c8d", lw=0.6)
+    strips[1].set_ylabel("attitude, °")
+    _legend(strips[1])
+
+
+def _draw_altitude(axes: Axes, flight: Flight) -> None:
+    some = thin(len(flight.line))
+    following = flight.flown.report[:, PHASE] == signals.FOLLOW
+    altitude, wanted = flight.log.altitude_m, flight.plan.altitude_m
+    axes.plot(flight.truth.time_s[some], altitude[some], color=NAV, lw=0.7, label="as measured")
+    axes.axhline(wanted, color=PLAN, lw=1.5, label="planned")
+    axes.set_ylabel("altitude, m")
+    off = np.abs(altitude[following] - wanted)
+    known = off[~np.isnan(off)]
+    spread = max(0.1, 1.2 * float(known.max())) if len(known) else 1.0
+    axes.set_ylim(wanted - spread, wanted + spread)
+    _legend(axes)
+
+
+def _draw_navigation_error(strips: list[Axes], flight: Flight) -> None:
+    some = thin(len(flight.line))
+    t = flight.truth.time_s[some]
+    off = flight.log.position_ned - flight.truth.ned_from_body.translation
+    columns = navigation.LOG_COLUMNS
+    for axis, (axes, name) in enumerate(zip(strips, ("north", "east"), strict=True)):
+        sigma = flight.flown.navigation[some, columns.index(f"sigma_{name}_m")]
+        band = _SPREAD_SIGMAS * sigma
+        axes.fill_between(
+            t, -band, band, color=NAV, alpha=0.18, lw=0, label=f"±{_SPREAD_SIGMAS:g} logged sigmas"
+        )
+        axes.plot(t, off[some, axis], color=TRUE, lw=1.0, label="believed less true")
+        axes.axhline(0, color="#7f8c8d", lw=0.6)
+        axes.set_ylabel(f"{name} error, m")
+    _legend(strips[0], "navigation")
+
+
+def _draw_speeds(figure: Figure, axes: Axes, flight: Flight, speed: Array) -> None:
+    some = thin(len(speed))
+    points = flight.glass_ned[some, 1::-1]
+    pieces = np.stack([points[:-1], points[1:]], axis=1)
+    most = float(np.percentile(speed, 99.5))
+    drawn = LineCollection(
+        pieces, array=speed[some][:-1], cmap="viridis", linewidths=1.6, zorder=4, clim=(0.0, most)
+    )
+    axes.add_collection(drawn)
+    axes.autoscale()
+    below = axes.transAxes + ScaledTranslation(0.0, -1.05, figure.dpi_scale_trans)
+    room = axes.inset_axes((0.15, 0.0, 0.7, 0.016), transform=below)
+    bar = figure.colorbar(drawn, cax=room, orientation="horizontal", extend="max")
+    bar.set_label("true speed over ground of the body's origin, m/s", fontsize=8)
+    room.tick_params(labelsize=8)
+
+
+def _draw_surge(axes: Axes, flight: Flight, surge: Array, speed: Array) -> None:
+    some = thin(len(speed))
+    t = flight.truth.time_s[some]
+    axes.plot(t, speed[some], color="#aab7b8", lw=0.8, label="speed over ground")
+    axes.plot(t, surge[some], color=TRUE, lw=0.9, label="surge")
+    wanted = flight.flown.report[some, WANTED_SURGE]
+    axes.plot(t, wanted, color=NAV, lw=0.9, label="wanted surge of the followed point")
+    axes.set_ylabel("speed, m/s")
+    _legend(axes)
+
+
+def _draw_roll(axes: Axes, flight: Flight) -> None:
+    some = thin(len(flight.line))
+    t = flight.truth.time_s[some]
+    roll = np.rad2deg(flight.attitude_rad[:, 0])
+    turning = (flight.flown.report[:, PHASE] == signals.FOLLOW) & (flight.line < 0)
+    in_turns = np.where(turning, roll, np.nan)
+    axes.plot(t, roll[some], color=_ROLL, lw=0.7, alpha=0.45)
+    axes.plot(t, in_turns[some], color=_ROLL, lw=1.0)
+    axes.axhline(0, color="#7f8c8d", lw=0.6)
+    axes.set_ylabel("roll, °")
+    if turning.any():
+        worst = float(np.abs(roll[turning]).max())
+        title = f"between lines {rms(in_turns):.1f}° rms, {worst:.1f}° at most"
+        axes.set_title(title, loc="left", fontsize=8.5, pad=3)
+
+
+def _draw_thrusters(axes: Axes, flight: Flight, names: list[str]) -> None:
+    """Speeds of some thrusters; their limits as dashes where these are near, else in words."""
+    some = thin(len(flight.line))
+    t = flight.truth.time_s[some]
+    speeds = rpm_of(flight.flown)
+    limits = {u.name: 60.0 * u.most_rps for u in vehicle(flight.vehicle).thrusters}
+    order = [u.name for u in vehicle(flight.vehicle).thrusters]
+    reached = max(float(np.abs(speeds[name]).max()) for name in names)
+    for name in names:
+        colour = _THRUSTERS[order.index(name) % len(_THRUSTERS)]
+        axes.plot(t, speeds[name][some], color=colour, lw=0.7, label=name, alpha=0.85)
+    limit = min(limits[name] for name in names)
+    axes.axhline(0, color="#7f8c8d", lw=0.6)
+    for end in (-limit, limit):
+        axes.axhline(end, color="#c0392b", lw=0.8, ls="--")
+    most = 1.08 * limit if reached > 0.5 * limit else max(1.15 * reached, 0.05 * limit)
+    axes.set_ylim(-most, most)
+    axes.set_ylabel("rpm")
+    _legend(axes, f"speed of thrusters, limits ±{limit:.0f}")
+
+
+def _draw_power(axes: Axes, flight: Flight) -> None:
+    flown = flight.flown
+    some = thin(len(flight.line))
+    t = flight.truth.time_s[some]
+    colours = [_THRUSTERS[i % len(_THRUSTERS)] for i in range(len(flown.thrusters))]
+    axes.stackplot(
+        t, flown.power_w[some].T, labels=flown.thrusters, colors=colours, alpha=0.75, lw=0
+    )
+    total = flown.power_w.sum(axis=1)
+    # The jerk of the first seconds would flatten the rest.
+    axes.set_ylim(0, max(1.0, 1.3 * float(np.percentile(total, 99.0))))
+    axes.set_ylabel("power, W")
+    energy = axes.twinx()
+    steps = np.diff(flight.truth.time_s, prepend=0.0)
+    energy.plot(t, (np.cumsum(total * steps) / 3600.0)[some], color="black", lw=1.2)
+    energy.set_ylim(bottom=0)
+    energy.set_ylabel("energy, Wh", fontsize=8.5)
+    energy.tick_params(labelsize=8)
+    spent = float(flown.energy_j.sum()) / 3600.0
+    said = f"electrical: {spent:.2f} Wh (line), {total.mean():.1f} W mean, {total.max():.0f} W peak"
+    _legend(axes, said)
+
+
+def _draw_current(axes: Axes, flight: Flight) -> None:
+    some = thin(len(flight.line))
+    t = flight.truth.time_s[some]
+    current = true_current(flight.flown)[some]
+    for axis, (name, colour) in enumerate((("north", TRUE), ("east", NAV))):
+        axes.plot(t, current[:, axis], color=colour, lw=1.0, label=f"towards {name}")
+    axes.axhline(0, color="#7f8c8d", lw=0.6)
+    axes.set_ylabel("current, m/s")
+    _legend(axes)

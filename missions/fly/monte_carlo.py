@@ -1,0 +1,173 @@
+"""How coverage varies from sea to sea: a plan flown again and again in simulation.
+
+Each flight draws anew the noise of the instruments and their biases, gusts, the slow change of the
+current, and where the mean current flows: all directions are alike, since the tide turns and a plan
+is made days before. Its speed and the swell stay as in the survey; so does a measured series.
+"""
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.base.config import SurveyConfig, changed
+from alice_survey.base.errors import PlanError
+from alice_survey.base.executor import parallel_map
+from alice_survey.base.frames import Array
+from alice_survey.vehicle.floor import FloorGrid
+from camera_calib.rig import Rig
+from missions.coverage.certificate import Certificate, certificate
+from missions.coverage.stations import plan_pattern, stations_of_flight, stations_of_plan
+from missions.values.plan_file import Plan
+
+_STREAM = 50
+"""Of a survey's seed; `fly` and `compare` have others."""
+_PERCENTILES = (5.0, 50.0, 95.0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MonteCarlo:
+    """What flights of one plan saw of its area."""
+
+    planned: Certificate
+    """Of the plan flown exactly, on the same grid."""
+    covered_share: Array
+    """(N,) of each flight: in at least one picture."""
+    stereo_share: Array
+    """(N,)"""
+    share_at_overlap: Array
+    """(N,)"""
+    fewest_pictures: NDArray[np.intp]
+    """(N,) of any camera that see any place."""
+    hole_probability: Array
+    """(rows, columns) share of flights that do not cover the place at the overlap asked for; NaN
+    outside of the area."""
+    endings: dict[str, int]
+    """How the flights ended, and how many so."""
+
+    @property
+    def flights(self) -> int:
+        """How many."""
+        return len(self.covered_share)
+
+    def to_json(self) -> dict[str, Any]:
+        """The figures, without the map."""
+        return {
+            "flights": self.flights,
+            "endings": self.endings,
+            "covered_share": _spread(self.covered_share),
+            "stereo_share": _spread(self.stereo_share),
+            "share_at_overlap": _spread(self.share_at_overlap),
+            "fewest_pictures_of_a_camera": _spread(self.fewest_pictures),
+            "greatest_hole_probability": float(np.nanmax(self.hole_probability)),
+            "ever_a_hole_share": float(
+                np.mean(self.hole_probability[self.planned.inside] > 0)
+            ),
+        }  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Flown:
+    """What one flight saw."""
+
+    covered_share: float
+    stereo_share: float
+    share_at_overlap: float
+    fewest_pictures: int
+    short: NDArray[np.uint8]
+    """Where the area is not covered at the overlap asked for, one bit a cell, row by row."""
+    ending: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """One flight to be made."""
+
+    plan: Plan
+    config: SurveyConfig
+    rig: Rig
+    floor: FloorGrid
+    cell_m: float
+    number: int
+
+
+def monte_carlo(
+    plan: Plan, config: SurveyConfig, rig: Rig, floor: FloorGrid, flights: int, threads: int
+) -> MonteCarlo:
+    """Fly a plan in many seas.
+
+    Args:
+        plan: what to fly, all its dives.
+        config: vehicle, sea, instruments and seed.
+        rig: the cameras, in water.
+        floor: the true sea floor.
+        flights: how many.
+        threads: processes.
+
+    Raises:
+        PlanError: no flight is asked for.
+        VehicleError: the vehicle cannot fly the plan.
+    """
+    if flights < 1:
+        raise PlanError(f"{flights} flights: choose 1 or more")
+    planned = certificate(plan.area, rig, stations_of_plan(plan), plan_pattern(plan, rig))
+    jobs = [
+        Job(plan=plan, config=config, rig=rig, floor=floor, cell_m=planned.grid.cell_m, number=n)
+        for n in range(flights)
+    ]
+    short = np.zeros(planned.grid.shape)
+    results: list[Flown] = []
+    for flown in _flown(jobs, min(threads, flights)):
+        bits = np.unpackbits(flown.short, count=short.size).reshape(short.shape)
+        short += bits
+        results.append(flown)
+    return MonteCarlo(
+        planned=planned,
+        covered_share=np.array([flown.covered_share for flown in results]),
+        stereo_share=np.array([flown.stereo_share for flown in results]),
+        share_at_overlap=np.array([flown.share_at_overlap for flown in results]),
+        fewest_pictures=np.array([flown.fewest_pictures for flown in results]),
+        hole_probability=np.where(planned.inside, short / flights, np.nan),
+        endings=dict(sorted(Counter(flown.ending for flown in results).items())),
+    )
+
+
+def fly_job(job: Job) -> Flown:
+    """Make one flight and certify it."""
+    from missions.fly.simulation import simulate_plan
+
+    rng = np.random.default_rng([job.config.seed, _STREAM, job.number])
+    towards_deg = float(rng.uniform(0.0, 360.0)) % 360.0
+    config = job.config
+    if config.sea.current_file is None:
+        config = changed(config, "sea", current_towards_deg=towards_deg)
+    flight = simulate_plan(job.plan, config, job.floor, rng, label="")
+    seen = certificate(
+        job.plan.area,
+        job.rig,
+        stations_of_flight(flight),
+        plan_pattern(job.plan, job.rig),
+        cell_m=job.cell_m,
+    )
+    return Flown(
+        covered_share=seen.covered_share,
+        stereo_share=seen.stereo_share,
+        share_at_overlap=seen.share_at_overlap,
+        fewest_pictures=seen.fewest_pictures,
+        short=np.packbits(seen.inside & ~seen.at_overlap),
+        ending=flight.ending,
+    )
+
+
+def _flown(jobs: list[Job], threads: int) -> Iterator[Flown]:
+    return parallel_map(fly_job, jobs, threads=threads, label="flights")
+
+
+def _spread(values: Array | NDArray[np.intp]) -> dict[str, float]:
+    """Least, mean and percentiles."""
+    at = np.percentile(values, _PERCENTILES)
+    named = {f"p{p:02.0f}": float(v) for p, v in zip(_PERCENTILES, at, strict=True)}
+    return {"least": float(values.min()), **named, "mean": float(values.mean())}

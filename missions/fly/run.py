@@ -1,0 +1,109 @@
+"""Fly a plan in simulation: true track, triggers, navigation log, vehicle log, bag and plots."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from alice_survey.base.artefacts import Stage, need_stage, run_stage, write_csv, write_json
+from alice_survey.base.config import SurveyConfig
+from alice_survey.base.errors import VehicleError, warn
+from alice_survey.base.executor import progress
+from alice_survey.base.trajectory import write_track
+from alice_survey.seafloor.terrain import survey_terrain
+from alice_survey.vehicle.log import write_vehicle_log
+from missions.fly.flight_plots import draw_flight, draw_vehicle
+from missions.fly.flight_records import bag_record, believed_log, flight_summary, true_log
+from missions.fly.flight_route import one_dive, stations_of_dives
+from missions.fly.simulation import floor_grid, simulate_plan
+from missions.logs.bag import write_bag
+from missions.values.flight import Flight
+from missions.values.navigation import write_navigation
+from missions.values.plan_file import read_plan
+
+_SEED_STREAM = 20
+TRIGGER_COLUMNS = ("station", "time_s", "line")
+
+
+def run_fly(workspace: Path, config: SurveyConfig, threads: int) -> bool:
+    """Stage `flight`: write triggers, navigation, vehicle logs, a bag, the truth and plots.
+
+    Returns:
+        True when work was done, False when the flight was up to date.
+
+    Raises:
+        WorkspaceError: there is no plan.
+        VehicleError: the vehicle took no picture at all; the message says why.
+    """
+    plan_path = need_stage(workspace, "plan", "plan") / "plan.json"
+    files = (config.sea.current_file, config.vehicle.coefficients_file)
+    stage = Stage(
+        name="flight",
+        version=4,
+        settings={
+            "seed": config.seed,
+            "vehicle": config.vehicle.model_dump(mode="json", exclude={"coefficients_file"}),
+            "sea": config.sea.model_dump(mode="json", exclude={"current_file"}),
+            "navigation": config.navigation.model_dump(mode="json"),
+            "seafloor": config.seafloor.model_dump(mode="json"),
+            "seafloor_depth_m": config.area.seafloor_depth_m,
+            "plan": config.plan.model_dump(mode="json"),
+            "position_body_m": list(config.camera.position_body_m),
+            "dvl_position_body_m": list(config.camera.dvl_position_body_m),
+        },
+        inputs=[plan_path, *(file for file in files if file is not None)],
+    )
+
+    def work(folder: Path) -> None:
+        for _ in progress(_steps(folder, plan_path, config), "flight files", 5):
+            pass
+
+    return run_stage(workspace, stage, work)
+
+
+def _steps(folder: Path, plan_path: Path, config: SurveyConfig) -> Iterator[str]:
+    """Write the files of a flight, and say after each step what is done."""
+    plan = one_dive(read_plan(plan_path), config.vehicle.dive)
+    planned = stations_of_dives(plan)
+    floor = floor_grid(survey_terrain(config, plan.area.allowed_corners_ne))
+    yield "sea floor"
+    rng = np.random.default_rng([config.seed, _SEED_STREAM])
+    flight = simulate_plan(plan, config, floor, rng)
+    if not len(flight.trigger_s):
+        raise VehicleError(
+            f"{config.vehicle.name} reached no line of the plan ({flight.ending} after "
+            f"{flight.truth.time_s[-1]:.0f} s): change the current, the thrusters or the plan"
+        )
+    if len(flight.trigger_s) < planned:
+        warn(
+            f"{len(flight.trigger_s)} of {planned} stations were reached: the mission "
+            f"was {flight.ending}"
+        )
+    if flight.stations_off_line:
+        warn(
+            f"{flight.stations_off_line} of {len(flight.trigger_s)} pictures were taken more than "
+            f"{flight.allowed_cross_track_m:.2f} m off their lines, where neighbouring lines may "
+            "leave gaps: choose more side_overlap, less current or another controller"
+        )
+    yield "flight"
+    write_track(folder / "truth" / "track.csv", flight.truth)
+    write_vehicle_log(folder / "truth" / "vehicle.csv", true_log(flight))
+    yield "truth"
+    _write_triggers(folder / "triggers.csv", flight)
+    write_navigation(folder / "navigation.csv", flight.log, plan.datum)
+    write_vehicle_log(folder / "vehicle.csv", believed_log(flight))
+    write_bag(folder / "bag", bag_record(flight))
+    yield "logs"
+    write_json(folder / "flight.json", flight_summary(flight, config))
+    draw_flight(folder / "track.png", flight)
+    draw_vehicle(folder / "vehicle.png", flight)
+    yield "plots"
+
+
+def _write_triggers(path: Path, flight: Flight) -> None:
+    rows = zip(flight.trigger_s.tolist(), flight.trigger_line, strict=True)
+    write_csv(
+        path,
+        TRIGGER_COLUMNS,
+        ([station, f"{time_s:.6f}", line] for station, (time_s, line) in enumerate(rows)),
+    )

@@ -1,0 +1,306 @@
+"""A plan, flown by the simulated vehicle over a sea floor."""
+
+import math
+from typing import Protocol
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.base.config import SeaConfig, SurveyConfig
+from alice_survey.base.errors import warn
+from alice_survey.base.frames import Array, rotation_from_attitude
+from alice_survey.base.trajectory import Trajectory
+from alice_survey.vehicle import signals
+from alice_survey.vehicle.floor import FloorGrid, floor_depth
+from alice_survey.vehicle.navigation import tick as navigation
+from alice_survey.vehicle.navigation.sensors import (
+    CompassSpec,
+    DvlSpec,
+    GpsSpec,
+    SensorSuite,
+    UsblSpec,
+)
+from alice_survey.vehicle.pilot.gains import gains_for
+from alice_survey.vehicle.pilot.memory import LINE, PHASE, REASON
+from alice_survey.vehicle.pilot.safety import NONE, REASONS, Limits
+from alice_survey.vehicle.pilot.settings import SPOT_RAD_S, pilot_guidance
+from alice_survey.vehicle.sea import (
+    Current,
+    Disturbance,
+    read_current,
+    sheared_current,
+    varying_current,
+)
+from alice_survey.vehicle.simulator import Flown, Setup, simulate
+from alice_survey.vehicle.stability import pitch_divergence_speed_mps
+from alice_survey.vehicle.swell import with_swell
+from missions.fly.flight_route import path_of, room_behind_m, turns_on_the_spot
+from missions.route.energy import sound_craft_of
+from missions.values.flight import Flight, trigger_times
+from missions.values.navigation import NavigationLog
+from missions.values.plan_file import Plan
+
+_FLOOR_SPACING_M = 0.1
+"""Of the grid that the DVL hears: finer than the spot of a beam."""
+_BLIND_ALTITUDES = 1.5
+"""A dive without bottom lock stops so many altitudes above the planned sea floor: half an altitude
+is left for a floor that is shallower."""
+_CLIMB_MPS = 0.1
+"""Slowest dive and ascent that a mission waits for."""
+_PATIENCE = 3.0
+"""A mission is broken off after so many times the time its plan takes."""
+_PITCH_MARGIN = 0.8
+"""Share of the speed at which pitch diverges that a plan may have without a warning (inferred)."""
+_USBL_HZ = 0.5
+"""A fix every other second: the turn-around of a modem at short range."""
+
+
+class SeaFloor(Protocol):
+    """What a flight needs to know of a sea floor."""
+
+    @property
+    def bounds_ne_m(self) -> tuple[float, float, float, float]:
+        """Least and greatest north, least and greatest east."""
+
+    def depth_at(self, points_ne: Array) -> Array:
+        """Depth, (...), at places (..., 2) within the bounds."""
+
+
+def simulate_plan(
+    plan: Plan,
+    config: SurveyConfig,
+    floor: FloorGrid,
+    rng: np.random.Generator,
+    label: str = "flight",
+) -> Flight:
+    """Fly a plan.
+
+    Args:
+        plan: what to fly.
+        config: vehicle, sea and sensors.
+        floor: the true sea floor.
+        rng: source of all noise.
+        label: what the progress bar says; there is none if it is empty.
+
+    Raises:
+        VehicleError: a setting does not fit the vehicle, or it cannot fly the plan's sway steps.
+        NavigationError: the file of the current cannot be read.
+    """
+    longest_s = longest_mission_s(plan)
+    setup = mission_setup(plan, config, floor, longest_s, rng)
+    ascent_s = plan.seafloor_depth_m / _CLIMB_MPS
+    flown = simulate(
+        setup, rng, longest_s=longest_s + ascent_s, label=label, expected_s=plan.duration_s
+    )
+    return flight_of(plan, config, setup, flown)
+
+
+def longest_mission_s(plan: Plan) -> float:
+    """After how long a mission is broken off."""
+    return _PATIENCE * (plan.duration_s + 2.0 * plan.seafloor_depth_m / _CLIMB_MPS)
+
+
+def mission_setup(
+    plan: Plan,
+    config: SurveyConfig,
+    floor: FloorGrid,
+    longest_s: float,
+    rng: np.random.Generator,
+) -> Setup:
+    """Vehicle, path, pilot, instruments and sea of a survey.
+
+    Args:
+        plan: what to fly.
+        config: vehicle, sea and sensors.
+        floor: the true sea floor.
+        longest_s: after which the vehicle gives up.
+        rng: for what is drawn once a mission.
+    """
+    craft = sound_craft_of(config.vehicle)
+    diverging_mps = pitch_divergence_speed_mps(craft)
+    if plan.speed_mps > _PITCH_MARGIN * diverging_mps:
+        warn(
+            f"the pitch of {craft.name} with {craft.coefficients.name!r} coefficients diverges "
+            f"above {diverging_mps:.2f} m/s and is badly damped at the plan's {plan.speed_mps:g} "
+            "m/s: lower the speed"
+        )
+    path = path_of(plan)
+    turns = turns_on_the_spot(path)
+    if turns and config.vehicle.controller == "los":
+        warn(
+            f"{craft.name} cannot push itself sideways under the controller los: in each of the "
+            f"{turns} turns on the spot it swings off its place and drifts with the current; "
+            "plan.turns = 'arcs' suits it better"
+        )
+    # A floor is followed down to two altitudes below the planned one.
+    deepest_m = plan.seafloor_depth_m + plan.altitude_m
+    # The pilot flies as well as the thrusters allow that he knows to be sound.
+    impaired = config.vehicle.thruster_health.impaired
+    known = impaired if config.vehicle.health_known else {}
+    gains = gains_for(craft.weakened(known), plan.speed_mps)
+    guidance = pilot_guidance(
+        gains,
+        path,
+        config.vehicle.controller,
+        most_depth_m=deepest_m,
+        point_body_m=config.camera.position_body_m,
+        spot_rad_s=min(SPOT_RAD_S, math.radians(config.plan.turn_rate_limit_deg_s)),
+        limits=Limits(
+            0.5 * plan.altitude_m,
+            deepest_m,
+            longest_s=longest_s,
+            blind_depth_m=max(plan.seafloor_depth_m - _BLIND_ALTITUDES * plan.altitude_m, 0.0),
+        ),
+    )
+    guidance = guidance._replace(
+        way_in_m=min(guidance.way_in_m, room_behind_m(plan, path, guidance.way_in_m))
+    )
+    gust, heading_rad = config.sea.gust_n, float(path.heading_rad[0] + path.side_rad[0])
+    # The vehicle is let go where its left port is above the start of the route.
+    glass_ned = rotation_from_attitude(0.0, 0.0, heading_rad).apply(config.camera.position_body_m)
+    start_ne = np.array([path.start_n[0], path.start_e[0]]) - glass_ned[:2]
+    return Setup(
+        vehicle=craft,
+        path=path,
+        guidance=guidance,
+        gains=gains,
+        sensors=sensors_of(config).pack(),
+        floor=floor,
+        current=current_of(config.sea, plan.seafloor_depth_m, longest_s, rng),
+        disturbance=Disturbance(
+            sigma=(*gust, 0.0, 0.0, 0.0), correlation_s=config.sea.gust_correlation_s
+        ),
+        exact_allocation=config.vehicle.allocation == "exact",
+        health=impaired,
+        known_health=known,
+        start_ne_m=(float(start_ne[0]), float(start_ne[1])),
+        start_heading_rad=heading_rad,
+    )
+
+
+def current_of(
+    sea: SeaConfig, seafloor_depth_m: float, duration_s: float, rng: np.random.Generator
+) -> Current:
+    """The current of a survey: measured, or as its settings have it; with its swell."""
+    current = _current_without_swell(sea, seafloor_depth_m, duration_s, rng)
+    if sea.swell_m == 0.0:
+        return current
+    return with_swell(
+        current,
+        sea.swell_m,
+        sea.swell_period_s,
+        sea.swell_towards_deg,
+        seafloor_depth_m,
+        duration_s,
+    )
+
+
+def _current_without_swell(
+    sea: SeaConfig, seafloor_depth_m: float, duration_s: float, rng: np.random.Generator
+) -> Current:
+    if sea.current_file is not None:
+        return read_current(sea.current_file)
+    surface = sea.current_mps if sea.surface_current_mps is None else sea.surface_current_mps
+    mean = sheared_current(
+        np.array([0.0, seafloor_depth_m]),
+        np.array([[speed, sea.current_towards_deg] for speed in (surface, sea.current_mps)]),
+    )
+    if sea.current_sigma_mps == 0.0:
+        return mean
+    return varying_current(mean, sea.current_sigma_mps, sea.current_correlation_s, duration_s, rng)
+
+
+def sensors_of(config: SurveyConfig) -> SensorSuite:
+    """The instruments of a survey."""
+    told = config.navigation
+    return SensorSuite(
+        gps=GpsSpec(bias_sigma_m=told.gps_bias_m, noise_m=told.gps_noise_m),
+        compass=CompassSpec(
+            bias_sigma_rad=math.radians(told.compass_bias_deg),
+            noise_rad=math.radians(told.compass_noise_deg),
+        ),
+        dvl=DvlSpec(
+            position_body_m=config.camera.dvl_position_body_m,
+            beam_noise_mps=told.dvl_noise_mps,
+            dropouts_s=told.dvl_dropouts_s,
+        ),
+        usbl=UsblSpec(rate_hz=_USBL_HZ if told.usbl else 0.0, noise_m=told.usbl_noise_m),
+        followed_body_m=config.camera.position_body_m,
+    )
+
+
+def floor_grid(floor: SeaFloor) -> FloorGrid:
+    """A sea floor on a grid for compiled code."""
+    south, north, west, east = floor.bounds_ne_m
+    inset = 1e-6
+    rows = np.arange(south + inset, north - inset, _FLOOR_SPACING_M)
+    columns = np.arange(west + inset, east - inset, _FLOOR_SPACING_M)
+    points = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1)
+    depth = np.ascontiguousarray(floor.depth_at(points))
+    return FloorGrid(float(rows[0]), float(columns[0]), _FLOOR_SPACING_M, depth)
+
+
+def flight_of(plan: Plan, config: SurveyConfig, setup: Setup, flown: Flown) -> Flight:
+    """What a mission's rows mean for its plan."""
+    glass_body = np.array(config.camera.position_body_m)
+    truth = Trajectory(
+        time_s=flown.time_s,
+        ned_from_body=RigidTransform.from_components(
+            flown.truth[:, :3], Rotation.from_quat(flown.truth[:, 3:7])
+        ),
+    )
+    log = navigation_log(flown)
+    believed = log.position_ned + rotation_from_attitude(*log.attitude_rad.T).apply(glass_body)
+    following = flown.report[:, PHASE] == signals.FOLLOW
+    line = np.where(following, flown.report[:, LINE], -1.0)
+    trigger_s, trigger_line = trigger_times(plan, flown.time_s, line, believed[:, :2])
+    reason = int(flown.report[-1, REASON])
+    if reason != NONE:
+        ending = f"aborted: {REASONS[reason]}"
+    elif flown.report[-1, PHASE] == signals.DONE:
+        ending = "complete"
+    else:
+        ending = f"broken off after {flown.time_s[-1]:.0f} s"
+    return Flight(
+        plan=plan,
+        vehicle=setup.vehicle.name,
+        truth=truth,
+        glass_ned=truth.ned_from_body.apply(glass_body),
+        altitude_m=_altitude(setup.floor, truth.ned_from_body.apply(glass_body)),
+        believed_glass_ned=believed,
+        line=line,
+        trigger_s=trigger_s,
+        trigger_line=trigger_line,
+        log=log,
+        flown=flown,
+        ending=ending,
+    )
+
+
+def _altitude(floor: FloorGrid, points_ned: Array) -> Array:
+    """Height, (T,), of places above the sea floor below them."""
+    depths = [floor_depth(floor, float(n), float(e)) for n, e in points_ned[:, :2]]
+    return np.asarray(np.array(depths) - points_ned[:, 2])
+
+
+def navigation_log(flown: Flown) -> NavigationLog:
+    """What the navigation believed, tick by tick."""
+    columns = dict(zip(navigation.LOG_COLUMNS, flown.navigation.T, strict=True))
+
+    def table(*names: str) -> Array:
+        return np.stack([columns[name] for name in names], axis=1)
+
+    def rms(*names: str) -> Array:
+        return np.asarray(np.sqrt(np.mean(table(*names) ** 2, axis=1)))
+
+    return NavigationLog(
+        time_s=flown.time_s,
+        position_ned=table("north_m", "east_m", "depth_m"),
+        attitude_rad=table("roll_rad", "pitch_rad", "heading_rad"),
+        altitude_m=columns["altitude_m"],
+        sigma_horizontal_m=rms("sigma_north_m", "sigma_east_m"),
+        sigma_depth_m=columns["sigma_depth_m"],
+        sigma_attitude_rad=rms("sigma_roll_rad", "sigma_pitch_rad"),
+        sigma_heading_rad=columns["sigma_heading_rad"],
+        sigma_altitude_m=columns["sigma_altitude_m"],
+    )

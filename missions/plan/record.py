@@ -1,0 +1,92 @@
+"""A finished plan as the files of its stage: for the next stages, for people, for vehicles."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from alice_survey.base.artefacts import write_json
+from alice_survey.base.config import SurveyConfig
+from alice_survey.base.run import progress
+from camera_calib.rig import Rig
+from missions.exports.options import Options
+from missions.exports.write import about_file, write_exports
+from missions.exposure.table import settings_table
+from missions.exposure.timetable import trigger_table, write_timetable
+from missions.plan.map import draw_plan
+from missions.plan.page import Link, write_page
+from missions.route.cost import leg_costs
+from missions.values.costs import Costs
+from missions.values.plan_file import Dive, Plan
+
+if TYPE_CHECKING:
+    from missions.plan.run import Planned
+
+_SAME_S = 1e-3
+
+
+@progress.step("write plan, maps and missions")
+def write_planned(folder: Path, planned: "Planned", config: SurveyConfig, rig: Rig) -> None:
+    """Write a plan.
+
+    Args:
+        folder: of the stage.
+        planned: the plan and what led to it.
+        config: the survey.
+        rig: its cameras in water.
+    """
+    plan = planned.plan
+    write_json(folder / "plan.json", plan.to_json())
+    write_json(folder / "certificate.json", planned.certificate.to_json())
+    table = "\n\n".join(filter(None, (settings_table(planned.rows), planned.terrain)))
+    (folder / "settings.txt").write_text(table + "\n", encoding="utf-8")
+    write_triggers(folder, plan, planned.costs, config)
+    draw_plan(folder / "map.png", plan, rig, planned.certificate, planned.bathymetry, config.sea)
+    options = Options(
+        altimeter_body_m=config.camera.dvl_position_body_m, pixel_um=config.camera.pixel_um
+    )
+    files = write_exports(folder / "exports", plan, rig, options=options)
+    write_page(
+        folder / "plan.html",
+        plan,
+        rig,
+        planned.certificate,
+        planned.rows,
+        bathymetry=planned.bathymetry,
+        sea=config.sea,
+        warnings=planned.warnings,
+        links=[Link(href=f"exports/{file.name}", about=about_file(file)) for file in files],
+    )
+
+
+def write_triggers(folder: Path, plan: Plan, costs: Costs, config: SurveyConfig) -> None:
+    """Write the time table of the trigger controller, of each dive flown as planned.
+
+    A dive's clock starts when the vehicle has reached its altitude at home; it comes to rest first.
+    """
+    for number, dive in enumerate(plan.dives, start=1):
+        name = "triggers.csv" if len(plan.dives) == 1 else f"triggers_dive{number}.csv"
+        rows = trigger_table(
+            station_times_s(plan, dive, costs),
+            plan.exposure_s,
+            plan.strobe_lead_s,
+            config.camera.shortest_interval_s,
+        )
+        write_timetable(folder / name, rows)
+
+
+def station_times_s(plan: Plan, dive: Dive, costs: Costs) -> list[float]:
+    """When pictures are taken on a dive that is flown exactly, seconds from its start.
+
+    Where a line begins at the very place where the one before has ended, one picture serves both.
+    """
+    _, took_s = leg_costs(dive.route, costs)
+    starts_s = costs.settle_s + np.concatenate([[0.0], np.cumsum(took_s)])
+    times: list[float] = []
+    for index, leg in enumerate(dive.route.legs):
+        if leg.line >= 0:
+            stations = plan.lines[leg.line].stations
+            passed = np.linspace(starts_s[index], starts_s[index + 1], stations).tolist()
+            again = bool(times) and passed[0] - times[-1] < _SAME_S
+            times += passed[1:] if again else passed
+    return times

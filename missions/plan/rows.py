@@ -1,0 +1,106 @@
+"""Rows of the printed table about lines, dives and coverage."""
+
+import math
+from collections.abc import Sequence
+
+from alice_survey.base.config import SurveyConfig
+from camera_calib.rig import Rig
+from missions.coverage.certificate import Certificate
+from missions.exposure.settings import raw_bytes
+from missions.exposure.table import Setting
+from missions.lines.sweep import Sweep
+from missions.route.energy import usable_wh
+from missions.values.plan_file import Plan
+
+_GROUP = "LINES AND DIVES"
+
+
+def plan_rows(
+    plan: Plan, seen: Certificate, sweep: Sweep | None, config: SurveyConfig, rig: Rig
+) -> tuple[Setting, ...]:
+    """What the plan comes to.
+
+    Args:
+        plan: the plan.
+        seen: its certificate.
+        sweep: how the direction of the lines was found; None where it was given.
+        config: the survey.
+        rig: its cameras.
+    """
+    return (
+        *_line_rows(plan, sweep),
+        *_dive_rows(plan, config),
+        _data_row(plan, rig),
+        *_coverage_rows(seen),
+    )
+
+
+def _line_rows(plan: Plan, sweep: Sweep | None) -> Sequence[Setting]:
+    counts = dict.fromkeys(("survey", "cross", "closing", "fill"), 0)
+    for line in plan.lines:
+        counts[line.kind] += 1
+    kinds = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
+    heading = math.degrees(plan.lines[0].heading_rad)
+    if sweep is None:
+        why, bound = "as set", "line_heading_deg"
+    else:
+        least = math.degrees(sweep.width_heading_rad) % 180.0
+        why = f"least total width along {least:.1f} deg; then turns, ways and current are counted"
+        bound = "energy"
+    return (
+        _row("area", plan.area.survey.area, "m2", "as given, with margin_m", "[area]"),
+        _row("line heading", heading, "deg", "least energy of all headings", bound, why),
+        _row("lines", len(plan.lines), "", "width / spacing", "line spacing", kinds),
+    )
+
+
+def _dive_rows(plan: Plan, config: SurveyConfig) -> Sequence[Setting]:
+    usable = usable_wh(config.vehicle)
+    longest = max(dive.energy_wh for dive in plan.dives)
+    spots = sum(1 for dive in plan.dives for leg in dive.route.legs if leg.turn_rad)
+    flown_m = sum(line.length_m for line in plan.lines)
+    vehicle = config.vehicle
+    return (
+        _row(
+            "way", plan.length_m, "m", "lines, turns, ways from home and back", "lines",
+            f"{flown_m:.0f} m on lines; {spots} turns on the spot",
+        ),
+        _row("duration", plan.duration_s / 60, "min", "way / speed + stops + dive", "speed_mps"),
+        _row(
+            "dives", len(plan.dives), "", "least number that the battery holds", "battery_wh",
+            f"the longest takes {longest:.0f} of {usable:.0f} Wh "
+            f"({vehicle.battery_reserve:.0%} of {vehicle.battery_wh:.0f} Wh are kept)",
+        ),
+        _row("energy", plan.energy_wh, "Wh", "sum of power x time", "hotel_w, drag, current"),
+    )  # fmt: skip
+
+
+def _data_row(plan: Plan, rig: Rig) -> Setting:
+    stored = raw_bytes(rig.cameras[rig.reference], len(rig.cameras), plan.stations)
+    return _row(
+        "data", stored / 1e9, "GB", "stations x cameras x pixels", "stations",
+        f"{plan.stations} stations, {plan.stations * len(rig.cameras)} pictures",
+    )  # fmt: skip
+
+
+def _coverage_rows(seen: Certificate) -> Sequence[Setting]:
+    often = seen.pattern.passes * seen.pattern.pictures
+    return (
+        _row(
+            "covered as asked", seen.share_at_overlap, "%", "union of real footprints", "lines",
+            f"by every camera on {seen.pattern.passes} line{'s'[: seen.pattern.passes > 1]} and in "
+            f"{often} pictures or more, as in an endless pattern of this spacing and step; "
+            f"{seen.covered_share:.2%} is in some picture, {seen.stereo_share:.2%} in stereo; the "
+            f"place seen least is in {seen.fewest_pictures} pictures of a camera, the mean place "
+            f"in {seen.mean_pictures:.1f} of all",
+        ),
+    )  # fmt: skip
+
+
+def _row(
+    name: str, value: float, unit: str, equation: str, bound_by: str, note: str = ""
+) -> Setting:
+    return Setting(
+        group=_GROUP, name=name, value=value, unit=unit, equation=equation,
+        source="this plan", bound_by=bound_by, note=note,
+    )  # fmt: skip

@@ -1,0 +1,163 @@
+"""A flown plan: where the left port was on each line, and when its pictures are taken."""
+
+import itertools
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from alice_survey.base.frames import Array, attitude_from_rotation
+from alice_survey.base.trajectory import Trajectory
+from alice_survey.vehicle.pilot.memory import CROSS, PATH_HEADING
+from alice_survey.vehicle.pilot.standing import STOP_M
+from alice_survey.vehicle.simulator import Flown
+from missions.values.navigation import NavigationLog
+from missions.values.plan_file import Plan
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Flight:
+    """A flown plan."""
+
+    plan: Plan
+    vehicle: str
+    """Its name."""
+    truth: Trajectory
+    """Of the body origin."""
+    glass_ned: Array
+    """(T, 3) the left port's outer glass."""
+    altitude_m: Array
+    """(T,) true, of the left port's glass above the sea floor below it."""
+    believed_glass_ned: Array
+    """(T, 3) where navigation had it."""
+    line: Array
+    """(T,) line of the plan that is being flown, -1 between lines; as the pilot believes."""
+    trigger_s: Array
+    """(S,) when each station's pictures are taken."""
+    trigger_line: tuple[int, ...]
+    """(S,) line of the plan of each station."""
+    log: NavigationLog
+    flown: Flown
+    ending: str
+    """Why the flight ended, in words."""
+
+    @cached_property
+    def attitude_rad(self) -> Array:
+        """(T, 3) true roll, pitch, heading."""
+        return attitude_from_rotation(self.truth.ned_from_body.rotation)
+
+    @cached_property
+    def line_errors(self) -> tuple[Array, Array]:
+        """How far the left port's glass and the heading truly are off the line, at each moment.
+
+        Returns:
+            Cross-track error, (T,) metres to starboard, and heading error, (T,) radians; NaN
+            between lines.
+        """
+        heading = np.full(len(self.line), np.nan)
+        for index, line in enumerate(self.plan.lines):
+            rows = self.line == index
+            turned = self.attitude_rad[rows, 2] - line.heading_rad
+            heading[rows] = np.angle(np.exp(1j * turned))
+        return self._cross_track(self.glass_ned), heading
+
+    @cached_property
+    def believed_cross_track(self) -> Array:
+        """(T,) metres: where the vehicle believed the glass to be off the line; NaN between."""
+        return self._cross_track(self.believed_glass_ned)
+
+    @cached_property
+    def believed_route_error(self) -> Array:
+        """(T,) metres: how far the pilot saw the glass to starboard of the route, turns too."""
+        return self.flown.report[:, CROSS]
+
+    @cached_property
+    def route_error(self) -> Array:
+        """(T,) metres: how far the glass truly was to starboard of the route's tangent.
+
+        The pilot's own figure, less the navigation's error across the path.
+        """
+        heading = self.flown.report[:, PATH_HEADING]
+        off = self.glass_ned - self.believed_glass_ned
+        across = off[:, 1] * np.cos(heading) - off[:, 0] * np.sin(heading)
+        return self.believed_route_error + across
+
+    @property
+    def allowed_cross_track_m(self) -> float:
+        """How far off its line a picture may be: two neighbours so far apart just meet."""
+        return 0.5 * (self.plan.footprint_m[0] - self.plan.line_spacing_m)
+
+    @cached_property
+    def stations_off_line(self) -> int:
+        """How many pictures were truly taken farther off their line than is allowed."""
+        places = np.column_stack(
+            [np.interp(self.trigger_s, self.truth.time_s, axis) for axis in self.glass_ned.T[:2]]
+        )
+        count = 0
+        for place, index in zip(places, self.trigger_line, strict=True):
+            line = self.plan.lines[index]
+            starboard = np.array([-math.sin(line.heading_rad), math.cos(line.heading_rad)])
+            count += bool(abs((place - line.start_ne_m) @ starboard) > self.allowed_cross_track_m)
+        return count
+
+    def _cross_track(self, glass_ned: Array) -> Array:
+        cross = np.full(len(self.line), np.nan)
+        for index, line in enumerate(self.plan.lines):
+            rows = self.line == index
+            off = glass_ned[rows, :2] - np.array(line.start_ne_m)
+            starboard = [-math.sin(line.heading_rad), math.cos(line.heading_rad)]
+            cross[rows] = off @ np.array(starboard)
+        return cross
+
+
+def trigger_times(
+    plan: Plan, time_s: Array, line: Array, glass_ne: Array
+) -> tuple[Array, tuple[int, ...]]:
+    """When the vehicle believes to pass each station of each line.
+
+    Args:
+        plan: its lines and stations.
+        time_s: (T,)
+        line: (T,) line being flown, -1 between lines.
+        glass_ne: (T, 2) where the vehicle believes the left port's glass to be.
+
+    Returns:
+        (S,) seconds, interpolated between ticks, and the line of each; stations that were never
+        reached are left out. One at a line's end where the vehicle stops is taken when it leaves
+        the line, since it may come to rest a little before it.
+    """
+    times: list[Array] = []
+    lines: list[int] = []
+    stopping = _stops_at_end(plan)
+    for index, planned in enumerate(plan.lines):
+        rows = np.flatnonzero(line == index)
+        if not len(rows):
+            continue
+        # The tick before the line is entered brackets its first station, the one after its last.
+        rows = np.arange(max(rows[0] - 1, 0), min(rows[-1] + 2, len(line)))
+        ahead = np.array([math.cos(planned.heading_rad), math.sin(planned.heading_rad)])
+        along = np.maximum.accumulate((glass_ne[rows] - planned.start_ne_m) @ ahead)
+        stations = np.linspace(0.0, planned.length_m, planned.stations)
+        stations = stations[stations <= along[-1] + (STOP_M if index in stopping else 0.0)]
+        # Of equal distances, while the vehicle falls back, the first counts.
+        first = np.concatenate([[True], np.diff(along) > 0])
+        times.append(np.interp(stations, along[first], time_s[rows][first]))
+        lines += [index] * len(stations)
+    return np.concatenate([np.empty(0), *times]), tuple(lines)
+
+
+def _stops_at_end(plan: Plan) -> set[int]:
+    """Lines at whose end the vehicle stops: a turn on the spot or a sway step follows at once."""
+    return {
+        leg.line
+        for dive in plan.dives
+        for leg, following in itertools.pairwise(dive.route.legs)
+        if leg.line >= 0 and (following.turn_rad != 0.0 or following.side_rad != 0.0)
+    }
+
+
+def rms(values: Array) -> float:
+    """Root mean square of what is known; NaN of nothing."""
+    known = values[~np.isnan(values)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else math.nan

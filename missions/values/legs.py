@@ -1,0 +1,194 @@
+"""The way as a value: straights, arcs, turns on the spot and sway steps.
+
+What a vehicle does at each leg, by what its fields say:
+
+- straight (`length_m` > 0, all else 0): it goes ahead along its course at the plan's speed. It
+  stops at the leg's end if a turn on the spot or a sway step follows, and starts from rest if one
+  came before; otherwise it passes both ends at speed.
+- arc (`curvature_per_m` not 0): likewise, on a circle; at most one full turn.
+- turn on the spot (`turn_rad` not 0; length, curvature and side 0): it stands at `start_ne_m`,
+  turns by `turn_rad` from `heading_rad` the way its sign says (positive to starboard), and stands
+  still again. At most half a turn.
+- sway step (`side_rad` exactly +-pi/2; curvature and turn 0): it stands, moves sideways along its
+  course at `Costs.sway_mps` with its heading held at `heading_rad + side_rad`, and stands again:
+  with +pi/2 it moves to port, with -pi/2 to starboard.
+
+`Costs.settle_s` is what each turn on the spot and each sway step takes beside its motion: braking
+before, coming to rest after, and speeding up again.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.base.frames import Array
+
+LegKind = Literal["straight", "arc", "spot", "sway"]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Leg:
+    """A straight, an arc, a turn on the spot or a sway step.
+
+    The vehicle's heading (`heading_rad + side_rad`) is continuous from leg to leg, but for full
+    turns. Its course may change at once where a turn on the spot or a sway step begins or ends:
+    there it stops.
+    """
+
+    start_ne_m: tuple[float, float]
+    heading_rad: float
+    """Of the path at its start: the course, from north."""
+    length_m: float
+    """0 of a turn on the spot."""
+    curvature_per_m: float
+    """Positive to starboard."""
+    line: int
+    """Index of the plan's line, or -1 between lines."""
+    turn_rad: float = 0.0
+    """How far the vehicle turns on the spot, positive to starboard; 0 of all other legs."""
+    side_rad: float = 0.0
+    """The vehicle's heading less the course: 0 where it goes ahead, +-pi/2 in a sway step."""
+
+    @property
+    def kind(self) -> LegKind:
+        """Which of the four it is."""
+        if self.turn_rad:
+            return "spot"
+        if self.side_rad:
+            return "sway"
+        return "arc" if self.curvature_per_m else "straight"
+
+    def places(self, along_m: Array) -> Array:
+        """Where the path is, (N, 2) north and east, after distances (N,) from the leg's start."""
+        k = self.curvature_per_m
+        turned = self.heading_rad + k * along_m / 2
+        # The chord of an arc points along its mean heading and is sinc(half the angle) as long.
+        chord = along_m * np.sinc(k * along_m / 2 / math.pi)
+        ne: Array = np.array(self.start_ne_m) + chord[:, None] * np.stack(
+            [np.cos(turned), np.sin(turned)], axis=1
+        )
+        return ne
+
+    @property
+    def end_ne_m(self) -> tuple[float, float]:
+        """Where it ends."""
+        half = self.curvature_per_m * self.length_m / 2
+        chord = self.length_m if half == 0.0 else self.length_m * math.sin(half) / half
+        mean = self.heading_rad + half
+        north, east = self.start_ne_m
+        return north + chord * math.cos(mean), east + chord * math.sin(mean)
+
+    @property
+    def end_heading_rad(self) -> float:
+        """Of the path at its end."""
+        return self.heading_rad + self.curvature_per_m * self.length_m + self.turn_rad
+
+    def to_json(self) -> dict[str, Any]:
+        """The leg as `plan.json` holds it; what is 0 or no line is left out."""
+        data: dict[str, Any] = {
+            "start_ne_m": list(self.start_ne_m),
+            "heading_rad": self.heading_rad,
+            "length_m": self.length_m,
+        }
+        rest = {
+            "curvature_per_m": self.curvature_per_m,
+            "turn_rad": self.turn_rad,
+            "side_rad": self.side_rad,
+        }
+        data |= {key: value for key, value in rest.items() if value}
+        return data | ({"line": self.line} if self.line >= 0 else {})
+
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> "Leg":
+        """The inverse of `to_json`."""
+        return cls(
+            start_ne_m=(float(data["start_ne_m"][0]), float(data["start_ne_m"][1])),
+            heading_rad=float(data["heading_rad"]),
+            length_m=float(data["length_m"]),
+            curvature_per_m=float(data.get("curvature_per_m", 0.0)),
+            line=int(data.get("line", -1)),
+            turn_rad=float(data.get("turn_rad", 0.0)),
+            side_rad=float(data.get("side_rad", 0.0)),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Route:
+    """Legs that follow one another without a gap. Places are of the left port's glass."""
+
+    legs: tuple[Leg, ...]
+
+    @cached_property
+    def starts_m(self) -> Array:
+        """(L + 1,) distance along the route at which each leg starts, and the whole length."""
+        return np.concatenate([[0.0], np.cumsum([leg.length_m for leg in self.legs])])
+
+    @property
+    def length_m(self) -> float:
+        """Of all legs."""
+        return float(self.starts_m[-1])
+
+    def places(self, along_m: Array) -> Array:
+        """Where the route is, (N, 2), at distances (N,); it goes on straight beyond its ends."""
+        result = np.empty((len(along_m), 2))
+        for leg, rows, within_m in self._by_leg(along_m):
+            result[rows] = leg.places(within_m)
+        return result
+
+    def headings_rad(self, along_m: Array) -> Array:
+        """Course of the route, (N,), at distances (N,); not wrapped within a leg."""
+        result = np.empty(len(along_m))
+        for leg, rows, within_m in self._by_leg(along_m):
+            result[rows] = leg.heading_rad + leg.curvature_per_m * within_m
+        return result
+
+    def _by_leg(self, along_m: Array) -> Iterator[tuple[Leg, NDArray[np.intp], Array]]:
+        """Each leg that is met, the indices of its distances, and these from its start."""
+        starts = self.starts_m
+        index = np.clip(np.searchsorted(starts, along_m, side="right") - 1, 0, len(self.legs) - 1)
+        order = np.argsort(index, kind="stable")
+        cuts = np.searchsorted(index[order], np.arange(len(self.legs) + 1))
+        for i, leg in enumerate(self.legs):
+            rows = order[cuts[i] : cuts[i + 1]]
+            if len(rows):
+                yield leg, rows, along_m[rows] - starts[i]
+
+    def line_starts_m(self) -> dict[int, float]:
+        """Distance along the route at which each line of the plan starts."""
+        starts = zip(self.legs, self.starts_m, strict=False)
+        return {leg.line: float(start) for leg, start in starts if leg.line >= 0}
+
+    @property
+    def spot_turns(self) -> int:
+        """How often the vehicle turns on the spot."""
+        return sum(leg.turn_rad != 0.0 for leg in self.legs)
+
+    @property
+    def sway_steps(self) -> int:
+        """How often it steps sideways."""
+        return sum(leg.side_rad != 0.0 for leg in self.legs)
+
+    @property
+    def arc_turns(self) -> int:
+        """How often it turns while going ahead: arcs in a row count once."""
+        arcs = [leg.kind == "arc" for leg in self.legs]
+        return sum(arc and not before for before, arc in zip([False, *arcs], arcs, strict=False))
+
+    def polyline_ne(self, step_m: float) -> Array:
+        """The route as places (K, 2), for maps: all ends of legs, and points on the arcs between.
+
+        Args:
+            step_m: along an arc from point to point, at most.
+        """
+        places = [np.array([leg.start_ne_m for leg in self.legs[:1]]).reshape(-1, 2)]
+        for leg in self.legs:
+            if leg.length_m == 0.0:
+                continue
+            steps = math.ceil(leg.length_m / step_m) if leg.curvature_per_m else 1
+            places.append(leg.places(leg.length_m * np.arange(1, steps + 1) / steps))
+        return np.concatenate(places)

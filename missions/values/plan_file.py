@@ -1,0 +1,168 @@
+"""The plan of a survey as a value, and `plan.json`.
+
+Altitude and all places are of the left port's outer glass.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from shapely.errors import ShapelyError
+
+from alice_survey.base.artefacts import read_json
+from alice_survey.base.contents import one_line, shown
+from alice_survey.base.errors import PlanError
+from alice_survey.base.frames import Datum
+from missions.values.area import Area
+from missions.values.legs import Leg, Route
+from missions.values.line import Line
+
+_FORMAT = {"format": "alice-survey plan", "version": 2}
+_NUMBERS = (
+    "seafloor_depth_m", "altitude_m", "speed_mps", "interval_s", "exposure_s", "line_spacing_m",
+    "station_spacing_m", "forward_overlap", "side_overlap", "turn_radius_m", "run_in_m",
+    "length_m", "duration_s", "energy_wh", "coverage",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dive:
+    """What is flown on one charge: from home along some lines and home again."""
+
+    first_line: int
+    """Index of the plan's line."""
+    last_line: int
+    """The last one that belongs to it."""
+    route: Route
+    """From home to home; lines count as in the plan."""
+    duration_s: float
+    energy_wh: float
+
+    def to_json(self) -> dict[str, Any]:
+        """The dive as `plan.json` holds it."""
+        return {
+            "first_line": self.first_line,
+            "last_line": self.last_line,
+            "duration_s": self.duration_s,
+            "energy_wh": self.energy_wh,
+            "length_m": self.route.length_m,
+            "legs": [leg.to_json() for leg in self.route.legs],
+        }
+
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> "Dive":
+        """The inverse of `to_json`."""
+        return cls(
+            first_line=int(data["first_line"]),
+            last_line=int(data["last_line"]),
+            route=Route(legs=tuple(Leg.from_json(leg) for leg in data["legs"])),
+            duration_s=float(data["duration_s"]),
+            energy_wh=float(data["energy_wh"]),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What to fly and how to take pictures; `plan.json`."""
+
+    name: str
+    area: Area
+    home_ne_m: tuple[float, float]
+    """Where the vehicle is launched and taken in."""
+    seafloor_depth_m: float
+    altitude_m: float
+    speed_mps: float
+    interval_s: float
+    exposure_s: float
+    strobe_pulse_s: float
+    strobe_lead_s: float
+    footprint_m: tuple[float, float]
+    """Across and along the track, on the middle row and column of a picture."""
+    line_spacing_m: float
+    station_spacing_m: float
+    forward_overlap: float
+    side_overlap: float
+    """As reached, of one camera's pictures, on the middle row and column."""
+    lines: tuple[Line, ...]
+    """In the order of flight."""
+    dives: tuple[Dive, ...]
+    """In the order of flight; together they fly all lines."""
+    turn_radius_m: float
+    run_in_m: float
+    length_m: float
+    """Of the ways of all dives, turns included."""
+    duration_s: float
+    energy_wh: float
+    coverage: float
+    """Share of the area that every camera sees as often as asked when the plan is flown exactly."""
+    line_depths_m: tuple[tuple[float, ...], ...] = ()
+    """Depth of the glass at each station of each line, where they follow a bathymetry; empty where
+    the glass keeps its altitude above a level sea floor."""
+    details: dict[str, Any]
+    """What else a reader may want to know; nothing is computed from it."""
+
+    @property
+    def datum(self) -> Datum:
+        """Origin of the local frame."""
+        return self.area.datum
+
+    @property
+    def stations(self) -> int:
+        """How many times all cameras take a picture."""
+        return sum(line.stations for line in self.lines)
+
+    def to_json(self) -> dict[str, Any]:
+        """The plan as `plan.json` holds it."""
+        return {
+            **_FORMAT,
+            "name": self.name,
+            "datum": {
+                "latitude_deg": self.datum.latitude_deg,
+                "longitude_deg": self.datum.longitude_deg,
+            },
+            "area": self.area.to_json(),
+            "home_ne_m": list(self.home_ne_m),
+            "strobe": {"pulse_s": self.strobe_pulse_s, "lead_s": self.strobe_lead_s},
+            "footprint_m": list(self.footprint_m),
+            **{name: getattr(self, name) for name in _NUMBERS},
+            "stations": self.stations,
+            "lines": [line.to_json() for line in self.lines],
+            "dives": [dive.to_json() for dive in self.dives],
+            **({"line_depths_m": self.line_depths_m} if self.line_depths_m else {}),
+            "details": self.details,
+        }
+
+
+def read_plan(path: Path) -> Plan:
+    """Read `plan.json`.
+
+    Raises:
+        PlanError: it is no plan, or lacks something.
+        WorkspaceError: it is missing or no JSON.
+    """
+    data = read_json(path)
+    try:
+        if {key: data[key] for key in _FORMAT} != _FORMAT:
+            raise PlanError(f"{path}: is no plan of version {_FORMAT['version']}; plan again")
+        return Plan(
+            name=str(data["name"]),
+            area=Area.from_json(data["area"], Datum(**data["datum"])),
+            home_ne_m=(float(data["home_ne_m"][0]), float(data["home_ne_m"][1])),
+            strobe_pulse_s=float(data["strobe"]["pulse_s"]),
+            strobe_lead_s=float(data["strobe"]["lead_s"]),
+            footprint_m=(float(data["footprint_m"][0]), float(data["footprint_m"][1])),
+            lines=tuple(Line.from_json(line) for line in data["lines"]),
+            dives=tuple(Dive.from_json(dive) for dive in data["dives"]),
+            line_depths_m=tuple(tuple(map(float, row)) for row in data.get("line_depths_m", ())),
+            details=dict(data["details"]),
+            **{name: float(data[name]) for name in _NUMBERS},
+        )
+    except PlanError as error:
+        named = str(error).startswith(str(path))
+        raise PlanError(str(error) if named else f"{path}: {shown(str(error))}") from None
+    except (
+        KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError,
+        RecursionError, ShapelyError,
+    ) as error:  # fmt: skip
+        what = f"lacks {one_line(error)}" if isinstance(error, KeyError) else one_line(error)
+        raise PlanError(f"{path}: {what}") from None

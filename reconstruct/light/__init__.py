@@ -1,0 +1,1 @@
+"""The light in which pictures were taken, solved from what several of them see."""

@@ -1,0 +1,426 @@
+"""Light of lamps and lens taken out of the colours, as far as overlapping pictures tell it.
+
+A lamp that travels with the camera leaves the same pattern in every picture: the model is
+`log I = log J + m(camera, place in the picture) + g(picture)`, with J what the sea floor itself
+shows. Two pictures that see one spot share J, so that their difference tells m and g without any
+assumption about the scene (the multiplicative part of Koeser et al. 2021, "Robustly removing deep
+sea lighting effects for visual mapping of abyssal plains"). What overlaps cannot tell, such as the
+fall-off across a single line, is taken from the median of all pictures, in which the scene averages
+out; it weighs the more, the more pictures there are. Along a line a lamp brighter ahead looks like
+pictures that grow darker one by one: there the pictures' own brightness tells, which the sea floor
+changes at random and a drift would not. Where overlaps speak they outweigh both.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from alice_survey.base.artefacts import read_json, write_json
+from alice_survey.base.contents import taken_from
+from alice_survey.base.frames import Array
+from alice_survey.base.run import progress
+from reconstruct.light.equations import Equations, Prior, solve_robustly
+
+GRID = (9, 11)
+"""Rows and columns of nodes over a picture, first and last on its edges."""
+LOW_WIDTH_PX = 108
+"""Width to which pictures are shrunk before their light is compared."""
+_DARKEST, _BRIGHTEST = 3.0, 250.0
+"""Grey levels beyond which a pixel tells nothing of the light."""
+_MISFIT = 0.1
+"""Difference of logarithms above which two views of a spot count less (shadow, gloss, mismatch)."""
+_NODE_SIGMA, _BEND_SIGMA, _GAIN_SIGMA = 2.0, 0.05, 0.3
+"""Expected size of m at a node, of its second difference, and of g; logarithms."""
+SAMPLES_PER_FACT = 20.0
+"""Samples of one pair of pictures that together tell as much as one independent one."""
+_ROUNDS = 6
+_FALL_OFF_SIGMA = 4.0
+"""Expected logarithm of the light lost over the middle range."""
+_SCENE_SIGMA = 0.5
+"""Spread of the sea floor's own logarithmic brightness from picture to picture."""
+_FEWEST_PICTURES = 6
+"""Of a camera, for their median to say something."""
+_LEAST_SHOWN = 0.5
+"""Of a picture's nodes, for its brightness to be known."""
+_LARGEST_GAIN = 8.0
+_WHITE_LEVEL, _WHITE_PERCENT = 215.0, 98.0
+_GREY_LEVEL = 128.0
+_NORM = 6.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LightSamples:
+    """Spots that two pictures see; arrays of N rows."""
+
+    views: NDArray[np.int32]
+    """(N, 2) numbers of the two views."""
+    places: NDArray[np.float32]
+    """(N, 2, 2) where each sees the spot: x and y over the picture's width and height."""
+    levels: NDArray[np.float32]
+    """(N, 2, 3) logarithm of the low-passed BGR levels."""
+    ranges: NDArray[np.float32] | None = None
+    """(N, 2) distances at which the views see the spots; None where they shall not count."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LightModel:
+    """What to divide colours by."""
+
+    patterns: Mapping[str, Array]
+    """Per camera (rows, columns, 3): logarithm of the light at the nodes, BGR."""
+    gains: Mapping[str, Array]
+    """Per picture (3,): logarithm of its light, BGR."""
+    white: Array
+    """(3,) factors, the same for all pictures, that take the cast of water and light away."""
+    fall_off: Array = field(default_factory=lambda: np.zeros(3))
+    """(3,) by how much the logarithm of light falls for each unit of range."""
+    fall_off_sigma: Array = field(default_factory=lambda: np.full(3, np.inf))
+    """(3,) of it."""
+    middle_range: float = 0.0
+    """Range at which patterns and gains hold."""
+
+    def factors(self, camera: str, image: str) -> NDArray[np.float32]:
+        """(rows, columns, 3) factors at the nodes that take a picture's BGR to even light."""
+        log_light = self.patterns[camera] + self.gains[image]
+        lift = np.clip(np.exp(-log_light), 1.0 / _LARGEST_GAIN, _LARGEST_GAIN)
+        return (lift * self.white).astype(np.float32)
+
+
+def low_pass(colour: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """A small blurred copy (h, w, 3) of what is valid, in which views can be compared.
+
+    Args:
+        colour: (H, W, 3).
+        valid: (H, W); what is not is left out of all averages (0 where nothing is near).
+    """
+    height, width = valid.shape
+    small = (LOW_WIDTH_PX, max(8, round(LOW_WIDTH_PX * height / width)))
+    weight = valid.astype(np.float32)
+    picture = colour.astype(np.float32) * weight[..., None]
+    total, weight = (
+        cv2.GaussianBlur(cv2.resize(p, small, interpolation=cv2.INTER_AREA), (0, 0), 1.0)
+        for p in (picture, weight)
+    )
+    low: NDArray[np.float32] = total / np.maximum(weight, 1e-3)[..., None]
+    return low
+
+
+def at_places(
+    picture: NDArray[np.float32], places: NDArray[np.float32], channels: int = 3
+) -> NDArray[np.float32]:
+    """Bilinear values (N, channels) of a picture at places (N, 2) over its width and height."""
+    height, width = picture.shape[:2]
+    x = places[:, 0] * np.float32(width) - np.float32(0.5)
+    y = places[:, 1] * np.float32(height) - np.float32(0.5)
+    picture = np.ascontiguousarray(picture, np.float32).reshape(height, width, channels)
+    found: NDArray[np.float32] = bilinear(picture, x.astype(np.float32), y.astype(np.float32))
+    return found
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def bilinear(
+    picture: NDArray[np.float32], x: NDArray[np.float32], y: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Values (N, channels) of a picture (H, W, channels) at columns and rows, edges repeated.
+
+    `cv2.remap` rounds places to 1/32 of a pixel, which shows as steps in smooth light.
+    """
+    height, width, channels = picture.shape
+    found = np.empty((len(x), channels), np.float32)
+    for n in range(len(x)):
+        u = min(max(x[n], np.float32(0.0)), np.float32(width - 1))
+        v = min(max(y[n], np.float32(0.0)), np.float32(height - 1))
+        left, top = min(int(u), width - 2), min(int(v), height - 2)
+        p, q = u - np.float32(left), v - np.float32(top)
+        for c in range(channels):
+            above = picture[top, left, c] * (1 - p) + picture[top, left + 1, c] * p
+            below = picture[top + 1, left, c] * (1 - p) + picture[top + 1, left + 1, c] * p
+            found[n, c] = above * (1 - q) + below * q
+    return found
+
+
+def compare_light(
+    views: tuple[int, int],
+    pictures: tuple[NDArray[np.float32], NDArray[np.float32]],
+    places: tuple[NDArray[np.float32], NDArray[np.float32]],
+) -> LightSamples:
+    """What two views of the same spots show.
+
+    Args:
+        views: their numbers.
+        pictures: low-passed, BGR.
+        places: (N, 2) each, where they see the spots.
+    """
+    first, second = (at_places(p, at) for p, at in zip(pictures, places, strict=True))
+    levels = np.stack([first, second], axis=1)
+    usable = ((levels > _DARKEST) & (levels < _BRIGHTEST)).all(axis=(1, 2))
+    return LightSamples(
+        views=np.broadcast_to(np.array(views, np.int32), (int(usable.sum()), 2)).copy(),
+        places=np.stack(places, axis=1)[usable],
+        levels=np.log(levels[usable]),
+    )
+
+
+def joined_samples(parts: Sequence[LightSamples]) -> LightSamples:
+    """Samples of several pairs as one; their ranges count when all parts have some."""
+    ranges = [p.ranges for p in parts if p.ranges is not None]
+    return LightSamples(
+        ranges=np.concatenate(ranges) if ranges and len(ranges) == len(parts) else None,
+        views=np.concatenate([np.empty((0, 2), np.int32), *(p.views for p in parts)]),
+        places=np.concatenate([np.empty((0, 2, 2), np.float32), *(p.places for p in parts)]),
+        levels=np.concatenate([np.empty((0, 2, 3), np.float32), *(p.levels for p in parts)]),
+    )
+
+
+@progress.step("solve the light of all pictures")
+def solve_light(
+    samples: LightSamples, nodes: Array, images: Sequence[str], cameras: Sequence[str]
+) -> LightModel:
+    """Find patterns and gains by robust least squares over all pairs of views.
+
+    Args:
+        samples: spots seen by two views.
+        nodes: (V, rows, columns, 3) logarithm of what each view shows at the nodes, BGR; NaN where
+            it shows nothing.
+        images: names of the views, by number.
+        cameras: their cameras.
+    """
+    even = solve_patterns(samples, nodes, images, cameras)
+    return replace(even, white=_white(samples, even, images, cameras))
+
+
+def solve_patterns(
+    samples: LightSamples,
+    nodes: Array,
+    images: Sequence[str],
+    cameras: Sequence[str],
+    gain_sigma: float = _GAIN_SIGMA,
+) -> LightModel:
+    """As `solve_light`, with a white of 1; the fall-off with range too where samples have it.
+
+    Args:
+        samples: see `solve_light`.
+        nodes: see `solve_light`.
+        images: see `solve_light`.
+        cameras: see `solve_light`.
+        gain_sigma: expected size of the logarithm of a picture's own light.
+    """
+    names = sorted(set(cameras))
+    camera_of = np.array([names.index(camera) for camera in cameras])
+    middle = 0.0
+    if samples.ranges is not None and len(samples.views):
+        middle = float(np.median(samples.ranges))
+    equations = _equations(samples, camera_of, len(names))
+    bends = _prior(len(names), _FALL_OFF_SIGMA / middle if middle > 0 else 1.0)
+    pull, pulled = _typical(nodes, camera_of, len(names))
+    brightness, told = _brightness(nodes, camera_of, len(names))
+    levels = samples.levels.astype(np.float64)
+    found = [
+        solve_robustly(
+            equations,
+            levels[:, 0, channel] - levels[:, 1, channel],
+            Prior(
+                patterns=bends + np.diag(pull[:, channel]),
+                right=pulled[:, channel],
+                gain=gain_sigma**-2 + told / _SCENE_SIGMA**2,
+                gain_right=brightness[:, channel] / _SCENE_SIGMA**2,
+            ),
+            _MISFIT,
+            SAMPLES_PER_FACT,
+            _ROUNDS,
+        )
+        for channel in range(3)
+    ]
+    solution = np.stack([x for x, _, _ in found], axis=1)
+    gains = np.stack([gain for _, gain, _ in found], axis=1)
+    patterns = solution[:-1].reshape(len(names), *GRID, 3)
+    patterns = patterns - patterns.mean(axis=(0, 1, 2))
+    gains = gains - gains.mean(axis=0)
+    return LightModel(
+        patterns=dict(zip(names, patterns, strict=True)),
+        gains=dict(zip(images, gains, strict=True)),
+        white=np.ones(3),
+        fall_off=solution[-1],
+        fall_off_sigma=np.sqrt([variance for _, _, variance in found]),
+        middle_range=middle,
+    )
+
+
+def _equations(samples: LightSamples, camera_of: NDArray[np.int64], cameras: int) -> Equations:
+    size = GRID[0] * GRID[1]
+    views = samples.views.astype(np.int64)
+    sides = [node_weights(samples.places[:, side]) for side in range(2)]
+    number = [nodes + size * camera_of[views[:, n]][:, None] for n, (nodes, _) in enumerate(sides)]
+    farther = np.zeros(len(views))
+    if samples.ranges is not None:
+        farther = (samples.ranges[:, 0] - samples.ranges[:, 1]).astype(np.float64)
+    pairs, pair = np.unique(np.sort(views, axis=1), axis=0, return_inverse=True)
+    return Equations(
+        nodes=np.ascontiguousarray(np.concatenate(number, axis=1)),
+        weights=np.ascontiguousarray(np.concatenate([sides[0][1], -sides[1][1]], axis=1)),
+        farther=farther,
+        views=views,
+        pair=pair.ravel().astype(np.int64),
+        pairs=pairs.reshape(-1, 2),
+        patterns=size * cameras,
+        pictures=len(camera_of),
+    )
+
+
+def node_weights(places: NDArray[np.float32]) -> tuple[NDArray[np.int64], Array]:
+    """The four nodes around each place and their bilinear weights, (N, 4) each."""
+    rows, columns = GRID
+    x = np.clip(places[:, 0].astype(np.float64), 0, 1) * (columns - 1)
+    y = np.clip(places[:, 1].astype(np.float64), 0, 1) * (rows - 1)
+    left = np.minimum(x.astype(np.int64), columns - 2)
+    top = np.minimum(y.astype(np.int64), rows - 2)
+    a, b = x - left, y - top
+    corner = top * columns + left
+    nodes = np.stack([corner, corner + 1, corner + columns, corner + columns + 1], axis=1)
+    weights = np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b], axis=1)
+    return nodes, weights
+
+
+def _prior(cameras: int, fall_off_sigma: float) -> Array:
+    """Normal matrix of smooth patterns around 0, and of a fall-off, last."""
+    rows, columns = GRID
+    number = np.arange(rows * columns).reshape(rows, columns)
+    triples = np.concatenate(
+        [
+            np.stack([number[:, :-2], number[:, 1:-1], number[:, 2:]], axis=-1).reshape(-1, 3),
+            np.stack([number[:-2], number[1:-1], number[2:]], axis=-1).reshape(-1, 3),
+        ]
+    )
+    bend = np.zeros((len(triples), rows * columns))
+    np.put_along_axis(bend, triples, np.array([[1.0, -2.0, 1.0]]) / _BEND_SIGMA, axis=1)
+    one = bend.T @ bend + np.eye(rows * columns) / _NODE_SIGMA**2
+    matrix = np.zeros((cameras * len(one) + 1,) * 2)
+    for camera in range(cameras):
+        at = slice(camera * len(one), (camera + 1) * len(one))
+        matrix[at, at] = one
+    matrix[-1, -1] = fall_off_sigma**-2
+    return matrix
+
+
+def _typical(nodes: Array, camera_of: NDArray[np.int64], cameras: int) -> tuple[Array, Array]:
+    """Weights, and weights times values, (nodes + 1, 3), of each camera's median picture."""
+    size = GRID[0] * GRID[1]
+    pull, pulled = np.zeros((size * cameras + 1, 3)), np.zeros((size * cameras + 1, 3))
+    for camera in range(cameras):
+        pictures = nodes[camera_of == camera].reshape(-1, size, 3)
+        known = np.isfinite(pictures)
+        count = known.sum(axis=0)
+        total = np.where(known, pictures, 0.0).sum(axis=1, keepdims=True)
+        relative = pictures - total / np.maximum(known.sum(axis=1, keepdims=True), 1)
+        for node in range(size):
+            for channel in range(3):
+                if count[node, channel] < _FEWEST_PICTURES:
+                    continue
+                values = relative[known[:, node, channel], node, channel]
+                weight = count[node, channel] / _SCENE_SIGMA**2
+                at = camera * size + node
+                pull[at, channel] = weight
+                pulled[at, channel] = weight * np.median(values)
+    return pull, pulled
+
+
+def _brightness(nodes: Array, camera_of: NDArray[np.int64], cameras: int) -> tuple[Array, Array]:
+    """By how much pictures are brighter than their camera's others, (V, 3); whether told, (V,).
+
+    Only nodes that a camera's pictures have in common are compared.
+    """
+    found, told = np.zeros((len(nodes), 3)), np.zeros(len(nodes))
+    for camera in range(cameras):
+        mine = np.flatnonzero(camera_of == camera)
+        pictures = nodes[mine].reshape(len(mine), -1, 3)
+        usual = np.isfinite(pictures).all(axis=2).sum(axis=0) >= _FEWEST_PICTURES
+        above = pictures[:, usual] - np.nanmedian(pictures[:, usual], axis=0)
+        shown: NDArray[np.bool_] = np.asarray(np.isfinite(above).all(axis=2))
+        count = np.count_nonzero(shown, axis=1)
+        known = np.flatnonzero(count > _LEAST_SHOWN * pictures.shape[1])
+        if len(known):
+            total = np.where(shown[..., None], above, 0.0).sum(axis=1)
+            mean = total[known] / count[known, None]
+            found[mine[known]] = mean - mean.mean(axis=0)
+            told[mine[known]] = 1.0
+    return found, told
+
+
+def at_nodes(low: NDArray[np.float32]) -> Array:
+    """Logarithm of a low-passed picture at the nodes, (rows, columns, 3); NaN where dark or burnt.
+
+    The outermost nodes take what is shown a little inside of the edge.
+    """
+    x, y = np.meshgrid(np.linspace(0.01, 0.99, GRID[1]), np.linspace(0.01, 0.99, GRID[0]))
+    places = np.column_stack([x.ravel(), y.ravel()]).astype(np.float32)
+    level = at_places(low, places).reshape(*GRID, 3).astype(np.float64)
+    usable = ((level > _DARKEST) & (level < _BRIGHTEST)).all(axis=-1, keepdims=True)
+    return np.where(usable, np.log(np.maximum(level, _DARKEST)), np.nan)
+
+
+def _white(
+    samples: LightSamples, light: LightModel, images: Sequence[str], cameras: Sequence[str]
+) -> Array:
+    """Factors that make what is bright neutral, and the survey light without burning out.
+
+    The cast is the 6-norm of each colour, between the mean (grey world, which paints a lawn
+    purple) and the largest value ("shades of gray", Finlayson & Trezzi 2004).
+    """
+    if not len(samples.views):
+        return np.ones(3)
+    first = samples.views[:, 0]
+    nodes, weights = node_weights(samples.places[:, 0])
+    level = np.empty((len(first), 3))
+    for number in np.unique(first):
+        mine = first == number
+        factors = light.factors(cameras[number], images[number]).reshape(-1, 3)
+        lift = (factors[nodes[mine]] * weights[mine][..., None]).sum(axis=1)
+        level[mine] = np.exp(samples.levels[mine, 0]) * lift
+    cast = (level**_NORM).mean(axis=0) ** (1.0 / _NORM)
+    neutral = cast.mean() / cast
+    grey = (level * neutral).mean(axis=1)
+    bright, middle = np.percentile(grey, _WHITE_PERCENT), np.median(grey)
+    white: Array = neutral * min(_WHITE_LEVEL / bright, _GREY_LEVEL / middle)
+    return white
+
+
+def write_light(path: Path, light: LightModel) -> None:
+    """Write `light.json`."""
+    write_json(
+        path,
+        {
+            "format": "alice-survey light",
+            "version": 1,
+            "channels": ["blue", "green", "red"],
+            "white": [round(float(w), 6) for w in light.white],
+            "patterns": {n: np.round(p, 5).tolist() for n, p in sorted(light.patterns.items())},
+            "gains": {n: np.round(g, 5).tolist() for n, g in sorted(light.gains.items())},
+        },
+    )
+
+
+def read_light(path: Path) -> LightModel:
+    """Read `light.json`.
+
+    Raises:
+        WorkspaceError: it is missing, or not as it was written.
+    """
+    data = read_json(path)
+    with taken_from(path):
+        light = LightModel(
+            patterns={n: np.array(p, dtype=np.float64) for n, p in data["patterns"].items()},
+            gains={n: np.array(g, dtype=np.float64) for n, g in data["gains"].items()},
+            white=np.array(data["white"], dtype=np.float64),
+        )
+        triples = [light.white, *light.gains.values()]
+        grids = list(light.patterns.values())
+        if any(t.shape != (3,) for t in triples) or any(g.shape[2:] != (3,) for g in grids):
+            raise ValueError("not of three channels")
+        if not all(np.isfinite(values).all() for values in (*triples, *grids)):
+            raise ValueError("values that are not finite")
+        return light

@@ -1,0 +1,277 @@
+"""Control of a model: known points and lengths place and scale it, or tell how right it is."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from alice_survey.base.errors import warn
+from alice_survey.base.frames import Array, Datum
+from reconstruct.placing.alignment import Similarity, align_rigid, align_similarity
+from reconstruct.placing.channels import PARAMETERS, SCALE, cross_matrices
+from reconstruct.placing.control_file import Control, KnownLength
+from reconstruct.placing.placement import Extra
+from reconstruct.placing.spots import Spot
+
+_DOUBTFUL_SIGMAS = 4.0
+_LEAST_SPREAD = 1e-3
+"""Points this close to one line, over their length, do not say how the model is turned about it."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Tie:
+    """A known point and where the model has it."""
+
+    name: str
+    use: str
+    spot: Spot
+    ned: Array
+    sigma: Array
+    """(3,) of `ned`."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Bar:
+    """A known length and the model's points that span it."""
+
+    name: str
+    use: str
+    pairs: tuple[tuple[Spot, Spot], ...]
+    """One for a bar; the four sides of a marker."""
+    known: KnownLength
+
+    @property
+    def in_model(self) -> float:
+        """Mean length in the model."""
+        return float(np.mean([np.linalg.norm(b.model - a.model) for a, b in self.pairs]))
+
+    @property
+    def sigma_in_model(self) -> float:
+        """By the picks."""
+        squares = []
+        for a, b in self.pairs:
+            way = (b.model - a.model) / np.linalg.norm(b.model - a.model)
+            squares.append(float(way @ (a.covariance + b.covariance) @ way))
+        return float(np.sqrt(np.sum(squares)) / len(self.pairs))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ControlFit:
+    """Control that the model shows."""
+
+    ties: tuple[_Tie, ...]
+    bars: tuple[_Bar, ...]
+    lost: Mapping[str, str]
+    """Why others are of no use, by name."""
+
+    @property
+    def used_points(self) -> tuple[_Tie, ...]:
+        """Those that place the model."""
+        return tuple(t for t in self.ties if t.use == "control")
+
+    @property
+    def used_bars(self) -> tuple[_Bar, ...]:
+        """Those that scale the model."""
+        return tuple(b for b in self.bars if b.use == "control")
+
+    @property
+    def informs(self) -> bool:
+        """Whether anything is used."""
+        return bool(self.used_points or self.used_bars)
+
+    @property
+    def informs_scale(self) -> bool:
+        """Whether the scale is seen."""
+        return len(self.used_points) > 1 or bool(self.used_bars)
+
+    def equations(self, place: Similarity, middle: Array) -> Extra:
+        """White equations of what is used, for `georeference.fit_navigation`."""
+        misfits, rows = [np.zeros(0)], [np.zeros((0, PARAMETERS))]
+        turn = place.rotation.as_matrix()
+        for tie in self.used_points:
+            at = place.apply(tie.spot.model[None])[0]
+            spread = place.scale**2 * turn @ tie.spot.covariance @ turn.T + np.diag(tie.sigma**2)
+            white = np.linalg.inv(np.linalg.cholesky(spread))
+            jacobian = np.zeros((3, PARAMETERS))
+            jacobian[:, :3] = -cross_matrices((at - middle)[None])[0]
+            jacobian[:, 3:6] = np.eye(3)
+            jacobian[:, SCALE] = at - middle
+            misfits.append(white @ (at - tie.ned))
+            rows.append(white @ jacobian)
+        for bar in self.used_bars:
+            factor, sigma = _log_factor(bar)
+            jacobian = np.zeros((1, PARAMETERS))
+            jacobian[0, SCALE] = 1.0 / sigma
+            misfits.append(np.array([(np.log(place.scale) - factor) / sigma]))
+            rows.append(jacobian)
+        return Extra(misfit=np.concatenate(misfits), jacobian=np.concatenate(rows))
+
+    def start(self, known_scale: float | None) -> Similarity | None:
+        """A first placement from the points alone; None where fewer than three, or on a line."""
+        ties = self.used_points
+        if len(ties) < 3:
+            return None
+        model, ned = np.stack([t.spot.model for t in ties]), np.stack([t.ned for t in ties])
+        spread = np.linalg.svd(ned - ned.mean(axis=0), compute_uv=False)
+        if spread[1] < _LEAST_SPREAD * spread[0]:
+            return None
+        if known_scale is None:
+            return align_similarity(model, ned)
+        rigid = align_rigid(known_scale * model, ned)
+        return Similarity(scale=known_scale, rotation=rigid.rotation, translation=rigid.translation)
+
+    def bar_scale(
+        self, known_scale: float | None, scale_sigma: float
+    ) -> tuple[float, float] | None:
+        """Scale from bars (and the known one, weighted) and its relative sigma; None without."""
+        told = [_log_factor(bar) for bar in self.used_bars]
+        if not told:
+            return None
+        if known_scale is not None:
+            told.append((float(np.log(known_scale)), scale_sigma))
+        weights = np.array([sigma**-2 for _, sigma in told])
+        mean = float(weights @ np.array([factor for factor, _ in told]) / weights.sum())
+        return float(np.exp(mean)), float(weights.sum() ** -0.5)
+
+    def score(self, place: Similarity, *, located: bool) -> dict[str, Any]:
+        """What `control.json` says of a placed model.
+
+        Args:
+            place: `world_from_model`, metres.
+            located: whether the world is the one in which the points are known.
+        """
+        points = [_score_point(tie, place) for tie in self.ties] if located else []
+        bars = [_score_bar(bar, place.scale) for bar in self.bars]
+        for row in (*points, *bars):
+            if row["use"] == "control" and row["misfit_sigmas"] > _DOUBTFUL_SIGMAS:
+                warn(
+                    f"control {row['name']} is {row['misfit_sigmas']:.1f} sigmas off the model: "
+                    "check its coordinates and picks, or set use to check"
+                )
+        return {
+            "format": "alice-survey control",
+            "version": 1,
+            "points": points,
+            "bars": bars,
+            "not_found": dict(self.lost),
+            "rms": {
+                use: {
+                    **_rms_points([p for p in points if p["use"] == use]),
+                    **_rms_bars([b for b in bars if b["use"] == use]),
+                }
+                for use in ("control", "check")
+            },
+        }
+
+
+def tie_control(
+    control: Control, spots: Mapping[str, Spot], lost: Mapping[str, str], datum: Datum | None
+) -> ControlFit:
+    """Bring together what is known and what the model shows."""
+    missing, ties, bars = dict(lost), [], []
+    for point in control.points:
+        if point.name not in spots:
+            missing.setdefault(point.name, "not picked in any picture")
+            continue
+        sigma = np.array([point.sigma_m, point.sigma_m, point.sigma_vertical_m])
+        ties.append(
+            _Tie(
+                name=point.name,
+                use=point.use,
+                spot=spots[point.name],
+                ned=point.ned(datum),
+                sigma=sigma,
+            )
+        )
+    for length in control.lengths:
+        names = [length.ends] if length.ends else _sides(length.name)
+        absent = sorted({n for pair in names for n in pair} - set(spots))
+        if absent:
+            missing.setdefault(length.name, f"{', '.join(absent)} not found in the pictures")
+            continue
+        pairs = tuple((spots[a], spots[b]) for a, b in names)
+        bars.append(_Bar(name=length.name, use=length.use, pairs=pairs, known=length))
+    return ControlFit(ties=tuple(ties), bars=tuple(bars), lost=missing)
+
+
+def _sides(marker: str) -> list[tuple[str, str]]:
+    """The corners at the ends of a marker's four sides."""
+    return [(f"{marker}.{k}", f"{marker}.{(k + 1) % 4}") for k in range(4)]
+
+
+def describe(score: Mapping[str, Any]) -> str:
+    """The score in a few lines."""
+    lines = []
+    for use, words in (("control", "used"), ("check", "held out")):
+        rms = score["rms"][use]
+        if rms["points"]:
+            lines.append(
+                f"{rms['points']} points {words}: rms north {1e3 * rms['north_m']:.1f}, east "
+                f"{1e3 * rms['east_m']:.1f}, down {1e3 * rms['down_m']:.1f} mm"
+            )
+        if rms["bars"]:
+            lines.append(
+                f"{rms['bars']} lengths {words}: rms {1e3 * rms['length_m']:.2f} mm, "
+                f"{100 * rms['length_relative']:.3f} %"
+            )
+    lines += [f"{name}: {why}" for name, why in score["not_found"].items()]
+    return "\n".join(lines) if lines else "no control was found in the pictures"
+
+
+def _log_factor(bar: _Bar) -> tuple[float, float]:
+    """Logarithm of the scale that a bar tells, and its sigma."""
+    relative = np.hypot(bar.known.sigma_m / bar.known.length_m, bar.sigma_in_model / bar.in_model)
+    return float(np.log(bar.known.length_m / bar.in_model)), float(relative)
+
+
+def _score_point(tie: _Tie, place: Similarity) -> dict[str, Any]:
+    miss = place.apply(tie.spot.model[None])[0] - tie.ned
+    turn = place.rotation.as_matrix()
+    spread = place.scale**2 * turn @ tie.spot.covariance @ turn.T
+    sigmas = np.sqrt(np.diag(spread) + tie.sigma**2)
+    return {
+        "name": tie.name,
+        "use": tie.use,
+        "views": tie.spot.views,
+        "left_out": list(tie.spot.left_out),
+        "reprojection_px": tie.spot.rms_px,
+        "north_m": float(miss[0]),
+        "east_m": float(miss[1]),
+        "down_m": float(miss[2]),
+        "sigma_picks_m": float(np.sqrt(np.trace(spread))),
+        "misfit_sigmas": float(np.abs(miss / sigmas).max()),
+    }
+
+
+def _score_bar(bar: _Bar, scale: float) -> dict[str, Any]:
+    length = scale * bar.in_model
+    miss = length - bar.known.length_m
+    sigma = float(np.hypot(bar.known.sigma_m, scale * bar.sigma_in_model))
+    return {
+        "name": bar.name,
+        "use": bar.use,
+        "length_m": length,
+        "known_m": bar.known.length_m,
+        "error_m": miss,
+        "error_relative": miss / bar.known.length_m,
+        "sigma_picks_m": scale * bar.sigma_in_model,
+        "misfit_sigmas": abs(miss) / sigma,
+    }
+
+
+def _rms(values: Sequence[float]) -> float | None:
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
+
+
+def _rms_points(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    axes = ("north_m", "east_m", "down_m")
+    return {"points": len(rows), **{axis: _rms([row[axis] for row in rows]) for axis in axes}}
+
+
+def _rms_bars(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    return {
+        "bars": len(rows),
+        "length_m": _rms([row["error_m"] for row in rows]),
+        "length_relative": _rms([row["error_relative"] for row in rows]),
+    }

@@ -1,0 +1,139 @@
+"""Errors that last: a Markov process with exponential correlation, in linear time.
+
+The error of a channel of navigation, over its stated sigma, is taken as
+`u = sqrt(1 - w) m + sqrt(w) n`: m a first-order Gauss-Markov process of unit variance that keeps
+`exp(-dt / tau)` of itself (Uhlenbeck & Ornstein 1930), n white. Where the sigma changes, m keeps
+the lesser over the greater of the two sigmas besides: an error in metres neither grows with a sigma
+that grows (drift is added to it) nor shrinks in proportion (the errors before and after the update
+of an optimal filter covary by the variance after it). The covariance matrix K of all values is
+dense, but a scalar Kalman filter turns values into innovations, which are white: the same as a
+multiplication by the inverse of K's Cholesky factor, in one pass (Kailath 1968).
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from alice_survey.base.frames import Array
+
+LEAST_WHITE = 1e-4
+"""Share of white error that two readings at the same moment need to have any innovation."""
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _kept(time: Array, sigma: Array, i: int, j: int, tau: float) -> float:
+    """Correlation of the lasting parts of two neighbours."""
+    lesser, greater = min(sigma[i], sigma[j]), max(sigma[i], sigma[j])
+    kept: float = math.exp(-abs(time[j] - time[i]) / tau) * lesser / greater
+    return kept
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def whiten(
+    time: Array, sigma: Array, used: NDArray[np.bool_], values: Array, tau: float, white: float
+) -> tuple[Array, float]:
+    """Make columns of correlated values of unit variance white.
+
+    Args:
+        time: (N,) not decreasing.
+        sigma: (N,) of the values before they were divided by it.
+        used: (N,) what is there; the rest is passed over as a gap.
+        values: (N, P) columns, each over its sigma.
+        tau: time in which the correlation falls to 1/e, above 0.
+        white: share w of the variance that is white, `LEAST_WHITE` to 1.
+
+    Returns:
+        (N, P) innovations over their standard deviation, zero where not used, and the logarithm of
+        the determinant of the covariance matrix of what is used.
+    """
+    count, columns = values.shape
+    found = np.zeros((count, columns))
+    state = np.zeros(columns)
+    gain_in = math.sqrt(1.0 - white)
+    variance, log_det, last = 1.0, 0.0, -1
+    for i in range(count):
+        if not used[i]:
+            continue
+        kept = _kept(time, sigma, last, i, tau) if last >= 0 else 1.0
+        last = i
+        variance = kept * kept * variance + 1.0 - kept * kept
+        spread = gain_in * gain_in * variance + white
+        root = math.sqrt(spread)
+        gain = gain_in * variance / spread
+        for k in range(columns):
+            state[k] *= kept
+            innovation = values[i, k] - gain_in * state[k]
+            found[i, k] = innovation / root
+            state[k] += gain * innovation
+        variance -= gain * gain_in * variance
+        log_det += math.log(spread)
+    return found, log_det
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _predictions(
+    time: Array, sigma: Array, used: NDArray[np.bool_], values: Array, tau: float, white: float
+) -> tuple[Array, Array]:
+    """Mean and variance of the lasting part of each used value, given the used ones before it."""
+    count = len(values)
+    means, variances = np.zeros(count), np.ones(count)
+    gain_in = math.sqrt(1.0 - white)
+    state, variance, last = 0.0, 1.0, -1
+    for i in range(count):
+        if not used[i]:
+            continue
+        kept = _kept(time, sigma, last, i, tau) if last >= 0 else 1.0
+        last = i
+        state *= kept
+        variance = kept * kept * variance + 1.0 - kept * kept
+        means[i], variances[i] = state, variance
+        gain = gain_in * variance / (gain_in * gain_in * variance + white)
+        state += gain * (values[i] - gain_in * state)
+        variance -= gain * gain_in * variance
+    return means, variances
+
+
+def surprise(
+    time: Array, sigma: Array, used: NDArray[np.bool_], values: Array, tau: float, white: float
+) -> Array:
+    """How far each value is from what all the others predict, in standard deviations.
+
+    Past and future predict independently but for the process's own mean and variance, which both
+    hold and which is taken out once (the two-filter smoother; Fraser & Potter 1969).
+
+    Args:
+        time: (N,) not decreasing.
+        sigma: (N,) of the values before they were divided by it.
+        used: (N,) what is there.
+        values: (N,), each over its sigma.
+        tau: as in `whiten`.
+        white: as in `whiten`.
+
+    Returns:
+        (N,), meaningless where not used.
+    """
+    past, past_variance = _predictions(time, sigma, used, values, tau, white)
+    back = slice(None, None, -1)
+    future, future_variance = _predictions(
+        time[back].copy(), sigma[back].copy(), used[back].copy(), values[back].copy(), tau, white
+    )
+    future, future_variance = future[back], future_variance[back]
+    precision = 1.0 / past_variance + 1.0 / future_variance - 1.0
+    mean = (past / past_variance + future / future_variance) / precision
+    spread = (1.0 - white) / precision + white
+    found: Array = (values - math.sqrt(1.0 - white) * mean) / np.sqrt(spread)
+    return found
+
+
+def lasting_share(time: Array, tau: float, white: float) -> float:
+    """Share of the variance that the plain mean over all times keeps beyond that of white error.
+
+    0 for white error, near 1 where one error lasts throughout. The times are taken as evenly
+    spread: twice the integral of `(1 - s) exp(-s T / tau)`.
+    """
+    ratio = float(time[-1] - time[0]) / tau
+    if ratio < 1e-6:
+        return 1.0 - white
+    return (1.0 - white) * 2.0 / ratio * (1.0 - (1.0 - math.exp(-ratio)) / ratio)

@@ -1,0 +1,446 @@
+"""Where a model lies in the world: fitted to navigation, or levelled where there is none."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.base.errors import warn
+from alice_survey.base.frames import Array, Datum
+from alice_survey.base.manifest import ImageRecord
+from reconstruct.placing.alignment import Similarity
+from reconstruct.placing.channels import (
+    GROUPS,
+    MOUNT,
+    PARAMETERS,
+    PLACE,
+    SCALE,
+    STRETCH,
+    TURN,
+    Epochs,
+    Equations,
+    equations,
+    read_epochs,
+    without_navigation,
+)
+from reconstruct.placing.placement import (
+    NO_EXTRA,
+    Estimate,
+    Extra,
+    Lasting,
+    estimate,
+    without_gross_errors,
+)
+
+_LEVEL_SIGMA_DEG = 10.0
+"""How far from level the sea floor's mean plane may be, where no attitude was measured."""
+_TRIMS = 5
+"""Rounds of leaving out what stands off the mean plane."""
+_ROBUST_STEPS = 30
+_ROBUST_SIGMAS = 2.0
+"""Beyond so many sigmas the first placement lets a misfit pull no more than in proportion."""
+_STEPS = 6
+_SETTLED_SIGMAS = 0.01
+_LEAST_BOUND = 1e-9
+_STRETCH = 0.005
+"""Of positions reckoned from a Doppler log: makers and users say 0.1 to 1 % (as in
+`vehicle.navigation.sensors`)."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Fit:
+    """A model placed by navigation, and how well."""
+
+    ned_from_model: Similarity
+    used: int
+    """Stations with a position that took part."""
+    left_out: Mapping[str, int]
+    """By group of channels, readings that the rest contradicts."""
+    rms_m: Array
+    """(3,) north, east, down misses of the positions that took part, root mean square."""
+    free_scale: float
+    """Scale that a similarity would choose: 1 where navigation agrees with the known scale."""
+    free_scale_sigma: float
+    middle_ned: Array
+    """(3,) middle of the camera track, about which the covariance's rotation and scale act."""
+    covariance: Array
+    """(7, 7) of rotation about north, east, down (rad), shift north, east, down of the middle (m),
+    and the logarithm of the scale."""
+    lasting: Mapping[str, Lasting]
+    """By group, how navigation's errors last."""
+    time_unit: str
+    mount_sigma_deg: float
+
+    @property
+    def sigma_position_m(self) -> Array:
+        """(3,) of the middle of the track, north, east and down."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)[3:6]))
+
+    @property
+    def sigma_tilt_deg(self) -> Array:
+        """(2,) of rotation about north and about east."""
+        return np.asarray(np.rad2deg(np.sqrt(np.diag(self.covariance)[:2])))
+
+    @property
+    def sigma_heading_deg(self) -> float:
+        """Of rotation about down."""
+        return float(np.rad2deg(np.sqrt(self.covariance[2, 2])))
+
+    @property
+    def sigma_scale(self) -> float:
+        """Of the logarithm of the scale, 0 where it is held."""
+        return float(np.sqrt(self.covariance[SCALE, SCALE]))
+
+    def to_json(self) -> dict[str, Any]:
+        """What `georeference.json` says."""
+        tilts, axes = np.linalg.eigh(self.covariance[:2, :2])
+        axis = np.rad2deg(np.arctan2(axes[1, 1], axes[0, 1])) % 180.0
+        north, east, down = self.sigma_position_m.tolist()
+        return {
+            "format": "alice-survey georeference",
+            "version": 1,
+            "method": _METHOD,
+            "stations": self.used,
+            "left_out": dict(self.left_out),
+            "rms_north_m": float(self.rms_m[0]),
+            "rms_east_m": float(self.rms_m[1]),
+            "rms_depth_m": float(self.rms_m[2]),
+            "sigma_north_m": north,
+            "sigma_east_m": east,
+            "sigma_depth_m": down,
+            "sigma_heading_deg": self.sigma_heading_deg,
+            "sigma_tilt_deg": float(np.rad2deg(np.sqrt(tilts.mean()))),
+            "sigma_tilt_north_deg": float(self.sigma_tilt_deg[0]),
+            "sigma_tilt_east_deg": float(self.sigma_tilt_deg[1]),
+            "largest_tilt_deg": float(np.rad2deg(np.sqrt(tilts[1]))),
+            "largest_tilt_axis_deg": float(axis),
+            "sigma_scale": self.sigma_scale,
+            "scale_of_navigation": self.free_scale,
+            "scale_of_navigation_sigma": self.free_scale_sigma,
+            "mount_sigma_deg": self.mount_sigma_deg,
+            "middle_ned_m": self.middle_ned.tolist(),
+            "covariance": self.covariance.tolist(),
+            "covariance_order": [
+                "rotation_north_rad", "rotation_east_rad", "rotation_down_rad",
+                "north_m", "east_m", "down_m", "log_scale",
+            ],
+            "errors": {
+                group: {
+                    f"correlation_{'s' if self.time_unit == 's' else 'stations'}": how.tau,
+                    "white_share": how.white,
+                    "constant_share": how.constant,
+                    "sigma_factor": how.factor,
+                }
+                for group, how in self.lasting.items()
+            },
+        }  # fmt: skip
+
+
+_METHOD = (
+    "generalised least squares; errors of navigation as first-order Gauss-Markov processes of the "
+    "stated sigmas, correlation times and white shares by restricted maximum likelihood"
+)
+
+
+def level(points: Array, centres: Array) -> Similarity:
+    """Put a model's mean plane level, its third axis down, away from the cameras.
+
+    The origin is the middle of the plane's points; the first axis points from the first camera to
+    the last.
+
+    Args:
+        points: (N, 3) points of the model, 3 or more.
+        centres: (M, 3) camera centres in order.
+
+    Returns:
+        `world_from_model`, of scale one.
+    """
+    kept = points
+    for _ in range(_TRIMS):
+        middle = kept.mean(axis=0)
+        normal = np.linalg.svd(kept - middle, full_matrices=False)[2][2]
+        away = np.abs((points - middle) @ normal)
+        kept = points[away <= 3.0 * np.median(away) + 1e-12]
+    middle = kept.mean(axis=0)
+    normal = np.linalg.svd(kept - middle, full_matrices=False)[2][2]
+    if (centres.mean(axis=0) - middle) @ normal > 0:
+        normal = -normal
+    ahead = centres[-1] - centres[0]
+    ahead = ahead - (ahead @ normal) * normal
+    if np.linalg.norm(ahead) < 1e-9 * (1.0 + np.abs(centres).max()):
+        ahead = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    ahead = ahead / np.linalg.norm(ahead)
+    rotation = Rotation.from_matrix(np.stack([ahead, np.cross(normal, ahead), normal]))
+    return Similarity(scale=1.0, rotation=rotation, translation=-rotation.apply(middle))
+
+
+ExtraOf = Callable[[Similarity, Array], Extra]
+"""Equations beside navigation's at a placement, whose rotation acts about a point (3,)."""
+
+
+def fit_navigation(
+    records: Sequence[ImageRecord],
+    model_from_cam: Sequence[RigidTransform],
+    body_from_cam: Mapping[str, RigidTransform],
+    datum: Datum,
+    levelled: Similarity,
+    *,
+    known_scale: float | None,
+    mount_sigma_deg: float = 0.0,
+    scale_sigma: float = 0.0,
+    control: ExtraOf | None = None,
+) -> Fit | None:
+    """Fit a model to the positions and attitudes of navigation.
+
+    Args:
+        records: registered pictures.
+        model_from_cam: pose of each picture's camera in the model.
+        body_from_cam: lever arm of every camera, metres; the identity where positions are of the
+            cameras themselves.
+        datum: origin of the local frame.
+        levelled: `level` of the model; where no attitude is known it keeps the model from turning
+            about a straight track, with a sigma of 10 degrees.
+        known_scale: metres in a unit of the model, or None: then the scale is fitted too.
+        mount_sigma_deg: of the rotation of the mount about each axis of the body.
+        scale_sigma: relative, of a known scale; above 0 the scale is fitted about it.
+        control: equations of control points and bars.
+
+    Returns:
+        The fit; None, after a warning, where positions are too few or too close together.
+    """
+    epochs = read_epochs(records, model_from_cam, body_from_cam, datum)
+    if epochs is None:
+        return None
+    start = _start(epochs, levelled, known_scale)
+    if start is None:
+        return None
+    free = [0, 1, 2, 3, 4, 5]
+    if known_scale is None or scale_sigma > 0:
+        free.append(SCALE)
+    task = _Task(
+        epochs=epochs,
+        levelled=levelled,
+        known_scale=known_scale,
+        scale_sigma=scale_sigma,
+        mount_sigma_rad=np.deg2rad(mount_sigma_deg),
+        control=control,
+    )
+    return task.fit(start, free)
+
+
+def fit_control(
+    records: Sequence[ImageRecord],
+    model_from_cam: Sequence[RigidTransform],
+    start: Similarity,
+    control: ExtraOf,
+    *,
+    known_scale: float | None,
+    scale_sigma: float,
+) -> Fit:
+    """Place a model by control points alone.
+
+    Args:
+        records: registered pictures.
+        model_from_cam: pose of each picture's camera in the model.
+        start: a placement near the right one.
+        control: equations of three or more points that are not on one line.
+        known_scale: metres in a unit of the model, or None: then the scale is fitted too.
+        scale_sigma: relative, of a known scale.
+    """
+    free = [0, 1, 2, 3, 4, 5]
+    if known_scale is None or scale_sigma > 0:
+        free.append(SCALE)
+    task = _Task(
+        epochs=without_navigation(records, model_from_cam),
+        levelled=None,
+        known_scale=known_scale,
+        scale_sigma=scale_sigma,
+        mount_sigma_rad=0.0,
+        control=control,
+    )
+    return task.fit(start, free)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Task:
+    epochs: Epochs
+    levelled: Similarity | None
+    """None where control holds the model level."""
+    known_scale: float | None
+    scale_sigma: float
+    mount_sigma_rad: float
+    control: ExtraOf | None
+
+    def fit(self, start: Similarity, free: list[int]) -> Fit:
+        """From a rough placement to the final one."""
+        epochs = self.epochs
+        place = self._robust(start, free)
+        found = equations(epochs, place, self._middle(place))
+        used = without_gross_errors(found.misfit, epochs.known)
+        solved_for = [*free, *self._nuisances()]
+        for _ in range(_STEPS):
+            middle = self._middle(place)
+            found = equations(epochs, place, middle)
+            got = self._estimate(found, place, middle, used, solved_for)
+            place = _moved(place, got.change, middle)
+            sigma = np.sqrt(np.diag(got.covariance))[free]
+            if np.all(np.abs(got.change[free]) <= _SETTLED_SIGMAS * sigma):
+                break
+        middle = self._middle(place)
+        scaled = got
+        if SCALE not in free:
+            found = equations(epochs, place, middle)
+            scaled = self._estimate(
+                found, place, middle, got.used, [*solved_for, SCALE], lasting=got.lasting
+            )
+        return self._report(place, middle, got, scaled, held=SCALE not in free)
+
+    def _report(
+        self, place: Similarity, middle: Array, got: Estimate, scaled: Estimate, *, held: bool
+    ) -> Fit:
+        epochs = self.epochs
+        kept = got.used[epochs.moment, 0]
+        misses = (epochs.positions(place) - epochs.measured_ned)[kept]
+        lost = epochs.known & ~got.used
+        first = {group: k for k, group in zip((0, 2, 3, 5), GROUPS, strict=True)}
+        return Fit(
+            ned_from_model=place,
+            used=int(got.used[:, 0].sum()),
+            left_out={group: int(lost[:, k].sum()) for group, k in first.items()},
+            rms_m=np.sqrt((misses**2).mean(axis=0)) if len(misses) else np.full(3, np.nan),
+            free_scale=float(np.exp(scaled.change[SCALE])) if held else 1.0,
+            free_scale_sigma=float(np.sqrt(scaled.covariance[SCALE, SCALE])),
+            middle_ned=middle,
+            covariance=got.covariance[:PLACE, :PLACE],
+            lasting=got.lasting,
+            time_unit="s" if epochs.timed else "stations",
+            mount_sigma_deg=float(np.rad2deg(self.mount_sigma_rad)),
+        )
+
+    def _middle(self, place: Similarity) -> Array:
+        middle: Array = place.apply(self.epochs.centres).mean(axis=0)
+        return middle
+
+    def _nuisances(self) -> list[int]:
+        found = [p for p, bound in self._frame_bounds().items() if bound > _LEAST_BOUND]
+        if self.mount_sigma_rad > 0 and self.epochs.has_attitude:
+            found += range(MOUNT.start, MOUNT.stop)
+        return found
+
+    def _frame_bounds(self) -> dict[int, float]:
+        """How navigation's own frame may be turned and stretched within its positions' sigmas.
+
+        Positions that were reckoned along a wrong heading are turned as a whole by its error; to
+        take their turn for a second, independent reading of the heading would count one error
+        twice as if it were two. Likewise a log's velocities are all wrong by one factor.
+        """
+        if not self.epochs.has_attitude:
+            return {}
+        plan = self.epochs.measured_ned[:, :2]
+        radius = float(np.sqrt(plan.var(axis=0).sum()))
+        sigma = float(np.median(self.epochs.sigma[:, 0]))
+        bound = sigma / radius if radius > sigma else 1.0
+        return {TURN: bound, STRETCH: min(bound, _STRETCH)}
+
+    def _estimate(
+        self,
+        found: Equations,
+        place: Similarity,
+        middle: Array,
+        used: NDArray[np.bool_],
+        free: list[int],
+        lasting: Mapping[str, Lasting] | None = None,
+    ) -> Estimate:
+        return estimate(
+            self.epochs.time,
+            found,
+            used,
+            free,
+            self._extra(place, middle),
+            frame_bounds=self._frame_bounds(),
+            lasting=lasting,
+        )
+
+    def _extra(self, place: Similarity, middle: Array) -> Extra:
+        misfits, rows = [NO_EXTRA.misfit], [NO_EXTRA.jacobian]
+        if self.levelled is not None and not self.epochs.has_attitude:
+            down = place.rotation.apply(self.levelled.rotation.inv().apply([0.0, 0.0, 1.0]))
+            sigma = np.deg2rad(_LEVEL_SIGMA_DEG)
+            tilt = np.zeros((2, PARAMETERS))
+            tilt[0, 1], tilt[0, 2] = down[2], -down[1]
+            tilt[1, 0], tilt[1, 2] = -down[2], down[0]
+            misfits.append(down[:2] / sigma)
+            rows.append(tilt / sigma)
+        if self.known_scale is not None and self.scale_sigma > 0:
+            scale = np.zeros((1, PARAMETERS))
+            scale[0, SCALE] = 1.0 / self.scale_sigma
+            misfits.append(np.log([place.scale / self.known_scale]) / self.scale_sigma)
+            rows.append(scale)
+        if self.mount_sigma_rad > 0:
+            mount = np.zeros((3, PARAMETERS))
+            mount[:, MOUNT] = np.eye(3) / self.mount_sigma_rad
+            misfits.append(np.zeros(3))
+            rows.append(mount)
+        if self.control is not None:
+            more = self.control(place, middle)
+            misfits.append(more.misfit)
+            rows.append(more.jacobian)
+        return Extra(misfit=np.concatenate(misfits), jacobian=np.concatenate(rows))
+
+    def _robust(self, place: Similarity, free: list[int]) -> Similarity:
+        """A placement that a few wrong readings hardly move: readings as independent, soft L1."""
+        for _ in range(_ROBUST_STEPS):
+            middle = self._middle(place)
+            found, extra = equations(self.epochs, place, middle), self._extra(place, middle)
+            known = self.epochs.known
+            misfit = np.concatenate([found.misfit[known], extra.misfit])
+            rows = np.concatenate([found.jacobian[known], extra.jacobian])[:, free]
+            weight = (1.0 + (misfit / _ROBUST_SIGMAS) ** 2) ** -0.25
+            size = np.linalg.norm(rows, axis=0)
+            size = np.where(size > 0, size, 1.0)
+            step = -np.linalg.lstsq(weight[:, None] * rows / size, weight * misfit)[0] / size
+            change = np.zeros(PARAMETERS)
+            change[free] = step
+            place = _moved(place, change, middle)
+            if np.all(np.abs(step) * size < 1e-6):
+                break
+        return place
+
+
+def _moved(place: Similarity, change: Array, middle: Array) -> Similarity:
+    """A placement after a small change of its first seven parameters about a point."""
+    turn, grow = Rotation.from_rotvec(change[:3]), float(np.exp(change[SCALE]))
+    shift = middle + grow * turn.apply(place.translation - middle) + change[3:6]
+    return Similarity(scale=place.scale * grow, rotation=turn * place.rotation, translation=shift)
+
+
+def _start(epochs: Epochs, levelled: Similarity, known_scale: float | None) -> Similarity | None:
+    """A first placement: from attitudes, else from the levelled model and the positions' plan."""
+    measured, count = epochs.measured_ned, len(epochs.time)
+    spread = float(np.sqrt(measured[:, :2].var(axis=0).sum()))
+    need = float(np.median(epochs.sigma[:, 0]))
+    flat = levelled.apply(epochs.centres)
+    has = epochs.known[epochs.moment, 3]
+    if not has.any() or known_scale is None:
+        least = 2 if has.any() else 3
+        if count < least or spread <= need:
+            warn(
+                f"{count} positions spread over {spread:.2f} m at a sigma of {need:.2f} m do not "
+                "place the model: it stays without CRS"
+            )
+            return None
+    a = (flat[:, :2] - flat[:, :2].mean(axis=0)) @ [1.0, 1j]
+    b = (measured[:, :2] - measured[:, :2].mean(axis=0)) @ [1.0, 1j]
+    turn = complex(np.vdot(a, b) / max(float(np.vdot(a, a).real), 1e-300))
+    if has.any():
+        some = np.flatnonzero(has)
+        rotation = (epochs.ned_from_body[some] * epochs.model_from_body[some].inv()).mean()
+    else:
+        rotation = Rotation.from_rotvec([0.0, 0.0, np.angle(turn)]) * levelled.rotation
+    scale = abs(turn) if known_scale is None else known_scale
+    start = Similarity(scale=scale, rotation=rotation, translation=np.zeros(3))
+    shift = np.median(measured - epochs.positions(start), axis=0)
+    return Similarity(scale=scale, rotation=rotation, translation=shift)

@@ -1,0 +1,236 @@
+"""The camera track of a model: where every registered picture was taken from, and how surely."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.base.artefacts import atomic_path, write_csv, write_json
+from alice_survey.base.contents import one_line
+from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, attitude_from_rotation
+from alice_survey.base.manifest import ImageRecord
+from reconstruct.mapping.arrays import observed
+from reconstruct.mapping.database import as_transform
+from reconstruct.placing.covariance import attitude_sigmas_deg
+from reconstruct.views.lens import Lens
+from reconstruct.views.model import WorldFrame
+
+_NED = ("north_m", "east_m", "depth_m")
+_MODEL = ("x", "y", "z")
+_MODEL_SCALED = ("x_m", "y_m", "z_m")
+_QUATERNION = ("qx", "qy", "qz", "qw")
+SIGMAS = (
+    "sigma_north_m", "sigma_east_m", "sigma_depth_m",
+    "sigma_roll_deg", "sigma_pitch_deg", "sigma_heading_deg",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrackRow:
+    """One registered picture."""
+
+    image: str
+    station: int
+    camera: str
+    time_s: float
+    """NaN when unknown."""
+    world_from_cam: RigidTransform
+    """Of the entrance pupil."""
+    points: int
+    """Observations of points of the model."""
+    reprojection_px: float
+    """Mean over those."""
+    world_from_body: Rotation
+    """Attitude of the vehicle; of a nadir camera's bearer where no rig is known."""
+
+
+def track_rows(
+    model: Any,
+    records: Mapping[str, ImageRecord],
+    lenses: Mapping[str, Lens],
+    frame: WorldFrame,
+    body_from_cam: Mapping[str, Rotation],
+) -> list[TrackRow]:
+    """Rows of all registered pictures of a COLMAP model of ideal pinholes, by station and name.
+
+    The pinhole's centre lies before or behind the entrance pupil, which is where the camera is; in
+    a model without scale the few millimetres between them are not known and left out.
+
+    Args:
+        model: in world coordinates.
+        records: by picture.
+        lenses: by camera.
+        frame: the world.
+        body_from_cam: mount of every camera that has one.
+    """
+    seen = observed(model)
+    missed = np.linalg.norm(seen.misses(model), axis=1)
+    pupils = {
+        name: lens.pinhole_from_cam if frame.scaled else RigidTransform.identity()
+        for name, lens in lenses.items()
+    }
+    rows = []
+    for n, number in enumerate(seen.pictures.tolist()):
+        image, misses = model.images[number], missed[seen.of(n)]
+        record = records[image.name]
+        cam_from_world = as_transform(image.cam_from_world())
+        pose = cam_from_world.inv() * pupils[record.camera]
+        mount = body_from_cam.get(record.camera, BODY_FROM_NADIR_CAM)
+        rows.append(
+            TrackRow(
+                image=image.name,
+                station=record.station,
+                camera=record.camera,
+                time_s=record.time_s,
+                world_from_cam=pose,
+                points=len(misses),
+                reprojection_px=float(misses.mean()) if len(misses) else float("nan"),
+                world_from_body=pose.rotation * mount.inv(),
+            )
+        )
+    return sorted(rows, key=lambda row: (row.station, row.image))
+
+
+def track_sigmas(rows: Sequence[TrackRow], covariances: Array | None) -> Array:
+    """(N, 6) in the order of `SIGMAS`; NaN where no covariance is known.
+
+    Args:
+        rows: the track.
+        covariances: (N, 6, 6) of the poses, see `covariance`; None where the world has no NED.
+    """
+    if covariances is None or not rows:
+        return np.full((len(rows), 6), np.nan)
+    attitudes = Rotation.concatenate([row.world_from_body for row in rows])
+    places = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)[:, :3])
+    found: Array = np.hstack([places, attitude_sigmas_deg(attitudes, covariances)])
+    return found
+
+
+def write_track_csv(path: Path, rows: Sequence[TrackRow], frame: WorldFrame, sigmas: Array) -> None:
+    """Write the track; columns of position are named after the frame; `sigmas` as `SIGMAS`."""
+    axes = _NED if frame.name == "ned" else _MODEL_SCALED if frame.scaled else _MODEL
+    header = [
+        "image", "station", "camera", "time_s", *axes, *_QUATERNION,
+        "latitude_deg", "longitude_deg", "points", "reprojection_px", *SIGMAS,
+    ]  # fmt: skip
+    positions = np.array([row.world_from_cam.translation for row in rows]).reshape(-1, 3)
+    places: Array = np.full((len(rows), 3), np.nan)
+    if frame.datum is not None:
+        places = frame.datum.geodetic_from_ned(positions)
+    lines = []
+    for row, position, place, sigma in zip(rows, positions, places, sigmas, strict=True):
+        quaternion = row.world_from_cam.rotation.as_quat(canonical=True)
+        where = ["", ""] if np.isnan(place[0]) else [f"{v:.10f}" for v in place[:2]]
+        lines.append(
+            [
+                row.image,
+                row.station,
+                row.camera,
+                row.time_s,
+                *(f"{v:.9f}" for v in position),
+                *(f"{q:.12f}" for q in quaternion),
+                *where,
+                row.points,
+                "" if np.isnan(row.reprojection_px) else f"{row.reprojection_px:.6f}",
+                *("" if np.isnan(value) else f"{value:.6g}" for value in sigma),
+            ]
+        )
+    write_csv(path, header, lines)
+
+
+def write_track_geojson(
+    path: Path, rows: Sequence[TrackRow], frame: WorldFrame, sigmas: Array
+) -> None:
+    """Write a point for every picture and a line through the stations, in RFC 7946.
+
+    Heights are those above the WGS 84 ellipsoid, as that format wants. Needs a datum.
+    """
+    if frame.datum is None:
+        raise ValueError("a track without datum has no longitude and latitude")
+    positions = np.array([row.world_from_cam.translation for row in rows]).reshape(-1, 3)
+    places = frame.datum.geodetic_from_ned(positions)
+    points: list[dict[str, Any]] = []
+    line: dict[int, list[float]] = {}
+    for row, (latitude, longitude, depth), sigma in zip(rows, places, sigmas, strict=True):
+        height = round(frame.datum.height_m - float(depth), 5)
+        at = [round(float(longitude), 10), round(float(latitude), 10), height]
+        line.setdefault(row.station, at)
+        roll, pitch, heading = np.rad2deg(attitude_from_rotation(row.world_from_body))
+        numbers = {
+            "time_s": row.time_s,
+            "depth_m": float(depth),
+            "roll_deg": float(roll),
+            "pitch_deg": float(pitch),
+            "heading_deg": float(heading % 360.0),
+            **dict(zip(SIGMAS, sigma.tolist(), strict=True)),
+        }
+        points.append(
+            {
+                "type": "Feature",
+                "geometry": {"type": "Point", "coordinates": at},
+                "properties": {
+                    "image": row.image,
+                    "station": row.station,
+                    "camera": row.camera,
+                    **{n: round(v, 6) if v == v else None for n, v in numbers.items()},
+                },
+            }
+        )
+    features = points
+    if len(line) > 1:
+        track = {
+            "type": "Feature",
+            "geometry": {"type": "LineString", "coordinates": list(line.values())},
+            "properties": {"stations": len(line), "vertical_datum": frame.vertical_datum},
+        }
+        features = [track, *points]
+    write_json(path, {"type": "FeatureCollection", "features": features})
+
+
+def write_track_tum(path: Path, rows: Sequence[TrackRow]) -> None:
+    """Write the track in TUM's format; without times the station number stands for the time.
+
+    Of every station one row is kept: that of its first camera.
+    """
+    lines, stations = [], set()
+    timed = all(row.time_s == row.time_s for row in rows)
+    for row in rows:
+        if row.station in stations:
+            continue
+        stations.add(row.station)
+        pose = row.world_from_cam
+        values = [*pose.translation, *pose.rotation.as_quat(canonical=True)]
+        time = f"{row.time_s if timed else row.station:.6f}"
+        lines.append(" ".join([time, *(f"{v:.9f}" for v in values)]))
+    with atomic_path(path) as temporary:
+        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def read_track_poses(path: Path) -> dict[str, RigidTransform]:
+    """Read `world_from_cam` (entrance pupils) by picture from `track.csv`.
+
+    Raises:
+        WorkspaceError: the file is missing or no track.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+    except OSError as error:
+        raise WorkspaceError(f"{path}: cannot be read: {error.strerror}") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise WorkspaceError(f"{path}: no CSV text in UTF-8: {error}") from None
+    poses = {}
+    for line, row in enumerate(rows, 2):
+        axes = next((a for a in (_NED, _MODEL_SCALED, _MODEL) if a[0] in row), _NED)
+        try:
+            position = np.array([float(row[name]) for name in axes])
+            rotation = Rotation.from_quat([float(row[name]) for name in _QUATERNION])
+            poses[row["image"]] = RigidTransform.from_components(position, rotation)
+        except (KeyError, TypeError, ValueError) as error:
+            raise WorkspaceError(f"{path} line {line}: no pose: {one_line(error)}") from None
+    return poses

@@ -1,0 +1,1 @@
+"""A picture in a model: lens, pose, where a point is seen."""

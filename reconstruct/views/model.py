@@ -1,0 +1,226 @@
+"""The sparse model as the later stages see it: views through ideal pinholes, and points."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.base.artefacts import read_json, write_json
+from alice_survey.base.contents import taken_from
+from alice_survey.base.frames import Array, Datum
+from reconstruct.views.lens import lens_from_json
+from reconstruct.views.range_shift import RangeShift, no_shift, range_shift
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldFrame:
+    """What the coordinates of a model mean. The third axis points down in every frame."""
+
+    name: Literal["ned", "model"]
+    """`ned`: north, east, down from the datum; `model`: arbitrary origin and heading, levelled."""
+    datum: Datum | None
+    scaled: bool
+    """Whether lengths are metres."""
+    vertical_datum: str
+    """Name of the level from which depths and heights count."""
+    notes: tuple[str, ...] = ()
+    """What a reader of any result must know, such as where the scale came from."""
+
+    @property
+    def unit(self) -> str:
+        """Name of the unit of length for labels."""
+        return "m" if self.scaled else "model units"
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """One registered picture, as an ideal pinhole sees it."""
+
+    image: str
+    """Name in the manifest."""
+    camera: str
+    station: int
+    width_px: int
+    height_px: int
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    world_from_cam: RigidTransform
+    shift: RangeShift | None = None
+    """What the warp of the picture leaves of the port's refraction; None without a port."""
+
+    def project(self, points_world: Array) -> Array:
+        """Pixels (N, 2) at which the warped picture shows points (N, 3); NaN behind the camera."""
+        ideal = self.project_ideal(points_world)
+        if self.shift is None:
+            return ideal
+        return self.shift.warped(ideal, self.world_from_cam.inv().apply(points_world)[:, 2])
+
+    def project_ideal(self, points_world: Array) -> Array:
+        """Pixels (N, 2) at which the ideal pinhole sees points (N, 3); NaN behind the camera."""
+        points = self.world_from_cam.inv().apply(points_world)
+        z = np.where(points[:, 2:] > 0, points[:, 2:], np.nan)
+        focal, centre = np.array([self.fx_px, self.fy_px]), np.array([self.cx_px, self.cy_px])
+        pixels: Array = focal * points[:, :2] / z + centre
+        return pixels
+
+    def at_depth(self, pixels: Array, depth: Array) -> Array:
+        """World points (N, 3) that the warped picture shows at pixels (N, 2) and depths (N,)."""
+        ideal = pixels if self.shift is None else self.shift.ideal(pixels, depth)
+        focal, centre = np.array([self.fx_px, self.fy_px]), np.array([self.cx_px, self.cy_px])
+        sideways = (ideal - centre) / focal * depth[:, None]
+        points: Array = self.world_from_cam.apply(np.column_stack([sideways, depth]))
+        return points
+
+    @property
+    def shift_arguments(self) -> tuple[NDArray[np.float64], float, float, float]:
+        """What kernels that look through the port take; a field of zeros without one."""
+        shift = self.shift or no_shift(self.width_px, self.height_px)
+        return shift.arguments
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SparseModel:
+    """Registered views and triangulated points, in one world frame."""
+
+    frame: WorldFrame
+    views: tuple[View, ...]
+    """Sorted by image name."""
+    points_world: Array
+    """(P, 3)."""
+    observations: NDArray[np.int64]
+    """(O, 2) rows of point index and view index."""
+
+
+def write_frame(path: Path, frame: WorldFrame) -> None:
+    """Write `frame.json`."""
+    datum = frame.datum
+    data: dict[str, Any] = {
+        "name": frame.name,
+        "datum": None
+        if datum is None
+        else {
+            "latitude_deg": datum.latitude_deg,
+            "longitude_deg": datum.longitude_deg,
+            "height_m": datum.height_m,
+        },
+        "scaled": frame.scaled,
+        "vertical_datum": frame.vertical_datum,
+        "notes": list(frame.notes),
+    }
+    write_json(path, data)
+
+
+def read_frame(path: Path) -> WorldFrame:
+    """Read `frame.json`.
+
+    Raises:
+        WorkspaceError: it is missing, or not as it was written.
+    """
+    data = read_json(path)
+    with taken_from(path):
+        if data["name"] not in ("ned", "model") or not isinstance(data["scaled"], bool):
+            raise ValueError("name or scaled")
+        texts = (data["vertical_datum"], *data["notes"])
+        if not all(isinstance(text, str) for text in texts):
+            raise ValueError("vertical_datum or notes")
+        return WorldFrame(
+            name=data["name"],
+            datum=None if data["datum"] is None else datum_of(data["datum"]),
+            scaled=data["scaled"],
+            vertical_datum=data["vertical_datum"],
+            notes=tuple(data["notes"]),
+        )
+
+
+def datum_of(data: dict[str, Any]) -> Datum:
+    """The datum of a JSON object.
+
+    Raises:
+        KeyError: it lacks a value.
+        ValueError: it is no place on Earth, or holds something else.
+    """
+    place = float(data["latitude_deg"]), float(data["longitude_deg"])
+    height_m = float(data.get("height_m", 0.0))
+    known = {"latitude_deg", "longitude_deg", "height_m"}
+    if (
+        not (abs(place[0]) <= 90 and abs(place[1]) <= 360 and abs(height_m) < 1e5)
+        or data.keys() - known
+    ):
+        raise ValueError(f"datum {data}")
+    return Datum(*place, height_m)
+
+
+def read_model(sparse: Path) -> SparseModel:
+    """Read the model of a finished `sparse/` stage.
+
+    Raises:
+        WorkspaceError: a file is missing, or not as it was written.
+        ReconstructionError: the model is damaged.
+    """
+    from reconstruct.views.model_files import read_reconstruction
+
+    stored = read_json(sparse / "cameras.json")
+    frame = read_frame(sparse / "frame.json")
+    model = read_reconstruction(sparse / "model")
+    with taken_from(sparse / "cameras.json"):
+        return _model(stored, frame, model)
+
+
+def _model(stored: dict[str, Any], frame: WorldFrame, model: Any) -> SparseModel:
+    cameras = stored["images"]
+    shifts = _shifts(stored, frame)
+    images = sorted(
+        (i for i in model.images.values() if i.has_pose), key=lambda image: str(image.name)
+    )
+    views = []
+    for image in images:
+        camera = model.cameras[image.camera_id]
+        fx, fy, cx, cy = camera.params
+        cam_from_world = image.cam_from_world()
+        pose = RigidTransform.from_components(
+            cam_from_world.translation, Rotation.from_quat(cam_from_world.rotation.quat)
+        )
+        views.append(
+            View(
+                image=image.name,
+                camera=cameras[image.name]["camera"],
+                station=cameras[image.name]["station"],
+                width_px=camera.width,
+                height_px=camera.height,
+                fx_px=fx,
+                fy_px=fy,
+                cx_px=cx,
+                cy_px=cy,
+                world_from_cam=pose.inv(),
+                shift=shifts.get(cameras[image.name]["camera"]),
+            )
+        )
+    view_of = {image.image_id: index for index, image in enumerate(images)}
+    ids = sorted(model.points3D)
+    rows = [
+        (index, view_of[element.image_id])
+        for index, point_id in enumerate(ids)
+        for element in model.points3D[point_id].track.elements
+    ]
+    return SparseModel(
+        frame=frame,
+        views=tuple(views),
+        points_world=np.array([model.points3D[i].xyz for i in ids]).reshape(-1, 3),
+        observations=np.array(rows, dtype=np.int64).reshape(-1, 2),
+    )
+
+
+def _shifts(stored: dict[str, Any], frame: WorldFrame) -> dict[str, RangeShift]:
+    """By camera; none for cameras without a port, and none where lengths are not known."""
+    if not frame.scaled:
+        return {}
+    return {
+        name: range_shift(lens_from_json(lens))
+        for name, lens in stored["cameras"].items()
+        if lens["kind"] == "flat_port"
+    }

@@ -1,0 +1,94 @@
+"""The command, from files to files."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from alice_survey.base.errors import VehicleError
+from alice_survey.cli.vehicle import app
+from alice_survey.vehicle.files import coefficients_from_file
+from alice_survey.vehicle.identification.report import IdentifyOptions, identify_report
+from alice_survey.vehicle.log import write_vehicle_log
+from tests.alice_survey.vehicle.identification.manoeuvres import fly, hidden, measured, survey_like
+from tests.alice_survey.vehicle.identification.test_bollard import pull_csv
+
+TRUTH = {"X_uu": -12.0, "N_rr": -70.0}
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A log, and one of another day: another current, other manoeuvres."""
+    folder = tmp_path_factory.mktemp("logs")
+    truth = hidden(TRUTH)
+    first = fly(truth, duration_s=40.0, current=(0.1, -0.05))
+    second = fly(
+        truth, duration_s=30.0, current=(-0.05, 0.1), asked=lambda time_s: survey_like(time_s + 53)
+    )
+    for seed, (name, log) in enumerate((("first", first), ("second", second))):
+        write_vehicle_log(folder / f"{name}.csv", measured(log, np.random.default_rng(seed)))
+    return folder / "first.csv", folder / "second.csv"
+
+
+def test_the_joint_fit_writes_what_it_found(logs: tuple[Path, Path], tmp_path: Path) -> None:
+    options = IdentifyOptions(free=("X_uu", "N_rr", "current"), validate=logs[1])
+    text, data = identify_report([logs[0]], tmp_path / "out", options)
+    found = data["identified"]
+    assert found["X_uu"]["identified"] == pytest.approx(-12.0, rel=0.05)
+    assert found["N_rr"]["identified"] == pytest.approx(-70.0, rel=0.05)
+    assert found["X_uu"]["factor"] == pytest.approx(12.0 / 15.23, rel=0.05)
+    assert found["current_north_mps"]["identified"] == pytest.approx(0.1, abs=0.01)
+    assert found["current_north_mps"]["factor"] is None
+    assert min(data["validation"]["fit_percent"].values()) > 80.0
+    assert data["validation"]["constant_fit_percent"]["u"] < 50.0
+    for name in ("report.txt", "coefficients.json", "fit.png", "validation.png"):
+        assert (tmp_path / "out" / name).stat().st_size > 500
+    lines = text.splitlines()
+    assert any(line.split()[:2] == ["X_uu", "-15.23"] for line in lines)
+    # The other day's current is that day's, and is told.
+    assert any(line.startswith("The current of that log") for line in lines)
+    read = coefficients_from_file(tmp_path / "out" / "coefficients.json")
+    assert read.values["X_uu"] == found["X_uu"]["identified"]
+    assert read.values["Y_vv"] == -321.597
+    identify_report([logs[0]], tmp_path / "again", options)
+    for name in ("coefficients.json", "report.txt", "fit.png"):
+        again = (tmp_path / "again" / name).read_bytes()
+        assert again == (tmp_path / "out" / name).read_bytes()
+
+
+def test_the_command_calibrates_in_two_steps(logs: tuple[Path, Path], tmp_path: Path) -> None:
+    pull = pull_csv(tmp_path / "pull.csv", 0.0, factors=(1.0, 1.0))
+    arguments = [
+        "identify", str(logs[0]), "--method", "two-step", "--free", "X_uu,N_rr", "--bollard",
+        str(pull), "--held", "current_north_mps=0.1", "--held", "current_east_mps=-0.05", "-o",
+        str(tmp_path / "out"), "--json",
+    ]  # fmt: skip
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    data = json.loads(result.stdout)
+    assert data["method"] == "two-step"
+    assert [round(one["factor"], 6) for one in data["thrust"]] == [1.0, 1.0]
+    assert data["identified"]["X_uu"]["identified"] == pytest.approx(-12.0, rel=0.05)
+    assert data["identified"]["N_rr"]["identified"] == pytest.approx(-70.0, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (IdentifyOptions(method="guess"), "method 'guess' is not known"),
+        (IdentifyOptions(held=("current_north_mps",)), "is not NAME=VALUE"),
+        (IdentifyOptions(held=("X_uu=3",)), "X_uu cannot be held by hand"),
+        (IdentifyOptions(vehicle="sparus2"), "are not those of sparus2"),
+        (IdentifyOptions(given=("u",)), "motion 'u' cannot be given"),
+        (IdentifyOptions(free=("gain",)), "tell nothing of gain_X"),
+    ],
+)
+def test_wrong_options_are_told(
+    logs: tuple[Path, Path], tmp_path: Path, options: IdentifyOptions, told: str
+) -> None:
+    with pytest.raises(VehicleError) as raised:
+        identify_report([logs[0]], tmp_path / "out", options)
+    assert told in str(raised.value)
+    assert not (tmp_path / "out").exists()

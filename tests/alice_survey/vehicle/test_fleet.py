@@ -1,0 +1,120 @@
+import math
+
+import numpy as np
+import pytest
+
+from alice_survey.base.errors import VehicleError
+from alice_survey.vehicle import fleet
+from alice_survey.vehicle.dynamics import GRAVITY
+from alice_survey.vehicle.propulsion import Thruster
+
+NAMES = ("alice", "sparus2")
+STARBOARD, PORT, VERTICAL, BOW, STERN = range(5)
+
+
+def force(thruster: Thruster, rps: float) -> float:
+    """In water at rest, N."""
+    kt = thruster.kt_forward if rps > 0 else thruster.kt_reverse
+    return fleet.DENSITY * thruster.diameter_m**4 * kt * rps * abs(rps)
+
+
+@pytest.mark.parametrize("coefficients", fleet.SETS)
+@pytest.mark.parametrize("name", NAMES)
+def test_inertia_is_symmetric_and_positive_definite(name: str, coefficients: str) -> None:
+    mass = fleet.vehicle(name, coefficients).mass
+    np.testing.assert_array_equal(mass, mass.T)
+    assert 0.5 < np.linalg.eigvalsh(mass)[0] < 1.0  # roll
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_water_inside_counts_once_with_every_set(name: str) -> None:
+    """The rigid body is one and the same: its surge inertia is dry mass and water."""
+    bodies = [fleet.vehicle(name, each).rigid_body for each in fleet.SETS]
+    assert all(body == bodies[0] for body in bodies)
+    surge = bodies[0].mass_matrix[0, 0]
+    assert surge == pytest.approx(52.0 + bodies[0].entrained_kg)
+    geometry = fleet.GEOMETRIES[name]
+    envelope = fleet.DENSITY * geometry.envelope_volume_m3
+    assert bodies[0].entrained_kg + bodies[0].buoyancy_kg == pytest.approx(envelope)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_it_is_trimmed_level_and_floats_up_slowly(name: str) -> None:
+    """Weight right below buoyancy; 0.1 kg of net buoyancy, which the vertical thruster holds."""
+    vehicle = fleet.vehicle(name)
+    body, plant = vehicle.rigid_body, vehicle.plant.body
+    assert body.cg_body_m[:2] == (0.0, 0.0) and 0.02 <= body.cg_body_m[2] <= 0.04
+    net = plant.buoyancy_n - plant.weight_n
+    assert net == pytest.approx(0.1 * GRAVITY, rel=1e-9)
+    assert net < 0.05 * force(vehicle.thrusters[VERTICAL], 50.0)
+
+
+def test_alice_has_two_thrusters_more_than_sparus2() -> None:
+    names = {name: [t.name for t in fleet.vehicle(name).thrusters] for name in NAMES}
+    assert names["sparus2"] == ["starboard", "port", "vertical"]
+    assert names["alice"] == [*names["sparus2"], "bow", "stern"]
+
+
+def test_thrust_turns_and_rolls_as_by_hand() -> None:
+    b = fleet.vehicle("alice").configuration_matrix
+    assert b.shape == (6, 5)
+    np.testing.assert_allclose(b[0], [1, 1, 0, 0, 0])
+    np.testing.assert_allclose(b[1], [0, 0, 0, 1, 1])
+    np.testing.assert_allclose(b[2], [0, 0, 1, 0, 0])
+    # Ahead on the starboard side turns the bow to port, N = -y X.
+    assert b[5, STARBOARD] == -0.167 == -b[5, PORT]
+    # To starboard at the bow turns the bow to starboard; at the stern to port.
+    assert b[5, BOW] > 0.9 and -0.8 < b[5, STERN] < -0.7
+    # Against the turn of the propeller: port turns by the right hand, so that the hull rolls to
+    # port (K < 0); both together cancel.
+    assert b[3, PORT] == pytest.approx(-b[3, STARBOARD]) and b[3, PORT] < -0.01
+    assert np.linalg.matrix_rank(b[[0, 1, 2, 5]]) == 4
+
+
+def test_lateral_thrusters_sit_in_their_tunnels() -> None:
+    alice = fleet.vehicle("alice")
+    for thruster in alice.thrusters[BOW:]:
+        tunnel = next(t for t in fleet.GEOMETRIES["alice"].tunnels if t.name == thruster.name)
+        assert thruster.position_body_m == (tunnel.x_m, 0.0, 0.0)
+        assert thruster.diameter_m == tunnel.diameter_m
+    for name in NAMES:
+        pod = fleet.GEOMETRIES[name].pod
+        for thruster in fleet.vehicle(name).thrusters[:2]:
+            x, y, z = thruster.position_body_m
+            assert pod.outline.tail_x_m < x < pod.outline.nose_x_m
+            assert abs(y) == pytest.approx(pod.y_m, abs=1e-3) and z == 0.0
+
+
+@pytest.mark.parametrize(
+    ("index", "forward_n", "reverse_n", "percent"),
+    [
+        (STARBOARD, 71.5, 30.0, 3.0),  # Toulon's limits
+        (PORT, 71.5, 30.0, 3.0),
+        (VERTICAL, 55.0, 28.5, 3.0),
+        (BOW, 51.4, 43.4, 1.0),  # T200: 16 V ahead, 3.78e-6 N per rpm^2 astern
+    ],
+)
+def test_thrusters_reach_what_other_sources_state(
+    index: int, forward_n: float, reverse_n: float, percent: float
+) -> None:
+    thruster = fleet.vehicle("alice").thrusters[index]
+    assert force(thruster, thruster.most_rps) == pytest.approx(forward_n, rel=percent / 100)
+    assert -force(thruster, -thruster.most_rps) == pytest.approx(reverse_n, rel=percent / 100)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_propeller_beats_momentum_theory(name: str) -> None:
+    """Shaft power over the least that the thrust in still water can take, T^1.5 / sqrt(2 rho A)."""
+    for thruster in fleet.vehicle(name).thrusters:
+        area = math.pi / 4.0 * thruster.diameter_m**2
+        n = thruster.most_rps
+        shaft = 2 * math.pi * fleet.DENSITY * thruster.diameter_m**5 * thruster.kq_forward * n**3
+        least = force(thruster, n) ** 1.5 / math.sqrt(2.0 * fleet.DENSITY * area)
+        assert 1.2 < shaft / least < 3.0
+
+
+def test_unknown_names_are_refused() -> None:
+    with pytest.raises(VehicleError, match="vehicle 'bluerov' is not known; known: alice, sparus2"):
+        fleet.vehicle("bluerov")
+    with pytest.raises(VehicleError, match="coefficients 'best' are not known; known: estimated"):
+        fleet.vehicle("alice", "best")

@@ -1,0 +1,227 @@
+"""Sigmas are what errors of the parameters do, to first order, found by doing them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.base.errors import CalibrationError
+from camera_calib.calibrate.freedom import POSE
+from camera_calib.flat_port import PARAMETERS
+from camera_calib.judge.judgement import anchors_cam
+from camera_calib.judge.uncertainty import (
+    baseline_sigma_m,
+    compensation,
+    frame_pixels,
+    frame_points,
+    length_sigmas_m,
+    noise_sigmas_m,
+    overlap_points,
+    point_sigmas_m,
+    projection_sigma,
+    rig_slopes,
+    shape_sigmas_m,
+    stereo_sigma,
+    taken_up,
+)
+from camera_calib.rig import Covariance
+from camera_calib.triangulate import reproject, triangulate
+from tests.oracles_report import (
+    DESIGN,
+    best_pose_by_search,
+    moved_rig,
+    some_errors,
+    usual,
+    with_one_error,
+)
+
+POINTS = np.array([[0.1, -0.2, 1.0], [-0.3, 0.25, 1.7], [0.02, 0.01, 0.8]])
+
+
+@pytest.mark.parametrize("field", [*PARAMETERS, *POSE])
+def test_slopes_by_each_parameter_are_those_of_small_changes(field: str) -> None:
+    name = f"right.{field}"
+    rig = with_one_error(usual().rig, {"left.fx_px": 1.0, name: 1.0})
+    _, _, slopes = rig_slopes(rig, "right", POINTS)
+
+    step = 1e-4 if field.endswith("_px") else 1e-6
+    plus, minus = (moved_rig(rig, {name: sign * step}) for sign in (1, -1))
+    moved = [
+        r.cameras["right"].project(r.cam_from_rig["right"].apply(POINTS)) for r in (plus, minus)
+    ]
+    numeric = (moved[0] - moved[1]) / (2 * step)
+
+    np.testing.assert_allclose(slopes[..., 1], numeric, rtol=2e-5, atol=2e-5)
+    np.testing.assert_array_equal(slopes[..., 0], 0.0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_projection_errs_by_its_sigma(seed: int) -> None:
+    """With one error only, the sigma in the worst direction is the length of its effect."""
+    found = usual()
+    errors = some_errors(found.rig, seed)
+    rig, wrong = with_one_error(found.rig, errors), moved_rig(found.rig, errors)
+    camera, anchors = rig.cameras["right"], anchors_cam(found, "right")[::7]
+    pixels = frame_pixels(camera, 5, 4)
+
+    sigma = projection_sigma(rig, "right", pixels, 1.5, compensation(rig, "right", anchors))
+
+    points = camera.at_depth(pixels, 1.5)
+    plain = np.linalg.norm(wrong.cameras["right"].project(points) - pixels, axis=-1)
+    pose = best_pose_by_search(camera, wrong.cameras["right"], anchors)
+    shifted = pose.apply(points.reshape(-1, 3)).reshape(points.shape)
+    compensated = np.linalg.norm(wrong.cameras["right"].project(shifted) - pixels, axis=-1)
+    np.testing.assert_allclose(sigma.plain_px, plain, rtol=0.05, atol=1e-4)
+    np.testing.assert_allclose(sigma.compensated_px, compensated, rtol=0.05, atol=2e-4)
+    assert compensated.mean() < 0.5 * plain.mean()
+
+
+def test_a_turn_hidden_in_the_principal_point_is_compensated() -> None:
+    """Far away, moving the centre of a narrow frame is a turn of the camera."""
+    rig = with_one_error(DESIGN, {"left.cx_px": 1.0})
+    camera = rig.cameras["left"]
+    pixels = frame_pixels(camera, 5, 5)
+    anchors = frame_points(camera, (5.0, 10.0))
+
+    sigma = projection_sigma(rig, "left", pixels, 8.0, compensation(rig, "left", anchors))
+
+    np.testing.assert_allclose(sigma.plain_px, 1.0, rtol=1e-9)
+    assert 0.0 < sigma.compensated_px.max() < 0.25
+
+
+def test_sigmas_grow_with_the_noise() -> None:
+    rig = usual().rig
+    assert rig.covariance is not None
+    twice = replace(
+        rig,
+        covariance=Covariance(
+            parameters=rig.covariance.parameters, matrix=4 * rig.covariance.matrix
+        ),
+    )
+    at = np.array([[0.0, 0.0, 2.0]])
+    np.testing.assert_allclose(point_sigmas_m(twice, at), 2 * point_sigmas_m(rig, at))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_triangulated_points_and_lengths_err_by_their_sigmas(seed: int) -> None:
+    """True pixels, triangulated exactly in a rig with one error."""
+    errors = some_errors(usual().rig, seed)
+    rig, wrong = with_one_error(usual().rig, errors), moved_rig(usual().rig, errors)
+    points = np.array([[0.0, 0.0, 2.0], [0.35, 0.2, 2.0], [-0.3, -0.3, 1.5], [0.1, 0.1, 1.0]])
+    cameras, poses = list(rig.cameras.values()), list(rig.cam_from_rig.values())
+
+    found = triangulate(
+        list(wrong.cameras.values()),
+        list(wrong.cam_from_rig.values()),
+        reproject(cameras, poses, points),
+    ).points_world
+
+    np.testing.assert_allclose(
+        point_sigmas_m(rig, points), np.abs(found - points), rtol=0.05, atol=2e-7
+    )
+    lengths = np.linalg.norm(np.diff(found, axis=0), axis=1)
+    true = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    np.testing.assert_allclose(
+        length_sigmas_m(rig, points[:-1], points[1:]), np.abs(lengths - true), rtol=0.05, atol=2e-7
+    )
+
+
+def test_noise_sigmas_are_those_of_the_triangulation() -> None:
+    rig = usual().rig
+    points = np.array([[0.0, 0.0, 2.0], [0.3, 0.2, 1.4]])
+    pixels = reproject(list(rig.cameras.values()), list(rig.cam_from_rig.values()), points)
+    found = triangulate(list(rig.cameras.values()), list(rig.cam_from_rig.values()), pixels, 0.1)
+    np.testing.assert_allclose(noise_sigmas_m(rig, points, 0.1), found.sigmas_m, rtol=1e-6)
+
+
+def test_depth_noise_is_range_squared_over_baseline_and_focal_length() -> None:
+    """The closed form of stereo, sigma_z = z^2 sqrt(2) sigma / (f B), from the pinhole's centre."""
+    camera = DESIGN.cameras["left"]
+    bare = {"port_distance_m": 0.0, "glass_thickness_m": 0.0}
+    rig = replace(DESIGN, cameras={n: camera.with_parameters(bare) for n in DESIGN.cameras})
+    rig = with_one_error(rig, {"left.fx_px": 0.1})
+
+    ((_, _, sigma_m),) = noise_sigmas_m(rig, np.array([[0.05, 0.0, 2.0]]), 0.1)
+
+    expected_m = 2.0**2 * 2**0.5 * 0.1 / (camera.fx_px * camera.n_water * 0.1)
+    assert sigma_m == pytest.approx(expected_m, rel=0.01)
+
+
+def test_a_rigs_rigid_motion_does_not_count_as_shape() -> None:
+    """An error that both centres share turns all that stereo sees."""
+    both = with_one_error(DESIGN, {"left.cy_px": 0.5, "right.cy_px": 0.5})
+    points = overlap_points(both, 2.0)
+    moved, shape = point_sigmas_m(both, points), shape_sigmas_m(both, points)
+    assert moved[:, 1].min() > 5e-4
+    assert np.abs(shape).max() < 0.1 * moved[:, 1].min()
+
+
+def test_points_that_one_camera_sees_have_no_sigma() -> None:
+    outside = np.array([[-0.72, 0.0, 2.0], [0.0, 0.0, 2.0]])
+    sigmas = point_sigmas_m(usual().rig, outside)
+    assert np.isnan(sigmas[0]).all()
+    assert np.isfinite(sigmas[1]).all()
+
+
+def test_cameras_that_look_apart_share_nothing() -> None:
+    away = replace(
+        usual().rig,
+        cam_from_rig={
+            "left": RigidTransform.identity(),
+            "right": RigidTransform.from_translation([-5.0, 0.0, 0.0]),
+        },
+    )
+    found = stereo_sigma(away, 2.0, 0.1)
+    assert np.isnan(found.length_sigma_m)
+    assert np.isnan(found.point_m).all()
+
+
+def test_a_length_fits_the_overlap() -> None:
+    near, far = (stereo_sigma(usual().rig, range_m, 0.1) for range_m in (0.5, 3.0))
+    assert 0.1 < near.length_m < 0.35
+    assert far.length_m == pytest.approx(1.0)
+    assert near.length_sigma_m < far.length_sigma_m
+
+
+def test_the_baselines_sigma_is_that_of_its_length() -> None:
+    rig = usual().rig
+    assert rig.covariance is not None
+    draws = np.random.default_rng(3).multivariate_normal(
+        np.zeros(len(rig.covariance.parameters)), rig.covariance.matrix, size=4000, method="eigh"
+    )
+    at = [rig.covariance.parameters.index(f"right.{axis}") for axis in POSE[3:]]
+    lengths = np.linalg.norm(rig.cam_from_rig["right"].translation + draws[:, at], axis=1)
+    assert baseline_sigma_m(rig, "right") == pytest.approx(lengths.std(), rel=0.05)
+
+
+def test_what_a_pose_takes_up_is_the_least_squares_fit() -> None:
+    rng = np.random.default_rng(5)
+    slopes, moved = rng.normal(size=(40, 6)), rng.normal(size=(40, 3))
+    expected = np.linalg.lstsq(slopes, moved, rcond=None)[0]
+    np.testing.assert_allclose(taken_up(slopes, moved), expected, rtol=1e-9)
+
+
+def test_a_design_has_no_uncertainty_to_tell() -> None:
+    with pytest.raises(CalibrationError, match=r"design values.* no covariance"):
+        point_sigmas_m(DESIGN, POINTS)
+
+
+@pytest.mark.parametrize("name", ["middle.fx_px", "left.rx_rad", "left.colour"])
+def test_a_covariance_of_what_the_rig_has_not_is_refused(name: str) -> None:
+    with pytest.raises(CalibrationError, match=name):
+        point_sigmas_m(with_one_error(DESIGN, {name: 1.0}), POINTS)
+
+
+def test_two_points_hold_no_pose() -> None:
+    with pytest.raises(CalibrationError, match="2 points do not hold a pose"):
+        compensation(usual().rig, "left", POINTS[:2])
+
+
+@pytest.mark.parametrize("seed", range(1, 5))
+def test_all_of_the_overlap_has_sigmas(seed: int) -> None:
+    """Also its points on the very edge of a frame, which rounding may put beyond."""
+    points = overlap_points(usual(seed).rig, 2.0)
+    assert len(points) > 100
+    assert np.isfinite(point_sigmas_m(usual(seed).rig, points)).all()
+    assert np.isfinite(shape_sigmas_m(usual(seed).rig, points)).all()

@@ -1,0 +1,250 @@
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from alice_survey.base.errors import CalibrationError
+from camera_calib.calibrate.freedom import (
+    PORT,
+    Freedom,
+    Prior,
+    intrinsics,
+    of_cameras,
+    pose_names,
+    value,
+)
+from camera_calib.calibrate.result import Calibration, TargetView
+from camera_calib.calibrate.start import locate
+from camera_calib.judge.judgement import anchors_cam
+from camera_calib.judge.uncertainty import frame_pixels
+from camera_calib.judge.validation import (
+    LengthErrors,
+    farthest,
+    halves_difference,
+    hold_out,
+    length_errors,
+    neighbours,
+    score_hold_out,
+)
+from tests.oracles_report import (
+    DESIGN,
+    SQUARE_M,
+    adjusted,
+    all_free,
+    board_points,
+    moved_rig,
+    synthetic_views,
+    true_rig,
+    usual,
+    usual_held_out,
+)
+
+
+def lengths_of(found: Calibration) -> LengthErrors:
+    return length_errors(
+        found.rig,
+        found.views,
+        found.rig_from_target,
+        found.residuals_px,
+        found.target_points,
+        found.noise_px,
+    )
+
+
+def test_every_fifth_view_is_held_out_and_posed_without_it() -> None:
+    held = usual_held_out()
+    names = {view.name for view in held.views}
+    assert names == {"02", "07", "12"}
+    assert not names & {view.name for view in held.used.views}
+    true = synthetic_views(true_rig(), 14, 0.1, 1).rig_from_target
+    for view, pose in zip(held.views, held.rig_from_target, strict=True):
+        off = pose.translation - true[int(view.name)].translation
+        assert np.abs(off).max() < 0.02
+
+
+def test_held_out_views_fit_as_noise_and_covariance_promise() -> None:
+    """Squares of the errors over five calibrations, against their expectation."""
+    scores = [score_hold_out(usual_held_out(seed)) for seed in range(1, 6)]
+    found = sum(s.points * s.rms_px**2 for s in scores)
+    expected = sum(s.points * s.expected_px**2 for s in scores)
+    assert found / expected == pytest.approx(1.0, abs=0.12)
+    assert all(s.outliers == 0 for s in scores)
+    assert all(s.expected_px < 0.1 * 2**0.5 * 1.1 for s in scores)
+
+
+def test_a_wrong_model_fits_held_out_views_worse_than_it_promises() -> None:
+    """Distortion is left out: a lens that the views used cannot bear, nor those held out."""
+    made = synthetic_views(true_rig(), 12, 0.02, 3)
+    names = ("fx_px", "fy_px", "cx_px", "cy_px", "port_distance_m")
+    free = Freedom(free=(*of_cameras(DESIGN, names), *pose_names(DESIGN)))
+
+    def wrong(views: Sequence[TargetView]) -> Calibration:
+        return replace(adjusted(views, made.points, DESIGN, free), noise_px=0.02)
+
+    held = hold_out(made.views, wrong, locate)
+
+    assert held is not None
+    score = score_hold_out(held)
+    assert score.outliers > 0.2 * (score.points + score.outliers)
+
+
+def test_halves_differ_as_their_covariances_promise() -> None:
+    ratios = []
+    for seed in range(1, 6):
+        held, found = usual_held_out(seed), usual(seed)
+        assert held.halves is not None
+        for name, camera in found.rig.cameras.items():
+            difference = halves_difference(
+                held.halves, name, frame_pixels(camera, 9, 7), 1.5, anchors_cam(found, name)
+            )
+            ratios.append(difference.rms_px / difference.expected_rms_px)
+    assert 0.6 < np.sqrt(np.mean(np.square(ratios))) < 1.4
+
+
+def test_an_error_of_the_prior_is_the_same_in_both_halves() -> None:
+    """A prior about as good as the views: its own error hardly shows between halves."""
+    lens = of_cameras(DESIGN, intrinsics("opencv5"))
+    true = np.array([value(true_rig(), name) for name in lens])
+    ratios, independent = [], []
+    for seed in range(1, 6):
+        found, rng = usual(seed), np.random.default_rng([seed, 5])
+        assert found.rig.covariance is not None
+        at = [found.rig.covariance.parameters.index(name) for name in lens]
+        covariance = 0.3 * found.rig.covariance.matrix[np.ix_(at, at)]
+        mean = rng.multivariate_normal(true, covariance)
+        prior = Prior(parameters=lens, mean=mean, covariance=covariance)
+        ports = (*of_cameras(DESIGN, PORT), *pose_names(DESIGN))
+        freedom = Freedom(free=ports, prior=prior)
+        first, second = (
+            adjusted(found.views[i::2], found.target_points, found.rig, freedom).rig
+            for i in range(2)
+        )
+        for name, camera in found.rig.cameras.items():
+            pixels, anchors = frame_pixels(camera, 9, 7), anchors_cam(found, name)
+            shared = halves_difference((first, second), name, pixels, 1.5, anchors, prior)
+            apart = halves_difference((first, second), name, pixels, 1.5, anchors)
+            ratios.append(shared.rms_px / shared.expected_rms_px)
+            independent.append(apart.rms_px / apart.expected_rms_px)
+    assert 0.75 < np.sqrt(np.mean(np.square(ratios))) < 1.3
+    assert np.sqrt(np.mean(np.square(independent))) < 0.75
+
+
+def test_the_same_calibration_twice_does_not_differ() -> None:
+    """Nor does one whose frame has moved with all that it sees: the pose takes that up."""
+    found = usual()
+    turned = replace(
+        found.rig,
+        cameras={
+            name: camera.with_parameters({"cx_px": camera.cx_px + 0.02})
+            for name, camera in found.rig.cameras.items()
+        },
+    )
+    anchors, pixels = anchors_cam(found, "left"), frame_pixels(found.rig.cameras["left"], 5, 5)
+    same = halves_difference((found.rig, found.rig), "left", pixels, 2.0, anchors)
+    moved = halves_difference((found.rig, turned), "left", pixels, 2.0, anchors)
+    assert same.rms_px < 1e-6
+    assert 0.0 < moved.rms_px < 0.005
+    assert same.expected_rms_px > 0.05
+
+
+def test_too_few_views_are_not_held_out(capsys: pytest.CaptureFixture[str]) -> None:
+    def refuse(views: Sequence[TargetView]) -> Calibration:
+        raise CalibrationError(f"{len(views)} views are too few")
+
+    assert hold_out(usual().views[:6], refuse, locate) is None
+    assert "5 views are too few" in capsys.readouterr().err
+
+
+def test_halves_are_left_out_where_they_do_not_calibrate(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    found = usual()
+
+    def calibrate(views: Sequence[TargetView]) -> Calibration:
+        if len(views) < 8:
+            raise CalibrationError("too few")
+        return adjusted(views, found.target_points, found.rig, all_free(DESIGN))
+
+    held = hold_out(found.views, calibrate, locate)
+
+    assert held is not None
+    assert held.halves is None
+    assert "halves" in capsys.readouterr().err
+
+
+def test_lengths_are_exact_in_the_true_rig() -> None:
+    rig = true_rig()
+    made = synthetic_views(rig, 5, 0.0, 4)
+    nothing = np.zeros((5, 2, len(made.points), 2))
+    for v, view in enumerate(made.views):
+        for c, name in enumerate(rig.cameras):
+            nothing[v, c, np.isnan(view.pixels[name][:, 0])] = np.nan
+    found = length_errors(rig, made.views, made.rig_from_target, nothing, made.points, 0.1)
+    assert np.abs(found.error_m).max() < 1e-9
+    assert found.scale_ppm()[0] == pytest.approx(0.0, abs=600.0)  # the bias, expected of noise
+
+
+def test_lengths_err_as_their_noise() -> None:
+    found = lengths_of(usual())
+    for long in (True, False):
+        rms, expected = found.rms_m(long)
+        assert rms / expected == pytest.approx(1.0, abs=0.2)
+    scale, sigma = found.scale_ppm()
+    assert abs(scale) < 4 * sigma
+    at = found.long
+    scaled = (found.error_m - found.bias_m)[at] / found.sigma_m[at]
+    assert np.std(scaled) == pytest.approx(1.0, abs=0.2)
+
+
+def test_lengths_in_dull_pictures_err_as_their_noise() -> None:
+    """Every second view three times as noisy."""
+    rig, made = true_rig(), synthetic_views(true_rig(), 16, 0.0, 4)
+    rng, noise_px = np.random.default_rng(8), np.tile([[0.05, 0.05], [0.15, 0.15]], (8, 1))
+    views, misses = [], np.full((16, 2, len(made.points), 2), np.nan)
+    for v, view in enumerate(made.views):
+        pixels = {}
+        for c, (name, seen) in enumerate(view.pixels.items()):
+            pixels[name] = seen + rng.normal(0.0, noise_px[v, c], seen.shape)
+            misses[v, c] = seen - pixels[name]
+        views.append(replace(view, pixels=pixels))
+    found = length_errors(rig, views, made.rig_from_target, misses, made.points, noise_px)
+    scores = (found.error_m - found.bias_m) / found.sigma_m
+    for odd in (0, 1):
+        assert np.std(scores[found.view % 2 == odd]) == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_wrong_baseline_is_a_wrong_scale() -> None:
+    found = usual()
+    longer = moved_rig(found.rig, {"right.x_m": -0.001 * 0.1001})
+    scale, sigma = lengths_of(replace(found, rig=longer)).scale_ppm()
+    before, _ = lengths_of(found).scale_ppm()
+    assert scale - before == pytest.approx(1000.0, abs=60.0)
+    assert sigma < 1000.0
+
+
+def test_a_wrong_target_size_is_a_wrong_scale() -> None:
+    found = usual()
+    true = lengths_of(found)
+    wrong = lengths_of(replace(found, target_points=0.998 * found.target_points))
+    assert wrong.scale_ppm()[0] - true.scale_ppm()[0] == pytest.approx(2000.0, abs=60.0)
+
+
+def test_neighbours_of_a_grid_are_a_square_apart() -> None:
+    points = board_points(5, 4)
+    pairs = neighbours(points)
+    assert len(pairs) == 4 * 4 + 5 * 3
+    apart = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+    np.testing.assert_allclose(apart, SQUARE_M)
+    assert (pairs[:, 0] < pairs[:, 1]).all()
+
+
+def test_the_farthest_of_a_grid_are_its_corners() -> None:
+    points = board_points(5, 4)
+    pairs = farthest(points, np.arange(20))
+    assert {0, 4, 15, 19} == set(pairs.ravel()) & {0, 4, 15, 19}
+    apart = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+    assert apart.max() == pytest.approx(SQUARE_M * 5.0)
+    assert len(np.unique(pairs, axis=0)) == len(pairs)
+    some = farthest(points, np.array([0, 1, 2]))
+    np.testing.assert_array_equal(some, [[0, 1], [0, 2]])

@@ -1,0 +1,100 @@
+import math
+
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from alice_survey.base.errors import PlanError
+from camera_calib.fov.table import FovChoices, fov_table
+from missions.exposure.focus import largest_f_number, needed_f_number, plan_focus, too_open
+from tests.missions.exposure.surveys import survey
+from tests.oracles_imaging import blur_circle_px
+
+
+def test_the_papers_lens_focuses_at_one_and_a_half_metres_in_air() -> None:
+    rig, config = survey(ideal_port=True, water={"n_water": 1.33}, plan={"relief_m": 0.0})
+    focus = plan_focus(rig.cameras["left"], config.camera, config.plan)
+    assert focus.focus_air_m == pytest.approx(2.0 / 1.33, rel=1e-12)
+    assert round(focus.focus_air_m, 1) == 1.5
+    # The paper's 2 m of depth of field at F/4 counts 3 px as sharp.
+    assert focus.papers_depth_px == pytest.approx(10.9 / 3.69, abs=0.02)
+    assert focus.far_altitude_m - focus.near_altitude_m == pytest.approx(2.05, abs=0.06)
+
+
+def test_the_depth_of_field_agrees_with_the_table_of_views() -> None:
+    rig, config = survey(plan={"relief_m": 0.0})
+    focus = plan_focus(rig.cameras["left"], config.camera, config.plan)
+    row = fov_table([12.5], [2.0], 1.34, config.camera, FovChoices(coc_px=3.0))[0]
+    assert focus.near_altitude_m == pytest.approx(row.near_altitude_m, rel=1e-6)
+    assert focus.far_altitude_m == pytest.approx(row.far_altitude_m, rel=1e-6)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    altitude_m=st.floats(1.0, 8.0),
+    relief=st.floats(0.01, 0.4),
+    f_number=st.floats(1.4, 8.0),
+    lens_mm=st.floats(8.0, 35.0),
+)
+def test_blur_at_both_ends_of_the_relief_is_that_of_traced_images(
+    altitude_m: float, relief: float, f_number: float, lens_mm: float
+) -> None:
+    rig, config = survey(
+        ideal_port=True,
+        camera={"focal_mm": lens_mm, "f_number": f_number},
+        plan={"altitude_m": altitude_m, "relief_m": relief * altitude_m, "sharp_px": 20.0},
+    )
+    camera = rig.cameras["left"]
+    assume(needed_f_number(camera, config.camera, config.plan) < f_number)
+    focus = plan_focus(camera, config.camera, config.plan)
+    for sign in (-1, 1):
+        apparent = altitude_m * (1 + sign * relief) / 1.34
+        blur = blur_circle_px(lens_mm * 1e-3, f_number, 3.69e-6, focus.focus_air_m, apparent)
+        assert focus.blur_px == pytest.approx(blur, rel=1e-9)
+    assert focus.near_altitude_m <= altitude_m * (1 - relief) + 1e-9
+    assert focus.far_altitude_m >= altitude_m * (1 + relief) - 1e-9
+
+
+def test_the_f_number_needed_just_fills_the_circle() -> None:
+    rig, config = survey(plan={"altitude_m": 1.2})
+    camera = rig.cameras["left"]
+    needed = needed_f_number(camera, config.camera, config.plan)
+    closed = config.camera.model_copy(update={"f_number": needed})
+    focus = plan_focus(camera, closed, config.plan)
+    assert focus.blur_px == pytest.approx(config.plan.sharp_px, rel=1e-9)
+    assert focus.f_number_needed == pytest.approx(needed, rel=1e-9)
+
+
+def test_diffraction_of_green_light_at_f4() -> None:
+    rig, config = survey()
+    focus = plan_focus(rig.cameras["left"], config.camera, config.plan)
+    assert focus.airy_px == pytest.approx(2.44 * 0.53 * 4 / 3.69, rel=0.01)
+    assert focus.f_number_diffraction == pytest.approx(3.0 / focus.airy_px * 4, rel=1e-9)
+    assert largest_f_number(config.camera, 3.0) == pytest.approx(8.56, abs=0.01)
+
+
+def test_an_aperture_that_is_too_open_is_told_what_to_set() -> None:
+    rig, config = survey(plan={"altitude_m": 1.2})
+    focus = plan_focus(rig.cameras["left"], config.camera, config.plan)
+    told = math.ceil(10 * needed_f_number(rig.cameras["left"], config.camera, config.plan)) / 10
+    assert f"set camera.f_number to {told:g}" in too_open(focus, config.camera, config.plan)
+    closed = config.camera.model_copy(update={"f_number": told})
+    assert not too_open(plan_focus(rig.cameras["left"], closed, config.plan), closed, config.plan)
+
+
+def test_a_lens_that_cannot_focus_gets_ways_out_that_work() -> None:
+    rig, config = survey(plan={"altitude_m": 0.8})
+    camera = rig.cameras["left"]
+    with pytest.raises(PlanError) as fault:
+        plan_focus(camera, config.camera, config.plan)
+    text = str(fault.value)
+    assert "relief_m (depth of field) conflicts with sharp_px (diffraction)" in text
+    assert len(text.splitlines()) == 4
+    for name in ("altitude_m", "sharp_px", "relief_m"):
+        told = float(text.split(f"- {name} ")[1].split(" instead")[0])
+        plan = config.plan.model_copy(update={name: told})
+        needed = needed_f_number(camera, config.camera, plan)
+        best = largest_f_number(config.camera, plan.sharp_px)
+        assert 0.9 * best < needed < best
+        closed = config.camera.model_copy(update={"f_number": math.ceil(10 * needed) / 10})
+        plan_focus(camera, closed, plan)

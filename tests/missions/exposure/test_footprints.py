@@ -1,0 +1,160 @@
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from shapely.geometry import Polygon
+
+from alice_survey.base.errors import PlanError
+from missions.exposure.footprints import (
+    altitude_for_pixel_m,
+    footprint_range,
+    line_spacing,
+    pixel_on_floor_m,
+    spacing_rows,
+)
+from tests.missions.exposure.surveys import survey
+from tests.oracles_imaging import traced_footprint, traced_spot
+
+STEP_M = 0.3
+
+
+def overlap_of_middle_row(first: Polygon, second: Polygon) -> float:
+    """Share of the first footprint's middle row that lies in the second."""
+    row = Polygon([(-9, -1e-4), (9, -1e-4), (9, 1e-4), (-9, 1e-4)])
+    strip = first.intersection(row)
+    return strip.intersection(second).area / strip.area
+
+
+def test_one_metre_lines_at_two_metres_overlap_by_29_percent_not_45() -> None:
+    rig, config = survey(ideal_port=True, plan={"line_spacing_m": 1.0})
+    spacing = line_spacing(rig, config.plan, STEP_M)
+
+    half = math.atan(3384 * 3.69e-3 / 2 / 12.5)
+    width = 2 * 2.0 * math.tan(math.asin(math.sin(half) / 1.34))
+    assert spacing.side_overlap == pytest.approx(1 - 1 / width, abs=1e-9)
+    assert round(100 * spacing.side_overlap, 1) == 29.3
+
+
+@pytest.mark.parametrize("distance_m", [0.01, 0.02, 0.03])
+def test_through_real_ports_they_overlap_by_30_to_32_percent(distance_m: float) -> None:
+    rig, config = survey(plan={"line_spacing_m": 1.0}, camera={"port_distance_m": distance_m})
+    assert 0.30 <= line_spacing(rig, config.plan, STEP_M).side_overlap <= 0.32
+
+
+@pytest.mark.parametrize("ideal", [False, True])
+@pytest.mark.parametrize("wanted", [0.29, 0.45, 0.7])
+def test_the_spacing_yields_the_overlap_on_traced_footprints(ideal: bool, wanted: float) -> None:
+    rig, config = survey(ideal_port=ideal, plan={"side_overlap": wanted})
+    spacing = line_spacing(rig, config.plan, STEP_M)
+    here = traced_footprint(rig.cameras["left"], 2.0, 0.0)
+    there = traced_footprint(rig.cameras["left"], 2.0, spacing.spacing_m)
+
+    assert spacing.bound_by == "side_overlap"
+    assert overlap_of_middle_row(here, there) == pytest.approx(wanted, abs=1e-3)
+    by_area = here.intersection(there).area / here.area
+    assert spacing.side_overlap_area == pytest.approx(by_area, abs=2e-3)
+    # Sides bulge: corners share less than the middle row.
+    assert wanted - 0.02 < by_area < wanted
+    assert by_area - 1e-3 < spacing.side_overlap_swath < wanted
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    altitude_m=st.floats(1.2, 6.0),
+    wanted=st.floats(0.3, 0.7),
+    track_error_m=st.floats(0.0, 0.08),
+    over_relief=st.booleans(),
+)
+def test_neighbours_off_their_lines_still_overlap_as_asked(
+    altitude_m: float, wanted: float, track_error_m: float, over_relief: bool
+) -> None:
+    rig, config = survey(
+        plan={
+            "altitude_m": altitude_m,
+            "relief_m": 0.2,
+            "side_overlap": wanted,
+            "track_error_m": track_error_m,
+            "overlap_over_relief": over_relief,
+        }
+    )
+    spacing = line_spacing(rig, config.plan, STEP_M)
+    ground_m = altitude_m - 0.2 if over_relief else altitude_m
+    here = traced_footprint(rig.cameras["left"], ground_m, -track_error_m)
+    there = traced_footprint(rig.cameras["left"], ground_m, spacing.spacing_m + track_error_m)
+    edge = traced_spot(rig.cameras["left"], 3384.0, 1355.0, ground_m)[0]
+    row = Polygon([(-99, -1e-4), (99, -1e-4), (99, 1e-4), (-99, 1e-4)])
+    shared = here.intersection(there).intersection(row).area / 2e-4
+
+    reached = spacing.side_overlap_worst if over_relief else spacing.side_overlap_off_track
+    assert shared / (2 * edge) == pytest.approx(reached, abs=2e-3)
+    assert reached >= wanted - 1e-9
+    if spacing.bound_by.startswith("side_overlap"):
+        assert reached == pytest.approx(wanted, abs=1e-9)
+
+
+def test_little_overlap_is_bound_by_stereo_without_gaps() -> None:
+    rig, config = survey(plan={"side_overlap": 0.0})
+    spacing = line_spacing(rig, config.plan, STEP_M)
+    assert spacing.bound_by == "no gap in stereo"
+    assert spacing.side_overlap > 0.05
+    assert spacing.stereo_overlap == pytest.approx(0.0, abs=1e-9)
+
+
+def test_footprints_over_the_relief_grow_with_the_way_down() -> None:
+    rig, config = survey()
+    prints = footprint_range(rig, config.plan, STEP_M)
+    assert [p.altitude_m for p in (prints.top, prints.mean, prints.bottom)] == [1.65, 2.0, 2.35]
+    for p in (prints.top, prints.mean, prints.bottom):
+        edge = traced_spot(rig.cameras["left"], 3384.0, 1355.0, p.altitude_m)[0]
+        assert p.across_m == pytest.approx(2 * edge, rel=1e-9)
+        # A tenth of a metre of baseline is not seen by both, on either side.
+        assert p.stereo_across_m < p.across_m - 0.1 + 1e-9
+        assert p.stereo_across_m > p.across_m - 0.13
+
+
+@given(pixel_mm=st.floats(0.05, 3.0))
+def test_altitude_and_pixel_are_inverse(pixel_mm: float) -> None:
+    rig, _ = survey()
+    camera = rig.cameras["left"]
+    altitude_m = altitude_for_pixel_m(camera, pixel_mm * 1e-3)
+    assert pixel_on_floor_m(camera, altitude_m) == pytest.approx(pixel_mm * 1e-3, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("plan", "first", "second"),
+    [
+        ({"altitude_m": 0.5, "relief_m": 0.6}, "altitude_m", "relief_m"),
+        ({"altitude_m": 0.6, "relief_m": 0.35}, "altitude_m", "relief_m"),
+        ({"track_error_m": 0.6}, "side_overlap", "track_error_m"),
+        ({"altitude_m": 0.3, "relief_m": 0.0}, "camera.baseline_m", "altitude_m"),
+    ],
+)
+def test_what_cannot_be_names_both_limits_in_under_five_lines(
+    plan: dict[str, float], first: str, second: str
+) -> None:
+    baseline = {"baseline_m": 0.4} if first == "camera.baseline_m" else {}
+    rig, config = survey(plan=plan, camera=baseline)
+    with pytest.raises(PlanError) as fault:
+        line_spacing(rig, config.plan, STEP_M)
+    lines = str(fault.value).splitlines()
+    assert f"{first} conflicts with {second}" in lines[0]
+    assert 2 <= len(lines) <= 4
+    assert all(line.startswith("  - ") for line in lines[1:])
+
+
+def test_the_altitude_that_is_told_lets_both_cameras_see() -> None:
+    rig, config = survey(plan={"altitude_m": 0.3, "relief_m": 0.0}, camera={"baseline_m": 0.4})
+    with pytest.raises(PlanError) as fault:
+        line_spacing(rig, config.plan, STEP_M)
+    told = float(str(fault.value).split("altitude_m ")[-1].split(":")[0])
+    raised = config.plan.model_copy(update={"altitude_m": told, "side_overlap": 0.0})
+    line_spacing(rig, raised, STEP_M)
+
+
+def test_the_papers_45_percent_is_explained_beside_its_lines() -> None:
+    rig, config = survey(plan={"line_spacing_m": 1.0, "side_overlap": 0.29})
+    prints = footprint_range(rig, config.plan, STEP_M)
+    rows = spacing_rows(line_spacing(rig, config.plan, STEP_M), config.plan, prints)
+    assert "1 m gives 30.6%" in rows[0].note
+    assert "0.793 m apart" in rows[0].note

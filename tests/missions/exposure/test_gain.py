@@ -1,0 +1,154 @@
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from alice_survey.base.errors import ImageError
+from alice_survey.seafloor.sensor import develop
+from missions.exposure.gain import gain_advice, gain_report, noise_sigma, picture_files, read_linear
+
+SIZE = (160, 200)
+FULL_WELL = 9000.0
+
+
+def scene(median_e: float, falloff: float = 0.0, noisy: bool = True, seed: int = 1) -> np.ndarray:
+    """Electrons of a textured floor, (H, W, 3)."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    r2 = ((x / SIZE[1] - 0.5) ** 2 + (y / SIZE[0] - 0.5) ** 2) * 4
+    light = np.exp(-falloff * r2) * (1 + 0.1 * np.sin(x / 23.0) * np.cos(y / 31.0))
+    electrons = np.repeat((median_e / np.median(light) * light)[:, :, None], 3, axis=2)
+    if noisy:
+        electrons = rng.poisson(electrons) + 12.0 * rng.standard_normal(electrons.shape)
+    return electrons.astype(np.float32)
+
+
+def taken(folder: Path, median_e: float, gain_db: float, count: int = 3, **how: float) -> Path:
+    """Control pictures as the simulator's sensor writes them."""
+    for i in range(count):
+        picture = develop(scene(median_e, seed=i, **how), 10 ** (gain_db / 20) / FULL_WELL)
+        cv2.imwrite(str(folder / f"{i}.png"), picture)
+    return folder
+
+
+@settings(max_examples=15, deadline=None)
+@given(median_e=st.floats(150, 2500), present_db=st.floats(0, 12))
+def test_the_gain_told_brings_the_median_to_the_target(
+    tmp_path_factory: pytest.TempPathFactory, median_e: float, present_db: float
+) -> None:
+    folder = taken(tmp_path_factory.mktemp("control"), median_e, present_db)
+    advice = gain_advice(picture_files(folder), present_gain_db=present_db)
+    assert advice.gain_db is not None
+    expected = 20 * np.log10(0.2 * FULL_WELL / median_e)
+    assert advice.gain_db == pytest.approx(expected, abs=0.5)
+    assert advice.bound_by == "median"
+
+
+def test_pictures_with_the_gain_told_need_no_more_of_it(tmp_path: Path) -> None:
+    first = gain_advice(picture_files(taken(tmp_path, 242.0, 6.0)), present_gain_db=6.0)
+    again = tmp_path / "again"
+    again.mkdir()
+    assert first.gain_db is not None
+    second = gain_advice(picture_files(taken(again, 242.0, first.gain_db)))
+    assert abs(second.change_db) < 0.15
+    assert second.median == pytest.approx(0.2, abs=0.004)
+
+
+def test_uneven_light_is_bound_by_its_highlights(tmp_path: Path) -> None:
+    advice = gain_advice(picture_files(taken(tmp_path, 400.0, 0.0, falloff=4.0)))
+    assert advice.bound_by == "highlights"
+    assert advice.bright * 10 ** (advice.change_db / 20) == pytest.approx(0.9)
+    assert advice.falloff < 0.15
+    assert any("light is uneven" in said for said in advice.advice)
+
+
+def test_where_light_is_the_limit_it_is_said(tmp_path: Path) -> None:
+    text, data = gain_report(taken(tmp_path, 40.0, 20.0), present_gain_db=20.0)
+    assert data["snr"] < 10
+    assert "gain cannot raise it: light is the limit" in text
+
+
+def test_plenty_of_light_is_bound_by_the_exposure(tmp_path: Path) -> None:
+    text, data = gain_report(taken(tmp_path, 4000.0, 0.0), present_gain_db=0.0)
+    assert data["gain_db"] == pytest.approx(20 * np.log10(0.2 * 9000 / 4000), abs=0.2)
+    assert "set the gain to 0.0 dB" in text
+    assert "the exposure to 0.45 of what it is" in text
+
+
+@pytest.mark.parametrize("sigma", [0.002, 0.01, 0.05])
+def test_noise_is_found_under_a_gradient(sigma: float) -> None:
+    rng = np.random.default_rng(5)
+    slope = np.linspace(0.2, 0.6, SIZE[1])[None, :, None] * np.ones((SIZE[0], 1, 1))
+    noisy = (slope + sigma * rng.standard_normal(slope.shape)).astype(np.float32)
+    assert noise_sigma(noisy) == pytest.approx(sigma, rel=0.15)
+
+
+def test_depths_and_curves_of_pictures_agree(tmp_path: Path) -> None:
+    share = np.tile(np.linspace(0, 1, SIZE[1]), (SIZE[0], 1))
+    cv2.imwrite(str(tmp_path / "a8.png"), np.round(share * 255).astype(np.uint8))
+    cv2.imwrite(str(tmp_path / "b16.png"), np.round(share * 65535).astype(np.uint16))
+    cv2.imwrite(str(tmp_path / "c12.png"), np.round(share * 4095).astype(np.uint16))
+    for file in picture_files(tmp_path):
+        read = read_linear(file, linear=True)
+        assert read is not None
+        np.testing.assert_allclose(read[..., 0], share, atol=0.6 / 255)
+    curved = read_linear(tmp_path / "b16.png", linear=False)
+    assert curved is not None
+    np.testing.assert_allclose(curved[0, -1, 0], 1.0)
+    middle = SIZE[1] // 2
+    assert curved[0, middle, 0] == pytest.approx(
+        ((share[0, middle] + 0.055) / 1.055) ** 2.4, rel=1e-3
+    )
+
+
+def test_twelve_bits_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cv2.imwrite(str(tmp_path / "c12.png"), np.full(SIZE, 800, np.uint16))
+    read = read_linear(tmp_path / "c12.png", linear=True)
+    assert read is not None
+    assert read.max() == pytest.approx(800 / 4095)
+    assert "taken for 12 bits" in capsys.readouterr().err
+
+
+def test_damaged_pictures_are_named_and_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    taken(tmp_path, 300.0, 6.0)
+    (tmp_path / "junk.png").write_bytes(b"\x89PNG\r\n\x1a\n and no more")
+    whole = tmp_path / "cut.jpg"
+    cv2.imwrite(str(whole), np.full((*SIZE, 3), 90, np.uint8))
+    whole.write_bytes(whole.read_bytes()[:-200])
+    text, data = gain_report(tmp_path)
+    told = capsys.readouterr().err
+    assert "junk.png" in told
+    assert "cut.jpg: the file ends early" in told
+    assert data["skipped"] == 2
+    assert "2 left out" in text
+
+
+@pytest.mark.parametrize(
+    ("level", "words"),
+    [(0, "are black .* lens is uncovered"), (255, "are white .* lower the gain by 12 dB")],
+)
+def test_pictures_that_say_nothing_are_refused(tmp_path: Path, level: int, words: str) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((*SIZE, 3), level, np.uint8))
+    with pytest.raises(ImageError, match=words) as fault:
+        gain_report(tmp_path)
+    assert "\n" not in str(fault.value)
+
+
+def test_no_picture_and_no_readable_one_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ImageError, match="no picture"):
+        gain_report(tmp_path)
+    with pytest.raises(ImageError, match="no picture"):
+        gain_report(str(tmp_path / "*.png"))
+    (tmp_path / "a.png").write_bytes(b"junk")
+    with pytest.raises(ImageError, match="none of 1 control pictures can be read"):
+        gain_report(tmp_path)
+
+
+def test_a_pattern_takes_what_it_names(tmp_path: Path) -> None:
+    taken(tmp_path, 300.0, 6.0)
+    assert len(picture_files(str(tmp_path / "[01].png"))) == 2

@@ -1,0 +1,167 @@
+import json
+import time
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from alice_survey.base.errors import PlanError
+from missions.exposure.settings import Setting, imaging_settings
+from missions.exposure.storage import storage_rows
+from missions.exposure.table import WIDTH, settings_table
+from tests.missions.exposure.surveys import survey
+
+
+def test_settings_of_the_papers_mission() -> None:
+    planned = imaging_settings(*survey(plan={"line_spacing_m": 1.0}))
+
+    assert planned.footprint_across_m == pytest.approx(1.441, abs=1e-3)
+    assert planned.footprint_along_m == pytest.approx(1.175, abs=1e-3)
+    assert planned.pixel_m == pytest.approx(0.448e-3, abs=1e-6)
+    assert planned.line_spacing_m == 1.0
+    assert planned.spacing.side_overlap == pytest.approx(0.306, abs=1e-3)
+    assert 1 / planned.interval_s == pytest.approx(0.43, abs=0.005)
+    assert planned.forward_overlap == pytest.approx(0.6, abs=1e-3)
+    assert planned.strobe_pulse_s == pytest.approx(planned.exposure_s + 2 * 0.2e-3)
+    assert planned.paper_rule.forward_overlap == pytest.approx(0.319, abs=1e-3)
+    assert planned.focus.focus_mean_air_m == pytest.approx(1.52, abs=0.005)
+    # Speed alone allows 2.24 ms at the centre; the corners and the attitude rates take their share.
+    assert 1.5e-3 < planned.exposure_s < 2.24e-3
+    still = survey(plan={"yaw_rate_deg_s": 0, "roll_pitch_rate_deg_s": 0})
+    by_speed = imaging_settings(*still)
+    assert planned.exposure_s < by_speed.exposure_s < 2.24e-3
+
+
+def test_the_table_explains_the_papers_numbers() -> None:
+    planned = imaging_settings(*survey(ideal_port=True, plan={"line_spacing_m": 1.0}))
+    text = " ".join(planned.table_text().split())
+    for words in (
+        "1 m gives 29.3% with this footprint of 1.415 m",
+        "the paper's rule gives 31% overlap, with the picture's short side along the track",
+        "3 ms blurs 1.36 px at 0.2 m/s and 3.40 px at 0.5 m/s, not none",
+        "it sets 1.5 m for 2 m",
+        "The paper's depth of field of 2 m at F/4 takes a circle of 3.0 px",
+    ):
+        assert words in text
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    altitude_m=st.floats(1.0, 8),
+    speed_mps=st.floats(0.05, 1.0),
+    forward=st.floats(0, 0.9),
+    blur_px=st.floats(0.2, 5),
+)
+def test_what_was_asked_for_is_reached(
+    altitude_m: float, speed_mps: float, forward: float, blur_px: float
+) -> None:
+    rig, config = survey(
+        camera={"shortest_interval_s": 0.01},
+        plan={
+            "altitude_m": altitude_m,
+            "relief_m": 0.1,
+            "speed_mps": speed_mps,
+            "forward_overlap": forward,
+            "allowed_blur_px": blur_px,
+        },
+    )
+    planned = imaging_settings(rig, config)
+
+    # Rounding down to a millisecond of interval costs at most that much overlap.
+    finest = speed_mps * 1e-3 / planned.footprint_along_m
+    assert -1e-8 <= planned.forward_overlap - forward <= finest + 1e-8
+    assert planned.station_spacing_m == pytest.approx(planned.interval_s * speed_mps, abs=1e-8)
+    assert planned.blur_px <= blur_px + 1e-6
+    assert planned.blur_px >= blur_px - planned.blur.combined * 1e-5 - 1e-6
+    assert 0 < planned.strobe_duty < 1
+    assert planned.imaging_w == pytest.approx(planned.frame_j / planned.interval_s)
+
+
+def test_rows_name_equation_source_and_limit() -> None:
+    rows = imaging_settings(*survey()).rows
+    assert len({row.name for row in rows}) == len(rows) > 30
+    for row in rows:
+        assert row.equation
+        assert row.source
+        assert row.bound_by
+
+
+def test_the_table_fits_a_hundred_columns_and_json_is_plain() -> None:
+    rig, config = survey(plan={"side_overlap": 0.45, "track_error_m": 0.12, "relief_m": 0.0})
+    planned = imaging_settings(rig, config)
+    more = storage_rows(planned.storage, config.camera, planned.interval_s, stations=603)[-1:]
+    text = planned.table_text(more)
+    assert max(len(line) for line in text.splitlines()) <= WIDTH
+    assert "whole survey" in text
+    data = json.loads(json.dumps(planned.to_json(), allow_nan=False))
+    assert len(data["rows"]) == len(planned.rows)
+    assert data["spacing"]["spacing_m"] == planned.line_spacing_m
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "shown"),
+    [
+        (0.42812, "Hz", "0.428 Hz"),
+        (0.306, "%", "30.6 %"),
+        ((1.65, 2.0, 2.345678), "m", "1.65 / 2 / 2.35 m"),
+        (9000.0, "e", "9000 e"),
+        (float("inf"), "m", "inf m"),
+        (12345678.0, "", "1.23e+07"),
+        (0.0, "dB", "0 dB"),
+        (0.00094, "", "0.00094"),
+    ],
+)
+def test_numbers_are_short(value: float | tuple[float, ...], unit: str, shown: str) -> None:
+    row = Setting(
+        group="g", name="n", value=value, unit=unit, equation="q", source="s", bound_by="b"
+    )
+    assert row.text == shown
+    assert shown in settings_table([row])
+
+
+def test_a_strobe_pulse_that_does_not_fit_is_told() -> None:
+    plan = {"speed_mps": 1.0, "forward_overlap": 0.9, "strobe_lead_s": 0.1}
+    with pytest.raises(PlanError, match=r"strobe pulse of 0\.2004 s"):
+        imaging_settings(*survey(plan=plan))
+
+
+@pytest.mark.parametrize(
+    ("sections", "words"),
+    [
+        ({"plan": {"altitude_m": 1.2}}, "set camera.f_number to"),
+        ({"plan": {"altitude_m": 1.2}}, "comes within 0.85 m of the glass"),
+        ({"water": {"jerlov": "9C"}}, "times the light is missing"),
+        ({"plan": {"line_spacing_m": 1.4}}, "lines leave gaps of 0.21 m"),
+        ({"plan": {"forward_overlap": 0.0}}, "pictures leave gaps of 0.20 m"),
+        ({"plan": {"forward_overlap": 0.9, "speed_mps": 1.0}}, "a cable of its own"),
+    ],
+)
+def test_what_will_be_poor_is_warned_of(
+    sections: dict[str, Any], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    imaging_settings(*survey(**sections), quiet=True)
+    assert capsys.readouterr().err == ""
+    imaging_settings(*survey(**sections))
+    assert words in capsys.readouterr().err
+
+
+def test_the_papers_mission_is_not_warned_of(capsys: pytest.CaptureFixture[str]) -> None:
+    imaging_settings(*survey(plan={"line_spacing_m": 1.0}))
+    assert capsys.readouterr().err == ""
+
+
+def test_exposure_grows_with_altitude() -> None:
+    low, high = (
+        imaging_settings(*survey(plan={"altitude_m": a, "relief_m": 0.1})) for a in (1.0, 3.0)
+    )
+    assert high.exposure_s > 2 * low.exposure_s
+    assert low.blur_px == pytest.approx(1.0, abs=0.02)
+
+
+def test_all_settings_take_a_few_hundredths_of_a_second() -> None:
+    rig, config = survey()
+    imaging_settings(rig, config)
+    started = time.process_time()
+    imaging_settings(rig, config)
+    assert time.process_time() - started < 0.1

@@ -1,0 +1,77 @@
+import re
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from alice_survey.base.errors import PlanError
+from missions.exposure.storage import raw_bytes, storage_load, storage_rows
+from missions.exposure.strobe import BUS_V, EFFICACY_LM_W, capacitor_f, duty_limit, strobe_load
+from tests.missions.exposure.surveys import survey
+
+
+def test_two_strobes_of_thirty_thousand_lumens() -> None:
+    _, config = survey()
+    load = strobe_load(config.imaging, config.plan, 1.8e-3, 2.35)
+    assert load.pulse_s == pytest.approx(2.2e-3)
+    assert load.duty == pytest.approx(2.2e-3 / 2.35)
+    assert load.lit_w == pytest.approx(288.3, abs=0.1)  # 20 LEDs of 14.4 W
+    assert load.frame_j == pytest.approx(2 * 288.3 * 2.2e-3 / 0.9, rel=1e-3)
+    assert load.mean_w == pytest.approx(load.frame_j / 2.35)
+    assert load.peak_a == pytest.approx(2 * 288.3 / 0.9 / 28.0, rel=1e-3)
+    assert 30.0 < load.solder_c < 30.5
+    assert load.junction_c == pytest.approx(load.solder_c + 1.8 * 14.41, abs=0.05)
+
+
+@given(energy_j=st.floats(1e-3, 1e3), sag=st.floats(0.01, 0.9))
+def test_the_capacitor_gives_the_energy_between_its_voltages(energy_j: float, sag: float) -> None:
+    farad = capacitor_f(energy_j, BUS_V, sag)
+    low = BUS_V * (1 - sag)
+    assert 0.5 * farad * BUS_V**2 - 0.5 * farad * low**2 == pytest.approx(energy_j, rel=1e-9)
+
+
+def test_at_the_duty_limit_the_solder_point_is_at_85_degrees() -> None:
+    _, config = survey()
+    limit = duty_limit(config.imaging)
+    interval_s = 0.01
+    exposure_s = limit * interval_s - 2 * config.plan.strobe_lead_s - 1e-9
+    load = strobe_load(config.imaging, config.plan, exposure_s, interval_s)
+    assert load.solder_c == pytest.approx(85.0, abs=0.01)
+    # All that a strobe of 1000 lm draws may be lit without end.
+    small = config.imaging.model_copy(update={"strobe_lumens": 1000.0})
+    assert duty_limit(small) == 1.0
+    assert small.strobe_lumens / EFFICACY_LM_W == pytest.approx(9.6, abs=0.1)
+
+
+def test_a_duty_cycle_that_is_too_high_gets_ways_out_that_work() -> None:
+    _, config = survey(plan={"strobe_lead_s": 0.03})
+    exposure_s, interval_s = 2e-3, 0.12
+    with pytest.raises(PlanError) as fault:
+        strobe_load(config.imaging, config.plan, exposure_s, interval_s)
+    text = str(fault.value)
+    assert "strobe pulse conflicts with heat of the strobe" in text
+    assert 2 <= len(text.splitlines()) <= 4
+    lead = float(re.search(r"strobe_lead_s ([\d.]+) instead", text)[1])
+    changed = config.plan.model_copy(update={"strobe_lead_s": lead})
+    assert strobe_load(config.imaging, changed, exposure_s, interval_s).duty > 0.37
+    lumens = float(re.search(r"strobe_lumens (\d+) instead", text)[1])
+    dimmed = config.imaging.model_copy(update={"strobe_lumens": lumens})
+    load = strobe_load(dimmed, config.plan, exposure_s, interval_s)
+    assert 0.98 * load.duty_limit < load.duty <= load.duty_limit
+
+
+def test_storage_counts_every_pixel() -> None:
+    rig, config = survey()
+    camera = rig.cameras["left"]
+    assert raw_bytes(camera, 2, 603) == 3384 * 2710 * 2 * 603
+    storage = storage_load(camera, 2, 0.5)
+    assert storage.bytes_per_s == 3384 * 2710 * 2 * 2
+    assert storage.mission_bytes(603) == raw_bytes(camera, 2, 603)
+    # One Gigabit cable takes 13.5 pictures a second of one camera, 6.8 of two.
+    assert storage.own_link_hz == pytest.approx(13.5, abs=0.05)
+    assert storage.shared_link_hz == pytest.approx(6.76, abs=0.01)
+    rows = storage_rows(storage, config.camera, 0.5, stations=603)
+    assert rows[-1].value == pytest.approx(11.06, abs=0.01)
+    assert "TOO SLOW" not in rows[1].note
+    fast = storage_rows(storage_load(camera, 2, 0.12), config.camera, 0.12)
+    assert "ONE CABLE FOR ALL IS TOO SLOW" in fast[1].note

@@ -1,0 +1,127 @@
+"""The map: the sheet fits the area, the current points where it flows, lines stay thin."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from PIL import Image
+from shapely.geometry import MultiPolygon
+
+from alice_survey.base.config import SeaConfig, parse_config
+from alice_survey.base.errors import PlanError
+from missions.plan.map import draw_plan
+from missions.plan.redraw import map_report
+from missions.plan.run import run_plan
+from missions.values.plan_file import Plan
+from tests.missions.exports.plans import RIG, line, plan_of, small_plan
+
+
+def drawn(path: Path, plan: Plan, monkeypatch: pytest.MonkeyPatch, **options: Any) -> Figure:
+    """The figure behind the picture."""
+    figures: list[Figure] = []
+    save = Figure.savefig
+
+    def keep(figure: Figure, *arguments: Any, **named: Any) -> None:
+        figures.append(figure)
+        save(figure, *arguments, **named)
+
+    monkeypatch.setattr(Figure, "savefig", keep)
+    draw_plan(path, plan, RIG, **options)
+    (figure,) = figures
+    return figure
+
+
+def rows(count: int, length_m: float) -> Plan:
+    """Lines to the east, 1 m apart, there and back."""
+    lines = [
+        line((float(i), 0.0), (float(i), length_m))
+        if i % 2 == 0
+        else line((float(i), length_m), (float(i), 0.0))
+        for i in range(count)
+    ]
+    return plan_of(lines, [(0, count - 1)])
+
+
+def test_a_long_area_leaves_no_empty_sheet(tmp_path: Path) -> None:
+    heights = {}
+    for name, plan in {"long": rows(4, 40.0), "square": rows(20, 20.0)}.items():
+        draw_plan(tmp_path / f"{name}.png", plan, RIG)
+        with Image.open(tmp_path / f"{name}.png") as picture:
+            pixels = np.asarray(picture.convert("L"))
+        heights[name] = pixels.shape[0]
+        used = np.flatnonzero((pixels < 200).any(axis=1))
+        blank = np.diff(used).max() / pixels.shape[0]
+        assert blank < 0.2, name
+    assert heights["long"] < 0.75 * heights["square"]
+
+
+@pytest.mark.parametrize("towards_deg", [0.0, 30.0, 135.0, 250.0])
+def test_the_current_points_where_it_flows_on_a_map_of_any_shape(
+    towards_deg: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sea = SeaConfig(current_mps=0.1, current_towards_deg=towards_deg)
+    figure = drawn(tmp_path / "map.png", rows(4, 40.0), monkeypatch, sea=sea)
+    axes = figure.axes[0]
+    (arrow,) = (t for t in axes.texts if t.get_text() == "" and hasattr(t, "xyann"))
+    tip, tail = axes.transData.transform([arrow.xy, arrow.xyann])
+    east, north = tip - tail
+    assert math.degrees(math.atan2(east, north)) % 360 == pytest.approx(towards_deg, abs=1e-6)
+    (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
+    for x, y in (arrow.xy, arrow.xyann):
+        assert west < x < east
+        assert south < y < north
+
+
+@pytest.mark.parametrize("count", [5, 120])
+def test_lines_leave_room_between_them(
+    count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    figure = drawn(tmp_path / "map.png", rows(count, float(count)), monkeypatch)
+    axes = figure.axes[0]
+    (drawn_lines,) = (c for c in axes.collections if isinstance(c, LineCollection))
+    width_px = float(drawn_lines.get_linewidths()[0]) * figure.dpi / 72
+    apart_px = abs(np.diff(axes.transData.transform([[0, 0], [0, 1]])[:, 1])[0])
+    assert width_px < 0.5 * apart_px
+    assert width_px > 0.2 * apart_px or width_px == pytest.approx(1.6 * figure.dpi / 72)
+
+
+def test_the_allowed_area_is_whole_on_the_map_unless_it_is_much_larger(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = rows(16, 15.0)
+    axes = drawn(tmp_path / "map.png", plan, monkeypatch).axes[0]
+    south, west, north, east = plan.area.allowed.bounds
+    assert axes.get_xlim()[0] < west < east < axes.get_xlim()[1]
+    assert axes.get_ylim()[0] < south < north < axes.get_ylim()[1]
+    sea = MultiPolygon([shapely.box(-500, -500, 500, 500)])
+    wide = replace(plan, area=replace(plan.area, allowed=sea))
+    monkeypatch.undo()
+    axes = drawn(tmp_path / "map.png", wide, monkeypatch).axes[0]
+    assert np.ptp(axes.get_xlim()) < 2 * 15
+
+
+def test_an_unknown_suffix_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(PlanError, match="change the suffix"):
+        draw_plan(tmp_path / "map.xyz", small_plan(), RIG)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "start"), [(".pdf", b"%PDF"), (".svg", b"<?xml"), (".png", b"\x89PNG")]
+)
+def test_a_finished_plan_is_drawn_anew_for_print(tmp_path: Path, suffix: str, start: bytes) -> None:
+    config = parse_config({"area": {"length_m": 4.0, "width_m": 3.0}}, "test")
+    run_plan(tmp_path, config, 1)
+    plan = tmp_path / "plan" / "plan.json"
+    drawn = [tmp_path / name / f"map{suffix}" for name in "ab"]
+    for out in drawn:
+        map_report(plan, config, out)
+    assert drawn[0].read_bytes().startswith(start)
+    assert drawn[0].read_bytes() == drawn[1].read_bytes()
+    with pytest.raises(PlanError, match="change the suffix"):
+        map_report(plan, config, tmp_path / "map.bmp")

@@ -1,0 +1,274 @@
+"""Known points and lengths place, scale and score a model whose truth is known."""
+
+import csv
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.base.errors import WorkspaceError
+from reconstruct.placing.alignment import Similarity
+from reconstruct.placing.control import ControlFit, describe, tie_control
+from reconstruct.placing.control_file import Pick, read_control, read_picks
+from reconstruct.placing.georeference import fit_control, fit_navigation, level
+from reconstruct.placing.place import body_from_pinhole
+from reconstruct.placing.spots import Camera, find_spots
+from reconstruct.views.lens import flat_port_lens
+from tests.reconstruct.scenes import ALTITUDE_M, DATUM, make_scene
+
+SCENE = make_scene(points=300, port_distance_m=0.1)
+LENSES = {
+    name: flat_port_lens(camera, 0.8 * ALTITUDE_M, 1.2 * ALTITUDE_M)
+    for name, camera in SCENE.rig.cameras.items()
+}
+KNOWN = np.array(
+    [[0.9, 0.4, 15.05], [2.6, 0.5, 14.9], [2.5, 1.6, 15.1], [0.8, 1.5, 14.95], [1.7, 1.0, 14.8]]
+)
+"""Five points of the sea floor in NED."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gauge:
+    """A model in a gauge of its own."""
+
+    ned_from_model: Similarity
+    cameras: dict[str, Camera]
+
+    def points(self, ned: np.ndarray) -> np.ndarray:
+        place = self.ned_from_model
+        return place.rotation.inv().apply(ned - place.translation) / place.scale
+
+
+def in_gauge(seed: int) -> Gauge:
+    """True poses in a random gauge of metres."""
+    rng = np.random.default_rng(seed)
+    turn, shift = Rotation.random(rng=rng), rng.normal(0, 30, 3)
+    place = RigidTransform.from_components(shift, turn)
+    cameras = {}
+    for record, pose in zip(SCENE.records, SCENE.ned_from_cam, strict=True):
+        lens = LENSES[record.camera]
+        pinhole = place.inv() * pose * lens.pinhole_from_cam.inv()
+        cameras[record.image] = Camera(lens=lens, model_from_pinhole=pinhole)
+    return Gauge(
+        ned_from_model=Similarity(scale=1.0, rotation=turn, translation=shift), cameras=cameras
+    )
+
+
+def picks_of(points: np.ndarray, noise_px: float = 0.0, seed: int = 0) -> list[Pick]:
+    """Every picture's exact view of points, through its port."""
+    rng = np.random.default_rng(seed)
+    picks = []
+    for record, pose in zip(SCENE.records, SCENE.ned_from_cam, strict=True):
+        camera = SCENE.rig.cameras[record.camera]
+        seen = camera.project(pose.inv().apply(points))
+        for number, (x, y) in enumerate(seen + rng.normal(0, noise_px, seen.shape)):
+            if 0 < x < camera.width_px and 0 < y < camera.height_px:
+                pick = Pick(image=record.image, point=f"p{number}", x_px=x, y_px=y, sigma_px=0.3)
+                picks.append(pick)
+    return picks
+
+
+def write(path: Path, rows: list[dict[str, object]]) -> Path:
+    names = sorted({name for row in rows for name in row})
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, names)
+        writer.writeheader()
+        writer.writerows(rows)
+    return path
+
+
+def control_rows(uses: str, sigma_m: float = 0.002) -> list[dict[str, object]]:
+    """One row for every known point, each in another of the ways to say where it is."""
+    from pyproj import Transformer
+
+    utm = Transformer.from_crs(4326, 32636, always_xy=True)
+    rows: list[dict[str, object]] = []
+    for number, (use, ned) in enumerate(zip(uses, KNOWN, strict=True)):
+        latitude, longitude, depth = DATUM.geodetic_from_ned(ned[None])[0]
+        row: dict[str, object] = {
+            "kind": "point",
+            "name": f"p{number}",
+            "use": {"+": "control", "?": "check"}[use],
+            "sigma_m": sigma_m,
+        }
+        if number % 3 == 0:
+            row |= {"latitude_deg": float(latitude), "longitude_deg": float(longitude)}
+            row |= {"height_m": float(DATUM.height_m - depth)}
+        elif number % 3 == 1:
+            row |= {"north_m": ned[0], "east_m": ned[1], "depth_m": ned[2]}
+        else:
+            easting, northing = utm.transform(longitude, latitude)
+            row |= {"easting_m": easting, "northing_m": northing, "epsg": 32636, "depth_m": depth}
+        rows.append(row)
+    return rows
+
+
+def tied(path: Path, gauge: Gauge, picks: list[Pick]) -> ControlFit:
+    spots, lost = find_spots(picks, gauge.cameras)
+    return tie_control(read_control(path), spots, lost, DATUM)
+
+
+def test_points_are_found_exactly_through_the_ports() -> None:
+    gauge = in_gauge(1)
+    spots, lost = find_spots(picks_of(KNOWN), gauge.cameras)
+    assert not lost
+    found = np.stack([spots[f"p{k}"].model for k in range(len(KNOWN))])
+    np.testing.assert_allclose(found, gauge.points(KNOWN), atol=1e-8)
+    assert min(spot.views for spot in spots.values()) >= 3
+    assert max(spot.rms_px for spot in spots.values()) < 1e-5
+
+
+def test_the_sigma_of_a_found_point_is_that_of_its_error() -> None:
+    gauge, ratios = in_gauge(2), []
+    for seed in range(8):
+        spots, _ = find_spots(picks_of(KNOWN, 0.3, seed), gauge.cameras)
+        for k, true in enumerate(gauge.points(KNOWN)):
+            spot = spots[f"p{k}"]
+            white = np.linalg.solve(np.linalg.cholesky(spot.covariance), spot.model - true)
+            ratios.append(white)
+    assert 0.75 < np.sqrt(np.mean(np.square(ratios))) < 1.15
+
+
+def test_a_wrong_pick_is_left_out_and_named() -> None:
+    gauge, picks = in_gauge(3), picks_of(KNOWN, 0.2)
+    at = next(i for i, p in enumerate(picks) if p.point == "p4")
+    picks[at] = Pick(image=picks[at].image, point="p4", x_px=400, y_px=300, sigma_px=0.3)
+    spots, _ = find_spots(picks, gauge.cameras)
+    assert spots["p4"].left_out == (picks[at].image,)
+    assert np.linalg.norm(spots["p4"].model - gauge.points(KNOWN)[4]) < 0.003
+
+
+def test_points_that_cannot_be_found_say_why() -> None:
+    gauge, picks = in_gauge(4), picks_of(KNOWN)
+    once = next(p for p in picks if p.point == "p0")
+    spots, lost = find_spots([once], gauge.cameras)
+    assert not spots
+    assert "two or more" in lost["p0"]
+    two = [p for p in picks if p.point == "p1"][:2]
+    two[1] = Pick(image=two[1].image, point="p1", x_px=20, y_px=20, sigma_px=0.3)
+    spots, lost = find_spots(two, gauge.cameras)
+    assert not spots
+    assert "px off one common point" in lost["p1"]
+
+
+@pytest.mark.parametrize("stretch", [1.0, 3.7])
+def test_control_points_alone_place_a_model(tmp_path: Path, stretch: float) -> None:
+    """Of known scale, or in a unit of which 3.7 make a metre: four points tell."""
+    gauge = in_gauge(5)
+    spots, _ = find_spots(picks_of(KNOWN), gauge.cameras)
+    spots = {
+        name: replace(spot, model=spot.model * stretch, covariance=spot.covariance * stretch**2)
+        for name, spot in spots.items()
+    }
+    poses = [
+        RigidTransform.from_components(
+            c.model_from_pinhole.translation * stretch, c.model_from_pinhole.rotation
+        )
+        for c in gauge.cameras.values()
+    ]
+    control = read_control(write(tmp_path / "control.csv", control_rows("++++?")))
+    ties = tie_control(control, spots, {}, DATUM)
+    known = 1.0 if stretch == 1.0 else None
+    start = ties.start(known)
+    assert start is not None
+    fit = fit_control(
+        SCENE.records, poses, start, ties.equations, known_scale=known, scale_sigma=0.0
+    )
+    placed = fit.ned_from_model
+    np.testing.assert_allclose(placed.apply(gauge.points(KNOWN) * stretch), KNOWN, atol=2e-6)
+    assert placed.scale == pytest.approx(1.0 / stretch, rel=1e-6)
+    assert np.all((fit.sigma_position_m > 5e-4) & (fit.sigma_position_m < 0.006))
+    score = ties.score(placed, located=True)
+    assert (score["rms"]["check"]["points"], score["rms"]["control"]["points"]) == (1, 4)
+    assert score["rms"]["check"]["north_m"] < 1e-5
+
+
+def test_control_and_navigation_place_together_within_their_sigmas(tmp_path: Path) -> None:
+    """Navigation is 0.3 m off; control of 2 mm pulls the model to the truth, check points tell."""
+    scene = make_scene(points=300, bias_m=(0.3, -0.2, 0.02))
+    gauge = in_gauge(6)
+    path = write(tmp_path / "control.csv", control_rows("+++?+"))
+    ties = tied(path, gauge, picks_of(KNOWN, 0.2))
+    poses = [c.model_from_pinhole for c in gauge.cameras.values()]
+    centres = np.stack([p.translation for p in poses])
+    levers = body_from_pinhole(SCENE.rig, LENSES)
+    levelled = level(gauge.points(SCENE.points_ned), centres)
+    alone, both = (
+        fit_navigation(
+            scene.records, poses, levers, DATUM, levelled,
+            known_scale=1.0, scale_sigma=1e-3 if control else 0.0, control=control,
+        )
+        for control in (None, ties.equations)
+    )  # fmt: skip
+    assert alone is not None
+    assert both is not None
+    before = ties.score(alone.ned_from_model, located=True)["rms"]["check"]
+    after = ties.score(both.ned_from_model, located=True)["rms"]["check"]
+    assert 0.2 < before["north_m"] < 0.4
+    assert max(after["north_m"], after["east_m"], after["down_m"]) < 0.004
+    assert np.all(both.sigma_position_m < 0.1 * alone.sigma_position_m.max())
+    assert 1e-5 < both.sigma_scale < 1e-3
+    text = describe(ties.score(both.ned_from_model, located=True))
+    assert "1 points held out" in text
+    assert "4 points used" in text
+
+
+def test_bars_scale_a_model_and_check_bars_score_it(tmp_path: Path) -> None:
+    gauge = in_gauge(7)
+    length = np.linalg.norm(KNOWN[1] - KNOWN[0])
+    rows = [
+        {"kind": "bar", "name": "a", "use": "control", "from": "p0", "to": "p1",
+         "length_m": 1.02 * length, "sigma_m": 0.001},
+        {"kind": "bar", "name": "b", "use": "check", "from": "p2", "to": "p3",
+         "length_m": np.linalg.norm(KNOWN[3] - KNOWN[2]), "sigma_m": 0.001},
+        {"kind": "bar", "name": "c", "use": "check", "from": "p2", "to": "q", "length_m": 1,
+         "sigma_m": 0.001},
+    ]  # fmt: skip
+    ties = tied(write(tmp_path / "c.csv", rows), gauge, picks_of(KNOWN))
+    found = ties.bar_scale(None, 0.0)
+    assert found is not None
+    assert found[0] == pytest.approx(1.02, rel=1e-6)
+    assert 0.001 / (1.02 * length) < found[1] < 0.003  # the bar's own, and that of the picks
+    held = ties.bar_scale(1.0, 1e-6)
+    assert held is not None
+    assert held[0] == pytest.approx(1.0, abs=1e-4)
+    place = Similarity(scale=1.02, rotation=Rotation.identity(), translation=np.zeros(3))
+    score = ties.score(place, located=False)
+    assert score["rms"]["check"]["length_relative"] == pytest.approx(0.02, rel=1e-4)
+    assert score["rms"]["control"]["length_m"] < 1e-6
+    assert score["points"] == []
+    assert "q" in score["not_found"]["c"]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"use": "yes"}, "use is 'yes'"),
+        ({"kind": "tree"}, "kind is 'tree'"),
+        ({"sigma_m": "0"}, "sigma_m must be more than 0"),
+        ({"sigma_m": "nan"}, "sigma_m is 'nan'"),
+        ({"north_m": ""}, "needs either latitude_deg"),
+        ({"height_m": "3"}, "either depth_m or height_m"),
+        ({"depth_m": "deep"}, "depth_m is 'deep'"),
+        ({"north_m": "", "easting_m": 1, "northing_m": 2, "epsg": 999999}, "epsg"),
+        ({"kind": "bar", "from": "a", "to": "a"}, "two points"),
+    ],
+)
+def test_wrong_rows_are_named(tmp_path: Path, change: dict[str, object], said: str) -> None:
+    row: dict[str, object] = {"kind": "point", "name": "a", "use": "check", "sigma_m": 0.1,
+                              "north_m": 1, "east_m": 2, "depth_m": 3, "length_m": 1}  # fmt: skip
+    with pytest.raises(WorkspaceError, match=said) as error:
+        read_control(write(tmp_path / "control.csv", [row | change]))
+    assert "line 2" in str(error.value)
+
+
+def test_picks_count_from_the_middle_of_the_first_pixel(tmp_path: Path) -> None:
+    path = tmp_path / "picks.csv"
+    path.write_text("image,point,x,y,sigma_px,near_x\na.png,p,10,20.5,,7\nb.png,p,,,,8\n")
+    (pick,) = read_picks(path)
+    assert (pick.x_px, pick.y_px, pick.sigma_px) == (10.5, 21.0, 0.5)
+    path.write_text("image,point,x,y\na.png,p,10,\n")
+    with pytest.raises(WorkspaceError, match="line 2"):
+        read_picks(path)

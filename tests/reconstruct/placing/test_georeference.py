@@ -1,0 +1,160 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.base.manifest import ImageRecord
+from reconstruct.placing.alignment import Similarity
+from reconstruct.placing.georeference import Fit, fit_navigation, level
+from tests.reconstruct.scenes import DATUM, Scene, make_scene
+
+
+def gauge(seed: int, scale: float) -> Similarity:
+    """A random `ned_from_model`."""
+    rng = np.random.default_rng(seed)
+    return Similarity(
+        scale=scale, rotation=Rotation.random(rng=rng), translation=rng.normal(0, 30, 3)
+    )
+
+
+def in_model(pose: RigidTransform, ned_from_model: Similarity) -> RigidTransform:
+    rotation = ned_from_model.rotation.inv()
+    place = rotation.apply(pose.translation - ned_from_model.translation) / ned_from_model.scale
+    return RigidTransform.from_components(place, rotation * pose.rotation)
+
+
+def points_in_model(points: np.ndarray, ned_from_model: Similarity) -> np.ndarray:
+    moved = ned_from_model.rotation.inv().apply(points - ned_from_model.translation)
+    return moved / ned_from_model.scale
+
+
+def fit(
+    scene: Scene, records: list[ImageRecord], truth: Similarity, *, known: bool, levers: bool = True
+) -> Fit | None:
+    poses = [in_model(pose, truth) for pose in scene.ned_from_cam]
+    points = points_in_model(scene.points_ned, truth)
+    centres = np.stack([p.translation for p in poses])
+    arms = {
+        name: scene.rig.body_from_cam(name) if levers else RigidTransform.identity()
+        for name in scene.rig.cameras
+    }
+    return fit_navigation(
+        records, poses, arms, DATUM, level(points, centres),
+        known_scale=truth.scale if known else None,
+    )  # fmt: skip
+
+
+def exact(scene: Scene) -> list[ImageRecord]:
+    """Navigation that tells the true attitude too."""
+    records = []
+    for record, pose in zip(scene.records, scene.ned_from_cam, strict=True):
+        ned_from_body = pose * scene.rig.body_from_cam(record.camera).inv()
+        heading, pitch, roll = np.rad2deg(ned_from_body.rotation.as_euler("ZYX"))
+        records.append(replace(record, roll_deg=roll, pitch_deg=pitch, heading_deg=heading % 360))
+    return records
+
+
+def without_attitude(scene: Scene) -> list[ImageRecord]:
+    """Positions of the cameras themselves, nothing more, as GPS in EXIF gives them."""
+    places = DATUM.geodetic_from_ned(np.stack([p.translation for p in scene.ned_from_cam]))
+    return [
+        replace(r, latitude_deg=a, longitude_deg=b, depth_m=d, roll_deg=np.nan,
+                sigma_horizontal_m=0.02, sigma_depth_m=0.02)
+        for r, (a, b, d) in zip(scene.records, places, strict=True)
+    ]  # fmt: skip
+
+
+def assert_same(found: Similarity, truth: Similarity, atol: float, scale_rtol: float) -> None:
+    places = np.random.default_rng(0).uniform(-3, 3, (20, 3)) + np.array([0, 0, 14])
+    model = points_in_model(places, truth)
+    np.testing.assert_allclose(found.apply(model), places, atol=atol)
+    assert found.scale == pytest.approx(truth.scale, rel=scale_rtol)
+
+
+SCENE = make_scene(points=400)
+
+
+@settings(deadline=None, max_examples=10)
+@given(seed=st.integers(0, 10_000), scale=st.floats(0.01, 100))
+def test_any_gauge_is_undone_when_navigation_is_exact(seed: int, scale: float) -> None:
+    truth = gauge(seed, scale)
+    found = fit(SCENE, exact(SCENE), truth, known=False)
+    assert found is not None
+    assert_same(found.ned_from_model, truth, atol=1e-6, scale_rtol=1e-7)
+    assert found.rms_m.max() < 1e-6
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_positions_alone_place_a_block(seed: int) -> None:
+    truth = gauge(seed, 3.0)
+    found = fit(SCENE, without_attitude(SCENE), truth, known=False, levers=False)
+    assert found is not None
+    assert_same(found.ned_from_model, truth, atol=0.02, scale_rtol=2e-3)
+
+
+def test_a_known_scale_is_kept_and_that_of_navigation_reported() -> None:
+    truth = gauge(3, 1.0)
+    origin = np.array([1.0, 1.0, 13.0])
+    places = np.stack([pose.translation for pose in SCENE.ned_from_cam])
+    told = DATUM.geodetic_from_ned(origin + 1.05 * (places - origin))
+    stretched = [
+        replace(r, latitude_deg=a, longitude_deg=b, depth_m=d)
+        for r, (a, b, d) in zip(without_attitude(SCENE), told, strict=True)
+    ]
+    found = fit(SCENE, stretched, truth, known=True, levers=False)
+    assert found is not None
+    assert found.ned_from_model.scale == 1.0
+    assert found.free_scale == pytest.approx(1.05, abs=0.003)
+
+
+def test_one_wrong_position_hardly_moves_the_model() -> None:
+    truth = gauge(4, 1.0)
+    records = exact(SCENE)
+    records[5] = replace(records[5], latitude_deg=records[5].latitude_deg + 1e-3)  # 111 m
+    found = fit(SCENE, records, truth, known=True)
+    assert found is not None
+    assert_same(found.ned_from_model, truth, atol=0.1, scale_rtol=1e-12)
+
+
+def test_a_straight_line_is_kept_from_turning_about_itself() -> None:
+    """Positions on one line say nothing of the roll about it: the sea floor's plane does."""
+    scene = make_scene(lines=1, stations=12, points=600)
+    truth = gauge(5, 2.0)
+    found = fit(scene, without_attitude(scene), truth, known=False, levers=False)
+    assert found is not None
+    down = (found.ned_from_model.rotation * truth.rotation.inv()).apply([0.0, 0.0, 1.0])
+    assert np.rad2deg(np.arccos(down[2])) < 6.0
+
+
+def test_positions_closer_than_their_sigma_do_not_place_a_model(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    records = [replace(r, roll_deg=np.nan, sigma_horizontal_m=50.0) for r in SCENE.records]
+    assert fit(SCENE, records, gauge(6, 1.0), known=True) is None
+    assert "do not place the model" in capsys.readouterr().err
+    nowhere = [replace(r, latitude_deg=np.nan) for r in SCENE.records]
+    assert fit(SCENE, nowhere, gauge(6, 1.0), known=True) is None
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_level_puts_the_mean_plane_flat_below_the_cameras(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth = gauge(seed, 1.0)
+    plane = np.column_stack([rng.uniform(-4, 4, (500, 2)), rng.normal(0, 0.02, 500)])
+    rock = np.column_stack([rng.uniform(0, 1, (60, 2)), rng.uniform(-1.5, -0.5, 60)])
+    centres = np.column_stack([np.linspace(-3, 3, 9), np.zeros(9), np.full(9, -2.0)])
+    placed = level(
+        points_in_model(np.concatenate([plane, rock]), truth), points_in_model(centres, truth)
+    )
+    assert placed.scale == 1.0
+    flat = placed.apply(points_in_model(plane, truth))
+    assert np.abs(flat[:, 2].mean()) < 0.01
+    assert flat[:, 2].std() < 0.03
+    cameras = placed.apply(points_in_model(centres, truth))
+    np.testing.assert_allclose(cameras[:, 2], -2.0, atol=0.05)
+    ahead = cameras[-1] - cameras[0]
+    np.testing.assert_allclose(ahead, [6.0, 0.0, 0.0], atol=0.1)
+    assert np.linalg.det(placed.rotation.as_matrix()) == pytest.approx(1.0)

@@ -1,0 +1,118 @@
+"""Coded markers that lie on the sea floor are found in pictures seen through flat ports."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.base.artefacts import write_json
+from alice_survey.base.errors import ReconstructionError
+from alice_survey.base.frames import Array
+from alice_survey.base.manifest import write_manifest
+from camera_calib.flat_port import FlatPortCamera
+from reconstruct.placing.control_file import read_picks
+from reconstruct.placing.markers import find_markers, survey_control
+from reconstruct.placing.spots import Camera, find_spots
+from reconstruct.views.lens import flat_port_lens
+from tests.reconstruct.scenes import ALTITUDE_M, make_scene
+
+SCENE = make_scene(lines=1, stations=3, points=50, port_distance_m=0.1)
+SIDE_M, DEPTH_M = 0.15, 15.0
+SHIFT_NE = np.mean([pose.translation[:2] for pose in SCENE.ned_from_cam[:4]], axis=0)
+"""Marker 7 lies flat, its upper edge to the north."""
+
+
+def corners_ned() -> Array:
+    """(4, 3) clockwise as a camera above sees them, from the marker's own upper left."""
+    half = SIDE_M / 2
+    plan = np.array([[half, -half], [half, half], [-half, half], [-half, -half]]) + SHIFT_NE
+    return np.column_stack([plan, np.full(4, DEPTH_M)])
+
+
+def picture(camera: FlatPortCamera, ned_from_cam: RigidTransform, dictionary: int) -> np.ndarray:
+    """A grey sea floor with the marker, every pixel's ray traced through the port."""
+    paper = np.full((800, 800), 120.0, np.float32)  # twice the marker's side, 400 texels
+    paper[120:680, 120:680] = 220.0
+    known = cv2.aruco.getPredefinedDictionary(dictionary)
+    paper[200:600, 200:600] = 20.0 + 0.78 * cv2.aruco.generateImageMarker(known, 7, 400)
+    paper = cv2.GaussianBlur(paper, (0, 0), 1.5)  # about half a pixel: no stairs
+    start, way = camera.unproject(camera.pixel_centres().reshape(-1, 2))
+    start, way = ned_from_cam.apply(start), ned_from_cam.rotation.apply(way)
+    spot = start + (DEPTH_M - start[:, 2:]) / way[:, 2:] * way
+    upper_left = corners_ned()[0, :2]
+    row = (upper_left[0] - spot[:, 0]) / SIDE_M * 400 + 200 - 0.5
+    column = (spot[:, 1] - upper_left[1]) / SIDE_M * 400 + 200 - 0.5
+    shape = (camera.height_px, camera.width_px)
+    x, y = (v.reshape(shape).astype(np.float32) for v in (column, row))
+    seen = cv2.remap(paper, x, y, cv2.INTER_LINEAR, borderValue=120.0)
+    return cv2.GaussianBlur(seen, (0, 0), 0.7).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("markers")
+    images = folder / "images"
+    for record, pose in zip(SCENE.records, SCENE.ned_from_cam, strict=True):
+        path = images / record.image
+        path.parent.mkdir(parents=True, exist_ok=True)
+        taken = picture(SCENE.rig.cameras[record.camera], pose, cv2.aruco.DICT_5X5_100)
+        cv2.imwrite(str(path), taken)
+    write_manifest(images / "manifest.csv", SCENE.records)
+    write_json(images / "stage.json", {"stage": "images", "digest": ""})
+    return folder
+
+
+def test_markers_are_found_to_a_part_of_a_pixel_and_their_side_measured(workspace: Path) -> None:
+    text, found = survey_control(workspace)
+    assert found["dictionary"] == "DICT_5X5_100"
+    assert list(found["markers"]) == ["7"]
+    assert found["markers"]["7"] >= 4
+    assert found["detections"] == found["markers"]["7"]
+    assert "1 markers of DICT_5X5_100" in text
+    picks = read_picks(workspace / "markers.csv")
+    of_name = {r.image: (r, p) for r, p in zip(SCENE.records, SCENE.ned_from_cam, strict=True)}
+    misses = []
+    for pick in picks:
+        record, pose = of_name[pick.image]
+        corner = corners_ned()[int(pick.point.split(".")[1])]
+        seen = SCENE.rig.cameras[record.camera].project(pose.inv().apply(corner[None]))[0]
+        misses.append(np.linalg.norm(seen - [pick.x_px, pick.y_px]))
+    assert 0.0 < np.sqrt(np.mean(np.square(misses))) < 0.35
+
+    lenses = {
+        n: flat_port_lens(c, 0.8 * ALTITUDE_M, 1.2 * ALTITUDE_M)
+        for n, c in SCENE.rig.cameras.items()
+    }
+    cameras = {
+        r.image: Camera(
+            lens=lenses[r.camera],
+            model_from_pinhole=p * lenses[r.camera].pinhole_from_cam.inv(),
+        )
+        for r, p in of_name.values()
+    }
+    spots, lost = find_spots(picks, cameras)
+    assert not lost
+    place = np.stack([spots[f"7.{k}"].model for k in range(4)])
+    np.testing.assert_allclose(place, corners_ned(), atol=0.012)
+    np.testing.assert_allclose(spots["7"].model[:2], SHIFT_NE, atol=0.003)
+    sides = np.linalg.norm(place - np.roll(place, -1, axis=0), axis=1)
+    assert sides.mean() == pytest.approx(SIDE_M, rel=0.01)
+
+
+def test_a_picture_without_markers_has_none() -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (300, 400)).astype(np.uint8)
+    assert find_markers(cv2.GaussianBlur(noise, (0, 0), 2.0), "DICT_6X6_250") == []
+
+
+def test_an_unknown_dictionary_is_refused(workspace: Path) -> None:
+    with pytest.raises(ReconstructionError, match="no dictionary 'DICT_9X9'"):
+        survey_control(workspace, dictionary="DICT_9X9")
+
+
+def test_markers_of_another_dictionary_are_not_seen(workspace: Path) -> None:
+    text, found = survey_control(workspace, dictionary="DICT_7X7_100")
+    assert found["detections"] == 0
+    assert "no marker is in two of the 6 pictures" in text
+    assert read_picks(workspace / "markers.csv") == []

@@ -1,0 +1,239 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from alice_survey.base.artefacts import read_json
+from alice_survey.base.config import ReconstructConfig, SurveyConfig
+from alice_survey.base.errors import AliceError, ReconstructionError
+from alice_survey.base.manifest import read_manifest, write_manifest
+from reconstruct.pictures.importing import import_images
+from reconstruct.pictures.undistorted import Pictures
+from reconstruct.placing.run import read_track_poses, run_sparse
+from reconstruct.placing.scale import scale_model
+from reconstruct.views.model import read_model
+
+QUICK = SurveyConfig(reconstruct=ReconstructConfig(max_features=2000))
+
+
+@pytest.fixture(scope="module")
+def drone(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six overlapping drone pictures, reduced, with their GPS."""
+    folder = tmp_path_factory.mktemp("drone")
+    (folder / "in").mkdir()
+    sources = sorted((shared_data / "brighton_beach" / "images").glob("*.jpg"))[9:15]
+    for source in sources:
+        with Image.open(source) as image:
+            small = image.resize((image.width // 2, image.height // 2), Image.Resampling.BOX)
+            small.save(folder / "in" / source.name, exif=image.getexif(), quality=92)
+    import_images(folder, [folder / "in"])
+    assert run_sparse(folder, QUICK, 1)
+    return folder
+
+
+def test_a_drone_block_is_registered_scaled_and_placed_by_its_gps(drone: Path) -> None:
+    found = read_json(drone / "sparse" / "registration.json")
+    assert found["registered"] == found["total"] == 6
+    assert 0.1 < found["mean_reprojection_px"] < 1.0
+    assert found["scale_source"] == "scale from navigation"
+    assert max(found["georeference"][f"rms_{axis}_m"] for axis in ("north", "east", "depth")) < 3
+    model = read_model(drone / "sparse")
+    assert (model.frame.name, model.frame.scaled) == ("ned", True)
+    assert model.frame.vertical_datum == "EXIF GPS altitude"
+    assert len(model.views) == 6
+    records = {r.image: r for r in read_manifest(drone / "images" / "manifest.csv")}
+    assert model.frame.datum is not None
+    for view in model.views:
+        record = records[view.image]
+        place = [[record.latitude_deg, record.longitude_deg, record.depth_m]]
+        told = model.frame.datum.ned_from_geodetic(np.array(place))[0]
+        assert np.linalg.norm(view.world_from_cam.translation - told) < 6
+        assert view.world_from_cam.rotation.apply([0, 0, 1])[2] > 0.95  # looks down
+
+
+def test_points_are_seen_where_the_model_says(drone: Path) -> None:
+    """Points of the model project into the pinholes' pictures onto the same texture."""
+    model, pictures = read_model(drone / "sparse"), Pictures.open(drone)
+    assert len(model.points_world) > 200
+    patches: dict[int, list[np.ndarray]] = {}
+    for index, view in enumerate(model.views):
+        grey = pictures.grey(view.image)
+        assert grey.shape == (view.height_px, view.width_px)
+        seen = model.observations[model.observations[:, 1] == index, 0]
+        for point, (x, y) in zip(seen, view.project(model.points_world[seen]), strict=True):
+            if 12 < x < view.width_px - 12 and 12 < y < view.height_px - 12:
+                patch = cv2.getRectSubPix(grey, (3, 3), (float(x) - 0.5, float(y) - 0.5))
+                patches.setdefault(int(point), []).append(patch.mean())
+    pairs = np.array([p[:2] for p in patches.values() if len(p) > 1], dtype=float)
+    assert np.corrcoef(pairs.T)[0, 1] > 0.8
+
+
+def test_the_track_agrees_with_the_model(drone: Path) -> None:
+    model = read_model(drone / "sparse")
+    poses = read_track_poses(drone / "sparse" / "track.csv")
+    assert set(poses) == {view.image for view in model.views}
+    for view in model.views:
+        np.testing.assert_allclose(
+            poses[view.image].as_matrix(), view.world_from_cam.as_matrix(), atol=1e-6
+        )
+    lines = (drone / "sparse" / "track.tum").read_text().splitlines()
+    assert len(lines) == 6
+    assert all(len(line.split()) == 8 for line in lines)
+    times = [float(line.split()[0]) for line in lines]
+    assert times == sorted(times)
+
+
+def test_what_is_done_is_not_done_again(drone: Path) -> None:
+    assert not run_sparse(drone, QUICK, 2)
+
+
+def test_two_processes_give_the_same_bytes(drone: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    import_images(other, [drone / "in"])
+    run_sparse(other, QUICK, 2)
+    for file in sorted((drone / "sparse").rglob("*")):
+        if file.is_file() and file.name != "stage.json":
+            twin = other / "sparse" / file.relative_to(drone / "sparse")
+            assert file.read_bytes() == twin.read_bytes(), file.name
+    assert "/" + str(tmp_path).split("/")[1] not in (other / "sparse" / "cameras.json").read_text()
+
+
+@pytest.fixture
+def nowhere(drone: Path, tmp_path: Path) -> Path:
+    """The same pictures without GPS: no scale, no CRS."""
+    folder = tmp_path / "nowhere"
+    source = tmp_path / "in"
+    source.mkdir()
+    for path in sorted((drone / "in").iterdir()):
+        with Image.open(path) as image:
+            image.save(source / path.name, quality="keep", exif=b"")
+    import_images(folder, [source])
+    run_sparse(folder, QUICK, 1)
+    return folder
+
+
+def test_without_positions_the_model_is_level_unscaled_and_says_so(nowhere: Path) -> None:
+    model = read_model(nowhere / "sparse")
+    assert (model.frame.name, model.frame.datum, model.frame.scaled) == ("model", None, False)
+    assert any("unscaled, no CRS" in note for note in model.frame.notes)
+    assert abs(np.median(model.points_world[:, 2])) < 0.05 * np.ptp(model.points_world[:, 0])
+    assert all(view.world_from_cam.translation[2] < 0 for view in model.views)
+
+    # one known length scales it
+    first, second = model.points_world[[3, 40]]
+    tokens = [",".join(f"{v:.9f}" for v in p) for p in (first, second)]
+    told = scale_model(nowhere, " ".join(tokens), 12.5)
+    assert "12.5 m" in told
+    before = (nowhere / "mapping" / "stage.json").stat().st_mtime_ns
+    assert run_sparse(nowhere, QUICK, 1)
+    assert (nowhere / "mapping" / "stage.json").stat().st_mtime_ns == before  # not mapped again
+    scaled = read_model(nowhere / "sparse")
+    assert scaled.frame.scaled
+    assert any("scaled by one known length" in note for note in scaled.frame.notes)
+    assert np.linalg.norm(scaled.points_world[3] - scaled.points_world[40]) == pytest.approx(12.5)
+    header = (nowhere / "sparse" / "track.csv").read_text().splitlines()[0]
+    assert "x_m,y_m,z_m" in header
+
+    # scaling again starts from the metres now shown; a spot may be marked in pictures
+    view = scaled.views[2]
+    picks = []
+    for point in scaled.points_world[[3, 40]]:
+        marks = []
+        for other in scaled.views:
+            pixel = (
+                Pictures.open(nowhere).lens(other.image).from_pinhole(other.project(point[None]))[0]
+            )
+            if np.all((pixel > 5) & (pixel < [other.width_px - 20, other.height_px - 20])):
+                marks.append(f"{other.image}:{pixel[0] - 0.5:.4f},{pixel[1] - 0.5:.4f}")
+        picks.append("+".join(marks))
+    assert all("+" in pick for pick in picks)
+    scale_model(nowhere, " ".join(picks), 25.0)
+    assert run_sparse(nowhere, QUICK, 1)
+    doubled = read_model(nowhere / "sparse")
+    length = np.linalg.norm(doubled.points_world[3] - doubled.points_world[40])
+    assert length == pytest.approx(25.0, rel=1e-3)
+    assert view.image in {v.image for v in doubled.views}
+
+    for points, message in (
+        ("1,2,3", "two points"),
+        ("1,2,3 1,2,3", "one and the same"),
+        ("1,2 1,2,3", "no point x,y,z"),
+        ("1,2,nan 1,2,3", "no point x,y,z"),
+        ("camera/x.jpg:5,5 1,2,3", "no picture camera/x.jpg"),
+        (f"{view.image}:9999,5 1,2,3", "outside of the picture"),
+        (f"{view.image}:5;5 1,2,3", "no spot"),
+    ):
+        with pytest.raises(ReconstructionError, match=message):
+            scale_model(nowhere, points, 1.0)
+    with pytest.raises(ReconstructionError, match="more than 0"):
+        scale_model(nowhere, "0,0,0 1,1,1", 0.0)
+
+    # a scale measured on another model is refused
+    scale = json.loads((nowhere / "scale.json").read_text())
+    (nowhere / "scale.json").write_text(json.dumps(scale | {"gauge": "other"}))
+    with pytest.raises(ReconstructionError, match="an earlier model"):
+        run_sparse(nowhere, QUICK, 1)
+
+
+def test_one_mark_is_taken_on_the_surface(drone: Path) -> None:
+    from reconstruct.placing.scale import find_point
+
+    model, pictures = read_model(drone / "sparse"), Pictures.open(drone)
+    view = model.views[1]
+    seen = model.observations[model.observations[:, 1] == 1, 0]
+    misses = []
+    for point in model.points_world[seen[::10]]:
+        pixel = pictures.lens(view.image).from_pinhole(view.project(point[None]))[0] - 0.5
+        found = find_point(f"{view.image}:{pixel[0]},{pixel[1]}", model, pictures)
+        misses.append(np.linalg.norm(found - point))
+    height = np.median(view.world_from_cam.inv().apply(model.points_world[seen])[:, 2])
+    assert np.median(misses) < 0.02 * height
+
+
+def test_real_stereo_without_calibration_gets_one_rigid_rig(
+    shared_data: Path, tmp_path: Path
+) -> None:
+    """Five dim underwater pairs, no calibration, no navigation."""
+    for side in ("left", "right"):
+        (tmp_path / side).mkdir()
+        for number in range(1, 6):
+            picture = cv2.imread(str(shared_data / "haltbrekken" / side / f"{number:03d}.png"))
+            small = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+            cv2.imwrite(str(tmp_path / side / f"{number:03d}.png"), small)
+    folder = tmp_path / "w"
+    import_images(folder, [], left=tmp_path / "left", right=tmp_path / "right")
+    run_sparse(folder, QUICK, 2)
+    found = read_json(folder / "sparse" / "registration.json")
+    assert found["registered"] == 10
+    assert 0.02 < found["mean_reprojection_px"] < 0.8
+    assert found["baseline"] == pytest.approx(1.0, rel=1e-9)
+    model = pycolmap.Reconstruction(folder / "sparse" / "model")
+    assert len(model.rigs) == 1
+    poses = read_track_poses(folder / "sparse" / "track.csv")
+    relative = [poses[f"right/{n:03d}.png"].inv() * poses[f"left/{n:03d}.png"] for n in range(1, 6)]
+    shifts = np.stack([r.translation for r in relative])
+    np.testing.assert_allclose(np.linalg.norm(shifts, axis=1), 1.0, rtol=1e-6)
+    np.testing.assert_allclose(shifts - shifts[0], 0, atol=1e-6)
+    view = next(v for v in read_model(folder / "sparse").views if v.camera == "left")
+    assert 600 < view.fx_px < 1100  # of 680 pixels width
+
+
+def test_a_rig_of_other_pictures_is_refused(drone: Path, tmp_path: Path) -> None:
+    from alice_survey.base.config import CameraConfig, WaterConfig
+    from camera_calib.rig import design_rig, write_rig
+
+    folder = tmp_path / "w"
+    import_images(folder, [drone / "in"])
+    write_rig(folder / "calibration" / "rig.json", design_rig(CameraConfig(), WaterConfig()))
+    with pytest.raises(AliceError, match="'camera' of the pictures is not in the rig"):
+        run_sparse(folder, QUICK, 1)
+    manifest = folder / "images" / "manifest.csv"
+    records = [replace(r, camera="left") for r in read_manifest(manifest)]
+    write_manifest(manifest, records)
+    with pytest.raises(AliceError, match=r"800 x 450 pixels, but the rig.*3384 x 2710"):
+        run_sparse(folder, QUICK, 1)

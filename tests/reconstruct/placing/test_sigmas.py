@@ -1,0 +1,310 @@
+"""The sigmas that a placement states are those of its errors, however long errors last."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.base.frames import Array, Datum, rotation_from_attitude
+from alice_survey.base.manifest import ImageRecord
+from reconstruct.placing.correlated import lasting_share, surprise, whiten
+from reconstruct.placing.georeference import Fit, fit_navigation, level
+from tests.oracles_place import covariance_matrix, surprises
+
+DATUM = Datum(32.8236, 34.9553)
+SIGMA = np.array([0.06, 0.06, 0.05, *np.deg2rad([0.05, 0.05, 0.3])])
+"""Of north, east, depth (m), roll, pitch, heading (rad)."""
+BODY_FROM_CAM = {"cam": RigidTransform.from_translation([0.4, 0.1, 0.2])}
+STEP_S = 2.5
+
+
+def flight(lines: int = 4, stations: int = 12) -> RigidTransform:
+    """True poses of the body along lawnmower lines 1 m apart, a picture every half metre."""
+    places, headings = [], []
+    for line in range(lines):
+        for step in range(stations):
+            at = step if line % 2 == 0 else stations - 1 - step
+            places.append([0.5 * at, 1.0 * line, 13.0])
+            headings.append(0.0 if line % 2 == 0 else np.pi)
+    rng = np.random.default_rng(99)
+    lean = rng.normal(0, np.deg2rad(1.5), (len(places), 2))
+    attitudes = rotation_from_attitude(lean[:, 0], lean[:, 1], np.array(headings))
+    return RigidTransform.from_components(np.array(places), attitudes)
+
+
+def gauss_markov(rng: np.random.Generator, count: int, tau_s: float) -> Array:
+    """(count, 6) stationary errors of unit variance at steps of `STEP_S`."""
+    kept = np.exp(-STEP_S / tau_s)
+    errors = rng.normal(size=(count, 6))
+    for i in range(1, count):
+        errors[i] = kept * errors[i - 1] + np.sqrt(1 - kept**2) * errors[i]
+    return errors
+
+
+def told(body: RigidTransform, errors: Array, sigma: Array) -> list[ImageRecord]:
+    """The manifest of a flight with such errors of position and attitude."""
+    roll_pitch_heading = body.rotation.as_euler("ZYX")[:, ::-1] + errors[:, 3:]
+    places = DATUM.geodetic_from_ned(body.translation + errors[:, :3])
+    return [
+        ImageRecord(
+            image=f"{k:03d}.png", camera="cam", station=k, time_s=STEP_S * k,
+            latitude_deg=float(place[0]), longitude_deg=float(place[1]), depth_m=float(place[2]),
+            roll_deg=float(a[0]), pitch_deg=float(a[1]), heading_deg=float(a[2] % 360),
+            sigma_horizontal_m=float(s[0]), sigma_depth_m=float(s[2]),
+            sigma_attitude_deg=float(np.rad2deg(s[3])), sigma_heading_deg=float(np.rad2deg(s[5])),
+        )
+        for k, (place, a, s) in enumerate(
+            zip(places, np.rad2deg(roll_pitch_heading), np.broadcast_to(sigma, errors.shape),
+                strict=True)
+        )
+    ]  # fmt: skip
+
+
+def place(
+    body: RigidTransform, records: list[ImageRecord], seed: int, **options: float | None
+) -> tuple[Fit, Array, Array]:
+    """Fit a model that is the truth moved; errors and sigmas: N, E, D, turn about each, scale.
+
+    The model's own errors are 1 mm and 0.005 degrees.
+    """
+    rng = np.random.default_rng(seed)
+    truth = RigidTransform.from_components(rng.normal(0, 30, 3), Rotation.random(rng=rng))
+    noise = RigidTransform.from_components(
+        rng.normal(0, 1e-3, (len(body), 3)),
+        Rotation.from_rotvec(rng.normal(0, 1e-4, (len(body), 3))),
+    )
+    cameras = body * BODY_FROM_CAM["cam"]
+    poses = [truth.inv() * pose * n for pose, n in zip(cameras, noise, strict=True)]
+    floor = np.column_stack([rng.uniform(0, 5, (300, 2)), rng.normal(15, 0.1, 300)])
+    centres = np.stack([pose.translation for pose in poses])
+    options = {"known_scale": 1.0} | options
+    fit = fit_navigation(
+        records, poses, BODY_FROM_CAM, DATUM, level(truth.inv().apply(floor), centres),
+        **options,  # type: ignore[arg-type]
+    )  # fmt: skip
+    assert fit is not None
+    found = fit.ned_from_model
+    shift = found.apply(centres).mean(axis=0) - truth.apply(centres).mean(axis=0)
+    turn = (found.rotation * truth.rotation.inv()).as_rotvec()
+    errors = np.r_[shift, turn, np.log(found.scale)]
+    sigma = np.sqrt(np.diag(fit.covariance))
+    return fit, errors, np.r_[sigma[3:6], sigma[:3], sigma[6]]
+
+
+@pytest.mark.parametrize("tau_s", [1.0, 40.0, 4000.0])
+def test_errors_over_their_sigmas_are_of_unit_size(tau_s: float) -> None:
+    """From white errors to ones that outlast the survey; a wrong independence gives 3 to 7."""
+    body, ratios = flight(), []
+    for seed in range(7):
+        rng = np.random.default_rng([int(tau_s), seed])
+        errors = SIGMA * gauss_markov(rng, len(body), tau_s)
+        _, error, sigma = place(body, told(body, errors, SIGMA), seed)
+        ratios.append(error[:6] / sigma[:6])
+    position, turns = np.array(ratios)[:, :3], np.array(ratios)[:, 3:]
+    assert 0.55 < np.sqrt(np.mean(position**2)) < 1.4
+    assert 0.5 < np.sqrt(np.mean(turns**2)) < 1.4
+
+
+def test_lasting_is_found() -> None:
+    body = flight(8, 15)
+    for tau_s, low, high in ((1.0, 0.1, 6.0), (25.0, 6.0, 100.0)):
+        errors = SIGMA * gauss_markov(np.random.default_rng(3), len(body), tau_s)
+        fit, _, _ = place(body, told(body, errors, SIGMA), 3)
+        for group in ("horizontal", "depth", "heading"):
+            how = fit.lasting[group]
+            decay = how.tau if how.white < 0.5 else 0.5
+            assert low / 2 <= decay <= high, (group, how)
+        assert fit.time_unit == "s"
+
+
+def test_a_heading_that_turns_the_reckoned_track_too_is_one_error_not_two() -> None:
+    """Compass error turns both headings and the positions reckoned along them."""
+    body, ratios = flight(), []
+    for seed in range(7):
+        rng = np.random.default_rng([5, seed])
+        errors = SIGMA * gauss_markov(rng, len(body), 4000.0)
+        turn = errors[:, 5].mean()
+        away = body.translation - body.translation.mean(axis=0)
+        errors[:, 0] -= turn * away[:, 1]
+        errors[:, 1] += turn * away[:, 0]
+        _, error, sigma = place(body, told(body, errors, SIGMA), seed)
+        ratios.append(error[5] / sigma[5])
+    assert 0.6 < np.sqrt(np.mean(np.square(ratios))) < 1.5
+
+
+def test_bad_fixes_are_left_out_and_gaps_do_no_harm() -> None:
+    body = flight()
+    errors = SIGMA * gauss_markov(np.random.default_rng(8), len(body), 100.0)
+    clean, error, sigma = place(body, told(body, errors, SIGMA), 1)
+    records = told(body, errors, SIGMA)
+    bad = {7: 0.5, 20: -2.0, 33: 40.0}  # metres north
+    for k, miss in bad.items():
+        records[k] = replace(records[k], latitude_deg=records[k].latitude_deg + miss / 110_900)
+    records[12] = replace(records[12], heading_deg=(records[12].heading_deg + 90) % 360)
+    hurt, error_hurt, _ = place(body, records, 1)
+    assert hurt.left_out["horizontal"] == 3
+    assert hurt.left_out["heading"] == 1
+    assert hurt.left_out["depth"] == clean.left_out["depth"] == 0
+    assert np.all(np.abs(error_hurt - error)[:6] < 0.3 * sigma[:6])
+    for k in range(15, 30):
+        records[k] = replace(records[k], latitude_deg=np.nan)
+    gap, error_gap, sigma_gap = place(body, records, 1)
+    assert gap.used == len(body) - 15 - 2
+    assert np.all(np.abs(error_gap[:6]) < 4.0 * sigma_gap[:6])
+
+
+def test_sigmas_that_are_stated_too_small_are_enlarged() -> None:
+    body = flight()
+    errors = 5.0 * SIGMA * gauss_markov(np.random.default_rng(4), len(body), 1.0)
+    fit, _, _ = place(body, told(body, errors, SIGMA), 1)
+    for group in ("horizontal", "depth", "heading"):
+        assert 3.5 < fit.lasting[group].factor < 7.0
+    honest, _, _ = place(body, told(body, errors / 5.0, SIGMA), 1)
+    assert all(how.factor < 1.3 for how in honest.lasting.values())
+
+
+def test_the_mount_adds_its_sigma_and_a_turning_vehicle_tells_it() -> None:
+    body = flight()
+    records = told(body, SIGMA * gauss_markov(np.random.default_rng(2), len(body), 1.0), SIGMA)
+    plain, _, exact = place(body, records, 1)
+    mounted, _, loose = place(body, records, 1, mount_sigma_deg=2.0)
+    assert (plain.mount_sigma_deg, mounted.mount_sigma_deg) == (0.0, 2.0)
+    # Heading: its mount error is the same on all lines, only positions tell it.
+    assert loose[5] > 1.5 * exact[5]
+    # Tilt: lines flown to and fro show it, and depths do.
+    assert np.all(loose[3:5] < np.deg2rad(0.5))
+    np.testing.assert_allclose(np.rad2deg(loose[3:5]), np.rad2deg(exact[3:5]), atol=0.5)
+
+
+def test_a_single_line_without_attitude_does_not_know_its_roll() -> None:
+    body = flight(1, 20)
+    errors = SIGMA * gauss_markov(np.random.default_rng(6), len(body), 1.0)
+    records = [replace(r, roll_deg=np.nan) for r in told(body, errors, SIGMA)]
+    fit, error, sigma = place(body, records, 1)
+    about_line, about_slope, heading = np.rad2deg(sigma[3:6])
+    assert 8.0 < about_line < 10.5  # what the level sea floor says
+    assert about_slope < 2.0
+    assert heading < 2.0
+    assert fit.to_json()["largest_tilt_deg"] == pytest.approx(about_line, rel=0.02)
+    axis = fit.to_json()["largest_tilt_axis_deg"]
+    assert min(axis, 180 - axis) < 3.0
+    assert np.abs(error[3]) < 3 * sigma[3]
+
+
+def test_two_fixes_place_a_model_with_attitudes_and_not_without(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    body = flight(1, 20)
+    errors = SIGMA * gauss_markov(np.random.default_rng(7), len(body), 1.0)
+    records = told(body, errors, SIGMA)
+    records = [
+        r if k in (0, 19) else replace(r, latitude_deg=np.nan) for k, r in enumerate(records)
+    ]
+    fit, error, sigma = place(body, records, 1)
+    assert fit.used == 2
+    assert np.all(sigma[:2] > 0.5 * SIGMA[0])
+    assert np.all(np.abs(error[:6]) < 4 * sigma[:6])
+    without = [replace(r, roll_deg=np.nan) for r in records]
+    with pytest.raises(AssertionError):
+        place(body, without, 1)
+    assert "2 positions" in capsys.readouterr().err
+
+
+def test_times_that_are_unknown_count_as_stations() -> None:
+    body = flight()
+    errors = SIGMA * gauss_markov(np.random.default_rng(9), len(body), 1.0)
+    records = [replace(r, time_s=np.nan) for r in told(body, errors, SIGMA)]
+    fit, error, sigma = place(body, records, 1)
+    assert fit.time_unit == "stations"
+    assert "correlation_stations" in fit.to_json()["errors"]["depth"]
+    assert np.all(np.abs(error[:6]) < 4 * sigma[:6])
+
+
+def test_a_free_scale_has_a_sigma_that_holds_its_error() -> None:
+    body, ratios = flight(), []
+    for seed in range(5):
+        rng = np.random.default_rng([6, seed])
+        records = told(body, SIGMA * gauss_markov(rng, len(body), 20.0), SIGMA)
+        _, error, sigma = place(body, records, seed, known_scale=None)
+        ratios.append(error[6] / sigma[6])
+    assert 0.4 < np.sqrt(np.mean(np.square(ratios))) < 1.5
+
+
+@pytest.mark.parametrize("tau", [0.5, 7.0, 300.0])
+@pytest.mark.parametrize("white", [1e-4, 0.3])
+def test_whitening_is_the_inverse_of_choleskys_factor(tau: float, white: float) -> None:
+    rng = np.random.default_rng(1)
+    time = np.sort(rng.uniform(0, 40, 30))
+    sigma = rng.uniform(0.5, 2.0, 30)
+    used = rng.uniform(size=30) < 0.8
+    values = np.where(used[:, None], rng.normal(size=(30, 3)), 0.0)
+    found, log_det = whiten(time, sigma, used, values, tau, white)
+    matrix = covariance_matrix(time[used], sigma[used], tau, white)
+    factor = np.linalg.cholesky(matrix)
+    np.testing.assert_allclose(found[used], np.linalg.solve(factor, values[used]), atol=1e-8)
+    assert log_det == pytest.approx(np.linalg.slogdet(matrix)[1], abs=1e-8)
+    assert np.all(found[~used] == 0)
+    off = surprise(time, sigma, used, values[:, 0], tau, white)
+    expected = surprises(matrix, values[used, 0])
+    np.testing.assert_allclose(off[used], expected, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("tau", [1.0, 30.0, 1e4])
+def test_the_lasting_share_is_that_of_the_mean(tau: float) -> None:
+    time = np.linspace(0, 100, 4000)
+    matrix = np.exp(-np.abs(time[:, None] - time) / tau)
+    assert lasting_share(time, tau, 0.2) == pytest.approx(0.8 * matrix.mean(), rel=0.02)
+    assert lasting_share(time, 1e12, 0.0) == pytest.approx(1.0)
+
+
+def test_placing_is_the_same_twice() -> None:
+    body = flight()
+    records = told(body, SIGMA * gauss_markov(np.random.default_rng(1), len(body), 50.0), SIGMA)
+    first, second = (place(body, records, 1)[0] for _ in range(2))
+    assert first.to_json() == second.to_json()
+
+
+def test_similarity_of_the_truth_is_found_when_nothing_errs() -> None:
+    body = flight()
+    fit, error, _ = place(body, told(body, np.zeros((len(body), 6)), SIGMA), 4)
+    assert fit.ned_from_model.scale == 1.0
+    assert 0 < np.linalg.norm(error[:3]) < 5e-4  # the model's own noise
+
+
+@pytest.mark.slow
+def test_twenty_flights_are_placed_within_their_sigmas() -> None:
+    """The built-in flight simulator, its sensors and its filter, 20 times over one small plan."""
+    from alice_survey.base.config import AreaConfig, PlanConfig, SurveyConfig
+    from alice_survey.seafloor.terrain import survey_terrain
+    from camera_calib.rig import design_rig
+    from missions.fly.simulation import floor_grid, simulate_plan
+    from missions.plan.run import make_plan
+
+    config = SurveyConfig(
+        area=AreaConfig(length_m=4.5, width_m=3.7, seafloor_depth_m=15.0),
+        plan=PlanConfig(forward_overlap=0.62, side_overlap=0.3, cross_lines=1),
+    )
+    plan = make_plan(config, design_rig(config.camera, config.water))
+    floor = floor_grid(survey_terrain(config, plan.area.allowed_corners_ne))
+    ratios = []
+    for seed in range(20):
+        flight_ = simulate_plan(plan, config, floor, np.random.default_rng([seed, 20]), label="")
+        log, time_s = flight_.log, flight_.truth.time_s
+        at = np.searchsorted(time_s, flight_.trigger_s).clip(0, len(time_s) - 1)
+        body = flight_.truth.ned_from_body[at]
+        true = body.rotation.as_euler("ZYX")[:, ::-1]
+        errors = np.hstack([log.position_ned[at] - body.translation, log.attitude_rad[at] - true])
+        sigma = np.column_stack([
+            log.sigma_horizontal_m, log.sigma_horizontal_m, log.sigma_depth_m,
+            log.sigma_attitude_rad, log.sigma_attitude_rad, log.sigma_heading_rad,
+        ])[at]  # fmt: skip
+        records = [
+            replace(r, time_s=float(t))
+            for r, t in zip(told(body, errors, sigma), time_s[at], strict=True)
+        ]
+        _, error, stated = place(body, records, seed)
+        ratios.append(error[:6] / stated[:6])
+    position, tilt, heading = np.split(np.array(ratios), [3, 5], axis=1)
+    for part in (position, tilt, heading):
+        assert 0.7 < np.sqrt(np.mean(part**2)) < 1.4

@@ -1,0 +1,235 @@
+"""Tracks say how surely each picture's pose is known, in every format."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.frames import Array, Datum, attitude_from_rotation, rotation_from_attitude
+from reconstruct.dense.dem import DemGrid
+from reconstruct.mapping.uncertainty import Uncertainty
+from reconstruct.placing.alignment import Similarity
+from reconstruct.placing.channels import attitude_axes, cross_matrices
+from reconstruct.placing.covariance import (
+    PlaceCovariance,
+    attitude_sigmas_deg,
+    placed_covariances,
+    shape_covariances,
+    write_covariances,
+)
+from reconstruct.placing.track import (
+    SIGMAS,
+    TrackRow,
+    read_track_poses,
+    track_sigmas,
+    write_track_csv,
+    write_track_geojson,
+)
+from reconstruct.placing.track_figure import plot_track_over, split_lines
+from reconstruct.raster import crs_of, transform_of
+from reconstruct.views.model import WorldFrame
+
+DATUM = Datum(32.8236, 34.9553)
+FRAME = WorldFrame(name="ned", datum=DATUM, scaled=True, vertical_datum="sea surface")
+
+
+def random_poses(count: int, seed: int = 0) -> RigidTransform:
+    rng = np.random.default_rng(seed)
+    return RigidTransform.from_components(
+        rng.uniform(-5, 5, (count, 3)), Rotation.random(count, rng=rng)
+    )
+
+
+def random_covariance(size: int, seed: int, scale: float) -> Array:
+    factor = np.random.default_rng(seed).normal(0, scale, (size, size))
+    return np.asarray(factor @ factor.T)
+
+
+def scatter(true: RigidTransform, moved: list[RigidTransform]) -> Array:
+    """(N, 6, 6) covariances of poses drawn many times: position, turn about the world's axes."""
+    shifts = np.stack([m.translation - true.translation for m in moved])
+    turns = np.stack([(m.rotation * true.rotation.inv()).as_rotvec() for m in moved])
+    both = np.concatenate([shifts, turns], axis=2)
+    return np.asarray(np.einsum("dni,dnj->nij", both, both) / len(moved))
+
+
+def assert_close(found: Array, drawn: Array) -> None:
+    """Within what some thousand draws tell."""
+    size = np.sqrt(np.einsum("nii->ni", drawn))
+    np.testing.assert_allclose(
+        (found - drawn) / (size[:, :, None] * size[:, None, :]), 0.0, atol=0.12
+    )
+
+
+def test_errors_of_the_place_move_every_picture_as_the_covariance_says() -> None:
+    poses, middle = random_poses(4), np.array([1.0, -2.0, 0.5])
+    covariance = random_covariance(7, 1, 1e-3)
+    drawn = np.random.default_rng(2).multivariate_normal(np.zeros(7), covariance, 3000)
+    moved = []
+    for turn, shift, grow in zip(drawn[:, :3], drawn[:, 3:6], drawn[:, 6], strict=True):
+        rotation = Rotation.from_rotvec(turn)
+        places = middle + np.exp(grow) * rotation.apply(poses.translation - middle) + shift
+        moved.append(RigidTransform.from_components(places, rotation * poses.rotation))
+    found = placed_covariances(poses, PlaceCovariance(middle=middle, covariance=covariance))
+    assert_close(found, scatter(poses, moved))
+
+
+def test_errors_of_a_station_move_its_other_camera_on_its_arm() -> None:
+    """The rig's origin errs in the model; both its pictures follow, in the world."""
+    rng = np.random.default_rng(3)
+    place = Similarity(
+        scale=2.0, rotation=Rotation.random(rng=rng), translation=np.array([4.0, 5.0, 6.0])
+    )
+    in_model = random_poses(1, 4)[0]
+    arm = RigidTransform.from_translation([0.6, 0.0, 0.0])  # of the second camera
+    covariance = random_covariance(6, 5, 1e-3)
+
+    def world(pose: RigidTransform) -> RigidTransform:
+        at = place.apply(pose.translation[None])[0]
+        return RigidTransform.from_components(at, place.rotation * pose.rotation)
+
+    both = [in_model, in_model * arm]
+    moved = []
+    for draw in rng.multivariate_normal(np.zeros(6), covariance, 3000):
+        turned = RigidTransform.from_components(
+            in_model.translation + draw[3:],
+            Rotation.from_rotvec(draw[:3]) * in_model.rotation,
+        )
+        moved.append(RigidTransform.concatenate([world(turned), world(turned * arm)]))
+    true = RigidTransform.concatenate([world(pose) for pose in both])
+    found = shape_covariances(
+        true,
+        np.array([7, 7]),
+        np.array([True, False]),
+        Uncertainty(
+            frames=np.array([1]), stations=np.array([7]), images=("a",),
+            frame_cov=covariance[None], point_ids=np.zeros(0, np.int64),
+            point_cov=np.zeros((0, 3, 3)), point_noise=np.zeros((0, 3, 3)), sigma_px=0.3,
+        ),
+        place,
+    )  # fmt: skip
+    assert_close(found, scatter(true, moved))
+    strange = shape_covariances(
+        true, np.array([8, 8]), np.array([True, False]),
+        Uncertainty(
+            frames=np.array([1]), stations=np.array([7]), images=("a",),
+            frame_cov=covariance[None], point_ids=np.zeros(0, np.int64),
+            point_cov=np.zeros((0, 3, 3)), point_noise=np.zeros((0, 3, 3)), sigma_px=0.3,
+        ),
+        place,
+    )  # fmt: skip
+    assert np.isnan(strange).all()
+
+
+@pytest.mark.parametrize("angles_deg", [(0, 0, 0), (5, -8, 120), (20, 30, -170)])
+def test_axes_of_the_attitude_are_its_derivatives(angles_deg: tuple[float, ...]) -> None:
+    angles = np.deg2rad(angles_deg)
+    axes = attitude_axes(Rotation.concatenate([rotation_from_attitude(*angles)]))[0]
+    for k in range(3):
+        step = np.zeros(3)
+        step[k] = 1e-6
+        turn = rotation_from_attitude(*(angles + step)) * rotation_from_attitude(*angles).inv()
+        np.testing.assert_allclose(turn.as_rotvec() / 1e-6, axes[:, k], atol=1e-5)
+
+
+def test_cross_matrices() -> None:
+    a, b = np.random.default_rng(0).normal(size=(2, 5, 3))
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", cross_matrices(a), b), np.cross(a, b))
+
+
+def test_sigmas_of_the_attitude_are_those_of_the_vehicle_not_of_north() -> None:
+    """One degree about north is roll when heading north, pitch when heading east."""
+    covariance = np.zeros((1, 6, 6))
+    covariance[0, 3, 3] = np.deg2rad(1.0) ** 2
+    north = Rotation.concatenate([rotation_from_attitude(0, 0, 0)])
+    east = Rotation.concatenate([rotation_from_attitude(0, 0, np.pi / 2)])
+    np.testing.assert_allclose(attitude_sigmas_deg(north, covariance), [[1, 0, 0]], atol=1e-9)
+    np.testing.assert_allclose(attitude_sigmas_deg(east, covariance), [[0, 1, 0]], atol=1e-9)
+
+
+def rows() -> list[TrackRow]:
+    poses = random_poses(3)
+    return [
+        TrackRow(
+            image=f"{k}.png", station=k // 2, camera="left" if k % 2 == 0 else "right",
+            time_s=np.nan if k == 2 else float(k // 2), world_from_cam=pose, points=5,
+            reprojection_px=0.2, world_from_body=pose.rotation,
+        )
+        for k, pose in enumerate(poses)
+    ]  # fmt: skip
+
+
+def test_a_track_keeps_its_poses_and_says_its_sigmas(tmp_path: Path) -> None:
+    track = rows()
+    covariances = np.stack([random_covariance(6, k, 0.01) for k in range(3)])
+    sigmas = track_sigmas(track, covariances)
+    write_track_csv(tmp_path / "track.csv", track, FRAME, sigmas)
+    poses = read_track_poses(tmp_path / "track.csv")
+    for row in track:
+        np.testing.assert_allclose(
+            poses[row.image].as_matrix(), row.world_from_cam.as_matrix(), atol=1e-8
+        )
+    header, first = (tmp_path / "track.csv").read_text().splitlines()[:2]
+    assert header.split(",")[-6:] == list(SIGMAS)
+    told = [float(cell) for cell in first.split(",")[-6:]]
+    np.testing.assert_allclose(told[:3], np.sqrt(np.diag(covariances[0])[:3]), rtol=1e-5)
+    nothing = track_sigmas(track, None)
+    write_track_csv(tmp_path / "none.csv", track, FRAME, nothing)
+    assert (tmp_path / "none.csv").read_text().splitlines()[1].endswith(",,,,,,")
+
+
+def test_geojson_is_where_the_cameras_are(tmp_path: Path) -> None:
+    track = rows()
+    write_track_geojson(tmp_path / "t.geojson", track, FRAME, track_sigmas(track, None))
+    data = json.loads((tmp_path / "t.geojson").read_text())
+    line, *points = data["features"]
+    assert line["geometry"]["type"] == "LineString"
+    assert len(line["geometry"]["coordinates"]) == 2  # stations
+    for row, point in zip(track, points, strict=True):
+        east, north, height = point["geometry"]["coordinates"]
+        back = DATUM.ned_from_geodetic(np.array([[north, east, DATUM.height_m - height]]))[0]
+        np.testing.assert_allclose(back, row.world_from_cam.translation, atol=1e-4)
+        heading = np.rad2deg(attitude_from_rotation(row.world_from_body))[2] % 360
+        assert point["properties"]["heading_deg"] == pytest.approx(heading, abs=1e-5)
+        assert point["properties"]["sigma_north_m"] is None
+    assert points[2]["properties"]["time_s"] is None
+
+
+def test_lines_end_where_the_track_turns() -> None:
+    places = [(0.5 * k, 0.0) for k in range(5)] + [(2.0 - 0.5 * k, 1.0) for k in range(5)]
+    assert split_lines(np.array(places)).tolist() == [0] * 5 + [1] * 5
+    assert split_lines(np.array(places[:2])).tolist() == [0, 0]
+    straight = np.column_stack([np.arange(9.0), np.zeros(9)])
+    assert split_lines(straight).tolist() == [0] * 9
+
+
+def test_the_figure_shows_the_mosaic_and_the_stations_on_it(tmp_path: Path) -> None:
+    grid = DemGrid(west=-6.0, north=6.0, cell=0.02, columns=600, rows=600)
+    profile = {
+        "driver": "GTiff", "width": 600, "height": 600, "count": 3, "dtype": "uint8",
+        "crs": crs_of(FRAME), "transform": transform_of(grid),
+    }  # fmt: skip
+    with rasterio.open(tmp_path / "mosaic.tif", "w", **profile) as raster:
+        raster.write(np.full((3, 600, 600), [[[40]], [[120]], [[60]]], np.uint8))
+    track = rows()
+    covariances = np.stack([np.diag([0.25, 0.04, 0.01, 0, 0, 0])] * 3)
+    write_track_csv(tmp_path / "track.csv", track, FRAME, track_sigmas(track, covariances))
+    figures = []
+    for told in (True, False):
+        path = tmp_path / "track_covariance.npz"
+        if told:
+            write_covariances(path, [row.image for row in track], covariances, "place")
+        else:
+            path.unlink()
+        plot_track_over(tmp_path / "mosaic.tif", tmp_path / "track.csv", tmp_path / "t.png")
+        figures.append(cv2.imread(str(tmp_path / "t.png")))
+    green = np.all(np.abs(figures[0].astype(int) - [60, 120, 40]) < 6, axis=2).mean()
+    assert 0.2 < green < 0.95
+    assert figures[0].shape != figures[1].shape or (figures[0] != figures[1]).any()  # ellipses
+    with pytest.raises(WorkspaceError, match="no mosaic"):
+        plot_track_over(tmp_path / "none.tif", tmp_path / "track.csv", tmp_path / "t.png")
