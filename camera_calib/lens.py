@@ -11,8 +11,8 @@ documentation of `calib3d`. Coefficients come as one vector in the order of `COE
 import math
 
 import numpy as np
-from numba import njit
 
+from alice_survey.base.compiled import compiled, compiled_ieee
 from alice_survey.base.frames import Array
 
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
@@ -49,7 +49,7 @@ def _first_positive_root(polynomial: np.polynomial.Polynomial) -> float:
     return 1.0 / float(nearest) if nearest > 1e-9 else math.inf
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def radial(r2: float, k: Array) -> tuple[float, float, float]:
     """L, its slope dL/d(r2), and its denominator."""
     top = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
@@ -60,7 +60,7 @@ def radial(r2: float, k: Array) -> tuple[float, float, float]:
     return ratio, (top_slope - ratio * bottom_slope) / bottom, bottom
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def distort(u: float, v: float, k: Array) -> tuple[float, float]:
     """(x, y) of the ray with tangents (u, v)."""
     r2 = u * u + v * v
@@ -72,7 +72,7 @@ def distort(u: float, v: float, k: Array) -> tuple[float, float]:
     return x, y
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled(error_model="numpy")  # a tuple of terms does as well as an array
 def distort_slopes(u: float, v: float, k: Array) -> tuple[float, float, float, float, float, float]:
     """(x, y) and their slopes dx/du, dx/dv, dy/du, dy/dv."""
     r2 = u * u + v * v
@@ -87,7 +87,7 @@ def distort_slopes(u: float, v: float, k: Array) -> tuple[float, float, float, f
     return x, y, x_u, cross + prism_x * v, cross + prism_y * u, y_v
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def undistort(x: float, y: float, k: Array, fold2: float) -> tuple[float, float]:
     """The ray (u, v) that the sensor sees at (x, y); NaN where no ray before the fold goes there.
 
@@ -125,7 +125,7 @@ def undistort(x: float, y: float, k: Array, fold2: float) -> tuple[float, float]
     return math.nan, math.nan
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def undistort_block(x: Array, y: Array, k: Array, fold2: float, u: Array, v: Array) -> None:
     """`undistort` for some (x, y) at a time, into (u, v).
 

@@ -8,8 +8,8 @@ Rows without a solution are NaN. Frames and units are those of `flat_port`.
 import math
 
 import numpy as np
-from numba import njit
 
+from alice_survey.base.compiled import compiled, compiled_ieee
 from alice_survey.base.frames import Array
 from camera_calib.lens import distort, distort_slopes, radial, undistort_block
 
@@ -24,7 +24,7 @@ LENS_COUNT, PORT_COUNT = 16, 7
 PARAMETER_COUNT = LENS_COUNT + 6
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def air_tangent(radius: float, water: float, port: Array) -> float:
     """Tangent in air, against the port's normal, of the light from a point in the water.
 
@@ -68,7 +68,7 @@ def air_tangent(radius: float, water: float, port: Array) -> float:
     return math.nan
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _air_tangents(radius: Array, water: Array, port: Array, tangent: Array, step: Array) -> None:
     """Three steps of `air_tangent` for a block of points, without branches.
 
@@ -102,7 +102,7 @@ def _air_tangents(radius: Array, water: Array, port: Array, tangent: Array, step
         step[j] = last
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled(nogil=True, error_model="numpy")
 def project(points: Array, lens: Array, port: Array, fold: float) -> Array:
     """(N, 2) pixels of (N, 3) points."""
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
@@ -141,7 +141,7 @@ def project(points: Array, lens: Array, port: Array, fold: float) -> Array:
     return pixels
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled(nogil=True, error_model="numpy")
 def unproject(pixels: Array, lens: Array, port: Array, fold: float) -> tuple[Array, Array]:
     """Points on the outer glass and unit directions in water, (N, 3) each, of (N, 2) pixels."""
     air, glass, n_glass, n_water, nx, ny, nz = port
@@ -184,7 +184,7 @@ def unproject(pixels: Array, lens: Array, port: Array, fold: float) -> tuple[Arr
     return points, directions
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled(nogil=True, error_model="numpy")
 def project_jacobian(
     points: Array, lens: Array, port: Array, fold: float
 ) -> tuple[Array, Array, Array]:
@@ -266,7 +266,7 @@ def project_jacobian(
     return pixels, by_point, by_parameter
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled_ieee
 def _by_lens(
     u: float, v: float, x: float, y: float, fx: float, fy: float, k: Array, out: Array
 ) -> None:

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from scipy.spatial.transform import RigidTransform
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from camera_calib.flat_port import FlatPortCamera
@@ -152,7 +152,7 @@ def _rays_world(
     return origins, directions
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled(nogil=True, error_model="numpy")
 def _solve(m: Array, g: Array, damping: float, out: Array) -> bool:
     """Solve (m + damping diag(m)) out = g, (3, 3) and symmetric, by Cholesky; False if singular."""
     more = 1.0 + damping
@@ -179,7 +179,7 @@ def _solve(m: Array, g: Array, damping: float, out: Array) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled(nogil=True, error_model="numpy")
 def _nearest(origins: Array, directions: Array) -> Array:
     cameras, count = origins.shape[:2]
     points = np.full((count, 3), np.nan)
@@ -202,7 +202,7 @@ def _nearest(origins: Array, directions: Array) -> Array:
     return points
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled(nogil=True, error_model="numpy")
 def _pixel_slopes(p: Array, lens: Array, port: Array, fold: float, out: Array) -> bool:
     """Pixel of one point and its slopes by the point, as in `refraction.project_jacobian`.
 
@@ -262,7 +262,7 @@ def _pixel_slopes(p: Array, lens: Array, port: Array, fold: float, out: Array) -
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled(nogil=True, error_model="numpy")
 def _equations(
     point: Array,
     i: int,
@@ -302,7 +302,7 @@ def _equations(
     return cost
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled(nogil=True, error_model="numpy")
 def _into_water(
     point: Array, i: int, pixels: Array, ports: Array, rotations: Array, translations: Array
 ) -> None:
@@ -330,7 +330,7 @@ def _into_water(
             return
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled(nogil=True, error_model="numpy")
 def _search(
     starts: Array,
     pixels: Array,

@@ -1,46 +1,79 @@
-"""How kernels are compiled: once for all processes, and anew when any source of their room changes.
+"""How kernels are compiled: once for all processes, and again when what they are made of changes.
 
-numba keeps a compiled kernel as long as its own file stays as it is, though the kernels that were
-compiled into it may have changed: here it is kept as long as the whole room stays. A numba that
-stores its stamp elsewhere falls back to its own rule, which is enough for a package that is
-installed and not edited.
+numba keeps a compiled kernel as long as the file it stands in stays unchanged, although the kernels
+and constants that were compiled into it may stand in other files. Here a kernel is kept as long as
+its call closure stays unchanged: its own code and options, and those of every kernel and constant
+that it reaches. A numba that stores its stamp elsewhere falls back to its own rule, which is
+enough for a package that is installed and not edited.
 """
 
-from collections.abc import Callable
-from functools import cache
+import hashlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from types import CodeType, ModuleType
+from typing import Any, ParamSpec, TypeVar, overload
 
+import numpy as np
 from numba import njit
 
 from alice_survey.base.errors import note
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
+_CONSTANTS = (bool, int, float, complex, str, bytes, tuple, np.ndarray, np.generic)
 
 
-def compiled(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Compile a function of plain loops, for a room such as `missions`."""
-    kept: Callable[_Arguments, _Result] = stamped(njit(cache=True)(function), _room(function))
-    return kept
+@overload
+def compiled(function: Callable[..., _Result]) -> Callable[..., _Result]: ...
+@overload
+def compiled(**options: Any) -> Callable[[Callable[..., _Result]], Callable[..., _Result]]: ...
+def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
+    """Compile a function of plain loops, and keep the result on disk.
+
+    Args:
+        function: what to compile; left out when options are given.
+        options: of `numba.njit`, such as `nogil=True` or `error_model="numpy"`.
+
+    Returns:
+        The kernel. numba compiles it again for each combination of types that it is given, so
+        that its annotations do not limit what it takes.
+    """
+
+    def decorated(plain: Callable[..., Any]) -> Any:
+        kernel = njit(cache=True, **options)(plain)
+        index: Any = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
+        if hasattr(index, "_source_stamp"):
+            index._source_stamp = _Stamp(kernel)
+        return kernel
+
+    return decorated if function is None else decorated(function)
 
 
 def compiled_ieee(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """The same, where a division by zero gives infinity or NaN as numpy has it, without a check."""
-    compiled = njit(cache=True, error_model="numpy")(function)
-    kept: Callable[_Arguments, _Result] = stamped(compiled, _room(function))
-    return kept
-
-
-def stamped(kernel: Any, room: Path) -> Any:
-    """A kernel of numba's that is kept as long as no source of a room changes."""
-    index: Any = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
-    if hasattr(index, "_source_stamp"):
-        index._source_stamp = _stamp(room)
+    """The same, where a division by zero gives infinity or NaN as in numpy, without a check."""
+    kernel: Callable[_Arguments, _Result] = compiled(error_model="numpy")(function)
     return kernel
 
 
-def tell_of_compiling(kernel: Any, what: str) -> None:
+def closure_digest(kernel: Any) -> str:
+    """Digest of what a compiled kernel is made of.
+
+    Args:
+        kernel: a function decorated by `compiled` or `numba.njit`.
+
+    Returns:
+        32 hexadecimal digits, which change with the kernel's code (not with its comments, its
+        docstring or its place in the file), its options, and those of all it calls, as well as
+        with the global constants that any of these reads.
+    """
+    digest = hashlib.blake2b(digest_size=16)
+    for part in _closure(kernel, set()):
+        digest.update(part.encode(errors="surrogatepass"))
+        digest.update(b"\0")
+    return digest.hexdigest()
+
+
+def note_compiling(kernel: Any, what: str) -> None:
     """Say, in one line on standard error, that the first call after an installation waits.
 
     Args:
@@ -53,13 +86,82 @@ def tell_of_compiling(kernel: Any, what: str) -> None:
         note(f"compiling {what}")
 
 
-def _room(function: Callable[..., Any]) -> Path:
-    """The top-level package of a function."""
-    return Path(function.__code__.co_filename).parents[function.__module__.count(".") - 1]
+class _Stamp:
+    """A kernel's digest, computed when first compared: all that it calls is defined by then.
+
+    It is stored as plain text, so that a cache can be read without this class.
+    """
+
+    def __init__(self, kernel: Any) -> None:
+        self._kernel = kernel
+        self._digest: str | None = None
+
+    def _value(self) -> str:
+        if self._digest is None:
+            self._digest = closure_digest(self._kernel)
+        return self._digest
+
+    def __eq__(self, other: object) -> bool:
+        return self._value() == other
+
+    def __hash__(self) -> int:
+        return hash(self._value())
+
+    def __reduce__(self) -> tuple[type[str], tuple[str]]:
+        return str, (self._value(),)
 
 
-@cache
-def _stamp(room: Path) -> tuple[tuple[str, int, int], ...]:
-    """Name, time of change and size of every source of a room."""
-    stats = ((file, file.stat()) for file in sorted(room.rglob("*.py")))
-    return tuple((str(f.relative_to(room)), s.st_mtime_ns, s.st_size) for f, s in stats)
+def _closure(kernel: Any, seen: set[int]) -> Iterator[str]:
+    """What a kernel is made of, itself first; each kernel once."""
+    if id(kernel) in seen:
+        return
+    seen.add(id(kernel))
+    plain = kernel.py_func
+    yield f"{plain.__module__}.{plain.__qualname__}"
+    yield repr(sorted((name, _text(value)) for name, value in kernel.targetoptions.items()))
+    yield repr((plain.__defaults__, plain.__kwdefaults__))
+    yield from _code(plain.__code__, plain.__doc__)
+    for name, value in _referenced(plain):
+        if hasattr(value, "py_func"):
+            yield from _closure(value, seen)
+        elif isinstance(value, _CONSTANTS):
+            yield f"{name}={_text(value)}"
+
+
+def _code(code: CodeType, doc: str | None) -> Iterator[str]:
+    """A function's code without file, line numbers and docstring."""
+    yield code.co_code.hex()
+    yield repr((code.co_names, code.co_varnames, code.co_freevars, code.co_argcount))
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _code(constant, None)
+        elif constant is None or constant != doc:
+            yield _text(constant)
+
+
+def _referenced(plain: Callable[..., Any]) -> Iterator[tuple[str, Any]]:
+    """Global and enclosed values that a function names, and those it names within modules."""
+    code, known = plain.__code__, plain.__globals__
+    for name, cell in zip(code.co_freevars, plain.__closure__ or (), strict=True):
+        yield name, cell.cell_contents
+    names = sorted(_names(code))
+    for name in names:
+        value = known.get(name)
+        if isinstance(value, ModuleType):
+            inside = vars(value)
+            yield from ((f"{name}.{other}", inside[other]) for other in names if other in inside)
+        elif name in known:
+            yield name, value
+
+
+def _names(code: CodeType) -> set[str]:
+    inside = (_names(part) for part in code.co_consts if isinstance(part, CodeType))
+    return set(code.co_names).union(*inside)
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype.str}{value.shape}{np.ascontiguousarray(value).tobytes().hex()}"
+    if isinstance(value, (set, frozenset)):
+        return repr(sorted(map(repr, value)))
+    return repr(value)

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
@@ -152,7 +152,7 @@ def _uneven_light(camera: FlatPortCamera) -> Floats:
     return total.reshape(x.shape)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _shade_board(
     origins: Array,
     directions: Array,

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from scipy.spatial.transform import RigidTransform
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.config import ImagingConfig
 from alice_survey.base.frames import Array
 from camera_calib.flat_port import FlatPortCamera
@@ -144,7 +144,7 @@ def beam_solid_angle_sr(beam_rad: float) -> float:
     return float(np.trapezoid(2.0 * math.pi * profile * np.sin(angle), angle))
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def beam_profile(cos_angle: float, beam_rad: float) -> float:
     """Intensity of a strobe off its axis over that on it: Lambert's cosine within a soft cone."""
     if cos_angle <= 0.0:
@@ -154,7 +154,7 @@ def beam_profile(cos_angle: float, beam_rad: float) -> float:
     return cos_angle * t * t * (3.0 - 2.0 * t)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def add_direct(
     x: float,
     y: float,
@@ -202,7 +202,7 @@ def add_direct(
             out[channel] += falls * math.exp(-attenuation[channel] * (distance + path_m))
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def backscatter_at(
     table: Array, reach_m: float, column: float, row: float, path_m: float, out: Array
 ) -> None:

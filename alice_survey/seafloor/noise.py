@@ -7,8 +7,8 @@ that it needs no table and has no period. Loops are written so that the compiler
 import math
 
 import numpy as np
-from numba import njit
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 
 _U, _F = np.uint32, np.float32
@@ -17,7 +17,7 @@ _SHIFT = 2.0**30
 """Added before rounding down, so that truncation is rounding down for negative numbers too."""
 
 
-@njit(inline="always")  # type: ignore[untyped-decorator]
+@compiled(inline="always")
 def mix(h: np.uint32) -> np.uint32:
     """Spread the bits of a 32-bit integer over all of its bits."""
     h = _U(h ^ (h >> _U(15)))
@@ -27,7 +27,7 @@ def mix(h: np.uint32) -> np.uint32:
     return _U(h ^ (h >> _U(15)))
 
 
-@njit(inline="always")  # type: ignore[untyped-decorator]
+@compiled(inline="always")
 def _corner(h: np.uint32, x: np.float32, y: np.float32, z: np.float32) -> np.float32:
     h = mix(h)
     gx = _F(np.int32(h & _U(1023))) - _F(511.5)
@@ -36,12 +36,12 @@ def _corner(h: np.uint32, x: np.float32, y: np.float32, z: np.float32) -> np.flo
     return gx * x + gy * y + gz * z
 
 
-@njit(inline="always")  # type: ignore[untyped-decorator]
+@compiled(inline="always")
 def _fade(t: np.float32) -> np.float32:
     return t * t * t * (t * (t * _F(6.0) - _F(15.0)) + _F(10.0))
 
 
-@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
+@compiled(fastmath=True)
 def noise(x: Array, y: Array, z: Array, lattice_m: float, seed: int, out: Array) -> None:
     """Fill `out` with noise of standard deviation about 0.48 and mean 0.
 
@@ -81,7 +81,7 @@ def noise(x: Array, y: Array, z: Array, lattice_m: float, seed: int, out: Array)
         out[i] = scale * (n0 + w * (n4 - n0))
 
 
-@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
+@compiled(fastmath=True)
 def add_octave(
     total: Array, scratch: Array, lattice_m: float, amplitude: float, footprint_m: Array
 ) -> None:
@@ -101,7 +101,7 @@ def add_octave(
         total[i] += _F(amplitude) * scratch[i] * (t * t * (_F(3.0) - _F(2.0) * t))
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def spot(
     x: float,
     y: float,

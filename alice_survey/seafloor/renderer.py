@@ -11,10 +11,10 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.errors import ImageError
 from alice_survey.base.frames import Array
 from alice_survey.seafloor.light import CameraLight, add_direct, backscatter_at
@@ -271,7 +271,7 @@ def _visible_strobes(
     return lit
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _moments(
     rows: int, columns: int, samples: int, poses: int, first_row: int
 ) -> NDArray[np.uint8]:
@@ -289,7 +289,7 @@ def _moments(
     return moments
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _to_world(
     origins: Array, directions: Array, moments: Array, rotations: Array, places: Array
 ) -> Floats:
@@ -306,7 +306,7 @@ def _to_world(
     return world
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _shadow_rays(
     world: Array, path: Array, moments: Array, rotations: Array, places: Array, strobe: Array
 ) -> Floats:
@@ -326,7 +326,7 @@ def _shadow_rays(
     return rays
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _surface(
     world: Array,
     path: Array,
@@ -364,7 +364,7 @@ def _surface(
     return points, normals, material
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _footprints(path: Array, normals: Array, world: Array, sample_rad: float) -> Floats:
     """Distance between neighbouring samples on the surface, metres."""
     footprint = np.empty(len(path), np.float32)
@@ -379,7 +379,7 @@ def _footprints(path: Array, normals: Array, world: Array, sample_rad: float) ->
     return footprint
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _shade(
     origins: Array,
     directions: Array,

@@ -7,9 +7,9 @@ at 2 m (0.42 mm). What is finer than a sample is left out of it, so that picture
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.frames import Array
 from alice_survey.seafloor.noise import add_octave, mix, noise, spot
@@ -72,13 +72,13 @@ def survey_texture(config: SurveyConfig) -> Texture:
     return Texture(seed=int(rng.integers(2**32)))
 
 
-@njit(inline="always")  # type: ignore[untyped-decorator]
+@compiled(inline="always")
 def _step(low: float, high: float, x: float) -> float:
     t = min(max((x - low) / (high - low), 0.0), 1.0)
     return t * t * (3.0 - 2.0 * t)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _octaves(
     table: Array, seed: int, x: Array, y: Array, z: Array, footprint: Array, out: Array
 ) -> None:
@@ -91,7 +91,7 @@ def _octaves(
             add_octave(out, scratch, table[k, 0], table[k, 1], footprint)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _albedo(points: Array, material: Array, footprint: Array, seed: int, out: Array) -> None:
     for start in range(0, len(points), _BLOCK):
         stop = min(start + _BLOCK, len(points))
@@ -127,7 +127,7 @@ def _albedo(points: Array, material: Array, footprint: Array, seed: int, out: Ar
             out[at, 2] = min(max(b, 0.01), 0.95)
 
 
-@njit(inline="always")  # type: ignore[untyped-decorator]
+@compiled(inline="always")
 def _sand(coarse: float, fine: float, hue: float, detritus: float) -> tuple[float, float, float]:
     film = 0.45 * _step(0.1, 0.75, coarse + 0.25 * hue - 0.2 * fine)
     film = max(film, 0.6 * _step(0.2, 1.1, detritus - 0.5 * fine + 0.35 * coarse))
@@ -138,7 +138,7 @@ def _sand(coarse: float, fine: float, hue: float, detritus: float) -> tuple[floa
     return r, g, b
 
 
-@njit(inline="always")  # type: ignore[untyped-decorator]
+@compiled(inline="always")
 def _rock(coarse: float, fine: float, growth: float, hue: float) -> tuple[float, float, float]:
     level = 1.0 + 0.2 * coarse + 0.42 * fine
     r, g, b = 0.225 * level, 0.200 * level, 0.160 * level
@@ -158,7 +158,7 @@ def _rock(coarse: float, fine: float, growth: float, hue: float) -> tuple[float,
     )
 
 
-@njit(inline="always")  # type: ignore[untyped-decorator]
+@compiled(inline="always")
 def _ceramic(coarse: float, fine: float, growth: float, hue: float) -> tuple[float, float, float]:
     level = 1.0 + 0.12 * coarse + 0.4 * fine
     r, g, b = (0.46 + 0.03 * hue) * level, 0.255 * level, 0.158 * level
@@ -170,7 +170,7 @@ def _ceramic(coarse: float, fine: float, growth: float, hue: float) -> tuple[flo
     return r + worms * (0.62 - r), g + worms * (0.58 - g), b + worms * (0.50 - b)
 
 
-@njit(inline="always")  # type: ignore[untyped-decorator]
+@compiled(inline="always")
 def _specked(
     x: float, y: float, z: float, apart: float, seed: int, fine: float, r: float, g: float, b: float
 ) -> tuple[float, float, float]:

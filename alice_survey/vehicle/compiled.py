@@ -1,12 +1,9 @@
 """How the vehicle's kernels are compiled."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import ParamSpec, TypeVar
 
-from numba import njit
-
-from alice_survey.base.compiled import stamped
+from alice_survey.base.compiled import compiled
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -18,7 +15,5 @@ def kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Res
     Without numba's runtime a function that would allocate an array does not compile, and none
     spends time on counting references: the equations of motion run seven times as fast.
     """
-    kept: Callable[_Arguments, _Result] = stamped(
-        njit(cache=True, _nrt=False)(function), Path(__file__).parent
-    )
+    kept: Callable[_Arguments, _Result] = compiled(_nrt=False)(function)
     return kept

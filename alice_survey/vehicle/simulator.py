@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from alice_survey.base.compiled import tell_of_compiling
+from alice_survey.base.compiled import note_compiling
 from alice_survey.base.frames import Array, attitude_from_rotation
 from alice_survey.vehicle import signals
 from alice_survey.vehicle.allocation.exact import allocate_exact
@@ -330,7 +330,7 @@ def simulate(
     """
     from alice_survey.base.executor import progress
 
-    tell_of_compiling(_fly_ticks, "the vehicle's model, once: this takes about a minute")
+    note_compiling(_fly_ticks, "the vehicle's model, once: this takes about a minute")
     chunks: list[Rows] = []
     total = math.ceil((expected_s or longest_s) / TICK_S / _CHUNK_TICKS)
     flying = _chunks(setup, rng, sea_rng or rng, longest_s)

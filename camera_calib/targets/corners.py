@@ -12,9 +12,9 @@ from typing import Self
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 
 Grey = NDArray[np.uint8] | NDArray[np.float32] | NDArray[np.float64]
@@ -143,7 +143,7 @@ def fit_corners(
     return Corners(pixels=fits[:, :2], sigma_px=fits[:, 2], contrast=fits[:, 3], states=states)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _fit_corners(
     picture: Array, near: Array, steps: Array, reach: float, arm: float
 ) -> tuple[Array, NDArray[np.intp]]:
@@ -176,7 +176,7 @@ def _fit_corners(
     return out, states
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _cut(
     picture: Array,
     column: int,
@@ -217,7 +217,7 @@ def _cut(
     return FITTED if count >= _FEWEST_PIXELS else NOT_SETTLED
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _start(window: Array, used: NDArray[np.bool_], x: float, y: float, steps: Array) -> Array:
     """Centre, normals of both edges, blur, contrast, level and its slopes, to begin with."""
     low, high, total, count = np.inf, -np.inf, 0.0, 0
@@ -237,7 +237,7 @@ def _start(window: Array, used: NDArray[np.bool_], x: float, y: float, steps: Ar
     return start
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _descend(window: Array, used: NDArray[np.bool_], start: Array) -> tuple[Array, float, Array]:
     """Levenberg-Marquardt on what `_start` lists; returns the cost and the normal matrix too."""
     q, damping = start.copy(), 1e-3
@@ -262,7 +262,7 @@ def _descend(window: Array, used: NDArray[np.bool_], start: Array) -> tuple[Arra
     return q, cost, normal
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _equations(window: Array, used: NDArray[np.bool_], q: Array) -> tuple[float, Array, Array]:
     """Sum of squares of the misses, and the normal equations."""
     cost, normal, right = 0.0, np.zeros((9, 9)), np.zeros(9)

@@ -11,9 +11,9 @@ from functools import cached_property
 
 import numpy as np
 import shapely
-from numba import njit
 from numpy.typing import NDArray
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from camera_calib.rig import Rig
 from missions.values.area import Area
@@ -118,7 +118,7 @@ def border_rays_body(rig: Rig) -> tuple[Array, Array]:
     return np.stack(points), np.stack(rays)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled(nogil=True)
 def footprints_ne(
     points_body: Array, rays_body: Array, glass_ne: Array, altitude_m: Array, attitude_rad: Array
 ) -> Array:
@@ -159,7 +159,7 @@ def footprints_ne(
     return borders
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled(nogil=True)
 def count_pictures(
     borders: Array,
     line: NDArray[np.intp],
@@ -237,7 +237,7 @@ def count_pictures(
                                 pairs[i, j] += 1
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled(nogil=True)
 def _inside(edges: Array, rows: int, columns: int) -> NDArray[np.bool_]:
     """Which middles of cells lie within closed rings, by the parity of edges to their left.
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.compiled import tell_of_compiling
+from alice_survey.base.compiled import note_compiling
 from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
@@ -144,7 +144,7 @@ def ordered(
 
 def tell_of_planner() -> None:
     """Say that the first plan after an installation waits until the planner is compiled."""
-    tell_of_compiling(hops.flight_parts_j, "the planner, once: this takes 40 s to a minute")
+    note_compiling(hops.flight_parts_j, "the planner, once: this takes 40 s to a minute")
 
 
 def check_size(area: Area, pattern: Pattern, most_stations: int = MOST_STATIONS) -> None:

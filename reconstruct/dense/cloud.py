@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from alice_survey.base.artefacts import write_json
+from alice_survey.base.compiled import compiled
 from reconstruct.dense.dem import DemGrid, bin_points, sorted_ranks
 from reconstruct.dense.points import Points
 from reconstruct.views.model import WorldFrame
@@ -40,7 +40,7 @@ _NO_DATE = date(2000, 1, 1)
 _PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def thin(
     starts: NDArray[np.int64],
     order: NDArray[np.int64],

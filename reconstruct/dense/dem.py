@@ -7,9 +7,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from reconstruct.dense.points import Points
 
@@ -112,7 +112,7 @@ def fuse_points(
     return height.reshape(shape), sigma.reshape(shape), count.reshape(shape), met.reshape(shape)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def bin_points(
     points_enu: Float32, north: float, west: float, cell: float, rows: int, columns: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -148,7 +148,7 @@ def bin_points(
     return starts, order
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def sorted_ranks(values: NDArray[Any]) -> NDArray[np.int64]:
     """Indices that sort values upwards (Shell's sort, which numba compiles in no time).
 
@@ -171,7 +171,7 @@ def sorted_ranks(values: NDArray[Any]) -> NDArray[np.int64]:
     return ranks
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def fuse_cells(
     starts: NDArray[np.int64],
     heights: Float32,
@@ -261,7 +261,7 @@ def fuse_cells(
     return height, sigma, count, met
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def fill_gaps(height: Float32, sigma: Float32, reach: int) -> tuple[Float32, Float32]:
     """Bridge small gaps in straight lines between what lies on either side.
 

@@ -7,9 +7,9 @@ maps of neighbouring views. What only one match claims and nothing confirms is l
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from reconstruct.views.sight import FAST, KernelLens, pixel_at
 
@@ -21,7 +21,7 @@ GATE_SIGMAS = 3.0
 """Depths that differ by no more than this many standard deviations of their difference agree."""
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
+@compiled(error_model="numpy", fastmath=FAST)
 def merge_depths(
     depths: Float32, sigmas: Float32, gate: float
 ) -> tuple[Float32, Float32, NDArray[np.uint8]]:
@@ -83,7 +83,7 @@ def merge_depths(
     return merged, sigma, agreeing
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
+@compiled(error_model="numpy", fastmath=FAST)
 def count_witnesses(
     depth: Float32,
     sigma: Float32,

@@ -4,9 +4,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from reconstruct.views.model import View
 from reconstruct.views.sight import FAST, KernelLens, lens_of, slopes_of
@@ -120,7 +120,7 @@ def _meeting(
     return meeting
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _widen(
     bounds: Array, rows: NDArray[np.int64], columns: NDArray[np.int64], world: Array
 ) -> None:
@@ -151,7 +151,7 @@ def joined(parts: list[Points]) -> Points:
     )
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
+@compiled(error_model="numpy", fastmath=FAST)
 def gather(
     depth: Float32,
     sigma: Float32,
@@ -244,7 +244,7 @@ def gather(
     return enu[:count].copy(), normals, colours, sigmas
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
+@compiled(error_model="numpy", fastmath=FAST)
 def _spot(depth: Float32, slopes: Float32, row: int, column: int, spot: Array) -> None:
     """Write the point (3,) of a pixel, in the camera, into `spot`; NaN where unknown."""
     z = depth[row, column]

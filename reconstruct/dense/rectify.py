@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from reconstruct.views.model import View
 from reconstruct.views.sight import FAST, KernelLens, field_of, lens_of
@@ -192,7 +192,7 @@ def depth_in_reference(
     return depth, float(np.sqrt(squares / max(count, 1)))
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
+@compiled(error_model="numpy", fastmath=FAST)
 def triangulate(
     disparity_px: NDArray[np.float32],
     shape: tuple[int, int],

@@ -18,10 +18,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from reconstruct.views.model import View
 from reconstruct.views.sight import FAST, KernelLens, field_of, lens_of, pixel_at
@@ -92,7 +92,7 @@ def _blur(picture: Float32, sigma_px: float) -> Float32:
     return blurred
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
+@compiled(error_model="numpy", fastmath=FAST)
 def sights(lens: KernelLens, height: int, width: int) -> Float32:
     """Lines on which the spots of a view's pixels lie, (H, W, 4).
 
@@ -110,7 +110,7 @@ def sights(lens: KernelLens, height: int, width: int) -> Float32:
     return lines
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
+@compiled(error_model="numpy", fastmath=FAST)
 def compare(
     inverse_depth: Float32,
     reference: Float32,
@@ -185,7 +185,7 @@ def compare(
     return rest, slope, speed
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
+@compiled(error_model="numpy", fastmath=FAST)
 def _weights(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.float32]:
     """The four weights of a cubic B-spline at a share t of the way from the second node."""
     s = _ONE - t
@@ -198,7 +198,7 @@ def _weights(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.floa
     )
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
+@compiled(error_model="numpy", fastmath=FAST)
 def _slopes(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.float32]:
     """How these weights change with t."""
     s = _ONE - t
@@ -339,7 +339,7 @@ def _sums(reference: Look, inverse: Float32, others: Sequence[Look]) -> _Sums:
     return _Sums(pull=pull, curvature=curvature, speed=speed, likeness=likeness, seen=seen)
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
+@compiled(error_model="numpy", fastmath=FAST)
 def _products(
     rest: Float32, slope: Float32, known: NDArray[np.bool_], outlying: float
 ) -> tuple[Float32, Float32, Float32, Float32, Float32, Float32]:
@@ -360,7 +360,7 @@ def _products(
     return weight, r, g, rg, gg, rr
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
+@compiled(error_model="numpy", fastmath=FAST)
 def _add(
     sums: tuple[Float32, Float32, Float32, Float32, Float32, Float32],
     spread: Float32,

@@ -9,11 +9,11 @@ dense system for the patterns and the fall-off: the Schur complement, as in bund
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 
 _DENSE_PICTURES = 400
@@ -100,7 +100,7 @@ def solve_robustly(
 # systems then take a hundred times as long, and their last digits depend on the number of threads
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _product(a: Array, b: Array) -> Array:
     """The product of a matrix with many zeros (P, V) and another (V, Q)."""
     found = np.zeros((a.shape[0], b.shape[1]))
@@ -113,7 +113,7 @@ def _product(a: Array, b: Array) -> Array:
     return found
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def solve_symmetric(matrix: Array, right: Array) -> Array:
     """Solve a positive definite system (N, N) for right sides (N, M) by Cholesky's factors."""
     count = len(matrix)
@@ -147,7 +147,7 @@ def _gains_block(e: Equations, own: Array, shared: Array) -> csc_array:
     return csc_array((values, (rows, columns)), shape=(e.pictures, e.pictures))
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def normal_equations(
     nodes: NDArray[np.int64], weights: Array, farther: Array, views: NDArray[np.int64],
     pair: NDArray[np.int64], pairs: int, target: Array, x: Array, gains: Array, misfit: float,

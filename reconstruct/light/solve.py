@@ -17,10 +17,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from alice_survey.base.artefacts import read_json, write_json
+from alice_survey.base.compiled import compiled
 from alice_survey.base.contents import taken_from
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
@@ -122,7 +122,7 @@ def at_places(
     return found
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def bilinear(
     picture: NDArray[np.float32], x: NDArray[np.float32], y: NDArray[np.float32]
 ) -> NDArray[np.float32]:

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from scipy.spatial.transform import RigidTransform
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from camera_calib.calibrate.freedom import POSE as TURN_AND_SHIFT
 from camera_calib.flat_port import PARAMETERS, FlatPortCamera, pose_jacobian
@@ -156,7 +156,7 @@ def exact_sights(
     )  # fmt: skip
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _in_rig(arm: Array, rows: Indices, station: Indices, turns: Array) -> Array:
     """Some observations' arms (N, 3) along the axes of their rigs."""
     found = np.empty((rows.shape[0], 3))
@@ -167,7 +167,7 @@ def _in_rig(arm: Array, rows: Indices, station: Indices, turns: Array) -> Array:
     return found
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _put(
     rows: Indices, at: Array, by_cam: Array, turn: Array, turns: Array, station: Indices,
     taken: Array, slopes: Array, source: Indices, target: Indices,

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import bsr_matrix, csc_matrix
 from scipy.sparse.linalg import splu
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 
 POSE = 6
@@ -135,7 +135,7 @@ def solver_of(matrix: csc_matrix, free: NDArray[np.bool_]) -> Callable[[Array], 
     return solve
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _mark(starts: Indices, station: Indices, meets: NDArray[np.bool_]) -> None:
     """Mark the pairs of stations that see a point in common, in place."""
     for p in range(starts.shape[0] - 1):
@@ -144,7 +144,7 @@ def _mark(starts: Indices, station: Indices, meets: NDArray[np.bool_]) -> None:
                 meets[station[a], station[b]] = True
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def find_block(pointers: Indices, columns: Indices, row: int, column: int) -> int:
     """Where a block stands among those of its row; it must be there."""
     low, high = pointers[row], pointers[row + 1]
@@ -157,7 +157,7 @@ def find_block(pointers: Indices, columns: Indices, row: int, column: int) -> in
     return int(low)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def by_pose(by_point: Array, arm: Array, out: Array) -> None:
     """Slopes (2, 6) of one pixel by its station's pose, from those by the point."""
     x, y, z = arm[0], arm[1], arm[2]
@@ -169,7 +169,7 @@ def by_pose(by_point: Array, arm: Array, out: Array) -> None:
         out[row, 3], out[row, 4], out[row, 5] = -u, -v, -w
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _invert(m: Array, out: Array) -> None:
     """The inverse of a symmetric 3 x 3 matrix; NaN where it has none."""
     a, b, c, d, e, f = m[0, 0], m[0, 1], m[0, 2], m[1, 1], m[1, 2], m[2, 2]
@@ -181,7 +181,7 @@ def _invert(m: Array, out: Array) -> None:
     out[2, 0], out[2, 1], out[2, 2] = out[0, 2], out[1, 2], (a * d - b * b) * scale
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _reduce(
     starts: Indices, station: Indices, by_point: Array, arm: Array, by_shared: Array, miss: Array,
     pointers: Indices, columns: Indices,
@@ -275,7 +275,7 @@ def _reduce(
     return blocks, border, shared, slope, shared_slope, inverse
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def moved_points(
     starts: Indices, station: Indices, by_point: Array, arm: Array, by_shared: Array, miss: Array,
     inverse: Array, steps: Array, shared_step: Array,
@@ -303,7 +303,7 @@ def moved_points(
     return moved
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def point_covariances(
     starts: Indices, station: Indices, by_point: Array, arm: Array, inverse: Array,
     pointers: Indices, columns: Indices, blocks: Array,

@@ -12,9 +12,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pycolmap
-from numba import njit
 from numpy.typing import NDArray
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from reconstruct.matching.features import Features, load_features
 from reconstruct.views.lens import Lens
@@ -42,7 +42,7 @@ _LEAST_RADIUS = 0.02
 """Of the search, as a share of the picture's longer side."""
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _best_two(
     products: Any, norms_a: Any, norms_b: Any, best: Any, first: Any, second: Any, best_b: Any,
     nearest_b: Any, offset: int,

@@ -16,12 +16,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.executor import parallel_map
 from alice_survey.base.frames import Array
 from reconstruct.matching.features import load_features
@@ -258,7 +258,7 @@ def align_patches(
     return found
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _cubic(picture: Any, x: float, y: float) -> float:
     """Grey level by cubic convolution (Keys 1981); the first pixel's centre is 0, 0."""
     column, row = math.floor(x), math.floor(y)
@@ -283,7 +283,7 @@ def _cubic(picture: Any, x: float, y: float) -> float:
     return level
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _template(
     picture: Any, x: float, y: float, patch: Any, weights: Any, levels: Any, slopes: Any
 ) -> None:
@@ -308,7 +308,7 @@ def _template(
             k += 1
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _inside(picture: Any, x: float, y: float, margin: float) -> bool:
     return bool(
         x >= margin
@@ -318,7 +318,7 @@ def _inside(picture: Any, x: float, y: float, margin: float) -> bool:
     )
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _compare(
     picture: Any, x: float, y: float, m: Any, weights: Any, levels: Any, slopes: Any, right: Any
 ) -> float:
@@ -347,7 +347,7 @@ def _compare(
     return float((sum_ab - sum_a * sum_b / total) / math.sqrt(max(spread, 1e-9)))
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _align(first: Any, second: Any, reference: Any, pixels: Any, affine: Any) -> Any:
     count = (2 * _RADIUS + 1) ** 2
     patch = np.empty((2 * _RADIUS + 3, 2 * _RADIUS + 3))

@@ -12,9 +12,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from reconstruct.mesh.topology import Triangles, edges_of
 
@@ -128,7 +128,7 @@ def _plane(normal: Array, offset: Array) -> Array:
     return np.stack([x * x, x * y, x * z, x * d, y * y, y * z, y * d, z * z, z * d, d * d], axis=1)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def quadric_error(q: Array, p: Array) -> float:
     """Sum of weighted squared distances of a point from the planes of a quadric (11,)."""
     x, y, z = p[0], p[1], p[2]
@@ -139,7 +139,7 @@ def quadric_error(q: Array, p: Array) -> float:
     return max(total, 0.0)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def best_point(q: Array, out: Array) -> bool:
     """The point of least error; False where the planes leave it open."""
     a, b, c, d, e, f = q[0], q[1], q[2], q[4], q[5], q[7]
@@ -156,7 +156,7 @@ def best_point(q: Array, out: Array) -> bool:
     return True
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _costs(
     place: Array,
     quadrics: Array,
@@ -207,7 +207,7 @@ def _costs(
     return cost, spot
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _normal(a: Array, b: Array, c: Array, out: Array) -> float:
     """Cross product of two sides; returns its length, and twice the area."""
     u0, u1, u2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
@@ -216,7 +216,7 @@ def _normal(a: Array, b: Array, c: Array, out: Array) -> float:
     return math.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _turns_or_thins(
     place: Array,
     faces: NDArray[np.int32],
@@ -247,7 +247,7 @@ def _turns_or_thins(
     return False
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _collapse(
     place: Array,
     faces: NDArray[np.int32],

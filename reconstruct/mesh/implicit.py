@@ -14,9 +14,9 @@ edge that it crosses.
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 
 KERNEL_STEPS = 0.8
@@ -26,7 +26,7 @@ REACH_STEPS = 2.5
 _NEWTON_STEPS = 3
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def splat(
     points: Array,
     normals: Array,
@@ -79,7 +79,7 @@ def splat(
     return moment
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def zero_mesh(values: Array) -> tuple[Array, NDArray[np.int32], NDArray[np.int32]]:
     """Mesh the zero of a function on a lattice.
 
@@ -154,7 +154,7 @@ def zero_mesh(values: Array) -> tuple[Array, NDArray[np.int32], NDArray[np.int32
     return vertices, cells, quads[:made].copy()
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _place(corner: Array, out: Array) -> None:
     """The vertex of one cell: the mean crossing of its edges, moved onto the zero within the cell.
 

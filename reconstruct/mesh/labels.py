@@ -9,11 +9,11 @@ stay small are then given to a neighbour that sees all of them.
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from reconstruct.mesh.topology import Triangles, edges_of, face_normals
@@ -98,7 +98,7 @@ def connected_charts(neighbours: NDArray[np.int32], label: NDArray[np.int32]) ->
     return chart
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def smooth(
     label: NDArray[np.int32],
     views: NDArray[np.int32],
@@ -138,7 +138,7 @@ def smooth(
             return
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def give_away(
     label: NDArray[np.int32],
     chart: NDArray[np.int32],

@@ -8,9 +8,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.executor import parallel_map
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
@@ -359,7 +359,7 @@ def _nearest(covered: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.i
     return row_of[labels], column_of[labels]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def spread_corners(
     corners: Array, triangles: Triangles, values: Float32, shape: tuple[int, int]
 ) -> tuple[Float32, NDArray[np.bool_]]:

@@ -11,10 +11,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from alice_survey.base.artefacts import atomic_path
+from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from reconstruct.light.solve import GRID, at_places
 from reconstruct.pictures.undistorted import Pictures
@@ -131,7 +131,7 @@ def measure_picture(task: tuple[Path, Path, str]) -> PictureFacts:
     )
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def sharp_and_mean(grey: NDArray[np.uint8], usable: NDArray[np.bool_]) -> tuple[float, float]:
     """Mean size of the Laplacian, and mean level, of the inner pixels that may be used.
 
@@ -182,7 +182,7 @@ def _dark(taken: NDArray[np.uint8], usable: NDArray[np.bool_] | None, table: Flo
     return np.where(np.isfinite(levels), np.interp(levels, np.arange(256), table), np.nan)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def low_levels(
     picture: NDArray[np.uint8], usable: NDArray[np.bool_], y: NDArray[np.int64],
     x: NDArray[np.int64], percent: float,

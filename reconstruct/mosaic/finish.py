@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from alice_survey.base.compiled import compiled
 from reconstruct.mosaic.facts import encoded
 
 Float32 = NDArray[np.float32]
@@ -28,7 +28,7 @@ def curve_by_root() -> Float32:
     return encoded((root**2).astype(np.float32))
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def finish_colours(
     light: Float32,
     places: tuple[Float32, Float32],

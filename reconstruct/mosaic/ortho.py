@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 
 Float32 = NDArray[np.float32]
@@ -16,7 +16,7 @@ _MOST_ROUNDS, _STILL_PX = 5, 1e-3
 """Of the fixed point that leads through a flat port; each round gains two digits or more."""
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def visible_cells(
     height: Float32,
     camera_enu: Array,
@@ -76,7 +76,7 @@ def visible_cells(
     return visible
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _at(nodes: Array, across: float, down: float, x: float, y: float) -> tuple[float, float]:
     """As `field_at`, with the nodes per pixel worked out before."""
     rows, columns = nodes.shape[0], nodes.shape[1]
@@ -94,7 +94,7 @@ def _at(nodes: Array, across: float, down: float, x: float, y: float) -> tuple[f
     )  # fmt: skip
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def look_up(
     height: Float32,
     wanted: tuple[NDArray[np.bool_], int],
@@ -221,7 +221,7 @@ def lanczos_weights() -> Float32:
     return rows
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def sample_lanczos(
     picture: NDArray[np.uint8], table: Float32, weights: Float32, x: Float32, y: Float32,
     first: int, last: int, out: Float32,

@@ -9,8 +9,9 @@ views in the same sweep and for two views comes close to the minimal cut.
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from alice_survey.base.compiled import compiled
 
 Float32 = NDArray[np.float32]
 
@@ -64,7 +65,7 @@ def choose_views(number: NDArray[np.int32], share: Float32, colours: Float32) ->
     return chosen
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def seam_cost(
     number_p: NDArray[np.int32], number_q: NDArray[np.int32], colours_p: Float32,
     colours_q: Float32, a: int, b: int,
@@ -101,7 +102,7 @@ def seam_cost(
     return _SEAM_COST + _DIFFERENCE_COST * 0.5 * total
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _trws(
     number: NDArray[np.int32], own: Float32, colours: Float32, sweeps: int
 ) -> NDArray[np.int32]:

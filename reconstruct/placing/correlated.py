@@ -13,16 +13,16 @@ multiplication by the inverse of K's Cholesky factor, in one pass (Kailath 1968)
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 
 LEAST_WHITE = 1e-4
 """Share of white error that two readings at the same moment need to have any innovation."""
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _kept(time: Array, sigma: Array, i: int, j: int, tau: float) -> float:
     """Correlation of the lasting parts of two neighbours."""
     lesser, greater = min(sigma[i], sigma[j]), max(sigma[i], sigma[j])
@@ -30,7 +30,7 @@ def _kept(time: Array, sigma: Array, i: int, j: int, tau: float) -> float:
     return kept
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def whiten(
     time: Array, sigma: Array, used: NDArray[np.bool_], values: Array, tau: float, white: float
 ) -> tuple[Array, float]:
@@ -72,7 +72,7 @@ def whiten(
     return found, log_det
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _predictions(
     time: Array, sigma: Array, used: NDArray[np.bool_], values: Array, tau: float, white: float
 ) -> tuple[Array, Array]:

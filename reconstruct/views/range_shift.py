@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from reconstruct.views.lens import FlatPortLens, Lens
 
@@ -131,7 +131,7 @@ def _without_holes(field: Array) -> Array:
     return filled
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def field_at(
     nodes: Array, width_px: float, height_px: float, x: float, y: float
 ) -> tuple[float, float]:
@@ -153,7 +153,7 @@ def field_at(
     )  # fmt: skip
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def ideal_pixel(
     nodes: Array, width_px: float, height_px: float, inverse_working: float,
     x: float, y: float, inverse_depth: float,
@@ -164,7 +164,7 @@ def ideal_pixel(
     return x + a * step, y + b * step
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def warped_pixel(
     nodes: Array, width_px: float, height_px: float, inverse_working: float,
     x: float, y: float, inverse_depth: float,
@@ -178,7 +178,7 @@ def warped_pixel(
     return u, v
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _fields(nodes: Array, width_px: float, height_px: float, pixels: Array) -> Array:
     found = np.empty_like(pixels)
     for i in range(pixels.shape[0]):

@@ -5,9 +5,9 @@ the port shifts pixels as the depth departs from that of the warp (zeros without
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from reconstruct.views.model import View
 
@@ -33,7 +33,7 @@ def pinhole_of(view: View) -> Array:
     return np.array([view.fx_px, view.fy_px, view.cx_px, view.cy_px])
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
+@compiled(error_model="numpy", fastmath=FAST)
 def field_of(lens: KernelLens, x: float, y: float) -> tuple[float, float]:
     """`range_shift.field_at` of a lens, compiled so that loops over pixels share its quotients."""
     nodes, width_px, height_px, _ = lens[1]
@@ -51,7 +51,7 @@ def field_of(lens: KernelLens, x: float, y: float) -> tuple[float, float]:
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
+@compiled(error_model="numpy", fastmath=FAST)
 def slopes_of(depth: NDArray[np.float32], lens: KernelLens) -> NDArray[np.float32]:
     """Slopes x/z, y/z (H, W, 2) of the spots that a warped picture shows; NaN without depth.
 
@@ -85,7 +85,7 @@ def slopes_of(depth: NDArray[np.float32], lens: KernelLens) -> NDArray[np.float3
     return slopes
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator]
+@compiled(error_model="numpy", fastmath=FAST)
 def pixel_at(lens: KernelLens, x: float, y: float, z: float) -> tuple[float, float]:
     """The warped picture's pixel of a point before the camera (z > 0)."""
     pinhole, shift = lens

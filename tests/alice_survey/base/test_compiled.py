@@ -1,0 +1,119 @@
+"""Compiled kernels are kept between processes, and dropped when what they are made of changes."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numba import njit
+
+from alice_survey.base.compiled import closure_digest
+
+ASK = "import inner, outer; print(outer.twice(3.0), sum(outer.twice.stats.cache_hits.values()))"
+INNER = '''
+from alice_survey.base.compiled import compiled
+{above}
+OFFSET = {offset}
+
+@compiled
+def once(x):
+    """{doc}"""
+    return x + OFFSET
+'''
+OUTER = """
+from alice_survey.base.compiled import compiled
+import numbers_used
+from inner import once
+
+@compiled
+def twice(x):
+    return once(x) * numbers_used.FACTOR
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write(tmp_path)
+    (tmp_path / "outer.py").write_text(OUTER)
+    assert ask(tmp_path) == (8.0, 0)
+    return tmp_path
+
+
+def write(
+    folder: Path, offset: float = 1.0, factor: float = 2.0, above: str = "", doc: str = ""
+) -> None:
+    (folder / "inner.py").write_text(INNER.format(offset=offset, above=above, doc=doc))
+    (folder / "numbers_used.py").write_text(f"FACTOR = {factor}\nUNUSED = 1\n")
+
+
+def ask(folder: Path) -> tuple[float, int]:
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(folder), str(Path(__file__).parents[3])]),
+        "NUMBA_CACHE_DIR": str(folder / "kept"),
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", ASK], env=environment, capture_output=True, text=True, check=True
+    )
+    value, hits = done.stdout.split()
+    return float(value), int(hits)
+
+
+def test_a_kernel_is_kept_between_processes(folder: Path) -> None:
+    assert ask(folder) == (8.0, 1)
+
+
+def test_a_kernel_is_kept_when_files_change_that_it_does_not_use(folder: Path) -> None:
+    (folder / "other.py").write_text("FACTOR = 7.0\n")
+    write(folder, above="# more lines\nUNUSED = 3.0\n", doc="Other words.")
+    (folder / "numbers_used.py").write_text("UNUSED = 2\nFACTOR = 2.0\n")
+    assert ask(folder) == (8.0, 1)
+
+
+def test_a_constant_of_a_called_kernel_counts(folder: Path) -> None:
+    write(folder, offset=10.0)
+    assert ask(folder) == (26.0, 0)
+
+
+def test_a_constant_named_through_a_module_counts(folder: Path) -> None:
+    write(folder, factor=3.0)
+    assert ask(folder) == (12.0, 0)
+
+
+def test_the_code_of_a_called_kernel_counts(folder: Path) -> None:
+    inner = (folder / "inner.py").read_text()
+    (folder / "inner.py").write_text(inner.replace("x + OFFSET", "x - OFFSET"))
+    assert ask(folder) == (4.0, 0)
+
+
+def scaled(table: np.ndarray, unit: float = 1.0) -> Callable[[int], float]:
+    def value(i: int) -> float:
+        return float(table[i] * unit)
+
+    return value
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "same"),
+    [
+        (njit(scaled(np.array([1.0, 2.0]))), njit(scaled(np.array([1.0, 2.0]))), True),
+        (njit(scaled(np.array([1.0, 2.0]))), njit(scaled(np.array([1.0, 2.5]))), False),
+        (njit(scaled(np.ones(2), 1.0)), njit(scaled(np.ones(2), 2.0)), False),
+        (njit(scaled(np.ones(2))), njit(error_model="numpy")(scaled(np.ones(2))), False),
+    ],
+)
+def test_enclosed_values_and_options_count(first: object, second: object, same: bool) -> None:
+    assert (closure_digest(first) == closure_digest(second)) is same
+
+
+def test_recursion_ends() -> None:
+    @njit
+    def down(n: int) -> int:
+        if n <= 0:
+            return 0
+        return int(down(n - 1) + 1)
+
+    assert closure_digest(down) == closure_digest(down)
