@@ -6,9 +6,12 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from alice_survey.base.executor import Executor
 
 CONTEXT = {"help_option_names": ["-h", "--help"]}
 
@@ -38,6 +41,13 @@ LogFile = Annotated[
 Events = Annotated[Path | None, typer.Option("--events", help="Add it as JSON lines to this file.")]
 WORK = Path("work")
 _SESSION = {"quiet": Quiet, "log_file": LogFile, "events": Events}
+
+
+def executor_of(threads: int | None) -> "Executor":
+    """Where a command runs its tasks, by its option `--threads`."""
+    from alice_survey.base.executor import local_executor  # here, so that --help stays quick
+
+    return local_executor(threads)
 
 
 def examples(*lines: str) -> str:

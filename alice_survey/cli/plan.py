@@ -13,6 +13,7 @@ from alice_survey.cli.options import (
     Threads,
     Workspace,
     examples,
+    executor_of,
     print_result,
 )
 
@@ -142,7 +143,7 @@ def check(
     print_result(
         *check_report(
             workspace, config, log,
-            triggers=triggers, out=output, monte_carlo=monte_carlo, threads=threads,
+            triggers=triggers, out=output, monte_carlo=monte_carlo, executor=executor_of(threads),
         ),
         as_json,
     )  # fmt: skip

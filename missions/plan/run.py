@@ -19,6 +19,7 @@ from shapely.geometry import Point
 from alice_survey.base.artefacts import Stage, run_stage
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import PlanError, heard, warn
+from alice_survey.base.executor import Executor
 from camera_calib.rig import Rig, design_rig
 from missions.areas.bathymetry import Bathymetry, area_depth, read_bathymetry
 from missions.areas.files import area_files
@@ -78,7 +79,7 @@ class Planned:
     """Every setting with its equation, source and limit."""
 
 
-def run_plan(workspace: Path, config: SurveyConfig, threads: int) -> bool:
+def run_plan(workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
     """Stage `plan`: write plan.json, its certificate, settings, maps and missions for vehicles.
 
     Returns:

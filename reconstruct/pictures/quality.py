@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from alice_survey.base.artefacts import read_stage, write_csv
 from alice_survey.base.errors import ImageError, why
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import Executor
 from alice_survey.base.manifest import ImageRecord, read_manifest
 from reconstruct.pictures.files import decode
 from reconstruct.pictures.normalise import even_light
@@ -267,12 +267,12 @@ def add_overlap(found: Sequence[PictureQuality], sparse: Path) -> list[PictureQu
     return filled
 
 
-def quality_report(workspace: Path, threads: int) -> tuple[str, dict[str, Any]]:
+def quality_report(workspace: Path, executor: Executor) -> tuple[str, dict[str, Any]]:
     """Measure all pictures of a workspace and write `quality/quality.csv` and `quality.png`.
 
     Args:
         workspace: with `images/manifest.csv`; a finished `sparse/` adds the overlaps.
-        threads: processes that read pictures.
+        executor: where tasks run that read pictures.
 
     Returns:
         The list of flagged pictures as text, and figures as JSON values.
@@ -287,7 +287,7 @@ def quality_report(workspace: Path, threads: int) -> tuple[str, dict[str, Any]]:
     if not records:
         raise ImageError(f"{images / 'manifest.csv'} names no picture")
     tasks = [MeasureTask(images=images, record=record) for record in records]
-    found = list(parallel_map(measure_file, tasks, threads=threads, label="picture quality"))
+    found = list(executor.map(measure_file, tasks, label="picture quality"))
     if read_stage(workspace / "sparse") is not None:
         found = add_overlap(found, workspace / "sparse")
     found = judge(found)
