@@ -16,6 +16,7 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.base.run import progress
 from reconstruct.mapping.database import Observations, as_transform, rigid3d, station_frames
 from reconstruct.mapping.pose_graph import average_poses, station_groups
+from reconstruct.mapping.solver import direct_solver
 from reconstruct.mapping.stations import link_stations
 
 _FIRST_ERROR_PX = 20.0
@@ -123,13 +124,11 @@ def adjust(
     for number in sorted(model.reg_image_ids()):
         config.add_image(number)
     config.set_constant_rig_from_world_pose(min(model.reg_frame_ids()))
-    adjustment = options.get_global_bundle_adjustment()
-    adjustment.print_summary = False
+    adjustment = direct_solver(options.get_global_bundle_adjustment())
     if robust_px is not None:
         adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         adjustment.ceres.loss_function_scale = robust_px
     solver = adjustment.ceres.solver_options
-    solver.num_threads = 1
     solver.function_tolerance = tolerance
     if robust_px is None:  # near its end: full Gauss-Newton steps, since weak directions are many
         solver.initial_trust_region_radius = _NO_BOUND

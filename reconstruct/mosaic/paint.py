@@ -78,7 +78,7 @@ class Labels:
     """Views of a block's cells."""
 
     block: Block
-    label: NDArray[np.uint16]
+    label: NDArray[np.int32]
     """(rows, columns) of the core's cells: number of the view plus one; 0 where none sees."""
     pictures: NDArray[np.uint16]
     """(rows, columns) how many pictures see the cell."""
@@ -95,7 +95,7 @@ class Painted:
     window: Window
     rgba: NDArray[np.uint8]
     """(4, H, W)."""
-    source: NDArray[np.uint16]
+    source: NDArray[np.int32]
     """(H, W) number of the view plus one; 0 where nothing is known."""
 
 
@@ -104,8 +104,8 @@ def label_block(task: PaintTask) -> Labels:
     block = task.block
     inner = _inner(block)
     rows, columns = block.grid.rows // CELL_PX, block.grid.columns // CELL_PX
-    label = np.zeros((rows, columns), np.uint16)
-    pictures, stations = np.zeros_like(label), np.zeros_like(label)
+    label = np.zeros((rows, columns), np.int32)
+    pictures, stations = (np.zeros(label.shape, np.uint16) for _ in range(2))
     tones = np.zeros((rows, columns, 3), np.float32)
     surface = ground_of(task.survey, block).surface(coarse(block.grid))
     looks = _looks(task, surface, task.views) if np.isfinite(surface.height).any() else []
@@ -133,7 +133,7 @@ def label_block(task: PaintTask) -> Labels:
         chosen = choose_views(number, share, colours)
         known = chosen >= 0
         taken = np.take_along_axis(number, np.maximum(chosen, 0)[..., None], axis=2)[..., 0]
-        label = np.where(known, taken + 1, 0).astype(np.uint16)
+        label = np.where(known, taken + 1, 0).astype(np.int32)
     return Labels(
         block=block,
         label=label[inner],
@@ -164,7 +164,7 @@ def paint_tile(task: PaintTask) -> Painted:
     changes = _changes(task, tools, _looks(task, cells, used), mean)
     named = cv2.resize(label, (grid.columns, grid.rows), interpolation=cv2.INTER_NEAREST)
     named[~np.isfinite(surface.height)] = 0
-    source = np.zeros((grid.rows, grid.columns), np.uint16)
+    source = np.zeros((grid.rows, grid.columns), np.int32)
     sights = {}
     for entry in used:  # pixels of a cell that its view does not see go to the best that does
         value = entry.number + 1
@@ -216,7 +216,7 @@ def _unknown(block: Block) -> Painted:
     return Painted(
         window=block.core,
         rgba=np.zeros((4, *shape), np.uint8),
-        source=np.zeros(shape, np.uint16),
+        source=np.zeros(shape, np.int32),
     )
 
 
@@ -401,11 +401,11 @@ def tones_path(scratch: Path) -> Path:
     return scratch / "tones.tif"
 
 
-def _read_cells(survey: Survey, block: Block) -> tuple[NDArray[np.uint16], Float32]:
+def _read_cells(survey: Survey, block: Block) -> tuple[NDArray[np.int32], Float32]:
     """Labels (rows, columns), and tones (rows, columns, 3), of a block; 0 beyond the mosaic."""
     rows, columns = block.grid.rows // CELL_PX, block.grid.columns // CELL_PX
     top, left = block.window.row_off // CELL_PX, block.window.col_off // CELL_PX
-    label = np.zeros((rows, columns), np.uint16)
+    label = np.zeros((rows, columns), np.int32)
     tones = np.zeros((rows, columns, 3), np.float32)
     with rasterio.open(label_path(survey.scratch)) as raster:
         r0, c0 = max(0, top), max(0, left)
