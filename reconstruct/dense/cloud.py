@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from alice_survey.base.artefacts import write_json
 from alice_survey.base.compiled import compiled
-from reconstruct.dense.dem import DemGrid, bin_points, sorted_ranks
+from reconstruct.dense.dem import bin_points, sorted_ranks
 from reconstruct.dense.points import Points
+from reconstruct.raster import DemGrid
 from reconstruct.views.model import WorldFrame
 
 Float32 = NDArray[np.float32]

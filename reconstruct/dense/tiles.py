@@ -14,7 +14,6 @@ from reconstruct.dense.cloud import thinned_points
 from reconstruct.dense.dem import (
     FILL_CELLS,
     STRAY_CELLS,
-    DemGrid,
     fill_gaps,
     fuse_points,
     slope_deg,
@@ -24,7 +23,7 @@ from reconstruct.dense.points import joined, points_in_box
 from reconstruct.dense.pose_part import PosePart, spread_over
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.light.solve import LightModel, LightSamples
-from reconstruct.raster import tiles_of
+from reconstruct.raster import DemGrid, tiles_of
 from reconstruct.views.model import View
 
 _TILE_CELLS = 256

@@ -17,14 +17,15 @@ from alice_survey.base.executor import parallel_map
 from alice_survey.base.frames import Array
 from reconstruct.dense.depth import pair_depth
 from reconstruct.dense.fusion import GATE_SIGMAS, count_witnesses, merge_depths
+from reconstruct.dense.matching_trial import shrunk
 from reconstruct.dense.points import block_bounds
-from reconstruct.dense.probe import open_pictures, shrunk
-from reconstruct.dense.refine import Look, prepared, refine
+from reconstruct.dense.refine_depth import ComparedView, prepared, refine
 from reconstruct.dense.stereo_pairs import StereoPair, in_frame
 from reconstruct.dense.tiles import ViewSummary
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.light.solve import LightSamples, at_nodes, compare_light, joined_samples, low_pass
 from reconstruct.pictures.normalise import normalise
+from reconstruct.pictures.undistorted import Pictures
 from reconstruct.views.model import View
 from reconstruct.views.sight import lens_of, slopes_of
 
@@ -91,7 +92,7 @@ def prepare_view(task: PrepareTask) -> None:
     store = task.store
     if store.has(task.index, "low"):
         return
-    colour, valid = shrunk(open_pictures(task.workspace), task.image, task.size_px)
+    colour, valid = shrunk(Pictures.open(task.workspace), task.image, task.size_px)
     store.save_colour(task.index, colour)
     store.save_mask(task.index, "valid", valid)
     store.save(task.index, "low", low_pass(colour, valid))
@@ -147,7 +148,7 @@ def refine_view(task: RefineTask) -> None:
     looks = []
     for number, view in ((task.index, task.view), *task.others):
         contrast, spline, valid = _look(store, number, view.width_px)
-        looks.append(Look(view=view, contrast=contrast, spline=spline, valid=valid))
+        looks.append(ComparedView(view=view, contrast=contrast, spline=spline, valid=valid))
     depth, sigma = store.load_depth(task.index, "depth")
     refined = refine(looks[0], depth, sigma, looks[1:])
     agreeing = np.asarray(store.load(task.index, "agreeing"))

@@ -24,7 +24,7 @@ from alice_survey.base.compiled import compiled
 from alice_survey.base.contents import taken_from
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
-from reconstruct.light.equations import Equations, Prior, solve_robustly
+from reconstruct.light.equations import LightEquations, LightPrior, solve_robustly
 
 GRID = (9, 11)
 """Rows and columns of nodes over a picture, first and last on its edges."""
@@ -224,7 +224,7 @@ def solve_patterns(
         solve_robustly(
             equations,
             levels[:, 0, channel] - levels[:, 1, channel],
-            Prior(
+            LightPrior(
                 patterns=bends + np.diag(pull[:, channel]),
                 right=pulled[:, channel],
                 gain=gain_sigma**-2 + told / _SCENE_SIGMA**2,
@@ -251,7 +251,7 @@ def solve_patterns(
     )
 
 
-def _equations(samples: LightSamples, camera_of: NDArray[np.int64], cameras: int) -> Equations:
+def _equations(samples: LightSamples, camera_of: NDArray[np.int64], cameras: int) -> LightEquations:
     size = GRID[0] * GRID[1]
     views = samples.views.astype(np.int64)
     sides = [node_weights(samples.places[:, side]) for side in range(2)]
@@ -260,7 +260,7 @@ def _equations(samples: LightSamples, camera_of: NDArray[np.int64], cameras: int
     if samples.ranges is not None:
         farther = (samples.ranges[:, 0] - samples.ranges[:, 1]).astype(np.float64)
     pairs, pair = np.unique(np.sort(views, axis=1), axis=0, return_inverse=True)
-    return Equations(
+    return LightEquations(
         nodes=np.ascontiguousarray(np.concatenate(number, axis=1)),
         weights=np.ascontiguousarray(np.concatenate([sides[0][1], -sides[1][1]], axis=1)),
         farther=farther,

@@ -35,7 +35,7 @@ _NAMED = 8
 
 
 @dataclass(frozen=True, kw_only=True)
-class Far:
+class FarStation:
     """A station that lies elsewhere than navigation has it."""
 
     station: int
@@ -53,7 +53,7 @@ class Acceptance:
     """Stations with a position."""
     usual_m: float
     """Of their distances from navigation, one standard deviation by axis, robustly; NaN without."""
-    far: tuple[Far, ...]
+    far: tuple[FarStation, ...]
     """The farthest first."""
     rig_error: float
     """Relative error of the rig in the finished model; NaN where there is no known rig."""
@@ -116,7 +116,7 @@ def check_mapping(
         scale: of the model against its stations' own stereo.
     """
     checked, usual = 0, float("nan")
-    far: tuple[Far, ...] = ()
+    far: tuple[FarStation, ...] = ()
     if positions is not None and sigmas is not None:
         checked, usual, far = _far_stations(model, records, positions, sigmas)
     found = Acceptance(checked=checked, usual_m=usual, far=far, rig_error=rig_error, scale=scale)
@@ -146,7 +146,7 @@ def check_survey(
 
 def _far_stations(
     model: pycolmap.Reconstruction, records: Sequence[ImageRecord], positions: Array, sigmas: Array
-) -> tuple[int, float, tuple[Far, ...]]:
+) -> tuple[int, float, tuple[FarStation, ...]]:
     first: dict[int, int] = {}
     for number, image in sorted(model.images.items()):
         told = np.isfinite(positions[number - 1] + sigmas[number - 1]).all()
@@ -162,7 +162,7 @@ def _far_stations(
     off, sigma = misses(centres, positions[rows], sigmas[rows])
     over = off / sigma
     found = [
-        Far(
+        FarStation(
             station=records[row].station,
             image=records[row].image,
             off_m=float(off[k]),

@@ -51,7 +51,7 @@ class Pixels:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class State:
+class RigState:
     """One guess of all unknowns."""
 
     cameras: tuple[FlatPortCamera, ...]
@@ -102,7 +102,7 @@ def choose_pixels(
 
 def start_state(
     mapped: Mapped, rig: Rig, names: Sequence[str], frames: Indices, ids: Indices
-) -> State:
+) -> RigState:
     """A model's poses and points as flat-port cameras on one rig have them.
 
     Args:
@@ -117,7 +117,7 @@ def start_state(
     poses = [
         as_transform(model.frames[int(f)].rig_from_world).inv() * pinhole_from_cam for f in frames
     ]
-    return State(
+    return RigState(
         cameras=tuple(rig.cameras[name] for name in names),
         cam_from_rig=tuple(rig.cam_from_rig[name] * reference.inv() for name in names),
         turns=np.array([p.rotation.as_matrix() for p in poses]),
@@ -128,7 +128,7 @@ def start_state(
 
 
 def exact_sights(
-    state: State, pixels: Pixels, fields: Sequence[str], names: Sequence[str], *, lever: bool
+    state: RigState, pixels: Pixels, fields: Sequence[str], names: Sequence[str], *, lever: bool
 ) -> Sights:
     """The observations linearised; those that no light explains count nothing."""
     count = len(fields) + 3 * lever

@@ -25,7 +25,7 @@ from reconstruct.mapping.arrays import Indices, frames_of
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.exact_sights import (
     Pixels,
-    State,
+    RigState,
     choose_pixels,
     exact_sights,
     start_state,
@@ -33,7 +33,7 @@ from reconstruct.mapping.exact_sights import (
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.normal_equations import (
     POSE,
-    Reduced,
+    ReducedSystem,
     Sights,
     moved_points,
     reduce_points,
@@ -180,7 +180,7 @@ def fit_rig(
     )
 
 
-def _lasting(told: Told, state: State) -> Told:
+def _lasting(told: Told, state: RigState) -> Told:
     """Sigmas that count how long navigation errs the same way.
 
     Errors that last tell less than as many new ones: a first-order process with the correlation r
@@ -246,7 +246,7 @@ def _hold_baseline(
         information[np.ix_(at, at)] += np.outer(along, along) / _BASELINE_SIGMA_M**2
 
 
-def _values(state: State, fields: Sequence[str], names: Sequence[str], *, lever: bool) -> Array:
+def _values(state: RigState, fields: Sequence[str], names: Sequence[str], *, lever: bool) -> Array:
     now = Rig(
         cameras=dict(zip(names, state.cameras, strict=True)),
         cam_from_rig=dict(zip(names, state.cam_from_rig, strict=True)),
@@ -258,21 +258,21 @@ def _values(state: State, fields: Sequence[str], names: Sequence[str], *, lever:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Step:
+class _RigStep:
     stations: Array
     shared: Array
     covariance: Array
-    reduced: Reduced
+    reduced: ReducedSystem
 
 
 def _step(
     sights: Sights,
-    state: State,
+    state: RigState,
     variance: float,
     information: Array,
     drift: Array,
     told: Told | None,
-) -> _Step:
+) -> _RigStep:
     """One Gauss-Newton step of stations and shared parameters, and the covariance of the latter."""
     count = len(state.centres)
     reduced = reduce_points(sights, count)
@@ -303,7 +303,7 @@ def _step(
     back, plain = solve(border), solve(slope)
     covariance = _inverse(shared - border.T @ back)
     moved = -covariance @ (pull - border.T @ plain)
-    return _Step(
+    return _RigStep(
         stations=(-plain - back @ moved).reshape(count, POSE),
         shared=moved,
         covariance=covariance,
@@ -326,13 +326,13 @@ def _block_diagonal(blocks: Array) -> Any:
 
 
 def _moved(
-    state: State,
+    state: RigState,
     pixels: Pixels,
-    step: _Step,
+    step: _RigStep,
     sights: Sights,
     fields: Sequence[str],
     names: Sequence[str],
-) -> State:
+) -> RigState:
     points = moved_points(
         sights.starts, sights.station, sights.by_point, sights.arm, sights.by_shared, sights.miss,
         step.reduced.point_inverse, step.stations, step.shared,
@@ -357,7 +357,7 @@ def _moved(
         )
     turns = Rotation.from_rotvec(step.stations[:, :3]).as_matrix() @ state.turns
     lever = state.lever + step.shared[-3:] if len(step.shared) > len(fields) else state.lever
-    return State(
+    return RigState(
         cameras=tuple(cameras),
         cam_from_rig=tuple(poses),
         turns=turns,
@@ -370,7 +370,7 @@ def _moved(
 def _as_rig(
     rig: Rig,
     names: Sequence[str],
-    state: State,
+    state: RigState,
     fields: Sequence[str],
     covariance: Array,
     lever: bool,

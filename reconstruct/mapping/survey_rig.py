@@ -25,14 +25,14 @@ from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import Convergence, refract
 from reconstruct.mapping.rig_refinement import RigFit, Told, fit_rig
-from reconstruct.mapping.working_range import Distances
+from reconstruct.mapping.working_range import WorkingDistances
 from reconstruct.matching.matches import as_seen
 from reconstruct.matching.pairs import positions_ned
 from reconstruct.views.lens import FlatPortLens, Lens, flat_port_lens
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Refined:
+class RefinedSurvey:
     """A survey mapped on its own refined rig."""
 
     mapped: Mapped
@@ -70,12 +70,12 @@ def refine_as_set(
     mapped: Mapped,
     seen: Observations,
     rig: Rig,
-    distances: Distances | None,
+    distances: WorkingDistances | None,
     adjust: NavigationAdjuster,
     datum: Datum | None,
     folder: Path,
     settings: ReconstructConfig,
-) -> Refined | str:
+) -> RefinedSurvey | str:
     """Refine a rig as far as `frees_rig` calls for it.
 
     Args:
@@ -110,14 +110,14 @@ def refine_rig(
     mapped: Mapped,
     seen: Observations,
     rig: Rig,
-    distances: Distances | None,
+    distances: WorkingDistances | None,
     adjust: NavigationAdjuster,
     datum: Datum | None,
     folder: Path,
     *,
     port: bool,
     pose: bool,
-) -> Refined:
+) -> RefinedSurvey:
     """Refine a rig from a finished model and make the model anew on it.
 
     Args:
@@ -153,7 +153,7 @@ def refine_rig(
     refined, convergence = refract(again[0], again[1], folder, adjust, poses, near=True)
     write_json(folder / "port.json", fit.to_json())
     write_rig(folder / "rig.json", fit.rig)
-    return Refined(
+    return RefinedSurvey(
         mapped=refined, seen=again[1], rig=fit.rig, convergence=convergence, adjust=adjust
     )
 

@@ -29,12 +29,12 @@ from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import Indices, Observed, frames_of, observed
 from reconstruct.mapping.calibration_part import CalibrationPart, calibration_part
 from reconstruct.mapping.database import Observations
-from reconstruct.mapping.gauge import Gauge
+from reconstruct.mapping.gauge_freedom import Gauge
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.normal_equations import (
     LEAST_POINTS,
     POSE,
-    Reduced,
+    ReducedSystem,
     Sights,
     point_covariances,
     reduce_points,
@@ -237,7 +237,7 @@ def sights_of(
 
 
 def _inverse_blocks(
-    reduced: Reduced,
+    reduced: ReducedSystem,
     variance: float,
     told: Array | None,
     gauge: Gauge,

@@ -32,8 +32,8 @@ from reconstruct.light.solve import (
     node_weights,
     solve_patterns,
 )
-from reconstruct.mosaic.facts import PictureFacts
 from reconstruct.mosaic.finish import LEAST_LEFT, LEAST_RANGE, MOST_RANGE
+from reconstruct.mosaic.picture_measures import PictureMeasures
 
 Float32 = NDArray[np.float32]
 Colour = Literal["even", "water", "raw"]
@@ -142,7 +142,7 @@ class ColourModel:
 def solve_colour(
     wanted: Colour,
     samples: LightSamples,
-    facts: Sequence[PictureFacts],
+    facts: Sequence[PictureMeasures],
     images: Sequence[str],
     cameras: Sequence[str],
 ) -> ColourModel:
@@ -212,7 +212,7 @@ def solve_colour(
 
 def _black(
     model: ColourModel,
-    facts: Sequence[PictureFacts],
+    facts: Sequence[PictureMeasures],
     images: Sequence[str],
     cameras: Sequence[str],
 ) -> Array:
@@ -300,7 +300,7 @@ def _nodes_without(nodes: Array, added: Mapping[str, Array], cameras: Sequence[s
     return np.where(usable, np.log(np.where(usable, left, 1.0)), np.nan)
 
 
-def darkest(facts: Sequence[PictureFacts], cameras: Sequence[str]) -> dict[str, Array] | None:
+def darkest(facts: Sequence[PictureMeasures], cameras: Sequence[str]) -> dict[str, Array] | None:
     """Per camera (rows, columns, 3) light of the darkest that each place shows; None if too few."""
     maps = {}
     for name in sorted(set(cameras)):
@@ -319,7 +319,7 @@ def darkest(facts: Sequence[PictureFacts], cameras: Sequence[str]) -> dict[str, 
 def _added(
     samples: LightSamples,
     nodes: Array,
-    facts: Sequence[PictureFacts],
+    facts: Sequence[PictureMeasures],
     images: Sequence[str],
     cameras: Sequence[str],
 ) -> tuple[Mapping[str, Array], Array, Array, str]:

@@ -12,19 +12,19 @@ from rasterio.windows import Window
 
 from alice_survey.base.run.resources import release_memory
 from reconstruct.light.solve import at_places
-from reconstruct.mosaic.blend import Blend, Part
+from reconstruct.mosaic.blend import Blend, ViewPart
 from reconstruct.mosaic.colour import ColourModel
 from reconstruct.mosaic.finish import finish_colours
 from reconstruct.mosaic.grid import ALIGNED_PX, CELL_PX, Block, coarse, dem_around
 from reconstruct.mosaic.ortho import sample_lanczos
 from reconstruct.mosaic.seams import candidates, choose_views
-from reconstruct.mosaic.sight import (
+from reconstruct.mosaic.tools import Survey, Tools, tools_of
+from reconstruct.mosaic.visibility import (
+    GridHeights,
     Ground,
-    Seen,
-    Surface,
+    SeenCells,
     see,
 )
-from reconstruct.mosaic.tools import Survey, Tools, tools_of
 from reconstruct.raster import opened_raster
 from reconstruct.views.model import View
 
@@ -53,11 +53,11 @@ class SeenView:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Look:
+class _ViewOfCells:
     """How a view sees the cells of a box of a block."""
 
     entry: SeenView
-    sight: Seen
+    sight: SeenCells
     box: tuple[slice, slice]
 
 
@@ -189,7 +189,7 @@ def paint_tile(task: PaintTask) -> Painted:
         change = changes.get(entry.number)
         colour = _colours(task, tools, entry, sight, (local, part, wanted), change)
         blend.add(
-            Part(
+            ViewPart(
                 row=part[0].start,
                 column=part[1].start,
                 colour=colour,
@@ -241,7 +241,9 @@ def ground_of(survey: Survey, block: Block) -> Ground:
         return Ground(*dem_around(raster, block.grid, block.reach), survey.scratch)
 
 
-def _looks(task: PaintTask, surface: Surface, entries: Sequence[SeenView]) -> list[_Look]:
+def _looks(
+    task: PaintTask, surface: GridHeights, entries: Sequence[SeenView]
+) -> list[_ViewOfCells]:
     """How views see a block's cells; quality takes sharpness and light in, masks leave out."""
     tools = tools_of(task.survey)
     looks = []
@@ -251,7 +253,7 @@ def _looks(task: PaintTask, surface: Surface, entries: Sequence[SeenView]) -> li
         if not sight.quality.any():
             continue
         box = _bounding(sight.quality > 0)
-        sight = Seen(
+        sight = SeenCells(
             x=sight.x[box], y=sight.y[box], quality=sight.quality[box], range=sight.range[box]
         )
         across, down = sight.places(optics.size_px)
@@ -266,7 +268,7 @@ def _looks(task: PaintTask, surface: Surface, entries: Sequence[SeenView]) -> li
             valid = at_places(copy.valid[..., None], places, 1).reshape(quality.shape)
             quality[valid < 0.999] = 0
         if quality.any():
-            looks.append(_Look(entry=entry, sight=replace(sight, quality=quality), box=box))
+            looks.append(_ViewOfCells(entry=entry, sight=replace(sight, quality=quality), box=box))
     return looks
 
 
@@ -275,7 +277,7 @@ def _bounding(used: NDArray[np.bool_]) -> tuple[slice, slice]:
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
 
-def _small_light(task: PaintTask, tools: Tools, found: _Look, *, broad: bool) -> Float32:
+def _small_light(task: PaintTask, tools: Tools, found: _ViewOfCells, *, broad: bool) -> Float32:
     """Corrected light of a view's small copy at the cells of its box, (h, w, 3)."""
     view, sight = found.entry.view, found.sight
     copy = tools.small.load(view.image)
@@ -291,7 +293,7 @@ def _logarithm(light: Float32) -> Float32:
     return found
 
 
-def _tones(task: PaintTask, tools: Tools, looks: list[_Look], quality: Float32) -> Float32:
+def _tones(task: PaintTask, tools: Tools, looks: list[_ViewOfCells], quality: Float32) -> Float32:
     """(rows, columns, 3) logarithm of broad light, the mean of all views by their quality."""
     best: Float32 = quality.max(axis=0)
     total = np.zeros((*best.shape, 3), np.float32)
@@ -307,7 +309,7 @@ def _tones(task: PaintTask, tools: Tools, looks: list[_Look], quality: Float32) 
 
 
 def _changes(
-    task: PaintTask, tools: Tools, looks: list[_Look], mean: Float32
+    task: PaintTask, tools: Tools, looks: list[_ViewOfCells], mean: Float32
 ) -> dict[int, tuple[Float32, tuple[slice, slice]]]:
     """Per view factors (h, w, 3) at the cells of a box that take its broad tones to the mean."""
     changes = {}
@@ -326,8 +328,8 @@ def _changes(
 
 
 def _sight_of(
-    task: PaintTask, entry: SeenView, surface: Surface, wanted: NDArray[np.bool_]
-) -> Seen:
+    task: PaintTask, entry: SeenView, surface: GridHeights, wanted: NDArray[np.bool_]
+) -> SeenCells:
     """How a view sees the pixels of cells, its mask applied exactly."""
     tools = tools_of(task.survey)
     sight = see(entry.view, tools.optics(entry.view), surface, (wanted, CELL_PX))
@@ -347,8 +349,8 @@ def _colours(
     task: PaintTask,
     tools: Tools,
     entry: SeenView,
-    sight: Seen,
-    at: tuple[Surface, tuple[slice, slice], NDArray[np.bool_]],
+    sight: SeenCells,
+    at: tuple[GridHeights, tuple[slice, slice], NDArray[np.bool_]],
     change: tuple[Float32, tuple[slice, slice]] | None,
 ) -> Float32:
     """Corrected colours of a view at the pixels of a box, levels, BGR."""

@@ -12,10 +12,17 @@ from rasterio.windows import Window
 
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.run import progress
-from reconstruct.dense.dem import DemGrid
 from reconstruct.mosaic.grid import CELL_PX, cells_over
 from reconstruct.mosaic.paint import Labels, Painted
-from reconstruct.raster import BLOCK, crs_of, frame_tags, opened_raster, transform_of, write_png
+from reconstruct.raster import (
+    BLOCK,
+    DemGrid,
+    crs_of,
+    frame_tags,
+    opened_raster,
+    transform_of,
+    write_png,
+)
 from reconstruct.views.model import WorldFrame
 
 _THUMBNAIL_PX = 1600

@@ -9,10 +9,10 @@ import numpy as np
 from alice_survey.base.errors import warn
 from alice_survey.base.frames import Array, Datum
 from reconstruct.placing.alignment import Similarity, align_rigid, align_similarity
-from reconstruct.placing.channels import PARAMETERS, SCALE, cross_matrices
 from reconstruct.placing.control_file import Control, KnownLength
-from reconstruct.placing.placement import Extra
-from reconstruct.placing.spots import Spot
+from reconstruct.placing.generalised_fit import Extra
+from reconstruct.placing.navigation_equations import PARAMETERS, SCALE, cross_matrices
+from reconstruct.placing.picked_points import Spot
 
 _DOUBTFUL_SIGMAS = 4.0
 _LEAST_SPREAD = 1e-3

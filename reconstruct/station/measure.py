@@ -21,13 +21,12 @@ from alice_survey.base.contents import taken_from
 from alice_survey.base.errors import ReconstructionError, WorkspaceError
 from alice_survey.base.frames import Array
 from camera_calib.rig import Rig, read_rig
-from reconstruct.dense.rectify import scaled_view
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.station.pair import pair_samplers, read_depth, to_axes
 from reconstruct.station.precise import precise_depth
-from reconstruct.station.solve import Optics, calibration_slopes, stereo_rig
+from reconstruct.station.solve import PairOptics, calibration_slopes, stereo_rig
 from reconstruct.views.lens import FlatPortLens, Lens, lens_from_json
-from reconstruct.views.model import View, read_model
+from reconstruct.views.model import View, read_model, scaled_view
 
 _NUMBER = r"(-?\d+(?:\.\d+)?)"
 _PIXEL = re.compile(rf"(?:(?P<image>[^=]+?):)?{_NUMBER},{_NUMBER}")
@@ -38,7 +37,7 @@ _CELL_STEPS = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pick:
+class PickedPixel:
     """A pixel as taken, from the outer corner of the first."""
 
     image: str | None
@@ -111,7 +110,7 @@ def measure(
     return _told(points.split(), located)
 
 
-def parse_picks(points: str) -> list[tuple[Pick, ...]]:
+def parse_picks(points: str) -> list[tuple[PickedPixel, ...]]:
     """Read points as `measure` takes them.
 
     Raises:
@@ -127,7 +126,7 @@ def parse_picks(points: str) -> list[tuple[Pick, ...]]:
                     f"point {word!r}: give x,y or IMAGE:x,y or IMAGE:x,y=IMAGE:x,y"
                 )
             x, y = float(match[2]) + 0.5, float(match[3]) + 0.5
-            spots.append(Pick(image=match["image"], x=x, y=y))
+            spots.append(PickedPixel(image=match["image"], x=x, y=y))
         if len(spots) > 2:
             raise ReconstructionError(f"point {word!r}: at most two pictures can show a spot")
         found.append(tuple(spots))
@@ -198,7 +197,7 @@ def _told(words: list[str], located: Located) -> tuple[str, dict[str, Any]]:
 
 
 def _in_pair(
-    folder: Path, picks: list[tuple[Pick, ...]], pick_sigma_px: float, n_water_sigma: float
+    folder: Path, picks: list[tuple[PickedPixel, ...]], pick_sigma_px: float, n_water_sigma: float
 ) -> Located:
     about = read_json(folder / "pair.json")
     rig = read_rig(folder / "rig.json")
@@ -212,7 +211,7 @@ def _in_pair(
             raise ValueError("pictures outside of its folder")
     if not isinstance(first, FlatPortLens) or not isinstance(second, FlatPortLens):
         raise WorkspaceError(f"{folder / 'pair.json'}: its lenses are not those of a rig")
-    optics = Optics(rig=stereo_rig(rig), lenses=(first, second))
+    optics = PairOptics(rig=stereo_rig(rig), lenses=(first, second))
     for pick in picks:
         if len(pick) > 1 or pick[0].image is not None:
             raise ReconstructionError("points of a pair are x,y in its left picture")
@@ -286,7 +285,9 @@ def _check_inside(taken: Array, lens: Lens, name: str) -> None:
             )
 
 
-def _in_workspace(workspace: Path, picks: list[tuple[Pick, ...]], pick_sigma_px: float) -> Located:
+def _in_workspace(
+    workspace: Path, picks: list[tuple[PickedPixel, ...]], pick_sigma_px: float
+) -> Located:
     sparse = need_stage(workspace, "sparse", "reconstruct")
     model = read_model(sparse)
     if not model.frame.scaled:
@@ -309,7 +310,7 @@ def _in_workspace(workspace: Path, picks: list[tuple[Pick, ...]], pick_sigma_px:
         if len(rays) == 2:
             point, covariance = _crossed(rays, pick_sigma_px or _TWO_PICTURES_SIGMA_PX)
         else:
-            surface = surface or _Surface(need_stage(workspace, "dense", "reconstruct"))
+            surface = surface or _DemSurface(need_stage(workspace, "dense", "reconstruct"))
             point, covariance = _on_surface(surface, *rays[0], pick_sigma_px)
         points.append(point)
         own.append(covariance)
@@ -362,7 +363,7 @@ def _crossed(rays: list[tuple[View, Lens, Array]], sigma_px: float) -> tuple[Arr
     return point, covariance
 
 
-class _Surface:
+class _DemSurface:
     """The DEM and its standard deviation."""
 
     def __init__(self, dense: Path) -> None:
@@ -414,7 +415,7 @@ class _Surface:
 
 
 def _on_surface(
-    surface: _Surface, view: View, lens: Lens, taken: Array, sigma_px: float
+    surface: _DemSurface, view: View, lens: Lens, taken: Array, sigma_px: float
 ) -> tuple[Array, Array]:
     start, direction = _ray(view, lens, taken)
     point = surface.hit(start, direction)

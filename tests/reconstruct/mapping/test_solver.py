@@ -29,7 +29,7 @@ def bent(mapped: Mapped, scene: Scene) -> Mapped:
     middle, half = 0.5 * (north.max() + north.min()), 0.5 * np.ptp(north)
 
     def sunk(place: np.ndarray) -> np.ndarray:
-        return place + [0.0, 0.0, BEND_M * ((place[0] - middle) / half) ** 2]
+        return place + np.array([0.0, 0.0, BEND_M * ((place[0] - middle) / half) ** 2])
 
     for frame in model.frames.values():
         pose = as_transform(frame.rig_from_world).inv()

@@ -9,10 +9,9 @@ import rasterio
 from alice_survey.base.artefacts import read_json, write_csv, write_json
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
 from alice_survey.base.errors import ReconstructionError
-from reconstruct.dense.dem import DemGrid
 from reconstruct.mosaic import run
 from reconstruct.mosaic.run import run_mosaic
-from reconstruct.raster import tiled_raster
+from reconstruct.raster import DemGrid, tiled_raster
 from reconstruct.views.model import View
 from tests.oracles_dense import (
     DEPTH_M,

@@ -35,7 +35,7 @@ _BROAD_STEP = 4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PictureFacts:
+class PictureMeasures:
     """Of one picture."""
 
     sharpness: float
@@ -93,14 +93,14 @@ def encoded(light: Float32) -> Float32:
     return levels
 
 
-def measure_picture(task: tuple[Path, Path, str]) -> PictureFacts:
+def measure_picture(task: tuple[Path, Path, str]) -> PictureMeasures:
     """Measure a picture of a workspace and write its small copy.
 
     Args:
         task: workspace, the folder for small copies, and the picture's name.
     """
     workspace, folder, image = task
-    pictures = _pictures(workspace)
+    pictures = Pictures.open(workspace)
     taken, usable = pictures.taken(image), pictures.usable(image)
     height, width = taken.shape[:2]
     table = linear_table()
@@ -123,7 +123,7 @@ def measure_picture(task: tuple[Path, Path, str]) -> PictureFacts:
         np.save(file, copy.broad)
     green = taken[..., 1]
     fine, mean = sharp_and_mean(green, np.ones((1, 1), np.bool_) if usable is None else usable)
-    return PictureFacts(
+    return PictureMeasures(
         sharpness=fine / mean if mean > 0 else float("nan"),
         grey=bool((taken[..., 0] == green).all() and (taken[..., 2] == green).all()),
         nodes=_broad_nodes(copy),
@@ -256,13 +256,3 @@ def _small_copy(content: NDArray[np.uint8]) -> SmallCopy:
     )
     broad: Float32 = total / np.maximum(weight, np.float32(1e-3))[..., None]
     return SmallCopy(levels=content, broad=broad)
-
-
-def forget_pictures() -> None:
-    """Let go of the lenses that an earlier run in this process read."""
-    _pictures.cache_clear()
-
-
-@lru_cache(maxsize=1)
-def _pictures(workspace: Path) -> Pictures:
-    return Pictures.open(workspace)

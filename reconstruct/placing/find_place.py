@@ -27,8 +27,8 @@ from reconstruct.placing.control_file import (
     read_control,
     read_picks,
 )
-from reconstruct.placing.georeference import Fit, fit_control, fit_navigation, level
-from reconstruct.placing.spots import Camera, find_spots
+from reconstruct.placing.georeference import PlacementFit, fit_control, fit_navigation, level
+from reconstruct.placing.picked_points import Camera, find_spots
 from reconstruct.views.lens import Lens
 from reconstruct.views.model import WorldFrame
 
@@ -47,7 +47,7 @@ class Placed:
 
     world_from_model: Similarity
     frame: WorldFrame
-    fit: Fit | None
+    fit: PlacementFit | None
     scale_source: str
     control: ControlFit | None
     """What is known of the site, where something is."""
@@ -166,7 +166,7 @@ def _fit(
     known: _KnownScale | None,
     ties: ControlFit,
     datum: Datum | None,
-) -> Fit | None:
+) -> PlacementFit | None:
     """By navigation and control, by navigation, by control; None where nothing places it."""
     # Control corrects a known scale within its sigma; without control it is held.
     sigma = known.sigma if known is not None and ties.informs_scale else 0.0

@@ -152,7 +152,7 @@ def _sigmas(rows: Sequence[ImageRecord]) -> Array:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Equations:
+class NavigationEquations:
     """Six channels at M moments, linear about a placement: misfit + jacobian x change = error."""
 
     misfit: Array
@@ -163,7 +163,7 @@ class Equations:
     """(M, 6) as stated."""
 
 
-def equations(epochs: Epochs, place: Similarity, middle_ned: Array) -> Equations:
+def equations(epochs: Epochs, place: Similarity, middle_ned: Array) -> NavigationEquations:
     """Misfits of navigation at a placement, and their derivatives.
 
     Args:
@@ -196,7 +196,7 @@ def equations(epochs: Epochs, place: Similarity, middle_ned: Array) -> Equations
     np.add.at(mean_misfit, epochs.moment, misfit)
     np.add.at(mean_jacobian, epochs.moment, jacobian)
     scale = epochs.sigma * shared[:, None]
-    return Equations(
+    return NavigationEquations(
         misfit=np.where(epochs.known, mean_misfit / scale, np.nan),
         jacobian=np.where(epochs.known[..., None], mean_jacobian / scale[..., None], np.nan),
         sigma=epochs.sigma,

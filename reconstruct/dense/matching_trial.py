@@ -7,7 +7,6 @@ matches, and better ones. How far depths from different partners differ, in unit
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -17,11 +16,10 @@ from numpy.typing import NDArray
 from alice_survey.base.executor import parallel_map
 from alice_survey.base.frames import Array
 from reconstruct.dense.depth import MATCH_SIGMA_PX, pair_depth
-from reconstruct.dense.rectify import scaled_view
 from reconstruct.dense.stereo_pairs import StereoPair
 from reconstruct.pictures.normalise import normalise
 from reconstruct.pictures.undistorted import Pictures
-from reconstruct.views.model import View
+from reconstruct.views.model import View, scaled_view
 
 LARGEST_PIXELS = 3_000_000
 """Pictures with more pixels are halved for matching, until they have fewer."""
@@ -119,12 +117,6 @@ def find_conditions(
     )
 
 
-@lru_cache(maxsize=1)
-def open_pictures(workspace: Path) -> Pictures:
-    """The pictures of a workspace, opened once in each process."""
-    return Pictures.open(workspace)
-
-
 def shrunk(
     pictures: Pictures, image: str, size_px: tuple[int, int]
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
@@ -172,7 +164,7 @@ def _looks(
     workspace: Path, view: View, scales: Sequence[float]
 ) -> list[tuple[NDArray[np.uint8], NDArray[np.bool_]]]:
     """An evened picture and its validity at every scale, the picture read once."""
-    pictures = open_pictures(workspace)
+    pictures = Pictures.open(workspace)
     colour, valid = pictures.colour(view.image), pictures.valid(view.image)
     found = []
     for scale in scales:
