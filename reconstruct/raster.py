@@ -181,7 +181,9 @@ def opened_raster(path: Path) -> Iterator[Any]:
         with rasterio.open(path, driver="GTiff") as raster:
             yield raster
     except (rasterio.errors.RasterioError, MemoryError) as error:
-        raise WorkspaceError(f"{path}: is damaged ({one_line(error)}): make it anew") from None
+        raise WorkspaceError(
+            f"{path}: is damaged ({one_line(error)}): delete it and run its stage again"
+        ) from None
 
 
 def tiles_of(grid: DemGrid, size: int) -> list[Window]:

@@ -171,7 +171,7 @@ def laz_writer(
     """A LAZ file (1.4, point format 7) that takes parts of `VERTEX` records as they pass.
 
     Coordinates are east, north and up in steps of 1/10000 of the unit, from the offset that the
-    header tells; colours are 16-bit; normals and sigma are extra dimensions. The projection is that
+    header gives; colours are 16-bit; normals and sigma are extra dimensions. The projection is that
     of the rasters where there is one.
 
     Yields:

@@ -2,7 +2,7 @@
 
 In dim or turbid water the finest detail of a picture is noise: half the resolution then finds more
 matches, and better ones. How far depths from different partners differ, in units of what a match of
-`MATCH_SIGMA_PX` would give, tells the true precision: noise, calibration and poses together.
+`MATCH_SIGMA_PX` would give, shows the true precision: noise, calibration and poses together.
 """
 
 from collections.abc import Sequence
@@ -109,8 +109,8 @@ def find_conditions(
     while best + 1 < len(scales) and known[best + 1] > _WORTH * known[best]:
         best += 1
     spreads = [result.spread[best] for result in results]
-    told = [spread for spread in spreads if np.isfinite(spread)]
-    sigma = MATCH_SIGMA_PX * (float(np.median(told)) if told else 1.0)
+    known_spreads = [spread for spread in spreads if np.isfinite(spread)]
+    sigma = MATCH_SIGMA_PX * (float(np.median(known_spreads)) if known_spreads else 1.0)
     return Conditions(
         scale=scales[best],
         match_sigma_px=round(float(np.clip(sigma, *_SIGMA_LIMITS_PX)), 3),

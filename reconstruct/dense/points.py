@@ -28,7 +28,7 @@ class Points:
     enu: Float32
     """(N, 3) east, north, up from an offset that the caller knows."""
     normals: Float32
-    """(N, 3) unit vectors towards the camera; NaN beside unknown depth."""
+    """(N, 3) unit vectors towards the camera; NaN next to unknown depth."""
     colours: NDArray[np.uint8]
     """(N, 3) RGB."""
     sigmas: Float32
@@ -85,7 +85,7 @@ def block_bounds(
     Args:
         shape: (H, W) of the picture.
         rows: (N,) of pixels.
-        columns: (N,) likewise.
+        columns: (N,) of the same pixels.
         world: (N, 3) their points: north, east, down.
 
     Returns:
@@ -168,7 +168,7 @@ def gather(
         meeting: (h, w) blocks of pixels of which any may be in the box.
 
     Returns:
-        (N, 3), (N, 3), (N, 3), (N,), row by row; a normal is NaN beside unknown depth.
+        (N, 3), (N, 3), (N, 3), (N,), row by row; a normal is NaN next to unknown depth.
     """
     height, width = depth.shape
     t = enu_from_cam

@@ -187,7 +187,7 @@ def triangulate(
     """Depth of every pixel from the two refracted rays of its match.
 
     A match says which pixels p and q of the two warped pictures show one spot. Where the pinholes
-    see it depends on its depth, which the pair of pinhole pixels tells: two rounds, of which each
+    see it depends on its depth, which the pair of pinhole pixels gives: two rounds, of which each
     gains the ratio of the port's shift to the disparity (under 0.01), settle it.
 
     Args:
@@ -196,7 +196,7 @@ def triangulate(
         reference: its lens.
         partner: its lens.
         rect_from_reference: (3, 3) from the model's pixels to the virtual picture's array indices.
-        rect_from_partner: (3, 3) likewise.
+        rect_from_partner: (3, 3) rotation of the partner.
         cosines: as in `Rectification`.
         focal_baseline: of the virtual pictures.
         offset_px: of the disparity.

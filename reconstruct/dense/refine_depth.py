@@ -8,7 +8,7 @@ own epipolar line. Sums over windows are filters over the picture, so that the w
 on the window's size (Le Besnerais & Champagnat 2005, "Dense optical flow by iterative local window
 registration"). The correction is repeated where it is large.
 
-The same sums tell how sure a depth is: the curvature of the misfit along the inverse depth, and
+The same sums show how sure a depth is: the curvature of the misfit along the inverse depth, and
 the noise that remains between pictures.
 """
 

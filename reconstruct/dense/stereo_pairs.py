@@ -161,7 +161,7 @@ def choose_pairs(model: SparseModel, per_view: int = 4) -> list[list[StereoPair]
 
 
 def _quality(ratio: float) -> float:
-    """Chance that a match at this base-to-height ratio is found and tells depth well."""
+    """Chance that a match at this base-to-height ratio is found and determines depth well."""
     low, high = _GOOD_RATIO
     if ratio < low:
         return 0.8 * float(np.sqrt(ratio / low))

@@ -37,7 +37,7 @@ LOOKS = 4
 """Neighbours by which depth is refined."""
 _DOUBTERS = 12
 _DOUBT_STEP = 7
-"""Views, and pixels between the pixels of each, by which the doubt is told."""
+"""Views, and pixels between the pixels of each, by which the doubt is measured."""
 _LEAST_PIXELS = 100
 """A view with fewer pixels of confirmed depth is left out."""
 
@@ -163,13 +163,13 @@ def refine_view(task: RefineTask) -> None:
 def find_doubt(checks: Sequence[CheckTask], threads: int) -> float:
     """How far refined depths of neighbouring views differ, in standard deviations as stated.
 
-    What the noise of pictures cannot tell (detail finer than the window, poses, calibration) shows
+    What the noise of pictures cannot show (detail finer than the window, poses, calibration) shows
     where views differ. The median over some views spread over the survey; at least 1.
     """
     step = max(1, len(checks) // _DOUBTERS)
     spreads = list(parallel_map(disagreement, checks[::step], threads=threads, label="compare"))
-    told = [spread for spread in spreads if np.isfinite(spread)]
-    return max(1.0, float(np.median(told))) if told else 1.0
+    known = [spread for spread in spreads if np.isfinite(spread)]
+    return max(1.0, float(np.median(known))) if known else 1.0
 
 
 def disagreement(task: CheckTask) -> float:
@@ -194,7 +194,7 @@ def disagreement(task: CheckTask) -> float:
 
 
 def looked_at(views: Sequence[View], index: int, pairs: Sequence[StereoPair]) -> list[int]:
-    """Views to refine depth with: partners at other stations, whose baselines tell depth best.
+    """Views to refine depth with: partners at other stations, whose baselines determine depth best.
 
     That of the same station is taken where there are fewer than two others.
     """

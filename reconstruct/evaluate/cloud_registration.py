@@ -115,7 +115,7 @@ def _adjust(
     pose, spacing = start, reference.spacing
     unknowns = 7 if free_scale else 6
     low, high = reference.points.min(axis=0), reference.points.max(axis=0)
-    for done in range(1, _ROUNDS + 1):  # noqa: B007 - told in the result
+    for done in range(1, _ROUNDS + 1):  # noqa: B007 - used in the result
         moved = pose.apply(cloud)
         middles, normals, nearest = reference.planes_at(moved)
         inside = np.all((moved[:, :2] >= low[:2]) & (moved[:, :2] <= high[:2]), axis=1)

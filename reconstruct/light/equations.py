@@ -74,7 +74,7 @@ def solve_robustly(
         target: (N,) differences of logarithms.
         prior: what holds without them.
         misfit: where an error becomes large; also the expected size of one.
-        per_fact: samples that together tell as much as one independent one.
+        per_fact: samples that together count as much as one independent one.
         rounds: of reweighting.
     """
     e = equations
@@ -171,7 +171,7 @@ def normal_equations(
         x: (P + 1,) solution so far.
         gains: (V,).
         misfit: see `solve_robustly`.
-        per_fact: likewise.
+        per_fact: see above.
 
     Returns:
         Upper triangle of the patterns' normal matrix (P + 1, P + 1), the part they share with

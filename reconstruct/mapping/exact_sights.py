@@ -24,7 +24,7 @@ from reconstruct.views.lens import Lens
 _SLOPES = (*PARAMETERS, *TURN_AND_SHIFT)
 """What a camera's pixels depend on: itself, and its place on the rig."""
 _BLOCK = 4096
-"""Observations at a time: what they need beside their results stays in the cache."""
+"""Observations at a time: what they need besides their results stays in the cache."""
 _MOST_OBSERVATIONS = 500_000
 """Linearised they take 1.2 kB each; of more, whole points are left out evenly."""
 
@@ -173,7 +173,7 @@ def _put(
     taken: Array, slopes: Array, source: Indices, target: Indices,
     by_point: Array, by_shared: Array, miss: Array,
 ) -> None:  # fmt: skip
-    """Put what one camera tells in its rows, in place; what it does not see stays as it is.
+    """Put what one camera sees in its rows, in place; what it does not see stays as it is.
 
     Args:
         rows: (N,) observations of the camera.
@@ -187,8 +187,8 @@ def _put(
         source: (G',) which of the K are wanted.
         target: (G',) and where among what is shared they go.
         by_point: (O, 2, 3) to fill.
-        by_shared: (O, 2, G) likewise.
-        miss: (O, 2) likewise.
+        by_shared: (O, 2, G) the same way.
+        miss: (O, 2) the same way.
     """
     cam_from_world = np.empty((3, 3))
     for i in range(rows.shape[0]):

@@ -85,7 +85,7 @@ def triangulate_and_adjust(
     rough.filter_points(_filter(options, _FIRST_ERROR_PX))
     model = rough.reconstruction
     adjust(model, options, tolerance=1e-2, robust_px=_ROBUST_PX)
-    # Anew, since the first poses joined what they should not, and left out what they should not.
+    # Again, since the first poses joined what they should not, and left out what they should not.
     poses = {f: as_transform(model.frames[f].rig_from_world) for f in model.reg_frame_ids()}
     mapper = _triangulated(cache, poses, options.get_triangulation())
     model = mapper.reconstruction
@@ -116,7 +116,7 @@ def adjust(
 
     Args:
         model: with registered frames and points.
-        options: tell what of cameras and rig is refined.
+        options: say what of cameras and rig is refined.
         tolerance: relative decrease of the cost below which it ends.
         robust_px: scale of a Cauchy loss; None: plain least squares.
     """

@@ -319,7 +319,7 @@ def point_covariances(
         arm: (O, 3).
         inverse: (P, 3, 3) V^-1.
         pointers: pattern of `blocks`, as in `ReducedSystem`.
-        columns: likewise.
+        columns: of the matrix.
         blocks: (B, 6, 6) covariances between the stations that see a point in common.
     """
     points = starts.shape[0] - 1

@@ -185,7 +185,7 @@ def extract(task: _FeatureTask) -> int:
 
 
 def _grey_file(features: Path) -> Path:
-    """Where the evened picture lies beside its features."""
+    """Where the evened picture lies next to its features."""
     return features.with_suffix(".npy")
 
 

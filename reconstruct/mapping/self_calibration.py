@@ -1,9 +1,9 @@
 """Mapping without a calibration: cameras, and the rig of two, are found from the pictures.
 
-Pictures that look straight down on a flat floor hardly tell focal length from distance, so nothing
-is freed that they do not determine: the mapper gets a simple lens, a focal length that EXIF states
-is kept unless the pictures contradict it, and the full lens model is accepted only where it comes
-out sane.
+Pictures that look straight down on a flat floor hardly separate focal length from distance, so
+nothing is freed that they do not determine: the mapper gets a simple lens, a focal length that EXIF
+states is kept unless the pictures contradict it, and the full lens model is accepted only where it
+comes out sane.
 """
 
 from collections.abc import Collection, Sequence

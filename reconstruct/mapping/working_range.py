@@ -114,7 +114,7 @@ def ray_passes(start_a: Array, ray_a: Array, start_b: Array, ray_b: Array) -> tu
     Args:
         start_a: (N, 3) points of the first rays.
         ray_a: (N, 3) unit directions.
-        start_b: (N, 3), likewise of the second.
+        start_b: (N, 3), the same of the second.
         ray_b: (N, 3).
 
     Returns:

@@ -126,7 +126,7 @@ def build_mesh(
 
 @progress.step("write the mesh")
 def write_mesh(folder: Path, mesh: Textured, facts: dict[str, Any]) -> None:
-    """Write `mesh.glb`, `.obj`, `.mtl`, `.ply`, `.json` and `.png` beside the pages."""
+    """Write `mesh.glb`, `.obj`, `.mtl`, `.ply`, `.json` and `.png` next to the pages."""
     offset = " ".join(repr(value) for value in facts["offset_east_north_up"])
     comments = [
         f"offset_east_north_up {offset}",

@@ -9,7 +9,7 @@ backscattered light have coefficients of their own):
 with z the distance, per channel, in linear light. m, g and b follow from pairs of views of one spot
 (`light`). A is the light of the darkest pixels that each place of the picture ever shows (dark
 pixels, as in Akkaynak & Treibitz 2019, "Sea-thru"; a robust additive map of the survey, as in
-Koeser et al. 2021), times a share per channel that the pairs themselves tell: of two views of a
+Koeser et al. 2021), times a share per channel that the pairs themselves give: of two views of a
 bright and of a dark spot a wrong A fits at most one.
 """
 
@@ -72,7 +72,7 @@ class ColourModel:
     added: Mapping[str, Array]
     """Per camera (rows, columns, 3): light that the water adds at the nodes, BGR."""
     shares: Array
-    """(3,) of the darkest pixels' light that is taken to be the water's; 0 where it is not told."""
+    """(3,) of the darkest pixels' light that is taken to be the water's; 0 where not known."""
     share_sigmas: Array
     """(3,)."""
     notes: tuple[str, ...]
@@ -187,7 +187,7 @@ def solve_colour(
         )
         if wanted == "water":
             notes.append(
-                "colours: ranges differ too little to tell how much the water weakens each colour"
+                "colours: ranges differ too little to find how much the water weakens each colour"
             )
     else:
         notes.append(
@@ -341,17 +341,17 @@ def _added(
     shares, sigmas = np.zeros(3), unknown.copy()
     for channel in range(3):
         shares[channel], sigmas[channel] = _lowest(cost[:, channel])
-    told = sigmas <= _LARGEST_SIGMA
-    if not told.all():
+    known = sigmas <= _LARGEST_SIGMA
+    if not known.all():
         words = ", ".join(f"{s:.2f}" for s in sigmas)
         note = (
-            f"colours: overlaps do not tell the water's light (sigma of its share {words} for "
+            f"colours: overlaps do not determine the water's light (sigma of its share {words} for "
             "blue, green, red); none taken away"
         )
         return nothing, np.zeros(3), sigmas, note
     note = (
         "colours: light that the water adds taken away: what the darkest pixels at each place of "
-        "the pictures show, times a share per colour that overlaps tell"
+        "the pictures show, times a share per colour that overlaps determine"
     )
     return {name: shares * level for name, level in dark.items()}, shares, sigmas, note
 
@@ -397,7 +397,7 @@ def _misfit(
 
 
 def _robust_cost(rest: Array) -> Array:
-    """(3,) for errors of Laplace's distribution, whose size the rest itself tells."""
+    """(3,) for errors of Laplace's distribution, whose size the rest itself gives."""
     size = np.abs(rest)
     mean = np.minimum(size, 4.0 * np.median(size, axis=0)).mean(axis=0) + 1e-9
     return np.asarray(2.0 * len(rest) / SAMPLES_PER_FACT * np.log(mean))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from reconstruct.light.solve import LightSamples, at_places, joined_samples
 from reconstruct.mosaic.grid import Block
 from reconstruct.mosaic.paint import Float32, SeenView, ground_of
-from reconstruct.mosaic.picture_measures import telling
+from reconstruct.mosaic.picture_measures import well_exposed
 from reconstruct.mosaic.tools import Survey, tools_of
 from reconstruct.mosaic.visibility import see
 from reconstruct.raster import DemGrid
@@ -53,7 +53,7 @@ def compare_block(task: LightTask) -> LightSamples:
         across, down = sight.places(optics.size_px)
         places = np.column_stack([across.ravel()[spots], down.ravel()[spots]])
         levels = at_places(copy.broad, places)
-        usable = telling(levels) & (at_places(copy.valid[..., None], places, 1)[:, 0] > 0.9)
+        usable = well_exposed(levels) & (at_places(copy.valid[..., None], places, 1)[:, 0] > 0.9)
         seen.append(
             _Shown(
                 number=entry.number,

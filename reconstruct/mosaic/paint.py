@@ -318,7 +318,7 @@ def _changes(
         tone = _logarithm(_small_light(task, tools, found, broad=True))
         seen = found.sight.quality > 0
         change = np.clip(mean[found.box] - tone, -limit, limit) * seen[..., None]
-        # cells that the view does not see take the change of those beside them
+        # cells that the view does not see take the change of those next to them
         near = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), 1.5)
         spread = cv2.GaussianBlur(change, (0, 0), 1.5).reshape(change.shape)
         spread = spread / np.maximum(near, np.float32(1e-3))[..., None]

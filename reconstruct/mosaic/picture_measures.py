@@ -26,7 +26,7 @@ _SMALL_PX = 432
 _LEAST_SHRINK = 4
 """Half a cell of the mosaic, whose pixels are about as large as those of pictures."""
 DARKEST, BRIGHTEST = 0.001, 0.95
-"""Linear light beyond which a broad level tells nothing."""
+"""Linear light beyond which a broad level is not used."""
 _DARK_PERCENT = 0.5
 _DARK_STEP = 2
 """Every so manieth pixel along rows and columns is looked at for dark ones."""
@@ -43,7 +43,7 @@ class PictureMeasures:
     grey: bool
     """Whether its channels are equal."""
     nodes: Array
-    """(rows, columns, 3) logarithm of its broad light at nodes, BGR; NaN where it tells nothing."""
+    """(rows, columns, 3) logarithm of its broad light at nodes, BGR; NaN where unusable."""
     dark: Array
     """(rows, columns, 3) light of the darkest pixels around nodes, BGR; NaN where masked."""
 
@@ -161,11 +161,11 @@ def _broad_nodes(copy: SmallCopy) -> Array:
     places = np.column_stack([x.ravel(), y.ravel()]).astype(np.float32)
     level = at_places(copy.broad, places).reshape(*GRID, 3).astype(np.float64)
     valid = at_places(copy.valid[..., None], places, 1).reshape(*GRID, 1)
-    usable = telling(level)[..., None] & (valid > 0.5)
+    usable = well_exposed(level)[..., None] & (valid > 0.5)
     return np.where(usable, np.log(np.maximum(level, DARKEST)), np.nan)
 
 
-def telling(light: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
+def well_exposed(light: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
     """Whether all channels (..., 3) are neither black nor burnt out."""
     return np.asarray(((light > DARKEST) & (light < BRIGHTEST)).all(axis=-1))
 

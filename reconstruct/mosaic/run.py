@@ -1,6 +1,6 @@
 """The stage `mosaic`: every pixel of the DEM's plane painted by the picture that sees it best.
 
-Pictures are measured; pairs of views that see one spot tell the light of the whole survey; seams
+Pictures are measured; pairs of views that see one spot give the light of the whole survey; seams
 are laid survey-wide on small cells; tiles are painted one by one, each colour resampled once from
 the picture as taken. No step holds more than one block, so that memory does not grow with the area.
 """
@@ -267,7 +267,7 @@ def _part_of(colour: ColourModel, images: Sequence[str]) -> ColourModel:
 def _dispersion(
     workspace: Path, model: SparseModel, config: SurveyConfig, grey: bool
 ) -> tuple[Water | None, dict[str, Any]]:
-    """The water through which colours are told apart, or None, and what to say about it."""
+    """The water through which colours are distinguished, or None, and what to say about it."""
     wanted = config.reconstruct.dispersion
     path = workspace / "sparse" / "cameras.json"
     with taken_from(path):

@@ -27,7 +27,7 @@ class Survey:
     scratch: Path
     scaled: bool
     water: Water | None
-    """Of the port's dispersion; None where channels are not told apart."""
+    """Of the port's dispersion; None where channels are not distinguished."""
 
 
 class Tools:

@@ -59,7 +59,7 @@ def shape_covariances(
     Args:
         poses: (N,) of the pictures in the world.
         stations: (N,) theirs.
-        reference: (N,) whether a picture is that whose pose `found` tells.
+        reference: (N,) whether a picture is that whose pose `found` has.
         found: covariances of the stations, in the model's axes and unit.
         world_from_model: the model's place.
     """

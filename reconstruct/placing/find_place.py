@@ -38,7 +38,7 @@ RIG_SCALE_SIGMA = 1e-3
 """Relative, of a scale that a rig gives, where control may correct it: what calibrated rigs reach
 (600 ppm in the built-in demo; the baseline's own sigma leaves out the angle between cameras)."""
 LENGTH_SCALE_SIGMA = 1e-2
-"""Likewise of one length that a person measured."""
+"""The same for one length that a person measured."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -112,12 +112,12 @@ def find_place(task: Placing) -> Placed:
             control=shown,
             located=True,
         )
-    told = ties.bar_scale(scale, 0.0 if known is None else known.sigma)
+    found = ties.bar_scale(scale, 0.0 if known is None else known.sigma)
     factor = 1.0 if scale is None else scale
     source = "unscaled" if known is None else known.source
-    if told is not None:
-        factor, source = told[0], _scale_source(known, ties)
-    scaled = known is not None or told is not None
+    if found is not None:
+        factor, source = found[0], _scale_source(known, ties)
+    scaled = known is not None or found is not None
     notes.append(f"{source}; no CRS" if scaled else "unscaled, no CRS")
     frame = WorldFrame(
         name="model",
@@ -235,17 +235,17 @@ def _scale_source(known: _KnownScale | None, ties: ControlFit) -> str:
     if not ties.informs_scale:
         return source
     bars, points = len(ties.used_bars), len(ties.used_points)
-    told = " and ".join(
+    found = " and ".join(
         [
             *([f"{points} control points"] if points > 1 else []),
             *([f"{bars} known length{'s' * (bars > 1)}"] if bars else []),
         ]
     )
-    return f"scale from {told}" if known is None else f"{source}, corrected by {told}"
+    return f"scale from {found}" if known is None else f"{source}, corrected by {found}"
 
 
 def _known_scale(workspace: Path, mapping: Mapping[str, Any]) -> _KnownScale | None:
-    """None where nothing but navigation or control tells it."""
+    """None where nothing but navigation or control determines it."""
     if mapping["scaled"]:
         return _KnownScale(scale=1.0, source="scale from the calibrated rig", sigma=RIG_SCALE_SIGMA)
     path = workspace / SCALE_FILE

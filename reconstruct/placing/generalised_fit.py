@@ -3,7 +3,7 @@
 Errors of navigation last: weights that take readings as independent state sigmas that are far too
 small. Here every group of channels (horizontal position, depth, tilt, heading) has the marginal
 sigma that navigation states, and a correlation time and white and constant shares that the misfit
-between navigation and the model tells, the model being stiff. They are found by restricted maximum
+between navigation and the model gives, the model being stiff. They are found by restricted maximum
 likelihood (Patterson & Thompson 1971), which counts what the placement itself has absorbed, and
 the covariance of the placement is averaged over all that are likely.
 """
@@ -56,7 +56,7 @@ class Lasting:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Extra:
-    """Independent equations beside navigation, made white: misfit + jacobian x change = N(0, 1)."""
+    """Independent further equations, made white: misfit + jacobian x change = N(0, 1)."""
 
     misfit: Array
     """(E,)."""

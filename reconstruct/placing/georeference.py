@@ -178,7 +178,7 @@ def level(points: Array, centres: Array) -> Similarity:
 
 
 ExtraOf = Callable[[Similarity, Array], Extra]
-"""Equations beside navigation's at a placement, whose rotation acts about a point (3,)."""
+"""Equations besides navigation's at a placement, whose rotation acts about a point (3,)."""
 
 
 def fit_navigation(
@@ -335,7 +335,7 @@ class _NavigationTask:
 
         Positions that were reckoned along a wrong heading are turned as a whole by its error; to
         take their turn for a second, independent reading of the heading would count one error
-        twice as if it were two. Likewise a log's velocities are all wrong by one factor.
+        twice as if it were two. In the same way a log's velocities are all wrong by one factor.
         """
         if not self.epochs.has_attitude:
             return {}

@@ -125,7 +125,7 @@ def survey_control(
     if score is not None:
         lines.append(describe(score))
     if (workspace / CONTROL_FILE).is_file():
-        lines.append("run 'alice-survey reconstruct' to place the model anew")
+        lines.append("run 'alice-survey reconstruct' to place the model again")
     else:
         lines.append(f"write what is known of the points to {CONTROL_FILE}")
     return "\n".join(lines), {

@@ -1,6 +1,6 @@
 """Lengths and areas between picked pixels, with their standard deviations.
 
-In the folder of a pair a pixel's depth is matched anew by least squares; in a reconstructed
+In the folder of a pair a pixel's depth is matched again by least squares; in a reconstructed
 workspace its exact ray is cut with the DEM, or with the ray of a second picture. What is known of
 the calibration moves all points together: its covariance is carried through the exact
 triangulation, so that an error of the baseline scales a length and leaves its points side by side.
@@ -107,7 +107,7 @@ def measure(
             f"{folder}: neither the folder of a pair (pair.json) nor a reconstructed workspace "
             "(sparse/)"
         )
-    return _told(points.split(), located)
+    return _described(points.split(), located)
 
 
 def parse_picks(points: str) -> list[tuple[PickedPixel, ...]]:
@@ -146,7 +146,7 @@ def polygon_area(points: Array) -> float:
     return 0.5 * float(np.linalg.norm(np.cross(local, np.roll(local, -1, axis=0)).sum(axis=0)))
 
 
-def _told(words: list[str], located: Located) -> tuple[str, dict[str, Any]]:
+def _described(words: list[str], located: Located) -> tuple[str, dict[str, Any]]:
     lines, segments = [], []
     count = len(located.points)
 
@@ -160,12 +160,12 @@ def _told(words: list[str], located: Located) -> tuple[str, dict[str, Any]]:
         }
 
     for n in range(count - 1):
-        told = entry(lambda p, n=n: polyline(p[n : n + 2]), "m")  # type: ignore[misc]
-        segments.append({"from": words[n], "to": words[n + 1], **told})
+        found = entry(lambda p, n=n: polyline(p[n : n + 2]), "m")  # type: ignore[misc]
+        segments.append({"from": words[n], "to": words[n + 1], **found})
         lines.append(
-            f"{words[n]} to {words[n + 1]}: {1e3 * told['value_m']:.2f} mm, sigma "
-            f"{1e3 * told['sigma_m']:.2f} mm ({1e3 * told['sigma_of_pixels_m']:.2f} of pixels, "
-            f"{1e3 * told['sigma_of_calibration_m']:.2f} of calibration)"
+            f"{words[n]} to {words[n + 1]}: {1e3 * found['value_m']:.2f} mm, sigma "
+            f"{1e3 * found['sigma_m']:.2f} mm ({1e3 * found['sigma_of_pixels_m']:.2f} of pixels, "
+            f"{1e3 * found['sigma_of_calibration_m']:.2f} of calibration)"
         )
     data: dict[str, Any] = {
         "format": "alice-survey measure",
@@ -248,7 +248,7 @@ def _in_pair(
     flip = np.diag([1.0, -1.0, -1.0])
     notes = [f"rig: {rig.source}"]
     if not len(parameters):
-        notes.append("the rig tells no covariance: sigmas are those of the pixels alone")
+        notes.append("the rig has no covariance: sigmas are those of the pixels alone")
     return Located(
         points=to_axes(points),
         own=flip @ own @ flip,
@@ -428,8 +428,8 @@ def _on_surface(
     raised = surface.hit(start, direction, lift=sigma)
     moves = [raised - point if raised is not None else sigma * direction]
     for axis in range(2):
-        beside = surface.hit(*_ray(view, lens, taken + np.eye(2)[axis]))
-        if beside is not None:
-            moves.append((beside - point) * sigma_px)
+        aside_point = surface.hit(*_ray(view, lens, taken + np.eye(2)[axis]))
+        if aside_point is not None:
+            moves.append((aside_point - point) * sigma_px)
     covariance = sum((np.outer(m, m) for m in moves), np.zeros((3, 3)))
     return point, covariance

@@ -88,7 +88,7 @@ def reconstruct_pair(
         rig: `rig.json`.
         output: folder to write; what it held of an earlier pair is replaced.
         near_m: nearest distance along the axis; from the pair's own matches when None.
-        far_m: farthest; likewise.
+        far_m: farthest one.
         scale: by which pictures are shrunk for matching; from their size when None.
         triangles: largest number of the mesh.
 
@@ -299,8 +299,8 @@ def _match_sigma(
     precise = precise_depth(views, greys, depth, _centres(rows, columns))
     miss = (depth[rows, columns] - precise.depth) / sigma[rows, columns]
     factor = inflation(precise)
-    told = 1.4826 * float(np.nanmedian(np.abs(miss))) * MATCH_SIGMA_PX
-    return round(told, 4), round(factor, 3)
+    match_sigma_px = 1.4826 * float(np.nanmedian(np.abs(miss))) * MATCH_SIGMA_PX
+    return round(match_sigma_px, 4), round(factor, 3)
 
 
 def _agreeing(left: View, right: View, maps: list[tuple[Float32, Float32]]) -> Float32:
@@ -327,7 +327,7 @@ def _centres(rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Array:
 
 
 def _sample(picture: Float32, x: Float32, y: Float32) -> Array:
-    """Bilinear values (N,) at OpenCV's pixels (N, 1); NaN beside what is unknown."""
+    """Bilinear values (N,) at OpenCV's pixels (N, 1); NaN next to what is unknown."""
     parts = [
         cv2.remap(
             picture, x[i : i + 30_000], y[i : i + 30_000], cv2.INTER_LINEAR,

@@ -20,7 +20,7 @@ from reconstruct.mapping.database import Observations, as_transform
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import refract
-from reconstruct.mapping.rig_refinement import RigFit, Told, fit_rig
+from reconstruct.mapping.rig_refinement import NavigationFixes, RigFit, fit_rig
 from reconstruct.mapping.survey_rig import (
     RefinedSurvey,
     frees_rig,
@@ -155,7 +155,7 @@ def test_the_lever_arm_follows_from_turning_about(tmp_path: Path) -> None:
     ned_from_body = [
         pose * scene.rig.body_from_cam("left").inv() for pose in scene.ned_from_cam[::2]
     ]
-    told = Told(
+    fixes = NavigationFixes(
         positions=np.array([p.translation for p in ned_from_body]) + rng.normal(0, 0.01, (10, 3)),
         sigmas=np.full((10, 3), 0.01),
     )
@@ -164,7 +164,7 @@ def test_the_lever_arm_follows_from_turning_about(tmp_path: Path) -> None:
         true.translation + np.array([0.03, -0.02, 0]), true.rotation
     )
     fit = fit_rig(
-        mapped, seen, replace(scene.rig, body_from_rig=moved), port=False, pose=True, told=told
+        mapped, seen, replace(scene.rig, body_from_rig=moved), port=False, pose=True, fixes=fixes
     )
     sigmas = np.sqrt(np.diag(fit.covariance))[-3:]
     truth = true.inv().translation
