@@ -8,8 +8,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from alice_survey.base.manifest import ImageRecord
-from reconstruct.placing.correlated import lasting_share, surprise, whiten
-from reconstruct.placing.georeference import Fit, fit_navigation, level
+from reconstruct.placing.correlated_errors import lasting_share, surprise, whiten
+from reconstruct.placing.georeference import PlacementFit, fit_navigation, level
 from tests.oracles_place import covariance_matrix, surprises
 
 DATUM = Datum(32.8236, 34.9553)
@@ -63,7 +63,7 @@ def told(body: RigidTransform, errors: Array, sigma: Array) -> list[ImageRecord]
 
 def place(
     body: RigidTransform, records: list[ImageRecord], seed: int, **options: float | None
-) -> tuple[Fit, Array, Array]:
+) -> tuple[PlacementFit, Array, Array]:
     """Fit a model that is the truth moved; errors and sigmas: N, E, D, turn about each, scale.
 
     The model's own errors are 1 mm and 0.005 degrees.
