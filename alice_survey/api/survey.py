@@ -77,6 +77,7 @@ class Survey:
         Raises:
             AliceError: a stage cannot be done; the message says what to change.
         """
+        from alice_survey.base.executor import local_executor
         from alice_survey.survey import LOOP, run
 
         return run(stages or LOOP, self.folder, None, executor=local_executor(threads))[1]
