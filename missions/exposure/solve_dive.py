@@ -7,6 +7,7 @@ import numpy as np
 
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import PlanError
+from alice_survey.vehicle.limits import spot_rate_rad_s
 from camera_calib.rig import design_rig
 from missions.exposure.settings import imaging_settings
 
@@ -94,7 +95,8 @@ def turn_s(config: SurveyConfig, spacing_m: float) -> float:
     from missions.values.costs import time_costs
 
     plan = config.plan
-    costs, radius = time_costs(plan.speed_mps), plan.turn_radius_m
+    rate_rad_s = spot_rate_rad_s(plan.turn_rate_limit_deg_s)
+    costs, radius = time_costs(plan.speed_mps, turn_rate_rad_s=rate_rad_s), plan.turn_radius_m
     if spacing_m >= 2 * radius:
         arcs = math.pi * radius + spacing_m - 2 * radius
     else:

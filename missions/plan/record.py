@@ -9,7 +9,7 @@ from alice_survey.base.artefacts import write_json
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.run import progress
 from camera_calib.rig import Rig
-from missions.exports.options import Options
+from missions.exports.options import options_of
 from missions.exports.write import about_file, write_exports
 from missions.exposure.table import settings_table
 from missions.exposure.timetable import trigger_table, write_timetable
@@ -42,9 +42,7 @@ def write_planned(folder: Path, planned: "Planned", config: SurveyConfig, rig: R
     (folder / "settings.txt").write_text(table + "\n", encoding="utf-8")
     write_triggers(folder, plan, planned.costs, config)
     draw_plan(folder / "map.png", plan, rig, planned.certificate, planned.bathymetry, config.sea)
-    options = Options(
-        altimeter_body_m=config.camera.dvl_position_body_m, pixel_um=config.camera.pixel_um
-    )
+    options = options_of(config.camera, config.plan)
     files = write_exports(folder / "exports", plan, rig, options=options)
     write_page(
         folder / "plan.html",

@@ -36,10 +36,8 @@ from missions.lines.lay import lay_lines
 from missions.lines.sweep import Sweep, best_heading
 from missions.plan.rows import plan_rows
 from missions.route.dives import split_dives
-from missions.route.energy import usable_wh, vehicle_costs
+from missions.route.energy import sound_craft_of, usable_wh, vehicle_costs
 from missions.route.terrain import (
-    HALF_BREADTH_M,
-    TAIL_M,
     TerrainLimits,
     line_profiles,
     reach_of,
@@ -336,7 +334,8 @@ def _terrain(
     )
     across_m = max(stereo.port_m, stereo.starboard_m)
     along_m = max(stereo.ahead_m, stereo.astern_m)
-    reach = reach_of(config.camera.position_body_m, across_m, along_m)
+    hull = sound_craft_of(config.vehicle).hull
+    reach = reach_of(hull, config.camera.position_body_m, across_m, along_m)
     profiles = line_profiles(lines, bathymetry, reach, limits)
     text, figures = terrain_report(
         lines,
@@ -403,7 +402,8 @@ def _check_smallest(area: Area, imaging: ImagingSettings) -> None:
 def _warn_of_zones(config: SurveyConfig, area: Area) -> None:
     """The allowed area holds the camera: the hull behind it reaches farther."""
     forward_m, right_m = config.camera.position_body_m[:2]
-    behind_m = math.hypot(TAIL_M + forward_m, HALF_BREADTH_M + abs(right_m))
+    hull = sound_craft_of(config.vehicle).hull
+    behind_m = math.hypot(hull.tail_m + forward_m, hull.half_breadth_m + abs(right_m))
     if not area.no_go.is_empty and config.area.no_go_clearance_m < behind_m:
         warn(
             f"the camera is kept {config.area.no_go_clearance_m:g} m off the no-go zones, the hull "

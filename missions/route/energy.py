@@ -35,10 +35,11 @@ from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.files import coefficients_from_file
 from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.limits import STEP_MPS, spot_rate_rad_s
 from alice_survey.vehicle.pilot.gains import STEADY_SHARE
 from alice_survey.vehicle.steady import steady_flight
 from alice_survey.vehicle.vehicle import Vehicle
-from missions.values.costs import SETTLE_S, SPOT_RAD_S, STEP_MPS, Costs
+from missions.values.costs import SETTLE_S, Costs
 
 Manner = Literal["held", "crab"]
 """Of meeting a current from the side: heading held, by sway; or heading turned into it."""
@@ -323,11 +324,12 @@ def _turning_power(
 
 def _spot(craft: Vehicle, config: SurveyConfig, current: Array) -> tuple[float, float]:
     """Power on the spot, of turning through a quarter and settling; and the rate of turning."""
-    rates = SPOT_RAD_S * np.append(_RATES, 0.0)
+    fastest = spot_rate_rad_s(config.plan.turn_rate_limit_deg_s)
+    rates = fastest * np.append(_RATES, 0.0)
     power = _turning_power(craft, config, current, np.zeros(len(rates)), rates)
     can = np.flatnonzero(np.isfinite(power[:-1]))
     if not len(can):
-        return math.inf, SPOT_RAD_S
+        return math.inf, fastest
     rate = float(rates[can[0]])
     turning_s = math.pi / 2 / rate
     joules = power[can[0]] * turning_s + power[-1] * SETTLE_S
