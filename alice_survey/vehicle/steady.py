@@ -89,7 +89,10 @@ def steady_flight(
     matrix = np.ascontiguousarray(vehicle.configuration_matrix)
     axes = AXIS_WEIGHTS * np.any(np.abs(matrix) > 1e-12, axis=1)
     n = len(vehicle.thrusters)
-    room = _Room(*(np.zeros(n) for _ in range(4)), np.zeros(6), allocation_scratch(n))
+    room = _Room(
+        lower=np.zeros(n), upper=np.zeros(n), weights=np.zeros(n), thrust=np.zeros(n),
+        target=np.zeros(6), allocation=allocation_scratch(n),
+    )  # fmt: skip
     rps, power_w, made = np.zeros((len(nu), n)), np.zeros((len(nu), n)), np.zeros((len(nu), 6))
     _keep(propulsion, matrix, axes, np.full(n, share), wanted, nu, room, made, rps, power_w)
     balanced = np.flatnonzero(axes) if slips else list(BALANCED)
