@@ -1,7 +1,7 @@
 """All exports of a plan: missions that vehicles load, and files that people look at."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -19,7 +19,7 @@ from missions.exports.gpx import write_gpx
 from missions.exports.kml import write_kml
 from missions.exports.mavlink import Item, mission_items
 from missions.exports.mount import Mount, mount_of
-from missions.exports.options import Options, line_tolerance_m
+from missions.exports.options import Options, line_tolerance_m, options_of
 from missions.exports.places import lat_lon
 from missions.exports.qgroundcontrol import write_qgroundcontrol, write_qgroundcontrol_survey
 from missions.exports.tables import write_lines, write_stations, write_waypoints
@@ -42,7 +42,9 @@ class _Job:
     home_lat_lon_deg: tuple[float, float]
 
     def items(self, dive: int) -> list[Item]:
-        return mission_items(self.plan, self.dives[dive], self.tolerance_m)
+        return mission_items(
+            self.plan, self.dives[dive], self.tolerance_m, self.options.turn_rate_rad_s
+        )
 
 
 @progress.step("write missions for vehicles")
@@ -83,7 +85,7 @@ def write_exports(
         rig=rig,
         mount=mount,
         options=given,
-        dives=all_waypoints(plan, mount, line_depths),
+        dives=all_waypoints(plan, mount, given.turn_rate_rad_s, line_depths),
         tolerance_m=line_tolerance_m(plan, rig, given),
         home_lat_lon_deg=(float(lat), float(lon)),
     )
@@ -122,12 +124,11 @@ def export_report(
     plan = read_plan(path)
     survey = config if config is not None else _config_beside(path)
     rig = design_rig(survey.camera, survey.water)
-    default = Options()
-    options = Options(
-        altimeter_body_m=survey.camera.dvl_position_body_m,
-        pixel_um=survey.camera.pixel_um,
-        camera_on=default.camera_on if camera_on is None else camera_on,
-        camera_off=default.camera_off if camera_off is None else camera_off,
+    options = options_of(survey.camera, survey.plan)
+    options = replace(
+        options,
+        camera_on=options.camera_on if camera_on is None else camera_on,
+        camera_off=options.camera_off if camera_off is None else camera_off,
     )
     folder = path.parent / "exports" if out is None else out
     files = write_exports(folder, plan, rig, formats=formats, options=options)
@@ -292,7 +293,7 @@ def _write_about(path: Path, job: _Job, files: Sequence[Path]) -> Path:
 
 
 def _config_beside(path: Path) -> SurveyConfig:
-    """Camera and water that a plan was made with."""
+    """Camera, water and limits that a plan was made with."""
     stage = read_stage(path.parent)
     settings = {} if stage is None else dict(stage.get("settings", {}))
     if "camera" not in settings or "water" not in settings:
@@ -300,4 +301,7 @@ def _config_beside(path: Path) -> SurveyConfig:
             f"{path}: lies in no finished plan folder, so that where the camera sits on the "
             "vehicle is not known: give the survey's settings too"
         )
-    return parse_config({key: settings[key] for key in ("camera", "water")}, str(path.parent))
+    known = {key: settings[key] for key in ("camera", "water")}
+    if isinstance(settings.get("plan"), dict):
+        known["plan"] = settings["plan"]
+    return parse_config(known, str(path.parent))
