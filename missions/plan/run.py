@@ -12,7 +12,7 @@ from alice_survey.base.run import progress
 from camera_calib.rig import Rig, design_rig
 from missions.areas.files import area_files
 from missions.exports.options import Options, options_of
-from missions.exports.write import about_file, write_exports
+from missions.exports.write import write_exports
 from missions.exposure.table import settings_table
 from missions.exposure.timetable import trigger_table, write_timetable
 from missions.plan.map import draw_plan
@@ -101,7 +101,7 @@ def write_planned(
         bathymetry=planned.bathymetry,
         sea=sea,
         warnings=planned.warnings,
-        links=[Link(href=f"exports/{file.name}", about=about_file(file)) for file in files],
+        links=[Link(href=f"exports/{file.name}", about=about) for file, about in files.items()],
     )
 
 
