@@ -23,7 +23,7 @@ from alice_survey.base.errors import CalibrationError, ImageError, Reconstructio
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from camera_calib.rig import Rig, read_rig, write_rig
-from reconstruct.dense.cloud import VERTEX, write_ply
+from reconstruct.dense.cloud import VERTEX, write_cloud
 from reconstruct.dense.depth import MATCH_SIGMA_PX, pair_depth
 from reconstruct.dense.matching_trial import matching_scale
 from reconstruct.matching.features import find_features
@@ -398,4 +398,4 @@ def _write_cloud(path: Path, found: PairDepth) -> int:
     rgb = found.colour[rows[known], columns[known], ::-1]
     vertices["red"], vertices["green"], vertices["blue"] = rgb.T
     vertices["sigma"] = found.sigma[rows[known], columns[known]]
-    return write_ply(path, [vertices], (0.0, 0.0, 0.0), _FRAME)
+    return write_cloud(path, [vertices], (0.0, 0.0, 0.0), _FRAME)
