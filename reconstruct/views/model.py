@@ -157,13 +157,14 @@ def datum_of(data: dict[str, Any]) -> Datum:
     return Datum(*place, height_m)
 
 
-def read_model(sparse: Path) -> SparseModel:
+def read_model(sparse: str | Path) -> SparseModel:
     """Read the model of a finished `sparse/` stage.
 
     Raises:
         WorkspaceError: a file is missing, or not as it was written.
         ReconstructionError: the model is damaged.
     """
+    sparse = Path(sparse)
     from reconstruct.views.model_files import read_reconstruction
 
     stored = read_json(sparse / "cameras.json")

@@ -279,13 +279,13 @@ def test_twenty_flights_are_placed_within_their_sigmas() -> None:
     from alice_survey.seafloor.terrain import survey_terrain
     from camera_calib.rig import design_rig
     from missions.fly.simulation import floor_grid, simulate_plan
-    from missions.plan.run import make_plan
+    from missions.plan.planner import plan_survey
 
     config = SurveyConfig(
         area=AreaConfig(length_m=4.5, width_m=3.7, seafloor_depth_m=15.0),
         plan=PlanConfig(forward_overlap=0.62, side_overlap=0.3, cross_lines=1),
     )
-    plan = make_plan(config, design_rig(config.camera, config.water))
+    plan = plan_survey(config, design_rig(config.camera, config.water)).plan
     floor = floor_grid(survey_terrain(config, plan.area.allowed_corners_ne))
     ratios = []
     for seed in range(20):

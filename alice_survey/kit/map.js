@@ -56,29 +56,30 @@ function startMap() {
           radius: 5, color: "#fff", weight: 1.5, fillColor: about.colour, fillOpacity: 1,
         })
         : many(places(shape), {
-          color: about.colour, weight: about.kind === "line" ? 2.6 : rimmed ? 1.8 : 1,
-          fillOpacity: 0.03, ...dashes,
+          color: about.colour,
+          weight: about.width || (about.kind === "line" ? 2.6 : rimmed ? 1.8 : 1),
+          fillOpacity: about.fill, ...dashes,
         });
       drawn.survey = {title: about.title, text: about.texts[index] || ""};
-      drawn.on("click", (event) => tell(drawn, event.latlng));
+      drawn.on("click", (event) => { if (!ruler.on) describe(drawn, event.latlng); });
       group.addLayer(drawn);
     });
     group.kind = about.kind;
     return group;
   }
 
-  function tell(shape, at) {
+  function describe(shape, at) {
     const content = document.createElement("div");
     const title = document.createElement("b");
     title.textContent = shape.survey.title;
     const text = document.createElement("p");
     text.textContent = shape.survey.text;
     content.append(title, text);
-    leaflet.popup({minWidth: 110, maxWidth: 260, className: "told"}).setLatLng(at).setContent(content).openOn(map);
+    leaflet.popup({minWidth: 110, maxWidth: 260, className: "described"}).setLatLng(at).setContent(content).openOn(map);
   }
 
   /* What a pointer would choose, for those who have none: the shape nearest to the middle. */
-  function tellMiddle() {
+  function describeMiddle() {
     const middle = map.containerPointToLayerPoint(map.getSize().divideBy(2));
     let best = null;
     let least = 60;
@@ -95,8 +96,8 @@ function startMap() {
         }
       });
     });
-    if (best) tell(...best);
-    else readout.textContent = "Nothing to tell within 60 px of the middle";
+    if (best) describe(...best);
+    else readout.textContent = "Nothing within 60 px of the middle";
   }
 
   function show(name, on) {
@@ -125,10 +126,37 @@ function startMap() {
     });
   }
 
+  /* Lengths between places that are clicked, or that Enter takes from the middle. */
+  const ruler = {on: false, places: [], line: leaflet.polyline([], {
+    color: "#8e44ad", weight: 2.5, dashArray: "6 3", interactive: false,
+  }).addTo(map)};
+  const ruled = (places) => places.slice(1).reduce(
+    (sum, place, i) => sum + Math.hypot(place.lat - places[i].lat, place.lng - places[i].lng), 0,
+  );
+  function measure(on) {
+    ruler.on = on;
+    ruler.places = [];
+    ruler.line.setLatLngs([]);
+    root.querySelector('[data-act="measure"]').setAttribute("aria-pressed", String(on));
+    if (on) map.closePopup();
+    readCentre();
+  }
+  function addPlace(place) {
+    ruler.places.push(place);
+    ruler.line.setLatLngs(ruler.places);
+    read("", place);
+  }
+
   const decimals = () => Math.min(4, Math.max(0, Math.ceil(Math.log10(2 ** map.getZoom()))));
   function read(word, place) {
     const [e, n] = [place.lng, place.lat].map((v) => v.toFixed(decimals()).replace("-", "−"));
-    readout.textContent = word + e + " " + data.unit + " east, " + n + " " + data.unit + " north";
+    let text = word + e + " " + data.unit + " east, " + n + " " + data.unit + " north";
+    if (data.geodetic) text += "; " + latLon(data.geodetic, place.lat, place.lng);
+    if (ruler.on) {
+      const total = lengthText(ruled([...ruler.places, place]), data.unit, 4);
+      text += ruler.places.length ? "; measured " + total : "; click to measure";
+    }
+    readout.textContent = text;
   }
   const readCentre = () => read("Middle: ", map.getCenter());
 
@@ -146,7 +174,11 @@ function startMap() {
     readCentre();
     drawBar();
   });
-  map.on("mousemove", (event) => read("", event.latlng));
+  map.on("mousemove", (event) => {
+    read("", event.latlng);
+    if (ruler.on) ruler.line.setLatLngs([...ruler.places, event.latlng]);
+  });
+  map.on("click", (event) => { if (ruler.on) addPlace(event.latlng); });
   map.on("mouseout", readCentre);
   map.on("tilelost", () => {
     readout.textContent = "A part of the picture did not come: load this page again";
@@ -164,13 +196,16 @@ function startMap() {
       show(input.value, input.checked);
     });
   });
-  const acts = {in: () => map.zoomIn(1), out: () => map.zoomOut(1), all: showAll};
+  const acts = {in: () => map.zoomIn(1), out: () => map.zoomOut(1), all: showAll, measure: () => measure(!ruler.on)};
   root.querySelectorAll("button[data-act]").forEach((button) => {
     button.addEventListener("click", acts[button.dataset.act]);
   });
   box.addEventListener("keydown", (event) => {
     if (event.target !== box || event.ctrlKey || event.metaKey || event.altKey) return;
-    const act = {0: showAll, Enter: tellMiddle}[event.key];
+    const enter = ruler.on ? () => addPlace(map.getCenter()) : describeMiddle;
+    const act = {
+      0: showAll, Enter: enter, m: acts.measure, Escape: ruler.on ? () => measure(false) : null,
+    }[event.key];
     if (!act) return;
     event.preventDefault();
     act();
@@ -179,9 +214,17 @@ function startMap() {
   root.dataset.ready = "";
 }
 
+/* Latitude and longitude are quadratic in metres north and east. */
+function latLon(geodetic, n, e) {
+  const terms = [1, n, e, n * n, n * e, e * e];
+  const [lat, lon] = geodetic.map((c) => terms.reduce((sum, term, i) => sum + c[i] * term, 0));
+  const degrees = (value, ahead, astern) => Math.abs(value).toFixed(7) + "° " + (value < 0 ? astern : ahead);
+  return degrees(lat, "N", "S") + " " + degrees((lon + 540) % 360 - 180, "E", "W");
+}
+
 /* 0.02 m reads as 2 cm. */
-function lengthText(length, unit) {
-  const places = (value) => Number(value.toPrecision(2)).toString();
+function lengthText(length, unit, digits = 2) {
+  const places = (value) => Number(value.toPrecision(digits)).toString();
   if (unit !== "m" || length >= 1) return places(length) + " " + unit;
   return length >= 0.01 ? places(length * 100) + " cm" : places(length * 1000) + " mm";
 }
