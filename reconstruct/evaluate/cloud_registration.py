@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
-from reconstruct.evaluate.figures import MAD_TO_SIGMA
+from alice_survey.base.robust import MAD_TO_SIGMA
 from reconstruct.placing.alignment import Similarity
 
 _TUKEY = 4.685

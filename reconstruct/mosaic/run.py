@@ -11,7 +11,7 @@ import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import rasterio
@@ -240,7 +240,7 @@ def _solve(
     facts: Sequence[PictureMeasures],
     views: Sequence[SeenView],
     blocks: Sequence[Block],
-    wanted: str,
+    wanted: Literal["even", "water", "raw"],
     threads: int,
 ) -> ColourModel:
     """The survey's light from spots that two views see."""

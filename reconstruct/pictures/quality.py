@@ -19,6 +19,7 @@ from alice_survey.base.artefacts import read_stage, write_csv
 from alice_survey.base.errors import ImageError, why
 from alice_survey.base.executor import parallel_map
 from alice_survey.base.manifest import ImageRecord, read_manifest
+from alice_survey.base.robust import MAD_TO_SIGMA
 from reconstruct.pictures.files import decode
 from reconstruct.pictures.normalise import even_light
 from reconstruct.pictures.undistorted import read_mask
@@ -36,7 +37,6 @@ OUTLIER_FACTOR = 1.6
 _BLOCK_PX = 48
 _SMOOTHEST_PERCENT = 10
 """Blocks so smooth show hardly anything but noise."""
-_MAD_TO_SIGMA = 1.4826
 _SHARED_POINTS = 15
 """Common points of the model from which two pictures count as overlapping."""
 _FINE_PX, _MID_PX, _COARSE_PX = 1.0, 2.0, 5.0
@@ -206,7 +206,7 @@ def _middle(pictures: Sequence[PictureQuality], name: str) -> tuple[float, float
     if not values.size:
         return NAN, NAN
     middle = float(np.median(values))
-    return middle, _MAD_TO_SIGMA * float(np.median(np.abs(values - middle)))
+    return middle, MAD_TO_SIGMA * float(np.median(np.abs(values - middle)))
 
 
 def _reasons(quality: PictureQuality, spreads: dict[str, tuple[float, float]]) -> tuple[str, ...]:

@@ -21,6 +21,7 @@ from rasterio.errors import NotGeoreferencedWarning
 from alice_survey.base.artefacts import write_json
 from alice_survey.base.errors import CalibrationError, ImageError, ReconstructionError
 from alice_survey.base.frames import Array
+from alice_survey.base.robust import MAD_TO_SIGMA
 from alice_survey.base.run import progress
 from camera_calib.rig import Rig, read_rig, write_rig
 from reconstruct.dense.cloud import VERTEX, write_cloud
@@ -299,7 +300,7 @@ def _match_sigma(
     precise = precise_depth(views, greys, depth, _centres(rows, columns))
     miss = (depth[rows, columns] - precise.depth) / sigma[rows, columns]
     factor = inflation(precise)
-    match_sigma_px = 1.4826 * float(np.nanmedian(np.abs(miss))) * MATCH_SIGMA_PX
+    match_sigma_px = MAD_TO_SIGMA * float(np.nanmedian(np.abs(miss))) * MATCH_SIGMA_PX
     return round(match_sigma_px, 4), round(factor, 3)
 
 
