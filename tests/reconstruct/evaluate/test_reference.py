@@ -15,8 +15,13 @@ from scipy.spatial.transform import Rotation
 from alice_survey.base.errors import ReconstructionError, WorkspaceError
 from alice_survey.base.frames import Datum
 from reconstruct.evaluate.cloud_files import read_reference
-from reconstruct.evaluate.cloud_registration import ReferenceSurface, register_cloud
-from reconstruct.evaluate.reference import covers, distances, lifted
+from reconstruct.evaluate.cloud_registration import (
+    ReferenceSurface,
+    covers,
+    distances,
+    register_cloud,
+)
+from reconstruct.evaluate.reference import lifted
 from reconstruct.evaluate.reference_plot import mean_map
 from reconstruct.placing.alignment import Similarity
 
