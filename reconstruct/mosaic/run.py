@@ -36,7 +36,6 @@ from reconstruct.mosaic.grid import (
     mosaic_grid,
     neighbours,
 )
-from reconstruct.mosaic.measure import ViewTask, measure_view
 from reconstruct.mosaic.paint import (
     PaintTask,
     SeenView,
@@ -45,8 +44,8 @@ from reconstruct.mosaic.paint import (
     paint_tiles,
     tones_path,
 )
-from reconstruct.mosaic.picture_measures import PictureMeasures
-from reconstruct.mosaic.tools import Survey, forget_tools
+from reconstruct.mosaic.picture_measures import PictureMeasures, ViewTask, measure_view
+from reconstruct.mosaic.tools import MosaicSetup, forget_tools
 from reconstruct.mosaic.visibility import Water
 from reconstruct.mosaic.writers import cloud_optimised, thumbnail, write_labels, write_tiles
 from reconstruct.placing.track_figure import plot_track_over
@@ -156,7 +155,9 @@ def build_mosaic(
     water, dispersion = _dispersion(
         workspace, settings.dispersion, sea, grey=all(f.grey for f in facts)
     )
-    survey = Survey(workspace=workspace, scratch=scratch, scaled=model.frame.scaled, water=water)
+    survey = MosaicSetup(
+        workspace=workspace, scratch=scratch, scaled=model.frame.scaled, water=water
+    )
     views = _seen_views(model, facts)
     ground = footprints(model.views, heights)
     label_blocks = seam_blocks(grid, ground)
@@ -236,7 +237,7 @@ def _seen_views(model: SparseModel, facts: Sequence[PictureMeasures]) -> list[Se
 
 def _solve(
     model: SparseModel,
-    survey: Survey,
+    survey: MosaicSetup,
     facts: Sequence[PictureMeasures],
     views: Sequence[SeenView],
     blocks: Sequence[Block],
