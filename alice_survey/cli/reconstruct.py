@@ -137,7 +137,7 @@ def quality(workspace: Workspace = WORK, threads: Threads = None, as_json: AsJso
 
     Sharpness, exposure, turbidity and overlap of each; the bad ones by name, with the reason.
     """
-    from reconstruct.pictures.quality import quality_report
+    from reconstruct.pictures.quality_sheet import quality_report
 
     print_result(*quality_report(workspace, executor_of(threads)), as_json)
 

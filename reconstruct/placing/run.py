@@ -66,7 +66,7 @@ def run_sparse(workspace: Path, config: SurveyConfig, executor: Executor) -> boo
         ReconstructionError: the pictures give no model.
     """
     inputs, survey, files = read_inputs(workspace)
-    mapped = run_mapping(workspace, inputs, files, config, executor)
+    mapped = run_mapping(workspace, inputs, files, config.reconstruct, config.seed, executor)
     mapping = workspace / "mapping"
     if not mapping.is_dir():  # only checking
         return True
