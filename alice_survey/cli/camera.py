@@ -168,46 +168,6 @@ def convert(
 
 
 @app.command(
-    epilog=examples(
-        "camera tank --boards boards --board 'chessboard 9x6 9.35mm' --reference "
-        "cam1_references.json --reference cam2_references.json --detections detections.csv -o tank",
-    )
-)
-def tank(
-    boards: Annotated[list[Path], typer.Option(help="Folder of the board in air; or one each.")],
-    board: Annotated[str, typer.Option(help="Such as 'chessboard 9x6 9.35mm'.")],
-    reference: Annotated[list[Path], typer.Option(help="Points on the interface, per camera.")],
-    detections: Annotated[Path, typer.Option(help="CSV: cam, frame, id, x, y.")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write.")],
-    unit: Annotated[str, typer.Option(help="Of the reference's world: m, cm or mm.")] = "cm",
-    n_water: Annotated[float, typer.Option(help="Index of the water.")] = 1.333,
-    glass: Annotated[
-        list[float] | None, typer.Option(help="Wall before it, mm; or one each.")
-    ] = None,
-    n_glass: Annotated[float, typer.Option(help="Index of the walls.")] = 1.52,
-    lens: Annotated[str | None, typer.Option(help="Lens model; chosen when not given.")] = None,
-    frame_offset: Annotated[
-        list[str] | None, typer.Option(metavar="CAMERA=N", help="Added to its frame numbers.")
-    ] = None,
-    refine: Annotated[bool, typer.Option(help="Poses from the detections too.")] = True,
-    threads: Threads = None,
-    as_json: AsJson = False,
-) -> None:
-    """Triangulate what fixed cameras see in a tank.
-
-    Lens from a board in air, poses from points on the flat interface each camera looks through.
-    """
-    from camera_calib.tank.run import TankSettings, run_tank
-
-    settings = TankSettings(
-        boards=tuple(boards), board=board, references=tuple(reference), detections=detections,
-        unit=unit, n_water=n_water, glass_mm=tuple(glass or ()), n_glass=n_glass, lens=lens,
-        frame_offsets=tuple(frame_offset or ()), refine=refine,
-    )  # fmt: skip
-    print_result(*run_tank(settings, out, threads), as_json)
-
-
-@app.command(
     epilog=examples("camera uncertainty rig.json", "camera uncertainty rig.json --range 2 --json")
 )
 def uncertainty(
