@@ -1,4 +1,4 @@
-"""A real rig behind real flat interfaces: two cameras at an aquarium (3D-ZeF, Aalborg University)."""
+"""A real rig behind real flat interfaces: two cameras at an aquarium (3D-ZeF, Aalborg)."""
 
 import csv
 import json
