@@ -17,12 +17,13 @@ from dataclasses import dataclass, replace
 from functools import cache, partial
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.executor import parallel_map
 from alice_survey.base.frames import Array
 from benchmarks.figures import Figure, Goal
-from camera_calib.calibrate.adjust import cramer_rao, stack_views
+from camera_calib.calibrate.adjust import stack_views
 from camera_calib.calibrate.freedom import (
     PORT,
     Freedom,
@@ -147,6 +148,34 @@ def _scene() -> tuple[RigidTransform, Covariance]:
     )
     at = [whole.parameters.index(name) for name in _LENS]
     return poses, Covariance(parameters=_LENS, matrix=whole.matrix[np.ix_(at, at)])
+
+
+def cramer_rao(
+    rig: Rig,
+    points: Array,
+    rig_from_target: RigidTransform,
+    seen: NDArray[np.bool_],
+    freedom: Freedom,
+    noise_px: float,
+) -> Covariance:
+    """The least covariance that any unbiased calibration can have, at the true values.
+
+    Args:
+        rig: the truth.
+        points: (N, 3) of the target, metres.
+        rig_from_target: (V,) true poses.
+        seen: (V, cameras, N) which points are measured.
+        freedom: what of the rig is unknown.
+        noise_px: standard deviation of one coordinate.
+
+    Raises:
+        CalibrationError: the views do not determine a parameter.
+    """
+    pixels = np.where(seen[..., None], 0.0, np.nan)
+    problem = Problem(pixels, points, rig, freedom)
+    state = problem.state(rig, rig_from_target)
+    weights = np.where(problem.seen, 1.0 / noise_px**2, 0.0)
+    return problem.covariance(problem.equations(state, weights))
 
 
 def bound_of(known: Intrinsics) -> Covariance:
