@@ -1,5 +1,6 @@
 """Print a target at true scale: PDF, SVG or PNG, with a bar to check the printer by."""
 
+import io
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
+from reportlab.lib.units import mm
 
 from alice_survey.base.artefacts import atomic_path
 from alice_survey.base.errors import CalibrationError
@@ -29,7 +31,6 @@ _MARGIN_MM = 8.0
 _STRIP_MM = 11.0
 """Below the pattern, for the bar and the words."""
 _TICK_MM, _LINE_MM, _TEXT_MM = 3.0, 0.3, 2.6
-_POINTS_PER_MM = 72.0 / 25.4
 _LARGEST_PAGE_MM = 5080.0
 """A PDF page is at most 200 inches."""
 _MOST_PIXELS = 600_000_000
@@ -141,41 +142,25 @@ def _bar(x: float, y: float) -> Array:
 
 
 def to_pdf(sheet: Sheet) -> bytes:
-    """The page as a PDF 1.4 of filled rectangles and one line of Helvetica."""
-    scale = _POINTS_PER_MM
+    """The page as a PDF of filled rectangles and one line of Helvetica, to print without scaling.
 
-    def number(value: float) -> str:
-        return f"{value:.5f}".rstrip("0").rstrip(".")
+    The same sheet gives the same bytes.
+    """
+    from reportlab.pdfgen.canvas import Canvas
 
-    drawn = ["0 g"]
-    for x0, y0, x1, y1 in sheet.rectangles_mm:
-        box = (x0, sheet.height_mm - y1, x1 - x0, y1 - y0)
-        drawn.append(" ".join(number(value * scale) for value in box) + " re")
-    drawn.append("f")
-    x, y = sheet.words_at_mm[0] * scale, (sheet.height_mm - sheet.words_at_mm[1]) * scale
-    words = sheet.words.replace("\\", r"\\").replace("(", r"\(").replace(")", r"\)")
-    drawn.append(f"BT /F1 {number(_TEXT_MM * scale)} Tf {number(x)} {number(y)} Td ({words}) Tj ET")
-    content = ("\n".join(drawn) + "\n").encode("ascii")
-    page = f"{number(sheet.width_mm * scale)} {number(sheet.height_mm * scale)}"
-    objects = [
-        b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
-        b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
-        (
-            f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {page}] /Contents 4 0 R "
-            "/Resources << /Font << /F1 5 0 R >> >> >>"
-        ).encode("ascii"),
-        b"<< /Length %d >>\nstream\n%sendstream" % (len(content), content),
-        b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica >>",
-    ]
-    file, starts = b"%PDF-1.4\n", []
-    for i, thing in enumerate(objects, start=1):
-        starts.append(len(file))
-        file += b"%d 0 obj\n%s\nendobj\n" % (i, thing)
-    table = b"".join(b"%010d 00000 n \n" % start for start in starts)
-    count = len(objects) + 1
-    file += b"xref\n0 %d\n0000000000 65535 f \n%s" % (count, table)
-    place = file.rindex(b"xref\n0 ")
-    return file + b"trailer\n<< /Size %d /Root 1 0 R >>\nstartxref\n%d\n%%%%EOF\n" % (count, place)
+    file = io.BytesIO()
+    page = (sheet.width_mm * mm, sheet.height_mm * mm)
+    canvas = Canvas(file, pagesize=page, invariant=True, pageCompression=False)
+    canvas.setViewerPreference("PrintScaling", "None")
+    path = canvas.beginPath()
+    for x0, y0, x1, y1 in sheet.rectangles_mm * mm:
+        path.rect(x0, page[1] - y1, x1 - x0, y1 - y0)
+    canvas.drawPath(path, stroke=0, fill=1)
+    canvas.setFont("Helvetica", _TEXT_MM * mm)
+    x, y = sheet.words_at_mm
+    canvas.drawString(x * mm, page[1] - y * mm, sheet.words)
+    canvas.save()
+    return file.getvalue()
 
 
 def to_svg(sheet: Sheet) -> str:
