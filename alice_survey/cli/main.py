@@ -120,20 +120,21 @@ def fov(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Tell field of view and resolution.
+    """Show field of view and resolution.
 
     Footprint, pixel, focus, depth of field, stereo and blur through the exact flat port, for any
     lens, altitude and water. What is not given is the survey's, or else the paper's.
     """
     from alice_survey.cli.fov_tables import FovOptions, Output, fov_report, validation_report
+    from camera_calib.fov.table import FovChoices
 
     output = Output(markdown=markdown, csv=csv, plot=plot)
     options = FovOptions(
         lens_mm=lens or (), altitude_m=altitude or (), speed_mps=speed or (),
         exposure_ms=exposure or (), survey=survey, rig=rig, n_water=n_water,
         temperature_c=temperature, salinity_psu=salinity, port_distance_mm=port_distance,
-        glass_mm=glass, n_glass=n_glass, pixel_um=pixel, f_number=f_number, coc_px=coc,
-        focus_air_m=focus_air, match_sigma_px=match_sigma, blur_px=blur,
+        glass_mm=glass, n_glass=n_glass, pixel_um=pixel, f_number=f_number, blur_px=blur,
+        choices=FovChoices(coc_px=coc, focus_air_m=focus_air, match_sigma_px=match_sigma),
     )  # fmt: skip
     table, data, passed = (
         validation_report(options, output) if validate else fov_report(options, output)

@@ -21,16 +21,10 @@ from camera_calib.fov.focus import (
     FocusedLens,
     air_rays,
     apparent_depths,
-    apparent_distance_m,
     glass_z_m,
 )
 from camera_calib.fov.stereo import disparity_per_m, stereo_overlap
 from camera_calib.rig import Rig, design_rig
-
-__all__ = [
-    "MATCH_SIGMA_PX", "TRUSTED_FOV_DEG", "BlurRow", "FovChoices", "FovRow", "apparent_distance_m",
-    "blur_table", "fov_table", "json_row", "rig_fov_table",
-]  # fmt: skip
 
 MATCH_SIGMA_PX = 0.3
 """Disparity noise for which the depth precision is stated."""
@@ -41,7 +35,7 @@ TRUSTED_FOV_DEG = 70.0
 
 @dataclass(frozen=True, kw_only=True)
 class FovChoices:
-    """What a table of fields of view is asked for beside lenses, altitudes, water and port."""
+    """What a table of fields of view takes besides lenses, altitudes, water and port."""
 
     coc_px: float = 1.0
     """Largest blur circle that counts as sharp."""
@@ -107,7 +101,7 @@ class FovRow:
     far_altitude_m: float
     """Farthest sharp altitude at the centre; may be inf."""
     depth_of_field_m: float
-    """Far less near, in water."""
+    """Far minus near, in water."""
     frame_near_altitude_m: float
     """As near, but sharp in the whole frame (the port bends the field); NaN when none is."""
     frame_far_altitude_m: float
@@ -219,7 +213,7 @@ def blur_table(
         rows: lenses and altitudes.
         speeds_mps: over ground.
         exposures_s: of the shutter, or of the strobe where that alone lights the scene.
-        allowed_px: blur for which the longest exposure is told.
+        allowed_px: blur for which the longest exposure is given.
 
     Raises:
         ConfigError: a value is out of range.

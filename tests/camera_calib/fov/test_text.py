@@ -80,11 +80,10 @@ def test_the_validation_says_pass_or_fail_and_why(validation: Validation) -> Non
     text = as_text(validation_tables(validation))
     assert text.count("  pass  ") == 6 + 7
     assert "FAIL " not in text
-    for words in ("diagonal/1474", "10 % is reached at 69.6 deg", "not true  3.38 px", "n 1.33"):
-        assert words in text
+    assert "n 1.33" in text and "n 1.34" in text
     rows = validation_csv_rows(validation)
     assert len(rows) == 6 + len(validation.claims)
-    assert {row["verdict"] for row in rows} == {"pass", "true", "not true"}
+    assert {row["verdict"] for row in rows} == {"pass"}
     markdown = as_markdown(validation_tables(validation))
     assert markdown.count("### ") == 3
     widths = {line.count(" | ") for line in markdown.splitlines() if line.startswith("| 40 deg")}
