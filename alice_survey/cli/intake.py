@@ -46,13 +46,13 @@ def import_images(
     from alice_survey.base.executor import default_threads
     from reconstruct.pictures.importing import import_images as work
 
-    work(
+    found = work(
         workspace, folders or [], left=left, right=right, video=video, every_s=every,
         navigation=navigation, clock_offset_s=clock_offset, time_zone=time_zone,
         vertical_datum=vertical_datum, rig=rig, masks=masks, threads=threads or default_threads(),
     )  # fmt: skip
     typer.echo(
-        f"pictures are in {workspace / 'images'}; next: alice-survey reconstruct -w {workspace}"
+        f"{found}\nin {workspace / 'images'}; next: alice-survey reconstruct -w {workspace}"
     )
 
 

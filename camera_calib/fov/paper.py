@@ -132,8 +132,9 @@ def paper_settings() -> tuple[CameraConfig, float, float]:
     return _BARE, _N_PAPER, _ALTITUDE_M
 
 
-def _row(lens_mm: float, camera: CameraConfig = _BARE, n_water: float = _N_PAPER) -> FovRow:
-    """The paper's set-up with the customary circle of confusion."""
+def _row(lens_mm: float, *, in_sea: bool = False) -> FovRow:
+    """The paper's set-up, or behind a port in the sea; the customary circle of confusion."""
+    camera, n_water = (_PORT, _N_SEA) if in_sea else (_BARE, _N_PAPER)
     diagonal_px = math.hypot(camera.width_px, camera.height_px)
     choices = FovChoices(coc_px=diagonal_px / _DIAGONAL_SHARE)
     return fov_table([lens_mm], [_ALTITUDE_M], n_water, camera, choices)[0]
@@ -178,7 +179,7 @@ def _angles(angles: tuple[AngleRow, ...]) -> list[PaperClaim]:
 
 
 def _focus() -> list[PaperClaim]:
-    readings = ((_row(12.5), _IN_PAPER), (_row(12.5, _PORT, _N_SEA), _IN_SEA))
+    readings = ((_row(12.5), _IN_PAPER), (_row(12.5, in_sea=True), _IN_SEA))
     focus = [
         PaperClaim(
             claim="focused at 2 m in water, 1.5 m in air",

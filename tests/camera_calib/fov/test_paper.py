@@ -34,7 +34,7 @@ def test_all_six_values_of_the_papers_table_pass(validation: Validation) -> None
 
 @pytest.mark.parametrize(
     ("printed", "tolerance", "passed"),
-    [("1.4", 0.1, True), ("1.16", 0.01, True), ("1.18", 0.01, False), ("3", 1.0, False)],
+    [("1.2", 0.1, True), ("1.16", 0.01, True), ("1.18", 0.01, False), ("3", 1.0, False)],
 )
 def test_a_value_passes_within_one_unit_of_the_last_digit(
     printed: str, tolerance: float, passed: bool
@@ -71,7 +71,7 @@ def test_claims_depend_on_water_and_limit(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_numbers_of_the_claims(validation: Validation) -> None:
     computed = [claim.computed for claim in validation.claims]
-    wanted = [65.24, 35.54, 0.061, 1.504, 1.519, 1.95, 2.02]
+    wanted = [65.23, 35.48, 0.061, 1.504, 1.519, 1.95, 2.02]
     assert computed == pytest.approx(wanted, abs=0.006)
 
 
