@@ -116,6 +116,11 @@ class FlatPortCamera:
             return float(self.normal[_NORMAL.index(name)])
         return float(getattr(self, name))
 
+    @property
+    def refracts(self) -> bool:
+        """Whether light bends at the port; not so in air, or for a pinhole calibrated in water."""
+        return self.n_water != 1.0 or (self.glass_thickness_m > 0.0 and self.n_glass != 1.0)
+
     def with_parameters(self, values: Mapping[str, float]) -> "FlatPortCamera":
         """The same camera with some of `PARAMETERS` set to other values.
 

@@ -51,9 +51,7 @@ def import_images(
         navigation=navigation, clock_offset_s=clock_offset, time_zone=time_zone,
         vertical_datum=vertical_datum, rig=rig, masks=masks, threads=threads or default_threads(),
     )  # fmt: skip
-    typer.echo(
-        f"{found}\nin {workspace / 'images'}; next: alice-survey reconstruct -w {workspace}"
-    )
+    typer.echo(f"{found}\nin {workspace / 'images'}; next: alice-survey reconstruct -w {workspace}")
 
 
 @app.command(

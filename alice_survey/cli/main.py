@@ -2,7 +2,7 @@
 
 import gc
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -300,19 +300,16 @@ def calibrate(
     From the pool of a survey, or from pictures of a target: chessboard, ChArUco or AprilTag grid.
     Writes the rig with its covariance, the residuals and a report.
     """
-    places = {"left": left, "right": right, "pictures": pictures, "target": target}
-    settings: dict[str, Any] = {
-        "start": start, "known": intrinsics, "port_distance_mm": port_distance, "glass_mm": glass,
-        "glass_sigma_mm": glass_sigma, "n_glass": n_glass, "n_glass_sigma": n_glass_sigma,
-        "n_water": n_water, "n_water_sigma": n_water_sigma, "carry_to_n": carry_to_n,
-    }  # fmt: skip
-    given = [value for value in (*places.values(), output, *settings.values()) if value is not None]
-    if given or water or lens != "opencv5":
-        from camera_calib.calibrate.pictures import calibrate_command
+    from camera_calib.calibrate.from_pictures import CalibrateOptions, calibrate_pictures
 
-        result = calibrate_command(
-            **places, output=output, threads=threads, lens=lens, water=water, **settings
-        )
+    options = CalibrateOptions(
+        left=left, right=right, pictures=pictures, target=target, output=output, lens=lens,
+        water=water, start=start, known=intrinsics, port_distance_mm=port_distance, glass_mm=glass,
+        glass_sigma_mm=glass_sigma, n_glass=n_glass, n_glass_sigma=n_glass_sigma, n_water=n_water,
+        n_water_sigma=n_water_sigma, carry_to_n=carry_to_n,
+    )  # fmt: skip
+    if options != CalibrateOptions():
+        result = calibrate_pictures(options, threads)
     else:
         from alice_survey.survey import run
 

@@ -77,9 +77,9 @@ def held_effect(calibration: Calibration, name: str) -> HeldEffect:
     coupling = information[np.ix_(a, b)].sum(axis=1)
     inner = information[np.ix_(a, a)] * np.outer(scale, scale)
     slopes = -scale * np.linalg.solve(inner, scale * coupling)
-    told = float(information[np.ix_(b, b)].sum() + coupling @ slopes)
+    known = float(information[np.ix_(b, b)].sum() + coupling @ slopes)
     return HeldEffect(
-        sigma=1.0 / math.sqrt(told) if told > 0.0 else math.inf,
+        sigma=1.0 / math.sqrt(known) if known > 0.0 else math.inf,
         slopes=dict(zip(adjusted, slopes.tolist(), strict=True)),
     )
 
@@ -103,7 +103,7 @@ def _line(calibration: Calibration, name: str, error: float) -> str | None:
     if not notable:
         return None
     return (
-        f"{name} is taken as {value(rig, held[0]):g}; these views would tell it to "
+        f"{name} is taken as {value(rig, held[0]):g}; these views would determine it to "
         f"{effect.sigma:.2g} only (sigma), and {error:g} more would move "
         + ", ".join(f"{parameter} by {move:+.2g}" for _, parameter, move in notable)
         + ": measure it apart"

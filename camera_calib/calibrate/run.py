@@ -8,7 +8,7 @@ from alice_survey.base.contents import taken_from
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.manifest import read_manifest
 from camera_calib.calibrate.detect_views import Size, detect_views
-from camera_calib.calibrate.files import finish, tell
+from camera_calib.calibrate.files import finish, warn_of_unseen
 from camera_calib.calibrate.picture_sets import PictureSet
 from camera_calib.calibrate.solve import calibrate_through_ports
 from camera_calib.rig import design_rig
@@ -48,7 +48,7 @@ def run_calibrate(workspace: Path, config: SurveyConfig, threads: int) -> bool:
                 size_m=float(board["square_m"]),
             )
         found = detect_views(_pool_pictures(pool), target, threads)
-        tell(found)
+        warn_of_unseen(found)
         start = design_rig(config.camera, config.water, _scale(found.sizes["left"], config.camera))
         calibration = calibrate_through_ports(found.views, target.points, start, "free")
         finish(folder, calibration, found)

@@ -12,7 +12,7 @@ from alice_survey.base.artefacts import read_json
 from alice_survey.base.errors import CalibrationError, WorkspaceError, warn
 from alice_survey.base.executor import default_threads
 from camera_calib.calibrate.detect_views import Detections, Size, detect_views
-from camera_calib.calibrate.files import finish, summary, tell
+from camera_calib.calibrate.files import finish, summary, warn_of_unseen
 from camera_calib.calibrate.freedom import intrinsics
 from camera_calib.calibrate.numbering import same_numbering
 from camera_calib.calibrate.picture_sets import find_pictures, pair_pictures
@@ -25,7 +25,7 @@ from camera_calib.calibrate.solve import (
     calibrate_through_ports,
     first_cameras,
 )
-from camera_calib.calibrate.told import calibration_text
+from camera_calib.calibrate.text import calibration_text
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.rig import Rig, read_rig, write_rig
 from camera_calib.targets.target import Target, parse_target
@@ -41,13 +41,18 @@ _FRESH_WATER, _GLASS = 1.34, 1.52
 
 
 @dataclass(frozen=True, kw_only=True)
-class PictureCalibration:
-    """What the user says of pictures to calibrate from."""
+class CalibrateOptions:
+    """Pictures to calibrate from, and what is known before."""
 
-    pictures: Mapping[str, str]
-    """Folder or pattern by camera; the first is the reference."""
-    target: str
+    left: str | None = None
+    """Folder or pattern; the left camera is the reference."""
+    right: str | None = None
+    pictures: str | None = None
+    """Those of a single camera, instead."""
+    target: str | None = None
     """As `parse_target` reads it."""
+    output: Path | None = None
+    """Folder to write."""
     lens: str = "opencv5"
     water: bool = False
     """The pictures were taken under water, through the ports."""
@@ -60,7 +65,7 @@ class PictureCalibration:
     glass_mm: float | None = None
     """Thickness."""
     glass_sigma_mm: float | None = None
-    """The thickness is found too, known this well; likewise the indices."""
+    """The thickness is found too, known this well; the indices below in the same way."""
     n_glass: float | None = None
     n_glass_sigma: float | None = None
     n_water: float | None = None
@@ -68,51 +73,32 @@ class PictureCalibration:
     carry_to_n: float | None = None
     """Also write the rig in water of this index."""
 
+    def places(self) -> dict[str, str]:
+        """Folder or pattern by camera; the first is the reference.
 
-def calibrate_command(
-    left: str | None,
-    right: str | None,
-    pictures: str | None,
-    target: str | None,
-    output: Path | None,
-    threads: int | None,
-    **others: Any,
-) -> tuple[str, dict[str, Any]]:
-    """`calibrate_pictures` from the options of the command line.
-
-    Args:
-        left: folder or pattern of the left camera's pictures.
-        right: the right camera's.
-        pictures: of one camera, instead.
-        target: in words, or the path of its file.
-        output: folder to write.
-        threads: cores to use; None for all.
-        others: further fields of `PictureCalibration`.
-
-    Raises:
-        CalibrationError: options are missing or do not go together, or as of `calibrate_pictures`.
-    """
-    places = {"left": left, "right": right, ONE_CAMERA: pictures}
-    given = {camera: place for camera, place in places.items() if place is not None}
-    if not given:
-        raise CalibrationError(
-            "these options are for pictures: give --left and --right, or --pictures; the pool of a "
-            "survey takes none of them"
-        )
-    if pictures is not None and len(given) > 1:
-        raise CalibrationError("give --left and --right, or --pictures, not both")
-    if pictures is None and len(given) == 1:
-        raise CalibrationError("give both --left and --right, or --pictures for a single camera")
-    if target is None:
-        raise CalibrationError("--target is missing: what is seen, such as 'chessboard 9x6 25mm'")
-    if output is None:
-        raise CalibrationError("-o is missing: the folder to write the calibration into")
-    settings = PictureCalibration(pictures=given, target=target, **others)
-    return calibrate_pictures(settings, output, threads or default_threads())
+        Raises:
+            CalibrationError: they are missing or do not go together.
+        """
+        stereo = {"left": self.left, "right": self.right}
+        given = {camera: place for camera, place in stereo.items() if place is not None}
+        if self.pictures is not None:
+            if given:
+                raise CalibrationError("give --left and --right, or --pictures, not both")
+            return {ONE_CAMERA: self.pictures}
+        if len(given) == 1:
+            raise CalibrationError(
+                "give both --left and --right, or --pictures for a single camera"
+            )
+        if not given:
+            raise CalibrationError(
+                "these options are for pictures: give --left and --right, or --pictures; the pool "
+                "of a survey takes none of them"
+            )
+        return given
 
 
 def calibrate_pictures(
-    settings: PictureCalibration, output: Path, threads: int
+    settings: CalibrateOptions, threads: int | None = None
 ) -> tuple[str, dict[str, Any]]:
     """Calibrate from pictures and write a folder of results.
 
@@ -122,15 +108,20 @@ def calibrate_pictures(
     Raises:
         CalibrationError: the pictures, the target or the settings do not give a calibration.
     """
+    places, output = settings.places(), settings.output
+    if settings.target is None:
+        raise CalibrationError("--target is missing: what is seen, such as 'chessboard 9x6 25mm'")
+    if output is None:
+        raise CalibrationError("-o is missing: the folder to write the calibration into")
     _check_output(output, settings.start)
     target = parse_target(settings.target)
     intrinsics(settings.lens)
     start = None if settings.start is None else read_rig(settings.start)
     _check_settings(settings, start)
-    lists = {camera: find_pictures(place) for camera, place in settings.pictures.items()}
+    lists = {camera: find_pictures(place) for camera, place in places.items()}
     with _replacing(output) as partial:
-        found = detect_views(pair_pictures(lists), target, threads)
-        tell(found)
+        found = detect_views(pair_pictures(lists), target, threads or default_threads())
+        warn_of_unseen(found)
         calibration = finish(partial, _calibrated(settings, found, target, start), found)
         _check_sides(calibration.rig)
         if settings.carry_to_n is not None:
@@ -149,7 +140,7 @@ def carried(rig: Rig, n_water: float) -> Rig:
     )
 
 
-def _check_settings(settings: PictureCalibration, start: Rig | None) -> None:
+def _check_settings(settings: CalibrateOptions, start: Rig | None) -> None:
     ports = {
         "--port-distance": settings.port_distance_mm,
         "--glass": settings.glass_mm,
@@ -179,7 +170,7 @@ def _check_settings(settings: PictureCalibration, start: Rig | None) -> None:
 
 
 def _calibrated(
-    settings: PictureCalibration, found: Detections, target: Target, start: Rig | None
+    settings: CalibrateOptions, found: Detections, target: Target, start: Rig | None
 ) -> Calibration:
     points, lens = target.points, settings.lens
     cameras = _first(settings, found.sizes, start)
@@ -210,7 +201,7 @@ def _calibrated(
 
 
 def _first(
-    settings: PictureCalibration, sizes: Mapping[str, Size], start: Rig | None
+    settings: CalibrateOptions, sizes: Mapping[str, Size], start: Rig | None
 ) -> dict[str, FlatPortCamera]:
     """Cameras of the start, or blank ones, in air or behind the port that the user names."""
     if start is not None:
@@ -237,14 +228,14 @@ def _metres(length_mm: float | None) -> float | None:
     return None if length_mm is None else length_mm / 1e3
 
 
-def _bare(camera: FlatPortCamera, _: PictureCalibration) -> FlatPortCamera:
+def _bare(camera: FlatPortCamera, _: CalibrateOptions) -> FlatPortCamera:
     """A camera out of its housing."""
     return replace(
         camera, n_water=1.0, port_distance_m=0.0, glass_thickness_m=0.0, normal=(0.0, 0.0, 1.0)
     )
 
 
-def _behind_port(camera: FlatPortCamera, settings: PictureCalibration) -> FlatPortCamera:
+def _behind_port(camera: FlatPortCamera, settings: CalibrateOptions) -> FlatPortCamera:
     """A camera of the start behind the port and in the water that the user names."""
     given = {
         "glass_thickness_m": _metres(settings.glass_mm),
@@ -282,7 +273,7 @@ def _matching(start: Rig, sizes: Mapping[str, Size]) -> Rig:
     )
 
 
-def _next(calibration: Calibration, output: Path, settings: PictureCalibration) -> list[str]:
+def _next(calibration: Calibration, output: Path, settings: CalibrateOptions) -> list[str]:
     """Where the results are, and what to do with them."""
     rig = shlex.quote(str(output / "rig.json"))
     lines = [f"rig in {output / 'rig.json'}; read {output / 'report.html'}"]
@@ -300,7 +291,7 @@ def _next(calibration: Calibration, output: Path, settings: PictureCalibration) 
 
 
 def _check_sides(rig: Rig) -> None:
-    """Tell when the pictures of the two cameras seem to be swapped."""
+    """Warn when the pictures of the two cameras seem to be swapped."""
     if set(rig.cameras) != {"left", "right"}:
         return
     x, y, z = (1e3 * rig.cam_from_rig["right"].inv().translation).tolist()

@@ -1,4 +1,4 @@
-"""What a calibration has found, in the lines that the command line prints."""
+"""A calibration's result as text."""
 
 import math
 from collections import Counter
@@ -52,22 +52,22 @@ def _baseline_lines(rig: Rig, target: Target) -> Iterator[str]:
 def _camera_lines(rig: Rig, name: str) -> Iterator[str]:
     camera, sigmas = rig.cameras[name], rig.sigmas
 
-    def told(field: str, unit: str, scale: float = 1.0) -> str:
+    def stated(field: str, unit: str, scale: float = 1.0) -> str:
         number, sigma = scale * camera.parameter(field), sigmas.get(f"{name}.{field}")
         if sigma is None:
             return f"{number:.6g}{unit} (held)"
         return f"{with_sigma(number, scale * sigma)}{unit}"
 
-    yield f"{name}: focal lengths {told('fx_px', ' px')}, {told('fy_px', ' px')}"
+    yield f"{name}: focal lengths {stated('fx_px', ' px')}, {stated('fy_px', ' px')}"
     if camera.n_water == 1.0 and camera.port_distance_m == camera.glass_thickness_m == 0.0:
         return
     tilt_deg, sigma_deg = port_tilt_deg(rig, name)
     tilt = f"{tilt_deg:.3g} deg (held)" if sigma_deg is None else with_sigma(tilt_deg, sigma_deg)
     yield (
-        f"{name} port: {told('port_distance_m', ' mm', 1e3)} from the pupil, tilt "
+        f"{name} port: {stated('port_distance_m', ' mm', 1e3)} from the pupil, tilt "
         f"{tilt}{'' if sigma_deg is None else ' deg'}, glass "
-        f"{told('glass_thickness_m', ' mm', 1e3)}, index {told('n_glass', '')}, water "
-        f"{told('n_water', '')}"
+        f"{stated('glass_thickness_m', ' mm', 1e3)}, index {stated('n_glass', '')}, water "
+        f"{stated('n_water', '')}"
     )
 
 
