@@ -90,7 +90,9 @@ class FlatPortCamera:
                     f"camera: {name} = {given:g}: {least:g} to {most:g}{unit} allowed"
                 )
         if abs(math.hypot(*self.normal) - 1) > 1e-6 or self.normal[2] <= 0:
-            raise CalibrationError(f"camera: normal {self.normal} is no unit vector facing forward")
+            raise CalibrationError(
+                f"camera: normal {self.normal} is not a unit vector facing forward"
+            )
 
     @cached_property
     def _lens(self) -> Array:
@@ -247,10 +249,10 @@ def camera_from_json(data: dict[str, Any]) -> FlatPortCamera:
         if name == "normal":
             numbers(value, 3, "camera: normal")
         elif isinstance(value, bool) or not isinstance(value, int | float):
-            raise CalibrationError(f"camera: {name} = {value!r} is no number")
+            raise CalibrationError(f"camera: {name} = {value!r} is not a number")
     for name in ("width_px", "height_px"):
         if not float(data[name]).is_integer():
-            raise CalibrationError(f"camera: {name} = {data[name]:g} is no whole number")
+            raise CalibrationError(f"camera: {name} = {data[name]:g} is not a whole number")
     return FlatPortCamera(**(data | {"normal": tuple(data.get("normal", _FORWARD))}))
 
 

@@ -31,7 +31,7 @@ def water(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Tell index and attenuation of water."""
+    """Show index and attenuation of water."""
     from camera_calib.water import water_report
 
     print_result(*water_report(temperature, salinity, depth, jerlov, wavelength), as_json)
@@ -92,7 +92,7 @@ def residual(
     plot: Annotated[Path | None, typer.Option(help="PNG, PDF or SVG to draw.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Tell what approximations cost.
+    """Show what approximations cost.
 
     Pixels that pinholes after a warp, and COLMAP's cameras without one, are wrong by through this
     port. Distances are from the entrance pupil along the axis.
@@ -127,7 +127,7 @@ def convert(
         typer.Option("--to", metavar="FORMAT", help="rig, opencv, colmap, flatport, kalibr, ros."),
     ] = None,
     image_size: Annotated[
-        tuple[int, int] | None, typer.Option(metavar="W H", help="Pixels, when IN tells none.")
+        tuple[int, int] | None, typer.Option(metavar="W H", help="Pixels, when IN states none.")
     ] = None,
     extrinsics: Annotated[Path | None, typer.Option(help="OpenCV file of R and T.")] = None,
     unit_m: Annotated[float, typer.Option(help="Metres in one unit of IN's translations.")] = 1.0,
@@ -155,16 +155,20 @@ def convert(
 
     OpenCV, COLMAP, Refractive COLMAP (flatport), Kalibr, ROS and rig.json; nothing is lost unasked.
     """
-    from camera_calib.formats.convert import convert_files
+    from camera_calib.formats.convert import Conversion
+    from camera_calib.formats.convert import convert as work
+    from camera_calib.formats.rigs import Reading
 
-    text, data = convert_files(
-        source, target, source_format=source_format, target_format=target_format,
-        image_size=image_size, extrinsics=extrinsics, unit_m=unit_m, camera=camera, names=names,
-        port_distance_mm=port_distance, glass_mm=glass, n_glass=n_glass, n_water=n_water,
-        water=water, model=model, drop_port=drop_port, drop_covariance=drop_covariance,
-        overwrite=overwrite,
+    task = Conversion(
+        source=source, target=target, source_format=source_format, target_format=target_format,
+        reading=Reading(
+            image_size=image_size, extrinsics=extrinsics, metres_per_unit=unit_m, camera=camera
+        ),
+        names=tuple(names.split(",")) if names else (), port_distance_mm=port_distance,
+        glass_mm=glass, n_glass=n_glass, n_water=n_water, water=water, model=model,
+        drop_port=drop_port, drop_covariance=drop_covariance, overwrite=overwrite,
     )  # fmt: skip
-    print_result(text, data, as_json)
+    print_result(*work(task), as_json)
 
 
 @app.command(
@@ -180,7 +184,7 @@ def uncertainty(
     noise: Annotated[float, typer.Option(min=0.0, help="Of a measured coordinate, px.")] = 0.1,
     as_json: AsJson = False,
 ) -> None:
-    """Tell what a calibration's sigmas mean.
+    """Show what a calibration's sigmas mean.
 
     For pixels over the frame, for triangulated points and for lengths, against distance.
     """

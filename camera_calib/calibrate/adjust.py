@@ -45,7 +45,7 @@ class Adjustment:
     rig_from_target: RigidTransform
     """(V,)."""
     residuals_px: Array
-    """(V, cameras, N, 2) projected less measured; NaN where unseen."""
+    """(V, cameras, N, 2) projected minus measured; NaN where unseen."""
     weights: Array
     """(V, cameras, N) robust weights in (0, 1]; NaN where unseen."""
     noise_px: float
@@ -54,7 +54,7 @@ class Adjustment:
     """(V, cameras) noise of each picture over that."""
     steps: int
     is_settled: bool
-    """Whether the last step was as short as asked for."""
+    """Whether the last step was as short as requested."""
 
 
 def stack_views(views: Sequence[TargetView], rig: Rig, count: int) -> Array:

@@ -69,7 +69,7 @@ def _scale(size: Size, camera: CameraConfig) -> int:
     scale = max(round(camera.width_px / width), 1)
     if (camera.width_px // scale, camera.height_px // scale) != (width, height):
         raise CalibrationError(
-            f"the pool's pictures have {width} x {height} px, which is no whole fraction of the "
+            f"the pool's pictures have {width} x {height} px, which is not a whole fraction of the "
             f"camera's {camera.width_px} x {camera.height_px}: set [camera] width_px and height_px"
         )
     return scale

@@ -70,7 +70,7 @@ class PictureFolder:
     masks: tuple[Path, ...]
     """`NAME_mask.png` next to the picture `NAME.*`."""
     left_out: Mapping[str, tuple[Path, ...]]
-    """What is no picture that can be read, by reason."""
+    """What is not a picture that can be read, by reason."""
 
     def warnings(self) -> list[str]:
         """A line for each reason: how many, such as which, and what to do."""
@@ -88,7 +88,7 @@ def look_into(folder: Path, apart: Collection[Path] = ()) -> PictureFolder:
         apart: files and folders that the caller knows; they are not reported as left out.
 
     Raises:
-        ImageError: it is no folder that can be read, or it holds no picture.
+        ImageError: it is not a folder that can be read, or it holds no picture.
     """
     known = {path.resolve() for path in apart}
     try:

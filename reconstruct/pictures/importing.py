@@ -120,7 +120,7 @@ def import_images(
             the tide which `import-log` took off; None for the sea surface.
         rig: `rig.json` of the cameras; its lever arm says that navigation is of the body.
         masks: folder of masks (0 = leave out) with the stems of the pictures, or with a folder per
-            camera; without it `NAME_mask.png` beside a picture is its mask.
+            camera; without it `NAME_mask.png` next to a picture is its mask.
         threads: how many processes.
 
     Returns:
@@ -134,7 +134,7 @@ def import_images(
     """
     _check_sources(folders, left, right, video, every_s)
     if not np.isfinite(clock_offset_s):
-        raise ImageError(f"--clock-offset {clock_offset_s} is no number of seconds")
+        raise ImageError(f"--clock-offset {clock_offset_s} is not a number of seconds")
     zone = find_zone(time_zone)
     logged_level = _checked_level(vertical_datum, navigation)
     given = [*folders, *(p for p in (left, right, video, navigation, rig, masks) if p is not None)]
@@ -279,7 +279,9 @@ def _checked_level(name: str | None, navigation: Path | None) -> str:
             "give --navigation too"
         )
     if not name.strip() or not name.isprintable():
-        raise NavigationError(f"--vertical-datum {name!r} is no name of one line, such as 'NN2000'")
+        raise NavigationError(
+            f"--vertical-datum {name!r} is not a name of one line, such as 'NN2000'"
+        )
     return name.strip()
 
 

@@ -144,7 +144,7 @@ def test_faults_name_file_and_key(tmp_path: Path) -> None:
         "cam0.resolution": fault(path, EXAMPLE.replace("[752, 480]", "[752]", 1)),
         "width": fault(path, EXAMPLE.replace("[752, 480]", "[752.5, 480]", 1)),
         "lacks cam1.T_cn_cnm1": fault(path, EXAMPLE.replace("T_cn_cnm1", "T_c1_c0", 1)),
-        "cam1.T_cn_cnm1 is no rotation": fault(path, EXAMPLE.replace("[0.0, -1.0", "[0.0, 1.0")),
+        "cam1.T_cn_cnm1 is not a rotation": fault(path, EXAMPLE.replace("[0.0, -1.0", "[0.0, 1.0")),
         "row 0 0 0 1": fault(
             path, EXAMPLE.replace("1.0]\n  rostopic: /s", "2.0]\n  rostopic: /s")
         ),

@@ -165,7 +165,7 @@ def test_faults_name_file_and_key(tmp_path: Path) -> None:
             path, GOOD + "port:\n   normal: [ 0., 0., 1. ]\n   port_distance_m: 0.02\n"
             "   glass_thickness_m: 0.01\n   n_glass: 1.5\n   n_water: many\n",
         ),
-        "is no rotation": fault(
+        "is not a rotation": fault(
             path,
             GOOD.replace("camera_matrix", "M1") + f"M2: {MATRIX}{matrix}\n"
             f"R: {MATRIX}[ 1., 0., 0., 0., 2., 0., 0., 0., 1. ]\nT: [ 1., 0., 0. ]\n",

@@ -214,7 +214,7 @@ def test_faults_name_file_and_key(tmp_path: Path) -> None:
             path, SAMPLE.replace("4827.94, 0,", "4827.94, 1,", 1)
         ),
         "camera name 'a b'": fault(path, SAMPLE.replace("prosilica", "a b")),
-        "projection_matrix is no 3 x 4": fault(path, SAMPLE.replace("cols: 4", "cols: 3")),
+        "projection_matrix is not a 3 x 4": fault(path, SAMPLE.replace("cols: 4", "cols: 3")),
     }  # fmt: skip
     for words, shown in faults.items():
         assert words in shown
@@ -230,5 +230,5 @@ def test_faults_name_file_and_key(tmp_path: Path) -> None:
     (folder / "b.yaml").write_text(
         moved.replace("prosilica", "other").replace("[1, 0, 0, 0, 1", "[1, 0, 0, 0, 3")
     )
-    with pytest.raises(CalibrationError, match=r"b\.yaml: rectification_matrix is no rotation"):
+    with pytest.raises(CalibrationError, match=r"b\.yaml: rectification_matrix is not a rotation"):
         read_ros(folder, Reading())
