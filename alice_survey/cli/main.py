@@ -18,6 +18,7 @@ from alice_survey.cli.options import (
     Threads,
     Workspace,
     examples,
+    executor_of,
     print_result,
     with_sessions,
 )
@@ -207,7 +208,7 @@ def image(
     """
     from alice_survey.survey import run
 
-    print_result(*run(["pool", "images"], workspace, survey, scale, threads), as_json)
+    print_result(*run(["pool", "images"], workspace, survey, scale, executor_of(threads)), as_json)
 
 
 @app.command(
@@ -309,11 +310,11 @@ def calibrate(
         n_water_sigma=n_water_sigma, carry_to_n=carry_to_n,
     )  # fmt: skip
     if options != CalibrateOptions():
-        result = calibrate_pictures(options, threads)
+        result = calibrate_pictures(options, executor_of(threads))
     else:
         from alice_survey.survey import run
 
-        result = run(["calibration"], workspace, survey, None, threads)
+        result = run(["calibration"], workspace, survey, None, executor_of(threads))
     print_result(*result, as_json)
 
 
@@ -332,7 +333,7 @@ def run_all(
     """
     from alice_survey.survey import LOOP, run
 
-    print_result(*run(LOOP, workspace, survey, scale, threads), as_json)
+    print_result(*run(LOOP, workspace, survey, scale, executor_of(threads)), as_json)
 
 
 @app.command(epilog=examples("demo", "demo -w demo --threads 2"))
@@ -345,7 +346,7 @@ def demo(
     """
     from alice_survey.survey import run_demo
 
-    print_result(*run_demo(workspace, threads), as_json)
+    print_result(*run_demo(workspace, executor_of(threads)), as_json)
 
 
 @app.command(epilog=examples("status -w reef", "status -w reef --json"))

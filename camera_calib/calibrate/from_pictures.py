@@ -14,7 +14,7 @@ import numpy as np
 
 from alice_survey.base.artefacts import read_json
 from alice_survey.base.errors import CalibrationError, WorkspaceError, warn
-from alice_survey.base.executor import default_threads
+from alice_survey.base.executor import Executor, local_executor
 from camera_calib.calibrate.detect_views import Detections, Size, detect_views
 from camera_calib.calibrate.files import finish, summary, warn_of_unseen
 from camera_calib.calibrate.freedom import intrinsics
@@ -104,7 +104,7 @@ class CalibrateOptions:
 
 
 def calibrate_pictures(
-    settings: CalibrateOptions, threads: int | None = None
+    settings: CalibrateOptions, executor: Executor | None = None
 ) -> tuple[str, dict[str, Any]]:
     """Calibrate from pictures and write a folder of results.
 
@@ -126,7 +126,7 @@ def calibrate_pictures(
     _check_settings(settings, start)
     lists = {camera: find_pictures(place) for camera, place in places.items()}
     with _replacing(output) as partial:
-        found = detect_views(pair_pictures(lists), target, threads or default_threads())
+        found = detect_views(pair_pictures(lists), target, executor or local_executor())
         warn_of_unseen(found)
         calibration = finish(partial, _calibrated(settings, found, target, start), found)
         _check_sides(calibration.rig)

@@ -2,9 +2,9 @@
 
 Index of the water, index and thickness of the glass are held (or known before). How far could the
 views have determined them, and how far does a small error in one of them move what is calibrated?
-Both follow from the information matrix S of all parameters, with a the adjusted ones and b the held one,
-the same for all cameras: the views know b with the information S_bb - S_ba S_aa^-1 S_ab, and an
-error of it moves a by -S_aa^-1 S_ab.
+Both follow from the information matrix S of all parameters, with a the adjusted ones and b the held
+one, the same for all cameras: the views know b with the information S_bb - S_ba S_aa^-1 S_ab, and
+an error of it moves a by -S_aa^-1 S_ab.
 """
 
 import math

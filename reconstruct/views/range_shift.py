@@ -67,7 +67,7 @@ class RangeShift:
 
     @property
     def arguments(self) -> tuple[NDArray[np.float64], float, float, float]:
-        """What kernels take: nodes, width, height and inverse working depth."""
+        """What kernels take of it; see `sight.KernelLens`."""
         return self.nodes, self.width_px, self.height_px, self.inverse_working
 
     def _shift(self, pixels: Array, depth: Array | float) -> Array:
