@@ -33,7 +33,7 @@ from camera_calib.calibrate.freedom import (
     pose_names,
     value,
 )
-from camera_calib.calibrate.normal_equations import Problem
+from camera_calib.calibrate.normal_equations import CalibrationProblem
 from camera_calib.calibrate.result import TargetView
 from camera_calib.calibrate.solve import Intrinsics, calibrate_through_ports
 from camera_calib.judge.uncertainty import baseline_sigma_m
@@ -172,7 +172,7 @@ def cramer_rao(
         CalibrationError: the views do not determine a parameter.
     """
     pixels = np.where(seen[..., None], 0.0, np.nan)
-    problem = Problem(pixels, points, rig, freedom)
+    problem = CalibrationProblem(pixels, points, rig, freedom)
     state = problem.state(rig, rig_from_target)
     weights = np.where(problem.seen, 1.0 / noise_px**2, 0.0)
     return problem.covariance(problem.equations(state, weights))
@@ -223,7 +223,7 @@ def run_trial(seed: int, known: Intrinsics) -> Trial:
 
 def _first_order(views: Sequence[TargetView], poses: RigidTransform, freedom: Freedom) -> Array:
     """The step of Gauss and Newton from the truth: its covariance is the bound."""
-    problem = Problem(stack_views(views, _TRUTH, len(BOARD)), BOARD, _TRUTH, freedom)
+    problem = CalibrationProblem(stack_views(views, _TRUTH, len(BOARD)), BOARD, _TRUTH, freedom)
     weights = np.where(problem.seen, _NOISE_PX**-2.0, 0.0)
     equations = problem.equations(problem.state(_TRUTH, poses), weights)
     by_poses = np.linalg.solve(equations.view, equations.view_slope[..., None])[..., 0]

@@ -156,11 +156,11 @@ def convert(
     """
     from camera_calib.formats.convert import Conversion
     from camera_calib.formats.convert import convert as work
-    from camera_calib.formats.rigs import Reading
+    from camera_calib.formats.rigs import ReadOptions
 
     task = Conversion(
         source=source, target=target, source_format=source_format, target_format=target_format,
-        reading=Reading(
+        reading=ReadOptions(
             image_size=image_size, extrinsics=extrinsics, metres_per_unit=unit_m, camera=camera
         ),
         names=tuple(names.split(",")) if names else (), port_distance_mm=port_distance,

@@ -18,7 +18,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from camera_calib.calibrate.freedom import Freedom
-from camera_calib.calibrate.normal_equations import Equations, Flags, Problem, State
+from camera_calib.calibrate.normal_equations import CalibrationProblem, Equations, Flags, State
 from camera_calib.calibrate.result import TargetView
 from camera_calib.rig import Rig
 
@@ -112,7 +112,7 @@ def adjust(
     return problem.solve(problem.state(start, rig_from_target), settled, at_most)
 
 
-class _Solver(Problem):
+class _Solver(CalibrationProblem):
     """Steps down to the least robust loss."""
 
     blur: Array = np.ones((1, 1, 1))

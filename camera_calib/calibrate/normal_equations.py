@@ -56,7 +56,7 @@ class Equations:
     """(V, 6)."""
 
 
-class Problem:
+class CalibrationProblem:
     """Measured pixels, and which parameters explain them."""
 
     def __init__(self, pixels: Array, points: Array, rig: Rig, freedom: Freedom) -> None:

@@ -17,7 +17,7 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.base.frames import Array
 from camera_calib.calibrate.adjust import stack_views
 from camera_calib.calibrate.freedom import Freedom, of_cameras, value
-from camera_calib.calibrate.normal_equations import Problem
+from camera_calib.calibrate.normal_equations import CalibrationProblem
 from camera_calib.calibrate.result import Calibration
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.rig import Covariance, Rig
@@ -90,7 +90,7 @@ def held_effect(calibration: Calibration, name: str) -> HeldEffect:
     held = of_cameras(rig, [name])
     wider = Freedom(free=(*freedom.free, *held), prior=freedom.prior)
     pixels = stack_views(calibration.views, rig, len(calibration.target_points))
-    problem = Problem(pixels, calibration.target_points, rig, wider)
+    problem = CalibrationProblem(pixels, calibration.target_points, rig, wider)
     weights = np.where(problem.seen, calibration.sigma_px[..., None] ** -2.0, 0.0)
     state = problem.state(rig, calibration.rig_from_target)
     information = problem.information(problem.equations(state, weights))

@@ -36,7 +36,7 @@ from camera_calib.formats.camera_files import (
 from camera_calib.formats.documents import read_json_fields
 from camera_calib.formats.fields import Fields, read_bytes, read_text
 from camera_calib.formats.opencv_model import behind_port
-from camera_calib.formats.rigs import Reading, assemble
+from camera_calib.formats.rigs import ReadOptions, assemble
 from camera_calib.rig import Rig
 
 CAMERA_FILES = ("cameras.bin", "cameras.txt")
@@ -52,7 +52,7 @@ _Sensor = tuple[int, int, tuple[float, ...]]
 _REFERENCE = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def read_colmap(path: Path, reading: Reading) -> Rig:
+def read_colmap(path: Path, reading: ReadOptions) -> Rig:
     """Read a model's cameras, of COLMAP or Refractive COLMAP, and what ties them to a rig.
 
     Args:
@@ -234,7 +234,7 @@ def _model_ties(file: Path, records: Sequence[CameraRecord]) -> list[_Tie]:
     return []
 
 
-def _from_config_alone(path: Path, reading: Reading) -> Rig:
+def _from_config_alone(path: Path, reading: ReadOptions) -> Rig:
     file = path / RIG_CONFIG if path.is_dir() else path
     entries = _entries(file)
     size = reading.size(file)

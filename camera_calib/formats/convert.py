@@ -19,12 +19,19 @@ from camera_calib.formats.registry import (
     PORT,
     PRISM,
     RATIONAL,
-    Format,
+    CalibrationFormat,
     detect,
     format_named,
     of_target,
 )
-from camera_calib.formats.rigs import UNKNOWN_MOUNT, Reading, only, referenced, renamed, with_port
+from camera_calib.formats.rigs import (
+    UNKNOWN_MOUNT,
+    ReadOptions,
+    only,
+    referenced,
+    renamed,
+    with_port,
+)
 from camera_calib.rig import Rig
 
 _TERMS = {K3: ("k3",), RATIONAL: ("k4", "k5", "k6"), PRISM: ("s1", "s2", "s3", "s4")}
@@ -40,7 +47,7 @@ class Conversion:
     source_format: str | None = None
     """By name; found from the file when None."""
     target_format: str | None = None
-    reading: Reading = field(default_factory=Reading)
+    reading: ReadOptions = field(default_factory=ReadOptions)
     names: tuple[str, ...] = ()
     """New names of the cameras, in order."""
     port_distance_mm: float | None = None
@@ -130,7 +137,7 @@ def convert(task: Conversion) -> tuple[str, dict[str, Any]]:
     return _summary(source, target, rig, written, prices)
 
 
-def read_as(source: Format, path: Path, reading: Reading) -> Rig:
+def read_as(source: CalibrationFormat, path: Path, reading: ReadOptions) -> Rig:
     """Read a rig; of several cameras only the one wanted, when one is named.
 
     Raises:
@@ -146,7 +153,7 @@ def read_as(source: Format, path: Path, reading: Reading) -> Rig:
     return rig
 
 
-def fitted(rig: Rig, target: Format, task: Conversion) -> tuple[Rig, list[str]]:
+def fitted(rig: Rig, target: CalibrationFormat, task: Conversion) -> tuple[Rig, list[str]]:
     """The part of a rig that a format holds, and notes of what was left out as requested.
 
     Raises:
@@ -212,8 +219,8 @@ def _port_words(camera: FlatPortCamera) -> str:
 
 
 def _summary(
-    source: Format,
-    target: Format,
+    source: CalibrationFormat,
+    target: CalibrationFormat,
     rig: Rig,
     written: Sequence[Path],
     prices: Mapping[str, Price],

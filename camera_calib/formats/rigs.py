@@ -19,7 +19,7 @@ UNKNOWN_MOUNT = RigidTransform.from_components([0.0, 0.0, 0.0], BODY_FROM_NADIR_
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reading:
+class ReadOptions:
     """What a file may leave open."""
 
     image_size: tuple[int, int] | None = None
@@ -44,7 +44,7 @@ class Reading:
 
 def assemble(
     path: Path,
-    reading: Reading,
+    reading: ReadOptions,
     tool: str,
     names: Sequence[str],
     cameras: Sequence[FlatPortCamera],
@@ -167,7 +167,7 @@ def with_port(rig: Rig, port: Mapping[str, Any]) -> Rig:
     )
 
 
-def _scaled(pose: RigidTransform, reading: Reading) -> RigidTransform:
+def _scaled(pose: RigidTransform, reading: ReadOptions) -> RigidTransform:
     return RigidTransform.from_components(
         np.asarray(pose.translation) * reading.metres_per_unit, pose.rotation
     )

@@ -97,7 +97,7 @@ class PaperClaim:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Validation:
+class PaperValidation:
     """Everything of the paper's optics that can be checked."""
 
     table: tuple[PaperCheck, ...]
@@ -121,10 +121,10 @@ class Validation:
         }
 
 
-def validate_paper() -> Validation:
+def validate_paper() -> PaperValidation:
     """Check the table, the 70 degrees, the focus and the depth of field."""
     angles = tuple(angle_table(_PORT, _N_SEA, altitude_m=_ALTITUDE_M))
-    return Validation(table=_table(), claims=(*_angles(angles), *_focus()), angles=angles)
+    return PaperValidation(table=_table(), claims=(*_angles(angles), *_focus()), angles=angles)
 
 
 def paper_settings() -> tuple[CameraConfig, float, float]:

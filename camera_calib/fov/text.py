@@ -9,7 +9,7 @@ from typing import Any
 
 from alice_survey.base.text_table import text_table
 from camera_calib.fov.angles import RELIEF, AngleRow
-from camera_calib.fov.paper import PAPER_RULE, PaperCheck, PaperClaim, Validation
+from camera_calib.fov.paper import PAPER_RULE, PaperCheck, PaperClaim, PaperValidation
 from camera_calib.fov.table import TRUSTED_FOV_DEG, BlurRow, FovRow
 
 
@@ -54,7 +54,7 @@ def fov_csv_rows(rows: Sequence[FovRow], blur: Sequence[BlurRow]) -> list[dict[s
     ]
 
 
-def validation_csv_rows(validation: Validation) -> list[dict[str, Any]]:
+def validation_csv_rows(validation: PaperValidation) -> list[dict[str, Any]]:
     """Every check and claim, flat."""
     checks = [
         {
@@ -86,7 +86,7 @@ def fov_tables(rows: Sequence[FovRow], blur: Sequence[BlurRow] = ()) -> list[Tex
     return [_footprints(rows), _focus(rows), *([_blur(blur)] if blur else [])]
 
 
-def validation_tables(validation: Validation) -> list[TextTable]:
+def validation_tables(validation: PaperValidation) -> list[TextTable]:
     """The paper's table, its claims, and the flat port against the angle."""
     return [_checks(validation.table), _claims(validation.claims), angles_table(validation.angles)]
 

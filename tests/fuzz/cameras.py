@@ -45,9 +45,9 @@ def _write(name: str, file: str, rig: Callable[[], Rig]) -> Callable[[Path], Non
 def read_calibration(path: Path) -> object:
     """As `camera convert` and `calibrate --from`: of whatever format it looks like."""
     from camera_calib.formats.registry import detect
-    from camera_calib.formats.rigs import Reading
+    from camera_calib.formats.rigs import ReadOptions
 
-    return detect(path).read(path, Reading(image_size=(640, 480), camera="1"))
+    return detect(path).read(path, ReadOptions(image_size=(640, 480), camera="1"))
 
 
 def _read_folder(path: Path) -> object:

@@ -16,7 +16,7 @@ from alice_survey.base.errors import AliceError, CalibrationError
 from alice_survey.cli.main import main
 from camera_calib.formats.convert import Conversion, convert, in_water
 from camera_calib.formats.registry import FORMATS, detect
-from camera_calib.formats.rigs import Reading, only, renamed, with_port
+from camera_calib.formats.rigs import ReadOptions, only, renamed, with_port
 from camera_calib.rig import Rig, design_rig, read_rig, write_rig
 from tests.strategies_formats import assert_same_geometry, covariance_of
 
@@ -49,7 +49,7 @@ def convert_files(
     camera: str | None = None,
     **options: Any,
 ) -> tuple[str, dict[str, Any]]:
-    reading = Reading(
+    reading = ReadOptions(
         image_size=image_size, extrinsics=extrinsics, metres_per_unit=unit_m, camera=camera
     )
     return convert(Conversion(source=source, target=target, reading=reading, **options))
@@ -343,9 +343,9 @@ def test_the_command_converts_and_names_faults(
 
 
 def _reading() -> Any:
-    from camera_calib.formats.rigs import Reading
+    from camera_calib.formats.rigs import ReadOptions
 
-    return Reading()
+    return ReadOptions()
 
 
 def _wet(name: str) -> Rig:

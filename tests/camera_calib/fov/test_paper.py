@@ -4,18 +4,18 @@ from dataclasses import replace
 import pytest
 
 from alice_survey.base.config import CameraConfig
-from camera_calib.fov.paper import PAPER_TABLE, PaperCheck, Validation, validate_paper
+from camera_calib.fov.paper import PAPER_TABLE, PaperCheck, PaperValidation, validate_paper
 from camera_calib.fov.table import FovChoices, fov_table
 
 NO_PORT = CameraConfig(port_distance_m=0.0, glass_thickness_m=0.0)
 
 
 @pytest.fixture(scope="module")
-def validation() -> Validation:
+def validation() -> PaperValidation:
     return validate_paper()
 
 
-def test_all_six_values_of_the_papers_table_pass(validation: Validation) -> None:
+def test_all_six_values_of_the_papers_table_pass(validation: PaperValidation) -> None:
     computed = {(c.lens_mm, c.quantity): c.computed for c in validation.table}
     assert computed == pytest.approx(
         {
@@ -45,7 +45,9 @@ def test_a_value_passes_within_one_unit_of_the_last_digit(
     assert check.passed is passed
 
 
-def test_the_validation_can_fail(monkeypatch: pytest.MonkeyPatch, validation: Validation) -> None:
+def test_the_validation_can_fail(
+    monkeypatch: pytest.MonkeyPatch, validation: PaperValidation
+) -> None:
     assert validation.passed
     claim = replace(validation.claims[0], most=60.0)
     assert not replace(validation, claims=(claim,)).passed
@@ -69,7 +71,7 @@ def test_claims_depend_on_water_and_limit(monkeypatch: pytest.MonkeyPatch) -> No
     }
 
 
-def test_numbers_of_the_claims(validation: Validation) -> None:
+def test_numbers_of_the_claims(validation: PaperValidation) -> None:
     computed = [claim.computed for claim in validation.claims]
     wanted = [65.23, 35.48, 0.061, 1.504, 1.519, 1.95, 2.02]
     assert computed == pytest.approx(wanted, abs=0.006)
@@ -93,7 +95,7 @@ def test_one_pixel_gives_a_quarter_of_the_claimed_depth() -> None:
     assert row.depth_of_field_m == pytest.approx(0.57, abs=0.005)
 
 
-def test_json_holds_every_part(validation: Validation) -> None:
+def test_json_holds_every_part(validation: PaperValidation) -> None:
     data = json.loads(json.dumps(validation.to_json(), allow_nan=False))
     assert data["passed"] is True
     assert [row["tolerance"] for row in data["table"]] == [0.1, 0.01, 0.01, 0.01, 0.1, 0.01]

@@ -7,7 +7,7 @@ import pytest
 from alice_survey.base.config import CameraConfig
 from alice_survey.base.errors import ConfigError
 from camera_calib.fov.angles import angle_table
-from camera_calib.fov.paper import Validation, validate_paper
+from camera_calib.fov.paper import PaperValidation, validate_paper
 from camera_calib.fov.plot import draw_fov
 from camera_calib.fov.table import FovChoices, blur_table, fov_table
 from camera_calib.fov.text import (
@@ -26,7 +26,7 @@ NO_PORT = CameraConfig(port_distance_m=0.0, glass_thickness_m=0.0)
 
 
 @pytest.fixture(scope="module")
-def validation() -> Validation:
+def validation() -> PaperValidation:
     return validate_paper()
 
 
@@ -76,7 +76,7 @@ def test_csv_has_each_lens_altitude_speed_and_exposure_once() -> None:
     assert as_csv([]) == "\n"
 
 
-def test_the_validation_says_pass_or_fail_and_why(validation: Validation) -> None:
+def test_the_validation_says_pass_or_fail_and_why(validation: PaperValidation) -> None:
     text = as_text(validation_tables(validation))
     assert text.count("pass") >= 6 + 7
     assert "FAIL " not in text
