@@ -22,7 +22,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from alice_survey.base.compiled import compiled
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from reconstruct.matching.features import load_features
 from reconstruct.matching.matches import Matches
@@ -84,7 +84,7 @@ def refine_tracks(
     greys: Sequence[Path],
     pairs: Sequence[tuple[int, int, Matches]],
     *,
-    threads: int,
+    executor: Executor,
 ) -> RefinedFeatures:
     """Align every observation of a track with the track's reference.
 
@@ -95,7 +95,7 @@ def refine_tracks(
         features: files of the features of every picture.
         greys: files of the evened pictures, (H, W) bytes as `numpy.save` writes them.
         pairs: indices of two pictures and (K, 2) verified matches.
-        threads: how many processes.
+        executor: where tasks run.
     """
     pixels = [load_features(path).pixels for path in features]
     starts = np.concatenate([[0], np.cumsum([len(p) for p in pixels])]).astype(np.int64)
@@ -103,7 +103,7 @@ def refine_tracks(
     tasks = _tasks(pixels, starts, reference, pairs, greys)
     together = np.concatenate([np.zeros((0, 2)), *pixels])
     tracked = moved = 0
-    for nodes, found in parallel_map(align, tasks, threads=threads, label="sub-pixel positions"):
+    for nodes, found in executor.map(align, tasks, label="sub-pixel positions"):
         good = np.isfinite(found[:, 0])
         together[nodes[good]] = found[good]
         tracked += len(nodes)
