@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 
 from alice_survey.base.artefacts import Stage, atomic_path, run_stage, write_json
-from alice_survey.base.config import SurveyConfig
+from alice_survey.base.config import ReconstructConfig
 from alice_survey.base.errors import ImageError, WorkspaceError, warn
 from alice_survey.base.executor import kept_workers, parallel_map
 from alice_survey.base.frames import Datum
@@ -78,7 +78,12 @@ class _FeatureTask:
 
 
 def run_mapping(
-    workspace: Path, inputs: Inputs, files: Sequence[Path], config: SurveyConfig, threads: int
+    workspace: Path,
+    inputs: Inputs,
+    files: Sequence[Path],
+    settings: ReconstructConfig,
+    seed: int,
+    threads: int,
 ) -> bool:
     """Write `mapping/`.
 
@@ -86,18 +91,18 @@ def run_mapping(
         workspace: folder of the survey.
         inputs: pictures and what is known of them.
         files: what `inputs` was read from, and the pictures.
-        config: settings.
+        settings: of the reconstruction.
+        seed: of the mapper.
         threads: how many processes.
 
     Returns:
         Whether there was anything to do.
     """
-    settings = config.reconstruct
     stage = Stage(
         name="mapping",
         version=4,
         settings={
-            "seed": config.seed,
+            "seed": seed,
             **settings.model_dump(
                 mode="json",
                 include={
@@ -117,10 +122,10 @@ def run_mapping(
     @kept_workers()
     def work(partial: Path) -> None:
         pycolmap.logging.minloglevel = 2  # its own account of every step is for its developers
-        features = _find_all(inputs, partial / "features", config, threads)
-        lenses, distances = _lenses(inputs, features, config, threads)
+        features = _find_all(inputs, partial / "features", settings, threads)
+        lenses, distances = _lenses(inputs, features, settings, threads)
         cameras, exif_focal = _cameras(inputs, lenses)
-        pairs = _match_all(inputs, features, cameras, lenses, config.seed, threads)
+        pairs = _match_all(inputs, features, cameras, lenses, seed, threads)
         refined = refine_tracks(
             features,
             [_grey_file(path) for path in features],
@@ -143,7 +148,7 @@ def run_mapping(
                 poses,
                 lenses,
                 partial,
-                config.seed,
+                seed,
                 method=settings.mapper,
                 threads=threads,
             )
@@ -162,7 +167,7 @@ def run_mapping(
                     mapped, refracted = refract(mapped, seen, partial, adjust, poses)
             sigmas = adjust.sigmas
         else:
-            mapped = map_self_calibrated(seen, exif_focal, partial, config.seed)
+            mapped = map_self_calibrated(seen, exif_focal, partial, seed)
             refracted, sigmas, rig = None, None, None
         save_uncertainty(partial, mapped, seen, rig, sigmas)
         _write(partial, inputs, mapped, distances, refracted)
@@ -189,7 +194,9 @@ def _grey_file(features: Path) -> Path:
     return features.with_suffix(".npy")
 
 
-def _find_all(inputs: Inputs, folder: Path, config: SurveyConfig, threads: int) -> list[Path]:
+def _find_all(
+    inputs: Inputs, folder: Path, settings: ReconstructConfig, threads: int
+) -> list[Path]:
     """Files of features, in the order of the pictures."""
     targets = [folder / f"{i:06d}.npz" for i in range(len(inputs.records))]
     tasks = [
@@ -197,8 +204,8 @@ def _find_all(inputs: Inputs, folder: Path, config: SurveyConfig, threads: int) 
             picture=inputs.images / record.image,
             mask=inputs.images / record.mask if record.mask else None,
             target=target,
-            scale=config.reconstruct.feature_scale,
-            most=config.reconstruct.max_features,
+            scale=settings.feature_scale,
+            most=settings.max_features,
             thrifty=inputs.rig is not None,
         )
         for record, target in zip(inputs.records, targets, strict=True)
@@ -212,7 +219,7 @@ def _find_all(inputs: Inputs, folder: Path, config: SurveyConfig, threads: int) 
 
 
 def _lenses(
-    inputs: Inputs, features: Sequence[Path], config: SurveyConfig, threads: int
+    inputs: Inputs, features: Sequence[Path], settings: ReconstructConfig, threads: int
 ) -> tuple[dict[str, Lens], WorkingDistances | None]:
     """The pinholes that stand in for calibrated cameras; none without a rig."""
     if inputs.rig is None:
@@ -221,7 +228,7 @@ def _lenses(
         inputs.records,
         features,
         inputs.rig,
-        given_m=config.reconstruct.working_range_m,
+        given_m=settings.working_range_m,
         ratio=RATIO,
         threads=threads,
     )

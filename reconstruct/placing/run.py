@@ -65,7 +65,7 @@ def run_sparse(workspace: Path, config: SurveyConfig, threads: int) -> bool:
         ReconstructionError: the pictures give no model.
     """
     inputs, survey, files = read_inputs(workspace)
-    mapped = run_mapping(workspace, inputs, files, config, threads)
+    mapped = run_mapping(workspace, inputs, files, config.reconstruct, config.seed, threads)
     mapping = workspace / "mapping"
     if not mapping.is_dir():  # only checking
         return True

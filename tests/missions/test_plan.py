@@ -16,7 +16,7 @@ from alice_survey.base.errors import AliceError, PlanError
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import stations_of_plan
-from missions.exports.footprints import footprint_outline, footprints_ne
+from missions.exports.geometry import footprint_outline, footprints_ne
 from missions.plan.planner import plan_survey
 from missions.plan.run import run_plan
 from missions.values.footprint import common_swath

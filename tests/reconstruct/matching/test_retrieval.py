@@ -49,7 +49,9 @@ def test_vectors_equal_those_of_the_slow_twin(tmp_path: Path) -> None:
     words = make_codebook(files, seed=4)
     with np.load(files[1]) as data:
         slow = vlad_slowly(data["descriptors"], words)
-    np.testing.assert_allclose(describe(_WordsTask(features=files[1], words=words)), slow, atol=1e-5)
+    np.testing.assert_allclose(
+        describe(_WordsTask(features=files[1], words=words)), slow, atol=1e-5
+    )
 
 
 def test_a_picture_without_features_looks_like_nothing(tmp_path: Path) -> None:
