@@ -252,7 +252,7 @@ def test_labels_beyond_65535_stay_apart(
     monkeypatch.setattr(run, "write_tiles", write_all)
     for name in ("images", "sparse", "dense"):
         (tmp_path / name).symlink_to(workspace / name)
-    assert run_mosaic(tmp_path, CONFIG, 1)
+    assert run_mosaic(tmp_path, CONFIG, SERIAL)
     sources = []
     for folder in (workspace, tmp_path):
         with rasterio.open(folder / "mosaic" / "mosaic_source.tif") as raster:
