@@ -28,8 +28,7 @@ from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, Datum
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
 from benchmarks.measured import Cost, measured, python
-from reconstruct.dense.dem import DemGrid
-from reconstruct.raster import tiled_raster, tiles_of
+from reconstruct.raster import DemGrid, tiled_raster, tiles_of
 from reconstruct.views.model import WorldFrame, write_frame
 
 PIXEL_M, CELL_M = 0.001, 0.0025
@@ -44,8 +43,9 @@ _MOST_MIB = 1536.0
 _RUN = (
     "import sys; from pathlib import Path; from alice_survey.base.config import ReconstructConfig, "
     "SurveyConfig; from reconstruct.mosaic.run import run_mosaic; "
+    "from alice_survey.base.executor import local_executor; "
     "run_mosaic(Path(sys.argv[1]), SurveyConfig(reconstruct=ReconstructConfig("
-    f"mosaic_pixel_m={PIXEL_M})), int(sys.argv[2]))"
+    f"mosaic_pixel_m={PIXEL_M})), local_executor(int(sys.argv[2])))"
 )
 
 

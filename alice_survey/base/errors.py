@@ -14,12 +14,22 @@ Level = Literal["note", "warning"]
 Show = Callable[[Level, str], None]
 
 _listeners: ContextVar[tuple[list[str], ...]] = ContextVar("listeners", default=())
+_collector: ContextVar[Show | None] = ContextVar("collector", default=None)
 _shows: list[Show] = []
 """Where notes and warnings go, the last one; to standard error while there is none."""
 
 
 class AliceError(Exception):
-    """A fault the user can mend; the command line prints it as one line and exits with 1."""
+    """A fault the user can mend; the command line prints it as one line and exits with 1.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> try:
+        ...     alice.load_config("nowhere.toml")
+        ... except alice.AliceError as error:
+        ...     print(type(error).__name__)
+        ConfigError
+    """
 
     def __str__(self) -> str:
         """The line, without what names in files could do to a terminal."""
@@ -99,7 +109,10 @@ def outliving() -> Iterator[None]:
 
 
 def _show(level: Level, text: str) -> None:
-    if _shows:
+    collect = _collector.get()
+    if collect is not None:
+        collect(level, text)
+    elif _shows:
         _shows[-1](level, text)
     else:
         say(f"warning: {text}" if level == "warning" else text)
@@ -113,6 +126,21 @@ def shown_by(show: Show) -> Iterator[None]:
         yield
     finally:
         _shows.remove(show)
+
+
+@contextlib.contextmanager
+def collected_by(collect: Show) -> Iterator[None]:
+    """Have notes and warnings of this task alone given to a function: they go with its result."""
+    token = _collector.set(collect)
+    try:
+        yield
+    finally:
+        _collector.reset(token)
+
+
+def is_in_task() -> bool:
+    """Whether this is the work of a task, whose notes and warnings are collected."""
+    return _collector.get() is not None
 
 
 @contextlib.contextmanager

@@ -6,10 +6,13 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 from typer.models import ArgumentInfo
+
+if TYPE_CHECKING:
+    from alice_survey.base.executor import Executor
 
 CONTEXT = {"help_option_names": ["-h", "--help"]}
 
@@ -42,6 +45,13 @@ Folder = Annotated[
     Path | None, typer.Argument(metavar="WORKSPACE", help="The same as -w.", show_default=False)
 ]
 _SESSION = {"quiet": Quiet, "log_file": LogFile, "events": Events}
+
+
+def executor_of(threads: int | None) -> "Executor":
+    """Where a command runs its tasks, by its option `--threads`."""
+    from alice_survey.base.executor import local_executor  # here, so that --help stays quick
+
+    return local_executor(threads)
 
 
 def examples(*lines: str) -> str:

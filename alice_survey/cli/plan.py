@@ -13,8 +13,10 @@ from alice_survey.cli.options import (
     Threads,
     Workspace,
     examples,
+    executor_of,
     print_result,
 )
+from missions.exports.registry import format_names
 
 app = typer.Typer(
     invoke_without_command=True,
@@ -60,9 +62,9 @@ def solve(
     workspace: Workspace = WORK,
     survey: SurveyFile = None,
     resolution: Annotated[
-        float | None, typer.Option(min=1e-3, help="Size of a pixel on the sea floor, mm.")
+        float | None, typer.Option(min=1e-3, max=1e3, help="Size of a pixel on the sea floor, mm.")
     ] = None,
-    dive: Annotated[float | None, typer.Option(min=1, help="Length of a dive, s.")] = None,
+    dive: Annotated[float | None, typer.Option(min=1, max=1e6, help="Length of a dive, s.")] = None,
     rate: Annotated[float | None, typer.Option(min=1e-3, help="Fixed frame rate, Hz.")] = None,
     lens: Annotated[list[float] | None, typer.Option(help="Focal lengths at hand, mm.")] = None,
     as_json: AsJson = False,
@@ -72,12 +74,18 @@ def solve(
     Altitude and lens for a resolution, the area that fits a dive, or the speed for a frame rate.
     """
     from alice_survey.survey import settings
+    from missions.exposure.settings import ImagingSetup
     from missions.exposure.solve import solve_report
 
     config = settings(workspace, survey, needed=False)
     print_result(
         *solve_report(
-            config, resolution_mm=resolution, dive_s=dive, rate_hz=rate, lenses=lens or (12.5, 25.0)
+            ImagingSetup.of(config),
+            config.area.seafloor_depth_m,
+            resolution_mm=resolution,
+            dive_s=dive,
+            rate_hz=rate,
+            lenses=lens or (12.5, 25.0),
         ),
         as_json,
     )
@@ -142,7 +150,7 @@ def check(
     print_result(
         *check_report(
             workspace, config, log,
-            triggers=triggers, out=output, monte_carlo=monte_carlo, threads=threads,
+            triggers=triggers, out=output, monte_carlo=monte_carlo, executor=executor_of(threads),
         ),
         as_json,
     )  # fmt: skip
@@ -159,7 +167,7 @@ def export(
         list[str] | None,
         typer.Option(
             "--format",
-            help="cola2, cola2-v1, qgc, qgc-survey, wpl, kml, gpx, geojson, csv; all if none.",
+            help=f"{', '.join(format_names())}; all if none.",
         ),
     ] = None,
     camera_on: Annotated[

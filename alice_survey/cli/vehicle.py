@@ -13,6 +13,7 @@ from alice_survey.cli.options import (
     Threads,
     Workspace,
     examples,
+    executor_of,
     print_result,
 )
 
@@ -82,7 +83,7 @@ def compare(
     config = settings(workspace, survey, needed=workspace != WORK)
     text, data = compare_report(
         config, out or workspace / "compare", currents=current or (), swell=swell, seed=seed,
-        flights=flights, threads=threads,
+        flights=flights, executor=executor_of(threads),
     )  # fmt: skip
     print_result(text, data, as_json)
 

@@ -10,8 +10,8 @@ import numpy as np
 from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.limits import SPOT_RAD_S
+from missions.exports.geometry import chords
 from missions.exports.mount import Mount
-from missions.exports.places import chords
 from missions.values.costs import SETTLE_S
 from missions.values.legs import Leg
 from missions.values.plan_file import Dive, Plan
@@ -73,7 +73,6 @@ def waypoints(
     dive: Dive,
     mount: Mount,
     turn_rate_rad_s: float = SPOT_RAD_S,
-    line_depths: Sequence[Array] | None = None,
 ) -> tuple[Waypoint, ...]:
     """The way-points of a dive, from the surface to the surface.
 
@@ -85,13 +84,11 @@ def waypoints(
         dive: one of the plan's.
         mount: of the camera on the vehicle.
         turn_rate_rad_s: of turns on the spot.
-        line_depths: of each of the plan's lines the glass's depth at its stations, (stations,);
-            without it the plan's own, or its altitude over a level sea floor.
 
     Raises:
         PlanError: depths do not fit the lines.
     """
-    depths = _depths(plan, line_depths)
+    depths = _depths(plan)
     if not dive.route.legs:
         raise PlanError("a dive has no legs: plan again")
     points = _switched(list(_points(plan, dive, turn_rate_rad_s, depths)))
@@ -132,10 +129,9 @@ def all_waypoints(
     plan: Plan,
     mount: Mount,
     turn_rate_rad_s: float = SPOT_RAD_S,
-    line_depths: Sequence[Array] | None = None,
 ) -> list[tuple[Waypoint, ...]]:
     """The way-points of each dive."""
-    return [waypoints(plan, dive, mount, turn_rate_rad_s, line_depths) for dive in plan.dives]
+    return [waypoints(plan, dive, mount, turn_rate_rad_s) for dive in plan.dives]
 
 
 def _points(
@@ -290,12 +286,11 @@ def _with_depths(
     return [replace(p, glass_depth_m=float(d)) for p, d in zip(points, levels, strict=True)]
 
 
-def _depths(plan: Plan, line_depths: Sequence[Array] | None) -> list[Array] | None:
+def _depths(plan: Plan) -> list[Array] | None:
     """Depths of the glass at each line's stations; None over a level sea floor."""
-    given = plan.line_depths_m if line_depths is None else line_depths
-    if line_depths is None and not plan.line_depths_m:
+    if not plan.line_depths_m:
         return None
-    depths = [np.asarray(row, dtype=np.float64) for row in given]
+    depths = [np.asarray(row, dtype=np.float64) for row in plan.line_depths_m]
     stations, wanted = [len(row) for row in depths], [line.stations for line in plan.lines]
     if stations != wanted:
         raise PlanError(

@@ -11,6 +11,7 @@ from typing import Any
 from alice_survey.base.artefacts import Stage, need_stage, run_stage, write_json
 from alice_survey.base.config import CameraConfig, PlanConfig, SurveyConfig, WaterConfig
 from alice_survey.base.errors import PlanError, warn
+from alice_survey.base.executor import SERIAL, Executor, local_executor
 from alice_survey.seafloor.terrain import survey_terrain
 from camera_calib.rig import Rig, design_rig, read_rig
 from missions.coverage.certificate import Certificate, certificate
@@ -23,7 +24,8 @@ from missions.fly.monte_carlo import MonteCarlo
 from missions.fly.monte_carlo import monte_carlo as fly_often
 from missions.fly.refly import refly_plan
 from missions.fly.simulation import flight_settings, floor_grid
-from missions.route.energy import usable_wh, vehicle_costs
+from missions.plan.strength import survey_costs
+from missions.route.energy import usable_wh
 from missions.values.plan_file import Plan, read_plan
 
 _LISTED = 20
@@ -64,7 +66,7 @@ def check_log(
     *,
     triggers: Path | None = None,
     manifest: Path | None = None,
-    threads: int = 1,
+    executor: Executor = SERIAL,
 ) -> Check:
     """Certify a dive by its log.
 
@@ -74,7 +76,7 @@ def check_log(
         log: navigation CSV, or the folder of a simulated flight.
         triggers: CSV with the times of the pictures.
         manifest: `images/manifest.csv` in its place.
-        threads: for large areas.
+        executor: where tasks run, of a large area.
 
     Raises:
         WorkspaceError: there is no plan.
@@ -83,9 +85,9 @@ def check_log(
     plan = read_plan(need_stage(workspace, "plan", "plan") / "plan.json")
     record = read_dive_record(log, plan, rig, triggers=triggers, manifest=manifest)
     pattern = plan_pattern(plan, rig)
-    planned = certificate(plan.area, rig, stations_of_plan(plan), pattern, threads=threads)
+    planned = certificate(plan.area, rig, stations_of_plan(plan), pattern, executor=executor)
     flown = certificate(
-        plan.area, rig, record.stations, pattern, cell_m=planned.grid.cell_m, threads=threads
+        plan.area, rig, record.stations, pattern, cell_m=planned.grid.cell_m, executor=executor
     )
     if flown.blind:
         they = "station looks" if flown.blind == 1 else "stations look"
@@ -119,7 +121,7 @@ def check_report(
     manifest: Path | None = None,
     out: Path | None = None,
     monte_carlo: int = 0,
-    threads: int | None = None,
+    executor: Executor | None = None,
 ) -> tuple[str, dict[str, Any]]:
     """Check a dive, write what is found, and plan the holes again.
 
@@ -134,7 +136,7 @@ def check_report(
         manifest: as of `check_log`.
         out: folder to write; left out, `check` in the workspace.
         monte_carlo: fly the plan so many times in simulation, too.
-        threads: processes.
+        executor: where tasks run; all cores of this machine when left out.
 
     Returns:
         A report as text, and as JSON values.
@@ -142,12 +144,10 @@ def check_report(
     Raises:
         AliceError: a file is missing or cannot be used.
     """
-    from alice_survey.base.executor import default_threads
-
-    cores = default_threads() if threads is None else threads
+    executor = executor or local_executor()
     path = need_stage(workspace, "flight", "fly") if log is None else log
     rig = rig_of(workspace, config.camera, config.water)
-    check = check_log(workspace, rig, path, triggers=triggers, manifest=manifest, threads=cores)
+    check = check_log(workspace, rig, path, triggers=triggers, manifest=manifest, executor=executor)
     folder = workspace / "check" if out is None else out
     (folder / "hole_probability.png").unlink(missing_ok=True)  # of an earlier check
     if not check.holes and (folder / "refly").exists():
@@ -161,7 +161,7 @@ def check_report(
                 check.rig,
                 check.flown,
                 check.holes,
-                costs=vehicle_costs(config),
+                costs=survey_costs(config),
                 settings=config.plan,
                 usable_wh=usable_wh(config.vehicle),
             )
@@ -188,7 +188,7 @@ def check_report(
             floor_grid(terrain),
             seed=config.seed,
             flights=monte_carlo,
-            threads=cores,
+            executor=executor,
         )
         _draw_flights(folder, check.plan, flights)
         data["monte_carlo"] = flights.to_json()

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.dynamics import STATE
 from alice_survey.vehicle.floor import level_floor
@@ -245,7 +245,7 @@ def fly_all(
     plan: Plan,
     cases: Sequence[Case],
     seeds: Sequence[int],
-    threads: int,
+    executor: Executor,
     variants: Sequence[Variant] = VARIANTS,
 ) -> Iterator[Outcome]:
     """Fly each variant in each sea, once a seed; flights of the first seed keep their trace.
@@ -256,7 +256,7 @@ def fly_all(
         plan: what to fly.
         cases: mean currents.
         seeds: of the water and of the instruments.
-        threads: processes.
+        executor: where tasks run.
         variants: what flies.
     """
     jobs = [
@@ -266,7 +266,7 @@ def fly_all(
         )
         for case in cases for variant in variants for seed in seeds
     ]  # fmt: skip
-    yield from parallel_map(fly_job, jobs, threads=threads, label="flights")
+    yield from executor.map(fly_job, jobs, label="flights")
 
 
 def fly_job(job: FlightJob) -> Outcome:

@@ -9,7 +9,7 @@ from typing import Any
 from alice_survey.base.artefacts import write_csv, write_json
 from alice_survey.base.config import SeaConfig, SurveyConfig, changed, parse_current
 from alice_survey.base.errors import ConfigError
-from alice_survey.base.executor import default_threads
+from alice_survey.base.executor import Executor, local_executor
 from alice_survey.base.text_table import text_table
 from camera_calib.rig import design_rig
 from missions.fly.compare import (
@@ -27,7 +27,7 @@ from missions.fly.compare import (
 )
 from missions.fly.compare_plots import draw_case
 from missions.fly.simulation import flight_settings
-from missions.plan.run import make_plan
+from missions.plan.planner import plan_survey
 from missions.values.plan_file import Plan
 
 _PAPER_SPACING_M = 1.0
@@ -46,7 +46,7 @@ def compare_report(
     swell: str | None = None,
     seed: int | None = None,
     flights: int = 5,
-    threads: int | None = None,
+    executor: Executor | None = None,
 ) -> tuple[str, dict[str, Any]]:
     """Fly a survey by both configurations, and write table, figures and pictures.
 
@@ -57,7 +57,7 @@ def compare_report(
         swell: `HEIGHT@PERIOD`, m and s, of waves that travel across the lines in all currents.
         seed: of the first flight; the survey's when left out.
         flights: of each variant in each current.
-        threads: processes; all cores when left out.
+        executor: where tasks run; all cores of this machine when left out.
 
     Returns:
         Text, and the same as values for JSON.
@@ -69,15 +69,14 @@ def compare_report(
     config = changed(config, "plan", turns="arcs")
     if config.plan.line_spacing_m is None:
         config = changed(config, "plan", line_spacing_m=_PAPER_SPACING_M)
-    plan = make_plan(config, design_rig(config.camera, config.water))
+    plan = plan_survey(config, design_rig(config.camera, config.water)).plan
     cases = [_case(text) for text in currents] or list(default_cases(plan))
     if swell is not None:
         cases = [_with_swell(plan, case, swell) for case in cases]
     first = config.seed if seed is None else seed
     seeds = list(range(first, first + flights))
-    outcomes = list(
-        fly_all(flight_settings(config), plan, cases, seeds, threads or default_threads())
-    )
+    settings = flight_settings(config)
+    outcomes = list(fly_all(settings, plan, cases, seeds, executor or local_executor()))
     results = [_result(plan, case, outcomes) for case in cases]
     text = "\n\n".join([
         _heading(plan, config.sea, seeds), *(_table(result) for result in results),

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.errors import PlanError
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.floor import FloorGrid
 from camera_calib.rig import Rig
@@ -103,7 +103,7 @@ def monte_carlo(
     *,
     seed: int,
     flights: int,
-    threads: int,
+    executor: Executor,
 ) -> MonteCarlo:
     """Fly a plan in many seas.
 
@@ -114,7 +114,7 @@ def monte_carlo(
         floor: the true sea floor.
         seed: of the survey.
         flights: how many.
-        threads: processes.
+        executor: where tasks run.
 
     Raises:
         PlanError: no flight is asked for.
@@ -137,7 +137,7 @@ def monte_carlo(
     ]
     short = np.zeros(planned.grid.shape)
     results: list[FlightCoverage] = []
-    for flown in _flown(jobs, min(threads, flights)):
+    for flown in _flown(jobs, executor):
         bits = np.unpackbits(flown.short, count=short.size).reshape(short.shape)
         short += bits
         results.append(flown)
@@ -178,8 +178,8 @@ def fly_job(job: TrialJob) -> FlightCoverage:
     )
 
 
-def _flown(jobs: list[TrialJob], threads: int) -> Iterator[FlightCoverage]:
-    return parallel_map(fly_job, jobs, threads=threads, label="flights")
+def _flown(jobs: list[TrialJob], executor: Executor) -> Iterator[FlightCoverage]:
+    return executor.map(fly_job, jobs, label="flights")
 
 
 def _spread(values: Array | NDArray[np.intp]) -> dict[str, float]:

@@ -16,14 +16,12 @@ from numpy.typing import NDArray
 
 from alice_survey.base.artefacts import Stage, need_stage, run_stage, write_json
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
-from alice_survey.base.contents import taken_from
 from alice_survey.base.errors import ReconstructionError, warn
-from alice_survey.base.executor import parallel_map
-from reconstruct.dense.cloud import laz_writer, voxel_edge, write_cloud_json, write_ply
-from reconstruct.dense.dem import FILL_CELLS, DemGrid, grid_over, round_cell
+from alice_survey.base.executor import Executor
+from reconstruct.dense.cloud import laz_writer, voxel_edge, write_cloud, write_cloud_json
+from reconstruct.dense.dem import FILL_CELLS
+from reconstruct.dense.matching_trial import find_conditions
 from reconstruct.dense.pose_part import find_pose_part
-from reconstruct.dense.probe import find_conditions
-from reconstruct.dense.rectify import scaled_view
 from reconstruct.dense.stereo_pairs import choose_pairs, neighbours, points_in_sight
 from reconstruct.dense.tiles import Tile, ViewSummary, fuse_tile, tile_tasks
 from reconstruct.dense.view_store import ViewStore
@@ -41,8 +39,8 @@ from reconstruct.dense.views import (
     view_depth,
 )
 from reconstruct.light.solve import joined_samples, solve_light, write_light
-from reconstruct.raster import preview_dem, tiled_raster
-from reconstruct.views.model import SparseModel, WorldFrame, read_model
+from reconstruct.raster import DemGrid, grid_over, preview_dem, round_cell, tiled_raster
+from reconstruct.views.model import SparseModel, WorldFrame, picture_files, read_model, scaled_view
 
 CELL_PIXELS = 2.5
 """Side of a DEM cell in mean ground pixels of the pictures as matched, unless depth is coarser."""
@@ -52,7 +50,7 @@ _MOST_CELLS = 4_000_000_000
 _MOST_POINTS = 40_000_000
 
 
-def run_dense(workspace: Path, config: SurveyConfig, threads: int) -> bool:
+def run_dense(workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
     """Find the surface of a finished sparse model and write `dense/`.
 
     Returns:
@@ -82,21 +80,9 @@ def run_dense(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     )
 
     def work(folder: Path) -> None:
-        build_surface(workspace, model, folder, config.reconstruct, threads)
+        build_surface(workspace, model, folder, config.reconstruct, executor)
 
     return run_stage(workspace, stage, work)
-
-
-def picture_files(workspace: Path, sparse: Path, model: SparseModel) -> list[Path]:
-    """The registered pictures and their masks."""
-    from alice_survey.base.artefacts import read_json
-
-    images = workspace / "images"
-    names = [view.image for view in model.views]
-    with taken_from(sparse / "cameras.json"):
-        about = read_json(sparse / "cameras.json")["images"]
-        masks = [str(about[name]["mask"]) for name in names if about[name].get("mask")]
-    return [images / name for name in [*names, *masks]]
 
 
 def build_surface(
@@ -104,7 +90,7 @@ def build_surface(
     model: SparseModel,
     folder: Path,
     settings: ReconstructConfig,
-    threads: int,
+    executor: Executor,
 ) -> None:
     """Do the work of the stage in a folder; see `run_dense`."""
     store = ViewStore(folder / "scratch")
@@ -112,7 +98,7 @@ def build_surface(
     partners = choose_pairs(model, settings.dense_partners)
     points = points_in_sight(model)
     conditions = find_conditions(
-        workspace, model.views, partners, points, settings.dense_scale, threads
+        workspace, model.views, partners, points, settings.dense_scale, executor
     )
     views = [scaled_view(view, conditions.scale) for view in model.views]
     prepare = [
@@ -125,7 +111,7 @@ def build_surface(
         )
         for index, view in enumerate(views)
     ]
-    _drain(parallel_map(prepare_view, prepare, threads=threads, label="even out pictures"))
+    _drain(executor.map(prepare_view, prepare, label="even out pictures"))
     depths = [
         DepthTask(
             store=store,
@@ -137,7 +123,7 @@ def build_surface(
         )
         for index, pairs in enumerate(partners)
     ]
-    _drain(parallel_map(view_depth, depths, threads=threads, label="match"))
+    _drain(executor.map(view_depth, depths, label="match"))
     witnesses = neighbours(model, _WITNESSES)
     refine_tasks = [
         RefineTask(
@@ -148,7 +134,7 @@ def build_surface(
         )
         for index in range(len(views))
     ]
-    _drain(parallel_map(refine_view, refine_tasks, threads=threads, label="refine"))
+    _drain(executor.map(refine_view, refine_tasks, label="refine"))
     checks = [
         CheckTask(
             store=store,
@@ -159,9 +145,9 @@ def build_surface(
         )
         for index in range(len(views))
     ]
-    doubt = find_doubt(checks, threads)
+    doubt = find_doubt(checks, executor)
     checks = [replace(check, doubt=doubt) for check in checks]
-    summaries = list(parallel_map(check_view, checks, threads=threads, label="cross-check"))
+    summaries = list(executor.map(check_view, checks, label="cross-check"))
     grid = surface_grid(summaries, settings.dem_cell_m, model.frame)
     offset = _offset(grid, summaries)
     edge = voxel_edge(grid.cell, grid.rows * grid.columns, _MOST_POINTS)
@@ -174,10 +160,10 @@ def build_surface(
     write_light(folder / "light.json", light)
     pose_part = find_pose_part(workspace, model)
     tasks = tile_tasks(store, grid, views, summaries, light, offset, edge, doubt, pose_part)
-    tiles = parallel_map(fuse_tile, tasks, threads=threads, label="fuse")
+    tiles = executor.map(fuse_tile, tasks, label="fuse")
     parts = _write_rasters(folder, grid, model.frame, tiles)
     with laz_writer(folder / "cloud.laz", offset, model.frame) as write_laz:
-        count = write_ply(folder / "cloud.ply", write_laz(parts), offset, model.frame)
+        count = write_cloud(folder / "cloud.ply", write_laz(parts), offset, model.frame)
     if count == 0:
         raise ReconstructionError(
             f"no depth was confirmed by a second view in {len(views)} pictures; they need more "

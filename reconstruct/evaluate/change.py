@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import find_objects
 
 from alice_survey.base.frames import Array
+from alice_survey.base.robust import MAD_TO_SIGMA
 from reconstruct.evaluate.elevation import Elevation
-from reconstruct.evaluate.figures import MAD_TO_SIGMA, rms, rounded
+from reconstruct.evaluate.figures import rms, rounded
 from reconstruct.evaluate.height_registration import HeightFit
 
 SIGNIFICANT = 1.96
@@ -112,7 +113,7 @@ def find_change(now: Elevation, before: Elevation, fit: HeightFit) -> Change:
     """Differences of two registered surveys.
 
     A place is found where most cells exceed their sigma, and followed outwards while the mean of
-    the ring around it has changed: where a change fades, no cell by itself tells.
+    the ring around it has changed: where a change fades, no cell by itself does.
 
     Args:
         now: its grid is that of the result.

@@ -12,10 +12,10 @@ from scipy.spatial.transform import RigidTransform
 from shapely.geometry import MultiPolygon
 
 from alice_survey.base.frames import Array
+from alice_survey.base.robust import MAD_TO_SIGMA
 from alice_survey.base.run import progress
 from alice_survey.seafloor.terrain import Terrain
 from reconstruct.evaluate.figures import (
-    MAD_TO_SIGMA,
     compare_volumes,
     fit_doming,
     rms,
@@ -27,7 +27,7 @@ from reconstruct.raster import opened_raster
 GOOD_M = 0.01
 """A cell counts as accurate when its distance from the true surface is below this."""
 WITHIN_PX = (1, 2, 3, 5)
-"""Ground pixels within which completeness is told."""
+"""Ground pixels within which completeness is reported."""
 LEAST_STATIONS = 3
 """Cells seen from so many stations are scored on their own as well."""
 

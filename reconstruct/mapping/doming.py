@@ -17,6 +17,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.errors import warn
 from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from alice_survey.base.manifest import ImageRecord
+from alice_survey.base.robust import CAUCHY_TUNING, MAD_TO_SIGMA
 from alice_survey.base.run import progress
 from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import Observed, observed
@@ -32,8 +33,6 @@ _THIN = 0.1
 """Width over length of a block below which it has no curvature across."""
 _SIGMAS = 3.0
 _ROUNDS = 10
-_TUNING = 2.385
-"""Of Cauchy's weights, for 95 % efficiency with normal errors (Rey 1983)."""
 _LEAST_STEREO_POINTS = 20
 
 
@@ -135,7 +134,7 @@ def measure_doming(
         records: pictures.
         positions: (N, 3) of the pinholes' centres in NED, as navigation has them; NaN where
             unknown; None without navigation.
-        sigmas: (N, 3), likewise.
+        sigmas: (N, 3); the same for these.
         rotations: `ned_from_pinhole` by picture's index, as navigation has it.
     """
     seen = observed(model)
@@ -147,9 +146,9 @@ def measure_doming(
     along = across = None
     if positions is not None and sigmas is not None and len(numbers):
         rows = np.array(numbers) - 1
-        told, sigma = positions[rows], sigmas[rows]
-        known = np.isfinite(told + sigma).all(axis=1)
-        along, across = bend_of(centres[known], told[known, 2], sigma[known, 2], down)
+        given, sigma = positions[rows], sigmas[rows]
+        known = np.isfinite(given + sigma).all(axis=1)
+        along, across = bend_of(centres[known], given[known, 2], sigma[known, 2], down)
     found = Doming(
         along=along,
         across=across,
@@ -229,9 +228,9 @@ def scale_trend(
         None where too few stations have points that both their cameras show.
     """
     local = [
-        (model.images[reference[frame]].projection_center(), *told)
+        (model.images[reference[frame]].projection_center(), *given)
         for frame in sorted(reference)
-        if (told := _station_scale(model, seen, frame)) is not None
+        if (given := _station_scale(model, seen, frame)) is not None
     ]
     if len(local) < _LEAST_STATIONS:
         return None
@@ -268,11 +267,11 @@ def navigation_rotations(
 def down_of(model: pycolmap.Reconstruction, rotations: Mapping[int, Rotation]) -> Array:
     """Down in the model's frame: by navigation's attitudes, else the mean way that cameras look."""
     posed = [n for n in sorted(model.images) if model.images[n].has_pose]
-    told = [n for n in posed if n - 1 in rotations]
+    given = [n for n in posed if n - 1 in rotations]
     rows = [
         model.images[n].cam_from_world().matrix()[:, :3].T
-        @ (rotations[n - 1].inv().apply([0.0, 0.0, 1.0]) if told else [0.0, 0.0, 1.0])
-        for n in told or posed
+        @ (rotations[n - 1].inv().apply([0.0, 0.0, 1.0]) if given else [0.0, 0.0, 1.0])
+        for n in given or posed
     ]
     mean = np.median(np.array(rows), axis=0)
     unit: Array = mean / np.linalg.norm(mean)
@@ -321,8 +320,8 @@ def _robust_fit(design: Array, values: Array, sigmas: Array) -> tuple[Array, Arr
         root = np.sqrt(weight) / sigmas
         fitted = np.linalg.lstsq(root[:, None] * design, root * values, rcond=None)[0]
         left = (values - design @ fitted) / sigmas
-        spread = max(1.4826 * float(np.median(np.abs(left))), 1e-12)
-        weight = np.asarray(1.0 / (1.0 + (left / (_TUNING * spread)) ** 2), np.float64)
+        spread = max(MAD_TO_SIGMA * float(np.median(np.abs(left))), 1e-12)
+        weight = np.asarray(1.0 / (1.0 + (left / (CAUCHY_TUNING * spread)) ** 2), np.float64)
     free = len(values) - design.shape[1]
     root = np.sqrt(weight) / sigmas
     variance = float((weight * left**2).sum() / max(weight.sum() * free / len(values), 1e-12))
@@ -359,5 +358,5 @@ def _station_scale(
     # Noise of pixels is that of 1 / depth: its mean, unlike that of depths, is not pulled away.
     ratio = seen.in_cameras[theirs[0]][at[0], 2] / (along * rays[0][:, 2])
     ratio = ratio[np.isfinite(ratio)]
-    spread = 1.4826 * float(np.median(np.abs(ratio - np.median(ratio))))
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(ratio - np.median(ratio))))
     return float(np.median(ratio)), max(1.2533 * spread / np.sqrt(len(ratio)), 1e-9)

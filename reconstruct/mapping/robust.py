@@ -11,13 +11,11 @@ import numpy as np
 import pycolmap
 
 from alice_survey.base.frames import Array
+from alice_survey.base.robust import CAUCHY_TUNING
 from reconstruct.mapping.arrays import Indices, observed
 
 _RAYLEIGH_MEDIAN = 1.1774
 """Median length of a plane vector whose components have unit sigma."""
-_TUNING = 2.385
-"""Scale of Cauchy's loss in sigmas (Rey 1983): 95 % efficiency where errors are normal, 94 % for
-residuals in the plane."""
 _LEAST_SIGMA_PX = 1e-3
 _WELL_SEEN = 4
 _MOST_ADAPTED = 0.9
@@ -46,14 +44,14 @@ def sigma_of(misses: Array, counts: Indices, stations: int) -> float:
     free = float((3.0 / counts).sum())  # unknowns of points
     by_station = 1.0 - min(_MOST_ADAPTED, 6.0 * stations / max(2.0 * len(misses) - free, 1.0))
     left = (1.0 - 1.5 / counts) * by_station
-    told = counts >= min(_WELL_SEEN, int(np.median(counts)))
-    median = float(np.median(np.linalg.norm(misses[told], axis=1) / np.sqrt(left[told])))
+    well_seen = counts >= min(_WELL_SEEN, int(np.median(counts)))
+    median = float(np.median(np.linalg.norm(misses[well_seen], axis=1) / np.sqrt(left[well_seen])))
     return max(median / _RAYLEIGH_MEDIAN, _LEAST_SIGMA_PX)
 
 
 def loss_scale(sigma_px: float) -> float:
     """Length of a residual, in pixels, that counts half."""
-    return _TUNING * sigma_px
+    return CAUCHY_TUNING * sigma_px
 
 
 def cauchy_weights(misses: Array, sigma_px: float) -> Array:

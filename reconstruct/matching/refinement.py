@@ -22,7 +22,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from alice_survey.base.compiled import compiled
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from reconstruct.matching.features import load_features
 from reconstruct.matching.matches import Matches
@@ -61,13 +61,13 @@ class _Partner:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Task:
+class _TrackTask:
     grey: Path
     partners: tuple[_Partner, ...]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Refined:
+class RefinedFeatures:
     """Features after refinement."""
 
     pixels: list[Array]
@@ -83,8 +83,8 @@ def refine_tracks(
     greys: Sequence[Path],
     pairs: Sequence[tuple[int, int, Matches]],
     *,
-    threads: int,
-) -> Refined:
+    executor: Executor,
+) -> RefinedFeatures:
     """Align every observation of a track with the track's reference.
 
     The reference is the observation that was matched with most others. An observation stays where
@@ -94,7 +94,7 @@ def refine_tracks(
         features: files of the features of every picture.
         greys: files of the evened pictures, (H, W) bytes as `numpy.save` writes them.
         pairs: indices of two pictures and (K, 2) verified matches.
-        threads: how many processes.
+        executor: where tasks run.
     """
     pixels = [load_features(path).pixels for path in features]
     starts = np.concatenate([[0], np.cumsum([len(p) for p in pixels])]).astype(np.int64)
@@ -102,12 +102,12 @@ def refine_tracks(
     tasks = _tasks(pixels, starts, reference, pairs, greys)
     together = np.concatenate([np.zeros((0, 2)), *pixels])
     tracked = moved = 0
-    for nodes, found in parallel_map(align, tasks, threads=threads, label="sub-pixel positions"):
+    for nodes, found in executor.map(align, tasks, label="sub-pixel positions"):
         good = np.isfinite(found[:, 0])
         together[nodes[good]] = found[good]
         tracked += len(nodes)
         moved += int(good.sum())
-    return Refined(
+    return RefinedFeatures(
         pixels=[together[a:b] for a, b in itertools.pairwise(starts)],
         tracked=tracked,
         moved=moved,
@@ -144,7 +144,7 @@ def _tasks(
     reference: NDArray[np.int64],
     pairs: Sequence[tuple[int, int, Matches]],
     greys: Sequence[Path],
-) -> list[_Task]:
+) -> list[_TrackTask]:
     """One task for each picture that has references."""
     nodes = np.flatnonzero(reference != np.arange(len(reference)))
     picture = np.searchsorted(starts, nodes, side="right") - 1
@@ -172,10 +172,10 @@ def _tasks(
             partners.setdefault(r, []).append(
                 _Partner(grey=greys[j], nodes=mine, reference=at[0], pixels=at[1], support=support)
             )
-    return [_Task(grey=greys[r], partners=tuple(partners[r])) for r in sorted(partners)]
+    return [_TrackTask(grey=greys[r], partners=tuple(partners[r])) for r in sorted(partners)]
 
 
-def align(task: _Task) -> tuple[NDArray[np.int64], Array]:
+def align(task: _TrackTask) -> tuple[NDArray[np.int64], Array]:
     """Numbers of features and their aligned positions (N, 2); NaN where they are to stay."""
     first = np.asarray(np.load(task.grey, mmap_mode="c"))
     found = []

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from reconstruct.matching.features import load_features
 from reconstruct.matching.pairs import Pair
@@ -29,13 +29,13 @@ _BLOCK = 512
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Task:
+class _WordsTask:
     features: Path
     words: NDArray[np.float32]
 
 
 def alike_pairs(
-    features: Sequence[Path], wanted: Sequence[int], partners: int, *, seed: int, threads: int
+    features: Sequence[Path], wanted: Sequence[int], partners: int, *, seed: int, executor: Executor
 ) -> list[Pair]:
     """Pairs of pictures that look most alike.
 
@@ -44,7 +44,7 @@ def alike_pairs(
         wanted: pictures for which partners are sought, among all.
         partners: how many for each.
         seed: of the codebook.
-        threads: how many processes.
+        executor: where tasks run.
 
     Returns:
         Pairs in rising order.
@@ -52,8 +52,8 @@ def alike_pairs(
     if len(features) < 2 or not len(wanted):
         return []
     words = make_codebook(features, seed)
-    tasks = [_Task(features=path, words=words) for path in features]
-    rows = parallel_map(describe, tasks, threads=threads, label="looks of pictures")
+    tasks = [_WordsTask(features=path, words=words) for path in features]
+    rows = executor.map(describe, tasks, label="looks of pictures")
     looks = np.stack(list(rows))
     looks = looks - looks.mean(axis=0)
     looks = looks / np.maximum(np.linalg.norm(looks, axis=1, keepdims=True), 1e-9)
@@ -92,7 +92,7 @@ def make_codebook(features: Sequence[Path], seed: int) -> NDArray[np.float32]:
     return words
 
 
-def describe(task: _Task) -> NDArray[np.float32]:
+def describe(task: _WordsTask) -> NDArray[np.float32]:
     """The vector of a picture, (W * 128,); zeros without features."""
     descriptors = load_features(task.features).descriptors[:_LARGEST].astype(np.float32)
     if not len(descriptors):

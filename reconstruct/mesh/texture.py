@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.compiled import compiled
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from reconstruct.light.solve import LightModel
 from reconstruct.mesh.atlas import Atlas, Wedges, make_atlas, make_wedges
 from reconstruct.mesh.labels import Charts
-from reconstruct.mesh.levelling import level_seams, seam_pairs
+from reconstruct.mesh.seam_colours import level_seams, seam_pairs
 from reconstruct.mesh.topology import Triangles
 from reconstruct.mesh.visibility import to_world
 from reconstruct.pictures.undistorted import Pictures
@@ -51,7 +50,7 @@ class Textured:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PaintTask:
+class PagePaintTask:
     """The patches of one view."""
 
     workspace: Path
@@ -97,7 +96,7 @@ def paint(
     *,
     plain_pixel: float,
     page_px: int,
-    threads: int,
+    executor: Executor,
 ) -> Textured:
     """Make the texture of a mesh.
 
@@ -113,12 +112,12 @@ def paint(
         cloud_colours: (V, 3) RGB that paint what no view sees.
         plain_pixel: side of a texture's pixel there.
         page_px: largest side of a page.
-        threads: processes.
+        executor: where tasks run.
     """
     wedges = make_wedges(triangles, charts)
     pixels = wedge_pixels(vertices, wedges, charts, views, offset_enu, plain_pixel)
     atlas = make_atlas(pixels, wedges, len(charts.views), page_px, _MOST_PAGES)
-    corrections = _corrections(pixels, wedges, charts, views, workspace, light, threads)
+    corrections = _corrections(pixels, wedges, charts, views, workspace, light, executor)
     unseen = charts.views[wedges.chart] < 0
     corrections[unseen] = cloud_colours[wedges.vertex[unseen]][:, ::-1]
     scratch = tuple(folder / f"page_{number}.raw" for number in range(len(atlas.sizes)))
@@ -128,7 +127,7 @@ def paint(
     tasks = _paint_tasks(
         workspace, atlas, wedges, charts, views, light, placed, corrections, scratch
     )
-    for _ in parallel_map(paint_view, tasks, threads=threads, label="paint"):
+    for _ in executor.map(paint_view, tasks, label="paint"):
         pass
     on_page = atlas.place(pixels, wedges.chart)
     pages, colours = [], np.zeros((len(vertices), 3))
@@ -207,7 +206,7 @@ def even_colour(pictures: Pictures, view: View, light: LightModel) -> Float32:
 
 def seam_colours(task: SeamTask) -> Float32:
     """Mean colour around pixels of one view, (N, 3) BGR; NaN where nothing usable is near."""
-    pictures = _pictures(task.workspace)
+    pictures = Pictures.open(task.workspace)
     even = even_colour(pictures, task.view, task.light)
     weight = pictures.valid(task.view.image).astype(np.float32)
     even *= weight[..., None]
@@ -233,7 +232,7 @@ def _corrections(
     views: Sequence[View],
     workspace: Path,
     light: LightModel,
-    threads: int,
+    executor: Executor,
 ) -> Array:
     """Corrections (W, 3), BGR, that level the seams between views."""
     label = charts.views[wedges.chart]
@@ -246,7 +245,7 @@ def _corrections(
         for g in groups
     ]
     colours = np.full((len(label), 3), np.nan)
-    found = parallel_map(seam_colours, tasks, threads=threads, label="compare seams")
+    found = executor.map(seam_colours, tasks, label="compare seams")
     for group, colour in zip(groups, found, strict=True):
         colours[group] = colour
     return level_seams(wedges, colours, label >= 0)
@@ -262,7 +261,7 @@ def _paint_tasks(
     placed: Array,
     corrections: Array,
     pages: tuple[Path, ...],
-) -> list[PaintTask]:
+) -> list[PagePaintTask]:
     """One task for each view with patches; the last for what no view sees."""
     count = len(charts.views)
     by_chart = np.argsort(wedges.chart, kind="stable")
@@ -277,7 +276,7 @@ def _paint_tasks(
         mine = np.flatnonzero(shown == number)
         members = [by_chart[wedge_starts[c] : wedge_starts[c + 1]] for c in mine]
         tasks.append(
-            PaintTask(
+            PagePaintTask(
                 workspace=workspace,
                 view=views[max(number, 0)],
                 light=light,
@@ -300,7 +299,7 @@ def _paint_tasks(
     return tasks
 
 
-def paint_view(task: PaintTask) -> None:
+def paint_view(task: PagePaintTask) -> None:
     """Write the patches of one view into the pages; no two views write to the same pixel."""
     plain = task.scale == 0.0
     pages = [
@@ -310,7 +309,7 @@ def paint_view(task: PaintTask) -> None:
     picture = np.zeros((1, 1, 3), np.float32)
     valid = np.ones((1, 1), np.uint8)
     if not plain:
-        pictures = _pictures(task.workspace)
+        pictures = Pictures.open(task.workspace)
         picture = even_colour(pictures, task.view, task.light)
         valid = pictures.valid(task.view.image).astype(np.uint8)
         if task.scale < 1.0:
@@ -411,11 +410,6 @@ def spread_corners(
                         share_a * values[a, k] + share_b * values[b, k] + share_c * values[c, k]
                     )
     return spread, covered
-
-
-@lru_cache(maxsize=1)
-def _pictures(workspace: Path) -> Pictures:
-    return Pictures.open(workspace)
 
 
 @progress.step("take colours from the cloud")

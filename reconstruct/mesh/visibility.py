@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from reconstruct.mesh.topology import Triangles, face_normals
 from reconstruct.pictures.undistorted import Pictures
@@ -75,7 +75,7 @@ def save_geometry(path: Path, vertices: Array, triangles: Triangles, offset_enu:
 
 
 def find_candidates(
-    mesh: Path, faces: int, workspace: Path, views: Sequence[View], lift: float, threads: int
+    mesh: Path, faces: int, workspace: Path, views: Sequence[View], lift: float, executor: Executor
 ) -> Candidates:
     """The best views of every face.
 
@@ -85,7 +85,7 @@ def find_candidates(
         workspace: with the pictures.
         views: to choose from.
         lift: see `SightTask`.
-        threads: processes.
+        executor: where tasks run.
     """
     tasks = [
         SightTask(mesh=mesh, workspace=workspace, number=number, view=view, lift=lift)
@@ -93,7 +93,7 @@ def find_candidates(
     ]
     numbers = np.full((faces, CANDIDATES), -1, np.int32)
     quality = np.zeros((faces, CANDIDATES), np.float32)
-    for sight in parallel_map(see_faces, tasks, threads=threads, label="lines of sight"):
+    for sight in executor.map(see_faces, tasks, label="lines of sight"):
         mine, rows = sight.quality, sight.faces
         worst = quality[rows, -1] < mine
         rows, mine = rows[worst], mine[worst]
@@ -109,7 +109,7 @@ def see_faces(task: SightTask) -> Sight:
     vertices, triangles, offset, scene, spheres = _geometry(task.mesh)
     view = task.view
     near = vertices_near(view, vertices, spheres, offset)
-    valid = _pictures(task.workspace).valid(view.image)
+    valid = Pictures.open(task.workspace).valid(view.image)
     pixels = np.full((len(vertices), 2), np.nan)
     pixels[near] = view.project(to_world(vertices[near], offset))
     inside = usable_pixels(pixels, valid)
@@ -220,8 +220,3 @@ def ray_scene(vertices: Array, triangles: Triangles) -> Any:
         o3d.core.Tensor(np.ascontiguousarray(triangles, dtype=np.uint32)),
     )
     return scene
-
-
-@lru_cache(maxsize=1)
-def _pictures(workspace: Path) -> Pictures:
-    return Pictures.open(workspace)

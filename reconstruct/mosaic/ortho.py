@@ -112,8 +112,8 @@ def look_up(
 ) -> tuple[Float32, Float32, Float32, Float32]:
     """Where the picture as taken shows each pixel of a tile, and how well.
 
-    A point goes to the ideal pinhole, from there by its depth to the warped picture (the fixed
-    point of `warped_pixel`, exact for a flat port, until it moves by less than `_STILL_PX`) and
+    A point goes to the ideal pinhole, from there by its depth to the warped picture (as
+    `RangeShift.warped`, exact for a flat port, until it moves by less than `_STILL_PX`) and
     through the lens to the picture as taken, so that colours are resampled once. The quality is the
     distance from the rim of the picture (1 in the middle, 0 at the rim) times the cosine of the
     angle to the vertical over the distance squared, so that the middle of near, steep views wins.
@@ -121,7 +121,7 @@ def look_up(
     Args:
         height: (H, W) up at the pixels' centres, NaN where unknown.
         wanted: (h, w) whether to look at squares of pixels, and their side; beyond the last
-            square the last one tells.
+            square the last one sees.
         visible: cells of the DEM that the view sees.
         first_cell: row and column of the first pixel's centre in `visible` (cell centres whole).
         cells_per_pixel: side of a pixel over side of a cell.

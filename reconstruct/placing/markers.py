@@ -11,7 +11,7 @@ import numpy as np
 
 from alice_survey.base.artefacts import need_stage, read_json, read_stage, write_csv
 from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import SERIAL, Executor
 from alice_survey.base.frames import Array, Datum
 from alice_survey.base.manifest import read_manifest
 from reconstruct.pictures.undistorted import Pictures, read_colour
@@ -48,7 +48,7 @@ class Marker:
 
 
 @dataclass(frozen=True)
-class _Task:
+class _MarkerTask:
     path: Path
     dictionaries: tuple[str, ...]
 
@@ -71,7 +71,7 @@ def find_markers(picture: Any, dictionary: str) -> list[Marker]:
 
 
 def survey_control(
-    workspace: Path, *, dictionary: str | None = None, threads: int = 1
+    workspace: Path, *, dictionary: str | None = None, executor: Executor = SERIAL
 ) -> tuple[str, dict[str, Any]]:
     """Find coded markers in all pictures and prepare the picking of control points by hand.
 
@@ -81,7 +81,7 @@ def survey_control(
     Args:
         workspace: folder with finished `images/`.
         dictionary: name of a dictionary of `cv2.aruco`; the one with most markers if None.
-        threads: how many processes.
+        executor: where tasks run.
 
     Returns:
         What was found, in words and as JSON values: `dictionary`, `markers` (pictures by number),
@@ -97,8 +97,8 @@ def survey_control(
             f"no dictionary {dictionary!r}; there are {', '.join(_known_dictionaries())}"
         )
     tried = DICTIONARIES if dictionary is None else (dictionary,)
-    tasks = [_Task(images / name, tried) for name in names]
-    found = list(parallel_map(_look, tasks, threads=threads, label="markers"))
+    tasks = [_MarkerTask(images / name, tried) for name in names]
+    found = list(executor.map(_look, tasks, label="markers"))
     best, views = _best_dictionary(tried, found)
     rows = [
         (name, f"{marker.number}.{k}", f"{x:.4f}", f"{y:.4f}", MARKER_SIGMA_PX)
@@ -125,7 +125,7 @@ def survey_control(
     if score is not None:
         lines.append(describe(score))
     if (workspace / CONTROL_FILE).is_file():
-        lines.append("run 'alice-survey reconstruct' to place the model anew")
+        lines.append("run 'alice-survey reconstruct' to place the model again")
     else:
         lines.append(f"write what is known of the points to {CONTROL_FILE}")
     return "\n".join(lines), {
@@ -141,7 +141,7 @@ def _known_dictionaries() -> tuple[str, ...]:
     return tuple(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")))
 
 
-def _look(task: _Task) -> dict[str, list[Marker]]:
+def _look(task: _MarkerTask) -> dict[str, list[Marker]]:
     picture = cv2.cvtColor(read_colour(task.path), cv2.COLOR_BGR2GRAY)
     return {name: find_markers(picture, name) for name in task.dictionaries}
 

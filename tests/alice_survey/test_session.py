@@ -18,7 +18,7 @@ import typer
 from typer.testing import CliRunner
 
 from alice_survey.base.errors import PlanError, note, warn
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import local_executor
 from alice_survey.base.run import interrupts, progress
 from alice_survey.cli import main as cli
 from alice_survey.cli.options import print_result, with_sessions
@@ -187,7 +187,7 @@ def test_warnings_of_other_processes_are_told_in_order(
     threads: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     def work() -> None:
-        for _ in parallel_map(_warns, range(3), threads=threads, label="look"):
+        for _ in local_executor(threads).map(_warns, range(3), label="look"):
             pass
 
     done = CliRunner().invoke(made(work), ["work-hard", "--events", str(tmp_path / "e")])
@@ -205,7 +205,7 @@ import typer
 from alice_survey.base.run import interrupts
 from alice_survey.base.artefacts import Stage, run_stage
 from alice_survey.cli.options import with_sessions
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import local_executor
 import sleeping
 
 app = typer.Typer()
@@ -219,7 +219,7 @@ def run(kind: str, folder: Path) -> None:
             Path(folder, "begun0").touch()
             hashlib.pbkdf2_hmac("sha256", b"a", b"b", 1_000_000_000)
         else:
-            list(parallel_map(sleeping.stay, [folder] * 8, threads=2, label="sleep"))
+            list(local_executor(2).map(sleeping.stay, [folder] * 8, label="sleep"))
     run_stage(folder, Stage(name="made", version=1, settings={}), work)
 
 if __name__ == "__main__":
@@ -362,7 +362,7 @@ def test_a_result_that_nobody_reads_is_no_fault() -> None:
 
 def test_a_killed_worker_is_told_in_one_line(tmp_path: Path) -> None:
     def work() -> None:
-        list(parallel_map(_dies, range(4), threads=2, label="die"))
+        list(local_executor(2).map(_dies, range(4), label="die"))
 
     done = CliRunner().invoke(made(work), ["work-hard", "--events", str(tmp_path / "e")])
     assert done.exit_code == 1

@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from alice_survey.base.config import SurveyConfig, changed, parse_config
 from alice_survey.base.errors import ConfigError
+from alice_survey.base.executor import SERIAL
 from alice_survey.cli.main import app
 from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.floor import level_floor
@@ -35,7 +36,7 @@ from missions.fly.compare import (
 from missions.fly.compare_report import compare_report
 from missions.fly.flight_plots import true_current
 from missions.fly.simulation import flight_settings, mission_setup, with_values
-from missions.plan.run import make_plan
+from missions.plan.planner import plan_survey
 from missions.values.flight import Flight
 from missions.values.plan_file import Plan
 from tests.oracles_guidance import los_offset_m
@@ -56,7 +57,7 @@ def survey(length_m: float, width_m: float, **sea: object) -> SurveyConfig:
 
 
 def plan_of(config: SurveyConfig) -> Plan:
-    return make_plan(config, design_rig(config.camera, config.water))
+    return plan_survey(config, design_rig(config.camera, config.water)).plan
 
 
 CONFIG = survey(3.0, 2.0)
@@ -209,7 +210,13 @@ def _rows(path: Path) -> list[dict[str, str]]:
 def test_the_report_holds_every_flight_next_to_the_paper(tmp_path: Path) -> None:
     currents = ["0.05@90", "0@0"]
     text, data = compare_report(
-        CONFIG, tmp_path / "one", currents=currents, swell="0.3@5", seed=4, flights=1, threads=1
+        CONFIG,
+        tmp_path / "one",
+        currents=currents,
+        swell="0.3@5",
+        seed=4,
+        flights=1,
+        executor=SERIAL,
     )
     for variant in VARIANTS:
         assert text.count(f"\n{variant.name}  ") == 2
@@ -249,7 +256,7 @@ def test_a_sea_that_makes_no_sense_is_refused(
     currents: Sequence[str], swell: str | None, said: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ConfigError, match=said):
-        compare_report(CONFIG, tmp_path, currents=currents, swell=swell, flights=1, threads=1)
+        compare_report(CONFIG, tmp_path, currents=currents, swell=swell, flights=1, executor=SERIAL)
 
 
 def test_the_command_prints_what_it_writes(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from missions.exports.mount import mount_of
 from missions.exports.options import options_of
 from missions.exports.waypoints import all_waypoints
 from missions.fly.simulation import flight_settings, simulate_plan
-from missions.plan.run import make_plan
+from missions.plan.planner import plan_survey
 from missions.values.costs import SETTLE_S
 from missions.values.plan_file import Plan
 
@@ -29,7 +29,7 @@ def _survey(limit_deg_s: float) -> SurveyConfig:
 
 
 def _planned(config: SurveyConfig) -> Plan:
-    return make_plan(config, design_rig(config.camera, config.water))
+    return plan_survey(config, design_rig(config.camera, config.water)).plan
 
 
 def _turned_rad(plan: Plan) -> float:

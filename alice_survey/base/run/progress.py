@@ -12,7 +12,7 @@ from contextvars import ContextVar
 from dataclasses import replace
 from typing import Any, TypeVar
 
-from alice_survey.base.errors import Level, shown_by
+from alice_survey.base.errors import Level, is_in_task, shown_by
 from alice_survey.base.run.display import Display, display_on_stderr
 from alice_survey.base.run.events import Event, Sink
 
@@ -308,11 +308,15 @@ class Run:
 
 _runs: list[Run] = []
 """The last one is told of what happens in this process."""
+_SILENT = Run(None, quiet=True, ticks=False)
+"""Of tasks, whose own steps nobody sees."""
 _part: ContextVar[str] = ContextVar("part", default="")
 
 
 def current() -> Run:
     """The run that is told; one that only shows on standard error when none was begun."""
+    if is_in_task():
+        return _SILENT
     if not _runs:
         _runs.append(Run(display_on_stderr()))
     return _runs[-1]
@@ -328,11 +332,6 @@ def told_to(run: Run) -> Iterator[None]:
     finally:
         _runs.remove(run)
         run.close()
-
-
-def keep_silent() -> None:
-    """Tell nothing from now on: in processes that work for another one."""
-    _runs.append(Run(None, quiet=True, ticks=False))
 
 
 @contextlib.contextmanager

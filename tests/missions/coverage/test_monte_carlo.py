@@ -6,6 +6,7 @@ import shapely
 
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import PlanError
+from alice_survey.base.executor import SERIAL
 from alice_survey.vehicle.floor import level_floor
 from camera_calib.rig import design_rig
 from missions.fly.monte_carlo import monte_carlo
@@ -50,7 +51,7 @@ def test_without_disturbance_flights_see_what_the_plan_sees() -> None:
         level_floor(DEPTH_M),
         seed=STILL.seed,
         flights=2,
-        threads=1,
+        executor=SERIAL,
     )
 
     planned = result.planned
@@ -76,7 +77,7 @@ def test_a_rough_sea_leaves_holes_that_move_and_a_seed_gives_them_again() -> Non
         level_floor(DEPTH_M),
         seed=ROUGH.seed,
         flights=3,
-        threads=1,
+        executor=SERIAL,
     )
     again = monte_carlo(
         plan,
@@ -85,7 +86,7 @@ def test_a_rough_sea_leaves_holes_that_move_and_a_seed_gives_them_again() -> Non
         level_floor(DEPTH_M),
         seed=ROUGH.seed,
         flights=3,
-        threads=1,
+        executor=SERIAL,
     )
 
     assert first.planned.share_at_overlap == 1.0
@@ -108,5 +109,5 @@ def test_no_flight_is_no_answer() -> None:
             level_floor(DEPTH_M),
             seed=STILL.seed,
             flights=0,
-            threads=1,
+            executor=SERIAL,
         )
