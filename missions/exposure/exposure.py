@@ -17,7 +17,7 @@ import numpy as np
 from alice_survey.base.config import PlanConfig
 from alice_survey.base.frames import Array
 from camera_calib.rig import Rig
-from missions.exposure.table import Setting
+from missions.exposure.settings_table import Setting
 from missions.exposure.trigger import floor_to
 from missions.values.footprint import glass_point_cam
 

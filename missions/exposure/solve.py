@@ -11,11 +11,11 @@ from alice_survey.base.errors import AliceError, ConfigError, PlanError
 from alice_survey.base.text_table import text_table
 from alice_survey.vehicle.limits import spot_rate_rad_s
 from camera_calib.fov.table import json_row
-from missions.exposure.conflicts import Way, conflict
 from missions.exposure.footprints import altitude_for_pixel_m, footprint_at, pixel_on_floor_m
 from missions.exposure.light import too_dark
 from missions.exposure.settings import ImagingSetup, imaging_settings
 from missions.exposure.solve_lens import LensOption, in_focus, lenses_for_resolution, with_lens
+from missions.exposure.ways_out import Way, conflict
 from missions.values.costs import time_costs
 
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from alice_survey.base.config import CameraConfig, PlanConfig
 from alice_survey.base.errors import PlanError
 from camera_calib.flat_port import FlatPortCamera
-from missions.exposure.conflicts import Way, conflict
-from missions.exposure.table import Setting
+from missions.exposure.settings_table import Setting
+from missions.exposure.ways_out import Way, conflict
 from missions.values.footprint import footprint_size_m, overlap, step_for_overlap
 
 _INTERVAL_STEP_S = 1e-3

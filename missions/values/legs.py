@@ -157,38 +157,3 @@ class Route:
             rows = order[cuts[i] : cuts[i + 1]]
             if len(rows):
                 yield leg, rows, along_m[rows] - starts[i]
-
-    def line_starts_m(self) -> dict[int, float]:
-        """Distance along the route at which each line of the plan starts."""
-        starts = zip(self.legs, self.starts_m, strict=False)
-        return {leg.line: float(start) for leg, start in starts if leg.line >= 0}
-
-    @property
-    def spot_turns(self) -> int:
-        """How often the vehicle turns on the spot."""
-        return sum(leg.turn_rad != 0.0 for leg in self.legs)
-
-    @property
-    def sway_steps(self) -> int:
-        """How often it steps sideways."""
-        return sum(leg.side_rad != 0.0 for leg in self.legs)
-
-    @property
-    def arc_turns(self) -> int:
-        """How often it turns while going ahead: arcs in a row count once."""
-        arcs = [leg.kind == "arc" for leg in self.legs]
-        return sum(arc and not before for before, arc in zip([False, *arcs], arcs, strict=False))
-
-    def polyline_ne(self, step_m: float) -> Array:
-        """The route as places (K, 2), for maps: all ends of legs, and points on the arcs between.
-
-        Args:
-            step_m: along an arc from point to point, at most.
-        """
-        places = [np.array([leg.start_ne_m for leg in self.legs[:1]]).reshape(-1, 2)]
-        for leg in self.legs:
-            if leg.length_m == 0.0:
-                continue
-            steps = math.ceil(leg.length_m / step_m) if leg.curvature_per_m else 1
-            places.append(leg.places(leg.length_m * np.arange(1, steps + 1) / steps))
-        return np.concatenate(places)
