@@ -176,7 +176,7 @@ def line_spacing(rig: Rig, plan: PlanConfig, step_m: float) -> Spacing:
 
     Args:
         rig: its first camera is the reference.
-        plan: what is asked for.
+        plan: what is requested.
         step_m: from picture to picture.
 
     Raises:
@@ -333,7 +333,7 @@ def spacing_rows(spacing: Spacing, plan: PlanConfig, prints: FootprintRange) -> 
     note = ""
     if given and spacing.mean_overlap < plan.side_overlap - 1e-9:
         wanted = step_for_overlap(across_m, plan.side_overlap) - 2 * plan.track_error_m
-        note = f"{plan.side_overlap:.0%}, as asked for, needs {wanted:.3f} m"
+        note = f"{plan.side_overlap:.0%}, as requested, needs {wanted:.3f} m"
     elif given and math.isclose(spacing.spacing_m, 1.0) and math.isclose(plan.altitude_m, 2.0):
         note = "the paper flew 1 m lines at 2 m and states 45 %: " + _papers_overlap(across_m)
     return [

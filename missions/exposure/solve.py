@@ -25,7 +25,7 @@ class RateOption:
 
     lens_mm: float
     speed_mps: float
-    """At which the forward overlap is as asked."""
+    """At which the forward overlap is as requested."""
     forward_overlap: float
     """At the speed of the plan instead."""
     exposure_ms: float = math.nan
@@ -100,7 +100,7 @@ def solve_report(
 def speeds_for_rate(
     setup: ImagingSetup, rate_hz: float, lenses: Sequence[float]
 ) -> list[RateOption]:
-    """Speed at which pictures at a fixed rate overlap as asked, u = r L (1 - O), for each lens.
+    """Speed at which pictures at a fixed rate overlap as requested, u = r L (1 - O), for each lens.
 
     Raises:
         PlanError: cameras or trigger are slower than the rate.
@@ -146,7 +146,7 @@ def _too_often(setup: ImagingSetup, rate_hz: float) -> PlanError:
     return conflict(
         f"{rate_hz:g} pictures a second are more than the {most_hz:g} that cameras and trigger "
         "take",
-        ("the rate asked for", "camera.shortest_interval_s"),
+        ("the rate requested", "camera.shortest_interval_s"),
         ways,
     )
 

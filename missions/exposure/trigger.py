@@ -1,4 +1,4 @@
-"""How often to take a picture: by the footprint, and by the paper's rule beside it."""
+"""How often to take a picture: by the footprint, and by the paper's rule next to it."""
 
 import math
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class PaperRule:
 
 
 def interval_for_overlap_s(along_m: float, plan: PlanConfig) -> float:
-    """Longest interval between pictures that overlap as asked, in steps of 1 ms."""
+    """Longest interval between pictures that overlap as requested, in steps of 1 ms."""
     return floor_to(step_for_overlap(along_m, plan.forward_overlap) / plan.speed_mps, 1e-3)
 
 

@@ -53,7 +53,7 @@ from missions.values.pattern import Pattern
 from missions.values.plan_file import Plan
 
 _ENOUGH = 0.999
-"""Share of the area that is to be covered at the overlap asked for; below, the plan warns."""
+"""Share of the area that is to be covered at the overlap requested; below, the plan warns."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -311,7 +311,7 @@ def _stations(plan: Plan, bathymetry: Bathymetry | None) -> Stations:
         return stations_of_plan(plan)
     places = np.vstack([line.stations_ne for line in plan.lines])
     stations = stations_of_plan(plan, bathymetry.depth_at(places))
-    # As for a dive: from too high a place, what is seen is not what was asked for.
+    # As for a dive: from too high a place, what is seen is not what was requested.
     near = stations.altitude_m <= MOST_ALTITUDES * plan.altitude_m
     if not near.all():
         warn(

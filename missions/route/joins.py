@@ -92,7 +92,7 @@ def join(
         fence: of the allowed area.
         prices: what to keep low.
         end: (3,) north, east, heading at the end of the line; a heading of NaN is free (home).
-        goal: (3,) likewise at the start of the next.
+        goal: (3,) the same at the start of the next.
         radius: of arcs.
         run_out: straight after the line if arcs follow.
         run_in: straight before the next line; after a stop only where it is inside.
@@ -100,7 +100,7 @@ def join(
 
     Returns:
         How; (L, 8) legs; whether a way round corners should be compared, since the straight is
-        blocked and nothing else was asked for.
+        blocked and nothing else was requested.
     """
     if _goes_on(end, goal) and straight_inside(fence, end[0], end[1], goal[0], goal[1]):
         ahead = np.empty((1, COLUMNS))

@@ -5,7 +5,7 @@ What a vehicle does at each leg, by what its fields say:
 - straight (`length_m` > 0, all else 0): it goes ahead along its course at the plan's speed. It
   stops at the leg's end if a turn on the spot or a sway step follows, and starts from rest if one
   came before; otherwise it passes both ends at speed.
-- arc (`curvature_per_m` not 0): likewise, on a circle; at most one full turn.
+- arc (`curvature_per_m` not 0): the same way, on a circle; at most one full turn.
 - turn on the spot (`turn_rad` not 0; length, curvature and side 0): it stands at `start_ne_m`,
   turns by `turn_rad` from `heading_rad` the way its sign says (positive to starboard), and stands
   still again. At most half a turn.
@@ -13,7 +13,7 @@ What a vehicle does at each leg, by what its fields say:
   course at `Costs.sway_mps` with its heading held at `heading_rad + side_rad`, and stands again:
   with +pi/2 it moves to port, with -pi/2 to starboard.
 
-`Costs.settle_s` is what each turn on the spot and each sway step takes beside its motion: braking
+`Costs.settle_s` is what each turn on the spot and each sway step takes besides its motion: braking
 before, coming to rest after, and speeding up again.
 """
 

@@ -101,7 +101,7 @@ class Plan:
     duration_s: float
     energy_wh: float
     coverage: float
-    """Share of the area that every camera sees as often as asked when the plan is flown exactly."""
+    """Share of the area that every camera sees as often as requested, flown exactly."""
     line_depths_m: tuple[tuple[float, ...], ...] = ()
     """Depth of the glass at each station of each line, where they follow a bathymetry; empty where
     the glass keeps its altitude above a level sea floor."""

@@ -40,7 +40,7 @@ def test_one_metre_lines_at_two_metres_overlap_by_29_percent_not_45() -> None:
 @pytest.mark.parametrize("distance_m", [0.01, 0.02, 0.03])
 def test_through_real_ports_they_overlap_by_30_to_32_percent(distance_m: float) -> None:
     rig, config = survey(plan={"line_spacing_m": 1.0}, camera={"port_distance_m": distance_m})
-    assert 0.30 <= line_spacing(rig, config.plan, STEP_M).side_overlap <= 0.32
+    assert 0.30 <= line_spacing(rig, config.plan, STEP_M).mean_overlap <= 0.32
 
 
 @pytest.mark.parametrize("ideal", [False, True])
