@@ -172,7 +172,7 @@ def test_apriltag_grids_are_kalibrs() -> None:
 
 
 @pytest.mark.parametrize("text", KINDS)
-def test_colours_around_the_points_are_told(text: str) -> None:
+def test_colours_around_the_points_are_reported(text: str) -> None:
     target = parse_target(text)
     rectangles = black_rectangles(target)
     near = 0.02 * target.size_m * np.array([[-1, -1], [1, 1], [1, -1], [-1, 1]])
