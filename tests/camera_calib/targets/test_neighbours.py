@@ -1,4 +1,4 @@
-"""Points of a board are predicted from those around them: exactly through a homography, nearly if bent."""
+"""Points of a board are predicted from those around them: exactly if flat, nearly if bent."""
 
 import numpy as np
 import pytest

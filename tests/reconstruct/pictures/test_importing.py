@@ -388,8 +388,8 @@ def test_every_fault_gives_one_line(tmp_path: Path, draw: Draw) -> None:
         ([three], {"time_zone": "Nowhere"}, "time-zone 'Nowhere'"),
         ([three], {"clock_offset_s": float("nan")}, "clock-offset nan"),
         ([three], {"vertical_datum": "LAT"}, "'LAT' names the level .* give --navigation too"),
-        ([three], {"navigation": nav, "vertical_datum": " "}, "no name of one line"),
-        ([three], {"navigation": nav, "vertical_datum": "a\nb"}, "no name of one line"),
+        ([three], {"navigation": nav, "vertical_datum": " "}, "not a name of one line"),
+        ([three], {"navigation": nav, "vertical_datum": "a\nb"}, "not a name of one line"),
     ]
     for folders, given, message in faults:
         with pytest.raises(AliceError, match=message) as caught:
