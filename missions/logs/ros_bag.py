@@ -132,7 +132,7 @@ def read_ros_bag(path: Path, options: BagOptions) -> LoggedDive:
         lost: Counter[str] = Counter()
         notes: list[str] = []
         series = _collect(reader, {*chosen.values(), *origin, *joints}, lost, notes)
-    return _Reading(path, options, chosen, series, lost, notes).dive(origin, joints)
+    return _BagReading(path, options, chosen, series, lost, notes).dive(origin, joints)
 
 
 @contextmanager
@@ -304,7 +304,7 @@ def _collect(
     return found
 
 
-class _Reading:
+class _BagReading:
     """The parts of a dive out of the topics of a bag."""
 
     def __init__(

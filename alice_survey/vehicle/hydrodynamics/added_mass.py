@@ -40,15 +40,6 @@ def ellipsoid_axial(length_m: float, diameter_m: float, density: float) -> float
     return alpha / (2.0 - alpha) * ellipsoid_mass(length_m, diameter_m, density)
 
 
-def ellipsoid_axial_as_printed(length_m: float, diameter_m: float, density: float) -> float:
-    """The same with the eccentricity as the paper prints it, e = 1 - (d / l)^2: for comparison.
-
-    The other slip of the print, (l / 2) ln, is left out: it would give 6.9 kg for the hull.
-    """
-    alpha = _alpha(1.0 - (diameter_m / length_m) ** 2)
-    return alpha / (2.0 - alpha) * ellipsoid_mass(length_m, diameter_m, density)
-
-
 def circle_section(radius_m: Array, density: float) -> Array:
     """Added mass of circular sections moving across, kg/m: rho pi r^2 (Fossen 2011; Newman)."""
     return density * np.pi * np.asarray(radius_m, dtype=np.float64) ** 2

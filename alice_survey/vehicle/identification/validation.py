@@ -46,7 +46,7 @@ class Forecast:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Validation:
+class MotionValidation:
     """How a model foretells a log."""
 
     source: str
@@ -92,7 +92,7 @@ def validate(
     *,
     simulation: Simulation | None = None,
     horizons_s: Sequence[float] = HORIZONS_S,
-) -> Validation:
+) -> MotionValidation:
     """Compare simulations with windows of a log.
 
     Args:
@@ -129,7 +129,7 @@ def validate(
                     horizon_s=horizon, starts=len(rows), model=_rms(model), constant=_rms(kept)
                 )
             )
-    return Validation(
+    return MotionValidation(
         source=Path(windows[0].source).name,
         time_s=np.concatenate([w.record.time_s for w in windows]),
         measured=measured, simulated=np.concatenate(simulated), constant=np.concatenate(constant),
