@@ -136,7 +136,7 @@ def run_apart(function: Callable[[Item], Result], item: Item) -> Result:
         BrokenExecutor: they did.
     """
     with _Processes(1) as pool:
-        future: Future[_Answer[Result]] = pool.submit(_Task(function), item)
+        future: Future[_TaskResult[Result]] = pool.submit(_Task(function), item)
         return _result(future)
 
 
@@ -184,7 +184,7 @@ class _Processes(ProcessPoolExecutor):
 
 
 @dataclass(frozen=True)
-class _Answer(Generic[Result]):
+class _TaskResult(Generic[Result]):
     """What comes back from a task."""
 
     result: Result
@@ -199,7 +199,7 @@ class _Task(Generic[Item, Result]):
     says_notes: bool = False
     """Show notes at once as well: they say why the next minute is long."""
 
-    def __call__(self, item: Item) -> _Answer[Result]:
+    def __call__(self, item: Item) -> _TaskResult[Result]:
         messages: list[tuple[Level, str]] = []
 
         def collect(level: Level, text: str) -> None:
@@ -209,7 +209,7 @@ class _Task(Generic[Item, Result]):
 
         with collected_by(collect):
             try:
-                return _Answer(self.function(item), messages)
+                return _TaskResult(self.function(item), messages)
             except Exception as error:
                 vars(error)[_MESSAGES] = messages
                 raise
@@ -219,9 +219,9 @@ def _in_order(
     pool: Pool, function: Callable[[Item], Result], items: Iterable[Item], queued: int
 ) -> Iterator[Result]:
     local = isinstance(pool, _Processes)
-    says_notes = local and not current().quiet
+    says_notes = local and not current().is_quiet
     task = _Task(function, says_notes)
-    waiting: deque[Future[_Answer[Result]]] = deque()
+    waiting: deque[Future[_TaskResult[Result]]] = deque()
     try:
         for item in items:
             waiting.append(pool.submit(task, item))
@@ -241,7 +241,7 @@ def _in_order(
                 future.cancel()
 
 
-def _result(future: "Future[_Answer[Result]]", *, shown: bool = False) -> Result:
+def _result(future: "Future[_TaskResult[Result]]", *, shown: bool = False) -> Result:
     """The result of a task, once its notes and warnings are reported here."""
     try:
         answer = future.result()
@@ -257,7 +257,7 @@ def _report(messages: list[tuple[Level, str]], *, shown: bool) -> None:
         if level == "warning":
             warn(text)
         elif shown:
-            current().tell("note", text, shown=True)
+            current().report("note", text, shown=True)
         else:
             note(text)
 

@@ -64,7 +64,7 @@ def print_result(table: str, data: Any, as_json: bool) -> None:
     typer.echo(json.dumps(data, indent=2) if as_json else table)
     from alice_survey.base.run.progress import current
 
-    current().tell("result", table)
+    current().report("result", table)
 
 
 def with_sessions(app: typer.Typer) -> None:

@@ -50,6 +50,7 @@ from reconstruct.mosaic.visibility import Water
 from reconstruct.mosaic.writers import cloud_optimised, thumbnail, write_labels, write_tiles
 from reconstruct.placing.track_figure import plot_track_over
 from reconstruct.raster import DemGrid, opened_raster, round_cell
+from reconstruct.views.lens import FlatPortLens, lens_from_json
 from reconstruct.views.model import SparseModel, picture_files, read_model
 
 _TILE_PX = 1024
@@ -278,7 +279,8 @@ def _dispersion(
     path = workspace / "sparse" / "cameras.json"
     with taken_from(path):
         cameras = read_json(path)["cameras"]
-        ports = any(camera["kind"] == "flat_port" for camera in cameras.values())
+        lenses = [lens_from_json(camera) for camera in cameras.values()]
+    ports = any(isinstance(lens, FlatPortLens) and lens.camera.n_water > 1 for lens in lenses)
     reason = ""
     if wanted == "off":
         reason = "switched off"
