@@ -31,7 +31,7 @@ _DOWN = 25
 _GOOD = 4
 """RangeFinder status: in range."""
 _INSTANCE = ("C", "I", "Instance", "id")
-"""Fields that tell one of several cores or sensors."""
+"""Fields that identify one of several cores or sensors."""
 _REBOOT_S = 1.0
 """A clock since boot that goes back by more has been started again."""
 
@@ -63,7 +63,7 @@ def _take(
     message: str, fields: Sequence[str], scale: float | Sequence[float] = 1.0,
     keep: _Keep | None = None, absent: float | None = None,
 ) -> _Reader:  # fmt: skip
-    """Reads fields of a message, times scales; `keep` tells rows to use, `absent` what is NaN."""
+    """Read fields of a message, times scales; `keep` marks rows to use, `absent` what is NaN."""
 
     def read(tables: _Tables) -> tuple[Array, Array] | None:
         table = tables.get(message)
@@ -349,7 +349,7 @@ def _one_instance(
     """The rows of one core or sensor, and a note on the others.
 
     Cores and GPS receivers count from the one that is used. Which barometer is the depth sensor
-    is not told by its number, so that of several one must be asked for.
+    is not identified by its number, so that of several one must be asked for.
     """
     field = next((name for name in _INSTANCE if name in table.columns), None)
     if field is None:
@@ -414,7 +414,7 @@ def _declination(parameters: LogTable | None) -> float | None:
 
 
 def _vehicle(path: Path, tables: _Tables, present: Sequence[str]) -> float:
-    """The system that tells most of where it is."""
+    """The system that reports its place most."""
     for name in ("GLOBAL_POSITION_INT", "GPS_RAW_INT", "ATTITUDE"):
         if name in tables:
             systems, counts = np.unique(tables[name].columns[SYSTEM], return_counts=True)
@@ -426,7 +426,7 @@ def _vehicle(path: Path, tables: _Tables, present: Sequence[str]) -> float:
 
 
 def _tlog_times(table: LogTable) -> Array:
-    """Times by the ground station's clock, without the jitter of the link where that can be told.
+    """Times by the ground station's clock, without the jitter of the link where that can be known.
 
     A message that carries the vehicle's time since boot has that, plus what the quickest message
     of one boot took; the others have the time of their recording.

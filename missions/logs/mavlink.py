@@ -119,7 +119,7 @@ MESSAGES = {
         Message(173, "RANGEFINDER", "float distance, float voltage"),
     )
 }  # fmt: skip
-"""By number: those that tell of navigation, and the one that every system sends."""
+"""By number: those about navigation, and the one that every system sends."""
 
 
 class Packet(NamedTuple):

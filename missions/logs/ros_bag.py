@@ -81,7 +81,7 @@ _COLA2 = {
 
 @dataclass(frozen=True, kw_only=True)
 class BagOptions:
-    """What a bag does not tell by itself."""
+    """What a bag does not say by itself."""
 
     topics: Mapping[str, str]
     """By role (`dive.ROLES`): which topic to use."""
@@ -321,7 +321,7 @@ class _BagReading:
         self._counted: set[_Topic] = set()
 
     def dive(self, origin: Sequence[_Topic], joints: Sequence[_Topic]) -> LoggedDive:
-        """Everything that the bag tells."""
+        """Everything that the bag holds."""
         navigation = self.series[self.chosen["navigation"]]
         if navigation.topic.kind == ODOMETRY:
             self._add_geodetic(self._datum(origin))

@@ -68,7 +68,7 @@ def read_tlog(
     names = sorted(MESSAGES[number].name for number in present if number in MESSAGES)
     others = len(present) - len(names)
     if others:
-        names.append(f"{others} more that do not tell where a vehicle is")
+        names.append(f"{others} more that do not say where a vehicle is")
     return tables, names
 
 

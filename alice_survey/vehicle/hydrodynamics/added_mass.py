@@ -1,7 +1,7 @@
 """Added mass from shape: ellipsoids along their axis, strips across it.
 
 Where the paper's printed form is wrong, the right one is computed and the printed one is kept as
-a function or a comment beside it.
+a function or a comment next to it.
 """
 
 import math

@@ -297,7 +297,7 @@ def poorly_determined(names: Sequence[str], values: Array, sigma: Array) -> list
 
 
 def high_correlations(fit: OutputErrorFit) -> list[tuple[str, str, float]]:
-    """Pairs of parameters that the logs hardly tell apart, the closest first."""
+    """Pairs of parameters that the logs hardly separate, the closest first."""
     names, matrix = fit.parameters.names, fit.correlation
     pairs = [
         (names[i], names[j], float(matrix[i, j]))
