@@ -8,6 +8,7 @@ from typing import Any
 from alice_survey.base.artefacts import STAGE_FILE, Stage, atomic_path, run_stage, write_json
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.executor import Executor
 from alice_survey.base.run import progress
 from alice_survey.kit.document import PictureLayer, Report, ShapeLayer, SurveyMap
 from alice_survey.kit.map_figure import with_stills
@@ -32,7 +33,7 @@ _READ = (
 """What a report is made of; what is made with these goes unnamed."""
 
 
-def run_report(workspace: Path, config: SurveyConfig, threads: int) -> bool:
+def run_report(workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
     """Write `report/` from what the workspace holds.
 
     Returns:

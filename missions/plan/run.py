@@ -8,6 +8,7 @@ from pydantic import BaseModel
 
 from alice_survey.base.artefacts import Stage, run_stage, write_json
 from alice_survey.base.config import SeaConfig, SurveyConfig
+from alice_survey.base.executor import Executor
 from alice_survey.base.run import progress
 from camera_calib.rig import Rig, design_rig
 from missions.areas.files import area_files
@@ -25,7 +26,7 @@ from missions.values.plan_file import Dive, Plan
 _SAME_S = 1e-3
 
 
-def run_plan(workspace: Path, config: SurveyConfig, threads: int) -> bool:
+def run_plan(workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
     """Stage `plan`: write plan.json, its certificate, settings, maps and missions for vehicles.
 
     Returns:

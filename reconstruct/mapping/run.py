@@ -16,7 +16,7 @@ import pycolmap
 from alice_survey.base.artefacts import Stage, atomic_path, run_stage, write_json
 from alice_survey.base.config import ReconstructConfig
 from alice_survey.base.errors import ImageError, WorkspaceError, warn
-from alice_survey.base.executor import kept_workers, parallel_map
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Datum
 from alice_survey.base.manifest import ImageRecord
 from camera_calib.rig import Rig
@@ -83,7 +83,7 @@ def run_mapping(
     files: Sequence[Path],
     settings: ReconstructConfig,
     seed: int,
-    threads: int,
+    executor: Executor,
 ) -> bool:
     """Write `mapping/`.
 
@@ -93,7 +93,7 @@ def run_mapping(
         files: what `inputs` was read from, and the pictures.
         settings: of the reconstruction.
         seed: of the mapper.
-        threads: how many processes.
+        executor: where tasks run.
 
     Returns:
         Whether there was anything to do.
@@ -119,18 +119,21 @@ def run_mapping(
         resumes=True,
     )
 
-    @kept_workers()
     def work(partial: Path) -> None:
+        with executor.started() as started:
+            map_pictures(partial, started)
+
+    def map_pictures(partial: Path, executor: Executor) -> None:
         pycolmap.logging.minloglevel = 2  # its own account of every step is for its developers
-        features = _find_all(inputs, partial / "features", settings, threads)
-        lenses, distances = _lenses(inputs, features, settings, threads)
+        features = _find_all(inputs, partial / "features", settings, executor)
+        lenses, distances = _lenses(inputs, features, settings, executor)
         cameras, exif_focal = _cameras(inputs, lenses)
-        pairs = _match_all(inputs, features, cameras, lenses, seed, threads)
+        pairs = _match_all(inputs, features, cameras, lenses, seed, executor)
         refined = refine_tracks(
             features,
             [_grey_file(path) for path in features],
             [(i, j, pair.matches) for i, j, pair in pairs],
-            threads=threads,
+            executor=executor,
         )
         seen = Observations(
             images=inputs.records,
@@ -150,7 +153,7 @@ def run_mapping(
                 partial,
                 seed,
                 method=settings.mapper,
-                threads=threads,
+                executor=executor,
             )
             adjust = NavigationAdjuster(inputs.records, inputs.rig, lenses, inputs.datum)
             rig, free = inputs.rig, frees_rig(settings, inputs.rig, list(cameras))
@@ -195,7 +198,7 @@ def _grey_file(features: Path) -> Path:
 
 
 def _find_all(
-    inputs: Inputs, folder: Path, settings: ReconstructConfig, threads: int
+    inputs: Inputs, folder: Path, settings: ReconstructConfig, executor: Executor
 ) -> list[Path]:
     """Files of features, in the order of the pictures."""
     targets = [folder / f"{i:06d}.npz" for i in range(len(inputs.records))]
@@ -211,7 +214,7 @@ def _find_all(
         for record, target in zip(inputs.records, targets, strict=True)
     ]
     folder.mkdir(parents=True, exist_ok=True)
-    counts = list(parallel_map(extract, tasks, threads=threads, label="features"))
+    counts = list(executor.map(extract, tasks, label="features"))
     poor = [r.image for r, n in zip(inputs.records, counts, strict=True) if n < 100]
     if poor:
         warn(f"{len(poor)} pictures have fewer than 100 features: {named(poor)}")
@@ -219,7 +222,7 @@ def _find_all(
 
 
 def _lenses(
-    inputs: Inputs, features: Sequence[Path], settings: ReconstructConfig, threads: int
+    inputs: Inputs, features: Sequence[Path], settings: ReconstructConfig, executor: Executor
 ) -> tuple[dict[str, Lens], WorkingDistances | None]:
     """The pinholes that stand in for calibrated cameras; none without a rig."""
     if inputs.rig is None:
@@ -230,7 +233,7 @@ def _lenses(
         inputs.rig,
         given_m=settings.working_range_m,
         ratio=RATIO,
-        threads=threads,
+        executor=executor,
     )
     lenses: dict[str, Lens] = {
         name: flat_port_lens(inputs.rig.cameras[name], distances.near_m, distances.far_m)
@@ -289,16 +292,16 @@ def _match_all(
     cameras: Mapping[str, pycolmap.Camera],
     lenses: Mapping[str, Lens],
     seed: int,
-    threads: int,
+    executor: Executor,
 ) -> list[VerifiedPair]:
     placed = placed_pictures(inputs.records, inputs.rig, inputs.datum)
     lost = [i for i in range(len(inputs.records)) if i not in placed]
     alike: list[tuple[int, int]] = []
     if len(inputs.records) > SMALL_SET:
-        alike = alike_pairs(features, lost, _ALIKE, seed=seed, threads=threads)
+        alike = alike_pairs(features, lost, _ALIKE, seed=seed, executor=executor)
     sure, maybe = choose_pairs(inputs.records, inputs.rig, inputs.datum, alike)
     looks = [PairTask(first=features[i], second=features[j], ratio=RATIO) for i, j in maybe]
-    counts = parallel_map(coarse_matches, looks, threads=threads, label="choosing pairs")
+    counts = executor.map(coarse_matches, looks, label="choosing pairs")
     likely = [pair for pair, n in zip(maybe, counts, strict=True) if n >= _LEAST_COARSE]
     pairs = sorted([*sure, *likely])
     texts = {name: camera_text(camera) for name, camera in cameras.items()}
@@ -314,7 +317,7 @@ def _match_all(
         )
         for i, j in pairs
     ]
-    found = parallel_map(match_pair, tasks, threads=threads, label="matching")
+    found = executor.map(match_pair, tasks, label="matching")
     return [
         (i, j, matches)
         for (i, j), matches in zip(pairs, found, strict=True)

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from camera_calib.calibrate.from_pictures import calibration_text, port_tilt_deg
 from camera_calib.calibrate.solve import calibrate_in_air, calibrate_through_ports
-from camera_calib.calibrate.told import calibration_text, port_tilt_deg
 from camera_calib.rig import Covariance, Rig
 from camera_calib.targets.target import parse_target
 from tests.camera_calib.calibration_scenes import (
