@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from camera_calib.calibrate.adjust import stack_views
-from camera_calib.calibrate.freedom import Freedom, of_cameras, value
 from camera_calib.calibrate.normal_equations import Problem
-from camera_calib.calibrate.result import Calibration
+from camera_calib.calibration import Calibration
 from camera_calib.flat_port import FlatPortCamera
+from camera_calib.freedom import Freedom, of_cameras, value
 
 TAKEN_FOR_GRANTED: Mapping[str, float] = {
     "n_water": 0.001,

@@ -13,10 +13,8 @@ from alice_survey.base.errors import CalibrationError, WorkspaceError, warn
 from alice_survey.base.executor import default_threads
 from camera_calib.calibrate.detect_views import Detections, Size, detect_views
 from camera_calib.calibrate.files import finish, summary, tell
-from camera_calib.calibrate.freedom import intrinsics
 from camera_calib.calibrate.numbering import same_numbering
 from camera_calib.calibrate.picture_sets import find_pictures, pair_pictures
-from camera_calib.calibrate.result import Calibration
 from camera_calib.calibrate.solve import (
     Intrinsics,
     blank_camera,
@@ -26,7 +24,9 @@ from camera_calib.calibrate.solve import (
     first_cameras,
 )
 from camera_calib.calibrate.told import calibration_text
+from camera_calib.calibration import Calibration
 from camera_calib.flat_port import FlatPortCamera
+from camera_calib.freedom import intrinsics
 from camera_calib.rig import Rig, read_rig, write_rig
 from camera_calib.targets.target import Target, parse_target
 

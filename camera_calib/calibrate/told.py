@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from camera_calib.calibrate.result import Calibration
+from camera_calib.calibration import Calibration
 from camera_calib.judge.page import with_sigma
 from camera_calib.judge.uncertainty import baseline_sigma_m
 from camera_calib.rig import Rig

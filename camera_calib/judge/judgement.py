@@ -8,9 +8,9 @@ import numpy as np
 
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
-from camera_calib.calibrate.freedom import POSE, value
-from camera_calib.calibrate.result import Calibration
+from camera_calib.calibration import Calibration
 from camera_calib.flat_port import PARAMETERS
+from camera_calib.freedom import POSE, value
 from camera_calib.judge.fit_quality import (
     CameraResiduals,
     Coverage,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from alice_survey.base.artefacts import atomic_path, write_json
 from alice_survey.base.run import progress
-from camera_calib.calibrate.result import Calibration
+from camera_calib.calibration import Calibration
 from camera_calib.judge.judgement import Judgement, judge
 from camera_calib.judge.numbers import report_json
 from camera_calib.judge.page import Section, page, with_sigma

@@ -16,8 +16,8 @@ from scipy.stats import chi2
 
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
-from camera_calib.calibrate.freedom import PORT, POSE
 from camera_calib.flat_port import PARAMETERS
+from camera_calib.freedom import PORT, POSE
 from camera_calib.rig import Covariance, Rig
 from camera_calib.tank.interface import FixedCamera, Reference, check_sides, place_camera
 from camera_calib.tank.single_lens import KnownLens

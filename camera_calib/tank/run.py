@@ -23,7 +23,7 @@ from alice_survey.base.artefacts import (
 from alice_survey.base.errors import CalibrationError, warn
 from alice_survey.base.executor import default_threads, parallel_map
 from alice_survey.base.frames import Array
-from camera_calib.calibrate.freedom import LENSES
+from camera_calib.freedom import LENSES
 from camera_calib.picture_files import is_cut_short, read_pixels
 from camera_calib.rig import write_rig
 from camera_calib.tank.adjust import (

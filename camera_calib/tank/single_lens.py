@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.executor import parallel_map
 from alice_survey.base.frames import Array
-from camera_calib.calibrate.freedom import LENSES, intrinsics
 from camera_calib.flat_port import PARAMETERS, FlatPortCamera, pose_jacobian
+from camera_calib.freedom import LENSES, intrinsics
 from camera_calib.lens import COEFFICIENTS
 
 _HALF_PX = 0.5

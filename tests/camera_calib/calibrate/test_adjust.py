@@ -19,7 +19,10 @@ from benchmarks.camera_calibration import (
     run_trial,
 )
 from camera_calib.calibrate.adjust import adjust, cramer_rao
-from camera_calib.calibrate.freedom import (
+from camera_calib.calibrate.solve import Intrinsics
+from camera_calib.calibrate.start import locate_all
+from camera_calib.calibration import TargetView
+from camera_calib.freedom import (
     HELD,
     PORT,
     Freedom,
@@ -29,9 +32,6 @@ from camera_calib.calibrate.freedom import (
     pose_names,
     value,
 )
-from camera_calib.calibrate.result import TargetView
-from camera_calib.calibrate.solve import Intrinsics
-from camera_calib.calibrate.start import locate_all
 from camera_calib.rig import Rig
 from tests.camera_calib.calibration_scenes import (
     BOARD,

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from alice_survey.base.errors import CalibrationError
-from camera_calib.calibrate.result import Calibration, Rejection, TargetView
+from camera_calib.calibration import Calibration, Rejection, TargetView
 from camera_calib.judge.judgement import judge
 from camera_calib.judge.page import with_sigma
 from camera_calib.judge.rig_uncertainty import uncertainty_report

@@ -4,10 +4,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from alice_survey.base.errors import CalibrationError
-from camera_calib.calibrate.freedom import intrinsics
-from camera_calib.calibrate.result import TargetView
 from camera_calib.calibrate.solve import calibrate_in_air
+from camera_calib.calibration import TargetView
 from camera_calib.flat_port import FlatPortCamera
+from camera_calib.freedom import intrinsics
 from camera_calib.tank.single_lens import LensView, _covariance, _fit, calibrate_single_lens
 
 Array = NDArray[np.float64]
