@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from alice_survey.kit.document import Figure, Section, Table
+from alice_survey.kit.figure import shrunk_png
+from alice_survey.kit.words import count, digits, duration, length, parts, share
 from alice_survey.report import plots
-from alice_survey.report.document import Figure, Section, Table
 from alice_survey.report.figures import Figures
 from alice_survey.report.held import Held
-from alice_survey.report.pictures import still
-from alice_survey.report.words import count, digits, duration, length, parts, share
 
 
 def sections(figures: Figures, *, has_map: bool, has_mesh: bool) -> Iterator[Section]:
@@ -437,7 +437,7 @@ def _stills(held: Held, wanted: Sequence[tuple[str, str, str, str, str]]) -> lis
         if file is not None:
             found.append(
                 Figure(
-                    png=still(file), title=title, alt=shows, shows=shows, good=good,
+                    png=shrunk_png(file), title=title, alt=shows, shows=shows, good=good,
                     otherwise=otherwise,
                 )
             )  # fmt: skip

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from alice_survey.base.frames import Array, Datum
-from alice_survey.report.document import ShapeLayer
+from alice_survey.kit.document import ShapeLayer
+from alice_survey.kit.words import length
 from alice_survey.report.figures import planned_area
 from alice_survey.report.held import Held, number
-from alice_survey.report.words import length
 
 _BLUE, _ORANGE, _GREEN, _RED, _BLACK = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#333333"
 """Of Okabe and Ito's palette, which the colour-blind tell apart."""

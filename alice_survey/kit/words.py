@@ -2,6 +2,8 @@
 
 import math
 
+_SIGMA_DIGITS = 2
+
 
 def length(metres: float | None, unit: str = "m") -> str:
     """`0.364 mm`, `2.4 cm`, `41 m`; in units of the model where it has no scale."""
@@ -9,16 +11,36 @@ def length(metres: float | None, unit: str = "m") -> str:
         return "unknown"
     if unit != "m":
         return f"{metres:.3g} {unit}"
+    factor, name = _length_unit(metres)
+    return f"{digits(factor * metres)} {name}"
+
+
+def length_with_sigma(metres: float, sigma_m: float, unit: str = "m") -> str:
+    """`4.6 ± 49 mm`: a length and its sigma in one unit."""
+    factor, name = _length_unit(max(abs(metres), sigma_m)) if unit == "m" else (1.0, unit)
+    return f"{with_sigma(factor * metres, factor * sigma_m)} {name}"
+
+
+def _length_unit(metres: float) -> tuple[float, str]:
     size = abs(metres)
     if size < 0.01:
-        return f"{digits(1e3 * metres)} mm"
+        return 1e3, "mm"
     if size < 1.0:
-        return f"{digits(1e2 * metres)} cm"
-    return f"{digits(metres)} m" if size < 1e4 else f"{digits(metres / 1e3)} km"
+        return 1e2, "cm"
+    return (1.0, "m") if size < 1e4 else (1e-3, "km")
+
+
+def with_sigma(value: float, sigma: float, sign: str = "") -> str:
+    """`849.31 ± 0.46`: two digits of the sigma, and the value to the same place."""
+    if not (math.isfinite(sigma) and sigma > 0):
+        return f"{value:{sign}.6g} ± {sigma:.2g}"
+    rounded = float(f"{sigma:.{_SIGMA_DIGITS - 1}e}")
+    places = max(0, _SIGMA_DIGITS - 1 - math.floor(math.log10(rounded)))
+    return f"{value:{sign}.{places}f} ± {sigma:.{places}f}"
 
 
 def digits(value: float, wanted: int = 3) -> str:
-    """With so many digits and never an exponent."""
+    """With this many digits and never an exponent."""
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
     rounded = float(f"{value:.{wanted - 1}e}")  # 99.96 has one digit more than it seems
@@ -41,6 +63,12 @@ def parts(value: float | None) -> str:
     if value is None or not math.isfinite(value):
         return "unknown"
     return f"{1e6 * value:+.0f} ppm" if abs(value) < 1e-3 else f"{100 * value:+.2f} %"
+
+
+def parts_with_sigma(value: float, sigma: float) -> str:
+    """Of a scale: `+0.07 ± 0.56 %`, value and sigma in one unit."""
+    factor, name = (1e6, "ppm") if max(abs(value), sigma) < 1e-3 else (1e2, "%")
+    return f"{with_sigma(factor * value, factor * sigma, '+')} {name}"
 
 
 def duration(seconds: float) -> str:

@@ -1,11 +1,28 @@
-"""What a report says, before anyone decides how it looks: the page and the PDF show the same."""
+"""The content of a report, without its layout: the HTML page and the PDF show the same values."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 Level = Literal["good", "look", "bad"]
+LEVELS: tuple[Level, ...] = ("bad", "look", "good")
+"""Worst first."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """One judgement with its numbers."""
+
+    level: Level
+    text: str
+    action: str = ""
+    """What to do, as a sentence; empty where nothing has to be done."""
+
+
+def worst_first(verdicts: Sequence[Verdict]) -> list[Verdict]:
+    """Verdicts in the order in which a report shows them."""
+    return sorted(verdicts, key=lambda verdict: LEVELS.index(verdict.level))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,17 +32,21 @@ class Figure:
     png: bytes
     title: str
     alt: str
-    """What somebody who cannot see it must know."""
+    """What a reader who cannot see it has to know."""
     shows: str
     good: str = ""
     """How it looks when all is well."""
     otherwise: str = ""
     """What to do when it does not."""
+    svg: bytes = b""
+    """The same plot as vectors, for print; empty where there are only pixels."""
+    share: float = 1.0
+    """Width in print, as a share of the text's width."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """Rows of text under a header; numbers stand to the right."""
+    """Rows of text under a header; columns of numbers are aligned to the right."""
 
     title: str
     header: Sequence[str]
@@ -34,7 +55,7 @@ class Table:
 
 @dataclass(frozen=True, kw_only=True)
 class Link:
-    """A way to a file or a page on the same server."""
+    """A link to a file next to the page, or to a page on the same server."""
 
     text: str
     address: str
@@ -45,16 +66,16 @@ class Link:
 class Section:
     """A part of the report."""
 
-    name: str
-    """Plain word that its anchor is made of."""
     title: str
+    name: str = ""
+    """Plain word for its anchor; from the title where empty."""
     text: Sequence[str] = ()
     figures: Sequence[Figure] = ()
     tables: Sequence[Table] = ()
     links: Sequence[Link] = ()
-    """Of a served page; print and the report have none."""
+    """Shown on the page alone, not in print."""
     scene: Literal["map", "mesh"] | None = None
-    """What the page shows here that moves; print shows a still of it."""
+    """The interactive part of the page that belongs here; print shows its stills."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +108,7 @@ class PictureLayer:
     """Level 0 is the coarsest; the last is full: tile x, y at level k covers
     `tile_px * 2**(levels - 1 - k)` full pixels a side."""
     tiles: Mapping[str, bytes]
-    """WebP by "k/x/y"; a tile at the border may be smaller. None where a server gives them."""
+    """WebP by "k/x/y"; a tile at the border may be smaller; empty where a server gives them."""
     address: str | None = None
     """Of a tile on the server that gives the page, with "{}" in place of "k/x/y"."""
     sizes: Sequence[tuple[int, int, float, float]] | None = None
@@ -95,7 +116,7 @@ class PictureLayer:
     halves, rounded up, where not given."""
     scale: Scale | None = None
     shown: bool = False
-    """From the start; of base layers only one can be."""
+    """From the start; only one base layer can be."""
     base: bool = True
     """Base layers exclude one another; others lie over them."""
 
@@ -124,17 +145,28 @@ class ShapeLayer:
     colour: str = "#0072b2"
     dashed: bool = False
     shown: bool = True
+    fill: float = 0.03
+    """Opacity of the inside of an outline."""
+    width: float | None = None
+    """Of its lines, px; None takes the usual width of its kind."""
+    group: str = "Over it"
+    """Heading in the list of layers."""
+    extends: bool = True
+    """Whether the map's first view has to hold it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SurveyMap:
-    """The map that pans and zooms."""
+    """The interactive map."""
 
     layers: Sequence[PictureLayer | ShapeLayer]
     unit: str
     """Of its axes: m, or unit where the model has no scale."""
     origin: str
     """Where (0, 0) is, in words."""
+    stills: Sequence[Figure] = ()
+    """The map for print and for browsers without scripts: all of them in print, the first on the
+    page; where there are none, the interactive map itself is printed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,10 +176,9 @@ class Mesh:
     glb: Path
     """Small enough for a page."""
     about: str
-    """Triangles and size, in words."""
-    still: bytes
-    """PNG for print and for browsers without WebGL."""
-    alt: str
+    """Triangles and size of what the page shows, in words."""
+    still: Figure
+    """For print and for browsers without WebGL."""
     address: str | None = None
     """On the server that gives the page, which then does not carry the mesh."""
 
@@ -158,14 +189,16 @@ class Report:
 
     title: str
     subtitle: str
-    summary: Mapping[str, str]
+    summary: Mapping[str, str] = field(default_factory=dict)
     """Three sentences: "What was mapped", "How well", "What to do next"."""
-    facts: Sequence[tuple[str, str]]
+    facts: Sequence[tuple[str, str]] = ()
     """Labels and values of the first row."""
-    verdicts: Sequence[tuple[Level, str]]
+    verdicts: Sequence[Verdict] = ()
     """Worst first."""
-    sections: Sequence[Section]
+    sections: Sequence[Section] = ()
     map: SurveyMap | None = None
     mesh: Mesh | None = None
-    data: Mapping[str, Any] | None = None
-    """The same numbers for programs: `report.json`."""
+    footer: str = ""
+    """Last line of the page."""
+    citation: Sequence[tuple[str, str]] = ()
+    """Labels and values of the title block in print: date, software and its version."""

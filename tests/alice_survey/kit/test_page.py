@@ -12,14 +12,15 @@ from pathlib import Path
 
 import pytest
 
-from alice_survey.report import page, page_map
-from alice_survey.report.document import Report, Section, Table
-from alice_survey.report.page import render_html
-from alice_survey.report.page_map import map_extent, round_length
-from tests.alice_survey.report.sketch import RUDE, encoded, picture_layer, seafloor, sketch_report
+from alice_survey.kit import map as kit_map
+from alice_survey.kit import page
+from alice_survey.kit.document import Report, Section, Table
+from alice_survey.kit.map import map_extent, round_length
+from alice_survey.kit.page import render_html
+from tests.alice_survey.kit.sketch import RUDE, encoded, picture_layer, seafloor, sketch_report
 
 ROOT = Path(__file__).parents[3]
-ROOM = ROOT / "alice_survey" / "report"
+ROOM = ROOT / "alice_survey" / "kit"
 
 
 class Elements(HTMLParser):
@@ -95,7 +96,8 @@ def test_policy_names_each_script_and_style(text: str) -> None:
 
 def test_order_of_the_page(report: Report, text: str) -> None:
     marks = [
-        "<h1>", *report.summary.values(), report.verdicts[0][1], "pictures placed", "<h2>Contents",
+        "<h1>", *report.summary.values(), report.verdicts[0].text, "pictures placed",
+        "<h2>Contents",
         *(f">{section.title}</h2>" for section in report.sections),
     ]  # fmt: skip
     at = [text.index(mark) for mark in marks]
@@ -134,9 +136,9 @@ def test_contradictions_are_refused(report: Report) -> None:
 def test_kinds_of_tiles() -> None:
     picture = seafloor(8, 8)
     for kind in ("JPEG", "PNG", "WEBP"):
-        assert page_map.picture_kind(encoded(picture, kind)) == kind.lower()
-    with pytest.raises(ValueError, match="no JPEG, PNG or WebP"):
-        page_map.picture_kind(encoded(picture, "GIF"))
+        assert kit_map.picture_kind(encoded(picture, kind)) == kind.lower()
+    with pytest.raises(ValueError, match="not a JPEG, PNG or WebP"):
+        kit_map.picture_kind(encoded(picture, "GIF"))
 
 
 def test_every_tile_lies_in_its_text(report: Report, text: str) -> None:
@@ -213,4 +215,4 @@ def test_package_carries_what_the_page_reads() -> None:
     files = ("page.css", "web/vendor_map.css", "web/LICENCES", *page._MAP_SCRIPTS)
     for file in (*files, *page._MESH_SCRIPTS):
         assert (ROOM / file).is_file()
-        assert any(fnmatch(f"report/{file}", glob) for glob in globs), file
+        assert any(fnmatch(f"kit/{file}", glob) for glob in globs), file

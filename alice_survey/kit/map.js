@@ -56,29 +56,30 @@ function startMap() {
           radius: 5, color: "#fff", weight: 1.5, fillColor: about.colour, fillOpacity: 1,
         })
         : many(places(shape), {
-          color: about.colour, weight: about.kind === "line" ? 2.6 : rimmed ? 1.8 : 1,
-          fillOpacity: 0.03, ...dashes,
+          color: about.colour,
+          weight: about.width || (about.kind === "line" ? 2.6 : rimmed ? 1.8 : 1),
+          fillOpacity: about.fill, ...dashes,
         });
       drawn.survey = {title: about.title, text: about.texts[index] || ""};
-      drawn.on("click", (event) => tell(drawn, event.latlng));
+      drawn.on("click", (event) => describe(drawn, event.latlng));
       group.addLayer(drawn);
     });
     group.kind = about.kind;
     return group;
   }
 
-  function tell(shape, at) {
+  function describe(shape, at) {
     const content = document.createElement("div");
     const title = document.createElement("b");
     title.textContent = shape.survey.title;
     const text = document.createElement("p");
     text.textContent = shape.survey.text;
     content.append(title, text);
-    leaflet.popup({minWidth: 110, maxWidth: 260, className: "told"}).setLatLng(at).setContent(content).openOn(map);
+    leaflet.popup({minWidth: 110, maxWidth: 260, className: "described"}).setLatLng(at).setContent(content).openOn(map);
   }
 
   /* What a pointer would choose, for those who have none: the shape nearest to the middle. */
-  function tellMiddle() {
+  function describeMiddle() {
     const middle = map.containerPointToLayerPoint(map.getSize().divideBy(2));
     let best = null;
     let least = 60;
@@ -95,8 +96,8 @@ function startMap() {
         }
       });
     });
-    if (best) tell(...best);
-    else readout.textContent = "Nothing to tell within 60 px of the middle";
+    if (best) describe(...best);
+    else readout.textContent = "Nothing within 60 px of the middle";
   }
 
   function show(name, on) {
@@ -170,7 +171,7 @@ function startMap() {
   });
   box.addEventListener("keydown", (event) => {
     if (event.target !== box || event.ctrlKey || event.metaKey || event.altKey) return;
-    const act = {0: showAll, Enter: tellMiddle}[event.key];
+    const act = {0: showAll, Enter: describeMiddle}[event.key];
     if (!act) return;
     event.preventDefault();
     act();

@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from alice_survey.report.words import count, digits, duration, length, parts, share
+from alice_survey.kit.words import count, digits, duration, length, parts, share
 
 
 @pytest.mark.parametrize(

@@ -1,14 +1,15 @@
 """A small made-up report with everything that a report can hold."""
 
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
 from PIL import Image
 
-from alice_survey.report.document import (
+from alice_survey.kit.document import (
     Figure,
     Mesh,
     PictureLayer,
@@ -18,7 +19,10 @@ from alice_survey.report.document import (
     ShapeLayer,
     SurveyMap,
     Table,
+    Verdict,
 )
+from alice_survey.kit.figure import drawn
+from alice_survey.kit.map_figure import with_stills
 
 PIXEL_M = 0.004
 TILE_PX = 256
@@ -166,26 +170,27 @@ def sketch_mesh(folder: Path) -> Mesh:
     return Mesh(
         glb=path,
         about=f"{len(sheet.faces)} triangles, 4.0 m by 3.2 m.",
-        still=encoded(seafloor(640, 400), "PNG"),
-        alt="The sea floor from the south: two rows of sand waves.",
+        still=Figure(
+            png=encoded(seafloor(640, 400), "PNG"),
+            title="Mesh",
+            alt="The sea floor from the south: two rows of sand waves.",
+            shows="The mesh from the south.",
+        ),
     )
 
 
 def sketch_figure(title: str, width: int = 1210, height: int = 629) -> Figure:
-    """Drawn by matplotlib, as the real ones are."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure as Plot
-
-    plot = Plot(figsize=(width / 130, height / 130), dpi=130)
-    FigureCanvasAgg(plot)
-    axes = plot.add_subplot()
+    """Drawn as the real ones are."""
     rng = np.random.default_rng(3)
-    axes.hist(rng.standard_normal(4000), 60, color="#0072b2")
-    axes.set(xlabel="residual, px", ylabel="observations")
-    held = io.BytesIO()
-    plot.savefig(held, format="png")
-    return Figure(
-        png=held.getvalue(),
+
+    def paint(axes: Sequence[Any]) -> None:
+        axes[0].hist(rng.standard_normal(4000), 60, color="#0072b2")
+        axes[0].set(xlabel="residual, px", ylabel="observations")
+
+    return drawn(
+        paint,
+        height / 130,
+        width_in=width / 130,
         title=title,
         alt="A histogram of residuals, as wide as one pixel, symmetric about zero.",
         shows="How far the points of the model fall from where the pictures saw them.",
@@ -228,9 +233,9 @@ def sketch_report(folder: Path, side: int = 1100) -> Report:
             ("depth", "15.0 m"), ("time", "14 min"),
         ],
         verdicts=[
-            ("bad", "Check point B is 12 mm off: its mark was moved between the dives."),
-            ("look", "0.6 % of the area is seen in fewer than three pictures."),
-            ("good", "All pictures are placed."),
+            Verdict(level="bad", text="Check point B is 12 mm off: its mark was moved."),
+            Verdict(level="look", text="0.6 % of the area is seen in fewer than three pictures."),
+            Verdict(level="good", text="All pictures are placed."),
         ],
         sections=[
             Section(name="map", title="Where it was flown", scene="map",
@@ -253,6 +258,6 @@ def sketch_report(folder: Path, side: int = 1100) -> Report:
                 ],
             ),
         ],
-        map=sketch_map(side),
+        map=with_stills(sketch_map(side)),
         mesh=sketch_mesh(folder),
     )  # fmt: skip

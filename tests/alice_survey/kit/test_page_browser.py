@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from alice_survey.report.document import PictureLayer, Report
-from alice_survey.report.page import render_html
-from tests.alice_survey.report.browser import Heard, chromium
-from tests.alice_survey.report.sketch import RUDE, encoded, seafloor, sketch_report
+from alice_survey.kit.document import PictureLayer, Report
+from alice_survey.kit.page import render_html
+from tests.alice_survey.kit.browser import Heard, chromium
+from tests.alice_survey.kit.sketch import RUDE, encoded, seafloor, sketch_report
 
 pytestmark = pytest.mark.xdist_group("chromium")
 SIZES = {"desk": (1280, 900), "phone": (400, 800)}
