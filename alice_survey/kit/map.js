@@ -110,6 +110,7 @@ function startMap() {
     const legend = document.getElementById("legend-" + name);
     if (legend) legend.hidden = !on;
     note();
+    map.fire("layerschanged");
   }
 
   /* Where the map stands, for the reader and for tests. */
@@ -126,10 +127,11 @@ function startMap() {
     });
   }
 
+  let more = () => "";
   const decimals = () => Math.min(4, Math.max(0, Math.ceil(Math.log10(2 ** map.getZoom()))));
   function read(word, place) {
     const [e, n] = [place.lng, place.lat].map((v) => v.toFixed(decimals()).replace("-", "−"));
-    readout.textContent = word + e + " " + data.unit + " east, " + n + " " + data.unit + " north";
+    readout.textContent = word + e + " " + data.unit + " east, " + n + " " + data.unit + " north" + more(place);
   }
   const readCentre = () => read("Middle: ", map.getCenter());
 
@@ -147,12 +149,17 @@ function startMap() {
     readCentre();
     drawBar();
   });
-  map.on("mousemove", (event) => read("", event.latlng));
+  map.on("mousemove readout", (event) => read("", event.latlng));
   map.on("mouseout", readCentre);
   map.on("tilelost", () => {
     readout.textContent = "A part of the picture did not come: load this page again";
   });
   map.fitBounds(whole, {padding: [24, 24], animate: false});
+  /* A script of the page's own, before this one, may define what it adds to the map. */
+  if (typeof extendMap === "function") {
+    more = extendMap(map, layers, data.more);
+    readCentre();
+  }
 
   root.querySelectorAll("input").forEach((input) => {
     if (input.checked) show(input.value, true);

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from alice_survey.kit.words import with_sigma
 from camera_calib.calibration import Calibration
-from camera_calib.judge.page import with_sigma
 from camera_calib.judge.uncertainty import baseline_sigma_m
 from camera_calib.rig import Rig
 from camera_calib.targets.target import Target

@@ -318,3 +318,10 @@ def _for_readers(name: str, number: float, sigma: float | None) -> tuple[float, 
         if name.endswith(ending):
             return number * factor, None if sigma is None else sigma * factor, unit
     return number, sigma, ""
+
+
+def short_label(field: str) -> str:
+    """A parameter's name without its unit: `fx_px` as `fx`."""
+    for ending in ("_px", "_rad", "_m"):
+        field = field.removesuffix(ending)
+    return field.replace("_", " ")

@@ -8,13 +8,14 @@ import numpy as np
 from alice_survey.base.artefacts import write_json
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.run import progress
+from alice_survey.kit.document import Link
 from camera_calib.rig import Rig
 from missions.exports.options import Options
 from missions.exports.write import about_file, write_exports
 from missions.exposure.table import settings_table
 from missions.exposure.timetable import trigger_table, write_timetable
 from missions.plan.map import draw_plan
-from missions.plan.page import Link, write_page
+from missions.plan.page import write_page
 from missions.route.cost import leg_costs
 from missions.values.costs import Costs
 from missions.values.plan_file import Dive, Plan
@@ -55,7 +56,10 @@ def write_planned(folder: Path, planned: "Planned", config: SurveyConfig, rig: R
         bathymetry=planned.bathymetry,
         sea=config.sea,
         warnings=planned.warnings,
-        links=[Link(href=f"exports/{file.name}", about=about_file(file)) for file in files],
+        links=[
+            Link(text=file.name, address=f"exports/{file.name}", about=about_file(file))
+            for file in files
+        ],
     )
 
 

@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from alice_survey.kit.words import count, digits, duration, length, parts, share
+from alice_survey.kit.words import count, digits, duration, length, parts, share, with_sigma
 
 
 @pytest.mark.parametrize(
@@ -39,3 +39,18 @@ def test_scales_are_told_in_parts() -> None:
 def test_durations_and_counts() -> None:
     assert [duration(s) for s in (3.04, 51, 840, 9000)] == ["3.0 s", "51 s", "14 min", "2.5 h"]
     assert (count(1, "picture"), count(1200, "picture")) == ("1 picture", "1,200 pictures")
+
+
+@pytest.mark.parametrize(
+    ("value", "sigma", "expected"),
+    [
+        (849.3123, 0.4567, "849.31 ± 0.46"),
+        (-0.0612, 0.00135, "-0.0612 ± 0.0014"),
+        (53.2, 12.3, "53 ± 12"),
+        (1234.5, 230.0, "1234 ± 230"),
+        (0.0994, 0.0996, "0.10 ± 0.10"),
+        (5.0, 0.0, "5 ± 0"),
+    ],
+)
+def test_a_sigma_has_two_digits(value: float, sigma: float, expected: str) -> None:
+    assert with_sigma(value, sigma) == expected

@@ -15,8 +15,7 @@ from shapely.geometry import MultiPolygon
 
 from alice_survey.base.config import SeaConfig, parse_config
 from alice_survey.base.errors import PlanError
-from missions.plan.map import draw_plan
-from missions.plan.redraw import map_report
+from missions.plan.map import draw_plan, map_report
 from missions.plan.run import run_plan
 from missions.values.plan_file import Plan
 from tests.missions.exports.plans import RIG, line, plan_of, small_plan
