@@ -178,6 +178,9 @@ class SurveyMap:
     """Of its axes: m, or unit where the model has no scale."""
     origin: str
     """Where (0, 0) is, in words."""
+    geodetic: tuple[Sequence[float], Sequence[float]] | None = None
+    """Degrees of latitude and longitude as quadratics of metres north n and east e: coefficients
+    of 1, n, e, n², ne and e²; the map then shows them under the pointer."""
     stills: Sequence[Figure] = ()
     """The map for print and for browsers without scripts: all of them in print, the first on the
     page; where there are none, the interactive map itself is printed."""

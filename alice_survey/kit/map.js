@@ -61,7 +61,7 @@ function startMap() {
           fillOpacity: about.fill, ...dashes,
         });
       drawn.survey = {title: about.title, text: about.texts[index] || ""};
-      drawn.on("click", (event) => describe(drawn, event.latlng));
+      drawn.on("click", (event) => { if (!ruler.on) describe(drawn, event.latlng); });
       group.addLayer(drawn);
     });
     group.kind = about.kind;
@@ -127,11 +127,39 @@ function startMap() {
     });
   }
 
+  /* Lengths between places that are clicked, or that Enter takes from the middle. */
+  const ruler = {on: false, places: [], line: leaflet.polyline([], {
+    color: "#8e44ad", weight: 2.5, dashArray: "6 3", interactive: false,
+  }).addTo(map)};
+  const ruled = (places) => places.slice(1).reduce(
+    (sum, place, i) => sum + Math.hypot(place.lat - places[i].lat, place.lng - places[i].lng), 0,
+  );
+  function measure(on) {
+    ruler.on = on;
+    ruler.places = [];
+    ruler.line.setLatLngs([]);
+    root.querySelector('[data-act="measure"]').setAttribute("aria-pressed", String(on));
+    if (on) map.closePopup();
+    readCentre();
+  }
+  function addPlace(place) {
+    ruler.places.push(place);
+    ruler.line.setLatLngs(ruler.places);
+    read("", place);
+  }
+
+  /* What a script of the page's own, before this one, adds for a place. */
   let more = () => "";
   const decimals = () => Math.min(4, Math.max(0, Math.ceil(Math.log10(2 ** map.getZoom()))));
   function read(word, place) {
     const [e, n] = [place.lng, place.lat].map((v) => v.toFixed(decimals()).replace("-", "−"));
-    readout.textContent = word + e + " " + data.unit + " east, " + n + " " + data.unit + " north" + more(place);
+    let text = word + e + " " + data.unit + " east, " + n + " " + data.unit + " north";
+    if (data.geodetic) text += "; " + latLon(data.geodetic, place.lat, place.lng);
+    if (ruler.on) {
+      const total = lengthText(ruled([...ruler.places, place]), data.unit, 4);
+      text += ruler.places.length ? "; measured " + total : "; click to measure";
+    }
+    readout.textContent = text + more(place);
   }
   const readCentre = () => read("Middle: ", map.getCenter());
 
@@ -149,17 +177,17 @@ function startMap() {
     readCentre();
     drawBar();
   });
-  map.on("mousemove readout", (event) => read("", event.latlng));
+  map.on("mousemove", (event) => {
+    read("", event.latlng);
+    if (ruler.on) ruler.line.setLatLngs([...ruler.places, event.latlng]);
+  });
+  map.on("click", (event) => { if (ruler.on) addPlace(event.latlng); });
   map.on("mouseout", readCentre);
   map.on("tilelost", () => {
     readout.textContent = "A part of the picture did not come: load this page again";
   });
   map.fitBounds(whole, {padding: [24, 24], animate: false});
-  /* A script of the page's own, before this one, may define what it adds to the map. */
-  if (typeof extendMap === "function") {
-    more = extendMap(map, layers, data.more);
-    readCentre();
-  }
+  if (typeof extendMap === "function") more = extendMap(map, layers, data.more);
 
   root.querySelectorAll("input").forEach((input) => {
     if (input.checked) show(input.value, true);
@@ -172,13 +200,16 @@ function startMap() {
       show(input.value, input.checked);
     });
   });
-  const acts = {in: () => map.zoomIn(1), out: () => map.zoomOut(1), all: showAll};
+  const acts = {in: () => map.zoomIn(1), out: () => map.zoomOut(1), all: showAll, measure: () => measure(!ruler.on)};
   root.querySelectorAll("button[data-act]").forEach((button) => {
     button.addEventListener("click", acts[button.dataset.act]);
   });
   box.addEventListener("keydown", (event) => {
     if (event.target !== box || event.ctrlKey || event.metaKey || event.altKey) return;
-    const act = {0: showAll, Enter: describeMiddle}[event.key];
+    const enter = ruler.on ? () => addPlace(map.getCenter()) : describeMiddle;
+    const act = {
+      0: showAll, Enter: enter, m: acts.measure, Escape: ruler.on ? () => measure(false) : null,
+    }[event.key];
     if (!act) return;
     event.preventDefault();
     act();
@@ -187,9 +218,17 @@ function startMap() {
   root.dataset.ready = "";
 }
 
+/* Latitude and longitude are quadratic in metres north and east. */
+function latLon(geodetic, n, e) {
+  const terms = [1, n, e, n * n, n * e, e * e];
+  const [lat, lon] = geodetic.map((c) => terms.reduce((sum, term, i) => sum + c[i] * term, 0));
+  const degrees = (value, ahead, astern) => Math.abs(value).toFixed(7) + "° " + (value < 0 ? astern : ahead);
+  return degrees(lat, "N", "S") + " " + degrees((lon + 540) % 360 - 180, "E", "W");
+}
+
 /* 0.02 m reads as 2 cm. */
-function lengthText(length, unit) {
-  const places = (value) => Number(value.toPrecision(2)).toString();
+function lengthText(length, unit, digits = 2) {
+  const places = (value) => Number(value.toPrecision(digits)).toString();
   if (unit !== "m" || length >= 1) return places(length) + " " + unit;
   return length >= 0.01 ? places(length * 100) + " cm" : places(length * 1000) + " mm";
 }

@@ -19,12 +19,13 @@ from alice_survey.kit.figure import (
     save_figure,
 )
 from camera_calib.rig import Rig, design_rig
-from missions.areas.bathymetry import Bathymetry, read_bathymetry
+from missions.areas.bathymetry import Bathymetry
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.drawing import draw_counts, draw_polygons, finish_map, map_sheet
 from missions.coverage.stations import plan_pattern, stations_of_plan
 from missions.exports.footprints import footprint_outline, footprints_ne
 from missions.plan.page_map import COLOURS, KINDS
+from missions.plan.planner import area_bathymetry
 from missions.values.plan_file import Plan, read_plan
 
 _MOST_ARROWS = 500
@@ -50,15 +51,9 @@ def map_report(plan_path: Path, config: SurveyConfig, out: Path) -> tuple[str, d
     check_figure_path(out)
     plan = read_plan(plan_path)
     rig = design_rig(config.camera, config.water)
-    bathymetry, floor_m = None, None
-    if config.area.bathymetry_file is not None:
-        bathymetry = read_bathymetry(
-            config.area.bathymetry_file,
-            plan.datum,
-            bounds_ne=plan.area.allowed.buffer(4.0 * plan.altitude_m).bounds,
-            sense=config.area.bathymetry_values,
-            crs=config.area.bathymetry_crs,
-        )
+    bathymetry = area_bathymetry(config.area, plan.area, plan.altitude_m)
+    floor_m = None
+    if bathymetry is not None:
         floor_m = bathymetry.depth_at(np.vstack([line.stations_ne for line in plan.lines]))
     stations = stations_of_plan(plan, floor_m)
     seen = certificate(plan.area, rig, stations, plan_pattern(plan, rig))

@@ -1,34 +1,11 @@
 /* What the map of a plan adds to the kit's: stations and footprints in view, the station under the
-   pointer, latitude and longitude, counts of pictures, and distances. Places are metres north and
-   east of the datum; Leaflet has them as latitude and longitude. */
+   pointer, and counts of pictures. Places are metres north and east of the datum; Leaflet has them
+   as latitude and longitude. */
 
 const MOST_SHOWN = 3000;  /* stations and footprints in view that are drawn one by one */
 const NEAR_PX = 14;
 const FOOTPRINT = "#2e86c1";
 const HOVER = "#b7950b";
-const MEASURE = "#8e44ad";
-
-function geodetic(geo, n, e) {
-  const terms = [1, n, e, n * n, n * e, e * e];
-  const sum = (c) => terms.reduce((total, term, i) => total + c[i] * term, 0);
-  return [sum(geo.lat), sum(geo.lon)];
-}
-
-function latLon(geo, n, e) {
-  const [lat, lon] = geodetic(geo, n, e);
-  const degrees = (value, ahead, astern) =>
-    Math.abs(value).toFixed(7) + "° " + (value < 0 ? astern : ahead);
-  return degrees(lat, "N", "S") + "  " + degrees((lon + 540) % 360 - 180, "E", "W");
-}
-
-function metres(length) {
-  if (length >= 1000) return (length / 1000).toFixed(length < 1e4 ? 2 : 1) + " km";
-  return (length < 10 ? length.toFixed(2) : length.toFixed(1)) + " m";
-}
-
-function bearing(a, b) {
-  return (Math.atan2(b[1] - a[1], b[0] - a[0]) * 180 / Math.PI + 360) % 360;
-}
 
 /* The line nearest to a place and its station there, or null where none is within a distance. */
 function nearest(lines, n, e, within) {
@@ -77,7 +54,6 @@ function extendMap(map, layers, data) {
   const shown = () => lines.filter((line) => map.hasLayer(line.group));
   const arrows = leaflet.featureGroup().addTo(map);
   const hovered = leaflet.featureGroup().addTo(map);
-  const ruler = leaflet.featureGroup().addTo(map);
   const fixed = {interactive: false};
 
   /* Stations, footprints and arrows of the lines in view, as far as they can be told apart. */
@@ -124,83 +100,25 @@ function extendMap(map, layers, data) {
     }));
   }
 
-  /* A text at a place, by a mark of no size: Leaflet's tooltips belong to layers. */
-  function label(group, place, text, direction) {
-    const content = document.createElement("span");
-    content.textContent = text;
-    content.style.whiteSpace = "pre-line";
-    leaflet.circleMarker(place, {...fixed, radius: 0, stroke: false}).addTo(group)
-      .bindTooltip(content, {permanent: true, direction, offset: [0, direction === "top" ? -8 : 0]});
-  }
-
   function hover({latlng: {lat: n, lng: e}}) {
     hovered.clearLayers();
-    const found = measuring ? null : nearest(shown(), n, e, NEAR_PX / metrePx());
+    const found = nearest(shown(), n, e, NEAR_PX / metrePx());
     if (!found) return;
     const {line, station} = found;
     const place = stationAt(line, station);
     const style = {...fixed, color: HOVER, weight: 1.2, fillColor: "#f1c40f"};
     hovered.addLayer(leaflet.polyline([[line.n0, line.e0], [line.n1, line.e1]], {...fixed, color: "#f1c40f", weight: 4, opacity: 0.75}));
     hovered.addLayer(leaflet.polygon(around(line, place, data.outline), {...style, fillOpacity: 0.18}));
-    hovered.addLayer(leaflet.circleMarker(place, {...style, radius: 5, fillOpacity: 1}));
-    label(hovered, place, [
+    const content = document.createElement("span");
+    content.style.whiteSpace = "pre-line";
+    content.textContent = [
       line.text,
       "Station " + (line.first + station) + ", " + (station + 1) + " of " + line.stations,
-      place[0].toFixed(3) + " m N, " + place[1].toFixed(3) + " m E", latLon(data.geo, ...place),
-    ].join("\n"), "top");
+      place[0].toFixed(3) + " m N, " + place[1].toFixed(3) + " m E",
+    ].join("\n");
+    leaflet.circleMarker(place, {...style, radius: 5, fillOpacity: 1}).addTo(hovered)
+      .bindTooltip(content, {permanent: true, direction: "top", offset: [0, -8]});
   }
-
-  /* ---- Distances ---- */
-
-  let measuring = false;
-  let measured = [];
-  const button = document.createElement("button");
-  button.type = "button";
-  button.textContent = "↔";
-  button.title = "Measure distances (m, Esc)";
-  button.setAttribute("aria-label", "Measure distances");
-  map.getContainer().parentElement.querySelector(".tools").append(button);
-
-  function measure(on) {
-    measuring = on;
-    measured = [];
-    button.setAttribute("aria-pressed", String(on));
-    hovered.clearLayers();
-    map.closePopup();
-    drawRuler();
-  }
-
-  function drawRuler() {
-    ruler.clearLayers();
-    ruler.addLayer(leaflet.polyline(measured, {...fixed, color: MEASURE, weight: 2, dashArray: "6 3"}));
-    measured.forEach((place, i) => {
-      ruler.addLayer(leaflet.circleMarker(place, {...fixed, radius: 3.5, stroke: false, fillColor: MEASURE, fillOpacity: 1}));
-      if (!i) return;
-      const from = measured[i - 1];
-      const text = metres(apart(from, place)) + "  " + bearing(from, place).toFixed(0) + "°";
-      label(ruler, [(from[0] + place[0]) / 2, (from[1] + place[1]) / 2], text, "center");
-    });
-  }
-
-  const apart = (a, b) => Math.hypot(b[0] - a[0], b[1] - a[1]);
-  let pressed = [0, 0];
-  const container = map.getContainer();
-  container.addEventListener("pointerdown", (event) => { pressed = [event.clientX, event.clientY]; });
-  /* Before Leaflet sees it: while distances are measured, a click chooses no line. */
-  container.addEventListener("click", (event) => {
-    if (!measuring || apart(pressed, [event.clientX, event.clientY]) > 4) return;
-    event.stopPropagation();
-    const {lat, lng} = map.mouseEventToLatLng(event);
-    measured.push([lat, lng]);
-    drawRuler();
-    map.fire("readout", {latlng: {lat, lng}});
-  }, true);
-  button.addEventListener("click", () => measure(!measuring));
-  container.addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey) return;
-    if (event.key === "m") measure(!measuring);
-    if (event.key === "Escape" && measuring) measure(false);
-  });
 
   /* ---- Counts under the pointer: red pictures, green lines, red 255 outside of the area ---- */
 
@@ -224,7 +142,7 @@ function extendMap(map, layers, data) {
     if (row < 0 || column < 0 || row >= counts.height || column >= counts.width) return "";
     const [pictures, passes] = counts.data.slice(4 * (row * counts.width + column));
     if (pictures === 255) return "";
-    return ", " + (pictures === 254 ? "254 or more" : pictures) + " pictures of " + passes
+    return "; " + (pictures === 254 ? "254 or more" : pictures) + " pictures of " + passes
       + (passes === 1 ? " line" : " lines");
   }
 
@@ -234,13 +152,9 @@ function extendMap(map, layers, data) {
   layers.get("contours")?.eachLayer((shape) => {
     if (shape.survey) shape.bindTooltip(shape.survey.text, {sticky: true});
   });
-  return ({lat, lng}) => {
-    const total = measured.slice(1).reduce((sum, b, i) => sum + apart(measured[i], b), 0);
-    const length = measuring ? ", " + (measured.length > 1 ? "measured " + metres(total) : "click to measure") : "";
-    return ", " + latLon(data.geo, lat, lng) + countsAt(lat, lng) + length;
-  };
+  return ({lat, lng}) => countsAt(lat, lng);
 }
 
 if (typeof module !== "undefined") {
-  module.exports = {around, bearing, geodetic, latLon, metres, nearest, stationAt};
+  module.exports = {around, nearest, stationAt};
 }

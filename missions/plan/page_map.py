@@ -91,16 +91,16 @@ def plan_map(
     )  # fmt: skip
     if sea is not None and sea.current_mps > 0 and sea.current_file is None:
         layers.append(_current_layer(sea, extent))
-    datum = plan.datum
     return SurveyMap(
         layers=layers,
         unit="m",
-        origin=f"North is up. 0, 0 is {datum.latitude_deg:.7f}°, {datum.longitude_deg:.7f}°.",
+        origin="North is up; the datum is at 0, 0.",
+        geodetic=geodetic_fit(plan, extent),
     )
 
 
 def station_data(plan: Plan, rig: Rig, certificate: Certificate | None) -> dict[str, Any]:
-    """What the map's script derives stations, footprints and geodetic places from, as JSON values.
+    """What the map's script starts from, as JSON values.
 
     `lines` holds, by layer and in the order of its shapes, the number of the line, of its first
     station, and of its stations.
@@ -115,7 +115,6 @@ def station_data(plan: Plan, rig: Rig, certificate: Certificate | None) -> dict[
         "outline": np.round(outline, 4).tolist(),
         "across": plan.footprint_m[0],
         "spacing": plan.line_spacing_m,
-        "geo": geodetic_fit(plan, map_extent(plan, outline)),
         "counts": None if certificate is None else _counts_data(certificate),
     }
 
@@ -212,7 +211,7 @@ def map_extent(plan: Plan, outline: Array) -> Extent:
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
 
-def geodetic_fit(plan: Plan, extent: Extent) -> dict[str, list[float]]:
+def geodetic_fit(plan: Plan, extent: Extent) -> tuple[list[float], list[float]]:
     """Latitude and longitude as polynomials of second order in north and east, degrees.
 
     Args:
@@ -241,7 +240,7 @@ def geodetic_fit(plan: Plan, extent: Extent) -> dict[str, list[float]]:
     factors, *_ = np.linalg.lstsq(scaled, turned, rcond=None)
     factors = factors / degree[:, None]
     factors[0] += start
-    return {"lat": factors[:, 0].tolist(), "lon": factors[:, 1].tolist()}
+    return factors[:, 0].tolist(), factors[:, 1].tolist()
 
 
 def _places(points_ne: Array) -> list[tuple[float, float]]:

@@ -16,14 +16,12 @@ from numpy.typing import NDArray
 
 from alice_survey.base.artefacts import Stage, need_stage, run_stage, write_json
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
-from alice_survey.base.contents import taken_from
 from alice_survey.base.errors import ReconstructionError, warn
 from alice_survey.base.executor import parallel_map
 from reconstruct.dense.cloud import laz_writer, voxel_edge, write_cloud_json, write_ply
-from reconstruct.dense.dem import FILL_CELLS, DemGrid, grid_over, round_cell
+from reconstruct.dense.dem import FILL_CELLS
+from reconstruct.dense.matching_trial import find_conditions
 from reconstruct.dense.pose_part import find_pose_part
-from reconstruct.dense.probe import find_conditions
-from reconstruct.dense.rectify import scaled_view
 from reconstruct.dense.stereo_pairs import choose_pairs, neighbours, points_in_sight
 from reconstruct.dense.tiles import Tile, ViewSummary, fuse_tile, tile_tasks
 from reconstruct.dense.view_store import ViewStore
@@ -41,8 +39,8 @@ from reconstruct.dense.views import (
     view_depth,
 )
 from reconstruct.light.solve import joined_samples, solve_light, write_light
-from reconstruct.raster import preview_dem, tiled_raster
-from reconstruct.views.model import SparseModel, WorldFrame, read_model
+from reconstruct.raster import DemGrid, grid_over, preview_dem, round_cell, tiled_raster
+from reconstruct.views.model import SparseModel, WorldFrame, picture_files, read_model, scaled_view
 
 CELL_PIXELS = 2.5
 """Side of a DEM cell in mean ground pixels of the pictures as matched, unless depth is coarser."""
@@ -85,18 +83,6 @@ def run_dense(workspace: Path, config: SurveyConfig, threads: int) -> bool:
         build_surface(workspace, model, folder, config.reconstruct, threads)
 
     return run_stage(workspace, stage, work)
-
-
-def picture_files(workspace: Path, sparse: Path, model: SparseModel) -> list[Path]:
-    """The registered pictures and their masks."""
-    from alice_survey.base.artefacts import read_json
-
-    images = workspace / "images"
-    names = [view.image for view in model.views]
-    with taken_from(sparse / "cameras.json"):
-        about = read_json(sparse / "cameras.json")["images"]
-        masks = [str(about[name]["mask"]) for name in names if about[name].get("mask")]
-    return [images / name for name in [*names, *masks]]
 
 
 def build_surface(

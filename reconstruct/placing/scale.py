@@ -15,7 +15,7 @@ from alice_survey.base.contents import taken_from
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
 from reconstruct.pictures.undistorted import Pictures
-from reconstruct.placing.place import SCALE_FILE
+from reconstruct.placing.find_place import SCALE_FILE
 from reconstruct.views.model import SparseModel, View, read_model
 
 _NEIGHBOURS = 15

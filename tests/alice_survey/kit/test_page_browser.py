@@ -240,6 +240,20 @@ def test_scale_bar_is_true(page: Any) -> None:
     assert bar.bounding_box()["width"] == pytest.approx(length_m * px_per_m, abs=1)
 
 
+def test_ruler_measures_between_clicks(page: Any) -> None:
+    button = page.get_by_role("button", name="Measure a length")
+    button.click()
+    page.mouse.click(*place_on_page(page, -1.0, 0.5))
+    page.mouse.click(*place_on_page(page, 0.5, 0.5))
+    text = page.locator("#map-readout").inner_text()
+    assert float(re.findall(r"measured ([\d.]+) m", text)[0]) == pytest.approx(1.5, abs=0.02)
+    assert page.locator(".leaflet-popup-content").count() == 0
+    page.locator(MAP).focus()
+    page.keyboard.press("Escape")
+    assert button.get_attribute("aria-pressed") == "false"
+    assert "measured" not in page.locator("#map-readout").inner_text()
+
+
 def test_popups(page: Any) -> None:
     page.mouse.click(*place_on_page(page, 0.6, -0.533))
     popup = page.locator(".leaflet-popup-content")
@@ -360,7 +374,7 @@ def test_paper_shows_all(page: Any) -> None:
         A4_PX,
     )
     stills = page.evaluate(
-        "[...document.querySelectorAll('.still img, .still > svg')]"
+        "[...document.querySelectorAll('.still img')]"
         ".map((e) => e.checkVisibility() && e.getBoundingClientRect().height)"
     )
     moving = page.evaluate(
@@ -412,7 +426,7 @@ def test_without_scripts_stills(browser: Any, file: Path) -> None:
     page = context.new_page()
     page.goto(file.as_uri())
     assert page.locator(".mesh .still img").is_visible()
-    assert page.locator(".map .still > svg").is_visible()
+    assert page.locator(".map .still img").is_visible()
     assert not page.locator("#map").is_visible()
     context.close()
 

@@ -5,8 +5,9 @@ import cv2
 import numpy as np
 import pytest
 
-from reconstruct.dense.probe import find_conditions, matching_scale
-from reconstruct.dense.stereo_pairs import choose_pairs, points_of_views
+from reconstruct.dense.matching_trial import find_conditions, matching_scale
+from reconstruct.dense.stereo_pairs import choose_pairs
+from reconstruct.views.model import points_of_views
 from tests.oracles_dense import (
     Scene,
     sloped_with_step,

@@ -2,12 +2,11 @@
 
 In dim or turbid water the finest detail of a picture is noise: half the resolution then finds more
 matches, and better ones. How far depths from different partners differ, in units of what a match of
-`MATCH_SIGMA_PX` would give, tells the true precision: noise, calibration and poses together.
+`MATCH_SIGMA_PX` would give, shows the true precision: noise, calibration and poses together.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -17,11 +16,10 @@ from numpy.typing import NDArray
 from alice_survey.base.executor import parallel_map
 from alice_survey.base.frames import Array
 from reconstruct.dense.depth import MATCH_SIGMA_PX, pair_depth
-from reconstruct.dense.rectify import scaled_view
 from reconstruct.dense.stereo_pairs import StereoPair
 from reconstruct.pictures.normalise import normalise
 from reconstruct.pictures.undistorted import Pictures
-from reconstruct.views.model import View
+from reconstruct.views.model import View, scaled_view
 
 LARGEST_PIXELS = 3_000_000
 """Pictures with more pixels are halved for matching, until they have fewer."""
@@ -111,18 +109,12 @@ def find_conditions(
     while best + 1 < len(scales) and known[best + 1] > _WORTH * known[best]:
         best += 1
     spreads = [result.spread[best] for result in results]
-    told = [spread for spread in spreads if np.isfinite(spread)]
-    sigma = MATCH_SIGMA_PX * (float(np.median(told)) if told else 1.0)
+    known_spreads = [spread for spread in spreads if np.isfinite(spread)]
+    sigma = MATCH_SIGMA_PX * (float(np.median(known_spreads)) if known_spreads else 1.0)
     return Conditions(
         scale=scales[best],
         match_sigma_px=round(float(np.clip(sigma, *_SIGMA_LIMITS_PX)), 3),
     )
-
-
-@lru_cache(maxsize=1)
-def open_pictures(workspace: Path) -> Pictures:
-    """The pictures of a workspace, opened once in each process."""
-    return Pictures.open(workspace)
 
 
 def shrunk(
@@ -172,7 +164,7 @@ def _looks(
     workspace: Path, view: View, scales: Sequence[float]
 ) -> list[tuple[NDArray[np.uint8], NDArray[np.bool_]]]:
     """An evened picture and its validity at every scale, the picture read once."""
-    pictures = open_pictures(workspace)
+    pictures = Pictures.open(workspace)
     colour, valid = pictures.colour(view.image), pictures.valid(view.image)
     found = []
     for scale in scales:

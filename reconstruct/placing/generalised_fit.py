@@ -3,7 +3,7 @@
 Errors of navigation last: weights that take readings as independent state sigmas that are far too
 small. Here every group of channels (horizontal position, depth, tilt, heading) has the marginal
 sigma that navigation states, and a correlation time and white and constant shares that the misfit
-between navigation and the model tells, the model being stiff. They are found by restricted maximum
+between navigation and the model gives, the model being stiff. They are found by restricted maximum
 likelihood (Patterson & Thompson 1971), which counts what the placement itself has absorbed, and
 the covariance of the placement is averaged over all that are likely.
 """
@@ -16,8 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.frames import Array
-from reconstruct.placing.channels import GROUP_OF, GROUPS, PARAMETERS, Equations
-from reconstruct.placing.correlated import LEAST_WHITE, lasting_share, surprise, whiten
+from reconstruct.placing.correlated_errors import LEAST_WHITE, lasting_share, surprise, whiten
+from reconstruct.placing.navigation_equations import (
+    GROUP_OF,
+    GROUPS,
+    PARAMETERS,
+    NavigationEquations,
+)
 
 _WHITE = (LEAST_WHITE, 3e-3, 0.05, 0.3, 0.8, 0.97)
 _CONSTANT = (0.0, 0.5, 0.75, 0.9)
@@ -51,7 +56,7 @@ class Lasting:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Extra:
-    """Independent equations beside navigation, made white: misfit + jacobian x change = N(0, 1)."""
+    """Independent further equations, made white: misfit + jacobian x change = N(0, 1)."""
 
     misfit: Array
     """(E,)."""
@@ -78,7 +83,7 @@ class Estimate:
 
 def estimate(
     time: Array,
-    found: Equations,
+    found: NavigationEquations,
     used: NDArray[np.bool_],
     free: Sequence[int],
     extra: Extra = NO_EXTRA,
@@ -100,7 +105,7 @@ def estimate(
         lasting: how errors last, where that is known: then no reading is left out either, and the
             covariance is that of this way alone.
     """
-    problem = _Problem(
+    problem = _PlacementProblem(
         time=time, found=found, free=np.array(free), extra=extra, frame_bounds=frame_bounds
     )
     used = used & np.isfinite(found.misfit)
@@ -171,9 +176,9 @@ class _Normal:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Problem:
+class _PlacementProblem:
     time: Array
-    found: Equations
+    found: NavigationEquations
     free: NDArray[np.int64]
     extra: Extra
     frame_bounds: Mapping[int, float]
@@ -307,7 +312,7 @@ def _grid(time: Array) -> list[Lasting]:
 
 
 def _likeliest(
-    problem: _Problem, used: NDArray[np.bool_], lasting: Mapping[str, Lasting]
+    problem: _PlacementProblem, used: NDArray[np.bool_], lasting: Mapping[str, Lasting]
 ) -> dict[str, Lasting]:
     """The likeliest lasting of every group, one after the other, some times around."""
     now = {group: how for group, how in lasting.items() if used[:, _channels(group)].any()}
@@ -325,7 +330,7 @@ def _likeliest(
 
 
 def _scores(
-    problem: _Problem,
+    problem: _PlacementProblem,
     used: NDArray[np.bool_],
     now: Mapping[str, Lasting],
     group: str,
@@ -351,7 +356,7 @@ def _scores(
 
 
 def _factor(
-    problem: _Problem, used: NDArray[np.bool_], now: Mapping[str, Lasting], group: str
+    problem: _PlacementProblem, used: NDArray[np.bool_], now: Mapping[str, Lasting], group: str
 ) -> float:
     """By how much a group's misfits are larger than its sigmas allow, 1 or more."""
     change, covariance = problem.total(used, now).solve()
@@ -365,7 +370,7 @@ def _factor(
 
 
 def _without_surprises(
-    problem: _Problem, used: NDArray[np.bool_], lasting: Mapping[str, Lasting]
+    problem: _PlacementProblem, used: NDArray[np.bool_], lasting: Mapping[str, Lasting]
 ) -> NDArray[np.bool_]:
     """Leave out, of each group, readings that all others contradict, the worst of neighbours first.
 
@@ -400,7 +405,7 @@ def _without_surprises(
 
 
 def _averaged(
-    problem: _Problem, used: NDArray[np.bool_], lasting: Mapping[str, Lasting]
+    problem: _PlacementProblem, used: NDArray[np.bool_], lasting: Mapping[str, Lasting]
 ) -> tuple[Array, Array]:
     """Parameters and covariance over all likely ways in which errors last, (P,) and (P, P).
 
@@ -426,7 +431,7 @@ def _averaged(
     return _filled(problem, mean, covariance)
 
 
-def _filled(problem: _Problem, mean: Array, covariance: Array) -> tuple[Array, Array]:
+def _filled(problem: _PlacementProblem, mean: Array, covariance: Array) -> tuple[Array, Array]:
     """With zeros for what is held."""
     full, matrix = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
     full[problem.free] = mean

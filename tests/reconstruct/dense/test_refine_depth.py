@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from reconstruct.dense.refine import Look, compare, prepared, refine, sights
+from reconstruct.dense.refine_depth import ComparedView, compare, prepared, refine, sights
 from reconstruct.views.sight import lens_of
 from tests.oracles_dense import Scene, hits, render, speckle, stereo_views
 
@@ -13,12 +13,12 @@ SCENE = Scene(
 VIEWS = stereo_views(np.array([0.1, 0.45]), np.array([0.3, 0.4]))
 
 
-def looks() -> list[Look]:
+def looks() -> list[ComparedView]:
     found = []
     for view in VIEWS:
         grey = cv2.cvtColor(render(view, SCENE), cv2.COLOR_BGR2GRAY)
         contrast, spline, valid = prepared(grey, np.ones(grey.shape, bool))
-        found.append(Look(view=view, contrast=contrast, spline=spline, valid=valid))
+        found.append(ComparedView(view=view, contrast=contrast, spline=spline, valid=valid))
     return found
 
 

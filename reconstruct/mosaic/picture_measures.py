@@ -26,7 +26,7 @@ _SMALL_PX = 432
 _LEAST_SHRINK = 4
 """Half a cell of the mosaic, whose pixels are about as large as those of pictures."""
 DARKEST, BRIGHTEST = 0.001, 0.95
-"""Linear light beyond which a broad level tells nothing."""
+"""Linear light beyond which a broad level is not used."""
 _DARK_PERCENT = 0.5
 _DARK_STEP = 2
 """Every so manieth pixel along rows and columns is looked at for dark ones."""
@@ -35,7 +35,7 @@ _BROAD_STEP = 4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PictureFacts:
+class PictureMeasures:
     """Of one picture."""
 
     sharpness: float
@@ -43,7 +43,7 @@ class PictureFacts:
     grey: bool
     """Whether its channels are equal."""
     nodes: Array
-    """(rows, columns, 3) logarithm of its broad light at nodes, BGR; NaN where it tells nothing."""
+    """(rows, columns, 3) logarithm of its broad light at nodes, BGR; NaN where unusable."""
     dark: Array
     """(rows, columns, 3) light of the darkest pixels around nodes, BGR; NaN where masked."""
 
@@ -93,14 +93,14 @@ def encoded(light: Float32) -> Float32:
     return levels
 
 
-def measure_picture(task: tuple[Path, Path, str]) -> PictureFacts:
+def measure_picture(task: tuple[Path, Path, str]) -> PictureMeasures:
     """Measure a picture of a workspace and write its small copy.
 
     Args:
         task: workspace, the folder for small copies, and the picture's name.
     """
     workspace, folder, image = task
-    pictures = _pictures(workspace)
+    pictures = Pictures.open(workspace)
     taken, usable = pictures.taken(image), pictures.usable(image)
     height, width = taken.shape[:2]
     table = linear_table()
@@ -123,7 +123,7 @@ def measure_picture(task: tuple[Path, Path, str]) -> PictureFacts:
         np.save(file, copy.broad)
     green = taken[..., 1]
     fine, mean = sharp_and_mean(green, np.ones((1, 1), np.bool_) if usable is None else usable)
-    return PictureFacts(
+    return PictureMeasures(
         sharpness=fine / mean if mean > 0 else float("nan"),
         grey=bool((taken[..., 0] == green).all() and (taken[..., 2] == green).all()),
         nodes=_broad_nodes(copy),
@@ -161,11 +161,11 @@ def _broad_nodes(copy: SmallCopy) -> Array:
     places = np.column_stack([x.ravel(), y.ravel()]).astype(np.float32)
     level = at_places(copy.broad, places).reshape(*GRID, 3).astype(np.float64)
     valid = at_places(copy.valid[..., None], places, 1).reshape(*GRID, 1)
-    usable = telling(level)[..., None] & (valid > 0.5)
+    usable = well_exposed(level)[..., None] & (valid > 0.5)
     return np.where(usable, np.log(np.maximum(level, DARKEST)), np.nan)
 
 
-def telling(light: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
+def well_exposed(light: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
     """Whether all channels (..., 3) are neither black nor burnt out."""
     return np.asarray(((light > DARKEST) & (light < BRIGHTEST)).all(axis=-1))
 
@@ -256,13 +256,3 @@ def _small_copy(content: NDArray[np.uint8]) -> SmallCopy:
     )
     broad: Float32 = total / np.maximum(weight, np.float32(1e-3))[..., None]
     return SmallCopy(levels=content, broad=broad)
-
-
-def forget_pictures() -> None:
-    """Let go of the lenses that an earlier run in this process read."""
-    _pictures.cache_clear()
-
-
-@lru_cache(maxsize=1)
-def _pictures(workspace: Path) -> Pictures:
-    return Pictures.open(workspace)

@@ -10,14 +10,14 @@ from alice_survey.base.artefacts import atomic_path
 from alice_survey.base.frames import Array
 from camera_calib.approximation.dispersion import channel_cameras
 from camera_calib.water import CHANNELS
-from reconstruct.dense.dem import DemGrid
-from reconstruct.dense.points import enu_from_cam, pinhole_of
 from reconstruct.mosaic.grid import Float32, footprints, height_at_pixels
 from reconstruct.mosaic.ortho import look_up, visible_cells
 from reconstruct.pictures.undistorted import taken_nodes
+from reconstruct.raster import DemGrid
 from reconstruct.views.lens import FlatPortLens, Lens
-from reconstruct.views.model import View
+from reconstruct.views.model import View, enu_from_cam
 from reconstruct.views.range_shift import RangeShift, range_shift
+from reconstruct.views.sight import pinhole_of
 
 _SPACING_PX = 8.0
 """Of nodes between which a lens is bilinear: within 0.001 px for the lenses of such cameras."""
@@ -36,7 +36,7 @@ class Water:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Optics:
+class CameraOptics:
     """One camera, or one channel of it, from its pinhole's pixels to the picture as taken."""
 
     taken_nodes: Array
@@ -47,7 +47,7 @@ class Optics:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Seen:
+class SeenCells:
     """Where and how well a view shows the cells of a grid, (H, W) each."""
 
     x: Float32
@@ -96,14 +96,14 @@ class Ground:
                 self._visible[view.image] = visible_over(view, self.dem, self.around)
         return self._visible[view.image]
 
-    def surface(self, grid: DemGrid) -> "Surface":
+    def surface(self, grid: DemGrid) -> "GridHeights":
         """Heights of a grid on it."""
         height = height_at_pixels(self.dem, self.around, grid)
-        return Surface(grid=grid, height=height, ground=self)
+        return GridHeights(grid=grid, height=height, ground=self)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Surface:
+class GridHeights:
     """Heights of a grid."""
 
     grid: DemGrid
@@ -111,7 +111,7 @@ class Surface:
     """(rows, columns) of the grid, up."""
     ground: Ground
 
-    def part(self, rows: slice, columns: slice) -> "Surface":
+    def part(self, rows: slice, columns: slice) -> "GridHeights":
         """A part of it."""
         grid = self.grid.window(
             rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start
@@ -190,16 +190,16 @@ def _load_visible(path: Path) -> Visible:
     return Visible(cells=cells.reshape(high, wide), west=west, north=north)
 
 
-def camera_optics(lens: Lens, scaled: bool) -> Optics:
+def camera_optics(lens: Lens, scaled: bool) -> CameraOptics:
     """Of a lens; without lengths in metres a port's range shift is not known."""
-    return Optics(
+    return CameraOptics(
         taken_nodes=taken_nodes(lens, _SPACING_PX),
         shift=range_shift(lens) if scaled and isinstance(lens, FlatPortLens) else None,
         size_px=lens.size_px,
     )
 
 
-def channel_optics(lens: FlatPortLens, water: Water, scaled: bool) -> tuple[Optics, ...]:
+def channel_optics(lens: FlatPortLens, water: Water, scaled: bool) -> tuple[CameraOptics, ...]:
     """Of the blue, green and red channel of a camera behind a port, in the order of BGR.
 
     All see through the pinhole of green; the rays that they take through port and water differ by
@@ -220,10 +220,10 @@ _ALL: tuple[NDArray[np.bool_], int] = (np.ones((1, 1), np.bool_), 1)
 
 def see(
     view: View,
-    optics: Optics,
-    surface: Surface,
+    optics: CameraOptics,
+    surface: GridHeights,
     wanted: tuple[NDArray[np.bool_], int] = _ALL,
-) -> Seen:
+) -> SeenCells:
     """Look at a surface with a view; what the surface itself hides is not seen.
 
     Args:
@@ -254,4 +254,4 @@ def see(
         grid.cell,
         _RIM_PX,
     )
-    return Seen(x=x, y=y, quality=quality, range=ranges)
+    return SeenCells(x=x, y=y, quality=quality, range=ranges)

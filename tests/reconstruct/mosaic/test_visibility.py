@@ -7,9 +7,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.frames import BODY_FROM_NADIR_CAM
 from camera_calib.approximation.dispersion import channel_cameras
 from camera_calib.flat_port import FlatPortCamera
-from reconstruct.dense.dem import DemGrid
 from reconstruct.mosaic.ortho import lanczos_weights, sample_lanczos
-from reconstruct.mosaic.sight import Ground, Water, camera_optics, channel_optics, see
+from reconstruct.mosaic.visibility import Ground, Water, camera_optics, channel_optics, see
+from reconstruct.raster import DemGrid
 from reconstruct.views.lens import FlatPortLens, flat_port_lens
 from reconstruct.views.model import View
 from reconstruct.views.range_shift import range_shift

@@ -27,8 +27,8 @@ from reconstruct.placing.control_file import (
     read_control,
     read_picks,
 )
-from reconstruct.placing.georeference import Fit, fit_control, fit_navigation, level
-from reconstruct.placing.spots import Camera, find_spots
+from reconstruct.placing.georeference import PlacementFit, fit_control, fit_navigation, level
+from reconstruct.placing.picked_points import Camera, find_spots
 from reconstruct.views.lens import Lens
 from reconstruct.views.model import WorldFrame
 
@@ -38,7 +38,7 @@ RIG_SCALE_SIGMA = 1e-3
 """Relative, of a scale that a rig gives, where control may correct it: what calibrated rigs reach
 (600 ppm in the built-in demo; the baseline's own sigma leaves out the angle between cameras)."""
 LENGTH_SCALE_SIGMA = 1e-2
-"""Likewise of one length that a person measured."""
+"""The same for one length that a person measured."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -47,7 +47,7 @@ class Placed:
 
     world_from_model: Similarity
     frame: WorldFrame
-    fit: Fit | None
+    fit: PlacementFit | None
     scale_source: str
     control: ControlFit | None
     """What is known of the site, where something is."""
@@ -112,12 +112,12 @@ def find_place(task: Placing) -> Placed:
             control=shown,
             located=True,
         )
-    told = ties.bar_scale(scale, 0.0 if known is None else known.sigma)
+    found = ties.bar_scale(scale, 0.0 if known is None else known.sigma)
     factor = 1.0 if scale is None else scale
     source = "unscaled" if known is None else known.source
-    if told is not None:
-        factor, source = told[0], _scale_source(known, ties)
-    scaled = known is not None or told is not None
+    if found is not None:
+        factor, source = found[0], _scale_source(known, ties)
+    scaled = known is not None or found is not None
     notes.append(f"{source}; no CRS" if scaled else "unscaled, no CRS")
     frame = WorldFrame(
         name="model",
@@ -166,7 +166,7 @@ def _fit(
     known: _KnownScale | None,
     ties: ControlFit,
     datum: Datum | None,
-) -> Fit | None:
+) -> PlacementFit | None:
     """By navigation and control, by navigation, by control; None where nothing places it."""
     # Control corrects a known scale within its sigma; without control it is held.
     sigma = known.sigma if known is not None and ties.informs_scale else 0.0
@@ -235,17 +235,17 @@ def _scale_source(known: _KnownScale | None, ties: ControlFit) -> str:
     if not ties.informs_scale:
         return source
     bars, points = len(ties.used_bars), len(ties.used_points)
-    told = " and ".join(
+    found = " and ".join(
         [
             *([f"{points} control points"] if points > 1 else []),
             *([f"{bars} known length{'s' * (bars > 1)}"] if bars else []),
         ]
     )
-    return f"scale from {told}" if known is None else f"{source}, corrected by {told}"
+    return f"scale from {found}" if known is None else f"{source}, corrected by {found}"
 
 
 def _known_scale(workspace: Path, mapping: Mapping[str, Any]) -> _KnownScale | None:
-    """None where nothing but navigation or control tells it."""
+    """None where nothing but navigation or control determines it."""
     if mapping["scaled"]:
         return _KnownScale(scale=1.0, source="scale from the calibrated rig", sigma=RIG_SCALE_SIGMA)
     path = workspace / SCALE_FILE

@@ -152,18 +152,18 @@ def _sigmas(rows: Sequence[ImageRecord]) -> Array:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Equations:
+class NavigationEquations:
     """Six channels at M moments, linear about a placement: misfit + jacobian x change = error."""
 
     misfit: Array
     """(M, 6) model less navigation, over the stated sigma; NaN where nothing is known."""
     jacobian: Array
-    """(M, 6, PARAMETERS) likewise."""
+    """(M, 6, PARAMETERS) its slopes."""
     sigma: Array
     """(M, 6) as stated."""
 
 
-def equations(epochs: Epochs, place: Similarity, middle_ned: Array) -> Equations:
+def equations(epochs: Epochs, place: Similarity, middle_ned: Array) -> NavigationEquations:
     """Misfits of navigation at a placement, and their derivatives.
 
     Args:
@@ -185,8 +185,8 @@ def equations(epochs: Epochs, place: Similarity, middle_ned: Array) -> Equations
     jacobian[:, 0, TURN], jacobian[:, 1, TURN] = away[:, 1], -away[:, 0]
     # Angle by angle: an error of heading must not pass for one of roll where the vehicle leans, nor
     # a wrong heading spoil the tilt that was read with it.
-    told, found = (r.as_euler("ZYX")[:, ::-1] for r in (epochs.ned_from_body, attitudes))
-    misfit[:, 3:] = (found - told + np.pi) % (2.0 * np.pi) - np.pi
+    stated, found = (r.as_euler("ZYX")[:, ::-1] for r in (epochs.ned_from_body, attitudes))
+    misfit[:, 3:] = (found - stated + np.pi) % (2.0 * np.pi) - np.pi
     angles_from_ned = np.linalg.pinv(attitude_axes(attitudes))
     jacobian[:, 3:, :3] = angles_from_ned
     jacobian[:, 3:, MOUNT] = angles_from_ned @ attitudes.as_matrix()
@@ -196,7 +196,7 @@ def equations(epochs: Epochs, place: Similarity, middle_ned: Array) -> Equations
     np.add.at(mean_misfit, epochs.moment, misfit)
     np.add.at(mean_jacobian, epochs.moment, jacobian)
     scale = epochs.sigma * shared[:, None]
-    return Equations(
+    return NavigationEquations(
         misfit=np.where(epochs.known, mean_misfit / scale, np.nan),
         jacobian=np.where(epochs.known[..., None], mean_jacobian / scale[..., None], np.nan),
         sigma=epochs.sigma,

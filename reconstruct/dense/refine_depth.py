@@ -8,7 +8,7 @@ own epipolar line. Sums over windows are filters over the picture, so that the w
 on the window's size (Le Besnerais & Champagnat 2005, "Dense optical flow by iterative local window
 registration"). The correction is repeated where it is large.
 
-The same sums tell how sure a depth is: the curvature of the misfit along the inverse depth, and
+The same sums show how sure a depth is: the curvature of the misfit along the inverse depth, and
 the noise that remains between pictures.
 """
 
@@ -57,7 +57,7 @@ _LONGEST_STEP_PX = 1.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Look:
+class ComparedView:
     """A picture ready to be compared."""
 
     view: View
@@ -72,7 +72,7 @@ class Look:
 def prepared(
     grey: NDArray[np.uint8], valid: NDArray[np.bool_]
 ) -> tuple[Float32, Float32, NDArray[np.bool_]]:
-    """Contrast, spline and validity of a picture (H, W), as `Look` has them."""
+    """Contrast, spline and validity of a picture (H, W), as `ComparedView` has them."""
     contrast = even_contrast(grey.astype(np.float32))
     spline = ndimage.spline_filter(contrast, order=3, output=np.float32, mode="mirror")
     return contrast, spline, valid
@@ -211,7 +211,7 @@ def _slopes(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.float
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Refined:
+class RefinedDepth:
     """Depth of a view where pictures agree, arrays of (H, W)."""
 
     depth: Float32
@@ -225,7 +225,7 @@ class Refined:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Sums:
+class _NeighbourSums:
     """What all neighbours say of a correction of the inverse depth, (H, W) each."""
 
     pull: Float32
@@ -236,7 +236,9 @@ class _Sums:
     seen: NDArray[np.uint8]
 
 
-def refine(reference: Look, depth: Float32, sigma: Float32, others: Sequence[Look]) -> Refined:
+def refine(
+    reference: ComparedView, depth: Float32, sigma: Float32, others: Sequence[ComparedView]
+) -> RefinedDepth:
     """Correct a depth map by all neighbours at once.
 
     A window that holds a step of the surface has no single correction: there the depth and its
@@ -265,7 +267,7 @@ def refine(reference: Look, depth: Float32, sigma: Float32, others: Sequence[Loo
     unknown = np.float32(np.nan)
     refined: Float32 = np.where(alike & ~kept, np.float32(1.0) / moved, unknown)
     root: Float32 = np.sqrt(np.where(alike, sums.curvature, unknown))
-    return Refined(
+    return RefinedDepth(
         depth=np.where(kept, depth, refined),
         sigma=np.where(kept, sigma, refined * refined / root),
         likeness=sums.likeness,
@@ -282,8 +284,8 @@ def _has_step(inverse: Float32, speed: Float32) -> NDArray[np.bool_]:
     return np.asarray(known & ((high - low) * speed > _STEP_PX))
 
 
-def _chosen(mask: NDArray[np.bool_], yes: _Sums, no: _Sums) -> _Sums:
-    return _Sums(
+def _chosen(mask: NDArray[np.bool_], yes: _NeighbourSums, no: _NeighbourSums) -> _NeighbourSums:
+    return _NeighbourSums(
         pull=np.where(mask, yes.pull, no.pull),
         curvature=np.where(mask, yes.curvature, no.curvature),
         speed=np.where(mask, yes.speed, no.speed),
@@ -292,7 +294,7 @@ def _chosen(mask: NDArray[np.bool_], yes: _Sums, no: _Sums) -> _Sums:
     )
 
 
-def _stepped(inverse: Float32, sums: _Sums) -> tuple[Float32, Float32]:
+def _stepped(inverse: Float32, sums: _NeighbourSums) -> tuple[Float32, Float32]:
     """Inverse depths moved to where the pictures agree best, and by how many pixels at most.
 
     Where little pulls they are held back, by a prior of one pixel's deviation along the longest
@@ -304,7 +306,9 @@ def _stepped(inverse: Float32, sums: _Sums) -> tuple[Float32, Float32]:
     return inverse + step, np.abs(step) * sums.speed
 
 
-def _sums(reference: Look, inverse: Float32, others: Sequence[Look]) -> _Sums:
+def _sums(
+    reference: ComparedView, inverse: Float32, others: Sequence[ComparedView]
+) -> _NeighbourSums:
     shape = inverse.shape
     pull, curvature, speed = (np.zeros(shape, np.float32) for _ in range(3))
     likeness, seen = np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
@@ -336,7 +340,7 @@ def _sums(reference: Look, inverse: Float32, others: Sequence[Look]) -> _Sums:
         )  # fmt: skip
     with np.errstate(invalid="ignore"):
         likeness = likeness / curvature
-    return _Sums(pull=pull, curvature=curvature, speed=speed, likeness=likeness, seen=seen)
+    return _NeighbourSums(pull=pull, curvature=curvature, speed=speed, likeness=likeness, seen=seen)
 
 
 @compiled(error_model="numpy", fastmath=FAST)

@@ -175,13 +175,13 @@ def _fit(
     start: Array, picks: Sequence[Pick], cameras: Mapping[str, Camera]
 ) -> tuple[Array, Array, Array]:
     """Misses (N, 2) px of the best point, the point (3,), and their derivatives (2 N, 3)."""
-    told = np.array([[p.x_px, p.y_px] for p in picks])
+    picked = np.array([[p.x_px, p.y_px] for p in picks])
     unit = float(np.linalg.norm(start - cameras[picks[0].image].model_from_pinhole.translation))
 
     def misses(x: Array) -> Array:
         point = start + unit * x
         seen = np.stack([cameras[p.image].project(point) for p in picks])
-        return np.asarray(np.nan_to_num((seen - told).ravel(), nan=1e6))
+        return np.asarray(np.nan_to_num((seen - picked).ravel(), nan=1e6))
 
     found = least_squares(
         misses, np.zeros(3), loss="soft_l1", f_scale=_ROBUST_PX, xtol=1e-12, ftol=1e-12, gtol=1e-12,
