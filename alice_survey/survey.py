@@ -14,7 +14,7 @@ from alice_survey.base.artefacts import STAGE_FILE, only_checking, read_json, re
 from alice_survey.base.config import SurveyConfig, changed, load_config, parse_current, parse_health
 from alice_survey.base.contents import taken_from
 from alice_survey.base.errors import AliceError, ConfigError, WorkspaceError, warn
-from alice_survey.base.executor import default_threads
+from alice_survey.base.executor import SERIAL, Executor, local_executor
 from alice_survey.base.run.progress import part
 from alice_survey.summaries import SUMMARIES
 
@@ -80,7 +80,7 @@ class FlightChanges:
         )  # fmt: skip
 
 
-StageWork = Callable[[Path, SurveyConfig, int], bool]
+StageWork = Callable[[Path, SurveyConfig, Executor], bool]
 
 
 def _work_of(stage: str) -> StageWork:
@@ -139,7 +139,7 @@ def run(
     workspace: Path,
     survey: Path | None,
     scale: int | None = None,
-    threads: int | None = None,
+    executor: Executor | None = None,
     flight: FlightChanges | None = None,
 ) -> tuple[str, dict[str, Any]]:
     """Do stages one after the other; those that are up to date are skipped.
@@ -149,7 +149,7 @@ def run(
         workspace: folder of the survey.
         survey: settings file; None looks for survey.toml in the workspace, then here.
         scale: overrides `imaging.scale`.
-        threads: cores to use; None for all.
+        executor: where tasks run; None for all cores of this machine.
         flight: overrides vehicle and sea.
 
     Returns:
@@ -177,7 +177,7 @@ def run(
                 warn(f"the plan is {state}; 'alice-survey plan -w {workspace}' renews it")
         for number, stage in enumerate(stages, 1):
             with part(stage, number, len(stages)):
-                done = _work_of(stage)(workspace, config, threads or default_threads())
+                done = _work_of(stage)(workspace, config, executor or local_executor())
             with taken_from(workspace / stage):
                 text, data = SUMMARIES[stage](workspace / stage)
             found[stage] = {"done": done, **data}
@@ -254,11 +254,11 @@ def _with_area(text: str, area: Path) -> str:
     )
 
 
-def run_demo(workspace: Path, threads: int | None) -> tuple[str, dict[str, Any]]:
+def run_demo(workspace: Path, executor: Executor | None) -> tuple[str, dict[str, Any]]:
     """Do the whole loop on the built-in survey, and say where its pictures are."""
     if not (workspace / "survey.toml").exists():
         init_survey(workspace, "demo.toml")
-    text, found = run(LOOP, workspace, None, None, threads)
+    text, found = run(LOOP, workspace, None, None, executor)
     pictures = [
         ("the plan", "plan/map.png"),
         ("a picture", "images/left/000000.png"),
@@ -313,7 +313,7 @@ def _state(
         return "up to date"  # what was made for the holes of a dive has no settings of its own
     try:
         with only_checking():
-            stale = _work_of(stage)(workspace, config, 1)
+            stale = _work_of(stage)(workspace, config, SERIAL)
     except AliceError as error:
         return f"stale ({error})"
     return "stale (settings or inputs changed)" if stale else "up to date"

@@ -19,7 +19,7 @@ from functools import cache, partial
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import SERIAL, Executor
 from alice_survey.base.frames import Array
 from benchmarks.figures import Figure, Goal
 from camera_calib.calibrate.adjust import cramer_rao, stack_views
@@ -203,10 +203,10 @@ def _first_order(views: Sequence[TargetView], poses: RigidTransform, freedom: Fr
     return step
 
 
-def run_mode(known: Intrinsics, seeds: Sequence[int], threads: int = 1) -> Mode:
+def run_mode(known: Intrinsics, seeds: Sequence[int], executor: Executor = SERIAL) -> Mode:
     """All trials of one mode."""
     work, label = partial(run_trial, known=known), f"calibrations, {known}"
-    found = list(parallel_map(work, seeds, threads=threads, label=label))
+    found = list(executor.map(work, seeds, label=label))
     bound = bound_of(known)
     names = (*bound.parameters, _BASELINE)
     truth = replace(_TRUTH, covariance=bound)

@@ -285,7 +285,13 @@ class ReconstructConfig(Config):
 
 
 class SurveyConfig(Config):
-    """A whole survey, as `survey.toml` says it."""
+    """A whole survey, as `survey.toml` says it.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> alice.SurveyConfig().plan.altitude_m
+        2.0
+    """
 
     name: str = Field("survey", min_length=1, max_length=80, pattern=r"^[\w .-]+$")
     seed: int = Field(1, ge=0, lt=2**32)
@@ -337,6 +343,12 @@ def load_config(path: str | Path) -> SurveyConfig:
     Raises:
         ConfigError: the file is missing, is no TOML, or holds an unknown key or a value out of
             range; the message names the file, the key, the value and what is allowed.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> survey = alice.Survey.new("wreck")
+        >>> alice.load_config("wreck/survey.toml").plan.speed_mps
+        0.2
     """
     path = Path(path)
     try:

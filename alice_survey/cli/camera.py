@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from alice_survey.cli.options import CONTEXT, AsJson, Threads, examples, print_result
+from alice_survey.cli.options import CONTEXT, AsJson, Threads, examples, executor_of, print_result
 
 app = typer.Typer(
     help="Look at, convert and judge camera models behind flat ports.",
@@ -65,13 +65,12 @@ def undisperse(
 
     A flat port shows each colour at its own scale: some pixels apart at the edge of the frame.
     """
-    from alice_survey.base.executor import default_threads
     from camera_calib.approximation.undisperse import undisperse_files
 
     text, data = undisperse_files(
         pictures, folder, rig=rig, camera=camera, range_m=distance, temperature_c=temperature,
         salinity_psu=salinity, depth_m=depth, glass=material, wavelengths_nm=wavelength,
-        threads=threads or default_threads(),
+        executor=executor_of(threads),
     )  # fmt: skip
     print_result(text, data, as_json)
 
@@ -204,7 +203,7 @@ def tank(
         unit=unit, n_water=n_water, glass_mm=tuple(glass or ()), n_glass=n_glass, lens=lens,
         frame_offsets=tuple(frame_offset or ()), refine=refine,
     )  # fmt: skip
-    print_result(*run_tank(settings, out, threads), as_json)
+    print_result(*run_tank(settings, out, executor_of(threads)), as_json)
 
 
 @app.command(

@@ -18,6 +18,7 @@ from alice_survey.cli.options import (
     Threads,
     Workspace,
     examples,
+    executor_of,
     print_result,
     with_sessions,
 )
@@ -206,7 +207,7 @@ def image(
     """
     from alice_survey.survey import run
 
-    print_result(*run(["pool", "images"], workspace, survey, scale, threads), as_json)
+    print_result(*run(["pool", "images"], workspace, survey, scale, executor_of(threads)), as_json)
 
 
 @app.command(
@@ -310,12 +311,17 @@ def calibrate(
         from camera_calib.calibrate.pictures import calibrate_command
 
         result = calibrate_command(
-            **places, output=output, threads=threads, lens=lens, water=water, **settings
+            **places,
+            output=output,
+            executor=executor_of(threads),
+            lens=lens,
+            water=water,
+            **settings,
         )
     else:
         from alice_survey.survey import run
 
-        result = run(["calibration"], workspace, survey, None, threads)
+        result = run(["calibration"], workspace, survey, None, executor_of(threads))
     print_result(*result, as_json)
 
 
@@ -334,7 +340,7 @@ def run_all(
     """
     from alice_survey.survey import LOOP, run
 
-    print_result(*run(LOOP, workspace, survey, scale, threads), as_json)
+    print_result(*run(LOOP, workspace, survey, scale, executor_of(threads)), as_json)
 
 
 @app.command(epilog=examples("demo", "demo -w demo --threads 2"))
@@ -347,7 +353,7 @@ def demo(
     """
     from alice_survey.survey import run_demo
 
-    print_result(*run_demo(workspace, threads), as_json)
+    print_result(*run_demo(workspace, executor_of(threads)), as_json)
 
 
 @app.command(epilog=examples("status -w reef", "status -w reef --json"))

@@ -13,8 +13,10 @@ from alice_survey.cli.options import (
     Threads,
     Workspace,
     examples,
+    executor_of,
     print_result,
 )
+from missions.exports.registry import format_names
 
 app = typer.Typer(
     invoke_without_command=True,
@@ -148,7 +150,7 @@ def check(
     print_result(
         *check_report(
             workspace, config, log,
-            triggers=triggers, out=output, monte_carlo=monte_carlo, threads=threads,
+            triggers=triggers, out=output, monte_carlo=monte_carlo, executor=executor_of(threads),
         ),
         as_json,
     )  # fmt: skip
@@ -165,7 +167,7 @@ def export(
         list[str] | None,
         typer.Option(
             "--format",
-            help="cola2, cola2-v1, qgc, qgc-survey, wpl, kml, gpx, geojson, csv; all if none.",
+            help=f"{', '.join(format_names())}; all if none.",
         ),
     ] = None,
     camera_on: Annotated[

@@ -13,6 +13,7 @@ from alice_survey.cli.options import (
     Threads,
     Workspace,
     examples,
+    executor_of,
     print_result,
 )
 
@@ -44,7 +45,7 @@ def reconstruct(
     if context.invoked_subcommand is None:
         from alice_survey.survey import RECONSTRUCT, run
 
-        print_result(*run(RECONSTRUCT, workspace, survey, None, threads), as_json)
+        print_result(*run(RECONSTRUCT, workspace, survey, None, executor_of(threads)), as_json)
 
 
 @reconstruct_app.command(
@@ -124,10 +125,9 @@ def control(
     Known points, bars and markers stand in WORKSPACE/control.csv; the next 'reconstruct' places
     and scales the model by those for control, and scores those for check.
     """
-    from alice_survey.base.executor import default_threads
     from reconstruct.placing.markers import survey_control
 
-    result = survey_control(workspace, dictionary=dictionary, threads=threads or default_threads())
+    result = survey_control(workspace, dictionary=dictionary, executor=executor_of(threads))
     print_result(*result, as_json)
 
 
@@ -137,10 +137,9 @@ def quality(workspace: Workspace = WORK, threads: Threads = None, as_json: AsJso
 
     Sharpness, exposure, turbidity and overlap of each; the bad ones by name, with the reason.
     """
-    from alice_survey.base.executor import default_threads
-    from reconstruct.pictures.quality import quality_report
+    from reconstruct.pictures.quality_sheet import quality_report
 
-    print_result(*quality_report(workspace, threads or default_threads()), as_json)
+    print_result(*quality_report(workspace, executor_of(threads)), as_json)
 
 
 @app.command(
@@ -207,7 +206,7 @@ def evaluate(
     else:
         from alice_survey.survey import run
 
-        result = run(["evaluation"], workspace, survey, None, threads)
+        result = run(["evaluation"], workspace, survey, None, executor_of(threads))
     print_result(*result, as_json)
 
 

@@ -13,6 +13,7 @@ from alice_survey.cli.options import (
     Threads,
     Workspace,
     examples,
+    executor_of,
     print_result,
 )
 
@@ -36,10 +37,9 @@ def coefficients(
     plot: Annotated[Path | None, typer.Option(help="PNG, PDF or SVG to draw.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compute coefficients from shape, beside the paper's.
+    """Compute coefficients from shape, next to the paper's.
 
-    Every row of the paper's three tables of added mass, damping and lift, with the equation, and
-    with the reason where its value does not follow from the vehicle's shape.
+    Every row of the paper's three tables of added mass, damping and lift, with the equation.
     """
     from alice_survey.vehicle.hydrodynamics.report import coefficients_report
 
@@ -83,7 +83,7 @@ def compare(
     config = settings(workspace, survey, needed=workspace != WORK)
     text, data = compare_report(
         config, out or workspace / "compare", currents=current or (), swell=swell, seed=seed,
-        flights=flights, threads=threads,
+        flights=flights, executor=executor_of(threads),
     )  # fmt: skip
     print_result(text, data, as_json)
 

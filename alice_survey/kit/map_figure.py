@@ -28,12 +28,15 @@ from alice_survey.kit.map import map_extent
 
 _MOST_PX = 1400
 """Of the longer side of a picture in print."""
-_MOST_HEIGHT_IN = 6.4
+_MOST_HEIGHT_IN = 4.1
+"""Of the map itself, so that two stand on a page."""
 _MARGIN = 0.04
 """Around all that is drawn, as a share of the longer side."""
 _RIMMED = 20
 """Outlines up to which each has a light rim, as in `map.js`."""
 _QUALITY = 88
+_TIGHT: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.04}
+"""A map seldom has the shape of its sheet."""
 _KINDS = ("polygon", "line", "point")
 
 
@@ -63,9 +66,7 @@ def map_figure(survey_map: SurveyMap, layers: Sequence[PictureLayer | ShapeLayer
     west, south, east, north = map_extent(survey_map)
     margin = _MARGIN * max(east - west, north - south)
     wide, high = east - west + 2 * margin, north - south + 2 * margin
-    width_in = WIDTH_IN
-    height_in = 0.8 + min(_MOST_HEIGHT_IN, (width_in - 1.6) * high / wide)
-    sheet = new_figure(height_in, width_in)
+    sheet = new_figure(0.8 + min(_MOST_HEIGHT_IN, (WIDTH_IN - 1.6) * high / wide))
     axes = sheet.subplots()
     axes.grid(visible=False)
     pictures = [layer for layer in layers if isinstance(layer, PictureLayer)]
@@ -80,13 +81,15 @@ def map_figure(survey_map: SurveyMap, layers: Sequence[PictureLayer | ShapeLayer
         sheet.legend(loc="outside lower center", ncols=min(4, len(shapes)), fontsize=8)
     titles = ", ".join(layer.title.lower() for layer in layers)
     first = pictures[0] if pictures else layers[0]
+    words = [f"{layer.title}: {layer.about[0].lower()}{layer.about[1:]}" for layer in shapes
+             if layer.about]  # fmt: skip
+    about = pictures[0].about if pictures else ""
     return Figure(
-        png=png_of(sheet),
-        svg=_with_jpegs(svg_of(sheet)),
+        png=png_of(sheet, **_TIGHT),
+        svg=_with_jpegs(svg_of(sheet, **_TIGHT)),
         title=first.title,
         alt=f"Map, north up: {titles}",
-        shows=" ".join(layer.about for layer in layers if layer.about),
-        share=min(1.0, (wide / high * (height_in - 0.8) + 1.6) / width_in),
+        shows=" ".join([about, *words]).strip(),
     )
 
 

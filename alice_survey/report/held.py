@@ -8,7 +8,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from alice_survey.base.artefacts import read_json, read_stage
+from alice_survey.base.frames import Array
 
 STAGES = (
     "plan", "flight", "pool", "images", "calibration", "mapping", "sparse", "dense", "mosaic",
@@ -16,7 +19,7 @@ STAGES = (
 )  # fmt: skip
 """In the order in which they are made."""
 LOOSE = ("quality", "reference", "against")
-"""Folders that commands write beside the stages."""
+"""Folders that commands write next to the stages."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,6 +88,17 @@ class Held:
         """Comparisons with earlier surveys, by their names."""
         files = sorted((self.workspace / "against").glob("*/change.json"))
         return [(file.parent.name, read_json(file)) for file in files]
+
+
+def known_column(rows: Sequence[Mapping[str, str]], start: str) -> Array:
+    """The numbers of a column whose name begins so, without empty cells.
+
+    Such as "area_" for `area_m2`, and for the `area_units2` of a model without scale.
+    """
+    name = next((name for name in (rows[0] if rows else {}) if name.startswith(start)), "")
+    values = np.array([number(row, name) for row in rows], dtype=np.float64)
+    known: Array = values[np.isfinite(values)]
+    return known
 
 
 def number(row: Mapping[str, str], name: str) -> float:

@@ -16,7 +16,7 @@ _PACKAGES = (
 )  # fmt: skip
 _SETTINGS = "survey.toml"
 _SHORT = 12
-"""Letters of a digest that are shown."""
+"""Length of a digest as shown."""
 
 
 def section(figures: Figures) -> Section:
@@ -40,7 +40,7 @@ def _words(held: Held) -> Iterator[str]:
     settings = held.workspace / _SETTINGS
     if settings.is_file():
         yield (
-            "The same settings, inputs and versions give the same results; a stage is made again "
+            "The same settings, inputs and versions give the same results; a stage is run again "
             "when its digest changes."
         )
     if held.simulated:
@@ -62,15 +62,15 @@ def _stages(held: Held) -> Table:
                 str(stage.get("digest", ""))[:_SHORT],
             )
         )
-    header = ("stage", "version", "time", "computing", "memory", "input files", "digest")
+    header = ("stage", "version", "time", "CPU time", "memory", "input files", "digest")
     return Table(title="Stages", header=header, rows=rows)
 
 
 def _versions(held: Held) -> Table:
-    told: dict[str, str] = {}
+    recorded: dict[str, str] = {}
     for stage in held.stages.values():
-        told |= stage.get("versions") or {}
-    rows = [(name, told.get(name) or version(name)) for name in _PACKAGES]
+        recorded |= stage.get("versions") or {}
+    rows = [(name, recorded.get(name) or version(name)) for name in _PACKAGES]
     rows.append(("Python", platform.python_version()))
     rows.append(("machine", f"{platform.system()} {platform.machine()}"))
     return Table(title="Versions", header=("package", "version"), rows=rows)

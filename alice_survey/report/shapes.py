@@ -1,7 +1,6 @@
 """Lines, outlines and points of a survey for its map: plan, flight, cameras, footprints."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -9,12 +8,14 @@ from alice_survey.base.frames import Array, Datum
 from alice_survey.kit.document import ShapeLayer
 from alice_survey.kit.words import length
 from alice_survey.report.figures import planned_area
-from alice_survey.report.held import Held, number
+from alice_survey.report.held import Held, known_column, number
 
 _BLUE, _ORANGE, _GREEN, _RED, _BLACK = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#333333"
-"""Of Okabe and Ito's palette, which the colour-blind tell apart."""
+"""Okabe and Ito's palette, safe for the colour-blind."""
 _MOST_VERTICES = 4000
 """Of a track on the map."""
+_MOST_OUTLINES, _MOST_POINTS = 4000, 20_000
+"""On the map: some 4 MB of the page each."""
 
 Shape = Sequence[tuple[float, float]]
 
@@ -24,15 +25,15 @@ def shape_layers(held: Held) -> Iterator[ShapeLayer]:
     area = planned_area(held)
     if area is not None:
         yield ShapeLayer(
-            name="area", title="Area to survey", about="As asked for in the plan.", kind="polygon",
+            name="area", title="Area to survey", about="As given in the plan.", kind="polygon",
             shapes=[_pairs(np.array(part.exterior.coords)) for part in area.geoms],
             colour=_BLACK, dashed=True,
         )  # fmt: skip
-    footprints = list(_footprints(held))
+    footprints, every = thinned(list(_footprints(held)), _MOST_OUTLINES)
     if footprints:
         yield ShapeLayer(
             name="footprints", title="Footprints", kind="polygon", colour=_GREEN, shown=False,
-            about="Sea floor that each picture shows.",
+            about=f"Sea floor that each picture shows{every}.",
             shapes=[outline for outline, _ in footprints], texts=[text for _, text in footprints],
         )  # fmt: skip
     lines = held.json("plan/plan.json").get("lines", [])
@@ -53,26 +54,35 @@ def shape_layers(held: Held) -> Iterator[ShapeLayer]:
             name="flown", title="Flown", about="Where the vehicle really was (simulated).",
             kind="line", shapes=[_pairs(places[::step])], colour=_ORANGE,
         )  # fmt: skip
-    cameras = _cameras(held)
+    cameras, every = thinned(_cameras(held), _MOST_POINTS)
     if cameras:
         yield ShapeLayer(
             name="cameras", title="Cameras", kind="point", colour=_BLUE, shown=not flown,
-            about="Where pictures were taken, from the model.",
+            about=f"Where pictures were taken, from the model{every}.",
             shapes=[place for place, _ in cameras], texts=[text for _, text in cameras],
         )  # fmt: skip
-    lost = _lost(held)
+    lost, every = thinned(_lost(held), _MOST_POINTS)
     if lost:
         yield ShapeLayer(
             name="lost", title="Lost pictures", kind="point", colour=_RED,
-            about="Pictures that are not in the model, where navigation has them.",
+            about=f"Pictures that are not in the model, where navigation has them{every}.",
             shapes=[place for place, _ in lost], texts=[text for _, text in lost],
         )  # fmt: skip
 
 
 def camera_place(row: Mapping[str, str]) -> Array:
-    """East and north of a row of the track; a model's own y and x stand for them."""
-    names = ("east_m", "north_m") if "east_m" in row else ("y", "x")
+    """East and north of a row of the track; a model's own x and y where it has no place."""
+    columns = (("east_m", "north_m"), ("x_m", "y_m"), ("x", "y"))
+    names = next(names for names in columns if names[0] in row)
     return np.array([number(row, name) for name in names])
+
+
+def thinned(
+    shapes: Sequence[tuple[Shape, str]], most: int
+) -> tuple[Sequence[tuple[Shape, str]], str]:
+    """At most this many shapes, evenly taken, and words on what was left out."""
+    step = -(-len(shapes) // most)
+    return (shapes, "") if step <= 1 else (shapes[::step], f"; one of {step} is shown")
 
 
 def _pairs(east_north: Array) -> list[tuple[float, float]]:
@@ -113,16 +123,16 @@ def _footprints(held: Held) -> Iterator[tuple[Shape, str]]:
     features = held.json("mosaic/footprints.geojson").get("features", [])
     datum = _datum(held)
     for feature in features:
-        facts: dict[str, Any] = feature["properties"]
-        for ring in feature["geometry"]["coordinates"]:
+        facts: dict[str, str] = feature["properties"]
+        for ring in (feature["geometry"] or {}).get("coordinates", []):
             corners = np.asarray(ring, dtype=np.float64)
             if datum is not None and held.json("sparse/frame.json")["name"] == "ned":
                 level = np.column_stack([corners[:, 1::-1], np.zeros(len(corners))])
                 corners = datum.ned_from_geodetic(level)[:, 1::-1]
-            area = f"{float(facts['area_m2']):.2f} {held.unit}²"
-            yield _pairs(corners[:, :2]), f"{facts['image']}: {area}"
+            area = float(known_column([facts], "area_")[0])
+            yield _pairs(corners[:, :2]), f"{facts['image']}: {area:.2f} {held.unit}²"
 
 
 def _datum(held: Held) -> Datum | None:
-    told = held.json("sparse/frame.json").get("datum")
-    return None if told is None else Datum(**told)
+    datum = held.json("sparse/frame.json").get("datum")
+    return None if datum is None else Datum(**datum)

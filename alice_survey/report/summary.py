@@ -88,8 +88,8 @@ def _how_well(figures: Figures) -> str:
     if score:
         cover = score["surface"]["completeness_within_px"]
         text += (
-            f" Against the truth the surface errs by "
-            f"{length(1e-3 * score['surface']['distance_rms_mm'])} rms, lengths by "
+            f" Against the truth the surface is off by "
+            f"{length(1e-3 * score['surface']['distance_rms_mm'])} rms and the scale by "
             f"{parts(1e-6 * score['cameras']['scale_error_ppm'])}; "
             f"{share(cover.get('3'))} of the area is within 3 ground pixels."
         )

@@ -10,7 +10,7 @@ from typing import Any
 
 from alice_survey.base.artefacts import read_json
 from alice_survey.base.errors import CalibrationError, WorkspaceError, warn
-from alice_survey.base.executor import default_threads
+from alice_survey.base.executor import Executor, local_executor
 from camera_calib.calibrate.detect_views import Detections, Size, detect_views
 from camera_calib.calibrate.files import finish, summary, tell
 from camera_calib.calibrate.numbering import same_numbering
@@ -75,7 +75,7 @@ def calibrate_command(
     pictures: str | None,
     target: str | None,
     output: Path | None,
-    threads: int | None,
+    executor: Executor | None,
     **others: Any,
 ) -> tuple[str, dict[str, Any]]:
     """`calibrate_pictures` from the options of the command line.
@@ -86,7 +86,7 @@ def calibrate_command(
         pictures: of one camera, instead.
         target: in words, or the path of its file.
         output: folder to write.
-        threads: cores to use; None for all.
+        executor: where tasks run; None for all cores of this machine.
         others: further fields of `PictureCalibration`.
 
     Raises:
@@ -108,11 +108,11 @@ def calibrate_command(
     if output is None:
         raise CalibrationError("-o is missing: the folder to write the calibration into")
     settings = PictureCalibration(pictures=given, target=target, **others)
-    return calibrate_pictures(settings, output, threads or default_threads())
+    return calibrate_pictures(settings, output, executor or local_executor())
 
 
 def calibrate_pictures(
-    settings: PictureCalibration, output: Path, threads: int
+    settings: PictureCalibration, output: Path, executor: Executor
 ) -> tuple[str, dict[str, Any]]:
     """Calibrate from pictures and write a folder of results.
 
@@ -129,7 +129,7 @@ def calibrate_pictures(
     _check_settings(settings, start)
     lists = {camera: find_pictures(place) for camera, place in settings.pictures.items()}
     with _replacing(output) as partial:
-        found = detect_views(pair_pictures(lists), target, threads)
+        found = detect_views(pair_pictures(lists), target, executor)
         tell(found)
         calibration = finish(partial, _calibrated(settings, found, target, start), found)
         _check_sides(calibration.rig)

@@ -6,6 +6,7 @@ from alice_survey.base.artefacts import Stage, need_stage, read_json, run_stage
 from alice_survey.base.config import CameraConfig, SurveyConfig
 from alice_survey.base.contents import taken_from
 from alice_survey.base.errors import CalibrationError
+from alice_survey.base.executor import Executor
 from alice_survey.base.manifest import read_manifest
 from camera_calib.calibrate.detect_views import Size, detect_views
 from camera_calib.calibrate.files import finish, tell
@@ -15,7 +16,7 @@ from camera_calib.rig import design_rig
 from camera_calib.targets.target import Target
 
 
-def run_calibrate(workspace: Path, config: SurveyConfig, threads: int) -> bool:
+def run_calibrate(workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
     """Calibrate the rig from `pool/` and write `calibration/`.
 
     Intrinsics, ports (with their normals) and the pose of the right camera are found together,
@@ -47,7 +48,7 @@ def run_calibrate(workspace: Path, config: SurveyConfig, threads: int) -> bool:
                 rows=int(board["rows"]),
                 size_m=float(board["square_m"]),
             )
-        found = detect_views(_pool_pictures(pool), target, threads)
+        found = detect_views(_pool_pictures(pool), target, executor)
         tell(found)
         start = design_rig(config.camera, config.water, _scale(found.sizes["left"], config.camera))
         calibration = calibrate_through_ports(found.views, target.points, start, "free")

@@ -21,7 +21,7 @@ from alice_survey.base.artefacts import (
     write_json,
 )
 from alice_survey.base.errors import CalibrationError, warn
-from alice_survey.base.executor import default_threads, parallel_map
+from alice_survey.base.executor import Executor, local_executor
 from alice_survey.base.frames import Array
 from camera_calib.freedom import LENSES
 from camera_calib.picture_files import is_cut_short, read_pixels
@@ -160,7 +160,7 @@ def _median(values: Array) -> float:
 
 
 def run_tank(
-    settings: TankSettings, out: Path, threads: int | None = None
+    settings: TankSettings, out: Path, executor: Executor | None = None
 ) -> tuple[str, dict[str, Any]]:
     """Calibrate the cameras of a tank, triangulate its detections and write the folder `out`.
 
@@ -185,19 +185,20 @@ def run_tank(
         | {"cameras": settings.cameras},
         inputs=[*settings.boards, *settings.references, settings.detections],
     )
-    run_stage(out.parent, stage, lambda folder: _work(settings, folder, threads))
+    run_stage(out.parent, stage, lambda folder: _work(settings, folder, executor))
     summary: dict[str, Any] = read_json(out / "tank.json")
     return tank_text(summary), summary
 
 
-def _work(settings: TankSettings, folder: Path, threads: int | None) -> None:
-    threads = threads or default_threads()
+def _work(settings: TankSettings, folder: Path, executor: Executor | None) -> None:
+    executor = executor or local_executor()
     references = [read_reference(path, settings.unit) for path in settings.references]
     detections = read_detections(settings.detections, settings.cameras, settings.offsets)
     warn_of_left_out(settings.detections, detections)
     target = parse_target(settings.board)
     by_folder = {
-        path: _lens(path, target, settings.lens, threads) for path in dict.fromkeys(settings.boards)
+        path: _lens(path, target, settings.lens, executor)
+        for path in dict.fromkeys(settings.boards)
     }
     count = len(references)
     lenses = [by_folder[path] for path in settings.boards] * (count // len(settings.boards))
@@ -273,7 +274,7 @@ def _both(settings: TankSettings, found: Triangulation) -> dict[str, Any]:
     }
 
 
-def _lens(folder: Path, target: Target, model: str | None, threads: int) -> SingleLens:
+def _lens(folder: Path, target: Target, model: str | None, executor: Executor) -> SingleLens:
     """Find the board in every picture of a folder and calibrate the lens."""
     if not folder.is_dir():
         raise CalibrationError(f"{folder}: no such folder of pictures")
@@ -281,7 +282,7 @@ def _lens(folder: Path, target: Target, model: str | None, threads: int) -> Sing
     if not paths:
         raise CalibrationError(f"{folder}: no pictures ({' '.join(_PICTURES)})")
     jobs = [(path, target) for path in paths]
-    looked = list(parallel_map(_look, jobs, threads=threads, label="board corners"))
+    looked = list(executor.map(_look, jobs, label="board corners"))
     sizes = {size for size, _ in looked}
     if len(sizes) > 1:
         several = ", ".join(f"{width} x {height}" for width, height in sorted(sizes))
@@ -296,7 +297,7 @@ def _lens(folder: Path, target: Target, model: str | None, threads: int) -> Sing
         lacking = ", ".join(path.stem for path, pixels in found if pixels is None)
         warn(f"{folder}: no board found in {len(paths) - len(views)} pictures: {lacking}")
     models = tuple(LENSES) if model is None else (model,)
-    lens = calibrate_single_lens(views, target.points, sizes.pop(), models, threads)
+    lens = calibrate_single_lens(views, target.points, sizes.pop(), models, executor)
     if lens.rejected:
         told = ", ".join(f"{name} ({rms:.2f} px rms)" for name, rms in lens.rejected.items())
         warn(f"{folder}: pictures left out that fit far worse than the others: {told}")

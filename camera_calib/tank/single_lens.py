@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from alice_survey.base.errors import CalibrationError
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import SERIAL, Executor
 from alice_survey.base.frames import Array
 from camera_calib.flat_port import PARAMETERS, FlatPortCamera, pose_jacobian
 from camera_calib.freedom import LENSES, intrinsics
@@ -78,7 +78,7 @@ def calibrate_single_lens(
     target_points: Array,
     size_px: tuple[int, int],
     models: Sequence[str] = tuple(LENSES),
-    threads: int = 1,
+    executor: Executor = SERIAL,
 ) -> SingleLens:
     """Calibrate one camera in air.
 
@@ -87,7 +87,7 @@ def calibrate_single_lens(
         target_points: (N, 3) its points, z = 0, metres.
         size_px: width and height of the pictures.
         models: names of `freedom.LENSES` to choose from.
-        threads: cores to use.
+        executor: where tasks run.
 
     Raises:
         CalibrationError: too few views, an unknown model, or none that fits the frame.
@@ -99,7 +99,7 @@ def calibrate_single_lens(
         )
     kept, rejected = _without_outlying(views, target_points, size_px, models)
     jobs = [(kept, target_points, size_px, name) for name in models]
-    tried = tuple(parallel_map(_judge, jobs, threads=threads, label="lens models"))
+    tried = tuple(executor.map(_judge, jobs, label="lens models"))
     sound = [model for model in tried if not model.folds]
     if not sound:
         raise CalibrationError(

@@ -26,7 +26,7 @@ from alice_survey.base.artefacts import (
 )
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import ImageError, NavigationError, WorkspaceError
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array, interpolate_poses, pose_to_json
 from alice_survey.base.manifest import ImageRecord, write_manifest
 from alice_survey.base.trajectory import Trajectory, read_columns, read_track
@@ -69,7 +69,7 @@ class _Shoot:
     """Size and time of the files that workers read, so that none keeps what has changed."""
 
 
-def run_pool(workspace: Path, config: SurveyConfig, threads: int) -> bool:
+def run_pool(workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
     """Take the stereo pictures of a chessboard in a pool and write `pool/`.
 
     Returns:
@@ -102,7 +102,7 @@ def run_pool(workspace: Path, config: SurveyConfig, threads: int) -> bool:
             for view, by_camera in enumerate(shown)
             for camera, pose in by_camera.items()
         ]
-        records = list(parallel_map(_take_board, jobs, threads=threads, label="pool pictures"))
+        records = list(executor.map(_take_board, jobs, label="pool pictures"))
         write_manifest(folder / "manifest.csv", records)
         write_json(folder / "board.json", asdict(board))
         write_rig(folder / "truth" / "rig.json", rig)
@@ -143,7 +143,7 @@ def _take_board(job: tuple[_Shoot, PoolBoard, int, str, Array]) -> ImageRecord:
     return record
 
 
-def run_images(workspace: Path, config: SurveyConfig, threads: int) -> bool:
+def run_images(workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
     """Take the pictures of a flown survey and write `images/`.
 
     Returns:
@@ -196,9 +196,7 @@ def run_images(workspace: Path, config: SurveyConfig, threads: int) -> bool:
             stamp=(terrain.stat().st_size, terrain.stat().st_mtime_ns),
         )
         jobs = _jobs(shoot, stations, truth)
-        images = list(
-            parallel_map(_take, jobs, threads=threads, label="pictures", total=2 * len(stations))
-        )
+        images = list(executor.map(_take, jobs, label="pictures", total=2 * len(stations)))
         records = [
             replace(
                 believed[i // 2],

@@ -11,6 +11,7 @@ from typing import Any
 from alice_survey.base.artefacts import Stage, need_stage, run_stage, write_json
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import PlanError, warn
+from alice_survey.base.executor import SERIAL, Executor, local_executor
 from camera_calib.rig import Rig, design_rig, read_rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.dives import DiveRecord, read_dive_record
@@ -68,7 +69,7 @@ def check_log(
     *,
     triggers: Path | None = None,
     manifest: Path | None = None,
-    threads: int = 1,
+    executor: Executor = SERIAL,
 ) -> Check:
     """Certify a dive by its log.
 
@@ -79,7 +80,7 @@ def check_log(
         log: navigation CSV, or the folder of a simulated flight.
         triggers: CSV with the times of the pictures.
         manifest: `images/manifest.csv` in its place.
-        threads: for large areas.
+        executor: where tasks run, of a large area.
 
     Raises:
         WorkspaceError: there is no plan.
@@ -89,9 +90,9 @@ def check_log(
     rig = rig_of(workspace, config)
     record = read_dive_record(log, plan, rig, triggers=triggers, manifest=manifest)
     pattern = plan_pattern(plan, rig)
-    planned = certificate(plan.area, rig, stations_of_plan(plan), pattern, threads=threads)
+    planned = certificate(plan.area, rig, stations_of_plan(plan), pattern, executor=executor)
     flown = certificate(
-        plan.area, rig, record.stations, pattern, cell_m=planned.grid.cell_m, threads=threads
+        plan.area, rig, record.stations, pattern, cell_m=planned.grid.cell_m, executor=executor
     )
     if flown.blind:
         they = "station looks" if flown.blind == 1 else "stations look"
@@ -119,7 +120,7 @@ def check_report(
     manifest: Path | None = None,
     out: Path | None = None,
     monte_carlo: int = 0,
-    threads: int | None = None,
+    executor: Executor | None = None,
 ) -> tuple[str, dict[str, Any]]:
     """Check a dive, write what is found, and plan the holes again.
 
@@ -134,7 +135,7 @@ def check_report(
         manifest: as of `check_log`.
         out: folder to write; left out, `check` in the workspace.
         monte_carlo: fly the plan so many times in simulation, too.
-        threads: processes.
+        executor: where tasks run; all cores of this machine when left out.
 
     Returns:
         A report as text, and as JSON values.
@@ -142,15 +143,13 @@ def check_report(
     Raises:
         AliceError: a file is missing or cannot be used.
     """
-    from alice_survey.base.executor import default_threads
-
-    cores = default_threads() if threads is None else threads
+    executor = executor or local_executor()
     if log is None and triggers is None and manifest is None:
         check = check_flight(workspace, config)
     else:
         path = need_stage(workspace, "flight", "fly") if log is None else log
         check = check_log(
-            workspace, config, path, triggers=triggers, manifest=manifest, threads=cores
+            workspace, config, path, triggers=triggers, manifest=manifest, executor=executor
         )
     folder = workspace / "check" if out is None else out
     (folder / "hole_probability.png").unlink(missing_ok=True)  # of an earlier check
@@ -163,7 +162,7 @@ def check_report(
         data["refly"] = again
         text += _told_refly(again)
     if monte_carlo:
-        flights = _fly_often(folder, check, config, monte_carlo, cores)
+        flights = _fly_often(folder, check, config, monte_carlo, executor)
         data["monte_carlo"] = flights.to_json()
         text += _told_flights(flights)
     _write(folder, check, data)
@@ -187,6 +186,7 @@ def _write(folder: Path, check: Check, data: dict[str, Any]) -> None:
 
 def _write_refly(folder: Path, check: Check, config: SurveyConfig) -> dict[str, Any] | None:
     """Plan the holes again, as a workspace to fly in; None where that cannot be done."""
+    from missions.exports.options import options_of
     from missions.exports.write import write_exports
     from missions.fly.refly import refly_plan
 
@@ -204,14 +204,16 @@ def _write_refly(folder: Path, check: Check, config: SurveyConfig) -> dict[str, 
         settings={
             "camera": config.camera.model_dump(mode="json"),
             "water": config.water.model_dump(mode="json"),
+            "plan": config.plan.model_dump(mode="json"),
             "refly_of": check.plan.name,
-            "plan": hashlib.blake2b(text.encode(), digest_size=16).hexdigest(),
+            "digest": hashlib.blake2b(text.encode(), digest_size=16).hexdigest(),
         },
     )
 
     def work(part: Path) -> None:
         write_json(part / "plan.json", values)
-        write_exports(part / "exports", plan, check.rig)
+        options = options_of(config.camera, config.plan)
+        write_exports(part / "exports", plan, check.rig, options=options)
 
     run_stage(refly, stage, work)
     return {
@@ -228,14 +230,14 @@ def _write_refly(folder: Path, check: Check, config: SurveyConfig) -> dict[str, 
 
 
 def _fly_often(
-    folder: Path, check: Check, config: SurveyConfig, flights: int, threads: int
+    folder: Path, check: Check, config: SurveyConfig, flights: int, executor: Executor
 ) -> MonteCarlo:
     from alice_survey.seafloor.terrain import survey_terrain
     from missions.coverage.drawing import draw_risk
     from missions.fly.simulation import floor_grid
 
     floor = floor_grid(survey_terrain(config, check.plan.area.allowed_corners_ne))
-    result = monte_carlo(check.plan, config, check.rig, floor, flights, threads)
+    result = monte_carlo(check.plan, config, check.rig, floor, flights, executor)
     folder.mkdir(parents=True, exist_ok=True)
     draw_risk(
         folder / "hole_probability.png", check.plan.area, result.planned.grid,

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.config import SurveyConfig, changed
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.vehicle import signals
 from alice_survey.vehicle.dynamics import GRAVITY, STATE
@@ -197,7 +197,7 @@ def fly_all(
     plan: Plan,
     cases: Sequence[Case],
     seeds: Sequence[int],
-    threads: int,
+    executor: Executor,
     variants: Sequence[Variant] = VARIANTS,
 ) -> Iterator[Outcome]:
     """Fly each variant in each sea, once a seed; flights of the first seed keep their trace.
@@ -207,7 +207,7 @@ def fly_all(
         plan: what to fly.
         cases: mean currents.
         seeds: of the water and of the instruments.
-        threads: processes.
+        executor: where tasks run.
         variants: what flies.
     """
     jobs = [
@@ -217,7 +217,7 @@ def fly_all(
         )
         for case in cases for variant in variants for seed in seeds
     ]  # fmt: skip
-    yield from parallel_map(fly_job, jobs, threads=threads, label="flights")
+    yield from executor.map(fly_job, jobs, label="flights")
 
 
 def fly_job(job: Job) -> Outcome:

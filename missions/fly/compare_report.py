@@ -9,7 +9,7 @@ from typing import Any
 from alice_survey.base.artefacts import write_csv, write_json
 from alice_survey.base.config import SurveyConfig, changed, parse_current
 from alice_survey.base.errors import ConfigError
-from alice_survey.base.executor import default_threads
+from alice_survey.base.executor import Executor, local_executor
 from alice_survey.base.text_table import text_table
 from camera_calib.rig import design_rig
 from missions.fly.compare import (
@@ -43,7 +43,7 @@ def compare_report(
     swell: str | None = None,
     seed: int | None = None,
     flights: int = 5,
-    threads: int | None = None,
+    executor: Executor | None = None,
 ) -> tuple[str, dict[str, Any]]:
     """Fly a survey by both configurations, and write table, figures and pictures.
 
@@ -54,7 +54,7 @@ def compare_report(
         swell: `HEIGHT@PERIOD`, m and s, of waves that travel across the lines in all currents.
         seed: of the first flight; the survey's when left out.
         flights: of each variant in each current.
-        threads: processes; all cores when left out.
+        executor: where tasks run; all cores of this machine when left out.
 
     Returns:
         Text, and the same as values for JSON.
@@ -72,7 +72,7 @@ def compare_report(
         cases = [_with_swell(plan, case, swell) for case in cases]
     first = config.seed if seed is None else seed
     seeds = list(range(first, first + flights))
-    outcomes = list(fly_all(config, plan, cases, seeds, threads or default_threads()))
+    outcomes = list(fly_all(config, plan, cases, seeds, executor or local_executor()))
     results = [_result(plan, case, outcomes) for case in cases]
     reasons = explained(plan, results)
     text = "\n\n".join([

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from alice_survey.base.config import SurveyConfig, changed
 from alice_survey.base.errors import PlanError
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.floor import FloorGrid
 from camera_calib.rig import Rig
@@ -95,7 +95,7 @@ class Job:
 
 
 def monte_carlo(
-    plan: Plan, config: SurveyConfig, rig: Rig, floor: FloorGrid, flights: int, threads: int
+    plan: Plan, config: SurveyConfig, rig: Rig, floor: FloorGrid, flights: int, executor: Executor
 ) -> MonteCarlo:
     """Fly a plan in many seas.
 
@@ -105,7 +105,7 @@ def monte_carlo(
         rig: the cameras, in water.
         floor: the true sea floor.
         flights: how many.
-        threads: processes.
+        executor: where tasks run.
 
     Raises:
         PlanError: no flight is asked for.
@@ -120,7 +120,7 @@ def monte_carlo(
     ]
     short = np.zeros(planned.grid.shape)
     results: list[Flown] = []
-    for flown in _flown(jobs, min(threads, flights)):
+    for flown in _flown(jobs, executor):
         bits = np.unpackbits(flown.short, count=short.size).reshape(short.shape)
         short += bits
         results.append(flown)
@@ -162,8 +162,8 @@ def fly_job(job: Job) -> Flown:
     )
 
 
-def _flown(jobs: list[Job], threads: int) -> Iterator[Flown]:
-    return parallel_map(fly_job, jobs, threads=threads, label="flights")
+def _flown(jobs: list[Job], executor: Executor) -> Iterator[Flown]:
+    return executor.map(fly_job, jobs, label="flights")
 
 
 def _spread(values: Array | NDArray[np.intp]) -> dict[str, float]:

@@ -8,7 +8,7 @@ import numpy as np
 from alice_survey.base.artefacts import Stage, need_stage, run_stage, write_csv, write_json
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import VehicleError, warn
-from alice_survey.base.executor import progress
+from alice_survey.base.executor import Executor, progress
 from alice_survey.base.trajectory import write_track
 from alice_survey.seafloor.terrain import survey_terrain
 from alice_survey.vehicle.log import write_vehicle_log
@@ -25,7 +25,7 @@ _SEED_STREAM = 20
 TRIGGER_COLUMNS = ("station", "time_s", "line")
 
 
-def run_fly(workspace: Path, config: SurveyConfig, threads: int) -> bool:
+def run_fly(workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
     """Stage `flight`: write triggers, navigation, vehicle logs, a bag, the truth and plots.
 
     Returns:

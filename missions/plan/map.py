@@ -23,7 +23,7 @@ from missions.areas.bathymetry import Bathymetry
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.drawing import draw_counts, draw_polygons, finish_map, map_sheet
 from missions.coverage.stations import plan_pattern, stations_of_plan
-from missions.exports.footprints import footprint_outline, footprints_ne
+from missions.exports.geometry import footprint_outline, footprints_ne
 from missions.plan.page_map import COLOURS, KINDS
 from missions.plan.planner import area_bathymetry
 from missions.values.plan_file import Plan, read_plan

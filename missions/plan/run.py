@@ -8,12 +8,13 @@ from pydantic import BaseModel
 
 from alice_survey.base.artefacts import Stage, run_stage, write_json
 from alice_survey.base.config import SeaConfig, SurveyConfig
+from alice_survey.base.executor import Executor
 from alice_survey.base.run import progress
 from alice_survey.kit.document import Link
 from camera_calib.rig import Rig, design_rig
 from missions.areas.files import area_files
-from missions.exports.options import Options
-from missions.exports.write import about_file, write_exports
+from missions.exports.options import Options, options_of
+from missions.exports.write import write_exports
 from missions.exposure.table import settings_table
 from missions.exposure.timetable import trigger_table, write_timetable
 from missions.plan.map import draw_plan
@@ -26,7 +27,7 @@ from missions.values.plan_file import Dive, Plan
 _SAME_S = 1e-3
 
 
-def run_plan(workspace: Path, config: SurveyConfig, threads: int) -> bool:
+def run_plan(workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
     """Stage `plan`: write plan.json, its certificate, settings, maps and missions for vehicles.
 
     Returns:
@@ -57,9 +58,7 @@ def run_plan(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     def work(folder: Path) -> None:
         rig = design_rig(config.camera, config.water)
         planned = plan_survey(config, rig)
-        options = Options(
-            altimeter_body_m=config.camera.dvl_position_body_m, pixel_um=config.camera.pixel_um
-        )
+        options = options_of(config.camera, config.plan)
         write_planned(folder, planned, rig, options, config.sea)
 
     return run_stage(workspace, stage, work)
@@ -105,8 +104,8 @@ def write_planned(
         sea=sea,
         warnings=planned.warnings,
         links=[
-            Link(text=file.name, address=f"exports/{file.name}", about=about_file(file))
-            for file in files
+            Link(text=file.name, address=f"exports/{file.name}", about=about)
+            for file, about in files.items()
         ],
     )
 

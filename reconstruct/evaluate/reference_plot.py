@@ -1,24 +1,19 @@
 """A picture of how a survey differs from a reference."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from alice_survey.base.frames import Array
 from alice_survey.kit.figure import colour_bar, figure_style, map_axes, new_figure, save_figure
-
-if TYPE_CHECKING:
-    from reconstruct.evaluate.reference import CloudDistances
+from reconstruct.evaluate.cloud_registration import CloudDistances
 
 _CELLS = 320
 """Cells of the map along its longer side."""
 
 
 @figure_style()
-def plot_reference(
-    path: Path, ours: "CloudDistances", back: "CloudDistances", pixel_m: float
-) -> None:
+def plot_reference(path: Path, ours: CloudDistances, back: CloudDistances, pixel_m: float) -> None:
     """Map of the survey's signed distance from the reference, and both cumulative shares."""
     limit = max(float(np.percentile(np.abs(ours.signed_m), 95)), 1e-9)
     values, extent = mean_map(ours.points[:, :2], ours.signed_m, _CELLS)

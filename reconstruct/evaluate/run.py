@@ -25,6 +25,7 @@ from alice_survey.base.artefacts import (
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.contents import taken_from
 from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import read_manifest
 from alice_survey.seafloor.terrain import read_terrain
@@ -45,7 +46,7 @@ from reconstruct.placing.track import read_track_poses
 _SEED_STREAM = 6100
 
 
-def run_evaluate(workspace: Path, config: SurveyConfig, threads: int) -> bool:
+def run_evaluate(workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
     """Score what `reconstruct` made and write `evaluation/`.
 
     Returns:

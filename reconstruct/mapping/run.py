@@ -14,9 +14,9 @@ import numpy as np
 import pycolmap
 
 from alice_survey.base.artefacts import Stage, atomic_path, run_stage, write_json
-from alice_survey.base.config import SurveyConfig
+from alice_survey.base.config import ReconstructConfig
 from alice_survey.base.errors import ImageError, WorkspaceError, warn
-from alice_survey.base.executor import kept_workers, parallel_map
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Datum
 from alice_survey.base.manifest import ImageRecord
 from camera_calib.rig import Rig
@@ -78,7 +78,12 @@ class _FeatureTask:
 
 
 def run_mapping(
-    workspace: Path, inputs: Inputs, files: Sequence[Path], config: SurveyConfig, threads: int
+    workspace: Path,
+    inputs: Inputs,
+    files: Sequence[Path],
+    settings: ReconstructConfig,
+    seed: int,
+    executor: Executor,
 ) -> bool:
     """Write `mapping/`.
 
@@ -86,18 +91,18 @@ def run_mapping(
         workspace: folder of the survey.
         inputs: pictures and what is known of them.
         files: what `inputs` was read from, and the pictures.
-        config: settings.
-        threads: how many processes.
+        settings: of the reconstruction.
+        seed: of the mapper.
+        executor: where tasks run.
 
     Returns:
         Whether there was anything to do.
     """
-    settings = config.reconstruct
     stage = Stage(
         name="mapping",
         version=4,
         settings={
-            "seed": config.seed,
+            "seed": seed,
             **settings.model_dump(
                 mode="json",
                 include={
@@ -114,18 +119,21 @@ def run_mapping(
         resumes=True,
     )
 
-    @kept_workers()
     def work(partial: Path) -> None:
+        with executor.started() as started:
+            map_pictures(partial, started)
+
+    def map_pictures(partial: Path, executor: Executor) -> None:
         pycolmap.logging.minloglevel = 2  # its own account of every step is for its developers
-        features = _find_all(inputs, partial / "features", config, threads)
-        lenses, distances = _lenses(inputs, features, config, threads)
+        features = _find_all(inputs, partial / "features", settings, executor)
+        lenses, distances = _lenses(inputs, features, settings, executor)
         cameras, exif_focal = _cameras(inputs, lenses)
-        pairs = _match_all(inputs, features, cameras, lenses, config.seed, threads)
+        pairs = _match_all(inputs, features, cameras, lenses, seed, executor)
         refined = refine_tracks(
             features,
             [_grey_file(path) for path in features],
             [(i, j, pair.matches) for i, j, pair in pairs],
-            threads=threads,
+            executor=executor,
         )
         seen = Observations(
             images=inputs.records,
@@ -143,9 +151,9 @@ def run_mapping(
                 poses,
                 lenses,
                 partial,
-                config.seed,
+                seed,
                 method=settings.mapper,
-                threads=threads,
+                executor=executor,
             )
             adjust = NavigationAdjuster(inputs.records, inputs.rig, lenses, inputs.datum)
             rig, free = inputs.rig, frees_rig(settings, inputs.rig, list(cameras))
@@ -162,7 +170,7 @@ def run_mapping(
                     mapped, refracted = refract(mapped, seen, partial, adjust, poses)
             sigmas = adjust.sigmas
         else:
-            mapped = map_self_calibrated(seen, exif_focal, partial, config.seed)
+            mapped = map_self_calibrated(seen, exif_focal, partial, seed)
             refracted, sigmas, rig = None, None, None
         save_uncertainty(partial, mapped, seen, rig, sigmas)
         _write(partial, inputs, mapped, distances, refracted)
@@ -189,7 +197,9 @@ def _grey_file(features: Path) -> Path:
     return features.with_suffix(".npy")
 
 
-def _find_all(inputs: Inputs, folder: Path, config: SurveyConfig, threads: int) -> list[Path]:
+def _find_all(
+    inputs: Inputs, folder: Path, settings: ReconstructConfig, executor: Executor
+) -> list[Path]:
     """Files of features, in the order of the pictures."""
     targets = [folder / f"{i:06d}.npz" for i in range(len(inputs.records))]
     tasks = [
@@ -197,14 +207,14 @@ def _find_all(inputs: Inputs, folder: Path, config: SurveyConfig, threads: int) 
             picture=inputs.images / record.image,
             mask=inputs.images / record.mask if record.mask else None,
             target=target,
-            scale=config.reconstruct.feature_scale,
-            most=config.reconstruct.max_features,
+            scale=settings.feature_scale,
+            most=settings.max_features,
             thrifty=inputs.rig is not None,
         )
         for record, target in zip(inputs.records, targets, strict=True)
     ]
     folder.mkdir(parents=True, exist_ok=True)
-    counts = list(parallel_map(extract, tasks, threads=threads, label="features"))
+    counts = list(executor.map(extract, tasks, label="features"))
     poor = [r.image for r, n in zip(inputs.records, counts, strict=True) if n < 100]
     if poor:
         warn(f"{len(poor)} pictures have fewer than 100 features: {named(poor)}")
@@ -212,7 +222,7 @@ def _find_all(inputs: Inputs, folder: Path, config: SurveyConfig, threads: int) 
 
 
 def _lenses(
-    inputs: Inputs, features: Sequence[Path], config: SurveyConfig, threads: int
+    inputs: Inputs, features: Sequence[Path], settings: ReconstructConfig, executor: Executor
 ) -> tuple[dict[str, Lens], WorkingDistances | None]:
     """The pinholes that stand in for calibrated cameras; none without a rig."""
     if inputs.rig is None:
@@ -221,9 +231,9 @@ def _lenses(
         inputs.records,
         features,
         inputs.rig,
-        given_m=config.reconstruct.working_range_m,
+        given_m=settings.working_range_m,
         ratio=RATIO,
-        threads=threads,
+        executor=executor,
     )
     lenses: dict[str, Lens] = {
         name: flat_port_lens(inputs.rig.cameras[name], distances.near_m, distances.far_m)
@@ -282,16 +292,16 @@ def _match_all(
     cameras: Mapping[str, pycolmap.Camera],
     lenses: Mapping[str, Lens],
     seed: int,
-    threads: int,
+    executor: Executor,
 ) -> list[VerifiedPair]:
     placed = placed_pictures(inputs.records, inputs.rig, inputs.datum)
     lost = [i for i in range(len(inputs.records)) if i not in placed]
     alike: list[tuple[int, int]] = []
     if len(inputs.records) > SMALL_SET:
-        alike = alike_pairs(features, lost, _ALIKE, seed=seed, threads=threads)
+        alike = alike_pairs(features, lost, _ALIKE, seed=seed, executor=executor)
     sure, maybe = choose_pairs(inputs.records, inputs.rig, inputs.datum, alike)
     looks = [PairTask(first=features[i], second=features[j], ratio=RATIO) for i, j in maybe]
-    counts = parallel_map(coarse_matches, looks, threads=threads, label="choosing pairs")
+    counts = executor.map(coarse_matches, looks, label="choosing pairs")
     likely = [pair for pair, n in zip(maybe, counts, strict=True) if n >= _LEAST_COARSE]
     pairs = sorted([*sure, *likely])
     texts = {name: camera_text(camera) for name, camera in cameras.items()}
@@ -307,7 +317,7 @@ def _match_all(
         )
         for i, j in pairs
     ]
-    found = parallel_map(match_pair, tasks, threads=threads, label="matching")
+    found = executor.map(match_pair, tasks, label="matching")
     return [
         (i, j, matches)
         for (i, j), matches in zip(pairs, found, strict=True)

@@ -10,10 +10,10 @@ from alice_survey.base.artefacts import Stage, need_stage, read_json, run_stage,
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
 from alice_survey.base.contents import taken_from
 from alice_survey.base.errors import warn
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from reconstruct.light.solve import read_light
-from reconstruct.mesh.cloud_file import open_cloud
 from reconstruct.mesh.formats import GLB_AXES, write_glb, write_mesh_ply, write_obj
 from reconstruct.mesh.labels import choose_views, make_charts
 from reconstruct.mesh.preview import render_oblique
@@ -21,6 +21,7 @@ from reconstruct.mesh.surface import TRIM_STEPS, TriangleMesh, mesh_cloud
 from reconstruct.mesh.texture import Textured, colours_of_cloud, paint
 from reconstruct.mesh.topology import face_areas
 from reconstruct.mesh.visibility import find_candidates, save_geometry
+from reconstruct.ply import open_cloud
 from reconstruct.raster import write_png
 from reconstruct.views.model import (
     SparseModel,
@@ -36,7 +37,7 @@ _LIFT_STEPS = 0.5
 """Height over the surface, in spacings of the cloud, at which lines of sight start."""
 
 
-def run_mesh(workspace: Path, config: SurveyConfig, threads: int) -> bool:
+def run_mesh(workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
     """Mesh and texture a finished surface and write `mesh/`.
 
     Returns:
@@ -67,13 +68,17 @@ def run_mesh(workspace: Path, config: SurveyConfig, threads: int) -> bool:
     )
 
     def work(folder: Path) -> None:
-        build_mesh(workspace, model, folder, config.reconstruct, threads)
+        build_mesh(workspace, model, folder, config.reconstruct, executor)
 
     return run_stage(workspace, stage, work)
 
 
 def build_mesh(
-    workspace: Path, model: SparseModel, folder: Path, settings: ReconstructConfig, threads: int
+    workspace: Path,
+    model: SparseModel,
+    folder: Path,
+    settings: ReconstructConfig,
+    executor: Executor,
 ) -> None:
     """Do the work of the stage in a folder; see `run_mesh`."""
     dense = workspace / "dense"
@@ -90,13 +95,13 @@ def build_mesh(
         step,
         settings.mesh_error_px * pixel,
         settings.mesh_triangles or MOST_TRIANGLES,
-        threads,
+        executor,
     )
     scratch = folder / "scratch"
     scratch.mkdir(exist_ok=True)
     save_geometry(scratch / "mesh.npz", mesh.vertices, mesh.triangles, offset)
     candidates = find_candidates(
-        scratch / "mesh.npz", len(mesh.triangles), workspace, views, _LIFT_STEPS * step, threads
+        scratch / "mesh.npz", len(mesh.triangles), workspace, views, _LIFT_STEPS * step, executor
     )
     label = choose_views(mesh.vertices, mesh.triangles, candidates)
     del candidates
@@ -112,7 +117,7 @@ def build_mesh(
         colours_of_cloud(cloud, mesh.vertices, step),
         plain_pixel=pixel,
         page_px=settings.mesh_page_px,
-        threads=threads,
+        executor=executor,
     )
     shutil.rmtree(scratch)
     facts = mesh_facts(mesh, textured, offset, step, model.frame)

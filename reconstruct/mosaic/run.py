@@ -11,15 +11,15 @@ import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import rasterio
 
 from alice_survey.base.artefacts import Stage, need_stage, read_json, run_stage, write_json
-from alice_survey.base.config import SurveyConfig
+from alice_survey.base.config import ReconstructConfig, SurveyConfig, WaterConfig
 from alice_survey.base.contents import taken_from
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import Executor
 from reconstruct.light.solve import joined_samples
 from reconstruct.mosaic.blend import SUPPORT_PX
 from reconstruct.mosaic.colour import ColourModel, solve_colour
@@ -36,7 +36,6 @@ from reconstruct.mosaic.grid import (
     mosaic_grid,
     neighbours,
 )
-from reconstruct.mosaic.measure import ViewTask, measure_view
 from reconstruct.mosaic.paint import (
     PaintTask,
     SeenView,
@@ -45,8 +44,8 @@ from reconstruct.mosaic.paint import (
     paint_tiles,
     tones_path,
 )
-from reconstruct.mosaic.picture_measures import PictureMeasures
-from reconstruct.mosaic.tools import Survey, forget_tools
+from reconstruct.mosaic.picture_measures import PictureMeasures, ViewTask, measure_view
+from reconstruct.mosaic.tools import MosaicSetup, forget_tools
 from reconstruct.mosaic.visibility import Water
 from reconstruct.mosaic.writers import cloud_optimised, thumbnail, write_labels, write_tiles
 from reconstruct.placing.track_figure import plot_track_over
@@ -65,13 +64,13 @@ _LIGHT_LATTICE = 24
 _MOST_SAMPLES = 150_000
 _CACHE_MIB, _WORKER_CACHE_MIB = 48, 16
 """Of files that GDAL reads and writes: here, and in each other process."""
-_MOST_PROCESSES = 2
-"""Each takes up to 0.4 GB; all of them and this one stay below 1.5 GiB."""
+_TASK_MIB = 400
+"""Memory that a process takes for a block of any kind."""
 _TEMPERATURE_C, _SALINITY_PSU = 15.0, 35.0
 """Of the sea where nobody says; red and blue move by 2 % of their dispersion from 5 to 30 C."""
 
 
-def run_mosaic(workspace: Path, config: SurveyConfig, threads: int) -> bool:
+def run_mosaic(workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
     """Paint the mosaic on a finished surface and write `mosaic/`.
 
     Returns:
@@ -95,9 +94,11 @@ def run_mosaic(workspace: Path, config: SurveyConfig, threads: int) -> bool:
         inputs=[sparse, dense / "dem.tif", *picture_files(workspace, sparse, model)],
     )
 
+    sea = _sea(config.water, config.area.seafloor_depth_m)
+
     def work(folder: Path) -> None:
         with _small_caches():
-            build_mosaic(workspace, model, folder, config, threads)
+            build_mosaic(workspace, model, folder, config.reconstruct, sea, executor)
 
     return run_stage(workspace, stage, work)
 
@@ -122,12 +123,15 @@ def _small_caches() -> Iterator[None]:
 
 
 def build_mosaic(
-    workspace: Path, model: SparseModel, folder: Path, config: SurveyConfig, threads: int
+    workspace: Path,
+    model: SparseModel,
+    folder: Path,
+    settings: ReconstructConfig,
+    sea: tuple[Water, bool],
+    executor: Executor,
 ) -> None:
     """Do the work of the stage in a folder; see `run_mosaic`."""
     forget_tools()
-    settings = config.reconstruct
-    threads = min(threads, _MOST_PROCESSES)
     scratch = folder / "scratch"
     scratch.mkdir()
     with opened_raster(workspace / "dense" / "dem.tif") as raster:
@@ -136,23 +140,27 @@ def build_mosaic(
         grid = mosaic_grid(raster, pixel, model.frame)
     names = [view.image for view in model.views]
     measured = list(
-        parallel_map(
+        executor.map(
             measure_view,
             [
                 ViewTask(workspace=workspace, scratch=scratch, view=view, heights=heights)
                 for view in model.views
             ],
-            threads=threads,
             label="measure pictures",
+            task_mib=_TASK_MIB,
         )
     )
     facts = [fact for fact, _ in measured]
-    water, dispersion = _dispersion(workspace, model, config, all(f.grey for f in facts))
-    survey = Survey(workspace=workspace, scratch=scratch, scaled=model.frame.scaled, water=water)
+    water, dispersion = _dispersion(
+        workspace, settings.dispersion, sea, grey=all(f.grey for f in facts)
+    )
+    survey = MosaicSetup(
+        workspace=workspace, scratch=scratch, scaled=model.frame.scaled, water=water
+    )
     views = _seen_views(model, facts)
     ground = footprints(model.views, heights)
     label_blocks = seam_blocks(grid, ground)
-    colour = _solve(model, survey, facts, views, label_blocks, config, threads)
+    colour = _solve(model, survey, facts, views, label_blocks, settings.colour, executor)
 
     def tasks(blocks: Sequence[Block]) -> list[PaintTask]:
         return [
@@ -171,14 +179,14 @@ def build_mosaic(
         folder / "coverage.tif",
         grid,
         model.frame,
-        parallel_map(label_block, tasks(label_blocks), threads=threads, label="seams"),
+        executor.map(label_block, tasks(label_blocks), label="seams", task_mib=_TASK_MIB),
     )
     tiles = blocks_of(grid, ground, _TILE_PX, SUPPORT_PX)
     rough = scratch / "rough.tif"
     groups = [tasks(group) for group in neighbours(tiles, _GROUP)]
-    painted = parallel_map(paint_tiles, groups, threads=threads, label="mosaic")
+    painted = executor.map(paint_tiles, groups, label="mosaic", task_mib=_TASK_MIB)
     covered = write_tiles(rough, folder / "mosaic_source.tif", grid, model.frame, painted, names)
-    cloud_optimised(rough, folder / "mosaic.tif", threads)
+    cloud_optimised(rough, folder / "mosaic.tif", executor.local_cores)
     thumbnail(folder / "mosaic.tif", folder / "mosaic.png")
     plot_track_over(folder / "mosaic.tif", workspace / "sparse" / "track.csv", folder / "track.png")
     shutil.rmtree(scratch)
@@ -228,17 +236,16 @@ def _seen_views(model: SparseModel, facts: Sequence[PictureMeasures]) -> list[Se
 
 def _solve(
     model: SparseModel,
-    survey: Survey,
+    survey: MosaicSetup,
     facts: Sequence[PictureMeasures],
     views: Sequence[SeenView],
     blocks: Sequence[Block],
-    config: SurveyConfig,
-    threads: int,
+    wanted: Literal["even", "water", "raw"],
+    executor: Executor,
 ) -> ColourModel:
     """The survey's light from spots that two views see."""
     images = [view.image for view in model.views]
     cameras = [view.camera for view in model.views]
-    wanted = config.reconstruct.colour
     if wanted == "raw":
         return solve_colour(wanted, joined_samples([]), facts, images, cameras)
     width = float(np.median([view.width_px for view in model.views]))
@@ -253,7 +260,7 @@ def _solve(
         )
         for block in blocks
     ]
-    found = list(parallel_map(compare_block, compare, threads=threads, label="compare light"))
+    found = list(executor.map(compare_block, compare, label="compare light", task_mib=_TASK_MIB))
     parts = [part for part in found if len(part.views)]
     return solve_colour(wanted, joined_samples(parts), facts, images, cameras)
 
@@ -265,10 +272,9 @@ def _part_of(colour: ColourModel, images: Sequence[str]) -> ColourModel:
 
 
 def _dispersion(
-    workspace: Path, model: SparseModel, config: SurveyConfig, grey: bool
+    workspace: Path, wanted: str, sea: tuple[Water, bool], *, grey: bool
 ) -> tuple[Water | None, dict[str, Any]]:
     """The water through which colours are distinguished, or None, and what to say about it."""
-    wanted = config.reconstruct.dispersion
     path = workspace / "sparse" / "cameras.json"
     with taken_from(path):
         cameras = read_json(path)["cameras"]
@@ -284,12 +290,7 @@ def _dispersion(
         reason = "rendered pictures have none"
     if reason:
         return None, {"corrected": False, "reason": reason}
-    stated = config.water.temperature_c is not None and config.water.salinity_psu is not None
-    water = Water(
-        temperature_c=_or(config.water.temperature_c, _TEMPERATURE_C),
-        salinity_psu=_or(config.water.salinity_psu, _SALINITY_PSU),
-        depth_m=config.area.seafloor_depth_m,
-    )
+    water, stated = sea
     return water, {
         "corrected": True,
         "temperature_c": water.temperature_c,
@@ -304,5 +305,12 @@ def _simulated(workspace: Path) -> bool:
         return bool(read_json(path).get("source") == "simulated")
 
 
-def _or(value: float | None, default: float) -> float:
-    return default if value is None else value
+def _sea(config: WaterConfig, depth_m: float) -> tuple[Water, bool]:
+    """The water of a survey, and whether its settings state it."""
+    stated = config.temperature_c is not None and config.salinity_psu is not None
+    water = Water(
+        temperature_c=_TEMPERATURE_C if config.temperature_c is None else config.temperature_c,
+        salinity_psu=_SALINITY_PSU if config.salinity_psu is None else config.salinity_psu,
+        depth_m=depth_m,
+    )
+    return water, stated

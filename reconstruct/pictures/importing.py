@@ -11,7 +11,7 @@ import numpy as np
 
 from alice_survey.base.artefacts import Stage, run_stage, write_json
 from alice_survey.base.errors import ImageError, NavigationError, WorkspaceError, warn
-from alice_survey.base.executor import parallel_map, progress
+from alice_survey.base.executor import SERIAL, Executor, progress
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord, write_manifest
 from camera_calib.rig import Rig, read_rig, write_rig
@@ -68,7 +68,7 @@ def import_images(
     vertical_datum: str | None = None,
     rig: Path | None = None,
     masks: Path | None = None,
-    threads: int = 1,
+    executor: Executor = SERIAL,
 ) -> bool:
     """Write `images/` from pictures of one camera, of a stereo pair, or from a video.
 
@@ -91,7 +91,7 @@ def import_images(
         rig: `rig.json` of the cameras; its lever arm says that navigation is of the body.
         masks: folder of masks (0 = leave out) with the stems of the pictures, or with a folder per
             camera; without it `NAME_mask.png` beside a picture is its mask.
-        threads: how many processes.
+        executor: where tasks run.
 
     Returns:
         Whether there was anything to do.
@@ -143,12 +143,12 @@ def import_images(
         if video is not None:
             entries = _take_frames(video, every_s, partial, _mono_name(known_rig))
         else:
-            entries = _find_entries(folders, left, right, known_rig, threads)
+            entries = _find_entries(folders, left, right, known_rig, executor)
         _check_entries(entries, known_rig)
         entries = _named(entries)
         entries = [replace(e, mask=_mask_of(e, masks, left is not None)) for e in entries]
         if video is None:
-            notes += _copy_all(entries, partial, threads)
+            notes += _copy_all(entries, partial, executor)
         records = [_record(entry, partial) for entry in entries]
         records, datum, level = _place(
             entries, records, log, logged_level, clock_offset_s, zone, notes
@@ -199,7 +199,11 @@ def _mono_name(rig: Rig | None) -> str:
 
 
 def _find_entries(
-    folders: Sequence[Path], left: Path | None, right: Path | None, rig: Rig | None, threads: int
+    folders: Sequence[Path],
+    left: Path | None,
+    right: Path | None,
+    rig: Rig | None,
+    executor: Executor,
 ) -> list[_Entry]:
     if left is not None and right is not None:
         sides = {"left": find_pictures(left), "right": find_pictures(right)}
@@ -216,7 +220,7 @@ def _find_entries(
         for station, path in enumerate(paths)
     ]
     paths = [path for _, _, path in listed]
-    facts = parallel_map(inspect, paths, threads=threads, label="checking pictures")
+    facts = executor.map(inspect, paths, label="checking pictures")
     entries = []
     for (camera, station, path), known in zip(listed, facts, strict=True):
         if known.fault:
@@ -294,10 +298,10 @@ def _mask_of(entry: _Entry, masks: Path | None, stereo: bool) -> Path | None:
     return found
 
 
-def _copy_all(entries: Sequence[_Entry], partial: Path, threads: int) -> list[str]:
+def _copy_all(entries: Sequence[_Entry], partial: Path, executor: Executor) -> list[str]:
     bits = {camera: _bits(entries, camera) for camera in {e.camera for e in entries}}
     tasks = [(entry.source, partial / entry.image, bits[entry.camera]) for entry in entries]
-    for _ in parallel_map(_copy, tasks, threads=threads, label="copying pictures"):
+    for _ in executor.map(_copy, tasks, label="copying pictures"):
         pass
     return [
         f"pictures of camera {camera} held {count} bits; the upper 8 were kept"

@@ -17,6 +17,7 @@ from alice_survey.base.artefacts import Stage, need_stage, read_json, run_stage,
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
 from alice_survey.base.contents import taken_from
 from alice_survey.base.errors import ImageError
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import read_manifest
 from camera_calib.rig import Rig, read_rig
@@ -48,14 +49,14 @@ from reconstruct.views.model_files import read_reconstruction
 __all__ = ["SCALE_FILE", "read_track_poses", "run_sparse"]
 
 
-def run_sparse(workspace: Path, config: SurveyConfig, threads: int) -> bool:
+def run_sparse(workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
     """Write `mapping/` and `sparse/`.
 
     Args:
         workspace: folder of the survey, with finished `images/`; the rig is looked for in
             `calibration/rig.json`, then in `images/rig.json`.
         config: settings.
-        threads: how many processes.
+        executor: where tasks run.
 
     Returns:
         Whether there was anything to do.
@@ -65,7 +66,7 @@ def run_sparse(workspace: Path, config: SurveyConfig, threads: int) -> bool:
         ReconstructionError: the pictures give no model.
     """
     inputs, survey, files = read_inputs(workspace)
-    mapped = run_mapping(workspace, inputs, files, config, threads)
+    mapped = run_mapping(workspace, inputs, files, config.reconstruct, config.seed, executor)
     mapping = workspace / "mapping"
     if not mapping.is_dir():  # only checking
         return True

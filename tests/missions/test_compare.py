@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from alice_survey.base.config import SurveyConfig, changed, parse_config
 from alice_survey.base.errors import ConfigError
+from alice_survey.base.executor import SERIAL
 from alice_survey.cli.main import app
 from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.floor import level_floor
@@ -245,7 +246,13 @@ def _rows(path: Path) -> list[dict[str, str]]:
 def test_the_report_holds_every_flight_and_a_reason_for_each_difference(tmp_path: Path) -> None:
     currents = ["0.05@90", "0@0"]
     text, data = compare_report(
-        CONFIG, tmp_path / "one", currents=currents, swell="0.3@5", seed=4, flights=1, threads=1
+        CONFIG,
+        tmp_path / "one",
+        currents=currents,
+        swell="0.3@5",
+        seed=4,
+        flights=1,
+        executor=SERIAL,
     )
     for variant in VARIANTS:
         assert text.count(f"\n{variant.name}  ") == 2
@@ -287,7 +294,7 @@ def test_a_sea_that_makes_no_sense_is_refused(
     currents: Sequence[str], swell: str | None, said: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ConfigError, match=said):
-        compare_report(CONFIG, tmp_path, currents=currents, swell=swell, flights=1, threads=1)
+        compare_report(CONFIG, tmp_path, currents=currents, swell=swell, flights=1, executor=SERIAL)
 
 
 def test_the_command_prints_what_it_writes(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.errors import AliceError, CalibrationError
+from alice_survey.base.executor import SERIAL
 from alice_survey.seafloor.board import PoolBoard, board_records, pool_poses, render_board
 from camera_calib.calibrate.detect_views import detect_views
 from camera_calib.calibrate.picture_sets import find_pictures, pair_pictures
@@ -82,7 +83,7 @@ def real(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[P
     folder, out = shared_data / "opencv_stereo", tmp_path_factory.mktemp("real") / "out"
     pictures = {side: str(folder / f"{side}*.jpg") for side in ("left", "right")}
     settings = PictureCalibration(pictures=pictures, target=BOARD)
-    return out, *calibrate_pictures(settings, out, threads=1)
+    return out, *calibrate_pictures(settings, out, executor=SERIAL)
 
 
 def test_a_real_stereo_set(real: tuple[Path, str, Any]) -> None:
@@ -155,12 +156,12 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_from_dry_pictures_to_the_sea(dry: Path, wet: Path, truth: Rig, tmp_path: Path) -> None:
     """In air, then through the ports with the air's knowledge, then carried to the sea."""
     air = PictureCalibration(pictures=both(dry), target=POOL_BOARD, lens="opencv5")
-    calibrate_pictures(air, tmp_path / "air", threads=1)
+    calibrate_pictures(air, tmp_path / "air", executor=SERIAL)
     pool = PictureCalibration(
         pictures=both(wet), target=POOL_BOARD, water=True, start=tmp_path / "air" / "rig.json",
         glass_mm=10.0, carry_to_n=1.342,
     )  # fmt: skip
-    text, found = calibrate_pictures(pool, tmp_path / "pool", threads=1)
+    text, found = calibrate_pictures(pool, tmp_path / "pool", executor=SERIAL)
 
     assert "left port: " in text
     assert "camera uncertainty" in text
@@ -185,7 +186,7 @@ def test_from_dry_pictures_to_the_sea(dry: Path, wet: Path, truth: Rig, tmp_path
 def test_one_camera(dry: Path, truth: Rig, tmp_path: Path) -> None:
     text, found = calibrate_command(
         left=None, right=None, pictures=str(dry / "left"), target=POOL_BOARD,
-        output=tmp_path / "one", threads=1, lens="k2",
+        output=tmp_path / "one", executor=SERIAL, lens="k2",
     )  # fmt: skip
     rig = read_rig(tmp_path / "one" / "rig.json")
     assert list(rig.cameras) == ["camera"]
@@ -204,7 +205,7 @@ def test_corrupt_pictures_and_pictures_without_the_board_are_left_out(
     cv2.imwrite(str(tmp_path / "in" / "right" / "05.png"), empty)
     settings = PictureCalibration(pictures=both(tmp_path / "in"), target=POOL_BOARD)
 
-    _, found = calibrate_pictures(settings, tmp_path / "out", threads=1)
+    _, found = calibrate_pictures(settings, tmp_path / "out", executor=SERIAL)
 
     shown = capsys.readouterr().err.splitlines()
     assert sum("03.png cannot be decoded" in line for line in shown) == 1
@@ -227,7 +228,7 @@ def test_pictures_that_are_cut_short_or_of_another_kind_are_named(
     cv2.imwrite(str(folder / "3.tif"), np.zeros((451, 564), dtype=np.float32))
     sets = pair_pictures({"camera": find_pictures(str(folder))})
 
-    found = detect_views(sets, parse_target(POOL_BOARD), threads=1)
+    found = detect_views(sets, parse_target(POOL_BOARD), executor=SERIAL)
 
     assert [view.name for view in found.views] == ["0", "2"]
     reasons = {r.view: r.reason for r in found.rejections if not r.points}
@@ -237,7 +238,7 @@ def test_pictures_that_are_cut_short_or_of_another_kind_are_named(
 
 def refuses(settings: PictureCalibration, tmp_path: Path) -> str:
     with pytest.raises(AliceError) as caught:
-        calibrate_pictures(settings, tmp_path / "out", threads=1)
+        calibrate_pictures(settings, tmp_path / "out", executor=SERIAL)
     assert len(str(caught.value).splitlines()) == 1
     assert not (tmp_path / "out").exists()
     assert not (tmp_path / "out.partial").exists()
@@ -330,7 +331,7 @@ def test_options_that_do_not_go_together(
 def test_commands_that_lack_something(given: dict[str, object], what: str) -> None:
     options: dict[str, object] = {
         "left": None, "right": None, "pictures": None, "target": BOARD, "output": Path("out"),
-        "threads": 1, **given,
+        "executor": SERIAL, **given,
     }  # fmt: skip
     with pytest.raises(CalibrationError, match=what):
         calibrate_command(**options)  # type: ignore[arg-type]
@@ -341,10 +342,10 @@ def test_a_folder_with_other_files_is_not_overwritten(dry: Path, tmp_path: Path)
     (tmp_path / "out" / "thesis.tex").write_text("years of work")
     settings = PictureCalibration(pictures=both(dry), target=POOL_BOARD)
     with pytest.raises(AliceError, match="holds other files"):
-        calibrate_pictures(settings, tmp_path / "out", threads=1)
+        calibrate_pictures(settings, tmp_path / "out", executor=SERIAL)
     (tmp_path / "out" / "calibration.json").write_text("{}")
     with pytest.raises(AliceError, match=r"such as thesis\.tex"):
-        calibrate_pictures(settings, tmp_path / "out", threads=1)
+        calibrate_pictures(settings, tmp_path / "out", executor=SERIAL)
     assert (tmp_path / "out" / "thesis.tex").read_text() == "years of work"
 
 
@@ -353,7 +354,7 @@ def test_a_place_that_cannot_be_a_folder_is_refused_at_once(tmp_path: Path) -> N
     settings = PictureCalibration(pictures={"camera": str(tmp_path)}, target=BOARD)
     for output, said in ((tmp_path / "taken", "is a file"), (Path(), "folder of its own")):
         with pytest.raises(AliceError, match=said):
-            calibrate_pictures(settings, output, threads=1)
+            calibrate_pictures(settings, output, executor=SERIAL)
     assert (tmp_path / "taken").read_text() == "mine"
 
 
@@ -364,7 +365,7 @@ def test_a_start_is_not_replaced_by_what_it_gives(tmp_path: Path) -> None:
         pictures={"camera": "nowhere"}, target=BOARD, start=tmp_path / "air" / "rig.json"
     )
     with pytest.raises(AliceError, match="rig of --start"):
-        calibrate_pictures(settings, tmp_path / "air", threads=1)
+        calibrate_pictures(settings, tmp_path / "air", executor=SERIAL)
     assert (tmp_path / "air" / "rig.json").is_file()
 
 
@@ -375,7 +376,7 @@ def test_swapped_lists_are_told(
     swapped = {"left": str(dry / "right"), "right": str(dry / "left")}
     for pictures, told in ((both(dry), 0), (swapped, 1)):
         settings = PictureCalibration(pictures=pictures, target=POOL_BOARD, lens="k2")
-        calibrate_pictures(settings, tmp_path / "out", threads=1)
+        calibrate_pictures(settings, tmp_path / "out", executor=SERIAL)
         shown = capsys.readouterr().err
         assert shown.count("the right camera stands 100 mm to the left of the left one") == told
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from alice_survey.base.errors import CalibrationError
+from alice_survey.base.executor import SERIAL
 from alice_survey.cli.main import app
 from camera_calib.rig import read_rig
 from camera_calib.tank.run import TankSettings, misses, run_tank
@@ -50,7 +51,7 @@ def zebrafish(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Ze
         detections=folder / "detections.csv",
     )
     out = tmp_path_factory.mktemp("aau") / "tank"
-    text, summary = run_tank(settings, out, threads=1)
+    text, summary = run_tank(settings, out, executor=SERIAL)
     return Zebrafish(
         settings=settings,
         out=out,
@@ -160,7 +161,7 @@ def test_clocks_are_told_apart(zebrafish: Zebrafish) -> None:
 def test_again_is_skipped_and_the_same(zebrafish: Zebrafish) -> None:
     before = (zebrafish.out / "points.csv").stat().st_mtime_ns
 
-    text, summary = run_tank(zebrafish.settings, zebrafish.out, threads=1)
+    text, summary = run_tank(zebrafish.settings, zebrafish.out, executor=SERIAL)
 
     assert (zebrafish.out / "points.csv").stat().st_mtime_ns == before
     assert (text, summary) == (zebrafish.text, zebrafish.summary)
@@ -190,7 +191,7 @@ def copied(shared_data: Path, tmp_path: Path) -> TankSettings:
 def test_bad_input_is_one_clear_line(copied: TankSettings, tmp_path: Path) -> None:
     def fails(settings: TankSettings) -> str:
         with pytest.raises(CalibrationError) as error:
-            run_tank(settings, tmp_path / "out", threads=1)
+            run_tank(settings, tmp_path / "out", executor=SERIAL)
         assert "\n" not in str(error.value)
         assert not (tmp_path / "out").exists()
         return str(error.value)

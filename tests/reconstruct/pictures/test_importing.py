@@ -13,6 +13,7 @@ from PIL import Image
 from alice_survey.base.artefacts import read_json
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.errors import AliceError, ImageError, WorkspaceError
+from alice_survey.base.executor import local_executor
 from alice_survey.base.manifest import read_manifest
 from camera_calib.rig import design_rig, read_rig, write_rig
 from reconstruct.pictures.files import inspect
@@ -342,7 +343,7 @@ def test_one_or_two_processes_write_the_same(tmp_path: Path, draw: Draw) -> None
     for number in range(4):
         draw(tmp_path / "in" / f"{number}.jpg", number)
     for threads in (1, 2):
-        import_images(tmp_path / f"w{threads}", [tmp_path / "in"], threads=threads)
+        import_images(tmp_path / f"w{threads}", [tmp_path / "in"], executor=local_executor(threads))
     one, two = tmp_path / "w1" / "images", tmp_path / "w2" / "images"
     for file in sorted(p for p in one.rglob("*") if p.is_file() and p.name != "stage.json"):
         assert file.read_bytes() == (two / file.relative_to(one)).read_bytes()

@@ -1,0 +1,121 @@
+"""A plan as tables: lines, stations, and the way-points of the paper's lawnmower; CSV."""
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from alice_survey.base.artefacts import write_csv
+from missions.exports.format import Export, ExportFile, ExportFormat
+from missions.exports.geometry import lat_lon
+from missions.exports.waypoints import Waypoint
+from missions.values.plan_file import Plan
+
+
+def write_lines(path: Path, export: Export, _dive: int = 0) -> None:
+    """The lines with their ends in latitude and longitude and in local metres."""
+    plan = export.plan
+    header = (
+        "line", "kind", "start_latitude_deg", "start_longitude_deg", "end_latitude_deg",
+        "end_longitude_deg", "start_north_m", "start_east_m", "end_north_m", "end_east_m",
+        "heading_deg", "length_m", "stations", "depth_m", "altitude_m", "speed_mps", "interval_s",
+    )  # fmt: skip
+    depth_m = plan.seafloor_depth_m - plan.altitude_m
+    ends_ne = np.array([end for line in plan.lines for end in (line.start_ne_m, line.end_ne_m)])
+    geodetic = lat_lon(plan.datum, ends_ne, depth_m).reshape(-1, 4)
+    ends = ends_ne.reshape(-1, 4)
+    rows = []
+    for index, line in enumerate(plan.lines):
+        depths = plan.line_depths_m[index] if plan.line_depths_m else (depth_m,)
+        rows.append(
+            [
+                index, line.kind,
+                *(f"{value:.10f}" for value in geodetic[index]),
+                *(f"{value:.4f}" for value in ends[index]),
+                f"{math.degrees(line.heading_rad):.6f}", f"{line.length_m:.4f}", line.stations,
+                f"{sum(depths) / len(depths):.3f}", f"{plan.altitude_m:.3f}", plan.speed_mps,
+                plan.interval_s,
+            ]
+        )  # fmt: skip
+    write_csv(path, header, rows)
+
+
+def write_stations(path: Path, export: Export, _dive: int = 0) -> None:
+    """Every place where all cameras take a picture, in the order of flight."""
+    header = (
+        "station", "dive", "line", "kind", "latitude_deg", "longitude_deg", "north_m", "east_m",
+        "depth_m", "altitude_m", "heading_deg",
+    )  # fmt: skip
+    write_csv(path, header, _stations(export.plan))
+
+
+def write_waypoints(path: Path, export: Export, _dive: int = 0) -> None:
+    """One row for each way-point: of the glass, and of the vehicle that brings it there."""
+    header = (
+        "number", "dive", "latitude_deg", "longitude_deg", "depth_m", "altitude_m", "speed_mps",
+        "heading_deg", "action", "line", "hold_s", "vehicle_latitude_deg", "vehicle_longitude_deg",
+        "vehicle_depth_m", "altimeter_altitude_m",
+    )  # fmt: skip
+    write_csv(path, header, _waypoints(export.dives))
+
+
+def _stations(plan: Plan) -> Iterator[list[Any]]:
+    depth_m = plan.seafloor_depth_m - plan.altitude_m
+    dive_of = {
+        line: number
+        for number, dive in enumerate(plan.dives, start=1)
+        for line in range(dive.first_line, dive.last_line + 1)
+    }
+    station = 0
+    for index, line in enumerate(plan.lines):
+        places = line.stations_ne
+        depths = plan.line_depths_m[index] if plan.line_depths_m else [depth_m] * line.stations
+        heading = f"{math.degrees(line.heading_rad):.6f}"
+        for place, (lat, lon), depth in zip(
+            places, lat_lon(plan.datum, places, depth_m), depths, strict=True
+        ):
+            yield [
+                station, dive_of.get(index), index, line.kind, f"{lat:.10f}", f"{lon:.10f}",
+                f"{place[0]:.4f}", f"{place[1]:.4f}", f"{depth:.3f}", f"{plan.altitude_m:.3f}",
+                heading,
+            ]  # fmt: skip
+            station += 1
+
+
+def _waypoints(dives: Sequence[Sequence[Waypoint]]) -> Iterator[list[Any]]:
+    number = 1
+    for dive, points in enumerate(dives, start=1):
+        for point in points:
+            yield [
+                number, dive, f"{point.glass_latitude_deg:.10f}",
+                f"{point.glass_longitude_deg:.10f}", f"{point.glass_depth_m:.3f}",
+                f"{point.glass_altitude_m:.3f}", point.speed_mps,
+                f"{math.degrees(point.heading_rad):.4f}", _action(point),
+                point.line if point.line >= 0 else None, f"{point.hold_s:.1f}",
+                f"{point.latitude_deg:.10f}", f"{point.longitude_deg:.10f}",
+                f"{point.depth_m:.3f}", f"{point.altitude_m:.3f}",
+            ]  # fmt: skip
+            number += 1
+
+
+def _action(point: Waypoint) -> str:
+    switch = "" if point.camera is None else f", camera {point.camera}"
+    return f"{point.kind}{switch}"
+
+
+FORMAT = ExportFormat(
+    read_by="tables; `waypoints.csv` is the lawnmower's way-point table",
+    files=(
+        ExportFile(name="lines.csv", about="table of the lines", write=write_lines),
+        ExportFile(
+            name="stations.csv", about="table of the places of pictures", write=write_stations
+        ),
+        ExportFile(
+            name="waypoints.csv",
+            about="table of the way-points, of glass and vehicle",
+            write=write_waypoints,
+        ),
+    ),
+)
