@@ -359,6 +359,8 @@ def _draw_power(axes: Axes, flight: Flight) -> None:
     steps = np.diff(flight.truth.time_s, prepend=0.0)
     energy.plot(t, (np.cumsum(total * steps) / 3600.0)[some], color="black", lw=1.2)
     energy.set_ylim(bottom=0)
+    energy.grid(visible=False)
+    energy.spines["right"].set_visible(True)
     energy.set_ylabel("energy, Wh", fontsize=8.5)
     energy.tick_params(labelsize=8)
     spent = float(flown.energy_j.sum()) / 3600.0
