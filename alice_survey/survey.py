@@ -185,10 +185,18 @@ def run(
     return "\n".join(lines), found
 
 
-def plan_report(workspace: Path, survey: Path | None) -> tuple[str, dict[str, Any]]:
-    """Plan a survey, and tell every setting with its equation, source and limit."""
+def plan_report(
+    workspace: Path, survey: Path | None, *, every_setting: bool = False
+) -> tuple[str, dict[str, Any]]:
+    """Plan a survey, and show its main settings; or every one with its equation and source."""
+    from missions.plan.rows import main_settings
+
     text, found = run(["plan"], workspace, survey)
-    table = (workspace / "plan" / "settings.txt").read_text(encoding="utf-8")
+    folder = workspace / "plan"
+    if every_setting:
+        table = (folder / "settings.txt").read_text(encoding="utf-8")
+    else:
+        table = main_settings(read_json(folder / "plan.json"))
     return f"{table}\n{text}", found
 
 

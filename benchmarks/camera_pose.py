@@ -15,8 +15,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.executor import SERIAL, Executor
 from alice_survey.base.frames import Array
+from benchmarks.absolute_pose import Sighting, absolute_pose, pose_information
 from benchmarks.figures import Figure, Goal
-from camera_calib.absolute_pose import Sighting, absolute_pose, pose_information
 from camera_calib.flat_port import FlatPortCamera
 
 PUBLISHED = {

@@ -38,8 +38,8 @@ class Executor:
     """Where tasks run: in this process, in local processes, or on an engine for many machines.
 
     A task is a module-level function of one picklable value: settings, arrays and paths. It may
-    rely on nothing else of the process that submits it. What it reports with `warn` and `note`
-    travels back with its result.
+    rely on nothing else of the process that submits it, and has its worker for itself. What it
+    reports with `warn` and `note` travels back with its result.
     """
 
     workers: int = 1

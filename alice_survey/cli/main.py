@@ -2,7 +2,7 @@
 
 import gc
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -128,20 +128,21 @@ def fov(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Tell field of view and resolution.
+    """Show field of view and resolution.
 
     Footprint, pixel, focus, depth of field, stereo and blur through the exact flat port, for any
     lens, altitude and water. What is not given is the survey's, or else the paper's.
     """
     from alice_survey.cli.fov_tables import FovOptions, Output, fov_report, validation_report
+    from camera_calib.fov.table import FovChoices
 
     output = Output(markdown=markdown, csv=csv, plot=plot)
     options = FovOptions(
         lens_mm=lens or (), altitude_m=altitude or (), speed_mps=speed or (),
         exposure_ms=exposure or (), survey=survey, rig=rig, n_water=n_water,
         temperature_c=temperature, salinity_psu=salinity, port_distance_mm=port_distance,
-        glass_mm=glass, n_glass=n_glass, pixel_um=pixel, f_number=f_number, coc_px=coc,
-        focus_air_m=focus_air, match_sigma_px=match_sigma, blur_px=blur,
+        glass_mm=glass, n_glass=n_glass, pixel_um=pixel, f_number=f_number, blur_px=blur,
+        choices=FovChoices(coc_px=coc, focus_air_m=focus_air, match_sigma_px=match_sigma),
     )  # fmt: skip
     table, data, passed = (
         validation_report(options, output) if validate else fov_report(options, output)
@@ -300,24 +301,16 @@ def calibrate(
     From the pool of a survey, or from pictures of a target: chessboard, ChArUco or AprilTag grid.
     Writes the rig with its covariance, the residuals and a report.
     """
-    places = {"left": left, "right": right, "pictures": pictures, "target": target}
-    settings: dict[str, Any] = {
-        "start": start, "known": intrinsics, "port_distance_mm": port_distance, "glass_mm": glass,
-        "glass_sigma_mm": glass_sigma, "n_glass": n_glass, "n_glass_sigma": n_glass_sigma,
-        "n_water": n_water, "n_water_sigma": n_water_sigma, "carry_to_n": carry_to_n,
-    }  # fmt: skip
-    given = [value for value in (*places.values(), output, *settings.values()) if value is not None]
-    if given or water or lens != "opencv5":
-        from camera_calib.calibrate.pictures import calibrate_command
+    from camera_calib.calibrate.from_pictures import CalibrateOptions, calibrate_pictures
 
-        result = calibrate_command(
-            **places,
-            output=output,
-            executor=executor_of(threads),
-            lens=lens,
-            water=water,
-            **settings,
-        )
+    options = CalibrateOptions(
+        left=left, right=right, pictures=pictures, target=target, output=output, lens=lens,
+        water=water, start=start, known=intrinsics, port_distance_mm=port_distance, glass_mm=glass,
+        glass_sigma_mm=glass_sigma, n_glass=n_glass, n_glass_sigma=n_glass_sigma, n_water=n_water,
+        n_water_sigma=n_water_sigma, carry_to_n=carry_to_n,
+    )  # fmt: skip
+    if options != CalibrateOptions():
+        result = calibrate_pictures(options, executor_of(threads))
     else:
         from alice_survey.survey import run
 

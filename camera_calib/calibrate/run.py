@@ -9,7 +9,7 @@ from alice_survey.base.errors import CalibrationError
 from alice_survey.base.executor import Executor
 from alice_survey.base.manifest import read_manifest
 from camera_calib.calibrate.detect_views import Size, detect_views
-from camera_calib.calibrate.files import finish, tell
+from camera_calib.calibrate.files import finish, warn_of_unseen
 from camera_calib.calibrate.picture_sets import PictureSet
 from camera_calib.calibrate.solve import calibrate_through_ports
 from camera_calib.rig import design_rig
@@ -49,7 +49,7 @@ def run_calibrate(workspace: Path, config: SurveyConfig, executor: Executor) -> 
                 size_m=float(board["square_m"]),
             )
         found = detect_views(_pool_pictures(pool), target, executor)
-        tell(found)
+        warn_of_unseen(found)
         start = design_rig(config.camera, config.water, _scale(found.sizes["left"], config.camera))
         calibration = calibrate_through_ports(found.views, target.points, start, "free")
         finish(folder, calibration, found)
@@ -70,7 +70,7 @@ def _scale(size: Size, camera: CameraConfig) -> int:
     scale = max(round(camera.width_px / width), 1)
     if (camera.width_px // scale, camera.height_px // scale) != (width, height):
         raise CalibrationError(
-            f"the pool's pictures have {width} x {height} px, which is no whole fraction of the "
+            f"the pool's pictures have {width} x {height} px, which is not a whole fraction of the "
             f"camera's {camera.width_px} x {camera.height_px}: set [camera] width_px and height_px"
         )
     return scale

@@ -80,7 +80,7 @@ class Certificate:
 
     @property
     def at_overlap(self) -> NDArray[np.bool_]:
-        """Where, (rows, columns), the area is covered at the overlap asked for.
+        """Where, (rows, columns), the area is covered at the overlap requested.
 
         Every camera sees such a place on as many lines, and in as many pictures, as it does
         everywhere in an endless pattern.
@@ -106,7 +106,7 @@ class Certificate:
 
     @property
     def share_at_overlap(self) -> float:
-        """Share of the area that is covered at the overlap asked for."""
+        """Share of the area that is covered at the overlap requested."""
         return self._share(self.at_overlap)
 
     @property
@@ -188,7 +188,7 @@ def certificate(
         area: what must be seen.
         rig: its cameras, in water.
         stations: where pictures are taken.
-        pattern: the overlap asked for.
+        pattern: the overlap requested.
         cell_m: of the grid; left out, a twentieth of a footprint, less for a small area, and more
             where that would be over 16 million cells.
         executor: where the parts of a large area are worked on.
@@ -247,7 +247,7 @@ def _cell_m(area: Area, rig: Rig, stations: Stations, asked_m: float | None) -> 
     """The side of a cell.
 
     Raises:
-        PlanError: the one asked for is not positive or too small.
+        PlanError: the one requested is not positive or too small.
     """
     boxed_m2 = float(area.survey.oriented_envelope.area)
     least_m = math.sqrt(boxed_m2 / _MOST_CELLS)

@@ -16,10 +16,9 @@ import numpy as np
 from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
-from missions.route.cost import leg_costs
 from missions.route.turns import Turns, route_through
 from missions.route.ways import Ways
-from missions.values.costs import Costs
+from missions.values.costs import Costs, leg_costs
 from missions.values.legs import Route
 from missions.values.line import Line
 from missions.values.plan_file import Dive

@@ -98,7 +98,12 @@ def run_evaluate(workspace: Path, config: SurveyConfig, executor: Executor) -> b
             dense / "dem.tif", area, terrain, moved, sigma=dense / "sigma.tif", stations=counter
         )
         painted = score_mosaic(
-            mosaic / "mosaic.tif", dense / "dem.tif", area, terrain, survey_texture(config), moved
+            mosaic / "mosaic.tif",
+            dense / "dem.tif",
+            area,
+            terrain,
+            survey_texture(config.seed),
+            moved,
         )
         rng = np.random.default_rng([config.seed, _SEED_STREAM])
         score: dict[str, Any] = {

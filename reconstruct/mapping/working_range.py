@@ -64,8 +64,10 @@ def find_distances(
         executor: where tasks run.
 
     Raises:
-        ReconstructionError: none of the three is there.
+        ReconstructionError: none of the three is there, and a camera refracts.
     """
+    if not any(camera.refracts for camera in rig.cameras.values()):
+        return WorkingDistances(near_m=_NEAR, far_m=_FAR, source="no refraction")  # any would do
     if given_m is not None:
         return WorkingDistances(
             near_m=_NEAR * given_m, far_m=_FAR * given_m, source="working_range_m"

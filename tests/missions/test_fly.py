@@ -11,12 +11,11 @@ from alice_survey.base.errors import VehicleError, WorkspaceError
 from alice_survey.base.executor import SERIAL
 from alice_survey.base.frames import interpolate_poses
 from alice_survey.base.trajectory import read_columns, read_track
-from alice_survey.seafloor.terrain import survey_terrain
 from alice_survey.survey import FlightChanges, run
 from alice_survey.vehicle.log import read_vehicle_log
 from missions.fly.run import run_fly
-from missions.plan.run import run_plan
-from missions.values.plan_file import read_plan
+from missions.plan.run import read_plan, run_plan
+from tests.missions.flown_plans import terrain_of
 
 FILES = (
     "triggers.csv", "navigation.csv", "vehicle.csv", "flight.json", "truth/track.csv",
@@ -84,7 +83,7 @@ def test_each_station_is_within_the_log_and_near_its_plan(workspace: Path) -> No
     glass = poses.apply(np.array(config.camera.position_body_m))
     off = glass[:, :2] - np.vstack([line.stations_ne for line in plan.lines])
     assert 0.005 < np.sqrt((off**2).sum(axis=1).mean()) < 0.2
-    floor = survey_terrain(config, plan.area.allowed_corners_ne)
+    floor = terrain_of(config, plan)
     altitude = floor.depth_at(glass[:, :2]) - glass[:, 2]
     assert 1.6 < altitude.min() < altitude.max() < 2.4
     assert abs(altitude.mean() - 2.0) < 0.1

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from alice_survey.base.frames import Array
 from alice_survey.kit.figure import Axes, figure_style, new_figure, save_figure
-from alice_survey.vehicle.identification.validation import Validation
+from alice_survey.vehicle.identification.validation import MotionValidation
 
 Places = NDArray[np.intp]
 _MEASURED, _MODEL, _CONSTANT = "#95a5a6", "#1b4f72", "#ca6f1e"
@@ -19,7 +19,7 @@ _LEAST = 0.02
 
 
 @figure_style()
-def draw_motion(path: Path, title: str, found: Validation) -> None:
+def draw_motion(path: Path, title: str, found: MotionValidation) -> None:
     """Draw measured and simulated velocities and rates over time, with the fit of each.
 
     Args:

@@ -27,7 +27,7 @@ from alice_survey.vehicle.pilot.gains import (
     lateral_pair,
 )
 from alice_survey.vehicle.pilot.path import Path
-from alice_survey.vehicle.pilot.safety import Limits
+from alice_survey.vehicle.pilot.safety import SafetyLimits
 
 LEFT_PORT_BODY_M = (0.55, -0.05, 0.08)
 """The left port's outer glass, as the default rig has it."""
@@ -83,7 +83,7 @@ class Guidance(NamedTuple):
     """Speed of a sway step."""
     step_mps2: float
     """How fast that speed is gained and lost."""
-    limits: Limits
+    limits: SafetyLimits
 
 
 def pilot_guidance(
@@ -97,7 +97,7 @@ def pilot_guidance(
     terrain_smoothing_m: float = 1.5,
     spot_rad_s: float = SPOT_RAD_S,
     step_mps: float = STEP_MPS,
-    limits: Limits | None = None,
+    limits: SafetyLimits | None = None,
 ) -> Guidance:
     """Settings for a vehicle and a path.
 
@@ -168,7 +168,7 @@ def pilot_guidance(
         spot_rad_s2=spot_rad_s * float(axes[YAW, BANDWIDTH]) / _RAMP_PERIODS,
         step_mps=step_mps,
         step_mps2=step_mps * float(axes[SWAY, BANDWIDTH]) / _RAMP_PERIODS,
-        limits=limits or Limits(0.5 * path.altitude_m, most_depth_m),
+        limits=limits or SafetyLimits(0.5 * path.altitude_m, most_depth_m),
     )
 
 
@@ -301,51 +301,3 @@ def shortest_look_ahead_m(gains: Gains, speed_mps: float, lever_m: float) -> flo
             f"weaving at {speed_mps:g} m/s: lower the speed, or check the vehicle's coefficients"
         )
     return found
-
-
-def los_offset_m(
-    look_ahead_m: float,
-    speed_mps: float,
-    across_mps: float,
-    along_mps: float = 0.0,
-    *,
-    over_ground: bool = True,
-) -> float:
-    """Where `los` settles beside a straight path in a steady current, metres to starboard.
-
-    Steady means no turning and no drag across the hull, since nothing would balance it: the sway
-    relative to the water is zero. With t the tangent of the angle from path to heading, the offset
-    is -look_ahead t. The current's part across the hull must be the sway over ground. If surge
-    relative to the water is kept at U, U sin = -across, so that the offset is
-    look_ahead across / sqrt(U^2 - across^2). If surge over ground is kept at U, the speed along the
-    path is U / cos and the sway over ground -U t, whence U t sqrt(1 + t^2) = along t - across;
-    without a current along the path t^2 = (sqrt(1 + 4 (across / U)^2) - 1) / 2.
-
-    Args:
-        look_ahead_m: of the guidance.
-        speed_mps: U, the surge that is kept.
-        across_mps: current to starboard of the path.
-        along_mps: current along the path.
-        over_ground: what U is relative to.
-
-    Returns:
-        NaN where there is no such state, or more than one: the current across is too strong for a
-        speed relative to the water, or the current along is not below U.
-    """
-    if not over_ground:
-        if abs(across_mps) >= speed_mps:
-            return math.nan
-        return look_ahead_m * across_mps / math.sqrt(speed_mps**2 - across_mps**2)
-    if along_mps >= speed_mps:
-        return math.nan
-    if along_mps == 0.0:
-        ratio = across_mps / speed_mps
-        size = math.sqrt(0.5 * (math.sqrt(1.0 + 4.0 * ratio**2) - 1.0))
-        return look_ahead_m * math.copysign(size, across_mps)
-    from scipy.optimize import brentq
-
-    def surplus(t: float) -> float:
-        return speed_mps * t * math.sqrt(1.0 + t * t) - along_mps * t + across_mps
-
-    reach = 1.0 + abs(across_mps) / (speed_mps - max(along_mps, 0.0))
-    return -look_ahead_m * float(brentq(surplus, -reach, reach, xtol=1e-14))

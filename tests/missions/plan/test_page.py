@@ -19,7 +19,7 @@ from alice_survey.kit.document import Link, PictureLayer, ShapeLayer
 from missions.areas.bathymetry import Bathymetry
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.stations import plan_pattern, stations_of_plan
-from missions.exposure.table import Setting
+from missions.exposure.settings_table import Setting
 from missions.plan import page as page_module
 from missions.plan.page import write_page
 from missions.plan.page_map import counts_picture, geodetic_fit, plan_map

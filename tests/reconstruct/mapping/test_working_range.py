@@ -12,7 +12,7 @@ from tests.reconstruct.scenes import ALTITUDE_M, Scene, make_scene
 
 
 def features_of(scene: Scene, folder: Path) -> list[Path]:
-    """Features whose descriptors tell which point they show."""
+    """Features whose descriptors determine which point they show."""
     codes = np.random.default_rng(0).integers(0, 90, (len(scene.points_ned), 128))
     paths = []
     for i, (pixels, ids) in enumerate(zip(scene.pixels, scene.ids, strict=True)):
@@ -56,6 +56,17 @@ def test_a_given_range_and_the_altitude_stand_in(tmp_path: Path) -> None:
     blind = [replace(r, altitude_m=np.nan) for r in scene.records]
     with pytest.raises(ReconstructionError, match="set working_range_m"):
         find_distances(blind, paths, scene.rig, given_m=None, ratio=0.8, executor=SERIAL)
+
+
+def test_cameras_without_refraction_need_no_distance(tmp_path: Path) -> None:
+    scene = make_scene(lines=1, stations=2, points=10)
+    paths = features_of(scene, tmp_path)
+    blind = [replace(r, altitude_m=np.nan) for r in scene.records]
+    bare = {"port_distance_m": 0.0, "glass_thickness_m": 0.0, "n_water": 1.0}
+    cameras = {name: replace(camera, **bare) for name, camera in scene.rig.cameras.items()}
+    rig = replace(scene.rig, cameras=cameras)
+    found = find_distances(blind, paths, rig, given_m=None, ratio=0.8, threads=1)
+    assert 0 < found.near_m < found.far_m and found.source == "no refraction"
 
 
 def test_rays_pass_where_they_were_built_to() -> None:

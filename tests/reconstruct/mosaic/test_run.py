@@ -7,13 +7,16 @@ import pytest
 import rasterio
 
 from alice_survey.base.artefacts import read_json, write_csv, write_json
-from alice_survey.base.config import ReconstructConfig, SurveyConfig
+from alice_survey.base.config import CameraConfig, ReconstructConfig, SurveyConfig, WaterConfig
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.executor import SERIAL
+from camera_calib.rig import design_rig
 from reconstruct.mosaic import run
-from reconstruct.mosaic.run import run_mosaic
+from reconstruct.mosaic.run import _dispersion, run_mosaic
 from reconstruct.raster import DemGrid, tiled_raster
+from reconstruct.views.lens import flat_port_lens
 from reconstruct.views.model import View
+from tests.engines import PicklingThreads
 from tests.oracles_dense import (
     DEPTH_M,
     FRAME,
@@ -148,10 +151,12 @@ def test_source_names_the_picture_nearest_to_straight_above(workspace: Path):
     assert len(np.unique(source[source > 0])) >= 4
 
 
-def test_bytes_do_not_change(workspace: Path, tmp_path: Path):
+def test_bytes_do_not_change_on_another_engine(workspace: Path, tmp_path: Path):
     for name in ("images", "sparse", "dense"):
         (tmp_path / name).symlink_to(workspace / name)
-    assert run_mosaic(tmp_path, CONFIG, SERIAL)
+    with PicklingThreads(1) as engine:
+        assert run_mosaic(tmp_path, CONFIG, engine.executor)
+        assert engine.tasks > len(list((tmp_path / "images").rglob("*.png")))
     names = ("mosaic.tif", "mosaic_source.tif", "coverage.tif", "mosaic.png", "mosaic.json")
     for name in (*names, "footprints.csv", "footprints.geojson"):
         same = (tmp_path / "mosaic" / name).read_bytes()
@@ -198,6 +203,19 @@ def test_a_single_grey_station_gives_a_grey_mosaic(tmp_path: Path):
     assert painted.shape[1] > 20_000
     assert np.ptp(painted, axis=0).max() <= 1
     assert 60 < np.median(painted) < 200
+
+
+@pytest.mark.parametrize(("n_water", "corrected"), [(1.0, False), (1.34, True)])
+def test_only_refraction_parts_the_colours(tmp_path: Path, n_water: float, corrected: bool):
+    """A camera calibrated in water as a plain pinhole has no dispersion to correct."""
+    camera = design_rig(CameraConfig(), WaterConfig()).cameras["left"]
+    bare = {"port_distance_m": 0.0, "glass_thickness_m": 0.0, "n_water": n_water}
+    lens = flat_port_lens(replace(camera, **bare), 1.5, 2.5)
+    write_json(tmp_path / "sparse" / "cameras.json", {"cameras": {"left": lens.to_json()}})
+    write_json(tmp_path / "images" / "survey.json", {"source": "imported"})
+    model = sparse_model(stereo_views(np.array([0.2]), np.array([0.0]), heading_deg=0.0), SCENE)
+    water, stated = _dispersion(tmp_path, model, CONFIG, grey=False)
+    assert stated["corrected"] is corrected and (water is not None) is corrected
 
 
 def test_what_a_mask_hides_is_not_painted_and_others_fill_it(tmp_path: Path):

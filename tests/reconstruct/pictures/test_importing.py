@@ -1,6 +1,7 @@
 import csv
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -9,12 +10,14 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from typer.testing import CliRunner
 
 from alice_survey.base.artefacts import read_json
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.errors import AliceError, ImageError, WorkspaceError
 from alice_survey.base.executor import local_executor
 from alice_survey.base.manifest import read_manifest
+from alice_survey.cli.main import app
 from camera_calib.rig import design_rig, read_rig, write_rig
 from reconstruct.pictures.files import inspect
 from reconstruct.pictures.importing import import_images
@@ -68,7 +71,7 @@ def test_pictures_of_one_camera_keep_their_bytes_and_order(tmp_path: Path, draw:
         draw(source / name, number)
     (source / "notes.txt").write_text("no picture")
     (source / ".hidden.jpg").write_bytes(b"x")
-    assert import_images(tmp_path / "w", [source])
+    assert import_images(tmp_path / "w", [source]).changed
     images = tmp_path / "w" / "images"
     records = read_manifest(images / "manifest.csv")
     assert [r.image for r in records] == ["camera/a.png", "camera/b9.jpg", "camera/b10.jpg"]
@@ -79,9 +82,87 @@ def test_pictures_of_one_camera_keep_their_bytes_and_order(tmp_path: Path, draw:
     assert survey["source"] == "imported"
     assert survey["datum"] is None
     assert any("unscaled" in note for note in survey["notes"])
-    assert not import_images(tmp_path / "w", [source])
+    assert not import_images(tmp_path / "w", [source]).changed
     draw(source / "c.jpg", 9)
-    assert import_images(tmp_path / "w", [source])
+    assert import_images(tmp_path / "w", [source]).changed
+
+
+def test_a_divers_folder_is_counted_by_kind_and_reason(
+    tmp_path: Path, draw: Draw, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = tmp_path / "in"
+    for number in range(4):
+        time = f"2024:07:01 12:00:0{number}"
+        draw(source / f"IMG_{number}.JPG", number, time=time, gps=(60.0 + number * 1e-5, 5.0, 0.0))
+    draw(source / "scan.png", 9)
+    (source / "IMG_7.jpg").write_bytes(b"cut")
+    for name in ("IMG_5.HEIC", "IMG_6.heic", "GX010001.MOV", "notes.txt", ".DS_Store"):
+        (source / name).write_bytes(b"x")
+    draw(source / "second" / "IMG_8.jpg", 8)
+    (source / "empty").mkdir()
+
+    found = import_images(tmp_path / "w", [source])
+
+    assert found.changed and found.cameras == {"camera": 5} and found.positions == 4
+    assert found.kinds == {"JPEG": 4, "PNG": 1}
+    assert found.left_out == {
+        "cannot be decoded": 1, "HEIC": 2, "video": 1, "in folders inside": 1, "other files": 1,
+    }  # fmt: skip
+    warnings = [line for line in capsys.readouterr().err.splitlines() if "left out" in line]
+    assert len(warnings) == 5
+    for name in ("IMG_7.jpg", "IMG_5.HEIC", "GX010001.MOV", "second", "notes.txt"):
+        assert sum(name in line for line in warnings) == 1
+    again = import_images(tmp_path / "w", [source])
+    assert not again.changed and replace(again, changed=True) == found
+
+
+def test_the_command_says_what_came_in(tmp_path: Path, draw: Draw) -> None:
+    for number in range(3):
+        draw(tmp_path / "in" / f"{number}.jpg", number)
+    (tmp_path / "in" / "dive.mp4").write_bytes(b"x")
+
+    done = CliRunner().invoke(
+        app, ["import-images", str(tmp_path / "in"), "-w", str(tmp_path / "w")]
+    )
+
+    assert done.exit_code == 0
+    assert "3 pictures (3 JPEG), 0 with a position" in done.stdout
+    assert "left out: 1 video" in done.stdout
+
+
+def test_a_folder_without_pictures_names_what_it_holds(tmp_path: Path, draw: Draw) -> None:
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "a.HEIC").write_bytes(b"x")
+    draw(tmp_path / "in" / "dive1" / "b.jpg")
+    with pytest.raises(ImageError) as caught:
+        import_images(tmp_path / "w", [tmp_path / "in"])
+    assert "1 HEIC" in str(caught.value) and "dive1" in str(caught.value)
+
+
+def test_one_folder_does_not_serve_twice(tmp_path: Path, draw: Draw) -> None:
+    for number in range(3):
+        draw(tmp_path / "in" / f"{number}.jpg", number)
+    (tmp_path / "link").symlink_to(tmp_path / "in")
+    pair = {"left": tmp_path / "in", "right": tmp_path / "link"}
+    with pytest.raises(ImageError, match="--right"):
+        import_images(tmp_path / "w", [], **pair)
+    with pytest.raises(ImageError, match="twice"):
+        import_images(tmp_path / "w", [tmp_path / "in", tmp_path / "in"])
+
+
+def test_masks_and_workspace_in_the_folder_are_not_left_out(
+    tmp_path: Path, draw: Draw, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = tmp_path / "in"
+    for number in range(3):
+        draw(source / f"{number}.png", number)
+    mask = np.full((48, 64), 255, np.uint8)
+    cv2.imwrite(str(source / "1_mask.png"), mask)
+    (source / "masks").mkdir()
+    cv2.imwrite(str(source / "masks" / "2.png"), mask)
+    found = import_images(source / "work", [source], masks=source / "masks")
+    assert found.left_out == {} and "left out" not in capsys.readouterr().err
+    assert not import_images(source / "work", [source], masks=source / "masks").changed
 
 
 def test_stereo_pictures_pair_in_order(tmp_path: Path, draw: Draw) -> None:
@@ -108,9 +189,9 @@ def test_a_corrupt_picture_is_left_out_and_its_partner_stays(
     (tmp_path / "right" / "2.jpg").write_bytes(b"no picture at all")
     (tmp_path / "right" / "3.jpg").write_bytes(b"")
     import_images(tmp_path / "w", [], left=tmp_path / "left", right=tmp_path / "right")
-    told = capsys.readouterr().err
+    shown = capsys.readouterr().err
     for name in ("left/1.jpg", "right/2.jpg", "right/3.jpg"):
-        assert any(name in line and "left out" in line for line in told.splitlines())
+        assert any(name in line and "left out" in line for line in shown.splitlines())
     records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
     kept = [(r.camera, r.station) for r in records]
     assert kept == [("left", 0), ("right", 0), ("right", 1), ("left", 2), ("left", 3)]
@@ -188,9 +269,9 @@ def test_navigation_is_tied_by_time_zone_and_clock_offset(
     assert [r.depth_m for r in records[:3]] == pytest.approx([12.5, 16.5, 20.5])
     assert records[1].heading_deg == pytest.approx(90)
     assert not records[3].has_position
-    told = capsys.readouterr().err
-    assert "1 pictures get no navigation" in told
-    assert "camera/3.jpg" in told
+    shown = capsys.readouterr().err
+    assert "1 pictures get no navigation" in shown
+    assert "camera/3.jpg" in shown
 
 
 @pytest.mark.parametrize(
@@ -307,8 +388,8 @@ def test_every_fault_gives_one_line(tmp_path: Path, draw: Draw) -> None:
         ([three], {"time_zone": "Nowhere"}, "time-zone 'Nowhere'"),
         ([three], {"clock_offset_s": float("nan")}, "clock-offset nan"),
         ([three], {"vertical_datum": "LAT"}, "'LAT' names the level .* give --navigation too"),
-        ([three], {"navigation": nav, "vertical_datum": " "}, "no name of one line"),
-        ([three], {"navigation": nav, "vertical_datum": "a\nb"}, "no name of one line"),
+        ([three], {"navigation": nav, "vertical_datum": " "}, "not a name of one line"),
+        ([three], {"navigation": nav, "vertical_datum": "a\nb"}, "not a name of one line"),
     ]
     for folders, given, message in faults:
         with pytest.raises(AliceError, match=message) as caught:

@@ -8,7 +8,11 @@ import pytest
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.fleet import vehicle
-from alice_survey.vehicle.identification.output_error import Fit, Simulation, fit_output_error
+from alice_survey.vehicle.identification.output_error import (
+    OutputErrorFit,
+    Simulation,
+    fit_output_error,
+)
 from alice_survey.vehicle.identification.parameters import free_parameters, unit_of
 from alice_survey.vehicle.identification.windows import make_windows
 from alice_survey.vehicle.log import VehicleLog, vehicle_log
@@ -20,7 +24,7 @@ DAMPING = ("X_uu", "Y_vv", "Z_ww", "N_rr")
 QUICK = Simulation(longest_step_s=0.05)
 
 
-def fitted(log: VehicleLog, free: tuple[str, ...], window_s: float | None = None) -> Fit:
+def fitted(log: VehicleLog, free: tuple[str, ...], window_s: float | None = None) -> OutputErrorFit:
     windows = make_windows(log, KNOWN, window_s=window_s)
     return fit_output_error(windows, free_parameters(KNOWN, free), simulation=QUICK)
 
@@ -146,12 +150,12 @@ def test_a_coefficient_without_effect_stops_at_its_bound() -> None:
 
 def test_what_a_log_does_not_tell_is_named() -> None:
     rest = fly(hidden({}), duration_s=5.0, asked=lambda time_s: np.zeros(5))
-    with pytest.raises(VehicleError, match="tell nothing of X_uu, gain_X: do not free them"):
+    with pytest.raises(VehicleError, match="do not determine X_uu, gain_X: do not free them"):
         fitted(measured(rest, np.random.default_rng(0)), ("X_uu", "gain_X"))
     straight = fly(
         hidden({}), duration_s=10.0, asked=lambda time_s: np.array([20.0, 20.0, 0, 0, 0])
     )
-    with pytest.raises(VehicleError, match=r"cannot tell .*current_.*bias_.* apart"):
+    with pytest.raises(VehicleError, match=r"cannot separate .*current_.*bias_"):
         fitted(straight, ("current", "bias_u_mps", "bias_v_mps", "bias_w_mps"))
 
 

@@ -1,18 +1,23 @@
 """Calibrate from pictures of a target: `alice-survey calibrate --left ... --right ...`."""
 
 import contextlib
+import math
 import shlex
 import shutil
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from alice_survey.base.artefacts import read_json
 from alice_survey.base.errors import CalibrationError, WorkspaceError, warn
 from alice_survey.base.executor import Executor, local_executor
+from alice_survey.kit.words import with_sigma
 from camera_calib.calibrate.detect_views import Detections, Size, detect_views
-from camera_calib.calibrate.files import finish, summary, tell
+from camera_calib.calibrate.files import finish, summary, warn_of_unseen
 from camera_calib.calibrate.numbering import same_numbering
 from camera_calib.calibrate.picture_sets import find_pictures, pair_pictures
 from camera_calib.calibrate.solve import (
@@ -23,10 +28,10 @@ from camera_calib.calibrate.solve import (
     calibrate_through_ports,
     first_cameras,
 )
-from camera_calib.calibrate.told import calibration_text
 from camera_calib.calibration import Calibration
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.freedom import intrinsics
+from camera_calib.judge.uncertainty import baseline_sigma_m
 from camera_calib.rig import Rig, read_rig, write_rig
 from camera_calib.targets.target import Target, parse_target
 
@@ -38,16 +43,22 @@ _WRITTEN = (
 """By this command; a folder with other files is not replaced."""
 _GUESSED_PORT_M = 0.02
 _FRESH_WATER, _GLASS = 1.34, 1.52
+_LEVELS = ("bad", "look", "good")
 
 
 @dataclass(frozen=True, kw_only=True)
-class PictureCalibration:
-    """What the user says of pictures to calibrate from."""
+class CalibrateOptions:
+    """Pictures to calibrate from, and what is known before."""
 
-    pictures: Mapping[str, str]
-    """Folder or pattern by camera; the first is the reference."""
-    target: str
+    left: str | None = None
+    """Folder or pattern; the left camera is the reference."""
+    right: str | None = None
+    pictures: str | None = None
+    """Those of a single camera, instead."""
+    target: str | None = None
     """As `parse_target` reads it."""
+    output: Path | None = None
+    """Folder to write."""
     lens: str = "opencv5"
     water: bool = False
     """The pictures were taken under water, through the ports."""
@@ -60,7 +71,7 @@ class PictureCalibration:
     glass_mm: float | None = None
     """Thickness."""
     glass_sigma_mm: float | None = None
-    """The thickness is found too, known this well; likewise the indices."""
+    """The thickness is found too, known this well; the indices below in the same way."""
     n_glass: float | None = None
     n_glass_sigma: float | None = None
     n_water: float | None = None
@@ -68,51 +79,32 @@ class PictureCalibration:
     carry_to_n: float | None = None
     """Also write the rig in water of this index."""
 
+    def places(self) -> dict[str, str]:
+        """Folder or pattern by camera; the first is the reference.
 
-def calibrate_command(
-    left: str | None,
-    right: str | None,
-    pictures: str | None,
-    target: str | None,
-    output: Path | None,
-    executor: Executor | None,
-    **others: Any,
-) -> tuple[str, dict[str, Any]]:
-    """`calibrate_pictures` from the options of the command line.
-
-    Args:
-        left: folder or pattern of the left camera's pictures.
-        right: the right camera's.
-        pictures: of one camera, instead.
-        target: in words, or the path of its file.
-        output: folder to write.
-        executor: where tasks run; None for all cores of this machine.
-        others: further fields of `PictureCalibration`.
-
-    Raises:
-        CalibrationError: options are missing or do not go together, or as of `calibrate_pictures`.
-    """
-    places = {"left": left, "right": right, ONE_CAMERA: pictures}
-    given = {camera: place for camera, place in places.items() if place is not None}
-    if not given:
-        raise CalibrationError(
-            "these options are for pictures: give --left and --right, or --pictures; the pool of a "
-            "survey takes none of them"
-        )
-    if pictures is not None and len(given) > 1:
-        raise CalibrationError("give --left and --right, or --pictures, not both")
-    if pictures is None and len(given) == 1:
-        raise CalibrationError("give both --left and --right, or --pictures for a single camera")
-    if target is None:
-        raise CalibrationError("--target is missing: what is seen, such as 'chessboard 9x6 25mm'")
-    if output is None:
-        raise CalibrationError("-o is missing: the folder to write the calibration into")
-    settings = PictureCalibration(pictures=given, target=target, **others)
-    return calibrate_pictures(settings, output, executor or local_executor())
+        Raises:
+            CalibrationError: they are missing or do not go together.
+        """
+        stereo = {"left": self.left, "right": self.right}
+        given = {camera: place for camera, place in stereo.items() if place is not None}
+        if self.pictures is not None:
+            if given:
+                raise CalibrationError("give --left and --right, or --pictures, not both")
+            return {ONE_CAMERA: self.pictures}
+        if len(given) == 1:
+            raise CalibrationError(
+                "give both --left and --right, or --pictures for a single camera"
+            )
+        if not given:
+            raise CalibrationError(
+                "these options are for pictures: give --left and --right, or --pictures; the pool "
+                "of a survey takes none of them"
+            )
+        return given
 
 
 def calibrate_pictures(
-    settings: PictureCalibration, output: Path, executor: Executor
+    settings: CalibrateOptions, executor: Executor | None = None
 ) -> tuple[str, dict[str, Any]]:
     """Calibrate from pictures and write a folder of results.
 
@@ -122,15 +114,20 @@ def calibrate_pictures(
     Raises:
         CalibrationError: the pictures, the target or the settings do not give a calibration.
     """
+    places, output = settings.places(), settings.output
+    if settings.target is None:
+        raise CalibrationError("--target is missing: what is seen, such as 'chessboard 9x6 25mm'")
+    if output is None:
+        raise CalibrationError("-o is missing: the folder to write the calibration into")
     _check_output(output, settings.start)
     target = parse_target(settings.target)
     intrinsics(settings.lens)
     start = None if settings.start is None else read_rig(settings.start)
     _check_settings(settings, start)
-    lists = {camera: find_pictures(place) for camera, place in settings.pictures.items()}
+    lists = {camera: find_pictures(place) for camera, place in places.items()}
     with _replacing(output) as partial:
-        found = detect_views(pair_pictures(lists), target, executor)
-        tell(found)
+        found = detect_views(pair_pictures(lists), target, executor or local_executor())
+        warn_of_unseen(found)
         calibration = finish(partial, _calibrated(settings, found, target, start), found)
         _check_sides(calibration.rig)
         if settings.carry_to_n is not None:
@@ -149,7 +146,7 @@ def carried(rig: Rig, n_water: float) -> Rig:
     )
 
 
-def _check_settings(settings: PictureCalibration, start: Rig | None) -> None:
+def _check_settings(settings: CalibrateOptions, start: Rig | None) -> None:
     ports = {
         "--port-distance": settings.port_distance_mm,
         "--glass": settings.glass_mm,
@@ -179,7 +176,7 @@ def _check_settings(settings: PictureCalibration, start: Rig | None) -> None:
 
 
 def _calibrated(
-    settings: PictureCalibration, found: Detections, target: Target, start: Rig | None
+    settings: CalibrateOptions, found: Detections, target: Target, start: Rig | None
 ) -> Calibration:
     points, lens = target.points, settings.lens
     cameras = _first(settings, found.sizes, start)
@@ -210,7 +207,7 @@ def _calibrated(
 
 
 def _first(
-    settings: PictureCalibration, sizes: Mapping[str, Size], start: Rig | None
+    settings: CalibrateOptions, sizes: Mapping[str, Size], start: Rig | None
 ) -> dict[str, FlatPortCamera]:
     """Cameras of the start, or blank ones, in air or behind the port that the user names."""
     if start is not None:
@@ -237,14 +234,14 @@ def _metres(length_mm: float | None) -> float | None:
     return None if length_mm is None else length_mm / 1e3
 
 
-def _bare(camera: FlatPortCamera, _: PictureCalibration) -> FlatPortCamera:
+def _bare(camera: FlatPortCamera, _: CalibrateOptions) -> FlatPortCamera:
     """A camera out of its housing."""
     return replace(
         camera, n_water=1.0, port_distance_m=0.0, glass_thickness_m=0.0, normal=(0.0, 0.0, 1.0)
     )
 
 
-def _behind_port(camera: FlatPortCamera, settings: PictureCalibration) -> FlatPortCamera:
+def _behind_port(camera: FlatPortCamera, settings: CalibrateOptions) -> FlatPortCamera:
     """A camera of the start behind the port and in the water that the user names."""
     given = {
         "glass_thickness_m": _metres(settings.glass_mm),
@@ -282,7 +279,7 @@ def _matching(start: Rig, sizes: Mapping[str, Size]) -> Rig:
     )
 
 
-def _next(calibration: Calibration, output: Path, settings: PictureCalibration) -> list[str]:
+def _next(calibration: Calibration, output: Path, settings: CalibrateOptions) -> list[str]:
     """Where the results are, and what to do with them."""
     rig = shlex.quote(str(output / "rig.json"))
     lines = [f"rig in {output / 'rig.json'}; read {output / 'report.html'}"]
@@ -300,7 +297,7 @@ def _next(calibration: Calibration, output: Path, settings: PictureCalibration) 
 
 
 def _check_sides(rig: Rig) -> None:
-    """Tell when the pictures of the two cameras seem to be swapped."""
+    """Warn when the pictures of the two cameras seem to be swapped."""
     if set(rig.cameras) != {"left", "right"}:
         return
     x, y, z = (1e3 * rig.cam_from_rig["right"].inv().translation).tolist()
@@ -312,7 +309,7 @@ def _check_sides(rig: Rig) -> None:
 
 
 def _check_output(output: Path, start: Path | None) -> None:
-    """Refuse what is no folder of this command, before hours of work and not after.
+    """Refuse what is not a folder of this command before the work starts.
 
     Raises:
         WorkspaceError: it cannot be written or would take something with it.
@@ -350,3 +347,89 @@ def _replacing(output: Path) -> Iterator[Path]:
     finally:
         if partial.exists():
             shutil.rmtree(partial)
+
+
+def calibration_text(
+    calibration: Calibration, target: Target, verdicts: Sequence[Mapping[str, str]]
+) -> str:
+    """Fit, baseline, lenses, ports and verdicts of a calibration; lengths in millimetres.
+
+    Args:
+        calibration: with its rig's covariance.
+        target: whose squares or tags are a measure for the baseline.
+        verdicts: `level` and `text` of each, the worst first, as in `report.json`.
+    """
+    rig, square = calibration.rig, (calibration.residuals_px**2).sum(axis=-1)
+    lines = [
+        f"{len(calibration.views)} views, {int(np.isfinite(square).sum())} points, "
+        f"{calibration.rms_px:.3f} px rms (noise {calibration.noise_px:.3f} px)",
+        *_baseline_lines(rig, target),
+    ]
+    for name in rig.cameras:
+        lines += _camera_lines(rig, name)
+    lines += _verdict_lines(verdicts, len(calibration.warnings))
+    return "\n".join(lines)
+
+
+def _baseline_lines(rig: Rig, target: Target) -> Iterator[str]:
+    for name in list(rig.cameras)[1:]:
+        length_m = float(np.linalg.norm(rig.cam_from_rig[name].translation))
+        sigma_m = baseline_sigma_m(rig, name)
+        unit = "tags" if target.kind == "apriltag" else "squares"
+        yield (
+            f"baseline {with_sigma(1e3 * length_m, 1e3 * sigma_m)} mm = "
+            f"{with_sigma(length_m / target.size_m, sigma_m / target.size_m)} {unit} of "
+            f"{1e3 * target.size_m:g} mm"
+        )
+
+
+def _camera_lines(rig: Rig, name: str) -> Iterator[str]:
+    camera, sigmas = rig.cameras[name], rig.sigmas
+
+    def stated(field: str, unit: str, scale: float = 1.0) -> str:
+        number, sigma = scale * camera.parameter(field), sigmas.get(f"{name}.{field}")
+        if sigma is None:
+            return f"{number:.6g}{unit} (held)"
+        return f"{with_sigma(number, scale * sigma)}{unit}"
+
+    yield f"{name}: focal lengths {stated('fx_px', ' px')}, {stated('fy_px', ' px')}"
+    if camera.n_water == 1.0 and camera.port_distance_m == camera.glass_thickness_m == 0.0:
+        return
+    tilt_deg, sigma_deg = port_tilt_deg(rig, name)
+    tilt = f"{tilt_deg:.3g} deg (held)" if sigma_deg is None else with_sigma(tilt_deg, sigma_deg)
+    yield (
+        f"{name} port: {stated('port_distance_m', ' mm', 1e3)} from the pupil, tilt "
+        f"{tilt}{'' if sigma_deg is None else ' deg'}, glass "
+        f"{stated('glass_thickness_m', ' mm', 1e3)}, index {stated('n_glass', '')}, water "
+        f"{stated('n_water', '')}"
+    )
+
+
+def port_tilt_deg(rig: Rig, name: str) -> tuple[float, float | None]:
+    """Angle between a port's normal and the camera's axis, and its sigma; None where held.
+
+    Of a port without tilt the direction of an error is open; its sigma is the larger of the two.
+    """
+    x, y, z = rig.cameras[name].normal
+    sine = math.hypot(x, y)
+    fields = [f"{name}.normal_x", f"{name}.normal_y"]
+    tilt_deg = math.degrees(math.atan2(sine, z))
+    if rig.covariance is None or not set(fields) <= set(rig.covariance.parameters):
+        return tilt_deg, None
+    at = [rig.covariance.parameters.index(field) for field in fields]
+    block = rig.covariance.matrix[np.ix_(at, at)]
+    if sine == 0.0:
+        variance = float(np.linalg.eigvalsh(block)[-1])
+    else:
+        along = np.array([x, y]) / sine
+        variance = float(along @ block @ along)
+    return tilt_deg, math.degrees(math.sqrt(max(variance, 0.0)) / z)
+
+
+def _verdict_lines(verdicts: Sequence[Mapping[str, str]], warnings: int) -> Iterator[str]:
+    counts = Counter(verdict["level"] for verdict in verdicts)
+    words = [f"{counts[level]} {level}" for level in _LEVELS if counts[level]]
+    yield f"verdicts: {', '.join(words)}; {warnings} warnings"
+    for verdict in verdicts:
+        if verdict["level"] != "good":
+            yield f"  {verdict['level']}: {verdict['text']}"

@@ -1,4 +1,4 @@
-"""What the controller is told: the places in the vector of the navigation's estimate."""
+"""Places in the vector of the navigation's estimate, which the pilot steers by."""
 
 NORTH, EAST, DEPTH = 0, 1, 2
 """Of the body's origin, metres in NED."""
@@ -13,9 +13,6 @@ ALTITUDE = 12
 lock."""
 CLEARANCE = 13
 """Least height, metres, of hull, port and DVL above the plane that the DVL's beams meet, and of
-the highest of those points above the lowest of the hull, less one sigma; NaN with the altitude."""
+the highest of those points above the lowest of the hull, minus one sigma; NaN with the altitude."""
 ESTIMATE = 14
 """Length of the vector."""
-
-DIVE, APPROACH, FOLLOW, ASCEND, DONE, ABORT = 0, 1, 2, 3, 4, 5
-"""What the guidance is doing."""

@@ -3,6 +3,7 @@
 import csv
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,12 @@ from alice_survey.base.errors import AliceError, CalibrationError
 from alice_survey.base.executor import SERIAL
 from alice_survey.seafloor.board import PoolBoard, board_records, pool_poses, render_board
 from camera_calib.calibrate.detect_views import detect_views
-from camera_calib.calibrate.picture_sets import find_pictures, pair_pictures
-from camera_calib.calibrate.pictures import (
-    PictureCalibration,
-    calibrate_command,
+from camera_calib.calibrate.from_pictures import (
+    CalibrateOptions,
     calibrate_pictures,
     carried,
 )
+from camera_calib.calibrate.picture_sets import find_pictures, pair_pictures
 from camera_calib.rig import Rig, read_rig, write_rig
 from camera_calib.targets.target import parse_target
 from tests.camera_calib.calibration_scenes import built_rig, in_air
@@ -82,8 +82,8 @@ def real(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[P
     """13 pairs of OpenCV's samples, calibrated: the folder, the text and the numbers."""
     folder, out = shared_data / "opencv_stereo", tmp_path_factory.mktemp("real") / "out"
     pictures = {side: str(folder / f"{side}*.jpg") for side in ("left", "right")}
-    settings = PictureCalibration(pictures=pictures, target=BOARD)
-    return out, *calibrate_pictures(settings, out, executor=SERIAL)
+    settings = CalibrateOptions(**pictures, target=BOARD)
+    return out, *calibrate_pictures(replace(settings, output=out), executor=SERIAL)
 
 
 def test_a_real_stereo_set(real: tuple[Path, str, Any]) -> None:
@@ -155,13 +155,13 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("quick")
 def test_from_dry_pictures_to_the_sea(dry: Path, wet: Path, truth: Rig, tmp_path: Path) -> None:
     """In air, then through the ports with the air's knowledge, then carried to the sea."""
-    air = PictureCalibration(pictures=both(dry), target=POOL_BOARD, lens="opencv5")
-    calibrate_pictures(air, tmp_path / "air", executor=SERIAL)
-    pool = PictureCalibration(
-        pictures=both(wet), target=POOL_BOARD, water=True, start=tmp_path / "air" / "rig.json",
+    air = CalibrateOptions(**both(dry), target=POOL_BOARD, lens="opencv5")
+    calibrate_pictures(replace(air, output=tmp_path / "air"), executor=SERIAL)
+    pool = CalibrateOptions(
+        **both(wet), target=POOL_BOARD, water=True, start=tmp_path / "air" / "rig.json",
         glass_mm=10.0, carry_to_n=1.342,
     )  # fmt: skip
-    text, found = calibrate_pictures(pool, tmp_path / "pool", executor=SERIAL)
+    text, found = calibrate_pictures(replace(pool, output=tmp_path / "pool"), executor=SERIAL)
 
     assert "left port: " in text
     assert "camera uncertainty" in text
@@ -184,10 +184,10 @@ def test_from_dry_pictures_to_the_sea(dry: Path, wet: Path, truth: Rig, tmp_path
 
 @pytest.mark.usefixtures("quick")
 def test_one_camera(dry: Path, truth: Rig, tmp_path: Path) -> None:
-    text, found = calibrate_command(
-        left=None, right=None, pictures=str(dry / "left"), target=POOL_BOARD,
-        output=tmp_path / "one", executor=SERIAL, lens="k2",
-    )  # fmt: skip
+    options = CalibrateOptions(
+        pictures=str(dry / "left"), target=POOL_BOARD, output=tmp_path / "one", lens="k2"
+    )
+    text, found = calibrate_pictures(options, executor=SERIAL)
     rig = read_rig(tmp_path / "one" / "rig.json")
     assert list(rig.cameras) == ["camera"]
     assert rig.cameras["camera"].fx_px == pytest.approx(truth.cameras["left"].fx_px, abs=0.5)
@@ -203,9 +203,9 @@ def test_corrupt_pictures_and_pictures_without_the_board_are_left_out(
     (tmp_path / "in" / "left" / "03.png").write_bytes(b"no picture")
     empty = np.full((451, 564), 128, dtype=np.uint8)
     cv2.imwrite(str(tmp_path / "in" / "right" / "05.png"), empty)
-    settings = PictureCalibration(pictures=both(tmp_path / "in"), target=POOL_BOARD)
+    settings = CalibrateOptions(**both(tmp_path / "in"), target=POOL_BOARD)
 
-    _, found = calibrate_pictures(settings, tmp_path / "out", executor=SERIAL)
+    _, found = calibrate_pictures(replace(settings, output=tmp_path / "out"), executor=SERIAL)
 
     shown = capsys.readouterr().err.splitlines()
     assert sum("03.png cannot be decoded" in line for line in shown) == 1
@@ -236,9 +236,9 @@ def test_pictures_that_are_cut_short_or_of_another_kind_are_named(
     assert "float32" in reasons["3"]
 
 
-def refuses(settings: PictureCalibration, tmp_path: Path) -> str:
+def refuses(settings: CalibrateOptions, tmp_path: Path) -> str:
     with pytest.raises(AliceError) as caught:
-        calibrate_pictures(settings, tmp_path / "out", executor=SERIAL)
+        calibrate_pictures(replace(settings, output=tmp_path / "out"), executor=SERIAL)
     assert len(str(caught.value).splitlines()) == 1
     assert not (tmp_path / "out").exists()
     assert not (tmp_path / "out.partial").exists()
@@ -254,7 +254,7 @@ def write_noise(folder: Path, names: list[str], size: tuple[int, int] = (120, 90
 
 def test_no_board_in_any_picture(tmp_path: Path) -> None:
     write_noise(tmp_path / "a", ["1.png", "2.png"])
-    settings = PictureCalibration(pictures={"camera": str(tmp_path / "a")}, target=BOARD)
+    settings = CalibrateOptions(pictures=str(tmp_path / "a"), target=BOARD)
     message = refuses(settings, tmp_path)
     assert "found in none of the 2 pictures of camera" in message
 
@@ -264,7 +264,7 @@ def test_a_board_of_another_size(wrong: str, dry: Path, tmp_path: Path) -> None:
     for view in range(3):
         (tmp_path / "few").mkdir(exist_ok=True)
         shutil.copy(dry / "left" / f"{view:02d}.png", tmp_path / "few")
-    settings = PictureCalibration(pictures={"camera": str(tmp_path / "few")}, target=wrong)
+    settings = CalibrateOptions(pictures=str(tmp_path / "few"), target=wrong)
     message = refuses(settings, tmp_path)
     assert "11x8" in message
     assert wrong.split()[1] in message
@@ -274,7 +274,7 @@ def test_mixed_sizes(dry: Path, tmp_path: Path) -> None:
     shutil.copytree(dry / "left", tmp_path / "mixed")
     odd = cv2.imread(str(tmp_path / "mixed" / "04.png"))
     cv2.imwrite(str(tmp_path / "mixed" / "04.png"), odd[:-20, :-30])
-    settings = PictureCalibration(pictures={"camera": str(tmp_path / "mixed")}, target=POOL_BOARD)
+    settings = CalibrateOptions(pictures=str(tmp_path / "mixed"), target=POOL_BOARD)
     message = refuses(settings, tmp_path)
     assert "11 of 564 x 451 px, 1 of 534 x 431 px (such as 04.png)" in message
 
@@ -282,21 +282,19 @@ def test_mixed_sizes(dry: Path, tmp_path: Path) -> None:
 def test_lists_that_do_not_pair(tmp_path: Path) -> None:
     write_noise(tmp_path / "a", ["dive_a.png", "dive_b.png"])
     write_noise(tmp_path / "b", ["x.png", "y.png", "z.png"])
-    settings = PictureCalibration(
-        pictures={"left": str(tmp_path / "a"), "right": str(tmp_path / "b")}, target=BOARD
-    )
+    settings = CalibrateOptions(left=str(tmp_path / "a"), right=str(tmp_path / "b"), target=BOARD)
     assert "2 of left (dive_a.png, dive_b.png), 3 of right" in refuses(settings, tmp_path)
 
 
 def test_a_place_without_pictures(tmp_path: Path) -> None:
-    settings = PictureCalibration(pictures={"camera": str(tmp_path / "none*.png")}, target=BOARD)
+    settings = CalibrateOptions(pictures=str(tmp_path / "none*.png"), target=BOARD)
     assert "no pictures at" in refuses(settings, tmp_path)
 
 
 def test_a_start_of_another_size(dry: Path, tmp_path: Path) -> None:
     write_rig(tmp_path / "rig.json", built_rig())
-    settings = PictureCalibration(
-        pictures=both(dry), target=POOL_BOARD, water=True, start=tmp_path / "rig.json"
+    settings = CalibrateOptions(
+        **both(dry), target=POOL_BOARD, water=True, start=tmp_path / "rig.json"
     )
     assert "564 x 451 px, the start's camera 3384 x 2710" in refuses(settings, tmp_path)
 
@@ -315,8 +313,8 @@ def test_a_start_of_another_size(dry: Path, tmp_path: Path) -> None:
 def test_options_that_do_not_go_together(
     options: dict[str, object], what: str, dry: Path, tmp_path: Path
 ) -> None:
-    fields: dict[str, object] = {"pictures": both(dry), "target": POOL_BOARD, **options}
-    assert what in refuses(PictureCalibration(**fields), tmp_path)  # type: ignore[arg-type]
+    fields: dict[str, object] = {**both(dry), "target": POOL_BOARD, **options}
+    assert what in refuses(CalibrateOptions(**fields), tmp_path)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -329,56 +327,53 @@ def test_options_that_do_not_go_together(
     ],
 )
 def test_commands_that_lack_something(given: dict[str, object], what: str) -> None:
-    options: dict[str, object] = {
-        "left": None, "right": None, "pictures": None, "target": BOARD, "output": Path("out"),
-        "executor": SERIAL, **given,
-    }  # fmt: skip
+    options: dict[str, object] = {"target": BOARD, "output": Path("out"), **given}
     with pytest.raises(CalibrationError, match=what):
-        calibrate_command(**options)  # type: ignore[arg-type]
+        calibrate_pictures(CalibrateOptions(**options))  # type: ignore[arg-type]
 
 
 def test_a_folder_with_other_files_is_not_overwritten(dry: Path, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.tex").write_text("years of work")
-    settings = PictureCalibration(pictures=both(dry), target=POOL_BOARD)
+    settings = CalibrateOptions(**both(dry), target=POOL_BOARD)
     with pytest.raises(AliceError, match="holds other files"):
-        calibrate_pictures(settings, tmp_path / "out", executor=SERIAL)
+        calibrate_pictures(replace(settings, output=tmp_path / "out"), executor=SERIAL)
     (tmp_path / "out" / "calibration.json").write_text("{}")
     with pytest.raises(AliceError, match=r"such as thesis\.tex"):
-        calibrate_pictures(settings, tmp_path / "out", executor=SERIAL)
+        calibrate_pictures(replace(settings, output=tmp_path / "out"), executor=SERIAL)
     assert (tmp_path / "out" / "thesis.tex").read_text() == "years of work"
 
 
 def test_a_place_that_cannot_be_a_folder_is_refused_at_once(tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("mine")
-    settings = PictureCalibration(pictures={"camera": str(tmp_path)}, target=BOARD)
+    settings = CalibrateOptions(pictures=str(tmp_path), target=BOARD)
     for output, said in ((tmp_path / "taken", "is a file"), (Path(), "folder of its own")):
         with pytest.raises(AliceError, match=said):
-            calibrate_pictures(settings, output, executor=SERIAL)
+            calibrate_pictures(replace(settings, output=output), executor=SERIAL)
     assert (tmp_path / "taken").read_text() == "mine"
 
 
 def test_a_start_is_not_replaced_by_what_it_gives(tmp_path: Path) -> None:
     (tmp_path / "air").mkdir()
     write_rig(tmp_path / "air" / "rig.json", built_rig())
-    settings = PictureCalibration(
-        pictures={"camera": "nowhere"}, target=BOARD, start=tmp_path / "air" / "rig.json"
+    settings = CalibrateOptions(
+        pictures="nowhere", target=BOARD, start=tmp_path / "air" / "rig.json"
     )
     with pytest.raises(AliceError, match="rig of --start"):
-        calibrate_pictures(settings, tmp_path / "air", executor=SERIAL)
+        calibrate_pictures(replace(settings, output=tmp_path / "air"), executor=SERIAL)
     assert (tmp_path / "air" / "rig.json").is_file()
 
 
 @pytest.mark.usefixtures("quick")
-def test_swapped_lists_are_told(
+def test_swapped_lists_are_reported(
     dry: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     swapped = {"left": str(dry / "right"), "right": str(dry / "left")}
-    for pictures, told in ((both(dry), 0), (swapped, 1)):
-        settings = PictureCalibration(pictures=pictures, target=POOL_BOARD, lens="k2")
-        calibrate_pictures(settings, tmp_path / "out", executor=SERIAL)
+    for pictures, warnings in ((both(dry), 0), (swapped, 1)):
+        settings = CalibrateOptions(**pictures, target=POOL_BOARD, lens="k2")
+        calibrate_pictures(replace(settings, output=tmp_path / "out"), executor=SERIAL)
         shown = capsys.readouterr().err
-        assert shown.count("the right camera stands 100 mm to the left of the left one") == told
+        assert shown.count("the right camera stands 100 mm to the left of the left one") == warnings
 
 
 def test_a_rig_carried_to_other_water_says_so() -> None:

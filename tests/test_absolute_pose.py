@@ -7,8 +7,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import CalibrationError
+from benchmarks.absolute_pose import Sighting, absolute_pose, pose_information
 from benchmarks.camera_pose import PUBLISHED, run_level, simulated
-from camera_calib.absolute_pose import Sighting, absolute_pose, pose_information
 from camera_calib.flat_port import FlatPortCamera
 
 Array = np.ndarray
