@@ -282,7 +282,7 @@ def _draw_navigation_error(strips: list[Axes], flight: Flight) -> None:
         axes.fill_between(
             t, -band, band, color=NAV, alpha=0.18, lw=0, label=f"±{_SPREAD_SIGMAS:g} logged sigmas"
         )
-        axes.plot(t, off[some, axis], color=TRUE, lw=1.0, label="believed less true")
+        axes.plot(t, off[some, axis], color=TRUE, lw=1.0, label="believed minus true")
         axes.axhline(0, color="#7f8c8d", lw=0.6)
         axes.set_ylabel(f"{name} error, m")
     _legend(strips[0], "navigation")
