@@ -10,6 +10,7 @@ from alice_survey.base.run import progress
 from alice_survey.kit.figure import (
     Axes,
     colour_bar,
+    even_limit,
     figure_style,
     map_axes,
     new_figure,
@@ -56,15 +57,16 @@ def plot_errors(path: Path, surface: "SurfaceScore", area: MultiPolygon) -> None
     """Map and histogram of height errors of the surface."""
     figures = surface.to_json()
     limit = max(5.0, 3 * figures["height_median_mm"], figures["height_95_mm"])
+    shown = even_limit(1e3 * surface.map_m)
     west, east, south, north = surface.extent_m
     figure = new_figure(_height_in(east - west, north - south), _WIDTH_IN)
     plane, bars = figure.subplots(1, 2, width_ratios=[1.3, 1])
     image = plane.imshow(
         1e3 * surface.map_m,
         extent=(west, east, south, north),
-        vmin=-limit,
-        vmax=limit,
-        cmap="RdBu_r",
+        vmin=-shown,
+        vmax=shown,
+        cmap="PuOr",
         interpolation="nearest",
     )
     _draw_area(plane, area)
@@ -109,8 +111,10 @@ def plot_sheet(
     west, east, south, north = surface.extent_m
     panels[3].set_title("Surface minus truth")
     panels[3].grid(visible=False)
+    error_mm = 1e3 * surface.map_m
+    shown = even_limit(error_mm)
     image = panels[3].imshow(
-        1e3 * surface.map_m, extent=(west, east, south, north), vmin=-10, vmax=10, cmap="RdBu_r"
+        error_mm, extent=(west, east, south, north), vmin=-shown, vmax=shown, cmap="PuOr"
     )
     colour_bar(image, panels[3], "height error (mm)")
     map_axes(panels[3])
