@@ -79,7 +79,7 @@ def plot_errors(path: Path, surface: "SurfaceScore", area: MultiPolygon) -> None
     bars.set(xlabel="height error (mm)", ylabel="cells")
     bars.set_title(
         f"rms {figures['height_rms_mm']:.2f} mm in height, {figures['distance_rms_mm']:.2f} mm "
-        f"in distance; {surface.completeness:.1%} complete",
+        f"in distance;\n{surface.completeness:.1%} complete",
         fontsize=9,
     )
     save_figure(figure, path)
