@@ -43,8 +43,8 @@ _POINTS = 20
 _MOST_MIB = 1536.0
 _RUN = (
     "import sys; from pathlib import Path; from alice_survey.base.config import ReconstructConfig, "
-    "SurveyConfig; from reconstruct.mosaic.run import run_mosaic; "
-    "run_mosaic(Path(sys.argv[1]), SurveyConfig(reconstruct=ReconstructConfig("
+    "SurveyConfig; from alice_survey.stages import spec; "
+    "spec('mosaic').make(Path(sys.argv[1]), SurveyConfig(reconstruct=ReconstructConfig("
     f"mosaic_pixel_m={PIXEL_M})), int(sys.argv[2]))"
 )
 

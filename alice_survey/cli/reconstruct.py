@@ -42,9 +42,12 @@ def reconstruct(
     Camera track, DEM, point cloud, orthomosaic and textured mesh.
     """
     if context.invoked_subcommand is None:
-        from alice_survey.survey import RECONSTRUCT, run
+        from alice_survey.stages import names
+        from alice_survey.survey import run
 
-        print_result(*run(RECONSTRUCT, workspace, survey, None, threads), as_json)
+        print_result(
+            *run(names("calibrate", "reconstruct"), workspace, survey, None, threads), as_json
+        )
 
 
 @reconstruct_app.command(
@@ -209,7 +212,7 @@ def evaluate(
     else:
         from alice_survey.survey import run
 
-        result = run(["evaluation"], workspace, survey, None, threads)
+        result = run(["evaluate"], workspace, survey, None, threads)
     print_result(*result, as_json)
 
 

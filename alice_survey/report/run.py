@@ -4,14 +4,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from alice_survey.base.artefacts import STAGE_FILE, Stage, atomic_path, run_stage, write_json
+from alice_survey.base.artefacts import STAGE_FILE, atomic_path
 from alice_survey.base.config import SurveyConfig
-from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.records import ReportRecord
 from alice_survey.base.run import progress
 from alice_survey.report import reproduce
 from alice_survey.report.document import PictureLayer, Report, ShapeLayer, SurveyMap
 from alice_survey.report.figures import Figures
-from alice_survey.report.held import LOOSE, Held
+from alice_survey.report.held import Held
 from alice_survey.report.mesh_copy import mesh_copy
 from alice_survey.report.page import render_html
 from alice_survey.report.pdf import write_pdf
@@ -21,50 +21,17 @@ from alice_survey.report.shapes import shape_layers
 from alice_survey.report.summary import facts, summary
 from alice_survey.report.verdicts import verdicts
 
-_READ = (
-    "survey.toml", "plan/plan.json", "flight/flight.json", "images/manifest.csv",
-    "calibration/report.json",
-    "mapping/mapping.json", "mapping/port.json", "sparse", "dense/dem.tif", "dense/sigma.tif",
-    "mosaic/mosaic.tif", "mesh/mesh.glb", "evaluation",
-)  # fmt: skip
-"""What a report is made of; what is made with these goes unnamed."""
 
-
-def run_report(workspace: Path, config: SurveyConfig, threads: int) -> bool:
-    """Write `report/` from what the workspace holds.
-
-    Returns:
-        True when done, False when nothing had changed.
-
-    Raises:
-        WorkspaceError: the workspace holds no finished stage.
-    """
-    held = Held.of(workspace)
-    if not held.stages:
-        raise WorkspaceError(
-            f"{workspace} holds nothing to report on: run 'alice-survey plan' or 'import-images'"
-        )
-    inputs = [held.workspace / path for path in _READ]
-    inputs += [file for name in LOOSE for file in sorted((workspace / name).rglob("*.json"))]
-    inputs += sorted((workspace / "quality").glob("*.csv"))
-    stage = Stage(
-        name="report",
-        version=1,
-        settings={},
-        inputs=[path for path in inputs if path.exists()],
-    )
-
-    def work(folder: Path) -> None:
-        report = build_report(held, folder)
-        with atomic_path(folder / "report.html") as path:
-            path.write_text(render_html(report), encoding="utf-8")
-        with atomic_path(folder / "report.pdf") as path:
-            write_pdf(report, path)
-        write_json(folder / "report.json", report.data)
-        if report.mesh is not None:
-            report.mesh.glb.unlink()
-
-    return run_stage(workspace, stage, work)
+def run_report(workspace: Path, config: SurveyConfig, threads: int, folder: Path) -> None:
+    """Write the report of what the workspace holds."""
+    report = build_report(Held.of(workspace), folder)
+    with atomic_path(folder / "report.html") as path:
+        path.write_text(render_html(report), encoding="utf-8")
+    with atomic_path(folder / "report.pdf") as path:
+        write_pdf(report, path)
+    ReportRecord.save(folder / "report.json", report.data or {})
+    if report.mesh is not None:
+        report.mesh.glb.unlink()
 
 
 def build_report(held: Held, folder: Path) -> Report:
@@ -102,20 +69,19 @@ def _subtitle(held: Held) -> str:
     kind = "simulated survey" if held.simulated else "survey"
     newest = max((held.workspace / n / STAGE_FILE).stat().st_mtime for n in held.stages)
     when = datetime.fromtimestamp(newest, UTC).strftime("%Y-%m-%d %H:%M UTC")
-    datum = held.json("sparse/frame.json").get("datum") or held.json("plan/plan.json").get("datum")
+    datum = held.frame.datum
     place = ""
-    if datum:
-        place = f"{datum['latitude_deg']:.5f}, {datum['longitude_deg']:.5f} (WGS 84); "
+    if datum is not None:
+        place = f"{datum.latitude_deg:.5f}, {datum.longitude_deg:.5f} (WGS 84); "
     return f"{kind}; {place}last worked on {when}"
 
 
 def origin_of(held: Held) -> str:
     """Where a map of it counts from, in words."""
-    datum = held.json("sparse/frame.json").get("datum") or held.json("plan/plan.json").get("datum")
-    if datum and held.json("sparse/frame.json").get("name", "ned") == "ned":
+    datum = held.frame.datum
+    if datum is not None and held.frame.name == "ned":
         return (
-            f"metres east and north of {datum['latitude_deg']:.7f}, {datum['longitude_deg']:.7f} "
-            "(WGS 84)"
+            f"metres east and north of {datum.latitude_deg:.7f}, {datum.longitude_deg:.7f} (WGS 84)"
         )
     return "the model's own axes"
 
@@ -132,7 +98,7 @@ def _data(figures: Figures, found: Any, said: Any, known: Any) -> dict[str, Any]
         "verdicts": [vars(verdict) for verdict in found],
         "surface": None if surface is None else _finite(vars(surface)),
         "stages": {
-            name: {key: stage.get(key) for key in ("version", "digest", "took_s")}
+            name: {"version": stage.version, "digest": stage.digest, "took_s": stage.took_s}
             for name, stage in figures.held.stages.items()
         },
     }

@@ -17,6 +17,11 @@ def length(metres: float | None, unit: str = "m") -> str:
     return f"{digits(metres)} m" if size < 1e4 else f"{digits(metres / 1e3)} km"
 
 
+def millimetres(value: float | None) -> str:
+    """As `length`, of millimetres."""
+    return length(None if value is None else 1e-3 * value)
+
+
 def digits(value: float, wanted: int = 3) -> str:
     """With so many digits and never an exponent."""
     if value == 0 or not math.isfinite(value):

@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.base.artefacts import Stage, need_stage, run_stage, write_csv, write_json
+from alice_survey.base.artefacts import write_csv
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import VehicleError, warn
 from alice_survey.base.executor import progress
+from alice_survey.base.records import FlightRecord
 from alice_survey.base.trajectory import write_track
 from alice_survey.seafloor.terrain import survey_terrain
 from alice_survey.vehicle.log import write_vehicle_log
@@ -25,40 +26,15 @@ _SEED_STREAM = 20
 TRIGGER_COLUMNS = ("station", "time_s", "line")
 
 
-def run_fly(workspace: Path, config: SurveyConfig, threads: int) -> bool:
-    """Stage `flight`: write triggers, navigation, vehicle logs, a bag, the truth and plots.
-
-    Returns:
-        True when work was done, False when the flight was up to date.
+def run_fly(workspace: Path, config: SurveyConfig, threads: int, folder: Path) -> None:
+    """Write triggers, navigation, vehicle logs, a bag, the truth and plots.
 
     Raises:
-        WorkspaceError: there is no plan.
         VehicleError: the vehicle took no picture at all; the message says why.
     """
-    plan_path = need_stage(workspace, "plan", "plan") / "plan.json"
-    files = (config.sea.current_file, config.vehicle.coefficients_file)
-    stage = Stage(
-        name="flight",
-        version=4,
-        settings={
-            "seed": config.seed,
-            "vehicle": config.vehicle.model_dump(mode="json", exclude={"coefficients_file"}),
-            "sea": config.sea.model_dump(mode="json", exclude={"current_file"}),
-            "navigation": config.navigation.model_dump(mode="json"),
-            "seafloor": config.seafloor.model_dump(mode="json"),
-            "seafloor_depth_m": config.area.seafloor_depth_m,
-            "plan": config.plan.model_dump(mode="json"),
-            "position_body_m": list(config.camera.position_body_m),
-            "dvl_position_body_m": list(config.camera.dvl_position_body_m),
-        },
-        inputs=[plan_path, *(file for file in files if file is not None)],
-    )
-
-    def work(folder: Path) -> None:
-        for _ in progress(_steps(folder, plan_path, config), "flight files", 5):
-            pass
-
-    return run_stage(workspace, stage, work)
+    plan_path = workspace / "plan" / "plan.json"
+    for _ in progress(_steps(folder, plan_path, config), "flight files", 5):
+        pass
 
 
 def _steps(folder: Path, plan_path: Path, config: SurveyConfig) -> Iterator[str]:
@@ -94,7 +70,7 @@ def _steps(folder: Path, plan_path: Path, config: SurveyConfig) -> Iterator[str]
     write_vehicle_log(folder / "vehicle.csv", believed_log(flight))
     write_bag(folder / "bag", bag_record(flight))
     yield "logs"
-    write_json(folder / "flight.json", flight_summary(flight, config))
+    FlightRecord.save(folder / "flight.json", flight_summary(flight, config))
     draw_flight(folder / "track.png", flight)
     draw_vehicle(folder / "vehicle.png", flight)
     yield "plots"

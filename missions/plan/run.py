@@ -13,15 +13,12 @@ from typing import Any
 
 import numpy as np
 import shapely.ops
-from pydantic import BaseModel
 from shapely.geometry import Point
 
-from alice_survey.base.artefacts import Stage, run_stage
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import PlanError, heard, warn
 from camera_calib.rig import Rig, design_rig
 from missions.areas.bathymetry import Bathymetry, area_depth, read_bathymetry
-from missions.areas.files import area_files
 from missions.areas.survey import survey_area
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.stations import (
@@ -78,50 +75,16 @@ class Planned:
     """Every setting with its equation, source and limit."""
 
 
-def run_plan(workspace: Path, config: SurveyConfig, threads: int) -> bool:
-    """Stage `plan`: write plan.json, its certificate, settings, maps and missions for vehicles.
-
-    Returns:
-        True when work was done, False when the plan was up to date.
+def run_plan(workspace: Path, config: SurveyConfig, threads: int, folder: Path) -> None:
+    """Write plan.json, its certificate, settings, maps and missions for vehicles.
 
     Raises:
         PlanError: no plan meets the settings.
     """
-    apart = [config.area.bathymetry_file, config.sea.current_file, config.vehicle.coefficients_file]
-    stage = Stage(
-        name="plan",
-        version=3,
-        settings={
-            "name": config.name,
-            **{
-                name: _without_paths(getattr(config, name))
-                for name in ("area", "camera", "water", "plan", "sea", "vehicle")
-            },
-            # Of a shape in degrees the middle is the datum unless one is set, to whatever value.
-            "datum_given": sorted({"latitude_deg", "longitude_deg"} & config.area.model_fields_set),
-            "strobes": config.imaging.model_dump(
-                mode="json", include={"strobe_lumens", "strobe_beam_deg", "strobes_body_m"}
-            ),
-        },
-        inputs=[*area_files(config.area), *(file for file in apart if file is not None)],
-    )
+    from missions.plan.record import write_planned
 
-    def work(folder: Path) -> None:
-        from missions.plan.record import write_planned
-
-        rig = design_rig(config.camera, config.water)
-        write_planned(folder, plan_survey(config, rig), config, rig)
-
-    return run_stage(workspace, stage, work)
-
-
-def _without_paths(section: BaseModel) -> dict[str, Any]:
-    """What a section says; of files their names alone, so that a survey may be moved."""
-    told = section.model_dump(mode="json", exclude={"dive"})
-    return {
-        key: value.name if isinstance(value := getattr(section, key), Path) else told[key]
-        for key in told
-    }
+    rig = design_rig(config.camera, config.water)
+    write_planned(folder, plan_survey(config, rig), config, rig)
 
 
 def make_plan(config: SurveyConfig, rig: Rig) -> Plan:

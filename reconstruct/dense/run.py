@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.artefacts import Stage, need_stage, run_stage, write_json
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
-from alice_survey.base.contents import taken_from
 from alice_survey.base.errors import ReconstructionError, warn
 from alice_survey.base.executor import parallel_map
+from alice_survey.base.records import SurfaceRecord
 from reconstruct.dense.cloud import laz_writer, voxel_edge, write_cloud_json, write_ply
 from reconstruct.dense.dem import FILL_CELLS, DemGrid, grid_over, round_cell
 from reconstruct.dense.pose_part import find_pose_part
@@ -52,51 +51,14 @@ _MOST_CELLS = 4_000_000_000
 _MOST_POINTS = 40_000_000
 
 
-def run_dense(workspace: Path, config: SurveyConfig, threads: int) -> bool:
-    """Find the surface of a finished sparse model and write `dense/`.
-
-    Returns:
-        True when done, False when nothing had changed.
+def run_dense(workspace: Path, config: SurveyConfig, threads: int, folder: Path) -> None:
+    """Find the surface of a placed model.
 
     Raises:
         ReconstructionError: the views do not overlap, or no depth was found.
-        WorkspaceError: a stage is missing.
+        WorkspaceError: the model is damaged.
     """
-    need_stage(workspace, "images", "image")
-    sparse = need_stage(workspace, "sparse", "reconstruct")
-    model = read_model(sparse)
-    settings = config.reconstruct.model_dump(
-        mode="json", include={"dense_scale", "dense_partners", "dem_cell_m"}
-    )
-    covariance = workspace / "mapping" / "covariance.npz"
-    stage = Stage(
-        name="dense",
-        version=3,
-        settings=settings,
-        inputs=[
-            sparse,
-            *([covariance] if covariance.is_file() else []),
-            *picture_files(workspace, sparse, model),
-        ],
-        resumes=True,
-    )
-
-    def work(folder: Path) -> None:
-        build_surface(workspace, model, folder, config.reconstruct, threads)
-
-    return run_stage(workspace, stage, work)
-
-
-def picture_files(workspace: Path, sparse: Path, model: SparseModel) -> list[Path]:
-    """The registered pictures and their masks."""
-    from alice_survey.base.artefacts import read_json
-
-    images = workspace / "images"
-    names = [view.image for view in model.views]
-    with taken_from(sparse / "cameras.json"):
-        about = read_json(sparse / "cameras.json")["images"]
-        masks = [str(about[name]["mask"]) for name in names if about[name].get("mask")]
-    return [images / name for name in [*names, *masks]]
+    build_surface(workspace, read_model(workspace / "sparse"), folder, config.reconstruct, threads)
 
 
 def build_surface(
@@ -184,7 +146,7 @@ def build_surface(
             "overlap, sharper texture or better positions"
         )
     write_cloud_json(folder / "cloud.json", count, offset, edge, model.frame)
-    write_json(
+    SurfaceRecord.save(
         folder / "surface.json",
         {
             "format": "alice-survey surface",

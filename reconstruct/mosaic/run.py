@@ -16,12 +16,10 @@ from typing import Any
 import numpy as np
 import rasterio
 
-from alice_survey.base.artefacts import Stage, need_stage, read_json, run_stage, write_json
 from alice_survey.base.config import SurveyConfig
-from alice_survey.base.contents import taken_from
 from alice_survey.base.executor import parallel_map
+from alice_survey.base.records import CamerasRecord, MosaicRecord, PicturesRecord
 from reconstruct.dense.dem import DemGrid, round_cell
-from reconstruct.dense.run import picture_files
 from reconstruct.light.solve import joined_samples
 from reconstruct.mosaic.blend import SUPPORT_PX
 from reconstruct.mosaic.colour import ColourModel, solve_colour
@@ -73,35 +71,15 @@ _TEMPERATURE_C, _SALINITY_PSU = 15.0, 35.0
 """Of the sea where nobody says; red and blue move by 2 % of their dispersion from 5 to 30 C."""
 
 
-def run_mosaic(workspace: Path, config: SurveyConfig, threads: int) -> bool:
-    """Paint the mosaic on a finished surface and write `mosaic/`.
-
-    Returns:
-        True when done, False when nothing had changed.
+def run_mosaic(workspace: Path, config: SurveyConfig, threads: int, folder: Path) -> None:
+    """Paint the mosaic on a finished surface.
 
     Raises:
         ReconstructionError: the surface has no cell.
-        WorkspaceError: a stage is missing.
+        WorkspaceError: the model or the surface is damaged.
     """
-    need_stage(workspace, "images", "image")
-    sparse = need_stage(workspace, "sparse", "reconstruct")
-    dense = need_stage(workspace, "dense", "reconstruct")
-    model = read_model(sparse)
-    settings = config.reconstruct.model_dump(
-        mode="json", include={"mosaic_pixel_m", "colour", "dispersion"}
-    )
-    stage = Stage(
-        name="mosaic",
-        version=5,
-        settings={**settings, "water": config.water.model_dump(mode="json")},
-        inputs=[sparse, dense / "dem.tif", *picture_files(workspace, sparse, model)],
-    )
-
-    def work(folder: Path) -> None:
-        with _small_caches():
-            build_mosaic(workspace, model, folder, config, threads)
-
-    return run_stage(workspace, stage, work)
+    with _small_caches():
+        build_mosaic(workspace, read_model(workspace / "sparse"), folder, config, threads)
 
 
 @contextlib.contextmanager
@@ -185,7 +163,7 @@ def build_mosaic(
     plot_track_over(folder / "mosaic.tif", workspace / "sparse" / "track.csv", folder / "track.png")
     shutil.rmtree(scratch)
     write_footprints(folder, model.views, [outline for _, outline in measured], model.frame)
-    write_json(
+    MosaicRecord.save(
         folder / "mosaic.json",
         {
             "format": "alice-survey mosaic",
@@ -271,10 +249,8 @@ def _dispersion(
 ) -> tuple[Water | None, dict[str, Any]]:
     """The water through which colours are told apart, or None, and what to say about it."""
     wanted = config.reconstruct.dispersion
-    path = workspace / "sparse" / "cameras.json"
-    with taken_from(path):
-        cameras = read_json(path)["cameras"]
-        ports = any(camera["kind"] == "flat_port" for camera in cameras.values())
+    cameras = CamerasRecord.read(workspace / "sparse" / "cameras.json").cameras.values()
+    ports = any(camera["kind"] == "flat_port" for camera in cameras)
     reason = ""
     if wanted == "off":
         reason = "switched off"
@@ -301,9 +277,7 @@ def _dispersion(
 
 
 def _simulated(workspace: Path) -> bool:
-    path = workspace / "images" / "survey.json"
-    with taken_from(path):
-        return bool(read_json(path).get("source") == "simulated")
+    return PicturesRecord.read(workspace / "images" / "survey.json").source == "simulated"
 
 
 def _or(value: float | None, default: float) -> float:

@@ -16,7 +16,8 @@ from typer.testing import CliRunner
 
 from alice_survey.base.config import SurveyConfig, load_config
 from alice_survey.cli.main import app, main
-from alice_survey.survey import LOOP, init_survey
+from alice_survey.stages import names
+from alice_survey.survey import init_survey
 
 COMMANDS = (
     "init", "fov", "target", "plan", "fly", "image", "calibrate", "import-images", "reconstruct",
@@ -187,7 +188,7 @@ def test_status_names_the_next_command(tmp_path: Path) -> None:
     init_survey(tmp_path)
     shown = CliRunner().invoke(app, ["status", "-w", str(tmp_path), "--json"])
     data = json.loads(shown.output)
-    assert data["stages"] == dict.fromkeys(LOOP, "missing")
+    assert data["stages"] == dict.fromkeys(names(), "missing")
     assert data["next"] == f"alice-survey plan -w {tmp_path}"
 
 

@@ -11,10 +11,10 @@ from alice_survey.base.errors import VehicleError, WorkspaceError
 from alice_survey.base.frames import interpolate_poses
 from alice_survey.base.trajectory import read_columns, read_track
 from alice_survey.seafloor.terrain import survey_terrain
+from alice_survey.stages import spec
 from alice_survey.survey import FlightChanges, run
 from alice_survey.vehicle.log import read_vehicle_log
-from missions.fly.run import run_fly
-from missions.plan.run import read_plan, run_plan
+from missions.plan.run import read_plan
 
 FILES = (
     "triggers.csv", "navigation.csv", "vehicle.csv", "flight.json", "truth/track.csv",
@@ -37,31 +37,31 @@ def survey(**changes: object) -> SurveyConfig:
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("survey")
-    run_plan(folder, survey(), 1)
-    assert run_fly(folder, survey(), 1)
+    spec("plan").make(folder, survey(), 1)
+    assert spec("fly").make(folder, survey(), 1)
     return folder
 
 
 def test_a_flight_needs_a_plan(tmp_path: Path) -> None:
     with pytest.raises(WorkspaceError, match="alice-survey plan"):
-        run_fly(tmp_path, survey(), 1)
+        spec("fly").make(tmp_path, survey(), 1)
 
 
 def test_it_is_skipped_while_nothing_it_needs_changes(workspace: Path) -> None:
-    assert not run_fly(workspace, survey(), 1)
-    assert not run_fly(workspace, survey(imaging={"scale": 4}), 1)
+    assert not spec("fly").make(workspace, survey(), 1)
+    assert not spec("fly").make(workspace, survey(imaging={"scale": 4}), 1)
 
 
 def test_a_flight_is_the_same_bytes_each_time_and_another_with_another_seed(
     workspace: Path, tmp_path: Path
 ) -> None:
-    run_plan(tmp_path, survey(), 1)
-    assert run_fly(tmp_path, survey(), 1)
+    spec("plan").make(tmp_path, survey(), 1)
+    assert spec("fly").make(tmp_path, survey(), 1)
     for name in FILES:
         one, two = workspace / "flight" / name, tmp_path / "flight" / name
         assert one.read_bytes() == two.read_bytes(), name
 
-    assert run_fly(tmp_path, survey(seed=2), 1)
+    assert spec("fly").make(tmp_path, survey(seed=2), 1)
     for name in FILES:
         one, two = workspace / "flight" / name, tmp_path / "flight" / name
         assert one.read_bytes() != two.read_bytes(), name
@@ -152,10 +152,10 @@ def test_pictures_are_pictures_with_ink(workspace: Path) -> None:
 
 def test_a_vehicle_that_reaches_no_line_says_why(tmp_path: Path) -> None:
     # The plan is for a calm sea: for this one there would be none.
-    run_plan(tmp_path, survey(), 1)
+    spec("plan").make(tmp_path, survey(), 1)
     strong = survey(sea={"current_mps": 2.5})
     with pytest.raises(VehicleError, match=r"alice reached no line of the plan \(aborted: "):
-        run_fly(tmp_path, strong, 1)
+        spec("fly").make(tmp_path, strong, 1)
     assert not (tmp_path / "flight").exists()
 
 

@@ -13,11 +13,12 @@ from shapely.geometry import shape
 from alice_survey.base.artefacts import read_stage
 from alice_survey.base.config import SurveyConfig, parse_config
 from alice_survey.base.errors import AliceError, PlanError
+from alice_survey.stages import spec
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import stations_of_plan
 from missions.exports.footprints import footprint_outline, footprints_ne
-from missions.plan.run import Plan, make_plan, read_plan, run_plan
+from missions.plan.run import Plan, make_plan, read_plan
 from missions.values.footprint import common_swath
 from missions.values.pattern import pattern
 
@@ -214,7 +215,7 @@ def test_an_absurd_overlap_is_refused_by_the_settings() -> None:
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("survey")
-    assert run_plan(folder, survey(name="small", **SMALL), 1)
+    assert spec("plan").make(folder, survey(name="small", **SMALL), 1)
     return folder
 
 
@@ -229,15 +230,15 @@ def test_a_plan_file_gives_back_the_plan(workspace: Path) -> None:
 
 def test_a_stage_is_skipped_until_a_setting_that_matters_changes(workspace: Path) -> None:
     config = survey(name="small", **SMALL)
-    assert not run_plan(workspace, config, 1)
-    assert not run_plan(workspace, config.model_copy(update={"seed": 9}), 1)
+    assert not spec("plan").make(workspace, config, 1)
+    assert not spec("plan").make(workspace, config.model_copy(update={"seed": 9}), 1)
     before = read_stage(workspace / "plan")
     assert before is not None
     assert "seed" not in before["settings"]
 
 
 def test_a_plan_is_the_same_bytes_each_time(workspace: Path, tmp_path: Path) -> None:
-    run_plan(tmp_path, survey(name="small", **SMALL), 1)
+    spec("plan").make(tmp_path, survey(name="small", **SMALL), 1)
     files = [path for path in (workspace / "plan").rglob("*") if path.is_file()]
     names = {str(path.relative_to(workspace / "plan")) for path in files} - {"stage.json"}
     assert {"plan.json", "map.png", "settings.txt", "triggers.csv"} < names

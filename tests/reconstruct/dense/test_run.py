@@ -7,7 +7,7 @@ import rasterio
 from alice_survey.base.artefacts import read_json
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
 from alice_survey.base.errors import ReconstructionError, WorkspaceError
-from reconstruct.dense.run import run_dense
+from alice_survey.stages import spec
 from tests.oracles_dense import (
     DEPTH_M,
     Scene,
@@ -34,7 +34,7 @@ def survey_views() -> list:
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("survey")
     write_workspace(folder, sparse_model(survey_views(), SCENE), SCENE)
-    assert run_dense(folder, CONFIG, 1)
+    assert spec("dense").make(folder, CONFIG, 1)
     return folder
 
 
@@ -152,7 +152,7 @@ def test_scratch_is_gone_and_files_are_there(workspace: Path):
 
 
 def test_a_second_run_does_nothing(workspace: Path):
-    assert not run_dense(workspace, CONFIG, 1)
+    assert not spec("dense").make(workspace, CONFIG, 1)
 
 
 @pytest.mark.slow
@@ -161,7 +161,7 @@ def test_bytes_do_not_depend_on_the_number_of_processes(workspace: Path, tmp_pat
     other.mkdir()
     for name in ("images", "sparse"):
         (other / name).symlink_to(workspace / name)
-    assert run_dense(other, CONFIG, 2)
+    assert spec("dense").make(other, CONFIG, 2)
     for path in sorted((workspace / "dense").iterdir()):
         if path.name != "stage.json":
             assert (other / "dense" / path.name).read_bytes() == path.read_bytes(), path.name
@@ -172,7 +172,7 @@ def test_pictures_without_texture_give_one_line(tmp_path: Path):
     views = stereo_views(np.array([0.0, 0.3]), np.array([0.0, 0.0]))
     write_workspace(tmp_path, sparse_model(views, grey), grey)
     with pytest.raises(ReconstructionError, match="no depth was confirmed") as caught:
-        run_dense(tmp_path, CONFIG, 1)
+        spec("dense").make(tmp_path, CONFIG, 1)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "dense").exists()
 
@@ -182,4 +182,4 @@ def test_a_workspace_without_model_says_which_command_makes_one(tmp_path: Path):
     write_workspace(tmp_path, sparse_model(stereo_views(np.zeros(1), np.zeros(1)), scene), scene)
     (tmp_path / "sparse" / "stage.json").unlink()
     with pytest.raises(WorkspaceError, match="reconstruct"):
-        run_dense(tmp_path, CONFIG, 1)
+        spec("dense").make(tmp_path, CONFIG, 1)

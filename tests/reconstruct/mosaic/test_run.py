@@ -8,8 +8,8 @@ import rasterio
 from alice_survey.base.artefacts import read_json, write_csv, write_json
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
 from alice_survey.base.errors import ReconstructionError
+from alice_survey.stages import spec
 from reconstruct.dense.dem import DemGrid
-from reconstruct.mosaic.run import run_mosaic
 from reconstruct.raster import tiled_raster
 from reconstruct.views.model import View
 from tests.oracles_dense import (
@@ -77,7 +77,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("mosaic")
     views = stereo_views(np.array([-0.2, 0.2, 0.6]), np.array([0.0, 0.05, 0.0]), heading_deg=30.0)
     make_workspace(folder, views, SCENE)
-    assert run_mosaic(folder, CONFIG, 1)
+    assert spec("mosaic").make(folder, CONFIG, 1)
     return folder
 
 
@@ -149,12 +149,12 @@ def test_source_names_the_picture_nearest_to_straight_above(workspace: Path):
 def test_bytes_do_not_change(workspace: Path, tmp_path: Path):
     for name in ("images", "sparse", "dense"):
         (tmp_path / name).symlink_to(workspace / name)
-    assert run_mosaic(tmp_path, CONFIG, 1)
+    assert spec("mosaic").make(tmp_path, CONFIG, 1)
     names = ("mosaic.tif", "mosaic_source.tif", "coverage.tif", "mosaic.png", "mosaic.json")
     for name in (*names, "footprints.csv", "footprints.geojson"):
         same = (tmp_path / "mosaic" / name).read_bytes()
         assert same == (workspace / "mosaic" / name).read_bytes()
-    assert not run_mosaic(tmp_path, CONFIG, 1)
+    assert not spec("mosaic").make(tmp_path, CONFIG, 1)
 
 
 def test_gains_of_pictures_leave_no_seam(tmp_path: Path):
@@ -166,7 +166,7 @@ def test_gains_of_pictures_leave_no_seam(tmp_path: Path):
         path = tmp_path / "images" / view.image
         picture = cv2.imread(str(path)).astype(np.float64) * np.exp(gain)
         cv2.imwrite(str(path), np.rint(picture).astype(np.uint8))
-    assert run_mosaic(tmp_path, EVEN, 1)
+    assert spec("mosaic").make(tmp_path, EVEN, 1)
     rgba, _, _ = read(tmp_path)
     painted = rgba[:3][:, rgba[3] > 0]
     assert np.ptp(np.percentile(painted, [0.5, 99.5])) < 8  # 60 without any correction
@@ -177,7 +177,7 @@ def test_no_picture_over_the_surface_gives_one_line(tmp_path: Path):
     views = stereo_views(np.array([30.0, 30.4]), np.array([0.0, 0.0]))
     make_workspace(tmp_path, views, SCENE)
     with pytest.raises(ReconstructionError, match="no picture sees") as caught:
-        run_mosaic(tmp_path, CONFIG, 1)
+        spec("mosaic").make(tmp_path, CONFIG, 1)
     assert "\n" not in str(caught.value)
 
 
@@ -190,7 +190,7 @@ def small_survey(folder: Path) -> list[View]:
 
 def test_a_single_grey_station_gives_a_grey_mosaic(tmp_path: Path):
     small_survey(tmp_path)
-    assert run_mosaic(tmp_path, EVEN, 1)
+    assert spec("mosaic").make(tmp_path, EVEN, 1)
     rgba, _, _ = read(tmp_path)
     painted = rgba[:3][:, rgba[3] > 0]
     assert painted.shape[1] > 20_000
@@ -209,7 +209,7 @@ def test_what_a_mask_hides_is_not_painted_and_others_fill_it(tmp_path: Path):
     cv2.imwrite(str(tmp_path / "images" / "fish.png"), mask)
     about["images"][left.image]["mask"] = "fish.png"
     write_json(tmp_path / "sparse" / "cameras.json", about)
-    assert run_mosaic(tmp_path, CONFIG, 1)
+    assert spec("mosaic").make(tmp_path, CONFIG, 1)
     rgba, north, east = read(tmp_path)
     known = rgba[3] > 0
     assert np.abs(rgba[:3][:, known] - 100).max() <= 3

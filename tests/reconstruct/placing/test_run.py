@@ -12,11 +12,18 @@ from alice_survey.base.artefacts import read_json
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
 from alice_survey.base.errors import AliceError, ReconstructionError
 from alice_survey.base.manifest import read_manifest, write_manifest
+from alice_survey.stages import spec
 from reconstruct.pictures.importing import import_images
 from reconstruct.pictures.undistorted import Pictures
-from reconstruct.placing.run import read_track_poses, run_sparse
+from reconstruct.placing.run import read_track_poses
 from reconstruct.placing.scale import scale_model
 from reconstruct.views.model import read_model
+
+
+def reconstruct(workspace: Path, config: SurveyConfig, threads: int) -> bool:
+    mapped = spec("mapping").make(workspace, config, threads)
+    return spec("placing").make(workspace, config, threads) or mapped
+
 
 QUICK = SurveyConfig(reconstruct=ReconstructConfig(max_features=2000))
 
@@ -32,7 +39,7 @@ def drone(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
             small = image.resize((image.width // 2, image.height // 2), Image.Resampling.BOX)
             small.save(folder / "in" / source.name, exif=image.getexif(), quality=92)
     import_images(folder, [folder / "in"])
-    assert run_sparse(folder, QUICK, 1)
+    assert reconstruct(folder, QUICK, 1)
     return folder
 
 
@@ -89,13 +96,13 @@ def test_the_track_agrees_with_the_model(drone: Path) -> None:
 
 
 def test_what_is_done_is_not_done_again(drone: Path) -> None:
-    assert not run_sparse(drone, QUICK, 2)
+    assert not reconstruct(drone, QUICK, 2)
 
 
 def test_two_processes_give_the_same_bytes(drone: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     import_images(other, [drone / "in"])
-    run_sparse(other, QUICK, 2)
+    reconstruct(other, QUICK, 2)
     for file in sorted((drone / "sparse").rglob("*")):
         if file.is_file() and file.name != "stage.json":
             twin = other / "sparse" / file.relative_to(drone / "sparse")
@@ -113,7 +120,7 @@ def nowhere(drone: Path, tmp_path: Path) -> Path:
         with Image.open(path) as image:
             image.save(source / path.name, quality="keep", exif=b"")
     import_images(folder, [source])
-    run_sparse(folder, QUICK, 1)
+    reconstruct(folder, QUICK, 1)
     return folder
 
 
@@ -130,7 +137,7 @@ def test_without_positions_the_model_is_level_unscaled_and_says_so(nowhere: Path
     told = scale_model(nowhere, " ".join(tokens), 12.5)
     assert "12.5 m" in told
     before = (nowhere / "mapping" / "stage.json").stat().st_mtime_ns
-    assert run_sparse(nowhere, QUICK, 1)
+    assert reconstruct(nowhere, QUICK, 1)
     assert (nowhere / "mapping" / "stage.json").stat().st_mtime_ns == before  # not mapped again
     scaled = read_model(nowhere / "sparse")
     assert scaled.frame.scaled
@@ -153,7 +160,7 @@ def test_without_positions_the_model_is_level_unscaled_and_says_so(nowhere: Path
         picks.append("+".join(marks))
     assert all("+" in pick for pick in picks)
     scale_model(nowhere, " ".join(picks), 25.0)
-    assert run_sparse(nowhere, QUICK, 1)
+    assert reconstruct(nowhere, QUICK, 1)
     doubled = read_model(nowhere / "sparse")
     length = np.linalg.norm(doubled.points_world[3] - doubled.points_world[40])
     assert length == pytest.approx(25.0, rel=1e-3)
@@ -177,7 +184,7 @@ def test_without_positions_the_model_is_level_unscaled_and_says_so(nowhere: Path
     scale = json.loads((nowhere / "scale.json").read_text())
     (nowhere / "scale.json").write_text(json.dumps(scale | {"gauge": "other"}))
     with pytest.raises(ReconstructionError, match="an earlier model"):
-        run_sparse(nowhere, QUICK, 1)
+        reconstruct(nowhere, QUICK, 1)
 
 
 def test_one_mark_is_taken_on_the_surface(drone: Path) -> None:
@@ -207,7 +214,7 @@ def test_real_stereo_without_calibration_gets_one_rigid_rig(
             cv2.imwrite(str(tmp_path / side / f"{number:03d}.png"), small)
     folder = tmp_path / "w"
     import_images(folder, [], left=tmp_path / "left", right=tmp_path / "right")
-    run_sparse(folder, QUICK, 2)
+    reconstruct(folder, QUICK, 2)
     found = read_json(folder / "sparse" / "registration.json")
     assert found["registered"] == 10
     assert 0.02 < found["mean_reprojection_px"] < 0.8
@@ -231,9 +238,9 @@ def test_a_rig_of_other_pictures_is_refused(drone: Path, tmp_path: Path) -> None
     import_images(folder, [drone / "in"])
     write_rig(folder / "calibration" / "rig.json", design_rig(CameraConfig(), WaterConfig()))
     with pytest.raises(AliceError, match="'camera' of the pictures is not in the rig"):
-        run_sparse(folder, QUICK, 1)
+        reconstruct(folder, QUICK, 1)
     manifest = folder / "images" / "manifest.csv"
     records = [replace(r, camera="left") for r in read_manifest(manifest)]
     write_manifest(manifest, records)
     with pytest.raises(AliceError, match=r"800 x 450 pixels, but the rig.*3384 x 2710"):
-        run_sparse(folder, QUICK, 1)
+        reconstruct(folder, QUICK, 1)
