@@ -6,11 +6,12 @@ WORKSPACE ?= demo
 WORKERS ?= 2
 WORK ?= build/benchmarks
 
-.PHONY: help setup demo test bench docs lint types imports check lock clean
+.PHONY: help setup demo test test-slow test-all bench docs lint types imports structure check lock clean
 
 help:
 	@echo "make demo    plan, fly, image, reconstruct and score a small survey into $(WORKSPACE)/"
-	@echo "make test    run the tests"
+	@echo "make test    run the tests of every day: about 10 minutes on two idle cores"
+	@echo "make test-all  run these and the slow ones: the loop, 50 kills, docs, browser, fuzzing, Monte Carlo"
 	@echo "make bench   run all benchmarks, for hours; table, logs and workspaces go into $(WORK)/"
 	@echo "make docs    build the site of docs/ into build/site/"
 	@echo "make check   lint, types and import rules"
@@ -31,6 +32,12 @@ demo: $(READY)
 	$(BIN)/alice-survey demo -w $(WORKSPACE)
 
 test: $(READY)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup -m "not slow"
+
+test-slow: $(READY)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup -m slow
+
+test-all: $(READY)
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
 bench: $(READY)
@@ -48,6 +55,9 @@ types: $(READY)
 
 imports: $(READY)
 	$(BIN)/lint-imports
+
+structure: $(READY)
+	$(BIN)/python -m tests.structure
 
 check: lint types imports
 

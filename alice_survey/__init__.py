@@ -1,1 +1,64 @@
-"""Plan, fly, image, reconstruct and score close-range underwater imaging surveys."""
+"""Plan, fly, image, reconstruct and score close-range underwater imaging surveys.
+
+The names below are the public Python interface; everything else may change without notice. They
+are imported when first used, so that `import alice_survey` is quick:
+
+    >>> import alice_survey as alice
+    >>> config = alice.SurveyConfig()
+    >>> camera = alice.design_rig(config.camera, config.water).cameras["left"]
+    >>> camera.project([0.1, 0.0, 2.0]).round(1)
+    array([2209.8, 1104. ])
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from alice_survey.api.figures import plot_dem, plot_mosaic, plot_plan, plot_track
+    from alice_survey.api.rasters import Dem, Mosaic, read_dem, read_mosaic
+    from alice_survey.api.survey import Survey
+    from alice_survey.api.track import Track, read_track
+    from alice_survey.base.config import SurveyConfig, load_config
+    from alice_survey.base.errors import AliceError
+    from alice_survey.base.frames import Datum
+    from alice_survey.base.seawater import n_water
+    from camera_calib.flat_port import FlatPortCamera
+    from camera_calib.rig import Covariance, Rig, design_rig, read_rig, write_rig
+    from camera_calib.triangulate import Triangulation, triangulate
+    from missions.values.plan_file import Plan, read_plan
+    from reconstruct.views.model import SparseModel, View, read_model
+
+_HOMES = {
+    "alice_survey.api.figures": ("plot_dem", "plot_mosaic", "plot_plan", "plot_track"),
+    "alice_survey.api.rasters": ("Dem", "Mosaic", "read_dem", "read_mosaic"),
+    "alice_survey.api.survey": ("Survey",),
+    "alice_survey.api.track": ("Track", "read_track"),
+    "alice_survey.base.config": ("SurveyConfig", "load_config"),
+    "alice_survey.base.errors": ("AliceError",),
+    "alice_survey.base.frames": ("Datum",),
+    "alice_survey.base.seawater": ("n_water",),
+    "camera_calib.flat_port": ("FlatPortCamera",),
+    "camera_calib.rig": ("Covariance", "Rig", "design_rig", "read_rig", "write_rig"),
+    "camera_calib.triangulate": ("Triangulation", "triangulate"),
+    "missions.values.plan_file": ("Plan", "read_plan"),
+    "reconstruct.views.model": ("SparseModel", "View", "read_model"),
+}
+
+__all__ = [
+    "AliceError", "Covariance", "Datum", "Dem", "FlatPortCamera", "Mosaic", "Plan", "Rig",
+    "SparseModel", "Survey", "SurveyConfig", "Track", "Triangulation", "View", "design_rig",
+    "load_config", "n_water", "plot_dem", "plot_mosaic", "plot_plan", "plot_track", "read_dem",
+    "read_model", "read_mosaic", "read_plan", "read_rig", "read_track", "triangulate", "write_rig",
+]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    for home, names in _HOMES.items():
+        if name in names:
+            value = globals()[name] = getattr(import_module(home), name)
+            return value
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -28,8 +28,7 @@ from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, Datum
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
 from benchmarks.measured import Cost, measured, python
-from reconstruct.dense.dem import DemGrid
-from reconstruct.raster import tiled_raster, tiles_of
+from reconstruct.raster import DemGrid, tiled_raster, tiles_of
 from reconstruct.views.model import WorldFrame, write_frame
 
 PIXEL_M, CELL_M = 0.001, 0.0025

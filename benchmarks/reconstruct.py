@@ -170,7 +170,7 @@ def run_haltbrekken(work: Path, data: Path, interpreter: str | None, limit_s: fl
 def run_brighton(work: Path, data: Path, interpreter: str | None, limit_s: float) -> Findings:
     """Real drone pictures: distance from another tool's cloud."""
     from reconstruct.evaluate.cloud_files import read_reference
-    from reconstruct.evaluate.cloud_registration import Surface, register_cloud
+    from reconstruct.evaluate.cloud_registration import ReferenceSurface, register_cloud
     from reconstruct.evaluate.reference import distances, evaluate_reference, lifted
     from reconstruct.views.model import read_frame
 
@@ -195,7 +195,7 @@ def run_brighton(work: Path, data: Path, interpreter: str | None, limit_s: float
     if not cost.ok:
         return findings
     datum = read_frame(workspace / "sparse" / "frame.json").datum
-    surface = Surface.of(read_reference(source / "model.laz", datum)[0])
+    surface = ReferenceSurface.of(read_reference(source / "model.laz", datum)[0])
     theirs, placed = read_reference(out / "dsm.tif", datum)
     rng = np.random.default_rng(1)
     fit = register_cloud(theirs, surface, lifted(theirs, surface), free_scale=True, rng=rng)

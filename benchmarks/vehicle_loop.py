@@ -25,7 +25,7 @@ from alice_survey.vehicle.simulator import Setup, simulate
 from benchmarks.figures import Figure, Goal
 from camera_calib.rig import design_rig
 from missions.fly.simulation import mission_setup
-from missions.plan.run import make_plan
+from missions.plan.planner import plan_survey
 
 _LONGEST_S = 7200.0
 
@@ -88,7 +88,7 @@ def measure(runs: int) -> list[Row]:
 
 
 def _setup(config: SurveyConfig, floor: FloorGrid) -> Setup:
-    plan = make_plan(config, design_rig(config.camera, config.water))
+    plan = plan_survey(config, design_rig(config.camera, config.water)).plan
     return mission_setup(plan, config, floor, _LONGEST_S, np.random.default_rng(1))
 
 

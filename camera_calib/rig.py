@@ -149,8 +149,9 @@ def design_rig(camera: CameraConfig, water: WaterConfig, scale: int = 1) -> Rig:
     )
 
 
-def write_rig(path: Path, rig: Rig) -> None:
+def write_rig(path: str | Path, rig: Rig) -> None:
     """Write `rig.json` (format in docs/formats.md)."""
+    path = Path(path)
     cameras = {
         name: {**camera.to_json(), "cam_from_rig": pose_to_json(rig.cam_from_rig[name])}
         for name, camera in rig.cameras.items()
@@ -170,12 +171,13 @@ def write_rig(path: Path, rig: Rig) -> None:
     write_json(path, body)
 
 
-def read_rig(path: Path) -> Rig:
+def read_rig(path: str | Path) -> Rig:
     """Read `rig.json`.
 
     Raises:
         CalibrationError: a key is missing or a value is wrong; the message names the file.
     """
+    path = Path(path)
     data = read_json(path)
     try:
         data = _mapping(data, "the file")

@@ -1,4 +1,4 @@
-"""GeoTIFFs over the local east-north plane, and pictures of a surface.
+"""Grids and GeoTIFFs over the local east-north plane, and pictures of a surface.
 
 Rasters of the `ned` frame carry an azimuthal equidistant projection centred on the datum. In it
 north and east of the NED frame are the map's axes, true to scale: within 1 km of the datum the
@@ -7,8 +7,10 @@ its meridian and stretch it by up to 0.04 % (0.4 mm a metre), so that either eve
 resampled or lengths are wrong; any GIS reprojects on the fly.
 """
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +29,74 @@ from alice_survey.base.contents import one_line
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.frames import Array, Datum
 from alice_survey.base.run import progress
-from reconstruct.dense.dem import DemGrid
 from reconstruct.views.model import WorldFrame
 
 BLOCK = 256
 """Pixels a side of the blocks of a tiled TIFF."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemGrid:
+    """Square cells in rows from north to south, columns from west to east.
+
+    In the `model` frame "north" and "east" are the first and second axis of the model.
+    """
+
+    west: float
+    """East coordinate of the outer edge of the first column."""
+    north: float
+    """North coordinate of the outer edge of the first row."""
+    cell: float
+    rows: int
+    columns: int
+
+    def east_of(self, column: NDArray[Any] | float) -> Array:
+        """East coordinate of a position in columns; cell centres are at n + 0.5."""
+        return np.asarray(self.west + np.asarray(column) * self.cell)
+
+    def north_of(self, row: NDArray[Any] | float) -> Array:
+        """North coordinate of a position in rows; cell centres are at n + 0.5."""
+        return np.asarray(self.north - np.asarray(row) * self.cell)
+
+    def window(self, row: int, column: int, rows: int, columns: int) -> "DemGrid":
+        """A part of the grid, clipped to it only where the caller does."""
+        return DemGrid(
+            west=self.west + column * self.cell,
+            north=self.north - row * self.cell,
+            cell=self.cell,
+            rows=rows,
+            columns=columns,
+        )
+
+    def moved(self, east: float, north: float) -> "DemGrid":
+        """The same cells, in coordinates in which they lie elsewhere."""
+        return DemGrid(
+            west=self.west + east,
+            north=self.north + north,
+            cell=self.cell,
+            rows=self.rows,
+            columns=self.columns,
+        )
+
+
+def grid_over(bounds: Sequence[tuple[float, float, float, float]], cell: float) -> DemGrid:
+    """The grid, aligned to whole cells, that covers boxes of (south, west, north, east)."""
+    boxes = np.array(bounds)
+    south, west = np.floor(boxes[:, :2].min(axis=0) / cell)
+    north, east = np.ceil(boxes[:, 2:].max(axis=0) / cell)
+    return DemGrid(
+        west=float(west * cell),
+        north=float(north * cell),
+        cell=cell,
+        rows=int(north - south),
+        columns=int(east - west),
+    )
+
+
+def round_cell(length: float) -> float:
+    """Round a length to two significant digits, for cells that people can name."""
+    digits = 1 - math.floor(math.log10(length))
+    return round(length, digits)
 
 
 def local_crs(datum: Datum) -> CRS:
@@ -116,7 +181,9 @@ def opened_raster(path: Path) -> Iterator[Any]:
         with rasterio.open(path, driver="GTiff") as raster:
             yield raster
     except (rasterio.errors.RasterioError, MemoryError) as error:
-        raise WorkspaceError(f"{path}: is damaged ({one_line(error)}): make it anew") from None
+        raise WorkspaceError(
+            f"{path}: is damaged ({one_line(error)}): delete it and run its stage again"
+        ) from None
 
 
 def tiles_of(grid: DemGrid, size: int) -> list[Window]:

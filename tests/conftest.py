@@ -4,7 +4,10 @@ import os
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 from hypothesis import HealthCheck, settings
+
+from tests.small_survey import settings_in, start
 
 # How long an example takes depends on what else the machine does, kernels to compile included.
 settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -20,3 +23,17 @@ def shared_data() -> Path:
             pytest.fail(f"CI needs the real data at {folder}")
         pytest.skip(f"no real data at {folder}")
     return folder
+
+
+@pytest.fixture(scope="session")
+def small_survey(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished workspace, made once for all workers; copy it before you write into it."""
+    shared = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        shared = shared.parent
+    workspace, done = shared / "small" / "survey", shared / "small.done"
+    with FileLock(shared / "small.lock"):
+        if not done.exists():
+            assert start(settings_in(workspace), threads=1).wait() == 0
+            done.touch()
+    return workspace

@@ -17,52 +17,16 @@ import pytest
 import rasterio
 
 from alice_survey.stages import STAGES
+from tests.small_survey import settings_in, start
 
-pytestmark = [pytest.mark.xdist_group("loop"), pytest.mark.slow]
-
-SMALL = """
-seed = 3
-[area]
-length_m = 1.3
-width_m = 1.5
-seafloor_depth_m = 12.0
-[plan]
-side_overlap = 0.35
-[seafloor]
-relief_m = 0.2
-grid_m = 0.02
-[imaging]
-scale = 6
-pool_views = 12
-[reconstruct]
-max_features = 1200
-"""
-
+pytestmark = pytest.mark.slow
 
 FOLDERS = tuple(stage.folder for stage in STAGES)
 
 
-def start(workspace: Path, threads: int) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-m", "alice_survey", "run", "-w", str(workspace)]
-    return subprocess.Popen(
-        [*command, "--threads", str(threads), "--events", str(workspace.with_suffix(".jsonl"))],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
-
-
-def survey(folder: Path) -> Path:
-    folder.mkdir()
-    (folder / "survey.toml").write_text(SMALL)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    workspace = survey(tmp_path_factory.mktemp("loop") / "one")
-    assert start(workspace, threads=1).wait() == 0
-    return workspace
+@pytest.fixture
+def undisturbed(small_survey: Path) -> Path:
+    return small_survey
 
 
 def results(workspace: Path) -> dict[str, bytes]:
@@ -156,7 +120,7 @@ def wait_for(
 
 def test_killed_fifty_times_it_ends_the_same(undisturbed: Path, tmp_path: Path) -> None:
     """At random moments of every stage, four or five times in each."""
-    workspace = survey(tmp_path / "killed")
+    workspace = settings_in(tmp_path / "killed")
     events = workspace.with_suffix(".jsonl")
     took_s = {
         stage: json.loads((undisturbed / stage / "stage.json").read_text())["took_s"]
@@ -247,7 +211,7 @@ def test_what_goes_wrong_half_way_is_told_in_a_line_and_nothing_is_lost(
 
 
 def test_more_threads_give_the_same_numbers(undisturbed: Path, tmp_path: Path) -> None:
-    workspace = survey(tmp_path / "two")
+    workspace = settings_in(tmp_path / "two")
     assert start(workspace, threads=2).wait() == 0
     for name in ("sparse/track.csv", "evaluation/cameras.csv"):
         one, two = (

@@ -352,13 +352,14 @@ _MOST_FAULTS = 8
 """Told at once."""
 
 
-def load_config(path: Path) -> SurveyConfig:
+def load_config(path: str | Path) -> SurveyConfig:
     """Read `survey.toml`.
 
     Raises:
         ConfigError: the file is missing, is no TOML, or holds an unknown key or a value out of
             range; the message names the file, the key, the value and what is allowed.
     """
+    path = Path(path)
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:

@@ -32,7 +32,6 @@ app = typer.Typer(
     help="Plan, fly, image and reconstruct close-range underwater imaging surveys, and score them.",
     epilog="A first survey, planned, flown, pictured, reconstructed and scored: alice-survey demo",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     context_settings=CONTEXT,
     rich_markup_mode=None,
@@ -46,6 +45,14 @@ app.add_typer(camera_app, name="camera")
 app.add_typer(vehicle_app, name="vehicle")
 
 
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(f"alice-survey {version('alice-survey')}")
+        raise typer.Exit
+
+
 @app.command(
     epilog=examples(
         "init reef",
@@ -54,7 +61,7 @@ app.add_typer(vehicle_app, name="vehicle")
     )
 )
 def init(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write it into.")],
+    workspace: Workspace = WORK,
     area: Annotated[
         Path | None,
         typer.Option(help="GeoJSON, KML, KMZ, GeoPackage, shapefile, WKT or .plan of the area."),
@@ -69,8 +76,8 @@ def init(
     """
     from alice_survey.survey import init_survey
 
-    path = init_survey(folder, f"{example or 'survey'}.toml", area)
-    typer.echo(f"wrote {path}; next: alice-survey plan -w {folder}")
+    path = init_survey(workspace, f"{example or 'survey'}.toml", area)
+    typer.echo(f"wrote {path}; next: alice-survey plan -w {workspace}")
 
 
 @app.command(
@@ -356,6 +363,18 @@ def status(workspace: Workspace = WORK, survey: SurveyFile = None, as_json: AsJs
 
 
 with_sessions(app)
+
+
+@app.callback()
+def front_door(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Show the version and exit."
+        ),
+    ] = False,
+) -> None:
+    """Plan, fly, image and reconstruct close-range underwater imaging surveys, and score them."""
 
 
 def main() -> None:

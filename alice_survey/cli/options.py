@@ -6,9 +6,10 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import typer
+from typer.models import ArgumentInfo
 
 CONTEXT = {"help_option_names": ["-h", "--help"]}
 
@@ -37,6 +38,9 @@ LogFile = Annotated[
 ]
 Events = Annotated[Path | None, typer.Option("--events", help="Add it as JSON lines to this file.")]
 WORK = Path("work")
+Folder = Annotated[
+    Path | None, typer.Argument(metavar="WORKSPACE", help="The same as -w.", show_default=False)
+]
 _SESSION = {"quiet": Quiet, "log_file": LogFile, "events": Events}
 
 
@@ -54,15 +58,43 @@ def print_result(table: str, data: Any, as_json: bool) -> None:
 
 
 def with_sessions(app: typer.Typer) -> None:
-    """Give every command of an app the options of a session, and do its work within one."""
+    """Give every command of an app the options of a session, and do its work within one.
+
+    A command that works in a workspace, and has no arguments of its own, takes the workspace as an
+    argument too.
+    """
     if app.registered_callback is not None and app.registered_callback.callback is not None:
         app.registered_callback.callback = _in_session(app.registered_callback.callback)
     for command in app.registered_commands:
         if command.callback is not None:
-            command.callback = _in_session(command.callback)
+            command.callback = _in_session(_with_folder(command.callback))
     for group in app.registered_groups:
         if group.typer_instance is not None:
             with_sessions(group.typer_instance)
+
+
+def _with_folder(command: Callable[..., Any]) -> Callable[..., Any]:
+    signature = inspect.signature(command)
+    kinds = [get_args(parameter.annotation) for parameter in signature.parameters.values()]
+    if get_args(Workspace) not in kinds or any(
+        isinstance(part, ArgumentInfo) for kind in kinds for part in kind
+    ):
+        return command
+    default = signature.parameters["workspace"].default
+
+    @functools.wraps(command)
+    def wrapped(*args: Any, folder: Path | None, workspace: Path, **kwargs: Any) -> Any:
+        if folder is not None and workspace not in (default, folder):
+            raise typer.BadParameter(f"two workspaces are given: {folder} and -w {workspace}")
+        return command(*args, workspace=folder or workspace, **kwargs)
+
+    own = inspect.Parameter(
+        "folder", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Folder
+    )
+    parameters = [*signature.parameters.values(), own]
+    vars(wrapped)["__signature__"] = signature.replace(parameters=parameters)
+    wrapped.__annotations__ = {**command.__annotations__, "folder": Folder}
+    return wrapped
 
 
 def _in_session(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -60,9 +60,9 @@ def solve(
     workspace: Workspace = WORK,
     survey: SurveyFile = None,
     resolution: Annotated[
-        float | None, typer.Option(min=1e-3, help="Size of a pixel on the sea floor, mm.")
+        float | None, typer.Option(min=1e-3, max=1e3, help="Size of a pixel on the sea floor, mm.")
     ] = None,
-    dive: Annotated[float | None, typer.Option(min=1, help="Length of a dive, s.")] = None,
+    dive: Annotated[float | None, typer.Option(min=1, max=1e6, help="Length of a dive, s.")] = None,
     rate: Annotated[float | None, typer.Option(min=1e-3, help="Fixed frame rate, Hz.")] = None,
     lens: Annotated[list[float] | None, typer.Option(help="Focal lengths at hand, mm.")] = None,
     as_json: AsJson = False,
@@ -72,12 +72,18 @@ def solve(
     Altitude and lens for a resolution, the area that fits a dive, or the speed for a frame rate.
     """
     from alice_survey.survey import settings
+    from missions.exposure.settings import ImagingSetup
     from missions.exposure.solve import solve_report
 
     config = settings(workspace, survey, needed=False)
     print_result(
         *solve_report(
-            config, resolution_mm=resolution, dive_s=dive, rate_hz=rate, lenses=lens or (12.5, 25.0)
+            ImagingSetup.of(config),
+            config.area.seafloor_depth_m,
+            resolution_mm=resolution,
+            dive_s=dive,
+            rate_hz=rate,
+            lenses=lens or (12.5, 25.0),
         ),
         as_json,
     )

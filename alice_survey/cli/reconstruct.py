@@ -89,9 +89,6 @@ def pair(
     )
 )
 def measure(
-    folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="Of a pair, or a reconstructed workspace.")
-    ],
     points: Annotated[
         str,
         typer.Option(
@@ -103,6 +100,7 @@ def measure(
     n_water_sigma: Annotated[
         float, typer.Option(min=0, help="Of the water's index, where the rig does not say.")
     ] = 0.0,
+    workspace: Workspace = WORK,
     as_json: AsJson = False,
 ) -> None:
     """Measure between picked pixels.
@@ -111,7 +109,7 @@ def measure(
     """
     from reconstruct.station.measure import measure as measured
 
-    result = measured(folder, points, pick_sigma_px=pick_sigma, n_water_sigma=n_water_sigma)
+    result = measured(workspace, points, pick_sigma_px=pick_sigma, n_water_sigma=n_water_sigma)
     print_result(*result, as_json)
 
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from rasterio.windows import Window
 
 from alice_survey.base.frames import Array
-from alice_survey.report.document import Scale
+from alice_survey.kit.document import Scale
+from alice_survey.kit.figure import palette_colours, palette_steps
 from reconstruct.raster import hillshade
 
 Rgba = NDArray[np.uint8]
@@ -38,7 +39,7 @@ class Numbers:
     title: str
     about: str
     palette: str
-    """Of matplotlib: safe for the colour-blind."""
+    """One of matplotlib's that is safe for the colour-blind."""
     limits: Callable[[Array], tuple[float, float]]
     """Of the colours, from the known values."""
     factor: float = 1.0
@@ -155,12 +156,10 @@ def coloured(level: Array, numbers: Numbers, limits: tuple[float, float], pixel:
         limits: as `limits_of` gives them.
         pixel: side of a pixel in the unit of lengths, for the shade.
     """
-    from matplotlib import colormaps
-
     low, high = limits
     known = np.isfinite(level)
     shares = np.clip((level - low) / (high - low), 0, 1)
-    picture: Rgba = (255 * colormaps[numbers.palette](shares)).astype(np.uint8)
+    picture: Rgba = palette_colours(numbers.palette, shares)
     if numbers.shaded:
         flat = np.sqrt(0.5)
         shade = hillshade(level, pixel) if min(level.shape) > 1 else np.full(level.shape, flat)
@@ -172,15 +171,11 @@ def coloured(level: Array, numbers: Numbers, limits: tuple[float, float], pixel:
 
 def scale_of(numbers: Numbers, limits: tuple[float, float]) -> Scale:
     """The legend."""
-    from matplotlib import colormaps
-    from matplotlib.colors import to_hex
-
-    palette = colormaps[numbers.palette]
     return Scale(
         label=numbers.label,
         low=limits[0],
         high=limits[1],
-        colours=[to_hex(palette(i / (_COLOURS - 1))) for i in range(_COLOURS)],
+        colours=palette_steps(numbers.palette, _COLOURS),
     )
 
 

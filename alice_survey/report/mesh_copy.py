@@ -15,15 +15,16 @@ from rasterio.enums import Resampling
 from alice_survey.base.frames import Array
 from alice_survey.base.records import MeshRecord
 from alice_survey.base.run import progress
-from alice_survey.report.document import Mesh
+from alice_survey.kit.document import Figure, Mesh
+from alice_survey.kit.figure import shrunk_png
+from alice_survey.kit.words import count
 from alice_survey.report.held import Held
-from alice_survey.report.pictures import still
-from alice_survey.report.words import count
 
 _MOST_TRIANGLES = 250_000
 _MOST_TEXTURE_PX = 3072
 _MOST_CELLS = 90_000
 _QUALITY = 80
+_MOST_STILL_PX = 1600
 
 
 @progress.step("thin the mesh")
@@ -40,8 +41,17 @@ def mesh_copy(held: Held, glb: Path) -> Mesh | None:
     return Mesh(
         glb=glb,
         about=mesh_about(mesh),
-        still=still(held.workspace / "mesh" / "mesh.png"),
+        still=mesh_still(held.workspace / "mesh" / "mesh.png"),
+    )
+
+
+def mesh_still(picture: Path, most_px: int = _MOST_STILL_PX) -> Figure:
+    """What stands for the mesh in print."""
+    return Figure(
+        png=shrunk_png(picture, most_px),
+        title="Mesh",
         alt="The mesh seen from above and from the side",
+        shows="The mesh from above and from the side.",
     )
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from alice_survey.base.run import progress
-from alice_survey.report.document import Figure, Level, PictureLayer, Report, Scale, Section, Table
+from alice_survey.kit.document import Figure, Level, PictureLayer, Report, Scale, Section, Table
 
 _MARGIN_MM = 16.0
 _INK, _SOFT, _BLUE, _LINE = "#22313a", "#5d6d77", "#1b6ca8", "#dde5e9"
@@ -119,10 +119,10 @@ def _parts(report: Report, width: float) -> Iterator[Any]:
         [0.45 * width, 0.3 * width],
     )  # fmt: skip
     yield Paragraph("Verdicts", styles["h2"])
-    for level, text in report.verdicts:
-        word, colour = _LEVELS[level]
+    for verdict in report.verdicts:
+        word, colour = _LEVELS[verdict.level]
         yield Paragraph(
-            f'<font color="{colour}"><b>{word}</b></font>  {escape(text)}', styles["body"]
+            f'<font color="{colour}"><b>{word}</b></font>  {escape(verdict.text)}', styles["body"]
         )
     for section in report.sections:
         yield from _section(report, section, styles, width)
@@ -142,7 +142,7 @@ def _section(
                 yield from _layer(layer, styles, width)
     if section.scene == "mesh" and report.mesh is not None:
         yield Paragraph(escape(report.mesh.about), styles["body"])
-        yield _picture(report.mesh.still, width)
+        yield _picture(report.mesh.still.png, width)
     for table in section.tables:
         yield from _table(table, styles, width)
     for figure in section.figures:

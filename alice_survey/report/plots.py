@@ -1,42 +1,16 @@
 """Plots of a report: readable in print and by the colour-blind, each with its plain words."""
 
-import io
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from alice_survey.base.frames import Array
-from alice_survey.report.document import Figure
+from alice_survey.kit.document import Figure
+from alice_survey.kit.figure import INKS, MARKS, colour_bar, drawn
+from alice_survey.kit.words import digits
 from alice_survey.report.figures import Figures
 from alice_survey.report.held import Held, number
-from alice_survey.report.words import digits
-
-INKS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-"""Of Okabe and Ito's palette; lines also differ by their marks."""
-_MARKS = ("o", "s", "^", "D", "v", "x")
-_WIDTH_IN = 7.6
-_DPI = 130
-_STYLE = {
-    "font.size": 9.5, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True,
-    "grid.color": "#e3e8eb", "axes.edgecolor": "#7b8a93", "axes.labelcolor": "#22313a",
-    "legend.frameon": False, "axes.axisbelow": True, "svg.hashsalt": "alice-survey",
-}  # fmt: skip
-
-
-def draw(height_in: float, columns: int, paint: Callable[[Sequence[Any]], None]) -> bytes:
-    """A PNG of a row of axes."""
-    import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure as Sheet
-
-    with mpl.rc_context(_STYLE):
-        sheet = Sheet(figsize=(_WIDTH_IN, height_in), dpi=_DPI, layout="constrained")
-        FigureCanvasAgg(sheet)
-        paint(list(sheet.subplots(1, columns, squeeze=False)[0]))
-        data = io.BytesIO()
-        sheet.savefig(data, format="png", metadata={"Software": None})
-    return data.getvalue()
 
 
 def camera_sigmas(figures: Figures) -> Figure | None:
@@ -48,13 +22,13 @@ def camera_sigmas(figures: Figures) -> Figure | None:
     misses = {r["image"]: r for r in figures.held.rows("evaluation/cameras.csv")}
 
     def paint(axes: Sequence[Any]) -> None:
-        for axis, ink, mark in zip(("north", "east", "depth"), INKS, _MARKS, strict=False):
+        for axis, ink, mark in zip(("north", "east", "depth"), INKS, MARKS, strict=False):
             sigma = [1e2 * number(row, f"sigma_{axis}_m") for row in rows]
             axes[0].plot(order, sigma, mark, ms=3, color=ink, label=axis)
         axes[0].set(xlabel="station", ylabel="sigma on the Earth, cm", ylim=(0, None))
         axes[0].legend()
         if misses:
-            for axis, ink, mark in zip(("north", "east", "down"), INKS, _MARKS, strict=False):
+            for axis, ink, mark in zip(("north", "east", "down"), INKS, MARKS, strict=False):
                 known = [(o, misses[r["image"]]) for o, r in zip(order, rows, strict=True)
                          if r["image"] in misses]  # fmt: skip
                 axes[1].plot(
@@ -65,8 +39,8 @@ def camera_sigmas(figures: Figures) -> Figure | None:
             axes[1].set(xlabel="station", ylabel="error within the survey, mm")
             axes[1].legend()
 
-    return Figure(
-        png=draw(2.9, 2 if misses else 1, paint),
+    return drawn(
+        paint, 2.9, columns=2 if misses else 1,
         title="How well each camera is placed",
         alt="Standard deviations of camera positions by station"
         + (", and their errors against the truth" if misses else ""),
@@ -93,8 +67,10 @@ def pictures_used(figures: Figures) -> Figure | None:
         axes[1].hist(error, bins=30, color=INKS[0], edgecolor="white", linewidth=0.4)
         axes[1].set(xlabel="mean reprojection error, px", ylabel="pictures")
 
-    return Figure(
-        png=draw(2.6, 2, paint),
+    return drawn(
+        paint,
+        2.6,
+        columns=2,
         title="What each picture gives to the model",
         alt="Points by picture, and a histogram of reprojection errors",
         shows=f"Points that each picture shares with others (median {np.median(points):.0f}), and "
@@ -130,8 +106,10 @@ def heights(figures: Figures) -> Figure | None:
             axes[1].set(xlabel="error over its stated sigma", yticks=[])
             axes[1].legend()
 
-    return Figure(
-        png=draw(2.6, 1 if errors is None else 2, paint),
+    return drawn(
+        paint,
+        2.6,
+        columns=1 if errors is None else 2,
         title="How well heights are known",
         alt="Histogram of the standard deviations of heights"
         + ("" if errors is None else ", and of errors over them beside the normal curve"),
@@ -157,8 +135,9 @@ def seen_by(figures: Figures) -> Figure | None:
         axes[0].bar(range(1, most + 1), 100 * share[1:], color=inks)
         axes[0].set(xlabel="stations that see a spot", ylabel="% of the surface")
 
-    return Figure(
-        png=draw(2.3, 1, paint),
+    return drawn(
+        paint,
+        2.3,
         title="Overlap reached",
         alt="Share of the surface by the number of stations that see it",
         shows=f"Share of the surface by the number of stations that see it; "
@@ -185,8 +164,10 @@ def stage_times(figures: Figures) -> Figure | None:
             axes[1].barh(names, np.nan_to_num(peaks), color=INKS[2])
             axes[1].set(xlabel="largest memory, MiB", yticklabels=[])
 
-    return Figure(
-        png=draw(0.9 + 0.24 * len(stages), 2 if known else 1, paint),
+    return drawn(
+        paint,
+        0.9 + 0.24 * len(stages),
+        columns=2 if known else 1,
         title="Time and memory",
         alt="Time and memory of every stage",
         shows="What each step took on this machine.",
@@ -201,12 +182,13 @@ def correlations(names: Sequence[str], matrix: Array) -> Figure:
         axes[0].set_xticks(range(len(names)), names, rotation=90, fontsize=6)
         axes[0].set_yticks(range(len(names)), names, fontsize=6)
         axes[0].grid(visible=False)
-        axes[0].figure.colorbar(picture, ax=axes[0], shrink=0.8, label="correlation")
+        colour_bar(picture, axes[0], "correlation")
 
     pairs = np.abs(np.triu(matrix, 1))
     i, j = (int(n) for n in np.unravel_index(int(pairs.argmax()), pairs.shape))
-    return Figure(
-        png=draw(5.6, 1, paint),
+    return drawn(
+        paint,
+        5.6,
         title="Which parameters go together",
         alt="Matrix of correlations of the rig's parameters",
         shows=f"Correlations of what was estimated; the strongest is {matrix[i, j]:+.3f}, of "

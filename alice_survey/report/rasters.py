@@ -10,6 +10,7 @@ import numpy as np
 import rasterio
 from rasterio.enums import Resampling
 
+from alice_survey.kit.document import PictureLayer, Scale
 from alice_survey.report.colours import (
     MOSAIC_ABOUT,
     MOSAIC_FILE,
@@ -23,7 +24,6 @@ from alice_survey.report.colours import (
     number_rasters,
     scale_of,
 )
-from alice_survey.report.document import PictureLayer, Scale
 from alice_survey.report.held import Held
 
 _MOST_PAINTED_PX = 24_000_000

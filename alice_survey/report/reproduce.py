@@ -5,11 +5,11 @@ from collections.abc import Iterator
 from importlib.metadata import version
 
 from alice_survey import stages
+from alice_survey.kit.document import Section, Table
+from alice_survey.kit.words import duration
 from alice_survey.report import plots
-from alice_survey.report.document import Section, Table
 from alice_survey.report.figures import Figures
 from alice_survey.report.held import Held
-from alice_survey.report.words import duration
 
 _PACKAGES = (
     "alice-survey", "numpy", "scipy", "numba", "opencv-contrib-python-headless", "pycolmap",

@@ -8,12 +8,13 @@ from alice_survey.base.artefacts import STAGE_FILE, atomic_path
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.records import ReportRecord
 from alice_survey.base.run import progress
+from alice_survey.kit.document import PictureLayer, Report, ShapeLayer, SurveyMap
+from alice_survey.kit.map_figure import with_stills
+from alice_survey.kit.page import render_html
 from alice_survey.report import reproduce
-from alice_survey.report.document import PictureLayer, Report, ShapeLayer, SurveyMap
 from alice_survey.report.figures import Figures
 from alice_survey.report.held import Held
 from alice_survey.report.mesh_copy import mesh_copy
-from alice_survey.report.page import render_html
 from alice_survey.report.pdf import write_pdf
 from alice_survey.report.rasters import picture_layers
 from alice_survey.report.sections import sections
@@ -24,18 +25,18 @@ from alice_survey.report.verdicts import verdicts
 
 def run_report(workspace: Path, config: SurveyConfig, threads: int, folder: Path) -> None:
     """Write the report of what the workspace holds."""
-    report = build_report(Held.of(workspace), folder)
+    report, data = build_report(Held.of(workspace), folder)
     with atomic_path(folder / "report.html") as path:
         path.write_text(render_html(report), encoding="utf-8")
     with atomic_path(folder / "report.pdf") as path:
         write_pdf(report, path)
-    ReportRecord.save(folder / "report.json", report.data or {})
+    ReportRecord.save(folder / "report.json", data)
     if report.mesh is not None:
         report.mesh.glb.unlink()
 
 
-def build_report(held: Held, folder: Path) -> Report:
-    """All that there is to say.
+def build_report(held: Held, folder: Path) -> tuple[Report, dict[str, Any]]:
+    """The report, and the same numbers for programs.
 
     Args:
         held: the workspace.
@@ -46,23 +47,23 @@ def build_report(held: Held, folder: Path) -> Report:
     said, known = summary(figures, found), facts(figures)
     with progress.step("draw the maps"):
         layers: list[PictureLayer | ShapeLayer] = [*picture_layers(held), *shape_layers(held)]
-    chart = None
-    if layers:
-        chart = SurveyMap(layers=layers, unit=held.unit, origin=origin_of(held))
+        chart = None
+        if layers:
+            chart = with_stills(SurveyMap(layers=layers, unit=held.unit, origin=origin_of(held)))
     mesh = mesh_copy(held, folder / "mesh.glb")
     parts = list(sections(figures, has_map=chart is not None, has_mesh=mesh is not None))
     parts.append(reproduce.section(figures))
-    return Report(
+    report = Report(
         title=held.name,
         subtitle=_subtitle(held),
         summary=said,
         facts=known,
-        verdicts=[(verdict.level, verdict.text) for verdict in found],
+        verdicts=found,
         sections=parts,
         map=chart,
         mesh=mesh,
-        data=_data(figures, found, said, known),
     )
+    return report, _data(figures, found, said, known)
 
 
 def _subtitle(held: Held) -> str:

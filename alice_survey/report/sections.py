@@ -19,12 +19,12 @@ from alice_survey.base.records import (
     ScoreRecord,
     SurfaceRecord,
 )
+from alice_survey.kit.document import Figure, Section, Table
+from alice_survey.kit.figure import shrunk_png
+from alice_survey.kit.words import count, digits, duration, length, millimetres, parts, share
 from alice_survey.report import plots
-from alice_survey.report.document import Figure, Section, Table
 from alice_survey.report.figures import Figures
 from alice_survey.report.held import Held
-from alice_survey.report.pictures import still
-from alice_survey.report.words import count, digits, duration, length, millimetres, parts, share
 from missions.values.plan_file import Plan
 
 
@@ -445,7 +445,7 @@ def _stills(held: Held, wanted: Sequence[tuple[str, str, str, str, str]]) -> lis
         if file is not None:
             found.append(
                 Figure(
-                    png=still(file), title=title, alt=shows, shows=shows, good=good,
+                    png=shrunk_png(file), title=title, alt=shows, shows=shows, good=good,
                     otherwise=otherwise,
                 )
             )  # fmt: skip

@@ -8,10 +8,10 @@ import numpy as np
 from alice_survey.base.artefacts import read_json
 from alice_survey.base.frames import Array, Datum
 from alice_survey.base.records import FrameRecord
-from alice_survey.report.document import ShapeLayer
+from alice_survey.kit.document import ShapeLayer
+from alice_survey.kit.words import length
 from alice_survey.report.figures import planned_area
 from alice_survey.report.held import Held, number
-from alice_survey.report.words import length
 from reconstruct.views.model import datum_of
 
 _BLUE, _ORANGE, _GREEN, _RED, _BLACK = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#333333"

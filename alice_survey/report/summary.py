@@ -3,9 +3,9 @@
 import math
 from collections.abc import Mapping, Sequence
 
+from alice_survey.kit.document import Verdict
+from alice_survey.kit.words import count, digits, duration, length, millimetres, parts, share
 from alice_survey.report.figures import Figures
-from alice_survey.report.verdicts import Verdict
-from alice_survey.report.words import count, digits, duration, length, millimetres, parts, share
 
 _MOST_ACTIONS = 2
 

@@ -6,14 +6,12 @@ its sigmas), or what the plan asked for.
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 from alice_survey.base.records import CalibrationReportRecord, FlightRecord
-from alice_survey.report.document import Level
+from alice_survey.kit.document import Verdict, worst_first
+from alice_survey.kit.words import count, length, millimetres, parts, share
 from alice_survey.report.figures import Figures
-from alice_survey.report.words import count, length, millimetres, parts, share
 
-_ORDER = ("bad", "look", "good")
 _SURE_SIGMAS = 3.0
 """From which a difference is no chance."""
 _HONEST = (0.7, 1.4)
@@ -25,19 +23,9 @@ _LEAST_STATIONS = 3.0
 _NAMED = 4
 
 
-@dataclass(frozen=True, kw_only=True)
-class Verdict:
-    """One line."""
-
-    level: Level
-    text: str
-    action: str = ""
-    """What to do, as a sentence; empty where all is well."""
-
-
 def verdicts(figures: Figures) -> list[Verdict]:
     """All that can be said, the worst first."""
-    found = [
+    return worst_first([
         *_flight(figures),
         *_calibration(figures),
         *_pictures(figures),
@@ -48,8 +36,7 @@ def verdicts(figures: Figures) -> list[Verdict]:
         *_truth(figures),
         *_reference(figures),
         *_control(figures),
-    ]
-    return sorted(found, key=lambda verdict: _ORDER.index(verdict.level))
+    ])  # fmt: skip
 
 
 def _flight(figures: Figures) -> Iterator[Verdict]:

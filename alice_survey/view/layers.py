@@ -12,6 +12,7 @@ from rasterio.errors import RasterioError
 
 from alice_survey.base.contents import one_line
 from alice_survey.base.errors import WorkspaceError
+from alice_survey.kit.document import PictureLayer
 from alice_survey.report.colours import (
     MOSAIC_ABOUT,
     MOSAIC_FILE,
@@ -25,7 +26,6 @@ from alice_survey.report.colours import (
     number_rasters,
     scale_of,
 )
-from alice_survey.report.document import PictureLayer
 from alice_survey.report.held import Held
 from alice_survey.view.paths import OpenedFile, Workspace
 from alice_survey.view.pyramid import (

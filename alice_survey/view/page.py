@@ -8,7 +8,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from alice_survey.base.records import MeshRecord
-from alice_survey.report.document import (
+from alice_survey.kit.document import (
     Link,
     Mesh,
     PictureLayer,
@@ -17,13 +17,12 @@ from alice_survey.report.document import (
     ShapeLayer,
     SurveyMap,
 )
+from alice_survey.kit.page import page_policy, render_html
+from alice_survey.kit.words import count, length
 from alice_survey.report.held import Held
-from alice_survey.report.mesh_copy import mesh_about, mesh_copy
-from alice_survey.report.page import page_policy, render_html
-from alice_survey.report.pictures import still
+from alice_survey.report.mesh_copy import mesh_about, mesh_copy, mesh_still
 from alice_survey.report.run import origin_of
 from alice_survey.report.shapes import shape_layers
-from alice_survey.report.words import count, length
 from alice_survey.view.layers import PATHS, ChangedError, Layers
 from alice_survey.view.paths import Entry, Workspace
 
@@ -126,8 +125,7 @@ class Page:
         return Mesh(
             glb=path,
             about=mesh_about(mesh),
-            still=still(picture, _STILL_PX),
-            alt="The mesh seen from above and from the side",
+            still=mesh_still(picture, _STILL_PX),
             address=f"/mesh.glb?v={token}",
         )
 

@@ -4,17 +4,22 @@ Every number stands as a row (`Setting`) with its equation, its source and the l
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
-from typing import Any
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any, Self
 
-from alice_survey.base.config import SurveyConfig
+from alice_survey.base.config import (
+    CameraConfig,
+    ImagingConfig,
+    PlanConfig,
+    SurveyConfig,
+    WaterConfig,
+)
 from alice_survey.base.errors import warn
-from camera_calib.rig import Rig
+from camera_calib.rig import Rig, design_rig
 from camera_calib.water import water_optics
 from missions.exposure.exposure import (
     BlurRates,
     blur_rates,
-    exposure_for_blur,
     exposure_for_rate,
     exposure_rows,
 )
@@ -36,7 +41,7 @@ from missions.exposure.light import (
 )
 from missions.exposure.light_rows import light_rows, scatter_rows, strobe_rows
 from missions.exposure.scatter import scatter, shadows
-from missions.exposure.storage import Storage, raw_bytes, storage_load, storage_rows
+from missions.exposure.storage import Storage, storage_load, storage_rows
 from missions.exposure.strobe import StrobeLoad, strobe_load
 from missions.exposure.table import Setting, settings_table
 from missions.exposure.trigger import (
@@ -48,16 +53,35 @@ from missions.exposure.trigger import (
 )
 from missions.values.footprint import footprint_size_m, overlap
 
-__all__ = [
-    "ImagingSettings",
-    "PaperRule",
-    "Setting",
-    "exposure_for_blur",
-    "imaging_settings",
-    "line_spacing",
-    "paper_rule",
-    "raw_bytes",
-]
+
+@dataclass(frozen=True, kw_only=True)
+class ImagingSetup:
+    """What imaging settings follow from: the overlaps wanted, cameras, water and strobes."""
+
+    plan: PlanConfig
+    camera: CameraConfig
+    water: WaterConfig
+    imaging: ImagingConfig
+
+    @classmethod
+    def of(cls, survey: SurveyConfig) -> Self:
+        """The setup of a survey."""
+        return cls(
+            plan=survey.plan, camera=survey.camera, water=survey.water, imaging=survey.imaging
+        )
+
+    @property
+    def rig(self) -> Rig:
+        """The cameras as designed, in water."""
+        return design_rig(self.camera, self.water)
+
+    def with_camera(self, **values: float) -> Self:
+        """The same with settings of the cameras changed."""
+        return replace(self, camera=self.camera.model_copy(update=values))
+
+    def with_plan(self, **values: float | None) -> Self:
+        """The same with settings of the plan changed."""
+        return replace(self, plan=self.plan.model_copy(update=values))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,7 +135,7 @@ class ImagingSettings:
         return {**plain, "rows": [row.to_json() for row in self.rows]}
 
 
-def imaging_settings(rig: Rig, config: SurveyConfig, *, quiet: bool = False) -> ImagingSettings:
+def imaging_settings(rig: Rig, setup: ImagingSetup, *, quiet: bool = False) -> ImagingSettings:
     """Every setting of cameras, strobes and lines that meets the plan.
 
     Warns of what will be poor: an aperture too open, too little light, gaps over the relief, a
@@ -119,14 +143,14 @@ def imaging_settings(rig: Rig, config: SurveyConfig, *, quiet: bool = False) -> 
 
     Args:
         rig: the cameras in water; the first is the reference, whose outer glass the altitude is of.
-        config: plan, camera, water and strobes.
+        setup: plan, camera, water and strobes.
         quiet: without the warnings.
 
     Raises:
         PlanError: limits conflict: frame rate, altitude, focus, strobe or track error; the message
             names both and the cheapest ways out.
     """
-    plan, limits = config.plan, config.camera
+    plan, limits, strobes, jerlov = setup.plan, setup.camera, setup.imaging, setup.water.jerlov
     camera, altitude_m = rig.cameras[rig.reference], plan.altitude_m
     along_m = footprint_size_m(camera, altitude_m)[1]
     interval_s = interval_for_overlap_s(along_m, plan)
@@ -138,11 +162,11 @@ def imaging_settings(rig: Rig, config: SurveyConfig, *, quiet: bool = False) -> 
     rates = blur_rates(rig, plan, altitude_m)
     exposure_s = exposure_for_rate(plan.allowed_blur_px, rates.combined)
     focus = plan_focus(camera, limits, plan)
-    optics = water_optics(config.water.jerlov)
-    budget = light_budget(rig, limits, config.imaging, optics, altitude_m, exposure_s)
-    veil = scatter(rig, config.imaging, optics, altitude_m)
-    shade = shadows(rig, config.imaging, altitude_m, plan.relief_m)
-    load = strobe_load(config.imaging, plan, exposure_s, interval_s)
+    optics = water_optics(jerlov)
+    budget = light_budget(rig, limits, strobes, optics, altitude_m, exposure_s)
+    veil = scatter(rig, strobes, optics, altitude_m)
+    shade = shadows(rig, strobes, altitude_m, plan.relief_m)
+    load = strobe_load(strobes, plan, exposure_s, interval_s)
     storage = storage_load(camera, len(rig.cameras), interval_s)
     mean = prints.mean
     rows = (
@@ -151,7 +175,7 @@ def imaging_settings(rig: Rig, config: SurveyConfig, *, quiet: bool = False) -> 
         *trigger_rows(plan, limits, along_m, prints.top.along_m, interval_s),
         *exposure_rows(plan, rates, exposure_s, mean.pixel_m),
         *focus_rows(focus, camera, limits, plan),
-        *light_rows(budget, config.imaging, limits, config.water.jerlov, exposure_s),
+        *light_rows(budget, strobes, limits, jerlov, exposure_s),
         *scatter_rows(veil, shade),
         *strobe_rows(load),
         *storage_rows(storage, limits, interval_s),
@@ -159,8 +183,8 @@ def imaging_settings(rig: Rig, config: SurveyConfig, *, quiet: bool = False) -> 
     if not quiet:
         for text in (
             too_open(focus, limits, plan),
-            _dark(budget, config),
-            _near(config),
+            _dark(budget, limits.read_noise_e, jerlov),
+            _near(plan),
             _gaps(spacing, prints, step_m),
             _slow_cable(storage, interval_s),
         ):
@@ -194,22 +218,20 @@ def imaging_settings(rig: Rig, config: SurveyConfig, *, quiet: bool = False) -> 
     )
 
 
-def _dark(budget: LightBudget, config: SurveyConfig) -> str:
+def _dark(budget: LightBudget, read_noise_e: float, jerlov: str) -> str:
     """What to do about too little light; empty where there is enough."""
     fault = too_dark(budget)
     if not fault:
         return ""
-    read_noise_e = config.camera.read_noise_e
     times = light_for_snr_e(LEAST_SNR, read_noise_e) / budget.median_e
     return (
-        f"pictures will be {fault} in Jerlov {config.water.jerlov} water: {times:.1f} times the "
+        f"pictures will be {fault} in Jerlov {jerlov} water: {times:.1f} times the "
         "light is missing; lower altitude_m or speed_mps, or raise allowed_blur_px or the aperture"
     )
 
 
-def _near(config: SurveyConfig) -> str:
+def _near(plan: PlanConfig) -> str:
     """Where the top of the relief comes nearer than is wanted of charted ground; else empty."""
-    plan = config.plan
     top_m = plan.altitude_m - plan.relief_m
     if top_m >= plan.least_clearance_m:
         return ""

@@ -3,19 +3,19 @@
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
-from alice_survey.base.config import SurveyConfig
+from alice_survey.base.config import PlanConfig
 from alice_survey.base.errors import AliceError, ConfigError, PlanError
 from alice_survey.base.text_table import text_table
 from camera_calib.fov.table import json_row
-from camera_calib.rig import design_rig
 from missions.exposure.conflicts import Way, conflict
 from missions.exposure.footprints import altitude_for_pixel_m, footprint_at, pixel_on_floor_m
 from missions.exposure.light import too_dark
-from missions.exposure.settings import ImagingSettings, imaging_settings
-from missions.exposure.solve_dive import DiveArea, area_for_dive, dive_of_energy_s
+from missions.exposure.settings import ImagingSetup, imaging_settings
 from missions.exposure.solve_lens import LensOption, in_focus, lenses_for_resolution, with_lens
+from missions.values.costs import time_costs
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,32 +27,47 @@ class RateOption:
     """At which the forward overlap is as asked."""
     forward_overlap: float
     """At the speed of the plan instead."""
-    exposure_ms: float
-    gain_db: float
-    snr: float
-    """Of the median pixel."""
-    fits: bool
+    exposure_ms: float = math.nan
+    gain_db: float = math.nan
+    snr: float = math.nan
+    """Of the median pixel; it and the two above are NaN where no settings can be made."""
+    fits: bool = False
     why: str
 
 
+@dataclass(frozen=True, kw_only=True)
+class DiveArea:
+    """What area a dive holds."""
+
+    dive_s: float
+    area_m2: float
+    side_m: float
+    """Of a square of it."""
+    lines: int
+    line_spacing_m: float
+    speed_mps: float
+    turn_s: float
+    cross_lines: int
+
+
 def solve_report(
-    config: SurveyConfig,
+    setup: ImagingSetup,
+    seafloor_depth_m: float,
     *,
     resolution_mm: float | None = None,
     dive_s: float | None = None,
-    dive_wh: float | None = None,
     rate_hz: float | None = None,
     lenses: Sequence[float] = (12.5, 25.0),
 ) -> tuple[str, dict[str, Any]]:
     """Settings for what is given, as text and as JSON values; each that is given has its part.
 
     Args:
-        config: all else of the plan.
+        setup: all else of cameras, water, strobes and plan.
+        seafloor_depth_m: below the surface.
         resolution_mm: size of a pixel on the sea floor at the mean altitude: find altitude and
             lens.
         dive_s: time of a dive: find the area that fits; with a resolution, at its altitude and
             lens.
-        dive_wh: energy of a dive: likewise, at the mean power of flying lines.
         rate_hz: pictures a second: find the speed.
         lenses: focal lengths at hand, mm.
 
@@ -62,48 +77,41 @@ def solve_report(
     """
     parts: list[str] = []
     data: dict[str, Any] = {}
-    dived = config
+    dived = setup
     if resolution_mm is not None:
-        options = lenses_for_resolution(config, resolution_mm, lenses)
+        options = lenses_for_resolution(setup, seafloor_depth_m, resolution_mm, lenses)
         parts.append(_lens_text(options, resolution_mm))
         data["lenses"] = [json_row(asdict(option)) for option in options]
-        dived = with_lens(config, options[0])
+        dived = with_lens(setup, options[0])
     if dive_s is not None:
-        area = area_for_dive(dived, dive_s)
+        area = area_for_dive(dived, seafloor_depth_m, dive_s)
         parts.append(_area_text(area, dived))
         data["dive"] = asdict(area)
-    if dive_wh is not None:
-        seconds, watts = dive_of_energy_s(dived, dive_wh)
-        area = area_for_dive(dived, seconds)
-        parts.append(
-            f"{dive_wh:g} Wh last {seconds:.0f} s at {watts:.0f} W\n{_area_text(area, dived)}"
-        )
-        data["energy"] = {"dive_wh": dive_wh, "mean_w": watts, **asdict(area)}
     if rate_hz is not None:
-        rates = speeds_for_rate(config, rate_hz, lenses)
-        parts.append(_rate_text(rates, rate_hz, config.plan.speed_mps))
+        rates = speeds_for_rate(setup, rate_hz, lenses)
+        parts.append(_rate_text(rates, rate_hz, setup.plan.speed_mps))
         data["rates"] = [json_row(asdict(option)) for option in rates]
     if not parts:
-        raise ConfigError("say what is given: a resolution (mm), a dive (s or Wh) or a rate (Hz)")
+        raise ConfigError("say what is given: a resolution (mm), a dive (s) or a rate (Hz)")
     return "\n\n".join(parts), data
 
 
 def speeds_for_rate(
-    config: SurveyConfig, rate_hz: float, lenses: Sequence[float]
+    setup: ImagingSetup, rate_hz: float, lenses: Sequence[float]
 ) -> list[RateOption]:
     """Speed at which pictures at a fixed rate overlap as asked, u = r L (1 - O), for each lens.
 
     Raises:
         PlanError: cameras or trigger are slower than the rate.
     """
-    if rate_hz > 1.0 / config.camera.shortest_interval_s * (1 + 1e-9):
-        raise _too_often(config, rate_hz)
-    return [_rate_option(config, rate_hz, lens) for lens in lenses]
+    if rate_hz > 1.0 / setup.camera.shortest_interval_s * (1 + 1e-9):
+        raise _too_often(setup, rate_hz)
+    return [_rate_option(setup, rate_hz, lens) for lens in lenses]
 
 
-def _too_often(config: SurveyConfig, rate_hz: float) -> PlanError:
+def _too_often(setup: ImagingSetup, rate_hz: float) -> PlanError:
     """The rate is beyond cameras or trigger: slower, or as fast with less overlap or higher."""
-    plan, most_hz = config.plan, 1.0 / config.camera.shortest_interval_s
+    plan, most_hz = setup.plan, 1.0 / setup.camera.shortest_interval_s
     share = most_hz / rate_hz
     ways = [
         Way(
@@ -124,7 +132,7 @@ def _too_often(config: SurveyConfig, rate_hz: float) -> PlanError:
                 cost=1.0 - share,
             )
         )
-    own = design_rig(config.camera, config.water).cameras["left"]
+    own = setup.rig.cameras["left"]
     pixel_m = pixel_on_floor_m(own, plan.altitude_m)
     higher_m = math.ceil(100 * altitude_for_pixel_m(own, pixel_m / share)) / 100
     ways.append(
@@ -142,33 +150,93 @@ def _too_often(config: SurveyConfig, rate_hz: float) -> PlanError:
     )
 
 
-def _rate_option(config: SurveyConfig, rate_hz: float, lens_mm: float) -> RateOption:
-    camera = config.camera.model_copy(update={"focal_mm": lens_mm})
-    rig = design_rig(camera, config.water)
-    plan = config.plan
+def _rate_option(setup: ImagingSetup, rate_hz: float, lens_mm: float) -> RateOption:
+    setup, plan = setup.with_camera(focal_mm=lens_mm), setup.plan
+    rig = setup.rig
     footprint = footprint_at(rig, plan.altitude_m, 1e-3)
-    # The interval is told in whole milliseconds: the speed must not ask for a shorter one.
+    # Intervals are whole milliseconds: the speed must not need a shorter one.
     speed = math.floor(rate_hz * footprint.along_m * (1 - plan.forward_overlap) * 1e4) / 1e4
-    reached = max(0.0, 1.0 - plan.speed_mps / rate_hz / footprint.along_m)
-    settings: ImagingSettings | None = None
-    why = ""
-    try:
-        moved = plan.model_copy(update={"speed_mps": speed})
-        changed = in_focus(config.model_copy(update={"camera": camera, "plan": moved}))
-        settings = imaging_settings(rig, changed, quiet=True)
-        why = too_dark(settings.light)
-    except AliceError as error:
-        why = str(error).split(": ")[0]
-    return RateOption(
+    option = partial(
+        RateOption,
         lens_mm=lens_mm,
         speed_mps=speed,
-        forward_overlap=reached,
-        exposure_ms=settings.exposure_s * 1e3 if settings else math.nan,
-        gain_db=settings.light.gain_db if settings else math.nan,
-        snr=settings.light.snr_median if settings else math.nan,
+        forward_overlap=max(0.0, 1.0 - plan.speed_mps / rate_hz / footprint.along_m),
+    )
+    try:
+        settings = imaging_settings(rig, in_focus(setup.with_plan(speed_mps=speed)), quiet=True)
+    except AliceError as error:
+        return option(why=str(error).split(": ")[0])
+    why = too_dark(settings.light)
+    return option(
+        exposure_ms=settings.exposure_s * 1e3,
+        gain_db=settings.light.gain_db,
+        snr=settings.light.snr_median,
         fits=not why,
         why=why,
     )
+
+
+def area_for_dive(setup: ImagingSetup, seafloor_depth_m: float, dive_s: float) -> DiveArea:
+    """The largest square that a dive holds, with its turns, cross lines, descent and ascent.
+
+    Lines of length a lie s apart: `n = ceil(a / s)` of them and `n - 1` turns, the cross lines and
+    the way home at the survey's speed. A real area takes longer the more it is cut up: then
+    `alice-survey plan` gives the time.
+
+    Raises:
+        PlanError: the dive is too short for one line of one picture's length.
+    """
+    settings, plan = imaging_settings(setup.rig, setup, quiet=True), setup.plan
+    costs = time_costs(plan.speed_mps)
+    dive_down_s = costs.dive_s(seafloor_depth_m - plan.altitude_m)
+    spacing = settings.line_spacing_m
+    turn = turn_s(plan, spacing)
+
+    def needed_s(side_m: float) -> float:
+        lines = max(1, math.ceil(side_m / spacing - 1e-9))
+        crossing = plan.cross_lines * (side_m / plan.speed_mps + turn)
+        home = side_m / plan.speed_mps
+        flown = lines * side_m / plan.speed_mps + (lines - 1) * turn
+        return dive_down_s + flown + crossing + home
+
+    smallest = settings.footprint_along_m
+    if needed_s(smallest) > dive_s:
+        raise PlanError(
+            f"a dive of {dive_s:g} s is too short: {dive_down_s:.0f} s go down and up, and one "
+            f"picture's length takes {needed_s(smallest):.0f} s in all: give a longer dive"
+        )
+    low, high = smallest, 2.0 * math.sqrt(dive_s * plan.speed_mps * spacing) + smallest
+    while high - low > 1e-3:
+        middle = (low + high) / 2
+        low, high = (middle, high) if needed_s(middle) <= dive_s else (low, middle)
+    return DiveArea(
+        dive_s=dive_s,
+        area_m2=low * low,
+        side_m=low,
+        lines=max(1, math.ceil(low / spacing - 1e-9)),
+        line_spacing_m=spacing,
+        speed_mps=plan.speed_mps,
+        turn_s=turn,
+        cross_lines=plan.cross_lines,
+    )
+
+
+def turn_s(plan: PlanConfig, spacing_m: float) -> float:
+    """Time from the end of a line to the start of the next, with its run-in.
+
+    Arcs of radius R: a half circle and a straight where lines are 2 R apart or more, else Dubins'
+    three arcs `R (pi + 4 acos((2 R + s) / (4 R)))`; on the spot: two right angles and the way
+    between. `turns = "auto"` takes the quicker.
+    """
+    costs, radius = time_costs(plan.speed_mps), plan.turn_radius_m
+    if spacing_m >= 2 * radius:
+        arcs = math.pi * radius + spacing_m - 2 * radius
+    else:
+        arcs = radius * (math.pi + 4 * math.acos((2 * radius + spacing_m) / (4 * radius)))
+    run_in = plan.run_in_m / plan.speed_mps
+    by_arcs = arcs / plan.speed_mps + run_in
+    by_spot = 2 * costs.spot_j(math.pi / 2) + spacing_m / plan.speed_mps + run_in
+    return {"arcs": by_arcs, "spot": by_spot}.get(plan.turns, min(by_arcs, by_spot))
 
 
 def _lens_text(options: list[LensOption], resolution_mm: float) -> str:
@@ -199,12 +267,12 @@ def _lens_text(options: list[LensOption], resolution_mm: float) -> str:
     ])  # fmt: skip
 
 
-def _area_text(area: DiveArea, config: SurveyConfig) -> str:
+def _area_text(area: DiveArea, setup: ImagingSetup) -> str:
     return (
         f"a dive of {area.dive_s:g} s holds {area.area_m2:.0f} m2, such as {area.side_m:.1f} x "
         f"{area.side_m:.1f} m: {area.lines} lines {area.line_spacing_m:.3g} m apart at "
         f"{area.speed_mps:g} m/s, {area.cross_lines} across, turns of {area.turn_s:.0f} s, descent "
-        f"and ascent; {config.camera.focal_mm:g} mm lens at {config.plan.altitude_m:.2f} m"
+        f"and ascent; {setup.camera.focal_mm:g} mm lens at {setup.plan.altitude_m:.2f} m"
     )
 
 

@@ -3,94 +3,98 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from alice_survey.base.config import SurveyConfig
+from alice_survey.base.config import PlanConfig
 from alice_survey.base.errors import AliceError, PlanError
-from camera_calib.rig import design_rig
 from missions.exposure.conflicts import Way, conflict
 from missions.exposure.focus import largest_f_number, needed_f_number
 from missions.exposure.footprints import altitude_for_pixel_m, footprint_at, pixel_on_floor_m
 from missions.exposure.light import LEAST_SNR, light_for_snr_e, too_dark
-from missions.exposure.settings import imaging_settings
+from missions.exposure.settings import ImagingSetup, imaging_settings
 
 _HIGHEST_M = 10.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class LensOption:
-    """One lens at the altitude that gives a resolution."""
+    """One lens at the altitude that gives a resolution.
+
+    What follows from the altitude is NaN where no settings can be made there.
+    """
 
     lens_mm: float
     altitude_m: float
     pixel_mm: float
-    f_number: float
+    f_number: float = math.nan
     """As set, or as the depth of field needs."""
-    across_m: float
-    stereo_m: float
-    spacing_m: float
-    interval_s: float
-    exposure_ms: float
-    gain_db: float
-    snr: float
+    across_m: float = math.nan
+    stereo_m: float = math.nan
+    spacing_m: float = math.nan
+    interval_s: float = math.nan
+    exposure_ms: float = math.nan
+    gain_db: float = math.nan
+    snr: float = math.nan
     """Of the median pixel."""
-    hours_per_1000_m2: float
+    hours_per_1000_m2: float = math.inf
     """On lines alone, without turns."""
-    fits: bool
+    fits: bool = False
     why: str
     """What is against it; empty where nothing is."""
 
 
-def least_altitude_m(config: SurveyConfig) -> float:
+def least_altitude_m(plan: PlanConfig) -> float:
     """Lowest altitude that keeps `least_clearance_m` over the top of the relief."""
-    return config.plan.relief_m + config.plan.least_clearance_m
-
-
-def _deepest_m(config: SurveyConfig) -> float:
-    """Highest altitude: what `plan.altitude_m` allows, below the surface."""
-    return min(_HIGHEST_M, config.area.seafloor_depth_m)
+    return plan.relief_m + plan.least_clearance_m
 
 
 def lenses_for_resolution(
-    config: SurveyConfig, resolution_mm: float, lenses: Sequence[float]
+    setup: ImagingSetup, seafloor_depth_m: float, resolution_mm: float, lenses: Sequence[float]
 ) -> list[LensOption]:
     """Altitude and what follows for each lens, the one that surveys fastest first.
+
+    Args:
+        setup: all else of cameras, water, strobes and plan.
+        seafloor_depth_m: the highest altitude is at the surface, or what `plan.altitude_m` allows.
+        resolution_mm: size of a pixel on the sea floor.
+        lenses: focal lengths, mm.
 
     Raises:
         PlanError: none fits.
     """
-    options = [_lens_option(config, resolution_mm, lens) for lens in lenses]
+    highest_m = min(_HIGHEST_M, seafloor_depth_m)
+    options = [_lens_option(setup, highest_m, resolution_mm, lens) for lens in lenses]
     options.sort(key=lambda o: (not o.fits, o.hours_per_1000_m2, o.lens_mm))
     if not options[0].fits:
-        raise _no_lens(config, resolution_mm, options)
+        raise _no_lens(setup, highest_m, resolution_mm, options)
     return options
 
 
-def _lens_option(config: SurveyConfig, resolution_mm: float, lens_mm: float) -> LensOption:
-    """One lens; fields beyond the altitude are NaN where no plan can be made there."""
-    camera = config.camera.model_copy(update={"focal_mm": lens_mm})
-    rig = design_rig(camera, config.water)
+def _lens_option(
+    setup: ImagingSetup, highest_m: float, resolution_mm: float, lens_mm: float
+) -> LensOption:
+    setup = setup.with_camera(focal_mm=lens_mm)
+    rig = setup.rig
     own = rig.cameras[rig.reference]
     altitude = math.floor(altitude_for_pixel_m(own, resolution_mm * 1e-3) * 1000) / 1000
-    least, deepest = least_altitude_m(config), _deepest_m(config)
-    if not least <= altitude < deepest:
+    option = partial(LensOption, lens_mm=lens_mm, altitude_m=altitude)
+    least_m = least_altitude_m(setup.plan)
+    if not least_m <= altitude < highest_m:
         why = (
-            f"{altitude:.2f} m is under the {least:.2f} m of relief_m and least_clearance_m"
-            if altitude < least
-            else f"{altitude:.2f} m is beyond the {deepest:g} m allowed"
+            f"{altitude:.2f} m is under the {least_m:.2f} m of relief_m and least_clearance_m"
+            if altitude < least_m
+            else f"{altitude:.2f} m is beyond the {highest_m:g} m allowed"
         )
-        return _no_option(lens_mm, altitude, resolution_mm, why)
-    plan = config.plan.model_copy(update={"altitude_m": altitude, "line_spacing_m": None})
-    changed = in_focus(config.model_copy(update={"camera": camera, "plan": plan}))
+        return option(pixel_mm=resolution_mm, why=why)
+    changed = in_focus(setup.with_plan(altitude_m=altitude, line_spacing_m=None))
     try:
         settings = imaging_settings(rig, changed, quiet=True)
     except AliceError as error:
-        return _no_option(lens_mm, altitude, resolution_mm, str(error).split(": ")[0])
+        return option(pixel_mm=resolution_mm, why=str(error).split(": ")[0])
     why = too_dark(settings.light)
-    return LensOption(
-        lens_mm=lens_mm,
-        altitude_m=altitude,
+    return option(
         pixel_mm=pixel_on_floor_m(own, altitude) * 1e3,
         f_number=changed.camera.f_number,
         across_m=settings.footprint_across_m,
@@ -100,46 +104,36 @@ def _lens_option(config: SurveyConfig, resolution_mm: float, lens_mm: float) -> 
         exposure_ms=settings.exposure_s * 1e3,
         gain_db=settings.light.gain_db,
         snr=settings.light.snr_median,
-        hours_per_1000_m2=1000.0 / settings.line_spacing_m / plan.speed_mps / 3600.0,
+        hours_per_1000_m2=1000.0 / settings.line_spacing_m / setup.plan.speed_mps / 3600.0,
         fits=not why,
         why=why,
     )
 
 
-def with_lens(config: SurveyConfig, option: LensOption) -> SurveyConfig:
-    """The survey with a lens, its aperture, and the altitude it needs; lines as then follows."""
-    camera = config.camera.model_copy(
-        update={"focal_mm": option.lens_mm, "f_number": option.f_number}
+def with_lens(setup: ImagingSetup, option: LensOption) -> ImagingSetup:
+    """The setup with a lens, its aperture, and the altitude it needs; lines as then follows."""
+    return setup.with_camera(focal_mm=option.lens_mm, f_number=option.f_number).with_plan(
+        altitude_m=option.altitude_m, line_spacing_m=None
     )
-    plan = config.plan.model_copy(update={"altitude_m": option.altitude_m, "line_spacing_m": None})
-    return config.model_copy(update={"camera": camera, "plan": plan})
 
 
-def in_focus(config: SurveyConfig) -> SurveyConfig:
+def in_focus(setup: ImagingSetup) -> ImagingSetup:
     """The same with the aperture closed as far as the relief needs, if diffraction allows it."""
-    camera, plan = config.camera, config.plan
-    own = design_rig(camera, config.water).cameras["left"]
-    needed = math.ceil(10 * needed_f_number(own, camera, plan) - 1e-9) / 10
+    camera, plan = setup.camera, setup.plan
+    needed = math.ceil(10 * needed_f_number(setup.rig.cameras["left"], camera, plan) - 1e-9) / 10
     if not camera.f_number < needed <= largest_f_number(camera, plan.sharp_px):
-        return config
-    return config.model_copy(update={"camera": camera.model_copy(update={"f_number": needed})})
+        return setup
+    return setup.with_camera(f_number=needed)
 
 
-def _no_option(lens_mm: float, altitude_m: float, pixel_mm: float, why: str) -> LensOption:
-    nan = math.nan
-    return LensOption(
-        lens_mm=lens_mm, altitude_m=altitude_m, pixel_mm=pixel_mm, f_number=nan, across_m=nan,
-        stereo_m=nan, spacing_m=nan, interval_s=nan, exposure_ms=nan, gain_db=nan, snr=nan,
-        hours_per_1000_m2=math.inf, fits=False, why=why,
-    )  # fmt: skip
-
-
-def _no_lens(config: SurveyConfig, resolution_mm: float, options: list[LensOption]) -> PlanError:
+def _no_lens(
+    setup: ImagingSetup, deepest: float, resolution_mm: float, options: list[LensOption]
+) -> PlanError:
     """No lens gives the resolution within the limits: what each can, and what it would take."""
     ways = []
-    least, deepest = least_altitude_m(config), _deepest_m(config)
+    plan, least = setup.plan, least_altitude_m(setup.plan)
     for option in options:
-        nearest = _nearest_that_fits(config, option)
+        nearest = _nearest_that_fits(setup, deepest, option)
         if nearest is not None:
             ratio = max(nearest.pixel_mm / resolution_mm, resolution_mm / nearest.pixel_mm)
             word = "coarser" if nearest.pixel_mm > resolution_mm else "finer"
@@ -151,7 +145,7 @@ def _no_lens(config: SurveyConfig, resolution_mm: float, options: list[LensOptio
                     cost=ratio - 1.0,
                 )
             )
-    ways += _more_light(config, options)
+    ways += _more_light(setup, options)
     lowest, highest = (f(option.altitude_m for option in options) for f in (min, max))
     # At no distance in front of the port there is no lens to scale.
     if 0.0 < highest < least:
@@ -175,13 +169,13 @@ def _no_lens(config: SurveyConfig, resolution_mm: float, options: list[LensOptio
                 cost=lens / shorter - 1.0,
             )
         )
-    clearance = math.floor(100 * (highest - config.plan.relief_m)) / 100
-    if 0.1 <= clearance < config.plan.least_clearance_m:
+    clearance = math.floor(100 * (highest - plan.relief_m)) / 100
+    if 0.1 <= clearance < plan.least_clearance_m:
         ways.append(
             Way(
                 change=f"least_clearance_m {clearance:g}",
                 price=f"flown from {highest:.2f} m, nearer to the ground",
-                cost=1.0 - clearance / config.plan.least_clearance_m,
+                cost=1.0 - clearance / plan.least_clearance_m,
             )
         )
     reasons = "; ".join(f"{o.lens_mm:g} mm: {o.why}" for o in options)
@@ -199,15 +193,15 @@ def _no_lens(config: SurveyConfig, resolution_mm: float, options: list[LensOptio
     return conflict(fault, ("the resolution", limit), ways)
 
 
-def _more_light(config: SurveyConfig, options: list[LensOption]) -> list[Way]:
+def _more_light(setup: ImagingSetup, options: list[LensOption]) -> list[Way]:
     """Blur and speed with which the options that are only too dark would do."""
     ways = []
     for option in options:
         if math.isnan(option.snr):
             continue
-        noise_e = config.camera.read_noise_e
+        noise_e = setup.camera.read_noise_e
         times = light_for_snr_e(LEAST_SNR, noise_e) / light_for_snr_e(option.snr, noise_e)
-        blur_px = math.ceil(100 * config.plan.allowed_blur_px * times) / 100
+        blur_px = math.ceil(100 * setup.plan.allowed_blur_px * times) / 100
         ways.append(
             Way(
                 change=f"allowed_blur_px {blur_px:g} with the {option.lens_mm:g} mm lens from "
@@ -219,15 +213,16 @@ def _more_light(config: SurveyConfig, options: list[LensOption]) -> list[Way]:
     return ways
 
 
-def _nearest_that_fits(config: SurveyConfig, option: LensOption) -> LensOption | None:
+def _nearest_that_fits(
+    setup: ImagingSetup, highest_m: float, option: LensOption
+) -> LensOption | None:
     """The altitude nearest to an option's that its lens can be used at, to about a fiftieth."""
-    camera = config.camera.model_copy(update={"focal_mm": option.lens_mm})
-    own = design_rig(camera, config.water).cameras["left"]
-    tried = np.geomspace(least_altitude_m(config), _deepest_m(config), 50)
+    own = setup.with_camera(focal_mm=option.lens_mm).rig.cameras["left"]
+    tried = np.geomspace(least_altitude_m(setup.plan), highest_m, 50)
     tried = tried[np.argsort(np.abs(np.log(tried / max(option.altitude_m, 1e-3))))]
     for altitude in tried:
         pixel_mm = math.ceil(pixel_on_floor_m(own, float(altitude)) * 1e6) / 1e3
-        found = _lens_option(config, pixel_mm, option.lens_mm)
+        found = _lens_option(setup, highest_m, pixel_mm, option.lens_mm)
         if found.fits:
             return found
     return None

@@ -24,7 +24,7 @@ from missions.fly.compare import (
 )
 from missions.fly.compare_plots import draw_case
 from missions.fly.compare_reasons import PAPER, CaseResult, Summary, explained
-from missions.plan.run import make_plan
+from missions.plan.planner import plan_survey
 from missions.values.plan_file import Plan
 
 _PAPER_SPACING_M = 1.0
@@ -66,7 +66,7 @@ def compare_report(
     config = changed(config, "plan", turns="arcs")
     if config.plan.line_spacing_m is None:
         config = changed(config, "plan", line_spacing_m=_PAPER_SPACING_M)
-    plan = make_plan(config, design_rig(config.camera, config.water))
+    plan = plan_survey(config, design_rig(config.camera, config.water)).plan
     cases = [_case(text) for text in currents] or list(default_cases(plan))
     if swell is not None:
         cases = [_with_swell(plan, case, swell) for case in cases]

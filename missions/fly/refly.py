@@ -15,8 +15,9 @@ from missions.coverage.holes import Hole
 from missions.coverage.stations import stations_of_plan
 from missions.lines.fill import lines_over
 from missions.lines.lay import ordered
+from missions.plan.strength import survey_costs
 from missions.route.dives import split_dives
-from missions.route.energy import usable_wh, vehicle_costs
+from missions.route.energy import usable_wh
 from missions.route.ways import Ways
 from missions.values.area import Area, multipolygon
 from missions.values.plan_file import Plan
@@ -46,7 +47,7 @@ def refly_plan(
     lines = lines_over(area.survey, area, flown.pattern)
     if not lines:
         raise PlanError(f"no line inside the allowed area sees any of the {len(holes)} holes")
-    costs, ways = vehicle_costs(config), Ways(area.allowed)
+    costs, ways = survey_costs(config), Ways(area.allowed)
     lines = ordered(lines, ways, costs, plan.home_ne_m)
     dives = split_dives(
         lines,

@@ -1,4 +1,4 @@
-"""`alice-survey plan map`: the map of a finished plan anew, in the format asked for."""
+"""`alice-survey plan map`: the map of a finished plan drawn again, in another format."""
 
 from pathlib import Path
 from typing import Any
@@ -7,10 +7,10 @@ import numpy as np
 
 from alice_survey.base.config import SurveyConfig
 from camera_calib.rig import design_rig
-from missions.areas.bathymetry import read_bathymetry
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import plan_pattern, stations_of_plan
 from missions.plan.map import draw_plan
+from missions.plan.planner import area_bathymetry
 from missions.values.plan_file import read_plan
 
 
@@ -23,19 +23,13 @@ def map_report(plan_path: Path, config: SurveyConfig, out: Path) -> tuple[str, d
         out: file to write.
 
     Raises:
-        PlanError: it is no plan, or the suffix is not known.
+        PlanError: the file is not a plan, or the suffix is not known.
     """
     plan = read_plan(plan_path)
     rig = design_rig(config.camera, config.water)
-    bathymetry, floor_m = None, None
-    if config.area.bathymetry_file is not None:
-        bathymetry = read_bathymetry(
-            config.area.bathymetry_file,
-            plan.datum,
-            bounds_ne=plan.area.allowed.buffer(4.0 * plan.altitude_m).bounds,
-            sense=config.area.bathymetry_values,
-            crs=config.area.bathymetry_crs,
-        )
+    bathymetry = area_bathymetry(config.area, plan.area, plan.altitude_m)
+    floor_m = None
+    if bathymetry is not None:
         floor_m = bathymetry.depth_at(np.vstack([line.stations_ne for line in plan.lines]))
     stations = stations_of_plan(plan, floor_m)
     seen = certificate(plan.area, rig, stations, plan_pattern(plan, rig))

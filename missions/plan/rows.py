@@ -3,10 +3,10 @@
 import math
 from collections.abc import Sequence
 
-from alice_survey.base.config import SurveyConfig
+from alice_survey.base.config import VehicleConfig
 from camera_calib.rig import Rig
 from missions.coverage.certificate import Certificate
-from missions.exposure.settings import raw_bytes
+from missions.exposure.storage import raw_bytes
 from missions.exposure.table import Setting
 from missions.lines.sweep import Sweep
 from missions.route.energy import usable_wh
@@ -16,7 +16,7 @@ _GROUP = "LINES AND DIVES"
 
 
 def plan_rows(
-    plan: Plan, seen: Certificate, sweep: Sweep | None, config: SurveyConfig, rig: Rig
+    plan: Plan, seen: Certificate, sweep: Sweep | None, vehicle: VehicleConfig, rig: Rig
 ) -> tuple[Setting, ...]:
     """What the plan comes to.
 
@@ -24,12 +24,12 @@ def plan_rows(
         plan: the plan.
         seen: its certificate.
         sweep: how the direction of the lines was found; None where it was given.
-        config: the survey.
+        vehicle: its battery.
         rig: its cameras.
     """
     return (
         *_line_rows(plan, sweep),
-        *_dive_rows(plan, config),
+        *_dive_rows(plan, vehicle),
         _data_row(plan, rig),
         *_coverage_rows(seen),
     )
@@ -54,12 +54,11 @@ def _line_rows(plan: Plan, sweep: Sweep | None) -> Sequence[Setting]:
     )
 
 
-def _dive_rows(plan: Plan, config: SurveyConfig) -> Sequence[Setting]:
-    usable = usable_wh(config.vehicle)
+def _dive_rows(plan: Plan, vehicle: VehicleConfig) -> Sequence[Setting]:
+    usable = usable_wh(vehicle)
     longest = max(dive.energy_wh for dive in plan.dives)
     spots = sum(1 for dive in plan.dives for leg in dive.route.legs if leg.turn_rad)
     flown_m = sum(line.length_m for line in plan.lines)
-    vehicle = config.vehicle
     return (
         _row(
             "way", plan.length_m, "m", "lines, turns, ways from home and back", "lines",

@@ -11,13 +11,13 @@ from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import PlanError, why
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.steady import drag_power
+from missions.exposure.settings import ImagingSetup, imaging_settings
 from missions.route.energy import (
+    FlightConditions,
     Manner,
     course_power,
     course_powers,
-    craft_of,
-    expected_current,
-    line_manner,
+    flight_conditions,
     motion,
     usable_wh,
 )
@@ -27,8 +27,8 @@ _SUFFIXES = (".png", ".pdf", ".svg")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Way:
-    """One way to lay and fly lines; means of flying them there and back."""
+class LinePower:
+    """What lines take that are laid and flown in one way, mean of there and back."""
 
     name: str
     drag_w: float
@@ -50,18 +50,20 @@ class Way:
         }
 
 
-def three_ways(config: SurveyConfig, *, imaging_w: float = 0.0) -> tuple[Way, Way, Way]:
+def three_ways(
+    flown: FlightConditions, *, imaging_w: float = 0.0
+) -> tuple[LinePower, LinePower, LinePower]:
     """Lines along the current, across it held by sway, and across it crabbing.
 
     Args:
-        config: of the survey.
+        flown: vehicle, speed and current.
         imaging_w: mean power of strobes while on lines.
     """
-    craft, current = craft_of(config.vehicle), expected_current(config)
-    speed, towards = config.plan.speed_mps, math.atan2(current[1], current[0])
+    craft, current, speed = flown.craft, flown.current_ne_mps, flown.speed_mps
+    towards = math.atan2(current[1], current[0])
     body = craft.plant.body
     bare = body._replace(lift=np.zeros(4))
-    other_w = config.vehicle.hotel_w + imaging_w
+    other_w = flown.hotel_w + imaging_w
     cases: tuple[tuple[str, float, Manner], ...] = (
         ("along the current", 0.0, "held"),
         ("across, held by sway", math.pi / 2, "held"),
@@ -74,7 +76,7 @@ def three_ways(config: SurveyConfig, *, imaging_w: float = 0.0) -> tuple[Way, Wa
         drag = float(drag_power(bare, moved.nu).mean())
         thrusters = float(course_power(craft, courses, speed, current, manner).mean())
         ways.append(
-            Way(
+            LinePower(
                 name=name,
                 drag_w=drag,
                 lift_w=float(drag_power(body, moved.nu).mean()) - drag,
@@ -93,11 +95,14 @@ def both_ways_w(power_w: Array) -> Array:
     return mean
 
 
-def energy_report(config: SurveyConfig, *, imaging_w: float = 0.0) -> tuple[str, dict[str, Any]]:
+def energy_report(
+    flown: FlightConditions, battery_wh: float, *, imaging_w: float = 0.0
+) -> tuple[str, dict[str, Any]]:
     """What line direction costs in the expected current.
 
     Args:
-        config: of the survey.
+        flown: vehicle, speed and current.
+        battery_wh: what a dive may take of the battery.
         imaging_w: mean power of strobes while on lines.
 
     Returns:
@@ -105,21 +110,19 @@ def energy_report(config: SurveyConfig, *, imaging_w: float = 0.0) -> tuple[str,
 
     Courses that cannot be flown have no power: "-" in the table, None in the numbers.
     """
-    lines_w = course_powers(config)[0] + config.vehicle.hotel_w + imaging_w
-    speed = config.plan.speed_mps
-    current = expected_current(config)
+    lines_w = course_powers(flown)[0] + flown.hotel_w + imaging_w
+    speed, current = flown.speed_mps, flown.current_ne_mps
     size, towards_deg = math.hypot(*current), math.degrees(math.atan2(current[1], current[0])) % 360
-    ways = three_ways(config, imaging_w=imaging_w)
+    ways = three_ways(flown, imaging_w=imaging_w)
     mean_w = both_ways_w(lines_w)
     headings_deg: Array = np.linspace(0.0, 180.0, len(mean_w), endpoint=False)
     flyable = np.flatnonzero(np.isfinite(mean_w))
-    battery_wh = usable_wh(config.vehicle)
     range_text, range_data = _range(headings_deg[flyable], mean_w[flyable], battery_wh, speed)
     if len(flyable) < len(mean_w):
         range_text.append(
             f"  lines can be flown both ways on {len(flyable)} of {len(mean_w)} headings"
         )
-    flown = "held by sway" if line_manner(config) == "held" else "crabbing"
+    manner = "held by sway" if flown.manner == "held" else "crabbing"
     rows = [
         f"  {way.name:22s}{way.drag_w:8.2f}{way.lift_w:8.2f}{_watts(way.thrusters_w):>12s}"
         f"{_watts(way.line_w):>9s}{way.crab_deg:8.0f}"
@@ -127,12 +130,12 @@ def energy_report(config: SurveyConfig, *, imaging_w: float = 0.0) -> tuple[str,
     ]
     text = "\n".join(
         [
-            f"energy: {config.vehicle.name} at {speed:g} m/s over ground in a current of "
-            f"{size:.2f} m/s towards {towards_deg:03.0f} deg, lines {flown}",
+            f"energy: {flown.craft.name} at {speed:g} m/s over ground in a current of "
+            f"{size:.2f} m/s towards {towards_deg:03.0f} deg, lines {manner}",
             f"  {'lines, there and back':22s}{'drag W':>8s}{'lift W':>8s}{'thrusters W':>12s}"
             f"{'total W':>9s}{'crab':>8s}",
             *rows,
-            f"  in the totals: hotel load {config.vehicle.hotel_w:g} W, lights {imaging_w:.1f} W",
+            f"  in the totals: hotel load {flown.hotel_w:g} W, lights {imaging_w:.1f} W",
             *range_text,
         ]
     )
@@ -140,13 +143,13 @@ def energy_report(config: SurveyConfig, *, imaging_w: float = 0.0) -> tuple[str,
         "current_mps": size,
         "current_towards_deg": towards_deg,
         "speed_mps": speed,
-        "lines": flown,
+        "lines": manner,
         "ways": [way.to_json() for way in ways],
         **range_data,
         "headings": len(mean_w),
         "headings_flyable": len(flyable),
         "usable_wh": battery_wh,
-        "hotel_w": config.vehicle.hotel_w,
+        "hotel_w": flown.hotel_w,
         "imaging_w": imaging_w,
     }
     return text, data
@@ -185,24 +188,21 @@ def current_report(config: SurveyConfig, plot: Path | None) -> tuple[str, dict[s
     Raises:
         PlanError: cameras and strobes cannot do what is asked, or the picture cannot be written.
     """
-    from camera_calib.rig import design_rig
-    from missions.exposure.settings import imaging_settings
-
-    rig = design_rig(config.camera, config.water)
-    imaging_w = imaging_settings(rig, config, quiet=True).imaging_w
-    text, data = energy_report(config, imaging_w=imaging_w)
+    setup, flown = ImagingSetup.of(config), flight_conditions(config)
+    imaging_w = imaging_settings(setup.rig, setup, quiet=True).imaging_w
+    text, data = energy_report(flown, usable_wh(config.vehicle), imaging_w=imaging_w)
     if plot is None:
         return text, data
-    draw_trade(plot, config, imaging_w=imaging_w)
+    draw_trade(plot, flown, imaging_w=imaging_w)
     return f"{text}\n{plot}", {**data, "plot": str(plot)}
 
 
-def draw_trade(path: Path, config: SurveyConfig, *, imaging_w: float = 0.0) -> None:
+def draw_trade(path: Path, flown: FlightConditions, *, imaging_w: float = 0.0) -> None:
     """Draw the power of the thrusters on lines and between, by course.
 
     Args:
         path: of a picture, PNG, PDF or SVG.
-        config: of the survey.
+        flown: vehicle, speed and current.
         imaging_w: mean power of strobes while on lines.
 
     Raises:
@@ -215,15 +215,16 @@ def draw_trade(path: Path, config: SurveyConfig, *, imaging_w: float = 0.0) -> N
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    (lines_w, way_w), current = course_powers(config), expected_current(config)
-    hotel_w, size = config.vehicle.hotel_w, math.hypot(*current)
+    (lines_w, way_w), current = course_powers(flown), flown.current_ne_mps
+    size = math.hypot(*current)
     towards = math.atan2(current[1], current[0])
     figure = Figure(figsize=(6.4, 6.4), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot(projection="polar")
     axes.set_theta_zero_location("N")
     axes.set_theta_direction(-1)
-    _draw_course(axes, lines_w, "C0", f"on lines ({_manner_text(config)})")
+    manner = "heading held" if flown.manner == "held" else "crabbing"
+    _draw_course(axes, lines_w, "C0", f"on lines ({manner})")
     _draw_course(axes, way_w, "C1", "between lines")
     mean_w = both_ways_w(lines_w)
     _draw_course(axes, np.concatenate([mean_w, mean_w]), "C0", "lines, there and back", "--")
@@ -247,8 +248,8 @@ def draw_trade(path: Path, config: SurveyConfig, *, imaging_w: float = 0.0) -> N
             va="center", bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.5},
         )  # fmt: skip
     axes.set_title(
-        f"Electrical power of {config.vehicle.name}'s thrusters, W, by course\n"
-        f"{config.plan.speed_mps:g} m/s over ground; on top come {hotel_w:g} W of hotel load and "
+        f"Electrical power of {flown.craft.name}'s thrusters, W, by course\n"
+        f"{flown.speed_mps:g} m/s over ground; on top come {flown.hotel_w:g} W of hotel load and "
         f"{imaging_w:.1f} W of lights",
         fontsize=10,
     )
@@ -266,10 +267,6 @@ def _draw_course(axes: Any, power_w: Array, colour: str, label: str, style: str 
     axes.plot(
         course, np.where(np.isfinite(closed), closed, np.nan), style, color=colour, label=label
     )
-
-
-def _manner_text(config: SurveyConfig) -> str:
-    return "heading held" if line_manner(config) == "held" else "crabbing"
 
 
 def _watts(power_w: float) -> str:

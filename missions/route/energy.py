@@ -23,14 +23,14 @@ ALICE's lateral thrusters stand still and wait for the error to grow (0.4 N, bel
 """
 
 import math
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.config import SurveyConfig, VehicleConfig
+from alice_survey.base.config import SeaConfig, SurveyConfig, VehicleConfig
 from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.files import coefficients_from_file
@@ -52,6 +52,55 @@ _HEAVES_MPS = np.linspace(0.5, 0.01, 50)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class FlightConditions:
+    """What the power of flying follows from: a vehicle, how it flies, and the current."""
+
+    craft: Vehicle
+    manner: Manner
+    """Of flying lines."""
+    speed_mps: float
+    """Over ground."""
+    line_heading_deg: float | None
+    """Of all lines; None where any will do."""
+    current_ne_mps: Array
+    """(2,) mean of the current that is expected."""
+    turn_radius_m: float
+    glass_body_m: tuple[float, float, float]
+    """The left port's outer glass, about which a vehicle with sway turns."""
+    hotel_w: float
+    """Everything but thrusters and strobes."""
+
+    def with_vehicle(self, settings: VehicleConfig) -> "FlightConditions":
+        """The same for another vehicle or controller.
+
+        Raises:
+            VehicleError: as `sound_craft_of`.
+        """
+        craft = craft_of(settings)
+        return replace(self, craft=craft, manner=_manner(craft, settings), hotel_w=settings.hotel_w)
+
+
+def flight_conditions(config: SurveyConfig) -> FlightConditions:
+    """The conditions that a survey expects.
+
+    Raises:
+        VehicleError: the vehicle is described wrongly.
+        NavigationError: the file of the current cannot be read.
+    """
+    craft, plan = craft_of(config.vehicle), config.plan
+    return FlightConditions(
+        craft=craft,
+        manner=_manner(craft, config.vehicle),
+        speed_mps=plan.speed_mps,
+        line_heading_deg=plan.line_heading_deg,
+        current_ne_mps=expected_current(config.sea, config.area.seafloor_depth_m - plan.altitude_m),
+        turn_radius_m=plan.turn_radius_m,
+        glass_body_m=config.camera.position_body_m,
+        hotel_w=config.vehicle.hotel_w,
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Motion:
     """Straight flight over ground in a current, at N courses."""
 
@@ -64,11 +113,17 @@ class Motion:
     crabs: it would have to turn its back on where it goes."""
 
 
-def vehicle_costs(config: SurveyConfig, *, imaging_w: float = 0.0) -> Costs:
-    """What flying takes in the current that is expected.
+def vehicle_costs(
+    conditions: FlightConditions,
+    *,
+    refused: Callable[[str], PlanError],
+    imaging_w: float = 0.0,
+) -> Costs:
+    """What flying takes.
 
     Args:
-        config: vehicle, sea and speed of the survey.
+        conditions: vehicle, speed and current.
+        refused: makes the error for what cannot be flown, in words; empty where nothing can.
         imaging_w: mean power of strobes while on lines.
 
     Returns:
@@ -76,25 +131,17 @@ def vehicle_costs(config: SurveyConfig, *, imaging_w: float = 0.0) -> Costs:
         thrust, the rest being left for control.
 
     Raises:
-        PlanError: lines cannot be flown both ways on any heading, or not on the one asked for, or
+        PlanError: lines cannot be flown both ways on any heading, or not on the one requested, or
             the vehicle cannot turn from one line to the next.
-        VehicleError: the vehicle is described wrongly.
-        NavigationError: the file of the current cannot be read.
     """
-    craft, current, speed = (
-        craft_of(config.vehicle),
-        expected_current(config),
-        config.plan.speed_mps,
-    )
+    craft, current = conditions.craft, conditions.current_ne_mps
     courses = _courses()
-    manner = line_manner(config)
-    lines, between = course_powers(config)
-    spot_w, turn_rad_s = _spot(craft, config, current)
-    refused = partial(_refused, config)
+    lines, between = course_powers(conditions)
+    spot_w, turn_rad_s = _spot(conditions)
     if not np.any(_both_ways(lines)) or not math.isfinite(spot_w):
         raise refused("")
-    asked_deg = config.plan.line_heading_deg
-    if asked_deg is not None and not _flies_heading(craft, config, current, asked_deg):
+    asked_deg = conditions.line_heading_deg
+    if not _flies_heading(conditions) and asked_deg is not None:
         can_deg = np.degrees(courses[np.flatnonzero(_both_ways(lines))])
         off_deg = np.abs((can_deg - asked_deg + 90.0) % 180.0 - 90.0)
         nearest_deg = can_deg[int(np.argmin(off_deg))]
@@ -102,12 +149,12 @@ def vehicle_costs(config: SurveyConfig, *, imaging_w: float = 0.0) -> Costs:
             f"lines on {asked_deg:g} deg cannot be flown both ways (the nearest that can are on "
             f"{nearest_deg:.0f} deg)"
         )
-    hotel_w = config.vehicle.hotel_w
-    arc_w, pace = _arc(craft, config, current)
-    step_mps, step_w = _sway_step(craft, courses, current, manner)
+    hotel_w = conditions.hotel_w
+    arc_w, pace = _arc(conditions)
+    step_mps, step_w = _sway_step(craft, courses, current, conditions.manner)
     heave_mps, heave_w = _heave(craft, current)
     return Costs(
-        speed_mps=speed,
+        speed_mps=conditions.speed_mps,
         line_w=lines + hotel_w + imaging_w,
         way_w=between + hotel_w,
         spot_w=spot_w + hotel_w,
@@ -122,41 +169,35 @@ def vehicle_costs(config: SurveyConfig, *, imaging_w: float = 0.0) -> Costs:
     )
 
 
-def course_powers(config: SurveyConfig) -> tuple[Array, Array]:
+def course_powers(conditions: FlightConditions) -> tuple[Array, Array]:
     """Power of the thrusters on lines and between, (COURSES,) W each, by course from north.
 
     Infinite at courses that cannot be kept.
     """
-    craft, current, speed = (
-        craft_of(config.vehicle),
-        expected_current(config),
-        config.plan.speed_mps,
-    )
-    lines = course_power(craft, _courses(), speed, current, line_manner(config))
-    return lines, _between(craft, config, current, _courses())
+    return _line_power(conditions, _courses()), _between(conditions, _courses())
 
 
-def _between(craft: Vehicle, config: SurveyConfig, current: Array, courses: Array) -> Array:
-    power = course_power(craft, courses, config.plan.speed_mps, current, "crab")
-    if line_manner(config) == "crab":
-        return power
+def _line_power(conditions: FlightConditions, courses: Array) -> Array:
+    return course_power(
+        conditions.craft, courses, conditions.speed_mps, conditions.current_ne_mps,
+        conditions.manner,
+    )  # fmt: skip
+
+
+def _between(conditions: FlightConditions, courses: Array) -> Array:
+    crabbing = _line_power(replace(conditions, manner="crab"), courses)
+    if conditions.manner == "crab":
+        return crabbing
     # Where it cannot crab it may still hold its heading.
-    held = course_power(craft, courses, config.plan.speed_mps, current, "held")
-    return np.where(np.isfinite(power), power, held)
+    return np.where(np.isfinite(crabbing), crabbing, _line_power(conditions, courses))
 
 
-def _flies_heading(
-    craft: Vehicle, config: SurveyConfig, current: Array, heading_deg: float
-) -> bool:
-    there_and_back = math.radians(heading_deg) + np.array([0.0, math.pi])
-    power = course_power(craft, there_and_back, config.plan.speed_mps, current, line_manner(config))
-    return bool(np.all(np.isfinite(power)))
-
-
-def _refused(config: SurveyConfig, what: str) -> PlanError:
-    from missions.plan.strength import too_strong  # only then: it tries much
-
-    return too_strong(config, what)
+def _flies_heading(conditions: FlightConditions) -> bool:
+    """Whether lines on the heading requested can be flown both ways; True where none is."""
+    if conditions.line_heading_deg is None:
+        return True
+    there_and_back = math.radians(conditions.line_heading_deg) + np.array([0.0, math.pi])
+    return bool(np.all(np.isfinite(_line_power(conditions, there_and_back))))
 
 
 def usable_wh(settings: VehicleConfig) -> float:
@@ -188,26 +229,28 @@ def craft_of(settings: VehicleConfig) -> Vehicle:
     return craft.weakened({name: left for name, left in lost.items() if name in present})
 
 
-def line_manner(config: SurveyConfig) -> Manner:
-    """How lines are flown: held by sway if the vehicle has it and its controller uses it."""
-    sways = np.any(np.abs(craft_of(config.vehicle).configuration_matrix[1]) > 0)
-    return "held" if sways and config.vehicle.controller == "sway" else "crab"
+def has_sway(craft: Vehicle) -> bool:
+    """Whether any of its thrusters pushes a vehicle sideways."""
+    return bool(np.any(np.abs(craft.configuration_matrix[1]) > 0))
 
 
-def expected_current(config: SurveyConfig) -> Array:
-    """(2,) the current's mean, m/s north and east, at the depth that is flown at.
+def _manner(craft: Vehicle, settings: VehicleConfig) -> Manner:
+    """Of flying lines: held by sway if the vehicle has it and its controller uses it."""
+    return "held" if has_sway(craft) and settings.controller == "sway" else "crab"
+
+
+def expected_current(sea: SeaConfig, depth_m: float) -> Array:
+    """(2,) the current's mean, m/s north and east, at a depth.
 
     Raises:
         NavigationError: the file of the current cannot be read.
     """
-    sea = config.sea
     if sea.current_file is None:
         towards = math.radians(sea.current_towards_deg)
         return sea.current_mps * np.array([math.cos(towards), math.sin(towards)])
     from alice_survey.vehicle.sea import read_current
 
     current = read_current(sea.current_file)
-    depth_m = config.area.seafloor_depth_m - config.plan.altitude_m
     means = [
         float(np.interp(depth_m, current.depth_m, profile))
         for profile in current.velocity_ne_mps.mean(axis=0).T
@@ -275,7 +318,7 @@ def _both_ways(power_w: Array) -> NDArray[np.bool_]:
 
 
 def _turning(
-    config: SurveyConfig, current: Array, headings: Array, speed_mps: Array, rate_rad_s: Array
+    conditions: FlightConditions, headings: Array, speed_mps: Array, rate_rad_s: Array
 ) -> tuple[Array, Array]:
     """Velocity relative to the water, and its rate, while the vehicle turns.
 
@@ -283,8 +326,7 @@ def _turning(
     the vehicle goes ahead itself and drifts across its heading with the water.
 
     Args:
-        config: of the survey.
-        current: (2,) m/s north and east.
+        conditions: vehicle and current.
         headings: (N,)
         speed_mps: (N,) ahead over ground.
         rate_rad_s: (N,) of yaw.
@@ -293,11 +335,12 @@ def _turning(
         (N, 6) each.
     """
     nu, nu_rate = np.zeros((len(headings), 6)), np.zeros((len(headings), 6))
+    current = conditions.current_ne_mps
     ahead = -(np.cos(headings) * current[0] + np.sin(headings) * current[1])
     nu[:, 0], nu[:, 5] = speed_mps + ahead, rate_rad_s
-    if line_manner(config) == "held":
+    if conditions.manner == "held":
         beside = np.sin(headings) * current[0] - np.cos(headings) * current[1]
-        forward_m, right_m, _ = config.camera.position_body_m
+        forward_m, right_m, _ = conditions.glass_body_m
         nu[:, 0] += rate_rad_s * right_m
         nu[:, 1] = beside - rate_rad_s * forward_m
         # The current, fixed over ground, turns in the body.
@@ -305,26 +348,24 @@ def _turning(
     return nu, nu_rate
 
 
-def _turning_power(
-    craft: Vehicle, config: SurveyConfig, current: Array, speeds_mps: Array, rates_rad_s: Array
-) -> Array:
+def _turning_power(conditions: FlightConditions, speeds_mps: Array, rates_rad_s: Array) -> Array:
     """Power, (N,), of turning at speeds and rates (N,), mean over all headings."""
     nu, nu_rate = _turning(
-        config,
-        current,
+        conditions,
         np.tile(_courses(_HEADINGS), len(speeds_mps)),
         np.repeat(speeds_mps, _HEADINGS),
         np.repeat(rates_rad_s, _HEADINGS),
     )
-    power = _power(craft, nu, nu_rate=nu_rate, slips=line_manner(config) == "crab")
+    slips = conditions.manner == "crab"
+    power = _power(conditions.craft, nu, nu_rate=nu_rate, slips=slips)
     means: Array = power.reshape(-1, _HEADINGS).mean(axis=1)
     return means
 
 
-def _spot(craft: Vehicle, config: SurveyConfig, current: Array) -> tuple[float, float]:
+def _spot(conditions: FlightConditions) -> tuple[float, float]:
     """Power on the spot, of turning through a quarter and settling; and the rate of turning."""
     rates = SPOT_RAD_S * np.append(_RATES, 0.0)
-    power = _turning_power(craft, config, current, np.zeros(len(rates)), rates)
+    power = _turning_power(conditions, np.zeros(len(rates)), rates)
     can = np.flatnonzero(np.isfinite(power[:-1]))
     if not len(can):
         return math.inf, SPOT_RAD_S
@@ -334,15 +375,15 @@ def _spot(craft: Vehicle, config: SurveyConfig, current: Array) -> tuple[float, 
     return float(joules / (turning_s + SETTLE_S)), rate
 
 
-def _arc(craft: Vehicle, config: SurveyConfig, current: Array) -> tuple[float, float]:
+def _arc(conditions: FlightConditions) -> tuple[float, float]:
     """Power on an arc of the plan's radius, and the share of the plan's speed it is flown at.
 
     Mean of both senses and all courses.
     """
-    speeds = config.plan.speed_mps * _RATES
-    rates = speeds / config.plan.turn_radius_m
+    speeds = conditions.speed_mps * _RATES
+    rates = speeds / conditions.turn_radius_m
     both = np.concatenate([rates, -rates])
-    power = _turning_power(craft, config, current, np.tile(speeds, 2), both)
+    power = _turning_power(conditions, np.tile(speeds, 2), both)
     power = power.reshape(2, -1).mean(axis=0)
     can = np.flatnonzero(np.isfinite(power))
     if not len(can):
@@ -392,32 +433,20 @@ def _heave(craft: Vehicle, current: Array) -> tuple[float, float]:
     return float(_HEAVES_MPS[can[0]]), float(power[can[0]])
 
 
-def _can_fly(craft: Vehicle, config: SurveyConfig, current: Array, speed_mps: float) -> bool:
-    lines = course_power(craft, _courses(), speed_mps, current, line_manner(config))
-    return bool(np.any(_both_ways(lines))) and math.isfinite(_spot(craft, config, current)[0])
+def flies_everywhere(conditions: FlightConditions) -> bool:
+    """Whether any survey can be flown, whatever way between lines it takes.
 
-
-def flies_everywhere(config: SurveyConfig, current_ne_mps: Array) -> bool:
-    """Whether any survey can be flown in a current, whatever way between lines it takes.
-
-    That is: lines both ways, on the heading asked for if there is one; all courses between lines;
+    That is: lines both ways, on the heading requested if there is one; all courses between lines;
     turns on the spot; descent and ascent.
-
-    Args:
-        config: of the survey; its own current does not count.
-        current_ne_mps: (2,)
     """
-    craft, asked_deg = craft_of(config.vehicle), config.plan.line_heading_deg
-    downstream = math.atan2(current_ne_mps[1], current_ne_mps[0])
-    between = _between(craft, config, current_ne_mps, downstream + _courses())
-    if not np.all(np.isfinite(between)) or not _can_fly(
-        craft, config, current_ne_mps, config.plan.speed_mps
-    ):
-        return False
-    if asked_deg is not None and not _flies_heading(craft, config, current_ne_mps, asked_deg):
+    current = conditions.current_ne_mps
+    downstream = math.atan2(current[1], current[0])
+    between = _between(conditions, downstream + _courses())
+    lines = _both_ways(_line_power(conditions, _courses()))
+    if not np.all(np.isfinite(between)) or not np.any(lines) or not _flies_heading(conditions):
         return False
     try:
-        _heave(craft, current_ne_mps)
+        _heave(conditions.craft, current)
     except PlanError:
         return False
-    return True
+    return math.isfinite(_spot(conditions)[0])

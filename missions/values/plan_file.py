@@ -144,13 +144,14 @@ class Plan:
         }
 
 
-def read_plan(path: Path) -> Plan:
+def read_plan(path: str | Path) -> Plan:
     """Read `plan.json`.
 
     Raises:
         PlanError: it is no plan, or lacks something.
         WorkspaceError: it is missing or no JSON.
     """
+    path = Path(path)
     data = read_json(path)
     try:
         if {key: data[key] for key in _FORMAT} != _FORMAT:

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from alice_survey.base.compiled import compiled
 from alice_survey.base.records import CloudRecord
-from reconstruct.dense.dem import DemGrid, bin_points, sorted_ranks
+from reconstruct.dense.dem import bin_points, sorted_ranks
 from reconstruct.dense.points import Points
+from reconstruct.raster import DemGrid
 from reconstruct.views.model import WorldFrame
 
 Float32 = NDArray[np.float32]
@@ -170,7 +171,7 @@ def laz_writer(
     """A LAZ file (1.4, point format 7) that takes parts of `VERTEX` records as they pass.
 
     Coordinates are east, north and up in steps of 1/10000 of the unit, from the offset that the
-    header tells; colours are 16-bit; normals and sigma are extra dimensions. The projection is that
+    header gives; colours are 16-bit; normals and sigma are extra dimensions. The projection is that
     of the rasters where there is one.
 
     Yields:

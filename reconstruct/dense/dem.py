@@ -1,8 +1,6 @@
 """The digital elevation model: one robust height per cell, positive up, with sigma and count."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -10,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.compiled import compiled
-from alice_survey.base.frames import Array
 from reconstruct.dense.points import Points
+from reconstruct.raster import DemGrid
 
 Float32 = NDArray[np.float32]
 
@@ -22,70 +20,6 @@ STRAY_CELLS = 8
 """Reach of the square around a cell in which others must be known."""
 _LEAST_COMPANY = 0.22
 """Share of that square that must be known; what is lonelier is mostly wrong."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class DemGrid:
-    """Square cells in rows from north to south, columns from west to east.
-
-    In the `model` frame "north" and "east" are the first and second axis of the model.
-    """
-
-    west: float
-    """East coordinate of the outer edge of the first column."""
-    north: float
-    """North coordinate of the outer edge of the first row."""
-    cell: float
-    rows: int
-    columns: int
-
-    def east_of(self, column: NDArray[Any] | float) -> Array:
-        """East coordinate of a position in columns; cell centres are at n + 0.5."""
-        return np.asarray(self.west + np.asarray(column) * self.cell)
-
-    def north_of(self, row: NDArray[Any] | float) -> Array:
-        """North coordinate of a position in rows; cell centres are at n + 0.5."""
-        return np.asarray(self.north - np.asarray(row) * self.cell)
-
-    def window(self, row: int, column: int, rows: int, columns: int) -> "DemGrid":
-        """A part of the grid, clipped to it only where the caller does."""
-        return DemGrid(
-            west=self.west + column * self.cell,
-            north=self.north - row * self.cell,
-            cell=self.cell,
-            rows=rows,
-            columns=columns,
-        )
-
-    def moved(self, east: float, north: float) -> "DemGrid":
-        """The same cells, in coordinates in which they lie elsewhere."""
-        return DemGrid(
-            west=self.west + east,
-            north=self.north + north,
-            cell=self.cell,
-            rows=self.rows,
-            columns=self.columns,
-        )
-
-
-def grid_over(bounds: Sequence[tuple[float, float, float, float]], cell: float) -> DemGrid:
-    """The grid, aligned to whole cells, that covers boxes of (south, west, north, east)."""
-    boxes = np.array(bounds)
-    south, west = np.floor(boxes[:, :2].min(axis=0) / cell)
-    north, east = np.ceil(boxes[:, 2:].max(axis=0) / cell)
-    return DemGrid(
-        west=float(west * cell),
-        north=float(north * cell),
-        cell=cell,
-        rows=int(north - south),
-        columns=int(east - west),
-    )
-
-
-def round_cell(length: float) -> float:
-    """Round a length to two significant digits, for cells that people can name."""
-    digits = 1 - math.floor(math.log10(length))
-    return round(length, digits)
 
 
 def fuse_points(

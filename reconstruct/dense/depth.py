@@ -9,7 +9,7 @@ from reconstruct.dense.rectify import Rectification, depth_in_reference, rectify
 from reconstruct.views.model import View
 
 MATCH_SIGMA_PX = 0.3
-"""Standard deviation of a match that semi-global matching finds, before a survey tells its own."""
+"""Standard deviation of a match that semi-global matching finds, before a survey gives its own."""
 _BLOCK_PX = 5
 _JUMP_PX = 1.0
 """A step of disparity between neighbours from which on both are taken to mix near and far."""
@@ -103,9 +103,9 @@ def pair_depth(
         reference: view to find depth for.
         partner: view to match with.
         grey_reference: (H, W) picture of even light.
-        grey_partner: likewise.
+        grey_partner: of the partner.
         valid_reference: (H, W) which pixels may be used.
-        valid_partner: likewise.
+        valid_partner: of the partner.
         points_world: (N, 3) points that bound the depth.
         match_sigma_px: standard deviation of a match.
 

@@ -8,13 +8,11 @@ from numpy.typing import NDArray
 
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
-from reconstruct.views.model import View
+from reconstruct.views.model import View, enu_from_cam
 from reconstruct.views.sight import FAST, KernelLens, lens_of, slopes_of
-from reconstruct.views.sight import pinhole_of as pinhole_of  # the mosaic takes it from here
 
 Float32 = NDArray[np.float32]
 
-_ENU_FROM_WORLD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _BLOCK = 16
 """Side of a block of pixels whose points are looked at together, pixels."""
 _ROUNDING = 1e-6
@@ -30,20 +28,13 @@ class Points:
     enu: Float32
     """(N, 3) east, north, up from an offset that the caller knows."""
     normals: Float32
-    """(N, 3) unit vectors towards the camera; NaN beside unknown depth."""
+    """(N, 3) unit vectors towards the camera; NaN next to unknown depth."""
     colours: NDArray[np.uint8]
     """(N, 3) RGB."""
     sigmas: Float32
     """(N,) standard deviations of the depth."""
     views: NDArray[np.int32]
     """(N,) number of the view, in ascending order."""
-
-
-def enu_from_cam(view: View, offset_enu: Array) -> Array:
-    """(3, 4) transform from a view's camera to east, north, up from an offset."""
-    matrix = _ENU_FROM_WORLD @ view.world_from_cam.as_matrix()[:3]
-    matrix[:, 3] -= offset_enu
-    return np.ascontiguousarray(matrix)
 
 
 def points_in_box(
@@ -94,7 +85,7 @@ def block_bounds(
     Args:
         shape: (H, W) of the picture.
         rows: (N,) of pixels.
-        columns: (N,) likewise.
+        columns: (N,) of the same pixels.
         world: (N, 3) their points: north, east, down.
 
     Returns:
@@ -177,7 +168,7 @@ def gather(
         meeting: (h, w) blocks of pixels of which any may be in the box.
 
     Returns:
-        (N, 3), (N, 3), (N, 3), (N,), row by row; a normal is NaN beside unknown depth.
+        (N, 3), (N, 3), (N, 3), (N,), row by row; a normal is NaN next to unknown depth.
     """
     height, width = depth.shape
     t = enu_from_cam

@@ -22,7 +22,7 @@ from reconstruct.views.model import SparseModel
 _COMPANY = 16
 """Sparse points around a spot of which the median counts: a single one may be a wrong match."""
 _NODE_CELLS = 16
-"""Cells of the DEM between places where it is told."""
+"""Cells of the DEM between places where it is computed."""
 _SAME = 1e-6
 """Of the model's size: how far points of the two files may lie apart."""
 
@@ -81,7 +81,7 @@ def spread_over(nodes: Array, rows: int, columns: int) -> Array:
 
 @progress.step("find what poses add to errors")
 def find_pose_part(workspace: Path, model: SparseModel) -> PosePart | None:
-    """What the poses leave unsure of the surface; None, with a warning, where nothing tells it."""
+    """What the poses leave unsure of the surface; None, with a warning, where it is not known."""
     path = workspace / "mapping" / "covariance.npz"
     if not path.is_file():
         warn("no mapping/covariance.npz: sigma.tif leaves out what errors of poses do to heights")

@@ -51,26 +51,6 @@ def intrinsics(view: View) -> Array:
     return np.array([[view.fx_px, 0.0, view.cx_px], [0.0, view.fy_px, view.cy_px], [0.0, 0.0, 1.0]])
 
 
-def scaled_view(view: View, scale: float) -> View:
-    """The same view in a picture shrunk by a factor (1 keeps it)."""
-    from dataclasses import replace
-
-    if scale == 1.0:
-        return view
-    width, height = round(view.width_px * scale), round(view.height_px * scale)
-    sx, sy = width / view.width_px, height / view.height_px
-    return replace(
-        view,
-        width_px=width,
-        height_px=height,
-        fx_px=view.fx_px * sx,
-        cx_px=view.cx_px * sx,
-        fy_px=view.fy_px * sy,
-        cy_px=view.cy_px * sy,
-        shift=None if view.shift is None else view.shift.scaled(sx, sy),
-    )
-
-
 def rectify(reference: View, partner: View, points_world: Array) -> Rectification | None:
     """Find the virtual pictures of a pair that hold what both see.
 
@@ -207,7 +187,7 @@ def triangulate(
     """Depth of every pixel from the two refracted rays of its match.
 
     A match says which pixels p and q of the two warped pictures show one spot. Where the pinholes
-    see it depends on its depth, which the pair of pinhole pixels tells: two rounds, of which each
+    see it depends on its depth, which the pair of pinhole pixels gives: two rounds, of which each
     gains the ratio of the port's shift to the disparity (under 0.01), settle it.
 
     Args:
@@ -216,7 +196,7 @@ def triangulate(
         reference: its lens.
         partner: its lens.
         rect_from_reference: (3, 3) from the model's pixels to the virtual picture's array indices.
-        rect_from_partner: (3, 3) likewise.
+        rect_from_partner: (3, 3) rotation of the partner.
         cosines: as in `Rectification`.
         focal_baseline: of the virtual pictures.
         offset_px: of the disparity.

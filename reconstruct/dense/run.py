@@ -19,10 +19,9 @@ from alice_survey.base.errors import ReconstructionError, warn
 from alice_survey.base.executor import parallel_map
 from alice_survey.base.records import SurfaceRecord
 from reconstruct.dense.cloud import laz_writer, voxel_edge, write_cloud_json, write_ply
-from reconstruct.dense.dem import FILL_CELLS, DemGrid, grid_over, round_cell
+from reconstruct.dense.dem import FILL_CELLS
+from reconstruct.dense.matching_trial import find_conditions
 from reconstruct.dense.pose_part import find_pose_part
-from reconstruct.dense.probe import find_conditions
-from reconstruct.dense.rectify import scaled_view
 from reconstruct.dense.stereo_pairs import choose_pairs, neighbours, points_in_sight
 from reconstruct.dense.tiles import Tile, ViewSummary, fuse_tile, tile_tasks
 from reconstruct.dense.view_store import ViewStore
@@ -40,8 +39,8 @@ from reconstruct.dense.views import (
     view_depth,
 )
 from reconstruct.light.solve import joined_samples, solve_light, write_light
-from reconstruct.raster import preview_dem, tiled_raster
-from reconstruct.views.model import SparseModel, WorldFrame, read_model
+from reconstruct.raster import DemGrid, grid_over, preview_dem, round_cell, tiled_raster
+from reconstruct.views.model import SparseModel, WorldFrame, read_model, scaled_view
 
 CELL_PIXELS = 2.5
 """Side of a DEM cell in mean ground pixels of the pictures as matched, unless depth is coarser."""

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
-from reconstruct.views.model import SparseModel, View
+from reconstruct.views.model import SparseModel, View, points_of_views
 
 LEAST_POINTS = 8
 """Sparse points that a view must see for its range of depths to be known."""
@@ -47,14 +47,6 @@ class StereoPair:
     """Share of the reference's points that the partner sees."""
     base_to_height: float
     """Baseline across the line of sight, over the median distance."""
-
-
-def points_of_views(model: SparseModel) -> list[Array]:
-    """World coordinates (N, 3) of the sparse points that each view observed."""
-    order = np.argsort(model.observations[:, 1], kind="stable")
-    points, views = model.observations[order].T
-    starts = np.searchsorted(views, np.arange(1, len(model.views)))
-    return [model.points_world[seen] for seen in np.split(points, starts)]
 
 
 def in_frame(view: View, points_world: Array) -> NDArray[np.bool_]:
@@ -169,7 +161,7 @@ def choose_pairs(model: SparseModel, per_view: int = 4) -> list[list[StereoPair]
 
 
 def _quality(ratio: float) -> float:
-    """Chance that a match at this base-to-height ratio is found and tells depth well."""
+    """Chance that a match at this base-to-height ratio is found and determines depth well."""
     low, high = _GOOD_RATIO
     if ratio < low:
         return 0.8 * float(np.sqrt(ratio / low))

@@ -14,7 +14,6 @@ from reconstruct.dense.cloud import thinned_points
 from reconstruct.dense.dem import (
     FILL_CELLS,
     STRAY_CELLS,
-    DemGrid,
     fill_gaps,
     fuse_points,
     slope_deg,
@@ -24,7 +23,7 @@ from reconstruct.dense.points import joined, points_in_box
 from reconstruct.dense.pose_part import PosePart, spread_over
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.light.solve import LightModel, LightSamples
-from reconstruct.raster import tiles_of
+from reconstruct.raster import DemGrid, tiles_of
 from reconstruct.views.model import View
 
 _TILE_CELLS = 256
@@ -117,9 +116,9 @@ def tile_tasks(
             row - rim[0], column - rim[2], rows + rim[0] + rim[1], columns + rim[2] + rim[3]
         )
         south, east = float(part.north_of(part.rows)), float(part.east_of(part.columns))
-        beside = (bounds[:, 0] >= part.north) | (bounds[:, 2] <= south)
-        beside |= (bounds[:, 1] >= east) | (bounds[:, 3] <= part.west)
-        seeing = [(index, views[index]) for index in np.flatnonzero(~beside).tolist()]
+        away = (bounds[:, 0] >= part.north) | (bounds[:, 2] <= south)
+        away |= (bounds[:, 1] >= east) | (bounds[:, 3] <= part.west)
+        seeing = [(index, views[index]) for index in np.flatnonzero(~away).tolist()]
         poses = None
         if pose_part is not None:
             poses = pose_part.at_nodes(part.north, part.west, part.cell, part.rows, part.columns)

@@ -17,14 +17,15 @@ from alice_survey.base.executor import parallel_map
 from alice_survey.base.frames import Array
 from reconstruct.dense.depth import pair_depth
 from reconstruct.dense.fusion import GATE_SIGMAS, count_witnesses, merge_depths
+from reconstruct.dense.matching_trial import shrunk
 from reconstruct.dense.points import block_bounds
-from reconstruct.dense.probe import open_pictures, shrunk
-from reconstruct.dense.refine import Look, prepared, refine
+from reconstruct.dense.refine_depth import ComparedView, prepared, refine
 from reconstruct.dense.stereo_pairs import StereoPair, in_frame
 from reconstruct.dense.tiles import ViewSummary
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.light.solve import LightSamples, at_nodes, compare_light, joined_samples, low_pass
 from reconstruct.pictures.normalise import normalise
+from reconstruct.pictures.undistorted import Pictures
 from reconstruct.views.model import View
 from reconstruct.views.sight import lens_of, slopes_of
 
@@ -36,7 +37,7 @@ LOOKS = 4
 """Neighbours by which depth is refined."""
 _DOUBTERS = 12
 _DOUBT_STEP = 7
-"""Views, and pixels between the pixels of each, by which the doubt is told."""
+"""Views, and pixels between the pixels of each, by which the doubt is measured."""
 _LEAST_PIXELS = 100
 """A view with fewer pixels of confirmed depth is left out."""
 
@@ -91,7 +92,7 @@ def prepare_view(task: PrepareTask) -> None:
     store = task.store
     if store.has(task.index, "low"):
         return
-    colour, valid = shrunk(open_pictures(task.workspace), task.image, task.size_px)
+    colour, valid = shrunk(Pictures.open(task.workspace), task.image, task.size_px)
     store.save_colour(task.index, colour)
     store.save_mask(task.index, "valid", valid)
     store.save(task.index, "low", low_pass(colour, valid))
@@ -147,7 +148,7 @@ def refine_view(task: RefineTask) -> None:
     looks = []
     for number, view in ((task.index, task.view), *task.others):
         contrast, spline, valid = _look(store, number, view.width_px)
-        looks.append(Look(view=view, contrast=contrast, spline=spline, valid=valid))
+        looks.append(ComparedView(view=view, contrast=contrast, spline=spline, valid=valid))
     depth, sigma = store.load_depth(task.index, "depth")
     refined = refine(looks[0], depth, sigma, looks[1:])
     agreeing = np.asarray(store.load(task.index, "agreeing"))
@@ -162,13 +163,13 @@ def refine_view(task: RefineTask) -> None:
 def find_doubt(checks: Sequence[CheckTask], threads: int) -> float:
     """How far refined depths of neighbouring views differ, in standard deviations as stated.
 
-    What the noise of pictures cannot tell (detail finer than the window, poses, calibration) shows
+    What the noise of pictures cannot show (detail finer than the window, poses, calibration) shows
     where views differ. The median over some views spread over the survey; at least 1.
     """
     step = max(1, len(checks) // _DOUBTERS)
     spreads = list(parallel_map(disagreement, checks[::step], threads=threads, label="compare"))
-    told = [spread for spread in spreads if np.isfinite(spread)]
-    return max(1.0, float(np.median(told))) if told else 1.0
+    known = [spread for spread in spreads if np.isfinite(spread)]
+    return max(1.0, float(np.median(known))) if known else 1.0
 
 
 def disagreement(task: CheckTask) -> float:
@@ -193,7 +194,7 @@ def disagreement(task: CheckTask) -> float:
 
 
 def looked_at(views: Sequence[View], index: int, pairs: Sequence[StereoPair]) -> list[int]:
-    """Views to refine depth with: partners at other stations, whose baselines tell depth best.
+    """Views to refine depth with: partners at other stations, whose baselines determine depth best.
 
     That of the same station is taken where there are fewer than two others.
     """

@@ -9,11 +9,10 @@ import rasterio
 from alice_survey.base.errors import ReconstructionError, WorkspaceError, warn
 from alice_survey.base.records import ChangeRecord
 from alice_survey.base.run import progress
-from reconstruct.dense.dem import DemGrid
 from reconstruct.evaluate.change import SIGNIFICANT, Change, find_change, without
 from reconstruct.evaluate.elevation import Elevation, enu_from_enu, read_elevation
 from reconstruct.evaluate.height_registration import HeightFit, refine_heights, register_heights
-from reconstruct.raster import BLOCK, crs_of, frame_tags, transform_of
+from reconstruct.raster import BLOCK, DemGrid, crs_of, frame_tags, transform_of
 from reconstruct.views.model import WorldFrame
 
 _MUCH = 0.5

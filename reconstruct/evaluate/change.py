@@ -112,7 +112,7 @@ def find_change(now: Elevation, before: Elevation, fit: HeightFit) -> Change:
     """Differences of two registered surveys.
 
     A place is found where most cells exceed their sigma, and followed outwards while the mean of
-    the ring around it has changed: where a change fades, no cell by itself tells.
+    the ring around it has changed: where a change fades, no cell by itself does.
 
     Args:
         now: its grid is that of the result.

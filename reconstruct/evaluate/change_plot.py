@@ -64,7 +64,7 @@ def _opacity(values: Array) -> Array:
 
 
 def _histogram(axis: Any, change: Change) -> None:
-    """Unchanged ground in standard deviations, beside what chance would give."""
+    """Unchanged ground in standard deviations, and what chance would give."""
     stable = np.isfinite(change.difference) & ~change.changed
     ratio = change.significance[stable]
     edges = np.linspace(-6, 6, 97)

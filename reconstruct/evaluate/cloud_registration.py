@@ -25,7 +25,7 @@ _LEAST_PAIRS = 200
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Surface:
+class ReferenceSurface:
     """A cloud that knows the plane through the neighbours of each point."""
 
     points: Array
@@ -33,7 +33,7 @@ class Surface:
     tree: cKDTree
 
     @classmethod
-    def of(cls, points: Array) -> "Surface":
+    def of(cls, points: Array) -> "ReferenceSurface":
         """From (N, 3) points."""
         return cls(points=points, tree=cKDTree(points))
 
@@ -85,7 +85,7 @@ class CloudFit:
 
 
 def register_cloud(
-    cloud: Array, reference: Surface, start: Similarity, *, free_scale: bool,
+    cloud: Array, reference: ReferenceSurface, start: Similarity, *, free_scale: bool,
     rng: np.random.Generator,
 ) -> CloudFit:  # fmt: skip
     """Adjust where a cloud lies on a reference.
@@ -110,12 +110,12 @@ def register_cloud(
 
 
 def _adjust(
-    cloud: Array, reference: Surface, start: Similarity, *, free_scale: bool
+    cloud: Array, reference: ReferenceSurface, start: Similarity, *, free_scale: bool
 ) -> CloudFit:  # fmt: skip
     pose, spacing = start, reference.spacing
     unknowns = 7 if free_scale else 6
     low, high = reference.points.min(axis=0), reference.points.max(axis=0)
-    for done in range(1, _ROUNDS + 1):  # noqa: B007 - told in the result
+    for done in range(1, _ROUNDS + 1):  # noqa: B007 - used in the result
         moved = pose.apply(cloud)
         middles, normals, nearest = reference.planes_at(moved)
         inside = np.all((moved[:, :2] >= low[:2]) & (moved[:, :2] <= high[:2]), axis=1)

@@ -30,7 +30,7 @@ def rounded(value: float, digits: int) -> float | None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Doming:
+class ModelBend:
     """The bend of a model: a paraboloid fitted to its height errors."""
 
     dome_m: float
@@ -51,7 +51,7 @@ class Doming:
         }
 
 
-def fit_doming(places_m: Array, errors_m: Array) -> Doming:
+def fit_doming(places_m: Array, errors_m: Array) -> ModelBend:
     """Fit `error = a + b x + c y + d x^2 + e x y + f y^2` over medians of square blocks.
 
     Medians keep outliers out. Errors of neighbouring cells go together, so that cells would promise
@@ -62,7 +62,7 @@ def fit_doming(places_m: Array, errors_m: Array) -> Doming:
         places_m: (N, 2) where the errors are.
         errors_m: (N,) height errors, positive where the model is too high.
     """
-    unknown = Doming(dome_m=math.nan, sigma_m=math.nan, bend_m=math.nan, radius_m=math.nan)
+    unknown = ModelBend(dome_m=math.nan, sigma_m=math.nan, bend_m=math.nan, radius_m=math.nan)
     if len(places_m) < _LEAST_BLOCKS:
         return unknown
     corner, far = places_m.min(axis=0), places_m.max(axis=0)
@@ -93,7 +93,7 @@ def fit_doming(places_m: Array, errors_m: Array) -> Doming:
     covariance = variance * np.linalg.inv(design.T @ design)
     mean = np.array([0, 0, 0, 0.5, 0, 0.5])
     bends = np.linalg.eigvalsh([[values[3], values[4] / 2], [values[4] / 2, values[5]]])
-    return Doming(
+    return ModelBend(
         dome_m=-float(mean @ values),
         sigma_m=math.sqrt(float(mean @ covariance @ mean)),
         bend_m=-float(bends[np.abs(bends).argmax()]),

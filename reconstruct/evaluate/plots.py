@@ -112,7 +112,7 @@ def plot_sheet(
 
 
 def _size(width_m: float, height_m: float) -> tuple[float, float]:
-    """Of a figure with a map beside something else, inches: higher where the map is."""
+    """Of a figure with a map next to something else, inches: higher where the map is."""
     return 11.0, 5.5 * min(max(0.9 * height_m / width_m, 1.0), 1.7)
 
 

@@ -15,7 +15,7 @@ from alice_survey.base.frames import Array
 from alice_survey.base.records import ReferenceRecord, RegistrationRecord
 from alice_survey.base.run import progress
 from reconstruct.evaluate.cloud_files import read_own_cloud, read_reference
-from reconstruct.evaluate.cloud_registration import CloudFit, Surface, register_cloud
+from reconstruct.evaluate.cloud_registration import CloudFit, ReferenceSurface, register_cloud
 from reconstruct.evaluate.figures import fit_doming, rms, rounded
 from reconstruct.placing.alignment import Similarity
 from reconstruct.views.model import SparseModel, read_model
@@ -29,7 +29,7 @@ _NAVIGATION = "navigation"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Distances:
+class CloudDistances:
     """Points of one cloud from the surface of another, where that one covers the ground."""
 
     points: Array
@@ -60,7 +60,7 @@ class Distances:
         return figures
 
 
-def distances(points: Array, surface: Surface, rng: np.random.Generator) -> Distances:
+def distances(points: Array, surface: ReferenceSurface, rng: np.random.Generator) -> CloudDistances:
     """Distances of a cloud from a surface, both ways to be called.
 
     Args:
@@ -77,7 +77,7 @@ def distances(points: Array, surface: Surface, rng: np.random.Generator) -> Dist
     if not covered.any():
         raise WorkspaceError("the survey and the reference cover no common ground")
     signed, nearest = surface.distance(points[covered])
-    return Distances(
+    return CloudDistances(
         points=points[covered],
         signed_m=signed,
         nearest_m=nearest,
@@ -85,7 +85,7 @@ def distances(points: Array, surface: Surface, rng: np.random.Generator) -> Dist
     )
 
 
-def covers(surface: Surface, points: Array) -> NDArray[np.bool_]:
+def covers(surface: ReferenceSurface, points: Array) -> NDArray[np.bool_]:
     """Whether a square of the plan under each of (N, 3) points holds points of a surface."""
     side = _COVER_SPACINGS * surface.spacing
     low = surface.points[:, :2].min(axis=0)
@@ -156,13 +156,13 @@ def evaluate_reference(
     rng = np.random.default_rng(seed)
     own = read_own_cloud(workspace)
     theirs, placed = read_reference(reference, model.frame.datum)
-    surface = Surface.of(theirs)
+    surface = ReferenceSurface.of(theirs)
     start = lifted(own, surface)
     fit = register_cloud(own, surface, start, free_scale=free_scale, rng=rng)
     moved = fit.reference_from_cloud.apply(own)
     pixel_m = ground_pixel_of(model) * fit.reference_from_cloud.scale
     ours = distances(moved, surface, rng)
-    back = distances(theirs, Surface.of(moved), rng)
+    back = distances(theirs, ReferenceSurface.of(moved), rng)
     figures = {
         "format": "alice-survey reference",
         "version": 1,
@@ -183,7 +183,7 @@ def evaluate_reference(
     return _text(figures, folder), figures
 
 
-def lifted(own: Array, surface: Surface) -> Similarity:
+def lifted(own: Array, surface: ReferenceSurface) -> Similarity:
     """Where both cover the ground their median heights are made equal: datums often differ.
 
     Where they share no ground the middles are laid on each other.
@@ -198,7 +198,7 @@ def lifted(own: Array, surface: Surface) -> Similarity:
     return Similarity(scale=1.0, rotation=Rotation.identity(), translation=shift)
 
 
-def _completeness(back: Distances, pixel_m: float, *, all_of_it: bool) -> dict[str, float]:
+def _completeness(back: CloudDistances, pixel_m: float, *, all_of_it: bool) -> dict[str, float]:
     """Share of the reference's points within some ground pixels of the survey's surface."""
     share = back.covered_share if all_of_it else 1.0
     return {

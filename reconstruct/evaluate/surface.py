@@ -27,7 +27,7 @@ from reconstruct.raster import opened_raster
 GOOD_M = 0.01
 """A cell counts as accurate when its distance from the true surface is below this."""
 WITHIN_PX = (1, 2, 3, 5)
-"""Ground pixels within which completeness is told."""
+"""Ground pixels within which completeness is reported."""
 LEAST_STATIONS = 3
 """Cells seen from so many stations are scored on their own as well."""
 

@@ -1,4 +1,4 @@
-"""What only the evaluation may read: the truth beside simulated pictures."""
+"""What only the evaluation may read: the truth next to simulated pictures."""
 
 import csv
 from pathlib import Path

@@ -21,7 +21,7 @@ _DENSE_PICTURES = 400
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Equations:
+class LightEquations:
     """Samples as equations: nodes @ x + gain of view 0 - gain of view 1 = target, N rows."""
 
     nodes: NDArray[np.int64]
@@ -43,7 +43,7 @@ class Equations:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Prior:
+class LightPrior:
     """What is known beforehand."""
 
     patterns: Array
@@ -57,7 +57,12 @@ class Prior:
 
 
 def solve_robustly(
-    equations: Equations, target: Array, prior: Prior, misfit: float, per_fact: float, rounds: int
+    equations: LightEquations,
+    target: Array,
+    prior: LightPrior,
+    misfit: float,
+    per_fact: float,
+    rounds: int,
 ) -> tuple[Array, Array, float]:
     """Nodes and fall-off (P + 1,), gains (V,), and the variance of the fall-off.
 
@@ -69,7 +74,7 @@ def solve_robustly(
         target: (N,) differences of logarithms.
         prior: what holds without them.
         misfit: where an error becomes large; also the expected size of one.
-        per_fact: samples that together tell as much as one independent one.
+        per_fact: samples that together count as much as one independent one.
         rounds: of reweighting.
     """
     e = equations
@@ -139,7 +144,7 @@ def solve_symmetric(matrix: Array, right: Array) -> Array:
     return found
 
 
-def _gains_block(e: Equations, own: Array, shared: Array) -> csc_array:
+def _gains_block(e: LightEquations, own: Array, shared: Array) -> csc_array:
     a, b = e.pairs[:, 0], e.pairs[:, 1]
     every = np.arange(e.pictures)
     values = np.concatenate([own, -shared, -shared])
@@ -156,7 +161,7 @@ def normal_equations(
     """Sums over samples, reweighted at a solution.
 
     Args:
-        nodes: see `Equations`, as all up to `pair`.
+        nodes: see `LightEquations`, as all up to `pair`.
         weights: as above.
         farther: as above.
         views: as above.
@@ -166,7 +171,7 @@ def normal_equations(
         x: (P + 1,) solution so far.
         gains: (V,).
         misfit: see `solve_robustly`.
-        per_fact: likewise.
+        per_fact: see above.
 
     Returns:
         Upper triangle of the patterns' normal matrix (P + 1, P + 1), the part they share with

@@ -1,13 +1,13 @@
-"""Light of lamps and lens taken out of the colours, as far as overlapping pictures tell it.
+"""Light of lamps and lens taken out of the colours, as far as overlapping pictures determine it.
 
 A lamp that travels with the camera leaves the same pattern in every picture: the model is
 `log I = log J + m(camera, place in the picture) + g(picture)`, with J what the sea floor itself
-shows. Two pictures that see one spot share J, so that their difference tells m and g without any
+shows. Two pictures that see one spot share J, so that their difference gives m and g without any
 assumption about the scene (the multiplicative part of Koeser et al. 2021, "Robustly removing deep
-sea lighting effects for visual mapping of abyssal plains"). What overlaps cannot tell, such as the
+sea lighting effects for visual mapping of abyssal plains"). What overlaps leave open, such as the
 fall-off across a single line, is taken from the median of all pictures, in which the scene averages
 out; it weighs the more, the more pictures there are. Along a line a lamp brighter ahead looks like
-pictures that grow darker one by one: there the pictures' own brightness tells, which the sea floor
+pictures that grow darker one by one: there the pictures' brightness counts, which the sea floor
 changes at random and a drift would not. Where overlaps speak they outweigh both.
 """
 
@@ -24,20 +24,20 @@ from alice_survey.base.compiled import compiled
 from alice_survey.base.contents import taken_from
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
-from reconstruct.light.equations import Equations, Prior, solve_robustly
+from reconstruct.light.equations import LightEquations, LightPrior, solve_robustly
 
 GRID = (9, 11)
 """Rows and columns of nodes over a picture, first and last on its edges."""
 LOW_WIDTH_PX = 108
 """Width to which pictures are shrunk before their light is compared."""
 _DARKEST, _BRIGHTEST = 3.0, 250.0
-"""Grey levels beyond which a pixel tells nothing of the light."""
+"""Grey levels beyond which a pixel says nothing of the light."""
 _MISFIT = 0.1
 """Difference of logarithms above which two views of a spot count less (shadow, gloss, mismatch)."""
 _NODE_SIGMA, _BEND_SIGMA, _GAIN_SIGMA = 2.0, 0.05, 0.3
 """Expected size of m at a node, of its second difference, and of g; logarithms."""
 SAMPLES_PER_FACT = 20.0
-"""Samples of one pair of pictures that together tell as much as one independent one."""
+"""Samples of one pair of pictures that together count as much as one independent one."""
 _ROUNDS = 6
 _FALL_OFF_SIGMA = 4.0
 """Expected logarithm of the light lost over the middle range."""
@@ -218,16 +218,16 @@ def solve_patterns(
     equations = _equations(samples, camera_of, len(names))
     bends = _prior(len(names), _FALL_OFF_SIGMA / middle if middle > 0 else 1.0)
     pull, pulled = _typical(nodes, camera_of, len(names))
-    brightness, told = _brightness(nodes, camera_of, len(names))
+    brightness, known_gain = _brightness(nodes, camera_of, len(names))
     levels = samples.levels.astype(np.float64)
     found = [
         solve_robustly(
             equations,
             levels[:, 0, channel] - levels[:, 1, channel],
-            Prior(
+            LightPrior(
                 patterns=bends + np.diag(pull[:, channel]),
                 right=pulled[:, channel],
-                gain=gain_sigma**-2 + told / _SCENE_SIGMA**2,
+                gain=gain_sigma**-2 + known_gain / _SCENE_SIGMA**2,
                 gain_right=brightness[:, channel] / _SCENE_SIGMA**2,
             ),
             _MISFIT,
@@ -251,7 +251,7 @@ def solve_patterns(
     )
 
 
-def _equations(samples: LightSamples, camera_of: NDArray[np.int64], cameras: int) -> Equations:
+def _equations(samples: LightSamples, camera_of: NDArray[np.int64], cameras: int) -> LightEquations:
     size = GRID[0] * GRID[1]
     views = samples.views.astype(np.int64)
     sides = [node_weights(samples.places[:, side]) for side in range(2)]
@@ -260,7 +260,7 @@ def _equations(samples: LightSamples, camera_of: NDArray[np.int64], cameras: int
     if samples.ranges is not None:
         farther = (samples.ranges[:, 0] - samples.ranges[:, 1]).astype(np.float64)
     pairs, pair = np.unique(np.sort(views, axis=1), axis=0, return_inverse=True)
-    return Equations(
+    return LightEquations(
         nodes=np.ascontiguousarray(np.concatenate(number, axis=1)),
         weights=np.ascontiguousarray(np.concatenate([sides[0][1], -sides[1][1]], axis=1)),
         farther=farther,
@@ -330,11 +330,11 @@ def _typical(nodes: Array, camera_of: NDArray[np.int64], cameras: int) -> tuple[
 
 
 def _brightness(nodes: Array, camera_of: NDArray[np.int64], cameras: int) -> tuple[Array, Array]:
-    """By how much pictures are brighter than their camera's others, (V, 3); whether told, (V,).
+    """By how much pictures are brighter than their camera's others, (V, 3); whether known, (V,).
 
     Only nodes that a camera's pictures have in common are compared.
     """
-    found, told = np.zeros((len(nodes), 3)), np.zeros(len(nodes))
+    found, known_gain = np.zeros((len(nodes), 3)), np.zeros(len(nodes))
     for camera in range(cameras):
         mine = np.flatnonzero(camera_of == camera)
         pictures = nodes[mine].reshape(len(mine), -1, 3)
@@ -347,8 +347,8 @@ def _brightness(nodes: Array, camera_of: NDArray[np.int64], cameras: int) -> tup
             total = np.where(shown[..., None], above, 0.0).sum(axis=1)
             mean = total[known] / count[known, None]
             found[mine[known]] = mean - mean.mean(axis=0)
-            told[mine[known]] = 1.0
-    return found, told
+            known_gain[mine[known]] = 1.0
+    return found, known_gain
 
 
 def at_nodes(low: NDArray[np.float32]) -> Array:

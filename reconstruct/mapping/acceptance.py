@@ -1,7 +1,8 @@
 """Whether a mapping is to be believed: stations against navigation, lengths against the rig.
 
-Both are told, not mended: a station far off navigation may be a jump of navigation as well as a
-wrong pose, and a scale that the rig's own stereo contradicts a wrong rig as well as a bent model.
+Both are reported, not repaired: a station far off navigation may be a jump of navigation as well
+as a wrong pose, and a scale that the rig's own stereo contradicts a wrong rig as well as a bent
+model.
 """
 
 from collections.abc import Sequence
@@ -35,7 +36,7 @@ _NAMED = 8
 
 
 @dataclass(frozen=True, kw_only=True)
-class Far:
+class FarStation:
     """A station that lies elsewhere than navigation has it."""
 
     station: int
@@ -53,7 +54,7 @@ class Acceptance:
     """Stations with a position."""
     usual_m: float
     """Of their distances from navigation, one standard deviation by axis, robustly; NaN without."""
-    far: tuple[Far, ...]
+    far: tuple[FarStation, ...]
     """The farthest first."""
     rig_error: float
     """Relative error of the rig in the finished model; NaN where there is no known rig."""
@@ -111,12 +112,12 @@ def check_mapping(
         records: pictures.
         positions: (N, 3) of the pinholes' centres in NED, as navigation has them; NaN where
             unknown; None without navigation.
-        sigmas: (N, 3), likewise.
+        sigmas: (N, 3); the same for these.
         rig_error: relative error of the rig's baseline in the model; NaN without one.
         scale: of the model against its stations' own stereo.
     """
     checked, usual = 0, float("nan")
-    far: tuple[Far, ...] = ()
+    far: tuple[FarStation, ...] = ()
     if positions is not None and sigmas is not None:
         checked, usual, far = _far_stations(model, records, positions, sigmas)
     found = Acceptance(checked=checked, usual_m=usual, far=far, rig_error=rig_error, scale=scale)
@@ -146,11 +147,11 @@ def check_survey(
 
 def _far_stations(
     model: pycolmap.Reconstruction, records: Sequence[ImageRecord], positions: Array, sigmas: Array
-) -> tuple[int, float, tuple[Far, ...]]:
+) -> tuple[int, float, tuple[FarStation, ...]]:
     first: dict[int, int] = {}
     for number, image in sorted(model.images.items()):
-        told = np.isfinite(positions[number - 1] + sigmas[number - 1]).all()
-        if image.has_pose and told:
+        given = np.isfinite(positions[number - 1] + sigmas[number - 1]).all()
+        if image.has_pose and given:
             first.setdefault(image.frame_id, number)
     numbers = sorted(first.values())
     if len(numbers) < _LEAST_STATIONS:
@@ -162,7 +163,7 @@ def _far_stations(
     off, sigma = misses(centres, positions[rows], sigmas[rows])
     over = off / sigma
     found = [
-        Far(
+        FarStation(
             station=records[row].station,
             image=records[row].image,
             off_m=float(off[k]),
@@ -175,12 +176,12 @@ def _far_stations(
     return len(numbers), float(np.median(off) / _MEDIAN_SIGMAS), ordered
 
 
-def misses(centres: Array, told: Array, sigmas: Array) -> tuple[Array, Array]:
-    """Distances between places and where they are told to be, after a robust rigid alignment.
+def misses(centres: Array, given: Array, sigmas: Array) -> tuple[Array, Array]:
+    """Distances between places and where navigation has them, after a robust rigid alignment.
 
     Args:
         centres: (N, 3) in any frame, metres.
-        told: (N, 3) in NED.
+        given: (N, 3) in NED.
         sigmas: (N, 3) of those.
 
     Returns:
@@ -192,7 +193,7 @@ def misses(centres: Array, told: Array, sigmas: Array) -> tuple[Array, Array]:
     off = np.zeros(len(centres))
     spread = 1.0
     for _ in range(_ROUNDS):
-        off = np.linalg.norm(_aligned(centres, told, weight / stated**2) - told, axis=1)
+        off = np.linalg.norm(_aligned(centres, given, weight / stated**2) - given, axis=1)
         spread = max(float(np.median(off / stated)) / _MEDIAN_SIGMAS, 1e-9)
         weight = 1.0 / (1.0 + (off / (_TUNING * spread * stated)) ** 2)
     return off, stated * max(spread, 1.0)

@@ -1,8 +1,7 @@
 """COLMAP's bundle adjustment as this house uses it: poses and points move, rig and cameras do not.
 
-It runs on one thread, since sums of several threads are not the same twice, and takes full
-Gauss-Newton steps, since it starts near its end: COLMAP's own first trust region costs ten
-times the iterations along a block's weak directions.
+It takes full Gauss-Newton steps, since it starts near its end: COLMAP's own first trust region
+costs ten times the iterations along a block's weak directions.
 """
 
 from collections.abc import Callable
@@ -13,6 +12,7 @@ import pycolmap
 
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.robust import loss_scale, pixel_sigma
+from reconstruct.mapping.solver import direct_solver
 
 Adjust = Callable[[Mapped, float], Mapped]
 """Adjusts a model, rig and cameras held, to a relative change of the cost; the one given is not
@@ -28,14 +28,12 @@ The last steps of a robust loss are many and small: of a block of 25 stations, w
 
 def held_options(sigma_px: float, tolerance: float = FULLY) -> pycolmap.BundleAdjustmentOptions:
     """Options that hold cameras and rig, for keypoints of this sigma and some that are wrong."""
-    options = pycolmap.BundleAdjustmentOptions()
+    options = direct_solver(pycolmap.BundleAdjustmentOptions())
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = loss_scale(sigma_px)
-    options.print_summary = False
     options.refine_sensor_from_rig = False
     options.refine_focal_length = options.refine_extra_params = False
     solver = options.ceres.solver_options
-    solver.num_threads = 1
     solver.initial_trust_region_radius = _TRUST
     solver.function_tolerance = tolerance
     return options

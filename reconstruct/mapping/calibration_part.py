@@ -18,7 +18,7 @@ from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import Indices, frames_of
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.exact_sights import choose_pixels, exact_sights, start_state
-from reconstruct.mapping.gauge import Gauge
+from reconstruct.mapping.gauge_freedom import Gauge
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.normal_equations import (
     LEAST_POINTS,
@@ -40,7 +40,7 @@ class CalibrationPart:
     stations: Array
     """(F, 6, G) turns and motions of the stations by the parameters, in the model's axes."""
     places: Array
-    """(P, 3) points at which the motion is told: enough of them, not all."""
+    """(P, 3) points at which the motion is known: enough of them, not all."""
     points: Array
     """(P, 3, G)."""
     covariance: Array
@@ -51,10 +51,10 @@ class CalibrationPart:
         return _spread(self.stations, self.covariance)
 
     def of_points(self, points: Array) -> Array:
-        """Covariances (N, 3, 3) of (N, 3) points: those of the nearest that are told."""
+        """Covariances (N, 3, 3) of (N, 3) points: those of the nearest where it is known."""
         nearest = np.asarray(KDTree(self.places).query(points)[1])
-        told, which = np.unique(nearest, return_inverse=True)
-        found: Array = _spread(self.points[told], self.covariance)[which]
+        given, which = np.unique(nearest, return_inverse=True)
+        found: Array = _spread(self.points[given], self.covariance)[which]
         return found
 
     def without(self, gauge: Gauge) -> "CalibrationPart":
@@ -75,7 +75,7 @@ def _spread(motions: Array, covariance: Array) -> Array:
 
 
 def calibration_part(
-    mapped: Mapped, seen: Observations, rig: Rig, told: Array | None = None
+    mapped: Mapped, seen: Observations, rig: Rig, given: Array | None = None
 ) -> CalibrationPart | None:
     """How a finished model depends on its calibration.
 
@@ -83,7 +83,7 @@ def calibration_part(
         mapped: exact model on the rig; picture i of `seen` has the id i + 1.
         seen: keypoints as warped by the model's lenses.
         rig: with the covariance of its calibration.
-        told: (F, 6) information of the stations' told poses, as in the adjustment; None without.
+        given: (F, 6) information of the stations' given poses, as in the adjustment; None without.
 
     Returns:
         None where the rig states no covariance: then nobody knows.
@@ -98,7 +98,7 @@ def calibration_part(
     sights = exact_sights(state, pixels, fields, names, lever=False)
     sigma = sigma_of(sights.miss, sights.seen_by, len(frames))
     sights = sights.weighted(cauchy_weights(sights.miss, sigma))
-    stations, points = _response(sights, len(frames), sigma**2, told)
+    stations, points = _response(sights, len(frames), sigma**2, given)
     at = [rig.covariance.parameters.index(name) for name in fields]
     return CalibrationPart(
         frames=frames,
@@ -116,17 +116,17 @@ def _known(rig: Rig, names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _response(
-    sights: Sights, count: int, variance: float, told: Array | None
+    sights: Sights, count: int, variance: float, given: Array | None
 ) -> tuple[Array, Array]:
     """Slopes of stations (F, 6, G) and points (P, 3, G) by what is shared, in some gauge."""
     reduced = reduce_points(sights, count)
     matrix = csc_matrix(reduced.matrix / variance)
     seeing = np.bincount(sights.station, minlength=count) >= LEAST_POINTS
     free = np.repeat(seeing, POSE)
-    if told is None:
+    if given is None:
         free[:POSE] = False
     else:
-        matrix = csc_matrix(matrix + diags_array(told.ravel()))
+        matrix = csc_matrix(matrix + diags_array(given.ravel()))
     solve = solver_of(matrix, free)
     shared = reduced.border.shape[1]
     stations = -solve(reduced.border / variance).reshape(count, POSE, shared)

@@ -135,7 +135,7 @@ def measure_doming(
         records: pictures.
         positions: (N, 3) of the pinholes' centres in NED, as navigation has them; NaN where
             unknown; None without navigation.
-        sigmas: (N, 3), likewise.
+        sigmas: (N, 3); the same for these.
         rotations: `ned_from_pinhole` by picture's index, as navigation has it.
     """
     seen = observed(model)
@@ -147,9 +147,9 @@ def measure_doming(
     along = across = None
     if positions is not None and sigmas is not None and len(numbers):
         rows = np.array(numbers) - 1
-        told, sigma = positions[rows], sigmas[rows]
-        known = np.isfinite(told + sigma).all(axis=1)
-        along, across = bend_of(centres[known], told[known, 2], sigma[known, 2], down)
+        given, sigma = positions[rows], sigmas[rows]
+        known = np.isfinite(given + sigma).all(axis=1)
+        along, across = bend_of(centres[known], given[known, 2], sigma[known, 2], down)
     found = Doming(
         along=along,
         across=across,
@@ -229,9 +229,9 @@ def scale_trend(
         None where too few stations have points that both their cameras show.
     """
     local = [
-        (model.images[reference[frame]].projection_center(), *told)
+        (model.images[reference[frame]].projection_center(), *given)
         for frame in sorted(reference)
-        if (told := _station_scale(model, seen, frame)) is not None
+        if (given := _station_scale(model, seen, frame)) is not None
     ]
     if len(local) < _LEAST_STATIONS:
         return None
@@ -268,11 +268,11 @@ def navigation_rotations(
 def down_of(model: pycolmap.Reconstruction, rotations: Mapping[int, Rotation]) -> Array:
     """Down in the model's frame: by navigation's attitudes, else the mean way that cameras look."""
     posed = [n for n in sorted(model.images) if model.images[n].has_pose]
-    told = [n for n in posed if n - 1 in rotations]
+    given = [n for n in posed if n - 1 in rotations]
     rows = [
         model.images[n].cam_from_world().matrix()[:, :3].T
-        @ (rotations[n - 1].inv().apply([0.0, 0.0, 1.0]) if told else [0.0, 0.0, 1.0])
-        for n in told or posed
+        @ (rotations[n - 1].inv().apply([0.0, 0.0, 1.0]) if given else [0.0, 0.0, 1.0])
+        for n in given or posed
     ]
     mean = np.median(np.array(rows), axis=0)
     unit: Array = mean / np.linalg.norm(mean)

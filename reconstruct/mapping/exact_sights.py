@@ -24,7 +24,7 @@ from reconstruct.views.lens import Lens
 _SLOPES = (*PARAMETERS, *TURN_AND_SHIFT)
 """What a camera's pixels depend on: itself, and its place on the rig."""
 _BLOCK = 4096
-"""Observations at a time: what they need beside their results stays in the cache."""
+"""Observations at a time: what they need besides their results stays in the cache."""
 _MOST_OBSERVATIONS = 500_000
 """Linearised they take 1.2 kB each; of more, whole points are left out evenly."""
 
@@ -51,7 +51,7 @@ class Pixels:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class State:
+class RigState:
     """One guess of all unknowns."""
 
     cameras: tuple[FlatPortCamera, ...]
@@ -102,7 +102,7 @@ def choose_pixels(
 
 def start_state(
     mapped: Mapped, rig: Rig, names: Sequence[str], frames: Indices, ids: Indices
-) -> State:
+) -> RigState:
     """A model's poses and points as flat-port cameras on one rig have them.
 
     Args:
@@ -117,7 +117,7 @@ def start_state(
     poses = [
         as_transform(model.frames[int(f)].rig_from_world).inv() * pinhole_from_cam for f in frames
     ]
-    return State(
+    return RigState(
         cameras=tuple(rig.cameras[name] for name in names),
         cam_from_rig=tuple(rig.cam_from_rig[name] * reference.inv() for name in names),
         turns=np.array([p.rotation.as_matrix() for p in poses]),
@@ -128,7 +128,7 @@ def start_state(
 
 
 def exact_sights(
-    state: State, pixels: Pixels, fields: Sequence[str], names: Sequence[str], *, lever: bool
+    state: RigState, pixels: Pixels, fields: Sequence[str], names: Sequence[str], *, lever: bool
 ) -> Sights:
     """The observations linearised; those that no light explains count nothing."""
     count = len(fields) + 3 * lever
@@ -173,7 +173,7 @@ def _put(
     taken: Array, slopes: Array, source: Indices, target: Indices,
     by_point: Array, by_shared: Array, miss: Array,
 ) -> None:  # fmt: skip
-    """Put what one camera tells in its rows, in place; what it does not see stays as it is.
+    """Put what one camera sees in its rows, in place; what it does not see stays as it is.
 
     Args:
         rows: (N,) observations of the camera.
@@ -187,8 +187,8 @@ def _put(
         source: (G',) which of the K are wanted.
         target: (G',) and where among what is shared they go.
         by_point: (O, 2, 3) to fill.
-        by_shared: (O, 2, G) likewise.
-        miss: (O, 2) likewise.
+        by_shared: (O, 2, G) the same way.
+        miss: (O, 2) the same way.
     """
     cam_from_world = np.empty((3, 3))
     for i in range(rows.shape[0]):

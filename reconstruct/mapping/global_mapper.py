@@ -16,6 +16,7 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.base.run import progress
 from reconstruct.mapping.database import Observations, as_transform, rigid3d, station_frames
 from reconstruct.mapping.pose_graph import average_poses, station_groups
+from reconstruct.mapping.solver import direct_solver
 from reconstruct.mapping.stations import link_stations
 
 _FIRST_ERROR_PX = 20.0
@@ -84,7 +85,7 @@ def triangulate_and_adjust(
     rough.filter_points(_filter(options, _FIRST_ERROR_PX))
     model = rough.reconstruction
     adjust(model, options, tolerance=1e-2, robust_px=_ROBUST_PX)
-    # Anew, since the first poses joined what they should not, and left out what they should not.
+    # Again, since the first poses joined what they should not, and left out what they should not.
     poses = {f: as_transform(model.frames[f].rig_from_world) for f in model.reg_frame_ids()}
     mapper = _triangulated(cache, poses, options.get_triangulation())
     model = mapper.reconstruction
@@ -115,7 +116,7 @@ def adjust(
 
     Args:
         model: with registered frames and points.
-        options: tell what of cameras and rig is refined.
+        options: say what of cameras and rig is refined.
         tolerance: relative decrease of the cost below which it ends.
         robust_px: scale of a Cauchy loss; None: plain least squares.
     """
@@ -123,13 +124,11 @@ def adjust(
     for number in sorted(model.reg_image_ids()):
         config.add_image(number)
     config.set_constant_rig_from_world_pose(min(model.reg_frame_ids()))
-    adjustment = options.get_global_bundle_adjustment()
-    adjustment.print_summary = False
+    adjustment = direct_solver(options.get_global_bundle_adjustment())
     if robust_px is not None:
         adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         adjustment.ceres.loss_function_scale = robust_px
     solver = adjustment.ceres.solver_options
-    solver.num_threads = 1
     solver.function_tolerance = tolerance
     if robust_px is None:  # near its end: full Gauss-Newton steps, since weak directions are many
         solver.initial_trust_region_radius = _NO_BOUND

@@ -1,4 +1,4 @@
-"""The relative pose of two stations as their pixels tell it best.
+"""The relative pose of two stations as their pixels determine it best.
 
 A resection takes the first station's stereo points as exact. They are not: where depths are noisy
 by some centimetres, what the second station sees misses by the parallax of that noise, which grows

@@ -323,7 +323,7 @@ def _map_once(
 def _repaired(
     model: pycolmap.Reconstruction, scratch: Path, options: pycolmap.IncrementalPipelineOptions
 ) -> pycolmap.Reconstruction:
-    """A model whose collapsed stations are taken out and registered anew from the others.
+    """A model whose collapsed stations are taken out and registered again from the others.
 
     The first pair is of arbitrary scale; now and then the adjustment shrinks its baseline to
     nothing, with its points in the cameras' common centre, where every ray meets them. The stereo

@@ -1,4 +1,4 @@
-"""Several models: those that share stations become one, and the others are told of by name."""
+"""Several models: those that share stations become one, and the others are reported by name."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,7 +27,7 @@ def merge_models(
     """Join models on one known rig that share stations.
 
     A rig gives every model its scale, so that one shared station suffices to place it. Joined
-    models are triangulated and adjusted anew, so that points of both sides link them.
+    models are triangulated and adjusted again, so that points of both sides link them.
 
     Args:
         models: largest first, on the rig of the database, which is held constant.

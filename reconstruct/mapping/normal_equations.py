@@ -62,7 +62,7 @@ class Sights:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Reduced:
+class ReducedSystem:
     """The normal equations of stations and of what is shared, the points eliminated."""
 
     pointers: Indices
@@ -89,7 +89,7 @@ class Reduced:
         return csc_matrix(bsr_matrix(blocks, shape=(size, size), blocksize=(POSE, POSE)))
 
 
-def reduce_points(sights: Sights, stations: int) -> Reduced:
+def reduce_points(sights: Sights, stations: int) -> ReducedSystem:
     """Eliminate the points.
 
     Args:
@@ -105,7 +105,7 @@ def reduce_points(sights: Sights, stations: int) -> Reduced:
         sights.starts, sights.station, sights.by_point, sights.arm, sights.by_shared, sights.miss,
         pointers, columns,
     )  # fmt: skip
-    return Reduced(
+    return ReducedSystem(
         pointers=pointers,
         columns=columns,
         blocks=blocks,
@@ -318,8 +318,8 @@ def point_covariances(
         by_point: (O, 2, 3).
         arm: (O, 3).
         inverse: (P, 3, 3) V^-1.
-        pointers: pattern of `blocks`, as in `Reduced`.
-        columns: likewise.
+        pointers: pattern of `blocks`, as in `ReducedSystem`.
+        columns: of the matrix.
         blocks: (B, 6, 6) covariances between the stations that see a point in common.
     """
     points = starts.shape[0] - 1

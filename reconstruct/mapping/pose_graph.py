@@ -17,7 +17,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
-from reconstruct.mapping.stations import Link
+from reconstruct.mapping.stations import StationLink
 
 Indices = NDArray[np.int64]
 _ROUNDS = 8
@@ -28,7 +28,7 @@ _MEDIANS = 2.0
 """Residuals of this many medians keep half their weight."""
 
 
-def station_groups(links: Sequence[Link]) -> list[list[int]]:
+def station_groups(links: Sequence[StationLink]) -> list[list[int]]:
     """Stations that links join, the largest group first (of equals that with the first station)."""
     names, ends = _numbered(links)
     graph = coo_array((np.ones(len(links)), ends), shape=(len(names),) * 2)
@@ -38,7 +38,7 @@ def station_groups(links: Sequence[Link]) -> list[list[int]]:
 
 
 @progress.step("average poses")
-def average_poses(links: Sequence[Link]) -> Mapping[int, RigidTransform]:
+def average_poses(links: Sequence[StationLink]) -> Mapping[int, RigidTransform]:
     """Poses that agree best with all links.
 
     Args:
@@ -65,7 +65,7 @@ def average_poses(links: Sequence[Link]) -> Mapping[int, RigidTransform]:
     return {name: poses[k] for k, name in enumerate(names)}
 
 
-def _numbered(links: Sequence[Link]) -> tuple[list[int], tuple[Indices, Indices]]:
+def _numbered(links: Sequence[StationLink]) -> tuple[list[int], tuple[Indices, Indices]]:
     names = sorted({s for link in links for s in (link.first, link.second)})
     number = {name: k for k, name in enumerate(names)}
     first = np.array([number[link.first] for link in links], dtype=np.int64)

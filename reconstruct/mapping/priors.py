@@ -56,7 +56,7 @@ def pinhole_positions(
 
 
 class NavigationAdjuster:
-    """Adjusts models with the positions of navigation, where they are told and agree."""
+    """Adjusts models with the positions of navigation, where they are given and agree."""
 
     def __init__(
         self,
@@ -74,23 +74,25 @@ class NavigationAdjuster:
             datum: of the positions; None where there are none.
         """
         self._records = records
-        self._told = None if datum is None else pinhole_positions(records, rig, lenses, datum)
+        self._given = None if datum is None else pinhole_positions(records, rig, lenses, datum)
         self._used = False
 
     def __call__(self, mapped: Mapped, tolerance: float = FULLY) -> Mapped:
         """The adjusted model."""
-        if self._told is not None and mapped.scaled:
-            refined = refine_with_positions(mapped, self._records, *self._told, tolerance=tolerance)
+        if self._given is not None and mapped.scaled:
+            refined = refine_with_positions(
+                mapped, self._records, *self._given, tolerance=tolerance
+            )
             self._used = refined is not mapped
             if self._used:
                 return refined
-            self._told = None  # said once
+            self._given = None  # said once
         return adjust_freely(mapped, tolerance)
 
     @property
     def sigmas(self) -> Array | None:
         """(N, 3) of the positions that shaped the last model, along its axes; None without."""
-        return self._told[1] if self._used and self._told is not None else None
+        return self._given[1] if self._used and self._given is not None else None
 
 
 def refine_with_positions(
@@ -107,7 +109,7 @@ def refine_with_positions(
         mapped: model whose scale comes from the rig; picture i of `records` has the id i + 1.
         records: pictures.
         positions: (N, 3) of the pinholes' centres in NED; NaN where unknown.
-        sigmas: (N, 3), likewise.
+        sigmas: (N, 3); the same for these.
         tolerance: relative change of the cost at which it ends.
 
     Returns:
@@ -120,16 +122,16 @@ def refine_with_positions(
     known = _one_a_station(model, positions, sigmas)
     if len(known) < _LEAST_STATIONS:
         return mapped
-    told = positions[[number - 1 for number in known]]
+    given = positions[[number - 1 for number in known]]
     # The adjuster's constructor aligns the model with the priors robustly, outliers left out: its
     # scale is taken out of the priors, so that the second one changes it no more.
     pixel = pixel_sigma(model)
     trial = pycolmap.Reconstruction(model)
-    _adjuster(trial, _priors(trial, known, told, sigmas / pixel), pixel, tolerance)
-    middle = told.mean(axis=0)
-    told = middle + (told - middle) * mapped.baseline / model_baseline(trial)
+    _adjuster(trial, _priors(trial, known, given, sigmas / pixel), pixel, tolerance)
+    middle = given.mean(axis=0)
+    given = middle + (given - middle) * mapped.baseline / model_baseline(trial)
     summary = _adjuster(
-        model, _priors(model, known, told, sigmas / pixel), pixel, tolerance
+        model, _priors(model, known, given, sigmas / pixel), pixel, tolerance
     ).solve()
     model.update_point_3d_errors()
     after = model.compute_mean_reprojection_error()
@@ -145,17 +147,17 @@ def refine_with_positions(
 
 
 def _one_a_station(model: pycolmap.Reconstruction, positions: Array, sigmas: Array) -> list[int]:
-    """Pictures whose positions are told: one of each frame, since navigation measured it once."""
+    """Pictures whose positions are given: one of each frame, since navigation measured it once."""
     known: dict[int, int] = {}
     for number, image in sorted(model.images.items()):
-        told = positions[number - 1] + sigmas[number - 1]
-        if image.has_pose and np.isfinite(told).all():
+        given = positions[number - 1] + sigmas[number - 1]
+        if image.has_pose and np.isfinite(given).all():
             known.setdefault(image.frame_id, number)
     return sorted(known.values())
 
 
 def _priors(
-    model: pycolmap.Reconstruction, known: Sequence[int], told: Array, sigmas: Array
+    model: pycolmap.Reconstruction, known: Sequence[int], given: Array, sigmas: Array
 ) -> list[pycolmap.PosePrior]:
     return [
         pycolmap.PosePrior(
@@ -165,7 +167,7 @@ def _priors(
             position_covariance=np.diag(sigmas[number - 1] ** 2),
             coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
         )
-        for number, position in zip(known, told, strict=True)
+        for number, position in zip(known, given, strict=True)
     ]
 
 

@@ -37,7 +37,7 @@ _SETTLED_SIGMAS = 0.05
 """And so have those that move less than this share of their noise, the farthest of them."""
 _ROUNDS = 6
 _UNMOVED_PX = 1e-6
-"""Keypoints that move less are not written anew."""
+"""Keypoints that move less are not written again."""
 _NEAREST, _FARTHEST = 0.2, 20.0
 """Depths of spots over the working depth; beyond, a point is wrong and is left to the filter."""
 _WRONG_SIGMAS, _LEAST_WRONG_PX, _MOST_WRONG_PX = 5.0, 1.0, 4.0

@@ -25,7 +25,7 @@ from reconstruct.mapping.arrays import Indices, frames_of
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.exact_sights import (
     Pixels,
-    State,
+    RigState,
     choose_pixels,
     exact_sights,
     start_state,
@@ -33,7 +33,7 @@ from reconstruct.mapping.exact_sights import (
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.normal_equations import (
     POSE,
-    Reduced,
+    ReducedSystem,
     Sights,
     moved_points,
     reduce_points,
@@ -43,16 +43,16 @@ from reconstruct.mapping.robust import cauchy_weights, sigma_of, variance_of
 
 _PORT_SIGMAS = {"port_distance_m": 0.02, "normal_x": 0.05, "normal_y": 0.05, "n_water": 0.005}
 _RIG_SIGMAS = dict(zip(TURN_AND_SHIFT, [0.02] * 3 + [0.005] * 3, strict=True))
-"""What is known of parameters that no calibration tells: next to nothing."""
+"""What is known of parameters that no calibration determines: next to nothing."""
 _LEVER = ("lever.x_m", "lever.y_m", "lever.z_m")
 """The body's origin in the rig's frame."""
 _LEVER_SIGMA_M = 0.05
 _MOST_LASTING = 0.98
 """Correlation of navigation's errors from one station to the next."""
 _BASELINE_SIGMA_M = 1e-7
-"""Of an uncalibrated baseline: it is the scale, which no picture tells."""
+"""Of an uncalibrated baseline: it is the scale, which no picture determines."""
 _TURN_INFORMATION = 1.0
-"""1/rad^2 of a station whose position is told: a line of stations does not tell its own roll."""
+"""1/rad^2 of a station whose position is given: a line does not determine its own roll."""
 _ROUNDS = 20
 _SETTLED = 3e-2
 """Steps of all parameters, in their sigmas, at which the adjustment ends."""
@@ -98,7 +98,7 @@ class RigFit:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Told:
+class NavigationFixes:
     """Positions of the body's origin by navigation, in the model's frame."""
 
     positions: Array
@@ -114,7 +114,7 @@ def fit_rig(
     *,
     port: bool,
     pose: bool,
-    told: Told | None = None,
+    fixes: NavigationFixes | None = None,
 ) -> RigFit:
     """Refine a rig from a finished model.
 
@@ -123,8 +123,8 @@ def fit_rig(
         seen: keypoints as warped by the model's lenses.
         rig: as calibrated or designed.
         port: free distance and normal of the ports and the water's index.
-        pose: free the poses of the cameras on the rig, and the lever arm where positions are told.
-        told: positions of the body.
+        pose: free the poses of the cameras on the rig, and the lever arm where positions are given.
+        fixes: positions of the body.
 
     Raises:
         ReconstructionError: the survey does not determine what is asked for.
@@ -134,36 +134,36 @@ def fit_rig(
     pixels, ids = choose_pixels(mapped, seen, names, frames)
     prior = _prior(rig, names, port=port, pose=pose)
     fields = prior.parameters
-    told = told if pose else None
-    information = np.zeros((len(fields) + 3 * (told is not None),) * 2)
+    fixes = fixes if pose else None
+    information = np.zeros((len(fields) + 3 * (fixes is not None),) * 2)
     information[: len(fields), : len(fields)] = prior.information
-    if told is not None:
+    if fixes is not None:
         information[-3:, -3:] = np.eye(3) / _LEVER_SIGMA_M**2
     _hold_baseline(information, fields, rig, names)
     state = start_state(mapped, rig, names, frames, ids)
-    told = None if told is None else _lasting(told, state)
-    first = _values(state, fields, names, lever=told is not None)
+    fixes = None if fixes is None else _lasting(fixes, state)
+    first = _values(state, fields, names, lever=fixes is not None)
     drift = np.zeros(len(first))
     variance = np.nan
     for _ in range(_ROUNDS):
-        sights = exact_sights(state, pixels, fields, names, lever=told is not None)
+        sights = exact_sights(state, pixels, fields, names, lever=fixes is not None)
         left = _spare(pixels, len(frames), len(first)) / (2 * len(pixels.station))
         sigma = sigma_of(sights.miss, sights.seen_by, len(frames))
         weights = cauchy_weights(sights.miss, sigma)
         now = variance_of(sights.miss, weights, left)
         sights = sights.weighted(weights)
         variance = now if np.isnan(variance) else min(variance, now)
-        step = _step(sights, state, variance, information, drift, told)
+        step = _step(sights, state, variance, information, drift, fixes)
         state = _moved(state, pixels, step, sights, fields, names)
         drift = drift + step.shared
         if np.all(np.abs(step.shared) < _SETTLED * np.sqrt(np.diag(step.covariance))):
             break
     else:
         warn(f"the rig's refinement did not settle in {_ROUNDS} rounds: trust it with care")
-    parameters = (*fields, *(_LEVER if told is not None else ()))
-    after = _values(state, fields, names, lever=told is not None)
+    parameters = (*fields, *(_LEVER if fixes is not None else ()))
+    after = _values(state, fields, names, lever=fixes is not None)
     return RigFit(
-        rig=_as_rig(rig, names, state, fields, step.covariance, told is not None),
+        rig=_as_rig(rig, names, state, fields, step.covariance, fixes is not None),
         parameters=parameters,
         before=first,
         after=after,
@@ -180,19 +180,19 @@ def fit_rig(
     )
 
 
-def _lasting(told: Told, state: State) -> Told:
+def _lasting(fixes: NavigationFixes, state: RigState) -> NavigationFixes:
     """Sigmas that count how long navigation errs the same way.
 
-    Errors that last tell less than as many new ones: a first-order process with the correlation r
+    Errors that last say less than as many new ones: a first-order process with the correlation r
     from one station to the next widens the sigma of a mean by sqrt((1 + r) / (1 - r)).
     """
-    known = np.flatnonzero(np.isfinite(told.positions + told.sigmas).all(axis=1))
+    known = np.flatnonzero(np.isfinite(fixes.positions + fixes.sigmas).all(axis=1))
     bodies = state.centres[known] + state.turns[known] @ state.lever
-    off = told.positions[known] - bodies
+    off = fixes.positions[known] - bodies
     off = off - off.mean(axis=0)
     spread = np.maximum((off**2).sum(axis=0), 1e-12)
     lasting = np.clip((off[1:] * off[:-1]).sum(axis=0) / spread, 0.0, _MOST_LASTING)
-    return replace(told, sigmas=told.sigmas * np.sqrt((1.0 + lasting) / (1.0 - lasting)))
+    return replace(fixes, sigmas=fixes.sigmas * np.sqrt((1.0 + lasting) / (1.0 - lasting)))
 
 
 def _spare(pixels: Pixels, stations: int, shared: int) -> int:
@@ -246,7 +246,7 @@ def _hold_baseline(
         information[np.ix_(at, at)] += np.outer(along, along) / _BASELINE_SIGMA_M**2
 
 
-def _values(state: State, fields: Sequence[str], names: Sequence[str], *, lever: bool) -> Array:
+def _values(state: RigState, fields: Sequence[str], names: Sequence[str], *, lever: bool) -> Array:
     now = Rig(
         cameras=dict(zip(names, state.cameras, strict=True)),
         cam_from_rig=dict(zip(names, state.cam_from_rig, strict=True)),
@@ -258,21 +258,21 @@ def _values(state: State, fields: Sequence[str], names: Sequence[str], *, lever:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Step:
+class _RigStep:
     stations: Array
     shared: Array
     covariance: Array
-    reduced: Reduced
+    reduced: ReducedSystem
 
 
 def _step(
     sights: Sights,
-    state: State,
+    state: RigState,
     variance: float,
     information: Array,
     drift: Array,
-    told: Told | None,
-) -> _Step:
+    fixes: NavigationFixes | None,
+) -> _RigStep:
     """One Gauss-Newton step of stations and shared parameters, and the covariance of the latter."""
     count = len(state.centres)
     reduced = reduce_points(sights, count)
@@ -281,16 +281,16 @@ def _step(
     border, slope = reduced.border / variance, reduced.slope / variance
     matrix = csc_matrix(reduced.matrix / variance)
     free = np.ones(POSE * count, dtype=np.bool_)
-    if told is None:
+    if fixes is None:
         free[:POSE] = False
     else:
         extra = np.zeros((count, POSE, POSE))
-        for s in np.flatnonzero(np.isfinite(told.positions + told.sigmas).all(axis=1)).tolist():
+        for s in np.flatnonzero(np.isfinite(fixes.positions + fixes.sigmas).all(axis=1)).tolist():
             arm = state.turns[s] @ state.lever
             x, y, z = arm
             rows = np.hstack([[[0, z, -y], [-z, 0, x], [y, -x, 0]], np.eye(3), state.turns[s]])
-            rows = rows / told.sigmas[s][:, None]
-            off = (state.centres[s] + arm - told.positions[s]) / told.sigmas[s]
+            rows = rows / fixes.sigmas[s][:, None]
+            off = (state.centres[s] + arm - fixes.positions[s]) / fixes.sigmas[s]
             extra[s] = rows[:, :POSE].T @ rows[:, :POSE]
             extra[s][[0, 1, 2], [0, 1, 2]] += _TURN_INFORMATION
             at = slice(POSE * s, POSE * s + POSE)
@@ -303,7 +303,7 @@ def _step(
     back, plain = solve(border), solve(slope)
     covariance = _inverse(shared - border.T @ back)
     moved = -covariance @ (pull - border.T @ plain)
-    return _Step(
+    return _RigStep(
         stations=(-plain - back @ moved).reshape(count, POSE),
         shared=moved,
         covariance=covariance,
@@ -326,13 +326,13 @@ def _block_diagonal(blocks: Array) -> Any:
 
 
 def _moved(
-    state: State,
+    state: RigState,
     pixels: Pixels,
-    step: _Step,
+    step: _RigStep,
     sights: Sights,
     fields: Sequence[str],
     names: Sequence[str],
-) -> State:
+) -> RigState:
     points = moved_points(
         sights.starts, sights.station, sights.by_point, sights.arm, sights.by_shared, sights.miss,
         step.reduced.point_inverse, step.stations, step.shared,
@@ -357,7 +357,7 @@ def _moved(
         )
     turns = Rotation.from_rotvec(step.stations[:, :3]).as_matrix() @ state.turns
     lever = state.lever + step.shared[-3:] if len(step.shared) > len(fields) else state.lever
-    return State(
+    return RigState(
         cameras=tuple(cameras),
         cam_from_rig=tuple(poses),
         turns=turns,
@@ -370,7 +370,7 @@ def _moved(
 def _as_rig(
     rig: Rig,
     names: Sequence[str],
-    state: State,
+    state: RigState,
     fields: Sequence[str],
     covariance: Array,
     lever: bool,

@@ -46,8 +46,8 @@ def sigma_of(misses: Array, counts: Indices, stations: int) -> float:
     free = float((3.0 / counts).sum())  # unknowns of points
     by_station = 1.0 - min(_MOST_ADAPTED, 6.0 * stations / max(2.0 * len(misses) - free, 1.0))
     left = (1.0 - 1.5 / counts) * by_station
-    told = counts >= min(_WELL_SEEN, int(np.median(counts)))
-    median = float(np.median(np.linalg.norm(misses[told], axis=1) / np.sqrt(left[told])))
+    well_seen = counts >= min(_WELL_SEEN, int(np.median(counts)))
+    median = float(np.median(np.linalg.norm(misses[well_seen], axis=1) / np.sqrt(left[well_seen])))
     return max(median / _RAYLEIGH_MEDIAN, _LEAST_SIGMA_PX)
 
 

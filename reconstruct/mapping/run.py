@@ -29,9 +29,9 @@ from reconstruct.mapping.mapper import Mapped, map_calibrated
 from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import Convergence, refract
 from reconstruct.mapping.self_calibration import SIMPLE, map_self_calibrated
-from reconstruct.mapping.survey_rig import Refined, frees_rig, refine_as_set
+from reconstruct.mapping.survey_rig import RefinedSurvey, frees_rig, refine_as_set
 from reconstruct.mapping.uncertainty import save_uncertainty
-from reconstruct.mapping.working_range import Distances, find_distances
+from reconstruct.mapping.working_range import WorkingDistances, find_distances
 from reconstruct.matching.features import find_features, load_features, save_features
 from reconstruct.matching.matches import (
     PairTask,
@@ -133,7 +133,7 @@ def run_mapping(workspace: Path, config: SurveyConfig, threads: int, folder: Pat
             found = refine_as_set(
                 mapped, seen, rig, distances, adjust, inputs.datum, folder, settings
             )
-            if isinstance(found, Refined):
+            if isinstance(found, RefinedSurvey):
                 mapped, refracted, adjust = found.mapped, found.convergence, found.adjust
                 seen, rig = found.seen, found.rig
             else:
@@ -162,7 +162,7 @@ def extract(task: _FeatureTask) -> int:
 
 
 def _grey_file(features: Path) -> Path:
-    """Where the evened picture lies beside its features."""
+    """Where the evened picture lies next to its features."""
     return features.with_suffix(".npy")
 
 
@@ -190,7 +190,7 @@ def _find_all(inputs: Inputs, folder: Path, config: SurveyConfig, threads: int) 
 
 def _lenses(
     inputs: Inputs, features: Sequence[Path], config: SurveyConfig, threads: int
-) -> tuple[dict[str, Lens], Distances | None]:
+) -> tuple[dict[str, Lens], WorkingDistances | None]:
     """The pinholes that stand in for calibrated cameras; none without a rig."""
     if inputs.rig is None:
         return {}, None
@@ -296,7 +296,7 @@ def _write(
     partial: Path,
     inputs: Inputs,
     mapped: Mapped,
-    distances: Distances | None,
+    distances: WorkingDistances | None,
     refracted: Convergence | None,
 ) -> None:
     model = mapped.model

@@ -1,9 +1,9 @@
 """Mapping without a calibration: cameras, and the rig of two, are found from the pictures.
 
-Pictures that look straight down on a flat floor hardly tell focal length from distance, so nothing
-is freed that they do not determine: the mapper gets a simple lens, a focal length that EXIF states
-is kept unless the pictures contradict it, and the full lens model is accepted only where it comes
-out sane.
+Pictures that look straight down on a flat floor hardly separate focal length from distance, so
+nothing is freed that they do not determine: the mapper gets a simple lens, a focal length that EXIF
+states is kept unless the pictures contradict it, and the full lens model is accepted only where it
+comes out sane.
 """
 
 from collections.abc import Collection, Sequence
@@ -28,6 +28,7 @@ from reconstruct.mapping.mapper import (
     sizes,
 )
 from reconstruct.mapping.merge import report_left_out
+from reconstruct.mapping.solver import direct_solver
 from reconstruct.views.lens import Lens, self_calibrated_lens
 
 SIMPLE, FULL = "RADIAL", "OPENCV"
@@ -190,10 +191,8 @@ def _adjust(model: pycolmap.Reconstruction, *, focal: bool) -> None:
         if image.has_pose:
             config.add_image(number)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
+    options = direct_solver(pycolmap.BundleAdjustmentOptions())
     options.refine_focal_length = focal
-    options.ceres.solver_options.num_threads = 1
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
     model.update_point_3d_errors()
 

@@ -35,7 +35,7 @@ _BLOCK = 32
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Link:
+class StationLink:
     """Where one station is as another sees it."""
 
     first: int
@@ -61,7 +61,7 @@ class _Resection:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Answer:
+class _LinkAnswer:
     """The second station's rig as the first sees it; covariance of turn, then shift."""
 
     quaternion: Array
@@ -112,7 +112,7 @@ def stereo_points(
 
 def link_stations(
     seen: Observations, cam_from_rig: Mapping[str, RigidTransform], seed: int, threads: int
-) -> list[Link]:
+) -> list[StationLink]:
     """Find the relative pose of every two stations whose pictures share enough.
 
     Args:
@@ -237,7 +237,7 @@ def _resect_all(
     cameras: Sequence[Mapping[str, object]],
     cam_from_rig: Sequence[tuple[Array, Array]],
     seed: int,
-) -> list[_Answer | None]:
+) -> list[_LinkAnswer | None]:
     ransac = pycolmap.RANSACOptions()
     ransac.max_error = _LARGEST_ERROR_PX
     ransac.min_inlier_ratio = _LEAST_SHARE
@@ -249,7 +249,7 @@ def _resect_all(
     sight = _sight(cameras, cam_from_rig)
     made = [pycolmap.Camera(dict(camera)) for camera in cameras]
     poses = [pycolmap.Rigid3d(pycolmap.Rotation3d(quat), shift) for quat, shift in cam_from_rig]
-    answers: list[_Answer | None] = []
+    answers: list[_LinkAnswer | None] = []
     for task in tasks:
         found = pycolmap.estimate_and_refine_generalized_absolute_pose(
             task.pixels, task.points, task.cameras, poses, made, ransac, refine
@@ -264,7 +264,7 @@ def _resect_all(
             continue
         pose, covariance = refined
         answers.append(
-            _Answer(
+            _LinkAnswer(
                 quaternion=pose.rotation.as_quat(),
                 shift=np.asarray(pose.translation),
                 inliers=int(found["num_inliers"]),
@@ -286,7 +286,7 @@ def _sight(
     )
 
 
-def _link(task: _Resection, found: _Answer | None) -> Link | None:
+def _link(task: _Resection, found: _LinkAnswer | None) -> StationLink | None:
     if found is None:
         return None
     share = found.inliers / len(task.points)
@@ -294,7 +294,7 @@ def _link(task: _Resection, found: _Answer | None) -> Link | None:
     known = turn > 0 and shift > 0 and np.isfinite(turn + shift)
     if found.inliers < _LEAST_INLIERS or share < _LEAST_SHARE or not known:
         return None
-    return Link(
+    return StationLink(
         first=task.first,
         second=task.second,
         second_from_first=RigidTransform.from_components(

@@ -1,6 +1,6 @@
-"""The rig refined from the survey, and the model anew on it: settings `refine_port`, `refine_rig`.
+"""The rig refined from the survey, the model rebuilt on it: settings `refine_port`, `refine_rig`.
 
-It writes `port.json` (values, sigmas, correlation) and `rig.json` (the refined rig) beside the
+It writes `port.json` (values, sigmas, correlation) and `rig.json` (the refined rig) next to the
 model.
 """
 
@@ -24,15 +24,15 @@ from reconstruct.mapping.database import Observations, rigid3d
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import Convergence, refract
-from reconstruct.mapping.rig_refinement import RigFit, Told, fit_rig
-from reconstruct.mapping.working_range import Distances
+from reconstruct.mapping.rig_refinement import NavigationFixes, RigFit, fit_rig
+from reconstruct.mapping.working_range import WorkingDistances
 from reconstruct.matching.matches import as_seen
 from reconstruct.matching.pairs import positions_ned
 from reconstruct.views.lens import FlatPortLens, Lens, flat_port_lens
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Refined:
+class RefinedSurvey:
     """A survey mapped on its own refined rig."""
 
     mapped: Mapped
@@ -70,12 +70,12 @@ def refine_as_set(
     mapped: Mapped,
     seen: Observations,
     rig: Rig,
-    distances: Distances | None,
+    distances: WorkingDistances | None,
     adjust: NavigationAdjuster,
     datum: Datum | None,
     folder: Path,
     settings: ReconstructConfig,
-) -> Refined | str:
+) -> RefinedSurvey | str:
     """Refine a rig as far as `frees_rig` calls for it.
 
     Args:
@@ -110,15 +110,15 @@ def refine_rig(
     mapped: Mapped,
     seen: Observations,
     rig: Rig,
-    distances: Distances | None,
+    distances: WorkingDistances | None,
     adjust: NavigationAdjuster,
     datum: Datum | None,
     folder: Path,
     *,
     port: bool,
     pose: bool,
-) -> Refined:
-    """Refine a rig from a finished model and make the model anew on it.
+) -> RefinedSurvey:
+    """Refine a rig from a finished model and build the model again on it.
 
     Args:
         mapped: exact model on the rig; picture i of `seen` has the id i + 1.
@@ -132,17 +132,18 @@ def refine_rig(
         pose: refine the poses of the cameras and the lever arm.
 
     Raises:
-        ReconstructionError: the model has no scale, or the survey does not tell what is asked for.
+        ReconstructionError: the model has no scale, or the survey does not determine what is to
+            be refined.
     """
     if not mapped.scaled or distances is None:
         raise ReconstructionError(
             "refine_port and refine_rig need two cameras, whose known baseline gives the scale: "
             'set refine_port = false and refine_rig = "off" in survey.toml'
         )
-    told = None
+    fixes = None
     if datum is not None and adjust.sigmas is not None:
-        told = told_positions(mapped.model, seen, datum)
-    fit = fit_rig(mapped, seen, rig, port=port, pose=pose, told=told)
+        fixes = navigation_fixes(mapped.model, seen, datum)
+    fit = fit_rig(mapped, seen, rig, port=port, pose=pose, fixes=fixes)
     lenses: dict[str, Lens] = {
         name: flat_port_lens(fit.rig.cameras[name], distances.near_m, distances.far_m)
         for name in seen.cameras
@@ -153,7 +154,7 @@ def refine_rig(
     refined, convergence = refract(again[0], again[1], folder, adjust, poses, near=True)
     PortRecord.save(folder / "port.json", fit.to_json())
     write_rig(folder / "rig.json", fit.rig)
-    return Refined(
+    return RefinedSurvey(
         mapped=refined, seen=again[1], rig=fit.rig, convergence=convergence, adjust=adjust
     )
 
@@ -202,7 +203,9 @@ def on_rig(
     )
 
 
-def told_positions(model: pycolmap.Reconstruction, seen: Observations, datum: Datum) -> Told:
+def navigation_fixes(
+    model: pycolmap.Reconstruction, seen: Observations, datum: Datum
+) -> NavigationFixes:
     """Where navigation says that the body's origin was, by ascending frame."""
     bodies = positions_ned(seen.images, datum)
     frames = frames_of(model).tolist()
@@ -214,7 +217,7 @@ def told_positions(model: pycolmap.Reconstruction, seen: Observations, datum: Da
             level = record.sigma_horizontal_m
             sigmas[row] = [level, level, record.sigma_depth_m]
     sigmas[~(sigmas > 0).all(axis=1)] = np.nan
-    return Told(positions=positions, sigmas=sigmas)
+    return NavigationFixes(positions=positions, sigmas=sigmas)
 
 
 def _taken(lens: Lens, warped: Array) -> Array:

@@ -29,12 +29,12 @@ from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import Indices, Observed, frames_of, observed
 from reconstruct.mapping.calibration_part import CalibrationPart, calibration_part
 from reconstruct.mapping.database import Observations
-from reconstruct.mapping.gauge import Gauge
+from reconstruct.mapping.gauge_freedom import Gauge
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.normal_equations import (
     LEAST_POINTS,
     POSE,
-    Reduced,
+    ReducedSystem,
     Sights,
     point_covariances,
     reduce_points,
@@ -45,7 +45,7 @@ from reconstruct.mapping.robust import cauchy_weights, sigma_of, variance_of
 _CHUNK = 32
 """Stations whose columns of the inverse are in memory at a time."""
 _TURN_INFORMATION = 1.0
-"""1/rad^2 of a station whose position is told: a line of stations does not tell its own roll."""
+"""1/rad^2 of a station whose position is given: a line does not determine its own roll."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -82,12 +82,12 @@ def estimate(
     Args:
         mapped: adjusted; picture i of `records` has the id i + 1.
         records: pictures.
-        position_sigmas: (N, 3) of the pictures' told positions along the model's axes, NaN where
+        position_sigmas: (N, 3) of the pictures' given positions along the model's axes, NaN where
             none took part in the adjustment; None for an adjustment without.
         calibration: what errors of the rig do; None where nobody knows.
 
     Raises:
-        ReconstructionError: the model is too small to tell.
+        ReconstructionError: the model is too small to determine its covariance.
     """
     model = mapped.model
     seen = observed(model)
@@ -98,7 +98,7 @@ def estimate(
     if spare < 1 or len(frames) < 2:
         raise ReconstructionError(
             f"{len(order)} observations of {len(seen.point_ids)} points from {len(frames)} "
-            "stations do not tell how well they are known"
+            "stations do not determine how well they are known"
         )
     left = spare / (2 * len(order))
     sigma = sigma_of(sights.miss, sights.seen_by, len(frames))
@@ -107,11 +107,11 @@ def estimate(
     sights = sights.weighted(weights)
     reduced = reduce_points(sights, len(frames))
     centres = _centres(model, frames)
-    told = told_information(model, position_sigmas)
+    given = navigation_information(model, position_sigmas)
     counts = np.bincount(sights.station, minlength=len(frames))
     loose = counts < LEAST_POINTS
     gauge = Gauge(centres, float(np.median(np.linalg.norm(sights.arm, axis=1))), scale_free)
-    blocks = _inverse_blocks(reduced, variance, told, gauge, loose)
+    blocks = _inverse_blocks(reduced, variance, given, gauge, loose)
     rows = np.repeat(np.arange(len(frames)), np.diff(reduced.pointers))
     own = np.flatnonzero(rows == reduced.columns)
     points = point_covariances(
@@ -150,8 +150,8 @@ def save_uncertainty(
     try:
         calibration = None
         if rig is not None:
-            told = told_information(mapped.model, position_sigmas)
-            calibration = calibration_part(mapped, seen, rig, told)
+            given = navigation_information(mapped.model, position_sigmas)
+            calibration = calibration_part(mapped, seen, rig, given)
         found = estimate(mapped, seen.images, position_sigmas, calibration)
     except ReconstructionError as error:
         warn(f"no covariance: {error}")
@@ -237,9 +237,9 @@ def sights_of(
 
 
 def _inverse_blocks(
-    reduced: Reduced,
+    reduced: ReducedSystem,
     variance: float,
-    told: Array | None,
+    given: Array | None,
     gauge: Gauge,
     loose: NDArray[np.bool_],
 ) -> Array:
@@ -247,10 +247,10 @@ def _inverse_blocks(
     matrix = csc_matrix(reduced.matrix / variance)
     size = matrix.shape[0]
     free = np.repeat(~loose, POSE)
-    if told is None:
+    if given is None:
         free[gauge.held] = False
     else:
-        matrix = csc_matrix(matrix + diags_array(told.ravel()))
+        matrix = csc_matrix(matrix + diags_array(given.ravel()))
     solve = solver_of(matrix, free)
     flat, spread = gauge.flat, gauge.spread
     weighed = gauge.weights[:, None] * flat
@@ -278,24 +278,24 @@ def _inverse_blocks(
     return blocks
 
 
-def told_information(model: pycolmap.Reconstruction, sigmas: Array | None) -> Array | None:
-    """(F, 6) information of stations whose positions are told; None where there are none.
+def navigation_information(model: pycolmap.Reconstruction, sigmas: Array | None) -> Array | None:
+    """(F, 6) information of stations whose positions are given; None where there are none.
 
     Args:
         model: picture i of `sigmas` has the id i + 1.
-        sigmas: (N, 3) of the pictures' told positions; NaN where none is told.
+        sigmas: (N, 3) of the pictures' given positions; NaN where none is given.
     """
     if sigmas is None:
         return None
     frames = frames_of(model)
-    told = np.zeros((len(frames), POSE))
+    given = np.zeros((len(frames), POSE))
     for number, image in sorted(model.images.items()):
         if not image.has_pose:
             continue
         row = int(np.searchsorted(frames, image.frame_id))
-        if np.isfinite(sigmas[number - 1]).all() and not told[row].any():
-            told[row] = [*[_TURN_INFORMATION] * 3, *(1.0 / sigmas[number - 1] ** 2)]
-    return told if told.any() else None
+        if np.isfinite(sigmas[number - 1]).all() and not given[row].any():
+            given[row] = [*[_TURN_INFORMATION] * 3, *(1.0 / sigmas[number - 1] ** 2)]
+    return given if given.any() else None
 
 
 def _centres(model: pycolmap.Reconstruction, frames: Indices) -> Array:

@@ -27,7 +27,7 @@ _NEAR, _FAR = 0.75, 1.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class Distances:
+class WorkingDistances:
     """Distances of the sea floor from the entrance pupils along the axes."""
 
     near_m: float
@@ -52,7 +52,7 @@ def find_distances(
     given_m: float | None,
     ratio: float,
     threads: int,
-) -> Distances:
+) -> WorkingDistances:
     """Distances from the setting, else from stereo matches, else from the altitudes measured.
 
     Args:
@@ -67,14 +67,16 @@ def find_distances(
         ReconstructionError: none of the three is there.
     """
     if given_m is not None:
-        return Distances(near_m=_NEAR * given_m, far_m=_FAR * given_m, source="working_range_m")
+        return WorkingDistances(
+            near_m=_NEAR * given_m, far_m=_FAR * given_m, source="working_range_m"
+        )
     tasks = _stereo_tasks(records, features, rig, ratio)
     depths = np.concatenate([np.zeros(0), *parallel_map(
         stereo_depths, tasks, threads=threads, label="working range"
     )])  # fmt: skip
     if len(depths) >= _LEAST_POINTS:
         near, far = np.percentile(depths, [2.0, 98.0])
-        return Distances(near_m=float(near), far_m=float(far), source="stereo")
+        return WorkingDistances(near_m=float(near), far_m=float(far), source="stereo")
     altitudes = np.array([r.altitude_m for r in records])
     if np.isfinite(altitudes).any():
         reference = rig.cameras[rig.reference]
@@ -82,7 +84,7 @@ def find_distances(
         middle = float(np.nanmedian(altitudes)) + glass
         if tasks:
             warn(f"{len(depths)} points in stereo matches: the altitude sets the working range")
-        return Distances(near_m=_NEAR * middle, far_m=_FAR * middle, source="altitude")
+        return WorkingDistances(near_m=_NEAR * middle, far_m=_FAR * middle, source="altitude")
     raise ReconstructionError(
         f"the distance to the sea floor is not known ({len(depths)} points in stereo matches, no "
         "altitude): set working_range_m under [reconstruct] in survey.toml"
@@ -112,7 +114,7 @@ def ray_passes(start_a: Array, ray_a: Array, start_b: Array, ray_b: Array) -> tu
     Args:
         start_a: (N, 3) points of the first rays.
         ray_a: (N, 3) unit directions.
-        start_b: (N, 3), likewise of the second.
+        start_b: (N, 3), the same of the second.
         ray_b: (N, 3).
 
     Returns:

@@ -196,7 +196,7 @@ def well_conditioned(
     """The best partners of every picture in all directions, on lines along and across its own.
 
     A partner is good for its overlap times its distance: far ones see heights under a wide angle,
-    near ones share many spots, and a picture of the same place from the same place tells nothing
+    near ones share many spots, and a picture of the same place from the same place adds nothing
     new. The partner of most overlap is kept too: it carries the track on.
 
     Args:

@@ -61,13 +61,13 @@ class _Partner:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Task:
+class _TrackTask:
     grey: Path
     partners: tuple[_Partner, ...]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Refined:
+class RefinedFeatures:
     """Features after refinement."""
 
     pixels: list[Array]
@@ -84,7 +84,7 @@ def refine_tracks(
     pairs: Sequence[tuple[int, int, Matches]],
     *,
     threads: int,
-) -> Refined:
+) -> RefinedFeatures:
     """Align every observation of a track with the track's reference.
 
     The reference is the observation that was matched with most others. An observation stays where
@@ -107,7 +107,7 @@ def refine_tracks(
         together[nodes[good]] = found[good]
         tracked += len(nodes)
         moved += int(good.sum())
-    return Refined(
+    return RefinedFeatures(
         pixels=[together[a:b] for a, b in itertools.pairwise(starts)],
         tracked=tracked,
         moved=moved,
@@ -144,7 +144,7 @@ def _tasks(
     reference: NDArray[np.int64],
     pairs: Sequence[tuple[int, int, Matches]],
     greys: Sequence[Path],
-) -> list[_Task]:
+) -> list[_TrackTask]:
     """One task for each picture that has references."""
     nodes = np.flatnonzero(reference != np.arange(len(reference)))
     picture = np.searchsorted(starts, nodes, side="right") - 1
@@ -172,10 +172,10 @@ def _tasks(
             partners.setdefault(r, []).append(
                 _Partner(grey=greys[j], nodes=mine, reference=at[0], pixels=at[1], support=support)
             )
-    return [_Task(grey=greys[r], partners=tuple(partners[r])) for r in sorted(partners)]
+    return [_TrackTask(grey=greys[r], partners=tuple(partners[r])) for r in sorted(partners)]
 
 
-def align(task: _Task) -> tuple[NDArray[np.int64], Array]:
+def align(task: _TrackTask) -> tuple[NDArray[np.int64], Array]:
     """Numbers of features and their aligned positions (N, 2); NaN where they are to stay."""
     first = np.asarray(np.load(task.grey, mmap_mode="c"))
     found = []

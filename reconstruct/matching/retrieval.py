@@ -29,7 +29,7 @@ _BLOCK = 512
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Task:
+class _WordsTask:
     features: Path
     words: NDArray[np.float32]
 
@@ -52,7 +52,7 @@ def alike_pairs(
     if len(features) < 2 or not len(wanted):
         return []
     words = make_codebook(features, seed)
-    tasks = [_Task(features=path, words=words) for path in features]
+    tasks = [_WordsTask(features=path, words=words) for path in features]
     rows = parallel_map(describe, tasks, threads=threads, label="looks of pictures")
     looks = np.stack(list(rows))
     looks = looks - looks.mean(axis=0)
@@ -92,7 +92,7 @@ def make_codebook(features: Sequence[Path], seed: int) -> NDArray[np.float32]:
     return words
 
 
-def describe(task: _Task) -> NDArray[np.float32]:
+def describe(task: _WordsTask) -> NDArray[np.float32]:
     """The vector of a picture, (W * 128,); zeros without features."""
     descriptors = load_features(task.features).descriptors[:_LARGEST].astype(np.float32)
     if not len(descriptors):

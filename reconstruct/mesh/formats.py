@@ -139,7 +139,7 @@ def _copy(part: NDArray[Any] | Path, file: BinaryIO) -> None:
 
 
 def write_obj(path: Path, mesh: Textured, comments: Sequence[str]) -> None:
-    """Write OBJ and, beside it, MTL that names the pages; x east, y north, z up."""
+    """Write OBJ and, next to it, MTL that names the pages; x east, y north, z up."""
     material = path.with_suffix(".mtl")
     with atomic_path(material) as temporary:
         temporary.write_text(

@@ -11,18 +11,22 @@ from alice_survey.base.errors import warn
 from alice_survey.base.frames import Array
 from alice_survey.base.records import CloudRecord, MeshRecord
 from alice_survey.base.run import progress
-from reconstruct.dense.stereo_pairs import points_of_views
 from reconstruct.light.solve import read_light
 from reconstruct.mesh.cloud_file import open_cloud
 from reconstruct.mesh.formats import GLB_AXES, write_glb, write_mesh_ply, write_obj
 from reconstruct.mesh.labels import choose_views, make_charts
 from reconstruct.mesh.preview import render_oblique
-from reconstruct.mesh.surface import TRIM_STEPS, Mesh, mesh_cloud
+from reconstruct.mesh.surface import TRIM_STEPS, TriangleMesh, mesh_cloud
 from reconstruct.mesh.texture import Textured, colours_of_cloud, paint
 from reconstruct.mesh.topology import face_areas
 from reconstruct.mesh.visibility import find_candidates, save_geometry
 from reconstruct.raster import write_png
-from reconstruct.views.model import SparseModel, WorldFrame, read_model
+from reconstruct.views.model import (
+    SparseModel,
+    WorldFrame,
+    points_of_views,
+    read_model,
+)
 
 MOST_TRIANGLES = 4_000_000
 """Where the settings name no number."""
@@ -92,7 +96,7 @@ def build_mesh(
 
 @progress.step("write the mesh")
 def write_mesh(folder: Path, mesh: Textured, facts: dict[str, Any]) -> None:
-    """Write `mesh.glb`, `.obj`, `.mtl`, `.ply`, `.json` and `.png` beside the pages."""
+    """Write `mesh.glb`, `.obj`, `.mtl`, `.ply`, `.json` and `.png` next to the pages."""
     offset = " ".join(repr(value) for value in facts["offset_east_north_up"])
     comments = [
         f"offset_east_north_up {offset}",
@@ -108,7 +112,7 @@ def write_mesh(folder: Path, mesh: Textured, facts: dict[str, Any]) -> None:
 
 
 def mesh_facts(
-    mesh: Mesh, textured: Textured, offset_enu: Array, step: float, frame: WorldFrame
+    mesh: TriangleMesh, textured: Textured, offset_enu: Array, step: float, frame: WorldFrame
 ) -> dict[str, Any]:
     """What the files cannot say."""
     area = face_areas(mesh.vertices, mesh.triangles)

@@ -66,7 +66,7 @@ class Piece:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Mesh:
+class TriangleMesh:
     """Triangles, counter-clockwise seen from the water."""
 
     vertices: Array
@@ -78,7 +78,7 @@ class Mesh:
 
 def mesh_cloud(
     cloud: CloudFile, step: float, error: float, most_triangles: int, threads: int
-) -> Mesh:
+) -> TriangleMesh:
     """Mesh a cloud.
 
     Args:
@@ -106,7 +106,7 @@ def mesh_cloud(
     vertices, triangles, error = _to_count(vertices, triangles, step, error, most_triangles)
     triangles = without_folds(vertices, triangles)
     vertices, triangles, _ = split_fans(vertices, triangles)
-    return Mesh(vertices=vertices, triangles=triangles, error=error)
+    return TriangleMesh(vertices=vertices, triangles=triangles, error=error)
 
 
 def surface_tasks(cloud: CloudFile, step: float, error: float) -> list[SurfaceTask]:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from alice_survey.base.run import progress
 from reconstruct.light.solve import LightModel
 from reconstruct.mesh.atlas import Atlas, Wedges, make_atlas, make_wedges
 from reconstruct.mesh.labels import Charts
-from reconstruct.mesh.levelling import level_seams, seam_pairs
+from reconstruct.mesh.seam_colours import level_seams, seam_pairs
 from reconstruct.mesh.topology import Triangles
 from reconstruct.mesh.visibility import to_world
 from reconstruct.pictures.undistorted import Pictures
@@ -51,7 +50,7 @@ class Textured:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PaintTask:
+class PagePaintTask:
     """The patches of one view."""
 
     workspace: Path
@@ -207,7 +206,7 @@ def even_colour(pictures: Pictures, view: View, light: LightModel) -> Float32:
 
 def seam_colours(task: SeamTask) -> Float32:
     """Mean colour around pixels of one view, (N, 3) BGR; NaN where nothing usable is near."""
-    pictures = _pictures(task.workspace)
+    pictures = Pictures.open(task.workspace)
     even = even_colour(pictures, task.view, task.light)
     weight = pictures.valid(task.view.image).astype(np.float32)
     even *= weight[..., None]
@@ -262,7 +261,7 @@ def _paint_tasks(
     placed: Array,
     corrections: Array,
     pages: tuple[Path, ...],
-) -> list[PaintTask]:
+) -> list[PagePaintTask]:
     """One task for each view with patches; the last for what no view sees."""
     count = len(charts.views)
     by_chart = np.argsort(wedges.chart, kind="stable")
@@ -277,7 +276,7 @@ def _paint_tasks(
         mine = np.flatnonzero(shown == number)
         members = [by_chart[wedge_starts[c] : wedge_starts[c + 1]] for c in mine]
         tasks.append(
-            PaintTask(
+            PagePaintTask(
                 workspace=workspace,
                 view=views[max(number, 0)],
                 light=light,
@@ -300,7 +299,7 @@ def _paint_tasks(
     return tasks
 
 
-def paint_view(task: PaintTask) -> None:
+def paint_view(task: PagePaintTask) -> None:
     """Write the patches of one view into the pages; no two views write to the same pixel."""
     plain = task.scale == 0.0
     pages = [
@@ -310,7 +309,7 @@ def paint_view(task: PaintTask) -> None:
     picture = np.zeros((1, 1, 3), np.float32)
     valid = np.ones((1, 1), np.uint8)
     if not plain:
-        pictures = _pictures(task.workspace)
+        pictures = Pictures.open(task.workspace)
         picture = even_colour(pictures, task.view, task.light)
         valid = pictures.valid(task.view.image).astype(np.uint8)
         if task.scale < 1.0:
@@ -411,11 +410,6 @@ def spread_corners(
                         share_a * values[a, k] + share_b * values[b, k] + share_c * values[c, k]
                     )
     return spread, covered
-
-
-@lru_cache(maxsize=1)
-def _pictures(workspace: Path) -> Pictures:
-    return Pictures.open(workspace)
 
 
 @progress.step("take colours from the cloud")

@@ -109,7 +109,7 @@ def see_faces(task: SightTask) -> Sight:
     vertices, triangles, offset, scene, spheres = _geometry(task.mesh)
     view = task.view
     near = vertices_near(view, vertices, spheres, offset)
-    valid = _pictures(task.workspace).valid(view.image)
+    valid = Pictures.open(task.workspace).valid(view.image)
     pixels = np.full((len(vertices), 2), np.nan)
     pixels[near] = view.project(to_world(vertices[near], offset))
     inside = usable_pixels(pixels, valid)
@@ -220,8 +220,3 @@ def ray_scene(vertices: Array, triangles: Triangles) -> Any:
         o3d.core.Tensor(np.ascontiguousarray(triangles, dtype=np.uint32)),
     )
     return scene
-
-
-@lru_cache(maxsize=1)
-def _pictures(workspace: Path) -> Pictures:
-    return Pictures.open(workspace)

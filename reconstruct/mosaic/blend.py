@@ -23,7 +23,7 @@ SUPPORT_PX = 4 * ALIGNED_PX
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Part:
+class ViewPart:
     """What one view contributes."""
 
     row: int
@@ -46,7 +46,7 @@ class Blend:
         self._bands = [np.zeros((*size, 3), np.float32) for size in sizes]
         self._weights = [np.zeros(size, np.float32) for size in sizes]
 
-    def add(self, part: Part) -> None:
+    def add(self, part: ViewPart) -> None:
         """Add a view."""
         weight = part.taken.astype(np.float32)
         share = part.valid.astype(np.float32)

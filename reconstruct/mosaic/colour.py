@@ -9,7 +9,7 @@ backscattered light have coefficients of their own):
 with z the distance, per channel, in linear light. m, g and b follow from pairs of views of one spot
 (`light`). A is the light of the darkest pixels that each place of the picture ever shows (dark
 pixels, as in Akkaynak & Treibitz 2019, "Sea-thru"; a robust additive map of the survey, as in
-Koeser et al. 2021), times a share per channel that the pairs themselves tell: of two views of a
+Koeser et al. 2021), times a share per channel that the pairs themselves give: of two views of a
 bright and of a dark spot a wrong A fits at most one.
 """
 
@@ -32,8 +32,8 @@ from reconstruct.light.solve import (
     node_weights,
     solve_patterns,
 )
-from reconstruct.mosaic.facts import PictureFacts
 from reconstruct.mosaic.finish import LEAST_LEFT, LEAST_RANGE, MOST_RANGE
+from reconstruct.mosaic.picture_measures import PictureMeasures
 
 Float32 = NDArray[np.float32]
 Colour = Literal["even", "water", "raw"]
@@ -72,7 +72,7 @@ class ColourModel:
     added: Mapping[str, Array]
     """Per camera (rows, columns, 3): light that the water adds at the nodes, BGR."""
     shares: Array
-    """(3,) of the darkest pixels' light that is taken to be the water's; 0 where it is not told."""
+    """(3,) of the darkest pixels' light that is taken to be the water's; 0 where not known."""
     share_sigmas: Array
     """(3,)."""
     notes: tuple[str, ...]
@@ -142,7 +142,7 @@ class ColourModel:
 def solve_colour(
     wanted: Colour,
     samples: LightSamples,
-    facts: Sequence[PictureFacts],
+    facts: Sequence[PictureMeasures],
     images: Sequence[str],
     cameras: Sequence[str],
 ) -> ColourModel:
@@ -187,7 +187,7 @@ def solve_colour(
         )
         if wanted == "water":
             notes.append(
-                "colours: ranges differ too little to tell how much the water weakens each colour"
+                "colours: ranges differ too little to find how much the water weakens each colour"
             )
     else:
         notes.append(
@@ -212,7 +212,7 @@ def solve_colour(
 
 def _black(
     model: ColourModel,
-    facts: Sequence[PictureFacts],
+    facts: Sequence[PictureMeasures],
     images: Sequence[str],
     cameras: Sequence[str],
 ) -> Array:
@@ -300,7 +300,7 @@ def _nodes_without(nodes: Array, added: Mapping[str, Array], cameras: Sequence[s
     return np.where(usable, np.log(np.where(usable, left, 1.0)), np.nan)
 
 
-def darkest(facts: Sequence[PictureFacts], cameras: Sequence[str]) -> dict[str, Array] | None:
+def darkest(facts: Sequence[PictureMeasures], cameras: Sequence[str]) -> dict[str, Array] | None:
     """Per camera (rows, columns, 3) light of the darkest that each place shows; None if too few."""
     maps = {}
     for name in sorted(set(cameras)):
@@ -319,7 +319,7 @@ def darkest(facts: Sequence[PictureFacts], cameras: Sequence[str]) -> dict[str, 
 def _added(
     samples: LightSamples,
     nodes: Array,
-    facts: Sequence[PictureFacts],
+    facts: Sequence[PictureMeasures],
     images: Sequence[str],
     cameras: Sequence[str],
 ) -> tuple[Mapping[str, Array], Array, Array, str]:
@@ -341,17 +341,17 @@ def _added(
     shares, sigmas = np.zeros(3), unknown.copy()
     for channel in range(3):
         shares[channel], sigmas[channel] = _lowest(cost[:, channel])
-    told = sigmas <= _LARGEST_SIGMA
-    if not told.all():
+    known = sigmas <= _LARGEST_SIGMA
+    if not known.all():
         words = ", ".join(f"{s:.2f}" for s in sigmas)
         note = (
-            f"colours: overlaps do not tell the water's light (sigma of its share {words} for "
+            f"colours: overlaps do not determine the water's light (sigma of its share {words} for "
             "blue, green, red); none taken away"
         )
         return nothing, np.zeros(3), sigmas, note
     note = (
         "colours: light that the water adds taken away: what the darkest pixels at each place of "
-        "the pictures show, times a share per colour that overlaps tell"
+        "the pictures show, times a share per colour that overlaps determine"
     )
     return {name: shares * level for name, level in dark.items()}, shares, sigmas, note
 
@@ -397,7 +397,7 @@ def _misfit(
 
 
 def _robust_cost(rest: Array) -> Array:
-    """(3,) for errors of Laplace's distribution, whose size the rest itself tells."""
+    """(3,) for errors of Laplace's distribution, whose size the rest itself gives."""
     size = np.abs(rest)
     mean = np.minimum(size, 4.0 * np.median(size, axis=0)).mean(axis=0) + 1e-9
     return np.asarray(2.0 * len(rest) / SAMPLES_PER_FACT * np.log(mean))

@@ -5,13 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruct.dense.dem import DemGrid
 from reconstruct.light.solve import LightSamples, at_places, joined_samples
-from reconstruct.mosaic.facts import telling
 from reconstruct.mosaic.grid import Block
 from reconstruct.mosaic.paint import Float32, SeenView, ground_of
-from reconstruct.mosaic.sight import see
+from reconstruct.mosaic.picture_measures import well_exposed
 from reconstruct.mosaic.tools import Survey, tools_of
+from reconstruct.mosaic.visibility import see
+from reconstruct.raster import DemGrid
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -53,7 +53,7 @@ def compare_block(task: LightTask) -> LightSamples:
         across, down = sight.places(optics.size_px)
         places = np.column_stack([across.ravel()[spots], down.ravel()[spots]])
         levels = at_places(copy.broad, places)
-        usable = telling(levels) & (at_places(copy.valid[..., None], places, 1)[:, 0] > 0.9)
+        usable = well_exposed(levels) & (at_places(copy.valid[..., None], places, 1)[:, 0] > 0.9)
         seen.append(
             _Shown(
                 number=entry.number,

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.compiled import compiled
-from reconstruct.mosaic.facts import encoded
+from reconstruct.mosaic.picture_measures import encoded
 
 Float32 = NDArray[np.float32]
 

@@ -15,8 +15,7 @@ from rasterio.warp import transform as to_crs
 from alice_survey.base.artefacts import write_csv, write_json
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
-from reconstruct.dense.dem import DemGrid
-from reconstruct.raster import crs_of
+from reconstruct.raster import DemGrid, crs_of
 from reconstruct.views.model import View, WorldFrame
 
 Float32 = NDArray[np.float32]

@@ -11,11 +11,8 @@ from rasterio.windows import Window
 
 from alice_survey.base.errors import ReconstructionError, warn
 from alice_survey.base.frames import Array
-from reconstruct.dense.dem import DemGrid
-from reconstruct.dense.points import enu_from_cam
-from reconstruct.dense.stereo_pairs import points_of_views
-from reconstruct.raster import tiles_of
-from reconstruct.views.model import SparseModel, View, WorldFrame
+from reconstruct.raster import DemGrid, tiles_of
+from reconstruct.views.model import SparseModel, View, WorldFrame, enu_from_cam, points_of_views
 
 Float32 = NDArray[np.float32]
 

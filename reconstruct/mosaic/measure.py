@@ -6,21 +6,19 @@ from pathlib import Path
 import numpy as np
 from rasterio.windows import Window
 
-from reconstruct.dense.dem import DemGrid
-from reconstruct.dense.points import enu_from_cam
-from reconstruct.mosaic.facts import PictureFacts, measure_picture
 from reconstruct.mosaic.footprints import PictureFootprint, picture_footprint
 from reconstruct.mosaic.grid import Float32, footprints
-from reconstruct.mosaic.sight import store_visible
-from reconstruct.raster import opened_raster
-from reconstruct.views.model import View
+from reconstruct.mosaic.picture_measures import PictureMeasures, measure_picture
+from reconstruct.mosaic.visibility import store_visible
+from reconstruct.raster import DemGrid, opened_raster
+from reconstruct.views.model import View, enu_from_cam
 
 _MOST_CELLS = 16_000_000
 """Of the DEM for one view; views that see more, to the horizon, are looked at block by block."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class MeasureTask:
+class ViewTask:
     """A view to measure."""
 
     workspace: Path
@@ -31,7 +29,7 @@ class MeasureTask:
     """Lowest and highest cell of the DEM."""
 
 
-def measure_view(task: MeasureTask) -> tuple[PictureFacts, PictureFootprint]:
+def measure_view(task: ViewTask) -> tuple[PictureMeasures, PictureFootprint]:
     """Measure a picture and where it lies; write its small copy and what it sees of the DEM."""
     facts = measure_picture((task.workspace, task.scratch, task.view.image))
     dem, grid, whole = _part_seen(task)
@@ -40,7 +38,7 @@ def measure_view(task: MeasureTask) -> tuple[PictureFacts, PictureFootprint]:
     return facts, picture_footprint(task.view, dem, grid)
 
 
-def _part_seen(task: MeasureTask) -> tuple[Float32, DemGrid, bool]:
+def _part_seen(task: ViewTask) -> tuple[Float32, DemGrid, bool]:
     """The DEM below a view and all that it may see, coarser where that is a lot; whether it is."""
     west, east, south, north = footprints((task.view,), task.heights).boxes[0]
     camera = enu_from_cam(task.view, np.zeros(3))[:, 3]

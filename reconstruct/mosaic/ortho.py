@@ -121,7 +121,7 @@ def look_up(
     Args:
         height: (H, W) up at the pixels' centres, NaN where unknown.
         wanted: (h, w) whether to look at squares of pixels, and their side; beyond the last
-            square the last one tells.
+            square the last one sees.
         visible: cells of the DEM that the view sees.
         first_cell: row and column of the first pixel's centre in `visible` (cell centres whole).
         cells_per_pixel: side of a pixel over side of a cell.

@@ -12,19 +12,19 @@ from rasterio.windows import Window
 
 from alice_survey.base.run.resources import release_memory
 from reconstruct.light.solve import at_places
-from reconstruct.mosaic.blend import Blend, Part
+from reconstruct.mosaic.blend import Blend, ViewPart
 from reconstruct.mosaic.colour import ColourModel
 from reconstruct.mosaic.finish import finish_colours
 from reconstruct.mosaic.grid import ALIGNED_PX, CELL_PX, Block, coarse, dem_around
 from reconstruct.mosaic.ortho import sample_lanczos
 from reconstruct.mosaic.seams import candidates, choose_views
-from reconstruct.mosaic.sight import (
+from reconstruct.mosaic.tools import Survey, Tools, tools_of
+from reconstruct.mosaic.visibility import (
+    GridHeights,
     Ground,
-    Seen,
-    Surface,
+    SeenCells,
     see,
 )
-from reconstruct.mosaic.tools import Survey, Tools, tools_of
 from reconstruct.raster import opened_raster
 from reconstruct.views.model import View
 
@@ -53,11 +53,11 @@ class SeenView:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Look:
+class _ViewOfCells:
     """How a view sees the cells of a box of a block."""
 
     entry: SeenView
-    sight: Seen
+    sight: SeenCells
     box: tuple[slice, slice]
 
 
@@ -78,7 +78,7 @@ class Labels:
     """Views of a block's cells."""
 
     block: Block
-    label: NDArray[np.uint16]
+    label: NDArray[np.int32]
     """(rows, columns) of the core's cells: number of the view plus one; 0 where none sees."""
     pictures: NDArray[np.uint16]
     """(rows, columns) how many pictures see the cell."""
@@ -95,7 +95,7 @@ class Painted:
     window: Window
     rgba: NDArray[np.uint8]
     """(4, H, W)."""
-    source: NDArray[np.uint16]
+    source: NDArray[np.int32]
     """(H, W) number of the view plus one; 0 where nothing is known."""
 
 
@@ -104,8 +104,8 @@ def label_block(task: PaintTask) -> Labels:
     block = task.block
     inner = _inner(block)
     rows, columns = block.grid.rows // CELL_PX, block.grid.columns // CELL_PX
-    label = np.zeros((rows, columns), np.uint16)
-    pictures, stations = np.zeros_like(label), np.zeros_like(label)
+    label = np.zeros((rows, columns), np.int32)
+    pictures, stations = (np.zeros(label.shape, np.uint16) for _ in range(2))
     tones = np.zeros((rows, columns, 3), np.float32)
     surface = ground_of(task.survey, block).surface(coarse(block.grid))
     looks = _looks(task, surface, task.views) if np.isfinite(surface.height).any() else []
@@ -133,7 +133,7 @@ def label_block(task: PaintTask) -> Labels:
         chosen = choose_views(number, share, colours)
         known = chosen >= 0
         taken = np.take_along_axis(number, np.maximum(chosen, 0)[..., None], axis=2)[..., 0]
-        label = np.where(known, taken + 1, 0).astype(np.uint16)
+        label = np.where(known, taken + 1, 0).astype(np.int32)
     return Labels(
         block=block,
         label=label[inner],
@@ -164,7 +164,7 @@ def paint_tile(task: PaintTask) -> Painted:
     changes = _changes(task, tools, _looks(task, cells, used), mean)
     named = cv2.resize(label, (grid.columns, grid.rows), interpolation=cv2.INTER_NEAREST)
     named[~np.isfinite(surface.height)] = 0
-    source = np.zeros((grid.rows, grid.columns), np.uint16)
+    source = np.zeros((grid.rows, grid.columns), np.int32)
     sights = {}
     for entry in used:  # pixels of a cell that its view does not see go to the best that does
         value = entry.number + 1
@@ -189,7 +189,7 @@ def paint_tile(task: PaintTask) -> Painted:
         change = changes.get(entry.number)
         colour = _colours(task, tools, entry, sight, (local, part, wanted), change)
         blend.add(
-            Part(
+            ViewPart(
                 row=part[0].start,
                 column=part[1].start,
                 colour=colour,
@@ -216,7 +216,7 @@ def _unknown(block: Block) -> Painted:
     return Painted(
         window=block.core,
         rgba=np.zeros((4, *shape), np.uint8),
-        source=np.zeros(shape, np.uint16),
+        source=np.zeros(shape, np.int32),
     )
 
 
@@ -241,7 +241,9 @@ def ground_of(survey: Survey, block: Block) -> Ground:
         return Ground(*dem_around(raster, block.grid, block.reach), survey.scratch)
 
 
-def _looks(task: PaintTask, surface: Surface, entries: Sequence[SeenView]) -> list[_Look]:
+def _looks(
+    task: PaintTask, surface: GridHeights, entries: Sequence[SeenView]
+) -> list[_ViewOfCells]:
     """How views see a block's cells; quality takes sharpness and light in, masks leave out."""
     tools = tools_of(task.survey)
     looks = []
@@ -251,7 +253,7 @@ def _looks(task: PaintTask, surface: Surface, entries: Sequence[SeenView]) -> li
         if not sight.quality.any():
             continue
         box = _bounding(sight.quality > 0)
-        sight = Seen(
+        sight = SeenCells(
             x=sight.x[box], y=sight.y[box], quality=sight.quality[box], range=sight.range[box]
         )
         across, down = sight.places(optics.size_px)
@@ -266,7 +268,7 @@ def _looks(task: PaintTask, surface: Surface, entries: Sequence[SeenView]) -> li
             valid = at_places(copy.valid[..., None], places, 1).reshape(quality.shape)
             quality[valid < 0.999] = 0
         if quality.any():
-            looks.append(_Look(entry=entry, sight=replace(sight, quality=quality), box=box))
+            looks.append(_ViewOfCells(entry=entry, sight=replace(sight, quality=quality), box=box))
     return looks
 
 
@@ -275,7 +277,7 @@ def _bounding(used: NDArray[np.bool_]) -> tuple[slice, slice]:
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
 
-def _small_light(task: PaintTask, tools: Tools, found: _Look, *, broad: bool) -> Float32:
+def _small_light(task: PaintTask, tools: Tools, found: _ViewOfCells, *, broad: bool) -> Float32:
     """Corrected light of a view's small copy at the cells of its box, (h, w, 3)."""
     view, sight = found.entry.view, found.sight
     copy = tools.small.load(view.image)
@@ -291,7 +293,7 @@ def _logarithm(light: Float32) -> Float32:
     return found
 
 
-def _tones(task: PaintTask, tools: Tools, looks: list[_Look], quality: Float32) -> Float32:
+def _tones(task: PaintTask, tools: Tools, looks: list[_ViewOfCells], quality: Float32) -> Float32:
     """(rows, columns, 3) logarithm of broad light, the mean of all views by their quality."""
     best: Float32 = quality.max(axis=0)
     total = np.zeros((*best.shape, 3), np.float32)
@@ -307,7 +309,7 @@ def _tones(task: PaintTask, tools: Tools, looks: list[_Look], quality: Float32) 
 
 
 def _changes(
-    task: PaintTask, tools: Tools, looks: list[_Look], mean: Float32
+    task: PaintTask, tools: Tools, looks: list[_ViewOfCells], mean: Float32
 ) -> dict[int, tuple[Float32, tuple[slice, slice]]]:
     """Per view factors (h, w, 3) at the cells of a box that take its broad tones to the mean."""
     changes = {}
@@ -316,7 +318,7 @@ def _changes(
         tone = _logarithm(_small_light(task, tools, found, broad=True))
         seen = found.sight.quality > 0
         change = np.clip(mean[found.box] - tone, -limit, limit) * seen[..., None]
-        # cells that the view does not see take the change of those beside them
+        # cells that the view does not see take the change of those next to them
         near = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), 1.5)
         spread = cv2.GaussianBlur(change, (0, 0), 1.5).reshape(change.shape)
         spread = spread / np.maximum(near, np.float32(1e-3))[..., None]
@@ -326,8 +328,8 @@ def _changes(
 
 
 def _sight_of(
-    task: PaintTask, entry: SeenView, surface: Surface, wanted: NDArray[np.bool_]
-) -> Seen:
+    task: PaintTask, entry: SeenView, surface: GridHeights, wanted: NDArray[np.bool_]
+) -> SeenCells:
     """How a view sees the pixels of cells, its mask applied exactly."""
     tools = tools_of(task.survey)
     sight = see(entry.view, tools.optics(entry.view), surface, (wanted, CELL_PX))
@@ -347,8 +349,8 @@ def _colours(
     task: PaintTask,
     tools: Tools,
     entry: SeenView,
-    sight: Seen,
-    at: tuple[Surface, tuple[slice, slice], NDArray[np.bool_]],
+    sight: SeenCells,
+    at: tuple[GridHeights, tuple[slice, slice], NDArray[np.bool_]],
     change: tuple[Float32, tuple[slice, slice]] | None,
 ) -> Float32:
     """Corrected colours of a view at the pixels of a box, levels, BGR."""
@@ -401,11 +403,11 @@ def tones_path(scratch: Path) -> Path:
     return scratch / "tones.tif"
 
 
-def _read_cells(survey: Survey, block: Block) -> tuple[NDArray[np.uint16], Float32]:
+def _read_cells(survey: Survey, block: Block) -> tuple[NDArray[np.int32], Float32]:
     """Labels (rows, columns), and tones (rows, columns, 3), of a block; 0 beyond the mosaic."""
     rows, columns = block.grid.rows // CELL_PX, block.grid.columns // CELL_PX
     top, left = block.window.row_off // CELL_PX, block.window.col_off // CELL_PX
-    label = np.zeros((rows, columns), np.uint16)
+    label = np.zeros((rows, columns), np.int32)
     tones = np.zeros((rows, columns, 3), np.float32)
     with rasterio.open(label_path(survey.scratch)) as raster:
         r0, c0 = max(0, top), max(0, left)

@@ -1,6 +1,6 @@
 """The stage `mosaic`: every pixel of the DEM's plane painted by the picture that sees it best.
 
-Pictures are measured; pairs of views that see one spot tell the light of the whole survey; seams
+Pictures are measured; pairs of views that see one spot give the light of the whole survey; seams
 are laid survey-wide on small cells; tiles are painted one by one, each colour resampled once from
 the picture as taken. No step holds more than one block, so that memory does not grow with the area.
 """
@@ -19,12 +19,10 @@ import rasterio
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.executor import parallel_map
 from alice_survey.base.records import CamerasRecord, MosaicRecord, PicturesRecord
-from reconstruct.dense.dem import DemGrid, round_cell
 from reconstruct.light.solve import joined_samples
 from reconstruct.mosaic.blend import SUPPORT_PX
 from reconstruct.mosaic.colour import ColourModel, solve_colour
 from reconstruct.mosaic.compare import LightTask, compare_block
-from reconstruct.mosaic.facts import PictureFacts
 from reconstruct.mosaic.footprints import write_footprints
 from reconstruct.mosaic.grid import (
     CELL_PX,
@@ -37,7 +35,7 @@ from reconstruct.mosaic.grid import (
     mosaic_grid,
     neighbours,
 )
-from reconstruct.mosaic.measure import MeasureTask, measure_view
+from reconstruct.mosaic.measure import ViewTask, measure_view
 from reconstruct.mosaic.paint import (
     PaintTask,
     SeenView,
@@ -46,11 +44,12 @@ from reconstruct.mosaic.paint import (
     paint_tiles,
     tones_path,
 )
-from reconstruct.mosaic.sight import Water
+from reconstruct.mosaic.picture_measures import PictureMeasures
 from reconstruct.mosaic.tools import Survey, forget_tools
+from reconstruct.mosaic.visibility import Water
 from reconstruct.mosaic.writers import cloud_optimised, thumbnail, write_labels, write_tiles
 from reconstruct.placing.track_figure import plot_track_over
-from reconstruct.raster import opened_raster
+from reconstruct.raster import DemGrid, opened_raster, round_cell
 from reconstruct.views.model import SparseModel, read_model
 
 _TILE_PX = 1024
@@ -119,7 +118,7 @@ def build_mosaic(
         parallel_map(
             measure_view,
             [
-                MeasureTask(workspace=workspace, scratch=scratch, view=view, heights=heights)
+                ViewTask(workspace=workspace, scratch=scratch, view=view, heights=heights)
                 for view in model.views
             ],
             threads=threads,
@@ -196,7 +195,7 @@ def seam_blocks(grid: DemGrid, ground: Footprints) -> list[Block]:
         size //= 2
 
 
-def _seen_views(model: SparseModel, facts: Sequence[PictureFacts]) -> list[SeenView]:
+def _seen_views(model: SparseModel, facts: Sequence[PictureMeasures]) -> list[SeenView]:
     sharpness = np.array([fact.sharpness for fact in facts])
     typical = float(np.nanmedian(sharpness)) if np.isfinite(sharpness).any() else 1.0
     relative = np.nan_to_num(sharpness / max(typical, 1e-9))
@@ -209,7 +208,7 @@ def _seen_views(model: SparseModel, facts: Sequence[PictureFacts]) -> list[SeenV
 def _solve(
     model: SparseModel,
     survey: Survey,
-    facts: Sequence[PictureFacts],
+    facts: Sequence[PictureMeasures],
     views: Sequence[SeenView],
     blocks: Sequence[Block],
     config: SurveyConfig,
@@ -247,7 +246,7 @@ def _part_of(colour: ColourModel, images: Sequence[str]) -> ColourModel:
 def _dispersion(
     workspace: Path, model: SparseModel, config: SurveyConfig, grey: bool
 ) -> tuple[Water | None, dict[str, Any]]:
-    """The water through which colours are told apart, or None, and what to say about it."""
+    """The water through which colours are distinguished, or None, and what to say about it."""
     wanted = config.reconstruct.dispersion
     cameras = CamerasRecord.read(workspace / "sparse" / "cameras.json").cameras.values()
     ports = any(camera["kind"] == "flat_port" for camera in cameras)

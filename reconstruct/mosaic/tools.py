@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruct.mosaic.facts import SmallCopies, forget_pictures, linear_table
 from reconstruct.mosaic.finish import curve_by_root
 from reconstruct.mosaic.ortho import lanczos_weights
-from reconstruct.mosaic.sight import Optics, Water, camera_optics, channel_optics
+from reconstruct.mosaic.picture_measures import SmallCopies, linear_table
+from reconstruct.mosaic.visibility import CameraOptics, Water, camera_optics, channel_optics
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.views.lens import FlatPortLens
 from reconstruct.views.model import View
@@ -27,7 +27,7 @@ class Survey:
     scratch: Path
     scaled: bool
     water: Water | None
-    """Of the port's dispersion; None where channels are not told apart."""
+    """Of the port's dispersion; None where channels are not distinguished."""
 
 
 class Tools:
@@ -40,17 +40,17 @@ class Tools:
         self.weights = lanczos_weights()
         self.curve = curve_by_root()
         self._water, self._scaled = water, scaled
-        self._optics: dict[str, Optics] = {}
-        self._channels: dict[str, tuple[Optics, ...]] = {}
+        self._optics: dict[str, CameraOptics] = {}
+        self._channels: dict[str, tuple[CameraOptics, ...]] = {}
         self._kept: dict[str, NDArray[np.uint8]] = {}
 
-    def optics(self, view: View) -> Optics:
+    def optics(self, view: View) -> CameraOptics:
         """Of a view's camera (its green channel)."""
         if view.camera not in self._optics:
             self._optics[view.camera] = camera_optics(self._pictures.lens(view.image), self._scaled)
         return self._optics[view.camera]
 
-    def channels(self, view: View) -> tuple[Optics, ...] | None:
+    def channels(self, view: View) -> tuple[CameraOptics, ...] | None:
         """Of a view's channels, BGR; None where they share one."""
         lens = self._pictures.lens(view.image)
         if self._water is None or not isinstance(lens, FlatPortLens):
@@ -83,7 +83,6 @@ def tools_of(survey: Survey) -> Tools:
 def forget_tools() -> None:
     """Let go of what an earlier run in this process kept: its files may have changed."""
     _kept_tools.cache_clear()
-    forget_pictures()
 
 
 @lru_cache(maxsize=1)

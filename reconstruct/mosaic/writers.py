@@ -12,13 +12,21 @@ from rasterio.windows import Window
 
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.run import progress
-from reconstruct.dense.dem import DemGrid
 from reconstruct.mosaic.grid import CELL_PX, cells_over
 from reconstruct.mosaic.paint import Labels, Painted
-from reconstruct.raster import BLOCK, crs_of, frame_tags, opened_raster, transform_of, write_png
+from reconstruct.raster import (
+    BLOCK,
+    DemGrid,
+    crs_of,
+    frame_tags,
+    opened_raster,
+    transform_of,
+    write_png,
+)
 from reconstruct.views.model import WorldFrame
 
 _THUMBNAIL_PX = 1600
+_LARGEST_UINT16 = 65_535
 
 
 def write_tiles(
@@ -35,12 +43,13 @@ def write_tiles(
         ReconstructionError: none has.
     """
     shared = _profile(grid, frame)
+    numbers = "uint16" if len(names) <= _LARGEST_UINT16 else "uint32"
     painted = 0
     with (
         rasterio.open(
             rough, "w", count=4, dtype="uint8", photometric="RGB", alpha="yes", **shared
         ) as colours,
-        rasterio.open(source, "w", count=1, dtype="uint16", **shared) as sources,
+        rasterio.open(source, "w", count=1, dtype=numbers, **shared) as sources,
     ):
         colours.update_tags(**frame_tags(frame))
         sources.update_tags(**frame_tags(frame), PICTURES=json.dumps(names))
@@ -48,7 +57,7 @@ def write_tiles(
         for group in groups:
             for tile in group:
                 colours.write(tile.rgba, window=tile.window)
-                sources.write(tile.source, 1, window=tile.window)
+                sources.write(tile.source.astype(numbers), 1, window=tile.window)
                 painted += int((tile.rgba[3] > 0).sum())
     if painted == 0:
         raise ReconstructionError("no picture sees any cell of dense/dem.tif; redo 'dense'")
@@ -69,7 +78,7 @@ def write_labels(
     )
     shared = _profile(cells, frame)
     with (
-        rasterio.open(cells_of[0], "w", count=1, dtype="uint16", **shared) as labels,
+        rasterio.open(cells_of[0], "w", count=1, dtype="int32", **shared) as labels,
         rasterio.open(
             cells_of[1], "w", count=3, dtype="float32", **shared | {"compress": None}
         ) as tones,

@@ -125,12 +125,14 @@ class Pictures:
 
     @classmethod
     def open(cls, workspace: Path) -> "Pictures":
-        """The pictures of a workspace whose `sparse/` is finished.
+        """The pictures of a workspace whose `sparse/` is finished; a process reads them once.
 
         Raises:
             WorkspaceError: `sparse/cameras.json` is missing or wrong.
         """
-        return cls.from_json(workspace / "images", workspace / "sparse" / "cameras.json")
+        path = workspace / "sparse" / "cameras.json"
+        written_ns = path.stat().st_mtime_ns if path.is_file() else 0
+        return _opened(workspace / "images", path, written_ns)
 
     @classmethod
     def from_json(cls, images: Path, cameras_json: Path) -> "Pictures":
@@ -212,3 +214,8 @@ class Pictures:
         width, height = self._lenses[camera].size_px
         x, y = self._maps(camera)
         return np.asarray((x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1))
+
+
+@lru_cache(maxsize=1)
+def _opened(images: Path, cameras_json: Path, written_ns: int) -> Pictures:
+    return Pictures.from_json(images, cameras_json)

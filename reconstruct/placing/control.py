@@ -1,4 +1,4 @@
-"""Control of a model: known points and lengths place and scale it, or tell how right it is."""
+"""Control of a model: known points and lengths place and scale it, or show how right it is."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,10 +9,10 @@ import numpy as np
 from alice_survey.base.errors import warn
 from alice_survey.base.frames import Array, Datum
 from reconstruct.placing.alignment import Similarity, align_rigid, align_similarity
-from reconstruct.placing.channels import PARAMETERS, SCALE, cross_matrices
 from reconstruct.placing.control_file import Control, KnownLength
-from reconstruct.placing.placement import Extra
-from reconstruct.placing.spots import Spot
+from reconstruct.placing.generalised_fit import Extra
+from reconstruct.placing.navigation_equations import PARAMETERS, SCALE, cross_matrices
+from reconstruct.placing.picked_points import Spot
 
 _DOUBTFUL_SIGMAS = 4.0
 _LEAST_SPREAD = 1e-3
@@ -125,13 +125,13 @@ class ControlFit:
         self, known_scale: float | None, scale_sigma: float
     ) -> tuple[float, float] | None:
         """Scale from bars (and the known one, weighted) and its relative sigma; None without."""
-        told = [_log_factor(bar) for bar in self.used_bars]
-        if not told:
+        factors = [_log_factor(bar) for bar in self.used_bars]
+        if not factors:
             return None
         if known_scale is not None:
-            told.append((float(np.log(known_scale)), scale_sigma))
-        weights = np.array([sigma**-2 for _, sigma in told])
-        mean = float(weights @ np.array([factor for factor, _ in told]) / weights.sum())
+            factors.append((float(np.log(known_scale)), scale_sigma))
+        weights = np.array([sigma**-2 for _, sigma in factors])
+        mean = float(weights @ np.array([factor for factor, _ in factors]) / weights.sum())
         return float(np.exp(mean)), float(weights.sum() ** -0.5)
 
     def score(self, place: Similarity, *, located: bool) -> dict[str, Any]:
@@ -220,7 +220,7 @@ def describe(score: Mapping[str, Any]) -> str:
 
 
 def _log_factor(bar: _Bar) -> tuple[float, float]:
-    """Logarithm of the scale that a bar tells, and its sigma."""
+    """Logarithm of the scale that a bar gives, and its sigma."""
     relative = np.hypot(bar.known.sigma_m / bar.known.length_m, bar.sigma_in_model / bar.in_model)
     return float(np.log(bar.known.length_m / bar.in_model)), float(relative)
 

@@ -17,7 +17,7 @@ from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from reconstruct.mapping.uncertainty import Uncertainty
 from reconstruct.placing.alignment import Similarity
-from reconstruct.placing.channels import attitude_axes, cross_matrices
+from reconstruct.placing.navigation_equations import attitude_axes, cross_matrices
 
 POSE_ORDER = (
     "north_m", "east_m", "down_m", "rotation_north_rad", "rotation_east_rad", "rotation_down_rad",
@@ -59,7 +59,7 @@ def shape_covariances(
     Args:
         poses: (N,) of the pictures in the world.
         stations: (N,) theirs.
-        reference: (N,) whether a picture is that whose pose `found` tells.
+        reference: (N,) whether a picture is that whose pose `found` has.
         found: covariances of the stations, in the model's axes and unit.
         world_from_model: the model's place.
     """

@@ -12,7 +12,15 @@ from alice_survey.base.errors import warn
 from alice_survey.base.frames import Array, Datum
 from alice_survey.base.manifest import ImageRecord
 from reconstruct.placing.alignment import Similarity
-from reconstruct.placing.channels import (
+from reconstruct.placing.generalised_fit import (
+    NO_EXTRA,
+    Estimate,
+    Extra,
+    Lasting,
+    estimate,
+    without_gross_errors,
+)
+from reconstruct.placing.navigation_equations import (
     GROUPS,
     MOUNT,
     PARAMETERS,
@@ -21,18 +29,10 @@ from reconstruct.placing.channels import (
     STRETCH,
     TURN,
     Epochs,
-    Equations,
+    NavigationEquations,
     equations,
     read_epochs,
     without_navigation,
-)
-from reconstruct.placing.placement import (
-    NO_EXTRA,
-    Estimate,
-    Extra,
-    Lasting,
-    estimate,
-    without_gross_errors,
 )
 
 _LEVEL_SIGMA_DEG = 10.0
@@ -51,7 +51,7 @@ _STRETCH = 0.005
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Fit:
+class PlacementFit:
     """A model placed by navigation, and how well."""
 
     ned_from_model: Similarity
@@ -178,7 +178,7 @@ def level(points: Array, centres: Array) -> Similarity:
 
 
 ExtraOf = Callable[[Similarity, Array], Extra]
-"""Equations beside navigation's at a placement, whose rotation acts about a point (3,)."""
+"""Equations besides navigation's at a placement, whose rotation acts about a point (3,)."""
 
 
 def fit_navigation(
@@ -192,7 +192,7 @@ def fit_navigation(
     mount_sigma_deg: float = 0.0,
     scale_sigma: float = 0.0,
     control: ExtraOf | None = None,
-) -> Fit | None:
+) -> PlacementFit | None:
     """Fit a model to the positions and attitudes of navigation.
 
     Args:
@@ -220,7 +220,7 @@ def fit_navigation(
     free = [0, 1, 2, 3, 4, 5]
     if known_scale is None or scale_sigma > 0:
         free.append(SCALE)
-    task = _Task(
+    task = _NavigationTask(
         epochs=epochs,
         levelled=levelled,
         known_scale=known_scale,
@@ -239,7 +239,7 @@ def fit_control(
     *,
     known_scale: float | None,
     scale_sigma: float,
-) -> Fit:
+) -> PlacementFit:
     """Place a model by control points alone.
 
     Args:
@@ -253,7 +253,7 @@ def fit_control(
     free = [0, 1, 2, 3, 4, 5]
     if known_scale is None or scale_sigma > 0:
         free.append(SCALE)
-    task = _Task(
+    task = _NavigationTask(
         epochs=without_navigation(records, model_from_cam),
         levelled=None,
         known_scale=known_scale,
@@ -265,7 +265,7 @@ def fit_control(
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Task:
+class _NavigationTask:
     epochs: Epochs
     levelled: Similarity | None
     """None where control holds the model level."""
@@ -274,7 +274,7 @@ class _Task:
     mount_sigma_rad: float
     control: ExtraOf | None
 
-    def fit(self, start: Similarity, free: list[int]) -> Fit:
+    def fit(self, start: Similarity, free: list[int]) -> PlacementFit:
         """From a rough placement to the final one."""
         epochs = self.epochs
         place = self._robust(start, free)
@@ -300,13 +300,13 @@ class _Task:
 
     def _report(
         self, place: Similarity, middle: Array, got: Estimate, scaled: Estimate, *, held: bool
-    ) -> Fit:
+    ) -> PlacementFit:
         epochs = self.epochs
         kept = got.used[epochs.moment, 0]
         misses = (epochs.positions(place) - epochs.measured_ned)[kept]
         lost = epochs.known & ~got.used
         first = {group: k for k, group in zip((0, 2, 3, 5), GROUPS, strict=True)}
-        return Fit(
+        return PlacementFit(
             ned_from_model=place,
             used=int(got.used[:, 0].sum()),
             left_out={group: int(lost[:, k].sum()) for group, k in first.items()},
@@ -335,7 +335,7 @@ class _Task:
 
         Positions that were reckoned along a wrong heading are turned as a whole by its error; to
         take their turn for a second, independent reading of the heading would count one error
-        twice as if it were two. Likewise a log's velocities are all wrong by one factor.
+        twice as if it were two. In the same way a log's velocities are all wrong by one factor.
         """
         if not self.epochs.has_attitude:
             return {}
@@ -347,7 +347,7 @@ class _Task:
 
     def _estimate(
         self,
-        found: Equations,
+        found: NavigationEquations,
         place: Similarity,
         middle: Array,
         used: NDArray[np.bool_],

@@ -49,7 +49,7 @@ class Marker:
 
 
 @dataclass(frozen=True)
-class _Task:
+class _MarkerTask:
     path: Path
     dictionaries: tuple[str, ...]
 
@@ -98,7 +98,7 @@ def survey_control(
             f"no dictionary {dictionary!r}; there are {', '.join(_known_dictionaries())}"
         )
     tried = DICTIONARIES if dictionary is None else (dictionary,)
-    tasks = [_Task(images / name, tried) for name in names]
+    tasks = [_MarkerTask(images / name, tried) for name in names]
     found = list(parallel_map(_look, tasks, threads=threads, label="markers"))
     best, views = _best_dictionary(tried, found)
     rows = [
@@ -126,7 +126,7 @@ def survey_control(
     if score is not None:
         lines.append(describe(score))
     if (workspace / CONTROL_FILE).is_file():
-        lines.append("run 'alice-survey reconstruct' to place the model anew")
+        lines.append("run 'alice-survey reconstruct' to place the model again")
     else:
         lines.append(f"write what is known of the points to {CONTROL_FILE}")
     return "\n".join(lines), {
@@ -142,7 +142,7 @@ def _known_dictionaries() -> tuple[str, ...]:
     return tuple(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")))
 
 
-def _look(task: _Task) -> dict[str, list[Marker]]:
+def _look(task: _MarkerTask) -> dict[str, list[Marker]]:
     picture = cv2.cvtColor(read_colour(task.path), cv2.COLOR_BGR2GRAY)
     return {name: find_markers(picture, name) for name in task.dictionaries}
 

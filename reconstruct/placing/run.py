@@ -31,7 +31,7 @@ from reconstruct.placing.covariance import (
     shape_covariances,
     write_covariances,
 )
-from reconstruct.placing.place import Placed, Placing, find_place
+from reconstruct.placing.find_place import Placed, Placing, find_place
 from reconstruct.placing.track import (
     TrackRow,
     read_track_poses,

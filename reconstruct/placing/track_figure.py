@@ -33,7 +33,7 @@ _COLOURS = (
 def plot_track_over(mosaic_tif: Path, track_csv: Path, path: Path) -> None:
     """Draw the stations of a track over its mosaic, each line in a colour, with 2-sigma ellipses.
 
-    The ellipses are of the horizontal position in the world, from `track_covariance.npz` beside the
+    The ellipses are of the horizontal position in the world, from `track_covariance.npz` by the
     track where that is; they are drawn true to scale and left out where nothing places the model.
 
     Args:

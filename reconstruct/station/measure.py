@@ -1,6 +1,6 @@
 """Lengths and areas between picked pixels, with their standard deviations.
 
-In the folder of a pair a pixel's depth is matched anew by least squares; in a reconstructed
+In the folder of a pair a pixel's depth is matched again by least squares; in a reconstructed
 workspace its exact ray is cut with the DEM, or with the ray of a second picture. What is known of
 the calibration moves all points together: its covariance is carried through the exact
 triangulation, so that an error of the baseline scales a length and leaves its points side by side.
@@ -21,13 +21,12 @@ from alice_survey.base.contents import taken_from
 from alice_survey.base.errors import ReconstructionError, WorkspaceError
 from alice_survey.base.frames import Array
 from camera_calib.rig import Rig, read_rig
-from reconstruct.dense.rectify import scaled_view
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.station.pair import pair_samplers, read_depth, to_axes
 from reconstruct.station.precise import precise_depth
-from reconstruct.station.solve import Optics, calibration_slopes, stereo_rig
+from reconstruct.station.solve import PairOptics, calibration_slopes, stereo_rig
 from reconstruct.views.lens import FlatPortLens, Lens, lens_from_json
-from reconstruct.views.model import View, read_model
+from reconstruct.views.model import View, read_model, scaled_view
 
 _NUMBER = r"(-?\d+(?:\.\d+)?)"
 _PIXEL = re.compile(rf"(?:(?P<image>[^=]+?):)?{_NUMBER},{_NUMBER}")
@@ -38,7 +37,7 @@ _CELL_STEPS = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pick:
+class PickedPixel:
     """A pixel as taken, from the outer corner of the first."""
 
     image: str | None
@@ -108,10 +107,10 @@ def measure(
             f"{folder}: neither the folder of a pair (pair.json) nor a reconstructed workspace "
             "(sparse/)"
         )
-    return _told(points.split(), located)
+    return _described(points.split(), located)
 
 
-def parse_picks(points: str) -> list[tuple[Pick, ...]]:
+def parse_picks(points: str) -> list[tuple[PickedPixel, ...]]:
     """Read points as `measure` takes them.
 
     Raises:
@@ -127,7 +126,7 @@ def parse_picks(points: str) -> list[tuple[Pick, ...]]:
                     f"point {word!r}: give x,y or IMAGE:x,y or IMAGE:x,y=IMAGE:x,y"
                 )
             x, y = float(match[2]) + 0.5, float(match[3]) + 0.5
-            spots.append(Pick(image=match["image"], x=x, y=y))
+            spots.append(PickedPixel(image=match["image"], x=x, y=y))
         if len(spots) > 2:
             raise ReconstructionError(f"point {word!r}: at most two pictures can show a spot")
         found.append(tuple(spots))
@@ -147,7 +146,7 @@ def polygon_area(points: Array) -> float:
     return 0.5 * float(np.linalg.norm(np.cross(local, np.roll(local, -1, axis=0)).sum(axis=0)))
 
 
-def _told(words: list[str], located: Located) -> tuple[str, dict[str, Any]]:
+def _described(words: list[str], located: Located) -> tuple[str, dict[str, Any]]:
     lines, segments = [], []
     count = len(located.points)
 
@@ -161,12 +160,12 @@ def _told(words: list[str], located: Located) -> tuple[str, dict[str, Any]]:
         }
 
     for n in range(count - 1):
-        told = entry(lambda p, n=n: polyline(p[n : n + 2]), "m")  # type: ignore[misc]
-        segments.append({"from": words[n], "to": words[n + 1], **told})
+        found = entry(lambda p, n=n: polyline(p[n : n + 2]), "m")  # type: ignore[misc]
+        segments.append({"from": words[n], "to": words[n + 1], **found})
         lines.append(
-            f"{words[n]} to {words[n + 1]}: {1e3 * told['value_m']:.2f} mm, sigma "
-            f"{1e3 * told['sigma_m']:.2f} mm ({1e3 * told['sigma_of_pixels_m']:.2f} of pixels, "
-            f"{1e3 * told['sigma_of_calibration_m']:.2f} of calibration)"
+            f"{words[n]} to {words[n + 1]}: {1e3 * found['value_m']:.2f} mm, sigma "
+            f"{1e3 * found['sigma_m']:.2f} mm ({1e3 * found['sigma_of_pixels_m']:.2f} of pixels, "
+            f"{1e3 * found['sigma_of_calibration_m']:.2f} of calibration)"
         )
     data: dict[str, Any] = {
         "format": "alice-survey measure",
@@ -198,7 +197,7 @@ def _told(words: list[str], located: Located) -> tuple[str, dict[str, Any]]:
 
 
 def _in_pair(
-    folder: Path, picks: list[tuple[Pick, ...]], pick_sigma_px: float, n_water_sigma: float
+    folder: Path, picks: list[tuple[PickedPixel, ...]], pick_sigma_px: float, n_water_sigma: float
 ) -> Located:
     about = read_json(folder / "pair.json")
     rig = read_rig(folder / "rig.json")
@@ -212,7 +211,7 @@ def _in_pair(
             raise ValueError("pictures outside of its folder")
     if not isinstance(first, FlatPortLens) or not isinstance(second, FlatPortLens):
         raise WorkspaceError(f"{folder / 'pair.json'}: its lenses are not those of a rig")
-    optics = Optics(rig=stereo_rig(rig), lenses=(first, second))
+    optics = PairOptics(rig=stereo_rig(rig), lenses=(first, second))
     for pick in picks:
         if len(pick) > 1 or pick[0].image is not None:
             raise ReconstructionError("points of a pair are x,y in its left picture")
@@ -249,7 +248,7 @@ def _in_pair(
     flip = np.diag([1.0, -1.0, -1.0])
     notes = [f"rig: {rig.source}"]
     if not len(parameters):
-        notes.append("the rig tells no covariance: sigmas are those of the pixels alone")
+        notes.append("the rig has no covariance: sigmas are those of the pixels alone")
     return Located(
         points=to_axes(points),
         own=flip @ own @ flip,
@@ -286,7 +285,9 @@ def _check_inside(taken: Array, lens: Lens, name: str) -> None:
             )
 
 
-def _in_workspace(workspace: Path, picks: list[tuple[Pick, ...]], pick_sigma_px: float) -> Located:
+def _in_workspace(
+    workspace: Path, picks: list[tuple[PickedPixel, ...]], pick_sigma_px: float
+) -> Located:
     sparse = need_stage(workspace, "sparse", "reconstruct")
     model = read_model(sparse)
     if not model.frame.scaled:
@@ -309,7 +310,7 @@ def _in_workspace(workspace: Path, picks: list[tuple[Pick, ...]], pick_sigma_px:
         if len(rays) == 2:
             point, covariance = _crossed(rays, pick_sigma_px or _TWO_PICTURES_SIGMA_PX)
         else:
-            surface = surface or _Surface(need_stage(workspace, "dense", "reconstruct"))
+            surface = surface or _DemSurface(need_stage(workspace, "dense", "reconstruct"))
             point, covariance = _on_surface(surface, *rays[0], pick_sigma_px)
         points.append(point)
         own.append(covariance)
@@ -362,7 +363,7 @@ def _crossed(rays: list[tuple[View, Lens, Array]], sigma_px: float) -> tuple[Arr
     return point, covariance
 
 
-class _Surface:
+class _DemSurface:
     """The DEM and its standard deviation."""
 
     def __init__(self, dense: Path) -> None:
@@ -414,7 +415,7 @@ class _Surface:
 
 
 def _on_surface(
-    surface: _Surface, view: View, lens: Lens, taken: Array, sigma_px: float
+    surface: _DemSurface, view: View, lens: Lens, taken: Array, sigma_px: float
 ) -> tuple[Array, Array]:
     start, direction = _ray(view, lens, taken)
     point = surface.hit(start, direction)
@@ -427,8 +428,8 @@ def _on_surface(
     raised = surface.hit(start, direction, lift=sigma)
     moves = [raised - point if raised is not None else sigma * direction]
     for axis in range(2):
-        beside = surface.hit(*_ray(view, lens, taken + np.eye(2)[axis]))
-        if beside is not None:
-            moves.append((beside - point) * sigma_px)
+        aside_point = surface.hit(*_ray(view, lens, taken + np.eye(2)[axis]))
+        if aside_point is not None:
+            moves.append((aside_point - point) * sigma_px)
     covariance = sum((np.outer(m, m) for m in moves), np.zeros((3, 3)))
     return point, covariance

@@ -25,8 +25,7 @@ from alice_survey.base.run import progress
 from camera_calib.rig import Rig, read_rig, write_rig
 from reconstruct.dense.cloud import VERTEX, write_ply
 from reconstruct.dense.depth import MATCH_SIGMA_PX, pair_depth
-from reconstruct.dense.probe import matching_scale
-from reconstruct.dense.rectify import scaled_view
+from reconstruct.dense.matching_trial import matching_scale
 from reconstruct.matching.features import find_features
 from reconstruct.matching.matches import match_descriptors
 from reconstruct.pictures.normalise import normalise
@@ -34,8 +33,8 @@ from reconstruct.pictures.undistorted import Pictures, read_colour
 from reconstruct.station.mesh import depth_mesh, write_station_mesh
 from reconstruct.station.plot import plot_pair
 from reconstruct.station.precise import Sampler, inflation, precise_depth, sampler
-from reconstruct.station.solve import Optics, matched_points, optics_for, stereo_rig
-from reconstruct.views.model import View, WorldFrame
+from reconstruct.station.solve import PairOptics, matched_points, optics_for, stereo_rig
+from reconstruct.views.model import View, WorldFrame, scaled_view
 
 Float32 = NDArray[np.float32]
 
@@ -89,7 +88,7 @@ def reconstruct_pair(
         rig: `rig.json`.
         output: folder to write; what it held of an earlier pair is replaced.
         near_m: nearest distance along the axis; from the pair's own matches when None.
-        far_m: farthest; likewise.
+        far_m: farthest one.
         scale: by which pictures are shrunk for matching; from their size when None.
         triangles: largest number of the mesh.
 
@@ -185,7 +184,7 @@ def check_sizes(rig: Rig, pictures: tuple[Path, Path]) -> None:
 @progress.step("match features of the pair")
 def find_optics(
     rig: Rig, pictures: tuple[Path, Path], near_m: float | None, far_m: float | None
-) -> tuple[Optics, Array]:
+) -> tuple[PairOptics, Array]:
     """The pinholes for the distances that matches of the pair show, and the matched points.
 
     Raises:
@@ -211,7 +210,7 @@ def find_optics(
 
 @progress.step("find depth")
 def dense_pair(
-    optics: Optics, pictures: tuple[Path, Path], points: Array, scale: float | None
+    optics: PairOptics, pictures: tuple[Path, Path], points: Array, scale: float | None
 ) -> PairDepth:
     """Depth of the left view that the right one confirms.
 
@@ -264,7 +263,7 @@ def dense_pair(
     )
 
 
-def open_pair(optics: Optics, pictures: tuple[Path, Path]) -> tuple[list[str], Pictures]:
+def open_pair(optics: PairOptics, pictures: tuple[Path, Path]) -> tuple[list[str], Pictures]:
     """The pictures of a pair as their pinholes see them, and their names there."""
     names = [str(path.absolute()) for path in pictures]
     opened = Pictures(
@@ -276,7 +275,7 @@ def open_pair(optics: Optics, pictures: tuple[Path, Path]) -> tuple[list[str], P
 
 
 def pair_samplers(
-    optics: Optics, pictures: tuple[Path, Path], views: tuple[View, View]
+    optics: PairOptics, pictures: tuple[Path, Path], views: tuple[View, View]
 ) -> tuple[Sampler, Sampler]:
     """What both views show, for precise matches."""
     first, second = (
@@ -300,8 +299,8 @@ def _match_sigma(
     precise = precise_depth(views, greys, depth, _centres(rows, columns))
     miss = (depth[rows, columns] - precise.depth) / sigma[rows, columns]
     factor = inflation(precise)
-    told = 1.4826 * float(np.nanmedian(np.abs(miss))) * MATCH_SIGMA_PX
-    return round(told, 4), round(factor, 3)
+    match_sigma_px = 1.4826 * float(np.nanmedian(np.abs(miss))) * MATCH_SIGMA_PX
+    return round(match_sigma_px, 4), round(factor, 3)
 
 
 def _agreeing(left: View, right: View, maps: list[tuple[Float32, Float32]]) -> Float32:
@@ -328,7 +327,7 @@ def _centres(rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Array:
 
 
 def _sample(picture: Float32, x: Float32, y: Float32) -> Array:
-    """Bilinear values (N,) at OpenCV's pixels (N, 1); NaN beside what is unknown."""
+    """Bilinear values (N,) at OpenCV's pixels (N, 1); NaN next to what is unknown."""
     parts = [
         cv2.remap(
             picture, x[i : i + 30_000], y[i : i + 30_000], cv2.INTER_LINEAR,
@@ -339,7 +338,7 @@ def _sample(picture: Float32, x: Float32, y: Float32) -> Array:
     return np.concatenate([np.zeros(0), *(part[:, 0] for part in parts)])
 
 
-def _angle_deg(optics: Optics) -> float:
+def _angle_deg(optics: PairOptics) -> float:
     return float(np.rad2deg(optics.rig.second_from_first.rotation.magnitude()))
 
 

@@ -1,4 +1,4 @@
-"""A picture beside its depth, with a scale bar."""
+"""A picture next to its depth, with a scale bar."""
 
 from pathlib import Path
 

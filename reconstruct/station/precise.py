@@ -3,7 +3,7 @@
 The patch around a pixel of the left picture is looked for in the right one at several depths, each
 through both exact lenses and along the slope of the surface, brightness and contrast fitted. The
 sum of squared differences is a parabola near its least value; its curvature and the scatter of what
-remains at its bottom tell the standard deviation (Gruen 1985, "Adaptive least squares
+remains at its bottom determine the standard deviation (Gruen 1985, "Adaptive least squares
 correlation").
 """
 
@@ -45,7 +45,7 @@ _ROUNDS = 2
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PreciseDepth:
-    """Depth of N pixels; NaN where the pictures do not tell it."""
+    """Depth of N pixels; NaN where the pictures do not determine it."""
 
     depth: Array
     """(N,) before the left pinhole's centre."""
@@ -118,7 +118,7 @@ def precise_depth(
     with np.errstate(divide="ignore", invalid="ignore"):
         seen = right.project(left.at_depth(flat, (1.0 / (inverse[:, None] + tilt)).reshape(-1)))
     square = np.repeat(across, len(grid), axis=0)
-    beside = [
+    offset_rests = [
         _compare(
             shown,
             greys[1](seen + k * _STEP_PX * square).reshape(len(pixels), -1),
@@ -126,14 +126,14 @@ def precise_depth(
         )[0]
         for k in (-1.0, 0.0, 1.0)
     ]
-    a, b, c = ((r * r) @ weight for r in beside)
+    a, b, c = ((r * r) @ weight for r in offset_rests)
     bend = (a - 2 * b + c) / 2
     with np.errstate(divide="ignore", invalid="ignore"):
         missed = (
             (a - c)
             / (4 * bend)
             * _STEP_PX
-            / _sigma_px(beside[0], beside[1], beside[2], bend, weight)
+            / _sigma_px(offset_rests[0], offset_rests[1], offset_rests[2], bend, weight)
         )
     return PreciseDepth(
         depth=depth,
@@ -146,9 +146,9 @@ def precise_depth(
 def inflation(found: PreciseDepth) -> float:
     """By what the sigmas of many pixels are too small, at least 1.
 
-    Aliasing and resampling leave errors that one patch cannot tell. Across the epipolar line the
+    Aliasing and resampling leave errors that one patch cannot show. Across the epipolar line the
     true miss is the same for all (the calibration's): its scatter (rms, gross errors held back), in
-    stated sigmas, tells.
+    stated sigmas, gives it.
 
     Raises:
         ReconstructionError: too few pixels are matched.
@@ -200,7 +200,7 @@ def sampler(taken: NDArray[np.uint8], lens: Lens, view: View) -> Sampler:
 
 
 def at_pixels(picture: Float32, pixels: Array) -> Array:
-    """Cubic values (N,) of a picture at pixels (N, 2); NaN beyond it or beside NaN."""
+    """Cubic values (N,) of a picture at pixels (N, 2); NaN beyond it or next to NaN."""
     found = np.empty(len(pixels))
     for first in range(0, len(pixels), 30_000):  # remap takes at most 32767 rows
         part = pixels[first : first + 30_000] - 0.5
@@ -235,7 +235,7 @@ def _compare(first: Array, second: Array, weight: Array) -> tuple[Array, Array]:
     """What remains of the first (N, P) once the second is fitted in brightness and contrast.
 
     Returns:
-        (N, P) residuals, in the grey levels of the first, and (N,) correlations; NaN beside
+        (N, P) residuals, in the grey levels of the first, and (N,) correlations; NaN next to
         unknown.
     """
     total = weight.sum()

@@ -69,7 +69,7 @@ def stereo_rig(rig: Rig) -> StereoRig:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Optics:
+class PairOptics:
     """A stereo rig as the pinholes that stand in for it at its working range."""
 
     rig: StereoRig
@@ -99,10 +99,10 @@ class Optics:
         return views[0], views[1]
 
 
-def optics_for(rig: StereoRig, near_m: float, far_m: float) -> Optics:
+def optics_for(rig: StereoRig, near_m: float, far_m: float) -> PairOptics:
     """The best pinholes for distances between near and far."""
     first, second = (flat_port_lens(camera, near_m, far_m) for camera in rig.cameras)
-    return Optics(rig=rig, lenses=(first, second))
+    return PairOptics(rig=rig, lenses=(first, second))
 
 
 def matched_points(rig: StereoRig, pixels: tuple[Array, Array]) -> Array:

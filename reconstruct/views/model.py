@@ -1,6 +1,6 @@
 """The sparse model as the later stages see it: views through ideal pinholes, and points."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,6 +13,8 @@ from alice_survey.base.frames import Array, Datum
 from alice_survey.base.records import CamerasRecord, FrameRecord, PlaceRecord
 from reconstruct.views.lens import Lens, lens_from_json
 from reconstruct.views.range_shift import RangeShift, no_shift, range_shift
+
+_ENU_FROM_WORLD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,13 +146,14 @@ def read_lenses(path: Path) -> dict[str, Lens]:
     return {name: lens_from_json(lens) for name, lens in CamerasRecord.read(path).cameras.items()}
 
 
-def read_model(sparse: Path) -> SparseModel:
+def read_model(sparse: str | Path) -> SparseModel:
     """Read the model of a finished `sparse/` stage.
 
     Raises:
         WorkspaceError: a file is missing, or not as it was written.
         ReconstructionError: the model is damaged.
     """
+    sparse = Path(sparse)
     from reconstruct.views.model_files import read_reconstruction
 
     stored = CamerasRecord.read(sparse / "cameras.json")
@@ -213,3 +216,36 @@ def _shifts(stored: CamerasRecord, frame: WorldFrame) -> dict[str, RangeShift]:
         for name, lens in stored.cameras.items()
         if lens["kind"] == "flat_port"
     }
+
+
+def points_of_views(model: SparseModel) -> list[Array]:
+    """World coordinates (N, 3) of the sparse points that each view observed."""
+    order = np.argsort(model.observations[:, 1], kind="stable")
+    points, views = model.observations[order].T
+    starts = np.searchsorted(views, np.arange(1, len(model.views)))
+    return [model.points_world[seen] for seen in np.split(points, starts)]
+
+
+def scaled_view(view: View, scale: float) -> View:
+    """The same view in a picture shrunk by a factor (1 keeps it)."""
+    if scale == 1.0:
+        return view
+    width, height = round(view.width_px * scale), round(view.height_px * scale)
+    sx, sy = width / view.width_px, height / view.height_px
+    return replace(
+        view,
+        width_px=width,
+        height_px=height,
+        fx_px=view.fx_px * sx,
+        cx_px=view.cx_px * sx,
+        fy_px=view.fy_px * sy,
+        cy_px=view.cy_px * sy,
+        shift=None if view.shift is None else view.shift.scaled(sx, sy),
+    )
+
+
+def enu_from_cam(view: View, offset_enu: Array) -> Array:
+    """(3, 4) transform from a view's camera to east, north, up from an offset."""
+    matrix = _ENU_FROM_WORLD @ view.world_from_cam.as_matrix()[:3]
+    matrix[:, 3] -= offset_enu
+    return np.ascontiguousarray(matrix)

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -201,3 +202,38 @@ def test_calibrate_does_not_forget_options_when_pictures_are_missing(
 ) -> None:
     shown = fails(["calibrate", *option], capsys, monkeypatch)
     assert "--left and --right, or --pictures" in shown
+
+
+def commands_in_a_workspace() -> list[str]:
+    """Those without arguments of their own; groups have commands below them instead."""
+    return [
+        name
+        for name, command in get_command(app).commands.items()  # type: ignore[attr-defined]
+        if not hasattr(command, "commands")
+        and any(option.name == "workspace" for option in command.params)
+        and all(p.name == "folder" for p in command.params if p.param_type_name == "argument")
+    ]
+
+
+@pytest.mark.parametrize("name", commands_in_a_workspace())
+def test_a_workspace_is_an_option_and_an_argument_of_each_command(name: str) -> None:
+    parameters = get_command(app).commands[name].params  # type: ignore[attr-defined]
+    assert [p.opts for p in parameters if p.name == "workspace"] == [["-w", "--workspace"]]
+    assert [p.name for p in parameters if p.param_type_name == "argument"] == ["folder"]
+
+
+def test_a_workspace_as_argument_is_the_same_as_by_option(tmp_path: Path) -> None:
+    assert CliRunner().invoke(app, ["init", str(tmp_path / "reef")]).exit_code == 0
+    by_argument = CliRunner().invoke(app, ["status", str(tmp_path / "reef"), "--json"])
+    by_option = CliRunner().invoke(app, ["status", "-w", str(tmp_path / "reef"), "--json"])
+    assert by_argument.exit_code == by_option.exit_code == 0
+    assert by_argument.output == by_option.output
+    both = CliRunner().invoke(app, ["status", str(tmp_path / "reef"), "-w", str(tmp_path / "bay")])
+    assert both.exit_code == 2
+    assert "bay" in both.output
+
+
+def test_version_is_that_of_the_distribution() -> None:
+    result = CliRunner().invoke(app, ["--version"])
+    assert result.exit_code == 0
+    assert result.output.split() == ["alice-survey", metadata.version("alice-survey")]

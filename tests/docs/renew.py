@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.alice_survey.report.browser import chromium
+from tests.alice_survey.kit.browser import chromium
 from tests.docs.given import TUTORIAL, Made
 from tests.docs.pages import DOCS
 

@@ -17,7 +17,7 @@ import pytest
 import yaml
 from mkdocs.exceptions import PluginError
 
-from tests.alice_survey.report.browser import Heard, chromium
+from tests.alice_survey.kit.browser import Heard, chromium
 from tests.docs.pages import DOCS, pages
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("site")]

@@ -15,7 +15,7 @@ from alice_survey.vehicle.hull import HULL_BODY_M
 from alice_survey.vehicle.pilot.safety import REASONS, TOO_LOW
 from camera_calib.rig import design_rig
 from missions.fly.simulation import simulate_plan
-from missions.plan.run import make_plan
+from missions.plan.planner import plan_survey
 from missions.values.flight import Flight
 from missions.values.plan_file import Plan
 
@@ -40,7 +40,7 @@ def survey(*silent_s: tuple[float, float]) -> SurveyConfig:
 @lru_cache
 def plan_of() -> Plan:
     config = survey()
-    return make_plan(config, design_rig(config.camera, config.water))
+    return plan_survey(config, design_rig(config.camera, config.water)).plan
 
 
 def ground(depth_at: Callable[[Array], Array]) -> FloorGrid:

@@ -40,7 +40,7 @@ from missions.fly.compare import (
 from missions.fly.compare_report import compare_report
 from missions.fly.flight_plots import true_current
 from missions.fly.simulation import mission_setup
-from missions.plan.run import make_plan
+from missions.plan.planner import plan_survey
 from missions.values.flight import Flight
 from missions.values.plan_file import Plan
 
@@ -60,7 +60,7 @@ def survey(length_m: float, width_m: float, **sea: object) -> SurveyConfig:
 
 
 def plan_of(config: SurveyConfig) -> Plan:
-    return make_plan(config, design_rig(config.camera, config.water))
+    return plan_survey(config, design_rig(config.camera, config.water)).plan
 
 
 CONFIG = survey(3.0, 2.0)

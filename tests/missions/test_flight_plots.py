@@ -18,7 +18,7 @@ from missions.fly import flight_plots
 from missions.fly.flight_plots import draw_flight, draw_vehicle, line_spans, thin, true_current
 from missions.fly.flight_records import rpm_of
 from missions.fly.simulation import simulate_plan
-from missions.plan.run import make_plan
+from missions.plan.planner import plan_survey
 from missions.values.flight import Flight, rms
 
 CONFIG = parse_config(
@@ -33,7 +33,7 @@ CONFIG = parse_config(
 
 @pytest.fixture(scope="module")
 def flight() -> Flight:
-    plan = make_plan(CONFIG, design_rig(CONFIG.camera, CONFIG.water))
+    plan = plan_survey(CONFIG, design_rig(CONFIG.camera, CONFIG.water)).plan
     return simulate_plan(plan, CONFIG, level_floor(6.0), np.random.default_rng(1))
 
 

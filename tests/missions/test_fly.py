@@ -14,7 +14,7 @@ from alice_survey.seafloor.terrain import survey_terrain
 from alice_survey.stages import spec
 from alice_survey.survey import FlightChanges, run
 from alice_survey.vehicle.log import read_vehicle_log
-from missions.plan.run import read_plan
+from missions.values.plan_file import read_plan
 
 FILES = (
     "triggers.csv", "navigation.csv", "vehicle.csv", "flight.json", "truth/track.csv",

@@ -18,9 +18,10 @@ from camera_calib.rig import design_rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import stations_of_plan
 from missions.exports.footprints import footprint_outline, footprints_ne
-from missions.plan.run import Plan, make_plan, read_plan
+from missions.plan.planner import plan_survey
 from missions.values.footprint import common_swath
 from missions.values.pattern import pattern
+from missions.values.plan_file import Plan, read_plan
 
 
 def survey(**sections: Any) -> SurveyConfig:
@@ -29,7 +30,7 @@ def survey(**sections: Any) -> SurveyConfig:
 
 def planned(**sections: Any) -> Plan:
     config = survey(**sections)
-    return make_plan(config, design_rig(config.camera, config.water))
+    return plan_survey(config, design_rig(config.camera, config.water)).plan
 
 
 SMALL = {"area": {"length_m": 4.6, "width_m": 4.0, "heading_deg": 20.0}}
@@ -105,7 +106,7 @@ def test_the_demos_mission_has_what_a_demo_needs() -> None:
 def test_an_overlap_that_is_asked_for_is_reached_on_real_footprints(wanted: float) -> None:
     config = survey(area={"length_m": 12.0, "width_m": 8.0}, plan={"side_overlap": wanted})
     rig = design_rig(config.camera, config.water)
-    plan = make_plan(config, rig)
+    plan = plan_survey(config, rig).plan
     first, second = plan.lines[:2]
     outline = footprint_outline(plan, rig)
     one = footprints_ne(first, outline)[3]

@@ -9,7 +9,7 @@ from alice_survey.base.config import SurveyConfig, load_config
 from alice_survey.seafloor.terrain import survey_terrain
 from camera_calib.rig import design_rig
 from missions.fly.simulation import floor_grid, simulate_plan
-from missions.plan.run import make_plan
+from missions.plan.planner import plan_survey
 from missions.values.plan_file import Plan
 
 
@@ -21,7 +21,7 @@ def config() -> SurveyConfig:
 
 @pytest.fixture(scope="module")
 def plan(config: SurveyConfig) -> Plan:
-    return make_plan(config, design_rig(config.camera, config.water))
+    return plan_survey(config, design_rig(config.camera, config.water)).plan
 
 
 def test_it_is_the_site_of_the_paper(plan: Plan) -> None:

@@ -15,7 +15,7 @@ from alice_survey.vehicle.sea import current_at
 from camera_calib.rig import design_rig
 from missions.fly.flight_records import flight_summary
 from missions.fly.simulation import current_of, simulate_plan
-from missions.plan.run import make_plan
+from missions.plan.planner import plan_survey
 from missions.values.flight import Flight
 from missions.values.plan_file import Plan
 
@@ -36,7 +36,7 @@ def plan_of(heading_deg: float = 20.0) -> Plan:
     config = survey()
     area = config.area.model_copy(update={"heading_deg": heading_deg})
     config = config.model_copy(update={"area": area})
-    return make_plan(config, design_rig(config.camera, config.water))
+    return plan_survey(config, design_rig(config.camera, config.water)).plan
 
 
 def fly(config: SurveyConfig, floor: FloorGrid | None = None, seed: int = 1) -> Flight:

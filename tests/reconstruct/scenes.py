@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.config import CameraConfig, WaterConfig
@@ -14,6 +15,8 @@ from reconstruct.matching.matches import PairMatches
 DATUM = Datum(32.8236, 34.9553)
 SEAFLOOR_M = 15.0
 ALTITUDE_M = 2.0
+_FAR_M = 4.0
+"""What lies farther from a camera is in no picture, and cameras so far apart share none."""
 CALIBRATED = 2
 """COLMAP's number of a pair of calibrated pictures."""
 
@@ -62,6 +65,7 @@ def make_scene(
     relief = 0.1 * np.sin(2.1 * north) + 0.06 * np.cos(3.3 * east + north)
     points_ned = np.stack([north, east, SEAFLOOR_M + relief * relief_m / 0.16], axis=1)
     records, poses, pixels, ids = [], [], [], []
+    tree = cKDTree(points_ned)
     for station in range(lines * stations):
         line, step = divmod(station, stations)
         place = step if line % 2 == 0 else stations - 1 - step
@@ -74,9 +78,10 @@ def make_scene(
         latitude, longitude, depth = DATUM.geodetic_from_ned(body[None] + bias_m)[0]
         for name, cam in rig.cameras.items():
             pose = ned_from_body * rig.body_from_cam(name)
-            seen = cam.project(pose.inv().apply(points_ned))
+            near = np.sort(tree.query_ball_point(pose.translation, _FAR_M))
+            seen = cam.project(pose.inv().apply(points_ned[near]))
             inside = np.all((seen > 1) & (seen < [cam.width_px - 1, cam.height_px - 1]), axis=1)
-            ids.append(np.flatnonzero(inside))
+            ids.append(near[inside])
             pixels.append(seen[inside] + rng.normal(0, noise_px, (int(inside.sum()), 2)))
             poses.append(pose)
             records.append(
@@ -99,13 +104,12 @@ def make_scene(
                 )
             )
     pairs = []
-    for i in range(len(ids)):
-        for j in range(i + 1, len(ids)):
-            _, a, b = np.intersect1d(ids[i], ids[j], return_indices=True)
-            if len(a) >= 15:
-                matches = np.stack([a, b], axis=1).astype(np.uint32)
-                geometry = {"config": CALIBRATED, "E": None, "F": None, "H": None}
-                pairs.append((i, j, PairMatches(matches=matches, geometry=geometry)))
+    for i, j in sorted(cKDTree([pose.translation for pose in poses]).query_pairs(_FAR_M)):
+        _, a, b = np.intersect1d(ids[i], ids[j], return_indices=True)
+        if len(a) >= 15:
+            matches = np.stack([a, b], axis=1).astype(np.uint32)
+            geometry = {"config": CALIBRATED, "E": None, "F": None, "H": None}
+            pairs.append((i, j, PairMatches(matches=matches, geometry=geometry)))
     return Scene(
         rig=rig,
         records=records,

@@ -8,8 +8,8 @@ import rasterio
 from pyproj import Transformer
 
 from alice_survey.base.errors import WorkspaceError
-from reconstruct.dense.dem import DemGrid
 from reconstruct.raster import (
+    DemGrid,
     crs_of,
     hillshade,
     local_crs,

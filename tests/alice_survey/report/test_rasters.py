@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from alice_survey.report.document import PictureLayer
+from alice_survey.kit.document import PictureLayer
 from alice_survey.report.held import Held
 from alice_survey.report.rasters import mosaic_layer, picture_layers
 from tests.alice_survey.report.tiny import tiny_workspace

@@ -11,8 +11,8 @@ from rasterio.transform import Affine
 
 from alice_survey.base.artefacts import write_json
 from alice_survey.view.server import serving
-from tests.alice_survey.report.browser import Heard, chromium
-from tests.alice_survey.report.sketch import encoded, seafloor, sketch_mesh
+from tests.alice_survey.kit.browser import Heard, chromium
+from tests.alice_survey.kit.sketch import encoded, seafloor, sketch_mesh
 from tests.alice_survey.report.tiny import tiny_workspace
 
 pytestmark = pytest.mark.xdist_group("chromium")

@@ -2,14 +2,15 @@
 
 from typing import Any
 
-from alice_survey.base.config import SurveyConfig, parse_config
-from camera_calib.rig import Rig, design_rig
+from alice_survey.base.config import parse_config
+from camera_calib.rig import Rig
+from missions.exposure.settings import ImagingSetup
 
 
-def survey(ideal_port: bool = False, **sections: Any) -> tuple[Rig, SurveyConfig]:
-    """A survey with the default settings but for those given, by section, and its rig."""
+def survey(ideal_port: bool = False, **sections: Any) -> tuple[Rig, ImagingSetup]:
+    """Rig and setup of a survey with the default settings but for those given, by section."""
     if ideal_port:
         port = {"port_distance_m": 0.0, "glass_thickness_m": 0.0}
         sections["camera"] = {**port, **sections.get("camera", {})}
-    config = parse_config(sections, "test")
-    return design_rig(config.camera, config.water), config
+    setup = ImagingSetup.of(parse_config(sections, "test"))
+    return setup.rig, setup

@@ -35,7 +35,7 @@ def taken(folder: Path, median_e: float, gain_db: float, count: int = 3, **how: 
 
 
 @settings(max_examples=15, deadline=None)
-@given(median_e=st.floats(150, 2500), present_db=st.floats(0, 12))
+@given(median_e=st.floats(150, 2000), present_db=st.floats(0, 12))
 def test_the_gain_told_brings_the_median_to_the_target(
     tmp_path_factory: pytest.TempPathFactory, median_e: float, present_db: float
 ) -> None:

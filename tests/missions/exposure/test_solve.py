@@ -4,20 +4,23 @@ import re
 
 import pytest
 
+from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import ConfigError, PlanError
+from camera_calib.rig import design_rig
 from missions.exposure.settings import imaging_settings
-from missions.exposure.solve import solve_report, speeds_for_rate
-from missions.exposure.solve_dive import area_for_dive, turn_s
+from missions.exposure.solve import area_for_dive, solve_report, speeds_for_rate, turn_s
 from missions.exposure.solve_lens import lenses_for_resolution
-from missions.plan.run import make_plan
+from missions.plan.planner import plan_survey
 from missions.values.costs import SETTLE_S
 from missions.values.footprint import footprint_size_m
 from tests.missions.exposure.surveys import survey
 
+DEPTH_M = SurveyConfig().area.seafloor_depth_m
+
 
 def test_a_resolution_gives_the_altitude_whose_pixel_it_is() -> None:
     _, config = survey(plan={"side_overlap": 0.45})
-    best, other = lenses_for_resolution(config, 0.448, (25.0, 12.5))
+    best, other = lenses_for_resolution(config, DEPTH_M, 0.448, (25.0, 12.5))
     assert best.lens_mm == 12.5
     assert best.fits
     assert best.altitude_m == pytest.approx(2.0, abs=0.005)
@@ -34,37 +37,39 @@ def test_a_resolution_gives_the_altitude_whose_pixel_it_is() -> None:
 
 def test_a_dive_at_a_resolution_is_solved_at_its_altitude() -> None:
     _, config = survey()
-    text, data = solve_report(config, resolution_mm=0.33, dive_s=1800.0)
+    text, data = solve_report(config, DEPTH_M, resolution_mm=0.33, dive_s=1800.0)
     best = data["lenses"][0]
     assert data["dive"]["line_spacing_m"] == pytest.approx(best["spacing_m"])
     _, lower = survey(
         plan={"altitude_m": best["altitude_m"]},
         camera={"focal_mm": best["lens_mm"], "f_number": best["f_number"]},
     )
-    assert data["dive"]["area_m2"] == pytest.approx(area_for_dive(lower, 1800.0).area_m2)
-    assert data["dive"]["area_m2"] < 0.9 * area_for_dive(config, 1800.0).area_m2
+    assert data["dive"]["area_m2"] == pytest.approx(area_for_dive(lower, DEPTH_M, 1800.0).area_m2)
+    assert data["dive"]["area_m2"] < 0.9 * area_for_dive(config, DEPTH_M, 1800.0).area_m2
     assert f"at {best['altitude_m']:.2f} m" in text.split("\n\n")[1]
 
 
 def test_ways_out_of_a_resolution_that_is_too_fine_work() -> None:
     _, config = survey()
     with pytest.raises(PlanError) as fault:
-        lenses_for_resolution(config, 0.22, (12.5, 25.0))
+        lenses_for_resolution(config, DEPTH_M, 0.22, (12.5, 25.0))
     text = str(fault.value)
     assert 2 <= len(text.splitlines()) <= 4
     assert "the resolution conflicts with" in text
     finer = float(re.search(r"resolution ([\d.]+) mm with the 12.5", text)[1])
-    assert lenses_for_resolution(config, finer + 5e-4, (12.5,))[0].fits
+    assert lenses_for_resolution(config, DEPTH_M, finer + 5e-4, (12.5,))[0].fits
     blur = float(re.search(r"allowed_blur_px ([\d.]+)", text)[1])
     _, blurred = survey(plan={"allowed_blur_px": blur})
-    assert lenses_for_resolution(blurred, 0.22, (25.0,))[0].snr == pytest.approx(5.0, abs=0.05)
+    assert lenses_for_resolution(blurred, DEPTH_M, 0.22, (25.0,))[0].snr == pytest.approx(
+        5.0, abs=0.05
+    )
 
 
 @pytest.mark.parametrize("resolution_mm", [0.05, 5.0])
 def test_resolutions_beyond_all_lenses_are_refused(resolution_mm: float) -> None:
     _, config = survey()
     with pytest.raises(PlanError) as fault:
-        lenses_for_resolution(config, resolution_mm, (12.5, 25.0))
+        lenses_for_resolution(config, DEPTH_M, resolution_mm, (12.5, 25.0))
     assert "a lens of about" in str(fault.value)
     assert len(str(fault.value).splitlines()) <= 4
 
@@ -73,7 +78,7 @@ def test_no_lens_of_negative_length_is_proposed() -> None:
     """Pixels smaller than the port itself allows put the altitude behind the glass."""
     _, config = survey()
     with pytest.raises(PlanError) as fault:
-        lenses_for_resolution(config, 0.001, (12.5, 25.0))
+        lenses_for_resolution(config, DEPTH_M, 0.001, (12.5, 25.0))
     assert "a lens of about" not in str(fault.value)
     assert "coarser" in str(fault.value)
 
@@ -81,7 +86,7 @@ def test_no_lens_of_negative_length_is_proposed() -> None:
 @pytest.mark.parametrize("dive_s", [600.0, 3600.0, 20_000.0])
 def test_the_area_of_a_dive_takes_the_dive(dive_s: float) -> None:
     _, config = survey(plan={"side_overlap": 0.45})
-    area = area_for_dive(config, dive_s)
+    area = area_for_dive(config, DEPTH_M, dive_s)
     assert area.area_m2 == pytest.approx(area.side_m**2)
     assert area.lines == math.ceil(area.side_m / area.line_spacing_m)
     lines = area.lines + area.cross_lines
@@ -93,20 +98,20 @@ def test_the_area_of_a_dive_takes_the_dive(dive_s: float) -> None:
 
 def test_turns_are_half_circles_where_lines_are_wide_apart() -> None:
     _, config = survey(plan={"turns": "arcs"})
-    assert turn_s(config, 1.0) == pytest.approx((math.pi * 0.5 + 0.5) / 0.2)
+    assert turn_s(config.plan, 1.0) == pytest.approx((math.pi * 0.5 + 0.5) / 0.2)
     # Dubins' three arcs join half circles where lines are two radii apart, and 7/3 pi R at none.
-    assert turn_s(config, 1.0 - 1e-9) == pytest.approx(turn_s(config, 1.0), abs=1e-3)
-    assert turn_s(config, 0.0) == pytest.approx((7 / 3 * math.pi * 0.5 + 0.5) / 0.2)
+    assert turn_s(config.plan, 1.0 - 1e-9) == pytest.approx(turn_s(config.plan, 1.0), abs=1e-3)
+    assert turn_s(config.plan, 0.0) == pytest.approx((7 / 3 * math.pi * 0.5 + 0.5) / 0.2)
     _, spot = survey(plan={"turns": "spot"})
     # Two right angles at 15 deg/s, and what each stop takes besides.
-    assert turn_s(spot, 1.0) == pytest.approx(2 * (6.0 + SETTLE_S) + 1.0 / 0.2 + 0.5 / 0.2)
+    assert turn_s(spot.plan, 1.0) == pytest.approx(2 * (6.0 + SETTLE_S) + 1.0 / 0.2 + 0.5 / 0.2)
     _, auto = survey()
-    assert turn_s(auto, 1.0) == min(turn_s(config, 1.0), turn_s(spot, 1.0))
+    assert turn_s(auto.plan, 1.0) == min(turn_s(config.plan, 1.0), turn_s(spot.plan, 1.0))
 
 
 def test_a_dive_that_is_too_short_is_refused() -> None:
     with pytest.raises(PlanError, match="too short: 173 s go down and up"):
-        area_for_dive(survey()[1], 150.0)
+        area_for_dive(survey()[1], DEPTH_M, 150.0)
 
 
 def test_a_fixed_rate_gives_the_speed_that_overlaps_as_asked() -> None:
@@ -127,21 +132,23 @@ def test_a_rate_beyond_the_trigger_is_refused() -> None:
 
 def test_the_planner_takes_about_as_long_for_the_area_of_a_dive() -> None:
     config = survey(plan={"side_overlap": 0.45})[1]
-    side_m = area_for_dive(config, 3600.0).side_m
-    rig, square = survey(
-        plan={"side_overlap": 0.45, "closing_line": False},
-        area={"length_m": side_m, "width_m": side_m},
+    side_m = area_for_dive(config, DEPTH_M, 3600.0).side_m
+    square = SurveyConfig.model_validate(
+        {
+            "plan": {"side_overlap": 0.45, "closing_line": False},
+            "area": {"length_m": side_m, "width_m": side_m},
+        }
     )
-    assert make_plan(square, rig).duration_s == pytest.approx(3600.0, rel=0.05)
+    rig = design_rig(square.camera, square.water)
+    assert plan_survey(square, rig).plan.duration_s == pytest.approx(3600.0, rel=0.05)
 
 
 def test_the_report_tells_what_was_asked() -> None:
     _, config = survey(plan={"side_overlap": 0.45})
-    text, data = solve_report(config, resolution_mm=0.5, dive_s=3600, dive_wh=100, rate_hz=0.25)
-    assert set(data) == {"lenses", "dive", "energy", "rates"}
+    text, data = solve_report(config, DEPTH_M, resolution_mm=0.5, dive_s=3600, rate_hz=0.25)
+    assert set(data) == {"lenses", "dive", "rates"}
     json.dumps(data, allow_nan=False)
     assert "take the 12.5 mm lens" in text
     assert max(len(line) for line in text.splitlines()) <= 160
-    assert data["energy"]["dive_s"] * data["energy"]["mean_w"] == pytest.approx(100 * 3600)
     with pytest.raises(ConfigError, match="say what is given"):
-        solve_report(config)
+        solve_report(config, DEPTH_M)

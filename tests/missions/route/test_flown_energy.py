@@ -11,9 +11,9 @@ from alice_survey.vehicle.floor import level_floor
 from alice_survey.vehicle.pilot.memory import LEG, PHASE
 from camera_calib.rig import design_rig
 from missions.fly.simulation import simulate_plan
-from missions.plan.run import make_plan
+from missions.plan.planner import plan_survey
+from missions.plan.strength import survey_costs
 from missions.route.cost import leg_costs
-from missions.route.energy import vehicle_costs
 from missions.values.costs import power_at
 from missions.values.flight import Flight
 from missions.values.plan_file import Plan
@@ -34,14 +34,14 @@ CONFIG = SurveyConfig.model_validate(
 
 @lru_cache
 def _flown() -> tuple[Plan, Flight]:
-    plan = make_plan(CONFIG, design_rig(CONFIG.camera, CONFIG.water))
+    plan = plan_survey(CONFIG, design_rig(CONFIG.camera, CONFIG.water)).plan
     return plan, simulate_plan(plan, CONFIG, level_floor(6.0), np.random.default_rng(1))
 
 
 def test_lines_take_the_power_that_the_plan_counts_on() -> None:
     """Thrusters alone; the first third of a line is still settling."""
     plan, flight = _flown()
-    costs, power_w = vehicle_costs(CONFIG), flight.flown.power_w.sum(axis=1)
+    costs, power_w = survey_costs(CONFIG), flight.flown.power_w.sum(axis=1)
     assert flight.ending == "complete"
     for index, line in enumerate(plan.lines):
         rows = np.flatnonzero(flight.line == index)
@@ -56,7 +56,7 @@ def test_lines_take_the_power_that_the_plan_counts_on() -> None:
 def test_arcs_take_the_energy_that_the_plan_counts_on() -> None:
     plan, flight = _flown()
     (dive,) = plan.dives
-    legs_j, legs_s = leg_costs(dive.route, vehicle_costs(CONFIG))
+    legs_j, legs_s = leg_costs(dive.route, survey_costs(CONFIG))
     report, power_w = flight.flown.report, flight.flown.power_w.sum(axis=1)
     following = report[:, PHASE] == signals.FOLLOW
     planned_j = flown_j = 0.0

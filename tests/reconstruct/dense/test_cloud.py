@@ -4,8 +4,8 @@ import numpy as np
 
 from alice_survey.base.artefacts import read_json
 from reconstruct.dense.cloud import VERTEX, thinned_points, voxel_edge, write_cloud_json, write_ply
-from reconstruct.dense.dem import DemGrid
 from reconstruct.dense.points import Points
+from reconstruct.raster import DemGrid
 from tests.oracles_dense import FRAME
 
 GRID = DemGrid(west=0.0, north=1.0, cell=0.1, rows=10, columns=10)

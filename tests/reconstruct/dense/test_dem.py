@@ -4,17 +4,15 @@ import numpy as np
 import pytest
 
 from reconstruct.dense.dem import (
-    DemGrid,
     bin_points,
     fill_gaps,
     fuse_cells,
     fuse_points,
-    grid_over,
-    round_cell,
     slope_deg,
     without_strays,
 )
 from reconstruct.dense.points import Points
+from reconstruct.raster import DemGrid, grid_over, round_cell
 from tests.oracles_dense import fused
 
 

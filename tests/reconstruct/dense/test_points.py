@@ -3,7 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reconstruct.dense.points import block_bounds, enu_from_cam, joined, points_in_box
+from reconstruct.dense.points import block_bounds, joined, points_in_box
+from reconstruct.views.model import enu_from_cam
 from tests.oracles_dense import (
     Scene,
     hits,

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from reconstruct.dense.rectify import depth_in_reference, rectify, scaled_view
-from reconstruct.views.model import View
+from reconstruct.dense.rectify import depth_in_reference, rectify
+from reconstruct.views.model import View, scaled_view
 from tests.oracles_dense import port_view
 
 

@@ -5,13 +5,8 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.errors import ReconstructionError
-from reconstruct.dense.stereo_pairs import (
-    choose_pairs,
-    in_frame,
-    neighbours,
-    points_in_sight,
-    points_of_views,
-)
+from reconstruct.dense.stereo_pairs import choose_pairs, in_frame, neighbours, points_in_sight
+from reconstruct.views.model import points_of_views
 from tests.oracles_dense import Scene, flat, position_code, sparse_model, stereo_views
 
 SCENE = Scene(depth_of=flat, paint=position_code)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from alice_survey.base.errors import ReconstructionError, WorkspaceError
 from alice_survey.base.frames import Datum
 from reconstruct.evaluate.cloud_files import read_reference
-from reconstruct.evaluate.cloud_registration import Surface, register_cloud
+from reconstruct.evaluate.cloud_registration import ReferenceSurface, register_cloud
 from reconstruct.evaluate.reference import covers, distances, lifted
 from reconstruct.evaluate.reference_plot import mean_map
 from reconstruct.placing.alignment import Similarity
@@ -48,7 +48,7 @@ def undone(pose: Similarity, points: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("scale", [1.0, 1.013])
 def test_a_known_motion_and_scale_are_found(scale: float) -> None:
     rng = np.random.default_rng(1)
-    reference = Surface.of(ground(rng, 40_000))
+    reference = ReferenceSurface.of(ground(rng, 40_000))
     true = moved(scale)
     own = undone(true, ground(rng, 30_000))
     fit = register_cloud(own, reference, lifted(own, reference), free_scale=scale != 1.0, rng=rng)
@@ -62,7 +62,7 @@ def test_the_rigid_fit_is_that_of_open3d() -> None:
     rng = np.random.default_rng(2)
     points, own = ground(rng, 20_000), undone(moved(1.0), ground(rng, 8_000))
     points[:, 2] += 0.01 * rng.normal(size=len(points))
-    reference = Surface.of(points)
+    reference = ReferenceSurface.of(points)
     fit = register_cloud(own, reference, lifted(own, reference), free_scale=False, rng=rng)
     target, source = (o3d.geometry.PointCloud(o3d.utility.Vector3dVector(p)) for p in (points, own))
     target.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(12))
@@ -79,7 +79,7 @@ def test_the_rigid_fit_is_that_of_open3d() -> None:
 
 def test_what_differs_does_not_pull_the_fit() -> None:
     rng = np.random.default_rng(3)
-    reference = Surface.of(ground(rng, 40_000))
+    reference = ReferenceSurface.of(ground(rng, 40_000))
     own = ground(rng, 30_000)
     changed = (own[:, 0] > 4) & (own[:, 1] > 4)  # 9 %
     own[changed, 2] += 0.7
@@ -91,8 +91,8 @@ def test_what_differs_does_not_pull_the_fit() -> None:
 def test_distances_are_the_lift_whatever_the_spacing() -> None:
     rng = np.random.default_rng(4)
     sparse, dense = ground(rng, 8_000), ground(rng, 40_000, lift_m=0.05)
-    ours = distances(dense, Surface.of(sparse), rng)
-    back = distances(sparse, Surface.of(dense), rng)
+    ours = distances(dense, ReferenceSurface.of(sparse), rng)
+    back = distances(sparse, ReferenceSurface.of(dense), rng)
     assert np.median(ours.signed_m) == pytest.approx(0.05, rel=0.15)
     assert np.median(back.signed_m) == pytest.approx(-0.05, rel=0.15)
     figures = ours.to_json(0.02)
@@ -103,7 +103,7 @@ def test_distances_are_the_lift_whatever_the_spacing() -> None:
 def test_only_common_ground_is_compared() -> None:
     rng = np.random.default_rng(5)
     whole = ground(rng, 40_000)
-    half = Surface.of(whole[whole[:, 0] < 0])
+    half = ReferenceSurface.of(whole[whole[:, 0] < 0])
     covered = covers(half, whole)
     assert covered[whole[:, 0] < -0.5].mean() > 0.97
     assert not covered[whole[:, 0] > 0.5].any()
@@ -114,7 +114,7 @@ def test_only_common_ground_is_compared() -> None:
 
 def test_a_cloud_far_away_is_refused() -> None:
     rng = np.random.default_rng(6)
-    reference = Surface.of(ground(rng, 5_000))
+    reference = ReferenceSurface.of(ground(rng, 5_000))
     start = Similarity(
         scale=1.0, rotation=Rotation.identity(), translation=np.array([60.0, 0.0, 0.0])
     )

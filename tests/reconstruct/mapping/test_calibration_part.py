@@ -12,7 +12,7 @@ from alice_survey.base.frames import Array
 from camera_calib.rig import Covariance, Rig
 from reconstruct.mapping.arrays import observed
 from reconstruct.mapping.calibration_part import CalibrationPart, calibration_part
-from reconstruct.mapping.gauge import Gauge
+from reconstruct.mapping.gauge_freedom import Gauge
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.refraction import refract
 from reconstruct.mapping.uncertainty import estimate, sights_of

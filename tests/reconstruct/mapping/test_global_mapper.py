@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped, faults_of, map_calibrated
 from reconstruct.mapping.pose_graph import average_poses, station_groups
-from reconstruct.mapping.stations import Link, link_stations, stereo_points
+from reconstruct.mapping.stations import StationLink, link_stations, stereo_points
 from tests.reconstruct.mapping.test_mapper import camera_rms, seen_by_pinholes
 from tests.reconstruct.scenes import Scene, make_scene
 
@@ -40,7 +40,9 @@ def mapped_by(scene: Scene, method: str, threads: int = 1) -> Mapped:
         )
 
 
-def ring(rng: np.random.Generator, noise: float = 0.0) -> tuple[list[Link], list[RigidTransform]]:
+def ring(
+    rng: np.random.Generator, noise: float = 0.0
+) -> tuple[list[StationLink], list[RigidTransform]]:
     """Twelve stations, each linked to the next three, with exact or noisy relative poses."""
     poses = [
         RigidTransform.from_components(
@@ -59,14 +61,14 @@ def ring(rng: np.random.Generator, noise: float = 0.0) -> tuple[list[Link], list
     return links, poses
 
 
-def linked(a: int, b: int, pose: RigidTransform) -> Link:
-    return Link(
+def linked(a: int, b: int, pose: RigidTransform) -> StationLink:
+    return StationLink(
         first=a, second=b, second_from_first=pose, inliers=100, share=0.9,
         turn_variance=1e-6, shift_variance=4e-6,
     )  # fmt: skip
 
 
-def misses(links: list[Link], poses: list[RigidTransform]) -> np.ndarray:
+def misses(links: list[StationLink], poses: list[RigidTransform]) -> np.ndarray:
     """Errors (rotation in rad, position) after moving both to the first station's frame."""
     found = average_poses(links)
     rows = []

@@ -20,9 +20,15 @@ from reconstruct.mapping.database import Observations, as_transform
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.priors import NavigationAdjuster
 from reconstruct.mapping.refraction import refract
-from reconstruct.mapping.rig_refinement import RigFit, Told, fit_rig
-from reconstruct.mapping.survey_rig import Refined, frees_rig, on_rig, refine_as_set, refine_rig
-from reconstruct.mapping.working_range import Distances
+from reconstruct.mapping.rig_refinement import NavigationFixes, RigFit, fit_rig
+from reconstruct.mapping.survey_rig import (
+    RefinedSurvey,
+    frees_rig,
+    on_rig,
+    refine_as_set,
+    refine_rig,
+)
+from reconstruct.mapping.working_range import WorkingDistances
 from reconstruct.placing.alignment import align_rigid
 from reconstruct.views.lens import FlatPortLens, Lens, flat_port_lens
 from tests.reconstruct.scenes import DATUM, Scene, make_scene
@@ -149,7 +155,7 @@ def test_the_lever_arm_follows_from_turning_about(tmp_path: Path) -> None:
     ned_from_body = [
         pose * scene.rig.body_from_cam("left").inv() for pose in scene.ned_from_cam[::2]
     ]
-    told = Told(
+    fixes = NavigationFixes(
         positions=np.array([p.translation for p in ned_from_body]) + rng.normal(0, 0.01, (10, 3)),
         sigmas=np.full((10, 3), 0.01),
     )
@@ -158,7 +164,7 @@ def test_the_lever_arm_follows_from_turning_about(tmp_path: Path) -> None:
         true.translation + np.array([0.03, -0.02, 0]), true.rotation
     )
     fit = fit_rig(
-        mapped, seen, replace(scene.rig, body_from_rig=moved), port=False, pose=True, told=told
+        mapped, seen, replace(scene.rig, body_from_rig=moved), port=False, pose=True, fixes=fixes
     )
     sigmas = np.sqrt(np.diag(fit.covariance))[-3:]
     truth = true.inv().translation
@@ -174,7 +180,7 @@ def test_the_model_is_made_anew_on_the_refined_rig(tmp_path: Path) -> None:
     mapped, seen = modelled(scene, wrong, tmp_path)
     adjust = NavigationAdjuster(scene.records, wrong, mapped.lenses, DATUM)
     mapped = adjust(mapped)
-    distances = Distances(near_m=1.75, far_m=2.35, source="test")
+    distances = WorkingDistances(near_m=1.75, far_m=2.35, source="test")
     found = refine_rig(
         mapped, seen, wrong, distances, adjust, DATUM, tmp_path, port=True, pose=False
     )
@@ -215,7 +221,7 @@ def test_points_that_took_no_part_move_along(
     wrong = replace(scene.rig, covariance=known, cam_from_rig=cam_from_rig)
     mapped, seen = modelled(scene, wrong, tmp_path)
     adjust = NavigationAdjuster(scene.records, wrong, mapped.lenses, None)
-    distances = Distances(near_m=1.75, far_m=2.35, source="test")
+    distances = WorkingDistances(near_m=1.75, far_m=2.35, source="test")
     models = []
     for most in (200_000, mapped.model.compute_num_observations() // 4):
         monkeypatch.setattr("reconstruct.mapping.exact_sights._MOST_OBSERVATIONS", most)
@@ -246,15 +252,15 @@ def test_a_calibration_with_sigmas_lets_the_survey_refine_the_rig(tmp_path: Path
     )
     mapped, seen = modelled(scene, wrong, tmp_path)
     adjust = NavigationAdjuster(scene.records, wrong, mapped.lenses, None)
-    distances = Distances(near_m=1.75, far_m=2.35, source="test")
+    distances = WorkingDistances(near_m=1.75, far_m=2.35, source="test")
 
-    def refined(rig: Rig, model: Mapped = mapped, **settings: Any) -> Refined | str:
+    def refined(rig: Rig, model: Mapped = mapped, **settings: Any) -> RefinedSurvey | str:
         return refine_as_set(
             model, seen, rig, distances, adjust, None, tmp_path, ReconstructConfig(**settings)
         )
 
     found = refined(wrong)
-    assert isinstance(found, Refined)
+    assert isinstance(found, RefinedSurvey)
     before, after = (
         np.sqrt((align_rigid(p, t).apply(p) - t) ** 2).mean()
         for p, t in (pupils_and_points(m, scene)[2:] for m in (mapped, found.mapped))

@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 
 from reconstruct.matching.features import Features, save_features
-from reconstruct.matching.retrieval import _Task, alike_pairs, describe, make_codebook
+from reconstruct.matching.retrieval import _WordsTask, alike_pairs, describe, make_codebook
 from tests.oracles_matching import vlad_slowly
 
 
@@ -49,7 +49,9 @@ def test_vectors_equal_those_of_the_slow_twin(tmp_path: Path) -> None:
     words = make_codebook(files, seed=4)
     with np.load(files[1]) as data:
         slow = vlad_slowly(data["descriptors"], words)
-    np.testing.assert_allclose(describe(_Task(features=files[1], words=words)), slow, atol=1e-5)
+    np.testing.assert_allclose(
+        describe(_WordsTask(features=files[1], words=words)), slow, atol=1e-5
+    )
 
 
 def test_a_picture_without_features_looks_like_nothing(tmp_path: Path) -> None:
@@ -61,4 +63,4 @@ def test_a_picture_without_features_looks_like_nothing(tmp_path: Path) -> None:
     )
     save_features(files[2], empty)
     words = make_codebook(files, seed=4)
-    assert not describe(_Task(features=files[2], words=words)).any()
+    assert not describe(_WordsTask(features=files[2], words=words)).any()

@@ -4,8 +4,8 @@ import numpy as np
 
 from reconstruct.light.solve import GRID, LightSamples
 from reconstruct.mosaic.colour import ColourModel, solve_colour
-from reconstruct.mosaic.facts import PictureFacts, encoded, linear_table
 from reconstruct.mosaic.finish import curve_by_root, finish_colours
+from reconstruct.mosaic.picture_measures import PictureMeasures, encoded, linear_table
 
 IMAGES = [f"left/{n:02d}.png" for n in range(24)]
 CAMERAS = ["left"] * len(IMAGES)
@@ -30,7 +30,7 @@ def shown(albedo: np.ndarray, place: np.ndarray, ranges: np.ndarray) -> np.ndarr
     return albedo * lamp(x, y) * water + haze(x, y)
 
 
-def survey(relief_m: float, count: int = 4000) -> tuple[LightSamples, list[PictureFacts]]:
+def survey(relief_m: float, count: int = 4000) -> tuple[LightSamples, list[PictureMeasures]]:
     rng = np.random.default_rng(4)
     views = rng.integers(0, len(IMAGES), (count, 2))
     views = views[views[:, 0] != views[:, 1]].astype(np.int32)
@@ -49,7 +49,7 @@ def survey(relief_m: float, count: int = 4000) -> tuple[LightSamples, list[Pictu
     for _ in IMAGES:
         dark = haze(NODE_X, NODE_Y) + 0.004 * rng.uniform(0, 1, (*GRID, 1))
         mean = 0.27 * rng.lognormal(0, 0.05) * lamp(NODE_X, NODE_Y) + haze(NODE_X, NODE_Y)
-        facts.append(PictureFacts(sharpness=1.0, grey=False, nodes=np.log(mean), dark=dark))
+        facts.append(PictureMeasures(sharpness=1.0, grey=False, nodes=np.log(mean), dark=dark))
     return samples, facts
 
 

@@ -7,10 +7,9 @@ import rasterio
 
 from alice_survey.base.artefacts import read_json, write_json
 from alice_survey.base.errors import ConfigError
-from reconstruct.dense.dem import DemGrid
 from reconstruct.mosaic.annotation import mosaic_tiles
 from reconstruct.mosaic.footprints import picture_footprint, surface_points, write_footprints
-from reconstruct.raster import crs_of, transform_of
+from reconstruct.raster import DemGrid, crs_of, transform_of
 from tests.oracles_dense import ALTITUDE_M, FOCAL, FRAME, HEIGHT, WIDTH, stereo_views
 
 GRID = DemGrid(west=-2.0, north=2.0, cell=0.02, rows=200, columns=200)

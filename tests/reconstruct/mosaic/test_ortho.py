@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from reconstruct.dense.points import enu_from_cam, pinhole_of
 from reconstruct.mosaic.ortho import look_up, visible_cells
-from reconstruct.views.model import View
+from reconstruct.views.model import View, enu_from_cam
+from reconstruct.views.sight import pinhole_of
 from tests.oracles_dense import sees, stereo_views
 
 

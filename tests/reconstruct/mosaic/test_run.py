@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -9,8 +10,8 @@ from alice_survey.base.artefacts import read_json, write_csv, write_json
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.stages import spec
-from reconstruct.dense.dem import DemGrid
-from reconstruct.raster import tiled_raster
+from reconstruct.mosaic import run
+from reconstruct.raster import DemGrid, tiled_raster
 from reconstruct.views.model import View
 from tests.oracles_dense import (
     DEPTH_M,
@@ -215,3 +216,30 @@ def test_what_a_mask_hides_is_not_painted_and_others_fill_it(tmp_path: Path):
     assert np.abs(rgba[:3][:, known] - 100).max() <= 3
     middle = (np.hypot(north - 0.2, east) < 0.1) & known
     assert middle.sum() > 500  # the other camera shows what the fish hides
+
+
+def test_labels_beyond_65535_stay_apart(
+    workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """The same survey whose views are the last of 70,000 is painted alike, by other numbers."""
+    before = 70_000
+    views_of, write = run._seen_views, run.write_tiles
+
+    def later_views(*arguments):
+        return [replace(entry, number=entry.number + before) for entry in views_of(*arguments)]
+
+    def write_all(*arguments):
+        *others, names = arguments
+        return write(*others, [*map(str, range(before)), *names])
+
+    monkeypatch.setattr(run, "_seen_views", later_views)
+    monkeypatch.setattr(run, "write_tiles", write_all)
+    for name in ("images", "sparse", "dense"):
+        (tmp_path / name).symlink_to(workspace / name)
+    assert spec("mosaic").make(tmp_path, CONFIG, 1)
+    sources = []
+    for folder in (workspace, tmp_path):
+        with rasterio.open(folder / "mosaic" / "mosaic_source.tif") as raster:
+            sources.append(raster.read(1).astype(np.int64))
+            assert raster.dtypes == (("uint16",) if folder == workspace else ("uint32",))
+    np.testing.assert_array_equal(sources[1], sources[0] + before * (sources[0] > 0))

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from reconstruct.dense.dem import DemGrid
 from reconstruct.mosaic.grid import CELL_PX, Footprints
 from reconstruct.mosaic.run import seam_blocks
+from reconstruct.raster import DemGrid
 
 GRID = DemGrid(north=0.0, west=0.0, cell=0.004, rows=4096, columns=6144)
 

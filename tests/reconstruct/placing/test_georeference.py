@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.manifest import ImageRecord
 from reconstruct.placing.alignment import Similarity
-from reconstruct.placing.georeference import Fit, fit_navigation, level
+from reconstruct.placing.georeference import PlacementFit, fit_navigation, level
 from tests.reconstruct.scenes import DATUM, Scene, make_scene
 
 
@@ -33,7 +33,7 @@ def points_in_model(points: np.ndarray, ned_from_model: Similarity) -> np.ndarra
 
 def fit(
     scene: Scene, records: list[ImageRecord], truth: Similarity, *, known: bool, levers: bool = True
-) -> Fit | None:
+) -> PlacementFit | None:
     poses = [in_model(pose, truth) for pose in scene.ned_from_cam]
     points = points_in_model(scene.points_ned, truth)
     centres = np.stack([p.translation for p in poses])

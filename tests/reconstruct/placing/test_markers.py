@@ -14,7 +14,7 @@ from alice_survey.base.manifest import write_manifest
 from camera_calib.flat_port import FlatPortCamera
 from reconstruct.placing.control_file import read_picks
 from reconstruct.placing.markers import find_markers, survey_control
-from reconstruct.placing.spots import Camera, find_spots
+from reconstruct.placing.picked_points import Camera, find_spots
 from reconstruct.views.lens import flat_port_lens
 from tests.reconstruct.scenes import ALTITUDE_M, make_scene
 

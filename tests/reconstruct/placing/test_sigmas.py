@@ -8,8 +8,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from alice_survey.base.manifest import ImageRecord
-from reconstruct.placing.correlated import lasting_share, surprise, whiten
-from reconstruct.placing.georeference import Fit, fit_navigation, level
+from reconstruct.placing.correlated_errors import lasting_share, surprise, whiten
+from reconstruct.placing.georeference import PlacementFit, fit_navigation, level
 from tests.oracles_place import covariance_matrix, surprises
 
 DATUM = Datum(32.8236, 34.9553)
@@ -63,7 +63,7 @@ def told(body: RigidTransform, errors: Array, sigma: Array) -> list[ImageRecord]
 
 def place(
     body: RigidTransform, records: list[ImageRecord], seed: int, **options: float | None
-) -> tuple[Fit, Array, Array]:
+) -> tuple[PlacementFit, Array, Array]:
     """Fit a model that is the truth moved; errors and sigmas: N, E, D, turn about each, scale.
 
     The model's own errors are 1 mm and 0.005 degrees.
@@ -279,13 +279,13 @@ def test_twenty_flights_are_placed_within_their_sigmas() -> None:
     from alice_survey.seafloor.terrain import survey_terrain
     from camera_calib.rig import design_rig
     from missions.fly.simulation import floor_grid, simulate_plan
-    from missions.plan.run import make_plan
+    from missions.plan.planner import plan_survey
 
     config = SurveyConfig(
         area=AreaConfig(length_m=4.5, width_m=3.7, seafloor_depth_m=15.0),
         plan=PlanConfig(forward_overlap=0.62, side_overlap=0.3, cross_lines=1),
     )
-    plan = make_plan(config, design_rig(config.camera, config.water))
+    plan = plan_survey(config, design_rig(config.camera, config.water)).plan
     floor = floor_grid(survey_terrain(config, plan.area.allowed_corners_ne))
     ratios = []
     for seed in range(20):

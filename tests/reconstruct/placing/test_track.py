@@ -11,10 +11,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.frames import Array, Datum, attitude_from_rotation, rotation_from_attitude
-from reconstruct.dense.dem import DemGrid
 from reconstruct.mapping.uncertainty import Uncertainty
 from reconstruct.placing.alignment import Similarity
-from reconstruct.placing.channels import attitude_axes, cross_matrices
 from reconstruct.placing.covariance import (
     PlaceCovariance,
     attitude_sigmas_deg,
@@ -22,6 +20,7 @@ from reconstruct.placing.covariance import (
     shape_covariances,
     write_covariances,
 )
+from reconstruct.placing.navigation_equations import attitude_axes, cross_matrices
 from reconstruct.placing.track import (
     SIGMAS,
     TrackRow,
@@ -31,7 +30,7 @@ from reconstruct.placing.track import (
     write_track_geojson,
 )
 from reconstruct.placing.track_figure import plot_track_over, split_lines
-from reconstruct.raster import crs_of, transform_of
+from reconstruct.raster import DemGrid, crs_of, transform_of
 from reconstruct.views.model import WorldFrame
 
 DATUM = Datum(32.8236, 34.9553)

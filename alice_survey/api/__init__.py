@@ -1,0 +1,1 @@
+"""What the public Python interface adds to the packages below it: see `alice_survey`."""

@@ -1,0 +1,1 @@
+"""Figures of a survey, each as a matplotlib `Figure`."""

@@ -1,0 +1,163 @@
+"""Surface and mosaic of a workspace as arrays."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rasterio.enums import Resampling
+
+from alice_survey.base.frames import Array
+from reconstruct.raster import opened_raster
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Raster:
+    west: float
+    """Of the left edge, in the raster's coordinates (metres where the model is scaled)."""
+    north: float
+    """Of the upper edge."""
+    cell: float
+    """Side of a cell."""
+    unit: str
+    """Unit of lengths: `m`, or `model units` where the scale is not known."""
+    crs: Any
+    """`rasterio.crs.CRS`, or None where the model has no place on the Earth."""
+
+    def _shape(self) -> tuple[int, int]:
+        raise NotImplementedError
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """West, east, south and north edges, as `matplotlib.imshow` takes them."""
+        rows, columns = self._shape()
+        return (
+            self.west, self.west + columns * self.cell,
+            self.north - rows * self.cell, self.north,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Dem(_Raster):
+    """Heights of the surface, and how well they are known.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> dem = alice.Survey("small").dem
+        >>> bool(dem.height.shape == dem.sigma.shape)
+        True
+    """
+
+    height: Array
+    """(rows, columns) heights, positive up, row 0 in the north; NaN where nothing was measured."""
+    sigma: Array
+    """(rows, columns) standard deviations of the heights."""
+
+    def _shape(self) -> tuple[int, int]:
+        return self.height.shape[0], self.height.shape[1]
+
+    def height_at(self, east: Array, north: Array) -> Array:
+        """Heights of the cells at places of any one shape; NaN outside or where none is known.
+
+        Args:
+            east: in the raster's coordinates.
+            north: of the same shape.
+        """
+        rows, columns = self._shape()
+        row = np.floor((self.north - np.asarray(north, dtype=float)) / self.cell).astype(int)
+        column = np.floor((np.asarray(east, dtype=float) - self.west) / self.cell).astype(int)
+        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+        found: Array = np.where(
+            inside, self.height[row.clip(0, rows - 1), column.clip(0, columns - 1)], np.nan
+        )
+        return found
+
+    def _repr_html_(self) -> str:
+        rows, columns = self._shape()
+        known = np.isfinite(self.height)
+        return (
+            f"<b>DEM</b>: {columns} x {rows} cells of {self.cell:.4g} {self.unit}, "
+            f"{known.mean():.0%} known, median sigma {np.nanmedian(self.sigma):.3g} {self.unit}"
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Mosaic(_Raster):
+    """The orthomosaic.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> alice.Survey("small").mosaic.rgba.shape[2]
+        4
+    """
+
+    rgba: NDArray[np.uint8]
+    """(rows, columns, 4); alpha is 0 where no picture shows the sea floor."""
+
+    def _shape(self) -> tuple[int, int]:
+        return self.rgba.shape[0], self.rgba.shape[1]
+
+    def _repr_html_(self) -> str:
+        rows, columns = self._shape()
+        share = (self.rgba[..., 3] > 0).mean()
+        return (
+            f"<b>mosaic</b>: {columns} x {rows} pixels of {self.cell:.4g} {self.unit}, "
+            f"{share:.0%} painted"
+        )
+
+
+def read_dem(workspace: str | Path, most_cells: int = 4000) -> Dem:
+    """Read the surface of a reconstructed workspace.
+
+    Args:
+        workspace: its folder.
+        most_cells: rows and columns at most; a larger raster is averaged down to this.
+
+    Raises:
+        WorkspaceError: there is no surface, or its file is damaged.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> alice.read_dem("small", most_cells=50).height.shape[0] <= 50
+        True
+    """
+    folder = Path(workspace) / "dense"
+    height, place = _read(folder / "dem.tif", [1], most_cells)
+    sigma, _ = _read(folder / "sigma.tif", [1], most_cells)
+    return Dem(height=height[0].astype(float), sigma=sigma[0].astype(float), **place)
+
+
+def read_mosaic(workspace: str | Path, most_pixels: int = 4000) -> Mosaic:
+    """Read the mosaic of a reconstructed workspace.
+
+    Args:
+        workspace: its folder.
+        most_pixels: rows and columns at most; a larger raster is averaged down to this.
+
+    Raises:
+        WorkspaceError: there is no mosaic, or its file is damaged.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> alice.read_mosaic("small", most_pixels=100).rgba.dtype
+        dtype('uint8')
+    """
+    bands, place = _read(Path(workspace) / "mosaic" / "mosaic.tif", [1, 2, 3, 4], most_pixels)
+    return Mosaic(rgba=np.ascontiguousarray(bands.transpose(1, 2, 0)), **place)
+
+
+def _read(path: Path, bands: list[int], most: int) -> tuple[Any, dict[str, Any]]:
+    """Bands (B, rows, columns), and where they lie."""
+    with opened_raster(path) as raster:
+        shrink = max(1.0, max(raster.height, raster.width) / most)
+        shape = max(1, int(raster.height / shrink)), max(1, int(raster.width / shrink))
+        values = raster.read(bands, out_shape=(len(bands), *shape), resampling=Resampling.average)
+        place = {
+            "west": raster.transform.c,
+            "north": raster.transform.f,
+            "cell": raster.transform.a * raster.width / shape[1],
+            "unit": raster.tags().get("UNIT", "m"),
+            "crs": raster.crs,
+        }
+    return values, place

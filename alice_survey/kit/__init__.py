@@ -1,0 +1,1 @@
+"""One kit for all reports: values, words, figure style, HTML page, map and PDF."""

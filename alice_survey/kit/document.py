@@ -1,0 +1,207 @@
+"""The content of a report, without its layout: the HTML page and the PDF show the same values."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+Level = Literal["good", "look", "bad"]
+LEVELS: tuple[Level, ...] = ("bad", "look", "good")
+"""Worst first."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """One judgement with its numbers."""
+
+    level: Level
+    text: str
+    action: str = ""
+    """What to do, as a sentence; empty where nothing has to be done."""
+
+
+def worst_first(verdicts: Sequence[Verdict]) -> list[Verdict]:
+    """Verdicts in the order in which a report shows them."""
+    return sorted(verdicts, key=lambda verdict: LEVELS.index(verdict.level))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figure:
+    """A plot with the plain words that go with it."""
+
+    png: bytes
+    title: str
+    alt: str
+    """What a reader who cannot see it has to know."""
+    shows: str
+    good: str = ""
+    """How it looks when all is well."""
+    otherwise: str = ""
+    """What to do when it does not."""
+    svg: bytes = b""
+    """The same plot as vectors, for print; empty where there are only pixels."""
+    share: float = 1.0
+    """Width in print, as a share of the text's width."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """Rows of text under a header; columns of numbers are aligned to the right."""
+
+    title: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Link:
+    """A link to a file next to the page, or to a page on the same server."""
+
+    text: str
+    address: str
+    about: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Section:
+    """A part of the report."""
+
+    title: str
+    name: str = ""
+    """Plain word for its anchor; from the title where empty."""
+    text: Sequence[str] = ()
+    figures: Sequence[Figure] = ()
+    tables: Sequence[Table] = ()
+    links: Sequence[Link] = ()
+    """Shown on the page alone, not in print."""
+    scene: Literal["map", "mesh"] | None = None
+    """The interactive part of the page that belongs here; print shows its stills."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scale:
+    """What the colours of a layer mean."""
+
+    label: str
+    """With its unit."""
+    low: float
+    high: float
+    colours: Sequence[str]
+    """Evenly spaced from low to high, #rrggbb."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureLayer:
+    """A raster on the map, with its pyramid."""
+
+    name: str
+    title: str
+    about: str
+    west_m: float
+    """Of its upper left corner, on the map's axes (east, north)."""
+    north_m: float
+    pixel_m: float
+    width_px: int
+    height_px: int
+    tile_px: int
+    levels: int
+    """Level 0 is the coarsest; the last is full: tile x, y at level k covers
+    `tile_px * 2**(levels - 1 - k)` full pixels a side."""
+    tiles: Mapping[str, bytes]
+    """WebP by "k/x/y"; a tile at the border may be smaller; empty where a server gives them."""
+    address: str | None = None
+    """Of a tile on the server that gives the page, with "{}" in place of "k/x/y"."""
+    sizes: Sequence[tuple[int, int, float, float]] | None = None
+    """Columns, rows and a pixel's width and height, metres, of each level, full resolution first;
+    halves, rounded up, where not given."""
+    scale: Scale | None = None
+    shown: bool = False
+    """From the start; only one base layer can be."""
+    base: bool = True
+    """Base layers exclude one another; others lie over them."""
+
+    def size(self, level: int) -> tuple[int, int, float, float]:
+        """Columns, rows and a pixel's width and height, metres, of a level."""
+        halvings = self.levels - 1 - level
+        if self.sizes is not None:
+            return self.sizes[halvings]
+        side = 2**halvings
+        pixel = self.pixel_m * side
+        return -(-self.width_px // side), -(-self.height_px // side), pixel, pixel
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShapeLayer:
+    """Lines, outlines or points on the map."""
+
+    name: str
+    title: str
+    about: str
+    kind: Literal["line", "polygon", "point"]
+    shapes: Sequence[Sequence[tuple[float, float]]]
+    """Each a list of (east_m, north_m); a point is a list of one."""
+    texts: Sequence[str] = ()
+    """Shown when a shape is chosen; one for each, or none."""
+    colour: str = "#0072b2"
+    dashed: bool = False
+    shown: bool = True
+    fill: float = 0.03
+    """Opacity of the inside of an outline."""
+    width: float | None = None
+    """Of its lines, px; None takes the usual width of its kind."""
+    group: str = "Over it"
+    """Heading in the list of layers."""
+    extends: bool = True
+    """Whether the map's first view has to hold it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurveyMap:
+    """The interactive map."""
+
+    layers: Sequence[PictureLayer | ShapeLayer]
+    unit: str
+    """Of its axes: m, or unit where the model has no scale."""
+    origin: str
+    """Where (0, 0) is, in words."""
+    geodetic: tuple[Sequence[float], Sequence[float]] | None = None
+    """Degrees of latitude and longitude as quadratics of metres north n and east e: coefficients
+    of 1, n, e, n², ne and e²; the map then shows them under the pointer."""
+    stills: Sequence[Figure] = ()
+    """The map for print and for browsers without scripts: all of them in print, the first on the
+    page; where there are none, the interactive map itself is printed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mesh:
+    """The mesh that turns."""
+
+    glb: Path
+    """Small enough for a page."""
+    about: str
+    """Triangles and size of what the page shows, in words."""
+    still: Figure
+    """For print and for browsers without WebGL."""
+    address: str | None = None
+    """On the server that gives the page, which then does not carry the mesh."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """All of it."""
+
+    title: str
+    subtitle: str
+    summary: Mapping[str, str] = field(default_factory=dict)
+    """Three sentences: "What was mapped", "How well", "What to do next"."""
+    facts: Sequence[tuple[str, str]] = ()
+    """Labels and values of the first row."""
+    verdicts: Sequence[Verdict] = ()
+    """Worst first."""
+    sections: Sequence[Section] = ()
+    map: SurveyMap | None = None
+    mesh: Mesh | None = None
+    footer: str = ""
+    """Last line of the page."""
+    citation: Sequence[tuple[str, str]] = ()
+    """Labels and values of the title block in print: date, software and its version."""

@@ -1,0 +1,278 @@
+"""The style of every figure, and what figures share: colour bars, scale bars, north, saving.
+
+This is the only module with matplotlib's settings. Others draw like this:
+
+    @figure_style()
+    def residual_plot(residuals_px: Array) -> Sheet:
+        sheet = new_figure(2.6)
+        axes = sheet.subplots()
+        axes.hist(residuals_px, color=INKS[0])
+        return sheet
+
+    save_figure(residual_plot(residuals_px), folder / "residuals.png")
+
+The same numbers give the same bytes.
+"""
+
+import io
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import EllipseCollection, LineCollection, PolyCollection
+from matplotlib.colors import (
+    BoundaryNorm,
+    LinearSegmentedColormap,
+    ListedColormap,
+    LogNorm,
+    to_hex,
+)
+from matplotlib.figure import Figure as Sheet
+from matplotlib.patches import Circle, Ellipse, PathPatch, Polygon, Rectangle
+from matplotlib.path import Path as Outline
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from alice_survey.base.artefacts import atomic_path
+from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.frames import Array
+from alice_survey.kit.document import Figure
+from alice_survey.kit.map import round_length
+
+__all__ = [
+    "BAND", "GRID", "INK", "INKS", "MARKS", "SOFT", "WIDTH_IN", "Axes", "BoundaryNorm", "Circle",
+    "Ellipse", "EllipseCollection", "LineCollection", "LinearSegmentedColormap", "ListedColormap",
+    "LogNorm", "MaxNLocator", "Outline", "PathPatch", "PolyCollection", "Polygon", "Rectangle",
+    "Sheet", "colour_bar", "drawn", "figure_style", "map_axes", "new_figure", "north_arrow",
+    "palette_colours", "palette_steps", "plain_name", "png_of", "save_figure", "scale_bar",
+    "shrunk_png", "svg_of", "withStroke",
+]  # fmt: skip
+
+INKS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+"""Okabe and Ito's palette, safe for the colour-blind; lines differ by their marks as well."""
+MARKS = ("o", "s", "^", "D", "v", "x")
+INK, SOFT, GRID, BAND = "#22313a", "#5d6d77", "#e3e8eb", "#dfe7ec"
+WIDTH_IN = 7.6
+_DPI = 130
+_STYLE: dict[str, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 9.5,
+    "axes.titlesize": 10.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.titlecolor": INK,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": "#7b8a93",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.formatter.useoffset": False,
+    "grid.color": GRID,
+    "grid.linewidth": 0.8,
+    "text.color": INK,
+    "xtick.color": SOFT,
+    "ytick.color": SOFT,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "figure.facecolor": "white",
+    "svg.hashsalt": "alice-survey",  # names within an SVG are random otherwise
+    "svg.fonttype": "none",
+}
+_NO_DATES: dict[str, dict[str, None]] = {
+    "png": {"Software": None},
+    "svg": {"Date": None, "Creator": None},
+    "pdf": {"CreationDate": None, "ModDate": None, "Producer": None, "Creator": None},
+}
+_MOST_PX = 1600
+
+
+@contextmanager
+def figure_style() -> Iterator[None]:
+    """Draw in the kit's style: a context, or a decorator of a function that draws."""
+    with mpl.rc_context(_STYLE):
+        yield
+
+
+def new_figure(height_in: float, width_in: float = WIDTH_IN, layout: str | None = None) -> Any:
+    """An empty figure that lays itself out.
+
+    Args:
+        height_in: inches.
+        width_in: inches.
+        layout: of matplotlib; None is "constrained".
+    """
+    with figure_style():
+        sheet = Sheet(figsize=(width_in, height_in), dpi=_DPI, layout=layout or "constrained")
+        FigureCanvasAgg(sheet)
+    return sheet
+
+
+def png_of(sheet: Any, dpi: float = _DPI, **options: Any) -> bytes:
+    """A figure's pixels."""
+    return _saved(sheet, "png", dpi, options)
+
+
+def svg_of(sheet: Any, dpi: float = _DPI, **options: Any) -> bytes:
+    """A figure's vectors, with text as text."""
+    return _saved(sheet, "svg", dpi, options)
+
+
+def save_figure(sheet: Any, path: Path, dpi: float = _DPI, **options: Any) -> None:
+    """Write a figure as what the file's name ends with: png, svg or pdf.
+
+    Args:
+        sheet: the figure.
+        path: of the file.
+        dpi: pixels per inch, of what is drawn as pixels.
+        options: of matplotlib's `savefig`.
+    """
+    content = _saved(sheet, path.suffix.removeprefix(".").lower(), dpi, options)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def _saved(sheet: Any, kind: str, dpi: float, options: dict[str, Any]) -> bytes:
+    content = io.BytesIO()
+    with figure_style(), warnings.catch_warnings():
+        # The name of a picture may have letters that the font lacks.
+        warnings.filterwarnings("ignore", message="Glyph")
+        sheet.savefig(content, format=kind, dpi=dpi, metadata=_NO_DATES[kind], **options)
+    return content.getvalue()
+
+
+def drawn(
+    paint: Callable[[Sequence[Any]], None],
+    height_in: float,
+    *,
+    columns: int = 1,
+    width_in: float = WIDTH_IN,
+    **words: Any,
+) -> Figure:
+    """A report's figure from a function that paints on a row of axes.
+
+    Args:
+        paint: draws on axes, from left to right.
+        height_in: inches.
+        columns: how many axes.
+        width_in: inches.
+        words: title, alt, shows, good and otherwise of the figure.
+    """
+    with figure_style():
+        sheet = new_figure(height_in, width_in)
+        paint(list(sheet.subplots(1, columns, squeeze=False)[0]))
+        return Figure(png=png_of(sheet), svg=svg_of(sheet), **words)
+
+
+def colour_bar(image: Any, axes: Any, label: str, **options: Any) -> Any:
+    """A colour bar with numbers and its quantity.
+
+    Args:
+        image: what is coloured: an image, a contour or a collection.
+        axes: one or several that share it.
+        label: quantity and unit.
+        options: of matplotlib's `colorbar`.
+    """
+    first = np.ravel(axes)[0]
+    bar = first.figure.colorbar(image, ax=axes, **{"shrink": 0.85, "pad": 0.02} | options)
+    bar.set_label(label)
+    bar.outline.set_visible(False)
+    return bar
+
+
+def map_axes(axes: Any, unit: str = "m") -> None:
+    """East to the right and north up, at one scale, with a scale bar and an arrow to the north.
+
+    Call it when everything is drawn, since both follow the limits.
+    """
+    axes.set(aspect="equal", xlabel=f"east, {unit}", ylabel=f"north, {unit}")
+    for spine in axes.spines.values():
+        spine.set_visible(True)
+    scale_bar(axes, unit)
+    north_arrow(axes)
+
+
+def scale_bar(axes: Any, unit: str = "m", share: float = 0.25) -> None:
+    """A bar of a round length at the lower left.
+
+    Args:
+        axes: with one unit on both axes, and their limits set.
+        unit: of the axes.
+        share: most of the axes' width that it may take.
+    """
+    low, high = sorted(axes.get_xlim())
+    bottom, top = sorted(axes.get_ylim())
+    length = round_length(share * (high - low))
+    x, y = low + 0.04 * (high - low), bottom + 0.05 * (top - bottom)
+    rim = [withStroke(linewidth=5, foreground="white")]
+    axes.plot([x, x + length], [y, y], color=INK, lw=2.4, solid_capstyle="butt", zorder=20,
+              path_effects=rim, scalex=False, scaley=False)  # fmt: skip
+    axes.annotate(
+        f"{length:g} {unit}", (x + length / 2, y), xytext=(0, 4), textcoords="offset points",
+        ha="center", va="bottom", fontsize=8, color=INK, zorder=20,
+        path_effects=[withStroke(linewidth=2.5, foreground="white")],
+    )  # fmt: skip
+
+
+def north_arrow(axes: Any, at: tuple[float, float] = (0.955, 0.95)) -> None:
+    """An arrow up with an N; `at` is its tip as a share of the axes."""
+    rim = [withStroke(linewidth=2.5, foreground="white")]
+    axes.annotate(
+        "N", at, xytext=(0, -24), xycoords="axes fraction", textcoords="offset points",
+        ha="center", va="top", fontsize=9, fontweight="bold", color=INK, zorder=20,
+        path_effects=rim,
+        arrowprops={"arrowstyle": "-|>", "color": INK, "lw": 1.6, "shrinkA": 0, "shrinkB": 0,
+                    "path_effects": [withStroke(linewidth=4, foreground="white")]},
+    )  # fmt: skip
+
+
+def palette_colours(name: str, shares: Array) -> NDArray[np.uint8]:
+    """Colours of a palette of matplotlib.
+
+    Args:
+        name: such as viridis.
+        shares: (...) from 0, its first colour, to 1, its last.
+
+    Returns:
+        (..., 4) red, green, blue and opacity, 0 to 255.
+    """
+    colours: NDArray[np.uint8] = (255 * mpl.colormaps[name](shares)).astype(np.uint8)
+    return colours
+
+
+def palette_steps(name: str, count: int) -> list[str]:
+    """Evenly spaced colours of a palette, #rrggbb."""
+    return [to_hex(mpl.colormaps[name](i / (count - 1))) for i in range(count)]
+
+
+def plain_name(name: str) -> str:
+    """A name as it is: matplotlib takes text between dollars for mathematics."""
+    return name.replace("$", r"\$")
+
+
+def shrunk_png(path: Path, most_px: int = _MOST_PX) -> bytes:
+    """A picture that a stage has drawn, at most this many pixels wide and high.
+
+    Raises:
+        WorkspaceError: it cannot be decoded.
+    """
+    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise WorkspaceError(f"{path} cannot be read as a picture: run its stage again")
+    height, width = picture.shape[:2]
+    shrink = max(width, height) / most_px
+    if shrink > 1.0:
+        size = (max(1, round(width / shrink)), max(1, round(height / shrink)))
+        picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    encoded: bytes = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes()
+    return encoded

@@ -1,0 +1,232 @@
+/* The report's map, part 2 of 2: what lies over the pictures, and the controls. */
+
+const RIMMED = 20;
+
+/* Metres east and north stand where Leaflet has longitude and latitude. */
+function startMap() {
+  const data = JSON.parse(document.getElementById("map-data").textContent);
+  const root = document.getElementById("map");
+  const box = document.getElementById("map-canvas");
+  const readout = document.getElementById("map-readout");
+  const [west, south, east, north] = data.extent;
+  const whole = leaflet.latLngBounds([south, west], [north, east]);
+  root.hidden = false;
+  root.parentElement.classList.add("lives");
+
+  const pixels = data.layers.filter((layer) => layer.kind === "picture").map((layer) => layer.pixel);
+  const span = Math.max(east - west, north - south) || 1;
+  const finest = Math.min(...pixels, span / 500);
+  const still = window.matchMedia("(prefers-reduced-motion: reduce)").matches;
+  const map = new leaflet.Map(box, {
+    crs: leaflet.CRS.Simple, attributionControl: false, zoomControl: false,
+    zoomSnap: 0.25, wheelPxPerZoomLevel: 90, maxZoom: Math.log2(16 / finest),
+    minZoom: Math.log2(60 / span), scrollWheelZoom: false, zoomAnimation: !still,
+    fadeAnimation: false, renderer: leaflet.canvas({tolerance: 6, padding: 0.3}),
+  });
+  map.createPane("pictures").style.zIndex = 200;
+  map.createPane("over").style.zIndex = 300;
+  const showAll = () => map.fitBounds(whole, {padding: [24, 24], animate: !still});
+
+  /* A page that scrolls must not stop at its map: the wheel zooms only what was chosen. */
+  box.addEventListener("focusin", () => map.scrollWheelZoom.enable());
+  box.addEventListener("focusout", () => map.scrollWheelZoom.disable());
+
+  const layers = new Map(data.layers.map((about) => [
+    about.name,
+    about.kind === "picture"
+      ? new Pyramid(about, about.base ? "pictures" : "over")
+      : shapesOf(about),
+  ]));
+
+  function shapesOf(about) {
+    const places = (shape) => shape.map(([e, n]) => [n, e]);
+    const group = leaflet.featureGroup();
+    const dashes = about.dashed ? {dashArray: "7 5"} : {};
+    /* A light rim keeps a shape readable on dark ground; many outlines would drown in it. */
+    const rimmed = about.kind === "line" || (about.kind === "polygon" && about.shapes.length <= RIMMED);
+    about.shapes.forEach((shape, index) => {
+      const many = about.kind === "polygon" ? leaflet.polygon : leaflet.polyline;
+      if (rimmed) {
+        group.addLayer(many(places(shape), {
+          color: "#fff", weight: 5, opacity: 0.75, fill: false, interactive: false,
+        }));
+      }
+      const drawn = about.kind === "point"
+        ? leaflet.circleMarker(places(shape)[0], {
+          radius: 5, color: "#fff", weight: 1.5, fillColor: about.colour, fillOpacity: 1,
+        })
+        : many(places(shape), {
+          color: about.colour,
+          weight: about.width || (about.kind === "line" ? 2.6 : rimmed ? 1.8 : 1),
+          fillOpacity: about.fill, ...dashes,
+        });
+      drawn.survey = {title: about.title, text: about.texts[index] || ""};
+      drawn.on("click", (event) => { if (!ruler.on) describe(drawn, event.latlng); });
+      group.addLayer(drawn);
+    });
+    group.kind = about.kind;
+    return group;
+  }
+
+  function describe(shape, at) {
+    const content = document.createElement("div");
+    const title = document.createElement("b");
+    title.textContent = shape.survey.title;
+    const text = document.createElement("p");
+    text.textContent = shape.survey.text;
+    content.append(title, text);
+    leaflet.popup({minWidth: 110, maxWidth: 260, className: "described"}).setLatLng(at).setContent(content).openOn(map);
+  }
+
+  /* What a pointer would choose, for those who have none: the shape nearest to the middle. */
+  function describeMiddle() {
+    const middle = map.containerPointToLayerPoint(map.getSize().divideBy(2));
+    let best = null;
+    let least = 60;
+    layers.forEach((group) => {
+      if (!group.kind || !map.hasLayer(group)) return;
+      group.eachLayer((shape) => {
+        if (!shape.survey) return;
+        const spot = shape.getLatLng
+          ? map.latLngToLayerPoint(shape.getLatLng()) : shape.closestLayerPoint(middle);
+        const away = spot ? spot.distanceTo(middle) : Infinity;
+        if (away < least) {
+          least = away;
+          best = [shape, map.layerPointToLatLng(spot)];
+        }
+      });
+    });
+    if (best) describe(...best);
+    else readout.textContent = "Nothing within 60 px of the middle";
+  }
+
+  function show(name, on) {
+    const layer = layers.get(name);
+    if (on) layer.addTo(map);
+    else layer.remove();
+    ["polygon", "line", "point"].forEach((kind) => layers.forEach((group) => {
+      if (group.kind === kind && map.hasLayer(group)) group.bringToFront();
+    }));
+    const legend = document.getElementById("legend-" + name);
+    if (legend) legend.hidden = !on;
+    note();
+  }
+
+  /* Where the map stands, for the reader and for tests. */
+  function note() {
+    const centre = map.getCenter();
+    box.dataset.east = centre.lng;
+    box.dataset.north = centre.lat;
+    box.dataset.zoom = map.getZoom();
+    layers.forEach((layer) => {
+      if (layer.about && layer.about.base && map.hasLayer(layer)) {
+        box.dataset.base = layer.about.name;
+        box.dataset.level = layer.level;
+      }
+    });
+  }
+
+  /* Lengths between places that are clicked, or that Enter takes from the middle. */
+  const ruler = {on: false, places: [], line: leaflet.polyline([], {
+    color: "#8e44ad", weight: 2.5, dashArray: "6 3", interactive: false,
+  }).addTo(map)};
+  const ruled = (places) => places.slice(1).reduce(
+    (sum, place, i) => sum + Math.hypot(place.lat - places[i].lat, place.lng - places[i].lng), 0,
+  );
+  function measure(on) {
+    ruler.on = on;
+    ruler.places = [];
+    ruler.line.setLatLngs([]);
+    root.querySelector('[data-act="measure"]').setAttribute("aria-pressed", String(on));
+    if (on) map.closePopup();
+    readCentre();
+  }
+  function addPlace(place) {
+    ruler.places.push(place);
+    ruler.line.setLatLngs(ruler.places);
+    read("", place);
+  }
+
+  const decimals = () => Math.min(4, Math.max(0, Math.ceil(Math.log10(2 ** map.getZoom()))));
+  function read(word, place) {
+    const [e, n] = [place.lng, place.lat].map((v) => v.toFixed(decimals()).replace("-", "−"));
+    let text = word + e + " " + data.unit + " east, " + n + " " + data.unit + " north";
+    if (data.geodetic) text += "; " + latLon(data.geodetic, place.lat, place.lng);
+    if (ruler.on) {
+      const total = lengthText(ruled([...ruler.places, place]), data.unit, 4);
+      text += ruler.places.length ? "; measured " + total : "; click to measure";
+    }
+    readout.textContent = text;
+  }
+  const readCentre = () => read("Middle: ", map.getCenter());
+
+  const bar = root.querySelector(".bar");
+  function drawBar() {
+    const longest = 130 / 2 ** map.getZoom();
+    const power = 10 ** Math.floor(Math.log10(longest));
+    const length = [5, 2, 1].map((step) => step * power).find((step) => step <= longest * (1 + 1e-9));
+    bar.style.width = length * 2 ** map.getZoom() + "px";
+    bar.firstChild.textContent = lengthText(length, data.unit);
+  }
+
+  map.on("moveend zoomend", () => {
+    note();
+    readCentre();
+    drawBar();
+  });
+  map.on("mousemove", (event) => {
+    read("", event.latlng);
+    if (ruler.on) ruler.line.setLatLngs([...ruler.places, event.latlng]);
+  });
+  map.on("click", (event) => { if (ruler.on) addPlace(event.latlng); });
+  map.on("mouseout", readCentre);
+  map.on("tilelost", () => {
+    readout.textContent = "A part of the picture did not come: load this page again";
+  });
+  map.fitBounds(whole, {padding: [24, 24], animate: false});
+
+  root.querySelectorAll("input").forEach((input) => {
+    if (input.checked) show(input.value, true);
+    input.addEventListener("change", () => {
+      if (input.type === "radio") {
+        root.querySelectorAll("input[type=radio]").forEach((other) => {
+          if (other !== input) show(other.value, false);
+        });
+      }
+      show(input.value, input.checked);
+    });
+  });
+  const acts = {in: () => map.zoomIn(1), out: () => map.zoomOut(1), all: showAll, measure: () => measure(!ruler.on)};
+  root.querySelectorAll("button[data-act]").forEach((button) => {
+    button.addEventListener("click", acts[button.dataset.act]);
+  });
+  box.addEventListener("keydown", (event) => {
+    if (event.target !== box || event.ctrlKey || event.metaKey || event.altKey) return;
+    const enter = ruler.on ? () => addPlace(map.getCenter()) : describeMiddle;
+    const act = {
+      0: showAll, Enter: enter, m: acts.measure, Escape: ruler.on ? () => measure(false) : null,
+    }[event.key];
+    if (!act) return;
+    event.preventDefault();
+    act();
+  });
+  new ResizeObserver(() => map.invalidateSize({pan: false})).observe(box);
+  root.dataset.ready = "";
+}
+
+/* Latitude and longitude are quadratic in metres north and east. */
+function latLon(geodetic, n, e) {
+  const terms = [1, n, e, n * n, n * e, e * e];
+  const [lat, lon] = geodetic.map((c) => terms.reduce((sum, term, i) => sum + c[i] * term, 0));
+  const degrees = (value, ahead, astern) => Math.abs(value).toFixed(7) + "° " + (value < 0 ? astern : ahead);
+  return degrees(lat, "N", "S") + " " + degrees((lon + 540) % 360 - 180, "E", "W");
+}
+
+/* 0.02 m reads as 2 cm. */
+function lengthText(length, unit, digits = 2) {
+  const places = (value) => Number(value.toPrecision(digits)).toString();
+  if (unit !== "m" || length >= 1) return places(length) + " " + unit;
+  return length >= 0.01 ? places(length * 100) + " cm" : places(length * 1000) + " mm";
+}
+
+startMap();

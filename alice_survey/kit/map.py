@@ -1,0 +1,144 @@
+"""The data of a page's interactive map."""
+
+import base64
+import json
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from alice_survey.kit.document import PictureLayer, ShapeLayer, SurveyMap
+
+
+def map_data(survey_map: SurveyMap) -> tuple[str, list[tuple[str, str]]]:
+    """What the page's script draws the map from.
+
+    The tiles of a layer are one text, so that each is decoded only when it is looked at.
+
+    Returns:
+        JSON without a `<`, since within a script only "</" and "<!--" could end or change it, and
+        the tiles of each layer as (id, base64 text).
+
+    Raises:
+        ValueError: two layers share a name, two base layers are shown, or a tile is not a JPEG, PNG
+            or WebP.
+    """
+    layers = survey_map.layers
+    names = [layer.name for layer in layers]
+    if len(set(names)) < len(names):
+        raise ValueError(f"layers share a name: {', '.join(sorted(names))}")
+    pictures = [layer for layer in layers if isinstance(layer, PictureLayer)]
+    if sum(layer.base and layer.shown for layer in pictures) > 1:
+        raise ValueError("more than one base layer is shown")
+    described: list[dict[str, Any]] = []
+    tiles: list[tuple[str, str]] = []
+    for index, layer in enumerate(layers):
+        if isinstance(layer, ShapeLayer):
+            described.append(_shapes(layer))
+        elif layer.address is not None:
+            described.append(_picture(layer) | {"address": layer.address})
+        else:
+            found, text = _packed(layer.tiles)
+            described.append(_picture(layer) | {"block": f"tiles-{index}", "tiles": found})
+            tiles.append((f"tiles-{index}", text))
+    data = {
+        "unit": survey_map.unit,
+        "extent": [_short(value) for value in map_extent(survey_map)],
+        "layers": described,
+        "geodetic": survey_map.geodetic,
+    }
+    held = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    return held, tiles
+
+
+def map_extent(survey_map: SurveyMap) -> tuple[float, float, float, float]:
+    """West, south, east and north of all that the map holds, on its own axes.
+
+    Raises:
+        ValueError: nothing is on the map.
+    """
+    layers = [a for a in survey_map.layers if isinstance(a, PictureLayer) or a.extends]
+    east: list[float] = []
+    north: list[float] = []
+    for layer in layers or survey_map.layers:
+        if isinstance(layer, PictureLayer):
+            east += [layer.west_m, layer.west_m + layer.width_px * layer.pixel_m]
+            north += [layer.north_m, layer.north_m - layer.height_px * layer.pixel_m]
+        else:
+            east += [place[0] for shape in layer.shapes for place in shape]
+            north += [place[1] for shape in layer.shapes for place in shape]
+    if not east:
+        raise ValueError("a map without a picture or a shape")
+    return min(east), min(north), max(east), max(north)
+
+
+def _packed(tiles: Mapping[str, bytes]) -> tuple[dict[str, list[Any]], str]:
+    """Where each tile lies in the text of all, and that text."""
+    found: dict[str, list[Any]] = {}
+    texts: list[str] = []
+    at = 0
+    for name in sorted(tiles):
+        text = base64.b64encode(tiles[name]).decode("ascii")
+        found[name] = [at, len(text), picture_kind(tiles[name])]
+        texts.append(text)
+        at += len(text)
+    return found, "".join(texts)
+
+
+def picture_kind(content: bytes) -> str:
+    """The subtype of a picture, by its first bytes.
+
+    Raises:
+        ValueError: it is not a JPEG, PNG or WebP.
+    """
+    if content.startswith(b"\xff\xd8\xff"):
+        return "jpeg"
+    if content.startswith(b"\x89PNG\r\n\x1a\n"):
+        return "png"
+    if content[:4] == b"RIFF" and content[8:12] == b"WEBP":
+        return "webp"
+    raise ValueError("a tile of the map is not a JPEG, PNG or WebP")
+
+
+def _picture(layer: PictureLayer) -> dict[str, Any]:
+    return {
+        "kind": "picture",
+        "name": layer.name,
+        "west": layer.west_m,
+        "north": layer.north_m,
+        "pixel": layer.pixel_m,
+        "width": layer.width_px,
+        "height": layer.height_px,
+        "tile": layer.tile_px,
+        "levels": layer.levels,
+        "base": layer.base,
+        **({} if layer.sizes is None else {"sizes": [list(size) for size in layer.sizes]}),
+    }
+
+
+def _shapes(layer: ShapeLayer) -> dict[str, Any]:
+    if layer.texts and len(layer.texts) != len(layer.shapes):
+        raise ValueError(f"{layer.name}: {len(layer.texts)} texts for {len(layer.shapes)} shapes")
+    return {
+        "kind": layer.kind,
+        "name": layer.name,
+        "title": layer.title,
+        "colour": layer.colour,
+        "dashed": layer.dashed,
+        "fill": layer.fill,
+        "width": layer.width,
+        "shapes": [
+            [[_short(east), _short(north)] for east, north in shape] for shape in layer.shapes
+        ],
+        "texts": list(layer.texts),
+    }
+
+
+def _short(value: float) -> float:
+    """Seven digits: a tenth of a millimetre on a kilometre."""
+    return float(f"{value:.7g}")
+
+
+def round_length(length: float) -> float:
+    """The greatest of 1, 2 and 5 times a power of ten that is not above a length."""
+    power = 10.0 ** math.floor(math.log10(length))
+    return next(step * power for step in (5, 2, 1) if step * power <= length * (1 + 1e-9))

@@ -1,0 +1,171 @@
+"""A map as a figure: for print, and for browsers without scripts."""
+
+import base64
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.kit.document import Figure, PictureLayer, ShapeLayer, SurveyMap
+from alice_survey.kit.figure import (
+    WIDTH_IN,
+    LinearSegmentedColormap,
+    LineCollection,
+    PolyCollection,
+    colour_bar,
+    figure_style,
+    map_axes,
+    new_figure,
+    png_of,
+    svg_of,
+    withStroke,
+)
+from alice_survey.kit.map import map_extent
+
+_MOST_PX = 1400
+"""Of the longer side of a picture in print."""
+_MOST_HEIGHT_IN = 6.4
+_MARGIN = 0.04
+"""Around all that is drawn, as a share of the longer side."""
+_RIMMED = 20
+"""Outlines up to which each has a light rim, as in `map.js`."""
+_QUALITY = 88
+_KINDS = ("polygon", "line", "point")
+
+
+def map_figures(survey_map: SurveyMap) -> list[Figure]:
+    """The map as it first shows, then each further picture without the shapes over it."""
+    shown = [layer for layer in survey_map.layers if layer.shown]
+    outline = [a for a in survey_map.layers if isinstance(a, ShapeLayer) and a.name == "area"]
+    further = [
+        layer
+        for layer in survey_map.layers
+        if isinstance(layer, PictureLayer) and layer.base and not layer.shown
+    ]
+    return [
+        map_figure(survey_map, shown),
+        *(map_figure(survey_map, [layer, *outline]) for layer in further),
+    ]
+
+
+@figure_style()
+def map_figure(survey_map: SurveyMap, layers: Sequence[PictureLayer | ShapeLayer]) -> Figure:
+    """Layers of a map over one another, with its scale, north, key and colour bar.
+
+    Args:
+        survey_map: what the layers are of; gives the frame.
+        layers: the lowest first; those of shapes lie over those of pictures.
+    """
+    west, south, east, north = map_extent(survey_map)
+    margin = _MARGIN * max(east - west, north - south)
+    wide, high = east - west + 2 * margin, north - south + 2 * margin
+    width_in = WIDTH_IN
+    height_in = 0.8 + min(_MOST_HEIGHT_IN, (width_in - 1.6) * high / wide)
+    sheet = new_figure(height_in, width_in)
+    axes = sheet.subplots()
+    axes.grid(visible=False)
+    pictures = [layer for layer in layers if isinstance(layer, PictureLayer)]
+    for layer in sorted(pictures, key=lambda layer: not layer.base):
+        _paint_picture(axes, layer)
+    shapes = [layer for layer in layers if isinstance(layer, ShapeLayer)]
+    for shape in sorted(shapes, key=lambda layer: _KINDS.index(layer.kind)):
+        _paint_shapes(axes, shape)
+    axes.set(xlim=(west - margin, east + margin), ylim=(south - margin, north + margin))
+    map_axes(axes, survey_map.unit)
+    if shapes:
+        sheet.legend(loc="outside lower center", ncols=min(4, len(shapes)), fontsize=8)
+    titles = ", ".join(layer.title.lower() for layer in layers)
+    first = pictures[0] if pictures else layers[0]
+    return Figure(
+        png=png_of(sheet),
+        svg=_with_jpegs(svg_of(sheet)),
+        title=first.title,
+        alt=f"Map, north up: {titles}",
+        shows=" ".join(layer.about for layer in layers if layer.about),
+        share=min(1.0, (wide / high * (height_in - 0.8) + 1.6) / width_in),
+    )
+
+
+def _paint_picture(axes: Any, layer: PictureLayer) -> None:
+    picture = flat_picture(layer)
+    extent = (
+        layer.west_m,
+        layer.west_m + layer.width_px * layer.pixel_m,
+        layer.north_m - layer.height_px * layer.pixel_m,
+        layer.north_m,
+    )
+    axes.imshow(picture, extent=extent, interpolation="none", zorder=1 if layer.base else 2)
+    scale = layer.scale
+    if scale is not None:
+        colours = LinearSegmentedColormap.from_list(layer.name, list(scale.colours))
+        ramp = axes.imshow(
+            np.array([[scale.low, scale.high]]), cmap=colours, visible=False, aspect="auto"
+        )
+        colour_bar(ramp, axes, scale.label)
+
+
+def flat_picture(layer: PictureLayer, most_px: int = _MOST_PX) -> NDArray[np.uint8]:
+    """A layer as one picture on white, from the finest level that is small enough.
+
+    Returns:
+        (H, W, 3) red, green, blue.
+    """
+    level = layer.levels - 1
+    while level > 0 and max(layer.size(level)[:2]) > most_px:
+        level -= 1
+    width, height = layer.size(level)[:2]
+    sheet = np.full((height, width, 3), 255, np.uint8)
+    for name, data in layer.tiles.items():
+        k, x, y = (int(part) for part in name.split("/"))
+        if k != level:
+            continue
+        tile = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        left, top = x * layer.tile_px, y * layer.tile_px
+        below = sheet[top : top + tile.shape[0], left : left + tile.shape[1]]
+        opacity = tile[..., 3:] / 255.0 if tile.shape[2] == 4 else 1.0
+        below[:] = (opacity * tile[..., 2::-1] + (1.0 - opacity) * below).astype(np.uint8)
+    return sheet
+
+
+def _paint_shapes(axes: Any, layer: ShapeLayer) -> None:
+    if layer.kind == "point":
+        places = np.array([shape[0] for shape in layer.shapes])
+        axes.plot(
+            *places.T, "o", ms=3.6, mew=0.7, color=layer.colour, mec="white", label=layer.title,
+            zorder=6,
+        )  # fmt: skip
+        return
+    kind = LineCollection if layer.kind == "line" else PolyCollection
+    many = len(layer.shapes) > _RIMMED and layer.kind == "polygon"
+    width = 0.5 if many else 1.4
+    drawn = kind(
+        [np.array(shape) for shape in layer.shapes], edgecolors=layer.colour, facecolors="none",
+        linewidths=width, linestyles="dashed" if layer.dashed else "solid", label=layer.title,
+        zorder=4 + _KINDS.index(layer.kind) / 2,
+    )  # fmt: skip
+    if not many and not layer.dashed:
+        drawn.set_path_effects([withStroke(linewidth=width + 1.6, foreground="white", alpha=0.8)])
+    axes.add_collection(drawn, autolim=False)
+
+
+def _with_jpegs(svg: bytes) -> bytes:
+    """An SVG whose pictures are JPEG in place of PNG, a tenth of the size."""
+
+    def shrunk(found: re.Match[bytes]) -> bytes:
+        png = base64.b64decode(found[1])
+        pixels = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+        coded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
+        if len(coded) >= len(png):
+            return found[0]
+        return b"data:image/jpeg;base64," + base64.b64encode(coded)
+
+    return re.sub(rb"data:image/png;base64,([A-Za-z0-9+/=\s]+)", shrunk, svg)
+
+
+def with_stills(survey_map: SurveyMap) -> SurveyMap:
+    """The same map with its figures for print."""
+    return replace(survey_map, stills=map_figures(survey_map))

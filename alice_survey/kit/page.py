@@ -1,0 +1,177 @@
+"""A report as one HTML page that loads nothing: text, plots, a map that zooms, a mesh that turns.
+
+The templates escape every text. The page's policy lets in its own scripts and styles by their
+hashes, and pictures that it carries itself. Leaflet draws the map and three the mesh; `web/` holds
+them as the page carries them. To write them again, with the same bytes:
+
+    cd alice_survey/kit/web && npm ci && npm run build
+"""
+
+import base64
+import hashlib
+import re
+import struct
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from alice_survey.kit.document import PictureLayer, Report, Section, SurveyMap, Table
+from alice_survey.kit.map import map_data
+
+_HERE = Path(__file__).parent
+_MAP_SCRIPTS = ("web/vendor_map.js", "map_tiles.js", "map.js")
+_MESH_SCRIPTS = ("web/vendor_mesh.js", "mesh.js")
+_NUMBER = re.compile(
+    r"[~<>≤≥±+\-−]?\s*\d[\d.,'\u2009\u202f ]*(e[+\-−]?\d+)?"  # with groups of thousands
+    r"(\s*(±|to|of|/|x|×)\s*[+\-−]?\d[\d.,]*(e[+\-−]?\d+)?)*"
+    r"\s*([%‰°]|[a-zA-Zµ²³/·%]{1,8}( [a-z]{1,4})?)?",
+    re.IGNORECASE,
+)
+"""With its unit, its sigma or a share: "12.3 mm", "0.4 ± 0.1 %", "3 of 58"."""
+_SHORT_WORD = 8
+_NO_VALUE = {"", "-", "–", "—", "n/a"}
+
+
+def render_html(report: Report) -> str:
+    """Write a report as one page; the same report gives the same text.
+
+    Args:
+        report: its content.
+
+    Returns:
+        The page, to be written as UTF-8.
+
+    Raises:
+        ValueError: two sections or layers share a name, a section shows a map or a mesh that the
+            report lacks, a map or a mesh has no section, or a picture is of no kind known here.
+    """
+    _check(report)
+    styles, scripts = _carried(report)
+    map_json, map_tiles = ("", []) if report.map is None else map_data(report.map)
+    carried = report.mesh is not None and report.mesh.address is None
+    page: str = (
+        _templates()
+        .get_template("page.html")
+        .render(
+            report=report,
+            policy=page_policy(report),
+            styles=styles,
+            scripts=scripts,
+            map_json=map_json,
+            map_tiles=map_tiles,
+            mesh_glb=_base64(report.mesh.glb.read_bytes()) if carried and report.mesh else "",
+        )
+    )
+    return page
+
+
+@cache
+def _templates() -> Any:
+    from jinja2 import Environment, FileSystemLoader
+
+    found = Environment(
+        loader=FileSystemLoader(_HERE / "templates"),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    found.filters |= {
+        "anchor": _anchor,
+        "layer_groups": _layer_groups,
+        "numeric_columns": numeric_columns,
+        "png_address": lambda png: f"data:image/png;base64,{_base64(png)}",
+        "png_size": _png_size,
+        "short": lambda value: f"{value:.4g}".replace("-", "−"),
+    }
+    return found
+
+
+def _check(report: Report) -> None:
+    names = [_anchor(section) for section in report.sections]
+    if len(set(names)) < len(names):
+        raise ValueError(f"sections share a name: {', '.join(sorted(names))}")
+    for scene, held in (("map", report.map), ("mesh", report.mesh)):
+        shown = sum(section.scene == scene for section in report.sections)
+        if shown != (held is not None):
+            raise ValueError(f"{shown} sections show the {scene}, {int(held is not None)} expected")
+
+
+def _carried(report: Report) -> tuple[list[str], list[str]]:
+    """The styles and the scripts that its page carries."""
+    styles, scripts = ["page.css"], list[str]()
+    if report.map is not None:
+        styles.insert(0, "web/vendor_map.css")
+        scripts += _MAP_SCRIPTS
+    if report.mesh is not None:
+        scripts += _MESH_SCRIPTS
+    return [_read(name) for name in styles], [_read(name) for name in scripts]
+
+
+def _read(name: str) -> str:
+    return (_HERE / name).read_text(encoding="utf-8")
+
+
+def page_policy(report: Report) -> str:
+    """What its page may load, as a content security policy.
+
+    A texture of the mesh is a `blob:` of the page itself. A page that a server gives may load
+    from that server too.
+    """
+    styles, scripts = _carried(report)
+    layers = report.map.layers if report.map is not None else ()
+    tiled = any(isinstance(layer, PictureLayer) and layer.address for layer in layers)
+    fetched = report.mesh is not None and report.mesh.address is not None
+    allowed_styles = " ".join(_hash(text) for text in styles)
+    allowed_scripts = " ".join(_hash(text) for text in scripts) or "'none'"
+    pictures = "'self' data: blob:" if tiled else "data: blob:"
+    fetches = "connect-src 'self'; " if fetched else ""
+    return (
+        f"default-src 'none'; img-src {pictures}; style-src {allowed_styles}; "
+        f"script-src {allowed_scripts}; {fetches}base-uri 'none'; form-action 'none'"
+    )
+
+
+def _hash(text: str) -> str:
+    """As a content security policy names inline text (W3C, CSP level 3)."""
+    return f"'sha256-{_base64(hashlib.sha256(text.encode('utf-8')).digest())}'"
+
+
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode("ascii")
+
+
+def _anchor(section: Section) -> str:
+    name = (section.name or section.title).lower()
+    return "part-" + re.sub(r"[^a-z0-9]+", "-", name).strip("-")
+
+
+def _layer_groups(survey_map: SurveyMap) -> list[tuple[str, str, list[Any]]]:
+    """Heading, kind of control and layers of each group in the map's list."""
+    groups: dict[tuple[str, str], list[Any]] = {("Picture", "radio"): []}
+    for layer in survey_map.layers:
+        if isinstance(layer, PictureLayer):
+            key = ("Picture", "radio") if layer.base else ("Over it", "checkbox")
+        else:
+            key = (layer.group, "checkbox")
+        groups.setdefault(key, []).append(layer)
+    return [(title, kind, layers) for (title, kind), layers in groups.items() if layers]
+
+
+def _png_size(png: bytes) -> tuple[int, int]:
+    if png[:8] != b"\x89PNG\r\n\x1a\n":
+        raise ValueError("a figure is not a PNG")
+    width, height = struct.unpack(">II", png[16:24])
+    return width, height
+
+
+def numeric_columns(table: Table) -> list[bool]:
+    """Whether most cells with a value are numbers, and the rest short words such as "held"."""
+    found = []
+    for index in range(len(table.header)):
+        cells = [row[index].strip() for row in table.rows]
+        values = [cell for cell in cells if cell.lower() not in _NO_VALUE]
+        words = [value for value in values if not _NUMBER.fullmatch(value)]
+        short = all(len(word) <= _SHORT_WORD for word in words)
+        found.append(short and len(values) > 2 * len(words))
+    return found

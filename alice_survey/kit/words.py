@@ -1,0 +1,88 @@
+"""Numbers as people read them: two or three digits, and a unit that fits."""
+
+import math
+
+_SIGMA_DIGITS = 2
+
+
+def length(metres: float | None, unit: str = "m") -> str:
+    """`0.364 mm`, `2.4 cm`, `41 m`; in units of the model where it has no scale."""
+    if metres is None or not math.isfinite(metres):
+        return "unknown"
+    if unit != "m":
+        return f"{metres:.3g} {unit}"
+    factor, name = _length_unit(metres)
+    return f"{digits(factor * metres)} {name}"
+
+
+def length_with_sigma(metres: float, sigma_m: float, unit: str = "m") -> str:
+    """`4.6 ± 49 mm`: a length and its sigma in one unit."""
+    factor, name = _length_unit(max(abs(metres), sigma_m)) if unit == "m" else (1.0, unit)
+    return f"{with_sigma(factor * metres, factor * sigma_m)} {name}"
+
+
+def _length_unit(metres: float) -> tuple[float, str]:
+    size = abs(metres)
+    if size < 0.01:
+        return 1e3, "mm"
+    if size < 1.0:
+        return 1e2, "cm"
+    return (1.0, "m") if size < 1e4 else (1e-3, "km")
+
+
+def with_sigma(value: float, sigma: float, sign: str = "") -> str:
+    """`849.31 ± 0.46`: two digits of the sigma, and the value to the same place."""
+    if not (math.isfinite(sigma) and sigma > 0):
+        return f"{value:{sign}.6g} ± {sigma:.2g}"
+    rounded = float(f"{sigma:.{_SIGMA_DIGITS - 1}e}")
+    places = max(0, _SIGMA_DIGITS - 1 - math.floor(math.log10(rounded)))
+    return f"{value:{sign}.{places}f} ± {sigma:.{places}f}"
+
+
+def millimetres(value: float | None) -> str:
+    """As `length`, of millimetres."""
+    return length(None if value is None else 1e-3 * value)
+
+
+def digits(value: float, wanted: int = 3) -> str:
+    """With this many digits and never an exponent."""
+    if value == 0 or not math.isfinite(value):
+        return f"{value:g}"
+    rounded = float(f"{value:.{wanted - 1}e}")  # 99.96 has one digit more than it seems
+    places = max(0, wanted - 1 - math.floor(math.log10(abs(rounded))))
+    return f"{value:.{places}f}"
+
+
+def share(value: float | None) -> str:
+    """`99.8 %`; never 100 % of what is not whole."""
+    if value is None or not math.isfinite(value):
+        return "unknown"
+    text = f"{100 * value:.1f}"
+    if text == "100.0":
+        text = "100" if value >= 1.0 else "more than 99.9"
+    return f"{text} %"
+
+
+def parts(value: float | None) -> str:
+    """Of a scale: `+98 ppm`, `0.51 %`."""
+    if value is None or not math.isfinite(value):
+        return "unknown"
+    return f"{1e6 * value:+.0f} ppm" if abs(value) < 1e-3 else f"{100 * value:+.2f} %"
+
+
+def parts_with_sigma(value: float, sigma: float) -> str:
+    """Of a scale: `+0.07 ± 0.56 %`, value and sigma in one unit."""
+    factor, name = (1e6, "ppm") if max(abs(value), sigma) < 1e-3 else (1e2, "%")
+    return f"{with_sigma(factor * value, factor * sigma, '+')} {name}"
+
+
+def duration(seconds: float) -> str:
+    """`51 s`, `14 min`, `2.3 h`."""
+    if seconds < 120:
+        return f"{seconds:.0f} s" if seconds >= 10 else f"{seconds:.1f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+
+
+def count(number: int, one: str, many: str = "") -> str:
+    """`1 picture`, `1,876,280 points`."""
+    return f"{number:,} {one if number == 1 else many or one + 's'}"

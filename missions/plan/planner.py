@@ -1,0 +1,399 @@
+"""The plan of a survey: lines, stations and camera settings that image an area.
+
+Altitude and all places are of the left port's outer glass.
+"""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import shapely.ops
+from shapely.geometry import Point
+
+from alice_survey.base.config import AreaConfig, PlanConfig, SurveyConfig
+from alice_survey.base.errors import PlanError, heard, warn
+from camera_calib.rig import Rig
+from missions.areas.bathymetry import Bathymetry, area_depth, read_bathymetry
+from missions.areas.survey import survey_area
+from missions.coverage.certificate import Certificate, certificate
+from missions.coverage.stations import (
+    MOST_ALTITUDES,
+    Stations,
+    stations_of_plan,
+    sure_pattern,
+)
+from missions.exposure.settings import ImagingSettings, ImagingSetup, imaging_settings
+from missions.exposure.storage import raw_bytes
+from missions.exposure.table import Setting
+from missions.lines.lay import lay_lines
+from missions.lines.sweep import Sweep, best_heading
+from missions.plan.rows import plan_rows
+from missions.plan.strength import arcs_fit, survey_costs, turn_rate_deg_s
+from missions.route.dives import split_dives
+from missions.route.energy import usable_wh
+from missions.route.terrain import (
+    HALF_BREADTH_M,
+    TAIL_M,
+    TerrainLimits,
+    line_profiles,
+    reach_of,
+    terrain_report,
+)
+from missions.route.ways import Ways
+from missions.values.area import Area
+from missions.values.costs import Costs
+from missions.values.footprint import Swath, common_swath, footprint_size_m, joint_swath
+from missions.values.line import Line
+from missions.values.pattern import Pattern
+from missions.values.plan_file import Plan
+
+_ENOUGH = 0.999
+"""Share of the area that is to be covered at the overlap asked for; below, the plan warns."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Planned:
+    """A plan and what led to it."""
+
+    plan: Plan
+    imaging: ImagingSettings
+    costs: Costs
+    certificate: Certificate
+    sweep: Sweep | None
+    """How the direction of the lines was found; None where it was given."""
+    bathymetry: Bathymetry | None
+    terrain: str
+    """How lines follow the bathymetry; empty without one."""
+    warnings: tuple[str, ...]
+    """What the plan was warned of."""
+    rows: tuple[Setting, ...]
+    """Every setting with its equation, source and limit."""
+
+
+def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
+    """Plan a survey.
+
+    Args:
+        config: the survey.
+        rig: its cameras in water.
+
+    Raises:
+        PlanError: no plan meets the settings; the message names the numbers.
+    """
+    with heard() as warnings:
+        wanted = config.plan
+        imaging = imaging_settings(rig, ImagingSetup.of(config))
+        _check_turns(wanted)
+        step_m = imaging.station_spacing_m
+        stereo = common_swath(rig, wanted.altitude_m, step_m)
+        pattern = sure_pattern(rig, wanted.altitude_m, imaging.line_spacing_m, step_m)
+        area = survey_area(
+            config.area, turn_margin_m=_turn_margin_m(wanted, pattern), margin_m=wanted.margin_m
+        )
+        bathymetry = area_bathymetry(config.area, area, wanted.altitude_m)
+        _check_smallest(area, imaging)
+        _warn_of_spacing(wanted, imaging, stereo)
+        _warn_of_zones(area, config.area.no_go_clearance_m, config.camera.position_body_m)
+        depth_m = _depth_m(config.area, area, bathymetry)
+        _check_depth(wanted.altitude_m, depth_m)
+        ways, home = Ways(area.allowed), _home(wanted.home_ne_m, area)
+        costs = survey_costs(config, imaging_w=imaging.imaging_w)
+        sweep = None
+        if wanted.line_heading_deg is None:
+            sweep = best_heading(
+                area,
+                pattern,
+                ways,
+                costs,
+                home,
+                cross_lines=wanted.cross_lines,
+                closing_line=wanted.closing_line,
+            )
+            heading = sweep.heading_rad
+        else:
+            heading = math.radians(wanted.line_heading_deg)
+        lines = lay_lines(
+            area,
+            heading,
+            pattern,
+            ways,
+            costs,
+            home,
+            cross_lines=wanted.cross_lines,
+            closing_line=wanted.closing_line,
+        )
+        dives = split_dives(
+            lines,
+            ways=ways,
+            costs=costs,
+            home_ne=home,
+            turn_radius_m=wanted.turn_radius_m,
+            run_in_m=wanted.run_in_m,
+            turns=wanted.turns,
+            usable_wh=usable_wh(config.vehicle),
+            longest_s=math.inf if wanted.dive_s is None else wanted.dive_s,
+            depth_m=depth_m - wanted.altitude_m,
+            split=wanted.split_dives,
+        )
+        glass_body_m = config.camera.position_body_m
+        terrain = _terrain(lines, wanted, glass_body_m, rig, stereo, pattern, bathymetry)
+        plan = Plan(
+            name=config.name,
+            area=area,
+            home_ne_m=home,
+            seafloor_depth_m=depth_m,
+            altitude_m=wanted.altitude_m,
+            speed_mps=wanted.speed_mps,
+            interval_s=imaging.interval_s,
+            exposure_s=imaging.exposure_s,
+            strobe_pulse_s=imaging.strobe_pulse_s,
+            strobe_lead_s=imaging.strobe_lead_s,
+            footprint_m=(imaging.footprint_across_m, imaging.footprint_along_m),
+            line_spacing_m=pattern.spacing_m,
+            station_spacing_m=step_m,
+            forward_overlap=imaging.forward_overlap,
+            side_overlap=imaging.spacing.side_overlap,
+            lines=tuple(lines),
+            dives=dives,
+            turn_radius_m=wanted.turn_radius_m,
+            run_in_m=wanted.run_in_m,
+            length_m=sum(dive.route.length_m for dive in dives),
+            duration_s=sum(dive.duration_s for dive in dives),
+            energy_wh=sum(dive.energy_wh for dive in dives),
+            coverage=math.nan,
+            line_depths_m=terrain.depths_m,
+            details={},
+        )
+        seen = certificate(area, rig, _stations(plan, bathymetry), pattern)
+        if seen.share_at_overlap < _ENOUGH:
+            warn(
+                f"{1 - seen.share_at_overlap:.2%} of the area gets less overlap than requested, "
+                f"and {1 - seen.every_camera_share:.2%} is not seen by every camera: look at "
+                "map.png, and give the vehicle more room, or raise the overlaps"
+            )
+        figures = _details(imaging, sweep, stereo, rig, wanted) | {"terrain": terrain.figures}
+        details = json.loads(json.dumps(figures))  # as they are read back
+        finished = replace(plan, coverage=seen.share_at_overlap, details=details)
+        planned = Planned(
+            plan=finished,
+            imaging=imaging,
+            costs=costs,
+            certificate=seen,
+            sweep=sweep,
+            bathymetry=bathymetry,
+            warnings=(),
+            terrain=terrain.text,
+            rows=(*imaging.rows, *plan_rows(finished, seen, sweep, config.vehicle, rig)),
+        )
+    return replace(planned, warnings=tuple(warnings))
+
+
+def _turn_margin_m(plan: PlanConfig, pattern: Pattern) -> float:
+    """Room around the area for the widest turn: run-out, and a loop of three quarters of a turn."""
+    outside = max(pattern.overhang_m, pattern.edge_m, 0.0)
+    outside += max(pattern.spacing_m, pattern.step_m) / 2
+    return outside + plan.run_in_m + 3.0 * plan.turn_radius_m
+
+
+def _home(given: tuple[float, float] | None, area: Area) -> tuple[float, float]:
+    """Where dives begin and end: as set, or the area's corner nearest the datum, or close to it.
+
+    Raises:
+        PlanError: it is not where the vehicle may be.
+    """
+    if given is None:
+        corners = area.corners_ne
+        # Of corners as far from the datum the most southerly, then the most westerly.
+        distance = np.round(np.hypot(corners[:, 0], corners[:, 1]), 6)
+        rank = np.lexsort((corners[:, 1], corners[:, 0], distance))
+        nearest, _ = shapely.ops.nearest_points(area.allowed, Point(corners[rank[0]]))
+        return round(float(nearest.x), 9), round(float(nearest.y), 9)
+    away_m = float(area.allowed.distance(Point(given)))
+    if away_m > 1e-6:
+        raise PlanError(
+            f"home at north {given[0]:g}, east {given[1]:g} m is {away_m:.1f} m outside of where "
+            "the vehicle may be: move plan.home_ne_m, or widen area.turn_margin_m or allowed area"
+        )
+    return given
+
+
+def area_bathymetry(settings: AreaConfig, area: Area, altitude_m: float) -> Bathymetry | None:
+    """The bathymetry of an area and of what pictures see around it; None where none is set.
+
+    Args:
+        settings: name the file.
+        area: of the plan.
+        altitude_m: at which pictures are taken.
+    """
+    if settings.bathymetry_file is None:
+        return None
+    reach_m = 4.0 * altitude_m
+    south, west, north, east = area.allowed.bounds
+    return read_bathymetry(
+        settings.bathymetry_file,
+        area.datum,
+        bounds_ne=(south - reach_m, west - reach_m, north + reach_m, east + reach_m),
+        sense=settings.bathymetry_values,
+        crs=settings.bathymetry_crs,
+    )
+
+
+def _depth_m(settings: AreaConfig, area: Area, bathymetry: Bathymetry | None) -> float:
+    """Mean depth of the sea floor, as set or as the bathymetry has it."""
+    set_m = settings.seafloor_depth_m
+    if bathymetry is None:
+        return set_m
+    found = area_depth(bathymetry, area.survey)
+    is_set = "seafloor_depth_m" in settings.model_fields_set
+    if is_set and abs(found.mean_m - set_m) > max(0.5, 0.05 * set_m):
+        warn(
+            f"{bathymetry.name}: the sea floor of the area is {found.mean_m:.2f} m deep in the "
+            f"mean, area.seafloor_depth_m is {set_m:g}: the plan uses {found.mean_m:.2f}; set "
+            "area.seafloor_depth_m to it, for light and refraction"
+        )
+    return found.mean_m
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Terrain:
+    """How lines follow a bathymetry."""
+
+    depths_m: tuple[tuple[float, ...], ...] = ()
+    """Of the glass, at each station of each line."""
+    text: str = ""
+    figures: dict[str, Any] | None = None
+
+
+def _terrain(
+    lines: Sequence[Line], wanted: PlanConfig, glass_body_m: tuple[float, float, float], rig: Rig,
+    stereo: Swath, pattern: Pattern, bathymetry: Bathymetry | None,
+) -> _Terrain:  # fmt: skip
+    if bathymetry is None:
+        return _Terrain()
+    limits = TerrainLimits(
+        altitude_m=wanted.altitude_m,
+        least_clearance_m=wanted.least_clearance_m,
+        steepest_rad=math.radians(wanted.steepest_deg),
+    )
+    across_m = max(stereo.port_m, stereo.starboard_m)
+    along_m = max(stereo.ahead_m, stereo.astern_m)
+    reach = reach_of(glass_body_m, across_m, along_m)
+    profiles = line_profiles(lines, bathymetry, reach, limits)
+    text, figures = terrain_report(
+        lines,
+        profiles,
+        limits,
+        relief_m=wanted.relief_m,
+        spacing_m=pattern.spacing_m,
+        step_m=pattern.step_m,
+        extent_m=partial(footprint_size_m, rig.cameras[rig.reference]),
+    )
+    depths = tuple(tuple(round(float(d), 4) for d in p.depth_m) for p in profiles)
+    return _Terrain(depths_m=depths, text=text, figures=figures)
+
+
+def _stations(plan: Plan, bathymetry: Bathymetry | None) -> Stations:
+    """Where pictures are taken when the plan is flown exactly."""
+    if bathymetry is None:
+        return stations_of_plan(plan)
+    places = np.vstack([line.stations_ne for line in plan.lines])
+    stations = stations_of_plan(plan, bathymetry.depth_at(places))
+    # As for a dive: from too high a place, what is seen is not what was asked for.
+    near = stations.altitude_m <= MOST_ALTITUDES * plan.altitude_m
+    if not near.all():
+        warn(
+            f"{np.count_nonzero(~near)} of {len(near)} pictures are taken from more than "
+            f"{MOST_ALTITUDES:g} times altitude_m, where the terrain is too steep to follow: they "
+            "do not count as coverage; raise steepest_deg, turn the lines along the slope "
+            "(line_heading_deg), or survey the steep part apart"
+        )
+    return stations.some(np.flatnonzero(near))
+
+
+def _check_depth(altitude_m: float, depth_m: float) -> None:
+    if altitude_m >= depth_m:
+        raise PlanError(
+            f"altitude_m {altitude_m:g} is not below the surface over a sea floor at "
+            f"{depth_m:g} m: lower plan.altitude_m or check area.seafloor_depth_m"
+        )
+
+
+def _check_turns(plan: PlanConfig) -> None:
+    if not arcs_fit(plan):
+        raise PlanError(
+            f"turns of {plan.turn_radius_m:g} m radius at {plan.speed_mps:g} m/s need "
+            f"{turn_rate_deg_s(plan):.0f} deg/s; turn_rate_limit_deg_s is "
+            f"{plan.turn_rate_limit_deg_s:g}: raise turn_radius_m or lower speed_mps"
+        )
+
+
+def _check_smallest(area: Area, imaging: ImagingSettings) -> None:
+    least_m = min(imaging.footprint_across_m, imaging.footprint_along_m)
+    north_0, east_0, north_1, east_1 = area.survey.bounds
+    diagonal_m = math.hypot(north_1 - north_0, east_1 - east_0)
+    if diagonal_m < least_m:
+        raise PlanError(
+            f"area: {diagonal_m:.2g} m across is less than one picture of "
+            f"{imaging.footprint_across_m:.2f} x {imaging.footprint_along_m:.2f} m: nothing to "
+            "plan; plan.margin_m adds its surroundings"
+        )
+
+
+def _warn_of_zones(
+    area: Area, clearance_m: float, glass_body_m: tuple[float, float, float]
+) -> None:
+    """The allowed area holds the camera: the hull behind it reaches farther."""
+    forward_m, right_m, _ = glass_body_m
+    behind_m = math.hypot(TAIL_M + forward_m, HALF_BREADTH_M + abs(right_m))
+    if not area.no_go.is_empty and clearance_m < behind_m:
+        warn(
+            f"the camera is kept {clearance_m:g} m off the no-go zones, the hull "
+            f"reaches {behind_m:.1f} m from it and navigation errs on top: raise "
+            "area.no_go_clearance_m unless the zones have room around what they keep off"
+        )
+
+
+def _warn_of_spacing(plan: PlanConfig, imaging: ImagingSettings, stereo: Swath) -> None:
+    spacing_m, reached = imaging.line_spacing_m, imaging.spacing.side_overlap
+    if spacing_m > 2 * stereo.half_across_m:
+        warn(
+            f"lines {spacing_m:g} m apart leave gaps of "
+            f"{spacing_m - 2 * stereo.half_across_m:.2f} m in stereo; at most "
+            f"{2 * stereo.half_across_m:.2f} m apart do not"
+        )
+    if reached < plan.side_overlap - 1e-9:
+        needed_m = imaging.footprint_across_m * (1 - plan.side_overlap)
+        warn(
+            f"lines {spacing_m:g} m apart overlap by {reached:.1%}, less than the "
+            f"{plan.side_overlap:.1%} asked for, which needs {needed_m:.3f} m"
+        )
+
+
+def _details(
+    imaging: ImagingSettings, sweep: Sweep | None, stereo: Swath, rig: Rig, plan: PlanConfig
+) -> dict[str, Any]:
+    camera = rig.cameras[rig.reference]
+    return {
+        "imaging": imaging.to_json(),
+        "heading": None if sweep is None else _sweep_json(sweep),
+        "wanted_forward_overlap": plan.forward_overlap,
+        "wanted_side_overlap": plan.side_overlap,
+        "stereo_swath_m": stereo.across_m,
+        "stereo_side_overlap": imaging.spacing.stereo_overlap,
+        "mosaic_swath_m": joint_swath(rig, plan.altitude_m, imaging.station_spacing_m).across_m,
+        "turn_rate_deg_s": turn_rate_deg_s(plan),
+        "raw_bytes_per_s": raw_bytes(camera, len(rig.cameras), 1) / imaging.interval_s,
+    }
+
+
+def _sweep_json(sweep: Sweep) -> dict[str, float]:
+    return {
+        "heading_deg": math.degrees(sweep.heading_rad),
+        "cost_j": sweep.cost_j,
+        "least_width_heading_deg": math.degrees(sweep.width_heading_rad),
+        "least_width_m": sweep.width_m,
+    }

@@ -1,0 +1,400 @@
+"""Depth made exact where several pictures look alike: multi-view least-squares matching.
+
+All neighbours are warped onto the reference through its present depth map, pixel by pixel, so that
+windows follow slopes and bends of the surface. What then differs between warped and reference is
+explained by one correction of the inverse depth in a window around each pixel (Lucas & Kanade 1981,
+"An iterative image registration technique"), the same for all neighbours: each sees it along its
+own epipolar line. Sums over windows are filters over the picture, so that the work does not depend
+on the window's size (Le Besnerais & Champagnat 2005, "Dense optical flow by iterative local window
+registration"). The correction is repeated where it is large.
+
+The same sums show how sure a depth is: the curvature of the misfit along the inverse depth, and
+the noise that remains between pictures.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from alice_survey.base.compiled import compiled
+from alice_survey.base.frames import Array
+from reconstruct.views.model import View
+from reconstruct.views.sight import FAST, KernelLens, field_of, lens_of, pixel_at
+
+Float32 = NDArray[np.float32]
+
+_SIXTH, _HALF, _TWO_THIRDS = np.float32(1 / 6), np.float32(0.5), np.float32(2 / 3)
+_ONE, _THREE_HALVES, _TWO = np.float32(1.0), np.float32(1.5), np.float32(2.0)
+
+_CONTRAST_SIGMA_PX = 8.0
+"""Of the Gaussian window in which pictures are brought to zero mean and unit contrast."""
+_LEAST_CONTRAST = 1.5
+"""Grey levels of noise that are not blown up to full contrast."""
+_WINDOW_SIGMA_PX = 1.25
+"""Of the Gaussian window that is compared. Wider ones blur the surface, narrower ones are noisier;
+the noise is averaged when views are fused, the blur is not."""
+_CONVERGED_PX = 0.5
+"""A first step below this lands so near that a second round does not lower the error."""
+_WINDOW_PX = 9
+"""Side of the square that holds what counts in the Gaussian window."""
+_STEP_WINDOW_PX = 5
+_STEP_PX = 4.0
+"""Change of disparity in that square from which on a window mixes near and far."""
+_NONE = np.float32(1e6)
+_ALIKE = 0.5
+"""Correlation from which two windows look alike."""
+_LEAST_SHARE = 0.4
+"""Of a window's weight that a neighbour must see."""
+_OUTLYING = 2.5
+"""Deviations beyond which a pixel counts less than half."""
+_LONGEST_STEP_PX = 1.0
+"""Of a round, along the epipolar line of the neighbour that moves most."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ComparedView:
+    """A picture ready to be compared."""
+
+    view: View
+    contrast: Float32
+    """(H, W) of zero mean and unit variance around every pixel."""
+    spline: Float32
+    """(H, W) coefficients of the cubic B-spline through it."""
+    valid: NDArray[np.bool_]
+    """(H, W) which pixels may be used."""
+
+
+def prepared(
+    grey: NDArray[np.uint8], valid: NDArray[np.bool_]
+) -> tuple[Float32, Float32, NDArray[np.bool_]]:
+    """Contrast, spline and validity of a picture (H, W), as `ComparedView` has them."""
+    contrast = even_contrast(grey.astype(np.float32))
+    spline = ndimage.spline_filter(contrast, order=3, output=np.float32, mode="mirror")
+    return contrast, spline, valid
+
+
+def even_contrast(grey: Float32) -> Float32:
+    """A picture less its local mean, over its local deviation."""
+    mean = _blur(grey, _CONTRAST_SIGMA_PX)
+    rest: Float32 = grey - mean
+    variance = _blur(rest * rest, _CONTRAST_SIGMA_PX) + np.float32(_LEAST_CONTRAST**2)
+    even: Float32 = rest * (variance ** np.float32(-0.5))
+    return even
+
+
+def _blur(picture: Float32, sigma_px: float) -> Float32:
+    blurred: Float32 = cv2.GaussianBlur(picture, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT)
+    return blurred
+
+
+@compiled(error_model="numpy", fastmath=FAST)
+def sights(lens: KernelLens, height: int, width: int) -> Float32:
+    """Lines on which the spots of a view's pixels lie, (H, W, 4).
+
+    Slopes x/z, y/z at an inverse depth of zero, and how they change with it.
+    """
+    pinhole, shift = lens
+    lines = np.empty((height, width, 4), np.float32)
+    for row in range(height):
+        for column in range(width):
+            a, b = field_of(lens, column + 0.5, row + 0.5)
+            lines[row, column, 0] = (column + 0.5 - a * shift[3] - pinhole[2]) / pinhole[0]
+            lines[row, column, 1] = (row + 0.5 - b * shift[3] - pinhole[3]) / pinhole[1]
+            lines[row, column, 2] = a / pinhole[0]
+            lines[row, column, 3] = b / pinhole[1]
+    return lines
+
+
+@compiled(error_model="numpy", fastmath=FAST)
+def compare(
+    inverse_depth: Float32,
+    reference: Float32,
+    lines: Float32,
+    spline: Float32,
+    valid: NDArray[np.bool_],
+    other_lens: KernelLens,
+    other_from_ref: Array,
+) -> tuple[Float32, Float32, Float32]:
+    """Warp a neighbour onto the reference through its depth.
+
+    Args:
+        inverse_depth: (H, W) along the reference's axis, NaN where unknown.
+        reference: (H, W) contrast.
+        lines: (H, W, 4) of the reference, see `sights`.
+        spline: (h, w) B-spline coefficients of the neighbour's contrast.
+        valid: (h, w) of the neighbour.
+        other_lens: of the neighbour.
+        other_from_ref: (3, 4) transform of points.
+
+    Returns:
+        (H, W) reference less warped neighbour; the warped neighbour's change per unit of inverse
+        depth; and how many of its pixels one unit moves. NaN where it does not see the spot.
+    """
+    height, width = inverse_depth.shape
+    rows, columns = spline.shape
+    rest = np.full((height, width), np.nan, np.float32)
+    slope = np.full((height, width), np.nan, np.float32)
+    speed = np.full((height, width), np.nan, np.float32)
+    fx, fy = other_lens[0][0], other_lens[0][1]
+    t = other_from_ref
+    for row in range(height):
+        for column in range(width):
+            w = inverse_depth[row, column]
+            if not w > 0.0:
+                continue
+            x = lines[row, column, 0] + w * lines[row, column, 2]
+            y = lines[row, column, 1] + w * lines[row, column, 3]
+            a = t[0, 0] * x + t[0, 1] * y + t[0, 2]
+            b = t[1, 0] * x + t[1, 1] * y + t[1, 2]
+            c = t[2, 0] * x + t[2, 1] * y + t[2, 2]
+            deep = c + w * t[2, 3]
+            if deep <= 0.0:
+                continue
+            u, v = pixel_at(other_lens, (a + w * t[0, 3]) / w, (b + w * t[1, 3]) / w, deep / w)
+            u -= 0.5
+            v -= 0.5
+            j, i = math.floor(u), math.floor(v)
+            if j < 1 or i < 1 or j >= columns - 2 or i >= rows - 2:
+                continue
+            if not (valid[i, j] and valid[i + 1, j + 1] and valid[i, j + 1] and valid[i + 1, j]):
+                continue
+            p, q = np.float32(u - j), np.float32(v - i)
+            a0, a1, a2, a3 = _weights(p)
+            b0, b1, b2, b3 = _slopes(p)
+            across, changes = _weights(q), _slopes(q)
+            value, right, down = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+            for m in range(4):
+                k = i - 1 + m
+                c0, c1 = spline[k, j - 1], spline[k, j]
+                c2, c3 = spline[k, j + 1], spline[k, j + 2]
+                line = a0 * c0 + a1 * c1 + a2 * c2 + a3 * c3
+                value += across[m] * line
+                down += changes[m] * line
+                right += across[m] * (b0 * c0 + b1 * c1 + b2 * c2 + b3 * c3)
+            scale = 1.0 / (deep * deep)
+            du = fx * (t[0, 3] * c - a * t[2, 3]) * scale
+            dv = fy * (t[1, 3] * c - b * t[2, 3]) * scale
+            rest[row, column] = reference[row, column] - value
+            slope[row, column] = right * du + down * dv
+            speed[row, column] = math.sqrt(du * du + dv * dv)
+    return rest, slope, speed
+
+
+@compiled(error_model="numpy", fastmath=FAST)
+def _weights(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.float32]:
+    """The four weights of a cubic B-spline at a share t of the way from the second node."""
+    s = _ONE - t
+    u, v = _HALF * t - _ONE, _HALF * s - _ONE
+    return (
+        _SIXTH * s * s * s,
+        t * t * u + _TWO_THIRDS,
+        s * s * v + _TWO_THIRDS,
+        _SIXTH * t * t * t,
+    )
+
+
+@compiled(error_model="numpy", fastmath=FAST)
+def _slopes(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.float32]:
+    """How these weights change with t."""
+    s = _ONE - t
+    return (
+        -_HALF * s * s,
+        (_THREE_HALVES * t - _TWO) * t,
+        (_TWO - _THREE_HALVES * s) * s,
+        _HALF * t * t,
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RefinedDepth:
+    """Depth of a view where pictures agree, arrays of (H, W)."""
+
+    depth: Float32
+    """NaN where unknown, or where no neighbour looks alike."""
+    sigma: Float32
+    """Standard deviation from what differs between the pictures, NaN where unknown."""
+    likeness: Float32
+    """Correlation of the window with its neighbours, their mean weighted as they were used."""
+    seen: NDArray[np.uint8]
+    """How many neighbours look alike there."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _NeighbourSums:
+    """What all neighbours say of a correction of the inverse depth, (H, W) each."""
+
+    pull: Float32
+    curvature: Float32
+    speed: Float32
+    """Pixels per unit of inverse depth, of the neighbour that moves most."""
+    likeness: Float32
+    seen: NDArray[np.uint8]
+
+
+def refine(
+    reference: ComparedView, depth: Float32, sigma: Float32, others: Sequence[ComparedView]
+) -> RefinedDepth:
+    """Correct a depth map by all neighbours at once.
+
+    A window that holds a step of the surface has no single correction: there the depth and its
+    deviation stay as they were.
+
+    Args:
+        reference: whose depth it is.
+        depth: (H, W) along its axis, NaN where unknown.
+        sigma: (H, W) of the depth.
+        others: neighbours to compare with.
+    """
+    inverse = (1.0 / depth).astype(np.float32)
+    first = _sums(reference, inverse, others)
+    moved, step_px = _stepped(inverse, first)
+    sums = first
+    far = (step_px > _CONVERGED_PX).astype(np.uint8)
+    if far.any():  # elsewhere a second round would change little
+        window = np.ones((_WINDOW_PX, _WINDOW_PX), np.uint8)
+        part = np.where(cv2.dilate(far, window) > 0, moved, np.float32(np.nan))
+        second = _sums(reference, part, others)
+        again = np.isfinite(part) & (second.curvature > 0)
+        sums = _chosen(again, second, first)
+        moved = np.where(again, _stepped(part, second)[0], moved)
+    alike = (sums.curvature > 0) & (sums.likeness >= _ALIKE)
+    kept = alike & _has_step(inverse, first.speed)
+    unknown = np.float32(np.nan)
+    refined: Float32 = np.where(alike & ~kept, np.float32(1.0) / moved, unknown)
+    root: Float32 = np.sqrt(np.where(alike, sums.curvature, unknown))
+    return RefinedDepth(
+        depth=np.where(kept, depth, refined),
+        sigma=np.where(kept, sigma, refined * refined / root),
+        likeness=sums.likeness,
+        seen=sums.seen,
+    )
+
+
+def _has_step(inverse: Float32, speed: Float32) -> NDArray[np.bool_]:
+    """Where known inverse depths in a window differ by much, in pixels of the farthest move."""
+    known = np.isfinite(inverse)
+    window = np.ones((_STEP_WINDOW_PX, _STEP_WINDOW_PX), np.uint8)
+    high = cv2.dilate(np.where(known, inverse, -_NONE), window)
+    low = cv2.erode(np.where(known, inverse, _NONE), window)
+    return np.asarray(known & ((high - low) * speed > _STEP_PX))
+
+
+def _chosen(mask: NDArray[np.bool_], yes: _NeighbourSums, no: _NeighbourSums) -> _NeighbourSums:
+    return _NeighbourSums(
+        pull=np.where(mask, yes.pull, no.pull),
+        curvature=np.where(mask, yes.curvature, no.curvature),
+        speed=np.where(mask, yes.speed, no.speed),
+        likeness=np.where(mask, yes.likeness, no.likeness),
+        seen=np.where(mask, yes.seen, no.seen),
+    )
+
+
+def _stepped(inverse: Float32, sums: _NeighbourSums) -> tuple[Float32, Float32]:
+    """Inverse depths moved to where the pictures agree best, and by how many pixels at most.
+
+    Where little pulls they are held back, by a prior of one pixel's deviation along the longest
+    epipolar line.
+    """
+    fast = np.maximum(sums.speed, np.float32(1e-6))
+    reach = _LONGEST_STEP_PX / fast
+    step: Float32 = np.clip(sums.pull / (sums.curvature + fast * fast), -reach, reach)
+    return inverse + step, np.abs(step) * sums.speed
+
+
+def _sums(
+    reference: ComparedView, inverse: Float32, others: Sequence[ComparedView]
+) -> _NeighbourSums:
+    shape = inverse.shape
+    pull, curvature, speed = (np.zeros(shape, np.float32) for _ in range(3))
+    likeness, seen = np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
+    lines = sights(lens_of(reference.view), *shape)
+    samples = np.float32(4.0 * np.pi * _WINDOW_SIGMA_PX**2)  # one over the sum of squared weights
+    mean = _blur(reference.contrast, _WINDOW_SIGMA_PX)
+    spread = _blur(reference.contrast * reference.contrast, _WINDOW_SIGMA_PX) - mean * mean
+    for other in others:
+        other_from_ref = other.view.world_from_cam.inv() * reference.view.world_from_cam
+        rest, slope, fast = compare(
+            inverse,
+            reference.contrast,
+            lines,
+            other.spline,
+            other.valid,
+            lens_of(other.view),
+            np.ascontiguousarray(other_from_ref.as_matrix()[:3]),
+        )
+        known = np.isfinite(rest) & reference.valid
+        sample = rest[::3, ::3][known[::3, ::3]]
+        if sample.size == 0:
+            continue
+        noise = max(np.float32(1.4826 * np.median(np.abs(sample))), np.float32(1e-3))
+        products = _products(rest, slope, known, noise * np.float32(_OUTLYING))
+        weight, r, g, rg, gg, rr = (_blur(product, _WINDOW_SIGMA_PX) for product in products)
+        _add(
+            (weight, r, g, rg, gg, rr), spread, fast, known, noise, samples,
+            (pull, curvature, speed, likeness, seen),
+        )  # fmt: skip
+    with np.errstate(invalid="ignore"):
+        likeness = likeness / curvature
+    return _NeighbourSums(pull=pull, curvature=curvature, speed=speed, likeness=likeness, seen=seen)
+
+
+@compiled(error_model="numpy", fastmath=FAST)
+def _products(
+    rest: Float32, slope: Float32, known: NDArray[np.bool_], outlying: float
+) -> tuple[Float32, Float32, Float32, Float32, Float32, Float32]:
+    """Weights, falling with the square of what is left (Cauchy), and weighted products."""
+    shape = rest.shape
+    weight, r = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    g, rg = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    gg, rr = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    for i in range(shape[0]):
+        for j in range(shape[1]):
+            if not known[i, j]:
+                continue
+            a, b = rest[i, j], slope[i, j]
+            w = 1.0 / (1.0 + (a / outlying) ** 2)
+            weight[i, j] = w
+            r[i, j], g[i, j] = w * a, w * b
+            rg[i, j], gg[i, j], rr[i, j] = w * a * b, w * b * b, w * a * a
+    return weight, r, g, rg, gg, rr
+
+
+@compiled(error_model="numpy", fastmath=FAST)
+def _add(
+    sums: tuple[Float32, Float32, Float32, Float32, Float32, Float32],
+    spread: Float32,
+    fast: Float32,
+    known: NDArray[np.bool_],
+    noise: float,
+    samples: float,
+    totals: tuple[Float32, Float32, Float32, Float32, NDArray[np.uint8]],
+) -> None:
+    """Add one neighbour's normal equations to the totals, each over the variance it leaves.
+
+    Means over the window are taken out, so that brightness does not count; a window that hardly
+    looks alike (occluded, moved) counts little.
+    """
+    weight, r, g, rg, gg, rr = sums
+    pull, curvature, speed, likeness, seen = totals
+    for i in range(known.shape[0]):
+        for j in range(known.shape[1]):
+            share = weight[i, j]
+            if not known[i, j] or share < _LEAST_SHARE:
+                continue
+            cross = rg[i, j] - r[i, j] * g[i, j] / share
+            square = gg[i, j] - g[i, j] * g[i, j] / share
+            misfit = rr[i, j] / share - (r[i, j] / share) ** 2
+            alike = 1.0 - 0.5 * misfit / max(spread[i, j], 1e-3)
+            trust = min(max(alike, 0.05), 1.0)
+            certainty = samples * trust * trust / max(misfit, 0.1 * noise * noise)
+            pull[i, j] += certainty * cross
+            curvature[i, j] += certainty * square
+            likeness[i, j] += certainty * square * alike
+            speed[i, j] = max(speed[i, j], fast[i, j])
+            if alike >= _ALIKE:
+                seen[i, j] += 1

@@ -1,0 +1,258 @@
+"""What the mosaic must know of a picture before it is painted: small copies, sharpness, dark light.
+
+Levels are linear light from here on: water adds and lamps multiply light, not grey values. Pictures
+are taken to be encoded by the sRGB curve (IEC 61966-2-1), as cameras write them.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.base.artefacts import atomic_path
+from alice_survey.base.compiled import compiled
+from alice_survey.base.frames import Array
+from reconstruct.light.solve import GRID, at_places
+from reconstruct.pictures.undistorted import Pictures
+
+Float32 = NDArray[np.float32]
+
+_SMALL_PX = 432
+"""Width of the copies in which views are compared, at most."""
+_LEAST_SHRINK = 4
+"""Half a cell of the mosaic, whose pixels are about as large as those of pictures."""
+DARKEST, BRIGHTEST = 0.001, 0.95
+"""Linear light beyond which a broad level is not used."""
+_DARK_PERCENT = 0.5
+_DARK_STEP = 2
+"""Every so manieth pixel along rows and columns is looked at for dark ones."""
+_BROAD_STEP = 4
+"""Pixels of a small copy to one of its broad light, which is blurred by as much."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PictureMeasures:
+    """Of one picture."""
+
+    sharpness: float
+    """Mean size of its Laplacian over its mean level; NaN where it is black."""
+    grey: bool
+    """Whether its channels are equal."""
+    nodes: Array
+    """(rows, columns, 3) logarithm of its broad light at nodes, BGR; NaN where unusable."""
+    dark: Array
+    """(rows, columns, 3) light of the darkest pixels around nodes, BGR; NaN where masked."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SmallCopy:
+    """A picture made small."""
+
+    levels: NDArray[np.uint8]
+    """(h, w, 4) BGR by the sRGB curve, and the share of each pixel that may be used, of 255."""
+    broad: Float32
+    """(h', w', 3) linear light, smaller and blurred, what is masked left out."""
+
+    @property
+    def detail(self) -> Float32:
+        """(h, w, 3) BGR, linear light."""
+        light: Float32 = linear_table()[self.levels[..., :3]]
+        return light
+
+    @property
+    def valid(self) -> Float32:
+        """(h, w) share of each pixel that may be used."""
+        share: Float32 = self.levels[..., 3].astype(np.float32) / np.float32(255)
+        return share
+
+    @property
+    def whole(self) -> bool:
+        """Whether all of it may be used."""
+        return bool((self.levels[..., 3] == 255).all())
+
+
+def linear_table() -> Float32:
+    """(256,) linear light, 0 to 1, of the levels of the sRGB curve."""
+    level = np.arange(256) / 255.0
+    linear = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
+    table: Float32 = linear.astype(np.float32)
+    return table
+
+
+def encoded(light: Float32) -> Float32:
+    """Levels, 0 to 255 where light is 0 to 1, by the sRGB curve; brighter light goes on beyond."""
+    light = np.maximum(light, np.float32(0.0))
+    curve = np.float32(1.055) * light ** np.float32(1 / 2.4) - np.float32(0.055)
+    levels: Float32 = np.float32(255.0) * np.where(
+        light <= np.float32(0.0031308), np.float32(12.92) * light, curve
+    )
+    return levels
+
+
+def measure_picture(task: tuple[Path, Path, str]) -> PictureMeasures:
+    """Measure a picture of a workspace and write its small copy.
+
+    Args:
+        task: workspace, the folder for small copies, and the picture's name.
+    """
+    workspace, folder, image = task
+    pictures = Pictures.open(workspace)
+    taken, usable = pictures.taken(image), pictures.usable(image)
+    height, width = taken.shape[:2]
+    table = linear_table()
+    shrink = max(_LEAST_SHRINK, round(width / _SMALL_PX))
+    size = (max(8, width // shrink), max(8, height // shrink))
+    small = np.ones((size[1], size[0], 4), np.float32)
+    if usable is not None:
+        small[..., 3] = cv2.resize(usable.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    for channel in range(3):
+        light = cv2.LUT(taken[..., channel], table)
+        light = light if usable is None else light * usable
+        total = cv2.resize(light, size, interpolation=cv2.INTER_AREA)
+        small[..., channel] = total / np.maximum(small[..., 3], 1e-3)
+    levels = np.rint(np.minimum(encoded(small[..., :3]), 255)).astype(np.uint8)
+    content = np.dstack([levels, np.rint(255 * small[..., 3]).astype(np.uint8)])
+    copy = _small_copy(content)
+    path = small_path(folder, image)
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.save(file, copy.levels)
+        np.save(file, copy.broad)
+    green = taken[..., 1]
+    fine, mean = sharp_and_mean(green, np.ones((1, 1), np.bool_) if usable is None else usable)
+    return PictureMeasures(
+        sharpness=fine / mean if mean > 0 else float("nan"),
+        grey=bool((taken[..., 0] == green).all() and (taken[..., 2] == green).all()),
+        nodes=_broad_nodes(copy),
+        dark=_dark(taken, usable, table),
+    )
+
+
+@compiled
+def sharp_and_mean(grey: NDArray[np.uint8], usable: NDArray[np.bool_]) -> tuple[float, float]:
+    """Mean size of the Laplacian, and mean level, of the inner pixels that may be used.
+
+    Args:
+        grey: (H, W).
+        usable: (H, W), or (1, 1) for all.
+    """
+    rows, columns = grey.shape
+    whole = usable.shape[0] == 1
+    fine, total, count = 0.0, 0.0, 0  # whole numbers, exact as floats
+    for row in range(1, rows - 1):
+        for column in range(1, columns - 1):
+            if whole or usable[row, column]:
+                here = np.int64(grey[row, column])
+                around = (
+                    np.int64(grey[row - 1, column]) + np.int64(grey[row + 1, column])
+                    + np.int64(grey[row, column - 1]) + np.int64(grey[row, column + 1])
+                )  # fmt: skip
+                fine += float(abs(around - 4 * here))
+                total += float(here)
+                count += 1
+    return fine / max(count, 1), total / max(count, 1)
+
+
+def _broad_nodes(copy: SmallCopy) -> Array:
+    x, y = np.meshgrid(np.linspace(0.01, 0.99, GRID[1]), np.linspace(0.01, 0.99, GRID[0]))
+    places = np.column_stack([x.ravel(), y.ravel()]).astype(np.float32)
+    level = at_places(copy.broad, places).reshape(*GRID, 3).astype(np.float64)
+    valid = at_places(copy.valid[..., None], places, 1).reshape(*GRID, 1)
+    usable = well_exposed(level)[..., None] & (valid > 0.5)
+    return np.where(usable, np.log(np.maximum(level, DARKEST)), np.nan)
+
+
+def well_exposed(light: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
+    """Whether all channels (..., 3) are neither black nor burnt out."""
+    return np.asarray(((light > DARKEST) & (light < BRIGHTEST)).all(axis=-1))
+
+
+def _dark(taken: NDArray[np.uint8], usable: NDArray[np.bool_] | None, table: Float32) -> Array:
+    """Darkest light in the cells around nodes."""
+    part = taken[::_DARK_STEP, ::_DARK_STEP]
+    mask = np.ones((1, 1), np.bool_) if usable is None else usable[::_DARK_STEP, ::_DARK_STEP]
+    height, width = part.shape[:2]
+    rows, columns = GRID
+    y = np.clip(np.rint((np.arange(rows + 1) - 0.5) / (rows - 1) * height), 0, height)
+    x = np.clip(np.rint((np.arange(columns + 1) - 0.5) / (columns - 1) * width), 0, width)
+    levels = low_levels(part, mask, y.astype(np.int64), x.astype(np.int64), _DARK_PERCENT)
+    return np.where(np.isfinite(levels), np.interp(levels, np.arange(256), table), np.nan)
+
+
+@compiled
+def low_levels(
+    picture: NDArray[np.uint8], usable: NDArray[np.bool_], y: NDArray[np.int64],
+    x: NDArray[np.int64], percent: float,
+) -> Array:  # fmt: skip
+    """A percentile of the levels in boxes of a picture, (rows, columns, 3).
+
+    Args:
+        picture: (H, W, 3).
+        usable: (H, W), or (1, 1) for all.
+        y: (rows + 1,) edges of the boxes.
+        x: (columns + 1,).
+        percent: of the pixels that are darker.
+
+    Returns:
+        The level that so many pixels are below, as a step; NaN where fewer than 100 may be used.
+    """
+    rows, columns = len(y) - 1, len(x) - 1
+    found = np.full((rows, columns, 3), np.nan)
+    whole = usable.shape[0] == 1
+    counts = np.zeros((3, 256), np.int64)
+    for row in range(rows):
+        for column in range(columns):
+            counts[:] = 0
+            for r in range(y[row], y[row + 1]):
+                for c in range(x[column], x[column + 1]):
+                    if whole or usable[r, c]:
+                        for k in range(3):
+                            counts[k, picture[r, c, k]] += 1
+            total = counts[0].sum()
+            if total < 100:
+                continue
+            for k in range(3):
+                below = 0
+                for level in range(256):
+                    below += counts[k, level]
+                    if below > percent / 100.0 * (total - 1):
+                        found[row, column, k] = level
+                        break
+    return found
+
+
+def small_path(folder: Path, image: str) -> Path:
+    """The file of a picture's small copy."""
+    return folder / f"{image}.small"
+
+
+class SmallCopies:
+    """Small copies as they are asked for; the last few stay in memory."""
+
+    def __init__(self, folder: Path, kept: int = 40) -> None:
+        self._load = lru_cache(maxsize=kept)(lambda image: _read_small(folder, image))
+
+    def load(self, image: str) -> SmallCopy:
+        """The copy of a picture."""
+        return self._load(image)
+
+
+def _read_small(folder: Path, image: str) -> SmallCopy:
+    with small_path(folder, image).open("rb") as file:
+        return SmallCopy(levels=np.load(file), broad=np.load(file))
+
+
+def _small_copy(content: NDArray[np.uint8]) -> SmallCopy:
+    copy = SmallCopy(levels=content, broad=np.empty((0, 0, 3), np.float32))
+    size = (max(8, content.shape[1] // _BROAD_STEP), max(8, content.shape[0] // _BROAD_STEP))
+    valid = copy.valid
+    parts = (copy.detail * valid[..., None], valid)
+    total, weight = (
+        cv2.GaussianBlur(cv2.resize(part, size, interpolation=cv2.INTER_AREA), (0, 0), 1.0)
+        for part in parts
+    )
+    broad: Float32 = total / np.maximum(weight, np.float32(1e-3))[..., None]
+    return SmallCopy(levels=content, broad=broad)

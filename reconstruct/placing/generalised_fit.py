@@ -1,0 +1,439 @@
+"""Generalised least squares for a model's place, with sigmas that count how long errors last.
+
+Errors of navigation last: weights that take readings as independent state sigmas that are far too
+small. Here every group of channels (horizontal position, depth, tilt, heading) has the marginal
+sigma that navigation states, and a correlation time and white and constant shares that the misfit
+between navigation and the model gives, the model being stiff. They are found by restricted maximum
+likelihood (Patterson & Thompson 1971), which counts what the placement itself has absorbed, and
+the covariance of the placement is averaged over all that are likely.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alice_survey.base.frames import Array
+from reconstruct.placing.correlated_errors import LEAST_WHITE, lasting_share, surprise, whiten
+from reconstruct.placing.navigation_equations import (
+    GROUP_OF,
+    GROUPS,
+    PARAMETERS,
+    NavigationEquations,
+)
+
+_WHITE = (LEAST_WHITE, 3e-3, 0.05, 0.3, 0.8, 0.97)
+_CONSTANT = (0.0, 0.5, 0.75, 0.9)
+"""The varying part's variance goes down by halves: what is not known of a variance is its size."""
+_TAUS = 10
+_SHORTEST_STEPS, _LONGEST_SPANS = 0.2, 30.0
+"""Correlation times looked at: from so many median time steps to so many lengths of the survey."""
+_GROSS_SIGMAS = 5.0
+_SURPRISE_SIGMAS = 4.5
+"""A reading this far from what all others say is left out."""
+_SWEEPS = 3
+_ROUNDS = 6
+_DRAWS = 64
+_CHI_SIGMAS = 3.0
+"""A misfit larger than stated sigmas allow, at this significance, makes them larger."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lasting:
+    """How the errors of a group of channels last."""
+
+    tau: float
+    """Correlation time of the varying part, in the unit of the epochs' time."""
+    white: float
+    """Share of the varying part's variance that is white."""
+    constant: float = 0.0
+    """Share of all variance that one constant error has."""
+    factor: float = 1.0
+    """By which the stated sigmas are too small."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Extra:
+    """Independent further equations, made white: misfit + jacobian x change = N(0, 1)."""
+
+    misfit: Array
+    """(E,)."""
+    jacobian: Array
+    """(E, PARAMETERS)."""
+
+
+NO_EXTRA = Extra(misfit=np.zeros(0), jacobian=np.zeros((0, PARAMETERS)))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Estimate:
+    """What the equations say of the parameters' change, and how well."""
+
+    change: Array
+    """(PARAMETERS,), zero for what is held."""
+    covariance: Array
+    """(PARAMETERS, PARAMETERS), zero for what is held."""
+    lasting: Mapping[str, Lasting]
+    """By group, of those with readings."""
+    used: NDArray[np.bool_]
+    """(M, 6) readings that took part."""
+
+
+def estimate(
+    time: Array,
+    found: NavigationEquations,
+    used: NDArray[np.bool_],
+    free: Sequence[int],
+    extra: Extra = NO_EXTRA,
+    *,
+    frame_bounds: Mapping[int, float],
+    lasting: Mapping[str, Lasting] | None = None,
+) -> Estimate:
+    """Solve for the parameters, the lasting of errors and the readings to leave out.
+
+    Args:
+        time: (M,) moments, not decreasing.
+        found: equations of navigation.
+        used: (M, 6) readings that may take part.
+        free: parameters to solve for; nuisances among them need an equation in `extra` or are
+            otherwise determined.
+        extra: further equations.
+        frame_bounds: sigmas of the nuisances of navigation's own frame (turn, stretch) if its
+            position errors lasted throughout; they shrink as those average out.
+        lasting: how errors last, where that is known: then no reading is left out either, and the
+            covariance is that of this way alone.
+    """
+    problem = _PlacementProblem(
+        time=time, found=found, free=np.array(free), extra=extra, frame_bounds=frame_bounds
+    )
+    used = used & np.isfinite(found.misfit)
+    if lasting is not None:
+        parameters, spread = problem.total(used, lasting).solve()
+        change, covariance = _filled(problem, parameters, spread)
+        return Estimate(change=change, covariance=covariance, lasting=lasting, used=used)
+    lasting = {
+        group: Lasting(tau=float(np.ptp(time)) or 1.0, white=0.1)
+        for group in GROUPS
+        if used[:, _channels(group)].any()
+    }
+    for _ in range(_ROUNDS):
+        lasting = _likeliest(problem, used, lasting)
+        kept = _without_surprises(problem, used, lasting)
+        if np.array_equal(kept, used):
+            break
+        used = kept
+    change, covariance = _averaged(problem, used, lasting)
+    return Estimate(change=change, covariance=covariance, lasting=lasting, used=used)
+
+
+def without_gross_errors(misfit: Array, known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Leave out readings far from the median misfit of their channel, all of a group together.
+
+    A frame that is off as a whole (a constant error) leaves nothing out.
+    """
+    used = known.copy()
+    for group in GROUPS:
+        channels = _channels(group)
+        for channel in channels:
+            rows = known[:, channel]
+            if rows.sum() < 3:
+                continue
+            off = np.abs(misfit[:, channel] - np.median(misfit[rows, channel]))
+            spread = max(1.0, 1.4826 * float(np.median(off[rows])))
+            used[rows & (off > _GROSS_SIGMAS * spread), min(channels)] = False
+        used[:, channels] &= used[:, [min(channels)]]
+    return used
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Normal:
+    """Normal equations and likelihood of a group."""
+
+    matrix: Array
+    vector: Array
+    square: float
+    log_det: float
+    rows: int
+
+    def plus(self, other: "_Normal") -> "_Normal":
+        return _Normal(
+            matrix=self.matrix + other.matrix,
+            vector=self.vector + other.vector,
+            square=self.square + other.square,
+            log_det=self.log_det + other.log_det,
+            rows=self.rows + other.rows,
+        )
+
+    def solve(self) -> tuple[Array, Array]:
+        """Parameters and their covariance."""
+        size = np.sqrt(np.diag(self.matrix))
+        size = np.where(size > 0, size, 1.0)
+        inverse = np.linalg.pinv(self.matrix / np.outer(size, size), rcond=1e-14, hermitian=True)
+        covariance = inverse / np.outer(size, size)
+        return -covariance @ self.vector, covariance
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _PlacementProblem:
+    time: Array
+    found: NavigationEquations
+    free: NDArray[np.int64]
+    extra: Extra
+    frame_bounds: Mapping[int, float]
+    cache: dict[Any, _Normal] = field(default_factory=dict)
+    stacks: dict[Any, tuple[Array, Array, Array, Array]] = field(default_factory=dict)
+
+    def group(self, group: str, used: NDArray[np.bool_], lasting: Lasting) -> _Normal:
+        """Normal equations of one group.
+
+        A constant error of variance c adds `c 1 1'` to the covariance matrix: its inverse is that
+        of the varying part less a product (Sherman & Morrison 1950).
+        """
+        key = (group, used.tobytes(), lasting.tau, lasting.white, lasting.constant)
+        if key not in self.cache:
+            self.cache[key] = self._unscaled(group, used, lasting)
+        found, square = self.cache[key], lasting.factor**2
+        return _Normal(
+            matrix=found.matrix / square,
+            vector=found.vector / square,
+            square=found.square / square,
+            log_det=found.log_det + found.rows * float(np.log(square)),
+            rows=found.rows,
+        )
+
+    def groups(
+        self, group: str, used: NDArray[np.bool_], choices: Sequence[Lasting]
+    ) -> tuple[Array, Array, Array, Array]:
+        """The same of many choices of one factor: matrices, vectors, squares, log dets."""
+        key = (group, used.tobytes(), len(choices))
+        if key not in self.stacks:
+            parts = [self.group(group, used, replace(c, factor=1.0)) for c in choices]
+            self.stacks[key] = (
+                np.stack([part.matrix for part in parts]),
+                np.stack([part.vector for part in parts]),
+                np.array([part.square for part in parts]),
+                np.array([part.log_det for part in parts]),
+            )
+        matrix, vector, misfit, log_det = self.stacks[key]
+        square = choices[0].factor ** 2
+        rows = int(used[:, _channels(group)].sum())
+        return matrix / square, vector / square, misfit / square, log_det + rows * np.log(square)
+
+    def _unscaled(self, group: str, used: NDArray[np.bool_], lasting: Lasting) -> _Normal:
+        size = len(self.free)
+        total = _Normal(
+            matrix=np.zeros((size, size)), vector=np.zeros(size), square=0.0, log_det=0.0, rows=0
+        )
+        for channel in _channels(group):
+            rows = used[:, channel]
+            if not rows.any():
+                continue
+            product, log_det, count = self._products(channel, rows, lasting)
+            ones = product[-1]
+            kept = product - np.outer(ones, ones) / (1.0 + ones[-1])
+            total = total.plus(
+                _Normal(
+                    matrix=kept[:-2, :-2],
+                    vector=kept[:-2, -2],
+                    square=float(kept[-2, -2]),
+                    log_det=log_det + float(np.log1p(ones[-1])),
+                    rows=count,
+                )
+            )
+        return total
+
+    def _products(
+        self, channel: int, rows: NDArray[np.bool_], lasting: Lasting
+    ) -> tuple[Array, float, int]:
+        """Products of all white columns, the last that of a constant error; log det; readings."""
+        varying, constant = self.shares(channel, rows, lasting)
+        columns = np.column_stack(
+            [self.found.jacobian[:, channel][:, self.free], self.found.misfit[:, channel], constant]
+        )
+        columns = np.where(rows[:, None], columns / varying[:, None], 0.0)
+        sigma = varying * self.found.sigma[:, channel]
+        even, log_det = whiten(self.time, sigma, rows, columns, lasting.tau, lasting.white)
+        return even.T @ even, log_det + 2.0 * float(np.log(varying[rows]).sum()), int(rows.sum())
+
+    def shares(
+        self, channel: int, rows: NDArray[np.bool_], lasting: Lasting
+    ) -> tuple[Array, Array]:
+        """Sigmas of the varying and of the constant part over the stated one, (M,) each.
+
+        The constant part is as large as the least of the stated sigmas allows.
+        """
+        sigma = self.found.sigma[:, channel]
+        constant = np.sqrt(lasting.constant) * sigma[rows].min() / sigma
+        constant = np.minimum(constant, np.sqrt(lasting.constant))
+        return np.sqrt(1.0 - constant**2), constant
+
+    def rest(self, lasting: Mapping[str, Lasting]) -> _Normal:
+        """Normal equations of what is not navigation, and of the turn of navigation's frame."""
+        jacobian, misfit = self.extra.jacobian[:, self.free], self.extra.misfit
+        matrix, vector = jacobian.T @ jacobian, jacobian.T @ misfit
+        if "horizontal" in lasting:
+            how = lasting["horizontal"]
+            share = lasting_share(self.time, how.tau, how.white)
+            share = how.constant + (1.0 - how.constant) * share
+            for parameter, bound in self.frame_bounds.items():
+                at = np.flatnonzero(self.free == parameter)
+                matrix[at, at] += 1.0 / max(bound * how.factor * np.sqrt(share), 1e-9) ** 2
+        return _Normal(
+            matrix=matrix, vector=vector, square=float(misfit @ misfit), log_det=0.0, rows=0
+        )
+
+    def total(self, used: NDArray[np.bool_], lasting: Mapping[str, Lasting]) -> _Normal:
+        """Normal equations of all."""
+        total = self.rest(lasting)
+        for group, how in lasting.items():
+            total = total.plus(self.group(group, used, how))
+        return total
+
+
+def _channels(group: str) -> list[int]:
+    return [k for k, name in enumerate(GROUP_OF) if name == group]
+
+
+def _grid(time: Array) -> list[Lasting]:
+    steps = np.diff(np.unique(time))
+    if not len(steps):
+        return [Lasting(tau=1.0, white=0.1)]
+    taus = np.geomspace(
+        _SHORTEST_STEPS * float(np.median(steps)), _LONGEST_SPANS * float(np.ptp(time)), _TAUS
+    )
+    return [
+        Lasting(tau=float(tau), white=white, constant=constant)
+        for tau in taus
+        for white in _WHITE
+        for constant in _CONSTANT
+    ]
+
+
+def _likeliest(
+    problem: _PlacementProblem, used: NDArray[np.bool_], lasting: Mapping[str, Lasting]
+) -> dict[str, Lasting]:
+    """The likeliest lasting of every group, one after the other, some times around."""
+    now = {group: how for group, how in lasting.items() if used[:, _channels(group)].any()}
+    grid = _grid(problem.time)
+    for _ in range(_SWEEPS):
+        before = dict(now)
+        for group in now:
+            choices = [replace(how, factor=now[group].factor) for how in grid]
+            scores = _scores(problem, used, now, group, choices)
+            now[group] = choices[int(np.argmax(scores))]
+            now[group] = replace(now[group], factor=_factor(problem, used, now, group))
+        if now == before:
+            break
+    return now
+
+
+def _scores(
+    problem: _PlacementProblem,
+    used: NDArray[np.bool_],
+    now: Mapping[str, Lasting],
+    group: str,
+    choices: Sequence[Lasting],
+) -> Array:
+    """Logarithm of the restricted likelihood of each choice for a group, but for a constant."""
+    others = problem.rest(now)
+    for name, how in now.items():
+        if name != group:
+            others = others.plus(problem.group(name, used, how))
+    matrix, vector, square, own = problem.groups(group, used, choices)
+    matrix, vector = others.matrix + matrix, others.vector + vector
+    size = np.sqrt(np.diagonal(matrix[0]))
+    size = np.where(size > 0, size, 1.0)
+    scaled = matrix / np.outer(size, size)
+    sign, log_det = np.linalg.slogdet(scaled)
+    usable = sign > 0
+    scores = np.full(len(choices), -np.inf)
+    change = np.linalg.solve(scaled[usable], (vector[usable] / size)[..., None])[..., 0]
+    gained = np.einsum("ki,ki->k", change, vector[usable] / size)
+    scores[usable] = -0.5 * (own[usable] + log_det[usable] + square[usable] - gained)
+    return scores
+
+
+def _factor(
+    problem: _PlacementProblem, used: NDArray[np.bool_], now: Mapping[str, Lasting], group: str
+) -> float:
+    """By how much a group's misfits are larger than its sigmas allow, 1 or more."""
+    change, covariance = problem.total(used, now).solve()
+    own = problem.group(group, used, now[group])
+    square = own.square + 2.0 * float(own.vector @ change) + float(change @ own.matrix @ change)
+    freedom = own.rows - float(np.trace(covariance @ own.matrix))
+    if freedom < 1.0:
+        return now[group].factor
+    ratio = square / freedom * now[group].factor ** 2
+    return float(np.sqrt(ratio)) if ratio > 1.0 + _CHI_SIGMAS * np.sqrt(2.0 / freedom) else 1.0
+
+
+def _without_surprises(
+    problem: _PlacementProblem, used: NDArray[np.bool_], lasting: Mapping[str, Lasting]
+) -> NDArray[np.bool_]:
+    """Leave out, of each group, readings that all others contradict, the worst of neighbours first.
+
+    An outlier makes its neighbours look wrong too: of two in a row only the worse goes at a time.
+    """
+    change, _ = problem.total(used, lasting).solve()
+    kept = used.copy()
+    for group, how in lasting.items():
+        channels = _channels(group)
+        worst = np.zeros(len(problem.time))
+        for channel in channels:
+            rows = used[:, channel]
+            jacobian = problem.found.jacobian[:, channel][:, problem.free]
+            misfit = problem.found.misfit[:, channel] + jacobian @ change
+            varying, constant = problem.shares(channel, rows, how)
+            sigma = varying * problem.found.sigma[:, channel]
+            both = np.column_stack([misfit / how.factor, constant]) / varying[:, None]
+            both = np.where(rows[:, None], both, 0.0)
+            value, one = whiten(problem.time, sigma, rows, both, how.tau, how.white)[0].T
+            steady = float(one @ value) / (1.0 + float(one @ one))
+            off = both[:, 0] - steady * both[:, 1]
+            off = np.abs(surprise(problem.time, sigma, rows, off, how.tau, how.white))
+            worst = np.maximum(worst, np.where(rows, off, 0.0))
+        if np.count_nonzero(worst) < 3:
+            continue
+        peak = np.ones(len(worst), dtype=bool)
+        peak[1:] &= worst[1:] >= worst[:-1]
+        peak[:-1] &= worst[:-1] > worst[1:]
+        contradicted = np.flatnonzero(peak & (worst > _SURPRISE_SIGMAS))
+        kept[contradicted[:, None], channels] = False
+    return kept
+
+
+def _averaged(
+    problem: _PlacementProblem, used: NDArray[np.bool_], lasting: Mapping[str, Lasting]
+) -> tuple[Array, Array]:
+    """Parameters and covariance over all likely ways in which errors last, (P,) and (P, P).
+
+    The covariance is the mean of those of the single ways and the scatter of their solutions.
+    """
+    rng = np.random.default_rng(0)  # which draws is of no consequence; the same bytes each time
+    grid = _grid(problem.time)
+    draws: dict[str, list[Lasting]] = {}
+    for group, how in lasting.items():
+        choices = [replace(g, factor=how.factor) for g in grid]
+        scores = _scores(problem, used, lasting, group, choices)
+        weights = np.exp(scores - scores.max())
+        picked = rng.choice(len(choices), size=_DRAWS, p=weights / weights.sum())
+        draws[group] = [choices[k] for k in picked]
+    solutions = [
+        problem.total(used, {group: draws[group][k] for group in lasting}).solve()
+        for k in range(_DRAWS if lasting else 1)
+    ]
+    changes = np.stack([change for change, _ in solutions])
+    mean = changes.mean(axis=0)
+    spread = (changes - mean).T @ (changes - mean) / len(changes)
+    covariance = np.mean([c for _, c in solutions], axis=0) + spread
+    return _filled(problem, mean, covariance)
+
+
+def _filled(problem: _PlacementProblem, mean: Array, covariance: Array) -> tuple[Array, Array]:
+    """With zeros for what is held."""
+    full, matrix = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
+    full[problem.free] = mean
+    matrix[np.ix_(problem.free, problem.free)] = covariance
+    return full, matrix

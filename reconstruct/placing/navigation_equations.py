@@ -1,0 +1,232 @@
+"""What navigation says of a model's place, as linear equations in the placement's parameters.
+
+A placement is `ned = scale * rotation * model + translation`. Its parameters here are small changes
+about a present one, in this order: rotation about north, east and down (radians), shift north, east
+and down of the middle of the track (metres), logarithm of the scale, and after these seven the
+nuisances: a turn (radians) and a stretch (relative) of navigation's own frame, and the error of the
+mount (radians about forward, right, down).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.base.frames import Array, Datum, rotation_from_attitude
+from alice_survey.base.manifest import ImageRecord
+from reconstruct.matching.pairs import positions_ned
+from reconstruct.placing.alignment import Similarity
+
+PARAMETERS = 12
+PLACE = 7
+"""The first so many are those of the placement, the rest nuisances."""
+SCALE, TURN, STRETCH, MOUNT = 6, 7, 8, slice(9, 12)
+GROUPS = ("horizontal", "depth", "tilt", "heading")
+GROUP_OF = ("horizontal", "horizontal", "depth", "tilt", "tilt", "heading")
+"""Of the six channels: north, east, depth, roll, pitch, heading."""
+_SIGMA_HORIZONTAL_M = 3.0
+_SIGMA_DEPTH_M = 3.0
+_SIGMA_ATTITUDE_DEG = 2.0
+_SIGMA_HEADING_DEG = 5.0
+"""Used where navigation states no sigma."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Epochs:
+    """Navigation at the stations of a model, by time: N pictures at M moments."""
+
+    time: Array
+    """(M,) seconds, or the station's number where a time is unknown."""
+    timed: bool
+    """Whether `time` is in seconds."""
+    moment: NDArray[np.int64]
+    """(N,) which moment each picture belongs to."""
+    centres: Array
+    """(N, 3) camera centres in the model."""
+    model_from_body: Rotation
+    """(N,) attitudes in the model."""
+    levers: Array
+    """(N, 3) body origin less camera centre, in the body frame, metres."""
+    measured_ned: Array
+    """(N, 3) positions of the body's origin."""
+    ned_from_body: Rotation
+    """(N,) measured; the identity where unknown."""
+    sigma: Array
+    """(M, 6) north, east, depth (m), roll, pitch, heading (rad) as navigation states it."""
+    known: NDArray[np.bool_]
+    """(M, 6)."""
+
+    def positions(self, ned_from_model: Similarity) -> Array:
+        """Body origins in NED, (N, 3)."""
+        arms = (ned_from_model.rotation * self.model_from_body).apply(self.levers)
+        moved: Array = ned_from_model.apply(self.centres) + arms
+        return moved
+
+    @property
+    def has_attitude(self) -> bool:
+        """Whether any attitude is known."""
+        return bool(self.known[:, 3:].any())
+
+
+def read_epochs(
+    records: Sequence[ImageRecord],
+    model_from_cam: Sequence[RigidTransform],
+    body_from_cam: Mapping[str, RigidTransform],
+    datum: Datum,
+) -> Epochs | None:
+    """Collect what navigation says; None where it says no position.
+
+    Pictures of one station share one reading of navigation, which must not count twice.
+    """
+    chosen = [i for i, r in enumerate(records) if r.has_position]
+    if not chosen:
+        return None
+    timed = all(np.isfinite(records[i].time_s) for i in chosen)
+    chosen.sort(
+        key=lambda i: (records[i].time_s if timed else 0.0, records[i].station, records[i].image)
+    )
+    rows = [records[i] for i in chosen]
+    stations = list(dict.fromkeys(r.station for r in rows))
+    number = {station: k for k, station in enumerate(stations)}
+    first = [next(r for r in rows if r.station == station) for station in stations]
+    attitudes = np.array([[r.roll_deg, r.pitch_deg, r.heading_deg] for r in rows])
+    has = np.isfinite(attitudes).all(axis=1)
+    moment = np.array([number[r.station] for r in rows])
+    known = np.ones((len(stations), 6), dtype=bool)
+    known[:, 3:] = False
+    known[moment[has], 3:] = True
+    levers = [body_from_cam[r.camera] for r in rows]
+    time = [r.time_s for r in first] if timed else [float(s) for s in stations]
+    return Epochs(
+        time=np.array(time),
+        timed=timed,
+        moment=moment,
+        centres=np.stack([model_from_cam[i].translation for i in chosen]),
+        model_from_body=Rotation.concatenate(
+            [
+                model_from_cam[i].rotation * lever.rotation.inv()
+                for i, lever in zip(chosen, levers, strict=True)
+            ]
+        ),
+        levers=np.stack([-lever.translation for lever in levers]),
+        measured_ned=positions_ned(rows, datum),
+        ned_from_body=rotation_from_attitude(*np.deg2rad(np.where(has[:, None], attitudes, 0)).T),
+        sigma=_sigmas(first),
+        known=known,
+    )
+
+
+def without_navigation(
+    records: Sequence[ImageRecord], model_from_cam: Sequence[RigidTransform]
+) -> Epochs:
+    """Epochs of a model of which navigation says nothing."""
+    stations = sorted({r.station for r in records})
+    number = {station: k for k, station in enumerate(stations)}
+    count, identity = len(records), Rotation.identity(len(records))
+    return Epochs(
+        time=np.arange(float(len(stations))),
+        timed=False,
+        moment=np.array([number[r.station] for r in records]),
+        centres=np.stack([pose.translation for pose in model_from_cam]),
+        model_from_body=identity,
+        levers=np.zeros((count, 3)),
+        measured_ned=np.zeros((count, 3)),
+        ned_from_body=identity,
+        sigma=np.ones((len(stations), 6)),
+        known=np.zeros((len(stations), 6), dtype=bool),
+    )
+
+
+def _sigmas(rows: Sequence[ImageRecord]) -> Array:
+    def stated(values: Sequence[float], default: float) -> Array:
+        array = np.array(values)
+        return np.where(array > 0, array, default)
+
+    level = stated([r.sigma_horizontal_m for r in rows], _SIGMA_HORIZONTAL_M)
+    depth = stated([r.sigma_depth_m for r in rows], _SIGMA_DEPTH_M)
+    tilt = np.deg2rad(stated([r.sigma_attitude_deg for r in rows], _SIGMA_ATTITUDE_DEG))
+    heading = np.deg2rad(stated([r.sigma_heading_deg for r in rows], _SIGMA_HEADING_DEG))
+    return np.stack([level, level, depth, tilt, tilt, heading], axis=1)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NavigationEquations:
+    """Six channels at M moments, linear about a placement: misfit + jacobian x change = error."""
+
+    misfit: Array
+    """(M, 6) model less navigation, over the stated sigma; NaN where nothing is known."""
+    jacobian: Array
+    """(M, 6, PARAMETERS) its slopes."""
+    sigma: Array
+    """(M, 6) as stated."""
+
+
+def equations(epochs: Epochs, place: Similarity, middle_ned: Array) -> NavigationEquations:
+    """Misfits of navigation at a placement, and their derivatives.
+
+    Args:
+        epochs: navigation and model.
+        place: present `ned_from_model`.
+        middle_ned: (3,) about which the placement's rotation and scale change.
+    """
+    count = len(epochs.centres)
+    positions = epochs.positions(place)
+    attitudes = place.rotation * epochs.model_from_body
+    misfit, jacobian = np.empty((count, 6)), np.zeros((count, 6, PARAMETERS))
+    misfit[:, :3] = positions - epochs.measured_ned
+    jacobian[:, :3, :3] = -cross_matrices(positions - middle_ned)
+    jacobian[:, :3, 3:6] = np.eye(3)
+    jacobian[:, :3, SCALE] = place.apply(epochs.centres) - middle_ned
+    # A turn and a stretch of navigation's own frame move what it measures: the misfit loses them.
+    away = positions - positions.mean(axis=0)
+    jacobian[:, :2, STRETCH] = -away[:, :2]
+    jacobian[:, 0, TURN], jacobian[:, 1, TURN] = away[:, 1], -away[:, 0]
+    # Angle by angle: an error of heading must not pass for one of roll where the vehicle leans, nor
+    # a wrong heading spoil the tilt that was read with it.
+    stated, found = (r.as_euler("ZYX")[:, ::-1] for r in (epochs.ned_from_body, attitudes))
+    misfit[:, 3:] = (found - stated + np.pi) % (2.0 * np.pi) - np.pi
+    angles_from_ned = np.linalg.pinv(attitude_axes(attitudes))
+    jacobian[:, 3:, :3] = angles_from_ned
+    jacobian[:, 3:, MOUNT] = angles_from_ned @ attitudes.as_matrix()
+    moments = len(epochs.time)
+    shared = np.bincount(epochs.moment, minlength=moments).astype(np.float64)
+    mean_misfit, mean_jacobian = np.zeros((moments, 6)), np.zeros((moments, 6, PARAMETERS))
+    np.add.at(mean_misfit, epochs.moment, misfit)
+    np.add.at(mean_jacobian, epochs.moment, jacobian)
+    scale = epochs.sigma * shared[:, None]
+    return NavigationEquations(
+        misfit=np.where(epochs.known, mean_misfit / scale, np.nan),
+        jacobian=np.where(epochs.known[..., None], mean_jacobian / scale[..., None], np.nan),
+        sigma=epochs.sigma,
+    )
+
+
+def cross_matrices(vectors: Array) -> Array:
+    """(N, 3, 3) matrices M with `M b = a x b` for rows a."""
+    zero = np.zeros(len(vectors))
+    x, y, z = vectors.T
+    return np.stack(
+        [
+            np.stack([zero, -z, y], axis=1),
+            np.stack([z, zero, -x], axis=1),
+            np.stack([-y, x, zero], axis=1),
+        ],
+        axis=1,
+    )
+
+
+def attitude_axes(ned_from_body: Rotation) -> Array:
+    """(N, 3, 3) matrices whose columns are the axes, in NED, of roll, pitch and heading.
+
+    A small change of the angles (z-y-x) turns the body by the rotation vector `axes @ change`.
+    """
+    heading, pitch = ned_from_body.as_euler("ZYX")[:, :2].T
+    zero, one = np.zeros(len(heading)), np.ones(len(heading))
+    forward = np.stack(
+        [np.cos(heading) * np.cos(pitch), np.sin(heading) * np.cos(pitch), -np.sin(pitch)], axis=1
+    )
+    starboard = np.stack([-np.sin(heading), np.cos(heading), zero], axis=1)
+    down = np.stack([zero, zero, one], axis=1)
+    return np.stack([forward, starboard, down], axis=2)

@@ -1,0 +1,196 @@
+"""Points picked in pictures, found in space through the exact lenses of their cameras."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.base.frames import Array
+from reconstruct.placing.control_file import Pick
+from reconstruct.views.lens import FlatPortLens, Lens
+
+_ROBUST_PX = 1.0
+_WRONG_SIGMAS = 5.0
+_WRONG_PX = 2.0
+"""A pick further off than both is left out where three or more remain."""
+_TRIED = 6
+_LARGEST_CONDITION = 1e8
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Camera:
+    """A registered picture: its lens, and where its pinhole stands in the model."""
+
+    lens: Lens
+    model_from_pinhole: RigidTransform
+
+    def project(self, point: Array) -> Array:
+        """(2,) pixel of the picture as taken at which a point (3,) of the model is seen."""
+        there = self.model_from_pinhole.inv().apply(point[None])
+        if isinstance(self.lens, FlatPortLens):
+            cam = self.lens.pinhole_from_cam.inv().apply(there)
+            return np.asarray(self.lens.camera.project(cam)[0])
+        if not there[0, 2] > 0:
+            return np.full(2, np.nan)
+        pinhole = self.lens.pinhole
+        ideal = pinhole.focal_px * there[:, :2] / there[:, 2:] + [pinhole.cx_px, pinhole.cy_px]
+        return np.asarray(self.lens.from_pinhole(ideal)[0])
+
+    def ray(self, pixel: Array) -> tuple[Array, Array]:
+        """Start and unit direction, (3,) each, in the model, of a pixel of the picture as taken."""
+        if isinstance(self.lens, FlatPortLens):
+            start, way = self.lens.camera.unproject(pixel[None])
+            start = self.lens.pinhole_from_cam.apply(start)
+            way = self.lens.pinhole_from_cam.rotation.apply(way)
+        else:
+            pinhole, ideal = self.lens.pinhole, self.lens.to_pinhole(pixel[None])
+            slope = (ideal - [pinhole.cx_px, pinhole.cy_px]) / pinhole.focal_px
+            start, way = np.zeros((1, 3)), np.column_stack([slope, np.ones(1)])
+        way = self.model_from_pinhole.rotation.apply(way[0])
+        return self.model_from_pinhole.apply(start[0]), way / np.linalg.norm(way)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Spot:
+    """A point found from picks."""
+
+    name: str
+    model: Array
+    """(3,) in the model."""
+    covariance: Array
+    """(3, 3) by the picks; larger where they disagree."""
+    views: int
+    left_out: tuple[str, ...]
+    """Pictures whose picks are off the common point."""
+    rms_px: float
+
+
+def find_spots(
+    picks: Sequence[Pick], cameras: Mapping[str, Camera]
+) -> tuple[dict[str, Spot], dict[str, str]]:
+    """Find every picked point that two or more registered pictures show.
+
+    Returns:
+        Spots by name, with the middles of markers whose four corners were found; and why other
+        points were not found, by name.
+    """
+    by_name: dict[str, list[Pick]] = {}
+    for pick in picks:
+        by_name.setdefault(pick.point, []).append(pick)
+    found, lost = {}, {}
+    for name, some in sorted(by_name.items()):
+        seen = [p for p in some if p.image in cameras]
+        if len({p.image for p in seen}) < 2:
+            lost[name] = f"picked in {len(seen)} pictures of the model; two or more are needed"
+            continue
+        spot = _triangulate(name, seen, cameras)
+        if isinstance(spot, str):
+            lost[name] = spot
+        else:
+            found[name] = spot
+    for name in sorted({n.rsplit(".", 1)[0] for n in found if "." in n} - set(found)):
+        corners = [found.get(f"{name}.{k}") for k in range(4)]
+        whole = [c for c in corners if c is not None]
+        if len(whole) == 4:
+            found[name] = Spot(
+                name=name,
+                model=np.mean([c.model for c in whole], axis=0),
+                covariance=np.sum([c.covariance for c in whole], axis=0) / 16.0,
+                views=min(c.views for c in whole),
+                left_out=(),
+                rms_px=float(np.sqrt(np.mean([c.rms_px**2 for c in whole]))),
+            )
+    return found, lost
+
+
+def _triangulate(name: str, picks: list[Pick], cameras: Mapping[str, Camera]) -> Spot | str:
+    """The point that fits the picks best, or why there is none."""
+    start = _nearest(picks, cameras)
+    if isinstance(start, str):
+        return start
+    kept = list(picks)
+    while True:
+        off, point, jacobian = _fit(start, kept, cameras)
+        if not np.isfinite(off).all():
+            return "a picture that it was picked in cannot see it"
+        worst = _worst(off, kept)
+        if worst <= 1.0:
+            break
+        if len(kept) < 4:
+            miss_px = float(np.linalg.norm(off, axis=1).max())
+            return f"its picks are {miss_px:.1f} px off one common point"
+        kept = _without_one(point, kept, off, cameras)
+    miss_px = np.linalg.norm(off, axis=1)
+    sigma = np.repeat([p.sigma_px for p in kept], 2)
+    weighted = jacobian / sigma[:, None]
+    chi = float(((off.ravel() / sigma) ** 2).sum()) / (2 * len(kept) - 3)
+    covariance = np.linalg.inv(weighted.T @ weighted) * max(1.0, chi)
+    names = {p.image for p in kept}
+    return Spot(
+        name=name,
+        model=point,
+        covariance=covariance,
+        views=len(kept),
+        left_out=tuple(p.image for p in picks if p.image not in names),
+        rms_px=float(np.sqrt((miss_px**2).mean())),
+    )
+
+
+def _worst(off: Array, picks: Sequence[Pick]) -> float:
+    """The largest miss, over what a right pick may miss by."""
+    limit = np.array([max(_WRONG_PX, _WRONG_SIGMAS * p.sigma_px) for p in picks])
+    return float((np.linalg.norm(off, axis=1) / limit).max())
+
+
+def _without_one(
+    point: Array, picks: list[Pick], off: Array, cameras: Mapping[str, Camera]
+) -> list[Pick]:
+    """Leave out the pick without which the others agree best; among many, the worst.
+
+    Among few, a wrong pick draws the point to itself and lets a right one look worse.
+    """
+    order = np.argsort(-np.linalg.norm(off, axis=1), kind="stable")[:_TRIED]
+    choices = [[p for k, p in enumerate(picks) if k != out] for out in order]
+    misses = [_worst(_fit(point, choice, cameras)[0], choice) for choice in choices]
+    return choices[int(np.argmin(misses))]
+
+
+def _nearest(picks: Sequence[Pick], cameras: Mapping[str, Camera]) -> Array | str:
+    """The point nearest to all rays, (3,)."""
+    rays = [cameras[p.image].ray(np.array([p.x_px, p.y_px])) for p in picks]
+    starts, ways = np.stack([r[0] for r in rays]), np.stack([r[1] for r in rays])
+    if not np.isfinite(starts + ways).all():
+        return "a pick is beyond the reach of its lens"
+    across = np.eye(3) - ways[:, :, None] * ways[:, None, :]
+    system = across.sum(axis=0)
+    if np.linalg.cond(system) > _LARGEST_CONDITION:
+        return "the pictures see it from one direction only"
+    found: Array = np.linalg.solve(system, np.einsum("nij,nj->i", across, starts))
+    return found
+
+
+def _fit(
+    start: Array, picks: Sequence[Pick], cameras: Mapping[str, Camera]
+) -> tuple[Array, Array, Array]:
+    """Misses (N, 2) px of the best point, the point (3,), and their derivatives (2 N, 3)."""
+    picked = np.array([[p.x_px, p.y_px] for p in picks])
+    unit = float(np.linalg.norm(start - cameras[picks[0].image].model_from_pinhole.translation))
+
+    def misses(x: Array) -> Array:
+        point = start + unit * x
+        seen = np.stack([cameras[p.image].project(point) for p in picks])
+        return np.asarray(np.nan_to_num((seen - picked).ravel(), nan=1e6))
+
+    found = least_squares(
+        misses, np.zeros(3), loss="soft_l1", f_scale=_ROBUST_PX, xtol=1e-12, ftol=1e-12, gtol=1e-12,
+        jac="3-point",
+    )  # fmt: skip
+    jacobian = np.empty((2 * len(picks), 3))
+    for axis in range(3):
+        step = np.zeros(3)
+        step[axis] = 1e-6
+        jacobian[:, axis] = (misses(found.x + step) - misses(found.x - step)) / (2e-6 * unit)
+    off = misses(found.x).reshape(-1, 2)
+    return np.where(np.abs(off) >= 1e6, np.nan, off), start + unit * found.x, jacobian

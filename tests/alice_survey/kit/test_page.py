@@ -1,0 +1,218 @@
+"""The report's page as text: strict, whole, and the same for the same report."""
+
+import base64
+import hashlib
+import json
+import re
+import tomllib
+from dataclasses import replace
+from fnmatch import fnmatch
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from alice_survey.kit import map as kit_map
+from alice_survey.kit import page
+from alice_survey.kit.document import Report, Section, Table
+from alice_survey.kit.map import map_extent, round_length
+from alice_survey.kit.page import render_html
+from tests.alice_survey.kit.sketch import RUDE, encoded, picture_layer, seafloor, sketch_report
+
+ROOT = Path(__file__).parents[3]
+ROOM = ROOT / "alice_survey" / "kit"
+
+
+class Elements(HTMLParser):
+    """Tags with their attributes, and the text within scripts and styles."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+        self.inline: list[tuple[str, dict[str, str | None], str]] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+        if tag in ("script", "style"):
+            self.inline.append((tag, dict(attrs), ""))
+
+    def handle_data(self, data: str) -> None:
+        if self.found and self.found[-1][0] in ("script", "style") and self.cdata_elem:
+            tag, attributes, text = self.inline[-1]
+            self.inline[-1] = (tag, attributes, text + data)
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> Report:
+    return sketch_report(tmp_path_factory.mktemp("sketch"), side=600)
+
+
+@pytest.fixture(scope="module")
+def text(report: Report) -> str:
+    return render_html(report)
+
+
+def test_same_report_same_page(report: Report, text: str) -> None:
+    assert render_html(report) == text
+
+
+def test_texts_are_escaped(text: str) -> None:
+    elements = Elements(text)
+    assert RUDE not in text
+    assert "&lt;img src=x onerror=" in text
+    assert not [tag for tag, attributes in elements.found if attributes.get("src") == "x"]
+    held = next(t for _, a, t in elements.inline if a.get("id") == "map-data")
+    assert "<" not in held
+    points = next(a for a in json.loads(held)["layers"] if a["name"] == "points")
+    assert points["texts"][1] == f"Point B {RUDE}"
+
+
+def test_nothing_is_loaded_from_elsewhere(text: str) -> None:
+    for tag, attributes in Elements(text).found:
+        assert "style" not in attributes, tag
+        assert not [name for name in attributes if name.startswith("on")], tag
+        for name in ("src", "href"):
+            value = attributes.get(name)
+            assert value is None or value.startswith(("data:image/", "data:,", "#")), (tag, value)
+
+
+def test_policy_names_each_script_and_style(text: str) -> None:
+    elements = Elements(text)
+    policy = next(
+        str(attributes["content"])
+        for tag, attributes in elements.found
+        if attributes.get("http-equiv") == "Content-Security-Policy"
+    )
+    assert "default-src 'none'" in policy
+    assert "unsafe" not in policy
+    assert "http:" not in policy and "https:" not in policy
+    runs = [t for tag, a, t in elements.inline if tag == "style" or "type" not in a]
+    assert len(runs) == 2 + 5
+    for held in runs:
+        digest = base64.b64encode(hashlib.sha256(held.encode()).digest()).decode()
+        assert f"'sha256-{digest}'" in policy
+
+
+def test_order_of_the_page(report: Report, text: str) -> None:
+    marks = [
+        "<h1>", *report.summary.values(), report.verdicts[0].text, "pictures placed",
+        "<h2>Contents",
+        *(f">{section.title}</h2>" for section in report.sections),
+    ]  # fmt: skip
+    at = [text.index(mark) for mark in marks]
+    assert at == sorted(at)
+    for _, word in (("bad", "Bad"), ("look", "Look"), ("good", "Good")):
+        assert f"{word}</b><span>" in text
+
+
+def test_a_report_without_scenes_runs_nothing(report: Report) -> None:
+    plain = replace(
+        report, map=None, mesh=None, sections=[s for s in report.sections if s.scene is None]
+    )
+    text = render_html(plain)
+    assert "script-src 'none'" in text
+    assert "<script" not in text
+    assert len(text) < 200_000
+
+
+def test_contradictions_are_refused(report: Report) -> None:
+    with pytest.raises(ValueError, match="sections share a name"):
+        render_html(replace(report, sections=[*report.sections, report.sections[-1]]))
+    with pytest.raises(ValueError, match="show the map"):
+        render_html(replace(report, map=None))
+    with pytest.raises(ValueError, match="show the mesh"):
+        render_html(replace(report, sections=report.sections[:1]))
+    assert report.map is not None
+    again = replace(report.map, layers=[*report.map.layers, report.map.layers[0]])
+    with pytest.raises(ValueError, match="layers share a name"):
+        render_html(replace(report, map=again))
+    twice = [picture_layer(name, name, seafloor(20, 20), shown=True) for name in "ab"]
+    other = replace(report.map, layers=twice)
+    with pytest.raises(ValueError, match="more than one base layer"):
+        render_html(replace(report, map=other))
+
+
+def test_kinds_of_tiles() -> None:
+    picture = seafloor(8, 8)
+    for kind in ("JPEG", "PNG", "WEBP"):
+        assert kit_map.picture_kind(encoded(picture, kind)) == kind.lower()
+    with pytest.raises(ValueError, match="not a JPEG, PNG or WebP"):
+        kit_map.picture_kind(encoded(picture, "GIF"))
+
+
+def test_every_tile_lies_in_its_text(report: Report, text: str) -> None:
+    assert report.map is not None
+    mosaic = report.map.layers[0]
+    held = {a.get("id"): t for _, a, t in Elements(text).inline}
+    about = json.loads(held["map-data"])["layers"][0]
+    assert about["tiles"].keys() == mosaic.tiles.keys()  # type: ignore[union-attr]
+    for name, (at, length, kind) in about["tiles"].items():
+        packed = base64.b64decode(held[about["block"]][at : at + length], validate=True)
+        assert packed == mosaic.tiles[name]  # type: ignore[union-attr]
+        assert kind == "jpeg"
+
+
+def test_extent_of_the_map(report: Report) -> None:
+    assert report.map is not None
+    # The mosaic goes from -2.2 m to 0.2 m east; the footprints reach farther east and south.
+    assert map_extent(report.map) == pytest.approx((-2.2, -1.6 - 0.34, 1.7 + 0.42, 2.1))
+
+
+@pytest.mark.parametrize(
+    ("length", "expected"), [(1.0, 1.0), (0.99, 0.5), (4.9, 2.0), (0.0503, 0.05), (730.0, 500.0)]
+)
+def test_round_length(length: float, expected: float) -> None:
+    assert round_length(length) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("cell", "number"),
+    [
+        ("12", True), ("-0.3 mm", True), ("−0.3 mm", True), ("1.2e-05", True), ("99.4 %", True),
+        ("0.4 ± 0.1 mm", True), ("3 of 58", True), ("1 234.5", True), ("4.10.0", True),
+        ("640 x 480", True), ("< 0.01", True), ("12.3 m²", True),
+        ("left/000001.png", False), ("good", False), ("2 lines are too far apart", False),
+        ("2026-05-04T10:00:00Z", False),
+    ],
+)  # fmt: skip
+def test_numbers_stand_to_the_right(report: Report, cell: str, number: bool) -> None:
+    table = Table(title="T", header=["what", "value"], rows=[["a", cell], ["b", "–"], ["c", ""]])
+    plain = replace(
+        report, map=None, mesh=None, sections=[Section(name="t", title="T", tables=[table])]
+    )
+    assert ('<td class="num">' in render_html(plain)) == number
+
+
+def test_a_word_among_numbers_stands_with_them(report: Report) -> None:
+    rows = [["a", "0.12"], ["b", "0.3"], ["c", "held"]]
+    table = Table(title="T", header=["what", "sigma"], rows=rows)
+    plain = replace(
+        report, map=None, mesh=None, sections=[Section(name="t", title="T", tables=[table])]
+    )
+    assert '<td class="num">held</td>' in render_html(plain)
+
+
+def test_committed_libraries_are_those_of_the_lock() -> None:
+    lock = json.loads((ROOM / "web" / "package-lock.json").read_text())["packages"]
+    wanted = json.loads((ROOM / "web" / "package.json").read_text())["dependencies"]
+    licences = (ROOM / "web" / "LICENCES").read_text()
+    for file, name in (
+        ("vendor_map.js", "leaflet"),
+        ("vendor_map.css", "leaflet"),
+        ("vendor_mesh.js", "three"),
+    ):
+        version = lock[f"node_modules/{name}"]["version"]
+        assert wanted[name] == version
+        assert (ROOM / "web" / file).read_text().startswith(f"/*! {name} {version} (")
+        assert f"{name} {version}\n" in licences
+        assert re.search(r"Copyright", (ROOM / "web" / file).read_text()[:400])
+
+
+def test_package_carries_what_the_page_reads() -> None:
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    globs = settings["package-data"]["alice_survey"]
+    files = ("page.css", "web/vendor_map.css", "web/LICENCES", *page._MAP_SCRIPTS)
+    for file in (*files, *page._MESH_SCRIPTS):
+        assert (ROOM / file).is_file()
+        assert any(fnmatch(f"kit/{file}", glob) for glob in globs), file

@@ -1,0 +1,115 @@
+import cv2
+import numpy as np
+from scipy import ndimage
+
+from reconstruct.dense.refine_depth import ComparedView, compare, prepared, refine, sights
+from reconstruct.views.sight import lens_of
+from tests.oracles_dense import Scene, hits, render, speckle, stereo_views
+
+SCENE = Scene(
+    depth_of=lambda n, e: 12.0 + 0.06 * np.sin(6 * n) * np.cos(5 * e) + 0.1 * n,
+    paint=speckle(),
+)
+VIEWS = stereo_views(np.array([0.1, 0.45]), np.array([0.3, 0.4]))
+
+
+def looks() -> list[ComparedView]:
+    found = []
+    for view in VIEWS:
+        grey = cv2.cvtColor(render(view, SCENE), cv2.COLOR_BGR2GRAY)
+        contrast, spline, valid = prepared(grey, np.ones(grey.shape, bool))
+        found.append(ComparedView(view=view, contrast=contrast, spline=spline, valid=valid))
+    return found
+
+
+LOOKS = looks()
+
+
+def true_depth() -> np.ndarray:
+    one = VIEWS[0]
+    points = one.world_from_cam.inv().apply(hits(one, SCENE).reshape(-1, 3))
+    return points[:, 2].reshape(one.height_px, one.width_px)
+
+
+def test_compare_equals_its_slow_twin():
+    one, other = LOOKS[0], LOOKS[1]
+    depth = true_depth()
+    move = other.view.world_from_cam.inv() * one.view.world_from_cam
+    rest, slope, speed = compare(
+        (1 / depth).astype(np.float32),
+        one.contrast,
+        sights(lens_of(one.view), *depth.shape),
+        other.spline,
+        other.valid,
+        lens_of(other.view),
+        np.ascontiguousarray(move.as_matrix()[:3]),
+    )
+    rows, columns = np.nonzero(np.isfinite(rest))
+    assert len(rows) > 0.5 * rest.size
+    chosen = slice(None, None, 997)
+    rows, columns = rows[chosen], columns[chosen]
+    pixels = np.column_stack([columns, rows]) + 0.5
+
+    def warped(inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        at = other.view.project(one.view.at_depth(pixels, 1 / inverse)) - 0.5
+        value = ndimage.map_coordinates(
+            other.spline.astype(np.float64), at.T[::-1], order=3, prefilter=False
+        )
+        return value, at
+
+    inverse = 1 / depth[rows, columns]
+    value, at = warped(inverse)
+    after, moved = warped(inverse + 1e-6)
+    expected = one.contrast[rows, columns] - value
+    np.testing.assert_allclose(rest[rows, columns], expected, atol=2e-4)
+    np.testing.assert_allclose(slope[rows, columns], (after - value) / 1e-6, rtol=0.02, atol=0.3)
+    fast = np.linalg.norm(moved - at, axis=1) / 1e-6
+    np.testing.assert_allclose(speed[rows, columns], fast, rtol=1e-3)
+
+
+def test_refinement_finds_the_surface_from_a_blurred_start_and_says_how_well():
+    true = true_depth()
+    rng = np.random.default_rng(0)
+    wrong = 0.006 * ndimage.gaussian_filter(rng.normal(size=true.shape), 4) * 12
+    start = (true + wrong).astype(np.float32)
+    found = refine(LOOKS[0], start, np.full_like(start, 0.004), LOOKS[1:])
+    known = np.isfinite(found.depth)
+    assert known.mean() > 0.85
+    error = (found.depth - true)[known]
+    before = np.sqrt(np.mean(wrong**2))
+    after = np.sqrt(np.mean(error**2))
+    assert before > 0.004
+    assert 1e-4 < after < 0.4 * before  # 1.5 mm, rims that one neighbour sees included
+    assert 0.3 < 1.4826 * np.median(np.abs(error / found.sigma[known])) < 3.0
+    assert np.median(found.likeness[known]) > 0.9
+
+
+def test_windows_across_a_step_keep_what_they_had():
+    true = true_depth().astype(np.float32)
+    start, sigma = true.copy(), np.full_like(true, 0.004)
+    start[100:120, 100:120] -= np.float32(0.3)  # 36 px of disparity at a baseline of 0.36 m
+    found = refine(LOOKS[0], start, sigma, LOOKS[1:])
+    rim = np.zeros(true.shape, bool)
+    rim[98:122, 98:122] = True
+    rim[102:118, 102:118] = False
+    kept = rim & np.isfinite(found.depth)
+    # but for some that only the near partner sees, along whose line the step is small
+    assert (found.depth[kept] == start[kept]).mean() > 0.98
+    assert (found.sigma[kept] == sigma[kept]).mean() > 0.98
+    far = ndimage.binary_dilation(rim, iterations=8) | ndimage.binary_fill_holes(rim)
+    assert (found.depth != start)[~far & np.isfinite(found.depth)].mean() > 0.99
+
+
+def test_unknown_depth_stays_unknown():
+    start = true_depth().astype(np.float32)
+    start[100:108, 100:108] = np.nan
+    found = refine(LOOKS[0], start, np.full_like(start, 0.004), LOOKS[1:])
+    assert np.isnan(found.depth[100:108, 100:108]).all()
+    assert np.isfinite(found.depth[110:, 110:300]).mean() > 0.85
+
+
+def test_a_view_without_neighbours_keeps_no_depth():
+    depth = true_depth().astype(np.float32)
+    found = refine(LOOKS[0], depth, np.full_like(depth, 0.004), [])
+    assert not np.isfinite(found.depth).any()
+    assert (found.seen == 0).all()

@@ -1,0 +1,109 @@
+"""Look-ups in pictures as taken against the exact camera behind its port."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.base.frames import BODY_FROM_NADIR_CAM
+from camera_calib.approximation.dispersion import channel_cameras
+from camera_calib.flat_port import FlatPortCamera
+from reconstruct.mosaic.ortho import lanczos_weights, sample_lanczos
+from reconstruct.mosaic.visibility import Ground, Water, camera_optics, channel_optics, see
+from reconstruct.raster import DemGrid
+from reconstruct.views.lens import FlatPortLens, flat_port_lens
+from reconstruct.views.model import View
+from reconstruct.views.range_shift import range_shift
+from tests.oracles_mosaic import lanczos_at
+
+TILT = np.deg2rad(2.0)
+CAMERA = FlatPortCamera(
+    width_px=846, height_px=676, fx_px=848.0, fy_px=848.5, cx_px=424.0, cy_px=340.0,
+    k1=-0.045, k2=0.02, p1=2e-4, p2=-1e-4, port_distance_m=0.1, glass_thickness_m=0.02,
+    normal=(np.sin(TILT), 0.0, np.cos(TILT)),
+)  # fmt: skip
+LENS = flat_port_lens(CAMERA, 1.6, 2.5)
+SEA = Water(temperature_c=24.0, salinity_psu=39.0, depth_m=10.0)
+
+
+def view_of(lens: FlatPortLens) -> View:
+    pinhole = lens.pinhole
+    turned = Rotation.from_euler("ZYX", [20.0, 4.0, -6.0], degrees=True) * BODY_FROM_NADIR_CAM
+    return View(
+        image="left/0.png", camera="left", station=0,
+        width_px=pinhole.width_px, height_px=pinhole.height_px,
+        fx_px=pinhole.focal_px, fy_px=pinhole.focal_px, cx_px=pinhole.cx_px, cy_px=pinhole.cy_px,
+        world_from_cam=RigidTransform.from_components([0.0, 0.0, 8.0], turned),
+        shift=range_shift(lens),
+    )  # fmt: skip
+
+
+def relief() -> tuple[DemGrid, np.ndarray]:
+    """A surface whose height spans a metre."""
+    grid = DemGrid(west=-0.9, north=0.9, cell=0.012, rows=150, columns=150)
+    columns, rows = np.meshgrid(np.arange(150) + 0.5, np.arange(150) + 0.5)
+    height = -10.0 + 0.3 * grid.north_of(rows) - 0.25 * grid.east_of(columns)
+    return grid, height.astype(np.float32)
+
+
+def exact(camera: FlatPortCamera, view: View, grid: DemGrid, height: np.ndarray) -> np.ndarray:
+    columns, rows = np.meshgrid(np.arange(150) + 0.5, np.arange(150) + 0.5)
+    world = np.stack([grid.north_of(rows), grid.east_of(columns), -height.astype(float)], axis=-1)
+    points = view.world_from_cam.inv().apply(world.reshape(-1, 3))
+    taken = camera.project(LENS.pinhole_from_cam.inv().apply(points))
+    return taken.reshape(150, 150, 2) - 0.5
+
+
+def test_points_are_looked_up_where_the_camera_behind_a_tilted_port_shows_them() -> None:
+    view, (grid, height) = view_of(LENS), relief()
+    sight = see(view, camera_optics(LENS, True), Ground(height, grid).surface(grid))
+    inside = sight.quality > 0
+    assert inside.mean() > 0.3
+    error = np.hypot(*(np.stack([sight.x, sight.y], -1) - exact(CAMERA, view, grid, height)).T).T
+    assert 1e-5 < error[inside].max() < 0.02
+    assert np.sqrt((error[inside] ** 2).mean()) < 0.008
+    forgetful = see(view, camera_optics(LENS, False), Ground(height, grid).surface(grid))
+    assert forgetful.quality.any()  # the view's own shift counts still
+    np.testing.assert_allclose(forgetful.x[inside], sight.x[inside], atol=1e-6)
+
+
+def test_forgetting_the_range_would_show() -> None:
+    from dataclasses import replace
+
+    view, (grid, height) = replace(view_of(LENS), shift=None), relief()
+    sight = see(view, camera_optics(LENS, False), Ground(height, grid).surface(grid))
+    inside = sight.quality > 0
+    error = np.hypot(*(np.stack([sight.x, sight.y], -1) - exact(CAMERA, view, grid, height)).T).T
+    assert error[inside].max() > 0.1
+
+
+def test_each_channel_is_looked_up_where_its_own_light_falls() -> None:
+    view, (grid, height) = view_of(LENS), relief()
+    surface = Ground(height, grid).surface(grid)
+    cameras = channel_cameras(CAMERA, temperature_c=24.0, salinity_psu=39.0, depth_m=10.0)
+    green = see(view, camera_optics(LENS, True), surface)
+    moved = []
+    for name, optics in zip(("blue", "green", "red"), channel_optics(LENS, SEA, True), strict=True):
+        sight = see(view, optics, surface)
+        inside = (sight.quality > 0) & (green.quality > 0)
+        error = np.stack([sight.x, sight.y], -1) - exact(cameras[name], view, grid, height)
+        assert np.hypot(*error[inside].T).max() < 0.05
+        moved.append(np.hypot(sight.x - green.x, sight.y - green.y)[inside].max())
+    assert moved[0] > 0.5
+    assert moved[1] == 0
+    assert moved[2] > 0.5
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_lanczos_equals_its_definition_inside_and_at_edges(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    picture = rng.integers(0, 256, (20, 24, 3)).astype(np.uint8)
+    table = (np.arange(256) / 255.0).astype(np.float32) ** 2
+    x = rng.uniform(0, 23, (1, 40)).astype(np.float32)
+    y = rng.uniform(0, 19, (1, 40)).astype(np.float32)
+    x[0, 0] = -1
+    found = np.full((1, 40, 3), -7, np.float32)
+    sample_lanczos(picture, table, lanczos_weights(), x, y, 0, 3, found)
+    assert (found[0, 0] == -7).all()
+    light = table[picture].astype(float)
+    expected = np.stack([lanczos_at(light, a, b) for a, b in zip(x[0], y[0], strict=True)])
+    np.testing.assert_allclose(found[0, 1:], expected[1:], atol=4e-3)

@@ -1,0 +1,41 @@
+"""The smallest survey that goes through the whole loop, made once for all tests that look at it."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+SMALL = """
+seed = 3
+[area]
+length_m = 1.3
+width_m = 1.5
+seafloor_depth_m = 12.0
+[plan]
+side_overlap = 0.35
+[seafloor]
+relief_m = 0.2
+grid_m = 0.02
+[imaging]
+scale = 6
+pool_views = 12
+[reconstruct]
+max_features = 1200
+"""
+
+
+def settings_in(folder: Path) -> Path:
+    """A new workspace with nothing but the settings."""
+    folder.mkdir(parents=True)
+    (folder / "survey.toml").write_text(SMALL)
+    return folder
+
+
+def start(workspace: Path, threads: int) -> subprocess.Popen[bytes]:
+    """Begin to run all stages, with events next to the workspace."""
+    command = [sys.executable, "-m", "alice_survey", "run", "-w", str(workspace)]
+    return subprocess.Popen(
+        [*command, "--threads", str(threads), "--events", str(workspace.with_suffix(".jsonl"))],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
