@@ -7,7 +7,7 @@ are imported when first used, so that `import alice_survey` is quick:
     >>> config = alice.SurveyConfig()
     >>> camera = alice.design_rig(config.camera, config.water).cameras["left"]
     >>> camera.project([0.1, 0.0, 2.0]).round(1)
-    array([2209.8, 1104. ])
+    array([1918.6, 1355. ])
 """
 
 from importlib import import_module

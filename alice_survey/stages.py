@@ -8,6 +8,7 @@ without them.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -51,10 +52,12 @@ class StageSpec:
     """Stages without which it cannot be made."""
     uses: Sequence[str] = ()
     """Stages that it takes into account where they are there."""
-    settings: Callable[[SurveyConfig], Mapping[str, Any]] = lambda config: {}
-    """All settings that the result depends on, as JSON values."""
-    inputs: Callable[[Path, SurveyConfig], Sequence[Path]] = lambda workspace, config: ()
-    """All files that the result depends on."""
+    settings: "Mapping[str, Any] | Part" = field(default_factory=dict)
+    """All settings that the result depends on, as `settings_of` reads them."""
+    setting_files: Sequence[str] = ()
+    """Dotted names of the settings that are files, or lists of files."""
+    inputs: Callable[[Path], Sequence[Path]] = lambda workspace: ()
+    """All files of a workspace that the result depends on."""
     resumes: bool = False
     """Work goes on in what an interrupted run of the same digest left."""
     simulated: bool = False
@@ -71,8 +74,8 @@ class StageSpec:
         return Stage(
             name=self.folder,
             version=self.version,
-            settings=self.settings(config),
-            inputs=self.inputs(workspace, config),
+            settings=settings_of(self.settings, config),
+            inputs=[*self.inputs(workspace), *files_of(self.setting_files, config)],
             resumes=self.resumes,
         )
 
@@ -118,6 +121,63 @@ class StageSpec:
         except AliceError as error:
             why = str(error)
         return "up to date" if why is None else f"stale ({why})"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    """Some values of a section of the settings."""
+
+    section: str
+    only: frozenset[str] | None = None
+    without: frozenset[str] = frozenset()
+
+
+def only(section: str, *names: str) -> Part:
+    """The values of some names."""
+    return Part(section=section, only=frozenset(names))
+
+
+def without(section: str, *names: str) -> Part:
+    """The values of all other names."""
+    return Part(section=section, without=frozenset(names))
+
+
+def settings_of(wanted: Any, config: SurveyConfig) -> Any:
+    """Settings as JSON values: what a stage's digest is made of.
+
+    Args:
+        wanted: a `Part`; the dotted name of a value or a section; a mapping of these; or a value
+            that stands for itself.
+        config: the settings of a survey.
+
+    Returns:
+        Values in the form that `wanted` has; files by their names alone, so that a survey may be
+        moved.
+    """
+    if isinstance(wanted, Mapping):
+        return {key: settings_of(value, config) for key, value in wanted.items()}
+    if not isinstance(wanted, str | Part):
+        return wanted
+    part = Part(section=wanted) if isinstance(wanted, str) else wanted
+    value = _value(config, part.section)
+    if not isinstance(value, BaseModel):
+        return list(value) if isinstance(value, tuple) else value
+    values = value.model_dump(mode="json", include=part.only and set(part.only), exclude=set(part.without))
+    return {
+        name: path.name if isinstance(path := getattr(value, name), Path) else values[name]
+        for name in values
+    }
+
+
+def files_of(wanted: Sequence[str], config: SurveyConfig) -> list[Path]:
+    """The files that settings name; none for those that are not set."""
+    values = [_value(config, name) for name in wanted]
+    return [path for value in values for path in (value if isinstance(value, list) else [value])
+            if path is not None]  # fmt: skip
+
+
+def _value(config: SurveyConfig, name: str) -> Any:
+    return attrgetter(name)(config)
 
 
 def spec(name: str) -> StageSpec:
@@ -169,45 +229,12 @@ def _is_planned(workspace: Path) -> bool:
     return (workspace / "survey.toml").is_file() or (workspace / "plan").is_dir()
 
 
-def _dump(section: BaseModel, *include: str, exclude: Sequence[str] = ()) -> dict[str, Any]:
-    """Values of a section of the settings as JSON has them; those named, or all."""
-    return section.model_dump(
-        mode="json", include=set(include) if include else None, exclude=set(exclude)
-    )
-
-
 def _there(*paths: Path | None) -> list[Path]:
     return [path for path in paths if path is not None and path.is_file()]
 
 
 def _given(*paths: Path | None) -> list[Path]:
     return [path for path in paths if path is not None]
-
-
-def _without_paths(section: BaseModel) -> dict[str, Any]:
-    """What a section says; of files their names alone, so that a survey may be moved."""
-    values = _dump(section, exclude=["dive"])
-    return {
-        key: value.name if isinstance(value := getattr(section, key), Path) else values[key]
-        for key in values
-    }
-
-
-def _plan_settings(config: SurveyConfig) -> dict[str, Any]:
-    sections = ("area", "camera", "water", "plan", "sea", "vehicle")
-    return {
-        "name": config.name,
-        **{name: _without_paths(getattr(config, name)) for name in sections},
-        # Of a shape in degrees the middle is the datum unless one is set, to whatever value.
-        "datum_given": sorted({"latitude_deg", "longitude_deg"} & config.area.model_fields_set),
-        "strobes": _dump(config.imaging, "strobe_lumens", "strobe_beam_deg", "strobes_body_m"),
-    }
-
-
-def _plan_inputs(workspace: Path, config: SurveyConfig) -> list[Path]:
-    area, sea, vehicle = config.area, config.sea, config.vehicle
-    apart = _given(area.bathymetry_file, sea.current_file, vehicle.coefficients_file)
-    return [*area.files, *apart]
 
 
 def _plan_summary(folder: Path) -> Summary:
@@ -222,25 +249,6 @@ def _plan_summary(folder: Path) -> Summary:
         f"{folder / 'map.png'}, files for vehicles in {folder / 'exports'}"
     )
     return text, plan
-
-
-def _fly_settings(config: SurveyConfig) -> dict[str, Any]:
-    return {
-        "seed": config.seed,
-        "vehicle": _dump(config.vehicle, exclude=["coefficients_file"]),
-        "sea": _dump(config.sea, exclude=["current_file"]),
-        "navigation": _dump(config.navigation),
-        "seafloor": _dump(config.seafloor),
-        "seafloor_depth_m": config.area.seafloor_depth_m,
-        "plan": _dump(config.plan),
-        "position_body_m": list(config.camera.position_body_m),
-        "dvl_position_body_m": list(config.camera.dvl_position_body_m),
-    }
-
-
-def _fly_inputs(workspace: Path, config: SurveyConfig) -> list[Path]:
-    apart = _given(config.sea.current_file, config.vehicle.coefficients_file)
-    return [workspace / "plan" / "plan.json", *apart]
 
 
 def _fly_summary(folder: Path) -> Summary:
@@ -268,27 +276,7 @@ def _degrees(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.1f} deg"
 
 
-def _pool_settings(config: SurveyConfig) -> dict[str, Any]:
-    return {
-        "seed": config.seed,
-        "camera": _dump(config.camera),
-        "n_water": config.water.n_water,
-        "board": records.BoardRecord().to_json(),
-        "imaging": _dump(config.imaging, "scale", "image_format", "samples", "noise", "pool_views"),
-    }
-
-
-def _image_settings(config: SurveyConfig) -> dict[str, Any]:
-    sections = ("camera", "water", "seafloor", "imaging")
-    return {
-        "seed": config.seed,
-        "seafloor_depth_m": config.area.seafloor_depth_m,
-        "margins": _dump(config.plan, "altitude_m", "run_in_m", "turn_radius_m", "margin_m"),
-        **{name: _dump(getattr(config, name), exclude=["pool_views"]) for name in sections},
-    }
-
-
-def _image_inputs(workspace: Path, config: SurveyConfig) -> list[Path]:
+def _image_inputs(workspace: Path) -> list[Path]:
     flight = workspace / "flight"
     return [
         workspace / "plan" / "plan.json",
@@ -303,11 +291,7 @@ def _pictures_summary(folder: Path) -> Summary:
     return f"{count} pictures in {folder}", {"pictures": count}
 
 
-def _calibrate_settings(config: SurveyConfig) -> dict[str, Any]:
-    return {"camera": _dump(config.camera), "water": _dump(config.water)}
-
-
-def _calibrate_inputs(workspace: Path, config: SurveyConfig) -> list[Path]:
+def _calibrate_inputs(workspace: Path) -> list[Path]:
     return [workspace / "pool" / name for name in ("manifest.csv", "board.json", "left", "right")]
 
 
@@ -332,17 +316,7 @@ def _about_pictures(workspace: Path) -> list[Path]:
     return [images / "manifest.csv", images / "survey.json", *_given(rig_file(workspace))]
 
 
-def _mapping_settings(config: SurveyConfig) -> dict[str, Any]:
-    return {
-        "seed": config.seed,
-        **_dump(
-            config.reconstruct, "feature_scale", "max_features", "working_range_m", "mapper",
-            "refine_port", "refine_rig",
-        ),
-    }  # fmt: skip
-
-
-def _mapping_inputs(workspace: Path, config: SurveyConfig) -> list[Path]:
+def _mapping_inputs(workspace: Path) -> list[Path]:
     images = workspace / "images"
     rows = read_manifest(images / "manifest.csv")
     files = [*(row.image for row in rows), *(row.mask for row in rows if row.mask)]
@@ -355,7 +329,7 @@ def _mapping_summary(folder: Path) -> Summary:
     return text, {"registered": found.registered, "total": found.total}
 
 
-def _placing_inputs(workspace: Path, config: SurveyConfig) -> list[Path]:
+def _placing_inputs(workspace: Path) -> list[Path]:
     known = _there(*(workspace / name for name in (SCALE_FILE, *CONTROL_FILES)))
     return [workspace / "mapping", *_about_pictures(workspace), *known]
 
@@ -377,7 +351,7 @@ def _model_inputs(workspace: Path) -> list[Path]:
     return [sparse, *(images / file for file in files)]
 
 
-def _dense_inputs(workspace: Path, config: SurveyConfig) -> list[Path]:
+def _dense_inputs(workspace: Path) -> list[Path]:
     return [*_there(workspace / "mapping" / "covariance.npz"), *_model_inputs(workspace)]
 
 
@@ -386,12 +360,7 @@ def _dense_summary(folder: Path) -> Summary:
     return f"{found.points} points; surface in {folder / 'dem.tif'}", found.to_json()
 
 
-def _mosaic_settings(config: SurveyConfig) -> dict[str, Any]:
-    wanted = _dump(config.reconstruct, "mosaic_pixel_m", "colour", "dispersion")
-    return {**wanted, "water": _dump(config.water)}
-
-
-def _mosaic_inputs(workspace: Path, config: SurveyConfig) -> list[Path]:
+def _mosaic_inputs(workspace: Path) -> list[Path]:
     return [workspace / "dense" / "dem.tif", *_model_inputs(workspace)]
 
 
@@ -401,7 +370,7 @@ def _mosaic_summary(folder: Path) -> Summary:
     return text, found.to_json()
 
 
-def _mesh_inputs(workspace: Path, config: SurveyConfig) -> list[Path]:
+def _mesh_inputs(workspace: Path) -> list[Path]:
     dense = [workspace / "dense" / name for name in ("cloud.ply", "cloud.json", "light.json")]
     return [*dense, *_model_inputs(workspace)]
 
@@ -415,7 +384,7 @@ def _mesh_summary(folder: Path) -> Summary:
     return text, found.to_json()
 
 
-def _evaluate_inputs(workspace: Path, config: SurveyConfig) -> list[Path]:
+def _evaluate_inputs(workspace: Path) -> list[Path]:
     images, mesh = workspace / "images", workspace / "mesh"
     if not (images / "truth").is_dir():
         raise WorkspaceError(
@@ -443,7 +412,7 @@ def _evaluate_summary(folder: Path) -> Summary:
     return f"score in {folder / 'score.json'}\n{table}", score
 
 
-def _report_inputs(workspace: Path, config: SurveyConfig) -> list[Path]:
+def _report_inputs(workspace: Path) -> list[Path]:
     if not finished(workspace):
         raise WorkspaceError(
             f"{workspace} holds nothing to report on: run 'alice-survey plan' or 'import-images'"
@@ -469,8 +438,23 @@ STAGES: tuple[StageSpec, ...] = (
         about="lines, stations and camera settings that image the area",
         version=3,
         work="missions.plan.run:run_plan",
-        settings=_plan_settings,
-        inputs=_plan_inputs,
+        settings={
+            "name": "name",
+            "area": "area",
+            "camera": "camera",
+            "water": "water",
+            "plan": "plan",
+            "sea": "sea",
+            "vehicle": without("vehicle", "dive"),
+            "datum_given": "area.datum_given",
+            "strobes": only("imaging", "strobe_lumens", "strobe_beam_deg", "strobes_body_m"),
+        },
+        setting_files=(
+            "area.files",
+            "area.bathymetry_file",
+            "sea.current_file",
+            "vehicle.coefficients_file",
+        ),
         summary=_plan_summary,
         simulated=True,
         products={
@@ -490,8 +474,19 @@ STAGES: tuple[StageSpec, ...] = (
         version=4,
         work="missions.fly.run:run_fly",
         needs=("plan",),
-        settings=_fly_settings,
-        inputs=_fly_inputs,
+        settings={
+            "seed": "seed",
+            "vehicle": without("vehicle", "coefficients_file"),
+            "sea": without("sea", "current_file"),
+            "navigation": "navigation",
+            "seafloor": "seafloor",
+            "seafloor_depth_m": "area.seafloor_depth_m",
+            "plan": "plan",
+            "position_body_m": "camera.position_body_m",
+            "dvl_position_body_m": "camera.dvl_position_body_m",
+        },
+        setting_files=("sea.current_file", "vehicle.coefficients_file"),
+        inputs=lambda workspace: [workspace / "plan" / "plan.json"],
         summary=_fly_summary,
         simulated=True,
         products={
@@ -510,7 +505,13 @@ STAGES: tuple[StageSpec, ...] = (
         about="rendered pictures of a board, to calibrate from",
         version=4,
         work="missions.acquire.run:run_pool",
-        settings=_pool_settings,
+        settings={
+            "seed": "seed",
+            "camera": "camera",
+            "n_water": "water.n_water",
+            "board": records.BoardRecord().to_json(),
+            "imaging": only("imaging", "scale", "image_format", "samples", "noise", "pool_views"),
+        },
         summary=_pictures_summary,
         resumes=True,
         simulated=True,
@@ -525,7 +526,15 @@ STAGES: tuple[StageSpec, ...] = (
         version=5,
         work="missions.acquire.run:run_images",
         needs=("plan", "fly"),
-        settings=_image_settings,
+        settings={
+            "seed": "seed",
+            "seafloor_depth_m": "area.seafloor_depth_m",
+            "margins": only("plan", "altitude_m", "run_in_m", "turn_radius_m", "margin_m"),
+            "camera": "camera",
+            "water": "water",
+            "seafloor": "seafloor",
+            "imaging": without("imaging", "pool_views"),
+        },
         inputs=_image_inputs,
         summary=_pictures_summary,
         resumes=True,
@@ -542,7 +551,7 @@ STAGES: tuple[StageSpec, ...] = (
         version=3,
         work="camera_calib.calibrate.run:run_calibrate",
         needs=("pool",),
-        settings=_calibrate_settings,
+        settings={"camera": "camera", "water": "water"},
         inputs=_calibrate_inputs,
         summary=_calibrate_summary,
         simulated=True,
@@ -561,7 +570,15 @@ STAGES: tuple[StageSpec, ...] = (
         work="reconstruct.mapping.run:run_mapping",
         needs=("image",),
         uses=("calibrate",),
-        settings=_mapping_settings,
+        settings={
+            "seed": "seed",
+            "feature_scale": "reconstruct.feature_scale",
+            "max_features": "reconstruct.max_features",
+            "working_range_m": "reconstruct.working_range_m",
+            "mapper": "reconstruct.mapper",
+            "refine_port": "reconstruct.refine_port",
+            "refine_rig": "reconstruct.refine_rig",
+        },
         inputs=_mapping_inputs,
         summary=_mapping_summary,
         resumes=True,
@@ -576,7 +593,7 @@ STAGES: tuple[StageSpec, ...] = (
         work="reconstruct.placing.run:run_sparse",
         needs=("image", "mapping"),
         uses=("calibrate",),
-        settings=lambda config: _dump(config.reconstruct, "mount_sigma_deg"),
+        settings={"mount_sigma_deg": "reconstruct.mount_sigma_deg"},
         inputs=_placing_inputs,
         summary=_placing_summary,
         products={"track.csv": "camera track with sigmas", "model": "COLMAP model"},
@@ -590,9 +607,7 @@ STAGES: tuple[StageSpec, ...] = (
         version=3,
         work="reconstruct.dense.run:run_dense",
         needs=("image", "placing"),
-        settings=lambda config: _dump(
-            config.reconstruct, "dense_scale", "dense_partners", "dem_cell_m"
-        ),
+        settings=only("reconstruct", "dense_scale", "dense_partners", "dem_cell_m"),
         inputs=_dense_inputs,
         summary=_dense_summary,
         resumes=True,
@@ -612,7 +627,12 @@ STAGES: tuple[StageSpec, ...] = (
         version=5,
         work="reconstruct.mosaic.run:run_mosaic",
         needs=("image", "placing", "dense"),
-        settings=_mosaic_settings,
+        settings={
+            "mosaic_pixel_m": "reconstruct.mosaic_pixel_m",
+            "colour": "reconstruct.colour",
+            "dispersion": "reconstruct.dispersion",
+            "water": "water",
+        },
         inputs=_mosaic_inputs,
         summary=_mosaic_summary,
         products={
@@ -630,9 +650,7 @@ STAGES: tuple[StageSpec, ...] = (
         version=1,
         work="reconstruct.mesh.run:run_mesh",
         needs=("image", "placing", "dense"),
-        settings=lambda config: _dump(
-            config.reconstruct, "mesh_triangles", "mesh_error_px", "mesh_page_px"
-        ),
+        settings=only("reconstruct", "mesh_triangles", "mesh_error_px", "mesh_page_px"),
         inputs=_mesh_inputs,
         summary=_mesh_summary,
         products={"mesh.glb": "textured mesh"},
@@ -648,7 +666,7 @@ STAGES: tuple[StageSpec, ...] = (
         work="reconstruct.evaluate.run:run_evaluate",
         needs=("image", "placing", "dense", "mosaic", "plan"),
         uses=("mesh",),
-        settings=lambda config: {"seed": config.seed},
+        settings={"seed": "seed"},
         inputs=_evaluate_inputs,
         summary=_evaluate_summary,
         simulated=True,

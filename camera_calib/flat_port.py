@@ -44,6 +44,17 @@ class FlatPortCamera:
 
     A port of zero distance and thickness in water of index n is a pinhole magnified by n; with
     n_water = 1 it is the camera in air.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> camera = alice.FlatPortCamera(
+        ...     width_px=1600, height_px=1200, fx_px=1500, fy_px=1500, cx_px=800, cy_px=600,
+        ...     port_distance_m=0.02, glass_thickness_m=0.01, n_water=1.34,
+        ... )
+        >>> camera.project([[0.0, 0.0, 2.0], [0.5, 0.2, 2.0], [0.0, 0.0, -1.0]]).round(1)
+        array([[ 800. ,  600. ],
+               [1315.9,  806.4],
+               [   nan,    nan]])
     """
 
     width_px: int

@@ -22,7 +22,14 @@ _NORM_TOLERANCE = 1e-3
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Covariance:
-    """How well calibrated parameters are known, and together."""
+    """How well calibrated parameters are known, and together.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> known = alice.Covariance(parameters=("left.fx_px",), matrix=np.array([[0.25]]))
+        >>> known.sigmas
+        {'left.fx_px': 0.5}
+    """
 
     parameters: tuple[str, ...]
     """Names such as `left.fx_px`, `left.normal_x` or `right.rx_rad` (see docs/formats.md)."""
@@ -62,7 +69,15 @@ class Covariance:
 
 @dataclass(frozen=True, kw_only=True)
 class Rig:
-    """Cameras that move as one body. The first is the reference: its frame is the rig's."""
+    """Cameras that move as one body. The first is the reference: its frame is the rig's.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> config = alice.SurveyConfig()
+        >>> rig = alice.design_rig(config.camera, config.water)
+        >>> list(rig.cameras), round(rig.baseline_m, 3)
+        (['left', 'right'], 0.1)
+    """
 
     cameras: Mapping[str, FlatPortCamera]
     cam_from_rig: Mapping[str, RigidTransform]
@@ -120,6 +135,12 @@ def design_rig(camera: CameraConfig, water: WaterConfig, scale: int = 1) -> Rig:
         camera: design values.
         water: its index of refraction.
         scale: pixels are this many times larger.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> config = alice.SurveyConfig()
+        >>> alice.design_rig(config.camera, config.water, scale=4).cameras["left"].width_px
+        846
     """
     focal_px = camera.focal_mm * 1e3 / camera.pixel_um
     x, y = (float(np.sin(np.deg2rad(tilt))) for tilt in camera.port_tilt_deg)
@@ -150,7 +171,13 @@ def design_rig(camera: CameraConfig, water: WaterConfig, scale: int = 1) -> Rig:
 
 
 def write_rig(path: str | Path, rig: Rig) -> None:
-    """Write `rig.json` (format in docs/formats.md)."""
+    """Write `rig.json` (format in docs/formats.md).
+
+    Example:
+        >>> import alice_survey as alice
+        >>> config = alice.SurveyConfig()
+        >>> alice.write_rig("rig.json", alice.design_rig(config.camera, config.water))
+    """
     path = Path(path)
     cameras = {
         name: {**camera.to_json(), "cam_from_rig": pose_to_json(rig.cam_from_rig[name])}
@@ -176,6 +203,13 @@ def read_rig(path: str | Path) -> Rig:
 
     Raises:
         CalibrationError: a key is missing or a value is wrong; the message names the file.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> config = alice.SurveyConfig()
+        >>> alice.write_rig("drawn.json", alice.design_rig(config.camera, config.water))
+        >>> alice.read_rig("drawn.json").reference
+        'left'
     """
     path = Path(path)
     data = read_json(path)

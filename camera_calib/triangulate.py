@@ -30,7 +30,18 @@ _INSIDE = 1e-4
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Triangulation:
-    """Points in the water; a row is NaN where there is no solution (see `triangulate`)."""
+    """Points in the water; a row is NaN where there is no solution (see `triangulate`).
+
+    Example:
+        >>> import alice_survey as alice
+        >>> config = alice.SurveyConfig()
+        >>> rig = alice.design_rig(config.camera, config.water)
+        >>> cameras, poses = list(rig.cameras.values()), list(rig.cam_from_rig.values())
+        >>> pixels = np.stack([c.project(p.apply([[0, 0, 2.0]])) for c, p in zip(cameras, poses)])
+        >>> found = alice.triangulate(cameras, poses, pixels, sigma_px=0.1)
+        >>> bool(found.sigmas_m[0, 2] < 0.002)
+        True
+    """
 
     points_world: Array
     """(N, 3) of least squared reprojection error, metres."""
@@ -70,6 +81,17 @@ def triangulate(
 
     Raises:
         CalibrationError: lists that do not pair, or a sigma that is not positive.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> config = alice.SurveyConfig()
+        >>> rig = alice.design_rig(config.camera, config.water)
+        >>> cameras, poses = list(rig.cameras.values()), list(rig.cam_from_rig.values())
+        >>> point = np.array([[0.1, 0.2, 2.0]])
+        >>> pixels = np.stack([c.project(p.apply(point)) for c, p in zip(cameras, poses)])
+        >>> found = alice.triangulate(cameras, poses, pixels, sigma_px=0.1)
+        >>> bool(np.allclose(found.points_world, point))
+        True
     """
     measured = np.ascontiguousarray(pixels, dtype=np.float64)
     sigmas = np.broadcast_to(np.asarray(sigma_px, dtype=np.float64), (len(cameras),))

@@ -1,4 +1,6 @@
-"""Mathematics of the pages as MathML when the site is built: nothing is fetched to show it.
+"""Mathematics of the pages as MathML, and tables of what the code knows, when the site is built.
+
+Nothing is fetched to show them.
 
 `pymdownx.arithmatex` finds `$...$` and `$$...$$` outside of code; what it found is converted here.
 """
@@ -22,6 +24,7 @@ _AFTER = re.compile(
 )
 _GAP = '<mspace width="0.17em" />'
 _BAR = re.compile(r'<mo(?: stretchy="false")?>(&#x02016;|&#x0007C;)</mo>')
+_FORMATS = "<!-- export formats: a table, made when the site is built -->"
 _TIGHT_BAR = r'<mo stretchy="false" lspace="0" rspace="0">\1</mo>'
 
 
@@ -30,6 +33,15 @@ def on_page_content(content: str, *, page: Page, config: MkDocsConfig, files: Fi
     where = page.file.src_uri
     content = _BLOCK.sub(lambda found: _block(found[1], where), content)
     return _INLINE.sub(lambda found: mathml(found[1], "inline", where), content)
+
+
+def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Put the table of export formats where a page asks for it."""
+    if _FORMATS not in markdown:
+        return markdown
+    from missions.exports.registry import formats_table
+
+    return markdown.replace(_FORMATS, formats_table())
 
 
 def _block(latex: str, where: str) -> str:

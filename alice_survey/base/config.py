@@ -75,6 +75,14 @@ class AreaConfig(Config):
     bathymetry_crs: str | None = None
 
     @property
+    def datum_given(self) -> list[str]:
+        """Which coordinates of the datum are set, to whatever value; the others have no meaning.
+
+        Of a shape in degrees the middle is the datum unless one is set.
+        """
+        return sorted({"latitude_deg", "longitude_deg"} & self.model_fields_set)
+
+    @property
     def files(self) -> list[Path]:
         """The files that shapes come from, a shapefile's side files too; those that exist."""
         files = []
@@ -306,7 +314,13 @@ class ReconstructConfig(Config):
 
 
 class SurveyConfig(Config):
-    """A whole survey, as `survey.toml` says it."""
+    """A whole survey, as `survey.toml` says it.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> alice.SurveyConfig().plan.altitude_m
+        2.0
+    """
 
     name: str = Field("survey", min_length=1, max_length=80, pattern=r"^[\w .-]+$")
     seed: int = Field(1, ge=0, lt=2**32)
@@ -358,6 +372,12 @@ def load_config(path: str | Path) -> SurveyConfig:
     Raises:
         ConfigError: the file is missing, is no TOML, or holds an unknown key or a value out of
             range; the message names the file, the key, the value and what is allowed.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> survey = alice.Survey.new("wreck")
+        >>> alice.load_config("wreck/survey.toml").plan.speed_mps
+        0.2
     """
     path = Path(path)
     try:

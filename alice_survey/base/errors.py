@@ -19,7 +19,16 @@ _shows: list[Show] = []
 
 
 class AliceError(Exception):
-    """A fault the user can mend; the command line prints it as one line and exits with 1."""
+    """A fault the user can mend; the command line prints it as one line and exits with 1.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> try:
+        ...     alice.load_config("nowhere.toml")
+        ... except alice.AliceError as error:
+        ...     print(type(error).__name__)
+        ConfigError
+    """
 
     def __str__(self) -> str:
         """The line, without what names in files could do to a terminal."""

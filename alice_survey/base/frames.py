@@ -20,7 +20,14 @@ BODY_FROM_NADIR_CAM = Rotation.from_matrix([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [
 
 @dataclass(frozen=True)
 class Datum:
-    """Origin of the local NED frame: a point of the sea surface on the WGS 84 ellipsoid."""
+    """Origin of the local NED frame: a point of the sea surface on the WGS 84 ellipsoid.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> datum = alice.Datum(32.8236, 34.9553)
+        >>> datum.ned_from_geodetic([[32.8237, 34.9553, 5.0]]).round(2) + 0.0
+        array([[11.09,  0.  ,  5.  ]])
+    """
 
     latitude_deg: float
     longitude_deg: float

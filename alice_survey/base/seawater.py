@@ -56,6 +56,11 @@ def n_water(
 
     Raises:
         ConfigError: a value is not finite or beyond what the formulas reach.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> float(alice.n_water(22.0, 35.0, 15.0).round(4))
+        1.3427
     """
     values = {
         "temperature_c": np.asarray(temperature_c, dtype=np.float64),

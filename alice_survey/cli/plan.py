@@ -15,6 +15,7 @@ from alice_survey.cli.options import (
     examples,
     print_result,
 )
+from missions.exports.registry import format_names
 
 app = typer.Typer(
     invoke_without_command=True,
@@ -165,7 +166,7 @@ def export(
         list[str] | None,
         typer.Option(
             "--format",
-            help="cola2, cola2-v1, qgc, qgc-survey, wpl, kml, gpx, geojson, csv; all if none.",
+            help=f"{', '.join(format_names())}; all if none.",
         ),
     ] = None,
     camera_on: Annotated[

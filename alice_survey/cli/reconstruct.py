@@ -141,7 +141,7 @@ def quality(workspace: Workspace = WORK, threads: Threads = None, as_json: AsJso
     Sharpness, exposure, turbidity and overlap of each; the bad ones by name, with the reason.
     """
     from alice_survey.base.executor import default_threads
-    from reconstruct.pictures.quality import quality_report
+    from reconstruct.pictures.quality_sheet import quality_report
 
     print_result(*quality_report(workspace, threads or default_threads()), as_json)
 

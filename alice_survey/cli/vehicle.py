@@ -36,10 +36,9 @@ def coefficients(
     plot: Annotated[Path | None, typer.Option(help="PNG, PDF or SVG to draw.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compute coefficients from shape, beside the paper's.
+    """Compute coefficients from shape, next to the paper's.
 
-    Every row of the paper's three tables of added mass, damping and lift, with the equation, and
-    with the reason where its value does not follow from the vehicle's shape.
+    Every row of the paper's three tables of added mass, damping and lift, with the equation.
     """
     from alice_survey.vehicle.hydrodynamics.report import coefficients_report
 

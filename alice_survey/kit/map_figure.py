@@ -28,7 +28,8 @@ from alice_survey.kit.map import map_extent
 
 _MOST_PX = 1400
 """Of the longer side of a picture in print."""
-_MOST_HEIGHT_IN = 6.4
+_MOST_HEIGHT_IN = 4.1
+"""Of the map itself, so that two stand on a page."""
 _MARGIN = 0.04
 """Around all that is drawn, as a share of the longer side."""
 _RIMMED = 20
@@ -63,9 +64,7 @@ def map_figure(survey_map: SurveyMap, layers: Sequence[PictureLayer | ShapeLayer
     west, south, east, north = map_extent(survey_map)
     margin = _MARGIN * max(east - west, north - south)
     wide, high = east - west + 2 * margin, north - south + 2 * margin
-    width_in = WIDTH_IN
-    height_in = 0.8 + min(_MOST_HEIGHT_IN, (width_in - 1.6) * high / wide)
-    sheet = new_figure(height_in, width_in)
+    sheet = new_figure(0.8 + min(_MOST_HEIGHT_IN, (WIDTH_IN - 1.6) * high / wide))
     axes = sheet.subplots()
     axes.grid(visible=False)
     pictures = [layer for layer in layers if isinstance(layer, PictureLayer)]
@@ -80,13 +79,14 @@ def map_figure(survey_map: SurveyMap, layers: Sequence[PictureLayer | ShapeLayer
         sheet.legend(loc="outside lower center", ncols=min(4, len(shapes)), fontsize=8)
     titles = ", ".join(layer.title.lower() for layer in layers)
     first = pictures[0] if pictures else layers[0]
+    words = [f"{layer.title}: {layer.about}" for layer in shapes if layer.about]
+    about = pictures[0].about if pictures else ""
     return Figure(
         png=png_of(sheet),
         svg=_with_jpegs(svg_of(sheet)),
         title=first.title,
         alt=f"Map, north up: {titles}",
-        shows=" ".join(layer.about for layer in layers if layer.about),
-        share=min(1.0, (wide / high * (height_in - 0.8) + 1.6) / width_in),
+        shows=" ".join([about, *words]).strip(),
     )
 
 

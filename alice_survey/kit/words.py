@@ -34,8 +34,7 @@ def with_sigma(value: float, sigma: float, sign: str = "") -> str:
     """`849.31 ± 0.46`: two digits of the sigma, and the value to the same place."""
     if not (math.isfinite(sigma) and sigma > 0):
         return f"{value:{sign}.6g} ± {sigma:.2g}"
-    rounded = float(f"{sigma:.{_SIGMA_DIGITS - 1}e}")
-    places = max(0, _SIGMA_DIGITS - 1 - math.floor(math.log10(rounded)))
+    places = max(0, _SIGMA_DIGITS - 1 - math.floor(math.log10(sigma)))
     return f"{value:{sign}.{places}f} ± {sigma:.{places}f}"
 
 

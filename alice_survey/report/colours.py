@@ -23,7 +23,7 @@ TILE_PX = 512
 _SAMPLED = 2_000_000
 """Values of a raster that its limits are taken from; of a smaller one all."""
 _THINNED = 4
-"""Of a larger raster's block every so many-th row and column."""
+"""Step between the rows and columns of a block that a larger raster's limits are taken from."""
 _WINDOW_PX = 256
 _COLOURS = 9
 """Of a scale in a legend."""
@@ -75,7 +75,7 @@ def number_rasters(unit: str) -> tuple[Numbers, ...]:
         ),
         Numbers(
             file="evaluation/error.tif", name="error", title="Error of height", palette="PuOr",
-            about="Height less the true height, after a rigid alignment of the cameras.",
+            about="Height minus the true height, after a rigid alignment of the cameras.",
             limits=_around_zero, factor=small, label=f"error, {label}",
         ),
         Numbers(

@@ -155,7 +155,7 @@ def _surface(held: Held) -> Surface:
 
 
 _KEPT = 16
-"""Every so many cells of a block enter medians: half a million of a DEM of 3,000 by 3,000."""
+"""Step between the cells that enter medians: half a million of a DEM of 3,000 by 3,000."""
 
 
 def _thinned(values: Array) -> Array:

@@ -8,8 +8,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
+
 from alice_survey import stages
 from alice_survey.base.artefacts import Record, StageRecord
+from alice_survey.base.frames import Array
 from alice_survey.base.records import ChangeRecord, FrameRecord, PicturesRecord, PlaceRecord
 from alice_survey.stages import finished
 from missions.values.plan_file import Plan, read_plan
@@ -102,6 +105,17 @@ def _place(plan: Plan) -> PlaceRecord:
     return PlaceRecord(
         latitude_deg=datum.latitude_deg, longitude_deg=datum.longitude_deg, height_m=datum.height_m
     )
+
+
+def known_column(rows: Sequence[Mapping[str, str]], start: str) -> Array:
+    """The numbers of a column whose name begins so, without empty cells.
+
+    Such as "area_" for `area_m2`, and for the `area_units2` of a model without scale.
+    """
+    name = next((name for name in (rows[0] if rows else {}) if name.startswith(start)), "")
+    values = np.array([number(row, name) for row in rows], dtype=np.float64)
+    known: Array = values[np.isfinite(values)]
+    return known
 
 
 def number(row: Mapping[str, str], name: str) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 from alice_survey.base.frames import Array
 from alice_survey.kit.document import Figure
 from alice_survey.kit.figure import INKS, MARKS, colour_bar, drawn
-from alice_survey.kit.words import digits
+from alice_survey.kit.words import digits, length, share
 from alice_survey.report.figures import Figures
 from alice_survey.report.held import Held, number
 
@@ -82,43 +82,83 @@ def pictures_used(figures: Figures) -> Figure | None:
 
 
 def heights(figures: Figures) -> Figure | None:
-    """Stated sigmas of the heights, and the errors over them where the truth is known."""
+    """Stated sigmas of the heights."""
     values = sampled(figures.held, "dense/sigma.tif")
     if values is None or not len(values):
         return None
     unit = figures.held.unit
     factor, label = (1e3, "mm") if unit == "m" else (1.0, unit)
-    errors = paired(figures.held, "evaluation/error.tif", "dense/sigma.tif")
 
     def paint(axes: Sequence[Any]) -> None:
         shown = factor * values
         most = float(np.percentile(shown, 99))
         axes[0].hist(shown, bins=60, range=(0, most), color=INKS[0])
         axes[0].axvline(float(np.median(shown)), color=INKS[1], label="median")
-        axes[0].set(xlabel=f"stated sigma of a height, {label}", yticks=[])
+        axes[0].set(xlabel=f"stated sigma of a height, {label}", ylabel="cells", yticks=[])
         axes[0].legend()
-        if errors is not None:
-            ratio = errors[0] / errors[1]
-            grid = np.linspace(-4, 4, 161)
-            axes[1].hist(ratio, bins=81, range=(-4, 4), density=True, color=INKS[0], label="found")
-            normal = np.exp(-(grid**2) / 2) / np.sqrt(2 * np.pi)
-            axes[1].plot(grid, normal, color=INKS[1], label="as stated")
-            axes[1].set(xlabel="error over its stated sigma", yticks=[])
-            axes[1].legend()
 
     return drawn(
         paint,
-        2.6,
-        columns=1 if errors is None else 2,
+        2.3,
         title="How well heights are known",
-        alt="Histogram of the standard deviations of heights"
-        + ("" if errors is None else ", and of errors over them beside the normal curve"),
-        shows="What the survey itself says of its heights, cell by cell: matching, geometry, and "
-        "the cameras' own uncertainty."
-        + ("" if errors is None else " Right: the true errors in those sigmas."),
-        good="The median is below the mosaic's pixel."
-        + ("" if errors is None else " The bars follow the line."),
+        alt="Histogram of the standard deviations of heights",
+        shows="The survey's own estimate for its heights, cell by cell: matching, geometry, and "
+        f"the cameras' own uncertainty. The median is {length(float(np.median(values)), unit)}.",
+        good="The median is below the mosaic's pixel.",
         otherwise="See the map of sigmas for where: low overlap, steep rocks, dark places.",
+    )
+
+
+def sigma_test(figures: Figures) -> Figure | None:
+    """True errors of the heights over their stated sigmas; None where no truth is known."""
+    errors = paired(figures.held, "evaluation/error.tif", "dense/sigma.tif")
+    if errors is None:
+        return None
+    ratio = errors[0] / errors[1]
+
+    def paint(axes: Sequence[Any]) -> None:
+        grid = np.linspace(-4, 4, 161)
+        axes[0].hist(ratio, bins=81, range=(-4, 4), density=True, color=INKS[0], label="found")
+        normal = np.exp(-(grid**2) / 2) / np.sqrt(2 * np.pi)
+        axes[0].plot(grid, normal, color=INKS[1], label="as stated")
+        axes[0].set(xlabel="error over its stated sigma", ylabel="share", yticks=[])
+        axes[0].legend()
+
+    return drawn(
+        paint,
+        2.3,
+        title="Test of the stated sigmas",
+        alt="Histogram of errors of heights over their stated sigmas, next to the normal curve",
+        shows="The true errors of the heights in units of their stated sigmas. "
+        f"{ratio_words(ratio)}",
+        good="The bars follow the line, with a median of 0 and 1 rms.",
+        otherwise="Bars wider than the line: multiply the sigmas by the rms. A median off zero: "
+        "neighbouring heights share an error, such as of one camera's position.",
+    )
+
+
+_MOST_SHIFT, _LEAST_SPREAD, _MOST_SPREAD = 0.25, 0.8, 1.25
+
+
+def ratio_words(ratio: Array) -> str:
+    """How errors over their stated sigmas compare with a standard normal distribution.
+
+    Args:
+        ratio: (N,) errors over sigmas.
+    """
+    middle = float(np.median(ratio))
+    spread = 1.4826 * float(np.median(np.abs(ratio - middle)))
+    found = []
+    if abs(middle) > _MOST_SHIFT:
+        found.append(f"shifted by {middle:+.2f} sigma")
+    if not _LEAST_SPREAD <= spread <= _MOST_SPREAD:
+        than = "wider" if spread > 1 else "narrower"
+        found.append(f"{than} than stated ({spread:.2f} sigma, one expected)")
+    within = [share(float((np.abs(ratio) <= sigmas).mean())) for sigmas in (1, 2)]
+    return (
+        f"They are {' and '.join(found) if found else 'as stated'}: median {middle:+.2f}, "
+        f"{float(np.sqrt((ratio**2).mean())):.2f} rms; {within[0]} lie within one sigma (68 % "
+        f"expected) and {within[1]} within two (95 %)."
     )
 
 
@@ -128,11 +168,12 @@ def seen_by(figures: Figures) -> Figure | None:
     if values is None or not len(values):
         return None
     most = int(np.percentile(values, 99.5))
-    share = np.bincount(np.minimum(values.astype(np.int64), most), minlength=most + 1) / len(values)
+    counts = np.bincount(np.minimum(values.astype(np.int64), most), minlength=most + 1)
+    percent = 100 * counts / len(values)
 
     def paint(axes: Sequence[Any]) -> None:
         inks = [INKS[1] if n < 3 else INKS[0] for n in range(1, most + 1)]
-        axes[0].bar(range(1, most + 1), 100 * share[1:], color=inks)
+        axes[0].bar(range(1, most + 1), percent[1:], color=inks)
         axes[0].set(xlabel="stations that see a spot", ylabel="% of the surface")
 
     return drawn(
@@ -141,7 +182,7 @@ def seen_by(figures: Figures) -> Figure | None:
         title="Overlap reached",
         alt="Share of the surface by the number of stations that see it",
         shows=f"Share of the surface by the number of stations that see it; "
-        f"{100 * share[3:].sum():.1f} % is seen by three and more.",
+        f"{percent[3:].sum():.1f} % is seen by three and more.",
         good="Hardly anything below three (orange), where heights do not check one another.",
         otherwise="Plan more forward or side overlap.",
     )
@@ -214,7 +255,7 @@ def sampled(held: Held, path: str, *, counts: bool = False) -> Array | None:
 
 
 def paired(held: Held, first: str, second: str) -> tuple[Array, Array] | None:
-    """Values of two rasters where both are known, likewise."""
+    """Values of two rasters where both are known, thinned the same way."""
     a, b = _read(held, first), _read(held, second)
     if a is None or b is None or a.shape != b.shape:
         return None
@@ -224,7 +265,7 @@ def paired(held: Held, first: str, second: str) -> tuple[Array, Array] | None:
 
 
 def _read(held: Held, path: str) -> Array | None:
-    """A raster, every so many cells, so that the largest fits."""
+    """A raster, thinned so that the largest fits."""
     import rasterio
     from rasterio.enums import Resampling
 

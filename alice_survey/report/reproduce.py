@@ -17,7 +17,7 @@ _PACKAGES = (
 )  # fmt: skip
 _SETTINGS = "survey.toml"
 _SHORT = 12
-"""Letters of a digest that are shown."""
+"""Length of a digest as shown."""
 
 
 def section(figures: Figures) -> Section:
@@ -41,7 +41,7 @@ def _words(held: Held) -> Iterator[str]:
     settings = held.workspace / _SETTINGS
     if settings.is_file():
         yield (
-            "The same settings, inputs and versions give the same results; a stage is made again "
+            "The same settings, inputs and versions give the same results; a stage is run again "
             "when its digest changes."
         )
     if held.simulated:
@@ -62,7 +62,7 @@ def _stages(held: Held) -> Table:
                 stage.digest[:_SHORT],
             )
         )
-    header = ("stage", "version", "time", "computing", "memory", "input files", "digest")
+    header = ("stage", "version", "time", "CPU time", "memory", "input files", "digest")
     return Table(title="Stages", header=header, rows=rows)
 
 

@@ -1,6 +1,7 @@
 """The stage `report`: `report.html`, `report.pdf` and `report.json` of whatever is there."""
 
 from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,11 @@ from alice_survey.base.run import progress
 from alice_survey.kit.document import PictureLayer, Report, ShapeLayer, SurveyMap
 from alice_survey.kit.map_figure import with_stills
 from alice_survey.kit.page import render_html
+from alice_survey.kit.paper import render_pdf
 from alice_survey.report import reproduce
 from alice_survey.report.figures import Figures
 from alice_survey.report.held import Held
 from alice_survey.report.mesh_copy import mesh_copy
-from alice_survey.report.pdf import write_pdf
 from alice_survey.report.rasters import picture_layers
 from alice_survey.report.sections import sections
 from alice_survey.report.shapes import shape_layers
@@ -25,11 +26,12 @@ from alice_survey.report.verdicts import verdicts
 
 def run_report(workspace: Path, config: SurveyConfig, threads: int, folder: Path) -> None:
     """Write the report of what the workspace holds."""
-    report, data = build_report(Held.of(workspace), folder)
-    with atomic_path(folder / "report.html") as path:
+    held = Held.of(workspace)
+    report, data = build_report(held, folder)
+    with progress.step("write the page"), atomic_path(folder / "report.html") as path:
         path.write_text(render_html(report), encoding="utf-8")
-    with atomic_path(folder / "report.pdf") as path:
-        write_pdf(report, path)
+    with progress.step("write the PDF"), atomic_path(folder / "report.pdf") as path:
+        path.write_bytes(render_pdf(report, last_worked_on(held)))
     ReportRecord.save(folder / "report.json", data)
     if report.mesh is not None:
         report.mesh.glb.unlink()
@@ -62,19 +64,43 @@ def build_report(held: Held, folder: Path) -> tuple[Report, dict[str, Any]]:
         sections=parts,
         map=chart,
         mesh=mesh,
+        citation=_title_block(held),
     )
     return report, _data(figures, found, said, known)
 
 
 def _subtitle(held: Held) -> str:
     kind = "simulated survey" if held.simulated else "survey"
+    when = f"{last_worked_on(held):%Y-%m-%d %H:%M UTC}"
+    place = _place(held)
+    return f"{kind}; {place}; last worked on {when}" if place else f"{kind}; last worked on {when}"
+
+
+def last_worked_on(held: Held) -> datetime:
+    """When the newest of its stages was finished."""
     newest = max((held.workspace / n / STAGE_FILE).stat().st_mtime for n in held.stages)
-    when = datetime.fromtimestamp(newest, UTC).strftime("%Y-%m-%d %H:%M UTC")
+    return datetime.fromtimestamp(newest, UTC)
+
+
+def _place(held: Held) -> str:
+    """Latitude and longitude of the survey; empty where unknown."""
     datum = held.frame.datum
-    place = ""
-    if datum is not None:
-        place = f"{datum.latitude_deg:.5f}, {datum.longitude_deg:.5f} (WGS 84); "
-    return f"{kind}; {place}last worked on {when}"
+    if datum is None:
+        return ""
+    return f"{datum.latitude_deg:.5f}, {datum.longitude_deg:.5f} (WGS 84)"
+
+
+def _title_block(held: Held) -> list[tuple[str, str]]:
+    """What a reader who cites the report needs."""
+    program = f"alice-survey {version('alice-survey')}"
+    rows = [
+        ("Survey", "simulated" if held.simulated else "of pictures that were taken"),
+        ("Last worked on", f"{last_worked_on(held):%Y-%m-%d %H:%M UTC}"),
+        ("Position", _place(held)),
+        ("Software", f"{program}; versions of its libraries are in the last section"),
+        ("Cite as", f"{held.name}, survey report, {program}, {last_worked_on(held):%Y-%m-%d}"),
+    ]
+    return [row for row in rows if row[1]]
 
 
 def origin_of(held: Held) -> str:

@@ -21,10 +21,20 @@ from alice_survey.base.records import (
 )
 from alice_survey.kit.document import Figure, Section, Table
 from alice_survey.kit.figure import shrunk_png
-from alice_survey.kit.words import count, digits, duration, length, millimetres, parts, share
+from alice_survey.kit.words import (
+    count,
+    digits,
+    duration,
+    length,
+    length_with_sigma,
+    millimetres,
+    parts,
+    parts_with_sigma,
+    share,
+)
 from alice_survey.report import plots
 from alice_survey.report.figures import Figures
-from alice_survey.report.held import Held
+from alice_survey.report.held import Held, known_column
 from missions.values.plan_file import Plan
 
 
@@ -57,18 +67,14 @@ def sections(figures: Figures, *, has_map: bool, has_mesh: bool) -> Iterator[Sec
 def _map(figures: Figures) -> Section:
     held = figures.held
     footprints = held.rows("mosaic/footprints.csv")
-    text = [
-        "Choose what the map shows at its upper right; it moves and zooms with mouse, fingers, or "
-        "the arrow keys and + and -."
-    ]
+    text = []
     if held.has("plan", "flight"):
         text.append(
             "Plan and flown track differ by navigation's error as well as by the vehicle's."
         )
     tables = []
-    if footprints:
-        areas = np.array([float(row["area_m2"]) for row in footprints])
-        pixels = np.array([float(row["ground_pixel_m"]) for row in footprints])
+    areas, pixels = (known_column(footprints, name) for name in ("area_", "ground_pixel_"))
+    if len(areas) and len(pixels):
         tables.append(
             Table(
                 title="Footprints",
@@ -92,8 +98,8 @@ def _mesh(found: MeshRecord, unit: str) -> Section:
         title="Mesh",
         text=[
             f"{count(found.triangles, 'triangle')}, {digits(found.area)} {unit}² of "
-            f"surface, {share(found.textured_share)} of it with texture. The page shows a "
-            "lighter copy; the files are in mesh/."
+            f"surface, {share(found.textured_share)} of it with texture. The files are "
+            "in mesh/."
         ],
         scene="mesh",
     )
@@ -142,7 +148,7 @@ def _truth(score: ScoreRecord, held: Held) -> Section:
         figures=_stills(held, [
             ("evaluation/errors.png", "Where the surface errs",
              "Map and histogram of height errors.",
-             "Pale all over, without a slope or a dome.",
+             "Without a slope or a dome.",
              "Errors at the rim come from few pictures; a dome from calibration."),
         ]),
     )  # fmt: skip
@@ -186,7 +192,7 @@ def _compared(figures: Figures) -> Section:
         )
         stills.append(
             (f"against/{name}/change.png", f"Change since {name}",
-             "Height less that of the earlier survey, and how sure it is.",
+             "Height minus that of the earlier survey, and how sure it is.",
              "Where nothing has changed, nothing is coloured.", "")
         )  # fmt: skip
     return Section(
@@ -244,7 +250,7 @@ def _surface(figures: Figures) -> Section:
         ("stations that see a spot, median", f"{surface.stations_median:.0f}"),
         ("heights count from", found.vertical_datum),
     ]
-    drawn = [plots.heights(figures), plots.seen_by(figures)]
+    drawn = [plots.heights(figures), plots.sigma_test(figures), plots.seen_by(figures)]
     return Section(
         name="surface",
         title="Surface",
@@ -263,14 +269,11 @@ def _model(figures: Figures, found: RegistrationRecord) -> Section:
     ]
     doming = figures.mapping.doming or DomingRecord()
     for way, bend in doming.bends.items():
-        rows.append(
-            (f"sag {way} the lines", f"{length(bend.sag_m)} +/- {length(bend.sag_sigma_m)}")
-        )
+        rows.append((f"sag {way} the lines", length_with_sigma(bend.sag_m, bend.sag_sigma_m)))
     scale = doming.scale
     if scale is not None:
         rows.append(
-            ("scale of the stereo pairs",
-             f"{parts(scale.mean - 1.0)} +/- {parts(scale.mean_sigma).lstrip('+')}")
+            ("scale of the stereo pairs", parts_with_sigma(scale.mean - 1.0, scale.mean_sigma))
         )  # fmt: skip
     place = found.georeference
     if place is not None:
@@ -417,7 +420,7 @@ def _mission(held: Held, plan: Plan) -> Section:
                     ("of that the control's part",
                      f"{length(line.believed_cross_track_rms_m)} rms"),
                     ("error of navigation", f"{length(flight.navigation_error_rms_m)} rms"),
-                    ("pictured as often as requested", share(flight.coverage.share_at_overlap)),
+                    ("pictured as often as required", share(flight.coverage.share_at_overlap)),
                 ],
             )
         )  # fmt: skip

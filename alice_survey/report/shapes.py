@@ -1,7 +1,6 @@
 """Lines, outlines and points of a survey for its map: plan, flight, cameras, footprints."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -11,11 +10,11 @@ from alice_survey.base.records import FrameRecord
 from alice_survey.kit.document import ShapeLayer
 from alice_survey.kit.words import length
 from alice_survey.report.figures import planned_area
-from alice_survey.report.held import Held, number
+from alice_survey.report.held import Held, known_column, number
 from reconstruct.views.model import datum_of
 
 _BLUE, _ORANGE, _GREEN, _RED, _BLACK = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#333333"
-"""Of Okabe and Ito's palette, which the colour-blind tell apart."""
+"""Okabe and Ito's palette, safe for the colour-blind."""
 _MOST_VERTICES = 4000
 """Of a track on the map."""
 
@@ -27,7 +26,7 @@ def shape_layers(held: Held) -> Iterator[ShapeLayer]:
     area = planned_area(held)
     if area is not None:
         yield ShapeLayer(
-            name="area", title="Area to survey", about="As asked for in the plan.", kind="polygon",
+            name="area", title="Area to survey", about="As given in the plan.", kind="polygon",
             shapes=[_pairs(np.array(part.exterior.coords)) for part in area.geoms],
             colour=_BLACK, dashed=True,
         )  # fmt: skip
@@ -73,8 +72,9 @@ def shape_layers(held: Held) -> Iterator[ShapeLayer]:
 
 
 def camera_place(row: Mapping[str, str]) -> Array:
-    """East and north of a row of the track; a model's own y and x stand for them."""
-    names = ("east_m", "north_m") if "east_m" in row else ("y", "x")
+    """East and north of a row of the track; a model's own x and y where it has no place."""
+    columns = (("east_m", "north_m"), ("x_m", "y_m"), ("x", "y"))
+    names = next(names for names in columns if names[0] in row)
     return np.array([number(row, name) for name in names])
 
 
@@ -118,14 +118,14 @@ def _footprints(held: Held) -> Iterator[tuple[Shape, str]]:
         return
     datum = _datum(held)
     for feature in read_json(file)["features"]:
-        facts: dict[str, Any] = feature["properties"]
-        for ring in feature["geometry"]["coordinates"]:
+        facts: dict[str, str] = feature["properties"]
+        for ring in (feature["geometry"] or {}).get("coordinates", []):
             corners = np.asarray(ring, dtype=np.float64)
             if datum is not None and held.frame.name == "ned":
                 level = np.column_stack([corners[:, 1::-1], np.zeros(len(corners))])
                 corners = datum.ned_from_geodetic(level)[:, 1::-1]
-            area = f"{float(facts['area_m2']):.2f} {held.unit}²"
-            yield _pairs(corners[:, :2]), f"{facts['image']}: {area}"
+            area = float(known_column([facts], "area_")[0])
+            yield _pairs(corners[:, :2]), f"{facts['image']}: {area:.2f} {held.unit}²"
 
 
 def _datum(held: Held) -> Datum | None:

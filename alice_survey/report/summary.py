@@ -85,8 +85,8 @@ def _how_well(figures: Figures) -> str:
     score, reference = figures.truth, figures.reference
     if score is not None:
         text += (
-            f" Against the truth the surface errs by "
-            f"{millimetres(score.surface.distance_rms_mm)} rms, lengths by "
+            f" Against the truth the surface is off by "
+            f"{millimetres(score.surface.distance_rms_mm)} rms and the scale by "
             f"{parts(1e-6 * score.cameras.scale_error_ppm)}; "
             f"{share(score.surface.completeness_within_px.get('3'))} of the area is within 3 "
             "ground pixels."

@@ -1,7 +1,7 @@
 """What is good, what to look at, what is bad: each with its number and what to do about it.
 
 Every limit is one of measurement: a share of what the survey itself says it can resolve (its pixel,
-its sigmas), or what the plan asked for.
+its sigmas), or what the plan requires.
 """
 
 import math
@@ -9,13 +9,21 @@ from collections.abc import Iterator
 
 from alice_survey.base.records import CalibrationReportRecord, FlightRecord
 from alice_survey.kit.document import Verdict, worst_first
-from alice_survey.kit.words import count, length, millimetres, parts, share
+from alice_survey.kit.words import (
+    count,
+    length,
+    length_with_sigma,
+    millimetres,
+    parts,
+    parts_with_sigma,
+    share,
+)
 from alice_survey.report.figures import Figures
 
 _SURE_SIGMAS = 3.0
 """From which a difference is no chance."""
 _HONEST = (0.7, 1.4)
-"""Errors over stated sigmas, root mean square, that are neither bold nor timid."""
+"""Errors over stated sigmas, root mean square, that are neither too large nor too small."""
 _LEAST_COVERED, _WELL_COVERED = 0.9, 0.99
 _LEAST_REGISTERED = 0.9
 _LEAST_STATIONS = 3.0
@@ -45,7 +53,7 @@ def _flight(figures: Figures) -> Iterator[Verdict]:
         return
     text = (
         f"flight: {flight.stations} of {flight.stations_planned} stations, "
-        f"{share(flight.coverage.share_at_overlap)} of the area pictured as often as requested"
+        f"{share(flight.coverage.share_at_overlap)} of the area pictured as often as required"
     )
     if flight.ending != "complete":
         yield Verdict(
@@ -139,7 +147,7 @@ def _scale(figures: Figures) -> Iterator[Verdict]:
         yield Verdict(level="good" if "rig" in source else "look", text=source)
         return
     off = 1.0 / navigation - 1.0
-    text = f"{source}; navigation's differs by {parts(-off)} +/- {parts(sigma).lstrip('+')}"
+    text = f"{source}; navigation's differs by {parts_with_sigma(-off, sigma)}"
     if abs(off) > _SURE_SIGMAS * sigma:
         yield Verdict(
             level="look",
@@ -166,8 +174,9 @@ def _shape(figures: Figures) -> Iterator[Verdict]:
         worst = max(bends, key=lambda bend: abs(bend.sag_m))
         yield Verdict(
             level="good",
-            text=f"bend of the model against navigation: {length(worst.sag_m)} +/- "
-            f"{length(worst.sag_sigma_m)} over {length(worst.length_m)}, so none is seen",
+            text="bend of the model against navigation: "
+            f"{length_with_sigma(worst.sag_m, worst.sag_sigma_m)} over "
+            f"{length(worst.length_m)}, so none is seen",
         )
 
 
@@ -221,12 +230,12 @@ def _truth(figures: Figures) -> Iterator[Verdict]:
         f"domed by {millimetres(surface.doming.dome_mm)}",
         action="" if good else "Look where on the map of errors.",
     )
-    over_sigma = None if surface.error_over_sigma is None else surface.error_over_sigma.rms
-    if over_sigma is not None:
-        honest = _HONEST[0] <= over_sigma <= _HONEST[1]
+    ratio = None if surface.error_over_sigma is None else surface.error_over_sigma.rms
+    if ratio is not None:
+        honest = _HONEST[0] <= ratio <= _HONEST[1]
         yield Verdict(
             level="good" if honest else "look",
-            text=f"heights err by {over_sigma:.2f} times their stated sigmas (1 is honest)",
+            text=f"errors of heights over their stated sigmas: {ratio:.2f} rms (1 is expected)",
             action="" if honest else "Multiply the stated sigmas by this factor where it matters.",
         )
 

@@ -156,5 +156,6 @@ def vehicle(name: str, coefficients: str = "calibrated") -> Vehicle:
         rigid_body=_rigid_body(GEOMETRIES[name]),
         coefficients=PAPER_SETS.get(coefficients) or _computed(name),
         thrusters=_thrusters(name),
+        hull=GEOMETRIES[name].hull,
         density_kg_m3=DENSITY,
     )

@@ -1,12 +1,41 @@
-"""Where the hull reaches lowest and farthest, for keeping it off the sea floor."""
+"""How far a vehicle's hull reaches from its origin, for keeping it off sea floor and zones."""
 
-HULL_BODY_M = (
-    (1.06, 0.0, 0.0),
-    (0.949, 0.0, 0.115),
-    (0.0, 0.0, 0.115),
-    (-0.611, 0.0, 0.115),
-    (-0.90, 0.0, 0.0),
-)
-"""Nose, keel below it, midships and at the tail, and tail: points of ALICE's outline
-(hydrodynamics/geometry.py) in the plane of symmetry. SPARUS II, 0.2 m shorter at either end or
-less, lies within. What hangs below it, DVL and port, is placed by a survey's settings."""
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from alice_survey.base.frames import Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hull:
+    """The reach of a hull; metres in the body, from the centre of buoyancy.
+
+    What hangs below it, DVL and ports, is placed by a survey's settings.
+    """
+
+    profile_body_m: tuple[tuple[float, float, float], ...]
+    """Points in the plane of symmetry, from the nose along the keel to the tail, between which the
+    lower side of the hull runs straight or inside."""
+    half_breadth_m: float
+    """To the outer edge of what is on either side."""
+
+    @property
+    def nose_m(self) -> float:
+        """How far it reaches ahead."""
+        return max(point[0] for point in self.profile_body_m)
+
+    @property
+    def tail_m(self) -> float:
+        """How far it reaches astern."""
+        return -min(point[0] for point in self.profile_body_m)
+
+    @cached_property
+    def points_body_m(self) -> Array:
+        """(P, 3) the profile, for compiled code."""
+        return np.array(self.profile_body_m, dtype=np.float64)
+
+
+POINT = Hull(profile_body_m=((0.0, 0.0, 0.0),), half_breadth_m=0.0)
+"""Of a vehicle whose shape is not given."""

@@ -29,7 +29,6 @@ from alice_survey.vehicle.dynamics import (
     scratch_for,
 )
 from alice_survey.vehicle.floor import FloorGrid, floor_depth
-from alice_survey.vehicle.hull import HULL_BODY_M
 from alice_survey.vehicle.navigation.sensors import DVL, FOLLOWED, Sensors
 from alice_survey.vehicle.navigation.state import NavigationState, new_navigation
 from alice_survey.vehicle.navigation.tick import LOG_ROW, log_row, navigation_tick
@@ -144,11 +143,12 @@ def _tell_truth(world: World, current: Current, time_s: float) -> None:
 def _touches(now: Array, sensors: Sensors, floor: FloorGrid) -> bool:
     """Whether hull, DVL or port is on the sea floor, or in it."""
     x, y, z, s = now[3], now[4], now[5], now[6]
-    for i in range(len(HULL_BODY_M) + 2):
-        if i < len(HULL_BODY_M):
-            a, b, c = HULL_BODY_M[i]
+    points = sensors.hull.shape[0]
+    for i in range(points + 2):
+        if i < points:
+            a, b, c = sensors.hull[i, 0], sensors.hull[i, 1], sensors.hull[i, 2]
         else:
-            k = DVL if i == len(HULL_BODY_M) else FOLLOWED
+            k = DVL if i == points else FOLLOWED
             a, b, c = sensors.place[k, 0], sensors.place[k, 1], sensors.place[k, 2]
         north = (1 - 2 * (y * y + z * z)) * a + 2 * (x * y - z * s) * b + 2 * (x * z + y * s) * c
         east = 2 * (x * y + z * s) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z - x * s) * c

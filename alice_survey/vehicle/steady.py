@@ -1,37 +1,29 @@
 """Steady motion: what thrusters must do, and the power they take, to keep a velocity.
 
-The same equations as in `dynamics` and `propulsion`, for many velocities at once in numpy, without
-compiled code: a planner asks for a few hundred of them and then no more. The vehicle is level; what
-rolls and pitches it is left to its weight, as in allocation. Surge, sway, heave and yaw are
-balanced exactly, the torque of propellers and the drag of jets included.
+The laws are those of `dynamics`, `propulsion` and `allocation`, called at many velocities: what a
+planner counts on is what the simulator flies. The vehicle is level; what rolls and pitches it is
+left to its weight, as in allocation. Surge, sway, heave and yaw are balanced exactly, the torque of
+propellers and the drag of jets included.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
 from alice_survey.base.frames import Array
-from alice_survey.vehicle.dynamics import Body
+from alice_survey.vehicle.allocation.exact import allocate_exact
+from alice_survey.vehicle.allocation.preference import AXIS_WEIGHTS, preference_weights
+from alice_survey.vehicle.allocation.scratch import AllocationScratch, allocation_scratch
+from alice_survey.vehicle.compiled import kernel
+from alice_survey.vehicle.dynamics import Body, add_coriolis, add_damping
 from alice_survey.vehicle.propulsion import (
-    ADVANCE,
-    ARM,
-    AXIS,
-    DISTRUST,
-    DRAG,
-    FORWARD,
-    HAND,
-    IDLE,
-    JET_AREA,
-    JET_CENTRE,
-    JET_LOSS,
-    KEPT,
     MOST,
-    REVERSE,
-    TORQUE_ADVANCE,
-    TORQUE_FORWARD,
-    TORQUE_REVERSE,
-    WATTS,
+    Propulsion,
+    add_thrust,
+    electrical_power,
+    speeds_for,
+    thrust_limits,
 )
 from alice_survey.vehicle.vehicle import Vehicle
 
@@ -40,12 +32,6 @@ BALANCED = (0, 1, 2, 5)
 _ROUNDS = 60
 _MISS_N = 1e-9
 """A wrench that is missed by no more, N and N m, is met."""
-_RANK = 1e-9
-"""Of the greatest: what is smaller is rounding."""
-_FAINT_N = 1e-12
-"""A jet weaker than this is none."""
-_MOST_EXPONENT = 9.0
-"""As in `allocation.preference`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -59,6 +45,17 @@ class SteadyFlight:
     load: Array
     """(N,) the hardest worked thruster's square of speed by the greatest it can turn at: 1 at its
     limit."""
+
+
+class _Room(NamedTuple):
+    """Room for one velocity."""
+
+    lower: Array
+    upper: Array
+    weights: Array
+    thrust: Array
+    target: Array
+    allocation: AllocationScratch
 
 
 def steady_flight(
@@ -81,187 +78,115 @@ def steady_flight(
         slips: leave out what no thruster can balance, instead of giving NaN: a vehicle without sway
             that turns is pushed sideways, and goes.
     """
-    plant = vehicle.plant
-    table = plant.propulsion.table
-    wanted = -water_force(plant.body, nu)
-    wanted[:, 2] -= plant.body.weight_n - plant.body.buoyancy_n
+    body, propulsion = vehicle.plant
+    nu = np.ascontiguousarray(nu, dtype=np.float64)
+    water = np.zeros((len(nu), 6))
+    _add_water(body, nu, water)
+    wanted = -water
+    wanted[:, 2] -= body.weight_n - body.buoyancy_n
     if nu_rate is not None:
-        wanted += nu_rate @ plant.body.mass
-    configuration = vehicle.configuration_matrix
-    asked = [axis for axis in BALANCED if np.any(np.abs(configuration[axis]) > 1e-12)]
-    target, spent = wanted[:, asked].copy(), np.zeros(len(nu), dtype=bool)
-    matrix = configuration[asked]
-    inverse, spare = _inverse(matrix, preference(table, nu[:, 0]))
-    lower, upper = limits(table, nu, share)
-    rps = np.zeros((len(nu), len(table)))
-    for _ in range(_ROUNDS):
-        thrust = _least_thrust(matrix, inverse, spare, target, lower, upper)
-        spent = np.any(np.isnan(thrust), axis=1)
-        rps = speeds_of(table, np.where(spent[:, None], 0.0, thrust), nu)
-        miss = (wanted - thruster_wrench(table, rps, nu))[:, asked]
-        miss[spent] = 0.0
-        if np.abs(miss).max(initial=0.0) <= _MISS_N:
-            break
-        target = target + miss
-    balanced = asked if slips else list(BALANCED)
-    off = np.abs(wanted - thruster_wrench(table, rps, nu))[:, balanced].max(axis=1)
-    lost = spent | (off > 1e3 * _MISS_N)
-    power, load = power_of(table, rps, nu).sum(axis=1), (rps / table[:, MOST]) ** 2
+        wanted += nu_rate @ body.mass
+    matrix = np.ascontiguousarray(vehicle.configuration_matrix)
+    axes = AXIS_WEIGHTS * np.any(np.abs(matrix) > 1e-12, axis=1)
+    n = len(vehicle.thrusters)
+    room = _Room(
+        lower=np.zeros(n), upper=np.zeros(n), weights=np.zeros(n), thrust=np.zeros(n),
+        target=np.zeros(6), allocation=allocation_scratch(n),
+    )  # fmt: skip
+    rps, power_w, made = np.zeros((len(nu), n)), np.zeros((len(nu), n)), np.zeros((len(nu), 6))
+    _keep(propulsion, matrix, axes, np.full(n, share), wanted, nu, room, made, rps, power_w)
+    balanced = np.flatnonzero(axes) if slips else list(BALANCED)
+    off = np.abs(wanted - made)[:, balanced].max(axis=1)
+    lost = ~(off <= 1e3 * _MISS_N)
+    load = (rps / propulsion.table[:, MOST]) ** 2
     return SteadyFlight(
         rps=np.where(lost[:, None], np.nan, rps),
-        power_w=np.where(lost, np.nan, power),
+        power_w=np.where(lost, np.nan, power_w.sum(axis=1)),
         load=np.where(lost, np.nan, load.max(axis=1)),
     )
 
 
 def drag_power(body: Body, nu: Array) -> Array:
     """Power, (N,) W, that the water takes from a body at velocities (N, 6) relative to it."""
-    power: Array = -np.sum(nu * _damping(body, nu), axis=1)
+    nu = np.ascontiguousarray(nu, dtype=np.float64)
+    force = np.zeros_like(nu)
+    _add_drag(body, nu, force)
+    power: Array = -np.sum(nu * force, axis=1)
     return power
 
 
-def water_force(body: Body, nu: Array) -> Array:
-    """Damping, body lift and Coriolis force, (N, 6), at velocities (N, 6): as in `dynamics`."""
-    momentum = nu @ body.mass
-    force = _damping(body, nu)
-    force[:, :3] -= np.cross(nu[:, 3:], momentum[:, :3])
-    force[:, 3:] -= np.cross(nu[:, :3], momentum[:, :3]) + np.cross(nu[:, 3:], momentum[:, 3:])
-    return force
+@kernel
+def _add_drag(body: Body, nu: Array, force: Array) -> None:
+    """Add damping and body lift at velocities (N, 6) to forces (N, 6)."""
+    for k in range(nu.shape[0]):
+        add_damping(body, nu[k], force[k])
 
 
-def _damping(body: Body, nu: Array) -> Array:
-    force: Array = nu @ body.linear.T + (nu * np.abs(nu)) @ body.quadratic.T
-    u, v, w = nu[:, 0], nu[:, 1], nu[:, 2]
-    force[:, 1] += body.lift[0] * np.abs(u) * v
-    force[:, 2] += body.lift[1] * np.abs(u) * w
-    force[:, 4] += body.lift[2] * u * w
-    force[:, 5] += body.lift[3] * u * v
-    return force
+@kernel
+def _add_water(body: Body, nu: Array, force: Array) -> None:
+    """Add damping, body lift and Coriolis force at velocities (N, 6) to forces (N, 6)."""
+    for k in range(nu.shape[0]):
+        add_damping(body, nu[k], force[k])
+        add_coriolis(body, nu[k], force[k])
 
 
-def preference(table: Array, surge_mps: Array) -> Array:
-    """Weights of thrusters, (N, n), at surge speeds (N,): as in `allocation.preference`."""
-    weights: Array = np.exp(
-        np.minimum(table[:, DISTRUST] * surge_mps[:, None] ** 2, _MOST_EXPONENT)
-    )
-    return weights
+@kernel
+def _keep(
+    propulsion: Propulsion,
+    matrix: Array,
+    axes: Array,
+    share: Array,
+    wanted: Array,
+    nu: Array,
+    room: _Room,
+    made: Array,
+    rps: Array,
+    power_w: Array,
+) -> None:
+    """Find thruster speeds whose wrench, jets and torques included, is the one wanted.
 
-
-def thruster_wrench(table: Array, rps: Array, nu: Array) -> Array:
-    """Force and moment, (N, 6), of thrusters at speeds (N, n): as `propulsion.add_thrust`."""
-    t, u = table, nu[:, :1]
-    along, size = _inflow(t, nu), np.abs(rps)
-    ahead = rps > 0.0
-    whole = size * (np.where(ahead, t[:, FORWARD], t[:, REVERSE]) * rps - t[:, ADVANCE] * along)
-    torque = np.where(ahead, t[:, TORQUE_FORWARD], t[:, TORQUE_REVERSE]) * rps
-    torque = -t[:, HAND] * size * (torque - t[:, TORQUE_ADVANCE] * along)
-    strength = np.maximum(np.abs(whole), _FAINT_N)
-    bent = whole * np.exp(-t[:, JET_LOSS] * u**2 / strength)
-    moment = np.copysign(t[:, JET_CENTRE], u) * (whole - bent)
-    ratio = np.abs(u) * np.sqrt(t[:, JET_AREA] / strength)
-    jet = t[:, DRAG] * np.exp(-t[:, DRAG + 1] * ratio)
-    jet = jet + t[:, DRAG + 2] * np.exp(-t[:, DRAG + 3] * ratio)
-    thrust = t[:, KEPT] * bent
-    axes, arms = t[:, AXIS : AXIS + 3], t[:, ARM : ARM + 3]
-    wrench = np.hstack([thrust @ axes, thrust @ arms + torque @ axes])
-    wrench[:, 0] -= jet.sum(axis=1) * (u * np.abs(u))[:, 0]
-    wrench[:, 4] -= moment @ axes[:, 2]
-    wrench[:, 5] += moment @ axes[:, 1]
-    return wrench
-
-
-def speeds_of(table: Array, thrust: Array, nu: Array) -> Array:
-    """Speeds, (N, n), that give thrusts (N, n): as `propulsion.speeds_for`."""
-    from scipy.special import lambertw
-
-    t = table
-    size = np.abs(thrust) / t[:, KEPT]
-    asked = size >= 1e-12
-    size = np.where(asked, size, 1.0)
-    loss: Any = t[:, JET_LOSS] * nu[:, :1] ** 2 / size
-    size = size * np.exp(np.asarray(lambertw(loss)).real)
-    ahead = thrust > 0.0
-    gain = np.where(ahead, t[:, FORWARD], t[:, REVERSE])
-    half = 0.5 * np.where(ahead, 1.0, -1.0) * t[:, ADVANCE] * _inflow(t, nu)
-    root = np.sqrt(half**2 + gain * size)
-    speed = np.where(half > 0.0, (half + root) / gain, size / (root - np.minimum(half, 0.0)))
-    speeds: Array = np.where(asked, np.where(ahead, speed, -speed), 0.0)
-    return speeds
-
-
-def power_of(table: Array, rps: Array, nu: Array) -> Array:
-    """Electrical power, (N, n) W, at speeds (N, n): as `propulsion.electrical_power`."""
-    t = table
-    gain = np.where(rps > 0.0, t[:, TORQUE_FORWARD], t[:, TORQUE_REVERSE])
-    torque = np.abs(rps) * (gain * rps - t[:, TORQUE_ADVANCE] * _inflow(t, nu))
-    power: Array = t[:, IDLE] + t[:, WATTS] * np.maximum(2.0 * np.pi * rps * torque, 0.0)
-    return power
-
-
-def limits(table: Array, nu: Array, share: float = 1.0) -> tuple[Array, Array]:
-    """Least and greatest thrust, (N, n), at a share of the greatest speed squared."""
-    ends = []
-    for sense in (-1.0, 1.0):
-        rps = np.broadcast_to(sense * np.sqrt(share) * table[:, MOST], (len(nu), len(table)))
-        gain = table[:, FORWARD] if sense > 0 else table[:, REVERSE]
-        thrust = np.abs(rps) * (gain * rps - table[:, ADVANCE] * _inflow(table, nu))
-        strength = np.maximum(np.abs(thrust), _FAINT_N)
-        thrust = thrust * np.exp(-table[:, JET_LOSS] * nu[:, :1] ** 2 / strength)
-        ends.append(table[:, KEPT] * thrust)
-    return np.minimum(ends[0], 0.0), np.maximum(ends[1], 0.0)
-
-
-def _inflow(table: Array, nu: Array) -> Array:
-    """Speed of the body through the water along each thruster's axis where it sits, (N, n)."""
-    inflow: Array = nu[:, :3] @ table[:, AXIS : AXIS + 3].T + nu[:, 3:] @ table[:, ARM : ARM + 3].T
-    return inflow
-
-
-def _inverse(matrix: Array, weights: Array) -> tuple[Array, Array]:
-    """What gives the thrust of least weighted square for a wrench, and what thrust makes none.
+    The wrench that is allocated is corrected by what was missed until nothing is; a row whose
+    allocation cannot be met is left with what it makes.
 
     Args:
-        matrix: (m, n) wrench per thrust.
-        weights: (N, n) of thrust squared.
-
-    Returns:
-        (N, n, m) thrust per wrench, and (k, n) thrusts that make no wrench.
+        propulsion: n thrusters.
+        matrix: (6, n) wrench per thrust.
+        axes: (6,) weights of the axes, 0 of one that no thruster has.
+        share: (n,) of each thruster's greatest speed squared.
+        wanted: (N, 6)
+        nu: (N, 6)
+        room: for one velocity.
+        made: (N, 6) wrench, is written.
+        rps: (N, n) is written.
+        power_w: (N, n) is written.
     """
-    _, singular, rows = np.linalg.svd(matrix)
-    rank = int(np.sum(singular > _RANK * singular[0])) if singular.size else 0
-    scale = 1.0 / np.sqrt(weights)
-    inverse: Array = scale[:, :, None] * np.linalg.pinv(matrix * scale[:, None, :], rcond=_RANK)
-    return inverse, rows[rank:]
-
-
-def _least_thrust(
-    matrix: Array, inverse: Array, spare: Array, wrench: Array, lower: Array, upper: Array
-) -> Array:
-    """Thrust of least weighted square that makes a wrench within its bounds.
-
-    One thruster more than axes leaves a line of solutions: the least is on it where the bounds cut
-    it off. With none to spare there is one solution.
-
-    Args:
-        matrix: (m, n) wrench per thrust.
-        inverse: as from `_inverse`.
-        spare: likewise.
-        wrench: (N, m)
-        lower: (N, n)
-        upper: (N, n)
-
-    Returns:
-        (N, n), NaN where no thrust within the bounds makes the wrench.
-    """
-    thrust: Array = np.einsum("knm,km->kn", inverse, wrench)
-    made = np.all(np.abs(thrust @ matrix.T - wrench) <= _RANK * (1.0 + np.abs(wrench)), axis=1)
-    if len(spare) == 1:
-        way = spare[0]
-        moves = np.abs(way) > _RANK
-        ends = np.stack([(lower - thrust)[:, moves], (upper - thrust)[:, moves]]) / way[moves]
-        least, most = ends.min(axis=0).max(axis=1), ends.max(axis=0).min(axis=1)
-        step = np.clip(0.0, least, np.maximum(most, least))
-        thrust = thrust + step[:, None] * way
-    slack = _RANK * (1.0 + np.abs(upper) + np.abs(lower))
-    within = np.all((thrust >= lower - slack) & (thrust <= upper + slack), axis=1)
-    return np.where((made & within)[:, None], thrust, np.nan)
+    n = matrix.shape[1]
+    for k in range(nu.shape[0]):
+        thrust_limits(propulsion, share, nu[k], room.lower, room.upper)
+        preference_weights(propulsion, nu[k, 0], room.weights)
+        for axis in range(6):
+            room.target[axis] = wanted[k, axis]
+        for _ in range(_ROUNDS):
+            allocate_exact(
+                matrix, room.target, room.lower, room.upper, axes, room.weights, room.thrust,
+                room.allocation,
+            )  # fmt: skip
+            speeds_for(propulsion, room.thrust, nu[k], rps[k])
+            for axis in range(6):
+                made[k, axis] = 0.0
+            add_thrust(propulsion, rps[k], nu[k], made[k])
+            worst = 0.0
+            beyond = False
+            for axis in range(6):
+                if axes[axis] > 0.0:
+                    allocated = 0.0
+                    for i in range(n):
+                        allocated += matrix[axis, i] * room.thrust[i]
+                    slack = _MISS_N * (1.0 + abs(room.target[axis]))
+                    beyond = beyond or abs(allocated - room.target[axis]) > slack
+                    miss = wanted[k, axis] - made[k, axis]
+                    worst = max(worst, abs(miss))
+                    room.target[axis] += miss
+            if beyond or worst <= _MISS_N:
+                break
+        electrical_power(propulsion, rps[k], nu[k], power_w[k])

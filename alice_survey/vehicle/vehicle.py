@@ -10,6 +10,7 @@ from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.coefficients import Coefficients
 from alice_survey.vehicle.dynamics import GRAVITY, Body, Plant
+from alice_survey.vehicle.hull import POINT, Hull
 from alice_survey.vehicle.propulsion import Thruster, pack
 
 
@@ -69,6 +70,8 @@ class Vehicle:
     rigid_body: RigidBody
     coefficients: Coefficients
     thrusters: tuple[Thruster, ...]
+    hull: Hull = POINT
+    """How far it reaches; nothing but its origin of one that is not to be flown."""
     density_kg_m3: float = 1025.0
 
     @cached_property

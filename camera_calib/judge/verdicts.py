@@ -57,12 +57,22 @@ def _fit_verdicts(judged: Judgement) -> Iterator[Verdict]:
     outliers = sum(p.outliers for p in judged.pictures)
     points = sum(p.points for p in judged.pictures)
     if odd:
-        listed = ", ".join(f"{p.view} {p.camera} ({p.rms_px:.2f} px)" for p in odd[:5])
+        listed = ", ".join(
+            f"view {p.view} of the {p.camera} camera at {p.rms_px:.3f} px" for p in odd[:5]
+        )
         rest = f" and {len(odd) - 5} more" if len(odd) > 5 else ""
+        held = judged.hold_out
+        harmless = held is not None and held.rms_px <= _HELD_LOOK * held.expected_px
         yield Verdict(
-            level="look",
+            level="good" if harmless else "look",
             text=f"pictures that fit {_ODD_PICTURE:g} times worse than the median of {usual:.3f} "
-            f"px: {listed}{rest}; look at them for blur, motion or a bent target",
+            f"px: {listed}{rest}; "
+            + (
+                "views that were held out fit as well as noise and covariance promise, so that "
+                "these do no harm"
+                if harmless
+                else "look at them for blur, motion or a bent target"
+            ),
         )
     else:
         yield Verdict(level="good", text=f"all pictures fit alike (median {usual:.3f} px rms)")

@@ -9,8 +9,8 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from alice_survey.vehicle.limits import SPOT_RAD_S
 from missions.exports.waypoints import Waypoint
-from missions.values.costs import time_costs
 from missions.values.plan_file import Plan
 
 FRAME_GLOBAL, FRAME_MISSION, FRAME_ABOVE_HOME, FRAME_ABOVE_TERRAIN = 0, 2, 3, 10
@@ -36,15 +36,18 @@ class Item:
     degrees, and altitude, metres."""
 
 
-def mission_items(plan: Plan, points: Sequence[Waypoint], tolerance_m: float) -> list[Item]:
+def mission_items(
+    plan: Plan, points: Sequence[Waypoint], tolerance_m: float, turn_rate_rad_s: float = SPOT_RAD_S
+) -> list[Item]:
     """All items of a dive, without home.
 
     Args:
         plan: what the dive is of.
         points: the dive's way-points.
         tolerance_m: how near to pass; ArduSub takes its parameter WPNAV_RADIUS instead.
+        turn_rate_rad_s: of turns on the spot.
     """
-    return list(_items(plan, points, tolerance_m))
+    return list(_items(plan, points, tolerance_m, math.degrees(turn_rate_rad_s)))
 
 
 def trigger_m(plan: Plan, line: int) -> float:
@@ -55,8 +58,9 @@ def trigger_m(plan: Plan, line: int) -> float:
     return (math.ceil(wanted.length_m / (wanted.stations - 1) * 1e4 - 1e-6) - 1) / 1e4
 
 
-def _items(plan: Plan, points: Sequence[Waypoint], tolerance_m: float) -> Iterator[Item]:
-    rate_deg_s = math.degrees(time_costs(plan.speed_mps).turn_rate_rad_s)
+def _items(
+    plan: Plan, points: Sequence[Waypoint], tolerance_m: float, rate_deg_s: float
+) -> Iterator[Item]:
     speed = _command(DO_CHANGE_SPEED, 1, plan.speed_mps, -1)  # over ground; throttle as it is
     yield speed
     heading_deg = math.degrees(points[0].heading_rad)

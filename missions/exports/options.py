@@ -2,8 +2,9 @@
 
 from dataclasses import dataclass
 
-from alice_survey.base.config import CameraConfig
+from alice_survey.base.config import CameraConfig, PlanConfig
 from alice_survey.base.errors import PlanError
+from alice_survey.vehicle.limits import SPOT_RAD_S, spot_rate_rad_s
 from camera_calib.rig import Rig
 from missions.values.footprint import common_swath
 from missions.values.plan_file import Plan
@@ -25,12 +26,23 @@ class Options:
     """COLA2: the service (without arguments) that starts pictures."""
     camera_off: str = "camera_trigger/disable"
     least_tolerance_m: float = _LEAST_TOLERANCE_M
+    turn_rate_rad_s: float = SPOT_RAD_S
+    """Of turns on the spot, which way-points wait for."""
 
     def __post_init__(self) -> None:
         if self.least_tolerance_m <= 0 or self.pixel_um <= 0:
             raise PlanError("a tolerance and a pixel are larger than 0")
         if not self.camera_on or not self.camera_off:
             raise PlanError("name the services that switch pictures on and off")
+
+
+def options_of(camera: CameraConfig, plan: PlanConfig) -> Options:
+    """The options that a survey's settings give."""
+    return Options(
+        altimeter_body_m=camera.dvl_position_body_m,
+        pixel_um=camera.pixel_um,
+        turn_rate_rad_s=spot_rate_rad_s(plan.turn_rate_limit_deg_s),
+    )
 
 
 def line_tolerance_m(plan: Plan, rig: Rig, options: Options) -> float:

@@ -9,9 +9,10 @@ import numpy as np
 
 from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import Array
+from alice_survey.vehicle.limits import SPOT_RAD_S
+from missions.exports.geometry import chords
 from missions.exports.mount import Mount
-from missions.exports.places import chords
-from missions.values.costs import time_costs
+from missions.values.costs import SETTLE_S
 from missions.values.legs import Leg
 from missions.values.plan_file import Dive, Plan
 
@@ -68,7 +69,10 @@ class _Point:
 
 
 def waypoints(
-    plan: Plan, dive: Dive, mount: Mount, line_depths: Sequence[Array] | None = None
+    plan: Plan,
+    dive: Dive,
+    mount: Mount,
+    turn_rate_rad_s: float = SPOT_RAD_S,
 ) -> tuple[Waypoint, ...]:
     """The way-points of a dive, from the surface to the surface.
 
@@ -79,16 +83,15 @@ def waypoints(
         plan: whose dive it is.
         dive: one of the plan's.
         mount: of the camera on the vehicle.
-        line_depths: of each of the plan's lines the glass's depth at its stations, (stations,);
-            without it the plan's own, or its altitude over a level sea floor.
+        turn_rate_rad_s: of turns on the spot.
 
     Raises:
         PlanError: depths do not fit the lines.
     """
-    depths = _depths(plan, line_depths)
+    depths = _depths(plan)
     if not dive.route.legs:
         raise PlanError("a dive has no legs: plan again")
-    points = _switched(list(_points(plan, dive, depths)))
+    points = _switched(list(_points(plan, dive, turn_rate_rad_s, depths)))
     points = _with_depths(points, plan, depths)
     glass_ne = np.array([point.place_ne_m for point in points])
     headings = np.array([point.heading_rad for point in points])
@@ -123,15 +126,18 @@ def waypoints(
 
 
 def all_waypoints(
-    plan: Plan, mount: Mount, line_depths: Sequence[Array] | None = None
+    plan: Plan,
+    mount: Mount,
+    turn_rate_rad_s: float = SPOT_RAD_S,
 ) -> list[tuple[Waypoint, ...]]:
     """The way-points of each dive."""
-    return [waypoints(plan, dive, mount, line_depths) for dive in plan.dives]
+    return [waypoints(plan, dive, mount, turn_rate_rad_s) for dive in plan.dives]
 
 
-def _points(plan: Plan, dive: Dive, line_depths: Sequence[Array] | None) -> Iterator[_Point]:
+def _points(
+    plan: Plan, dive: Dive, turn_rate_rad_s: float, line_depths: Sequence[Array] | None
+) -> Iterator[_Point]:
     """Where each leg leads, in order."""
-    costs = time_costs(plan.speed_mps)  # the planner's own figures of turning and settling
     legs = dive.route.legs
     first = legs[0]
     yield _Point(
@@ -145,7 +151,7 @@ def _points(plan: Plan, dive: Dive, line_depths: Sequence[Array] | None) -> Iter
         heading = leg.end_heading_rad + leg.side_rad
         if leg.length_m <= _TINY_M:
             if leg.turn_rad:
-                hold_s = abs(leg.turn_rad) / costs.turn_rate_rad_s + costs.settle_s
+                hold_s = abs(leg.turn_rad) / turn_rate_rad_s + SETTLE_S
                 yield _Point(
                     kind="turn", place_ne_m=leg.start_ne_m, heading_rad=heading, hold_s=hold_s
                 )
@@ -157,7 +163,7 @@ def _points(plan: Plan, dive: Dive, line_depths: Sequence[Array] | None) -> Iter
                 kind="sway",
                 place_ne_m=leg.end_ne_m,
                 heading_rad=heading,
-                hold_s=costs.settle_s,
+                hold_s=SETTLE_S,
             )
         elif leg.curvature_per_m:
             yield from _arc_points(leg)
@@ -280,12 +286,11 @@ def _with_depths(
     return [replace(p, glass_depth_m=float(d)) for p, d in zip(points, levels, strict=True)]
 
 
-def _depths(plan: Plan, line_depths: Sequence[Array] | None) -> list[Array] | None:
+def _depths(plan: Plan) -> list[Array] | None:
     """Depths of the glass at each line's stations; None over a level sea floor."""
-    given = plan.line_depths_m if line_depths is None else line_depths
-    if line_depths is None and not plan.line_depths_m:
+    if not plan.line_depths_m:
         return None
-    depths = [np.asarray(row, dtype=np.float64) for row in given]
+    depths = [np.asarray(row, dtype=np.float64) for row in plan.line_depths_m]
     stations, wanted = [len(row) for row in depths], [line.stations for line in plan.lines]
     if stations != wanted:
         raise PlanError(

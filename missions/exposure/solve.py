@@ -9,6 +9,7 @@ from typing import Any
 from alice_survey.base.config import PlanConfig
 from alice_survey.base.errors import AliceError, ConfigError, PlanError
 from alice_survey.base.text_table import text_table
+from alice_survey.vehicle.limits import spot_rate_rad_s
 from camera_calib.fov.table import json_row
 from missions.exposure.conflicts import Way, conflict
 from missions.exposure.footprints import altitude_for_pixel_m, footprint_at, pixel_on_floor_m
@@ -228,7 +229,8 @@ def turn_s(plan: PlanConfig, spacing_m: float) -> float:
     three arcs `R (pi + 4 acos((2 R + s) / (4 R)))`; on the spot: two right angles and the way
     between. `turns = "auto"` takes the quicker.
     """
-    costs, radius = time_costs(plan.speed_mps), plan.turn_radius_m
+    rate_rad_s = spot_rate_rad_s(plan.turn_rate_limit_deg_s)
+    costs, radius = time_costs(plan.speed_mps, turn_rate_rad_s=rate_rad_s), plan.turn_radius_m
     if spacing_m >= 2 * radius:
         arcs = math.pi * radius + spacing_m - 2 * radius
     else:

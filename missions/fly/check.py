@@ -187,6 +187,7 @@ def _write(folder: Path, check: Check, data: dict[str, Any]) -> None:
 
 def _write_refly(folder: Path, check: Check, config: SurveyConfig) -> dict[str, Any] | None:
     """Plan the holes again, as a workspace to fly in; None where that cannot be done."""
+    from missions.exports.options import options_of
     from missions.exports.write import write_exports
     from missions.fly.refly import refly_plan
 
@@ -204,14 +205,16 @@ def _write_refly(folder: Path, check: Check, config: SurveyConfig) -> dict[str, 
         settings={
             "camera": config.camera.model_dump(mode="json"),
             "water": config.water.model_dump(mode="json"),
+            "plan": config.plan.model_dump(mode="json"),
             "refly_of": check.plan.name,
-            "plan": hashlib.blake2b(text.encode(), digest_size=16).hexdigest(),
+            "digest": hashlib.blake2b(text.encode(), digest_size=16).hexdigest(),
         },
     )
 
     def work(part: Path) -> None:
         write_json(part / "plan.json", values)
-        write_exports(part / "exports", plan, check.rig)
+        options = options_of(config.camera, config.plan)
+        write_exports(part / "exports", plan, check.rig, options=options)
 
     run_stage(refly, stage, work)
     return {

@@ -12,6 +12,7 @@ from alice_survey.base.frames import Array, rotation_from_attitude
 from alice_survey.base.trajectory import Trajectory
 from alice_survey.vehicle import signals
 from alice_survey.vehicle.floor import FloorGrid, floor_depth
+from alice_survey.vehicle.limits import spot_rate_rad_s
 from alice_survey.vehicle.navigation import tick as navigation
 from alice_survey.vehicle.navigation.sensors import (
     CompassSpec,
@@ -23,7 +24,7 @@ from alice_survey.vehicle.navigation.sensors import (
 from alice_survey.vehicle.pilot.gains import gains_for
 from alice_survey.vehicle.pilot.memory import LINE, PHASE, REASON
 from alice_survey.vehicle.pilot.safety import NONE, REASONS, Limits
-from alice_survey.vehicle.pilot.settings import SPOT_RAD_S, pilot_guidance
+from alice_survey.vehicle.pilot.settings import pilot_guidance
 from alice_survey.vehicle.sea import (
     Current,
     Disturbance,
@@ -144,7 +145,7 @@ def mission_setup(
         config.vehicle.controller,
         most_depth_m=deepest_m,
         point_body_m=config.camera.position_body_m,
-        spot_rad_s=min(SPOT_RAD_S, math.radians(config.plan.turn_rate_limit_deg_s)),
+        spot_rad_s=spot_rate_rad_s(config.plan.turn_rate_limit_deg_s),
         limits=Limits(
             0.5 * plan.altitude_m,
             deepest_m,
@@ -164,7 +165,7 @@ def mission_setup(
         path=path,
         guidance=guidance,
         gains=gains,
-        sensors=sensors_of(config).pack(),
+        sensors=sensors_of(config).pack(craft.hull),
         floor=floor,
         current=current_of(config.sea, plan.seafloor_depth_m, longest_s, rng),
         disturbance=Disturbance(

@@ -21,7 +21,7 @@ from alice_survey.base.frames import Array
 from camera_calib.rig import Rig
 from missions.areas.bathymetry import Bathymetry
 from missions.coverage.certificate import Certificate
-from missions.exports.footprints import footprint_outline, footprints_ne
+from missions.exports.geometry import footprint_outline, footprints_ne
 from missions.values.plan_file import Plan
 
 _AREA, _WAY, _NO_GO, _ALLOWED = "#c8553d", "#7f8c8d", "#b03a2e", "#566573"

@@ -19,8 +19,7 @@ from alice_survey.base.frames import Array
 from camera_calib.rig import Rig
 from missions.areas.bathymetry import Bathymetry
 from missions.coverage.certificate import Certificate
-from missions.exports.footprints import footprint_outline
-from missions.exports.places import rings_ne, route_ne
+from missions.exports.geometry import footprint_outline, rings_ne, route_ne
 from missions.values.plan_file import Plan
 
 KINDS = ("survey", "cross", "closing", "fill")

@@ -16,6 +16,8 @@ from shapely.geometry import Point
 
 from alice_survey.base.config import AreaConfig, PlanConfig, SurveyConfig
 from alice_survey.base.errors import PlanError, heard, warn
+from alice_survey.vehicle.hull import Hull
+from camera_calib.flat_port import FlatPortCamera
 from camera_calib.rig import Rig
 from missions.areas.bathymetry import Bathymetry, area_depth, read_bathymetry
 from missions.areas.survey import survey_area
@@ -34,10 +36,9 @@ from missions.lines.sweep import Sweep, best_heading
 from missions.plan.rows import plan_rows
 from missions.plan.strength import arcs_fit, survey_costs, turn_rate_deg_s
 from missions.route.dives import split_dives
-from missions.route.energy import usable_wh
+from missions.route.energy import sound_craft_of, usable_wh
 from missions.route.terrain import (
-    HALF_BREADTH_M,
-    TAIL_M,
+    Reach,
     TerrainLimits,
     line_profiles,
     reach_of,
@@ -97,7 +98,8 @@ def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
         bathymetry = area_bathymetry(config.area, area, wanted.altitude_m)
         _check_smallest(area, imaging)
         _warn_of_spacing(wanted, imaging, stereo)
-        _warn_of_zones(area, config.area.no_go_clearance_m, config.camera.position_body_m)
+        hull, glass_body_m = sound_craft_of(config.vehicle).hull, config.camera.position_body_m
+        _warn_of_zones(area, config.area.no_go_clearance_m, hull, glass_body_m)
         depth_m = _depth_m(config.area, area, bathymetry)
         _check_depth(wanted.altitude_m, depth_m)
         ways, home = Ways(area.allowed), _home(wanted.home_ne_m, area)
@@ -139,8 +141,14 @@ def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
             depth_m=depth_m - wanted.altitude_m,
             split=wanted.split_dives,
         )
-        glass_body_m = config.camera.position_body_m
-        terrain = _terrain(lines, wanted, glass_body_m, rig, stereo, pattern, bathymetry)
+        reach = reach_of(
+            hull,
+            glass_body_m,
+            max(stereo.port_m, stereo.starboard_m),
+            max(stereo.ahead_m, stereo.astern_m),
+        )
+        camera = rig.cameras[rig.reference]
+        terrain = _terrain(lines, wanted, reach, pattern, camera, bathymetry)
         plan = Plan(
             name=config.name,
             area=area,
@@ -269,9 +277,13 @@ class _Terrain:
 
 
 def _terrain(
-    lines: Sequence[Line], wanted: PlanConfig, glass_body_m: tuple[float, float, float], rig: Rig,
-    stereo: Swath, pattern: Pattern, bathymetry: Bathymetry | None,
-) -> _Terrain:  # fmt: skip
+    lines: Sequence[Line],
+    wanted: PlanConfig,
+    reach: Reach,
+    pattern: Pattern,
+    camera: FlatPortCamera,
+    bathymetry: Bathymetry | None,
+) -> _Terrain:
     if bathymetry is None:
         return _Terrain()
     limits = TerrainLimits(
@@ -279,9 +291,6 @@ def _terrain(
         least_clearance_m=wanted.least_clearance_m,
         steepest_rad=math.radians(wanted.steepest_deg),
     )
-    across_m = max(stereo.port_m, stereo.starboard_m)
-    along_m = max(stereo.ahead_m, stereo.astern_m)
-    reach = reach_of(glass_body_m, across_m, along_m)
     profiles = line_profiles(lines, bathymetry, reach, limits)
     text, figures = terrain_report(
         lines,
@@ -290,7 +299,7 @@ def _terrain(
         relief_m=wanted.relief_m,
         spacing_m=pattern.spacing_m,
         step_m=pattern.step_m,
-        extent_m=partial(footprint_size_m, rig.cameras[rig.reference]),
+        extent_m=partial(footprint_size_m, camera),
     )
     depths = tuple(tuple(round(float(d), 4) for d in p.depth_m) for p in profiles)
     return _Terrain(depths_m=depths, text=text, figures=figures)
@@ -344,11 +353,11 @@ def _check_smallest(area: Area, imaging: ImagingSettings) -> None:
 
 
 def _warn_of_zones(
-    area: Area, clearance_m: float, glass_body_m: tuple[float, float, float]
+    area: Area, clearance_m: float, hull: Hull, glass_body_m: tuple[float, float, float]
 ) -> None:
     """The allowed area holds the camera: the hull behind it reaches farther."""
     forward_m, right_m, _ = glass_body_m
-    behind_m = math.hypot(TAIL_M + forward_m, HALF_BREADTH_M + abs(right_m))
+    behind_m = math.hypot(hull.tail_m + forward_m, hull.half_breadth_m + abs(right_m))
     if not area.no_go.is_empty and clearance_m < behind_m:
         warn(
             f"the camera is kept {clearance_m:g} m off the no-go zones, the hull "

@@ -8,8 +8,8 @@ from alice_survey.base.artefacts import write_json
 from alice_survey.base.config import SeaConfig, SurveyConfig
 from alice_survey.base.run import progress
 from camera_calib.rig import Rig, design_rig
-from missions.exports.options import Options
-from missions.exports.write import about_file, write_exports
+from missions.exports.options import Options, options_of
+from missions.exports.write import write_exports
 from missions.exposure.table import settings_table
 from missions.exposure.timetable import trigger_table, write_timetable
 from missions.plan.map import draw_plan
@@ -30,9 +30,7 @@ def run_plan(workspace: Path, config: SurveyConfig, threads: int, folder: Path) 
     """
     rig = design_rig(config.camera, config.water)
     planned = plan_survey(config, rig)
-    options = Options(
-        altimeter_body_m=config.camera.dvl_position_body_m, pixel_um=config.camera.pixel_um
-    )
+    options = options_of(config.camera, config.plan)
     write_planned(folder, planned, rig, options, config.sea)
 
 
@@ -66,7 +64,7 @@ def write_planned(
         bathymetry=planned.bathymetry,
         sea=sea,
         warnings=planned.warnings,
-        links=[Link(href=f"exports/{file.name}", about=about_file(file)) for file in files],
+        links=[Link(href=f"exports/{file.name}", about=about) for file, about in files.items()],
     )
 
 

@@ -35,10 +35,11 @@ from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.files import coefficients_from_file
 from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.limits import STEP_MPS, spot_rate_rad_s
 from alice_survey.vehicle.pilot.gains import STEADY_SHARE
 from alice_survey.vehicle.steady import steady_flight
 from alice_survey.vehicle.vehicle import Vehicle
-from missions.values.costs import SETTLE_S, SPOT_RAD_S, STEP_MPS, Costs
+from missions.values.costs import SETTLE_S, Costs
 
 Manner = Literal["held", "crab"]
 """Of meeting a current from the side: heading held, by sway; or heading turned into it."""
@@ -65,6 +66,8 @@ class FlightConditions:
     current_ne_mps: Array
     """(2,) mean of the current that is expected."""
     turn_radius_m: float
+    most_spot_rad_s: float
+    """Rate of turns on the spot, if the vehicle has the thrust for it."""
     glass_body_m: tuple[float, float, float]
     """The left port's outer glass, about which a vehicle with sway turns."""
     hotel_w: float
@@ -95,6 +98,7 @@ def flight_conditions(config: SurveyConfig) -> FlightConditions:
         line_heading_deg=plan.line_heading_deg,
         current_ne_mps=expected_current(config.sea, config.area.seafloor_depth_m - plan.altitude_m),
         turn_radius_m=plan.turn_radius_m,
+        most_spot_rad_s=spot_rate_rad_s(plan.turn_rate_limit_deg_s),
         glass_body_m=config.camera.position_body_m,
         hotel_w=config.vehicle.hotel_w,
     )
@@ -364,11 +368,11 @@ def _turning_power(conditions: FlightConditions, speeds_mps: Array, rates_rad_s:
 
 def _spot(conditions: FlightConditions) -> tuple[float, float]:
     """Power on the spot, of turning through a quarter and settling; and the rate of turning."""
-    rates = SPOT_RAD_S * np.append(_RATES, 0.0)
+    rates = conditions.most_spot_rad_s * np.append(_RATES, 0.0)
     power = _turning_power(conditions, np.zeros(len(rates)), rates)
     can = np.flatnonzero(np.isfinite(power[:-1]))
     if not len(can):
-        return math.inf, SPOT_RAD_S
+        return math.inf, conditions.most_spot_rad_s
     rate = float(rates[can[0]])
     turning_s = math.pi / 2 / rate
     joules = power[can[0]] * turning_s + power[-1] * SETTLE_S

@@ -21,13 +21,10 @@ import numpy as np
 
 from alice_survey.base.errors import PlanError, warn
 from alice_survey.base.frames import Array
+from alice_survey.vehicle.hull import Hull
 from missions.areas.bathymetry import Bathymetry
 from missions.values.line import Line
 
-NOSE_M, TAIL_M = 0.8545, 0.734
-"""Ends of the hull from its centre of buoyancy (public model of SPARUS II in Stonefish)."""
-HALF_BREADTH_M = 0.226
-"""To the outer edge of the thruster pods (the same model)."""
 _CHUNK = 200_000
 _PER_CELL = 2.0
 """Places looked at per cell of the bathymetry, each way."""
@@ -96,19 +93,22 @@ class DepthProfile:
         return slopes
 
 
-def reach_of(glass_body_m: Sequence[float], half_swath_m: float, half_along_m: float) -> Reach:
+def reach_of(
+    hull: Hull, glass_body_m: Sequence[float], half_swath_m: float, half_along_m: float
+) -> Reach:
     """The reach of a hull and of the pictures.
 
     Args:
+        hull: of the vehicle.
         glass_body_m: place of the glass in the body.
         half_swath_m: what pictures see to the farther side of a line.
         half_along_m: what a picture sees ahead or astern, the farther.
     """
     forward_m, right_m = float(glass_body_m[0]), float(glass_body_m[1])
     return Reach(
-        ahead_m=max(NOSE_M - forward_m, half_along_m),
-        astern_m=max(TAIL_M + forward_m, half_along_m),
-        beside_m=max(HALF_BREADTH_M + abs(right_m), half_swath_m),
+        ahead_m=max(hull.nose_m - forward_m, half_along_m),
+        astern_m=max(hull.tail_m + forward_m, half_along_m),
+        beside_m=max(hull.half_breadth_m + abs(right_m), half_swath_m),
     )
 
 

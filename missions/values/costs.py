@@ -1,6 +1,5 @@
 """What flying costs, by course: electrical power of the whole vehicle along lines and between."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -8,11 +7,8 @@ import numpy as np
 
 from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import Array
+from alice_survey.vehicle.limits import SPOT_RAD_S, STEP_MPS
 
-SPOT_RAD_S = math.radians(15.0)
-"""Rate of a turn on the spot, if the vehicle has the thrust for it; as the pilot flies it."""
-STEP_MPS = 0.15
-"""Speed of a sway step, likewise."""
 SETTLE_S = 6.5
 """That a stop takes beside its motion: braking, getting steady, under way again. Measured in the
 simulator with exact navigation: ALICE turns by 90 degrees at 15 deg/s in 7.3 s and by 180 in

@@ -64,7 +64,14 @@ class Dive:
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What to fly and how to take pictures; `plan.json`."""
+    """What to fly and how to take pictures; `plan.json`.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> plan = alice.Survey.new("shoal", example="demo").plan()
+        >>> f"{plan.forward_overlap:.0%} along lines of {plan.altitude_m} m altitude"
+        '62% along lines of 2.0 m altitude'
+    """
 
     name: str
     area: Area
@@ -150,6 +157,12 @@ def read_plan(path: str | Path) -> Plan:
     Raises:
         PlanError: it is no plan, or lacks something.
         WorkspaceError: it is missing or no JSON.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> plan = alice.read_plan("small/plan/plan.json")
+        >>> len(plan.dives)
+        1
     """
     path = Path(path)
     data = read_json(path)

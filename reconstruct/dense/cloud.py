@@ -1,7 +1,6 @@
 """The coloured point cloud: points of all views, averaged in small cubes, as PLY and LAZ."""
 
 import math
-import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import date
@@ -15,19 +14,14 @@ from alice_survey.base.compiled import compiled
 from alice_survey.base.records import CloudRecord
 from reconstruct.dense.dem import bin_points, sorted_ranks
 from reconstruct.dense.points import Points
+from reconstruct.ply import VERTEX as MESH_VERTEX
+from reconstruct.ply import write_ply
 from reconstruct.raster import DemGrid
 from reconstruct.views.model import WorldFrame
 
 Float32 = NDArray[np.float32]
 
-VERTEX = np.dtype(
-    [
-        ("x", "<f4"), ("y", "<f4"), ("z", "<f4"),
-        ("nx", "<f4"), ("ny", "<f4"), ("nz", "<f4"),
-        ("red", "u1"), ("green", "u1"), ("blue", "u1"),
-        ("sigma", "<f4"),
-    ]
-)  # fmt: skip
+VERTEX = np.dtype([*MESH_VERTEX.descr, ("sigma", "<f4")])
 """One point: x east, y north, z up from the cloud's offset, normal, colour, standard deviation."""
 _LAZ_STEP = 1e-4
 _LAZ_EXTRA = {
@@ -38,7 +32,6 @@ _LAZ_EXTRA = {
 }
 _NO_DATE = date(2000, 1, 1)
 """The same bytes on every day."""
-_PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
 
 
 @compiled
@@ -133,35 +126,16 @@ def voxel_edge(cell: float, cells: int, most_points: int) -> float:
     return cell * max(1.0, math.sqrt(cells / most_points))
 
 
-def write_ply(
+def write_cloud(
     path: Path, parts: Iterable[NDArray[Any]], offset_enu: Sequence[float], frame: WorldFrame
 ) -> int:
-    """Write a binary PLY from parts that are dropped once written.
-
-    Returns:
-        How many points were written.
-    """
-    body = path.with_suffix(".body")
-    count = 0
-    with body.open("wb") as file:
-        for part in parts:
-            file.write(part.tobytes())
-            count += len(part)
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"comment offset_east_north_up {' '.join(repr(float(o)) for o in offset_enu)}",
-        f"comment frame {frame.name}, unit {frame.unit}, x east, y north, z up",
-        f"comment vertical datum: {frame.vertical_datum}",
-        f"element vertex {count}",
-        *(f"property {_PLY_TYPES[VERTEX[name].str]} {name}" for name in VERTEX.names or ()),
-        "end_header",
+    """Write parts of `VERTEX` records as a PLY; return how many points there are."""
+    comments = [
+        f"offset_east_north_up {' '.join(repr(float(o)) for o in offset_enu)}",
+        f"frame {frame.name}, unit {frame.unit}, x east, y north, z up",
+        f"vertical datum: {frame.vertical_datum}",
     ]
-    with path.open("wb") as file, body.open("rb") as source:
-        file.write(("\n".join(header) + "\n").encode("ascii", "replace"))
-        shutil.copyfileobj(source, file)
-    body.unlink()
-    return count
+    return write_ply(path, parts, comments)
 
 
 @contextmanager

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.compiled import compiled
+from alice_survey.base.robust import MAD_TO_SIGMA
 from reconstruct.dense.points import Points
 from reconstruct.raster import DemGrid
 
@@ -116,7 +117,7 @@ def fuse_cells(
 ) -> tuple[Float32, Float32, NDArray[np.uint16], NDArray[np.uint8]]:
     """Robust height of each cell: the weighted mean of what lies near the median.
 
-    The gate around the median is `gate` times the larger of the scatter (1.4826 MAD) and the
+    The gate around the median is `gate` times the larger of the scatter (from the MAD) and the
     median's own sigma. The standard deviation adds the formal one of independent views to the
     scatter over the square root of the number of views: pixels of one view err together.
 
@@ -158,9 +159,9 @@ def fuse_cells(
             misses[i] = abs(values[i] - median)
         ranks = sorted_ranks(misses)
         middle = values.size // 2
-        scatter = 1.4826 * misses[ranks[middle]]
+        scatter = MAD_TO_SIGMA * misses[ranks[middle]]
         if values.size % 2 == 0:
-            scatter = 0.5 * (scatter + 1.4826 * misses[ranks[middle - 1]])
+            scatter = 0.5 * (scatter + MAD_TO_SIGMA * misses[ranks[middle - 1]])
         reach = gate * max(scatter, sigmas[first + median_at])
         total, weights, squares = 0.0, 0.0, 0.0
         formal, in_view, view_weight, seen, last_view = 0.0, 0, 0.0, 0, -1

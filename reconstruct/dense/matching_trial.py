@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from alice_survey.base.executor import parallel_map
 from alice_survey.base.frames import Array
+from alice_survey.base.robust import MAD_TO_SIGMA
 from reconstruct.dense.depth import MATCH_SIGMA_PX, pair_depth
 from reconstruct.dense.stereo_pairs import StereoPair
 from reconstruct.pictures.normalise import normalise
@@ -184,5 +185,5 @@ def _spread(maps: Sequence[tuple[NDArray[np.float32], NDArray[np.float32]]]) -> 
             if both.sum() < _LEAST_COMMON:
                 continue
             difference = (z[both] - y[both]) / np.hypot(s[both], t[both])
-            spreads.append(1.4826 * float(np.median(np.abs(difference))))
+            spreads.append(MAD_TO_SIGMA * float(np.median(np.abs(difference))))
     return float(np.median(spreads)) if spreads else float("nan")

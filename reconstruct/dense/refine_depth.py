@@ -23,6 +23,7 @@ from scipy import ndimage
 
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
+from alice_survey.base.robust import MAD_TO_SIGMA
 from reconstruct.views.model import View
 from reconstruct.views.sight import FAST, KernelLens, field_of, lens_of, pixel_at
 
@@ -331,7 +332,7 @@ def _sums(
         sample = rest[::3, ::3][known[::3, ::3]]
         if sample.size == 0:
             continue
-        noise = max(np.float32(1.4826 * np.median(np.abs(sample))), np.float32(1e-3))
+        noise = max(np.float32(MAD_TO_SIGMA * np.median(np.abs(sample))), np.float32(1e-3))
         products = _products(rest, slope, known, noise * np.float32(_OUTLYING))
         weight, r, g, rg, gg, rr = (_blur(product, _WINDOW_SIGMA_PX) for product in products)
         _add(

@@ -18,7 +18,7 @@ from alice_survey.base.config import ReconstructConfig, SurveyConfig
 from alice_survey.base.errors import ReconstructionError, warn
 from alice_survey.base.executor import parallel_map
 from alice_survey.base.records import SurfaceRecord
-from reconstruct.dense.cloud import laz_writer, voxel_edge, write_cloud_json, write_ply
+from reconstruct.dense.cloud import laz_writer, voxel_edge, write_cloud, write_cloud_json
 from reconstruct.dense.dem import FILL_CELLS
 from reconstruct.dense.matching_trial import find_conditions
 from reconstruct.dense.pose_part import find_pose_part
@@ -138,7 +138,7 @@ def build_surface(
     tiles = parallel_map(fuse_tile, tasks, threads=threads, label="fuse")
     parts = _write_rasters(folder, grid, model.frame, tiles)
     with laz_writer(folder / "cloud.laz", offset, model.frame) as write_laz:
-        count = write_ply(folder / "cloud.ply", write_laz(parts), offset, model.frame)
+        count = write_cloud(folder / "cloud.ply", write_laz(parts), offset, model.frame)
     if count == 0:
         raise ReconstructionError(
             f"no depth was confirmed by a second view in {len(views)} pictures; they need more "

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from alice_survey.base.executor import parallel_map
 from alice_survey.base.frames import Array
+from alice_survey.base.robust import MAD_TO_SIGMA
 from reconstruct.dense.depth import pair_depth
 from reconstruct.dense.fusion import GATE_SIGMAS, count_witnesses, merge_depths
 from reconstruct.dense.matching_trial import shrunk
@@ -190,7 +191,7 @@ def disagreement(task: CheckTask) -> float:
         parts.append((other_z - z) / np.hypot(own, other_sigma))
     apart = np.concatenate(parts) if parts else np.empty(0)
     apart = apart[np.isfinite(apart)]
-    return 1.4826 * float(np.median(np.abs(apart))) if len(apart) >= _LEAST_PIXELS else np.nan
+    return MAD_TO_SIGMA * float(np.median(np.abs(apart))) if len(apart) >= _LEAST_PIXELS else np.nan
 
 
 def looked_at(views: Sequence[View], index: int, pairs: Sequence[StereoPair]) -> list[int]:

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import find_objects
 
 from alice_survey.base.frames import Array
+from alice_survey.base.robust import MAD_TO_SIGMA
 from reconstruct.evaluate.elevation import Elevation
-from reconstruct.evaluate.figures import MAD_TO_SIGMA, rms, rounded
+from reconstruct.evaluate.figures import rms, rounded
 from reconstruct.evaluate.height_registration import HeightFit
 
 SIGNIFICANT = 1.96

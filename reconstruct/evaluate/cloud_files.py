@@ -17,7 +17,7 @@ from alice_survey.base.artefacts import need_stage
 from alice_survey.base.contents import one_line
 from alice_survey.base.errors import ReconstructionError, WorkspaceError, why
 from alice_survey.base.frames import Array, Datum
-from reconstruct.evaluate.ply_points import read_ply_points
+from reconstruct.ply import read_ply_points
 
 _MOST_POINTS = 2_000_000
 _LARGEST_BLOCK = 64_000_000

@@ -5,19 +5,25 @@ rigid motion or with a free scale: Open3D's has no scale in that form.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.errors import ReconstructionError
+from alice_survey.base.errors import ReconstructionError, WorkspaceError
 from alice_survey.base.frames import Array
-from reconstruct.evaluate.figures import MAD_TO_SIGMA
+from alice_survey.base.robust import MAD_TO_SIGMA
+from reconstruct.evaluate.figures import rms, rounded
 from reconstruct.placing.alignment import Similarity
 
 _TUKEY = 4.685
 _NEIGHBOURS = 12
 _SAMPLES = (8_000, 40_000)
+_COMPARED = 300_000
+_COVER_SPACINGS = 4.0
+"""Side of the squares in which a cloud counts as covering the ground, in its own spacings."""
 _ROUNDS = 60
 _STILL = 1e-3
 """Of the spacing of the reference: motion of the cloud's rim at which the adjustment settles."""
@@ -158,3 +164,75 @@ def _moved(pose: Similarity, centre: Array, move: Array, rim: float) -> Similari
         rotation=turn * pose.rotation,
         translation=centre + move[3:6] + stretch * turn.apply(pose.translation - centre),
     )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CloudDistances:
+    """Points of one cloud from the surface of another, where that one covers the ground."""
+
+    points: Array
+    """(N, 3) of the first."""
+    signed_m: Array
+    """(N,) from the plane through the nearest points of the other; positive above."""
+    nearest_m: Array
+    """(N,) from the nearest point of the other."""
+    covered_share: float
+    """Share of the first cloud's points where the other covers the ground."""
+
+    def to_json(self, pixel_m: float) -> dict[str, Any]:
+        """Figures in metres and ground pixels."""
+        away = np.abs(self.signed_m)
+        figures: dict[str, Any] = {
+            "points": len(away),
+            "covered_share": round(self.covered_share, 4),
+            "median_signed_m": rounded(float(np.median(self.signed_m)), 5),
+            "nearest_point_median_m": rounded(float(np.median(self.nearest_m)), 5),
+        }
+        for name, value in (
+            ("median", float(np.median(away))),
+            ("rms", rms(away)),
+            ("95", float(np.percentile(away, 95))),
+        ):
+            figures[f"{name}_m"] = rounded(value, 5)
+            figures[f"{name}_px"] = rounded(value / pixel_m, 3)
+        return figures
+
+
+def distances(points: Array, surface: ReferenceSurface, rng: np.random.Generator) -> CloudDistances:
+    """Distances of a cloud from a surface, both ways to be called.
+
+    Args:
+        points: (N, 3) of the first cloud, registered; of many a sample is compared.
+        surface: the other cloud.
+        rng: draws the sample.
+
+    Raises:
+        WorkspaceError: the two cover no common ground.
+    """
+    if len(points) > _COMPARED:
+        points = points[np.sort(rng.choice(len(points), _COMPARED, replace=False))]
+    covered = covers(surface, points)
+    if not covered.any():
+        raise WorkspaceError("the survey and the reference cover no common ground")
+    signed, nearest = surface.distance(points[covered])
+    return CloudDistances(
+        points=points[covered],
+        signed_m=signed,
+        nearest_m=nearest,
+        covered_share=float(covered.mean()),
+    )
+
+
+def covers(surface: ReferenceSurface, points: Array) -> NDArray[np.bool_]:
+    """Whether a square of the plan under each of (N, 3) points holds points of a surface."""
+    side = _COVER_SPACINGS * surface.spacing
+    low = surface.points[:, :2].min(axis=0)
+    own = np.floor((surface.points[:, :2] - low) / side).astype(np.int64)
+    shape = own.max(axis=0) + 1
+    full = np.zeros(shape, dtype=np.bool_)
+    full[own[:, 0], own[:, 1]] = True
+    cell = np.floor((points[:, :2] - low) / side).astype(np.int64)
+    inside = np.all((cell >= 0) & (cell < shape), axis=1)
+    found = np.zeros(len(points), dtype=np.bool_)
+    found[inside] = full[cell[inside, 0], cell[inside, 1]]
+    return found

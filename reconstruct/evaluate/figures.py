@@ -8,9 +8,6 @@ import numpy as np
 
 from alice_survey.base.frames import Array
 
-MAD_TO_SIGMA = 1.4826
-"""Standard deviation of a normal distribution over the median of its absolute values."""
-
 _BLOCKS = 10
 """Blocks along the longer side over which errors are averaged before a bend is fitted."""
 _LEAST_SHARE = 0.25

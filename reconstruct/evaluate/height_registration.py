@@ -14,8 +14,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
+from alice_survey.base.robust import MAD_TO_SIGMA
 from reconstruct.evaluate.elevation import Elevation
-from reconstruct.evaluate.figures import MAD_TO_SIGMA
 
 _TUKEY = 4.685
 """Tukey's constant: 95 % efficient for normal errors."""

@@ -1,7 +1,7 @@
 """A picture of how a survey differs from a reference."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -9,18 +9,14 @@ from matplotlib.figure import Figure
 
 from alice_survey.base.artefacts import atomic_path
 from alice_survey.base.frames import Array
-
-if TYPE_CHECKING:
-    from reconstruct.evaluate.reference import CloudDistances
+from reconstruct.evaluate.cloud_registration import CloudDistances
 
 _STYLE: dict[str, Any] = {"font.size": 8, "axes.titlesize": 9, "figure.dpi": 110}
 _CELLS = 320
 """Cells of the map along its longer side."""
 
 
-def plot_reference(
-    path: Path, ours: "CloudDistances", back: "CloudDistances", pixel_m: float
-) -> None:
+def plot_reference(path: Path, ours: CloudDistances, back: CloudDistances, pixel_m: float) -> None:
     """Map of the survey's signed distance from the reference, and both cumulative shares."""
     limit = max(float(np.percentile(np.abs(ours.signed_m), 95)), 1e-9)
     values, extent = mean_map(ours.points[:, :2], ours.signed_m, _CELLS)

@@ -12,10 +12,10 @@ from scipy.spatial.transform import RigidTransform
 from shapely.geometry import MultiPolygon
 
 from alice_survey.base.frames import Array
+from alice_survey.base.robust import MAD_TO_SIGMA
 from alice_survey.base.run import progress
 from alice_survey.seafloor.terrain import Terrain
 from reconstruct.evaluate.figures import (
-    MAD_TO_SIGMA,
     compare_volumes,
     fit_doming,
     rms,

@@ -15,6 +15,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.errors import warn
 from alice_survey.base.frames import Array, Datum
 from alice_survey.base.manifest import ImageRecord
+from alice_survey.base.robust import CAUCHY_TUNING
 from alice_survey.base.run import progress
 from camera_calib.rig import Rig
 from reconstruct.mapping.database import as_transform
@@ -28,8 +29,6 @@ SCALE_BOUND = 1e-3
 """Relative error of lengths that a known rig must not exceed."""
 _LEAST_STATIONS = 5
 _ROUNDS = 20
-_TUNING = 2.385
-"""Of Cauchy's weights, for 95 % efficiency with normal errors (Rey 1983)."""
 _MEDIAN_SIGMAS = 1.5382
 """Median length of a vector of three independent unit normal numbers."""
 _NAMED = 8
@@ -195,7 +194,7 @@ def misses(centres: Array, given: Array, sigmas: Array) -> tuple[Array, Array]:
     for _ in range(_ROUNDS):
         off = np.linalg.norm(_aligned(centres, given, weight / stated**2) - given, axis=1)
         spread = max(float(np.median(off / stated)) / _MEDIAN_SIGMAS, 1e-9)
-        weight = 1.0 / (1.0 + (off / (_TUNING * spread * stated)) ** 2)
+        weight = 1.0 / (1.0 + (off / (CAUCHY_TUNING * spread * stated)) ** 2)
     return off, stated * max(spread, 1.0)
 
 

@@ -18,11 +18,11 @@ from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import Indices, frames_of
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.exact_sights import choose_pixels, exact_sights, start_state
-from reconstruct.mapping.gauge_freedom import Gauge
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.normal_equations import (
     LEAST_POINTS,
     POSE,
+    Gauge,
     Sights,
     moved_points,
     reduce_points,

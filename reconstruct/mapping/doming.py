@@ -17,6 +17,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.errors import warn
 from alice_survey.base.frames import Array, Datum, rotation_from_attitude
 from alice_survey.base.manifest import ImageRecord
+from alice_survey.base.robust import CAUCHY_TUNING, MAD_TO_SIGMA
 from alice_survey.base.run import progress
 from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import Observed, observed
@@ -32,8 +33,6 @@ _THIN = 0.1
 """Width over length of a block below which it has no curvature across."""
 _SIGMAS = 3.0
 _ROUNDS = 10
-_TUNING = 2.385
-"""Of Cauchy's weights, for 95 % efficiency with normal errors (Rey 1983)."""
 _LEAST_STEREO_POINTS = 20
 
 
@@ -321,8 +320,8 @@ def _robust_fit(design: Array, values: Array, sigmas: Array) -> tuple[Array, Arr
         root = np.sqrt(weight) / sigmas
         fitted = np.linalg.lstsq(root[:, None] * design, root * values, rcond=None)[0]
         left = (values - design @ fitted) / sigmas
-        spread = max(1.4826 * float(np.median(np.abs(left))), 1e-12)
-        weight = np.asarray(1.0 / (1.0 + (left / (_TUNING * spread)) ** 2), np.float64)
+        spread = max(MAD_TO_SIGMA * float(np.median(np.abs(left))), 1e-12)
+        weight = np.asarray(1.0 / (1.0 + (left / (CAUCHY_TUNING * spread)) ** 2), np.float64)
     free = len(values) - design.shape[1]
     root = np.sqrt(weight) / sigmas
     variance = float((weight * left**2).sum() / max(weight.sum() * free / len(values), 1e-12))
@@ -359,5 +358,5 @@ def _station_scale(
     # Noise of pixels is that of 1 / depth: its mean, unlike that of depths, is not pulled away.
     ratio = seen.in_cameras[theirs[0]][at[0], 2] / (along * rays[0][:, 2])
     ratio = ratio[np.isfinite(ratio)]
-    spread = 1.4826 * float(np.median(np.abs(ratio - np.median(ratio))))
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(ratio - np.median(ratio))))
     return float(np.median(ratio)), max(1.2533 * spread / np.sqrt(len(ratio)), 1e-9)

@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.frames import Array
+from alice_survey.base.robust import CAUCHY_TUNING
 
 Indices = NDArray[np.int64]
 _ROUNDS = 10
 _SETTLED = 1e-7
 """Radians, or metres, below which a step ends the search."""
-_TUNING = 2.385
-"""Of Cauchy's weights, for 95 % efficiency with normal errors (Rey 1983)."""
 _MEDIAN_OF_TWO = 1.3863
 """Median of the sum of two squared unit normal numbers, which is what a seen point leaves over."""
 
@@ -86,7 +85,7 @@ def refine_link(
             continue
         left = (miss**2).sum(axis=1) + ((moved - points) * away).sum(axis=1)
         usual = max(float(np.median(left)) / _MEDIAN_OF_TWO, 1e-12)
-        weight = 1.0 / (1.0 + left / (_TUNING**2 * usual))
+        weight = 1.0 / (1.0 + left / (CAUCHY_TUNING**2 * usual))
         by_pose = np.concatenate([-by_place @ _skew(turned), by_place], axis=2)
         cross = by_pose.swapaxes(1, 2) @ by_point
         gain = cross @ back

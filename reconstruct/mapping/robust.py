@@ -11,13 +11,11 @@ import numpy as np
 import pycolmap
 
 from alice_survey.base.frames import Array
+from alice_survey.base.robust import CAUCHY_TUNING
 from reconstruct.mapping.arrays import Indices, observed
 
 _RAYLEIGH_MEDIAN = 1.1774
 """Median length of a plane vector whose components have unit sigma."""
-_TUNING = 2.385
-"""Scale of Cauchy's loss in sigmas (Rey 1983): 95 % efficiency where errors are normal, 94 % for
-residuals in the plane."""
 _LEAST_SIGMA_PX = 1e-3
 _WELL_SEEN = 4
 _MOST_ADAPTED = 0.9
@@ -53,7 +51,7 @@ def sigma_of(misses: Array, counts: Indices, stations: int) -> float:
 
 def loss_scale(sigma_px: float) -> float:
     """Length of a residual, in pixels, that counts half."""
-    return _TUNING * sigma_px
+    return CAUCHY_TUNING * sigma_px
 
 
 def cauchy_weights(misses: Array, sigma_px: float) -> Array:

@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 
 from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.config import SurveyConfig
+from alice_survey.base.config import ReconstructConfig, SurveyConfig
 from alice_survey.base.errors import ImageError, WorkspaceError, warn
 from alice_survey.base.executor import kept_workers, parallel_map
 from alice_survey.base.frames import Datum
@@ -96,8 +96,8 @@ def run_mapping(workspace: Path, config: SurveyConfig, threads: int, folder: Pat
     """
     inputs, settings = read_inputs(workspace), config.reconstruct
     pycolmap.logging.minloglevel = 2  # its own account of every step is for its developers
-    features = _find_all(inputs, folder / "features", config, threads)
-    lenses, distances = _lenses(inputs, features, config, threads)
+    features = _find_all(inputs, folder / "features", settings, threads)
+    lenses, distances = _lenses(inputs, features, settings, threads)
     cameras, exif_focal = _cameras(inputs, lenses)
     pairs = _match_all(inputs, features, cameras, lenses, config.seed, threads)
     refined = refine_tracks(
@@ -166,7 +166,9 @@ def _grey_file(features: Path) -> Path:
     return features.with_suffix(".npy")
 
 
-def _find_all(inputs: Inputs, folder: Path, config: SurveyConfig, threads: int) -> list[Path]:
+def _find_all(
+    inputs: Inputs, folder: Path, settings: ReconstructConfig, threads: int
+) -> list[Path]:
     """Files of features, in the order of the pictures."""
     targets = [folder / f"{i:06d}.npz" for i in range(len(inputs.records))]
     tasks = [
@@ -174,8 +176,8 @@ def _find_all(inputs: Inputs, folder: Path, config: SurveyConfig, threads: int) 
             picture=inputs.images / record.image,
             mask=inputs.images / record.mask if record.mask else None,
             target=target,
-            scale=config.reconstruct.feature_scale,
-            most=config.reconstruct.max_features,
+            scale=settings.feature_scale,
+            most=settings.max_features,
             thrifty=inputs.rig is not None,
         )
         for record, target in zip(inputs.records, targets, strict=True)
@@ -189,7 +191,7 @@ def _find_all(inputs: Inputs, folder: Path, config: SurveyConfig, threads: int) 
 
 
 def _lenses(
-    inputs: Inputs, features: Sequence[Path], config: SurveyConfig, threads: int
+    inputs: Inputs, features: Sequence[Path], settings: ReconstructConfig, threads: int
 ) -> tuple[dict[str, Lens], WorkingDistances | None]:
     """The pinholes that stand in for calibrated cameras; none without a rig."""
     if inputs.rig is None:
@@ -198,7 +200,7 @@ def _lenses(
         inputs.records,
         features,
         inputs.rig,
-        given_m=config.reconstruct.working_range_m,
+        given_m=settings.working_range_m,
         ratio=RATIO,
         threads=threads,
     )

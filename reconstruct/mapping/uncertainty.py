@@ -29,11 +29,11 @@ from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import Indices, Observed, frames_of, observed
 from reconstruct.mapping.calibration_part import CalibrationPart, calibration_part
 from reconstruct.mapping.database import Observations
-from reconstruct.mapping.gauge_freedom import Gauge
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.normal_equations import (
     LEAST_POINTS,
     POSE,
+    Gauge,
     ReducedSystem,
     Sights,
     point_covariances,

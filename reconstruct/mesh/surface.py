@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.executor import parallel_map, progress
 from alice_survey.base.frames import Array
-from reconstruct.mesh.cloud_file import CloudFile
 from reconstruct.mesh.decimate import decimate
 from reconstruct.mesh.implicit import splat, zero_mesh
 from reconstruct.mesh.topology import (
@@ -20,6 +19,7 @@ from reconstruct.mesh.topology import (
     triangulated,
     without_folds,
 )
+from reconstruct.ply import CloudFile
 
 _NODES = 12_000_000
 """Of a tile's lattice, which bounds its memory to some 300 MB."""
@@ -100,8 +100,8 @@ def mesh_cloud(
     vertices, triangles, _ = split_fans(vertices, triangles[large])
     if not len(triangles):
         raise ReconstructionError(
-            f"{cloud.path}: its {cloud.count} points, {step:.3g} apart, lie too thinly to carry a "
-            "surface; the pictures need more overlap or sharper texture"
+            f"{cloud.header.path}: its {cloud.header.count} points, {step:.3g} apart, lie too "
+            "thinly to carry a surface; the pictures need more overlap or sharper texture"
         )
     vertices, triangles, error = _to_count(vertices, triangles, step, error, most_triangles)
     triangles = without_folds(vertices, triangles)

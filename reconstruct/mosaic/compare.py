@@ -9,7 +9,7 @@ from reconstruct.light.solve import LightSamples, at_places, joined_samples
 from reconstruct.mosaic.grid import Block
 from reconstruct.mosaic.paint import Float32, SeenView, ground_of
 from reconstruct.mosaic.picture_measures import well_exposed
-from reconstruct.mosaic.tools import Survey, tools_of
+from reconstruct.mosaic.tools import MosaicSetup, tools_of
 from reconstruct.mosaic.visibility import see
 from reconstruct.raster import DemGrid
 
@@ -18,7 +18,7 @@ from reconstruct.raster import DemGrid
 class LightTask:
     """A block on which to compare what views show."""
 
-    survey: Survey
+    survey: MosaicSetup
     block: Block
     views: tuple[SeenView, ...]
     step_px: int

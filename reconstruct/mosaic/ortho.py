@@ -112,8 +112,8 @@ def look_up(
 ) -> tuple[Float32, Float32, Float32, Float32]:
     """Where the picture as taken shows each pixel of a tile, and how well.
 
-    A point goes to the ideal pinhole, from there by its depth to the warped picture (the fixed
-    point of `warped_pixel`, exact for a flat port, until it moves by less than `_STILL_PX`) and
+    A point goes to the ideal pinhole, from there by its depth to the warped picture (as
+    `RangeShift.warped`, exact for a flat port, until it moves by less than `_STILL_PX`) and
     through the lens to the picture as taken, so that colours are resampled once. The quality is the
     distance from the rim of the picture (1 in the middle, 0 at the rim) times the cosine of the
     angle to the vertical over the distance squared, so that the middle of near, steep views wins.

@@ -18,7 +18,7 @@ from reconstruct.mosaic.finish import finish_colours
 from reconstruct.mosaic.grid import ALIGNED_PX, CELL_PX, Block, coarse, dem_around
 from reconstruct.mosaic.ortho import sample_lanczos
 from reconstruct.mosaic.seams import candidates, choose_views
-from reconstruct.mosaic.tools import Survey, Tools, tools_of
+from reconstruct.mosaic.tools import MosaicSetup, Tools, tools_of
 from reconstruct.mosaic.visibility import (
     GridHeights,
     Ground,
@@ -65,7 +65,7 @@ class _ViewOfCells:
 class PaintTask:
     """A block to lay seams in, or to paint."""
 
-    survey: Survey
+    survey: MosaicSetup
     block: Block
     views: tuple[SeenView, ...]
     colour: ColourModel
@@ -235,7 +235,7 @@ def _box(
     return (pixels[0], pixels[1]), (cells[0], cells[1])
 
 
-def ground_of(survey: Survey, block: Block) -> Ground:
+def ground_of(survey: MosaicSetup, block: Block) -> Ground:
     """The surface of a block, and what around it may hide it."""
     with opened_raster(survey.workspace / "dense" / "dem.tif") as raster:
         return Ground(*dem_around(raster, block.grid, block.reach), survey.scratch)
@@ -403,7 +403,7 @@ def tones_path(scratch: Path) -> Path:
     return scratch / "tones.tif"
 
 
-def _read_cells(survey: Survey, block: Block) -> tuple[NDArray[np.int32], Float32]:
+def _read_cells(survey: MosaicSetup, block: Block) -> tuple[NDArray[np.int32], Float32]:
     """Labels (rows, columns), and tones (rows, columns, 3), of a block; 0 beyond the mosaic."""
     rows, columns = block.grid.rows // CELL_PX, block.grid.columns // CELL_PX
     top, left = block.window.row_off // CELL_PX, block.window.col_off // CELL_PX

@@ -12,15 +12,21 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from rasterio.windows import Window
 
 from alice_survey.base.artefacts import atomic_path
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from reconstruct.light.solve import GRID, at_places
+from reconstruct.mosaic.footprints import PictureFootprint, picture_footprint
+from reconstruct.mosaic.grid import Float32, footprints
+from reconstruct.mosaic.visibility import store_visible
 from reconstruct.pictures.undistorted import Pictures
+from reconstruct.raster import DemGrid, opened_raster
+from reconstruct.views.model import View, enu_from_cam
 
-Float32 = NDArray[np.float32]
-
+_MOST_CELLS = 16_000_000
+"""Of the DEM for one view; views that see more, to the horizon, are looked at block by block."""
 _SMALL_PX = 432
 """Width of the copies in which views are compared, at most."""
 _LEAST_SHRINK = 4
@@ -256,3 +262,48 @@ def _small_copy(content: NDArray[np.uint8]) -> SmallCopy:
     )
     broad: Float32 = total / np.maximum(weight, np.float32(1e-3))[..., None]
     return SmallCopy(levels=content, broad=broad)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ViewTask:
+    """A view to measure."""
+
+    workspace: Path
+    scratch: Path
+    """For what tiles will ask for."""
+    view: View
+    heights: tuple[float, float]
+    """Lowest and highest cell of the DEM."""
+
+
+def measure_view(task: ViewTask) -> tuple[PictureMeasures, PictureFootprint]:
+    """Measure a picture and where it lies; write its small copy and what it sees of the DEM."""
+    facts = measure_picture((task.workspace, task.scratch, task.view.image))
+    dem, grid, whole = _part_seen(task)
+    if whole:
+        store_visible(task.scratch, task.view, dem, grid)
+    return facts, picture_footprint(task.view, dem, grid)
+
+
+def _part_seen(task: ViewTask) -> tuple[Float32, DemGrid, bool]:
+    """The DEM below a view and all that it may see, coarser where that is a lot; whether it is."""
+    west, east, south, north = footprints((task.view,), task.heights).boxes[0]
+    camera = enu_from_cam(task.view, np.zeros(3))[:, 3]
+    with opened_raster(task.workspace / "dense" / "dem.tif") as raster:
+        t = raster.transform
+        columns = [min(west, camera[0]), max(east, camera[0])]
+        rows = [max(north, camera[1]), min(south, camera[1])]
+        c0, c1 = np.clip((np.array(columns) - t.c) / t.a + [-3, 4], 0, raster.width).astype(int)
+        r0, r1 = np.clip((t.f - np.array(rows)) / t.a + [-3, 4], 0, raster.height).astype(int)
+        window = Window(int(c0), int(r0), int(c1 - c0), int(r1 - r0))
+        coarser = int(np.ceil(np.sqrt(window.width * window.height / _MOST_CELLS)))
+        shape = -(-window.height // max(coarser, 1)), -(-window.width // max(coarser, 1))
+        dem = raster.read(1, window=window, out_shape=shape) if min(shape) else np.empty(
+            shape, np.float32
+        )  # fmt: skip
+    cell = t.a * max(coarser, 1)
+    grid = DemGrid(
+        west=t.c + window.col_off * t.a, north=t.f - window.row_off * t.a, cell=cell,
+        rows=dem.shape[0], columns=dem.shape[1],
+    )  # fmt: skip
+    return dem, grid, coarser <= 1

@@ -11,12 +11,12 @@ import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import rasterio
 
-from alice_survey.base.config import SurveyConfig
+from alice_survey.base.config import ReconstructConfig, SurveyConfig, WaterConfig
 from alice_survey.base.executor import parallel_map
 from alice_survey.base.records import CamerasRecord, MosaicRecord, PicturesRecord
 from reconstruct.light.solve import joined_samples
@@ -35,7 +35,6 @@ from reconstruct.mosaic.grid import (
     mosaic_grid,
     neighbours,
 )
-from reconstruct.mosaic.measure import ViewTask, measure_view
 from reconstruct.mosaic.paint import (
     PaintTask,
     SeenView,
@@ -44,8 +43,8 @@ from reconstruct.mosaic.paint import (
     paint_tiles,
     tones_path,
 )
-from reconstruct.mosaic.picture_measures import PictureMeasures
-from reconstruct.mosaic.tools import Survey, forget_tools
+from reconstruct.mosaic.picture_measures import PictureMeasures, ViewTask, measure_view
+from reconstruct.mosaic.tools import MosaicSetup, forget_tools
 from reconstruct.mosaic.visibility import Water
 from reconstruct.mosaic.writers import cloud_optimised, thumbnail, write_labels, write_tiles
 from reconstruct.placing.track_figure import plot_track_over
@@ -77,8 +76,10 @@ def run_mosaic(workspace: Path, config: SurveyConfig, threads: int, folder: Path
         ReconstructionError: the surface has no cell.
         WorkspaceError: the model or the surface is damaged.
     """
+    model = read_model(workspace / "sparse")
+    sea = _sea(config.water, config.area.seafloor_depth_m)
     with _small_caches():
-        build_mosaic(workspace, read_model(workspace / "sparse"), folder, config, threads)
+        build_mosaic(workspace, model, folder, config.reconstruct, sea, threads)
 
 
 @contextlib.contextmanager
@@ -101,11 +102,15 @@ def _small_caches() -> Iterator[None]:
 
 
 def build_mosaic(
-    workspace: Path, model: SparseModel, folder: Path, config: SurveyConfig, threads: int
+    workspace: Path,
+    model: SparseModel,
+    folder: Path,
+    settings: ReconstructConfig,
+    sea: tuple[Water, bool],
+    threads: int,
 ) -> None:
     """Do the work of the stage in a folder; see `run_mosaic`."""
     forget_tools()
-    settings = config.reconstruct
     threads = min(threads, _MOST_PROCESSES)
     scratch = folder / "scratch"
     scratch.mkdir()
@@ -126,12 +131,16 @@ def build_mosaic(
         )
     )
     facts = [fact for fact, _ in measured]
-    water, dispersion = _dispersion(workspace, model, config, all(f.grey for f in facts))
-    survey = Survey(workspace=workspace, scratch=scratch, scaled=model.frame.scaled, water=water)
+    water, dispersion = _dispersion(
+        workspace, settings.dispersion, sea, grey=all(f.grey for f in facts)
+    )
+    survey = MosaicSetup(
+        workspace=workspace, scratch=scratch, scaled=model.frame.scaled, water=water
+    )
     views = _seen_views(model, facts)
     ground = footprints(model.views, heights)
     label_blocks = seam_blocks(grid, ground)
-    colour = _solve(model, survey, facts, views, label_blocks, config, threads)
+    colour = _solve(model, survey, facts, views, label_blocks, settings.colour, threads)
 
     def tasks(blocks: Sequence[Block]) -> list[PaintTask]:
         return [
@@ -207,17 +216,16 @@ def _seen_views(model: SparseModel, facts: Sequence[PictureMeasures]) -> list[Se
 
 def _solve(
     model: SparseModel,
-    survey: Survey,
+    survey: MosaicSetup,
     facts: Sequence[PictureMeasures],
     views: Sequence[SeenView],
     blocks: Sequence[Block],
-    config: SurveyConfig,
+    wanted: Literal["even", "water", "raw"],
     threads: int,
 ) -> ColourModel:
     """The survey's light from spots that two views see."""
     images = [view.image for view in model.views]
     cameras = [view.camera for view in model.views]
-    wanted = config.reconstruct.colour
     if wanted == "raw":
         return solve_colour(wanted, joined_samples([]), facts, images, cameras)
     width = float(np.median([view.width_px for view in model.views]))
@@ -244,10 +252,9 @@ def _part_of(colour: ColourModel, images: Sequence[str]) -> ColourModel:
 
 
 def _dispersion(
-    workspace: Path, model: SparseModel, config: SurveyConfig, grey: bool
+    workspace: Path, wanted: str, sea: tuple[Water, bool], *, grey: bool
 ) -> tuple[Water | None, dict[str, Any]]:
     """The water through which colours are distinguished, or None, and what to say about it."""
-    wanted = config.reconstruct.dispersion
     cameras = CamerasRecord.read(workspace / "sparse" / "cameras.json").cameras.values()
     ports = any(camera["kind"] == "flat_port" for camera in cameras)
     reason = ""
@@ -261,12 +268,7 @@ def _dispersion(
         reason = "rendered pictures have none"
     if reason:
         return None, {"corrected": False, "reason": reason}
-    stated = config.water.temperature_c is not None and config.water.salinity_psu is not None
-    water = Water(
-        temperature_c=_or(config.water.temperature_c, _TEMPERATURE_C),
-        salinity_psu=_or(config.water.salinity_psu, _SALINITY_PSU),
-        depth_m=config.area.seafloor_depth_m,
-    )
+    water, stated = sea
     return water, {
         "corrected": True,
         "temperature_c": water.temperature_c,
@@ -279,5 +281,12 @@ def _simulated(workspace: Path) -> bool:
     return PicturesRecord.read(workspace / "images" / "survey.json").source == "simulated"
 
 
-def _or(value: float | None, default: float) -> float:
-    return default if value is None else value
+def _sea(config: WaterConfig, depth_m: float) -> tuple[Water, bool]:
+    """The water of a survey, and whether its settings state it."""
+    stated = config.temperature_c is not None and config.salinity_psu is not None
+    water = Water(
+        temperature_c=_TEMPERATURE_C if config.temperature_c is None else config.temperature_c,
+        salinity_psu=_SALINITY_PSU if config.salinity_psu is None else config.salinity_psu,
+        depth_m=depth_m,
+    )
+    return water, stated

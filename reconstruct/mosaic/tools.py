@@ -20,7 +20,7 @@ _CACHED_BYTES = 100_000_000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Survey:
+class MosaicSetup:
     """What all tasks share; it travels to each process once a task."""
 
     workspace: Path
@@ -75,7 +75,7 @@ class Tools:
         return taken
 
 
-def tools_of(survey: Survey) -> Tools:
+def tools_of(survey: MosaicSetup) -> Tools:
     """The tools of this process for a survey."""
     return _kept_tools(survey.workspace, survey.scratch, survey.scaled, survey.water)
 

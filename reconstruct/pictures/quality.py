@@ -7,7 +7,7 @@ all is listed with the reason. Nothing is left out of the reconstruction because
 import math
 from collections import Counter, defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.artefacts import read_stage, write_csv
 from alice_survey.base.errors import ImageError, why
-from alice_survey.base.executor import parallel_map
-from alice_survey.base.manifest import ImageRecord, read_manifest
+from alice_survey.base.manifest import ImageRecord
+from alice_survey.base.robust import MAD_TO_SIGMA
 from reconstruct.pictures.files import decode
 from reconstruct.pictures.normalise import even_light
 from reconstruct.pictures.undistorted import read_mask
@@ -36,7 +35,6 @@ OUTLIER_FACTOR = 1.6
 _BLOCK_PX = 48
 _SMOOTHEST_PERCENT = 10
 """Blocks so smooth show hardly anything but noise."""
-_MAD_TO_SIGMA = 1.4826
 _SHARED_POINTS = 15
 """Common points of the model from which two pictures count as overlapping."""
 _FINE_PX, _MID_PX, _COARSE_PX = 1.0, 2.0, 5.0
@@ -206,7 +204,7 @@ def _middle(pictures: Sequence[PictureQuality], name: str) -> tuple[float, float
     if not values.size:
         return NAN, NAN
     middle = float(np.median(values))
-    return middle, _MAD_TO_SIGMA * float(np.median(np.abs(values - middle)))
+    return middle, MAD_TO_SIGMA * float(np.median(np.abs(values - middle)))
 
 
 def _reasons(quality: PictureQuality, spreads: dict[str, tuple[float, float]]) -> tuple[str, ...]:
@@ -265,69 +263,3 @@ def add_overlap(found: Sequence[PictureQuality], sparse: Path) -> list[PictureQu
             )
         )
     return filled
-
-
-def quality_report(workspace: Path, threads: int) -> tuple[str, dict[str, Any]]:
-    """Measure all pictures of a workspace and write `quality/quality.csv` and `quality.png`.
-
-    Args:
-        workspace: with `images/manifest.csv`; a finished `sparse/` adds the overlaps.
-        threads: processes that read pictures.
-
-    Returns:
-        The list of flagged pictures as text, and figures as JSON values.
-
-    Raises:
-        ImageError: there is no manifest, or it names no picture.
-    """
-    from reconstruct.pictures.quality_sheet import plot_quality
-
-    images = workspace / "images"
-    records = read_manifest(images / "manifest.csv")
-    if not records:
-        raise ImageError(f"{images / 'manifest.csv'} names no picture")
-    tasks = [MeasureTask(images=images, record=record) for record in records]
-    found = list(parallel_map(measure_file, tasks, threads=threads, label="picture quality"))
-    if read_stage(workspace / "sparse") is not None:
-        found = add_overlap(found, workspace / "sparse")
-    found = judge(found)
-    folder = workspace / "quality"
-    write_csv(folder / "quality.csv", _HEADER, (_row(quality) for quality in found))
-    plot_quality(folder / "quality.png", images, found)
-    return _text(found, folder), _figures(found)
-
-
-_NUMBERS = tuple(f.name for f in fields(PictureQuality) if f.type in (float, "float"))
-_HEADER = ("image", "camera", "station", *_NUMBERS, "reasons")
-
-
-def _row(quality: PictureQuality) -> list[Any]:
-    numbers = [getattr(quality, name) for name in _NUMBERS]
-    cells = ["" if math.isnan(number) else f"{number:.6g}" for number in numbers]
-    return [
-        quality.image, quality.camera, quality.station, *cells, "; ".join(quality.reasons)
-    ]  # fmt: skip
-
-
-def _text(found: Sequence[PictureQuality], folder: Path) -> str:
-    flagged = [quality for quality in found if quality.flagged]
-    lines = [f"{q.image}: {'; '.join(q.reasons)}" for q in flagged]
-    lines.append(
-        f"{len(found)} pictures, {len(flagged)} to look at (all are still used where they can be); "
-        f"{folder / 'quality.csv'}"
-    )
-    return "\n".join(lines)
-
-
-def _figures(found: Sequence[PictureQuality]) -> dict[str, Any]:
-    medians = {}
-    for name in _NUMBERS:
-        values = np.array([getattr(q, name) for q in found])
-        if np.isfinite(values).any():
-            medians[name] = round(float(np.nanmedian(values)), 6)
-    return {
-        "pictures": len(found),
-        "unreadable": sum(math.isnan(q.sharpness) for q in found),
-        "flagged": [{"image": q.image, "reasons": list(q.reasons)} for q in found if q.flagged],
-        "median": medians,
-    }

@@ -1,6 +1,8 @@
-"""A sheet of the quality of a survey's pictures: figures in their order, and the worst ones."""
+"""What is written about the quality of a survey's pictures: a table, and a sheet of the worst."""
 
+import math
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +12,21 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from alice_survey.base.artefacts import atomic_path
+from alice_survey.base.artefacts import atomic_path, read_stage, write_csv
 from alice_survey.base.errors import ImageError
+from alice_survey.base.executor import parallel_map
+from alice_survey.base.manifest import read_manifest
 from reconstruct.pictures.files import decode
-from reconstruct.pictures.quality import PictureQuality
+from reconstruct.pictures.quality import (
+    MeasureTask,
+    PictureQuality,
+    add_overlap,
+    judge,
+    measure_file,
+)
 
+_NUMBERS = tuple(f.name for f in fields(PictureQuality) if f.type in (float, "float"))
+_HEADER = ("image", "camera", "station", *_NUMBERS, "reasons")
 _MOST_SHOWN = 8
 _ACROSS = 4
 _THUMBNAIL_PX = 420
@@ -106,3 +118,63 @@ def _thumbnail(panel: Axes, images: Path, quality: PictureQuality) -> None:
 
 def _short(reason: str) -> str:
     return reason if len(reason) <= 54 else reason[:53] + "…"
+
+
+def quality_report(workspace: Path, threads: int) -> tuple[str, dict[str, Any]]:
+    """Measure all pictures of a workspace and write `quality/quality.csv` and `quality.png`.
+
+    Args:
+        workspace: with `images/manifest.csv`; a finished `sparse/` adds the overlaps.
+        threads: processes that read pictures.
+
+    Returns:
+        The list of flagged pictures as text, and figures as JSON values.
+
+    Raises:
+        ImageError: there is no manifest, or it names no picture.
+    """
+    images = workspace / "images"
+    records = read_manifest(images / "manifest.csv")
+    if not records:
+        raise ImageError(f"{images / 'manifest.csv'} names no picture")
+    tasks = [MeasureTask(images=images, record=record) for record in records]
+    found = list(parallel_map(measure_file, tasks, threads=threads, label="picture quality"))
+    if read_stage(workspace / "sparse") is not None:
+        found = add_overlap(found, workspace / "sparse")
+    found = judge(found)
+    folder = workspace / "quality"
+    write_csv(folder / "quality.csv", _HEADER, (_row(quality) for quality in found))
+    plot_quality(folder / "quality.png", images, found)
+    return _text(found, folder), _figures(found)
+
+
+def _row(quality: PictureQuality) -> list[Any]:
+    numbers = [getattr(quality, name) for name in _NUMBERS]
+    cells = ["" if math.isnan(number) else f"{number:.6g}" for number in numbers]
+    return [
+        quality.image, quality.camera, quality.station, *cells, "; ".join(quality.reasons)
+    ]  # fmt: skip
+
+
+def _text(found: Sequence[PictureQuality], folder: Path) -> str:
+    flagged = [quality for quality in found if quality.flagged]
+    lines = [f"{q.image}: {'; '.join(q.reasons)}" for q in flagged]
+    lines.append(
+        f"{len(found)} pictures, {len(flagged)} to look at (all are still used where they can be); "
+        f"{folder / 'quality.csv'}"
+    )
+    return "\n".join(lines)
+
+
+def _figures(found: Sequence[PictureQuality]) -> dict[str, Any]:
+    medians = {}
+    for name in _NUMBERS:
+        values = np.array([getattr(q, name) for q in found])
+        if np.isfinite(values).any():
+            medians[name] = round(float(np.nanmedian(values)), 6)
+    return {
+        "pictures": len(found),
+        "unreadable": sum(math.isnan(q.sharpness) for q in found),
+        "flagged": [{"image": q.image, "reasons": list(q.reasons)} for q in found if q.flagged],
+        "median": medians,
+    }

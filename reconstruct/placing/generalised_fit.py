@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.frames import Array
+from alice_survey.base.robust import MAD_TO_SIGMA
 from reconstruct.placing.correlated_errors import LEAST_WHITE, lasting_share, surprise, whiten
 from reconstruct.placing.navigation_equations import (
     GROUP_OF,
@@ -141,7 +142,7 @@ def without_gross_errors(misfit: Array, known: NDArray[np.bool_]) -> NDArray[np.
             if rows.sum() < 3:
                 continue
             off = np.abs(misfit[:, channel] - np.median(misfit[rows, channel]))
-            spread = max(1.0, 1.4826 * float(np.median(off[rows])))
+            spread = max(1.0, MAD_TO_SIGMA * float(np.median(off[rows])))
             used[rows & (off > _GROSS_SIGMAS * spread), min(channels)] = False
         used[:, channels] &= used[:, [min(channels)]]
     return used

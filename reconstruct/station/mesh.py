@@ -16,6 +16,7 @@ from reconstruct.mesh.decimate import decimate
 from reconstruct.mesh.formats import GLB_AXES, write_glb, write_mesh_ply, write_obj
 from reconstruct.mesh.texture import Textured, write_jpeg
 from reconstruct.mesh.topology import Triangles, split_fans, without_folds
+from reconstruct.station.precise import remapped
 from reconstruct.views.model import View
 
 _MOST_VERTICES = 600_000
@@ -96,13 +97,8 @@ def write_station_mesh(
     uv = np.clip(pixels / size, 0.0, 1.0)
     uv[:, 1] = 1.0 - uv[:, 1]
     count = len(mesh.vertices)
-    x, y = ((pixels[:, k] - 0.5).astype(np.float32).reshape(-1, 1) for k in range(2))
-    shown = [
-        cv2.remap(colour, x[i : i + 30_000], y[i : i + 30_000], cv2.INTER_LINEAR,
-                  borderMode=cv2.BORDER_REPLICATE)
-        for i in range(0, count, 30_000)
-    ]  # fmt: skip
-    rgb = np.ascontiguousarray(np.concatenate(shown).reshape(-1, 3)[:, ::-1])
+    shown = remapped(colour, pixels, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
+    rgb = np.ascontiguousarray(shown[:, ::-1])
     vertices = mesh.vertices * [1.0, -1.0, -1.0]
     textured = Textured(
         vertices=vertices,

@@ -21,18 +21,19 @@ from rasterio.errors import NotGeoreferencedWarning
 from alice_survey.base.artefacts import write_json
 from alice_survey.base.errors import CalibrationError, ImageError, ReconstructionError
 from alice_survey.base.frames import Array
+from alice_survey.base.robust import MAD_TO_SIGMA
 from alice_survey.base.run import progress
 from camera_calib.rig import Rig, read_rig, write_rig
-from reconstruct.dense.cloud import VERTEX, write_ply
+from reconstruct.dense.cloud import VERTEX, write_cloud
 from reconstruct.dense.depth import MATCH_SIGMA_PX, pair_depth
-from reconstruct.dense.matching_trial import matching_scale
+from reconstruct.dense.matching_trial import matching_scale, shrunk
 from reconstruct.matching.features import find_features
 from reconstruct.matching.matches import match_descriptors
 from reconstruct.pictures.normalise import normalise
 from reconstruct.pictures.undistorted import Pictures, read_colour
 from reconstruct.station.mesh import depth_mesh, write_station_mesh
 from reconstruct.station.plot import plot_pair
-from reconstruct.station.precise import Sampler, inflation, precise_depth, sampler
+from reconstruct.station.precise import Sampler, inflation, precise_depth, remapped, sampler
 from reconstruct.station.solve import PairOptics, matched_points, optics_for, stereo_rig
 from reconstruct.views.model import View, WorldFrame, scaled_view
 
@@ -228,13 +229,9 @@ def dense_pair(
     names, opened = open_pair(optics, pictures)
     colours, valids = [], []
     for name, view in zip(names, views, strict=True):
-        colour, valid = opened.colour(name), opened.valid(name)
-        size = (view.width_px, view.height_px)
-        if colour.shape[1::-1] != size:
-            small = cv2.resize(valid.astype(np.uint8) * 255, size, interpolation=cv2.INTER_AREA)
-            colour, valid = cv2.resize(colour, size, interpolation=cv2.INTER_AREA), small == 255
+        colour, valid = shrunk(opened, name, (view.width_px, view.height_px))
         colours.append(colour)
-        valids.append(np.asarray(valid))
+        valids.append(valid)
     greys = [normalise(colour) for colour in colours]
     maps = []
     for a, b in ((0, 1), (1, 0)):
@@ -299,7 +296,7 @@ def _match_sigma(
     precise = precise_depth(views, greys, depth, _centres(rows, columns))
     miss = (depth[rows, columns] - precise.depth) / sigma[rows, columns]
     factor = inflation(precise)
-    match_sigma_px = 1.4826 * float(np.nanmedian(np.abs(miss))) * MATCH_SIGMA_PX
+    match_sigma_px = MAD_TO_SIGMA * float(np.nanmedian(np.abs(miss))) * MATCH_SIGMA_PX
     return round(match_sigma_px, 4), round(factor, 3)
 
 
@@ -311,9 +308,10 @@ def _agreeing(left: View, right: View, maps: list[tuple[Float32, Float32]]) -> F
     points = left.at_depth(pixels, depth[rows, columns].astype(np.float64))
     there = right.project(points)
     z = right.world_from_cam.inv().apply(points)[:, 2]
-    x, y = ((there[:, k] - 0.5).astype(np.float32).reshape(-1, 1) for k in range(2))
-    seen = _sample(other, x, y)
-    seen_sigma = _sample(other_sigma, x, y)
+    seen, seen_sigma = (
+        remapped(map_, there, cv2.INTER_LINEAR, cv2.BORDER_CONSTANT).astype(np.float64)
+        for map_ in (other, other_sigma)
+    )
     with np.errstate(invalid="ignore"):
         miss = (seen - z) / np.hypot(seen_sigma, sigma[rows, columns])
         agrees = np.abs(miss) <= _AGREE_SIGMAS
@@ -324,18 +322,6 @@ def _agreeing(left: View, right: View, maps: list[tuple[Float32, Float32]]) -> F
 
 def _centres(rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Array:
     return np.column_stack([columns, rows]).astype(np.float64) + 0.5
-
-
-def _sample(picture: Float32, x: Float32, y: Float32) -> Array:
-    """Bilinear values (N,) at OpenCV's pixels (N, 1); NaN next to what is unknown."""
-    parts = [
-        cv2.remap(
-            picture, x[i : i + 30_000], y[i : i + 30_000], cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan,
-        )
-        for i in range(0, len(x), 30_000)
-    ]  # fmt: skip
-    return np.concatenate([np.zeros(0), *(part[:, 0] for part in parts)])
 
 
 def _angle_deg(optics: PairOptics) -> float:
@@ -398,4 +384,4 @@ def _write_cloud(path: Path, found: PairDepth) -> int:
     rgb = found.colour[rows[known], columns[known], ::-1]
     vertices["red"], vertices["green"], vertices["blue"] = rgb.T
     vertices["sigma"] = found.sigma[rows[known], columns[known]]
-    return write_ply(path, [vertices], (0.0, 0.0, 0.0), _FRAME)
+    return write_cloud(path, [vertices], (0.0, 0.0, 0.0), _FRAME)

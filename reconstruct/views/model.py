@@ -39,7 +39,14 @@ class WorldFrame:
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """One registered picture, as an ideal pinhole sees it."""
+    """One registered picture, as an ideal pinhole sees it.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> model = alice.Survey("small").model
+        >>> model.views[0].project(model.points_world).shape == (len(model.points_world), 2)
+        True
+    """
 
     image: str
     """Name in the manifest."""
@@ -87,7 +94,14 @@ class View:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SparseModel:
-    """Registered views and triangulated points, in one world frame."""
+    """Registered views and triangulated points, in one world frame.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> model = alice.Survey("small").model
+        >>> model.points_world.shape[1]
+        3
+    """
 
     frame: WorldFrame
     views: tuple[View, ...]
@@ -152,6 +166,11 @@ def read_model(sparse: str | Path) -> SparseModel:
     Raises:
         WorkspaceError: a file is missing, or not as it was written.
         ReconstructionError: the model is damaged.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> alice.read_model("small/sparse").frame.name
+        'ned'
     """
     sparse = Path(sparse)
     from reconstruct.views.model_files import read_reconstruction

@@ -67,7 +67,7 @@ class RangeShift:
 
     @property
     def arguments(self) -> tuple[NDArray[np.float64], float, float, float]:
-        """What the kernels `ideal_pixel` and `warped_pixel` take."""
+        """What kernels take of it; see `sight.KernelLens`."""
         return self.nodes, self.width_px, self.height_px, self.inverse_working
 
     def _shift(self, pixels: Array, depth: Array | float) -> Array:
@@ -151,31 +151,6 @@ def field_at(
         a * nodes[row, column, 1] + b * nodes[row, column + 1, 1]
         + c * nodes[row + 1, column, 1] + d * nodes[row + 1, column + 1, 1],
     )  # fmt: skip
-
-
-@compiled
-def ideal_pixel(
-    nodes: Array, width_px: float, height_px: float, inverse_working: float,
-    x: float, y: float, inverse_depth: float,
-) -> tuple[float, float]:  # fmt: skip
-    """Where the pinhole sees the spot that the warped picture shows at (x, y), in kernels."""
-    a, b = field_at(nodes, width_px, height_px, x, y)
-    step = inverse_depth - inverse_working
-    return x + a * step, y + b * step
-
-
-@compiled
-def warped_pixel(
-    nodes: Array, width_px: float, height_px: float, inverse_working: float,
-    x: float, y: float, inverse_depth: float,
-) -> tuple[float, float]:  # fmt: skip
-    """The inverse of `ideal_pixel`: where the warped picture shows what the pinhole sees."""
-    step = inverse_depth - inverse_working
-    u, v = x, y
-    for _ in range(_ROUNDS):
-        a, b = field_at(nodes, width_px, height_px, u, v)
-        u, v = x - a * step, y - b * step
-    return u, v
 
 
 @compiled

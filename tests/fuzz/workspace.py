@@ -260,18 +260,18 @@ def points() -> Any:
 
 
 def _own_cloud(folder: Path) -> None:
-    from reconstruct.dense.cloud import VERTEX, write_ply
+    from reconstruct.dense.cloud import VERTEX, write_cloud
     from reconstruct.views.model import WorldFrame
 
     rows = np.zeros(400, VERTEX)
     rows["x"], rows["y"], rows["z"] = points().T
     rows["nz"] = 1.0
     frame = WorldFrame(name="ned", datum=_DATUM, scaled=True, vertical_datum="sea")
-    write_ply(folder / "cloud.ply", [rows], (0.0, 0.0, 0.0), frame)
+    write_cloud(folder / "cloud.ply", [rows], (0.0, 0.0, 0.0), frame)
 
 
 def read_own_cloud(path: Path) -> object:
-    from reconstruct.mesh.cloud_file import open_cloud
+    from reconstruct.ply import open_cloud
 
     cloud = open_cloud(path)
     return cloud.inside(-1.0, 1.0, -1.0, 1.0), cloud.sample(10)

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.base.config import SurveyConfig, parse_config
 from alice_survey.base.frames import Array
+from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.floor import FloorGrid, floor_depth
-from alice_survey.vehicle.hull import HULL_BODY_M
 from alice_survey.vehicle.pilot.safety import REASONS, TOO_LOW
 from camera_calib.rig import design_rig
 from missions.fly.simulation import simulate_plan
@@ -22,6 +22,7 @@ from missions.values.plan_file import Plan
 LEAST_M = 1.0
 """Half the altitude of 2 m."""
 DEPTH_M = 12.0
+HULL = vehicle("alice").hull
 AT_M = np.arange(-15.0, 15.05, 0.1)
 
 
@@ -61,7 +62,7 @@ def true_clearance_m(flight: Flight, floor: FloorGrid) -> float:
     """Least height of a point of the hull, the port or the DVL above the floor below it."""
     turn = Rotation.from_quat(flight.flown.truth[::4, 3:7])
     least = math.inf
-    for place in (*HULL_BODY_M, (0.55, -0.05, 0.08), (-0.4145, 0.0, 0.11)):
+    for place in (*HULL.profile_body_m, (0.55, -0.05, 0.08), (-0.4145, 0.0, 0.11)):
         points = flight.flown.truth[::4, :3] + turn.apply(place)
         least = min(least, *(floor_depth(floor, n, e) - d for n, e, d in points))
     return float(least)
@@ -117,7 +118,7 @@ def test_the_hull_on_the_sea_floor_ends_the_mission_and_says_so() -> None:
     flight = fly(floor)
     assert flight.ending == "aborted: the hull touched the sea floor"
     bow = flight.flown.truth[:, :3]
-    bow = bow + Rotation.from_quat(flight.flown.truth[:, 3:7]).apply(HULL_BODY_M[0])
+    bow = bow + Rotation.from_quat(flight.flown.truth[:, 3:7]).apply(HULL.profile_body_m[0])
     above = np.array([floor_depth(floor, n, e) - d for n, e, d in bow])
     assert above[-1] <= 0.0
     assert above[:-1].min() > 0.0

@@ -17,7 +17,7 @@ from alice_survey.stages import spec
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import stations_of_plan
-from missions.exports.footprints import footprint_outline, footprints_ne
+from missions.exports.geometry import footprint_outline, footprints_ne
 from missions.plan.planner import plan_survey
 from missions.values.footprint import common_swath
 from missions.values.pattern import pattern

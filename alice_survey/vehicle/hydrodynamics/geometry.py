@@ -17,6 +17,7 @@ from typing import Literal
 import numpy as np
 
 from alice_survey.base.errors import VehicleError
+from alice_survey.vehicle.hull import Hull
 from alice_survey.vehicle.hydrodynamics.outline import Outline
 
 
@@ -99,6 +100,21 @@ class Geometry:
     pod: Pod
     mount: Mount
     tunnels: tuple[Tunnel, ...]
+
+    @cached_property
+    def hull(self) -> Hull:
+        """How far hull and pods reach, to the millimetre."""
+        x, radius = np.array(self.outline.x_m), np.array(self.outline.radius_m)
+        keel = x[radius == radius.max()]
+        deepest = float(radius.max())
+        profile = (
+            (self.outline.nose_x_m, 0.0), (float(keel.max()), deepest), (0.0, deepest),
+            (float(keel.min()), deepest), (self.outline.tail_x_m, 0.0),
+        )  # fmt: skip
+        return Hull(
+            profile_body_m=tuple((round(ahead, 3), 0.0, round(down, 3)) for ahead, down in profile),
+            half_breadth_m=round(self.pod.y_m + max(self.pod.outline.radius_m), 3),
+        )
 
     @cached_property
     def envelope_volume_m3(self) -> float:

@@ -1,8 +1,8 @@
-"""The paper's three tables of coefficients, as printed, with the signs that had to be mended.
+"""The paper's three tables of coefficients, as printed, with the signs that had to be corrected.
 
 Gutnik, Avni, Treibitz and Groper (2021): tables III (estimated), IV (estimated beside CFD) and V
 (before and after calibration at sea). A row keeps what is printed; `value` is what its sign must be
-in the paper's own frame, x forward, y starboard, z down, and `mended` says why.
+in the paper's own frame, x forward, y starboard, z down (docs/vehicle-comparison.md says why).
 """
 
 from collections.abc import Iterable
@@ -14,27 +14,7 @@ from alice_survey.vehicle.coefficients import LIFTS, Coefficients
 Table = Literal["III", "IV", "V"]
 Column = Literal["estimated", "other"]
 
-_K_VDOT = (
-    "printed +0.216: the mast is above the origin (z < 0), so a force Y < 0 on it rolls by "
-    "K = -z Y < 0"
-)
-_N_PDOT = (
-    "printed -0.102: rolling to starboard sweeps the mast to starboard, the water holds it back, "
-    "Y < 0, aft of the origin (x < 0): N = x Y > 0"
-)
-_M_WDOT = (
-    "printed negative: M = -x Z, so M_wdot = -(Y_rdot of the same strips) and M_wdot = Z_qdot; "
-    "more of the hull is ahead of the origin"
-)
-_K_PP = "printed +0.192 in table III, -0.192 in table IV: damping opposes the roll"
-_K_VV = (
-    "printed +3.397 in table III, -3.39 in table IV: drag of the mast, above the origin, in sway "
-    "rolls by K = -z Y < 0"
-)
-_REASONS = {
-    "K_vdot": _K_VDOT, "N_pdot": _N_PDOT, "M_wdot": _M_WDOT, "K_pp": _K_PP, "K_vv": _K_VV,
-}  # fmt: skip
-_MUST = {"K_vdot": -1, "N_pdot": 1, "M_wdot": 1, "K_pp": -1, "K_vv": -1}
+_SIGNS = {"K_vdot": -1, "N_pdot": 1, "M_wdot": 1, "K_pp": -1, "K_vv": -1}
 """The sign these have; the others are right in print (tests derive all of them)."""
 
 
@@ -55,21 +35,16 @@ class PaperRow:
 
     @property
     def value(self) -> float:
-        """First column with its sign mended."""
+        """First column with its sign corrected."""
         return self._signed(self.printed)
 
     @property
     def other(self) -> float | None:
-        """Second column with its sign mended."""
+        """Second column with its sign corrected."""
         return None if self.printed_other is None else self._signed(self.printed_other)
 
-    @property
-    def mended(self) -> str:
-        """Why the sign differs from the print; empty if it does not."""
-        return _REASONS[self.coefficient] if self.value != self.printed else ""
-
     def _signed(self, printed: float) -> float:
-        sign = _MUST.get(self.coefficient)
+        sign = _SIGNS.get(self.coefficient)
         return printed if sign is None else sign * abs(printed)
 
 

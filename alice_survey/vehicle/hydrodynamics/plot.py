@@ -1,8 +1,7 @@
-"""A picture of the vehicle's shape, its strips, and its coefficients beside the paper's."""
+"""A picture of the vehicle's shape, its strips, and its coefficients next to the paper's."""
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import matplotlib as mpl
 import numpy as np
@@ -12,14 +11,13 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
 
 from alice_survey.base.errors import ConfigError
+from alice_survey.vehicle import fleet
 from alice_survey.vehicle.hydrodynamics import added_mass, drag
-from alice_survey.vehicle.hydrodynamics.entrained import Entrained
+from alice_survey.vehicle.hydrodynamics.comparison import CoefficientRow
+from alice_survey.vehicle.hydrodynamics.entrained import Entrained, entrained_water
 from alice_survey.vehicle.hydrodynamics.geometry import Geometry
 from alice_survey.vehicle.hydrodynamics.parts import Flow
 from alice_survey.vehicle.propulsion import Thruster
-
-if TYPE_CHECKING:
-    from alice_survey.vehicle.hydrodynamics.report import ReportRow
 
 _NO_DATES = {
     ".png": {"Software": None},
@@ -35,21 +33,13 @@ _FLOOR, _CEILING = 0.1, 10.0
 """Least and greatest ratio that the axis of ratios holds."""
 
 
-def draw_coefficients(
-    path: Path,
-    geometry: Geometry,
-    inside: Entrained,
-    thrusters: Sequence[Thruster],
-    rows: Sequence["ReportRow"],
-) -> None:
+def draw_coefficients(path: Path, geometry: Geometry, rows: Sequence[CoefficientRow]) -> None:
     """Draw side and top view, mass and drag along the hull, and the ratio to the paper's values.
 
     Args:
         path: PNG, PDF or SVG.
-        geometry: the vehicle.
-        inside: its entrained water.
-        thrusters: where they sit and push.
-        rows: of the report.
+        geometry: of a vehicle that is known by name.
+        rows: of the comparison.
 
     Raises:
         ConfigError: the suffix is none of the three.
@@ -57,6 +47,9 @@ def draw_coefficients(
     suffix = path.suffix.lower()
     if suffix not in _NO_DATES:
         raise ConfigError(f"{path}: plots are written as {', '.join(_NO_DATES)}: change the suffix")
+    craft = fleet.vehicle(geometry.name)
+    thrusters = craft.thrusters
+    inside = entrained_water(geometry, craft.rigid_body.buoyancy_kg, craft.density_kg_m3)
     figure = Figure(figsize=_SIZE_IN, facecolor="white")
     FigureCanvasAgg(figure)
     side, top = (_view(figure, bottom, limits) for bottom, limits in ((5.6, _SIDE), (2.9, _TOP)))
@@ -211,9 +204,9 @@ def _draw_strips(axes: Axes, geometry: Geometry, inside: Entrained) -> None:
     axes.set_title("strips along the hull", loc="left", fontsize=10)
 
 
-def _draw_ratios(axes: Axes, rows: Sequence["ReportRow"]) -> None:
+def _draw_ratios(axes: Axes, rows: Sequence[CoefficientRow]) -> None:
     """Computed over the paper's estimate, and its CFD and calibrated values over the same."""
-    shown: dict[tuple[str, str], ReportRow] = {}
+    shown: dict[tuple[str, str], CoefficientRow] = {}
     for row in rows:
         if row.table != "V":
             shown.setdefault((row.coefficient, row.part), row)

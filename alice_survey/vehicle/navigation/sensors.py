@@ -24,6 +24,7 @@ import numpy as np
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.dynamics import GRAVITY
+from alice_survey.vehicle.hull import POINT, Hull
 
 Place = tuple[float, float, float]
 
@@ -162,6 +163,8 @@ class Sensors(NamedTuple):
     tick_s: float
     place: Array
     """(6, 3) of the instruments and of the followed point on the body."""
+    hull: Array
+    """(P, 3) points of the vehicle's hull, whose clearance is reckoned."""
     beams: Array
     """(4, 3) unit vectors in the body frame."""
     dropouts_s: Array
@@ -242,10 +245,11 @@ class SensorSuite:
     relief_memory_s: float = 10.0
     """Over which the spread of the beams is averaged; their own footprint at survey speed."""
 
-    def pack(self, tick_s: float = 0.05) -> Sensors:
+    def pack(self, hull: Hull = POINT, tick_s: float = 0.05) -> Sensors:
         """For compiled code.
 
         Args:
+            hull: of the vehicle that carries them.
             tick_s: between calls of the navigation.
 
         Raises:
@@ -263,6 +267,7 @@ class SensorSuite:
                     gps.position_body_m, usbl.position_body_m, self.followed_body_m,
                 ], dtype=np.float64,
             ),
+            hull=hull.points_body_m,
             beams=janus_beams(dvl.beam_angle_rad),
             dropouts_s=np.array(dvl.dropouts_s, dtype=np.float64).reshape(-1, 2),
             gyro_noise=imu.gyro_noise_rad_per_sqrt_s,

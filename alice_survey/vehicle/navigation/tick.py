@@ -11,7 +11,6 @@ import numpy as np
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.floor import FloorGrid
-from alice_survey.vehicle.hull import HULL_BODY_M
 from alice_survey.vehicle.navigation.filter import (
     correct,
     lever_row,
@@ -278,9 +277,10 @@ def _hear_floor(time_s: float, used: int, nav: NavigationState, suite: Sensors) 
     memory[FOLLOWED_DEPTH] = _followed_depth(nav, suite)
 
     clearance, lowest = altitude, 0.0
-    for i in range(len(HULL_BODY_M) + 1):
-        if i < len(HULL_BODY_M):
-            a, b, c = HULL_BODY_M[i]
+    points = suite.hull.shape[0]
+    for i in range(points + 1):
+        if i < points:
+            a, b, c = suite.hull[i, 0], suite.hull[i, 1], suite.hull[i, 2]
         else:
             a, b, c = place[DVL, 0], place[DVL, 1], place[DVL, 2]
         a, b, c = a - place[FOLLOWED, 0], b - place[FOLLOWED, 1], c - place[FOLLOWED, 2]

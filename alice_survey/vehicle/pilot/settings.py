@@ -8,6 +8,7 @@ import numpy as np
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.compiled import kernel
+from alice_survey.vehicle.limits import SPOT_RAD_S, STEP_MPS
 from alice_survey.vehicle.pilot.gains import (
     BANDWIDTH,
     FASTEST,
@@ -30,21 +31,17 @@ from alice_survey.vehicle.pilot.safety import Limits
 
 LEFT_PORT_BODY_M = (0.55, -0.05, 0.08)
 """The left port's outer glass, as the default rig has it."""
-HULL_LENGTH_M = 1.6
-"""Of SPARUS II and ALICE (paper, section II)."""
+CONTROL_LENGTH_M = 1.6
+"""The unit of the pilot's distances: the hull of SPARUS II, which the paper (section II) states for
+ALICE too; ALICE's is longer (`Vehicle.hull`)."""
 LOS_DAMPING_RATIO = 0.5
 """Least of the path loop of `los` (inferred: one overshoot of a sixth)."""
 _STRAIGHT_PER_M = 1e-9
-_LOOK_AHEADS_M = np.geomspace(HULL_LENGTH_M, 100.0, 400)
-SPOT_RAD_S = math.radians(15.0)
-"""Rate of a turn on the spot: half of the fastest that gains.py lets a vehicle ask for (inferred).
-"""
-STEP_MPS = 0.15
-"""Speed of a sway step (inferred: what ALICE swayed at in the paper's turns, section VI)."""
+_LOOK_AHEADS_M = np.geomspace(CONTROL_LENGTH_M, 100.0, 400)
 _RAMP_PERIODS = 2.0
 """A reference gains its speed in so many times 1 / bandwidth of the loop that follows it: a
 critically damped pair has then done most of what it does (inferred)."""
-SWAY_LOOK_AHEAD_M = 2.5 * HULL_LENGTH_M
+SWAY_LOOK_AHEAD_M = 2.5 * CONTROL_LENGTH_M
 """Of `sway`, which goes by it only when far off its path, where none is damped well: the longest
 that Fossen (2011, section 10.3.2) gives."""
 
@@ -157,11 +154,11 @@ def pilot_guidance(
         sway=float(by_sway),
         point_body_m=np.array(point_body_m, np.float64),
         look_ahead_m=look_ahead_m,
-        far_m=0.5 * HULL_LENGTH_M,
-        near_m=0.25 * HULL_LENGTH_M,
-        lost_m=5.0 * HULL_LENGTH_M,
+        far_m=0.5 * CONTROL_LENGTH_M,
+        near_m=0.25 * CONTROL_LENGTH_M,
+        lost_m=5.0 * CONTROL_LENGTH_M,
         capture_m=0.2 if by_sway else 1.0,
-        way_in_m=HULL_LENGTH_M if by_sway else 3.0 * look_ahead_m,
+        way_in_m=CONTROL_LENGTH_M if by_sway else 3.0 * look_ahead_m,
         smooth_m=min(speed, turning) / float(axes[YAW, BANDWIDTH]),
         brake_mps2=STEADY_SHARE * weakest / float(axes[SURGE, MASS]),
         floor_rate_rad_s=2.0 * speed / terrain_smoothing_m,
@@ -267,7 +264,7 @@ def damped_look_ahead_m(gains: Gains, speed_mps: float, lever_m: float) -> float
         return None
     first = int(np.argmax(ratios >= LOS_DAMPING_RATIO))
     if first == 0:
-        return HULL_LENGTH_M
+        return CONTROL_LENGTH_M
     low, high = float(_LOOK_AHEADS_M[first - 1]), float(_LOOK_AHEADS_M[first])
     while high - low > 1e-3:
         middle = 0.5 * (low + high)
@@ -300,7 +297,7 @@ def shortest_look_ahead_m(gains: Gains, speed_mps: float, lever_m: float) -> flo
     found = damped_look_ahead_m(gains, speed_mps, lever_m)
     if found is None:
         raise VehicleError(
-            f"no look-ahead from {HULL_LENGTH_M:g} to {_LOOK_AHEADS_M[-1]:g} m keeps los from "
+            f"no look-ahead from {CONTROL_LENGTH_M:g} to {_LOOK_AHEADS_M[-1]:g} m keeps los from "
             f"weaving at {speed_mps:g} m/s: lower the speed, or check the vehicle's coefficients"
         )
     return found

@@ -20,7 +20,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def words(text: str) -> str:
-    return re.sub(r"[\s\u00ad]+", "", text)
+    return re.sub(r"[\s\u00ad\u200b]+", "", text)
 
 
 def test_page_and_pdf_say_the_same(workspace: Path) -> None:
@@ -35,10 +35,29 @@ def test_page_and_pdf_say_the_same(workspace: Path) -> None:
         assert words(sentence) in shown, sentence
         assert words(sentence) in printed, sentence
     cells = re.findall(r"<(?:td|th|h2|h3)[^>]*>(.*?)</(?:td|th|h2|h3)>", page, re.DOTALL)
-    told = {words(unescape(re.sub(r"<[^>]*>", "", cell))) for cell in cells}
-    assert len(told) > 60
-    missing = {cell for cell in told if cell not in printed}
+    texts = {words(unescape(re.sub(r"<[^>]*>", "", cell))) for cell in cells}
+    assert len(texts) > 60
+    missing = {cell for cell in texts if cell not in printed}
     assert missing <= {"Contents", "Verdicts", "Keyfigures"}, missing
+
+
+def test_the_pdf_can_be_cited_and_read_aloud(workspace: Path) -> None:
+    reader = PdfReader(workspace / "report" / "report.pdf")
+    text = [sheet.extract_text() for sheet in reader.pages]
+    whole = "".join(text)
+    assert f"page 2 of {len(text)}" in text[1]
+    figures = [int(n) for n in re.findall(r"Figure (\d+)\.", whole)]
+    tables = [int(n) for n in re.findall(r"Table (\d+)\.", whole)]
+    assert sorted(set(figures)) == list(range(1, max(figures) + 1))
+    assert sorted(set(tables)) == list(range(1, max(tables) + 1))
+    assert max(figures) >= 6 and max(tables) >= 5
+    assert reader.metadata is not None
+    assert reader.metadata.title == "tiny reef"
+    for word in ("drag", "click", "mouse", "Choose what", "lighter copy"):
+        assert word.lower() not in whole.lower(), word
+    root = reader.trailer["/Root"]
+    assert root["/MarkInfo"]["/Marked"]
+    assert root["/Lang"] == "en"
 
 
 def test_the_same_workspace_gives_the_same_bytes(workspace: Path) -> None:
@@ -50,7 +69,7 @@ def test_the_same_workspace_gives_the_same_bytes(workspace: Path) -> None:
         assert (folder / name).read_bytes() == before[name], name
 
 
-def test_a_report_is_made_anew_only_when_something_has_changed(workspace: Path) -> None:
+def test_a_report_is_made_again_only_when_something_has_changed(workspace: Path) -> None:
     assert not spec("report").make(workspace, SurveyConfig(), 1)
     path = workspace / "sparse" / "registration.json"
     text = path.read_text()
@@ -59,6 +78,21 @@ def test_a_report_is_made_anew_only_when_something_has_changed(workspace: Path) 
     assert "4 of 5" in (workspace / "report" / "report.html").read_text()
     path.write_text(text)
     assert spec("report").make(workspace, SurveyConfig(), 1)
+
+
+@pytest.mark.parametrize(("scaled", "unit"), [(False, "unit"), (True, "m")])
+def test_a_model_without_a_place_is_reported(tmp_path: Path, scaled: bool, unit: str) -> None:
+    workspace = tiny_workspace(tmp_path, scaled=scaled, placed=False)
+    (workspace / "plan" / "stage.json").unlink()
+    assert spec("report").make(workspace, SurveyConfig(), 1)
+    data = json.loads((workspace / "report" / "report.json").read_text())
+    assert data["unit"] == unit
+    page = (workspace / "report" / "report.html").read_text(encoding="utf-8")
+    assert f"0.25 {unit}²" in page
+    shown = json.loads(re.findall(r'id="map-data">(.*?)</script>', page)[0])
+    cameras = next(layer for layer in shown["layers"] if layer["name"] == "cameras")
+    # A model's own x goes east and its y north.
+    assert cameras["shapes"][0] == [[0.3, 0.4]]
 
 
 def test_nothing_is_loaded_from_anywhere(workspace: Path) -> None:

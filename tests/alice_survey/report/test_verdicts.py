@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 from typing import Any
 
@@ -6,6 +7,7 @@ import pytest
 from alice_survey.base.artefacts import write_json
 from alice_survey.report.figures import Figures
 from alice_survey.report.held import Held
+from alice_survey.report.sections import sections
 from alice_survey.report.summary import facts, summary
 from alice_survey.report.verdicts import Verdict, verdicts
 from tests.alice_survey.report.tiny import tiny_workspace
@@ -29,13 +31,13 @@ def test_a_hole_in_the_planned_area_is_seen_and_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("registered", "level"), [(4, "good"), (3, "bad")])
-def test_lost_pictures_are_told(tmp_path: Path, registered: int, level: str) -> None:
+def test_lost_pictures_are_judged(tmp_path: Path, registered: int, level: str) -> None:
     _, found = judged(tiny_workspace(tmp_path, sparse={"registered": registered}))
     assert level_of(found, f"{registered} of 4") == level
 
 
 @pytest.mark.parametrize(("scale", "level"), [(0.99, "look"), (0.999, "good"), (1.01, "look")])
-def test_navigation_that_contradicts_the_rig_is_told(
+def test_navigation_that_contradicts_the_rig_is_judged(
     tmp_path: Path, scale: float, level: str
 ) -> None:
     place: dict[str, Any] = {"scale_of_navigation": scale, "scale_of_navigation_sigma": 0.001}
@@ -59,12 +61,12 @@ def test_a_model_without_scale_is_bad_and_says_what_to_do(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("miss_mm", "told", "levels"),
+    ("miss_mm", "ratio", "levels"),
     [(0.5, 1.1, ("good", "good")), (5.0, 1.1, ("bad", "good")), (0.5, 3.4, ("good", "look")),
      (0.5, 0.3, ("good", "look"))],
 )  # fmt: skip
 def test_errors_are_judged_by_the_pixel_and_by_their_sigmas(
-    tmp_path: Path, miss_mm: float, told: float, levels: tuple[str, str]
+    tmp_path: Path, miss_mm: float, ratio: float, levels: tuple[str, str]
 ) -> None:
     workspace = tiny_workspace(tmp_path)
     write_json(workspace / "evaluation" / "stage.json", {"took_s": 1.0})
@@ -75,7 +77,7 @@ def test_errors_are_judged_by_the_pixel_and_by_their_sigmas(
         "mosaic": {}, "lengths": {},
         "surface": {
             "distance_rms_mm": miss_mm, "ground_pixel_mm": 1.8, "doming": {"dome_mm": 0.1},
-            "error_over_sigma": {"rms": told}, "completeness_within_px": {"3": 0.99},
+            "error_over_sigma": {"rms": ratio}, "completeness_within_px": {"3": 0.99},
         },
     })  # fmt: skip
     figures, found = judged(workspace)
@@ -104,3 +106,42 @@ def test_every_verdict_that_is_not_good_says_what_to_do(tmp_path: Path) -> None:
     asked = [verdict for verdict in found if verdict.level != "good"]
     assert len(asked) >= 5
     assert all(verdict.action for verdict in asked)
+
+
+def test_values_and_their_sigmas_have_one_unit(tmp_path: Path) -> None:
+    bend = {"sag_m": 0.00459, "sag_sigma_m": 0.0492, "length_m": 5.0}
+    place = {"scale_of_navigation": 0.9993, "scale_of_navigation_sigma": 0.0056}
+    axes = {f"{kind}_{axis}_m": 0.1 for kind in ("rms", "sigma") for axis in
+            ("north", "east", "depth")}  # fmt: skip
+    workspace = tiny_workspace(
+        tmp_path,
+        sparse={"georeference": place | axes | {"sigma_heading_deg": 0.1, "sigma_tilt_deg": 0.1}},
+        mapping={"doming": {"along": bend, "across": None, "notes": [],
+                            "scale": {"mean": 1.0007, "mean_sigma": 0.0056}}},
+    )  # fmt: skip
+    figures, found = judged(workspace)
+    texts = [verdict.text for verdict in found]
+    for section in sections(figures, has_map=False, has_mesh=False):
+        texts += [cell for table in section.tables for row in table.rows for cell in row]
+    pairs = [text for text in texts if "±" in text]
+    assert len(pairs) == 4
+    assert not any("+/-" in text for text in texts)
+    for text in pairs:
+        value, _, unit = re.findall(r"([-+]?[\d.]+) ± ([\d.]+) (\S+)", text)[0]
+        assert unit in ("cm", "%"), text
+        assert float(value) != 0.0
+
+
+def test_a_calibration_whose_own_checks_passed_asks_for_nothing(tmp_path: Path) -> None:
+    workspace = tiny_workspace(tmp_path)
+    write_json(workspace / "calibration" / "stage.json", {"took_s": 1.0})
+    write_json(workspace / "calibration" / "report.json", {
+        "views": 25, "rms_px": 0.014, "parameters": [], "verdicts": [
+            {"level": "good", "text": "1 picture fits worse and changes nothing"},
+            {"level": "good", "text": "held-out views fit to 0.012 px rms"},
+        ],
+    })  # fmt: skip
+    write_json(workspace / "calibration" / "calibration.json",
+               {"parameters": ["a", "b"], "correlation": [[1.0, 0.1], [0.1, 1.0]]})  # fmt: skip
+    _, found = judged(workspace)
+    assert level_of(found, "calibration") == "good"

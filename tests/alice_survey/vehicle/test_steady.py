@@ -1,78 +1,18 @@
-"""Steady motion in numpy against the compiled equations of motion."""
+"""Steady motion against the equations of motion."""
 
 import math
 
 import numpy as np
 import pytest
 
-from alice_survey.vehicle.allocation.exact import allocate_exact
-from alice_survey.vehicle.allocation.preference import AXIS_WEIGHTS, preference_weights
-from alice_survey.vehicle.allocation.scratch import allocation_scratch
-from alice_survey.vehicle.dynamics import (
-    add_coriolis,
-    add_damping,
-    derivative,
-    initial_state,
-    scratch_for,
-)
+from alice_survey.vehicle.dynamics import derivative, initial_state, scratch_for
 from alice_survey.vehicle.fleet import vehicle
-from alice_survey.vehicle.propulsion import (
-    add_thrust,
-    electrical_power,
-    speeds_for,
-    thrust_limits,
-)
+from alice_survey.vehicle.propulsion import add_thrust
 from alice_survey.vehicle.sea import constant_current
-from alice_survey.vehicle.steady import (
-    BALANCED,
-    drag_power,
-    limits,
-    power_of,
-    preference,
-    speeds_of,
-    steady_flight,
-    thruster_wrench,
-    water_force,
-)
-from alice_survey.vehicle.vehicle import Vehicle
+from alice_survey.vehicle.steady import BALANCED, drag_power, steady_flight
 
 ALICE, SPARUS = vehicle("alice"), vehicle("sparus2")
 RNG = np.random.default_rng(1)
-MOTIONS = RNG.uniform(-0.4, 0.4, (40, 6))
-MOTIONS[0] = 0.0
-MOTIONS[1] = [0.2, 0.0, 0.0, 0.0, 0.0, 0.0]
-
-
-@pytest.mark.parametrize("craft", [ALICE, SPARUS], ids=["alice", "sparus2"])
-def test_each_law_equals_its_compiled_twin(craft: Vehicle) -> None:
-    plant, n = craft.plant, len(craft.thrusters)
-    table = plant.propulsion.table
-    rps = RNG.uniform(-40, 40, (len(MOTIONS), n))
-    rps[2] = 0.0
-    thrust = RNG.uniform(-15, 15, (len(MOTIONS), n))
-    thrust[3] = 0.0
-    force, wrench = water_force(plant.body, MOTIONS), thruster_wrench(table, rps, MOTIONS)
-    speeds, power = speeds_of(table, thrust, MOTIONS), power_of(table, rps, MOTIONS)
-    lower, upper = limits(table, MOTIONS)
-    weights = preference(table, MOTIONS[:, 0])
-    for i, nu in enumerate(MOTIONS):
-        expected = np.zeros(6)
-        add_damping(plant.body, nu, expected)
-        add_coriolis(plant.body, nu, expected)
-        np.testing.assert_allclose(force[i], expected, atol=1e-12)
-        expected = np.zeros(6)
-        add_thrust(plant.propulsion, rps[i], nu, expected)
-        np.testing.assert_allclose(wrench[i], expected, rtol=1e-12, atol=1e-12)
-        out, other = np.zeros(n), np.zeros(n)
-        speeds_for(plant.propulsion, thrust[i], nu, out)
-        np.testing.assert_allclose(speeds[i], out, rtol=1e-10, atol=1e-12)
-        electrical_power(plant.propulsion, rps[i], nu, out)
-        np.testing.assert_allclose(power[i], out, rtol=1e-12)
-        thrust_limits(plant.propulsion, np.ones(n), nu, out, other)
-        np.testing.assert_allclose(lower[i], out, rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(upper[i], other, rtol=1e-12, atol=1e-12)
-        preference_weights(plant.propulsion, float(nu[0]), out)
-        np.testing.assert_allclose(weights[i], out, rtol=1e-12)
 
 
 def _planar() -> np.ndarray:
@@ -101,39 +41,14 @@ def test_the_compiled_dynamics_stay_as_they_are_at_the_steady_thrust() -> None:
         assert np.abs(force[list(BALANCED)]).max() < 1e-6
 
 
-def test_thrust_is_what_the_exact_allocation_gives() -> None:
-    """Of the wrench that the thrusts make; jets' drag and torques at speed come on top."""
-    nu = _planar()
-    flight = steady_flight(ALICE, nu)
-    plant, n = ALICE.plant, 5
-    room, health = allocation_scratch(n), np.ones(n)
-    for i in range(len(nu)):
-        made = np.zeros(6)
-        add_thrust(plant.propulsion, flight.rps[i], nu[i], made)
-        lower, upper, weights = np.zeros(n), np.zeros(n), np.zeros(n)
-        thrust_limits(plant.propulsion, health, nu[i], lower, upper)
-        preference_weights(plant.propulsion, float(nu[i, 0]), weights)
-        gain = np.zeros(n)  # thrust along each axis, from the speeds
-        for k in range(n):
-            alone = np.zeros(6)
-            single = np.where(np.arange(n) == k, flight.rps[i], 0.0)
-            add_thrust(plant.propulsion, single, nu[i], alone)
-            gain[k] = alone[:3] @ np.array(ALICE.thrusters[k].direction_body)
-        wanted = ALICE.configuration_matrix @ gain
-        best = np.zeros(n)
-        allocate_exact(
-            ALICE.configuration_matrix, wanted, lower, upper, AXIS_WEIGHTS, weights, best, room
-        )
-        np.testing.assert_allclose(gain, best, atol=1e-6)
-
-
 def test_power_of_a_sound_figure_is_known() -> None:
     """0.2 m/s ahead: 15.23 x 0.04 N of drag, and 0.98 N of buoyancy held down."""
     nu = np.zeros((1, 6))
     nu[0, 0] = 0.2
     flight = steady_flight(ALICE, nu)
     assert drag_power(ALICE.plant.body, nu)[0] == pytest.approx(15.23 * 0.2**3, rel=1e-12)
-    made = thruster_wrench(ALICE.plant.propulsion.table, flight.rps, nu)[0]
+    made = np.zeros(6)
+    add_thrust(ALICE.plant.propulsion, flight.rps[0], nu[0], made)
     assert made[0] == pytest.approx(15.23 * 0.2**2, abs=1e-9)
     assert made[2] == pytest.approx(0.1 * 9.80665, abs=1e-9)
     assert made[1] == pytest.approx(0.0, abs=1e-9)

@@ -219,6 +219,19 @@ def test_a_sound_calibration_has_only_good_verdicts_on_its_fit() -> None:
     assert not any(v.level == "bad" for v in found)
 
 
+def test_a_picture_that_does_no_harm_asks_for_nothing() -> None:
+    judged = judge(usual(), usual_held_out())
+    first = judged.pictures[0]
+    odd = replace(judged, pictures=(replace(first, rms_px=3 * first.rms_px), *judged.pictures[1:]))
+    assert odd.hold_out is not None
+    bad = replace(odd.hold_out, rms_px=2 * odd.hold_out.expected_px)
+    for judgement, level in (
+        (odd, "good"), (replace(odd, hold_out=bad), "look"), (replace(odd, hold_out=None), "look"),
+    ):  # fmt: skip
+        about = [v for v in verdicts(judgement) if f"view {first.view} of" in v.text]
+        assert [v.level for v in about] == [level]
+
+
 def test_a_forgotten_port_is_told() -> None:
     made = synthetic_views(true_rig(), 25, 0.03, 1)
     free = Freedom(free=(*of_cameras(DESIGN, intrinsics("opencv5")), *pose_names(DESIGN)))

@@ -13,7 +13,6 @@ from fastkml import Folder, Placemark, kml
 from fastkml.utils import find_all
 from hypothesis import HealthCheck, given, settings
 
-from missions.exports.kml import write_kml
 from missions.exports.write import write_exports
 from missions.values.plan_file import Plan
 from tests.missions.exports.plans import RIG, small_plan
@@ -69,10 +68,10 @@ def test_kml_in_fastkml(plan: Plan) -> None:
         assert length == pytest.approx(dive.route.length_m, rel=1e-4, abs=0.02)
 
 
-def test_kml_has_areas_with_their_holes_and_footprints_when_asked(tmp_path: Path) -> None:
+def test_kml_has_areas_with_their_holes(tmp_path: Path) -> None:
     plan = small_plan()
-    write_kml(tmp_path / "with.kml", plan, RIG, footprints=True)
-    marks = {mark.name: mark for mark in placemarks(tmp_path / "with.kml", "Areas")}
+    write_exports(tmp_path, plan, RIG, formats=["kml"])
+    marks = {mark.name: mark for mark in placemarks(tmp_path / "plan.kml", "Areas")}
     area = marks["survey area"].geometry
     (wanted,) = plan.area.survey.geoms
     read = shapely.Polygon(
@@ -81,11 +80,6 @@ def test_kml_has_areas_with_their_holes_and_footprints_when_asked(tmp_path: Path
     assert read.symmetric_difference(wanted).area < MM
     assert len(read.interiors) == 1
     np.testing.assert_allclose(ne(plan, marks["home"].geometry.coords), [[-2, -2]], atol=MM)
-    prints = placemarks(tmp_path / "with.kml", "Footprints")
-    assert len(prints) == plan.stations
-    first = shapely.Polygon(ne(plan, prints[0].geometry.exterior.coords))
-    # 1.44 m by 1.17 m on the middle row and column, less at its corners: a footprint bulges.
-    assert 0.94 * 1.441 * 1.1749 < first.area < 0.98 * 1.441 * 1.1749
 
 
 @WIDE

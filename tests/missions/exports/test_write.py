@@ -1,20 +1,28 @@
 import csv
+import importlib.util
 import json
 import math
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from alice_survey.base.artefacts import write_json
 from alice_survey.base.config import parse_config
 from alice_survey.base.errors import PlanError
+from missions.exports import formats
 from missions.exports.options import Options
+from missions.exports.registry import format_named, format_names, formats_table
 from missions.exports.waypoints import DEPTH_STEP_M, bends
-from missions.exports.write import FORMATS, counted, export_report, write_exports
+from missions.exports.write import export_report, write_exports
 from missions.values.plan_file import read_plan
 from tests.missions.exports.plans import RIG, small_plan
 from tests.missions.exports.readers import local_ne
+
+DOCS = Path(__file__).parents[3] / "docs"
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -38,17 +46,18 @@ def test_every_format_is_written_the_same_twice(tmp_path: Path) -> None:
         assert one.read_bytes() == two.read_bytes()
 
 
-@pytest.mark.parametrize("format_", FORMATS)
+@pytest.mark.parametrize("format_", format_names())
 def test_a_format_comes_alone_with_its_description(tmp_path: Path, format_: str) -> None:
     files = write_exports(tmp_path, small_plan(), RIG, formats=[format_])
-    assert files[-1].name == "about.txt"
-    text = files[-1].read_text()
-    assert all(file.name in text for file in files[:-1])
+    *written, about = files
+    assert about.name == "about.txt"
+    text = about.read_text()
+    assert all(f"{file.name}: {files[file]}" in text for file in written)
     assert 1 <= len(files) - 1 <= 3
 
 
 def test_an_unknown_format_names_those_that_are_known(tmp_path: Path) -> None:
-    with pytest.raises(PlanError, match=r"format 'dxf' is not known; known are cola2, .*csv"):
+    with pytest.raises(PlanError, match=r"'dxf' .* cola2, cola2-v1, csv"):
         write_exports(tmp_path / "none", small_plan(), RIG, formats=["cola2", "dxf"])
     assert not (tmp_path / "none").exists()
 
@@ -96,14 +105,14 @@ def test_the_report_takes_the_mount_from_the_settings_of_the_plan(tmp_path: Path
     settings = {name: getattr(config, name).model_dump(mode="json") for name in ("camera", "water")}
     write_json(folder / "stage.json", {"settings": settings})
     text, about = export_report(folder / "plan.json", ["wpl", "csv"])
-    given, _ = export_report(folder, ["wpl", "csv"], tmp_path / "other", config)
+    given, _ = export_report(folder, ["wpl", "csv"], tmp_path / "other")
 
     assert len(about["files"]) == 6
     assert text.splitlines()[0].startswith(f"{folder / 'exports'}: 6 files of 64 stations in 2")
     assert text.splitlines()[1:] == given.splitlines()[1:]
-    told = (folder / "exports" / "about.txt").read_text()
-    assert "+0.700 m forward, -0.100 m right" in told
-    assert "plan of 6 lines, 64 stations, 2 dives\n" in told
+    stated = (folder / "exports" / "about.txt").read_text()
+    assert "+0.700 m forward, -0.100 m right" in stated
+    assert "plan of 6 lines, 64 stations, 2 dives\n" in stated
     json.dumps(about)
 
     export_report(folder, ["cola2"], tmp_path / "named", camera_on="/rig/go")
@@ -112,9 +121,66 @@ def test_the_report_takes_the_mount_from_the_settings_of_the_plan(tmp_path: Path
 
 
 def test_depths_that_do_not_fit_the_lines_are_refused(tmp_path: Path) -> None:
-    plan = small_plan()
+    plan = small_plan(line_depths_m=((13.0,) * 5,))
     with pytest.raises(PlanError, match="depths of 1 lines with 5 stations do not fit a plan of 6"):
-        write_exports(tmp_path, plan, RIG, line_depths=[np.full(5, 13.0)])
+        write_exports(tmp_path, plan, RIG)
+
+
+_TOY = '''
+"""Lines as a list of their lengths."""
+
+from pathlib import Path
+
+from missions.exports.format import Export, ExportFile, ExportFormat
+
+
+def write_lengths(path: Path, export: Export, _dive: int = 0) -> None:
+    """Write a length a row."""
+    path.write_text("\\n".join(f"{line.length_m:.3f}" for line in export.plan.lines))
+
+
+FORMAT = ExportFormat(
+    read_by="people who like lengths",
+    files=(ExportFile(name="lengths.txt", about="lengths of lines", write=write_lengths),),
+)
+'''
+
+
+def test_a_format_is_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "toy_lengths.py").write_text(_TOY)
+    monkeypatch.setattr(formats, "__path__", [*formats.__path__, str(tmp_path)])
+    assert "toy-lengths" in format_names()
+    assert "| `toy-lengths` | `lengths.txt` | people who like lengths |" in formats_table()
+    files = write_exports(tmp_path / "out", small_plan(), RIG)
+    assert files[tmp_path / "out" / "lengths.txt"] == "lengths of lines"
+    assert len((tmp_path / "out" / "lengths.txt").read_text().splitlines()) == 6
+    assert "lengths.txt: lengths of lines" in (tmp_path / "out" / "about.txt").read_text()
+    monkeypatch.setitem(sys.modules, "alice_survey.cli.plan", None)
+    monkeypatch.delitem(sys.modules, "alice_survey.cli.plan")
+    command = importlib.import_module("alice_survey.cli.plan").app
+    shown = CliRunner().invoke(command, ["export", "--help"], env={"COLUMNS": "200"})
+    assert "toy-lengths" in shown.output
+
+
+def test_names_of_formats_are_known_without_importing_them() -> None:
+    code = (
+        "import sys, alice_survey.cli.plan\n"
+        "print([name for name in sys.modules if name.startswith('missions.exports.formats.')])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_the_documentation_lists_all_formats() -> None:
+    spec = importlib.util.spec_from_file_location("hooks", DOCS / "hooks.py")
+    assert spec is not None and spec.loader is not None
+    hooks = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(hooks)
+    page = (DOCS / "exports.md").read_text()
+    shown = hooks.on_page_markdown(page, page=None, config=None, files=None)
+    for name in format_names():
+        assert f"| `{name}` |" in shown
+        assert format_named(name).read_by in shown
 
 
 @pytest.mark.parametrize("change", [{"least_tolerance_m": 0.0}, {"camera_on": ""}])
@@ -134,11 +200,6 @@ def test_bends_keep_every_depth_within_the_tolerance() -> None:
         assert len(kept) < 60
     slope = np.linspace(0.0, 5.0, 40)
     assert bends(slope, 0.3 * slope, DEPTH_STEP_M) == [0, 39]
-
-
-@pytest.mark.parametrize(("number", "told"), [(0, "0 dives"), (1, "1 dive"), (2, "2 dives")])
-def test_one_is_told_in_the_singular(number: int, told: str) -> None:
-    assert counted(number, "dive") == told
 
 
 @pytest.mark.parametrize(

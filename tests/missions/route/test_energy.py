@@ -15,7 +15,6 @@ from PIL import Image
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import PlanError
 from alice_survey.vehicle.fleet import vehicle
-from alice_survey.vehicle.pilot import settings as pilot
 from alice_survey.vehicle.steady import steady_flight
 from missions.exposure.settings import ImagingSetup, imaging_settings
 from missions.plan.strength import arcs_fit, held_current_mps, survey_costs, too_strong
@@ -30,7 +29,7 @@ from missions.route.energy import (
     motion,
     usable_wh,
 )
-from missions.values.costs import SPOT_RAD_S, STEP_MPS, power_at, time_costs
+from missions.values.costs import power_at, time_costs
 from missions.values.line import Line
 
 
@@ -392,10 +391,6 @@ def test_costs_compile_nothing() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["0", "False"]
-
-
-def test_stops_are_counted_as_the_pilot_flies_them() -> None:
-    assert (SPOT_RAD_S, STEP_MPS) == (pilot.SPOT_RAD_S, pilot.STEP_MPS)
 
 
 def test_seconds_stand_for_joules() -> None:

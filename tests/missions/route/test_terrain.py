@@ -11,6 +11,8 @@ from pyproj import Transformer
 
 from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import Array, Datum
+from alice_survey.vehicle.fleet import vehicle
+from alice_survey.vehicle.hull import Hull
 from missions.areas.bathymetry import Bathymetry, read_bathymetry
 from missions.route.terrain import (
     Reach,
@@ -27,7 +29,8 @@ from tests.oracles_energy import envelope as slow_envelope
 from tests.oracles_energy import highest_within
 
 DATUM = Datum(32.8236, 34.9553)
-REACH = reach_of((0.55, -0.05, 0.08), 0.7, 0.6)
+ALICE, SPARUS2 = vehicle("alice").hull, vehicle("sparus2").hull
+REACH = reach_of(ALICE, (0.55, -0.05, 0.08), 0.7, 0.6)
 LIMITS = TerrainLimits(altitude_m=2.0, least_clearance_m=1.0, steepest_rad=math.radians(20.0))
 
 
@@ -107,6 +110,15 @@ def test_a_slope_is_followed_above_its_highest_within_reach() -> None:
     assert up.clearance_m == pytest.approx(2.0, abs=1e-9)
     assert np.degrees(up.slopes_rad) == pytest.approx(-math.degrees(math.atan(0.2)), abs=0.05)
     assert np.degrees(down.slopes_rad) == pytest.approx(math.degrees(math.atan(0.2)), abs=0.05)
+
+
+@pytest.mark.parametrize(("hull", "tail_m"), [(ALICE, 0.90), (SPARUS2, 0.734)])
+def test_down_a_slope_the_vehicles_own_tail_is_kept_clear(hull: Hull, tail_m: float) -> None:
+    floor = _floor(14.0 - 0.2 * _eastings())
+    reach = reach_of(hull, (0.55, -0.05, 0.08), 0.1, 0.1)
+    (down,) = line_profiles([_line((0.0, 15.0), (0.0, -15.0))], floor, reach, LIMITS)
+    raised_m = (down.altitude_m - LIMITS.altitude_m) / 0.2 - 0.55
+    assert raised_m == pytest.approx(tail_m, abs=0.03)
 
 
 def test_before_a_cliff_the_glass_climbs_at_the_steepest_slope() -> None:
@@ -230,11 +242,14 @@ def test_the_report_names_where_pictures_are_taken_from_too_high(
 
 
 def test_the_reach_is_of_hull_or_pictures_whichever_is_farther() -> None:
-    near = reach_of((0.55, -0.05, 0.08), 0.1, 0.1)
-    far = reach_of((0.55, -0.05, 0.08), 2.0, 3.0)
-    assert near == Reach(
-        ahead_m=pytest.approx(0.3045), astern_m=pytest.approx(1.284), beside_m=pytest.approx(0.276)
-    )
+    glass = 0.55, -0.05, 0.08
+    far = reach_of(ALICE, glass, 2.0, 3.0)
+    for hull, ahead_m, astern_m in ((ALICE, 0.51, 1.45), (SPARUS2, 0.305, 1.284)):
+        assert reach_of(hull, glass, 0.1, 0.1) == Reach(
+            ahead_m=pytest.approx(ahead_m),
+            astern_m=pytest.approx(astern_m),
+            beside_m=pytest.approx(0.276),
+        )
     assert far == Reach(ahead_m=3.0, astern_m=3.0, beside_m=2.0)
 
 

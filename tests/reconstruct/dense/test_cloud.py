@@ -3,7 +3,13 @@ from dataclasses import replace
 import numpy as np
 
 from alice_survey.base.artefacts import read_json
-from reconstruct.dense.cloud import VERTEX, thinned_points, voxel_edge, write_cloud_json, write_ply
+from reconstruct.dense.cloud import (
+    VERTEX,
+    thinned_points,
+    voxel_edge,
+    write_cloud,
+    write_cloud_json,
+)
 from reconstruct.dense.points import Points
 from reconstruct.raster import DemGrid
 from tests.oracles_dense import FRAME
@@ -54,7 +60,7 @@ def test_ply_is_read_back_by_another_library(tmp_path):
 
     vertices = thinned_points(GRID, random_points())
     parts = [vertices[:100], vertices[100:100], vertices[100:]]
-    count = write_ply(tmp_path / "cloud.ply", parts, (1.0, 2.0, -12.0), FRAME)
+    count = write_cloud(tmp_path / "cloud.ply", parts, (1.0, 2.0, -12.0), FRAME)
     assert count == len(vertices)
     cloud = o3d.t.io.read_point_cloud(str(tmp_path / "cloud.ply"))
     places = np.column_stack([vertices["x"], vertices["y"], vertices["z"]])

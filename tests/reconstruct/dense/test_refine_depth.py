@@ -1,3 +1,5 @@
+from functools import cache
+
 import cv2
 import numpy as np
 from scipy import ndimage
@@ -13,6 +15,7 @@ SCENE = Scene(
 VIEWS = stereo_views(np.array([0.1, 0.45]), np.array([0.3, 0.4]))
 
 
+@cache
 def looks() -> list[ComparedView]:
     found = []
     for view in VIEWS:
@@ -22,9 +25,6 @@ def looks() -> list[ComparedView]:
     return found
 
 
-LOOKS = looks()
-
-
 def true_depth() -> np.ndarray:
     one = VIEWS[0]
     points = one.world_from_cam.inv().apply(hits(one, SCENE).reshape(-1, 3))
@@ -32,7 +32,7 @@ def true_depth() -> np.ndarray:
 
 
 def test_compare_equals_its_slow_twin():
-    one, other = LOOKS[0], LOOKS[1]
+    one, other = looks()[0], looks()[1]
     depth = true_depth()
     move = other.view.world_from_cam.inv() * one.view.world_from_cam
     rest, slope, speed = compare(
@@ -72,7 +72,7 @@ def test_refinement_finds_the_surface_from_a_blurred_start_and_says_how_well():
     rng = np.random.default_rng(0)
     wrong = 0.006 * ndimage.gaussian_filter(rng.normal(size=true.shape), 4) * 12
     start = (true + wrong).astype(np.float32)
-    found = refine(LOOKS[0], start, np.full_like(start, 0.004), LOOKS[1:])
+    found = refine(looks()[0], start, np.full_like(start, 0.004), looks()[1:])
     known = np.isfinite(found.depth)
     assert known.mean() > 0.85
     error = (found.depth - true)[known]
@@ -88,7 +88,7 @@ def test_windows_across_a_step_keep_what_they_had():
     true = true_depth().astype(np.float32)
     start, sigma = true.copy(), np.full_like(true, 0.004)
     start[100:120, 100:120] -= np.float32(0.3)  # 36 px of disparity at a baseline of 0.36 m
-    found = refine(LOOKS[0], start, sigma, LOOKS[1:])
+    found = refine(looks()[0], start, sigma, looks()[1:])
     rim = np.zeros(true.shape, bool)
     rim[98:122, 98:122] = True
     rim[102:118, 102:118] = False
@@ -103,13 +103,13 @@ def test_windows_across_a_step_keep_what_they_had():
 def test_unknown_depth_stays_unknown():
     start = true_depth().astype(np.float32)
     start[100:108, 100:108] = np.nan
-    found = refine(LOOKS[0], start, np.full_like(start, 0.004), LOOKS[1:])
+    found = refine(looks()[0], start, np.full_like(start, 0.004), looks()[1:])
     assert np.isnan(found.depth[100:108, 100:108]).all()
     assert np.isfinite(found.depth[110:, 110:300]).mean() > 0.85
 
 
 def test_a_view_without_neighbours_keeps_no_depth():
     depth = true_depth().astype(np.float32)
-    found = refine(LOOKS[0], depth, np.full_like(depth, 0.004), [])
+    found = refine(looks()[0], depth, np.full_like(depth, 0.004), [])
     assert not np.isfinite(found.depth).any()
     assert (found.seen == 0).all()

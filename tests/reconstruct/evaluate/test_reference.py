@@ -15,8 +15,13 @@ from scipy.spatial.transform import Rotation
 from alice_survey.base.errors import ReconstructionError, WorkspaceError
 from alice_survey.base.frames import Datum
 from reconstruct.evaluate.cloud_files import read_reference
-from reconstruct.evaluate.cloud_registration import ReferenceSurface, register_cloud
-from reconstruct.evaluate.reference import covers, distances, lifted
+from reconstruct.evaluate.cloud_registration import (
+    ReferenceSurface,
+    covers,
+    distances,
+    register_cloud,
+)
+from reconstruct.evaluate.reference import lifted
 from reconstruct.evaluate.reference_plot import mean_map
 from reconstruct.placing.alignment import Similarity
 
@@ -182,7 +187,7 @@ def test_files_that_are_no_reference_say_why(tmp_path: Path) -> None:
     with pytest.raises(WorkspaceError, match="no such file"):
         read_reference(tmp_path / "none.laz", DATUM)
     for name, text in (("c.txt", "LAZ, LAS, PLY or GeoTIFF"), ("c.laz", "cannot be read"),
-                       ("c.tif", "cannot be read"), ("c.ply", "no PLY file")):  # fmt: skip
+                       ("c.tif", "cannot be read"), ("c.ply", "not a PLY file")):  # fmt: skip
         (tmp_path / name).write_bytes(b"nothing of the kind")
         with pytest.raises(WorkspaceError, match=text):
             read_reference(tmp_path / name, DATUM)

@@ -12,8 +12,8 @@ from alice_survey.base.frames import Array
 from camera_calib.rig import Covariance, Rig
 from reconstruct.mapping.arrays import observed
 from reconstruct.mapping.calibration_part import CalibrationPart, calibration_part
-from reconstruct.mapping.gauge_freedom import Gauge
 from reconstruct.mapping.mapper import Mapped
+from reconstruct.mapping.normal_equations import Gauge
 from reconstruct.mapping.refraction import refract
 from reconstruct.mapping.uncertainty import estimate, sights_of
 from reconstruct.placing.alignment import align_rigid

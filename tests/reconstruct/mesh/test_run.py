@@ -9,7 +9,7 @@ import trimesh
 from alice_survey.base.artefacts import read_json, write_json
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
 from alice_survey.stages import spec
-from reconstruct.dense.cloud import VERTEX, write_cloud_json, write_ply
+from reconstruct.dense.cloud import VERTEX, write_cloud, write_cloud_json
 from reconstruct.light.solve import GRID, LightModel, write_light
 from reconstruct.mesh.atlas import pack
 from reconstruct.mesh.decimate import decimate
@@ -55,7 +55,7 @@ def write_dense(folder: Path, images: list[str]) -> None:
     points["x"], points["y"], points["z"] = east, north, -bump(north, east) - OFFSET[2]
     points["nx"], points["ny"], points["nz"] = normal.T
     points["sigma"] = 1e-3
-    write_ply(dense / "cloud.ply", [points], OFFSET, FRAME)
+    write_cloud(dense / "cloud.ply", [points], OFFSET, FRAME)
     write_cloud_json(dense / "cloud.json", len(points), OFFSET, STEP_M, FRAME)
     light = LightModel(
         patterns={camera: np.zeros((*GRID, 3)) for camera in ("left", "right")},

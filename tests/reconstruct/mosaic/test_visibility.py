@@ -1,5 +1,7 @@
 """Look-ups in pictures as taken against the exact camera behind its port."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -21,7 +23,13 @@ CAMERA = FlatPortCamera(
     k1=-0.045, k2=0.02, p1=2e-4, p2=-1e-4, port_distance_m=0.1, glass_thickness_m=0.02,
     normal=(np.sin(TILT), 0.0, np.cos(TILT)),
 )  # fmt: skip
-LENS = flat_port_lens(CAMERA, 1.6, 2.5)
+
+
+@cache
+def lens() -> FlatPortLens:
+    return flat_port_lens(CAMERA, 1.6, 2.5)
+
+
 SEA = Water(temperature_c=24.0, salinity_psu=39.0, depth_m=10.0)
 
 
@@ -49,19 +57,19 @@ def exact(camera: FlatPortCamera, view: View, grid: DemGrid, height: np.ndarray)
     columns, rows = np.meshgrid(np.arange(150) + 0.5, np.arange(150) + 0.5)
     world = np.stack([grid.north_of(rows), grid.east_of(columns), -height.astype(float)], axis=-1)
     points = view.world_from_cam.inv().apply(world.reshape(-1, 3))
-    taken = camera.project(LENS.pinhole_from_cam.inv().apply(points))
+    taken = camera.project(lens().pinhole_from_cam.inv().apply(points))
     return taken.reshape(150, 150, 2) - 0.5
 
 
 def test_points_are_looked_up_where_the_camera_behind_a_tilted_port_shows_them() -> None:
-    view, (grid, height) = view_of(LENS), relief()
-    sight = see(view, camera_optics(LENS, True), Ground(height, grid).surface(grid))
+    view, (grid, height) = view_of(lens()), relief()
+    sight = see(view, camera_optics(lens(), True), Ground(height, grid).surface(grid))
     inside = sight.quality > 0
     assert inside.mean() > 0.3
     error = np.hypot(*(np.stack([sight.x, sight.y], -1) - exact(CAMERA, view, grid, height)).T).T
     assert 1e-5 < error[inside].max() < 0.02
     assert np.sqrt((error[inside] ** 2).mean()) < 0.008
-    forgetful = see(view, camera_optics(LENS, False), Ground(height, grid).surface(grid))
+    forgetful = see(view, camera_optics(lens(), False), Ground(height, grid).surface(grid))
     assert forgetful.quality.any()  # the view's own shift counts still
     np.testing.assert_allclose(forgetful.x[inside], sight.x[inside], atol=1e-6)
 
@@ -69,20 +77,22 @@ def test_points_are_looked_up_where_the_camera_behind_a_tilted_port_shows_them()
 def test_forgetting_the_range_would_show() -> None:
     from dataclasses import replace
 
-    view, (grid, height) = replace(view_of(LENS), shift=None), relief()
-    sight = see(view, camera_optics(LENS, False), Ground(height, grid).surface(grid))
+    view, (grid, height) = replace(view_of(lens()), shift=None), relief()
+    sight = see(view, camera_optics(lens(), False), Ground(height, grid).surface(grid))
     inside = sight.quality > 0
     error = np.hypot(*(np.stack([sight.x, sight.y], -1) - exact(CAMERA, view, grid, height)).T).T
     assert error[inside].max() > 0.1
 
 
 def test_each_channel_is_looked_up_where_its_own_light_falls() -> None:
-    view, (grid, height) = view_of(LENS), relief()
+    view, (grid, height) = view_of(lens()), relief()
     surface = Ground(height, grid).surface(grid)
     cameras = channel_cameras(CAMERA, temperature_c=24.0, salinity_psu=39.0, depth_m=10.0)
-    green = see(view, camera_optics(LENS, True), surface)
+    green = see(view, camera_optics(lens(), True), surface)
     moved = []
-    for name, optics in zip(("blue", "green", "red"), channel_optics(LENS, SEA, True), strict=True):
+    for name, optics in zip(
+        ("blue", "green", "red"), channel_optics(lens(), SEA, True), strict=True
+    ):
         sight = see(view, optics, surface)
         inside = (sight.quality > 0) & (green.quality > 0)
         error = np.stack([sight.x, sight.y], -1) - exact(cameras[name], view, grid, height)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from alice_survey.base.errors import ImageError
 from alice_survey.base.manifest import ImageRecord, write_manifest
-from reconstruct.pictures.quality import PictureQuality, judge, measure, quality_report
-from reconstruct.pictures.quality_sheet import worst_first
+from reconstruct.pictures.quality import PictureQuality, judge, measure
+from reconstruct.pictures.quality_sheet import quality_report, worst_first
 
 Picture = NDArray[np.uint8]
 

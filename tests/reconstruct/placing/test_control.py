@@ -2,6 +2,7 @@
 
 import csv
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -15,18 +16,26 @@ from reconstruct.placing.control_file import Pick, read_control, read_picks
 from reconstruct.placing.find_place import body_from_pinhole
 from reconstruct.placing.georeference import fit_control, fit_navigation, level
 from reconstruct.placing.picked_points import Camera, find_spots
-from reconstruct.views.lens import flat_port_lens
-from tests.reconstruct.scenes import ALTITUDE_M, DATUM, make_scene
+from reconstruct.views.lens import Lens, flat_port_lens
+from tests.reconstruct.scenes import ALTITUDE_M, DATUM, Scene, make_scene
 
-SCENE = make_scene(points=300, port_distance_m=0.1)
-LENSES = {
-    name: flat_port_lens(camera, 0.8 * ALTITUDE_M, 1.2 * ALTITUDE_M)
-    for name, camera in SCENE.rig.cameras.items()
-}
 KNOWN = np.array(
     [[0.9, 0.4, 15.05], [2.6, 0.5, 14.9], [2.5, 1.6, 15.1], [0.8, 1.5, 14.95], [1.7, 1.0, 14.8]]
 )
 """Five points of the sea floor in NED."""
+
+
+@cache
+def site() -> Scene:
+    return make_scene(points=300, port_distance_m=0.1)
+
+
+@cache
+def lenses() -> dict[str, Lens]:
+    return {
+        name: flat_port_lens(camera, 0.8 * ALTITUDE_M, 1.2 * ALTITUDE_M)
+        for name, camera in site().rig.cameras.items()
+    }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,8 +56,8 @@ def in_gauge(seed: int) -> Gauge:
     turn, shift = Rotation.random(rng=rng), rng.normal(0, 30, 3)
     place = RigidTransform.from_components(shift, turn)
     cameras = {}
-    for record, pose in zip(SCENE.records, SCENE.ned_from_cam, strict=True):
-        lens = LENSES[record.camera]
+    for record, pose in zip(site().records, site().ned_from_cam, strict=True):
+        lens = lenses()[record.camera]
         pinhole = place.inv() * pose * lens.pinhole_from_cam.inv()
         cameras[record.image] = Camera(lens=lens, model_from_pinhole=pinhole)
     return Gauge(
@@ -60,8 +69,8 @@ def picks_of(points: np.ndarray, noise_px: float = 0.0, seed: int = 0) -> list[P
     """Every picture's exact view of points, through its port."""
     rng = np.random.default_rng(seed)
     picks = []
-    for record, pose in zip(SCENE.records, SCENE.ned_from_cam, strict=True):
-        camera = SCENE.rig.cameras[record.camera]
+    for record, pose in zip(site().records, site().ned_from_cam, strict=True):
+        camera = site().rig.cameras[record.camera]
         seen = camera.project(pose.inv().apply(points))
         for number, (x, y) in enumerate(seen + rng.normal(0, noise_px, seen.shape)):
             if 0 < x < camera.width_px and 0 < y < camera.height_px:
@@ -174,7 +183,7 @@ def test_control_points_alone_place_a_model(tmp_path: Path, stretch: float) -> N
     start = ties.start(known)
     assert start is not None
     fit = fit_control(
-        SCENE.records, poses, start, ties.equations, known_scale=known, scale_sigma=0.0
+        site().records, poses, start, ties.equations, known_scale=known, scale_sigma=0.0
     )
     placed = fit.ned_from_model
     np.testing.assert_allclose(placed.apply(gauge.points(KNOWN) * stretch), KNOWN, atol=2e-6)
@@ -193,8 +202,8 @@ def test_control_and_navigation_place_together_within_their_sigmas(tmp_path: Pat
     ties = tied(path, gauge, picks_of(KNOWN, 0.2))
     poses = [c.model_from_pinhole for c in gauge.cameras.values()]
     centres = np.stack([p.translation for p in poses])
-    levers = body_from_pinhole(SCENE.rig, LENSES)
-    levelled = level(gauge.points(SCENE.points_ned), centres)
+    levers = body_from_pinhole(site().rig, lenses())
+    levelled = level(gauge.points(site().points_ned), centres)
     alone, both = (
         fit_navigation(
             scene.records, poses, levers, DATUM, levelled,

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -74,14 +75,16 @@ def assert_same(found: Similarity, truth: Similarity, atol: float, scale_rtol: f
     assert found.scale == pytest.approx(truth.scale, rel=scale_rtol)
 
 
-SCENE = make_scene(points=400)
+@cache
+def site() -> Scene:
+    return make_scene(points=400)
 
 
 @settings(deadline=None, max_examples=10)
 @given(seed=st.integers(0, 10_000), scale=st.floats(0.01, 100))
 def test_any_gauge_is_undone_when_navigation_is_exact(seed: int, scale: float) -> None:
     truth = gauge(seed, scale)
-    found = fit(SCENE, exact(SCENE), truth, known=False)
+    found = fit(site(), exact(site()), truth, known=False)
     assert found is not None
     assert_same(found.ned_from_model, truth, atol=1e-6, scale_rtol=1e-7)
     assert found.rms_m.max() < 1e-6
@@ -90,7 +93,7 @@ def test_any_gauge_is_undone_when_navigation_is_exact(seed: int, scale: float) -
 @pytest.mark.parametrize("seed", [1, 2])
 def test_positions_alone_place_a_block(seed: int) -> None:
     truth = gauge(seed, 3.0)
-    found = fit(SCENE, without_attitude(SCENE), truth, known=False, levers=False)
+    found = fit(site(), without_attitude(site()), truth, known=False, levers=False)
     assert found is not None
     assert_same(found.ned_from_model, truth, atol=0.02, scale_rtol=2e-3)
 
@@ -98,13 +101,13 @@ def test_positions_alone_place_a_block(seed: int) -> None:
 def test_a_known_scale_is_kept_and_that_of_navigation_reported() -> None:
     truth = gauge(3, 1.0)
     origin = np.array([1.0, 1.0, 13.0])
-    places = np.stack([pose.translation for pose in SCENE.ned_from_cam])
+    places = np.stack([pose.translation for pose in site().ned_from_cam])
     told = DATUM.geodetic_from_ned(origin + 1.05 * (places - origin))
     stretched = [
         replace(r, latitude_deg=a, longitude_deg=b, depth_m=d)
-        for r, (a, b, d) in zip(without_attitude(SCENE), told, strict=True)
+        for r, (a, b, d) in zip(without_attitude(site()), told, strict=True)
     ]
-    found = fit(SCENE, stretched, truth, known=True, levers=False)
+    found = fit(site(), stretched, truth, known=True, levers=False)
     assert found is not None
     assert found.ned_from_model.scale == 1.0
     assert found.free_scale == pytest.approx(1.05, abs=0.003)
@@ -112,9 +115,9 @@ def test_a_known_scale_is_kept_and_that_of_navigation_reported() -> None:
 
 def test_one_wrong_position_hardly_moves_the_model() -> None:
     truth = gauge(4, 1.0)
-    records = exact(SCENE)
+    records = exact(site())
     records[5] = replace(records[5], latitude_deg=records[5].latitude_deg + 1e-3)  # 111 m
-    found = fit(SCENE, records, truth, known=True)
+    found = fit(site(), records, truth, known=True)
     assert found is not None
     assert_same(found.ned_from_model, truth, atol=0.1, scale_rtol=1e-12)
 
@@ -132,11 +135,11 @@ def test_a_straight_line_is_kept_from_turning_about_itself() -> None:
 def test_positions_closer_than_their_sigma_do_not_place_a_model(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    records = [replace(r, roll_deg=np.nan, sigma_horizontal_m=50.0) for r in SCENE.records]
-    assert fit(SCENE, records, gauge(6, 1.0), known=True) is None
+    records = [replace(r, roll_deg=np.nan, sigma_horizontal_m=50.0) for r in site().records]
+    assert fit(site(), records, gauge(6, 1.0), known=True) is None
     assert "do not place the model" in capsys.readouterr().err
-    nowhere = [replace(r, latitude_deg=np.nan) for r in SCENE.records]
-    assert fit(SCENE, nowhere, gauge(6, 1.0), known=True) is None
+    nowhere = [replace(r, latitude_deg=np.nan) for r in site().records]
+    assert fit(site(), nowhere, gauge(6, 1.0), known=True) is None
 
 
 @pytest.mark.parametrize("seed", range(4))

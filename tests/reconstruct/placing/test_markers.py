@@ -1,5 +1,6 @@
 """Coded markers that lie on the sea floor are found in pictures seen through flat ports."""
 
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -16,18 +17,25 @@ from reconstruct.placing.control_file import read_picks
 from reconstruct.placing.markers import find_markers, survey_control
 from reconstruct.placing.picked_points import Camera, find_spots
 from reconstruct.views.lens import flat_port_lens
-from tests.reconstruct.scenes import ALTITUDE_M, make_scene
+from tests.reconstruct.scenes import ALTITUDE_M, Scene, make_scene
 
-SCENE = make_scene(lines=1, stations=3, points=50, port_distance_m=0.1)
 SIDE_M, DEPTH_M = 0.15, 15.0
-SHIFT_NE = np.mean([pose.translation[:2] for pose in SCENE.ned_from_cam[:4]], axis=0)
-"""Marker 7 lies flat, its upper edge to the north."""
+
+
+@cache
+def site() -> Scene:
+    return make_scene(lines=1, stations=3, points=50, port_distance_m=0.1)
+
+
+def middle_ne() -> Array:
+    """Where marker 7 lies flat, its upper edge to the north."""
+    return np.mean([pose.translation[:2] for pose in site().ned_from_cam[:4]], axis=0)
 
 
 def corners_ned() -> Array:
     """(4, 3) clockwise as a camera above sees them, from the marker's own upper left."""
     half = SIDE_M / 2
-    plan = np.array([[half, -half], [half, half], [-half, half], [-half, -half]]) + SHIFT_NE
+    plan = np.array([[half, -half], [half, half], [-half, half], [-half, -half]]) + middle_ne()
     return np.column_stack([plan, np.full(4, DEPTH_M)])
 
 
@@ -54,12 +62,12 @@ def picture(camera: FlatPortCamera, ned_from_cam: RigidTransform, dictionary: in
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("markers")
     images = folder / "images"
-    for record, pose in zip(SCENE.records, SCENE.ned_from_cam, strict=True):
+    for record, pose in zip(site().records, site().ned_from_cam, strict=True):
         path = images / record.image
         path.parent.mkdir(parents=True, exist_ok=True)
-        taken = picture(SCENE.rig.cameras[record.camera], pose, cv2.aruco.DICT_5X5_100)
+        taken = picture(site().rig.cameras[record.camera], pose, cv2.aruco.DICT_5X5_100)
         cv2.imwrite(str(path), taken)
-    write_manifest(images / "manifest.csv", SCENE.records)
+    write_manifest(images / "manifest.csv", site().records)
     write_json(images / "stage.json", {"stage": "images", "digest": ""})
     return folder
 
@@ -72,18 +80,18 @@ def test_markers_are_found_to_a_part_of_a_pixel_and_their_side_measured(workspac
     assert found["detections"] == found["markers"]["7"]
     assert "1 markers of DICT_5X5_100" in text
     picks = read_picks(workspace / "markers.csv")
-    of_name = {r.image: (r, p) for r, p in zip(SCENE.records, SCENE.ned_from_cam, strict=True)}
+    of_name = {r.image: (r, p) for r, p in zip(site().records, site().ned_from_cam, strict=True)}
     misses = []
     for pick in picks:
         record, pose = of_name[pick.image]
         corner = corners_ned()[int(pick.point.split(".")[1])]
-        seen = SCENE.rig.cameras[record.camera].project(pose.inv().apply(corner[None]))[0]
+        seen = site().rig.cameras[record.camera].project(pose.inv().apply(corner[None]))[0]
         misses.append(np.linalg.norm(seen - [pick.x_px, pick.y_px]))
     assert 0.0 < np.sqrt(np.mean(np.square(misses))) < 0.35
 
     lenses = {
         n: flat_port_lens(c, 0.8 * ALTITUDE_M, 1.2 * ALTITUDE_M)
-        for n, c in SCENE.rig.cameras.items()
+        for n, c in site().rig.cameras.items()
     }
     cameras = {
         r.image: Camera(
@@ -96,7 +104,7 @@ def test_markers_are_found_to_a_part_of_a_pixel_and_their_side_measured(workspac
     assert not lost
     place = np.stack([spots[f"7.{k}"].model for k in range(4)])
     np.testing.assert_allclose(place, corners_ned(), atol=0.012)
-    np.testing.assert_allclose(spots["7"].model[:2], SHIFT_NE, atol=0.003)
+    np.testing.assert_allclose(spots["7"].model[:2], middle_ne(), atol=0.003)
     sides = np.linalg.norm(place - np.roll(place, -1, axis=0), axis=1)
     assert sides.mean() == pytest.approx(SIDE_M, rel=0.01)
 

@@ -19,7 +19,7 @@ from alice_survey.vehicle.pilot.guidance import steer
 from alice_survey.vehicle.pilot.memory import PilotState, new_pilot
 from alice_survey.vehicle.pilot.path import Path, place_at
 from alice_survey.vehicle.pilot.settings import (
-    HULL_LENGTH_M,
+    CONTROL_LENGTH_M,
     LOS_DAMPING_RATIO,
     SWAY_LOOK_AHEAD_M,
     Guidance,
@@ -220,7 +220,7 @@ def test_look_ahead_is_the_shortest_that_damps(name: str) -> None:
     assert ratios[0] < ratios[1] < ratios[2]
     assert ratios[1] == pytest.approx(LOS_DAMPING_RATIO, abs=1e-3)
     # About the least that the literature takes: 1.5 to 2.5 lengths of the vessel.
-    assert 1.0 < shortest / HULL_LENGTH_M < 2.0
+    assert 1.0 < shortest / CONTROL_LENGTH_M < 2.0
 
 
 @pytest.mark.parametrize("name", ["alice", "sparus2"])
@@ -262,7 +262,7 @@ def test_los_is_damped_with_every_set(name: str, coefficients: str, speed_mps: f
         ratio = damping_ratio(los_loop(gains, speed_mps, lever_m, look_ahead_m))
         assert LOS_DAMPING_RATIO <= ratio <= 1.0
         shorter = damping_ratio(los_loop(gains, speed_mps, lever_m, 0.98 * look_ahead_m))
-        assert look_ahead_m == HULL_LENGTH_M or shorter < LOS_DAMPING_RATIO
+        assert look_ahead_m == CONTROL_LENGTH_M or shorter < LOS_DAMPING_RATIO
 
 
 def test_where_no_look_ahead_will_do_los_is_refused_and_sway_has_another() -> None:
@@ -273,7 +273,7 @@ def test_where_no_look_ahead_will_do_los_is_refused_and_sway_has_another() -> No
     with pytest.raises(VehicleError, match=r"no look-ahead from .*: lower the speed"):
         pilot_guidance(loose, path, "los", most_depth_m=40.0)
     guidance = pilot_guidance(loose, path, "sway", most_depth_m=40.0)
-    assert guidance.look_ahead_m == SWAY_LOOK_AHEAD_M == 2.5 * HULL_LENGTH_M
+    assert guidance.look_ahead_m == SWAY_LOOK_AHEAD_M == 2.5 * CONTROL_LENGTH_M
 
 
 def test_settings_that_make_no_sense_are_refused() -> None:

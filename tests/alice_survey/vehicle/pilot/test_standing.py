@@ -11,14 +11,13 @@ from hypothesis.extra.numpy import arrays
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
 from alice_survey.vehicle import signals
+from alice_survey.vehicle.limits import SPOT_RAD_S, STEP_MPS
 from alice_survey.vehicle.pilot import memory as told
 from alice_survey.vehicle.pilot.gains import FASTEST, LAG, SURGE, SWAY, YAW
 from alice_survey.vehicle.pilot.guidance import steer
 from alice_survey.vehicle.pilot.memory import new_pilot
 from alice_survey.vehicle.pilot.path import Path
 from alice_survey.vehicle.pilot.settings import (
-    SPOT_RAD_S,
-    STEP_MPS,
     Guidance,
     pilot_guidance,
     stop_speeds,

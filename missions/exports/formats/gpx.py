@@ -1,27 +1,20 @@
 """GPX 1.1 (topografix.com) for chart plotters: home, ends of lines, a route for each dive."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from xml.etree.ElementTree import Element, register_namespace
 
 import numpy as np
 
-from missions.exports.places import lat_lon
-from missions.exports.text import child, degrees, metres, write_xml
-from missions.exports.waypoints import Waypoint
-from missions.values.plan_file import Plan
+from missions.exports.format import Export, ExportFile, ExportFormat
+from missions.exports.geometry import lat_lon
+from missions.exports.xml_text import child, degrees, metres, write_xml
 
 _GPX = "http://www.topografix.com/GPX/1/1"
 
 
-def write_gpx(path: Path, plan: Plan, dives: Sequence[Sequence[Waypoint]]) -> None:
-    """Write way-points of the left port's glass; elevations are negative depths.
-
-    Args:
-        path: where to.
-        plan: the plan.
-        dives: way-points of each dive.
-    """
+def write_gpx(path: Path, export: Export, _dive: int = 0) -> None:
+    """Write way-points of the left port's glass; elevations are negative depths."""
+    plan = export.plan
     register_namespace("", _GPX)
     root = Element(f"{{{_GPX}}}gpx", {"version": "1.1", "creator": "alice-survey"})
     metadata = _child(root, "metadata")
@@ -42,7 +35,7 @@ def write_gpx(path: Path, plan: Plan, dives: Sequence[Sequence[Waypoint]]) -> No
                 root, "wpt", float(place[0]), float(place[1]), -depth_m,
                 f"line {index} {name}", line.kind,
             )  # fmt: skip
-    for index, points in enumerate(dives, start=1):
+    for index, points in enumerate(export.dives, start=1):
         route = _child(root, "rte")
         _child(route, "name", f"{plan.name} dive {index}")
         _child(route, "number", index)
@@ -67,3 +60,9 @@ def _point(
 
 def _child(parent: Element, tag: str, text: str | float | None = None) -> Element:
     return child(parent, f"{{{_GPX}}}{tag}", text)
+
+
+FORMAT = ExportFormat(
+    read_by="chart plotters: home, ends of lines, a route a dive",
+    files=(ExportFile(name="plan.gpx", about="GPX for chart plotters", write=write_gpx),),
+)

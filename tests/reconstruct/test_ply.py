@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from alice_survey.base.errors import WorkspaceError
-from reconstruct.evaluate.ply_points import read_ply_points
+from reconstruct.ply import read_ply_points
 
 XYZ = np.random.default_rng(2).normal(0, 100, (50, 3))
 FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
@@ -51,7 +51,7 @@ def test_a_file_that_is_cut_short_makes_no_points(tmp_path: Path, kind: str) -> 
     start = whole.index(b"end_header") + 11
     for end in (3, start - 1, start, start + 100):
         (tmp_path / "a.ply").write_bytes(whole[:end])
-        with pytest.raises(WorkspaceError, match=r"cut short|no PLY"):
+        with pytest.raises(WorkspaceError, match=r"cut short|not a PLY"):
             read_ply_points(tmp_path / "a.ply", 1000)
 
 

@@ -1,4 +1,4 @@
-"""Places of a plan on the ellipsoid."""
+"""Places, areas, routes and footprints of a plan, in local metres and on the ellipsoid."""
 
 import math
 from collections.abc import Iterator
@@ -8,7 +8,11 @@ import shapely
 from shapely.geometry import MultiPolygon, Polygon
 
 from alice_survey.base.frames import Array, Datum
+from camera_calib.rig import Rig
+from missions.values.footprint import footprint_ne, level_pose
 from missions.values.legs import Leg, Route
+from missions.values.line import Line
+from missions.values.plan_file import Plan
 
 CHORD_M = 0.02
 """How far the chords that stand for an arc may lie off it."""
@@ -60,3 +64,18 @@ def chords(leg: Leg, chord_m: float = CHORD_M) -> int:
     # The sagitta of a chord over an angle a is r (1 - cos(a / 2)).
     widest_rad = 2 * math.acos(max(0.0, 1.0 - chord_m * abs(leg.curvature_per_m)))
     return max(1, math.ceil(leg.length_m * abs(leg.curvature_per_m) / widest_rad - 1e-9))
+
+
+def footprint_outline(plan: Plan, rig: Rig) -> Array:
+    """Outline of the first camera's footprint, (8, 2): ahead and to starboard of the glass, m."""
+    camera = rig.cameras[rig.reference]
+    pose = level_pose(camera, np.zeros(2), plan.altitude_m, plan.seafloor_depth_m, 0.0)
+    return footprint_ne(camera, pose, plan.seafloor_depth_m, points_per_side=2)
+
+
+def footprints_ne(line: Line, outline: Array) -> Array:
+    """Outlines, (stations, N, 2) north and east, at all stations of a line."""
+    c, s = math.cos(line.heading_rad), math.sin(line.heading_rad)
+    turned = outline @ np.array([[c, s], [-s, c]])
+    outlines: Array = line.stations_ne[:, None] + turned
+    return outlines

@@ -13,16 +13,21 @@ from alice_survey.base.artefacts import atomic_path
 from alice_survey.base.executor import progress
 from alice_survey.base.frames import Array, Datum
 from camera_calib.rig import Rig
-from missions.exports.footprints import footprint_outline, footprints_ne
-from missions.exports.places import lat_lon, polygons, rings_ne, route_ne
-from missions.exports.tables import write_lines
+from missions.exports.format import Export, ExportFile, ExportFormat
+from missions.exports.geometry import (
+    footprint_outline,
+    footprints_ne,
+    lat_lon,
+    polygons,
+    rings_ne,
+    route_ne,
+)
 from missions.values.plan_file import Plan
 
-__all__ = ["write_geojson", "write_lines"]
 
-
-def write_geojson(path: Path, plan: Plan, rig: Rig) -> None:
+def write_geojson(path: Path, export: Export, _dive: int = 0) -> None:
     """Write what a plan holds, of the left port's glass; footprints are of the first camera."""
+    plan, rig = export.plan, export.rig
     with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write('{"type": "FeatureCollection", "features": [\n')
         areas = (plan.area.survey, plan.area.allowed, plan.area.no_go)
@@ -115,3 +120,15 @@ def _lon_lat(datum: Datum, points_ne: Array, depth_m: float) -> list[list[float]
 def _texts(datum: Datum, points_ne: Array, depth_m: float) -> list[str]:
     """Each place as a JSON array of longitude and latitude."""
     return [f"[{lon:.10f}, {lat:.10f}]" for lat, lon in lat_lon(datum, points_ne, depth_m).tolist()]
+
+
+FORMAT = ExportFormat(
+    read_by="GIS: areas, lines, routes, stations, footprints",
+    files=(
+        ExportFile(
+            name="plan.geojson",
+            about="GeoJSON for geographic information systems",
+            write=write_geojson,
+        ),
+    ),
+)

@@ -1,27 +1,22 @@
 """QGC WPL 110, the plain-text missions that ArduSub's ground stations load."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from alice_survey.base.artefacts import atomic_path
+from missions.exports.format import Export, ExportFile, ExportFormat
 from missions.exports.mavlink import FRAME_GLOBAL, NAV_WAYPOINT, Item
-from missions.exports.text import degrees
+from missions.exports.xml_text import degrees
 
 
-def write_wpl(path: Path, home_lat_lon_deg: tuple[float, float], items: Sequence[Item]) -> None:
+def write_wpl(path: Path, export: Export, dive: int) -> None:
     """Write mission items, tab separated, after a row for home.
 
-    The format has no comments: what places and altitudes are of is said beside it, in `about.txt`.
-
-    Args:
-        path: where to.
-        home_lat_lon_deg: where the vehicle is launched, at the surface.
-        items: of one dive.
+    The format has no comments: `about.txt` says what places and altitudes are of.
     """
-    lat, lon = home_lat_lon_deg
+    lat, lon = export.home_lat_lon_deg
     home = Item(command=NAV_WAYPOINT, frame=FRAME_GLOBAL, params=(0, 0, 0, 0, lat, lon, 0.0))
     rows = ["QGC WPL 110"]
-    for index, item in enumerate((home, *items)):
+    for index, item in enumerate((home, *export.items(dive))):
         *params, lat, lon, altitude = item.params
         cells = [str(index), str(int(index == 0)), str(item.frame), str(item.command)]
         cells += [f"{value:.6f}" for value in params]
@@ -29,3 +24,15 @@ def write_wpl(path: Path, home_lat_lon_deg: tuple[float, float], items: Sequence
         rows.append("\t".join(cells))
     with atomic_path(path) as temporary:
         temporary.write_text("\n".join(rows) + "\n", encoding="ascii", newline="\n")
+
+
+FORMAT = ExportFormat(
+    read_by="QGroundControl, Mission Planner, MAVProxy: QGC WPL 110",
+    files=(
+        ExportFile(
+            name="mission_dive{}.waypoints",
+            about="QGC WPL 110 mission for ArduSub",
+            write=write_wpl,
+        ),
+    ),
+)

@@ -8,13 +8,15 @@ from typing import Any
 import numpy as np
 
 from alice_survey.base.artefacts import write_csv
-from missions.exports.places import lat_lon
+from missions.exports.format import Export, ExportFile, ExportFormat
+from missions.exports.geometry import lat_lon
 from missions.exports.waypoints import Waypoint
 from missions.values.plan_file import Plan
 
 
-def write_lines(path: Path, plan: Plan) -> None:
+def write_lines(path: Path, export: Export, _dive: int = 0) -> None:
     """The lines with their ends in latitude and longitude and in local metres."""
+    plan = export.plan
     header = (
         "line", "kind", "start_latitude_deg", "start_longitude_deg", "end_latitude_deg",
         "end_longitude_deg", "start_north_m", "start_east_m", "end_north_m", "end_east_m",
@@ -40,28 +42,23 @@ def write_lines(path: Path, plan: Plan) -> None:
     write_csv(path, header, rows)
 
 
-def write_stations(path: Path, plan: Plan) -> None:
+def write_stations(path: Path, export: Export, _dive: int = 0) -> None:
     """Every place where all cameras take a picture, in the order of flight."""
     header = (
         "station", "dive", "line", "kind", "latitude_deg", "longitude_deg", "north_m", "east_m",
         "depth_m", "altitude_m", "heading_deg",
     )  # fmt: skip
-    write_csv(path, header, _stations(plan))
+    write_csv(path, header, _stations(export.plan))
 
 
-def write_waypoints(path: Path, dives: Sequence[Sequence[Waypoint]]) -> None:
-    """One row for each way-point: of the glass, and of the vehicle that brings it there.
-
-    Args:
-        path: where to.
-        dives: way-points of each dive.
-    """
+def write_waypoints(path: Path, export: Export, _dive: int = 0) -> None:
+    """One row for each way-point: of the glass, and of the vehicle that brings it there."""
     header = (
         "number", "dive", "latitude_deg", "longitude_deg", "depth_m", "altitude_m", "speed_mps",
         "heading_deg", "action", "line", "hold_s", "vehicle_latitude_deg", "vehicle_longitude_deg",
         "vehicle_depth_m", "altimeter_altitude_m",
     )  # fmt: skip
-    write_csv(path, header, _waypoints(dives))
+    write_csv(path, header, _waypoints(export.dives))
 
 
 def _stations(plan: Plan) -> Iterator[list[Any]]:
@@ -106,3 +103,19 @@ def _waypoints(dives: Sequence[Sequence[Waypoint]]) -> Iterator[list[Any]]:
 def _action(point: Waypoint) -> str:
     switch = "" if point.camera is None else f", camera {point.camera}"
     return f"{point.kind}{switch}"
+
+
+FORMAT = ExportFormat(
+    read_by="tables; `waypoints.csv` is the lawnmower's way-point table",
+    files=(
+        ExportFile(name="lines.csv", about="table of the lines", write=write_lines),
+        ExportFile(
+            name="stations.csv", about="table of the places of pictures", write=write_stations
+        ),
+        ExportFile(
+            name="waypoints.csv",
+            about="table of the way-points, of glass and vehicle",
+            write=write_waypoints,
+        ),
+    ),
+)

@@ -8,10 +8,9 @@ import numpy as np
 from shapely.geometry import MultiPolygon
 
 from alice_survey.base.frames import Array
-from camera_calib.rig import Rig
-from missions.exports.footprints import footprint_outline, footprints_ne
-from missions.exports.places import lat_lon, polygons, rings_ne, route_ne
-from missions.exports.text import child, degrees, metres, write_xml
+from missions.exports.format import Export, ExportFile, ExportFormat
+from missions.exports.geometry import lat_lon, polygons, rings_ne, route_ne
+from missions.exports.xml_text import child, degrees, metres, write_xml
 from missions.values.plan_file import Plan
 
 _KML = "http://www.opengis.net/kml/2.2"
@@ -25,26 +24,19 @@ _STYLES = {
     "closing": ("ff12859c", "2", "00ffffff"),
     "fill": ("ff3c8f2e", "2", "00ffffff"),
     "route": ("b08d8c7f", "1", "00ffffff"),
-    "footprint": ("60e2ad5d", "1", "30e2ad5d"),
 }
 
 
-def write_kml(path: Path, plan: Plan, rig: Rig, *, footprints: bool = False) -> None:
-    """Write areas, lines and routes of the left port's glass; heights are negative depths.
-
-    Args:
-        path: where to.
-        plan: the plan.
-        rig: its cameras; needed for footprints.
-        footprints: also what the first camera sees at each station.
-    """
+def write_kml(path: Path, export: Export, _dive: int = 0) -> None:
+    """Write areas, lines and routes of the left port's glass; heights are negative depths."""
+    plan = export.plan
     register_namespace("", _KML)
     root = Element(f"{{{_KML}}}kml")
     document = _child(root, "Document")
     _child(document, "name", plan.name)
     for name, (colour, width, fill) in _STYLES.items():
         _style(document, name, colour, width, fill)
-    floor_m, glass_m = plan.seafloor_depth_m, plan.seafloor_depth_m - plan.altitude_m
+    glass_m = plan.seafloor_depth_m - plan.altitude_m
     areas = _folder(document, "Areas")
     for name, style, geometry in (
         ("survey area", "area", plan.area.survey),
@@ -81,8 +73,6 @@ def write_kml(path: Path, plan: Plan, rig: Rig, *, footprints: bool = False) -> 
         mark = _placemark(routes, f"dive {index}", "route", about)
         corners = lat_lon(plan.datum, route_ne(dive.route), glass_m)
         _coordinates(_child(mark, "LineString"), corners, [glass_m] * len(corners))
-    if footprints:
-        _footprints(document, plan, rig, floor_m)
     write_xml(path, root)
 
 
@@ -93,18 +83,6 @@ def _areas(folder: Element, plan: Plan, name: str, style: str, geometry: MultiPo
         for index, ring in enumerate(rings_ne(polygon)):
             edge = _child(shape, "outerBoundaryIs" if index == 0 else "innerBoundaryIs")
             _ring(edge, lat_lon(plan.datum, ring, plan.seafloor_depth_m))
-
-
-def _footprints(document: Element, plan: Plan, rig: Rig, floor_m: float) -> None:
-    folder = _folder(document, "Footprints")
-    outline = footprint_outline(plan, rig)
-    station = 0
-    for line in plan.lines:
-        for border in footprints_ne(line, outline):
-            mark = _placemark(folder, f"station {station}", "footprint", {"station": station})
-            edge = _child(_child(mark, "Polygon"), "outerBoundaryIs")
-            _ring(edge, lat_lon(plan.datum, border, floor_m))
-            station += 1
 
 
 def _child(parent: Element, tag: str, text: str | float | None = None) -> Element:
@@ -154,3 +132,9 @@ def _coordinates(
         for (lat, lon), depth in zip(rows, depths_m, strict=True)
     )
     _child(geometry, "coordinates", text)
+
+
+FORMAT = ExportFormat(
+    read_by="globes: areas with holes, lines, routes",
+    files=(ExportFile(name="plan.kml", about="KML for globes", write=write_kml),),
+)

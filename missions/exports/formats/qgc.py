@@ -1,0 +1,140 @@
+"""QGroundControl plans: mission, and fence of allowed area and no-go zones.
+
+Keys and versions: QGroundControl's developer guide, "Plan File Format".
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from shapely.geometry import Polygon
+
+from alice_survey.base.artefacts import write_json
+from alice_survey.base.errors import warn
+from missions.exports.format import Export, ExportFile, ExportFormat
+from missions.exports.geometry import grown, lat_lon
+from missions.exports.mavlink import (
+    FRAME_ABOVE_HOME,
+    FRAME_ABOVE_TERRAIN,
+    NAV_WAYPOINT,
+    Item,
+)
+from missions.exports.mount import Mount
+from missions.exports.waypoints import Waypoint
+from missions.values.plan_file import Plan
+
+_ARDUPILOT, _SUBMARINE = 3, 12
+"""MAV_AUTOPILOT_ARDUPILOTMEGA and MAV_TYPE_SUBMARINE."""
+ALTITUDE_MODES = {FRAME_ABOVE_HOME: 1, FRAME_ABOVE_TERRAIN: 4}
+"""QGroundControl's own numbers for MAVLink frames."""
+_MIXED = 0
+
+
+def write_qgc(path: Path, export: Export, dive: int) -> None:
+    """Write a dive as single mission items."""
+    write_json(path, document(export, dive, simple_items(export.items(dive))))
+
+
+def simple_items(items: Sequence[Item], first: int = 1) -> list[dict[str, Any]]:
+    """Mission items as QGroundControl lists them, numbered from the first."""
+    return [_simple(item, number) for number, item in enumerate(items, start=first)]
+
+
+def document(export: Export, dive: int, items: list[dict[str, Any]]) -> dict[str, Any]:
+    """The whole file, with the fence."""
+    plan, home, mount = export.plan, export.home_lat_lon_deg, export.mount
+    fence = _fence(plan, export.dives[dive], mount)
+    return {
+        "fileType": "Plan",
+        "version": 1,
+        "groundStation": "QGroundControl",
+        "mission": {
+            "version": 2,
+            "firmwareType": _ARDUPILOT,
+            "vehicleType": _SUBMARINE,
+            "globalPlanAltitudeMode": _MIXED,
+            "cruiseSpeed": plan.speed_mps,
+            "hoverSpeed": plan.speed_mps,
+            "plannedHomePosition": [round(home[0], 10), round(home[1], 10), 0],
+            "items": items,
+        },
+        "geoFence": {
+            "version": 2,
+            "circles": [],
+            "polygons": fence,
+        },
+        "rallyPoints": {"version": 2, "points": []},
+        "aliceSurvey": {"name": plan.name, "about": mount.about},
+    }
+
+
+def _simple(item: Item, number: int) -> dict[str, Any]:
+    data: dict[str, Any] = {
+        "type": "SimpleItem",
+        "autoContinue": True,
+        "command": item.command,
+        "doJumpId": number,
+        "frame": item.frame,
+        "params": list(item.params),
+    }
+    if item.command == NAV_WAYPOINT:
+        data |= {
+            "AMSLAltAboveTerrain": None,
+            "Altitude": item.params[6],
+            "AltitudeMode": ALTITUDE_MODES[item.frame],
+        }
+    return data
+
+
+def _fence(plan: Plan, points: Sequence[Waypoint], mount: Mount) -> list[dict[str, Any]]:
+    """The areas of the glass as those of the vehicle's reference point, a lever arm away.
+
+    The allowed area grows by the lever arm. A zone to keep out of stays as it is, unless the
+    reference point has to cut its corner to bring the glass along its edge: then it shrinks by the
+    lever arm, which the reference point surely keeps out of.
+    """
+    outer = [Polygon(part.exterior) for part in grown(plan.area.allowed, mount.reach_m)]
+    zones: list[Polygon] = []
+    holes = [Polygon(hole) for part in plan.area.allowed.geoms for hole in part.interiors]
+    for zone in (*holes, *plan.area.no_go.geoms):
+        # A hole of the allowed area is most often a no-go zone: say it once.
+        if not any(other.buffer(1e-3).contains(zone) for other in zones):
+            zones.append(Polygon(zone.exterior))
+    track = shapely.LineString([point.vehicle_ne_m for point in points])
+    fences = [_polygon(plan, part, inclusion=True) for part in outer]
+    for zone in zones:
+        parts = [zone]
+        if zone.intersects(track):
+            parts = grown(shapely.MultiPolygon([zone]), -mount.reach_m)
+            if not parts:
+                warn(
+                    f"a no-go zone of {zone.area:.2f} m2 is left out of the fence: the vehicle's "
+                    f"reference point, {mount.reach_m:.2f} m from the glass, crosses it in a turn"
+                )
+        fences += [_polygon(plan, part, inclusion=False) for part in parts]
+    return fences
+
+
+def _polygon(plan: Plan, polygon: Polygon, *, inclusion: bool) -> dict[str, Any]:
+    return {"version": 1, "inclusion": inclusion, "polygon": corners(plan, polygon)}
+
+
+def corners(plan: Plan, polygon: Polygon) -> list[list[float]]:
+    """Latitudes and longitudes of a polygon's outer corners."""
+    outer_ne = np.asarray(polygon.exterior.coords, dtype=np.float64)[:-1, :2]
+    rows = lat_lon(plan.datum, outer_ne, 0.0)
+    return [[round(float(lat), 10), round(float(lon), 10)] for lat, lon in rows]
+
+
+FORMAT = ExportFormat(
+    read_by="QGroundControl, MAVSDK: mission, fence",
+    files=(
+        ExportFile(
+            name="mission_dive{}.plan",
+            about="QGroundControl plan for ArduSub",
+            write=write_qgc,
+        ),
+    ),
+)

@@ -1,0 +1,118 @@
+"""The public names are few, quick to import, and each has an example that runs."""
+
+import ast
+import doctest
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import alice_survey as alice
+
+NEEDS_A_MODEL = '"small'
+
+
+def examples_of(name: str) -> list[doctest.DocTest]:
+    finder = doctest.DocTestFinder(exclude_empty=True)
+    found = finder.find(getattr(alice, name), name, globs={"np": np})
+    return [test for test in found if test.examples]
+
+
+def run(test: doctest.DocTest) -> str:
+    shown: list[str] = []
+    doctest.DocTestRunner().run(test, out=shown.append)
+    return "".join(shown)
+
+
+@pytest.mark.parametrize("name", alice.__all__)
+def test_each_public_name_has_an_example(name: str) -> None:
+    assert any(test.name == name for test in examples_of(name))
+
+
+def quick_or_slow() -> list[object]:
+    return [
+        pytest.param(
+            name,
+            marks=pytest.mark.slow
+            if any(NEEDS_A_MODEL in str(test.docstring) for test in examples_of(name))
+            else (),
+        )
+        for name in alice.__all__
+    ]
+
+
+@pytest.mark.parametrize("name", quick_or_slow())
+def test_examples_run(
+    name: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    request: pytest.FixtureRequest,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    tests = examples_of(name)
+    if any(NEEDS_A_MODEL in str(test.docstring) for test in tests):
+        Path("small").symlink_to(request.getfixturevalue("small_survey"))
+    assert [run(test) for test in tests] == [""] * len(tests)
+
+
+def test_the_example_of_the_package_runs() -> None:
+    tests = doctest.DocTestFinder(recurse=False).find(alice, "alice_survey")
+    assert len(tests[0].examples) == 4
+    assert run(tests[0]) == ""
+
+
+def test_importing_loads_nothing_heavy() -> None:
+    code = (
+        "import sys, alice_survey\n"
+        "assert 'read_plan' in dir(alice_survey)\n"
+        "sys.exit(', '.join({'numpy', 'pydantic', 'scipy'} & set(sys.modules)) or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_names_for_readers_and_for_type_checkers_are_the_same() -> None:
+    """The lazy table, `__all__` and the imports under TYPE_CHECKING agree."""
+    assert alice.__file__ is not None
+    tree = ast.parse(Path(alice.__file__).read_text(encoding="utf-8"))
+    block = next(node for node in tree.body if isinstance(node, ast.If))
+    seen = {a.name: n.module for n in block.body if isinstance(n, ast.ImportFrom) for a in n.names}
+    lazy = {name: home for home, names in alice._HOMES.items() for name in names}
+    assert seen == lazy
+    assert sorted(seen) == sorted(alice.__all__)
+    assert len(seen) <= 30
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="reed_plan"):
+        _ = alice.reed_plan  # type: ignore[attr-defined]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["dem", "mosaic", "track"])
+def test_results_show_themselves_in_a_notebook(name: str, small_survey: Path) -> None:
+    shown = getattr(alice.Survey(small_survey), name)._repr_html_()
+    assert shown.startswith("<b>")
+    assert " m" in shown
+
+
+@pytest.mark.slow
+def test_heights_are_looked_up_in_their_cells(small_survey: Path) -> None:
+    dem = alice.read_dem(small_survey)
+    rows, columns = dem.height.shape
+    row, column = np.mgrid[:rows, :columns]
+    east, north = dem.west + (column + 0.5) * dem.cell, dem.north - (row + 0.5) * dem.cell
+    np.testing.assert_array_equal(dem.height_at(east, north), dem.height)
+    assert np.isnan(dem.height_at(dem.west - dem.cell, dem.north))
+    west, right, south, top = dem.extent
+    assert (right - west, top - south) == pytest.approx((columns * dem.cell, rows * dem.cell))
+
+
+def test_signatures_take_strings_as_paths() -> None:
+    for name in ("read_plan", "read_rig", "read_model", "load_config", "read_dem", "read_track"):
+        first = next(iter(inspect.signature(getattr(alice, name)).parameters.values()))
+        assert str(first.annotation) == "str | pathlib.Path", name
