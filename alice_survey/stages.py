@@ -162,7 +162,11 @@ def settings_of(wanted: Any, config: SurveyConfig) -> Any:
     value = _value(config, part.section)
     if not isinstance(value, BaseModel):
         return list(value) if isinstance(value, tuple) else value
-    values = value.model_dump(mode="json", include=part.only and set(part.only), exclude=set(part.without))
+    values = value.model_dump(
+        mode="json",
+        include=None if part.only is None else set(part.only),
+        exclude=set(part.without),
+    )
     return {
         name: path.name if isinstance(path := getattr(value, name), Path) else values[name]
         for name in values
