@@ -18,12 +18,13 @@ from alice_survey.base import artefacts, records
 from alice_survey.base.artefacts import Stage, read_json, read_stage, run_stage, why_stale
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import AliceError, WorkspaceError
+from alice_survey.base.executor import Executor
 from alice_survey.base.manifest import read_manifest
 
 Summary = tuple[str, dict[str, Any]]
 """What a stage has found: a line to read, and JSON values."""
-StageWork = Callable[[Path, SurveyConfig, int, Path], None]
-"""Takes the workspace, the settings, how many processes, and the folder to write into."""
+StageWork = Callable[[Path, SurveyConfig, Executor, Path], None]
+"""Takes the workspace, the settings, where tasks run, and the folder to write into."""
 
 LOOSE_FOLDERS = ("quality", "reference", "against")
 """Folders that commands write next to those of the stages, and that a report shows."""
@@ -79,7 +80,7 @@ class StageSpec:
             resumes=self.resumes,
         )
 
-    def make(self, workspace: Path, config: SurveyConfig, threads: int) -> bool:
+    def make(self, workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
         """Do the stage's work unless it is up to date.
 
         Returns:
@@ -94,7 +95,7 @@ class StageSpec:
 
         def work(folder: Path) -> None:
             do: StageWork = getattr(import_module(module), function)
-            do(workspace, config, threads, folder)
+            do(workspace, config, executor, folder)
 
         return run_stage(workspace, self.stage(workspace, config), work)
 

@@ -16,7 +16,7 @@ from alice_survey import stages as survey_stages
 from alice_survey.base.artefacts import read_stage
 from alice_survey.base.config import SurveyConfig, changed, load_config, parse_current, parse_health
 from alice_survey.base.errors import ConfigError, WorkspaceError, warn
-from alice_survey.base.executor import default_threads
+from alice_survey.base.executor import Executor, local_executor
 from alice_survey.base.run.progress import part
 from alice_survey.stages import is_imported, names, spec
 
@@ -59,7 +59,7 @@ def run(
     workspace: Path,
     survey: Path | None,
     scale: int | None = None,
-    threads: int | None = None,
+    executor: Executor | None = None,
     flight: FlightChanges | None = None,
 ) -> tuple[str, dict[str, Any]]:
     """Do stages one after the other; those that are up to date are skipped.
@@ -69,7 +69,7 @@ def run(
         workspace: folder of the survey.
         survey: settings file; None looks for survey.toml in the workspace, then here.
         scale: overrides `imaging.scale`.
-        threads: cores to use; None for all.
+        executor: where tasks run; None for all cores of this machine.
         flight: overrides vehicle and sea.
 
     Returns:
@@ -99,7 +99,7 @@ def run(
                 warn(f"the plan is {state}; 'alice-survey plan -w {workspace}' renews it")
         for number, stage in enumerate(map(spec, stages), 1):
             with part(stage.folder, number, len(stages)):
-                done = stage.make(workspace, config, threads or default_threads())
+                done = stage.make(workspace, config, executor or local_executor())
             text, data = stage.summary(workspace / stage.folder)
             found[stage.name] = {"done": done, **data}
             lines.append(f"{stage.name}: {text}" if done else f"{stage.name}: (up to date) {text}")
@@ -194,11 +194,11 @@ def _with_area(text: str, area: Path, folder: Path) -> str:
     )
 
 
-def run_demo(workspace: Path, threads: int | None) -> tuple[str, dict[str, Any]]:
+def run_demo(workspace: Path, executor: Executor | None) -> tuple[str, dict[str, Any]]:
     """Do the whole loop on the built-in survey, and say where its pictures are."""
     if not (workspace / "survey.toml").exists():
         init_survey(workspace, "demo.toml")
-    text, found = run(names(), workspace, None, None, threads)
+    text, found = run(names(), workspace, None, None, executor)
     rows = [
         f"  {stage.name:12} {workspace / stage.folder / stage.picture}"
         for stage in survey_stages.STAGES

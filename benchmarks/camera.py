@@ -15,6 +15,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from alice_survey.base.executor import local_executor
 from benchmarks import camera_calibration, camera_pose, camera_speed
 from benchmarks.figures import Findings, add_options, hand_over
 from benchmarks.machine import heading, machine
@@ -40,7 +41,7 @@ def main() -> None:
     if "pose" in options.only:
         noise = (0.5, 2.0) if options.quick else tuple(camera_pose.PUBLISHED)
         seeds = range(100 if options.quick else 1000)
-        levels = [camera_pose.run_level(n, seeds, options.threads) for n in noise]
+        levels = [camera_pose.run_level(n, seeds, local_executor(options.threads)) for n in noise]
         print(
             f"Absolute pose, {len(seeds)} trials a level: published by She et al. 2024, and ours."
         )
@@ -50,7 +51,7 @@ def main() -> None:
     if "calibration" in options.only:
         count = 40 if options.quick else 200
         modes = [
-            camera_calibration.run_mode(mode, range(count), options.threads)
+            camera_calibration.run_mode(mode, range(count), local_executor(options.threads))
             for mode in camera_calibration.MODES
         ]
         print(f"Calibration through ports, {count} trials a mode: rms error / Cramer-Rao bound.")

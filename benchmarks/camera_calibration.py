@@ -17,12 +17,13 @@ from dataclasses import dataclass, replace
 from functools import cache, partial
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import SERIAL, Executor
 from alice_survey.base.frames import Array
 from benchmarks.figures import Figure, Goal
-from camera_calib.calibrate.adjust import cramer_rao, stack_views
+from camera_calib.calibrate.adjust import stack_views
 from camera_calib.calibrate.freedom import (
     PORT,
     Freedom,
@@ -32,7 +33,7 @@ from camera_calib.calibrate.freedom import (
     pose_names,
     value,
 )
-from camera_calib.calibrate.normal_equations import Problem
+from camera_calib.calibrate.normal_equations import CalibrationProblem
 from camera_calib.calibrate.result import TargetView
 from camera_calib.calibrate.solve import Intrinsics, calibrate_through_ports
 from camera_calib.judge.uncertainty import baseline_sigma_m
@@ -149,6 +150,34 @@ def _scene() -> tuple[RigidTransform, Covariance]:
     return poses, Covariance(parameters=_LENS, matrix=whole.matrix[np.ix_(at, at)])
 
 
+def cramer_rao(
+    rig: Rig,
+    points: Array,
+    rig_from_target: RigidTransform,
+    seen: NDArray[np.bool_],
+    freedom: Freedom,
+    noise_px: float,
+) -> Covariance:
+    """The least covariance that any unbiased calibration can have, at the true values.
+
+    Args:
+        rig: the truth.
+        points: (N, 3) of the target, metres.
+        rig_from_target: (V,) true poses.
+        seen: (V, cameras, N) which points are measured.
+        freedom: what of the rig is unknown.
+        noise_px: standard deviation of one coordinate.
+
+    Raises:
+        CalibrationError: the views do not determine a parameter.
+    """
+    pixels = np.where(seen[..., None], 0.0, np.nan)
+    problem = CalibrationProblem(pixels, points, rig, freedom)
+    state = problem.state(rig, rig_from_target)
+    weights = np.where(problem.seen, 1.0 / noise_px**2, 0.0)
+    return problem.covariance(problem.equations(state, weights))
+
+
 def bound_of(known: Intrinsics) -> Covariance:
     """The least covariance of any unbiased calibration of these views."""
     poses, lens = _scene()
@@ -194,7 +223,7 @@ def run_trial(seed: int, known: Intrinsics) -> Trial:
 
 def _first_order(views: Sequence[TargetView], poses: RigidTransform, freedom: Freedom) -> Array:
     """The step of Gauss and Newton from the truth: its covariance is the bound."""
-    problem = Problem(stack_views(views, _TRUTH, len(BOARD)), BOARD, _TRUTH, freedom)
+    problem = CalibrationProblem(stack_views(views, _TRUTH, len(BOARD)), BOARD, _TRUTH, freedom)
     weights = np.where(problem.seen, _NOISE_PX**-2.0, 0.0)
     equations = problem.equations(problem.state(_TRUTH, poses), weights)
     by_poses = np.linalg.solve(equations.view, equations.view_slope[..., None])[..., 0]
@@ -203,10 +232,10 @@ def _first_order(views: Sequence[TargetView], poses: RigidTransform, freedom: Fr
     return step
 
 
-def run_mode(known: Intrinsics, seeds: Sequence[int], threads: int = 1) -> Mode:
+def run_mode(known: Intrinsics, seeds: Sequence[int], executor: Executor = SERIAL) -> Mode:
     """All trials of one mode."""
     work, label = partial(run_trial, known=known), f"calibrations, {known}"
-    found = list(parallel_map(work, seeds, threads=threads, label=label))
+    found = list(executor.map(work, seeds, label=label))
     bound = bound_of(known)
     names = (*bound.parameters, _BASELINE)
     truth = replace(_TRUTH, covariance=bound)

@@ -13,10 +13,10 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import SERIAL, Executor
 from alice_survey.base.frames import Array
+from benchmarks.absolute_pose import Sighting, absolute_pose, pose_information
 from benchmarks.figures import Figure, Goal
-from camera_calib.absolute_pose import Sighting, absolute_pose, pose_information
 from camera_calib.flat_port import FlatPortCamera
 
 PUBLISHED = {
@@ -179,12 +179,10 @@ def run_trial(seed: int, noise_px: float) -> Trial:
     )
 
 
-def run_level(noise_px: float, seeds: Sequence[int], threads: int = 1) -> Level:
+def run_level(noise_px: float, seeds: Sequence[int], executor: Executor = SERIAL) -> Level:
     """All trials at one level of noise, of which each has its seed."""
     label = f"poses at {noise_px} px"
-    trials = list(
-        parallel_map(partial(run_trial, noise_px=noise_px), seeds, threads=threads, label=label)
-    )
+    trials = list(executor.map(partial(run_trial, noise_px=noise_px), seeds, label=label))
 
     def rms(values: list[float]) -> float:
         return float(np.sqrt(np.mean(np.square(values))))

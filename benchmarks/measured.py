@@ -1,7 +1,6 @@
 """Wall time and peak memory of a command with all its children."""
 
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -9,7 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from alice_survey.base.run.resources import family_of, memory_mib_of
+import psutil
+
+from alice_survey.base.run.resources import family, memory_mib
 
 _EVERY_S, _SURELY_EVERY_S = 0.2, 2.0
 """Between looks at the memory of a command; it takes the kernel 6 ms a process to share it out, so
@@ -53,18 +54,18 @@ def measured(command: Sequence[str], log: Path, timeout_s: float = 7200.0) -> Co
         process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
         try:
             while process.poll() is None:
-                family, now = family_of(process.pid), time.perf_counter() - started
-                plain = sum(_resident_mib(pid) for pid in family)
+                running, now = family(process.pid), time.perf_counter() - started
+                plain = sum(map(_resident_mib, running))
                 if plain > most or now > looked + _SURELY_EVERY_S:
-                    peak = max(peak, sum(memory_mib_of(pid) for pid in family))
+                    peak = max(peak, sum(map(memory_mib, running)))
                     looked, most = now, max(most, plain)
                 if late := now > timeout_s:
                     break
                 time.sleep(_EVERY_S)
         finally:
             if process.poll() is None:
-                for pid in family_of(process.pid):
-                    os.kill(pid, signal.SIGTERM)
+                for child in family(process.pid):
+                    child.terminate()
                 process.wait()
     after = os.times()
     return Cost(
@@ -78,13 +79,12 @@ def measured(command: Sequence[str], log: Path, timeout_s: float = 7200.0) -> Co
     )  # fmt: skip
 
 
-def _resident_mib(pid: int) -> float:
+def _resident_mib(process: psutil.Process) -> float:
     """Resident memory of a process, what it shares included; 0 of one that has ended."""
     try:
-        pages = Path(f"/proc/{pid}/statm").read_text().split()[1]
-    except (OSError, IndexError):
+        return float(process.memory_info().rss / 2**20)
+    except psutil.Error:
         return 0.0
-    return int(pages) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def python(*arguments: str) -> list[str]:

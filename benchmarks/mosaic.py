@@ -43,8 +43,9 @@ _MOST_MIB = 1536.0
 _RUN = (
     "import sys; from pathlib import Path; from alice_survey.base.config import ReconstructConfig, "
     "SurveyConfig; from alice_survey.stages import spec; "
+    "from alice_survey.base.executor import local_executor; "
     "spec('mosaic').make(Path(sys.argv[1]), SurveyConfig(reconstruct=ReconstructConfig("
-    f"mosaic_pixel_m={PIXEL_M})), int(sys.argv[2]))"
+    f"mosaic_pixel_m={PIXEL_M})), local_executor(int(sys.argv[2])))"
 )
 
 

@@ -41,8 +41,8 @@ _STAGES = ("sparse", "dense", "mosaic")
 _RUN = (
     "import sys; from pathlib import Path; from alice_survey.survey import settings; "
     "from reconstruct.{stage}.run import run_{stage}; from alice_survey.base.executor import "
-    "default_threads; "
-    "w = Path(sys.argv[1]); run_{stage}(w, settings(w, None, needed=False), default_threads())"
+    "local_executor; "
+    "w = Path(sys.argv[1]); run_{stage}(w, settings(w, None, needed=False), local_executor())"
 )
 
 

@@ -18,13 +18,12 @@ import numpy as np
 
 from alice_survey.base.config import SurveyConfig, changed
 from alice_survey.vehicle.floor import FloorGrid, level_floor
-from alice_survey.vehicle.pilot.memory import PHASE, REASON
+from alice_survey.vehicle.pilot.memory import DONE, PHASE, REASON
 from alice_survey.vehicle.pilot.safety import NONE
-from alice_survey.vehicle.signals import DONE
 from alice_survey.vehicle.simulator import Setup, simulate
 from benchmarks.figures import Figure, Goal
 from camera_calib.rig import design_rig
-from missions.fly.simulation import mission_setup
+from missions.fly.simulation import flight_settings, mission_setup
 from missions.plan.planner import plan_survey
 
 _LONGEST_S = 7200.0
@@ -89,7 +88,7 @@ def measure(runs: int) -> list[Row]:
 
 def _setup(config: SurveyConfig, floor: FloorGrid) -> Setup:
     plan = plan_survey(config, design_rig(config.camera, config.water)).plan
-    return mission_setup(plan, config, floor, _LONGEST_S, np.random.default_rng(1))
+    return mission_setup(plan, flight_settings(config), floor, _LONGEST_S, np.random.default_rng(1))
 
 
 def _waves(depth_m: float) -> FloorGrid:

@@ -101,7 +101,9 @@ class FlatPortCamera:
                     f"camera: {name} = {given:g}: {least:g} to {most:g}{unit} allowed"
                 )
         if abs(math.hypot(*self.normal) - 1) > 1e-6 or self.normal[2] <= 0:
-            raise CalibrationError(f"camera: normal {self.normal} is no unit vector facing forward")
+            raise CalibrationError(
+                f"camera: normal {self.normal} is not a unit vector facing forward"
+            )
 
     @cached_property
     def _lens(self) -> Array:
@@ -126,6 +128,11 @@ class FlatPortCamera:
         if name in _NORMAL:
             return float(self.normal[_NORMAL.index(name)])
         return float(getattr(self, name))
+
+    @property
+    def refracts(self) -> bool:
+        """Whether light bends at the port; not so in air, or for a pinhole calibrated in water."""
+        return self.n_water != 1.0 or (self.glass_thickness_m > 0.0 and self.n_glass != 1.0)
 
     def with_parameters(self, values: Mapping[str, float]) -> "FlatPortCamera":
         """The same camera with some of `PARAMETERS` set to other values.
@@ -253,10 +260,10 @@ def camera_from_json(data: dict[str, Any]) -> FlatPortCamera:
         if name == "normal":
             numbers(value, 3, "camera: normal")
         elif isinstance(value, bool) or not isinstance(value, int | float):
-            raise CalibrationError(f"camera: {name} = {value!r} is no number")
+            raise CalibrationError(f"camera: {name} = {value!r} is not a number")
     for name in ("width_px", "height_px"):
         if not float(data[name]).is_integer():
-            raise CalibrationError(f"camera: {name} = {data[name]:g} is no whole number")
+            raise CalibrationError(f"camera: {name} = {data[name]:g} is not a whole number")
     return FlatPortCamera(**(data | {"normal": tuple(data.get("normal", _FORWARD))}))
 
 

@@ -49,7 +49,7 @@ def read_pixels(path: Path, flags: int) -> NDArray[Any] | None:
     """
     if pixels_too_many(path):
         return None
-    # OpenCV's own warnings would stand beside the line that the caller makes of it.
+    # OpenCV's own warnings would stand next to the line that the caller makes of it.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
     try:
         pixels: NDArray[Any] | None = cv2.imread(str(path), flags)

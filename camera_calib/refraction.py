@@ -29,9 +29,10 @@ def air_tangent(radius: float, water: float, port: Array) -> float:
     """Tangent in air, against the port's normal, of the light from a point in the water.
 
     It solves t (air + glass / G + water / W) = radius with G = sqrt(n_g^2 + (n_g^2 - 1) t^2) and W
-    likewise (Snell's law twice, in tangents). The left side is concave in t: from below, Newton's
-    method climbs to the root and never passes it; its slope at 0 gives such a lower bound. The
-    start t / sqrt(1 - c t^2) from that bound t is exact to third order, and for one layer exact.
+    in the same way (Snell's law twice, in tangents). The left side is concave in t: from below,
+    Newton's method climbs to the root and never passes it; its slope at 0 gives such a lower
+    bound. The start t / sqrt(1 - c t^2) from that bound t is exact to third order, and for one
+    layer exact.
 
     Args:
         radius: distance of the point from the normal through the pupil, > 0.

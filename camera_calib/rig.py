@@ -216,7 +216,7 @@ def read_rig(path: str | Path) -> Rig:
     try:
         data = _mapping(data, "the file")
         if data.get("format") != _FORMAT["format"]:
-            raise CalibrationError(f'is no rig file: "format" is not "{_FORMAT["format"]}"')
+            raise CalibrationError(f'is not a rig file: "format" is not "{_FORMAT["format"]}"')
         if data.get("version") != _FORMAT["version"]:
             raise CalibrationError(
                 f"is a rig file of version {data.get('version')}; this program reads version "
@@ -242,7 +242,7 @@ def read_rig(path: str | Path) -> Rig:
 
 def _mapping(data: Any, what: str) -> dict[str, Any]:
     if not isinstance(data, dict):
-        raise CalibrationError(f"{what} is no object of names and values")
+        raise CalibrationError(f"{what} is not an object of names and values")
     return data
 
 

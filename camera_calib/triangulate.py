@@ -48,7 +48,7 @@ class Triangulation:
     covariance: Array
     """(N, 3, 3) from the noise of the pixels alone, m^2."""
     residuals_px: Array
-    """(C, N, 2) projected less measured; NaN where a camera does not see the point."""
+    """(C, N, 2) projected minus measured; NaN where a camera does not see the point."""
     nearest_world: Array
     """(N, 3) the points nearest to all rays in water: where the search began."""
     nearest_residuals_px: Array

@@ -3,13 +3,14 @@
 import math
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from alice_survey.base.frames import Array
-from alice_survey.vehicle import signals
+from alice_survey.vehicle import estimate_vector as vector
 from alice_survey.vehicle.dynamics import coriolis_matrix, damping_matrix
 from alice_survey.vehicle.pilot import gains as g
-from alice_survey.vehicle.pilot import memory as told
+from alice_survey.vehicle.pilot import memory as slot
 from alice_survey.vehicle.pilot.gains import Gains
 from alice_survey.vehicle.pilot.path import Path
 from alice_survey.vehicle.pilot.settings import Guidance
@@ -50,14 +51,14 @@ def point_motion(estimate: Array, guidance: Guidance) -> tuple[Array, Array]:
 
     The velocity leaves out what roll and pitch rates add.
     """
-    roll, pitch, heading = estimate[signals.ROLL : signals.HEADING + 1]
+    roll, pitch, heading = estimate[vector.ROLL : vector.HEADING + 1]
     ned_from_body = Rotation.from_euler("ZYX", [heading, pitch, roll])
     place = estimate[:3] + ned_from_body.apply(guidance.point_body_m)
     level_from_body = Rotation.from_euler("ZYX", [0.0, pitch, roll])
-    q, r = estimate[signals.Q], estimate[signals.R]
+    q, r = estimate[vector.Q], estimate[vector.R]
     turn = (math.sin(roll) * q + math.cos(roll) * r) / math.cos(pitch)
     lever = level_from_body.apply(guidance.point_body_m)
-    velocity = level_from_body.apply(estimate[signals.U : signals.W + 1])
+    velocity = level_from_body.apply(estimate[vector.U : vector.W + 1])
     velocity = velocity + np.cross([0.0, 0.0, turn], lever)
     return place, velocity[:2]
 
@@ -66,8 +67,8 @@ def wrench(gains: Gains, demand: Array) -> Array:
     """The wrench that a demand stands for, by matrices."""
     body = gains.body
     nu, rate = np.zeros(6), np.zeros(6)
-    nu[list(g.DEGREES)] = demand[told.REF_SURGE : told.REF_SURGE + 4]
-    rate[list(g.DEGREES)] = demand[told.ACC_SURGE : told.ACC_SURGE + 4]
+    nu[list(g.DEGREES)] = demand[slot.REF_SURGE : slot.REF_SURGE + 4]
+    rate[list(g.DEGREES)] = demand[slot.ACC_SURGE : slot.ACC_SURGE + 4]
     force = body.mass @ rate + coriolis_matrix(body.mass, nu) @ nu + damping_matrix(body, nu) @ nu
     force[2] -= body.weight_n - body.buoyancy_n
     result = np.zeros(6)
@@ -91,8 +92,8 @@ def follow_demand(
     tangent = np.array([math.cos(beta), math.sin(beta)])
     normal = np.array([-math.sin(beta), math.cos(beta)])
     cross = float((place[:2] - start) @ normal)
-    heading, roll, pitch = (estimate[i] for i in (signals.HEADING, signals.ROLL, signals.PITCH))
-    q, r = estimate[signals.Q], estimate[signals.R]
+    heading, roll, pitch = (estimate[i] for i in (vector.HEADING, vector.ROLL, vector.PITCH))
+    q, r = estimate[vector.Q], estimate[vector.R]
     turn = (math.sin(roll) * q + math.cos(roll) * r) / math.cos(pitch)
     course = heading - beta
     sway_row, yaw_row, surge_row = gains.axes[g.SWAY], gains.axes[g.YAW], gains.axes[g.SURGE]
@@ -169,8 +170,8 @@ def standing_demand(
         (3,)
     """
     point, (surge, sway) = point_motion(estimate, guidance)
-    heading, roll, pitch = (estimate[i] for i in (signals.HEADING, signals.ROLL, signals.PITCH))
-    q, r = estimate[signals.Q], estimate[signals.R]
+    heading, roll, pitch = (estimate[i] for i in (vector.HEADING, vector.ROLL, vector.PITCH))
+    q, r = estimate[vector.Q], estimate[vector.R]
     turn = (math.sin(roll) * q + math.cos(roll) * r) / math.cos(pitch)
     hull = np.array([
         [math.cos(heading), math.sin(heading)], [-math.sin(heading), math.cos(heading)]
@@ -210,3 +211,50 @@ def smoothed_floor(heard_m: Array, rate_rad_s: float, dt_s: float) -> Array:
     system = ([2 * rate_rad_s, rate_rad_s**2], [1.0, 2 * rate_rad_s, rate_rad_s**2])
     result: Array = lsim(system, held, time_s)[1][::fine] + heard_m[0]
     return result
+
+
+def los_offset_m(
+    look_ahead_m: float,
+    speed_mps: float,
+    across_mps: float,
+    along_mps: float = 0.0,
+    *,
+    over_ground: bool = True,
+) -> float:
+    """Where `los` settles next to a straight path in a steady current, metres to starboard.
+
+    Steady means no turning and no drag across the hull, since nothing would balance it: the sway
+    relative to the water is zero. With t the tangent of the angle from path to heading, the offset
+    is -look_ahead t. The current's part across the hull must be the sway over ground. If surge
+    relative to the water is kept at U, U sin = -across, so that the offset is
+    look_ahead across / sqrt(U^2 - across^2). If surge over ground is kept at U, the speed along the
+    path is U / cos and the sway over ground -U t, whence U t sqrt(1 + t^2) = along t - across;
+    without a current along the path t^2 = (sqrt(1 + 4 (across / U)^2) - 1) / 2.
+
+    Args:
+        look_ahead_m: of the guidance.
+        speed_mps: U, the surge that is kept.
+        across_mps: current to starboard of the path.
+        along_mps: current along the path.
+        over_ground: what U is relative to.
+
+    Returns:
+        NaN where there is no such state, or more than one: the current across is too strong for a
+        speed relative to the water, or the current along is not below U.
+    """
+    if not over_ground:
+        if abs(across_mps) >= speed_mps:
+            return math.nan
+        return look_ahead_m * across_mps / math.sqrt(speed_mps**2 - across_mps**2)
+    if along_mps >= speed_mps:
+        return math.nan
+    if along_mps == 0.0:
+        ratio = across_mps / speed_mps
+        size = math.sqrt(0.5 * (math.sqrt(1.0 + 4.0 * ratio**2) - 1.0))
+        return look_ahead_m * math.copysign(size, across_mps)
+
+    def surplus(t: float) -> float:
+        return speed_mps * t * math.sqrt(1.0 + t * t) - along_mps * t + across_mps
+
+    reach = 1.0 + abs(across_mps) / (speed_mps - max(along_mps, 0.0))
+    return -look_ahead_m * float(brentq(surplus, -reach, reach, xtol=1e-14))

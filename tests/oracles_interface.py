@@ -1,7 +1,7 @@
-"""Slow, obvious twins of triangulation, and a tank whose truth is known."""
+"""Slow, obvious twins of triangulation, and a rig before two interfaces whose truth is known."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,9 +9,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from camera_calib.flat_port import FlatPortCamera
-from camera_calib.tank.adjust import Tank
-from camera_calib.tank.interface import FixedCamera, Plane, Reference, plane_through
-from camera_calib.tank.single_lens import KnownLens
+from camera_calib.triangulate import Triangulation, reproject, triangulate
 
 Array = NDArray[np.float64]
 
@@ -56,6 +54,22 @@ def nearest_slowly(origins: Array, directions: Array) -> Array:
     return np.linalg.lstsq(rows, right, rcond=None)[0]
 
 
+@dataclass(frozen=True, eq=False)
+class Tank:
+    """Fixed cameras in air that look into one body of water."""
+
+    cameras: tuple[FlatPortCamera, ...]
+    poses: tuple[RigidTransform, ...]
+    """Camera from world."""
+
+    def triangulate(self, pixels: Array) -> Triangulation:
+        return triangulate(self.cameras, self.poses, pixels)
+
+    def seen(self, points_world: Array) -> Array:
+        """(C, N, 2) exact pixels."""
+        return reproject(self.cameras, self.poses, points_world)
+
+
 def looking(position: Array, target: Array, right: Array) -> RigidTransform:
     """Camera from world, of a camera at a place that looks at another, its x axis near `right`."""
     z = (target - position) / np.linalg.norm(target - position)
@@ -65,6 +79,27 @@ def looking(position: Array, target: Array, right: Array) -> RigidTransform:
     return RigidTransform.from_components(-rotation.apply(position), rotation)
 
 
+def behind_interface(
+    lens: FlatPortCamera,
+    cam_from_world: RigidTransform,
+    points_world: Array,
+    *,
+    n_water: float = 1.333,
+    glass_m: float = 0.0,
+) -> FlatPortCamera:
+    """A camera in air with the plane of points of its interface, on the air's side, as its port."""
+    points_cam = cam_from_world.apply(points_world)
+    middle = points_cam.mean(axis=0)
+    normal = np.linalg.svd(points_cam - middle)[2][2]
+    normal *= np.sign(normal @ middle)
+    return replace(
+        lens,
+        n_water=n_water,
+        glass_thickness_m=glass_m,
+        port_distance_m=float(normal @ middle),
+    ).with_parameters({"normal_x": float(normal[0]), "normal_y": float(normal[1])})
+
+
 def true_tank(
     glass_m: Sequence[float] = (0.0, 0.006), n_water: float = 1.333, lean_m: float = 0.008
 ) -> Tank:
@@ -72,45 +107,18 @@ def true_tank(
     x, y, z = SIZE_M
     tops = np.array([[0, 0, 0], [x, 0, 0], [x, y, 0], [0, y, 0]], dtype=np.float64)
     fronts = np.array([[0, y, 0], [x, y, 0], [x, y - lean_m, z], [0, y - lean_m, z]])
-    places = (np.array([0.19, 0.08, -0.21]), np.array([0.18, 0.40, 0.08]))
     middle = SIZE_M / 2
-    lens = KnownLens(camera=LENS)
-    cameras = []
-    for i, (points, place) in enumerate(zip((tops, fronts), places, strict=True)):
-        pose = looking(place, middle, np.array([-1.0 if i == 0 else 1.0, 0.02, 0.01]))
-        pixels = LENS.project(pose.apply(points))
-        reference = Reference(camera=f"cam{i + 1}", pixels=pixels, points_world=points)
-        fixed = FixedCamera(
-            name=f"cam{i + 1}",
-            lens=LENS,
-            cam_from_world=pose,
-            plane=into_water(reference, middle),
-            reference=reference,
-            n_water=n_water,
-            glass_thickness_m=glass_m[i],
-        )
-        cameras.append(fixed)
-    return Tank(
-        cameras=tuple(cameras),
-        lenses=(lens, lens),
-        reference_sigma_px=1.0,
-        covariance=np.zeros((12, 12)),
+    poses = (
+        looking(np.array([0.19, 0.08, -0.21]), middle, np.array([-1.0, 0.02, 0.01])),
+        looking(np.array([0.18, 0.40, 0.08]), middle, np.array([1.0, 0.02, 0.01])),
     )
-
-
-def into_water(reference: Reference, inside: Array) -> Plane:
-    """The plane of reference points with its normal on the side of a point in the water."""
-    plane = plane_through(reference)
-    if plane.heights_m(inside) < 0:
-        plane = replace(plane, normal_world=-plane.normal_world)
-    return plane
+    cameras = tuple(
+        behind_interface(LENS, pose, points, n_water=n_water, glass_m=glass)
+        for pose, points, glass in zip(poses, (tops, fronts), glass_m, strict=True)
+    )
+    return Tank(cameras=cameras, poses=poses)
 
 
 def points_in_tank(rng: np.random.Generator, count: int) -> Array:
     """Places in the water, away from the walls."""
     return SIZE_M * rng.uniform(0.1, 0.75, (count, 3))
-
-
-def seen(tank: Tank, points_world: Array) -> Array:
-    """(C, N, 2) exact pixels."""
-    return np.stack([c.camera.project(c.cam_from_world.apply(points_world)) for c in tank.cameras])

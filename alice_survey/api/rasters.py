@@ -28,6 +28,10 @@ class _Raster:
     def _shape(self) -> tuple[int, int]:
         raise NotImplementedError
 
+    def _repr_html_(self) -> str:
+        title, _, text = repr(self).partition(": ")
+        return f"<b>{title}</b>: {text}"
+
     @property
     def extent(self) -> tuple[float, float, float, float]:
         """West, east, south and north edges, as `matplotlib.imshow` takes them."""
@@ -38,7 +42,7 @@ class _Raster:
         )  # fmt: skip
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Dem(_Raster):
     """Heights of the surface, and how well they are known.
 
@@ -73,16 +77,16 @@ class Dem(_Raster):
         )
         return found
 
-    def _repr_html_(self) -> str:
+    def __repr__(self) -> str:
         rows, columns = self._shape()
         known = np.isfinite(self.height)
         return (
-            f"<b>DEM</b>: {columns} x {rows} cells of {self.cell:.4g} {self.unit}, "
+            f"DEM: {columns} x {rows} cells of {self.cell:.4g} {self.unit}, "
             f"{known.mean():.0%} known, median sigma {np.nanmedian(self.sigma):.3g} {self.unit}"
         )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Mosaic(_Raster):
     """The orthomosaic.
 
@@ -98,12 +102,11 @@ class Mosaic(_Raster):
     def _shape(self) -> tuple[int, int]:
         return self.rgba.shape[0], self.rgba.shape[1]
 
-    def _repr_html_(self) -> str:
+    def __repr__(self) -> str:
         rows, columns = self._shape()
         share = (self.rgba[..., 3] > 0).mean()
         return (
-            f"<b>mosaic</b>: {columns} x {rows} pixels of {self.cell:.4g} {self.unit}, "
-            f"{share:.0%} painted"
+            f"mosaic: {columns} x {rows} pixels of {self.cell:.4g} {self.unit}, {share:.0%} painted"
         )
 
 

@@ -78,10 +78,11 @@ class Survey:
         Raises:
             AliceError: a stage cannot be done; the message says what to change.
         """
+        from alice_survey.base.executor import local_executor
         from alice_survey.stages import names
         from alice_survey.survey import run
 
-        return run(stages or names(), self.folder, None, threads=threads)[1]
+        return run(stages or names(), self.folder, None, executor=local_executor(threads))[1]
 
     def plan(self) -> Plan:
         """Plan the survey if its plan is missing or stale, and return the plan."""

@@ -12,7 +12,7 @@ from reconstruct.placing.track import read_track_poses
 from reconstruct.views.model import WorldFrame, read_frame
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Track:
     """Where each registered picture was taken from, and how well that is known.
 
@@ -41,11 +41,15 @@ class Track:
         sigma: Array = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)[:, :3])
         return sigma
 
-    def _repr_html_(self) -> str:
-        text = f"<b>track</b>: {len(self.images)} pictures in the frame '{self.frame.name}'"
+    def __repr__(self) -> str:
+        text = f"track: {len(self.images)} pictures in the frame '{self.frame.name}'"
         if self.sigma is not None:
             text += f", median position sigma {np.median(self.sigma):.3g} {self.frame.unit}"
         return text
+
+    def _repr_html_(self) -> str:
+        title, _, text = repr(self).partition(": ")
+        return f"<b>{title}</b>: {text}"
 
 
 def read_track(workspace: str | Path) -> Track:

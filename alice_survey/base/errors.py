@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import logging
 import os
 import stat
 import sys
@@ -11,15 +12,13 @@ from pathlib import Path
 from typing import Literal
 
 Level = Literal["note", "warning"]
-Show = Callable[[Level, str], None]
 
 _listeners: ContextVar[tuple[list[str], ...]] = ContextVar("listeners", default=())
-_shows: list[Show] = []
-"""Where notes and warnings go, the last one; to standard error while there is none."""
+_collector: ContextVar[Callable[[Level, str], None] | None] = ContextVar("collector", default=None)
 
 
 class AliceError(Exception):
-    """A fault the user can mend; the command line prints it as one line and exits with 1.
+    """A fault the user can put right; the command line prints it as one line and exits with 1.
 
     Example:
         >>> import alice_survey as alice
@@ -45,7 +44,7 @@ class WorkspaceError(AliceError):
 
 
 class PlanError(AliceError):
-    """No plan meets what was asked for."""
+    """No plan meets what was requested."""
 
 
 class VehicleError(AliceError):
@@ -68,16 +67,66 @@ class ReconstructionError(AliceError):
     """The pictures do not give a model."""
 
 
+class _OnStderr(logging.Handler):
+    """Shows notes and warnings where no run takes them."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a line."""
+        prefix = "warning: " if record.levelno >= logging.WARNING else ""
+        say(prefix + record.getMessage())
+
+
+LOG = logging.getLogger("alice_survey")
+"""Where notes and warnings go, and what else happens during a run."""
+LOG.setLevel(logging.INFO)
+LOG.propagate = False
+LOG.addHandler(_OnStderr())
+
+
 def warn(text: str) -> None:
-    """Tell the user, in one line on standard error, of something that work goes on without."""
-    _show("warning", text)
-    for told in _listeners.get():
-        told.append(text)
+    """Report, in one line on standard error, a fault that does not stop the work."""
+    _report("warning", text)
+    for warnings in _listeners.get():
+        warnings.append(text)
 
 
 def note(text: str) -> None:
-    """Tell the user, in one line on standard error, why it takes long."""
-    _show("note", text)
+    """Report, in one line on standard error, why it takes long."""
+    _report("note", text)
+
+
+def _report(level: Level, text: str) -> None:
+    collect = _collector.get()
+    if collect is not None:
+        collect(level, text)
+    else:
+        LOG.log(logging.WARNING if level == "warning" else logging.INFO, "%s", text)
+
+
+@contextlib.contextmanager
+def collected_by(collect: Callable[[Level, str], None]) -> Iterator[None]:
+    """Have notes and warnings of this task alone given to a function: they go with its result."""
+    token = _collector.set(collect)
+    try:
+        yield
+    finally:
+        _collector.reset(token)
+
+
+def is_in_task() -> bool:
+    """Whether this is the work of a task, whose notes and warnings are collected."""
+    return _collector.get() is not None
+
+
+@contextlib.contextmanager
+def heard() -> Iterator[list[str]]:
+    """Also keep the warnings reported meanwhile, to write them down."""
+    warnings: list[str] = []
+    token = _listeners.set((*_listeners.get(), warnings))
+    try:
+        yield warnings
+    finally:
+        _listeners.reset(token)
 
 
 def say(text: str) -> None:
@@ -107,34 +156,6 @@ def outliving() -> Iterator[None]:
             os.close(nowhere)
 
 
-def _show(level: Level, text: str) -> None:
-    if _shows:
-        _shows[-1](level, text)
-    else:
-        say(f"warning: {text}" if level == "warning" else text)
-
-
-@contextlib.contextmanager
-def shown_by(show: Show) -> Iterator[None]:
-    """Have notes and warnings of all threads shown by a function meanwhile."""
-    _shows.append(show)
-    try:
-        yield
-    finally:
-        _shows.remove(show)
-
-
-@contextlib.contextmanager
-def heard() -> Iterator[list[str]]:
-    """Also keep what is warned of meanwhile, to write it down."""
-    told: list[str] = []
-    token = _listeners.set((*_listeners.get(), told))
-    try:
-        yield told
-    finally:
-        _listeners.reset(token)
-
-
 def why(error: Exception) -> str:
     """What went wrong with a file, without numbers of the operating system."""
     if isinstance(error, FileNotFoundError):
@@ -146,7 +167,7 @@ def why(error: Exception) -> str:
 
 _ON = ", and the same command goes on from here"
 _FEWER = f": give fewer --threads, or close other programs{_ON}"
-_MENDS = {
+_REMEDIES = {
     errno.ENOSPC: f": free some of the disk{_ON}",
     errno.EDQUOT: f": free some of your share of the disk{_ON}",
     errno.EROFS: ": choose a workspace that can be written, with -w",
@@ -168,7 +189,7 @@ def memory_shortage(path: Path) -> AliceError:
 
 
 def known_fault(error: BaseException) -> str | None:
-    """The line that tells the user of a fault which is no bug; None for a bug."""
+    """The line to show for a fault that is not a bug; None for a bug."""
     if isinstance(error, AliceError):
         return str(error)
     said = str(error).lower()
@@ -178,5 +199,5 @@ def known_fault(error: BaseException) -> str | None:
         where = error.filename2 or error.filename
         text = error.strerror or str(error)
         line = text if where is None else f"{where}: {text}"
-        return line + _MENDS.get(error.errno or 0, "")
+        return line + _REMEDIES.get(error.errno or 0, "")
     return None

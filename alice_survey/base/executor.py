@@ -1,4 +1,4 @@
-"""Run pure functions over pictures, pairs and tiles: in order, parallel, with a bounded queue."""
+"""Run pure functions over pictures, pairs and tiles: in order, in parallel, on any engine."""
 
 import contextlib
 import ctypes
@@ -8,191 +8,271 @@ import signal
 import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sized
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextvars import ContextVar
-from dataclasses import dataclass, field
-from typing import Generic, TypeVar
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
+from dataclasses import dataclass, field, replace
+from types import TracebackType
+from typing import Any, Generic, Protocol, TypeVar
 
-from alice_survey.base.errors import AliceError, Level, say, shown_by, warn
-from alice_survey.base.run.progress import counted, current, keep_silent, step
+from alice_survey.base.errors import AliceError, Level, collected_by, note, say, warn
+from alice_survey.base.run.progress import counted, current, step
 
 _PR_SET_PDEATHSIG = 1
-_TOLD = "told_in_worker"
+_MESSAGES = "messages_of_task"
 _CORES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-
-_kept: ContextVar[dict[int, ProcessPoolExecutor] | None] = ContextVar("kept", default=None)
+_QUEUED = 3
+"""Tasks in flight for each that runs: enough to keep all busy, few enough to bound memory."""
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
+class Pool(Protocol):
+    """The part of `concurrent.futures.Executor` that an engine has to offer."""
+
+    def submit(self, function: Callable[..., Any], /, *args: Any) -> "Future[Any]":
+        """Run `function(*args)` in the background; both are picklable, and so is the result."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Executor:
+    """Where tasks run: in this process, in local processes, or on an engine for many machines.
+
+    A task is a module-level function of one picklable value: settings, arrays and paths. It may
+    rely on nothing else of the process that submits it. What it reports with `warn` and `note`
+    travels back with its result.
+    """
+
+    workers: int = 1
+    """How many tasks run at once; with one and no pool they run in this process."""
+    pool: Pool | None = None
+    """An engine that is running; without one, local processes start where there are tasks."""
+
+    @property
+    def local_cores(self) -> int:
+        """How many cores work in this process, outside of tasks, may use."""
+        return self.workers if self._is_local else default_threads()
+
+    @property
+    def _is_local(self) -> bool:
+        return self.pool is None or isinstance(self.pool, _Processes)
+
+    def map(
+        self,
+        function: Callable[[Item], Result],
+        items: Iterable[Item],
+        *,
+        label: str,
+        total: int | None = None,
+        task_mib: float = 0.0,
+    ) -> Iterator[Result]:
+        """Yield `function(item)` for each item, in the order of the items, with a progress bar.
+
+        At most three items per worker are in flight, so that memory stays bounded.
+
+        Args:
+            function: a task, see the class.
+            items: what to work on.
+            label: what the progress bar says.
+            total: how many items, when `items` has no length.
+            task_mib: memory that one task takes, where that is known to be much: in local
+                processes as many run at once as there is memory for.
+
+        Raises:
+            AliceError: a worker was ended from outside.
+        """
+        if total is None and isinstance(items, Sized):
+            total = len(items)
+        workers = self.workers
+        if self._is_local:
+            workers = min(workers, _fitting(task_mib), workers if total is None else max(1, total))
+        if workers <= 1 and self.pool is None:
+            yield from counted(map(function, items), label, total, 1)
+            return
+        with self._running(workers) as pool:
+            queued = _QUEUED * workers if workers == self.workers else workers
+            yield from counted(_in_order(pool, function, items, queued), label, total, workers)
+
+    @contextlib.contextmanager
+    def started(self) -> Iterator["Executor"]:
+        """Within this block all calls of `map` share their processes.
+
+        To start one and to load its libraries takes about two seconds of computing.
+        """
+        if self.pool is not None or self.workers <= 1:
+            yield self
+            return
+        with _Processes(self.workers) as pool:
+            yield replace(self, pool=pool)
+
+    @contextlib.contextmanager
+    def _running(self, workers: int) -> Iterator[Pool]:
+        if self.pool is not None:
+            yield self.pool
+            return
+        with _Processes(workers) as pool:
+            yield pool
+
+
+SERIAL = Executor()
+"""Runs tasks in this process, one after the other."""
+
+
+def local_executor(threads: int | None = None) -> Executor:
+    """Processes on this machine, as many as given; one for each core when None."""
+    return Executor(workers=threads or default_threads())
+
+
 def default_threads() -> int:
     """How many cores this process may use."""
-    return len(os.sched_getaffinity(0))
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
-def parallel_map(
-    function: Callable[[Item], Result],
-    items: Iterable[Item],
-    *,
-    threads: int,
-    label: str,
-    total: int | None = None,
-) -> Iterator[Result]:
-    """Yield `function(item)` for each item, in the order of the items, with a progress bar.
+def run_apart(function: Callable[[Item], Result], item: Item) -> Result:
+    """Run a task in a local process of its own, which faults in native code may end.
 
-    With one thread the work runs here; else in local processes (spawned, so that threads of numeric
-    libraries are never forked), of which each uses one core. At most three items per process are
-    queued, so that memory stays bounded.
-
-    Args:
-        function: a module-level function (it travels to other processes).
-        items: what to work on.
-        threads: how many processes.
-        label: what the progress bar says.
-        total: how many items, when `items` has no length.
+    Raises:
+        BrokenExecutor: they did.
     """
-    if total is None and isinstance(items, Sized):
-        total = len(items)
-    if threads <= 1:
-        yield from counted(map(function, items), label, total, 1)
-        return
-    kept = _kept.get()
-    if kept is not None:
-        if threads not in kept:
-            kept[threads] = _workers(threads)
-        done = _in_order(kept[threads], function, items, 3 * threads)
-        yield from counted(done, label, total, threads)
-        return
-    with _ended(_workers(threads)) as pool:
-        yield from counted(_in_order(pool, function, items, 3 * threads), label, total, threads)
+    with _Processes(1) as pool:
+        future: Future[_TaskResult[Result]] = pool.submit(_Task(function), item)
+        return _result(future)
 
 
-@contextlib.contextmanager
-def kept_workers() -> Iterator[None]:
-    """Within this block all calls of `parallel_map` share their processes.
+def _fitting(task_mib: float) -> int:
+    """How many tasks the memory of this machine has room for, at least one."""
+    if task_mib <= 0:
+        return sys.maxsize
+    import psutil
 
-    To start one and to load its libraries takes about two seconds of computing.
-    """
-    kept: dict[int, ProcessPoolExecutor] = {}
-    token = _kept.set(kept)
-    try:
-        yield
-    except BaseException:
-        for pool in kept.values():
-            _end(pool)
-        raise
-    finally:
-        _kept.reset(token)
-    for pool in kept.values():
-        pool.shutdown(cancel_futures=True)
+    return max(1, int(psutil.virtual_memory().available / (task_mib * 2**20)))
 
 
-@contextlib.contextmanager
-def _ended(pool: ProcessPoolExecutor) -> Iterator[ProcessPoolExecutor]:
-    """Wait for the processes of a pool at the end; where work is broken off, end them at once."""
-    try:
-        yield pool
-    except BaseException:
-        _end(pool)
-        raise
-    pool.shutdown()
+class _Processes(ProcessPoolExecutor):
+    """Local processes of one core each, spawned, so that threads of libraries are never forked."""
 
+    def __init__(self, workers: int) -> None:
+        with _signals_restored():  # Python's tracker of semaphores changes the mask
+            super().__init__(
+                workers,
+                mp_context=multiprocessing.get_context("spawn"),
+                initializer=_start_worker,
+            )
 
-def _end(pool: ProcessPoolExecutor) -> None:
-    """End a pool whatever it is doing.
+    def submit(self, function: Callable[..., Any], /, *args: Any) -> "Future[Any]":  # type: ignore[override]
+        """Queue a task; a process starts when there is something for it to do."""
+        with _as_workers_start():
+            return super().submit(function, *args)
 
-    Its processes are killed, since COLMAP's log answers a termination with a stack trace. What is
-    queued is not cancelled one by one: the thread that tends the pool fails on items that were,
-    when it finds its processes gone.
-    """
-    for process in list((pool._processes or {}).values()):
-        process.kill()
-    pool.shutdown(cancel_futures=True)
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Wait for the processes; where work is broken off, end them whatever they are doing.
 
-
-def _workers(threads: int) -> ProcessPoolExecutor:
-    context = multiprocessing.get_context("spawn")
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, ())  # Python's tracker of semaphores lifts it
-    try:
-        return ProcessPoolExecutor(threads, mp_context=context, initializer=_start_worker)
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        They are killed then, since COLMAP's log answers a termination with a stack trace. What is
+        queued is not cancelled one by one: the thread that tends the pool fails on items that
+        were, when it finds its processes gone.
+        """
+        if kind is not None:
+            for process in list((self._processes or {}).values()):
+                process.kill()
+        self.shutdown(cancel_futures=True)
 
 
 @dataclass(frozen=True)
-class _Answer(Generic[Result]):
-    """What comes back from another process."""
+class _TaskResult(Generic[Result]):
+    """What comes back from a task."""
 
     result: Result
-    told: list[tuple[Level, str]] = field(default_factory=list)
+    messages: list[tuple[Level, str]] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
-class _Call(Generic[Item, Result]):
+class _Task(Generic[Item, Result]):
     """A function whose notes and warnings come back with its result."""
 
     function: Callable[[Item], Result]
-    quiet: bool
+    says_notes: bool = False
+    """Show notes at once as well: they say why the next minute is long."""
 
-    def __call__(self, item: Item) -> _Answer[Result]:
-        told: list[tuple[Level, str]] = []
+    def __call__(self, item: Item) -> _TaskResult[Result]:
+        messages: list[tuple[Level, str]] = []
 
-        def show(level: Level, text: str) -> None:
-            told.append((level, text))
-            if level == "note" and not self.quiet:  # it says why the next minute is long
+        def collect(level: Level, text: str) -> None:
+            messages.append((level, text))
+            if level == "note" and self.says_notes:
                 say(text)
 
-        with shown_by(show):
+        with collected_by(collect):
             try:
-                return _Answer(self.function(item), told)
+                return _TaskResult(self.function(item), messages)
             except Exception as error:
-                vars(error)[_TOLD] = told
+                vars(error)[_MESSAGES] = messages
                 raise
 
 
 def _in_order(
-    pool: ProcessPoolExecutor,
-    function: Callable[[Item], Result],
-    items: Iterable[Item],
-    queued: int,
+    pool: Pool, function: Callable[[Item], Result], items: Iterable[Item], queued: int
 ) -> Iterator[Result]:
-    call = _Call(function, current().quiet)
-    waiting: deque[Future[_Answer[Result]]] = deque()
+    local = isinstance(pool, _Processes)
+    says_notes = local and not current().is_quiet
+    task = _Task(function, says_notes)
+    waiting: deque[Future[_TaskResult[Result]]] = deque()
     try:
         for item in items:
-            with _as_workers_start():  # a process starts when there is something for it to do
-                waiting.append(pool.submit(call, item))
+            waiting.append(pool.submit(task, item))
             if len(waiting) >= queued:
-                yield _result(waiting.popleft())
+                yield _result(waiting.popleft(), shown=says_notes)
         while waiting:
-            yield _result(waiting.popleft())
-    except BrokenProcessPool:
+            yield _result(waiting.popleft(), shown=says_notes)
+    except BrokenExecutor:
         raise AliceError(
             "a process that worked for this one was ended from outside, most likely because memory "
             "ran out: give fewer --threads, or close other programs; the same command goes on from "
             "here"
         ) from None
+    finally:
+        if not local:
+            for future in waiting:
+                future.cancel()
 
 
-def _result(future: "Future[_Answer[Result]]") -> Result:
-    """What an item gave, once what its work told is told here."""
+def _result(future: "Future[_TaskResult[Result]]", *, shown: bool = False) -> Result:
+    """The result of a task, once its notes and warnings are reported here."""
     try:
         answer = future.result()
     except Exception as error:
-        _tell(vars(error).pop(_TOLD, []))
+        _report(vars(error).pop(_MESSAGES, []), shown=shown)
         raise
-    _tell(answer.told)
+    _report(answer.messages, shown=shown)
     return answer.result
 
 
-def _tell(told: list[tuple[Level, str]]) -> None:
-    for level, text in told:
+def _report(messages: list[tuple[Level, str]], *, shown: bool) -> None:
+    for level, text in messages:
         if level == "warning":
             warn(text)
+        elif shown:
+            current().report("note", text, shown=True)
         else:
-            current().tell("note", text, shown=True)
+            note(text)
+
+
+@contextlib.contextmanager
+def _signals_restored() -> Iterator[None]:
+    """Restore the mask of blocked signals at the end, where the system has one."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 @contextlib.contextmanager
@@ -200,11 +280,12 @@ def _as_workers_start() -> Iterator[None]:
     """Have processes started meanwhile take one core each, and leave Ctrl-C to this one."""
     before = {name: os.environ.get(name) for name in _CORES}
     os.environ.update(dict.fromkeys(_CORES, "1"))
-    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        yield
+        with _signals_restored():
+            if hasattr(signal, "pthread_sigmask"):
+                signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         for name, value in before.items():
             if value is None:
                 os.environ.pop(name, None)
@@ -217,7 +298,6 @@ def _start_worker() -> None:
     import cv2
 
     cv2.setNumThreads(1)
-    keep_silent()
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 

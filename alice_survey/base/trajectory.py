@@ -63,10 +63,8 @@ def read_track(path: Path) -> Trajectory:
     return Trajectory(time_s=time_s, ned_from_body=poses)
 
 
-def read_columns(
-    path: Path, required: Sequence[str], may_be_blank: Sequence[str] = ()
-) -> dict[str, Array]:
-    """Read the required columns of a CSV file as finite numbers; NaN where they may be blank.
+def read_columns(path: Path, required: Sequence[str]) -> dict[str, Array]:
+    """Read the required columns of a CSV file as finite numbers.
 
     Raises:
         NavigationError: the file is missing, lacks a column, or holds a value that is no finite
@@ -79,7 +77,7 @@ def read_columns(
             if missing:
                 raise NavigationError(f"{path}: column {missing[0]} is missing")
             table = [
-                [_number(path, i, row, name, name in may_be_blank) for name in required]
+                [_number(path, i, row, name) for name in required]
                 for i, row in enumerate(reader, 2)
             ]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -88,9 +86,7 @@ def read_columns(
     return {name: values[:, i] for i, name in enumerate(required)}
 
 
-def _number(path: Path, line: int, row: dict[str, str], name: str, may_be_blank: bool) -> float:
-    if may_be_blank and row[name] == "":
-        return math.nan
+def _number(path: Path, line: int, row: dict[str, str], name: str) -> float:
     try:
         value = float(row[name])
     except (TypeError, ValueError):

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from alice_survey.cli.options import CONTEXT, AsJson, Threads, examples, print_result
+from alice_survey.cli.options import CONTEXT, AsJson, Threads, examples, executor_of, print_result
 
 app = typer.Typer(
     help="Look at, convert and judge camera models behind flat ports.",
@@ -31,7 +31,7 @@ def water(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Tell index and attenuation of water."""
+    """Show index and attenuation of water."""
     from camera_calib.water import water_report
 
     print_result(*water_report(temperature, salinity, depth, jerlov, wavelength), as_json)
@@ -65,13 +65,12 @@ def undisperse(
 
     A flat port shows each colour at its own scale: some pixels apart at the edge of the frame.
     """
-    from alice_survey.base.executor import default_threads
     from camera_calib.approximation.undisperse import undisperse_files
 
     text, data = undisperse_files(
         pictures, folder, rig=rig, camera=camera, range_m=distance, temperature_c=temperature,
         salinity_psu=salinity, depth_m=depth, glass=material, wavelengths_nm=wavelength,
-        threads=threads or default_threads(),
+        executor=executor_of(threads),
     )  # fmt: skip
     print_result(text, data, as_json)
 
@@ -92,7 +91,7 @@ def residual(
     plot: Annotated[Path | None, typer.Option(help="PNG, PDF or SVG to draw.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Tell what approximations cost.
+    """Show what approximations cost.
 
     Pixels that pinholes after a warp, and COLMAP's cameras without one, are wrong by through this
     port. Distances are from the entrance pupil along the axis.
@@ -127,7 +126,7 @@ def convert(
         typer.Option("--to", metavar="FORMAT", help="rig, opencv, colmap, flatport, kalibr, ros."),
     ] = None,
     image_size: Annotated[
-        tuple[int, int] | None, typer.Option(metavar="W H", help="Pixels, when IN tells none.")
+        tuple[int, int] | None, typer.Option(metavar="W H", help="Pixels, when IN states none.")
     ] = None,
     extrinsics: Annotated[Path | None, typer.Option(help="OpenCV file of R and T.")] = None,
     unit_m: Annotated[float, typer.Option(help="Metres in one unit of IN's translations.")] = 1.0,
@@ -155,56 +154,20 @@ def convert(
 
     OpenCV, COLMAP, Refractive COLMAP (flatport), Kalibr, ROS and rig.json; nothing is lost unasked.
     """
-    from camera_calib.formats.convert import convert_files
+    from camera_calib.formats.convert import Conversion
+    from camera_calib.formats.convert import convert as work
+    from camera_calib.formats.rigs import ReadOptions
 
-    text, data = convert_files(
-        source, target, source_format=source_format, target_format=target_format,
-        image_size=image_size, extrinsics=extrinsics, unit_m=unit_m, camera=camera, names=names,
-        port_distance_mm=port_distance, glass_mm=glass, n_glass=n_glass, n_water=n_water,
-        water=water, model=model, drop_port=drop_port, drop_covariance=drop_covariance,
-        overwrite=overwrite,
+    task = Conversion(
+        source=source, target=target, source_format=source_format, target_format=target_format,
+        reading=ReadOptions(
+            image_size=image_size, extrinsics=extrinsics, metres_per_unit=unit_m, camera=camera
+        ),
+        names=tuple(names.split(",")) if names else (), port_distance_mm=port_distance,
+        glass_mm=glass, n_glass=n_glass, n_water=n_water, water=water, model=model,
+        drop_port=drop_port, drop_covariance=drop_covariance, overwrite=overwrite,
     )  # fmt: skip
-    print_result(text, data, as_json)
-
-
-@app.command(
-    epilog=examples(
-        "camera tank --boards boards --board 'chessboard 9x6 9.35mm' --reference "
-        "cam1_references.json --reference cam2_references.json --detections detections.csv -o tank",
-    )
-)
-def tank(
-    boards: Annotated[list[Path], typer.Option(help="Folder of the board in air; or one each.")],
-    board: Annotated[str, typer.Option(help="Such as 'chessboard 9x6 9.35mm'.")],
-    reference: Annotated[list[Path], typer.Option(help="Points on the interface, per camera.")],
-    detections: Annotated[Path, typer.Option(help="CSV: cam, frame, id, x, y.")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write.")],
-    unit: Annotated[str, typer.Option(help="Of the reference's world: m, cm or mm.")] = "cm",
-    n_water: Annotated[float, typer.Option(help="Index of the water.")] = 1.333,
-    glass: Annotated[
-        list[float] | None, typer.Option(help="Wall before it, mm; or one each.")
-    ] = None,
-    n_glass: Annotated[float, typer.Option(help="Index of the walls.")] = 1.52,
-    lens: Annotated[str | None, typer.Option(help="Lens model; chosen when not given.")] = None,
-    frame_offset: Annotated[
-        list[str] | None, typer.Option(metavar="CAMERA=N", help="Added to its frame numbers.")
-    ] = None,
-    refine: Annotated[bool, typer.Option(help="Poses from the detections too.")] = True,
-    threads: Threads = None,
-    as_json: AsJson = False,
-) -> None:
-    """Triangulate what fixed cameras see in a tank.
-
-    Lens from a board in air, poses from points on the flat interface each camera looks through.
-    """
-    from camera_calib.tank.run import TankSettings, run_tank
-
-    settings = TankSettings(
-        boards=tuple(boards), board=board, references=tuple(reference), detections=detections,
-        unit=unit, n_water=n_water, glass_mm=tuple(glass or ()), n_glass=n_glass, lens=lens,
-        frame_offsets=tuple(frame_offset or ()), refine=refine,
-    )  # fmt: skip
-    print_result(*run_tank(settings, out, threads), as_json)
+    print_result(*work(task), as_json)
 
 
 @app.command(
@@ -220,7 +183,7 @@ def uncertainty(
     noise: Annotated[float, typer.Option(min=0.0, help="Of a measured coordinate, px.")] = 0.1,
     as_json: AsJson = False,
 ) -> None:
-    """Tell what a calibration's sigmas mean.
+    """Show what a calibration's sigmas mean.
 
     For pixels over the frame, for triangulated points and for lengths, against distance.
     """

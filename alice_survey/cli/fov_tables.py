@@ -1,17 +1,26 @@
-"""Tables that the command line prints."""
+"""The `fov` command: what a lens sees, and the check of the paper's optics."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from alice_survey.base.config import CameraConfig, SurveyConfig, load_config, parse_config
 from alice_survey.base.errors import ConfigError, warn
-
-if TYPE_CHECKING:
-    from camera_calib.fov.table import FovChoices, FovRow
-    from camera_calib.fov.text import TextTable
-    from camera_calib.rig import Rig
+from camera_calib.fov.angles import angle_table
+from camera_calib.fov.paper import paper_settings, validate_paper
+from camera_calib.fov.table import FovChoices, FovRow, blur_table, fov_table, rig_fov_table
+from camera_calib.fov.text import (
+    TextTable,
+    as_csv,
+    as_markdown,
+    as_text,
+    fov_csv_rows,
+    fov_tables,
+    validation_csv_rows,
+    validation_tables,
+)
+from camera_calib.rig import Rig, read_rig
 
 PAPER_LENSES_MM = (12.5, 25.0)
 PAPER_EXPOSURE_MS = 3.0
@@ -20,7 +29,7 @@ _PLOT_ANGLES_DEG = tuple(float(angle) for angle in range(30, 111, 5))
 
 @dataclass(frozen=True, kw_only=True)
 class Output:
-    """How a table is told, and where else it goes."""
+    """How a table is printed, and where else it goes."""
 
     markdown: bool = False
     csv: Path | None = None
@@ -29,7 +38,7 @@ class Output:
 
 @dataclass(frozen=True, kw_only=True)
 class FovOptions:
-    """What `fov` is asked for; None or empty is the survey's, or else the paper's."""
+    """What `fov` takes; None or empty is the survey's, or else the paper's."""
 
     lens_mm: Sequence[float] = ()
     altitude_m: Sequence[float] = ()
@@ -45,32 +54,21 @@ class FovOptions:
     n_glass: float | None = None
     pixel_um: float | None = None
     f_number: float | None = None
-    coc_px: float = 1.0
-    focus_air_m: float | None = None
-    match_sigma_px: float = 0.3
     blur_px: float | None = None
+    choices: FovChoices = field(default_factory=FovChoices)
 
 
 def fov_report(options: FovOptions, output: Output) -> tuple[str, Any, bool]:
     """FOV, resolution, focus, stereo and blur as text and JSON values."""
-    from camera_calib.fov.angles import angle_table
-    from camera_calib.fov.plot import draw_fov
-    from camera_calib.fov.table import FovChoices, blur_table, fov_table, rig_fov_table
-    from camera_calib.fov.text import as_csv, fov_csv_rows, fov_tables
-
     settings = _settings(options)
-    choices = FovChoices(
-        coc_px=options.coc_px,
-        focus_air_m=options.focus_air_m,
-        match_sigma_px=options.match_sigma_px,
-    )
-    rig = _rig(options, settings)
+    choices = options.choices
+    rig = _rig(options, settings.water.n_water)
     camera, n_water = settings.camera, settings.water.n_water
     if rig is not None:
         camera, n_water = _sensor_of(rig, settings.camera, options)
     lenses = options.lens_mm or ((camera.focal_mm,) if options.survey else PAPER_LENSES_MM)
 
-    def table(altitudes_m: Sequence[float], asked: "FovChoices") -> list["FovRow"]:
+    def table(altitudes_m: Sequence[float], asked: FovChoices) -> list[FovRow]:
         if rig is not None:
             return rig_fov_table(rig, altitudes_m, camera, asked)
         return fov_table(lenses, altitudes_m, n_water, camera, asked)
@@ -84,6 +82,8 @@ def fov_report(options: FovOptions, output: Output) -> tuple[str, Any, bool]:
     if output.csv is not None:
         _write(output.csv, as_csv(fov_csv_rows(rows, blur)))
     if output.plot is not None:
+        from camera_calib.fov.plot import draw_fov
+
         angles = angle_table(camera, n_water, altitude_m=altitudes[0], angles_deg=_PLOT_ANGLES_DEG)
         draw_fov(
             output.plot, table, altitudes, choices, speeds_mps=speeds, exposures_s=exposures,
@@ -94,7 +94,7 @@ def fov_report(options: FovOptions, output: Output) -> tuple[str, Any, bool]:
         "rows": [row.to_json() for row in rows],
         "blur": [row.to_json() for row in blur],
     }
-    return _told(fov_tables(rows, blur), output), data, True
+    return _printed(fov_tables(rows, blur), output), data, True
 
 
 def validation_report(options: FovOptions, output: Output) -> tuple[str, Any, bool]:
@@ -103,12 +103,6 @@ def validation_report(options: FovOptions, output: Output) -> tuple[str, Any, bo
     Raises:
         ConfigError: an option was given: the claims bring their own lenses, water and altitude.
     """
-    from camera_calib.fov.angles import angle_table
-    from camera_calib.fov.paper import paper_settings, validate_paper
-    from camera_calib.fov.plot import draw_fov
-    from camera_calib.fov.table import FovChoices, fov_table
-    from camera_calib.fov.text import as_csv, validation_csv_rows, validation_tables
-
     if options != FovOptions():
         raise ConfigError(
             "--validate checks the paper's own lenses, water and altitude: leave out all options "
@@ -118,6 +112,8 @@ def validation_report(options: FovOptions, output: Output) -> tuple[str, Any, bo
     if output.csv is not None:
         _write(output.csv, as_csv(validation_csv_rows(validation)))
     if output.plot is not None:
+        from camera_calib.fov.plot import draw_fov
+
         camera, n_water, altitude = paper_settings()
         angles = angle_table(
             CameraConfig(),
@@ -131,8 +127,8 @@ def validation_report(options: FovOptions, output: Output) -> tuple[str, Any, bo
             [altitude], FovChoices(), speeds_mps=[0.2, 0.5],
             exposures_s=[PAPER_EXPOSURE_MS * 1e-3], allowed_px=1.0, angles=angles, paper=True,
         )  # fmt: skip
-    told = _told(validation_tables(validation), output)
-    return told, validation.to_json(), validation.passed
+    text = _printed(validation_tables(validation), output)
+    return text, validation.to_json(), validation.passed
 
 
 def _settings(options: FovOptions) -> SurveyConfig:
@@ -161,9 +157,7 @@ def _settings(options: FovOptions) -> SurveyConfig:
     return parse_config(values, "options")
 
 
-def _rig(options: FovOptions, settings: SurveyConfig) -> "Rig | None":
-    from camera_calib.rig import read_rig
-
+def _rig(options: FovOptions, n_water: float) -> Rig | None:
     if options.rig is None:
         return None
     designed = {
@@ -177,10 +171,10 @@ def _rig(options: FovOptions, settings: SurveyConfig) -> "Rig | None":
         raise ConfigError(f"{options.rig} has lenses and ports of its own: leave out {wrong[0]}")
     rig = read_rig(options.rig)
     other_water = options.n_water is not None or options.temperature_c is not None
-    return rig.in_water(settings.water.n_water) if other_water else rig
+    return rig.in_water(n_water) if other_water else rig
 
 
-def _sensor_of(rig: "Rig", camera: CameraConfig, options: FovOptions) -> tuple[CameraConfig, float]:
+def _sensor_of(rig: Rig, camera: CameraConfig, options: FovOptions) -> tuple[CameraConfig, float]:
     """Sensor and port of a rig's reference camera, and its water; a rig knows no pixel pitch."""
     own = rig.cameras[rig.reference]
     pixel_um = camera.pixel_um
@@ -212,9 +206,7 @@ def _metres(mm: float | None) -> float | None:
     return None if mm is None else mm * 1e-3
 
 
-def _told(tables: "Sequence[TextTable]", output: Output) -> str:
-    from camera_calib.fov.text import as_markdown, as_text
-
+def _printed(tables: Sequence[TextTable], output: Output) -> str:
     return as_markdown(tables) if output.markdown else as_text(tables)
 
 

@@ -5,7 +5,15 @@ from typing import Annotated
 
 import typer
 
-from alice_survey.cli.options import WORK, AsJson, Threads, Workspace, examples, print_result
+from alice_survey.cli.options import (
+    WORK,
+    AsJson,
+    Threads,
+    Workspace,
+    examples,
+    executor_of,
+    print_result,
+)
 
 app = typer.Typer()
 
@@ -43,17 +51,14 @@ def import_images(
 
     Mono or stereo pictures or a video, with a navigation log, GPS from EXIF, or nothing at all.
     """
-    from alice_survey.base.executor import default_threads
     from reconstruct.pictures.importing import import_images as work
 
-    work(
+    found = work(
         workspace, folders or [], left=left, right=right, video=video, every_s=every,
         navigation=navigation, clock_offset_s=clock_offset, time_zone=time_zone,
-        vertical_datum=vertical_datum, rig=rig, masks=masks, threads=threads or default_threads(),
+        vertical_datum=vertical_datum, rig=rig, masks=masks, executor=executor_of(threads),
     )  # fmt: skip
-    typer.echo(
-        f"pictures are in {workspace / 'images'}; next: alice-survey reconstruct -w {workspace}"
-    )
+    typer.echo(f"{found}\nin {workspace / 'images'}; next: alice-survey reconstruct -w {workspace}")
 
 
 @app.command(

@@ -2,7 +2,7 @@
 
 import gc
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -18,6 +18,7 @@ from alice_survey.cli.options import (
     Threads,
     Workspace,
     examples,
+    executor_of,
     print_result,
     with_sessions,
 )
@@ -127,20 +128,21 @@ def fov(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Tell field of view and resolution.
+    """Show field of view and resolution.
 
     Footprint, pixel, focus, depth of field, stereo and blur through the exact flat port, for any
     lens, altitude and water. What is not given is the survey's, or else the paper's.
     """
     from alice_survey.cli.fov_tables import FovOptions, Output, fov_report, validation_report
+    from camera_calib.fov.table import FovChoices
 
     output = Output(markdown=markdown, csv=csv, plot=plot)
     options = FovOptions(
         lens_mm=lens or (), altitude_m=altitude or (), speed_mps=speed or (),
         exposure_ms=exposure or (), survey=survey, rig=rig, n_water=n_water,
         temperature_c=temperature, salinity_psu=salinity, port_distance_mm=port_distance,
-        glass_mm=glass, n_glass=n_glass, pixel_um=pixel, f_number=f_number, coc_px=coc,
-        focus_air_m=focus_air, match_sigma_px=match_sigma, blur_px=blur,
+        glass_mm=glass, n_glass=n_glass, pixel_um=pixel, f_number=f_number, blur_px=blur,
+        choices=FovChoices(coc_px=coc, focus_air_m=focus_air, match_sigma_px=match_sigma),
     )  # fmt: skip
     table, data, passed = (
         validation_report(options, output) if validate else fov_report(options, output)
@@ -206,7 +208,7 @@ def image(
     """
     from alice_survey.survey import run
 
-    print_result(*run(["pool", "image"], workspace, survey, scale, threads), as_json)
+    print_result(*run(["pool", "image"], workspace, survey, scale, executor_of(threads)), as_json)
 
 
 @app.command(
@@ -299,23 +301,20 @@ def calibrate(
     From the pool of a survey, or from pictures of a target: chessboard, ChArUco or AprilTag grid.
     Writes the rig with its covariance, the residuals and a report.
     """
-    places = {"left": left, "right": right, "pictures": pictures, "target": target}
-    settings: dict[str, Any] = {
-        "start": start, "known": intrinsics, "port_distance_mm": port_distance, "glass_mm": glass,
-        "glass_sigma_mm": glass_sigma, "n_glass": n_glass, "n_glass_sigma": n_glass_sigma,
-        "n_water": n_water, "n_water_sigma": n_water_sigma, "carry_to_n": carry_to_n,
-    }  # fmt: skip
-    given = [value for value in (*places.values(), output, *settings.values()) if value is not None]
-    if given or water or lens != "opencv5":
-        from camera_calib.calibrate.pictures import calibrate_command
+    from camera_calib.calibrate.from_pictures import CalibrateOptions, calibrate_pictures
 
-        result = calibrate_command(
-            **places, output=output, threads=threads, lens=lens, water=water, **settings
-        )
+    options = CalibrateOptions(
+        left=left, right=right, pictures=pictures, target=target, output=output, lens=lens,
+        water=water, start=start, known=intrinsics, port_distance_mm=port_distance, glass_mm=glass,
+        glass_sigma_mm=glass_sigma, n_glass=n_glass, n_glass_sigma=n_glass_sigma, n_water=n_water,
+        n_water_sigma=n_water_sigma, carry_to_n=carry_to_n,
+    )  # fmt: skip
+    if options != CalibrateOptions():
+        result = calibrate_pictures(options, executor_of(threads))
     else:
         from alice_survey.survey import run
 
-        result = run(["calibrate"], workspace, survey, None, threads)
+        result = run(["calibrate"], workspace, survey, None, executor_of(threads))
     print_result(*result, as_json)
 
 
@@ -335,7 +334,7 @@ def run_all(
     from alice_survey.stages import names
     from alice_survey.survey import run
 
-    print_result(*run(names(), workspace, survey, scale, threads), as_json)
+    print_result(*run(names(), workspace, survey, scale, executor_of(threads)), as_json)
 
 
 @app.command(epilog=examples("demo", "demo -w demo --threads 2"))
@@ -348,7 +347,7 @@ def demo(
     """
     from alice_survey.survey import run_demo
 
-    print_result(*run_demo(workspace, threads), as_json)
+    print_result(*run_demo(workspace, executor_of(threads)), as_json)
 
 
 @app.command(epilog=examples("status -w reef", "status -w reef --json"))

@@ -6,10 +6,13 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 from typer.models import ArgumentInfo
+
+if TYPE_CHECKING:
+    from alice_survey.base.executor import Executor
 
 CONTEXT = {"help_option_names": ["-h", "--help"]}
 
@@ -44,6 +47,13 @@ Folder = Annotated[
 _SESSION = {"quiet": Quiet, "log_file": LogFile, "events": Events}
 
 
+def executor_of(threads: int | None) -> "Executor":
+    """Where a command runs its tasks, by its option `--threads`."""
+    from alice_survey.base.executor import local_executor  # here, so that --help stays quick
+
+    return local_executor(threads)
+
+
 def examples(*lines: str) -> str:
     """An epilog that keeps its lines (the first character tells the formatter not to wrap)."""
     return "\b\nExamples:\n" + "\n".join(f"  alice-survey {line}" for line in lines)
@@ -54,7 +64,7 @@ def print_result(table: str, data: Any, as_json: bool) -> None:
     typer.echo(json.dumps(data, indent=2) if as_json else table)
     from alice_survey.base.run.progress import current
 
-    current().tell("result", table)
+    current().report("result", table)
 
 
 def with_sessions(app: typer.Typer) -> None:

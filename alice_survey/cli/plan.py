@@ -13,6 +13,7 @@ from alice_survey.cli.options import (
     Threads,
     Workspace,
     examples,
+    executor_of,
     print_result,
 )
 from missions.exports.registry import format_names
@@ -149,7 +150,7 @@ def check(
     print_result(
         *check_report(
             workspace, config, log,
-            triggers=triggers, out=output, monte_carlo=monte_carlo, threads=threads,
+            triggers=triggers, out=output, monte_carlo=monte_carlo, executor=executor_of(threads),
         ),
         as_json,
     )  # fmt: skip

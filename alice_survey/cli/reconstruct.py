@@ -13,6 +13,7 @@ from alice_survey.cli.options import (
     Threads,
     Workspace,
     examples,
+    executor_of,
     print_result,
 )
 
@@ -45,9 +46,8 @@ def reconstruct(
         from alice_survey.stages import names
         from alice_survey.survey import run
 
-        print_result(
-            *run(names("calibrate", "reconstruct"), workspace, survey, None, threads), as_json
-        )
+        stages = names("calibrate", "reconstruct")
+        print_result(*run(stages, workspace, survey, None, executor_of(threads)), as_json)
 
 
 @reconstruct_app.command(
@@ -127,10 +127,9 @@ def control(
     Known points, bars and markers stand in WORKSPACE/control.csv; the next 'reconstruct' places
     and scales the model by those for control, and scores those for check.
     """
-    from alice_survey.base.executor import default_threads
     from reconstruct.placing.markers import survey_control
 
-    result = survey_control(workspace, dictionary=dictionary, threads=threads or default_threads())
+    result = survey_control(workspace, dictionary=dictionary, executor=executor_of(threads))
     print_result(*result, as_json)
 
 
@@ -140,10 +139,9 @@ def quality(workspace: Workspace = WORK, threads: Threads = None, as_json: AsJso
 
     Sharpness, exposure, turbidity and overlap of each; the bad ones by name, with the reason.
     """
-    from alice_survey.base.executor import default_threads
     from reconstruct.pictures.quality_sheet import quality_report
 
-    print_result(*quality_report(workspace, threads or default_threads()), as_json)
+    print_result(*quality_report(workspace, executor_of(threads)), as_json)
 
 
 @app.command(
@@ -210,7 +208,7 @@ def evaluate(
     else:
         from alice_survey.survey import run
 
-        result = run(["evaluate"], workspace, survey, None, threads)
+        result = run(["evaluate"], workspace, survey, None, executor_of(threads))
     print_result(*result, as_json)
 
 

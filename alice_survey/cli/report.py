@@ -12,6 +12,7 @@ from alice_survey.cli.options import (
     Threads,
     Workspace,
     examples,
+    executor_of,
     print_result,
 )
 
@@ -32,7 +33,7 @@ def report(
     """
     from alice_survey.survey import run
 
-    print_result(*run(["report"], workspace, survey, None, threads), as_json)
+    print_result(*run(["report"], workspace, survey, None, executor_of(threads)), as_json)
 
 
 @app.command(epilog=examples("view -w reef", "view -w reef --port 8000 --no-browser"))

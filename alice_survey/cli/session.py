@@ -1,4 +1,4 @@
-"""One run of the command line: who is told of it, and how it ends."""
+"""One run of the command line: where it is reported, and how it ends."""
 
 import contextlib
 import errno
@@ -11,9 +11,9 @@ from pathlib import Path
 
 from alice_survey.base.errors import WorkspaceError, known_fault, say
 from alice_survey.base.run import interrupts
-from alice_survey.base.run.display import display_on_stderr
+from alice_survey.base.run.display import Console
 from alice_survey.base.run.events import EventFile, LogFile
-from alice_survey.base.run.progress import Run, told_to
+from alice_survey.base.run.progress import Run, reported_to
 from alice_survey.base.run.resources import versions
 
 
@@ -33,14 +33,14 @@ def session(
         WorkspaceError: a file cannot be written; nothing is done then.
         SystemExit: with 130 after Ctrl-C, 143 or 129 after SIGTERM or SIGHUP.
     """
-    run = Run(display_on_stderr(quiet=quiet), _opened(log_file, events), quiet=quiet)
+    run = Run(Console(quiet=quiet), _opened(log_file, events))
     command = shlex.join(["alice-survey", *arguments])
-    told = {"python": platform.python_version(), **versions()}
+    packages = {"python": platform.python_version(), **versions()}
     with interrupts.heeded(lambda error: _finish(run, error)):
         try:
-            with told_to(run):
-                run.tell(
-                    "run_started", command=command, folder=str(Path.cwd()), versions=told,
+            with reported_to(run):
+                run.report(
+                    "run_started", command=command, folder=str(Path.cwd()), versions=packages,
                     process=os.getpid(),
                 )  # fmt: skip
                 code = 1
@@ -49,14 +49,14 @@ def session(
                     code = 0
                 except BaseException as error:
                     reason = interrupts.behind(error) or error
-                    code = _told_end(run, reason)
+                    code = _report_end(run, reason)
                     if reason is not error:
                         raise reason from None
                     raise
                 finally:
-                    run.tell("run_finished", exit_code=code)
+                    run.report("run_finished", exit_code=code)
         except KeyboardInterrupt as error:
-            _bid_farewell(run, error)
+            _say_how_to_go_on(run, error)
             raise SystemExit(interrupts.exit_code(error)) from None
 
 
@@ -69,45 +69,41 @@ def _opened(log_file: Path | None, events: Path | None) -> list[LogFile | EventF
             )
     if log_file is not None and events is not None and log_file.resolve() == events.resolve():
         raise WorkspaceError(f"{events}: give --log-file and --events a file each")
-    sinks: list[LogFile | EventFile] = []
-    if log_file is not None:
-        sinks.append(LogFile(log_file))
-    if events is not None:
-        sinks.append(EventFile(events))
-    return sinks
+    files: list[LogFile | EventFile] = [] if log_file is None else [LogFile(log_file)]
+    return files if events is None else [*files, EventFile(events)]
 
 
-def _told_end(run: Run, error: BaseException) -> int:
-    """Tell why a run ends early; the exit code it ends with."""
+def _report_end(run: Run, error: BaseException) -> int:
+    """Report why a run ends early; the exit code it ends with."""
     if isinstance(error, KeyboardInterrupt):
-        run.tell("error", interrupts.words(error))
+        run.report("error", interrupts.words(error))
         return interrupts.exit_code(error)
     if isinstance(error, SystemExit):
         return error.code if isinstance(error.code, int) else int(error.code is not None)
     code = getattr(error, "exit_code", None)  # of typer's own: an end, or a wrong option
     if isinstance(code, int):
         if code and str(error) not in ("", str(code)):
-            run.tell("error", str(error))
+            run.report("error", str(error))
         return code
     if isinstance(error, OSError) and error.errno == errno.EPIPE:
-        return 1  # nobody reads the result any more, and nobody needs to be told
+        return 1  # nobody reads the result any more, nor a report of it
     fault = known_fault(error)
     if fault is not None:
-        run.tell("error", fault)
+        run.report("error", fault)
     else:
         text = "".join(traceback.format_exception(error))
-        run.tell("error", f"{type(error).__name__}: {error}", traceback=text)
+        run.report("error", f"{type(error).__name__}: {error}", traceback=text)
     return 1
 
 
-def _bid_farewell(run: Run, error: KeyboardInterrupt) -> None:
+def _say_how_to_go_on(run: Run, error: KeyboardInterrupt) -> None:
     goes_on = "; the same command goes on from here" if run.stages_begun else ""
     say(f"{interrupts.words(error)}{goes_on}")
 
 
 def _finish(run: Run, error: KeyboardInterrupt) -> None:
     """End a run whose main thread does not answer."""
-    run.tell("error", interrupts.words(error))
-    run.tell("run_finished", exit_code=interrupts.exit_code(error))
+    run.report("error", interrupts.words(error))
+    run.report("run_finished", exit_code=interrupts.exit_code(error))
     run.close()
-    _bid_farewell(run, error)
+    _say_how_to_go_on(run, error)

@@ -1,4 +1,4 @@
-"""The `vehicle` commands: its coefficients, how it compares, and what its logs tell of it."""
+"""The `vehicle` commands: its coefficients, how it compares, and what its logs say of it."""
 
 from pathlib import Path
 from typing import Annotated
@@ -13,6 +13,7 @@ from alice_survey.cli.options import (
     Threads,
     Workspace,
     examples,
+    executor_of,
     print_result,
 )
 
@@ -74,7 +75,7 @@ def compare(
     """Fly a survey by both configurations in the same sea.
 
     SPARUS II steering by line of sight, and ALICE holding its lines by sway: cross-track error,
-    roll, speed and energy beside the paper's section VIII, and why they differ.
+    roll, speed and energy next to the paper's section VIII.
     """
     from alice_survey.survey import settings
     from missions.fly.compare_report import compare_report
@@ -82,7 +83,7 @@ def compare(
     config = settings(workspace, survey, needed=workspace != WORK)
     text, data = compare_report(
         config, out or workspace / "compare", currents=current or (), swell=swell, seed=seed,
-        flights=flights, threads=threads,
+        flights=flights, executor=executor_of(threads),
     )  # fmt: skip
     print_result(text, data, as_json)
 
@@ -90,7 +91,7 @@ def compare(
 @app.command(
     epilog=examples(
         "vehicle identify surge.csv turns.csv --free X_uu,Y_vv,N_rr,N_rdot,current -o found",
-        "vehicle identify dive.csv --validate second.csv --bollard pull.csv --method two-step",
+        "vehicle identify dive.csv --validate second.csv --bollard pull.csv",
         "vehicle identify run1.csv run2.csv --columns columns.toml --vehicle rov.toml "
         "--given p,q --window 5 --free X_u,X_uu,N_r,N_rr,gain_X,gain_N --validate run3.csv",
     )
@@ -101,7 +102,7 @@ def identify(
     coefficients: Annotated[
         str | None, typer.Option(help="Set or file to start from; the vehicle's if not given.")
     ] = None,
-    validate: Annotated[Path | None, typer.Option(help="Log to foretell.")] = None,
+    validate: Annotated[Path | None, typer.Option(help="Log to predict.")] = None,
     bollard: Annotated[Path | None, typer.Option(help="CSV: thruster, rpm, force_n.")] = None,
     free: Annotated[
         str | None,
@@ -110,7 +111,6 @@ def identify(
     held: Annotated[
         list[str] | None, typer.Option(metavar="NAME=VALUE", help="As current_north_mps=0.1.")
     ] = None,
-    method: Annotated[str, typer.Option(help="joint, or two-step as in the paper.")] = "joint",
     columns: Annotated[Path | None, typer.Option(help="TOML: what other columns mean.")] = None,
     given: Annotated[
         str | None, typer.Option(help="Rates, of p,q,r, that follow the log, not the forces.")
@@ -127,14 +127,14 @@ def identify(
     """Identify coefficients from logs of motion.
 
     Damping, added mass, body lift, a constant current and more, each with its sigma; and how well
-    they foretell another log.
+    they predict another log.
     """
     from alice_survey.vehicle.identification.report import IdentifyOptions, identify_report
 
     options = IdentifyOptions(
         vehicle=vehicle, coefficients=coefficients, validate=validate, bollard=bollard,
         free=tuple((free or "").split(",")) if free else (), held=tuple(held or ()),
-        method=method, columns=columns, given=tuple(given.split(",")) if given else (),
+        columns=columns, given=tuple(given.split(",")) if given else (),
         window_s=window, hold_input=hold_input,
     )  # fmt: skip
     print_result(*identify_report(logs, out, options), as_json)

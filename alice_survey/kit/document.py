@@ -40,8 +40,6 @@ class Figure:
     """What to do when it does not."""
     svg: bytes = b""
     """The same plot as vectors, for print; empty where there are only pixels."""
-    share: float = 1.0
-    """Width in print, as a share of the text's width."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -97,6 +97,13 @@ _NO_DATES: dict[str, dict[str, None]] = {
 _MOST_PX = 1600
 
 
+class _Shown(Sheet):  # type: ignore[misc]
+    """A figure that a notebook shows without any set-up."""
+
+    def _repr_png_(self) -> bytes:
+        return png_of(self)
+
+
 @contextmanager
 def figure_style() -> Iterator[None]:
     """Draw in the kit's style: a context, or a decorator of a function that draws."""
@@ -113,7 +120,7 @@ def new_figure(height_in: float, width_in: float = WIDTH_IN, layout: str | None 
         layout: of matplotlib; None is "constrained".
     """
     with figure_style():
-        sheet = Sheet(figsize=(width_in, height_in), dpi=_DPI, layout=layout or "constrained")
+        sheet = _Shown(figsize=(width_in, height_in), dpi=_DPI, layout=layout or "constrained")
         FigureCanvasAgg(sheet)
     return sheet
 

@@ -35,6 +35,8 @@ _MARGIN = 0.04
 _RIMMED = 20
 """Outlines up to which each has a light rim, as in `map.js`."""
 _QUALITY = 88
+_TIGHT: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.04}
+"""A map seldom has the shape of its sheet."""
 _KINDS = ("polygon", "line", "point")
 
 
@@ -79,11 +81,12 @@ def map_figure(survey_map: SurveyMap, layers: Sequence[PictureLayer | ShapeLayer
         sheet.legend(loc="outside lower center", ncols=min(4, len(shapes)), fontsize=8)
     titles = ", ".join(layer.title.lower() for layer in layers)
     first = pictures[0] if pictures else layers[0]
-    words = [f"{layer.title}: {layer.about}" for layer in shapes if layer.about]
+    words = [f"{layer.title}: {layer.about[0].lower()}{layer.about[1:]}" for layer in shapes
+             if layer.about]  # fmt: skip
     about = pictures[0].about if pictures else ""
     return Figure(
-        png=png_of(sheet),
-        svg=_with_jpegs(svg_of(sheet)),
+        png=png_of(sheet, **_TIGHT),
+        svg=_with_jpegs(svg_of(sheet, **_TIGHT)),
         title=first.title,
         alt=f"Map, north up: {titles}",
         shows=" ".join([about, *words]).strip(),

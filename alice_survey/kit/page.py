@@ -81,7 +81,7 @@ def _templates() -> Any:
         "layer_groups": _layer_groups,
         "numeric_columns": numeric_columns,
         "png_address": lambda png: f"data:image/png;base64,{_base64(png)}",
-        "png_size": _png_size,
+        "png_size": png_size,
         "short": lambda value: f"{value:.4g}".replace("-", "−"),
     }
     return found
@@ -158,7 +158,12 @@ def _layer_groups(survey_map: SurveyMap) -> list[tuple[str, str, list[Any]]]:
     return [(title, kind, layers) for (title, kind), layers in groups.items() if layers]
 
 
-def _png_size(png: bytes) -> tuple[int, int]:
+def png_size(png: bytes) -> tuple[int, int]:
+    """Width and height in pixels.
+
+    Raises:
+        ValueError: it is not a PNG.
+    """
     if png[:8] != b"\x89PNG\r\n\x1a\n":
         raise ValueError("a figure is not a PNG")
     width, height = struct.unpack(">II", png[16:24])

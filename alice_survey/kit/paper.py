@@ -14,11 +14,15 @@ from pathlib import Path
 from typing import Any
 
 from alice_survey.kit.document import Figure, Report, Section
-from alice_survey.kit.page import numeric_columns
+from alice_survey.kit.figure import WIDTH_IN
+from alice_survey.kit.page import numeric_columns, png_size
 
 _TEMPLATE = Path(__file__).with_name("paper.typ")
 _STANDARD = "ua-1"
 _LONG_WORD = re.compile(r"\S{28,}")
+_SVG_WIDTH = re.compile(rb'<svg[^>]* width="([0-9.]+)pt"')
+_PIXELS_HIGH = 0.85
+"""Most height of a picture of pixels, over the width of the text."""
 _BREAKS = re.compile(r"([/_.,;:=-])(?=\w)")
 
 
@@ -111,8 +115,18 @@ class _Files:
         self._count += 1
         name = f"figure-{self._count}.{'svg' if figure.svg else 'png'}"
         (self._folder / name).write_bytes(figure.svg or figure.png)
-        words = ("title", "alt", "shows", "good", "otherwise", "share")
-        return {"file": name} | {word: getattr(figure, word) for word in words}
+        words = ("title", "alt", "shows", "good", "otherwise")
+        texts = {word: getattr(figure, word) for word in words}
+        return {"file": name, "share": _width_share(figure)} | texts
+
+
+def _width_share(figure: Figure) -> float:
+    """Width in print, as a share of the text's: vectors keep their size, pixels fit the page."""
+    found = _SVG_WIDTH.search(figure.svg)
+    if found:
+        return min(1.0, float(found[1]) / (72.0 * WIDTH_IN))
+    width, height = png_size(figure.png)
+    return min(1.0, _PIXELS_HIGH * width / height)
 
 
 def _breakable(cell: str) -> str:

@@ -17,6 +17,8 @@ _BLUE, _ORANGE, _GREEN, _RED, _BLACK = "#0072b2", "#e69f00", "#009e73", "#d55e00
 """Okabe and Ito's palette, safe for the colour-blind."""
 _MOST_VERTICES = 4000
 """Of a track on the map."""
+_MOST_OUTLINES, _MOST_POINTS = 4000, 20_000
+"""On the map: some 4 MB of the page each."""
 
 Shape = Sequence[tuple[float, float]]
 
@@ -30,11 +32,11 @@ def shape_layers(held: Held) -> Iterator[ShapeLayer]:
             shapes=[_pairs(np.array(part.exterior.coords)) for part in area.geoms],
             colour=_BLACK, dashed=True,
         )  # fmt: skip
-    footprints = list(_footprints(held))
+    footprints, every = thinned(list(_footprints(held)), _MOST_OUTLINES)
     if footprints:
         yield ShapeLayer(
             name="footprints", title="Footprints", kind="polygon", colour=_GREEN, shown=False,
-            about="Sea floor that each picture shows.",
+            about=f"Sea floor that each picture shows{every}.",
             shapes=[outline for outline, _ in footprints], texts=[text for _, text in footprints],
         )  # fmt: skip
     lines = () if held.plan is None else held.plan.lines
@@ -55,18 +57,18 @@ def shape_layers(held: Held) -> Iterator[ShapeLayer]:
             name="flown", title="Flown", about="Where the vehicle really was (simulated).",
             kind="line", shapes=[_pairs(places[::step])], colour=_ORANGE,
         )  # fmt: skip
-    cameras = _cameras(held)
+    cameras, every = thinned(_cameras(held), _MOST_POINTS)
     if cameras:
         yield ShapeLayer(
             name="cameras", title="Cameras", kind="point", colour=_BLUE, shown=not flown,
-            about="Where pictures were taken, from the model.",
+            about=f"Where pictures were taken, from the model{every}.",
             shapes=[place for place, _ in cameras], texts=[text for _, text in cameras],
         )  # fmt: skip
-    lost = _lost(held)
+    lost, every = thinned(_lost(held), _MOST_POINTS)
     if lost:
         yield ShapeLayer(
             name="lost", title="Lost pictures", kind="point", colour=_RED,
-            about="Pictures that are not in the model, where navigation has them.",
+            about=f"Pictures that are not in the model, where navigation has them{every}.",
             shapes=[place for place, _ in lost], texts=[text for _, text in lost],
         )  # fmt: skip
 
@@ -76,6 +78,14 @@ def camera_place(row: Mapping[str, str]) -> Array:
     columns = (("east_m", "north_m"), ("x_m", "y_m"), ("x", "y"))
     names = next(names for names in columns if names[0] in row)
     return np.array([number(row, name) for name in names])
+
+
+def thinned(
+    shapes: Sequence[tuple[Shape, str]], most: int
+) -> tuple[Sequence[tuple[Shape, str]], str]:
+    """At most this many shapes, evenly taken, and words on what was left out."""
+    step = -(-len(shapes) // most)
+    return (shapes, "") if step <= 1 else (shapes[::step], f"; one of {step} is shown")
 
 
 def _pairs(east_north: Array) -> list[tuple[float, float]]:

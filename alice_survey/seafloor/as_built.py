@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.config import SurveyConfig
+from alice_survey.base.config import CameraConfig, WaterConfig
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.rig import Rig, design_rig
 
@@ -24,24 +24,27 @@ TILT_TOLERANCE = float(np.sin(np.deg2rad(0.3)))
 BASELINE_TOLERANCE_M = 0.0002
 
 
-def true_rig(config: SurveyConfig) -> Rig:
-    """The survey's rig with errors of manufacture, the same for pool and sea.
+def true_rig(camera: CameraConfig, water: WaterConfig, *, scale: int, seed: int) -> Rig:
+    """The rig of a survey with errors of manufacture, the same for pool and sea.
 
     Focal length, principal point, lens distortion, port distance and the port's normal of each
     camera differ from the design, and so does the pose of the right camera; the left camera's place
     on the vehicle, glass and indices do not.
+
+    Args:
+        camera: the design.
+        water: that it is in.
+        scale: how many pixels of the sensor, each way, make one of a picture.
+        seed: of the survey.
     """
-    rng = np.random.default_rng([config.seed, _SEED_STREAM])
-    design = design_rig(config.camera, config.water)
-    cameras = {
-        name: _built(camera, rng).reduced(config.imaging.scale)
-        for name, camera in design.cameras.items()
-    }
+    rng = np.random.default_rng([seed, _SEED_STREAM])
+    design = design_rig(camera, water)
+    cameras = {name: _built(drawn, rng).reduced(scale) for name, drawn in design.cameras.items()}
     turn = Rotation.from_rotvec(rng.uniform(-TURN_TOLERANCE_RAD, TURN_TOLERANCE_RAD, 3))
     shift = rng.uniform(-BASELINE_TOLERANCE_M, BASELINE_TOLERANCE_M, 3)
-    cameras = {name: _tilted(camera, rng) for name, camera in cameras.items()}
-    drawn = design.cam_from_rig["right"]
-    right = RigidTransform.from_components(drawn.translation + shift, turn * drawn.rotation)
+    cameras = {name: _tilted(built, rng) for name, built in cameras.items()}
+    pose = design.cam_from_rig["right"]
+    right = RigidTransform.from_components(pose.translation + shift, turn * pose.rotation)
     return replace(
         design,
         cameras=cameras,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from alice_survey.base.artefacts import atomic_path, read_json, write_json
-from alice_survey.base.config import SeafloorConfig, SurveyConfig
+from alice_survey.base.config import SeafloorConfig
 from alice_survey.base.errors import ConfigError, WorkspaceError
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
@@ -353,19 +353,28 @@ def build_terrain(
 
 
 @progress.step("make the sea floor")
-def survey_terrain(config: SurveyConfig, within_ne_m: Sequence[Sequence[float]] | Array) -> Terrain:
-    """The one sea floor of a survey: the same for whoever asks, from the settings alone.
+def survey_terrain(
+    seafloor: SeafloorConfig,
+    within_ne_m: Sequence[Sequence[float]] | Array,
+    *,
+    margin_m: float,
+    depth_m: float,
+    seed: int,
+) -> Terrain:
+    """The one sea floor of a survey: the same for all stages, from the settings alone.
 
     Args:
-        config: the survey.
+        seafloor: its settings.
         within_ne_m: (N, 2) corners of the area the vehicle may be in, as in `plan.json`.
+        margin_m: around that area: the altitude of the pictures.
+        depth_m: mean depth.
+        seed: of the survey.
     """
-    margin_m = config.plan.altitude_m
     return build_terrain(
-        config.seafloor,
+        seafloor,
         terrain_bounds(within_ne_m, margin_m),
-        config.area.seafloor_depth_m,
-        np.random.default_rng([config.seed, _SEED_STREAM]),
+        depth_m,
+        np.random.default_rng([seed, _SEED_STREAM]),
     )
 
 

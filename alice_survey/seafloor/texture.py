@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.compiled import compiled
-from alice_survey.base.config import SurveyConfig
 from alice_survey.base.frames import Array
 from alice_survey.seafloor.noise import add_octave, mix, noise, spot
 
@@ -66,9 +65,9 @@ class Texture:
         return out
 
 
-def survey_texture(config: SurveyConfig) -> Texture:
-    """The one texture of a survey."""
-    rng = np.random.default_rng([config.seed, _SEED_STREAM])
+def survey_texture(seed: int) -> Texture:
+    """The one texture of a survey with a seed."""
+    rng = np.random.default_rng([seed, _SEED_STREAM])
     return Texture(seed=int(rng.integers(2**32)))
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.propulsion import Propulsion, add_speed_rates, add_thrust
+from alice_survey.vehicle.rotations import matrix_rows
 from alice_survey.vehicle.sea import Current, current_at
 
 GRAVITY = 9.80665
@@ -184,9 +185,7 @@ def derivative(
     body = plant.body
     nu, force, water = state[7:13], scratch.force, scratch.water
     x, y, z, s = state[3], state[4], state[5], state[6]
-    r00, r01, r02 = 1 - 2 * (y * y + z * z), 2 * (x * y - z * s), 2 * (x * z + y * s)
-    r10, r11, r12 = 2 * (x * y + z * s), 1 - 2 * (x * x + z * z), 2 * (y * z - x * s)
-    r20, r21, r22 = 2 * (x * z - y * s), 2 * (y * z + x * s), 1 - 2 * (x * x + y * y)
+    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = matrix_rows(x, y, z, s)
     current_at(current, time_s, state[2], water)
 
     u, v, w, p, q, r = nu[0], nu[1], nu[2], nu[3], nu[4], nu[5]

@@ -5,20 +5,26 @@ import math
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.compiled import kernel
 
+Row = tuple[float, float, float]
+
+
+@kernel
+def matrix_rows(x: float, y: float, z: float, s: float) -> tuple[Row, Row, Row]:
+    """The rows of the rotation matrix of a unit quaternion."""
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * s), 2 * (x * z + y * s)),
+        (2 * (x * y + z * s), 1 - 2 * (x * x + z * z), 2 * (y * z - x * s)),
+        (2 * (x * z - y * s), 2 * (y * z + x * s), 1 - 2 * (x * x + y * y)),
+    )
+
 
 @kernel
 def matrix_of(quaternion: Array, out: Array) -> None:
     """The rotation matrix, (3, 3) into `out`, of a unit quaternion (4,)."""
-    x, y, z, s = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
-    out[0, 0], out[0, 1], out[0, 2] = (
-        1 - 2 * (y * y + z * z), 2 * (x * y - z * s), 2 * (x * z + y * s),
-    )  # fmt: skip
-    out[1, 0], out[1, 1], out[1, 2] = (
-        2 * (x * y + z * s), 1 - 2 * (x * x + z * z), 2 * (y * z - x * s),
-    )  # fmt: skip
-    out[2, 0], out[2, 1], out[2, 2] = (
-        2 * (x * z - y * s), 2 * (y * z + x * s), 1 - 2 * (x * x + y * y),
-    )  # fmt: skip
+    rows = matrix_rows(quaternion[0], quaternion[1], quaternion[2], quaternion[3])
+    out[0, 0], out[0, 1], out[0, 2] = rows[0]
+    out[1, 0], out[1, 1], out[1, 2] = rows[1]
+    out[2, 0], out[2, 1], out[2, 2] = rows[2]
 
 
 @kernel

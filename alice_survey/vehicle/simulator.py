@@ -1,6 +1,6 @@
 """The closed loop: navigation, guidance, control, allocation and dynamics, tick by tick.
 
-A tick is 0.05 s: the navigation is told what its sensors measure of the true state, the pilot asks
+A tick is 0.05 s: the sensors measure the true state for the navigation, the pilot asks
 for a wrench, the allocation turns it into thruster speeds, and the equations of motion advance by
 five Runge-Kutta steps of 10 ms.
 """
@@ -14,7 +14,7 @@ import numpy as np
 
 from alice_survey.base.compiled import note_compiling
 from alice_survey.base.frames import Array, attitude_from_rotation
-from alice_survey.vehicle import signals
+from alice_survey.vehicle import estimate_vector as vector
 from alice_survey.vehicle.allocation.exact import allocate_exact
 from alice_survey.vehicle.allocation.preference import AXIS_WEIGHTS, preference_weights
 from alice_survey.vehicle.allocation.rpi import allocate_rpi
@@ -35,7 +35,9 @@ from alice_survey.vehicle.navigation.tick import LOG_ROW, log_row, navigation_ti
 from alice_survey.vehicle.pilot.gains import Gains
 from alice_survey.vehicle.pilot.guidance import steer
 from alice_survey.vehicle.pilot.memory import (
+    ABORT,
     AT_SURFACE,
+    DONE,
     PHASE,
     REASON,
     REPORT,
@@ -52,6 +54,7 @@ from alice_survey.vehicle.propulsion import (
     thrust_limits,
     weakened,
 )
+from alice_survey.vehicle.rotations import matrix_rows
 from alice_survey.vehicle.sea import Current, Disturbance, current_at
 from alice_survey.vehicle.vehicle import Vehicle
 
@@ -107,7 +110,7 @@ class World(NamedTuple):
     wrench: Array
 
 
-class Rows(NamedTuple):
+class TickRows(NamedTuple):
     """What is recorded of each tick, a row each."""
 
     state: Array
@@ -120,21 +123,17 @@ class Rows(NamedTuple):
 
 
 @kernel
-def _tell_truth(world: World, current: Current, time_s: float) -> None:
+def _write_truth(world: World, current: Current, time_s: float) -> None:
     """Write the truth of now from the state of the dynamics."""
     state, now = world.state, world.now
     current_at(current, time_s, state[2], world.water)
-    x, y, z, s = state[3], state[4], state[5], state[6]
     u, v, w = state[7], state[8], state[9]
     for i in range(7):
         now[i] = state[i]
-    now[7] = (
-        (1 - 2 * (y * y + z * z)) * u + 2 * (x * y - z * s) * v + 2 * (x * z + y * s) * w
-    ) + world.water[0]
-    now[8] = (
-        2 * (x * y + z * s) * u + (1 - 2 * (x * x + z * z)) * v + 2 * (y * z - x * s) * w
-    ) + world.water[1]
-    now[9] = 2 * (x * z - y * s) * u + 2 * (y * z + x * s) * v + (1 - 2 * (x * x + y * y)) * w
+    north, east, down = matrix_rows(state[3], state[4], state[5], state[6])
+    now[7] = (north[0] * u + north[1] * v + north[2] * w) + world.water[0]
+    now[8] = (east[0] * u + east[1] * v + east[2] * w) + world.water[1]
+    now[9] = down[0] * u + down[1] * v + down[2] * w
     for i in range(3):
         now[10 + i] = state[10 + i]
 
@@ -142,7 +141,7 @@ def _tell_truth(world: World, current: Current, time_s: float) -> None:
 @kernel
 def _touches(now: Array, sensors: Sensors, floor: FloorGrid) -> bool:
     """Whether hull, DVL or port is on the sea floor, or in it."""
-    x, y, z, s = now[3], now[4], now[5], now[6]
+    rows = matrix_rows(now[3], now[4], now[5], now[6])
     points = sensors.hull.shape[0]
     for i in range(points + 2):
         if i < points:
@@ -150,9 +149,9 @@ def _touches(now: Array, sensors: Sensors, floor: FloorGrid) -> bool:
         else:
             k = DVL if i == points else FOLLOWED
             a, b, c = sensors.place[k, 0], sensors.place[k, 1], sensors.place[k, 2]
-        north = (1 - 2 * (y * y + z * z)) * a + 2 * (x * y - z * s) * b + 2 * (x * z + y * s) * c
-        east = 2 * (x * y + z * s) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z - x * s) * c
-        down = 2 * (x * z - y * s) * a + 2 * (y * z + x * s) * b + (1 - 2 * (x * x + y * y)) * c
+        north = rows[0][0] * a + rows[0][1] * b + rows[0][2] * c
+        east = rows[1][0] * a + rows[1][1] * b + rows[1][2] * c
+        down = rows[2][0] * a + rows[2][1] * b + rows[2][2] * c
         if now[2] + down >= floor_depth(floor, now[0] + north, now[1] + east):
             return True
     return False
@@ -175,14 +174,14 @@ def _fly_ticks(
     scratch: Scratch,
     rng: np.random.Generator,
     sea_rng: np.random.Generator,
-    rows: Rows,
+    rows: TickRows,
 ) -> int:
     """Fly ticks until the rows are full or the mission is over; how many were flown."""
     count, thrusters, flown = rows.state.shape[0], allocation.thrust.shape[0], 0
     for k in range(count):
         tick = first + k
         time_s = tick * TICK_S
-        _tell_truth(world, sea.current, time_s)
+        _write_truth(world, sea.current, time_s)
         navigation_tick(
             time_s, tick, TICK_S, world.before, world.now, world.water, floor, sensors,
             navigation, rng, world.estimate,
@@ -190,9 +189,9 @@ def _fly_ticks(
         steer(time_s, TICK_S, world.estimate, path, guidance, gains, pilot, world.wrench)
         touched = _touches(world.now, sensors, floor)
         if touched:
-            pilot.report[PHASE], pilot.report[REASON] = signals.ABORT, TOUCHED
+            pilot.report[PHASE], pilot.report[REASON] = ABORT, TOUCHED
         # The flow past the hull is not measured: the velocity over ground stands for it.
-        known = world.estimate[signals.U : signals.U + 6]
+        known = world.estimate[vector.U : vector.U + 6]
         lower, upper = allocation.lower, allocation.upper
         thrust_limits(allocation.propulsion, allocation.health, known, lower, upper)
         preference_weights(allocation.propulsion, known[0], allocation.weights)
@@ -223,7 +222,7 @@ def _fly_ticks(
         )
         log_row(navigation, rows.navigation[k])
         flown += 1
-        if touched or pilot.report[PHASE] == signals.DONE or pilot.report[AT_SURFACE] == 1.0:
+        if touched or pilot.report[PHASE] == DONE or pilot.report[AT_SURFACE] == 1.0:
             break
 
         for i in range(STATE):
@@ -331,12 +330,12 @@ def simulate(
     from alice_survey.base.executor import progress
 
     note_compiling(_fly_ticks, "the vehicle's model, once: this takes about a minute")
-    chunks: list[Rows] = []
+    chunks: list[TickRows] = []
     total = math.ceil((expected_s or longest_s) / TICK_S / _CHUNK_TICKS)
     flying = _chunks(setup, rng, sea_rng or rng, longest_s)
     for chunk in progress(flying, label, total) if label else flying:
         chunks.append(chunk)  # noqa: PERF402  the bar takes an iterator
-    rows = Rows(*(np.concatenate(parts) for parts in zip(*chunks, strict=True)))
+    rows = TickRows(*(np.concatenate(parts) for parts in zip(*chunks, strict=True)))
     return Flown(
         time_s=TICK_S * np.arange(len(rows.state), dtype=np.float64),
         thrusters=tuple(t.name for t in setup.vehicle.thrusters),
@@ -346,7 +345,7 @@ def simulate(
 
 def _chunks(
     setup: Setup, rng: np.random.Generator, sea_rng: np.random.Generator, longest_s: float
-) -> Iterator[Rows]:
+) -> Iterator[TickRows]:
     """Rows of a minute each, until the mission is over."""
     vehicle, n = setup.vehicle, len(setup.vehicle.thrusters)
     plant = vehicle.plant
@@ -366,7 +365,7 @@ def _chunks(
             setup.guidance, setup.gains, pilot, allocation, world, scratch, rng, sea_rng,
             rows,
         )  # fmt: skip
-        yield Rows(*(part[:flown] for part in rows))
+        yield TickRows(*(part[:flown] for part in rows))
         if flown < len(rows.state) or pilot.report[REASON] == TOUCHED:
             return
 
@@ -376,9 +375,9 @@ def _new_world(setup: Setup, thrusters: int) -> World:
     attitude = np.array([0.0, 0.0, setup.start_heading_rad])
     world = World(
         initial_state(start, attitude, thrusters),
-        *(np.zeros(size) for size in (13, 13, 6, 6, 6, signals.ESTIMATE, 6)),
+        *(np.zeros(size) for size in (13, 13, 6, 6, 6, vector.ESTIMATE, 6)),
     )
-    _tell_truth(world, setup.current, 0.0)
+    _write_truth(world, setup.current, 0.0)
     world.before[:] = world.now
     return world
 
@@ -396,6 +395,6 @@ def _allocation(setup: Setup) -> Allocation:
     )  # fmt: skip
 
 
-def _new_rows(count: int, thrusters: int) -> Rows:
+def _new_rows(count: int, thrusters: int) -> TickRows:
     widths = (STATE + thrusters, STATE, LOG_ROW, REPORT, 6, thrusters, thrusters)
-    return Rows(*(np.zeros((count, width)) for width in widths))
+    return TickRows(*(np.zeros((count, width)) for width in widths))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from alice_survey.base.errors import CalibrationError, ImageError
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import SERIAL, Executor
 from camera_calib.approximation.dispersion import (
     Maps,
     channel_cameras,
@@ -43,7 +43,7 @@ def undisperse_files(
     depth_m: float,
     glass: str = "bk7",
     wavelengths_nm: Sequence[float] | None = None,
-    threads: int = 1,
+    executor: Executor = SERIAL,
 ) -> tuple[str, dict[str, Any]]:
     """Warp red and blue onto green in pictures, and write them under their names to a folder.
 
@@ -58,7 +58,7 @@ def undisperse_files(
         depth_m: of the camera below the surface.
         glass: material of the port, one of `glass.GLASSES`.
         wavelengths_nm: of red, green and blue; the middle of their bands when not given.
-        threads: how many processes.
+        executor: where tasks run.
 
     Returns:
         The size of the shifts as text and as JSON values.
@@ -92,7 +92,7 @@ def undisperse_files(
     jobs: list[_Job] = [
         (source, target, items, range_m) for source, target in zip(pictures, targets, strict=True)
     ]
-    written = list(parallel_map(_undisperse_file, jobs, threads=threads, label="colours"))
+    written = list(executor.map(_undisperse_file, jobs, label="colours"))
     data = {"camera": name, **data, "pictures": [path.name for path in written]}
     return f"{text}\n{len(written)} pictures of {name} corrected in {folder}", data
 

@@ -30,7 +30,7 @@ class VirtualPinhole:
     """Distance from the entrance pupil along the axis at which the warp is exact."""
     centre_x_m: float = 0.0
     centre_y_m: float = 0.0
-    """Beside the axis: not zero where the port is tilted."""
+    """Next to the axis: not zero where the port is tilted."""
 
     @property
     def virtual_from_cam(self) -> RigidTransform:

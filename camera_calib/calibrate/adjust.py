@@ -18,9 +18,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from camera_calib.calibrate.freedom import Freedom
-from camera_calib.calibrate.normal_equations import Equations, Flags, Problem, State
+from camera_calib.calibrate.normal_equations import CalibrationProblem, Equations, Flags, State
 from camera_calib.calibrate.result import TargetView
-from camera_calib.rig import Covariance, Rig
+from camera_calib.rig import Rig
 
 HUBER = 3.0
 """Length, in sigmas of a coordinate, from which a residual's pull no longer grows."""
@@ -45,7 +45,7 @@ class Adjustment:
     rig_from_target: RigidTransform
     """(V,)."""
     residuals_px: Array
-    """(V, cameras, N, 2) projected less measured; NaN where unseen."""
+    """(V, cameras, N, 2) projected minus measured; NaN where unseen."""
     weights: Array
     """(V, cameras, N) robust weights in (0, 1]; NaN where unseen."""
     noise_px: float
@@ -54,7 +54,7 @@ class Adjustment:
     """(V, cameras) noise of each picture over that."""
     steps: int
     is_settled: bool
-    """Whether the last step was as short as asked for."""
+    """Whether the last step was as short as requested."""
 
 
 def stack_views(views: Sequence[TargetView], rig: Rig, count: int) -> Array:
@@ -112,35 +112,7 @@ def adjust(
     return problem.solve(problem.state(start, rig_from_target), settled, at_most)
 
 
-def cramer_rao(
-    rig: Rig,
-    points: Array,
-    rig_from_target: RigidTransform,
-    seen: Flags,
-    freedom: Freedom,
-    noise_px: float,
-) -> Covariance:
-    """The least covariance that any unbiased calibration can have, at the true values.
-
-    Args:
-        rig: the truth.
-        points: (N, 3) of the target, metres.
-        rig_from_target: (V,) true poses.
-        seen: (V, cameras, N) which points are measured.
-        freedom: what of the rig is unknown.
-        noise_px: standard deviation of one coordinate.
-
-    Raises:
-        CalibrationError: the views do not determine a parameter.
-    """
-    pixels = np.where(seen[..., None], 0.0, np.nan)
-    problem = Problem(pixels, points, rig, freedom)
-    state = problem.state(rig, rig_from_target)
-    weights = np.where(problem.seen, 1.0 / noise_px**2, 0.0)
-    return problem.covariance(problem.equations(state, weights))
-
-
-class _Solver(Problem):
+class _Solver(CalibrationProblem):
     """Steps down to the least robust loss."""
 
     blur: Array = np.ones((1, 1, 1))

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from alice_survey.base.errors import CalibrationError
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import Executor
 from camera_calib.calibrate.picture_sets import PictureSet
 from camera_calib.calibrate.result import Rejection, TargetView
 from camera_calib.picture_files import is_cut_short, read_pixels
@@ -43,13 +43,13 @@ class _Seen:
     """Corners along the longer and the shorter side of the chessboard, where it was looked at."""
 
 
-def detect_views(sets: Sequence[PictureSet], target: Target, threads: int) -> Detections:
+def detect_views(sets: Sequence[PictureSet], target: Target, executor: Executor) -> Detections:
     """Find the target in sets of pictures; what cannot be used is named and left out.
 
     Args:
         sets: pictures of one moment each.
         target: what to look for.
-        threads: cores to use.
+        executor: where tasks run.
 
     Raises:
         CalibrationError: a camera has pictures of different sizes, or none that shows the target.
@@ -59,7 +59,7 @@ def detect_views(sets: Sequence[PictureSet], target: Target, threads: int) -> De
         for i, one in enumerate(sets)
         for path in one.paths.values()
     ]
-    found = iter(list(parallel_map(_look, jobs, threads=threads, label="target points")))
+    found = iter(list(executor.map(_look, jobs, label="target points")))
     seen = {(one.name, camera): next(found) for one in sets for camera in one.paths}
     paths = {(one.name, camera): path for one in sets for camera, path in one.paths.items()}
     cameras = list(dict.fromkeys(camera for one in sets for camera in one.paths))

@@ -105,7 +105,7 @@ def _corner_rows(calibration: Calibration, measured: Sequence[TargetView]) -> It
                 yield [view.name, name, i, *(round(float(number), 5) for number in numbers)]
 
 
-def tell(found: Detections) -> None:
+def warn_of_unseen(found: Detections) -> None:
     """Warn of each picture in which the target was not found."""
     for rejection in found.rejections:
         if rejection.points == 0:
@@ -113,7 +113,7 @@ def tell(found: Detections) -> None:
 
 
 def finish(folder: Path, calibration: Calibration, found: Detections) -> Calibration:
-    """Tell what a calibration left out and does not know, and write its files."""
+    """Warn of what a calibration left out and does not know, and write its files."""
     lost = [r for r in calibration.rejections if r.points]
     if lost:
         views = ", ".join(dict.fromkeys(r.view for r in lost))

@@ -171,7 +171,7 @@ class Freedom:
         """What is adjusted, in the order of `all_names`.
 
         Raises:
-            CalibrationError: a name is no parameter of the rig.
+            CalibrationError: a name is not a parameter of the rig.
         """
         wanted = {*self.free, *self.prior.parameters}
         known = all_names(rig)

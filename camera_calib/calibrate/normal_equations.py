@@ -56,7 +56,7 @@ class Equations:
     """(V, 6)."""
 
 
-class Problem:
+class CalibrationProblem:
     """Measured pixels, and which parameters explain them."""
 
     def __init__(self, pixels: Array, points: Array, rig: Rig, freedom: Freedom) -> None:
@@ -130,7 +130,7 @@ class Problem:
         )
 
     def residuals(self, state: State) -> Array:
-        """(V, C, N, 2) projected less measured; NaN where unseen or where nothing is projected."""
+        """(V, C, N, 2) projected minus measured; NaN where unseen or where nothing is projected."""
         out = np.full(self.pixels.shape, np.nan)
         turned = self.points @ state.turns.transpose(0, 2, 1)
         for c, camera in enumerate(state.cameras):
@@ -186,8 +186,8 @@ class Problem:
     def information(self, equations: Equations) -> Array:
         """What is known of the rig's parameters, (P, P), with the target's poses marginalised."""
         solved = np.linalg.solve(equations.view, equations.between.transpose(0, 2, 1))
-        told: Array = np.tensordot(equations.between, solved, axes=([0, 2], [0, 1]))
-        return equations.rig - told
+        eliminated: Array = np.tensordot(equations.between, solved, axes=([0, 2], [0, 1]))
+        return equations.rig - eliminated
 
     def covariance(self, equations: Equations) -> Covariance:
         """Inverse of the information.
@@ -198,7 +198,7 @@ class Problem:
         schur = self.information(equations)
         if not self.names:
             return Covariance(parameters=(), matrix=np.zeros((0, 0)))
-        # Held against what the views would tell if poses and all else were known.
+        # Held against what the views would determine if poses and all else were known.
         diagonal = np.diag(equations.rig)
         blind = [n for n, d in zip(self.names, diagonal, strict=True) if not d > 0]
         if blind:

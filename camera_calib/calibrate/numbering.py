@@ -1,8 +1,8 @@
 """One numbering of a symmetric target for all cameras.
 
 A chessboard of two odd or two even counts looks the same when turned by half a turn, so that two
-cameras may number its corners unlike. The rig tells: only with one numbering do the cameras stand
-to each other in the same way in all views.
+cameras may number its corners differently. The rig decides: only with one numbering do the
+cameras stand to each other in the same way in all views.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,23 +1,26 @@
-"""What views under water do not tell of the parameters that are taken for granted.
+"""What views under water do not determine of the parameters that are taken for granted.
 
 Index of the water, index and thickness of the glass are held (or known before). How far could the
-views have told them, and how far does a small error in one of them move what is calibrated? Both
-follow from the information matrix S of all parameters, with a the adjusted ones and b the held one,
-the same for all cameras: the views know b with the information S_bb - S_ba S_aa^-1 S_ab, and an
-error of it moves a by -S_aa^-1 S_ab.
+views have determined them, and how far does a small error in one of them move what is calibrated?
+Both follow from the information matrix S of all parameters, with a the adjusted ones and b the held
+one, the same for all cameras: the views know b with the information S_bb - S_ba S_aa^-1 S_ab, and
+an error of it moves a by -S_aa^-1 S_ab.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
+from alice_survey.base.frames import Array
 from camera_calib.calibrate.adjust import stack_views
 from camera_calib.calibrate.freedom import Freedom, of_cameras, value
-from camera_calib.calibrate.normal_equations import Problem
+from camera_calib.calibrate.normal_equations import CalibrationProblem
 from camera_calib.calibrate.result import Calibration
 from camera_calib.flat_port import FlatPortCamera
+from camera_calib.rig import Covariance, Rig
 
 TAKEN_FOR_GRANTED: Mapping[str, float] = {
     "n_water": 0.001,
@@ -29,6 +32,27 @@ _MOVED = ("fx_px", "port_distance_m", "normal_x", "normal_y", "x_m")
 _NOTABLE = 0.5
 """Sigmas of its own that a parameter must move to be named."""
 _MOST_NAMED = 3
+FEW_VIEWS = 10
+_CELLS = (4, 3)
+"""Parts of the frame along x and y."""
+_ROWS, _COLUMNS = ("top", "middle", "bottom"), ("far left", "left", "right", "far right")
+_LEAST_TILT = math.radians(8.0)
+"""Root mean square lean of the target about each axis, from its mean."""
+_LEAST_RANGE_RATIO = 1.4
+_ALIKE = 0.99
+_BADLY = 2.5
+"""A picture's residuals over those of all."""
+_LENS_ONLY = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
+_FOCAL = ("fx_px", "fy_px")
+_WATER = ("n_water",)
+_USEFUL = {
+    "fx_px": (0.005, "of the focal length", "more views at 20 to 40 degrees of tilt"),
+    "fy_px": (0.005, "of the focal length", "more views at 20 to 40 degrees of tilt"),
+    "port_distance_m": (0.003, "m", "near views that fill the frame, and tilted ones"),
+    "normal_x": (math.radians(0.5), "rad", "near views with the target in the frame's corners"),
+    "normal_y": (math.radians(0.5), "rad", "near views with the target in the frame's corners"),
+}
+"""Largest useful sigma, what it is a share or number of, and what would lower it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +60,7 @@ class HeldEffect:
     """What follows from a parameter that was held."""
 
     sigma: float
-    """How well the views would have told it; inf: not at all."""
+    """How well the views would have determined it; inf: not at all."""
     slopes: Mapping[str, float]
     """By adjusted parameter: how far it moves for each unit of an error of the held one."""
 
@@ -44,7 +68,7 @@ class HeldEffect:
 def unobservable(
     calibration: Calibration, errors: Mapping[str, float] = TAKEN_FOR_GRANTED
 ) -> tuple[str, ...]:
-    """A line for each held parameter whose likely error matters and that the views cannot tell.
+    """A line for each held parameter whose likely error matters and that the views leave open.
 
     Args:
         calibration: through ports.
@@ -66,7 +90,7 @@ def held_effect(calibration: Calibration, name: str) -> HeldEffect:
     held = of_cameras(rig, [name])
     wider = Freedom(free=(*freedom.free, *held), prior=freedom.prior)
     pixels = stack_views(calibration.views, rig, len(calibration.target_points))
-    problem = Problem(pixels, calibration.target_points, rig, wider)
+    problem = CalibrationProblem(pixels, calibration.target_points, rig, wider)
     weights = np.where(problem.seen, calibration.sigma_px[..., None] ** -2.0, 0.0)
     state = problem.state(rig, calibration.rig_from_target)
     information = problem.information(problem.equations(state, weights))
@@ -77,9 +101,9 @@ def held_effect(calibration: Calibration, name: str) -> HeldEffect:
     coupling = information[np.ix_(a, b)].sum(axis=1)
     inner = information[np.ix_(a, a)] * np.outer(scale, scale)
     slopes = -scale * np.linalg.solve(inner, scale * coupling)
-    told = float(information[np.ix_(b, b)].sum() + coupling @ slopes)
+    known = float(information[np.ix_(b, b)].sum() + coupling @ slopes)
     return HeldEffect(
-        sigma=1.0 / math.sqrt(told) if told > 0.0 else math.inf,
+        sigma=1.0 / math.sqrt(known) if known > 0.0 else math.inf,
         slopes=dict(zip(adjusted, slopes.tolist(), strict=True)),
     )
 
@@ -103,7 +127,7 @@ def _line(calibration: Calibration, name: str, error: float) -> str | None:
     if not notable:
         return None
     return (
-        f"{name} is taken as {value(rig, held[0]):g}; these views would tell it to "
+        f"{name} is taken as {value(rig, held[0]):g}; these views would determine it to "
         f"{effect.sigma:.2g} only (sigma), and {error:g} more would move "
         + ", ".join(f"{parameter} by {move:+.2g}" for _, parameter, move in notable)
         + ": measure it apart"
@@ -117,3 +141,142 @@ def _matters(camera: FlatPortCamera, name: str) -> bool:
     if name == "glass_thickness_m":
         return camera.n_glass != camera.n_water
     return True
+
+
+def advice(
+    rig: Rig,
+    measured: Array,
+    residuals_px: Array,
+    names: Iterable[str],
+    rig_from_target: RigidTransform,
+    noise_px: float,
+) -> tuple[str, ...]:
+    """Lines on what the views do not constrain, each naming what to take more of.
+
+    Args:
+        rig: calibrated, with its covariance.
+        measured: (V, cameras, N, 2) pixels used; NaN where unseen.
+        residuals_px: (V, cameras, N, 2).
+        names: of the views.
+        rig_from_target: (V,).
+        noise_px: standard deviation of one coordinate.
+    """
+    lines = []
+    views = len(measured)
+    if views < FEW_VIEWS:
+        lines.append(f"only {views} views: take {FEW_VIEWS} or more, 25 is good")
+    for c, camera in enumerate(rig.cameras):
+        lines += _uncovered(camera, rig, measured[:, c].reshape(-1, 2))
+    adjusted = set() if rig.covariance is None else set(rig.covariance.parameters)
+    if any(name.split(".")[1] in _USEFUL for name in adjusted):
+        lines += _tilts(rig_from_target)
+    if any(name.endswith("port_distance_m") for name in adjusted):
+        lines += _ranges(rig_from_target)
+    if rig.covariance is not None:
+        lines += _loose(rig, rig.covariance)
+        lines += _alike(rig.covariance)
+    lines += _bad_pictures(rig, residuals_px, list(names), noise_px)
+    return tuple(lines)
+
+
+def _uncovered(camera: str, rig: Rig, pixels: Array) -> list[str]:
+    model = rig.cameras[camera]
+    seen = pixels[np.isfinite(pixels).all(axis=1)]
+    counts, _, _ = np.histogram2d(
+        seen[:, 0], seen[:, 1], bins=_CELLS, range=((0, model.width_px), (0, model.height_px))
+    )
+    empty = [f"{_ROWS[y]} {_COLUMNS[x]}" for y in range(_CELLS[1]) for x in range(_CELLS[0])
+             if counts[x, y] == 0]  # fmt: skip
+    if not empty:
+        return []
+    where = ", ".join(empty[:4]) + (", ..." if len(empty) > 4 else "")
+    return [
+        f"{camera}: no points in {len(empty)} of {counts.size} parts of the frame ({where}): "
+        "take views with the target there"
+    ]
+
+
+def _tilts(rig_from_target: RigidTransform) -> list[str]:
+    normals = rig_from_target.rotation.apply([0.0, 0.0, 1.0]).reshape(-1, 3)
+    lean = np.arcsin(np.clip(normals[:, :2] - normals[:, :2].mean(axis=0), -1.0, 1.0))
+    spread = np.sqrt((lean**2).mean(axis=0))
+    lines = []
+    for axis, tilt in (("left and right", spread[0]), ("up and down", spread[1])):
+        if tilt < _LEAST_TILT:
+            lines.append(
+                f"the target leans {axis} by only {math.degrees(tilt):.1f} deg rms: take views "
+                f"in which it faces 20 to 40 deg {axis}"
+            )
+    return lines
+
+
+def _ranges(rig_from_target: RigidTransform) -> list[str]:
+    depths = np.asarray(rig_from_target.translation).reshape(-1, 3)[:, 2]
+    near, far = np.quantile(depths, [0.1, 0.9])
+    if far > _LEAST_RANGE_RATIO * near:
+        return []
+    return [
+        f"nearly all views lie between {near:.2f} and {far:.2f} m: take some at half and some at "
+        "twice the distance, for the port"
+    ]
+
+
+def _loose(rig: Rig, covariance: Covariance) -> list[str]:
+    lines = []
+    for name, sigma in covariance.sigmas.items():
+        camera, field = name.split(".")
+        if field not in _USEFUL:
+            continue
+        limit, unit, more = _USEFUL[field]
+        size = sigma / rig.cameras[camera].parameter(field) if unit.startswith("of") else sigma
+        if size > limit:
+            lines.append(f"{name} is known to {size:.2g} {unit} only (sigma): take {more}")
+    for camera, model in rig.cameras.items():
+        if f"{camera}.port_distance_m" in covariance.parameters and model.port_distance_m == 0.0:
+            lines.append(
+                f"{camera}.port_distance_m ended at 0, its least: hold it, or hold the intrinsics "
+                "of a calibration in air"
+            )
+    return lines
+
+
+def _alike(covariance: Covariance) -> list[str]:
+    """One line for each group of parameters that only their sum is known of."""
+    strong = np.abs(covariance.correlation) > _ALIKE
+    names = covariance.parameters
+    fields = [name.split(".")[1] for name in names]
+    for kin in (_LENS_ONLY, _FOCAL, _WATER):  # always alike, and never used apart
+        at = [i for i, field in enumerate(fields) if field in kin]
+        strong[np.ix_(at, at)] = False
+    groups: list[set[int]] = []
+    for i in range(len(names)):
+        linked = {i, *np.flatnonzero(strong[i]).tolist()}
+        for group in [g for g in groups if g & linked]:
+            linked |= group
+            groups.remove(group)
+        groups.append(linked)
+    lines = []
+    for together in sorted(sorted(group) for group in groups):
+        if len(together) < 2:
+            continue
+        both = np.abs(covariance.correlation[np.ix_(together, together)])
+        np.fill_diagonal(both, 0.0)
+        lines.append(
+            f"{', '.join(names[i] for i in together)} go together (correlation {both.max():.4f}) "
+            "and are not known one by one: tilt the target more, fill the frame's corners, or hold "
+            "some of them"
+        )
+    return lines
+
+
+def _bad_pictures(rig: Rig, residuals_px: Array, names: list[str], noise_px: float) -> list[str]:
+    square = np.nanmean(np.where(np.isfinite(residuals_px), residuals_px, 0.0) ** 2, axis=(2, 3))
+    share = np.isfinite(residuals_px).mean(axis=(2, 3))
+    rms = np.sqrt(np.divide(square, share, out=np.zeros_like(square), where=share > 0))
+    lines = []
+    for v, c in zip(*np.nonzero(rms > _BADLY * noise_px), strict=True):
+        lines.append(
+            f"view {names[v]}, {list(rig.cameras)[c]}: residuals of {rms[v, c]:.3g} px where all "
+            f"have {noise_px:.3g}: is it blurred, or did the target move?"
+        )
+    return lines

@@ -72,7 +72,7 @@ def adjust_without_outliers(
 def _fitting(measured: Flags, kept: Flags, fits: Flags) -> Flags:
     """Which points take part next, (V, cameras, N).
 
-    Where a picture does not fit, the pose of its view is no measure for the others yet: of the
+    Where a picture does not fit, the pose of its view is not a measure for the others yet: of the
     pictures of one view only the worst is left out at a time.
     """
     share = fits.sum(axis=2) / np.maximum(measured.sum(axis=2), 1)
@@ -89,7 +89,7 @@ def _blur(adjusted: Adjustment) -> Array:
     """Noise of each picture over that of all, (V, cameras); 1 where all are alike by chance.
 
     Far targets and moving water blur some pictures more than others; weighted by their own noise
-    they tell more. Noise is the mean square of residuals after Huber's weights, drawn a little
+    they say more. Noise is the mean square of residuals after Huber's weights, drawn a little
     towards that of all, so that a picture of few points gets no weight by luck.
     """
     pull = (adjusted.weights[..., None] * adjusted.residuals_px) ** 2

@@ -46,7 +46,7 @@ class Calibration:
     rig_from_target: RigidTransform
     """(V,) poses of the target; the rig's frame is the reference camera's."""
     residuals_px: Array
-    """(V, cameras, N, 2) projected less measured, cameras in the rig's order; NaN where unseen."""
+    """(V, cameras, N, 2) projected minus measured, cameras in the rig's order; NaN where unseen."""
     weights: Array
     """(V, cameras, N) robust weights, 1 for a point that fits; NaN where unseen."""
     noise_px: float

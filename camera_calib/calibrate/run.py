@@ -4,17 +4,18 @@ from pathlib import Path
 
 from alice_survey.base.config import CameraConfig, SurveyConfig
 from alice_survey.base.errors import CalibrationError
+from alice_survey.base.executor import Executor
 from alice_survey.base.manifest import read_manifest
 from alice_survey.base.records import BoardRecord
 from camera_calib.calibrate.detect_views import Size, detect_views
-from camera_calib.calibrate.files import finish, tell
+from camera_calib.calibrate.files import finish, warn_of_unseen
 from camera_calib.calibrate.picture_sets import PictureSet
 from camera_calib.calibrate.solve import calibrate_through_ports
 from camera_calib.rig import design_rig
 from camera_calib.targets.target import Target
 
 
-def run_calibrate(workspace: Path, config: SurveyConfig, threads: int, folder: Path) -> None:
+def run_calibrate(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
     """Calibrate the rig from `pool/`.
 
     Intrinsics, ports (with their normals) and the pose of the right camera are found together,
@@ -28,8 +29,8 @@ def run_calibrate(workspace: Path, config: SurveyConfig, threads: int, folder: P
     target = Target(
         kind="chessboard", columns=board.columns, rows=board.rows, size_m=board.square_m
     )
-    found = detect_views(_pool_pictures(pool), target, threads)
-    tell(found)
+    found = detect_views(_pool_pictures(pool), target, executor)
+    warn_of_unseen(found)
     start = design_rig(config.camera, config.water, _scale(found.sizes["left"], config.camera))
     calibration = calibrate_through_ports(found.views, target.points, start, "free")
     finish(folder, calibration, found)
@@ -48,7 +49,7 @@ def _scale(size: Size, camera: CameraConfig) -> int:
     scale = max(round(camera.width_px / width), 1)
     if (camera.width_px // scale, camera.height_px // scale) != (width, height):
         raise CalibrationError(
-            f"the pool's pictures have {width} x {height} px, which is no whole fraction of the "
+            f"the pool's pictures have {width} x {height} px, which is not a whole fraction of the "
             f"camera's {camera.width_px} x {camera.height_px}: set [camera] width_px and height_px"
         )
     return scale

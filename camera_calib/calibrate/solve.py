@@ -16,7 +16,6 @@ from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from camera_calib.calibrate.adjust import adjust, stack_views
-from camera_calib.calibrate.advice import advice
 from camera_calib.calibrate.freedom import (
     PINHOLE,
     PORT,
@@ -26,7 +25,7 @@ from camera_calib.calibrate.freedom import (
     of_cameras,
     pose_names,
 )
-from camera_calib.calibrate.observability import unobservable
+from camera_calib.calibrate.observability import advice, unobservable
 from camera_calib.calibrate.outliers import (
     FEWEST_VIEWS,
     STEPS,
@@ -174,8 +173,8 @@ def calibrate_through_ports(
         points: (N, 3) of the target, metres.
         start: cameras calibrated in air, or a design; with glass, water and a guess of the ports.
         known: whether the cameras' intrinsics are held at the start's, taken with their
-            covariance as a prior, or found anew.
-        lens: name of the lens model that is found anew.
+            covariance as a prior, or found again.
+        lens: name of the lens model that is found again.
         sigmas: more parameters that are known about as the start has them, such as
             `left.glass_thickness_m`, with their standard deviations.
 

@@ -96,7 +96,7 @@ def camera_of(path: Path, record: CameraRecord) -> FlatPortCamera:
     """The camera of a record, without its port.
 
     Raises:
-        CalibrationError: a value is no finite number or out of range.
+        CalibrationError: a value is not a finite number or out of range.
     """
     fields = record.fields(path)
     names = MODELS[record.model][1]
@@ -212,7 +212,7 @@ def _read_binary(path: Path) -> list[CameraRecord]:
         records = _unpacked(path, content, refractive)
         if records is not None:
             return records
-    raise CalibrationError(f"{path}: is no cameras.bin of COLMAP or Refractive COLMAP")
+    raise CalibrationError(f"{path}: is not a cameras.bin of COLMAP or Refractive COLMAP")
 
 
 def _unpacked(path: Path, content: bytes, refractive: bool) -> list[CameraRecord] | None:

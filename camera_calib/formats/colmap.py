@@ -4,10 +4,17 @@ A folder holds `cameras.txt` (or `.bin`) and `rig_config.json`, which gives name
 pictures) and poses; for COLMAP also the other files of a model without pictures, so that it opens
 there. `rig_config.json` is https://colmap.github.io/rigs.html; Refractive COLMAP, a fork of 3.10,
 has that version's: cameras by `camera_id`, the reference by `ref_camera_id`.
+
+Without it the model's own `rigs.txt` or `rigs.bin` say which cameras form a rig
+(https://colmap.github.io/format.html): `RIG_ID NUM_SENSORS REF_SENSOR_TYPE REF_SENSOR_ID`, then
+for each other sensor `SENSOR_TYPE SENSOR_ID HAS_POSE [QW QX QY QZ TX TY TZ]`. They are read here
+and not by pycolmap, which needs the whole model and accepts a file that is cut short.
 """
 
+import math
+import struct
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,17 +34,25 @@ from camera_calib.formats.camera_files import (
     write_records,
 )
 from camera_calib.formats.documents import read_json_fields
-from camera_calib.formats.fields import Fields
+from camera_calib.formats.fields import Fields, read_bytes, read_text
 from camera_calib.formats.opencv_model import behind_port
-from camera_calib.formats.rig_files import read_rigs
-from camera_calib.formats.rigs import Reading, assemble
+from camera_calib.formats.rigs import ReadOptions, assemble
 from camera_calib.rig import Rig
 
 CAMERA_FILES = ("cameras.bin", "cameras.txt")
 RIG_CONFIG = "rig_config.json"
+_Tie = tuple[CameraRecord, str, RigidTransform]
+_CAMERA = 0
+_TYPES = {"CAMERA": _CAMERA, "IMU": 1}
+_POSE = 7
+PosesById = Mapping[int, RigidTransform]
+"""Poses sensor_from_rig by CAMERA_ID, the reference's first; cameras without a pose are absent."""
+_Sensor = tuple[int, int, tuple[float, ...]]
+"""Type, number, and the seven numbers of its pose; none when it has no pose."""
+_REFERENCE = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def read_colmap(path: Path, reading: Reading) -> Rig:
+def read_colmap(path: Path, reading: ReadOptions) -> Rig:
     """Read a model's cameras, of COLMAP or Refractive COLMAP, and what ties them to a rig.
 
     Args:
@@ -60,7 +75,7 @@ def read_colmap(path: Path, reading: Reading) -> Rig:
             ids = ", ".join(str(record.camera_id) for record in records)
             raise CalibrationError(
                 f"{file}: cameras {ids} have no common rig: choose one with --camera, "
-                f"or put {RIG_CONFIG} beside it"
+                f"or put {RIG_CONFIG} next to it"
             )
         ties = [(chosen[0], str(chosen[0].camera_id), RigidTransform.identity())]
     cameras = [_camera(file, record) for record, _, _ in ties]
@@ -181,9 +196,6 @@ def _camera(path: Path, record: CameraRecord) -> FlatPortCamera:
     )
 
 
-_Tie = tuple[CameraRecord, str, RigidTransform]
-
-
 def _config_ties(path: Path, records: Sequence[CameraRecord]) -> list[_Tie]:
     """Each camera with its name and pose, the reference first, after a rig configuration."""
     entries = _entries(path)
@@ -222,7 +234,7 @@ def _model_ties(file: Path, records: Sequence[CameraRecord]) -> list[_Tie]:
     return []
 
 
-def _from_config_alone(path: Path, reading: Reading) -> Rig:
+def _from_config_alone(path: Path, reading: ReadOptions) -> Rig:
     file = path / RIG_CONFIG if path.is_dir() else path
     entries = _entries(file)
     size = reading.size(file)
@@ -245,7 +257,7 @@ def _entries(path: Path) -> list[Fields]:
     rig = Fields(path=path, values=rigs[0])
     cameras = rig.get("cameras")
     if not isinstance(cameras, list) or not all(isinstance(camera, dict) for camera in cameras):
-        raise rig.fault("cameras", "is no list of cameras")
+        raise rig.fault("cameras", "is not a list of cameras")
     entries = [Fields(path=path, values=c, prefix=f"cameras[{i}].") for i, c in enumerate(cameras)]
     first = rig.number("ref_camera_id") if "ref_camera_id" in rig else None
     references = [
@@ -271,7 +283,7 @@ def _entry_pose(entry: Fields) -> RigidTransform:
         return RigidTransform.identity()
     w, x, y, z = entry.numbers("cam_from_rig_rotation", 4)
     if abs(np.linalg.norm([w, x, y, z]) - 1.0) > 1e-3:
-        raise entry.fault("cam_from_rig_rotation", "is no unit quaternion w x y z")
+        raise entry.fault("cam_from_rig_rotation", "is not a unit quaternion w x y z")
     return RigidTransform.from_components(
         entry.numbers("cam_from_rig_translation", 3), Rotation.from_quat([x, y, z, w])
     )
@@ -287,3 +299,78 @@ def _pose_entry(pose: RigidTransform) -> dict[str, list[float]]:
 
 def _prefix_name(entry: Fields) -> str:
     return entry.text("image_prefix").strip("/") or "cam"
+
+
+def read_rigs(path: Path) -> list[PosesById]:
+    """The rigs of a model.
+
+    Args:
+        path: rigs.txt or rigs.bin.
+
+    Raises:
+        CalibrationError: the file is malformed.
+    """
+    try:
+        rows = _binary_rows(path) if path.suffix == ".bin" else _text_rows(path)
+        return [_poses(row) for row in rows]
+    except (struct.error, ValueError, IndexError, KeyError, OverflowError):
+        raise CalibrationError(f"{path}: is not a {path.name} of COLMAP") from None
+
+
+def _poses(sensors: list[_Sensor]) -> PosesById:
+    poses: dict[int, RigidTransform] = {}
+    for kind, number, pose in sensors:
+        if kind != _CAMERA or not pose:
+            continue
+        w, x, y, z, *shift = pose
+        if not all(map(math.isfinite, pose)) or abs(math.hypot(w, x, y, z) - 1.0) > 1e-3:
+            raise ValueError("no pose")
+        poses[number] = RigidTransform.from_components(
+            np.array(shift), Rotation.from_quat([x, y, z, w])
+        )
+    return poses
+
+
+def _text_rows(path: Path) -> list[list[_Sensor]]:
+    rows: list[list[_Sensor]] = []
+    for line in read_text(path).splitlines():
+        items = line.split()
+        if not items or items[0].startswith("#"):
+            continue
+        count = int(items[1])
+        sensors: list[_Sensor] = [(_TYPES[items[2]], int(items[3]), _REFERENCE)] if count else []
+        at = 4
+        for _ in range(min(count, len(items)) - 1):
+            length = _POSE if items[at + 2] == "1" else 0
+            pose = tuple(map(float, items[at + 3 : at + 3 + length]))
+            if len(pose) != length:
+                raise ValueError("pose cut short")
+            sensors.append((_TYPES[items[at]], int(items[at + 1]), pose))
+            at += 3 + length
+        rows.append(sensors)
+    return rows
+
+
+def _binary_rows(path: Path) -> list[list[_Sensor]]:
+    content = read_bytes(path)
+    (rigs,) = struct.unpack_from("<Q", content)
+    at = 8
+    rows: list[list[_Sensor]] = []
+    for _ in range(min(rigs, len(content))):
+        _, count = struct.unpack_from("<II", content, at)
+        at += 8
+        sensors: list[_Sensor] = []
+        for i in range(min(count, len(content))):
+            kind, number = struct.unpack_from("<iI", content, at)
+            at += 8
+            pose: tuple[float, ...] = _REFERENCE
+            if i > 0:
+                has_pose = content[at]
+                at += 1
+                pose = struct.unpack_from(f"<{_POSE}d", content, at) if has_pose else ()
+                at += 8 * len(pose)
+            sensors.append((kind, number, pose))
+        rows.append(sensors)
+    if at != len(content):
+        raise ValueError("more bytes than rigs")
+    return rows

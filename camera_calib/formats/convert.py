@@ -5,10 +5,12 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from scipy.spatial.transform import RigidTransform
+
 from alice_survey.base.errors import CalibrationError, warn
+from camera_calib.approximation.residual import COLMAP_PARAMETERS, Residual, approximations
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.formats.fields import camera_name
-from camera_calib.formats.in_water import Price, in_water
 from camera_calib.formats.opencv_model import IN_AIR, distorts
 from camera_calib.formats.registry import (
     COVARIANCE,
@@ -17,15 +19,23 @@ from camera_calib.formats.registry import (
     PORT,
     PRISM,
     RATIONAL,
-    Format,
+    CalibrationFormat,
     detect,
     format_named,
     of_target,
 )
-from camera_calib.formats.rigs import UNKNOWN_MOUNT, Reading, only, referenced, renamed, with_port
+from camera_calib.formats.rigs import (
+    UNKNOWN_MOUNT,
+    ReadOptions,
+    only,
+    referenced,
+    renamed,
+    with_port,
+)
 from camera_calib.rig import Rig
 
 _TERMS = {K3: ("k3",), RATIONAL: ("k4", "k5", "k6"), PRISM: ("s1", "s2", "s3", "s4")}
+MODELS = ("OPENCV", "FULL_OPENCV")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,11 +47,14 @@ class Conversion:
     source_format: str | None = None
     """By name; found from the file when None."""
     target_format: str | None = None
-    reading: Reading = field(default_factory=Reading)
+    reading: ReadOptions = field(default_factory=ReadOptions)
     names: tuple[str, ...] = ()
     """New names of the cameras, in order."""
-    port: tuple[tuple[str, float], ...] = ()
-    """Fields of the port to set: `port_distance_m`, `glass_thickness_m`, `n_glass`, `n_water`."""
+    port_distance_mm: float | None = None
+    """To set, as the three below."""
+    glass_mm: float | None = None
+    n_glass: float | None = None
+    n_water: float | None = None
     water: tuple[float, float] | None = None
     """Nearest and farthest distance, m, over which a camera without port stands in for one with."""
     model: str = "OPENCV"
@@ -50,9 +63,39 @@ class Conversion:
     drop_covariance: bool = False
     overwrite: bool = False
 
+    @property
+    def port(self) -> dict[str, float]:
+        """Fields of the port to set, of `FlatPortCamera`."""
+        given = {
+            "port_distance_m": None
+            if self.port_distance_mm is None
+            else self.port_distance_mm / 1e3,
+            "glass_thickness_m": None if self.glass_mm is None else self.glass_mm / 1e3,
+            "n_glass": self.n_glass,
+            "n_water": self.n_water,
+        }
+        return {name: value for name, value in given.items() if value is not None}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Price:
+    """What a stand-in without port costs against the exact camera."""
+
+    model: str
+    near_m: float
+    far_m: float
+    rms_px: float
+    max_px: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.model} for {self.near_m:g} to {self.far_m:g} m of water misses the exact "
+            f"camera by {self.rms_px:.3f} px rms, {self.max_px:.3f} px at most"
+        )
+
 
 def convert(task: Conversion) -> tuple[str, dict[str, Any]]:
-    """Read, change as asked, write.
+    """Read, change as requested, write.
 
     Returns:
         What was written, as text and as JSON values.
@@ -94,77 +137,7 @@ def convert(task: Conversion) -> tuple[str, dict[str, Any]]:
     return _summary(source, target, rig, written, prices)
 
 
-def convert_files(
-    source: Path,
-    target: Path,
-    *,
-    source_format: str | None = None,
-    target_format: str | None = None,
-    image_size: tuple[int, int] | None = None,
-    extrinsics: Path | None = None,
-    unit_m: float = 1.0,
-    camera: str | None = None,
-    names: str | None = None,
-    port_distance_mm: float | None = None,
-    glass_mm: float | None = None,
-    n_glass: float | None = None,
-    n_water: float | None = None,
-    water: tuple[float, float] | None = None,
-    model: str = "OPENCV",
-    drop_port: bool = False,
-    drop_covariance: bool = False,
-    overwrite: bool = False,
-) -> tuple[str, dict[str, Any]]:
-    """`convert` with the values of the command line.
-
-    Args:
-        source: file or folder to read.
-        target: file or folder to write.
-        source_format: by name; found from the file when None.
-        target_format: by name; from the target's name when None.
-        image_size: width and height, px, when the file tells none.
-        extrinsics: OpenCV file of R and T when they are not with the intrinsics.
-        unit_m: length of one unit of the file's translations.
-        camera: the only one wanted.
-        names: new names of the cameras, separated by commas.
-        port_distance_mm: from the entrance pupil to the inner glass.
-        glass_mm: thickness of the port.
-        n_glass: its index.
-        n_water: index of the water.
-        water: distances over which to fit cameras without port, m.
-        model: `OPENCV` or `FULL_OPENCV`, for them.
-        drop_port: leave the port out.
-        drop_covariance: leave the covariance out.
-        overwrite: replace what is there.
-    """
-    given = {
-        "port_distance_m": None if port_distance_mm is None else port_distance_mm / 1e3,
-        "glass_thickness_m": None if glass_mm is None else glass_mm / 1e3,
-        "n_glass": n_glass,
-        "n_water": n_water,
-    }
-    reading = Reading(
-        image_size=image_size, extrinsics=extrinsics, metres_per_unit=unit_m, camera=camera
-    )
-    return convert(
-        Conversion(
-            source=source,
-            target=target,
-            source_format=source_format,
-            target_format=target_format,
-            reading=reading,
-            names=() if names is None else tuple(names.split(",")),
-            port=tuple((name, value) for name, value in given.items() if value is not None),
-            water=water,
-            model=model,
-            drop_port=drop_port,
-            drop_covariance=drop_covariance,
-            overwrite=overwrite,
-        )
-    )
-
-
-def read_as(source: Format, path: Path, reading: Reading) -> Rig:
+def read_as(source: CalibrationFormat, path: Path, reading: ReadOptions) -> Rig:
     """Read a rig; of several cameras only the one wanted, when one is named.
 
     Raises:
@@ -180,8 +153,8 @@ def read_as(source: Format, path: Path, reading: Reading) -> Rig:
     return rig
 
 
-def fitted(rig: Rig, target: Format, task: Conversion) -> tuple[Rig, list[str]]:
-    """The part of a rig that a format holds, and notes of what was left out as asked.
+def fitted(rig: Rig, target: CalibrationFormat, task: Conversion) -> tuple[Rig, list[str]]:
+    """The part of a rig that a format holds, and notes of what was left out as requested.
 
     Raises:
         CalibrationError: something would be lost that nobody allowed to be lost.
@@ -217,7 +190,7 @@ def fitted(rig: Rig, target: Format, task: Conversion) -> tuple[Rig, list[str]]:
         notes.append(f"{task.target}: left out the rig's pose on the vehicle")
     if MOUNT in target.holds and rig.body_from_rig is UNKNOWN_MOUNT:
         notes.append(
-            f"{task.source}: tells no pose on the vehicle: {next(iter(rig.cameras))} is taken to "
+            f"{task.source}: states no pose on the vehicle: {next(iter(rig.cameras))} is taken to "
             "look down from the body's origin"
         )
     return rig, notes
@@ -246,8 +219,8 @@ def _port_words(camera: FlatPortCamera) -> str:
 
 
 def _summary(
-    source: Format,
-    target: Format,
+    source: CalibrationFormat,
+    target: CalibrationFormat,
     rig: Rig,
     written: Sequence[Path],
     prices: Mapping[str, Price],
@@ -271,3 +244,67 @@ def _summary(
         "baseline_m": rig.baseline_m if len(rig.cameras) > 1 else None,
     }
     return "\n".join(lines), data
+
+
+def in_water(rig: Rig, near_m: float, far_m: float, model: str) -> tuple[Rig, Mapping[str, Price]]:
+    """The rig that other software can use under water without knowing of ports.
+
+    Each camera is the best fit, over the frame and the interval of distances, of a camera with
+    distortion that absorbs the refraction; its centre lies next to the entrance pupil, and the
+    poses in the rig and on the vehicle follow it.
+
+    Args:
+        rig: exact.
+        near_m: nearest distance from the entrance pupil along the axis.
+        far_m: farthest.
+        model: one of `MODELS`.
+
+    Returns:
+        The rig, whose cameras are as in air and without covariance, and the price by camera.
+
+    Raises:
+        CalibrationError: the model is none of these, or a part of a frame sees nothing.
+        ConfigError: the interval is empty or reaches into a port.
+    """
+    if model not in MODELS:
+        raise CalibrationError(f"model {model}: {' or '.join(MODELS)} wanted")
+    found = {
+        name: _of_model(approximations(camera, near_m, far_m), model)
+        for name, camera in rig.cameras.items()
+    }
+    cameras = {name: _stand_in(rig.cameras[name], fit) for name, fit in found.items()}
+    poses = {name: _from_cam(fit) * rig.cam_from_rig[name] for name, fit in found.items()}
+    prices = {
+        name: Price(model=model, near_m=near_m, far_m=far_m, rms_px=fit.rms_px, max_px=fit.max_px)
+        for name, fit in found.items()
+    }
+    source = f"{rig.source}; best {model} in water, {near_m:g} to {far_m:g} m"
+    return (
+        replace(rig, cameras=cameras, cam_from_rig=poses, source=source, covariance=None),
+        prices,
+    )
+
+
+def _of_model(every: list[Residual], model: str) -> Residual:
+    unwarped = (fit for fit in every if fit.stand_in.warped_at_m is None)
+    return next(fit for fit in unwarped if fit.stand_in.model == model)
+
+
+def _stand_in(camera: FlatPortCamera, fit: Residual) -> FlatPortCamera:
+    stand_in = fit.stand_in
+    values = dict(zip(COLMAP_PARAMETERS[stand_in.model], stand_in.params, strict=True))
+    fx, fy, cx, cy = (values.pop(name) for name in ("fx", "fy", "cx", "cy"))
+    return FlatPortCamera(
+        width_px=camera.width_px,
+        height_px=camera.height_px,
+        fx_px=fx,
+        fy_px=fy,
+        cx_px=cx,
+        cy_px=cy,
+        **{**values, **IN_AIR},
+    )
+
+
+def _from_cam(fit: Residual) -> RigidTransform:
+    turn = fit.stand_in.approx_from_cam
+    return RigidTransform.from_components(-turn.apply(fit.stand_in.centre_m), turn)

@@ -68,7 +68,7 @@ def read_storage(path: Path) -> Fields:
     """A YAML, XML or JSON file of OpenCV's FileStorage; matrices are `{rows, cols, dt, data}`.
 
     Raises:
-        CalibrationError: the file is missing, is no such file, declares a document type (XML
+        CalibrationError: the file is missing, is not such a file, declares a document type (XML
             entities), or repeats a key.
     """
     text = read_text(path)
@@ -107,7 +107,7 @@ def _plain(path: Path, node: Any) -> Any:
 
 def _mapping(path: Path, value: Any) -> Fields:
     if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
-        raise CalibrationError(f"{path}: is no mapping of keys to values")
+        raise CalibrationError(f"{path}: is not a mapping of keys to values")
     return Fields(path=path, values=value)
 
 

@@ -58,14 +58,14 @@ class Fields:
         """The mapping below a key."""
         value = self.get(key)
         if not isinstance(value, Mapping):
-            raise self.fault(key, "is no mapping")
+            raise self.fault(key, "is not a mapping")
         return Fields(path=self.path, values=value, prefix=f"{self.prefix}{key}.")
 
     def text(self, key: str) -> str:
         """A line of text."""
         value = self.get(key)
         if not isinstance(value, str) or "\n" in value:
-            raise self.fault(key, "is no line of text")
+            raise self.fault(key, "is not a line of text")
         return value
 
     def texts(self, key: str) -> list[str]:
@@ -73,7 +73,7 @@ class Fields:
         value = self.get(key)
         every = [value] if isinstance(value, str) else value
         if not isinstance(every, list) or not all(isinstance(text, str) for text in every):
-            raise self.fault(key, "is no list of names")
+            raise self.fault(key, "is not a list of names")
         return every
 
     def number(self, key: str) -> float:
@@ -84,14 +84,14 @@ class Fields:
         """A positive whole number."""
         value = self.number(key)
         if value != int(value) or not 1 <= value <= 1e6:
-            raise self.fault(key, f"= {value:g} is no number of pixels")
+            raise self.fault(key, f"= {value:g} is not a number of pixels")
         return int(value)
 
     def numbers(self, key: str, *counts: int) -> Array:
         """Finite numbers, however nested, as one vector of one of these lengths."""
         flat = _flat(self.get(key))
         if flat is None:
-            raise self.fault(key, "holds something that is no finite number")
+            raise self.fault(key, "holds something that is not a finite number")
         if len(flat) not in counts:
             wanted = " or ".join(map(str, counts))
             raise self.fault(key, f"holds {len(flat)} numbers; {wanted} wanted")
@@ -104,7 +104,7 @@ class Fields:
             return self.numbers(key, rows * columns).reshape(rows, columns)
         inner = self.fields(key)
         if [inner.size("rows"), inner.size("cols")] != [rows, columns]:
-            raise self.fault(key, f"is no {rows} x {columns} matrix")
+            raise self.fault(key, f"is not a {rows} x {columns} matrix")
         return inner.numbers("data", rows * columns).reshape(rows, columns)
 
     def vector(self, key: str, *counts: int) -> Array:
@@ -121,7 +121,7 @@ class Fields:
         """
         off = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
         if off > _ROTATION_TOLERANCE or np.linalg.det(matrix) < 0:
-            raise self.fault(key, f"is no rotation (R R^T misses the identity by {off:.2g})")
+            raise self.fault(key, f"is not a rotation (R R^T misses the identity by {off:.2g})")
         return Rotation.from_matrix(matrix)
 
     def pose(self, key: str) -> RigidTransform:
@@ -177,9 +177,9 @@ def read_text(path: Path) -> str:
     try:
         text = read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise CalibrationError(f"{path}: is no UTF-8 text") from None
+        raise CalibrationError(f"{path}: is not UTF-8 text") from None
     if "\0" in text:
-        raise CalibrationError(f"{path}: is no text")
+        raise CalibrationError(f"{path}: is not text")
     if len(re.findall(r"[\[{]|<[A-Za-z_]", text)) > _MOST_PARTS:
         raise CalibrationError(f"{path}: has more than {_MOST_PARTS} parts: no calibration file")
     return text

@@ -18,14 +18,14 @@ from camera_calib.flat_port import FlatPortCamera
 from camera_calib.formats.documents import read_yaml
 from camera_calib.formats.fields import Fields
 from camera_calib.formats.opencv_model import HALF_PIXEL, camera_in_air
-from camera_calib.formats.rigs import Reading, assemble
+from camera_calib.formats.rigs import ReadOptions, assemble
 from camera_calib.rig import Rig
 
 _NOT_HELD = ("T_cam_imu", "T_imu_cam", "timeshift_cam_imu")
 _TOPIC = re.compile(r"/(?P<name>[A-Za-z0-9][A-Za-z0-9_./-]*)/image_raw")
 
 
-def read_kalibr(path: Path, reading: Reading) -> Rig:
+def read_kalibr(path: Path, reading: ReadOptions) -> Rig:
     """Read a chain of cameras.
 
     Raises:

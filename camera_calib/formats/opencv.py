@@ -19,7 +19,7 @@ from camera_calib.flat_port import FlatPortCamera
 from camera_calib.formats.documents import read_storage
 from camera_calib.formats.fields import Fields
 from camera_calib.formats.opencv_model import behind_port, camera_matrix, distortion, read_camera
-from camera_calib.formats.rigs import Reading, assemble, default_names, own_keys
+from camera_calib.formats.rigs import ReadOptions, assemble, default_names, own_keys
 from camera_calib.rig import Rig
 
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K")
@@ -31,7 +31,7 @@ _HEIGHT = ("image_height", "image_Height")
 _PORT_LENGTHS = ("port_distance_m", "glass_thickness_m", "n_glass", "n_water")
 
 
-def read_opencv(path: Path, reading: Reading) -> Rig:
+def read_opencv(path: Path, reading: ReadOptions) -> Rig:
     """Read one camera or a stereo pair.
 
     Raises:
@@ -110,7 +110,7 @@ def _write_texts(storage: Any, key: str, texts: list[str]) -> None:
     storage.endWriteStruct()
 
 
-def _numbered(fields: Fields, number: str, reading: Reading) -> FlatPortCamera:
+def _numbered(fields: Fields, number: str, reading: ReadOptions) -> FlatPortCamera:
     matrix = fields.first(*(key.format(number) for key in (_PAIR if number else _MATRIX)))
     if matrix is None:
         wanted = f"camera_matrix, or M{number} of a stereo pair"
@@ -122,7 +122,7 @@ def _numbered(fields: Fields, number: str, reading: Reading) -> FlatPortCamera:
 
 
 def _camera(
-    fields: Fields, matrix: str, k: str | None, number: str, reading: Reading
+    fields: Fields, matrix: str, k: str | None, number: str, reading: ReadOptions
 ) -> FlatPortCamera:
     camera = read_camera(fields, matrix, k, _size(fields, number, reading))
     if f"port{number}" not in fields:
@@ -133,7 +133,7 @@ def _camera(
     return behind_port(fields, f"port{number}", camera, **numbers, normal=(x, y, z))
 
 
-def _size(fields: Fields, number: str, reading: Reading) -> tuple[int, int]:
+def _size(fields: Fields, number: str, reading: ReadOptions) -> tuple[int, int]:
     for end in (number, ""):
         width = fields.first(*(key + end for key in _WIDTH))
         height = fields.first(*(key + end for key in _HEIGHT))
@@ -142,7 +142,7 @@ def _size(fields: Fields, number: str, reading: Reading) -> tuple[int, int]:
     return reading.size(fields.path)
 
 
-def _second_pose(fields: Fields, first: Fields, reading: Reading) -> RigidTransform:
+def _second_pose(fields: Fields, first: Fields, reading: ReadOptions) -> RigidTransform:
     if reading.extrinsics is None and "R" not in first and "T" not in first:
         raise CalibrationError(
             f"{first.path}: lacks R and T of the second camera: "

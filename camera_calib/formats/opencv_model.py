@@ -131,4 +131,4 @@ def behind_port(fields: Fields, key: str, camera: FlatPortCamera, **port: Any) -
     try:
         return replace(camera, **port)
     except CalibrationError as error:
-        raise fields.fault(key, f"is no port: {error}") from None
+        raise fields.fault(key, f"is not a port: {error}") from None

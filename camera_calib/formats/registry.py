@@ -18,7 +18,7 @@ from camera_calib.formats.documents import read_yaml
 from camera_calib.formats.fields import read_text
 from camera_calib.formats.kalibr import read_kalibr, write_kalibr
 from camera_calib.formats.opencv import read_opencv, write_opencv
-from camera_calib.formats.rigs import Reading
+from camera_calib.formats.rigs import ReadOptions
 from camera_calib.formats.ros import SUFFIXES, read_ros, ros_files, write_ros
 from camera_calib.rig import Rig, read_rig, write_rig
 
@@ -26,19 +26,19 @@ PORT, K3, RATIONAL, PRISM, COVARIANCE, MOUNT = "port", "k3", "rational", "prism"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Format:
+class CalibrationFormat:
     """One format of camera calibrations."""
 
     name: str
     title: str
     holds: frozenset[str]
-    read: Callable[[Path, Reading], Rig]
+    read: Callable[[Path, ReadOptions], Rig]
     write: Callable[[Path, Rig], list[Path]]
     targets: Callable[[Path, Rig], list[Path]]
     """The files that writing a rig to a path would replace."""
 
 
-def _read_own(path: Path, reading: Reading) -> Rig:
+def _read_own(path: Path, reading: ReadOptions) -> Rig:
     del reading  # rig.json leaves nothing open
     return read_rig(path)
 
@@ -54,7 +54,7 @@ def _itself(path: Path, rig: Rig) -> list[Path]:
 
 
 _FORMATS = (
-    Format(
+    CalibrationFormat(
         name="rig",
         title="rig.json of this project",
         holds=frozenset({PORT, K3, RATIONAL, PRISM, COVARIANCE, MOUNT}),
@@ -62,7 +62,7 @@ _FORMATS = (
         write=_write_own,
         targets=_itself,
     ),
-    Format(
+    CalibrationFormat(
         name="opencv",
         title="OpenCV YAML or XML",
         holds=frozenset({PORT, K3, RATIONAL, PRISM, COVARIANCE, MOUNT}),
@@ -70,7 +70,7 @@ _FORMATS = (
         write=write_opencv,
         targets=_itself,
     ),
-    Format(
+    CalibrationFormat(
         name="colmap",
         title="COLMAP model and rig_config.json",
         holds=frozenset({K3, RATIONAL}),
@@ -78,7 +78,7 @@ _FORMATS = (
         write=write_colmap,
         targets=model_files,
     ),
-    Format(
+    CalibrationFormat(
         name="flatport",
         title="Refractive COLMAP cameras with FLATPORT",
         holds=frozenset({PORT, K3, RATIONAL}),
@@ -86,7 +86,7 @@ _FORMATS = (
         write=write_flatport,
         targets=model_files,
     ),
-    Format(
+    CalibrationFormat(
         name="kalibr",
         title="Kalibr camchain YAML",
         holds=frozenset(),
@@ -94,7 +94,7 @@ _FORMATS = (
         write=write_kalibr,
         targets=_itself,
     ),
-    Format(
+    CalibrationFormat(
         name="ros",
         title="ROS camera_info YAML",
         holds=frozenset({K3, RATIONAL}),
@@ -106,7 +106,7 @@ _FORMATS = (
 FORMATS = {each.name: each for each in _FORMATS}
 
 
-def format_named(name: str) -> Format:
+def format_named(name: str) -> CalibrationFormat:
     """A format by its name.
 
     Raises:
@@ -117,7 +117,7 @@ def format_named(name: str) -> Format:
     return FORMATS[name]
 
 
-def detect(path: Path) -> Format:
+def detect(path: Path) -> CalibrationFormat:
     """The format of a file or folder, from its name and content.
 
     Raises:
@@ -131,7 +131,7 @@ def detect(path: Path) -> Format:
     return FORMATS[name]
 
 
-def of_target(path: Path) -> Format:
+def of_target(path: Path) -> CalibrationFormat:
     """The format that the name of a new file calls for.
 
     Raises:

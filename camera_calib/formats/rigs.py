@@ -15,11 +15,11 @@ from camera_calib.formats.fields import Fields, camera_name
 from camera_calib.rig import Covariance, Rig
 
 UNKNOWN_MOUNT = RigidTransform.from_components([0.0, 0.0, 0.0], BODY_FROM_NADIR_CAM)
-"""Pose on the vehicle of rigs whose file tells none: at the body's origin, looking down."""
+"""Pose on the vehicle of rigs whose file states none: at the body's origin, looking down."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reading:
+class ReadOptions:
     """What a file may leave open."""
 
     image_size: tuple[int, int] | None = None
@@ -32,10 +32,10 @@ class Reading:
     """The one camera that is wanted."""
 
     def size(self, path: Path) -> tuple[int, int]:
-        """Width and height for a file that does not tell them.
+        """Width and height for a file that does not state them.
 
         Raises:
-            CalibrationError: nobody tells.
+            CalibrationError: nothing states them.
         """
         if self.image_size is None:
             raise CalibrationError(f"{path}: lacks image_width and image_height: give --image-size")
@@ -44,7 +44,7 @@ class Reading:
 
 def assemble(
     path: Path,
-    reading: Reading,
+    reading: ReadOptions,
     tool: str,
     names: Sequence[str],
     cameras: Sequence[FlatPortCamera],
@@ -70,7 +70,7 @@ def assemble(
 
 
 def default_names(count: int) -> list[str]:
-    """Names for cameras whose file tells none."""
+    """Names for cameras whose file states none."""
     return ["left", "right"] if count == 2 else [f"cam{i}" for i in range(count)]
 
 
@@ -135,7 +135,7 @@ def referenced(rig: Rig) -> Rig:
 
 
 def own_keys(fields: Fields, rig: Rig) -> Rig:
-    """A rig with what only files of this project tell: mount, source and covariance."""
+    """A rig with what only files of this project hold: mount, source and covariance."""
     if "body_from_rig" in fields:
         rig = replace(rig, body_from_rig=fields.pose("body_from_rig"))
     if "source" in fields:
@@ -167,7 +167,7 @@ def with_port(rig: Rig, port: Mapping[str, Any]) -> Rig:
     )
 
 
-def _scaled(pose: RigidTransform, reading: Reading) -> RigidTransform:
+def _scaled(pose: RigidTransform, reading: ReadOptions) -> RigidTransform:
     return RigidTransform.from_components(
         np.asarray(pose.translation) * reading.metres_per_unit, pose.rotation
     )

@@ -21,14 +21,14 @@ from camera_calib.flat_port import FlatPortCamera
 from camera_calib.formats.documents import read_yaml
 from camera_calib.formats.fields import Fields
 from camera_calib.formats.opencv_model import camera_matrix, distortion, read_camera
-from camera_calib.formats.rigs import Reading, assemble
+from camera_calib.formats.rigs import ReadOptions, assemble
 from camera_calib.rig import Rig
 
 _MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14)}
 SUFFIXES = (".yaml", ".yml")
 
 
-def read_ros(path: Path, reading: Reading) -> Rig:
+def read_ros(path: Path, reading: ReadOptions) -> Rig:
     """Read a file of one camera, or a folder that holds those of a stereo pair.
 
     Raises:

@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.optimize import brentq
 
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.seawater import n_water as n_water_of_colour
@@ -44,12 +43,12 @@ class AngleRow:
     displacement_percent: float
     """The same over the distance of that spot from the centre."""
     viewpoint_shift_mm: float
-    """Where a corner's ray in water meets the axis less where central rays do: no single centre."""
+    """Where a corner's ray in water meets the axis minus where central rays do."""
     residual_rms_px: float
     """Left by the best virtual pinhole, warped at the working range, over frame and relief."""
     residual_max_px: float
     chromatic_px: float
-    """Blue (460 nm) less red (600 nm) in the corner of a colour camera, without correction."""
+    """Blue (460 nm) minus red (600 nm) in the corner of a colour camera, without correction."""
     corner_blur_px: float
     """Blur circle in the corner when the centre is sharp: the port bends the field."""
 
@@ -80,22 +79,6 @@ def angle_table(
     check_range("altitude", [altitude_m], 0.01, 1000.0, "m")
     check_range("n_water", [n_water], 1.0, 1.4, "")
     return [_angle_row(camera_config, n_water, altitude_m, float(angle)) for angle in angles_deg]
-
-
-def angle_of_displacement(
-    camera_config: CameraConfig, n_water: float, percent: float, altitude_m: float = 2.0
-) -> float:
-    """Full angle in air, degrees, at which the corner is displaced by so many percent.
-
-    Raises:
-        ValueError: none between 1 and 170 degrees is.
-    """
-
-    def excess(angle_deg: float) -> float:
-        camera = _camera(camera_config, n_water, angle_deg)
-        return _displacement(camera, altitude_m)[1] - percent
-
-    return float(brentq(excess, 1.0, 170.0))
 
 
 def _blue_red(n_green: float) -> tuple[float, float]:

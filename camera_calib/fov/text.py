@@ -9,7 +9,7 @@ from typing import Any
 
 from alice_survey.base.text_table import text_table
 from camera_calib.fov.angles import RELIEF, AngleRow
-from camera_calib.fov.paper import PAPER_RULE, PaperCheck, PaperClaim, Validation
+from camera_calib.fov.paper import PAPER_RULE, PaperCheck, PaperClaim, PaperValidation
 from camera_calib.fov.table import TRUSTED_FOV_DEG, BlurRow, FovRow
 
 
@@ -54,12 +54,12 @@ def fov_csv_rows(rows: Sequence[FovRow], blur: Sequence[BlurRow]) -> list[dict[s
     ]
 
 
-def validation_csv_rows(validation: Validation) -> list[dict[str, Any]]:
+def validation_csv_rows(validation: PaperValidation) -> list[dict[str, Any]]:
     """Every check and claim, flat."""
     checks = [
         {
             "claim": f"{c.quantity} of the {c.lens_mm:g} mm lens: {c.paper} {c.unit}",
-            "verdict": "pass" if c.passed else "FAIL",
+            "verdict": _verdict(c),
             "computed": f"{c.computed:.4f} {c.unit}",
             "assumption": PAPER_RULE.partition(";")[0],
             "rule": f"within {c.tolerance:g} {c.unit}",
@@ -70,9 +70,9 @@ def validation_csv_rows(validation: Validation) -> list[dict[str, Any]]:
         {
             "claim": c.claim,
             "verdict": _verdict(c),
-            "computed": c.computed,
+            "computed": f"{c.computed:.4f} {c.unit}",
             "assumption": c.assumption,
-            "rule": c.rule,
+            "rule": _bounds(c),
         }
         for c in validation.claims
     ]
@@ -86,7 +86,7 @@ def fov_tables(rows: Sequence[FovRow], blur: Sequence[BlurRow] = ()) -> list[Tex
     return [_footprints(rows), _focus(rows), *([_blur(blur)] if blur else [])]
 
 
-def validation_tables(validation: Validation) -> list[TextTable]:
+def validation_tables(validation: PaperValidation) -> list[TextTable]:
     """The paper's table, its claims, and the flat port against the angle."""
     return [_checks(validation.table), _claims(validation.claims), angles_table(validation.angles)]
 
@@ -183,7 +183,7 @@ def _blur(blur: Sequence[BlurRow]) -> TextTable:
 def _checks(checks: Sequence[PaperCheck]) -> TextTable:
     return TextTable(
         title="The paper's table of fields of view at 2 m",
-        header=("lens", "quantity", "computed", "paper", "difference", "allowed", "", "note"),
+        header=("lens", "quantity", "computed", "paper", "difference", "allowed", ""),
         cells=tuple(
             (
                 f"{c.lens_mm:g} mm",
@@ -192,8 +192,7 @@ def _checks(checks: Sequence[PaperCheck]) -> TextTable:
                 f"{c.paper} {c.unit}",
                 f"{c.difference:+.4f}",
                 f"{c.tolerance:g}",
-                "pass" if c.passed else "FAIL",
-                c.note,
+                _verdict(c),
             )
             for c in checks
         ),
@@ -204,20 +203,23 @@ def _checks(checks: Sequence[PaperCheck]) -> TextTable:
 def _claims(claims: Sequence[PaperClaim]) -> TextTable:
     return TextTable(
         title="The paper's further claims",
-        header=("claim", "verdict", "computed", "if", "rule"),
-        cells=tuple((c.claim, _verdict(c), c.computed, c.assumption, c.rule) for c in claims),
-        notes=(
-            "pass or FAIL: under the rule named; true or not true: what follows from an "
-            "assumption, without a rule, so that it cannot fail",
+        header=("claim", "verdict", "computed", "allowed", "if"),
+        cells=tuple(
+            (c.claim, _verdict(c), f"{c.computed:.4g} {c.unit}", _bounds(c), c.assumption)
+            for c in claims
         ),
+        notes=("other readings of these claims, and why they differ: docs/paper-optics.md",),
         listed=True,
     )
 
 
-def _verdict(claim: PaperClaim) -> str:
-    if claim.rule:
-        return "pass" if claim.holds else "FAIL"
-    return "true" if claim.holds else "not true"
+def _bounds(claim: PaperClaim) -> str:
+    bounds = f"at most {claim.most:g} {claim.unit}"
+    return f"{claim.least:g} to {claim.most:g} {claim.unit}" if claim.least else bounds
+
+
+def _verdict(check: PaperCheck | PaperClaim) -> str:
+    return "pass" if check.passed else "FAIL"
 
 
 def angles_table(angles: Sequence[AngleRow]) -> TextTable:
@@ -250,7 +252,7 @@ def angles_table(angles: Sequence[AngleRow]) -> TextTable:
         ),
         notes=(
             "one sensor, lenses to fit; angles of the diagonal; displacement of the corner from a "
-            "paraxial pinhole; viewpoint: where corner rays meet the axis less where central ones "
+            "paraxial pinhole; viewpoint: where corner rays meet the axis minus where central ones "
             "do",
             f"residual of the best virtual pinhole over relief of +/-{RELIEF:.0%}; blue - red in "
             "the corner; corner blur when the centre is in focus",

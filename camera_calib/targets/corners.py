@@ -53,10 +53,10 @@ class Corners:
     pixels: Array
     """(N, 2) from the outer corner of the first pixel; NaN rows were not fitted."""
     sigma_px: Array
-    """(N,) standard deviation of a coordinate, from the misses of the fit; NaN likewise."""
+    """(N,) standard deviation of a coordinate, from the misses of the fit; NaN as above."""
     contrast: Array
     """(N,) half the difference of black and white in linear light; above 0 where the square between
-    the ways back along both steps is black, below 0 where it is white; NaN likewise."""
+    the ways back along both steps is black, below 0 where it is white; NaN as above."""
     states: NDArray[np.intp]
     """(N,) FITTED, a key of REASONS, or UNSEEN where there was nothing to start from."""
 
@@ -120,7 +120,7 @@ def fit_corners(
         pixels_per_square: (N, 2, 2) at each corner, the steps in pixels along one edge (first
             column) and along the other (second column) by one square.
         reach: distance to the next edges that cross these two, in squares.
-        arm: distance to the next edges beside these two, in squares; in between, farther than that
+        arm: distance to the next edges next to these two, in squares; in between, farther than that
             from both edges, there may be anything.
     """
     fits = np.full((len(near), 4), np.nan)
@@ -188,7 +188,7 @@ def _cut(
     window: Array,
     used: NDArray[np.bool_],
 ) -> int:
-    """Fill the window with the pixels around a corner; tell which of them show its edges only."""
+    """Fill the window with the pixels around a corner; report which of them show its edges only."""
     rows, columns = picture.shape
     used[:] = False
     area = steps[0, 0] * steps[1, 1] - steps[0, 1] * steps[1, 0]

@@ -32,7 +32,7 @@ _MOST_ROUNDS = 40
 _MOST_TRIES = 3
 _NEAR = 40
 _ALIKE = 0.15
-"""Least strength of a saddle over that of the stronger one beside which it stands in a start."""
+"""Least strength of a saddle over that of the stronger one next to which it stands in a start."""
 _OFF = 0.15
 """Farthest a grown corner may be from where its neighbours say it is, in squares."""
 _WEAKEST = 0.2
@@ -42,7 +42,7 @@ _LONGEST = 100
 _LEAST_SHARE = 0.5
 """Of the corners that must be fitted."""
 _LEAST_OUTER_SHARE = 0.25
-"""The same of each of the outer rows and columns, which tell where the board ends."""
+"""The same of each of the outer rows and columns, which show where the board ends."""
 
 
 def grown_chessboard(picture: NDArray[np.uint8], shape: tuple[int, int]) -> Array | None:
@@ -68,7 +68,7 @@ def grown_chessboard(picture: NDArray[np.uint8], shape: tuple[int, int]) -> Arra
 
 
 def spans_board(seen: NDArray[np.bool_]) -> bool:
-    """Whether the corners seen, (rows, columns), tell for certain where the board ends."""
+    """Whether the corners seen, (rows, columns), show for certain where the board ends."""
     sides = (seen[0], seen[-1], seen[:, 0], seen[:, -1])
     outer = min(float(side.mean()) for side in sides)
     return bool(seen.mean() >= _LEAST_SHARE and outer >= _LEAST_OUTER_SHARE)

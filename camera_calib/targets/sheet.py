@@ -1,18 +1,27 @@
 """Print a target at true scale: PDF, SVG or PNG, with a bar to check the printer by."""
 
+import io
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
+from reportlab.lib.units import mm
 
 from alice_survey.base.artefacts import atomic_path
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
-from camera_calib.targets.pattern import black_rectangles
-from camera_calib.targets.target import Target, parse_target, write_target
+from camera_calib.targets.target import (
+    TAG_BORDER_BITS,
+    TAG_FAMILY,
+    Target,
+    aruco_dictionary,
+    parse_target,
+    write_target,
+)
 
 PAPERS_MM = {
     "A4": (210.0, 297.0),
@@ -29,10 +38,10 @@ _MARGIN_MM = 8.0
 _STRIP_MM = 11.0
 """Below the pattern, for the bar and the words."""
 _TICK_MM, _LINE_MM, _TEXT_MM = 3.0, 0.3, 2.6
-_POINTS_PER_MM = 72.0 / 25.4
 _LARGEST_PAGE_MM = 5080.0
 """A PDF page is at most 200 inches."""
 _MOST_PIXELS = 600_000_000
+Bits = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -141,41 +150,25 @@ def _bar(x: float, y: float) -> Array:
 
 
 def to_pdf(sheet: Sheet) -> bytes:
-    """The page as a PDF 1.4 of filled rectangles and one line of Helvetica."""
-    scale = _POINTS_PER_MM
+    """The page as a PDF of filled rectangles and one line of Helvetica, to print without scaling.
 
-    def number(value: float) -> str:
-        return f"{value:.5f}".rstrip("0").rstrip(".")
+    The same sheet gives the same bytes.
+    """
+    from reportlab.pdfgen.canvas import Canvas
 
-    drawn = ["0 g"]
-    for x0, y0, x1, y1 in sheet.rectangles_mm:
-        box = (x0, sheet.height_mm - y1, x1 - x0, y1 - y0)
-        drawn.append(" ".join(number(value * scale) for value in box) + " re")
-    drawn.append("f")
-    x, y = sheet.words_at_mm[0] * scale, (sheet.height_mm - sheet.words_at_mm[1]) * scale
-    words = sheet.words.replace("\\", r"\\").replace("(", r"\(").replace(")", r"\)")
-    drawn.append(f"BT /F1 {number(_TEXT_MM * scale)} Tf {number(x)} {number(y)} Td ({words}) Tj ET")
-    content = ("\n".join(drawn) + "\n").encode("ascii")
-    page = f"{number(sheet.width_mm * scale)} {number(sheet.height_mm * scale)}"
-    objects = [
-        b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
-        b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
-        (
-            f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {page}] /Contents 4 0 R "
-            "/Resources << /Font << /F1 5 0 R >> >> >>"
-        ).encode("ascii"),
-        b"<< /Length %d >>\nstream\n%sendstream" % (len(content), content),
-        b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica >>",
-    ]
-    file, starts = b"%PDF-1.4\n", []
-    for i, thing in enumerate(objects, start=1):
-        starts.append(len(file))
-        file += b"%d 0 obj\n%s\nendobj\n" % (i, thing)
-    table = b"".join(b"%010d 00000 n \n" % start for start in starts)
-    count = len(objects) + 1
-    file += b"xref\n0 %d\n0000000000 65535 f \n%s" % (count, table)
-    place = file.rindex(b"xref\n0 ")
-    return file + b"trailer\n<< /Size %d /Root 1 0 R >>\nstartxref\n%d\n%%%%EOF\n" % (count, place)
+    file = io.BytesIO()
+    page = (sheet.width_mm * mm, sheet.height_mm * mm)
+    canvas = Canvas(file, pagesize=page, invariant=True, pageCompression=False)
+    canvas.setViewerPreference("PrintScaling", "None")
+    path = canvas.beginPath()
+    for x0, y0, x1, y1 in sheet.rectangles_mm * mm:
+        path.rect(x0, page[1] - y1, x1 - x0, y1 - y0)
+    canvas.drawPath(path, stroke=0, fill=1)
+    canvas.setFont("Helvetica", _TEXT_MM * mm)
+    x, y = sheet.words_at_mm
+    canvas.drawString(x * mm, page[1] - y * mm, sheet.words)
+    canvas.save()
+    return file.getvalue()
 
 
 def to_svg(sheet: Sheet) -> str:
@@ -228,7 +221,7 @@ def _shares(low: float, high: float) -> tuple[slice, NDArray[np.float32]]:
 def write_sheet(
     target: Target, path: Path, paper: str | None = None, dpi: float = 300.0
 ) -> tuple[Path, Sheet]:
-    """Write a page to print, and beside it the target's JSON file, for calibrations.
+    """Write a page to print, and next to it the target's JSON file, for calibrations.
 
     Args:
         target: what to print.
@@ -292,3 +285,64 @@ def print_target(
         "ambiguous": target.is_ambiguous,
     }
     return "\n".join(lines), data
+
+
+def black_rectangles(target: Target) -> Array:
+    """The black areas of a target; they touch, but do not overlap.
+
+    Returns:
+        (M, 4) least x, least y, greatest x, greatest y in the target's frame, metres.
+    """
+    if target.kind == "apriltag":
+        return _apriltag(target)
+    return _chessboard(target)
+
+
+def _chessboard(target: Target) -> Array:
+    """The black squares, and the markers in the white ones."""
+    rows, columns = (count + 1 for count in target.shape)
+    y, x = np.mgrid[-1 : rows - 1, -1 : columns - 1]
+    black = (x + y + target.first_square_white) % 2 == 0
+    corners = np.column_stack([x[black], y[black]]) * target.size_m
+    parts = [np.column_stack([corners, corners + target.size_m])]
+    if target.marker_m is not None:
+        for number, place in enumerate(target.marker_places):
+            bits = marker_bits(str(target.dictionary), number, 1)
+            parts.append(_bit_rectangles(bits, place, target.marker_m))
+    return np.concatenate(parts)
+
+
+def _apriltag(target: Target) -> Array:
+    """The tags as Kalibr prints them, and the small squares between their corners."""
+    parts = []
+    for number, place in enumerate(target.marker_places):
+        # Kalibr's tags stand upside down against OpenCV's.
+        bits = np.rot90(marker_bits(TAG_FAMILY, number, TAG_BORDER_BITS), 2)
+        parts.append(_bit_rectangles(bits, place, target.size_m))
+    gap = target.size_m * float(target.spacing or 0.0)
+    places = target.points[:, :2].reshape(*target.shape, 2)
+    x = np.concatenate([[-gap], places[0, 1::2, 0]])
+    y = np.concatenate([[-gap], places[1::2, 0, 1]])
+    corners = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    parts.append(np.column_stack([corners, corners + gap]))
+    return np.concatenate(parts)
+
+
+def marker_bits(dictionary: str, number: int, border: int) -> Bits:
+    """Which bits of a marker are black, with its border, as OpenCV draws it upright."""
+    known = aruco_dictionary(dictionary)
+    side = known.markerSize + 2 * border
+    picture = cv2.aruco.generateImageMarker(known, number, side, borderBits=border)
+    black: Bits = picture == 0
+    return black
+
+
+def _bit_rectangles(black: Bits, place: Array, side_m: float) -> Array:
+    """Rectangles of runs of black bits along the rows."""
+    bit = side_m / black.shape[1]
+    rows = []
+    for j, row in enumerate(black):
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], row.astype(int), [0]])))
+        rows += [(a, j, b, j + 1) for a, b in edges.reshape(-1, 2)]
+    rectangles: Array = np.array(rows, dtype=np.float64).reshape(-1, 4) * bit + np.tile(place, 2)
+    return rectangles

@@ -5,7 +5,7 @@ down along the columns, z into the board, away from the camera. Points are numbe
 the top left, as the board is read when it hangs upright.
 
 - A chessboard's points are its inner corners. The square at its top left is black wherever that can
-  be told (see `Target.symmetries`).
+  be distinguished (see `Target.symmetries`).
 - A ChArUco board is OpenCV's: its points are the inner corners too, and the markers, in the white
   squares, count row by row from the top left. `legacy` is the layout before OpenCV 4.6: boards with
   an even number of rows then begin with a white square.
@@ -252,7 +252,7 @@ class Target:
         """The inverse of `to_json`.
 
         Raises:
-            CalibrationError: it is no target, or a newer one than this program knows.
+            CalibrationError: it is not a target, or a newer one than this program knows.
         """
         if not isinstance(data, dict) or data.get("format") != FORMAT:
             raise CalibrationError(f'target: its file must hold "format": "{FORMAT}"')
@@ -362,14 +362,14 @@ def _dictionary_called(word: str) -> str:
 def _counts(word: str) -> tuple[int, int]:
     match = re.fullmatch(r"(\d{1,6})[xX](\d{1,6})", word)
     if match is None:
-        raise CalibrationError(f"target: '{word}' is no pair of counts such as 9x6")
+        raise CalibrationError(f"target: '{word}' is not a pair of counts such as 9x6")
     return int(match[1]), int(match[2])
 
 
 def _length_m(word: str) -> float:
     match = re.fullmatch(r"(\d+\.?\d*|\.\d+)(mm|cm|m)", word)
     if match is None:
-        raise CalibrationError(f"target: '{word}' is no length with its unit, such as 25mm")
+        raise CalibrationError(f"target: '{word}' is not a length with its unit, such as 25mm")
     return round(float(match[1]) * _UNITS_M[match[2]], 12)
 
 
@@ -377,4 +377,4 @@ def _number(word: str, name: str) -> float:
     try:
         return float(word)
     except ValueError:
-        raise CalibrationError(f"target: {name} '{word}' is no number") from None
+        raise CalibrationError(f"target: {name} '{word}' is not a number") from None

@@ -6,6 +6,7 @@ not at all, and none depends on another.
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
+from datetime import UTC
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.artefacts import atomic_path, read_json, write_csv, write_json
+from alice_survey.base.artefacts import (
+    atomic_path,
+    write_csv,
+    write_json,
+)
 from alice_survey.base.config import SurveyConfig
-from alice_survey.base.errors import ImageError, NavigationError, WorkspaceError
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.errors import ImageError, NavigationError
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array, interpolate_poses, pose_to_json
 from alice_survey.base.manifest import ImageRecord, write_manifest
-from alice_survey.base.records import BoardRecord, PicturesRecord, PlaceRecord
+from alice_survey.base.records import BoardRecord, PicturesRecord
 from alice_survey.base.trajectory import Trajectory, read_columns, read_track
 from alice_survey.seafloor.as_built import true_rig
 from alice_survey.seafloor.board import PoolBoard, board_records, pool_poses, render_board
@@ -30,8 +35,11 @@ from alice_survey.seafloor.renderer import Scene, flat_floor_radiance, range_map
 from alice_survey.seafloor.sensor import Sensor, develop, expose, make_sensor, nominal_gain
 from alice_survey.seafloor.terrain import read_terrain, survey_terrain
 from alice_survey.seafloor.texture import SAND_ALBEDO, survey_texture
+from camera_calib.flat_port import FlatPortCamera
 from camera_calib.rig import Rig, read_rig, write_rig
 from camera_calib.water import water_optics
+from missions.logs.navigation_csv import read_navigation
+from missions.values.plan_file import read_plan
 
 CAMERAS = ("left", "right")
 VERTICAL_DATUM = "sea surface at the datum (simulated)"
@@ -41,13 +49,6 @@ MOMENTS = 16
 _POOL_STREAM, _POOL_NOISE_STREAM, _NOISE_STREAM = 3500, 3501, 3300
 _POOL_WHITE = 0.6
 """Share of the full well that a white of full reflectance fills in the pool."""
-_NAVIGATION = (
-    "latitude_deg", "longitude_deg", "depth_m", "roll_deg", "pitch_deg", "heading_deg",
-    "altitude_m", "sigma_horizontal_m", "sigma_depth_m", "sigma_attitude_deg", "sigma_heading_deg",
-    "sigma_altitude_m",
-)  # fmt: skip
-_BLANK_WITHOUT_BOTTOM = ("altitude_m", "sigma_altitude_m")
-_ANGLES = ("longitude_deg", "roll_deg", "pitch_deg", "heading_deg")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,20 +63,20 @@ class _Shoot:
     """Size and time of the files that workers read, so that none keeps what has changed."""
 
 
-def run_pool(workspace: Path, config: SurveyConfig, threads: int, folder: Path) -> None:
+def run_pool(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
     """Take the stereo pictures of a chessboard in a pool."""
     board = PoolBoard()
-    rig = true_rig(config)
+    rig = true_rig(config.camera, config.water, scale=config.imaging.scale, seed=config.seed)
     rng = np.random.default_rng([config.seed, _POOL_STREAM])
     poses = pool_poses(board, rig, config.imaging.pool_views, rng)
     shown = board_records(rig, poses)
     shoot = _Shoot(folder=folder, config=config, exposure_s=0.0, altitude_m=0.0)
     jobs = [
-        (shoot, board, view, camera, pose.as_matrix())
+        (shoot, board, view, camera, rig.cameras[camera], pose.as_matrix())
         for view, by_camera in enumerate(shown)
         for camera, pose in by_camera.items()
     ]
-    records = list(parallel_map(_take_board, jobs, threads=threads, label="pool pictures"))
+    records = list(executor.map(_take_board, jobs, label="pool pictures"))
     write_manifest(folder / "manifest.csv", records)
     BoardRecord(**asdict(board)).write(folder / "board.json")
     write_rig(folder / "truth" / "rig.json", rig)
@@ -90,14 +91,13 @@ def run_pool(workspace: Path, config: SurveyConfig, threads: int, folder: Path) 
     )
 
 
-def _take_board(job: tuple[_Shoot, PoolBoard, int, str, Array]) -> ImageRecord:
-    shoot, board, view, camera, matrix = job
+def _take_board(job: tuple[_Shoot, PoolBoard, int, str, FlatPortCamera, Array]) -> ImageRecord:
+    shoot, board, view, camera, one, matrix = job
     config = shoot.config
     image = f"{camera}/{view:02d}.{config.imaging.image_format}"
     record = ImageRecord(image=image, camera=camera, station=view)
     if (shoot.folder / image).exists():
         return record
-    one = true_rig(config).cameras[camera]
     # Large pixels need more rays for the same precision of an edge on the board.
     samples = config.imaging.samples + (1 if config.imaging.scale > 1 else 0)
     light = render_board(board, one, RigidTransform.from_matrix(matrix), samples)
@@ -114,7 +114,7 @@ def _take_board(job: tuple[_Shoot, PoolBoard, int, str, Array]) -> ImageRecord:
     return record
 
 
-def run_images(workspace: Path, config: SurveyConfig, threads: int, folder: Path) -> None:
+def run_images(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
     """Take the pictures of a flown survey.
 
     Raises:
@@ -124,29 +124,34 @@ def run_images(workspace: Path, config: SurveyConfig, threads: int, folder: Path
     flight = workspace / "flight"
     triggers, navigation = flight / "triggers.csv", flight / "navigation.csv"
     track = flight / "truth" / "track.csv"
-    planned = _read_plan(workspace / "plan" / "plan.json")
+    planned = read_plan(workspace / "plan" / "plan.json")
     rows = read_columns(triggers, ("station", "time_s"))
     stations = [(int(s), float(t)) for s, t in zip(*rows.values(), strict=True)]
     if not stations:
         raise NavigationError(f"{triggers} holds no trigger: plan a larger area")
     truth = read_track(track)
     believed = _believed(navigation, np.array([t for _, t in stations]))
-    rig = true_rig(config)
+    rig = true_rig(config.camera, config.water, scale=config.imaging.scale, seed=config.seed)
     terrain = folder / "truth" / "terrain.ply"
     if not terrain.with_suffix(".json").exists():
-        survey_terrain(config, planned["within_ne_m"]).write(terrain)
+        floor = survey_terrain(
+            config.seafloor,
+            planned.area.allowed_corners_ne,
+            margin_m=config.plan.altitude_m,
+            depth_m=config.area.seafloor_depth_m,
+            seed=config.seed,
+        )
+        floor.write(terrain)
     write_rig(folder / "truth" / "rig.json", rig)
     shoot = _Shoot(
         folder=folder,
         config=config,
-        exposure_s=planned["exposure_s"],
-        altitude_m=planned["altitude_m"],
+        exposure_s=planned.exposure_s,
+        altitude_m=planned.altitude_m,
         stamp=(terrain.stat().st_size, terrain.stat().st_mtime_ns),
     )
     jobs = _jobs(shoot, stations, truth)
-    images = list(
-        parallel_map(_take, jobs, threads=threads, label="pictures", total=2 * len(stations))
-    )
+    images = list(executor.map(_take, jobs, label="pictures", total=2 * len(stations)))
     records = [
         replace(
             believed[i // 2],
@@ -158,53 +163,29 @@ def run_images(workspace: Path, config: SurveyConfig, threads: int, folder: Path
     ]
     write_manifest(folder / "manifest.csv", records)
     _write_poses(folder / "truth" / "poses.csv", records, stations, truth, rig)
-    PicturesRecord(
-        source="simulated",
-        datum=PlaceRecord(**planned["datum"]),
-        vertical_datum=VERTICAL_DATUM,
-        notes=("pictures are rendered: a simulated sea floor, lit by strobes alone",),
-    ).write(folder / "survey.json")
-
-
-def _read_plan(path: Path) -> dict[str, Any]:
-    data = read_json(path)
-    try:
-        return {
-            "exposure_s": float(data["exposure_s"]),
-            "altitude_m": float(data["altitude_m"]),
-            "within_ne_m": _corners(data["area"]["allowed"]["coordinates"]),
-            "datum": {key: float(data["datum"][key]) for key in ("latitude_deg", "longitude_deg")},
-        }
-    except (KeyError, TypeError, ValueError) as error:
-        raise WorkspaceError(f"{path}: {error!r} is missing or wrong; plan again") from None
-
-
-def _corners(nested: Any) -> list[list[float]]:
-    """All points of the nested lists of a GeoJSON geometry."""
-    if nested and isinstance(nested[0], (int, float)):
-        return [[float(nested[0]), float(nested[1])]]
-    return [point for part in nested for point in _corners(part)]
+    PicturesRecord.save(
+        folder / "survey.json",
+        {
+            "source": "simulated",
+            "datum": {
+                "latitude_deg": planned.datum.latitude_deg,
+                "longitude_deg": planned.datum.longitude_deg,
+            },
+            "vertical_datum": VERTICAL_DATUM,
+            "notes": ["pictures are rendered: a simulated sea floor, lit by strobes alone"],
+        },
+    )
 
 
 def _believed(path: Path, at_s: Array) -> list[ImageRecord]:
     """What the navigation log says at some times: rows of the manifest that lack their picture."""
-    log = read_columns(path, ("time_s", *_NAVIGATION), _BLANK_WITHOUT_BOTTOM)
-    time_s = log["time_s"]
-    if not np.all(np.diff(time_s) > 0):
-        raise NavigationError(f"{path}: time_s must increase from row to row")
-    if len(time_s) < 2 or at_s.min() < time_s[0] or at_s.max() > time_s[-1]:
+    log = read_navigation(path, UTC)
+    if at_s.min() < log.time_s[0] or at_s.max() > log.time_s[-1]:
         raise NavigationError(
-            f"{path} covers {time_s[0]:.2f} to {time_s[-1]:.2f} s, but triggers go from "
+            f"{path} covers {log.time_s[0]:.2f} to {log.time_s[-1]:.2f} s, but triggers go from "
             f"{at_s.min():.2f} to {at_s.max():.2f} s: fly again"
         )
-    columns = {"time_s": at_s}
-    for name in _NAVIGATION:
-        values = log[name]
-        if name in _ANGLES:  # across north, and across the date line, the short way
-            values = np.rad2deg(np.unwrap(np.deg2rad(values)))
-        columns[name] = np.interp(at_s, time_s, values)
-    columns["heading_deg"] %= 360.0
-    columns["longitude_deg"] = (columns["longitude_deg"] + 180.0) % 360.0 - 180.0
+    columns = {"time_s": at_s, **log.at(at_s)}
     nameless = ImageRecord(image="", camera="", station=0)
     return [
         replace(nameless, **{name: float(values[i]) for name, values in columns.items()})  # type: ignore[arg-type]
@@ -267,7 +248,7 @@ def _studio(shoot: _Shoot) -> tuple[Scene, Rig, dict[str, CameraLight], Sensor, 
     """What a process needs for all of its pictures: sea floor, rig, light, sensor and gain."""
     config, truth = shoot.config, shoot.folder / "truth"
     rig, water = read_rig(truth / "rig.json"), water_optics(config.water.jerlov)
-    scene = Scene(terrain=read_terrain(truth / "terrain.ply"), texture=survey_texture(config))
+    scene = Scene(terrain=read_terrain(truth / "terrain.ply"), texture=survey_texture(config.seed))
     reach_m = 2.0 * shoot.altitude_m + 1.0
     lights = {
         name: camera_light(camera, rig.body_from_cam(name), config.imaging, water, reach_m)

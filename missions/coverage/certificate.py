@@ -1,8 +1,8 @@
 """The certificate of coverage: what all pictures together see of the survey area."""
 
+import itertools
 import math
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.errors import PlanError, warn
+from alice_survey.base.executor import SERIAL, Executor
 from alice_survey.base.frames import Array
-from alice_survey.base.run import progress
 from camera_calib.rig import Rig
 from missions.coverage.raster import (
     Grid,
@@ -30,8 +30,8 @@ _CELLS_PER_FOOTPRINT = 20.0
 _LEAST_CELLS = 40_000
 """Of a small area, so that its shares are told finely."""
 _MOST_CELLS = 16_000_000
-_TILE = 2048
-"""Cells a side that are worked on at once: about 90 MB for two cameras."""
+_TILE, _TILE_MIB = 2048, 90
+"""Cells a side that are worked on at once, and the memory that they take for two cameras."""
 _CHUNK = 8192
 """Stations whose borders are kept at once: about 17 MB for two cameras."""
 
@@ -152,7 +152,27 @@ class Certificate:
         }
 
 
-@progress.step("count the views of each place")
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _TileTask:
+    """A part of the area whose views are counted."""
+
+    grid: Grid
+    rays: tuple[Array, Array]
+    stations: Stations
+    inside: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _TileCounts:
+    """What was counted in a part of the area."""
+
+    maps: dict[str, Counts]
+    pictures: list[NDArray[np.intp]]
+    """Of each camera: how many cells of the area are in 0, 1, ... pictures."""
+    lines: list[NDArray[np.intp]]
+    """The same for lines."""
+
+
 def certificate(
     area: Area,
     rig: Rig,
@@ -160,7 +180,7 @@ def certificate(
     pattern: Pattern,
     *,
     cell_m: float | None = None,
-    threads: int = 1,
+    executor: Executor = SERIAL,
 ) -> Certificate:
     """Certify what pictures see of an area.
 
@@ -171,7 +191,7 @@ def certificate(
         pattern: the overlap asked for.
         cell_m: of the grid; left out, a twentieth of a footprint, less for a small area, and more
             where that would be over 16 million cells.
-        threads: how many parts of a large area are worked on at once.
+        executor: where the parts of a large area are worked on.
 
     Raises:
         PlanError: `cell_m` is not positive, or would make too large a grid.
@@ -193,29 +213,22 @@ def certificate(
         for name in ("pictures", "least_pictures", "least_lines", "pairs")
     }
 
-    def work(tile: tuple[int, int]) -> tuple[list[NDArray[np.intp]], list[NDArray[np.intp]]]:
-        part = grid.part(*tile, _TILE, _TILE)
-        here = (slice(tile[0], tile[0] + part.rows), slice(tile[1], tile[1] + part.columns))
-        within = mask[here]
-        if not within.any():
-            return [], []
-        pictures, lines, pairs = _counts(part, rays, stations.some(_near(part, stations, reach_m)))
-        result["pictures"][here] = np.minimum(pictures.sum(axis=0, dtype=np.uint32), 65535)
-        result["least_pictures"][here] = pictures.min(axis=0)
-        result["least_lines"][here] = lines.min(axis=0)
-        result["pairs"][here] = pairs
-        return (
-            [np.bincount(counts[within]) for counts in pictures],
-            [np.bincount(counts[within]) for counts in lines],
-        )
-
-    tiles = [(i, j) for i in range(0, grid.rows, _TILE) for j in range(0, grid.columns, _TILE)]
-    if threads > 1 and len(tiles) > 1:
-        with ThreadPoolExecutor(threads) as executor:
-            counted = list(executor.map(work, tiles))
-    else:
-        counted = [work(tile) for tile in tiles]
-    worked = [pair for pair in counted if pair[0]]
+    places, tasks = [], []
+    for row, column in itertools.product(range(0, grid.rows, _TILE), range(0, grid.columns, _TILE)):
+        part = grid.part(row, column, _TILE, _TILE)
+        here = (slice(row, row + part.rows), slice(column, column + part.columns))
+        if mask[here].any():
+            near = stations.some(_near(part, stations, reach_m))
+            places.append(here)
+            tasks.append(_TileTask(grid=part, rays=rays, stations=near, inside=mask[here]))
+    tiles = []
+    found = executor.map(
+        count_tile, tasks, label="count the views of each place", task_mib=_TILE_MIB
+    )
+    for here, tile in zip(places, found, strict=True):
+        for name, counts in tile.maps.items():
+            result[name][here] = counts
+        tiles.append(tile)
     return Certificate(
         area=area,
         pattern=pattern,
@@ -224,8 +237,8 @@ def certificate(
         blind=blind,
         grid=grid,
         inside=mask,
-        histograms={n: _histogram([p[0][i] for p in worked]) for i, n in enumerate(names)},
-        line_histograms={n: _histogram([p[1][i] for p in worked]) for i, n in enumerate(names)},
+        histograms={n: _histogram([t.pictures[i] for t in tiles]) for i, n in enumerate(names)},
+        line_histograms={n: _histogram([t.lines[i] for t in tiles]) for i, n in enumerate(names)},
         **result,
     )
 
@@ -286,6 +299,21 @@ def _near(grid: Grid, stations: Stations, reach_m: Array) -> NDArray[np.bool_]:
     beyond_m = np.linalg.norm(np.maximum(off, 0.0), axis=1) * grid.cell_m
     near: NDArray[np.bool_] = beyond_m <= reach_m + 1e-6
     return near
+
+
+def count_tile(task: _TileTask) -> _TileCounts:
+    """Count the views of each cell of a part of the area."""
+    pictures, lines, pairs = _counts(task.grid, task.rays, task.stations)
+    return _TileCounts(
+        maps={
+            "pictures": np.minimum(pictures.sum(axis=0, dtype=np.uint32), 65535).astype(np.uint16),
+            "least_pictures": pictures.min(axis=0),
+            "least_lines": lines.min(axis=0),
+            "pairs": pairs,
+        },
+        pictures=[np.bincount(counts[task.inside]) for counts in pictures],
+        lines=[np.bincount(counts[task.inside]) for counts in lines],
+    )
 
 
 def _counts(

@@ -12,7 +12,7 @@ from shapely.affinity import translate
 
 from alice_survey.base.config import PlanConfig
 from camera_calib.flat_port import FlatPortCamera
-from camera_calib.fov.table import apparent_distance_m
+from camera_calib.fov.focus import apparent_distance_m
 from camera_calib.rig import Rig
 from missions.exposure.conflicts import Way, conflict
 from missions.exposure.table import Setting

@@ -9,15 +9,23 @@ from pathlib import Path
 from typing import Any
 
 from alice_survey.base.artefacts import Stage, need_stage, run_stage, write_json
-from alice_survey.base.config import SurveyConfig
+from alice_survey.base.config import CameraConfig, PlanConfig, SurveyConfig, WaterConfig
 from alice_survey.base.errors import PlanError, warn
+from alice_survey.base.executor import SERIAL, Executor, local_executor
+from alice_survey.seafloor.terrain import survey_terrain
 from camera_calib.rig import Rig, design_rig, read_rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.dives import DiveRecord, read_dive_record
 from missions.coverage.geofiles import write_coverage_tif, write_holes
 from missions.coverage.holes import Hole, find_holes
 from missions.coverage.stations import plan_pattern, stations_of_plan
-from missions.fly.monte_carlo import MonteCarlo, monte_carlo
+from missions.exports.options import options_of
+from missions.fly.monte_carlo import MonteCarlo
+from missions.fly.monte_carlo import monte_carlo as fly_often
+from missions.fly.refly import refly_plan
+from missions.fly.simulation import flight_settings, floor_grid
+from missions.plan.strength import survey_costs
+from missions.route.energy import usable_wh
 from missions.values.plan_file import Plan, read_plan
 
 _LISTED = 20
@@ -25,7 +33,7 @@ _LISTED = 20
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Check:
-    """A dive beside its plan."""
+    """A dive next to its plan."""
 
     plan: Plan
     rig: Rig
@@ -51,47 +59,35 @@ class Check:
         }
 
 
-def check_flight(workspace: Path, config: SurveyConfig) -> Check:
-    """Certify the simulated flight of a workspace by its true track.
-
-    Raises:
-        WorkspaceError: there is no plan or no flight.
-    """
-    flight = need_stage(workspace, "flight", "fly")
-    return check_log(workspace, config, flight)
-
-
 def check_log(
     workspace: Path,
-    config: SurveyConfig,
+    rig: Rig,
     log: Path,
     *,
     triggers: Path | None = None,
     manifest: Path | None = None,
-    threads: int = 1,
+    executor: Executor = SERIAL,
 ) -> Check:
     """Certify a dive by its log.
 
     Args:
-        workspace: with the plan, and with `calibration/rig.json` or `images/rig.json` where the
-            cameras were calibrated; else they are as designed.
-        config: the survey, for the design of the cameras and the water.
+        workspace: with the plan.
+        rig: the cameras in the survey's water.
         log: navigation CSV, or the folder of a simulated flight.
         triggers: CSV with the times of the pictures.
         manifest: `images/manifest.csv` in its place.
-        threads: for large areas.
+        executor: where tasks run, of a large area.
 
     Raises:
         WorkspaceError: there is no plan.
         NavigationError: the log or the triggers cannot be used.
     """
     plan = read_plan(need_stage(workspace, "plan", "plan") / "plan.json")
-    rig = rig_of(workspace, config)
     record = read_dive_record(log, plan, rig, triggers=triggers, manifest=manifest)
     pattern = plan_pattern(plan, rig)
-    planned = certificate(plan.area, rig, stations_of_plan(plan), pattern, threads=threads)
+    planned = certificate(plan.area, rig, stations_of_plan(plan), pattern, executor=executor)
     flown = certificate(
-        plan.area, rig, record.stations, pattern, cell_m=planned.grid.cell_m, threads=threads
+        plan.area, rig, record.stations, pattern, cell_m=planned.grid.cell_m, executor=executor
     )
     if flown.blind:
         they = "station looks" if flown.blind == 1 else "stations look"
@@ -101,13 +97,19 @@ def check_log(
     )
 
 
-def rig_of(workspace: Path, config: SurveyConfig) -> Rig:
-    """The cameras of a workspace in the survey's water: calibrated, or else as designed."""
+def rig_of(workspace: Path, camera: CameraConfig, water: WaterConfig) -> Rig:
+    """The cameras of a workspace in the survey's water: calibrated, or else as designed.
+
+    Args:
+        workspace: with `calibration/rig.json` or `images/rig.json` where they were calibrated.
+        camera: the design.
+        water: of the survey.
+    """
     for folder in ("calibration", "images"):
         path = workspace / folder / "rig.json"
         if path.is_file():
-            return read_rig(path).in_water(config.water.n_water)
-    return design_rig(config.camera, config.water)
+            return read_rig(path).in_water(water.n_water)
+    return design_rig(camera, water)
 
 
 def check_report(
@@ -119,7 +121,7 @@ def check_report(
     manifest: Path | None = None,
     out: Path | None = None,
     monte_carlo: int = 0,
-    threads: int | None = None,
+    executor: Executor | None = None,
 ) -> tuple[str, dict[str, Any]]:
     """Check a dive, write what is found, and plan the holes again.
 
@@ -134,7 +136,7 @@ def check_report(
         manifest: as of `check_log`.
         out: folder to write; left out, `check` in the workspace.
         monte_carlo: fly the plan so many times in simulation, too.
-        threads: processes.
+        executor: where tasks run; all cores of this machine when left out.
 
     Returns:
         A report as text, and as JSON values.
@@ -142,30 +144,55 @@ def check_report(
     Raises:
         AliceError: a file is missing or cannot be used.
     """
-    from alice_survey.base.executor import default_threads
-
-    cores = default_threads() if threads is None else threads
-    if log is None and triggers is None and manifest is None:
-        check = check_flight(workspace, config)
-    else:
-        path = need_stage(workspace, "flight", "fly") if log is None else log
-        check = check_log(
-            workspace, config, path, triggers=triggers, manifest=manifest, threads=cores
-        )
+    executor = executor or local_executor()
+    path = need_stage(workspace, "flight", "fly") if log is None else log
+    rig = rig_of(workspace, config.camera, config.water)
+    check = check_log(workspace, rig, path, triggers=triggers, manifest=manifest, executor=executor)
     folder = workspace / "check" if out is None else out
     (folder / "hole_probability.png").unlink(missing_ok=True)  # of an earlier check
     if not check.holes and (folder / "refly").exists():
         warn(f"{folder / 'refly'} is of an earlier check: there are no holes now")
     data = check.to_json()
-    text = _told(check)
-    again = _write_refly(folder, check, config) if check.holes else None
-    if again is not None:
-        data["refly"] = again
-        text += _told_refly(again)
+    text = _check_text(check)
+    if check.holes:
+        try:
+            plan = refly_plan(
+                check.plan,
+                check.rig,
+                check.flown,
+                check.holes,
+                costs=survey_costs(config),
+                settings=config.plan,
+                usable_wh=usable_wh(config.vehicle),
+            )
+        except PlanError as error:
+            warn(f"the holes cannot be planned again: {error}")
+        else:
+            again = _write_refly(
+                folder / "refly", plan, check, config.camera, config.water, config.plan
+            )
+            data["refly"] = again
+            text += _refly_text(again)
     if monte_carlo:
-        flights = _fly_often(folder, check, config, monte_carlo, cores)
+        terrain = survey_terrain(
+            config.seafloor,
+            check.plan.area.allowed_corners_ne,
+            margin_m=config.plan.altitude_m,
+            depth_m=config.area.seafloor_depth_m,
+            seed=config.seed,
+        )
+        flights = fly_often(
+            check.plan,
+            flight_settings(config),
+            check.rig,
+            floor_grid(terrain),
+            seed=config.seed,
+            flights=monte_carlo,
+            executor=executor,
+        )
+        _draw_flights(folder, check.plan, flights)
         data["monte_carlo"] = flights.to_json()
-        text += _told_flights(flights)
+        text += _flights_text(flights)
     _write(folder, check, data)
     files = "certificate.json, coverage.png, coverage.tif, holes.geojson"
     files += ", hole_probability.png" if monte_carlo else ""
@@ -185,27 +212,26 @@ def _write(folder: Path, check: Check, data: dict[str, Any]) -> None:
     write_json(folder / "certificate.json", data)
 
 
-def _write_refly(folder: Path, check: Check, config: SurveyConfig) -> dict[str, Any] | None:
-    """Plan the holes again, as a workspace to fly in; None where that cannot be done."""
-    from missions.exports.options import options_of
+def _write_refly(
+    folder: Path,
+    plan: Plan,
+    check: Check,
+    camera: CameraConfig,
+    water: WaterConfig,
+    settings: PlanConfig,
+) -> dict[str, Any]:
+    """Write the plan of the holes as a workspace to fly in."""
     from missions.exports.write import write_exports
-    from missions.fly.refly import refly_plan
 
-    refly = folder / "refly"
-    try:
-        plan = refly_plan(check.plan, config, check.rig, check.flown, check.holes)
-    except PlanError as error:
-        warn(f"the holes cannot be planned again: {error}")
-        return None
     values = plan.to_json()
     text = json.dumps(values, sort_keys=True)
     stage = Stage(
         name="plan",
         version=1,
         settings={
-            "camera": config.camera.model_dump(mode="json"),
-            "water": config.water.model_dump(mode="json"),
-            "plan": config.plan.model_dump(mode="json"),
+            "camera": camera.model_dump(mode="json"),
+            "water": water.model_dump(mode="json"),
+            "plan": settings.model_dump(mode="json"),
             "refly_of": check.plan.name,
             "digest": hashlib.blake2b(text.encode(), digest_size=16).hexdigest(),
         },
@@ -213,12 +239,12 @@ def _write_refly(folder: Path, check: Check, config: SurveyConfig) -> dict[str, 
 
     def work(part: Path) -> None:
         write_json(part / "plan.json", values)
-        options = options_of(config.camera, config.plan)
+        options = options_of(camera, settings)
         write_exports(part / "exports", plan, check.rig, options=options)
 
-    run_stage(refly, stage, work)
+    run_stage(folder, stage, work)
     return {
-        "folder": str(refly),
+        "folder": str(folder),
         "lines": len(plan.lines),
         "stations": plan.stations,
         "dives": len(plan.dives),
@@ -230,26 +256,18 @@ def _write_refly(folder: Path, check: Check, config: SurveyConfig) -> dict[str, 
     }
 
 
-def _fly_often(
-    folder: Path, check: Check, config: SurveyConfig, flights: int, threads: int
-) -> MonteCarlo:
-    from alice_survey.seafloor.terrain import survey_terrain
+def _draw_flights(folder: Path, plan: Plan, result: MonteCarlo) -> None:
     from missions.coverage.drawing import draw_risk
-    from missions.fly.simulation import floor_grid
 
-    floor = floor_grid(survey_terrain(config, check.plan.area.allowed_corners_ne))
-    result = monte_carlo(check.plan, config, check.rig, floor, flights, threads)
     folder.mkdir(parents=True, exist_ok=True)
     draw_risk(
-        folder / "hole_probability.png", check.plan.area, result.planned.grid,
-        result.hole_probability,
-        f"{check.plan.name}: holes in {flights} simulated flight{_s(flights)}",
-        _told_flights(result).strip(),
+        folder / "hole_probability.png", plan.area, result.planned.grid, result.hole_probability,
+        f"{plan.name}: holes in {result.flights} simulated flight{_s(result.flights)}",
+        _flights_text(result).strip(),
     )  # fmt: skip
-    return result
 
 
-def _told(check: Check) -> str:
+def _check_text(check: Check) -> str:
     record, planned, flown = check.record, check.planned, check.flown
     pattern = flown.pattern
     pictures = pattern.passes * pattern.pictures
@@ -269,7 +287,7 @@ def _told(check: Check) -> str:
             f"  left out: {count} ({count / record.triggered:.1%}) {reason}"
             for reason, count in record.left_out.items()
         ),
-        *_told_way(record),
+        *_way_rows(record),
         *(f"  {note}" for note in record.notes),
         f"{check.plan.name}: {flown.area_m2:.1f} m2, cameras {', '.join(flown.cameras)} "
         f"({check.rig.source}), judged every {100 * flown.grid.cell_m:.1f} cm",
@@ -278,12 +296,12 @@ def _told(check: Check) -> str:
         f"  {'pictures':<{width}}  {planned.taken:>9}  {flown.taken:>9}",
         f"  {'fewest pictures of a camera':<{width}}  {planned.fewest_pictures:>9}  "
         f"{flown.fewest_pictures:>9}",
-        *_told_holes(check.holes),
+        *_hole_rows(check.holes),
     ]
     return "\n".join(lines)
 
 
-def _told_way(record: DiveRecord) -> list[str]:
+def _way_rows(record: DiveRecord) -> list[str]:
     if not record.on_way:
         return []
     return [
@@ -292,12 +310,12 @@ def _told_way(record: DiveRecord) -> list[str]:
     ]
 
 
-def _told_holes(holes: Sequence[Hole]) -> list[str]:
+def _hole_rows(holes: Sequence[Hole]) -> list[str]:
     if not holes:
         return ["no holes"]
     whole = sum(hole.area_m2 for hole in holes)
     unseen = sum(hole.unseen_m2 for hole in holes)
-    told = [
+    rows = [
         f"{len(holes)} hole{_s(len(holes))}, {whole:.2f} m2 short of that overlap, of which "
         f"{unseen:.2f} m2 in no picture; worst first:",
         f"  {'':>3}  {'area m2':>8}  {'unseen m2':>9}  {'size m':>13}  {'latitude':>12}  "
@@ -305,18 +323,18 @@ def _told_holes(holes: Sequence[Hole]) -> list[str]:
     ]
     for number, hole in enumerate(holes[:_LISTED], 1):
         size = f"{hole.length_m:.2f} x {hole.width_m:.2f}"
-        told.append(
+        rows.append(
             f"  {number:>3}  {hole.area_m2:>8.2f}  {hole.unseen_m2:>9.2f}  {size:>13}  "
             f"{hole.latitude_deg:>12.7f}  {hole.longitude_deg:>13.7f}  {hole.place_ne[0]:>8.2f}  "
             f"{hole.place_ne[1]:>8.2f}"
         )
     if len(holes) > _LISTED:
         rest = sum(hole.area_m2 for hole in holes[_LISTED:])
-        told.append(f"  and {len(holes) - _LISTED} more, {rest:.2f} m2 in all (certificate.json)")
-    return told
+        rows.append(f"  and {len(holes) - _LISTED} more, {rest:.2f} m2 in all (certificate.json)")
+    return rows
 
 
-def _told_refly(again: dict[str, Any]) -> str:
+def _refly_text(again: dict[str, Any]) -> str:
     return (
         f"\nto fly the holes again: {again['lines']} line{_s(again['lines'])}, "
         f"{again['stations']} station{_s(again['stations'])}, "
@@ -326,7 +344,7 @@ def _told_refly(again: dict[str, Any]) -> str:
     )
 
 
-def _told_flights(result: MonteCarlo) -> str:
+def _flights_text(result: MonteCarlo) -> str:
     share = result.to_json()["share_at_overlap"]
     seen = result.to_json()["covered_share"]
     worst = float(result.to_json()["greatest_hole_probability"])

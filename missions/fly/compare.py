@@ -16,20 +16,24 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.config import SurveyConfig, changed
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
-from alice_survey.vehicle import signals
-from alice_survey.vehicle.dynamics import GRAVITY, STATE
+from alice_survey.vehicle.dynamics import STATE
 from alice_survey.vehicle.floor import level_floor
 from alice_survey.vehicle.pilot.gains import gains_for
-from alice_survey.vehicle.pilot.memory import CROSS, PHASE
+from alice_survey.vehicle.pilot.memory import CROSS, FOLLOW, PHASE
 from alice_survey.vehicle.pilot.settings import pilot_guidance
 from alice_survey.vehicle.propulsion import add_thrust
 from alice_survey.vehicle.simulator import Flown, Setup, simulate
 from alice_survey.vehicle.vehicle import Vehicle
 from missions.fly.flight_records import true_velocity
-from missions.fly.simulation import flight_of, longest_mission_s, mission_setup
+from missions.fly.simulation import (
+    FlightSettings,
+    flight_of,
+    longest_mission_s,
+    mission_setup,
+    with_values,
+)
 from missions.values.flight import Flight, rms
 from missions.values.plan_file import Plan
 
@@ -52,7 +56,7 @@ class Variant:
     """Thrusters that are left out."""
     equal_speeds: bool = False
     """The allocation takes propellers to push astern as well as ahead, so that a turn is made by
-    equal and opposite speeds, as the paper tells of the original (section V)."""
+    equal and opposite speeds, as the paper says of the original (section V)."""
 
 
 ORIGINAL, EQUAL, IMPROVED = "original", "original, equal speeds", "improved"
@@ -78,9 +82,22 @@ VARIANTS = (
 """What is compared: the two configurations, and what their difference hangs on."""
 
 
+PAPER = {
+    ORIGINAL: {
+        "cross_track_rms_m": [0.36, 0.36],
+        "roll_in_turns_deg": [20.0, 30.0],
+        "surge_in_turns_mps": [0.3, 0.5],
+        "yaw_in_turns_deg_s": [17.0, 17.0],
+    },
+    IMPROVED: {"cross_track_rms_m": [0.12, 0.12], "roll_in_turns_deg": [0.0, 10.0]},
+}
+"""Least and greatest. Cross-track and roll: section VIII. Surge and yaw rate: section V, of another
+lawnmower at 0.2 m/s, turned by the horizontal thrusters."""
+
+
 @dataclass(frozen=True, kw_only=True)
-class Figures:
-    """What came out of one flight; NaN where there is nothing to tell.
+class FlightFigures:
+    """What came out of one flight; NaN where there is none.
 
     Cross-track errors are rms, of the body's origin: "true" by the true place, "believed" by the
     navigation's. "Route" is all the way from the first line's run-in to the last line's end, turns
@@ -151,10 +168,10 @@ class Case:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Job:
+class FlightJob:
     """One flight to be made."""
 
-    config: SurveyConfig
+    settings: FlightSettings
     plan: Plan
     variant: Variant
     case: Case
@@ -169,16 +186,47 @@ class Outcome:
     variant: str
     case: Case
     seed: int
-    figures: Figures
+    figures: FlightFigures
     trace: Trace | None
     ending: str
     look_ahead_m: float
 
 
+Summary = dict[str, dict[str, float]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaseResult:
+    """All flights in one sea."""
+
+    case: Case
+    across_mps: float
+    """Of the current, to starboard of the first line."""
+    along_mps: float
+    outcomes: tuple[Outcome, ...]
+    summaries: dict[str, Summary]
+    """By variant."""
+
+    @property
+    def title(self) -> str:
+        """Which way the water flows, in words."""
+        waves = (
+            f", swell of {self.case.swell_m:g} m and {self.case.swell_s:g} s across the lines"
+            if self.case.swell_m > 0.0
+            else ""
+        )
+        if self.case.current_mps == 0.0:
+            return f"no current{waves}" if waves else "still water"
+        return (
+            f"current {self.case.name}: {self.across_mps:+.2f} m/s across the first line, "
+            f"{self.along_mps:+.2f} m/s along it{waves}"
+        )
+
+
 def default_cases(plan: Plan) -> tuple[Case, ...]:
     """A current across the lines, one along them, still water, and that with some swell.
 
-    The paper tells nothing of its sea. 0.1 m/s is the current that the improved controller is
+    The paper says nothing of its sea. 0.1 m/s is the current that the improved controller is
     asked to hold its lines in; 0.5 m and 6 s are a calm day on an open coast (inferred).
     """
     along = math.degrees(plan.lines[0].heading_rad)
@@ -193,36 +241,37 @@ def default_cases(plan: Plan) -> tuple[Case, ...]:
 
 
 def fly_all(
-    config: SurveyConfig,
+    settings: FlightSettings,
     plan: Plan,
     cases: Sequence[Case],
     seeds: Sequence[int],
-    threads: int,
+    executor: Executor,
     variants: Sequence[Variant] = VARIANTS,
 ) -> Iterator[Outcome]:
     """Fly each variant in each sea, once a seed; flights of the first seed keep their trace.
 
     Args:
-        config: sea and instruments; its vehicle and its current's mean are not looked at.
+        settings: sea and instruments; vehicle and the current's mean are those of the variants and
+            cases.
         plan: what to fly.
         cases: mean currents.
         seeds: of the water and of the instruments.
-        threads: processes.
+        executor: where tasks run.
         variants: what flies.
     """
     jobs = [
-        Job(
-            config=config, plan=plan, variant=variant, case=case, seed=seed,
+        FlightJob(
+            settings=settings, plan=plan, variant=variant, case=case, seed=seed,
             traced=seed == seeds[0],
         )
         for case in cases for variant in variants for seed in seeds
     ]  # fmt: skip
-    yield from parallel_map(fly_job, jobs, threads=threads, label="flights")
+    yield from executor.map(fly_job, jobs, label="flights")
 
 
-def fly_job(job: Job) -> Outcome:
+def fly_job(job: FlightJob) -> Outcome:
     """Make one flight."""
-    setup, flown, flight = fly_variant(job.config, job.plan, job.variant, job.case, job.seed)
+    setup, flown, flight = fly_variant(job.settings, job.plan, job.variant, job.case, job.seed)
     return Outcome(
         variant=job.variant.name,
         case=job.case,
@@ -235,28 +284,29 @@ def fly_job(job: Job) -> Outcome:
 
 
 def fly_variant(
-    config: SurveyConfig, plan: Plan, variant: Variant, case: Case, seed: int
+    settings: FlightSettings, plan: Plan, variant: Variant, case: Case, seed: int
 ) -> tuple[Setup, Flown, Flight]:
     """Fly a plan by a variant, over a level sea floor."""
-    config = changed(
-        config, "vehicle", name=variant.vehicle, controller=variant.controller,
-        thruster_health=dict.fromkeys(variant.failed, 0.0),
+    settings = replace(
+        settings,
+        vehicle=with_values(
+            settings.vehicle, name=variant.vehicle, controller=variant.controller,
+            thruster_health=dict.fromkeys(variant.failed, 0.0),
+        ),
+        sea=with_values(
+            settings.sea, current_mps=case.current_mps, current_towards_deg=case.towards_deg,
+            swell_m=case.swell_m, swell_period_s=case.swell_s,
+            swell_towards_deg=case.swell_towards_deg % 360.0, current_file=None,
+        ),
+        camera=with_values(settings.camera, position_body_m=(0.0, 0.0, 0.0)),
     )  # fmt: skip
-    config = changed(
-        config, "sea", current_mps=case.current_mps, current_towards_deg=case.towards_deg,
-        swell_m=case.swell_m, swell_period_s=case.swell_s,
-        swell_towards_deg=case.swell_towards_deg % 360.0,
-    )  # fmt: skip
-    config = changed(config, "camera", position_body_m=(0.0, 0.0, 0.0))
-    sea = config.sea.model_copy(update={"current_file": None})
-    config = config.model_copy(update={"sea": sea})
     longest_s = longest_mission_s(plan)
     water = np.random.default_rng([seed, _SEA])
     floor = level_floor(plan.seafloor_depth_m)
-    setup = varied(mission_setup(plan, config, floor, longest_s, water), variant)
+    setup = varied(mission_setup(plan, settings, floor, longest_s, water), variant)
     chance = np.random.default_rng([seed, _CHANCE])
     flown = simulate(setup, chance, longest_s=longest_s, label="", sea_rng=water)
-    return setup, flown, flight_of(plan, config, setup, flown)
+    return setup, flown, flight_of(plan, settings.camera.position_body_m, setup, flown)
 
 
 def varied(setup: Setup, variant: Variant) -> Setup:
@@ -276,7 +326,7 @@ def varied(setup: Setup, variant: Variant) -> Setup:
 
 
 def with_equal_thrust(vehicle: Vehicle) -> Vehicle:
-    """The vehicle with propellers beside the hull that push astern as they push ahead."""
+    """The vehicle with open propellers that push astern as they push ahead."""
     return replace(
         vehicle,
         thrusters=tuple(
@@ -286,11 +336,11 @@ def with_equal_thrust(vehicle: Vehicle) -> Vehicle:
     )
 
 
-def figures_of(flight: Flight, vehicle: Vehicle) -> Figures:
+def figures_of(flight: Flight, vehicle: Vehicle) -> FlightFigures:
     """What came out of a flight."""
     flown, line = flight.flown, flight.line
     tick_s = float(flown.time_s[1] - flown.time_s[0])
-    following = flown.report[:, PHASE] == signals.FOLLOW
+    following = flown.report[:, PHASE] == FOLLOW
     reached = np.flatnonzero(following & (line >= 0))
     ticks = np.arange(len(line))
     ends = (reached[0], reached[-1]) if len(reached) else (0, -1)
@@ -305,7 +355,7 @@ def figures_of(flight: Flight, vehicle: Vehicle) -> Figures:
     roll_peaks, surge_peaks = _peaks(roll, turns), _peaks(velocity[:, 0], turns)
     torque = np.abs(roll_moment(vehicle, flown, turns))
     between = [int(np.sum(line[rows] < 0)) for rows in turns]
-    return Figures(
+    return FlightFigures(
         lines_true_m=rms(true),
         lines_believed_m=rms(believed),
         route_true_m=rms(flight.route_error[route]),
@@ -348,52 +398,18 @@ def roll_moment(vehicle: Vehicle, flown: Flown, turns: Sequence[slice]) -> Array
     moment = np.full(len(flown.time_s), np.nan)
     for rows in turns:
         for row in range(rows.start, rows.stop):
-            moment[row] = thruster_wrench(vehicle, flown.rps[row], flown.state[row, 7:STATE])[3]
+            wrench = np.zeros(6)
+            nu = flown.state[row, 7:STATE]
+            add_thrust(vehicle.plant.propulsion, flown.rps[row], nu, wrench)
+            moment[row] = wrench[3]
     return moment
 
 
-def thruster_wrench(vehicle: Vehicle, rps: Array, nu: Array) -> Array:
-    """(6,) forces and moments of the thrusters at speeds (n,), at a velocity (6,)."""
-    force = np.zeros(6)
-    add_thrust(vehicle.plant.propulsion, rps, nu, force)
-    return force
-
-
-def righting_moment(vehicle: Vehicle, roll_deg: float) -> float:
-    """What holds the vehicle at a roll angle, N m."""
-    rigid = vehicle.rigid_body
-    return rigid.dry_kg * GRAVITY * rigid.cg_body_m[2] * math.sin(math.radians(roll_deg))
-
-
-def opposed_turn(vehicle: Vehicle, rate_deg_s: float) -> tuple[float, Array]:
-    """A steady turn on the spot by equal and opposite speeds of the propellers beside the hull.
-
-    Returns:
-        Their speed, rev/s, and the wrench (6,) that they make.
-    """
-    from scipy.optimize import brentq
-
-    rate = math.radians(rate_deg_s)
-    nu = np.array([0.0, 0.0, 0.0, 0.0, 0.0, rate])
-    body = vehicle.plant.body
-    needed = -(body.linear[5, 5] + body.quadratic[5, 5] * abs(rate)) * rate
-    sides = np.array(
-        [-np.sign(t.position_body_m[1]) if t.kind == "open" else 0.0 for t in vehicle.thrusters]
-    )
-    most = min(t.most_rps for t in vehicle.thrusters if t.kind == "open")
-
-    def surplus(speed: float) -> float:
-        return float(thruster_wrench(vehicle, speed * sides, nu)[5] - needed)
-
-    speed = float(brentq(surplus, 0.0, 4.0 * most))
-    return speed, thruster_wrench(vehicle, speed * sides, nu)
-
-
-def summarised(outcomes: Sequence[Outcome]) -> dict[str, dict[str, float]]:
+def summarised(outcomes: Sequence[Outcome]) -> Summary:
     """Mean and extremes of each figure over flights, and the standard deviation of two or more."""
     columns = {
         name: np.array([asdict(outcome.figures)[name] for outcome in outcomes])
-        for name in Figures.__dataclass_fields__
+        for name in FlightFigures.__dataclass_fields__
     }
     summary = {}
     for name, values in columns.items():
@@ -408,7 +424,7 @@ def summarised(outcomes: Sequence[Outcome]) -> dict[str, dict[str, float]]:
 
 
 def _trace(flight: Flight, flown: Flown) -> Trace:
-    rows = np.flatnonzero(flown.report[:, PHASE] == signals.FOLLOW)[::_TRACE_STEP]
+    rows = np.flatnonzero(flown.report[:, PHASE] == FOLLOW)[::_TRACE_STEP]
     first = flown.time_s[rows[0]] if len(rows) else 0.0
     return Trace(
         time_s=flown.time_s[rows] - first,

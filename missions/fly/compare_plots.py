@@ -1,4 +1,4 @@
-"""A picture of both configurations in the same sea, beside what the paper reports."""
+"""A picture of both configurations in the same sea, next to what the paper reports."""
 
 from pathlib import Path
 
@@ -8,8 +8,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from alice_survey.base.frames import Array
-from missions.fly.compare import EQUAL, IMPROVED, ORIGINAL, Outcome, Trace
-from missions.fly.compare_reasons import PAPER, CaseResult
+from missions.fly.compare import EQUAL, IMPROVED, ORIGINAL, PAPER, CaseResult, Outcome, Trace
 from missions.fly.flight_plots import BAND, draw_lines
 from missions.fly.flight_route import whole_route
 from missions.values.plan_file import Plan
@@ -100,13 +99,13 @@ def _draw_bars(
     paper: str,
     figures: tuple[str, ...],
 ) -> None:
-    """Bars of some figures of each variant, with their spread, beside the paper's span."""
+    """Bars of some figures of each variant, with their spread, next to the paper's span."""
     width = 0.8 / (1 + len(figures))
     top = 0.0
     for i, name in enumerate(names):
-        told = PAPER.get(name, PAPER[ORIGINAL] if name == EQUAL else {}).get(paper)
-        if told is not None:
-            least, most = told
+        printed = PAPER.get(name, PAPER[ORIGINAL] if name == EQUAL else {}).get(paper)
+        if printed is not None:
+            least, most = printed
             bottom = 0.0 if least == most else least
             axes.bar(
                 i - 0.4 + width / 2, most - bottom, width * 0.9, bottom=bottom, color=_PAPER,

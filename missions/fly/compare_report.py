@@ -1,4 +1,4 @@
-"""The comparison of both configurations as a table, with a reason for each difference."""
+"""The comparison of both configurations as a table next to the paper's figures."""
 
 import math
 from collections.abc import Sequence
@@ -7,23 +7,26 @@ from pathlib import Path
 from typing import Any
 
 from alice_survey.base.artefacts import write_csv, write_json
-from alice_survey.base.config import SurveyConfig, changed, parse_current
+from alice_survey.base.config import SeaConfig, SurveyConfig, changed, parse_current
 from alice_survey.base.errors import ConfigError
-from alice_survey.base.executor import default_threads
+from alice_survey.base.executor import Executor, local_executor
 from alice_survey.base.text_table import text_table
 from camera_calib.rig import design_rig
 from missions.fly.compare import (
     IMPROVED,
     ORIGINAL,
+    PAPER,
     VARIANTS,
     Case,
+    CaseResult,
     Outcome,
+    Summary,
     default_cases,
     fly_all,
     summarised,
 )
 from missions.fly.compare_plots import draw_case
-from missions.fly.compare_reasons import PAPER, CaseResult, Summary, explained
+from missions.fly.simulation import flight_settings
 from missions.plan.planner import plan_survey
 from missions.values.plan_file import Plan
 
@@ -43,7 +46,7 @@ def compare_report(
     swell: str | None = None,
     seed: int | None = None,
     flights: int = 5,
-    threads: int | None = None,
+    executor: Executor | None = None,
 ) -> tuple[str, dict[str, Any]]:
     """Fly a survey by both configurations, and write table, figures and pictures.
 
@@ -54,7 +57,7 @@ def compare_report(
         swell: `HEIGHT@PERIOD`, m and s, of waves that travel across the lines in all currents.
         seed: of the first flight; the survey's when left out.
         flights: of each variant in each current.
-        threads: processes; all cores when left out.
+        executor: where tasks run; all cores of this machine when left out.
 
     Returns:
         Text, and the same as values for JSON.
@@ -72,14 +75,14 @@ def compare_report(
         cases = [_with_swell(plan, case, swell) for case in cases]
     first = config.seed if seed is None else seed
     seeds = list(range(first, first + flights))
-    outcomes = list(fly_all(config, plan, cases, seeds, threads or default_threads()))
+    settings = flight_settings(config)
+    outcomes = list(fly_all(settings, plan, cases, seeds, executor or local_executor()))
     results = [_result(plan, case, outcomes) for case in cases]
-    reasons = explained(plan, results)
     text = "\n\n".join([
-        _heading(plan, config, seeds), *(_table(result) for result in results),
-        "Why\n" + "\n".join(f"- {reason}" for reason in reasons),
+        _heading(plan, config.sea, seeds), *(_table(result) for result in results),
+        "Why they differ from the paper: docs/vehicle-comparison.md",
     ])  # fmt: skip
-    data = _data(plan, seeds, results, reasons)
+    data = _data(plan, seeds, results)
     try:
         out.mkdir(parents=True, exist_ok=True)
         write_json(out / "compare.json", data)
@@ -92,9 +95,8 @@ def compare_report(
     return f"{text}\n\nwrote {out}", data
 
 
-def _heading(plan: Plan, config: SurveyConfig, seeds: Sequence[int]) -> str:
+def _heading(plan: Plan, sea: SeaConfig, seeds: Sequence[int]) -> str:
     size = [max(axis) - min(axis) for axis in plan.area.corners_ne.T]
-    sea = config.sea
     return (
         f"{size[0]:g} x {size[1]:g} m, {len(plan.lines)} lines {plan.line_spacing_m:g} m apart, "
         f"{plan.altitude_m:g} m above the sea floor at {plan.speed_mps:g} m/s; current varying by "
@@ -113,12 +115,12 @@ def _table(result: CaseResult) -> str:
 
 
 def _paper_row(name: str) -> tuple[str, ...]:
-    told = PAPER[name]
+    paper = PAPER[name]
 
     def span(key: str) -> str:
-        if key not in told:
+        if key not in paper:
             return ""
-        least, most = told[key]
+        least, most = paper[key]
         return (
             f"{most:g}"
             if least == most
@@ -157,9 +159,7 @@ def _row(name: str, summary: Summary) -> tuple[str, ...]:
     )
 
 
-def _data(
-    plan: Plan, seeds: Sequence[int], results: Sequence[CaseResult], reasons: Sequence[str]
-) -> dict[str, Any]:
+def _data(plan: Plan, seeds: Sequence[int], results: Sequence[CaseResult]) -> dict[str, Any]:
     return {
         "paper": PAPER,
         "followed_point": "body origin",
@@ -190,7 +190,6 @@ def _data(
             }
             for result in results
         ],
-        "why": list(reasons),
     }
 
 

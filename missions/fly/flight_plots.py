@@ -18,10 +18,17 @@ from scipy.spatial.transform import Rotation
 from shapely.geometry import MultiPolygon
 
 from alice_survey.base.frames import Array
-from alice_survey.vehicle import signals
 from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.navigation import tick as navigation
-from alice_survey.vehicle.pilot.memory import PHASE, WANTED_SURGE
+from alice_survey.vehicle.pilot.memory import (
+    ABORT,
+    APPROACH,
+    ASCEND,
+    DIVE,
+    FOLLOW,
+    PHASE,
+    WANTED_SURGE,
+)
 from alice_survey.vehicle.simulator import Flown
 from missions.fly.flight_records import rpm_of, true_velocity
 from missions.fly.flight_route import whole_route
@@ -38,11 +45,11 @@ _DRAWN = 20_000
 _SPREAD_SIGMAS = 2.0
 """The band of the navigation error: 95 % of the time within it."""
 _PHASES = {
-    signals.DIVE: "dive",
-    signals.APPROACH: "approach",
-    signals.FOLLOW: "survey",
-    signals.ASCEND: "ascent",
-    signals.ABORT: "abort",
+    DIVE: "dive",
+    APPROACH: "approach",
+    FOLLOW: "survey",
+    ASCEND: "ascent",
+    ABORT: "abort",
 }
 
 
@@ -51,7 +58,7 @@ def draw_flight(path: Path, flight: Flight) -> None:
     figure, chart, strips = _sheet(6)
     _draw_plan(chart, flight.plan)
     some = thin(len(flight.line))
-    following = flight.flown.report[some, PHASE] == signals.FOLLOW
+    following = flight.flown.report[some, PHASE] == FOLLOW
     true, believed = flight.glass_ned[some, :2], flight.believed_glass_ned[some, :2]
     for track, colour, label in (
         (true, TRUE, "true track of the left port"),
@@ -263,7 +270,7 @@ def _draw_attitude(strips: list[Axes], flight: Flight, heading: Array) -> None:
 
 def _draw_altitude(axes: Axes, flight: Flight) -> None:
     some = thin(len(flight.line))
-    following = flight.flown.report[:, PHASE] == signals.FOLLOW
+    following = flight.flown.report[:, PHASE] == FOLLOW
     altitude, wanted = flight.log.altitude_m, flight.plan.altitude_m
     axes.plot(flight.truth.time_s[some], altitude[some], color=NAV, lw=0.7, label="as measured")
     axes.axhline(wanted, color=PLAN, lw=1.5, label="planned")
@@ -324,7 +331,7 @@ def _draw_roll(axes: Axes, flight: Flight) -> None:
     some = thin(len(flight.line))
     t = flight.truth.time_s[some]
     roll = np.rad2deg(flight.attitude_rad[:, 0])
-    turning = (flight.flown.report[:, PHASE] == signals.FOLLOW) & (flight.line < 0)
+    turning = (flight.flown.report[:, PHASE] == FOLLOW) & (flight.line < 0)
     in_turns = np.where(turning, roll, np.nan)
     axes.plot(t, roll[some], color=_ROLL, lw=0.7, alpha=0.45)
     axes.plot(t, in_turns[some], color=_ROLL, lw=1.0)

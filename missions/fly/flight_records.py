@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.config import SurveyConfig
+from alice_survey.base.config import VehicleConfig
 from alice_survey.base.frames import Array, rotation_from_attitude
-from alice_survey.vehicle import signals
+from alice_survey.vehicle import estimate_vector as vector
 from alice_survey.vehicle.log import VehicleLog, vehicle_log
 from alice_survey.vehicle.navigation import tick as navigation
-from alice_survey.vehicle.pilot.memory import PHASE
+from alice_survey.vehicle.pilot.memory import FOLLOW, PHASE
 from alice_survey.vehicle.simulator import Flown
-from camera_calib.rig import design_rig
+from camera_calib.rig import Rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import plan_pattern, stations_of_flight
 from missions.fly.flight_route import stations_of_dives
@@ -85,23 +85,29 @@ def bag_record(flight: Flight) -> BagRecord:
     )
 
 
-def flight_summary(flight: Flight, config: SurveyConfig) -> dict[str, Any]:
-    """The figures of a flight: `flight.json`."""
+def flight_summary(flight: Flight, vehicle: VehicleConfig, rig: Rig) -> dict[str, Any]:
+    """The figures of a flight: `flight.json`.
+
+    Args:
+        flight: what was flown.
+        vehicle: its settings.
+        rig: the cameras in the survey's water.
+    """
     flown, plan = flight.flown, flight.plan
     cross, heading = flight.line_errors
     on_line = ~np.isnan(cross)
-    following = flown.report[:, PHASE] == signals.FOLLOW
+    following = flown.report[:, PHASE] == FOLLOW
     turning = following & ~on_line
     roll, pitch = np.abs(np.rad2deg(flight.attitude_rad[:, :2])).T
     off = flight.log.position_ned - flight.truth.ned_from_body.translation
     speed = np.linalg.norm(true_velocity(flown)[:, :2], axis=1)
     energy_wh = flown.energy_j / 3600.0
     return {
-        "vehicle": config.vehicle.name,
-        "controller": config.vehicle.controller,
-        "coefficients": config.vehicle.coefficients,
-        "allocation": config.vehicle.allocation,
-        "thruster_health": config.vehicle.thruster_health.model_dump(),
+        "vehicle": vehicle.name,
+        "controller": vehicle.controller,
+        "coefficients": vehicle.coefficients,
+        "allocation": vehicle.allocation,
+        "thruster_health": vehicle.thruster_health.model_dump(),
         "ending": flight.ending,
         "duration_s": float(flown.time_s[-1]),
         "stations": len(flight.trigger_s),
@@ -133,15 +139,14 @@ def flight_summary(flight: Flight, config: SurveyConfig) -> dict[str, Any]:
         "navigation_error_rms_m": _rms(np.linalg.norm(off[following, :2], axis=1)),
         "power_mean_w": float(flown.power_w.sum(axis=1).mean()),
         "energy_wh": dict(zip(flown.thrusters, energy_wh.tolist(), strict=True)),
-        "coverage": _coverage(flight, config),
+        "coverage": _coverage(flight, rig),
     }
 
 
-def _coverage(flight: Flight, config: SurveyConfig) -> dict[str, float]:
-    """What the pictures of the true track see of the whole area; `plan check` tells more."""
+def _coverage(flight: Flight, rig: Rig) -> dict[str, float]:
+    """What the pictures of the true track see of the whole area; `plan check` shows more."""
     if not len(flight.trigger_s):
         return {"covered_share": 0.0, "every_camera_share": 0.0, "share_at_overlap": 0.0}
-    rig = design_rig(config.camera, config.water)
     wanted = plan_pattern(flight.plan, rig)
     seen = certificate(flight.plan.area, rig, stations_of_flight(flight), wanted)
     return {
@@ -159,7 +164,7 @@ def true_velocity(flown: Flown) -> Array:
 
 def believed_velocity(flown: Flown) -> Array:
     """(T, 6) as `true_velocity`, as navigation had it."""
-    return flown.navigation[:, signals.U : signals.U + 6]
+    return flown.navigation[:, vector.U : vector.U + 6]
 
 
 def rpm_of(flown: Flown) -> dict[str, Array]:

@@ -1,26 +1,26 @@
 """How coverage varies from sea to sea: a plan flown again and again in simulation.
 
-Each flight draws anew the noise of the instruments and their biases, gusts, the slow change of the
+Each flight draws again the noise of the instruments and their biases, gusts, the slow change of the
 current, and where the mean current flows: all directions are alike, since the tide turns and a plan
 is made days before. Its speed and the swell stay as in the survey; so does a measured series.
 """
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.config import SurveyConfig, changed
 from alice_survey.base.errors import PlanError
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.floor import FloorGrid
 from camera_calib.rig import Rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.stations import plan_pattern, stations_of_flight, stations_of_plan
+from missions.fly.simulation import FlightSettings, simulate_plan, with_values
 from missions.values.plan_file import Plan
 
 _STREAM = 50
@@ -70,7 +70,7 @@ class MonteCarlo:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Flown:
+class FlightCoverage:
     """What one flight saw."""
 
     covered_share: float
@@ -83,11 +83,12 @@ class Flown:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Job:
+class TrialJob:
     """One flight to be made."""
 
     plan: Plan
-    config: SurveyConfig
+    settings: FlightSettings
+    seed: int
     rig: Rig
     floor: FloorGrid
     cell_m: float
@@ -95,17 +96,25 @@ class Job:
 
 
 def monte_carlo(
-    plan: Plan, config: SurveyConfig, rig: Rig, floor: FloorGrid, flights: int, threads: int
+    plan: Plan,
+    settings: FlightSettings,
+    rig: Rig,
+    floor: FloorGrid,
+    *,
+    seed: int,
+    flights: int,
+    executor: Executor,
 ) -> MonteCarlo:
     """Fly a plan in many seas.
 
     Args:
         plan: what to fly, all its dives.
-        config: vehicle, sea, instruments and seed.
+        settings: vehicle, sea and instruments.
         rig: the cameras, in water.
         floor: the true sea floor.
+        seed: of the survey.
         flights: how many.
-        threads: processes.
+        executor: where tasks run.
 
     Raises:
         PlanError: no flight is asked for.
@@ -115,12 +124,20 @@ def monte_carlo(
         raise PlanError(f"{flights} flights: choose 1 or more")
     planned = certificate(plan.area, rig, stations_of_plan(plan), plan_pattern(plan, rig))
     jobs = [
-        Job(plan=plan, config=config, rig=rig, floor=floor, cell_m=planned.grid.cell_m, number=n)
+        TrialJob(
+            plan=plan,
+            settings=settings,
+            seed=seed,
+            rig=rig,
+            floor=floor,
+            cell_m=planned.grid.cell_m,
+            number=n,
+        )
         for n in range(flights)
     ]
     short = np.zeros(planned.grid.shape)
-    results: list[Flown] = []
-    for flown in _flown(jobs, min(threads, flights)):
+    results: list[FlightCoverage] = []
+    for flown in _flown(jobs, executor):
         bits = np.unpackbits(flown.short, count=short.size).reshape(short.shape)
         short += bits
         results.append(flown)
@@ -135,16 +152,15 @@ def monte_carlo(
     )
 
 
-def fly_job(job: Job) -> Flown:
+def fly_job(job: TrialJob) -> FlightCoverage:
     """Make one flight and certify it."""
-    from missions.fly.simulation import simulate_plan
-
-    rng = np.random.default_rng([job.config.seed, _STREAM, job.number])
+    rng = np.random.default_rng([job.seed, _STREAM, job.number])
     towards_deg = float(rng.uniform(0.0, 360.0)) % 360.0
-    config = job.config
-    if config.sea.current_file is None:
-        config = changed(config, "sea", current_towards_deg=towards_deg)
-    flight = simulate_plan(job.plan, config, job.floor, rng, label="")
+    settings = job.settings
+    if settings.sea.current_file is None:
+        sea = with_values(settings.sea, current_towards_deg=towards_deg)
+        settings = replace(settings, sea=sea)
+    flight = simulate_plan(job.plan, settings, job.floor, rng, label="")
     seen = certificate(
         job.plan.area,
         job.rig,
@@ -152,7 +168,7 @@ def fly_job(job: Job) -> Flown:
         plan_pattern(job.plan, job.rig),
         cell_m=job.cell_m,
     )
-    return Flown(
+    return FlightCoverage(
         covered_share=seen.covered_share,
         stereo_share=seen.stereo_share,
         share_at_overlap=seen.share_at_overlap,
@@ -162,8 +178,8 @@ def fly_job(job: Job) -> Flown:
     )
 
 
-def _flown(jobs: list[Job], threads: int) -> Iterator[Flown]:
-    return parallel_map(fly_job, jobs, threads=threads, label="flights")
+def _flown(jobs: list[TrialJob], executor: Executor) -> Iterator[FlightCoverage]:
+    return executor.map(fly_job, jobs, label="flights")
 
 
 def _spread(values: Array | NDArray[np.intp]) -> dict[str, float]:

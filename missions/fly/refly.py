@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 from shapely.geometry import MultiPolygon
 
-from alice_survey.base.config import SurveyConfig
+from alice_survey.base.config import PlanConfig
 from alice_survey.base.errors import PlanError
 from camera_calib.rig import Rig
 from missions.coverage.certificate import Certificate, certificate
@@ -15,16 +15,22 @@ from missions.coverage.holes import Hole
 from missions.coverage.stations import stations_of_plan
 from missions.lines.fill import lines_over
 from missions.lines.lay import ordered
-from missions.plan.strength import survey_costs
 from missions.route.dives import split_dives
-from missions.route.energy import usable_wh
 from missions.route.ways import Ways
 from missions.values.area import Area, multipolygon
+from missions.values.costs import Costs
 from missions.values.plan_file import Plan
 
 
 def refly_plan(
-    plan: Plan, config: SurveyConfig, rig: Rig, flown: Certificate, holes: Sequence[Hole]
+    plan: Plan,
+    rig: Rig,
+    flown: Certificate,
+    holes: Sequence[Hole],
+    *,
+    costs: Costs,
+    settings: PlanConfig,
+    usable_wh: float,
 ) -> Plan:
     """Plan short lines over the holes, at the overlap of the plan itself.
 
@@ -33,10 +39,12 @@ def refly_plan(
 
     Args:
         plan: what was flown.
-        config: the survey, for what the vehicle takes.
         rig: the cameras.
         flown: the certificate of what was flown.
         holes: its holes.
+        costs: what flying takes.
+        settings: how the vehicle turns and how long a dive may be.
+        usable_wh: what a dive may take of a battery.
 
     Raises:
         PlanError: there are none, or lines over them leave the allowed area.
@@ -47,7 +55,7 @@ def refly_plan(
     lines = lines_over(area.survey, area, flown.pattern)
     if not lines:
         raise PlanError(f"no line inside the allowed area sees any of the {len(holes)} holes")
-    costs, ways = survey_costs(config), Ways(area.allowed)
+    ways = Ways(area.allowed)
     lines = ordered(lines, ways, costs, plan.home_ne_m)
     dives = split_dives(
         lines,
@@ -56,11 +64,11 @@ def refly_plan(
         home_ne=plan.home_ne_m,
         turn_radius_m=plan.turn_radius_m,
         run_in_m=plan.run_in_m,
-        turns=config.plan.turns,
-        usable_wh=usable_wh(config.vehicle),
-        longest_s=config.plan.dive_s,
+        turns=settings.turns,
+        usable_wh=usable_wh,
+        longest_s=settings.dive_s,
         depth_m=plan.seafloor_depth_m - plan.altitude_m,
-        split=config.plan.split_dives,
+        split=settings.split_dives,
     )
     again = replace(
         plan,

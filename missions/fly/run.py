@@ -8,15 +8,16 @@ import numpy as np
 from alice_survey.base.artefacts import write_csv
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import VehicleError, warn
-from alice_survey.base.executor import progress
+from alice_survey.base.executor import Executor, progress
 from alice_survey.base.records import FlightRecord
 from alice_survey.base.trajectory import write_track
 from alice_survey.seafloor.terrain import survey_terrain
 from alice_survey.vehicle.log import write_vehicle_log
+from camera_calib.rig import design_rig
 from missions.fly.flight_plots import draw_flight, draw_vehicle
 from missions.fly.flight_records import bag_record, believed_log, flight_summary, true_log
 from missions.fly.flight_route import one_dive, stations_of_dives
-from missions.fly.simulation import floor_grid, simulate_plan
+from missions.fly.simulation import flight_settings, floor_grid, simulate_plan
 from missions.logs.bag import write_bag
 from missions.values.flight import Flight
 from missions.values.navigation import write_navigation
@@ -26,14 +27,13 @@ _SEED_STREAM = 20
 TRIGGER_COLUMNS = ("station", "time_s", "line")
 
 
-def run_fly(workspace: Path, config: SurveyConfig, threads: int, folder: Path) -> None:
+def run_fly(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
     """Write triggers, navigation, vehicle logs, a bag, the truth and plots.
 
     Raises:
         VehicleError: the vehicle took no picture at all; the message says why.
     """
-    plan_path = workspace / "plan" / "plan.json"
-    for _ in progress(_steps(folder, plan_path, config), "flight files", 5):
+    for _ in progress(_steps(folder, workspace / "plan" / "plan.json", config), "flight files", 5):
         pass
 
 
@@ -41,13 +41,44 @@ def _steps(folder: Path, plan_path: Path, config: SurveyConfig) -> Iterator[str]
     """Write the files of a flight, and say after each step what is done."""
     plan = one_dive(read_plan(plan_path), config.vehicle.dive)
     planned = stations_of_dives(plan)
-    floor = floor_grid(survey_terrain(config, plan.area.allowed_corners_ne))
+    floor = floor_grid(
+        survey_terrain(
+            config.seafloor,
+            plan.area.allowed_corners_ne,
+            margin_m=config.plan.altitude_m,
+            depth_m=config.area.seafloor_depth_m,
+            seed=config.seed,
+        )
+    )
     yield "sea floor"
     rng = np.random.default_rng([config.seed, _SEED_STREAM])
-    flight = simulate_plan(plan, config, floor, rng)
+    flight = simulate_plan(plan, flight_settings(config), floor, rng)
+    _check_pictures(flight, planned)
+    yield "flight"
+    write_track(folder / "truth" / "track.csv", flight.truth)
+    write_vehicle_log(folder / "truth" / "vehicle.csv", true_log(flight))
+    yield "truth"
+    _write_triggers(folder / "triggers.csv", flight)
+    write_navigation(folder / "navigation.csv", flight.log, plan.datum)
+    write_vehicle_log(folder / "vehicle.csv", believed_log(flight))
+    write_bag(folder / "bag", bag_record(flight))
+    yield "logs"
+    rig = design_rig(config.camera, config.water)
+    FlightRecord.save(folder / "flight.json", flight_summary(flight, config.vehicle, rig))
+    draw_flight(folder / "track.png", flight)
+    draw_vehicle(folder / "vehicle.png", flight)
+    yield "plots"
+
+
+def _check_pictures(flight: Flight, planned: int) -> None:
+    """Warn of stations that were missed or lie off their lines.
+
+    Raises:
+        VehicleError: there is no picture at all.
+    """
     if not len(flight.trigger_s):
         raise VehicleError(
-            f"{config.vehicle.name} reached no line of the plan ({flight.ending} after "
+            f"{flight.vehicle} reached no line of the plan ({flight.ending} after "
             f"{flight.truth.time_s[-1]:.0f} s): change the current, the thrusters or the plan"
         )
     if len(flight.trigger_s) < planned:
@@ -61,19 +92,6 @@ def _steps(folder: Path, plan_path: Path, config: SurveyConfig) -> Iterator[str]
             f"{flight.allowed_cross_track_m:.2f} m off their lines, where neighbouring lines may "
             "leave gaps: choose more side_overlap, less current or another controller"
         )
-    yield "flight"
-    write_track(folder / "truth" / "track.csv", flight.truth)
-    write_vehicle_log(folder / "truth" / "vehicle.csv", true_log(flight))
-    yield "truth"
-    _write_triggers(folder / "triggers.csv", flight)
-    write_navigation(folder / "navigation.csv", flight.log, plan.datum)
-    write_vehicle_log(folder / "vehicle.csv", believed_log(flight))
-    write_bag(folder / "bag", bag_record(flight))
-    yield "logs"
-    FlightRecord.save(folder / "flight.json", flight_summary(flight, config))
-    draw_flight(folder / "track.png", flight)
-    draw_vehicle(folder / "vehicle.png", flight)
-    yield "plots"
 
 
 def _write_triggers(path: Path, flight: Flight) -> None:

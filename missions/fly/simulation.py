@@ -1,19 +1,25 @@
 """A plan, flown by the simulated vehicle over a sea floor."""
 
 import math
-from typing import Protocol
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.config import SeaConfig, SurveyConfig
+from alice_survey.base.config import (
+    CameraConfig,
+    Config,
+    NavigationConfig,
+    SeaConfig,
+    SurveyConfig,
+    VehicleConfig,
+)
 from alice_survey.base.errors import warn
 from alice_survey.base.frames import Array, rotation_from_attitude
 from alice_survey.base.trajectory import Trajectory
-from alice_survey.vehicle import signals
 from alice_survey.vehicle.floor import FloorGrid, floor_depth
 from alice_survey.vehicle.limits import spot_rate_rad_s
-from alice_survey.vehicle.navigation import tick as navigation
 from alice_survey.vehicle.navigation.sensors import (
     CompassSpec,
     DvlSpec,
@@ -21,8 +27,9 @@ from alice_survey.vehicle.navigation.sensors import (
     SensorSuite,
     UsblSpec,
 )
+from alice_survey.vehicle.navigation.tick import LOG_COLUMNS
 from alice_survey.vehicle.pilot.gains import gains_for
-from alice_survey.vehicle.pilot.memory import LINE, PHASE, REASON
+from alice_survey.vehicle.pilot.memory import DONE, FOLLOW, LINE, PHASE, REASON
 from alice_survey.vehicle.pilot.safety import NONE, REASONS, Limits
 from alice_survey.vehicle.pilot.settings import pilot_guidance
 from alice_survey.vehicle.sea import (
@@ -38,7 +45,7 @@ from alice_survey.vehicle.swell import with_swell
 from missions.fly.flight_route import path_of, room_behind_m, turns_on_the_spot
 from missions.route.energy import sound_craft_of
 from missions.values.flight import Flight, trigger_times
-from missions.values.navigation import NavigationLog
+from missions.values.navigation import BelievedNavigation
 from missions.values.plan_file import Plan
 
 _FLOOR_SPACING_M = 0.1
@@ -56,6 +63,37 @@ _USBL_HZ = 0.5
 """A fix every other second: the turn-around of a modem at short range."""
 
 
+_Section = TypeVar("_Section", bound=Config)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlightSettings:
+    """The settings of a survey that decide how its plan is flown."""
+
+    vehicle: VehicleConfig
+    sea: SeaConfig
+    navigation: NavigationConfig
+    camera: CameraConfig
+    """Where the left port and the DVL sit."""
+    turn_rate_limit_deg_s: float
+
+
+def flight_settings(config: SurveyConfig) -> FlightSettings:
+    """The settings of a survey's flight."""
+    return FlightSettings(
+        vehicle=config.vehicle,
+        sea=config.sea,
+        navigation=config.navigation,
+        camera=config.camera,
+        turn_rate_limit_deg_s=config.plan.turn_rate_limit_deg_s,
+    )
+
+
+def with_values(section: _Section, **values: Any) -> _Section:
+    """A section of settings with some values replaced and checked."""
+    return type(section).model_validate({**section.model_dump(), **values})
+
+
 class SeaFloor(Protocol):
     """What a flight needs to know of a sea floor."""
 
@@ -69,7 +107,7 @@ class SeaFloor(Protocol):
 
 def simulate_plan(
     plan: Plan,
-    config: SurveyConfig,
+    settings: FlightSettings,
     floor: FloorGrid,
     rng: np.random.Generator,
     label: str = "flight",
@@ -78,7 +116,7 @@ def simulate_plan(
 
     Args:
         plan: what to fly.
-        config: vehicle, sea and sensors.
+        settings: vehicle, sea and sensors.
         floor: the true sea floor.
         rng: source of all noise.
         label: what the progress bar says; there is none if it is empty.
@@ -88,12 +126,12 @@ def simulate_plan(
         NavigationError: the file of the current cannot be read.
     """
     longest_s = longest_mission_s(plan)
-    setup = mission_setup(plan, config, floor, longest_s, rng)
+    setup = mission_setup(plan, settings, floor, longest_s, rng)
     ascent_s = plan.seafloor_depth_m / _CLIMB_MPS
     flown = simulate(
         setup, rng, longest_s=longest_s + ascent_s, label=label, expected_s=plan.duration_s
     )
-    return flight_of(plan, config, setup, flown)
+    return flight_of(plan, settings.camera.position_body_m, setup, flown)
 
 
 def longest_mission_s(plan: Plan) -> float:
@@ -103,7 +141,7 @@ def longest_mission_s(plan: Plan) -> float:
 
 def mission_setup(
     plan: Plan,
-    config: SurveyConfig,
+    settings: FlightSettings,
     floor: FloorGrid,
     longest_s: float,
     rng: np.random.Generator,
@@ -112,12 +150,12 @@ def mission_setup(
 
     Args:
         plan: what to fly.
-        config: vehicle, sea and sensors.
+        settings: vehicle, sea and sensors.
         floor: the true sea floor.
         longest_s: after which the vehicle gives up.
         rng: for what is drawn once a mission.
     """
-    craft = sound_craft_of(config.vehicle)
+    craft = sound_craft_of(settings.vehicle)
     diverging_mps = pitch_divergence_speed_mps(craft)
     if plan.speed_mps > _PITCH_MARGIN * diverging_mps:
         warn(
@@ -127,7 +165,7 @@ def mission_setup(
         )
     path = path_of(plan)
     turns = turns_on_the_spot(path)
-    if turns and config.vehicle.controller == "los":
+    if turns and settings.vehicle.controller == "los":
         warn(
             f"{craft.name} cannot push itself sideways under the controller los: in each of the "
             f"{turns} turns on the spot it swings off its place and drifts with the current; "
@@ -136,16 +174,16 @@ def mission_setup(
     # A floor is followed down to two altitudes below the planned one.
     deepest_m = plan.seafloor_depth_m + plan.altitude_m
     # The pilot flies as well as the thrusters allow that he knows to be sound.
-    impaired = config.vehicle.thruster_health.impaired
-    known = impaired if config.vehicle.health_known else {}
+    impaired = settings.vehicle.thruster_health.impaired
+    known = impaired if settings.vehicle.health_known else {}
     gains = gains_for(craft.weakened(known), plan.speed_mps)
     guidance = pilot_guidance(
         gains,
         path,
-        config.vehicle.controller,
+        settings.vehicle.controller,
         most_depth_m=deepest_m,
-        point_body_m=config.camera.position_body_m,
-        spot_rad_s=spot_rate_rad_s(config.plan.turn_rate_limit_deg_s),
+        point_body_m=settings.camera.position_body_m,
+        spot_rad_s=spot_rate_rad_s(settings.turn_rate_limit_deg_s),
         limits=Limits(
             0.5 * plan.altitude_m,
             deepest_m,
@@ -156,22 +194,22 @@ def mission_setup(
     guidance = guidance._replace(
         way_in_m=min(guidance.way_in_m, room_behind_m(plan, path, guidance.way_in_m))
     )
-    gust, heading_rad = config.sea.gust_n, float(path.heading_rad[0] + path.side_rad[0])
+    gust, heading_rad = settings.sea.gust_n, float(path.heading_rad[0] + path.side_rad[0])
     # The vehicle is let go where its left port is above the start of the route.
-    glass_ned = rotation_from_attitude(0.0, 0.0, heading_rad).apply(config.camera.position_body_m)
+    glass_ned = rotation_from_attitude(0.0, 0.0, heading_rad).apply(settings.camera.position_body_m)
     start_ne = np.array([path.start_n[0], path.start_e[0]]) - glass_ned[:2]
     return Setup(
         vehicle=craft,
         path=path,
         guidance=guidance,
         gains=gains,
-        sensors=sensors_of(config).pack(craft.hull),
+        sensors=sensors_of(settings.navigation, settings.camera).pack(craft.hull),
         floor=floor,
-        current=current_of(config.sea, plan.seafloor_depth_m, longest_s, rng),
+        current=current_of(settings.sea, plan.seafloor_depth_m, longest_s, rng),
         disturbance=Disturbance(
-            sigma=(*gust, 0.0, 0.0, 0.0), correlation_s=config.sea.gust_correlation_s
+            sigma=(*gust, 0.0, 0.0, 0.0), correlation_s=settings.sea.gust_correlation_s
         ),
-        exact_allocation=config.vehicle.allocation == "exact",
+        exact_allocation=settings.vehicle.allocation == "exact",
         health=impaired,
         known_health=known,
         start_ne_m=(float(start_ne[0]), float(start_ne[1])),
@@ -211,22 +249,23 @@ def _current_without_swell(
     return varying_current(mean, sea.current_sigma_mps, sea.current_correlation_s, duration_s, rng)
 
 
-def sensors_of(config: SurveyConfig) -> SensorSuite:
+def sensors_of(navigation: NavigationConfig, camera: CameraConfig) -> SensorSuite:
     """The instruments of a survey."""
-    told = config.navigation
     return SensorSuite(
-        gps=GpsSpec(bias_sigma_m=told.gps_bias_m, noise_m=told.gps_noise_m),
+        gps=GpsSpec(bias_sigma_m=navigation.gps_bias_m, noise_m=navigation.gps_noise_m),
         compass=CompassSpec(
-            bias_sigma_rad=math.radians(told.compass_bias_deg),
-            noise_rad=math.radians(told.compass_noise_deg),
+            bias_sigma_rad=math.radians(navigation.compass_bias_deg),
+            noise_rad=math.radians(navigation.compass_noise_deg),
         ),
         dvl=DvlSpec(
-            position_body_m=config.camera.dvl_position_body_m,
-            beam_noise_mps=told.dvl_noise_mps,
-            dropouts_s=told.dvl_dropouts_s,
+            position_body_m=camera.dvl_position_body_m,
+            beam_noise_mps=navigation.dvl_noise_mps,
+            dropouts_s=navigation.dvl_dropouts_s,
         ),
-        usbl=UsblSpec(rate_hz=_USBL_HZ if told.usbl else 0.0, noise_m=told.usbl_noise_m),
-        followed_body_m=config.camera.position_body_m,
+        usbl=UsblSpec(
+            rate_hz=_USBL_HZ if navigation.usbl else 0.0, noise_m=navigation.usbl_noise_m
+        ),
+        followed_body_m=camera.position_body_m,
     )
 
 
@@ -241,9 +280,18 @@ def floor_grid(floor: SeaFloor) -> FloorGrid:
     return FloorGrid(float(rows[0]), float(columns[0]), _FLOOR_SPACING_M, depth)
 
 
-def flight_of(plan: Plan, config: SurveyConfig, setup: Setup, flown: Flown) -> Flight:
-    """What a mission's rows mean for its plan."""
-    glass_body = np.array(config.camera.position_body_m)
+def flight_of(
+    plan: Plan, glass_body_m: tuple[float, float, float], setup: Setup, flown: Flown
+) -> Flight:
+    """What a mission's rows mean for its plan.
+
+    Args:
+        plan: that was flown.
+        glass_body_m: where the left port's glass sits on the vehicle.
+        setup: of the mission.
+        flown: its rows.
+    """
+    glass_body = np.array(glass_body_m)
     truth = Trajectory(
         time_s=flown.time_s,
         ned_from_body=RigidTransform.from_components(
@@ -252,13 +300,13 @@ def flight_of(plan: Plan, config: SurveyConfig, setup: Setup, flown: Flown) -> F
     )
     log = navigation_log(flown)
     believed = log.position_ned + rotation_from_attitude(*log.attitude_rad.T).apply(glass_body)
-    following = flown.report[:, PHASE] == signals.FOLLOW
+    following = flown.report[:, PHASE] == FOLLOW
     line = np.where(following, flown.report[:, LINE], -1.0)
     trigger_s, trigger_line = trigger_times(plan, flown.time_s, line, believed[:, :2])
     reason = int(flown.report[-1, REASON])
     if reason != NONE:
         ending = f"aborted: {REASONS[reason]}"
-    elif flown.report[-1, PHASE] == signals.DONE:
+    elif flown.report[-1, PHASE] == DONE:
         ending = "complete"
     else:
         ending = f"broken off after {flown.time_s[-1]:.0f} s"
@@ -284,9 +332,9 @@ def _altitude(floor: FloorGrid, points_ned: Array) -> Array:
     return np.asarray(np.array(depths) - points_ned[:, 2])
 
 
-def navigation_log(flown: Flown) -> NavigationLog:
+def navigation_log(flown: Flown) -> BelievedNavigation:
     """What the navigation believed, tick by tick."""
-    columns = dict(zip(navigation.LOG_COLUMNS, flown.navigation.T, strict=True))
+    columns = dict(zip(LOG_COLUMNS, flown.navigation.T, strict=True))
 
     def table(*names: str) -> Array:
         return np.stack([columns[name] for name in names], axis=1)
@@ -294,7 +342,7 @@ def navigation_log(flown: Flown) -> NavigationLog:
     def rms(*names: str) -> Array:
         return np.asarray(np.sqrt(np.mean(table(*names) ** 2, axis=1)))
 
-    return NavigationLog(
+    return BelievedNavigation(
         time_s=flown.time_s,
         position_ned=table("north_m", "east_m", "depth_m"),
         attitude_rad=table("roll_rad", "pitch_rad", "heading_rad"),

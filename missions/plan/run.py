@@ -6,6 +6,7 @@ import numpy as np
 
 from alice_survey.base.artefacts import write_json
 from alice_survey.base.config import SeaConfig, SurveyConfig
+from alice_survey.base.executor import Executor
 from alice_survey.base.run import progress
 from camera_calib.rig import Rig, design_rig
 from missions.exports.options import Options, options_of
@@ -22,7 +23,7 @@ from missions.values.plan_file import Dive, Plan
 _SAME_S = 1e-3
 
 
-def run_plan(workspace: Path, config: SurveyConfig, threads: int, folder: Path) -> None:
+def run_plan(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
     """Write plan.json, its certificate, settings, maps and missions for vehicles.
 
     Raises:

@@ -12,7 +12,7 @@ from alice_survey.base.trajectory import Trajectory
 from alice_survey.vehicle.pilot.memory import CROSS, PATH_HEADING
 from alice_survey.vehicle.pilot.standing import STOP_M
 from alice_survey.vehicle.simulator import Flown
-from missions.values.navigation import NavigationLog
+from missions.values.navigation import BelievedNavigation
 from missions.values.plan_file import Plan
 
 
@@ -37,7 +37,7 @@ class Flight:
     """(S,) when each station's pictures are taken."""
     trigger_line: tuple[int, ...]
     """(S,) line of the plan of each station."""
-    log: NavigationLog
+    log: BelievedNavigation
     flown: Flown
     ending: str
     """Why the flight ended, in words."""

@@ -18,7 +18,7 @@ _DECIMALS = (6, 10, 10, 5, 6, 6, 6, 5, 6, 6, 6, 6, 6)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class NavigationLog:
+class BelievedNavigation:
     """Believed position and attitude of the body origin, and altitude of the left port's glass.
 
     All (T,) but `position_ned` and `attitude_rad`, (T, 3).
@@ -39,7 +39,7 @@ class NavigationLog:
     sigma_altitude_m: Array
 
 
-def write_navigation(path: Path, log: NavigationLog, datum: Datum) -> None:
+def write_navigation(path: Path, log: BelievedNavigation, datum: Datum) -> None:
     """Write `navigation.csv`; positions in latitude and longitude to 0.01 mm; NaN as nothing."""
     geodetic = datum.geodetic_from_ned(log.position_ned)
     roll, pitch, heading = np.rad2deg(log.attitude_rad).T

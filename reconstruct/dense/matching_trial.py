@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.robust import MAD_TO_SIGMA
 from reconstruct.dense.depth import MATCH_SIGMA_PX, pair_depth
@@ -78,7 +78,7 @@ def find_conditions(
     pairs: Sequence[Sequence[StereoPair]],
     points: Sequence[Array],
     scale: float | None,
-    threads: int,
+    executor: Executor,
 ) -> Conditions:
     """Try a few views spread over the survey.
 
@@ -88,7 +88,7 @@ def find_conditions(
         pairs: for every view.
         points: (N, 3) for every view, that bound its depth.
         scale: of matching, or None to choose it.
-        threads: processes.
+        executor: where tasks run.
     """
     able = [number for number, found in enumerate(pairs) if found]
     chosen = able[:: max(1, len(able) // _PROBES)][:_PROBES]
@@ -104,7 +104,7 @@ def find_conditions(
         )
         for number in chosen
     ]
-    results = list(parallel_map(probe, tasks, threads=threads, label="try matching"))
+    results = list(executor.map(probe, tasks, label="try matching"))
     known = np.mean([result.known for result in results], axis=0)
     best = 0
     while best + 1 < len(scales) and known[best + 1] > _WORTH * known[best]:

@@ -24,13 +24,11 @@ from scipy import ndimage
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from alice_survey.base.robust import MAD_TO_SIGMA
+from reconstruct.views.interpolation import spline_slopes, spline_weights
 from reconstruct.views.model import View
 from reconstruct.views.sight import FAST, KernelLens, field_of, lens_of, pixel_at
 
 Float32 = NDArray[np.float32]
-
-_SIXTH, _HALF, _TWO_THIRDS = np.float32(1 / 6), np.float32(0.5), np.float32(2 / 3)
-_ONE, _THREE_HALVES, _TWO = np.float32(1.0), np.float32(1.5), np.float32(2.0)
 
 _CONTRAST_SIGMA_PX = 8.0
 """Of the Gaussian window in which pictures are brought to zero mean and unit contrast."""
@@ -165,9 +163,9 @@ def compare(
             if not (valid[i, j] and valid[i + 1, j + 1] and valid[i, j + 1] and valid[i + 1, j]):
                 continue
             p, q = np.float32(u - j), np.float32(v - i)
-            a0, a1, a2, a3 = _weights(p)
-            b0, b1, b2, b3 = _slopes(p)
-            across, changes = _weights(q), _slopes(q)
+            a0, a1, a2, a3 = spline_weights(p)
+            b0, b1, b2, b3 = spline_slopes(p)
+            across, changes = spline_weights(q), spline_slopes(q)
             value, right, down = np.float32(0.0), np.float32(0.0), np.float32(0.0)
             for m in range(4):
                 k = i - 1 + m
@@ -184,31 +182,6 @@ def compare(
             slope[row, column] = right * du + down * dv
             speed[row, column] = math.sqrt(du * du + dv * dv)
     return rest, slope, speed
-
-
-@compiled(error_model="numpy", fastmath=FAST)
-def _weights(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.float32]:
-    """The four weights of a cubic B-spline at a share t of the way from the second node."""
-    s = _ONE - t
-    u, v = _HALF * t - _ONE, _HALF * s - _ONE
-    return (
-        _SIXTH * s * s * s,
-        t * t * u + _TWO_THIRDS,
-        s * s * v + _TWO_THIRDS,
-        _SIXTH * t * t * t,
-    )
-
-
-@compiled(error_model="numpy", fastmath=FAST)
-def _slopes(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.float32]:
-    """How these weights change with t."""
-    s = _ONE - t
-    return (
-        -_HALF * s * s,
-        (_THREE_HALVES * t - _TWO) * t,
-        (_TWO - _THREE_HALVES * s) * s,
-        _HALF * t * t,
-    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
 from alice_survey.base.errors import ReconstructionError, warn
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import Executor
 from alice_survey.base.records import SurfaceRecord
 from reconstruct.dense.cloud import laz_writer, voxel_edge, write_cloud, write_cloud_json
 from reconstruct.dense.dem import FILL_CELLS
@@ -50,14 +50,14 @@ _MOST_CELLS = 4_000_000_000
 _MOST_POINTS = 40_000_000
 
 
-def run_dense(workspace: Path, config: SurveyConfig, threads: int, folder: Path) -> None:
+def run_dense(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
     """Find the surface of a placed model.
 
     Raises:
         ReconstructionError: the views do not overlap, or no depth was found.
         WorkspaceError: the model is damaged.
     """
-    build_surface(workspace, read_model(workspace / "sparse"), folder, config.reconstruct, threads)
+    build_surface(workspace, read_model(workspace / "sparse"), folder, config.reconstruct, executor)
 
 
 def build_surface(
@@ -65,7 +65,7 @@ def build_surface(
     model: SparseModel,
     folder: Path,
     settings: ReconstructConfig,
-    threads: int,
+    executor: Executor,
 ) -> None:
     """Do the work of the stage in a folder; see `run_dense`."""
     store = ViewStore(folder / "scratch")
@@ -73,7 +73,7 @@ def build_surface(
     partners = choose_pairs(model, settings.dense_partners)
     points = points_in_sight(model)
     conditions = find_conditions(
-        workspace, model.views, partners, points, settings.dense_scale, threads
+        workspace, model.views, partners, points, settings.dense_scale, executor
     )
     views = [scaled_view(view, conditions.scale) for view in model.views]
     prepare = [
@@ -86,7 +86,7 @@ def build_surface(
         )
         for index, view in enumerate(views)
     ]
-    _drain(parallel_map(prepare_view, prepare, threads=threads, label="even out pictures"))
+    _drain(executor.map(prepare_view, prepare, label="even out pictures"))
     depths = [
         DepthTask(
             store=store,
@@ -98,7 +98,7 @@ def build_surface(
         )
         for index, pairs in enumerate(partners)
     ]
-    _drain(parallel_map(view_depth, depths, threads=threads, label="match"))
+    _drain(executor.map(view_depth, depths, label="match"))
     witnesses = neighbours(model, _WITNESSES)
     refine_tasks = [
         RefineTask(
@@ -109,7 +109,7 @@ def build_surface(
         )
         for index in range(len(views))
     ]
-    _drain(parallel_map(refine_view, refine_tasks, threads=threads, label="refine"))
+    _drain(executor.map(refine_view, refine_tasks, label="refine"))
     checks = [
         CheckTask(
             store=store,
@@ -120,9 +120,9 @@ def build_surface(
         )
         for index in range(len(views))
     ]
-    doubt = find_doubt(checks, threads)
+    doubt = find_doubt(checks, executor)
     checks = [replace(check, doubt=doubt) for check in checks]
-    summaries = list(parallel_map(check_view, checks, threads=threads, label="cross-check"))
+    summaries = list(executor.map(check_view, checks, label="cross-check"))
     grid = surface_grid(summaries, settings.dem_cell_m, model.frame)
     offset = _offset(grid, summaries)
     edge = voxel_edge(grid.cell, grid.rows * grid.columns, _MOST_POINTS)
@@ -135,7 +135,7 @@ def build_surface(
     write_light(folder / "light.json", light)
     pose_part = find_pose_part(workspace, model)
     tasks = tile_tasks(store, grid, views, summaries, light, offset, edge, doubt, pose_part)
-    tiles = parallel_map(fuse_tile, tasks, threads=threads, label="fuse")
+    tiles = executor.map(fuse_tile, tasks, label="fuse")
     parts = _write_rasters(folder, grid, model.frame, tiles)
     with laz_writer(folder / "cloud.laz", offset, model.frame) as write_laz:
         count = write_cloud(folder / "cloud.ply", write_laz(parts), offset, model.frame)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.robust import MAD_TO_SIGMA
 from reconstruct.dense.depth import pair_depth
@@ -161,14 +161,14 @@ def refine_view(task: RefineTask) -> None:
     store.drop(task.index, "depth.sigma")
 
 
-def find_doubt(checks: Sequence[CheckTask], threads: int) -> float:
+def find_doubt(checks: Sequence[CheckTask], executor: Executor) -> float:
     """How far refined depths of neighbouring views differ, in standard deviations as stated.
 
     What the noise of pictures cannot show (detail finer than the window, poses, calibration) shows
     where views differ. The median over some views spread over the survey; at least 1.
     """
     step = max(1, len(checks) // _DOUBTERS)
-    spreads = list(parallel_map(disagreement, checks[::step], threads=threads, label="compare"))
+    spreads = list(executor.map(disagreement, checks[::step], label="compare"))
     known = [spread for spread in spreads if np.isfinite(spread)]
     return max(1.0, float(np.median(known))) if known else 1.0
 

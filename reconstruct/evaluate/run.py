@@ -15,6 +15,7 @@ import rasterio
 
 from alice_survey.base.artefacts import read_stage, write_csv
 from alice_survey.base.config import SurveyConfig
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import read_manifest
 from alice_survey.base.records import RegistrationRecord, ScoreRecord
@@ -36,7 +37,7 @@ from reconstruct.placing.track import read_track_poses
 _SEED_STREAM = 6100
 
 
-def run_evaluate(workspace: Path, config: SurveyConfig, threads: int, folder: Path) -> None:
+def run_evaluate(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
     """Score what `reconstruct` made of a simulated survey."""
     folders = ("plan", "images", "sparse", "dense", "mosaic", "mesh")
     plan, images, sparse, dense, mosaic, mesh = (workspace / name for name in folders)
@@ -61,7 +62,7 @@ def run_evaluate(workspace: Path, config: SurveyConfig, threads: int, folder: Pa
         dense / "dem.tif", area, terrain, moved, sigma=dense / "sigma.tif", stations=counter
     )
     painted = score_mosaic(
-        mosaic / "mosaic.tif", dense / "dem.tif", area, terrain, survey_texture(config), moved
+        mosaic / "mosaic.tif", dense / "dem.tif", area, terrain, survey_texture(config.seed), moved
     )
     rng = np.random.default_rng([config.seed, _SEED_STREAM])
     score: dict[str, Any] = {

@@ -13,6 +13,7 @@ from pathlib import Path
 import pycolmap
 from scipy.spatial.transform import RigidTransform
 
+from alice_survey.base.executor import Executor
 from alice_survey.base.run import progress
 from reconstruct.mapping.database import Observations, as_transform, rigid3d, station_frames
 from reconstruct.mapping.pose_graph import average_poses, station_groups
@@ -35,7 +36,7 @@ def map_globally(
     cam_from_rig: Mapping[str, RigidTransform],
     options: pycolmap.IncrementalPipelineOptions,
     seed: int,
-    threads: int,
+    executor: Executor,
 ) -> list[pycolmap.Reconstruction]:
     """Map stations of one rig with metric poses from its stereo pairs.
 
@@ -45,12 +46,12 @@ def map_globally(
         cam_from_rig: poses of two cameras or more on the rig.
         options: of the last triangulation and adjustment.
         seed: of robust estimation.
-        threads: processes for the relative poses.
+        executor: where tasks run for the relative poses.
 
     Returns:
         One model per group of linked stations (of 2 and more), in no particular order.
     """
-    links = link_stations(seen, cam_from_rig, seed, threads)
+    links = link_stations(seen, cam_from_rig, seed, executor)
     models = []
     for group in station_groups(links) if links else []:
         members = set(group)

@@ -16,6 +16,7 @@ import pycolmap
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.errors import ReconstructionError, warn
+from alice_survey.base.executor import SERIAL, Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord
 from alice_survey.base.run import progress
@@ -73,7 +74,7 @@ def map_calibrated(
     seed: int,
     *,
     method: Method = "auto",
-    threads: int = 1,
+    executor: Executor = SERIAL,
 ) -> Mapped:
     """Map with cameras and rig held constant: the rig gives the scale.
 
@@ -84,12 +85,12 @@ def map_calibrated(
         folder: for scratch files.
         seed: of the mapper.
         method: all stations at once, one after the other, or the first if it works.
-        threads: processes for work on pairs; the result does not depend on it.
+        executor: where tasks run for work on pairs; the result does not depend on it.
     """
     pinhole_from_rig = {
         name: lenses[name].pinhole_from_cam * cam_from_rig[name] for name in seen.cameras
     }
-    found, notes = _map_rig(seen, pinhole_from_rig, folder, seed, method, threads)
+    found, notes = _map_rig(seen, pinhole_from_rig, folder, seed, method, executor)
     model = largest(found, seen.images)
     known = _baseline(list(pinhole_from_rig.values())[:2])
     factor = 1.0
@@ -114,7 +115,7 @@ def _map_rig(
     folder: Path,
     seed: int,
     method: Method,
-    threads: int,
+    executor: Executor,
 ) -> tuple[list[pycolmap.Reconstruction], list[str]]:
     """Models, largest first, and how they came about."""
     total = len(seen.images)
@@ -125,7 +126,7 @@ def _map_rig(
         return run_mapper(seen, cam_from_rig, folder, seed, free="nothing"), [
             f"incremental mapping: {why}"
         ]
-    found = _globally(seen, cam_from_rig, folder, seed, threads)
+    found = _globally(seen, cam_from_rig, folder, seed, executor)
     faults = faults_of(found, total)
     if not faults or method == "global":
         for fault in faults:
@@ -151,7 +152,7 @@ def _globally(
     cam_from_rig: Mapping[str, RigidTransform],
     folder: Path,
     seed: int,
-    threads: int,
+    executor: Executor,
 ) -> list[pycolmap.Reconstruction]:
     """Map all stations at once, then register what is left over one by one; largest first."""
     options = _options(cam_from_rig, seed, "nothing")
@@ -160,7 +161,7 @@ def _globally(
     scratch.mkdir(parents=True)
     database = scratch / "database.db"
     write_database(database, seen, cam_from_rig)
-    found = _sorted(map_globally(database, seen, cam_from_rig, options, seed, threads))
+    found = _sorted(map_globally(database, seen, cam_from_rig, options, seed, executor))
     if found and found[0].num_reg_images() < len(seen.images) and not unsound(found[0]):
         begun, output = scratch / "begun", scratch / "more"
         begun.mkdir()

@@ -104,6 +104,11 @@ class Keypoints:
         """Whether there is anything to correct."""
         return any(np.isfinite(p.working_m) for p in self._pictures.values())
 
+    @property
+    def shifted(self) -> bool:
+        """Whether distance moves any keypoint; not so for a pinhole calibrated in water."""
+        return any(np.any(p.field) for p in self._pictures.values())
+
     def metres_per_unit(self, model: pycolmap.Reconstruction) -> float:
         """Metres in a unit of a model without scale, whose median depth is the working depth."""
         working = [p.working_m for p in self._pictures.values() if np.isfinite(p.working_m)]
@@ -196,7 +201,7 @@ def refract(
         none = Convergence(moved_px=(0.0,), corrected_px=0.0, removed=0, added=0, settled=True)
         return mapped, none
     notes = mapped.notes
-    if not mapped.scaled:
+    if not mapped.scaled and keypoints.shifted:
         notes = (
             *notes,
             "refraction through the port removed for a median distance of the working range",

@@ -16,7 +16,7 @@ import pycolmap
 from alice_survey.base.artefacts import atomic_path
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
 from alice_survey.base.errors import ImageError, WorkspaceError, warn
-from alice_survey.base.executor import kept_workers, parallel_map
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Datum
 from alice_survey.base.manifest import ImageRecord, read_manifest
 from alice_survey.base.records import CamerasRecord, MappingRecord, PicturesRecord
@@ -86,25 +86,30 @@ class _FeatureTask:
     thrifty: bool
 
 
-@kept_workers()
-def run_mapping(workspace: Path, config: SurveyConfig, threads: int, folder: Path) -> None:
+def run_mapping(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
     """Map the pictures of `images/`, with the rig of `calibration/` or `images/` if there is one.
 
     Raises:
         ImageError: there are too few pictures, or they are not those of the rig.
         ReconstructionError: the pictures give no model.
     """
-    inputs, settings = read_inputs(workspace), config.reconstruct
+    with executor.started() as started:
+        _map(read_inputs(workspace), config.reconstruct, config.seed, started, folder)
+
+
+def _map(
+    inputs: Inputs, settings: ReconstructConfig, seed: int, executor: Executor, folder: Path
+) -> None:
     pycolmap.logging.minloglevel = 2  # its own account of every step is for its developers
-    features = _find_all(inputs, folder / "features", settings, threads)
-    lenses, distances = _lenses(inputs, features, settings, threads)
+    features = _find_all(inputs, folder / "features", settings, executor)
+    lenses, distances = _lenses(inputs, features, settings, executor)
     cameras, exif_focal = _cameras(inputs, lenses)
-    pairs = _match_all(inputs, features, cameras, lenses, config.seed, threads)
+    pairs = _match_all(inputs, features, cameras, lenses, seed, executor)
     refined = refine_tracks(
         features,
         [_grey_file(path) for path in features],
         [(i, j, pair.matches) for i, j, pair in pairs],
-        threads=threads,
+        executor=executor,
     )
     seen = Observations(
         images=inputs.records,
@@ -122,9 +127,9 @@ def run_mapping(workspace: Path, config: SurveyConfig, threads: int, folder: Pat
             poses,
             lenses,
             folder,
-            config.seed,
+            seed,
             method=settings.mapper,
-            threads=threads,
+            executor=executor,
         )
         adjust = NavigationAdjuster(inputs.records, inputs.rig, lenses, inputs.datum)
         rig, free = inputs.rig, frees_rig(settings, inputs.rig, list(cameras))
@@ -141,7 +146,7 @@ def run_mapping(workspace: Path, config: SurveyConfig, threads: int, folder: Pat
                 mapped, refracted = refract(mapped, seen, folder, adjust, poses)
         sigmas = adjust.sigmas
     else:
-        mapped = map_self_calibrated(seen, exif_focal, folder, config.seed)
+        mapped = map_self_calibrated(seen, exif_focal, folder, seed)
         refracted, sigmas, rig = None, None, None
     save_uncertainty(folder, mapped, seen, rig, sigmas)
     _write(folder, inputs, mapped, distances, refracted)
@@ -167,7 +172,7 @@ def _grey_file(features: Path) -> Path:
 
 
 def _find_all(
-    inputs: Inputs, folder: Path, settings: ReconstructConfig, threads: int
+    inputs: Inputs, folder: Path, settings: ReconstructConfig, executor: Executor
 ) -> list[Path]:
     """Files of features, in the order of the pictures."""
     targets = [folder / f"{i:06d}.npz" for i in range(len(inputs.records))]
@@ -183,7 +188,7 @@ def _find_all(
         for record, target in zip(inputs.records, targets, strict=True)
     ]
     folder.mkdir(parents=True, exist_ok=True)
-    counts = list(parallel_map(extract, tasks, threads=threads, label="features"))
+    counts = list(executor.map(extract, tasks, label="features"))
     poor = [r.image for r, n in zip(inputs.records, counts, strict=True) if n < 100]
     if poor:
         warn(f"{len(poor)} pictures have fewer than 100 features: {named(poor)}")
@@ -191,7 +196,7 @@ def _find_all(
 
 
 def _lenses(
-    inputs: Inputs, features: Sequence[Path], settings: ReconstructConfig, threads: int
+    inputs: Inputs, features: Sequence[Path], settings: ReconstructConfig, executor: Executor
 ) -> tuple[dict[str, Lens], WorkingDistances | None]:
     """The pinholes that stand in for calibrated cameras; none without a rig."""
     if inputs.rig is None:
@@ -202,7 +207,7 @@ def _lenses(
         inputs.rig,
         given_m=settings.working_range_m,
         ratio=RATIO,
-        threads=threads,
+        executor=executor,
     )
     lenses: dict[str, Lens] = {
         name: flat_port_lens(inputs.rig.cameras[name], distances.near_m, distances.far_m)
@@ -261,16 +266,16 @@ def _match_all(
     cameras: Mapping[str, pycolmap.Camera],
     lenses: Mapping[str, Lens],
     seed: int,
-    threads: int,
+    executor: Executor,
 ) -> list[VerifiedPair]:
     placed = placed_pictures(inputs.records, inputs.rig, inputs.datum)
     lost = [i for i in range(len(inputs.records)) if i not in placed]
     alike: list[tuple[int, int]] = []
     if len(inputs.records) > SMALL_SET:
-        alike = alike_pairs(features, lost, _ALIKE, seed=seed, threads=threads)
+        alike = alike_pairs(features, lost, _ALIKE, seed=seed, executor=executor)
     sure, maybe = choose_pairs(inputs.records, inputs.rig, inputs.datum, alike)
     looks = [PairTask(first=features[i], second=features[j], ratio=RATIO) for i, j in maybe]
-    counts = parallel_map(coarse_matches, looks, threads=threads, label="choosing pairs")
+    counts = executor.map(coarse_matches, looks, label="choosing pairs")
     likely = [pair for pair, n in zip(maybe, counts, strict=True) if n >= _LEAST_COARSE]
     pairs = sorted([*sure, *likely])
     texts = {name: camera_text(camera) for name, camera in cameras.items()}
@@ -286,7 +291,7 @@ def _match_all(
         )
         for i, j in pairs
     ]
-    found = parallel_map(match_pair, tasks, threads=threads, label="matching")
+    found = executor.map(match_pair, tasks, label="matching")
     return [
         (i, j, matches)
         for (i, j), matches in zip(pairs, found, strict=True)

@@ -13,7 +13,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from reconstruct.mapping.database import Observations, as_transform
 from reconstruct.mapping.link_refinement import RigSight, refine_link
@@ -111,7 +111,7 @@ def stereo_points(
 
 
 def link_stations(
-    seen: Observations, cam_from_rig: Mapping[str, RigidTransform], seed: int, threads: int
+    seen: Observations, cam_from_rig: Mapping[str, RigidTransform], seed: int, executor: Executor
 ) -> list[StationLink]:
     """Find the relative pose of every two stations whose pictures share enough.
 
@@ -119,7 +119,7 @@ def link_stations(
         seen: pictures, keypoints and matches.
         cam_from_rig: poses of the cameras on the rig.
         seed: of the robust estimation.
-        threads: how many processes; the result does not depend on it.
+        executor: where tasks run; the result does not depend on it.
 
     Returns:
         Links by rising stations; those that no pose explains are left out.
@@ -137,7 +137,7 @@ def link_stations(
         ],
         seed=seed,
     )
-    found = parallel_map(resect, blocks, threads=threads, label="linking stations")
+    found = executor.map(resect, blocks, label="linking stations")
     answers = [answer for block in found for answer in block]
     links = [_link(*pair) for pair in zip(tasks, answers, strict=True)]
     return [link for link in links if link is not None]

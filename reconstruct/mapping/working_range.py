@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.errors import ReconstructionError, warn
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord
 from camera_calib.flat_port import FlatPortCamera
@@ -51,7 +51,7 @@ def find_distances(
     *,
     given_m: float | None,
     ratio: float,
-    threads: int,
+    executor: Executor,
 ) -> WorkingDistances:
     """Distances from the setting, else from stereo matches, else from the altitudes measured.
 
@@ -61,18 +61,20 @@ def find_distances(
         rig: calibrated cameras.
         given_m: working range set by the user.
         ratio: for matching.
-        threads: how many processes.
+        executor: where tasks run.
 
     Raises:
-        ReconstructionError: none of the three is there.
+        ReconstructionError: none of the three is there, and a camera refracts.
     """
+    if not any(camera.refracts for camera in rig.cameras.values()):
+        return WorkingDistances(near_m=_NEAR, far_m=_FAR, source="no refraction")  # any would do
     if given_m is not None:
         return WorkingDistances(
             near_m=_NEAR * given_m, far_m=_FAR * given_m, source="working_range_m"
         )
     tasks = _stereo_tasks(records, features, rig, ratio)
-    depths = np.concatenate([np.zeros(0), *parallel_map(
-        stereo_depths, tasks, threads=threads, label="working range"
+    depths = np.concatenate([np.zeros(0), *executor.map(
+        stereo_depths, tasks, label="working range"
     )])  # fmt: skip
     if len(depths) >= _LEAST_POINTS:
         near, far = np.percentile(depths, [2.0, 98.0])

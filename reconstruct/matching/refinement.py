@@ -22,10 +22,11 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from alice_survey.base.compiled import compiled
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from reconstruct.matching.features import load_features
 from reconstruct.matching.matches import Matches
+from reconstruct.views.interpolation import cubic_level, is_inside
 
 _RADIUS = 7
 """Of a patch, pixels."""
@@ -83,7 +84,7 @@ def refine_tracks(
     greys: Sequence[Path],
     pairs: Sequence[tuple[int, int, Matches]],
     *,
-    threads: int,
+    executor: Executor,
 ) -> RefinedFeatures:
     """Align every observation of a track with the track's reference.
 
@@ -94,7 +95,7 @@ def refine_tracks(
         features: files of the features of every picture.
         greys: files of the evened pictures, (H, W) bytes as `numpy.save` writes them.
         pairs: indices of two pictures and (K, 2) verified matches.
-        threads: how many processes.
+        executor: where tasks run.
     """
     pixels = [load_features(path).pixels for path in features]
     starts = np.concatenate([[0], np.cumsum([len(p) for p in pixels])]).astype(np.int64)
@@ -102,7 +103,7 @@ def refine_tracks(
     tasks = _tasks(pixels, starts, reference, pairs, greys)
     together = np.concatenate([np.zeros((0, 2)), *pixels])
     tracked = moved = 0
-    for nodes, found in parallel_map(align, tasks, threads=threads, label="sub-pixel positions"):
+    for nodes, found in executor.map(align, tasks, label="sub-pixel positions"):
         good = np.isfinite(found[:, 0])
         together[nodes[good]] = found[good]
         tracked += len(nodes)
@@ -259,31 +260,6 @@ def align_patches(
 
 
 @compiled
-def _cubic(picture: Any, x: float, y: float) -> float:
-    """Grey level by cubic convolution (Keys 1981); the first pixel's centre is 0, 0."""
-    column, row = math.floor(x), math.floor(y)
-    p, q = x - column, y - row
-    a = ((-0.5 * p + 1.0) * p - 0.5) * p
-    b = (1.5 * p - 2.5) * p * p + 1.0
-    c = ((-1.5 * p + 2.0) * p + 0.5) * p
-    d = (0.5 * p - 0.5) * p * p
-    rows = (
-        ((-0.5 * q + 1.0) * q - 0.5) * q,
-        (1.5 * q - 2.5) * q * q + 1.0,
-        ((-1.5 * q + 2.0) * q + 0.5) * q,
-        (0.5 * q - 0.5) * q * q,
-    )
-    level = 0.0
-    for k in range(4):
-        r = row - 1 + k
-        level += rows[k] * (
-            a * picture[r, column - 1] + b * picture[r, column]
-            + c * picture[r, column + 1] + d * picture[r, column + 2]
-        )  # fmt: skip
-    return level
-
-
-@compiled
 def _template(
     picture: Any, x: float, y: float, patch: Any, weights: Any, levels: Any, slopes: Any
 ) -> None:
@@ -291,7 +267,7 @@ def _template(
     side = 2 * _RADIUS + 3
     for i in range(side):
         for j in range(side):
-            patch[i, j] = _cubic(picture, x + j - _RADIUS - 1, y + i - _RADIUS - 1)
+            patch[i, j] = cubic_level(picture, x + j - _RADIUS - 1, y + i - _RADIUS - 1)
     k = 0
     for i in range(1, side - 1):
         for j in range(1, side - 1):
@@ -309,16 +285,6 @@ def _template(
 
 
 @compiled
-def _inside(picture: Any, x: float, y: float, margin: float) -> bool:
-    return bool(
-        x >= margin
-        and y >= margin
-        and x < picture.shape[1] - margin - 1
-        and y < picture.shape[0] - margin - 1
-    )
-
-
-@compiled
 def _compare(
     picture: Any, x: float, y: float, m: Any, weights: Any, levels: Any, slopes: Any, right: Any
 ) -> float:
@@ -330,9 +296,9 @@ def _compare(
         for j in range(-_RADIUS, _RADIUS + 1):
             at_x = x + m[0, 0] * j + m[0, 1] * i
             at_y = y + m[1, 0] * j + m[1, 1] * i
-            if not _inside(picture, at_x, at_y, 2.0):
+            if not is_inside(picture, at_x, at_y, 2.0):
                 return -2.0
-            level, weight = _cubic(picture, at_x, at_y), weights[k]
+            level, weight = cubic_level(picture, at_x, at_y), weights[k]
             miss = weight * (level - levels[k])
             for n in range(_UNKNOWNS):
                 right[n] += slopes[k, n] * miss
@@ -358,7 +324,7 @@ def _align(first: Any, second: Any, reference: Any, pixels: Any, affine: Any) ->
     found = np.full(pixels.shape, np.nan)
     for point in range(len(pixels)):
         x, y = reference[point, 0] - 0.5, reference[point, 1] - 0.5
-        if not _inside(first, x, y, _RADIUS + 3.0):
+        if not is_inside(first, x, y, _RADIUS + 3.0):
             continue
         _template(first, x, y, patch, weights, levels, slopes)
         square[:] = 0.0

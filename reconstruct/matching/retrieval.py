@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from reconstruct.matching.features import load_features
 from reconstruct.matching.pairs import Pair
@@ -35,7 +35,7 @@ class _WordsTask:
 
 
 def alike_pairs(
-    features: Sequence[Path], wanted: Sequence[int], partners: int, *, seed: int, threads: int
+    features: Sequence[Path], wanted: Sequence[int], partners: int, *, seed: int, executor: Executor
 ) -> list[Pair]:
     """Pairs of pictures that look most alike.
 
@@ -44,7 +44,7 @@ def alike_pairs(
         wanted: pictures for which partners are sought, among all.
         partners: how many for each.
         seed: of the codebook.
-        threads: how many processes.
+        executor: where tasks run.
 
     Returns:
         Pairs in rising order.
@@ -53,7 +53,7 @@ def alike_pairs(
         return []
     words = make_codebook(features, seed)
     tasks = [_WordsTask(features=path, words=words) for path in features]
-    rows = parallel_map(describe, tasks, threads=threads, label="looks of pictures")
+    rows = executor.map(describe, tasks, label="looks of pictures")
     looks = np.stack(list(rows))
     looks = looks - looks.mean(axis=0)
     looks = looks / np.maximum(np.linalg.norm(looks, axis=1, keepdims=True), 1e-9)

@@ -8,6 +8,7 @@ import numpy as np
 
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
 from alice_survey.base.errors import warn
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.records import CloudRecord, MeshRecord
 from alice_survey.base.run import progress
@@ -34,18 +35,22 @@ _LIFT_STEPS = 0.5
 """Height over the surface, in spacings of the cloud, at which lines of sight start."""
 
 
-def run_mesh(workspace: Path, config: SurveyConfig, threads: int, folder: Path) -> None:
+def run_mesh(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
     """Mesh and texture a finished surface.
 
     Raises:
         ReconstructionError: the cloud carries no surface.
         WorkspaceError: the model or the cloud is damaged.
     """
-    build_mesh(workspace, read_model(workspace / "sparse"), folder, config.reconstruct, threads)
+    build_mesh(workspace, read_model(workspace / "sparse"), folder, config.reconstruct, executor)
 
 
 def build_mesh(
-    workspace: Path, model: SparseModel, folder: Path, settings: ReconstructConfig, threads: int
+    workspace: Path,
+    model: SparseModel,
+    folder: Path,
+    settings: ReconstructConfig,
+    executor: Executor,
 ) -> None:
     """Do the work of the stage in a folder; see `run_mesh`."""
     dense = workspace / "dense"
@@ -60,13 +65,13 @@ def build_mesh(
         step,
         settings.mesh_error_px * pixel,
         settings.mesh_triangles or MOST_TRIANGLES,
-        threads,
+        executor,
     )
     scratch = folder / "scratch"
     scratch.mkdir(exist_ok=True)
     save_geometry(scratch / "mesh.npz", mesh.vertices, mesh.triangles, offset)
     candidates = find_candidates(
-        scratch / "mesh.npz", len(mesh.triangles), workspace, views, _LIFT_STEPS * step, threads
+        scratch / "mesh.npz", len(mesh.triangles), workspace, views, _LIFT_STEPS * step, executor
     )
     label = choose_views(mesh.vertices, mesh.triangles, candidates)
     del candidates
@@ -82,7 +87,7 @@ def build_mesh(
         colours_of_cloud(cloud, mesh.vertices, step),
         plain_pixel=pixel,
         page_px=settings.mesh_page_px,
-        threads=threads,
+        executor=executor,
     )
     shutil.rmtree(scratch)
     facts = mesh_facts(mesh, textured, offset, step, model.frame)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.executor import parallel_map, progress
+from alice_survey.base.executor import Executor, progress
 from alice_survey.base.frames import Array
 from reconstruct.mesh.decimate import decimate
 from reconstruct.mesh.implicit import splat, zero_mesh
@@ -77,7 +77,7 @@ class TriangleMesh:
 
 
 def mesh_cloud(
-    cloud: CloudFile, step: float, error: float, most_triangles: int, threads: int
+    cloud: CloudFile, step: float, error: float, most_triangles: int, executor: Executor
 ) -> TriangleMesh:
     """Mesh a cloud.
 
@@ -86,13 +86,13 @@ def mesh_cloud(
         step: of the lattice: the spacing of the points.
         error: that decimation may make, in the unit of the points.
         most_triangles: the error is raised until there are no more.
-        threads: processes.
+        executor: where tasks run.
 
     Raises:
         ReconstructionError: no surface is left.
     """
     tasks = surface_tasks(cloud, step, error)
-    pieces = parallel_map(mesh_tile, tasks, threads=threads, label="mesh")
+    pieces = executor.map(mesh_tile, tasks, label="mesh")
     vertices, triangles = weld([p for p in pieces if len(p.triangles)])
     triangles = without_folds(vertices, triangles)
     part, area = component_areas(vertices, triangles)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.compiled import compiled
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from reconstruct.light.solve import LightModel
@@ -96,7 +96,7 @@ def paint(
     *,
     plain_pixel: float,
     page_px: int,
-    threads: int,
+    executor: Executor,
 ) -> Textured:
     """Make the texture of a mesh.
 
@@ -112,12 +112,12 @@ def paint(
         cloud_colours: (V, 3) RGB that paint what no view sees.
         plain_pixel: side of a texture's pixel there.
         page_px: largest side of a page.
-        threads: processes.
+        executor: where tasks run.
     """
     wedges = make_wedges(triangles, charts)
     pixels = wedge_pixels(vertices, wedges, charts, views, offset_enu, plain_pixel)
     atlas = make_atlas(pixels, wedges, len(charts.views), page_px, _MOST_PAGES)
-    corrections = _corrections(pixels, wedges, charts, views, workspace, light, threads)
+    corrections = _corrections(pixels, wedges, charts, views, workspace, light, executor)
     unseen = charts.views[wedges.chart] < 0
     corrections[unseen] = cloud_colours[wedges.vertex[unseen]][:, ::-1]
     scratch = tuple(folder / f"page_{number}.raw" for number in range(len(atlas.sizes)))
@@ -127,7 +127,7 @@ def paint(
     tasks = _paint_tasks(
         workspace, atlas, wedges, charts, views, light, placed, corrections, scratch
     )
-    for _ in parallel_map(paint_view, tasks, threads=threads, label="paint"):
+    for _ in executor.map(paint_view, tasks, label="paint"):
         pass
     on_page = atlas.place(pixels, wedges.chart)
     pages, colours = [], np.zeros((len(vertices), 3))
@@ -232,7 +232,7 @@ def _corrections(
     views: Sequence[View],
     workspace: Path,
     light: LightModel,
-    threads: int,
+    executor: Executor,
 ) -> Array:
     """Corrections (W, 3), BGR, that level the seams between views."""
     label = charts.views[wedges.chart]
@@ -245,7 +245,7 @@ def _corrections(
         for g in groups
     ]
     colours = np.full((len(label), 3), np.nan)
-    found = parallel_map(seam_colours, tasks, threads=threads, label="compare seams")
+    found = executor.map(seam_colours, tasks, label="compare seams")
     for group, colour in zip(groups, found, strict=True):
         colours[group] = colour
     return level_seams(wedges, colours, label >= 0)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from reconstruct.mesh.topology import Triangles, face_normals
 from reconstruct.pictures.undistorted import Pictures
@@ -75,7 +75,7 @@ def save_geometry(path: Path, vertices: Array, triangles: Triangles, offset_enu:
 
 
 def find_candidates(
-    mesh: Path, faces: int, workspace: Path, views: Sequence[View], lift: float, threads: int
+    mesh: Path, faces: int, workspace: Path, views: Sequence[View], lift: float, executor: Executor
 ) -> Candidates:
     """The best views of every face.
 
@@ -85,7 +85,7 @@ def find_candidates(
         workspace: with the pictures.
         views: to choose from.
         lift: see `SightTask`.
-        threads: processes.
+        executor: where tasks run.
     """
     tasks = [
         SightTask(mesh=mesh, workspace=workspace, number=number, view=view, lift=lift)
@@ -93,7 +93,7 @@ def find_candidates(
     ]
     numbers = np.full((faces, CANDIDATES), -1, np.int32)
     quality = np.zeros((faces, CANDIDATES), np.float32)
-    for sight in parallel_map(see_faces, tasks, threads=threads, label="lines of sight"):
+    for sight in executor.map(see_faces, tasks, label="lines of sight"):
         mine, rows = sight.quality, sight.faces
         worst = quality[rows, -1] < mine
         rows, mine = rows[worst], mine[worst]

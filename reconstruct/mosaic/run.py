@@ -17,8 +17,8 @@ import numpy as np
 import rasterio
 
 from alice_survey.base.config import ReconstructConfig, SurveyConfig, WaterConfig
-from alice_survey.base.executor import parallel_map
-from alice_survey.base.records import CamerasRecord, MosaicRecord, PicturesRecord
+from alice_survey.base.executor import Executor
+from alice_survey.base.records import MosaicRecord, PicturesRecord
 from reconstruct.light.solve import joined_samples
 from reconstruct.mosaic.blend import SUPPORT_PX
 from reconstruct.mosaic.colour import ColourModel, solve_colour
@@ -49,7 +49,8 @@ from reconstruct.mosaic.visibility import Water
 from reconstruct.mosaic.writers import cloud_optimised, thumbnail, write_labels, write_tiles
 from reconstruct.placing.track_figure import plot_track_over
 from reconstruct.raster import DemGrid, opened_raster, round_cell
-from reconstruct.views.model import SparseModel, read_model
+from reconstruct.views.lens import FlatPortLens
+from reconstruct.views.model import SparseModel, read_lenses, read_model
 
 _TILE_PX = 1024
 _GROUP = 2
@@ -63,13 +64,13 @@ _LIGHT_LATTICE = 24
 _MOST_SAMPLES = 150_000
 _CACHE_MIB, _WORKER_CACHE_MIB = 48, 16
 """Of files that GDAL reads and writes: here, and in each other process."""
-_MOST_PROCESSES = 2
-"""Each takes up to 0.4 GB; all of them and this one stay below 1.5 GiB."""
+_TASK_MIB = 400
+"""Memory that a process takes for a block of any kind."""
 _TEMPERATURE_C, _SALINITY_PSU = 15.0, 35.0
 """Of the sea where nobody says; red and blue move by 2 % of their dispersion from 5 to 30 C."""
 
 
-def run_mosaic(workspace: Path, config: SurveyConfig, threads: int, folder: Path) -> None:
+def run_mosaic(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
     """Paint the mosaic on a finished surface.
 
     Raises:
@@ -79,7 +80,7 @@ def run_mosaic(workspace: Path, config: SurveyConfig, threads: int, folder: Path
     model = read_model(workspace / "sparse")
     sea = _sea(config.water, config.area.seafloor_depth_m)
     with _small_caches():
-        build_mosaic(workspace, model, folder, config.reconstruct, sea, threads)
+        build_mosaic(workspace, model, folder, config.reconstruct, sea, executor)
 
 
 @contextlib.contextmanager
@@ -107,11 +108,10 @@ def build_mosaic(
     folder: Path,
     settings: ReconstructConfig,
     sea: tuple[Water, bool],
-    threads: int,
+    executor: Executor,
 ) -> None:
     """Do the work of the stage in a folder; see `run_mosaic`."""
     forget_tools()
-    threads = min(threads, _MOST_PROCESSES)
     scratch = folder / "scratch"
     scratch.mkdir()
     with opened_raster(workspace / "dense" / "dem.tif") as raster:
@@ -120,14 +120,14 @@ def build_mosaic(
         grid = mosaic_grid(raster, pixel, model.frame)
     names = [view.image for view in model.views]
     measured = list(
-        parallel_map(
+        executor.map(
             measure_view,
             [
                 ViewTask(workspace=workspace, scratch=scratch, view=view, heights=heights)
                 for view in model.views
             ],
-            threads=threads,
             label="measure pictures",
+            task_mib=_TASK_MIB,
         )
     )
     facts = [fact for fact, _ in measured]
@@ -140,7 +140,7 @@ def build_mosaic(
     views = _seen_views(model, facts)
     ground = footprints(model.views, heights)
     label_blocks = seam_blocks(grid, ground)
-    colour = _solve(model, survey, facts, views, label_blocks, settings.colour, threads)
+    colour = _solve(model, survey, facts, views, label_blocks, settings.colour, executor)
 
     def tasks(blocks: Sequence[Block]) -> list[PaintTask]:
         return [
@@ -159,14 +159,14 @@ def build_mosaic(
         folder / "coverage.tif",
         grid,
         model.frame,
-        parallel_map(label_block, tasks(label_blocks), threads=threads, label="seams"),
+        executor.map(label_block, tasks(label_blocks), label="seams", task_mib=_TASK_MIB),
     )
     tiles = blocks_of(grid, ground, _TILE_PX, SUPPORT_PX)
     rough = scratch / "rough.tif"
     groups = [tasks(group) for group in neighbours(tiles, _GROUP)]
-    painted = parallel_map(paint_tiles, groups, threads=threads, label="mosaic")
+    painted = executor.map(paint_tiles, groups, label="mosaic", task_mib=_TASK_MIB)
     covered = write_tiles(rough, folder / "mosaic_source.tif", grid, model.frame, painted, names)
-    cloud_optimised(rough, folder / "mosaic.tif", threads)
+    cloud_optimised(rough, folder / "mosaic.tif", executor.local_cores)
     thumbnail(folder / "mosaic.tif", folder / "mosaic.png")
     plot_track_over(folder / "mosaic.tif", workspace / "sparse" / "track.csv", folder / "track.png")
     shutil.rmtree(scratch)
@@ -221,7 +221,7 @@ def _solve(
     views: Sequence[SeenView],
     blocks: Sequence[Block],
     wanted: Literal["even", "water", "raw"],
-    threads: int,
+    executor: Executor,
 ) -> ColourModel:
     """The survey's light from spots that two views see."""
     images = [view.image for view in model.views]
@@ -240,7 +240,7 @@ def _solve(
         )
         for block in blocks
     ]
-    found = list(parallel_map(compare_block, compare, threads=threads, label="compare light"))
+    found = list(executor.map(compare_block, compare, label="compare light", task_mib=_TASK_MIB))
     parts = [part for part in found if len(part.views)]
     return solve_colour(wanted, joined_samples(parts), facts, images, cameras)
 
@@ -255,8 +255,8 @@ def _dispersion(
     workspace: Path, wanted: str, sea: tuple[Water, bool], *, grey: bool
 ) -> tuple[Water | None, dict[str, Any]]:
     """The water through which colours are distinguished, or None, and what to say about it."""
-    cameras = CamerasRecord.read(workspace / "sparse" / "cameras.json").cameras.values()
-    ports = any(camera["kind"] == "flat_port" for camera in cameras)
+    lenses = read_lenses(workspace / "sparse" / "cameras.json").values()
+    ports = any(isinstance(lens, FlatPortLens) and lens.camera.n_water > 1 for lens in lenses)
     reason = ""
     if wanted == "off":
         reason = "switched off"

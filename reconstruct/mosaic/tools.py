@@ -53,7 +53,7 @@ class Tools:
     def channels(self, view: View) -> tuple[CameraOptics, ...] | None:
         """Of a view's channels, BGR; None where they share one."""
         lens = self._pictures.lens(view.image)
-        if self._water is None or not isinstance(lens, FlatPortLens):
+        if self._water is None or not isinstance(lens, FlatPortLens) or lens.camera.n_water == 1:
             return None
         if view.camera not in self._channels:
             self._channels[view.camera] = channel_optics(lens, self._water, self._scaled)

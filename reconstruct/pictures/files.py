@@ -3,6 +3,7 @@
 import re
 import shutil
 import warnings
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, timezone, tzinfo
 from fractions import Fraction
@@ -23,6 +24,19 @@ RAW = (
     ".3fr", ".arw", ".cr2", ".cr3", ".dng", ".erf", ".gpr", ".iiq", ".kdc", ".mef", ".mos", ".mrw",
     ".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f",
 )  # fmt: skip
+_HEIC = (".heic", ".heif", ".hif", ".avif")
+_VIDEO = (
+    ".360", ".avi", ".insv", ".lrv", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg",
+    ".mts", ".webm", ".wmv",
+)  # fmt: skip
+IN_FOLDERS = "in folders inside"
+_ADVICE = {
+    "HEIC": "save them as JPEG first",
+    "video": "take its frames with --video, into a workspace of their own",
+    IN_FOLDERS: "give these folders too",
+    "other files": "they are no pictures by their names",
+}
+_NAMED = 3
 _YEARS = range(1970, 2200)
 """In which a digital camera can have taken a picture."""
 _GPS, _EXIF = 0x8825, 0x8769
@@ -46,29 +60,92 @@ class PictureFacts:
     fault: str = ""
 
 
-def find_pictures(folder: Path) -> list[Path]:
-    """Picture files of a folder (not of folders inside), numbers in their names in order.
+@dataclass(frozen=True, kw_only=True)
+class PictureFolder:
+    """What a folder holds, without hidden files and folders."""
 
-    Masks (`NAME_mask.png` beside `NAME.*`) and hidden files are left out.
+    folder: Path
+    pictures: tuple[Path, ...]
+    """In the order of the numbers in their names."""
+    masks: tuple[Path, ...]
+    """`NAME_mask.png` next to the picture `NAME.*`."""
+    left_out: Mapping[str, tuple[Path, ...]]
+    """What is not a picture that can be read, by reason."""
+
+    def warnings(self) -> list[str]:
+        """A line for each reason: how many, such as which, and what to do."""
+        return [
+            f"{self.folder}: {_named(reason, paths)} left out; {_ADVICE[reason]}"
+            for reason, paths in self.left_out.items()
+        ]
+
+
+def look_into(folder: Path, apart: Collection[Path] = ()) -> PictureFolder:
+    """List the pictures of a folder, not of folders inside, and what else is there.
+
+    Args:
+        folder: to look into.
+        apart: files and folders that the caller knows; they are not reported as left out.
 
     Raises:
-        ImageError: it is no folder that can be read, or it holds no picture.
+        ImageError: it is not a folder that can be read, or it holds no picture.
     """
+    known = {path.resolve() for path in apart}
     try:
-        inside = list(folder.iterdir())
+        inside = sorted(folder.iterdir(), key=lambda p: (natural_key(p.name), p.name))
     except OSError as error:
         raise ImageError(f"{folder}: cannot be read: {error.strerror}") from None
-    known = (*PLAIN, *TIFF, *RAW)
-    pictures = [
-        p
-        for p in inside
-        if p.suffix.lower() in known and not p.name.startswith(".") and not p.is_dir()
-    ]
-    stems = {p.stem for p in pictures}
-    pictures = [p for p in pictures if not _is_mask(p, stems)]
+    inside = [p for p in inside if not p.name.startswith(".")]
+    files = [p for p in inside if not p.is_dir() and kind_of(p)]
+    stems = {p.stem for p in files}
+    masks = tuple(p for p in files if _is_mask(p, stems))
+    pictures = tuple(p for p in files if p not in masks)
+    left_out: dict[str, list[Path]] = {}
+    for path in inside:
+        if path in files or path.resolve() in known:
+            continue
+        if path.is_dir():
+            deeper = [p for p in sorted(path.rglob("*")) if kind_of(p) and p.is_file()]
+            if deeper and not any(other.is_relative_to(path.resolve()) for other in known):
+                left_out.setdefault(IN_FOLDERS, []).extend(deeper)
+            continue
+        suffix = path.suffix.lower()
+        reason = "HEIC" if suffix in _HEIC else "video" if suffix in _VIDEO else "other files"
+        left_out.setdefault(reason, []).append(path)
+    found = PictureFolder(
+        folder=folder,
+        pictures=pictures,
+        masks=masks,
+        left_out={reason: tuple(left_out[reason]) for reason in _ADVICE if reason in left_out},
+    )
     if not pictures:
-        raise ImageError(f"{folder}: holds no pictures (JPEG, PNG, TIFF or camera RAW)")
-    return sorted(pictures, key=lambda p: (natural_key(p.name), p.name))
+        held = ", ".join(_named(reason, paths) for reason, paths in found.left_out.items())
+        raise ImageError(
+            f"{folder}: holds no pictures (JPEG, PNG, TIFF or camera RAW)"
+            + (
+                f", but {held}: {next(_ADVICE[reason] for reason in found.left_out)}"
+                if held
+                else ""
+            )
+        )
+    return found
+
+
+def kind_of(path: Path) -> str:
+    """`JPEG`, `PNG`, `TIFF` or `RAW` by the name of a file; empty for all others."""
+    suffix = path.suffix.lower()
+    if suffix in TIFF or suffix in RAW:
+        return "TIFF" if suffix in TIFF else "RAW"
+    return {".png": "PNG"}.get(suffix, "JPEG") if suffix in PLAIN else ""
+
+
+def _named(reason: str, paths: Sequence[Path]) -> str:
+    """Such as `2 HEIC (a.heic, b.heic)`; of folders inside, their names."""
+    names = [p.name for p in paths]
+    if reason == IN_FOLDERS:
+        names = list(dict.fromkeys(p.parent.name for p in paths))
+    more = ", ..." if len(names) > _NAMED else ""
+    return f"{len(paths)} {reason} ({', '.join(names[:_NAMED])}{more})"
 
 
 def _is_mask(path: Path, stems: set[str]) -> bool:

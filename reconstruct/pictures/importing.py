@@ -1,6 +1,7 @@
 """Real pictures into a workspace: checked, named, timed and placed; the stage `images/`."""
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, tzinfo
 from pathlib import Path
@@ -11,9 +12,9 @@ import numpy as np
 
 from alice_survey.base.artefacts import Stage, run_stage
 from alice_survey.base.errors import ImageError, NavigationError, WorkspaceError, warn
-from alice_survey.base.executor import parallel_map, progress
+from alice_survey.base.executor import SERIAL, Executor, progress
 from alice_survey.base.frames import Array
-from alice_survey.base.manifest import ImageRecord, write_manifest
+from alice_survey.base.manifest import ImageRecord, read_manifest, write_manifest
 from alice_survey.base.records import PicturesRecord
 from camera_calib.rig import Rig, read_rig, write_rig
 from missions.logs.navigation_csv import (
@@ -26,10 +27,12 @@ from missions.logs.navigation_csv import (
 )
 from reconstruct.pictures.files import (
     PictureFacts,
+    PictureFolder,
     bits_used,
     copy_picture,
-    find_pictures,
     inspect,
+    kind_of,
+    look_into,
     safe_name,
     target_suffix,
     to_utc,
@@ -37,13 +40,39 @@ from reconstruct.pictures.files import (
 from reconstruct.pictures.undistorted import read_mask
 
 _MONO = "camera"
+_FRAMES = "frames of the video"
+_UNDECODABLE = "cannot be decoded"
 _EXIF_SIGMA_M = (3.0, 6.0)
 """Horizontal and vertical sigma of the GPS in a picture's EXIF, which states none."""
 _LOGGED_LEVEL = "sea surface, as in the navigation log"
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Entry:
+class ImportedPictures:
+    """What a workspace got, and what was left out."""
+
+    changed: bool
+    """False when all was there already."""
+    cameras: Mapping[str, int]
+    """Pictures by camera."""
+    kinds: Mapping[str, int]
+    """Pictures by kind of file."""
+    positions: int
+    """How many know where they were taken."""
+    left_out: Mapping[str, int]
+    """Files by the reason why they did not come in."""
+
+    def __str__(self) -> str:
+        """One line, such as `68 pictures (68 PNG) of left and right, 0 with a position`."""
+        total = sum(self.cameras.values())
+        several = f" of {' and '.join(self.cameras)}" if len(self.cameras) > 1 else ""
+        text = f"{total} pictures ({_counted(self.kinds)}){several}"
+        text += f", {self.positions} with a position"
+        return text + (f"; left out: {_counted(self.left_out)}" if self.left_out else "")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Incoming:
     """One picture on its way in."""
 
     source: Path
@@ -69,12 +98,13 @@ def import_images(
     vertical_datum: str | None = None,
     rig: Path | None = None,
     masks: Path | None = None,
-    threads: int = 1,
-) -> bool:
+    executor: Executor = SERIAL,
+) -> ImportedPictures:
     """Write `images/` from pictures of one camera, of a stereo pair, or from a video.
 
     A picture that cannot be decoded to its end is left out with a warning; the other picture of its
-    stereo station stays. Where each picture was taken comes from the navigation log, else from
+    stereo station stays. HEIC, videos, folders inside and other files are left out with a warning
+    for each kind. Where each picture was taken comes from the navigation log, else from
     GPS in EXIF, else from nothing: then the model will have neither scale nor CRS.
 
     Args:
@@ -91,20 +121,21 @@ def import_images(
             the tide which `import-log` took off; None for the sea surface.
         rig: `rig.json` of the cameras; its lever arm says that navigation is of the body.
         masks: folder of masks (0 = leave out) with the stems of the pictures, or with a folder per
-            camera; without it `NAME_mask.png` beside a picture is its mask.
-        threads: how many processes.
+            camera; without it `NAME_mask.png` next to a picture is its mask.
+        executor: where tasks run.
 
     Returns:
-        Whether there was anything to do.
+        How many pictures of which kind there are now, and what was left out.
 
     Raises:
-        ImageError: pictures are missing, do not pair, are of different sizes, or too few.
+        ImageError: pictures are missing, a folder is given twice, or pictures do not pair, are of
+            different sizes, or too few.
         NavigationError: the navigation log cannot be used, or a level is named without one.
         CalibrationError: the rig file is wrong or not that of the pictures.
     """
     _check_sources(folders, left, right, video, every_s)
     if not np.isfinite(clock_offset_s):
-        raise ImageError(f"--clock-offset {clock_offset_s} is no number of seconds")
+        raise ImageError(f"--clock-offset {clock_offset_s} is not a number of seconds")
     zone = find_zone(time_zone)
     logged_level = _checked_level(vertical_datum, navigation)
     given = [*folders, *(p for p in (left, right, video, navigation, rig, masks) if p is not None)]
@@ -113,13 +144,15 @@ def import_images(
             raise ImageError(f"{path}: no such file or folder")
     for path in given:
         if path.resolve().is_relative_to((workspace / "images").resolve()):
-            raise WorkspaceError(f"{path} is inside {workspace / 'images'}, which is written anew")
+            raise WorkspaceError(f"{path} is inside {workspace / 'images'}, which is written again")
     for simulated in (workspace / "images" / "truth", workspace / "pool" / "truth"):
         if simulated.exists():
             raise WorkspaceError(
                 f"{workspace} holds a simulated survey, whose rig is not that of real pictures: "
                 "choose another workspace with -w"
             )
+    sides = _look_into(folders, left, right, [*given, workspace])
+    files = [file for side in sides.values() for each in side for file in _files_of(each)]
     stage = Stage(
         name="images",
         version=1,
@@ -134,7 +167,7 @@ def import_images(
             "rig": rig is not None,
             "masks": masks is not None,
         },
-        inputs=given,
+        inputs=[*files, *(path for path in given if path not in (*folders, left, right))],
     )
 
     def work(partial: Path) -> None:
@@ -144,12 +177,16 @@ def import_images(
         if video is not None:
             entries = _take_frames(video, every_s, partial, _mono_name(known_rig))
         else:
-            entries = _find_entries(folders, left, right, known_rig, threads)
+            for line in [
+                line for side in sides.values() for one in side for line in one.warnings()
+            ]:
+                warn(line)
+            entries = _find_entries(sides, known_rig, executor)
         _check_entries(entries, known_rig)
         entries = _named(entries)
         entries = [replace(e, mask=_mask_of(e, masks, left is not None)) for e in entries]
         if video is None:
-            notes += _copy_all(entries, partial, threads)
+            notes += _copy_all(entries, partial, executor)
         records = [_record(entry, partial) for entry in entries]
         records, datum, level = _place(
             entries, records, log, logged_level, clock_offset_s, zone, notes
@@ -163,7 +200,53 @@ def import_images(
             {"source": "imported", "datum": datum, "vertical_datum": level, "notes": notes},
         )
 
-    return run_stage(workspace, stage, work)
+    changed = run_stage(workspace, stage, work)
+    records = read_manifest(workspace / "images" / "manifest.csv")
+    return _imported(records, sides, changed=changed)
+
+
+def _imported(
+    records: Sequence[ImageRecord], sides: Mapping[str, Sequence[PictureFolder]], *, changed: bool
+) -> ImportedPictures:
+    """Counts by the manifest, whose stations number the pictures that were found."""
+    left_out: Counter[str] = Counter()
+    kinds = Counter({_FRAMES: len(records)})
+    if sides:
+        paths = {
+            side: [path for one in folders for path in one.pictures]
+            for side, folders in sides.items()
+        }
+        names = {record.camera for record in records}
+        of_camera = paths if len(paths) > 1 else dict.fromkeys(names, paths[_MONO])
+        kinds = Counter(kind_of(of_camera[r.camera][r.station]) for r in records)
+        lost = sum(map(len, paths.values())) - len(records)
+        left_out += Counter({_UNDECODABLE: lost})
+        for one in (one for folders in sides.values() for one in folders):
+            left_out += Counter({reason: len(paths) for reason, paths in one.left_out.items()})
+    return ImportedPictures(
+        changed=changed,
+        cameras=dict(Counter(record.camera for record in records)),
+        kinds=dict(kinds),
+        positions=sum(record.has_position for record in records),
+        left_out=dict(left_out),
+    )
+
+
+def _counted(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {what}" for what, count in counts.items())
+
+
+def _look_into(
+    folders: Sequence[Path], left: Path | None, right: Path | None, apart: Sequence[Path]
+) -> dict[str, list[PictureFolder]]:
+    """Contents of the folders of each camera; of one camera whose name follows later, `_MONO`."""
+    if left is not None and right is not None:
+        return {"left": [look_into(left, apart)], "right": [look_into(right, apart)]}
+    return {_MONO: [look_into(folder, apart) for folder in folders]} if folders else {}
+
+
+def _files_of(folder: PictureFolder) -> tuple[Path, ...]:
+    return (*folder.pictures, *folder.masks)
 
 
 def _check_sources(
@@ -179,6 +262,12 @@ def _check_sources(
         raise ImageError("give folders of pictures, or --left and --right, or --video: one of them")
     if not every_s > 0:
         raise ImageError(f"--every {every_s}: seconds between frames must be more than 0")
+    if left is not None and right is not None and left.resolve() == right.resolve():
+        raise ImageError(f"--left and --right are both {left}: give each camera's own folder")
+    places = [folder.resolve() for folder in folders]
+    twice = [folder for folder in folders if places.count(folder.resolve()) > 1]
+    if twice:
+        raise ImageError(f"{twice[0]} is given twice")
 
 
 def _checked_level(name: str | None, navigation: Path | None) -> str:
@@ -191,7 +280,9 @@ def _checked_level(name: str | None, navigation: Path | None) -> str:
             "give --navigation too"
         )
     if not name.strip() or not name.isprintable():
-        raise NavigationError(f"--vertical-datum {name!r} is no name of one line, such as 'NN2000'")
+        raise NavigationError(
+            f"--vertical-datum {name!r} is not a name of one line, such as 'NN2000'"
+        )
     return name.strip()
 
 
@@ -200,34 +291,35 @@ def _mono_name(rig: Rig | None) -> str:
 
 
 def _find_entries(
-    folders: Sequence[Path], left: Path | None, right: Path | None, rig: Rig | None, threads: int
-) -> list[_Entry]:
-    if left is not None and right is not None:
-        sides = {"left": find_pictures(left), "right": find_pictures(right)}
-        if len(sides["left"]) != len(sides["right"]):
-            raise ImageError(
-                f"{len(sides['left'])} pictures in {left} but {len(sides['right'])} in {right}: "
-                "they are paired in order of their names, so every picture needs its partner"
-            )
-    else:
-        sides = {_mono_name(rig): [path for folder in folders for path in find_pictures(folder)]}
+    sides: Mapping[str, Sequence[PictureFolder]], rig: Rig | None, executor: Executor
+) -> list[_Incoming]:
+    found = {side: [p for one in folders for p in one.pictures] for side, folders in sides.items()}
+    counts = {side: len(paths) for side, paths in found.items()}
+    if len(set(counts.values())) > 1:
+        left, right = (folders[0].folder for folders in sides.values())
+        raise ImageError(
+            f"{counts['left']} pictures in {left} but {counts['right']} in {right}: "
+            "they are paired in order of their names, so every picture needs its partner"
+        )
+    if len(found) == 1:
+        found = {_mono_name(rig): paths for paths in found.values()}
     listed = [
         (camera, station, path)
-        for camera, paths in sides.items()
+        for camera, paths in found.items()
         for station, path in enumerate(paths)
     ]
     paths = [path for _, _, path in listed]
-    facts = parallel_map(inspect, paths, threads=threads, label="checking pictures")
+    facts = executor.map(inspect, paths, label="checking pictures")
     entries = []
     for (camera, station, path), known in zip(listed, facts, strict=True):
         if known.fault:
             warn(f"{path} is left out: {known.fault}")
             continue
-        entries.append(_Entry(source=path, camera=camera, station=station, facts=known))
+        entries.append(_Incoming(source=path, camera=camera, station=station, facts=known))
     return entries
 
 
-def _check_entries(entries: Sequence[_Entry], rig: Rig | None) -> None:
+def _check_entries(entries: Sequence[_Incoming], rig: Rig | None) -> None:
     if len({entry.station for entry in entries}) < 2:
         count = len(entries)
         raise ImageError(
@@ -257,7 +349,7 @@ def _check_entries(entries: Sequence[_Entry], rig: Rig | None) -> None:
             )
 
 
-def _named(entries: Sequence[_Entry]) -> list[_Entry]:
+def _named(entries: Sequence[_Incoming]) -> list[_Incoming]:
     """Names below `images/`: the camera's folder and a safe, unique form of the file's own name."""
     taken: set[str] = set()
     named = []
@@ -276,11 +368,11 @@ def _named(entries: Sequence[_Entry]) -> list[_Entry]:
     return named
 
 
-def _bits(entries: Sequence[_Entry], camera: str) -> int:
+def _bits(entries: Sequence[_Incoming], camera: str) -> int:
     return bits_used(max(e.facts.highest for e in entries if e.camera == camera))
 
 
-def _mask_of(entry: _Entry, masks: Path | None, stereo: bool) -> Path | None:
+def _mask_of(entry: _Incoming, masks: Path | None, stereo: bool) -> Path | None:
     stem = entry.source.stem
     names = [f"{stem}.png", f"{stem}_mask.png", f"{stem}.jpg", f"{stem}.tif"]
     if masks is None:
@@ -295,10 +387,10 @@ def _mask_of(entry: _Entry, masks: Path | None, stereo: bool) -> Path | None:
     return found
 
 
-def _copy_all(entries: Sequence[_Entry], partial: Path, threads: int) -> list[str]:
+def _copy_all(entries: Sequence[_Incoming], partial: Path, executor: Executor) -> list[str]:
     bits = {camera: _bits(entries, camera) for camera in {e.camera for e in entries}}
     tasks = [(entry.source, partial / entry.image, bits[entry.camera]) for entry in entries]
-    for _ in parallel_map(_copy, tasks, threads=threads, label="copying pictures"):
+    for _ in executor.map(_copy, tasks, label="copying pictures"):
         pass
     return [
         f"pictures of camera {camera} held {count} bits; the upper 8 were kept"
@@ -311,12 +403,12 @@ def _copy(task: tuple[Path, Path, int]) -> None:
     copy_picture(*task)
 
 
-def _take_frames(video: Path, every_s: float, partial: Path, camera: str) -> list[_Entry]:
+def _take_frames(video: Path, every_s: float, partial: Path, camera: str) -> list[_Incoming]:
     """Write a frame every so many seconds as PNG."""
     capture = cv2.VideoCapture(str(video))
     if not capture.isOpened():
         raise ImageError(f"{video}: no video that can be read")
-    entries: list[_Entry] = []
+    entries: list[_Incoming] = []
     try:
         total = max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
         rate = capture.get(cv2.CAP_PROP_FPS)
@@ -339,7 +431,7 @@ def _take_frames(video: Path, every_s: float, partial: Path, camera: str) -> lis
                 raise ImageError(f"{partial / image}: cannot be written")
             facts = PictureFacts(path=video, width_px=pixels.shape[1], height_px=pixels.shape[0])
             entries.append(
-                _Entry(
+                _Incoming(
                     source=video.with_name(Path(image).name),
                     camera=camera,
                     station=len(entries),
@@ -353,7 +445,7 @@ def _take_frames(video: Path, every_s: float, partial: Path, camera: str) -> lis
     return entries
 
 
-def _record(entry: _Entry, partial: Path) -> ImageRecord:
+def _record(entry: _Incoming, partial: Path) -> ImageRecord:
     mask = ""
     if entry.mask is not None:
         mask = f"masks/{Path(entry.image).with_suffix('.png').as_posix()}"
@@ -365,7 +457,7 @@ def _record(entry: _Entry, partial: Path) -> ImageRecord:
 
 
 def _place(
-    entries: Sequence[_Entry],
+    entries: Sequence[_Incoming],
     records: Sequence[ImageRecord],
     log: NavigationLog | None,
     logged_level: str,
@@ -406,7 +498,7 @@ def _place(
 
 
 def _times(
-    entries: Sequence[_Entry], log: NavigationLog | None, clock_offset_s: float, zone: tzinfo
+    entries: Sequence[_Incoming], log: NavigationLog | None, clock_offset_s: float, zone: tzinfo
 ) -> tuple[Array, bool]:
     """Seconds of every picture on the clock of navigation (else since the first), NaN if unknown.
 
@@ -443,7 +535,7 @@ def _with_navigation(
     return placed
 
 
-def _with_gps(records: Sequence[ImageRecord], entries: Sequence[_Entry]) -> list[ImageRecord]:
+def _with_gps(records: Sequence[ImageRecord], entries: Sequence[_Incoming]) -> list[ImageRecord]:
     placed, lost = [], []
     for record, entry in zip(records, entries, strict=True):
         facts = entry.facts

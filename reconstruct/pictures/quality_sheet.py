@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from alice_survey.base.artefacts import atomic_path, read_stage, write_csv
 from alice_survey.base.errors import ImageError
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import Executor
 from alice_survey.base.manifest import read_manifest
 from reconstruct.pictures.files import decode
 from reconstruct.pictures.quality import (
@@ -120,12 +120,12 @@ def _short(reason: str) -> str:
     return reason if len(reason) <= 54 else reason[:53] + "…"
 
 
-def quality_report(workspace: Path, threads: int) -> tuple[str, dict[str, Any]]:
+def quality_report(workspace: Path, executor: Executor) -> tuple[str, dict[str, Any]]:
     """Measure all pictures of a workspace and write `quality/quality.csv` and `quality.png`.
 
     Args:
         workspace: with `images/manifest.csv`; a finished `sparse/` adds the overlaps.
-        threads: processes that read pictures.
+        executor: where tasks run that read pictures.
 
     Returns:
         The list of flagged pictures as text, and figures as JSON values.
@@ -138,7 +138,7 @@ def quality_report(workspace: Path, threads: int) -> tuple[str, dict[str, Any]]:
     if not records:
         raise ImageError(f"{images / 'manifest.csv'} names no picture")
     tasks = [MeasureTask(images=images, record=record) for record in records]
-    found = list(parallel_map(measure_file, tasks, threads=threads, label="picture quality"))
+    found = list(executor.map(measure_file, tasks, label="picture quality"))
     if read_stage(workspace / "sparse") is not None:
         found = add_overlap(found, workspace / "sparse")
     found = judge(found)

@@ -60,7 +60,8 @@ class PlacementFit:
     left_out: Mapping[str, int]
     """By group of channels, readings that the rest contradicts."""
     rms_m: Array
-    """(3,) north, east, down misses of the positions that took part, root mean square."""
+    """(3,) north, east, down misses of the positions that took part, root mean square; NaN where
+    none did."""
     free_scale: float
     """Scale that a similarity would choose: 1 where navigation agrees with the known scale."""
     free_scale_sigma: float
@@ -105,9 +106,10 @@ class PlacementFit:
             "method": _METHOD,
             "stations": self.used,
             "left_out": dict(self.left_out),
-            "rms_north_m": float(self.rms_m[0]),
-            "rms_east_m": float(self.rms_m[1]),
-            "rms_depth_m": float(self.rms_m[2]),
+            **{
+                f"rms_{axis}_m": None if np.isnan(rms_m) else float(rms_m)
+                for axis, rms_m in zip(("north", "east", "depth"), self.rms_m, strict=True)
+            },
             "sigma_north_m": north,
             "sigma_east_m": east,
             "sigma_depth_m": down,

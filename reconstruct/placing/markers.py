@@ -11,7 +11,7 @@ import numpy as np
 
 from alice_survey.base.artefacts import need_stage, read_stage, write_csv
 from alice_survey.base.errors import ReconstructionError
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import SERIAL, Executor
 from alice_survey.base.frames import Array, Datum
 from alice_survey.base.manifest import read_manifest
 from alice_survey.base.records import ControlRecord
@@ -72,7 +72,7 @@ def find_markers(picture: Any, dictionary: str) -> list[Marker]:
 
 
 def survey_control(
-    workspace: Path, *, dictionary: str | None = None, threads: int = 1
+    workspace: Path, *, dictionary: str | None = None, executor: Executor = SERIAL
 ) -> tuple[str, dict[str, Any]]:
     """Find coded markers in all pictures and prepare the picking of control points by hand.
 
@@ -82,7 +82,7 @@ def survey_control(
     Args:
         workspace: folder with finished `images/`.
         dictionary: name of a dictionary of `cv2.aruco`; the one with most markers if None.
-        threads: how many processes.
+        executor: where tasks run.
 
     Returns:
         What was found, in words and as JSON values: `dictionary`, `markers` (pictures by number),
@@ -99,7 +99,7 @@ def survey_control(
         )
     tried = DICTIONARIES if dictionary is None else (dictionary,)
     tasks = [_MarkerTask(images / name, tried) for name in names]
-    found = list(parallel_map(_look, tasks, threads=threads, label="markers"))
+    found = list(executor.map(_look, tasks, label="markers"))
     best, views = _best_dictionary(tried, found)
     rows = [
         (name, f"{marker.number}.{k}", f"{x:.4f}", f"{y:.4f}", MARKER_SIGMA_PX)

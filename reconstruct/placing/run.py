@@ -13,6 +13,7 @@ import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.config import SurveyConfig
+from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.records import (
     ControlRecord,
@@ -47,7 +48,7 @@ from reconstruct.views.model_files import read_reconstruction
 __all__ = ["read_track_poses", "run_sparse"]
 
 
-def run_sparse(workspace: Path, config: SurveyConfig, threads: int, folder: Path) -> None:
+def run_sparse(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
     """Place the model of `mapping/` in the world.
 
     Raises:

@@ -188,7 +188,7 @@ def test_a_resumed_stage_counts_what_was_spent_before(
     tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("alice_survey.base.run.resources._EVERY_S", 0.01)
-    monkeypatch.setattr("alice_survey.base.run.resources._TOLD_EVERY_S", 0.01)
+    monkeypatch.setattr("alice_survey.base.run.resources._REPORTED_EVERY_S", 0.01)
     spent = tmp_path / "made.partial" / ".spent"
 
     def broken(folder: Path) -> None:

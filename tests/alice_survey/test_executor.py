@@ -9,16 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from alice_survey.base.executor import kept_workers, parallel_map
+from alice_survey.base.executor import local_executor
 
 WORKERS = """
 import os, sys, time
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 import sleeping
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import local_executor
 if __name__ == "__main__":
-    list(parallel_map(sleeping.stay, [sys.argv[1]] * 8, threads=2, label="sleep"))
+    list(local_executor(2).map(sleeping.stay, [sys.argv[1]] * 8, label="sleep"))
 """
 SLEEPING = """
 import os, time
@@ -31,7 +31,7 @@ def stay(folder):
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_results_come_in_order(threads: int) -> None:
-    assert list(parallel_map(abs, range(-20, 20), threads=threads, label="abs")) == [
+    assert list(local_executor(threads).map(abs, range(-20, 20), label="abs")) == [
         abs(i) for i in range(-20, 20)
     ]
 
@@ -42,13 +42,11 @@ def _process(_: int) -> int:
 
 
 def test_kept_workers_are_the_same_from_call_to_call_and_end_with_their_block() -> None:
-    with kept_workers():
-        first, second = (
-            set(parallel_map(_process, range(8), threads=2, label="ids")) for _ in range(2)
-        )
+    with local_executor(2).started() as started:
+        first, second = (set(started.map(_process, range(8), label="ids")) for _ in range(2))
         with pytest.raises(TypeError):
-            list(parallel_map(abs, [1, "a", 2], threads=2, label="abs"))  # type: ignore[list-item]
-        third = set(parallel_map(_process, range(8), threads=2, label="ids"))
+            list(started.map(abs, [1, "a", 2], label="abs"))  # type: ignore[list-item]
+        third = set(started.map(_process, range(8), label="ids"))
     assert len(first) == 2
     assert first == second == third
     for _ in range(100):
@@ -56,12 +54,12 @@ def test_kept_workers_are_the_same_from_call_to_call_and_end_with_their_block() 
             break
         time.sleep(0.1)
     assert not any(Path(f"/proc/{pid}").exists() for pid in first)
-    assert set(parallel_map(_process, range(8), threads=2, label="ids")).isdisjoint(first)
+    assert set(local_executor(2).map(_process, range(8), label="ids")).isdisjoint(first)
 
 
 def test_a_fault_of_the_work_reaches_the_caller() -> None:
     with pytest.raises(TypeError):
-        list(parallel_map(abs, [1, "a", 2], threads=2, label="abs"))  # type: ignore[list-item]
+        list(local_executor(2).map(abs, [1, "a", 2], label="abs"))  # type: ignore[list-item]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the kernel's parent-death signal is Linux's")

@@ -1,6 +1,7 @@
-"""What is told of work: how far, how long still; on a clock that the test turns by hand."""
+"""How far work is and how long it will still take, on a clock that the test turns by hand."""
 
 import io
+import logging
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,8 +12,8 @@ import pytest
 from alice_survey.base.artefacts import Stage, run_stage
 from alice_survey.base.errors import heard, warn
 from alice_survey.base.run import progress
-from alice_survey.base.run.display import Lines, Quiet
-from alice_survey.base.run.events import Event
+from alice_survey.base.run.display import Console
+from alice_survey.base.run.events import Event, LogFile, event_of
 from alice_survey.base.run.progress import Remaining, Run
 
 
@@ -29,21 +30,18 @@ class Clock:
         self.now_s += seconds
 
 
-class Kept:
+class Kept(logging.Handler):
     """Keeps every event."""
 
     def __init__(self) -> None:
+        super().__init__()
         self.events: list[Event] = []
-        self.closed = False
 
-    def hear(self, event: Event) -> None:
-        self.events.append(event)
-
-    def close(self) -> None:
-        self.closed = True
+    def emit(self, record: logging.LogRecord) -> None:
+        self.events.append(event_of(record))
 
     def named(self, name: str) -> list[Event]:
-        return [event for event in self.events if event.name == name]
+        return [event for event in self.events if event["event"] == name]
 
 
 @pytest.fixture
@@ -59,8 +57,8 @@ def kept() -> Kept:
 @pytest.fixture
 def run(clock: Clock, kept: Kept) -> Iterator[Run]:
     """A run whose thread does not tick, so that the test does."""
-    begun = Run(Lines(clock), [kept], clock=clock, wall_clock=clock, ticks=False)
-    with progress.told_to(begun):
+    begun = Run(Console(clock=clock), [kept], clock=clock, ticks=False)
+    with progress.reported_to(begun):
         yield begun
 
 
@@ -86,7 +84,7 @@ def test_remaining_time_is_within_a_factor_of_two_from_a_fifth_on(
     rng = np.random.default_rng([width, items_per_worker])
     item_s, total = 7.0, width * items_per_worker
     ends = ends_in_order(width, total, item_s, start_items * item_s, rng)
-    remaining, told = Remaining(width), 0
+    remaining, estimates = Remaining(width), 0
     moments = np.arange(0.0, ends[-1], 0.5)
     done = 0
     for now_s in moments:
@@ -98,11 +96,11 @@ def test_remaining_time_is_within_a_factor_of_two_from_a_fifth_on(
         left_s = remaining.left_s(total, now_s)
         if left_s is None:
             continue
-        told += 1
+        estimates += 1
         truth_s = ends[-1] - now_s
         assert truth_s / 2 - item_s <= left_s <= 2 * truth_s + item_s, (now_s, done)
     # Something is said as soon as one more than are worked on side by side are done.
-    assert told == np.count_nonzero(moments >= ends[max(width, round(0.2 * total) - 1)])
+    assert estimates == np.count_nonzero(moments >= ends[max(width, round(0.2 * total) - 1)])
 
 
 def test_nothing_is_said_before_anything_is_known() -> None:
@@ -150,42 +148,43 @@ def test_steps_are_told_of_in_order_with_their_counts(run: Run, kept: Kept, cloc
             clock.turn(0.2)
             counter.advance()
     started, *moved, ended = kept.events
-    assert (started.name, started.total, started.done) == ("step_started", 40, 0)
-    assert (ended.name, ended.done, ended.elapsed_s) == ("step_finished", 40, pytest.approx(8.0))
-    assert ended.facts == {"complete": True}
-    assert {event.name for event in moved} == {"step_progress"}
-    assert [event.done for event in moved] == sorted(event.done or 0 for event in moved)
-    times = [event.time_s for event in moved]
+    assert (started["event"], started["total"], started["done"]) == ("step_started", 40, 0)
+    assert (ended["event"], ended["done"], ended["elapsed_s"]) == ("step_finished", 40, 8.0)
+    assert ended["complete"] is True
+    assert {event["event"] for event in moved} == {"step_progress"}
+    assert [event["done"] for event in moved] == sorted(event["done"] for event in moved)
+    times = [event["elapsed_s"] for event in moved]
     assert min(np.diff(times)) >= 0.5  # at most two a second
     assert len(moved) == 13
-    assert moved[-1].remaining_s == pytest.approx(0.2 * (40 - (moved[-1].done or 0)), abs=0.3)
+    assert moved[-1]["remaining_s"] == pytest.approx(0.2 * (40 - moved[-1]["done"]), abs=0.3)
 
 
 def test_more_items_than_expected_leave_their_number_open(run: Run, kept: Kept) -> None:
     with progress.step("fly", 2) as counter:
         counter.advance(2)
-        assert run._steps[0].remaining_s == 0.0
+        assert counter.left_s == 0.0
         counter.advance()
-        assert run._steps[0].remaining_s is None
-    assert (kept.events[-1].done, kept.events[-1].total) == (3, None)
+        assert counter.left_s is None
+    assert kept.events[-1]["done"] == 3
+    assert "total" not in kept.events[-1]
 
 
 def test_items_are_passed_on_and_counted(run: Run, kept: Kept) -> None:
     assert list(progress.counted(iter("abc"), "letters", None, 1)) == ["a", "b", "c"]
-    assert kept.events[-1].done == 3
-    assert kept.events[-1].total is None
+    assert kept.events[-1]["done"] == 3
+    assert "total" not in kept.events[-1]
 
 
 def test_steps_within_steps_keep_their_numbers(run: Run, kept: Kept) -> None:
     with progress.step("outer"), progress.step("inner"):
         pass
-    assert [(e.name, e.step, e.step_number) for e in kept.events] == [
+    assert [(e["event"], e["step"], e["step_number"]) for e in kept.events] == [
         ("step_started", "outer", 1),
         ("step_started", "inner", 2),
         ("step_finished", "inner", 2),
         ("step_finished", "outer", 1),
     ]
-    assert kept.events[0].done is None  # nothing is counted
+    assert "done" not in kept.events[0]  # nothing is counted
 
 
 def test_a_step_that_fails_is_not_told_as_done(
@@ -197,7 +196,7 @@ def test_a_step_that_fails_is_not_told_as_done(
 
     with pytest.raises(ValueError), progress.step("break"):
         fail()
-    assert kept.events[-1].facts == {"complete": False}
+    assert kept.events[-1]["complete"] is False
     assert capsys.readouterr().err == ""
 
 
@@ -205,8 +204,8 @@ def test_who_takes_no_more_items_ends_the_step(run: Run, kept: Kept) -> None:
     items = progress.counted(iter(range(9)), "search", 9, 1)
     assert next(items) == 0
     del items
-    assert kept.events[-1].name == "step_finished"
-    assert kept.events[-1].facts == {"complete": True}
+    assert kept.events[-1]["event"] == "step_finished"
+    assert kept.events[-1]["complete"] is True
 
 
 def test_a_stage_ends_what_was_left_in_it(run: Run, kept: Kept) -> None:
@@ -214,7 +213,7 @@ def test_a_stage_ends_what_was_left_in_it(run: Run, kept: Kept) -> None:
     with progress.stage("sparse") as finish:
         next(items)
         finish(took_s=1.0, cpu_s=1.0, peak_mib=1.0)
-    assert [event.name for event in kept.events] == [
+    assert [event["event"] for event in kept.events] == [
         "stage_started", "step_started", "step_finished", "stage_finished",
     ]  # fmt: skip
     del items
@@ -239,9 +238,9 @@ def test_lines_say_what_took_long_and_stay_alive(
             clock.turn(1.0)
             run.tick()
         finish(took_s=125.3, cpu_s=1.0, peak_mib=1.0)
-    told = capsys.readouterr()
-    assert told.out == ""
-    assert told.err.splitlines() == [
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err.splitlines() == [
         "sparse (2 of 5): mapping",
         "mapping: matching 29 of 100 after 29 s, about 1 min 11 s left",
         "matching: 50 done in 50.0 s",
@@ -256,22 +255,21 @@ def test_what_hangs_is_told_of_every_five_seconds(run: Run, kept: Kept, clock: C
         for _ in range(20):
             clock.turn(1.0)
             run.tick()
-    assert [e.elapsed_s for e in kept.named("step_progress")] == [5.0, 10.0, 15.0, 20.0]
+    assert [e["elapsed_s"] for e in kept.named("step_progress")] == [5.0, 10.0, 15.0, 20.0]
 
 
 def test_a_display_of_warnings_alone(
     clock: Clock, kept: Kept, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = Run(Quiet(), [kept], clock=clock, wall_clock=clock, quiet=True, ticks=False)
-    with progress.told_to(run), heard() as told, progress.step("long"):
+    run = Run(Console(quiet=True, clock=clock), [kept], clock=clock, ticks=False)
+    with progress.reported_to(run), heard() as warnings, progress.step("long"):
         clock.turn(100.0)
         run.tick()
         warn("it is late")
     shown = capsys.readouterr()
     assert (shown.out, shown.err) == ("", "warning: it is late\n")
-    assert told == ["it is late"]
-    assert [event.message for event in kept.named("warning")] == ["it is late"]
-    assert kept.closed
+    assert warnings == ["it is late"]
+    assert [event["message"] for event in kept.named("warning")] == ["it is late"]
 
 
 def test_standard_error_that_nobody_reads_does_not_stop_the_work(
@@ -284,43 +282,39 @@ def test_standard_error_that_nobody_reads_does_not_stop_the_work(
     monkeypatch.setattr(sys, "stderr", Gone())
     warn("one")
     warn("two")
-    assert [event.message for event in kept.named("warning")] == ["one", "two"]
+    assert [event["message"] for event in kept.named("warning")] == ["one", "two"]
 
 
-class Full:
-    """A file on a disk that is full after so many events."""
+class Full(io.StringIO):
+    """A file on a disk that is full after some lines."""
 
     def __init__(self, room: int) -> None:
+        super().__init__()
         self.room = room
 
-    def __str__(self) -> str:
-        return "log file run.log"
-
-    def hear(self, event: Event) -> None:
+    def write(self, text: str) -> int:
         self.room -= 1
         if self.room < 0:
             raise OSError(28, "No space left on device")
-
-    def close(self) -> None:
-        self.room = -1
+        return super().write(text)
 
 
 @pytest.mark.parametrize("room", [0, 1, 5])
 def test_a_full_disk_of_the_log_costs_one_warning(
     room: int, clock: Clock, kept: Kept, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = Run(Lines(clock), [Full(room), kept], clock=clock, wall_clock=clock, ticks=False)
-    with progress.told_to(run):
+    log = LogFile(tmp_path / "run.log")
+    log.setStream(Full(room))  # type: ignore[arg-type]
+    with progress.reported_to(Run(Console(clock=clock), [log, kept], clock=clock, ticks=False)):
         for name in ("one", "two"):
             run_stage(
                 tmp_path,
                 Stage(name=name, version=1, settings={}),
                 lambda folder: (folder / "a").write_text("a") and None,
             )
-    assert [event.message for event in kept.named("warning")] == [
-        "the log file run.log is written no further: no space left on device"
-    ]
-    assert capsys.readouterr().err.count("warning: the log file run.log is written no further") == 1
+    (warning,) = kept.named("warning")
+    assert str(tmp_path / "run.log") in warning["message"]
+    assert capsys.readouterr().err.count(str(tmp_path / "run.log")) == 1
     assert len(kept.named("stage_finished")) == 2
 
 

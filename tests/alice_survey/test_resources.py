@@ -1,11 +1,10 @@
 """Processor time and memory of a process with all that it has started."""
 
-import os
 import subprocess
 import sys
 import time
 
-from alice_survey.base.run.resources import Meter, Spent, cpu_s, family_of, memory_mib_of, versions
+from alice_survey.base.run.resources import Meter, Spent, cpu_s, family, memory_mib, versions
 
 BUSY = """
 import sys, time
@@ -27,19 +26,19 @@ def test_descendants_count_while_they_run_and_after_they_ended() -> None:
     )
     assert child.stdout is not None
     assert child.stdout.readline() == "ready\n"
-    assert child.pid in family_of(os.getpid())
+    (process,) = (found for found in family() if found.pid == child.pid)
     during = meter.look()
-    assert 100 < memory_mib_of(child.pid) < 200
-    assert during.peak_mib > memory_mib_of(child.pid)
+    assert 100 < memory_mib(process) < 200
+    assert during.peak_mib > memory_mib(process)
     assert 0.3 <= during.cpu_s < 5
     child.communicate()
-    assert child.pid not in family_of(os.getpid())
+    assert process not in family()
     after = meter.look()
     assert after.cpu_s >= during.cpu_s
     assert after.peak_mib >= during.peak_mib
     assert after.took_s > during.took_s
-    assert memory_mib_of(child.pid) == 0.0
-    assert cpu_s(child.pid) == 0.0
+    assert (memory_mib(process), cpu_s(process)) == (0.0, 0.0)
+    assert family(child.pid) == []
 
 
 def test_what_was_spent_twice_adds_up_but_for_memory() -> None:

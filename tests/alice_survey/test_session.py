@@ -18,7 +18,7 @@ import typer
 from typer.testing import CliRunner
 
 from alice_survey.base.errors import PlanError, note, warn
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import local_executor
 from alice_survey.base.run import interrupts, progress
 from alice_survey.cli import main as cli
 from alice_survey.cli.options import print_result, with_sessions
@@ -187,7 +187,7 @@ def test_warnings_of_other_processes_are_told_in_order(
     threads: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     def work() -> None:
-        for _ in parallel_map(_warns, range(3), threads=threads, label="look"):
+        for _ in local_executor(threads).map(_warns, range(3), label="look"):
             pass
 
     done = CliRunner().invoke(made(work), ["work-hard", "--events", str(tmp_path / "e")])
@@ -205,7 +205,7 @@ import typer
 from alice_survey.base.run import interrupts
 from alice_survey.base.artefacts import Stage, run_stage
 from alice_survey.cli.options import with_sessions
-from alice_survey.base.executor import parallel_map
+from alice_survey.base.executor import local_executor
 import sleeping
 
 app = typer.Typer()
@@ -219,7 +219,7 @@ def run(kind: str, folder: Path) -> None:
             Path(folder, "begun0").touch()
             hashlib.pbkdf2_hmac("sha256", b"a", b"b", 1_000_000_000)
         else:
-            list(parallel_map(sleeping.stay, [folder] * 8, threads=2, label="sleep"))
+            list(local_executor(2).map(sleeping.stay, [folder] * 8, label="sleep"))
     run_stage(folder, Stage(name="made", version=1, settings={}), work)
 
 if __name__ == "__main__":
@@ -362,7 +362,7 @@ def test_a_result_that_nobody_reads_is_no_fault() -> None:
 
 def test_a_killed_worker_is_told_in_one_line(tmp_path: Path) -> None:
     def work() -> None:
-        list(parallel_map(_dies, range(4), threads=2, label="die"))
+        list(local_executor(2).map(_dies, range(4), label="die"))
 
     done = CliRunner().invoke(made(work), ["work-hard", "--events", str(tmp_path / "e")])
     assert done.exit_code == 1
@@ -390,7 +390,7 @@ def run() -> None:
     with progress.part("sparse", 2, 5), progress.stage("mapping") as finish:
         with progress.step("[features]", 10) as counter:
             for _ in range(10):
-                time.sleep(0.05)
+                time.sleep(0.2)
                 counter.advance()
             warn("few [b]features[/b] in " + "a very long name " * 10)
         with progress.step("solve"):
@@ -420,8 +420,8 @@ def test_a_terminal_shows_bars_and_is_left_as_it_was(tmp_path: Path) -> None:
     assert (run.returncode, out) == (0, b"the result\n")
     text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown.decode())
     assert text.startswith("sparse (2 of 5): mapping")
-    assert re.search(r"\[features\] .* [1-9] of 10, \d s, about \d s left", text)
-    assert re.search(r"solve +0 s", text)
+    assert re.search(r"\[features\] .* [1-9] of 10 .* about \d s left", text)
+    assert "solve" in text
     assert "warning: few [b]features[/b] in a very long name a very long name" in text
     assert "mapping: done in 2 min 05 s" in text
     assert shown.count(b"\x1b[?25l") == shown.count(b"\x1b[?25h") == 1  # the cursor is back

@@ -17,6 +17,7 @@ from alice_survey.base import records
 from alice_survey.base.artefacts import Record, read_stage
 from alice_survey.base.config import SurveyConfig, load_config
 from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.executor import Executor
 from alice_survey.cli.main import app
 from alice_survey.report import reproduce
 from alice_survey.report.figures import Figures
@@ -45,7 +46,7 @@ def test_a_workspace_of_version_0_1_0_is_up_to_date(old: Path) -> None:
 
 
 def test_a_workspace_of_version_0_1_0_is_not_done_again(old: Path) -> None:
-    _, found = run(stages.names(), old, None, threads=1)
+    _, found = run(stages.names(), old, None)
     assert [name for name, part in found.items() if part["done"]] == []
     assert found["fly"]["stations"] == found["placing"]["stations"] == 58
 
@@ -173,7 +174,7 @@ def test_settings_that_are_not_named_leave_a_stage_as_it_is(old: Path) -> None:
 # A stage, added here alone.
 
 
-def count_lines(workspace: Path, config: SurveyConfig, threads: int, folder: Path) -> None:
+def count_lines(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
     lines = (workspace / "notes.txt").read_text().splitlines()
     (folder / "lines.txt").write_text(str(len(lines) * config.seed))
 
@@ -209,10 +210,10 @@ def test_a_stage_added_in_one_file_is_run_shown_reported_and_documented(
         return workspace_status(tmp_path, None)[1]["stages"]["toy"]
 
     assert state() == "missing"
-    text, found = run(["toy"], tmp_path, None, threads=1)
+    text, found = run(["toy"], tmp_path, None)
     assert (text, found["toy"]["done"]) == ("toy: 6 lines", True)
     assert state() == "up to date"
-    assert run(["toy"], tmp_path, None, threads=1)[1]["toy"]["done"] is False
+    assert run(["toy"], tmp_path, None)[1]["toy"]["done"] is False
     held = Held.of(tmp_path)
     tables = {table.title: table.rows for table in reproduce.section(Figures(held=held)).tables}
     assert [row[0] for row in tables["Stages"]] == ["toys"]

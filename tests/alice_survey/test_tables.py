@@ -11,6 +11,7 @@ from alice_survey.base.errors import AliceError, ConfigError
 from alice_survey.base.seawater import n_water
 from alice_survey.cli.fov_tables import FovOptions, Output, fov_report, validation_report
 from alice_survey.cli.main import app
+from camera_calib.fov.table import FovChoices
 from camera_calib.rig import design_rig, write_rig
 
 QUIET = Output()
@@ -23,7 +24,7 @@ def rows(**options: object) -> list[dict[str, float]]:
 def test_options_reach_the_rows() -> None:
     row = rows(
         lens_mm=[16.0], altitude_m=[1.5], n_water=1.345, port_distance_mm=35.0, glass_mm=12.0,
-        f_number=5.6, coc_px=2.0, focus_air_m=1.2, match_sigma_px=0.5,
+        f_number=5.6, choices=FovChoices(coc_px=2.0, focus_air_m=1.2, match_sigma_px=0.5),
     )[0]  # fmt: skip
     wanted = {
         "lens_mm": 16.0, "altitude_m": 1.5, "n_water": 1.345, "port_distance_m": 0.035,

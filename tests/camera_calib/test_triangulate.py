@@ -11,9 +11,9 @@ from alice_survey.base.errors import CalibrationError
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.triangulate import _pixel_slopes, nearest_to_rays, reproject, triangulate
 from tests.oracles_interface import (
+    LENS,
     nearest_slowly,
     points_in_tank,
-    seen,
     triangulate_slowly,
     true_tank,
 )
@@ -77,7 +77,7 @@ def test_exact_through_two_interfaces_at_right_angles(
     tank = true_tank(glass_m=(glass_m / 2, glass_m), n_water=n_water, lean_m=lean_m)
     points = points_in_tank(np.random.default_rng(seed), 40)
 
-    found = tank.triangulate(seen(tank, points))
+    found = tank.triangulate(tank.seen(points))
 
     np.testing.assert_allclose(found.points_world, points, atol=1e-9)
 
@@ -99,16 +99,14 @@ def test_converges_even_where_rays_miss_by_hundreds_of_pixels() -> None:
     rng = np.random.default_rng(3)
     tank = true_tank()
     points = points_in_tank(rng, 12)
-    pixels = seen(tank, points)
+    pixels = tank.seen(points)
     pixels[1, :, 0] += rng.choice([-150.0, 150.0], 12)
-    cameras = [camera.camera for camera in tank.cameras]
-    poses = [camera.cam_from_world for camera in tank.cameras]
 
     found = tank.triangulate(pixels)
 
     assert np.isfinite(found.points_world).all()
     for i in range(len(points)):
-        slow = triangulate_slowly(cameras, poses, pixels[:, i], found.nearest_world[i])
+        slow = triangulate_slowly(tank.cameras, tank.poses, pixels[:, i], found.nearest_world[i])
         np.testing.assert_allclose(found.points_world[i], slow, atol=1e-6)
 
 
@@ -167,9 +165,9 @@ def test_rays_that_meet_in_the_air_have_no_solution() -> None:
     inside = np.array([[0.2, 0.1, 0.1]])
     # Where a camera in air would see a point above the water, before the wall.
     above = np.array([[0.2, 0.30, -0.02]])
-    pixels = np.stack([c.lens.project(c.cam_from_world.apply(above)) for c in tank.cameras])
+    pixels = np.stack([LENS.project(pose.apply(above)) for pose in tank.poses])
 
-    found = tank.triangulate(np.concatenate([pixels, seen(tank, inside)], axis=1))
+    found = tank.triangulate(np.concatenate([pixels, tank.seen(inside)], axis=1))
 
     assert np.isnan(found.points_world[0]).all() and np.isnan(found.residuals_px[:, 0]).all()
     np.testing.assert_allclose(found.points_world[1], inside[0], atol=1e-9)

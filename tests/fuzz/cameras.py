@@ -1,6 +1,5 @@
-"""Calibrations of every format that is read, pictures of every kind, targets and tanks."""
+"""Calibrations of every format that is read, pictures of every kind, and targets."""
 
-import json
 import struct
 from collections.abc import Callable
 from functools import partial
@@ -46,9 +45,9 @@ def _write(name: str, file: str, rig: Callable[[], Rig]) -> Callable[[Path], Non
 def read_calibration(path: Path) -> object:
     """As `camera convert` and `calibrate --from`: of whatever format it looks like."""
     from camera_calib.formats.registry import detect
-    from camera_calib.formats.rigs import Reading
+    from camera_calib.formats.rigs import ReadOptions
 
-    return detect(path).read(path, Reading(image_size=(640, 480), camera="1"))
+    return detect(path).read(path, ReadOptions(image_size=(640, 480), camera="1"))
 
 
 def _read_folder(path: Path) -> object:
@@ -77,31 +76,6 @@ def read_board(path: Path) -> object:
     from camera_calib.targets.target import read_target
 
     return read_target(path).points
-
-
-def _tank_points(folder: Path) -> None:
-    rows = [
-        {"camera": {"x": 100.0 + i, "y": 90.0}, "world": {"x": 0.0, "y": float(i), "z": 2.0}}
-        for i in range(6)
-    ]
-    (folder / "cam1_references.json").write_text("// points\n" + json.dumps(rows))
-
-
-def read_tank_points(path: Path) -> object:
-    from camera_calib.tank.files import read_reference
-
-    return read_reference(path, "cm")
-
-
-def _tank_rows(folder: Path) -> None:
-    rows = [f"{i},{c},{i},1,{100 + i}.5,{200 - i}.25" for i in range(6) for c in (1, 2)]
-    (folder / "d.csv").write_text("\n".join([",cam,frame,id,x,y", *rows]) + "\n")
-
-
-def read_tank_rows(path: Path) -> object:
-    from camera_calib.tank.files import read_detections
-
-    return read_detections(path, ("cam1", "cam2"))
 
 
 def _pixels(channels: int, kind: type) -> Any:
@@ -250,10 +224,6 @@ TARGETS = (
         _write("flatport", "m/cameras.bin", small_rig), read=_read_folder,
     ),
     _calibration("target JSON", "json", "board.json", _board, read=read_board),
-    _calibration(
-        "tank points", "json", "cam1_references.json", _tank_points, read=read_tank_points
-    ),
-    _calibration("tank detections", "csv", "d.csv", _tank_rows, read=read_tank_rows),
     _image("JPEG", "a.jpg", partial(_picture, name="a.jpg", mode="RGB")),
     _image("JPEG, CMYK", "a.jpg", partial(_picture, name="a.jpg", mode="CMYK")),
     _image("PNG, 8 bits", "a.png", partial(_picture, name="a.png", mode="RGBA")),

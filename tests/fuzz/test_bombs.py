@@ -126,9 +126,9 @@ def test_links_in_archives_are_not_followed(sandbox: Sandbox) -> None:
 
 _JSON = {
     "a.geojson": areas.read_area, "a.plan": areas.read_area, "rig.json": cameras.read_rig,
-    "cam1_references.json": cameras.read_tank_points, "plan.json": workspace.read_plan,
-    "frame.json": workspace.read_frame, "v.json": logs.read_vehicle,
-    "cameras.json": workspace.read_lenses, "board.json": cameras.read_board,
+    "plan.json": workspace.read_plan, "frame.json": workspace.read_frame,
+    "v.json": logs.read_vehicle, "cameras.json": workspace.read_lenses,
+    "board.json": cameras.read_board,
     "light.json": workspace.read_light,
 }  # fmt: skip
 
@@ -178,7 +178,7 @@ _TABLES = {
     "n.csv": logs.read_nav, "manifest.csv": workspace.read_manifest, "d.csv": logs.check_dive,
     "track.csv": workspace.read_track, "v.csv": logs.read_vehicle_log,
     "control.csv": workspace.read_control, "q.csv": logs.read_any_log,
-    "tank.csv": cameras.read_tank_rows, "current.csv": logs.read_current,
+    "current.csv": logs.read_current,
 }  # fmt: skip
 
 

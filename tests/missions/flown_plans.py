@@ -5,7 +5,9 @@ from collections.abc import Sequence
 
 from shapely.geometry import MultiPolygon, box
 
+from alice_survey.base.config import SurveyConfig
 from alice_survey.base.frames import Datum
+from alice_survey.seafloor.terrain import Terrain, survey_terrain
 from missions.values.area import Area
 from missions.values.legs import Leg, Route
 from missions.values.line import Line
@@ -88,3 +90,14 @@ def plan_of(routes: Sequence[Route], stations: int = 6, turn_radius_m: float = 0
         coverage=1.0,
         details={},
     )  # fmt: skip
+
+
+def terrain_of(config: SurveyConfig, plan: Plan) -> Terrain:
+    """The sea floor of a survey under a plan."""
+    return survey_terrain(
+        config.seafloor,
+        plan.area.allowed_corners_ne,
+        margin_m=config.plan.altitude_m,
+        depth_m=config.area.seafloor_depth_m,
+        seed=config.seed,
+    )

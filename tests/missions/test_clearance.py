@@ -14,7 +14,7 @@ from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.floor import FloorGrid, floor_depth
 from alice_survey.vehicle.pilot.safety import REASONS, TOO_LOW
 from camera_calib.rig import design_rig
-from missions.fly.simulation import simulate_plan
+from missions.fly.simulation import flight_settings, simulate_plan
 from missions.plan.planner import plan_survey
 from missions.values.flight import Flight
 from missions.values.plan_file import Plan
@@ -55,7 +55,9 @@ def slope(angle_deg: float) -> FloorGrid:
 
 
 def fly(floor: FloorGrid, *silent_s: tuple[float, float]) -> Flight:
-    return simulate_plan(plan_of(), survey(*silent_s), floor, np.random.default_rng(1))
+    return simulate_plan(
+        plan_of(), flight_settings(survey(*silent_s)), floor, np.random.default_rng(1)
+    )
 
 
 def true_clearance_m(flight: Flight, floor: FloorGrid) -> float:

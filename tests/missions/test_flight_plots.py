@@ -17,7 +17,7 @@ from camera_calib.rig import design_rig
 from missions.fly import flight_plots
 from missions.fly.flight_plots import draw_flight, draw_vehicle, line_spans, thin, true_current
 from missions.fly.flight_records import rpm_of
-from missions.fly.simulation import simulate_plan
+from missions.fly.simulation import flight_settings, simulate_plan
 from missions.plan.planner import plan_survey
 from missions.values.flight import Flight, rms
 
@@ -34,7 +34,7 @@ CONFIG = parse_config(
 @pytest.fixture(scope="module")
 def flight() -> Flight:
     plan = plan_survey(CONFIG, design_rig(CONFIG.camera, CONFIG.water)).plan
-    return simulate_plan(plan, CONFIG, level_floor(6.0), np.random.default_rng(1))
+    return simulate_plan(plan, flight_settings(CONFIG), level_floor(6.0), np.random.default_rng(1))
 
 
 @pytest.fixture(scope="module")

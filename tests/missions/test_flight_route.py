@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from shapely.geometry import MultiPolygon, Polygon, box
 
-from alice_survey.base.config import SurveyConfig, parse_config
+from alice_survey.base.config import CameraConfig, SurveyConfig, WaterConfig, parse_config
 from alice_survey.base.errors import PlanError, VehicleError
+from alice_survey.base.executor import SERIAL
 from alice_survey.stages import spec
-from alice_survey.vehicle import signals
 from alice_survey.vehicle.floor import level_floor
-from alice_survey.vehicle.pilot.memory import LEG, PHASE
+from alice_survey.vehicle.pilot.memory import FOLLOW, LEG, PHASE
+from camera_calib.rig import design_rig
 from missions.fly.flight_records import flight_summary
 from missions.fly.flight_route import (
     one_dive,
@@ -23,7 +24,7 @@ from missions.fly.flight_route import (
     stations_of_dives,
     whole_route,
 )
-from missions.fly.simulation import longest_mission_s, simulate_plan
+from missions.fly.simulation import flight_settings, longest_mission_s, simulate_plan
 from missions.values.flight import Flight
 from missions.values.plan_file import Plan
 from tests.missions.flown_plans import plan_of, walk
@@ -43,6 +44,9 @@ SECOND = walk(
 PLAN = plan_of([FIRST, SECOND])
 
 
+RIG = design_rig(CameraConfig(), WaterConfig())
+
+
 def survey(**changes: object) -> SurveyConfig:
     return parse_config(
         {
@@ -55,7 +59,7 @@ def survey(**changes: object) -> SurveyConfig:
 
 
 def fly(plan: Plan, config: SurveyConfig) -> Flight:
-    return simulate_plan(plan, config, level_floor(6.0), np.random.default_rng(1))
+    return simulate_plan(plan, flight_settings(config), level_floor(6.0), np.random.default_rng(1))
 
 
 @pytest.fixture(scope="module")
@@ -101,9 +105,9 @@ def test_all_dives_are_flown_in_one_mission_from_home_to_home(flight: Flight) ->
     assert flight.trigger_line == (*[0] * 6, *[1] * 6, *[2] * 6)
     assert np.all(np.diff(flight.trigger_s) > 0)
     np.testing.assert_allclose(flight.glass_ned[0, :2], PLAN.home_ne_m, atol=1e-9)
-    following = flight.flown.report[:, PHASE] == signals.FOLLOW
+    following = flight.flown.report[:, PHASE] == FOLLOW
     assert np.linalg.norm(flight.glass_ned[following][-1, :2] - PLAN.home_ne_m) < 0.3
-    found = flight_summary(flight, survey())
+    found = flight_summary(flight, survey().vehicle, RIG)
     assert (found["dives"], found["stations_planned"]) == (2, 18)
 
 
@@ -122,7 +126,7 @@ def test_pictures_are_taken_in_their_places_at_a_line_that_ends_in_a_stop(flight
 def test_stops_are_made_where_they_are_planned(flight: Flight) -> None:
     """By the navigation: where the vehicle turns on the spot, and how it steps aside."""
     path, leg = path_of(PLAN), flight.flown.report[:, LEG]
-    following = flight.flown.report[:, PHASE] == signals.FOLLOW
+    following = flight.flown.report[:, PHASE] == FOLLOW
     for i in np.flatnonzero(path.turn_rad):
         rows = following & (leg == i)
         away = flight.believed_glass_ned[rows, :2] - [path.start_n[i], path.start_e[i]]
@@ -138,7 +142,7 @@ def test_one_dive_is_flown_alone() -> None:
     assert flown.ending == "complete"
     assert set(flown.trigger_line) == {2}
     assert np.flatnonzero(~np.isnan(flown.line_errors[0])).size > 100
-    found = flight_summary(flown, survey())
+    found = flight_summary(flown, survey().vehicle, RIG)
     assert (found["dives"], found["stations_planned"], found["stations"]) == (1, 6, 6)
 
 
@@ -162,7 +166,7 @@ def test_a_vehicle_at_the_fence_begins_without_a_way_in() -> None:
     fence = MultiPolygon([box(0.0, -3.0, 8.0, 5.0)])
     flown = fly(replace(PLAN, area=replace(PLAN.area, allowed=fence)), survey())
     assert flown.ending == "complete"
-    following = flown.flown.report[:, PHASE] == signals.FOLLOW
+    following = flown.flown.report[:, PHASE] == FOLLOW
     # But for what control and navigation err.
     assert -0.3 < flown.glass_ned[following, 0].min() < 0.0
 
@@ -188,8 +192,8 @@ def test_the_settings_choose_the_dive(tmp_path: Path) -> None:
     write_json(folder / "plan.json", PLAN.to_json())
     write_json(folder / "stage.json", {})
     config = survey(vehicle={"dive": 2}, seafloor={"grid_m": 0.05})
-    assert spec("fly").make(tmp_path, config, 1)
+    assert spec("fly").make(tmp_path, config, SERIAL)
     found = json.loads((tmp_path / "flight" / "flight.json").read_text())
     assert (found["stations"], found["stations_planned"]) == (6, 6)
     with pytest.raises(PlanError, match="dive 3 is asked for"):
-        spec("fly").make(tmp_path, survey(vehicle={"dive": 3}, seafloor={"grid_m": 0.05}), 1)
+        spec("fly").make(tmp_path, survey(vehicle={"dive": 3}, seafloor={"grid_m": 0.05}), SERIAL)

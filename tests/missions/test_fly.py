@@ -8,13 +8,14 @@ from rosbags.highlevel import AnyReader
 
 from alice_survey.base.config import SurveyConfig, parse_config
 from alice_survey.base.errors import VehicleError, WorkspaceError
+from alice_survey.base.executor import SERIAL
 from alice_survey.base.frames import interpolate_poses
 from alice_survey.base.trajectory import read_columns, read_track
-from alice_survey.seafloor.terrain import survey_terrain
 from alice_survey.stages import spec
 from alice_survey.survey import FlightChanges, run
 from alice_survey.vehicle.log import read_vehicle_log
 from missions.values.plan_file import read_plan
+from tests.missions.flown_plans import terrain_of
 
 FILES = (
     "triggers.csv", "navigation.csv", "vehicle.csv", "flight.json", "truth/track.csv",
@@ -37,31 +38,31 @@ def survey(**changes: object) -> SurveyConfig:
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("survey")
-    spec("plan").make(folder, survey(), 1)
-    assert spec("fly").make(folder, survey(), 1)
+    spec("plan").make(folder, survey(), SERIAL)
+    assert spec("fly").make(folder, survey(), SERIAL)
     return folder
 
 
 def test_a_flight_needs_a_plan(tmp_path: Path) -> None:
     with pytest.raises(WorkspaceError, match="alice-survey plan"):
-        spec("fly").make(tmp_path, survey(), 1)
+        spec("fly").make(tmp_path, survey(), SERIAL)
 
 
 def test_it_is_skipped_while_nothing_it_needs_changes(workspace: Path) -> None:
-    assert not spec("fly").make(workspace, survey(), 1)
-    assert not spec("fly").make(workspace, survey(imaging={"scale": 4}), 1)
+    assert not spec("fly").make(workspace, survey(), SERIAL)
+    assert not spec("fly").make(workspace, survey(imaging={"scale": 4}), SERIAL)
 
 
 def test_a_flight_is_the_same_bytes_each_time_and_another_with_another_seed(
     workspace: Path, tmp_path: Path
 ) -> None:
-    spec("plan").make(tmp_path, survey(), 1)
-    assert spec("fly").make(tmp_path, survey(), 1)
+    spec("plan").make(tmp_path, survey(), SERIAL)
+    assert spec("fly").make(tmp_path, survey(), SERIAL)
     for name in FILES:
         one, two = workspace / "flight" / name, tmp_path / "flight" / name
         assert one.read_bytes() == two.read_bytes(), name
 
-    assert spec("fly").make(tmp_path, survey(seed=2), 1)
+    assert spec("fly").make(tmp_path, survey(seed=2), SERIAL)
     for name in FILES:
         one, two = workspace / "flight" / name, tmp_path / "flight" / name
         assert one.read_bytes() != two.read_bytes(), name
@@ -82,7 +83,7 @@ def test_each_station_is_within_the_log_and_near_its_plan(workspace: Path) -> No
     glass = poses.apply(np.array(config.camera.position_body_m))
     off = glass[:, :2] - np.vstack([line.stations_ne for line in plan.lines])
     assert 0.005 < np.sqrt((off**2).sum(axis=1).mean()) < 0.2
-    floor = survey_terrain(config, plan.area.allowed_corners_ne)
+    floor = terrain_of(config, plan)
     altitude = floor.depth_at(glass[:, :2]) - glass[:, 2]
     assert 1.6 < altitude.min() < altitude.max() < 2.4
     assert abs(altitude.mean() - 2.0) < 0.1
@@ -152,10 +153,10 @@ def test_pictures_are_pictures_with_ink(workspace: Path) -> None:
 
 def test_a_vehicle_that_reaches_no_line_says_why(tmp_path: Path) -> None:
     # The plan is for a calm sea: for this one there would be none.
-    spec("plan").make(tmp_path, survey(), 1)
+    spec("plan").make(tmp_path, survey(), SERIAL)
     strong = survey(sea={"current_mps": 2.5})
     with pytest.raises(VehicleError, match=r"alice reached no line of the plan \(aborted: "):
-        spec("fly").make(tmp_path, strong, 1)
+        spec("fly").make(tmp_path, strong, SERIAL)
     assert not (tmp_path / "flight").exists()
 
 

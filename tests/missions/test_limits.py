@@ -11,7 +11,7 @@ from camera_calib.rig import design_rig
 from missions.exports.mount import mount_of
 from missions.exports.options import options_of
 from missions.exports.waypoints import all_waypoints
-from missions.fly.simulation import simulate_plan
+from missions.fly.simulation import flight_settings, simulate_plan
 from missions.plan.planner import plan_survey
 from missions.values.costs import SETTLE_S
 from missions.values.plan_file import Plan
@@ -42,7 +42,9 @@ def test_a_slow_turn_is_planned_as_it_is_flown() -> None:
     config = _survey(5.0)
     plan = _planned(config)
     assert _turned_rad(plan) / math.radians(5.0) > 0.2 * plan.duration_s
-    flight = simulate_plan(plan, config, level_floor(6.0), np.random.default_rng(1), label="")
+    flight = simulate_plan(
+        plan, flight_settings(config), level_floor(6.0), np.random.default_rng(1), label=""
+    )
     assert flight.ending == "complete"
     assert 0.9 < plan.duration_s / flight.flown.time_s[-1] < 1.1
 

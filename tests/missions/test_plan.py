@@ -13,6 +13,7 @@ from shapely.geometry import shape
 from alice_survey.base.artefacts import read_stage
 from alice_survey.base.config import SurveyConfig, parse_config
 from alice_survey.base.errors import AliceError, PlanError
+from alice_survey.base.executor import SERIAL
 from alice_survey.stages import spec
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import certificate
@@ -216,7 +217,7 @@ def test_an_absurd_overlap_is_refused_by_the_settings() -> None:
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("survey")
-    assert spec("plan").make(folder, survey(name="small", **SMALL), 1)
+    assert spec("plan").make(folder, survey(name="small", **SMALL), SERIAL)
     return folder
 
 
@@ -231,15 +232,15 @@ def test_a_plan_file_gives_back_the_plan(workspace: Path) -> None:
 
 def test_a_stage_is_skipped_until_a_setting_that_matters_changes(workspace: Path) -> None:
     config = survey(name="small", **SMALL)
-    assert not spec("plan").make(workspace, config, 1)
-    assert not spec("plan").make(workspace, config.model_copy(update={"seed": 9}), 1)
+    assert not spec("plan").make(workspace, config, SERIAL)
+    assert not spec("plan").make(workspace, config.model_copy(update={"seed": 9}), SERIAL)
     before = read_stage(workspace / "plan")
     assert before is not None
     assert "seed" not in before["settings"]
 
 
 def test_a_plan_is_the_same_bytes_each_time(workspace: Path, tmp_path: Path) -> None:
-    spec("plan").make(tmp_path, survey(name="small", **SMALL), 1)
+    spec("plan").make(tmp_path, survey(name="small", **SMALL), SERIAL)
     files = [path for path in (workspace / "plan").rglob("*") if path.is_file()]
     names = {str(path.relative_to(workspace / "plan")) for path in files} - {"stage.json"}
     assert {"plan.json", "map.png", "settings.txt", "triggers.csv"} < names

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from alice_survey.base.config import SurveyConfig, load_config
-from alice_survey.seafloor.terrain import survey_terrain
 from camera_calib.rig import design_rig
-from missions.fly.simulation import floor_grid, simulate_plan
+from missions.fly.simulation import flight_settings, floor_grid, simulate_plan
 from missions.plan.planner import plan_survey
 from missions.values.plan_file import Plan
+from tests.missions.flown_plans import terrain_of
 
 
 @pytest.fixture(scope="module")
@@ -37,11 +37,13 @@ def test_it_is_the_site_of_the_paper(plan: Plan) -> None:
 def test_it_is_flown_over_its_rocks(config: SurveyConfig, plan: Plan) -> None:
     coarse = config.seafloor.model_copy(update={"grid_m": 0.05})
     rough = config.model_copy(update={"seafloor": coarse})
-    terrain = survey_terrain(rough, plan.area.allowed_corners_ne)
+    terrain = terrain_of(rough, plan)
     # Large rocks: they stick out of the sand by decimetres.
     assert 0.3 < -terrain.depths.min() < 1.0
     assert 0.05 < (terrain.material > 0.5).mean() < 0.3
-    flight = simulate_plan(plan, config, floor_grid(terrain), np.random.default_rng(1))
+    flight = simulate_plan(
+        plan, flight_settings(config), floor_grid(terrain), np.random.default_rng(1)
+    )
     assert flight.ending == "complete"
     assert len(flight.trigger_s) == plan.stations
     assert flight.stations_off_line == 0

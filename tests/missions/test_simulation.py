@@ -7,17 +7,25 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from alice_survey.base.config import SeaConfig, SurveyConfig, parse_config
+from alice_survey.base.config import (
+    CameraConfig,
+    SeaConfig,
+    SurveyConfig,
+    WaterConfig,
+    parse_config,
+)
 from alice_survey.base.errors import VehicleError
 from alice_survey.vehicle.floor import FloorGrid, level_floor
 from alice_survey.vehicle.navigation.tick import LOG_COLUMNS
 from alice_survey.vehicle.sea import current_at
 from camera_calib.rig import design_rig
 from missions.fly.flight_records import flight_summary
-from missions.fly.simulation import current_of, simulate_plan
+from missions.fly.simulation import current_of, flight_settings, simulate_plan
 from missions.plan.planner import plan_survey
 from missions.values.flight import Flight
 from missions.values.plan_file import Plan
+
+RIG = design_rig(CameraConfig(), WaterConfig())
 
 
 def survey(**changes: object) -> SurveyConfig:
@@ -41,7 +49,7 @@ def plan_of(heading_deg: float = 20.0) -> Plan:
 
 def fly(config: SurveyConfig, floor: FloorGrid | None = None, seed: int = 1) -> Flight:
     rng = np.random.default_rng(seed)
-    return simulate_plan(plan_of(), config, floor or level_floor(6.0), rng)
+    return simulate_plan(plan_of(), flight_settings(config), floor or level_floor(6.0), rng)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +81,7 @@ def test_in_a_cross_current_alice_keeps_to_her_lines(flight: Flight) -> None:
 
 
 def test_roll_stays_below_ten_degrees_in_turns(flight: Flight) -> None:
-    found = flight_summary(flight, survey())
+    found = flight_summary(flight, survey().vehicle, RIG)
     assert 0.5 < found["in_turns"]["roll_worst_deg"] < 10.0
     assert found["in_turns"]["off_route_rms_m"] < 0.3
 
@@ -130,17 +138,19 @@ def test_weak_thrusters_push_no_more_than_is_left_of_them() -> None:
 
 
 def test_a_thruster_that_fails_unnoticed_leaves_pictures_off_their_lines() -> None:
-    told = fly(survey(vehicle={"thruster_health": {"bow": 0.0}}))
+    known = fly(survey(vehicle={"thruster_health": {"bow": 0.0}}))
     dead = survey(vehicle={"thruster_health": {"bow": 0.0}, "health_known": False})
-    untold = fly(dead)
+    unknown = fly(dead)
     # Off their lines, or not taken at all, where the vehicle spins before it has reached the start.
-    on_line = [len(f.trigger_s) - f.stations_off_line for f in (told, untold)]
+    on_line = [len(f.trigger_s) - f.stations_off_line for f in (known, unknown)]
     assert on_line[1] < 0.9 * on_line[0]
-    assert flight_summary(untold, dead)["stations_off_line"] == untold.stations_off_line
+    assert (
+        flight_summary(unknown, dead.vehicle, RIG)["stations_off_line"] == unknown.stations_off_line
+    )
 
 
 def test_figures_of_turns_and_altitude_are_true_ones(flight: Flight) -> None:
-    found = flight_summary(flight, survey())
+    found = flight_summary(flight, survey().vehicle, RIG)
     on_line = flight.line >= 0
     # Truth and belief differ by what the navigation errs, no more.
     np.testing.assert_allclose(

@@ -1,83 +1,139 @@
 """What a user sees of a run, on standard error: moving bars on a terminal, else a few lines."""
 
+import logging
 import sys
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Protocol, TextIO, cast
+from typing import TYPE_CHECKING, Any, TextIO, cast
 
 from alice_survey.base.errors import outliving, say
-from alice_survey.base.run.events import Event, duration, finished, how_far
+from alice_survey.base.run.events import Event, duration, event_of, finished, how_far
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
+    from rich.progress import Progress, TaskID
 
-_WORTH_TELLING_S = 2.0
+_LONG_S = 2.0
+"""A step or a stage that took less is not worth a line."""
 _ALIVE_EVERY_S = 30.0
 
 
-class ShownStep(Protocol):
-    """What a bar shows of a step."""
+class Console(logging.Handler):
+    """A line for what stays: warnings, notes, stages, and steps that took long."""
 
-    label: str
-    done: int
-    counted: bool
+    def __init__(
+        self, *, quiet: bool = False, clock: Callable[[], float] = lambda: time.monotonic()
+    ) -> None:
+        """Begin.
 
-    @property
-    def total(self) -> int | None:
-        """How many items are expected; None where that is not known."""
+        Args:
+            quiet: show warnings alone.
+            clock: that only goes forward, s.
+        """
+        super().__init__(logging.WARNING if quiet else logging.INFO)
+        self.quiet = quiet
+        self.bars = Bars() if not quiet and sys.stderr.isatty() else None
+        self._clock = clock
+        self._last_s = clock()
 
-    @property
-    def elapsed_s(self) -> float:
-        """Since it began."""
-
-    @property
-    def remaining_s(self) -> float | None:
-        """How long it still takes; None where nothing can be said."""
-
-
-class Display(Protocol):
-    """What the user sees. Its methods are called one at a time, from several threads."""
-
-    def hear(self, event: Event) -> None:
-        """Something has happened."""
-
-    def step_began(self, step: ShownStep) -> None:
-        """Before its first event."""
-
-    def step_ended(self, step: ShownStep) -> None:
-        """After its last event."""
-
-    def stage_ended(self) -> None:
-        """After its last event."""
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write what stays of an event."""
+        text = _line_of(event_of(record))
+        if text is not None:
+            self._write(text)
 
     def tick(self, event: Event) -> None:
-        """The innermost of what goes on still does."""
+        """Write how far the innermost work is, if nothing was written for long.
+
+        Args:
+            event: `step_progress` of a step, or the name and time of a stage.
+        """
+        if self.quiet or self.bars or self._clock() - self._last_s < _ALIVE_EVERY_S:
+            return
+        of_stage = f"{event['stage']}: " if "stage" in event else ""
+        how = how_far(event) if "step" in event else f"working for {duration(event['elapsed_s'])}"
+        self._write(of_stage + how)
+
+    def rest(self) -> None:
+        """Nothing was going on until now, so that silence meant nothing."""
+        if self._clock() - self._last_s > _ALIVE_EVERY_S:
+            self._last_s = self._clock()
 
     def close(self) -> None:
-        """Nothing more comes."""
+        """Leave the terminal as it was."""
+        if self.bars:
+            self.bars.clear()
+        super().close()
 
-
-def display_on_stderr(*, quiet: bool = False) -> Display:
-    """What suits where standard error goes to."""
-    if quiet:
-        return Quiet()
-    return Bars() if sys.stderr.isatty() else Lines()
+    def _write(self, text: str) -> None:
+        (self.bars.write if self.bars else say)(text)
+        self._last_s = self._clock()
 
 
 def _line_of(event: Event) -> str | None:
     """What stays on the screen of an event, if anything."""
-    match event.name:
+    match event["event"]:
         case "warning":
-            return f"warning: {event.message}"
+            return f"warning: {event['message']}"
         case "note":
-            return None if event.facts.get("shown") else event.message
+            return None if event.get("shown") else str(event["message"])
         case "stage_started":
-            return (event.message or "") + (", resumed" if event.facts.get("resumed") else "")
-        case "step_finished" if (event.elapsed_s or 0.0) > _WORTH_TELLING_S:
-            return finished(event) if event.facts.get("complete", True) else None
-        case "stage_finished" if event.facts["took_s"] > _WORTH_TELLING_S:
-            return f"{event.stage}: done in {duration(event.facts['took_s'])}"
+            return str(event["message"]) + (", resumed" if event.get("resumed") else "")
+        case "step_finished" if event["elapsed_s"] > _LONG_S:
+            return finished(event) if event["complete"] else None
+        case "stage_finished" if event["took_s"] > _LONG_S:
+            return f"{event['stage']}: done in {duration(event['took_s'])}"
     return None
+
+
+class Bars:
+    """A moving bar at the foot of a terminal for each stage and step that goes on."""
+
+    def __init__(self) -> None:
+        self._shown: Progress | None = None
+        self._tasks: dict[object, TaskID] = {}
+
+    def show(
+        self,
+        key: object,
+        label: str,
+        done: int | None = None,
+        total: int | None = None,
+        left_s: float | None = None,
+    ) -> None:
+        """Show how far something is; a spinner alone where nothing is counted."""
+        if self._shown is None:
+            self._shown = _bars()
+            self._shown.start()
+        if key not in self._tasks:
+            self._tasks[key] = self._shown.add_task(label, total=None, count="", left="")
+        self._shown.update(
+            self._tasks[key],
+            completed=done or 0,
+            total=total,
+            count="" if done is None else f"{done}" if total is None else f"{done} of {total}",
+            left="" if left_s is None else f"about {duration(left_s)} left",
+        )
+
+    def remove(self, key: object) -> None:
+        """Take a bar away."""
+        if self._shown is not None and key in self._tasks:
+            self._shown.remove_task(self._tasks.pop(key))
+        if not self._tasks:
+            self.clear()
+
+    def clear(self) -> None:
+        """Take all away and leave the terminal as it was."""
+        self._tasks.clear()
+        if self._shown is not None:
+            self._shown.stop()
+            self._shown = None
+
+    def write(self, text: str) -> None:
+        """Write a line above the bars."""
+        if self._shown is None:
+            say(text)
+        else:
+            self._shown.console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 class _Outlived:
@@ -99,170 +155,18 @@ class _Outlived:
         return getattr(self._file, name)
 
 
-class Quiet:
-    """Warnings alone."""
-
-    def hear(self, event: Event) -> None:
-        """Write a warning."""
-        if event.name == "warning":
-            say(f"warning: {event.message}")
-
-    def step_began(self, step: ShownStep) -> None:
-        """Say nothing."""
-
-    def step_ended(self, step: ShownStep) -> None:
-        """Say nothing."""
-
-    def stage_ended(self) -> None:
-        """Say nothing."""
-
-    def tick(self, event: Event) -> None:
-        """Say nothing."""
-
-    def close(self) -> None:
-        """Say nothing."""
-
-
-class Lines:
-    """A line when a stage begins and ends, when a step has taken long, and every half minute."""
-
-    def __init__(self, clock: Callable[[], float] = lambda: time.monotonic()) -> None:
-        self._clock = clock
-        self._last_s = clock()
-
-    def hear(self, event: Event) -> None:
-        """Write what stays."""
-        text = _line_of(event)
-        if text is not None:
-            self._line(text)
-
-    def step_began(self, step: ShownStep) -> None:
-        """Say nothing."""
-        if self._clock() - self._last_s > _ALIVE_EVERY_S:  # there was nothing to tell of
-            self._last_s = self._clock()
-
-    def step_ended(self, step: ShownStep) -> None:
-        """Say nothing: its last event has said it."""
-
-    def stage_ended(self) -> None:
-        """Say nothing: its last event has said it."""
-
-    def tick(self, event: Event) -> None:
-        """Write how far the work is, if nothing has been written for long."""
-        if self._clock() - self._last_s < _ALIVE_EVERY_S:
-            return
-        of_stage = f"{event.stage}: " if event.stage else ""
-        if event.step is None:
-            self._line(f"{event.stage}: working for {duration(event.elapsed_s or 0.0)}")
-        else:
-            self._line(of_stage + how_far(event))
-
-    def close(self) -> None:
-        """Say nothing."""
-
-    def _line(self, text: str) -> None:
-        say(text)
-        self._last_s = self._clock()
-
-
-class Bars:
-    """A bar for each step that goes on, and above them what stays."""
-
-    def __init__(self) -> None:
-        self._bars: Progress | None = None
-        self._tasks: dict[int, Any] = {}
-        self._stage: Any = None
-
-    def hear(self, event: Event) -> None:
-        """Write what stays; begin the spinner of a stage."""
-        text = _line_of(event)
-        if text is not None and self._bars is not None:
-            self._bars.console.print(text, markup=False, highlight=False, soft_wrap=True)
-        elif text is not None:
-            say(text)
-        if event.name == "stage_started":
-            self._stage = self._begun().add_task(event.stage or "", total=None)
-
-    def step_began(self, step: ShownStep) -> None:
-        """Show a bar, or a spinner where nothing is counted."""
-        bars = self._begun()
-        if self._stage is not None:
-            bars.update(self._stage, visible=False)
-        self._tasks[id(step)] = bars.add_task(step.label, total=step.total, step=step)
-
-    def step_ended(self, step: ShownStep) -> None:
-        """Take its bar away."""
-        if self._bars is not None:
-            self._bars.remove_task(self._tasks.pop(id(step)))
-            if not self._tasks and self._stage is not None:
-                self._bars.update(self._stage, visible=True)
-        self._end_if_idle()
-
-    def stage_ended(self) -> None:
-        """Take its spinner away."""
-        if self._bars is not None and self._stage is not None:
-            self._bars.remove_task(self._stage)
-        self._stage = None
-        self._end_if_idle()
-
-    def tick(self, event: Event) -> None:
-        """Say nothing: the bars move by themselves."""
-
-    def close(self) -> None:
-        """Leave the terminal as it was."""
-        self._tasks.clear()
-        self._stage = None
-        self._end_if_idle()
-
-    def _begun(self) -> "Progress":
-        if self._bars is None:
-            self._bars = _bars()
-            self._bars.start()
-        return self._bars
-
-    def _end_if_idle(self) -> None:
-        if self._bars is not None and not self._tasks and self._stage is None:
-            self._bars.stop()
-            self._bars = None
-
-
 def _bars() -> "Progress":
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TextColumn
-    from rich.text import Text
-
-    class Far(ProgressColumn):
-        """How many are done, how long it has taken, how long it still takes."""
-
-        def render(self, task: Task) -> Text:
-            step: ShownStep | None = task.fields.get("step")
-            if step is None:
-                return Text(duration(task.elapsed or 0.0))
-            count = ""
-            if step.counted:
-                total = step.total
-                count = f"{step.done}, " if total is None else f"{step.done} of {total}, "
-            left_s = step.remaining_s
-            left = "" if left_s is None else f", about {duration(left_s)} left"
-            return Text(f"{count}{duration(step.elapsed_s)}{left}")
-
-    class Moving(BarColumn):
-        """A bar where items are counted."""
-
-        def render(self, task: Task) -> Any:
-            step: ShownStep | None = task.fields.get("step")
-            total = None if step is None else step.total
-            if step is None or total is None:
-                return Text("")
-            task.completed, task.total = min(step.done, total), total
-            return super().render(task)
+    from rich.console import Console as Terminal
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     return Progress(
         SpinnerColumn(),
         TextColumn("{task.description}", markup=False),
-        Moving(bar_width=30),
-        Far(),
-        console=Console(file=cast(TextIO, _Outlived(sys.stderr))),
+        BarColumn(bar_width=30),
+        TextColumn("{task.fields[count]}"),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[left]}"),
+        console=Terminal(file=cast(TextIO, _Outlived(sys.stderr))),
         transient=True,
         redirect_stdout=False,
         refresh_per_second=8,

@@ -1,4 +1,4 @@
-"""What happens during a run, as events, and the files that can take them down.
+"""What happens during a run, as events, and the files that keep them.
 
 An events file holds one JSON object a line, a log file one line of text an event; both are only
 ever added to, and a file that can no longer be written costs a warning, never the run.
@@ -6,206 +6,150 @@ ever added to, and a file that can no longer be written costs a warning, never t
 
 import contextlib
 import json
+import logging
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from datetime import UTC, datetime
+import sys
+import threading
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar
 
-from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.errors import WorkspaceError, warn, why
 
 _LOGGED_EVERY_S = 30.0
-_LEVELS = {"warning": "WARNING", "error": "ERROR"}
+_LOCK = threading.RLock()
+"""Of all files: one that cannot be written warns, and the others take that down."""
+
+Event = dict[str, Any]
+"""One thing that has happened: the keys and JSON values of a line of an events file, in the order
+of the documentation; what is not known is left out."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Event:
-    """One thing that has happened."""
-
-    name: str
-    time_s: float
-    """Seconds since 1970, UTC."""
-    stage: str | None = None
-    step: str | None = None
-    step_number: int | None = None
-    """Of the steps of a run, from 1 on: what tells two of the same name apart."""
-    done: int | None = None
-    total: int | None = None
-    elapsed_s: float | None = None
-    """Of the step, the stage or the run, whichever the event is of."""
-    remaining_s: float | None = None
-    message: str | None = None
-    facts: Mapping[str, Any] = field(default_factory=dict)
-    """What else there is to say, as JSON values."""
-
-    @property
-    def time_utc(self) -> str:
-        """To the millisecond, as ISO 8601."""
-        told = datetime.fromtimestamp(self.time_s, UTC).isoformat(timespec="milliseconds")
-        return told.replace("+00:00", "Z")
-
-    def to_json(self) -> dict[str, Any]:
-        """What is known, in the order of the documentation."""
-        told: dict[str, Any] = {
-            "time_utc": self.time_utc,
-            "event": self.name,
-            "stage": self.stage,
-            "step": self.step,
-            "step_number": self.step_number,
-            "done": self.done,
-            "total": self.total,
-            "elapsed_s": None if self.elapsed_s is None else round(self.elapsed_s, 3),
-            "remaining_s": None if self.remaining_s is None else round(self.remaining_s, 1),
-            "message": self.message,
-        }
-        return {**{key: value for key, value in told.items() if value is not None}, **self.facts}
+def event_of(record: logging.LogRecord) -> Event:
+    """The event that a run has put into a record."""
+    event: Event = vars(record)["event"]
+    return event
 
 
-class Sink(Protocol):
-    """Takes events down."""
-
-    def hear(self, event: Event) -> None:
-        """Take one down; called in order, from one thread at a time.
-
-        Raises:
-            OSError: it cannot be written.
-        """
-
-    def close(self) -> None:
-        """Nothing more comes."""
-
-
-class _Appended:
+class _LinesFile(logging.FileHandler):
     """A file to whose end whole lines are written, at once."""
 
+    kind: ClassVar[str]
+
     def __init__(self, path: Path) -> None:
+        """Open it.
+
+        Raises:
+            WorkspaceError: it cannot be written.
+        """
         self.path = path
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC
-            self._file = os.open(path, flags, 0o666)
+            super().__init__(path, encoding="utf-8", errors="backslashreplace")
             with contextlib.suppress(OSError), path.open("rb") as file:
                 file.seek(-1, os.SEEK_END)
-                if file.read(1) != b"\n":  # a line that a full disk has cut
-                    os.write(self._file, b"\n")
+                if file.read(1) != b"\n" and self.stream:  # a line that a full disk has cut
+                    self.stream.write("\n")
         except OSError as error:
-            raise WorkspaceError(
-                f"{path} cannot be written: {(error.strerror or str(error)).lower()}"
-            ) from None
+            raise WorkspaceError(f"{path} cannot be written: {why(error)}") from None
 
-    def write(self, line: str) -> None:
-        rest = memoryview(line.encode("utf-8", "backslashreplace"))
-        while rest:
-            rest = rest[os.write(self._file, rest) :]
+    def createLock(self) -> None:  # noqa: N802 (a name of logging)
+        """Share one lock."""
+        self.lock = _LOCK
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 (a name of logging)
+        """Write no further."""
+        error = sys.exception()
+        if not isinstance(error, OSError):
+            super().handleError(record)
+            return
+        self.setLevel(logging.CRITICAL + 1)
+        warn(f"the {self.kind} file {self.path} is written no further: {why(error)}")
 
     def close(self) -> None:
-        os.close(self._file)
+        """Close it; what a full disk could not take is lost."""
+        with contextlib.suppress(OSError):
+            super().close()
 
 
-class EventFile:
+class EventFile(_LinesFile):
     """Events as JSON lines."""
 
-    def __init__(self, path: Path) -> None:
-        """Open it.
+    kind = "events"
 
-        Raises:
-            WorkspaceError: it cannot be written.
-        """
-        self._file = _Appended(path)
-
-    def __str__(self) -> str:
-        return f"events file {self._file.path}"
-
-    def hear(self, event: Event) -> None:
-        """Write a line."""
-        self._file.write(json.dumps(event.to_json(), allow_nan=False) + "\n")
-
-    def close(self) -> None:
-        """Close it."""
-        self._file.close()
+    def format(self, record: logging.LogRecord) -> str:
+        """One line."""
+        return json.dumps(event_of(record), allow_nan=False)
 
 
-class LogFile:
+class LogFile(_LinesFile):
     """Events as lines of time, level and text."""
 
+    kind = "log"
+
     def __init__(self, path: Path) -> None:
-        """Open it.
+        super().__init__(path)
+        self._last_s: dict[int, float] = {}
 
-        Raises:
-            WorkspaceError: it cannot be written.
-        """
-        self._file = _Appended(path)
-        self._last_s: dict[int | None, float] = {}
-
-    def __str__(self) -> str:
-        return f"log file {self._file.path}"
-
-    def hear(self, event: Event) -> None:
+    def emit(self, record: logging.LogRecord) -> None:
         """Write what a reader wants to know."""
-        if event.name == "step_progress":
-            elapsed_s = event.elapsed_s or 0.0
-            if elapsed_s - self._last_s.get(event.step_number, 0.0) < _LOGGED_EVERY_S:
+        event = event_of(record)
+        if event["event"] == "step_progress":
+            number, elapsed_s = event["step_number"], event["elapsed_s"]
+            if elapsed_s - self._last_s.get(number, 0.0) < _LOGGED_EVERY_S:
                 return
-            self._last_s[event.step_number] = elapsed_s
-        level = _LEVELS.get(event.name, "INFO")
-        first, *more = described(event).splitlines() or [""]
-        lines = [f"{event.time_utc} {level} {first}", *(f"    {line}" for line in more)]
-        self._file.write("\n".join(lines) + "\n")
+            self._last_s[number] = elapsed_s
+        super().emit(record)
 
-    def close(self) -> None:
-        """Close it."""
-        self._file.close()
+    def format(self, record: logging.LogRecord) -> str:
+        """A line of time, level and text; details are indented."""
+        event = event_of(record)
+        lines = described(event).splitlines() or [""]
+        return f"{event['time_utc']} {record.levelname} " + "\n    ".join(lines)
 
 
 def described(event: Event) -> str:
     """An event in words; further lines are details."""
-    text = event.message or ""
-    facts = event.facts
-    of_stage = f"{event.stage}: " if event.stage else ""
-    match event.name:
+    text = event.get("message", "")
+    of_stage = f"{event['stage']}: " if "stage" in event else ""
+    match event["event"]:
         case "run_started":
-            told = ", ".join(f"{name} {number}" for name, number in facts["versions"].items())
-            return f"run started: {facts['command']}\nin {facts['folder']}, with {told}"
+            versions = ", ".join(f"{name} {number}" for name, number in event["versions"].items())
+            return f"run started: {event['command']}\nin {event['folder']}, with {versions}"
         case "run_finished":
-            return (
-                f"run finished: exit code {facts['exit_code']} after {event.elapsed_s or 0:.1f} s"
-            )
+            return f"run finished: exit code {event['exit_code']} after {event['elapsed_s']:.1f} s"
         case "stage_started":
-            return f"stage {text}" + (", resumed" if facts.get("resumed") else "")
+            return f"stage {text}" + (", resumed" if event.get("resumed") else "")
         case "stage_skipped":
             return f"{of_stage}up to date"
         case "stage_finished":
             return (
-                f"{of_stage}finished in {facts['took_s']:.1f} s, {facts['cpu_s']:.1f} s of "
-                f"processor time, {facts['peak_mib']:.0f} MiB at most"
+                f"{of_stage}finished in {event['took_s']:.1f} s, {event['cpu_s']:.1f} s of "
+                f"processor time, {event['peak_mib']:.0f} MiB at most"
             )
         case "step_started":
-            return f"{of_stage}{event.step} ..."
+            return f"{of_stage}{event['step']} ..."
         case "step_progress":
             return f"{of_stage}{how_far(event)}"
         case "step_finished":
             return f"{of_stage}{finished(event)}"
-        case "error" if "traceback" in facts:
-            return f"{text}\n{facts['traceback'].rstrip()}"
-    return text
+        case "error" if "traceback" in event:
+            return f"{text}\n{event['traceback'].rstrip()}"
+    return str(text)
 
 
 def how_far(event: Event) -> str:
-    """A step that runs: how far, how long already, how long still."""
-    count = ""
-    if event.done is not None:
-        count = f" {event.done}" + ("" if event.total is None else f" of {event.total}")
-    left = "" if event.remaining_s is None else f", about {duration(event.remaining_s)} left"
-    return f"{event.step}{count} after {duration(event.elapsed_s or 0.0)}{left}"
+    """How far a running step is, how long it has taken, how long it will still take."""
+    count = f" {event['done']}" if "done" in event else ""
+    total = f" of {event['total']}" if count and "total" in event else ""
+    left = f", about {duration(event['remaining_s'])} left" if "remaining_s" in event else ""
+    return f"{event['step']}{count}{total} after {duration(event['elapsed_s'])}{left}"
 
 
 def finished(event: Event) -> str:
     """A step that has ended, or was given up."""
-    took = f"{event.elapsed_s or 0.0:.1f} s"
-    count = "" if event.done is None else f"{event.done} "
-    how = "done in" if event.facts.get("complete", True) else "given up after"
-    return f"{event.step}: {count}{how} {took}"
+    count = f"{event['done']} " if "done" in event else ""
+    how = "done in" if event.get("complete", True) else "given up after"
+    return f"{event['step']}: {count}{how} {event['elapsed_s']:.1f} s"
 
 
 def duration(seconds: float) -> str:

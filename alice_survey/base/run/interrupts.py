@@ -11,9 +11,11 @@ from typing import cast
 
 _GRACE_S = 5.0
 """Between such a signal and the end of a run that is deep in a library."""
-ASKING = frozenset({signal.SIGTERM, signal.SIGHUP})
+_IS_POSIX = hasattr(signal, "sigwait")
+"""Elsewhere Ctrl-C alone ends a run early, whenever Python gets to it."""
+ASKING = frozenset({signal.SIGTERM, signal.SIGHUP} if _IS_POSIX else {signal.SIGTERM})
 """What a scheduler, a system that shuts down, or a terminal that closes sends."""
-_FORWARD = signal.SIGUSR1
+_FORWARD = signal.SIGUSR1 if _IS_POSIX else signal.SIGTERM
 """Sent on to the main thread for these: one whose handler COLMAP's log does not replace."""
 
 
@@ -31,7 +33,7 @@ def exit_code(error: KeyboardInterrupt) -> int:
 
 
 def words(error: KeyboardInterrupt) -> str:
-    """Tell the user what has ended the run."""
+    """What has ended the run, for the user."""
     if isinstance(error, Interrupted):
         return f"interrupted by {signal.Signals(error.number).name}"
     return "interrupted"
@@ -54,9 +56,9 @@ def heeded(finish: Callable[[KeyboardInterrupt], None]) -> Iterator[None]:
     is deep in. What is broken off then is as after a kill, which loses nothing.
 
     Args:
-        finish: tells of the end where the main thread does not.
+        finish: reports the end where the main thread does not.
     """
-    if threading.current_thread() is not threading.main_thread():
+    if not _IS_POSIX or threading.current_thread() is not threading.main_thread():
         yield
         return
     heeding = _Heeding(finish)
@@ -67,6 +69,9 @@ def heeded(finish: Callable[[KeyboardInterrupt], None]) -> Iterator[None]:
 @contextlib.contextmanager
 def for_other_programs() -> Iterator[None]:
     """Within this block start programs that heed the signals which ask as they always do."""
+    if not _IS_POSIX:
+        yield
+        return
     blocked = signal.pthread_sigmask(signal.SIG_UNBLOCK, ASKING)
     try:
         yield
@@ -89,9 +94,9 @@ class _Heeding:
 
     def end(self) -> None:
         """From any thread."""
-        telling = threading.Thread(target=self._finish, args=(self.asked,), daemon=True)
-        telling.start()
-        telling.join(1.0)  # the main thread may hold what is needed for it
+        reporting = threading.Thread(target=self._finish, args=(self.asked,), daemon=True)
+        reporting.start()
+        reporting.join(1.0)  # the main thread may hold what is needed for it
         os._exit(exit_code(self.asked))
 
 
@@ -102,8 +107,8 @@ def _ends_late(heeding: _Heeding) -> Iterator[None]:
     ended = threading.Event()
 
     def watch() -> None:
-        while (told := os.read(reader, 1)) != b"":
-            if told[0] not in (signal.SIGINT, _FORWARD):
+        while (number := os.read(reader, 1)) != b"":
+            if number[0] not in (signal.SIGINT, _FORWARD):
                 continue
             select.select([reader], [], [], _GRACE_S)  # a second one, or the end, or neither
             if ended.is_set():

@@ -1,38 +1,41 @@
-"""What a run is doing, how far it is and how long it still takes.
+"""What a run is doing, how far it is and how long it will still take.
 
-Work is told of through three context managers, `part`, `stage` and `step`, wherever it is done.
-What is told becomes events, which the screen, a log and an events file take down.
+Work is reported through three context managers, `part`, `stage` and `step`, wherever it is done.
+Reports become events, records of the package's logger, which the screen, a log and an events file
+take from there.
 """
 
 import contextlib
+import logging
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
-from dataclasses import replace
+from datetime import UTC, datetime
 from typing import Any, TypeVar
 
-from alice_survey.base.errors import Level, shown_by
-from alice_survey.base.run.display import Display, display_on_stderr
-from alice_survey.base.run.events import Event, Sink
+from alice_survey.base.errors import LOG, is_in_task
+from alice_survey.base.run.display import Bars, Console
+from alice_survey.base.run.events import Event
 
-_TOLD_EVERY_S = 0.5
+_REPORTED_EVERY_S = 0.5
 """Between two events of how far a step is."""
 _ALIVE_EVERY_S = 5.0
 """Between two such events where nothing moves."""
 _TICK_S = 1.0
 _KEPT = 256
+_LEVELS = {"warning": logging.WARNING, "error": logging.ERROR}
 
 Item = TypeVar("Item")
 Clock = Callable[[], float]
 
 
 class Remaining:
-    """How long work of equal items still takes, from when items were done.
+    """How long work of equal items will still take, from when items were done.
 
-    The first items tell nothing: processes start, kernels are compiled. Time is counted from the
+    The first items say nothing: processes start, kernels are compiled. Time is counted from the
     first done on, and of it the last half, so that a slow start and a change of pace are forgotten.
-    Items that are worked on side by side end together: fewer of them than that tell nothing.
+    Items that are worked on side by side end together: fewer of them than that say nothing.
     """
 
     def __init__(self, width: int) -> None:
@@ -40,8 +43,8 @@ class Remaining:
         self._seen: list[tuple[float, int]] = []
 
     def note(self, done: int, now_s: float) -> None:
-        """So many are done by now."""
-        if len(self._seen) >= _KEPT:  # every other one tells as much
+        """This number is done by now."""
+        if len(self._seen) >= _KEPT:  # every other one says as much
             del self._seen[1:-1:2]
         self._seen.append((now_s, done))
 
@@ -77,112 +80,103 @@ class Remaining:
 class Step:
     """A part of a stage that is going on."""
 
-    def __init__(
-        self, label: str, number: int, total: int | None, width: int, clock: Clock
-    ) -> None:
-        self.label, self.number, self.expected = label, number, total
-        self.done = 0
-        self.counted = total is not None
-        self.told_s = self.started_s = clock()
-        self._clock = clock
+    def __init__(self, run: "Run", label: str, number: int, total: int | None, width: int) -> None:
+        self._run, self._expected = run, total
+        self.label, self.number = label, number
+        self.done = None if total is None else 0
+        self.reported_s = self.started_s = run.clock()
         self._remaining = Remaining(width)
 
-    def count(self, items: int) -> None:
-        """So many more are done."""
-        self.done += items
-        self.counted = True
-        self._remaining.note(self.done, self._clock())
+    def advance(self, items: int = 1) -> None:
+        """Some more items are done."""
+        self.done = (self.done or 0) + items
+        self._remaining.note(self.done, self._run.clock())
+        self._run.moved(self)
 
     @property
     def total(self) -> int | None:
-        """How many items are expected, as long as there are no more."""
-        return None if self.expected is None or self.done > self.expected else self.expected
+        """How many items are expected, unless there are more already."""
+        return None if (self.done or 0) > (self._expected or 0) else self._expected
 
     @property
-    def elapsed_s(self) -> float:
-        """Since it began."""
-        return self._clock() - self.started_s
-
-    @property
-    def remaining_s(self) -> float | None:
-        """How long it still takes; None where nothing can be said."""
+    def left_s(self) -> float | None:
+        """How long it will still take; None where nothing can be said."""
         total = self.total
-        return None if total is None else self._remaining.left_s(total, self._clock())
-
-
-class Counter:
-    """Counts what is done of a step."""
-
-    def __init__(self, run: "Run", step: Step) -> None:
-        self._run, self._step = run, step
-
-    def advance(self, items: int = 1) -> None:
-        """So many more are done."""
-        self._run.advance(self._step, items)
+        return None if total is None else self._remaining.left_s(total, self._run.clock())
 
 
 class Run:
-    """What is going on, and who is told."""
+    """What is going on, reported to the handlers of a logger."""
 
     def __init__(
         self,
-        display: Display | None,
-        sinks: Sequence[Sink] = (),
+        console: Console | None = None,
+        files: Sequence[logging.Handler] = (),
         *,
+        log: logging.Logger = LOG,
         clock: Clock = lambda: time.monotonic(),
-        wall_clock: Clock = lambda: time.time(),
-        quiet: bool = False,
         ticks: bool = True,
     ) -> None:
         """Begin.
 
         Args:
-            display: what the user sees.
-            sinks: files.
+            console: what the user sees.
+            files: where events go besides.
+            log: whose records the events are.
             clock: that only goes forward, s.
-            wall_clock: seconds since 1970.
-            quiet: other processes show nothing either.
-            ticks: whether a thread tells now and then of what takes long.
+            ticks: whether a thread reports now and then on what takes long.
         """
-        self.display = display
-        self.quiet = quiet
+        self.clock = clock
         self.stages_begun = 0
-        self._sinks = list(sinks)
-        self._clock, self._wall_clock = clock, wall_clock
+        self._console, self._log = console, log
+        self._handlers = [*([console] if console else []), *files]
+        self._bars: Bars | None = console.bars if console else None
         self._started_s = clock()
         self._stages: list[tuple[str, float]] = []
         self._steps: list[Step] = []
-        self._begun = 0
+        self._steps_begun = 0
         self._lock = threading.RLock()
-        self._ticks, self._ticker = ticks, threading.Event()
+        self._ticks, self._closed = ticks, threading.Event()
         self._ticking: threading.Thread | None = None
 
     @property
-    def elapsed_s(self) -> float:
-        """Since it began."""
-        return self._clock() - self._started_s
+    def is_quiet(self) -> bool:
+        """Whether the user wants to see warnings alone."""
+        return self._console is None or self._console.quiet
 
-    def tell(self, name: str, message: str | None = None, **facts: Any) -> None:
-        """Tell of something that is neither a stage nor a step."""
+    def take(self, log: logging.Logger) -> None:
+        """Have all records of a logger go the way of this run."""
+        log.handlers[:] = self._handlers
+        log.filters[:] = [self._complete]
+
+    def close(self) -> None:
+        """Report nothing more."""
+        self._closed.set()
+        ticking = self._ticking
+        if ticking is not None:
+            ticking.join()
         with self._lock:
-            self._emit(self._event(name, elapsed_s=self.elapsed_s, message=message, facts=facts))
+            for handler in self._handlers:
+                handler.close()
+
+    def report(self, name: str, message: str | None = None, **facts: Any) -> None:
+        """Report something that is neither a stage nor a step."""
+        elapsed_s = self.clock() - self._started_s
+        self._emit(self._event(name, elapsed_s=elapsed_s, message=message, **facts))
 
     def skip_stage(self, name: str) -> None:
         """A stage is up to date."""
-        with self._lock:
-            event = self._event("stage_skipped", elapsed_s=self.elapsed_s)
-            self._emit(replace(event, stage=name))
-
-    def show(self, level: Level, text: str) -> None:
-        """Tell of a note or a warning."""
-        self.tell(level, text)
+        elapsed_s = self.clock() - self._started_s
+        self._emit({**self._event("stage_skipped", elapsed_s=elapsed_s), "stage": name})
 
     def begin_stage(self, name: str, title: str, facts: Mapping[str, Any]) -> None:
-        """A stage begins; what it is called before the user is its title."""
+        """A stage begins; the user sees its title."""
         with self._lock:
-            self._stages.append((name, self._clock()))
+            self._stages.append((name, self.clock()))
             self.stages_begun += 1
-            self._emit_stage("stage_started", title, facts)
+            self._emit(self._event("stage_started", elapsed_s=0.0, message=title, **facts))
+            if self._bars:
+                self._bars.show(self._stages[-1], name)
             self._tick_on()
 
     def end_stage(self, facts: Mapping[str, Any] | None) -> None:
@@ -191,27 +185,27 @@ class Run:
             for step in list(self._steps):  # of generators that nobody went on with
                 self.end_step(step, complete=False)
             if facts is not None:
-                self._emit_stage("stage_finished", None, facts)
-            self._stages.pop()
-            if self.display is not None:
-                self.display.stage_ended()
+                elapsed_s = self.clock() - self._stages[-1][1]
+                self._emit(self._event("stage_finished", elapsed_s=elapsed_s, **facts))
+            ended = self._stages.pop()
+            if self._bars:
+                self._bars.remove(ended)
 
     def begin_step(self, label: str, total: int | None, width: int) -> Step:
         """A step begins."""
         with self._lock:
-            self._begun += 1
-            step = Step(label, self._begun, total, width, self._clock)
+            if self._console:
+                self._console.rest()
+            self._steps_begun += 1
+            step = Step(self, label, self._steps_begun, total, width)
             self._steps.append(step)
-            if self.display is not None:
-                self.display.step_began(step)
             self._emit_step("step_started", step)
             self._tick_on()
             return step
 
-    def advance(self, step: Step, items: int) -> None:
+    def moved(self, step: Step) -> None:
         """Some more of a step is done."""
-        step.count(items)
-        if self._clock() - step.told_s >= _TOLD_EVERY_S:
+        if self.clock() - step.reported_s >= _REPORTED_EVERY_S:
             with self._lock:
                 self._emit_step("step_progress", step)
 
@@ -220,77 +214,67 @@ class Run:
         with self._lock:
             if step not in self._steps:
                 return
-            self._steps.remove(step)
             self._emit_step("step_finished", step, complete=complete)
-            if self.display is not None:
-                self.display.step_ended(step)
+            self._steps.remove(step)
+            if self._bars:
+                self._bars.remove(step)
 
     def tick(self) -> None:
-        """Tell of what nothing has been heard of for a while."""
+        """Report what nothing has been heard of for a while."""
         with self._lock:
-            now_s = self._clock()
+            now_s = self.clock()
             for step in self._steps:
-                if now_s - step.told_s >= _ALIVE_EVERY_S:
+                self._show(step)
+                if now_s - step.reported_s >= _ALIVE_EVERY_S:
                     self._emit_step("step_progress", step)
-            if self.display is not None and (self._steps or self._stages):
-                of_stage_s = now_s - self._stages[-1][1] if self._stages else 0.0
-                if self._steps:
-                    innermost = self._event_of("step_progress", self._steps[-1])
-                else:
-                    innermost = self._event("stage_runs", elapsed_s=of_stage_s)
-                self.display.tick(innermost)
-
-    def close(self) -> None:
-        """Nothing more is told."""
-        self._ticker.set()
-        ticking = self._ticking
-        if ticking is not None:
-            ticking.join()
-        with self._lock:
-            if self.display is not None:
-                self.display.close()
-            for sink in self._sinks:
-                sink.close()
-            self._sinks.clear()
-
-    @property
-    def _stage(self) -> str | None:
-        return self._stages[-1][0] if self._stages else None
+            if self._console and self._steps:
+                self._console.tick(self._event_of("step_progress", self._steps[-1]))
+            elif self._console and self._stages:
+                elapsed_s = now_s - self._stages[-1][1]
+                self._console.tick(self._event("stage_runs", elapsed_s=elapsed_s))
 
     def _event(self, name: str, **known: Any) -> Event:
-        return Event(name=name, time_s=self._wall_clock(), stage=self._stage, **known)
+        utc = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        stage = self._stages[-1][0] if self._stages else None
+        if known.get("elapsed_s") is not None:
+            known["elapsed_s"] = round(known["elapsed_s"], 3)
+        event = {"time_utc": utc, "event": name, "stage": stage, **known}
+        return {key: value for key, value in event.items() if value is not None}
 
     def _event_of(self, name: str, step: Step, **facts: Any) -> Event:
+        left_s = step.left_s if name == "step_progress" else None
         return self._event(
             name,
             step=step.label,
             step_number=step.number,
-            done=step.done if step.counted else None,
+            done=step.done,
             total=step.total,
-            elapsed_s=step.elapsed_s,
-            remaining_s=step.remaining_s if name == "step_progress" else None,
-            facts=facts,
+            elapsed_s=self.clock() - step.started_s,
+            remaining_s=None if left_s is None else round(left_s, 1),
+            **facts,
         )
 
     def _emit_step(self, name: str, step: Step, **facts: Any) -> None:
-        step.told_s = self._clock()
+        step.reported_s = self.clock()
         self._emit(self._event_of(name, step, **facts))
-
-    def _emit_stage(self, name: str, title: str | None, facts: Mapping[str, Any]) -> None:
-        elapsed_s = self._clock() - self._stages[-1][1]
-        self._emit(self._event(name, elapsed_s=elapsed_s, message=title, facts=facts))
+        self._show(step)
 
     def _emit(self, event: Event) -> None:
-        if self.display is not None:
-            self.display.hear(event)
-        for sink in list(self._sinks):
-            try:
-                sink.hear(event)
-            except OSError as error:
-                self._sinks.remove(sink)
-                sink.close()
-                why = (error.strerror or str(error)).lower()
-                self.tell("warning", f"the {sink} is written no further: {why}")
+        level = _LEVELS.get(event["event"], logging.INFO)
+        with self._lock:
+            self._log.log(level, event.get("message", ""), extra={"event": event})
+
+    def _complete(self, record: logging.LogRecord) -> bool:
+        """Make an event of a record that is only a message: a note or a warning."""
+        if "event" not in vars(record):
+            name = "note" if record.levelno < logging.WARNING else "warning"
+            elapsed_s = self.clock() - self._started_s
+            record.event = self._event(name, elapsed_s=elapsed_s, message=record.getMessage())
+        return True
+
+    def _show(self, step: Step) -> None:
+        if self._bars and step in self._steps:
+            self._bars.show(step, step.label, step.done, step.total, step.left_s)
 
     def _tick_on(self) -> None:
         if self._ticks and self._ticking is None:
@@ -298,7 +282,7 @@ class Run:
             self._ticking.start()
 
     def _tick_often(self) -> None:
-        while not self._ticker.wait(_TICK_S):
+        while not self._closed.wait(_TICK_S):
             with self._lock:
                 if not self._steps and not self._stages:
                     self._ticking = None
@@ -307,37 +291,39 @@ class Run:
 
 
 _runs: list[Run] = []
-"""The last one is told of what happens in this process."""
+"""What happens in this process is reported to the last one."""
+_UNSEEN = Run(log=logging.Logger("unseen", logging.CRITICAL + 1), ticks=False)
+"""Of tasks: nobody sees their own steps."""
 _part: ContextVar[str] = ContextVar("part", default="")
 
 
 def current() -> Run:
-    """The run that is told; one that only shows on standard error when none was begun."""
+    """The run that is reported to; when none was begun, one that only shows on standard error."""
+    if is_in_task():
+        return _UNSEEN
     if not _runs:
-        _runs.append(Run(display_on_stderr()))
+        _runs.append(Run(Console()))
+        _runs[0].take(LOG)
     return _runs[-1]
 
 
 @contextlib.contextmanager
-def told_to(run: Run) -> Iterator[None]:
-    """Within this block what happens, warnings included, is told to a run; then it is closed."""
+def reported_to(run: Run) -> Iterator[None]:
+    """Within this block what happens, warnings included, goes to a run; then it is closed."""
+    before = LOG.handlers[:], LOG.filters[:]
     _runs.append(run)
+    run.take(LOG)
     try:
-        with shown_by(run.show):
-            yield
+        yield
     finally:
         _runs.remove(run)
+        LOG.handlers[:], LOG.filters[:] = before
         run.close()
-
-
-def keep_silent() -> None:
-    """Tell nothing from now on: in processes that work for another one."""
-    _runs.append(Run(None, quiet=True, ticks=False))
 
 
 @contextlib.contextmanager
 def part(name: str, number: int, of: int) -> Iterator[None]:
-    """Within this block stages are told of as a part of a longer run."""
+    """Within this block stages are reported as a part of a longer run."""
     token = _part.set(f"{name} ({number} of {of})" if of > 1 else name)
     try:
         yield
@@ -347,11 +333,11 @@ def part(name: str, number: int, of: int) -> Iterator[None]:
 
 @contextlib.contextmanager
 def stage(name: str, **facts: Any) -> Iterator[Callable[..., None]]:
-    """A stage is worked on; what is yielded takes the facts to tell at its end.
+    """A stage is worked on; what is yielded takes the facts to report at its end.
 
     Args:
         name: of its folder.
-        facts: to tell at its beginning, as JSON values.
+        facts: to report at its beginning, as JSON values.
     """
     whole = _part.get()
     title = whole if whole.split(" (")[0] == name else f"{whole}: {name}" if whole else name
@@ -371,8 +357,8 @@ def skipped(name: str) -> None:
 
 
 @contextlib.contextmanager
-def step(label: str, total: int | None = None, *, width: int = 1) -> Iterator[Counter]:
-    """A step of a stage, or of a command without stages, is worked on.
+def step(label: str, total: int | None = None, *, width: int = 1) -> Iterator[Step]:
+    """A step of a stage, or of a command without stages, is worked on; its items are counted on it.
 
     Args:
         label: what it does, in a few words.
@@ -383,7 +369,7 @@ def step(label: str, total: int | None = None, *, width: int = 1) -> Iterator[Co
     begun = run.begin_step(label, total, width)
     complete = False
     try:
-        yield Counter(run, begun)
+        yield begun
         complete = True
     except GeneratorExit:  # whoever takes the items has enough
         complete = True
@@ -394,7 +380,7 @@ def step(label: str, total: int | None = None, *, width: int = 1) -> Iterator[Co
 
 def counted(items: Iterable[Item], label: str, total: int | None, width: int) -> Iterator[Item]:
     """Pass on items that took work to make, and count them."""
-    with step(label, total, width=width) as counter:
+    with step(label, total, width=width) as begun:
         for item in items:
-            counter.advance()
+            begun.advance()
             yield item

@@ -2,17 +2,19 @@
 
 import contextlib
 import ctypes
-import os
+import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import psutil
 
 _EVERY_S = 1.0
-_TOLD_EVERY_S = 5.0
+_REPORTED_EVERY_S = 5.0
 _PACKAGES = {
     "alice-survey": "alice-survey",
     "numpy": "numpy",
@@ -67,30 +69,30 @@ class Meter:
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
-        self._started, self._cpu_s = clock(), cpu_s(os.getpid())
+        self._started, self._cpu_s = clock(), sum(map(cpu_s, family()))
         self._peak_mib = 0.0
         self._lock = threading.Lock()
 
     def look(self) -> Spent:
         """What has been spent until now."""
-        family = family_of(os.getpid())
-        memory_mib = sum(memory_mib_of(pid) for pid in family)
+        processes = family()
+        memory = sum(map(memory_mib, processes))
         with self._lock:
-            self._peak_mib = max(self._peak_mib, memory_mib)
+            self._peak_mib = max(self._peak_mib, memory)
             return Spent(
                 took_s=self._clock() - self._started,
-                cpu_s=max(0.0, cpu_s(os.getpid(), family) - self._cpu_s),
+                cpu_s=max(0.0, sum(map(cpu_s, processes)) - self._cpu_s),
                 peak_mib=self._peak_mib,
             )
 
 
 @contextlib.contextmanager
-def watched(meter: Meter, told: Callable[[Spent], None]) -> Iterator[None]:
-    """Look at a meter about once a second from a thread of its own, and tell every few seconds.
+def watched(meter: Meter, report: Callable[[Spent], None]) -> Iterator[None]:
+    """Look at a meter about once a second from a thread of its own, and report every few seconds.
 
     Args:
         meter: to look at.
-        told: called from that thread.
+        report: called from that thread.
     """
     stop = threading.Event()
 
@@ -99,9 +101,9 @@ def watched(meter: Meter, told: Callable[[Spent], None]) -> Iterator[None]:
         while not stop.wait(_EVERY_S):
             spent = meter.look()
             since_s += _EVERY_S
-            if since_s >= _TOLD_EVERY_S:
+            if since_s >= _REPORTED_EVERY_S:
                 since_s = 0.0
-                told(spent)
+                report(spent)
 
     thread = threading.Thread(target=look, name="meter", daemon=True)
     thread.start()
@@ -112,48 +114,46 @@ def watched(meter: Meter, told: Callable[[Spent], None]) -> Iterator[None]:
         thread.join()
 
 
-def family_of(root: int) -> list[int]:
-    """A process and all its descendants."""
-    family, waiting = [], [root]
-    while waiting:
-        pid = waiting.pop()
-        family.append(pid)
-        try:
-            for task in Path(f"/proc/{pid}/task").iterdir():
-                waiting += [int(child) for child in (task / "children").read_text().split()]
-        except OSError:
-            continue  # it has ended meanwhile
-    return family
+def family(root: int | None = None) -> "list[psutil.Process]":
+    """A process, this one if none is given, and all its descendants."""
+    import psutil
 
-
-def memory_mib_of(pid: int) -> float:
-    """Proportional set size: what is shared counts once; 0 of a process that has ended."""
     try:
-        text = Path(f"/proc/{pid}/smaps_rollup").read_text()
-    except OSError:
-        return 0.0
-    return next((int(s.split()[1]) / 1024 for s in text.splitlines() if s.startswith("Pss:")), 0.0)
+        process = psutil.Process(root)
+        return [process, *process.children(recursive=True)]
+    except psutil.NoSuchProcess:
+        return []
+
+
+def memory_mib(process: "psutil.Process") -> float:
+    """Proportional set size, where what is shared counts once; elsewhere than on Linux all of it.
+
+    0 of a process that has ended.
+    """
+    import psutil
+
+    with contextlib.suppress(psutil.Error):
+        if psutil.LINUX:
+            return float(process.memory_full_info().pss / 2**20)
+        return float(process.memory_info().rss / 2**20)
+    return 0.0
+
+
+def cpu_s(process: "psutil.Process") -> float:
+    """User and system time of a process and of its children that have ended (on Linux only)."""
+    import psutil
+
+    with contextlib.suppress(psutil.Error):
+        return float(sum(process.cpu_times()[:4]))
+    return 0.0
 
 
 def release_memory() -> None:
     """Give memory back to the system that was freed but is kept for later, where libc can."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
-        trim(0)
-
-
-def cpu_s(root: int, family: list[int] | None = None) -> float:
-    """User and system time of a process, of its descendants and of those that have ended."""
-    return sum(_cpu_s_of(pid) for pid in family or family_of(root))
-
-
-def _cpu_s_of(pid: int) -> float:
-    try:
-        text = Path(f"/proc/{pid}/stat").read_text()
-    except OSError:
-        return 0.0
-    fields = text.rsplit(")", 1)[1].split()
-    return sum(int(ticks) for ticks in fields[11:15]) / os.sysconf("SC_CLK_TCK")
+    if sys.platform == "linux":
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+        if trim is not None:
+            trim(0)
 
 
 @cache

@@ -72,7 +72,7 @@ class Simulation:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Fit:
+class OutputErrorFit:
     """Parameters and how well they are known."""
 
     parameters: Parameters
@@ -117,7 +117,7 @@ def fit_output_error(
     simulation: Simulation | None = None,
     channel_sigma: Array | None = None,
     most_evaluations: int = 60,
-) -> Fit:
+) -> OutputErrorFit:
     """Fit parameters to windows.
 
     Args:
@@ -137,7 +137,7 @@ def fit_output_error(
     lower, upper = parameters.bounds
     short = [part for window in windows for part in cut(window, _SHORT_S)]
     rough = replace(how, longest_step_s=max(how.longest_step_s, _ROUGH_STEP_S))
-    approach = _Problem(short, parameters, rough, sigma, settled=1.0)
+    approach = _FitProblem(short, parameters, rough, sigma, settled=1.0)
     approach.begin(parameters.start)
     result = least_squares(
         approach.residuals, np.clip(parameters.start, lower, upper), approach.jacobian,
@@ -147,7 +147,7 @@ def fit_output_error(
     if channel_sigma is None:
         approach.estimate_sigma(values)
         sigma = approach.sigma
-    problem = _Problem(windows, parameters, how, sigma)
+    problem = _FitProblem(windows, parameters, how, sigma)
     rounds = (1e2,) * _ROUNDS + (1.0,) if channel_sigma is None else (1.0,)
     settled = False
     for looseness in progress(rounds, "fit", len(rounds)):
@@ -173,7 +173,7 @@ def fit_output_error(
     return problem.result(values, held != 0, evaluations)
 
 
-class _Problem:
+class _FitProblem:
     """Residuals of all windows with their starts solved for."""
 
     def __init__(
@@ -250,7 +250,7 @@ class _Problem:
         self.sigma = new
         return changed
 
-    def result(self, values: Array, at_bound: Mask, evaluations: int) -> Fit:
+    def result(self, values: Array, at_bound: Mask, evaluations: int) -> OutputErrorFit:
         """What the fit tells, at the values it settled on."""
         residuals, table = self.residuals(values), self.jacobian(values)
         free = np.flatnonzero(~at_bound)
@@ -278,7 +278,7 @@ class _Problem:
         covariance, white = (np.zeros((self.count, self.count)) for _ in range(2))
         covariance[np.ix_(free, free)] = coloured
         white[np.ix_(free, free)] = inverse
-        return Fit(
+        return OutputErrorFit(
             parameters=self.parameters, values=values, covariance=covariance,
             white_covariance=white, at_bound=at_bound, channel_sigma=sigma * self.sigma,
             correlation_s=times, windows=self.windows, starts=list(self.starts),

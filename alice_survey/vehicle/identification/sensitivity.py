@@ -22,12 +22,13 @@ from alice_survey.vehicle.identification.slopes import (
     CURRENT,
     STATES,
     Physics,
-    Scratch,
+    SlopeScratch,
     Terms,
     rate_of,
     slope_by_parameters,
     slope_by_state,
 )
+from alice_survey.vehicle.rotations import matrix_rows
 
 CHANNELS, START = 9, 9
 """Lengths of an observation (velocity over ground, rates, attitude error) and of the free start."""
@@ -50,7 +51,7 @@ class Record(NamedTuple):
 
 @kernel
 def _stage(
-    physics: Physics, terms: Terms, state: Array, sensitivity: Array, scratch: Scratch
+    physics: Physics, terms: Terms, state: Array, sensitivity: Array, scratch: SlopeScratch
 ) -> None:
     """Write the rates of a state and of its sensitivities into the first of the stages."""
     rate, slopes = scratch.stage[0], scratch.stages[0]
@@ -80,7 +81,7 @@ def _step(
     hold: bool,
     state: Array,
     sensitivity: Array,
-    scratch: Scratch,
+    scratch: SlopeScratch,
 ) -> None:
     """Advance a state and its sensitivities by one classical Runge-Kutta step.
 
@@ -143,8 +144,7 @@ def observe(
     x, y, z, s = state[0], state[1], state[2], state[3]
     cn, ce = physics.current_ne[0], physics.current_ne[1]
     columns, parameters = sensitivity.shape[1], terms.kind.shape[0]
-    r00, r01, r02 = 1 - 2 * (y * y + z * z), 2 * (x * y - z * s), 2 * (x * z + y * s)
-    r10, r11, r12 = 2 * (x * y + z * s), 1 - 2 * (x * x + z * z), 2 * (y * z - x * s)
+    (r00, r01, r02), (r10, r11, r12), _ = matrix_rows(x, y, z, s)
     out[0] = state[4] + r00 * cn + r10 * ce
     out[1] = state[5] + r01 * cn + r11 * ce
     out[2] = state[6] + r02 * cn + r12 * ce
@@ -202,7 +202,7 @@ def simulate(
     start: Array,
     longest_step_s: float,
     hold: bool,
-    scratch: Scratch,
+    scratch: SlopeScratch,
     sensitivity: Array,
     states: Array,
     observed: Array,

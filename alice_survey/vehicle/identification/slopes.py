@@ -14,6 +14,7 @@ from alice_survey.base.frames import Array
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.dynamics import Body, add_coriolis, add_damping
 from alice_survey.vehicle.propulsion import Propulsion, add_thrust
+from alice_survey.vehicle.rotations import matrix_rows
 
 LINEAR, QUADRATIC, LIFT, ADDED_MASS, CURRENT, BUOYANCY, TRIM, BIAS, GAIN = range(9)
 """Kinds of parameters."""
@@ -48,7 +49,7 @@ class Physics(NamedTuple):
     """(6,) 1 of a motion of nu that follows the log, 0 of one that follows the forces."""
 
 
-class Scratch(NamedTuple):
+class SlopeScratch(NamedTuple):
     """Room for intermediate results."""
 
     force: Array
@@ -71,9 +72,9 @@ class Scratch(NamedTuple):
     """(6,)"""
 
 
-def scratch_for(columns: int, thrusters: int) -> Scratch:
+def scratch_for(columns: int, thrusters: int) -> SlopeScratch:
     """Room for so many columns and thrusters."""
-    return Scratch(
+    return SlopeScratch(
         np.zeros((3, 6)), np.zeros((6, 6)), np.zeros((STATES, STATES)), np.zeros((STATES, columns)),
         np.zeros((3, STATES)), np.zeros((3, STATES, columns)), np.zeros(thrusters), np.zeros(6),
         np.zeros(6),
@@ -95,7 +96,7 @@ def force_on(physics: Physics, state: Array, rps: Array, load: Array, force: Arr
     """Write the force and moment, (6,), on the body: all but M nu'."""
     body, nu = physics.body, state[4:10]
     x, y, z, s = state[0], state[1], state[2], state[3]
-    r20, r21, r22 = 2 * (x * z - y * s), 2 * (y * z + x * s), 1 - 2 * (x * x + y * y)
+    r20, r21, r22 = matrix_rows(x, y, z, s)[2]
     for i in range(6):
         force[i] = physics.gain[i] * load[i]
     add_thrust(physics.propulsion, rps, nu, force)
@@ -146,7 +147,7 @@ def rate_of(
 
 @kernel
 def slope_by_state(
-    physics: Physics, state: Array, rps: Array, load: Array, scratch: Scratch
+    physics: Physics, state: Array, rps: Array, load: Array, scratch: SlopeScratch
 ) -> None:
     """Write df/dx into `by_state`."""
     body, nu, by_nu, out = physics.body, state[4:10], scratch.by_nu, scratch.by_state
@@ -246,12 +247,12 @@ def slope_by_state(
 
 @kernel
 def slope_by_parameters(
-    physics: Physics, terms: Terms, state: Array, rates: Array, scratch: Scratch
+    physics: Physics, terms: Terms, state: Array, rates: Array, scratch: SlopeScratch
 ) -> None:
     """Write df/d(parameters) into `by_column`; `rates` is nu' (6,)."""
     body, nu, force, out = physics.body, state[4:10], scratch.force[2], scratch.by_column
     x, y, z, s = state[0], state[1], state[2], state[3]
-    r20, r21, r22 = 2 * (x * z - y * s), 2 * (y * z + x * s), 1 - 2 * (x * x + y * y)
+    r20, r21, r22 = matrix_rows(x, y, z, s)[2]
     u, v, w, p, q, r = nu[0], nu[1], nu[2], nu[3], nu[4], nu[5]
     weight = body.weight_n
     for k in range(terms.kind.shape[0]):

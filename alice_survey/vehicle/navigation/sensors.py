@@ -239,9 +239,9 @@ class SensorSuite:
     gate_sigmas: float = 5.0
     """A measurement farther from its prediction is not used; by chance 1 in 1.7 million is."""
     followed_body_m: Place = (0.55, -0.05, 0.08)
-    """The point whose altitude is told: the left port's outer glass."""
+    """The point whose altitude is reported: the left port's outer glass."""
     altitude_age_s: float = 2.0
-    """An altitude whose last ping is older is not told."""
+    """An altitude whose last ping is older is not reported."""
     relief_memory_s: float = 10.0
     """Over which the spread of the beams is averaged; their own footprint at survey speed."""
 

@@ -7,8 +7,8 @@ import numpy as np
 
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
+from alice_survey.vehicle.estimate_vector import ESTIMATE
 from alice_survey.vehicle.navigation.sensors import IMU, Sensors
-from alice_survey.vehicle.signals import ESTIMATE
 
 POSITION, VELOCITY, ATTITUDE, GYRO_BIAS, ACCELEROMETER_BIAS = 0, 3, 6, 9, 12
 HEADING_BIAS, DEPTH_BIAS, DVL_SCALE, DVL_ANGLE, DVL_BIAS, GPS_BIAS, WATER = (
@@ -56,7 +56,7 @@ MEMORY = LATEST + ESTIMATE
 and depth at the last ping; the beams' spread; altitude and its sigma now; where the IMU is on the
 body (3); by how much the floor's depth grows to the north and to the east at the last ping, the
 variance of either, and both averaged; how far the vehicle has gone since; clearance at the last
-ping and now; the latest estimate, as `signals` has it (14)."""
+ping and now; the latest estimate, as `estimate_vector` has it (14)."""
 
 TRUTH_BEFORE, TRUTH_NOW, BELIEVED = 0, 1, 2
 """Rows of `turns`."""

@@ -1,4 +1,4 @@
-"""The navigation's tick: measure, predict, weigh, and tell the controller and the log.
+"""The navigation's tick: measure, predict, weigh, and report to the controller and the log.
 
 The tick is what the closed loop calls. Instruments measure the true state of now, the filter never
 sees it otherwise.
@@ -10,6 +10,7 @@ import numpy as np
 
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.compiled import kernel
+from alice_survey.vehicle.estimate_vector import ALTITUDE, CLEARANCE, ESTIMATE, HEADING, P, U
 from alice_survey.vehicle.floor import FloorGrid
 from alice_survey.vehicle.navigation.filter import (
     correct,
@@ -71,7 +72,6 @@ from alice_survey.vehicle.navigation.state import (
     NavigationState,
 )
 from alice_survey.vehicle.rotations import matrix_of, wrapped
-from alice_survey.vehicle.signals import ALTITUDE, CLEARANCE, ESTIMATE, HEADING, P, U
 
 LOG_COLUMNS = (
     "north_m", "east_m", "depth_m", "roll_rad", "pitch_rad", "heading_rad",
@@ -83,8 +83,8 @@ LOG_COLUMNS = (
     "rejected_compass", "rejected_depth", "rejected_dvl", "rejected_water", "rejected_gps",
     "rejected_usbl", "clearance_m",
 )  # fmt: skip
-"""Of a row of `log_row`: the estimate in the order of `signals`, sigmas, the latest ping's ranges,
-how many measurements of each instrument were used and rejected so far, and the clearance."""
+"""Of a row of `log_row`: the estimate in the order of `estimate_vector`, sigmas, the latest ping's
+ranges, how many measurements of each instrument were used and rejected so far, the clearance."""
 LOG_ROW = len(LOG_COLUMNS)
 LOG_SIGMA, LOG_RANGE, LOG_USED, LOG_REJECTED, LOG_CLEARANCE = 13, 20, 24, 30, 36
 """Where sigmas, ranges and counts begin in a row, and where the clearance is."""
@@ -120,8 +120,8 @@ def navigation_tick(
         suite: the instruments.
         nav: filter and instruments, overwritten.
         rng: where noise comes from.
-        estimate: (14,) is written as `signals` has it; altitude and clearance are NaN without
-            bottom lock.
+        estimate: (14,) is written as `estimate_vector` has it; altitude and clearance are NaN
+            without bottom lock.
     """
     for i in range(nav.innovations.shape[0]):
         nav.innovations[i] = math.nan
@@ -157,7 +157,7 @@ def navigation_tick(
         used |= use_beams(nav, suite, True) != 0
     if used:
         correct(nav)
-    _tell(nav, suite, estimate)
+    _write_estimate(nav, suite, estimate)
     if pinged and bottom != 0:
         _hear_floor(time_s, bottom, nav, suite)
     _carry_altitude(time_s, nav, suite)
@@ -177,7 +177,7 @@ def _use_usbl(nav: NavigationState, suite: Sensors) -> bool:
 
 
 @kernel
-def _tell(nav: NavigationState, suite: Sensors, estimate: Array) -> None:
+def _write_estimate(nav: NavigationState, suite: Sensors, estimate: Array) -> None:
     """Write the estimate of the body's origin, but for the altitude."""
     x, turned, memory = nav.nominal, nav.turns[BELIEVED], nav.memory
     a, b, c = suite.place[IMU, 0], suite.place[IMU, 1], suite.place[IMU, 2]
@@ -213,7 +213,7 @@ def _hear_floor(time_s: float, used: int, nav: NavigationState, suite: Sensors) 
     relief departs from a plane is not seen by one ping, whose four ends leave a single degree of
     freedom: what the ends stray from their mean slope of the last seconds says so.
     A beam whose velocity was an outlier heard something else than the sea floor. Fewer than three
-    beams, or three whose ends lie nearly in line, tell nothing.
+    beams, or three whose ends lie nearly in line, say nothing.
     """
     turned, memory, place = nav.turns[BELIEVED], nav.memory, suite.place
     count = 0

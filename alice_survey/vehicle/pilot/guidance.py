@@ -1,13 +1,13 @@
 """Guidance: which way to head, how fast to go, and how to sway, tick by tick.
 
 Two ways of following a path (paper, section VII). `los`, of the original vehicle, heads for a point
-a look-ahead distance further on the path's tangent; a cross current holds it off the path by
-`los_offset_m`. `sway` keeps the heading along the path and asks the lateral thrusters for a sway
-speed that takes the cross-track error away; far off the path it turns to `los` until it is near.
-Position, cross-track error and altitude are those of the followed point, by default the left port's
-glass, for which plans are made.
+a look-ahead distance further on the path's tangent; a cross current holds it off the path
+(docs/vehicle-comparison.md). `sway` keeps the heading along the path and asks the lateral thrusters
+for a sway speed that takes the cross-track error away; far off the path it turns to `los` until it
+is near. Position, cross-track error and altitude are those of the followed point, by default the
+left port's glass, for which plans are made.
 
-A mission's phases (signals.py): DIVE to the altitude, as near to the start as the thrusters can
+A mission's phases (memory.py): DIVE to the altitude, as near to the start as the thrusters can
 stay; APPROACH to the start of a straight way in, however far the current has carried the vehicle;
 FOLLOW the path; ASCEND; DONE. ABORT, from any phase but the last two, is an ascent with a reason
 (safety.py). Close to the sea floor the vehicle slows down and climbs. Without bottom lock it stops
@@ -17,12 +17,20 @@ and holds its depth, rising as the floor last did, until the lock is lost for to
 import math
 
 from alice_survey.base.frames import Array
-from alice_survey.vehicle import signals
+from alice_survey.vehicle import estimate_vector as vector
 from alice_survey.vehicle.compiled import kernel
-from alice_survey.vehicle.pilot import memory as told
+from alice_survey.vehicle.pilot import memory as slot
 from alice_survey.vehicle.pilot.control import write_wrench
 from alice_survey.vehicle.pilot.gains import HEAVE, LEAST, STEADY_SHARE, Gains
-from alice_survey.vehicle.pilot.memory import PilotState
+from alice_survey.vehicle.pilot.memory import (
+    ABORT,
+    APPROACH,
+    ASCEND,
+    DIVE,
+    DONE,
+    FOLLOW,
+    PilotState,
+)
 from alice_survey.vehicle.pilot.path import Path, advance, place_at
 from alice_survey.vehicle.pilot.safety import (
     LOST_PATH,
@@ -53,7 +61,6 @@ from alice_survey.vehicle.pilot.steering import (
     surge_at,
     tell_point,
 )
-from alice_survey.vehicle.signals import ABORT, APPROACH, ASCEND, DIVE, DONE, FOLLOW
 
 _DEPTH_SPEED_KEPT_MPS = 0.05
 _CAUTION_M = 0.5
@@ -79,7 +86,7 @@ def steer(
     Args:
         time_s: since the start of the mission.
         dt_s: the tick.
-        estimate: (14,) of the navigation, see signals.py.
+        estimate: (14,) of the navigation, see estimate_vector.py.
         path: to follow.
         guidance: settings.
         gains: of the inner loops.
@@ -87,17 +94,17 @@ def steer(
         wrench: (6,) N and N m, is written: forces and moments to ask of the thrusters.
     """
     report, demand = pilot.report, pilot.demand
-    for i in range(told.FULL_SURGE):
+    for i in range(slot.FULL_SURGE):
         demand[i] = 0.0
     for i in range(6):
         wrench[i] = 0.0
-    report[told.WANTED_SWAY] = report[told.WANTED_SURGE] = 0.0
-    if report[told.PHASE] == DONE:
+    report[slot.WANTED_SWAY] = report[slot.WANTED_SURGE] = 0.0
+    if report[slot.PHASE] == DONE:
         return
     if not navigates(estimate):
-        report[told.REASON] = NO_NAVIGATION
+        report[slot.REASON] = NO_NAVIGATION
         _enter(pilot, ABORT)
-    if report[told.REASON] == NO_NAVIGATION:
+    if report[slot.REASON] == NO_NAVIGATION:
         # Without knowing how it moves the vehicle can only push itself up.
         wrench[2] = STEADY_SHARE * gains.axes[HEAVE, LEAST]
         return
@@ -110,20 +117,20 @@ def steer(
     if reason != NONE:
         _abort(reason, estimate, pilot)
 
-    phase = report[told.PHASE]
+    phase = report[slot.PHASE]
     if phase == FOLLOW:
         _on_path(dt_s, estimate, path, guidance, gains, pilot)
     elif phase == DIVE or phase == APPROACH:  # noqa: SIM109  a tuple is slower here
         _on_the_way(dt_s, estimate, path, guidance, gains, pilot)
     else:
         sink_to(0.0, 0.0, estimate, dt_s, gains, pilot)
-        head_for(report[told.WANTED_HEADING], 0.0, 0.0, estimate, dt_s, gains, pilot)
+        head_for(report[slot.WANTED_HEADING], 0.0, 0.0, estimate, dt_s, gains, pilot)
         surge_at(0.0, dt_s, guidance, gains, pilot)
-        report[told.LINE], report[told.BY_SWAY] = -1.0, 0.0
-        if estimate[signals.DEPTH] < guidance.surface_m:
-            report[told.AT_SURFACE] = 1.0
+        report[slot.LINE], report[slot.BY_SWAY] = -1.0, 0.0
+        if estimate[vector.DEPTH] < guidance.surface_m:
+            report[slot.AT_SURFACE] = 1.0
             if phase == ASCEND:
-                report[told.PHASE] = DONE
+                report[slot.PHASE] = DONE
     write_wrench(gains, pilot, wrench)
     if guidance.sway == 0.0:
         wrench[1] = 0.0
@@ -131,15 +138,15 @@ def steer(
 
 @kernel
 def _enter(pilot: PilotState, phase: int) -> None:
-    pilot.report[told.PHASE] = phase
-    pilot.memory[told.SETTLED_S] = 0.0
+    pilot.report[slot.PHASE] = phase
+    pilot.memory[slot.SETTLED_S] = 0.0
     restart_watch(pilot)
 
 
 @kernel
 def _abort(reason: int, estimate: Array, pilot: PilotState) -> None:
-    pilot.report[told.REASON] = reason
-    pilot.report[told.WANTED_HEADING] = estimate[signals.HEADING]
+    pilot.report[slot.REASON] = reason
+    pilot.report[slot.WANTED_HEADING] = estimate[vector.HEADING]
     _enter(pilot, ABORT)
 
 
@@ -149,19 +156,19 @@ def _target_m(path: Path, guidance: Guidance, pilot: PilotState) -> float:
 
     The smoothed sum of depth and altitude holds by how much the followed point is below the origin.
     """
-    if pilot.memory[told.FLOOR_KNOWN] == 0.0:
+    if pilot.memory[slot.FLOOR_KNOWN] == 0.0:
         limits = guidance.limits
         return float(min(limits.blind_depth_m, limits.most_depth_m - _CAUTION_M))
-    return float(pilot.memory[told.FLOOR] - path.altitude_m)
+    return float(pilot.memory[slot.FLOOR] - path.altitude_m)
 
 
 @kernel
 def _goal(path: Path, guidance: Guidance, pilot: PilotState) -> tuple[float, float, float]:
     """North, east and heading where the way in to the path begins."""
-    leg, along = int(pilot.report[told.LEG]), pilot.report[told.ALONG]
+    leg, along = int(pilot.report[slot.LEG]), pilot.report[slot.ALONG]
     if stands(path, leg):
         # Here the vehicle goes to the place itself, with the heading it has there.
-        turned = math.copysign(pilot.memory[told.REF], path.turn_rad[leg])
+        turned = math.copysign(pilot.memory[slot.REF], path.turn_rad[leg])
         n, e, heading, _ = place_at(path, leg, along)
         return n, e, heading + (turned if path.turn_rad[leg] != 0.0 else path.side_rad[leg])
     n, e, heading, _ = place_at(path, leg, along)
@@ -172,18 +179,18 @@ def _goal(path: Path, guidance: Guidance, pilot: PilotState) -> tuple[float, flo
 @kernel
 def _progress_m(estimate: Array, path: Path, guidance: Guidance, pilot: PilotState) -> float:
     """What should grow in the present phase."""
-    phase = pilot.report[told.PHASE]
+    phase = pilot.report[slot.PHASE]
     if phase == DIVE:
-        return float(-abs(_target_m(path, guidance, pilot) - estimate[signals.DEPTH]))
+        return float(-abs(_target_m(path, guidance, pilot) - estimate[vector.DEPTH]))
     if phase == APPROACH:
         n, e, _ = _goal(path, guidance, pilot)
         point = pilot.point
-        return float(-math.hypot(n - point[told.POINT_NORTH], e - point[told.POINT_EAST]))
-    leg = int(pilot.report[told.LEG])
-    progress = path.begins_m[leg] + pilot.report[told.ALONG]
+        return float(-math.hypot(n - point[slot.POINT_NORTH], e - point[slot.POINT_EAST]))
+    leg = int(pilot.report[slot.LEG])
+    progress = path.begins_m[leg] + pilot.report[slot.ALONG]
     if path.turn_rad[leg] != 0.0:
         # A radian of a turn on the spot counts as a metre.
-        progress += pilot.memory[told.REF]
+        progress += pilot.memory[slot.REF]
     return float(progress)
 
 
@@ -193,32 +200,32 @@ def _on_the_way(
 ) -> None:
     """Dive or approach for a tick."""
     memory, report, point = pilot.memory, pilot.report, pilot.point
-    phase = report[told.PHASE]
+    phase = report[slot.PHASE]
     target = mind_floor(_target_m(path, guidance, pilot), estimate, guidance.limits, pilot)
-    sink_to(target, memory[told.FLOOR_SLOPE], estimate, dt_s, gains, pilot)
+    sink_to(target, memory[slot.FLOOR_SLOPE], estimate, dt_s, gains, pilot)
     n, e, heading = _goal(path, guidance, pilot)
     distance, error = go_to(n, e, heading, dt_s, estimate, path, guidance, gains, pilot)
-    dn, de = point[told.POINT_NORTH] - n, point[told.POINT_EAST] - e
-    report[told.CROSS] = de * math.cos(heading) - dn * math.sin(heading)
-    report[told.PATH_HEADING], report[told.LINE] = heading, -1.0
+    dn, de = point[slot.POINT_NORTH] - n, point[slot.POINT_EAST] - e
+    report[slot.CROSS] = de * math.cos(heading) - dn * math.sin(heading)
+    report[slot.PATH_HEADING], report[slot.LINE] = heading, -1.0
 
     if phase == DIVE:
         settled = (
-            memory[told.FLOOR_KNOWN] > 0.0
-            and abs(target - estimate[signals.DEPTH]) < DEPTH_KEPT_M
-            and abs(point[told.SINK_SPEED]) < _DEPTH_SPEED_KEPT_MPS
+            memory[slot.FLOOR_KNOWN] > 0.0
+            and abs(target - estimate[vector.DEPTH]) < DEPTH_KEPT_M
+            and abs(point[slot.SINK_SPEED]) < _DEPTH_SPEED_KEPT_MPS
         )
     else:
         settled = distance < guidance.capture_m and (
             guidance.sway == 0.0 or abs(error) < HEADING_KEPT_RAD
         )
-    memory[told.SETTLED_S] = memory[told.SETTLED_S] + dt_s if settled else 0.0
-    if phase == DIVE and memory[told.SETTLED_S] > _SETTLE_S:
+    memory[slot.SETTLED_S] = memory[slot.SETTLED_S] + dt_s if settled else 0.0
+    if phase == DIVE and memory[slot.SETTLED_S] > _SETTLE_S:
         _enter(pilot, APPROACH)
-    elif phase == APPROACH and memory[told.SETTLED_S] > (_SETTLE_S if guidance.sway > 0.0 else 0.0):
-        memory[told.STANDING] = 0.0
-        if not stands(path, int(report[told.LEG])):
-            report[told.ALONG] -= guidance.way_in_m
+    elif phase == APPROACH and memory[slot.SETTLED_S] > (_SETTLE_S if guidance.sway > 0.0 else 0.0):
+        memory[slot.STANDING] = 0.0
+        if not stands(path, int(report[slot.LEG])):
+            report[slot.ALONG] -= guidance.way_in_m
         _enter(pilot, FOLLOW)
 
 
@@ -228,35 +235,35 @@ def _on_path(
 ) -> None:
     """Follow the path for a tick."""
     memory, report, point = pilot.memory, pilot.report, pilot.point
-    leg, along, over = int(report[told.LEG]), report[told.ALONG], False
-    if memory[told.STANDING] == 0.0 and stands(path, leg):
-        start_standing(memory[told.REF], 0.0, pilot)
-    elif memory[told.STANDING] == 0.0:
+    leg, along, over = int(report[slot.LEG]), report[slot.ALONG], False
+    if memory[slot.STANDING] == 0.0 and stands(path, leg):
+        start_standing(memory[slot.REF], 0.0, pilot)
+    elif memory[slot.STANDING] == 0.0:
         leg, along, over = advance(
             path,
             leg,
             along,
-            point[told.POINT_NORTH],
-            point[told.POINT_EAST],
+            point[slot.POINT_NORTH],
+            point[slot.POINT_EAST],
             _QUICKEST * path.speed_mps * dt_s,
         )
         if must_brake(path, guidance, gains, pilot, leg, along):
-            speed = max(point[told.SURGE_SPEED], 0.0)
-            brake(speed, along, estimate[signals.HEADING], gains, pilot)
+            speed = max(point[slot.SURGE_SPEED], 0.0)
+            brake(speed, along, estimate[vector.HEADING], gains, pilot)
     target = mind_floor(_target_m(path, guidance, pilot), estimate, guidance.limits, pilot)
-    sink_to(target, memory[told.FLOOR_SLOPE], estimate, dt_s, gains, pilot)
-    if memory[told.STANDING] == 0.0:
+    sink_to(target, memory[slot.FLOOR_SLOPE], estimate, dt_s, gains, pilot)
+    if memory[slot.STANDING] == 0.0:
         follow(leg, along, dt_s, estimate, path, guidance, gains, pilot)
     elif stand(leg, dt_s, estimate, path, guidance, gains, pilot):
-        over = leave_stop(path, estimate[signals.HEADING], pilot)
+        over = leave_stop(path, estimate[vector.HEADING], pilot)
     if over:
         _enter(pilot, ASCEND)
-    elif abs(report[told.CROSS]) > guidance.lost_m:
-        memory[told.RETURNS] += 1.0
-        if memory[told.RETURNS] > guidance.limits.most_returns:
+    elif abs(report[slot.CROSS]) > guidance.lost_m:
+        memory[slot.RETURNS] += 1.0
+        if memory[slot.RETURNS] > guidance.limits.most_returns:
             _abort(LOST_PATH, estimate, pilot)
             return
         # Back to where the path was left; of an arc, to its start, since the way in is straight.
         if path.curvature_per_m[leg] != 0.0:
-            report[told.ALONG] = 0.0
+            report[slot.ALONG] = 0.0
         _enter(pilot, APPROACH)

@@ -1,4 +1,4 @@
-"""What the pilot remembers from tick to tick, and what it tells of itself."""
+"""What the pilot remembers from tick to tick, and what it reports."""
 
 import math
 from typing import NamedTuple
@@ -11,13 +11,16 @@ from alice_survey.base.frames import Array
     PHASE, LEG, ALONG, CROSS, WANTED_HEADING, WANTED_SURGE, BY_SWAY, REASON, LINE, WANTED_DEPTH,
     WANTED_SWAY, AT_SURFACE, PATH_HEADING,
 ) = range(13)  # fmt: skip
-"""Columns of a report: phase (signals.py); leg; distance along it, m; how far the followed point is
+"""Columns of a report: phase (below); leg; distance along it, m; how far the followed point is
 to starboard of the path, m; wanted heading, rad; wanted surge over ground, m/s; 1 while the path is
 held by sway, 0 while it is by heading; reason of an abort (safety.py); survey line or -1; wanted
 depth of the body's origin, m; wanted sway over ground, m/s; 1 at the surface after the mission or
 an abort; heading of the path, rad. Phase, leg, distance, the manner of steering and the reason are
 also what the pilot goes by on the next tick."""
 REPORT = 13
+
+DIVE, APPROACH, FOLLOW, ASCEND, DONE, ABORT = 0, 1, 2, 3, 4, 5
+"""Phases of the guidance."""
 
 (
     FLOOR, FLOOR_SLOPE, FLOOR_KNOWN, SURGE_SUM, SWAY_SUM_N, SWAY_SUM_E, HEAVE_SUM, YAW_SUM,

@@ -5,9 +5,13 @@ from typing import NamedTuple
 
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.compiled import kernel
+from alice_survey.vehicle.estimate_vector import ALTITUDE, CLEARANCE, DEPTH, ESTIMATE, PITCH
 from alice_survey.vehicle.pilot.memory import (
+    APPROACH,
     BEST,
+    DIVE,
     FLOOR_KNOWN,
+    FOLLOW,
     LOST_S,
     LOW_S,
     PACE,
@@ -16,16 +20,6 @@ from alice_survey.vehicle.pilot.memory import (
     SINCE_BEST_S,
     UNSAFE_S,
     PilotState,
-)
-from alice_survey.vehicle.signals import (
-    ALTITUDE,
-    APPROACH,
-    CLEARANCE,
-    DEPTH,
-    DIVE,
-    ESTIMATE,
-    FOLLOW,
-    PITCH,
 )
 
 (

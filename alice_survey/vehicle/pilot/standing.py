@@ -14,9 +14,9 @@ import math
 from typing import NamedTuple
 
 from alice_survey.base.frames import Array
-from alice_survey.vehicle import signals
+from alice_survey.vehicle import estimate_vector as vector
 from alice_survey.vehicle.compiled import kernel
-from alice_survey.vehicle.pilot import memory as told
+from alice_survey.vehicle.pilot import memory as slot
 from alice_survey.vehicle.pilot.control import (
     clamped,
     place_demand,
@@ -59,7 +59,7 @@ def must_brake(
     """Whether a vehicle that goes ahead has to begin to brake for the stop at its leg's end."""
     if path.stop[leg] == 0.0:
         return False
-    speed = max(pilot.point[told.SURGE_SPEED], 0.0)
+    speed = max(pilot.point[slot.SURGE_SPEED], 0.0)
     braking = speed * speed / (2.0 * guidance.stop_mps2) + speed * gains.axes[SURGE, LAG]
     return bool(path.length_m[leg] - along_m <= braking)
 
@@ -74,20 +74,20 @@ def brake(
     see (gains.py), and what the current takes; only this is wanted of the place's.
     """
     memory = pilot.memory
-    held = memory[told.SURGE_SUM] - (1.0 - gains.axes[SURGE, WEIGHT]) * speed_mps
-    memory[told.PLACE_SUM_N] = held * math.cos(heading_rad)
-    memory[told.PLACE_SUM_E] = held * math.sin(heading_rad)
+    held = memory[slot.SURGE_SUM] - (1.0 - gains.axes[SURGE, WEIGHT]) * speed_mps
+    memory[slot.PLACE_SUM_N] = held * math.cos(heading_rad)
+    memory[slot.PLACE_SUM_E] = held * math.sin(heading_rad)
     start_standing(along_m, speed_mps, pilot)
-    memory[told.RAMP] += gains.axes[SURGE, LAG] * speed_mps
+    memory[slot.RAMP] += gains.axes[SURGE, LAG] * speed_mps
 
 
 @kernel
 def start_standing(at: float, speed: float, pilot: PilotState) -> None:
     """Let a reference begin at a place or heading, at a speed."""
     memory = pilot.memory
-    memory[told.STANDING], memory[told.WAITED_S] = 1.0, 0.0
-    memory[told.REF], memory[told.REF_SPEED] = at, speed
-    memory[told.RAMP], memory[told.RAMP_SPEED] = at, speed
+    memory[slot.STANDING], memory[slot.WAITED_S] = 1.0, 0.0
+    memory[slot.REF], memory[slot.REF_SPEED] = at, speed
+    memory[slot.RAMP], memory[slot.RAMP_SPEED] = at, speed
 
 
 @kernel
@@ -147,13 +147,13 @@ def _move_on(
         The acceleration to feed forward.
     """
     memory = pilot.memory
-    memory[told.RAMP], memory[told.RAMP_SPEED], quicken = ramp(
-        memory[told.RAMP], memory[told.RAMP_SPEED], goal, most, acceleration, dt_s
+    memory[slot.RAMP], memory[slot.RAMP_SPEED], quicken = ramp(
+        memory[slot.RAMP], memory[slot.RAMP_SPEED], goal, most, acceleration, dt_s
     )
-    speed = memory[told.REF_SPEED]
-    speed += min(dt_s / lag_s, 1.0) * (memory[told.RAMP_SPEED] - speed)
-    memory[told.REF_SPEED] = speed
-    memory[told.REF] = min(memory[told.REF] + speed * dt_s, goal)
+    speed = memory[slot.REF_SPEED]
+    speed += min(dt_s / lag_s, 1.0) * (memory[slot.RAMP_SPEED] - speed)
+    memory[slot.REF_SPEED] = speed
+    memory[slot.REF] = min(memory[slot.REF] + speed * dt_s, goal)
     return quicken
 
 
@@ -170,13 +170,13 @@ def _turning(
     """Move the heading of a turn on the spot on by a tick."""
     memory, sense = pilot.memory, math.copysign(1.0, path.turn_rad[leg])
     n, e, start, _ = place_at(path, leg, 0.0)
-    behind = abs(wrapped(start + sense * memory[told.REF] - estimate[signals.HEADING]))
+    behind = abs(wrapped(start + sense * memory[slot.REF] - estimate[vector.HEADING]))
     most = guidance.spot_rad_s * _patience(behind / _BEHIND_RAD)
     goal = abs(path.turn_rad[leg])
     lag_s = gains.axes[YAW, LAG]
     quicken = sense * _move_on(goal, most, guidance.spot_rad_s2, lag_s, dt_s, pilot)
-    heading, rate = start + sense * memory[told.REF], sense * memory[told.REF_SPEED]
-    over = goal - memory[told.REF] < 0.5 * STOP_RAD and memory[told.RAMP] >= goal
+    heading, rate = start + sense * memory[slot.REF], sense * memory[slot.REF_SPEED]
+    over = goal - memory[slot.REF] < 0.5 * STOP_RAD and memory[slot.RAMP] >= goal
     return Reference(n, e, heading, 0.0, 0.0, heading, rate, quicken, 0.0, over)
 
 
@@ -186,18 +186,18 @@ def _moving(
 ) -> Reference:
     """Move the place on by a tick, ahead into a stop or aside."""
     memory, point, side = pilot.memory, pilot.point, path.side_rad[leg]
-    n, e, course, _ = place_at(path, leg, memory[told.REF])
-    dn, de = n - point[told.POINT_NORTH], e - point[told.POINT_EAST]
+    n, e, course, _ = place_at(path, leg, memory[slot.REF])
+    dn, de = n - point[slot.POINT_NORTH], e - point[slot.POINT_EAST]
     behind = math.cos(course) * dn + math.sin(course) * de
     most = path.speed_mps if side == 0.0 else guidance.step_mps
-    most *= memory[told.PACE] * _patience(behind / _BEHIND_M)
+    most *= memory[slot.PACE] * _patience(behind / _BEHIND_M)
     acceleration = guidance.stop_mps2 if side == 0.0 else guidance.step_mps2
     lag_s = gains.axes[SURGE if side == 0.0 else SWAY, LAG]
     goal = path.length_m[leg]
     quicken = _move_on(goal, most, acceleration, lag_s, dt_s, pilot)
-    along, speed = memory[told.REF], memory[told.REF_SPEED]
+    along, speed = memory[slot.REF], memory[slot.REF_SPEED]
     n, e, course, curvature = place_at(path, leg, along)
-    over = goal - along < 0.5 * STOP_M and memory[told.RAMP] >= goal
+    over = goal - along < 0.5 * STOP_M and memory[slot.RAMP] >= goal
     return Reference(
         n, e, course, speed, quicken, course + side, curvature * speed, 0.0, along, over
     )
@@ -244,23 +244,23 @@ def stand(
     ahead, beside = _keep_place(wanted, dt_s, estimate, path, guidance, gains, pilot)
 
     by_sway = guidance.sway > 0.0
-    report[told.BY_SWAY] = 1.0 if by_sway else 0.0
-    report[told.LEG], report[told.ALONG], report[told.LINE] = leg, wanted.along_m, path.line[leg]
-    report[told.PATH_HEADING] = wanted.course_rad
-    dn, de = point[told.POINT_NORTH] - wanted.north_m, point[told.POINT_EAST] - wanted.east_m
-    report[told.CROSS] = de * math.cos(wanted.course_rad) - dn * math.sin(wanted.course_rad)
+    report[slot.BY_SWAY] = 1.0 if by_sway else 0.0
+    report[slot.LEG], report[slot.ALONG], report[slot.LINE] = leg, wanted.along_m, path.line[leg]
+    report[slot.PATH_HEADING] = wanted.course_rad
+    dn, de = point[slot.POINT_NORTH] - wanted.north_m, point[slot.POINT_EAST] - wanted.east_m
+    report[slot.CROSS] = de * math.cos(wanted.course_rad) - dn * math.sin(wanted.course_rad)
     if not wanted.over:
         return False
-    memory[told.WAITED_S] += dt_s
-    wide = 1.0 + memory[told.WAITED_S] / _WIDEN_S
-    off, moves = abs(ahead), abs(point[told.SURGE_SPEED])
+    memory[slot.WAITED_S] += dt_s
+    wide = 1.0 + memory[slot.WAITED_S] / _WIDEN_S
+    off, moves = abs(ahead), abs(point[slot.SURGE_SPEED])
     if by_sway:
-        off, moves = math.hypot(ahead, beside), math.hypot(moves, point[told.SWAY_SPEED])
+        off, moves = math.hypot(ahead, beside), math.hypot(moves, point[slot.SWAY_SPEED])
     return bool(
         off < STOP_M * wide
         and moves < STOP_MPS * wide
         and abs(error) < STOP_RAD * wide
-        and abs(point[told.TURN_SPEED]) < STOP_RAD_S * wide
+        and abs(point[slot.TURN_SPEED]) < STOP_RAD_S * wide
     )
 
 
@@ -281,36 +281,36 @@ def _keep_place(
     Returns:
         How far the place is ahead and to starboard of the followed point.
     """
-    memory, demand, now = pilot.memory, pilot.demand, estimate[signals.HEADING]
+    memory, demand, now = pilot.memory, pilot.demand, estimate[vector.HEADING]
     s, c = math.sin(now), math.cos(now)
-    dn = wanted.north_m - pilot.point[told.POINT_NORTH]
-    de = wanted.east_m - pilot.point[told.POINT_EAST]
+    dn = wanted.north_m - pilot.point[slot.POINT_NORTH]
+    de = wanted.east_m - pilot.point[slot.POINT_EAST]
     ahead, beside = c * dn + s * de, c * de - s * dn
     cosine, sine = math.cos(wanted.course_rad - now), math.sin(wanted.course_rad - now)
-    pulled, lever = memory[told.PACE] * ahead, guidance.point_body_m[1]
-    total = c * memory[told.PLACE_SUM_N] + s * memory[told.PLACE_SUM_E]
+    pulled, lever = memory[slot.PACE] * ahead, guidance.point_body_m[1]
+    total = c * memory[slot.PLACE_SUM_N] + s * memory[slot.PLACE_SUM_E]
     steady, accelerate = place_demand(
         gains,
         SURGE,
         pulled,
-        pilot.point[told.SURGE_SPEED],
+        pilot.point[slot.SURGE_SPEED],
         wanted.speed_mps * cosine,
         total,
         path.speed_mps,
     )
-    demand[told.REF_SURGE] = steady + lever * demand[told.REF_YAW]
-    demand[told.ACC_SURGE] = (
-        accelerate + wanted.quicken_mps2 * cosine + lever * demand[told.ACC_YAW]
+    demand[slot.REF_SURGE] = steady + lever * demand[slot.REF_YAW]
+    demand[slot.ACC_SURGE] = (
+        accelerate + wanted.quicken_mps2 * cosine + lever * demand[slot.ACC_YAW]
     )
-    pilot.report[told.WANTED_SURGE] = steady
+    pilot.report[slot.WANTED_SURGE] = steady
     near = clamped(pulled, STOP_M)
-    step = place_sum_step(gains, SURGE, near, demand[told.FULL_SURGE], dt_s)
-    north, east = memory[told.PLACE_SUM_N] + c * step, memory[told.PLACE_SUM_E] + s * step
+    step = place_sum_step(gains, SURGE, near, demand[slot.FULL_SURGE], dt_s)
+    north, east = memory[slot.PLACE_SUM_N] + c * step, memory[slot.PLACE_SUM_E] + s * step
     cut = min(1.0, sum_bound(gains, SURGE) / max(math.hypot(north, east), 1e-9))
-    memory[told.PLACE_SUM_N], memory[told.PLACE_SUM_E] = cut * north, cut * east
+    memory[slot.PLACE_SUM_N], memory[slot.PLACE_SUM_E] = cut * north, cut * east
     if guidance.sway > 0.0:
         sway_by(-beside, wanted.speed_mps * sine, estimate, dt_s, guidance, gains, pilot)
-        demand[told.ACC_SWAY] += wanted.quicken_mps2 * sine
+        demand[slot.ACC_SWAY] += wanted.quicken_mps2 * sine
     return ahead, beside
 
 
@@ -322,14 +322,14 @@ def leave_stop(path: Path, heading_rad: float, pilot: PilotState) -> bool:
         Whether there is none: the path is over.
     """
     memory, report = pilot.memory, pilot.report
-    following = int(report[told.LEG]) + 1
+    following = int(report[slot.LEG]) + 1
     if following == path.length_m.shape[0]:
         return True
-    report[told.LEG], report[told.ALONG] = following, 0.0
+    report[slot.LEG], report[slot.ALONG] = following, 0.0
     start_standing(0.0, 0.0, pilot)
     if not stands(path, following):
-        memory[told.STANDING] = 0.0
-        north, east = memory[told.PLACE_SUM_N], memory[told.PLACE_SUM_E]
-        memory[told.SURGE_SUM] = north * math.cos(heading_rad) + east * math.sin(heading_rad)
+        memory[slot.STANDING] = 0.0
+        north, east = memory[slot.PLACE_SUM_N], memory[slot.PLACE_SUM_E]
+        memory[slot.SURGE_SUM] = north * math.cos(heading_rad) + east * math.sin(heading_rad)
     restart_watch(pilot)
     return False

@@ -8,9 +8,9 @@ depend on the yaw that was asked for.
 import math
 
 from alice_survey.base.frames import Array
-from alice_survey.vehicle import signals
+from alice_survey.vehicle import estimate_vector as vector
 from alice_survey.vehicle.compiled import kernel
-from alice_survey.vehicle.pilot import memory as told
+from alice_survey.vehicle.pilot import memory as slot
 from alice_survey.vehicle.pilot.control import (
     clamped,
     place_demand,
@@ -48,20 +48,23 @@ _HOVER_SHARE = 0.25
 def tell_point(estimate: Array, guidance: Guidance, pilot: PilotState) -> None:
     """Write where the followed point is and how it moves into the pilot's `point`."""
     p, point = guidance.point_body_m, pilot.point
-    sr, cr = math.sin(estimate[signals.ROLL]), math.cos(estimate[signals.ROLL])
-    sp, cp = math.sin(estimate[signals.PITCH]), math.cos(estimate[signals.PITCH])
-    sy, cy = math.sin(estimate[signals.HEADING]), math.cos(estimate[signals.HEADING])
+    sr, cr = math.sin(estimate[vector.ROLL]), math.cos(estimate[vector.ROLL])
+    sp, cp = math.sin(estimate[vector.PITCH]), math.cos(estimate[vector.PITCH])
+    sy, cy = (
+        math.sin(estimate[vector.HEADING]),
+        math.cos(estimate[vector.HEADING]),
+    )
     ahead = cp * p[0] + sp * (sr * p[1] + cr * p[2])
     beside = cr * p[1] - sr * p[2]
-    u, v, w = estimate[signals.U], estimate[signals.V], estimate[signals.W]
-    turn = (sr * estimate[signals.Q] + cr * estimate[signals.R]) / cp
+    u, v, w = estimate[vector.U], estimate[vector.V], estimate[vector.W]
+    turn = (sr * estimate[vector.Q] + cr * estimate[vector.R]) / cp
     # Roll and pitch rates are left out: nothing here can answer them.
-    point[told.POINT_NORTH] = estimate[signals.NORTH] + cy * ahead - sy * beside
-    point[told.POINT_EAST] = estimate[signals.EAST] + sy * ahead + cy * beside
-    point[told.SURGE_SPEED] = cp * u + sp * (sr * v + cr * w) - turn * beside
-    point[told.SWAY_SPEED] = cr * v - sr * w + turn * ahead
-    point[told.SINK_SPEED] = -sp * u + cp * (sr * v + cr * w)
-    point[told.TURN_SPEED] = turn
+    point[slot.POINT_NORTH] = estimate[vector.NORTH] + cy * ahead - sy * beside
+    point[slot.POINT_EAST] = estimate[vector.EAST] + sy * ahead + cy * beside
+    point[slot.SURGE_SPEED] = cp * u + sp * (sr * v + cr * w) - turn * beside
+    point[slot.SWAY_SPEED] = cr * v - sr * w + turn * ahead
+    point[slot.SINK_SPEED] = -sp * u + cp * (sr * v + cr * w)
+    point[slot.TURN_SPEED] = turn
 
 
 @kernel
@@ -73,18 +76,18 @@ def hear_floor(estimate: Array, dt_s: float, guidance: Guidance, pilot: PilotSta
     the depth of one that fell is held.
     """
     memory, rate = pilot.memory, guidance.floor_rate_rad_s
-    heard = estimate[signals.DEPTH] + estimate[signals.ALTITUDE]
+    heard = estimate[vector.DEPTH] + estimate[vector.ALTITUDE]
     if not math.isfinite(heard):
-        memory[told.FLOOR_SLOPE] = min(memory[told.FLOOR_SLOPE], 0.0) * (1.0 - dt_s / _RISE_ON_S)
-        memory[told.FLOOR] += dt_s * memory[told.FLOOR_SLOPE]
+        memory[slot.FLOOR_SLOPE] = min(memory[slot.FLOOR_SLOPE], 0.0) * (1.0 - dt_s / _RISE_ON_S)
+        memory[slot.FLOOR] += dt_s * memory[slot.FLOOR_SLOPE]
         return
-    if memory[told.FLOOR_KNOWN] == 0.0:
-        memory[told.FLOOR_KNOWN], memory[told.FLOOR] = 1.0, heard
+    if memory[slot.FLOOR_KNOWN] == 0.0:
+        memory[slot.FLOOR_KNOWN], memory[slot.FLOOR] = 1.0, heard
         restart_watch(pilot)
         return
-    surprise = clamped(heard - memory[told.FLOOR], _MOST_SURPRISE_M)
-    memory[told.FLOOR] += dt_s * (memory[told.FLOOR_SLOPE] + 2.0 * rate * surprise)
-    memory[told.FLOOR_SLOPE] += dt_s * rate * rate * surprise
+    surprise = clamped(heard - memory[slot.FLOOR], _MOST_SURPRISE_M)
+    memory[slot.FLOOR] += dt_s * (memory[slot.FLOOR_SLOPE] + 2.0 * rate * surprise)
+    memory[slot.FLOOR_SLOPE] += dt_s * rate * rate * surprise
 
 
 @kernel
@@ -93,21 +96,21 @@ def sink_to(
 ) -> None:
     """Ask for the heave that takes the origin to a depth, which itself moves at a speed."""
     memory, demand = pilot.memory, pilot.demand
-    error, most = depth_m - estimate[signals.DEPTH], gains.axes[HEAVE, FASTEST]
-    demand[told.REF_HEAVE], demand[told.ACC_HEAVE] = place_demand(
+    error, most = depth_m - estimate[vector.DEPTH], gains.axes[HEAVE, FASTEST]
+    demand[slot.REF_HEAVE], demand[slot.ACC_HEAVE] = place_demand(
         gains,
         HEAVE,
         error,
-        pilot.point[told.SINK_SPEED],
+        pilot.point[slot.SINK_SPEED],
         clamped(feed_mps, 0.5 * most),
-        memory[told.HEAVE_SUM],
+        memory[slot.HEAVE_SUM],
         most,
     )
-    if abs(error) < DEPTH_KEPT_M or abs(pilot.point[told.SINK_SPEED]) < _AT_REST * most:
+    if abs(error) < DEPTH_KEPT_M or abs(pilot.point[slot.SINK_SPEED]) < _AT_REST * most:
         near = clamped(error, DEPTH_KEPT_M)
-        step = place_sum_step(gains, HEAVE, near, demand[told.FULL_HEAVE], dt_s)
-        memory[told.HEAVE_SUM] = clamped(memory[told.HEAVE_SUM] + step, sum_bound(gains, HEAVE))
-    pilot.report[told.WANTED_DEPTH] = depth_m
+        step = place_sum_step(gains, HEAVE, near, demand[slot.FULL_HEAVE], dt_s)
+        memory[slot.HEAVE_SUM] = clamped(memory[slot.HEAVE_SUM] + step, sum_bound(gains, HEAVE))
+    pilot.report[slot.WANTED_DEPTH] = depth_m
 
 
 @kernel
@@ -135,17 +138,17 @@ def head_for(
         Wanted less present heading, within -pi and pi.
     """
     memory, demand = pilot.memory, pilot.demand
-    error, most = wrapped(heading - estimate[signals.HEADING]), gains.axes[YAW, FASTEST]
-    demand[told.REF_YAW], accelerate = place_demand(
-        gains, YAW, error, pilot.point[told.TURN_SPEED], feed, memory[told.YAW_SUM], most
+    error, most = wrapped(heading - estimate[vector.HEADING]), gains.axes[YAW, FASTEST]
+    demand[slot.REF_YAW], accelerate = place_demand(
+        gains, YAW, error, pilot.point[slot.TURN_SPEED], feed, memory[slot.YAW_SUM], most
     )
-    demand[told.ACC_YAW] = accelerate + quicken
-    off = abs(pilot.point[told.TURN_SPEED] - feed)
+    demand[slot.ACC_YAW] = accelerate + quicken
+    off = abs(pilot.point[slot.TURN_SPEED] - feed)
     if abs(error) < HEADING_KEPT_RAD or off < _AT_REST * most:
         near = clamped(error, HEADING_KEPT_RAD)
-        step = place_sum_step(gains, YAW, near, demand[told.FULL_YAW], dt_s)
-        memory[told.YAW_SUM] = clamped(memory[told.YAW_SUM] + step, sum_bound(gains, YAW))
-    pilot.report[told.WANTED_HEADING] = heading
+        step = place_sum_step(gains, YAW, near, demand[slot.FULL_YAW], dt_s)
+        memory[slot.YAW_SUM] = clamped(memory[slot.YAW_SUM] + step, sum_bound(gains, YAW))
+    pilot.report[slot.WANTED_HEADING] = heading
     return error
 
 
@@ -155,13 +158,13 @@ def surge_at(
 ) -> None:
     """Ask for a surge of the followed point over ground, as far as the sea floor leaves it."""
     memory, demand = pilot.memory, pilot.demand
-    speed *= memory[told.PACE]
-    now = pilot.point[told.SURGE_SPEED]
-    demand[told.ACC_SURGE], memory[told.SURGE_SUM] = speed_demand(
-        gains, SURGE, speed, now, demand[told.FULL_SURGE], memory[told.SURGE_SUM], dt_s
+    speed *= memory[slot.PACE]
+    now = pilot.point[slot.SURGE_SPEED]
+    demand[slot.ACC_SURGE], memory[slot.SURGE_SUM] = speed_demand(
+        gains, SURGE, speed, now, demand[slot.FULL_SURGE], memory[slot.SURGE_SUM], dt_s
     )
-    demand[told.REF_SURGE] = speed + demand[told.REF_YAW] * guidance.point_body_m[1]
-    pilot.report[told.WANTED_SURGE] = speed
+    demand[slot.REF_SURGE] = speed + demand[slot.REF_YAW] * guidance.point_body_m[1]
+    pilot.report[slot.WANTED_SURGE] = speed
 
 
 @kernel
@@ -179,28 +182,28 @@ def sway_by(
     The integral is kept as a vector in NED and turned into the body (Fossen 2011, section 12.2,
     does so for positioning): what holds against a current is still right after a turn.
     """
-    memory, demand, heading = pilot.memory, pilot.demand, estimate[signals.HEADING]
+    memory, demand, heading = pilot.memory, pilot.demand, estimate[vector.HEADING]
     s, c = math.sin(heading), math.cos(heading)
-    total = c * memory[told.SWAY_SUM_E] - s * memory[told.SWAY_SUM_N]
+    total = c * memory[slot.SWAY_SUM_E] - s * memory[slot.SWAY_SUM_N]
     steady, accelerate = place_demand(
         gains,
         SWAY,
         -offset,
-        pilot.point[told.SWAY_SPEED],
+        pilot.point[slot.SWAY_SPEED],
         feed,
         total,
         gains.axes[SWAY, FASTEST],
     )
     lever = guidance.point_body_m[0]
-    demand[told.REF_SWAY] = steady - lever * demand[told.REF_YAW]
-    demand[told.ACC_SWAY] = accelerate - lever * demand[told.ACC_YAW]
-    pilot.report[told.WANTED_SWAY] = steady
+    demand[slot.REF_SWAY] = steady - lever * demand[slot.REF_YAW]
+    demand[slot.ACC_SWAY] = accelerate - lever * demand[slot.ACC_YAW]
+    pilot.report[slot.WANTED_SWAY] = steady
     if abs(offset) < guidance.far_m:
-        step = place_sum_step(gains, SWAY, -offset, demand[told.FULL_SWAY], dt_s)
-        north, east = memory[told.SWAY_SUM_N] - s * step, memory[told.SWAY_SUM_E] + c * step
+        step = place_sum_step(gains, SWAY, -offset, demand[slot.FULL_SWAY], dt_s)
+        north, east = memory[slot.SWAY_SUM_N] - s * step, memory[slot.SWAY_SUM_E] + c * step
         bound = sum_bound(gains, SWAY)
         cut = min(1.0, bound / max(math.hypot(north, east), 1e-9))
-        memory[told.SWAY_SUM_N], memory[told.SWAY_SUM_E] = cut * north, cut * east
+        memory[slot.SWAY_SUM_N], memory[slot.SWAY_SUM_E] = cut * north, cut * east
 
 
 @kernel
@@ -222,8 +225,8 @@ def go_to(
     Returns:
         Distance from the goal, and the error of the wanted heading.
     """
-    now = estimate[signals.HEADING]
-    dn, de = goal_n - pilot.point[told.POINT_NORTH], goal_e - pilot.point[told.POINT_EAST]
+    now = estimate[vector.HEADING]
+    dn, de = goal_n - pilot.point[slot.POINT_NORTH], goal_e - pilot.point[slot.POINT_EAST]
     distance = math.hypot(dn, de)
     ahead, beside = math.cos(now) * dn + math.sin(now) * de, math.cos(now) * de - math.sin(now) * dn
     speed = clamped(_HOVER_SHARE * gains.axes[SURGE, BANDWIDTH] * ahead, path.speed_mps)
@@ -234,14 +237,14 @@ def go_to(
         error = head_for(math.atan2(de, dn), 0.0, 0.0, estimate, dt_s, gains, pilot)
         speed = path.speed_mps * max(math.cos(error), 0.0)
     else:
-        facing = pilot.report[told.WANTED_HEADING]
+        facing = pilot.report[slot.WANTED_HEADING]
         if not math.isfinite(facing):
             facing = heading
         error = head_for(facing, 0.0, 0.0, estimate, dt_s, gains, pilot)
     surge_at(speed, dt_s, guidance, gains, pilot)
     if hover:
         sway_by(-beside, 0.0, estimate, dt_s, guidance, gains, pilot)
-    pilot.report[told.BY_SWAY] = 1.0 if hover else 0.0
+    pilot.report[slot.BY_SWAY] = 1.0 if hover else 0.0
     return distance, error
 
 
@@ -257,8 +260,8 @@ def follow(
     pilot: PilotState,
 ) -> None:
     """Follow the path from where the progress is."""
-    report, point, now = pilot.report, pilot.point, estimate[signals.HEADING]
-    north, east = point[told.POINT_NORTH], point[told.POINT_EAST]
+    report, point, now = pilot.report, pilot.point, estimate[vector.HEADING]
+    north, east = point[slot.POINT_NORTH], point[slot.POINT_EAST]
     n, e, beta, _ = place_at(path, leg, along)
     cross = (east - e) * math.cos(beta) - (north - n) * math.sin(beta)
     # A turn begins before its arc and ends after it: the path's heading averaged over a window.
@@ -270,13 +273,13 @@ def follow(
     speed = _wanted_speed(path, guidance, gains, leg, along, curvature)
     course = now - beta
     sine, cosine = math.sin(course), math.cos(course)
-    surge, sway = point[told.SURGE_SPEED], point[told.SWAY_SPEED]
+    surge, sway = point[slot.SURGE_SPEED], point[slot.SWAY_SPEED]
     slant = max(1.0 - curvature * cross, LEAST_SLANT)
     pace = min(max(surge * cosine - sway * sine, 0.0), 2.0 * speed) / slant
     feed = curvature * pace
     quicken = (k_front - k_back) / (2.0 * window) * pace * pace
 
-    by_sway = report[told.BY_SWAY] > 0.0
+    by_sway = report[slot.BY_SWAY] > 0.0
     if by_sway and abs(cross) > guidance.far_m:
         by_sway = False
     elif not by_sway and guidance.sway > 0.0 and abs(cross) < guidance.near_m:
@@ -299,9 +302,9 @@ def follow(
             # Lateral thrusters keep the vehicle from slipping sideways, so that it goes where it
             # heads: else a current could hold it off the path for ever.
             sway_by(0.0, 0.0, estimate, dt_s, guidance, gains, pilot)
-    report[told.BY_SWAY] = 1.0 if by_sway else 0.0
-    report[told.CROSS], report[told.PATH_HEADING] = cross, beta
-    report[told.LEG], report[told.ALONG], report[told.LINE] = leg, along, path.line[leg]
+    report[slot.BY_SWAY] = 1.0 if by_sway else 0.0
+    report[slot.CROSS], report[slot.PATH_HEADING] = cross, beta
+    report[slot.LEG], report[slot.ALONG], report[slot.LINE] = leg, along, path.line[leg]
 
 
 @kernel

@@ -16,12 +16,17 @@ from tests.oracles_seafloor import fermat_pixels, fit_saddle
 
 CONFIG = SurveyConfig.model_validate({"imaging": {"scale": 4}})
 
-EIGHTH = true_rig(SurveyConfig.model_validate({"imaging": {"scale": 8}}))
+
+def built_rig(seed: int = CONFIG.seed) -> Rig:
+    return true_rig(CONFIG.camera, CONFIG.water, scale=4, seed=seed)
+
+
+EIGHTH = true_rig(CONFIG.camera, CONFIG.water, scale=8, seed=CONFIG.seed)
 
 
 @pytest.fixture(scope="module")
 def rig() -> Rig:
-    return true_rig(CONFIG)
+    return built_rig()
 
 
 def find(picture: np.ndarray, board: PoolBoard) -> tuple[np.ndarray, np.ndarray]:
@@ -113,8 +118,8 @@ def test_a_board_that_never_fits_says_so(rig: Rig) -> None:
 
 
 def test_the_rig_as_built_is_near_its_drawing_but_not_on_it() -> None:
-    drawn, built = design_rig(CONFIG.camera, CONFIG.water, 4), true_rig(CONFIG)
-    again, other = true_rig(CONFIG), true_rig(CONFIG.model_copy(update={"seed": 9}))
+    drawn, built = design_rig(CONFIG.camera, CONFIG.water, 4), built_rig()
+    again, other = built_rig(), built_rig(9)
     assert again.cameras == built.cameras
     assert other.cameras != built.cameras
     for name, camera in built.cameras.items():

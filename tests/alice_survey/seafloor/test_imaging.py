@@ -12,6 +12,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.artefacts import Stage, run_stage, write_csv, write_json
 from alice_survey.base.config import SurveyConfig, parse_config
 from alice_survey.base.errors import NavigationError, WorkspaceError
+from alice_survey.base.executor import SERIAL, local_executor
 from alice_survey.base.frames import interpolate_poses, rotation_from_attitude
 from alice_survey.base.manifest import read_manifest
 from alice_survey.base.trajectory import Trajectory, read_track, write_track
@@ -96,7 +97,7 @@ def content(folder: Path) -> dict[str, bytes]:
 def survey(tmp_path_factory: pytest.TempPathFactory) -> Path:
     workspace = tmp_path_factory.mktemp("survey")
     fly(workspace)
-    assert spec("image").make(workspace, settings(range_maps=True), 1)
+    assert spec("image").make(workspace, settings(range_maps=True), SERIAL)
     return workspace
 
 
@@ -177,7 +178,7 @@ def test_range_maps_fit_terrain_and_poses(survey: Path) -> None:
 
 def test_two_processes_give_the_same_bytes_as_one(survey: Path, tmp_path: Path) -> None:
     fly(tmp_path)
-    assert spec("image").make(tmp_path, settings(range_maps=True), 2)
+    assert spec("image").make(tmp_path, settings(range_maps=True), local_executor(2))
     assert content(tmp_path / "images") == content(survey / "images")
 
 
@@ -195,7 +196,7 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(
 
     monkeypatch.setattr(imaging, "render", dies_at_the_fourth)
     with pytest.raises(KeyboardInterrupt):
-        spec("image").make(tmp_path, settings(range_maps=True), 1)
+        spec("image").make(tmp_path, settings(range_maps=True), SERIAL)
     assert not (tmp_path / "images").exists()
     left = sorted((tmp_path / "images.partial").glob("*/*.png"))
     assert len(left) == 3
@@ -203,7 +204,7 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(
 
     again: list[Any] = []
     monkeypatch.setattr(imaging, "render", lambda *args: again.append(args) or real(*args))
-    assert spec("image").make(tmp_path, settings(range_maps=True), 1)
+    assert spec("image").make(tmp_path, settings(range_maps=True), SERIAL)
     assert len(again) == 3
     kept = {path: (tmp_path / "images" / path).stat().st_mtime_ns for path in before}
     assert kept == before
@@ -211,12 +212,12 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(
 
 
 def test_what_is_done_is_not_done_again(survey: Path) -> None:
-    assert not spec("image").make(survey, settings(range_maps=True), 1)
+    assert not spec("image").make(survey, settings(range_maps=True), SERIAL)
 
 
 def test_noise_can_be_left_out(survey: Path, tmp_path: Path) -> None:
     fly(tmp_path)
-    spec("image").make(tmp_path, settings(noise=False), 1)
+    spec("image").make(tmp_path, settings(noise=False), SERIAL)
     clean, noisy = (
         cv2.imread(str(w / "images" / "left" / "000000.png")).astype(float)
         for w in (tmp_path, survey)
@@ -229,21 +230,21 @@ def test_noise_can_be_left_out(survey: Path, tmp_path: Path) -> None:
 def test_a_flight_that_ends_before_its_triggers_says_so(tmp_path: Path) -> None:
     fly(tmp_path, until_s=5.0)
     with pytest.raises(NavigationError, match=r"covers 0\.00 to 4\.90 s, but triggers go .* 6\.50"):
-        spec("image").make(tmp_path, settings(), 1)
+        spec("image").make(tmp_path, settings(), SERIAL)
 
 
 def test_without_a_plan_or_flight_the_next_command_is_named(tmp_path: Path) -> None:
     with pytest.raises(WorkspaceError, match="alice-survey plan"):
-        spec("image").make(tmp_path, settings(), 1)
+        spec("image").make(tmp_path, settings(), SERIAL)
 
 
 def test_the_pool_is_the_same_with_any_number_of_processes(tmp_path: Path) -> None:
     one, two = tmp_path / "one", tmp_path / "two"
     config = settings(image_format="jpg")
-    assert spec("pool").make(one, config, 1)
-    assert spec("pool").make(two, config, 2)
+    assert spec("pool").make(one, config, SERIAL)
+    assert spec("pool").make(two, config, local_executor(2))
     assert content(one / "pool") == content(two / "pool")
-    assert not spec("pool").make(one, config, 1)
+    assert not spec("pool").make(one, config, SERIAL)
     records = read_manifest(one / "pool" / "manifest.csv")
     assert len(records) == 16
     assert records[3].image == "right/01.jpg"

@@ -24,7 +24,7 @@ from camera_calib.water import water_optics
 from tests.oracles_seafloor import fermat_pixels, world_to_cam
 
 CONFIG = SurveyConfig.model_validate({"imaging": {"scale": 16}})
-RIG = true_rig(CONFIG)
+RIG = true_rig(CONFIG.camera, CONFIG.water, scale=16, seed=CONFIG.seed)
 CAMERA = RIG.cameras["left"]
 FLOOR_M = 15.0
 BOUNDS = (-3.0, 3.0, -3.0, 3.0)

@@ -7,7 +7,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alice_survey.base.config import SeafloorConfig, SurveyConfig
+from alice_survey.base.config import SeafloorConfig
 from alice_survey.base.errors import ConfigError, WorkspaceError
 from alice_survey.seafloor.amphora import LENGTH_M, amphora_mesh
 from alice_survey.seafloor.terrain import (
@@ -187,9 +187,10 @@ def test_a_patch_is_the_same_surface(terrain: Terrain) -> None:
 
 def test_a_survey_has_one_terrain_by_its_seed() -> None:
     area = [[0.0, 0.0], [2.0, 0.0], [2.0, 3.0]]
-    config = SurveyConfig.model_validate({"seafloor": {"grid_m": 0.03}})
-    one, two = survey_terrain(config, area), survey_terrain(config, area)
-    other = survey_terrain(config.model_copy(update={"seed": 2}), area)
+    coarse = SeafloorConfig(grid_m=0.03)
+    one, two, other = (
+        survey_terrain(coarse, area, margin_m=2.0, depth_m=15.0, seed=seed) for seed in (1, 1, 2)
+    )
     np.testing.assert_array_equal(one.vertices, two.vertices)
     assert np.abs(one.depths - other.depths).max() > 0.05
     south, north, west, east = one.bounds_ne_m

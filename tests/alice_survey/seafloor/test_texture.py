@@ -3,7 +3,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alice_survey.base.config import SurveyConfig
 from alice_survey.seafloor.noise import add_octave, noise, spot
 from alice_survey.seafloor.terrain import CERAMIC, ROCK, SAND
 from alice_survey.seafloor.texture import SAND_ALBEDO, Texture, survey_texture
@@ -146,5 +145,5 @@ def test_samples_do_not_alias(step_m: float) -> None:
 
 
 def test_a_survey_has_one_texture_by_its_seed() -> None:
-    assert survey_texture(SurveyConfig(seed=3)) == survey_texture(SurveyConfig(seed=3))
-    assert survey_texture(SurveyConfig(seed=3)) != survey_texture(SurveyConfig(seed=4))
+    assert survey_texture(3) == survey_texture(3)
+    assert survey_texture(3) != survey_texture(4)

@@ -7,13 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from alice_survey.base.errors import VehicleError
-from alice_survey.vehicle import signals
 from alice_survey.vehicle.dynamics import STATE, rk4_step, scratch_for
 from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.floor import level_floor
 from alice_survey.vehicle.navigation.sensors import SensorSuite
 from alice_survey.vehicle.pilot.gains import gains_for
-from alice_survey.vehicle.pilot.memory import PHASE
+from alice_survey.vehicle.pilot.memory import APPROACH, ASCEND, DIVE, DONE, FOLLOW, PHASE
 from alice_survey.vehicle.pilot.path import path_from_legs
 from alice_survey.vehicle.pilot.settings import pilot_guidance
 from alice_survey.vehicle.sea import Disturbance, constant_current
@@ -56,7 +55,7 @@ def gusty() -> Flown:
 def test_a_mission_passes_through_its_phases_in_order(calm: Flown) -> None:
     phases = calm.report[:, PHASE]
     seen = phases[np.concatenate([[True], np.diff(phases) != 0])]
-    order = [signals.DIVE, signals.APPROACH, signals.FOLLOW, signals.ASCEND, signals.DONE]
+    order = [DIVE, APPROACH, FOLLOW, ASCEND, DONE]
     assert seen.tolist() == order
     assert 60.0 < calm.time_s[-1] < 200.0
     np.testing.assert_allclose(np.diff(calm.time_s), TICK_S, rtol=1e-9)
@@ -96,7 +95,7 @@ def test_commands_replayed_give_the_same_motion(calm: Flown) -> None:
 
 def test_gusts_shake_the_vehicle_and_calm_water_does_not(calm: Flown, gusty: Flown) -> None:
     def wobble(flown: Flown) -> float:
-        rows = flown.report[:, PHASE] == signals.FOLLOW
+        rows = flown.report[:, PHASE] == FOLLOW
         return float(np.std(np.diff(flown.state[rows, 8])))
 
     assert wobble(gusty) > 1.2 * wobble(calm)
@@ -127,7 +126,7 @@ def test_power_is_that_of_the_thrusters_alone(calm: Flown) -> None:
 def test_a_mission_that_takes_too_long_is_broken_off_where_it_is() -> None:
     flown = simulate(setup(), np.random.default_rng(1), longest_s=10.0, label="test")
     assert len(flown.time_s) == 200
-    assert flown.report[-1, PHASE] == signals.DIVE
+    assert flown.report[-1, PHASE] == DIVE
 
 
 def test_an_unknown_thruster_cannot_fail() -> None:

@@ -14,12 +14,12 @@ from camera_calib.approximation.dispersion import (
     channel_cameras,
     channel_maps,
     frame_shifts,
+    n_glass,
     shift_px,
     shifts_report,
     undisperse,
 )
 from camera_calib.flat_port import FlatPortCamera
-from camera_calib.glass import n_glass
 from camera_calib.water import CHANNELS, n_water
 
 ALICE = FlatPortCamera(

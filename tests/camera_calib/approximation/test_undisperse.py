@@ -10,6 +10,7 @@ from PIL import Image
 
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.errors import AliceError
+from alice_survey.base.executor import local_executor
 from camera_calib.approximation.dispersion import channel_cameras, channel_maps, undisperse
 from camera_calib.approximation.undisperse import undisperse_files
 from camera_calib.rig import design_rig, write_rig
@@ -90,7 +91,12 @@ def test_threads_change_nothing(tmp_path: Path, rig_path: Path) -> None:
         cv2.imwrite(str(paths[-1]), np.roll(noise_picture(), i * 20, axis=1))
     for threads in (1, 2):
         undisperse_files(
-            paths, tmp_path / str(threads), rig=rig_path, range_m=2.0, **SEA, threads=threads
+            paths,
+            tmp_path / str(threads),
+            rig=rig_path,
+            range_m=2.0,
+            **SEA,
+            executor=local_executor(threads),
         )
     for path in paths:
         one, two = ((tmp_path / n / path.name).read_bytes() for n in ("1", "2"))

@@ -15,10 +15,11 @@ from benchmarks.camera_calibration import (
     MODES,
     RIG,
     bound_of,
+    cramer_rao,
     run_mode,
     run_trial,
 )
-from camera_calib.calibrate.adjust import adjust, cramer_rao
+from camera_calib.calibrate.adjust import adjust
 from camera_calib.calibrate.freedom import (
     HELD,
     PORT,

@@ -17,7 +17,7 @@ from camera_calib.flat_port import FlatPortCamera
 from camera_calib.formats.camera_files import MODELS
 from camera_calib.formats.colmap import read_colmap, write_colmap, write_flatport
 from camera_calib.formats.registry import detect
-from camera_calib.formats.rigs import Reading
+from camera_calib.formats.rigs import ReadOptions
 from camera_calib.rig import Rig
 from tests.strategies_formats import POINTS_RIG, RATIONAL, assert_same_geometry, rigs
 
@@ -44,9 +44,9 @@ def pair(camera: FlatPortCamera) -> Rig:
     )
 
 
-def fault(path: Path, reading: Reading | None = None) -> str:
+def fault(path: Path, reading: ReadOptions | None = None) -> str:
     with pytest.raises(CalibrationError) as error:
-        read_colmap(path, reading or Reading())
+        read_colmap(path, reading or ReadOptions())
     shown = str(error.value)
     assert str(path) in shown
     assert "\n" not in shown
@@ -130,7 +130,7 @@ def test_a_model_that_colmap_wrote_gives_its_rig(tmp_path: Path) -> None:
         folder = tmp_path / kind[-3:]
         write_colmap(folder / kind, rig)
         (folder / "rig_config.json").unlink()
-        after = read_colmap(folder, Reading())
+        after = read_colmap(folder, ReadOptions())
         assert list(after.cameras) == ["cam1", "cam2"]
         np.testing.assert_allclose(
             after.cam_from_rig["cam2"].as_matrix(), rig.cam_from_rig["right"].as_matrix(),
@@ -148,7 +148,7 @@ def test_rigs_that_are_malformed_or_hold_too_little_are_refused(tmp_path: Path) 
         for bad in (good[:-cut], good + b"1 2", good.replace(b"CAMERA 2", b"LIDAR 2") + b"\0"):
             rigs_file.write_bytes(bad)
             with pytest.raises(CalibrationError, match=r"rigs\.(txt|bin)"):
-                read_colmap(folder, Reading())
+                read_colmap(folder, ReadOptions())
         rigs_file.write_bytes(struct.pack("<Q", 0) if kind.endswith("bin") else b"# none\n")
         assert "no common rig" in fault(folder)
 
@@ -159,7 +159,7 @@ def test_cameras_without_a_rig_are_read_one_by_one(tmp_path: Path) -> None:
         "# a comment\n3 SIMPLE_RADIAL 640 480 500 320 240 -0.1\n7 PINHOLE 9 8 5 6 4 3\n"
     )
     assert "3, 7" in fault(path)
-    rig = read_colmap(path, Reading(camera="3"))
+    rig = read_colmap(path, ReadOptions(camera="3"))
     (camera,) = rig.cameras.values()
     assert (camera.fx_px, camera.fy_px, camera.cx_px, camera.k1) == (500, 500, 320, -0.1)
     assert camera.n_water == 1.0
@@ -171,7 +171,7 @@ def test_a_rig_configuration_alone_needs_the_picture_size(tmp_path: Path) -> Non
     alone = tmp_path / "rig_config.json"
     alone.write_text((tmp_path / "model" / "rig_config.json").read_text())
     assert "--image-size" in fault(alone)
-    assert_same_geometry(read_colmap(alone, Reading(image_size=(1920, 1200))), rig)
+    assert_same_geometry(read_colmap(alone, ReadOptions(image_size=(1920, 1200))), rig)
 
 
 def test_a_rig_configuration_without_cameras_takes_them_in_order_and_says_so(
@@ -183,7 +183,7 @@ def test_a_rig_configuration_without_cameras_takes_them_in_order_and_says_so(
     for entry in config[0]["cameras"]:
         del entry["camera_model_name"], entry["camera_params"]
     (tmp_path / "rig_config.json").write_text(json.dumps(config))
-    assert_same_geometry(read_colmap(tmp_path, Reading()), rig)
+    assert_same_geometry(read_colmap(tmp_path, ReadOptions()), rig)
     assert "in the order of their CAMERA_ID" in capsys.readouterr().err
 
 
@@ -221,7 +221,7 @@ def test_the_fork_may_leave_a_camera_without_port(tmp_path: Path) -> None:
         "1 PINHOLE 9 8 5 6 4 3 FLATPORT 0 0 1 0.02 0.01 1 1.5 1.33\n2 PINHOLE 9 8 5 6 4 3\n"
     )
     assert detect(text).name == "flatport"
-    dry = read_colmap(text, Reading(camera="2")).cameras["2"]
+    dry = read_colmap(text, ReadOptions(camera="2")).cameras["2"]
     assert (dry.n_water, dry.port_distance_m) == (1.0, 0.0)
     binary = tmp_path / "cameras.bin"
     lens = (1, 9, 8, 5.0, 6.0, 4.0, 3.0)
@@ -232,14 +232,14 @@ def test_the_fork_may_leave_a_camera_without_port(tmp_path: Path) -> None:
         + struct.pack("<IiQQ4di", 2, *lens, -1)
     )
     assert detect(binary).name == "flatport"
-    assert read_colmap(binary, Reading(camera="1")).cameras["1"].n_water == 1.33
-    assert read_colmap(binary, Reading(camera="2")).cameras["2"] == dry
+    assert read_colmap(binary, ReadOptions(camera="1")).cameras["1"].n_water == 1.33
+    assert read_colmap(binary, ReadOptions(camera="2")).cameras["2"] == dry
 
 
 def test_an_index_of_air_divides_the_others(tmp_path: Path) -> None:
     path = tmp_path / "cameras.txt"
     path.write_text("1 PINHOLE 9 8 5 6 4 3 FLATPORT 0 0 1 0.02 0.01 1.25 1.5 1.5\n")
-    camera = read_colmap(path, Reading()).cameras["1"]
+    camera = read_colmap(path, ReadOptions()).cameras["1"]
     assert (camera.n_glass, camera.n_water) == (1.2, 1.2)
 
 
@@ -305,4 +305,4 @@ def test_faults_of_a_rig_configuration_name_the_key(tmp_path: Path) -> None:
 def test_a_size_that_no_picture_has_is_refused(tmp_path: Path, size: str) -> None:
     (tmp_path / "cameras.txt").write_text(f"1 PINHOLE {size} 480 500 500 320 240\n")
     with pytest.raises(CalibrationError, match=r"cameras\.txt"):
-        read_colmap(tmp_path / "cameras.txt", Reading())
+        read_colmap(tmp_path / "cameras.txt", ReadOptions())

@@ -14,10 +14,9 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.errors import AliceError, CalibrationError
 from alice_survey.cli.main import main
-from camera_calib.formats.convert import convert_files
-from camera_calib.formats.in_water import in_water
+from camera_calib.formats.convert import Conversion, convert, in_water
 from camera_calib.formats.registry import FORMATS, detect
-from camera_calib.formats.rigs import only, renamed, with_port
+from camera_calib.formats.rigs import ReadOptions, only, renamed, with_port
 from camera_calib.rig import Rig, design_rig, read_rig, write_rig
 from tests.strategies_formats import assert_same_geometry, covariance_of
 
@@ -38,6 +37,22 @@ CHANNELS = {
     "kalibr": "c.yaml",
     "ros": "r",
 }
+
+
+def convert_files(
+    source: Path,
+    target: Path,
+    *,
+    image_size: tuple[int, int] | None = None,
+    extrinsics: Path | None = None,
+    unit_m: float = 1.0,
+    camera: str | None = None,
+    **options: Any,
+) -> tuple[str, dict[str, Any]]:
+    reading = ReadOptions(
+        image_size=image_size, extrinsics=extrinsics, metres_per_unit=unit_m, camera=camera
+    )
+    return convert(Conversion(source=source, target=target, reading=reading, **options))
 
 
 @pytest.fixture
@@ -201,13 +216,13 @@ def test_one_camera_of_a_rig_keeps_its_place_on_the_vehicle(own: Path, tmp_path:
 
 
 def test_names_can_be_chosen(own: Path, tmp_path: Path) -> None:
-    convert_files(own, tmp_path / "new.json", names="port,starboard")
+    convert_files(own, tmp_path / "new.json", names=("port", "starboard"))
     rig = read_rig(tmp_path / "new.json")
     assert list(rig.cameras) == ["port", "starboard"]
     assert rig.covariance is not None
     assert "starboard.x_m" in rig.covariance.parameters
     for names in ("a", "a,a", "a,../b", "a,b c"):
-        assert "--names" in refused(own, tmp_path / "other.json", names=names)
+        assert "--names" in refused(own, tmp_path / "other.json", names=tuple(names.split(",")))
     assert renamed(rig, ["left", "right"]).sigmas == FULL.sigmas
 
 
@@ -230,7 +245,7 @@ def test_the_mount_of_foreign_cameras_is_said_to_be_unknown(
 ) -> None:
     FORMATS["ros"].write(tmp_path / "pair", IN_AIR)
     convert_files(tmp_path / "pair", tmp_path / "rig.json")
-    assert "tells no pose on the vehicle" in capsys.readouterr().err
+    assert "states no pose on the vehicle" in capsys.readouterr().err
     rig = read_rig(tmp_path / "rig.json")
     np.testing.assert_allclose(rig.body_from_rig.translation, 0.0)
     np.testing.assert_allclose(rig.body_from_rig.apply([0.0, 0.0, 1.0]), [0, 0, 1], atol=1e-15)
@@ -328,9 +343,9 @@ def test_the_command_converts_and_names_faults(
 
 
 def _reading() -> Any:
-    from camera_calib.formats.rigs import Reading
+    from camera_calib.formats.rigs import ReadOptions
 
-    return Reading()
+    return ReadOptions()
 
 
 def _wet(name: str) -> Rig:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.errors import CalibrationError
 from camera_calib.formats.kalibr import read_kalibr, write_kalibr
 from camera_calib.formats.registry import detect
-from camera_calib.formats.rigs import Reading
+from camera_calib.formats.rigs import ReadOptions
 from camera_calib.rig import Rig
 from tests.strategies_formats import POINTS_RIG, RADTAN, rigs
 
@@ -61,7 +61,7 @@ cam2:
 def fault(path: Path, text: str) -> str:
     path.write_text(text, encoding="utf-8")
     with pytest.raises(CalibrationError) as error:
-        read_kalibr(path, Reading())
+        read_kalibr(path, ReadOptions())
     shown = str(error.value)
     assert str(path) in shown
     assert "\n" not in shown
@@ -105,7 +105,7 @@ def test_an_example_like_that_of_the_wiki_is_read(
     path = tmp_path / "camchain.yaml"
     path.write_text(EXAMPLE)
     assert detect(path).name == "kalibr"
-    rig = read_kalibr(path, Reading())
+    rig = read_kalibr(path, ReadOptions())
 
     assert list(rig.cameras) == ["cam0", "stereo_cam1", "cam2"]
     first = rig.cameras["cam0"]
@@ -126,7 +126,7 @@ def test_an_example_like_that_of_the_wiki_is_read(
 def test_rounded_rotations_are_made_rotations(tmp_path: Path) -> None:
     path = tmp_path / "camchain.yaml"
     path.write_text(EXAMPLE.replace("[1.0, 0.0, 0.0, 0.0]", "[0.9999, 0.0, 0.0, 0.0]"))
-    pose = read_kalibr(path, Reading()).cam_from_rig["cam2"]
+    pose = read_kalibr(path, ReadOptions()).cam_from_rig["cam2"]
     assert isinstance(pose, RigidTransform)
     np.testing.assert_allclose(np.linalg.det(pose.rotation.as_matrix()), 1.0, atol=1e-14)
 
@@ -144,7 +144,7 @@ def test_faults_name_file_and_key(tmp_path: Path) -> None:
         "cam0.resolution": fault(path, EXAMPLE.replace("[752, 480]", "[752]", 1)),
         "width": fault(path, EXAMPLE.replace("[752, 480]", "[752.5, 480]", 1)),
         "lacks cam1.T_cn_cnm1": fault(path, EXAMPLE.replace("T_cn_cnm1", "T_c1_c0", 1)),
-        "cam1.T_cn_cnm1 is no rotation": fault(path, EXAMPLE.replace("[0.0, -1.0", "[0.0, 1.0")),
+        "cam1.T_cn_cnm1 is not a rotation": fault(path, EXAMPLE.replace("[0.0, -1.0", "[0.0, 1.0")),
         "row 0 0 0 1": fault(
             path, EXAMPLE.replace("1.0]\n  rostopic: /s", "2.0]\n  rostopic: /s")
         ),

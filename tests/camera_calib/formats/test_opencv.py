@@ -13,7 +13,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.errors import CalibrationError
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.formats.opencv import read_opencv, write_opencv
-from camera_calib.formats.rigs import Reading
+from camera_calib.formats.rigs import ReadOptions
 from camera_calib.rig import Rig
 from tests.strategies_formats import POINTS_RIG, rigs
 
@@ -41,9 +41,9 @@ def write(path: Path, text: str) -> Path:
     return path
 
 
-def fault(path: Path, text: str, reading: Reading | None = None) -> str:
+def fault(path: Path, text: str, reading: ReadOptions | None = None) -> str:
     with pytest.raises(CalibrationError) as error:
-        read_opencv(write(path, text), reading or Reading())
+        read_opencv(write(path, text), reading or ReadOptions())
     shown = str(error.value)
     assert str(path) in shown
     assert "\n" not in shown
@@ -92,7 +92,7 @@ def test_the_half_pixel_is_taken_once(tmp_path: Path) -> None:
 
 def test_opencvs_sample_calibration_of_one_camera_is_read(shared_data: Path) -> None:
     path = shared_data / "opencv_stereo" / "left_intrinsics.yml"
-    (camera,) = read_opencv(path, Reading()).cameras.values()
+    (camera,) = read_opencv(path, ReadOptions()).cameras.values()
 
     assert (camera.width_px, camera.height_px) == (640, 480)
     assert camera.fx_px == camera.fy_px == 535.91573396163199
@@ -104,16 +104,18 @@ def test_opencvs_sample_calibration_of_one_camera_is_read(shared_data: Path) -> 
 def test_opencvs_sample_of_a_pair_asks_for_what_it_lacks(shared_data: Path, tmp_path: Path) -> None:
     path = shared_data / "opencv_stereo" / "intrinsics.yml"
     with pytest.raises(CalibrationError, match="--image-size"):
-        read_opencv(path, Reading())
+        read_opencv(path, ReadOptions())
     with pytest.raises(CalibrationError, match=r"lacks R and T.*--extrinsics"):
-        read_opencv(path, Reading(image_size=(640, 480)))
+        read_opencv(path, ReadOptions(image_size=(640, 480)))
 
     pose = write(
         tmp_path / "extrinsics.yml",
         f"%YAML:1.0\n---\nR: {MATRIX}[ 1., 0., 0., 0., 1., 0., 0., 0., 1. ]\n"
         "T: !!opencv-matrix\n   rows: 3\n   cols: 1\n   dt: d\n   data: [ -3.33, 0., 0. ]\n",
     )
-    rig = read_opencv(path, Reading(image_size=(640, 480), extrinsics=pose, metres_per_unit=0.025))
+    rig = read_opencv(
+        path, ReadOptions(image_size=(640, 480), extrinsics=pose, metres_per_unit=0.025)
+    )
     assert rig.baseline_m == pytest.approx(3.33 * 0.025, abs=1e-15)
     assert list(rig.cameras) == ["left", "right"]
     assert rig.cameras["right"].k1 == -0.16916358306948096
@@ -122,7 +124,7 @@ def test_opencvs_sample_of_a_pair_asks_for_what_it_lacks(shared_data: Path, tmp_
 def test_a_list_of_pictures_is_no_calibration(shared_data: Path) -> None:
     path = shared_data / "opencv_stereo" / "stereo_calib.xml"
     with pytest.raises(CalibrationError, match=r"stereo_calib\.xml: lacks camera_matrix"):
-        read_opencv(path, Reading())
+        read_opencv(path, ReadOptions())
 
 
 @pytest.mark.parametrize(
@@ -130,7 +132,7 @@ def test_a_list_of_pictures_is_no_calibration(shared_data: Path) -> None:
 )
 def test_other_common_keys_are_understood(tmp_path: Path, matrix: str, k: str) -> None:
     text = GOOD.replace("camera_matrix", matrix) + f"{k}: [ -0.1, 0.02, 0.001, -0.002 ]\n"
-    (camera,) = read_opencv(write(tmp_path / "a.yml", text), Reading()).cameras.values()
+    (camera,) = read_opencv(write(tmp_path / "a.yml", text), ReadOptions()).cameras.values()
     assert (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px) == (530, 531, 320, 240)
     assert (camera.k1, camera.k2, camera.p1, camera.p2) == (-0.1, 0.02, 0.001, -0.002)
 
@@ -138,7 +140,7 @@ def test_other_common_keys_are_understood(tmp_path: Path, matrix: str, k: str) -
 def test_a_tilted_sensor_is_refused_and_a_level_one_read(tmp_path: Path) -> None:
     coefficients = "distortion_coefficients: [" + ", ".join(["0.001"] * 12)
     level = write(tmp_path / "a.yml", GOOD + coefficients + ", 0., 0. ]\n")
-    (camera,) = read_opencv(level, Reading()).cameras.values()
+    (camera,) = read_opencv(level, ReadOptions()).cameras.values()
     assert (camera.k6, camera.s4) == (0.001, 0.001)
     shown = fault(tmp_path / "b.yml", GOOD + coefficients + ", 0.01, 0. ]\n")
     assert "distortion_coefficients" in shown
@@ -165,7 +167,7 @@ def test_faults_name_file_and_key(tmp_path: Path) -> None:
             path, GOOD + "port:\n   normal: [ 0., 0., 1. ]\n   port_distance_m: 0.02\n"
             "   glass_thickness_m: 0.01\n   n_glass: 1.5\n   n_water: many\n",
         ),
-        "is no rotation": fault(
+        "is not a rotation": fault(
             path,
             GOOD.replace("camera_matrix", "M1") + f"M2: {MATRIX}{matrix}\n"
             f"R: {MATRIX}[ 1., 0., 0., 0., 2., 0., 0., 0., 1. ]\nT: [ 1., 0., 0. ]\n",
@@ -199,7 +201,7 @@ def test_no_entity_of_xml_is_ever_seen_by_the_parser(
     assert "1 MiB" in fault(tmp_path / "long.yml", "#" * (1 << 20) + "\n")
     (tmp_path / "wide.xml").write_bytes('<?xml version="1.0"?><!DOCTYPE a>'.encode("utf-16"))
     with pytest.raises(CalibrationError, match="UTF-8"):
-        read_opencv(tmp_path / "wide.xml", Reading())
+        read_opencv(tmp_path / "wide.xml", ReadOptions())
 
 
 def test_three_cameras_are_too_many(tmp_path: Path) -> None:

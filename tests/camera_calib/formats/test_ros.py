@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.errors import CalibrationError
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.formats.registry import detect
-from camera_calib.formats.rigs import Reading
+from camera_calib.formats.rigs import ReadOptions
 from camera_calib.formats.ros import read_ros, write_ros
 from camera_calib.rig import Rig
 from tests.strategies_formats import POINTS_RIG, RATIONAL, assert_same_geometry, rigs
@@ -59,7 +59,7 @@ def fault(path: Path, text: str | None = None) -> str:
     if text is not None:
         path.write_text(text, encoding="utf-8")
     with pytest.raises(CalibrationError) as error:
-        read_ros(path, Reading())
+        read_ros(path, ReadOptions())
     shown = str(error.value)
     assert str(path) in shown
     assert "\n" not in shown
@@ -130,7 +130,7 @@ def test_a_pair_that_is_nearly_rectified_comes_back_exactly(
     pose = RigidTransform.from_components(shift, Rotation.from_rotvec([small, -small, 2 * small]))
     rig = replace(PAIR, cam_from_rig={"left": RigidTransform.identity(), "right": pose})
     write_ros(tmp_path / "pair", rig)
-    after = read_ros(tmp_path / "pair", Reading()).cam_from_rig["right"]
+    after = read_ros(tmp_path / "pair", ReadOptions()).cam_from_rig["right"]
     np.testing.assert_allclose(after.as_matrix(), pose.as_matrix(), atol=1e-15)
 
 
@@ -152,7 +152,7 @@ def test_the_sample_of_the_wiki_is_read(tmp_path: Path) -> None:
     path = tmp_path / "prosilica.yaml"
     path.write_text(SAMPLE)
     assert detect(path).name == "ros"
-    rig = read_ros(path, Reading())
+    rig = read_ros(path, ReadOptions())
     camera = rig.cameras["prosilica"]
     assert (camera.width_px, camera.height_px) == (2448, 2050)
     assert (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px) == (
@@ -166,7 +166,7 @@ def test_the_reference_is_the_camera_without_baseline(tmp_path: Path) -> None:
     folder = tmp_path / "pair"
     write_ros(folder, PAIR)
     (folder / "left.yaml").rename(folder / "z.yaml")
-    rig = read_ros(folder, Reading())
+    rig = read_ros(folder, ReadOptions())
     assert rig.reference == "left"
     assert_same_geometry(rig, PAIR)
 
@@ -175,7 +175,7 @@ def test_half_a_pair_says_that_the_other_half_is_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_ros(tmp_path / "pair", PAIR)
-    rig = read_ros(tmp_path / "pair" / "right.yaml", Reading())
+    rig = read_ros(tmp_path / "pair" / "right.yaml", ReadOptions())
     assert rig.cameras["right"].k1 == -0.1
     assert "baseline left out" in capsys.readouterr().err
 
@@ -214,7 +214,7 @@ def test_faults_name_file_and_key(tmp_path: Path) -> None:
             path, SAMPLE.replace("4827.94, 0,", "4827.94, 1,", 1)
         ),
         "camera name 'a b'": fault(path, SAMPLE.replace("prosilica", "a b")),
-        "projection_matrix is no 3 x 4": fault(path, SAMPLE.replace("cols: 4", "cols: 3")),
+        "projection_matrix is not a 3 x 4": fault(path, SAMPLE.replace("cols: 4", "cols: 3")),
     }  # fmt: skip
     for words, shown in faults.items():
         assert words in shown
@@ -230,5 +230,5 @@ def test_faults_name_file_and_key(tmp_path: Path) -> None:
     (folder / "b.yaml").write_text(
         moved.replace("prosilica", "other").replace("[1, 0, 0, 0, 1", "[1, 0, 0, 0, 3")
     )
-    with pytest.raises(CalibrationError, match=r"b\.yaml: rectification_matrix is no rotation"):
-        read_ros(folder, Reading())
+    with pytest.raises(CalibrationError, match=r"b\.yaml: rectification_matrix is not a rotation"):
+        read_ros(folder, ReadOptions())

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from camera_calib.formats.convert import Conversion, convert
 from camera_calib.formats.registry import FORMATS, detect
-from camera_calib.formats.rigs import Reading
+from camera_calib.formats.rigs import ReadOptions
 from camera_calib.rig import Rig, read_rig, write_rig
 from tests.strategies_formats import (
     EVERY,
@@ -57,7 +57,7 @@ def test_a_rig_comes_back_through_a_format_found_by_itself(case: str) -> None:
             target = target_of(Path(folder), name, rig)
             FORMATS[kind].write(target, rig)
             assert detect(target).name == kind
-            after = detect(target).read(target, Reading())
+            after = detect(target).read(target, ReadOptions())
         assert_same_geometry(after, rig)
 
     comes_back()

@@ -11,11 +11,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.errors import ConfigError
 from camera_calib.flat_port import FlatPortCamera
+from camera_calib.fov.focus import apparent_distance_m
 from camera_calib.fov.table import (
     MATCH_SIGMA_PX,
     FovChoices,
     FovRow,
-    apparent_distance_m,
     blur_table,
     fov_table,
     rig_fov_table,

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from pypdf import PdfReader
 
 from alice_survey.base.errors import CalibrationError
 from camera_calib.targets.detect import detect
@@ -34,20 +35,23 @@ def painted(rectangles_mm: np.ndarray, page_mm: tuple[float, float], dpi: float)
 
 def read_pdf(path: Path) -> tuple[np.ndarray, tuple[float, float], str]:
     """Filled rectangles in mm from the top left, the page in mm, and the words."""
-    file = path.read_bytes()
-    start = int(re.search(rb"startxref\n(\d+)\n%%EOF\n$", file)[1])
-    head = re.match(rb"xref\n0 (\d+)\n0000000000 65535 f \n", file[start:])
-    entries = file[start + head.end() :].split(b"\n")[: int(head[1]) - 1]
-    for number, entry in enumerate(entries, start=1):
-        assert file[int(entry[:10]) :].startswith(b"%d 0 obj\n" % number)
-    box = [float(v) for v in re.search(rb"/MediaBox \[([^\]]*)\]", file)[1].split()]
-    length, stream = re.search(rb"/Length (\d+) >>\nstream\n(.*)endstream", file, re.S).groups()
-    assert int(length) == len(stream)
-    boxes = re.findall(rb"^([\d. ]+) re$", stream, re.M)
-    x, y, w, h = np.array([[float(v) for v in line.split()] for line in boxes]).T
-    rectangles = np.column_stack([x, box[3] - y - h, x + w, box[3] - y]) * MM_PER_POINT
-    words = re.search(rb"\((.*)\) Tj", stream)[1].decode()
-    return rectangles, (box[2] * MM_PER_POINT, box[3] * MM_PER_POINT), words
+    reader = PdfReader(path, strict=True)
+    (page,) = reader.pages
+    assert reader.viewer_preferences.print_scaling == "/None"
+    rectangles, at = [], []
+
+    def visit(operator: bytes, operands: list, matrix: list, _: object) -> None:
+        if operator == b"re":
+            rectangles.append([float(value) for value in operands])
+            at.append([float(value) for value in matrix])
+
+    words = page.extract_text(visitor_operand_before=visit).strip()
+    assert np.allclose(at, [1, 0, 0, 1, 0, 0])
+    assert page["/Resources"]["/Font"]["/F1"]["/BaseFont"] == "/Helvetica"
+    width, height = float(page.mediabox.width), float(page.mediabox.height)
+    x, y, w, h = np.array(rectangles).T
+    boxes = np.column_stack([x, height - y - h, x + w, height - y]) * MM_PER_POINT
+    return boxes, (width * MM_PER_POINT, height * MM_PER_POINT), words
 
 
 def read_svg(path: Path) -> tuple[np.ndarray, tuple[float, float], str]:

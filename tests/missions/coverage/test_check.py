@@ -1,4 +1,5 @@
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,11 +13,12 @@ from alice_survey.base.artefacts import Stage, run_stage, write_json
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import NavigationError, PlanError, WorkspaceError
 from camera_calib.rig import design_rig
-from missions.coverage.certificate import certificate
-from missions.coverage.holes import find_holes
+from missions.coverage.certificate import Certificate, certificate
+from missions.coverage.holes import Hole, find_holes
 from missions.coverage.stations import Stations, plan_pattern, stations_of_plan
 from missions.fly.check import check_report
 from missions.fly.refly import refly_plan
+from missions.route.energy import usable_wh, vehicle_costs
 from missions.route.ways import Ways
 from missions.values.line import Line
 from missions.values.navigation import write_navigation
@@ -26,6 +28,15 @@ from tests.oracles_coverage import DATUM, area_of, lawnmower, plan_of
 
 CONFIG = SurveyConfig()
 RIG = design_rig(CONFIG.camera, CONFIG.water)
+
+
+def refly(plan: Plan, flown: Certificate, holes: Sequence[Hole]) -> Plan:
+    return refly_plan(
+        plan, RIG, flown, holes,
+        costs=vehicle_costs(CONFIG), settings=CONFIG.plan, usable_wh=usable_wh(CONFIG.vehicle),
+    )  # fmt: skip
+
+
 MISSING = 3
 
 
@@ -145,12 +156,12 @@ def test_holes_by_a_no_go_zone_and_of_several_lines_are_closed() -> None:
     holes = find_holes(first)
     assert len(holes) == 2
 
-    again = refly_plan(plan, CONFIG, RIG, first, holes)
+    again = refly(plan, first, holes)
 
     both = certificate(plan.area, RIG, flown.and_then(stations_of_plan(again)), pattern)
     assert both.share_at_overlap >= 0.9995
     with pytest.raises(PlanError, match="no hole"):
-        refly_plan(plan, CONFIG, RIG, first, ())
+        refly(plan, first, ())
 
 
 def test_a_complete_dive_leaves_no_plan(tmp_path: Path) -> None:

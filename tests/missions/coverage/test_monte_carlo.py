@@ -6,9 +6,11 @@ import shapely
 
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import PlanError
+from alice_survey.base.executor import SERIAL
 from alice_survey.vehicle.floor import level_floor
 from camera_calib.rig import design_rig
 from missions.fly.monte_carlo import monte_carlo
+from missions.fly.simulation import flight_settings
 from missions.route.turns import route_through
 from missions.values.plan_file import Plan
 from tests.oracles_coverage import area_of, lawnmower, plan_of
@@ -42,7 +44,15 @@ def test_without_disturbance_flights_see_what_the_plan_sees() -> None:
     """Lines too far apart, so that there are holes to find again where the plan has them."""
     plan = flyable(1.6)
 
-    result = monte_carlo(plan, STILL, RIG, level_floor(DEPTH_M), flights=2, threads=1)
+    result = monte_carlo(
+        plan,
+        flight_settings(STILL),
+        RIG,
+        level_floor(DEPTH_M),
+        seed=STILL.seed,
+        flights=2,
+        executor=SERIAL,
+    )
 
     planned = result.planned
     assert result.endings == {"complete": 2}
@@ -60,8 +70,24 @@ def test_without_disturbance_flights_see_what_the_plan_sees() -> None:
 
 def test_a_rough_sea_leaves_holes_that_move_and_a_seed_gives_them_again() -> None:
     plan = flyable(1.0)
-    first = monte_carlo(plan, ROUGH, RIG, level_floor(DEPTH_M), flights=3, threads=1)
-    again = monte_carlo(plan, ROUGH, RIG, level_floor(DEPTH_M), flights=3, threads=1)
+    first = monte_carlo(
+        plan,
+        flight_settings(ROUGH),
+        RIG,
+        level_floor(DEPTH_M),
+        seed=ROUGH.seed,
+        flights=3,
+        executor=SERIAL,
+    )
+    again = monte_carlo(
+        plan,
+        flight_settings(ROUGH),
+        RIG,
+        level_floor(DEPTH_M),
+        seed=ROUGH.seed,
+        flights=3,
+        executor=SERIAL,
+    )
 
     assert first.planned.share_at_overlap == 1.0
     assert first.share_at_overlap.max() < 1.0
@@ -76,4 +102,12 @@ def test_a_rough_sea_leaves_holes_that_move_and_a_seed_gives_them_again() -> Non
 
 def test_no_flight_is_no_answer() -> None:
     with pytest.raises(PlanError, match="0 flights: choose 1 or more"):
-        monte_carlo(flyable(1.0), STILL, RIG, level_floor(DEPTH_M), flights=0, threads=1)
+        monte_carlo(
+            flyable(1.0),
+            flight_settings(STILL),
+            RIG,
+            level_floor(DEPTH_M),
+            seed=STILL.seed,
+            flights=0,
+            executor=SERIAL,
+        )

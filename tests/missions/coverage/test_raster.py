@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from shapely.geometry import Polygon
 
 from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.base.executor import local_executor
 from camera_calib.rig import design_rig
 from missions.coverage import certificate as module
 from missions.coverage.certificate import certificate
@@ -125,7 +126,7 @@ def test_tiles_chunks_and_threads_change_nothing(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(module, "_TILE", 17)
     monkeypatch.setattr(module, "_CHUNK", 7)
 
-    tiled = certificate(area, RIG, stations, ASKED, cell_m=0.11, threads=2)
+    tiled = certificate(area, RIG, stations, ASKED, cell_m=0.11, executor=local_executor(2))
 
     for name in ("pictures", "least_pictures", "least_lines", "pairs"):
         within = whole.inside

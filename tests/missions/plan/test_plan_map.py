@@ -15,6 +15,7 @@ from shapely.geometry import MultiPolygon
 
 from alice_survey.base.config import SeaConfig, parse_config
 from alice_survey.base.errors import PlanError
+from alice_survey.base.executor import SERIAL
 from alice_survey.stages import spec
 from missions.plan.map import draw_plan
 from missions.plan.redraw import map_report
@@ -116,7 +117,7 @@ def test_an_unknown_suffix_is_refused(tmp_path: Path) -> None:
 )
 def test_a_finished_plan_is_drawn_anew_for_print(tmp_path: Path, suffix: str, start: bytes) -> None:
     config = parse_config({"area": {"length_m": 4.0, "width_m": 3.0}}, "test")
-    spec("plan").make(tmp_path, config, 1)
+    spec("plan").make(tmp_path, config, SERIAL)
     plan = tmp_path / "plan" / "plan.json"
     drawn = [tmp_path / name / f"map{suffix}" for name in "ab"]
     for out in drawn:

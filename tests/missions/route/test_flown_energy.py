@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from alice_survey.base.config import SurveyConfig
-from alice_survey.vehicle import signals
 from alice_survey.vehicle.floor import level_floor
-from alice_survey.vehicle.pilot.memory import LEG, PHASE
+from alice_survey.vehicle.pilot.memory import FOLLOW, LEG, PHASE
 from camera_calib.rig import design_rig
-from missions.fly.simulation import simulate_plan
+from missions.fly.simulation import flight_settings, simulate_plan
 from missions.plan.planner import plan_survey
 from missions.plan.strength import survey_costs
 from missions.route.cost import leg_costs
@@ -35,7 +34,9 @@ CONFIG = SurveyConfig.model_validate(
 @lru_cache
 def _flown() -> tuple[Plan, Flight]:
     plan = plan_survey(CONFIG, design_rig(CONFIG.camera, CONFIG.water)).plan
-    return plan, simulate_plan(plan, CONFIG, level_floor(6.0), np.random.default_rng(1))
+    return plan, simulate_plan(
+        plan, flight_settings(CONFIG), level_floor(6.0), np.random.default_rng(1)
+    )
 
 
 def test_lines_take_the_power_that_the_plan_counts_on() -> None:
@@ -58,7 +59,7 @@ def test_arcs_take_the_energy_that_the_plan_counts_on() -> None:
     (dive,) = plan.dives
     legs_j, legs_s = leg_costs(dive.route, survey_costs(CONFIG))
     report, power_w = flight.flown.report, flight.flown.power_w.sum(axis=1)
-    following = report[:, PHASE] == signals.FOLLOW
+    following = report[:, PHASE] == FOLLOW
     planned_j = flown_j = 0.0
     for index, leg in enumerate(dive.route.legs):
         if leg.curvature_per_m:

@@ -9,7 +9,7 @@ from rasterio.transform import from_origin
 from scipy.spatial.transform import RigidTransform
 from shapely.geometry import MultiPolygon, box
 
-from alice_survey.base.config import SeafloorConfig, SurveyConfig
+from alice_survey.base.config import SeafloorConfig
 from alice_survey.seafloor.terrain import Terrain, build_terrain
 from alice_survey.seafloor.texture import Texture, survey_texture
 from reconstruct.evaluate.figures import compare_lengths
@@ -25,7 +25,7 @@ STILL = RigidTransform.identity()
 def floor() -> tuple[Terrain, Texture]:
     config = SeafloorConfig(relief_m=0.1, grid_m=0.02, rocks_per_m2=0.0, amphora=False)
     terrain = build_terrain(config, (-1.0, 3.0, -1.0, 3.0), 10.0, np.random.default_rng(1))
-    return terrain, survey_texture(SurveyConfig())
+    return terrain, survey_texture(1)
 
 
 def write(

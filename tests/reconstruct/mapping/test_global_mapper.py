@@ -6,6 +6,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.base.executor import local_executor
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped, faults_of, map_calibrated
 from reconstruct.mapping.pose_graph import average_poses, station_groups
@@ -36,7 +37,7 @@ def mapped_by(scene: Scene, method: str, threads: int = 1) -> Mapped:
             Path(folder),
             1,
             method=method,  # type: ignore[arg-type]
-            threads=threads,
+            executor=local_executor(threads),
         )
 
 

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from alice_survey.base.errors import ReconstructionError
+from alice_survey.base.executor import SERIAL
 from reconstruct.mapping.working_range import find_distances, ray_passes
 from reconstruct.matching.features import Features, save_features
 from tests.reconstruct.scenes import ALTITUDE_M, Scene, make_scene
@@ -28,7 +29,9 @@ def features_of(scene: Scene, folder: Path) -> list[Path]:
 def test_stereo_matches_tell_the_distance(tmp_path: Path) -> None:
     scene = make_scene(lines=1, stations=4, points=2500, noise_px=0.2)
     paths = features_of(scene, tmp_path)
-    found = find_distances(scene.records, paths, scene.rig, given_m=None, ratio=0.8, threads=1)
+    found = find_distances(
+        scene.records, paths, scene.rig, given_m=None, ratio=0.8, executor=SERIAL
+    )
     depths = np.concatenate(
         [
             pose.inv().apply(scene.points_ned[ids])[:, 2]
@@ -45,14 +48,25 @@ def test_a_given_range_and_the_altitude_stand_in(tmp_path: Path) -> None:
     scene = make_scene(lines=1, stations=2, points=10)
     paths = features_of(scene, tmp_path)
     arguments = (scene.records, paths, scene.rig)
-    given = find_distances(*arguments, given_m=3.0, ratio=0.8, threads=1)
+    given = find_distances(*arguments, given_m=3.0, ratio=0.8, executor=SERIAL)
     assert 2 / (1 / given.near_m + 1 / given.far_m) == pytest.approx(3.0)
-    measured = find_distances(*arguments, given_m=None, ratio=0.8, threads=1)
+    measured = find_distances(*arguments, given_m=None, ratio=0.8, executor=SERIAL)
     assert measured.source == "altitude"
     assert 2 / (1 / measured.near_m + 1 / measured.far_m) == pytest.approx(ALTITUDE_M + 0.03)
     blind = [replace(r, altitude_m=np.nan) for r in scene.records]
     with pytest.raises(ReconstructionError, match="set working_range_m"):
-        find_distances(blind, paths, scene.rig, given_m=None, ratio=0.8, threads=1)
+        find_distances(blind, paths, scene.rig, given_m=None, ratio=0.8, executor=SERIAL)
+
+
+def test_cameras_without_refraction_need_no_distance(tmp_path: Path) -> None:
+    scene = make_scene(lines=1, stations=2, points=10)
+    paths = features_of(scene, tmp_path)
+    blind = [replace(r, altitude_m=np.nan) for r in scene.records]
+    bare = {"port_distance_m": 0.0, "glass_thickness_m": 0.0, "n_water": 1.0}
+    cameras = {name: replace(camera, **bare) for name, camera in scene.rig.cameras.items()}
+    rig = replace(scene.rig, cameras=cameras)
+    found = find_distances(blind, paths, rig, given_m=None, ratio=0.8, threads=1)
+    assert 0 < found.near_m < found.far_m and found.source == "no refraction"
 
 
 def test_rays_pass_where_they_were_built_to() -> None:

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from alice_survey.base.executor import local_executor
 from reconstruct.matching.features import Features, save_features
 from reconstruct.matching.refinement import (
     affine_from_neighbours,
@@ -160,7 +161,9 @@ def test_tracks_mean_one_spot_in_all_pictures(tmp_path: Path, threads: int) -> N
         )
         np.save(greys[k], texture.picture(affine, shift, noise=1.0))
     same = np.repeat(np.arange(50, dtype=np.uint32)[:, None], 2, axis=1)
-    found = refine_tracks(features, greys, [(0, 1, same), (1, 2, same)], threads=threads)
+    found = refine_tracks(
+        features, greys, [(0, 1, same), (1, 2, same)], executor=local_executor(threads)
+    )
     assert found.tracked == 100
     assert found.moved >= 95
     spot = [

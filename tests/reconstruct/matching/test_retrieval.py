@@ -2,6 +2,7 @@ from pathlib import Path
 
 import numpy as np
 
+from alice_survey.base.executor import SERIAL
 from reconstruct.matching.features import Features, save_features
 from reconstruct.matching.retrieval import _WordsTask, alike_pairs, describe, make_codebook
 from tests.oracles_matching import vlad_slowly
@@ -29,19 +30,19 @@ def strip(folder: Path, pictures: int = 40, shared: int = 60) -> list[Path]:
 
 def test_neighbours_look_most_alike(tmp_path: Path) -> None:
     files = strip(tmp_path)
-    found = alike_pairs(files, range(len(files)), 2, seed=3, threads=1)
+    found = alike_pairs(files, range(len(files)), 2, seed=3, executor=SERIAL)
     beside = {(i, i + 1) for i in range(len(files) - 1)}
     assert len(beside & set(found)) >= 0.9 * len(beside)
     assert len(found) <= 2 * len(files)
-    assert found == alike_pairs(files, range(len(files)), 2, seed=3, threads=1)
+    assert found == alike_pairs(files, range(len(files)), 2, seed=3, executor=SERIAL)
 
 
 def test_partners_are_sought_for_those_that_need_them(tmp_path: Path) -> None:
     files = strip(tmp_path, pictures=12)
-    found = alike_pairs(files, [5], 3, seed=3, threads=1)
+    found = alike_pairs(files, [5], 3, seed=3, executor=SERIAL)
     assert len(found) == 3
     assert all(5 in pair for pair in found)
-    assert alike_pairs(files, [], 3, seed=3, threads=1) == []
+    assert alike_pairs(files, [], 3, seed=3, executor=SERIAL) == []
 
 
 def test_vectors_equal_those_of_the_slow_twin(tmp_path: Path) -> None:

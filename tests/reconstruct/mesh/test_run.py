@@ -8,6 +8,7 @@ import trimesh
 
 from alice_survey.base.artefacts import read_json, write_json
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
+from alice_survey.base.executor import SERIAL
 from alice_survey.stages import spec
 from reconstruct.dense.cloud import VERTEX, write_cloud, write_cloud_json
 from reconstruct.light.solve import GRID, LightModel, write_light
@@ -73,8 +74,8 @@ def mesh(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_workspace(folder, sparse_model(views, SCENE), SCENE)
     write_dense(folder, [view.image for view in views])
     settings = SurveyConfig(reconstruct=ReconstructConfig(mesh_error_px=0.1, mesh_page_px=1024))
-    assert spec("mesh").make(folder, settings, 1)
-    assert not spec("mesh").make(folder, settings, 1)
+    assert spec("mesh").make(folder, settings, SERIAL)
+    assert not spec("mesh").make(folder, settings, SERIAL)
     return folder / "mesh"
 
 

@@ -7,11 +7,15 @@ import pytest
 import rasterio
 
 from alice_survey.base.artefacts import read_json, write_csv, write_json
-from alice_survey.base.config import ReconstructConfig, SurveyConfig
+from alice_survey.base.config import CameraConfig, ReconstructConfig, SurveyConfig, WaterConfig
 from alice_survey.base.errors import ReconstructionError
+from alice_survey.base.executor import SERIAL
 from alice_survey.stages import spec
+from camera_calib.rig import design_rig
 from reconstruct.mosaic import run
+from reconstruct.mosaic.run import _dispersion
 from reconstruct.raster import DemGrid, tiled_raster
+from reconstruct.views.lens import flat_port_lens
 from reconstruct.views.model import View
 from tests.oracles_dense import (
     DEPTH_M,
@@ -78,7 +82,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("mosaic")
     views = stereo_views(np.array([-0.2, 0.2, 0.6]), np.array([0.0, 0.05, 0.0]), heading_deg=30.0)
     make_workspace(folder, views, SCENE)
-    assert spec("mosaic").make(folder, CONFIG, 1)
+    assert spec("mosaic").make(folder, CONFIG, SERIAL)
     return folder
 
 
@@ -150,12 +154,12 @@ def test_source_names_the_picture_nearest_to_straight_above(workspace: Path):
 def test_bytes_do_not_change(workspace: Path, tmp_path: Path):
     for name in ("images", "sparse", "dense"):
         (tmp_path / name).symlink_to(workspace / name)
-    assert spec("mosaic").make(tmp_path, CONFIG, 1)
+    assert spec("mosaic").make(tmp_path, CONFIG, SERIAL)
     names = ("mosaic.tif", "mosaic_source.tif", "coverage.tif", "mosaic.png", "mosaic.json")
     for name in (*names, "footprints.csv", "footprints.geojson"):
         same = (tmp_path / "mosaic" / name).read_bytes()
         assert same == (workspace / "mosaic" / name).read_bytes()
-    assert not spec("mosaic").make(tmp_path, CONFIG, 1)
+    assert not spec("mosaic").make(tmp_path, CONFIG, SERIAL)
 
 
 def test_gains_of_pictures_leave_no_seam(tmp_path: Path):
@@ -167,7 +171,7 @@ def test_gains_of_pictures_leave_no_seam(tmp_path: Path):
         path = tmp_path / "images" / view.image
         picture = cv2.imread(str(path)).astype(np.float64) * np.exp(gain)
         cv2.imwrite(str(path), np.rint(picture).astype(np.uint8))
-    assert spec("mosaic").make(tmp_path, EVEN, 1)
+    assert spec("mosaic").make(tmp_path, EVEN, SERIAL)
     rgba, _, _ = read(tmp_path)
     painted = rgba[:3][:, rgba[3] > 0]
     assert np.ptp(np.percentile(painted, [0.5, 99.5])) < 8  # 60 without any correction
@@ -178,7 +182,7 @@ def test_no_picture_over_the_surface_gives_one_line(tmp_path: Path):
     views = stereo_views(np.array([30.0, 30.4]), np.array([0.0, 0.0]))
     make_workspace(tmp_path, views, SCENE)
     with pytest.raises(ReconstructionError, match="no picture sees") as caught:
-        spec("mosaic").make(tmp_path, CONFIG, 1)
+        spec("mosaic").make(tmp_path, CONFIG, SERIAL)
     assert "\n" not in str(caught.value)
 
 
@@ -191,12 +195,25 @@ def small_survey(folder: Path) -> list[View]:
 
 def test_a_single_grey_station_gives_a_grey_mosaic(tmp_path: Path):
     small_survey(tmp_path)
-    assert spec("mosaic").make(tmp_path, EVEN, 1)
+    assert spec("mosaic").make(tmp_path, EVEN, SERIAL)
     rgba, _, _ = read(tmp_path)
     painted = rgba[:3][:, rgba[3] > 0]
     assert painted.shape[1] > 20_000
     assert np.ptp(painted, axis=0).max() <= 1
     assert 60 < np.median(painted) < 200
+
+
+@pytest.mark.parametrize(("n_water", "corrected"), [(1.0, False), (1.34, True)])
+def test_only_refraction_parts_the_colours(tmp_path: Path, n_water: float, corrected: bool):
+    """A camera calibrated in water as a plain pinhole has no dispersion to correct."""
+    camera = design_rig(CameraConfig(), WaterConfig()).cameras["left"]
+    bare = {"port_distance_m": 0.0, "glass_thickness_m": 0.0, "n_water": n_water}
+    lens = flat_port_lens(replace(camera, **bare), 1.5, 2.5)
+    write_json(tmp_path / "sparse" / "cameras.json", {"cameras": {"left": lens.to_json()}})
+    write_json(tmp_path / "images" / "survey.json", {"source": "imported"})
+    model = sparse_model(stereo_views(np.array([0.2]), np.array([0.0]), heading_deg=0.0), SCENE)
+    water, stated = _dispersion(tmp_path, model, CONFIG, grey=False)
+    assert stated["corrected"] is corrected and (water is not None) is corrected
 
 
 def test_what_a_mask_hides_is_not_painted_and_others_fill_it(tmp_path: Path):
@@ -210,7 +227,7 @@ def test_what_a_mask_hides_is_not_painted_and_others_fill_it(tmp_path: Path):
     cv2.imwrite(str(tmp_path / "images" / "fish.png"), mask)
     about["images"][left.image]["mask"] = "fish.png"
     write_json(tmp_path / "sparse" / "cameras.json", about)
-    assert spec("mosaic").make(tmp_path, CONFIG, 1)
+    assert spec("mosaic").make(tmp_path, CONFIG, SERIAL)
     rgba, north, east = read(tmp_path)
     known = rgba[3] > 0
     assert np.abs(rgba[:3][:, known] - 100).max() <= 3
@@ -236,7 +253,7 @@ def test_labels_beyond_65535_stay_apart(
     monkeypatch.setattr(run, "write_tiles", write_all)
     for name in ("images", "sparse", "dense"):
         (tmp_path / name).symlink_to(workspace / name)
-    assert spec("mosaic").make(tmp_path, CONFIG, 1)
+    assert spec("mosaic").make(tmp_path, CONFIG, SERIAL)
     sources = []
     for folder in (workspace, tmp_path):
         with rasterio.open(folder / "mosaic" / "mosaic_source.tif") as raster:

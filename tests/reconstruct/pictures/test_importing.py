@@ -1,6 +1,7 @@
 import csv
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -9,11 +10,14 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from typer.testing import CliRunner
 
 from alice_survey.base.artefacts import read_json
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.errors import AliceError, ImageError, WorkspaceError
+from alice_survey.base.executor import local_executor
 from alice_survey.base.manifest import read_manifest
+from alice_survey.cli.main import app
 from camera_calib.rig import design_rig, read_rig, write_rig
 from reconstruct.pictures.files import inspect
 from reconstruct.pictures.importing import import_images
@@ -67,7 +71,7 @@ def test_pictures_of_one_camera_keep_their_bytes_and_order(tmp_path: Path, draw:
         draw(source / name, number)
     (source / "notes.txt").write_text("no picture")
     (source / ".hidden.jpg").write_bytes(b"x")
-    assert import_images(tmp_path / "w", [source])
+    assert import_images(tmp_path / "w", [source]).changed
     images = tmp_path / "w" / "images"
     records = read_manifest(images / "manifest.csv")
     assert [r.image for r in records] == ["camera/a.png", "camera/b9.jpg", "camera/b10.jpg"]
@@ -78,9 +82,87 @@ def test_pictures_of_one_camera_keep_their_bytes_and_order(tmp_path: Path, draw:
     assert survey["source"] == "imported"
     assert survey["datum"] is None
     assert any("unscaled" in note for note in survey["notes"])
-    assert not import_images(tmp_path / "w", [source])
+    assert not import_images(tmp_path / "w", [source]).changed
     draw(source / "c.jpg", 9)
-    assert import_images(tmp_path / "w", [source])
+    assert import_images(tmp_path / "w", [source]).changed
+
+
+def test_a_divers_folder_is_counted_by_kind_and_reason(
+    tmp_path: Path, draw: Draw, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = tmp_path / "in"
+    for number in range(4):
+        time = f"2024:07:01 12:00:0{number}"
+        draw(source / f"IMG_{number}.JPG", number, time=time, gps=(60.0 + number * 1e-5, 5.0, 0.0))
+    draw(source / "scan.png", 9)
+    (source / "IMG_7.jpg").write_bytes(b"cut")
+    for name in ("IMG_5.HEIC", "IMG_6.heic", "GX010001.MOV", "notes.txt", ".DS_Store"):
+        (source / name).write_bytes(b"x")
+    draw(source / "second" / "IMG_8.jpg", 8)
+    (source / "empty").mkdir()
+
+    found = import_images(tmp_path / "w", [source])
+
+    assert found.changed and found.cameras == {"camera": 5} and found.positions == 4
+    assert found.kinds == {"JPEG": 4, "PNG": 1}
+    assert found.left_out == {
+        "cannot be decoded": 1, "HEIC": 2, "video": 1, "in folders inside": 1, "other files": 1,
+    }  # fmt: skip
+    warnings = [line for line in capsys.readouterr().err.splitlines() if "left out" in line]
+    assert len(warnings) == 5
+    for name in ("IMG_7.jpg", "IMG_5.HEIC", "GX010001.MOV", "second", "notes.txt"):
+        assert sum(name in line for line in warnings) == 1
+    again = import_images(tmp_path / "w", [source])
+    assert not again.changed and replace(again, changed=True) == found
+
+
+def test_the_command_says_what_came_in(tmp_path: Path, draw: Draw) -> None:
+    for number in range(3):
+        draw(tmp_path / "in" / f"{number}.jpg", number)
+    (tmp_path / "in" / "dive.mp4").write_bytes(b"x")
+
+    done = CliRunner().invoke(
+        app, ["import-images", str(tmp_path / "in"), "-w", str(tmp_path / "w")]
+    )
+
+    assert done.exit_code == 0
+    assert "3 pictures (3 JPEG), 0 with a position" in done.stdout
+    assert "left out: 1 video" in done.stdout
+
+
+def test_a_folder_without_pictures_names_what_it_holds(tmp_path: Path, draw: Draw) -> None:
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "a.HEIC").write_bytes(b"x")
+    draw(tmp_path / "in" / "dive1" / "b.jpg")
+    with pytest.raises(ImageError) as caught:
+        import_images(tmp_path / "w", [tmp_path / "in"])
+    assert "1 HEIC" in str(caught.value) and "dive1" in str(caught.value)
+
+
+def test_one_folder_does_not_serve_twice(tmp_path: Path, draw: Draw) -> None:
+    for number in range(3):
+        draw(tmp_path / "in" / f"{number}.jpg", number)
+    (tmp_path / "link").symlink_to(tmp_path / "in")
+    pair = {"left": tmp_path / "in", "right": tmp_path / "link"}
+    with pytest.raises(ImageError, match="--right"):
+        import_images(tmp_path / "w", [], **pair)
+    with pytest.raises(ImageError, match="twice"):
+        import_images(tmp_path / "w", [tmp_path / "in", tmp_path / "in"])
+
+
+def test_masks_and_workspace_in_the_folder_are_not_left_out(
+    tmp_path: Path, draw: Draw, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = tmp_path / "in"
+    for number in range(3):
+        draw(source / f"{number}.png", number)
+    mask = np.full((48, 64), 255, np.uint8)
+    cv2.imwrite(str(source / "1_mask.png"), mask)
+    (source / "masks").mkdir()
+    cv2.imwrite(str(source / "masks" / "2.png"), mask)
+    found = import_images(source / "work", [source], masks=source / "masks")
+    assert found.left_out == {} and "left out" not in capsys.readouterr().err
+    assert not import_images(source / "work", [source], masks=source / "masks").changed
 
 
 def test_stereo_pictures_pair_in_order(tmp_path: Path, draw: Draw) -> None:
@@ -342,7 +424,7 @@ def test_one_or_two_processes_write_the_same(tmp_path: Path, draw: Draw) -> None
     for number in range(4):
         draw(tmp_path / "in" / f"{number}.jpg", number)
     for threads in (1, 2):
-        import_images(tmp_path / f"w{threads}", [tmp_path / "in"], threads=threads)
+        import_images(tmp_path / f"w{threads}", [tmp_path / "in"], executor=local_executor(threads))
     one, two = tmp_path / "w1" / "images", tmp_path / "w2" / "images"
     for file in sorted(p for p in one.rglob("*") if p.is_file() and p.name != "stage.json"):
         assert file.read_bytes() == (two / file.relative_to(one)).read_bytes()

@@ -1,6 +1,7 @@
 """Known points and lengths place, scale and score a model whose truth is known."""
 
 import csv
+import json
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -189,6 +190,8 @@ def test_control_points_alone_place_a_model(tmp_path: Path, stretch: float) -> N
     np.testing.assert_allclose(placed.apply(gauge.points(KNOWN) * stretch), KNOWN, atol=2e-6)
     assert placed.scale == pytest.approx(1.0 / stretch, rel=1e-6)
     assert np.all((fit.sigma_position_m > 5e-4) & (fit.sigma_position_m < 0.006))
+    assert fit.to_json()["rms_north_m"] is None  # no navigation took part
+    json.dumps(fit.to_json(), allow_nan=False)
     score = ties.score(placed, located=True)
     assert (score["rms"]["check"]["points"], score["rms"]["control"]["points"]) == (1, 4)
     assert score["rms"]["check"]["north_m"] < 1e-5

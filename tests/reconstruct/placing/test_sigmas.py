@@ -276,20 +276,22 @@ def test_similarity_of_the_truth_is_found_when_nothing_errs() -> None:
 def test_twenty_flights_are_placed_within_their_sigmas() -> None:
     """The built-in flight simulator, its sensors and its filter, 20 times over one small plan."""
     from alice_survey.base.config import AreaConfig, PlanConfig, SurveyConfig
-    from alice_survey.seafloor.terrain import survey_terrain
     from camera_calib.rig import design_rig
-    from missions.fly.simulation import floor_grid, simulate_plan
+    from missions.fly.simulation import flight_settings, floor_grid, simulate_plan
     from missions.plan.planner import plan_survey
+    from tests.missions.flown_plans import terrain_of
 
     config = SurveyConfig(
         area=AreaConfig(length_m=4.5, width_m=3.7, seafloor_depth_m=15.0),
         plan=PlanConfig(forward_overlap=0.62, side_overlap=0.3, cross_lines=1),
     )
     plan = plan_survey(config, design_rig(config.camera, config.water)).plan
-    floor = floor_grid(survey_terrain(config, plan.area.allowed_corners_ne))
+    floor = floor_grid(terrain_of(config, plan))
     ratios = []
     for seed in range(20):
-        flight_ = simulate_plan(plan, config, floor, np.random.default_rng([seed, 20]), label="")
+        flight_ = simulate_plan(
+            plan, flight_settings(config), floor, np.random.default_rng([seed, 20]), label=""
+        )
         log, time_s = flight_.log, flight_.truth.time_s
         at = np.searchsorted(time_s, flight_.trigger_s).clip(0, len(time_s) - 1)
         body = flight_.truth.ned_from_body[at]

@@ -8,7 +8,11 @@ import pytest
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.fleet import vehicle
-from alice_survey.vehicle.identification.output_error import Fit, Simulation, fit_output_error
+from alice_survey.vehicle.identification.output_error import (
+    OutputErrorFit,
+    Simulation,
+    fit_output_error,
+)
 from alice_survey.vehicle.identification.parameters import free_parameters, unit_of
 from alice_survey.vehicle.identification.windows import make_windows
 from alice_survey.vehicle.log import VehicleLog, vehicle_log
@@ -20,7 +24,7 @@ DAMPING = ("X_uu", "Y_vv", "Z_ww", "N_rr")
 QUICK = Simulation(longest_step_s=0.05)
 
 
-def fitted(log: VehicleLog, free: tuple[str, ...], window_s: float | None = None) -> Fit:
+def fitted(log: VehicleLog, free: tuple[str, ...], window_s: float | None = None) -> OutputErrorFit:
     windows = make_windows(log, KNOWN, window_s=window_s)
     return fit_output_error(windows, free_parameters(KNOWN, free), simulation=QUICK)
 

@@ -58,26 +58,26 @@ def test_the_joint_fit_writes_what_it_found(logs: tuple[Path, Path], tmp_path: P
         assert again == (tmp_path / "out" / name).read_bytes()
 
 
-def test_the_command_calibrates_in_two_steps(logs: tuple[Path, Path], tmp_path: Path) -> None:
+def test_the_command_takes_a_bollard_pull_and_held_values(
+    logs: tuple[Path, Path], tmp_path: Path
+) -> None:
     pull = pull_csv(tmp_path / "pull.csv", 0.0, factors=(1.0, 1.0))
     arguments = [
-        "identify", str(logs[0]), "--method", "two-step", "--free", "X_uu,N_rr", "--bollard",
+        "identify", str(logs[0]), "--free", "X_uu,N_rr", "--bollard",
         str(pull), "--held", "current_north_mps=0.1", "--held", "current_east_mps=-0.05", "-o",
         str(tmp_path / "out"), "--json",
     ]  # fmt: skip
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     data = json.loads(result.stdout)
-    assert data["method"] == "two-step"
     assert [round(one["factor"], 6) for one in data["thrust"]] == [1.0, 1.0]
     assert data["identified"]["X_uu"]["identified"] == pytest.approx(-12.0, rel=0.05)
     assert data["identified"]["N_rr"]["identified"] == pytest.approx(-70.0, rel=0.05)
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
-        (IdentifyOptions(method="guess"), "method 'guess' is not known"),
         (IdentifyOptions(held=("current_north_mps",)), "is not NAME=VALUE"),
         (IdentifyOptions(held=("X_uu=3",)), "X_uu cannot be held by hand"),
         (IdentifyOptions(vehicle="sparus2"), "are not those of sparus2"),
@@ -85,10 +85,10 @@ def test_the_command_calibrates_in_two_steps(logs: tuple[Path, Path], tmp_path: 
         (IdentifyOptions(free=("gain",)), "tell nothing of gain_X"),
     ],
 )
-def test_wrong_options_are_told(
-    logs: tuple[Path, Path], tmp_path: Path, options: IdentifyOptions, told: str
+def test_wrong_options_are_refused(
+    logs: tuple[Path, Path], tmp_path: Path, options: IdentifyOptions, message: str
 ) -> None:
     with pytest.raises(VehicleError) as raised:
         identify_report([logs[0]], tmp_path / "out", options)
-    assert told in str(raised.value)
+    assert message in str(raised.value)
     assert not (tmp_path / "out").exists()

@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from alice_survey.vehicle.compiled import kernel
+from alice_survey.vehicle.estimate_vector import ESTIMATE
 from alice_survey.vehicle.floor import FloorGrid
 from alice_survey.vehicle.navigation.sensors import IMU, Sensors
 from alice_survey.vehicle.navigation.state import GYRO_BIAS, WATER, NavigationState, new_navigation
 from alice_survey.vehicle.navigation.tick import LOG_ROW, log_row, navigation_tick
-from alice_survey.vehicle.signals import ESTIMATE
 
 Array = NDArray[np.float64]
 TICK_S = 0.05

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from alice_survey.base.frames import Array
-from alice_survey.vehicle import signals
+from alice_survey.vehicle import estimate_vector as vector
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.dynamics import (
     Plant,
@@ -19,7 +19,7 @@ from alice_survey.vehicle.dynamics import (
     scratch_for,
 )
 from alice_survey.vehicle.fleet import vehicle
-from alice_survey.vehicle.pilot import memory as told
+from alice_survey.vehicle.pilot import memory as slot
 from alice_survey.vehicle.pilot.gains import DEGREES, LAG, Gains, gains_for
 from alice_survey.vehicle.pilot.guidance import steer
 from alice_survey.vehicle.pilot.memory import PilotState, new_pilot
@@ -144,21 +144,21 @@ class Rows:
 
     def on_lines(self) -> "Rows":
         """The part on survey lines."""
-        following = self.report[:, told.PHASE] == signals.FOLLOW
-        return Rows(self.table[following & (self.report[:, told.LINE] >= 0)])
+        following = self.report[:, slot.PHASE] == slot.FOLLOW
+        return Rows(self.table[following & (self.report[:, slot.LINE] >= 0)])
 
     @property
     def cross_m(self) -> Array:
-        return self.report[:, told.CROSS]
+        return self.report[:, slot.CROSS]
 
     @property
     def heading_error_rad(self) -> Array:
-        off = self.estimate[:, signals.HEADING] - self.report[:, told.PATH_HEADING]
+        off = self.estimate[:, vector.HEADING] - self.report[:, slot.PATH_HEADING]
         return np.asarray(np.angle(np.exp(1j * off)))
 
     def phases(self) -> list[int]:
         """Phases in the order in which they came."""
-        phase = self.report[:, told.PHASE].astype(int)
+        phase = self.report[:, slot.PHASE].astype(int)
         return [int(phase[0]), *(int(p) for p in phase[1:][np.diff(phase) != 0])]
 
 
@@ -231,7 +231,7 @@ def launch(
     )
     pilot = new_pilot()
     if following:
-        pilot.report[told.PHASE] = signals.FOLLOW
+        pilot.report[slot.PHASE] = slot.FOLLOW
         at_ned = (at_ned[0], at_ned[1], floor_m - path.altitude_m - guidance.point_body_m[2])
     n = len(craft.thrusters)
     return Flight(

@@ -9,7 +9,7 @@ from hypothesis.extra.numpy import arrays
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.pilot import control
 from alice_survey.vehicle.pilot import gains as g
-from alice_survey.vehicle.pilot import memory as told
+from alice_survey.vehicle.pilot import memory as slot
 from alice_survey.vehicle.pilot.memory import new_pilot
 from tests import oracles_guidance as oracle
 from tests.alice_survey.vehicle.pilot.pilot_runs import gains_of
@@ -37,7 +37,7 @@ def test_what_is_cut_is_told(demand: Array) -> None:
     pilot.demand[:8] = demand * np.array([1, 1, 1, 1, 5, 5, 5, 20])
     control.write_wrench(gains, pilot, wrench)
     for axis, degree in enumerate(g.DEGREES):
-        full = pilot.demand[told.FULL_SURGE + axis]
+        full = pilot.demand[slot.FULL_SURGE + axis]
         ends = gains.axes[axis, [g.LEAST, g.MOST]]
         if full == 0.0:
             assert ends[0] <= wrench[degree] <= ends[1]
@@ -49,7 +49,7 @@ def test_signs_of_a_wrench() -> None:
     gains, pilot, wrench = gains_of("alice"), new_pilot(), np.zeros(6)
     for axis, degree in enumerate(g.DEGREES):
         pilot.demand[:] = 0.0
-        pilot.demand[told.ACC_SURGE + axis] = 0.01
+        pilot.demand[slot.ACC_SURGE + axis] = 0.01
         control.write_wrench(gains, pilot, wrench)
         assert wrench[degree] > 0.0  # ahead, to starboard, down, and the bow to starboard
 

@@ -10,10 +10,10 @@ from hypothesis.extra.numpy import arrays
 
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
-from alice_survey.vehicle import signals
+from alice_survey.vehicle import estimate_vector as vector
 from alice_survey.vehicle.fleet import SETS, vehicle
 from alice_survey.vehicle.pilot import gains as g
-from alice_survey.vehicle.pilot import memory as told
+from alice_survey.vehicle.pilot import memory as slot
 from alice_survey.vehicle.pilot.gains import damping_ratio, gains_for
 from alice_survey.vehicle.pilot.guidance import steer
 from alice_survey.vehicle.pilot.memory import PilotState, new_pilot
@@ -24,13 +24,13 @@ from alice_survey.vehicle.pilot.settings import (
     SWAY_LOOK_AHEAD_M,
     Guidance,
     los_loop,
-    los_offset_m,
     pilot_guidance,
     shortest_look_ahead_m,
 )
 from alice_survey.vehicle.pilot.steering import hear_floor, tell_point
 from tests import oracles_guidance as oracle
 from tests.alice_survey.vehicle.pilot.pilot_runs import gains_of, launch, lawnmower, straight
+from tests.oracles_guidance import los_offset_m
 
 TICK_S = 0.05
 MOTIONS = arrays(np.float64, 12, elements=st.floats(-1.0, 1.0))
@@ -41,13 +41,13 @@ MIDDLE = np.array([10.0, 0.0, 13.0, 0.0, 0.0, 0.0, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0]
 def estimate_of(motion: Array, cross_m: float = 0.0) -> Array:
     """An estimate about the middle of a straight path to the north."""
     estimate = np.append(MIDDLE + SCALES * motion, [2.0, 2.0])
-    estimate[signals.EAST] += cross_m
+    estimate[vector.EAST] += cross_m
     return estimate
 
 
 def pilot_on(path: Path, leg: int = 0, along_m: float = 0.0) -> PilotState:
     pilot = new_pilot()
-    pilot.report[[told.PHASE, told.LEG, told.ALONG]] = signals.FOLLOW, leg, along_m
+    pilot.report[[slot.PHASE, slot.LEG, slot.ALONG]] = slot.FOLLOW, leg, along_m
     return pilot
 
 
@@ -84,9 +84,9 @@ def test_a_tick_asks_for_what_its_twin_asks(
     expected, cross = oracle.follow_demand(estimate, path, guidance, gains, place[0])
     assume(abs(abs(cross) - guidance.near_m) > 1e-9)
     steer(0.0, TICK_S, estimate, path, guidance, gains, pilot, wrench)
-    accelerations = pilot.demand[[told.ACC_SURGE, told.ACC_SWAY, told.ACC_YAW]]
+    accelerations = pilot.demand[[slot.ACC_SURGE, slot.ACC_SWAY, slot.ACC_YAW]]
     np.testing.assert_allclose(accelerations, expected, atol=1e-9)
-    assert pilot.report[told.CROSS] == pytest.approx(cross, abs=1e-9)
+    assert pilot.report[slot.CROSS] == pytest.approx(cross, abs=1e-9)
     full = oracle.wrench(gains, pilot.demand)
     if controller == "los":
         full[1] = 0.0
@@ -104,7 +104,7 @@ def test_north_is_nothing_special(motion: Array, cross_m: float, turn: float) ->
         n, e = estimate[:2].copy()
         estimate[0] = n * math.cos(angle) - e * math.sin(angle)
         estimate[1] = n * math.sin(angle) + e * math.cos(angle)
-        estimate[signals.HEADING] += angle
+        estimate[vector.HEADING] += angle
         steer(0.0, TICK_S, estimate, path, guidance, gains, pilot_on(path, 0, 10.0), wrench)
         wrenches.append(wrench)
     np.testing.assert_allclose(wrenches[1], wrenches[0], atol=1e-8)
@@ -129,16 +129,20 @@ def test_turns_begin_before_the_arc_and_end_after_it(at: float) -> None:
     along = at - path.begins_m[leg]
     n, e, heading, _ = place_at(path, leg, along)
     lever = guidance.point_body_m
-    estimate = np.zeros(signals.ESTIMATE)
+    estimate = np.zeros(vector.ESTIMATE)
     estimate[0] = n - lever[0] * math.cos(heading) + lever[1] * math.sin(heading)
     estimate[1] = e - lever[0] * math.sin(heading) - lever[1] * math.cos(heading)
-    estimate[[signals.HEADING, signals.U, signals.DEPTH]] = heading, 0.2, 13.0
+    estimate[[vector.HEADING, vector.U, vector.DEPTH]] = (
+        heading,
+        0.2,
+        13.0,
+    )
     pilot, wrench = pilot_on(path, leg, along), np.zeros(6)
     steer(0.0, TICK_S, estimate, path, guidance, gains, pilot, wrench)
-    assert pilot.report[told.CROSS] == pytest.approx(0.0, abs=1e-12)
+    assert pilot.report[slot.CROSS] == pytest.approx(0.0, abs=1e-12)
     # Simpson's rule across the kink of the heading.
     expected = oracle.mean_heading(path, at, guidance.smooth_m)
-    assert pilot.report[told.WANTED_HEADING] == pytest.approx(expected, abs=0.02)
+    assert pilot.report[slot.WANTED_HEADING] == pytest.approx(expected, abs=0.02)
 
 
 def test_the_floor_is_smoothed_as_its_transfer_function_says() -> None:
@@ -146,30 +150,30 @@ def test_the_floor_is_smoothed_as_its_transfer_function_says() -> None:
     rng = np.random.default_rng(2)
     heard = 15.0 + 0.02 * np.arange(800) * TICK_S + 0.05 * rng.standard_normal(800)
     pilot, smoothed = new_pilot(), []
-    estimate = np.zeros(signals.ESTIMATE)
+    estimate = np.zeros(vector.ESTIMATE)
     for depth in heard:
-        estimate[signals.DEPTH], estimate[signals.ALTITUDE] = 13.0, depth - 13.0
+        estimate[vector.DEPTH], estimate[vector.ALTITUDE] = 13.0, depth - 13.0
         hear_floor(estimate, TICK_S, guidance, pilot)
-        smoothed.append(pilot.memory[told.FLOOR])
+        smoothed.append(pilot.memory[slot.FLOOR])
     expected = oracle.smoothed_floor(heard, guidance.floor_rate_rad_s, TICK_S)
     # A tick ends when the next begins.
     np.testing.assert_allclose(smoothed[:-1], expected[1:], atol=0.001)
     # A constant slope is followed without lag, and noise is taken away.
     ramp = 15.0 + 0.02 * np.arange(800) * TICK_S
     assert np.abs(np.array(smoothed[400:]) - ramp[400:]).max() < 0.03
-    assert pilot.memory[told.FLOOR_SLOPE] == pytest.approx(0.02, abs=0.01)
+    assert pilot.memory[slot.FLOOR_SLOPE] == pytest.approx(0.02, abs=0.01)
 
 
 def test_a_false_echo_moves_the_floor_little() -> None:
     _, guidance = guide(straight(20.0), "alice", "sway")
-    pilot, estimate = new_pilot(), np.zeros(signals.ESTIMATE)
+    pilot, estimate = new_pilot(), np.zeros(vector.ESTIMATE)
     for k in range(400):
-        estimate[signals.DEPTH] = 13.0
-        estimate[signals.ALTITUDE] = 40.0 if k == 200 else 2.0
+        estimate[vector.DEPTH] = 13.0
+        estimate[vector.ALTITUDE] = 40.0 if k == 200 else 2.0
         hear_floor(estimate, TICK_S, guidance, pilot)
         if k == 200:
-            assert 0.0 < pilot.memory[told.FLOOR] - 15.0 < 0.03
-    assert pilot.memory[told.FLOOR] == pytest.approx(15.0, abs=0.02)
+            assert 0.0 < pilot.memory[slot.FLOOR] - 15.0 < 0.03
+    assert pilot.memory[slot.FLOOR] == pytest.approx(15.0, abs=0.02)
 
 
 @given(
@@ -233,7 +237,7 @@ def test_small_offsets_fade_as_the_linear_loop_says(name: str) -> None:
     before = flight.state.copy()
     rows = flight.fly(80.0)
     loop = los_loop(flight.gains, 0.2, 0.55, flight.guidance.look_ahead_m)
-    start = np.array([rows.cross_m[0], rows.estimate[0, signals.HEADING], before[8], before[12], 0])
+    start = np.array([rows.cross_m[0], rows.estimate[0, vector.HEADING], before[8], before[12], 0])
     for seconds in (5.0, 10.0, 20.0, 40.0, 60.0):
         expected = (expm(loop * seconds) @ start)[0]
         assert rows.cross_m[round(seconds / TICK_S)] == pytest.approx(expected, abs=0.0012)

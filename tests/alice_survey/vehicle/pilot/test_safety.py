@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from alice_survey.base.frames import Array
-from alice_survey.vehicle import signals
+from alice_survey.vehicle import estimate_vector as vector
 from alice_survey.vehicle.pilot import gains as g
-from alice_survey.vehicle.pilot import memory as told
+from alice_survey.vehicle.pilot import memory as slot
 from alice_survey.vehicle.pilot import safety
 from alice_survey.vehicle.pilot.guidance import steer
 from alice_survey.vehicle.pilot.memory import PilotState, new_pilot
@@ -20,9 +20,13 @@ TICK_S = 0.05
 
 
 def calm(altitude_m: float = 2.0, pitch_rad: float = 0.0, depth_m: float = 13.0) -> Array:
-    estimate = np.zeros(signals.ESTIMATE)
-    estimate[[signals.ALTITUDE, signals.PITCH, signals.DEPTH]] = altitude_m, pitch_rad, depth_m
-    estimate[signals.CLEARANCE] = altitude_m
+    estimate = np.zeros(vector.ESTIMATE)
+    estimate[[vector.ALTITUDE, vector.PITCH, vector.DEPTH]] = (
+        altitude_m,
+        pitch_rad,
+        depth_m,
+    )
+    estimate[vector.CLEARANCE] = altitude_m
     return estimate
 
 
@@ -40,12 +44,12 @@ def watched(
 
 def pilot_in(phase: int) -> PilotState:
     pilot = new_pilot()
-    pilot.memory[told.FLOOR_KNOWN] = 1.0
-    pilot.report[told.PHASE] = phase
+    pilot.memory[slot.FLOOR_KNOWN] = 1.0
+    pilot.report[slot.PHASE] = phase
     return pilot
 
 
-@pytest.mark.parametrize("phase", [signals.DIVE, signals.APPROACH, signals.FOLLOW])
+@pytest.mark.parametrize("phase", [slot.DIVE, slot.APPROACH, slot.FOLLOW])
 def test_a_calm_mission_goes_on(phase: int) -> None:
     assert watched(pilot_in(phase), calm(), 200.0)[0] == safety.NONE
 
@@ -53,17 +57,17 @@ def test_a_calm_mission_goes_on(phase: int) -> None:
 @pytest.mark.parametrize(
     ("estimate", "phase", "speed", "reason", "after_s"),
     [
-        (calm(altitude_m=0.9), signals.FOLLOW, 0.2, safety.TOO_LOW, 10.0),
-        (calm(altitude_m=0.9), signals.DIVE, 0.2, safety.TOO_LOW, 10.0),
-        (calm(altitude_m=0.49), signals.FOLLOW, 0.2, safety.TOO_LOW, 1.0),
-        (calm(altitude_m=0.49), signals.DIVE, 0.2, safety.TOO_LOW, 1.0),
-        (calm(pitch_rad=0.6), signals.FOLLOW, 0.2, safety.TOO_STEEP, 1.0),
-        (calm(pitch_rad=-0.6), signals.APPROACH, 0.2, safety.TOO_STEEP, 1.0),
-        (calm(altitude_m=math.nan), signals.FOLLOW, 0.2, safety.NO_BOTTOM, 20.0),
-        (calm(depth_m=20.1), signals.DIVE, 0.2, safety.TOO_DEEP, TICK_S),
-        (calm(), signals.DIVE, 0.0, safety.NO_DIVE, 90.0),
-        (calm(), signals.APPROACH, -0.1, safety.NO_APPROACH, 90.0),
-        (calm(), signals.FOLLOW, 0.0005, safety.NO_PROGRESS, 90.0),
+        (calm(altitude_m=0.9), slot.FOLLOW, 0.2, safety.TOO_LOW, 10.0),
+        (calm(altitude_m=0.9), slot.DIVE, 0.2, safety.TOO_LOW, 10.0),
+        (calm(altitude_m=0.49), slot.FOLLOW, 0.2, safety.TOO_LOW, 1.0),
+        (calm(altitude_m=0.49), slot.DIVE, 0.2, safety.TOO_LOW, 1.0),
+        (calm(pitch_rad=0.6), slot.FOLLOW, 0.2, safety.TOO_STEEP, 1.0),
+        (calm(pitch_rad=-0.6), slot.APPROACH, 0.2, safety.TOO_STEEP, 1.0),
+        (calm(altitude_m=math.nan), slot.FOLLOW, 0.2, safety.NO_BOTTOM, 20.0),
+        (calm(depth_m=20.1), slot.DIVE, 0.2, safety.TOO_DEEP, TICK_S),
+        (calm(), slot.DIVE, 0.0, safety.NO_DIVE, 90.0),
+        (calm(), slot.APPROACH, -0.1, safety.NO_APPROACH, 90.0),
+        (calm(), slot.FOLLOW, 0.0005, safety.NO_PROGRESS, 90.0),
     ],
 )
 def test_each_reason_comes_after_its_time(
@@ -75,15 +79,15 @@ def test_each_reason_comes_after_its_time(
 
 
 def test_a_mission_that_takes_too_long_ends() -> None:
-    assert watched(pilot_in(signals.FOLLOW), calm(), 1.0, time_s=5000.1)[0] == safety.TOO_LONG
+    assert watched(pilot_in(slot.FOLLOW), calm(), 1.0, time_s=5000.1)[0] == safety.TOO_LONG
 
 
 def test_the_dive_may_begin_out_of_reach_of_the_bottom() -> None:
-    assert watched(pilot_in(signals.DIVE), calm(altitude_m=math.nan), 80.0)[0] == safety.NONE
+    assert watched(pilot_in(slot.DIVE), calm(altitude_m=math.nan), 80.0)[0] == safety.NONE
 
 
 def test_false_echoes_and_gaps_do_not_end_a_mission() -> None:
-    pilot = pilot_in(signals.FOLLOW)
+    pilot = pilot_in(slot.FOLLOW)
     for k in range(100):
         # 0.9 s of false echoes, a good one; 19 s without lock, a good one.
         assert watched(pilot, calm(altitude_m=0.1), 0.9, time_s=40.0 * k)[0] == safety.NONE
@@ -94,20 +98,20 @@ def test_false_echoes_and_gaps_do_not_end_a_mission() -> None:
 
 
 def test_echoes_between_gaps_still_tell_of_low_altitude() -> None:
-    pilot, reason = pilot_in(signals.FOLLOW), 0
+    pilot, reason = pilot_in(slot.FOLLOW), 0
     for k in range(200):
         altitude = 0.4 if k % 4 == 0 else math.nan
         reason = reason or safety.watch(0.0, TICK_S, calm(altitude), 0.2 * k, LIMITS, pilot)
     assert reason == safety.TOO_LOW
 
 
-@pytest.mark.parametrize("phase", [signals.ASCEND, signals.DONE, signals.ABORT])
+@pytest.mark.parametrize("phase", [slot.ASCEND, slot.DONE, slot.ABORT])
 def test_on_the_way_up_nothing_aborts(phase: int) -> None:
     assert watched(pilot_in(phase), calm(0.1, 1.0, 30.0), 200.0, 0.0)[0] == safety.NONE
 
 
 def test_every_reason_has_words() -> None:
-    borrowed = vars(signals).keys() | vars(told).keys()
+    borrowed = vars(slot).keys()
     codes = [
         value
         for name, value in vars(safety).items()
@@ -133,9 +137,9 @@ def test_without_navigation_the_vehicle_pushes_itself_up(lost: int) -> None:
         wrench = _steered(flight, estimate)
         expected = g.STEADY_SHARE * flight.gains.axes[g.HEAVE, g.LEAST]
         np.testing.assert_array_equal(wrench, [0, 0, expected, 0, 0, 0])
-    assert flight.pilot.report[told.PHASE] == signals.ABORT
-    assert flight.pilot.report[told.REASON] == safety.NO_NAVIGATION
-    assert np.all(np.isfinite(flight.pilot.memory[: told.BEST]))
+    assert flight.pilot.report[slot.PHASE] == slot.ABORT
+    assert flight.pilot.report[slot.REASON] == safety.NO_NAVIGATION
+    assert np.all(np.isfinite(flight.pilot.memory[: slot.BEST]))
 
 
 def test_an_abort_takes_the_vehicle_to_the_surface() -> None:
@@ -143,27 +147,27 @@ def test_an_abort_takes_the_vehicle_to_the_surface() -> None:
     flight.fly(20.0)
     flight.floor[0] -= 1.8  # a rock: 0.2 m below the port
     rows = flight.fly(90.0)
-    assert rows.phases() == [signals.FOLLOW, signals.ABORT]
-    assert rows.report[-1, told.REASON] == safety.TOO_LOW
-    low_s = rows.time_s[np.argmax(rows.report[:, told.PHASE] == signals.ABORT)] - rows.time_s[0]
+    assert rows.phases() == [slot.FOLLOW, slot.ABORT]
+    assert rows.report[-1, slot.REASON] == safety.TOO_LOW
+    low_s = rows.time_s[np.argmax(rows.report[:, slot.PHASE] == slot.ABORT)] - rows.time_s[0]
     assert 0.9 < low_s < 1.2
-    assert rows.estimate[:, signals.CLEARANCE].min() > 0.1
-    assert rows.report[-1, told.AT_SURFACE] == 1.0
-    assert rows.estimate[-1, signals.DEPTH] < 0.3
+    assert rows.estimate[:, vector.CLEARANCE].min() > 0.1
+    assert rows.report[-1, slot.AT_SURFACE] == 1.0
+    assert rows.estimate[-1, vector.DEPTH] < 0.3
     # It rises at the speed that is allowed, without turning round.
-    rising = -np.diff(rows.estimate[:, signals.DEPTH]) / TICK_S
+    rising = -np.diff(rows.estimate[:, vector.DEPTH]) / TICK_S
     assert 0.8 < rising.max() / flight.gains.axes[g.HEAVE, g.FASTEST] < 1.2
-    assert np.abs(rows.estimate[:, signals.HEADING]).max() < math.radians(15.0)
+    assert np.abs(rows.estimate[:, vector.HEADING]).max() < math.radians(15.0)
 
 
-@pytest.mark.parametrize("part", [signals.ALTITUDE, signals.CLEARANCE])
+@pytest.mark.parametrize("part", [vector.ALTITUDE, vector.CLEARANCE])
 def test_either_too_low_stops_the_surge_and_raises_the_vehicle(part: int) -> None:
-    pilot, estimate = pilot_in(signals.FOLLOW), calm()
+    pilot, estimate = pilot_in(slot.FOLLOW), calm()
     for clear_m, pace, rise_m in ((1.5, 1.0, 0.0), (1.125, 0.5, 0.125), (0.9, 0.0, 0.35)):
         estimate[part] = clear_m
         depth = safety.mind_floor(13.0, estimate, LIMITS, pilot)
         assert depth == pytest.approx(13.0 - rise_m)
-        assert pilot.memory[told.PACE] == pytest.approx(pace)
+        assert pilot.memory[slot.PACE] == pytest.approx(pace)
 
 
 def test_over_a_rock_it_stops_climbs_and_goes_on() -> None:
@@ -171,13 +175,13 @@ def test_over_a_rock_it_stops_climbs_and_goes_on() -> None:
     flight.fly(20.0)
     flight.floor[0] -= 1.3  # a rock: 0.7 m below the port
     rows = flight.fly(60.0)
-    assert rows.phases() == [signals.FOLLOW]
-    assert rows.estimate[:, signals.CLEARANCE].min() > 0.6
-    low = rows.estimate[:, signals.CLEARANCE] < 1.0
+    assert rows.phases() == [slot.FOLLOW]
+    assert rows.estimate[:, vector.CLEARANCE].min() > 0.6
+    low = rows.estimate[:, vector.CLEARANCE] < 1.0
     assert 0.5 < low.sum() * TICK_S < LIMITS.climb_s
-    assert np.all(rows.report[low, told.WANTED_SURGE] == 0.0)
-    assert rows.estimate[-1, signals.ALTITUDE] == pytest.approx(2.0, abs=0.1)
-    assert rows.report[-1, told.WANTED_SURGE] == pytest.approx(0.2)
+    assert np.all(rows.report[low, slot.WANTED_SURGE] == 0.0)
+    assert rows.estimate[-1, vector.ALTITUDE] == pytest.approx(2.0, abs=0.1)
+    assert rows.report[-1, slot.WANTED_SURGE] == pytest.approx(0.2)
 
 
 def test_without_the_bottom_it_stops_rises_as_the_floor_did_and_goes_on_when_it_hears() -> None:
@@ -186,15 +190,15 @@ def test_without_the_bottom_it_stops_rises_as_the_floor_did_and_goes_on_when_it_
     floor = flight.floor.copy()
     flight.floor[2] = 0.0
     rows = flight.fly(15.0)
-    north, depth = rows.estimate[:, signals.NORTH], rows.estimate[:, signals.DEPTH]
+    north, depth = rows.estimate[:, vector.NORTH], rows.estimate[:, vector.DEPTH]
     clear = floor[0] + floor[1] * (north + 0.55) - depth - 0.08
     assert clear.min() > 1.8
     assert 0.005 < np.ptp(north[200:]) < 0.1  # at full speed: 1 m
     assert 0.2 < depth[0] - depth[-1] < 0.7
     flight.floor[2] = 1.0
     rows = flight.fly(30.0)
-    assert rows.phases() == [signals.FOLLOW]
-    assert rows.estimate[-1, signals.U] == pytest.approx(0.2, abs=0.02)
+    assert rows.phases() == [slot.FOLLOW]
+    assert rows.estimate[-1, vector.U] == pytest.approx(0.2, abs=0.02)
 
 
 def test_depth_is_held_while_the_bottom_is_not_heard() -> None:
@@ -202,8 +206,8 @@ def test_depth_is_held_while_the_bottom_is_not_heard() -> None:
     flight.fly(60.0)
     flight.floor[2] = 0.0
     rows = flight.fly(21.0)
-    held = rows.estimate[(rows.time_s < rows.time_s[0] + 20.0), signals.DEPTH]
+    held = rows.estimate[(rows.time_s < rows.time_s[0] + 20.0), vector.DEPTH]
     # The rise that was followed fades as the vehicle stops; then depth stays.
     assert np.ptp(held[-100:]) < 0.01
     assert abs(held[-1] - held[0]) < 0.1
-    assert rows.report[-1, told.REASON] == safety.NO_BOTTOM
+    assert rows.report[-1, slot.REASON] == safety.NO_BOTTOM

@@ -10,9 +10,9 @@ from hypothesis.extra.numpy import arrays
 
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
-from alice_survey.vehicle import signals
+from alice_survey.vehicle import estimate_vector as vector
 from alice_survey.vehicle.limits import SPOT_RAD_S, STEP_MPS
-from alice_survey.vehicle.pilot import memory as told
+from alice_survey.vehicle.pilot import memory as slot
 from alice_survey.vehicle.pilot.gains import FASTEST, LAG, SURGE, SWAY, YAW
 from alice_survey.vehicle.pilot.guidance import steer
 from alice_survey.vehicle.pilot.memory import new_pilot
@@ -104,9 +104,9 @@ def test_a_tick_of_a_stop_asks_for_what_its_twin_asks(
     slowing = (guidance.stop_mps2, guidance.step_mps2, guidance.spot_rad_s2)[leg]
     goal = (path.length_m[0], path.length_m[1], abs(path.turn_rad[2]))[leg]
     speed = share * fastest
-    pilot.report[[told.PHASE, told.LEG, told.ALONG]] = signals.FOLLOW, leg, progress
-    pilot.memory[[told.STANDING, told.REF, told.REF_SPEED]] = 1.0, progress, speed
-    pilot.memory[[told.RAMP, told.RAMP_SPEED]] = progress, speed
+    pilot.report[[slot.PHASE, slot.LEG, slot.ALONG]] = slot.FOLLOW, leg, progress
+    pilot.memory[[slot.STANDING, slot.REF, slot.REF_SPEED]] = 1.0, progress, speed
+    pilot.memory[[slot.RAMP, slot.RAMP_SPEED]] = progress, speed
     _, rate, quicken = ramp(progress, speed, goal, fastest, slowing, TICK_S)
     # What thrusters that lag make of it.
     rate = speed + (rate - speed) * TICK_S / gains.axes[(SURGE, SWAY, YAW)[leg], LAG]
@@ -121,9 +121,9 @@ def test_a_tick_of_a_stop_asks_for_what_its_twin_asks(
         place, moves, quickens = start + after * ahead, rate * ahead, quicken * ahead
         turning = np.array([course + path.side_rad[leg], 0.0, 0.0])
     estimate = np.append(SCALES * motion, [2.0, 2.0])
-    estimate[[signals.NORTH, signals.EAST]] += place - np.array([0.55, 0.0])
-    estimate[signals.DEPTH] += 13.0
-    estimate[signals.HEADING] += turning[0]
+    estimate[[vector.NORTH, vector.EAST]] += place - np.array([0.55, 0.0])
+    estimate[vector.DEPTH] += 13.0
+    estimate[vector.HEADING] += turning[0]
     # Near enough that the reference does not wait.
     point, _ = oracle.point_motion(estimate, guidance)
     behind = start + progress * ahead - point[:2] if leg < 2 else np.zeros(2)
@@ -134,29 +134,29 @@ def test_a_tick_of_a_stop_asks_for_what_its_twin_asks(
     )
     wrench = np.zeros(6)
     steer(0.0, TICK_S, estimate, path, guidance, gains, pilot, wrench)
-    found = pilot.demand[[told.ACC_SURGE, told.ACC_SWAY, told.ACC_YAW]]
+    found = pilot.demand[[slot.ACC_SURGE, slot.ACC_SWAY, slot.ACC_YAW]]
     np.testing.assert_allclose(found, expected, atol=1e-9)
     np.testing.assert_allclose(wrench, oracle.wrench(gains, pilot.demand), atol=1e-9)
 
 
 def glass_of(flight: Flight, rows: Rows) -> Array:
     """(T, 2) where the followed point is."""
-    heading, lever = rows.estimate[:, signals.HEADING], flight.guidance.point_body_m
+    heading, lever = rows.estimate[:, vector.HEADING], flight.guidance.point_body_m
     ahead = np.stack([np.cos(heading), np.sin(heading)], axis=1)
     beside = np.stack([-np.sin(heading), np.cos(heading)], axis=1)
     return np.asarray(rows.estimate[:, :2] + lever[0] * ahead + lever[1] * beside)
 
 
 def on_leg(rows: Rows, leg: int) -> Array:
-    following = rows.report[:, told.PHASE] == signals.FOLLOW
-    return np.asarray(following & (rows.report[:, told.LEG] == leg))
+    following = rows.report[:, slot.PHASE] == slot.FOLLOW
+    return np.asarray(following & (rows.report[:, slot.LEG] == leg))
 
 
 @pytest.mark.parametrize("current", [(0.0, 0.0), (0.1, 30.0), (0.2, 90.0)])
 def test_alice_turns_on_the_spot_about_her_port(current: tuple[float, float]) -> None:
     flight = launch(SPOTS, current=current, at_ned=(-1.2, 0.05, 0.0), following=True)
     rows = flight.fly(90.0)
-    assert rows.phases()[-1] == signals.ASCEND
+    assert rows.phases()[-1] == slot.ASCEND
     glass = glass_of(flight, rows)
     for leg in (1, 3):
         on = on_leg(rows, leg)
@@ -164,16 +164,16 @@ def test_alice_turns_on_the_spot_about_her_port(current: tuple[float, float]) ->
             glass[on] - [SPOTS.start_n[leg], SPOTS.start_e[leg]], axis=1
         )  # fmt: skip
         assert 0.005 < away.max() < 0.2
-        rate = np.rad2deg(rows.estimate[on, signals.R])
+        rate = np.rad2deg(rows.estimate[on, vector.R])
         assert 13.0 < rate.max() < 20.0
         assert rate.min() > -3.0
         # Six seconds at full rate and the ramp of it; then it is left at once.
         assert 6.5 < on.sum() * TICK_S < 11.0
-        end = rows.estimate[on, signals.HEADING][-1]
+        end = rows.estimate[on, vector.HEADING][-1]
         turned = math.remainder(end - SPOTS.heading_rad[leg] - QUARTER, 2 * math.pi)
         assert abs(turned) < 1.5 * STOP_RAD
     after = rows.on_lines()
-    second = after.report[:, told.LINE] == 1
+    second = after.report[:, slot.LINE] == 1
     assert np.abs(after.cross_m[second]).max() < 0.1
 
 
@@ -181,9 +181,9 @@ def test_alice_turns_on_the_spot_about_her_port(current: tuple[float, float]) ->
 def test_alice_steps_aside_with_her_heading_held(current: tuple[float, float]) -> None:
     flight = launch(STEPS, current=current, at_ned=(-1.2, 0.05, 0.0), following=True)
     rows = flight.fly(90.0)
-    assert rows.phases()[-1] == signals.ASCEND
+    assert rows.phases()[-1] == slot.ASCEND
     on, glass = on_leg(rows, 1), glass_of(flight, rows)
-    assert np.abs(np.rad2deg(rows.estimate[on, signals.HEADING])).max() < 4.0
+    assert np.abs(np.rad2deg(rows.estimate[on, vector.HEADING])).max() < 4.0
     assert np.abs(glass[on, 0] - 3.0).max() < 0.2
     np.testing.assert_allclose(glass[on][-1], [3.0, 1.0], atol=1.5 * STOP_M)
     sideways = np.diff(glass[on, 1]) / TICK_S
@@ -196,7 +196,7 @@ def test_the_vehicle_comes_to_rest_before_it_turns() -> None:
     flight = launch(SPOTS, at_ned=(-1.2, 0.0, 0.0), following=True)
     rows = flight.fly(60.0)
     on = on_leg(rows, 0)
-    speed = np.hypot(rows.estimate[on, signals.U], rows.estimate[on, signals.V])
+    speed = np.hypot(rows.estimate[on, vector.U], rows.estimate[on, vector.V])
     assert speed.max() > 0.18
     assert speed[-1] < 0.06
     # Not long before: from full speed it takes no more than its braking and the loop's settling.
@@ -208,19 +208,19 @@ def test_the_vehicle_comes_to_rest_before_it_turns() -> None:
 def test_a_turn_goes_the_way_it_is_told_though_it_is_longer() -> None:
     path = with_stops([("go", 2.0, 0), ("spot", -1.5 * math.pi), ("go", 2.0, 1)])
     rows = launch(path, at_ned=(-1.2, 0.0, 0.0), following=True).fly(60.0)
-    heading = np.unwrap(rows.estimate[:, signals.HEADING])
-    assert rows.phases()[-1] == signals.ASCEND
+    heading = np.unwrap(rows.estimate[:, vector.HEADING])
+    assert rows.phases()[-1] == slot.ASCEND
     assert heading[-1] - heading[0] == pytest.approx(-1.5 * math.pi, abs=0.05)
 
 
 def test_a_vehicle_without_sway_turns_and_goes_on_but_takes_no_steps() -> None:
     flight = launch(SPOTS, "sparus2", "los", at_ned=(-1.2, 0.0, 0.0), following=True)
     rows = flight.fly(120.0)
-    assert rows.phases()[-1] == signals.ASCEND
+    assert rows.phases()[-1] == slot.ASCEND
     # It swings about its middle: along its heading the port is in its place again.
     on = on_leg(rows, 1)
     off = glass_of(flight, rows)[on][-1] - [3.0, 0.0]
-    heading = rows.estimate[on, signals.HEADING][-1]
+    heading = rows.estimate[on, vector.HEADING][-1]
     assert abs(off @ [math.cos(heading), math.sin(heading)]) < 2 * STOP_M
     assert np.linalg.norm(off) > 0.3
     with pytest.raises(VehicleError, match=r"1 sway step, which the controller los cannot fly"):
@@ -230,17 +230,17 @@ def test_a_vehicle_without_sway_turns_and_goes_on_but_takes_no_steps() -> None:
 def test_a_stop_is_left_though_the_sea_does_not_let_the_vehicle_rest() -> None:
     path, guidance, gains = SPOTS, guidance_of(SPOTS), gains_of("alice")
     pilot, wrench = new_pilot(), np.zeros(6)
-    pilot.report[[told.PHASE, told.LEG]] = signals.FOLLOW, 1
-    pilot.memory[[told.STANDING, told.REF, told.RAMP]] = 1.0, QUARTER, QUARTER
-    estimate = np.zeros(signals.ESTIMATE)
+    pilot.report[[slot.PHASE, slot.LEG]] = slot.FOLLOW, 1
+    pilot.memory[[slot.STANDING, slot.REF, slot.RAMP]] = 1.0, QUARTER, QUARTER
+    estimate = np.zeros(vector.ESTIMATE)
     # The port 0.25 m beyond its place, for ever.
-    estimate[[signals.NORTH, signals.EAST]] = 3.25 - 0.05, -0.55
-    estimate[[signals.HEADING, signals.DEPTH]] = QUARTER, 13.0
-    estimate[[signals.ALTITUDE, signals.CLEARANCE]] = 2.0
+    estimate[[vector.NORTH, vector.EAST]] = 3.25 - 0.05, -0.55
+    estimate[[vector.HEADING, vector.DEPTH]] = QUARTER, 13.0
+    estimate[[vector.ALTITUDE, vector.CLEARANCE]] = 2.0
     left = None
     for tick in range(600):
         steer(tick * TICK_S, TICK_S, estimate, path, guidance, gains, pilot, wrench)
-        if pilot.report[told.LEG] == 2.0:
+        if pilot.report[slot.LEG] == 2.0:
             left = tick * TICK_S
             break
     # 0.1 m (1 + t / 5 s) reaches 0.25 m after 7.5 s.
@@ -250,11 +250,11 @@ def test_a_stop_is_left_though_the_sea_does_not_let_the_vehicle_rest() -> None:
 def test_carried_off_a_stop_the_vehicle_comes_back_to_it() -> None:
     flight = launch(SPOTS, at_ned=(-1.2, 0.0, 0.0), following=True)
     flight.fly(30.0)
-    assert flight.pilot.report[told.LEG] == 1.0
+    assert flight.pilot.report[slot.LEG] == 1.0
     flight.state[0] -= 9.0
     rows = flight.fly(200.0)
     assert rows.phases() == [
-        signals.APPROACH, signals.FOLLOW, signals.ASCEND, signals.DONE,
+        slot.APPROACH, slot.FOLLOW, slot.ASCEND, slot.DONE,
     ]  # fmt: skip
     on = on_leg(rows, 2)
     assert np.abs(rows.cross_m[on]).max() < 0.3

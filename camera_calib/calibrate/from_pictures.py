@@ -1,0 +1,435 @@
+"""Calibrate from pictures of a target: `alice-survey calibrate --left ... --right ...`."""
+
+import contextlib
+import math
+import shlex
+import shutil
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from alice_survey.base.artefacts import read_json
+from alice_survey.base.errors import CalibrationError, WorkspaceError, warn
+from alice_survey.base.executor import Executor, local_executor
+from camera_calib.calibrate.detect_views import Detections, Size, detect_views
+from camera_calib.calibrate.files import finish, summary, warn_of_unseen
+from camera_calib.calibrate.freedom import intrinsics
+from camera_calib.calibrate.numbering import same_numbering
+from camera_calib.calibrate.picture_sets import find_pictures, pair_pictures
+from camera_calib.calibrate.result import Calibration
+from camera_calib.calibrate.solve import (
+    Intrinsics,
+    blank_camera,
+    calibrate_in_air,
+    calibrate_in_water_alone,
+    calibrate_through_ports,
+    first_cameras,
+)
+from camera_calib.flat_port import FlatPortCamera
+from camera_calib.judge.page import with_sigma
+from camera_calib.judge.uncertainty import baseline_sigma_m
+from camera_calib.rig import Rig, read_rig, write_rig
+from camera_calib.targets.target import Target, parse_target
+
+ONE_CAMERA = "camera"
+"""Name of the camera of `--pictures`."""
+_WRITTEN = (
+    "rig.json", "rig_carried.json", "calibration.json", "corners.csv", "report.html", "report.json",
+)  # fmt: skip
+"""By this command; a folder with other files is not replaced."""
+_GUESSED_PORT_M = 0.02
+_FRESH_WATER, _GLASS = 1.34, 1.52
+_LEVELS = ("bad", "look", "good")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrateOptions:
+    """Pictures to calibrate from, and what is known before."""
+
+    left: str | None = None
+    """Folder or pattern; the left camera is the reference."""
+    right: str | None = None
+    pictures: str | None = None
+    """Those of a single camera, instead."""
+    target: str | None = None
+    """As `parse_target` reads it."""
+    output: Path | None = None
+    """Folder to write."""
+    lens: str = "opencv5"
+    water: bool = False
+    """The pictures were taken under water, through the ports."""
+    start: Path | None = None
+    """rig.json of a calibration in air, or an earlier one."""
+    known: Intrinsics | None = None
+    """What is done with the intrinsics of `start`; None: prior if it has a covariance, or held."""
+    port_distance_mm: float | None = None
+    """First value; it is found."""
+    glass_mm: float | None = None
+    """Thickness."""
+    glass_sigma_mm: float | None = None
+    """The thickness is found too, known this well; the indices below in the same way."""
+    n_glass: float | None = None
+    n_glass_sigma: float | None = None
+    n_water: float | None = None
+    n_water_sigma: float | None = None
+    carry_to_n: float | None = None
+    """Also write the rig in water of this index."""
+
+    def places(self) -> dict[str, str]:
+        """Folder or pattern by camera; the first is the reference.
+
+        Raises:
+            CalibrationError: they are missing or do not go together.
+        """
+        stereo = {"left": self.left, "right": self.right}
+        given = {camera: place for camera, place in stereo.items() if place is not None}
+        if self.pictures is not None:
+            if given:
+                raise CalibrationError("give --left and --right, or --pictures, not both")
+            return {ONE_CAMERA: self.pictures}
+        if len(given) == 1:
+            raise CalibrationError(
+                "give both --left and --right, or --pictures for a single camera"
+            )
+        if not given:
+            raise CalibrationError(
+                "these options are for pictures: give --left and --right, or --pictures; the pool "
+                "of a survey takes none of them"
+            )
+        return given
+
+
+def calibrate_pictures(
+    settings: CalibrateOptions, executor: Executor | None = None
+) -> tuple[str, dict[str, Any]]:
+    """Calibrate from pictures and write a folder of results.
+
+    Returns:
+        What was found, as text and as JSON values.
+
+    Raises:
+        CalibrationError: the pictures, the target or the settings do not give a calibration.
+    """
+    places, output = settings.places(), settings.output
+    if settings.target is None:
+        raise CalibrationError("--target is missing: what is seen, such as 'chessboard 9x6 25mm'")
+    if output is None:
+        raise CalibrationError("-o is missing: the folder to write the calibration into")
+    _check_output(output, settings.start)
+    target = parse_target(settings.target)
+    intrinsics(settings.lens)
+    start = None if settings.start is None else read_rig(settings.start)
+    _check_settings(settings, start)
+    lists = {camera: find_pictures(place) for camera, place in places.items()}
+    with _replacing(output) as partial:
+        found = detect_views(pair_pictures(lists), target, executor or local_executor())
+        warn_of_unseen(found)
+        calibration = finish(partial, _calibrated(settings, found, target, start), found)
+        _check_sides(calibration.rig)
+        if settings.carry_to_n is not None:
+            write_rig(partial / "rig_carried.json", carried(calibration.rig, settings.carry_to_n))
+    verdicts = read_json(output / "report.json")["verdicts"]
+    text = calibration_text(calibration, target, verdicts)
+    return "\n".join([text, *_next(calibration, output, settings)]), summary(calibration)
+
+
+def carried(rig: Rig, n_water: float) -> Rig:
+    """The rig in other water, which says so."""
+    old = next(iter(rig.cameras.values())).n_water
+    return replace(
+        rig.in_water(n_water),
+        source=f"{rig.source}, carried from water of index {old:g} to {n_water:g}",
+    )
+
+
+def _check_settings(settings: CalibrateOptions, start: Rig | None) -> None:
+    ports = {
+        "--port-distance": settings.port_distance_mm,
+        "--glass": settings.glass_mm,
+        "--glass-sigma": settings.glass_sigma_mm,
+        "--n-glass": settings.n_glass,
+        "--n-glass-sigma": settings.n_glass_sigma,
+        "--n-water": settings.n_water,
+        "--n-water-sigma": settings.n_water_sigma,
+        "--carry-to-n": settings.carry_to_n,
+        "--intrinsics": settings.known,
+    }
+    if not settings.water:
+        given = [name for name, value in ports.items() if value is not None]
+        if given:
+            raise CalibrationError(f"{', '.join(given)} need --water: pictures in air see no port")
+        return
+    if settings.known in ("held", "prior") and start is None:
+        raise CalibrationError(
+            f"--intrinsics {settings.known} needs --start, the rig.json of a calibration in air"
+        )
+    if settings.glass_mm is None:
+        thin = start is None or all(c.glass_thickness_m == 0.0 for c in start.cameras.values())
+        if thin:
+            raise CalibrationError(
+                "--water needs --glass, the thickness of the port in mm (0 for a thin film)"
+            )
+
+
+def _calibrated(
+    settings: CalibrateOptions, found: Detections, target: Target, start: Rig | None
+) -> Calibration:
+    points, lens = target.points, settings.lens
+    cameras = _first(settings, found.sizes, start)
+    known = settings.known
+    if start is not None:
+        start = replace(_matching(start, found.sizes), cameras=cameras)
+        known = known or ("held" if start.covariance is None else "prior")
+    views = found.views
+    if target.is_ambiguous and len(cameras) > 1:
+        near = cameras if start is not None else first_cameras(views, points, cameras, lens)
+        views = tuple(same_numbering(near, views, points, target.symmetries))
+    if not settings.water:
+        return calibrate_in_air(views, points, found.sizes, lens, start)
+    known_to = {
+        "glass_thickness_m": _metres(settings.glass_sigma_mm),
+        "n_glass": settings.n_glass_sigma,
+        "n_water": settings.n_water_sigma,
+    }
+    sigmas = {
+        f"{name}.{parameter}": sigma
+        for name in cameras
+        for parameter, sigma in known_to.items()
+        if sigma is not None
+    }
+    if start is None or known is None:
+        return calibrate_in_water_alone(views, points, cameras, lens, sigmas)
+    return calibrate_through_ports(views, points, start, known, lens, sigmas)
+
+
+def _first(
+    settings: CalibrateOptions, sizes: Mapping[str, Size], start: Rig | None
+) -> dict[str, FlatPortCamera]:
+    """Cameras of the start, or blank ones, in air or behind the port that the user names."""
+    if start is not None:
+        given = _matching(start, sizes).cameras
+        prepare = _behind_port if settings.water else _bare
+        return {name: prepare(camera, settings) for name, camera in given.items()}
+    if not settings.water:
+        bare = {"n_water": 1.0, "port_distance_m": 0.0, "glass_thickness_m": 0.0}
+        return {name: blank_camera(size, **bare) for name, size in sizes.items()}
+    port_m, thickness_m = _metres(settings.port_distance_mm), _metres(settings.glass_mm)
+    return {
+        name: blank_camera(
+            size,
+            n_water=_FRESH_WATER if settings.n_water is None else settings.n_water,
+            n_glass=_GLASS if settings.n_glass is None else settings.n_glass,
+            port_distance_m=_GUESSED_PORT_M if port_m is None else port_m,
+            glass_thickness_m=0.0 if thickness_m is None else thickness_m,
+        )
+        for name, size in sizes.items()
+    }
+
+
+def _metres(length_mm: float | None) -> float | None:
+    return None if length_mm is None else length_mm / 1e3
+
+
+def _bare(camera: FlatPortCamera, _: CalibrateOptions) -> FlatPortCamera:
+    """A camera out of its housing."""
+    return replace(
+        camera, n_water=1.0, port_distance_m=0.0, glass_thickness_m=0.0, normal=(0.0, 0.0, 1.0)
+    )
+
+
+def _behind_port(camera: FlatPortCamera, settings: CalibrateOptions) -> FlatPortCamera:
+    """A camera of the start behind the port and in the water that the user names."""
+    given = {
+        "glass_thickness_m": _metres(settings.glass_mm),
+        "n_glass": settings.n_glass,
+        "n_water": settings.n_water,
+        "port_distance_m": _metres(settings.port_distance_mm),
+    }
+    if settings.n_water is None and camera.n_water == 1.0:
+        given["n_water"] = _FRESH_WATER
+    if settings.port_distance_mm is None and camera.port_distance_m == 0.0:
+        given["port_distance_m"] = _GUESSED_PORT_M
+    return camera.with_parameters({k: v for k, v in given.items() if v is not None})
+
+
+def _matching(start: Rig, sizes: Mapping[str, Size]) -> Rig:
+    """The cameras of a start that are calibrated, if its pictures have the same size."""
+    if not set(sizes) <= set(start.cameras):
+        raise CalibrationError(
+            f"the start has cameras {', '.join(start.cameras)}; pictures are of {', '.join(sizes)}"
+        )
+    for name, size in sizes.items():
+        camera = start.cameras[name]
+        if (camera.width_px, camera.height_px) != size:
+            raise CalibrationError(
+                f"pictures of {name} have {size[0]} x {size[1]} px, the start's camera "
+                f"{camera.width_px} x {camera.height_px}"
+            )
+    names = list(sizes)
+    to_first = start.cam_from_rig[names[0]].inv()
+    return replace(
+        start,
+        cameras={name: start.cameras[name] for name in names},
+        cam_from_rig={name: start.cam_from_rig[name] * to_first for name in names},
+        body_from_rig=start.body_from_cam(names[0]),
+    )
+
+
+def _next(calibration: Calibration, output: Path, settings: CalibrateOptions) -> list[str]:
+    """Where the results are, and what to do with them."""
+    rig = shlex.quote(str(output / "rig.json"))
+    lines = [f"rig in {output / 'rig.json'}; read {output / 'report.html'}"]
+    if settings.carry_to_n is not None:
+        lines.append(f"in water of index {settings.carry_to_n:g}: {output / 'rig_carried.json'}")
+    if settings.water:
+        lines.append(f"next: alice-survey camera uncertainty {rig}")
+    else:
+        places = "--pictures P" if ONE_CAMERA in calibration.rig.cameras else "--left L --right R"
+        lines.append(
+            f"next, behind ports, with pictures under water: alice-survey calibrate {places} "
+            f"--target T --water --glass MM --start {rig} -o DIR"
+        )
+    return lines
+
+
+def _check_sides(rig: Rig) -> None:
+    """Warn when the pictures of the two cameras seem to be swapped."""
+    if set(rig.cameras) != {"left", "right"}:
+        return
+    x, y, z = (1e3 * rig.cam_from_rig["right"].inv().translation).tolist()
+    if x < -max(abs(y), abs(z)):
+        warn(
+            f"the right camera stands {-x:.0f} mm to the left of the left one: swap --left and "
+            "--right, unless the cameras hang upside down"
+        )
+
+
+def _check_output(output: Path, start: Path | None) -> None:
+    """Refuse what is not a folder of this command before the work starts.
+
+    Raises:
+        WorkspaceError: it cannot be written or would take something with it.
+    """
+    if not output.name or output.name == "..":
+        raise WorkspaceError(f"-o {output}: name a folder of its own, such as -o air")
+    if not output.exists():
+        return
+    if not output.is_dir():
+        raise WorkspaceError(f"{output} is a file: name a folder with -o")
+    others = sorted(path.name for path in output.iterdir() if path.name not in _WRITTEN)
+    if others:
+        raise WorkspaceError(
+            f"{output} holds other files (such as {others[0]}): choose another folder with -o"
+        )
+    if start is not None and start.resolve().parent == output.resolve():
+        raise WorkspaceError(
+            f"{output} holds the rig of --start, which would be replaced: choose another folder "
+            "with -o"
+        )
+
+
+@contextlib.contextmanager
+def _replacing(output: Path) -> Iterator[Path]:
+    """A folder to write to that takes the place of `output` when all went well."""
+    partial = output.with_name(f"{output.name}.partial")
+    if partial.exists():
+        shutil.rmtree(partial)
+    partial.mkdir(parents=True)
+    try:
+        yield partial
+        if output.exists():
+            shutil.rmtree(output)
+        partial.rename(output)
+    finally:
+        if partial.exists():
+            shutil.rmtree(partial)
+
+
+def calibration_text(
+    calibration: Calibration, target: Target, verdicts: Sequence[Mapping[str, str]]
+) -> str:
+    """Fit, baseline, lenses, ports and verdicts of a calibration; lengths in millimetres.
+
+    Args:
+        calibration: with its rig's covariance.
+        target: whose squares or tags are a measure for the baseline.
+        verdicts: `level` and `text` of each, the worst first, as in `report.json`.
+    """
+    rig, square = calibration.rig, (calibration.residuals_px**2).sum(axis=-1)
+    lines = [
+        f"{len(calibration.views)} views, {int(np.isfinite(square).sum())} points, "
+        f"{calibration.rms_px:.3f} px rms (noise {calibration.noise_px:.3f} px)",
+        *_baseline_lines(rig, target),
+    ]
+    for name in rig.cameras:
+        lines += _camera_lines(rig, name)
+    lines += _verdict_lines(verdicts, len(calibration.warnings))
+    return "\n".join(lines)
+
+
+def _baseline_lines(rig: Rig, target: Target) -> Iterator[str]:
+    for name in list(rig.cameras)[1:]:
+        length_m = float(np.linalg.norm(rig.cam_from_rig[name].translation))
+        sigma_m = baseline_sigma_m(rig, name)
+        unit = "tags" if target.kind == "apriltag" else "squares"
+        yield (
+            f"baseline {with_sigma(1e3 * length_m, 1e3 * sigma_m)} mm = "
+            f"{with_sigma(length_m / target.size_m, sigma_m / target.size_m)} {unit} of "
+            f"{1e3 * target.size_m:g} mm"
+        )
+
+
+def _camera_lines(rig: Rig, name: str) -> Iterator[str]:
+    camera, sigmas = rig.cameras[name], rig.sigmas
+
+    def stated(field: str, unit: str, scale: float = 1.0) -> str:
+        number, sigma = scale * camera.parameter(field), sigmas.get(f"{name}.{field}")
+        if sigma is None:
+            return f"{number:.6g}{unit} (held)"
+        return f"{with_sigma(number, scale * sigma)}{unit}"
+
+    yield f"{name}: focal lengths {stated('fx_px', ' px')}, {stated('fy_px', ' px')}"
+    if camera.n_water == 1.0 and camera.port_distance_m == camera.glass_thickness_m == 0.0:
+        return
+    tilt_deg, sigma_deg = port_tilt_deg(rig, name)
+    tilt = f"{tilt_deg:.3g} deg (held)" if sigma_deg is None else with_sigma(tilt_deg, sigma_deg)
+    yield (
+        f"{name} port: {stated('port_distance_m', ' mm', 1e3)} from the pupil, tilt "
+        f"{tilt}{'' if sigma_deg is None else ' deg'}, glass "
+        f"{stated('glass_thickness_m', ' mm', 1e3)}, index {stated('n_glass', '')}, water "
+        f"{stated('n_water', '')}"
+    )
+
+
+def port_tilt_deg(rig: Rig, name: str) -> tuple[float, float | None]:
+    """Angle between a port's normal and the camera's axis, and its sigma; None where held.
+
+    Of a port without tilt the direction of an error is open; its sigma is the larger of the two.
+    """
+    x, y, z = rig.cameras[name].normal
+    sine = math.hypot(x, y)
+    fields = [f"{name}.normal_x", f"{name}.normal_y"]
+    tilt_deg = math.degrees(math.atan2(sine, z))
+    if rig.covariance is None or not set(fields) <= set(rig.covariance.parameters):
+        return tilt_deg, None
+    at = [rig.covariance.parameters.index(field) for field in fields]
+    block = rig.covariance.matrix[np.ix_(at, at)]
+    if sine == 0.0:
+        variance = float(np.linalg.eigvalsh(block)[-1])
+    else:
+        along = np.array([x, y]) / sine
+        variance = float(along @ block @ along)
+    return tilt_deg, math.degrees(math.sqrt(max(variance, 0.0)) / z)
+
+
+def _verdict_lines(verdicts: Sequence[Mapping[str, str]], warnings: int) -> Iterator[str]:
+    counts = Counter(verdict["level"] for verdict in verdicts)
+    words = [f"{counts[level]} {level}" for level in _LEVELS if counts[level]]
+    yield f"verdicts: {', '.join(words)}; {warnings} warnings"
+    for verdict in verdicts:
+        if verdict["level"] != "good":
+            yield f"  {verdict['level']}: {verdict['text']}"

@@ -1,1 +1,0 @@
-"""Fixed cameras that look into water through one flat interface: poses, points, plots."""

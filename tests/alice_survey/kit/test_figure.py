@@ -1,0 +1,106 @@
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alice_survey.kit.document import ShapeLayer, SurveyMap
+from alice_survey.kit.figure import (
+    figure_style,
+    map_axes,
+    new_figure,
+    palette_colours,
+    palette_steps,
+    png_of,
+    save_figure,
+    scale_bar,
+    svg_of,
+)
+from alice_survey.kit.map_figure import flat_picture, map_figures, with_stills
+from alice_survey.kit.page import png_size
+from tests.alice_survey.kit.sketch import picture_layer, seafloor, sketch_map
+
+
+@figure_style()
+def sine() -> object:
+    sheet = new_figure(2.0, 4.0)
+    axes = sheet.subplots()
+    axes.plot(np.sin(np.linspace(0, 6, 50)))
+    axes.set(xlabel="x, m")
+    return sheet
+
+
+@pytest.mark.parametrize("suffix", ["png", "svg", "pdf"])
+def test_the_same_numbers_give_the_same_bytes(tmp_path: Path, suffix: str) -> None:
+    paths = [tmp_path / f"{name}.{suffix}" for name in "ab"]
+    for path in paths:
+        save_figure(sine(), path)
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+
+
+def test_the_style_ends_with_the_figure() -> None:
+    import matplotlib as mpl
+
+    before = dict(mpl.rcParams)
+    sine()
+    assert dict(mpl.rcParams) == before
+
+
+def test_vectors_keep_text_and_pixels_their_size() -> None:
+    assert b">x, m</text>" in svg_of(sine())
+    assert png_size(png_of(sine(), dpi=100)) == (400, 200)
+
+
+def test_a_scale_bar_is_as_long_as_it_says() -> None:
+    sheet = new_figure(3.0)
+    axes = sheet.subplots()
+    axes.set(xlim=(100.0, 137.0), ylim=(0.0, 20.0))
+    scale_bar(axes)
+    (bar,) = axes.lines
+    length = float(np.ptp(bar.get_xdata()))
+    assert axes.texts[0].get_text() == f"{length:g} m" == "5 m"
+    assert 100 < bar.get_xdata()[0] < 110
+    map_axes(axes)
+    assert axes.get_xlim() == (100.0, 137.0)
+    assert "N" in [text.get_text() for text in axes.texts]
+
+
+def test_palettes_run_from_their_first_colour_to_their_last() -> None:
+    steps = palette_steps("viridis", 5)
+    ends = palette_colours("viridis", np.array([0.0, 1.0]))
+    assert (steps[0], steps[-1]) == ("#440154", "#fde725")
+    np.testing.assert_allclose(ends, [(0x44, 0x01, 0x54, 255), (0xFD, 0xE7, 0x25, 255)], atol=1)
+
+
+def test_a_flat_picture_shows_every_tile_on_white() -> None:
+    floor = seafloor(700, 500)
+    layer = picture_layer("mosaic", "Mosaic", floor)
+    found = flat_picture(layer)
+    assert found.shape == (500, 700, 3)
+    difference = found.astype(int) - np.asarray(floor).astype(int)
+    assert abs(difference.mean()) < 0.5
+    assert np.abs(difference).mean() < 6  # of JPEG
+    assert flat_picture(layer, most_px=400).shape == (250, 350, 3)
+    clear = floor.convert("RGBA")
+    clear.putalpha(0)
+    assert (flat_picture(picture_layer("c", "C", clear)) == 255).all()
+
+
+def test_every_base_picture_has_its_map_in_print() -> None:
+    survey_map = with_stills(sketch_map(600))
+    assert [figure.title for figure in survey_map.stills] == ["Mosaic", "Height", "Its sigma"]
+    height = survey_map.stills[1].svg.decode()
+    texts = set(re.findall(r">([^<>]+)</text>", height))
+    assert {"east, m", "north, m", "height above the datum, m"} <= texts
+    numbers = [float(t.replace("−", "-")) for t in texts if re.fullmatch(r"−?1[45]\.\d", t)]
+    assert len(numbers) >= 3 and min(numbers) >= -15.4 and max(numbers) <= -14.8
+    assert "data:image/jpeg" in survey_map.stills[0].svg.decode()
+
+
+def test_a_map_of_shapes_alone_is_drawn() -> None:
+    square = ShapeLayer(
+        name="area", title="Area", about="", kind="polygon", shapes=[[(0, 0), (1, 0), (1, 1)]]
+    )
+    (figure,) = map_figures(SurveyMap(layers=[square], unit="m", origin=""))
+    assert figure.title == "Area"
+    assert png_size(figure.png)[0] > 300

@@ -1,0 +1,383 @@
+"""Calibration from pictures: a real set, a simulated pool, and what users get wrong."""
+
+import csv
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform
+
+from alice_survey.base.errors import AliceError, CalibrationError
+from alice_survey.base.executor import SERIAL
+from alice_survey.seafloor.board import PoolBoard, board_records, pool_poses, render_board
+from camera_calib.calibrate.detect_views import detect_views
+from camera_calib.calibrate.from_pictures import (
+    CalibrateOptions,
+    calibrate_pictures,
+    carried,
+)
+from camera_calib.calibrate.picture_sets import find_pictures, pair_pictures
+from camera_calib.rig import Rig, read_rig, write_rig
+from camera_calib.targets.target import parse_target
+from tests.camera_calib.calibration_scenes import built_rig, in_air
+
+BOARD = "chessboard 9x6 1m"
+
+
+def small(rig: Rig) -> Rig:
+    """The same rig at a sixth of the resolution."""
+    return Rig(
+        cameras={name: camera.reduced(6) for name, camera in rig.cameras.items()},
+        cam_from_rig=rig.cam_from_rig,
+        body_from_rig=rig.body_from_rig,
+        source="truth",
+    )
+
+
+def shoot(folder: Path, rig: Rig, views: int, seed: int) -> None:
+    """Pictures of the pool's board, without noise, as `left/00.png`, `right/00.png`, ..."""
+    board = PoolBoard()
+    poses = pool_poses(board, rig, views, np.random.default_rng(seed))
+    for view, by_camera in enumerate(board_records(rig, poses)):
+        for name, pose in by_camera.items():
+            light = render_board(board, rig.cameras[name], pose, 3)
+            picture = np.clip(255.0 * light.mean(axis=2) ** (1 / 2.2), 0, 255).astype(np.uint8)
+            (folder / name).mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(folder / name / f"{view:02d}.png"), picture)
+
+
+@pytest.fixture(scope="module")
+def truth() -> Rig:
+    return small(built_rig())
+
+
+@pytest.fixture(scope="module")
+def dry(truth: Rig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("dry")
+    shoot(folder, in_air(truth), 12, 1)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def wet(truth: Rig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wet")
+    shoot(folder, truth, 12, 2)
+    return folder
+
+
+def both(folder: Path) -> dict[str, str]:
+    return {"left": str(folder / "left"), "right": str(folder / "right")}
+
+
+POOL_BOARD = "chessboard 11x8 40mm"
+
+
+@pytest.fixture(scope="module")
+def real(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, Any]:
+    """13 pairs of OpenCV's samples, calibrated: the folder, the text and the numbers."""
+    folder, out = shared_data / "opencv_stereo", tmp_path_factory.mktemp("real") / "out"
+    pictures = {side: str(folder / f"{side}*.jpg") for side in ("left", "right")}
+    settings = CalibrateOptions(**pictures, target=BOARD)
+    return out, *calibrate_pictures(replace(settings, output=out), executor=SERIAL)
+
+
+def test_a_real_stereo_set(real: tuple[Path, str, Any]) -> None:
+    """OpenCV's own calibration of the set has 0.215 px and 3.327 squares."""
+    folder, text, found = real
+    assert 0.10 < found["rms_px"] <= 0.22
+    assert found["points"] > 0.98 * 2 * 13 * 54
+    assert found["baseline_m"] == pytest.approx(3.33, abs=0.01)
+    rig = read_rig(folder / "rig.json")
+    assert rig.cameras["left"].fx_px == pytest.approx(533.4, abs=2.0)
+    assert rig.cameras["right"].fx_px == pytest.approx(537.0, abs=2.0)
+    assert 0.1 < rig.sigmas["left.fx_px"] < 1.0
+    assert 1e-4 < rig.sigmas["right.x_m"] < 5e-3
+    assert "13 views" in text
+
+    # OpenCV's own definition of the rms, from the file of corners.
+    with (folder / "corners.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    used = [row for row in rows if float(row["weight"]) > 0]
+    square = [float(r["residual_x_px"]) ** 2 + float(r["residual_y_px"]) ** 2 for r in used]
+    assert np.sqrt(np.mean(square)) == pytest.approx(found["rms_px"], abs=1e-5)
+    assert len(used) == found["points"]
+    report = (folder / "report.html").read_text()
+    assert "<html" in report
+    assert json.loads((folder / "calibration.json").read_text()) == found
+
+
+def test_opencv_agrees_on_the_real_set(real: tuple[Path, str, Any]) -> None:
+    """The same corners in cv2.stereoCalibrate give the same rig, within three sigmas."""
+    folder, _, found = real
+    rig = read_rig(folder / "rig.json")
+    seen: dict[tuple[str, str], np.ndarray] = {}
+    with (folder / "corners.csv").open() as file:
+        for row in csv.DictReader(file):
+            pixels = seen.setdefault((row["view"], row["camera"]), np.full((54, 2), np.nan))
+            pixels[int(row["point"])] = float(row["x_px"]) - 0.5, float(row["y_px"]) - 0.5
+    y, x = np.mgrid[:6, :9]
+    points = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3).astype(np.float32)
+    names = sorted({view for view, _ in seen})
+    whole = [n for n in names if all(np.isfinite(seen[n, c]).all() for c in ("left", "right"))]
+    left, right = (
+        [seen[n, c].astype(np.float32)[:, None] for n in whole] for c in ("left", "right")
+    )
+    objects = [points] * len(whole)
+    alone = [cv2.calibrateCamera(objects, p, (640, 480), None, None) for p in (left, right)]
+    rms, k1, _, k2, _, _, shift, *_ = cv2.stereoCalibrate(
+        objects, left, right, alone[0][1], alone[0][2], alone[1][1], alone[1][2], (640, 480),
+        flags=cv2.CALIB_USE_INTRINSIC_GUESS,
+    )  # fmt: skip
+    assert rms == pytest.approx(found["rms_px"], abs=0.01)
+    sigmas = rig.sigmas
+    for name, matrix in (("left", k1), ("right", k2)):
+        camera = rig.cameras[name]
+        assert abs(camera.fx_px - matrix[0, 0]) < 3 * sigmas[f"{name}.fx_px"]
+        assert abs(camera.cx_px - 0.5 - matrix[0, 2]) < 3 * sigmas[f"{name}.cx_px"]
+    assert abs(rig.baseline_m - np.linalg.norm(shift)) < 3 * sigmas["right.x_m"]
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A report without plots, which take seconds."""
+
+    def without_plots(folder: Path, *_: object) -> None:
+        (folder / "report.json").write_text('{"verdicts": []}')
+
+    monkeypatch.setattr("camera_calib.calibrate.files.write_report", without_plots)
+
+
+@pytest.mark.usefixtures("quick")
+def test_from_dry_pictures_to_the_sea(dry: Path, wet: Path, truth: Rig, tmp_path: Path) -> None:
+    """In air, then through the ports with the air's knowledge, then carried to the sea."""
+    air = CalibrateOptions(**both(dry), target=POOL_BOARD, lens="opencv5")
+    calibrate_pictures(replace(air, output=tmp_path / "air"), executor=SERIAL)
+    pool = CalibrateOptions(
+        **both(wet), target=POOL_BOARD, water=True, start=tmp_path / "air" / "rig.json",
+        glass_mm=10.0, carry_to_n=1.342,
+    )  # fmt: skip
+    text, found = calibrate_pictures(replace(pool, output=tmp_path / "pool"), executor=SERIAL)
+
+    assert "left port: " in text
+    assert "camera uncertainty" in text
+    assert found["with_prior"][0] == "left.fx_px"
+    rig = read_rig(tmp_path / "pool" / "rig.json")
+    for name, camera in rig.cameras.items():
+        true = truth.cameras[name]
+        assert camera.n_water == 1.34
+        assert camera.port_distance_m == pytest.approx(true.port_distance_m, abs=2e-3)
+        assert np.arccos(np.dot(camera.normal, true.normal)) < np.deg2rad(0.2)
+        assert camera.fx_px == pytest.approx(true.fx_px, abs=0.3)
+    assert rig.baseline_m == pytest.approx(truth.baseline_m, abs=5e-5)
+
+    sea = read_rig(tmp_path / "pool" / "rig_carried.json")
+    assert {camera.n_water for camera in sea.cameras.values()} == {1.342}
+    assert sea.cameras["left"].fx_px == rig.cameras["left"].fx_px
+    assert "carried from water of index 1.34 to 1.342" in sea.source
+    assert sea.sigmas == rig.sigmas
+
+
+@pytest.mark.usefixtures("quick")
+def test_one_camera(dry: Path, truth: Rig, tmp_path: Path) -> None:
+    options = CalibrateOptions(
+        pictures=str(dry / "left"), target=POOL_BOARD, output=tmp_path / "one", lens="k2"
+    )
+    text, found = calibrate_pictures(options, executor=SERIAL)
+    rig = read_rig(tmp_path / "one" / "rig.json")
+    assert list(rig.cameras) == ["camera"]
+    assert rig.cameras["camera"].fx_px == pytest.approx(truth.cameras["left"].fx_px, abs=0.5)
+    assert found["baseline_m"] is None
+    assert "baseline" not in text
+
+
+@pytest.mark.usefixtures("quick")
+def test_corrupt_pictures_and_pictures_without_the_board_are_left_out(
+    dry: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(dry, tmp_path / "in")
+    (tmp_path / "in" / "left" / "03.png").write_bytes(b"no picture")
+    empty = np.full((451, 564), 128, dtype=np.uint8)
+    cv2.imwrite(str(tmp_path / "in" / "right" / "05.png"), empty)
+    settings = CalibrateOptions(**both(tmp_path / "in"), target=POOL_BOARD)
+
+    _, found = calibrate_pictures(replace(settings, output=tmp_path / "out"), executor=SERIAL)
+
+    shown = capsys.readouterr().err.splitlines()
+    assert sum("03.png cannot be decoded" in line for line in shown) == 1
+    assert sum("view 05, right" in line for line in shown) == 1
+    whole = {(r["view"], r["camera"]) for r in found["rejections"] if r["points"] == 0}
+    assert whole == {("03", "left"), ("05", "right")}
+    assert found["views"] == 12
+
+
+def test_pictures_that_are_cut_short_or_of_another_kind_are_named(
+    dry: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for view in range(3):
+        picture = cv2.imread(str(dry / "left" / f"{view:02d}.png"))
+        cv2.imwrite(str(folder / f"{view}.jpg"), picture)
+    whole = (folder / "1.jpg").read_bytes()
+    (folder / "1.jpg").write_bytes(whole[: len(whole) * 2 // 3])
+    cv2.imwrite(str(folder / "3.tif"), np.zeros((451, 564), dtype=np.float32))
+    sets = pair_pictures({"camera": find_pictures(str(folder))})
+
+    found = detect_views(sets, parse_target(POOL_BOARD), executor=SERIAL)
+
+    assert [view.name for view in found.views] == ["0", "2"]
+    reasons = {r.view: r.reason for r in found.rejections if not r.points}
+    assert reasons["1"] == "the file is cut short"
+    assert "float32" in reasons["3"]
+
+
+def refuses(settings: CalibrateOptions, tmp_path: Path) -> str:
+    with pytest.raises(AliceError) as caught:
+        calibrate_pictures(replace(settings, output=tmp_path / "out"), executor=SERIAL)
+    assert len(str(caught.value).splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+    assert not (tmp_path / "out.partial").exists()
+    return str(caught.value)
+
+
+def write_noise(folder: Path, names: list[str], size: tuple[int, int] = (120, 90)) -> None:
+    folder.mkdir(parents=True)
+    rng = np.random.default_rng(1)
+    for name in names:
+        cv2.imwrite(str(folder / name), rng.integers(0, 255, size[::-1], dtype=np.uint8))
+
+
+def test_no_board_in_any_picture(tmp_path: Path) -> None:
+    write_noise(tmp_path / "a", ["1.png", "2.png"])
+    settings = CalibrateOptions(pictures=str(tmp_path / "a"), target=BOARD)
+    message = refuses(settings, tmp_path)
+    assert "found in none of the 2 pictures of camera" in message
+
+
+@pytest.mark.parametrize("wrong", ["chessboard 12x8 40mm", "chessboard 6x5 40mm"])
+def test_a_board_of_another_size(wrong: str, dry: Path, tmp_path: Path) -> None:
+    for view in range(3):
+        (tmp_path / "few").mkdir(exist_ok=True)
+        shutil.copy(dry / "left" / f"{view:02d}.png", tmp_path / "few")
+    settings = CalibrateOptions(pictures=str(tmp_path / "few"), target=wrong)
+    message = refuses(settings, tmp_path)
+    assert "11x8" in message
+    assert wrong.split()[1] in message
+
+
+def test_mixed_sizes(dry: Path, tmp_path: Path) -> None:
+    shutil.copytree(dry / "left", tmp_path / "mixed")
+    odd = cv2.imread(str(tmp_path / "mixed" / "04.png"))
+    cv2.imwrite(str(tmp_path / "mixed" / "04.png"), odd[:-20, :-30])
+    settings = CalibrateOptions(pictures=str(tmp_path / "mixed"), target=POOL_BOARD)
+    message = refuses(settings, tmp_path)
+    assert "11 of 564 x 451 px, 1 of 534 x 431 px (such as 04.png)" in message
+
+
+def test_lists_that_do_not_pair(tmp_path: Path) -> None:
+    write_noise(tmp_path / "a", ["dive_a.png", "dive_b.png"])
+    write_noise(tmp_path / "b", ["x.png", "y.png", "z.png"])
+    settings = CalibrateOptions(left=str(tmp_path / "a"), right=str(tmp_path / "b"), target=BOARD)
+    assert "2 of left (dive_a.png, dive_b.png), 3 of right" in refuses(settings, tmp_path)
+
+
+def test_a_place_without_pictures(tmp_path: Path) -> None:
+    settings = CalibrateOptions(pictures=str(tmp_path / "none*.png"), target=BOARD)
+    assert "no pictures at" in refuses(settings, tmp_path)
+
+
+def test_a_start_of_another_size(dry: Path, tmp_path: Path) -> None:
+    write_rig(tmp_path / "rig.json", built_rig())
+    settings = CalibrateOptions(
+        **both(dry), target=POOL_BOARD, water=True, start=tmp_path / "rig.json"
+    )
+    assert "564 x 451 px, the start's camera 3384 x 2710" in refuses(settings, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        ({"glass_mm": 10.0}, "--glass need"),
+        ({"water": True}, "--glass, the thickness"),
+        ({"water": True, "known": "prior", "glass_mm": 10.0}, "needs --start"),
+        ({"lens": "fisheye"}, "no lens model"),
+        ({"target": "chessboard"}, "chessboard"),
+        ({"start": Path("nowhere.json")}, "nowhere.json"),
+    ],
+)
+def test_options_that_do_not_go_together(
+    options: dict[str, object], what: str, dry: Path, tmp_path: Path
+) -> None:
+    fields: dict[str, object] = {**both(dry), "target": POOL_BOARD, **options}
+    assert what in refuses(CalibrateOptions(**fields), tmp_path)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("given", "what"),
+    [
+        ({"left": "a"}, "both --left and --right"),
+        ({"left": "a", "right": "b", "pictures": "c"}, "not both"),
+        ({"pictures": "c", "target": None}, "--target is missing"),
+        ({"pictures": "c", "output": None}, "-o is missing"),
+    ],
+)
+def test_commands_that_lack_something(given: dict[str, object], what: str) -> None:
+    options: dict[str, object] = {"target": BOARD, "output": Path("out"), **given}
+    with pytest.raises(CalibrationError, match=what):
+        calibrate_pictures(CalibrateOptions(**options))  # type: ignore[arg-type]
+
+
+def test_a_folder_with_other_files_is_not_overwritten(dry: Path, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thesis.tex").write_text("years of work")
+    settings = CalibrateOptions(**both(dry), target=POOL_BOARD)
+    with pytest.raises(AliceError, match="holds other files"):
+        calibrate_pictures(replace(settings, output=tmp_path / "out"), executor=SERIAL)
+    (tmp_path / "out" / "calibration.json").write_text("{}")
+    with pytest.raises(AliceError, match=r"such as thesis\.tex"):
+        calibrate_pictures(replace(settings, output=tmp_path / "out"), executor=SERIAL)
+    assert (tmp_path / "out" / "thesis.tex").read_text() == "years of work"
+
+
+def test_a_place_that_cannot_be_a_folder_is_refused_at_once(tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("mine")
+    settings = CalibrateOptions(pictures=str(tmp_path), target=BOARD)
+    for output, said in ((tmp_path / "taken", "is a file"), (Path(), "folder of its own")):
+        with pytest.raises(AliceError, match=said):
+            calibrate_pictures(replace(settings, output=output), executor=SERIAL)
+    assert (tmp_path / "taken").read_text() == "mine"
+
+
+def test_a_start_is_not_replaced_by_what_it_gives(tmp_path: Path) -> None:
+    (tmp_path / "air").mkdir()
+    write_rig(tmp_path / "air" / "rig.json", built_rig())
+    settings = CalibrateOptions(
+        pictures="nowhere", target=BOARD, start=tmp_path / "air" / "rig.json"
+    )
+    with pytest.raises(AliceError, match="rig of --start"):
+        calibrate_pictures(replace(settings, output=tmp_path / "air"), executor=SERIAL)
+    assert (tmp_path / "air" / "rig.json").is_file()
+
+
+@pytest.mark.usefixtures("quick")
+def test_swapped_lists_are_reported(
+    dry: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    swapped = {"left": str(dry / "right"), "right": str(dry / "left")}
+    for pictures, warnings in ((both(dry), 0), (swapped, 1)):
+        settings = CalibrateOptions(**pictures, target=POOL_BOARD, lens="k2")
+        calibrate_pictures(replace(settings, output=tmp_path / "out"), executor=SERIAL)
+        shown = capsys.readouterr().err
+        assert shown.count("the right camera stands 100 mm to the left of the left one") == warnings
+
+
+def test_a_rig_carried_to_other_water_says_so() -> None:
+    rig = carried(built_rig(), 1.345)
+    assert {camera.n_water for camera in rig.cameras.values()} == {1.345}
+    assert rig.source.endswith("from water of index 1.34 to 1.345")
+    assert isinstance(rig.body_from_rig, RigidTransform)

@@ -1,0 +1,310 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.base.errors import CalibrationError
+from benchmarks.absolute_pose import Sighting, absolute_pose, pose_information
+from benchmarks.camera_pose import PUBLISHED, run_level, simulated
+from camera_calib.flat_port import FlatPortCamera
+
+Array = np.ndarray
+
+CAMERA = FlatPortCamera(
+    width_px=1920,
+    height_px=1080,
+    fx_px=1297.0,
+    fy_px=1290.0,
+    cx_px=955.0,
+    cy_px=545.0,
+    k1=-0.1,
+    p1=0.001,
+    port_distance_m=0.03,
+    glass_thickness_m=0.02,
+    normal=(0.05, -0.03, math.sqrt(1 - 0.05**2 - 0.03**2)),
+)
+
+
+def sighting(
+    rng: np.random.Generator,
+    cam_from_world: RigidTransform,
+    *,
+    camera: FlatPortCamera = CAMERA,
+    count: int = 120,
+    noise_px: float = 0.0,
+) -> Sighting:
+    pixels = rng.uniform([0, 0], [camera.width_px, camera.height_px], (count, 2))
+    points_cam = camera.at_depth(pixels, rng.uniform(0.6, 4.0, count))
+    noisy = pixels + noise_px * rng.normal(size=pixels.shape)
+    return Sighting(
+        camera=camera, pixels=noisy, points_world=cam_from_world.inv().apply(points_cam)
+    )
+
+
+def random_pose(rng: np.random.Generator) -> RigidTransform:
+    return RigidTransform.from_components(3 * rng.normal(size=3), Rotation.random(rng=rng))
+
+
+def apart(first: RigidTransform, second: RigidTransform) -> tuple[float, float]:
+    """Angle (degrees) and distance (mm) of two poses."""
+    motion = first * second.inv()
+    return math.degrees(motion.rotation.magnitude()), 1e3 * float(
+        np.linalg.norm(motion.translation)
+    )
+
+
+@pytest.mark.parametrize("noise_px", [0.5, 2.0])
+def test_errors_reach_the_bound_and_beat_the_published_ones(noise_px: float) -> None:
+    level = run_level(noise_px, range(70))
+
+    assert level.misses() == []
+    assert level.mean_deg < PUBLISHED[noise_px][0] / 3
+    assert level.mean_mm < PUBLISHED[noise_px][1] / 3
+    assert 0.85 < level.rms_deg / level.bound_deg < 1.15
+    assert 0.85 < level.rms_mm / level.bound_mm < 1.15
+    assert 0.9 < level.by_bound < 1.1
+    assert 0.9 < level.by_sigma < 1.1
+    assert level.sigma_px == pytest.approx(noise_px, rel=0.03)
+    assert level.missed < 0.3
+    assert level.wrong < 0.3
+
+
+def test_without_noise_outliers_are_found_and_the_pose_is_exact() -> None:
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        seen, cam_from_world, right = simulated(rng, 0.0)
+
+        found = absolute_pose([seen], rng)
+
+        angle_deg, distance_mm = apart(cam_from_world, found.rig_from_world)
+        assert angle_deg < 1e-10
+        assert distance_mm < 1e-8
+        np.testing.assert_array_equal(found.inliers[0], right)
+
+
+def test_half_wrong_at_random_and_in_a_cluster() -> None:
+    rng = np.random.default_rng(3)
+    truth = random_pose(rng)
+    seen = sighting(rng, truth, count=200, noise_px=0.3)
+    pixels = seen.pixels.copy()
+    pixels[:60] = rng.uniform([0, 0], [1920, 1080], (60, 2))
+    pixels[60:100] += [40.0, 25.0]  # a second, consistent story, told by fewer
+
+    found = absolute_pose([replace(seen, pixels=pixels)], rng)
+
+    assert found.inliers[0][100:].sum() >= 98
+    assert found.inliers[0][:100].sum() <= 1
+    angle_deg, distance_mm = apart(truth, found.rig_from_world)
+    assert angle_deg < 5 * math.degrees(found.sigma_rotation_rad)
+    assert distance_mm < 5e3 * found.sigma_position_m
+    assert 0.25 < found.sigma_px < 0.36
+
+
+@pytest.mark.parametrize("ports", [(0.0, 0.0, 1.34), (0.0, 0.0, 1.0), (1e-9, 0.0, 1.34)])
+def test_a_port_without_depth_is_no_special_case(ports: tuple[float, float, float]) -> None:
+    rng = np.random.default_rng(4)
+    truth = random_pose(rng)
+    distance_m, glass_m, n_water = ports
+    camera = replace(CAMERA, port_distance_m=distance_m, glass_thickness_m=glass_m, n_water=n_water)
+
+    found = absolute_pose([sighting(rng, truth, camera=camera)], rng)
+
+    assert np.all(np.less(apart(truth, found.rig_from_world), (1e-9, 1e-7)))
+
+
+def test_two_cameras_of_a_rig_pose_it_together() -> None:
+    rng = np.random.default_rng(5)
+    rig_from_world = random_pose(rng)
+    right_from_rig = RigidTransform.from_components(
+        [-0.1, 0.002, 0.001], Rotation.from_rotvec([0.01, -0.03, 0.005])
+    )
+    right = replace(CAMERA, port_distance_m=0.012, fx_px=1400.0)
+    left_seen = sighting(rng, rig_from_world, noise_px=0.4)
+    right_seen = replace(
+        sighting(rng, right_from_rig * rig_from_world, camera=right, noise_px=0.4),
+        cam_from_rig=right_from_rig,
+    )
+    wrong = np.arange(120) % 4 == 0
+    both = [
+        replace(s, pixels=np.where(wrong[:, None], s.pixels[::-1], s.pixels))
+        for s in (left_seen, right_seen)
+    ]
+
+    found = absolute_pose(both, np.random.default_rng(1))
+    alone = absolute_pose(both[:1], np.random.default_rng(1))
+
+    for mask in found.inliers:
+        assert not mask[wrong].any()
+        assert mask[~wrong].sum() >= 88
+    angle_deg, distance_mm = apart(rig_from_world, found.rig_from_world)
+    assert angle_deg < 4 * math.degrees(found.sigma_rotation_rad) < 0.05
+    assert distance_mm < 4e3 * found.sigma_position_m < 2.0
+    assert found.sigma_position_m < 0.9 * alone.sigma_position_m
+
+
+def test_information_is_that_of_numeric_slopes() -> None:
+    rng = np.random.default_rng(6)
+    rig_from_world = random_pose(rng)
+    cam_from_rig = RigidTransform.from_components(
+        [0.1, -0.05, 0.02], Rotation.from_rotvec([0.1, 0.2, -0.1])
+    )
+    seen = replace(sighting(rng, cam_from_rig * rig_from_world), cam_from_rig=cam_from_rig)
+
+    def pixels(motion: Array) -> Array:
+        moved = RigidTransform.from_components(motion[3:], Rotation.from_rotvec(motion[:3]))
+        points_cam = (cam_from_rig * moved * rig_from_world).apply(seen.points_world)
+        return seen.camera.project(points_cam).ravel()
+
+    step = 1e-6
+    slopes = np.stack([(pixels(a) - pixels(-a)) / (2 * step) for a in step * np.eye(6)], axis=1)
+    expected = slopes.T @ slopes
+
+    found = pose_information(rig_from_world, [seen])
+
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_allclose(found / scale, expected / scale, atol=1e-7)
+
+
+def test_refinement_ends_where_another_solver_does() -> None:
+    rng = np.random.default_rng(7)
+    truth = random_pose(rng)
+    seen = sighting(rng, truth, count=40, noise_px=1.0)
+    found = absolute_pose([seen], rng)
+    keep = found.inliers[0]
+
+    def miss(motion: Array) -> Array:
+        moved = RigidTransform.from_components(motion[3:], Rotation.from_rotvec(motion[:3]))
+        points_cam = (moved * truth).apply(seen.points_world[keep])
+        return (seen.camera.project(points_cam) - seen.pixels[keep]).ravel()
+
+    other = least_squares(miss, np.zeros(6), xtol=1e-15, ftol=1e-15, gtol=1e-15)
+
+    expected = (
+        RigidTransform.from_components(other.x[3:], Rotation.from_rotvec(other.x[:3])) * truth
+    )
+    assert np.all(np.less(apart(expected, found.rig_from_world), (1e-6, 1e-5)))
+    freedom = 2 * keep.sum() - 6
+    assert found.sigma_px == pytest.approx(math.sqrt((other.fun**2).sum() / freedom), rel=1e-6)
+
+
+def test_far_from_the_worlds_origin_nothing_is_lost() -> None:
+    rng = np.random.default_rng(8)
+    truth = random_pose(rng)
+    seen = sighting(rng, truth, noise_px=0.5)
+    shift = np.array([4.5e5, 6.1e6, -300.0])
+    far = replace(seen, points_world=seen.points_world + shift)
+
+    near_pose = absolute_pose([seen], np.random.default_rng(2))
+    far_pose = absolute_pose([far], np.random.default_rng(2))
+
+    back = far_pose.rig_from_world * RigidTransform.from_translation(shift)
+    assert np.all(np.less(apart(near_pose.rig_from_world, back), (1e-5, 1e-4)))
+    np.testing.assert_allclose(far_pose.covariance, near_pose.covariance, rtol=1e-4, atol=1e-12)
+
+
+def test_rows_without_numbers_are_left_out_and_counted() -> None:
+    rng = np.random.default_rng(9)
+    seen = sighting(rng, random_pose(rng), noise_px=0.2)
+    pixels, points = seen.pixels.copy(), seen.points_world.copy()
+    pixels[3, 0] = np.nan
+    points[7, 2] = np.inf
+    whole = np.setdiff1d(np.arange(120), [3, 7])
+    shorter = replace(seen, pixels=seen.pixels[whole], points_world=seen.points_world[whole])
+
+    found = absolute_pose(
+        [replace(seen, pixels=pixels, points_world=points)], np.random.default_rng(1)
+    )
+
+    expected = absolute_pose([shorter], np.random.default_rng(1))
+    assert found.ignored == 2
+    assert not found.inliers[0][[3, 7]].any()
+    np.testing.assert_array_equal(found.inliers[0][whole], expected.inliers[0])
+    np.testing.assert_array_equal(
+        found.rig_from_world.as_matrix(), expected.rig_from_world.as_matrix()
+    )
+
+
+def test_more_observations_than_ransac_scores_are_all_used() -> None:
+    rng = np.random.default_rng(10)
+    truth = random_pose(rng)
+    seen = sighting(rng, truth, count=6000, noise_px=0.5)
+    pixels = seen.pixels.copy()
+    pixels[:2000] = rng.uniform([0, 0], [1920, 1080], (2000, 2))
+
+    found = absolute_pose([replace(seen, pixels=pixels)], rng)
+
+    assert 3985 < found.inliers[0][2000:].sum() <= 4000
+    assert found.inliers[0][:2000].sum() < 10
+    angle_deg, _ = apart(truth, found.rig_from_world)
+    assert angle_deg < 4 * math.degrees(found.sigma_rotation_rad) < 0.005
+
+
+def test_the_same_seed_gives_the_same_pose() -> None:
+    seen, _, _ = simulated(np.random.default_rng(11), 1.0)
+
+    first = absolute_pose([seen], np.random.default_rng(5))
+    second = absolute_pose([seen], np.random.default_rng(5))
+
+    np.testing.assert_array_equal(
+        first.rig_from_world.as_matrix(), second.rig_from_world.as_matrix()
+    )
+    np.testing.assert_array_equal(first.covariance, second.covariance)
+
+
+def test_random_pixels_have_no_pose() -> None:
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        nonsense = Sighting(
+            camera=CAMERA,
+            pixels=rng.uniform([0, 0], [1920, 1080], (60, 2)),
+            points_world=rng.normal(size=(60, 3)),
+        )
+        with pytest.raises(CalibrationError, match=r"pose: .* observations"):
+            absolute_pose([nonsense], rng)
+
+
+def test_chance_agreement_is_no_pose() -> None:
+    # Six of 400 that agree to 2 px can be found among random pixels; six of six cannot.
+    rng = np.random.default_rng(12)
+    truth = random_pose(rng)
+    few = sighting(rng, truth, count=6, noise_px=0.5)
+    crowd = Sighting(
+        camera=CAMERA,
+        pixels=np.concatenate([few.pixels, rng.uniform([0, 0], [1920, 1080], (394, 2))]),
+        points_world=np.concatenate([few.points_world, 3 * rng.normal(size=(394, 3))]),
+    )
+
+    assert absolute_pose([few], np.random.default_rng(1)).inliers[0].sum() == 6
+    with pytest.raises(CalibrationError, match="pose: "):
+        absolute_pose([crowd], np.random.default_rng(1))
+
+
+def test_what_leaves_the_pose_open_is_said() -> None:
+    rng = np.random.default_rng(13)
+    line = np.array([0.0, 0.0, 2.0]) + np.linspace(-0.5, 0.5, 30)[:, None] * [1.0, 0.3, 0.2]
+    with pytest.raises(CalibrationError, match=r"30 points leave it open.*line"):
+        absolute_pose(
+            [Sighting(camera=CAMERA, pixels=CAMERA.project(line), points_world=line)], rng
+        )
+    spot = np.repeat([[0.1, 0.1, 2.0]], 30, axis=0)
+    with pytest.raises(CalibrationError, match="no three of 30 observations"):
+        absolute_pose(
+            [Sighting(camera=CAMERA, pixels=CAMERA.project(spot), points_world=spot)], rng
+        )
+
+
+def test_bad_input_is_said_in_one_line() -> None:
+    rng = np.random.default_rng(14)
+    seen = sighting(rng, random_pose(rng), count=8)
+    with pytest.raises(CalibrationError, match=r"\(8, 2\) and points \(7, 3\)"):
+        replace(seen, points_world=seen.points_world[:7])
+    nothing = replace(seen, pixels=np.where(np.arange(8)[:, None] < 5, seen.pixels, np.nan))
+    with pytest.raises(CalibrationError, match="5 of 8 observations are usable; at least 6"):
+        absolute_pose([nothing], rng)
+    with pytest.raises(CalibrationError, match="no sightings"):
+        absolute_pose([], rng)
+    with pytest.raises(CalibrationError, match="start_error_px = 0"):
+        absolute_pose([seen], rng, start_error_px=0.0)
