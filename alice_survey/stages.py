@@ -53,7 +53,7 @@ class StageSpec:
     """Stages without which it cannot be made."""
     uses: Sequence[str] = ()
     """Stages that it takes into account where they are there."""
-    settings: "Mapping[str, Any] | Part" = field(default_factory=dict)
+    settings: "Mapping[str, Any] | SettingsPart" = field(default_factory=dict)
     """All settings that the result depends on, as `settings_of` reads them."""
     setting_files: Sequence[str] = ()
     """Dotted names of the settings that are files, or lists of files."""
@@ -125,7 +125,7 @@ class StageSpec:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Part:
+class SettingsPart:
     """Some values of a section of the settings."""
 
     section: str
@@ -133,22 +133,22 @@ class Part:
     without: frozenset[str] = frozenset()
 
 
-def only(section: str, *names: str) -> Part:
+def only(section: str, *names: str) -> SettingsPart:
     """The values of some names."""
-    return Part(section=section, only=frozenset(names))
+    return SettingsPart(section=section, only=frozenset(names))
 
 
-def without(section: str, *names: str) -> Part:
+def without(section: str, *names: str) -> SettingsPart:
     """The values of all other names."""
-    return Part(section=section, without=frozenset(names))
+    return SettingsPart(section=section, without=frozenset(names))
 
 
 def settings_of(wanted: Any, config: SurveyConfig) -> Any:
     """Settings as JSON values: what a stage's digest is made of.
 
     Args:
-        wanted: a `Part`; the dotted name of a value or a section; a mapping of these; or a value
-            that stands for itself.
+        wanted: a `SettingsPart`; the dotted name of a value or a section; a mapping of these; or
+            a value that stands for itself.
         config: the settings of a survey.
 
     Returns:
@@ -157,10 +157,10 @@ def settings_of(wanted: Any, config: SurveyConfig) -> Any:
     """
     if isinstance(wanted, Mapping):
         return {key: settings_of(value, config) for key, value in wanted.items()}
-    if not isinstance(wanted, str | Part):
+    if not isinstance(wanted, str | SettingsPart):
         return wanted
-    part = Part(section=wanted) if isinstance(wanted, str) else wanted
-    value = _value(config, part.section)
+    part = SettingsPart(section=wanted) if isinstance(wanted, str) else wanted
+    value = attrgetter(part.section)(config)
     if not isinstance(value, BaseModel):
         return list(value) if isinstance(value, tuple) else value
     values = value.model_dump(
@@ -176,13 +176,9 @@ def settings_of(wanted: Any, config: SurveyConfig) -> Any:
 
 def files_of(wanted: Sequence[str], config: SurveyConfig) -> list[Path]:
     """The files that settings name; none for those that are not set."""
-    values = [_value(config, name) for name in wanted]
+    values = [attrgetter(name)(config) for name in wanted]
     return [path for value in values for path in (value if isinstance(value, list) else [value])
             if path is not None]  # fmt: skip
-
-
-def _value(config: SurveyConfig, name: str) -> Any:
-    return attrgetter(name)(config)
 
 
 def spec(name: str) -> StageSpec:
@@ -684,7 +680,7 @@ STAGES: tuple[StageSpec, ...] = (
         folder="report",
         command="report",
         about="a page and a PDF of what the workspace holds",
-        version=1,
+        version=2,
         work="alice_survey.report.run:run_report",
         uses=("mosaic", "mesh", "evaluate"),
         inputs=_report_inputs,

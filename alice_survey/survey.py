@@ -13,7 +13,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from alice_survey import stages as survey_stages
-from alice_survey.base.artefacts import read_stage
+from alice_survey.base.artefacts import read_json, read_stage
 from alice_survey.base.config import SurveyConfig, changed, load_config, parse_current, parse_health
 from alice_survey.base.errors import ConfigError, WorkspaceError, warn
 from alice_survey.base.executor import Executor, local_executor
@@ -106,10 +106,18 @@ def run(
     return "\n".join(lines), found
 
 
-def plan_report(workspace: Path, survey: Path | None) -> tuple[str, dict[str, Any]]:
-    """Plan a survey, and show every setting with its equation, source and limit."""
+def plan_report(
+    workspace: Path, survey: Path | None, *, every_setting: bool = False
+) -> tuple[str, dict[str, Any]]:
+    """Plan a survey, and show its main settings; or every one with its equation and source."""
+    from missions.plan.rows import main_settings
+
     text, found = run(["plan"], workspace, survey)
-    table = (workspace / "plan" / "settings.txt").read_text(encoding="utf-8")
+    folder = workspace / "plan"
+    if every_setting:
+        table = (folder / "settings.txt").read_text(encoding="utf-8")
+    else:
+        table = main_settings(read_json(folder / "plan.json"))
     return f"{table}\n{text}", found
 
 

@@ -146,7 +146,7 @@ def opencoverage_plan(area: Area, repeats: int) -> Way:
             camera=camera,
             pattern="back_forth",
             lateral_overlap=0.0,
-            forward_overlap=0.0,
+            reached_forward_overlap=0.0,
             target="altitude",
             target_value=10.0,
         ),

@@ -33,6 +33,7 @@ from reconstruct.views.model import WorldFrame
 
 BLOCK = 256
 """Pixels a side of the blocks of a tiled TIFF."""
+_CACHE_MIB = 16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,6 +167,16 @@ def tiled_raster(
         raster.update_tags(**frame_tags(frame))
         raster.set_band_description(1, text)
         yield raster
+
+
+@contextmanager
+def small_cache() -> Iterator[None]:
+    """Within this block, or a task that it decorates, GDAL keeps little of the files it opens.
+
+    Its own choice is 5 % of the machine's memory in each process.
+    """
+    with rasterio.Env(GDAL_CACHEMAX=_CACHE_MIB << 20):
+        yield
 
 
 @contextmanager

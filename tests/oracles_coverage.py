@@ -151,7 +151,7 @@ def plan_of(area: Area, lines: list[Line], **others: Any) -> Plan:
         "seafloor_depth_m": 15.0, "altitude_m": 2.0, "speed_mps": 0.2, "interval_s": 2.3,
         "exposure_s": 0.001, "strobe_pulse_s": 0.002, "strobe_lead_s": 0.0002,
         "footprint_m": (1.44, 1.15), "line_spacing_m": 1.0, "station_spacing_m": 0.46,
-        "forward_overlap": 0.6, "side_overlap": 0.3, "lines": tuple(lines),
+        "reached_forward_overlap": 0.6, "reached_side_overlap": 0.3, "lines": tuple(lines),
         "turn_radius_m": 0.5, "run_in_m": 0.5, "length_m": route.length_m,
         "duration_s": route.length_m / 0.2, "energy_wh": 10.0, "coverage": 1.0, "details": {},
     }  # fmt: skip

@@ -9,7 +9,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry import LineString, MultiPolygon
 
-from missions.values.costs import Costs, power_at
+from missions.values.costs import Costs, leg_costs, power_at
 from missions.values.legs import Leg, Route
 from missions.values.line import Line
 
@@ -75,6 +75,27 @@ def farthest_outside_m(allowed: MultiPolygon, route: Route, samples: int = 400) 
         # The straights between samples cut an arc's inside by up to `bend`.
         worst = max(worst, float(shapely.distance(allowed, corners).max()) - bend)
     return worst
+
+
+def route_cost(route: Route, costs: Costs) -> tuple[float, float]:
+    """Energy, J, and time, s, of a route; descent and ascent are not in it."""
+    legs_j, legs_s = leg_costs(route, costs)
+    return float(legs_j.sum()), float(legs_s.sum())
+
+
+def turn_counts(route: Route) -> tuple[int, int, int]:
+    """How many times a route turns in arcs (in a row once), on the spot, and steps sideways."""
+    kinds = [leg.kind for leg in route.legs]
+    arcs = sum(
+        kind == "arc" and before != "arc" for before, kind in zip(["", *kinds], kinds, strict=False)
+    )
+    return arcs, kinds.count("spot"), kinds.count("sway")
+
+
+def line_starts_m(route: Route) -> dict[int, float]:
+    """Distance along a route at which each line of the plan starts."""
+    starts = zip(route.legs, route.starts_m, strict=False)
+    return {leg.line: float(start) for leg, start in starts if leg.line >= 0}
 
 
 def route_cost_by_steps(route: Route, costs: Costs, step_m: float) -> tuple[float, float]:

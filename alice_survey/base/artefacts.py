@@ -46,7 +46,7 @@ class Stage:
     """Work can go on in what an interrupted run of the same digest left."""
 
 
-class Record(BaseModel):
+class JsonRecord(BaseModel):
     """A JSON file of a workspace: a frozen value that is read and written whole.
 
     Values that a subclass does not name are kept as they are, so that a file of another version of
@@ -95,7 +95,7 @@ class Record(BaseModel):
         write_json(path, self.to_json())
 
 
-class StageRecord(Record):
+class StageRecord(JsonRecord):
     """`stage.json`: what a finished stage was made of, and what the work took."""
 
     stage: str = ""

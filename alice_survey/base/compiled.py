@@ -44,6 +44,7 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
         index: Any = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
         if hasattr(index, "_source_stamp"):
             index._source_stamp = _Stamp(kernel)
+            index._load_index = _readable(index._load_index)
         return kernel
 
     return decorated if function is None else decorated(function)
@@ -84,6 +85,21 @@ def note_compiling(kernel: Any, what: str) -> None:
     kept = Path(stats.cache_path).glob(f"*{kernel.__name__}*.nbi")
     if not stats.cache_hits and not stats.cache_misses and not any(kept):
         note(f"compiling {what}")
+
+
+def _readable(load: Callable[[], dict[Any, str]]) -> Callable[[], dict[Any, str]]:
+    """How an index of compiled kernels is read: as empty where its types cannot be found.
+
+    It holds the classes of the arguments by their names, which an older version may have had.
+    """
+
+    def loaded() -> dict[Any, str]:
+        try:
+            return load()
+        except (AttributeError, ImportError):
+            return {}
+
+    return loaded
 
 
 class _Stamp:

@@ -38,8 +38,8 @@ class Executor:
     """Where tasks run: in this process, in local processes, or on an engine for many machines.
 
     A task is a module-level function of one picklable value: settings, arrays and paths. It may
-    rely on nothing else of the process that submits it. What it reports with `warn` and `note`
-    travels back with its result.
+    rely on nothing else of the process that submits it, and has its worker for itself. What it
+    reports with `warn` and `note` travels back with its result.
     """
 
     workers: int = 1
@@ -89,7 +89,8 @@ class Executor:
             yield from counted(map(function, items), label, total, 1)
             return
         with self._running(workers) as pool:
-            queued = _QUEUED * workers if workers == self.workers else workers
+            is_limited = self.pool is not None and workers < self.workers
+            queued = workers if is_limited else _QUEUED * workers
             yield from counted(_in_order(pool, function, items, queued), label, total, workers)
 
     @contextlib.contextmanager

@@ -10,12 +10,12 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
-from alice_survey.base.artefacts import Record
+from alice_survey.base.artefacts import JsonRecord
 
 Notes = tuple[str, ...]
 
 
-class BoardRecord(Record):
+class BoardRecord(JsonRecord):
     """`pool/board.json`: a flat chessboard by its inner corners."""
 
     path: ClassVar = "pool/board.json"
@@ -25,7 +25,7 @@ class BoardRecord(Record):
     square_m: float = 0.04
 
 
-class PlaceRecord(Record):
+class PlaceRecord(JsonRecord):
     """Where the local frame is: WGS 84."""
 
     latitude_deg: float = Field(ge=-90, le=90)
@@ -33,7 +33,7 @@ class PlaceRecord(Record):
     height_m: float = Field(0.0, gt=-1e5, lt=1e5)
 
 
-class PicturesRecord(Record):
+class PicturesRecord(JsonRecord):
     """`images/survey.json`: where pictures come from, and what their positions count from."""
 
     path: ClassVar = "images/survey.json"
@@ -43,7 +43,7 @@ class PicturesRecord(Record):
     notes: Notes = ()
 
 
-class OnLines(Record):
+class OnLines(JsonRecord):
     """How well a vehicle kept to its lines."""
 
     cross_track_rms_m: float | None
@@ -51,13 +51,13 @@ class OnLines(Record):
     heading_rms_deg: float | None
 
 
-class InTurns(Record):
+class InTurns(JsonRecord):
     """How a vehicle moved between its lines."""
 
     roll_worst_deg: float | None
 
 
-class Covered(Record):
+class Covered(JsonRecord):
     """Shares of the area that pictures show."""
 
     covered_share: float
@@ -65,7 +65,7 @@ class Covered(Record):
     share_at_overlap: float
 
 
-class FlightRecord(Record):
+class FlightRecord(JsonRecord):
     """`flight/flight.json`."""
 
     path: ClassVar = "flight/flight.json"
@@ -84,7 +84,7 @@ class FlightRecord(Record):
     coverage: Covered
 
 
-class CalibrationRecord(Record):
+class CalibrationRecord(JsonRecord):
     """`calibration/calibration.json`."""
 
     path: ClassVar = "calibration/calibration.json"
@@ -96,14 +96,14 @@ class CalibrationRecord(Record):
     """Of the parameters, square."""
 
 
-class CalibrationVerdict(Record):
+class CalibrationVerdict(JsonRecord):
     """One line of a calibration report."""
 
     level: Literal["good", "look", "bad"]
     text: str
 
 
-class CalibratedValue(Record):
+class CalibratedValue(JsonRecord):
     """A parameter of a calibrated rig."""
 
     name: str
@@ -113,7 +113,7 @@ class CalibratedValue(Record):
     unit: str
 
 
-class CalibrationReportRecord(Record):
+class CalibrationReportRecord(JsonRecord):
     """`calibration/report.json`."""
 
     path: ClassVar = "calibration/report.json"
@@ -123,7 +123,7 @@ class CalibrationReportRecord(Record):
     parameters: tuple[CalibratedValue, ...] = ()
 
 
-class RangeRecord(Record):
+class RangeRecord(JsonRecord):
     """Distances from the cameras at which the scene lies."""
 
     near_m: float
@@ -131,13 +131,13 @@ class RangeRecord(Record):
     source: str
 
 
-class RefractionRecord(Record):
+class RefractionRecord(JsonRecord):
     """How the correction of refraction converged."""
 
     settled: bool
 
 
-class Bend(Record):
+class BendRecord(JsonRecord):
     """Sag of a model along one direction, against navigation."""
 
     length_m: float
@@ -145,35 +145,35 @@ class Bend(Record):
     sag_sigma_m: float
 
 
-class ScaleOfPairs(Record):
+class ScaleOfPairs(JsonRecord):
     """Scale of the stereo pairs over the survey."""
 
     mean: float
     mean_sigma: float
 
 
-class DomingRecord(Record):
+class DomingRecord(JsonRecord):
     """Bend of a model, as far as navigation shows it."""
 
-    along: Bend | None = None
-    across: Bend | None = None
+    along: BendRecord | None = None
+    across: BendRecord | None = None
     scale: ScaleOfPairs | None = None
     notes: Notes = ()
 
     @property
-    def bends(self) -> dict[str, Bend]:
+    def bends(self) -> dict[str, BendRecord]:
         """Those that are known, by direction."""
         ways = {"along": self.along, "across": self.across}
         return {way: bend for way, bend in ways.items() if bend is not None}
 
 
-class AcceptanceRecord(Record):
+class AcceptanceRecord(JsonRecord):
     """Whether the model agrees with rig and navigation."""
 
     notes: Notes = ()
 
 
-class MappingRecord(Record):
+class MappingRecord(JsonRecord):
     """`mapping/mapping.json`."""
 
     path: ClassVar = "mapping/mapping.json"
@@ -193,7 +193,7 @@ class MappingRecord(Record):
     notes: Notes = ()
 
 
-class PortRecord(Record):
+class PortRecord(JsonRecord):
     """`mapping/port.json`: the rig as refined by the survey's own pictures."""
 
     path: ClassVar = "mapping/port.json"
@@ -207,7 +207,7 @@ class PortRecord(Record):
     correlation: tuple[tuple[float, ...], ...]
 
 
-class GeoreferenceRecord(Record):
+class GeoreferenceRecord(JsonRecord):
     """`sparse/georeference.json`: residuals of navigation, and how well the place is known."""
 
     path: ClassVar = "sparse/georeference.json"
@@ -223,7 +223,7 @@ class GeoreferenceRecord(Record):
     scale_of_navigation_sigma: float | None = None
 
 
-class RegistrationRecord(Record):
+class RegistrationRecord(JsonRecord):
     """`sparse/registration.json`."""
 
     path: ClassVar = "sparse/registration.json"
@@ -242,7 +242,7 @@ class RegistrationRecord(Record):
     georeference: GeoreferenceRecord | None = None
 
 
-class ControlRow(Record):
+class ControlRow(JsonRecord):
     """How a known point or length fits the model."""
 
     name: str
@@ -267,7 +267,7 @@ class BarRow(ControlRow):
     error_relative: float
 
 
-class ControlRms(Record):
+class ControlRms(JsonRecord):
     """Over all points and bars of one use; None where there is none."""
 
     points: int = 0
@@ -278,7 +278,7 @@ class ControlRms(Record):
     length_m: float | None = None
 
 
-class ControlRecord(Record):
+class ControlRecord(JsonRecord):
     """`sparse/control.json`."""
 
     path: ClassVar = "sparse/control.json"
@@ -290,7 +290,7 @@ class ControlRecord(Record):
     """By use."""
 
 
-class PictureCamera(Record):
+class PictureCamera(JsonRecord):
     """What took a picture of a model, and its mask."""
 
     camera: str
@@ -298,7 +298,7 @@ class PictureCamera(Record):
     mask: str | None = None
 
 
-class CamerasRecord(Record):
+class CamerasRecord(JsonRecord):
     """`sparse/cameras.json`: lenses by camera, and the pictures of a model."""
 
     path: ClassVar = "sparse/cameras.json"
@@ -307,7 +307,7 @@ class CamerasRecord(Record):
     images: dict[str, PictureCamera]
 
 
-class FrameRecord(Record):
+class FrameRecord(JsonRecord):
     """`sparse/frame.json`: what the coordinates of a model mean."""
 
     path: ClassVar = "sparse/frame.json"
@@ -319,7 +319,7 @@ class FrameRecord(Record):
     notes: Notes = ()
 
 
-class ScaleRecord(Record):
+class ScaleRecord(JsonRecord):
     """`scale.json` of a workspace: one known length."""
 
     path: ClassVar = "scale.json"
@@ -331,7 +331,7 @@ class ScaleRecord(Record):
     """Of the model that was measured, as its `MappingRecord` has it."""
 
 
-class CloudRecord(Record):
+class CloudRecord(JsonRecord):
     """`dense/cloud.json`; lengths in the unit of the model."""
 
     path: ClassVar = "dense/cloud.json"
@@ -340,7 +340,7 @@ class CloudRecord(Record):
     thinned_to: float
 
 
-class SurfaceRecord(Record):
+class SurfaceRecord(JsonRecord):
     """`dense/surface.json`."""
 
     path: ClassVar = "dense/surface.json"
@@ -349,7 +349,7 @@ class SurfaceRecord(Record):
     vertical_datum: str
 
 
-class MosaicRecord(Record):
+class MosaicRecord(JsonRecord):
     """`mosaic/mosaic.json`."""
 
     path: ClassVar = "mosaic/mosaic.json"
@@ -361,7 +361,7 @@ class MosaicRecord(Record):
     pictures: tuple[str, ...] = ()
 
 
-class MeshRecord(Record):
+class MeshRecord(JsonRecord):
     """`mesh/mesh.json`."""
 
     path: ClassVar = "mesh/mesh.json"
@@ -371,7 +371,7 @@ class MeshRecord(Record):
     offset_east_north_up: tuple[float, float, float]
 
 
-class CameraErrors(Record):
+class CameraErrors(JsonRecord):
     """Of the camera track against the truth."""
 
     registered: int
@@ -381,26 +381,26 @@ class CameraErrors(Record):
     scale_error_ppm: float
 
 
-class Dome(Record):
+class Dome(JsonRecord):
     """Bend of the surface against the truth."""
 
     dome_mm: float | None
 
 
-class PartOfSurface(Record):
+class PartOfSurface(JsonRecord):
     """Errors of a part of the surface."""
 
     share: float
     distance_rms_mm: float | None
 
 
-class ErrorOverSigma(Record):
+class ErrorOverSigma(JsonRecord):
     """Errors of heights over their stated sigmas."""
 
     rms: float | None
 
 
-class SurfaceErrors(Record):
+class SurfaceErrors(JsonRecord):
     """Of the DEM against the truth."""
 
     distance_rms_mm: float
@@ -413,38 +413,38 @@ class SurfaceErrors(Record):
     error_over_sigma: ErrorOverSigma | None = None
 
 
-class MosaicErrors(Record):
+class MosaicErrors(JsonRecord):
     """Of the mosaic against the truth."""
 
     position_rms_mm: float | None = None
     position_95_mm: float | None = None
 
 
-class LengthErrors(Record):
+class LengthsRecord(JsonRecord):
     """Of lengths in the mosaic against the truth."""
 
     rms_mm: float | None = None
     mean_length_m: float | None = None
 
 
-class MeshErrors(Record):
+class MeshErrors(JsonRecord):
     """Of the mesh against the truth."""
 
     distance_rms_mm: float | None
 
 
-class ScoreRecord(Record):
+class ScoreRecord(JsonRecord):
     """`evaluation/score.json`: errors against the truth of a simulated survey."""
 
     path: ClassVar = "evaluation/score.json"
     cameras: CameraErrors
     surface: SurfaceErrors
     mosaic: MosaicErrors
-    lengths: LengthErrors
+    lengths: LengthsRecord
     mesh: MeshErrors | None = None
 
 
-class Distances(Record):
+class Distances(JsonRecord):
     """From one surface to another, metres."""
 
     median_m: float
@@ -454,13 +454,13 @@ class Distances(Record):
     covered_share: float
 
 
-class ReferenceRegistration(Record):
+class ReferenceRegistration(JsonRecord):
     """How a survey was brought onto a reference."""
 
     transform: str
 
 
-class ReferenceRecord(Record):
+class ReferenceRecord(JsonRecord):
     """`reference/reference.json`."""
 
     path: ClassVar = "reference/reference.json"
@@ -471,7 +471,7 @@ class ReferenceRecord(Record):
     reference_to_survey: Distances
 
 
-class ChangeRecord(Record):
+class ChangeRecord(JsonRecord):
     """`against/NAME/change.json`: figures of a comparison with an earlier survey."""
 
     path: ClassVar = "against/NAME/change.json"
@@ -487,7 +487,7 @@ class ChangeRecord(Record):
         }
 
 
-class ReportRecord(Record):
+class ReportRecord(JsonRecord):
     """`report/report.json`."""
 
     path: ClassVar = "report/report.json"

@@ -24,6 +24,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     epilog=examples(
         "plan -w reef",
+        "plan -w reef --all",
         "plan -w reef -s other.toml --json",
         "plan solve -w reef --resolution 0.5",
         "plan gain 'control/*.jpg'",
@@ -38,17 +39,22 @@ def plan(
     context: typer.Context,
     workspace: Workspace = WORK,
     survey: SurveyFile = None,
+    every_setting: Annotated[
+        bool,
+        typer.Option("--all", help="Print every setting with its equation, source and limit."),
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Plan lines and camera settings.
 
-    They image the whole area at the overlap asked for. Writes the plan with its certificate, maps,
-    and missions that vehicles load; prints every setting with the equation and the limit behind it.
+    They image the whole area at the overlap requested. Writes the plan with its certificate, maps,
+    and missions that vehicles load; prints the main settings, and with --all every one with the
+    equation and the limit behind it, as plan/settings.txt holds them.
     """
     if context.invoked_subcommand is None:
         from alice_survey.survey import plan_report
 
-        print_result(*plan_report(workspace, survey), as_json)
+        print_result(*plan_report(workspace, survey, every_setting=every_setting), as_json)
 
 
 @app.command(
@@ -102,7 +108,7 @@ def gain(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Tell the gain to set.
+    """Find the gain to set.
 
     From control pictures of a short dive before the survey, as the paper does it.
     """

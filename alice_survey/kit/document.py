@@ -29,17 +29,18 @@ def worst_first(verdicts: Sequence[Verdict]) -> list[Verdict]:
 class Figure:
     """A plot with the plain words that go with it."""
 
-    png: bytes
     title: str
     alt: str
     """What a reader who cannot see it has to know."""
     shows: str
+    png: bytes = b""
+    """For the page; a figure of the print alone has none."""
     good: str = ""
     """How it looks when all is well."""
     otherwise: str = ""
     """What to do when it does not."""
     svg: bytes = b""
-    """The same plot as vectors, for print; empty where there are only pixels."""
+    """For print; empty where there are only pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -51,9 +51,9 @@ __all__ = [
     "BAND", "GRID", "INK", "INKS", "MARKS", "SOFT", "WIDTH_IN", "Axes", "BoundaryNorm", "Circle",
     "Ellipse", "EllipseCollection", "LineCollection", "LinearSegmentedColormap", "ListedColormap",
     "LogNorm", "MaxNLocator", "Outline", "PathPatch", "PolyCollection", "Polygon", "Rectangle",
-    "Sheet", "colour_bar", "drawn", "figure_style", "map_axes", "new_figure", "north_arrow",
-    "palette_colours", "palette_steps", "plain_name", "png_of", "save_figure", "scale_bar",
-    "shrunk_png", "svg_of", "withStroke",
+    "Sheet", "colour_bar", "drawn", "even_limit", "figure_style", "map_axes", "new_figure",
+    "north_arrow", "palette_colours", "palette_steps", "plain_name", "png_of", "save_figure",
+    "scale_bar", "shrunk_png", "svg_of", "withStroke",
 ]  # fmt: skip
 
 INKS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
@@ -260,6 +260,17 @@ def palette_colours(name: str, shares: Array) -> NDArray[np.uint8]:
 def palette_steps(name: str, count: int) -> list[str]:
     """Evenly spaced colours of a palette, #rrggbb."""
     return [to_hex(mpl.colormaps[name](i / (count - 1))) for i in range(count)]
+
+
+def even_limit(values: Array, percent: float = 97.0) -> float:
+    """The limit of a colour scale about zero at which most values show; NaNs do not count.
+
+    Args:
+        values: any shape.
+        percent: of the known values that are within it.
+    """
+    known = np.abs(values[np.isfinite(values)])
+    return max(float(np.percentile(known, percent)), 1e-9) if len(known) else 1.0
 
 
 def plain_name(name: str) -> str:

@@ -11,13 +11,13 @@ from typing import TypeVar
 import numpy as np
 
 from alice_survey import stages
-from alice_survey.base.artefacts import Record, StageRecord
+from alice_survey.base.artefacts import JsonRecord, StageRecord
 from alice_survey.base.frames import Array
 from alice_survey.base.records import ChangeRecord, FrameRecord, PicturesRecord, PlaceRecord
 from alice_survey.stages import finished
 from missions.values.plan_file import Plan, read_plan
 
-R = TypeVar("R", bound=Record)
+R = TypeVar("R", bound=JsonRecord)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

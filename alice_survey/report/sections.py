@@ -395,7 +395,8 @@ def _mission(held: Held, plan: Plan) -> Section:
         ("altitude, speed", f"{plan.altitude_m:g} m, {plan.speed_mps:g} m/s"),
         ("lines", f"{len(plan.lines)}, {plan.line_spacing_m:.2f} m apart"),
         ("stations", f"{plan.stations}, {plan.station_spacing_m:.2f} m apart"),
-        ("overlap", f"{plan.forward_overlap:.0%} forward, {plan.side_overlap:.0%} side"),
+        ("overlap", f"{plan.reached_forward_overlap:.0%} forward, "
+                    f"{plan.reached_side_overlap:.0%} side"),
         ("a picture every", f"{plan.interval_s:.2f} s"),
         ("exposure", f"{1e3 * plan.exposure_s:.2g} ms"),
         ("motion blur", f"{plan.blur_px:.2f} px"),

@@ -215,7 +215,7 @@ class Terrain:
         return inner
 
     def write(self, path: Path) -> None:
-        """Write the mesh as binary PLY, and beside it, with suffix `.json`, what else is known."""
+        """Write the mesh as binary PLY, and next to it, with suffix `.json`, what else is known."""
         whole = self.patch()
         header = (
             "ply\nformat binary_little_endian 1.0\n"

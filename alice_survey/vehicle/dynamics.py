@@ -102,16 +102,6 @@ def coriolis_matrix(mass: Array, nu: Array) -> Array:
     return result
 
 
-def damping_matrix(body: Body, nu: Array) -> Array:
-    """D(nu), (6, 6): linear and quadratic damping and body lift; D(nu) nu opposes motion."""
-    u = nu[0]
-    lift = np.zeros((6, 6))
-    lift[1, 1], lift[2, 2] = body.lift[0] * abs(u), body.lift[1] * abs(u)
-    lift[4, 2], lift[5, 1] = body.lift[2] * u, body.lift[3] * u
-    matrix: Array = -(body.linear + body.quadratic * np.abs(nu) + lift)
-    return matrix
-
-
 def _skew(a: Array) -> Array:
     return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
 

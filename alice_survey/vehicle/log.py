@@ -1,6 +1,6 @@
 """The vehicle log, one CSV: how a vehicle moved and what its thrusters did.
 
-docs/vehicle-logs.md tells of each column. Every field but the time may be missing, in whole or in
+docs/vehicle-logs.md describes each column. Every field but the time may be missing, in whole or in
 single rows: NaN is what was not measured.
 """
 

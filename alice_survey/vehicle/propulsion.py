@@ -170,7 +170,7 @@ laterals give 1.5 N of 49 N each to hold it against 0.1 m/s across (Y_vv 322, 3.
 class Propulsion(NamedTuple):
     """Thrusters as compiled code sees them.
 
-    One array, since each costs a kernel 56 bytes to be told of.
+    One array, since each costs a kernel 56 bytes.
     """
 
     table: Array

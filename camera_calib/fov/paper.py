@@ -108,7 +108,7 @@ class PaperValidation:
     @property
     def passed(self) -> bool:
         """Every check and every claim holds."""
-        return all(check.passed for check in (*self.table, *self.claims))
+        return all(c.passed for c in self.table) and all(c.passed for c in self.claims)
 
     def to_json(self) -> dict[str, Any]:
         """Everything as JSON values."""

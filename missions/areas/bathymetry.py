@@ -207,7 +207,7 @@ def read_bathymetry(
 
     Raises:
         PlanError: it is no raster, has no coordinate system, does not reach the bounds, has
-            too many cells within them, or its sense cannot be told.
+            too many cells within them, or it is not clear whether it holds heights or depths.
     """
     import rasterio
     from rasterio.errors import RasterioError
@@ -386,7 +386,7 @@ def _window(
 def _sense(path: Path, file: Any, band: Any, sense: Sense) -> tuple[bool, str]:
     """Whether values are heights, and how that was told."""
     if sense != "auto":
-        return sense == "heights", f"{sense}, as asked"
+        return sense == "heights", f"{sense}, as requested"
     values = band.compressed()
     values = values[np.isfinite(values)]
     below = float(np.mean(values < 0)) if len(values) else 0.0
@@ -394,11 +394,11 @@ def _sense(path: Path, file: Any, band: Any, sense: Sense) -> tuple[bool, str]:
     if heights is None:
         if _ONE_SIGN > below > 1 - _ONE_SIGN:
             raise PlanError(
-                f"{path}: {below:.0%} of its values are negative, so that heights cannot be told "
-                "from depths; set area.bathymetry_values to one of them"
+                f"{path}: {below:.0%} of its values are negative, so that it is not clear "
+                "whether they are heights or depths; set area.bathymetry_values to one of them"
             )
-        told = f"{below:.0%} of its values are negative"
-        return below >= _ONE_SIGN, f"{'heights' if below >= _ONE_SIGN else 'depths'}, since {told}"
+        share = f"{below:.0%} of its values are negative"
+        return below >= _ONE_SIGN, f"{'heights' if below >= _ONE_SIGN else 'depths'}, since {share}"
     as_heights, why = heights
     dry = 1 - below if as_heights else below
     if len(values) and dry > _ONE_SIGN:

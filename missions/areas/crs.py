@@ -162,7 +162,7 @@ def geographic_shapes(raw: RawShapes, crs: Any) -> RawShapes:
                 f"area: {raw.origin}: {name + ', ' if name else ''}corner {first + 1} at x "
                 f"{yx[first, 1]:.10g}, y {yx[first, 0]:.10g} has no place in {crs.name}: check crs"
             )
-        # PROJ tells of no operation where there is nothing to change.
+        # PROJ reports no operation where there is nothing to change.
         with contextlib.suppress(ProjError):
             accuracy_m.append(float(transformer.get_last_used_operation().accuracy))
         check_latitudes(lat_lon, raw.origin, name)
@@ -271,7 +271,7 @@ def unwrapped(lon_deg: Array, near_deg: float) -> Array:
 
 
 def _distance_m(lat_lon: Array, datum: Datum) -> Array:
-    """(N,) great circle distances on a sphere, good to 0.5 %, to tell near from far."""
+    """(N,) great circle distances on a sphere, good to 0.5 %, to separate near from far."""
     radius_m = 6_371_000.0
     lat, lon = np.deg2rad(lat_lon.T)
     lat_0, lon_0 = math.radians(datum.latitude_deg), math.radians(datum.longitude_deg)

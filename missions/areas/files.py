@@ -51,7 +51,7 @@ def read_area_file(
     """Read the shapes of a file.
 
     Args:
-        path: a file of one of the kinds in `SUFFIXES`, told by its ending.
+        path: a file of one of the kinds in `SUFFIXES`, recognised by its suffix.
         layer: which of its layers, where several hold shapes.
         crs: coordinate system for a file that states none; `local` for metres east and north of
             the datum.
@@ -112,7 +112,7 @@ def read_wkt(origin: str, text: str, crs: str | None) -> RawShapes:
     if _depth(text) > _DEEPEST:
         raise PlanError(f"area: {origin}: no well-known text: it nests over {_DEEPEST} brackets")
     try:
-        with np.errstate(invalid="ignore"):  # NaN is told with its corner later
+        with np.errstate(invalid="ignore"):  # NaN is reported with its corner later
             geometry = shapely.from_wkt(text.strip())
     except shapely.errors.ShapelyError as first:
         geometry = _closed_wkt(origin, text.strip(), str(first))
@@ -176,7 +176,7 @@ def _layers(path: Path, suffix: str) -> list[_Layer]:
     layers = _linked_layers([path], "GeoJSON")
     if data.get("crs") is not None:
         return layers
-    # RFC 7946 makes it WGS 84, yet older writers left out other systems: the numbers tell.
+    # RFC 7946 makes it WGS 84, yet older writers left out other systems: the numbers show which.
     return [
         _Layer(name=found.name, shapes=found.shapes, crs=found.crs if _degrees(found) else None)
         for found in layers
@@ -231,7 +231,7 @@ def _gdal_layers(file: Path, shown: Path, driver: str) -> list[_Layer]:
     from pyogrio.errors import DataLayerError, DataSourceError
 
     layers = []
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
             names = pyogrio.list_layers(file)
@@ -251,8 +251,8 @@ def _gdal_layers(file: Path, shown: Path, driver: str) -> list[_Layer]:
         ) as error:  # fmt: skip
             text = one_line(error).replace(str(file), shown.name)
             raise PlanError(f"area: {shown}: cannot be read: {text}") from None
-    for text in dict.fromkeys(str(w.message).splitlines()[0] for w in told):
-        if not text.startswith("Non closed ring"):  # told with its feature
+    for text in dict.fromkeys(str(w.message).splitlines()[0] for w in caught):
+        if not text.startswith("Non closed ring"):  # reported with its feature
             warn(f"area: {shown.name}: {text}")
     return layers
 
@@ -294,7 +294,7 @@ def _refuse_corners(origin: str, count: int) -> None:
 
 
 def _choose(path: Path, layers: list[_Layer], layer: str | None, role: Role) -> _Layer:
-    """The layer that is asked for, or the only one with usable shapes.
+    """The layer that is requested, or the only one with usable shapes.
 
     Raises:
         PlanError: there is none, or there are several to choose from.

@@ -43,7 +43,7 @@ class RawShapes:
     no_go: "RawShapes | None" = None
     """Zones to keep out of that came in the same file."""
     unused_fence: str = ""
-    """What to tell of a fence in the same file where no allowed area is set."""
+    """What to report of a fence in the same file where no allowed area is set."""
 
     @property
     def coordinates(self) -> Array:

@@ -32,7 +32,7 @@ cut off (1 / sin 30 degrees = 2)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Mended:
+class Repaired:
     """Valid polygons, metres north and east."""
 
     solid: MultiPolygon
@@ -42,7 +42,7 @@ class Mended:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Teller:
+class _Reporter:
     """Names faults and their places."""
 
     origin: str
@@ -62,32 +62,34 @@ class _Teller:
         warn(self.line(name, text))
 
 
-def mended(raw: RawShapes, frame: LocalFrame, *, geographic: bool, overlaps: bool = True) -> Mended:
+def repaired(
+    raw: RawShapes, frame: LocalFrame, *, geographic: bool, overlaps: bool = True
+) -> Repaired:
     """Check the polygons of a source.
 
     Args:
         raw: shapes in metres north and east; its lines and points do not count.
-        frame: to tell places with.
-        geographic: whether the shapes were given in degrees, to tell places so.
+        frame: to name places in.
+        geographic: whether the shapes were given in degrees, to name places so.
         overlaps: whether to warn of polygons that overlap.
 
     Returns:
-        Their union; corners keep their order where nothing had to be mended or joined.
+        Their union; corners keep their order where nothing had to be repaired or joined.
 
     Raises:
         PlanError: a polygon has fewer than 3 distinct corners, no size, or edges that cross; the
             message names the polygon and the place.
     """
-    tell = _Teller(origin=raw.origin, frame=frame, geographic=geographic)
+    report = _Reporter(origin=raw.origin, frame=frame, geographic=geographic)
     solids: list[BaseGeometry] = []
     names: list[str] = []
     holes: list[BaseGeometry] = []
     for i, rings in enumerate(raw.polygons):
         name = raw.ring_name(i, 0)
-        shell = _ring_area(rings[0], name, tell)
+        shell = _ring_area(rings[0], name, report)
         cuts = []
         for j, ring in enumerate(rings[1:], 1):
-            hole = _hole(ring, shell, raw.ring_name(i, j), tell)
+            hole = _hole(ring, shell, raw.ring_name(i, j), report)
             if hole is not None:
                 cuts.append(hole)
         holes += cuts
@@ -95,20 +97,20 @@ def mended(raw: RawShapes, frame: LocalFrame, *, geographic: bool, overlaps: boo
         if cuts:
             solid = shapely.difference(shell, shapely.union_all(cuts), grid_size=GRID_M)
         if solid.area < _SLIGHT_M2 and len(raw.polygons) > 1:
-            tell.warn(
+            report.warn(
                 name,
-                f"{solid.area:.2g} m2 at {tell.at(_first(rings[0]))} is too small and left out",
+                f"{solid.area:.2g} m2 at {report.at(_first(rings[0]))} is too small and left out",
             )
             continue
         solids.append(solid)
         names.append(name)
     if raw.polygons and not any(solid.area > 0 for solid in solids):
-        raise tell.refuse("", "its holes, or its size, leave nothing")
-    solid = _joined(solids, names, tell if overlaps else None)
+        raise report.refuse("", "its holes, or its size, leave nothing")
+    solid = _joined(solids, names, report if overlaps else None)
     left: BaseGeometry = MultiPolygon()
     if holes:
         left = shapely.difference(shapely.union_all(holes), solid, grid_size=GRID_M)
-    return Mended(solid=solid, holes=without_slivers(multipolygon(left)))
+    return Repaired(solid=solid, holes=without_slivers(multipolygon(left)))
 
 
 def without_slivers(geometry: MultiPolygon) -> MultiPolygon:
@@ -136,33 +138,33 @@ def distinct(corners: Array, *, closed: bool) -> Array:
     return left
 
 
-def _ring_area(ring: Array, name: str, tell: _Teller) -> Polygon | MultiPolygon:
+def _ring_area(ring: Array, name: str, report: _Reporter) -> Polygon | MultiPolygon:
     """What a ring encloses."""
     closed = len(ring) > 1 and np.linalg.norm(ring[0] - ring[-1]) < SAME_PLACE_M
     corners = distinct(ring, closed=True)
     if len(corners) < 3:
-        raise tell.refuse(name, f"{len(corners)} distinct corners; a polygon needs 3 or more")
+        raise report.refuse(name, f"{len(corners)} distinct corners; a polygon needs 3 or more")
     repeats = len(ring) - len(corners) - int(closed)
     if repeats > 0:
-        tell.warn(
+        report.warn(
             name,
             f"{repeats} corner{'s' if repeats > 1 else ''} repeating the one before left out, the "
-            f"first at {tell.at(_first_repeat(ring))}",
+            f"first at {report.at(_first_repeat(ring))}",
         )
     if MultiPolygon([Polygon(corners)]).convex_hull.area < _NO_SIZE_M2:
-        raise tell.refuse(
+        raise report.refuse(
             name,
             f"{Polygon(corners).convex_hull.area:.2g} m2 is no size; its corners lie on one line "
-            f"through {tell.at(corners[0])}",
+            f"through {report.at(corners[0])}",
         )
-    corners = _without_spikes(corners, name, tell)
+    corners = _without_spikes(corners, name, report)
     if len(corners) < 3:
-        raise tell.refuse(name, f"its corners enclose nothing near {tell.at(_first(ring))}")
+        raise report.refuse(name, f"its corners enclose nothing near {report.at(_first(ring))}")
     polygon = Polygon(corners)
-    return polygon if polygon.is_valid else _uncrossed(polygon, name, tell)
+    return polygon if polygon.is_valid else _uncrossed(polygon, name, report)
 
 
-def _without_spikes(corners: Array, name: str, tell: _Teller) -> Array:
+def _without_spikes(corners: Array, name: str, report: _Reporter) -> Array:
     """Leave out corners where the edge runs straight back over itself."""
     found = corners
     while len(found) >= 3:
@@ -170,9 +172,9 @@ def _without_spikes(corners: Array, name: str, tell: _Teller) -> Array:
         if not spikes.any():
             break
         tip = int(spikes.argmax())
-        tell.warn(
+        report.warn(
             name,
-            f"a spike of {spikes[tip]:.3g} m without width at {tell.at(found[tip])} is cut off",
+            f"a spike of {spikes[tip]:.3g} m without width at {report.at(found[tip])} is cut off",
         )
         found = distinct(np.delete(found, tip, axis=0), closed=True)
     return found
@@ -189,7 +191,7 @@ def _spike_lengths_m(corners: Array) -> Array:
     return lengths
 
 
-def _uncrossed(polygon: Polygon, name: str, tell: _Teller) -> Polygon | MultiPolygon:
+def _uncrossed(polygon: Polygon, name: str, report: _Reporter) -> Polygon | MultiPolygon:
     """A ring that meets itself: as it is meant where that is clear.
 
     The signed area of the ring counts a loop run the other way round as less, and one run twice as
@@ -203,26 +205,26 @@ def _uncrossed(polygon: Polygon, name: str, tell: _Teller) -> Polygon | MultiPol
     north, east = corners[:-1].T
     signed = 0.5 * float(np.sum(north * corners[1:, 1] - corners[1:, 0] * east))
     wrong_m2 = abs(abs(signed) - repaired.area)
-    where = tell.at(place)
+    where = report.at(place)
     if wrong_m2 > _SLIGHT_M2:
         what = "edges cross" if "intersection" in reason.lower() else reason.lower()
-        raise tell.refuse(name, f"{what} near {where}; list the corners in order round the edge")
+        raise report.refuse(name, f"{what} near {where}; list the corners in order round the edge")
     parts = [part for part in repaired.geoms if part.area > _SLIGHT_M2]
     if not parts:
-        raise tell.refuse(name, f"its edges enclose no size near {where}")
+        raise report.refuse(name, f"its edges enclose no size near {where}")
     kept = multipolygon(
         MultiPolygon(
             [Polygon(p.exterior, [r for r in p.interiors if Polygon(r).area > 1e-6]) for p in parts]
         )
     )
     if "ring self-intersection" in reason.lower():
-        tell.warn(
+        report.warn(
             name,
             f"the edge touches itself at {where}: taken as {len(parts)} part"
             f"{'s' if len(parts) > 1 else ''} with {sum(len(p.interiors) for p in parts)} holes",
         )
     else:
-        tell.warn(
+        report.warn(
             name,
             f"edges cross near {where}; the loop of {wrong_m2 / 2:.2g} m2 or less is left out",
         )
@@ -230,37 +232,39 @@ def _uncrossed(polygon: Polygon, name: str, tell: _Teller) -> Polygon | MultiPol
 
 
 def _hole(
-    ring: Array, shell: Polygon | MultiPolygon, name: str, tell: _Teller
+    ring: Array, shell: Polygon | MultiPolygon, name: str, report: _Reporter
 ) -> Polygon | MultiPolygon | None:
     """A hole of a polygon; None where it has no size."""
     corners = distinct(ring, closed=True)
     if len(corners) < 3 or Polygon(corners).convex_hull.area < _SLIGHT_M2:
         size = Polygon(corners).convex_hull.area if len(corners) > 2 else 0.0
-        tell.warn(name, f"{size:.2g} m2 at {tell.at(_first(ring))} is too small and left out")
+        report.warn(name, f"{size:.2g} m2 at {report.at(_first(ring))} is too small and left out")
         return None
-    hole = _ring_area(ring, name, tell)
+    hole = _ring_area(ring, name, report)
     if shell.contains_properly(hole):
         return hole
     outside = hole.difference(shell)
     if not hole.intersects(shell) or hole.intersection(shell).area < 1e-6:
-        tell.warn(
+        report.warn(
             name,
-            f"it lies outside of its polygon, near {tell.at(_inside(hole))}: it stays a zone to "
+            f"it lies outside of its polygon, near {report.at(_inside(hole))}: it stays a zone to "
             "keep out of",
         )
     elif outside.area > 1e-6:
-        tell.warn(
+        report.warn(
             name,
             f"{outside.area:.3g} m2 of it lie outside of its polygon, near "
-            f"{tell.at(_inside(outside))}: they are kept out of, too",
+            f"{report.at(_inside(outside))}: they are kept out of, too",
         )
     else:
         touch = hole.boundary.intersection(shell.boundary)
-        tell.warn(name, f"it touches the edge near {tell.at(_inside(touch))}: it is cut from it")
+        report.warn(
+            name, f"it touches the edge near {report.at(_inside(touch))}: it is cut from it"
+        )
     return hole
 
 
-def _joined(solids: list[BaseGeometry], names: list[str], tell: _Teller | None) -> MultiPolygon:
+def _joined(solids: list[BaseGeometry], names: list[str], report: _Reporter | None) -> MultiPolygon:
     """The union of a source's polygons; overlaps are told."""
     if len(solids) <= 1:
         return multipolygon(solids[0]) if solids else MultiPolygon()
@@ -268,31 +272,31 @@ def _joined(solids: list[BaseGeometry], names: list[str], tell: _Teller | None) 
     near = tree.query(solids, predicate="dwithin", distance=SLIVER_M).T.tolist()
     if all(i == j for i, j in near):
         return multipolygon(MultiPolygon([p for s in solids for p in multipolygon(s).geoms]))
-    if tell is not None:
-        _tell_overlaps(solids, names, near, tell)
+    if report is not None:
+        _warn_of_overlaps(solids, names, near, report)
     union = shapely.union_all(solids, grid_size=GRID_M)
     if all(solids[i].distance(solids[j]) <= GRID_M for i, j in near):
         return multipolygon(union)
-    if tell is not None:
-        tell.warn("", f"gaps narrower than {SLIVER_M:g} m between its polygons are closed")
+    if report is not None:
+        report.warn("", f"gaps narrower than {SLIVER_M:g} m between its polygons are closed")
     wider = union.buffer(SLIVER_M / 2, join_style="mitre", mitre_limit=_SHARP)
     closed = wider.buffer(-SLIVER_M / 2, join_style="mitre", mitre_limit=_SHARP)
     return multipolygon(closed)
 
 
-def _tell_overlaps(
-    solids: list[BaseGeometry], names: list[str], pairs: list[list[int]], tell: _Teller
+def _warn_of_overlaps(
+    solids: list[BaseGeometry], names: list[str], pairs: list[list[int]], report: _Reporter
 ) -> None:
     common = [(solids[i].intersection(solids[j]), names[i], names[j]) for i, j in pairs if i < j]
     overlaps = [overlap for overlap in common if overlap[0].area > _SLIGHT_M2]
     for shared, one, other in overlaps[:_NAMED]:
-        tell.warn(
+        report.warn(
             "",
-            f"{one} and {other} overlap by {shared.area:.3g} m2 near {tell.at(_inside(shared))}: "
+            f"{one} and {other} overlap by {shared.area:.3g} m2 near {report.at(_inside(shared))}: "
             "taken together",
         )
     if len(overlaps) > _NAMED:
-        tell.warn("", f"{len(overlaps) - _NAMED} more overlaps of polygons: taken together")
+        report.warn("", f"{len(overlaps) - _NAMED} more overlaps of polygons: taken together")
 
 
 def _inside(geometry: BaseGeometry) -> Array:

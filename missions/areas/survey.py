@@ -16,10 +16,10 @@ from missions.areas.crs import LocalFrame, middle
 from missions.areas.raw import RawShapes
 from missions.areas.repair import (
     GRID_M,
-    Mended,
+    Repaired,
     buffered_line,
     distinct,
-    mended,
+    repaired,
     widened,
     without_slivers,
 )
@@ -110,14 +110,14 @@ def local_frame(settings: AreaConfig, raw: RawShapes) -> LocalFrame:
     )
 
 
-def _polygons(raw: RawShapes, frame: LocalFrame, corridor_width_m: float) -> Mended:
+def _polygons(raw: RawShapes, frame: LocalFrame, corridor_width_m: float) -> Repaired:
     """The polygons of a source and the corridors along its lines."""
     if raw.is_empty or not (raw.polygons or raw.lines):
         raise PlanError(
             f"area: {raw.origin}: it holds {_counted(raw)}; an area needs a polygon or a line"
         )
     local = frame.localised(raw)
-    shape = mended(local, frame, geographic=raw.geographic)
+    shape = repaired(local, frame, geographic=raw.geographic)
     if len(raw.points):
         warn(f"area: {raw.origin}: {_counted(replace(raw, polygons=(), lines=()))} left out")
     if not raw.lines:
@@ -128,13 +128,13 @@ def _polygons(raw: RawShapes, frame: LocalFrame, corridor_width_m: float) -> Men
         for i, (line, width_m) in enumerate(zip(local.lines, widths_m, strict=True))
     ]
     if raw.polygons:
-        told = " and ".join(f"{width_m:g} m" for width_m in sorted(set(widths_m)))
+        widths = " and ".join(f"{width_m:g} m" for width_m in sorted(set(widths_m)))
         warn(
-            f"area: {raw.origin}: it holds {_counted(raw)}: lines become corridors of {told} width "
-            "beside the polygons"
+            f"area: {raw.origin}: it holds {_counted(raw)}: lines become corridors of {widths} "
+            "width next to the polygons"
         )
     solid = _union([shape.solid, *(multipolygon(strip) for strip in strips)])
-    return Mended(solid=solid, holes=_less(shape.holes, solid))
+    return Repaired(solid=solid, holes=_less(shape.holes, solid))
 
 
 def _zone(raw: RawShapes, frame: LocalFrame, clearance_m: float) -> MultiPolygon:
@@ -147,7 +147,7 @@ def _zone(raw: RawShapes, frame: LocalFrame, clearance_m: float) -> MultiPolygon
             f"area: {raw.origin}: it holds {_counted(raw)}: set no_go_clearance_m, how far to keep "
             "from lines and points"
         )
-    shape = mended(local, frame, geographic=raw.geographic, overlaps=False)
+    shape = repaired(local, frame, geographic=raw.geographic, overlaps=False)
     around = [multipolygon(mark.buffer(clearance_m)) for mark in marks]
     return _union([widened(shape.solid, clearance_m), *around])
 
@@ -171,8 +171,8 @@ def _less(shape: MultiPolygon, taken: MultiPolygon) -> MultiPolygon:
 
 def _counted(raw: RawShapes) -> str:
     counts = {"polygon": len(raw.polygons), "line": len(raw.lines), "point": len(raw.points)}
-    told = [f"{n} {what}{'s' if n > 1 else ''}" for what, n in counts.items() if n]
-    return " and ".join(told) or "nothing"
+    parts = [f"{n} {what}{'s' if n > 1 else ''}" for what, n in counts.items() if n]
+    return " and ".join(parts) or "nothing"
 
 
 def _check_parts(area: Area, *, margin_m: float = 0.0, given: str = "") -> None:

@@ -80,7 +80,7 @@ class Certificate:
 
     @property
     def at_overlap(self) -> NDArray[np.bool_]:
-        """Where, (rows, columns), the area is covered at the overlap asked for.
+        """Where, (rows, columns), the area is covered at the overlap requested.
 
         Every camera sees such a place on as many lines, and in as many pictures, as it does
         everywhere in an endless pattern.
@@ -106,7 +106,7 @@ class Certificate:
 
     @property
     def share_at_overlap(self) -> float:
-        """Share of the area that is covered at the overlap asked for."""
+        """Share of the area that is covered at the overlap requested."""
         return self._share(self.at_overlap)
 
     @property
@@ -153,7 +153,7 @@ class Certificate:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _TileTask:
+class _GridTask:
     """A part of the area whose views are counted."""
 
     grid: Grid
@@ -188,7 +188,7 @@ def certificate(
         area: what must be seen.
         rig: its cameras, in water.
         stations: where pictures are taken.
-        pattern: the overlap asked for.
+        pattern: the overlap requested.
         cell_m: of the grid; left out, a twentieth of a footprint, less for a small area, and more
             where that would be over 16 million cells.
         executor: where the parts of a large area are worked on.
@@ -220,7 +220,7 @@ def certificate(
         if mask[here].any():
             near = stations.some(_near(part, stations, reach_m))
             places.append(here)
-            tasks.append(_TileTask(grid=part, rays=rays, stations=near, inside=mask[here]))
+            tasks.append(_GridTask(grid=part, rays=rays, stations=near, inside=mask[here]))
     tiles = []
     found = executor.map(
         count_tile, tasks, label="count the views of each place", task_mib=_TILE_MIB
@@ -247,7 +247,7 @@ def _cell_m(area: Area, rig: Rig, stations: Stations, asked_m: float | None) -> 
     """The side of a cell.
 
     Raises:
-        PlanError: the one asked for is not positive or too small.
+        PlanError: the one requested is not positive or too small.
     """
     boxed_m2 = float(area.survey.oriented_envelope.area)
     least_m = math.sqrt(boxed_m2 / _MOST_CELLS)
@@ -301,7 +301,7 @@ def _near(grid: Grid, stations: Stations, reach_m: Array) -> NDArray[np.bool_]:
     return near
 
 
-def count_tile(task: _TileTask) -> _TileCounts:
+def count_tile(task: _GridTask) -> _TileCounts:
     """Count the views of each cell of a part of the area."""
     pictures, lines, pairs = _counts(task.grid, task.rays, task.stations)
     return _TileCounts(

@@ -89,7 +89,7 @@ def draw_certificate(
         )  # fmt: skip
     for index, hole in enumerate(holes):
         _outline(
-            axes, hole.outline, _HOLE, 1.6, "not at the overlap asked for" if not index else ""
+            axes, hole.outline, _HOLE, 1.6, "not at the overlap requested" if not index else ""
         )
         if index < _NUMBERED:
             _number(axes, hole, index + 1)
@@ -109,7 +109,7 @@ def draw_certificate(
 def draw_risk(
     path: Path, area: Area, grid: Grid, probability: Array, title: str, text: str
 ) -> None:
-    """Draw the probability, (rows, columns), that a place is not covered at the overlap asked for.
+    """Draw the probability, (rows, columns), that a place is not covered at the overlap requested.
 
     NaN is outside of the area.
     """
@@ -141,7 +141,7 @@ def _figures(certificate: Certificate, holes: Sequence[Hole]) -> str:
     return (
         f"{certificate.stations} stations, {certificate.taken} pictures; seen "
         f"{certificate.covered_share:.2%}, in stereo {certificate.stereo_share:.2%}, at the "
-        f"overlap asked for {certificate.share_at_overlap:.2%}\n(that is {pattern.passes} "
+        f"overlap requested {certificate.share_at_overlap:.2%}\n(that is {pattern.passes} "
         f"line{'s' if pattern.passes > 1 else ''} and {asked} pictures of each camera); "
         f"{holes_text}, {sum(hole.area_m2 for hole in holes):.2f} m²; "
         f"grid {100 * certificate.grid.cell_m:.1f} cm"

@@ -1,4 +1,4 @@
-"""Where an area is not covered at the overlap asked for: places, sizes, outlines."""
+"""Where an area is not covered at the overlap requested: places, sizes, outlines."""
 
 import math
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from missions.values.area import multipolygon
 
 @dataclass(frozen=True, kw_only=True)
 class Hole:
-    """A connected part of the area that is not covered at the overlap asked for."""
+    """A connected part of the area that is not covered at the overlap requested."""
 
     outline: MultiPolygon
     """x = north, y = east, metres: the cells of the certificate's grid, cut at the area's edge."""
@@ -25,7 +25,7 @@ class Hole:
     longitude_deg: float
     """Of that place."""
     area_m2: float
-    """Of the cells whose middles are short of what was asked for."""
+    """Of the cells whose middles are short of what was requested."""
     unseen_m2: float
     """Of these, what is in no picture at all."""
     length_m: float

@@ -126,7 +126,7 @@ def footprints_ne(
 
     Args:
         points_body: (C, P, 3) from `border_rays_body`.
-        rays_body: (C, P, 3) likewise.
+        rays_body: (C, P, 3) the same way.
         glass_ne: (S, 2).
         altitude_m: (S,) of the glass.
         attitude_rad: (S, 3) roll, pitch, heading.
@@ -182,7 +182,7 @@ def count_pictures(
         pictures: (C, rows, columns) how many of each camera; added to.
         lines: (C, rows, columns) how many lines of each camera; added to.
         last: (C, rows, columns) line that saw it last, -1 at first; kept from call to call.
-        stamp: (rows, columns) picture that saw it last, -1 at first; kept likewise.
+        stamp: (rows, columns) picture that saw it last, -1 at first; kept the same way.
         pairs: (rows, columns) how many stations see it with all cameras at once; added to.
     """
     stations, cameras, points = borders.shape[:3]

@@ -1,4 +1,4 @@
-"""What a vehicle needs said beside the plan."""
+"""What a vehicle needs said besides the plan."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ to pass a place more closely turns back for it."""
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """What a vehicle needs said beside the plan."""
+    """What a vehicle needs said besides the plan."""
 
     altimeter_body_m: tuple[float, float, float] = CameraConfig().dvl_position_body_m
     """The sensor whose altitude the vehicle holds, from its reference point."""

@@ -17,7 +17,7 @@ import numpy as np
 from alice_survey.base.config import PlanConfig
 from alice_survey.base.frames import Array
 from camera_calib.rig import Rig
-from missions.exposure.table import Setting
+from missions.exposure.settings_table import Setting
 from missions.exposure.trigger import floor_to
 from missions.values.footprint import glass_point_cam
 
@@ -103,7 +103,7 @@ def exposure_for_rate(allowed_blur_px: float, rate_px_per_s: float) -> float:
 def exposure_rows(
     plan: PlanConfig, rates: BlurRates, exposure_s: float, pixel_m: float
 ) -> list[Setting]:
-    """Exposure, the blur it leaves, and the paper's 3 ms beside it."""
+    """Exposure, the blur it leaves, and the paper's 3 ms next to it."""
     attitude = plan.yaw_rate_deg_s > 0 or plan.roll_pitch_rate_deg_s > 0
     papers = PAPER_EXPOSURE_S * 1e3
     papers_blur = [u * PAPER_EXPOSURE_S / pixel_m for u in PAPER_SPEEDS_MPS]

@@ -15,8 +15,8 @@ from alice_survey.base.errors import PlanError
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.fov.focus import FocusedLens, apparent_depths, apparent_distance_m
 from camera_calib.water import WAVELENGTH_NM
-from missions.exposure.conflicts import Way, conflict
-from missions.exposure.table import Setting
+from missions.exposure.settings_table import Setting
+from missions.exposure.ways_out import Way, conflict
 
 _GREEN_M = float(WAVELENGTH_NM[1]) * 1e-9
 _AIRY = 2.44

@@ -14,8 +14,8 @@ from alice_survey.base.config import PlanConfig
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.fov.focus import apparent_distance_m
 from camera_calib.rig import Rig
-from missions.exposure.conflicts import Way, conflict
-from missions.exposure.table import Setting
+from missions.exposure.settings_table import Setting
+from missions.exposure.ways_out import Way, conflict
 from missions.values.footprint import (
     camera_swath,
     common_swath,
@@ -65,19 +65,17 @@ class Spacing:
 
     spacing_m: float
     bound_by: str
-    side_overlap: float
+    mean_overlap: float
     """Of one camera's pictures on the middle row, at the mean altitude."""
-    side_overlap_top: float
+    top_overlap: float
     """The same at the top of the relief."""
-    side_overlap_off_track: float
-    """At the mean altitude where two neighbours are each off by the track error, away from each
-    other."""
-    side_overlap_worst: float
-    """Both at once."""
-    side_overlap_area: float
+    off_track_overlap: float
+    """At the top of the relief where two neighbours are each off by the track error, away from
+    each other."""
+    area_overlap: float
     """Share of the area of one camera's picture that the picture abeam on the next line sees too,
     at the mean altitude. Less than on the middle row: through a port a footprint bulges."""
-    side_overlap_swath: float
+    swath_overlap: float
     """The same of what one camera surely sees on a line, between its pictures."""
     stereo_overlap: float
     """Least overlap of neighbouring stereo swaths at the mean altitude."""
@@ -178,7 +176,7 @@ def line_spacing(rig: Rig, plan: PlanConfig, step_m: float) -> Spacing:
 
     Args:
         rig: its first camera is the reference.
-        plan: what is asked for.
+        plan: what is requested.
         step_m: from picture to picture.
 
     Raises:
@@ -227,12 +225,11 @@ def _spacing(
     return Spacing(
         spacing_m=spacing_m,
         bound_by=bound_by,
-        side_overlap=overlap(prints.mean.across_m, spacing_m),
-        side_overlap_top=overlap(prints.top.across_m, spacing_m),
-        side_overlap_off_track=overlap(prints.mean.across_m, apart_m),
-        side_overlap_worst=overlap(prints.top.across_m, apart_m),
-        side_overlap_area=picture.intersection(abeam).area / picture.area,
-        side_overlap_swath=overlap(one.across_m, spacing_m),
+        mean_overlap=overlap(prints.mean.across_m, spacing_m),
+        top_overlap=overlap(prints.top.across_m, spacing_m),
+        off_track_overlap=overlap(prints.top.across_m, apart_m),
+        area_overlap=picture.intersection(abeam).area / picture.area,
+        swath_overlap=overlap(one.across_m, spacing_m),
         stereo_overlap=max(0.0, (2 * swath.half_across_m - spacing_m) / swath.across_m),
     )
 
@@ -334,9 +331,9 @@ def spacing_rows(spacing: Spacing, plan: PlanConfig, prints: FootprintRange) -> 
     given = plan.line_spacing_m is not None
     across_m = prints.mean.across_m
     note = ""
-    if given and spacing.side_overlap < plan.side_overlap - 1e-9:
+    if given and spacing.mean_overlap < plan.side_overlap - 1e-9:
         wanted = step_for_overlap(across_m, plan.side_overlap) - 2 * plan.track_error_m
-        note = f"{plan.side_overlap:.0%}, as asked for, needs {wanted:.3f} m"
+        note = f"{plan.side_overlap:.0%}, as requested, needs {wanted:.3f} m"
     elif given and math.isclose(spacing.spacing_m, 1.0) and math.isclose(plan.altitude_m, 2.0):
         note = "the paper flew 1 m lines at 2 m and states 45 %: " + _papers_overlap(across_m)
     return [
@@ -353,15 +350,15 @@ def spacing_rows(spacing: Spacing, plan: PlanConfig, prints: FootprintRange) -> 
         Setting(
             group="footprint and lines",
             name="side overlap",
-            value=(spacing.side_overlap, spacing.side_overlap_top, spacing.side_overlap_worst),
+            value=(spacing.mean_overlap, spacing.top_overlap, spacing.off_track_overlap),
             unit="%",
             equation="1 - (s + 2 e) / W",
             source=_GEOMETRY,
             bound_by="line spacing",
             note=f"at the mean / over the top of the relief / there with lines each "
             f"{plan.track_error_m:g} m off (track_error_m). All on the middle row; footprints "
-            f"bulge through a port: by area whole pictures share {spacing.side_overlap_area:.1%}, "
-            f"and the swaths that lines surely see {spacing.side_overlap_swath:.1%}, at the mean",
+            f"bulge through a port: by area whole pictures share {spacing.area_overlap:.1%}, "
+            f"and the swaths that lines surely see {spacing.swath_overlap:.1%}, at the mean",
         ),
         Setting(
             group="footprint and lines",

@@ -1,4 +1,4 @@
-"""The paper's gain procedure: control pictures of a short dive tell the gain to set.
+"""The paper's gain procedure: control pictures of a short dive show which gain to set.
 
 Gain changes brightness, not the light that was caught: where shot and read noise are the limit the
 report says so, and how much light is missing.
@@ -26,7 +26,7 @@ Floats = NDArray[np.float32]
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 _ZONES = 5
-"""Zones along each side of the frame: the lens's and the beam's fall-off is told by them."""
+"""Zones along each side of the frame: the lens's and the beam's fall-off is measured by them."""
 _SAMPLES = 250_000
 """Pixels of a picture that percentiles are taken of, about."""
 _HIGHLIGHT = 0.9
@@ -65,7 +65,7 @@ class PictureLevels:
 
 @dataclass(frozen=True, kw_only=True)
 class GainAdvice:
-    """The gain to set, and what it cannot mend."""
+    """The gain to set, and what it cannot correct."""
 
     pictures: int
     skipped: int
@@ -97,7 +97,7 @@ def gain_report(
 
     Args:
         pictures: a folder, or a pattern such as `control/*.png`.
-        present_gain_db: at which they were taken; the gain is told relative to it when None.
+        present_gain_db: at which they were taken; the change is reported relative to it when None.
         linear: grey values are proportional to light; else they follow the sRGB curve.
         target: share of full scale, linear, that the median is to have.
 
@@ -107,7 +107,7 @@ def gain_report(
     advice = gain_advice(
         picture_files(pictures), present_gain_db=present_gain_db, linear=linear, target=target
     )
-    return _told(advice, linear=linear), asdict(advice)
+    return _text(advice, linear=linear), asdict(advice)
 
 
 def picture_files(pictures: str | Path) -> list[Path]:
@@ -277,7 +277,7 @@ def _refuse_useless(
     if clipped > _MOST_CLIPPED or median >= _WHITE:
         raise ImageError(
             f"{len(levels)} control pictures are white ({clipped:.0%} of the pixels are clipped): "
-            "how much too bright cannot be told: lower the gain by 12 dB, or the exposure to a "
+            "how much too bright is not known: lower the gain by 12 dB, or the exposure to a "
             "quarter, and take them again"
         )
 
@@ -290,11 +290,11 @@ def _advice(
     clipped: float,
     present_db: float | None,
 ) -> list[str]:
-    """What gain cannot mend."""
+    """What gain cannot correct."""
     said = []
     if by_median > change + 0.05:
         said.append(
-            f"highlights allow {by_median - change:.1f} dB less than the median asks for: light "
+            f"highlights allow {by_median - change:.1f} dB less than the median needs: light "
             "is uneven; move the strobes apart or accept dark edges"
         )
     if snr < _ACCEPTABLE_SNR:
@@ -310,7 +310,7 @@ def _advice(
         )
     if clipped > 0.01:
         said.append(
-            f"{clipped:.1%} of the pixels are clipped: the gain told may still be too high; "
+            f"{clipped:.1%} of the pixels are clipped: this gain may still be too high; "
             "check it with new pictures"
         )
     spread = [p.median for p in levels]
@@ -322,7 +322,7 @@ def _advice(
     return said
 
 
-def _told(advice: GainAdvice, *, linear: bool) -> str:
+def _text(advice: GainAdvice, *, linear: bool) -> str:
     """The report as text."""
     curve = "linear" if linear else "sRGB curve undone"
     skipped = f", {advice.skipped} left out" if advice.skipped else ""

@@ -22,6 +22,7 @@ from alice_survey.base.config import CameraConfig, ImagingConfig
 from alice_survey.base.frames import Array
 from camera_calib.rig import Rig
 from camera_calib.water import WAVELENGTH_NM, WaterOptics
+from missions.exposure.settings_table import Setting
 from missions.values.footprint import glass_point_cam
 
 FLOOR_REFLECTANCE = np.array([0.40, 0.345, 0.255])
@@ -45,6 +46,10 @@ _LUMENS_PER_WATT = 683.0
 _BANDS_NM = ((600.0, 700.0), (500.0, 600.0), (400.0, 500.0))
 """Of red, green and blue."""
 _GRID = (13, 11)
+_SOURCE = (
+    "missions.exposure.light; water: Jerlov 1976 and Kirk 1984 (camera_calib.water); LEDs as a "
+    f"Planck radiator of {STROBE_KELVIN:g} K; sand; lens transmission 0.9 (inferred)"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,3 +238,72 @@ def light_for_snr_e(snr: float, read_noise_e: float) -> float:
 def _triple(values: Array) -> tuple[float, float, float]:
     red, green, blue = (float(v) for v in values)
     return red, green, blue
+
+
+def light_rows(
+    budget: LightBudget,
+    imaging: ImagingConfig,
+    limits: CameraConfig,
+    jerlov: str,
+    exposure_s: float,
+) -> list[Setting]:
+    """Electrons, signal to noise, gain, and the aperture or exposure that would fill the well."""
+    strobes = len(imaging.strobes_body_m)
+    dark = budget.gain_db > 0
+    return [
+        Setting(
+            group="light",
+            name="electrons, centre",
+            value=budget.centre_e,
+            unit="e",
+            equation="pi L T / (4 N^2 n^2) p^2 t QE / (h nu)",
+            source=_SOURCE,
+            bound_by="exposure",
+            note=f"red / green / blue of a pixel over sand in Jerlov {jerlov} water, {strobes} "
+            f"strobes of {imaging.strobe_lumens:g} lm, F/{limits.f_number:g}; the brightest pixel "
+            f"fills {budget.full_share:.1%} of the well of {limits.full_well_e:g} e",
+        ),
+        Setting(
+            group="light",
+            name="electrons, corner",
+            value=budget.corner_e,
+            unit="e",
+            equation="the same, with cos^4",
+            source=_SOURCE,
+            bound_by="lens, beam",
+        ),
+        Setting(
+            group="light",
+            name="signal to noise",
+            value=budget.snr_centre,
+            unit="",
+            equation="S / sqrt(S + read^2)",
+            source="Poisson shot noise and read noise",
+            bound_by="electrons",
+            note=f"at the centre; of the median pixel {budget.snr_median:.1f}, in the corner "
+            + " / ".join(f"{value:.1f}" for value in budget.snr_corner),
+        ),
+        Setting(
+            group="light",
+            name="gain",
+            value=budget.gain_db,
+            unit="dB",
+            equation="20 log10(grey x well / median)",
+            source=_SOURCE,
+            bound_by="light" if dark else "full well",
+            note=f"brings the median to {MIDDLE_GREY:.0%} of full scale (linear); 0 dB puts the "
+            "full well at full scale. Check it in the water: alice-survey plan gain PICTURES",
+        ),
+        Setting(
+            group="light",
+            name="f-number for half well",
+            value=budget.half_full_f_number,
+            unit="",
+            equation="N sqrt(S / half well)",
+            source=_SOURCE,
+            bound_by="depth of field",
+            note=f"for the brightest pixel in {exposure_s * 1e3:.3g} ms; or "
+            f"{budget.half_full_exposure_s * 1e3:.3g} ms at F/{limits.f_number:g}"
+            + ("; no common lens opens so far" if budget.half_full_f_number < 1.2 else ""),
+        ),
+    ]

@@ -1,4 +1,4 @@
-"""Two strobes beside a camera: light that the water throws back, and the shadows they cast."""
+"""Two strobes next to a camera: light that the water throws back, and the shadows they cast."""
 
 import math
 from dataclasses import dataclass
@@ -10,9 +10,11 @@ from alice_survey.base.frames import Array
 from camera_calib.rig import Rig
 from camera_calib.water import WaterOptics, phase_per_sr
 from missions.exposure.light import cone_intensity, floor_radiance, watts_per_lumen
+from missions.exposure.settings_table import Setting
 from missions.values.footprint import glass_point_cam
 
 _STEPS = 400
+_SOURCE = "missions.exposure.scatter: single scattering, Henyey-Greenstein 0.924 (Petzold)"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,3 +152,34 @@ def _strobes_cam(rig: Rig, imaging: ImagingConfig) -> Array:
 def _reach(strobe: Array) -> float:
     """Distance of a strobe from the camera's axis."""
     return float(np.hypot(strobe[0], strobe[1]))
+
+
+def scatter_rows(water: Scatter, shade: Shadows) -> list[Setting]:
+    """Veiling light and shadows."""
+    return [
+        Setting(
+            group="light",
+            name="veil, centre",
+            value=water.veil_share,
+            unit="%",
+            equation="B / (B + L)",
+            source=_SOURCE,
+            bound_by="strobe places",
+            note="share of the light that the water throws back before it reached the floor, red / "
+            f"green / blue. Strobes light the axis from {water.lit_from_m:.2f} m below the glass "
+            f"on, the field of view from {water.seen_lit_from_m:.2f} m; {water.lit_share:.0%} of "
+            "the water on the axis is lit",
+        ),
+        Setting(
+            group="light",
+            name="shadows",
+            value=shade.length_m,
+            unit="m",
+            equation="h r / (H - h)",
+            source="geometry of the strobes' places",
+            bound_by="strobe places",
+            note=f"of a thing {shade.height_m:g} m high below the camera, by each strobe; their "
+            f"light meets there at {shade.between_deg:.0f} deg"
+            + (" from both sides: each lights the other's shadow" if shade.opposite else ""),
+        ),
+    ]

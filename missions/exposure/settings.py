@@ -14,10 +14,11 @@ from alice_survey.base.config import (
     SurveyConfig,
     WaterConfig,
 )
-from alice_survey.base.errors import warn
+from alice_survey.base.errors import PlanError, warn
 from camera_calib.rig import Rig, design_rig
 from camera_calib.water import water_optics
 from missions.exposure.exposure import (
+    EXPOSURE_STEP_S,
     BlurRates,
     blur_rates,
     exposure_for_rate,
@@ -37,13 +38,13 @@ from missions.exposure.light import (
     LightBudget,
     light_budget,
     light_for_snr_e,
+    light_rows,
     too_dark,
 )
-from missions.exposure.light_rows import light_rows, scatter_rows, strobe_rows
-from missions.exposure.scatter import scatter, shadows
+from missions.exposure.scatter import scatter, scatter_rows, shadows
+from missions.exposure.settings_table import Setting, settings_table
 from missions.exposure.storage import Storage, storage_load, storage_rows
-from missions.exposure.strobe import StrobeLoad, strobe_load
-from missions.exposure.table import Setting, settings_table
+from missions.exposure.strobe import StrobeLoad, strobe_load, strobe_rows
 from missions.exposure.trigger import (
     PaperRule,
     interval_for_overlap_s,
@@ -161,6 +162,12 @@ def imaging_settings(rig: Rig, setup: ImagingSetup, *, quiet: bool = False) -> I
     spacing = line_spacing(rig, plan, step_m)
     rates = blur_rates(rig, plan, altitude_m)
     exposure_s = exposure_for_rate(plan.allowed_blur_px, rates.combined)
+    if exposure_s < EXPOSURE_STEP_S:
+        raise PlanError(
+            f"the sea floor moves {rates.combined:.3g} px a second over the sensor: "
+            f"allowed_blur_px {plan.allowed_blur_px:g} needs an exposure below "
+            f"{EXPOSURE_STEP_S * 1e6:g} us: raise allowed_blur_px, or lower speed_mps or the rates"
+        )
     focus = plan_focus(camera, limits, plan)
     optics = water_optics(jerlov)
     budget = light_budget(rig, limits, strobes, optics, altitude_m, exposure_s)

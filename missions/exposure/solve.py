@@ -11,11 +11,11 @@ from alice_survey.base.errors import AliceError, ConfigError, PlanError
 from alice_survey.base.text_table import text_table
 from alice_survey.vehicle.limits import spot_rate_rad_s
 from camera_calib.fov.table import json_row
-from missions.exposure.conflicts import Way, conflict
 from missions.exposure.footprints import altitude_for_pixel_m, footprint_at, pixel_on_floor_m
 from missions.exposure.light import too_dark
 from missions.exposure.settings import ImagingSetup, imaging_settings
 from missions.exposure.solve_lens import LensOption, in_focus, lenses_for_resolution, with_lens
+from missions.exposure.ways_out import Way, conflict
 from missions.values.costs import time_costs
 
 
@@ -25,7 +25,7 @@ class RateOption:
 
     lens_mm: float
     speed_mps: float
-    """At which the forward overlap is as asked."""
+    """At which the forward overlap is as requested."""
     forward_overlap: float
     """At the speed of the plan instead."""
     exposure_ms: float = math.nan
@@ -100,7 +100,7 @@ def solve_report(
 def speeds_for_rate(
     setup: ImagingSetup, rate_hz: float, lenses: Sequence[float]
 ) -> list[RateOption]:
-    """Speed at which pictures at a fixed rate overlap as asked, u = r L (1 - O), for each lens.
+    """Speed at which pictures at a fixed rate overlap as requested, u = r L (1 - O), for each lens.
 
     Raises:
         PlanError: cameras or trigger are slower than the rate.
@@ -146,7 +146,7 @@ def _too_often(setup: ImagingSetup, rate_hz: float) -> PlanError:
     return conflict(
         f"{rate_hz:g} pictures a second are more than the {most_hz:g} that cameras and trigger "
         "take",
-        ("the rate asked for", "camera.shortest_interval_s"),
+        ("the rate requested", "camera.shortest_interval_s"),
         ways,
     )
 

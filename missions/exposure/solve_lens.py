@@ -9,11 +9,11 @@ import numpy as np
 
 from alice_survey.base.config import PlanConfig
 from alice_survey.base.errors import AliceError, PlanError
-from missions.exposure.conflicts import Way, conflict
 from missions.exposure.focus import largest_f_number, needed_f_number
 from missions.exposure.footprints import altitude_for_pixel_m, footprint_at, pixel_on_floor_m
 from missions.exposure.light import LEAST_SNR, light_for_snr_e, too_dark
 from missions.exposure.settings import ImagingSetup, imaging_settings
+from missions.exposure.ways_out import Way, conflict
 
 _HIGHEST_M = 10.0
 

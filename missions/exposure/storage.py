@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from alice_survey.base.config import CameraConfig
 from camera_calib.flat_port import FlatPortCamera
-from missions.exposure.table import Setting
+from missions.exposure.settings_table import Setting
 
 LINK_BYTES_PER_S = 124e6
 """Of one Gigabit Ethernet cable: the cameras' `StreamBytesPerSecond` at full bandwidth (Allied

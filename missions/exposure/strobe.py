@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 from alice_survey.base.config import ImagingConfig, PlanConfig
 from alice_survey.base.errors import PlanError
-from missions.exposure.conflicts import Way, conflict
+from missions.exposure.settings_table import Setting
+from missions.exposure.ways_out import Way, conflict
 
 LEDS = 20
 EFFICACY_LM_W = 1354.0 / 13.01
@@ -24,6 +25,10 @@ HOUSING_KELVIN_PER_WATT = 0.5
 """Inferred: 0.02 m^2 of metal in water at 100 W/(m^2 K), the low end of free convection in liquids
 (Incropera, Fundamentals of Heat and Mass Transfer, table 1.1)."""
 WARM_SEA_C, SOLDER_LIMIT_C = 30.0, 85.0
+_SOURCE = (
+    "Cree XHP35: 104 lm/W (koef3, 2024), 1.8 K/W and 85 C (data sheet); driver 0.9, bus 28 V, "
+    "housing 0.5 K/W are inferred (missions.exposure.strobe)"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,3 +154,63 @@ def _too_long(
         ("strobe pulse", "heat of the strobe"),
         ways,
     )
+
+
+def strobe_rows(load: StrobeLoad) -> list[Setting]:
+    """Pulse, duty cycle, energy, capacitor, heat."""
+    return [
+        Setting(
+            group="strobes",
+            name="pulse",
+            value=load.pulse_s * 1e3,
+            unit="ms",
+            equation="t + 2 lead",
+            source="strobe covers the exposure",
+            bound_by="exposure",
+            note=f"lit {load.lead_s * 1e3:g} ms before the exposure, out as long after it "
+            "(strobe_lead_s)",
+        ),
+        Setting(
+            group="strobes",
+            name="duty cycle",
+            value=load.duty,
+            unit="%",
+            equation="pulse / interval",
+            source=_SOURCE,
+            bound_by="interval",
+            note=f"LEDs bear {load.duty_limit:.0%} in water of {WARM_SEA_C:g} C",
+        ),
+        Setting(
+            group="strobes",
+            name="energy a trigger",
+            value=load.frame_j,
+            unit="J",
+            equation="lm / (lm/W) x pulse / driver",
+            source=_SOURCE,
+            bound_by="pulse",
+            note=f"{load.count} strobes of {load.lit_w:.0f} W while lit, {load.peak_a:.1f} A from "
+            f"{BUS_V:g} V",
+        ),
+        Setting(
+            group="strobes",
+            name="capacitor, each",
+            value=load.capacitor_f * 1e3,
+            unit="mF",
+            equation="2 E / (V^2 - V_low^2)",
+            source=_SOURCE,
+            bound_by="pulse",
+            note=f"feeds a pulse while its {BUS_V:g} V sag by {BUS_SAG:.0%}; "
+            "continuous drive needs none",
+        ),
+        Setting(
+            group="strobes",
+            name="mean power",
+            value=load.mean_w,
+            unit="W",
+            equation="energy / interval",
+            source=_SOURCE,
+            bound_by="duty cycle",
+            note=f"from the battery, on lines; solder point {load.solder_c:.0f} C, junction "
+            f"{load.junction_c:.0f} C at most. Cameras and recorder are in vehicle.hotel_w",
+        ),
+    ]

@@ -1,4 +1,4 @@
-"""How often to take a picture: by the footprint, and by the paper's rule beside it."""
+"""How often to take a picture: by the footprint, and by the paper's rule next to it."""
 
 import math
 from dataclasses import dataclass
@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from alice_survey.base.config import CameraConfig, PlanConfig
 from alice_survey.base.errors import PlanError
 from camera_calib.flat_port import FlatPortCamera
-from missions.exposure.conflicts import Way, conflict
-from missions.exposure.table import Setting
+from missions.exposure.settings_table import Setting
+from missions.exposure.ways_out import Way, conflict
 from missions.values.footprint import footprint_size_m, overlap, step_for_overlap
 
 _INTERVAL_STEP_S = 1e-3
@@ -31,7 +31,7 @@ class PaperRule:
 
 
 def interval_for_overlap_s(along_m: float, plan: PlanConfig) -> float:
-    """Longest interval between pictures that overlap as asked, in steps of 1 ms."""
+    """Longest interval between pictures that overlap as requested, in steps of 1 ms."""
     return floor_to(step_for_overlap(along_m, plan.forward_overlap) / plan.speed_mps, 1e-3)
 
 

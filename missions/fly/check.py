@@ -15,7 +15,7 @@ from alice_survey.base.executor import SERIAL, Executor, local_executor
 from alice_survey.seafloor.terrain import survey_terrain
 from camera_calib.rig import Rig, design_rig, read_rig
 from missions.coverage.certificate import Certificate, certificate
-from missions.coverage.dives import DiveRecord, read_dive_record
+from missions.coverage.dive_record import DiveRecord, read_dive_record
 from missions.coverage.geofiles import write_coverage_tif, write_holes
 from missions.coverage.holes import Hole, find_holes
 from missions.coverage.stations import plan_pattern, stations_of_plan

@@ -54,7 +54,7 @@ _PHASES = {
 
 
 def draw_flight(path: Path, flight: Flight) -> None:
-    """Draw a map of plan, true track and navigation beside strips of the errors."""
+    """Draw a map of plan, true track and navigation next to strips of the errors."""
     figure, chart, strips = _sheet(6)
     _draw_plan(chart, flight.plan)
     some = thin(len(flight.line))
@@ -82,7 +82,7 @@ def draw_flight(path: Path, flight: Flight) -> None:
 
 
 def draw_vehicle(path: Path, flight: Flight) -> None:
-    """Draw the track, coloured by speed, beside strips of speed, roll, thrusters and power."""
+    """Draw the track, coloured by speed, next to strips of speed, roll, thrusters and power."""
     craft = vehicle(flight.vehicle)
     lateral = [t.name for t in craft.thrusters if abs(t.direction_body[1]) > 0.5]
     main = [t.name for t in craft.thrusters if abs(t.direction_body[0]) > 0.5]

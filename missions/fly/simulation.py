@@ -30,7 +30,7 @@ from alice_survey.vehicle.navigation.sensors import (
 from alice_survey.vehicle.navigation.tick import LOG_COLUMNS
 from alice_survey.vehicle.pilot.gains import gains_for
 from alice_survey.vehicle.pilot.memory import DONE, FOLLOW, LINE, PHASE, REASON
-from alice_survey.vehicle.pilot.safety import NONE, REASONS, Limits
+from alice_survey.vehicle.pilot.safety import NONE, REASONS, SafetyLimits
 from alice_survey.vehicle.pilot.settings import pilot_guidance
 from alice_survey.vehicle.sea import (
     Current,
@@ -184,7 +184,7 @@ def mission_setup(
         most_depth_m=deepest_m,
         point_body_m=settings.camera.position_body_m,
         spot_rad_s=spot_rate_rad_s(settings.turn_rate_limit_deg_s),
-        limits=Limits(
+        limits=SafetyLimits(
             0.5 * plan.altitude_m,
             deepest_m,
             longest_s=longest_s,

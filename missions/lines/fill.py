@@ -34,7 +34,7 @@ from missions.values.line import Line
 from missions.values.pattern import Pattern
 
 LEFT_SHARE = 0.0003
-"""Share of the area that may be left: the least share that matters where 99.9 % is asked for."""
+"""Share of the area that may be left: the least share that matters where 99.9 % is requested."""
 _HOP_STEPS = 10.0
 """A line more costs about as much as this many steps of line more. Chosen: with pictures half a
 metre apart, a stop and two turns at 0.2 m/s."""
@@ -298,7 +298,7 @@ def _best_line(
     Args:
         points: (N, 3) u, v and worth of places, by u.
         reach_along: half the size of what a point stands for, along.
-        reach_across: likewise across.
+        reach_across: the same across.
         offsets: (O,) ascending, to try.
         allowed: (A, 4) u, v of the edges of the allowed area.
         half_across: what a line sees.

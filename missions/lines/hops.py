@@ -8,14 +8,13 @@ are cheaper, is made later by `missions.route.turns`: this price orders lines, i
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from missions.route.joins import LONGEST_SWAY_M
-from missions.values.costs import Costs
+from missions.values.costs import Costs, Prices, prices
 
 NOWHERE_J = 1e15
 """Beyond any battery: stands for what cannot be flown, so that the rest can still be compared."""
@@ -23,35 +22,9 @@ _SAME_M = 1e-6
 _SAME_RAD = 1e-6
 
 
-class Prices(NamedTuple):
-    """`Costs` as compiled code takes them; nothing is infinite."""
-
-    speed_mps: float
-    line_w: Array
-    way_w: Array
-    sway_w: Array
-    spot_w: float
-    turn_rate_rad_s: float
-    settle_s: float
-    sway_mps: float
-
-
-def prices_of(costs: Costs) -> Prices:
-    """The part of the costs that the order of lines depends on."""
-    return Prices(
-        speed_mps=float(costs.speed_mps),
-        line_w=_finite(costs.line_w),
-        way_w=_finite(costs.way_w),
-        sway_w=_finite(costs.sway_w),
-        spot_w=float(costs.spot_w),
-        turn_rate_rad_s=float(costs.turn_rate_rad_s),
-        settle_s=float(costs.settle_s),
-        sway_mps=float(costs.sway_mps),
-    )
-
-
-def _finite(power_w: Array) -> Array:
-    return np.minimum(np.ascontiguousarray(power_w, dtype=np.float64), NOWHERE_J)
+def comparable_prices(costs: Costs) -> Prices:
+    """Prices of which nothing is infinite, so that totals with hops nobody can fly compare."""
+    return prices(costs, NOWHERE_J)
 
 
 @compiled
@@ -99,10 +72,10 @@ def hop_j(
     Args:
         prices: of the vehicle.
         north_0: where it begins.
-        east_0: likewise.
+        east_0: where it begins.
         course_0: of the line before; NaN at home, where any will do.
         north_1: where it ends.
-        east_1: likewise.
+        east_1: where it ends.
         course_1: of the line after; NaN at home.
         way_m: length of the shortest way inside the allowed area; inf where there is none.
     """
@@ -133,7 +106,7 @@ def hops_j(prices: Prices, leave: Array, enter: Array, ways_m: Array) -> Array:
     Args:
         prices: of the vehicle.
         leave: (N, 3) north, east, course at the ends of lines; NaN at home.
-        enter: (M, 3) likewise at the starts.
+        enter: (M, 3) the same at the starts.
         ways_m: (N, M) lengths of the ways.
 
     Returns:

@@ -22,7 +22,7 @@ from missions.lines.fill import fill_table
 from missions.lines.site import Site
 from missions.route.ways import Ways
 from missions.values.area import Area
-from missions.values.costs import Costs
+from missions.values.costs import Costs, Prices
 from missions.values.line import Line, LineKind
 from missions.values.pattern import Pattern
 
@@ -102,7 +102,7 @@ def lay_lines(
         heading_rad,
         pattern,
         ways,
-        hops.prices_of(costs),
+        hops.comparable_prices(costs),
         home_ne,
         cross_lines=cross_lines,
         closing_line=closing_line,
@@ -124,7 +124,7 @@ def ordered(
     if not lines:
         return []
     ends = np.array([(*line.start_ne_m, *line.end_ne_m) for line in lines])
-    prices, home = hops.prices_of(costs), np.array(home_ne, dtype=np.float64)
+    prices, home = hops.comparable_prices(costs), np.array(home_ne, dtype=np.float64)
     corners, inner = np.zeros((len(lines), cells.CORNERS, 3)), np.full((len(lines), 4), np.inf)
     for i, line in enumerate(lines):
         corners[i] = [[*line.start_ne_m, line.heading_rad]] * cells.CORNERS
@@ -163,7 +163,7 @@ def laid(
     heading_rad: float,
     pattern: Pattern,
     ways: Ways,
-    prices: hops.Prices,
+    prices: Prices,
     home_ne: tuple[float, float],
     *,
     cross_lines: int,
@@ -364,7 +364,7 @@ def _tour(
     exits: NDArray[np.int64],
     inner: Array,
     ways: Ways,
-    prices: hops.Prices,
+    prices: Prices,
     home: Array,
     closed: _Closings | None,
     survey_cells: int,
@@ -439,7 +439,7 @@ def _inserted(
     kinds: NDArray[np.int64],
     home: Array,
     ways: Ways,
-    prices: hops.Prices,
+    prices: Prices,
 ) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
     """Fly fill lines, (F, 6) a table and steps, each where its detour costs least."""
     ways_m = ways_between(table, home, ways)

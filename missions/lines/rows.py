@@ -247,7 +247,7 @@ def lay_rows(
 
     Args:
         survey: (E, 4) u, v of both ends of the edges of the area to see.
-        allowed: (A, 4) likewise of the area where lines may be.
+        allowed: (A, 4) the same of the area where lines may be.
         offsets: (R,) ascending v of the rows.
         half_m: half the width of the strip a row looks after.
         overhang_m: how far a line begins before the area, and ends behind it.

@@ -32,7 +32,7 @@ from missions.lines.lay import check_size, laid, tell_of_planner
 from missions.lines.site import Site
 from missions.route.ways import Ways
 from missions.values.area import Area
-from missions.values.costs import Costs
+from missions.values.costs import Costs, Prices
 from missions.values.pattern import Pattern
 
 _ESTIMATES = 1800
@@ -91,7 +91,7 @@ def best_heading(
     """
     tell_of_planner()
     check_size(area, pattern)
-    site, prices = Site.of(area), hops.prices_of(costs)
+    site, prices = Site.of(area), hops.comparable_prices(costs)
     width_heading, width = least_width(site.survey)
     close: dict[float, float] = {}
     found: dict[float, float] = {}
@@ -179,7 +179,7 @@ def full_cost_j(
         heading_rad,
         pattern,
         ways,
-        hops.prices_of(costs),
+        hops.comparable_prices(costs),
         home_ne,
         cross_lines=cross_lines,
         closing_line=closing_line,
@@ -211,7 +211,7 @@ def widths_m(edges: Array, headings: Array) -> Array:
 
 
 def estimate_j(
-    site: Site, headings: Array, pattern: Pattern, prices: hops.Prices, cross_lines: int
+    site: Site, headings: Array, pattern: Pattern, prices: Prices, cross_lines: int
 ) -> Array:
     """Energy, (H,), of all pieces of lines and of a turn to each, at headings (H,)."""
     turn_j = hops.hop_j(prices, 0.0, 0.0, 0.0, 0.0, pattern.spacing_m, math.pi, pattern.spacing_m)
@@ -243,7 +243,7 @@ def _estimates(
     overhang: float,
     step: float,
     least_steps: int,
-    prices: hops.Prices,
+    prices: Prices,
     turn_j: float,
     cross_lines: int,
 ) -> Array:

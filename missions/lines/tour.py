@@ -195,9 +195,9 @@ def improved_tour(
     Args:
         tour: (C,) corners of entry in order.
         hops: as of `exact_tour`.
-        exits: likewise.
-        inner: likewise.
-        start: likewise.
+        exits: the same.
+        inner: the same.
+        start: the same.
         finish: (4C,) cost after leaving last at a corner.
         fixed: how many cells at its begin stay as they are, 0 or 1.
     """
@@ -295,10 +295,10 @@ def good_tour(
 
     Args:
         hops: as of `improved_tour`.
-        exits: likewise.
-        inner: likewise.
-        start: likewise.
-        finish: likewise.
+        exits: the same.
+        inner: the same.
+        start: the same.
+        finish: the same.
         first: (C,) tour to begin with.
         fixed: as of `improved_tour`.
     """

@@ -15,7 +15,7 @@ import numpy as np
 
 from alice_survey.base.errors import NavigationError
 from alice_survey.base.frames import Array, Datum
-from missions.logs.dataflash import Mask, Table, read_dataflash
+from missions.logs.dataflash import LogTable, Mask, read_dataflash
 from missions.logs.dive import DATED_AFTER_S, LoggedDive, Signal, cleaned, usable_positions
 from missions.logs.tlog import COMPONENT, RECORDED, SYSTEM, read_tlog
 
@@ -31,11 +31,11 @@ _DOWN = 25
 _GOOD = 4
 """RangeFinder status: in range."""
 _INSTANCE = ("C", "I", "Instance", "id")
-"""Fields that tell one of several cores or sensors."""
+"""Fields that identify one of several cores or sensors."""
 _REBOOT_S = 1.0
 """A clock since boot that goes back by more has been started again."""
 
-_Tables = Mapping[str, Table]
+_Tables = Mapping[str, LogTable]
 _Reader = Callable[[_Tables], tuple[Array, Array] | None]
 """From tables to times and values; None where a table or a field is missing."""
 
@@ -56,14 +56,14 @@ class _Keep:
 
     fields: tuple[str, ...]
     """What `rows` needs."""
-    rows: Callable[[Table], Mask]
+    rows: Callable[[LogTable], Mask]
 
 
 def _take(
     message: str, fields: Sequence[str], scale: float | Sequence[float] = 1.0,
     keep: _Keep | None = None, absent: float | None = None,
 ) -> _Reader:  # fmt: skip
-    """Reads fields of a message, times scales; `keep` tells rows to use, `absent` what is NaN."""
+    """Read fields of a message, times scales; `keep` marks rows to use, `absent` what is NaN."""
 
     def read(tables: _Tables) -> tuple[Array, Array] | None:
         table = tables.get(message)
@@ -106,7 +106,7 @@ def _has_fix(field: str) -> _Keep:
     return _Keep((field,), lambda table: table.columns[field] >= _FIX_3D)
 
 
-def _sees_down(table: Table) -> Mask:
+def _sees_down(table: LogTable) -> Mask:
     """Rows of a range finder that looks down and is in range."""
     good: Mask = table.columns["Stat"] == _GOOD
     if "Orient" in table.columns:
@@ -114,7 +114,7 @@ def _sees_down(table: Table) -> Mask:
     return good
 
 
-def _hears_bottom(table: Table) -> Mask:
+def _hears_bottom(table: LogTable) -> Mask:
     """Rows of DISTANCE_SENSOR that look down and are within what the sensor measures."""
     distance = table.columns["current_distance"]
     inside = (distance >= table.columns["min_distance"]) & (
@@ -240,7 +240,7 @@ def read_ardusub_tlog(path: Path, asked: Mapping[str, str]) -> LoggedDive:
     wanted = {source.message for sources in _TLOG.values() for source in sources}
     tables, present = read_tlog(path, wanted, lost)
     vehicle = _vehicle(path, tables, present)
-    offset: dict[str, Table] = {}
+    offset: dict[str, LogTable] = {}
     for name, table in tables.items():
         own = table.rows(table.columns[SYSTEM] == vehicle)
         if len(own) < len(table):
@@ -344,12 +344,12 @@ def _signal(
 
 
 def _one_instance(
-    path: Path, role: str, table: Table, asked: str, named: bool
-) -> tuple[Table | None, str]:
+    path: Path, role: str, table: LogTable, asked: str, named: bool
+) -> tuple[LogTable | None, str]:
     """The rows of one core or sensor, and a note on the others.
 
     Cores and GPS receivers count from the one that is used. Which barometer is the depth sensor
-    is not told by its number, so that of several one must be asked for.
+    is not identified by its number, so that of several one must be asked for.
     """
     field = next((name for name in _INSTANCE if name in table.columns), None)
     if field is None:
@@ -377,8 +377,8 @@ def _one_instance(
     return table.rows(table.columns[field] == numbers[0]), note
 
 
-def _with_time(table: Table, time_s: Array) -> Table:
-    return Table(
+def _with_time(table: LogTable, time_s: Array) -> LogTable:
+    return LogTable(
         name=table.name,
         columns={**table.columns, "time_s": time_s},
         kinds=table.kinds,
@@ -402,7 +402,7 @@ def _since_1970(tables: _Tables) -> tuple[float, bool]:
     return float(np.median(utc - fixed.columns["TimeUS"] * 1e-6)), True
 
 
-def _declination(parameters: Table | None) -> float | None:
+def _declination(parameters: LogTable | None) -> float | None:
     """What the vehicle added to its compass, degrees; NaN where it took it from its own table."""
     if parameters is None or "Name" not in parameters.texts or "Value" not in parameters.columns:
         return None
@@ -414,7 +414,7 @@ def _declination(parameters: Table | None) -> float | None:
 
 
 def _vehicle(path: Path, tables: _Tables, present: Sequence[str]) -> float:
-    """The system that tells most of where it is."""
+    """The system that reports its place most."""
     for name in ("GLOBAL_POSITION_INT", "GPS_RAW_INT", "ATTITUDE"):
         if name in tables:
             systems, counts = np.unique(tables[name].columns[SYSTEM], return_counts=True)
@@ -425,8 +425,8 @@ def _vehicle(path: Path, tables: _Tables, present: Sequence[str]) -> float:
     )
 
 
-def _tlog_times(table: Table) -> Array:
-    """Times by the ground station's clock, without the jitter of the link where that can be told.
+def _tlog_times(table: LogTable) -> Array:
+    """Times by the ground station's clock, without the jitter of the link where that can be known.
 
     A message that carries the vehicle's time since boot has that, plus what the quickest message
     of one boot took; the others have the time of their recording.

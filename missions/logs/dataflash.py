@@ -33,7 +33,7 @@ _DIVISORS = {"c": 100.0, "C": 100.0, "e": 100.0, "E": 100.0, "L": 1e7}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Table:
+class LogTable:
     """All messages of one name."""
 
     name: str
@@ -47,9 +47,9 @@ class Table:
     def __len__(self) -> int:
         return len(next(iter(self.columns.values()), ()))
 
-    def rows(self, keep: Mask) -> "Table":
+    def rows(self, keep: Mask) -> "LogTable":
         """The rows where a mask, (N,), holds."""
-        return Table(
+        return LogTable(
             name=self.name,
             columns={name: column[keep] for name, column in self.columns.items()},
             kinds=self.kinds,
@@ -65,7 +65,7 @@ class Table:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Format:
+class _MessageFormat:
     name: str
     length: int
     kinds: str
@@ -93,7 +93,7 @@ class _Format:
 
 def read_dataflash(
     path: Path, wanted: Collection[str], lost: Counter[str]
-) -> tuple[dict[str, Table], list[str]]:
+) -> tuple[dict[str, LogTable], list[str]]:
     """Read the messages of some names.
 
     Args:
@@ -122,8 +122,8 @@ def read_dataflash(
 
 def _read_binary(
     data: bytes, wanted: Collection[str], lost: Counter[str]
-) -> tuple[dict[str, Table], list[str]]:
-    formats: dict[int, _Format] = {}
+) -> tuple[dict[str, LogTable], list[str]]:
+    formats: dict[int, _MessageFormat] = {}
     lengths = [0] * 256
     lengths[_FMT] = _FMT_LENGTH
     offsets: list[list[int]] = [[] for _ in range(256)]
@@ -148,7 +148,7 @@ def _read_binary(
     if place < end:
         lost["bytes of a message cut off at the end of the file"] += end - place
     view = np.frombuffer(data, dtype=np.uint8)
-    tables: dict[str, Table] = {}
+    tables: dict[str, LogTable] = {}
     for number, form in formats.items():
         if form.name in wanted and offsets[number]:
             starts = np.array(offsets[number])
@@ -159,12 +159,12 @@ def _read_binary(
 
 
 def _learn(
-    body: bytes, formats: dict[int, _Format], lengths: list[int], lost: Counter[str]
+    body: bytes, formats: dict[int, _MessageFormat], lengths: list[int], lost: Counter[str]
 ) -> None:
     """Take in one FMT message."""
     number, length, *texts = struct.unpack("<BB4s16s64s", body)
     name, kinds, fields = (t.split(b"\0")[0].decode("ascii", "replace") for t in texts)
-    form = _Format(
+    form = _MessageFormat(
         name=name, length=length, kinds=kinds, fields=tuple(fields.split(",")) if fields else ()
     )
     known = formats.get(number)
@@ -182,7 +182,7 @@ def _learn(
     lengths[number] = length if length > 3 else 0
 
 
-def _table(form: _Format, records: Any) -> Table:
+def _table(form: _MessageFormat, records: Any) -> LogTable:
     columns: dict[str, Array] = {}
     texts: dict[str, list[str]] = {}
     for name, kind in zip(form.fields, form.kinds, strict=True):
@@ -190,7 +190,7 @@ def _table(form: _Format, records: Any) -> Table:
             texts[name] = [t.split(b"\0")[0].decode("utf-8", "replace") for t in records[name]]
         else:
             columns[name] = records[name].astype(np.float64) / _DIVISORS.get(kind, 1.0)
-    return Table(
+    return LogTable(
         name=form.name,
         columns=columns,
         kinds=dict(zip(form.fields, form.kinds, strict=True)),
@@ -200,7 +200,7 @@ def _table(form: _Format, records: Any) -> Table:
 
 def _read_text(
     data: bytes, wanted: Collection[str], lost: Counter[str]
-) -> tuple[dict[str, Table], list[str]]:
+) -> tuple[dict[str, LogTable], list[str]]:
     """Lines of comma-separated values, already scaled; FMT lines first name the fields."""
     formats: dict[str, tuple[str, tuple[str, ...]]] = {}
     rows: dict[str, list[list[str]]] = {}
@@ -225,7 +225,7 @@ def _read_text(
 
 def _text_table(
     name: str, kinds: str, fields: tuple[str, ...], rows: list[list[str]], lost: Counter[str]
-) -> Table:
+) -> LogTable:
     whole = [row for row in rows if len(row) == len(fields)]
     if len(whole) < len(rows):
         lost[f"{name}: lines without all of its fields"] += len(rows) - len(whole)
@@ -243,6 +243,6 @@ def _text_table(
             except ValueError:
                 lost[f"{name}: {field} is no number"] += 1
         columns[field] = values
-    return Table(
+    return LogTable(
         name=name, columns=columns, kinds=dict(zip(fields, kinds, strict=False)), texts=texts
     )

@@ -1,4 +1,4 @@
-"""What a vehicle's own log tells of a dive, whatever its format: series of numbers against time."""
+"""What a vehicle's own log says of a dive, whatever its format: series of numbers against time."""
 
 import bisect
 from collections import Counter
@@ -101,7 +101,7 @@ class LoggedDive:
     pwm: Signal | None = None
     """(N, n) microseconds of servo outputs 1 to n."""
     declination_in_log_deg: float | None = None
-    """What the vehicle itself added to its compass, where the log tells; NaN: it did, by a table
+    """What the vehicle itself added to its compass, where the log says; NaN: it did, by a table
     of its own."""
     lost: Mapping[str, int] = field(default_factory=dict)
     """How many rows or bytes were left out, by reason."""

@@ -121,7 +121,7 @@ def import_log(
 
 
 def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
-    """Read a log of any format that is known, told by its name and content.
+    """Read a log of any format that is known, recognised by its name and content.
 
     Raises:
         NavigationError: it is missing, of no known format, or cannot be used.
@@ -306,9 +306,9 @@ def _report(
     if lost:
         warn(f"{path}: left out: " + "; ".join(f"{n} {why}" for why, n in sorted(lost.items())))
     if gaps:
-        told = ", ".join(f"{length:.1f} s from {moment(start)}" for start, length in gaps[:_NAMED])
+        spans = ", ".join(f"{length:.1f} s from {moment(start)}" for start, length in gaps[:_NAMED])
         more = f" and {len(gaps) - _NAMED} more" if len(gaps) > _NAMED else ""
-        warn(f"{path}: {len(gaps)} gaps in the positions: {told}{more}")
+        warn(f"{path}: {len(gaps)} gaps in the positions: {spans}{more}")
     sources = {
         "position": dive.position, "depth": dive.depth, "attitude": dive.attitude,
         "altitude": dive.altitude,

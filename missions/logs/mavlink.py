@@ -119,7 +119,7 @@ MESSAGES = {
         Message(173, "RANGEFINDER", "float distance, float voltage"),
     )
 }  # fmt: skip
-"""By number: those that tell of navigation, and the one that every system sends."""
+"""By number: those about navigation, and the one that every system sends."""
 
 
 class Packet(NamedTuple):
@@ -161,6 +161,6 @@ def packet_at(data: bytes, start: int) -> Packet | None:
         return None
     message, whole = MESSAGES.get(number), None
     if message is not None:
-        told = int.from_bytes(data[checked : checked + _CHECKSUM], "little")
-        whole = checksum(data[start + 1 : checked] + bytes([message.crc_extra])) == told
+        stated = int.from_bytes(data[checked : checked + _CHECKSUM], "little")
+        whole = checksum(data[start + 1 : checked] + bytes([message.crc_extra])) == stated
     return Packet(end - start, number, system, component, data[start + head : checked], whole)

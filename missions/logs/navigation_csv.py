@@ -146,9 +146,9 @@ def read_navigation(path: Path, zone: tzinfo) -> NavigationLog:
         times.append(time)
         table.append([*position, *rest])
     if faults:
-        told = _by_ranges(faults)
-        more = f" and {len(told) - _NAMED} more" if len(told) > _NAMED else ""
-        warn(f"{path}: left out {'; '.join(told[:_NAMED])}{more}")
+        texts = _by_ranges(faults)
+        more = f" and {len(texts) - _NAMED} more" if len(texts) > _NAMED else ""
+        warn(f"{path}: left out {'; '.join(texts[:_NAMED])}{more}")
     if not times:
         raise NavigationError(f"{path}: no row with a time and a position")
     values = np.array(table)

@@ -81,7 +81,7 @@ _COLA2 = {
 
 @dataclass(frozen=True, kw_only=True)
 class BagOptions:
-    """What a bag does not tell by itself."""
+    """What a bag does not say by itself."""
 
     topics: Mapping[str, str]
     """By role (`dive.ROLES`): which topic to use."""
@@ -132,7 +132,7 @@ def read_ros_bag(path: Path, options: BagOptions) -> LoggedDive:
         lost: Counter[str] = Counter()
         notes: list[str] = []
         series = _collect(reader, {*chosen.values(), *origin, *joints}, lost, notes)
-    return _Reading(path, options, chosen, series, lost, notes).dive(origin, joints)
+    return _BagReading(path, options, chosen, series, lost, notes).dive(origin, joints)
 
 
 @contextmanager
@@ -304,7 +304,7 @@ def _collect(
     return found
 
 
-class _Reading:
+class _BagReading:
     """The parts of a dive out of the topics of a bag."""
 
     def __init__(
@@ -321,7 +321,7 @@ class _Reading:
         self._counted: set[_Topic] = set()
 
     def dive(self, origin: Sequence[_Topic], joints: Sequence[_Topic]) -> LoggedDive:
-        """Everything that the bag tells."""
+        """Everything that the bag holds."""
         navigation = self.series[self.chosen["navigation"]]
         if navigation.topic.kind == ODOMETRY:
             self._add_geodetic(self._datum(origin))

@@ -1,4 +1,4 @@
-"""Messages of ROS as rows of numbers: what of each type tells where a vehicle was.
+"""Messages of ROS as rows of numbers: what of each type says where a vehicle was.
 
 Orientations and velocities come out in NED and FRD. They are taken to be ENU and FLU (REP-103)
 unless the name of the message's frame holds `ned`, as in COLA2 and Stonefish.

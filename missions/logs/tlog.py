@@ -13,7 +13,7 @@ from typing import BinaryIO
 import numpy as np
 
 from alice_survey.base.errors import NavigationError
-from missions.logs.dataflash import Table
+from missions.logs.dataflash import LogTable
 from missions.logs.mavlink import LONGEST, MESSAGES, V1, V2, Message, Packet, packet_at
 
 RECORDED = "recorded_s"
@@ -29,7 +29,7 @@ _START = re.compile(bytes([ord("["), V1, V2, ord("]")]))
 
 def read_tlog(
     path: Path, wanted: Collection[str], lost: Counter[str]
-) -> tuple[dict[str, Table], list[str]]:
+) -> tuple[dict[str, LogTable], list[str]]:
     """Read the messages of some names.
 
     Args:
@@ -68,7 +68,7 @@ def read_tlog(
     names = sorted(MESSAGES[number].name for number in present if number in MESSAGES)
     others = len(present) - len(names)
     if others:
-        names.append(f"{others} more that do not tell where a vehicle is")
+        names.append(f"{others} more that do not say where a vehicle is")
     return tables, names
 
 
@@ -134,7 +134,7 @@ def _leads_on(data: bytes, place: int, following: int, previous: bytes) -> bool:
     return bool(other) and abs(apart_us) < _DAY_US
 
 
-def _table(message: Message, records: bytes) -> Table:
+def _table(message: Message, records: bytes) -> LogTable:
     """Stamps, origins and payloads, one after the other, as columns."""
     kind = np.dtype(
         [(RECORDED, ">u8"), (SYSTEM, "u1"), (COMPONENT, "u1"), ("payload", message.payload)]
@@ -144,4 +144,4 @@ def _table(message: Message, records: bytes) -> Table:
     columns[RECORDED] *= 1e-6
     for name in message.payload.names or ():
         columns[name] = rows["payload"][name].astype(np.float64)
-    return Table(name=message.name, columns=columns, kinds=dict.fromkeys(columns, "d"), texts={})
+    return LogTable(name=message.name, columns=columns, kinds=dict.fromkeys(columns, "d"), texts={})

@@ -97,8 +97,8 @@ def _summary(plan: Plan) -> str:
     return (
         f"{plan.stations} stations every {plan.interval_s:.2f} s, {plan.length_m:.0f} m, {dives}"
         f"{plan.duration_s / 60:.0f} min at {plan.speed_mps:g} m/s, {plan.energy_wh:.0f} Wh\n"
-        f"altitude {plan.altitude_m:g} m, overlap {plan.forward_overlap:.0%} forward, "
-        f"{plan.side_overlap:.0%} side, lines {plan.line_spacing_m:.2f} m apart, "
+        f"altitude {plan.altitude_m:g} m, overlap {plan.reached_forward_overlap:.0%} forward, "
+        f"{plan.reached_side_overlap:.0%} side, lines {plan.line_spacing_m:.2f} m apart, "
         f"{plan.coverage:.1%} covered as asked"
     )
 

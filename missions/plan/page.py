@@ -18,7 +18,7 @@ from alice_survey.base.config import SeaConfig
 from camera_calib.rig import Rig
 from missions.areas.bathymetry import Bathymetry
 from missions.coverage.certificate import Certificate
-from missions.exposure.table import Setting
+from missions.exposure.settings_table import Setting
 from missions.plan.page_data import page_data
 from missions.values.plan_file import Plan
 
@@ -121,13 +121,14 @@ def _subtitle(plan: Plan) -> str:
 
 def _facts(plan: Plan, rig: Rig) -> str:
     minutes = plan.duration_s / 60
+    along, across = 100 * plan.reached_forward_overlap, 100 * plan.reached_side_overlap
     facts = (
         ("lines", f"{len(plan.lines)}"),
         ("stations", f"{plan.stations}"),
         ("pictures", f"{plan.stations * len(rig.cameras)}"),
         ("every", f"{plan.interval_s:.2f} s"),
         ("exposure", f"{plan.exposure_s * 1000:.2f} ms"),
-        ("overlap", f"{100 * plan.forward_overlap:.0f} / {100 * plan.side_overlap:.0f} %"),
+        ("overlap", f"{along:.0f} / {across:.0f} %"),
         ("covered", f"{plan.coverage:.2%}"),
         ("way", f"{plan.length_m:.0f} m"),
         ("time", f"{minutes:.0f} min" if minutes < 180 else f"{minutes / 60:.1f} h"),

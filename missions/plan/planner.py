@@ -29,8 +29,8 @@ from missions.coverage.stations import (
     sure_pattern,
 )
 from missions.exposure.settings import ImagingSettings, ImagingSetup, imaging_settings
+from missions.exposure.settings_table import Setting
 from missions.exposure.storage import raw_bytes
-from missions.exposure.table import Setting
 from missions.lines.lay import lay_lines
 from missions.lines.sweep import Sweep, best_heading
 from missions.plan.rows import plan_rows
@@ -53,7 +53,7 @@ from missions.values.pattern import Pattern
 from missions.values.plan_file import Plan
 
 _ENOUGH = 0.999
-"""Share of the area that is to be covered at the overlap asked for; below, the plan warns."""
+"""Share of the area that is to be covered at the overlap requested; below, the plan warns."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -163,8 +163,8 @@ def plan_survey(config: SurveyConfig, rig: Rig) -> Planned:
             footprint_m=(imaging.footprint_across_m, imaging.footprint_along_m),
             line_spacing_m=pattern.spacing_m,
             station_spacing_m=step_m,
-            forward_overlap=imaging.forward_overlap,
-            side_overlap=imaging.spacing.side_overlap,
+            reached_forward_overlap=imaging.forward_overlap,
+            reached_side_overlap=imaging.spacing.mean_overlap,
             lines=tuple(lines),
             dives=dives,
             turn_radius_m=wanted.turn_radius_m,
@@ -267,7 +267,7 @@ def _depth_m(settings: AreaConfig, area: Area, bathymetry: Bathymetry | None) ->
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Terrain:
+class _Following:
     """How lines follow a bathymetry."""
 
     depths_m: tuple[tuple[float, ...], ...] = ()
@@ -283,9 +283,9 @@ def _terrain(
     pattern: Pattern,
     camera: FlatPortCamera,
     bathymetry: Bathymetry | None,
-) -> _Terrain:
+) -> _Following:
     if bathymetry is None:
-        return _Terrain()
+        return _Following()
     limits = TerrainLimits(
         altitude_m=wanted.altitude_m,
         least_clearance_m=wanted.least_clearance_m,
@@ -302,7 +302,7 @@ def _terrain(
         extent_m=partial(footprint_size_m, camera),
     )
     depths = tuple(tuple(round(float(d), 4) for d in p.depth_m) for p in profiles)
-    return _Terrain(depths_m=depths, text=text, figures=figures)
+    return _Following(depths_m=depths, text=text, figures=figures)
 
 
 def _stations(plan: Plan, bathymetry: Bathymetry | None) -> Stations:
@@ -311,7 +311,7 @@ def _stations(plan: Plan, bathymetry: Bathymetry | None) -> Stations:
         return stations_of_plan(plan)
     places = np.vstack([line.stations_ne for line in plan.lines])
     stations = stations_of_plan(plan, bathymetry.depth_at(places))
-    # As for a dive: from too high a place, what is seen is not what was asked for.
+    # As for a dive: from too high a place, what is seen is not what was requested.
     near = stations.altitude_m <= MOST_ALTITUDES * plan.altitude_m
     if not near.all():
         warn(
@@ -367,18 +367,24 @@ def _warn_of_zones(
 
 
 def _warn_of_spacing(plan: PlanConfig, imaging: ImagingSettings, stereo: Swath) -> None:
-    spacing_m, reached = imaging.line_spacing_m, imaging.spacing.side_overlap
+    spacing_m, reached = imaging.line_spacing_m, imaging.spacing.mean_overlap
     if spacing_m > 2 * stereo.half_across_m:
         warn(
             f"lines {spacing_m:g} m apart leave gaps of "
             f"{spacing_m - 2 * stereo.half_across_m:.2f} m in stereo; at most "
             f"{2 * stereo.half_across_m:.2f} m apart do not"
         )
-    if reached < plan.side_overlap - 1e-9:
-        needed_m = imaging.footprint_across_m * (1 - plan.side_overlap)
+    needed_m = imaging.footprint_across_m * (1 - plan.side_overlap)
+    if {"line_spacing_m", "side_overlap"} <= plan.model_fields_set and plan.line_spacing_m:
+        warn(
+            f"plan.line_spacing_m {spacing_m:g} and plan.side_overlap {plan.side_overlap:g} are "
+            f"both set: line_spacing_m is used, lines overlap by {reached:.1%}; leave one out "
+            f"({plan.side_overlap:.0%} needs {needed_m:.3f} m)"
+        )
+    elif reached < plan.side_overlap - 1e-9:
         warn(
             f"lines {spacing_m:g} m apart overlap by {reached:.1%}, less than the "
-            f"{plan.side_overlap:.1%} asked for, which needs {needed_m:.3f} m"
+            f"{plan.side_overlap:.1%} requested, which needs {needed_m:.3f} m"
         )
 
 

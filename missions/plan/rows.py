@@ -2,17 +2,38 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 from alice_survey.base.config import VehicleConfig
+from alice_survey.base.text_table import text_table
 from camera_calib.rig import Rig
 from missions.coverage.certificate import Certificate
+from missions.exposure.settings_table import Setting, setting_from_json
 from missions.exposure.storage import raw_bytes
-from missions.exposure.table import Setting
 from missions.lines.sweep import Sweep
 from missions.route.energy import usable_wh
 from missions.values.plan_file import Plan
 
 _GROUP = "LINES AND DIVES"
+_MAIN = (
+    "footprint across", "footprint along", "pixel on the floor", "stereo swath", "line spacing",
+    "side overlap", "interval", "forward overlap", "exposure", "blur", "focus, set in air",
+    "sharp from, to", "f-number needed", "signal to noise", "gain", "pulse", "mean power",
+    "write rate on a line",
+)  # fmt: skip
+"""Settings that a person sets or checks before a dive."""
+
+
+def main_settings(plan_json: dict[str, Any]) -> str:
+    """The main settings of a plan as one screen of text; all are in `settings.txt`.
+
+    Args:
+        plan_json: the contents of `plan.json`.
+    """
+    rows = [setting_from_json(row) for row in plan_json["details"]["imaging"]["rows"]]
+    shown = {row.name: (row.name, row.text, row.bound_by) for row in rows}
+    table = text_table(("setting", "value", "bound by"), [shown[n] for n in _MAIN if n in shown])
+    return f"{table}\nEvery setting with its equation and source: plan/settings.txt, or --all\n"
 
 
 def plan_rows(
@@ -86,7 +107,7 @@ def _coverage_rows(seen: Certificate) -> Sequence[Setting]:
     often = seen.pattern.passes * seen.pattern.pictures
     return (
         _row(
-            "covered as asked", seen.share_at_overlap, "%", "union of real footprints", "lines",
+            "covered as requested", seen.share_at_overlap, "%", "union of real footprints", "lines",
             f"by every camera on {seen.pattern.passes} line{'s'[: seen.pattern.passes > 1]} and in "
             f"{often} pictures or more, as in an endless pattern of this spacing and step; "
             f"{seen.covered_share:.2%} is in some picture, {seen.stereo_share:.2%} in stereo; the "

@@ -11,13 +11,12 @@ from alice_survey.base.run import progress
 from camera_calib.rig import Rig, design_rig
 from missions.exports.options import Options, options_of
 from missions.exports.write import write_exports
-from missions.exposure.table import settings_table
+from missions.exposure.settings_table import settings_table
 from missions.exposure.timetable import trigger_table, write_timetable
 from missions.plan.map import draw_plan
 from missions.plan.page import Link, write_page
 from missions.plan.planner import Planned, plan_survey
-from missions.route.cost import leg_costs
-from missions.values.costs import Costs
+from missions.values.costs import Costs, leg_costs
 from missions.values.plan_file import Dive, Plan
 
 _SAME_S = 1e-3

@@ -9,8 +9,8 @@ import numpy as np
 
 from alice_survey.base.config import PlanConfig, SurveyConfig, VehicleConfig
 from alice_survey.base.errors import AliceError, PlanError
-from missions.exposure.conflicts import Way, conflict
 from missions.exposure.settings import ImagingSetup, imaging_settings
+from missions.exposure.ways_out import Way, conflict
 from missions.route.energy import (
     FlightConditions,
     flies_everywhere,

@@ -78,7 +78,7 @@ def shortest_turn(fence: Fence, start: Array, goal: Array, radius: float) -> Arr
     Args:
         fence: of the allowed area.
         start: (3,) north, east, heading.
-        goal: (3,) likewise.
+        goal: (3,) the same way.
         radius: of every arc.
 
     Returns:

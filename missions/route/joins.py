@@ -5,7 +5,6 @@ the allowed area is for the caller (`turns.route_through`).
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,7 @@ from alice_survey.base.compiled import compiled_ieee
 from alice_survey.base.frames import Array
 from missions.route.dubins import moved, shortest_turn
 from missions.route.fence import Fence, straight_inside
-from missions.values.costs import Costs
+from missions.values.costs import Prices
 
 NONE, AHEAD, ARCS, SPOT, SWAY = 0, 1, 2, 3, 4
 """How two lines are joined; nothing direct, and straight on."""
@@ -30,33 +29,6 @@ _TINY = 1e-9
 _SAME_M = 1e-6
 _DEAR_J = 1e15
 """Beyond any battery: stands for an infinite cost, so that of two such the shorter is chosen."""
-
-
-class Prices(NamedTuple):
-    """`Costs` as compiled code takes them."""
-
-    speed_mps: float
-    way_w: Array
-    spot_w: float
-    arc_extra_w: float
-    turn_rate_rad_s: float
-    settle_s: float
-    sway_mps: float
-    sway_w: Array
-
-
-def prices(costs: Costs) -> Prices:
-    """The part of the costs that the choice of a turn depends on."""
-    return Prices(
-        speed_mps=float(costs.speed_mps),
-        way_w=np.ascontiguousarray(costs.way_w, dtype=np.float64),
-        spot_w=float(costs.spot_w),
-        arc_extra_w=float(costs.arc_extra_w),
-        turn_rate_rad_s=float(costs.turn_rate_rad_s),
-        settle_s=float(costs.settle_s),
-        sway_mps=float(costs.sway_mps),
-        sway_w=np.ascontiguousarray(costs.sway_w, dtype=np.float64),
-    )
 
 
 @compiled_ieee
@@ -120,7 +92,7 @@ def join(
         fence: of the allowed area.
         prices: what to keep low.
         end: (3,) north, east, heading at the end of the line; a heading of NaN is free (home).
-        goal: (3,) likewise at the start of the next.
+        goal: (3,) the same at the start of the next.
         radius: of arcs.
         run_out: straight after the line if arcs follow.
         run_in: straight before the next line; after a stop only where it is inside.
@@ -128,7 +100,7 @@ def join(
 
     Returns:
         How; (L, 8) legs; whether a way round corners should be compared, since the straight is
-        blocked and nothing else was asked for.
+        blocked and nothing else was requested.
     """
     if _goes_on(end, goal) and straight_inside(fence, end[0], end[1], goal[0], goal[1]):
         ahead = np.empty((1, COLUMNS))

@@ -18,7 +18,8 @@ from alice_survey.base.frames import Array
 from missions.route import joins
 from missions.route.fence import OPEN_WATER, TOUCH_M, Fence, straight_inside
 from missions.route.ways import Ways
-from missions.values.costs import Costs, time_costs
+from missions.values.costs import Costs, Prices, time_costs
+from missions.values.costs import prices as flight_prices
 from missions.values.legs import Leg, Route
 from missions.values.line import Line
 
@@ -64,7 +65,7 @@ def route_through(
     table = np.array([(*x.start_ne_m, *x.end_ne_m, x.heading_rad) for x in lines])
     fence = OPEN_WATER if ways is None else ways.fence
     _check_lines(table, ways, first_line)
-    prices = joins.prices(time_costs(PAPER_SPEED_MPS) if costs is None else costs)
+    prices = flight_prices(time_costs(PAPER_SPEED_MPS) if costs is None else costs)
     wanted = _WANTED[turns]
     legs, rows, kinds, detours = joins.joined_lines(
         fence, prices, table, turn_radius_m, run_in_m, wanted
@@ -126,7 +127,7 @@ def _run_out(fence: Fence, end: Array, run_out_m: float) -> Array:
 
 def _single(
     ways: Ways | None,
-    prices: joins.Prices,
+    prices: Prices,
     end: Array,
     goal: Array,
     turn_radius_m: float,
@@ -144,9 +145,7 @@ def _single(
     return result
 
 
-def _cheaper(
-    kind: int, direct: Array, round_corners: Array, prices: joins.Prices
-) -> tuple[Array, int]:
+def _cheaper(kind: int, direct: Array, round_corners: Array, prices: Prices) -> tuple[Array, int]:
     """The direct way, if there is one, or that round corners; and which."""
     if kind != joins.NONE and joins.price(prices, direct) <= joins.price(prices, round_corners):
         return direct, kind
@@ -192,7 +191,7 @@ def _legs(table: Array) -> tuple[Leg, ...]:
 
 
 def _warn_of_others(kinds: NDArray[np.intp], turns: Turns) -> None:
-    """Tell how many turns are not as asked for."""
+    """Tell how many turns are not as requested."""
     if turns == "auto":
         return
     asked = kinds[kinds != joins.AHEAD]

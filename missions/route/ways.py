@@ -274,7 +274,7 @@ def _shorten(
     Args:
         distances: (N, M) to fill.
         blocked_a: (A,) rows with something blocked.
-        blocked_b: (B,) columns likewise.
+        blocked_b: (B,) columns the same way.
         seen_a: (A, U) to the corners that any of them sees.
         seen_b: (B, V) to all corners.
         between: (U, V)

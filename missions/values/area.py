@@ -21,7 +21,7 @@ class Area:
 
     datum: Datum
     survey: MultiPolygon
-    """What must be covered at the overlap asked for, to its edge; holes are no-go zones."""
+    """What must be covered at the overlap requested, to its edge; holes are no-go zones."""
     allowed: MultiPolygon
     """Where the vehicle may be: by default the survey area and a margin to turn in, less the no-go
     zones."""

@@ -1,16 +1,19 @@
 """What flying costs, by course: electrical power of the whole vehicle along lines and between."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
 from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.limits import SPOT_RAD_S, STEP_MPS
+from missions.values.legs import Route
 
 SETTLE_S = 6.5
-"""That a stop takes beside its motion: braking, getting steady, under way again. Measured in the
+"""That a stop takes besides its motion: braking, getting steady, under way again. Measured in the
 simulator with exact navigation: ALICE turns by 90 degrees at 15 deg/s in 7.3 s and by 180 in
 13.3 s, and braking before and gathering way after cost 6 s more."""
 
@@ -29,7 +32,7 @@ class Costs:
     """(K,) of the whole vehicle (hotel load, lights, thrusters) on a line, at K courses spread
     evenly over a full turn from north; in between it is interpolated."""
     way_w: Array
-    """(K,) likewise between lines."""
+    """(K,) the same between lines."""
     spot_w: float
     """While it turns or waits on the spot."""
     arc_extra_w: float
@@ -37,11 +40,11 @@ class Costs:
     turn_rate_rad_s: float
     """On the spot."""
     settle_s: float
-    """That a stop (turn on the spot, sway step) takes beside its motion."""
+    """That a stop (turn on the spot, sway step) takes besides its motion."""
     sway_mps: float
     """Speed of a sway step."""
     sway_w: Array
-    """(K,) likewise of a sway step, by its course; infinite of a vehicle that cannot sway."""
+    """(K,) the same of a sway step, by its course; infinite of a vehicle that cannot sway."""
     heave_mps: float
     """Of descent and ascent, on the spot."""
     heave_w: float
@@ -100,7 +103,7 @@ def time_costs(
 
 
 def power_at(power_w: Array, course_rad: float) -> float:
-    """Power at a course, between the even samples of a full turn; infinite beside an infinite one.
+    """Power at a course, between the even samples of a full turn; infinite next to an infinite one.
 
     Args:
         power_w: (K,) from north on.
@@ -112,3 +115,129 @@ def power_at(power_w: Array, course_rad: float) -> float:
     if share == 0.0:  # nothing of the next one, though it may be infinite
         return float(power_w[low])
     return float((1 - share) * power_w[low] + share * power_w[(low + 1) % len(power_w)])
+
+
+class Prices(NamedTuple):
+    """`Costs` as compiled code takes them."""
+
+    speed_mps: float
+    line_w: Array
+    way_w: Array
+    sway_w: Array
+    spot_w: float
+    arc_extra_w: float
+    turn_rate_rad_s: float
+    settle_s: float
+    sway_mps: float
+
+
+def prices(costs: Costs, most_w: float = math.inf) -> Prices:
+    """The part of the costs that the choice of turns and the order of lines depend on.
+
+    Args:
+        costs: what flying takes.
+        most_w: powers by course are no higher; finite where totals have to be compared.
+    """
+
+    def bounded(power_w: Array) -> Array:
+        return np.minimum(np.ascontiguousarray(power_w, dtype=np.float64), most_w)
+
+    return Prices(
+        speed_mps=float(costs.speed_mps),
+        line_w=bounded(costs.line_w),
+        way_w=bounded(costs.way_w),
+        sway_w=bounded(costs.sway_w),
+        spot_w=float(costs.spot_w),
+        arc_extra_w=float(costs.arc_extra_w),
+        turn_rate_rad_s=float(costs.turn_rate_rad_s),
+        settle_s=float(costs.settle_s),
+        sway_mps=float(costs.sway_mps),
+    )
+
+
+def leg_costs(route: Route, costs: Costs) -> tuple[Array, Array]:
+    """Energy, J, and time, s, of each leg, both (L,).
+
+    The power on an arc is that of each course it passes through.
+    """
+    if not route.legs:
+        return np.empty(0), np.empty(0)
+    rows = np.array(
+        [
+            (
+                leg.heading_rad,
+                leg.length_m,
+                leg.curvature_per_m,
+                leg.line,
+                leg.turn_rad,
+                leg.side_rad,
+            )
+            for leg in route.legs
+        ]
+    )
+    course, length, curvature, line, turn, side = rows.T
+    spot, sway = turn != 0.0, side != 0.0
+    seconds = length / np.where(sway, costs.sway_mps, costs.speed_mps)
+    seconds = seconds + np.abs(turn) / costs.turn_rate_rad_s
+    end_course = course + curvature * length
+    power = np.where(
+        line >= 0,
+        mean_power(costs.line_w, course, end_course),
+        mean_power(costs.way_w, course, end_course),
+    )
+    power = power + np.where((line < 0) & (curvature != 0.0), costs.arc_extra_w, 0.0)
+    power = np.where(sway, mean_power(costs.sway_w, course, course), power)
+    power = np.where(spot, costs.spot_w, power)
+    settle = np.where(spot | sway, costs.settle_s, 0.0)
+    moving = np.zeros_like(seconds)
+    np.multiply(seconds, power, out=moving, where=seconds > 0.0)
+    return moving + settle * costs.spot_w, seconds + settle
+
+
+def mean_power(power_w: Array, start_rad: Array, end_rad: Array) -> Array:
+    """Mean power over courses, (N,); infinite where one that is passed through is.
+
+    Between its samples power changes evenly with the course, so its integral is a parabola's.
+
+    Args:
+        power_w: (K,) from north on, evenly over a full turn.
+        start_rad: (N,) first courses, any angle.
+        end_rad: (N,) last ones; as far from the first as the course turns.
+    """
+    low, high = np.minimum(start_rad, end_rad), np.maximum(start_rad, end_rad)
+    finite = np.isfinite(power_w)
+    known = np.where(finite, power_w, 0.0)
+    result = _mean(known, low, high)
+    if not finite.all():
+        result = np.where(_mean(np.where(finite, 0.0, 1.0), low, high) > 0.0, np.inf, result)
+    return result
+
+
+def _mean(power_w: Array, low_rad: Array, high_rad: Array) -> Array:
+    per_rad = len(power_w) / (2 * np.pi)
+    low, high = low_rad * per_rad, high_rad * per_rad
+    narrow = high - low < 1e-6
+    middle = np.where(narrow, (low + high) / 2, 0.0)
+    steps = np.where(narrow, 1.0, high - low)
+    passed = (_integral(power_w, high) - _integral(power_w, low)) / steps
+    return np.where(narrow, _at(power_w, middle), passed)
+
+
+def _at(power_w: Array, place: Array) -> Array:
+    low = np.floor(place)
+    index = low.astype(np.intp) % len(power_w)
+    following = power_w[(index + 1) % len(power_w)]
+    value: Array = power_w[index] + (place - low) * (following - power_w[index])
+    return value
+
+
+def _integral(power_w: Array, place: Array) -> Array:
+    """From north to places, both counted in samples."""
+    following = np.roll(power_w, -1)
+    whole = np.concatenate([[0.0], np.cumsum((power_w + following) / 2)])
+    low = np.floor(place)
+    turns, index = np.divmod(low.astype(np.intp), len(power_w))
+    share = place - low
+    part = share * (power_w[index] + share / 2 * (following[index] - power_w[index]))
+    value: Array = turns * whole[-1] + whole[index] + part
+    return value

@@ -5,7 +5,7 @@ What a vehicle does at each leg, by what its fields say:
 - straight (`length_m` > 0, all else 0): it goes ahead along its course at the plan's speed. It
   stops at the leg's end if a turn on the spot or a sway step follows, and starts from rest if one
   came before; otherwise it passes both ends at speed.
-- arc (`curvature_per_m` not 0): likewise, on a circle; at most one full turn.
+- arc (`curvature_per_m` not 0): the same way, on a circle; at most one full turn.
 - turn on the spot (`turn_rad` not 0; length, curvature and side 0): it stands at `start_ne_m`,
   turns by `turn_rad` from `heading_rad` the way its sign says (positive to starboard), and stands
   still again. At most half a turn.
@@ -13,7 +13,7 @@ What a vehicle does at each leg, by what its fields say:
   course at `Costs.sway_mps` with its heading held at `heading_rad + side_rad`, and stands again:
   with +pi/2 it moves to port, with -pi/2 to starboard.
 
-`Costs.settle_s` is what each turn on the spot and each sway step takes beside its motion: braking
+`Costs.settle_s` is what each turn on the spot and each sway step takes besides its motion: braking
 before, coming to rest after, and speeding up again.
 """
 
@@ -157,38 +157,3 @@ class Route:
             rows = order[cuts[i] : cuts[i + 1]]
             if len(rows):
                 yield leg, rows, along_m[rows] - starts[i]
-
-    def line_starts_m(self) -> dict[int, float]:
-        """Distance along the route at which each line of the plan starts."""
-        starts = zip(self.legs, self.starts_m, strict=False)
-        return {leg.line: float(start) for leg, start in starts if leg.line >= 0}
-
-    @property
-    def spot_turns(self) -> int:
-        """How often the vehicle turns on the spot."""
-        return sum(leg.turn_rad != 0.0 for leg in self.legs)
-
-    @property
-    def sway_steps(self) -> int:
-        """How often it steps sideways."""
-        return sum(leg.side_rad != 0.0 for leg in self.legs)
-
-    @property
-    def arc_turns(self) -> int:
-        """How often it turns while going ahead: arcs in a row count once."""
-        arcs = [leg.kind == "arc" for leg in self.legs]
-        return sum(arc and not before for before, arc in zip([False, *arcs], arcs, strict=False))
-
-    def polyline_ne(self, step_m: float) -> Array:
-        """The route as places (K, 2), for maps: all ends of legs, and points on the arcs between.
-
-        Args:
-            step_m: along an arc from point to point, at most.
-        """
-        places = [np.array([leg.start_ne_m for leg in self.legs[:1]]).reshape(-1, 2)]
-        for leg in self.legs:
-            if leg.length_m == 0.0:
-                continue
-            steps = math.ceil(leg.length_m / step_m) if leg.curvature_per_m else 1
-            places.append(leg.places(leg.length_m * np.arange(1, steps + 1) / steps))
-        return np.concatenate(places)

@@ -21,7 +21,7 @@ from missions.values.line import Line
 _FORMAT = {"format": "alice-survey plan", "version": 2}
 _NUMBERS = (
     "seafloor_depth_m", "altitude_m", "speed_mps", "interval_s", "exposure_s", "line_spacing_m",
-    "station_spacing_m", "forward_overlap", "side_overlap", "turn_radius_m", "run_in_m",
+    "station_spacing_m", "turn_radius_m", "run_in_m",
     "length_m", "duration_s", "energy_wh", "coverage",
 )  # fmt: skip
 
@@ -69,7 +69,7 @@ class Plan:
     Example:
         >>> import alice_survey as alice
         >>> plan = alice.Survey.new("shoal", example="demo").plan()
-        >>> f"{plan.forward_overlap:.0%} along lines of {plan.altitude_m} m altitude"
+        >>> f"{plan.reached_forward_overlap:.0%} along lines of {plan.altitude_m} m altitude"
         '62% along lines of 2.0 m altitude'
     """
 
@@ -88,9 +88,9 @@ class Plan:
     """Across and along the track, on the middle row and column of a picture."""
     line_spacing_m: float
     station_spacing_m: float
-    forward_overlap: float
-    side_overlap: float
-    """As reached, of one camera's pictures, on the middle row and column."""
+    reached_forward_overlap: float
+    reached_side_overlap: float
+    """Of one camera's pictures, on the middle row and column."""
     lines: tuple[Line, ...]
     """In the order of flight."""
     dives: tuple[Dive, ...]
@@ -102,7 +102,7 @@ class Plan:
     duration_s: float
     energy_wh: float
     coverage: float
-    """Share of the area that every camera sees as often as asked when the plan is flown exactly."""
+    """Share of the area that every camera sees as often as requested, flown exactly."""
     line_depths_m: tuple[tuple[float, ...], ...] = ()
     """Depth of the glass at each station of each line, where they follow a bathymetry; empty where
     the glass keeps its altitude above a level sea floor."""
@@ -143,6 +143,8 @@ class Plan:
             "strobe": {"pulse_s": self.strobe_pulse_s, "lead_s": self.strobe_lead_s},
             "footprint_m": list(self.footprint_m),
             **{name: getattr(self, name) for name in _NUMBERS},
+            "forward_overlap": self.reached_forward_overlap,
+            "side_overlap": self.reached_side_overlap,
             "stations": self.stations,
             "lines": [line.to_json() for line in self.lines],
             "dives": [dive.to_json() for dive in self.dives],
@@ -180,6 +182,8 @@ def read_plan(path: str | Path) -> Plan:
             dives=tuple(Dive.from_json(dive) for dive in data["dives"]),
             line_depths_m=tuple(tuple(map(float, row)) for row in data.get("line_depths_m", ())),
             details=dict(data["details"]),
+            reached_forward_overlap=float(data["forward_overlap"]),
+            reached_side_overlap=float(data["side_overlap"]),
             **{name: float(data[name]) for name in _NUMBERS},
         )
     except PlanError as error:

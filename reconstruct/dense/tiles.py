@@ -51,7 +51,7 @@ class ViewSummary:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class TileTask:
+class FuseTask:
     """One tile of the grid to fuse."""
 
     store: ViewStore
@@ -97,7 +97,7 @@ def tile_tasks(
     edge: float,
     doubt: float,
     pose_part: PosePart | None,
-) -> list[TileTask]:
+) -> list[FuseTask]:
     """Tiles in the order of the file's rows, each with the views whose points may fall in it."""
     tasks = []
     stations = np.array([view.station for view in views], dtype=np.int64)
@@ -123,7 +123,7 @@ def tile_tasks(
         if pose_part is not None:
             poses = pose_part.at_nodes(part.north, part.west, part.cell, part.rows, part.columns)
         tasks.append(
-            TileTask(
+            FuseTask(
                 store=store,
                 window=window,
                 grid=part,
@@ -140,7 +140,7 @@ def tile_tasks(
     return tasks
 
 
-def fuse_tile(task: TileTask) -> Tile:
+def fuse_tile(task: FuseTask) -> Tile:
     """Fuse the points of all views in a tile into cells and cloud points."""
     offset = np.array(task.offset_enu)
     grid = task.grid.moved(-offset[0], -offset[1])

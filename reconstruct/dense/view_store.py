@@ -4,7 +4,8 @@ What is kept is kept small: depth as a 16-bit logarithm, its deviation as an 8-b
 half the resolution of brightness. A picture takes 5 bytes a pixel until its tile is fused.
 """
 
-from dataclasses import dataclass
+import uuid
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,8 @@ class ViewStore:
     """A folder with one file per view and name; a file is there whole or not at all."""
 
     folder: Path
+    run: str = field(default_factory=lambda: uuid.uuid4().hex)
+    """Tells one run from the next in a process that works for both: files may have changed."""
 
     def path(self, view: int, name: str) -> Path:
         """Where an array is kept."""

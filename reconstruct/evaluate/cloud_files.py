@@ -4,10 +4,8 @@ Coordinates in a projection reach 5,000 km: they are taken to local metres in fl
 anything else is done with them.
 """
 
-import multiprocessing
 import struct
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import BrokenExecutor
 from pathlib import Path
 from typing import BinaryIO
 
@@ -16,6 +14,7 @@ import numpy as np
 from alice_survey.base.artefacts import need_stage
 from alice_survey.base.contents import one_line
 from alice_survey.base.errors import ReconstructionError, WorkspaceError, why
+from alice_survey.base.executor import run_apart
 from alice_survey.base.frames import Array, Datum
 from reconstruct.ply import read_ply_points
 
@@ -84,12 +83,10 @@ def _apart(path: Path) -> tuple[Array, str | None]:
     Raises:
         ValueError: as `_read_las`, or they did.
     """
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, mp_context=context) as pool:
-        try:
-            return pool.submit(_read_las, path).result()
-        except BrokenProcessPool:
-            raise ValueError("its points are damaged: they cannot be unpacked") from None
+    try:
+        return run_apart(_read_las, path)
+    except BrokenExecutor:
+        raise ValueError("its points are damaged: they cannot be unpacked") from None
 
 
 def _read_las(path: Path) -> tuple[Array, str | None]:

@@ -11,6 +11,7 @@ from shapely.geometry import MultiPolygon
 
 from alice_survey.base.artefacts import atomic_path
 from alice_survey.base.run import progress
+from alice_survey.kit.figure import even_limit
 from missions.values.plan_file import read_plan
 
 if TYPE_CHECKING:
@@ -53,6 +54,7 @@ def plot_errors(path: Path, surface: "SurfaceScore", area: MultiPolygon) -> None
     """Map and histogram of height errors of the surface."""
     figures = surface.to_json()
     limit = max(5.0, 3 * figures["height_median_mm"], figures["height_95_mm"])
+    shown = even_limit(1e3 * surface.map_m)
     west, east, south, north = surface.extent_m
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=_size(east - west, north - south), layout="constrained")
@@ -60,14 +62,14 @@ def plot_errors(path: Path, surface: "SurfaceScore", area: MultiPolygon) -> None
         image = plane.imshow(
             1e3 * surface.map_m,
             extent=(west, east, south, north),
-            vmin=-limit,
-            vmax=limit,
-            cmap="RdBu_r",
+            vmin=-shown,
+            vmax=shown,
+            cmap="PuOr",
             interpolation="nearest",
         )
         _draw_area(plane, area)
         figure.colorbar(image, ax=plane, label="height error (mm)", shrink=0.8)
-        plane.set(xlabel="east (m)", ylabel="north (m)", title="Surface less truth")
+        plane.set(xlabel="east (m)", ylabel="north (m)", title="Surface minus truth")
         plane.set_facecolor("0.85")
         bars.hist(1e3 * surface.height_m, bins=np.linspace(-4 * limit, 4 * limit, 161), log=True)
         bars.set(xlabel="height error (mm)", ylabel="cells")
@@ -103,9 +105,11 @@ def plot_sheet(
             panel.axis("off")
             panel.imshow(_read(file))
         west, east, south, north = surface.extent_m
-        panels[3].set_title("Surface less truth (mm)")
+        panels[3].set_title("Surface minus truth (mm)")
+        error_mm = 1e3 * surface.map_m
+        shown = even_limit(error_mm)
         image = panels[3].imshow(
-            1e3 * surface.map_m, extent=(west, east, south, north), vmin=-10, vmax=10, cmap="RdBu_r"
+            error_mm, extent=(west, east, south, north), vmin=-shown, vmax=shown, cmap="PuOr"
         )
         figure.colorbar(image, ax=panels[3], shrink=0.8)
         _save(figure, path)

@@ -106,7 +106,7 @@ def find_candidates(
 
 def see_faces(task: SightTask) -> Sight:
     """The faces that a view sees whole, unmasked, from their front."""
-    vertices, triangles, offset, scene, spheres = _geometry(task.mesh)
+    vertices, triangles, offset, scene, spheres = _geometry(task.mesh, task.mesh.stat().st_mtime_ns)
     view = task.view
     near = vertices_near(view, vertices, spheres, offset)
     valid = Pictures.open(task.workspace).valid(view.image)
@@ -204,7 +204,9 @@ def _quality(
 
 
 @lru_cache(maxsize=1)
-def _geometry(path: Path) -> tuple[Array, Triangles, Array, Any, tuple[Array, Array]]:
+def _geometry(
+    path: Path, _written_ns: int
+) -> tuple[Array, Triangles, Array, Any, tuple[Array, Array]]:
     with np.load(path) as data:
         vertices, triangles, offset = data["vertices"], data["triangles"], data["offset"]
     return vertices, triangles, offset, ray_scene(vertices, triangles), block_spheres(vertices)

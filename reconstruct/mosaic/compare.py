@@ -11,7 +11,7 @@ from reconstruct.mosaic.paint import Float32, SeenView, ground_of
 from reconstruct.mosaic.picture_measures import well_exposed
 from reconstruct.mosaic.tools import MosaicSetup, tools_of
 from reconstruct.mosaic.visibility import see
-from reconstruct.raster import DemGrid
+from reconstruct.raster import DemGrid, small_cache
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -38,6 +38,7 @@ class _Shown:
     ranges: Float32
 
 
+@small_cache()
 def compare_block(task: LightTask) -> LightSamples:
     """Samples of light on a lattice of spots, in linear light."""
     tools = tools_of(task.survey)

@@ -25,7 +25,7 @@ from reconstruct.mosaic.visibility import (
     SeenCells,
     see,
 )
-from reconstruct.raster import opened_raster
+from reconstruct.raster import opened_raster, small_cache
 from reconstruct.views.model import View
 
 Float32 = NDArray[np.float32]
@@ -99,6 +99,7 @@ class Painted:
     """(H, W) number of the view plus one; 0 where nothing is known."""
 
 
+@small_cache()
 def label_block(task: PaintTask) -> Labels:
     """Choose the view of each cell of a block."""
     block = task.block
@@ -143,6 +144,7 @@ def label_block(task: PaintTask) -> Labels:
     )
 
 
+@small_cache()
 def paint_tiles(tasks: Sequence[PaintTask]) -> list[Painted]:
     """Paint neighbouring tiles, which share pictures."""
     painted = [paint_tile(task) for task in tasks]

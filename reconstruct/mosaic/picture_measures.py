@@ -22,7 +22,7 @@ from reconstruct.mosaic.footprints import PictureFootprint, picture_footprint
 from reconstruct.mosaic.grid import Float32, footprints
 from reconstruct.mosaic.visibility import store_visible
 from reconstruct.pictures.undistorted import Pictures
-from reconstruct.raster import DemGrid, opened_raster
+from reconstruct.raster import DemGrid, opened_raster, small_cache
 from reconstruct.views.model import View, enu_from_cam
 
 _MOST_CELLS = 16_000_000
@@ -276,6 +276,7 @@ class ViewTask:
     """Lowest and highest cell of the DEM."""
 
 
+@small_cache()
 def measure_view(task: ViewTask) -> tuple[PictureMeasures, PictureFootprint]:
     """Measure a picture and where it lies; write its small copy and what it sees of the DEM."""
     facts = measure_picture((task.workspace, task.scratch, task.view.image))

@@ -5,10 +5,8 @@ are laid survey-wide on small cells; tiles are painted one by one, each colour r
 the picture as taken. No step holds more than one block, so that memory does not grow with the area.
 """
 
-import contextlib
-import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -44,7 +42,7 @@ from reconstruct.mosaic.paint import (
     tones_path,
 )
 from reconstruct.mosaic.picture_measures import PictureMeasures, ViewTask, measure_view
-from reconstruct.mosaic.tools import MosaicSetup, forget_tools
+from reconstruct.mosaic.tools import MosaicSetup
 from reconstruct.mosaic.visibility import Water
 from reconstruct.mosaic.writers import cloud_optimised, thumbnail, write_labels, write_tiles
 from reconstruct.placing.track_figure import plot_track_over
@@ -62,8 +60,8 @@ _MOST_LOOKS = 12e6
 _LIGHT_LATTICE = 24
 """Spots across a picture at which light is compared."""
 _MOST_SAMPLES = 150_000
-_CACHE_MIB, _WORKER_CACHE_MIB = 48, 16
-"""Of files that GDAL reads and writes: here, and in each other process."""
+_CACHE_MIB = 48
+"""Of files that GDAL reads and writes in this process."""
 _TASK_MIB = 400
 """Memory that a process takes for a block of any kind."""
 _TEMPERATURE_C, _SALINITY_PSU = 15.0, 35.0
@@ -79,27 +77,8 @@ def run_mosaic(workspace: Path, config: SurveyConfig, executor: Executor, folder
     """
     model = read_model(workspace / "sparse")
     sea = _sea(config.water, config.area.seafloor_depth_m)
-    with _small_caches():
+    with rasterio.Env(GDAL_CACHEMAX=_CACHE_MIB << 20):
         build_mosaic(workspace, model, folder, config.reconstruct, sea, executor)
-
-
-@contextlib.contextmanager
-def _small_caches() -> Iterator[None]:
-    """Have GDAL, here and in processes started meanwhile, keep little of the files it reads.
-
-    Its own choice is 5 % of the machine's memory in each process.
-    """
-    name = "GDAL_CACHEMAX"
-    before = os.environ.get(name)
-    os.environ[name] = str(_WORKER_CACHE_MIB)
-    try:
-        with rasterio.Env(**{name: _CACHE_MIB << 20}):
-            yield
-    finally:
-        if before is None:
-            os.environ.pop(name, None)
-        else:
-            os.environ[name] = before
 
 
 def build_mosaic(
@@ -111,7 +90,6 @@ def build_mosaic(
     executor: Executor,
 ) -> None:
     """Do the work of the stage in a folder; see `run_mosaic`."""
-    forget_tools()
     scratch = folder / "scratch"
     scratch.mkdir()
     with opened_raster(workspace / "dense" / "dem.tif") as raster:

@@ -1,6 +1,7 @@
 """What a process keeps between the mosaic's tasks: lenses, small copies, a few pictures."""
 
-from dataclasses import dataclass
+import uuid
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
@@ -28,6 +29,8 @@ class MosaicSetup:
     scaled: bool
     water: Water | None
     """Of the port's dispersion; None where channels are not distinguished."""
+    run: str = field(default_factory=lambda: uuid.uuid4().hex)
+    """Tells one run from the next in a process that works for both: files may have changed."""
 
 
 class Tools:
@@ -77,14 +80,11 @@ class Tools:
 
 def tools_of(survey: MosaicSetup) -> Tools:
     """The tools of this process for a survey."""
-    return _kept_tools(survey.workspace, survey.scratch, survey.scaled, survey.water)
-
-
-def forget_tools() -> None:
-    """Let go of what an earlier run in this process kept: its files may have changed."""
-    _kept_tools.cache_clear()
+    return _kept_tools(survey.run, survey.workspace, survey.scratch, survey.scaled, survey.water)
 
 
 @lru_cache(maxsize=1)
-def _kept_tools(workspace: Path, scratch: Path, scaled: bool, water: Water | None) -> Tools:
+def _kept_tools(
+    run: str, workspace: Path, scratch: Path, scaled: bool, water: Water | None
+) -> Tools:
     return Tools(workspace, scratch, scaled, water)

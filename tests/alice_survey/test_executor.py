@@ -1,15 +1,23 @@
 """Results keep their order whatever the number of processes; a killed run leaves none behind."""
 
 import os
+import pickle
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
+from typing import Any
 
+import psutil
 import pytest
 
-from alice_survey.base.executor import local_executor
+from alice_survey.base.errors import AliceError, heard, note, warn
+from alice_survey.base.executor import SERIAL, Executor, local_executor
+from alice_survey.base.run import progress
+from tests.engines import PicklingThreads
 
 WORKERS = """
 import os, sys, time
@@ -60,6 +68,72 @@ def test_kept_workers_are_the_same_from_call_to_call_and_end_with_their_block() 
 def test_a_fault_of_the_work_reaches_the_caller() -> None:
     with pytest.raises(TypeError):
         list(local_executor(2).map(abs, [1, "a", 2], label="abs"))  # type: ignore[list-item]
+
+
+class Elsewhere:
+    """An engine as of other machines: all that reaches a task is its pickle, in a new process."""
+
+    def submit(self, function: Callable[..., Any], /, *args: Any) -> "Future[Any]":
+        code = (
+            "import pickle, sys\n"
+            "function, args = pickle.load(sys.stdin.buffer)\n"
+            "try: done = (function(*args), None)\n"
+            "except Exception as error: done = (None, error)\n"
+            "sys.stdout.buffer.write(pickle.dumps(done))"
+        )
+        ran = subprocess.run(
+            [sys.executable, "-c", code], input=pickle.dumps((function, args)),
+            capture_output=True, check=True, cwd=Path(__file__).parents[2],
+        )  # fmt: skip
+        assert ran.stderr == b""
+        result, error = pickle.loads(ran.stdout)  # noqa: S301 (its own)
+        future: Future[Any] = Future()
+        future.set_result(result) if error is None else future.set_exception(error)
+        return future
+
+
+def looked_at(number: int) -> int:
+    """A task that reports all it can."""
+    with progress.step("unseen"), progress.step("unseen either", 2) as counter:
+        counter.advance()
+        note(f"note {number}")
+        warn(f"{number} is odd" if number % 2 else f"{number} is even")
+    if number == 3:
+        raise AliceError(f"{number} is too much")
+    return number * number
+
+
+def reported(executor: Executor, capsys: pytest.CaptureFixture[str]) -> tuple[list[int], list[str]]:
+    """Results until a fault, and all that a user saw."""
+    results = []
+    with heard() as warnings, pytest.raises(AliceError, match="3 is too much"):
+        results.extend(executor.map(looked_at, [0, 1, 2], label="look"))
+        results.extend(executor.map(looked_at, [3], label="look again"))
+    assert warnings == ["0 is even", "1 is odd", "2 is even", "3 is odd"]
+    lines = capsys.readouterr().err.splitlines()
+    return results, [line for line in lines if "done in" not in line]  # slow steps say so
+
+
+def test_an_engine_elsewhere_gives_the_same_results_and_reports(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    here = reported(SERIAL, capsys)
+    assert here[0] == [0, 1, 4]
+    assert reported(Executor(workers=2, pool=Elsewhere()), capsys) == here
+    with PicklingThreads(2) as threads:
+        assert reported(threads.executor, capsys) == here
+
+
+def test_as_many_tasks_run_as_there_is_memory_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    memory = psutil.virtual_memory()._replace(available=1000 * 2**20)
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)
+
+    def processes(task_mib: float) -> set[int]:
+        return set(local_executor(3).map(_process, range(9), label="ids", task_mib=task_mib))
+
+    assert processes(2000.0) == {os.getpid()}  # one runs, whatever it takes
+    assert len(processes(450.0)) == 2
+    assert os.getpid() not in processes(450.0)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the kernel's parent-death signal is Linux's")

@@ -84,9 +84,9 @@ def test_a_picture_that_memory_is_too_short_for_is_not_called_damaged(tmp_path: 
     command = [sys.executable, "-c", TIGHT, str(small), str(large)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.stderr == ""
-    shape, told = done.stdout.splitlines()
+    shape, shown = done.stdout.splitlines()
     assert shape == "(60, 80, 3)"
-    assert told.startswith(f"memory ran out while {large} was read: give fewer --threads")
+    assert shown.startswith(f"memory ran out while {large} was read: give fewer --threads")
 
 
 def test_pictures_are_read_as_opencv_reads_them(tmp_path: Path) -> None:

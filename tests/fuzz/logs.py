@@ -120,7 +120,7 @@ def read_nav(path: Path) -> object:
 
 
 def read_triggers(path: Path) -> object:
-    from missions.coverage.dives import read_triggers
+    from missions.coverage.dive_record import read_triggers
     from missions.logs.navigation_csv import read_navigation
 
     return read_triggers(path, read_navigation(path.with_name("n.csv"), UTC))
@@ -134,7 +134,7 @@ def _triggers(folder: Path) -> None:
 def check_dive(path: Path) -> object:
     """As `plan check LOG`: the stations of a dive, for a plan."""
     from camera_calib.rig import design_rig
-    from missions.coverage.dives import read_dive_record
+    from missions.coverage.dive_record import read_dive_record
     from tests.fuzz.workspace import small_plan
 
     return read_dive_record(path, small_plan(), design_rig(CameraConfig(), WaterConfig()))

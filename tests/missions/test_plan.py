@@ -20,6 +20,7 @@ from missions.coverage.certificate import certificate
 from missions.coverage.stations import stations_of_plan
 from missions.exports.geometry import footprint_outline, footprints_ne
 from missions.plan.planner import plan_survey
+from missions.plan.rows import main_settings
 from missions.values.footprint import common_swath
 from missions.values.pattern import pattern
 from missions.values.plan_file import Plan, read_plan
@@ -43,8 +44,8 @@ def test_the_papers_mission() -> None:
 
     assert plan.footprint_m == pytest.approx((1.4410, 1.1749), abs=1e-4)
     assert plan.line_spacing_m == 1.0
-    assert plan.side_overlap == pytest.approx(0.306, abs=1e-3)
-    assert plan.forward_overlap == pytest.approx(0.600, abs=1e-3)
+    assert plan.reached_side_overlap == pytest.approx(0.306, abs=1e-3)
+    assert plan.reached_forward_overlap == pytest.approx(0.600, abs=1e-3)
     assert plan.interval_s == pytest.approx(2.349)
     assert sum(line.kind == "survey" for line in plan.lines) == 15
     assert sum(line.kind == "cross" for line in plan.lines) == 1
@@ -66,7 +67,7 @@ def test_an_ideal_port_gives_the_known_overlap_of_29_percent() -> None:
     plan = planned(
         camera={"port_distance_m": 0.0, "glass_thickness_m": 0.0}, plan={"line_spacing_m": 1.0}
     )
-    assert plan.side_overlap == pytest.approx(0.293, abs=5e-4)
+    assert plan.reached_side_overlap == pytest.approx(0.293, abs=5e-4)
 
 
 def test_the_length_of_a_plan_in_closed_form() -> None:
@@ -98,8 +99,8 @@ def test_the_demos_mission_has_what_a_demo_needs() -> None:
     assert sum(line.kind == "survey" for line in plan.lines) >= 4
     assert sum(line.kind == "cross" for line in plan.lines) == 1
     assert plan.stations >= 48
-    assert plan.forward_overlap >= 0.6
-    assert plan.side_overlap >= 0.3
+    assert plan.reached_forward_overlap >= 0.6
+    assert plan.reached_side_overlap >= 0.3
     assert plan.coverage == pytest.approx(1.0, abs=1e-9)
 
 
@@ -119,9 +120,9 @@ def test_an_overlap_that_is_asked_for_is_reached_on_real_footprints(wanted: floa
     shared = min(one_m.max(), two_m.max()) - max(one_m.min(), two_m.min())
     measured = shared / (one_m.max() - one_m.min())
 
-    assert plan.side_overlap == pytest.approx(measured, abs=1e-6)
+    assert plan.reached_side_overlap == pytest.approx(measured, abs=1e-6)
     # 10 % of one camera's pictures would leave gaps in stereo.
-    assert plan.side_overlap == pytest.approx(max(wanted, 0.144), abs=2e-4)
+    assert plan.reached_side_overlap == pytest.approx(max(wanted, 0.144), abs=2e-4)
 
 
 def test_a_line_spacing_that_is_too_wide_is_kept_and_warned_of(
@@ -131,10 +132,20 @@ def test_a_line_spacing_that_is_too_wide_is_kept_and_warned_of(
 
     err = capsys.readouterr().err
     assert plan.line_spacing_m == 1.3
-    assert "overlap by 9.8%, less than the 45.0% asked for, which needs 0.793 m" in err
+    both = next(text for text in err.splitlines() if "both set" in text)
+    assert "line_spacing_m is used" in both
+    assert "9.8%" in both and "0.793 m" in both
     assert "gaps" in err
     assert all(text.startswith("warning: ") for text in err.splitlines())
     assert plan.coverage < 0.999
+
+
+def test_the_main_settings_are_one_screen() -> None:
+    screen = main_settings(json.loads(json.dumps(planned(**SMALL).to_json())))
+    assert len(screen.splitlines()) <= 24
+    assert {"line spacing", "exposure", "gain"} <= {
+        line[:22].strip() for line in screen.splitlines()
+    }
 
 
 def test_a_good_line_spacing_gives_no_warning(capsys: pytest.CaptureFixture[str]) -> None:

@@ -74,7 +74,7 @@ def make_scene(
         body += rng.normal(0, 0.03, 3)
         attitude = np.array([0, 0, heading]) + rng.normal(0, np.deg2rad(1.5), 3)
         ned_from_body = RigidTransform.from_components(body, rotation_from_attitude(*attitude))
-        told = np.rad2deg(attitude + rng.normal(0, np.deg2rad(0.1), 3))
+        stated = np.rad2deg(attitude + rng.normal(0, np.deg2rad(0.1), 3))
         latitude, longitude, depth = DATUM.geodetic_from_ned(body[None] + bias_m)[0]
         for name, cam in rig.cameras.items():
             pose = ned_from_body * rig.body_from_cam(name)
@@ -93,9 +93,9 @@ def make_scene(
                     latitude_deg=latitude,
                     longitude_deg=longitude,
                     depth_m=depth,
-                    roll_deg=told[0],
-                    pitch_deg=told[1],
-                    heading_deg=told[2] % 360.0,
+                    roll_deg=stated[0],
+                    pitch_deg=stated[1],
+                    heading_deg=stated[2] % 360.0,
                     altitude_m=ALTITUDE_M,
                     sigma_horizontal_m=0.3,
                     sigma_depth_m=0.02,

@@ -56,7 +56,7 @@ def test_a_file_that_is_cut_short_makes_no_points(tmp_path: Path, kind: str) -> 
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "told"),
+    ("old", "new", "reason"),
     [
         (b"vertex 50", b"vertex -5", "not the first"),
         (b"vertex 50", b"vertex x", "not the first"),
@@ -67,8 +67,8 @@ def test_a_file_that_is_cut_short_makes_no_points(tmp_path: Path, kind: str) -> 
         (b"ascii 1.0", b"morse 1.0", "format 'morse'"),
     ],
 )
-def test_headers_that_do_not_hold(tmp_path: Path, old: bytes, new: bytes, told: str) -> None:
+def test_headers_that_do_not_hold(tmp_path: Path, old: bytes, new: bytes, reason: str) -> None:
     path = ply(tmp_path / "a.ply", "ascii")
     path.write_bytes(path.read_bytes().replace(old, new, 1))
-    with pytest.raises(WorkspaceError, match=told):
+    with pytest.raises(WorkspaceError, match=reason):
         read_ply_points(path, 1000)

@@ -116,7 +116,7 @@ def test_preview_is_white_where_nothing_is_known(tmp_path):
     assert (picture[5:-5, 5:145] < 255).any(axis=2).all()
 
 
-def test_a_damaged_raster_is_told_with_its_name(tmp_path: Path) -> None:
+def test_a_damaged_raster_is_reported_with_its_name(tmp_path: Path) -> None:
     path = tmp_path / "dem.tif"
     with pytest.raises(WorkspaceError, match="no such file"), opened_raster(path):
         pass

@@ -44,7 +44,7 @@ def near_truth(
 ) -> Mapped:
     """A model of all stations and all points seen twice, a little away from the truth.
 
-    Point i of the scene has the id i + 1. Stereo rigs are as told by the scene.
+    Point i of the scene has the id i + 1. Stereo rigs are as given by the scene.
     """
     pinhole_from_rig = {
         name: lenses[name].pinhole_from_cam * pose for name, pose in scene.rig.cam_from_rig.items()

@@ -1,6 +1,6 @@
 """Thrust allocation: which thrusters make a wrench.
 
-Both are told the matrix B (6, n) of `Vehicle.configuration_matrix`, the wrench wanted (6,), the
+Both take the matrix B (6, n) of `Vehicle.configuration_matrix`, the wrench wanted (6,), the
 bounds of thrust (n,), the weights of axes (6,) and of thrusters (n,), and write the thrust (n,):
 
 - `allocate_exact`: the least weighted miss within the bounds and, of all ways to it, the least

@@ -2,7 +2,7 @@
 
 f = -c + W^-1 B^T (B W^-1 B^T + eps I)^-1 (tau + B_0 c): the columns of B of thrusters that are
 saturated are zero, and c holds minus their thrust. The identity has as many rows as there are axes
-asked for (the paper prints I_3 beside a 6 x 5 matrix).
+asked for (the paper prints I_3 next to a 6 x 5 matrix).
 """
 
 import math

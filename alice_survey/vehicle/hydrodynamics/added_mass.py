@@ -1,7 +1,7 @@
 """Added mass from shape: ellipsoids along their axis, strips across it.
 
 Where the paper's printed form is wrong, the right one is computed and the printed one is kept as
-a function or a comment beside it.
+a function or a comment next to it.
 """
 
 import math
@@ -37,15 +37,6 @@ def ellipsoid_mass(length_m: float, diameter_m: float, density: float) -> float:
 def ellipsoid_axial(length_m: float, diameter_m: float, density: float) -> float:
     """Added mass of a prolate spheroid along its axis, kg: alpha_0 / (2 - alpha_0) m_e."""
     alpha = alpha_0(length_m, diameter_m)
-    return alpha / (2.0 - alpha) * ellipsoid_mass(length_m, diameter_m, density)
-
-
-def ellipsoid_axial_as_printed(length_m: float, diameter_m: float, density: float) -> float:
-    """The same with the eccentricity as the paper prints it, e = 1 - (d / l)^2: for comparison.
-
-    The other slip of the print, (l / 2) ln, is left out: it would give 6.9 kg for the hull.
-    """
-    alpha = _alpha(1.0 - (diameter_m / length_m) ** 2)
     return alpha / (2.0 - alpha) * ellipsoid_mass(length_m, diameter_m, density)
 
 

@@ -8,7 +8,7 @@ from alice_survey.base.frames import Array
 from alice_survey.vehicle.coefficients import FORCES, LIFTS, MOTIONS, Coefficients
 from alice_survey.vehicle.hydrodynamics.geometry import Geometry
 from alice_survey.vehicle.hydrodynamics.lift import body_lift
-from alice_survey.vehicle.hydrodynamics.parts import Flow, Part, parts
+from alice_survey.vehicle.hydrodynamics.parts import Flow, HullPart, parts
 
 _NOTHING = 1e-9
 """Below this an entry is a zero by symmetry that rounding hides."""
@@ -36,7 +36,7 @@ def estimate(geometry: Geometry, flow: Flow | None = None) -> Coefficients:
     return Coefficients(name="computed", values=values)
 
 
-def part_coefficients(part: Part) -> dict[str, float]:
+def part_coefficients(part: HullPart) -> dict[str, float]:
     """One part's share by name."""
     return {**named(part.added_mass, kind="dot"), **named(part.quadratic, kind="quadratic")}
 

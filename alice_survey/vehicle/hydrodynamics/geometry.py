@@ -65,7 +65,7 @@ class Pod:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Mount:
+class PodArm:
     """The arm between hull and pod, on either side, at z = 0."""
 
     aft_x_m: float
@@ -98,7 +98,7 @@ class Geometry:
     outline: Outline
     mast: Mast
     pod: Pod
-    mount: Mount
+    mount: PodArm
     tunnels: tuple[Tunnel, ...]
 
     @cached_property
@@ -219,7 +219,7 @@ SPARUS2 = Geometry(
     pod=Pod(outline=_POD, body_diameter_m=0.067, y_m=0.166883),
     # thruster_phy.obj (model): the arm's root runs from x = -0.515 to -0.346, its tip from -0.514
     # to -0.380; their mean. z +/-0.0188.
-    mount=Mount(aft_x_m=-0.515, fore_x_m=-0.363, tip_y_m=0.1335, thickness_m=0.0375),
+    mount=PodArm(aft_x_m=-0.515, fore_x_m=-0.363, tip_y_m=0.1335, thickness_m=0.0375),
     # The propeller's diameter (model); the tunnel's own is not published.
     tunnels=(Tunnel(name="vertical", x_m=0.0, axis="z", diameter_m=0.08),),
 )

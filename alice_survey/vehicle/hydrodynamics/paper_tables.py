@@ -1,6 +1,6 @@
 """The paper's three tables of coefficients, as printed, with the signs that had to be corrected.
 
-Gutnik, Avni, Treibitz and Groper (2021): tables III (estimated), IV (estimated beside CFD) and V
+Gutnik, Avni, Treibitz and Groper (2021): tables III (estimated), IV (estimated next to CFD) and V
 (before and after calibration at sea). A row keeps what is printed; `value` is what its sign must be
 in the paper's own frame, x forward, y starboard, z down (docs/vehicle-comparison.md says why).
 """

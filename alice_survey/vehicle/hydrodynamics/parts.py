@@ -14,7 +14,7 @@ import numpy as np
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.hydrodynamics import added_mass, drag
-from alice_survey.vehicle.hydrodynamics.geometry import Geometry, Mast, Mount, Pod, Tunnel
+from alice_survey.vehicle.hydrodynamics.geometry import Geometry, Mast, Pod, PodArm, Tunnel
 from alice_survey.vehicle.hydrodynamics.outline import Outline
 
 _FORWARD, _STARBOARD, _DOWN = np.eye(3)
@@ -42,7 +42,7 @@ class Flow:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Part:
+class HullPart:
     """One part's share."""
 
     name: str
@@ -76,7 +76,7 @@ def drag_of(points_body: Array, direction_body: Array, drag_kg_m: Array) -> Arra
     return matrix
 
 
-def parts(geometry: Geometry, flow: Flow) -> tuple[Part, ...]:
+def parts(geometry: Geometry, flow: Flow) -> tuple[HullPart, ...]:
     """Hull, mast, pods, mounts and tunnels."""
     pods = [_pod(geometry.pod, side, flow) for side in (1.0, -1.0)]
     tunnels = [_tunnel(tunnel, flow) for tunnel in geometry.tunnels]
@@ -89,9 +89,9 @@ def parts(geometry: Geometry, flow: Flow) -> tuple[Part, ...]:
     )
 
 
-def _sum(name: str, each: list[Part]) -> Part:
+def _sum(name: str, each: list[HullPart]) -> HullPart:
     nothing = np.zeros((6, 6))
-    return Part(
+    return HullPart(
         name=name,
         added_mass=sum((part.added_mass for part in each), nothing),
         quadratic=sum((part.quadratic for part in each), nothing),
@@ -104,7 +104,7 @@ def _on_axis(x_m: Array, y_m: float = 0.0) -> Array:
     return points
 
 
-def _hull(geometry: Geometry, flow: Flow) -> Part:
+def _hull(geometry: Geometry, flow: Flow) -> HullPart:
     """Ellipsoid along; circular strips across, finned where the mounts are, in heave."""
     outline, mount, density = geometry.outline, geometry.mount, flow.density_kg_m3
     x, r, w = outline.strips(breaks_m=(mount.aft_x_m, mount.fore_x_m))
@@ -132,10 +132,10 @@ def _hull(geometry: Geometry, flow: Flow) -> Part:
         + drag_of(points, _STARBOARD, side)
         + drag_of(points, _DOWN, side)
     )
-    return Part(name="hull", added_mass=inertia, quadratic=quadratic)
+    return HullPart(name="hull", added_mass=inertia, quadratic=quadratic)
 
 
-def _mast(mast: Mast, flow: Flow) -> Part:
+def _mast(mast: Mast, flow: Flow) -> HullPart:
     """Elliptic strips up its height; a plate across, on the hull as on a wall; a strut along."""
     density = flow.density_kg_m3
     z = mast.middle_z_m + mast.height_m / 2.0 * _NODES
@@ -149,10 +149,10 @@ def _mast(mast: Mast, flow: Flow) -> Part:
     quadratic = drag_of(points, _FORWARD, 0.5 * density * along * mast.width_m * w) + drag_of(
         points, _STARBOARD, 0.5 * density * across * mast.chord_m * w
     )
-    return Part(name="mast", added_mass=inertia, quadratic=quadratic)
+    return HullPart(name="mast", added_mass=inertia, quadratic=quadratic)
 
 
-def _pod(pod: Pod, side: float, flow: Flow) -> Part:
+def _pod(pod: Pod, side: float, flow: Flow) -> HullPart:
     """Ellipsoid along, of the motor body: water passes through the nozzle; strips across."""
     density, outline, y = flow.density_kg_m3, pod.outline, side * pod.y_m
     x, r, w = outline.strips()
@@ -175,10 +175,10 @@ def _pod(pod: Pod, side: float, flow: Flow) -> Part:
         + drag_of(points, _STARBOARD, sideways)
         + drag_of(points, _DOWN, sideways)
     )
-    return Part(name="pod", added_mass=inertia, quadratic=quadratic)
+    return HullPart(name="pod", added_mass=inertia, quadratic=quadratic)
 
 
-def _mounts(mount: Mount, hull: Outline, flow: Flow) -> Part:
+def _mounts(mount: PodArm, hull: Outline, flow: Flow) -> HullPart:
     """Plates in heave, struts in surge; their added mass is in the hull's finned strips."""
     density = flow.density_kg_m3
     middle_x = (mount.aft_x_m + mount.fore_x_m) / 2.0
@@ -193,14 +193,14 @@ def _mounts(mount: Mount, hull: Outline, flow: Flow) -> Part:
     quadratic = drag_of(points, _FORWARD, np.full(2, 0.5 * density * along * frontal)) + drag_of(
         points, _DOWN, np.full(2, 0.5 * density * across * plan)
     )
-    return Part(name="mounts", added_mass=np.zeros((6, 6)), quadratic=quadratic)
+    return HullPart(name="mounts", added_mass=np.zeros((6, 6)), quadratic=quadratic)
 
 
-def _tunnel(tunnel: Tunnel, flow: Flow) -> Part:
+def _tunnel(tunnel: Tunnel, flow: Flow) -> HullPart:
     """Drag of the mouths in surge; the water inside belongs to the hull's."""
     points = _on_axis(np.array([tunnel.x_m]))
     amount = 0.5 * flow.density_kg_m3 * drag.tunnel_area(tunnel.diameter_m)
-    return Part(
+    return HullPart(
         name=tunnel.name,
         added_mass=np.zeros((6, 6)),
         quadratic=drag_of(points, _FORWARD, np.array([amount])),

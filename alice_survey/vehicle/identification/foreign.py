@@ -77,7 +77,7 @@ def read_column_map(path: Path) -> ColumnMap:
 
 
 def read_foreign_log(path: Path, columns: ColumnMap) -> VehicleLog:
-    """Read a log whose columns and frames a map tells of.
+    """Read a log whose columns and frames a map gives.
 
     Raises:
         VehicleError: a column is missing, or what `read_vehicle_log` raises.

@@ -38,9 +38,9 @@ _START_SIGMA = np.array([0.5] * 3 + [2.0] * 6)
 """How far, rad, m/s and rad/s, a start may be from the first measured values before it costs one
 sigma: wide, so that it matters only where nothing was measured."""
 _SETTLED = 1e-2
-"""A start is found when what is left to gain is this small beside one sigma squared."""
+"""A start is found when what is left to gain is this small against one sigma squared."""
 _NOTHING = 1e-6
-"""Or as small beside all that is left."""
+"""Or as small against all that is left."""
 _ROUGH_SHARE = 0.1
 """Of a channel's spread: what counts as one sigma in the approach, where it is not noise."""
 _BLIND = 1e-3
@@ -52,7 +52,7 @@ parameter."""
 _HANG = 3.0
 """Residuals are taken to hang together over so many correlation times, at most half a window."""
 _ROUNDS = 4
-"""Most times that the noise is estimated anew."""
+"""Most times that the noise is estimated again."""
 _SAME = 0.02
 """Relative change of the noise that is none."""
 _LEAST_SIGMA = np.array([1e-6] * CHANNELS)
@@ -211,7 +211,7 @@ class _FitProblem:
         reach = np.linalg.norm(self.jacobian(values), axis=0) * np.maximum(np.abs(values), 1.0)
         names = [n for n, r in zip(self.parameters.names, reach, strict=True) if r < _BLIND]
         if names:
-            raise VehicleError(f"the logs tell nothing of {', '.join(names)}: do not free them")
+            raise VehicleError(f"the logs do not determine {', '.join(names)}: do not free them")
 
     def residuals(self, values: Array) -> Array:
         """All residuals in sigmas, less what the starts explain; infinite where there are none."""
@@ -251,7 +251,7 @@ class _FitProblem:
         return changed
 
     def result(self, values: Array, at_bound: Mask, evaluations: int) -> OutputErrorFit:
-        """What the fit tells, at the values it settled on."""
+        """The fit at the values it settled on."""
         residuals, table = self.residuals(values), self.jacobian(values)
         free = np.flatnonzero(~at_bound)
         information = table[:, free].T @ table[:, free]
@@ -269,7 +269,7 @@ class _FitProblem:
             lasting_s = min(_HANG * longest_s, 0.5 * self._window_s())
             blocks = max(self._row_s() * sum(len(run) for run in scores) / lasting_s, 2.0)
             meat = score_information(scores, round(lasting_s / self._row_s()))
-            # Few stretches that have nothing to do with one another tell their own spread badly.
+            # Few stretches that have nothing to do with one another show their own spread badly.
             meat *= spread * blocks / (blocks - 1.0)
             coloured = inverse @ (meat + self._prior(table[:, free])) @ inverse
             # By chance it may come out below that of white noise: such luck is not claimed.
@@ -468,18 +468,18 @@ def _inverse(information: Array, names: Sequence[str]) -> Array:
     """Inverse of the information.
 
     Raises:
-        VehicleError: it has none: the parameters that cannot be told apart are named.
+        VehicleError: it has none: the parameters that cannot be separated are named.
     """
     scale = np.sqrt(np.diag(information))
     blind = [name for name, value in zip(names, scale, strict=True) if value == 0]
     if blind:
-        raise VehicleError(f"the logs tell nothing of {', '.join(blind)}: do not free them")
+        raise VehicleError(f"the logs do not determine {', '.join(blind)}: do not free them")
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
     if len(values) and values[0] < _SINGULAR * values[-1]:
         weight = np.abs(vectors[:, 0])
         mixed = [name for name, w in zip(names, weight, strict=True) if w > 0.3 * weight.max()]
         raise VehicleError(
-            f"the logs cannot tell {', '.join(mixed)} apart: free fewer of them, or add manoeuvres"
+            f"the logs cannot separate {', '.join(mixed)}: free fewer of them, or add manoeuvres"
         )
     inverse: Array = (vectors / values) @ vectors.T / np.outer(scale, scale)
     return inverse

@@ -1,7 +1,7 @@
 """The parameters that a fit may free: their names, places, values and bounds."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
 
@@ -117,10 +117,6 @@ class Parameters:
             np.array([others[name] for name in GAINS]),
             np.zeros(6),
         )
-
-    def with_names(self, names: Sequence[str]) -> "Parameters":
-        """The same with other free parameters."""
-        return replace(self, names=tuple(names))
 
     def _given(self, name: str) -> float:
         if name not in OTHERS:

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from alice_survey.base.frames import Array
-from alice_survey.vehicle.identification.validation import Validation
+from alice_survey.vehicle.identification.validation import MotionValidation
 
 Places = NDArray[np.intp]
 _MEASURED, _MODEL, _CONSTANT = "#95a5a6", "#1b4f72", "#ca6f1e"
@@ -20,7 +20,7 @@ _LEAST = 0.02
 """Least height of a strip, m/s; in degrees per second, 100 times that."""
 
 
-def draw_motion(path: Path, title: str, found: Validation) -> None:
+def draw_motion(path: Path, title: str, found: MotionValidation) -> None:
     """Draw measured and simulated velocities and rates over time, with the fit of each.
 
     Args:
@@ -47,10 +47,10 @@ def draw_motion(path: Path, title: str, found: Validation) -> None:
         strip.plot(time_s[some], measured[some], ".", color=_MEASURED, ms=2.5)
         strip.plot(time_s[some], model[some], color=_MODEL, lw=1.1)
         strip.set_ylabel(_NAMES[k])
-        told = "follows the log"
+        title = "follows the log"
         if np.isfinite(fits[k]):
-            told = f"fit: model {fits[k]:.0f} %, constant {constant_fits[k]:.0f} %"
-        strip.set_title(told, loc="left", fontsize=9)
+            title = f"fit: model {fits[k]:.0f} %, constant {constant_fits[k]:.0f} %"
+        strip.set_title(title, loc="left", fontsize=9)
         _limit(strip, np.concatenate([measured, model]), _LEAST if k < 3 else 100 * _LEAST)
     for strip in axes[2]:
         strip.set_xlabel("time, s")

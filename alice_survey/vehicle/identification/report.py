@@ -35,7 +35,7 @@ from alice_survey.vehicle.identification.parameters import (
     free_parameters,
     unit_of,
 )
-from alice_survey.vehicle.identification.validation import Validation, validate
+from alice_survey.vehicle.identification.validation import MotionValidation, validate
 from alice_survey.vehicle.identification.windows import (
     CHANNEL_NAMES,
     Window,
@@ -206,8 +206,8 @@ def _text(
     logs: Sequence[Path],
     result: OutputErrorFit,
     thrust: Sequence[ThrustCoefficient],
-    own: Validation,
-    validation: Validation | None,
+    own: MotionValidation,
+    validation: MotionValidation | None,
     drift: Array | None,
     options: IdentifyOptions,
 ) -> str:
@@ -297,7 +297,7 @@ def poorly_determined(names: Sequence[str], values: Array, sigma: Array) -> list
 
 
 def high_correlations(fit: OutputErrorFit) -> list[tuple[str, str, float]]:
-    """Pairs of parameters that the logs hardly tell apart, the closest first."""
+    """Pairs of parameters that the logs hardly separate, the closest first."""
     names, matrix = fit.parameters.names, fit.correlation
     pairs = [
         (names[i], names[j], float(matrix[i, j]))
@@ -308,7 +308,7 @@ def high_correlations(fit: OutputErrorFit) -> list[tuple[str, str, float]]:
     return sorted(pairs, key=lambda pair: -abs(pair[2]))
 
 
-def _fit_lines(title: str, found: Validation) -> list[str]:
+def _fit_lines(title: str, found: MotionValidation) -> list[str]:
     """Fit of each motion, and the errors of forecasts."""
     names = CHANNEL_NAMES[:6]
     lines = [
@@ -342,8 +342,8 @@ def _data(
     logs: Sequence[Path],
     result: OutputErrorFit,
     thrust: Sequence[ThrustCoefficient],
-    own: Validation,
-    validation: Validation | None,
+    own: MotionValidation,
+    validation: MotionValidation | None,
 ) -> dict[str, Any]:
     """The same as JSON values; what is not known is null."""
 
@@ -353,7 +353,7 @@ def _data(
     def motions(values: Array) -> dict[str, float | None]:
         return {name: known(v) for name, v in zip(CHANNEL_NAMES[:6], values, strict=True)}
 
-    def fits(found: Validation) -> dict[str, Any]:
+    def fits(found: MotionValidation) -> dict[str, Any]:
         return {
             "source": found.source,
             "window_s": found.window_s,
@@ -425,8 +425,8 @@ def _write(
     result: OutputErrorFit,
     text: str,
     data: dict[str, Any],
-    own: Validation,
-    validation: Validation | None,
+    own: MotionValidation,
+    validation: MotionValidation | None,
 ) -> None:
     from alice_survey.vehicle.identification.plots import draw_motion
 

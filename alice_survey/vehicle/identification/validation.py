@@ -3,7 +3,7 @@
 The fit of a velocity is 100 (1 - |y - y_model| / |y - mean(y)|) per cent over the rows where it was
 measured (normalised root mean square, as in the System Identification Toolbox's `compare`): 100 is
 perfect, 0 no better than the mean. Simulations start from what is measured in their first row and
-see only the inputs from there on; beside them the velocity of that row is kept.
+see only the inputs from there on; next to them the velocity of that row is kept.
 """
 
 from collections.abc import Sequence
@@ -46,7 +46,7 @@ class Forecast:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Validation:
+class MotionValidation:
     """How a model foretells a log."""
 
     source: str
@@ -92,7 +92,7 @@ def validate(
     *,
     simulation: Simulation | None = None,
     horizons_s: Sequence[float] = HORIZONS_S,
-) -> Validation:
+) -> MotionValidation:
     """Compare simulations with windows of a log.
 
     Args:
@@ -108,7 +108,7 @@ def validate(
     how = simulation or Simulation()
     physics = with_given(parameters.physics(values), windows[0].given)
     measured = np.concatenate([window.measured for window in windows])
-    # A motion that follows the log is not foretold.
+    # A motion that follows the log is not predicted.
     measured[:, list(windows[0].given)] = np.nan
     simulated, constant, longest = [], [], 0.0
     errors: dict[float, list[tuple[Array, Array]]] = {h: [] for h in horizons_s}
@@ -129,7 +129,7 @@ def validate(
                     horizon_s=horizon, starts=len(rows), model=_rms(model), constant=_rms(kept)
                 )
             )
-    return Validation(
+    return MotionValidation(
         source=Path(windows[0].source).name,
         time_s=np.concatenate([w.record.time_s for w in windows]),
         measured=measured, simulated=np.concatenate(simulated), constant=np.concatenate(constant),

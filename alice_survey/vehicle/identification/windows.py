@@ -20,7 +20,7 @@ Mask = NDArray[np.bool_]
 CHANNEL_NAMES = ("u", "v", "w", "p", "q", "r", "roll", "pitch", "heading")
 """Velocity over ground, m/s; rates, rad/s; attitude about the body's axes, rad."""
 _FEWEST_ROWS = 5
-"""A shorter stretch tells less than its free start asks."""
+"""A shorter stretch gives less than its free start asks."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -141,7 +141,7 @@ def inputs(log: VehicleLog, vehicle: Vehicle, source: str | None = None) -> tupl
 
 
 def cut(window: Window, longest_s: float) -> list[Window]:
-    """A window in equal shorter ones; those that tell nothing are left out."""
+    """A window in equal shorter ones; those without information are left out."""
     record = window.record
     known = np.ones(len(record.time_s), bool)
     parts = []
@@ -239,7 +239,7 @@ def _pieces(time_s: Array, known: Mask, window_s: float | None) -> list[slice]:
 
 
 def _window(source: str, record: Record, measured: Array, given: tuple[int, ...]) -> Window | None:
-    """A stretch; None where it is too short or tells nothing of motion or attitude."""
+    """A stretch; None where it is too short or has nothing of motion or attitude."""
     attitudes = np.flatnonzero(np.all(np.isfinite(record.attitude), axis=1))
     if len(measured) < _FEWEST_ROWS or not len(attitudes) or not np.any(np.isfinite(measured)):
         return None

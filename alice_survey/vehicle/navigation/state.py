@@ -186,30 +186,3 @@ def initial_covariance(sensors: Sensors) -> Array:
 def _velocity_sigma(sensors: Sensors) -> float:
     """Of each axis at the start: at rest, known to a few of the DVL's pings."""
     return 2.0 * sensors.beam_noise + sensors.dvl_bias_sigma
-
-
-def estimation_error(
-    navigation: NavigationState, sensors: Sensors, truth: Array, water_ned: Array
-) -> Array:
-    """Truth minus belief, (25,), in the order and frames of the covariance.
-
-    Args:
-        navigation: what is believed.
-        sensors: the instruments.
-        truth: (13,) now.
-        water_ned: (2,) or more: the current now, north and east.
-    """
-    from scipy.spatial.transform import Rotation
-
-    nominal = navigation.nominal
-    attitude = Rotation.from_quat(truth[3:7])
-    lever = sensors.place[IMU]
-    error = np.empty(ERROR)
-    error[:3] = truth[:3] + attitude.apply(lever) - nominal[:3]
-    velocity = attitude.inv().apply(truth[7:10]) + np.cross(truth[10:13], lever)
-    error[3:6] = (1.0 + navigation.hidden[DVL_SCALE - GYRO_BIAS]) * velocity - nominal[3:6]
-    believed = Rotation.from_quat(nominal[QUATERNION : QUATERNION + 4])
-    error[ATTITUDE : ATTITUDE + 3] = (attitude * believed.inv()).as_rotvec()
-    error[GYRO_BIAS:WATER] = navigation.hidden - nominal[GYRO_BIAS + 1 : WATER + 1]
-    error[WATER:] = water_ned[:2] - nominal[WATER + 1 :]
-    return error

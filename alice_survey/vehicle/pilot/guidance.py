@@ -59,7 +59,7 @@ from alice_survey.vehicle.pilot.steering import (
     hear_floor,
     sink_to,
     surge_at,
-    tell_point,
+    write_point,
 )
 
 _DEPTH_SPEED_KEPT_MPS = 0.05
@@ -109,7 +109,7 @@ def steer(
         wrench[2] = STEADY_SHARE * gains.axes[HEAVE, LEAST]
         return
 
-    tell_point(estimate, guidance, pilot)
+    write_point(estimate, guidance, pilot)
     hear_floor(estimate, dt_s, guidance, pilot)
     reason = watch(
         time_s, dt_s, estimate, _progress_m(estimate, path, guidance, pilot), guidance.limits, pilot

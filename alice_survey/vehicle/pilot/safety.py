@@ -56,7 +56,7 @@ _STEP_M = 0.1
 """Less than this is no progress."""
 
 
-class Limits(NamedTuple):
+class SafetyLimits(NamedTuple):
     """Bounds beyond which the vehicle gives up and comes to the surface."""
 
     least_altitude_m: float
@@ -94,7 +94,7 @@ def _clear_m(estimate: Array) -> float:
 
 
 @kernel
-def mind_floor(depth_m: float, estimate: Array, limits: Limits, pilot: PilotState) -> float:
+def mind_floor(depth_m: float, estimate: Array, limits: SafetyLimits, pilot: PilotState) -> float:
     """Keep clear of the sea floor: slow down, and climb.
 
     The pace is 1 where the clearance is at least 1.25 times the least that is allowed and falls to
@@ -126,7 +126,7 @@ def watch(
     dt_s: float,
     estimate: Array,
     progress_m: float,
-    limits: Limits,
+    limits: SafetyLimits,
     pilot: PilotState,
 ) -> int:
     """Look after the vehicle for a tick.

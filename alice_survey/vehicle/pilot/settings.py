@@ -27,7 +27,7 @@ from alice_survey.vehicle.pilot.gains import (
     lateral_pair,
 )
 from alice_survey.vehicle.pilot.path import Path
-from alice_survey.vehicle.pilot.safety import Limits
+from alice_survey.vehicle.pilot.safety import SafetyLimits
 
 LEFT_PORT_BODY_M = (0.55, -0.05, 0.08)
 """The left port's outer glass, as the default rig has it."""
@@ -83,7 +83,7 @@ class Guidance(NamedTuple):
     """Speed of a sway step."""
     step_mps2: float
     """How fast that speed is gained and lost."""
-    limits: Limits
+    limits: SafetyLimits
 
 
 def pilot_guidance(
@@ -97,7 +97,7 @@ def pilot_guidance(
     terrain_smoothing_m: float = 1.5,
     spot_rad_s: float = SPOT_RAD_S,
     step_mps: float = STEP_MPS,
-    limits: Limits | None = None,
+    limits: SafetyLimits | None = None,
 ) -> Guidance:
     """Settings for a vehicle and a path.
 
@@ -168,7 +168,7 @@ def pilot_guidance(
         spot_rad_s2=spot_rad_s * float(axes[YAW, BANDWIDTH]) / _RAMP_PERIODS,
         step_mps=step_mps,
         step_mps2=step_mps * float(axes[SWAY, BANDWIDTH]) / _RAMP_PERIODS,
-        limits=limits or Limits(0.5 * path.altitude_m, most_depth_m),
+        limits=limits or SafetyLimits(0.5 * path.altitude_m, most_depth_m),
     )
 
 

@@ -119,7 +119,7 @@ def ramp(
     return at + step, wanted, clamped((wanted - speed) / dt_s, acceleration)
 
 
-class Reference(NamedTuple):
+class StopReference(NamedTuple):
     """Where the followed point and the heading shall be in a tick, and how they move."""
 
     north_m: float
@@ -166,7 +166,7 @@ def _turning(
     guidance: Guidance,
     gains: Gains,
     pilot: PilotState,
-) -> Reference:
+) -> StopReference:
     """Move the heading of a turn on the spot on by a tick."""
     memory, sense = pilot.memory, math.copysign(1.0, path.turn_rad[leg])
     n, e, start, _ = place_at(path, leg, 0.0)
@@ -177,13 +177,13 @@ def _turning(
     quicken = sense * _move_on(goal, most, guidance.spot_rad_s2, lag_s, dt_s, pilot)
     heading, rate = start + sense * memory[slot.REF], sense * memory[slot.REF_SPEED]
     over = goal - memory[slot.REF] < 0.5 * STOP_RAD and memory[slot.RAMP] >= goal
-    return Reference(n, e, heading, 0.0, 0.0, heading, rate, quicken, 0.0, over)
+    return StopReference(n, e, heading, 0.0, 0.0, heading, rate, quicken, 0.0, over)
 
 
 @kernel
 def _moving(
     leg: int, dt_s: float, path: Path, guidance: Guidance, gains: Gains, pilot: PilotState
-) -> Reference:
+) -> StopReference:
     """Move the place on by a tick, ahead into a stop or aside."""
     memory, point, side = pilot.memory, pilot.point, path.side_rad[leg]
     n, e, course, _ = place_at(path, leg, memory[slot.REF])
@@ -198,7 +198,7 @@ def _moving(
     along, speed = memory[slot.REF], memory[slot.REF_SPEED]
     n, e, course, curvature = place_at(path, leg, along)
     over = goal - along < 0.5 * STOP_M and memory[slot.RAMP] >= goal
-    return Reference(
+    return StopReference(
         n, e, course, speed, quicken, course + side, curvature * speed, 0.0, along, over
     )
 
@@ -241,7 +241,7 @@ def stand(
     error = head_for(
         wanted.heading_rad, wanted.turn_rad_s, wanted.quicken_rad_s2, estimate, dt_s, gains, pilot
     )
-    ahead, beside = _keep_place(wanted, dt_s, estimate, path, guidance, gains, pilot)
+    ahead, abeam = _keep_place(wanted, dt_s, estimate, path, guidance, gains, pilot)
 
     by_sway = guidance.sway > 0.0
     report[slot.BY_SWAY] = 1.0 if by_sway else 0.0
@@ -255,7 +255,7 @@ def stand(
     wide = 1.0 + memory[slot.WAITED_S] / _WIDEN_S
     off, moves = abs(ahead), abs(point[slot.SURGE_SPEED])
     if by_sway:
-        off, moves = math.hypot(ahead, beside), math.hypot(moves, point[slot.SWAY_SPEED])
+        off, moves = math.hypot(ahead, abeam), math.hypot(moves, point[slot.SWAY_SPEED])
     return bool(
         off < STOP_M * wide
         and moves < STOP_MPS * wide
@@ -266,7 +266,7 @@ def stand(
 
 @kernel
 def _keep_place(
-    wanted: Reference,
+    wanted: StopReference,
     dt_s: float,
     estimate: Array,
     path: Path,
@@ -285,7 +285,7 @@ def _keep_place(
     s, c = math.sin(now), math.cos(now)
     dn = wanted.north_m - pilot.point[slot.POINT_NORTH]
     de = wanted.east_m - pilot.point[slot.POINT_EAST]
-    ahead, beside = c * dn + s * de, c * de - s * dn
+    ahead, abeam = c * dn + s * de, c * de - s * dn
     cosine, sine = math.cos(wanted.course_rad - now), math.sin(wanted.course_rad - now)
     pulled, lever = memory[slot.PACE] * ahead, guidance.point_body_m[1]
     total = c * memory[slot.PLACE_SUM_N] + s * memory[slot.PLACE_SUM_E]
@@ -309,9 +309,9 @@ def _keep_place(
     cut = min(1.0, sum_bound(gains, SURGE) / max(math.hypot(north, east), 1e-9))
     memory[slot.PLACE_SUM_N], memory[slot.PLACE_SUM_E] = cut * north, cut * east
     if guidance.sway > 0.0:
-        sway_by(-beside, wanted.speed_mps * sine, estimate, dt_s, guidance, gains, pilot)
+        sway_by(-abeam, wanted.speed_mps * sine, estimate, dt_s, guidance, gains, pilot)
         demand[slot.ACC_SWAY] += wanted.quicken_mps2 * sine
-    return ahead, beside
+    return ahead, abeam
 
 
 @kernel

@@ -45,7 +45,7 @@ _HOVER_SHARE = 0.25
 
 
 @kernel
-def tell_point(estimate: Array, guidance: Guidance, pilot: PilotState) -> None:
+def write_point(estimate: Array, guidance: Guidance, pilot: PilotState) -> None:
     """Write where the followed point is and how it moves into the pilot's `point`."""
     p, point = guidance.point_body_m, pilot.point
     sr, cr = math.sin(estimate[vector.ROLL]), math.cos(estimate[vector.ROLL])
@@ -55,13 +55,13 @@ def tell_point(estimate: Array, guidance: Guidance, pilot: PilotState) -> None:
         math.cos(estimate[vector.HEADING]),
     )
     ahead = cp * p[0] + sp * (sr * p[1] + cr * p[2])
-    beside = cr * p[1] - sr * p[2]
+    abeam = cr * p[1] - sr * p[2]
     u, v, w = estimate[vector.U], estimate[vector.V], estimate[vector.W]
     turn = (sr * estimate[vector.Q] + cr * estimate[vector.R]) / cp
     # Roll and pitch rates are left out: nothing here can answer them.
-    point[slot.POINT_NORTH] = estimate[vector.NORTH] + cy * ahead - sy * beside
-    point[slot.POINT_EAST] = estimate[vector.EAST] + sy * ahead + cy * beside
-    point[slot.SURGE_SPEED] = cp * u + sp * (sr * v + cr * w) - turn * beside
+    point[slot.POINT_NORTH] = estimate[vector.NORTH] + cy * ahead - sy * abeam
+    point[slot.POINT_EAST] = estimate[vector.EAST] + sy * ahead + cy * abeam
+    point[slot.SURGE_SPEED] = cp * u + sp * (sr * v + cr * w) - turn * abeam
     point[slot.SWAY_SPEED] = cr * v - sr * w + turn * ahead
     point[slot.SINK_SPEED] = -sp * u + cp * (sr * v + cr * w)
     point[slot.TURN_SPEED] = turn
@@ -228,7 +228,7 @@ def go_to(
     now = estimate[vector.HEADING]
     dn, de = goal_n - pilot.point[slot.POINT_NORTH], goal_e - pilot.point[slot.POINT_EAST]
     distance = math.hypot(dn, de)
-    ahead, beside = math.cos(now) * dn + math.sin(now) * de, math.cos(now) * de - math.sin(now) * dn
+    ahead, abeam = math.cos(now) * dn + math.sin(now) * de, math.cos(now) * de - math.sin(now) * dn
     speed = clamped(_HOVER_SHARE * gains.axes[SURGE, BANDWIDTH] * ahead, path.speed_mps)
     hover = guidance.sway > 0.0 and distance < _HOVER_M
     if hover:
@@ -243,7 +243,7 @@ def go_to(
         error = head_for(facing, 0.0, 0.0, estimate, dt_s, gains, pilot)
     surge_at(speed, dt_s, guidance, gains, pilot)
     if hover:
-        sway_by(-beside, 0.0, estimate, dt_s, guidance, gains, pilot)
+        sway_by(-abeam, 0.0, estimate, dt_s, guidance, gains, pilot)
     pilot.report[slot.BY_SWAY] = 1.0 if hover else 0.0
     return distance, error
 

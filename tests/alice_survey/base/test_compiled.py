@@ -49,14 +49,14 @@ def write(
     (folder / "numbers_used.py").write_text(f"FACTOR = {factor}\nUNUSED = 1\n")
 
 
-def ask(folder: Path) -> tuple[float, int]:
+def ask(folder: Path, code: str = ASK) -> tuple[float, int]:
     environment = {
         **os.environ,
         "PYTHONPATH": os.pathsep.join([str(folder), str(Path(__file__).parents[3])]),
         "NUMBA_CACHE_DIR": str(folder / "kept"),
     }
     done = subprocess.run(
-        [sys.executable, "-c", ASK], env=environment, capture_output=True, text=True, check=True
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
     )
     value, hits = done.stdout.split()
     return float(value), int(hits)
@@ -87,6 +87,31 @@ def test_the_code_of_a_called_kernel_counts(folder: Path) -> None:
     inner = (folder / "inner.py").read_text()
     (folder / "inner.py").write_text(inner.replace("x + OFFSET", "x - OFFSET"))
     assert ask(folder) == (4.0, 0)
+
+
+def test_a_kernel_whose_argument_has_a_new_class_name_is_compiled_again(tmp_path: Path) -> None:
+    """The kept index names the old class, which is not there any more."""
+    text = """
+from typing import NamedTuple
+from alice_survey.base.compiled import compiled
+
+class {name}(NamedTuple):
+    length: float
+
+@compiled
+def twice(x):
+    return 2.0 * x.length + 2.0
+
+def run(x):
+    return twice({name}(x))
+run.stats = twice.stats
+"""
+    (tmp_path / "inner.py").write_text("")
+    ask_run = ASK.replace("outer.twice(3.0)", "outer.run(3.0)")
+    for name in ("Old", "New"):
+        (tmp_path / "outer.py").write_text(text.format(name=name))
+        assert ask(tmp_path, ask_run) == (8.0, 0)
+    assert ask(tmp_path, ask_run) == (8.0, 1)
 
 
 def scaled(table: np.ndarray, unit: float = 1.0) -> Callable[[int], float]:

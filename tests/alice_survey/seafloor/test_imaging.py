@@ -1,6 +1,7 @@
 import csv
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
+from shapely.geometry import MultiPolygon, box
 
 from alice_survey.base.artefacts import Stage, run_stage, write_csv, write_json
 from alice_survey.base.config import SurveyConfig, parse_config
@@ -20,8 +22,8 @@ from alice_survey.seafloor.terrain import read_terrain
 from alice_survey.stages import spec
 from camera_calib.rig import read_rig
 from missions.acquire import run as imaging
+from tests.missions.flown_plans import plan_of, walk
 
-AREA_NE = [[0.0, 0.0], [1.0, 0.0], [1.0, 0.5], [0.0, 0.5]]
 TIMES_S = (2.0, 4.25, 6.5)
 NAVIGATION_COLUMNS = (
     "time_s", "latitude_deg", "longitude_deg", "depth_m", "roll_deg", "pitch_deg", "heading_deg",
@@ -47,15 +49,9 @@ def fly(workspace: Path, until_s: float = 9.0) -> None:
     """A plan and a flight northward at 0.2 m/s, in the files that missions write."""
 
     def plan(folder: Path) -> None:
-        write_json(
-            folder / "plan.json",
-            {
-                "format": "alice-survey plan", "version": 2,
-                "area": {"allowed": {"type": "Polygon", "coordinates": [AREA_NE]}},
-                "datum": {"latitude_deg": 32.8, "longitude_deg": 34.9},
-                "exposure_s": 0.002, "altitude_m": 2.0,
-            },
-        )  # fmt: skip
+        planned = plan_of([walk((0.0, 0.0), 0.0, [("line", 1.0, 0)])])
+        area = replace(planned.area, allowed=MultiPolygon([box(0.0, 0.0, 1.0, 0.5)]))
+        write_json(folder / "plan.json", replace(planned, area=area, exposure_s=0.002).to_json())
 
     def flight(folder: Path) -> None:
         time_s = np.arange(0.0, until_s, 0.1)

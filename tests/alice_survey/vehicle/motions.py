@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from alice_survey.base.frames import attitude_from_rotation, rotation_from_attitude
 from alice_survey.vehicle import fleet
 from alice_survey.vehicle.coefficients import Coefficients
-from alice_survey.vehicle.dynamics import derivative, initial_state, rk4_step, scratch_for
+from alice_survey.vehicle.dynamics import Body, derivative, initial_state, rk4_step, scratch_for
 from alice_survey.vehicle.propulsion import Thruster
 from alice_survey.vehicle.sea import Current, constant_current
 from alice_survey.vehicle.vehicle import RigidBody, Vehicle
@@ -58,6 +58,16 @@ def block(
         coefficients=Coefficients(name="given", values=dict(values or {})),
         thrusters=(),
     )
+
+
+def damping_matrix(body: Body, nu: Array) -> Array:
+    """D(nu), (6, 6): linear and quadratic damping and body lift; D(nu) nu opposes motion."""
+    u = nu[0]
+    lift = np.zeros((6, 6))
+    lift[1, 1], lift[2, 2] = body.lift[0] * abs(u), body.lift[1] * abs(u)
+    lift[4, 2], lift[5, 1] = body.lift[2] * u, body.lift[3] * u
+    matrix: Array = -(body.linear + body.quadratic * np.abs(nu) + lift)
+    return matrix
 
 
 def state_of(

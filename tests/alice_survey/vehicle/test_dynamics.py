@@ -17,7 +17,6 @@ from alice_survey.vehicle.dynamics import (
     add_coriolis,
     add_damping,
     coriolis_matrix,
-    damping_matrix,
     initial_state,
     scratch_for,
 )
@@ -30,6 +29,7 @@ from tests.alice_survey.vehicle.motions import (
     alice,
     attitudes,
     block,
+    damping_matrix,
     rates,
     rotations,
     state_of,

@@ -160,16 +160,16 @@ def test_a_rendered_pattern_fits_again(dtype: type[np.uint8] | type[np.uint16]) 
 
 
 def test_a_scene_nearer_or_farther_is_corrected_nearly_as_well() -> None:
-    """The rest that is told for a quarter of the range is what remains."""
+    """The rest that is stated for a quarter of the range is what remains."""
     camera = ALICE.reduced(4)
     cameras = channel_cameras(camera, **LEVANT)
-    told = frame_shifts(cameras, RANGE_M)[1].rest_px
+    stated = frame_shifts(cameras, RANGE_M)[1].rest_px
     picture = render(cameras, 0.75 * RANGE_M).astype(np.float32)
 
     corrected = undisperse(picture, channel_maps(cameras, RANGE_M))
 
     left = np.linalg.norm(misregistration_px(corrected, 2), axis=1)
-    assert 0.3 * told < left.max() < told + 0.01
+    assert 0.3 * stated < left.max() < stated + 0.01
 
 
 def test_nothing_changes_where_all_channels_are_equal() -> None:

@@ -295,7 +295,7 @@ def test_a_port_at_the_pupil_stays_there() -> None:
     assert 0.0 < max(ends) < 0.01
 
 
-def test_what_no_view_tells_is_named() -> None:
+def test_what_no_view_shows_is_named() -> None:
     air = in_air(TRUTH)
     rng = np.random.default_rng(1)
     poses = board_poses(air, 8, rng)
@@ -304,7 +304,7 @@ def test_what_no_view_tells_is_named() -> None:
         adjust(views, BOARD, air, poses, Freedom(free=("left.port_distance_m", "left.fx_px")))
 
 
-def test_a_zoom_and_the_index_of_water_without_a_port_cannot_be_told_apart() -> None:
+def test_a_zoom_and_the_index_of_water_without_a_port_cannot_be_distinguished() -> None:
     thin = replace(
         TRUTH, cameras={n: replace(c, port_distance_m=0.0, glass_thickness_m=0.0, k1=0.0, k2=0.0,
                                    k3=0.0, p1=0.0, p2=0.0, n_water=1.0001)

@@ -382,24 +382,24 @@ def views_of_uneven_noise() -> tuple[list[TargetView], RigidTransform, np.ndarra
     return views, poses, blur
 
 
-def test_what_views_tell_of_the_water_counts_pictures_as_the_calibration_did() -> None:
+def test_what_views_show_of_the_water_counts_pictures_as_the_calibration_did() -> None:
     """A prior as good as the views are said to be halves the variance."""
     views, _, blur = views_of_uneven_noise()
     found = calibrate_through_ports(views, BOARD, TRUTH, "free")
     assert found.blur is not None
     np.testing.assert_allclose(found.blur * found.noise_px, blur, rtol=0.35)
-    told = held_effect(found, "n_water").sigma
+    stated = held_effect(found, "n_water").sigma
     alike = held_effect(replace(found, blur=None), "n_water").sigma
 
-    prior = Prior.around(found.rig, dict.fromkeys(of_cameras(TRUTH, ["n_water"]), told))
+    prior = Prior.around(found.rig, dict.fromkeys(of_cameras(TRUTH, ["n_water"]), stated))
     # One step from where it starts: sigmas are those at the calibration itself.
     both = adjust(
         views, BOARD, found.rig, found.rig_from_target,
         Freedom(free=found.freedom.free, prior=prior), at_most=1, blur=found.blur,
     ).rig  # fmt: skip
 
-    assert both.sigmas["left.n_water"] == pytest.approx(told / np.sqrt(2), rel=0.05)
-    assert alike > 1.15 * told
+    assert both.sigmas["left.n_water"] == pytest.approx(stated / np.sqrt(2), rel=0.05)
+    assert alike > 1.15 * stated
 
 
 def test_sharp_pictures_weigh_more_than_dull_ones() -> None:

@@ -72,7 +72,7 @@ def test_pictures_are_found_in_folders_and_by_patterns(
     assert len(find_pictures(f"{tmp_path.name[:-1]}?/left*")) == 2
 
 
-def test_pairs_by_order_of_pictures_with_other_numbers_are_told(
+def test_pairs_by_order_of_pictures_with_other_numbers_are_reported(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     pair_pictures({"left": paths("a1.png", "a2.png"), "right": paths("b51.png", "b52.png")})

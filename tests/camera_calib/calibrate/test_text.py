@@ -54,7 +54,7 @@ def test_a_port_without_tilt_has_the_larger_sigma_and_a_held_one_none() -> None:
     assert port_tilt_deg(rig, "right") == (0.0, None)
 
 
-def test_ports_and_baseline_are_told_in_millimetres_with_their_sigmas() -> None:
+def test_ports_and_baseline_are_reported_in_millimetres_with_their_sigmas() -> None:
     rng, truth = np.random.default_rng(5), built_rig()
     views = views_of(truth, board_poses(truth, 8, rng), 0.1, rng)
     found = calibrate_through_ports(views, BOARD, truth, "held")
@@ -76,7 +76,7 @@ def test_ports_and_baseline_are_told_in_millimetres_with_their_sigmas() -> None:
     assert lines[-2:] == [f"verdicts: 1 look, 1 good; {warnings} warnings", "  look: blurred"]
 
 
-def test_cameras_in_air_have_no_port_to_tell_of() -> None:
+def test_cameras_in_air_have_no_port_to_report() -> None:
     rng, truth = np.random.default_rng(6), in_air(built_rig())
     views = views_of(truth, board_poses(truth, 8, rng), 0.1, rng)
     sizes = {name: (camera.width_px, camera.height_px) for name, camera in truth.cameras.items()}

@@ -58,10 +58,10 @@ def test_models_are_as_colmap_has_them(name: str) -> None:
     number, parameters = MODELS[name]
     assert int(pycolmap.CameraModelId.__members__[name]) == number
     camera = pycolmap.Camera(model=name, width=9, height=9, params=np.ones(len(parameters)))
-    told = camera.params_info.split(", ")
+    stated = camera.params_info.split(", ")
     if name in ("SIMPLE_RADIAL", "RADIAL"):  # COLMAP calls their first coefficient k or k1
-        told = [{"k": "k1"}.get(each, each) for each in told]
-    assert tuple(told) == parameters
+        stated = [{"k": "k1"}.get(each, each) for each in stated]
+    assert tuple(stated) == parameters
 
 
 @pytest.mark.parametrize("target", ["model", "model/cameras.bin"])

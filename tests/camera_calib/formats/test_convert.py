@@ -1,4 +1,4 @@
-"""Conversions: nothing is lost unasked, the price of a stand-in is told, faults are one line."""
+"""Conversions: nothing is lost unasked, the price of a stand-in is stated, faults are one line."""
 
 import json
 import sys

@@ -150,7 +150,7 @@ def test_faults_name_file_and_key(tmp_path: Path) -> None:
         ),
         "left out": fault(path, EXAMPLE.replace("cam1:", "cam7:")),
         "lacks cam0": fault(path, "a: 1\n"),
-        "no mapping": fault(path, "- 1\n"),
+        "not a mapping": fault(path, "- 1\n"),
         "line 3": fault(path, "cam0:\n  a: [1\n"),
         "the key a twice": fault(path, "a: 1\na: 2\n"),
         "an alias": fault(path, "a: &x [1]\nb: *x\n"),

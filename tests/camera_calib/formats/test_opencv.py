@@ -174,7 +174,7 @@ def test_faults_name_file_and_key(tmp_path: Path) -> None:
         ),
         "twice": fault(path, GOOD + "image_width: 3\n"),
         "lacks camera_matrix": fault(path, "%YAML:1.0\n---\na: 1\n"),
-        "no mapping": fault(path, "%YAML:1.0\n---\n- 1\n- 2\n"),
+        "not a mapping": fault(path, "%YAML:1.0\n---\n- 1\n- 2\n"),
         "line 3": fault(path, "%YAML:1.0\n---\na: [ 1., 2.\n"),
         "FileStorage": fault(path, "hello\n"),
         "is empty": fault(path, "\n"),

@@ -133,7 +133,7 @@ def test_sigmas_are_true() -> None:
 
 
 @pytest.mark.parametrize("turn", [0, 1])
-def test_contrast_tells_the_colours(turn: int) -> None:
+def test_contrast_shows_the_colours(turn: int) -> None:
     picture, true = drawn_board(0.01, 3)
     steps = steps_of(true)
     row, column = np.mgrid[:ROWS, :COLUMNS]

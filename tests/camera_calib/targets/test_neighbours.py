@@ -1,4 +1,4 @@
-"""Points of a board are told by those around them: exactly through a homography, nearly if bent."""
+"""Points of a board are predicted from those around them: exactly if flat, nearly if bent."""
 
 import numpy as np
 import pytest
@@ -47,7 +47,7 @@ def test_what_a_lens_bends_is_followed() -> None:
 
 
 @pytest.mark.parametrize("known", [GRID[:0], GRID[:3], GRID[:8]])
-def test_a_line_or_less_tells_nothing(known: np.ndarray) -> None:
+def test_a_line_or_less_shows_nothing(known: np.ndarray) -> None:
     pixels, steps = from_neighbours(known, known * 30.0, GRID)
     assert np.isnan(pixels).all() and np.isnan(steps).all()
     assert pixels.shape == (48, 2) and steps.shape == (48, 2, 2)

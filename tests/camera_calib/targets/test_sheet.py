@@ -142,7 +142,7 @@ def test_boards_lie_or_stand_on_paper_and_stay_on_it(paper: str) -> None:
 @pytest.mark.parametrize(
     "text", ["chessboard 9x6 40mm", "charuco 12x9 40mm 30mm", "apriltag 6x6 88mm 0.3"]
 )
-def test_what_does_not_fit_is_told_with_what_would(text: str) -> None:
+def test_what_does_not_fit_is_shown_with_what_would(text: str) -> None:
     with pytest.raises(CalibrationError, match="needs a page of") as caught:
         lay_out(parse_target(text), "A4")
     fitting = re.search(r"at the most '(.*)'$", str(caught.value))[1]
@@ -168,7 +168,7 @@ def test_wrong_wishes_give_one_clear_line(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_ambiguous_chessboards_are_told(tmp_path: Path) -> None:
+def test_ambiguous_chessboards_are_reported(tmp_path: Path) -> None:
     said = {
         text: print_target(text, tmp_path / "board.svg", None, 300.0)
         for text in ("chessboard 8x6 25mm", "chessboard 9x6 25mm")

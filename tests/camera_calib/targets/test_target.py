@@ -77,8 +77,8 @@ def test_units_agree(length: str) -> None:
         ("", "not understood"),
         ("circles 9x6 25mm", "not understood"),
         ("chessboard 9x6", "not understood"),
-        ("chessboard 9x6 25", "no length with its unit"),
-        ("chessboard 9 25mm", "no pair of counts"),
+        ("chessboard 9x6 25", "not a length with its unit"),
+        ("chessboard 9 25mm", "not a pair of counts"),
         ("chessboard 9x2 25mm", "each count must be 3"),
         ("chessboard 900x6 25mm", "to 100"),
         ("chessboard 9x6 25m", "check the unit"),
@@ -89,7 +89,7 @@ def test_units_agree(length: str) -> None:
         ("charuco 12x9 40mm 30mm DICT_4X4_50", "need 54 markers, DICT_4X4_50 has 50"),
         ("charuco 12x9 40mm 30mm DICT_4X4_100 old", "not understood"),
         ("apriltag 6x6 88mm", "not understood"),
-        ("apriltag 6x6 88mm 26.4mm", "no number"),
+        ("apriltag 6x6 88mm 26.4mm", "not a number"),
         ("apriltag 6x6 88mm 26", "gap over the tag"),
         ("apriltag 6x6 88mm nan", "gap over the tag"),
         ("apriltag 30x30 88mm 0.3", "has 587"),
@@ -172,7 +172,7 @@ def test_apriltag_grids_are_kalibrs() -> None:
 
 
 @pytest.mark.parametrize("text", KINDS)
-def test_colours_around_the_points_are_told(text: str) -> None:
+def test_colours_around_the_points_are_reported(text: str) -> None:
     target = parse_target(text)
     rectangles = black_rectangles(target)
     near = 0.02 * target.size_m * np.array([[-1, -1], [1, 1], [1, -1], [-1, 1]])

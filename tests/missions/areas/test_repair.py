@@ -10,14 +10,14 @@ from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import Datum
 from missions.areas.crs import LocalFrame
 from missions.areas.raw import RawShapes, no_points
-from missions.areas.repair import Mended, mended
+from missions.areas.repair import Repaired, repaired
 from missions.areas.survey import survey_area
 
 FRAME = LocalFrame(datum=Datum(32.0, 34.0), seafloor_depth_m=15.0, datum_is_given=True)
 SQUARE = ((0, 0), (10, 0), (10, 10), (0, 10))
 
 
-def mend(*polygons: tuple[object, ...]) -> Mended:
+def mend(*polygons: tuple[object, ...]) -> Repaired:
     """Of polygons, each its outer ring and its holes."""
     raw = RawShapes(
         origin="test",
@@ -25,7 +25,7 @@ def mend(*polygons: tuple[object, ...]) -> Mended:
         polygons=tuple(tuple(np.array(ring, float) for ring in rings) for rings in polygons),
         points=no_points(),
     )
-    return mended(raw, FRAME, geographic=False)
+    return repaired(raw, FRAME, geographic=False)
 
 
 def box(north: float, east: float, height: float, width: float) -> tuple[tuple[float, float], ...]:
@@ -99,7 +99,7 @@ def test_a_faulty_ring_is_refused_with_its_place(
         ),
     ],
 )
-def test_what_is_slightly_wrong_is_mended_and_told(
+def test_what_is_slightly_wrong_is_repaired_and_reported(
     rings: tuple[object, ...], area_m2: float, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shape = mend(rings)

@@ -18,7 +18,8 @@ from missions.coverage.holes import Hole, find_holes
 from missions.coverage.stations import Stations, plan_pattern, stations_of_plan
 from missions.fly.check import check_report
 from missions.fly.refly import refly_plan
-from missions.route.energy import usable_wh, vehicle_costs
+from missions.plan.strength import survey_costs
+from missions.route.energy import usable_wh
 from missions.route.ways import Ways
 from missions.values.line import Line
 from missions.values.navigation import write_navigation
@@ -33,7 +34,7 @@ RIG = design_rig(CONFIG.camera, CONFIG.water)
 def refly(plan: Plan, flown: Certificate, holes: Sequence[Hole]) -> Plan:
     return refly_plan(
         plan, RIG, flown, holes,
-        costs=vehicle_costs(CONFIG), settings=CONFIG.plan, usable_wh=usable_wh(CONFIG.vehicle),
+        costs=survey_costs(CONFIG), settings=CONFIG.plan, usable_wh=usable_wh(CONFIG.vehicle),
     )  # fmt: skip
 
 

@@ -6,10 +6,10 @@ import pytest
 from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.errors import PlanError
 from camera_calib.rig import Rig, design_rig
-from missions.coverage.overlap import measured_side_overlap
 from missions.coverage.stations import Stations, stations_of_lines
 from missions.values.footprint import footprint_size_m, step_for_overlap
 from tests.oracles_coverage import lawnmower, pinhole_rig
+from tests.oracles_overlap import measured_side_overlap
 
 IDEAL = design_rig(CameraConfig(port_distance_m=0.0, glass_thickness_m=0.0), WaterConfig())
 REAL = design_rig(CameraConfig(), WaterConfig())

@@ -109,8 +109,8 @@ def plan_of(
         "footprint_m": (1.441, 1.1749),
         "line_spacing_m": 1.0,
         "station_spacing_m": 0.46,
-        "forward_overlap": 0.6,
-        "side_overlap": 0.3,
+        "reached_forward_overlap": 0.6,
+        "reached_side_overlap": 0.3,
         "lines": tuple(lines),
         "dives": tuple(
             Dive(

@@ -13,6 +13,7 @@ from missions.exposure.footprints import (
     pixel_on_floor_m,
     spacing_rows,
 )
+from missions.values.footprint import footprint_size_m, overlap
 from tests.missions.exposure.surveys import survey
 from tests.oracles_imaging import traced_footprint, traced_spot
 
@@ -32,14 +33,14 @@ def test_one_metre_lines_at_two_metres_overlap_by_29_percent_not_45() -> None:
 
     half = math.atan(3384 * 3.69e-3 / 2 / 12.5)
     width = 2 * 2.0 * math.tan(math.asin(math.sin(half) / 1.34))
-    assert spacing.side_overlap == pytest.approx(1 - 1 / width, abs=1e-9)
-    assert round(100 * spacing.side_overlap, 1) == 29.3
+    assert spacing.mean_overlap == pytest.approx(1 - 1 / width, abs=1e-9)
+    assert round(100 * spacing.mean_overlap, 1) == 29.3
 
 
 @pytest.mark.parametrize("distance_m", [0.01, 0.02, 0.03])
 def test_through_real_ports_they_overlap_by_30_to_32_percent(distance_m: float) -> None:
     rig, config = survey(plan={"line_spacing_m": 1.0}, camera={"port_distance_m": distance_m})
-    assert 0.30 <= line_spacing(rig, config.plan, STEP_M).side_overlap <= 0.32
+    assert 0.30 <= line_spacing(rig, config.plan, STEP_M).mean_overlap <= 0.32
 
 
 @pytest.mark.parametrize("ideal", [False, True])
@@ -53,10 +54,10 @@ def test_the_spacing_yields_the_overlap_on_traced_footprints(ideal: bool, wanted
     assert spacing.bound_by == "side_overlap"
     assert overlap_of_middle_row(here, there) == pytest.approx(wanted, abs=1e-3)
     by_area = here.intersection(there).area / here.area
-    assert spacing.side_overlap_area == pytest.approx(by_area, abs=2e-3)
+    assert spacing.area_overlap == pytest.approx(by_area, abs=2e-3)
     # Sides bulge: corners share less than the middle row.
     assert wanted - 0.02 < by_area < wanted
-    assert by_area - 1e-3 < spacing.side_overlap_swath < wanted
+    assert by_area - 1e-3 < spacing.swath_overlap < wanted
 
 
 @settings(max_examples=40, deadline=None)
@@ -86,7 +87,10 @@ def test_neighbours_off_their_lines_still_overlap_as_asked(
     row = Polygon([(-99, -1e-4), (99, -1e-4), (99, 1e-4), (-99, 1e-4)])
     shared = here.intersection(there).intersection(row).area / 2e-4
 
-    reached = spacing.side_overlap_worst if over_relief else spacing.side_overlap_off_track
+    reached = spacing.off_track_overlap
+    if not over_relief:
+        across_m = footprint_size_m(rig.cameras["left"], altitude_m)[0]
+        reached = overlap(across_m, spacing.spacing_m + 2 * track_error_m)
     assert shared / (2 * edge) == pytest.approx(reached, abs=2e-3)
     assert reached >= wanted - 1e-9
     if spacing.bound_by.startswith("side_overlap"):
@@ -97,7 +101,7 @@ def test_little_overlap_is_bound_by_stereo_without_gaps() -> None:
     rig, config = survey(plan={"side_overlap": 0.0})
     spacing = line_spacing(rig, config.plan, STEP_M)
     assert spacing.bound_by == "no gap in stereo"
-    assert spacing.side_overlap > 0.05
+    assert spacing.mean_overlap > 0.05
     assert spacing.stereo_overlap == pytest.approx(0.0, abs=1e-9)
 
 

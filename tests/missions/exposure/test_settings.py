@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from alice_survey.base.errors import PlanError
 from missions.exposure.settings import imaging_settings
+from missions.exposure.settings_table import WIDTH, Setting, settings_table
 from missions.exposure.storage import storage_rows
-from missions.exposure.table import WIDTH, Setting, settings_table
 from tests.missions.exposure.surveys import survey
 
 
@@ -19,7 +19,7 @@ def test_settings_of_the_papers_mission() -> None:
     assert planned.footprint_along_m == pytest.approx(1.175, abs=1e-3)
     assert planned.pixel_m == pytest.approx(0.448e-3, abs=1e-6)
     assert planned.line_spacing_m == 1.0
-    assert planned.spacing.side_overlap == pytest.approx(0.306, abs=1e-3)
+    assert planned.spacing.mean_overlap == pytest.approx(0.306, abs=1e-3)
     assert 1 / planned.interval_s == pytest.approx(0.43, abs=0.005)
     assert planned.forward_overlap == pytest.approx(0.6, abs=1e-3)
     assert planned.strobe_pulse_s == pytest.approx(planned.exposure_s + 2 * 0.2e-3)
@@ -117,6 +117,11 @@ def test_numbers_are_short(value: float | tuple[float, ...], unit: str, shown: s
     )
     assert row.text == shown
     assert shown in settings_table([row])
+
+
+def test_an_exposure_of_nothing_is_refused_with_what_bounds_it() -> None:
+    with pytest.raises(PlanError, match=r"allowed_blur_px 0\.001"):
+        imaging_settings(*survey(plan={"allowed_blur_px": 0.001}))
 
 
 def test_a_strobe_pulse_that_does_not_fit_is_told() -> None:

@@ -244,7 +244,7 @@ def test_messages_that_are_not_known_are_passed_over_whole(tmp_path: Path, versi
     lost: Counter[str] = Counter()
     tables, present = read_tlog(tmp_path / "a.tlog", ["GLOBAL_POSITION_INT"], lost)
     assert tables["GLOBAL_POSITION_INT"].columns["time_boot_ms"].tolist() == [1, 2]
-    assert present == ["GLOBAL_POSITION_INT", "2 more that do not tell where a vehicle is"]
+    assert present == ["GLOBAL_POSITION_INT", "2 more that do not say where a vehicle is"]
     assert not lost
 
 

@@ -22,7 +22,7 @@ from alice_survey.base.frames import Datum
 from missions.areas.bathymetry import Bathymetry
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.stations import plan_pattern, stations_of_plan
-from missions.exposure.table import Setting
+from missions.exposure.settings_table import Setting
 from missions.plan import page as page_module
 from missions.plan.page import Link, page_script, write_page
 from missions.plan.page_data import page_data

@@ -12,8 +12,7 @@ from camera_calib.rig import design_rig
 from missions.fly.simulation import flight_settings, simulate_plan
 from missions.plan.planner import plan_survey
 from missions.plan.strength import survey_costs
-from missions.route.cost import leg_costs
-from missions.values.costs import power_at
+from missions.values.costs import leg_costs, power_at
 from missions.values.flight import Flight
 from missions.values.plan_file import Plan
 

@@ -5,14 +5,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from shapely.geometry import LineString, Point
 
-from missions.route.cost import leg_costs, mean_power, route_cost
-from missions.route.joins import COLUMNS, price, prices
+from missions.route.joins import COLUMNS, price
 from missions.route.turns import route_through
-from missions.values.costs import Costs, time_costs
+from missions.values.costs import Costs, leg_costs, mean_power, prices, time_costs
 from missions.values.legs import Leg, Route
-from tests.oracles_route import lawn, route_cost_by_steps, sampled_leg
+from tests.oracles_route import lawn, route_cost, route_cost_by_steps, sampled_leg, turn_counts
 
 angles = st.floats(-7.0, 7.0)
 lengths = st.floats(0.01, 30.0)
@@ -137,18 +135,6 @@ def test_no_way_on_a_course_that_cannot_be_flown() -> None:
         assert math.isfinite(mean) == open_water
 
 
-def test_a_polyline_follows_the_route() -> None:
-    route = route_through(lawn(5, 10.0, 1.0), 0.5, 0.5)
-    places = route.polyline_ne(0.05)
-    fine = route.polyline_ne(0.005)
-
-    assert len(places) < 5 * 40
-    assert LineString(places).length == pytest.approx(route.length_m, rel=1e-3)
-    on_route = LineString(fine)
-    assert max(on_route.distance(Point(place)) for place in places) < 1e-5
-    np.testing.assert_allclose(places[[0, -1]], [route.legs[0].start_ne_m, route.legs[-1].end_ne_m])
-
-
 def test_turns_and_steps_are_counted() -> None:
     turns = [
         leg((0, 0), 0, 1.0, line=0),
@@ -160,6 +146,6 @@ def test_turns_and_steps_are_counted() -> None:
         leg((1, 0), 1.0, 0.5, curvature=2.0),
     ]
     route = Route(legs=tuple(turns))
-    assert (route.spot_turns, route.sway_steps, route.arc_turns) == (1, 1, 2)
+    assert turn_counts(route) == (2, 1, 1)
     assert [one.kind for one in turns[:4]] == ["straight", "spot", "sway", "arc"]
     assert route.length_m == pytest.approx(5.0)

@@ -52,7 +52,7 @@ def test_two_that_disagree_say_nothing():
 
 
 def witness(shift_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """The reference sees a plane 2 m away; the other, beside it, sees one `shift_m` farther."""
+    """The reference sees a plane 2 m away; the other, next to it, sees one `shift_m` farther."""
     depth = np.full((16, 20), 2.0, np.float32)
     sigma = np.full_like(depth, 0.005)
     other_from_ref = RigidTransform.from_translation([-0.1, 0.0, 0.0]).as_matrix()[:3]

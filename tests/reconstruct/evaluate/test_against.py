@@ -183,6 +183,6 @@ def test_a_model_that_is_bent_is_warned_of(tmp_path: Path) -> None:
     )
     now = write_survey(tmp_path / "now", flat, datum)
     before = write_survey(tmp_path / "before", bent, datum)
-    with heard() as told:
+    with heard() as stated:
         evaluate_against(now, before)
-    assert any("of the common ground differs" in text for text in told)
+    assert any("of the common ground differs" in text for text in stated)

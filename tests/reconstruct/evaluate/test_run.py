@@ -147,9 +147,10 @@ def plan_with(lines: list[Line]) -> Plan:
     return Plan(
         name="lines", area=area, home_ne_m=(0.0, 0.0), seafloor_depth_m=10.0, altitude_m=2.0,
         speed_mps=0.2, interval_s=1.0, exposure_s=0.003, strobe_pulse_s=0.003, strobe_lead_s=0.0,
-        footprint_m=(1.4, 1.15), line_spacing_m=1.0, station_spacing_m=0.4, forward_overlap=0.6,
-        side_overlap=0.3, lines=tuple(lines), dives=(dive,), turn_radius_m=0.5, run_in_m=0.5,
-        length_m=1.0, duration_s=5.0, energy_wh=1.0, coverage=1.0, details={},
+        footprint_m=(1.4, 1.15), line_spacing_m=1.0, station_spacing_m=0.4,
+        reached_forward_overlap=0.6, reached_side_overlap=0.3, lines=tuple(lines), dives=(dive,),
+        turn_radius_m=0.5, run_in_m=0.5, length_m=1.0, duration_s=5.0,
+        energy_wh=1.0, coverage=1.0, details={},
     )  # fmt: skip
 
 

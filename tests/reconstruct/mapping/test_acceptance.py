@@ -18,17 +18,17 @@ SURE = ScaleTrend(mean=1.0, mean_sigma=1e-4, range=0.0, range_sigma=1e-4)
 def survey(seed: int, count: int = 60) -> tuple[np.ndarray, np.ndarray]:
     """Places in a frame of their own, and where navigation has them within 0.1 m."""
     rng = np.random.default_rng(seed)
-    told = rng.uniform([0, 0, 12.9], [20, 8, 13.1], (count, 3))
+    stated = rng.uniform([0, 0, 12.9], [20, 8, 13.1], (count, 3))
     turn = Rotation.random(random_state=seed)
-    centres = turn.apply(told + rng.normal(0, 0.1, told.shape))
-    return centres + np.array([3.0, -50.0, 7.0]), told
+    centres = turn.apply(stated + rng.normal(0, 0.1, stated.shape))
+    return centres + np.array([3.0, -50.0, 7.0]), stated
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_stations_that_jumped_stand_out_of_those_that_did_not(seed: int) -> None:
-    centres, told = survey(seed)
-    told[[7, 21, 22]] += [[0.0, 3.0, 0.0], [-9.0, 4.0, 0.0], [200.0, 0.0, 0.0]]
-    off, sigma = misses(centres, told, np.full(told.shape, 0.1))
+    centres, stated = survey(seed)
+    stated[[7, 21, 22]] += [[0.0, 3.0, 0.0], [-9.0, 4.0, 0.0], [200.0, 0.0, 0.0]]
+    off, sigma = misses(centres, stated, np.full(stated.shape, 0.1))
     assert off[[7, 21, 22]] == pytest.approx([3.0, np.hypot(9, 4), 200.0], abs=0.5)
     rest = np.delete(off, [7, 21, 22])
     assert rest.max() < 0.5
@@ -37,15 +37,15 @@ def test_stations_that_jumped_stand_out_of_those_that_did_not(seed: int) -> None
 
 
 def test_drift_that_navigation_does_not_own_up_to_widens_the_bounds() -> None:
-    centres, told = survey(2)
-    along = told[:, 0] - told[:, 0].mean()
-    told[:, 1] += 0.1 * along**2 / 2  # up to 5 m by the ends
-    off, sigma = misses(centres, told, np.full(told.shape, 0.01))
+    centres, stated = survey(2)
+    along = stated[:, 0] - stated[:, 0].mean()
+    stated[:, 1] += 0.1 * along**2 / 2  # up to 5 m by the ends
+    off, sigma = misses(centres, stated, np.full(stated.shape, 0.01))
     assert off.max() > 0.5
     assert (off < 5 * sigma).all()
 
 
-def test_a_jump_is_told_by_name_and_small_misses_are_not(
+def test_a_jump_is_reported_by_name_and_small_misses_are_not(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     scene, mapped = block(), block_mapped()
@@ -66,11 +66,11 @@ def test_a_jump_is_told_by_name_and_small_misses_are_not(
     assert [far.station for far in found.far] == [station]
     assert found.far[0].off_m == pytest.approx(2.4, abs=0.1)
     assert f"{scene.records[rows[0]].image} (2." in capsys.readouterr().err
-    told = json.loads(json.dumps(found.to_json(), allow_nan=False))
-    assert told["far"][0]["station"] == station
+    stated = json.loads(json.dumps(found.to_json(), allow_nan=False))
+    assert stated["far"][0]["station"] == station
 
 
-def test_a_rig_that_came_out_another_size_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_rig_that_came_out_another_size_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     scene, mapped = block(), block_mapped()
     assert check_mapping(mapped.model, scene.records, None, None, 0.9e-3, SURE).notes() == []
     found = check_mapping(mapped.model, scene.records, None, None, -2e-3, SURE)
@@ -92,7 +92,7 @@ def test_a_survey_is_checked_with_what_it_knows() -> None:
     assert found.far == ()
     assert abs(found.rig_error) < 1e-6
     shrunk = replace(mapped, rig_factor=1.01)
-    told = check_survey(shrunk, scene.records, scene.rig, DATUM, None)
-    assert told is not None
-    assert told.rig_error == pytest.approx(-0.01, abs=2e-4)
+    stated = check_survey(shrunk, scene.records, scene.rig, DATUM, None)
+    assert stated is not None
+    assert stated.rig_error == pytest.approx(-0.01, abs=2e-4)
     assert check_survey(mapped, scene.records, None, None, None) is None

@@ -33,12 +33,12 @@ def test_a_bent_block_shows_its_curvature(seed: int) -> None:
     """Bent 2 mm/m^2 along and half as much the other way across, in any frame."""
     rng = np.random.default_rng(seed)
     centres = grid(rng, 30.0, 10.0, 150)
-    told = centres[:, 2] + rng.normal(0, 0.005, 150)
+    stated = centres[:, 2] + rng.normal(0, 0.005, 150)
     middle = centres[:, :2] - centres[:, :2].mean(axis=0)
     bent = centres.copy()
     bent[:, 2] -= 0.5 * (2e-3 * middle[:, 0] ** 2 - 1e-3 * middle[:, 1] ** 2)  # up is less depth
     turn = Rotation.random(random_state=seed)
-    along, across = bend_of(turn.apply(bent), told, np.full(150, 0.005), turn.apply(DOWN))
+    along, across = bend_of(turn.apply(bent), stated, np.full(150, 0.005), turn.apply(DOWN))
     assert along is not None and across is not None
     assert along.curvature_per_m == pytest.approx(2e-3, rel=0.05)
     assert across.curvature_per_m == pytest.approx(-1e-3, rel=0.05, abs=4 * across.sigma_per_m)
@@ -52,8 +52,8 @@ def test_straight_blocks_are_not_called_bent_and_sigmas_are_true() -> None:
     for seed in range(200):
         rng = np.random.default_rng(seed)
         centres = grid(rng, 20.0, 8.0, 80)
-        told = centres[:, 2] + rng.normal(0, 0.02, 80)
-        for bend in bend_of(centres, told, np.full(80, 0.02), DOWN):
+        stated = centres[:, 2] + rng.normal(0, 0.02, 80)
+        for bend in bend_of(centres, stated, np.full(80, 0.02), DOWN):
             assert bend is not None
             pulls.append(bend.curvature_per_m / bend.sigma_per_m)
             warned += bend.significant(0.5e-3)
@@ -61,12 +61,12 @@ def test_straight_blocks_are_not_called_bent_and_sigmas_are_true() -> None:
     assert warned <= 3  # 0.27 % of 400 by chance
 
 
-def test_sigmas_that_are_told_too_small_do_not_make_a_bend() -> None:
+def test_sigmas_that_are_stated_too_small_do_not_make_a_bend() -> None:
     rng = np.random.default_rng(3)
     centres = grid(rng, 20.0, 8.0, 80)
-    told = centres[:, 2] + rng.normal(0, 0.02, 80)
-    true, _ = bend_of(centres, told, np.full(80, 0.02), DOWN)
-    small, _ = bend_of(centres, told, np.full(80, 0.001), DOWN)
+    stated = centres[:, 2] + rng.normal(0, 0.02, 80)
+    true, _ = bend_of(centres, stated, np.full(80, 0.02), DOWN)
+    small, _ = bend_of(centres, stated, np.full(80, 0.001), DOWN)
     assert true is not None and small is not None
     assert small.sigma_per_m == pytest.approx(true.sigma_per_m, rel=0.35)
 
@@ -74,10 +74,10 @@ def test_sigmas_that_are_told_too_small_do_not_make_a_bend() -> None:
 def test_jumps_of_the_depth_sensor_do_not_make_a_bend() -> None:
     rng = np.random.default_rng(4)
     centres = grid(rng, 20.0, 8.0, 100)
-    told = centres[:, 2] + rng.normal(0, 0.005, 100)
-    clean, _ = bend_of(centres, told, np.full(100, 0.005), DOWN)
-    told[np.argsort(centres[:, 0])[:5]] += 1.5
-    along, _ = bend_of(centres, told, np.full(100, 0.005), DOWN)
+    stated = centres[:, 2] + rng.normal(0, 0.005, 100)
+    clean, _ = bend_of(centres, stated, np.full(100, 0.005), DOWN)
+    stated[np.argsort(centres[:, 0])[:5]] += 1.5
+    along, _ = bend_of(centres, stated, np.full(100, 0.005), DOWN)
     assert clean is not None and along is not None
     assert abs(along.curvature_per_m - clean.curvature_per_m) < 3 * clean.sigma_per_m
     assert not along.significant(1e-3)
@@ -97,8 +97,8 @@ def test_a_mapped_block_is_straight_until_navigation_is_bent(
     scene, mapped = block(), block_mapped()
     positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.lenses, DATUM)
     rotations = navigation_rotations(scene.records, scene.rig, mapped.lenses)
-    told = (mapped.model, scene.records)
-    straight = measure_doming(*told, positions, sigmas, rotations)
+    stated = (mapped.model, scene.records)
+    straight = measure_doming(*stated, positions, sigmas, rotations)
     assert straight.notes() == []
     assert "bent" not in capsys.readouterr().err
     assert straight.along is not None
@@ -108,7 +108,7 @@ def test_a_mapped_block_is_straight_until_navigation_is_bent(
     bent = positions.copy()
     north = positions[:, 0] - positions[:, 0].mean()
     bent[:, 2] += 0.5 * 0.05 * north**2
-    found = measure_doming(*told, bent, sigmas, rotations)
+    found = measure_doming(*stated, bent, sigmas, rotations)
     assert found.along is not None and straight.along is not None
     gained = found.along.curvature_per_m - straight.along.curvature_per_m
     assert gained == pytest.approx(0.05, rel=0.05)
@@ -155,8 +155,8 @@ def test_a_survey_tells_its_bend_in_numbers_that_json_takes() -> None:
     scene, mapped = block(), block_mapped()
     found = doming_of_survey(mapped, scene.records, scene.rig, DATUM)
     assert found is not None and found.across is not None and found.scale is not None
-    told = json.loads(json.dumps(found.to_json(), allow_nan=False))
-    assert told["across"]["sag_m"] == found.across.sag_m
+    stated = json.loads(json.dumps(found.to_json(), allow_nan=False))
+    assert stated["across"]["sag_m"] == found.across.sag_m
     assert doming_of_survey(mapped, scene.records, None, None) is None
     blind = doming_of_survey(mapped, scene.records, scene.rig, None)
     assert blind is not None and blind.along is None

@@ -158,16 +158,16 @@ def test_threads_do_not_change_a_byte(tmp_path: Path) -> None:
         assert file.read_bytes() == (tmp_path / "2" / file.name).read_bytes()
 
 
-def test_a_fall_back_is_told(monkeypatch: pytest.MonkeyPatch, capsys) -> None:  # type: ignore[no-untyped-def]
+def test_a_fall_back_is_reported(monkeypatch: pytest.MonkeyPatch, capsys) -> None:  # type: ignore[no-untyped-def]
     from reconstruct.mapping import mapper
 
     scene = make_scene(lines=1, stations=5, points=3000, noise_px=0.2)
     monkeypatch.setattr(mapper, "map_globally", lambda *_: [])
     mapped = mapped_by(scene, "auto")
     assert mapped.models[0] == 10
-    told = "global mapping found no model: incremental mapping instead, with 10 of 10 pictures"
-    assert told in mapped.notes
-    assert told in capsys.readouterr().err
+    stated = "global mapping found no model: incremental mapping instead, with 10 of 10 pictures"
+    assert stated in mapped.notes
+    assert stated in capsys.readouterr().err
 
 
 def test_a_model_that_lost_pictures_is_not_sound() -> None:

@@ -97,7 +97,7 @@ def test_noise_of_a_third_of_a_pixel_costs_millimetres() -> None:
 
 
 def test_the_scale_is_that_of_the_rig() -> None:
-    """A rig told twice as large gives a model twice as large: nothing else sets the scale."""
+    """A rig given twice as large gives a model twice as large: nothing else sets the scale."""
     scene = make_scene(lines=1, stations=6, points=4000, noise_px=0.1)
     found, true = pupils(mapped_scene(scene, rig_scale=2.0), scene)
     assert align_similarity(found, true).scale == pytest.approx(0.5, rel=5e-3)
@@ -290,10 +290,10 @@ def test_navigation_tells_where_pinholes_were() -> None:
 def test_positions_straighten_a_long_line_but_leave_its_scale(jump_m: float) -> None:
     scene, mapped = strip()
     positions, sigmas = pinhole_positions(scene.records, scene.rig, mapped.lenses, DATUM)
-    told = positions + np.array([0.4, -0.3, 0.05])
-    told[6:8] += [jump_m, 0.0, 0.0]  # one station whose position is wrong
-    told = told.mean(axis=0) + 1.02 * (told - told.mean(axis=0))  # 2 % too long
-    refined = refine_with_positions(mapped, scene.records, told, sigmas)
+    stated = positions + np.array([0.4, -0.3, 0.05])
+    stated[6:8] += [jump_m, 0.0, 0.0]  # one station whose position is wrong
+    stated = stated.mean(axis=0) + 1.02 * (stated - stated.mean(axis=0))  # 2 % too long
+    refined = refine_with_positions(mapped, scene.records, stated, sigmas)
     assert refined is not mapped
     assert model_baseline(refined.model) == pytest.approx(0.1, rel=1e-9)
     assert camera_rms(refined, scene) < 0.8 * camera_rms(mapped, scene)

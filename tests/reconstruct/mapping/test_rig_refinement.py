@@ -148,7 +148,7 @@ def test_calibrated_parameters_move_within_their_covariance(tmp_path: Path) -> N
 
 
 def test_the_lever_arm_follows_from_turning_about(tmp_path: Path) -> None:
-    """Lines flown both ways tell where navigation's origin sits; how deep, they cannot tell."""
+    """Lines flown both ways show where navigation's origin sits, but not how deep."""
     scene = noisy(5)
     mapped, seen = modelled(scene, scene.rig, tmp_path)
     rng = np.random.default_rng(2)

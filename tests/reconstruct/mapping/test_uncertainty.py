@@ -95,7 +95,7 @@ def test_points_are_eliminated_as_dense_algebra_does(tmp_path: Path) -> None:
     np.testing.assert_allclose(moved.ravel(), wanted, atol=1e-9)
 
 
-def test_told_positions_do_not_place_the_shape_but_firm_it(tmp_path: Path) -> None:
+def test_given_positions_do_not_place_the_shape_but_firm_it(tmp_path: Path) -> None:
     """Exact positions leave stations only turns, which move all of them; vague ones do nothing."""
     scene, mapped = drawn(1, tmp_path)
     free = estimate(mapped, scene.records, None)
@@ -143,7 +143,7 @@ def test_a_station_that_sees_next_to_nothing_has_no_covariance(tmp_path: Path) -
     assert np.isfinite(rest).all()
 
 
-def test_too_small_a_model_is_told_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_too_small_a_model_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene, mapped = drawn(4, tmp_path)
     for point in sorted(mapped.model.points3D)[3:]:
         mapped.model.delete_point3D(point)

@@ -12,7 +12,7 @@ from tests.reconstruct.scenes import ALTITUDE_M, Scene, make_scene
 
 
 def features_of(scene: Scene, folder: Path) -> list[Path]:
-    """Features whose descriptors tell which point they show."""
+    """Features whose descriptors determine which point they show."""
     codes = np.random.default_rng(0).integers(0, 90, (len(scene.points_ned), 128))
     paths = []
     for i, (pixels, ids) in enumerate(zip(scene.pixels, scene.ids, strict=True)):

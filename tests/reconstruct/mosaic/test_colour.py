@@ -1,4 +1,4 @@
-"""Known lamp, water and range, and whether the survey's pictures tell them."""
+"""Known lamp, water and range, and whether the survey's pictures determine them."""
 
 import numpy as np
 
@@ -20,7 +20,7 @@ def lamp(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def haze(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Backscatter: strongest beside the lamps at the left and right."""
+    """Backscatter: strongest next to the lamps at the left and right."""
     return (0.02 + 0.10 * (x - 0.5) ** 2 + 0.02 * y)[..., None] * [1.2, 1.0, 0.4]
 
 

@@ -23,7 +23,7 @@ NODES_X, NODES_Y = np.meshgrid(np.linspace(0, 1, GRID[1]), np.linspace(0, 1, GRI
 
 
 def pattern(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Logarithm of a lamp that falls off from a point beside the middle."""
+    """Logarithm of a lamp that falls off from a point next to the middle."""
     return -1.2 * ((x - 0.45) ** 2 + (y - 0.6) ** 2)
 
 

@@ -17,6 +17,7 @@ from reconstruct.mosaic.run import _dispersion
 from reconstruct.raster import DemGrid, tiled_raster
 from reconstruct.views.lens import flat_port_lens
 from reconstruct.views.model import View
+from tests.engines import PicklingThreads
 from tests.oracles_dense import (
     DEPTH_M,
     FRAME,
@@ -151,10 +152,12 @@ def test_source_names_the_picture_nearest_to_straight_above(workspace: Path):
     assert len(np.unique(source[source > 0])) >= 4
 
 
-def test_bytes_do_not_change(workspace: Path, tmp_path: Path):
+def test_bytes_do_not_change_on_another_engine(workspace: Path, tmp_path: Path):
     for name in ("images", "sparse", "dense"):
         (tmp_path / name).symlink_to(workspace / name)
-    assert spec("mosaic").make(tmp_path, CONFIG, SERIAL)
+    with PicklingThreads(1) as engine:
+        assert spec("mosaic").make(tmp_path, CONFIG, engine.executor)
+        assert engine.tasks > len(list((tmp_path / "images").rglob("*.png")))
     names = ("mosaic.tif", "mosaic_source.tif", "coverage.tif", "mosaic.png", "mosaic.json")
     for name in (*names, "footprints.csv", "footprints.geojson"):
         same = (tmp_path / "mosaic" / name).read_bytes()

@@ -189,9 +189,9 @@ def test_a_corrupt_picture_is_left_out_and_its_partner_stays(
     (tmp_path / "right" / "2.jpg").write_bytes(b"no picture at all")
     (tmp_path / "right" / "3.jpg").write_bytes(b"")
     import_images(tmp_path / "w", [], left=tmp_path / "left", right=tmp_path / "right")
-    told = capsys.readouterr().err
+    shown = capsys.readouterr().err
     for name in ("left/1.jpg", "right/2.jpg", "right/3.jpg"):
-        assert any(name in line and "left out" in line for line in told.splitlines())
+        assert any(name in line and "left out" in line for line in shown.splitlines())
     records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
     kept = [(r.camera, r.station) for r in records]
     assert kept == [("left", 0), ("right", 0), ("right", 1), ("left", 2), ("left", 3)]
@@ -269,9 +269,9 @@ def test_navigation_is_tied_by_time_zone_and_clock_offset(
     assert [r.depth_m for r in records[:3]] == pytest.approx([12.5, 16.5, 20.5])
     assert records[1].heading_deg == pytest.approx(90)
     assert not records[3].has_position
-    told = capsys.readouterr().err
-    assert "1 pictures get no navigation" in told
-    assert "camera/3.jpg" in told
+    shown = capsys.readouterr().err
+    assert "1 pictures get no navigation" in shown
+    assert "camera/3.jpg" in shown
 
 
 @pytest.mark.parametrize(
@@ -388,8 +388,8 @@ def test_every_fault_gives_one_line(tmp_path: Path, draw: Draw) -> None:
         ([three], {"time_zone": "Nowhere"}, "time-zone 'Nowhere'"),
         ([three], {"clock_offset_s": float("nan")}, "clock-offset nan"),
         ([three], {"vertical_datum": "LAT"}, "'LAT' names the level .* give --navigation too"),
-        ([three], {"navigation": nav, "vertical_datum": " "}, "no name of one line"),
-        ([three], {"navigation": nav, "vertical_datum": "a\nb"}, "no name of one line"),
+        ([three], {"navigation": nav, "vertical_datum": " "}, "not a name of one line"),
+        ([three], {"navigation": nav, "vertical_datum": "a\nb"}, "not a name of one line"),
     ]
     for folders, given, message in faults:
         with pytest.raises(AliceError, match=message) as caught:

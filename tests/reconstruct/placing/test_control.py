@@ -165,7 +165,7 @@ def test_points_that_cannot_be_found_say_why() -> None:
 
 @pytest.mark.parametrize("stretch", [1.0, 3.7])
 def test_control_points_alone_place_a_model(tmp_path: Path, stretch: float) -> None:
-    """Of known scale, or in a unit of which 3.7 make a metre: four points tell."""
+    """Of known scale, or in a unit of which 3.7 make a metre: four points show it."""
     gauge = in_gauge(5)
     spots, _ = find_spots(picks_of(KNOWN), gauge.cameras)
     spots = {
@@ -198,7 +198,7 @@ def test_control_points_alone_place_a_model(tmp_path: Path, stretch: float) -> N
 
 
 def test_control_and_navigation_place_together_within_their_sigmas(tmp_path: Path) -> None:
-    """Navigation is 0.3 m off; control of 2 mm pulls the model to the truth, check points tell."""
+    """Navigation is 0.3 m off; control of 2 mm pulls the model to the truth, as checks show."""
     scene = make_scene(points=300, bias_m=(0.3, -0.2, 0.02))
     gauge = in_gauge(6)
     path = write(tmp_path / "control.csv", control_rows("+++?+"))

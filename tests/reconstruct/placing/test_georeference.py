@@ -49,7 +49,7 @@ def fit(
 
 
 def exact(scene: Scene) -> list[ImageRecord]:
-    """Navigation that tells the true attitude too."""
+    """Navigation that shows the true attitude too."""
     records = []
     for record, pose in zip(scene.records, scene.ned_from_cam, strict=True):
         ned_from_body = pose * scene.rig.body_from_cam(record.camera).inv()
@@ -102,10 +102,10 @@ def test_a_known_scale_is_kept_and_that_of_navigation_reported() -> None:
     truth = gauge(3, 1.0)
     origin = np.array([1.0, 1.0, 13.0])
     places = np.stack([pose.translation for pose in site().ned_from_cam])
-    told = DATUM.geodetic_from_ned(origin + 1.05 * (places - origin))
+    stated = DATUM.geodetic_from_ned(origin + 1.05 * (places - origin))
     stretched = [
         replace(r, latitude_deg=a, longitude_deg=b, depth_m=d)
-        for r, (a, b, d) in zip(without_attitude(site()), told, strict=True)
+        for r, (a, b, d) in zip(without_attitude(site()), stated, strict=True)
     ]
     found = fit(site(), stretched, truth, known=True, levers=False)
     assert found is not None

@@ -59,8 +59,8 @@ def test_a_drone_block_is_registered_scaled_and_placed_by_its_gps(drone: Path) -
     for view in model.views:
         record = records[view.image]
         place = [[record.latitude_deg, record.longitude_deg, record.depth_m]]
-        told = model.frame.datum.ned_from_geodetic(np.array(place))[0]
-        assert np.linalg.norm(view.world_from_cam.translation - told) < 6
+        stated = model.frame.datum.ned_from_geodetic(np.array(place))[0]
+        assert np.linalg.norm(view.world_from_cam.translation - stated) < 6
         assert view.world_from_cam.rotation.apply([0, 0, 1])[2] > 0.95  # looks down
 
 
@@ -135,8 +135,8 @@ def test_without_positions_the_model_is_level_unscaled_and_says_so(nowhere: Path
     # one known length scales it
     first, second = model.points_world[[3, 40]]
     tokens = [",".join(f"{v:.9f}" for v in p) for p in (first, second)]
-    told = scale_model(nowhere, " ".join(tokens), 12.5)
-    assert "12.5 m" in told
+    stated = scale_model(nowhere, " ".join(tokens), 12.5)
+    assert "12.5 m" in stated
     before = (nowhere / "mapping" / "stage.json").stat().st_mtime_ns
     assert reconstruct(nowhere, QUICK, SERIAL)
     assert (nowhere / "mapping" / "stage.json").stat().st_mtime_ns == before  # not mapped again

@@ -58,7 +58,7 @@ def scatter(true: RigidTransform, moved: list[RigidTransform]) -> Array:
 
 
 def assert_close(found: Array, drawn: Array) -> None:
-    """Within what some thousand draws tell."""
+    """Within what some thousand draws determine."""
     size = np.sqrt(np.einsum("nii->ni", drawn))
     np.testing.assert_allclose(
         (found - drawn) / (size[:, :, None] * size[:, None, :]), 0.0, atol=0.12
@@ -175,8 +175,8 @@ def test_a_track_keeps_its_poses_and_says_its_sigmas(tmp_path: Path) -> None:
         )
     header, first = (tmp_path / "track.csv").read_text().splitlines()[:2]
     assert header.split(",")[-6:] == list(SIGMAS)
-    told = [float(cell) for cell in first.split(",")[-6:]]
-    np.testing.assert_allclose(told[:3], np.sqrt(np.diag(covariances[0])[:3]), rtol=1e-5)
+    stated = [float(cell) for cell in first.split(",")[-6:]]
+    np.testing.assert_allclose(stated[:3], np.sqrt(np.diag(covariances[0])[:3]), rtol=1e-5)
     nothing = track_sigmas(track, None)
     write_track_csv(tmp_path / "none.csv", track, FRAME, nothing)
     assert (tmp_path / "none.csv").read_text().splitlines()[1].endswith(",,,,,,")
@@ -219,9 +219,9 @@ def test_the_figure_shows_the_mosaic_and_the_stations_on_it(tmp_path: Path) -> N
     covariances = np.stack([np.diag([0.25, 0.04, 0.01, 0, 0, 0])] * 3)
     write_track_csv(tmp_path / "track.csv", track, FRAME, track_sigmas(track, covariances))
     figures = []
-    for told in (True, False):
+    for stated in (True, False):
         path = tmp_path / "track_covariance.npz"
-        if told:
+        if stated:
             write_covariances(path, [row.image for row in track], covariances, "place")
         else:
             path.unlink()

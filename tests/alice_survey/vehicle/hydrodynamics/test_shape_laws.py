@@ -37,14 +37,6 @@ def test_a_needle_drags_nothing_along_its_axis() -> None:
         assert k_1 == pytest.approx(slender, rel=10.0 / fineness)
 
 
-def test_the_printed_eccentricity_of_the_paper() -> None:
-    """It overstates the hull's added mass by two thirds, and gives what the paper has."""
-    right = added_mass.ellipsoid_axial(1.96, 0.23, RHO)
-    printed = added_mass.ellipsoid_axial_as_printed(1.96, 0.23, RHO)
-    assert right == pytest.approx(1.477, abs=1e-3)
-    assert printed == pytest.approx(2.485, abs=1e-3)
-
-
 def test_sections_by_hand() -> None:
     np.testing.assert_allclose(
         added_mass.circle_section(np.array([0.0, 0.115]), RHO), [0, RHO * math.pi * 0.115**2]

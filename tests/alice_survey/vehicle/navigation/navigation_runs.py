@@ -70,7 +70,7 @@ class Run:
     every: int
 
     def errors(self) -> Array:
-        """(M, 25) truth minus belief at the epochs, as `estimation_error` has it."""
+        """(M, 25) truth minus belief at the epochs of the covariance."""
         truth = self.truth[:: self.every]
         attitude = Rotation.from_quat(truth[:, 3:7])
         lever = self.sensors.place[IMU]

@@ -12,10 +12,10 @@ from alice_survey.vehicle.pilot import memory as slot
 from alice_survey.vehicle.pilot import safety
 from alice_survey.vehicle.pilot.guidance import steer
 from alice_survey.vehicle.pilot.memory import PilotState, new_pilot
-from alice_survey.vehicle.pilot.safety import REASONS, Limits
+from alice_survey.vehicle.pilot.safety import REASONS, SafetyLimits
 from tests.alice_survey.vehicle.pilot.pilot_runs import Flight, launch, straight
 
-LIMITS = Limits(1.0, 20.0, math.radians(30.0), 20.0, 90.0, 3.0, 5000.0)
+LIMITS = SafetyLimits(1.0, 20.0, math.radians(30.0), 20.0, 90.0, 3.0, 5000.0)
 TICK_S = 0.05
 
 

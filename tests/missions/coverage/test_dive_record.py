@@ -14,8 +14,7 @@ from alice_survey.base.frames import Array, rotation_from_attitude
 from alice_survey.base.manifest import ImageRecord, write_manifest
 from alice_survey.base.trajectory import Trajectory, write_track
 from camera_calib.rig import design_rig
-from missions.coverage.dives import read_dive_record
-from missions.coverage.passes import assign_lines
+from missions.coverage.dive_record import assign_lines, read_dive_record
 from missions.coverage.stations import Stations, stations_of_plan
 from missions.values.navigation import write_navigation
 from tests.missions.coverage.logs import log_of, write_triggers

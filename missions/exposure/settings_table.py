@@ -44,6 +44,13 @@ class Setting:
         return f"{' / '.join(_number(v) for v in values)} {self.unit}".rstrip()
 
 
+def setting_from_json(row: dict[str, Any]) -> Setting:
+    """The inverse of `Setting.to_json`; what was not finite is NaN."""
+    values = row["value"] if isinstance(row["value"], list) else [row["value"]]
+    known = tuple(math.nan if value is None else float(value) for value in values)
+    return Setting(**{**row, "value": known})
+
+
 def settings_table(rows: Sequence[Setting]) -> str:
     """Rows under the headings of their groups, with notes below each; no line exceeds `WIDTH`."""
     header = ("setting", "value", "equation [source]", "bound by")

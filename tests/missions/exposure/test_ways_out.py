@@ -1,7 +1,7 @@
 import pytest
 
 from alice_survey.base.errors import PlanError
-from missions.exposure.conflicts import Way, conflict
+from missions.exposure.ways_out import Way, conflict
 
 
 def test_the_three_cheapest_ways_are_told_in_order() -> None:

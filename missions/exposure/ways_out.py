@@ -1,7 +1,7 @@
 """What to say when limits conflict: which two do, and the cheapest ways out.
 
 Whoever finds a conflict computes the ways: each is a setting with the value that just fits and what
-it costs. Costs are shares (0.3: the survey takes 30 % longer, or 30 % of what was asked for is
+it costs. Costs are shares (0.3: the survey takes 30 % longer, or 30 % of what was requested is
 given up), so that ways of different kinds can be put in order.
 """
 
@@ -22,7 +22,7 @@ class Way:
     price: str
     """What is lost by it, in words and numbers."""
     cost: float
-    """The loss as a share: extra time of the survey, or what is given up of what was asked for."""
+    """The loss as a share: extra time of the survey, or what is given up of what was requested."""
 
 
 def conflict(what: str, limits: tuple[str, str], ways: Sequence[Way]) -> PlanError:
