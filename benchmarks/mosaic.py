@@ -41,9 +41,9 @@ _POINTS = 20
 _MOST_MIB = 1536.0
 _RUN = (
     "import sys; from pathlib import Path; from alice_survey.base.config import ReconstructConfig, "
-    "SurveyConfig; from reconstruct.mosaic.run import run_mosaic; "
+    "SurveyConfig; from alice_survey.stages import spec; "
     "from alice_survey.base.executor import local_executor; "
-    "run_mosaic(Path(sys.argv[1]), SurveyConfig(reconstruct=ReconstructConfig("
+    "spec('mosaic').make(Path(sys.argv[1]), SurveyConfig(reconstruct=ReconstructConfig("
     f"mosaic_pixel_m={PIXEL_M})), local_executor(int(sys.argv[2])))"
 )
 

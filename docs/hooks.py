@@ -24,6 +24,7 @@ _AFTER = re.compile(
 )
 _GAP = '<mspace width="0.17em" />'
 _BAR = re.compile(r'<mo(?: stretchy="false")?>(&#x02016;|&#x0007C;)</mo>')
+_STAGES = "<!-- stages: a table, made when the site is built -->"
 _FORMATS = "<!-- export formats: a table, made when the site is built -->"
 _TIGHT_BAR = r'<mo stretchy="false" lspace="0" rspace="0">\1</mo>'
 
@@ -36,12 +37,16 @@ def on_page_content(content: str, *, page: Page, config: MkDocsConfig, files: Fi
 
 
 def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Put the table of export formats where a page asks for it."""
-    if _FORMATS not in markdown:
-        return markdown
-    from missions.exports.registry import formats_table
+    """Put the tables of stages and of export formats where a page asks for them."""
+    if _STAGES in markdown:
+        from alice_survey import stages
 
-    return markdown.replace(_FORMATS, formats_table())
+        markdown = markdown.replace(_STAGES, stages.table())
+    if _FORMATS in markdown:
+        from missions.exports.registry import formats_table
+
+        markdown = markdown.replace(_FORMATS, formats_table())
+    return markdown
 
 
 def _block(latex: str, where: str) -> str:

@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 import rasterio
 
-from alice_survey.survey import LOOP
+from alice_survey.stages import STAGES
 from tests.small_survey import settings_in, start
 
 pytestmark = pytest.mark.slow
 
-FOLDERS = (*LOOP[:5], "mapping", *LOOP[5:])
+FOLDERS = tuple(stage.folder for stage in STAGES)
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def test_every_stage_is_told_of(undisturbed: Path) -> None:
     for name in ("stage_started", "stage_finished"):
         assert [e["stage"] for e in run if e["event"] == name] == list(FOLDERS)
     titles = [e["message"] for e in run if e["event"] == "stage_started"]
-    assert titles[5:7] == [f"sparse (6 of {len(LOOP)}): mapping", f"sparse (6 of {len(LOOP)})"]
+    assert titles == [f"{name} ({n} of {len(FOLDERS)})" for n, name in enumerate(FOLDERS, 1)]
     for event in run:
         if event["event"] == "stage_finished":
             record = json.loads((undisturbed / event["stage"] / "stage.json").read_text())
@@ -85,7 +85,7 @@ def test_truth_is_not_read_by_reconstruct(undisturbed: Path, tmp_path: Path) -> 
     """Without the truth beside the pictures the reconstruction is the same, to the byte."""
     workspace = tmp_path / "blind"
     shutil.copytree(undisturbed, workspace)
-    for stage in ("sparse", "dense", "mosaic", "mesh", "evaluation", "calibration"):
+    for stage in ("mapping", "sparse", "dense", "mosaic", "mesh", "evaluation", "calibration"):
         shutil.rmtree(workspace / stage)
     shutil.rmtree(workspace / "images" / "truth")
     shutil.rmtree(workspace / "flight" / "truth")
@@ -94,7 +94,7 @@ def test_truth_is_not_read_by_reconstruct(undisturbed: Path, tmp_path: Path) -> 
     subprocess.run([*command, "--threads", "1"], check=True, capture_output=True)
     seen, whole = results(workspace), results(undisturbed)
     for name in seen:
-        if name.split("/")[0] in {"calibration", "sparse", "dense", "mosaic", "mesh"}:
+        if name.split("/")[0] in {"calibration", "mapping", "sparse", "dense", "mosaic", "mesh"}:
             assert seen[name] == whole[name], name
 
 

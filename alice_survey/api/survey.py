@@ -60,7 +60,8 @@ class Survey:
     @property
     def config(self) -> SurveyConfig:
         """The settings of `survey.toml`; defaults where a workspace holds imported pictures."""
-        from alice_survey.survey import is_imported, settings
+        from alice_survey.stages import is_imported
+        from alice_survey.survey import settings
 
         return settings(self.folder, None, needed=not is_imported(self.folder))
 
@@ -78,9 +79,10 @@ class Survey:
             AliceError: a stage cannot be done; the message says what to change.
         """
         from alice_survey.base.executor import local_executor
-        from alice_survey.survey import LOOP, run
+        from alice_survey.stages import names
+        from alice_survey.survey import run
 
-        return run(stages or LOOP, self.folder, None, executor=local_executor(threads))[1]
+        return run(stages or names(), self.folder, None, executor=local_executor(threads))[1]
 
     def plan(self) -> Plan:
         """Plan the survey if its plan is missing or stale, and return the plan."""

@@ -14,10 +14,11 @@ import re
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.run import progress
@@ -45,17 +46,70 @@ class Stage:
     """Work can go on in what an interrupted run of the same digest left."""
 
 
-_checking: ContextVar[bool] = ContextVar("checking", default=False)
+class JsonRecord(BaseModel):
+    """A JSON file of a workspace: a frozen value that is read and written whole.
+
+    Values that a subclass does not name are kept as they are, so that a file of another version of
+    the program is read and written without loss.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="allow", populate_by_name=True)
+    path: ClassVar[str] = ""
+    """Of the file, from the workspace."""
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Read a file.
+
+        Raises:
+            WorkspaceError: it is missing, not JSON, or lacks a value.
+        """
+        try:
+            return cls.model_validate(read_json(path))
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            where = ".".join(str(name) for name in first["loc"]) or "its content"
+            raise WorkspaceError(
+                f"{path}: {where}: {first['msg']}: the file is damaged or was edited; remove the "
+                "folder and run the command that makes it again"
+            ) from None
+
+    @classmethod
+    def made(cls, path: Path) -> Self | None:
+        """Read a file; None where it is missing."""
+        return cls.read(path) if path.is_file() else None
+
+    def to_json(self) -> dict[str, Any]:
+        """The values as JSON holds them."""
+        return self.model_dump(mode="json", by_alias=True)
+
+    @classmethod
+    def save(cls, path: Path, values: Mapping[str, Any]) -> Self:
+        """Write values that make up a file of this type."""
+        record = cls.model_validate(values)
+        record.write(path)
+        return record
+
+    def write(self, path: Path) -> None:
+        """Write the file, whole or not at all."""
+        write_json(path, self.to_json())
 
 
-@contextlib.contextmanager
-def only_checking() -> Iterator[None]:
-    """Within this block `run_stage` works nothing; it tells whether there would be work."""
-    token = _checking.set(True)
-    try:
-        yield
-    finally:
-        _checking.reset(token)
+class StageRecord(JsonRecord):
+    """`stage.json`: what a finished stage was made of, and what the work took."""
+
+    stage: str = ""
+    """Name of its folder."""
+    version: int = 0
+    digest: str = ""
+    settings: dict[str, Any] = Field(default_factory=dict)
+    inputs: dict[str, tuple[int, int, str]] = Field(default_factory=dict)
+    """Size, modification time (ns) and digest of each file, by its path from the workspace."""
+    took_s: float = 0.0
+    cpu_s: float | None = None
+    peak_mib: float | None = None
+    versions: dict[str, str] = Field(default_factory=dict)
+    """Of the packages that decide results."""
 
 
 def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], None]) -> bool:
@@ -69,8 +123,6 @@ def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], None]) -> bo
     Returns:
         True when the work was done, False when it was skipped.
     """
-    if _checking.get():
-        return not is_current(workspace, stage)
     final, partial = workspace / stage.name, workspace / f"{stage.name}.partial"
     replaced = workspace / f"{stage.name}.replaced"
     if replaced.exists():  # a kill fell between the two renames below
@@ -82,7 +134,7 @@ def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], None]) -> bo
     with progress.step(f"check what {stage.name} depends on"):
         inputs = digest_inputs(stage.inputs, workspace, previous)
     digest = _digest_stage(stage, inputs)
-    if previous is not None and previous.get("digest") == digest:
+    if previous is not None and previous.digest == digest:
         if partial.exists():
             shutil.rmtree(partial)
         progress.skipped(stage.name)
@@ -96,8 +148,8 @@ def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], None]) -> bo
     _drop_cut_files(partial)
     with atomic_path(marker) as path:
         path.write_text(digest)
-    told = {"resumed": True} if resumed else {}
-    with progress.stage(stage.name, **told) as finish:
+    how = {"resumed": True} if resumed else {}
+    with progress.stage(stage.name, **how) as finish:
         spent = _measured(partial, work).to_json()
         _check_unchanged(inputs, workspace, stage.name)
         record = {
@@ -107,7 +159,7 @@ def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], None]) -> bo
             "settings": stage.settings,
             "inputs": inputs,
             **spent,
-            **told,
+            **how,
             "versions": versions(),
         }
         write_json(partial / STAGE_FILE, record)
@@ -118,7 +170,7 @@ def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], None]) -> bo
         partial.rename(final)
         if replaced.exists():
             shutil.rmtree(replaced)
-        finish(**spent, **told)
+        finish(**spent, **how)
     return True
 
 
@@ -139,13 +191,39 @@ def _measured(partial: Path, work: Callable[[Path], None]) -> Spent:
         return meter.look().after(earlier)
 
 
-def is_current(workspace: Path, stage: Stage) -> bool:
-    """Whether the stage's folder is there and nothing it depends on has changed."""
-    previous = read_stage(workspace / stage.name)
-    if previous is None:
-        return False
-    inputs = digest_inputs(stage.inputs, workspace, previous)
-    return bool(previous.get("digest") == _digest_stage(stage, inputs))
+def why_stale(workspace: Path, stage: Stage) -> str | None:
+    """What has changed since a stage was made, in a few words; None while it is up to date.
+
+    Raises:
+        WorkspaceError: an input does not exist.
+    """
+    record = read_stage(workspace / stage.name)
+    if record is None:
+        return "missing"
+    inputs = digest_inputs(stage.inputs, workspace, record)
+    if record.digest == _digest_stage(stage, inputs):
+        return None
+    if record.version != stage.version:
+        return f"made by version {record.version} of the stage, now {stage.version}"
+    settings = json.loads(json.dumps(stage.settings))
+    changed = list(_different(record.settings, settings))
+    if changed:
+        return f"changed: {_first(changed)}"
+    content = {name: entry[2] for name, entry in record.inputs.items()}
+    return f"changed: {_first(list(_different(content, {n: e[2] for n, e in inputs.items()})))}"
+
+
+def _different(old: object, new: object, name: str = "") -> Iterator[str]:
+    """Dotted names of the values in which two JSON values differ."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in [*old, *(key for key in new if key not in old)]:
+            yield from _different(old.get(key), new.get(key), f"{name}.{key}" if name else str(key))
+    elif old != new:
+        yield name
+
+
+def _first(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
 
 
 def need_stage(workspace: Path, name: str, command: str) -> Path:
@@ -160,35 +238,35 @@ def need_stage(workspace: Path, name: str, command: str) -> Path:
     return folder
 
 
-def read_stage(folder: Path) -> dict[str, Any] | None:
-    """The content of a stage's `stage.json`, or None where no whole stage is."""
+def read_stage(folder: Path) -> StageRecord | None:
+    """What a stage's `stage.json` says, or None where no whole stage is."""
     try:
-        record = json.loads((folder / STAGE_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        return StageRecord.model_validate_json((folder / STAGE_FILE).read_bytes())
+    except (OSError, ValidationError):
         return None
-    return record if isinstance(record, dict) else None
 
 
 def digest_inputs(
-    inputs: Sequence[Path], workspace: Path, previous: Mapping[str, Any] | None
-) -> dict[str, list[Any]]:
-    """Digest every file of the inputs, as `{path: [size, mtime_ns, digest]}`.
+    inputs: Sequence[Path], workspace: Path, previous: StageRecord | None
+) -> dict[str, tuple[int, int, str]]:
+    """Digest every file of the inputs, as `{path: (size, mtime_ns, digest)}`.
 
     A file whose size and modification time stand in `previous` is not read again.
 
     Raises:
         WorkspaceError: an input does not exist.
     """
-    told = (previous or {}).get("inputs")
-    known = told if isinstance(told, dict) else {}
-    digests: dict[str, list[Any]] = {}
+    known = {} if previous is None else previous.inputs
+    digests = {}
     for path in _files(inputs):
         name = os.path.relpath(path, workspace)
         digests[name] = _entry(path, known.get(name))
     return digests
 
 
-def _check_unchanged(inputs: Mapping[str, Sequence[Any]], workspace: Path, stage: str) -> None:
+def _check_unchanged(
+    inputs: Mapping[str, tuple[int, int, str]], workspace: Path, stage: str
+) -> None:
     """Check that files are as they were when their digests were taken.
 
     Raises:
@@ -207,14 +285,14 @@ def _check_unchanged(inputs: Mapping[str, Sequence[Any]], workspace: Path, stage
             )
 
 
-def _entry(path: Path, old: object) -> list[Any]:
+def _entry(path: Path, old: tuple[int, int, str] | None) -> tuple[int, int, str]:
     """Size, modification time and digest of a file, which is read only if these differ from old."""
     stat = path.stat()
-    if isinstance(old, list) and len(old) == 3 and old[:2] == [stat.st_size, stat.st_mtime_ns]:
+    if old is not None and old[:2] == (stat.st_size, stat.st_mtime_ns):
         return old
     with path.open("rb") as file:
         content = hashlib.file_digest(file, "blake2b").hexdigest()[:32]
-    return [stat.st_size, stat.st_mtime_ns, content]
+    return stat.st_size, stat.st_mtime_ns, content
 
 
 def _files(inputs: Sequence[Path]) -> Iterator[Path]:
@@ -228,7 +306,7 @@ def _files(inputs: Sequence[Path]) -> Iterator[Path]:
             raise WorkspaceError(f"{path}: no such file or folder")
 
 
-def _digest_stage(stage: Stage, inputs: Mapping[str, Sequence[Any]]) -> str:
+def _digest_stage(stage: Stage, inputs: Mapping[str, tuple[int, int, str]]) -> str:
     content = {name: entry[2] for name, entry in inputs.items()}
     text = json.dumps([stage.name, stage.version, stage.settings, content], sort_keys=True)
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
@@ -250,7 +328,7 @@ def _drop_cut_files(folder: Path) -> None:
 
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """A path to write to, beside `path`, that replaces it when all went well.
+    """A path to write to, next to `path`, that replaces it when all went well.
 
     Raises:
         WorkspaceError: there is a folder of that name.
@@ -276,7 +354,7 @@ def read_json(path: Path) -> Any:
     """Read JSON.
 
     Raises:
-        WorkspaceError: the file is missing or no JSON.
+        WorkspaceError: the file is missing or not JSON.
     """
     try:
         return json.loads(path.read_text(encoding="utf-8-sig"))

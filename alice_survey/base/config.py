@@ -27,6 +27,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Ring = tuple[tuple[float, float], ...]
 GeoRing = tuple[tuple[Latitude, Longitude], ...]
 Gust = Annotated[float, Field(ge=0, le=1000)]
+SHAPEFILE_SIDES = (".shx", ".dbf", ".prj", ".cpg")
 
 
 class Config(BaseModel):
@@ -73,6 +74,23 @@ class AreaConfig(Config):
     bathymetry_values: Literal["auto", "heights", "depths"] = "auto"
     bathymetry_crs: str | None = None
 
+    @property
+    def datum_given(self) -> list[str]:
+        """Which coordinates of the datum are set, to whatever value; the others have no meaning.
+
+        Of a shape in degrees the middle is the datum unless one is set.
+        """
+        return sorted({"latitude_deg", "longitude_deg"} & self.model_fields_set)
+
+    @property
+    def files(self) -> list[Path]:
+        """The files that shapes come from, a shapefile's side files too; those that exist."""
+        files = []
+        for path in (self.file, self.no_go_file, self.allowed_file):
+            if path is not None:
+                files += [path, *(sides_of(path) if path.suffix.lower() == ".shp" else [])]
+        return [path for path in dict.fromkeys(files) if path.exists()]
+
     @model_validator(mode="after")
     def _one_shape(self) -> Self:
         shapes = (
@@ -95,6 +113,17 @@ class AreaConfig(Config):
         if len(given) > 1:
             raise ValueError(f"give {' or '.join(given)}, not both")
         return self
+
+
+def sides_of(shapefile: Path) -> list[Path]:
+    """The files next to a shapefile that belong to it, whatever the case of their endings."""
+    if not shapefile.parent.is_dir():
+        return []
+    return sorted(
+        other
+        for other in shapefile.parent.iterdir()
+        if other.stem == shapefile.stem and other.suffix.lower() in SHAPEFILE_SIDES
+    )
 
 
 PortTilt = Annotated[float, Field(ge=-15, le=15)]

@@ -191,7 +191,7 @@ def fly(
     changes = FlightChanges(
         vehicle=vehicle, controller=controller, current=current, failed=fail, dive=dive
     )
-    print_result(*run(["flight"], workspace, survey, flight=changes), as_json)
+    print_result(*run(["fly"], workspace, survey, flight=changes), as_json)
 
 
 @app.command(epilog=examples("image -w reef --scale 4 --threads 2"))
@@ -208,7 +208,7 @@ def image(
     """
     from alice_survey.survey import run
 
-    print_result(*run(["pool", "images"], workspace, survey, scale, executor_of(threads)), as_json)
+    print_result(*run(["pool", "image"], workspace, survey, scale, executor_of(threads)), as_json)
 
 
 @app.command(
@@ -314,7 +314,7 @@ def calibrate(
     else:
         from alice_survey.survey import run
 
-        result = run(["calibration"], workspace, survey, None, executor_of(threads))
+        result = run(["calibrate"], workspace, survey, None, executor_of(threads))
     print_result(*result, as_json)
 
 
@@ -331,9 +331,10 @@ def run_all(
     plan, fly, image, calibrate, reconstruct, evaluate, report: stages that are up to date are
     skipped.
     """
-    from alice_survey.survey import LOOP, run
+    from alice_survey.stages import names
+    from alice_survey.survey import run
 
-    print_result(*run(LOOP, workspace, survey, scale, executor_of(threads)), as_json)
+    print_result(*run(names(), workspace, survey, scale, executor_of(threads)), as_json)
 
 
 @app.command(epilog=examples("demo", "demo -w demo --threads 2"))

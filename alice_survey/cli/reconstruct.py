@@ -43,9 +43,11 @@ def reconstruct(
     Camera track, DEM, point cloud, orthomosaic and textured mesh.
     """
     if context.invoked_subcommand is None:
-        from alice_survey.survey import RECONSTRUCT, run
+        from alice_survey.stages import names
+        from alice_survey.survey import run
 
-        print_result(*run(RECONSTRUCT, workspace, survey, None, executor_of(threads)), as_json)
+        stages = names("calibrate", "reconstruct")
+        print_result(*run(stages, workspace, survey, None, executor_of(threads)), as_json)
 
 
 @reconstruct_app.command(
@@ -206,7 +208,7 @@ def evaluate(
     else:
         from alice_survey.survey import run
 
-        result = run(["evaluation"], workspace, survey, None, executor_of(threads))
+        result = run(["evaluate"], workspace, survey, None, executor_of(threads))
     print_result(*result, as_json)
 
 

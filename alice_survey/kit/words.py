@@ -38,6 +38,11 @@ def with_sigma(value: float, sigma: float, sign: str = "") -> str:
     return f"{value:{sign}.{places}f} ± {sigma:.{places}f}"
 
 
+def millimetres(value: float | None) -> str:
+    """As `length`, of millimetres."""
+    return length(None if value is None else 1e-3 * value)
+
+
 def digits(value: float, wanted: int = 3) -> str:
     """With this many digits and never an exponent."""
     if value == 0 or not math.isfinite(value):

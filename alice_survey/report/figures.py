@@ -7,6 +7,14 @@ from typing import Any
 import numpy as np
 
 from alice_survey.base.frames import Array
+from alice_survey.base.records import (
+    ControlRecord,
+    MappingRecord,
+    MosaicRecord,
+    ReferenceRecord,
+    RegistrationRecord,
+    ScoreRecord,
+)
 from alice_survey.report.held import Held, number
 
 
@@ -19,13 +27,24 @@ class Figures:
     @property
     def registered(self) -> int:
         """Pictures in the model."""
-        return int(self.held.json("sparse/registration.json").get("registered", 0))
+        return 0 if self.registration is None else self.registration.registered
 
     @property
     def total(self) -> int:
         """Pictures of the survey."""
-        found = self.held.json("sparse/registration.json").get("total")
-        return int(found) if found is not None else len(self.held.rows("images/manifest.csv"))
+        if self.registration is not None:
+            return self.registration.total
+        return len(self.held.rows("images/manifest.csv"))
+
+    @cached_property
+    def registration(self) -> RegistrationRecord | None:
+        """Which pictures are in the model, and how it got its place."""
+        return self.held.read(RegistrationRecord)
+
+    @cached_property
+    def mapping(self) -> MappingRecord:
+        """How the model was made; empty without one."""
+        return self.held.read(MappingRecord) or MappingRecord()
 
     @cached_property
     def stations(self) -> int:
@@ -43,7 +62,8 @@ class Figures:
     @property
     def pixel_m(self) -> float:
         """Of the mosaic, in the model's unit; NaN without one."""
-        return float(self.held.json("mosaic/mosaic.json").get("pixel", np.nan))
+        mosaic = self.held.read(MosaicRecord)
+        return np.nan if mosaic is None else mosaic.pixel
 
     @cached_property
     def camera_sigmas(self) -> Array:
@@ -59,20 +79,20 @@ class Figures:
         known = np.isfinite(level).all(axis=1)
         return float(np.sqrt((level[known] ** 2).sum(axis=1).mean())) if known.any() else np.nan
 
-    @property
-    def truth(self) -> dict[str, Any]:
+    @cached_property
+    def truth(self) -> ScoreRecord | None:
         """Errors against the truth of a simulated survey."""
-        return self.held.json("evaluation/score.json")
+        return self.held.read(ScoreRecord)
 
-    @property
-    def reference(self) -> dict[str, Any]:
+    @cached_property
+    def reference(self) -> ReferenceRecord | None:
         """Distances from a reference."""
-        return self.held.json("reference/reference.json")
+        return self.held.read(ReferenceRecord)
 
-    @property
-    def control(self) -> dict[str, Any]:
+    @cached_property
+    def control(self) -> ControlRecord | None:
         """Check points and scale bars."""
-        return self.held.json("sparse/control.json")
+        return self.held.read(ControlRecord)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,13 +165,10 @@ def _thinned(values: Array) -> Array:
 def planned_area(held: Held) -> Any | None:
     """The area that the plan is to cover, on the map's axes (east, north); None without a plan."""
     import shapely
-    from shapely.geometry import shape
 
-    area = held.json("plan/plan.json").get("area")
-    if not area:
+    if held.plan is None:
         return None
-    north_east = shape(area["survey"])
-    return shapely.transform(north_east, lambda rows: rows[:, ::-1])
+    return shapely.transform(held.plan.area.survey, lambda rows: rows[:, ::-1])
 
 
 def _inside(area: Any, transform: Any, size: tuple[int, int]) -> Any:

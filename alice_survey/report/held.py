@@ -6,20 +6,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 
-from alice_survey.base.artefacts import read_json, read_stage
+from alice_survey import stages
+from alice_survey.base.artefacts import JsonRecord, StageRecord
 from alice_survey.base.frames import Array
+from alice_survey.base.records import ChangeRecord, FrameRecord, PicturesRecord, PlaceRecord
+from alice_survey.stages import finished
+from missions.values.plan_file import Plan, read_plan
 
-STAGES = (
-    "plan", "flight", "pool", "images", "calibration", "mapping", "sparse", "dense", "mosaic",
-    "mesh", "evaluation",
-)  # fmt: skip
-"""In the order in which they are made."""
-LOOSE = ("quality", "reference", "against")
-"""Folders that commands write next to the stages."""
+R = TypeVar("R", bound=JsonRecord)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -27,33 +25,31 @@ class Held:
     """The finished stages of a workspace and their files."""
 
     workspace: Path
-    stages: Mapping[str, Mapping[str, Any]]
-    """By name, what each `stage.json` says."""
+    stages: Mapping[str, StageRecord]
+    """Of the finished ones but the report, by their folders."""
 
     @classmethod
     def of(cls, workspace: Path) -> "Held":
         """Look at a workspace."""
-        found = {name: read_stage(workspace / name) for name in STAGES}
-        return cls(workspace=workspace, stages={n: s for n, s in found.items() if s is not None})
+        found = finished(workspace)
+        found.pop("report", None)
+        return cls(workspace=workspace, stages=found)
 
-    def has(self, *stages: str) -> bool:
-        """Whether all of these stages are finished."""
-        return all(stage in self.stages for stage in stages)
+    def has(self, *folders: str) -> bool:
+        """Whether the stages of all these folders are finished."""
+        return all(folder in self.stages for folder in folders)
 
     def file(self, path: str) -> Path | None:
         """A file of a finished stage or of a command; None where it is not there."""
         whole = self.workspace / path
         stage = path.split("/")[0]
-        there = stage in self.stages or stage not in STAGES
+        there = stage in self.stages or all(stage != one.folder for one in stages.STAGES)
         return whole if there and whole.is_file() else None
 
-    def json(self, path: str) -> dict[str, Any]:
-        """The content of a JSON file; empty where it is not there."""
-        file = self.file(path)
-        if file is None:
-            return {}
-        found: dict[str, Any] = read_json(file)
-        return found
+    def read(self, kind: type[R]) -> R | None:
+        """A JSON file of a finished stage or of a command; None where it is not there."""
+        file = self.file(kind.path)
+        return None if file is None else kind.read(file)
 
     def rows(self, path: str) -> list[dict[str, str]]:
         """The rows of a CSV file; none where it is not there."""
@@ -63,20 +59,34 @@ class Held:
         with file.open(newline="", encoding="utf-8") as lines:
             return list(csv.DictReader(lines))
 
+    @cached_property
+    def plan(self) -> Plan | None:
+        """The plan; None without one."""
+        file = self.file("plan/plan.json")
+        return None if file is None else read_plan(file)
+
     @property
     def name(self) -> str:
         """The survey's, else the folder's."""
-        return str(self.json("plan/plan.json").get("name") or self.workspace.resolve().name)
+        return (self.plan.name if self.plan else "") or self.workspace.resolve().name
 
     @cached_property
     def simulated(self) -> bool:
         """Whether its pictures are rendered."""
-        return self.json("images/survey.json").get("source") == "simulated"
+        pictures = self.read(PicturesRecord)
+        return pictures is not None and pictures.source == "simulated"
 
     @cached_property
+    def frame(self) -> FrameRecord:
+        """What coordinates of the model mean; as planned before there is one."""
+        return self.read(FrameRecord) or FrameRecord(
+            datum=None if self.plan is None else _place(self.plan)
+        )
+
+    @property
     def unit(self) -> str:
         """Of lengths: metres, or units of a model without scale."""
-        return "m" if self.json("sparse/frame.json").get("scaled", True) else "unit"
+        return "m" if self.frame.scaled else "unit"
 
     @cached_property
     def track(self) -> list[dict[str, str]]:
@@ -84,10 +94,17 @@ class Held:
         return self.rows("sparse/track.csv")
 
     @cached_property
-    def earlier(self) -> Sequence[tuple[str, dict[str, Any]]]:
+    def earlier(self) -> Sequence[tuple[str, ChangeRecord]]:
         """Comparisons with earlier surveys, by their names."""
         files = sorted((self.workspace / "against").glob("*/change.json"))
-        return [(file.parent.name, read_json(file)) for file in files]
+        return [(file.parent.name, ChangeRecord.read(file)) for file in files]
+
+
+def _place(plan: Plan) -> PlaceRecord:
+    datum = plan.datum
+    return PlaceRecord(
+        latitude_deg=datum.latitude_deg, longitude_deg=datum.longitude_deg, height_m=datum.height_m
+    )
 
 
 def known_column(rows: Sequence[Mapping[str, str]], start: str) -> Array:

@@ -13,6 +13,7 @@ import rasterio
 from rasterio.enums import Resampling
 
 from alice_survey.base.frames import Array
+from alice_survey.base.records import MeshRecord
 from alice_survey.base.run import progress
 from alice_survey.kit.document import Figure, Mesh
 from alice_survey.kit.figure import shrunk_png
@@ -29,17 +30,17 @@ _MOST_STILL_PX = 1600
 @progress.step("thin the mesh")
 def mesh_copy(held: Held, glb: Path) -> Mesh | None:
     """Write a light copy to `glb`; None where there is no mesh, or one too large and no mosaic."""
-    if not held.has("mesh"):
+    mesh = held.read(MeshRecord)
+    if mesh is None:
         return None
-    triangles = int(held.json("mesh/mesh.json")["triangles"])
-    whole = triangles <= _MOST_TRIANGLES
+    whole = mesh.triangles <= _MOST_TRIANGLES
     if not whole and not held.has("mosaic"):
         return None
     scene = _shrunk(held.workspace / "mesh" / "mesh.glb") if whole else _relief(held)
     glb.write_bytes(scene.export(file_type="glb"))
     return Mesh(
         glb=glb,
-        about=mesh_about(held),
+        about=mesh_about(mesh),
         still=mesh_still(held.workspace / "mesh" / "mesh.png"),
     )
 
@@ -54,9 +55,9 @@ def mesh_still(picture: Path, most_px: int = _MOST_STILL_PX) -> Figure:
     )
 
 
-def mesh_about(held: Held) -> str:
+def mesh_about(mesh: MeshRecord) -> str:
     """What the light copy is, in words."""
-    triangles = int(held.json("mesh/mesh.json")["triangles"])
+    triangles = mesh.triangles
     if triangles <= _MOST_TRIANGLES:
         return f"{count(triangles, 'triangle')}, texture shrunk for the page."
     return (

@@ -190,25 +190,25 @@ def seen_by(figures: Figures) -> Figure | None:
 
 def stage_times(figures: Figures) -> Figure | None:
     """Time and memory of the stages."""
-    stages = [(name, s) for name, s in figures.held.stages.items() if s.get("took_s") is not None]
+    stages = figures.held.stages
     if not stages:
         return None
-    names = [name for name, _ in stages][::-1]
-    took = [float(stage["took_s"]) for _, stage in stages][::-1]
-    peaks = [float(stage.get("peak_mib") or np.nan) for _, stage in stages][::-1]
-    measured = bool(np.isfinite(peaks).any())
+    names = list(stages)[::-1]
+    took = [stages[name].took_s for name in names]
+    peaks = [stages[name].peak_mib or np.nan for name in names]
+    known = bool(np.isfinite(peaks).any())
 
     def paint(axes: Sequence[Any]) -> None:
         axes[0].barh(names, took, color=INKS[0])
         axes[0].set(xlabel="time, s")
-        if measured:
+        if known:
             axes[1].barh(names, np.nan_to_num(peaks), color=INKS[2])
             axes[1].set(xlabel="largest memory, MiB", yticklabels=[])
 
     return drawn(
         paint,
         0.9 + 0.24 * len(stages),
-        columns=2 if measured else 1,
+        columns=2 if known else 1,
         title="Time and memory",
         alt="Time and memory of every stage",
         shows="What each step took on this machine.",

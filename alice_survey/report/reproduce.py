@@ -4,6 +4,7 @@ import platform
 from collections.abc import Iterator
 from importlib.metadata import version
 
+from alice_survey import stages
 from alice_survey.kit.document import Section, Table
 from alice_survey.kit.words import duration
 from alice_survey.report import plots
@@ -50,16 +51,15 @@ def _words(held: Held) -> Iterator[str]:
 def _stages(held: Held) -> Table:
     rows = []
     for name, stage in held.stages.items():
-        memory = stage.get("peak_mib")
         rows.append(
             (
                 name,
-                str(stage.get("version", "")),
-                duration(float(stage.get("took_s", 0.0))),
-                "" if stage.get("cpu_s") is None else duration(float(stage["cpu_s"])),
-                "" if memory is None else f"{memory:.0f} MiB",
-                f"{len(stage.get('inputs', {}))}",
-                str(stage.get("digest", ""))[:_SHORT],
+                str(stage.version),
+                duration(stage.took_s),
+                "" if stage.cpu_s is None else duration(stage.cpu_s),
+                "" if stage.peak_mib is None else f"{stage.peak_mib:.0f} MiB",
+                f"{len(stage.inputs)}",
+                stage.digest[:_SHORT],
             )
         )
     header = ("stage", "version", "time", "CPU time", "memory", "input files", "digest")
@@ -69,7 +69,7 @@ def _stages(held: Held) -> Table:
 def _versions(held: Held) -> Table:
     recorded: dict[str, str] = {}
     for stage in held.stages.values():
-        recorded |= stage.get("versions") or {}
+        recorded |= stage.versions
     rows = [(name, recorded.get(name) or version(name)) for name in _PACKAGES]
     rows.append(("Python", platform.python_version()))
     rows.append(("machine", f"{platform.system()} {platform.machine()}"))
@@ -94,25 +94,12 @@ def _short(value: object) -> str:
     return text if len(text) <= 120 else f"{text[:117]}..."
 
 
-_PRODUCTS = (
-    ("sparse/track.csv", "camera track with sigmas"),
-    ("sparse/model", "COLMAP model"),
-    ("dense/dem.tif", "elevation model (GeoTIFF)"),
-    ("dense/sigma.tif", "sigma of its heights"),
-    ("dense/cloud.laz", "point cloud with colour, normal, sigma"),
-    ("mosaic/mosaic.tif", "orthomosaic (cloud-optimised GeoTIFF)"),
-    ("mosaic/footprints.geojson", "what each picture shows"),
-    ("mesh/mesh.glb", "textured mesh"),
-    ("evaluation/score.json", "errors against the truth"),
-    ("plan/exports", "plan for vehicles"),
-)
-
-
 def _files(held: Held) -> Table:
     rows = []
-    for path, about in _PRODUCTS:
-        whole = held.workspace / path
-        if path.split("/")[0] in held.stages and whole.exists():
-            size = whole.stat().st_size / 1e6 if whole.is_file() else None
-            rows.append((path, about, "" if size is None else f"{size:.1f} MB"))
+    for stage in stages.STAGES:
+        for path, about in stage.products.items():
+            whole = held.workspace / stage.folder / path
+            if stage.folder in held.stages and whole.exists():
+                size = f"{whole.stat().st_size / 1e6:.1f} MB" if whole.is_file() else ""
+                rows.append((f"{stage.folder}/{path}", about, size))
     return Table(title="Files", header=("file", "what it is", "size"), rows=rows)

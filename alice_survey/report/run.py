@@ -5,10 +5,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from alice_survey.base.artefacts import STAGE_FILE, Stage, atomic_path, run_stage, write_json
+from alice_survey.base.artefacts import STAGE_FILE, atomic_path
 from alice_survey.base.config import SurveyConfig
-from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.executor import Executor
+from alice_survey.base.records import ReportRecord
 from alice_survey.base.run import progress
 from alice_survey.kit.document import PictureLayer, Report, ShapeLayer, SurveyMap
 from alice_survey.kit.map_figure import with_stills
@@ -16,7 +16,7 @@ from alice_survey.kit.page import render_html
 from alice_survey.kit.paper import render_pdf
 from alice_survey.report import reproduce
 from alice_survey.report.figures import Figures
-from alice_survey.report.held import LOOSE, Held
+from alice_survey.report.held import Held
 from alice_survey.report.mesh_copy import mesh_copy
 from alice_survey.report.rasters import picture_layers
 from alice_survey.report.sections import sections
@@ -24,50 +24,18 @@ from alice_survey.report.shapes import shape_layers
 from alice_survey.report.summary import facts, summary
 from alice_survey.report.verdicts import verdicts
 
-_READ = (
-    "survey.toml", "plan/plan.json", "flight/flight.json", "images/manifest.csv",
-    "calibration/report.json",
-    "mapping/mapping.json", "mapping/port.json", "sparse", "dense/dem.tif", "dense/sigma.tif",
-    "mosaic/mosaic.tif", "mesh/mesh.glb", "evaluation",
-)  # fmt: skip
-"""What a report is made of; what is made with these goes unnamed."""
 
-
-def run_report(workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
-    """Write `report/` from what the workspace holds.
-
-    Returns:
-        True when done, False when nothing had changed.
-
-    Raises:
-        WorkspaceError: the workspace holds no finished stage.
-    """
+def run_report(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
+    """Write the report of what the workspace holds."""
     held = Held.of(workspace)
-    if not held.stages:
-        raise WorkspaceError(
-            f"{workspace} holds nothing to report on: run 'alice-survey plan' or 'import-images'"
-        )
-    inputs = [held.workspace / path for path in _READ]
-    inputs += [file for name in LOOSE for file in sorted((workspace / name).rglob("*.json"))]
-    inputs += sorted((workspace / "quality").glob("*.csv"))
-    stage = Stage(
-        name="report",
-        version=2,
-        settings={},
-        inputs=[path for path in inputs if path.exists()],
-    )
-
-    def work(folder: Path) -> None:
-        report, data = build_report(held, folder)
-        with progress.step("write the page"), atomic_path(folder / "report.html") as path:
-            path.write_text(render_html(report), encoding="utf-8")
-        with progress.step("write the PDF"), atomic_path(folder / "report.pdf") as path:
-            path.write_bytes(render_pdf(report, last_worked_on(held)))
-        write_json(folder / "report.json", data)
-        if report.mesh is not None:
-            report.mesh.glb.unlink()
-
-    return run_stage(workspace, stage, work)
+    report, data = build_report(held, folder)
+    with progress.step("write the page"), atomic_path(folder / "report.html") as path:
+        path.write_text(render_html(report), encoding="utf-8")
+    with progress.step("write the PDF"), atomic_path(folder / "report.pdf") as path:
+        path.write_bytes(render_pdf(report, last_worked_on(held)))
+    ReportRecord.save(folder / "report.json", data)
+    if report.mesh is not None:
+        report.mesh.glb.unlink()
 
 
 def build_report(held: Held, folder: Path) -> tuple[Report, dict[str, Any]]:
@@ -117,10 +85,10 @@ def last_worked_on(held: Held) -> datetime:
 
 def _place(held: Held) -> str:
     """Latitude and longitude of the survey; empty where unknown."""
-    datum = held.json("sparse/frame.json").get("datum") or held.json("plan/plan.json").get("datum")
-    if not datum:
+    datum = held.frame.datum
+    if datum is None:
         return ""
-    return f"{datum['latitude_deg']:.5f}, {datum['longitude_deg']:.5f} (WGS 84)"
+    return f"{datum.latitude_deg:.5f}, {datum.longitude_deg:.5f} (WGS 84)"
 
 
 def _title_block(held: Held) -> list[tuple[str, str]]:
@@ -138,11 +106,10 @@ def _title_block(held: Held) -> list[tuple[str, str]]:
 
 def origin_of(held: Held) -> str:
     """Where a map of it counts from, in words."""
-    datum = held.json("sparse/frame.json").get("datum") or held.json("plan/plan.json").get("datum")
-    if datum and held.json("sparse/frame.json").get("name", "ned") == "ned":
+    datum = held.frame.datum
+    if datum is not None and held.frame.name == "ned":
         return (
-            f"metres east and north of {datum['latitude_deg']:.7f}, {datum['longitude_deg']:.7f} "
-            "(WGS 84)"
+            f"metres east and north of {datum.latitude_deg:.7f}, {datum.longitude_deg:.7f} (WGS 84)"
         )
     return "the model's own axes"
 
@@ -159,7 +126,7 @@ def _data(figures: Figures, found: Any, said: Any, known: Any) -> dict[str, Any]
         "verdicts": [vars(verdict) for verdict in found],
         "surface": None if surface is None else _finite(vars(surface)),
         "stages": {
-            name: {key: stage.get(key) for key in ("version", "digest", "took_s")}
+            name: {"version": stage.version, "digest": stage.digest, "took_s": stage.took_s}
             for name, stage in figures.held.stages.items()
         },
     }

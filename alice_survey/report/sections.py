@@ -6,6 +6,19 @@ from typing import Any
 
 import numpy as np
 
+from alice_survey.base.records import (
+    CalibrationRecord,
+    CalibrationReportRecord,
+    CamerasRecord,
+    ControlRecord,
+    DomingRecord,
+    FlightRecord,
+    MeshRecord,
+    PortRecord,
+    RegistrationRecord,
+    ScoreRecord,
+    SurfaceRecord,
+)
 from alice_survey.kit.document import Figure, Section, Table
 from alice_survey.kit.figure import shrunk_png
 from alice_survey.kit.words import (
@@ -14,6 +27,7 @@ from alice_survey.kit.words import (
     duration,
     length,
     length_with_sigma,
+    millimetres,
     parts,
     parts_with_sigma,
     share,
@@ -21,6 +35,7 @@ from alice_survey.kit.words import (
 from alice_survey.report import plots
 from alice_survey.report.figures import Figures
 from alice_survey.report.held import Held, known_column
+from missions.values.plan_file import Plan
 
 
 def sections(figures: Figures, *, has_map: bool, has_mesh: bool) -> Iterator[Section]:
@@ -28,24 +43,25 @@ def sections(figures: Figures, *, has_map: bool, has_mesh: bool) -> Iterator[Sec
     if has_map:
         yield _map(figures)
     held = figures.held
-    if has_mesh:
-        yield _mesh(held)
-    if held.has("evaluation"):
-        yield _truth(figures)
+    mesh = held.read(MeshRecord)
+    if has_mesh and mesh is not None:
+        yield _mesh(mesh, held.unit)
+    if figures.truth is not None:
+        yield _truth(figures.truth, held)
     if figures.reference or held.earlier:
         yield _compared(figures)
-    if figures.control:
-        yield _control(figures)
+    if figures.control is not None:
+        yield _control(figures.control)
     if held.has("dense"):
         yield _surface(figures)
-    if held.has("sparse"):
-        yield _model(figures)
+    if figures.registration is not None:
+        yield _model(figures, figures.registration)
     if held.has("mapping") or held.has("calibration"):
         yield _camera(figures)
     if held.rows("quality/quality.csv"):
         yield _quality(held)
-    if held.has("plan"):
-        yield _mission(figures)
+    if held.plan is not None:
+        yield _mission(held, held.plan)
 
 
 def _map(figures: Figures) -> Section:
@@ -76,68 +92,60 @@ def _three(values: Any) -> tuple[float, float, float]:
     return float(values.min()), float(np.median(values)), float(values.max())
 
 
-def _mesh(held: Held) -> Section:
-    found = held.json("mesh/mesh.json")
+def _mesh(found: MeshRecord, unit: str) -> Section:
     return Section(
         name="mesh",
         title="Mesh",
         text=[
-            f"{count(found['triangles'], 'triangle')}, {digits(found['area'])} {held.unit}² of "
-            f"surface, {share(found['textured_share'])} of it with texture. The files are "
+            f"{count(found.triangles, 'triangle')}, {digits(found.area)} {unit}² of "
+            f"surface, {share(found.textured_share)} of it with texture. The files are "
             "in mesh/."
         ],
         scene="mesh",
     )
 
 
-def _truth(figures: Figures) -> Section:
-    score = figures.truth
-    cameras, surface, mosaic = score["cameras"], score["surface"], score["mosaic"]
+def _truth(score: ScoreRecord, held: Held) -> Section:
+    cameras, surface, mosaic = score.cameras, score.surface, score.mosaic
     rows: list[Sequence[str]] = [
-        ("cameras", _mm(cameras["rms_mm"]), _mm(cameras["max_mm"]), "position, rms"),
-        ("surface", _mm(surface["distance_rms_mm"]), _mm(surface["distance_max_mm"]),
+        ("cameras", _mm(cameras.rms_mm), _mm(cameras.max_mm), "position, rms"),
+        ("surface", _mm(surface.distance_rms_mm), _mm(surface.distance_max_mm),
          "distance from the true surface, rms over all cells"),
-        ("mosaic", _mm(mosaic["position_rms_mm"]), _mm(mosaic["position_95_mm"]),
+        ("mosaic", _mm(mosaic.position_rms_mm), _mm(mosaic.position_95_mm),
          "position, rms; 95 % are below the larger one"),
-        ("lengths", _mm(score["lengths"]["rms_mm"]), "",
-         f"rms, over {length(score['lengths']['mean_length_m'])}"),
-        ("dome", _mm(surface["doming"]["dome_mm"]), "", "bend of the whole surface"),
+        ("lengths", _mm(score.lengths.rms_mm), "",
+         f"rms, over {length(score.lengths.mean_length_m)}"),
+        ("dome", _mm(surface.doming.dome_mm), "", "bend of the whole surface"),
     ]  # fmt: skip
-    seen = surface.get("seen_from_3_stations")
-    if seen:
+    seen = surface.seen_from_3_stations
+    if seen is not None:
         rows.insert(
-            2, ("surface, 3 stations and more", _mm(seen["distance_rms_mm"]), "",
-                f"{share(seen['share'])} of the area"),
+            2, ("surface, 3 stations and more", _mm(seen.distance_rms_mm), "",
+                f"{share(seen.share)} of the area"),
         )  # fmt: skip
-    if "mesh" in score:
+    if score.mesh is not None:
         rows.insert(
-            3,
-            (
-                "mesh",
-                _mm(score["mesh"]["distance_rms_mm"]),
-                "",
-                "distance from the true surface, rms",
-            ),
+            3, ("mesh", _mm(score.mesh.distance_rms_mm), "", "distance from the true surface, rms")
         )
-    within = surface["completeness_within_px"]
+    within = surface.completeness_within_px
     return Section(
         name="truth",
         title="Error against the truth",
         text=[
             "The sea floor was simulated, so that every error is known. The model was moved and "
             "turned onto the truth by its cameras; its scale was not fitted: it is "
-            f"{parts(1e-6 * cameras['scale_error_ppm'])} off."
+            f"{parts(1e-6 * cameras.scale_error_ppm)} off."
         ],
         tables=[
             Table(title="Errors", header=("what", "error", "largest", "of"), rows=rows),
             Table(
                 title="Share of the area within so many ground pixels "
-                f"({length(1e-3 * surface['ground_pixel_mm'])}) of the truth",
+                f"({_mm(surface.ground_pixel_mm)}) of the truth",
                 header=[f"{pixels} px" for pixels in within],
                 rows=[[share(value) for value in within.values()]],
             ),
         ],
-        figures=_stills(figures.held, [
+        figures=_stills(held, [
             ("evaluation/errors.png", "Where the surface errs",
              "Map and histogram of height errors.",
              "Without a slope or a dome.",
@@ -147,7 +155,7 @@ def _truth(figures: Figures) -> Section:
 
 
 def _mm(value: float | None) -> str:
-    return "" if value is None else length(1e-3 * value)
+    return "" if value is None else millimetres(value)
 
 
 def _compared(figures: Figures) -> Section:
@@ -155,16 +163,16 @@ def _compared(figures: Figures) -> Section:
     found = figures.reference
     if found:
         rows = [
-            (what, length(part["median_m"]), length(part["rms_m"]), length(part["95_m"]),
-             share(part["covered_share"]))
+            (what, length(part.median_m), length(part.rms_m), length(part.within_95_m),
+             share(part.covered_share))
             for what, part in (
-                ("survey to reference", found["survey_to_reference"]),
-                ("reference to survey", found["reference_to_survey"]),
+                ("survey to reference", found.survey_to_reference),
+                ("reference to survey", found.reference_to_survey),
             )
         ]  # fmt: skip
         tables.append(
             Table(
-                title=f"Distances from {found['reference'].rsplit('/', 1)[-1]}",
+                title=f"Distances from {found.reference.rsplit('/', 1)[-1]}",
                 header=("", "median", "rms", "95 %", "covered"),
                 rows=rows,
             )
@@ -179,7 +187,7 @@ def _compared(figures: Figures) -> Section:
             Table(
                 title=f"Change since {name}",
                 header=("what", "value"),
-                rows=[(k.replace("_", " "), _plain(v)) for k, v in change.items() if _is_plain(v)],
+                rows=[(name.replace("_", " "), _plain(v)) for name, v in change.plain.items()],
             )
         )
         stills.append(
@@ -195,25 +203,20 @@ def _compared(figures: Figures) -> Section:
     )
 
 
-def _is_plain(value: Any) -> bool:
-    return isinstance(value, (int, float, str)) and not isinstance(value, bool)
-
-
-def _plain(value: Any) -> str:
+def _plain(value: float | str) -> str:
     return digits(float(value)) if isinstance(value, float) else str(value)
 
 
-def _control(figures: Figures) -> Section:
-    score = figures.control
+def _control(score: ControlRecord) -> Section:
     points: list[Sequence[str]] = [
-        (row["name"], row["use"], str(row["views"]), *(length(row[a]) for a in
-         ("north_m", "east_m", "down_m")), digits(row["misfit_sigmas"], 2))
-        for row in score["points"]
+        (row.name, row.use, str(row.views), length(row.north_m), length(row.east_m),
+         length(row.down_m), digits(row.misfit_sigmas, 2))
+        for row in score.points
     ]  # fmt: skip
     bars: list[Sequence[str]] = [
-        (row["name"], row["use"], length(row["known_m"]), length(row["error_m"]),
-         parts(row["error_relative"]), digits(row["misfit_sigmas"], 2))
-        for row in score["bars"]
+        (row.name, row.use, length(row.known_m), length(row.error_m),
+         parts(row.error_relative), digits(row.misfit_sigmas, 2))
+        for row in score.bars
     ]  # fmt: skip
     tables = []
     if points:
@@ -232,9 +235,9 @@ def _control(figures: Figures) -> Section:
 
 def _surface(figures: Figures) -> Section:
     surface, held = figures.surface, figures.held
-    if surface is None:
+    found = held.read(SurfaceRecord)
+    if surface is None or found is None:
         return Section(name="surface", title="Surface")
-    found = held.json("dense/surface.json")
     unit = held.unit
     rows = [
         ("cell", length(surface.cell, unit)),
@@ -242,10 +245,10 @@ def _surface(figures: Figures) -> Section:
         ("relief (99 % of it)", length(surface.high - surface.low, unit)),
         ("share of the planned area", share(surface.covered)),
         ("sigma of a height, median", length(surface.sigma_median, unit)),
-        ("of that the cameras' share", length(found.get("pose_sigma"), unit)),
-        ("sigma of a match", f"{digits(found['match_sigma_px'], 2)} px"),
+        ("of that the cameras' share", length(found.pose_sigma, unit)),
+        ("sigma of a match", f"{digits(found.match_sigma_px, 2)} px"),
         ("stations that see a spot, median", f"{surface.stations_median:.0f}"),
-        ("heights count from", found["vertical_datum"]),
+        ("heights count from", found.vertical_datum),
     ]
     drawn = [plots.heights(figures), plots.sigma_test(figures), plots.seen_by(figures)]
     return Section(
@@ -256,42 +259,38 @@ def _surface(figures: Figures) -> Section:
     )
 
 
-def _model(figures: Figures) -> Section:
-    held = figures.held
-    found, mapping = held.json("sparse/registration.json"), held.json("mapping/mapping.json")
+def _model(figures: Figures, found: RegistrationRecord) -> Section:
     rows = [
-        ("pictures", f"{found['registered']} of {found['total']}"),
-        ("points", f"{found['points']:,}"),
-        ("pictures that see a point, mean", digits(found["mean_track_length"])),
-        ("reprojection error, mean", f"{digits(found['mean_reprojection_px'])} px"),
-        ("scale", found["scale_source"]),
+        ("pictures", f"{found.registered} of {found.total}"),
+        ("points", f"{found.points:,}"),
+        ("pictures that see a point, mean", digits(found.mean_track_length)),
+        ("reprojection error, mean", f"{digits(found.mean_reprojection_px)} px"),
+        ("scale", found.scale_source or "unknown"),
     ]
-    doming = mapping.get("doming") or {}
-    for way in ("along", "across"):
-        bend = doming.get(way)
-        if bend:
-            sag = length_with_sigma(bend["sag_m"], bend["sag_sigma_m"])
-            rows.append((f"sag {way} the lines", sag))
-    scale = doming.get("scale")
-    if scale:
+    doming = figures.mapping.doming or DomingRecord()
+    for way, bend in doming.bends.items():
+        rows.append((f"sag {way} the lines", length_with_sigma(bend.sag_m, bend.sag_sigma_m)))
+    scale = doming.scale
+    if scale is not None:
         rows.append(
-            ("scale of the stereo pairs",
-             parts_with_sigma(scale["mean"] - 1.0, scale["mean_sigma"]))
+            ("scale of the stereo pairs", parts_with_sigma(scale.mean - 1.0, scale.mean_sigma))
         )  # fmt: skip
-    place = found.get("georeference") or {}
-    axes = ("north", "east", "depth")
-    if place:
+    place = found.georeference
+    if place is not None:
+        residuals = (place.rms_north_m, place.rms_east_m, place.rms_depth_m)
+        sigmas = (place.sigma_north_m, place.sigma_east_m, place.sigma_depth_m)
+        axes = ("north", "east", "depth")
         rows += [
-            (f"navigation's residual {axis}", f"{length(place[f'rms_{axis}_m'])} rms")
-            for axis in axes
+            (f"navigation's residual {axis}", f"{length(value)} rms")
+            for axis, value in zip(axes, residuals, strict=True)
         ]
         rows += [
-            (f"sigma of the whole survey, {axis}", length(place[f"sigma_{axis}_m"]))
-            for axis in axes
+            (f"sigma of the whole survey, {axis}", length(value))
+            for axis, value in zip(axes, sigmas, strict=True)
         ]
-        rows.append(("sigma of its heading", f"{digits(place['sigma_heading_deg'], 2)} deg"))
-        rows.append(("sigma of its level", f"{digits(place['sigma_tilt_deg'], 2)} deg"))
-    notes = held.json("sparse/frame.json").get("notes", [])
+        rows.append(("sigma of its heading", _degrees(place.sigma_heading_deg)))
+        rows.append(("sigma of its level", _degrees(place.sigma_tilt_deg)))
+    notes = figures.held.frame.notes
     drawn = [plots.camera_sigmas(figures), plots.pictures_used(figures)]
     return Section(
         name="model",
@@ -302,14 +301,19 @@ def _model(figures: Figures) -> Section:
     )
 
 
+def _degrees(value: float | None) -> str:
+    return "unknown" if value is None else f"{digits(value, 2)} deg"
+
+
 def _camera(figures: Figures) -> Section:
     held = figures.held
-    calibrated, refined = held.json("calibration/report.json"), held.json("mapping/port.json")
+    calibrated, refined = held.read(CalibrationReportRecord), held.read(PortRecord)
+    own, cameras = held.read(CalibrationRecord), held.read(CamerasRecord)
     text, tables, drawn = [], [], []
-    if calibrated:
+    if calibrated is not None:
         text.append(
-            f"Calibrated from {count(calibrated['views'], 'view')}: "
-            f"{digits(calibrated['rms_px'], 2)} px rms. The calibration's own report is "
+            f"Calibrated from {count(calibrated.views, 'view')}: "
+            f"{digits(calibrated.rms_px, 2)} px rms. The calibration's own report is "
             "calibration/report.html."
         )
         tables.append(
@@ -317,18 +321,16 @@ def _camera(figures: Figures) -> Section:
                 title="Calibration",
                 header=("parameter", "value", "sigma", "unit"),
                 rows=[
-                    (row["name"], f"{row['value']:.8g}", _sigma(row["sigma"]), row["unit"])
-                    for row in calibrated["parameters"]
+                    (row.name, f"{row.value:.8g}", _sigma(row.sigma), row.unit)
+                    for row in calibrated.parameters
                 ],
             )
         )
-    if refined:
-        names = refined["parameters"]
+    if refined is not None:
         text.append(
-            f"The survey's own pictures refined the rig from {refined['observations']:,} "
-            f"observations at {refined['stations']} stations, within what calibration knew."
+            f"The survey's own pictures refined the rig from {refined.observations:,} "
+            f"observations at {refined.stations} stations, within what calibration knew."
         )
-        columns = ("before", "after", "prior_sigmas", "sigmas")
         tables.append(
             Table(
                 title="Rig refined by the survey",
@@ -336,24 +338,27 @@ def _camera(figures: Figures) -> Section:
                 rows=[
                     (name, f"{a:.8g}", f"{b:.8g}", _sigma(before), _sigma(after))
                     for name, a, b, before, after in zip(
-                        names, *(refined[column] for column in columns), strict=True
+                        refined.parameters,
+                        refined.before,
+                        refined.after,
+                        refined.prior_sigmas,
+                        refined.sigmas,
+                        strict=True,
                     )
                 ],
             )
         )
-        drawn.append(plots.correlations(names, np.array(refined["correlation"])))
-    elif calibrated:
-        found = held.json("calibration/calibration.json")
-        drawn.append(plots.correlations(found["parameters"], np.array(found["correlation"])))
-    cameras = held.json("sparse/cameras.json").get("cameras", {})
-    if cameras and not calibrated and not refined:
+        drawn.append(plots.correlations(refined.parameters, np.array(refined.correlation)))
+    elif own is not None:
+        drawn.append(plots.correlations(own.parameters, np.array(own.correlation)))
+    if cameras is not None and calibrated is None and refined is None:
         text.append("The cameras calibrated themselves from the survey's pictures.")
-        own = [
+        rows = [
             (name, str(camera.get("model", camera["kind"])),
              ", ".join(f"{p:.6g}" for p in camera.get("params", [])))
-            for name, camera in cameras.items()
+            for name, camera in cameras.cameras.items()
         ]  # fmt: skip
-        tables.append(Table(title="Cameras", header=("camera", "model", "parameters"), rows=own))
+        tables.append(Table(title="Cameras", header=("camera", "model", "parameters"), rows=rows))
     return Section(name="camera", title="Camera and rig", text=text, tables=tables, figures=drawn)
 
 
@@ -385,41 +390,38 @@ def _quality(held: Held) -> Section:
     )  # fmt: skip
 
 
-def _mission(figures: Figures) -> Section:
-    held = figures.held
-    plan = held.json("plan/plan.json")
-    imaging: dict[str, Any] = plan["details"]["imaging"]
+def _mission(held: Held, plan: Plan) -> Section:
     rows = [
-        ("altitude, speed", f"{plan['altitude_m']:g} m, {plan['speed_mps']:g} m/s"),
-        ("lines", f"{len(plan['lines'])}, {plan['line_spacing_m']:.2f} m apart"),
-        ("stations", f"{plan['stations']}, {plan['station_spacing_m']:.2f} m apart"),
-        ("overlap", f"{plan['forward_overlap']:.0%} forward, {plan['side_overlap']:.0%} side"),
-        ("a picture every", f"{plan['interval_s']:.2f} s"),
-        ("exposure", f"{1e3 * plan['exposure_s']:.2g} ms"),
-        ("motion blur", f"{imaging['blur_px']:.2f} px"),
-        ("pixel on the floor", length(imaging["pixel_m"])),
-        ("dives, time, energy", f"{len(plan['dives'])}, {duration(plan['duration_s'])}, "
-                                f"{plan['energy_wh']:.1f} Wh"),
+        ("altitude, speed", f"{plan.altitude_m:g} m, {plan.speed_mps:g} m/s"),
+        ("lines", f"{len(plan.lines)}, {plan.line_spacing_m:.2f} m apart"),
+        ("stations", f"{plan.stations}, {plan.station_spacing_m:.2f} m apart"),
+        ("overlap", f"{plan.reached_forward_overlap:.0%} forward, "
+                    f"{plan.reached_side_overlap:.0%} side"),
+        ("a picture every", f"{plan.interval_s:.2f} s"),
+        ("exposure", f"{1e3 * plan.exposure_s:.2g} ms"),
+        ("motion blur", f"{plan.blur_px:.2f} px"),
+        ("pixel on the floor", length(plan.pixel_m)),
+        ("dives, time, energy", f"{len(plan.dives)}, {duration(plan.duration_s)}, "
+                                f"{plan.energy_wh:.1f} Wh"),
     ]  # fmt: skip
     tables = [Table(title="Plan", header=("what", "value"), rows=rows)]
-    flight = held.json("flight/flight.json")
-    if flight:
-        line = flight["on_lines"]
+    flight = held.read(FlightRecord)
+    if flight is not None:
+        line = flight.on_lines
         tables.append(
             Table(
                 title="Flight",
                 header=("what", "value"),
                 rows=[
-                    ("ending", flight["ending"]),
-                    ("stations", f"{flight['stations']} of {flight['stations_planned']}"),
-                    ("time", duration(flight["duration_s"])),
-                    ("energy", f"{sum(flight['energy_wh'].values()):.1f} Wh"),
-                    ("off the line", f"{length(line['cross_track_rms_m'])} rms"),
+                    ("ending", flight.ending),
+                    ("stations", f"{flight.stations} of {flight.stations_planned}"),
+                    ("time", duration(flight.duration_s)),
+                    ("energy", f"{sum(flight.energy_wh.values()):.1f} Wh"),
+                    ("off the line", f"{length(line.cross_track_rms_m)} rms"),
                     ("of that the control's part",
-                     f"{length(line['believed_cross_track_rms_m'])} rms"),
-                    ("error of navigation", f"{length(flight['navigation_error_rms_m'])} rms"),
-                    ("pictured as often as required",
-                     share(flight["coverage"]["share_at_overlap"])),
+                     f"{length(line.believed_cross_track_rms_m)} rms"),
+                    ("error of navigation", f"{length(flight.navigation_error_rms_m)} rms"),
+                    ("pictured as often as required", share(flight.coverage.share_at_overlap)),
                 ],
             )
         )  # fmt: skip

@@ -4,11 +4,14 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from alice_survey.base.artefacts import read_json
 from alice_survey.base.frames import Array, Datum
+from alice_survey.base.records import FrameRecord
 from alice_survey.kit.document import ShapeLayer
 from alice_survey.kit.words import length
 from alice_survey.report.figures import planned_area
 from alice_survey.report.held import Held, known_column, number
+from reconstruct.views.model import datum_of
 
 _BLUE, _ORANGE, _GREEN, _RED, _BLACK = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#333333"
 """Okabe and Ito's palette, safe for the colour-blind."""
@@ -36,14 +39,14 @@ def shape_layers(held: Held) -> Iterator[ShapeLayer]:
             about=f"Sea floor that each picture shows{every}.",
             shapes=[outline for outline, _ in footprints], texts=[text for _, text in footprints],
         )  # fmt: skip
-    lines = held.json("plan/plan.json").get("lines", [])
+    lines = () if held.plan is None else held.plan.lines
     if lines:
         yield ShapeLayer(
             name="plan", title="Plan", about="Survey lines as planned.", kind="line",
             shapes=[
-                _pairs(np.array([line["start_ne_m"], line["end_ne_m"]])[:, ::-1]) for line in lines
+                _pairs(np.array([line.start_ne_m, line.end_ne_m])[:, ::-1]) for line in lines
             ],
-            texts=[f"line {n}, {row['stations']} stations" for n, row in enumerate(lines, 1)],
+            texts=[f"line {n}, {line.stations} stations" for n, line in enumerate(lines, 1)],
             colour=_BLUE, dashed=True,
         )  # fmt: skip
     flown = held.rows("flight/truth/track.csv")
@@ -120,13 +123,15 @@ def _lost(held: Held) -> list[tuple[Shape, str]]:
 
 
 def _footprints(held: Held) -> Iterator[tuple[Shape, str]]:
-    features = held.json("mosaic/footprints.geojson").get("features", [])
+    file = held.file("mosaic/footprints.geojson")
+    if file is None:
+        return
     datum = _datum(held)
-    for feature in features:
+    for feature in read_json(file)["features"]:
         facts: dict[str, str] = feature["properties"]
         for ring in (feature["geometry"] or {}).get("coordinates", []):
             corners = np.asarray(ring, dtype=np.float64)
-            if datum is not None and held.json("sparse/frame.json")["name"] == "ned":
+            if datum is not None and held.frame.name == "ned":
                 level = np.column_stack([corners[:, 1::-1], np.zeros(len(corners))])
                 corners = datum.ned_from_geodetic(level)[:, 1::-1]
             area = float(known_column([facts], "area_")[0])
@@ -134,5 +139,5 @@ def _footprints(held: Held) -> Iterator[tuple[Shape, str]]:
 
 
 def _datum(held: Held) -> Datum | None:
-    datum = held.json("sparse/frame.json").get("datum")
-    return None if datum is None else Datum(**datum)
+    frame = held.read(FrameRecord)
+    return None if frame is None or frame.datum is None else datum_of(frame.datum)

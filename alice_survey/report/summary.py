@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from alice_survey.kit.document import Verdict
-from alice_survey.kit.words import count, digits, duration, length, parts, share
+from alice_survey.kit.words import count, digits, duration, length, millimetres, parts, share
 from alice_survey.report.figures import Figures
 
 _MOST_ACTIONS = 2
@@ -23,9 +23,9 @@ def facts(figures: Figures) -> list[tuple[str, str]]:
     """Labels and values."""
     unit, surface = figures.held.unit, figures.surface
     rows: list[tuple[str, str]] = []
-    if figures.held.has("sparse"):
+    if figures.registration is not None:
         rows.append(("pictures in the model", f"{figures.registered} of {figures.total}"))
-        error = figures.held.json("sparse/registration.json")["mean_reprojection_px"]
+        error = figures.registration.mean_reprojection_px
         rows.append(("reprojection error", f"{digits(error, 2)} px"))
     if surface is not None:
         rows.append(("area with a height", f"{digits(surface.area)} {unit}²"))
@@ -34,12 +34,10 @@ def facts(figures: Figures) -> list[tuple[str, str]]:
     if math.isfinite(figures.pixel_m):
         rows.append(("mosaic pixel", length(figures.pixel_m, unit)))
     score = figures.truth
-    if score:
-        rows.append(
-            ("surface error (truth)", f"{length(1e-3 * score['surface']['distance_rms_mm'])} rms")
-        )
-        rows.append(("camera error (truth)", f"{length(1e-3 * score['cameras']['rms_mm'])} rms"))
-    took = sum(float(stage.get("took_s", 0.0)) for stage in figures.held.stages.values())
+    if score is not None:
+        rows.append(("surface error (truth)", f"{millimetres(score.surface.distance_rms_mm)} rms"))
+        rows.append(("camera error (truth)", f"{millimetres(score.cameras.rms_mm)} rms"))
+    took = sum(stage.took_s for stage in figures.held.stages.values())
     rows.append(("computing", duration(took)))
     return rows
 
@@ -58,15 +56,15 @@ def _mapped(figures: Figures) -> str:
             f"{length(surface.high - surface.low, held.unit)} of relief{mosaic}, from "
             f"{count(figures.registered, 'picture')} taken at {count(figures.stations, 'station')}."
         )
-    plan = held.json("plan/plan.json")
+    plan = held.plan
     if held.has("sparse"):
         return (
             f"Nothing yet: {count(figures.registered, 'picture')} are placed, no surface is made."
         )
-    if plan:
+    if plan is not None:
         return (
-            f"Nothing yet: a plan of {count(len(plan['lines']), 'line')}, "
-            f"{count(plan['stations'], 'station')} and {duration(plan['duration_s'])} is ready."
+            f"Nothing yet: a plan of {count(len(plan.lines), 'line')}, "
+            f"{count(plan.stations, 'station')} and {duration(plan.duration_s)} is ready."
         )
     return "Nothing yet."
 
@@ -85,19 +83,19 @@ def _how_well(figures: Figures) -> str:
         sentences.append(f"its place on the Earth to {length(figures.place_sigma_m, unit)}")
     text = ", ".join(sentences) + "." if sentences else "The model states no sigma."
     score, reference = figures.truth, figures.reference
-    if score:
-        cover = score["surface"]["completeness_within_px"]
+    if score is not None:
         text += (
             f" Against the truth the surface is off by "
-            f"{length(1e-3 * score['surface']['distance_rms_mm'])} rms and the scale by "
-            f"{parts(1e-6 * score['cameras']['scale_error_ppm'])}; "
-            f"{share(cover.get('3'))} of the area is within 3 ground pixels."
+            f"{millimetres(score.surface.distance_rms_mm)} rms and the scale by "
+            f"{parts(1e-6 * score.cameras.scale_error_ppm)}; "
+            f"{share(score.surface.completeness_within_px.get('3'))} of the area is within 3 "
+            "ground pixels."
         )
-    if reference:
-        miss = reference["survey_to_reference"]
+    if reference is not None:
+        miss = reference.survey_to_reference
         text += (
-            f" Against the reference: {length(miss['median_m'])} median, "
-            f"{length(miss['95_m'])} for 95 % of it."
+            f" Against the reference: {length(miss.median_m)} median, "
+            f"{length(miss.within_95_m)} for 95 % of it."
         )
     return text
 

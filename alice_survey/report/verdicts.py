@@ -7,11 +7,13 @@ its sigmas), or what the plan requires.
 import math
 from collections.abc import Iterator
 
+from alice_survey.base.records import CalibrationReportRecord, FlightRecord
 from alice_survey.kit.document import Verdict, worst_first
 from alice_survey.kit.words import (
     count,
     length,
     length_with_sigma,
+    millimetres,
     parts,
     parts_with_sigma,
     share,
@@ -46,20 +48,20 @@ def verdicts(figures: Figures) -> list[Verdict]:
 
 
 def _flight(figures: Figures) -> Iterator[Verdict]:
-    flight = figures.held.json("flight/flight.json")
-    if not flight:
+    flight = figures.held.read(FlightRecord)
+    if flight is None:
         return
     text = (
-        f"flight: {flight['stations']} of {flight['stations_planned']} stations, "
-        f"{share(flight['coverage']['share_at_overlap'])} of the area pictured as often as required"
+        f"flight: {flight.stations} of {flight.stations_planned} stations, "
+        f"{share(flight.coverage.share_at_overlap)} of the area pictured as often as required"
     )
-    if flight["ending"] != "complete":
+    if flight.ending != "complete":
         yield Verdict(
             level="bad",
-            text=f"{text}; it ended early: {flight['ending']}",
+            text=f"{text}; it ended early: {flight.ending}",
             action="Fly what is left: 'alice-survey plan check' writes a plan for it.",
         )
-    elif flight["coverage"]["share_at_overlap"] < _WELL_COVERED:
+    elif flight.coverage.share_at_overlap < _WELL_COVERED:
         yield Verdict(
             level="look",
             text=text,
@@ -70,16 +72,17 @@ def _flight(figures: Figures) -> Iterator[Verdict]:
 
 
 def _calibration(figures: Figures) -> Iterator[Verdict]:
-    known = figures.held.json("calibration/report.json").get("verdicts", [])
-    worse = [v for v in known if v["level"] != "good"]
+    calibrated = figures.held.read(CalibrationReportRecord)
+    checks = () if calibrated is None else calibrated.verdicts
+    worse = [verdict for verdict in checks if verdict.level != "good"]
     for verdict in worse:
         yield Verdict(
-            level=verdict["level"],
-            text=f"calibration: {verdict['text']}",
+            level=verdict.level,
+            text=f"calibration: {verdict.text}",
             action="Read the calibration's own report, and take more views where it says so.",
         )
-    if known and not worse:
-        yield Verdict(level="good", text=f"calibration: all {len(known)} checks passed")
+    if checks and not worse:
+        yield Verdict(level="good", text=f"calibration: all {len(checks)} checks passed")
 
 
 def _pictures(figures: Figures) -> Iterator[Verdict]:
@@ -112,13 +115,12 @@ def _registration(figures: Figures) -> Iterator[Verdict]:
             action="Fly with more overlap where pictures were lost (see the map), or with more "
             "light if they are dark.",
         )
-    mapping = figures.held.json("mapping/mapping.json")
-    for note in (mapping.get("acceptance") or {}).get("notes", []):
+    mapping = figures.mapping
+    for note in () if mapping.acceptance is None else mapping.acceptance.notes:
         yield Verdict(
             level="look", text=note, action="Look at the stations that the first lines name."
         )
-    refraction = mapping.get("refraction")
-    if refraction is not None and not refraction["settled"]:
+    if mapping.refraction is not None and not mapping.refraction.settled:
         yield Verdict(
             level="bad",
             text="the refraction of the port did not settle",
@@ -127,10 +129,10 @@ def _registration(figures: Figures) -> Iterator[Verdict]:
 
 
 def _scale(figures: Figures) -> Iterator[Verdict]:
-    found = figures.held.json("sparse/registration.json")
-    if not found:
+    found = figures.registration
+    if found is None:
         return
-    source = found["scale_source"]
+    source = found.scale_source or "unknown"
     if figures.held.unit != "m":
         yield Verdict(
             level="bad",
@@ -138,8 +140,9 @@ def _scale(figures: Figures) -> Iterator[Verdict]:
             action="Give a rig, a scale bar or positions: 'alice-survey scale' takes a length.",
         )
         return
-    place = found.get("georeference") or {}
-    navigation, sigma = place.get("scale_of_navigation"), place.get("scale_of_navigation_sigma")
+    place = found.georeference
+    navigation = None if place is None else place.scale_of_navigation
+    sigma = None if place is None else place.scale_of_navigation_sigma
     if navigation is None or not sigma or "rig" not in source:
         yield Verdict(level="good" if "rig" in source else "look", text=source)
         return
@@ -157,23 +160,23 @@ def _scale(figures: Figures) -> Iterator[Verdict]:
 
 
 def _shape(figures: Figures) -> Iterator[Verdict]:
-    doming = figures.held.json("mapping/mapping.json").get("doming")
-    if not doming:
+    doming = figures.mapping.doming
+    if doming is None:
         return
-    for note in doming["notes"]:
+    for note in doming.notes:
         yield Verdict(
             level="look",
             text=note,
             action="Add lines across the others, or refine the rig (refine_rig, refine_port).",
         )
-    bends = [doming[way] for way in ("along", "across") if doming.get(way)]
-    if bends and not doming["notes"]:
-        worst = max(bends, key=lambda bend: abs(bend["sag_m"]))
+    bends = list(doming.bends.values())
+    if bends and not doming.notes:
+        worst = max(bends, key=lambda bend: abs(bend.sag_m))
         yield Verdict(
             level="good",
             text="bend of the model against navigation: "
-            f"{length_with_sigma(worst['sag_m'], worst['sag_sigma_m'])} over "
-            f"{length(worst['length_m'])}, so none is seen",
+            f"{length_with_sigma(worst.sag_m, worst.sag_sigma_m)} over "
+            f"{length(worst.length_m)}, so none is seen",
         )
 
 
@@ -215,21 +218,19 @@ def _surface(figures: Figures) -> Iterator[Verdict]:
 
 def _truth(figures: Figures) -> Iterator[Verdict]:
     score = figures.truth
-    if not score:
+    if score is None:
         return
-    surface = score["surface"]
-    pixel = surface.get("ground_pixel_mm")
-    miss = surface["distance_rms_mm"]
-    good = pixel is None or miss <= pixel
+    surface, cameras = score.surface, score.cameras
+    miss = surface.distance_rms_mm
+    good = miss <= surface.ground_pixel_mm
     yield Verdict(
         level="good" if good else "bad",
-        text=f"against the truth: surface {length(1e-3 * miss)} rms, cameras "
-        f"{length(1e-3 * score['cameras']['rms_mm'])} rms, scale "
-        f"{parts(1e-6 * score['cameras']['scale_error_ppm'])}, domed by "
-        f"{length(1e-3 * surface['doming']['dome_mm'])}",
+        text=f"against the truth: surface {millimetres(miss)} rms, cameras "
+        f"{millimetres(cameras.rms_mm)} rms, scale {parts(1e-6 * cameras.scale_error_ppm)}, "
+        f"domed by {millimetres(surface.doming.dome_mm)}",
         action="" if good else "Look where on the map of errors.",
     )
-    ratio = (surface.get("error_over_sigma") or {}).get("rms")
+    ratio = None if surface.error_over_sigma is None else surface.error_over_sigma.rms
     if ratio is not None:
         honest = _HONEST[0] <= ratio <= _HONEST[1]
         yield Verdict(
@@ -241,45 +242,44 @@ def _truth(figures: Figures) -> Iterator[Verdict]:
 
 def _reference(figures: Figures) -> Iterator[Verdict]:
     found = figures.reference
-    if not found:
+    if found is None:
         return
-    miss = found["survey_to_reference"]
+    miss = found.survey_to_reference
     yield Verdict(
-        level="good" if miss["median_px"] <= 2.0 else "look",
-        text=f"against {found['reference'].rsplit('/', 1)[-1]}: {length(miss['median_m'])} median "
-        f"({miss['median_px']:.1f} ground pixels), after a {found['registration']['transform']} "
+        level="good" if miss.median_px <= 2.0 else "look",
+        text=f"against {found.reference.rsplit('/', 1)[-1]}: {length(miss.median_m)} median "
+        f"({miss.median_px:.1f} ground pixels), after a {found.registration.transform} "
         "registration",
-        action="" if miss["median_px"] <= 2.0 else "See where in reference/reference.png.",
+        action="" if miss.median_px <= 2.0 else "See where in reference/reference.png.",
     )
 
 
 def _control(figures: Figures) -> Iterator[Verdict]:
     score = figures.control
-    if not score:
+    if score is None:
         return
-    for use, rms in score["rms"].items():
-        if rms.get("points"):
-            level = math.hypot(rms["north_m"], rms["east_m"])
+    for use, rms in score.rms.items():
+        if rms.points and rms.north_m is not None and rms.east_m is not None:
+            level = math.hypot(rms.north_m, rms.east_m)
             yield Verdict(
                 level="good",
-                text=f"{count(rms['points'], 'point')} ({use}): off by {length(level)} level and "
-                f"{length(rms['down_m'])} in depth, rms",
+                text=f"{count(rms.points, 'point')} ({use}): off by {length(level)} level and "
+                f"{length(rms.down_m)} in depth, rms",
             )
-        if rms.get("bars"):
+        if rms.bars:
             yield Verdict(
                 level="good",
-                text=f"{count(rms['bars'], 'scale bar')} ({use}): off by "
-                f"{length(rms['length_m'])} rms",
+                text=f"{count(rms.bars, 'scale bar')} ({use}): off by {length(rms.length_m)} rms",
             )
-    far = [row for row in [*score["points"], *score["bars"]] if row["misfit_sigmas"] > 5.0]
+    far = [row for row in (*score.points, *score.bars) if row.misfit_sigmas > 5.0]
     for row in far[:_NAMED]:
         yield Verdict(
             level="look",
-            text=f"{row['name']} misses by {row['misfit_sigmas']:.1f} of its sigmas",
-            action=f"Check how {row['name']} was picked and measured.",
+            text=f"{row.name} misses by {row.misfit_sigmas:.1f} of its sigmas",
+            action=f"Check how {row.name} was picked and measured.",
         )
-    if score["not_found"]:
-        names = ", ".join(list(score["not_found"])[:_NAMED])
+    if score.not_found:
+        names = ", ".join(list(score.not_found)[:_NAMED])
         yield Verdict(
             level="look",
             text=f"not found in the pictures: {names}",

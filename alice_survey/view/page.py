@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote
 
+from alice_survey.base.records import MeshRecord
 from alice_survey.kit.document import (
     Link,
     Mesh,
@@ -114,13 +115,14 @@ class Page:
 
     def _mesh_view(self, held: Held) -> Mesh | None:
         path, picture = held.file("mesh/mesh.glb"), held.file("mesh/mesh.png")
-        if path is None or picture is None:
+        mesh = held.read(MeshRecord)
+        if path is None or picture is None or mesh is None:
             return None
         with self._workspace.opened(("mesh", "mesh.glb")) as file:
             token = file.token
         return Mesh(
             glb=path,
-            about=mesh_about(held),
+            about=mesh_about(mesh),
             still=mesh_still(picture, _STILL_PX),
             address=f"/mesh.glb?v={token}",
         )

@@ -15,9 +15,9 @@ from pathlib import Path
 from urllib.parse import unquote_to_bytes
 
 from alice_survey.base.artefacts import STAGE_FILE
-from alice_survey.report.held import LOOSE, STAGES
+from alice_survey.stages import LOOSE_FOLDERS, STAGES
 
-PRODUCTS = (*STAGES, "report", *LOOSE, "check")
+PRODUCTS = (*(stage.folder for stage in STAGES), *LOOSE_FOLDERS, "check")
 """Folders that are shown."""
 _LOOSE_FILES = ("survey.toml",)
 _LONGEST_PATH = 2000

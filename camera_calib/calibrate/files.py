@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.artefacts import write_csv, write_json
+from alice_survey.base.artefacts import write_csv
 from alice_survey.base.errors import warn
+from alice_survey.base.records import CalibrationRecord
 from camera_calib.calibrate.adjust import stack_views
 from camera_calib.calibrate.detect_views import Detections
 from camera_calib.calibrate.solve import recalibrate
@@ -34,7 +35,7 @@ def write_calibration(
         measured: all views in which the target was seen, also those that took no part.
     """
     write_rig(folder / "rig.json", calibration.rig)
-    write_json(folder / "calibration.json", summary(calibration))
+    CalibrationRecord.save(folder / "calibration.json", summary(calibration))
     write_csv(folder / "corners.csv", _CORNERS, _corner_rows(calibration, measured))
     _write_report(folder, calibration)
 

@@ -2,12 +2,11 @@
 
 from pathlib import Path
 
-from alice_survey.base.artefacts import Stage, need_stage, read_json, run_stage
 from alice_survey.base.config import CameraConfig, SurveyConfig
-from alice_survey.base.contents import taken_from
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.executor import Executor
 from alice_survey.base.manifest import read_manifest
+from alice_survey.base.records import BoardRecord
 from camera_calib.calibrate.detect_views import Size, detect_views
 from camera_calib.calibrate.files import finish, warn_of_unseen
 from camera_calib.calibrate.picture_sets import PictureSet
@@ -16,45 +15,25 @@ from camera_calib.rig import design_rig
 from camera_calib.targets.target import Target
 
 
-def run_calibrate(workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
-    """Calibrate the rig from `pool/` and write `calibration/`.
+def run_calibrate(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
+    """Calibrate the rig from `pool/`.
 
     Intrinsics, ports (with their normals) and the pose of the right camera are found together,
     from the design.
 
-    Returns:
-        True when done, False when nothing had changed.
-
     Raises:
         CalibrationError: too few usable views.
     """
-    pool = need_stage(workspace, "pool", "image")
-    stage = Stage(
-        name="calibration",
-        version=3,
-        settings={
-            "camera": config.camera.model_dump(mode="json"),
-            "water": config.water.model_dump(mode="json"),
-        },
-        inputs=[pool / "manifest.csv", pool / "board.json", pool / "left", pool / "right"],
+    pool = workspace / "pool"
+    board = BoardRecord.read(pool / "board.json")
+    target = Target(
+        kind="chessboard", columns=board.columns, rows=board.rows, size_m=board.square_m
     )
-
-    def work(folder: Path) -> None:
-        board = read_json(pool / "board.json")
-        with taken_from(pool / "board.json"):
-            target = Target(
-                kind="chessboard",
-                columns=int(board["columns"]),
-                rows=int(board["rows"]),
-                size_m=float(board["square_m"]),
-            )
-        found = detect_views(_pool_pictures(pool), target, executor)
-        warn_of_unseen(found)
-        start = design_rig(config.camera, config.water, _scale(found.sizes["left"], config.camera))
-        calibration = calibrate_through_ports(found.views, target.points, start, "free")
-        finish(folder, calibration, found)
-
-    return run_stage(workspace, stage, work)
+    found = detect_views(_pool_pictures(pool), target, executor)
+    warn_of_unseen(found)
+    start = design_rig(config.camera, config.water, _scale(found.sizes["left"], config.camera))
+    calibration = calibrate_through_ports(found.views, target.points, start, "free")
+    finish(folder, calibration, found)
 
 
 def _pool_pictures(pool: Path) -> list[PictureSet]:

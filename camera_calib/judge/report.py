@@ -4,7 +4,8 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 
-from alice_survey.base.artefacts import atomic_path, write_json
+from alice_survey.base.artefacts import atomic_path
+from alice_survey.base.records import CalibrationReportRecord
 from alice_survey.base.run import progress
 from alice_survey.kit.document import Figure, Report, Section, Table, Verdict, worst_first
 from alice_survey.kit.page import render_html
@@ -40,7 +41,7 @@ def write_report(
     """
     judged = judge(calibration, held_out, working_range_m)
     found = verdicts(judged)
-    write_json(folder / "report.json", report_json(judged, found))
+    CalibrationReportRecord.save(folder / "report.json", report_json(judged, found))
     with atomic_path(folder / "report.html") as path:
         path.write_text(render(judged, found), encoding="utf-8")
 

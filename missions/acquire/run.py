@@ -17,10 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.artefacts import (
-    Stage,
     atomic_path,
-    need_stage,
-    run_stage,
     write_csv,
     write_json,
 )
@@ -29,6 +26,7 @@ from alice_survey.base.errors import ImageError, NavigationError
 from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array, interpolate_poses, pose_to_json
 from alice_survey.base.manifest import ImageRecord, write_manifest
+from alice_survey.base.records import BoardRecord, PicturesRecord
 from alice_survey.base.trajectory import Trajectory, read_columns, read_track
 from alice_survey.seafloor.as_built import true_rig
 from alice_survey.seafloor.board import PoolBoard, board_records, pool_poses, render_board
@@ -65,54 +63,32 @@ class _Shoot:
     """Size and time of the files that workers read, so that none keeps what has changed."""
 
 
-def run_pool(workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
-    """Take the stereo pictures of a chessboard in a pool and write `pool/`.
-
-    Returns:
-        True when done, False when nothing had changed.
-    """
-    imaging, board = config.imaging, PoolBoard()
-    stage = Stage(
-        name="pool",
-        version=4,
-        settings={
-            "seed": config.seed,
-            "camera": config.camera.model_dump(mode="json"),
-            "n_water": config.water.n_water,
-            "board": asdict(board),
-            "imaging": imaging.model_dump(
-                mode="json", include={"scale", "image_format", "samples", "noise", "pool_views"}
-            ),
+def run_pool(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
+    """Take the stereo pictures of a chessboard in a pool."""
+    board = PoolBoard()
+    rig = true_rig(config.camera, config.water, scale=config.imaging.scale, seed=config.seed)
+    rng = np.random.default_rng([config.seed, _POOL_STREAM])
+    poses = pool_poses(board, rig, config.imaging.pool_views, rng)
+    shown = board_records(rig, poses)
+    shoot = _Shoot(folder=folder, config=config, exposure_s=0.0, altitude_m=0.0)
+    jobs = [
+        (shoot, board, view, camera, rig.cameras[camera], pose.as_matrix())
+        for view, by_camera in enumerate(shown)
+        for camera, pose in by_camera.items()
+    ]
+    records = list(executor.map(_take_board, jobs, label="pool pictures"))
+    write_manifest(folder / "manifest.csv", records)
+    BoardRecord(**asdict(board)).write(folder / "board.json")
+    write_rig(folder / "truth" / "rig.json", rig)
+    write_json(
+        folder / "truth" / "boards.json",
+        {
+            "cam_from_board": [
+                {"station": view, **{name: pose_to_json(p) for name, p in by_camera.items()}}
+                for view, by_camera in enumerate(shown)
+            ]
         },
-        resumes=True,
     )
-
-    def work(folder: Path) -> None:
-        rig = true_rig(config.camera, config.water, scale=config.imaging.scale, seed=config.seed)
-        rng = np.random.default_rng([config.seed, _POOL_STREAM])
-        poses = pool_poses(board, rig, imaging.pool_views, rng)
-        shown = board_records(rig, poses)
-        shoot = _Shoot(folder=folder, config=config, exposure_s=0.0, altitude_m=0.0)
-        jobs = [
-            (shoot, board, view, camera, rig.cameras[camera], pose.as_matrix())
-            for view, by_camera in enumerate(shown)
-            for camera, pose in by_camera.items()
-        ]
-        records = list(executor.map(_take_board, jobs, label="pool pictures"))
-        write_manifest(folder / "manifest.csv", records)
-        write_json(folder / "board.json", asdict(board))
-        write_rig(folder / "truth" / "rig.json", rig)
-        write_json(
-            folder / "truth" / "boards.json",
-            {
-                "cam_from_board": [
-                    {"station": view, **{name: pose_to_json(p) for name, p in by_camera.items()}}
-                    for view, by_camera in enumerate(shown)
-                ]
-            },
-        )
-
-    return run_stage(workspace, stage, work)
 
 
 def _take_board(job: tuple[_Shoot, PoolBoard, int, str, FlatPortCamera, Array]) -> ImageRecord:
@@ -138,92 +114,67 @@ def _take_board(job: tuple[_Shoot, PoolBoard, int, str, FlatPortCamera, Array]) 
     return record
 
 
-def run_images(workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
-    """Take the pictures of a flown survey and write `images/`.
-
-    Returns:
-        True when done, False when nothing had changed.
+def run_images(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
+    """Take the pictures of a flown survey.
 
     Raises:
-        WorkspaceError: the plan or the flight is missing or lacks a value.
+        WorkspaceError: the plan or the flight lacks a value.
         NavigationError: a trigger lies outside of the flight, or none is there.
     """
-    plan, flight = need_stage(workspace, "plan", "plan"), need_stage(workspace, "flight", "fly")
+    flight = workspace / "flight"
     triggers, navigation = flight / "triggers.csv", flight / "navigation.csv"
     track = flight / "truth" / "track.csv"
-    sections = ("camera", "water", "seafloor", "imaging")
-    stage = Stage(
-        name="images",
-        version=5,
-        settings={
-            "seed": config.seed,
-            "seafloor_depth_m": config.area.seafloor_depth_m,
-            "margins": config.plan.model_dump(
-                mode="json", include={"altitude_m", "run_in_m", "turn_radius_m", "margin_m"}
-            ),
-            **{
-                name: getattr(config, name).model_dump(mode="json", exclude={"pool_views"})
-                for name in sections
-            },
-        },
-        inputs=[plan / "plan.json", triggers, navigation, track],
-        resumes=True,
+    planned = read_plan(workspace / "plan" / "plan.json")
+    rows = read_columns(triggers, ("station", "time_s"))
+    stations = [(int(s), float(t)) for s, t in zip(*rows.values(), strict=True)]
+    if not stations:
+        raise NavigationError(f"{triggers} holds no trigger: plan a larger area")
+    truth = read_track(track)
+    believed = _believed(navigation, np.array([t for _, t in stations]))
+    rig = true_rig(config.camera, config.water, scale=config.imaging.scale, seed=config.seed)
+    terrain = folder / "truth" / "terrain.ply"
+    if not terrain.with_suffix(".json").exists():
+        floor = survey_terrain(
+            config.seafloor,
+            planned.area.allowed_corners_ne,
+            margin_m=config.plan.altitude_m,
+            depth_m=config.area.seafloor_depth_m,
+            seed=config.seed,
+        )
+        floor.write(terrain)
+    write_rig(folder / "truth" / "rig.json", rig)
+    shoot = _Shoot(
+        folder=folder,
+        config=config,
+        exposure_s=planned.exposure_s,
+        altitude_m=planned.altitude_m,
+        stamp=(terrain.stat().st_size, terrain.stat().st_mtime_ns),
     )
-
-    def work(folder: Path) -> None:
-        planned = read_plan(plan / "plan.json")
-        rows = read_columns(triggers, ("station", "time_s"))
-        stations = [(int(s), float(t)) for s, t in zip(*rows.values(), strict=True)]
-        if not stations:
-            raise NavigationError(f"{triggers} holds no trigger: plan a larger area")
-        truth = read_track(track)
-        believed = _believed(navigation, np.array([t for _, t in stations]))
-        rig = true_rig(config.camera, config.water, scale=config.imaging.scale, seed=config.seed)
-        terrain = folder / "truth" / "terrain.ply"
-        if not terrain.with_suffix(".json").exists():
-            floor = survey_terrain(
-                config.seafloor,
-                planned.area.allowed_corners_ne,
-                margin_m=config.plan.altitude_m,
-                depth_m=config.area.seafloor_depth_m,
-                seed=config.seed,
-            )
-            floor.write(terrain)
-        write_rig(folder / "truth" / "rig.json", rig)
-        shoot = _Shoot(
-            folder=folder,
-            config=config,
-            exposure_s=planned.exposure_s,
-            altitude_m=planned.altitude_m,
-            stamp=(terrain.stat().st_size, terrain.stat().st_mtime_ns),
+    jobs = _jobs(shoot, stations, truth)
+    images = list(executor.map(_take, jobs, label="pictures", total=2 * len(stations)))
+    records = [
+        replace(
+            believed[i // 2],
+            image=image,
+            camera=CAMERAS[i % 2],
+            station=stations[i // 2][0],
         )
-        jobs = _jobs(shoot, stations, truth)
-        images = list(executor.map(_take, jobs, label="pictures", total=2 * len(stations)))
-        records = [
-            replace(
-                believed[i // 2],
-                image=image,
-                camera=CAMERAS[i % 2],
-                station=stations[i // 2][0],
-            )
-            for i, image in enumerate(images)
-        ]
-        write_manifest(folder / "manifest.csv", records)
-        _write_poses(folder / "truth" / "poses.csv", records, stations, truth, rig)
-        write_json(
-            folder / "survey.json",
-            {
-                "source": "simulated",
-                "datum": {
-                    "latitude_deg": planned.datum.latitude_deg,
-                    "longitude_deg": planned.datum.longitude_deg,
-                },
-                "vertical_datum": VERTICAL_DATUM,
-                "notes": ["pictures are rendered: a simulated sea floor, lit by strobes alone"],
+        for i, image in enumerate(images)
+    ]
+    write_manifest(folder / "manifest.csv", records)
+    _write_poses(folder / "truth" / "poses.csv", records, stations, truth, rig)
+    PicturesRecord.save(
+        folder / "survey.json",
+        {
+            "source": "simulated",
+            "datum": {
+                "latitude_deg": planned.datum.latitude_deg,
+                "longitude_deg": planned.datum.longitude_deg,
             },
-        )
-
-    return run_stage(workspace, stage, work)
+            "vertical_datum": VERTICAL_DATUM,
+            "notes": ["pictures are rendered: a simulated sea floor, lit by strobes alone"],
+        },
+    )
 
 
 def _believed(path: Path, at_s: Array) -> list[ImageRecord]:

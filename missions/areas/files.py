@@ -15,13 +15,12 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from alice_survey.base.config import AreaConfig
+from alice_survey.base.config import sides_of
 from alice_survey.base.contents import one_line, shown
 from alice_survey.base.errors import PlanError, warn
 from missions.areas.crs import LOCAL, geographic_shapes, parse_crs, usable_crs
 from missions.areas.raw import RawShapes, from_geometries
 from missions.areas.safe import (
-    SHAPEFILE_SIDES,
     check_kml,
     check_start,
     read_bytes,
@@ -44,29 +43,6 @@ class _Layer:
     shapes: RawShapes
     """In the file's own coordinates, y (north) before x (east)."""
     crs: str | None
-
-
-def area_files(settings: AreaConfig) -> list[Path]:
-    """The files that shapes come from, a shapefile's side files too; those that exist."""
-    files = []
-    for path in (settings.file, settings.no_go_file, settings.allowed_file):
-        if path is None:
-            continue
-        files.append(path)
-        if path.suffix.lower() == ".shp":
-            files += _sides(path)
-    return [path for path in dict.fromkeys(files) if path.exists()]
-
-
-def _sides(path: Path) -> list[Path]:
-    """The files next to a shapefile that belong to it, whatever the case of their endings."""
-    if not path.parent.is_dir():
-        return []
-    return sorted(
-        other
-        for other in path.parent.iterdir()
-        if other.stem == path.stem and other.suffix.lower() in SHAPEFILE_SIDES
-    )
 
 
 def read_area_file(
@@ -194,7 +170,7 @@ def _layers(path: Path, suffix: str) -> list[_Layer]:
         return _linked_layers([path], "GPKG")
     if suffix == ".shp":
         check_start(path, b"\x00\x00\x27\x0a", "shapefile")
-        return _linked_layers([path, *_sides(path)], "ESRI Shapefile")
+        return _linked_layers([path, *sides_of(path)], "ESRI Shapefile")
     data = read_geojson(path)
     _check_places(path.name, data)
     layers = _linked_layers([path], "GeoJSON")

@@ -12,6 +12,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 from xml.parsers import expat
 
+from alice_survey.base.config import SHAPEFILE_SIDES
 from alice_survey.base.errors import PlanError
 
 LARGEST_BYTES = 100_000_000
@@ -23,7 +24,6 @@ _GEOJSON = frozenset(
         "LineString", "MultiLineString", "Point", "MultiPoint",
     }
 )  # fmt: skip
-SHAPEFILE_SIDES = (".shx", ".dbf", ".prj", ".cpg")
 
 
 def read_bytes(path: Path) -> bytes:

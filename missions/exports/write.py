@@ -133,7 +133,7 @@ def _write_about(path: Path, export: Export, files: Mapping[Path, str]) -> None:
 def _config_beside(path: Path) -> SurveyConfig:
     """Camera, water and limits that a plan was made with."""
     stage = read_stage(path.parent)
-    settings = {} if stage is None else dict(stage.get("settings", {}))
+    settings = {} if stage is None else stage.settings
     if "camera" not in settings or "water" not in settings:
         raise PlanError(
             f"{path}: lies in no finished plan folder, so that where the camera sits on the "

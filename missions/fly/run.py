@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.base.artefacts import Stage, need_stage, run_stage, write_csv, write_json
+from alice_survey.base.artefacts import write_csv
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import VehicleError, warn
 from alice_survey.base.executor import Executor, progress
+from alice_survey.base.records import FlightRecord
 from alice_survey.base.trajectory import write_track
 from alice_survey.seafloor.terrain import survey_terrain
 from alice_survey.vehicle.log import write_vehicle_log
@@ -26,72 +27,47 @@ _SEED_STREAM = 20
 TRIGGER_COLUMNS = ("station", "time_s", "line")
 
 
-def run_fly(workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
-    """Stage `flight`: write triggers, navigation, vehicle logs, a bag, the truth and plots.
-
-    Returns:
-        True when work was done, False when the flight was up to date.
+def run_fly(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
+    """Write triggers, navigation, vehicle logs, a bag, the truth and plots.
 
     Raises:
-        WorkspaceError: there is no plan.
         VehicleError: the vehicle took no picture at all; the message says why.
     """
-    plan_path = need_stage(workspace, "plan", "plan") / "plan.json"
-    files = (config.sea.current_file, config.vehicle.coefficients_file)
-    stage = Stage(
-        name="flight",
-        version=4,
-        settings={
-            "seed": config.seed,
-            "vehicle": config.vehicle.model_dump(mode="json", exclude={"coefficients_file"}),
-            "sea": config.sea.model_dump(mode="json", exclude={"current_file"}),
-            "navigation": config.navigation.model_dump(mode="json"),
-            "seafloor": config.seafloor.model_dump(mode="json"),
-            "seafloor_depth_m": config.area.seafloor_depth_m,
-            "plan": config.plan.model_dump(mode="json"),
-            "position_body_m": list(config.camera.position_body_m),
-            "dvl_position_body_m": list(config.camera.dvl_position_body_m),
-        },
-        inputs=[plan_path, *(file for file in files if file is not None)],
-    )
+    for _ in progress(_steps(folder, workspace / "plan" / "plan.json", config), "flight files", 5):
+        pass
 
-    def steps(folder: Path) -> Iterator[str]:
-        """Write the files of a flight, and say after each step what is done."""
-        plan = one_dive(read_plan(plan_path), config.vehicle.dive)
-        planned = stations_of_dives(plan)
-        floor = floor_grid(
-            survey_terrain(
-                config.seafloor,
-                plan.area.allowed_corners_ne,
-                margin_m=config.plan.altitude_m,
-                depth_m=config.area.seafloor_depth_m,
-                seed=config.seed,
-            )
+
+def _steps(folder: Path, plan_path: Path, config: SurveyConfig) -> Iterator[str]:
+    """Write the files of a flight, and say after each step what is done."""
+    plan = one_dive(read_plan(plan_path), config.vehicle.dive)
+    planned = stations_of_dives(plan)
+    floor = floor_grid(
+        survey_terrain(
+            config.seafloor,
+            plan.area.allowed_corners_ne,
+            margin_m=config.plan.altitude_m,
+            depth_m=config.area.seafloor_depth_m,
+            seed=config.seed,
         )
-        yield "sea floor"
-        rng = np.random.default_rng([config.seed, _SEED_STREAM])
-        flight = simulate_plan(plan, flight_settings(config), floor, rng)
-        _check_pictures(flight, planned)
-        yield "flight"
-        write_track(folder / "truth" / "track.csv", flight.truth)
-        write_vehicle_log(folder / "truth" / "vehicle.csv", true_log(flight))
-        yield "truth"
-        _write_triggers(folder / "triggers.csv", flight)
-        write_navigation(folder / "navigation.csv", flight.log, plan.datum)
-        write_vehicle_log(folder / "vehicle.csv", believed_log(flight))
-        write_bag(folder / "bag", bag_record(flight))
-        yield "logs"
-        rig = design_rig(config.camera, config.water)
-        write_json(folder / "flight.json", flight_summary(flight, config.vehicle, rig))
-        draw_flight(folder / "track.png", flight)
-        draw_vehicle(folder / "vehicle.png", flight)
-        yield "plots"
-
-    def work(folder: Path) -> None:
-        for _ in progress(steps(folder), "flight files", 5):
-            pass
-
-    return run_stage(workspace, stage, work)
+    )
+    yield "sea floor"
+    rng = np.random.default_rng([config.seed, _SEED_STREAM])
+    flight = simulate_plan(plan, flight_settings(config), floor, rng)
+    _check_pictures(flight, planned)
+    yield "flight"
+    write_track(folder / "truth" / "track.csv", flight.truth)
+    write_vehicle_log(folder / "truth" / "vehicle.csv", true_log(flight))
+    yield "truth"
+    _write_triggers(folder / "triggers.csv", flight)
+    write_navigation(folder / "navigation.csv", flight.log, plan.datum)
+    write_vehicle_log(folder / "vehicle.csv", believed_log(flight))
+    write_bag(folder / "bag", bag_record(flight))
+    yield "logs"
+    rig = design_rig(config.camera, config.water)
+    FlightRecord.save(folder / "flight.json", flight_summary(flight, config.vehicle, rig))
+    draw_flight(folder / "track.png", flight)
+    draw_vehicle(folder / "vehicle.png", flight)
+    yield "plots"
 
 
 def _check_pictures(flight: Flight, planned: int) -> None:

@@ -1,18 +1,15 @@
 """The stage `plan`: a survey planned, and written for the next stages, for people, for vehicles."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from pydantic import BaseModel
 
-from alice_survey.base.artefacts import Stage, run_stage, write_json
+from alice_survey.base.artefacts import write_json
 from alice_survey.base.config import SeaConfig, SurveyConfig
 from alice_survey.base.executor import Executor
 from alice_survey.base.run import progress
 from alice_survey.kit.document import Link
 from camera_calib.rig import Rig, design_rig
-from missions.areas.files import area_files
 from missions.exports.options import Options, options_of
 from missions.exports.write import write_exports
 from missions.exposure.settings_table import settings_table
@@ -26,50 +23,16 @@ from missions.values.plan_file import Dive, Plan
 _SAME_S = 1e-3
 
 
-def run_plan(workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
-    """Stage `plan`: write plan.json, its certificate, settings, maps and missions for vehicles.
-
-    Returns:
-        True when work was done, False when the plan was up to date.
+def run_plan(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
+    """Write plan.json, its certificate, settings, maps and missions for vehicles.
 
     Raises:
         PlanError: no plan meets the settings.
     """
-    apart = [config.area.bathymetry_file, config.sea.current_file, config.vehicle.coefficients_file]
-    stage = Stage(
-        name="plan",
-        version=3,
-        settings={
-            "name": config.name,
-            **{
-                name: _without_paths(getattr(config, name))
-                for name in ("area", "camera", "water", "plan", "sea", "vehicle")
-            },
-            # Of a shape in degrees the middle is the datum unless one is set, to whatever value.
-            "datum_given": sorted({"latitude_deg", "longitude_deg"} & config.area.model_fields_set),
-            "strobes": config.imaging.model_dump(
-                mode="json", include={"strobe_lumens", "strobe_beam_deg", "strobes_body_m"}
-            ),
-        },
-        inputs=[*area_files(config.area), *(file for file in apart if file is not None)],
-    )
-
-    def work(folder: Path) -> None:
-        rig = design_rig(config.camera, config.water)
-        planned = plan_survey(config, rig)
-        options = options_of(config.camera, config.plan)
-        write_planned(folder, planned, rig, options, config.sea)
-
-    return run_stage(workspace, stage, work)
-
-
-def _without_paths(section: BaseModel) -> dict[str, Any]:
-    """What a section says; of files their names alone, so that a survey may be moved."""
-    values = section.model_dump(mode="json", exclude={"dive"})
-    return {
-        key: value.name if isinstance(value := getattr(section, key), Path) else values[key]
-        for key in values
-    }
+    rig = design_rig(config.camera, config.water)
+    planned = plan_survey(config, rig)
+    options = options_of(config.camera, config.plan)
+    write_planned(folder, planned, rig, options, config.sea)
 
 
 @progress.step("write plan, maps and missions")

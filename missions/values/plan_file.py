@@ -3,6 +3,7 @@
 Altitude and all places are of the left port's outer glass.
 """
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -107,6 +108,16 @@ class Plan:
     the glass keeps its altitude above a level sea floor."""
     details: dict[str, Any]
     """What else a reader may want to know; nothing is computed from it."""
+
+    @property
+    def blur_px(self) -> float:
+        """Motion blur over one exposure; NaN where it is not noted."""
+        return float(self.details.get("imaging", {}).get("blur_px", math.nan))
+
+    @property
+    def pixel_m(self) -> float:
+        """Side of a pixel on the sea floor; NaN where it is not noted."""
+        return float(self.details.get("imaging", {}).get("pixel_m", math.nan))
 
     @property
     def datum(self) -> Datum:

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.artefacts import write_json
 from alice_survey.base.compiled import compiled
+from alice_survey.base.records import CloudRecord
 from reconstruct.dense.dem import bin_points, sorted_ranks
 from reconstruct.dense.points import Points
 from reconstruct.ply import VERTEX as MESH_VERTEX
@@ -194,7 +194,7 @@ def write_cloud_json(
     from reconstruct.raster import crs_of
 
     crs = crs_of(frame)
-    write_json(
+    CloudRecord.save(
         path,
         {
             "format": "alice-survey cloud",

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.artefacts import Stage, need_stage, run_stage, write_json
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
 from alice_survey.base.errors import ReconstructionError, warn
 from alice_survey.base.executor import Executor
+from alice_survey.base.records import SurfaceRecord
 from reconstruct.dense.cloud import laz_writer, voxel_edge, write_cloud, write_cloud_json
 from reconstruct.dense.dem import FILL_CELLS
 from reconstruct.dense.matching_trial import find_conditions
@@ -40,7 +40,7 @@ from reconstruct.dense.views import (
 )
 from reconstruct.light.solve import joined_samples, solve_light, write_light
 from reconstruct.raster import DemGrid, grid_over, preview_dem, round_cell, tiled_raster
-from reconstruct.views.model import SparseModel, WorldFrame, picture_files, read_model, scaled_view
+from reconstruct.views.model import SparseModel, WorldFrame, read_model, scaled_view
 
 CELL_PIXELS = 2.5
 """Side of a DEM cell in mean ground pixels of the pictures as matched, unless depth is coarser."""
@@ -50,39 +50,14 @@ _MOST_CELLS = 4_000_000_000
 _MOST_POINTS = 40_000_000
 
 
-def run_dense(workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
-    """Find the surface of a finished sparse model and write `dense/`.
-
-    Returns:
-        True when done, False when nothing had changed.
+def run_dense(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
+    """Find the surface of a placed model.
 
     Raises:
         ReconstructionError: the views do not overlap, or no depth was found.
-        WorkspaceError: a stage is missing.
+        WorkspaceError: the model is damaged.
     """
-    need_stage(workspace, "images", "image")
-    sparse = need_stage(workspace, "sparse", "reconstruct")
-    model = read_model(sparse)
-    settings = config.reconstruct.model_dump(
-        mode="json", include={"dense_scale", "dense_partners", "dem_cell_m"}
-    )
-    covariance = workspace / "mapping" / "covariance.npz"
-    stage = Stage(
-        name="dense",
-        version=3,
-        settings=settings,
-        inputs=[
-            sparse,
-            *([covariance] if covariance.is_file() else []),
-            *picture_files(workspace, sparse, model),
-        ],
-        resumes=True,
-    )
-
-    def work(folder: Path) -> None:
-        build_surface(workspace, model, folder, config.reconstruct, executor)
-
-    return run_stage(workspace, stage, work)
+    build_surface(workspace, read_model(workspace / "sparse"), folder, config.reconstruct, executor)
 
 
 def build_surface(
@@ -170,7 +145,7 @@ def build_surface(
             "overlap, sharper texture or better positions"
         )
     write_cloud_json(folder / "cloud.json", count, offset, edge, model.frame)
-    write_json(
+    SurfaceRecord.save(
         folder / "surface.json",
         {
             "format": "alice-survey surface",

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import rasterio
 
-from alice_survey.base.artefacts import write_json
 from alice_survey.base.errors import ReconstructionError, WorkspaceError, warn
+from alice_survey.base.records import ChangeRecord
 from alice_survey.base.run import progress
 from reconstruct.evaluate.change import SIGNIFICANT, Change, find_change, without
 from reconstruct.evaluate.elevation import Elevation, enu_from_enu, read_elevation
@@ -99,7 +99,7 @@ def evaluate_against(
     _write(folder / "difference.tif", grid, frame, change.difference, "height less before (m)")
     _write(folder / "significance.tif", grid, frame, change.significance, "change over its sigma")
     plot_change(folder / "change.png", now, change)
-    write_json(folder / "change.json", figures)
+    ChangeRecord.save(folder / "change.json", figures)
     return _text(figures, folder), figures
 
 

@@ -8,10 +8,9 @@ import shapely
 from scipy.spatial.transform import RigidTransform
 from shapely.geometry import MultiPolygon
 
-from alice_survey.base.artefacts import read_json
-from alice_survey.base.contents import taken_from
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.frames import Array
+from alice_survey.base.records import MeshRecord
 from alice_survey.base.run import progress
 from alice_survey.seafloor.terrain import Terrain
 from reconstruct.evaluate.figures import rms, rounded
@@ -29,9 +28,7 @@ def read_mesh(folder: Path) -> tuple[Array, Array]:
     """
     import open3d as o3d
 
-    with taken_from(folder / "mesh.json"):
-        stated = read_json(folder / "mesh.json")["offset_east_north_up"]
-        offset = np.array([float(value) for value in stated]).reshape(3)
+    offset = np.array(MeshRecord.read(folder / "mesh.json").offset_east_north_up)
     mesh = o3d.io.read_triangle_mesh(str(folder / "mesh.ply"))
     if not len(mesh.triangles):
         raise WorkspaceError(f"{folder / 'mesh.ply'}: holds no triangles")

@@ -7,10 +7,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from alice_survey.base.artefacts import need_stage, read_json, write_json
-from alice_survey.base.contents import taken_from
+from alice_survey.base.artefacts import need_stage
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.frames import Array
+from alice_survey.base.records import ReferenceRecord, RegistrationRecord
 from alice_survey.base.run import progress
 from reconstruct.evaluate.cloud_files import read_own_cloud, read_reference
 from reconstruct.evaluate.cloud_registration import (
@@ -79,8 +79,7 @@ def evaluate_reference(
             f"{workspace} is not georeferenced: a reference is compared where the georeference "
             "puts it; give positions in the manifest or control points"
         )
-    with taken_from(sparse / "registration.json"):
-        source = str(read_json(sparse / "registration.json")["scale_source"] or "no scale")
+    source = RegistrationRecord.read(sparse / "registration.json").scale_source or "no scale"
     if free_scale is None:
         free_scale = not model.frame.scaled or _NAVIGATION in source
     rng = np.random.default_rng(seed)
@@ -109,7 +108,7 @@ def evaluate_reference(
     folder = out or workspace / "reference"
     folder.mkdir(parents=True, exist_ok=True)
     plot_reference(folder / "reference.png", ours, back, pixel_m)
-    write_json(folder / "reference.json", figures)
+    ReferenceRecord.save(folder / "reference.json", figures)
     return _text(figures, folder), figures
 
 

@@ -13,21 +13,12 @@ from typing import Any
 import numpy as np
 import rasterio
 
-from alice_survey.base.artefacts import (
-    Stage,
-    need_stage,
-    read_json,
-    read_stage,
-    run_stage,
-    write_csv,
-    write_json,
-)
+from alice_survey.base.artefacts import read_stage, write_csv
 from alice_survey.base.config import SurveyConfig
-from alice_survey.base.contents import taken_from
-from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import read_manifest
+from alice_survey.base.records import RegistrationRecord, ScoreRecord
 from alice_survey.seafloor.terrain import read_terrain
 from alice_survey.seafloor.texture import survey_texture
 from camera_calib.rig import read_rig
@@ -46,83 +37,49 @@ from reconstruct.placing.track import read_track_poses
 _SEED_STREAM = 6100
 
 
-def run_evaluate(workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
-    """Score what `reconstruct` made and write `evaluation/`.
-
-    Returns:
-        True when done, False when nothing had changed.
-
-    Raises:
-        WorkspaceError: a stage is missing, or the survey is not simulated and so has no truth.
-    """
-    images = need_stage(workspace, "images", "image")
+def run_evaluate(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
+    """Score what `reconstruct` made of a simulated survey."""
+    folders = ("plan", "images", "sparse", "dense", "mosaic", "mesh")
+    plan, images, sparse, dense, mosaic, mesh = (workspace / name for name in folders)
     truth = images / "truth"
-    if not truth.is_dir():
-        raise WorkspaceError(
-            f"{images} has no truth: only simulated surveys can be scored; what is known of this "
-            f"one is in {workspace / 'sparse' / 'registration.json'}"
-        )
-    sparse = need_stage(workspace, "sparse", "reconstruct")
-    dense = need_stage(workspace, "dense", "reconstruct")
-    mosaic = need_stage(workspace, "mosaic", "reconstruct")
-    plan = need_stage(workspace, "plan", "plan")
-    mesh = workspace / "mesh"
-    inputs = [truth / "poses.csv", truth / "terrain.ply", truth / "rig.json", dense / "dem.tif"]
-    inputs += [dense / "sigma.tif", mosaic / "mosaic.tif", sparse / "track.csv"]
-    inputs += [sparse / "registration.json", plan / "plan.json", images / "manifest.csv"]
-    inputs += [workspace / "flight" / "triggers.csv"]
-    has_mesh = read_stage(mesh) is not None
-    if has_mesh:
-        inputs += [mesh / "mesh.ply", mesh / "mesh.json"]
-    stage = Stage(name="evaluation", version=4, settings={"seed": config.seed}, inputs=inputs)
-
-    def work(folder: Path) -> None:
-        area = read_plan(plan / "plan.json").area.survey
-        terrain = read_terrain(truth / "terrain.ply")
-        rig, poses = read_rig(truth / "rig.json"), read_true_poses(truth / "poses.csv")
-        records = read_manifest(images / "manifest.csv")
-        with taken_from(sparse / "registration.json"):
-            total = int(read_json(sparse / "registration.json")["total"])
-        track = read_track_poses(sparse / "track.csv")
-        cameras = score_cameras(track, truth / "poses.csv", total)
-        moved = cameras.truth_from_world
-        pixel_m = ground_pixel_m(rig, {r.image: r.camera for r in records}, poses, terrain)
-        counter = partial(
-            count_stations,
-            rig=rig,
-            pictures={r.image: (r.camera, r.station) for r in records},
-            poses=poses,
-            terrain=terrain,
-        )
-        surface = score_surface(
-            dense / "dem.tif", area, terrain, moved, sigma=dense / "sigma.tif", stations=counter
-        )
-        painted = score_mosaic(
-            mosaic / "mosaic.tif",
-            dense / "dem.tif",
-            area,
-            terrain,
-            survey_texture(config.seed),
-            moved,
-        )
-        rng = np.random.default_rng([config.seed, _SEED_STREAM])
-        score: dict[str, Any] = {
-            "cameras": cameras.to_json(),
-            "surface": surface.to_json(pixel_m),
-            "mosaic": painted.to_json(),
-            "lengths": compare_lengths(painted.points_world, painted.points_true, rng),
-        }
-        if has_mesh:
-            score["mesh"] = score_mesh(*read_mesh(mesh), area, terrain, moved, pixel_m, rng)
-        score["overlaps"] = _rounded(overlaps_reached(workspace, truth))
-        write_json(folder / "score.json", score)
-        write_cameras(folder / "cameras.csv", cameras)
-        _write_errors(folder / "error.tif", dense / "dem.tif", surface.map_m)
-        plot_track(folder / "track.png", plan / "plan.json", cameras)
-        plot_errors(folder / "errors.png", surface, area)
-        plot_sheet(folder / "sheet.png", workspace, cameras, surface, area)
-
-    return run_stage(workspace, stage, work)
+    area = read_plan(plan / "plan.json").area.survey
+    terrain = read_terrain(truth / "terrain.ply")
+    rig, poses = read_rig(truth / "rig.json"), read_true_poses(truth / "poses.csv")
+    records = read_manifest(images / "manifest.csv")
+    total = RegistrationRecord.read(sparse / "registration.json").total
+    track = read_track_poses(sparse / "track.csv")
+    cameras = score_cameras(track, truth / "poses.csv", total)
+    moved = cameras.truth_from_world
+    pixel_m = ground_pixel_m(rig, {r.image: r.camera for r in records}, poses, terrain)
+    counter = partial(
+        count_stations,
+        rig=rig,
+        pictures={r.image: (r.camera, r.station) for r in records},
+        poses=poses,
+        terrain=terrain,
+    )
+    surface = score_surface(
+        dense / "dem.tif", area, terrain, moved, sigma=dense / "sigma.tif", stations=counter
+    )
+    painted = score_mosaic(
+        mosaic / "mosaic.tif", dense / "dem.tif", area, terrain, survey_texture(config.seed), moved
+    )
+    rng = np.random.default_rng([config.seed, _SEED_STREAM])
+    score: dict[str, Any] = {
+        "cameras": cameras.to_json(),
+        "surface": surface.to_json(pixel_m),
+        "mosaic": painted.to_json(),
+        "lengths": compare_lengths(painted.points_world, painted.points_true, rng),
+    }
+    if read_stage(mesh) is not None:
+        score["mesh"] = score_mesh(*read_mesh(mesh), area, terrain, moved, pixel_m, rng)
+    score["overlaps"] = _rounded(overlaps_reached(workspace, truth))
+    ScoreRecord.save(folder / "score.json", score)
+    write_cameras(folder / "cameras.csv", cameras)
+    _write_errors(folder / "error.tif", dense / "dem.tif", surface.map_m)
+    plot_track(folder / "track.png", plan / "plan.json", cameras)
+    plot_errors(folder / "errors.png", surface, area)
+    plot_sheet(folder / "sheet.png", workspace, cameras, surface, area)
 
 
 def _write_errors(path: Path, dem: Path, errors: Array) -> None:

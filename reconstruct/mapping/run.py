@@ -13,13 +13,15 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from alice_survey.base.artefacts import Stage, atomic_path, run_stage, write_json
-from alice_survey.base.config import ReconstructConfig
+from alice_survey.base.artefacts import atomic_path
+from alice_survey.base.config import ReconstructConfig, SurveyConfig
 from alice_survey.base.errors import ImageError, WorkspaceError, warn
 from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Datum
-from alice_survey.base.manifest import ImageRecord
-from camera_calib.rig import Rig
+from alice_survey.base.manifest import ImageRecord, read_manifest
+from alice_survey.base.records import CamerasRecord, MappingRecord, PicturesRecord
+from alice_survey.stages import rig_file
+from camera_calib.rig import Rig, read_rig
 from reconstruct.mapping.acceptance import check_survey
 from reconstruct.mapping.database import Observations, VerifiedPair
 from reconstruct.mapping.doming import doming_of_survey
@@ -45,6 +47,7 @@ from reconstruct.pictures.files import exif_focal_px
 from reconstruct.pictures.normalise import even_light, finely, normalise, read_deep
 from reconstruct.pictures.undistorted import read_colour, read_mask
 from reconstruct.views.lens import Lens, flat_port_lens
+from reconstruct.views.model import datum_of
 
 RATIO = 0.8
 """Largest distance of a match over that of the second nearest descriptor."""
@@ -64,7 +67,13 @@ class Inputs:
     """Folder of the pictures."""
     records: tuple[ImageRecord, ...]
     rig: Rig | None
-    datum: Datum | None
+    survey: PicturesRecord
+
+    @property
+    def datum(self) -> Datum | None:
+        """Of the local frame; None where pictures have no positions."""
+        place = self.survey.datum
+        return None if place is None else datum_of(place)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,106 +86,71 @@ class _FeatureTask:
     thrifty: bool
 
 
-def run_mapping(
-    workspace: Path,
-    inputs: Inputs,
-    files: Sequence[Path],
-    settings: ReconstructConfig,
-    seed: int,
-    executor: Executor,
-) -> bool:
-    """Write `mapping/`.
+def run_mapping(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
+    """Map the pictures of `images/`, with the rig of `calibration/` or `images/` if there is one.
 
-    Args:
-        workspace: folder of the survey.
-        inputs: pictures and what is known of them.
-        files: what `inputs` was read from, and the pictures.
-        settings: of the reconstruction.
-        seed: of the mapper.
-        executor: where tasks run.
-
-    Returns:
-        Whether there was anything to do.
+    Raises:
+        ImageError: there are too few pictures, or they are not those of the rig.
+        ReconstructionError: the pictures give no model.
     """
-    stage = Stage(
-        name="mapping",
-        version=4,
-        settings={
-            "seed": seed,
-            **settings.model_dump(
-                mode="json",
-                include={
-                    "feature_scale",
-                    "max_features",
-                    "working_range_m",
-                    "mapper",
-                    "refine_port",
-                    "refine_rig",
-                },
-            ),
-        },
-        inputs=files,
-        resumes=True,
+    with executor.started() as started:
+        _map(read_inputs(workspace), config.reconstruct, config.seed, started, folder)
+
+
+def _map(
+    inputs: Inputs, settings: ReconstructConfig, seed: int, executor: Executor, folder: Path
+) -> None:
+    pycolmap.logging.minloglevel = 2  # its own account of every step is for its developers
+    features = _find_all(inputs, folder / "features", settings, executor)
+    lenses, distances = _lenses(inputs, features, settings, executor)
+    cameras, exif_focal = _cameras(inputs, lenses)
+    pairs = _match_all(inputs, features, cameras, lenses, seed, executor)
+    refined = refine_tracks(
+        features,
+        [_grey_file(path) for path in features],
+        [(i, j, pair.matches) for i, j, pair in pairs],
+        executor=executor,
     )
-
-    def work(partial: Path) -> None:
-        with executor.started() as started:
-            map_pictures(partial, started)
-
-    def map_pictures(partial: Path, executor: Executor) -> None:
-        pycolmap.logging.minloglevel = 2  # its own account of every step is for its developers
-        features = _find_all(inputs, partial / "features", settings, executor)
-        lenses, distances = _lenses(inputs, features, settings, executor)
-        cameras, exif_focal = _cameras(inputs, lenses)
-        pairs = _match_all(inputs, features, cameras, lenses, seed, executor)
-        refined = refine_tracks(
-            features,
-            [_grey_file(path) for path in features],
-            [(i, j, pair.matches) for i, j, pair in pairs],
+    seen = Observations(
+        images=inputs.records,
+        cameras=cameras,
+        pixels=[
+            as_seen(pixels, lenses.get(record.camera))
+            for record, pixels in zip(inputs.records, refined.pixels, strict=True)
+        ],
+        pairs=pairs,
+    )
+    if inputs.rig is not None:
+        poses = {name: inputs.rig.cam_from_rig[name] for name in cameras}
+        mapped = map_calibrated(
+            seen,
+            poses,
+            lenses,
+            folder,
+            seed,
+            method=settings.mapper,
             executor=executor,
         )
-        seen = Observations(
-            images=inputs.records,
-            cameras=cameras,
-            pixels=[
-                as_seen(pixels, lenses.get(record.camera))
-                for record, pixels in zip(inputs.records, refined.pixels, strict=True)
-            ],
-            pairs=pairs,
-        )
-        if inputs.rig is not None:
-            poses = {name: inputs.rig.cam_from_rig[name] for name in cameras}
-            mapped = map_calibrated(
-                seen,
-                poses,
-                lenses,
-                partial,
-                seed,
-                method=settings.mapper,
-                executor=executor,
+        adjust = NavigationAdjuster(inputs.records, inputs.rig, lenses, inputs.datum)
+        rig, free = inputs.rig, frees_rig(settings, inputs.rig, list(cameras))
+        mapped, refracted = refract(mapped, seen, folder, adjust, poses, settle=not free)
+        if free:
+            found = refine_as_set(
+                mapped, seen, rig, distances, adjust, inputs.datum, folder, settings
             )
-            adjust = NavigationAdjuster(inputs.records, inputs.rig, lenses, inputs.datum)
-            rig, free = inputs.rig, frees_rig(settings, inputs.rig, list(cameras))
-            mapped, refracted = refract(mapped, seen, partial, adjust, poses, settle=not free)
-            if free:
-                found = refine_as_set(
-                    mapped, seen, rig, distances, adjust, inputs.datum, partial, settings
-                )
-                if isinstance(found, RefinedSurvey):
-                    mapped, refracted, adjust = found.mapped, found.convergence, found.adjust
-                    seen, rig = found.seen, found.rig
-                else:
-                    mapped = replace(mapped, notes=(*mapped.notes, found))
-                    mapped, refracted = refract(mapped, seen, partial, adjust, poses)
-            sigmas = adjust.sigmas
-        else:
-            mapped = map_self_calibrated(seen, exif_focal, partial, seed)
-            refracted, sigmas, rig = None, None, None
-        save_uncertainty(partial, mapped, seen, rig, sigmas)
-        _write(partial, inputs, mapped, distances, refracted)
-        shutil.rmtree(partial / "features")
-
-    return run_stage(workspace, stage, work)
+            if isinstance(found, RefinedSurvey):
+                mapped, refracted, adjust = found.mapped, found.convergence, found.adjust
+                seen, rig = found.seen, found.rig
+            else:
+                mapped = replace(mapped, notes=(*mapped.notes, found))
+                mapped, refracted = refract(mapped, seen, folder, adjust, poses)
+        sigmas = adjust.sigmas
+    else:
+        mapped = map_self_calibrated(seen, exif_focal, folder, seed)
+        refracted, sigmas, rig = None, None, None
+    save_uncertainty(folder, mapped, seen, rig, sigmas)
+    _write(folder, inputs, mapped, distances, refracted)
+    shutil.rmtree(folder / "features")
 
 
 def extract(task: _FeatureTask) -> int:
@@ -339,7 +313,7 @@ def _write(
         warn(f"{len(lost)} of {len(inputs.records)} pictures are not in the model: {named(lost)}")
     (partial / "model").mkdir(exist_ok=True)
     model.write_binary(partial / "model")
-    write_json(
+    CamerasRecord.save(
         partial / "cameras.json",
         {
             "cameras": {name: lens.to_json() for name, lens in mapped.lenses.items()},
@@ -359,7 +333,7 @@ def _write(
         None if doming is None else doming.scale,
     )
     content = b"".join(p.read_bytes() for p in sorted((partial / "model").iterdir()))
-    write_json(
+    MappingRecord.save(
         partial / "mapping.json",
         {
             "registered": len(registered),
@@ -376,6 +350,28 @@ def _write(
             "notes": list(mapped.notes),
         },
     )
+
+
+def read_inputs(workspace: Path) -> Inputs:
+    """Pictures, rig and datum of a workspace.
+
+    Raises:
+        ImageError: there are fewer than two pictures, or they are not those of the rig.
+        WorkspaceError: a file is missing or damaged.
+    """
+    images = workspace / "images"
+    records = read_manifest(images / "manifest.csv")
+    if len(records) < 2:
+        raise ImageError(f"{images / 'manifest.csv'}: {len(records)} pictures; a model needs 2")
+    rig = rig_file(workspace)
+    inputs = Inputs(
+        images=images,
+        records=tuple(records),
+        rig=None if rig is None else read_rig(rig),
+        survey=PicturesRecord.read(images / "survey.json"),
+    )
+    check_sizes(inputs)
+    return inputs
 
 
 def named(images: Sequence[str]) -> str:

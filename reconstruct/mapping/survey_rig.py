@@ -12,10 +12,10 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.artefacts import write_json
 from alice_survey.base.config import ReconstructConfig
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array, Datum
+from alice_survey.base.records import PortRecord
 from camera_calib.freedom import pose_names
 from camera_calib.rig import Rig, write_rig
 from reconstruct.mapping.arrays import frames_of
@@ -152,7 +152,7 @@ def refine_rig(
     adjust = NavigationAdjuster(seen.images, fit.rig, lenses, datum)
     poses = {name: fit.rig.cam_from_rig[name] for name in seen.cameras}
     refined, convergence = refract(again[0], again[1], folder, adjust, poses, near=True)
-    write_json(folder / "port.json", fit.to_json())
+    PortRecord.save(folder / "port.json", fit.to_json())
     write_rig(folder / "rig.json", fit.rig)
     return RefinedSurvey(
         mapped=refined, seen=again[1], rig=fit.rig, convergence=convergence, adjust=adjust

@@ -6,12 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.artefacts import Stage, need_stage, read_json, run_stage, write_json
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
-from alice_survey.base.contents import taken_from
 from alice_survey.base.errors import warn
 from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
+from alice_survey.base.records import CloudRecord, MeshRecord
 from alice_survey.base.run import progress
 from reconstruct.light.solve import read_light
 from reconstruct.mesh.formats import GLB_AXES, write_glb, write_mesh_ply, write_obj
@@ -26,7 +25,6 @@ from reconstruct.raster import write_png
 from reconstruct.views.model import (
     SparseModel,
     WorldFrame,
-    picture_files,
     points_of_views,
     read_model,
 )
@@ -37,40 +35,14 @@ _LIFT_STEPS = 0.5
 """Height over the surface, in spacings of the cloud, at which lines of sight start."""
 
 
-def run_mesh(workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
-    """Mesh and texture a finished surface and write `mesh/`.
-
-    Returns:
-        True when done, False when nothing had changed.
+def run_mesh(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
+    """Mesh and texture a finished surface.
 
     Raises:
         ReconstructionError: the cloud carries no surface.
-        WorkspaceError: a stage is missing.
+        WorkspaceError: the model or the cloud is damaged.
     """
-    need_stage(workspace, "images", "image")
-    sparse = need_stage(workspace, "sparse", "reconstruct")
-    dense = need_stage(workspace, "dense", "reconstruct")
-    model = read_model(sparse)
-    settings = config.reconstruct.model_dump(
-        mode="json", include={"mesh_triangles", "mesh_error_px", "mesh_page_px"}
-    )
-    stage = Stage(
-        name="mesh",
-        version=1,
-        settings=settings,
-        inputs=[
-            sparse,
-            dense / "cloud.ply",
-            dense / "cloud.json",
-            dense / "light.json",
-            *picture_files(workspace, sparse, model),
-        ],
-    )
-
-    def work(folder: Path) -> None:
-        build_mesh(workspace, model, folder, config.reconstruct, executor)
-
-    return run_stage(workspace, stage, work)
+    build_mesh(workspace, read_model(workspace / "sparse"), folder, config.reconstruct, executor)
 
 
 def build_mesh(
@@ -82,11 +54,9 @@ def build_mesh(
 ) -> None:
     """Do the work of the stage in a folder; see `run_mesh`."""
     dense = workspace / "dense"
-    about = read_json(dense / "cloud.json")
+    about = CloudRecord.read(dense / "cloud.json")
     light = read_light(dense / "light.json")
-    with taken_from(dense / "cloud.json"):
-        offset = np.array([float(v) for v in about["offset_east_north_up"]]).reshape(3)
-        step = float(about["thinned_to"])
+    offset, step = np.array(about.offset_east_north_up), about.thinned_to
     pixel = ground_pixel(model)
     views = [view for view in model.views if view.image in light.gains]
     cloud = open_cloud(dense / "cloud.ply")
@@ -142,7 +112,7 @@ def write_mesh(folder: Path, mesh: Textured, facts: dict[str, Any]) -> None:
     write_obj(folder / "mesh.obj", mesh, comments)
     triangles = mesh.wedges.vertex[mesh.wedges.triangles].astype(np.int32)
     write_mesh_ply(folder / "mesh.ply", mesh.vertices, triangles, mesh.colours, comments)
-    write_json(folder / "mesh.json", facts)
+    MeshRecord.save(folder / "mesh.json", facts)
     write_png(folder / "mesh.png", render_oblique(mesh))
 
 

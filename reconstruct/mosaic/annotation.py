@@ -17,10 +17,10 @@ import rasterio.shutil
 from numpy.typing import NDArray
 from rasterio.windows import Window
 
-from alice_survey.base.artefacts import atomic_path, need_stage, read_json, write_csv
-from alice_survey.base.contents import taken_from
+from alice_survey.base.artefacts import atomic_path, need_stage, write_csv
 from alice_survey.base.errors import ConfigError
 from alice_survey.base.executor import progress
+from alice_survey.base.records import MosaicRecord
 
 LARGEST_SIDE_PX = 32_767
 _STRIP = 512
@@ -64,9 +64,8 @@ def mosaic_tiles(
     if not 0 <= overlap_px < side_px:
         raise ConfigError(f"overlap of {overlap_px} px: give 0 to {side_px - 1}, less than a side")
     mosaic = need_stage(workspace, "mosaic", "reconstruct")
-    with taken_from(mosaic / "mosaic.json"):
-        about = read_json(mosaic / "mosaic.json")
-        unit, pixel = str(about["unit"]), float(about["pixel"])
+    about = MosaicRecord.read(mosaic / "mosaic.json")
+    unit, pixel = about.unit, about.pixel
     folder.mkdir(parents=True, exist_ok=True)
     rows = []
     with rasterio.open(mosaic / "mosaic.tif") as raster:

@@ -14,10 +14,9 @@ from typing import Any, Literal
 import numpy as np
 import rasterio
 
-from alice_survey.base.artefacts import Stage, need_stage, read_json, run_stage, write_json
 from alice_survey.base.config import ReconstructConfig, SurveyConfig, WaterConfig
-from alice_survey.base.contents import taken_from
 from alice_survey.base.executor import Executor
+from alice_survey.base.records import MosaicRecord, PicturesRecord
 from reconstruct.light.solve import joined_samples
 from reconstruct.mosaic.blend import SUPPORT_PX
 from reconstruct.mosaic.colour import ColourModel, solve_colour
@@ -48,8 +47,8 @@ from reconstruct.mosaic.visibility import Water
 from reconstruct.mosaic.writers import cloud_optimised, thumbnail, write_labels, write_tiles
 from reconstruct.placing.track_figure import plot_track_over
 from reconstruct.raster import DemGrid, opened_raster, round_cell
-from reconstruct.views.lens import FlatPortLens, lens_from_json
-from reconstruct.views.model import SparseModel, picture_files, read_model
+from reconstruct.views.lens import FlatPortLens
+from reconstruct.views.model import SparseModel, read_lenses, read_model
 
 _TILE_PX = 1024
 _GROUP = 2
@@ -69,37 +68,17 @@ _TEMPERATURE_C, _SALINITY_PSU = 15.0, 35.0
 """Of the sea where nobody says; red and blue move by 2 % of their dispersion from 5 to 30 C."""
 
 
-def run_mosaic(workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
-    """Paint the mosaic on a finished surface and write `mosaic/`.
-
-    Returns:
-        True when done, False when nothing had changed.
+def run_mosaic(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
+    """Paint the mosaic on a finished surface.
 
     Raises:
         ReconstructionError: the surface has no cell.
-        WorkspaceError: a stage is missing.
+        WorkspaceError: the model or the surface is damaged.
     """
-    need_stage(workspace, "images", "image")
-    sparse = need_stage(workspace, "sparse", "reconstruct")
-    dense = need_stage(workspace, "dense", "reconstruct")
-    model = read_model(sparse)
-    settings = config.reconstruct.model_dump(
-        mode="json", include={"mosaic_pixel_m", "colour", "dispersion"}
-    )
-    stage = Stage(
-        name="mosaic",
-        version=5,
-        settings={**settings, "water": config.water.model_dump(mode="json")},
-        inputs=[sparse, dense / "dem.tif", *picture_files(workspace, sparse, model)],
-    )
-
+    model = read_model(workspace / "sparse")
     sea = _sea(config.water, config.area.seafloor_depth_m)
-
-    def work(folder: Path) -> None:
-        with rasterio.Env(GDAL_CACHEMAX=_CACHE_MIB << 20):
-            build_mosaic(workspace, model, folder, config.reconstruct, sea, executor)
-
-    return run_stage(workspace, stage, work)
+    with rasterio.Env(GDAL_CACHEMAX=_CACHE_MIB << 20):
+        build_mosaic(workspace, model, folder, config.reconstruct, sea, executor)
 
 
 def build_mosaic(
@@ -170,7 +149,7 @@ def build_mosaic(
     plot_track_over(folder / "mosaic.tif", workspace / "sparse" / "track.csv", folder / "track.png")
     shutil.rmtree(scratch)
     write_footprints(folder, model.views, [outline for _, outline in measured], model.frame)
-    write_json(
+    MosaicRecord.save(
         folder / "mosaic.json",
         {
             "format": "alice-survey mosaic",
@@ -254,10 +233,7 @@ def _dispersion(
     workspace: Path, wanted: str, sea: tuple[Water, bool], *, grey: bool
 ) -> tuple[Water | None, dict[str, Any]]:
     """The water through which colours are distinguished, or None, and what to say about it."""
-    path = workspace / "sparse" / "cameras.json"
-    with taken_from(path):
-        cameras = read_json(path)["cameras"]
-        lenses = [lens_from_json(camera) for camera in cameras.values()]
+    lenses = read_lenses(workspace / "sparse" / "cameras.json").values()
     ports = any(isinstance(lens, FlatPortLens) and lens.camera.n_water > 1 for lens in lenses)
     reason = ""
     if wanted == "off":
@@ -280,9 +256,7 @@ def _dispersion(
 
 
 def _simulated(workspace: Path) -> bool:
-    path = workspace / "images" / "survey.json"
-    with taken_from(path):
-        return bool(read_json(path).get("source") == "simulated")
+    return PicturesRecord.read(workspace / "images" / "survey.json").source == "simulated"
 
 
 def _sea(config: WaterConfig, depth_m: float) -> tuple[Water, bool]:

@@ -10,11 +10,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from alice_survey.base.artefacts import Stage, run_stage, write_json
+from alice_survey.base.artefacts import Stage, run_stage
 from alice_survey.base.errors import ImageError, NavigationError, WorkspaceError, warn
 from alice_survey.base.executor import SERIAL, Executor, progress
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import ImageRecord, read_manifest, write_manifest
+from alice_survey.base.records import PicturesRecord
 from camera_calib.rig import Rig, read_rig, write_rig
 from missions.logs.navigation_csv import (
     OPTIONAL,
@@ -194,7 +195,7 @@ def import_images(
         write_manifest(partial / "manifest.csv", records)
         if known_rig is not None:
             write_rig(partial / "rig.json", known_rig)
-        write_json(
+        PicturesRecord.save(
             partial / "survey.json",
             {"source": "imported", "datum": datum, "vertical_datum": level, "notes": notes},
         )

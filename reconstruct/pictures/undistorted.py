@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.artefacts import read_json
 from alice_survey.base.errors import ImageError, WorkspaceError
 from alice_survey.base.frames import Array
+from alice_survey.base.records import CamerasRecord
 from camera_calib.picture_files import read_pixels
 from reconstruct.pictures.normalise import Grey, normalise
 from reconstruct.views.lens import Lens, lens_from_json
@@ -137,13 +137,10 @@ class Pictures:
     @classmethod
     def from_json(cls, images: Path, cameras_json: Path) -> "Pictures":
         """As `open`, from the folder of the pictures and a file of cameras."""
-        data = read_json(cameras_json)
-        try:
-            lenses = {name: lens_from_json(lens) for name, lens in data["cameras"].items()}
-            pictures = cls(images, lenses, {n: i["camera"] for n, i in data["images"].items()})
-            pictures._masks = {n: i["mask"] for n, i in data["images"].items() if i["mask"]}
-        except (KeyError, TypeError, AttributeError) as error:
-            raise WorkspaceError(f"{cameras_json}: lacks {error}") from None
+        stored = CamerasRecord.read(cameras_json)
+        lenses = {name: lens_from_json(lens) for name, lens in stored.cameras.items()}
+        pictures = cls(images, lenses, {name: i.camera for name, i in stored.images.items()})
+        pictures._masks = {name: i.mask for name, i in stored.images.items() if i.mask}
         return pictures
 
     def lens(self, image: str) -> Lens:

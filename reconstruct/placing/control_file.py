@@ -28,8 +28,9 @@ import numpy as np
 
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.frames import Array, Datum
+from alice_survey.stages import CONTROL_FILES
 
-CONTROL_FILE, PICKS_FILE, MARKERS_FILE = "control.csv", "picks.csv", "markers.csv"
+CONTROL_FILE, PICKS_FILE, MARKERS_FILE = CONTROL_FILES
 PICK_SIGMA_PX = 0.5
 Use = Literal["control", "check"]
 
@@ -170,12 +171,6 @@ def read_picks(path: Path) -> list[Pick]:
             )
         )
     return picks
-
-
-def control_files(workspace: Path) -> list[Path]:
-    """Those of the three files that are there."""
-    names = (CONTROL_FILE, PICKS_FILE, MARKERS_FILE)
-    return [workspace / name for name in names if (workspace / name).is_file()]
 
 
 def _point(

@@ -3,19 +3,18 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.artefacts import read_json
 from alice_survey.base.config import ReconstructConfig
-from alice_survey.base.contents import taken_from
 from alice_survey.base.errors import ReconstructionError, WorkspaceError, warn
 from alice_survey.base.frames import Datum
 from alice_survey.base.manifest import ImageRecord
+from alice_survey.base.records import MappingRecord, PicturesRecord, ScaleRecord
 from alice_survey.base.run import progress
+from alice_survey.stages import SCALE_FILE
 from camera_calib.rig import Rig
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.control import ControlFit, tie_control
@@ -32,8 +31,6 @@ from reconstruct.placing.picked_points import Camera, find_spots
 from reconstruct.views.lens import Lens
 from reconstruct.views.model import WorldFrame
 
-SCALE_FILE = "scale.json"
-"""In the workspace: one known length, as `scale_model` writes it."""
 RIG_SCALE_SIGMA = 1e-3
 """Relative, of a scale that a rig gives, where control may correct it: what calibrated rigs reach
 (600 ppm in the built-in demo; the baseline's own sigma leaves out the angle between cameras)."""
@@ -68,8 +65,8 @@ class Placing:
     lenses: Mapping[str, Lens]
     rig: Rig | None
     datum: Datum | None
-    survey: Mapping[str, Any]
-    mapping: Mapping[str, Any]
+    survey: PicturesRecord
+    mapping: MappingRecord
     settings: ReconstructConfig
 
 
@@ -92,11 +89,11 @@ def find_place(task: Placing) -> Placed:
     datum = task.datum or control.datum()
     ties = _tie(task, control, datum)
     fit = _fit(task, levelled, scale, known, ties, datum)
-    notes = [*task.survey.get("notes", []), *task.mapping["notes"]]
+    notes = [*task.survey.notes, *task.mapping.notes]
     shown = ties if control.points or control.lengths else None
     if fit is not None:
         source = _scale_source(known, ties)
-        vertical = str(task.survey["vertical_datum"]) if task.datum else _VERTICAL_OF_CONTROL
+        vertical = str(task.survey.vertical_datum) if task.datum else _VERTICAL_OF_CONTROL
         frame = WorldFrame(
             name="model" if datum is None else "ned",
             datum=datum,
@@ -244,25 +241,21 @@ def _scale_source(known: _KnownScale | None, ties: ControlFit) -> str:
     return f"scale from {found}" if known is None else f"{source}, corrected by {found}"
 
 
-def _known_scale(workspace: Path, mapping: Mapping[str, Any]) -> _KnownScale | None:
-    """None where nothing but navigation or control determines it."""
-    if mapping["scaled"]:
+def _known_scale(workspace: Path, mapping: MappingRecord) -> _KnownScale | None:
+    """None where nothing but navigation or control gives it."""
+    if mapping.scaled:
         return _KnownScale(scale=1.0, source="scale from the calibrated rig", sigma=RIG_SCALE_SIGMA)
     path = workspace / SCALE_FILE
-    if not path.is_file():
+    measured = ScaleRecord.made(path)
+    if measured is None:
         return None
-    scale = read_json(path)
-    with taken_from(path):
-        metres_per_unit = float(scale["metres_per_unit"])
-        if not 0 < metres_per_unit < float("inf"):
-            raise ValueError(f"metres_per_unit = {metres_per_unit}")
-    if scale.get("gauge") != mapping["gauge"]:
+    if measured.gauge != mapping.gauge:
         raise ReconstructionError(
             f"{path} measures an earlier model: remove it, run 'alice-survey reconstruct', and "
             "measure the known length again with 'alice-survey scale'"
         )
     return _KnownScale(
-        scale=metres_per_unit,
+        scale=measured.metres_per_unit,
         source="scaled by one known length",
         sigma=LENGTH_SCALE_SIGMA,
     )

@@ -9,11 +9,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from alice_survey.base.artefacts import need_stage, read_json, read_stage, write_csv
+from alice_survey.base.artefacts import need_stage, read_stage, write_csv
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.executor import SERIAL, Executor
 from alice_survey.base.frames import Array, Datum
 from alice_survey.base.manifest import read_manifest
+from alice_survey.base.records import ControlRecord
 from reconstruct.pictures.undistorted import Pictures, read_colour
 from reconstruct.placing.control import describe
 from reconstruct.placing.control_file import (
@@ -199,5 +200,4 @@ def _score(workspace: Path) -> dict[str, Any] | None:
     path = workspace / "sparse" / "control.json"
     if read_stage(workspace / "sparse") is None or not path.is_file():
         return None
-    score: dict[str, Any] = read_json(path)
-    return score
+    return ControlRecord.read(path).to_json()

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.artefacts import need_stage, read_json, write_json
-from alice_survey.base.contents import taken_from
+from alice_survey.base.artefacts import need_stage
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array
+from alice_survey.base.records import MappingRecord, RegistrationRecord, ScaleRecord
+from alice_survey.stages import SCALE_FILE
 from reconstruct.pictures.undistorted import Pictures
-from reconstruct.placing.find_place import SCALE_FILE
 from reconstruct.views.model import SparseModel, View, read_model
 
 _NEIGHBOURS = 15
@@ -47,10 +47,8 @@ def scale_model(workspace: Path, points: str, length_m: float) -> str:
     if not (math.isfinite(length_m) and length_m > 0):
         raise ReconstructionError(f"--length {length_m}: the true distance must be more than 0 m")
     sparse = need_stage(workspace, "sparse", "reconstruct")
-    mapping = read_json(workspace / "mapping" / "mapping.json")
-    with taken_from(workspace / "mapping" / "mapping.json"):
-        scaled, gauge = bool(mapping["scaled"]), mapping["gauge"]
-    if scaled:
+    mapping = MappingRecord.read(workspace / "mapping" / "mapping.json")
+    if mapping.scaled:
         raise ReconstructionError("the calibrated rig has scaled this model already")
     tokens = points.split()
     if len(tokens) != 2:
@@ -60,14 +58,12 @@ def scale_model(workspace: Path, points: str, length_m: float) -> str:
     model = read_model(sparse)
     pictures = Pictures.open(workspace)
     first, second = (find_point(token, model, pictures) for token in tokens)
-    with taken_from(sparse / "registration.json"):
-        registration = read_json(sparse / "registration.json")
-        world_per_unit = float(registration["world_per_mapping_unit"])
+    world_per_unit = RegistrationRecord.read(sparse / "registration.json").world_per_mapping_unit
     distance = float(np.linalg.norm(second - first))
     if not distance > 0:
         raise ReconstructionError(f"the two points are one and the same: {points!r}")
     metres_per_unit = length_m * world_per_unit / distance
-    write_json(
+    ScaleRecord.save(
         workspace / SCALE_FILE,
         {
             "format": "alice-survey scale",
@@ -75,7 +71,7 @@ def scale_model(workspace: Path, points: str, length_m: float) -> str:
             "points": tokens,
             "length_m": length_m,
             "metres_per_unit": metres_per_unit,
-            "gauge": gauge,
+            "gauge": mapping.gauge,
         },
     )
     return (

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.artefacts import read_json, write_json
 from alice_survey.base.contents import taken_from
 from alice_survey.base.frames import Array, Datum
-from reconstruct.views.lens import lens_from_json
+from alice_survey.base.records import CamerasRecord, FrameRecord, PlaceRecord
+from reconstruct.views.lens import Lens, lens_from_json
 from reconstruct.views.range_shift import RangeShift, no_shift, range_shift
 
 _ENU_FROM_WORLD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -115,20 +115,13 @@ class SparseModel:
 def write_frame(path: Path, frame: WorldFrame) -> None:
     """Write `frame.json`."""
     datum = frame.datum
-    data: dict[str, Any] = {
-        "name": frame.name,
-        "datum": None
-        if datum is None
-        else {
-            "latitude_deg": datum.latitude_deg,
-            "longitude_deg": datum.longitude_deg,
-            "height_m": datum.height_m,
-        },
-        "scaled": frame.scaled,
-        "vertical_datum": frame.vertical_datum,
-        "notes": list(frame.notes),
-    }
-    write_json(path, data)
+    FrameRecord(
+        name=frame.name,
+        datum=None if datum is None else _place(datum),
+        scaled=frame.scaled,
+        vertical_datum=frame.vertical_datum,
+        notes=frame.notes,
+    ).write(path)
 
 
 def read_frame(path: Path) -> WorldFrame:
@@ -137,38 +130,34 @@ def read_frame(path: Path) -> WorldFrame:
     Raises:
         WorkspaceError: it is missing, or not as it was written.
     """
-    data = read_json(path)
-    with taken_from(path):
-        if data["name"] not in ("ned", "model") or not isinstance(data["scaled"], bool):
-            raise ValueError("name or scaled")
-        texts = (data["vertical_datum"], *data["notes"])
-        if not all(isinstance(text, str) for text in texts):
-            raise ValueError("vertical_datum or notes")
-        return WorldFrame(
-            name=data["name"],
-            datum=None if data["datum"] is None else datum_of(data["datum"]),
-            scaled=data["scaled"],
-            vertical_datum=data["vertical_datum"],
-            notes=tuple(data["notes"]),
-        )
+    stored = FrameRecord.read(path)
+    return WorldFrame(
+        name=stored.name,
+        datum=None if stored.datum is None else datum_of(stored.datum),
+        scaled=stored.scaled,
+        vertical_datum=stored.vertical_datum,
+        notes=stored.notes,
+    )
 
 
-def datum_of(data: dict[str, Any]) -> Datum:
-    """The datum of a JSON object.
+def _place(datum: Datum) -> PlaceRecord:
+    return PlaceRecord(
+        latitude_deg=datum.latitude_deg, longitude_deg=datum.longitude_deg, height_m=datum.height_m
+    )
+
+
+def datum_of(place: PlaceRecord) -> Datum:
+    """The datum that a file of a workspace names."""
+    return Datum(place.latitude_deg, place.longitude_deg, place.height_m)
+
+
+def read_lenses(path: Path) -> dict[str, Lens]:
+    """The lenses of `cameras.json`, by camera.
 
     Raises:
-        KeyError: it lacks a value.
-        ValueError: it is no place on Earth, or holds something else.
+        WorkspaceError: it is missing, or a camera is wrong.
     """
-    place = float(data["latitude_deg"]), float(data["longitude_deg"])
-    height_m = float(data.get("height_m", 0.0))
-    known = {"latitude_deg", "longitude_deg", "height_m"}
-    if (
-        not (abs(place[0]) <= 90 and abs(place[1]) <= 360 and abs(height_m) < 1e5)
-        or data.keys() - known
-    ):
-        raise ValueError(f"datum {data}")
-    return Datum(*place, height_m)
+    return {name: lens_from_json(lens) for name, lens in CamerasRecord.read(path).cameras.items()}
 
 
 def read_model(sparse: str | Path) -> SparseModel:
@@ -186,15 +175,15 @@ def read_model(sparse: str | Path) -> SparseModel:
     sparse = Path(sparse)
     from reconstruct.views.model_files import read_reconstruction
 
-    stored = read_json(sparse / "cameras.json")
+    stored = CamerasRecord.read(sparse / "cameras.json")
     frame = read_frame(sparse / "frame.json")
     model = read_reconstruction(sparse / "model")
     with taken_from(sparse / "cameras.json"):
         return _model(stored, frame, model)
 
 
-def _model(stored: dict[str, Any], frame: WorldFrame, model: Any) -> SparseModel:
-    cameras = stored["images"]
+def _model(stored: CamerasRecord, frame: WorldFrame, model: Any) -> SparseModel:
+    cameras = stored.images
     shifts = _shifts(stored, frame)
     images = sorted(
         (i for i in model.images.values() if i.has_pose), key=lambda image: str(image.name)
@@ -210,8 +199,8 @@ def _model(stored: dict[str, Any], frame: WorldFrame, model: Any) -> SparseModel
         views.append(
             View(
                 image=image.name,
-                camera=cameras[image.name]["camera"],
-                station=cameras[image.name]["station"],
+                camera=cameras[image.name].camera,
+                station=cameras[image.name].station,
                 width_px=camera.width,
                 height_px=camera.height,
                 fx_px=fx,
@@ -219,7 +208,7 @@ def _model(stored: dict[str, Any], frame: WorldFrame, model: Any) -> SparseModel
                 cx_px=cx,
                 cy_px=cy,
                 world_from_cam=pose.inv(),
-                shift=shifts.get(cameras[image.name]["camera"]),
+                shift=shifts.get(cameras[image.name].camera),
             )
         )
     view_of = {image.image_id: index for index, image in enumerate(images)}
@@ -237,13 +226,13 @@ def _model(stored: dict[str, Any], frame: WorldFrame, model: Any) -> SparseModel
     )
 
 
-def _shifts(stored: dict[str, Any], frame: WorldFrame) -> dict[str, RangeShift]:
+def _shifts(stored: CamerasRecord, frame: WorldFrame) -> dict[str, RangeShift]:
     """By camera; none for cameras without a port, and none where lengths are not known."""
     if not frame.scaled:
         return {}
     return {
         name: range_shift(lens_from_json(lens))
-        for name, lens in stored["cameras"].items()
+        for name, lens in stored.cameras.items()
         if lens["kind"] == "flat_port"
     }
 
@@ -272,16 +261,6 @@ def scaled_view(view: View, scale: float) -> View:
         cy_px=view.cy_px * sy,
         shift=None if view.shift is None else view.shift.scaled(sx, sy),
     )
-
-
-def picture_files(workspace: Path, sparse: Path, model: SparseModel) -> list[Path]:
-    """The registered pictures and their masks."""
-    images = workspace / "images"
-    names = [view.image for view in model.views]
-    with taken_from(sparse / "cameras.json"):
-        about = read_json(sparse / "cameras.json")["images"]
-        masks = [str(about[name]["mask"]) for name in names if about[name].get("mask")]
-    return [images / name for name in [*names, *masks]]
 
 
 def enu_from_cam(view: View, offset_enu: Array) -> Array:

@@ -17,7 +17,8 @@ from typer.testing import CliRunner
 
 from alice_survey.base.config import SurveyConfig, load_config
 from alice_survey.cli.main import app, main
-from alice_survey.survey import LOOP, init_survey
+from alice_survey.stages import names
+from alice_survey.survey import init_survey
 
 COMMANDS = (
     "init", "fov", "target", "plan", "fly", "image", "calibrate", "import-images", "reconstruct",
@@ -184,11 +185,41 @@ def test_stages_name_the_command_that_is_missing(
     assert "'alice-survey image'" in fails(["evaluate", "-w", "w"], capsys, monkeypatch)
 
 
+@pytest.mark.parametrize(("where", "named"), [("reef", "../reef.geojson"), (".", "reef.geojson")])
+def test_init_names_the_area_from_the_folder_of_the_settings(
+    where: str, named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A survey and its area may be moved together."""
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    (here / "reef.geojson").write_text("{}")
+    path = init_survey(Path(where), area=Path("reef.geojson"))
+    assert f'file = "{named}"' in path.read_text()
+    moved = here.rename(tmp_path / "moved")
+    file = load_config(moved / where / "survey.toml").area.file
+    assert file is not None
+    assert file.samefile(moved / "reef.geojson")
+
+
+def test_reconstruct_in_a_folder_of_pictures_names_the_command_that_takes_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "photos" / "day1").mkdir(parents=True)
+    (tmp_path / "photos" / "day1" / "IMG_1.JPG").write_bytes(b"")
+    shown = fails(["reconstruct", "-w", "photos"], capsys, monkeypatch)
+    assert "'alice-survey import-images photos -w" in shown
+    assert "init" not in shown
+    assert "'alice-survey init" in fails(["plan", "-w", "photos"], capsys, monkeypatch)
+    assert not (tmp_path / "photos" / ".lock").exists()
+
+
 def test_status_names_the_next_command(tmp_path: Path) -> None:
     init_survey(tmp_path)
     shown = CliRunner().invoke(app, ["status", "-w", str(tmp_path), "--json"])
     data = json.loads(shown.output)
-    assert data["stages"] == dict.fromkeys(LOOP, "missing")
+    assert data["stages"] == dict.fromkeys(names(), "missing")
     assert data["next"] == f"alice-survey plan -w {tmp_path}"
 
 

@@ -174,7 +174,7 @@ def _survey_json() -> dict[str, Any]:
 
 def read_inputs(path: Path) -> object:
     """As `reconstruct` begins: `images/` of a workspace."""
-    from reconstruct.placing.run import read_inputs
+    from reconstruct.mapping.run import read_inputs
 
     return read_inputs(path.parents[1])
 

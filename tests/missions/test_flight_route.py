@@ -12,6 +12,7 @@ from shapely.geometry import MultiPolygon, Polygon, box
 from alice_survey.base.config import CameraConfig, SurveyConfig, WaterConfig, parse_config
 from alice_survey.base.errors import PlanError, VehicleError
 from alice_survey.base.executor import SERIAL
+from alice_survey.stages import spec
 from alice_survey.vehicle.floor import level_floor
 from alice_survey.vehicle.pilot.memory import FOLLOW, LEG, PHASE
 from camera_calib.rig import design_rig
@@ -23,7 +24,6 @@ from missions.fly.flight_route import (
     stations_of_dives,
     whole_route,
 )
-from missions.fly.run import run_fly
 from missions.fly.simulation import flight_settings, longest_mission_s, simulate_plan
 from missions.values.flight import Flight
 from missions.values.plan_file import Plan
@@ -192,8 +192,8 @@ def test_the_settings_choose_the_dive(tmp_path: Path) -> None:
     write_json(folder / "plan.json", PLAN.to_json())
     write_json(folder / "stage.json", {})
     config = survey(vehicle={"dive": 2}, seafloor={"grid_m": 0.05})
-    assert run_fly(tmp_path, config, SERIAL)
+    assert spec("fly").make(tmp_path, config, SERIAL)
     found = json.loads((tmp_path / "flight" / "flight.json").read_text())
     assert (found["stations"], found["stations_planned"]) == (6, 6)
     with pytest.raises(PlanError, match="dive 3 is asked for"):
-        run_fly(tmp_path, survey(vehicle={"dive": 3}, seafloor={"grid_m": 0.05}), SERIAL)
+        spec("fly").make(tmp_path, survey(vehicle={"dive": 3}, seafloor={"grid_m": 0.05}), SERIAL)

@@ -11,10 +11,10 @@ from alice_survey.base.errors import VehicleError, WorkspaceError
 from alice_survey.base.executor import SERIAL
 from alice_survey.base.frames import interpolate_poses
 from alice_survey.base.trajectory import read_columns, read_track
+from alice_survey.stages import spec
 from alice_survey.survey import FlightChanges, run
 from alice_survey.vehicle.log import read_vehicle_log
-from missions.fly.run import run_fly
-from missions.plan.run import read_plan, run_plan
+from missions.values.plan_file import read_plan
 from tests.missions.flown_plans import terrain_of
 
 FILES = (
@@ -38,31 +38,31 @@ def survey(**changes: object) -> SurveyConfig:
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("survey")
-    run_plan(folder, survey(), SERIAL)
-    assert run_fly(folder, survey(), SERIAL)
+    spec("plan").make(folder, survey(), SERIAL)
+    assert spec("fly").make(folder, survey(), SERIAL)
     return folder
 
 
 def test_a_flight_needs_a_plan(tmp_path: Path) -> None:
     with pytest.raises(WorkspaceError, match="alice-survey plan"):
-        run_fly(tmp_path, survey(), SERIAL)
+        spec("fly").make(tmp_path, survey(), SERIAL)
 
 
 def test_it_is_skipped_while_nothing_it_needs_changes(workspace: Path) -> None:
-    assert not run_fly(workspace, survey(), SERIAL)
-    assert not run_fly(workspace, survey(imaging={"scale": 4}), SERIAL)
+    assert not spec("fly").make(workspace, survey(), SERIAL)
+    assert not spec("fly").make(workspace, survey(imaging={"scale": 4}), SERIAL)
 
 
 def test_a_flight_is_the_same_bytes_each_time_and_another_with_another_seed(
     workspace: Path, tmp_path: Path
 ) -> None:
-    run_plan(tmp_path, survey(), SERIAL)
-    assert run_fly(tmp_path, survey(), SERIAL)
+    spec("plan").make(tmp_path, survey(), SERIAL)
+    assert spec("fly").make(tmp_path, survey(), SERIAL)
     for name in FILES:
         one, two = workspace / "flight" / name, tmp_path / "flight" / name
         assert one.read_bytes() == two.read_bytes(), name
 
-    assert run_fly(tmp_path, survey(seed=2), SERIAL)
+    assert spec("fly").make(tmp_path, survey(seed=2), SERIAL)
     for name in FILES:
         one, two = workspace / "flight" / name, tmp_path / "flight" / name
         assert one.read_bytes() != two.read_bytes(), name
@@ -153,10 +153,10 @@ def test_pictures_are_pictures_with_ink(workspace: Path) -> None:
 
 def test_a_vehicle_that_reaches_no_line_says_why(tmp_path: Path) -> None:
     # The plan is for a calm sea: for this one there would be none.
-    run_plan(tmp_path, survey(), SERIAL)
+    spec("plan").make(tmp_path, survey(), SERIAL)
     strong = survey(sea={"current_mps": 2.5})
     with pytest.raises(VehicleError, match=r"alice reached no line of the plan \(aborted: "):
-        run_fly(tmp_path, strong, SERIAL)
+        spec("fly").make(tmp_path, strong, SERIAL)
     assert not (tmp_path / "flight").exists()
 
 

@@ -14,13 +14,13 @@ from alice_survey.base.artefacts import read_stage
 from alice_survey.base.config import SurveyConfig, parse_config
 from alice_survey.base.errors import AliceError, PlanError
 from alice_survey.base.executor import SERIAL
+from alice_survey.stages import spec
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import stations_of_plan
 from missions.exports.geometry import footprint_outline, footprints_ne
 from missions.plan.planner import plan_survey
 from missions.plan.rows import main_settings
-from missions.plan.run import run_plan
 from missions.values.footprint import common_swath
 from missions.values.pattern import pattern
 from missions.values.plan_file import Plan, read_plan
@@ -228,7 +228,7 @@ def test_an_absurd_overlap_is_refused_by_the_settings() -> None:
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("survey")
-    assert run_plan(folder, survey(name="small", **SMALL), SERIAL)
+    assert spec("plan").make(folder, survey(name="small", **SMALL), SERIAL)
     return folder
 
 
@@ -243,15 +243,15 @@ def test_a_plan_file_gives_back_the_plan(workspace: Path) -> None:
 
 def test_a_stage_is_skipped_until_a_setting_that_matters_changes(workspace: Path) -> None:
     config = survey(name="small", **SMALL)
-    assert not run_plan(workspace, config, SERIAL)
-    assert not run_plan(workspace, config.model_copy(update={"seed": 9}), SERIAL)
+    assert not spec("plan").make(workspace, config, SERIAL)
+    assert not spec("plan").make(workspace, config.model_copy(update={"seed": 9}), SERIAL)
     before = read_stage(workspace / "plan")
     assert before is not None
     assert "seed" not in before["settings"]
 
 
 def test_a_plan_is_the_same_bytes_each_time(workspace: Path, tmp_path: Path) -> None:
-    run_plan(tmp_path, survey(name="small", **SMALL), SERIAL)
+    spec("plan").make(tmp_path, survey(name="small", **SMALL), SERIAL)
     files = [path for path in (workspace / "plan").rglob("*") if path.is_file()]
     names = {str(path.relative_to(workspace / "plan")) for path in files} - {"stage.json"}
     assert {"plan.json", "map.png", "settings.txt", "triggers.csv"} < names

@@ -34,7 +34,8 @@ def _with_mesh(workspace: Path, triangles: int) -> Held:
     )
     folder = workspace / "mesh"
     write_json(folder / "stage.json", {"took_s": 1.0})
-    write_json(folder / "mesh.json", {"triangles": triangles})
+    about = {"area": 12.0, "textured_share": 1.0, "offset_east_north_up": [0.0, 0.0, 0.0]}
+    write_json(folder / "mesh.json", {"triangles": triangles, **about})
     (folder / "mesh.glb").write_bytes(trimesh.Scene(box).export(file_type="glb"))
     picture.resize((64, 64)).save(folder / "mesh.png")
     return Held.of(workspace)

@@ -9,14 +9,14 @@ from pypdf import PdfReader
 from alice_survey.base.config import SurveyConfig
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.executor import SERIAL
-from alice_survey.report.run import run_report
+from alice_survey.stages import spec
 from tests.alice_survey.report.tiny import tiny_workspace
 
 
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     workspace = tiny_workspace(tmp_path_factory.mktemp("tiny"))
-    assert run_report(workspace, SurveyConfig(), SERIAL)
+    assert spec("report").make(workspace, SurveyConfig(), SERIAL)
     return workspace
 
 
@@ -65,27 +65,27 @@ def test_the_same_workspace_gives_the_same_bytes(workspace: Path) -> None:
     folder = workspace / "report"
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     (folder / "stage.json").unlink()
-    assert run_report(workspace, SurveyConfig(), SERIAL)
+    assert spec("report").make(workspace, SurveyConfig(), SERIAL)
     for name in ("report.html", "report.pdf", "report.json"):
         assert (folder / name).read_bytes() == before[name], name
 
 
 def test_a_report_is_made_again_only_when_something_has_changed(workspace: Path) -> None:
-    assert not run_report(workspace, SurveyConfig(), SERIAL)
+    assert not spec("report").make(workspace, SurveyConfig(), SERIAL)
     path = workspace / "sparse" / "registration.json"
     text = path.read_text()
     path.write_text(text.replace('"total": 4', '"total": 5'))
-    assert run_report(workspace, SurveyConfig(), SERIAL)
+    assert spec("report").make(workspace, SurveyConfig(), SERIAL)
     assert "4 of 5" in (workspace / "report" / "report.html").read_text()
     path.write_text(text)
-    assert run_report(workspace, SurveyConfig(), SERIAL)
+    assert spec("report").make(workspace, SurveyConfig(), SERIAL)
 
 
 @pytest.mark.parametrize(("scaled", "unit"), [(False, "unit"), (True, "m")])
 def test_a_model_without_a_place_is_reported(tmp_path: Path, scaled: bool, unit: str) -> None:
     workspace = tiny_workspace(tmp_path, scaled=scaled, placed=False)
     (workspace / "plan" / "stage.json").unlink()
-    assert run_report(workspace, SurveyConfig(), SERIAL)
+    assert spec("report").make(workspace, SurveyConfig(), SERIAL)
     data = json.loads((workspace / "report" / "report.json").read_text())
     assert data["unit"] == unit
     page = (workspace / "report" / "report.html").read_text(encoding="utf-8")
@@ -108,11 +108,11 @@ def test_a_plan_alone_is_reported(tmp_path: Path) -> None:
     workspace = tiny_workspace(tmp_path)
     for stage in ("images", "mapping", "sparse", "dense", "mosaic"):
         (workspace / stage / "stage.json").unlink()
-    assert run_report(workspace, SurveyConfig(), SERIAL)
+    assert spec("report").make(workspace, SurveyConfig(), SERIAL)
     said = json.loads((workspace / "report" / "report.json").read_text())["summary"]
     assert "a plan of 1 line" in said["What was mapped"]
 
 
 def test_an_empty_folder_says_what_to_run(tmp_path: Path) -> None:
     with pytest.raises(WorkspaceError, match="alice-survey plan"):
-        run_report(tmp_path, SurveyConfig(), SERIAL)
+        spec("report").make(tmp_path, SurveyConfig(), SERIAL)

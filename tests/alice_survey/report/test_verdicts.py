@@ -71,7 +71,10 @@ def test_errors_are_judged_by_the_pixel_and_by_their_sigmas(
     workspace = tiny_workspace(tmp_path)
     write_json(workspace / "evaluation" / "stage.json", {"took_s": 1.0})
     write_json(workspace / "evaluation" / "score.json", {
-        "cameras": {"rms_mm": 0.3, "scale_error_ppm": 50.0},
+        "cameras": {
+            "registered": 4, "total": 4, "rms_mm": 0.3, "max_mm": 0.5, "scale_error_ppm": 50.0,
+        },
+        "mosaic": {}, "lengths": {},
         "surface": {
             "distance_rms_mm": miss_mm, "ground_pixel_mm": 1.8, "doming": {"dome_mm": 0.1},
             "error_over_sigma": {"rms": ratio}, "completeness_within_px": {"3": 0.99},

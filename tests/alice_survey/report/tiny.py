@@ -1,6 +1,7 @@
 """A workspace of a few files, as finished stages would leave it: a tilted plane with a hole."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import rasterio
 from rasterio.transform import Affine
 
 from alice_survey.base.artefacts import write_csv, write_json
+from tests.missions.exports.plans import line, plan_of
 
 CELL_M, ROWS, COLUMNS = 0.01, 120, 80
 HOLE = (slice(100, 120), slice(0, 20))
@@ -77,15 +79,14 @@ def heights() -> Any:
 def _plan(datum: dict[str, float]) -> dict[str, Any]:
     north, east = ROWS * CELL_M, COLUMNS * CELL_M
     ring = [[0.0, 0.0], [north, 0.0], [north, east], [0.0, east], [0.0, 0.0]]
-    imaging = {"blur_px": 0.8, "pixel_m": 0.0005}
+    planned = plan_of([line((0.1, 0.4), (1.1, 0.4))], [(0, 0)])
+    area = planned.to_json()["area"]
     return {
-        "name": "tiny reef", "datum": datum, "altitude_m": 2.0, "speed_mps": 0.2,
-        "area": {"survey": {"type": "MultiPolygon", "coordinates": [[ring]]}},
-        "line_spacing_m": 1.0, "stations": 2, "station_spacing_m": 0.4, "forward_overlap": 0.6,
-        "side_overlap": 0.3, "interval_s": 2.0, "exposure_s": 0.002, "duration_s": 60.0,
-        "energy_wh": 1.0, "details": {"imaging": imaging}, "dives": [{}],
-        "lines": [{"start_ne_m": [0.1, 0.4], "end_ne_m": [1.1, 0.4], "stations": 2}],
-    }  # fmt: skip
+        **replace(planned, name="tiny reef").to_json(),
+        "datum": datum,
+        "area": {**area, "survey": {"type": "MultiPolygon", "coordinates": [[ring]]}},
+        "details": {"imaging": {"blur_px": 0.8, "pixel_m": 0.0005}},
+    }
 
 
 def _write_track(path: Path, axes: Sequence[str], *, placed: bool) -> None:

@@ -19,9 +19,9 @@ from alice_survey.base.frames import interpolate_poses, rotation_from_attitude
 from alice_survey.base.manifest import read_manifest
 from alice_survey.base.trajectory import Trajectory, read_track, write_track
 from alice_survey.seafloor.terrain import read_terrain
+from alice_survey.stages import spec
 from camera_calib.rig import read_rig
 from missions.acquire import run as imaging
-from missions.acquire.run import run_images, run_pool
 from tests.missions.flown_plans import plan_of, walk
 
 TIMES_S = (2.0, 4.25, 6.5)
@@ -93,7 +93,7 @@ def content(folder: Path) -> dict[str, bytes]:
 def survey(tmp_path_factory: pytest.TempPathFactory) -> Path:
     workspace = tmp_path_factory.mktemp("survey")
     fly(workspace)
-    assert run_images(workspace, settings(range_maps=True), SERIAL)
+    assert spec("image").make(workspace, settings(range_maps=True), SERIAL)
     return workspace
 
 
@@ -174,7 +174,7 @@ def test_range_maps_fit_terrain_and_poses(survey: Path) -> None:
 
 def test_two_processes_give_the_same_bytes_as_one(survey: Path, tmp_path: Path) -> None:
     fly(tmp_path)
-    assert run_images(tmp_path, settings(range_maps=True), local_executor(2))
+    assert spec("image").make(tmp_path, settings(range_maps=True), local_executor(2))
     assert content(tmp_path / "images") == content(survey / "images")
 
 
@@ -192,7 +192,7 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(
 
     monkeypatch.setattr(imaging, "render", dies_at_the_fourth)
     with pytest.raises(KeyboardInterrupt):
-        run_images(tmp_path, settings(range_maps=True), SERIAL)
+        spec("image").make(tmp_path, settings(range_maps=True), SERIAL)
     assert not (tmp_path / "images").exists()
     left = sorted((tmp_path / "images.partial").glob("*/*.png"))
     assert len(left) == 3
@@ -200,7 +200,7 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(
 
     again: list[Any] = []
     monkeypatch.setattr(imaging, "render", lambda *args: again.append(args) or real(*args))
-    assert run_images(tmp_path, settings(range_maps=True), SERIAL)
+    assert spec("image").make(tmp_path, settings(range_maps=True), SERIAL)
     assert len(again) == 3
     kept = {path: (tmp_path / "images" / path).stat().st_mtime_ns for path in before}
     assert kept == before
@@ -208,12 +208,12 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(
 
 
 def test_what_is_done_is_not_done_again(survey: Path) -> None:
-    assert not run_images(survey, settings(range_maps=True), SERIAL)
+    assert not spec("image").make(survey, settings(range_maps=True), SERIAL)
 
 
 def test_noise_can_be_left_out(survey: Path, tmp_path: Path) -> None:
     fly(tmp_path)
-    run_images(tmp_path, settings(noise=False), SERIAL)
+    spec("image").make(tmp_path, settings(noise=False), SERIAL)
     clean, noisy = (
         cv2.imread(str(w / "images" / "left" / "000000.png")).astype(float)
         for w in (tmp_path, survey)
@@ -226,21 +226,21 @@ def test_noise_can_be_left_out(survey: Path, tmp_path: Path) -> None:
 def test_a_flight_that_ends_before_its_triggers_says_so(tmp_path: Path) -> None:
     fly(tmp_path, until_s=5.0)
     with pytest.raises(NavigationError, match=r"covers 0\.00 to 4\.90 s, but triggers go .* 6\.50"):
-        run_images(tmp_path, settings(), SERIAL)
+        spec("image").make(tmp_path, settings(), SERIAL)
 
 
 def test_without_a_plan_or_flight_the_next_command_is_named(tmp_path: Path) -> None:
     with pytest.raises(WorkspaceError, match="alice-survey plan"):
-        run_images(tmp_path, settings(), SERIAL)
+        spec("image").make(tmp_path, settings(), SERIAL)
 
 
 def test_the_pool_is_the_same_with_any_number_of_processes(tmp_path: Path) -> None:
     one, two = tmp_path / "one", tmp_path / "two"
     config = settings(image_format="jpg")
-    assert run_pool(one, config, SERIAL)
-    assert run_pool(two, config, local_executor(2))
+    assert spec("pool").make(one, config, SERIAL)
+    assert spec("pool").make(two, config, local_executor(2))
     assert content(one / "pool") == content(two / "pool")
-    assert not run_pool(one, config, SERIAL)
+    assert not spec("pool").make(one, config, SERIAL)
     records = read_manifest(one / "pool" / "manifest.csv")
     assert len(records) == 16
     assert records[3].image == "right/01.jpg"

@@ -39,7 +39,8 @@ def folder(tmp_path: Path) -> Path:
     triangles = sum(
         len(part.faces) for part in trimesh.load_scene(mesh / "mesh.glb").geometry.values()
     )
-    write_json(mesh / "mesh.json", {"triangles": triangles, "area": 12.0, "textured_share": 1.0})
+    about = {"area": 12.0, "textured_share": 1.0, "offset_east_north_up": [0.0, 0.0, 0.0]}
+    write_json(mesh / "mesh.json", {"triangles": triangles, **about})
     (mesh / "mesh.png").write_bytes(encoded(Image.fromarray(floor[:300, :400]), "PNG"))
     write_json(mesh / "stage.json", {"stage": "mesh"})
     return workspace

@@ -15,7 +15,7 @@ from shapely.geometry.base import BaseGeometry
 from alice_survey.base.config import AreaConfig
 from alice_survey.base.errors import PlanError
 from missions.areas import safe
-from missions.areas.files import area_files, read_area_file
+from missions.areas.files import read_area_file
 from missions.areas.survey import survey_area
 from missions.values.area import Area
 
@@ -128,11 +128,11 @@ def test_the_files_of_an_area_are_known_with_their_side_files(tmp_path: Path) ->
     site = shapefile(tmp_path)
     other = make("kml", tmp_path)
     settings = AreaConfig(file=site, no_go_file=other, allowed_file=other)
-    assert {file.name for file in area_files(settings)} == {
+    assert {file.name for file in settings.files} == {
         "site.shp", "site.shx", "site.dbf", "site.prj", "site.cpg", "a.kml"
     }  # fmt: skip
-    assert len(area_files(settings)) == 6
-    assert area_files(AreaConfig()) == []
+    assert len(settings.files) == 6
+    assert AreaConfig().files == []
 
 
 def test_a_file_without_a_system_is_read_by_crs_or_refused(tmp_path: Path, wanted: Area) -> None:

@@ -14,8 +14,8 @@ from shapely.geometry import MultiPolygon
 from alice_survey.base.config import SeaConfig, parse_config
 from alice_survey.base.errors import ConfigError
 from alice_survey.base.executor import SERIAL
+from alice_survey.stages import spec
 from missions.plan.map import draw_plan, map_report, plan_figure
-from missions.plan.run import run_plan
 from missions.values.plan_file import Plan
 from tests.missions.exports.plans import RIG, line, plan_of, small_plan
 
@@ -96,7 +96,7 @@ def test_a_finished_plan_is_drawn_again_for_print(
     tmp_path: Path, suffix: str, start: bytes
 ) -> None:
     config = parse_config({"area": {"length_m": 4.0, "width_m": 3.0}}, "test")
-    run_plan(tmp_path, config, SERIAL)
+    spec("plan").make(tmp_path, config, SERIAL)
     plan = tmp_path / "plan" / "plan.json"
     drawn = [tmp_path / name / f"map{suffix}" for name in "ab"]
     for out in drawn:

@@ -8,7 +8,7 @@ from alice_survey.base.artefacts import read_json
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
 from alice_survey.base.errors import ReconstructionError, WorkspaceError
 from alice_survey.base.executor import SERIAL, local_executor
-from reconstruct.dense.run import run_dense
+from alice_survey.stages import spec
 from tests.oracles_dense import (
     DEPTH_M,
     Scene,
@@ -35,7 +35,7 @@ def survey_views() -> list:
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("survey")
     write_workspace(folder, sparse_model(survey_views(), SCENE), SCENE)
-    assert run_dense(folder, CONFIG, SERIAL)
+    assert spec("dense").make(folder, CONFIG, SERIAL)
     return folder
 
 
@@ -153,7 +153,7 @@ def test_scratch_is_gone_and_files_are_there(workspace: Path):
 
 
 def test_a_second_run_does_nothing(workspace: Path):
-    assert not run_dense(workspace, CONFIG, SERIAL)
+    assert not spec("dense").make(workspace, CONFIG, SERIAL)
 
 
 @pytest.mark.slow
@@ -162,7 +162,7 @@ def test_bytes_do_not_depend_on_the_number_of_processes(workspace: Path, tmp_pat
     other.mkdir()
     for name in ("images", "sparse"):
         (other / name).symlink_to(workspace / name)
-    assert run_dense(other, CONFIG, local_executor(2))
+    assert spec("dense").make(other, CONFIG, local_executor(2))
     for path in sorted((workspace / "dense").iterdir()):
         if path.name != "stage.json":
             assert (other / "dense" / path.name).read_bytes() == path.read_bytes(), path.name
@@ -173,7 +173,7 @@ def test_pictures_without_texture_give_one_line(tmp_path: Path):
     views = stereo_views(np.array([0.0, 0.3]), np.array([0.0, 0.0]))
     write_workspace(tmp_path, sparse_model(views, grey), grey)
     with pytest.raises(ReconstructionError, match="no depth was confirmed") as caught:
-        run_dense(tmp_path, CONFIG, SERIAL)
+        spec("dense").make(tmp_path, CONFIG, SERIAL)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "dense").exists()
 
@@ -183,4 +183,4 @@ def test_a_workspace_without_model_says_which_command_makes_one(tmp_path: Path):
     write_workspace(tmp_path, sparse_model(stereo_views(np.zeros(1), np.zeros(1)), scene), scene)
     (tmp_path / "sparse" / "stage.json").unlink()
     with pytest.raises(WorkspaceError, match="reconstruct"):
-        run_dense(tmp_path, CONFIG, SERIAL)
+        spec("dense").make(tmp_path, CONFIG, SERIAL)

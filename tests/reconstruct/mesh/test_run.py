@@ -9,12 +9,12 @@ import trimesh
 from alice_survey.base.artefacts import read_json, write_json
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
 from alice_survey.base.executor import SERIAL
+from alice_survey.stages import spec
 from reconstruct.dense.cloud import VERTEX, write_cloud, write_cloud_json
 from reconstruct.light.solve import GRID, LightModel, write_light
 from reconstruct.mesh.atlas import pack
 from reconstruct.mesh.decimate import decimate
 from reconstruct.mesh.implicit import splat
-from reconstruct.mesh.run import run_mesh
 from reconstruct.mesh.texture import spread_corners
 from reconstruct.mesh.topology import edges_of
 from tests.oracles_dense import (
@@ -74,8 +74,8 @@ def mesh(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_workspace(folder, sparse_model(views, SCENE), SCENE)
     write_dense(folder, [view.image for view in views])
     settings = SurveyConfig(reconstruct=ReconstructConfig(mesh_error_px=0.1, mesh_page_px=1024))
-    assert run_mesh(folder, settings, SERIAL)
-    assert not run_mesh(folder, settings, SERIAL)
+    assert spec("mesh").make(folder, settings, SERIAL)
+    assert not spec("mesh").make(folder, settings, SERIAL)
     return folder / "mesh"
 
 

@@ -10,9 +10,10 @@ from alice_survey.base.artefacts import read_json, write_csv, write_json
 from alice_survey.base.config import CameraConfig, ReconstructConfig, SurveyConfig, WaterConfig
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.executor import SERIAL
+from alice_survey.stages import spec
 from camera_calib.rig import design_rig
 from reconstruct.mosaic import run
-from reconstruct.mosaic.run import _dispersion, run_mosaic
+from reconstruct.mosaic.run import _dispersion
 from reconstruct.raster import DemGrid, tiled_raster
 from reconstruct.views.lens import flat_port_lens
 from reconstruct.views.model import View
@@ -82,7 +83,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("mosaic")
     views = stereo_views(np.array([-0.2, 0.2, 0.6]), np.array([0.0, 0.05, 0.0]), heading_deg=30.0)
     make_workspace(folder, views, SCENE)
-    assert run_mosaic(folder, CONFIG, SERIAL)
+    assert spec("mosaic").make(folder, CONFIG, SERIAL)
     return folder
 
 
@@ -155,13 +156,13 @@ def test_bytes_do_not_change_on_another_engine(workspace: Path, tmp_path: Path):
     for name in ("images", "sparse", "dense"):
         (tmp_path / name).symlink_to(workspace / name)
     with PicklingThreads(1) as engine:
-        assert run_mosaic(tmp_path, CONFIG, engine.executor)
+        assert spec("mosaic").make(tmp_path, CONFIG, engine.executor)
         assert engine.tasks > len(list((tmp_path / "images").rglob("*.png")))
     names = ("mosaic.tif", "mosaic_source.tif", "coverage.tif", "mosaic.png", "mosaic.json")
     for name in (*names, "footprints.csv", "footprints.geojson"):
         same = (tmp_path / "mosaic" / name).read_bytes()
         assert same == (workspace / "mosaic" / name).read_bytes()
-    assert not run_mosaic(tmp_path, CONFIG, SERIAL)
+    assert not spec("mosaic").make(tmp_path, CONFIG, SERIAL)
 
 
 def test_gains_of_pictures_leave_no_seam(tmp_path: Path):
@@ -173,7 +174,7 @@ def test_gains_of_pictures_leave_no_seam(tmp_path: Path):
         path = tmp_path / "images" / view.image
         picture = cv2.imread(str(path)).astype(np.float64) * np.exp(gain)
         cv2.imwrite(str(path), np.rint(picture).astype(np.uint8))
-    assert run_mosaic(tmp_path, EVEN, SERIAL)
+    assert spec("mosaic").make(tmp_path, EVEN, SERIAL)
     rgba, _, _ = read(tmp_path)
     painted = rgba[:3][:, rgba[3] > 0]
     assert np.ptp(np.percentile(painted, [0.5, 99.5])) < 8  # 60 without any correction
@@ -184,7 +185,7 @@ def test_no_picture_over_the_surface_gives_one_line(tmp_path: Path):
     views = stereo_views(np.array([30.0, 30.4]), np.array([0.0, 0.0]))
     make_workspace(tmp_path, views, SCENE)
     with pytest.raises(ReconstructionError, match="no picture sees") as caught:
-        run_mosaic(tmp_path, CONFIG, SERIAL)
+        spec("mosaic").make(tmp_path, CONFIG, SERIAL)
     assert "\n" not in str(caught.value)
 
 
@@ -197,7 +198,7 @@ def small_survey(folder: Path) -> list[View]:
 
 def test_a_single_grey_station_gives_a_grey_mosaic(tmp_path: Path):
     small_survey(tmp_path)
-    assert run_mosaic(tmp_path, EVEN, SERIAL)
+    assert spec("mosaic").make(tmp_path, EVEN, SERIAL)
     rgba, _, _ = read(tmp_path)
     painted = rgba[:3][:, rgba[3] > 0]
     assert painted.shape[1] > 20_000
@@ -229,7 +230,7 @@ def test_what_a_mask_hides_is_not_painted_and_others_fill_it(tmp_path: Path):
     cv2.imwrite(str(tmp_path / "images" / "fish.png"), mask)
     about["images"][left.image]["mask"] = "fish.png"
     write_json(tmp_path / "sparse" / "cameras.json", about)
-    assert run_mosaic(tmp_path, CONFIG, SERIAL)
+    assert spec("mosaic").make(tmp_path, CONFIG, SERIAL)
     rgba, north, east = read(tmp_path)
     known = rgba[3] > 0
     assert np.abs(rgba[:3][:, known] - 100).max() <= 3
@@ -255,7 +256,7 @@ def test_labels_beyond_65535_stay_apart(
     monkeypatch.setattr(run, "write_tiles", write_all)
     for name in ("images", "sparse", "dense"):
         (tmp_path / name).symlink_to(workspace / name)
-    assert run_mosaic(tmp_path, CONFIG, SERIAL)
+    assert spec("mosaic").make(tmp_path, CONFIG, SERIAL)
     sources = []
     for folder in (workspace, tmp_path):
         with rasterio.open(folder / "mosaic" / "mosaic_source.tif") as raster:

@@ -11,13 +11,20 @@ from PIL import Image
 from alice_survey.base.artefacts import read_json
 from alice_survey.base.config import ReconstructConfig, SurveyConfig
 from alice_survey.base.errors import AliceError, ReconstructionError
-from alice_survey.base.executor import SERIAL, local_executor
+from alice_survey.base.executor import SERIAL, Executor, local_executor
 from alice_survey.base.manifest import read_manifest, write_manifest
+from alice_survey.stages import spec
 from reconstruct.pictures.importing import import_images
 from reconstruct.pictures.undistorted import Pictures
-from reconstruct.placing.run import read_track_poses, run_sparse
+from reconstruct.placing.run import read_track_poses
 from reconstruct.placing.scale import scale_model
 from reconstruct.views.model import read_model
+
+
+def reconstruct(workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
+    mapped = spec("mapping").make(workspace, config, executor)
+    return spec("placing").make(workspace, config, executor) or mapped
+
 
 QUICK = SurveyConfig(reconstruct=ReconstructConfig(max_features=2000))
 
@@ -33,7 +40,7 @@ def drone(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
             small = image.resize((image.width // 2, image.height // 2), Image.Resampling.BOX)
             small.save(folder / "in" / source.name, exif=image.getexif(), quality=92)
     import_images(folder, [folder / "in"])
-    assert run_sparse(folder, QUICK, SERIAL)
+    assert reconstruct(folder, QUICK, SERIAL)
     return folder
 
 
@@ -90,13 +97,13 @@ def test_the_track_agrees_with_the_model(drone: Path) -> None:
 
 
 def test_what_is_done_is_not_done_again(drone: Path) -> None:
-    assert not run_sparse(drone, QUICK, local_executor(2))
+    assert not reconstruct(drone, QUICK, local_executor(2))
 
 
 def test_two_processes_give_the_same_bytes(drone: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     import_images(other, [drone / "in"])
-    run_sparse(other, QUICK, local_executor(2))
+    reconstruct(other, QUICK, local_executor(2))
     for file in sorted((drone / "sparse").rglob("*")):
         if file.is_file() and file.name != "stage.json":
             twin = other / "sparse" / file.relative_to(drone / "sparse")
@@ -114,7 +121,7 @@ def nowhere(drone: Path, tmp_path: Path) -> Path:
         with Image.open(path) as image:
             image.save(source / path.name, quality="keep", exif=b"")
     import_images(folder, [source])
-    run_sparse(folder, QUICK, SERIAL)
+    reconstruct(folder, QUICK, SERIAL)
     return folder
 
 
@@ -131,7 +138,7 @@ def test_without_positions_the_model_is_level_unscaled_and_says_so(nowhere: Path
     stated = scale_model(nowhere, " ".join(tokens), 12.5)
     assert "12.5 m" in stated
     before = (nowhere / "mapping" / "stage.json").stat().st_mtime_ns
-    assert run_sparse(nowhere, QUICK, SERIAL)
+    assert reconstruct(nowhere, QUICK, SERIAL)
     assert (nowhere / "mapping" / "stage.json").stat().st_mtime_ns == before  # not mapped again
     scaled = read_model(nowhere / "sparse")
     assert scaled.frame.scaled
@@ -154,7 +161,7 @@ def test_without_positions_the_model_is_level_unscaled_and_says_so(nowhere: Path
         picks.append("+".join(marks))
     assert all("+" in pick for pick in picks)
     scale_model(nowhere, " ".join(picks), 25.0)
-    assert run_sparse(nowhere, QUICK, SERIAL)
+    assert reconstruct(nowhere, QUICK, SERIAL)
     doubled = read_model(nowhere / "sparse")
     length = np.linalg.norm(doubled.points_world[3] - doubled.points_world[40])
     assert length == pytest.approx(25.0, rel=1e-3)
@@ -178,7 +185,7 @@ def test_without_positions_the_model_is_level_unscaled_and_says_so(nowhere: Path
     scale = json.loads((nowhere / "scale.json").read_text())
     (nowhere / "scale.json").write_text(json.dumps(scale | {"gauge": "other"}))
     with pytest.raises(ReconstructionError, match="an earlier model"):
-        run_sparse(nowhere, QUICK, SERIAL)
+        reconstruct(nowhere, QUICK, SERIAL)
 
 
 def test_one_mark_is_taken_on_the_surface(drone: Path) -> None:
@@ -208,7 +215,7 @@ def test_real_stereo_without_calibration_gets_one_rigid_rig(
             cv2.imwrite(str(tmp_path / side / f"{number:03d}.png"), small)
     folder = tmp_path / "w"
     import_images(folder, [], left=tmp_path / "left", right=tmp_path / "right")
-    run_sparse(folder, QUICK, local_executor(2))
+    reconstruct(folder, QUICK, local_executor(2))
     found = read_json(folder / "sparse" / "registration.json")
     assert found["registered"] == 10
     assert 0.02 < found["mean_reprojection_px"] < 0.8
@@ -232,9 +239,9 @@ def test_a_rig_of_other_pictures_is_refused(drone: Path, tmp_path: Path) -> None
     import_images(folder, [drone / "in"])
     write_rig(folder / "calibration" / "rig.json", design_rig(CameraConfig(), WaterConfig()))
     with pytest.raises(AliceError, match="'camera' of the pictures is not in the rig"):
-        run_sparse(folder, QUICK, SERIAL)
+        reconstruct(folder, QUICK, SERIAL)
     manifest = folder / "images" / "manifest.csv"
     records = [replace(r, camera="left") for r in read_manifest(manifest)]
     write_manifest(manifest, records)
     with pytest.raises(AliceError, match=r"800 x 450 pixels, but the rig.*3384 x 2710"):
-        run_sparse(folder, QUICK, SERIAL)
+        reconstruct(folder, QUICK, SERIAL)

@@ -1,0 +1,694 @@
+"""The stages of a survey, in one list: run, status, report, view and documentation read it.
+
+A stage is added by adding a `StageSpec`. Nothing here imports the packages that do the work: each
+is named as `module:function` and loaded when its stage is made, so that `status` compares digests
+without them.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from alice_survey.base import artefacts, records
+from alice_survey.base.artefacts import Stage, read_json, read_stage, run_stage, why_stale
+from alice_survey.base.config import SurveyConfig
+from alice_survey.base.errors import AliceError, WorkspaceError
+from alice_survey.base.executor import Executor
+from alice_survey.base.manifest import read_manifest
+
+Summary = tuple[str, dict[str, Any]]
+"""What a stage has found: a line to read, and JSON values."""
+StageWork = Callable[[Path, SurveyConfig, Executor, Path], None]
+"""Takes the workspace, the settings, where tasks run, and the folder to write into."""
+
+LOOSE_FOLDERS = ("quality", "reference", "against")
+"""Folders that commands write next to those of the stages, and that a report shows."""
+CONTROL_FILES = ("control.csv", "picks.csv", "markers.csv")
+SCALE_FILE = "scale.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageSpec:
+    """One step of a survey: what it depends on, what does it, and what it writes."""
+
+    name: str
+    """Also of its package and its command, where they are its own."""
+    folder: str
+    """The folder of the workspace that it writes."""
+    command: str
+    """The command that makes it."""
+    about: str
+    version: int
+    """Raise it when the stage's code changes its result; `tests/test_stage_code.py` notices."""
+    work: str
+    """`module:function` of a `StageWork`."""
+    summary: Callable[[Path], Summary]
+    """Takes the stage's folder."""
+    needs: Sequence[str] = ()
+    """Stages without which it cannot be made."""
+    uses: Sequence[str] = ()
+    """Stages that it takes into account where they are there."""
+    settings: "Mapping[str, Any] | SettingsPart" = field(default_factory=dict)
+    """All settings that the result depends on, as `settings_of` reads them."""
+    setting_files: Sequence[str] = ()
+    """Dotted names of the settings that are files, or lists of files."""
+    inputs: Callable[[Path], Sequence[Path]] = lambda workspace: ()
+    """All files of a workspace that the result depends on."""
+    resumes: bool = False
+    """Work goes on in what an interrupted run of the same digest left."""
+    simulated: bool = False
+    """It is for simulated surveys: imported pictures have no such stage."""
+    products: Mapping[str, str] = field(default_factory=dict)
+    """What people use of it: paths below its folder, and what they are."""
+    picture: str = ""
+    """A product to look at first."""
+    reported: Sequence[str] = ()
+    """What a report reads of it: paths below its folder, `.` for all of it."""
+
+    def stage(self, workspace: Path, config: SurveyConfig) -> Stage:
+        """What the stage depends on, in a workspace."""
+        return Stage(
+            name=self.folder,
+            version=self.version,
+            settings=settings_of(self.settings, config),
+            inputs=[*self.inputs(workspace), *files_of(self.setting_files, config)],
+            resumes=self.resumes,
+        )
+
+    def make(self, workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
+        """Do the stage's work unless it is up to date.
+
+        Returns:
+            True when done, False when nothing had changed.
+
+        Raises:
+            WorkspaceError: a stage that it needs is missing.
+        """
+        for name in self.needs:
+            need(workspace, name)
+        module, function = self.work.split(":")
+
+        def work(folder: Path) -> None:
+            do: StageWork = getattr(import_module(module), function)
+            do(workspace, config, executor, folder)
+
+        return run_stage(workspace, self.stage(workspace, config), work)
+
+    def state(self, workspace: Path, config: SurveyConfig, before: Mapping[str, str]) -> str:
+        """Whether the stage is up to date, or why it is not.
+
+        Args:
+            workspace: folder of the survey.
+            config: its settings.
+            before: states of earlier stages, by name.
+        """
+        record = read_stage(workspace / self.folder)
+        if record is None:
+            partial = workspace / f"{self.folder}.partial"
+            return "interrupted" if partial.exists() else "missing"
+        if "refly_of" in record.settings or (self.name == "image" and is_imported(workspace)):
+            return "up to date"  # it was made by another command, from other settings
+        for name in (*self.needs, *self.uses):
+            state = before.get(name, "up to date")
+            if state != "up to date" and not (name in self.uses and state == "missing"):
+                return f"stale ({name} is {state.split()[0]})"
+        try:
+            why = why_stale(workspace, self.stage(workspace, config))
+        except AliceError as error:
+            why = str(error)
+        return "up to date" if why is None else f"stale ({why})"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SettingsPart:
+    """Some values of a section of the settings."""
+
+    section: str
+    only: frozenset[str] | None = None
+    without: frozenset[str] = frozenset()
+
+
+def only(section: str, *names: str) -> SettingsPart:
+    """The values of some names."""
+    return SettingsPart(section=section, only=frozenset(names))
+
+
+def without(section: str, *names: str) -> SettingsPart:
+    """The values of all other names."""
+    return SettingsPart(section=section, without=frozenset(names))
+
+
+def settings_of(wanted: Any, config: SurveyConfig) -> Any:
+    """Settings as JSON values: what a stage's digest is made of.
+
+    Args:
+        wanted: a `SettingsPart`; the dotted name of a value or a section; a mapping of these; or
+            a value that stands for itself.
+        config: the settings of a survey.
+
+    Returns:
+        Values in the form that `wanted` has; files by their names alone, so that a survey may be
+        moved.
+    """
+    if isinstance(wanted, Mapping):
+        return {key: settings_of(value, config) for key, value in wanted.items()}
+    if not isinstance(wanted, str | SettingsPart):
+        return wanted
+    part = SettingsPart(section=wanted) if isinstance(wanted, str) else wanted
+    value = attrgetter(part.section)(config)
+    if not isinstance(value, BaseModel):
+        return list(value) if isinstance(value, tuple) else value
+    values = value.model_dump(
+        mode="json",
+        include=None if part.only is None else set(part.only),
+        exclude=set(part.without),
+    )
+    return {
+        name: path.name if isinstance(path := getattr(value, name), Path) else values[name]
+        for name in values
+    }
+
+
+def files_of(wanted: Sequence[str], config: SurveyConfig) -> list[Path]:
+    """The files that settings name; none for those that are not set."""
+    values = [attrgetter(name)(config) for name in wanted]
+    return [path for value in values for path in (value if isinstance(value, list) else [value])
+            if path is not None]  # fmt: skip
+
+
+def spec(name: str) -> StageSpec:
+    """The stage of a name."""
+    return next(stage for stage in STAGES if stage.name == name)
+
+
+def names(*commands: str) -> list[str]:
+    """Names of the stages that some commands make, in order; of all stages without one."""
+    return [stage.name for stage in STAGES if not commands or stage.command in commands]
+
+
+def need(workspace: Path, name: str) -> Path:
+    """The folder of a finished stage.
+
+    Raises:
+        WorkspaceError: it is not there; the message names the command that makes it.
+    """
+    stage = spec(name)
+    command = "import-images" if name == "image" and not _is_planned(workspace) else stage.command
+    return artefacts.need_stage(workspace, stage.folder, command)
+
+
+def finished(workspace: Path) -> dict[str, artefacts.StageRecord]:
+    """Records of all finished stages, by their folders."""
+    found = {stage.folder: read_stage(workspace / stage.folder) for stage in STAGES}
+    return {folder: record for folder, record in found.items() if record is not None}
+
+
+def is_imported(workspace: Path) -> bool:
+    """Whether the pictures of a workspace are real ones."""
+    pictures = records.PicturesRecord.made(workspace / "images" / "survey.json")
+    return pictures is not None and pictures.source == "imported"
+
+
+def table() -> str:
+    """All stages as a Markdown table, for the documentation."""
+    rows = [
+        f"| `{stage.name}` | `{stage.folder}/` | `{stage.command}` | {stage.about} | "
+        f"{', '.join(f'`{name}`' for name in stage.needs)} | "
+        f"{'; '.join(f'`{path}` ({what})' for path, what in stage.products.items())} |"
+        for stage in STAGES
+    ]
+    head = "| stage | folder | made by | what it does | needs | products |"
+    return "\n".join([head, "|---|---|---|---|---|---|", *rows])
+
+
+def _is_planned(workspace: Path) -> bool:
+    return (workspace / "survey.toml").is_file() or (workspace / "plan").is_dir()
+
+
+def _there(*paths: Path | None) -> list[Path]:
+    return [path for path in paths if path is not None and path.is_file()]
+
+
+def _given(*paths: Path | None) -> list[Path]:
+    return [path for path in paths if path is not None]
+
+
+def _plan_summary(folder: Path) -> Summary:
+    plan = read_json(folder / "plan.json")
+    dives = len(plan["dives"])
+    text = (
+        f"{len(plan['lines'])} lines, {plan['stations']} stations, {plan['length_m']:.0f} m, "
+        f"{plan['duration_s'] / 60:.0f} min, {plan['energy_wh']:.0f} Wh in {dives} "
+        f"dive{'s' if dives > 1 else ''}; overlap {plan['forward_overlap']:.0%} forward, "
+        f"{plan['side_overlap']:.0%} side, {plan['coverage']:.1%} covered as requested; a picture "
+        f"every {plan['interval_s']:.2f} s, exposed {1e3 * plan['exposure_s']:.2g} ms; map in "
+        f"{folder / 'map.png'}, files for vehicles in {folder / 'exports'}"
+    )
+    return text, plan
+
+
+def _fly_summary(folder: Path) -> Summary:
+    flight = records.FlightRecord.read(folder / "flight.json")
+    line = flight.on_lines
+    text = (
+        f"{flight.vehicle} with {flight.controller}: {flight.ending}, {flight.stations} of "
+        f"{flight.stations_planned} stations in {flight.duration_s / 60:.0f} min; on lines "
+        f"{_metres(line.cross_track_rms_m)} cross-track rms (the control's part "
+        f"{_metres(line.believed_cross_track_rms_m)}), heading {_degrees(line.heading_rms_deg)} "
+        f"rms; roll in turns to {_degrees(flight.in_turns.roll_worst_deg)}; "
+        f"{sum(flight.energy_wh.values()):.1f} Wh; "
+        f"{flight.coverage.share_at_overlap:.1%} of the area covered as requested, "
+        f"{flight.coverage.every_camera_share:.1%} seen by every camera; "
+        f"plots in {folder / 'track.png'} and {folder / 'vehicle.png'}"
+    )
+    return text, flight.to_json()
+
+
+def _metres(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.3f} m"
+
+
+def _degrees(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.1f} deg"
+
+
+def _image_inputs(workspace: Path) -> list[Path]:
+    flight = workspace / "flight"
+    return [
+        workspace / "plan" / "plan.json",
+        flight / "triggers.csv",
+        flight / "navigation.csv",
+        flight / "truth" / "track.csv",
+    ]
+
+
+def _pictures_summary(folder: Path) -> Summary:
+    count = len(read_manifest(folder / "manifest.csv"))
+    return f"{count} pictures in {folder}", {"pictures": count}
+
+
+def _calibrate_inputs(workspace: Path) -> list[Path]:
+    return [workspace / "pool" / name for name in ("manifest.csv", "board.json", "left", "right")]
+
+
+def _calibrate_summary(folder: Path) -> Summary:
+    found = records.CalibrationRecord.read(folder / "calibration.json")
+    text = (
+        f"{found.views} views, {found.rms_px:.3f} px rms; rig in {folder / 'rig.json'}, "
+        f"report in {folder / 'report.html'}"
+    )
+    return text, {"views": found.views, "rms_px": found.rms_px, "worst_px": found.worst_px}
+
+
+def rig_file(workspace: Path) -> Path | None:
+    """The rig of a survey's pictures: as calibrated, else as imported with them; None without."""
+    folders = ("calibration", "images")
+    return next(iter(_there(*(workspace / folder / "rig.json" for folder in folders))), None)
+
+
+def _about_pictures(workspace: Path) -> list[Path]:
+    """Files that say what the pictures are."""
+    images = workspace / "images"
+    return [images / "manifest.csv", images / "survey.json", *_given(rig_file(workspace))]
+
+
+def _mapping_inputs(workspace: Path) -> list[Path]:
+    images = workspace / "images"
+    rows = read_manifest(images / "manifest.csv")
+    files = [*(row.image for row in rows), *(row.mask for row in rows if row.mask)]
+    return [*_about_pictures(workspace), *(images / file for file in files)]
+
+
+def _mapping_summary(folder: Path) -> Summary:
+    found = records.MappingRecord.read(folder / "mapping.json")
+    text = f"{found.registered} of {found.total} pictures in the model, in its own gauge"
+    return text, {"registered": found.registered, "total": found.total}
+
+
+def _placing_inputs(workspace: Path) -> list[Path]:
+    known = _there(*(workspace / name for name in (SCALE_FILE, *CONTROL_FILES)))
+    return [workspace / "mapping", *_about_pictures(workspace), *known]
+
+
+def _placing_summary(folder: Path) -> Summary:
+    found = records.RegistrationRecord.read(folder / "registration.json")
+    text = (
+        f"{found.registered} of {found.total} pictures registered, "
+        f"{found.mean_reprojection_px:.2f} px; {found.scale_source}"
+    )
+    return text, found.to_json()
+
+
+def _model_inputs(workspace: Path) -> list[Path]:
+    """The placed model, and the pictures and masks that are in it."""
+    sparse, images = workspace / "sparse", workspace / "images"
+    pictures = records.CamerasRecord.read(sparse / "cameras.json").images
+    files = [*pictures, *(picture.mask for picture in pictures.values() if picture.mask)]
+    return [sparse, *(images / file for file in files)]
+
+
+def _dense_inputs(workspace: Path) -> list[Path]:
+    return [*_there(workspace / "mapping" / "covariance.npz"), *_model_inputs(workspace)]
+
+
+def _dense_summary(folder: Path) -> Summary:
+    found = records.CloudRecord.read(folder / "cloud.json")
+    return f"{found.points} points; surface in {folder / 'dem.tif'}", found.to_json()
+
+
+def _mosaic_inputs(workspace: Path) -> list[Path]:
+    return [workspace / "dense" / "dem.tif", *_model_inputs(workspace)]
+
+
+def _mosaic_summary(folder: Path) -> Summary:
+    found = records.MosaicRecord.read(folder / "mosaic.json")
+    text = f"{found.width_px} x {found.height_px} px in {folder / 'mosaic.tif'}"
+    return text, found.to_json()
+
+
+def _mesh_inputs(workspace: Path) -> list[Path]:
+    dense = [workspace / "dense" / name for name in ("cloud.ply", "cloud.json", "light.json")]
+    return [*dense, *_model_inputs(workspace)]
+
+
+def _mesh_summary(folder: Path) -> Summary:
+    found = records.MeshRecord.read(folder / "mesh.json")
+    text = (
+        f"{found.triangles} triangles, {found.textured_share:.0%} textured, in "
+        f"{folder / 'mesh.glb'}"
+    )
+    return text, found.to_json()
+
+
+def _evaluate_inputs(workspace: Path) -> list[Path]:
+    images, mesh = workspace / "images", workspace / "mesh"
+    if not (images / "truth").is_dir():
+        raise WorkspaceError(
+            f"{images} has no truth: only simulated surveys can be scored; what is known of this "
+            f"one is in {workspace / 'sparse' / 'registration.json'}"
+        )
+    read = [
+        "images/truth/poses.csv", "images/truth/terrain.ply", "images/truth/rig.json",
+        "dense/dem.tif", "dense/sigma.tif", "mosaic/mosaic.tif", "sparse/track.csv",
+        "sparse/registration.json", "plan/plan.json", "images/manifest.csv", "flight/triggers.csv",
+    ]  # fmt: skip
+    if read_stage(mesh) is not None:
+        read += ["mesh/mesh.ply", "mesh/mesh.json"]
+    return [workspace / path for path in read]
+
+
+def _evaluate_summary(folder: Path) -> Summary:
+    score = records.ScoreRecord.read(folder / "score.json").to_json()
+    rows = [
+        (f"{group}.{name}", value)
+        for group, part in score.items()
+        for name, value in (part or {}).items()
+    ]
+    table = "\n".join(f"  {name:44} {value}" for name, value in rows)
+    return f"score in {folder / 'score.json'}\n{table}", score
+
+
+def _report_inputs(workspace: Path) -> list[Path]:
+    if not finished(workspace):
+        raise WorkspaceError(
+            f"{workspace} holds nothing to report on: run 'alice-survey plan' or 'import-images'"
+        )
+    read = [workspace / "survey.toml"]
+    read += [workspace / stage.folder / path for stage in STAGES for path in stage.reported]
+    read += [f for name in LOOSE_FOLDERS for f in sorted((workspace / name).rglob("*.json"))]
+    read += sorted((workspace / "quality").glob("*.csv"))
+    return [path for path in read if path.exists()]
+
+
+def _report_summary(folder: Path) -> Summary:
+    found = records.ReportRecord.read(folder / "report.json")
+    answers = "\n".join(f"  {question}: {text}" for question, text in found.summary.items())
+    return f"{folder / 'report.html'} and {folder / 'report.pdf'}\n{answers}", found.to_json()
+
+
+STAGES: tuple[StageSpec, ...] = (
+    StageSpec(
+        name="plan",
+        folder="plan",
+        command="plan",
+        about="lines, stations and camera settings that image the area",
+        version=3,
+        work="missions.plan.run:run_plan",
+        settings={
+            "name": "name",
+            "area": "area",
+            "camera": "camera",
+            "water": "water",
+            "plan": "plan",
+            "sea": "sea",
+            "vehicle": without("vehicle", "dive"),
+            "datum_given": "area.datum_given",
+            "strobes": only("imaging", "strobe_lumens", "strobe_beam_deg", "strobes_body_m"),
+        },
+        setting_files=(
+            "area.files",
+            "area.bathymetry_file",
+            "sea.current_file",
+            "vehicle.coefficients_file",
+        ),
+        summary=_plan_summary,
+        simulated=True,
+        products={
+            "plan.json": "the plan, for the next stages",
+            "settings.txt": "every setting with its equation, source and limit",
+            "exports": "the plan for vehicles",
+            "plan.html": "the plan as a page",
+        },
+        picture="map.png",
+        reported=("plan.json",),
+    ),
+    StageSpec(
+        name="fly",
+        folder="flight",
+        command="fly",
+        about="the plan flown by a simulated vehicle",
+        version=4,
+        work="missions.fly.run:run_fly",
+        needs=("plan",),
+        settings={
+            "seed": "seed",
+            "vehicle": without("vehicle", "coefficients_file"),
+            "sea": without("sea", "current_file"),
+            "navigation": "navigation",
+            "seafloor": "seafloor",
+            "seafloor_depth_m": "area.seafloor_depth_m",
+            "plan": "plan",
+            "position_body_m": "camera.position_body_m",
+            "dvl_position_body_m": "camera.dvl_position_body_m",
+        },
+        setting_files=("sea.current_file", "vehicle.coefficients_file"),
+        inputs=lambda workspace: [workspace / "plan" / "plan.json"],
+        summary=_fly_summary,
+        simulated=True,
+        products={
+            "triggers.csv": "when pictures are taken",
+            "navigation.csv": "where the vehicle believed to be",
+            "vehicle.csv": "log of the vehicle",
+            "bag": "the same as a ROS 2 bag",
+        },
+        picture="track.png",
+        reported=("flight.json",),
+    ),
+    StageSpec(
+        name="pool",
+        folder="pool",
+        command="image",
+        about="rendered pictures of a board, to calibrate from",
+        version=4,
+        work="missions.acquire.run:run_pool",
+        settings={
+            "seed": "seed",
+            "camera": "camera",
+            "n_water": "water.n_water",
+            "board": records.BoardRecord().to_json(),
+            "imaging": only("imaging", "scale", "image_format", "samples", "noise", "pool_views"),
+        },
+        summary=_pictures_summary,
+        resumes=True,
+        simulated=True,
+        products={"manifest.csv": "the pictures", "board.json": "the board"},
+        picture="left/00.png",
+    ),
+    StageSpec(
+        name="image",
+        folder="images",
+        command="image",
+        about="the pictures: rendered, or real ones (`import-images`)",
+        version=5,
+        work="missions.acquire.run:run_images",
+        needs=("plan", "fly"),
+        settings={
+            "seed": "seed",
+            "seafloor_depth_m": "area.seafloor_depth_m",
+            "margins": only("plan", "altitude_m", "run_in_m", "turn_radius_m", "margin_m"),
+            "camera": "camera",
+            "water": "water",
+            "seafloor": "seafloor",
+            "imaging": without("imaging", "pool_views"),
+        },
+        inputs=_image_inputs,
+        summary=_pictures_summary,
+        resumes=True,
+        simulated=True,
+        products={"manifest.csv": "the pictures, with time and navigation"},
+        picture="left/000000.png",
+        reported=("manifest.csv",),
+    ),
+    StageSpec(
+        name="calibrate",
+        folder="calibration",
+        command="calibrate",
+        about="the rig, from the pictures of the board",
+        version=3,
+        work="camera_calib.calibrate.run:run_calibrate",
+        needs=("pool",),
+        settings={"camera": "camera", "water": "water"},
+        inputs=_calibrate_inputs,
+        summary=_calibrate_summary,
+        simulated=True,
+        products={
+            "rig.json": "cameras, ports and baseline with their covariance",
+            "report.html": "how good the calibration is",
+        },
+        reported=("report.json",),
+    ),
+    StageSpec(
+        name="mapping",
+        folder="mapping",
+        command="reconstruct",
+        about="cameras and points in the model's own gauge",
+        version=4,
+        work="reconstruct.mapping.run:run_mapping",
+        needs=("image",),
+        uses=("calibrate",),
+        settings={
+            "seed": "seed",
+            "feature_scale": "reconstruct.feature_scale",
+            "max_features": "reconstruct.max_features",
+            "working_range_m": "reconstruct.working_range_m",
+            "mapper": "reconstruct.mapper",
+            "refine_port": "reconstruct.refine_port",
+            "refine_rig": "reconstruct.refine_rig",
+        },
+        inputs=_mapping_inputs,
+        summary=_mapping_summary,
+        resumes=True,
+        reported=("mapping.json", "port.json"),
+    ),
+    StageSpec(
+        name="placing",
+        folder="sparse",
+        command="reconstruct",
+        about="the model placed in the world",
+        version=2,
+        work="reconstruct.placing.run:run_sparse",
+        needs=("image", "mapping"),
+        uses=("calibrate",),
+        settings={"mount_sigma_deg": "reconstruct.mount_sigma_deg"},
+        inputs=_placing_inputs,
+        summary=_placing_summary,
+        products={"track.csv": "camera track with sigmas", "model": "COLMAP model"},
+        reported=(".",),
+    ),
+    StageSpec(
+        name="dense",
+        folder="dense",
+        command="reconstruct",
+        about="the surface: depth of every view, fused",
+        version=3,
+        work="reconstruct.dense.run:run_dense",
+        needs=("image", "placing"),
+        settings=only("reconstruct", "dense_scale", "dense_partners", "dem_cell_m"),
+        inputs=_dense_inputs,
+        summary=_dense_summary,
+        resumes=True,
+        products={
+            "dem.tif": "elevation model (GeoTIFF)",
+            "sigma.tif": "sigma of its heights",
+            "cloud.laz": "point cloud with colour, normal, sigma",
+        },
+        picture="dem.png",
+        reported=("dem.tif", "sigma.tif"),
+    ),
+    StageSpec(
+        name="mosaic",
+        folder="mosaic",
+        command="reconstruct",
+        about="the orthomosaic, painted on the surface",
+        version=5,
+        work="reconstruct.mosaic.run:run_mosaic",
+        needs=("image", "placing", "dense"),
+        settings={
+            "mosaic_pixel_m": "reconstruct.mosaic_pixel_m",
+            "colour": "reconstruct.colour",
+            "dispersion": "reconstruct.dispersion",
+            "water": "water",
+        },
+        inputs=_mosaic_inputs,
+        summary=_mosaic_summary,
+        products={
+            "mosaic.tif": "orthomosaic (cloud-optimised GeoTIFF)",
+            "footprints.geojson": "what each picture shows",
+        },
+        picture="mosaic.png",
+        reported=("mosaic.tif",),
+    ),
+    StageSpec(
+        name="mesh",
+        folder="mesh",
+        command="reconstruct",
+        about="the textured mesh",
+        version=1,
+        work="reconstruct.mesh.run:run_mesh",
+        needs=("image", "placing", "dense"),
+        settings=only("reconstruct", "mesh_triangles", "mesh_error_px", "mesh_page_px"),
+        inputs=_mesh_inputs,
+        summary=_mesh_summary,
+        products={"mesh.glb": "textured mesh"},
+        picture="mesh.png",
+        reported=("mesh.glb",),
+    ),
+    StageSpec(
+        name="evaluate",
+        folder="evaluation",
+        command="evaluate",
+        about="errors against the truth of the simulation",
+        version=4,
+        work="reconstruct.evaluate.run:run_evaluate",
+        needs=("image", "placing", "dense", "mosaic", "plan"),
+        uses=("mesh",),
+        settings={"seed": "seed"},
+        inputs=_evaluate_inputs,
+        summary=_evaluate_summary,
+        simulated=True,
+        products={"score.json": "errors against the truth"},
+        picture="errors.png",
+        reported=(".",),
+    ),
+    StageSpec(
+        name="report",
+        folder="report",
+        command="report",
+        about="a page and a PDF of what the workspace holds",
+        version=2,
+        work="alice_survey.report.run:run_report",
+        uses=("mosaic", "mesh", "evaluate"),
+        inputs=_report_inputs,
+        summary=_report_summary,
+        products={
+            "report.html": "one page that needs no network",
+            "report.pdf": "the same to print",
+        },
+    ),
+)
+"""In the order in which they are made."""

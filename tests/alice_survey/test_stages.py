@@ -1,0 +1,235 @@
+"""One list of stages: what it declares, what reads it, and workspaces of version 0.1.0."""
+
+import json
+import subprocess
+import sys
+import zipfile
+from importlib import import_module
+from inspect import signature
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from alice_survey import stages
+from alice_survey.base import records
+from alice_survey.base.artefacts import JsonRecord, read_stage
+from alice_survey.base.config import SurveyConfig, load_config
+from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.executor import Executor
+from alice_survey.cli.main import app
+from alice_survey.report import reproduce
+from alice_survey.report.figures import Figures
+from alice_survey.report.held import Held
+from alice_survey.report.sections import sections
+from alice_survey.report.verdicts import verdicts
+from alice_survey.stages import STAGES, StageSpec, spec
+from alice_survey.survey import run, workspace_status
+
+OLD = Path(__file__).parent / "workspace_0_1_0.zip"
+"""Made with version 0.1.0: records and small files as it wrote them, others cut short."""
+
+
+@pytest.fixture
+def old(tmp_path: Path) -> Path:
+    with zipfile.ZipFile(OLD) as archive:
+        archive.extractall(tmp_path / "old")
+    return tmp_path / "old"
+
+
+def test_a_workspace_of_version_0_1_0_is_up_to_date(old: Path) -> None:
+    before = {path: path.read_bytes() for path in old.rglob("*") if path.is_file()}
+    text, found = workspace_status(old, None)
+    raised = {"report": "stale (made by version 1 of the stage, now 2)"}
+    assert found["stages"] == dict.fromkeys(stages.names(), "up to date") | raised, text
+    assert found["next"] == f"alice-survey report -w {old}"
+    assert {path: path.read_bytes() for path in old.rglob("*") if path.is_file()} == before
+
+
+def test_a_workspace_of_version_0_1_0_is_not_done_again(old: Path) -> None:
+    _, found = run([name for name in stages.names() if name != "report"], old, None)
+    assert [name for name, part in found.items() if part["done"]] == []
+    assert found["fly"]["stations"] == found["placing"]["stations"] == 58
+
+
+@pytest.mark.parametrize(
+    ("change", "stale", "why"),
+    [
+        (("survey.toml", "relief_m = 0.35", "relief_m = 0.45"), "fly", "seafloor.relief_m"),
+        (("sparse/track.csv", "left/000000.png", "left/00000x.png"), "dense", "sparse/track.csv"),
+        (("dense/stage.json", '"version": 3', '"version": 2'), None, ""),
+    ],
+)
+def test_what_changed_in_an_old_workspace_is_named(
+    old: Path, change: tuple[str, str, str], stale: str | None, why: str
+) -> None:
+    path = old / change[0]
+    assert change[1] in path.read_text()
+    path.write_text(path.read_text().replace(change[1], change[2]))
+    states = workspace_status(old, None)[1]["stages"]
+    if stale is None:  # what decides is the digest
+        assert {states[name] for name in stages.names() if name != "report"} == {"up to date"}
+        return
+    assert states["plan"] == "up to date"
+    assert states[stale].startswith("stale (changed: ")
+    assert why in states[stale]
+    assert states["report"].startswith("stale")
+
+
+def test_a_raised_version_makes_a_stage_and_those_after_it_stale(
+    old: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    raised = [
+        StageSpec(**{**vars(stage), "version": 4}) if stage.name == "dense" else stage
+        for stage in STAGES
+    ]
+    monkeypatch.setattr(stages, "STAGES", tuple(raised))
+    states = workspace_status(old, None)[1]["stages"]
+    assert states["placing"] == "up to date"
+    assert states["dense"] == "stale (made by version 3 of the stage, now 4)"
+    assert states["mosaic"] == states["mesh"] == "stale (dense is stale)"
+
+
+def test_a_report_reads_what_version_0_1_0_wrote(old: Path) -> None:
+    (old / "dense" / "dem.tif").unlink()  # they are cut short
+    (old / "mosaic" / "mosaic.tif").unlink()
+    (old / "plan" / "map.png").unlink()
+    figures = Figures(held=Held.of(old))
+    assert (figures.registered, figures.total, figures.held.simulated) == (116, 116, True)
+    assert figures.held.name == "demo"
+    assert len(verdicts(figures)) > 5
+    titles = [section.title for section in sections(figures, has_map=False, has_mesh=True)]
+    assert {"Mesh", "Error against the truth", "Camera and rig", "Mission"} <= set(titles)
+    assert len(reproduce.section(figures).tables[0].rows) == len(STAGES) - 1
+
+
+def test_status_loads_no_package_that_works(old: Path) -> None:
+    code = (
+        "import sys; from pathlib import Path; from alice_survey.survey import workspace_status\n"
+        "assert workspace_status(Path(sys.argv[1]), None)[1]['stages']['mesh'] == 'up to date'\n"
+        "heavy = {'scipy', 'numba', 'cv2', 'pycolmap', 'open3d', 'shapely', 'rasterio'}\n"
+        "sys.exit(', '.join(heavy & set(sys.modules)) or 0)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(old)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def records_of(base: type[JsonRecord]) -> list[type[JsonRecord]]:
+    return [kind for kind in base.__subclasses__() if kind.path]
+
+
+@pytest.mark.parametrize("kind", records_of(JsonRecord), ids=lambda kind: kind.__name__)
+def test_a_record_keeps_all_that_version_0_1_0_wrote(kind: type[JsonRecord], old: Path) -> None:
+    path = old / kind.path
+    if not path.is_file():
+        assert kind in {
+            records.ControlRecord, records.ScaleRecord, records.ReferenceRecord,
+            records.ChangeRecord,
+        }  # fmt: skip
+        return
+    written = json.loads(path.read_text())
+    kind.read(path).write(path)
+    again = json.loads(path.read_text())
+    for name, value in written.items():
+        if isinstance(value, dict):
+            assert {key: again[name][key] for key in value} == value
+        else:
+            assert again[name] == value
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"points": "many"}', "\x00"])
+def test_a_damaged_record_is_one_line_that_names_it(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "cloud.json"
+    path.write_text(text)
+    with pytest.raises(WorkspaceError) as fault:
+        records.CloudRecord.read(path)
+    assert str(path) in str(fault.value)
+    assert "\n" not in str(fault.value)
+
+
+@pytest.mark.parametrize("stage", STAGES, ids=lambda stage: stage.name)
+def test_a_stage_declares_what_there_is(stage: StageSpec) -> None:
+    module, function = stage.work.split(":")
+    assert len(signature(getattr(import_module(module), function)).parameters) == 4
+    earlier = [one.name for one in STAGES[: STAGES.index(stage)]]
+    assert set(stage.needs) | set(stage.uses) <= set(earlier)
+    json.dumps(stages.settings_of(stage.settings, SurveyConfig()))
+    assert stages.files_of(stage.setting_files, SurveyConfig()) == []
+    commands = CliRunner().invoke(app, [stage.command, "--help"])
+    assert commands.exit_code == 0
+
+
+def test_settings_that_are_not_named_leave_a_stage_as_it_is(old: Path) -> None:
+    config = load_config(old / "survey.toml")
+    other = config.model_copy(update={"name": "other", "seed": 77})
+    same = [
+        stage.name
+        for stage in STAGES
+        if stages.settings_of(stage.settings, config) == stages.settings_of(stage.settings, other)
+    ]
+    assert same == ["calibrate", "placing", "dense", "mosaic", "mesh", "report"]
+
+
+# A stage, added here alone.
+
+
+def count_lines(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
+    lines = (workspace / "notes.txt").read_text().splitlines()
+    (folder / "lines.txt").write_text(str(len(lines) * config.seed))
+
+
+TOY = StageSpec(
+    name="toy",
+    folder="toys",
+    command="run",
+    about="counts the lines of a note",
+    version=1,
+    work=f"{__name__}:count_lines",
+    settings={"seed": "seed"},
+    inputs=lambda workspace: [workspace / "notes.txt"],
+    summary=lambda folder: (f"{(folder / 'lines.txt').read_text()} lines", {}),
+    products={"lines.txt": "how many lines there are"},
+    reported=("lines.txt",),
+)
+
+
+@pytest.fixture
+def toy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, __name__, sys.modules[__name__])
+    monkeypatch.setattr(stages, "STAGES", (*STAGES[:-1], TOY, STAGES[-1]))
+
+
+def test_a_stage_added_in_one_file_is_run_shown_reported_and_documented(
+    toy: None, tmp_path: Path
+) -> None:
+    (tmp_path / "notes.txt").write_text("one\ntwo\n")
+    (tmp_path / "survey.toml").write_text("seed = 3\n")
+
+    def state() -> Any:
+        return workspace_status(tmp_path, None)[1]["stages"]["toy"]
+
+    assert state() == "missing"
+    text, found = run(["toy"], tmp_path, None)
+    assert (text, found["toy"]["done"]) == ("toy: 6 lines", True)
+    assert state() == "up to date"
+    assert run(["toy"], tmp_path, None)[1]["toy"]["done"] is False
+    held = Held.of(tmp_path)
+    tables = {table.title: table.rows for table in reproduce.section(Figures(held=held)).tables}
+    assert [row[0] for row in tables["Stages"]] == ["toys"]
+    assert [row[:2] for row in tables["Files"]] == [("toys/lines.txt", "how many lines there are")]
+    assert tmp_path / "toys" / "lines.txt" in spec("report").inputs(tmp_path)
+    assert "| `toy` | `toys/` | `run` | counts the lines of a note |" in stages.table()
+    assert stages.names("run") == ["toy"]
+    (tmp_path / "survey.toml").write_text("seed = 4\n")
+    assert state() == "stale (changed: seed)"
+    (tmp_path / "survey.toml").write_text("seed = 3\n")
+    (tmp_path / "notes.txt").write_text("one\n")
+    assert state() == "stale (changed: notes.txt)"
+    (tmp_path / "notes.txt").unlink()
+    assert state().startswith("stale (")
+    record = read_stage(tmp_path / "toys")
+    assert record is not None
+    assert (record.stage, record.version, record.settings) == ("toys", 1, {"seed": 3})
