@@ -23,7 +23,6 @@ import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.artefacts import write_csv, write_json
-from alice_survey.base.executor import default_threads
 from alice_survey.base.frames import BODY_FROM_NADIR_CAM, Array, Datum
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
@@ -198,7 +197,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--work", type=Path, required=True, help="folder for the surveys")
     parser.add_argument("--megapixels", type=float, nargs="+", default=[50.0, 200.0, 1000.0])
-    parser.add_argument("--threads", type=int, default=default_threads())
+    parser.add_argument("--threads", type=int, default=2, help="each takes up to 400 MiB")
     add_options(parser, quick="50 megapixels alone")
     options = parser.parse_args()
     about, findings = machine(_PACKAGES), Findings()

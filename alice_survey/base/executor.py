@@ -89,7 +89,8 @@ class Executor:
             yield from counted(map(function, items), label, total, 1)
             return
         with self._running(workers) as pool:
-            queued = _QUEUED * workers if workers == self.workers else workers
+            is_limited = self.pool is not None and workers < self.workers
+            queued = workers if is_limited else _QUEUED * workers
             yield from counted(_in_order(pool, function, items, queued), label, total, workers)
 
     @contextlib.contextmanager

@@ -51,17 +51,20 @@ def map_figures(survey_map: SurveyMap) -> list[Figure]:
     ]
     return [
         map_figure(survey_map, shown),
-        *(map_figure(survey_map, [layer, *outline]) for layer in further),
+        *(map_figure(survey_map, [layer, *outline], on_page=False) for layer in further),
     ]
 
 
 @figure_style()
-def map_figure(survey_map: SurveyMap, layers: Sequence[PictureLayer | ShapeLayer]) -> Figure:
+def map_figure(
+    survey_map: SurveyMap, layers: Sequence[PictureLayer | ShapeLayer], *, on_page: bool = True
+) -> Figure:
     """Layers of a map over one another, with its scale, north, key and colour bar.
 
     Args:
         survey_map: what the layers are of; gives the frame.
         layers: the lowest first; those of shapes lie over those of pictures.
+        on_page: whether it needs pixels too.
     """
     west, south, east, north = map_extent(survey_map)
     margin = _MARGIN * max(east - west, north - south)
@@ -85,7 +88,7 @@ def map_figure(survey_map: SurveyMap, layers: Sequence[PictureLayer | ShapeLayer
              if layer.about]  # fmt: skip
     about = pictures[0].about if pictures else ""
     return Figure(
-        png=png_of(sheet, **_TIGHT),
+        png=png_of(sheet, **_TIGHT) if on_page else b"",
         svg=_with_jpegs(svg_of(sheet, **_TIGHT)),
         title=first.title,
         alt=f"Map, north up: {titles}",

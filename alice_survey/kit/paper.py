@@ -11,14 +11,14 @@ from collections.abc import Iterator
 from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from alice_survey.kit.document import Figure, Report, Section
 from alice_survey.kit.figure import WIDTH_IN
 from alice_survey.kit.page import numeric_columns, png_size
 
 _TEMPLATE = Path(__file__).with_name("paper.typ")
-_STANDARD = "ua-1"
+_STANDARD: Final = "ua-1"
 _LONG_WORD = re.compile(r"\S{28,}")
 _SVG_WIDTH = re.compile(rb'<svg[^>]* width="([0-9.]+)pt"')
 _PIXELS_HIGH = 0.85

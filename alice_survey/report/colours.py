@@ -11,7 +11,7 @@ from rasterio.windows import Window
 
 from alice_survey.base.frames import Array
 from alice_survey.kit.document import Scale
-from alice_survey.kit.figure import palette_colours, palette_steps
+from alice_survey.kit.figure import even_limit, palette_colours, palette_steps
 from reconstruct.raster import hillshade
 
 Rgba = NDArray[np.uint8]
@@ -100,7 +100,7 @@ def _from_zero(values: Array) -> tuple[float, float]:
 
 
 def _around_zero(values: Array) -> tuple[float, float]:
-    most = float(max(np.percentile(np.abs(values), 97), 1e-9))
+    most = even_limit(values)
     return -most, most
 
 

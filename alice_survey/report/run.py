@@ -52,7 +52,7 @@ def run_report(workspace: Path, config: SurveyConfig, executor: Executor) -> boo
     inputs += sorted((workspace / "quality").glob("*.csv"))
     stage = Stage(
         name="report",
-        version=1,
+        version=2,
         settings={},
         inputs=[path for path in inputs if path.exists()],
     )

@@ -217,8 +217,8 @@ def _control(figures: Figures) -> Section:
     ]  # fmt: skip
     tables = []
     if points:
-        columns = ("point", "use", "pictures", "north", "east", "down", "in sigmas")
-        tables.append(Table(title="Points", header=columns, rows=points))
+        header = ("point", "use", "pictures", "north", "east", "down", "in sigmas")
+        tables.append(Table(title="Points", header=header, rows=points))
     if bars:
         columns = ("bar", "use", "length", "error", "relative", "in sigmas")
         tables.append(Table(title="Scale bars", header=columns, rows=bars))

@@ -153,7 +153,7 @@ class Certificate:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _TileTask:
+class _GridTask:
     """A part of the area whose views are counted."""
 
     grid: Grid
@@ -220,7 +220,7 @@ def certificate(
         if mask[here].any():
             near = stations.some(_near(part, stations, reach_m))
             places.append(here)
-            tasks.append(_TileTask(grid=part, rays=rays, stations=near, inside=mask[here]))
+            tasks.append(_GridTask(grid=part, rays=rays, stations=near, inside=mask[here]))
     tiles = []
     found = executor.map(
         count_tile, tasks, label="count the views of each place", task_mib=_TILE_MIB
@@ -301,7 +301,7 @@ def _near(grid: Grid, stations: Stations, reach_m: Array) -> NDArray[np.bool_]:
     return near
 
 
-def count_tile(task: _TileTask) -> _TileCounts:
+def count_tile(task: _GridTask) -> _TileCounts:
     """Count the views of each cell of a part of the area."""
     pictures, lines, pairs = _counts(task.grid, task.rays, task.stations)
     return _TileCounts(

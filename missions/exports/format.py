@@ -10,7 +10,7 @@ import numpy as np
 from camera_calib.rig import Rig
 from missions.exports.geometry import lat_lon
 from missions.exports.mavlink import Item, mission_items
-from missions.exports.mount import Mount, mount_of
+from missions.exports.mount import CameraMount, mount_of
 from missions.exports.options import Options, line_tolerance_m
 from missions.exports.waypoints import Waypoint, all_waypoints
 from missions.values.plan_file import Plan
@@ -25,7 +25,7 @@ class Export:
     options: Options
 
     @cached_property
-    def mount(self) -> Mount:
+    def mount(self) -> CameraMount:
         """Where glass and altimeter are on the vehicle."""
         return mount_of(self.rig, self.options.altimeter_body_m)
 

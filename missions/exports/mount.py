@@ -19,7 +19,7 @@ _ALTIMETER_BODY_M: tuple[float, float, float] = CameraConfig().dvl_position_body
 
 
 @dataclass(frozen=True, kw_only=True)
-class Mount:
+class CameraMount:
     """Where glass and altimeter are on the vehicle; metres forward, right and down."""
 
     glass_body_m: tuple[float, float, float]
@@ -65,7 +65,9 @@ class Mount:
         )
 
 
-def mount_of(rig: Rig, altimeter_body_m: tuple[float, float, float] = _ALTIMETER_BODY_M) -> Mount:
+def mount_of(
+    rig: Rig, altimeter_body_m: tuple[float, float, float] = _ALTIMETER_BODY_M
+) -> CameraMount:
     """The mount of a rig.
 
     Args:
@@ -75,4 +77,4 @@ def mount_of(rig: Rig, altimeter_body_m: tuple[float, float, float] = _ALTIMETER
     glass_cam = glass_point_cam(rig.cameras[rig.reference])
     glass_body = rig.body_from_cam(rig.reference).apply(glass_cam)
     forward_m, right_m, down_m = (float(value) for value in glass_body)
-    return Mount(glass_body_m=(forward_m, right_m, down_m), altimeter_body_m=altimeter_body_m)
+    return CameraMount(glass_body_m=(forward_m, right_m, down_m), altimeter_body_m=altimeter_body_m)

@@ -11,7 +11,7 @@ from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.limits import SPOT_RAD_S
 from missions.exports.geometry import chords
-from missions.exports.mount import Mount
+from missions.exports.mount import CameraMount
 from missions.values.costs import SETTLE_S
 from missions.values.legs import Leg
 from missions.values.plan_file import Dive, Plan
@@ -71,7 +71,7 @@ class _Point:
 def waypoints(
     plan: Plan,
     dive: Dive,
-    mount: Mount,
+    mount: CameraMount,
     turn_rate_rad_s: float = SPOT_RAD_S,
 ) -> tuple[Waypoint, ...]:
     """The way-points of a dive, from the surface to the surface.
@@ -127,7 +127,7 @@ def waypoints(
 
 def all_waypoints(
     plan: Plan,
-    mount: Mount,
+    mount: CameraMount,
     turn_rate_rad_s: float = SPOT_RAD_S,
 ) -> list[tuple[Waypoint, ...]]:
     """The way-points of each dive."""

@@ -267,7 +267,7 @@ def _depth_m(settings: AreaConfig, area: Area, bathymetry: Bathymetry | None) ->
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Terrain:
+class _Following:
     """How lines follow a bathymetry."""
 
     depths_m: tuple[tuple[float, ...], ...] = ()
@@ -283,9 +283,9 @@ def _terrain(
     pattern: Pattern,
     camera: FlatPortCamera,
     bathymetry: Bathymetry | None,
-) -> _Terrain:
+) -> _Following:
     if bathymetry is None:
-        return _Terrain()
+        return _Following()
     limits = TerrainLimits(
         altitude_m=wanted.altitude_m,
         least_clearance_m=wanted.least_clearance_m,
@@ -302,7 +302,7 @@ def _terrain(
         extent_m=partial(footprint_size_m, camera),
     )
     depths = tuple(tuple(round(float(d), 4) for d in p.depth_m) for p in profiles)
-    return _Terrain(depths_m=depths, text=text, figures=figures)
+    return _Following(depths_m=depths, text=text, figures=figures)
 
 
 def _stations(plan: Plan, bathymetry: Bathymetry | None) -> Stations:

@@ -10,6 +10,7 @@ from alice_survey.base.artefacts import Stage, run_stage, write_json
 from alice_survey.base.config import SeaConfig, SurveyConfig
 from alice_survey.base.executor import Executor
 from alice_survey.base.run import progress
+from alice_survey.kit.document import Link
 from camera_calib.rig import Rig, design_rig
 from missions.areas.files import area_files
 from missions.exports.options import Options, options_of
@@ -17,7 +18,7 @@ from missions.exports.write import write_exports
 from missions.exposure.settings_table import settings_table
 from missions.exposure.timetable import trigger_table, write_timetable
 from missions.plan.map import draw_plan
-from missions.plan.page import Link, write_page
+from missions.plan.page import write_page
 from missions.plan.planner import Planned, plan_survey
 from missions.values.costs import Costs, leg_costs
 from missions.values.plan_file import Dive, Plan
@@ -101,7 +102,10 @@ def write_planned(
         bathymetry=planned.bathymetry,
         sea=sea,
         warnings=planned.warnings,
-        links=[Link(href=f"exports/{file.name}", about=about) for file, about in files.items()],
+        links=[
+            Link(text=file.name, address=f"exports/{file.name}", about=about)
+            for file, about in files.items()
+        ],
     )
 
 

@@ -27,7 +27,7 @@ _J_PER_WH = 3600.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Limits:
+class DiveLimits:
     """What one dive may take."""
 
     energy_j: float
@@ -110,7 +110,7 @@ def split_dives(
             first_line=first,
         )
 
-    limits = Limits(
+    limits = DiveLimits(
         energy_j=usable_wh * _J_PER_WH, time_s=math.inf if longest_s is None else longest_s
     )
     down_and_up = costs.dive_j(depth_m), costs.dive_s(depth_m)
@@ -186,7 +186,7 @@ def _sums(whole: Route, legs: Array, alone: Sequence[Route], costs: Costs, depth
     )
 
 
-def _least_dives(sums: _Sums, limits: Limits) -> list[tuple[int, int]] | None:
+def _least_dives(sums: _Sums, limits: DiveLimits) -> list[tuple[int, int]] | None:
     """First and last line of each dive; None where some line fits no dive by itself.
 
     Of the best parting of the lines up to each: how many dives, what energy, where the last begins.
@@ -226,7 +226,7 @@ def _least_dives(sums: _Sums, limits: Limits) -> list[tuple[int, int]] | None:
     return parted[::-1]
 
 
-def _line_too_long(lines: Sequence[Line], sums: _Sums, limits: Limits, depth_m: float) -> str:
+def _line_too_long(lines: Sequence[Line], sums: _Sums, limits: DiveLimits, depth_m: float) -> str:
     """Which line fits no dive by itself, and what to do."""
     each = [sums.of(i, i) for i in range(len(lines))]
     over = [i for i, (energy, time) in enumerate(each) if not limits.hold(energy, time)]
@@ -248,7 +248,7 @@ def _line_too_long(lines: Sequence[Line], sums: _Sums, limits: Limits, depth_m: 
 
 
 def _too_large(
-    lines: Sequence[Line], sums: _Sums, limits: Limits, energy_j: float, time_s: float
+    lines: Sequence[Line], sums: _Sums, limits: DiveLimits, energy_j: float, time_s: float
 ) -> str:
     """How much fits one dive, and the ways out."""
     fitting = [i for i in range(len(lines)) if limits.hold(*sums.of(0, i))]
@@ -275,7 +275,7 @@ def _numbers(energy_j: float, time_s: float) -> str:
     return f"{_wh(energy_j)} and {time_s / 3600.0:.2f} h"
 
 
-def _allowed(limits: Limits) -> str:
+def _allowed(limits: DiveLimits) -> str:
     longest = f" and {limits.time_s / 3600.0:.2f} h" if math.isfinite(limits.time_s) else ""
     return f"{_wh(limits.energy_j)}{longest}"
 

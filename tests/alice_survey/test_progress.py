@@ -108,7 +108,7 @@ def test_nothing_is_said_before_anything_is_known() -> None:
     assert remaining.left_s(10, 5.0) is None
     remaining.note(1, 6.0)
     assert remaining.left_s(10, 6.1) is None
-    remaining.note(2, 6.2)  # its neighbour's end tells of no pace
+    remaining.note(2, 6.2)  # its neighbour's end says nothing of the pace
     assert remaining.left_s(10, 6.3) is None
 
 
@@ -142,7 +142,7 @@ def test_the_record_of_long_work_stays_short() -> None:
     assert remaining.left_s(200_000, 1000.0) == pytest.approx(1000.0, rel=0.02)
 
 
-def test_steps_are_told_of_in_order_with_their_counts(run: Run, kept: Kept, clock: Clock) -> None:
+def test_steps_are_reported_in_order_with_their_counts(run: Run, kept: Kept, clock: Clock) -> None:
     with progress.step("sort", 40) as counter:
         for _ in range(40):
             clock.turn(0.2)
@@ -187,7 +187,7 @@ def test_steps_within_steps_keep_their_numbers(run: Run, kept: Kept) -> None:
     assert "done" not in kept.events[0]  # nothing is counted
 
 
-def test_a_step_that_fails_is_not_told_as_done(
+def test_a_step_that_fails_is_not_reported_as_done(
     run: Run, kept: Kept, clock: Clock, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fail() -> None:
@@ -250,7 +250,7 @@ def test_lines_say_what_took_long_and_stay_alive(
     ]
 
 
-def test_what_hangs_is_told_of_every_five_seconds(run: Run, kept: Kept, clock: Clock) -> None:
+def test_what_hangs_is_reported_every_five_seconds(run: Run, kept: Kept, clock: Clock) -> None:
     with progress.step("solve"):
         for _ in range(20):
             clock.turn(1.0)

@@ -21,7 +21,7 @@ from missions.exports.mavlink import (
     NAV_WAYPOINT,
     Item,
 )
-from missions.exports.mount import Mount
+from missions.exports.mount import CameraMount
 from missions.exports.waypoints import Waypoint
 from missions.values.plan_file import Plan
 
@@ -88,7 +88,7 @@ def _simple(item: Item, number: int) -> dict[str, Any]:
     return data
 
 
-def _fence(plan: Plan, points: Sequence[Waypoint], mount: Mount) -> list[dict[str, Any]]:
+def _fence(plan: Plan, points: Sequence[Waypoint], mount: CameraMount) -> list[dict[str, Any]]:
     """The areas of the glass as those of the vehicle's reference point, a lever arm away.
 
     The allowed area grows by the lever arm. A zone to keep out of stays as it is, unless the

@@ -6,6 +6,7 @@ import pytest
 
 from alice_survey.kit.document import ShapeLayer, SurveyMap
 from alice_survey.kit.figure import (
+    even_limit,
     figure_style,
     map_axes,
     new_figure,
@@ -70,6 +71,12 @@ def test_palettes_run_from_their_first_colour_to_their_last() -> None:
     ends = palette_colours("viridis", np.array([0.0, 1.0]))
     assert (steps[0], steps[-1]) == ("#440154", "#fde725")
     np.testing.assert_allclose(ends, [(0x44, 0x01, 0x54, 255), (0xFD, 0xE7, 0x25, 255)], atol=1)
+
+
+def test_a_scale_about_zero_shows_small_errors_next_to_few_large_ones() -> None:
+    errors_mm = np.concatenate([np.linspace(-0.4, 0.4, 980), [20.0] * 20, [np.nan]])
+    assert 0.35 < even_limit(errors_mm) <= 0.4
+    assert even_limit(np.array([np.nan])) == 1.0
 
 
 def test_a_flat_picture_shows_every_tile_on_white() -> None:
