@@ -14,7 +14,8 @@ from alice_survey.base.trajectory import read_columns, read_track
 from alice_survey.survey import FlightChanges, run
 from alice_survey.vehicle.log import read_vehicle_log
 from missions.fly.run import run_fly
-from missions.plan.run import read_plan, run_plan
+from missions.plan.run import run_plan
+from missions.values.plan_file import read_plan
 from tests.missions.flown_plans import terrain_of
 
 FILES = (
