@@ -27,7 +27,7 @@ from alice_survey.vehicle.pilot.settings import (
     pilot_guidance,
     shortest_look_ahead_m,
 )
-from alice_survey.vehicle.pilot.steering import hear_floor, tell_point
+from alice_survey.vehicle.pilot.steering import hear_floor, write_point
 from tests import oracles_guidance as oracle
 from tests.alice_survey.vehicle.pilot.pilot_runs import gains_of, launch, lawnmower, straight
 from tests.oracles_guidance import los_offset_m
@@ -62,7 +62,7 @@ def guide(path: Path, name: str, controller: str) -> tuple[g.Gains, Guidance]:
 def test_followed_point_moves_as_rotations_say(motion: Array) -> None:
     _, guidance = guide(straight(20.0), "alice", "sway")
     estimate, pilot = estimate_of(motion), new_pilot()
-    tell_point(estimate, guidance, pilot)
+    write_point(estimate, guidance, pilot)
     place, velocity = oracle.point_motion(estimate, guidance)
     np.testing.assert_allclose(pilot.point[:2], place[:2], atol=1e-12)
     np.testing.assert_allclose(pilot.point[2:4], velocity, atol=1e-12)

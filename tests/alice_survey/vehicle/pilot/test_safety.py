@@ -111,7 +111,7 @@ def test_on_the_way_up_nothing_aborts(phase: int) -> None:
 
 
 def test_every_reason_has_words() -> None:
-    borrowed = vars(slot).keys()
+    borrowed = vars(vector).keys() | vars(slot).keys()
     codes = [
         value
         for name, value in vars(safety).items()
