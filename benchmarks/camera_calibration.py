@@ -24,7 +24,10 @@ from alice_survey.base.executor import SERIAL, Executor
 from alice_survey.base.frames import Array
 from benchmarks.figures import Figure, Goal
 from camera_calib.calibrate.adjust import stack_views
-from camera_calib.calibrate.freedom import (
+from camera_calib.calibrate.normal_equations import CalibrationProblem
+from camera_calib.calibrate.solve import Intrinsics, calibrate_through_ports
+from camera_calib.calibration import TargetView
+from camera_calib.freedom import (
     PORT,
     Freedom,
     Prior,
@@ -33,9 +36,6 @@ from camera_calib.calibrate.freedom import (
     pose_names,
     value,
 )
-from camera_calib.calibrate.normal_equations import CalibrationProblem
-from camera_calib.calibrate.result import TargetView
-from camera_calib.calibrate.solve import Intrinsics, calibrate_through_ports
 from camera_calib.judge.uncertainty import baseline_sigma_m
 from camera_calib.rig import Covariance, Rig
 from tests.camera_calib.calibration_scenes import (

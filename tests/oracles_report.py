@@ -11,10 +11,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.config import CameraConfig, WaterConfig
 from camera_calib.calibrate.adjust import adjust
-from camera_calib.calibrate.freedom import PORT, POSE, Freedom, intrinsics, of_cameras, pose_names
-from camera_calib.calibrate.result import Calibration, TargetView
 from camera_calib.calibrate.start import locate
+from camera_calib.calibration import Calibration, TargetView
 from camera_calib.flat_port import FlatPortCamera
+from camera_calib.freedom import PORT, POSE, Freedom, intrinsics, of_cameras, pose_names
 from camera_calib.judge.validation import HeldOut, hold_out
 from camera_calib.rig import Covariance, Rig, design_rig
 

@@ -210,7 +210,7 @@ def draw_map(
     Area, zones, lines, footprints, how many pictures see each place, current, bathymetry.
     """
     from alice_survey.survey import settings
-    from missions.plan.redraw import map_report
+    from missions.plan.map import map_report
 
     config = settings(workspace, survey, needed=False)
     print_result(*map_report(workspace / "plan" / "plan.json", config, output), as_json)

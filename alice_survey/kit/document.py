@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 Level = Literal["good", "look", "bad"]
 LEVELS: tuple[Level, ...] = ("bad", "look", "good")
@@ -118,6 +118,8 @@ class PictureLayer:
     """From the start; only one base layer can be."""
     base: bool = True
     """Base layers exclude one another; others lie over them."""
+    group: str = "Over it"
+    """Heading in the list of layers of one that is not a base layer."""
 
     def size(self, level: int) -> tuple[int, int, float, float]:
         """Columns, rows and a pixel's width and height, metres, of a level."""
@@ -155,6 +157,18 @@ class ShapeLayer:
 
 
 @dataclass(frozen=True, kw_only=True)
+class MapScript:
+    """What a page adds to its map."""
+
+    text: str
+    """Defines `extendMap(map, layers, data)`: Leaflet's map, the groups of shapes by the name of
+    their layer, and the data below. It returns a function from a place to what the line below the
+    map adds for it. The map fires `layerschanged` when a layer is switched."""
+    data: Mapping[str, Any]
+    """JSON values."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class SurveyMap:
     """The interactive map."""
 
@@ -169,6 +183,7 @@ class SurveyMap:
     stills: Sequence[Figure] = ()
     """The map for print and for browsers without scripts: all of them in print, the first on the
     page; where there are none, the interactive map itself is printed."""
+    script: MapScript | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -42,7 +42,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.errors import ConfigError, WorkspaceError
 from alice_survey.base.frames import Array
 from alice_survey.kit.document import Figure
 from alice_survey.kit.map import round_length
@@ -51,7 +51,8 @@ __all__ = [
     "BAND", "GRID", "INK", "INKS", "MARKS", "SOFT", "WIDTH_IN", "Axes", "BoundaryNorm", "Circle",
     "Ellipse", "EllipseCollection", "LineCollection", "LinearSegmentedColormap", "ListedColormap",
     "LogNorm", "MaxNLocator", "Outline", "PathPatch", "PolyCollection", "Polygon", "Rectangle",
-    "Sheet", "colour_bar", "drawn", "even_limit", "figure_style", "map_axes", "new_figure",
+    "Sheet", "check_figure_path", "colour_bar", "drawn", "even_limit", "figure_style", "map_axes",
+    "new_figure",
     "north_arrow", "palette_colours", "palette_steps", "plain_name", "png_of", "save_figure",
     "scale_bar", "shrunk_png", "svg_of", "withStroke",
 ]  # fmt: skip
@@ -135,6 +136,17 @@ def svg_of(sheet: Any, dpi: float = _DPI, **options: Any) -> bytes:
     return _saved(sheet, "svg", dpi, options)
 
 
+def check_figure_path(path: Path) -> None:
+    """Refuse a file that no figure can be written to, before one is drawn.
+
+    Raises:
+        ConfigError: its name does not end with .png, .svg or .pdf.
+    """
+    if path.suffix.removeprefix(".").lower() not in _NO_DATES:
+        endings = ", ".join(f".{kind}" for kind in _NO_DATES)
+        raise ConfigError(f"{path}: figures are written as {endings}: change the suffix")
+
+
 def save_figure(sheet: Any, path: Path, dpi: float = _DPI, **options: Any) -> None:
     """Write a figure as what the file's name ends with: png, svg or pdf.
 
@@ -143,10 +155,18 @@ def save_figure(sheet: Any, path: Path, dpi: float = _DPI, **options: Any) -> No
         path: of the file.
         dpi: pixels per inch, of what is drawn as pixels.
         options: of matplotlib's `savefig`.
+
+    Raises:
+        ConfigError: the name has another ending, or the file cannot be written.
     """
+    check_figure_path(path)
     content = _saved(sheet, path.suffix.removeprefix(".").lower(), dpi, options)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(content)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(content)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from None
 
 
 def _saved(sheet: Any, kind: str, dpi: float, options: dict[str, Any]) -> bytes:

@@ -110,6 +110,7 @@ function startMap() {
     const legend = document.getElementById("legend-" + name);
     if (legend) legend.hidden = !on;
     note();
+    map.fire("layerschanged");
   }
 
   /* Where the map stands, for the reader and for tests. */
@@ -147,6 +148,8 @@ function startMap() {
     read("", place);
   }
 
+  /* What a script of the page's own, before this one, adds for a place. */
+  let more = () => "";
   const decimals = () => Math.min(4, Math.max(0, Math.ceil(Math.log10(2 ** map.getZoom()))));
   function read(word, place) {
     const [e, n] = [place.lng, place.lat].map((v) => v.toFixed(decimals()).replace("-", "−"));
@@ -156,7 +159,7 @@ function startMap() {
       const total = lengthText(ruled([...ruler.places, place]), data.unit, 4);
       text += ruler.places.length ? "; measured " + total : "; click to measure";
     }
-    readout.textContent = text;
+    readout.textContent = text + more(place);
   }
   const readCentre = () => read("Middle: ", map.getCenter());
 
@@ -184,6 +187,7 @@ function startMap() {
     readout.textContent = "A part of the picture did not come: load this page again";
   });
   map.fitBounds(whole, {padding: [24, 24], animate: false});
+  if (typeof extendMap === "function") more = extendMap(map, layers, data.more);
 
   root.querySelectorAll("input").forEach((input) => {
     if (input.checked) show(input.value, true);

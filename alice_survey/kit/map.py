@@ -44,6 +44,7 @@ def map_data(survey_map: SurveyMap) -> tuple[str, list[tuple[str, str]]]:
         "unit": survey_map.unit,
         "extent": [_short(value) for value in map_extent(survey_map)],
         "layers": described,
+        "more": None if survey_map.script is None else survey_map.script.data,
         "geodetic": survey_map.geodetic,
     }
     held = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")

@@ -99,13 +99,14 @@ def _check(report: Report) -> None:
 
 def _carried(report: Report) -> tuple[list[str], list[str]]:
     """The styles and the scripts that its page carries."""
-    styles, scripts = ["page.css"], list[str]()
+    styles, scripts = [_read("page.css")], list[str]()
     if report.map is not None:
-        styles.insert(0, "web/vendor_map.css")
-        scripts += _MAP_SCRIPTS
+        styles.insert(0, _read("web/vendor_map.css"))
+        more = [] if report.map.script is None else [report.map.script.text]
+        scripts += [*map(_read, _MAP_SCRIPTS[:-1]), *more, _read(_MAP_SCRIPTS[-1])]
     if report.mesh is not None:
-        scripts += _MESH_SCRIPTS
-    return [_read(name) for name in styles], [_read(name) for name in scripts]
+        scripts += map(_read, _MESH_SCRIPTS)
+    return styles, scripts
 
 
 def _read(name: str) -> str:
@@ -151,7 +152,7 @@ def _layer_groups(survey_map: SurveyMap) -> list[tuple[str, str, list[Any]]]:
     groups: dict[tuple[str, str], list[Any]] = {("Picture", "radio"): []}
     for layer in survey_map.layers:
         if isinstance(layer, PictureLayer):
-            key = ("Picture", "radio") if layer.base else ("Over it", "checkbox")
+            key = ("Picture", "radio") if layer.base else (layer.group, "checkbox")
         else:
             key = (layer.group, "checkbox")
         groups.setdefault(key, []).append(layer)

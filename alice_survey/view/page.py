@@ -3,7 +3,6 @@
 import tempfile
 import threading
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
 from urllib.parse import quote
 
@@ -36,7 +35,6 @@ _LINKS = (
     ("sparse/track.csv", "The cameras' track", "CSV"),
     ("plan/plan.html", "The plan", "an interactive map"),
 )
-LISTING_POLICY = "default-src 'none'; base-uri 'none'; form-action 'none'"
 
 
 class Page:
@@ -156,22 +154,19 @@ def _files(workspace: Workspace, host: str) -> Section:
 
 def listing(names: Sequence[str], entries: Sequence[Entry], more: int) -> tuple[bytes, str]:
     """A page that lists a folder, and its policy."""
-    title = "/".join(("files", *names))
-    rows = []
+    links = [Link(text="The survey", address="/")]
     if names:
-        rows.append('<li><a href="../">..</a></li>')
+        links.append(Link(text="..", address="../"))
     for entry in entries:
         mark = "/" if entry.is_folder else ""
-        size = "" if entry.is_folder else f" {count(entry.size, 'byte')}"
-        href = escape(quote(entry.name) + mark)
-        rows.append(f'<li><a href="./{href}">{escape(entry.name + mark)}</a>{size}</li>')
-    if more:
-        rows.append(f"<li>and {more:,} more</li>")
-    text = (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width,initial-scale=1">'
-        f'<link rel="icon" href="data:,"><title>{escape(title)}</title></head><body><main>'
-        f'<h1>{escape(title)}</h1><p><a href="/">The survey</a></p><ul>{"".join(rows)}</ul>'
-        "</main></body></html>\n"
+        size = "" if entry.is_folder else count(entry.size, "byte")
+        links.append(
+            Link(text=entry.name + mark, address=f"./{quote(entry.name)}{mark}", about=size)
+        )
+    text = [f"and {more:,} more"] if more else []
+    report = Report(
+        title="/".join(("files", *names)),
+        subtitle="",
+        sections=[Section(title="Files", text=text, links=links)],
     )
-    return text.encode(), LISTING_POLICY
+    return render_html(report).encode(), page_policy(report)

@@ -3,20 +3,25 @@
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
 
 from alice_survey.base.config import SurveyConfig, load_config
 from alice_survey.base.errors import CalibrationError, ConfigError
 from alice_survey.base.text_table import text_table
+from alice_survey.kit.figure import (
+    INKS,
+    LogNorm,
+    check_figure_path,
+    colour_bar,
+    figure_style,
+    new_figure,
+    save_figure,
+)
 from camera_calib.approximation.residual import Residual, approximations, residual
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.rig import design_rig, read_rig
 
-_COLOURS = ("#0072b2", "#009e73", "#999999", "#d55e00", "#cc79a7")
 _STYLES = ("-", "-", "--", "--", ":")
-_PICTURE_TYPES = (".png", ".pdf", ".svg")
 
 
 def residual_report(
@@ -46,8 +51,8 @@ def residual_report(
     """
     if survey is not None and rig is not None:
         raise ConfigError("give a survey's design or a rig, not both")
-    if plot is not None and plot.suffix.lower() not in _PICTURE_TYPES:
-        raise ConfigError(f"{plot}: a plot is drawn as {', '.join(_PICTURE_TYPES)}")
+    if plot is not None:
+        check_figure_path(plot)
     if rig is not None:
         origin, cameras = str(rig), read_rig(rig).cameras
     else:
@@ -93,20 +98,21 @@ def residual_table(found: list[Residual]) -> str:
     return "\n".join([text_table(header, rows), note])
 
 
+@figure_style()
 def draw_residuals(camera: FlatPortCamera, found: list[Residual], title: str, path: Path) -> None:
     """Maps over the frame on one scale, and the rms against distance.
 
     Raises:
         ConfigError: the file cannot be written.
     """
-    figure = Figure(figsize=(3.0 * len(found), 6.8), layout="constrained")
+    figure = new_figure(6.8, 3.0 * len(found))
     figure.suptitle(title, fontsize=11)
     upper, lower = figure.subfigures(2, 1, height_ratios=(1.0, 1.15))
     axes = upper.subplots(1, len(found), squeeze=False)[0]
     maps = [residual(camera, one.stand_in, one.distances_m, grid=61) for one in found]
     high = max(float(one.map_px.max()) for one in maps)
     low = max(min(one.rms_px for one in found) / 3, 1e-5 * high)
-    norm = mpl.colors.LogNorm(low, high, clip=True)
+    norm = LogNorm(low, high, clip=True)
     for one, fine, axis in zip(found, maps, axes, strict=True):
         x, y = fine.pixels[0, :, 0], fine.pixels[:, 0, 1]
         shown = axis.pcolormesh(
@@ -117,10 +123,10 @@ def draw_residuals(camera: FlatPortCamera, found: list[Residual], title: str, pa
         axis.set_title(
             f"{one.stand_in.name}\nrms {one.rms_px:.3g} px, max {one.max_px:.3g} px", fontsize=9
         )
-    upper.colorbar(shown, ax=list(axes), label="rms over distances, px", shrink=0.85, pad=0.01)
+    colour_bar(shown, list(axes), "rms over distances, px")
     plain = lower.subplots(1, 1)
     distances = np.linspace(found[0].distances_m[0], found[0].distances_m[-1], 101)
-    for one, colour, style in zip(found, _COLOURS, _STYLES, strict=False):
+    for one, colour, style in zip(found, INKS, _STYLES, strict=False):
         curve = residual(camera, one.stand_in, distances).rms_by_distance_px
         exact = one.stand_in.warped_at_m
         label = one.stand_in.name + ("" if exact is None else f" at {exact:.2f} m")
@@ -132,26 +138,8 @@ def draw_residuals(camera: FlatPortCamera, found: list[Residual], title: str, pa
         xlim=(distances[0], distances[-1]),
         ylim=(low / 3, 1.3 * high),
     )
-    plain.spines[["top", "right"]].set_visible(False)
-    plain.grid(visible=True, which="both", alpha=0.25)
-    plain.legend(fontsize=9, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
-    _save(figure, path)
-
-
-def _save(figure: Figure, path: Path) -> None:
-    """The same bytes each time: no dates, and SVG names that do not change."""
-    suffix = path.suffix.lower()
-    metadata: dict[str, Any] = {
-        ".png": {"Software": None},
-        ".pdf": {"CreationDate": None, "ModDate": None, "Producer": None, "Creator": None},
-        ".svg": {"Date": None, "Creator": None},
-    }[suffix]
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with mpl.rc_context({"svg.hashsalt": "alice-survey"}):
-            figure.savefig(path, dpi=130, metadata=metadata)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from None
+    plain.legend(fontsize=9, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    save_figure(figure, path)
 
 
 def _port(camera: FlatPortCamera) -> str:

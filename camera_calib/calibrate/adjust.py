@@ -17,9 +17,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
-from camera_calib.calibrate.freedom import Freedom
 from camera_calib.calibrate.normal_equations import CalibrationProblem, Equations, Flags, State
-from camera_calib.calibrate.result import TargetView
+from camera_calib.calibration import TargetView
+from camera_calib.freedom import Freedom
 from camera_calib.rig import Rig
 
 HUBER = 3.0

@@ -11,7 +11,7 @@ import numpy as np
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.executor import Executor
 from camera_calib.calibrate.picture_sets import PictureSet
-from camera_calib.calibrate.result import Rejection, TargetView
+from camera_calib.calibration import Rejection, TargetView
 from camera_calib.picture_files import is_cut_short, read_pixels
 from camera_calib.targets.detect import Detection, detect_with_reasons
 from camera_calib.targets.grow import chessboard_size

@@ -12,11 +12,11 @@ from alice_survey.base.errors import warn
 from alice_survey.base.records import CalibrationRecord
 from camera_calib.calibrate.adjust import stack_views
 from camera_calib.calibrate.detect_views import Detections
-from camera_calib.calibrate.result import Calibration, TargetView
 from camera_calib.calibrate.solve import recalibrate
 from camera_calib.calibrate.start import locate
+from camera_calib.calibration import Calibration, TargetView
+from camera_calib.judge.report import write_report
 from camera_calib.judge.validation import hold_out
-from camera_calib.judge.write import write_report
 from camera_calib.rig import write_rig
 
 _CORNERS = (

@@ -15,12 +15,11 @@ import numpy as np
 from alice_survey.base.artefacts import read_json
 from alice_survey.base.errors import CalibrationError, WorkspaceError, warn
 from alice_survey.base.executor import Executor, local_executor
+from alice_survey.kit.words import with_sigma
 from camera_calib.calibrate.detect_views import Detections, Size, detect_views
 from camera_calib.calibrate.files import finish, summary, warn_of_unseen
-from camera_calib.calibrate.freedom import intrinsics
 from camera_calib.calibrate.numbering import same_numbering
 from camera_calib.calibrate.picture_sets import find_pictures, pair_pictures
-from camera_calib.calibrate.result import Calibration
 from camera_calib.calibrate.solve import (
     Intrinsics,
     blank_camera,
@@ -29,8 +28,9 @@ from camera_calib.calibrate.solve import (
     calibrate_through_ports,
     first_cameras,
 )
+from camera_calib.calibration import Calibration
 from camera_calib.flat_port import FlatPortCamera
-from camera_calib.judge.page import with_sigma
+from camera_calib.freedom import intrinsics
 from camera_calib.judge.uncertainty import baseline_sigma_m
 from camera_calib.rig import Rig, read_rig, write_rig
 from camera_calib.targets.target import Target, parse_target

@@ -14,8 +14,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
-from camera_calib.calibrate.freedom import POSE, Freedom, Prior
 from camera_calib.flat_port import PARAMETERS, FlatPortCamera, pose_jacobian
+from camera_calib.freedom import POSE, Freedom, Prior
 from camera_calib.rig import Covariance, Rig
 
 Flags = NDArray[np.bool_]

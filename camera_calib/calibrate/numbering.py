@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.frames import Array
-from camera_calib.calibrate.result import TargetView
 from camera_calib.calibrate.start import poses_alone
+from camera_calib.calibration import TargetView
 from camera_calib.flat_port import FlatPortCamera
 
 Indices = NDArray[np.intp]

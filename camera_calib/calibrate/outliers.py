@@ -9,9 +9,9 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from camera_calib.calibrate.adjust import Adjustment, adjust
-from camera_calib.calibrate.freedom import Freedom
 from camera_calib.calibrate.normal_equations import Flags
-from camera_calib.calibrate.result import Rejection, TargetView
+from camera_calib.calibration import Rejection, TargetView
+from camera_calib.freedom import Freedom
 from camera_calib.rig import Rig
 
 FEWEST_VIEWS = 4

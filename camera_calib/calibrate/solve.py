@@ -16,15 +16,6 @@ from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from camera_calib.calibrate.adjust import adjust, stack_views
-from camera_calib.calibrate.freedom import (
-    PINHOLE,
-    PORT,
-    Freedom,
-    Prior,
-    intrinsics,
-    of_cameras,
-    pose_names,
-)
 from camera_calib.calibrate.observability import advice, unobservable
 from camera_calib.calibrate.outliers import (
     FEWEST_VIEWS,
@@ -34,9 +25,18 @@ from camera_calib.calibrate.outliers import (
     rejected,
     whole_picture,
 )
-from camera_calib.calibrate.result import Calibration, Rejection, TargetView
 from camera_calib.calibrate.start import first_cam_from_rig, first_focal_px, locate_all, spans
+from camera_calib.calibration import Calibration, Rejection, TargetView
 from camera_calib.flat_port import FlatPortCamera
+from camera_calib.freedom import (
+    PINHOLE,
+    PORT,
+    Freedom,
+    Prior,
+    intrinsics,
+    of_cameras,
+    pose_names,
+)
 from camera_calib.rig import Rig
 
 Intrinsics = Literal["held", "prior", "free"]

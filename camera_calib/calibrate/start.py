@@ -15,9 +15,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from camera_calib.calibrate.adjust import adjust
-from camera_calib.calibrate.freedom import HELD
-from camera_calib.calibrate.result import TargetView
+from camera_calib.calibration import TargetView
 from camera_calib.flat_port import FlatPortCamera
+from camera_calib.freedom import HELD
 from camera_calib.rig import Rig
 
 FEWEST_POINTS = 6

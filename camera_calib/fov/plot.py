@@ -4,13 +4,16 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
-from alice_survey.base.errors import ConfigError
+from alice_survey.kit.figure import (
+    INKS,
+    Axes,
+    check_figure_path,
+    figure_style,
+    new_figure,
+    save_figure,
+)
 from camera_calib.fov.angles import RELIEF, AngleRow
 from camera_calib.fov.paper import PAPER_TABLE
 from camera_calib.fov.table import TRUSTED_FOV_DEG, FovChoices, FovRow
@@ -18,16 +21,11 @@ from camera_calib.fov.table import TRUSTED_FOV_DEG, FovChoices, FovRow
 FovTable = Callable[[Sequence[float], FovChoices], list[FovRow]]
 """Rows of all lenses at altitudes, lenses outside."""
 
-_NO_DATES = {
-    ".png": {"Software": None},
-    ".svg": {"Date": None, "Creator": None},
-    ".pdf": {"CreationDate": None, "Creator": None, "Producer": None},
-}
-_COLOURS = ("#1b4f72", "#c8553d", "#1e8449", "#6c3483", "#b7950b", "#566573")
 _STYLES = ("-", "--", ":", "-.")
 _CURVE_POINTS = 30
 
 
+@figure_style()
 def draw_fov(
     path: Path,
     table: FovTable,
@@ -56,22 +54,15 @@ def draw_fov(
     Raises:
         ConfigError: another suffix, or the file cannot be written.
     """
-    suffix = path.suffix.lower()
-    if suffix not in _NO_DATES:
-        raise ConfigError(f"{path}: plots are written as {', '.join(_NO_DATES)}: change the suffix")
+    check_figure_path(path)
     marked = _by_lens(table(altitudes_m, choices))
     low, high = 0.25 * min(altitudes_m), 1.5 * max(altitudes_m)
     curve = np.linspace(max(low, 0.01), high, _CURVE_POINTS).tolist()
     curves = _by_lens(table(curve, choices))
     soft = _by_lens(table(curve, replace(choices, coc_px=3 * choices.coc_px)))
 
-    figure = Figure(figsize=(15.0, 9.4), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(9.4, 15.0)
     panels = figure.subplots(2, 3)
-    for axes in panels.flat:
-        axes.grid(visible=True, color="#d5d8dc", lw=0.6)
-        axes.set_axisbelow(True)
-        axes.spines[["top", "right"]].set_visible(False)
     _footprints(panels[0, 0], curves, marked, paper=paper)
     _pixels(panels[0, 1], curves, marked, paper=paper)
     _depth_of_field(panels[0, 2], curves, soft, choices)
@@ -83,11 +74,7 @@ def draw_fov(
         f"Through a flat port: n {first.n_water:.4g}, {_port(first)} before the pupil",
         fontsize=13,
     )
-    try:
-        with mpl.rc_context({"svg.hashsalt": "fov", "svg.fonttype": "none"}):
-            figure.savefig(path, dpi=120, metadata=_NO_DATES[suffix])
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from None
+    save_figure(figure, path, dpi=120)
 
 
 def _port(row: FovRow | AngleRow) -> str:
@@ -102,7 +89,7 @@ def _by_lens(rows: Sequence[FovRow]) -> dict[float, list[FovRow]]:
 
 
 def _colour(i: int) -> str:
-    return _COLOURS[i % len(_COLOURS)]
+    return INKS[i % len(INKS)]
 
 
 def _values(rows: Sequence[FovRow], name: str) -> list[float]:
@@ -156,7 +143,7 @@ def _footprints(
         _paper(axes, ("horizontal", "vertical"), curves)
     axes.set_title("Footprint")
     axes.set_ylabel("m")
-    axes.legend(frameon=False, fontsize=9)
+    axes.legend(fontsize=9)
 
 
 def _pixels(
@@ -167,7 +154,7 @@ def _pixels(
         _paper(axes, ("pixel",), curves)
     axes.set_title("Pixel on the sea floor")
     axes.set_ylabel("mm")
-    axes.legend(frameon=False, fontsize=9)
+    axes.legend(fontsize=9)
 
 
 def _depth_of_field(
@@ -227,7 +214,7 @@ def _precision(
     axes.set_ylabel("one sigma, mm")
     axes.set_xlim(left=0)
     axes.set_ylim(bottom=0)
-    axes.legend(frameon=False, fontsize=9)
+    axes.legend(fontsize=9)
 
 
 def _blur(
@@ -262,7 +249,7 @@ def _blur(
     axes.set_xlabel("exposure, ms")
     axes.set_ylabel("px")
     axes.set_xlim(low * 1e3, high * 1e3)
-    axes.legend(frameon=False, fontsize=9)
+    axes.legend(fontsize=9)
 
 
 def _distortion(axes: Axes, angles: Sequence[AngleRow], marked: dict[float, list[FovRow]]) -> None:

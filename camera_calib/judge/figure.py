@@ -1,92 +1,57 @@
-"""How figures of a calibration report look: style, and parts that several of them share."""
+"""Parts that several figures of a calibration report share."""
 
 import math
-import warnings
 from collections.abc import Callable, Sequence
-from io import BytesIO
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from alice_survey.base.frames import Array
+from alice_survey.kit.figure import (
+    INK,
+    INKS,
+    Axes,
+    BoundaryNorm,
+    LinearSegmentedColormap,
+    MaxNLocator,
+    Sheet,
+    colour_bar,
+    figure_style,
+    new_figure,
+    plain_name,
+    png_of,
+)
 from camera_calib.judge.fit_quality import Profile
 from camera_calib.judge.judgement import Judgement
 
-COLOURS = ("#1b6ca8", "#d1603d", "#3a8f5c", "#7a4fa3", "#b8860b", "#4d6470")
-"""Of the cameras, in the rig's order; then again from the start."""
-INK, SOFT, GRID, BAND = "#22313a", "#6b7b85", "#e3e8eb", "#dfe7ec"
 SEQUENTIAL = LinearSegmentedColormap.from_list(
     "depth", ["#f4f9fb", "#bcdcea", "#6fb1d1", "#2f7fb0", "#15507f", "#0b2545"]
 )
 DIVERGING = LinearSegmentedColormap.from_list(
     "opposed", ["#a63c1f", "#e39b7b", "#fbfbfb", "#86b7d6", "#14548a"]
 )
-_STYLE: dict[str, Any] = {
-    "font.family": "DejaVu Sans",
-    "font.size": 9.5,
-    "axes.titlesize": 10.5,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.labelsize": 9.5,
-    "axes.edgecolor": SOFT,
-    "axes.labelcolor": INK,
-    "axes.titlecolor": INK,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": GRID,
-    "grid.linewidth": 0.8,
-    "text.color": INK,
-    "xtick.color": SOFT,
-    "ytick.color": SOFT,
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
-    "legend.frameon": False,
-    "legend.fontsize": 8.5,
-    "figure.facecolor": "white",
-}
-_DPI = 130
-WIDTH = 10.4
+WIDTH_IN = 10.4
 _MOST_LABELS = 45
 _WIDE = 5.0
 """Largest over least value from which levels go by factors."""
 _FINE, _COARSE, _DECADES = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0), (1.0, 2.0, 5.0), (1.0, 3.0)
 _MOST_LEVELS = 11
 
-Draw = Callable[[Figure], None]
 
-
-def png(height: float, draw: Draw, width: float = WIDTH) -> bytes:
-    """Draw a figure of some inches and return its file; the bytes depend on the numbers only."""
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(width, height), layout="constrained")
-        FigureCanvasAgg(figure)
-        draw(figure)
-        file = BytesIO()
-        with warnings.catch_warnings():  # a picture's name may have letters that the font lacks
-            warnings.filterwarnings("ignore", message="Glyph")
-            figure.savefig(file, format="png", dpi=_DPI, metadata={"Software": None})
-    return file.getvalue()
+def png(height_in: float, draw: Callable[[Sheet], None], width_in: float = WIDTH_IN) -> bytes:
+    """Draw a figure and return its file; the bytes depend on the numbers only."""
+    with figure_style():
+        sheet = new_figure(height_in, width_in)
+        draw(sheet)
+        return png_of(sheet)
 
 
 def colour(index: int) -> str:
     """Of a camera by its place in the rig."""
-    return COLOURS[index % len(COLOURS)]
+    return INKS[index % len(INKS)]
 
 
-def plain(name: str) -> str:
-    """A name as it is: matplotlib takes text between dollars for mathematics."""
-    return name.replace("$", r"\$")
-
-
-def axes_grid(figure: Figure, count: int, rows: int = 1) -> list[list[Axes]]:
+def axes_grid(figure: Sheet, count: int, rows: int = 1) -> list[list[Axes]]:
     """Axes by row and column."""
     grid = figure.subplots(rows, count, squeeze=False)
     return [list(row) for row in grid]
@@ -105,7 +70,7 @@ def draw_frame(axes: Axes, judged: Judgement, camera: str) -> None:
 def frame_height(judged: Judgement, rows: int = 1) -> float:
     """Height of a figure with one column per camera."""
     shapes = [c.height_px / c.width_px for c in judged.calibration.rig.cameras.values()]
-    wide = WIDTH / max(len(shapes), 1.35)
+    wide = WIDTH_IN / max(len(shapes), 1.35)
     return rows * (min(max(shapes) * wide * 0.82, 6.0) + 0.75)
 
 
@@ -124,7 +89,7 @@ def draw_profile(above: Axes, below: Axes, found: Profile, index: int, name: str
         "lw": 1.3,
         "elinewidth": 1.0,
         "capsize": 2,
-        "label": plain(name),
+        "label": plain_name(name),
     }
     shift = 0.12 * (found.edges[1] - found.edges[0]) * index
     at = found.centres + shift
@@ -177,14 +142,11 @@ def banded(levels: Array) -> dict[str, Any]:
     }
 
 
-def level_bar(
-    figure: Figure, image: Any, axes: Axes | list[Axes], levels: Array, text: str
-) -> None:
+def level_bar(image: Any, axes: Axes | list[Axes], levels: Array, text: str) -> None:
     """A colour bar that names every level."""
-    bar = figure.colorbar(image, ax=axes, shrink=0.88, pad=0.015, spacing="uniform")
+    bar = colour_bar(image, axes, text, spacing="uniform")
     bar.set_ticks(levels.tolist(), labels=[f"{level:.4g}" for level in levels])
     bar.minorticks_off()
-    bar.set_label(text)
 
 
 def draw_map(axes: Axes, judged: Judgement, name: str, values: Array, levels: Array) -> Any:
@@ -208,7 +170,7 @@ def label_views(axes: Axes, names: list[str]) -> None:
     long = max(len(name) for name in names) > 4
     axes.set_xticks(
         list(shown),
-        [plain(short(names[i])) for i in shown],
+        [plain_name(short(names[i])) for i in shown],
         rotation=60 if long else 0,
         ha="right" if long else "center",
         rotation_mode="anchor",

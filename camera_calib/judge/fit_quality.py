@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.frames import Array
-from camera_calib.calibrate.result import Calibration, TargetView
+from camera_calib.calibration import Calibration, TargetView
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.rig import Rig
 

@@ -16,7 +16,7 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.frames import Array
 from camera_calib.approximation.virtual_pinhole import VirtualPinhole, best_pinhole
-from camera_calib.calibrate.result import Calibration
+from camera_calib.calibration import Calibration
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.judge.fit_quality import (
     Profile,

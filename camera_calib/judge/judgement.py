@@ -8,9 +8,9 @@ import numpy as np
 
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
-from camera_calib.calibrate.freedom import POSE, value
-from camera_calib.calibrate.result import Calibration
+from camera_calib.calibration import Calibration
 from camera_calib.flat_port import PARAMETERS
+from camera_calib.freedom import POSE, value
 from camera_calib.judge.fit_quality import (
     CameraResiduals,
     Coverage,
@@ -318,3 +318,10 @@ def _for_readers(name: str, number: float, sigma: float | None) -> tuple[float, 
         if name.endswith(ending):
             return number * factor, None if sigma is None else sigma * factor, unit
     return number, sigma, ""
+
+
+def short_label(field: str) -> str:
+    """A parameter's name without its unit: `fx_px` as `fx`."""
+    for ending in ("_px", "_rad", "_m"):
+        field = field.removesuffix(ending)
+    return field.replace("_", " ")

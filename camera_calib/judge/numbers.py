@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from alice_survey.kit.document import Verdict
 from camera_calib.judge.judgement import CameraJudgement, Judgement
 from camera_calib.judge.validation import LengthErrors
-from camera_calib.judge.verdicts import Verdict
 
 FORMAT = {"format": "alice-survey calibration report", "version": 1}
 
@@ -24,7 +24,7 @@ def report_json(judged: Judgement, verdicts: Sequence[Verdict]) -> dict[str, Any
         "noise_px": _number(calibration.noise_px),
         "working_range_m": _number(judged.working_range_m),
         "warnings": list(calibration.warnings),
-        "verdicts": [asdict(verdict) for verdict in verdicts],
+        "verdicts": [{"level": v.level, "text": v.text} for v in verdicts],
         "rejections": [asdict(rejection) for rejection in calibration.rejections],
         "parameters": [_rounded(asdict(p)) for p in judged.parameters],
         "baselines_m": {k: [_number(v), _number(s)] for k, (v, s) in judged.baselines_m.items()},

@@ -3,17 +3,22 @@
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Rectangle
 
 from alice_survey.base.frames import Array
-from camera_calib.judge.figure import (
+from alice_survey.kit.figure import (
     BAND,
-    COLOURS,
     INK,
-    SEQUENTIAL,
+    INKS,
     SOFT,
+    Axes,
+    Circle,
+    Rectangle,
+    Sheet,
+    colour_bar,
+    plain_name,
+)
+from camera_calib.judge.figure import (
+    SEQUENTIAL,
     axes_grid,
     colour,
     draw_frame,
@@ -23,7 +28,6 @@ from camera_calib.judge.figure import (
     frame_height,
     label_views,
     level_bar,
-    plain,
     png,
     shared_levels,
 )
@@ -35,7 +39,7 @@ def plot_halves(judged: Judgement) -> bytes:
     """How far calibrations from either half of the views project apart."""
     found = {name: c.halves for name, c in judged.cameras.items() if c.halves is not None}
 
-    def draw(figure: Figure) -> None:
+    def draw(figure: Sheet) -> None:
         grid = axes_grid(figure, len(found))
         maps = [np.linalg.norm(h.difference_px, axis=-1) for h in found.values()]
         levels = shared_levels(maps)
@@ -55,17 +59,17 @@ def plot_halves(judged: Judgement) -> bytes:
                 arrows[..., 0],
                 arrows[..., 1],
                 angles="xy",
-                color=COLOURS[1],
+                color=INKS[1],
                 width=0.004,
                 scale=11 * longest,
             )
             axes.set_title(
-                f"{plain(name)}: {halves.rms_px:.3f} px rms "
+                f"{plain_name(name)}: {halves.rms_px:.3f} px rms "
                 f"({halves.expected_rms_px:.3f} expected)",
                 color=colour(c),
             )
             axes.set_ylabel("y (px)" if c == 0 else "")
-        level_bar(figure, image, grid[0], levels, "difference (px)")
+        level_bar(image, grid[0], levels, "difference (px)")
 
     return png(frame_height(judged), draw)
 
@@ -78,18 +82,18 @@ def plot_hold_out(judged: Judgement) -> bytes:
     used = held.used
     order = {view.name: i for i, view in enumerate(judged.calibration.views)}
 
-    def draw(figure: Figure) -> None:
+    def draw(figure: Sheet) -> None:
         axes = figure.subplots()
         for values, names, tone, marker, label in (
             (used.residuals_px, [v.name for v in used.views], SOFT, "o", "used"),
-            (held.residuals_px, [v.name for v in held.views], COLOURS[1], "D", "held out"),
+            (held.residuals_px, [v.name for v in held.views], INKS[1], "D", "held out"),
         ):
             rms = np.sqrt(np.nanmean((values**2).sum(axis=-1), axis=(1, 2)))
             at = [order[name] for name in names]
             axes.vlines(at, 0, rms, color=tone, lw=1.2)
             axes.plot(at, rms, marker, color=tone, ms=6, label=label)
         axes.axhline(score.used_rms_px, color=SOFT, lw=1.0, label="used, all")
-        axes.axhline(score.rms_px, color=COLOURS[1], lw=1.0, label="held out, all")
+        axes.axhline(score.rms_px, color=INKS[1], lw=1.0, label="held out, all")
         axes.axhline(score.expected_px, color=INK, lw=1.1, ls="--", label="held out, expected")
         label_views(axes, list(order))
         axes.set(xlabel="view", ylabel="rms of residuals (px)", xlim=(-0.7, len(order) - 0.3))
@@ -105,13 +109,13 @@ def plot_lengths(judged: Judgement) -> bytes:
     found = [
         (lengths, name, tone, marker)
         for lengths, name, tone, marker in (
-            (judged.lengths, "used", COLOURS[0], "o"),
-            (judged.held_lengths, "held out", COLOURS[1], "D"),
+            (judged.lengths, "used", INKS[0], "o"),
+            (judged.held_lengths, "held out", INKS[1], "D"),
         )
         if lengths is not None and len(lengths.true_m)
     ]
 
-    def draw(figure: Figure) -> None:
+    def draw(figure: Sheet) -> None:
         left, right = axes_grid(figure, 2)[0]
         for lengths, name, tone, marker in found:
             views, scales, _ = lengths.scales()
@@ -144,7 +148,7 @@ def plot_homographies(judged: Judgement) -> bytes:
     """What is left of homographies against the radius: rms and mean outward part."""
     found = {n: c.homography for n, c in judged.cameras.items() if c.homography is not None}
 
-    def draw(figure: Figure) -> None:
+    def draw(figure: Sheet) -> None:
         above, below = axes_grid(figure, 2)[0]
         for name, test in found.items():
             index = list(judged.cameras).index(name)
@@ -155,7 +159,7 @@ def plot_homographies(judged: Judgement) -> bytes:
                 "--",
                 color=colour(index),
                 lw=1.0,
-                label=f"{plain(name)}, expected",
+                label=f"{plain_name(name)}, expected",
             )
         inner = max(test.inner_px for test in found.values())
         finish_profile(above, below, "radius from the principal point (px)", inner)
@@ -167,7 +171,7 @@ def plot_homographies(judged: Judgement) -> bytes:
 def plot_coverage(judged: Judgement) -> bytes:
     """How many points fell where in each frame; red marks corners that none came near."""
 
-    def draw(figure: Figure) -> None:
+    def draw(figure: Sheet) -> None:
         grid = axes_grid(figure, len(judged.cameras))
         largest = max(int(c.coverage.counts.max()) for c in judged.cameras.values())
         for c, (axes, (name, camera)) in enumerate(
@@ -187,10 +191,10 @@ def plot_coverage(judged: Judgement) -> bytes:
             axes.plot(*camera.seen.pixels.T, ".", ms=1.3, color=INK, alpha=0.45)
             for corner in camera.coverage.uncovered:
                 _mark_corner(axes, corner, size)
-            axes.set_title(plain(name), color=colour(c))
+            axes.set_title(plain_name(name), color=colour(c))
             draw_frame(axes, judged, name)
             axes.set_ylabel("y (px)" if c == 0 else "")
-        figure.colorbar(image, ax=grid[0], shrink=0.85, label="points in a cell", pad=0.015)
+        colour_bar(image, grid[0], "points in a cell")
 
     return png(frame_height(judged), draw)
 
@@ -208,7 +212,7 @@ def _mark_corner(axes: Axes, corner: str, size: tuple[int, int]) -> None:
 def plot_spread(judged: Judgement) -> bytes:
     """How the target was held: tilts, and distance against turn."""
 
-    def draw(figure: Figure) -> None:
+    def draw(figure: Sheet) -> None:
         left, right = axes_grid(figure, 2)[0]
         for c, (name, camera) in enumerate(judged.cameras.items()):
             held = camera.spread
@@ -217,7 +221,7 @@ def plot_spread(judged: Judgement) -> bytes:
                 "ms": 4.5 + 3.0 * c,
                 "mfc": colour(c) if c == 0 else "none",
                 "mew": 1.3,
-                "label": plain(name),
+                "label": plain_name(name),
             }
             left.plot(*held.tilt_xy_deg.T, "o", **style)
             right.plot(held.range_m, np.linalg.norm(held.tilt_xy_deg, axis=1), "o", **style)

@@ -3,16 +3,11 @@
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from alice_survey.base.frames import Array
+from alice_survey.kit.figure import BAND, INK, INKS, SOFT, Axes, Sheet, colour_bar, plain_name
 from camera_calib.judge.figure import (
-    BAND,
-    COLOURS,
     DIVERGING,
-    INK,
-    SOFT,
     axes_grid,
     banded,
     colour,
@@ -23,13 +18,11 @@ from camera_calib.judge.figure import (
     frame_height,
     label_views,
     level_bar,
-    plain,
     png,
     shared_levels,
     short,
 )
-from camera_calib.judge.judgement import Judgement
-from camera_calib.judge.page import short_label
+from camera_calib.judge.judgement import Judgement, short_label
 
 _CELLS = 12
 """Across a frame, whose residuals are averaged."""
@@ -43,7 +36,7 @@ def plot_pictures(judged: Judgement) -> bytes:
     views = [view.name for view in judged.calibration.views]
     cameras = list(judged.cameras)
 
-    def draw(figure: Figure) -> None:
+    def draw(figure: Sheet) -> None:
         axes, right = figure.subplots(1, 2, width_ratios=[3.2, 1], sharey=True)
         width = 0.8 / len(cameras)
         for c, camera in enumerate(cameras):
@@ -54,7 +47,7 @@ def plot_pictures(judged: Judgement) -> bytes:
                 [rms[views[i]] for i in at],
                 0.92 * width,
                 color=colour(c),
-                label=plain(camera),
+                label=plain_name(camera),
             )
             fits = [p for p in judged.pictures if p.camera == camera]
             right.plot(
@@ -77,7 +70,7 @@ def plot_pictures(judged: Judgement) -> bytes:
 def plot_vectors(judged: Judgement) -> bytes:
     """Residuals over the frame: every one thin, the mean of each cell bold."""
 
-    def draw(figure: Figure) -> None:
+    def draw(figure: Sheet) -> None:
         for c, (axes, (name, camera)) in enumerate(
             zip(axes_grid(figure, len(judged.cameras))[0], judged.cameras.items(), strict=True)
         ):
@@ -115,7 +108,7 @@ def plot_vectors(judged: Judgement) -> bytes:
             if len(out):
                 axes.plot(*out.T, "x", color="#b3261e", ms=5, mew=1.2, label="rejected")
                 axes.legend(loc="upper right", facecolor="white", frameon=True, framealpha=0.8)
-            axes.set_title(plain(name), color=colour(c))
+            axes.set_title(plain_name(name), color=colour(c))
             draw_frame(axes, judged, name)
             axes.set_xlabel(
                 f"x (px);  thin lines {px_per_px:.0f} times enlarged, arrows {4 * px_per_px:.0f}"
@@ -149,7 +142,7 @@ def _cell_means(pixels: Array, residuals: Array, width_px: int) -> tuple[Array, 
 def plot_profiles(judged: Judgement) -> bytes:
     """Residuals against radius and angle of incidence: rms above, mean outward part below."""
 
-    def draw(figure: Figure) -> None:
+    def draw(figure: Sheet) -> None:
         grid = axes_grid(figure, 2, 2)
         for c, (name, camera) in enumerate(judged.cameras.items()):
             for column, found in enumerate((camera.profiles.radius, camera.profiles.incidence)):
@@ -170,7 +163,7 @@ def plot_profiles(judged: Judgement) -> bytes:
 def plot_histogram(judged: Judgement) -> bytes:
     """Residuals in units of their pictures' noise against the normal law."""
 
-    def draw(figure: Figure) -> None:
+    def draw(figure: Sheet) -> None:
         sigma_px = judged.calibration.sigma_px[..., None, None]
         edges = np.linspace(-6, 6, 61)
         middle = (edges[1:] + edges[:-1]) / 2
@@ -191,7 +184,7 @@ def plot_histogram(judged: Judgement) -> bytes:
             )
             axes.plot(middle, normal, color=INK, lw=1.4, label="normal law")
             beyond = float((np.abs(values) > 3).mean())
-            axes.set_title(plain(name), color=colour(c))
+            axes.set_title(plain_name(name), color=colour(c))
             axes.set(
                 xlabel=f"residual / noise;  {beyond:.2%} beyond 3 (normal law: 0.27%)",
                 ylim=(1e-5, 1),
@@ -210,11 +203,11 @@ def plot_correlation(judged: Judgement) -> bytes:
         raise ValueError("a judged rig has a covariance")
     names, count = covariance.parameters, len(covariance.parameters)
 
-    def draw(figure: Figure) -> None:
+    def draw(figure: Sheet) -> None:
         axes = figure.subplots()
         matrix = covariance.correlation
         image = axes.imshow(matrix, vmin=-1, vmax=1, cmap=DIVERGING, interpolation="nearest")
-        labels = [plain(_label(name)) for name in names]
+        labels = [plain_name(_label(name)) for name in names]
         size = 8.0 if count <= 34 else 6.0
         axes.set_xticks(range(count), labels, rotation=90, fontsize=size)
         axes.set_yticks(range(count), labels, fontsize=size)
@@ -237,8 +230,8 @@ def plot_correlation(judged: Judgement) -> bytes:
                         fontsize=size - 2.2,
                         color="white" if strong else INK,
                     )
-        bar = figure.colorbar(image, ax=axes, shrink=0.6, pad=0.02)
-        bar.set_label("correlation (printed in hundredths where 0.5 or more)")
+        label = "correlation (printed in hundredths where 0.5 or more)"
+        colour_bar(image, axes, label, shrink=0.6)
 
     side = min(max(5.0, 0.27 * count + 2.2), 13.0)
     return png(side - 0.7, draw, side + 0.6)
@@ -253,7 +246,7 @@ def _label(name: str) -> str:
 def plot_projection(judged: Judgement) -> bytes:
     """Projection uncertainty over the frames at the working range, plain and compensated."""
 
-    def draw(figure: Figure) -> None:
+    def draw(figure: Sheet) -> None:
         grid = axes_grid(figure, len(judged.cameras), 2)
         for row, (kind, field) in enumerate(
             (("best pose taken", "compensated_px"), ("camera held still", "plain_px"))
@@ -264,9 +257,9 @@ def plot_projection(judged: Judgement) -> bytes:
                 zip(grid[row], judged.cameras, maps, strict=True)
             ):
                 image = draw_map(axes, judged, name, values, levels)
-                axes.set_title(f"{plain(name)}: {kind}", color=colour(c))
+                axes.set_title(f"{plain_name(name)}: {kind}", color=colour(c))
                 axes.set_ylabel("y (px)" if c == 0 else "")
-            level_bar(figure, image, grid[row], levels, "sigma (px)")
+            level_bar(image, grid[row], levels, "sigma (px)")
 
     return png(frame_height(judged, 2), draw)
 
@@ -275,12 +268,12 @@ def plot_ranges(judged: Judgement) -> bytes:
     """Uncertainty against distance: projection, and what it does to stereo."""
     stereo = judged.stereo
 
-    def draw(figure: Figure) -> None:
+    def draw(figure: Sheet) -> None:
         panels = axes_grid(figure, 2 if stereo else 1)[0]
         axes = panels[0]
         for c, (name, camera) in enumerate(judged.cameras.items()):
             at = [r.range_m for r in camera.by_range]
-            tone, label = colour(c), plain(name)
+            tone, label = colour(c), plain_name(name)
             best = [r.compensated_median_px for r in camera.by_range]
             worst = [r.compensated_worst_px for r in camera.by_range]
             still = [r.plain_median_px for r in camera.by_range]
@@ -306,10 +299,10 @@ def _draw_stereo(axes: Axes, judged: Judgement) -> None:
         axes.plot(at, 1e3 * np.array(values), style, color=tone, ms=4, label=label)
 
     line([s.noise_m[2] for s in judged.stereo], ":", SOFT, "distance of a point, its noise alone")
-    line([s.worst_point_m for s in judged.stereo], "--", COLOURS[3], "distance, worst in overlap")
-    line([s.point_m[2] for s in judged.stereo], "o-", COLOURS[3], "distance, middle of overlap")
+    line([s.worst_point_m for s in judged.stereo], "--", INKS[3], "distance, worst in overlap")
+    line([s.point_m[2] for s in judged.stereo], "o-", INKS[3], "distance, middle of overlap")
     per_m = [s.length_sigma_m / s.length_m if s.length_m > 0 else np.nan for s in judged.stereo]
-    line(per_m, "s-", COLOURS[2], "length across, per metre")
+    line(per_m, "s-", INKS[2], "length across, per metre")
     axes.set(xlabel="distance (m)", ylabel="sigma (mm)")
     axes.set_title("Stereo")
     _log_axes(axes)
@@ -339,7 +332,7 @@ def plot_stereo_map(judged: Judgement) -> bytes:
     if found is None:
         raise ValueError("one camera has no stereo")
 
-    def draw(figure: Figure) -> None:
+    def draw(figure: Sheet) -> None:
         x, y = found.points_rig[:, 0], found.points_rig[:, 1]
         for axes, values, title in zip(
             axes_grid(figure, 2)[0],
@@ -349,7 +342,7 @@ def plot_stereo_map(judged: Judgement) -> bytes:
         ):
             levels = shared_levels([1e3 * values])
             image = axes.tricontourf(x, y, 1e3 * values, **banded(levels))
-            level_bar(figure, image, axes, levels, "sigma (mm)")
+            level_bar(image, axes, levels, "sigma (mm)")
             axes.set(aspect="equal", xlabel="right (m)", ylabel="down (m)", title=title)
             axes.invert_yaxis()
             axes.grid(visible=False)

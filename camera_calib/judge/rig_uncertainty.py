@@ -9,8 +9,8 @@ import numpy as np
 
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.text_table import text_table
+from alice_survey.kit.words import with_sigma
 from camera_calib.judge.judgement import over_frame, rig_parameters
-from camera_calib.judge.page import with_sigma
 from camera_calib.judge.uncertainty import (
     baseline_sigma_m,
     compensation,

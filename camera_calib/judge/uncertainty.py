@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
-from camera_calib.calibrate.freedom import POSE
 from camera_calib.flat_port import PARAMETERS, FlatPortCamera, pose_jacobian
+from camera_calib.freedom import POSE
 from camera_calib.rig import Covariance, Rig
 
 _OVERLAP_GRID = 25

@@ -22,9 +22,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.errors import CalibrationError, warn
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
-from camera_calib.calibrate.freedom import NO_PRIOR, Prior
-from camera_calib.calibrate.result import Calibration, TargetView
+from camera_calib.calibration import Calibration, TargetView
 from camera_calib.flat_port import FlatPortCamera, pose_jacobian
+from camera_calib.freedom import NO_PRIOR, Prior
 from camera_calib.judge.fit_quality import rms_length_px, within_gate
 from camera_calib.judge.uncertainty import (
     camera_slopes,

@@ -4,14 +4,12 @@ What the views do not constrain stands in the calibration's own warnings.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
+from alice_survey.kit.document import Level, Verdict, worst_first
 from camera_calib.judge.judgement import CameraJudgement, Judgement
 
-Level = Literal["good", "look", "bad"]
 _ODD_PICTURE = 2.0
 _MOST_OUTLIERS = 0.01
 """Share of the points."""
@@ -24,18 +22,9 @@ _SIGMA_LOOK, _SIGMA_BAD = 3.0, 10.0
 """Projection sigma that nine tenths of the frame keep below, over the noise."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Verdict:
-    """One line of judgement."""
-
-    level: Level
-    text: str
-
-
 def verdicts(judged: Judgement) -> tuple[Verdict, ...]:
     """All lines, the worst first."""
-    order = ("bad", "look", "good")
-    return tuple(sorted(_lines(judged), key=lambda verdict: order.index(verdict.level)))
+    return tuple(worst_first(list(_lines(judged))))
 
 
 def _lines(judged: Judgement) -> Iterator[Verdict]:

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
-from camera_calib.calibrate.result import Rejection
+from camera_calib.calibration import Rejection
 from camera_calib.targets.corners import (
     ASTRAY,
     FITTED,

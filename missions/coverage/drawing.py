@@ -7,17 +7,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap, ListedColormap
-from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from numpy.typing import NDArray
 from shapely.geometry import MultiPolygon
 
-from alice_survey.base.frames import Array
+from alice_survey.base.frames import Array, Datum
 from alice_survey.base.run import progress
+from alice_survey.kit.figure import (
+    Axes,
+    BoundaryNorm,
+    LinearSegmentedColormap,
+    LineCollection,
+    ListedColormap,
+    Outline,
+    PathPatch,
+    Sheet,
+    colour_bar,
+    figure_style,
+    map_axes,
+    new_figure,
+    save_figure,
+)
 from missions.coverage.certificate import Certificate
 from missions.coverage.geofiles import NO_DATA, sampled
 from missions.coverage.holes import Hole
@@ -32,17 +41,18 @@ _SEEN = LinearSegmentedColormap.from_list("seen", ["#d6eaf8", "#5dade2", "#1f618
 _RISK = LinearSegmentedColormap.from_list("risk", ["#e8f8f5", "#f7dc6f", "#e67e22", "#78281f"])
 _LONGEST_PX = 1400
 _NUMBERED = 12
-_WIDTH_IN, _LEAST_WIDTH_IN, _HEAD_IN, _FOOT_IN = 9.0, 6.6, 0.95, 0.72
-"""Of the sheet, and its least; of title and axis label; of legend and figures below the map."""
-_MAP_IN, _LEAST_MAP_IN, _MOST_MAP_IN = 7.55, 2.2, 8.2
-"""Width of a map between its labels and the colours' bar, and its least and greatest height."""
+_WIDTH_IN, _LEAST_WIDTH_IN, _AROUND_IN = 9.0, 6.6, (1.5, 1.7)
+"""Width of a sheet and its least, and what labels, bar, title and legend take of its sides."""
+_LEAST_MAP_IN, _MOST_MAP_IN = 2.2, 8.2
+"""Height of a map."""
 _MARGIN = 0.06
 """Around the area, of its longer side."""
 _CLASSES = 12
-"""At most, of counts that are told apart."""
+"""At most, of counts."""
 
 
 @progress.step("draw the coverage")
+@figure_style()
 def draw_certificate(
     path: Path,
     certificate: Certificate,
@@ -62,25 +72,10 @@ def draw_certificate(
         stations: where pictures were taken, to be drawn as points.
         again: lines that fly the holes again.
     """
-    most = int(np.percentile(certificate.pictures[certificate.inside], 99.5))
-    width = math.ceil(max(most, 1) / _CLASSES)
-    steps = np.arange(1, most + 2 * width, width)
-    colours = [_NONE, *(_SEEN(i / max(len(steps) - 2, 1)) for i in range(len(steps) - 1))]
-    colour_map = ListedColormap(colours).with_extremes(bad=(0, 0, 0, 0), over=colours[-1])
-    figure, axes = _sheet(certificate.area)
-    image, extent = _north_up(certificate, certificate.pictures)
-    drawn = axes.imshow(
-        image, extent=extent, origin="lower", cmap=colour_map, interpolation="nearest",
-        norm=BoundaryNorm([0, *steps], len(colours)), zorder=1,
-    )  # fmt: skip
-    bar = figure.colorbar(
-        drawn, ax=axes, shrink=0.7, pad=0.02, ticks=[0.5, *(steps[:-1] + steps[1:]) / 2]
-    )
-    bar.ax.set_yticklabels(["0", *(_class(a, b) for a, b in itertools.pairwise(steps.tolist()))])
-    bar.ax.tick_params(length=0, labelsize=8)
-    bar.set_label("pictures of all cameras", fontsize=9)
-    _outline(axes, certificate.area.survey, _AREA, 1.4, "survey area")
-    _no_go(axes, certificate.area)
+    figure, axes = map_sheet(_bounds(certificate.area))
+    draw_counts(axes, certificate)
+    draw_polygons(axes, certificate.area.survey, "survey area", edgecolor=_AREA, lw=1.4)
+    _draw_no_go(axes, certificate.area)
     if stations is not None and len(stations):
         size = 5.0 if len(stations) < 1500 else 1.5
         axes.scatter(
@@ -88,9 +83,8 @@ def draw_certificate(
             alpha=0.55, zorder=3, label="stations",
         )  # fmt: skip
     for index, hole in enumerate(holes):
-        _outline(
-            axes, hole.outline, _HOLE, 1.6, "not at the overlap requested" if not index else ""
-        )
+        label = "" if index else "below the requested overlap"
+        draw_polygons(axes, hole.outline, label, edgecolor=_HOLE, lw=1.6)
         if index < _NUMBERED:
             _number(axes, hole, index + 1)
     if again:
@@ -100,34 +94,30 @@ def draw_certificate(
                 ends, colors=_AGAIN, linewidths=1.8, zorder=5, label="lines to fly again"
             )
         )
-    _furniture(figure, axes, certificate.area)
-    axes.set_title(title, loc="left", fontsize=12, weight="bold")
-    _foot(figure, _figures(certificate, holes))
-    figure.savefig(path, dpi=130, metadata=_plain(path))
+    finish_map(figure, axes, certificate.area.datum, title, _figures(certificate, holes))
+    save_figure(figure, path)
 
 
+@figure_style()
 def draw_risk(
     path: Path, area: Area, grid: Grid, probability: Array, title: str, text: str
 ) -> None:
-    """Draw the probability, (rows, columns), that a place is not covered at the overlap requested.
+    """Draw the probability, (rows, columns), that a place is not covered at the requested overlap.
 
     NaN is outside of the area.
     """
-    figure, axes = _sheet(area)
+    figure, axes = map_sheet(_bounds(area))
     image, extent = _resampled(area, grid, probability)
     colour_map = _RISK.with_extremes(bad=(0, 0, 0, 0))
     drawn = axes.imshow(
         image, extent=extent, origin="lower", cmap=colour_map, interpolation="nearest",
         vmin=0.0, vmax=max(float(np.nanmax(probability)), 1e-9), zorder=1,
     )  # fmt: skip
-    bar = figure.colorbar(drawn, ax=axes, shrink=0.7, pad=0.02, format="{x:.0%}")
-    bar.set_label("share of flights that leave a hole here", fontsize=9)
-    _outline(axes, area.survey, _AREA, 1.4, "survey area")
-    _no_go(axes, area)
-    _furniture(figure, axes, area)
-    axes.set_title(title, loc="left", fontsize=12, weight="bold")
-    _foot(figure, text)
-    figure.savefig(path, dpi=130, metadata=_plain(path))
+    colour_bar(drawn, axes, "share of flights that leave a hole here", format="{x:.0%}")
+    draw_polygons(axes, area.survey, "survey area", edgecolor=_AREA, lw=1.4)
+    _draw_no_go(axes, area)
+    finish_map(figure, axes, area.datum, title, text)
+    save_figure(figure, path)
 
 
 def _class(low: int, following: int) -> str:
@@ -141,35 +131,77 @@ def _figures(certificate: Certificate, holes: Sequence[Hole]) -> str:
     return (
         f"{certificate.stations} stations, {certificate.taken} pictures; seen "
         f"{certificate.covered_share:.2%}, in stereo {certificate.stereo_share:.2%}, at the "
-        f"overlap requested {certificate.share_at_overlap:.2%}\n(that is {pattern.passes} "
+        f"requested overlap {certificate.share_at_overlap:.2%}\n(that is {pattern.passes} "
         f"line{'s' if pattern.passes > 1 else ''} and {asked} pictures of each camera); "
         f"{holes_text}, {sum(hole.area_m2 for hole in holes):.2f} m²; "
         f"grid {100 * certificate.grid.cell_m:.1f} cm"
     )
 
 
-def _sheet(area: Area) -> tuple[Figure, Axes]:
+def _bounds(area: Area) -> tuple[float, float, float, float]:
+    """South, west, north and east of a map of an area."""
     south, west, north, east = area.survey.bounds
-    margin = 2 * _MARGIN * max(north - south, east - west)
-    tall = (north - south + margin) / (east - west + margin)
-    map_in = min(max(_MAP_IN * tall, _LEAST_MAP_IN), _MOST_MAP_IN)
-    wide_in = min(max(map_in / tall + _WIDTH_IN - _MAP_IN, _LEAST_WIDTH_IN), _WIDTH_IN)
-    high_in = _FOOT_IN + map_in + _HEAD_IN
-    figure = Figure(
-        figsize=(wide_in, high_in), facecolor="white",
-        layout=ConstrainedLayoutEngine(
-            rect=(0, _FOOT_IN / high_in, 1, 1 - (_FOOT_IN + 0.05) / high_in)
-        ),
-    )  # fmt: skip
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    axes.set_aspect("equal")
-    axes.grid(color="#e5e8e8", lw=0.6)
-    axes.set_axisbelow(True)
-    datum = area.datum
+    margin = _MARGIN * max(north - south, east - west)
+    return south - margin, west - margin, north + margin, east + margin
+
+
+def map_sheet(bounds_ne: tuple[float, float, float, float]) -> tuple[Sheet, Axes]:
+    """A figure with one map; it is as high as the map needs.
+
+    Args:
+        bounds_ne: south, west, north and east of the map, metres.
+    """
+    south, west, north, east = bounds_ne
+    tall = (north - south) / (east - west)
+    map_in = min(max((_WIDTH_IN - _AROUND_IN[0]) * tall, _LEAST_MAP_IN), _MOST_MAP_IN)
+    wide_in = min(max(map_in / tall + _AROUND_IN[0], _LEAST_WIDTH_IN), _WIDTH_IN)
+    figure = new_figure(map_in + _AROUND_IN[1], wide_in)
+    axes = figure.subplots()
+    axes.set(xlim=(west, east), ylim=(south, north), aspect="equal", autoscale_on=False)
+    return figure, axes
+
+
+def finish_map(figure: Sheet, axes: Axes, datum: Datum, title: str, text: str) -> None:
+    """Scale, north, labels and legend of a map, and a text over the legend."""
+    map_axes(axes)
     axes.set_xlabel(f"east of {abs(datum.longitude_deg):.6f}° {'EW'[datum.longitude_deg < 0]}, m")
     axes.set_ylabel(f"north of {abs(datum.latitude_deg):.6f}° {'NS'[datum.latitude_deg < 0]}, m")
-    return figure, axes
+    axes.set_title(title, fontsize=12)
+    figure.legend(
+        *axes.get_legend_handles_labels(), loc="outside lower left", ncols=4, fontsize=8,
+        title=text, title_fontsize=8.5, alignment="left",
+    )  # fmt: skip
+
+
+def draw_counts(axes: Axes, certificate: Certificate, opacity: float = 1.0) -> None:
+    """How many pictures see each place, in steps that the eye can tell apart."""
+    most = int(np.percentile(certificate.pictures[certificate.inside], 99.5))
+    width = math.ceil(max(most, 1) / _CLASSES)
+    steps = np.arange(1, most + 2 * width, width)
+    colours = [_NONE, *(_SEEN(i / max(len(steps) - 2, 1)) for i in range(len(steps) - 1))]
+    colour_map = ListedColormap(colours).with_extremes(bad=(0, 0, 0, 0), over=colours[-1])
+    image, extent = _north_up(certificate, certificate.pictures)
+    drawn = axes.imshow(
+        image, extent=extent, origin="lower", cmap=colour_map, interpolation="nearest",
+        norm=BoundaryNorm([0, *steps], len(colours)), alpha=opacity, zorder=0.6,
+    )  # fmt: skip
+    ticks = [0.5, *(steps[:-1] + steps[1:]) / 2]
+    bar = colour_bar(drawn, axes, "pictures of all cameras", ticks=ticks)
+    bar.ax.set_yticklabels(["0", *(_class(a, b) for a, b in itertools.pairwise(steps.tolist()))])
+    bar.ax.tick_params(length=0, labelsize=8)
+
+
+def draw_polygons(axes: Axes, shape: MultiPolygon, label: str, **style: Any) -> None:
+    """Polygons with their holes, (north, east) in metres; an empty label is in no legend."""
+    rings = [
+        Outline(np.asarray(ring.coords)[:, 1::-1], closed=True)
+        for polygon in shape.geoms
+        for ring in (polygon.exterior, *polygon.interiors)
+    ]
+    if rings:
+        whole = Outline.make_compound_path(*rings)
+        given = {"facecolor": "none", "zorder": 4, "label": label or "_nolegend_"} | style
+        axes.add_patch(PathPatch(whole, **given))
 
 
 def _north_up(
@@ -208,29 +240,6 @@ def _pixels(area: Area, cell_m: float) -> tuple[Array, tuple[float, float, float
     return np.stack(at, axis=-1), extent
 
 
-def _outline(axes: Axes, shape: MultiPolygon, colour: str, width: float, label: str) -> None:
-    rings = [
-        np.asarray(ring.coords)[:, 1::-1]
-        for polygon in shape.geoms
-        for ring in (polygon.exterior, *polygon.interiors)
-    ]
-    edges = LineCollection(
-        rings, colors=colour, linewidths=width, zorder=4, label=label or "_nolegend_"
-    )
-    axes.add_collection(edges)
-
-
-def _no_go(axes: Axes, area: Area) -> None:
-    rings = [np.asarray(polygon.exterior.coords)[:, 1::-1] for polygon in area.no_go.geoms]
-    if rings:
-        axes.add_collection(
-            PolyCollection(
-                rings, facecolors="#eaeded", edgecolors="#7f8c8d", hatch="//", lw=0.8, zorder=2,
-                label="no-go zone",
-            )
-        )  # fmt: skip
-
-
 def _number(axes: Axes, hole: Hole, number: int) -> None:
     axes.annotate(
         str(number), xy=hole.place_ne[::-1], ha="center", va="center", fontsize=8, weight="bold",
@@ -239,32 +248,8 @@ def _number(axes: Axes, hole: Hole, number: int) -> None:
     )  # fmt: skip
 
 
-def _foot(figure: Figure, text: str) -> None:
-    figure.text(
-        0.012, 0.1 / figure.get_figheight(), text, fontsize=8.5, color="#333333", va="bottom"
-    )
-
-
-def _furniture(figure: Figure, axes: Axes, area: Area) -> None:
-    """Limits, legend and a north arrow."""
-    south, west, north, east = area.survey.bounds
-    margin = _MARGIN * max(north - south, east - west)
-    axes.set_xlim(west - margin, east + margin)
-    axes.set_ylim(south - margin, north + margin)
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="lower center", ncol=5, frameon=False, fontsize=8,
-        bbox_to_anchor=(0.5, 0.43 / figure.get_figheight()),
+def _draw_no_go(axes: Axes, area: Area) -> None:
+    draw_polygons(
+        axes, area.no_go, "no-go zone", facecolor="#eaeded", edgecolor="#7f8c8d", hatch="//",
+        lw=0.8, zorder=2,
     )  # fmt: skip
-    axes.annotate(
-        "N", xy=(0.975, 0.99), xytext=(0, -28), xycoords="axes fraction",
-        textcoords="offset points", ha="center", va="center", fontsize=10, weight="bold", zorder=9,
-        arrowprops={"arrowstyle": "-|>", "color": "black", "lw": 1.4},
-    )  # fmt: skip
-
-
-def _plain(path: Path) -> dict[str, None]:
-    """No date and no version in the file: the same map is the same bytes."""
-    if path.suffix.lower() == ".pdf":
-        return {"CreationDate": None, "Creator": None, "Producer": None}
-    return {"Software": None}

@@ -3,11 +3,9 @@
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from alice_survey.base.frames import Array
+from alice_survey.kit.figure import Axes, figure_style, new_figure, save_figure
 from missions.fly.compare import EQUAL, IMPROVED, ORIGINAL, PAPER, CaseResult, Outcome, Trace
 from missions.fly.flight_plots import BAND, draw_lines
 from missions.fly.flight_route import whole_route
@@ -16,16 +14,16 @@ from missions.values.plan_file import Plan
 _AROUND_M = 3.2
 """Of the lines, that a map shows: the turns, not the way in."""
 _COLOURS = {ORIGINAL: "#c0392b", EQUAL: "#ca6f1e", IMPROVED: "#1b4f72"}
-_PAPER, _GRID, _WAY = "#5d6d7e", "#e5e8e8", "#aab7b8"
+_PAPER, _WAY = "#5d6d7e", "#aab7b8"
 
 
+@figure_style()
 def draw_case(path: Path, plan: Plan, result: CaseResult) -> None:
     """Draw the tracks over the plan, cross-track and roll along the mission, and bars.
 
     The tracks are of the first flight, the bars of all.
     """
-    figure = Figure(figsize=(15, 11), facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(11, 15)
     grid = figure.add_gridspec(3, 3, height_ratios=(1.6, 1, 1))
     shown = [name for name in (ORIGINAL, EQUAL, IMPROVED) if name in result.summaries]
     traced = {o.variant: o for o in result.outcomes if o.trace is not None}
@@ -54,7 +52,7 @@ def draw_case(path: Path, plan: Plan, result: CaseResult) -> None:
     ):
         _draw_bars(figure.add_subplot(bars[row]), result, shown, title, paper, figures)
     figure.suptitle(f"{plan.name}, {result.title}", x=0.01, ha="left", fontsize=12, weight="bold")
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    save_figure(figure, path, dpi=110)
 
 
 def _draw_track(axes: Axes, plan: Plan, outcome: Outcome, labelled: bool) -> None:
@@ -87,7 +85,7 @@ def _draw_strip(axes: Axes, traced: dict[str, Outcome], names: list[str], field:
         values: Array = getattr(trace, field)
         axes.plot(share, values, color=_COLOURS[name], lw=0.8, label=name)
     axes.axhline(0, color="#7f8c8d", lw=0.6)
-    axes.grid(axis="y", color=_GRID, lw=0.5)
+    axes.grid(visible=False, axis="x")
     axes.margins(x=0.005)
 
 
@@ -134,8 +132,7 @@ def _draw_bars(
     said = " (full: lines, pale: whole route; hatched: paper)" if len(figures) > 1 else ""
     axes.set_title(title + said, loc="left", fontsize=8.5)
     axes.tick_params(axis="y", labelsize=7.5)
-    axes.grid(axis="y", color=_GRID, lw=0.5)
-    axes.set_axisbelow(True)
+    axes.grid(visible=False, axis="x")
 
 
 def _legend(axes: Axes) -> None:

@@ -4,20 +4,20 @@ import itertools
 import math
 import textwrap
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
-from matplotlib.patches import PathPatch
-from matplotlib.path import Path as Path2D
-from matplotlib.transforms import ScaledTranslation
 from scipy.spatial.transform import Rotation
-from shapely.geometry import MultiPolygon
 
 from alice_survey.base.frames import Array
+from alice_survey.kit.figure import (
+    Axes,
+    LineCollection,
+    Sheet,
+    colour_bar,
+    figure_style,
+    new_figure,
+    save_figure,
+)
 from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.navigation import tick as navigation
 from alice_survey.vehicle.pilot.memory import (
@@ -30,13 +30,14 @@ from alice_survey.vehicle.pilot.memory import (
     WANTED_SURGE,
 )
 from alice_survey.vehicle.simulator import Flown
+from missions.coverage.drawing import draw_polygons
 from missions.fly.flight_records import rpm_of, true_velocity
 from missions.fly.flight_route import whole_route
 from missions.values.flight import Flight, rms
 from missions.values.plan_file import Plan
 
 PLAN, TRUE, NAV, AREA, BAND = "#95a5a6", "#1b4f72", "#ca6f1e", "#c8553d", "#eaf2f8"
-_ROLL, _PITCH, _GRID = "#884ea0", "#229954", "#e5e8e8"
+_ROLL, _PITCH = "#884ea0", "#229954"
 _THRUSTERS = ("#1b4f72", "#ca6f1e", "#229954", "#884ea0", "#c0392b", "#7f8c8d")
 _ALLOWED, _HOME = "#566573", "#27ae60"
 _WAY_POINTS = 4000
@@ -53,6 +54,7 @@ _PHASES = {
 }
 
 
+@figure_style()
 def draw_flight(path: Path, flight: Flight) -> None:
     """Draw a map of plan, true track and navigation next to strips of the errors."""
     figure, chart, strips = _sheet(6)
@@ -78,9 +80,10 @@ def draw_flight(path: Path, flight: Flight) -> None:
     _draw_altitude(strips[3], flight)
     _draw_navigation_error(strips[4:], flight)
     _end_strips(figure, strips, flight)
-    figure.savefig(path, dpi=120, metadata={"Software": None})
+    save_figure(figure, path, dpi=120)
 
 
+@figure_style()
 def draw_vehicle(path: Path, flight: Flight) -> None:
     """Draw the track, coloured by speed, next to strips of speed, roll, thrusters and power."""
     craft = vehicle(flight.vehicle)
@@ -92,7 +95,7 @@ def draw_vehicle(path: Path, flight: Flight) -> None:
     velocity = true_velocity(flight.flown)
     speed = np.hypot(velocity[:, 0], velocity[:, 1])
     _draw_plan(chart, flight.plan)
-    _draw_speeds(figure, chart, flight, speed)
+    _draw_speeds(chart, flight, speed)
     _end_chart(chart, f"{flight.plan.name}: {flight.vehicle} over the plan")
 
     _draw_surge(strips[0], flight, velocity[:, 0], speed)
@@ -102,7 +105,7 @@ def draw_vehicle(path: Path, flight: Flight) -> None:
     _draw_power(strips[-2], flight)
     _draw_current(strips[-1], flight)
     _end_strips(figure, strips, flight)
-    figure.savefig(path, dpi=120, metadata={"Software": None})
+    save_figure(figure, path, dpi=120)
 
 
 def line_spans(flight: Flight) -> list[tuple[float, float]]:
@@ -132,8 +135,6 @@ def draw_lines(axes: Axes, plan: Plan) -> None:
     """The planned lines of a map, and how a map of ours looks."""
     axes.set_aspect("equal")
     axes.set_facecolor("#fbfcfc")
-    axes.grid(color=_GRID, lw=0.6)
-    axes.set_axisbelow(True)
     ends = [(line.start_ne_m[::-1], line.end_ne_m[::-1]) for line in plan.lines]
     axes.add_collection(
         LineCollection(ends, colors=PLAN, linewidths=3.2, alpha=0.7, label="planned lines")
@@ -142,10 +143,9 @@ def draw_lines(axes: Axes, plan: Plan) -> None:
     axes.set_ylabel("north, m")
 
 
-def _sheet(strips: int) -> tuple[Figure, Axes, list[Axes]]:
+def _sheet(strips: int) -> tuple[Sheet, Axes, list[Axes]]:
     """A picture with a map and strips that share their time."""
-    figure = Figure(figsize=(15, 9.5), facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(9.5, 15)
     grid = figure.add_gridspec(strips, 2, width_ratios=(1, 1.15))
     chart = figure.add_subplot(grid[:, 0])
     first = figure.add_subplot(grid[0, 1])
@@ -162,42 +162,31 @@ def _draw_plan(axes: Axes, plan: Plan) -> None:
     way = route.places(np.linspace(0.0, route.length_m, _WAY_POINTS))
     axes.plot(way[:, 1], way[:, 0], color=PLAN, lw=0.8, zorder=1, label="planned way")
     area = plan.area
-    _outline(axes, area.survey, "area", edgecolor=AREA, lw=1.6, ls="--", fill=False)
-    _outline(axes, area.allowed, "may be within", edgecolor=_ALLOWED, lw=0.9, ls=":", fill=False)
-    _outline(
+    draw_polygons(axes, area.survey, "area", edgecolor=AREA, lw=1.6, ls="--")
+    draw_polygons(axes, area.allowed, "may be within", edgecolor=_ALLOWED, lw=0.9, ls=":")
+    draw_polygons(
         axes, area.no_go, "no-go zone", facecolor="#f5b7b1", edgecolor=AREA, hatch="xxx", alpha=0.5
     )
     north, east = plan.home_ne_m
     axes.plot(east, north, "D", ms=7, mfc=_HOME, mec="white", zorder=6, ls="", label="home")
 
 
-def _outline(axes: Axes, shape: MultiPolygon, label: str, **style: Any) -> None:
-    rings = [
-        Path2D(np.asarray(ring.coords)[:, 1::-1], closed=True)
-        for polygon in shape.geoms
-        for ring in (polygon.exterior, *polygon.interiors)
-    ]
-    if rings:
-        whole = Path2D.make_compound_path(*rings)
-        axes.add_patch(PathPatch(whole, label=label, zorder=2, **style))
-
-
 def _end_chart(axes: Axes, title: str) -> None:
     axes.set_anchor("N")
     axes.set_title(textwrap.fill(title, 60), loc="left", fontsize=12, weight="bold")
     axes.legend(
-        loc="upper center", bbox_to_anchor=(0.5, 0.0), borderaxespad=4.5, ncol=3, frameon=False,
+        loc="upper center", bbox_to_anchor=(0.5, 0.0), borderaxespad=4.5, ncol=3,
         fontsize=8,
     )  # fmt: skip
 
 
-def _end_strips(figure: Figure, strips: list[Axes], flight: Flight) -> None:
+def _end_strips(figure: Sheet, strips: list[Axes], flight: Flight) -> None:
     """Shade the lines, name the phases, and leave the times to the last strip."""
     spans = line_spans(flight)
     for axes in strips:
         for begin, end in spans:
             axes.axvspan(begin, end, color=BAND, lw=0, zorder=0)
-        axes.grid(axis="y", color=_GRID, lw=0.5)
+        axes.grid(visible=False, axis="x")
         axes.margins(x=0.005)
         axes.tick_params(labelsize=8)
         axes.yaxis.label.set_size(8.5)
@@ -225,7 +214,7 @@ def _end_strips(figure: Figure, strips: list[Axes], flight: Flight) -> None:
 def _legend(axes: Axes, title: str = "") -> None:
     """Names of the curves above a strip, to the right, and a title to the left."""
     axes.legend(
-        loc="lower right", bbox_to_anchor=(1.0, 0.95), ncol=5, fontsize=7.5, frameon=False,
+        loc="lower right", bbox_to_anchor=(1.0, 0.95), ncol=5, fontsize=7.5,
         borderaxespad=0.0, columnspacing=1.2, handlelength=1.6,
     )  # fmt: skip
     if title:
@@ -293,13 +282,13 @@ def _draw_navigation_error(strips: list[Axes], flight: Flight) -> None:
         axes.fill_between(
             t, -band, band, color=NAV, alpha=0.18, lw=0, label=f"±{_SPREAD_SIGMAS:g} logged sigmas"
         )
-        axes.plot(t, off[some, axis], color=TRUE, lw=1.0, label="believed less true")
+        axes.plot(t, off[some, axis], color=TRUE, lw=1.0, label="believed minus true")
         axes.axhline(0, color="#7f8c8d", lw=0.6)
         axes.set_ylabel(f"{name} error, m")
     _legend(strips[0], "navigation")
 
 
-def _draw_speeds(figure: Figure, axes: Axes, flight: Flight, speed: Array) -> None:
+def _draw_speeds(axes: Axes, flight: Flight, speed: Array) -> None:
     some = thin(len(speed))
     points = flight.glass_ned[some, 1::-1]
     pieces = np.stack([points[:-1], points[1:]], axis=1)
@@ -309,11 +298,8 @@ def _draw_speeds(figure: Figure, axes: Axes, flight: Flight, speed: Array) -> No
     )
     axes.add_collection(drawn)
     axes.autoscale()
-    below = axes.transAxes + ScaledTranslation(0.0, -1.05, figure.dpi_scale_trans)
-    room = axes.inset_axes((0.15, 0.0, 0.7, 0.016), transform=below)
-    bar = figure.colorbar(drawn, cax=room, orientation="horizontal", extend="max")
-    bar.set_label("true speed over ground of the body's origin, m/s", fontsize=8)
-    room.tick_params(labelsize=8)
+    label = "true speed over ground of the body's origin, m/s"
+    colour_bar(drawn, axes, label, location="top", extend="max", shrink=0.7)
 
 
 def _draw_surge(axes: Axes, flight: Flight, surge: Array, speed: Array) -> None:
@@ -380,6 +366,8 @@ def _draw_power(axes: Axes, flight: Flight) -> None:
     steps = np.diff(flight.truth.time_s, prepend=0.0)
     energy.plot(t, (np.cumsum(total * steps) / 3600.0)[some], color="black", lw=1.2)
     energy.set_ylim(bottom=0)
+    energy.grid(visible=False)
+    energy.spines["right"].set_visible(True)
     energy.set_ylabel("energy, Wh", fontsize=8.5)
     energy.tick_params(labelsize=8)
     spent = float(flown.energy_j.sum()) / 3600.0

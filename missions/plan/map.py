@@ -1,42 +1,65 @@
-"""The map of a plan: area, no-go zones, lines, footprints, overlap, current, bathymetry."""
+"""The map of a plan as a figure: area, no-go zones, lines, footprints, overlap, current, depth."""
 
 import math
 from pathlib import Path
+from typing import Any
 
-import matplotlib as mpl
 import numpy as np
-import shapely
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import BoundaryNorm
-from matplotlib.figure import Figure
-from matplotlib.patches import PathPatch
-from matplotlib.path import Path as Outline
-from matplotlib.transforms import Affine2D
 
-from alice_survey.base.config import SeaConfig
-from alice_survey.base.errors import PlanError
+from alice_survey.base.config import SeaConfig, SurveyConfig
 from alice_survey.base.frames import Array
-from camera_calib.rig import Rig
+from alice_survey.kit.figure import (
+    INK,
+    Axes,
+    LineCollection,
+    PolyCollection,
+    Sheet,
+    check_figure_path,
+    figure_style,
+    save_figure,
+)
+from camera_calib.rig import Rig, design_rig
 from missions.areas.bathymetry import Bathymetry
-from missions.coverage.certificate import Certificate
+from missions.coverage.certificate import Certificate, certificate
+from missions.coverage.drawing import draw_counts, draw_polygons, finish_map, map_sheet
+from missions.coverage.stations import plan_pattern, stations_of_plan
 from missions.exports.geometry import footprint_outline, footprints_ne
-from missions.values.plan_file import Plan
+from missions.plan.page_map import COLOURS, KINDS
+from missions.plan.planner import area_bathymetry
+from missions.values.plan_file import Plan, read_plan
 
-_AREA, _WAY, _NO_GO, _ALLOWED = "#c8553d", "#7f8c8d", "#b03a2e", "#566573"
-_LINES = {"survey": "#1b4f72", "cross": "#6c3483", "closing": "#117a65", "fill": "#b9770e"}
-_FOOTPRINT, _PAPER = "#2e86c1", "#fbfcfc"
-_INK = "#17202a"
 _MOST_ARROWS = 500
 _MOST_FOOTPRINTS = 3000
 """Beyond, single footprints are no longer seen: the count of pictures shows what they cover."""
 _ALLOWED_BEYOND = 0.3
 """Share of the map by which the allowed area may be larger than all else and is still shown whole.
 """
-_LEAST_MAP_IN = 2.2
-_PDF_DATE = {"CreationDate": None, "ModDate": None}
-SUFFIXES = (".png", ".pdf", ".svg")
+
+
+def map_report(plan_path: Path, config: SurveyConfig, out: Path) -> tuple[str, dict[str, Any]]:
+    """Draw the map of a finished plan again, as PNG, PDF or SVG after the suffix.
+
+    Args:
+        plan_path: `plan.json`.
+        config: the survey, for its cameras, bathymetry and current.
+        out: file to write.
+
+    Raises:
+        PlanError: the file holds no plan.
+        ConfigError: the suffix is not known.
+    """
+    check_figure_path(out)
+    plan = read_plan(plan_path)
+    rig = design_rig(config.camera, config.water)
+    bathymetry = area_bathymetry(config.area, plan.area, plan.altitude_m)
+    floor_m = None
+    if bathymetry is not None:
+        floor_m = bathymetry.depth_at(np.vstack([line.stations_ne for line in plan.lines]))
+    stations = stations_of_plan(plan, floor_m)
+    seen = certificate(plan.area, rig, stations, plan_pattern(plan, rig))
+    out.parent.mkdir(parents=True, exist_ok=True)
+    draw_plan(out, plan, rig, seen, bathymetry, config.sea)
+    return f"map of {plan.name} in {out}", {"plan": plan.name, "file": str(out)}
 
 
 def draw_plan(
@@ -47,10 +70,10 @@ def draw_plan(
     bathymetry: Bathymetry | None = None,
     sea: SeaConfig | None = None,
 ) -> None:
-    """Draw a plan, east to the right, north up, as PNG, PDF or SVG.
+    """Draw a plan, east to the right, north up.
 
     Args:
-        path: its suffix says what to write.
+        path: PNG, PDF or SVG.
         plan: what to draw.
         rig: its first camera's footprints are drawn.
         certificate: how many pictures see each place.
@@ -58,38 +81,42 @@ def draw_plan(
         sea: its mean current near the sea floor is shown.
 
     Raises:
-        PlanError: the suffix is not known.
+        ConfigError: the suffix is not known.
     """
-    if path.suffix.lower() not in SUFFIXES:
-        raise PlanError(f"{path}: maps are written as {', '.join(SUFFIXES)}: change the suffix")
-    figure, axes = _sheet(plan)
-    around = [np.asarray(shapely.get_coordinates(plan.area.survey))[:, ::-1]]
+    save_figure(plan_figure(plan, rig, certificate, bathymetry, sea), path)
+
+
+@figure_style()
+def plan_figure(
+    plan: Plan,
+    rig: Rig,
+    certificate: Certificate | None = None,
+    bathymetry: Bathymetry | None = None,
+    sea: SeaConfig | None = None,
+) -> Sheet:
+    """The map as a figure; arguments are those of `draw_plan`."""
+    outline = footprint_outline(plan, rig)
+    shapes = [shape for line in plan.lines for shape in footprints_ne(line, outline)]
+    ways = [
+        dive.route.places(np.linspace(0.0, dive.route.length_m, _points(dive.route.length_m)))
+        for dive in plan.dives
+    ]
+    figure, axes = map_sheet(
+        _bounds(np.vstack([plan.area.corners_ne[:, :2], *shapes, *ways]), plan)
+    )
     if certificate is not None:
-        _draw_counts(figure, axes, certificate)
-    around.append(_draw_footprints(axes, plan, rig, faint=certificate is not None))
+        draw_counts(axes, certificate, opacity=0.6)
+    if len(shapes) <= _MOST_FOOTPRINTS:
+        _draw_footprints(axes, shapes, rig, faint=certificate is not None)
     _draw_area(axes, plan)
-    around.append(_draw_route(axes, plan))
-    points = np.vstack(around)
-    _frame(axes, points, plan)
-    _fit_sheet(figure, axes)
+    _draw_route(axes, plan, ways)
     _draw_lines(axes, plan)
     if bathymetry is not None:
         _draw_bathymetry(axes, bathymetry)
-    _furniture(axes, points)
     if sea is not None and sea.current_mps > 0 and sea.current_file is None:
         _draw_current(axes, sea)
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower center", ncol=4, frameon=False, fontsize=8)
-    figure.text(0.02, 0.985, plan.name, fontsize=13, weight="bold", va="top")
-    figure.text(0.98, 0.985, _summary(plan), fontsize=8, color="#444444", va="top", ha="right")
-    kind = path.suffix.lower()
-    metadata = (
-        {"Software": None} if kind == ".png" else _PDF_DATE if kind == ".pdf" else {"Date": None}
-    )
-    # Packing a PNG harder takes longer than all the rest of its writing.
-    packing = {"pil_kwargs": {"compress_level": 2}} if kind == ".png" else {}
-    with mpl.rc_context({"svg.hashsalt": plan.name}):  # names within an SVG are random otherwise
-        figure.savefig(path, dpi=130, metadata=metadata, **packing)
+    finish_map(figure, axes, plan.datum, plan.name, _summary(plan))
+    return figure
 
 
 def _summary(plan: Plan) -> str:
@@ -99,114 +126,71 @@ def _summary(plan: Plan) -> str:
         f"{plan.duration_s / 60:.0f} min at {plan.speed_mps:g} m/s, {plan.energy_wh:.0f} Wh\n"
         f"altitude {plan.altitude_m:g} m, overlap {plan.reached_forward_overlap:.0%} forward, "
         f"{plan.reached_side_overlap:.0%} side, lines {plan.line_spacing_m:.2f} m apart, "
-        f"{plan.coverage:.1%} covered as asked"
+        f"{plan.coverage:.1%} covered as requested"
     )
 
 
-def _sheet(plan: Plan) -> tuple[Figure, Axes]:
-    figure = Figure(figsize=(8.5, 8.5), facecolor="white")
-    FigureCanvasAgg(figure)
-    # Places that are set: a layout engine would draw everything twice.
-    axes = figure.add_axes((0.09, 0.145, 0.78, 0.785), anchor="N")
-    axes.set_facecolor(_PAPER)
-    axes.set_aspect("equal")
-    axes.grid(color="#e5e8e8", lw=0.6)
-    axes.set_axisbelow(True)
-    datum = plan.datum
-    axes.set_xlabel(f"east of {abs(datum.longitude_deg):.6f}° {'EW'[datum.longitude_deg < 0]}, m")
-    axes.set_ylabel(f"north of {abs(datum.latitude_deg):.6f}° {'NS'[datum.latitude_deg < 0]}, m")
-    return figure, axes
+def _bounds(points_ne: Array, plan: Plan) -> tuple[float, float, float, float]:
+    """South, west, north and east of all points, and of the allowed area unless it is much larger.
 
-
-def _draw_counts(figure: Figure, axes: Axes, certificate: Certificate) -> None:
-    """How many pictures see each place, in steps that the eye can tell apart."""
-    grid = certificate.grid
-    seen = np.ma.masked_array(certificate.pictures, ~certificate.inside)
-    most = max(int(np.percentile(certificate.pictures[certificate.inside], 99.5)), 2)
-    edges = np.unique(np.round(np.linspace(1, most + 1, min(most, 8) + 1)))
-    # Rows of the grid count along its heading, columns to the right of it.
-    turned = Affine2D().scale(grid.cell_m).rotate(-grid.heading_rad)
-    turned = turned.translate(grid.origin_ne[1], grid.origin_ne[0])
-    image = axes.imshow(
-        seen,
-        origin="lower",
-        extent=(0, grid.columns, 0, grid.rows),
-        transform=turned + axes.transData,
-        cmap="GnBu",
-        norm=BoundaryNorm([0, *edges], 256),
-        alpha=0.75,
-        interpolation="nearest",
-        zorder=0.5,
+    Below them is room for the scale.
+    """
+    low, high = points_ne.min(axis=0), points_ne.max(axis=0)
+    south, west, north, east = plan.area.allowed.bounds
+    beyond = max(low[0] - south, low[1] - west, north - high[0], east - high[1])
+    if beyond < _ALLOWED_BEYOND * float(max(high - low)):
+        low, high = np.minimum(low, [south, west]), np.maximum(high, [north, east])
+    margin = 0.06 * float(max(high - low))
+    return (
+        float(low[0]) - 2.0 * margin,
+        float(low[1]) - margin,
+        float(high[0]) + margin,
+        float(high[1]) + margin,
     )
-    bar = figure.colorbar(image, cax=figure.add_axes((0.895, 0.33, 0.022, 0.42)))
-    bar.set_label("pictures of all cameras that see it", fontsize=8)
-    bar.ax.tick_params(labelsize=8)
 
 
-def _draw_footprints(axes: Axes, plan: Plan, rig: Rig, *, faint: bool) -> Array:
-    """Footprints of the first camera; returns their points, east before north."""
-    outline = footprint_outline(plan, rig)
-    shapes = [shape[:, ::-1] for line in plan.lines for shape in footprints_ne(line, outline)]
-    points: Array = np.vstack(shapes)
-    if len(shapes) <= _MOST_FOOTPRINTS:
-        axes.add_collection(
-            PolyCollection(
-                shapes,
-                facecolors="none" if faint else _FOOTPRINT,
-                edgecolors=_FOOTPRINT if faint else "none",
-                linewidths=0.35,
-                alpha=0.35 if faint else 0.16,
-                zorder=1,
-                label="footprints (left camera)",
-            )
+def _draw_footprints(axes: Axes, shapes: list[Array], rig: Rig, *, faint: bool) -> None:
+    colour = COLOURS["footprint"]
+    axes.add_collection(
+        PolyCollection(
+            [shape[:, ::-1] for shape in shapes],
+            facecolors="none" if faint else colour,
+            edgecolors=colour if faint else "none",
+            linewidths=0.35,
+            alpha=0.35 if faint else 0.16,
+            zorder=1,
+            label=f"footprints ({rig.reference} camera)",
         )
-    return points
+    )
 
 
 def _draw_area(axes: Axes, plan: Plan) -> None:
     area = plan.area
-    _patch(axes, area.survey, facecolor="none", edgecolor=_AREA, lw=2.0, zorder=6, label="area")
-    _patch(
-        axes, area.allowed, facecolor="none", edgecolor=_ALLOWED, lw=0.9, ls=":", zorder=2,
-        label="the vehicle may be within",
+    draw_polygons(axes, area.survey, "area", edgecolor=COLOURS["area"], lw=2.0, zorder=6)
+    draw_polygons(
+        axes, area.allowed, "the vehicle may be within", edgecolor=COLOURS["allowed"], lw=0.9,
+        ls=":", zorder=2,
     )  # fmt: skip
-    _patch(
-        axes, area.no_go, facecolor="#f5b7b1", edgecolor=_NO_GO, hatch="xxx", lw=1.0, alpha=0.55,
-        zorder=5, label="no-go zone",
+    draw_polygons(
+        axes, area.no_go, "no-go zone", facecolor="#f5b7b1", edgecolor=COLOURS["no_go"],
+        hatch="xxx", lw=1.0, alpha=0.55, zorder=5,
     )  # fmt: skip
 
 
-def _patch(axes: Axes, shape: shapely.MultiPolygon, label: str, **style: object) -> None:
-    rings = [
-        np.asarray(ring.coords)[:, 1::-1]
-        for polygon in shape.geoms
-        for ring in (polygon.exterior, *polygon.interiors)
-    ]
-    if rings:
-        outline = Outline.make_compound_path(*(Outline(ring, closed=True) for ring in rings))
-        axes.add_patch(PathPatch(outline, label=label, **style))
-
-
-def _draw_route(axes: Axes, plan: Plan) -> Array:
-    """The ways of all dives; returns their points, east before north."""
-    points = []
-    for index, dive in enumerate(plan.dives):
-        route = dive.route
-        way = route.places(np.linspace(0.0, route.length_m, _points(route.length_m)))
-        axes.plot(
-            way[:, 1], way[:, 0], color=_WAY, lw=0.9, zorder=3,
-            label="way between lines" if index == 0 else None,
-        )  # fmt: skip
-        points.append(way[:, ::-1])
+def _draw_route(axes: Axes, plan: Plan, ways: list[Array]) -> None:
+    for index, way in enumerate(ways):
+        label = "" if index else "way between lines"
+        axes.plot(way[:, 1], way[:, 0], color=COLOURS["way"], lw=0.9, zorder=3, label=label or None)
     north, east = plan.home_ne_m
-    axes.plot(east, north, "D", ms=9, mfc="#27ae60", mec="white", zorder=8, ls="", label="home")
-    for index, dive in enumerate(plan.dives[1:], start=2):
+    axes.plot(
+        east, north, "D", ms=9, mfc=COLOURS["home"], mec="white", zorder=8, ls="", label="home"
+    )
+    for number, dive in enumerate(plan.dives[1:], start=2):
         line = plan.lines[dive.first_line]
         axes.annotate(
-            f"dive {index}", line.start_ne_m[::-1], fontsize=8, weight="bold", zorder=9,
-            bbox={"boxstyle": "round,pad=0.2", "fc": "white", "ec": _WAY, "lw": 0.6},
+            f"dive {number}", line.start_ne_m[::-1], fontsize=8, weight="bold", zorder=9,
+            bbox={"boxstyle": "round,pad=0.2", "fc": "white", "ec": COLOURS["way"], "lw": 0.6},
         )  # fmt: skip
-    return np.vstack(points)
 
 
 def _draw_lines(axes: Axes, plan: Plan) -> None:
@@ -214,11 +198,11 @@ def _draw_lines(axes: Axes, plan: Plan) -> None:
     # Lines and dots leave two thirds of the space between lines to what they cover.
     widest = max(plan.line_spacing_m * _points_per_metre(axes) / 3.0, 0.25)
     size = min(size, widest**2)
-    for kind, colour in _LINES.items():
+    for kind in KINDS:
         lines = [line for line in plan.lines if line.kind == kind]
         if not lines:
             continue
-        ends = [(line.start_ne_m[::-1], line.end_ne_m[::-1]) for line in lines]
+        colour, ends = COLOURS[kind], [(a.start_ne_m[::-1], a.end_ne_m[::-1]) for a in lines]
         label = f"{len(ends)} {kind} line{'s' if len(ends) > 1 else ''}"
         axes.add_collection(
             LineCollection(ends, colors=colour, linewidths=min(1.6, widest), zorder=4, label=label)
@@ -226,14 +210,14 @@ def _draw_lines(axes: Axes, plan: Plan) -> None:
         places = np.vstack([line.stations_ne for line in lines])
         axes.scatter(places[:, 1], places[:, 0], s=size, color=colour, zorder=5, lw=0)
     if len(plan.lines) <= _MOST_ARROWS:
-        axes.add_collection(PolyCollection(_arrows(plan), facecolors=_INK, zorder=6))
+        axes.add_collection(PolyCollection(_arrows(plan), facecolors=INK, zorder=6))
 
 
 def _arrows(plan: Plan) -> list[Array]:
     """An arrow head at a third of each line, so that the direction of travel is seen."""
     north_0, east_0, north_1, east_1 = plan.area.survey.bounds
     size = 0.011 * max(north_1 - north_0, east_1 - east_0)
-    # Of many lines each so-many-th, an odd number: neighbours fly opposite ways.
+    # Of many lines every n-th, an odd number: neighbours fly opposite ways.
     apart = 2 * int(size / plan.line_spacing_m) + 1
     heads = []
     for index, line in enumerate(plan.lines):
@@ -255,7 +239,8 @@ def _draw_bathymetry(axes: Axes, bathymetry: Bathymetry) -> None:
     depth = bathymetry.depth_at(grid.reshape(-1, 2)).reshape(grid.shape[:2])
     known = depth[np.isfinite(depth)]
     if len(known) and np.ptp(known) > 0.01:
-        lines = axes.contour(easts, norths, depth, 10, colors="#5d6d7e", linewidths=0.6, zorder=1.5)
+        colour = COLOURS["contour"]
+        lines = axes.contour(easts, norths, depth, 10, colors=colour, linewidths=0.6, zorder=1.5)
         axes.clabel(lines, fontsize=7, fmt="%g m")
 
 
@@ -271,80 +256,23 @@ def _draw_current(axes: Axes, sea: SeaConfig) -> None:
         "",
         xy=tuple((middle + half).tolist()),
         xytext=tuple((middle - half).tolist()),
-        arrowprops={"arrowstyle": "-|>", "color": "#2471a3", "lw": 2.2, "mutation_scale": 15},
+        arrowprops={
+            "arrowstyle": "-|>", "color": COLOURS["current"], "lw": 2.2, "mutation_scale": 15
+        },
         zorder=9,
-    )
+    )  # fmt: skip
     axes.text(
         middle[0] - 0.045 * size, middle[1], f"current\n{sea.current_mps:g} m/s", ha="right",
-        va="center", fontsize=7.5, color="#1a5276", zorder=9,
+        va="center", fontsize=7.5, color=COLOURS["current"], zorder=9,
         bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.7},
     )  # fmt: skip
 
 
-def _frame(axes: Axes, points_xy: Array, plan: Plan) -> None:
-    """Show all points, and the allowed area with them unless it is much larger."""
-    low, high = points_xy.min(axis=0), points_xy.max(axis=0)
-    south, west, north, east = plan.area.allowed.bounds
-    beyond = max(low[0] - west, low[1] - south, east - high[0], north - high[1])
-    if beyond < _ALLOWED_BEYOND * float(max(high - low)):
-        low, high = np.minimum(low, [west, south]), np.maximum(high, [east, north])
-    margin = 0.06 * float(max(high - low))
-    axes.set_xlim(low[0] - margin, high[0] + margin)
-    axes.set_ylim(low[1] - 2.0 * margin, high[1] + margin)
-
-
-def _fit_sheet(figure: Figure, axes: Axes) -> None:
-    """Make the sheet as high as the map, so that a long area leaves no empty page."""
-    (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
-    width_in, height_in = figure.get_size_inches()
-    left, bottom, width, height = axes.get_position(original=True).bounds
-    below_in, above_in = bottom * height_in, (1.0 - bottom - height) * height_in
-    map_in = width * width_in * (north - south) / (east - west)
-    map_in = min(max(map_in, _LEAST_MAP_IN), height * height_in)
-    sheet_in = below_in + map_in + above_in
-    figure.set_size_inches(width_in, sheet_in)
-    axes.set_position((left, below_in / sheet_in, width, map_in / sheet_in))
-    for bar in figure.axes[1:]:
-        x, _, bar_width, _ = bar.get_position(original=True).bounds
-        bar.set_position(
-            (x, (below_in + 0.15 * map_in) / sheet_in, bar_width, 0.7 * map_in / sheet_in)
-        )
-
-
-def _furniture(axes: Axes, points_xy: Array) -> None:
-    """A north arrow and a scale bar."""
-    size = float(max(points_xy.max(axis=0) - points_xy.min(axis=0)))
-    bar = _round_length(size / 5)
-    left, bottom = axes.get_xlim()[0] + 0.04 * size, axes.get_ylim()[0] + 0.045 * size
-    axes.plot([left, left + bar], [bottom, bottom], color="black", lw=3, solid_capstyle="butt")
-    axes.text(left + bar / 2, bottom + 0.012 * size, f"{bar:g} m", ha="center", fontsize=9)
-    axes.annotate(
-        "N",
-        xy=(0.955, 0.985),
-        xytext=(0.955, 0.90),
-        xycoords="axes fraction",
-        ha="center",
-        va="center",
-        fontsize=11,
-        weight="bold",
-        arrowprops={"arrowstyle": "-|>", "color": "black", "lw": 1.6},
-        zorder=9,
-    )
-
-
-def _round_length(length_m: float) -> float:
-    """1, 2 or 5 times a power of ten, not above a length."""
-    power = 10.0 ** math.floor(math.log10(length_m))
-    return float(max(step * power for step in (1, 2, 5) if step * power <= length_m))
-
-
 def _points_per_metre(axes: Axes) -> float:
-    """Of the printed map; a point is 1/72 inch."""
+    """Of the printed map, before it is laid out; a point is 1/72 inch."""
     (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
-    width_in, height_in = axes.get_figure().get_size_inches()
-    box = axes.get_position(original=True)
-    inches = min(box.width * width_in / (east - west), box.height * height_in / (north - south))
-    return float(72.0 * inches)
+    width_in, height_in = axes.figure.get_size_inches()
+    return float(72.0 * 0.8 * min(width_in / (east - west), height_in / (north - south)))
 
 
 def _points(length_m: float) -> int:

@@ -8,13 +8,14 @@ from alice_survey.base.artefacts import write_json
 from alice_survey.base.config import SeaConfig, SurveyConfig
 from alice_survey.base.executor import Executor
 from alice_survey.base.run import progress
+from alice_survey.kit.document import Link
 from camera_calib.rig import Rig, design_rig
 from missions.exports.options import Options, options_of
 from missions.exports.write import write_exports
 from missions.exposure.settings_table import settings_table
 from missions.exposure.timetable import trigger_table, write_timetable
 from missions.plan.map import draw_plan
-from missions.plan.page import Link, write_page
+from missions.plan.page import write_page
 from missions.plan.planner import Planned, plan_survey
 from missions.values.costs import Costs, leg_costs
 from missions.values.plan_file import Dive, Plan
@@ -64,7 +65,10 @@ def write_planned(
         bathymetry=planned.bathymetry,
         sea=sea,
         warnings=planned.warnings,
-        links=[Link(href=f"exports/{file.name}", about=about) for file, about in files.items()],
+        links=[
+            Link(text=file.name, address=f"exports/{file.name}", about=about)
+            for file, about in files.items()
+        ],
     )
 
 

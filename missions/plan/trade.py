@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from alice_survey.base.config import SurveyConfig
-from alice_survey.base.errors import PlanError, why
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.steady import drag_power
 from missions.exposure.settings import ImagingSetup, imaging_settings
@@ -23,7 +22,6 @@ from missions.route.energy import (
 )
 
 _J_PER_WH = 3600.0
-_SUFFIXES = (".png", ".pdf", ".svg")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,21 +204,17 @@ def draw_trade(path: Path, flown: FlightConditions, *, imaging_w: float = 0.0) -
         imaging_w: mean power of strobes while on lines.
 
     Raises:
-        PlanError: the picture cannot be written.
+        ConfigError: the picture cannot be written.
     """
-    if path.suffix.lower() not in _SUFFIXES:
-        raise PlanError(
-            f"{path}: pictures are written as {', '.join(_SUFFIXES)}: change the suffix"
-        )
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    from alice_survey.kit.figure import check_figure_path, figure_style, new_figure, save_figure
 
+    check_figure_path(path)
     (lines_w, way_w), current = course_powers(flown), flown.current_ne_mps
     size = math.hypot(*current)
     towards = math.atan2(current[1], current[0])
-    figure = Figure(figsize=(6.4, 6.4), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot(projection="polar")
+    figure = new_figure(6.4, 6.4)
+    with figure_style():
+        axes = figure.add_subplot(projection="polar")
     axes.set_theta_zero_location("N")
     axes.set_theta_direction(-1)
     manner = "heading held" if flown.manner == "held" else "crabbing"
@@ -253,12 +247,8 @@ def draw_trade(path: Path, flown: FlightConditions, *, imaging_w: float = 0.0) -
         f"{imaging_w:.1f} W of lights",
         fontsize=10,
     )
-    axes.legend(loc="lower center", bbox_to_anchor=(0.5, -0.17), ncols=3, fontsize=8, frameon=False)
-    metadata = {"Software": None} if path.suffix.lower() == ".png" else None
-    try:
-        figure.savefig(path, dpi=130, metadata=metadata)
-    except OSError as error:
-        raise PlanError(f"{path}: cannot be written: {why(error)}") from None
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, -0.17), ncols=3, fontsize=8)
+    save_figure(figure, path)
 
 
 def _draw_course(axes: Any, power_w: Array, colour: str, label: str, style: str = "-") -> None:

@@ -1,47 +1,43 @@
 """A picture of how a survey differs from a reference."""
 
 from pathlib import Path
-from typing import Any
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
 
-from alice_survey.base.artefacts import atomic_path
 from alice_survey.base.frames import Array
+from alice_survey.kit.figure import colour_bar, figure_style, map_axes, new_figure, save_figure
 from reconstruct.evaluate.cloud_registration import CloudDistances
 
-_STYLE: dict[str, Any] = {"font.size": 8, "axes.titlesize": 9, "figure.dpi": 110}
 _CELLS = 320
 """Cells of the map along its longer side."""
 
 
+@figure_style()
 def plot_reference(path: Path, ours: CloudDistances, back: CloudDistances, pixel_m: float) -> None:
     """Map of the survey's signed distance from the reference, and both cumulative shares."""
     limit = max(float(np.percentile(np.abs(ours.signed_m), 95)), 1e-9)
     values, extent = mean_map(ours.points[:, :2], ours.signed_m, _CELLS)
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(13, 5.6), layout="constrained")
-        plane, curve = figure.subplots(1, 2, width_ratios=[1.3, 1])
-        plane.set_facecolor("0.85")
-        image = plane.imshow(
-            values, extent=extent, vmin=-limit, vmax=limit, cmap="RdBu_r", interpolation="nearest"
-        )
-        figure.colorbar(image, ax=plane, label="survey above reference (m)", shrink=0.8)
-        plane.set(xlabel="east (m)", ylabel="north (m)", title="Survey less reference")
-        for one, name in ((ours, "survey to reference"), (back, "reference to survey")):
-            away = np.sort(np.abs(one.signed_m))[:: max(1, len(one.signed_m) // 2000)]
-            curve.plot(away / pixel_m, np.linspace(0, 1, len(away)), label=name)
-        curve.axvline(2, color="0.6", linestyle=":", label="2 ground pixels")
-        curve.set(xlim=(0, max(6.0, 2 * limit / pixel_m)), ylim=(0, 1))
-        curve.set(xlabel="distance (ground pixels)", ylabel="share of points below")
-        curve.set_title(
-            f"median {np.median(np.abs(ours.signed_m)):.3g} m, ground pixel {pixel_m:.3g} m"
-        )
-        curve.grid(alpha=0.3)
-        curve.legend(loc="lower right")
-        with atomic_path(path) as temporary:
-            figure.savefig(temporary, metadata={"Software": None})
+    figure = new_figure(5.6, 13)
+    plane, curve = figure.subplots(1, 2, width_ratios=[1.3, 1])
+    plane.set_facecolor("0.85")
+    image = plane.imshow(
+        values, extent=extent, vmin=-limit, vmax=limit, cmap="RdBu_r", interpolation="nearest"
+    )
+    plane.grid(visible=False)
+    plane.set_title("Survey minus reference")
+    colour_bar(image, plane, "survey above reference (m)")
+    map_axes(plane)
+    for one, name in ((ours, "survey to reference"), (back, "reference to survey")):
+        away = np.sort(np.abs(one.signed_m))[:: max(1, len(one.signed_m) // 2000)]
+        curve.plot(away / pixel_m, np.linspace(0, 1, len(away)), label=name)
+    curve.axvline(2, color="0.6", linestyle=":", label="2 ground pixels")
+    curve.set(xlim=(0, max(6.0, 2 * limit / pixel_m)), ylim=(0, 1))
+    curve.set(xlabel="distance (ground pixels)", ylabel="share of points below")
+    curve.set_title(
+        f"median {np.median(np.abs(ours.signed_m)):.3g} m, ground pixel {pixel_m:.3g} m"
+    )
+    curve.legend(loc="lower right")
+    save_figure(figure, path)
 
 
 def mean_map(

@@ -12,8 +12,8 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
-from camera_calib.calibrate.freedom import POSE as TURN_AND_SHIFT
 from camera_calib.flat_port import PARAMETERS, FlatPortCamera, pose_jacobian
+from camera_calib.freedom import POSE as TURN_AND_SHIFT
 from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import Indices, observed
 from reconstruct.mapping.database import Observations, as_transform

@@ -17,9 +17,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.errors import ReconstructionError, warn
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
-from camera_calib.calibrate.freedom import POSE as TURN_AND_SHIFT
-from camera_calib.calibrate.freedom import Prior, pose_names, value
 from camera_calib.flat_port import PARAMETERS
+from camera_calib.freedom import POSE as TURN_AND_SHIFT
+from camera_calib.freedom import Prior, pose_names, value
 from camera_calib.rig import Covariance, Rig
 from reconstruct.mapping.arrays import Indices, frames_of
 from reconstruct.mapping.database import Observations

@@ -16,7 +16,7 @@ from alice_survey.base.config import ReconstructConfig
 from alice_survey.base.errors import ReconstructionError
 from alice_survey.base.frames import Array, Datum
 from alice_survey.base.records import PortRecord
-from camera_calib.calibrate.freedom import pose_names
+from camera_calib.freedom import pose_names
 from camera_calib.rig import Rig, write_rig
 from reconstruct.mapping.arrays import frames_of
 from reconstruct.mapping.bundle import move_points

@@ -7,15 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from alice_survey.base.artefacts import atomic_path, read_stage, write_csv
+from alice_survey.base.artefacts import read_stage, write_csv
 from alice_survey.base.errors import ImageError
 from alice_survey.base.executor import Executor
 from alice_survey.base.manifest import read_manifest
+from alice_survey.kit.figure import INKS, Axes, figure_style, new_figure, plain_name, save_figure
 from reconstruct.pictures.files import decode
 from reconstruct.pictures.quality import (
     MeasureTask,
@@ -30,7 +28,6 @@ _HEADER = ("image", "camera", "station", *_NUMBERS, "reasons")
 _MOST_SHOWN = 8
 _ACROSS = 4
 _THUMBNAIL_PX = 420
-_STYLE: dict[str, Any] = {"font.size": 8, "axes.titlesize": 8, "figure.dpi": 110}
 _STRIPS = (
     ("sharpness", "sharpness"),
     ("contrast", "contrast"),
@@ -39,6 +36,7 @@ _STRIPS = (
 )
 
 
+@figure_style()
 def plot_quality(path: Path, images: Path, found: Sequence[PictureQuality]) -> None:
     """Draw figures of all pictures in their order, and thumbnails of the worst with the reason.
 
@@ -49,20 +47,18 @@ def plot_quality(path: Path, images: Path, found: Sequence[PictureQuality]) -> N
     """
     worst = worst_first(found)[:_MOST_SHOWN]
     rows = -(-len(worst) // _ACROSS)
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(12, 5.2 + 2.6 * rows), layout="constrained")
-        if not rows:
-            _strips(figure, found)
-        else:
-            upper, lower = figure.subfigures(2, 1, height_ratios=[5.2, 2.6 * rows])
-            _strips(upper, found)
-            panels = lower.subplots(rows, _ACROSS, squeeze=False).ravel()
-            for panel in panels:
-                panel.axis("off")
-            for panel, quality in zip(panels, worst, strict=False):
-                _thumbnail(panel, images, quality)
-        with atomic_path(path) as temporary:
-            figure.savefig(temporary, metadata={"Software": None})
+    figure = new_figure(5.2 + 2.6 * rows, 12)
+    if not rows:
+        _strips(figure, found)
+    else:
+        upper, lower = figure.subfigures(2, 1, height_ratios=[5.2, 2.6 * rows])
+        _strips(upper, found)
+        panels = lower.subplots(rows, _ACROSS, squeeze=False).ravel()
+        for panel in panels:
+            panel.axis("off")
+        for panel, quality in zip(panels, worst, strict=False):
+            _thumbnail(panel, images, quality)
+    save_figure(figure, path)
 
 
 def worst_first(found: Sequence[PictureQuality]) -> list[PictureQuality]:
@@ -84,24 +80,24 @@ def _strips(figure: Any, found: Sequence[PictureQuality]) -> None:
         for camera in cameras:
             own = np.array([quality.camera == camera for quality in found])
             axis.plot(order[own], values[own], ".", markersize=4, label=camera)
-        axis.plot(order[flagged], values[flagged], "o", mfc="none", mec="tab:red", markersize=8)
+        axis.plot(order[flagged], values[flagged], "o", mfc="none", mec=INKS[1], markersize=8)
         axis.set_ylabel(label)
         gone = np.isnan(values)
         if gone.any():  # an empty line without clipping has no extent, and no layout
-            axis.plot(order[gone], np.zeros(gone.sum()), "x", color="tab:red", clip_on=False)
+            axis.plot(order[gone], np.zeros(gone.sum()), "x", color=INKS[1], clip_on=False)
         axis.set_ylim(0, 1.15 * np.nanmax(values, initial=1e-3))
-        axis.grid(alpha=0.3)
     axes[0].set_title(
         f"{len(found)} pictures in their order; {flagged.sum()} to look at (crosses: unreadable)"
     )
-    axes[0].legend(loc="lower right", ncols=len(cameras), frameon=False)
+    axes[0].legend(loc="lower right", ncols=len(cameras))
     axes[-1].set_xlabel("picture")
     axes[-1].xaxis.get_major_locator().set_params(integer=True)
 
 
 def _thumbnail(panel: Axes, images: Path, quality: PictureQuality) -> None:
     panel.set_title(
-        f"{quality.image}\n" + "\n".join(_short(r) for r in quality.reasons), loc="left"
+        plain_name(f"{quality.image}\n" + "\n".join(_short(r) for r in quality.reasons)),
+        fontsize=8,
     )
     try:
         pixels = decode(images / quality.image)

@@ -1,22 +1,24 @@
 """Camera positions over the mosaic, by line, with what is known of their errors."""
 
 from pathlib import Path
-from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import rasterio
-from matplotlib.collections import EllipseCollection
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from alice_survey.base.artefacts import atomic_path
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
+from alice_survey.kit.figure import (
+    EllipseCollection,
+    figure_style,
+    map_axes,
+    new_figure,
+    save_figure,
+    withStroke,
+)
 from reconstruct.placing.track import read_track_poses
 
-_STYLE: dict[str, Any] = {"font.size": 9, "axes.titlesize": 10, "figure.dpi": 130}
 _LONGEST_PX = 1800
 _LONGEST_IN = 9.0
 _TURN_DEG = 50.0
@@ -30,6 +32,7 @@ _COLOURS = (
 
 
 @progress.step("draw the track")
+@figure_style()
 def plot_track_over(mosaic_tif: Path, track_csv: Path, path: Path) -> None:
     """Draw the stations of a track over its mosaic, each line in a colour, with 2-sigma ellipses.
 
@@ -52,57 +55,54 @@ def plot_track_over(mosaic_tif: Path, track_csv: Path, path: Path) -> None:
     places = np.stack([poses[name].translation for name in names])[:, :2]
     ellipses = _ellipses(track_csv.with_name("track_covariance.npz"), names, places)
     lines = split_lines(places)
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=_size(extent), layout="constrained")
-        axes = figure.subplots()
-        axes.imshow(picture, extent=extent, interpolation="bilinear")
-        axes.plot(places[:, 1], places[:, 0], color="white", linewidth=0.6, alpha=0.7, zorder=2)
-        for number in range(lines.max() + 1):
-            on = lines == number
-            colour = _COLOURS[number % len(_COLOURS)]
-            axes.plot(
-                places[on, 1], places[on, 0], "o-", color=colour, markersize=3.5, linewidth=1.2,
-                markeredgecolor="black", markeredgewidth=0.4, zorder=4,
-                label=f"line {number + 1}: {int(on.sum())} stations",
-            )  # fmt: skip
-        turning = lines < 0
-        if turning.any():
-            axes.plot(
-                places[turning, 1], places[turning, 0], "o", color="0.8", markersize=3,
-                markeredgecolor="black", markeredgewidth=0.4, zorder=3, label="in turns",
-            )  # fmt: skip
-        if ellipses is not None:
-            wide, high, angle, said = ellipses
-            axes.add_collection(
-                EllipseCollection(
-                    wide, high, angle, units="xy", offsets=places[:, ::-1],
-                    offset_transform=axes.transData, facecolor="none", edgecolor="white",
-                    linewidth=0.7, alpha=0.8, zorder=3
-                )
-            )  # fmt: skip
-            axes.plot([], [], "o", markersize=9, markerfacecolor="none", markeredgecolor="0.5",
-                      label=said)  # fmt: skip
-        axes.plot(places[0, 1], places[0, 0], "^", color="white", markeredgecolor="black", zorder=5)
-        axes.annotate(
-            "start", places[0, ::-1], xytext=(6, 6), textcoords="offset points", color="white",
-            fontsize=8, zorder=6, path_effects=_outline(),
+    width_in, height_in = _size(extent)
+    figure = new_figure(height_in, width_in)
+    axes = figure.subplots()
+    axes.imshow(picture, extent=extent, interpolation="bilinear")
+    axes.plot(places[:, 1], places[:, 0], color="white", linewidth=0.6, alpha=0.7, zorder=2)
+    for number in range(lines.max() + 1):
+        on = lines == number
+        colour = _COLOURS[number % len(_COLOURS)]
+        axes.plot(
+            places[on, 1], places[on, 0], "o-", color=colour, markersize=3.5, linewidth=1.2,
+            markeredgecolor="black", markeredgewidth=0.4, zorder=4,
+            label=f"line {number + 1}: {int(on.sum())} stations",
         )  # fmt: skip
-        margin = 0.02 * max(extent[1] - extent[0], extent[3] - extent[2])
-        axes.set_xlim(min(extent[0], places[:, 1].min()) - margin,
-                      max(extent[1], places[:, 1].max()) + margin)  # fmt: skip
-        axes.set_ylim(min(extent[2], places[:, 0].min()) - margin,
-                      max(extent[3], places[:, 0].max()) + margin)  # fmt: skip
-        axes.set_aspect("equal")
-        axes.set_facecolor("0.15")
-        axes.set(xlabel=f"east ({unit})", ylabel=f"north ({unit})")
-        axes.set_title(
-            f"Camera positions over the mosaic: {len(poses)} pictures at {len(names)} stations"
-        )
-        axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
-        with atomic_path(path) as temporary:
-            figure.savefig(
-                temporary, format="png", bbox_inches="tight", metadata={"Software": None}
+    turning = lines < 0
+    if turning.any():
+        axes.plot(
+            places[turning, 1], places[turning, 0], "o", color="0.8", markersize=3,
+            markeredgecolor="black", markeredgewidth=0.4, zorder=3, label="in turns",
+        )  # fmt: skip
+    if ellipses is not None:
+        wide, high, angle, said = ellipses
+        axes.add_collection(
+            EllipseCollection(
+                wide, high, angle, units="xy", offsets=places[:, ::-1],
+                offset_transform=axes.transData, facecolor="none", edgecolor="white",
+                linewidth=0.7, alpha=0.8, zorder=3
             )
+        )  # fmt: skip
+        axes.plot([], [], "o", markersize=9, markerfacecolor="none", markeredgecolor="0.5",
+                  label=said)  # fmt: skip
+    axes.plot(places[0, 1], places[0, 0], "^", color="white", markeredgecolor="black", zorder=5)
+    axes.annotate(
+        "start", places[0, ::-1], xytext=(6, 6), textcoords="offset points", color="white",
+        fontsize=8, zorder=6, path_effects=[withStroke(linewidth=2, foreground="black")],
+    )  # fmt: skip
+    margin = 0.02 * max(extent[1] - extent[0], extent[3] - extent[2])
+    axes.set_xlim(min(extent[0], places[:, 1].min()) - margin,
+                  max(extent[1], places[:, 1].max()) + margin)  # fmt: skip
+    axes.set_ylim(min(extent[2], places[:, 0].min()) - margin,
+                  max(extent[3], places[:, 0].max()) + margin)  # fmt: skip
+    axes.set_facecolor("0.15")
+    axes.grid(visible=False)
+    map_axes(axes, unit)
+    axes.set_title(
+        f"Camera positions over the mosaic: {len(poses)} pictures at {len(names)} stations"
+    )
+    axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
+    save_figure(figure, path, bbox_inches="tight")
 
 
 def split_lines(places: Array) -> NDArray[np.int64]:
@@ -139,12 +139,6 @@ def _wrapped(angle: float) -> float:
 
 def _mean(angles: Array) -> float:
     return float(np.angle(np.exp(1j * angles).mean()))
-
-
-def _outline() -> list[Any]:
-    from matplotlib import patheffects
-
-    return [patheffects.withStroke(linewidth=2, foreground="black")]
 
 
 def _stations(track_csv: Path) -> list[str]:

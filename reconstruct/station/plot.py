@@ -5,12 +5,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.artefacts import atomic_path
+from alice_survey.kit.figure import colour_bar, figure_style, new_figure, save_figure
 from reconstruct.views.model import View
 
 _BARS_M = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 
 
+@figure_style()
 def plot_pair(
     path: Path,
     view: View,
@@ -27,12 +28,8 @@ def plot_pair(
         depth: (H, W) m, NaN where unknown.
         sigma: (H, W) m.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     height, width = depth.shape
-    figure = Figure(figsize=(12.0, 1.1 + 5.4 * height / width), dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(1.1 + 5.4 * height / width, 12.0)
     first, second = figure.subplots(1, 2)
     middle = float(np.nanmedian(depth))
     ground = middle / np.sqrt(view.fx_px * view.fy_px)
@@ -45,18 +42,18 @@ def plot_pair(
         left, low - 0.025 * height, f"{text} at {middle:.2f} m",
         color="white", ha="left", va="bottom",
     )  # fmt: skip
-    first.set_title("left picture, without refraction and distortion", fontsize=10)
+    first.set_title("left picture, without refraction and distortion")
     near, far = np.nanpercentile(depth, [1, 99])
     shown = second.imshow(depth, cmap="viridis_r", vmin=near, vmax=far, interpolation="nearest")
     second.set_facecolor("white")
-    figure.colorbar(shown, ax=second, label="distance along the axis (m)", shrink=0.85)
+    colour_bar(shown, second, "distance along the axis (m)")
     second.set_title(
         f"depth: {np.isfinite(depth).mean():.0%} of the picture, matching sigma "
         f"{1e3 * float(np.nanmedian(sigma)):.1f} mm",
         fontsize=10,
     )
     for axes in (first, second):
+        axes.grid(visible=False)
         axes.set_xticks([])
         axes.set_yticks([])
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, metadata={"Software": None})
+    save_figure(figure, path, dpi=120)

@@ -168,7 +168,7 @@ def calibration_slopes(
 
 
 def _changed(rig: Rig, camera: str, field: str, step: float) -> Rig:
-    """The rig with one parameter moved by a step; see `camera_calib.calibrate.freedom`."""
+    """The rig with one parameter moved by a step; see `camera_calib.freedom`."""
     if field in PARAMETERS:
         old = rig.cameras[camera]
         new = old.with_parameters({field: old.parameter(field) + step})

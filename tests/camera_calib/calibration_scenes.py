@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.config import CameraConfig, WaterConfig
-from camera_calib.calibrate.result import TargetView
+from camera_calib.calibration import TargetView
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.rig import Rig, design_rig
 

@@ -106,7 +106,7 @@ def test_strips_of_the_flight_show_its_errors(
     off = flight.log.position_ned - flight.truth.ned_from_body.translation
     column = navigation.LOG_COLUMNS.index("sigma_east_m")
     np.testing.assert_array_equal(
-        curve(figure, "east error, m", "believed less true"), off[some, 1]
+        curve(figure, "east error, m", "believed minus true"), off[some, 1]
     )
     (strip,) = [axes for axes in figure.axes if axes.get_ylabel() == "east error, m"]
     (band,) = [c for c in strip.collections if "sigmas" in str(c.get_label())]

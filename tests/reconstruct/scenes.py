@@ -78,7 +78,7 @@ def make_scene(
         latitude, longitude, depth = DATUM.geodetic_from_ned(body[None] + bias_m)[0]
         for name, cam in rig.cameras.items():
             pose = ned_from_body * rig.body_from_cam(name)
-            near = np.sort(tree.query_ball_point(pose.translation, _FAR_M))
+            near = np.sort(np.array(tree.query_ball_point(pose.translation, _FAR_M), dtype=int))
             seen = cam.project(pose.inv().apply(points_ned[near]))
             inside = np.all((seen > 1) & (seen < [cam.width_px - 1, cam.height_px - 1]), axis=1)
             ids.append(near[inside])

@@ -3,14 +3,18 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.patches import Polygon, Rectangle
 
-from alice_survey.base.errors import ConfigError
+from alice_survey.kit.figure import (
+    Axes,
+    Polygon,
+    Rectangle,
+    Sheet,
+    check_figure_path,
+    figure_style,
+    new_figure,
+    save_figure,
+)
 from alice_survey.vehicle import fleet
 from alice_survey.vehicle.hydrodynamics import added_mass, drag
 from alice_survey.vehicle.hydrodynamics.comparison import CoefficientRow
@@ -19,11 +23,6 @@ from alice_survey.vehicle.hydrodynamics.geometry import Geometry
 from alice_survey.vehicle.hydrodynamics.parts import Flow
 from alice_survey.vehicle.propulsion import Thruster
 
-_NO_DATES = {
-    ".png": {"Software": None},
-    ".svg": {"Date": None, "Creator": None},
-    ".pdf": {"CreationDate": None, "Creator": None, "Producer": None},
-}
 _HULL, _EDGE, _WATER, _PART, _THRUST = "#f4ead5", "#34495e", "#cfe3f1", "#b9c4cc", "#c0392b"
 _COLOURS = {"reproduced": "#1e8449", "near": "#82b74b", "no": "#d68910"}
 _SIZE_IN, _LEFT_IN, _WIDTH_IN = (15.2, 8.9), 0.75, 8.5
@@ -33,6 +32,7 @@ _FLOOR, _CEILING = 0.1, 10.0
 """Least and greatest ratio that the axis of ratios holds."""
 
 
+@figure_style()
 def draw_coefficients(path: Path, geometry: Geometry, rows: Sequence[CoefficientRow]) -> None:
     """Draw side and top view, mass and drag along the hull, and the ratio to the paper's values.
 
@@ -44,14 +44,11 @@ def draw_coefficients(path: Path, geometry: Geometry, rows: Sequence[Coefficient
     Raises:
         ConfigError: the suffix is none of the three.
     """
-    suffix = path.suffix.lower()
-    if suffix not in _NO_DATES:
-        raise ConfigError(f"{path}: plots are written as {', '.join(_NO_DATES)}: change the suffix")
+    check_figure_path(path)
     craft = fleet.vehicle(geometry.name)
     thrusters = craft.thrusters
     inside = entrained_water(geometry, craft.rigid_body.buoyancy_kg, craft.density_kg_m3)
-    figure = Figure(figsize=_SIZE_IN, facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = new_figure(_SIZE_IN[1], _SIZE_IN[0], layout="none")
     side, top = (_view(figure, bottom, limits) for bottom, limits in ((5.6, _SIDE), (2.9, _TOP)))
     along = figure.add_axes((*_fraction(_LEFT_IN, 0.65), *_fraction(_WIDTH_IN, 1.75)))
     along.set_xlim(_X)
@@ -67,15 +64,14 @@ def draw_coefficients(path: Path, geometry: Geometry, rows: Sequence[Coefficient
         f"{inside.mass_kg:.0f} kg of water inside",
         fontsize=13, y=0.992,
     )  # fmt: skip
-    with mpl.rc_context({"svg.hashsalt": "coefficients", "svg.fonttype": "none"}):
-        figure.savefig(path, dpi=120, metadata=_NO_DATES[suffix])
+    save_figure(figure, path, dpi=120)
 
 
 def _fraction(x_in: float, y_in: float) -> tuple[float, float]:
     return x_in / _SIZE_IN[0], y_in / _SIZE_IN[1]
 
 
-def _view(figure: Figure, bottom_in: float, limits: tuple[float, float]) -> Axes:
+def _view(figure: Sheet, bottom_in: float, limits: tuple[float, float]) -> Axes:
     """Axes to one scale: all views have the same x above each other."""
     height = (limits[0] - limits[1]) * _WIDTH_IN / (_X[1] - _X[0])
     axes = figure.add_axes((*_fraction(_LEFT_IN, bottom_in), *_fraction(_WIDTH_IN, height)))
@@ -97,9 +93,6 @@ def _hull(axes: Axes, geometry: Geometry, inside: Entrained) -> None:
         axes.add_patch(wet)
         wet.set_clip_path(hull)
     axes.add_patch(Polygon(shape, fill=False, edgecolor=_EDGE, lw=1.4, zorder=4))
-    axes.grid(color="#e5e8e8", lw=0.6)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
     axes.plot(0, 0, marker="+", color="black", ms=11, mew=1.6, zorder=9)
 
 
@@ -139,9 +132,7 @@ def _draw_side(
     axes.annotate("wet", (inside.tail_to_x_m - 0.02, -0.08), fontsize=8, ha="right", zorder=9)
     axes.annotate("wet", (inside.nose_from_x_m + 0.02, -0.08), fontsize=8, zorder=9)
     axes.set_ylabel("z, down, m")
-    axes.set_title(
-        "from starboard: + origin, red thrusters, blue water inside", loc="left", fontsize=10
-    )
+    axes.set_title("from starboard: + origin, red thrusters, blue water inside")
 
 
 def _draw_top(
@@ -169,7 +160,7 @@ def _draw_top(
                           fontsize=9)  # fmt: skip
     _arrows(axes, thrusters, 1)
     axes.set_ylabel("y, starboard, m")
-    axes.set_title("from above", loc="left", fontsize=10)
+    axes.set_title("from above")
 
 
 def _draw_strips(axes: Axes, geometry: Geometry, inside: Entrained) -> None:
@@ -188,20 +179,18 @@ def _draw_strips(axes: Axes, geometry: Geometry, inside: Entrained) -> None:
     axes.set_ylim(0, None)
     axes.set_ylabel("kg/m")
     axes.set_xlabel("x, forward, m")
-    axes.grid(color="#e5e8e8", lw=0.6)
-    axes.set_axisbelow(True)
     crossing = drag.cylinder_across(outline.length_m / outline.diameter_m)
     twin = axes.twinx()
     twin.plot(x, 0.5 * flow.density_kg_m3 * crossing * 2.0 * r, color="#ca6f1e", lw=1.5,
               label="drag across (right)")  # fmt: skip
     twin.set_ylim(0, None)
     twin.set_ylabel("N/m at 1 m/s")
-    for each in (axes, twin):
-        each.spines["top"].set_visible(False)
+    twin.spines["right"].set_visible(True)
+    twin.grid(visible=False)
     lines = [axes.get_legend_handles_labels(), twin.get_legend_handles_labels()]
-    axes.legend(lines[0][0] + lines[1][0], lines[0][1] + lines[1][1], frameon=False, fontsize=9,
+    axes.legend(lines[0][0] + lines[1][0], lines[0][1] + lines[1][1], fontsize=9,
                 loc="lower center", ncol=2)  # fmt: skip
-    axes.set_title("strips along the hull", loc="left", fontsize=10)
+    axes.set_title("strips along the hull")
 
 
 def _draw_ratios(axes: Axes, rows: Sequence[CoefficientRow]) -> None:
@@ -234,16 +223,14 @@ def _draw_ratios(axes: Axes, rows: Sequence[CoefficientRow]) -> None:
     axes.minorticks_off()
     axes.set_yticks(range(len(labels)), labels, fontsize=9)
     axes.set_ylim(len(labels) - 0.4, -0.6)
-    axes.grid(axis="x", color="#e5e8e8", lw=0.6)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(visible=False, axis="y")
     for mark, words in (("reproduced", "within 1 %"), ("near", "within 5 %"), ("no", "farther")):
         axes.plot([], [], color=_COLOURS[mark], lw=6, label=f"computed, {words}")
     axes.plot([], [], "x", mec="#2c3e50", label="the paper's CFD")
     axes.plot([], [], "D", mfc="none", mec="#2c3e50", label="calibrated at sea")
-    axes.legend(frameon=False, fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.06), ncol=2)
+    axes.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.06), ncol=2)
     axes.set_xlabel("over the paper's estimate (small marks: beyond the axis)")
-    axes.set_title("coefficients", loc="left", fontsize=10)
+    axes.set_title("coefficients")
 
 
 def _box(axes: Axes, x: float, y: float, width: float, height: float, colour: str = _PART) -> None:

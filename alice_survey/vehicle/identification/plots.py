@@ -3,12 +3,10 @@
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from alice_survey.base.frames import Array
+from alice_survey.kit.figure import Axes, figure_style, new_figure, save_figure
 from alice_survey.vehicle.identification.validation import MotionValidation
 
 Places = NDArray[np.intp]
@@ -20,6 +18,7 @@ _LEAST = 0.02
 """Least height of a strip, m/s; in degrees per second, 100 times that."""
 
 
+@figure_style()
 def draw_motion(path: Path, title: str, found: MotionValidation) -> None:
     """Draw measured and simulated velocities and rates over time, with the fit of each.
 
@@ -28,15 +27,13 @@ def draw_motion(path: Path, title: str, found: MotionValidation) -> None:
         title: of the picture.
         found: what to draw.
     """
-    figure = Figure(figsize=(13, 8.5), facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(8.5, 13)
     axes = figure.subplots(3, 2, sharex=True)
     units = np.array([1.0] * 3 + [180.0 / np.pi] * 3)
     fits, constant_fits = found.fit_percent, found.constant_fit_percent
     time_s, gaps = _with_gaps(found.time_s)
     for k in range(6):
         strip = axes[k % 3, k // 3]
-        strip.grid(color="#e5e8e8", lw=0.6)
         measured, model, constant = (
             _series(table[:, k] * units[k], gaps)
             for table in (found.measured, found.simulated, found.constant)
@@ -47,10 +44,10 @@ def draw_motion(path: Path, title: str, found: MotionValidation) -> None:
         strip.plot(time_s[some], measured[some], ".", color=_MEASURED, ms=2.5)
         strip.plot(time_s[some], model[some], color=_MODEL, lw=1.1)
         strip.set_ylabel(_NAMES[k])
-        title = "follows the log"
+        fit = "follows the log"
         if np.isfinite(fits[k]):
-            title = f"fit: model {fits[k]:.0f} %, constant {constant_fits[k]:.0f} %"
-        strip.set_title(title, loc="left", fontsize=9)
+            fit = f"fit: model {fits[k]:.0f} %, constant {constant_fits[k]:.0f} %"
+        strip.set_title(fit, fontsize=9)
         _limit(strip, np.concatenate([measured, model]), _LEAST if k < 3 else 100 * _LEAST)
     for strip in axes[2]:
         strip.set_xlabel("time, s")
@@ -60,8 +57,8 @@ def draw_motion(path: Path, title: str, found: MotionValidation) -> None:
         figure.axes[0].plot([], [], color=_MODEL, label="model")[0],
         figure.axes[0].plot([], [], color=_CONSTANT, label="constant velocity")[0],
     ]
-    figure.legend(handles=handles, loc="outside upper right", ncol=3, frameon=False, fontsize=9)
-    figure.savefig(path, dpi=110, metadata={"Software": None} if path.suffix == ".png" else None)
+    figure.legend(handles=handles, loc="outside upper right", ncol=3, fontsize=9)
+    save_figure(figure, path, dpi=110)
 
 
 def _with_gaps(time_s: Array) -> tuple[Array, Places]:

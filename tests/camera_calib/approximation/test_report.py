@@ -74,7 +74,7 @@ def test_each_fault_is_one_line(tmp_path: Path) -> None:
         ({"rig": rig, "camera": "top"}, "no camera 'top'; it has left, right"),
         ({"rig": rig, "survey": tmp_path / "survey.toml"}, "not both"),
         ({"rig": tmp_path / "none.json"}, "none.json"),
-        ({"plot": tmp_path / "plot.bmp"}, "drawn as .png, .pdf, .svg"),
+        ({"plot": tmp_path / "plot.bmp"}, ".png, .svg, .pdf"),
     ):
         with pytest.raises(AliceError) as error:
             residual_report(1.5, 2.5, **options)  # type: ignore[arg-type]

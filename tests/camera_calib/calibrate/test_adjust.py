@@ -20,7 +20,10 @@ from benchmarks.camera_calibration import (
     run_trial,
 )
 from camera_calib.calibrate.adjust import adjust
-from camera_calib.calibrate.freedom import (
+from camera_calib.calibrate.solve import Intrinsics
+from camera_calib.calibrate.start import locate_all
+from camera_calib.calibration import TargetView
+from camera_calib.freedom import (
     HELD,
     PORT,
     Freedom,
@@ -30,9 +33,6 @@ from camera_calib.calibrate.freedom import (
     pose_names,
     value,
 )
-from camera_calib.calibrate.result import TargetView
-from camera_calib.calibrate.solve import Intrinsics
-from camera_calib.calibrate.start import locate_all
 from camera_calib.rig import Rig
 from tests.camera_calib.calibration_scenes import (
     BOARD,

@@ -8,17 +8,7 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.errors import CalibrationError
 from camera_calib.calibrate.adjust import adjust
-from camera_calib.calibrate.freedom import (
-    PORT,
-    Freedom,
-    Prior,
-    intrinsics,
-    of_cameras,
-    pose_names,
-    value,
-)
 from camera_calib.calibrate.observability import held_effect
-from camera_calib.calibrate.result import TargetView
 from camera_calib.calibrate.solve import (
     blank_camera,
     calibrate,
@@ -28,6 +18,16 @@ from camera_calib.calibrate.solve import (
     recalibrate,
 )
 from camera_calib.calibrate.start import locate
+from camera_calib.calibration import TargetView
+from camera_calib.freedom import (
+    PORT,
+    Freedom,
+    Prior,
+    intrinsics,
+    of_cameras,
+    pose_names,
+    value,
+)
 from camera_calib.rig import Rig
 from tests.camera_calib.calibration_scenes import (
     BOARD,

@@ -128,5 +128,6 @@ def test_plots_are_written_by_suffix_without_dates(
 def test_plots_that_cannot_be_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"\.png, \.svg, \.pdf"):
         draw(tmp_path / "a.bmp", paper=True)
+    (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="cannot be written"):
-        draw(tmp_path / "missing" / "a.png", paper=True)
+        draw(tmp_path / "file" / "a.png", paper=True)

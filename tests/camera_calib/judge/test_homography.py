@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from camera_calib.approximation.virtual_pinhole import best_pinhole
-from camera_calib.calibrate.freedom import Freedom, intrinsics, of_cameras, pose_names
-from camera_calib.calibrate.result import TargetView
+from camera_calib.calibration import TargetView
+from camera_calib.freedom import Freedom, intrinsics, of_cameras, pose_names
 from camera_calib.judge.homography import homography_residuals, homography_test
 from tests.oracles_report import (
     DESIGN,

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.errors import CalibrationError
-from camera_calib.calibrate.freedom import POSE
 from camera_calib.flat_port import PARAMETERS
+from camera_calib.freedom import POSE
 from camera_calib.judge.judgement import anchors_cam
 from camera_calib.judge.uncertainty import (
     baseline_sigma_m,

@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 
 from alice_survey.base.errors import CalibrationError
-from camera_calib.calibrate.freedom import (
+from camera_calib.calibrate.start import locate
+from camera_calib.calibration import Calibration, TargetView
+from camera_calib.freedom import (
     PORT,
     Freedom,
     Prior,
@@ -14,8 +16,6 @@ from camera_calib.calibrate.freedom import (
     pose_names,
     value,
 )
-from camera_calib.calibrate.result import Calibration, TargetView
-from camera_calib.calibrate.start import locate
 from camera_calib.judge.judgement import anchors_cam
 from camera_calib.judge.uncertainty import frame_pixels
 from camera_calib.judge.validation import (

@@ -13,7 +13,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.config import ReconstructConfig
 from alice_survey.base.errors import ReconstructionError
-from camera_calib.calibrate.freedom import value
+from camera_calib.freedom import value
 from camera_calib.rig import Covariance, Rig, read_rig
 from reconstruct.mapping.arrays import observed
 from reconstruct.mapping.database import Observations, as_transform

@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from alice_survey.base.errors import ImageError
+from alice_survey.base.executor import SERIAL
 from alice_survey.base.manifest import ImageRecord, write_manifest
 from reconstruct.pictures.quality import PictureQuality, judge, measure
 from reconstruct.pictures.quality_sheet import quality_report, worst_first
@@ -136,7 +137,7 @@ def survey(tmp_path: Path) -> Path:
 
 
 def test_each_fault_is_named_and_nothing_else(survey: Path) -> None:
-    text, figures = quality_report(survey, 1)
+    text, figures = quality_report(survey, SERIAL)
     reasons = {Path(f["image"]).stem: " ".join(f["reasons"]) for f in figures["flagged"]}
     assert set(reasons) == {"blurred", "dark", "hazy", "burnt", "cut", "missing"}
     for name, word in (
@@ -165,4 +166,4 @@ def test_the_worst_come_first(survey: Path) -> None:
 def test_an_empty_manifest_is_refused(tmp_path: Path) -> None:
     write_manifest(tmp_path / "images" / "manifest.csv", [])
     with pytest.raises(ImageError, match="names no picture"):
-        quality_report(tmp_path, 1)
+        quality_report(tmp_path, SERIAL)

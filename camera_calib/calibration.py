@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
-from camera_calib.calibrate.freedom import HELD, Freedom
+from camera_calib.freedom import HELD, Freedom
 from camera_calib.rig import Rig
 
 
