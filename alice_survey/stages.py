@@ -182,8 +182,15 @@ def files_of(wanted: Sequence[str], config: SurveyConfig) -> list[Path]:
 
 
 def spec(name: str) -> StageSpec:
-    """The stage of a name."""
-    return next(stage for stage in STAGES if stage.name == name)
+    """The stage of a name, or of a folder.
+
+    Raises:
+        WorkspaceError: there is none.
+    """
+    for stage in STAGES:
+        if name in (stage.name, stage.folder):
+            return stage
+    raise WorkspaceError(f"there is no stage {name!r}: the stages are {', '.join(names())}")
 
 
 def names(*commands: str) -> list[str]:

@@ -75,6 +75,7 @@ def run(
     Returns:
         What each stage has found, as text and as JSON values.
     """
+    stages = [spec(stage).name for stage in stages]
     imported = is_imported(workspace)
     simulated = all(spec(stage).simulated for stage in stages)
     config = settings(workspace, survey, needed=not imported, simulated=simulated)

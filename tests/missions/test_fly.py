@@ -169,7 +169,7 @@ def test_a_stale_plan_is_flown_with_a_warning_and_options_are_said_to_be_for_onc
     (tmp_path / "survey.toml").write_text(small)
     run(["plan"], tmp_path, None)
     (tmp_path / "survey.toml").write_text(small + "[plan]\nspeed_mps = 0.25\n")
-    run(["flight"], tmp_path, None, flight=FlightChanges(current="0.1@90"))
+    run(["fly"], tmp_path, None, flight=FlightChanges(current="0.1@90"))
     told = capsys.readouterr().err
     assert "the plan is stale" in told
     assert "put them into survey.toml" in told
