@@ -20,8 +20,11 @@ from alice_survey.stages import STAGES
 ROOT = Path(__file__).parents[1]
 RECORD = Path(__file__).with_suffix(".json")
 PACKAGES = ("alice_survey", "camera_calib", "missions", "reconstruct")
-WITHOUT_EFFECT = ("alice_survey.base.run", "alice_survey.base.errors", "alice_survey.stages")
-"""Modules whose code shows what happens, or lists the stages, and decides no result."""
+WITHOUT_EFFECT = (
+    "alice_survey.api", "alice_survey.base.errors", "alice_survey.base.run", "alice_survey.stages",
+    "alice_survey.survey",
+)  # fmt: skip
+"""Modules that call stages, list them or show what happens, and decide no result."""
 
 
 @cache
@@ -61,7 +64,7 @@ def closure_of(module: str) -> set[str]:
     found, waiting = set(), [module]
     while waiting:
         name = waiting.pop()
-        if name not in found and not name.startswith(WITHOUT_EFFECT):
+        if name not in found and name not in PACKAGES and not name.startswith(WITHOUT_EFFECT):
             found.add(name)
             waiting += imports_of(name)
     return found
