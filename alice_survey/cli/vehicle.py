@@ -91,7 +91,7 @@ def compare(
 @app.command(
     epilog=examples(
         "vehicle identify surge.csv turns.csv --free X_uu,Y_vv,N_rr,N_rdot,current -o found",
-        "vehicle identify dive.csv --validate second.csv --bollard pull.csv",
+        "vehicle identify dive.csv --validate second.csv --bollard pull.csv --method two-step",
         "vehicle identify run1.csv run2.csv --columns columns.toml --vehicle rov.toml "
         "--given p,q --window 5 --free X_u,X_uu,N_r,N_rr,gain_X,gain_N --validate run3.csv",
     )
@@ -111,6 +111,7 @@ def identify(
     held: Annotated[
         list[str] | None, typer.Option(metavar="NAME=VALUE", help="As current_north_mps=0.1.")
     ] = None,
+    method: Annotated[str, typer.Option(help="joint, or two-step as in the paper.")] = "joint",
     columns: Annotated[Path | None, typer.Option(help="TOML: what other columns mean.")] = None,
     given: Annotated[
         str | None, typer.Option(help="Rates, of p,q,r, that follow the log, not the forces.")
@@ -134,7 +135,7 @@ def identify(
     options = IdentifyOptions(
         vehicle=vehicle, coefficients=coefficients, validate=validate, bollard=bollard,
         free=tuple((free or "").split(",")) if free else (), held=tuple(held or ()),
-        columns=columns, given=tuple(given.split(",")) if given else (),
+        method=method, columns=columns, given=tuple(given.split(",")) if given else (),
         window_s=window, hold_input=hold_input,
     )  # fmt: skip
     print_result(*identify_report(logs, out, options), as_json)

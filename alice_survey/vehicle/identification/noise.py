@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
+from scipy.signal import fftconvolve
 
 from alice_survey.base.frames import Array
 
@@ -71,6 +72,24 @@ def autocovariance(runs: Sequence[Array]) -> Array:
     while len(lags) < longest and max(abs(lag) for lag in lags[-chosen:]) > _FADED * sample[0]:
         lags.append(float(factors @ np.array(lags[: -chosen - 1 : -1])))
     return np.array(lags)
+
+
+def correlated_information(slopes: Sequence[Array], covariance: Array) -> Array:
+    """Sum of S^T T S, (P, P), over runs S, (N_i, P), with the Toeplitz matrix T of a process.
+
+    With the residual's autocovariance this is the covariance of S^T e (E. A. Morelli & V. Klein,
+    J. Guidance, Control, and Dynamics 20, 1997, on parameter accuracy with coloured residuals).
+    """
+    width = slopes[0].shape[1]
+    total = np.zeros((width, width))
+    for run in slopes:
+        lags = covariance[: len(run)]
+        if len(lags) == 1:
+            total += lags[0] * (run.T @ run)
+        elif len(run):
+            filtered = fftconvolve(run, np.concatenate([lags[:0:-1], lags])[:, None], axes=0)
+            total += run.T @ filtered[len(lags) - 1 : len(lags) - 1 + len(run)]
+    return 0.5 * (total + total.T)
 
 
 def score_information(scores: Sequence[Array], lags: int) -> Array:

@@ -32,9 +32,11 @@ from alice_survey.vehicle.identification.output_error import (
 from alice_survey.vehicle.identification.parameters import (
     CURRENTS,
     OTHERS,
+    Parameters,
     free_parameters,
     unit_of,
 )
+from alice_survey.vehicle.identification.two_step import calibrate
 from alice_survey.vehicle.identification.validation import MotionValidation, validate
 from alice_survey.vehicle.identification.windows import (
     CHANNEL_NAMES,
@@ -45,7 +47,8 @@ from alice_survey.vehicle.identification.windows import (
 from alice_survey.vehicle.log import VehicleLog, read_vehicle_log
 from alice_survey.vehicle.vehicle import Vehicle
 
-DEFAULT_FREE = ("X_uu", "Y_vv", "Z_ww", "N_rr", "current")
+JOINT_FREE = ("X_uu", "Y_vv", "Z_ww", "N_rr", "current")
+TWO_STEP_FREE = ("X_udot", "X_uu", "Z_wdot", "Z_ww", "N_rdot", "N_rr")
 """What is free when nothing is said; the second as in the paper's three manoeuvres."""
 _HIGH_CORRELATION = 0.9
 _LASTING = 0.2
@@ -67,6 +70,8 @@ class IdentifyOptions:
     free: tuple[str, ...] = ()
     held: tuple[str, ...] = ()
     """`NAME=VALUE` of parameters that are no coefficients."""
+    method: str = "joint"
+    """`joint` or `two-step`."""
     columns: Path | None = None
     """What the columns of logs mean, if they are not the documented ones."""
     given: tuple[str, ...] = ()
@@ -77,6 +82,19 @@ class IdentifyOptions:
     hold_input: bool = False
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Identified:
+    """Parameters by either method."""
+
+    parameters: Parameters
+    values: Array
+    sigma: Array
+    fit: OutputErrorFit | None
+    """None of the two-step calibration."""
+    steps: tuple[str, ...]
+    """In which each was calibrated; none of the joint fit."""
+
+
 def identify_report(
     logs: Sequence[Path], out: Path, options: IdentifyOptions
 ) -> tuple[str, dict[str, Any]]:
@@ -85,6 +103,8 @@ def identify_report(
     Raises:
         VehicleError: a file or an option is wrong, or the logs do not determine what is free.
     """
+    if options.method not in ("joint", "two-step"):
+        raise VehicleError(f"method {options.method!r} is not known: joint or two-step")
     vehicle = _start(options)
     thrust: list[ThrustCoefficient] = []
     if options.bollard is not None:
@@ -99,9 +119,10 @@ def identify_report(
                 f"the logs give speeds, but {options.vehicle} does not say what they mean of "
                 f"{'; '.join(missing)}"
             )
-    parameters = free_parameters(used, options.free or DEFAULT_FREE, _held(options.held))
+    free = options.free or (JOINT_FREE if options.method == "joint" else TWO_STEP_FREE)
+    parameters = free_parameters(used, free, _held(options.held))
     how = Simulation(hold=options.hold_input)
-    result = fit_output_error(windows, parameters, simulation=how)
+    result = _identify(windows, parameters, how, options.method)
     validation, drift = None, None
     if options.validate is not None:
         shorter = _windows(options.validate, vehicle, options, options.validation_window_s)
@@ -151,8 +172,21 @@ def _windows(
     return make_windows(log, vehicle, window_s=window_s or options.window_s, given=options.given)
 
 
+def _identify(
+    windows: Sequence[Window], parameters: Parameters, how: Simulation, method: str
+) -> _Identified:
+    if method == "two-step":
+        found = calibrate(windows, parameters)
+        return _Identified(
+            parameters=parameters, values=found.values, sigma=found.sigma, fit=None,
+            steps=found.step,
+        )  # fmt: skip
+    fit = fit_output_error(windows, parameters, simulation=how)
+    return _Identified(parameters=parameters, values=fit.values, sigma=fit.sigma, fit=fit, steps=())
+
+
 def _with_its_current(
-    windows: Sequence[Window], result: OutputErrorFit, how: Simulation
+    windows: Sequence[Window], result: _Identified, how: Simulation
 ) -> tuple[Array, Array | None]:
     """Values for another log: coefficients are the vehicle's, a current is the day's.
 
@@ -204,7 +238,7 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 def _text(
     vehicle: Vehicle,
     logs: Sequence[Path],
-    result: OutputErrorFit,
+    result: _Identified,
     thrust: Sequence[ThrustCoefficient],
     own: MotionValidation,
     validation: MotionValidation | None,
@@ -212,8 +246,9 @@ def _text(
     options: IdentifyOptions,
 ) -> str:
     lines = [
-        f"{vehicle.name} by the joint fit to {', '.join(path.name for path in logs)}; from "
-        f"{vehicle.coefficients.name!r} coefficients",
+        f"{vehicle.name} by the {options.method} "
+        f"{'fit' if options.method == 'joint' else 'calibration'} to "
+        f"{', '.join(path.name for path in logs)}; from {vehicle.coefficients.name!r} coefficients",
         "",
     ]
     if thrust:
@@ -234,9 +269,9 @@ def _text(
             name, f"{start:.5g}", f"{value:.5g}", _cell(float(result.sigma[k]), ".2g"),
             _cell(factor, ".3g"), unit_of(name),
         ]  # fmt: skip
-        rows_.append(row)
+        rows_.append([*row, result.steps[k]] if result.steps else row)
     head_ = ["coefficient", "start", "identified", "sigma", "factor", "unit"]
-    lines += _table(head_, rows_)
+    lines += _table([*head_, "step"] if result.steps else head_, rows_)
     lines += _remarks(result)
     lines += ["", *_fit_lines("Simulated over the same logs", own)]
     if validation is not None:
@@ -249,13 +284,16 @@ def _text(
     return "\n".join(lines)
 
 
-def _remarks(fit: OutputErrorFit) -> list[str]:
+def _remarks(result: _Identified) -> list[str]:
     """What a reader must know of the numbers."""
     lines = [""]
-    names = fit.parameters.names
-    poor = poorly_determined(names, fit.values, fit.sigma)
+    names, fit = result.parameters.names, result.fit
+    poor = poorly_determined(names, result.values, result.sigma)
     if poor:
         lines.append(f"hardly determined (sigma over {_POOR:.0%}): {', '.join(poor)}")
+    if fit is None:
+        lines.append("Sigmas are those of the regressions; noise pulls coefficients towards zero.")
+        return lines
     bound = [name for name, held in zip(names, fit.at_bound, strict=True) if held]
     if bound:
         lines.append(f"at a bound, so without sigma: {', '.join(bound)}")
@@ -340,7 +378,7 @@ def _fit_lines(title: str, found: MotionValidation) -> list[str]:
 def _data(
     vehicle: Vehicle,
     logs: Sequence[Path],
-    result: OutputErrorFit,
+    result: _Identified,
     thrust: Sequence[ThrustCoefficient],
     own: MotionValidation,
     validation: MotionValidation | None,
@@ -370,7 +408,7 @@ def _data(
             ],
         }
 
-    start = result.parameters.start
+    fit, start = result.fit, result.parameters.start
     identified = {
         name: {
             "start": float(start[k]),
@@ -386,7 +424,7 @@ def _data(
     data: dict[str, Any] = {
         "vehicle": vehicle.name,
         "logs": [path.name for path in logs],
-        "method": "joint",
+        "method": "joint" if fit is not None else "two-step",
         "identified": identified,
         "others": result.parameters.others(result.values),
         "poorly_determined": poorly_determined(
@@ -406,14 +444,15 @@ def _data(
         ],
         "same_logs": fits(own),
     }
-    data["high_correlations"] = [
-        {"of": [a, b], "correlation": value} for a, b, value in high_correlations(result)
-    ]
-    data["residual_sigma"] = {
-        name: known(float(value))
-        for name, value in zip(CHANNEL_NAMES, result.channel_sigma, strict=True)
-    }
-    data["covariance"] = [[float(value) for value in row] for row in result.covariance]
+    if fit is not None:
+        data["high_correlations"] = [
+            {"of": [a, b], "correlation": value} for a, b, value in high_correlations(fit)
+        ]
+        data["residual_sigma"] = {
+            name: known(float(value))
+            for name, value in zip(CHANNEL_NAMES, fit.channel_sigma, strict=True)
+        }
+        data["covariance"] = [[float(value) for value in row] for row in fit.covariance]
     if validation is not None:
         data["validation"] = fits(validation)
     return data
@@ -422,7 +461,7 @@ def _data(
 def _write(
     out: Path,
     vehicle: Vehicle,
-    result: OutputErrorFit,
+    result: _Identified,
     text: str,
     data: dict[str, Any],
     own: MotionValidation,

@@ -5,9 +5,11 @@ import pytest
 
 from alice_survey.vehicle.identification.noise import (
     autocovariance,
+    correlated_information,
     noise_sigma,
     score_information,
 )
+from tests.oracles_identification import dense_information
 
 
 def test_noise_is_found_under_a_smooth_motion() -> None:
@@ -40,6 +42,15 @@ def test_a_process_is_known_by_its_autocovariance() -> None:
     expected = decay ** np.arange(30) / (1 - decay**2)
     np.testing.assert_allclose(lags[:30], expected, rtol=0.25, atol=0.1 * expected[0])
     assert lags.sum() == pytest.approx(np.sum(decay ** np.arange(200)) / (1 - decay**2), rel=0.2)
+
+
+@pytest.mark.parametrize("count", [1, 6, 60])
+def test_information_is_that_of_the_written_out_matrix(count: int) -> None:
+    rng = np.random.default_rng(4)
+    lags = 0.8 ** np.arange(count)
+    runs = [rng.normal(size=(rows, 3)) for rows in (40, 25)]
+    expected = sum(dense_information(run, lags) for run in runs)
+    np.testing.assert_allclose(correlated_information(runs, lags), expected, rtol=1e-10, atol=1e-9)
 
 
 def test_scores_of_one_push_count_together() -> None:

@@ -58,18 +58,20 @@ def test_the_joint_fit_writes_what_it_found(logs: tuple[Path, Path], tmp_path: P
         assert again == (tmp_path / "out" / name).read_bytes()
 
 
+@pytest.mark.parametrize("method", ["joint", "two-step"])
 def test_the_command_takes_a_bollard_pull_and_held_values(
-    logs: tuple[Path, Path], tmp_path: Path
+    logs: tuple[Path, Path], tmp_path: Path, method: str
 ) -> None:
     pull = pull_csv(tmp_path / "pull.csv", 0.0, factors=(1.0, 1.0))
     arguments = [
-        "identify", str(logs[0]), "--free", "X_uu,N_rr", "--bollard",
+        "identify", str(logs[0]), "--method", method, "--free", "X_uu,N_rr", "--bollard",
         str(pull), "--held", "current_north_mps=0.1", "--held", "current_east_mps=-0.05", "-o",
         str(tmp_path / "out"), "--json",
     ]  # fmt: skip
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     data = json.loads(result.stdout)
+    assert data["method"] == method
     assert [round(one["factor"], 6) for one in data["thrust"]] == [1.0, 1.0]
     assert data["identified"]["X_uu"]["identified"] == pytest.approx(-12.0, rel=0.05)
     assert data["identified"]["N_rr"]["identified"] == pytest.approx(-70.0, rel=0.05)
@@ -78,6 +80,7 @@ def test_the_command_takes_a_bollard_pull_and_held_values(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        (IdentifyOptions(method="guess"), "method 'guess' is not known"),
         (IdentifyOptions(held=("current_north_mps",)), "is not NAME=VALUE"),
         (IdentifyOptions(held=("X_uu=3",)), "X_uu cannot be held by hand"),
         (IdentifyOptions(vehicle="sparus2"), "are not those of sparus2"),
