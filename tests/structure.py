@@ -70,8 +70,10 @@ def code_lines(text: str) -> int:
     for number, token in enumerate(tokens):
         starts = previous in (tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT)
         if token.type == tokenize.STRING and starts:
-            after = next(t for t in tokens[number + 1 :] if t.type != tokenize.COMMENT)
-            if after.type == tokenize.NEWLINE:  # a docstring
+            after = number + 1
+            while tokens[after].type == tokenize.COMMENT:
+                after += 1
+            if tokens[after].type == tokenize.NEWLINE:  # a docstring
                 previous = token.type
                 continue
         if token.type not in passed:
@@ -203,6 +205,7 @@ def single_importer() -> list[str]:
     return [name for name, count in users.items() if count == 1]
 
 
+@cache
 def counts() -> list[Count]:
     """All counts, with their bounds."""
     sources = [module.text for module in modules().values()]

@@ -1,5 +1,6 @@
 """The pictures of a flight show what the flight holds."""
 
+import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -51,7 +52,8 @@ def drawn(
     """The figure that would be saved."""
     kept: list[Figure] = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: kept.append(figure))
-    draw(Path("nowhere.png"), flight)
+    with tempfile.TemporaryDirectory() as folder:
+        draw(Path(folder) / "drawn.png", flight)
     return kept[0]
 
 
