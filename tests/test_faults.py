@@ -13,6 +13,8 @@ import pytest
 
 from alice_survey.survey import init_survey
 
+pytestmark = pytest.mark.slow
+
 AS_ROOT = pytest.mark.skipif(
     os.geteuid() != 0 and "CI" not in os.environ, reason="only root mounts a small disk"
 )

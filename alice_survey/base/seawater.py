@@ -60,7 +60,7 @@ def n_water(
     Example:
         >>> import alice_survey as alice
         >>> float(alice.n_water(22.0, 35.0, 15.0).round(4))
-        1.3427
+        1.3414
     """
     values = {
         "temperature_c": np.asarray(temperature_c, dtype=np.float64),

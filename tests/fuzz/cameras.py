@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from alice_survey.base.config import CameraConfig, WaterConfig
+from alice_survey.base.executor import SERIAL
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.rig import Rig, design_rig
 from tests.fuzz.target import Target
@@ -179,7 +180,7 @@ def look_for_board(path: Path) -> object:
     from camera_calib.targets.target import parse_target
 
     sets = [PictureSet(name="v", paths={path.name: path})]
-    return detect_views(sets, parse_target("chessboard 9x6 25mm"), 1)
+    return detect_views(sets, parse_target("chessboard 9x6 25mm"), SERIAL)
 
 
 def _calibration(

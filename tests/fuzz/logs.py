@@ -226,7 +226,7 @@ def read_vehicle(path: Path) -> object:
 
 
 def _vehicle(folder: Path) -> None:
-    source = _HERE.parent / "vehicle" / "identification" / "bluerov2.toml"
+    source = _HERE.parent / "alice_survey" / "vehicle" / "identification" / "bluerov2.toml"
     (folder / "v.toml").write_bytes(source.read_bytes())
 
 

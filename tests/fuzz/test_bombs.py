@@ -14,6 +14,8 @@ from missions.logs import bag_chunks
 from tests.fuzz import areas, cameras, logs, workspace
 from tests.fuzz.judge import Sandbox, Verdict, judge
 
+pytestmark = pytest.mark.slow
+
 _MANY = 100_000
 
 _LAUGHS = "<!DOCTYPE k [<!ENTITY a0 'ha'>" + "".join(

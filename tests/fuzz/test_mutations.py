@@ -13,6 +13,8 @@ from tests.fuzz.judge import Sandbox, judge
 from tests.fuzz.mutations import MOST_BYTES, mutate
 from tests.fuzz.targets import GROUPS, TARGETS, Trial
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("name", TARGETS)
 def test_spoilt_files_are_read_or_refused_in_one_line(name: str, tmp_path: Path) -> None:

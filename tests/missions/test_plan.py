@@ -247,7 +247,7 @@ def test_a_stage_is_skipped_until_a_setting_that_matters_changes(workspace: Path
     assert not spec("plan").make(workspace, config.model_copy(update={"seed": 9}), SERIAL)
     before = read_stage(workspace / "plan")
     assert before is not None
-    assert "seed" not in before["settings"]
+    assert "seed" not in before.settings
 
 
 def test_a_plan_is_the_same_bytes_each_time(workspace: Path, tmp_path: Path) -> None:

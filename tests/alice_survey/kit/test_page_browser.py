@@ -16,7 +16,7 @@ from alice_survey.kit.page import render_html
 from tests.alice_survey.kit.browser import Heard, chromium
 from tests.alice_survey.kit.sketch import RUDE, encoded, seafloor, sketch_report
 
-pytestmark = pytest.mark.xdist_group("chromium")
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
 SIZES = {"desk": (1280, 900), "phone": (400, 800)}
 MAP, MESH = "#map-canvas", "#mesh-canvas"
 RESTS = "() => !document.querySelector('.leaflet-zoom-anim, .leaflet-pan-anim')"

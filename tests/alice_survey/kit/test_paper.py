@@ -47,6 +47,7 @@ def test_text_is_never_markup(report: Report, pdf: bytes) -> None:
     assert printed(render_pdf(other, DATE)).count("".join(hostile.split())) >= 3
 
 
+@pytest.mark.slow
 def test_a_screen_reader_gets_what_figures_show(report: Report, pdf: bytes) -> None:
     reader = PdfReader(io.BytesIO(pdf))
     alts = [

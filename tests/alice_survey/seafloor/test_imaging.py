@@ -111,7 +111,7 @@ def test_there_is_a_stereo_pair_for_each_trigger(survey: Path) -> None:
         assert picture.std() > 8
     facts = json.loads((survey / "images" / "survey.json").read_text())
     assert facts["source"] == "simulated"
-    assert facts["datum"] == {"latitude_deg": 32.8, "longitude_deg": 34.9}
+    assert facts["datum"] == {"latitude_deg": 32.8, "longitude_deg": 34.9, "height_m": 0.0}
 
 
 def test_the_manifest_says_what_navigation_believes_not_the_truth(survey: Path) -> None:

@@ -15,7 +15,7 @@ from tests.alice_survey.kit.browser import Heard, chromium
 from tests.alice_survey.kit.sketch import encoded, seafloor, sketch_mesh
 from tests.alice_survey.report.tiny import tiny_workspace
 
-pytestmark = pytest.mark.xdist_group("chromium")
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
 MAP = "#map-canvas"
 
 

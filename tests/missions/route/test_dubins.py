@@ -41,7 +41,7 @@ def test_a_turn_arrives_without_a_gap_or_a_kink(
     assert math.dist(legs[-1].end_ne_m, goal) < 1e-5
     assert math.cos(legs[-1].end_heading_rad - last) > 1 - 1e-9
     assert all(abs(leg.curvature_per_m) <= 1 / radius_m * (1 + 1e-12) for leg in legs)
-    assert length(legs) >= math.dist(start, goal) - 1e-9
+    assert length(legs) >= math.dist(start, goal) - 1e-5  # as far as it may miss the goal
 
 
 @settings(deadline=None, max_examples=60)

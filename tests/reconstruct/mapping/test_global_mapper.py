@@ -6,7 +6,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.executor import local_executor
+from alice_survey.base.executor import SERIAL, local_executor
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped, faults_of, map_calibrated
 from reconstruct.mapping.pose_graph import average_poses, station_groups
@@ -124,7 +124,7 @@ def test_stereo_points_lie_where_the_floor_is() -> None:
 def test_links_are_the_true_relative_poses() -> None:
     scene = make_scene(lines=2, stations=4, points=5000, noise_px=0.1)
     seen, lenses = seen_by_pinholes(scene)
-    links = link_stations(seen, pinhole_rig(scene, lenses), 1, 1)
+    links = link_stations(seen, pinhole_rig(scene, lenses), 1, SERIAL)
     poses = station_poses(scene)
     assert {(k.first, k.second) for k in links} | {(k.second, k.first) for k in links} >= {
         (k, k + 1) for k in range(3)

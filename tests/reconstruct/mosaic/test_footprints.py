@@ -75,7 +75,10 @@ def workspace_with_mosaic(folder: Path) -> np.ndarray:
         dtype="uint8", crs=crs_of(FRAME), transform=transform_of(grid),
     ) as raster:  # fmt: skip
         raster.write(rgba)
-    write_json(folder / "mosaic" / "mosaic.json", {"pixel": 0.01, "unit": "m"})
+    write_json(
+        folder / "mosaic" / "mosaic.json",
+        {"width_px": 230, "height_px": 150, "pixel": 0.01, "unit": "m"},
+    )
     write_json(folder / "mosaic" / "stage.json", {})
     return rgba
 

@@ -13,7 +13,7 @@ from alice_survey.base.executor import SERIAL
 from alice_survey.stages import spec
 from camera_calib.rig import design_rig
 from reconstruct.mosaic import run
-from reconstruct.mosaic.run import _dispersion
+from reconstruct.mosaic.run import _dispersion, _sea
 from reconstruct.raster import DemGrid, tiled_raster
 from reconstruct.views.lens import flat_port_lens
 from reconstruct.views.model import View
@@ -212,10 +212,13 @@ def test_only_refraction_parts_the_colours(tmp_path: Path, n_water: float, corre
     camera = design_rig(CameraConfig(), WaterConfig()).cameras["left"]
     bare = {"port_distance_m": 0.0, "glass_thickness_m": 0.0, "n_water": n_water}
     lens = flat_port_lens(replace(camera, **bare), 1.5, 2.5)
-    write_json(tmp_path / "sparse" / "cameras.json", {"cameras": {"left": lens.to_json()}})
+    write_json(
+        tmp_path / "sparse" / "cameras.json", {"cameras": {"left": lens.to_json()}, "images": {}}
+    )
     write_json(tmp_path / "images" / "survey.json", {"source": "imported"})
     model = sparse_model(stereo_views(np.array([0.2]), np.array([0.0]), heading_deg=0.0), SCENE)
-    water, stated = _dispersion(tmp_path, model, CONFIG, grey=False)
+    sea = _sea(CONFIG.water, CONFIG.area.seafloor_depth_m)
+    water, stated = _dispersion(tmp_path, "auto", sea, grey=False)
     assert stated["corrected"] is corrected and (water is not None) is corrected
 
 

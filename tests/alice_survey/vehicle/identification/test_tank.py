@@ -48,8 +48,9 @@ def test_frames_and_step_of_the_runs_are_as_mapped(runs: list[VehicleLog]) -> No
         assert step_s == pytest.approx(0.1, rel=0.08)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("left_out", [0, 1, 2, 3])
-def test_each_run_is_foretold_from_the_others(runs: list[VehicleLog], left_out: int) -> None:
+def test_each_run_is_predicted_from_the_others(runs: list[VehicleLog], left_out: int) -> None:
     rov = vehicle_from_file(HERE / "bluerov2.toml")
     parameters = free_parameters(rov, FREE)
     # Rolling and pitching answer to nothing in the log: they follow it.

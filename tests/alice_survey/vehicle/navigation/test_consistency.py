@@ -30,6 +30,7 @@ def runs(name: str) -> list[Run]:
     return [fly(sensors, truth, level_floor(15.0), seed) for seed in range(RUNS)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SUITES)
 @pytest.mark.parametrize("states", [slice(0, 25), slice(0, 15), slice(0, 9)])
 def test_errors_are_as_large_as_the_covariance_says(name: str, states: slice) -> None:
