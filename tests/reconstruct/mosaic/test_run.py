@@ -216,7 +216,6 @@ def test_only_refraction_parts_the_colours(tmp_path: Path, n_water: float, corre
         tmp_path / "sparse" / "cameras.json", {"cameras": {"left": lens.to_json()}, "images": {}}
     )
     write_json(tmp_path / "images" / "survey.json", {"source": "imported"})
-    model = sparse_model(stereo_views(np.array([0.2]), np.array([0.0]), heading_deg=0.0), SCENE)
     sea = _sea(CONFIG.water, CONFIG.area.seafloor_depth_m)
     water, stated = _dispersion(tmp_path, "auto", sea, grey=False)
     assert stated["corrected"] is corrected and (water is not None) is corrected
