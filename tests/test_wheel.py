@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-import sysconfig
 import venv
 import zipfile
 from pathlib import Path
@@ -32,7 +31,8 @@ def program(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     venv.create(folder, with_pip=False, symlinks=True)
     packages = next(folder.glob("lib/python*/site-packages"))
     # Lines of .pth files are paths: an editable install in the other environment stays unseen.
-    (packages / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    known = [path for path in sys.path if path.endswith("site-packages")]
+    (packages / "dependencies.pth").write_text("\n".join(known) + "\n")
     subprocess.run(
         [sys.executable, "-m", "pip", f"--python={folder / 'bin' / 'python'}", "install",
          "--no-deps", "--no-index", "--quiet", "--disable-pip-version-check",

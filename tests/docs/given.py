@@ -109,12 +109,19 @@ def _on_one_core() -> None:
 
 def _reef(folder: Path, made: Made) -> None:
     shutil.copytree(made.reef, folder / "reef")
+    _area(folder, made)
+
+
+def _area(folder: Path, made: Made) -> None:
+    """What the settings of the survey name by a path relative to its workspace."""
+    shutil.copy(made.reef.parent / "area.geojson", folder)
 
 
 def _planned(folder: Path, made: Made) -> None:
     """Only settings: what follows, the page's commands make."""
     (folder / "reef").mkdir()
     shutil.copy(made.reef / "survey.toml", folder / "reef")
+    _area(folder, made)
 
 
 def _cameras(folder: Path, made: Made) -> None:
