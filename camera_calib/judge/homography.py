@@ -46,7 +46,7 @@ class HomographyTest:
     """Residuals against the radius; expected as predicted from those of the inner points."""
     views: int
     inner_px: float
-    """Standard deviation of one coordinate of the inner points, by degrees of freedom of the fits."""
+    """Standard deviation of one coordinate of the inner points, by the degrees of freedom."""
     outer_px: float
     """The same of the outer points."""
     outer_from_px: float
