@@ -22,7 +22,7 @@ from alice_survey.base.executor import Executor
 from alice_survey.base.manifest import read_manifest
 
 Summary = tuple[str, dict[str, Any]]
-"""What a stage has found: a line to read, and JSON values."""
+"""Result of a stage: a line of text, and JSON values."""
 StageWork = Callable[[Path, SurveyConfig, Executor, Path], None]
 """Takes the workspace, the settings, where tasks run, and the folder to write into."""
 
@@ -34,25 +34,25 @@ SCALE_FILE = "scale.json"
 
 @dataclass(frozen=True, kw_only=True)
 class StageSpec:
-    """One step of a survey: what it depends on, what does it, and what it writes."""
+    """One step of a survey: its dependencies, its implementation and its output."""
 
     name: str
-    """Also of its package and its command, where they are its own."""
+    """Name, also of its package and its command, where it has its own."""
     folder: str
     """The folder of the workspace that it writes."""
     command: str
     """The command that makes it."""
     about: str
     version: int
-    """Raise it when the stage's code changes its result; `tests/test_stage_code.py` notices."""
+    """Increase it when the stage's code changes its result; `tests/test_stage_code.py` checks."""
     work: str
     """`module:function` of a `StageWork`."""
     summary: Callable[[Path], Summary]
     """Takes the stage's folder."""
     needs: Sequence[str] = ()
-    """Stages without which it cannot be made."""
+    """Stages that it requires."""
     uses: Sequence[str] = ()
-    """Stages that it takes into account where they are there."""
+    """Stages that it uses if they exist."""
     settings: "Mapping[str, Any] | SettingsPart" = field(default_factory=dict)
     """All settings that the result depends on, as `settings_of` reads them."""
     setting_files: Sequence[str] = ()
@@ -60,15 +60,15 @@ class StageSpec:
     inputs: Callable[[Path], Sequence[Path]] = lambda workspace: ()
     """All files of a workspace that the result depends on."""
     resumes: bool = False
-    """Work goes on in what an interrupted run of the same digest left."""
+    """Work resumes from what an interrupted run of the same digest left."""
     simulated: bool = False
     """It is for simulated surveys: imported pictures have no such stage."""
     products: Mapping[str, str] = field(default_factory=dict)
-    """What people use of it: paths below its folder, and what they are."""
+    """Its products for users: paths below its folder, and descriptions."""
     picture: str = ""
     """A product to look at first."""
     reported: Sequence[str] = ()
-    """What a report reads of it: paths below its folder, `.` for all of it."""
+    """Files that a report reads: paths below its folder, `.` for all of it."""
 
     def stage(self, workspace: Path, config: SurveyConfig) -> Stage:
         """What the stage depends on, in a workspace."""
@@ -81,7 +81,7 @@ class StageSpec:
         )
 
     def make(self, workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
-        """Do the stage's work unless it is up to date.
+        """Run the stage unless it is up to date.
 
         Returns:
             True when done, False when nothing had changed.
@@ -194,7 +194,7 @@ def spec(name: str) -> StageSpec:
 
 
 def names(*commands: str) -> list[str]:
-    """Names of the stages that some commands make, in order; of all stages without one."""
+    """Names of the stages that some commands run, in order; of all stages without one."""
     return [stage.name for stage in STAGES if not commands or stage.command in commands]
 
 
@@ -698,4 +698,4 @@ STAGES: tuple[StageSpec, ...] = (
         },
     ),
 )
-"""In the order in which they are made."""
+"""All stages, in the order in which they run."""

@@ -1,4 +1,4 @@
-"""The whole loop: which stages are made, what each has found, and what a workspace holds."""
+"""The whole loop: which stages run, their results, and the state of a workspace."""
 
 import contextlib
 import json
@@ -25,7 +25,7 @@ _VIDEOS = (".avi", ".mkv", ".mov", ".mp4")
 
 @dataclass(frozen=True, kw_only=True)
 class FlightChanges:
-    """What a command line may change of a flight; None leaves the setting."""
+    """Flight settings that the command line may override; None leaves the setting."""
 
     vehicle: str | None = None
     controller: str | None = None
@@ -34,7 +34,7 @@ class FlightChanges:
     failed: Sequence[str] | None = None
     """NAME of a thruster that has failed, or NAME=SHARE that is left of it."""
     dive: int | None = None
-    """The one to fly, from 1 on."""
+    """Number of the dive to fly, from 1."""
 
     def applied(self, config: SurveyConfig) -> SurveyConfig:
         """The survey with these changes.
@@ -62,7 +62,7 @@ def run(
     executor: Executor | None = None,
     flight: FlightChanges | None = None,
 ) -> tuple[str, dict[str, Any]]:
-    """Do stages one after the other; those that are up to date are skipped.
+    """Run stages one after the other; those that are up to date are skipped.
 
     Args:
         stages: names in order.
@@ -73,7 +73,7 @@ def run(
         flight: overrides vehicle and sea.
 
     Returns:
-        What each stage has found, as text and as JSON values.
+        Results of each stage, as text and as JSON values.
     """
     stages = [spec(stage).name for stage in stages]
     imported = is_imported(workspace)
@@ -204,7 +204,7 @@ def _with_area(text: str, area: Path, folder: Path) -> str:
 
 
 def run_demo(workspace: Path, executor: Executor | None) -> tuple[str, dict[str, Any]]:
-    """Do the whole loop on the built-in survey, and say where its pictures are."""
+    """Run the whole loop on the built-in survey, and report where its pictures are."""
     if not (workspace / "survey.toml").exists():
         init_survey(workspace, "demo.toml")
     text, found = run(names(), workspace, None, None, executor)
@@ -218,7 +218,7 @@ def run_demo(workspace: Path, executor: Executor | None) -> tuple[str, dict[str,
 
 
 def workspace_status(workspace: Path, survey: Path | None) -> tuple[str, dict[str, Any]]:
-    """What a workspace holds, stage by stage, and the next command."""
+    """State of a workspace, stage by stage, and the next command."""
     if not workspace.is_dir():
         raise WorkspaceError(f"{workspace}: no such folder; 'alice-survey init' makes one")
     imported = is_imported(workspace)
@@ -240,7 +240,7 @@ def workspace_status(workspace: Path, survey: Path | None) -> tuple[str, dict[st
 
 @contextlib.contextmanager
 def _only_one(workspace: Path) -> Iterator[None]:
-    """Hold the workspace so that no second run writes into it."""
+    """Lock the workspace so that no second run writes into it."""
     lock = FileLock(workspace / ".lock", timeout=0)
     try:
         workspace.mkdir(parents=True, exist_ok=True)

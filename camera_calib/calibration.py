@@ -1,4 +1,4 @@
-"""What a calibration is made from and what comes out of it."""
+"""Input and result of a calibration."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -29,20 +29,20 @@ class Rejection:
     view: str
     camera: str
     points: int
-    """How many; 0 when the whole picture is meant."""
+    """Number of points; 0 for the whole picture."""
     reason: str
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Calibration:
-    """A calibrated rig, and all that is needed to judge it."""
+    """A calibrated rig, with all that is needed to assess it."""
 
     rig: Rig
-    """With its covariance."""
+    """The rig with its covariance."""
     target_points: Array
     """(N, 3) in the target's frame, metres."""
     views: tuple[TargetView, ...]
-    """(V) those adjusted."""
+    """(V) the adjusted views."""
     rig_from_target: RigidTransform
     """(V,) poses of the target; the rig's frame is the reference camera's."""
     residuals_px: Array
@@ -60,7 +60,7 @@ class Calibration:
     rejected: Array | None = None
     """(V, cameras, N, 2) measured pixels that took no part; NaN elsewhere."""
     blur: Array | None = None
-    """(V, cameras) noise of each picture over `noise_px`; None for alike ones."""
+    """(V, cameras) noise of each picture over `noise_px`; None if all are equal."""
 
     def __post_init__(self) -> None:
         shape = (len(self.views), len(self.rig.cameras), len(self.target_points), 2)

@@ -31,16 +31,16 @@ _RANGES = (
     ("n_glass", 3.0, ""),
     ("n_water", 2.0, ""),
 )
-"""Largest value of what describes a port; the wall of a tank may be some metres away."""
+"""Largest port distance or thickness; the wall of a tank may be some metres away."""
 
 PARAMETERS = (*_LENS, *_PORT, *_NORMAL)
-"""What can be calibrated, in the order of `FlatPortCamera.project_jacobian`. The unit normal has
+"""Parameters that can be calibrated, ordered as in `project_jacobian`. The unit normal has
 two: its first two components, sines of the port's tilt about the camera's y and x axes."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FlatPortCamera:
-    """One camera: pinhole and distortion as in air (OpenCV's model), and the port before it.
+    """One camera: pinhole and distortion as in air (OpenCV's model), and its flat port.
 
     A port of zero distance and thickness in water of index n is a pinhole magnified by n; with
     n_water = 1 it is the camera in air.
@@ -78,7 +78,7 @@ class FlatPortCamera:
     s4: float = 0.0
     """s1 to s4: OpenCV's thin prism."""
     port_distance_m: float = 0.0
-    """From the entrance pupil to the inner glass, along the port's normal."""
+    """Distance from the entrance pupil to the inner glass, along the port's normal."""
     glass_thickness_m: float = 0.0
     n_glass: float = 1.52
     n_water: float = 1.34
@@ -159,7 +159,7 @@ class FlatPortCamera:
 
         Returns:
             (..., 2) pixels (not clipped to the frame); NaN where the point is not in the water
-            before the port, no light reaches the pupil from it, or it lies so far out that the lens
+            beyond the port, no light reaches the pupil from it, or it lies so far out that the lens
             model folds back.
         """
         points = np.ascontiguousarray(points_cam, dtype=np.float64)
@@ -169,13 +169,13 @@ class FlatPortCamera:
         return pixels.reshape(*points.shape[:-1], 2)
 
     def project_jacobian(self, points_cam: Array) -> tuple[Array, Array, Array]:
-        """Project points, with the analytic slopes of the pixels.
+        """Project points, with the analytic derivatives of the pixels.
 
         Args:
             points_cam: (..., 3) points in the camera frame, metres.
 
         Returns:
-            Pixels, (..., 2); their slopes by the point, (..., 2, 3), px/m; and by each of
+            Pixels, (..., 2); their derivatives by the point, (..., 2, 3), px/m; and by each of
             `PARAMETERS`, (..., 2, 22). NaN where `project` is.
         """
         points = np.ascontiguousarray(points_cam, dtype=np.float64)
@@ -215,7 +215,7 @@ class FlatPortCamera:
         return hits
 
     def reduced(self, scale: int) -> "FlatPortCamera":
-        """The same camera with pixels `scale` times as large; a rest at right and bottom is cut."""
+        """The same camera with pixels `scale` times as large; partial ones are cut off."""
         return replace(
             self,
             width_px=self.width_px // scale,
@@ -268,10 +268,10 @@ def camera_from_json(data: dict[str, Any]) -> FlatPortCamera:
 
 
 def numbers(value: Any, count: int, what: str) -> Array:
-    """A list of so many finite numbers of a JSON file.
+    """A list of a given count of finite numbers from a JSON file.
 
     Raises:
-        CalibrationError: it is none; `what` says where it stands.
+        CalibrationError: it is not; `what` names its place.
     """
     plain = isinstance(value, list | tuple) and all(
         isinstance(one, int | float) and not isinstance(one, bool) and math.isfinite(one)
@@ -283,10 +283,10 @@ def numbers(value: Any, count: int, what: str) -> Array:
 
 
 def pose_jacobian(by_point: Array, points_cam: Array) -> Array:
-    """Slopes of pixels by a small motion of the points in the camera's frame.
+    """Derivatives of pixels by a small motion of the points in the camera's frame.
 
     Args:
-        by_point: (..., 2, 3) slopes of the pixels by the points.
+        by_point: (..., 2, 3) derivatives of the pixels by the points.
         points_cam: (..., 3).
 
     Returns:

@@ -1,4 +1,4 @@
-"""Which parameters of a rig an adjustment may change, and what is known of them beforehand.
+"""Parameters of a rig that an adjustment may change, and their priors.
 
 A rig's parameters are called `<camera>.<name>`. Names of a camera are those of
 `flat_port.PARAMETERS`; every camera but the reference also has its pose `cam_from_rig`: a rotation
@@ -17,14 +17,14 @@ from camera_calib.flat_port import PARAMETERS
 from camera_calib.rig import Rig
 
 POSE = ("rx_rad", "ry_rad", "rz_rad", "x_m", "y_m", "z_m")
-"""Of a camera that is not the reference; its rotation first."""
+"""Pose parameters of a camera that is not the reference; its rotation first."""
 PINHOLE = ("fx_px", "fy_px", "cx_px", "cy_px")
 PORT = ("port_distance_m", "normal_x", "normal_y")
-"""What a calibration through a port finds; glass and indices are known better from elsewhere."""
+"""Port parameters that a calibration estimates; glass and indices are known better."""
 
 _ONE_WATER = ".n_water"
 _SAME = 1.0 - 0.5e-6
-"""Correlation of what is known of one number twice: both differ by 0.001 sigma."""
+"""Correlation of two priors of one number: both differ by 0.001 sigma."""
 _OPENCV4 = ("k1", "k2", "p1", "p2")
 LENSES: Mapping[str, tuple[str, ...]] = {
     "pinhole": (),
@@ -73,7 +73,7 @@ def value(rig: Rig, name: str) -> float:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Prior:
-    """Normally distributed knowledge of some parameters, from elsewhere than the views."""
+    """Normally distributed prior of some parameters, not from the views."""
 
     parameters: tuple[str, ...]
     mean: Array
@@ -109,7 +109,7 @@ class Prior:
 
     @classmethod
     def around(cls, rig: Rig, sigmas: Mapping[str, float]) -> "Prior":
-        """Each parameter is the rig's value, give or take its sigma, independent of the others.
+        """Prior at the rig's values with the given sigmas, independent of each other.
 
         Only the indices of the water are one number: all cameras look into the same.
         """
@@ -125,7 +125,7 @@ class Prior:
 
     @classmethod
     def of_rig(cls, rig: Rig, names: Iterable[str]) -> "Prior":
-        """What an earlier calibration knows, with its correlations, of those names it found."""
+        """Prior from an earlier calibration, with its correlations, of the names it estimated."""
         if rig.covariance is None:
             raise CalibrationError(
                 f"the rig ({rig.source}) has no covariance to serve as a prior: calibrate it, or "
@@ -161,14 +161,14 @@ NO_PRIOR = Prior(parameters=(), mean=np.zeros(0), covariance=np.zeros((0, 0)))
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Freedom:
-    """What an adjustment may change; every parameter not named is held."""
+    """Parameters that an adjustment may change; all others are held."""
 
     free: tuple[str, ...] = ()
     """Parameters known from the views alone. Those of the prior are adjusted too."""
     prior: Prior = NO_PRIOR
 
     def names(self, rig: Rig) -> tuple[str, ...]:
-        """What is adjusted, in the order of `all_names`.
+        """Adjusted parameters, in the order of `all_names`.
 
         Raises:
             CalibrationError: a name is not a parameter of the rig.

@@ -1,4 +1,4 @@
-"""OpenCV's lens distortion with all its named terms, its slopes and its inverse.
+"""OpenCV's lens distortion with all its named terms, its derivatives and its inverse.
 
     x = u L + 2 p1 u v + p2 (r2 + 2 u^2) + s1 r2 + s2 r2^2
     y = v L + p1 (r2 + 2 v^2) + 2 p2 u v + s3 r2 + s4 r2^2
@@ -21,7 +21,7 @@ COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3"
 _NEWTON_STEPS = 60
 _BISECTIONS = 60
 _SETTLED = 1e-9
-"""After a step of Newton's method this short in a tangent, what is left is its square."""
+"""After a step of Newton's method this short in a tangent, the remaining error is its square."""
 
 
 def fold(k: Array) -> float:
@@ -51,7 +51,7 @@ def _first_positive_root(polynomial: np.polynomial.Polynomial) -> float:
 
 @compiled_ieee
 def radial(r2: float, k: Array) -> tuple[float, float, float]:
-    """L, its slope dL/d(r2), and its denominator."""
+    """L, its derivative dL/d(r2), and its denominator."""
     top = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
     bottom = 1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))
     top_slope = k[0] + r2 * (2.0 * k[1] + 3.0 * r2 * k[4])
@@ -74,7 +74,7 @@ def distort(u: float, v: float, k: Array) -> tuple[float, float]:
 
 @compiled(error_model="numpy")  # a tuple of terms does as well as an array
 def distort_slopes(u: float, v: float, k: Array) -> tuple[float, float, float, float, float, float]:
-    """(x, y) and their slopes dx/du, dx/dv, dy/du, dy/dv."""
+    """(x, y) and their derivatives dx/du, dx/dv, dy/du, dy/dv."""
     r2 = u * u + v * v
     ratio, slope, _ = radial(r2, k)
     uv2 = 2.0 * u * v
@@ -91,7 +91,7 @@ def distort_slopes(u: float, v: float, k: Array) -> tuple[float, float, float, f
 def undistort(x: float, y: float, k: Array, fold2: float) -> tuple[float, float]:
     """The ray (u, v) that the sensor sees at (x, y); NaN where no ray before the fold goes there.
 
-    Newton's method from (x, y); where that strays, from the radial part's inverse, which bisection
+    Newton's method from (x, y); if it diverges, from the radial part's inverse, which bisection
     finds as it is monotonic up to the fold.
     """
     for attempt in range(2):

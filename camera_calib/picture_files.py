@@ -1,4 +1,4 @@
-"""Files of pictures: looked at before they are decoded, and decoded within bounds."""
+"""Picture files: checked before they are decoded, and decoded within bounds."""
 
 import struct
 import warnings
@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from alice_survey.base.errors import memory_shortage
 
 MOST_PIXELS = 104_000_000
-"""Of a picture: 0.8 GB of 4 channels and 16 bits. A file of a few kilobytes can state any size."""
+"""Most pixels of a picture: 0.8 GB of 4 channels and 16 bits. A small file can state any size."""
 MOST_PIXELS_JPEG = 160_000_000
-"""Of a JPEG, whose pixels take half as much or less."""
+"""Most pixels of a JPEG, whose pixels take half as much or less."""
 PILLOW_FAULTS = (
     OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, AttributeError,
     ArithmeticError, MemoryError, EOFError, RuntimeError, struct.error, zlib.error,
 )  # fmt: skip
-"""What Pillow raises of damaged files, by format and version."""
+"""Errors that Pillow raises on damaged files, by format and version."""
 
 
 def pixels_too_many(path: Path) -> int:

@@ -1,4 +1,4 @@
-"""Kernels of the flat port: pixel to ray, point to pixel, and the slopes of point to pixel.
+"""Kernels of the flat port: pixel to ray, point to pixel, and its derivatives.
 
 A camera comes as three values: `lens`, (16,) fx fy cx cy and the distortion coefficients; `port`,
 (7,) air gap, glass thickness, n_glass, n_water and the unit normal; and the fold of its distortion.

@@ -17,12 +17,12 @@ from camera_calib.flat_port import FlatPortCamera, camera_from_json, numbers
 
 _FORMAT = {"format": "alice-survey rig", "version": 2}
 _NORM_TOLERANCE = 1e-3
-"""Of a quaternion in a file that was typed or rounded."""
+"""Tolerance of the length of a quaternion in a file that was typed or rounded."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Covariance:
-    """How well calibrated parameters are known, and together.
+    """Joint covariance of calibrated parameters.
 
     Example:
         >>> import alice_survey as alice
@@ -51,7 +51,7 @@ class Covariance:
         return dict(zip(self.parameters, np.sqrt(np.diag(self.matrix)).tolist(), strict=True))
 
     def without(self, field: str) -> "Covariance":
-        """Of all parameters but one of every camera: it is marginalised."""
+        """Covariance without one parameter of every camera: it is marginalised."""
         names = self.parameters
         kept = [i for i, name in enumerate(names) if not name.endswith(f".{field}")]
         return Covariance(
@@ -86,7 +86,7 @@ class Rig:
     source: str
     """Where the numbers come from, in words; it is printed with every result."""
     covariance: Covariance | None = None
-    """Of the calibrated parameters; None for a design."""
+    """Covariance of the calibrated parameters; None for a design."""
 
     def __post_init__(self) -> None:
         if not self.cameras or set(self.cameras) != set(self.cam_from_rig):
@@ -118,7 +118,7 @@ class Rig:
     def in_water(self, n_water: float) -> "Rig":
         """The same rig in other water: a pool calibration carried to the sea.
 
-        What was found of the old water's index says nothing of the new one: it leaves the
+        The estimate of the old water's index does not apply to the new one: it leaves the
         covariance.
         """
         cameras = {name: replace(c, n_water=n_water) for name, c in self.cameras.items()}
@@ -127,7 +127,7 @@ class Rig:
 
 
 def design_rig(camera: CameraConfig, water: WaterConfig, scale: int = 1) -> Rig:
-    """The stereo rig as drawn: two equal cameras, parallel, nadir, left on the port side.
+    """The stereo rig as designed: two equal cameras, parallel, nadir, left on the port side.
 
     The left port's outer glass is at `camera.position_body_m`; the pupil lies behind it.
 

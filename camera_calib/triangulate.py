@@ -44,15 +44,15 @@ class Triangulation:
     """
 
     points_world: Array
-    """(N, 3) of least squared reprojection error, metres."""
+    """(N, 3) points of least squared reprojection error, metres."""
     covariance: Array
-    """(N, 3, 3) from the noise of the pixels alone, m^2."""
+    """(N, 3, 3) covariances from the noise of the pixels alone, m^2."""
     residuals_px: Array
     """(C, N, 2) projected minus measured; NaN where a camera does not see the point."""
     nearest_world: Array
     """(N, 3) the points nearest to all rays in water: where the search began."""
     nearest_residuals_px: Array
-    """(C, N, 2) theirs; NaN also where such a point is not in the water."""
+    """(C, N, 2) residuals of these points; NaN also where one is not in the water."""
 
     @property
     def sigmas_m(self) -> Array:
@@ -70,7 +70,7 @@ def triangulate(
     """Find the points that two or more cameras see.
 
     A row has no solution, and is NaN, where fewer than two cameras see the point, the rays are
-    parallel, or the squared error has no minimum in the water before every port.
+    parallel, or the squared error has no minimum in the water beyond every port.
 
     Args:
         cameras: C cameras.
@@ -226,14 +226,14 @@ def _nearest(origins: Array, directions: Array) -> Array:
 
 @compiled(nogil=True, error_model="numpy")
 def _pixel_slopes(p: Array, lens: Array, port: Array, fold: float, out: Array) -> bool:
-    """Pixel of one point and its slopes by the point, as in `refraction.project_jacobian`.
+    """Pixel of one point and its derivatives by the point, as in `refraction.project_jacobian`.
 
     Args:
         p: (3,) in the camera's frame.
         lens: as there.
         port: as there.
         fold: as there.
-        out: (2, 4), filled: slopes by x, y, z, then the pixel.
+        out: (2, 4), filled: derivatives by x, y, z, then the pixel.
 
     Returns:
         False where the point has no pixel.
@@ -328,7 +328,7 @@ def _equations(
 def _into_water(
     point: Array, i: int, pixels: Array, ports: Array, rotations: Array, translations: Array
 ) -> None:
-    """Move a point that is not in the water before every port that sees it to just inside."""
+    """Move a point that is not in the water beyond every port that sees it to just inside."""
     for _ in range(20):
         moved = False
         for c in range(pixels.shape[0]):

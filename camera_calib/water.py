@@ -1,7 +1,7 @@
 """Optical properties of sea water: index of refraction, and attenuation by Jerlov type.
 
 Jerlov's tables give K_d, the attenuation of daylight with depth. A beam from a strobe is weakened
-more: by c = a + b (absorption and scattering). The two are joined here by Kirk's relation (1984),
+more: by c = a + b (absorption and scattering). The two are related here by Kirk (1984),
 K_d mu_0 = sqrt(a^2 + 0.256 a b), with mu_0 = 0.9, and by an assumption for each type on the share
 of scattering at 550 nm, b / (a + b), rising from clear ocean to turbid coast as measurements of
 these types do; b falls as 1 / wavelength, as it does for particles.
@@ -38,7 +38,7 @@ __all__ = [
 
 CHANNELS = ("red", "green", "blue")
 WAVELENGTH_NM = np.array([600.0, 530.0, 460.0])
-"""At the middle of the red, green and blue band."""
+"""Wavelengths at the middle of the red, green and blue band."""
 
 ASYMMETRY = 0.924
 """Mean cosine of the Henyey-Greenstein phase function: with it 1.7 % of the scattered light goes
@@ -65,7 +65,7 @@ _KIRK = 0.256
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WaterOptics:
-    """How water absorbs and scatters light of some wavelengths, mostly red, green and blue."""
+    """Absorption and scattering of water at some wavelengths, mostly red, green and blue."""
 
     absorption_per_m: Array
     """(W,)."""
@@ -74,12 +74,12 @@ class WaterOptics:
 
     @property
     def attenuation_per_m(self) -> Array:
-        """(W,) beam attenuation: light that is scattered once counts as lost to the beam."""
+        """(W,) beam attenuation: light that is scattered once counts as lost."""
         return self.absorption_per_m + self.scattering_per_m
 
 
 def diffuse_attenuation_per_m(jerlov: Jerlov, wavelength_nm: Array) -> Array:
-    """Jerlov's K_d, straight between the table's wavelengths.
+    """Jerlov's K_d, interpolated linearly between the table's wavelengths.
 
     Raises:
         ConfigError: a wavelength is beyond the table.
@@ -132,11 +132,11 @@ class WaterRow:
     wavelength_nm: float
     n_water: float
     diffuse_per_m: float
-    """Jerlov's K_d, of daylight."""
+    """Jerlov's K_d of daylight."""
     absorption_per_m: float
     scattering_per_m: float
     beam_per_m: float
-    """Of a beam from a strobe: absorption and scattering."""
+    """Attenuation of a strobe's beam: absorption and scattering."""
 
 
 def water_table(

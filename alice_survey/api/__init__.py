@@ -1,1 +1,1 @@
-"""What the public Python interface adds to the packages below it: see `alice_survey`."""
+"""The additions of the public Python interface to the packages below it: see `alice_survey`."""

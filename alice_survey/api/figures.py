@@ -27,7 +27,7 @@ def plot_plan(plan: Plan) -> Sheet:
     """Draw the area, the survey lines and home of a plan, east to the right.
 
     Args:
-        plan: of a survey.
+        plan: the survey's plan.
 
     Example:
         >>> import alice_survey as alice
@@ -80,7 +80,7 @@ def plot_mosaic(mosaic: Mosaic) -> Sheet:
     """Draw the mosaic with its coordinates and a scale bar.
 
     Args:
-        mosaic: of a survey.
+        mosaic: the survey's mosaic.
 
     Example:
         >>> import alice_survey as alice
@@ -97,7 +97,7 @@ def plot_track(track: Track) -> Sheet:
     """Draw where pictures were taken, coloured by the standard deviation of their position.
 
     Args:
-        track: of a survey.
+        track: the survey's camera track.
 
     Example:
         >>> import alice_survey as alice

@@ -15,9 +15,9 @@ from reconstruct.raster import opened_raster
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Raster:
     west: float
-    """Of the left edge, in the raster's coordinates (metres where the model is scaled)."""
+    """Left edge, in the raster's coordinates (metres where the model is scaled)."""
     north: float
-    """Of the upper edge."""
+    """Upper edge."""
     cell: float
     """Side of a cell."""
     unit: str
@@ -44,7 +44,7 @@ class _Raster:
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Dem(_Raster):
-    """Heights of the surface, and how well they are known.
+    """Heights of the surface, with their standard deviations.
 
     Example:
         >>> import alice_survey as alice
@@ -62,7 +62,7 @@ class Dem(_Raster):
         return self.height.shape[0], self.height.shape[1]
 
     def height_at(self, east: Array, north: Array) -> Array:
-        """Heights of the cells at places of any one shape; NaN outside or where none is known.
+        """Heights of the cells at given coordinates; NaN outside or where none is known.
 
         Args:
             east: in the raster's coordinates.

@@ -37,10 +37,10 @@ class Survey:
     def new(
         cls, folder: str | Path, *, area: str | Path | None = None, example: str = "survey"
     ) -> "Survey":
-        """Make a workspace with a commented `survey.toml`.
+        """Create a workspace with a commented `survey.toml`.
 
         Args:
-            folder: of the workspace; made when missing.
+            folder: the workspace; created if missing.
             area: GeoJSON, KML, GeoPackage, shapefile or WKT of the area to survey.
             example: `survey` (the paper's mission), `demo` or `caesarea`.
 
@@ -66,14 +66,14 @@ class Survey:
         return settings(self.folder, None, needed=not is_imported(self.folder))
 
     def run(self, *stages: str, threads: int | None = None) -> dict[str, Any]:
-        """Do stages in the order given; those that are up to date are skipped.
+        """Run stages in the order given; those that are up to date are skipped.
 
         Args:
             stages: names as `alice-survey status` shows them; all when none is given.
             threads: cores to use; None for all.
 
         Returns:
-            By stage what it found, as its summary holds it.
+            Results by stage, as in its summary.
 
         Raises:
             AliceError: a stage cannot be done; the message says what to change.
@@ -90,7 +90,7 @@ class Survey:
         return read_plan(self.folder / "plan" / "plan.json")
 
     def status(self) -> dict[str, str]:
-        """By stage whether it is up to date, stale (and why), interrupted or missing."""
+        """State of each stage: up to date, stale (and why), interrupted or missing."""
         from alice_survey.survey import workspace_status
 
         states: dict[str, str] = workspace_status(self.folder, None)[1]["stages"]

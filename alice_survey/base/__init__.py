@@ -1,1 +1,1 @@
-"""What everything else stands on: errors, frames, settings, stages, files."""
+"""Foundations used everywhere: errors, frames, settings, stages, files."""

@@ -2,7 +2,7 @@
 
 A stage folder is written as `NAME.partial` and renamed when complete. Its `stage.json` carries the
 stage's version, its settings and a digest of every input file, and a later run skips the stage
-while all of these still hold; also what the work took and the versions of the packages it used.
+while all of these are unchanged; also the resources used and the versions of the packages.
 """
 
 import contextlib
@@ -26,24 +26,24 @@ from alice_survey.base.run.resources import Meter, Spent, versions, watched
 
 STAGE_FILE = "stage.json"
 _SPENT_FILE = ".spent"
-"""In an unfinished stage: what it has taken so far."""
+"""In an unfinished stage: the resources used so far."""
 _TEMPORARY = re.compile(r"\..+\.tmp\d+(\..*)?")
-"""Names that `atomic_path` gives, and those that libraries make of them."""
+"""Names that `atomic_path` gives, and those that libraries derive from them."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stage:
-    """One step of the loop: what it depends on and the folder it writes."""
+    """One step of the loop: its dependencies and the folder it writes."""
 
     name: str
     version: int
-    """Raise it when the stage's code changes its result."""
+    """Increase it when the stage's code changes its result."""
     settings: Mapping[str, Any]
     """Everything but files that the result depends on, as JSON values."""
     inputs: Sequence[Path] = ()
     """Files and folders that the result depends on; `stage.json` files inside do not count."""
     resumes: bool = False
-    """Work can go on in what an interrupted run of the same digest left."""
+    """Work can resume from what an interrupted run of the same digest left."""
 
 
 class JsonRecord(BaseModel):
@@ -55,7 +55,7 @@ class JsonRecord(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="allow", populate_by_name=True)
     path: ClassVar[str] = ""
-    """Of the file, from the workspace."""
+    """Path of the file, from the workspace."""
 
     @classmethod
     def read(cls, path: Path) -> Self:
@@ -96,7 +96,7 @@ class JsonRecord(BaseModel):
 
 
 class StageRecord(JsonRecord):
-    """`stage.json`: what a finished stage was made of, and what the work took."""
+    """`stage.json`: inputs of a finished stage, and the resources used."""
 
     stage: str = ""
     """Name of its folder."""
@@ -109,15 +109,15 @@ class StageRecord(JsonRecord):
     cpu_s: float | None = None
     peak_mib: float | None = None
     versions: dict[str, str] = Field(default_factory=dict)
-    """Of the packages that decide results."""
+    """Versions of the packages that affect results."""
 
 
 def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], None]) -> bool:
-    """Do a stage's work unless its folder is there and nothing it depends on has changed.
+    """Do a stage's work unless its folder exists and nothing it depends on has changed.
 
     Args:
         workspace: folder that holds the stage folders; made when missing.
-        stage: what to do it for.
+        stage: the stage to run.
         work: writes its files into the folder it is given (`NAME.partial`).
 
     Returns:
@@ -175,7 +175,7 @@ def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], None]) -> bo
 
 
 def _measured(partial: Path, work: Callable[[Path], None]) -> Spent:
-    """Do a stage's work; what it took, with what was spent on it before it was interrupted."""
+    """Do a stage's work; return the resources used, including those of an interrupted run."""
     try:
         earlier = Spent.from_json(json.loads((partial / _SPENT_FILE).read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError, KeyError):  # a kill may have come before the first
@@ -239,7 +239,7 @@ def need_stage(workspace: Path, name: str, command: str) -> Path:
 
 
 def read_stage(folder: Path) -> StageRecord | None:
-    """What a stage's `stage.json` says, or None where no whole stage is."""
+    """Contents of a stage's `stage.json`, or None where there is no complete stage."""
     try:
         return StageRecord.model_validate_json((folder / STAGE_FILE).read_bytes())
     except (OSError, ValidationError):
@@ -251,7 +251,7 @@ def digest_inputs(
 ) -> dict[str, tuple[int, int, str]]:
     """Digest every file of the inputs, as `{path: (size, mtime_ns, digest)}`.
 
-    A file whose size and modification time stand in `previous` is not read again.
+    A file whose size and modification time match `previous` is not read again.
 
     Raises:
         WorkspaceError: an input does not exist.
@@ -267,7 +267,7 @@ def digest_inputs(
 def _check_unchanged(
     inputs: Mapping[str, tuple[int, int, str]], workspace: Path, stage: str
 ) -> None:
-    """Check that files are as they were when their digests were taken.
+    """Check that files are unchanged since their digests were taken.
 
     Raises:
         WorkspaceError: one has changed or is gone.

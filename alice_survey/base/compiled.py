@@ -1,7 +1,7 @@
-"""How kernels are compiled: once for all processes, and again when what they are made of changes.
+"""Compile kernels once for all processes, and again when any code they use changes.
 
-numba keeps a compiled kernel as long as the file it stands in stays unchanged, although the kernels
-and constants that were compiled into it may stand in other files. Here a kernel is kept as long as
+numba keeps a compiled kernel as long as its file stays unchanged, although the kernels
+and constants that were compiled into it may be in other files. Here a kernel is kept as long as
 its call closure stays unchanged: its own code and options, and those of every kernel and constant
 that it reaches. A numba that stores its stamp elsewhere falls back to its own rule, which is
 enough for a package that is installed and not edited.
@@ -57,7 +57,7 @@ def compiled_ieee(function: Callable[_Arguments, _Result]) -> Callable[_Argument
 
 
 def closure_digest(kernel: Any) -> str:
-    """Digest of what a compiled kernel is made of.
+    """Digest of all the code in a compiled kernel.
 
     Args:
         kernel: a function decorated by `compiled` or `numba.njit`.
@@ -75,11 +75,11 @@ def closure_digest(kernel: Any) -> str:
 
 
 def note_compiling(kernel: Any, what: str) -> None:
-    """Say, in one line on standard error, that the first call after an installation waits.
+    """Report, in one line on standard error, that the first call after an installation waits.
 
     Args:
         kernel: one that is compiled last, by `compiled`.
-        what: that is compiled, and how long it takes.
+        what: what is compiled, and how long it takes.
     """
     stats = kernel.stats
     kept = Path(stats.cache_path).glob(f"*{kernel.__name__}*.nbi")
@@ -128,7 +128,7 @@ class _Stamp:
 
 
 def _closure(kernel: Any, seen: set[int]) -> Iterator[str]:
-    """What a kernel is made of, itself first; each kernel once."""
+    """All code that a kernel uses, itself first; each kernel once."""
     if id(kernel) in seen:
         return
     seen.add(id(kernel))

@@ -1,4 +1,4 @@
-"""Settings of a survey: `survey.toml` as frozen sections that refuse what they do not know."""
+"""Settings of a survey: `survey.toml` as frozen sections that reject unknown keys."""
 
 import math
 import tomllib
@@ -76,9 +76,9 @@ class AreaConfig(Config):
 
     @property
     def datum_given(self) -> list[str]:
-        """Which coordinates of the datum are set, to whatever value; the others have no meaning.
+        """Coordinates of the datum that are set; the others have no meaning.
 
-        Of a shape in degrees the middle is the datum unless one is set.
+        The middle of a shape in degrees is the datum unless one is set.
         """
         return sorted({"latitude_deg", "longitude_deg"} & self.model_fields_set)
 
@@ -204,7 +204,7 @@ class PlanConfig(Config):
 
 
 class ThrusterHealth(Config):
-    """Share of its greatest thrust that each thruster has left: 0 failed, 1 sound."""
+    """Share of maximum thrust that each thruster has left: 0 failed, 1 intact."""
 
     starboard: Share = 1.0
     port: Share = 1.0
@@ -214,12 +214,12 @@ class ThrusterHealth(Config):
 
     @property
     def impaired(self) -> dict[str, float]:
-        """Those that are not sound."""
+        """Thrusters that are not intact."""
         return {name: share for name, share in self.model_dump().items() if share < 1.0}
 
 
 class VehicleConfig(Config):
-    """What flies, and how it is steered."""
+    """The vehicle and how it is controlled."""
 
     name: Literal["alice", "sparus2"] = "alice"
     coefficients: Literal["estimated", "cfd", "calibrated", "computed"] = "calibrated"
@@ -235,7 +235,7 @@ class VehicleConfig(Config):
 
 
 class SeaConfig(Config):
-    """What the water does to the vehicle.
+    """Current and swell that act on the vehicle.
 
     The current near the sea floor; where `surface_current_mps` is set it changes evenly up to the
     surface; a slow Gauss-Markov process is added. `current_file` holds a measured series instead.
@@ -256,7 +256,7 @@ class SeaConfig(Config):
 
 
 class NavigationConfig(Config):
-    """How well the vehicle knows where it is; the rest as in `vehicle.navigation.sensors`."""
+    """Navigation sensors of the vehicle; the rest as in `vehicle.navigation.sensors`."""
 
     gps_bias_m: float = Field(0.03, ge=0, le=100)
     gps_noise_m: float = Field(0.02, gt=0, le=100)
@@ -314,7 +314,7 @@ class ReconstructConfig(Config):
 
 
 class SurveyConfig(Config):
-    """A whole survey, as `survey.toml` says it.
+    """Settings of a whole survey, as in `survey.toml`.
 
     Example:
         >>> import alice_survey as alice
@@ -363,14 +363,14 @@ class SurveyConfig(Config):
 
 _LONGEST = 1_000_000
 _MOST_FAULTS = 8
-"""Told at once."""
+"""Faults reported at once."""
 
 
 def load_config(path: str | Path) -> SurveyConfig:
     """Read `survey.toml`.
 
     Raises:
-        ConfigError: the file is missing, is no TOML, or holds an unknown key or a value out of
+        ConfigError: the file is missing, is not TOML, or holds an unknown key or a value out of
             range; the message names the file, the key, the value and what is allowed.
 
     Example:
@@ -405,7 +405,7 @@ _FILES = (
 
 
 def _with_files_beside(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Settings whose relative file names count from the folder of the settings file."""
+    """Settings whose relative file names are resolved from the folder of the settings file."""
     result = dict(settings)
     for section, key in _FILES:
         values = settings.get(section)
@@ -462,7 +462,7 @@ def parse_health(texts: Sequence[str] | None) -> dict[str, float] | None:
     """Thrusters and what is left of them, from `NAME` (nothing) or `NAME=SHARE`; None of none.
 
     Raises:
-        ConfigError: a share is no number.
+        ConfigError: a share is not a number.
     """
     if not texts:
         return None

@@ -1,4 +1,4 @@
-"""Files that this program wrote, and that a user or a disk may have changed since."""
+"""Read files that this program wrote, and that a user or a disk may have changed since."""
 
 import contextlib
 import zipfile
@@ -16,14 +16,14 @@ _SHOWN = 200
 
 @contextlib.contextmanager
 def taken_from(path: Path, fault: type[AliceError] = WorkspaceError) -> Iterator[None]:
-    """Within this block values are taken from what a file holds.
+    """Within this block values are read from the contents of a file.
 
     Args:
         path: the file, for the message.
         fault: what is raised.
 
     Raises:
-        AliceError: of the type `fault`, where a value is missing or of another kind.
+        AliceError: of the type `fault`, where a value is missing or of another type.
     """
     try:
         yield
@@ -55,11 +55,11 @@ def read_arrays(path: Path, *names: str) -> dict[str, NDArray[np.generic]]:
 
 
 def one_line(error: BaseException) -> str:
-    """What an exception says, on one line that can be printed; its type where it says nothing."""
+    """Message of an exception, on one printable line; its type where the message is empty."""
     return shown(str(error)) or type(error).__name__
 
 
 def shown(text: str) -> str:
-    """Text of others as a message may hold it: on one line, printable, and not without end."""
+    """External text made safe for a message: one line, printable, of limited length."""
     plain = " ".join("".join(c if c.isprintable() else " " for c in text).split())
     return plain if len(plain) <= _SHOWN else f"{plain[: _SHOWN - 3]}..."

@@ -1,4 +1,4 @@
-"""Known faults: one line that says what is wrong, with the numbers and what to change."""
+"""Known faults: one line that states what is wrong, with the numbers and what to change."""
 
 import contextlib
 import errno
@@ -18,7 +18,7 @@ _collector: ContextVar[Callable[[Level, str], None] | None] = ContextVar("collec
 
 
 class AliceError(Exception):
-    """A fault the user can put right; the command line prints it as one line and exits with 1.
+    """A fault the user can fix; the command line prints it as one line and exits with 1.
 
     Example:
         >>> import alice_survey as alice
@@ -30,7 +30,7 @@ class AliceError(Exception):
     """
 
     def __str__(self) -> str:
-        """The line, without what names in files could do to a terminal."""
+        """The line, with control characters from file names removed."""
         text = super().__str__()
         return "".join(c if c.isprintable() or c == "\n" else "\ufffd" for c in text)
 
@@ -48,7 +48,7 @@ class PlanError(AliceError):
 
 
 class VehicleError(AliceError):
-    """A vehicle, its sea or its controller is described wrongly, or cannot do what is asked."""
+    """A vehicle, its sea or its controller is described wrongly, or a request is infeasible."""
 
 
 class ImageError(AliceError):
@@ -105,7 +105,7 @@ def _report(level: Level, text: str) -> None:
 
 @contextlib.contextmanager
 def collected_by(collect: Callable[[Level, str], None]) -> Iterator[None]:
-    """Have notes and warnings of this task alone given to a function: they go with its result."""
+    """Pass notes and warnings of this task alone to a function: they go with its result."""
     token = _collector.set(collect)
     try:
         yield
@@ -130,7 +130,7 @@ def heard() -> Iterator[list[str]]:
 
 
 def say(text: str) -> None:
-    """Write a line on standard error, if anybody still takes it."""
+    """Write a line on standard error, if it is still open."""
     with outliving():
         sys.stderr.write(f"{text}\n")
         sys.stderr.flush()
@@ -138,7 +138,7 @@ def say(text: str) -> None:
 
 @contextlib.contextmanager
 def outliving() -> Iterator[None]:
-    """Write to standard error within this block: when nobody takes it any more, the work goes on.
+    """Write to standard error within this block: if it is closed, the work goes on.
 
     From then on it goes nowhere, and so does standard output if that was the same terminal: what
     Python cannot flush at its end would otherwise turn success into failure.
@@ -157,7 +157,7 @@ def outliving() -> Iterator[None]:
 
 
 def why(error: Exception) -> str:
-    """What went wrong with a file, without numbers of the operating system."""
+    """Cause of a file error, without error numbers of the operating system."""
     if isinstance(error, FileNotFoundError):
         return "no such file"
     if isinstance(error, OSError) and error.strerror:
@@ -173,18 +173,18 @@ _REMEDIES = {
     errno.EROFS: ": choose a workspace that can be written, with -w",
     errno.EACCES: ": take the rights to it, or choose another workspace with -w",
 }
-"""What to do about faults of the system, by their numbers."""
+"""Advice on errors of the operating system, by error number."""
 
 
 _NO_MEMORY = (
     "insufficient memory", "out of memory", "cannot allocate memory", "bad_alloc",
     "failed to map segment",
 )  # fmt: skip
-"""What libraries say whose faults have types of their own, in small letters."""
+"""Messages, in lower case, of libraries with error types of their own."""
 
 
 def memory_shortage(path: Path) -> AliceError:
-    """What to raise where a file is well and there is no room for what it holds."""
+    """Error to raise where a file is valid but does not fit into memory."""
     return AliceError(f"memory ran out while {path} was read{_FEWER}")
 
 

@@ -20,14 +20,14 @@ _PR_SET_PDEATHSIG = 1
 _MESSAGES = "messages_of_task"
 _CORES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 _QUEUED = 3
-"""Tasks in flight for each that runs: enough to keep all busy, few enough to bound memory."""
+"""Tasks in flight for each one running: enough to keep all busy, few enough to bound memory."""
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
 class Pool(Protocol):
-    """The part of `concurrent.futures.Executor` that an engine has to offer."""
+    """The part of `concurrent.futures.Executor` that an engine must provide."""
 
     def submit(self, function: Callable[..., Any], /, *args: Any) -> "Future[Any]":
         """Run `function(*args)` in the background; both are picklable, and so is the result."""
@@ -38,7 +38,7 @@ class Executor:
     """Where tasks run: in this process, in local processes, or on an engine for many machines.
 
     A task is a module-level function of one picklable value: settings, arrays and paths. It may
-    rely on nothing else of the process that submits it, and has its worker for itself. What it
+    rely on nothing else of the process that submits it, and has its worker to itself. What it
     reports with `warn` and `note` travels back with its result.
     """
 
@@ -72,9 +72,9 @@ class Executor:
         Args:
             function: a task, see the class.
             items: what to work on.
-            label: what the progress bar says.
+            label: text of the progress bar.
             total: how many items, when `items` has no length.
-            task_mib: memory that one task takes, where that is known to be much: in local
+            task_mib: memory that one task takes, where that is known to be large: in local
                 processes as many run at once as there is memory for.
 
         Raises:
@@ -97,7 +97,7 @@ class Executor:
     def started(self) -> Iterator["Executor"]:
         """Within this block all calls of `map` share their processes.
 
-        To start one and to load its libraries takes about two seconds of computing.
+        Starting one and loading its libraries takes about two seconds of processor time.
         """
         if self.pool is not None or self.workers <= 1:
             yield self
@@ -186,7 +186,7 @@ class _Processes(ProcessPoolExecutor):
 
 @dataclass(frozen=True)
 class _TaskResult(Generic[Result]):
-    """What comes back from a task."""
+    """Result of a task, with its notes and warnings."""
 
     result: Result
     messages: list[tuple[Level, str]] = field(default_factory=list)
@@ -304,10 +304,10 @@ def _start_worker() -> None:
 
 
 def progress(items: Iterable[Item], label: str, total: int | None = None) -> Iterator[Item]:
-    """Pass items through while standard error shows how far the work on them is.
+    """Pass items through while standard error shows the progress of the work on them.
 
     Args:
-        items: each of which whoever takes it then works on.
+        items: what the caller works on, one by one.
         label: what is done, in a few words.
         total: how many items, if that is known.
     """

@@ -1,4 +1,4 @@
-"""Frames and how to pass between them: geodetic, NED, body and camera.
+"""Frames and transforms between them: geodetic, NED, body and camera.
 
 World `ned` is local North-East-Down with its origin at the datum on the sea surface; `body` is
 forward-right-down; `cam` is right-down-forward. `a_from_b` takes coordinates in b to a.

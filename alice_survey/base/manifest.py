@@ -1,4 +1,4 @@
-"""The image manifest: which pictures there are, who took them, when, and what navigation says.
+"""The image manifest: all pictures with their camera, time and navigation.
 
 Pictures enter a reconstruction through `images/manifest.csv` only, never by a file-name trick.
 """
@@ -18,7 +18,7 @@ NAN = math.nan
 
 @dataclass(frozen=True, kw_only=True)
 class ImageRecord:
-    """One picture: a row of the manifest. What is not known is NaN (an empty cell)."""
+    """One picture: a row of the manifest. Unknown values are NaN (an empty cell)."""
 
     image: str
     """Path below the folder of the manifest, with forward slashes."""
@@ -32,14 +32,14 @@ class ImageRecord:
     """Seconds since mission start."""
     latitude_deg: float = NAN
     longitude_deg: float = NAN
-    """Of the body's origin (of the camera itself where no rig is known)."""
+    """Position of the body's origin (of the camera itself where no rig is known)."""
     depth_m: float = NAN
-    """Below the datum's reference level, of the same point; negative above it."""
+    """Depth of the same point below the datum's reference level; negative above it."""
     roll_deg: float = NAN
     pitch_deg: float = NAN
     heading_deg: float = NAN
     altitude_m: float = NAN
-    """Of the left port's outer glass above the sea floor."""
+    """Height of the left port's outer glass above the sea floor."""
     sigma_horizontal_m: float = NAN
     """Standard deviation of north and of east."""
     sigma_depth_m: float = NAN
@@ -59,7 +59,7 @@ class ImageRecord:
 
 
 _GREATEST = 1e15
-"""Of any number: whole numbers up to here are exact, and of no quantity is more meant."""
+"""Largest number: integers up to here are exact, and no quantity needs more."""
 _TEXT = ("image", "camera", "mask")
 _COLUMNS = tuple(field.name for field in fields(ImageRecord))
 
@@ -73,8 +73,8 @@ def read_manifest(path: Path) -> list[ImageRecord]:
     """Read a manifest.
 
     Raises:
-        ImageError: it is missing, lacks a column, holds a value that is no number, names a picture
-            twice, or a path that leaves its folder.
+        ImageError: it is missing, lacks a column, holds a value that is not a number, names a
+            picture twice, or a path that leaves its folder.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:

@@ -1,4 +1,4 @@
-"""What the JSON files of finished stages say: one type each, for those that write and read them.
+"""Contents of the JSON files of finished stages: one type each, for writers and readers.
 
 A type names the values that programs read; others are kept as they are. Types of files that need
 more than numbers are with their algorithms: the plan (`missions.values.plan_file`), the rig
@@ -26,7 +26,7 @@ class BoardRecord(JsonRecord):
 
 
 class PlaceRecord(JsonRecord):
-    """Where the local frame is: WGS 84."""
+    """Origin of the local frame, WGS 84."""
 
     latitude_deg: float = Field(ge=-90, le=90)
     longitude_deg: float = Field(ge=-360, le=360)
@@ -34,7 +34,7 @@ class PlaceRecord(JsonRecord):
 
 
 class PicturesRecord(JsonRecord):
-    """`images/survey.json`: where pictures come from, and what their positions count from."""
+    """`images/survey.json`: origin of the pictures, and the datum of their positions."""
 
     path: ClassVar = "images/survey.json"
     source: Literal["simulated", "imported"]
@@ -52,7 +52,7 @@ class OnLines(JsonRecord):
 
 
 class InTurns(JsonRecord):
-    """How a vehicle moved between its lines."""
+    """Motion of a vehicle between its lines."""
 
     roll_worst_deg: float | None
 
@@ -80,7 +80,7 @@ class FlightRecord(JsonRecord):
     in_turns: InTurns
     navigation_error_rms_m: float | None
     energy_wh: dict[str, float]
-    """By thruster."""
+    """Energy by thruster."""
     coverage: Covered
 
 
@@ -93,7 +93,7 @@ class CalibrationRecord(JsonRecord):
     worst_px: float
     parameters: tuple[str, ...] = ()
     correlation: tuple[tuple[float, ...], ...] = ()
-    """Of the parameters, square."""
+    """Correlations of the parameters, square."""
 
 
 class CalibrationVerdict(JsonRecord):
@@ -109,7 +109,7 @@ class CalibratedValue(JsonRecord):
     name: str
     value: float
     sigma: float | None
-    """None or 0 where it was held."""
+    """Standard deviation; None or 0 where it was held."""
     unit: str
 
 
@@ -162,7 +162,7 @@ class DomingRecord(JsonRecord):
 
     @property
     def bends(self) -> dict[str, BendRecord]:
-        """Those that are known, by direction."""
+        """Known bends, by direction."""
         ways = {"along": self.along, "across": self.across}
         return {way: bend for way, bend in ways.items() if bend is not None}
 
@@ -189,7 +189,7 @@ class MappingRecord(JsonRecord):
     doming: DomingRecord | None = None
     acceptance: AcceptanceRecord | None = None
     gauge: str = ""
-    """Digest of the model: a known length holds for this one alone."""
+    """Digest of the model: a known length applies to this one alone."""
     notes: Notes = ()
 
 
@@ -208,7 +208,7 @@ class PortRecord(JsonRecord):
 
 
 class GeoreferenceRecord(JsonRecord):
-    """`sparse/georeference.json`: residuals of navigation, and how well the place is known."""
+    """`sparse/georeference.json`: residuals of navigation, and sigmas of the placing."""
 
     path: ClassVar = "sparse/georeference.json"
     rms_north_m: float | None
@@ -251,7 +251,7 @@ class ControlRow(JsonRecord):
 
 
 class PointRow(ControlRow):
-    """Misses of a known point, metres."""
+    """Errors of a known point, metres."""
 
     views: int
     north_m: float
@@ -268,7 +268,7 @@ class BarRow(ControlRow):
 
 
 class ControlRms(JsonRecord):
-    """Over all points and bars of one use; None where there is none."""
+    """Statistics of all points and bars of one use; None where there is none."""
 
     points: int = 0
     north_m: float | None = None
@@ -285,13 +285,13 @@ class ControlRecord(JsonRecord):
     points: tuple[PointRow, ...]
     bars: tuple[BarRow, ...]
     not_found: dict[str, str]
-    """Why, by name."""
+    """Reasons, by name."""
     rms: dict[str, ControlRms]
-    """By use."""
+    """Statistics by use."""
 
 
 class PictureCamera(JsonRecord):
-    """What took a picture of a model, and its mask."""
+    """Camera of a picture of a model, and its mask."""
 
     camera: str
     station: int
@@ -328,7 +328,7 @@ class ScaleRecord(JsonRecord):
     length_m: float
     metres_per_unit: float = Field(gt=0, allow_inf_nan=False)
     gauge: str
-    """Of the model that was measured, as its `MappingRecord` has it."""
+    """Digest of the model that was measured, as in its `MappingRecord`."""
 
 
 class CloudRecord(JsonRecord):
@@ -356,7 +356,7 @@ class MosaicRecord(JsonRecord):
     width_px: int
     height_px: int
     pixel: float
-    """Side, in the unit."""
+    """Side of a cell, in the unit."""
     unit: str = "m"
     pictures: tuple[str, ...] = ()
 
@@ -372,7 +372,7 @@ class MeshRecord(JsonRecord):
 
 
 class CameraErrors(JsonRecord):
-    """Of the camera track against the truth."""
+    """Errors of the camera track against the truth."""
 
     registered: int
     total: int
@@ -401,7 +401,7 @@ class ErrorOverSigma(JsonRecord):
 
 
 class SurfaceErrors(JsonRecord):
-    """Of the DEM against the truth."""
+    """Errors of the DEM against the truth."""
 
     distance_rms_mm: float
     distance_max_mm: float | None = None
@@ -414,21 +414,21 @@ class SurfaceErrors(JsonRecord):
 
 
 class MosaicErrors(JsonRecord):
-    """Of the mosaic against the truth."""
+    """Errors of the mosaic against the truth."""
 
     position_rms_mm: float | None = None
     position_95_mm: float | None = None
 
 
 class LengthsRecord(JsonRecord):
-    """Of lengths in the mosaic against the truth."""
+    """Errors of lengths in the mosaic against the truth."""
 
     rms_mm: float | None = None
     mean_length_m: float | None = None
 
 
 class MeshErrors(JsonRecord):
-    """Of the mesh against the truth."""
+    """Errors of the mesh against the truth."""
 
     distance_rms_mm: float | None
 
@@ -445,7 +445,7 @@ class ScoreRecord(JsonRecord):
 
 
 class Distances(JsonRecord):
-    """From one surface to another, metres."""
+    """Distances from one surface to another, metres."""
 
     median_m: float
     median_px: float
@@ -455,7 +455,7 @@ class Distances(JsonRecord):
 
 
 class ReferenceRegistration(JsonRecord):
-    """How a survey was brought onto a reference."""
+    """Alignment of a survey to a reference."""
 
     transform: str
 

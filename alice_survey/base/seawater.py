@@ -23,7 +23,7 @@ _FIT = {
     "salinity_psu": (0.0, 35.0, "psu"),
     "wavelength_nm": (400.0, 700.0, "nm"),
 }
-"""Where Quan and Fry's formula was fitted."""
+"""Range in which Quan and Fry's formula was fitted."""
 
 _REACH = {
     "temperature_c": (-2.0, 35.0, "C"),
@@ -31,7 +31,7 @@ _REACH = {
     "depth_m": (0.0, 11_000.0, "m"),
     "wavelength_nm": (380.0, 750.0, "nm"),
 }
-"""Where it still holds to 1e-4 beside IAPWS R9-97 (pure water) and Millard and Seaver (salt)."""
+"""Range within 1e-4 of IAPWS R9-97 (pure water) and Millard and Seaver (salt)."""
 
 
 def n_water(
@@ -115,7 +115,7 @@ def _by_pressure(
     p: NDArray[np.float64],
     nm: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """What pressure adds: regions III and IV of Millard and Seaver (1990), table 1."""
+    """Pressure term of the index: regions III and IV of Millard and Seaver (1990), table 1."""
     pure = 1.5868383e-6 + 1.0712063e-8 / (nm * 1e-3) ** 2 - 9.4834486e-9 * t + 1.0100326e-10 * t**2
     salt = -1.1177517e-9 + 5.7311268e-11 * t - 1.5460458e-12 * t**2
     curved = -1.574074e-11 + 5.8085198e-15 * t**2

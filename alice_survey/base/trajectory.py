@@ -1,4 +1,4 @@
-"""Where the body was, and when: the true track of a simulation and the navigation log of a dive."""
+"""Poses of the body over time: the true track of a simulation, the navigation log of a dive."""
 
 import csv
 import math
@@ -20,7 +20,7 @@ TRACK_COLUMNS = (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trajectory:
-    """Where the body was, and when."""
+    """Poses of the body over time."""
 
     time_s: Array
     """(T,) seconds since mission start, strictly increasing."""
@@ -46,7 +46,7 @@ def read_track(path: Path) -> Trajectory:
     """Read what `write_track` wrote.
 
     Raises:
-        NavigationError: the file is missing, lacks a column, holds a value that is no number, has
+        NavigationError: the file is missing, lacks a column, holds a non-number, has
             no rows, or its times do not increase.
     """
     columns = read_columns(path, TRACK_COLUMNS)

@@ -29,7 +29,7 @@ _PLOT_ANGLES_DEG = tuple(float(angle) for angle in range(30, 111, 5))
 
 @dataclass(frozen=True, kw_only=True)
 class Output:
-    """How a table is printed, and where else it goes."""
+    """Output options of a table."""
 
     markdown: bool = False
     csv: Path | None = None
@@ -38,7 +38,7 @@ class Output:
 
 @dataclass(frozen=True, kw_only=True)
 class FovOptions:
-    """What `fov` takes; None or empty is the survey's, or else the paper's."""
+    """Options of `fov`; None or empty is the survey's, or else the paper's."""
 
     lens_mm: Sequence[float] = ()
     altitude_m: Sequence[float] = ()
@@ -132,7 +132,7 @@ def validation_report(options: FovOptions, output: Output) -> tuple[str, Any, bo
 
 
 def _settings(options: FovOptions) -> SurveyConfig:
-    """The survey's settings, with what the command line says instead."""
+    """The survey's settings, overridden by the command line."""
     survey = SurveyConfig() if options.survey is None else load_config(options.survey)
     values = survey.model_dump(mode="json")
     given = {
@@ -175,7 +175,7 @@ def _rig(options: FovOptions, n_water: float) -> Rig | None:
 
 
 def _sensor_of(rig: Rig, camera: CameraConfig, options: FovOptions) -> tuple[CameraConfig, float]:
-    """Sensor and port of a rig's reference camera, and its water; a rig knows no pixel pitch."""
+    """Sensor and port of a rig's reference camera, and its water; a rig has no pixel pitch."""
     own = rig.cameras[rig.reference]
     pixel_um = camera.pixel_um
     if options.pixel_um is None and own.width_px != camera.width_px:

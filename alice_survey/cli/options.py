@@ -1,4 +1,4 @@
-"""Options and habits that all commands share."""
+"""Options and behaviour that all commands share."""
 
 import functools
 import inspect
@@ -55,12 +55,12 @@ def executor_of(threads: int | None) -> "Executor":
 
 
 def examples(*lines: str) -> str:
-    """An epilog that keeps its lines (the first character tells the formatter not to wrap)."""
+    """An epilog that keeps its lines (the first character disables wrapping)."""
     return "\b\nExamples:\n" + "\n".join(f"  alice-survey {line}" for line in lines)
 
 
 def print_result(table: str, data: Any, as_json: bool) -> None:
-    """Print a command's result as text, or as JSON when asked."""
+    """Print a command's result as text, or as JSON if requested."""
     typer.echo(json.dumps(data, indent=2) if as_json else table)
     from alice_survey.base.run.progress import current
 

@@ -1,4 +1,4 @@
-"""One run of the command line: where it is reported, and how it ends."""
+"""One run of the command line: its reporting, and its end."""
 
 import contextlib
 import errno
@@ -74,7 +74,7 @@ def _opened(log_file: Path | None, events: Path | None) -> list[LogFile | EventF
 
 
 def _report_end(run: Run, error: BaseException) -> int:
-    """Report why a run ends early; the exit code it ends with."""
+    """Report why a run ends early; return its exit code."""
     if isinstance(error, KeyboardInterrupt):
         run.report("error", interrupts.words(error))
         return interrupts.exit_code(error)
@@ -102,7 +102,7 @@ def _say_how_to_go_on(run: Run, error: KeyboardInterrupt) -> None:
 
 
 def _finish(run: Run, error: KeyboardInterrupt) -> None:
-    """End a run whose main thread does not answer."""
+    """End a run whose main thread does not respond."""
     run.report("error", interrupts.words(error))
     run.report("run_finished", exit_code=interrupts.exit_code(error))
     run.close()

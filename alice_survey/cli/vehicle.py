@@ -1,4 +1,4 @@
-"""The `vehicle` commands: its coefficients, how it compares, and what its logs say of it."""
+"""The `vehicle` commands: coefficients, comparison, and identification from logs."""
 
 from pathlib import Path
 from typing import Annotated

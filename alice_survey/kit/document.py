@@ -17,7 +17,7 @@ class Verdict:
     level: Level
     text: str
     action: str = ""
-    """What to do, as a sentence; empty where nothing has to be done."""
+    """Advice, as a sentence; empty where nothing has to be done."""
 
 
 def worst_first(verdicts: Sequence[Verdict]) -> list[Verdict]:
@@ -27,20 +27,20 @@ def worst_first(verdicts: Sequence[Verdict]) -> list[Verdict]:
 
 @dataclass(frozen=True, kw_only=True)
 class Figure:
-    """A plot with the plain words that go with it."""
+    """A plot with its explanation in plain words."""
 
     title: str
     alt: str
-    """What a reader who cannot see it has to know."""
+    """Text alternative for readers who cannot see it."""
     shows: str
     png: bytes = b""
-    """For the page; a figure of the print alone has none."""
+    """Image for the page; a figure of the print alone has none."""
     good: str = ""
-    """How it looks when all is well."""
+    """How it looks when the result is good."""
     otherwise: str = ""
     """What to do when it does not."""
     svg: bytes = b""
-    """For print; empty where there are only pixels."""
+    """Vector image for print; empty where there are only pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,10 +79,10 @@ class Section:
 
 @dataclass(frozen=True, kw_only=True)
 class Scale:
-    """What the colours of a layer mean."""
+    """Legend of a layer's colours."""
 
     label: str
-    """With its unit."""
+    """Quantity with its unit."""
     low: float
     high: float
     colours: Sequence[str]
@@ -97,7 +97,7 @@ class PictureLayer:
     title: str
     about: str
     west_m: float
-    """Of its upper left corner, on the map's axes (east, north)."""
+    """Position of its upper left corner, on the map's axes (east, north)."""
     north_m: float
     pixel_m: float
     width_px: int
@@ -109,13 +109,13 @@ class PictureLayer:
     tiles: Mapping[str, bytes]
     """WebP by "k/x/y"; a tile at the border may be smaller; empty where a server gives them."""
     address: str | None = None
-    """Of a tile on the server that gives the page, with "{}" in place of "k/x/y"."""
+    """URL of a tile on the server of the page, with "{}" in place of "k/x/y"."""
     sizes: Sequence[tuple[int, int, float, float]] | None = None
     """Columns, rows and a pixel's width and height, metres, of each level, full resolution first;
     halves, rounded up, where not given."""
     scale: Scale | None = None
     shown: bool = False
-    """From the start; only one base layer can be."""
+    """Whether it is shown at first; only one base layer can be."""
     base: bool = True
     """Base layers exclude one another; others lie over them."""
     group: str = "Over it"
@@ -149,7 +149,7 @@ class ShapeLayer:
     fill: float = 0.03
     """Opacity of the inside of an outline."""
     width: float | None = None
-    """Of its lines, px; None takes the usual width of its kind."""
+    """Width of its lines, px; None is the default of its kind."""
     group: str = "Over it"
     """Heading in the list of layers."""
     extends: bool = True
@@ -158,7 +158,7 @@ class ShapeLayer:
 
 @dataclass(frozen=True, kw_only=True)
 class MapScript:
-    """What a page adds to its map."""
+    """An extension of a page's map."""
 
     text: str
     """Defines `extendMap(map, layers, data)`: Leaflet's map, the groups of shapes by the name of
@@ -174,7 +174,7 @@ class SurveyMap:
 
     layers: Sequence[PictureLayer | ShapeLayer]
     unit: str
-    """Of its axes: m, or unit where the model has no scale."""
+    """Unit of its axes: m, or unit where the model has no scale."""
     origin: str
     """Where (0, 0) is, in words."""
     geodetic: tuple[Sequence[float], Sequence[float]] | None = None
@@ -188,21 +188,21 @@ class SurveyMap:
 
 @dataclass(frozen=True, kw_only=True)
 class Mesh:
-    """The mesh that turns."""
+    """The interactive mesh."""
 
     glb: Path
-    """Small enough for a page."""
+    """Binary glTF, small enough for a page."""
     about: str
     """Triangles and size of what the page shows, in words."""
     still: Figure
-    """For print and for browsers without WebGL."""
+    """Image for print and for browsers without WebGL."""
     address: str | None = None
-    """On the server that gives the page, which then does not carry the mesh."""
+    """URL on the server of the page, which then does not embed the mesh."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """All of it."""
+    """All of the report."""
 
     title: str
     subtitle: str

@@ -58,7 +58,7 @@ __all__ = [
 ]  # fmt: skip
 
 INKS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-"""Okabe and Ito's palette, safe for the colour-blind; lines differ by their marks as well."""
+"""Okabe and Ito's palette, safe for the colour-blind; lines also differ by their markers."""
 MARKS = ("o", "s", "^", "D", "v", "x")
 INK, SOFT, GRID, BAND = "#22313a", "#5d6d77", "#e3e8eb", "#dfe7ec"
 WIDTH_IN = 7.6
@@ -99,7 +99,7 @@ _MOST_PX = 1600
 
 
 class _Shown(Sheet):  # type: ignore[misc]
-    """A figure that a notebook shows without any set-up."""
+    """A figure that a notebook shows without set-up."""
 
     def _repr_png_(self) -> bytes:
         return png_of(self)
@@ -205,7 +205,7 @@ def colour_bar(image: Any, axes: Any, label: str, **options: Any) -> Any:
     """A colour bar with numbers and its quantity.
 
     Args:
-        image: what is coloured: an image, a contour or a collection.
+        image: an image, a contour or a collection.
         axes: one or several that share it.
         label: quantity and unit.
         options: of matplotlib's `colorbar`.
@@ -283,7 +283,7 @@ def palette_steps(name: str, count: int) -> list[str]:
 
 
 def even_limit(values: Array, percent: float = 97.0) -> float:
-    """The limit of a colour scale about zero at which most values show; NaNs do not count.
+    """Limit of a colour scale about zero that includes most values; NaNs do not count.
 
     Args:
         values: any shape.

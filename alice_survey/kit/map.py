@@ -10,7 +10,7 @@ from alice_survey.kit.document import PictureLayer, ShapeLayer, SurveyMap
 
 
 def map_data(survey_map: SurveyMap) -> tuple[str, list[tuple[str, str]]]:
-    """What the page's script draws the map from.
+    """Data from which the page's script draws the map.
 
     The tiles of a layer are one text, so that each is decoded only when it is looked at.
 
@@ -52,7 +52,7 @@ def map_data(survey_map: SurveyMap) -> tuple[str, list[tuple[str, str]]]:
 
 
 def map_extent(survey_map: SurveyMap) -> tuple[float, float, float, float]:
-    """West, south, east and north of all that the map holds, on its own axes.
+    """West, south, east and north limits of the map's contents, on its own axes.
 
     Raises:
         ValueError: nothing is on the map.

@@ -27,11 +27,11 @@ from alice_survey.kit.figure import (
 from alice_survey.kit.map import map_extent
 
 _MOST_PX = 1400
-"""Of the longer side of a picture in print."""
+"""Pixels along the longer side of a picture in print."""
 _MOST_HEIGHT_IN = 4.1
-"""Of the map itself, so that two stand on a page."""
+"""Height of the map itself, so that two fit on a page."""
 _MARGIN = 0.04
-"""Around all that is drawn, as a share of the longer side."""
+"""Margin around all that is drawn, as a share of the longer side."""
 _RIMMED = 20
 """Outlines up to which each has a light rim, as in `map.js`."""
 _QUALITY = 88

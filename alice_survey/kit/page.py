@@ -27,7 +27,7 @@ _NUMBER = re.compile(
     r"\s*([%‰°]|[a-zA-Zµ²³/·%]{1,8}( [a-z]{1,4})?)?",
     re.IGNORECASE,
 )
-"""With its unit, its sigma or a share: "12.3 mm", "0.4 ± 0.1 %", "3 of 58"."""
+"""A number with its unit, its sigma or a share: "12.3 mm", "0.4 ± 0.1 %", "3 of 58"."""
 _SHORT_WORD = 8
 _NO_VALUE = {"", "-", "–", "—", "n/a"}
 
@@ -43,7 +43,7 @@ def render_html(report: Report) -> str:
 
     Raises:
         ValueError: two sections or layers share a name, a section shows a map or a mesh that the
-            report lacks, a map or a mesh has no section, or a picture is of no kind known here.
+            report lacks, a map or a mesh has no section, or a picture is of an unknown kind.
     """
     _check(report)
     styles, scripts = _carried(report)
@@ -98,7 +98,7 @@ def _check(report: Report) -> None:
 
 
 def _carried(report: Report) -> tuple[list[str], list[str]]:
-    """The styles and the scripts that its page carries."""
+    """Styles and scripts that the page embeds."""
     styles, scripts = [_read("page.css")], list[str]()
     if report.map is not None:
         styles.insert(0, _read("web/vendor_map.css"))
@@ -114,7 +114,7 @@ def _read(name: str) -> str:
 
 
 def page_policy(report: Report) -> str:
-    """What its page may load, as a content security policy.
+    """The page's content security policy: what it may load.
 
     A texture of the mesh is a `blob:` of the page itself. A page that a server gives may load
     from that server too.
@@ -134,7 +134,7 @@ def page_policy(report: Report) -> str:
 
 
 def _hash(text: str) -> str:
-    """As a content security policy names inline text (W3C, CSP level 3)."""
+    """Hash by which a content security policy names inline text (W3C, CSP level 3)."""
     return f"'sha256-{_base64(hashlib.sha256(text.encode('utf-8')).digest())}'"
 
 

@@ -22,7 +22,7 @@ _STANDARD: Final = "ua-1"
 _LONG_WORD = re.compile(r"\S{28,}")
 _SVG_WIDTH = re.compile(rb'<svg[^>]* width="([0-9.]+)pt"')
 _PIXELS_HIGH = 0.85
-"""Most height of a picture of pixels, over the width of the text."""
+"""Greatest height of a bitmap, over the width of the text."""
 _BREAKS = re.compile(r"([/_.,;:=-])(?=\w)")
 
 
@@ -30,7 +30,7 @@ def render_pdf(report: Report, date: datetime) -> bytes:
     """Set a report on A4 pages; the same report and date give the same bytes.
 
     Args:
-        report: its content; links to files and what moves stay away.
+        report: its content; links to files and interactive parts are left out.
         date: of the document.
 
     Returns:

@@ -44,7 +44,7 @@ def millimetres(value: float | None) -> str:
 
 
 def digits(value: float, wanted: int = 3) -> str:
-    """With this many digits and never an exponent."""
+    """A number with this many digits and never an exponent."""
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
     rounded = float(f"{value:.{wanted - 1}e}")  # 99.96 has one digit more than it seems
@@ -53,7 +53,7 @@ def digits(value: float, wanted: int = 3) -> str:
 
 
 def share(value: float | None) -> str:
-    """`99.8 %`; never 100 % of what is not whole."""
+    """`99.8 %`; never 100 % of what is incomplete."""
     if value is None or not math.isfinite(value):
         return "unknown"
     text = f"{100 * value:.1f}"
@@ -63,14 +63,14 @@ def share(value: float | None) -> str:
 
 
 def parts(value: float | None) -> str:
-    """Of a scale: `+98 ppm`, `0.51 %`."""
+    """Error of a scale: `+98 ppm`, `0.51 %`."""
     if value is None or not math.isfinite(value):
         return "unknown"
     return f"{1e6 * value:+.0f} ppm" if abs(value) < 1e-3 else f"{100 * value:+.2f} %"
 
 
 def parts_with_sigma(value: float, sigma: float) -> str:
-    """Of a scale: `+0.07 ± 0.56 %`, value and sigma in one unit."""
+    """Error of a scale: `+0.07 ± 0.56 %`, value and sigma in one unit."""
     factor, name = (1e6, "ppm") if max(abs(value), sigma) < 1e-3 else (1e2, "%")
     return f"{with_sigma(factor * value, factor * sigma, '+')} {name}"
 

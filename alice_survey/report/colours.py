@@ -1,4 +1,4 @@
-"""How rasters look on a map: their words, palettes and limits, the same wherever they are shown."""
+"""Appearance of rasters on a map: labels, palettes and limits, the same wherever shown."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -21,12 +21,12 @@ MOSAIC_TITLE = "Mosaic"
 MOSAIC_ABOUT = "What the cameras saw, each spot from the picture that sees it best."
 TILE_PX = 512
 _SAMPLED = 2_000_000
-"""Values of a raster that its limits are taken from; of a smaller one all."""
+"""Number of values of a raster that its limits are taken from; all of a smaller one."""
 _THINNED = 4
 """Step between the rows and columns of a block that a larger raster's limits are taken from."""
 _WINDOW_PX = 256
 _COLOURS = 9
-"""Of a scale in a legend."""
+"""Colours of a scale in a legend."""
 _QUALITY = 82
 
 
@@ -39,15 +39,15 @@ class Numbers:
     title: str
     about: str
     palette: str
-    """One of matplotlib's that is safe for the colour-blind."""
+    """Palette of matplotlib that is safe for the colour-blind."""
     limits: Callable[[Array], tuple[float, float]]
-    """Of the colours, from the known values."""
+    """Limits of the colours, from the known values."""
     factor: float = 1.0
-    """From the raster's unit to the legend's."""
+    """Factor from the raster's unit to the legend's."""
     label: str = ""
     shaded: bool = False
     counted: bool = False
-    """Its numbers are counts: zero is nothing seen."""
+    """Whether its numbers are counts: zero means unseen."""
 
     def levels(self, values: Array) -> Array:
         """Values of the raster in the legend's unit; NaN where nothing is known."""
@@ -109,10 +109,10 @@ def _whole(values: Array) -> tuple[float, float]:
 
 
 def limits_of(raster: Any, numbers: Numbers) -> tuple[float, float]:
-    """Between which values a raster is coloured, in the legend's unit; 0 to 1 where none is known.
+    """Limits of a raster's colours, in the legend's unit; 0 to 1 where no value is known.
 
-    Of a large raster the values of blocks all over it, in an order without a pattern, until there
-    are enough: what it holds in memory does not grow with the raster.
+    A large raster is sampled in blocks all over it, in an order without a pattern, until there
+    are enough values: memory does not grow with the raster.
     """
     kept, count = list[Array](), 0
     for values in _sample(raster):
@@ -140,7 +140,7 @@ def block_window(raster: Any, column: int, row: int, side: int) -> Window:
 
 
 def known_values(raster: Any, window: Window) -> Array:
-    """Values of the first band, float32; NaN where the raster says that it knows none."""
+    """Values of the first band, float32; NaN where the raster marks them as unknown."""
     values: Array = raster.read(1, window=window).astype(np.float32, copy=False)
     if raster.nodata is not None and np.isfinite(raster.nodata):
         values[values == np.float32(raster.nodata)] = np.nan
@@ -148,7 +148,7 @@ def known_values(raster: Any, window: Window) -> Array:
 
 
 def coloured(level: Array, numbers: Numbers, limits: tuple[float, float], pixel: float) -> Rgba:
-    """Numbers as colours; what is not known is clear.
+    """Numbers as colours; unknown values are transparent.
 
     Args:
         level: (H, W) in the legend's unit, NaN where unknown.

@@ -1,4 +1,4 @@
-"""The few numbers that a survey comes down to, from whatever its workspace holds."""
+"""The key figures of a survey, from whatever its workspace holds."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,7 +20,7 @@ from alice_survey.report.held import Held, number
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Figures:
-    """Of one survey; NaN or None where nothing is known."""
+    """Key figures of one survey; NaN or None where nothing is known."""
 
     held: Held
 
@@ -61,20 +61,20 @@ class Figures:
 
     @property
     def pixel_m(self) -> float:
-        """Of the mosaic, in the model's unit; NaN without one."""
+        """Pixel of the mosaic, in the model's unit; NaN without one."""
         mosaic = self.held.read(MosaicRecord)
         return np.nan if mosaic is None else mosaic.pixel
 
     @cached_property
     def camera_sigmas(self) -> Array:
-        """(N, 3) north, east, down of each picture of the track; NaN where none is stated."""
+        """(N, 3) sigmas north, east, down of the track's pictures; NaN where none is stated."""
         names = ("sigma_north_m", "sigma_east_m", "sigma_depth_m")
         rows = [[number(row, name) for name in names] for row in self.held.track]
         return np.array(rows).reshape(-1, 3)
 
     @property
     def place_sigma_m(self) -> float:
-        """Of a camera on the Earth, horizontally: root mean square."""
+        """Horizontal sigma of a camera on the Earth: root mean square."""
         level = self.camera_sigmas[:, :2]
         known = np.isfinite(level).all(axis=1)
         return float(np.sqrt((level[known] ** 2).sum(axis=1).mean())) if known.any() else np.nan
@@ -100,15 +100,15 @@ class Surface:
     """Figures of the DEM."""
 
     area: float
-    """Of its known cells, square units."""
+    """Area of its known cells, square units."""
     cell: float
     low: float
     high: float
     sigma_median: float
-    """Of the heights; NaN where none is stated."""
+    """Sigma of the heights; NaN where none is stated."""
     sigma_95: float
     stations_median: float
-    """That see a cell."""
+    """Stations that see a cell."""
     covered: float
     """Share of the planned area with a height; NaN without a plan."""
 

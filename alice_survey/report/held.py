@@ -1,4 +1,4 @@
-"""What a workspace holds, read once and as it is."""
+"""Contents of a workspace, read once and unchanged."""
 
 import csv
 import math
@@ -26,11 +26,11 @@ class Held:
 
     workspace: Path
     stages: Mapping[str, StageRecord]
-    """Of the finished ones but the report, by their folders."""
+    """Records of the finished stages except the report, by their folders."""
 
     @classmethod
     def of(cls, workspace: Path) -> "Held":
-        """Look at a workspace."""
+        """Read a workspace."""
         found = finished(workspace)
         found.pop("report", None)
         return cls(workspace=workspace, stages=found)
@@ -78,14 +78,14 @@ class Held:
 
     @cached_property
     def frame(self) -> FrameRecord:
-        """What coordinates of the model mean; as planned before there is one."""
+        """Frame of the model's coordinates; as planned before there is one."""
         return self.read(FrameRecord) or FrameRecord(
             datum=None if self.plan is None else _place(self.plan)
         )
 
     @property
     def unit(self) -> str:
-        """Of lengths: metres, or units of a model without scale."""
+        """Unit of lengths: metres, or units of a model without scale."""
         return "m" if self.frame.scaled else "unit"
 
     @cached_property

@@ -1,4 +1,4 @@
-"""A copy of the mesh that is light enough for a page.
+"""A copy of the mesh that is small enough for a page.
 
 Small meshes keep their triangles and get a smaller texture. Of large ones the page shows the
 elevation model under the mosaic instead: as many cells as a browser turns smoothly.
@@ -46,7 +46,7 @@ def mesh_copy(held: Held, glb: Path) -> Mesh | None:
 
 
 def mesh_still(picture: Path, most_px: int = _MOST_STILL_PX) -> Figure:
-    """What stands for the mesh in print."""
+    """Image of the mesh for print."""
     return Figure(
         png=shrunk_png(picture, most_px),
         title="Mesh",
@@ -56,7 +56,7 @@ def mesh_still(picture: Path, most_px: int = _MOST_STILL_PX) -> Figure:
 
 
 def mesh_about(mesh: MeshRecord) -> str:
-    """What the light copy is, in words."""
+    """Description of the light copy."""
     triangles = mesh.triangles
     if triangles <= _MOST_TRIANGLES:
         return f"{count(triangles, 'triangle')}, texture shrunk for the page."

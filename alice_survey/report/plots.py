@@ -1,4 +1,4 @@
-"""Plots of a report: readable in print and by the colour-blind, each with its plain words."""
+"""Plots of a report: readable in print and by the colour-blind, each with an explanation."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -216,7 +216,7 @@ def stage_times(figures: Figures) -> Figure | None:
 
 
 def correlations(names: Sequence[str], matrix: Array) -> Figure:
-    """Of the rig's parameters."""
+    """Correlations of the rig's parameters."""
 
     def paint(axes: Sequence[Any]) -> None:
         picture = axes[0].imshow(matrix, cmap="PuOr", vmin=-1, vmax=1)

@@ -27,9 +27,9 @@ from alice_survey.report.colours import (
 from alice_survey.report.held import Held
 
 _MOST_PAINTED_PX = 24_000_000
-"""Of the mosaic in a page: about 5 MB."""
+"""Pixels of the mosaic in a page: about 5 MB."""
 _MOST_COLOURED_PX = 2_000_000
-"""Of a layer that shows numbers."""
+"""Pixels of a layer that shows numbers."""
 
 
 def picture_layers(held: Held) -> Iterator[PictureLayer]:
@@ -46,7 +46,7 @@ def picture_layers(held: Held) -> Iterator[PictureLayer]:
 
 
 def mosaic_layer(path: Path, most_px: int = _MOST_PAINTED_PX) -> PictureLayer:
-    """The mosaic; what no picture saw is clear."""
+    """The mosaic; what no picture saw is transparent."""
     with rasterio.open(path) as raster:
         height, width = _shrunk(raster.height, raster.width, most_px)
         bands = raster.read([1, 2, 3], out_shape=(3, height, width), resampling=Resampling.average)
@@ -118,7 +118,7 @@ def _layer(
 
 
 def _halved(picture: Rgba) -> Rgba:
-    """Half the size, rounded up; clear pixels lend no colour to their neighbours."""
+    """Half the size, rounded up; transparent pixels add no colour to their neighbours."""
     height, width = picture.shape[:2]
     padded = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0))).astype(np.uint32)
     blocks = padded.reshape(padded.shape[0] // 2, 2, padded.shape[1] // 2, 2, 4)

@@ -1,4 +1,4 @@
-"""What it takes to make a survey again: settings, versions, digests, time and memory."""
+"""What is needed to reproduce a survey: settings, versions, digests, time and memory."""
 
 import platform
 from collections.abc import Iterator
@@ -77,7 +77,7 @@ def _versions(held: Held) -> Table:
 
 
 def _changed(held: Held) -> Table:
-    """The settings as they are in the file: what is not there has its default."""
+    """Settings as in the file; missing ones have their defaults."""
     import tomllib
 
     path = held.workspace / _SETTINGS

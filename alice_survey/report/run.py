@@ -92,7 +92,7 @@ def _place(held: Held) -> str:
 
 
 def _title_block(held: Held) -> list[tuple[str, str]]:
-    """What a reader who cites the report needs."""
+    """Citation details of the report."""
     program = f"alice-survey {version('alice-survey')}"
     rows = [
         ("Survey", "simulated" if held.simulated else "of pictures that were taken"),
@@ -105,7 +105,7 @@ def _title_block(held: Held) -> list[tuple[str, str]]:
 
 
 def origin_of(held: Held) -> str:
-    """Where a map of it counts from, in words."""
+    """Origin of its map, in words."""
     datum = held.frame.datum
     if datum is not None and held.frame.name == "ned":
         return (

@@ -16,9 +16,9 @@ from reconstruct.views.model import datum_of
 _BLUE, _ORANGE, _GREEN, _RED, _BLACK = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#333333"
 """Okabe and Ito's palette, safe for the colour-blind."""
 _MOST_VERTICES = 4000
-"""Of a track on the map."""
+"""Most points of a track on the map."""
 _MOST_OUTLINES, _MOST_POINTS = 4000, 20_000
-"""On the map: some 4 MB of the page each."""
+"""Most shapes on the map: some 4 MB of the page each."""
 
 Shape = Sequence[tuple[float, float]]
 

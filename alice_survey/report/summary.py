@@ -1,4 +1,4 @@
-"""The three sentences that a reader takes away, and the first row of facts."""
+"""The three summary sentences of a report, and the first row of facts."""
 
 import math
 from collections.abc import Mapping, Sequence

@@ -1,6 +1,6 @@
 """What is good, what to look at, what is bad: each with its number and what to do about it.
 
-Every limit is one of measurement: a share of what the survey itself says it can resolve (its pixel,
+Every limit is one of measurement: a share of what the survey itself can resolve (its pixel,
 its sigmas), or what the plan requires.
 """
 
@@ -21,18 +21,18 @@ from alice_survey.kit.words import (
 from alice_survey.report.figures import Figures
 
 _SURE_SIGMAS = 3.0
-"""From which a difference is no chance."""
+"""Sigmas from which a difference is significant."""
 _HONEST = (0.7, 1.4)
 """Errors over stated sigmas, root mean square, that are neither too large nor too small."""
 _LEAST_COVERED, _WELL_COVERED = 0.9, 0.99
 _LEAST_REGISTERED = 0.9
 _LEAST_STATIONS = 3.0
-"""That see a spot, for its height to be checked by more than one pair."""
+"""Stations that must see a spot, so that more than one pair checks its height."""
 _NAMED = 4
 
 
 def verdicts(figures: Figures) -> list[Verdict]:
-    """All that can be said, the worst first."""
+    """All verdicts, the worst first."""
     return worst_first([
         *_flight(figures),
         *_calibration(figures),

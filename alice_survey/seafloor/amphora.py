@@ -12,7 +12,7 @@ from alice_survey.base.frames import Array
 
 LENGTH_M = 0.6
 BELLY_X_M = 0.34
-"""Where along the axis it is widest."""
+"""Position along the axis of the greatest width."""
 
 _PROFILE_M = np.array([
     [0.000, 0.000], [0.000, 0.017], [0.012, 0.025], [0.035, 0.028], [0.060, 0.026], [0.085, 0.034],

@@ -1,6 +1,6 @@
-"""The rig as it came from the workshop: near its drawing, not equal to it.
+"""The rig as built: close to its design, not equal to it.
 
-Pictures are taken with this rig. Calibration has to find it; a reconstruction never reads it.
+Pictures are taken with this rig. Calibration must estimate it; a reconstruction never reads it.
 """
 
 from dataclasses import replace
@@ -16,11 +16,11 @@ _SEED_STREAM = 3400
 
 FOCAL_TOLERANCE = 0.003
 CENTRE_TOLERANCE_PX = 10.0
-"""At full resolution."""
+"""Error at full resolution."""
 PORT_TOLERANCE_M = 0.001
 TURN_TOLERANCE_RAD = np.deg2rad(0.3)
 TILT_TOLERANCE = float(np.sin(np.deg2rad(0.3)))
-"""Of a port's normal, about each axis."""
+"""Error of a port's normal, about each axis."""
 BASELINE_TOLERANCE_M = 0.0002
 
 
@@ -33,9 +33,9 @@ def true_rig(camera: CameraConfig, water: WaterConfig, *, scale: int, seed: int)
 
     Args:
         camera: the design.
-        water: that it is in.
+        water: the water it is in.
         scale: how many pixels of the sensor, each way, make one of a picture.
-        seed: of the survey.
+        seed: the survey's seed.
     """
     rng = np.random.default_rng([seed, _SEED_STREAM])
     design = design_rig(camera, water)

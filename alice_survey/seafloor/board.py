@@ -64,9 +64,9 @@ def pool_poses(
     everywhere; the whole chessboard is in the frame of every camera.
 
     Args:
-        board: what is shown.
-        rig: who looks; its first camera's frame is the rig's.
-        views: how many.
+        board: the board.
+        rig: the cameras; the first camera's frame is the rig's.
+        views: number of poses.
         rng: source of the poses.
 
     Raises:
@@ -117,12 +117,12 @@ def _in_frame(board: PoolBoard, rig: Rig, name: str, rig_from_board: RigidTransf
 def render_board(
     board: PoolBoard, camera: FlatPortCamera, cam_from_board: RigidTransform, samples: int
 ) -> Floats:
-    """Reflected light of the board before a tiled wall, evenly lit, with the lens's fall-off.
+    """Reflected light of the board in front of a tiled wall, evenly lit, with the lens's fall-off.
 
     Args:
-        board: what is shown.
-        camera: who looks.
-        cam_from_board: where it is.
+        board: the board.
+        camera: the camera.
+        cam_from_board: pose of the board.
         samples: rays along a side of a pixel.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Strobes: what light reaches a surface and the camera, on straight paths and scattered once.
+"""Strobes: light that reaches a surface and the camera, directly and scattered once.
 
 Positions are in the camera's frame, metres; strobes, camera and backscatter move with the vehicle,
 so that the light in the water before a camera is computed once for a survey. Daylight is left out:
@@ -30,10 +30,10 @@ _STEPS = 97
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraLight:
-    """The strobes as one camera sees them, and the light that the water throws back into it."""
+    """The strobes as one camera sees them, and the backscatter of the water."""
 
     positions_cam: Array
-    """(S, 3) of the strobes."""
+    """(S, 3) positions of the strobes."""
     axis_cam: Array
     """(3,) unit vector along which all strobes point."""
     beam_rad: float
@@ -63,7 +63,7 @@ def camera_light(
         body_from_cam: its place on the vehicle.
         imaging: strobes; they point down in the body's frame.
         water: optical properties.
-        reach_m: longest path along a ray that will be asked for.
+        reach_m: longest path along a ray that will be requested.
     """
     positions = body_from_cam.inv().apply(np.asarray(imaging.strobes_body_m, dtype=np.float64))
     axis = body_from_cam.rotation.inv().apply([0.0, 0.0, 1.0])
@@ -206,7 +206,7 @@ def add_direct(
 def backscatter_at(
     table: Array, reach_m: float, column: float, row: float, path_m: float, out: Array
 ) -> None:
-    """Look up the backscatter of a ray: straight between rays of the grid and between paths.
+    """Look up the backscatter of a ray: linear between rays of the grid and between paths.
 
     Args:
         table: see `CameraLight.backscatter`.

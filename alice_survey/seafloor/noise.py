@@ -1,4 +1,4 @@
-"""Gradient noise in space: the same value at the same place, whoever asks and in what order.
+"""Gradient noise in space: the same value at the same place, in any order of evaluation.
 
 Improved noise after Perlin (2002), with gradients from an integer hash of the lattice point, so
 that it needs no table and has no period. Loops are written so that the compiler vectorises them.

@@ -15,7 +15,7 @@ _RIPPLE_LENGTH_M = 0.16
 _RIPPLE_HEIGHT_M = 0.012
 _SMALLEST_ROCK_M = 0.07
 _FILLET_M = 0.006
-"""Radius, about, with which sand rounds the foot of a rock."""
+"""Approximate radius with which sand rounds the foot of a rock."""
 _EDGE = 0.05
 """Radius, about, of a stone's edges in shares of its height."""
 
@@ -31,7 +31,7 @@ class Rock:
     flattening: float
     """Second horizontal axis over the first."""
     height_m: float
-    """From its widest level to its top."""
+    """Height from its widest level to its top."""
     buried: float
     """Share of the height that is under the sand."""
     heading_rad: float
@@ -95,7 +95,7 @@ def scatter_rocks(
 
     Args:
         bounds_ne_m: least and greatest north, least and greatest east.
-        rocks_per_m2: how many, on average.
+        rocks_per_m2: mean number.
         largest_m: longest horizontal axis of the largest.
         keep_clear: (K, 3) north, east and radius of circles without rocks.
         rng: source of places and shapes.
@@ -134,13 +134,13 @@ def scatter_rocks(
 def add_rocks(
     north_m: Array, east_m: Array, heights: Array, rocks: list[Rock]
 ) -> tuple[Array, Array]:
-    """Let rocks stick out of the sand.
+    """Add rocks to the sand.
 
     Args:
         north_m: (R,) grid lines.
         east_m: (C,) grid lines.
         heights: (R, C) heights of the sand, positive up.
-        rocks: what to add.
+        rocks: the rocks to add.
 
     Returns:
         New (R, C) heights, and the share of rock at each point, (R, C) from 0 to 1.

@@ -29,12 +29,12 @@ _BAND_RAYS = 250_000
 """Rays worked on at once, about; bounds the memory at any picture size."""
 _SHADOW_BLUR_PX = 3
 _PAD_M = 0.4
-"""How far beyond the frame terrain can cast a shadow into it, about."""
+"""Distance beyond the frame from which terrain can cast a shadow into it, about."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
-    """What lies before the camera."""
+    """Objects in front of the camera."""
 
     terrain: Terrain
     texture: Texture

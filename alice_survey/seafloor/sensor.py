@@ -27,7 +27,7 @@ MIDDLE_GREY = 0.2
 
 @dataclass(frozen=True, kw_only=True)
 class Sensor:
-    """What turns light into electrons, for one exposure time."""
+    """Conversion of light to electrons, for one exposure time."""
 
     electrons_per_radiance: tuple[float, float, float]
     """Electrons in a pixel on the axis for 1 W / (m^2 sr) in water, red, green and blue."""
@@ -45,7 +45,7 @@ def make_sensor(camera: CameraConfig, n_water: float, exposure_s: float, scale: 
     Args:
         camera: pixel, lens, and noise as designed.
         n_water: index of the water.
-        exposure_s: the light comes in this time.
+        exposure_s: exposure time.
         scale: pixels are this many times larger than the sensor's.
     """
     radiance = PORT_TRANSMITTANCE / n_water**2
@@ -65,7 +65,7 @@ def expose(radiance: Floats, sensor: Sensor, rng: np.random.Generator | None) ->
 
     Args:
         radiance: (H, W, 3) W / (m^2 sr) in water, with the lens's fall-off.
-        sensor: what catches them.
+        sensor: the sensor.
         rng: source of shot noise (Poisson) and read noise (normal); None for neither.
 
     Returns:

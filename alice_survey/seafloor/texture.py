@@ -1,4 +1,4 @@
-"""What the sea floor is coloured like: a reflectance for every point in space, at any resolution.
+"""Colour of the sea floor: a reflectance for every point in space, at any resolution.
 
 Detail runs from half a metre to a fifth of a millimetre, below one pixel of the full-size camera
 at 2 m (0.42 mm). What is finer than a sample is left out of it, so that pictures do not alias.
@@ -28,7 +28,7 @@ _FINE = np.array([
 """Pits, burrows and pellets down to grains of sand; about as strong in every octave, as natural
 pictures are."""
 _GROWTH = np.array([[0.13, 0.75], [0.042, 0.5], [0.014, 0.35]])
-"""Where algae and crusts grow on hard ground."""
+"""Pattern of algae and crusts on hard ground."""
 _SPECKS = np.array([[0.0036, 0.45], [0.012, 0.50], [0.032, 0.45], [0.085, 0.30]])
 """(cell in metres, share of cells): shells and pebbles, and their fragments."""
 

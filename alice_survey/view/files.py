@@ -1,4 +1,4 @@
-"""Files of a workspace as answers: what kind they are, what they may do, their bytes."""
+"""Files of a workspace as responses: their type, their policy, their bytes."""
 
 import os
 import socket
@@ -24,16 +24,16 @@ _CLOSED_PAGE = (
     "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "
     "script-src 'unsafe-inline'; base-uri 'none'; form-action 'none'; sandbox allow-scripts"
 )
-"""Of pages that carry all they need: they run, but reach neither a network nor this server."""
+"""Policy of self-contained pages: they run, but reach neither a network nor this server."""
 
 
 def content_type(name: str) -> str:
-    """Of a file, by the end of its name."""
+    """Content type of a file, by the end of its name."""
     return _TYPES.get(PurePath(name).suffix.lower(), "application/octet-stream")
 
 
 def policy_of(name: str) -> str:
-    """What a file may do when a browser shows it."""
+    """Content security policy of a file in a browser."""
     return _CLOSED_PAGE if content_type(name).startswith("text/html") else _INERT
 
 

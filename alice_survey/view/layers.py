@@ -37,19 +37,19 @@ from alice_survey.view.pyramid import (
 )
 
 _KEPT_BYTES = 48 << 20
-"""Of encoded tiles."""
+"""Cache size of encoded tiles."""
 _MOST_RENDERERS = 4
 _MOSAIC = "mosaic"
 _DAMAGES = (RasterioError, IndexError)
-"""What reading a damaged raster, or one with too few bands, raises."""
+"""Errors on reading a damaged raster, or one with too few bands."""
 NAMES = (_MOSAIC, *(numbers.name for numbers in number_rasters("m")))
-"""Of layers, in the order in which a page shows them."""
+"""Names of layers, in the order in which a page shows them."""
 PATHS = (MOSAIC_FILE, *(numbers.file for numbers in number_rasters("m")))
-"""Of their rasters."""
+"""Folders of their rasters."""
 
 
 class ChangedError(Exception):
-    """What was asked for was made anew meanwhile."""
+    """The requested file was replaced meanwhile."""
 
 
 @dataclass(kw_only=True)
@@ -59,13 +59,13 @@ class _Raster:
     file: OpenedFile
     pyramid: Pyramid
     numbers: Numbers | None
-    """None of the mosaic."""
+    """Colouring of the raster; None for the mosaic."""
     users: int = 0
     lock: threading.Lock = field(default_factory=threading.Lock)
     limits: tuple[float, float] | None = None
 
     def coloured_between(self) -> tuple[float, float]:
-        """Limits of the colours, found when first asked for."""
+        """Limits of the colours, computed on first use."""
         with self.lock:
             if self.limits is None:
                 if self.numbers is None:
@@ -76,7 +76,7 @@ class _Raster:
 
 
 class Layers:
-    """What a map of a workspace can show; threads may share it."""
+    """Layers of a map of a workspace; threads may share it."""
 
     def __init__(self, workspace: Workspace, stop: threading.Event | None = None) -> None:
         """Take a workspace; `stop` ends long work soon after it is set."""
@@ -116,11 +116,11 @@ class Layers:
         """A tile as WebP, and the token of the raster that it is of.
 
         Args:
-            name: of the layer.
+            name: name of the layer.
             level: 0 is the coarsest, as on the report's page.
             x: column of the tile.
             y: row of the tile.
-            token: of the raster that the page knows; None for the one that is there.
+            token: of the raster that the page has; None for the current one.
 
         Raises:
             FileNotFoundError: there is no such layer or no such tile.
@@ -223,7 +223,7 @@ class Layers:
                 raster.file.close()
 
     def _fault(self, name: str, error: BaseException, unchanged: bool) -> BaseException:
-        """What to tell of an error in a raster."""
+        """Error to report for a fault in a raster."""
         if not isinstance(error, (*_DAMAGES, MemoryError)):
             return error
         if not unchanged:

@@ -38,7 +38,7 @@ _LINKS = (
 
 
 class Page:
-    """The survey's page and its mesh, made when asked for and kept while nothing changes."""
+    """The survey's page and its mesh, made on request and kept while nothing changes."""
 
     def __init__(self, workspace: Workspace, layers: Layers) -> None:
         """Take a workspace and its layers."""
@@ -55,7 +55,7 @@ class Page:
 
         Raises:
             WorkspaceError: a file of the workspace is damaged.
-            FileNotFoundError: a stage went away meanwhile.
+            FileNotFoundError: a stage was removed meanwhile.
         """
         with self._lock:
             state = f"{host} {self._workspace.token(*PATHS)}"
@@ -69,7 +69,7 @@ class Page:
         """The light copy of the mesh as binary glTF, and the token of the mesh.
 
         Args:
-            token: of the mesh that the page knows; None for the one that is there.
+            token: of the mesh that the page has; None for the current one.
 
         Raises:
             FileNotFoundError: there is no mesh.

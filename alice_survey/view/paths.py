@@ -27,7 +27,7 @@ _ESCAPE = re.compile(r"%(?![0-9A-Fa-f]{2})")
 _NOT_THERE = {
     errno.ENOENT, errno.ENOTDIR, errno.ELOOP, errno.EACCES, errno.ENXIO, errno.ENAMETOOLONG,
 }  # fmt: skip
-"""For a reader: also a link, a socket and what may not be read."""
+"""Reasons, for a reader, also for a link, a socket and unreadable files."""
 _UNFINISHED = (".partial", ".replaced")
 
 
@@ -47,7 +47,7 @@ class OpenedFile:
 
     @property
     def path(self) -> str:
-        """By which libraries open the same file, even after another took its name."""
+        """Path by which libraries open the same file, even after another took its name."""
         return f"/proc/self/fd/{self.descriptor}"
 
     def is_unchanged(self) -> bool:
@@ -55,7 +55,7 @@ class OpenedFile:
         return _token(os.fstat(self.descriptor)) == self.token
 
     def close(self) -> None:
-        """Give it back; it can be read no more."""
+        """Close it."""
         os.close(self.descriptor)
 
 
@@ -146,7 +146,7 @@ class Workspace:
             return False
 
     def listed(self, names: Sequence[str]) -> tuple[Sequence[Entry], int]:
-        """What may be seen in a folder, folders first, and how much more there is.
+        """Visible contents of a folder, folders first, and the number of further entries.
 
         Raises:
             FileNotFoundError: there is no such folder.
@@ -167,7 +167,7 @@ class Workspace:
         return found[:_MOST_LISTED], max(0, len(found) - _MOST_LISTED)
 
     def token(self, *paths: str) -> str:
-        """Names the state of all finished stages and of some files: what is made anew changes it.
+        """Token of the state of all finished stages and of some files; any change gives another.
 
         Args:
             paths: of the files.

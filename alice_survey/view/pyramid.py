@@ -23,11 +23,11 @@ from alice_survey.base.frames import Array
 from alice_survey.report.colours import TILE_PX, known_values
 
 _KEPT_PX = 2_000_000
-"""Most of the level that is kept in memory."""
+"""Most pixels of the level that is kept in memory."""
 _WINDOW_PX = 1024
-"""Side of what is read at once, at least."""
+"""Least side of a window that is read at once."""
 _GDAL = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_CACHEMAX": 32 << 20}
-"""No file beside a raster is read, and little of it is kept."""
+"""GDAL options: no sidecar file of a raster is read, and the cache is small."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -35,14 +35,14 @@ class Part:
     """A part of a level."""
 
     values: Array
-    """(B, H, W) float32 means of what is known."""
+    """(B, H, W) float32 means of the known values."""
     weight: Array
     """(H, W) share of the raster's pixels that is known, 0 to 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LevelSize:
-    """How large a level is."""
+    """Size of a level."""
 
     columns: int
     rows: int
@@ -59,7 +59,7 @@ Reader = Callable[[Any, Window], Part]
 
 
 def read_numbers(raster: Any, window: Window) -> Part:
-    """The first band; what it does not know weighs nothing."""
+    """The first band; unknown values have zero weight."""
     values = known_values(raster, window)
     known = np.isfinite(values)
     values[~known] = 0
@@ -73,14 +73,14 @@ def read_counts(raster: Any, window: Window) -> Part:
 
 
 def read_painted(raster: Any, window: Window) -> Part:
-    """The first three bands; what is clear weighs nothing."""
+    """The first three bands; transparent pixels have zero weight."""
     bands = raster.read([1, 2, 3], window=window).astype(np.float32)
     mask = raster.read(4, window=window) if raster.count > 3 else raster.dataset_mask(window=window)
     return Part(values=bands, weight=mask.astype(np.float32) / 255)
 
 
 class StoppedError(Exception):
-    """Nobody waits for the answer any more."""
+    """The request was abandoned."""
 
 
 class Pyramid:
@@ -94,7 +94,7 @@ class Pyramid:
         stop: threading.Event | None = None,
         most_kept_px: int = _KEPT_PX,
     ) -> None:
-        """Look at a raster.
+        """Open a raster.
 
         Args:
             path: as GDAL opens it, as long as this lives.
@@ -166,7 +166,7 @@ class Pyramid:
         return self._from_file(level, left, top, right, bottom)
 
     def _keep(self) -> Part:
-        """The finest level that is kept, made when it is first asked for."""
+        """The finest level that is kept, made on first use."""
         with self._lock:
             if self._kept is None:
                 size = self.levels[self._keeps]
@@ -205,7 +205,7 @@ class Pyramid:
 
 
 def _reduced(part: Part, factor: int, left: int, top: int, right: int, bottom: int) -> Part:
-    """Means over squares of so many pixels; beyond the border nothing is known.
+    """Means over squares of `factor` pixels a side; unknown beyond the border.
 
     Args:
         part: finer.

@@ -1,4 +1,4 @@
-"""Parts of files as browsers and GIS programs ask for them (RFC 9110, sections 8.8, 13 and 14)."""
+"""Parts of files as browsers and GIS programs request them (RFC 9110, sections 8.8, 13, 14)."""
 
 import re
 import time
@@ -10,30 +10,30 @@ from typing import Literal
 _RANGE = re.compile(r"bytes[ \t]*=[ \t]*(?:([0-9]{1,18})-([0-9]{0,18})|-([0-9]{1,18}))[ \t]*")
 _ENTITY_TAG = re.compile(r'(W/)?"[\x21\x23-\x7e\x80-\xff]*"')
 _SETTLED_S = 2.0
-"""Age from which a time of whole seconds names one content."""
+"""Age from which a time in whole seconds identifies one content."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Version:
-    """Which content a file has."""
+    """Identity of a file's content."""
 
     token: str
     modified_s: float
 
     @property
     def tag(self) -> str:
-        """As HTTP names it."""
+        """Entity tag of HTTP."""
         return f'"{self.token}"'
 
     @property
     def date(self) -> str:
-        """When it was written, as HTTP gives times."""
+        """Time of writing, in HTTP format."""
         return formatdate(int(self.modified_s), usegmt=True)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """Which bytes are sent, and as what."""
+    """Bytes to send, with status and headers."""
 
     status: Literal[200, 206, 304, 412, 416]
     first: int = 0
@@ -41,7 +41,7 @@ class Answer:
 
 
 def answer_to(headers: Mapping[str, str], size: int, version: Version, *, is_get: bool) -> Answer:
-    """Which part of a file a request gets.
+    """Part of a file to send for a request.
 
     Several ranges at once are not taken apart: the whole file is the answer, as the standard lets
     a server do.
@@ -50,7 +50,7 @@ def answer_to(headers: Mapping[str, str], size: int, version: Version, *, is_get
         headers: of the request, by their names in small letters.
         size: of the file, bytes.
         version: of the file.
-        is_get: it is no HEAD, for which ranges mean nothing.
+        is_get: it is not a HEAD, for which ranges have no meaning.
     """
     whole = Answer(status=200, count=size)
     if "if-match" in headers:
@@ -103,7 +103,7 @@ def _still_holds(text: str | None, version: Version) -> bool:
 
 
 def _is_later(text: str | None, version: Version) -> bool:
-    """Whether the file was written after a time; False where it is no time."""
+    """Whether the file was written after a time; False where it is not a time."""
     seconds = None if text is None else _seconds(text)
     return seconds is not None and int(version.modified_s) > seconds
 

@@ -13,10 +13,10 @@ def run_view(workspace: Path, port: int, *, browser: bool, tell: Callable[[str],
     """Serve a workspace; Ctrl-C ends it as it ends every command.
 
     Args:
-        workspace: to show.
+        workspace: the workspace to show.
         port: to listen on; 0 for any that is free.
         browser: open one.
-        tell: shows a line.
+        tell: prints a line.
 
     Raises:
         WorkspaceError: there is nothing to show, or the port is taken.

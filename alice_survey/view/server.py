@@ -1,4 +1,4 @@
-"""The server: who may ask for what, and how it is answered.
+"""The server: allowed requests and their responses.
 
 It listens on the loopback address and answers GET and HEAD alone. A request whose Host is not this
 server by its address and port is refused, since a page of another site could otherwise reach it
@@ -30,18 +30,18 @@ from alice_survey.view.ranges import Version, answer_to
 ADDRESS = "127.0.0.1"
 _MOST_CONNECTIONS = 48
 _IDLE_S = 20.0
-"""After which a connection that says nothing is closed."""
+"""Time after which a silent connection is closed."""
 _BUSY_S = 2.0
-"""That a new connection waits while there are too many."""
+"""Time a new connection waits while there are too many."""
 _ENDING_S = 3.0
-"""That answers under way are waited for in the end."""
+"""Time to wait at the end for responses in progress."""
 _TILE = re.compile(
     rf"/tiles/({'|'.join(NAMES)})/([0-9]{{1,2}})/([0-9]{{1,6}})/([0-9]{{1,6}})\.webp"
 )
 _VERSION = re.compile(r"v=([0-9a-f-]{1,64})")
 _CHANGED = "the survey was worked on meanwhile: load the page again"
 _KEEP = "private, max-age=86400, immutable"
-"""Of what is asked for with its version."""
+"""Cache policy of requests that state a version."""
 _ASK_AGAIN = "no-cache"
 _NOTHING = "default-src 'none'; sandbox"
 _COMMON = {
@@ -68,7 +68,7 @@ class Server(ThreadingHTTPServer):
             port: 0 for any that is free.
 
         Raises:
-            WorkspaceError: the port cannot be had.
+            WorkspaceError: the port is not available.
         """
         self.workspace = Workspace(folder)
         self.stopping = threading.Event()
@@ -127,12 +127,12 @@ class Server(ThreadingHTTPServer):
         self._slots.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A browser that goes away is no fault; a bug is told."""
+        """Ignore a browser that disconnects; report a bug."""
         if not isinstance(sys.exception(), (ConnectionError, TimeoutError)):
             super().handle_error(request, client_address)
 
     def server_close(self) -> None:
-        """Stop listening, and wait a little for the answers under way."""
+        """Stop listening, and wait briefly for the responses in progress."""
         self.stopping.set()
         super().server_close()
         with self._connections_lock:
@@ -146,7 +146,7 @@ class Server(ThreadingHTTPServer):
 
 
 class _AnsweredError(Exception):
-    """The answer is a status and a line of text."""
+    """The response is a status and a line of text."""
 
     def __init__(self, status: HTTPStatus, text: str) -> None:
         super().__init__(text)
@@ -164,11 +164,11 @@ class Handler(BaseHTTPRequestHandler):
         return cast(Server, self.server)
 
     def version_string(self) -> str:
-        """What the server calls itself, to this machine's users."""
+        """Name of the server, for this machine's users."""
         return "alice-survey"
 
     def parse_request(self) -> bool:
-        """Read a request; one that is refused for how it asks is answered here."""
+        """Read a request; a malformed one is answered here."""
         if not super().parse_request():
             return False
         try:
@@ -244,7 +244,7 @@ class Handler(BaseHTTPRequestHandler):
             raise FileNotFoundError(path)
 
     def _made_page(self, host: str) -> tuple[bytes, str]:
-        """The survey's page; a stage that is made anew meanwhile is no damage."""
+        """The survey's page; a stage that is replaced meanwhile is not an error."""
         workspace = self._served.workspace
         before = workspace.token()
         try:
@@ -284,7 +284,7 @@ class Handler(BaseHTTPRequestHandler):
                 self.close_connection |= sent < answer.count  # it was cut short meanwhile
 
     def _send(self, content: bytes, policy: str, kind: str) -> None:
-        """A page that is made anew for every request."""
+        """A page that is made for each request."""
         self._begin(200, policy, len(content), _ASK_AGAIN, {"Content-Type": kind})
         self._write(content)
 
@@ -329,18 +329,18 @@ class Handler(BaseHTTPRequestHandler):
             self.wfile.write(content)
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """Answer what the request's own form forbids, like all else here."""
+        """Answer a malformed request in the same format as all others."""
         self.close_connection = True
         self.command = self.command or "GET"
         self._tell(HTTPStatus(code), message or explain or HTTPStatus(code).phrase)
 
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002
-        """Requests are not told of."""
+        """Do not log requests."""
 
 
 @contextlib.contextmanager
 def serving(folder: Path, port: int = 0) -> Iterator[Server]:
-    """A server that answers in a thread of its own within this block."""
+    """A server that runs in a thread of its own within this block."""
     server = Server(folder, port)
     thread = threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True)
     thread.start()

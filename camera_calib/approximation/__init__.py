@@ -1,1 +1,1 @@
-"""Simpler cameras in place of a flat port, what they cost, and the port's dispersion undone."""
+"""Simpler cameras in place of a flat port, their errors, and correction of dispersion."""

@@ -24,9 +24,9 @@ from camera_calib.water import CHANNELS, WAVELENGTH_NM, n_water
 
 _REFERENCE = "green"
 _NODES_PX = 64
-"""Spacing of exact nodes of a warp; the rest is a cubic spline, exact to 1e-4 px."""
+"""Spacing of exact nodes of a warp; between them a cubic spline, exact to 1e-4 px."""
 _NEARER = 0.25
-"""Relief, as a share of the range, for which the rest of a correction is stated."""
+"""Relief, as a share of the range, for which the residual of a correction is stated."""
 
 Floats = NDArray[np.float32]
 Maps = Mapping[str, tuple[Floats, Floats]]
@@ -68,7 +68,7 @@ def channel_cameras(
 ) -> dict[str, FlatPortCamera]:
     """The camera as its red, green and blue channels see.
 
-    The camera's own indices, mostly calibrated, hold for green; to red and blue they change by as
+    The camera's own indices, mostly calibrated, apply to green; for red and blue they change by as
     much as those of the water and the material do.
 
     Args:
@@ -103,7 +103,7 @@ def channel_cameras(
 def shift_px(
     green: FlatPortCamera, channel: FlatPortCamera, pixels: Array, range_m: float
 ) -> Array:
-    """How far a channel shows what green shows at each pixel.
+    """Shift of a channel against green at each pixel.
 
     Args:
         green: camera of the green channel.
@@ -120,7 +120,7 @@ def shift_px(
 
 @dataclass(frozen=True, kw_only=True)
 class ChannelShift:
-    """What dispersion does to one channel, against green, over the frame."""
+    """Shift of one channel by dispersion, against green, over the frame."""
 
     channel: str
     n_water: float
@@ -134,7 +134,7 @@ class ChannelShift:
     """Length of the shift over the frame."""
     max_px: float
     rest_px: float
-    """What a correction at this range leaves at most where the scene is a quarter nearer or
+    """Largest residual of a correction at this range where the scene is a quarter nearer or
     farther."""
 
 
@@ -182,7 +182,7 @@ def frame_shifts(cameras: Mapping[str, FlatPortCamera], range_m: float) -> list[
 
 
 def channel_maps(cameras: Mapping[str, FlatPortCamera], range_m: float) -> Maps:
-    """Where each pixel of green is found in the red and the blue channel.
+    """Position of each pixel of green in the red and the blue channel.
 
     Args:
         cameras: from `channel_cameras`.

@@ -1,4 +1,4 @@
-"""The price of approximations as a table, JSON values and a plot."""
+"""Errors of approximations as a table, JSON values and a plot."""
 
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,7 @@ def residual_report(
     working_range_m: float | None = None,
     plot: Path | None = None,
 ) -> tuple[str, dict[str, Any]]:
-    """What each approximation of a camera costs, as text and as JSON values.
+    """Errors of each approximation of a camera, as text and as JSON values.
 
     Args:
         near_m: nearest distance from the entrance pupil along the axis.

@@ -1,7 +1,7 @@
-"""What it costs to treat a flat-port camera as one of the cameras that other software knows.
+"""Errors of treating a flat-port camera as a camera model of other software.
 
 Two ways: warp the pictures at one range to a virtual pinhole, or let a camera with distortion
-absorb refraction. Either is exact at most at one range; `approximations` states what is left over
+absorb refraction. Either is exact at most at one range; `approximations` states the residual over
 the frame and over an interval of distances.
 """
 
@@ -33,7 +33,7 @@ FITTED = ("SIMPLE_RADIAL", "OPENCV", "FULL_OPENCV")
 
 _GRID = 15
 _CANCELLING_PX = 0.01
-"""Price of a distortion coefficient of 1: of coefficients that cancel in FULL_OPENCV's fraction,
+"""Penalty of a distortion coefficient of 1: of coefficients that cancel in FULL_OPENCV's fraction,
 the smallest are taken; the residual grows by less than 1 % for it."""
 
 
@@ -49,7 +49,7 @@ class StandIn:
     warped_at_m: float | None
     """Pictures are warped so that they are exact at this range; None: they are used as they are."""
     centre_m: tuple[float, float, float]
-    """Of projection, in the flat-port camera's frame."""
+    """Centre of projection, in the flat-port camera's frame."""
     approx_from_cam: Rotation
     """Turn of the axes against those of the flat-port camera."""
 
@@ -62,7 +62,7 @@ class StandIn:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Residual:
-    """The price of a stand-in over the frame and some distances."""
+    """Errors of a stand-in over the frame and some distances."""
 
     stand_in: StandIn
     distances_m: Array
@@ -70,29 +70,29 @@ class Residual:
     pixels: Array
     """(rows, columns, 2) places in the picture, corners included."""
     misses_px: Array
-    """(D, rows, columns, 2): pixel of the stand-in less pixel of the (warped) picture."""
+    """(D, rows, columns, 2): pixel of the stand-in minus pixel of the (warped) picture."""
 
     @property
     def sizes_px(self) -> Array:
-        """(D, rows, columns) lengths of the misses."""
+        """(D, rows, columns) lengths of the errors."""
         lengths: Array = np.linalg.norm(self.misses_px, axis=-1)
         return lengths
 
     @property
     def rms_by_distance_px(self) -> Array:
-        """(D,) over the frame's area."""
+        """(D,) rms over the frame's area."""
         weights = _area_weights(*self.pixels.shape[:2])
         rms: Array = np.sqrt(np.sum(self.sizes_px**2 * weights, axis=(1, 2)))
         return rms
 
     @property
     def rms_px(self) -> float:
-        """Over the frame's area and the distances."""
+        """Rms over the frame's area and the distances."""
         return float(np.sqrt(np.mean(self.rms_by_distance_px**2)))
 
     @property
     def max_px(self) -> float:
-        """Anywhere in the frame, its corners included, at any of the distances."""
+        """Largest error in the frame, its corners included, at any of the distances."""
         return float(self.sizes_px.max())
 
     @property
@@ -171,7 +171,7 @@ def approximations(
 def residual(
     camera: FlatPortCamera, stand_in: StandIn, distances_m: Array, grid: int = _GRID
 ) -> Residual:
-    """How far a stand-in is from the flat-port camera.
+    """Errors of a stand-in against the flat-port camera.
 
     Args:
         camera: exact.

@@ -25,12 +25,12 @@ class VirtualPinhole:
     cx_px: float
     cy_px: float
     centre_z_m: float
-    """Where the centre is along the camera's axis, before (+) or behind (-) the entrance pupil."""
+    """Position of the centre along the camera's axis, in front of (+) or behind (-) the pupil."""
     working_range_m: float
     """Distance from the entrance pupil along the axis at which the warp is exact."""
     centre_x_m: float = 0.0
     centre_y_m: float = 0.0
-    """Next to the axis: not zero where the port is tilted."""
+    """Offset from the axis: not zero where the port is tilted."""
 
     @property
     def virtual_from_cam(self) -> RigidTransform:
@@ -99,13 +99,13 @@ def best_pinhole(
 def residual_px(
     camera: FlatPortCamera, pinhole: VirtualPinhole, depths_m: Array, grid: int = 15
 ) -> Array:
-    """How far a warped picture's pixels are from where the pinhole would see each point.
+    """Distance of a warped picture's pixels from where the pinhole would see each point.
 
     Args:
         camera: the flat-port camera.
         pinhole: its stand-in.
         depths_m: (D,) distances along the axis from the entrance pupil.
-        grid: pixels a side of the frame at which to look.
+        grid: number of pixels a side of the frame.
 
     Returns:
         (D, grid, grid) distances in pixels of the pinhole.

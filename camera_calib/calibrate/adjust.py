@@ -23,25 +23,25 @@ from camera_calib.freedom import Freedom
 from camera_calib.rig import Rig
 
 HUBER = 3.0
-"""Length, in sigmas of a coordinate, from which a residual's pull no longer grows."""
+"""Length, in sigmas of a coordinate, beyond which a residual's influence is constant."""
 RAYLEIGH_MEDIAN = math.sqrt(2.0 * math.log(2.0))
-"""Median length of a residual, in sigmas of a coordinate, of normal noise."""
+"""Median residual length, in sigmas of a coordinate, for normal noise."""
 _LEAST_NOISE_PX = 1e-6
-"""Below it the rounding of projections shows."""
+"""Smallest noise: below it the rounding of projections shows."""
 _STEPS = 100
 _SETTLED = 1e-4
 _LEAST_DAMPING = 1e-13
-"""Parameters of a rig can be so alike that more damping than this hides how they differ."""
+"""Parameters of a rig can be so similar that more damping than this hides their difference."""
 _POSE_DAMPING = 1e-6
-"""Those of a pose cannot."""
+"""Least damping of poses, whose parameters are never so similar."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Adjustment:
-    """The most likely rig and poses, and what is left over."""
+    """The most likely rig and poses, with the residuals."""
 
     rig: Rig
-    """With the covariance of all that was adjusted, poses of the target marginalised."""
+    """The rig with the covariance of all adjusted parameters, target poses marginalised."""
     rig_from_target: RigidTransform
     """(V,)."""
     residuals_px: Array
@@ -49,7 +49,7 @@ class Adjustment:
     weights: Array
     """(V, cameras, N) robust weights in (0, 1]; NaN where unseen."""
     noise_px: float
-    """Standard deviation of one coordinate of a measured point, in all."""
+    """Standard deviation of one coordinate of a measured point, over all pictures."""
     blur: Array
     """(V, cameras) noise of each picture over that."""
     steps: int
@@ -98,9 +98,9 @@ def adjust(
         rig_from_target: (V,) poses near the truth.
         freedom: what of the rig is adjusted.
         settled: length of a step, in sigmas, at which the adjustment ends.
-        at_most: it may also end, not settled, after so many steps: views that do not fit at all
+        at_most: it may also end, not settled, after this many steps: views that do not fit at all
             creep for long, and can be left out once the others fit.
-        blur: (V, cameras) noise of each picture over that of all; None for alike ones.
+        blur: (V, cameras) noise of each picture over that of all; None if all are equal.
 
     Raises:
         CalibrationError: there are fewer measurements than unknowns, the views do not determine
@@ -113,7 +113,7 @@ def adjust(
 
 
 class _Solver(CalibrationProblem):
-    """Steps down to the least robust loss."""
+    """Minimisation of the robust loss."""
 
     blur: Array = np.ones((1, 1, 1))
     """(V, C, 1) noise of each picture over `noise_px`."""
@@ -145,7 +145,7 @@ class _Solver(CalibrationProblem):
         return max(float(np.median(lengths)) / RAYLEIGH_MEDIAN * share, _LEAST_NOISE_PX)
 
     def solve(self, state: State, settled: float, at_most: int | None) -> Adjustment:
-        """Step down from a guess until a step is shorter than `settled` sigmas."""
+        """Iterate from a guess until a step is shorter than `settled` sigmas."""
         least = _LEAST_DAMPING if self.names else _POSE_DAMPING
         if self.spare <= 0:
             raise CalibrationError(

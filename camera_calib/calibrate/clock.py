@@ -1,7 +1,7 @@
-"""How far the clocks of the cameras of a rig are apart, estimated from things that move.
+"""Clock offsets between the cameras of a rig, estimated from moving objects.
 
-A camera that is late shows a moving thing where it will be a little later: its ray misses those of
-the others in proportion to how fast the thing crosses its picture. The share of all misses that
+A camera that is late shows a moving object where it will be a little later: its ray misses those of
+the others in proportion to how fast the object crosses its picture. The share of all misses that
 follows these speeds is the lag.
 """
 
@@ -26,13 +26,13 @@ _CAUCHY = 2.385
 
 @dataclass(frozen=True, kw_only=True)
 class Lag:
-    """How much later than the first camera another one takes pictures of equal numbers."""
+    """Lag of a camera behind the first, for pictures of equal numbers."""
 
     frames: float
     sigma: float
-    """As if misses were independent; those of neighbouring frames are not quite."""
+    """Standard deviation as if misses were independent; those of neighbouring frames are not."""
     points: int
-    """How many observations with a speed it rests on."""
+    """Number of observations with a speed."""
 
 
 def estimate_lags(
@@ -41,7 +41,7 @@ def estimate_lags(
     speeds_px: Array,
     found: Triangulation,
 ) -> tuple[Lag, ...]:
-    """Lags of all cameras but the first; empty where too few things move.
+    """Lags of all cameras but the first; empty where too few objects move.
 
     Args:
         cameras: C cameras.
@@ -76,11 +76,11 @@ def estimate_lags(
 
 
 def pixel_speeds(frames: NDArray[np.int64], ids: NDArray[np.int64], pixels: Array) -> Array:
-    """Speeds of moving things in the pictures, (C, N, 2), pixels a frame; NaN where not known.
+    """Speeds of moving objects in the pictures, (C, N, 2), pixels a frame; NaN where not known.
 
     Args:
-        frames: (N,) increasing for each thing; a frame that one thing has twice gives no speed.
-        ids: (N,) which thing.
+        frames: (N,) increasing for each object; a frame that one object has twice gives no speed.
+        ids: (N,) which object.
         pixels: (C, N, 2); NaN where a camera does not see it.
     """
     speeds = np.full_like(pixels, np.nan)
@@ -97,7 +97,7 @@ def pixel_speeds(frames: NDArray[np.int64], ids: NDArray[np.int64], pixels: Arra
 
 
 def _robust_fit(by_lag: Array, misses: Array, freedom: int) -> tuple[Array, Array]:
-    """Lags that leave the least of the misses, with Cauchy's weights, and their sigmas."""
+    """Lags of least residuals, with Cauchy's weights, and their sigmas."""
     lags = np.zeros(by_lag.shape[2])
     for _ in range(_ROUNDS):
         left2 = ((misses + by_lag @ lags) ** 2).sum(axis=1) / freedom

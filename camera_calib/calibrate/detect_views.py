@@ -25,10 +25,10 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Detections:
-    """What all pictures show of the target."""
+    """Observations of the target in all pictures."""
 
     views: tuple[TargetView, ...]
-    """Those in which a camera saw it."""
+    """Views in which a camera saw it."""
     sizes: Mapping[str, Size]
     """Width and height of each camera's pictures."""
     rejections: tuple[Rejection, ...]
@@ -40,7 +40,7 @@ class _Seen:
     """None where the picture cannot be decoded."""
     detection: Detection
     board: Size | None = None
-    """Corners along the longer and the shorter side of the chessboard, where it was looked at."""
+    """Corners along the longer and the shorter side of the chessboard, where counted."""
 
 
 def detect_views(sets: Sequence[PictureSet], target: Target, executor: Executor) -> Detections:
@@ -83,7 +83,7 @@ def detect_views(sets: Sequence[PictureSet], target: Target, executor: Executor)
 
 
 def _checked(count: int) -> set[int]:
-    """Numbers of the views in which the size of the board is looked at."""
+    """Numbers of the views in which the size of the board is measured."""
     return {(2 * i + 1) * count // (2 * _CHECKED) for i in range(_CHECKED)}
 
 
@@ -126,7 +126,7 @@ def _one_size(
 
 
 def _check_board(target: Target, seen: Sequence[_Seen]) -> None:
-    """A part of a larger chessboard looks like a smaller one, but not like the same part always."""
+    """A part of a larger chessboard looks like a smaller one, but not always the same part."""
     wanted = max(target.columns, target.rows), min(target.columns, target.rows)
     boards = [what.board for what in seen if what.board is not None]
     larger = [b for b in boards if b[0] >= wanted[0] and b[1] >= wanted[1] and b != wanted]

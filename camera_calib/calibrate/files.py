@@ -30,7 +30,7 @@ def write_calibration(
     """Write `rig.json`, `calibration.json`, `corners.csv` and the report (docs/formats.md).
 
     Args:
-        folder: is there already.
+        folder: an existing folder.
         calibration: what was found.
         measured: all views in which the target was seen, also those that took no part.
     """
@@ -113,7 +113,7 @@ def warn_of_unseen(found: Detections) -> None:
 
 
 def finish(folder: Path, calibration: Calibration, found: Detections) -> Calibration:
-    """Warn of what a calibration left out and does not know, and write its files."""
+    """Warn of what a calibration left out or did not determine, and write its files."""
     lost = [r for r in calibration.rejections if r.points]
     if lost:
         views = ", ".join(dict.fromkeys(r.view for r in lost))

@@ -40,7 +40,7 @@ ONE_CAMERA = "camera"
 _WRITTEN = (
     "rig.json", "rig_carried.json", "calibration.json", "corners.csv", "report.html", "report.json",
 )  # fmt: skip
-"""By this command; a folder with other files is not replaced."""
+"""Files of this command; a folder with other files is not replaced."""
 _GUESSED_PORT_M = 0.02
 _FRESH_WATER, _GLASS = 1.34, 1.52
 _LEVELS = ("bad", "look", "good")
@@ -48,30 +48,30 @@ _LEVELS = ("bad", "look", "good")
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateOptions:
-    """Pictures to calibrate from, and what is known before."""
+    """Pictures to calibrate from, and prior knowledge."""
 
     left: str | None = None
     """Folder or pattern; the left camera is the reference."""
     right: str | None = None
     pictures: str | None = None
-    """Those of a single camera, instead."""
+    """Pictures of a single camera, instead."""
     target: str | None = None
-    """As `parse_target` reads it."""
+    """Target, as `parse_target` reads it."""
     output: Path | None = None
     """Folder to write."""
     lens: str = "opencv5"
     water: bool = False
-    """The pictures were taken under water, through the ports."""
+    """Whether the pictures were taken under water, through the ports."""
     start: Path | None = None
     """rig.json of a calibration in air, or an earlier one."""
     known: Intrinsics | None = None
-    """What is done with the intrinsics of `start`; None: prior if it has a covariance, or held."""
+    """Use of the intrinsics of `start`; None: prior if it has a covariance, or held."""
     port_distance_mm: float | None = None
-    """First value; it is found."""
+    """First value; it is estimated."""
     glass_mm: float | None = None
-    """Thickness."""
+    """Thickness of the glass."""
     glass_sigma_mm: float | None = None
-    """The thickness is found too, known this well; the indices below in the same way."""
+    """Prior sigma of the thickness, which is then estimated; the indices below in the same way."""
     n_glass: float | None = None
     n_glass_sigma: float | None = None
     n_water: float | None = None
@@ -138,7 +138,7 @@ def calibrate_pictures(
 
 
 def carried(rig: Rig, n_water: float) -> Rig:
-    """The rig in other water, which says so."""
+    """The rig in other water, with a note in its source."""
     old = next(iter(rig.cameras.values())).n_water
     return replace(
         rig.in_water(n_water),
@@ -280,7 +280,7 @@ def _matching(start: Rig, sizes: Mapping[str, Size]) -> Rig:
 
 
 def _next(calibration: Calibration, output: Path, settings: CalibrateOptions) -> list[str]:
-    """Where the results are, and what to do with them."""
+    """Location of the results, and what to do with them."""
     rig = shlex.quote(str(output / "rig.json"))
     lines = [f"rig in {output / 'rig.json'}; read {output / 'report.html'}"]
     if settings.carry_to_n is not None:
@@ -309,7 +309,7 @@ def _check_sides(rig: Rig) -> None:
 
 
 def _check_output(output: Path, start: Path | None) -> None:
-    """Refuse what is not a folder of this command before the work starts.
+    """Reject a folder that is not of this command before the work starts.
 
     Raises:
         WorkspaceError: it cannot be written or would take something with it.
@@ -334,7 +334,7 @@ def _check_output(output: Path, start: Path | None) -> None:
 
 @contextlib.contextmanager
 def _replacing(output: Path) -> Iterator[Path]:
-    """A folder to write to that takes the place of `output` when all went well."""
+    """A folder to write to that replaces `output` on success."""
     partial = output.with_name(f"{output.name}.partial")
     if partial.exists():
         shutil.rmtree(partial)
@@ -356,7 +356,7 @@ def calibration_text(
 
     Args:
         calibration: with its rig's covariance.
-        target: whose squares or tags are a measure for the baseline.
+        target: its squares or tags set the scale of the baseline.
         verdicts: `level` and `text` of each, the worst first, as in `report.json`.
     """
     rig, square = calibration.rig, (calibration.residuals_px**2).sum(axis=-1)
@@ -408,7 +408,7 @@ def _camera_lines(rig: Rig, name: str) -> Iterator[str]:
 def port_tilt_deg(rig: Rig, name: str) -> tuple[float, float | None]:
     """Angle between a port's normal and the camera's axis, and its sigma; None where held.
 
-    Of a port without tilt the direction of an error is open; its sigma is the larger of the two.
+    For a port without tilt the direction of an error is open; its sigma is the larger of the two.
     """
     x, y, z = rig.cameras[name].normal
     sine = math.hypot(x, y)

@@ -1,4 +1,4 @@
-"""Normal equations of a calibration: what each pixel says about rig, ports and target poses.
+"""Normal equations of a calibration: observations of rig, ports and target poses.
 
 The unknowns are a few parameters of the rig and six of every view's target pose. A view's pose
 meets only its own pixels, so that the equations have a small dense part of the rig, a 6 x 6 block
@@ -22,7 +22,7 @@ Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
 _SINGULAR = 1e-13
-"""Least eigenvalue of the rig's information, scaled to 1 where all else were known."""
+"""Least eigenvalue of the rig's information, scaled to 1 if all else were known."""
 _TURNS = len(POSE) // 2
 _LOW = {"port_distance_m": 0.0, "glass_thickness_m": 0.0, "n_glass": 1.0, "n_water": 1.0}
 
@@ -57,7 +57,7 @@ class Equations:
 
 
 class CalibrationProblem:
-    """Measured pixels, and which parameters explain them."""
+    """Measured pixels, and the parameters that explain them."""
 
     def __init__(self, pixels: Array, points: Array, rig: Rig, freedom: Freedom) -> None:
         self.pixels, self.points, self.rig = pixels, np.asarray(points, dtype=np.float64), rig
@@ -180,11 +180,11 @@ class CalibrationProblem:
         )
 
     def surprise(self, state: State) -> Array:
-        """(K,) parameters of the prior less its mean; a turn counts from the mean's rotation."""
+        """(K,) parameters minus the prior's mean; a turn counts from the mean's rotation."""
         return _surprise(self.prior, self.values(state)[self.prior_at], self.rig, state)
 
     def information(self, equations: Equations) -> Array:
-        """What is known of the rig's parameters, (P, P), with the target's poses marginalised."""
+        """Information of the rig's parameters, (P, P), with the target's poses marginalised."""
         solved = np.linalg.solve(equations.view, equations.between.transpose(0, 2, 1))
         eliminated: Array = np.tensordot(equations.between, solved, axes=([0, 2], [0, 1]))
         return equations.rig - eliminated

@@ -27,7 +27,7 @@ TAKEN_FOR_GRANTED: Mapping[str, float] = {
     "n_glass": 0.01,
     "glass_thickness_m": 0.0005,
 }
-"""How well each is known at best without a measurement of its own."""
+"""Best sigma of each without a measurement of its own."""
 _MOVED = ("fx_px", "port_distance_m", "normal_x", "normal_y", "x_m")
 _NOTABLE = 0.5
 """Sigmas of its own that a parameter must move to be named."""
@@ -41,7 +41,7 @@ _LEAST_TILT = math.radians(8.0)
 _LEAST_RANGE_RATIO = 1.4
 _ALIKE = 0.99
 _BADLY = 2.5
-"""A picture's residuals over those of all."""
+"""Ratio of a picture's residuals to those of all."""
 _LENS_ONLY = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
 _FOCAL = ("fx_px", "fy_px")
 _WATER = ("n_water",)
@@ -57,10 +57,10 @@ _USEFUL = {
 
 @dataclass(frozen=True, kw_only=True)
 class HeldEffect:
-    """What follows from a parameter that was held."""
+    """Effect of a parameter that was held."""
 
     sigma: float
-    """How well the views would have determined it; inf: not at all."""
+    """Sigma with which the views would have determined it; inf: not at all."""
     slopes: Mapping[str, float]
     """By adjusted parameter: how far it moves for each unit of an error of the held one."""
 
@@ -80,7 +80,7 @@ def unobservable(
 
 
 def held_effect(calibration: Calibration, name: str) -> HeldEffect:
-    """What the views say of a held parameter, the same for all cameras, and what hangs on it.
+    """Information on a held parameter, the same for all cameras, and its effects.
 
     Args:
         calibration: through ports.
@@ -151,7 +151,7 @@ def advice(
     rig_from_target: RigidTransform,
     noise_px: float,
 ) -> tuple[str, ...]:
-    """Lines on what the views do not constrain, each naming what to take more of.
+    """Lines on what the views do not constrain, each stating which views to add.
 
     Args:
         rig: calibrated, with its covariance.
@@ -241,7 +241,7 @@ def _loose(rig: Rig, covariance: Covariance) -> list[str]:
 
 
 def _alike(covariance: Covariance) -> list[str]:
-    """One line for each group of parameters that only their sum is known of."""
+    """One line for each group of parameters of which only the sum is determined."""
     strong = np.abs(covariance.correlation) > _ALIKE
     names = covariance.parameters
     fields = [name.split(".")[1] for name in names]

@@ -1,4 +1,4 @@
-"""An adjustment that leaves out what misses by far, and says what that was."""
+"""An adjustment that leaves out gross outliers, and reports them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,16 +19,16 @@ OUTLIER = 6.0
 """Length of a residual, in sigmas of a coordinate, beyond which a point takes no part: of normal
 noise one in 65 million is longer."""
 _DULLEST = 3.0
-"""Largest noise of one picture, in that of all, that still is noise."""
+"""Largest noise of one picture, over that of all, that is still noise."""
 _BY_CHANCE = 2.0
-"""Mean square of how far pictures' noise differs, in what chance makes of equal ones."""
+"""Mean square difference of the pictures' noise, relative to chance for equal noise."""
 _DRAWN = 16.0
 """Coordinates by which a picture's noise is drawn towards that of all."""
 _SAME_BLUR = 0.1
 _LEAST_LIMIT_PX = 1e-4
 _ROUNDS = 6
 STEPS = 40
-"""Of an adjustment that may still hold views which do not fit at all."""
+"""Step limit of an adjustment that may still include views which do not fit at all."""
 _FEWEST_FITTING = 0.5
 """Share of a picture's points; with fewer the whole picture is left out."""
 
@@ -41,7 +41,7 @@ def adjust_without_outliers(
     poses: RigidTransform,
     freedom: Freedom,
 ) -> tuple[Adjustment, Flags, Flags]:
-    """Adjust and leave out what misses by far, until that stays the same.
+    """Adjust and leave out gross outliers, until that set stays the same.
 
     Returns:
         The adjustment; which points (V, cameras, N) took part; which views (V,) did.
@@ -88,8 +88,8 @@ def _fitting(measured: Flags, kept: Flags, fits: Flags) -> Flags:
 def _blur(adjusted: Adjustment) -> Array:
     """Noise of each picture over that of all, (V, cameras); 1 where all are alike by chance.
 
-    Far targets and moving water blur some pictures more than others; weighted by their own noise
-    they say more. Noise is the mean square of residuals after Huber's weights, drawn a little
+    Distant targets and moving water blur some pictures more than others; weighted by their noise
+    they count more. Noise is the mean square of residuals after Huber's weights, drawn a little
     towards that of all, so that a picture of few points gets no weight by luck.
     """
     pull = (adjusted.weights[..., None] * adjusted.residuals_px) ** 2
@@ -118,7 +118,7 @@ def _trimmed(view: TargetView, kept: Flags, rig: Rig) -> TargetView:
 
 
 def _lengths(adjusted: Adjustment, pixels: Array, points: Array) -> Array:
-    """(V, cameras, N) misses of all measured points, also of those that took no part; px."""
+    """(V, cameras, N) residual lengths of all measured points, also of those left out; px."""
     misses = np.full(pixels.shape[:-1], np.inf)
     for c, (name, camera) in enumerate(adjusted.rig.cameras.items()):
         for v in range(len(pixels)):
@@ -130,7 +130,7 @@ def _lengths(adjusted: Adjustment, pixels: Array, points: Array) -> Array:
 def rejected(
     views: Sequence[TargetView], pixels: Array, kept: Flags, rig: Rig, adjusted: Adjustment
 ) -> list[Rejection]:
-    """What the adjustment left out, picture by picture."""
+    """Pictures and points that the adjustment left out."""
     limit = f"{OUTLIER:.0f} sigmas (of {adjusted.noise_px:.2g} px, or of the picture's own noise)"
     rejections = []
     for v, view in enumerate(views):

@@ -42,7 +42,7 @@ from camera_calib.rig import Rig
 Intrinsics = Literal["held", "prior", "free"]
 
 _ROUGHLY = 0.1
-"""Sigmas to which values are found that only serve as a start."""
+"""Convergence limit, in sigmas, of values that only serve as a start."""
 _LOOSEST_FOCAL = 0.1
 """Largest sigma of a focal length, as a share of it, that still is a calibration."""
 
@@ -134,7 +134,7 @@ def calibrate_in_air(
     lens: str = "opencv5",
     start: Rig | None = None,
 ) -> Calibration:
-    """Intrinsics of each camera alone, then of all with the rig, in air, from nothing.
+    """Intrinsics of each camera alone, then of all with the rig, in air, without a start.
 
     Args:
         views: where the cameras saw the target.
@@ -246,7 +246,7 @@ def blank_camera(
 def first_rig(
     views: Sequence[TargetView], points: Array, blank: Mapping[str, FlatPortCamera], lens: str
 ) -> Rig:
-    """A rig near the truth from nothing but views: each camera alone, then how they stand.
+    """A rig near the truth from views alone: each camera, then their relative poses.
 
     Raises:
         CalibrationError: a camera has too few views, or no view joins it to the others.
@@ -329,7 +329,7 @@ def _check_served(views: Sequence[TargetView], rig: Rig) -> None:
 
 
 def _check_focal(rig: Rig, poses: RigidTransform) -> None:
-    """Refuse what views that face the same way give: a focal length of any size."""
+    """Reject views that face the same way: they leave the focal length open."""
     for name, sigma in rig.sigmas.items():
         camera, field = name.split(".")
         if field not in ("fx_px", "fy_px"):

@@ -1,4 +1,4 @@
-"""First values of a calibration: poses of the target, focal lengths, how cameras stand.
+"""First values of a calibration: target poses, focal lengths, relative camera poses.
 
 Poses come from the closed form for planar targets (T. Collins, A. Bartoli 2014, "Infinitesimal
 plane-based pose estimation", in OpenCV), with every pixel's exact ray in water in place of a
@@ -21,13 +21,13 @@ from camera_calib.freedom import HELD
 from camera_calib.rig import Rig
 
 FEWEST_POINTS = 6
-"""That give a pose: six coordinates and some to spare."""
+"""Fewest points that give a pose: six coordinates and some to spare."""
 _THINNEST = 0.02
 """Least width over length of the seen part of a target: points in one row give no pose."""
 _CLEAR = 2.0
-"""A second pose that misses this many times more than the first is not looked at."""
+"""A second pose with residuals this many times larger than the first is ignored."""
 _ROUGHLY = 0.3
-"""Sigmas to which poses are found that only serve as a start."""
+"""Convergence limit, in sigmas, of poses that only serve as a start."""
 _STEPS = 30
 _FOCALS = 0.5 * 1.25 ** np.arange(14)
 """Focal lengths that are tried, in widths of the picture: 0.5 to 9 (90 to 6 degrees)."""
@@ -147,10 +147,10 @@ def _pinhole_poses(tangents: Array, points: Array, centre: Array) -> list[RigidT
 
 
 def first_focal_px(pixels: Sequence[Array], points: Array, size: tuple[int, int]) -> float:
-    """A focal length, within a quarter, that explains views of a target, from nothing.
+    """A focal length, within a quarter, that explains views of a target, without a start.
 
     The principal point is taken in the middle and the lens without distortion. Of some focal
-    lengths the one is returned for which poses of the target miss least.
+    lengths the one with the least residuals of the target's poses is returned.
 
     Args:
         pixels: (N, 2) of each view; NaN where not seen.
@@ -172,7 +172,7 @@ def first_focal_px(pixels: Sequence[Array], points: Array, size: tuple[int, int]
 
 
 def _homography_miss(centred: Array, points: Array, focal_px: float) -> float:
-    """Mean squared miss, px^2, of the best pose under one focal length."""
+    """Mean squared residual, px^2, of the best pose under one focal length."""
     known = np.isfinite(centred).all(axis=1)
     tangents = centred[known] / focal_px
     misses = [np.inf]
@@ -186,7 +186,7 @@ def _homography_miss(centred: Array, points: Array, focal_px: float) -> float:
 def first_cam_from_rig(
     cameras: Mapping[str, FlatPortCamera], views: Sequence[TargetView], points: Array
 ) -> dict[str, RigidTransform]:
-    """How cameras stand to the first of them, from the target's poses in each.
+    """Poses of the cameras relative to the first, from the target's poses in each.
 
     Args:
         cameras: near the truth.

@@ -40,12 +40,12 @@ MODELS = ("OPENCV", "FULL_OPENCV")
 
 @dataclass(frozen=True, kw_only=True)
 class Conversion:
-    """What to convert, and what may be changed or left out on the way."""
+    """What to convert, and what may be changed or left out."""
 
     source: Path
     target: Path
     source_format: str | None = None
-    """By name; found from the file when None."""
+    """Format of the source; detected from the file when None."""
     target_format: str | None = None
     reading: ReadOptions = field(default_factory=ReadOptions)
     names: tuple[str, ...] = ()
@@ -65,7 +65,7 @@ class Conversion:
 
     @property
     def port(self) -> dict[str, float]:
-        """Fields of the port to set, of `FlatPortCamera`."""
+        """Fields of `FlatPortCamera` to set for the port."""
         given = {
             "port_distance_m": None
             if self.port_distance_mm is None
@@ -79,7 +79,7 @@ class Conversion:
 
 @dataclass(frozen=True, kw_only=True)
 class Price:
-    """What a stand-in without port costs against the exact camera."""
+    """Errors of a stand-in without port against the exact camera."""
 
     model: str
     near_m: float
@@ -157,7 +157,7 @@ def fitted(rig: Rig, target: CalibrationFormat, task: Conversion) -> tuple[Rig, 
     """The part of a rig that a format holds, and notes of what was left out as requested.
 
     Raises:
-        CalibrationError: something would be lost that nobody allowed to be lost.
+        CalibrationError: something would be lost without permission.
     """
     where = f"{task.target}: {target.title} cannot hold"
     notes = []
@@ -247,7 +247,7 @@ def _summary(
 
 
 def in_water(rig: Rig, near_m: float, far_m: float, model: str) -> tuple[Rig, Mapping[str, Price]]:
-    """The rig that other software can use under water without knowing of ports.
+    """The rig for other software under water that has no port model.
 
     Each camera is the best fit, over the frame and the interval of distances, of a camera with
     distortion that absorbs the refraction; its centre lies next to the entrance pupil, and the

@@ -38,7 +38,7 @@ def read_yaml(path: Path) -> Fields:
     """A YAML file whose top is a mapping.
 
     Raises:
-        CalibrationError: the file is missing, no YAML, or no mapping of text keys.
+        CalibrationError: the file is missing, not YAML, or not a mapping of text keys.
     """
     text = read_text(path)
     try:
@@ -55,7 +55,7 @@ def read_json_fields(path: Path) -> Fields:
     """A JSON file whose top is a mapping, or a list, which is then found below the key `list`.
 
     Raises:
-        CalibrationError: the file is missing or no JSON.
+        CalibrationError: the file is missing or not JSON.
     """
     try:
         value = json.loads(read_text(path))

@@ -1,4 +1,4 @@
-"""Files of other tools, read with care: bounded, checked value by value, faults named by key."""
+"""Files of other tools, read safely: bounded, checked value by value, faults named by key."""
 
 import math
 import re
@@ -16,11 +16,11 @@ from alice_survey.base.frames import Array
 _LARGEST_BYTES = 1 << 20
 _MOST_PARTS = 5000
 """Lists, mappings and tags. Parsers recurse: this bounds how deep (OpenCV's exhausts memory at some
-hundred thousand levels, and stands 20,000)."""
+hundred thousand levels, and handles 20,000)."""
 _DEEPEST = 20
 """Lists in lists that hold numbers."""
 _ROTATION_TOLERANCE = 1e-3
-"""How far written digits may leave a matrix from a rotation (four decimals and better pass)."""
+"""Tolerance of a rotation matrix written with few digits (four decimals and better pass)."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
@@ -34,7 +34,7 @@ class Fields:
     """Keys that lead here, such as `cam0.`."""
 
     def fault(self, key: str, text: str) -> CalibrationError:
-        """What is wrong with a key, as one line that names the file."""
+        """Error about a key, as one line that names the file."""
         return CalibrationError(f"{self.path}: {self.prefix}{key} {text}")
 
     def __contains__(self, key: str) -> bool:
@@ -117,7 +117,7 @@ class Fields:
         """A 3 x 3 matrix read from `key` as a rotation.
 
         Raises:
-            CalibrationError: it is none.
+            CalibrationError: it is not one.
         """
         off = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
         if off > _ROTATION_TOLERANCE or np.linalg.det(matrix) < 0:

@@ -51,8 +51,8 @@ def read_camera(
 
     Args:
         fields: where both are.
-        matrix_key: of the 3 x 3 matrix.
-        distortion_key: of 4, 5, 8, 12 or 14 coefficients; None when there is no distortion.
+        matrix_key: key of the 3 x 3 matrix.
+        distortion_key: key of 4, 5, 8, 12 or 14 coefficients; None when there is no distortion.
         size: width and height, px.
 
     Raises:
@@ -87,7 +87,7 @@ def camera_in_air(
 
     Args:
         fields: where the numbers come from.
-        key: of the focal lengths, named when they are wrong.
+        key: key of the focal lengths, named when they are wrong.
         size: width and height, px.
         lens: fx, fy, cx, cy in this project's pixels.
         coefficients: of the distortion, by this project's names.
@@ -121,7 +121,7 @@ def behind_port(fields: Fields, key: str, camera: FlatPortCamera, **port: Any) -
 
     Args:
         fields: where the port is.
-        key: of the port.
+        key: key of the port.
         camera: in air.
         **port: fields of `FlatPortCamera`.
 

@@ -1,4 +1,4 @@
-"""The formats there are: how each is read and written, what it holds, how it is recognised."""
+"""All formats: how each is read and written, what it holds, how it is recognised."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Rigs from the pieces that files give, and with parts taken away or put on."""
+"""Rigs assembled from files, and with parts removed or added."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ UNKNOWN_MOUNT = RigidTransform.from_components([0.0, 0.0, 0.0], BODY_FROM_NADIR_
 
 @dataclass(frozen=True, kw_only=True)
 class ReadOptions:
-    """What a file may leave open."""
+    """Values that a file may lack."""
 
     image_size: tuple[int, int] | None = None
     """Width and height, px."""
@@ -53,7 +53,7 @@ def assemble(
     """A rig of cameras and poses in the units of a file; the first camera becomes the reference.
 
     Raises:
-        CalibrationError: a name is unfit or there twice.
+        CalibrationError: a name is invalid or occurs twice.
     """
     plain = [camera_name(path, name) for name in names]
     if len(set(plain)) != len(plain):
@@ -101,7 +101,7 @@ def renamed(rig: Rig, names: Sequence[str]) -> Rig:
     """The same rig with other names of its cameras, in order.
 
     Raises:
-        CalibrationError: too few or too many names, one twice, or one that is unfit.
+        CalibrationError: too few or too many names, one twice, or one that is invalid.
     """
     if len(names) != len(rig.cameras) or len(set(names)) != len(names):
         raise CalibrationError(
@@ -127,7 +127,7 @@ def renamed(rig: Rig, names: Sequence[str]) -> Rig:
 
 
 def referenced(rig: Rig) -> Rig:
-    """The same rig counted from its first camera, whose pose becomes the identity."""
+    """The same rig relative to its first camera, whose pose becomes the identity."""
     rig_from_first = rig.cam_from_rig[rig.reference].inv()
     poses = {name: pose * rig_from_first for name, pose in rig.cam_from_rig.items()}
     poses[rig.reference] = RigidTransform.identity()
@@ -151,7 +151,7 @@ def own_keys(fields: Fields, rig: Rig) -> Rig:
 
 
 def with_port(rig: Rig, port: Mapping[str, Any]) -> Rig:
-    """Every camera of a rig behind a port; what was known of the numbers it had is forgotten.
+    """Every camera of a rig behind a port; the covariance of replaced numbers is dropped.
 
     Args:
         rig: cameras in air, or behind ports some of whose numbers change.

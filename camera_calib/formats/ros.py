@@ -157,7 +157,7 @@ def _rectified(second_from_first: RigidTransform, axis: int) -> tuple[Array, Arr
 
     Each takes half of the turn between the cameras, then both what is left to the axis, as
     `cv2.stereoRectify` does; that one takes turns below 1e-5 rad for none, so that the pose could
-    not be had back from its rotations.
+    not be recovered from its rotations.
     """
     half = Rotation.from_rotvec(-0.5 * second_from_first.rotation.as_rotvec())
     shift = half.apply(second_from_first.translation)

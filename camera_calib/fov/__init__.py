@@ -1,1 +1,1 @@
-"""Field of view, focus, stereo and blur behind a flat port, and what the paper says of them."""
+"""Field of view, focus, stereo and blur behind a flat port, and the paper's values."""

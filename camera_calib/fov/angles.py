@@ -1,4 +1,4 @@
-"""What a flat port costs with growing field of view: nothing sudden happens at 70 degrees."""
+"""Errors of a flat port against the field of view: nothing sudden happens at 70 degrees."""
 
 import math
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ RELIEF = 0.25
 """Working ranges from (1 - this) to (1 + this) times the altitude: 1.5 to 2.5 m at 2 m."""
 
 _TEMPERATURE_C, _SALINITY_PSU = 20.0, 35.0
-"""Of the water whose dispersion is taken; it hardly depends on them."""
+"""Conditions of the water for its dispersion, which hardly depends on them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,13 +39,13 @@ class AngleRow:
     fov_water_deg: float
     """Full angle of the diagonal after the port."""
     displacement_px: float
-    """How far outwards a corner's picture lies from where the paraxial pinhole would see it."""
+    """Outward shift of a corner's picture from where the paraxial pinhole would see it."""
     displacement_percent: float
     """The same over the distance of that spot from the centre."""
     viewpoint_shift_mm: float
-    """Where a corner's ray in water meets the axis minus where central rays do."""
+    """Place where a corner's ray in water meets the axis minus that of central rays."""
     residual_rms_px: float
-    """Left by the best virtual pinhole, warped at the working range, over frame and relief."""
+    """Residual of the best virtual pinhole, warped at the working range, over frame and relief."""
     residual_max_px: float
     chromatic_px: float
     """Blue (460 nm) minus red (600 nm) in the corner of a colour camera, without correction."""
@@ -97,7 +97,7 @@ def _camera(config: CameraConfig, n_water: float, angle_deg: float) -> FlatPortC
 
 
 def _displacement(camera: FlatPortCamera, altitude_m: float) -> tuple[float, float]:
-    """Of the corner, in px and percent."""
+    """Distortion of the corner, in px and percent."""
     floor_z = camera.port_distance_m + camera.glass_thickness_m + altitude_m
     radius_px = math.hypot(camera.cx_px, camera.cy_px)
     spot = camera.at_depth(np.zeros((1, 2)), floor_z)[0]

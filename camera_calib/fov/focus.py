@@ -1,6 +1,6 @@
 """Focus and depth of field through a flat port, on the axis and towards the corners.
 
-A plane surface makes of a point in water two line images in air, one for the rays in the plane of
+A plane surface forms two line images in air of a point in water, one for the rays in the plane of
 incidence (tangential) and one for those across it (sagittal); on the axis they coincide. Along a
 ray that meets the port at the angle a in air, and b in the glass and c in the water, of path
 lengths A, G and W, the images appear at the distances from the entrance pupil
@@ -31,7 +31,7 @@ class FocusedLens:
     pixel_m: float
     """Pitch of the sensor."""
     focus_m: float
-    """From the entrance pupil to the plane in air that is sharp."""
+    """Distance from the entrance pupil to the plane in air that is sharp."""
 
     def __post_init__(self) -> None:
         if not self.focus_m > self.focal_m:
@@ -70,14 +70,14 @@ class FocusedLens:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ApparentDepths:
-    """Where a sea floor seems to be along the camera's axis, for some pixels.
+    """Apparent depth of a sea floor along the camera's axis, for some pixels.
 
     Apparent depth in air is `offset_m + slope * altitude_m`; the last axis holds tangential and
     sagittal.
     """
 
     offset_m: Array
-    """(N, 2): what the port adds."""
+    """(N, 2): contribution of the port."""
     slope: Array
     """(N, 2): 1 / n_water on the axis."""
 
@@ -99,7 +99,7 @@ class ApparentDepths:
 
 
 def apparent_distance_m(camera: FlatPortCamera, altitude_m: float) -> float:
-    """Where the sea floor seems to be to the entrance pupil, near the axis of the port."""
+    """Apparent depth of the sea floor from the entrance pupil, near the axis of the port."""
     air = camera.port_distance_m + camera.glass_thickness_m / camera.n_glass
     return air + altitude_m / camera.n_water
 

@@ -1,9 +1,9 @@
-"""The paper's table of its two lenses, and its claims on optics that a number decides.
+"""The paper's table of its two lenses, and its claims on optics that can be computed.
 
 The paper (Gutnik, Avni, Treibitz, Groper 2021) states what its lenses see at 2 m (its table of
 section III.B), trusts a flat port up to 70 degrees, and sets focus and aperture in its section
-VII.A. It names neither the index of the water, nor the port, nor a circle of confusion; every check
-says which it takes. Other readings, and where the paper rounds, are in docs/paper-optics.md.
+VII.A. It gives neither the index of the water, nor the port, nor a circle of confusion; each check
+states its values. Other readings, and where the paper rounds, are in docs/paper-optics.md.
 """
 
 import math
@@ -51,7 +51,7 @@ class PaperCheck:
     unit: str
     computed: float
     paper: str
-    """As printed."""
+    """Value as printed."""
 
     @property
     def difference(self) -> float:
@@ -76,11 +76,11 @@ class PaperCheck:
 
 @dataclass(frozen=True, kw_only=True)
 class PaperClaim:
-    """A claim that the paper makes in words, and the number that decides it."""
+    """A claim of the paper in words, and the number that decides it."""
 
     claim: str
     assumption: str
-    """What is taken where the paper is silent."""
+    """Assumption where the paper states nothing."""
     computed: float
     unit: str
     least: float = 0.0
@@ -103,7 +103,7 @@ class PaperValidation:
     table: tuple[PaperCheck, ...]
     claims: tuple[PaperClaim, ...]
     angles: tuple[AngleRow, ...]
-    """What happens up to and beyond 70 degrees."""
+    """Errors up to and beyond 70 degrees."""
 
     @property
     def passed(self) -> bool:

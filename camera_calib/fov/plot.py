@@ -45,7 +45,7 @@ def draw_fov(
         table: rows of all lenses at given altitudes.
         altitudes_m: altitudes of interest; the curves go some way beyond them.
         choices: circle of confusion, focus, matching noise.
-        speeds_mps: of the blur curves.
+        speeds_mps: speeds of the blur curves.
         exposures_s: of interest; marked.
         allowed_px: blur that is allowed; marked.
         angles: distortion against the field of view.

@@ -36,7 +36,7 @@ TRUSTED_FOV_DEG = 70.0
 
 @dataclass(frozen=True, kw_only=True)
 class FovChoices:
-    """What a table of fields of view takes besides lenses, altitudes, water and port."""
+    """Settings of a table of fields of view besides lenses, altitudes, water and port."""
 
     coc_px: float = 1.0
     """Largest blur circle that counts as sharp."""
@@ -54,7 +54,7 @@ class FovChoices:
 
 @dataclass(frozen=True, kw_only=True)
 class FovRow:
-    """What one lens sees from one altitude. Altitude is that of the port's outer glass.
+    """View of one lens from one altitude. Altitude is that of the port's outer glass.
 
     The sea floor is level and square to the axis of the left (or only, or reference) camera. What
     does not exist (the stereo of one camera, a frame that is nowhere sharp) is NaN.
@@ -129,7 +129,7 @@ class BlurRow:
     blur_px: float
     allowed_px: float
     longest_exposure_s: float
-    """For which the blur is `allowed_px`."""
+    """Longest exposure for which the blur is `allowed_px`."""
 
     def to_json(self) -> dict[str, Any]:
         """All fields as JSON values."""
@@ -186,7 +186,7 @@ def rig_fov_table(
     Args:
         rig: the first camera is the left one, the second its partner.
         altitudes_m: of the first camera's outer glass, where the normal of its pupil meets it.
-        camera_config: `pixel_um` and `f_number`, which a rig does not know; the rest is not used.
+        camera_config: `pixel_um` and `f_number`, which a rig does not have; the rest is not used.
         choices: circle of confusion, focus, matching noise.
 
     Returns:
@@ -208,7 +208,7 @@ def blur_table(
     exposures_s: Sequence[float],
     allowed_px: float,
 ) -> list[BlurRow]:
-    """How far the central pixel moves over the sea floor while it is exposed.
+    """Motion of the central pixel over the sea floor during the exposure.
 
     Args:
         rows: lenses and altitudes.
@@ -239,7 +239,7 @@ def blur_table(
 
 
 def check_range(what: str, values: Sequence[float], least: float, most: float, unit: str) -> None:
-    """Refuse numbers that are out of range or not finite.
+    """Reject numbers that are out of range or not finite.
 
     Raises:
         ConfigError: names the first of them and what is allowed.
@@ -379,7 +379,7 @@ def stereo_overlap(rig: Rig, floor_z_m: float) -> float:
 
 
 def disparity_per_m(rig: Rig, floor_z_m: float) -> float:
-    """How fast a point that slides along its left ray moves in the right picture, px/m.
+    """Shift in the right picture per distance moved along the left ray, px/m.
 
     The point lies on the sea floor below the middle of the pair; NaN where one camera misses it,
     and for a single camera. The noise of a disparity over this is the depth precision.

@@ -223,7 +223,7 @@ def _verdict(check: PaperCheck | PaperClaim) -> str:
 
 
 def angles_table(angles: Sequence[AngleRow]) -> TextTable:
-    """What the port does against the lens's angle."""
+    """Effects of the port against the lens's angle."""
     first = angles[0]
     return TextTable(
         title=(

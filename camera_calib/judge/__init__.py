@@ -1,1 +1,1 @@
-"""What a calibration is worth: measures, plots and the page that shows them."""
+"""Quality of a calibration: measures, plots and the page that shows them."""

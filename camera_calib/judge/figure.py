@@ -33,7 +33,7 @@ DIVERGING = LinearSegmentedColormap.from_list(
 WIDTH_IN = 10.4
 _MOST_LABELS = 45
 _WIDE = 5.0
-"""Largest over least value from which levels go by factors."""
+"""Ratio of largest to least value from which levels are logarithmic."""
 _FINE, _COARSE, _DECADES = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0), (1.0, 2.0, 5.0), (1.0, 3.0)
 _MOST_LEVELS = 11
 
@@ -47,7 +47,7 @@ def png(height_in: float, draw: Callable[[Sheet], None], width_in: float = WIDTH
 
 
 def colour(index: int) -> str:
-    """Of a camera by its place in the rig."""
+    """Colour of a camera by its place in the rig."""
     return INKS[index % len(INKS)]
 
 
@@ -110,7 +110,7 @@ def finish_profile(above: Axes, below: Axes, label: str, noise: float) -> None:
 
 
 def shared_levels(maps: Sequence[Array]) -> Array:
-    """Some ten round numbers for maps together: evenly spaced, or by factors where values differ.
+    """About ten round levels for maps together: evenly spaced, or by factors where values differ.
 
     Factors show the middle of a frame as well as its corners, where an uncertainty may be a hundred
     times larger.

@@ -19,19 +19,19 @@ _FEWEST_IN_BIN = 8
 COVERED_REACH = 0.75
 """A corner of the frame is covered when a point lies beyond this share of both half sides."""
 TILTED_DEG = 15.0
-"""A view tilted by less tells little of focal length and port."""
+"""A view tilted by less gives little information on focal length and port."""
 CORNERS = ("top left", "top right", "bottom left", "bottom right")
 
 
 def within_gate(residuals_px: Array, noise_px: Array | float) -> NDArray[np.bool_]:
-    """Which residuals (..., 2) are known and no outliers, by the noise (...) of a coordinate."""
+    """Which residuals (..., 2) are known and not outliers, by the noise (...) of a coordinate."""
     squared = (residuals_px**2).sum(axis=-1)
     known: NDArray[np.bool_] = squared <= (GATE_SIGMAS * noise_px) ** 2
     return known
 
 
 def rms_length_px(residuals_px: Array, noise_px: Array | float) -> float:
-    """Root mean square length of the residuals (..., 2) that are no outliers; NaN for none."""
+    """Root mean square length of the residuals (..., 2) that are not outliers; NaN for none."""
     kept = residuals_px[within_gate(residuals_px, noise_px)]
     return float(np.sqrt((kept**2).sum(axis=-1).mean())) if len(kept) else float("nan")
 
@@ -50,7 +50,7 @@ class PictureFit:
     range_m: float
     """Mean distance of its points from the entrance pupil along the axis."""
     tilt_deg: float
-    """Between the target's normal and the camera's axis."""
+    """Angle between the target's normal and the camera's axis."""
 
     def to_json(self) -> dict[str, Any]:
         """JSON values."""
@@ -100,15 +100,15 @@ class CameraResiduals:
     pixels: Array
     """(N, 2) as measured."""
     residuals_px: Array
-    """(N, 2) projected less measured."""
+    """(N, 2) projected minus measured."""
     sigma_px: Array
     """(N,) expected standard deviation of a coordinate: the noise of the point's picture."""
     view: NDArray[np.intp]
     """(N,) number of the view."""
     radius_px: Array
-    """(N,) from the principal point."""
+    """(N,) distance from the principal point."""
     incidence_deg: Array
-    """(N,) between the ray in water and the port's normal."""
+    """(N,) angle between the ray in water and the port's normal."""
     outward: Array
     """(N, 2) unit vectors away from the principal point."""
 
@@ -172,14 +172,14 @@ class Profile:
     edges: Array
     """(B + 1,) ends of the bins."""
     count: NDArray[np.intp]
-    """(B,) points."""
+    """(B,) number of points."""
     rms_px: Array
-    """(B,) of one coordinate."""
+    """(B,) rms of one coordinate."""
     expected_px: Array
-    """(B,) that rms, were there noise only; give or take expected / (2 sqrt(count))."""
+    """(B,) rms from noise alone; its sigma is expected / (2 sqrt(count))."""
     outward_px: Array
     """(B,) mean of the part away from the principal point: 0 but for noise if the model is right,
-    give or take expected / sqrt(count)."""
+    with sigma expected / sqrt(count)."""
 
     @property
     def centres(self) -> Array:
@@ -234,7 +234,7 @@ def profile(
 
 
 def largest_radius_px(camera: FlatPortCamera) -> float:
-    """From the principal point to the farthest corner of the frame."""
+    """Distance from the principal point to the farthest corner of the frame."""
     return float(radius_px(camera, camera.border(1)).max())
 
 
@@ -251,7 +251,7 @@ def residual_profiles(camera: FlatPortCamera, seen: CameraResiduals) -> "Profile
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Profiles:
-    """Of one camera."""
+    """Residual profiles of one camera."""
 
     radius: Profile
     incidence: Profile
@@ -259,7 +259,7 @@ class Profiles:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Coverage:
-    """Where in one frame points were seen."""
+    """Distribution of the points over one frame."""
 
     counts: NDArray[np.intp]
     """(rows, columns) points by cell of the frame."""
@@ -287,7 +287,7 @@ class Coverage:
 
 
 def coverage(camera: FlatPortCamera, pixels: Array, columns: int = 10, rows: int = 8) -> Coverage:
-    """Count pixels (N, 2) by cell of the frame, and see how near they come to its corners."""
+    """Count pixels (N, 2) by cell of the frame, and measure how near they come to its corners."""
     size = np.array([camera.width_px, camera.height_px])
     cell = np.floor(pixels / size * [columns, rows]).astype(int)
     inside = ((cell >= 0) & (cell < [columns, rows])).all(axis=1)
@@ -305,7 +305,7 @@ def coverage(camera: FlatPortCamera, pixels: Array, columns: int = 10, rows: int
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Spread:
-    """How the target was held, seen from one camera."""
+    """Poses of the target, seen from one camera."""
 
     range_m: Array
     """(V,) distance of the target's middle along the axis."""

@@ -1,4 +1,4 @@
-"""What is left of a homography between a flat target and its picture, without lens and port.
+"""Residuals of a homography between a flat target and its picture, without lens and port.
 
 Through a perfect model a flat target is seen as a plane by a pinhole, so its points map to the
 pinhole's pixels by a homography, whatever its pose. The flat port has no single centre: a pixel's
@@ -28,11 +28,11 @@ from camera_calib.judge.fit_quality import (
 )
 
 _FEWEST_POINTS = 12
-"""Of a view: 8 unknowns against 24 coordinates."""
+"""Fewest points of a view: 8 unknowns against 24 coordinates."""
 _FLAT_SHARE = 1e-6
 """A target is flat if its points leave a plane by less than this share of its size."""
 _OUTLYING = 6.0
-"""Length over the median length: 7 sigmas of normal noise."""
+"""Outlier limit of length over median length: 7 sigmas of normal noise."""
 _HALF_STEP_PX = 0.5
 _OUTER_SHARE = 0.7
 """Residuals beyond this share of the largest radius with points are compared with the others."""
@@ -40,23 +40,23 @@ _OUTER_SHARE = 0.7
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HomographyTest:
-    """Of one camera, over all views."""
+    """Homography residuals of one camera, over all views."""
 
     profile: Profile
-    """Against the radius; expected is what the inner points' residuals let one expect."""
+    """Residuals against the radius; expected as predicted from those of the inner points."""
     views: int
     inner_px: float
-    """Standard deviation of one coordinate of the inner points, freedom of the fits considered."""
+    """Standard deviation of one coordinate of the inner points, by the degrees of freedom."""
     outer_px: float
     """The same of the outer points."""
     outer_from_px: float
     """Radius at which outer points begin."""
     outer_count: int
-    """Outer points."""
+    """Number of outer points."""
 
     @property
     def excess_px(self) -> float:
-        """What the outer residuals have beyond the inner ones and chance (3 sigma); 0 if nothing.
+        """Excess of the outer residuals over the inner ones and chance (3 sigma); 0 if none.
 
         The variance of n points, two coordinates each, has a relative sigma of 1 / sqrt(n).
         """
@@ -162,11 +162,11 @@ def homography_residuals(
         pinhole: the ideal camera that looks instead.
         target_points: (N, 3) on one plane, N > 4.
         pixels: (N, 2) as measured.
-        cam_from_target: tells how far away the points are.
+        cam_from_target: gives the distances of the points.
 
     Returns:
-        Residuals (N, 2), fitted less measured, in the camera's pixels; and (N,) the share of the
-        noise's variance that the fit leaves in each (1 less its leverage).
+        Residuals (N, 2), fitted minus measured, in the camera's pixels; and (N,) the share of the
+        noise's variance that the fit leaves in each (1 minus its leverage).
     """
     depth = cam_from_target.apply(target_points)[:, 2]
 

@@ -49,9 +49,9 @@ from camera_calib.judge.validation import (
 from camera_calib.rig import Rig
 
 DESIGN_RANGE_M = 2.0
-"""Where the vehicle works; used when the views come near to it."""
+"""Usual working range; used if the views are close to it."""
 _RANGE_STEPS = np.array([0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.0])
-"""Distances looked at, in working ranges: 0.5 to 10 m for 2 m."""
+"""Distances evaluated, in working ranges: 0.5 to 10 m for 2 m."""
 _MAP_COLUMNS, _MAP_ROWS = 25, 21
 _DEG = math.degrees(1.0)
 
@@ -63,13 +63,13 @@ class Parameter:
     name: str
     value: float
     sigma: float | None
-    """None: it was held."""
+    """Standard deviation; None: it was held."""
     unit: str
     most_alike: str
     """The parameter it correlates with most; empty when held or alone."""
     correlation: float
     prior: bool
-    """Something was known of it beforehand."""
+    """Whether it had a prior."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,7 +85,7 @@ class RangeSigma:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraJudgement:
-    """What is said of one camera."""
+    """Measures of one camera."""
 
     seen: CameraResiduals
     profiles: Profiles
@@ -109,12 +109,12 @@ class StereoMap:
     depth_m: Array
     """(N,) sigma of the distance."""
     shape_m: Array
-    """(N,) the same after the rigid motion of all points that leaves least."""
+    """(N,) the same after the best rigid motion of all points."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Judgement:
-    """What a report says of a calibration."""
+    """Contents of a calibration report."""
 
     calibration: Calibration
     held: HeldOut | None
@@ -128,9 +128,9 @@ class Judgement:
     """By distance; empty for one camera."""
     stereo_map: StereoMap | None
     lengths: LengthErrors | None
-    """On the views used; None for one camera."""
+    """Errors on the views used; None for one camera."""
     held_lengths: LengthErrors | None
-    """On held-out views, in the rig calibrated without them."""
+    """Errors on held-out views, in the rig calibrated without them."""
     hold_out: HoldOutScore | None
 
     @property
@@ -144,13 +144,13 @@ class Judgement:
 def judge(
     calibration: Calibration, held: HeldOut | None, working_range_m: float | None = None
 ) -> Judgement:
-    """Measure everything that the report shows.
+    """Compute everything that the report shows.
 
     Args:
         calibration: with its rig's covariance.
         held: held-out views, if there were any.
         working_range_m: distance at which the rig will work; 2 m if not given, or, where the views
-            were taken at quite other distances, the views' median.
+            were taken at very different distances, the views' median.
 
     Raises:
         CalibrationError: the rig has no covariance.
@@ -278,7 +278,7 @@ def rig_parameters(rig: Rig, with_prior: Collection[str] = ()) -> tuple[Paramete
 
     Args:
         rig: with its covariance.
-        with_prior: names of those of which something was known beforehand.
+        with_prior: names of those that had a prior.
     """
     covariance = covariance_of(rig)
     names = [f"{c}.{p}" for c in rig.cameras for p in PARAMETERS]

@@ -145,7 +145,7 @@ def plot_lengths(judged: Judgement) -> bytes:
 
 
 def plot_homographies(judged: Judgement) -> bytes:
-    """What is left of homographies against the radius: rms and mean outward part."""
+    """Residuals of homographies against the radius: rms and mean outward part."""
     found = {n: c.homography for n, c in judged.cameras.items() if c.homography is not None}
 
     def draw(figure: Sheet) -> None:
@@ -200,7 +200,7 @@ def plot_coverage(judged: Judgement) -> bytes:
 
 
 def _mark_corner(axes: Axes, corner: str, size: tuple[int, int]) -> None:
-    """A red outline around what a covered corner would have a point in."""
+    """A red outline around the region in which a covered corner has a point."""
     wide, high = ((1 - COVERED_REACH) * side / 2 for side in size)
     x = 0.0 if "left" in corner else size[0] - wide
     y = 0.0 if "top" in corner else size[1] - high
@@ -210,7 +210,7 @@ def _mark_corner(axes: Axes, corner: str, size: tuple[int, int]) -> None:
 
 
 def plot_spread(judged: Judgement) -> bytes:
-    """How the target was held: tilts, and distance against turn."""
+    """Poses of the target: tilts, and distance against turn."""
 
     def draw(figure: Sheet) -> None:
         left, right = axes_grid(figure, 2)[0]

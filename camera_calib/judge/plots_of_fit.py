@@ -25,14 +25,14 @@ from camera_calib.judge.figure import (
 from camera_calib.judge.judgement import Judgement, short_label
 
 _CELLS = 12
-"""Across a frame, whose residuals are averaged."""
+"""Cells across a frame, in which residuals are averaged."""
 _FEWEST_IN_CELL = 6
 _STRONG = 3.0
 """Mean length over noise of the mean from which an arrow is in colour: 1 % of cells by chance."""
 
 
 def plot_pictures(judged: Judgement) -> bytes:
-    """Rms of each picture, cameras side by side, and against its distance."""
+    """Rms of each picture, cameras next to each other, and against its distance."""
     views = [view.name for view in judged.calibration.views]
     cameras = list(judged.cameras)
 
@@ -68,7 +68,7 @@ def plot_pictures(judged: Judgement) -> bytes:
 
 
 def plot_vectors(judged: Judgement) -> bytes:
-    """Residuals over the frame: every one thin, the mean of each cell bold."""
+    """Residuals over the frame: each one thin, the mean of each cell bold."""
 
     def draw(figure: Sheet) -> None:
         for c, (axes, (name, camera)) in enumerate(
@@ -161,7 +161,7 @@ def plot_profiles(judged: Judgement) -> bytes:
 
 
 def plot_histogram(judged: Judgement) -> bytes:
-    """Residuals in units of their pictures' noise against the normal law."""
+    """Residuals in units of their pictures' noise against the normal distribution."""
 
     def draw(figure: Sheet) -> None:
         sigma_px = judged.calibration.sigma_px[..., None, None]
@@ -265,7 +265,7 @@ def plot_projection(judged: Judgement) -> bytes:
 
 
 def plot_ranges(judged: Judgement) -> bytes:
-    """Uncertainty against distance: projection, and what it does to stereo."""
+    """Uncertainty against distance: projection, and its effect on stereo."""
     stereo = judged.stereo
 
     def draw(figure: Sheet) -> None:

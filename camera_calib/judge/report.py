@@ -1,4 +1,4 @@
-"""The calibration report: one HTML page that stands alone, and its numbers as JSON."""
+"""The calibration report: one self-contained HTML page, and its numbers as JSON."""
 
 import math
 from collections.abc import Iterator
@@ -31,7 +31,7 @@ def write_report(
     """Write `report.html` and `report.json` into a folder.
 
     Args:
-        folder: is there already.
+        folder: an existing folder.
         calibration: with its rig's covariance.
         held_out: from `validation.hold_out`; None if no views could be held out.
         working_range_m: where the rig will work, for maps and stereo (see `judge`).
@@ -229,7 +229,7 @@ def _correlations_section(judged: Judgement) -> Section:
 
 
 def _uncertainty_section(judged: Judgement) -> Section:
-    """What the covariance means for pixels, points and lengths."""
+    """Effect of the covariance on pixels, points and lengths."""
     work = f"{judged.working_range_m:.3g} m"
     figures = [
         Figure(
@@ -405,7 +405,7 @@ def _lengths_section(judged: Judgement) -> Section:
 
 
 def _homographies_section(judged: Judgement) -> Section:
-    """What homographies leave."""
+    """Residuals of homographies."""
     if all(camera.homography is None for camera in judged.cameras.values()):
         return Section(
             title="Homographies",
@@ -434,7 +434,7 @@ def _homographies_section(judged: Judgement) -> Section:
 
 
 def _coverage_section(judged: Judgement) -> Section:
-    """Where points fell, and how the target was held."""
+    """Distribution of points, and poses of the target."""
     rows = []
     for name, camera in judged.cameras.items():
         views, reach = camera.spread, camera.coverage.corner_reach
@@ -495,7 +495,7 @@ def _coverage_section(judged: Judgement) -> Section:
 
 
 def _rejections_section(judged: Judgement) -> Section:
-    """What took no part, and why."""
+    """Pictures and points left out, and why."""
     rows = [
         (r.view, r.camera, f"{r.points}" if r.points else "whole picture", r.reason)
         for r in judged.calibration.rejections

@@ -1,4 +1,4 @@
-"""What a calibrated rig's covariance means, as a table for the command line."""
+"""Effects of a calibrated rig's covariance, as a table for the command line."""
 
 import math
 from dataclasses import asdict
@@ -32,8 +32,8 @@ def uncertainty_report(
 
     Args:
         path: `rig.json` with a covariance.
-        ranges_m: distances to look at; `RANGES_M` if none.
-        near_m: nearest distance of what poses are found from.
+        ranges_m: distances to evaluate; `RANGES_M` if none.
+        near_m: nearest distance of the points that poses are estimated from.
         far_m: farthest.
         noise_px: of one measured coordinate, for comparison.
 

@@ -1,7 +1,7 @@
-"""What the covariance of a calibrated rig means for pixels, points and lengths.
+"""Effect of a calibrated rig's covariance on pixels, points and lengths.
 
 Everything here is first order: a parameter error d moves a pixel by J d and has the covariance S,
-so the pixel's is J S J^T. The slopes J are the analytic ones of `FlatPortCamera`.
+so the pixel's is J S J^T. The derivatives J are the analytic ones of `FlatPortCamera`.
 """
 
 import math
@@ -17,9 +17,9 @@ from camera_calib.freedom import POSE
 from camera_calib.rig import Covariance, Rig
 
 _OVERLAP_GRID = 25
-"""Pixels a side of the reference frame at which the overlap of the cameras is looked for."""
+"""Pixels a side of the reference frame at which the overlap of the cameras is evaluated."""
 _EDGE_PX = 1e-6
-"""Beyond rounding: a point on the edge of a frame is in it."""
+"""Tolerance above rounding: a point on the edge of a frame is in it."""
 
 
 def covariance_of(rig: Rig) -> Covariance:
@@ -81,13 +81,13 @@ def rig_slopes(rig: Rig, camera: str, points_rig: Array) -> tuple[Array, Array, 
 
 
 def compensation(rig: Rig, camera: str, anchors_cam: Array) -> Array:
-    """How the pose that fits best follows each parameter's error, (6, P).
+    """Change of the best-fitting pose with each parameter's error, (6, P).
 
     A rotation and a translation of the anchors, small, in the camera's frame, chosen so that their
-    projections move least in all. mrcal's reprojection uncertainty does the same with the boards.
+    projections move least overall. mrcal's reprojection uncertainty does the same with the boards.
 
     Raises:
-        CalibrationError: the anchors do not hold a pose.
+        CalibrationError: the anchors do not determine a pose.
     """
     _, by_point, by_parameter = camera_slopes(rig, camera, anchors_cam)
     seen = np.isfinite(by_parameter).all(axis=(1, 2)) & np.isfinite(by_point).all(axis=(1, 2))
@@ -128,10 +128,10 @@ class ProjectionSigma:
     """How uncertain a projection is, along its worst direction, px; shaped as the pixels."""
 
     plain_px: Array
-    """Of a point fixed to the camera: what a rig that measures by itself suffers."""
+    """Uncertainty of a point fixed to the camera: applies to a rig that measures by itself."""
     compensated_px: Array
-    """Of a point fixed to what the camera sees, after the pose that fits best took what it can:
-    what pictures suffer whose poses are found from the pictures. mrcal reports this one."""
+    """Uncertainty of a point fixed to the scene, after the best-fitting pose compensates:
+    applies to pictures with poses estimated from them. mrcal reports this one."""
 
 
 def projection_sigma(
@@ -142,7 +142,7 @@ def projection_sigma(
     Args:
         rig: with its covariance.
         camera: which camera.
-        pixels: (..., 2) where to look.
+        pixels: (..., 2) where to evaluate.
         range_m: distance of the points from the entrance pupil along the axis.
         compensating: (6, P) from `compensation`; its anchors are best all points of the target that
             the camera saw.
@@ -169,7 +169,7 @@ def _worst_sigma(slopes: Array, matrix: Array) -> Array:
 
 
 def _triangulation(rig: Rig, points_rig: Array) -> tuple[Array, Array]:
-    """How triangulated points follow the parameters, (N, 3, P), and the pixels, (N, 3, 2C).
+    """Derivatives of triangulated points by the parameters, (N, 3, P), and pixels, (N, 3, 2C).
 
     Pixels are held and the point with the least reprojection error is taken: with G the slopes by
     the point, dp = -(G^T G)^-1 G^T J d. NaN where fewer than two cameras see a point.
@@ -202,9 +202,9 @@ def point_sigmas_m(rig: Rig, points_rig: Array) -> Array:
 
 
 def shape_sigmas_m(rig: Rig, points_rig: Array) -> Array:
-    """As `point_sigmas_m`, after the rigid motion of all points that leaves least: their shape.
+    """As `point_sigmas_m`, after the best rigid motion of all points: their shape.
 
-    A survey's frame takes up the motion; what is left bends what is measured.
+    A survey's frame takes up the motion; the rest bends the model.
     """
     follow, _ = _triangulation(rig, points_rig)
     known = np.isfinite(follow).all(axis=(1, 2))
@@ -273,21 +273,21 @@ def _seen_twice(rig: Rig, points_rig: Array) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, kw_only=True)
 class StereoSigma:
-    """What stereo suffers at one distance; NaN where no two cameras see the same."""
+    """Stereo uncertainty at one distance; NaN where no two cameras see the same."""
 
     range_m: float
     point_m: tuple[float, float, float]
-    """Right, down, forward: of a point in the middle of the overlap, by calibration alone."""
+    """Sigmas right, down, forward of a point mid-overlap, by calibration alone."""
     worst_point_m: float
-    """Forward, anywhere in the overlap, by calibration alone."""
+    """Largest sigma forward in the overlap, by calibration alone."""
     worst_shape_m: float
-    """Forward, anywhere in the overlap, after the rigid motion that leaves least."""
+    """Largest sigma forward in the overlap, after the best rigid motion."""
     noise_m: tuple[float, float, float]
-    """Of the same point as `point_m`, by the noise of its pixels alone."""
+    """Sigmas of the same point as `point_m`, by the noise of its pixels alone."""
     length_m: float
     """A length across the overlap: 1 m, or what fits."""
     length_sigma_m: float
-    """Of it, by calibration alone."""
+    """Sigma of the length, by calibration alone."""
 
 
 def stereo_sigma(rig: Rig, range_m: float, noise_px: float) -> StereoSigma:

@@ -1,12 +1,12 @@
-"""Tests of a calibration that its own residuals cannot fake.
+"""Tests of a calibration that are independent of its own residuals.
 
 - Held-out views: pictures that took no part, posed in the rig; their error against what noise and
   the rig's covariance predict.
 - Halves: two calibrations from disjoint views, and how far their projections lie apart (mrcal's
   cross-validation), against what their covariances predict.
 - Lengths: distances on the target, from triangulated points.
-- Homographies: a flat target through a perfect camera is a plane seen by a pinhole; what is left of
-  a homography per picture tells lens and port errors without any truth.
+- Homographies: a flat target through a perfect camera is a plane seen by a pinhole; residuals of
+  a homography per picture show lens and port errors without any truth.
 """
 
 from collections.abc import Callable, Sequence
@@ -45,15 +45,15 @@ class HeldOut:
     """Views that took no part in a calibration, and two calibrations from halves of the views."""
 
     used: Calibration
-    """Without the held-out views."""
+    """Calibration without the held-out views."""
     views: tuple[TargetView, ...]
-    """(H) held out."""
+    """(H) held-out views."""
     rig_from_target: RigidTransform
     """(H,) their poses, found in the rig of `used`."""
     residuals_px: Array
-    """(H, cameras, N, 2) projected less measured."""
+    """(H, cameras, N, 2) projected minus measured."""
     halves: tuple[Rig, Rig] | None
-    """Calibrated from every other view each; None where a half did not suffice."""
+    """Two rigs, each from every other view; None where a half did not suffice."""
 
 
 @progress.step("hold views out")
@@ -66,7 +66,7 @@ def hold_out(
         views: those that the calibration kept.
         calibrate: the calibration to be tested.
         locate: finds `rig_from_target` of one view in a rig, from the target's points.
-        every: one view in so many is held out.
+        every: one view in this many is held out.
 
     Returns:
         None, with a warning, where too few views are left to calibrate from.
@@ -107,7 +107,7 @@ def hold_out(
 def view_residuals(
     rig: Rig, view: TargetView, target_points: Array, rig_from_target: RigidTransform
 ) -> Array:
-    """Projected less measured, (cameras, N, 2); NaN where unseen."""
+    """Projected minus measured, (cameras, N, 2); NaN where unseen."""
     points_rig = rig_from_target.apply(target_points)
     residuals = np.full((len(rig.cameras), len(target_points), 2), np.nan)
     for c, (camera, model) in enumerate(rig.cameras.items()):
@@ -125,7 +125,7 @@ class HoldOutScore:
     points: int
     rms_px: float
     expected_px: float
-    """From the noise, and from the rig's covariance as far as a pose cannot take it up."""
+    """Rms expected from noise and the rig's covariance, as far as a pose cannot absorb it."""
     used_rms_px: float
     outliers: int
 
@@ -142,7 +142,7 @@ class HoldOutScore:
 
 
 def score_hold_out(held: HeldOut) -> HoldOutScore:
-    """Compare held-out residuals with what the calibration without them promises.
+    """Compare held-out residuals with what the calibration without them predicts.
 
     With G the slopes by a view's pose, J those by the rig's parameters and S their covariance, the
     residuals of a posed view are P (noise + J d), P = 1 - G (G^T G)^-1 G^T.
@@ -182,7 +182,7 @@ class HalvesDifference:
     pixels: Array
     """(R, C, 2) where."""
     difference_px: Array
-    """(R, C, 2) second less first."""
+    """(R, C, 2) second minus first."""
     expected_px: Array
     """(R, C) root mean square length of the difference by both covariances."""
 
@@ -205,7 +205,7 @@ def halves_difference(
     anchors_cam: Array,
     prior: Prior = NO_PRIOR,
 ) -> HalvesDifference:
-    """Compare two calibrations as mrcal compares models: over the frame, after the best pose.
+    """Compare two calibrations as mrcal does: over the frame, after the best pose.
 
     An error d of the prior's mean, of information I, moves a calibration of covariance S by S I d.
     Both halves have the same d, so that most of it does not show: what differs are the errors by
@@ -214,7 +214,7 @@ def halves_difference(
     Args:
         halves: the rigs.
         camera: which camera.
-        pixels: (R, C, 2) where to look.
+        pixels: (R, C, 2) where to evaluate.
         range_m: distance of the points along the axis.
         anchors_cam: (A, 3) points in the camera's frame that fix the pose between both.
         prior: what both calibrations took as known.
@@ -260,7 +260,7 @@ def _best_pose(first: FlatPortCamera, second: FlatPortCamera, anchors_cam: Array
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LengthErrors:
-    """Distances on the target, triangulated less true."""
+    """Distances on the target, triangulated minus true."""
 
     true_m: Array
     """(L,)"""
@@ -280,7 +280,7 @@ class LengthErrors:
     def scales(self) -> tuple[NDArray[np.intp], Array, Array]:
         """By view that has long lengths: its number, relative error, and weight.
 
-        The error is what long lengths have beyond their bias; the weight the inverse of their mean
+        The error is that of long lengths beyond their bias; the weight the inverse of their mean
         variance.
         """
         views = np.unique(self.view[self.long])
@@ -325,7 +325,7 @@ def length_errors(
     target_points: Array,
     noise_px: Array | float,
 ) -> LengthErrors:
-    """Triangulate what two or more cameras saw of each view and compare lengths with the target's.
+    """Triangulate the points of two or more cameras and compare lengths with the target's.
 
     With C the covariance of the difference of both points, u the length's direction, L the length
     and Q = 1 - u u^T, noise gives a length the bias tr(Q C) / 2L and the variance
@@ -334,7 +334,7 @@ def length_errors(
     Args:
         rig: calibrated.
         views: (V) where the cameras saw the target.
-        rig_from_target: (V,) its poses; they only tell the directions of the lengths.
+        rig_from_target: (V,) its poses; they only give the directions of the lengths.
         residuals_px: (V, cameras, N, 2); outliers among them take no part.
         target_points: (N, 3).
         noise_px: standard deviation of one coordinate, of all or of each picture (V, cameras).

@@ -1,6 +1,6 @@
 """Verdicts on a calibration: one line each, with the numbers and what to do.
 
-What the views do not constrain stands in the calibration's own warnings.
+What the views do not constrain is in the calibration's own warnings.
 """
 
 from collections.abc import Iterator
@@ -23,7 +23,7 @@ _SIGMA_LOOK, _SIGMA_BAD = 3.0, 10.0
 
 
 def verdicts(judged: Judgement) -> tuple[Verdict, ...]:
-    """All lines, the worst first."""
+    """All verdicts as lines, the worst first."""
     return tuple(worst_first(list(_lines(judged))))
 
 

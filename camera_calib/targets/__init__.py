@@ -1,1 +1,1 @@
-"""Calibration targets: what they look like, printed sheets, and their points found in pictures."""
+"""Calibration targets: their layouts, printed sheets, and detection of their points."""

@@ -1,7 +1,7 @@
 """Corners of checkered patterns to a fiftieth of a pixel: the crossing of two soft edges is fitted.
 
 OpenCV's `cornerSubPix` is good to about a tenth of a pixel on pictures with noise, which a stereo
-rig of 0.1 m baseline feels at the sea floor. Here the grey values around each corner are explained
+rig of 0.1 m baseline notices at the sea floor. Here the grey values around each corner are fitted
 by the product of two blurred edges, in linear light. The window follows the board: it is cut to the
 shape of its squares, and to a cross along the edges where markers or bits stand between them.
 """
@@ -32,7 +32,7 @@ _WHITE_NOISE = 4.0 * math.pi * _BLUR_PX**2
 """Variance of white noise over its variance after the blur."""
 _STEPS = 30
 _FARTHEST_PX, _FARTHEST = 1.5, 0.1
-"""How far from its start a corner may settle: the more of this, and of so many squares."""
+"""Largest distance of a corner from its start: the greater of this and of these squares."""
 _NARROWEST_PX, _WIDEST_PX = 0.2, 8.0
 _HALF_PX = 12
 _REACH = 0.45
@@ -53,7 +53,7 @@ class Corners:
     pixels: Array
     """(N, 2) from the outer corner of the first pixel; NaN rows were not fitted."""
     sigma_px: Array
-    """(N,) standard deviation of a coordinate, from the misses of the fit; NaN as above."""
+    """(N,) standard deviation of a coordinate, from the residuals of the fit; NaN as above."""
     contrast: Array
     """(N,) half the difference of black and white in linear light; above 0 where the square between
     the ways back along both steps is black, below 0 where it is white; NaN as above."""
@@ -264,7 +264,7 @@ def _descend(window: Array, used: NDArray[np.bool_], start: Array) -> tuple[Arra
 
 @compiled
 def _equations(window: Array, used: NDArray[np.bool_], q: Array) -> tuple[float, Array, Array]:
-    """Sum of squares of the misses, and the normal equations."""
+    """Sum of squared residuals, and the normal equations."""
     cost, normal, right = 0.0, np.zeros((9, 9)), np.zeros(9)
     slope = np.empty(9)
     c1, s1, c2, s2 = math.cos(q[2]), math.sin(q[2]), math.cos(q[3]), math.sin(q[3])

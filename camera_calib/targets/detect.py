@@ -2,7 +2,7 @@
 
 OpenCV finds the board or its markers, on a reduced picture where that suffices (`detect_board`);
 then every point is fitted at full resolution (`corners`). Of boards with markers any part may be
-seen. A plain chessboard's outer rows and columns must be seen: of a part nobody can say which part
+seen. A plain chessboard's outer rows and columns must be seen: otherwise it is unknown which part
 it is; corners in between may be hidden.
 """
 
@@ -42,13 +42,13 @@ Picture = NDArray[np.uint8] | NDArray[np.uint16]
 
 _FEWEST_POINTS = 6
 _FARTHEST_OFF = 0.2
-"""Of a point from where its neighbours say it is, in squares."""
+"""Largest distance of a point from its prediction by its neighbours, in squares."""
 _WEAKEST = 0.15
 """Contrast of a corner over the middle one of the picture."""
 _SECOND_LOOK = 0.5
-"""How much smaller the window is for points that did not fit."""
+"""Factors of smaller windows for points that did not fit."""
 SMALL_PX, LARGE_PX = 1000, 2000
-"""Longest sides of the reduced pictures that detectors look at."""
+"""Longest sides of the reduced pictures given to the detectors."""
 _DARK, _FLAT = 8, 4
 """Grey levels of 255 that the brightest pixels and the range of a usable picture exceed."""
 _AGREED = 0.7
@@ -58,16 +58,16 @@ _LEAST_PX = 32
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Detection:
-    """What was found of a target in one picture."""
+    """Points of a target found in one picture."""
 
     pixels: Array | None
     """(N, 2) from the outer corner of the first pixel, NaN rows not found; None: not the target."""
     sigma_px: Array | None = None
-    """(N,) standard deviation of a coordinate that the misfit of each corner stands for."""
+    """(N,) standard deviation of a coordinate, from the misfit of each corner."""
     refused: str | None = None
     """Why the picture was refused."""
     dropped: Mapping[str, int] = field(default_factory=dict)
-    """How many points were seen but not used, by reason."""
+    """Number of points seen but not used, by reason."""
 
     def rejections(self, view: str, camera: str) -> tuple[Rejection, ...]:
         """What took no part, for a calibration's report."""
@@ -98,7 +98,7 @@ def detect(target: Target, picture: Picture) -> Array | None:
 
 
 def detect_with_reasons(target: Target, picture: Picture) -> Detection:
-    """As `detect`, and what was refused and why."""
+    """As `detect`, with rejected points and the reasons."""
     grey = as_grey(picture)
     poor = unusable(grey)
     if poor is not None:
@@ -196,7 +196,7 @@ def _fit_with(target: Target, grey: Grey, near: Array, steps: Array, shrink: flo
 
 
 def _second_look(target: Target, grey: Grey, corners: Corners) -> Corners:
-    """Look again, in smaller windows, where the neighbours of unfitted points say they must be."""
+    """Fit again, in smaller windows, where neighbours predict the unfitted points."""
     used = corners.states == FITTED
     if used.all() or used.sum() < 4:
         return corners
@@ -212,7 +212,7 @@ def _second_look(target: Target, grey: Grey, corners: Corners) -> Corners:
 
 
 def _without_astray(target: Target, corners: Corners) -> Corners:
-    """Leave out corners far from where the others say, of the wrong colours or too faint."""
+    """Leave out corners far from their prediction, of the wrong colours or too faint."""
     fitted = corners.states == FITTED
     if fitted.sum() < 5:
         return corners
@@ -282,7 +282,7 @@ def reduced(grey: Grey, longest_px: int) -> Reduced:
 
 
 def unusable(grey: Grey) -> str | None:
-    """Why nobody could find anything in a picture, if so."""
+    """Reason why a picture is unusable, if it is."""
     if min(grey.shape) < _LEAST_PX:
         return f"only {grey.shape[1]} x {grey.shape[0]} px"
     low, high = np.percentile(reduced(grey, SMALL_PX).picture, [0.1, 99.9])
@@ -309,7 +309,7 @@ def find_chessboard_near(target: Target, grey: Grey) -> Array | None:
 
 
 def _chessboard_tries(target: Target, grey: Grey) -> Iterator[Array | None]:
-    """Detectors, from the quick one to those that see what it misses."""
+    """Detectors, the fast one first, then more thorough ones."""
     size = (target.columns, target.rows)
     small, large = reduced(grey, SMALL_PX), reduced(grey, LARGE_PX)
     found, corners = cv2.findChessboardCornersSB(small.picture, size, flags=0)

@@ -34,13 +34,13 @@ _NEAR = 40
 _ALIKE = 0.15
 """Least strength of a saddle over that of the stronger one next to which it stands in a start."""
 _OFF = 0.15
-"""Farthest a grown corner may be from where its neighbours say it is, in squares."""
+"""Largest distance of a grown corner from its prediction by its neighbours, in squares."""
 _WEAKEST = 0.2
 """Contrast of a grown corner over the middle one of those it grows from."""
 _FEWEST = 9
 _LONGEST = 100
 _LEAST_SHARE = 0.5
-"""Of the corners that must be fitted."""
+"""Share of the corners that must be fitted."""
 _LEAST_OUTER_SHARE = 0.25
 """The same of each of the outer rows and columns, which show where the board ends."""
 
@@ -68,7 +68,7 @@ def grown_chessboard(picture: NDArray[np.uint8], shape: tuple[int, int]) -> Arra
 
 
 def spans_board(seen: NDArray[np.bool_]) -> bool:
-    """Whether the corners seen, (rows, columns), show for certain where the board ends."""
+    """Whether the corners seen, (rows, columns), determine where the board ends."""
     sides = (seen[0], seen[-1], seen[:, 0], seen[:, -1])
     outer = min(float(side.mean()) for side in sides)
     return bool(seen.mean() >= _LEAST_SHARE and outer >= _LEAST_OUTER_SHARE)
@@ -213,7 +213,7 @@ def _next_to(
     """Corners that fit next to known ones, or beyond one that is hidden.
 
     Their contrast must alternate as the known ones', of which `middle` is the middle one. A place
-    is tried only so often, which `tries` counts.
+    is tried a limited number of times, counted in `tries`.
     """
     far = 2 if len(known) >= _FEWEST else 1
     moves = [(a, b) for a in range(-far, far + 1) for b in range(-far, far + 1)]

@@ -1,4 +1,4 @@
-"""Where a point of a board must be in a picture, from those that are known around it."""
+"""Position of a board's point in a picture, predicted from known points around it."""
 
 import cv2
 import numpy as np
@@ -16,16 +16,16 @@ _STIFFNESS = 0.1
 def from_neighbours(
     board: Array, pixels: Array, asked: Array, others: bool = False
 ) -> tuple[Array, Array]:
-    """Where points of the board must be in the picture, and how large a square is there.
+    """Predict positions of the board's points in the picture, and the size of a square there.
 
     A homography through all known points, plus an affine change of its misses near each point: so
     a lens may bend the board.
 
     Args:
         board: (M, 2) known points, in squares.
-        pixels: (M, 2) where they are.
-        asked: (K, 2) points asked for, in squares.
-        others: take no notice of a known point at the very place that is asked for.
+        pixels: (M, 2) their pixels.
+        asked: (K, 2) requested points, in squares.
+        others: ignore a known point at exactly the requested place.
 
     Returns:
         (K, 2) pixels, and (K, 2, 2) pixels per square along x (first column) and y (second); NaN

@@ -1,4 +1,4 @@
-"""Print a target at true scale: PDF, SVG or PNG, with a bar to check the printer by."""
+"""Print a target at true scale: PDF, SVG or PNG, with a bar to check the printer."""
 
 import io
 import math
@@ -34,9 +34,9 @@ PAPERS_MM = {
 SUFFIXES = (".pdf", ".svg", ".png")
 BAR_MM = 100.0
 _MARGIN_MM = 8.0
-"""White around the pattern; printers leave about 5 mm blank themselves."""
+"""White margin around the pattern; printers leave about 5 mm blank themselves."""
 _STRIP_MM = 11.0
-"""Below the pattern, for the bar and the words."""
+"""Space below the pattern, for the bar and the text."""
 _TICK_MM, _LINE_MM, _TEXT_MM = 3.0, 0.3, 2.6
 _LARGEST_PAGE_MM = 5080.0
 """A PDF page is at most 200 inches."""
@@ -114,7 +114,7 @@ def _on_paper(target: Target, needed: tuple[float, float], paper: str) -> tuple[
 
 
 def _advice(target: Target, pages: list[tuple[float, float]]) -> str:
-    """How large the target could be on one of the pages."""
+    """Largest possible target on one of the pages."""
     left, top, right, bottom = (1e3 * side for side in target.outline)
     scale = max(
         min(
@@ -262,7 +262,7 @@ def _write_png(sheet: Sheet, path: Path, dpi: float) -> None:
 def print_target(
     text: str, path: Path, paper: str | None, dpi: float
 ) -> tuple[str, dict[str, object]]:
-    """Do what `alice-survey target` does; what it says, as text and as JSON values."""
+    """Run `alice-survey target`; return its result as text and as JSON values."""
     target = parse_target(text)
     described, sheet = write_sheet(target, path, paper, dpi)
     lines = [

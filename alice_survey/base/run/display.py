@@ -1,4 +1,4 @@
-"""What a user sees of a run, on standard error: moving bars on a terminal, else a few lines."""
+"""Output of a run on standard error: progress bars on a terminal, else a few lines."""
 
 import logging
 import sys
@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
 _LONG_S = 2.0
-"""A step or a stage that took less is not worth a line."""
+"""A step or a stage that took less gets no line."""
 _ALIVE_EVERY_S = 30.0
 
 
 class Console(logging.Handler):
-    """A line for what stays: warnings, notes, stages, and steps that took long."""
+    """Plain lines: warnings, notes, stages, and steps that took long."""
 
     def __init__(
         self, *, quiet: bool = False, clock: Callable[[], float] = lambda: time.monotonic()
@@ -27,7 +27,7 @@ class Console(logging.Handler):
 
         Args:
             quiet: show warnings alone.
-            clock: that only goes forward, s.
+            clock: monotonic, s.
         """
         super().__init__(logging.WARNING if quiet else logging.INFO)
         self.quiet = quiet
@@ -36,13 +36,13 @@ class Console(logging.Handler):
         self._last_s = clock()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write what stays of an event."""
+        """Write the line of an event, if it has one."""
         text = _line_of(event_of(record))
         if text is not None:
             self._write(text)
 
     def tick(self, event: Event) -> None:
-        """Write how far the innermost work is, if nothing was written for long.
+        """Write the progress of the innermost work, if nothing was written for long.
 
         Args:
             event: `step_progress` of a step, or the name and time of a stage.
@@ -54,12 +54,12 @@ class Console(logging.Handler):
         self._write(of_stage + how)
 
     def rest(self) -> None:
-        """Nothing was going on until now, so that silence meant nothing."""
+        """Reset the silence timer: nothing was running until now."""
         if self._clock() - self._last_s > _ALIVE_EVERY_S:
             self._last_s = self._clock()
 
     def close(self) -> None:
-        """Leave the terminal as it was."""
+        """Restore the terminal."""
         if self.bars:
             self.bars.clear()
         super().close()
@@ -70,7 +70,7 @@ class Console(logging.Handler):
 
 
 def _line_of(event: Event) -> str | None:
-    """What stays on the screen of an event, if anything."""
+    """Permanent text of an event on the screen, if any."""
     match event["event"]:
         case "warning":
             return f"warning: {event['message']}"
@@ -86,7 +86,7 @@ def _line_of(event: Event) -> str | None:
 
 
 class Bars:
-    """A moving bar at the foot of a terminal for each stage and step that goes on."""
+    """A progress bar at the foot of a terminal for each running stage and step."""
 
     def __init__(self) -> None:
         self._shown: Progress | None = None
@@ -100,7 +100,7 @@ class Bars:
         total: int | None = None,
         left_s: float | None = None,
     ) -> None:
-        """Show how far something is; a spinner alone where nothing is counted."""
+        """Show the progress of a stage or step; only a spinner where nothing is counted."""
         if self._shown is None:
             self._shown = _bars()
             self._shown.start()
@@ -115,14 +115,14 @@ class Bars:
         )
 
     def remove(self, key: object) -> None:
-        """Take a bar away."""
+        """Remove a bar."""
         if self._shown is not None and key in self._tasks:
             self._shown.remove_task(self._tasks.pop(key))
         if not self._tasks:
             self.clear()
 
     def clear(self) -> None:
-        """Take all away and leave the terminal as it was."""
+        """Remove all bars and restore the terminal."""
         self._tasks.clear()
         if self._shown is not None:
             self._shown.stop()

@@ -1,4 +1,4 @@
-"""What happens during a run, as events, and the files that keep them.
+"""Events of a run, and the files that record them.
 
 An events file holds one JSON object a line, a log file one line of text an event; both are only
 ever added to, and a file that can no longer be written costs a warning, never the run.
@@ -17,7 +17,7 @@ from alice_survey.base.errors import WorkspaceError, warn, why
 
 _LOGGED_EVERY_S = 30.0
 _LOCK = threading.RLock()
-"""Of all files: one that cannot be written warns, and the others take that down."""
+"""Lock of all files: one that cannot be written warns, and the others record that."""
 
 Event = dict[str, Any]
 """One thing that has happened: the keys and JSON values of a line of an events file, in the order
@@ -91,7 +91,7 @@ class LogFile(_LinesFile):
         self._last_s: dict[int, float] = {}
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write what a reader wants to know."""
+        """Write the events that matter to a reader."""
         event = event_of(record)
         if event["event"] == "step_progress":
             number, elapsed_s = event["step_number"], event["elapsed_s"]
@@ -138,7 +138,7 @@ def described(event: Event) -> str:
 
 
 def how_far(event: Event) -> str:
-    """How far a running step is, how long it has taken, how long it will still take."""
+    """Progress of a running step, its elapsed time and its remaining time."""
     count = f" {event['done']}" if "done" in event else ""
     total = f" of {event['total']}" if count and "total" in event else ""
     left = f", about {duration(event['remaining_s'])} left" if "remaining_s" in event else ""
@@ -153,7 +153,7 @@ def finished(event: Event) -> str:
 
 
 def duration(seconds: float) -> str:
-    """A length of time in words."""
+    """A duration in words."""
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"

@@ -1,4 +1,4 @@
-"""Signals that ask a run to end: it ends cleanly, and soon, whatever it is deep in."""
+"""Signals that end a run: it ends cleanly and soon, whatever code is running."""
 
 import contextlib
 import os
@@ -10,17 +10,17 @@ from types import FrameType
 from typing import cast
 
 _GRACE_S = 5.0
-"""Between such a signal and the end of a run that is deep in a library."""
+"""Time between such a signal and the end of a run that is inside a library."""
 _IS_POSIX = hasattr(signal, "sigwait")
 """Elsewhere Ctrl-C alone ends a run early, whenever Python gets to it."""
 ASKING = frozenset({signal.SIGTERM, signal.SIGHUP} if _IS_POSIX else {signal.SIGTERM})
-"""What a scheduler, a system that shuts down, or a terminal that closes sends."""
+"""Signals of a scheduler, a system that shuts down, or a terminal that closes."""
 _FORWARD = signal.SIGUSR1 if _IS_POSIX else signal.SIGTERM
 """Sent on to the main thread for these: one whose handler COLMAP's log does not replace."""
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal other than that of Ctrl-C has asked the run to end."""
+    """A signal other than that of Ctrl-C has requested the end of the run."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
@@ -28,19 +28,19 @@ class Interrupted(KeyboardInterrupt):
 
 
 def exit_code(error: KeyboardInterrupt) -> int:
-    """What a shell expects of a program that a signal has ended."""
+    """Exit code of a program that a signal has ended, as a shell expects it."""
     return 128 + (error.number if isinstance(error, Interrupted) else signal.SIGINT)
 
 
 def words(error: KeyboardInterrupt) -> str:
-    """What has ended the run, for the user."""
+    """Reason why the run ended, for the user."""
     if isinstance(error, Interrupted):
         return f"interrupted by {signal.Signals(error.number).name}"
     return "interrupted"
 
 
 def behind(error: BaseException) -> KeyboardInterrupt | None:
-    """The interruption that led to an error, if one did: libraries in C may make a fault of it."""
+    """The interruption that led to an error, if any: libraries in C may turn it into an error."""
     found: BaseException | None = error
     while found is not None and not isinstance(found, KeyboardInterrupt):
         found = found.__cause__ or found.__context__
@@ -49,7 +49,7 @@ def behind(error: BaseException) -> KeyboardInterrupt | None:
 
 @contextlib.contextmanager
 def heeded(finish: Callable[[KeyboardInterrupt], None]) -> Iterator[None]:
-    """Within this block Ctrl-C raises KeyboardInterrupt, and what else asks to end `Interrupted`.
+    """Within this block Ctrl-C raises KeyboardInterrupt, and other such signals `Interrupted`.
 
     Python raises them only between its own instructions, and an adjustment of a large model may
     take minutes. Some seconds later, or at a second signal, the process therefore ends whatever it
@@ -68,7 +68,7 @@ def heeded(finish: Callable[[KeyboardInterrupt], None]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def for_other_programs() -> Iterator[None]:
-    """Within this block start programs that heed the signals which ask as they always do."""
+    """Within this block start programs that handle these signals in their usual way."""
     if not _IS_POSIX:
         yield
         return
@@ -80,7 +80,7 @@ def for_other_programs() -> Iterator[None]:
 
 
 class _Heeding:
-    """What came of signals so far."""
+    """State of signal handling so far."""
 
     def __init__(self, finish: Callable[[KeyboardInterrupt], None]) -> None:
         self._finish = finish
@@ -130,7 +130,7 @@ def _ends_late(heeding: _Heeding) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _forwards(heeding: _Heeding) -> Iterator[None]:
-    """Take the signals that ask in a thread of its own.
+    """Handle the signals that end a run in a thread of their own.
 
     They are blocked everywhere else, also in processes started within: COLMAP's log answers them
     with a trace of its stack, in whatever process has loaded it.

@@ -1,4 +1,4 @@
-"""What a run is doing, how far it is and how long it will still take.
+"""Progress of a run: what it is doing, how much is done and the remaining time.
 
 Work is reported through three context managers, `part`, `stage` and `step`, wherever it is done.
 Reports become events, records of the package's logger, which the screen, a log and an events file
@@ -19,9 +19,9 @@ from alice_survey.base.run.display import Bars, Console
 from alice_survey.base.run.events import Event
 
 _REPORTED_EVERY_S = 0.5
-"""Between two events of how far a step is."""
+"""Time between two progress events of a step."""
 _ALIVE_EVERY_S = 5.0
-"""Between two such events where nothing moves."""
+"""Time between two such events where nothing changes."""
 _TICK_S = 1.0
 _KEPT = 256
 _LEVELS = {"warning": logging.WARNING, "error": logging.ERROR}
@@ -31,11 +31,11 @@ Clock = Callable[[], float]
 
 
 class Remaining:
-    """How long work of equal items will still take, from when items were done.
+    """Remaining time of work on equal items, from when items were done.
 
     The first items say nothing: processes start, kernels are compiled. Time is counted from the
     first done on, and of it the last half, so that a slow start and a change of pace are forgotten.
-    Items that are worked on side by side end together: fewer of them than that say nothing.
+    Items that are worked on in parallel end together: fewer of them than that say nothing.
     """
 
     def __init__(self, width: int) -> None:
@@ -49,7 +49,7 @@ class Remaining:
         self._seen.append((now_s, done))
 
     def left_s(self, total: int, now_s: float) -> float | None:
-        """How long the rest takes; None as long as nothing can be said."""
+        """Remaining time; None as long as it cannot be estimated."""
         if not self._seen:
             return None
         last_s, done = self._seen[-1]
@@ -78,7 +78,7 @@ class Remaining:
 
 
 class Step:
-    """A part of a stage that is going on."""
+    """A running part of a stage."""
 
     def __init__(self, run: "Run", label: str, number: int, total: int | None, width: int) -> None:
         self._run, self._expected = run, total
@@ -88,7 +88,7 @@ class Step:
         self._remaining = Remaining(width)
 
     def advance(self, items: int = 1) -> None:
-        """Some more items are done."""
+        """Count more items as done."""
         self.done = (self.done or 0) + items
         self._remaining.note(self.done, self._run.clock())
         self._run.moved(self)
@@ -100,13 +100,13 @@ class Step:
 
     @property
     def left_s(self) -> float | None:
-        """How long it will still take; None where nothing can be said."""
+        """Remaining time; None where it cannot be estimated."""
         total = self.total
         return None if total is None else self._remaining.left_s(total, self._run.clock())
 
 
 class Run:
-    """What is going on, reported to the handlers of a logger."""
+    """State of a run, reported to the handlers of a logger."""
 
     def __init__(
         self,
@@ -121,9 +121,9 @@ class Run:
 
         Args:
             console: what the user sees.
-            files: where events go besides.
-            log: whose records the events are.
-            clock: that only goes forward, s.
+            files: where events also go.
+            log: the logger of the events.
+            clock: monotonic, s.
             ticks: whether a thread reports now and then on what takes long.
         """
         self.clock = clock
@@ -145,7 +145,7 @@ class Run:
         return self._console is None or self._console.quiet
 
     def take(self, log: logging.Logger) -> None:
-        """Have all records of a logger go the way of this run."""
+        """Route all records of a logger to this run."""
         log.handlers[:] = self._handlers
         log.filters[:] = [self._complete]
 
@@ -204,13 +204,13 @@ class Run:
             return step
 
     def moved(self, step: Step) -> None:
-        """Some more of a step is done."""
+        """Report more of a step as done."""
         if self.clock() - step.reported_s >= _REPORTED_EVERY_S:
             with self._lock:
                 self._emit_step("step_progress", step)
 
     def end_step(self, step: Step, *, complete: bool) -> None:
-        """It ends, well or not; a second time means nothing."""
+        """End it, successful or not; a second call has no effect."""
         with self._lock:
             if step not in self._steps:
                 return
@@ -220,7 +220,7 @@ class Run:
                 self._bars.remove(step)
 
     def tick(self) -> None:
-        """Report what nothing has been heard of for a while."""
+        """Report steps that have been silent for a while."""
         with self._lock:
             now_s = self.clock()
             for step in self._steps:
@@ -265,7 +265,7 @@ class Run:
             self._log.log(level, event.get("message", ""), extra={"event": event})
 
     def _complete(self, record: logging.LogRecord) -> bool:
-        """Make an event of a record that is only a message: a note or a warning."""
+        """Convert a record that is only a message, a note or a warning, to an event."""
         if "event" not in vars(record):
             name = "note" if record.levelno < logging.WARNING else "warning"
             elapsed_s = self.clock() - self._started_s
@@ -291,14 +291,14 @@ class Run:
 
 
 _runs: list[Run] = []
-"""What happens in this process is reported to the last one."""
+"""Open runs; events of this process go to the last one."""
 _UNSEEN = Run(log=logging.Logger("unseen", logging.CRITICAL + 1), ticks=False)
-"""Of tasks: nobody sees their own steps."""
+"""Run of tasks, whose own steps are not shown."""
 _part: ContextVar[str] = ContextVar("part", default="")
 
 
 def current() -> Run:
-    """The run that is reported to; when none was begun, one that only shows on standard error."""
+    """The current run; if none was begun, one that only shows on standard error."""
     if is_in_task():
         return _UNSEEN
     if not _runs:
@@ -309,7 +309,7 @@ def current() -> Run:
 
 @contextlib.contextmanager
 def reported_to(run: Run) -> Iterator[None]:
-    """Within this block what happens, warnings included, goes to a run; then it is closed."""
+    """Within this block all events, warnings included, go to a run; then it is closed."""
     before = LOG.handlers[:], LOG.filters[:]
     _runs.append(run)
     run.take(LOG)
@@ -363,7 +363,7 @@ def step(label: str, total: int | None = None, *, width: int = 1) -> Iterator[St
     Args:
         label: what it does, in a few words.
         total: how many items are to be done, if they are counted.
-        width: how many are worked on side by side.
+        width: how many are worked on in parallel.
     """
     run = current()
     begun = run.begin_step(label, total, width)
@@ -379,7 +379,7 @@ def step(label: str, total: int | None = None, *, width: int = 1) -> Iterator[St
 
 
 def counted(items: Iterable[Item], label: str, total: int | None, width: int) -> Iterator[Item]:
-    """Pass on items that took work to make, and count them."""
+    """Pass on items that took work to produce, and count them."""
     with step(label, total, width=width) as begun:
         for item in items:
             begun.advance()

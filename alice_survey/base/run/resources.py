@@ -1,4 +1,4 @@
-"""What work takes: processor time and memory of a process with all its descendants."""
+"""Resource usage: processor time and memory of a process with all its descendants."""
 
 import contextlib
 import ctypes
@@ -25,12 +25,12 @@ _PACKAGES = {
     "numba": "numba",
     "rasterio": "rasterio",
 }
-"""Those that decide results, and the distributions that hold them."""
+"""Packages that affect results, and the distributions that contain them."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Spent:
-    """What work has taken so far."""
+    """Resources used so far."""
 
     took_s: float = 0.0
     cpu_s: float = 0.0
@@ -39,7 +39,7 @@ class Spent:
     """Largest sum of their proportional memory, seen about once a second."""
 
     def after(self, earlier: "Spent") -> "Spent":
-        """Both together, one after the other."""
+        """Sum of two uses, one after the other."""
         return Spent(
             took_s=self.took_s + earlier.took_s,
             cpu_s=self.cpu_s + earlier.cpu_s,
@@ -56,7 +56,7 @@ class Spent:
 
     @staticmethod
     def from_json(data: Mapping[str, Any]) -> "Spent":
-        """What `to_json` wrote.
+        """Read what `to_json` wrote.
 
         Raises:
             KeyError, TypeError, ValueError: it is something else.
@@ -65,7 +65,7 @@ class Spent:
 
 
 class Meter:
-    """Counts what this process and its descendants spend, from its making on."""
+    """Meter of the resources this process and its descendants use since its creation."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
@@ -74,7 +74,7 @@ class Meter:
         self._lock = threading.Lock()
 
     def look(self) -> Spent:
-        """What has been spent until now."""
+        """Resources used until now."""
         processes = family()
         memory = sum(map(memory_mib, processes))
         with self._lock:
@@ -88,10 +88,10 @@ class Meter:
 
 @contextlib.contextmanager
 def watched(meter: Meter, report: Callable[[Spent], None]) -> Iterator[None]:
-    """Look at a meter about once a second from a thread of its own, and report every few seconds.
+    """Read a meter about once a second from a thread of its own, and report every few seconds.
 
     Args:
-        meter: to look at.
+        meter: the meter to read.
         report: called from that thread.
     """
     stop = threading.Event()
@@ -149,7 +149,7 @@ def cpu_s(process: "psutil.Process") -> float:
 
 
 def release_memory() -> None:
-    """Give memory back to the system that was freed but is kept for later, where libc can."""
+    """Return freed memory that libc keeps for later to the system, where libc can."""
     if sys.platform == "linux":
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
         if trim is not None:
@@ -158,7 +158,7 @@ def release_memory() -> None:
 
 @cache
 def versions() -> dict[str, str]:
-    """Versions of the packages that decide results; without those that are not installed."""
+    """Versions of the installed packages that affect results."""
     found = {}
     for name, distribution in _PACKAGES.items():
         with contextlib.suppress(metadata.PackageNotFoundError):
