@@ -21,13 +21,13 @@ class Options:
     altimeter_body_m: tuple[float, float, float] = CameraConfig().dvl_position_body_m
     """The sensor whose altitude the vehicle holds, from its reference point."""
     pixel_um: float = CameraConfig().pixel_um
-    """Of the sensor; QGroundControl wants its size."""
+    """Size of the sensor's pixels; QGroundControl needs the sensor's size."""
     camera_on: str = "camera_trigger/enable"
     """COLA2: the service (without arguments) that starts pictures."""
     camera_off: str = "camera_trigger/disable"
     least_tolerance_m: float = _LEAST_TOLERANCE_M
     turn_rate_rad_s: float = SPOT_RAD_S
-    """Of turns on the spot, which way-points wait for."""
+    """Rate of turns on the spot, which way-points wait for."""
 
     def __post_init__(self) -> None:
         if self.least_tolerance_m <= 0 or self.pixel_um <= 0:
