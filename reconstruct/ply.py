@@ -98,7 +98,7 @@ class PlyHeader:
     start: int
     """Byte after the header."""
     offset: Array
-    """(3,) that our own files state in a comment; zeros in others."""
+    """(3,) offset that our own files state in a comment; zeros in others."""
 
     def rows(self) -> NDArray[Any]:
         """Records (N,) of a binary file, which stay on disk.
@@ -118,7 +118,7 @@ def read_ply_points(path: Path, most: int) -> Array:
     """Every n-th point, so that there are at most `most`, (N, 3), with the offset our files state.
 
     Raises:
-        WorkspaceError: it is no PLY, its points do not come first, or it is cut short.
+        WorkspaceError: it is not a PLY, its points do not come first, or it is cut short.
     """
     header = read_header(path)
     step = max(1, -(-header.count // most))
@@ -154,7 +154,7 @@ def read_header(path: Path) -> PlyHeader:
     """The header of a PLY file whose points come first, whatever else it holds.
 
     Raises:
-        WorkspaceError: it is no PLY, or its points are not read.
+        WorkspaceError: it is not a PLY, or its points are not read.
         OSError: the file cannot be read.
     """
     with path.open("rb") as file:

@@ -16,7 +16,7 @@ settings.load_profile("busy")
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """The folder of real data beside the checkout; without it the test is skipped, never in CI."""
+    """The folder of real data next to the checkout; without it the test is skipped, never in CI."""
     folder = Path(__file__).parents[2] / "shared" / "data"
     if not folder.is_dir():
         if os.environ.get("CI"):

@@ -125,7 +125,7 @@ PERIOD_M = 0.3
 
 
 def position_code(north: Array, east: Array) -> Array:
-    """Blue tells east and green tells north, periodic, 2 levels a millimetre at most."""
+    """Blue encodes east and green encodes north, periodic, 2 levels a millimetre at most."""
     wave = 2 * np.pi / PERIOD_M
     blue, green = 128 + 100 * np.sin(wave * east), 128 + 100 * np.sin(wave * north)
     return np.stack([blue, green, np.full_like(blue, 128)], axis=-1)

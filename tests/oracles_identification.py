@@ -39,7 +39,7 @@ def dense_information(run: Array, lags: Array) -> Array:
 
 
 def numpy_observation(state: Array, current_ne: Array, bias: Array, attitude: Array) -> Array:
-    """What sensors tell of a state (10,): velocity over ground, rates, attitude error."""
+    """What sensors measure of a state (10,): velocity over ground, rates, attitude error."""
     from scipy.spatial.transform import Rotation
 
     ned_from_body = Rotation.from_quat(state[:4])

@@ -105,7 +105,7 @@ def sees(lines: Sequence[Line], points: Array, pattern: Pattern) -> tuple[Array,
 
 
 def seen_enough(lines: Sequence[Line], points: Array, pattern: Pattern) -> Array:
-    """Whether each point is seen at the overlap asked for."""
+    """Whether each point is seen at the requested overlap."""
     passes, pictures = sees(lines, points, pattern)
     return (passes >= pattern.passes) & (pictures >= pattern.passes * pattern.pictures)
 

@@ -1,7 +1,7 @@
 """The side overlap that pictures really have, measured point by point.
 
 Independent of footprints and spacing: points of the sea floor across each picture are projected
-into the pictures of the line beside it through the flat port, and those counted that fall in.
+into the pictures of the next line through the flat port, and those counted that fall in.
 """
 
 import math

@@ -28,7 +28,7 @@ def _number(low: float, high: float) -> st.SearchStrategy[float]:
 def cameras(
     draw: st.DrawFn, terms: tuple[str, ...] = EVERY, *, port: bool = False, size: bool = True
 ) -> FlatPortCamera:
-    """A camera with some of the distortion terms, behind a port when asked, else in air."""
+    """A camera with some of the distortion terms, behind a port when requested, else in air."""
     used = draw(st.sets(st.sampled_from(terms)))
     width, height = (
         draw(st.tuples(st.integers(300, 4000), st.integers(200, 3000))) if size else (1600, 1200)
@@ -58,7 +58,7 @@ def cameras(
 
 @st.composite
 def poses(draw: st.DrawFn) -> RigidTransform:
-    """A pose of a camera beside another."""
+    """A pose of a camera next to another."""
     turn = [draw(_number(-0.2, 0.2)) for _ in range(3)]
     sideways = draw(_number(-0.3, -0.02))
     shift = [sideways, draw(_number(-0.01, 0.01)), draw(_number(-0.01, 0.01))]

@@ -91,7 +91,7 @@ def test_half_wrong_at_random_and_in_a_cluster() -> None:
     seen = sighting(rng, truth, count=200, noise_px=0.3)
     pixels = seen.pixels.copy()
     pixels[:60] = rng.uniform([0, 0], [1920, 1080], (60, 2))
-    pixels[60:100] += [40.0, 25.0]  # a second, consistent story, told by fewer
+    pixels[60:100] += [40.0, 25.0]  # a second consistent solution, with fewer inliers
 
     found = absolute_pose([replace(seen, pixels=pixels)], rng)
 

@@ -1,4 +1,4 @@
-"""`python -m benchmarks`: every benchmark hands its figures over alike, and the table tells all."""
+"""`python -m benchmarks`: every benchmark returns figures of one form, and the table shows all."""
 
 import argparse
 import importlib
@@ -167,7 +167,7 @@ def a_run(folder: Path, *figures: Figure, code: int = 0, **others: Any) -> Run:
 
 
 def three_runs(folder: Path) -> list[Run]:
-    """Times of 3, 1, 8 s beside 4, 4, 2 s; a speed that falls short once."""
+    """Times of 3, 1, 8 s against 4, 4, 2 s; a speed that falls short once."""
     times, peers, speeds = (3.0, 1.0, 8.0), (4.0, 4.0, 2.0), (20.0, 30.0, 5.0)
     return [
         a_run(
@@ -318,7 +318,7 @@ def test_one_part_runs_and_one_is_left_out(tmp_path: Path) -> None:
     assert refraction["state"] == "done"
     assert refraction["command"] == "python -m benchmarks.refraction --quick"
     cameras = [row for row in refraction["figures"] if row["name"].endswith("rms of cameras")]
-    assert len(cameras) == 8  # of two ports at two tilts, beside two others
+    assert len(cameras) == 8  # of two ports at two tilts, against two others
     assert all(0 < row["median"] < 10 and row["unit"] == "mm" for row in cameras)
     assert all(row["ratio"] < 1 for row in cameras if row["peer"] == "OPENCV")
     assert "OPENCV" in (out / "logs" / "refraction-1.log").read_text()

@@ -30,7 +30,7 @@ def undisturbed(small_survey: Path) -> Path:
 
 
 def results(workspace: Path) -> dict[str, bytes]:
-    """Every file of the finished stages but SQLite files, and those that tell how long it took."""
+    """Every file of the finished stages but SQLite files, and those that state how long it took."""
     return {
         str(path.relative_to(workspace)): path.read_bytes()
         for stage in FOLDERS
@@ -82,7 +82,7 @@ def test_every_stage_is_told_of(undisturbed: Path) -> None:
 
 
 def test_truth_is_not_read_by_reconstruct(undisturbed: Path, tmp_path: Path) -> None:
-    """Without the truth beside the pictures the reconstruction is the same, to the byte."""
+    """Without the truth next to the pictures the reconstruction is the same, to the byte."""
     workspace = tmp_path / "blind"
     shutil.copytree(undisturbed, workspace)
     for stage in ("mapping", "sparse", "dense", "mosaic", "mesh", "evaluation", "calibration"):

@@ -19,7 +19,7 @@ from alice_survey.base.errors import PlanError, warn, why
 from alice_survey.base.frames import Array, Datum
 
 Sense = Literal["auto", "heights", "depths"]
-"""Of a raster's values: heights are positive up, depths positive down."""
+"""What a raster's values are: heights positive up, or depths positive down."""
 _MOST_CELLS = 16_000_000
 """Read at once: 128 MB."""
 _LOOKED_AT = 4096
@@ -29,7 +29,7 @@ _PAD_CELLS = 2
 _SAME_CELL = 1e-6
 """A place so near a centre, in cells, is on it."""
 _EDGE_POINTS = 32
-"""On each side of the bounds, whose straight sides are curves in the raster."""
+"""Points on each side of the bounds, whose straight sides are curves in the raster."""
 _ONE_SIGN = 0.99
 """Share of cells of one sign from which a raster without a word on it is taken to be of that sign.
 """
@@ -41,9 +41,9 @@ class Bathymetry:
     """Depths at the centres of a raster's cells, in its own coordinate system."""
 
     name: str
-    """Of the file."""
+    """Name of the file."""
     datum: Datum
-    """Of the local frame."""
+    """Origin of the local frame."""
     crs: str
     """WKT of the raster's horizontal coordinate system."""
     from_pixel: tuple[float, float, float, float, float, float]
@@ -52,9 +52,9 @@ class Bathymetry:
     depth_m: Array
     """(rows, columns) below the vertical datum, positive down; NaN where it is not known."""
     vertical_datum: str
-    """As the file names it."""
+    """Vertical datum as the file names it."""
     reading: str
-    """How the sign was told, in words."""
+    """How the sign was determined, in words."""
 
     @cached_property
     def cell_m(self) -> float:
@@ -157,7 +157,7 @@ def area_depth(bathymetry: Bathymetry, survey: MultiPolygon) -> AreaDepth:
     """Mean and range of depth over an area, on a grid as fine as the raster's.
 
     Raises:
-        PlanError: the raster knows nothing of it.
+        PlanError: the raster has no values there.
     """
     north_0, east_0, north_1, east_1 = survey.bounds
     count = (north_1 - north_0) * (east_1 - east_0) / bathymetry.cell_m**2
@@ -206,7 +206,7 @@ def read_bathymetry(
         crs: of a raster that does not say its own.
 
     Raises:
-        PlanError: it is no raster, has no coordinate system, does not reach the bounds, has
+        PlanError: it is not a raster, has no coordinate system, does not reach the bounds, has
             too many cells within them, or it is not clear whether it holds heights or depths.
     """
     import rasterio
@@ -384,7 +384,7 @@ def _window(
 
 
 def _sense(path: Path, file: Any, band: Any, sense: Sense) -> tuple[bool, str]:
-    """Whether values are heights, and how that was told."""
+    """Whether values are heights, and how that was determined."""
     if sense != "auto":
         return sense == "heights", f"{sense}, as requested"
     values = band.compressed()

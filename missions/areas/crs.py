@@ -13,13 +13,13 @@ from alice_survey.base.frames import Array, Datum
 from missions.areas.raw import RawShapes
 
 LOCAL = "local"
-"""In place of a coordinate system: metres east (x) and north (y) of the datum."""
+"""Stands for a coordinate system: metres east (x) and north (y) of the datum."""
 FARTHEST_M = 20_000.0
-"""From the datum: beyond, a flat local frame is no longer one."""
+"""Largest distance from the datum: beyond it the local frame is no longer flat."""
 _HIGHEST_LATITUDE_DEG = 85.0
 """Nearer to a pole, headings from north change within an area."""
 _WGS84_ACCURACY_M = 2.0
-"""Of the ensemble of WGS 84's realisations (EPSG datum 6326)."""
+"""Accuracy of the ensemble of WGS 84's realisations (EPSG datum 6326)."""
 _DATUM_DECIMALS = 6
 
 
@@ -62,7 +62,7 @@ class LocalFrame:
         """Shapes in metres north and east of the datum.
 
         Raises:
-            PlanError: a corner is no number, or farther than `FARTHEST_M` from the datum.
+            PlanError: a corner is not a number, or farther than `FARTHEST_M` from the datum.
         """
 
         def change(corners: Array, name: str) -> Array:
@@ -106,7 +106,7 @@ class LocalFrame:
 
 
 def check_finite(corners: Array, origin: str, name: str) -> None:
-    """Refuse coordinates that are no numbers.
+    """Refuse coordinates that are not numbers.
 
     Raises:
         PlanError: with the corner's number.

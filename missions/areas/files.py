@@ -41,7 +41,7 @@ SUFFIXES = (".geojson", ".json", ".kml", ".kmz", ".gpkg", ".shp", ".zip", ".wkt"
 class _Layer:
     name: str
     shapes: RawShapes
-    """In the file's own coordinates, y (north) before x (east)."""
+    """Shapes in the file's own coordinates, y (north) before x (east)."""
     crs: str | None
 
 
@@ -94,7 +94,7 @@ def read_wkt(origin: str, text: str, crs: str | None) -> RawShapes:
         crs: system of its coordinates; None or `local`: metres east and north of the datum.
 
     Raises:
-        PlanError: it is no well-known text, or crs is unknown or contradicts the SRID.
+        PlanError: it is not well-known text, or crs is unknown or contradicts the SRID.
     """
     match = _SRID.match(text)
     if match:
@@ -244,7 +244,7 @@ def _gdal_layers(file: Path, shown: Path, driver: str) -> list[_Layer]:
                 meta, _, wkb, _ = pyogrio.raw.read(file, layer=i, columns=[], force_2d=True)
                 shapes = _shapes(wkb, shown.name, several=len(names) > 1, layer=str(name))
                 layers.append(_Layer(name=str(name), shapes=shapes, crs=meta["crs"]))
-        # pyogrio lets names that are no UTF-8 through, and trips over a damaged coordinate system.
+        # pyogrio lets names that are not UTF-8 through, and trips over a damaged coordinate system.
         except (
             DataSourceError, DataLayerError, UnicodeDecodeError, UnboundLocalError, ValueError,
             MemoryError,

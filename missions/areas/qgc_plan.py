@@ -35,7 +35,7 @@ def read_qgc_plan(
         role: what the shapes are for.
 
     Raises:
-        PlanError: it is no plan, or holds nothing of that kind.
+        PlanError: it is not a plan, or holds nothing of that kind.
     """
     data = read_json(path)
     if not (isinstance(data, dict) and data.get("fileType") == "Plan"):

@@ -36,7 +36,7 @@ class RawShapes:
     """How messages name the source, such as `polygon_ne_m` or `reef.kml`."""
     geographic: bool
     polygons: tuple[tuple[Ring, ...], ...] = ()
-    """Of each polygon its outer ring, then its holes."""
+    """For each polygon its outer ring, then its holes."""
     lines: tuple[RawLine, ...] = ()
     points: Array
     """(N, 2)."""

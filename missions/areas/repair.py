@@ -1,4 +1,4 @@
-"""Check polygons ring by ring; mend what is slightly wrong and say so, refuse the rest."""
+"""Check polygons ring by ring; repair small faults and report them, refuse the rest."""
 
 from dataclasses import dataclass
 
@@ -23,7 +23,7 @@ corners. Parts and holes below it are left out."""
 _NO_SIZE_M2 = 1e-4
 _NAMED = 3
 GRID_M = 1e-6
-"""Of corners where polygons are joined or cut: it closes the seams that rounding leaves."""
+"""Grid of corners where polygons are joined or cut: it closes the seams that rounding leaves."""
 _SHARP = 1e3
 """Mitre limit with which a shape that is widened and narrowed keeps its corners."""
 MITRE_LIMIT = 2.0
@@ -265,7 +265,7 @@ def _hole(
 
 
 def _joined(solids: list[BaseGeometry], names: list[str], report: _Reporter | None) -> MultiPolygon:
-    """The union of a source's polygons; overlaps are told."""
+    """The union of a source's polygons; overlaps are reported."""
     if len(solids) <= 1:
         return multipolygon(solids[0]) if solids else MultiPolygon()
     tree = shapely.STRtree(solids)

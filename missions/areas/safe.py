@@ -16,7 +16,7 @@ from alice_survey.base.config import SHAPEFILE_SIDES
 from alice_survey.base.errors import PlanError
 
 LARGEST_BYTES = 100_000_000
-"""Of a file, and of all that is unpacked from an archive."""
+"""Size limit of a file, and of all that is unpacked from an archive."""
 _MOST_MEMBERS = 1000
 _GEOJSON = frozenset(
     {
@@ -40,7 +40,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def check_file(path: Path) -> None:
-    """Refuse what is no file of bounded size.
+    """Refuse what is not a file of bounded size.
 
     Raises:
         PlanError: with the size and the limit.
@@ -63,7 +63,7 @@ def read_json(path: Path) -> Any:
     """The JSON value in a file.
 
     Raises:
-        PlanError: it is no JSON; the message names the line.
+        PlanError: it is not JSON; the message names the line.
     """
 
     def no_number(text: str) -> float:
@@ -81,7 +81,7 @@ def read_geojson(path: Path) -> dict[str, Any]:
     """The GeoJSON object in a file; its geometries are not looked at.
 
     Raises:
-        PlanError: it is no GeoJSON.
+        PlanError: it is not GeoJSON.
     """
     data = read_json(path)
     kind = data.get("type") if isinstance(data, dict) else None
@@ -136,7 +136,7 @@ def unpacked_kmz(path: Path) -> Iterator[Path]:
     """The KML of a KMZ: its `doc.kml`, else the only one in it.
 
     Raises:
-        PlanError: it is no archive, holds no KML, or would be too large.
+        PlanError: it is not an archive, holds no KML, or would be too large.
     """
     with _archive(path) as archive:
         names = [m.filename for m in archive.infolist() if _suffix(m.filename) == ".kml"]
@@ -159,7 +159,7 @@ def unpacked_shapefiles(path: Path) -> Iterator[list[Path]]:
     """The shapefiles in a zip, with their side files, in one folder.
 
     Raises:
-        PlanError: it is no archive, holds no shapefile or two of one name, or would be too large.
+        PlanError: it is not an archive, holds no shapefile or two of one name, or is too large.
     """
     with _archive(path) as archive, tempfile.TemporaryDirectory() as folder:
         members = {m.filename for m in archive.infolist()}

@@ -28,7 +28,7 @@ from missions.values.pattern import Pattern
 
 _CELLS_PER_FOOTPRINT = 20.0
 _LEAST_CELLS = 40_000
-"""Of a small area, so that its shares are told finely."""
+"""Fewest cells of a small area, so that its shares are finely resolved."""
 _MOST_CELLS = 16_000_000
 _TILE, _TILE_MIB = 2048, 90
 """Cells a side that are worked on at once, and the memory that they take for two cameras."""
@@ -49,7 +49,7 @@ class Certificate:
     pattern: Pattern
     cameras: tuple[str, ...]
     stations: int
-    """At which every camera took a picture."""
+    """Number of stations, at which every camera took a picture."""
     blind: int
     """Stations of these whose pictures look past the sea floor: they count as seeing nothing."""
     grid: Grid
@@ -58,9 +58,9 @@ class Certificate:
     pictures: Counts
     """(rows, columns) how many pictures of all cameras see it."""
     least_pictures: Counts
-    """(rows, columns) of the camera that sees it least often."""
+    """(rows, columns) how many pictures of the camera that sees it least often."""
     least_lines: Counts
-    """(rows, columns) lines that see it, of the camera that does so on the fewest."""
+    """(rows, columns) how many lines see it, of the camera for which they are fewest."""
     pairs: Counts
     """(rows, columns) stations that see it with all cameras at once."""
     histograms: dict[str, Array]
@@ -168,7 +168,7 @@ class _TileCounts:
 
     maps: dict[str, Counts]
     pictures: list[NDArray[np.intp]]
-    """Of each camera: how many cells of the area are in 0, 1, ... pictures."""
+    """For each camera: how many cells of the area are in 0, 1, ... pictures."""
     lines: list[NDArray[np.intp]]
     """The same for lines."""
 

@@ -1,7 +1,7 @@
 """Where the pictures of a dive were taken: from its navigation log and the times of its triggers.
 
 Logs are of the body's origin, and so is what `import-log` writes; the cameras' lever arm is in the
-rig. What cannot be used is left out and said, never filled in without a word.
+rig. What cannot be used is left out and reported, never silently filled in.
 """
 
 import csv
@@ -29,12 +29,12 @@ _ALIKE_RAD = math.radians(45.0)
 """A vehicle that crabs or yaws by less than this still flies its line (inferred: half way to a line
 across)."""
 _LEAST_RUN = 3
-"""Pictures that make a straight run of their own."""
+"""Pictures that make a straight run outside of the plan."""
 
 _MOST_TRIGGERS = 1_000_000
 """More than a month of pictures every 3 s: times or intervals beyond are wrong."""
 _ELSEWHERE_M = 100.0
-"""A log that stays farther from the area than this is of another place."""
+"""A log that stays farther from the area than this belongs to another place."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +45,7 @@ class Triggers:
     time_s: Array
     """(T,) increasing."""
     line: NDArray[np.intp] | None
-    """(T,) of the plan; None where it is not told."""
+    """(T,) line of the plan; None where it is not known."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -385,7 +385,7 @@ def _gaps(nav: NavigationLog) -> tuple[tuple[float, float], ...]:
 
 
 def _tell(record: DiveRecord) -> None:
-    """Warn of gaps; what was left out and assumed stands in the report of who reads the record."""
+    """Warn of gaps; what was left out or assumed is in the caller's report."""
     for start_s, length_s in record.gaps[:8]:
         warn(f"{record.source}: a gap of {length_s:.1f} s from {start_s:.1f} s")
     if len(record.gaps) > 8:
@@ -397,7 +397,7 @@ def assign_lines(stations: Stations, plan: Plan) -> NDArray[np.intp]:
 
     A station belongs to the plan's line that it is nearest to, if it is within half a spacing of
     it, beyond its ends by no more than a step, and along it either way. Of what is left, runs of
-    three pictures or more on one course without a pause count as lines of their own, numbered on
+    three pictures or more on one course without a pause count as separate lines, numbered on
     from the plan's; the rest is -1: seen, but on no line.
     """
     line = np.full(len(stations), -1, dtype=np.intp)

@@ -46,9 +46,9 @@ _WIDTH_IN, _LEAST_WIDTH_IN, _AROUND_IN = 9.0, 6.6, (1.5, 1.7)
 _LEAST_MAP_IN, _MOST_MAP_IN = 2.2, 8.2
 """Height of a map."""
 _MARGIN = 0.06
-"""Around the area, of its longer side."""
+"""Margin around the area, as a share of its longer side."""
 _CLASSES = 12
-"""At most, of counts."""
+"""Most classes of counts."""
 
 
 @progress.step("draw the coverage")
@@ -174,7 +174,7 @@ def finish_map(figure: Sheet, axes: Axes, datum: Datum, title: str, text: str) -
 
 
 def draw_counts(axes: Axes, certificate: Certificate, opacity: float = 1.0) -> None:
-    """How many pictures see each place, in steps that the eye can tell apart."""
+    """How many pictures see each place, in steps that the eye can distinguish."""
     most = int(np.percentile(certificate.pictures[certificate.inside], 99.5))
     width = math.ceil(max(most, 1) / _CLASSES)
     steps = np.arange(1, most + 2 * width, width)

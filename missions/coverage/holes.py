@@ -23,16 +23,16 @@ class Hole:
     """A place inside of it."""
     latitude_deg: float
     longitude_deg: float
-    """Of that place."""
+    """Longitude of that place."""
     area_m2: float
-    """Of the cells whose middles are short of what was requested."""
+    """Area of the cells whose middles are short of what was requested."""
     unseen_m2: float
-    """Of these, what is in no picture at all."""
+    """The part of that area that is in no picture at all."""
     length_m: float
     width_m: float
-    """Of the smallest rectangle round it."""
+    """Width of the smallest rectangle round it."""
     fewest_pictures: int
-    """Of the camera that sees least, where it sees least."""
+    """Fewest pictures of a place in it, of the camera that sees least."""
     fewest_lines: int
 
     def to_json(self) -> dict[str, Any]:
@@ -83,7 +83,7 @@ def find_holes(certificate: Certificate) -> tuple[Hole, ...]:
         outlines.setdefault(int(label), []).append(shapely.geometry.shape(shape))
     holes = []
     for label, parts in outlines.items():
-        # Rings that touch themselves at a corner are no valid polygons before they are mended.
+        # Rings that touch themselves at a corner are not valid polygons before they are repaired.
         cell_outline = shapely.make_valid(shapely.union_all(shapely.make_valid(parts)))
         outline = shapely.transform(
             cell_outline, lambda xy: certificate.grid.places_of(xy[:, ::-1])

@@ -20,7 +20,8 @@ from missions.values.area import Area
 from missions.values.footprint import glass_point_cam
 
 _POINTS_PER_SIDE = 16
-"""Of a footprint's border. Chords of so short arcs leave out less than 1e-4 of its width."""
+"""Points on each side of a footprint's border. Chords this short leave out less than 1e-4 of its
+width."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +29,7 @@ class Grid:
     """Square cells in rows along a heading; the cell (0, 0) is at the corner astern to port."""
 
     origin_ne: tuple[float, float]
-    """That corner, metres."""
+    """North and east of that corner, metres."""
     heading_rad: float
     """The way in which rows count; columns count to the right of it."""
     cell_m: float
@@ -81,7 +82,7 @@ def grid_over(area: Area, cell_m: float) -> Grid:
     bare = Grid(origin_ne=(0.0, 0.0), heading_rad=heading, cell_m=cell_m, rows=1, columns=1)
     corners = bare.cells_of(area.corners_ne)
     low, high = corners.min(axis=0), corners.max(axis=0)
-    # A side of a whole number of cells has so many, whatever the rounding.
+    # A side of a whole number of cells has that many, whatever the rounding.
     counts = np.maximum(np.ceil(high - low - 1e-9).astype(int), 1)
     origin = bare.places_of((low + high - counts) / 2)
     return Grid(

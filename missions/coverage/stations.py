@@ -30,13 +30,13 @@ class Stations:
     glass_ne: Array
     """(S, 2) north and east of the left port's outer glass, metres."""
     altitude_m: Array
-    """(S,) of the left port's outer glass above the sea floor, which is level below it."""
+    """(S,) height of the left port's outer glass above the sea floor, which is level below it."""
     attitude_rad: Array
     """(S, 3) roll, pitch, heading of the vehicle."""
     line: NDArray[np.intp]
     """(S,) which pass over the area it belongs to: the plan's line, or -1 between lines."""
     time_s: Array | None = None
-    """(S,) where it is known."""
+    """(S,) times, where they are known."""
 
     def __post_init__(self) -> None:
         count = len(self.glass_ne)
@@ -137,9 +137,9 @@ def sure_pattern(rig: Rig, altitude_m: float, spacing_m: float, step_m: float) -
     """The pattern of lines and pictures that keeps what it promises at the corners of footprints.
 
     A footprint bulges: its side reaches less far out at the corners than in the middle. A place
-    that `k` pictures of a line shall see must be within reach of the side over `k` steps, so more
-    pictures make a narrower swath. Of all that hold, the one with the most pictures of a place is
-    taken, and of equal ones that with the most lines.
+    that `k` pictures of a line are to see must be within reach of the side over `k` steps, so more
+    pictures make a narrower swath. Of all that qualify, the one with the most pictures of a place
+    is taken, and of equal ones that with the most lines.
 
     Args:
         rig: the cameras; what every one of them sees counts.

@@ -63,7 +63,7 @@ class ExportFile:
     """A file of a format."""
 
     name: str
-    """With `{}` for the number of the dive where there is one for each."""
+    """File name, with `{}` for the number of the dive where there is one for each."""
     about: str
     """What it is, in words."""
     write: Callable[[Path, Export, int], None]

@@ -32,8 +32,8 @@ class Item:
     command: int
     frame: int
     params: tuple[float, float, float, float, float, float, float]
-    """As the command defines them; of a way-point the last three are latitude and longitude,
-    degrees, and altitude, metres."""
+    """Parameters as the command defines them; the last three of a way-point are latitude and
+    longitude, degrees, and altitude, metres."""
 
 
 def mission_items(

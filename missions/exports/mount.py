@@ -1,9 +1,9 @@
-"""What a vehicle steers, beside what a plan is of: its reference point and altimeter, the glass.
+"""A vehicle's reference point and altimeter, relative to the glass that a plan's places are of.
 
 A plan's places, depths and altitudes are of the left port's outer glass. A vehicle steers its own
 reference point (COLA2: base_link; ArduSub: the origin of its EKF) and holds the altitude that its
 altimeter (DVL, sounder) measures. The ways between are fixed lengths on the vehicle; here it is
-level, as the plan wants it.
+level, as the plan assumes.
 """
 
 from dataclasses import dataclass

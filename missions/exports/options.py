@@ -1,4 +1,4 @@
-"""What a vehicle needs said besides the plan."""
+"""What a vehicle needs to know besides the plan."""
 
 from dataclasses import dataclass
 
@@ -10,24 +10,24 @@ from missions.values.footprint import common_swath
 from missions.values.plan_file import Plan
 
 _LEAST_TOLERANCE_M = 0.12
-"""The cross-track error that the paper's vehicle holds with its improved controller: a vehicle told
+"""The cross-track error that the paper's vehicle holds with its improved controller: a vehicle set
 to pass a place more closely turns back for it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """What a vehicle needs said besides the plan."""
+    """What a vehicle needs to know besides the plan."""
 
     altimeter_body_m: tuple[float, float, float] = CameraConfig().dvl_position_body_m
     """The sensor whose altitude the vehicle holds, from its reference point."""
     pixel_um: float = CameraConfig().pixel_um
-    """Of the sensor; QGroundControl wants its size."""
+    """Size of the sensor's pixels; QGroundControl needs the sensor's size."""
     camera_on: str = "camera_trigger/enable"
     """COLA2: the service (without arguments) that starts pictures."""
     camera_off: str = "camera_trigger/disable"
     least_tolerance_m: float = _LEAST_TOLERANCE_M
     turn_rate_rad_s: float = SPOT_RAD_S
-    """Of turns on the spot, which way-points wait for."""
+    """Rate of turns on the spot, which way-points wait for."""
 
     def __post_init__(self) -> None:
         if self.least_tolerance_m <= 0 or self.pixel_um <= 0:
@@ -46,11 +46,11 @@ def options_of(camera: CameraConfig, plan: PlanConfig) -> Options:
 
 
 def line_tolerance_m(plan: Plan, rig: Rig, options: Options) -> float:
-    """How far off a line's ends the vehicle may be and the survey still holds.
+    """How far off a line's ends the vehicle may be with the survey still complete.
 
     Half a step along the line, so that its last picture is taken; across it, half of what
-    neighbouring stereo swaths see more often than the plan wants, so that two lines that err apart
-    leave no gap. Not less than what a vehicle can hold.
+    neighbouring stereo swaths see more often than the plan needs, so that two lines off track leave
+    no gap. Not less than what a vehicle can hold.
     """
     stereo = common_swath(rig, plan.altitude_m, plan.station_spacing_m)
     passes = max(1, int(2 * stereo.half_across_m / plan.line_spacing_m + 1e-9))

@@ -38,18 +38,18 @@ class Waypoint:
     """What to switch pictures to on arrival."""
     glass_ne_m: tuple[float, float]
     vehicle_ne_m: tuple[float, float]
-    """Of the vehicle's reference point."""
+    """North and east of the vehicle's reference point."""
     latitude_deg: float
-    """Of the reference point, as `longitude_deg`."""
+    """Latitude of the reference point, as `longitude_deg`."""
     longitude_deg: float
     glass_latitude_deg: float
     glass_longitude_deg: float
     heading_rad: float
-    """Of the vehicle on arrival, in [0, 2 pi)."""
+    """Heading of the vehicle on arrival, in [0, 2 pi)."""
     depth_m: float
-    """Of the reference point, below the surface."""
+    """Depth of the reference point below the surface."""
     altitude_m: float
-    """Of the altimeter above the sea floor."""
+    """Height of the altimeter above the sea floor."""
     glass_depth_m: float
     glass_altitude_m: float
     speed_mps: float

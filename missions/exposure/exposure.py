@@ -32,13 +32,13 @@ class BlurRates:
     """How fast the sea floor moves over the sensor, px/s."""
 
     speed: float
-    """At the centre, from speed over ground."""
+    """Motion at the centre, from speed over ground."""
     speed_worst: float
     """The same in the worst pixel: the port magnifies towards the corners."""
     roll_pitch: float
-    """At the centre, from roll and pitch, each at its rate, in quadrature."""
+    """Motion at the centre, from roll and pitch, each at its rate, in quadrature."""
     yaw: float
-    """At the worst corner, from yaw."""
+    """Motion at the worst corner, from yaw."""
     combined: float
     """All, in quadrature (rates are taken for independent standard deviations), in the worst of
     the frame's centre, corners and middles of sides."""

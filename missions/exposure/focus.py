@@ -141,7 +141,7 @@ def _altitude_of(camera: FlatPortCamera, apparent_m: float) -> float:
 def _coc_for_depth_px(
     camera: FlatPortCamera, limits: CameraConfig, focus_m: float, depth_m: float
 ) -> float:
-    """Circle of confusion for which so many metres of water are sharp, focused at focus_m.
+    """Circle of confusion for which a depth of metres of water is sharp, focused at focus_m.
 
     Apparent distances 1 / (1/s -+ k) differ by depth / n: 2 k = (1/s^2 - k^2) depth / n, of which
     the positive root in k counts.

@@ -31,7 +31,7 @@ _PORT = (
     "pixel: D = d + g/n_glass + a/n_water"
 )
 LEAST_ALTITUDE_M = 0.3
-"""Of the glass over any ground; `plan.altitude_m` allows no less either."""
+"""Least altitude of the glass over any ground; `plan.altitude_m` allows no less either."""
 _GEOMETRY = "geometry of level footprints"
 
 
@@ -41,9 +41,9 @@ class FootprintAt:
 
     altitude_m: float
     across_m: float
-    """On the middle row."""
+    """Width of a footprint on the middle row."""
     along_m: float
-    """On the middle column."""
+    """Length of a footprint on the middle column."""
     pixel_m: float
     """The central pixel on the sea floor (paraxial)."""
     stereo_across_m: float
@@ -66,17 +66,17 @@ class Spacing:
     spacing_m: float
     bound_by: str
     mean_overlap: float
-    """Of one camera's pictures on the middle row, at the mean altitude."""
+    """Side overlap of one camera's pictures on the middle row, at the mean altitude."""
     top_overlap: float
     """The same at the top of the relief."""
     off_track_overlap: float
-    """At the top of the relief where two neighbours are each off by the track error, away from
-    each other."""
+    """Side overlap at the top of the relief where two neighbours are each off by the track error,
+    away from each other."""
     area_overlap: float
     """Share of the area of one camera's picture that the picture abeam on the next line sees too,
     at the mean altitude. Less than on the middle row: through a port a footprint bulges."""
     swath_overlap: float
-    """The same of what one camera surely sees on a line, between its pictures."""
+    """Side overlap of what one camera surely sees on a line, between its pictures."""
     stereo_overlap: float
     """Least overlap of neighbouring stereo swaths at the mean altitude."""
 

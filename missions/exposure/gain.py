@@ -48,7 +48,7 @@ class PictureLevels:
 
     picture: str
     median: float
-    """Of the mean of its channels."""
+    """Median of the mean of its channels."""
     dark: float
     """0.5th percentile."""
     bright: float

@@ -9,7 +9,7 @@ Assumed: no daylight; the LEDs' spectrum is Planck's at their colour temperature
 700 nm (an LED has a blue peak and a gap at 480 nm instead; its lumens are the same); each channel
 takes a third of that range, with the water of its middle, and has the whole quantum efficiency;
 sand as in the simulator. The simulator (`alice_survey.seafloor`) computes the same by ray, with a
-soft edge of the cone and an even spectrum: it is the twin that tests compare with.
+soft edge of the cone and an even spectrum: tests compare the two.
 """
 
 import math
@@ -37,14 +37,14 @@ MIDDLE_GREY = 0.2
 """Share of full scale, linear, that the median is brought to; as in the simulator."""
 
 LEAST_SNR = 5.0
-"""Below it detail of a pixel drowns (Rose 1948, J. Opt. Soc. Am. 38, 196)."""
+"""Below it detail of a pixel is lost in noise (Rose 1948, J. Opt. Soc. Am. 38, 196)."""
 
 Spectrum = Literal["planck", "even"]
 
 _PLANCK_J_S, _LIGHT_M_S, _BOLTZMANN_J_K = 6.62607015e-34, 299_792_458.0, 1.380649e-23
 _LUMENS_PER_WATT = 683.0
 _BANDS_NM = ((600.0, 700.0), (500.0, 600.0), (400.0, 500.0))
-"""Of red, green and blue."""
+"""Bands of red, green and blue."""
 _GRID = (13, 11)
 _SOURCE = (
     "missions.exposure.light; water: Jerlov 1976 and Kirk 1984 (camera_calib.water); LEDs as a "
@@ -59,9 +59,9 @@ class LightBudget:
     centre_e: tuple[float, float, float]
     """Red, green and blue, at the middle of the frame."""
     corner_e: tuple[float, float, float]
-    """In the darkest corner."""
+    """Electrons in the darkest corner."""
     median_e: float
-    """Of the mean of the channels over the frame."""
+    """Median of the mean of the channels over the frame."""
     brightest_e: float
     """The largest of any channel anywhere in the frame."""
     snr_centre: tuple[float, float, float]
@@ -71,7 +71,8 @@ class LightBudget:
     full_share: float
     """Brightest over full well."""
     gain_db: float
-    """That brings the median to middle grey of the full scale; 0 dB puts the full well there."""
+    """Gain that brings the median to middle grey of the full scale; 0 dB puts the full well there.
+    """
     half_full_f_number: float
     """F-number at which the brightest reaches half the full well, in this exposure."""
     half_full_exposure_s: float

@@ -36,9 +36,9 @@ class Shadows:
     """What the strobes' places do to an object on the floor below the camera."""
 
     length_m: tuple[float, ...]
-    """Of the shadow that each strobe casts of an object."""
+    """Length of the shadow that each strobe casts of an object."""
     height_m: float
-    """Of that object."""
+    """Height of that object."""
     between_deg: float
     """Angle at the floor between the two strobes' light (the largest of any two); 0 of one."""
     opposite: bool

@@ -95,13 +95,13 @@ class ImagingSettings:
     """The central pixel on the sea floor (paraxial)."""
     exposure_s: float
     blur_px: float
-    """In the worst pixel, from speed and attitude rates in quadrature."""
+    """Blur in the worst pixel, from speed and attitude rates in quadrature."""
     interval_s: float
     shortest_interval_s: float
-    """Of camera and trigger controller."""
+    """Shortest interval of camera and trigger controller."""
     station_spacing_m: float
     forward_overlap: float
-    """As reached, on the middle column."""
+    """Forward overlap as reached, on the middle column."""
     strobe_pulse_s: float
     strobe_lead_s: float
     strobe_duty: float
@@ -110,7 +110,7 @@ class ImagingSettings:
     """Mean power of the strobes from the battery while a line is flown; cameras and recorder are
     in `vehicle.hotel_w`."""
     frame_j: float
-    """The same for one trigger."""
+    """Battery energy of the strobes for one trigger."""
     paper_rule: PaperRule
     spacing: Spacing
     blur: BlurRates

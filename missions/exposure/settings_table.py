@@ -21,7 +21,7 @@ class Setting:
     value: float | tuple[float, ...]
     """One number, or some: over the relief, over the channels (the note says which)."""
     unit: str
-    """Of the value; `%` shows a share as percent."""
+    """Unit of the value; `%` shows a share as percent."""
     equation: str
     source: str
     bound_by: str

@@ -21,29 +21,30 @@ from missions.values.costs import time_costs
 
 @dataclass(frozen=True, kw_only=True)
 class RateOption:
-    """What a fixed frame rate asks of the speed, with one lens."""
+    """The speed that a fixed frame rate needs, with one lens."""
 
     lens_mm: float
     speed_mps: float
-    """At which the forward overlap is as requested."""
+    """Speed at which the forward overlap is as requested."""
     forward_overlap: float
-    """At the speed of the plan instead."""
+    """Forward overlap at the speed of the plan instead."""
     exposure_ms: float = math.nan
     gain_db: float = math.nan
     snr: float = math.nan
-    """Of the median pixel; it and the two above are NaN where no settings can be made."""
+    """Signal to noise of the median pixel; it and the two above are NaN where no settings can be
+    made."""
     fits: bool = False
     why: str
 
 
 @dataclass(frozen=True, kw_only=True)
 class DiveArea:
-    """What area a dive holds."""
+    """The area that a dive covers."""
 
     dive_s: float
     area_m2: float
     side_m: float
-    """Of a square of it."""
+    """Side of a square of that area."""
     lines: int
     line_spacing_m: float
     speed_mps: float

@@ -29,7 +29,7 @@ class LensOption:
     altitude_m: float
     pixel_mm: float
     f_number: float = math.nan
-    """As set, or as the depth of field needs."""
+    """F-number as set, or as the depth of field needs."""
     across_m: float = math.nan
     stereo_m: float = math.nan
     spacing_m: float = math.nan
@@ -37,9 +37,9 @@ class LensOption:
     exposure_ms: float = math.nan
     gain_db: float = math.nan
     snr: float = math.nan
-    """Of the median pixel."""
+    """Signal to noise of the median pixel."""
     hours_per_1000_m2: float = math.inf
-    """On lines alone, without turns."""
+    """Time on lines alone, without turns."""
     fits: bool = False
     why: str
     """What is against it; empty where nothing is."""

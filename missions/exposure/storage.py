@@ -7,8 +7,8 @@ from camera_calib.flat_port import FlatPortCamera
 from missions.exposure.settings_table import Setting
 
 LINK_BYTES_PER_S = 124e6
-"""Of one Gigabit Ethernet cable: the cameras' `StreamBytesPerSecond` at full bandwidth (Allied
-Vision, Manta Technical Manual, notes on frame rates)."""
+"""Capacity of one Gigabit Ethernet cable: the cameras' `StreamBytesPerSecond` at full bandwidth
+(Allied Vision, Manta Technical Manual, notes on frame rates)."""
 DISK_BYTES_PER_S = 250e6
 """Inferred: half of what a SATA disk on the recorder writes at best (about 500 MB/s)."""
 _SOURCE = "Allied Vision, Manta Technical Manual (124 MB/s a link); disk 250 MB/s is inferred"
@@ -19,11 +19,11 @@ class Storage:
     """Data of one trigger and what limits their flow."""
 
     frame_bytes: int
-    """Of one picture, raw, one byte a pixel."""
+    """Size of one picture, raw, one byte a pixel."""
     station_bytes: int
-    """Of all cameras' pictures of one trigger."""
+    """Size of all cameras' pictures of one trigger."""
     bytes_per_s: float
-    """While a line is flown."""
+    """Data rate while a line is flown."""
     own_link_hz: float
     """Most triggers a second, each camera on a cable of its own."""
     shared_link_hz: float

@@ -20,7 +20,7 @@ DRIVER_EFFICIENCY = 0.9
 """Inferred: a switched LED driver."""
 LED_KELVIN_PER_WATT = 1.8
 BUS_V, BUS_SAG = 28.0, 0.10
-"""Inferred: a lithium-ion battery of 7 to 8 cells; the sag that its other loads bear."""
+"""Inferred: a lithium-ion battery of 7 to 8 cells; the sag that its other loads tolerate."""
 HOUSING_KELVIN_PER_WATT = 0.5
 """Inferred: 0.02 m^2 of metal in water at 100 W/(m^2 K), the low end of free convection in liquids
 (Incropera, Fundamentals of Heat and Mass Transfer, table 1.1)."""
@@ -33,7 +33,7 @@ _SOURCE = (
 
 @dataclass(frozen=True, kw_only=True)
 class StrobeLoad:
-    """What the strobes ask of the vehicle; powers and energies are electric."""
+    """What the strobes need from the vehicle; powers and energies are electric."""
 
     count: int
     pulse_s: float
@@ -41,21 +41,21 @@ class StrobeLoad:
     duty: float
     """Share of the time for which they are lit."""
     duty_limit: float
-    """At which an LED's solder point reaches its limit in warm water."""
+    """Duty cycle at which an LED's solder point reaches its limit in warm water."""
     lit_w: float
-    """Of one strobe while it is lit, at the LEDs."""
+    """Power of one strobe while it is lit, at the LEDs."""
     frame_j: float
-    """From the battery, for all strobes and one picture."""
+    """Energy from the battery, for all strobes and one picture."""
     mean_w: float
-    """From the battery, for all strobes."""
+    """Mean power from the battery, for all strobes."""
     peak_a: float
-    """From the battery while all are lit, without a capacitor."""
+    """Current from the battery while all are lit, without a capacitor."""
     capacitor_f: float
-    """That feeds one pulse of one strobe within `BUS_SAG` of `BUS_V`."""
+    """Capacity that feeds one pulse of one strobe within `BUS_SAG` of `BUS_V`."""
     solder_c: float
-    """Of the LEDs in water of `WARM_SEA_C`, in the mean."""
+    """Mean temperature of the LEDs' solder points in water of `WARM_SEA_C`."""
     junction_c: float
-    """At most: mean of the solder point and the rise of a long pulse."""
+    """Highest junction temperature: mean of the solder point and the rise of a long pulse."""
 
 
 def strobe_load(
@@ -64,7 +64,7 @@ def strobe_load(
     """Pulse and what it takes.
 
     Raises:
-        PlanError: the strobes would be lit for a larger share of the time than they bear.
+        PlanError: the strobes would be lit for a larger share of the time than they can take.
     """
     pulse_s = exposure_s + 2 * plan.strobe_lead_s
     lit_w = imaging.strobe_lumens / EFFICACY_LM_W

@@ -20,7 +20,7 @@ _HIGHEST_M = 10.0
 class PaperRule:
     """What the paper's frame rate r = u / (H (1 - O)) gives (its section VII.A).
 
-    It takes the altitude H for the footprint along the track, which holds for no lens of the paper.
+    It takes the altitude H for the footprint along the track, which fits no lens of the paper.
     """
 
     rate_hz: float

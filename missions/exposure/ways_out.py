@@ -1,8 +1,8 @@
 """What to say when limits conflict: which two do, and the cheapest ways out.
 
-Whoever finds a conflict computes the ways: each is a setting with the value that just fits and what
-it costs. Costs are shares (0.3: the survey takes 30 % longer, or 30 % of what was requested is
-given up), so that ways of different kinds can be put in order.
+The code that finds a conflict computes the ways: each is a setting with the value that just fits
+and what it costs. Costs are shares (0.3: the survey takes 30 % longer, or 30 % of what was
+requested is given up), so that ways of different kinds can be put in order.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""`alice-survey plan check`: what a dive has seen, where holes are left, and a plan for these."""
+"""`alice-survey plan check`: what a dive has seen, which holes are left, and a plan for these."""
 
 import hashlib
 import json
@@ -41,7 +41,7 @@ class Check:
     planned: Certificate
     flown: Certificate
     holes: tuple[Hole, ...]
-    """Of what was flown, worst first."""
+    """Holes of what was flown, worst first."""
 
     def to_json(self) -> dict[str, Any]:
         """All figures: `certificate.json`."""
@@ -135,7 +135,7 @@ def check_report(
         triggers: as of `check_log`.
         manifest: as of `check_log`.
         out: folder to write; left out, `check` in the workspace.
-        monte_carlo: fly the plan so many times in simulation, too.
+        monte_carlo: how many times to also fly the plan in simulation.
         executor: where tasks run; all cores of this machine when left out.
 
     Returns:

@@ -2,7 +2,7 @@
 
 The original SPARUS II steers by line of sight with two horizontal thrusters; ALICE has two lateral
 thrusters more and holds its lines by sway. All fly the same plan in the same sea: the current and
-the gusts are drawn from a generator of their own, so that vehicles which behave differently still
+the gusts are drawn from a separate generator, so that vehicles which behave differently still
 meet the same water. The followed point is the body's origin, as in the paper ("the coordinates of
 the vehicle", eq. los_heading), not the left port's glass as in `fly`.
 """
@@ -51,7 +51,7 @@ class Variant:
     vehicle: Literal["alice", "sparus2"]
     controller: Literal["sway", "los"]
     look_ahead_m: float | None = None
-    """Of `los`; derived from the vehicle when left out."""
+    """Look-ahead distance of `los`; derived from the vehicle when left out."""
     failed: tuple[str, ...] = ()
     """Thrusters that are left out."""
     equal_speeds: bool = False
@@ -79,7 +79,7 @@ VARIANTS = (
     Variant(name="ALICE by line of sight", vehicle="alice", controller="los"),
     Variant(name=IMPROVED, vehicle="alice", controller="sway"),
 )  # fmt: skip
-"""What is compared: the two configurations, and what their difference hangs on."""
+"""What is compared: the two configurations, and what separates them."""
 
 
 PAPER = {
@@ -97,7 +97,7 @@ lawnmower at 0.2 m/s, turned by the horizontal thrusters."""
 
 @dataclass(frozen=True, kw_only=True)
 class FlightFigures:
-    """What came out of one flight; NaN where there is none.
+    """Figures of one flight; NaN where there is none.
 
     Cross-track errors are rms, of the body's origin: "true" by the true place, "believed" by the
     navigation's. "Route" is all the way from the first line's run-in to the last line's end, turns
@@ -118,15 +118,15 @@ class FlightFigures:
     turn_surge_peak_mps: float
     turn_surge_worst_mps: float
     turn_speed_peak_mps: float
-    """Of the horizontal speed: surge and sway."""
+    """Peak of the horizontal speed: surge and sway."""
     turn_yaw_peak_deg_s: float
     turn_torque_peak_nm: float
-    """Roll moment by propellers."""
+    """Roll moment of the propellers."""
     turn_s: float
-    """From the end of one line to the start of the next."""
+    """Time from the end of one line to the start of the next."""
     navigation_rms_m: float
     survey_energy_wh: float
-    """From the run-in to the end of the last line."""
+    """Energy from the run-in to the end of the last line."""
     survey_s: float
     complete: float
     """1 if the mission came to its end."""
@@ -201,11 +201,11 @@ class CaseResult:
 
     case: Case
     across_mps: float
-    """Of the current, to starboard of the first line."""
+    """Speed of the current to starboard of the first line."""
     along_mps: float
     outcomes: tuple[Outcome, ...]
     summaries: dict[str, Summary]
-    """By variant."""
+    """Summary of each variant."""
 
     @property
     def title(self) -> str:
@@ -226,8 +226,8 @@ class CaseResult:
 def default_cases(plan: Plan) -> tuple[Case, ...]:
     """A current across the lines, one along them, still water, and that with some swell.
 
-    The paper says nothing of its sea. 0.1 m/s is the current that the improved controller is
-    asked to hold its lines in; 0.5 m and 6 s are a calm day on an open coast (inferred).
+    The paper does not describe its sea. 0.1 m/s is the current in which the improved controller is
+    to hold its lines; 0.5 m and 6 s are a calm day on an open coast (inferred).
     """
     along = math.degrees(plan.lines[0].heading_rad)
     across = round((along + 90.0) % 360.0, 6)
@@ -394,7 +394,7 @@ def turn_rows(line: Array, following: NDArray[np.bool_]) -> list[slice]:
 
 
 def roll_moment(vehicle: Vehicle, flown: Flown, turns: Sequence[slice]) -> Array:
-    """(T,) moment of the thrusters about the roll axis, N m; NaN but in turns."""
+    """(T,) moment of the thrusters about the roll axis, N m; NaN outside of turns."""
     moment = np.full(len(flown.time_s), np.nan)
     for rows in turns:
         for row in range(rows.start, rows.stop):

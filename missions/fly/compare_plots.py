@@ -12,7 +12,7 @@ from missions.fly.flight_route import whole_route
 from missions.values.plan_file import Plan
 
 _AROUND_M = 3.2
-"""Of the lines, that a map shows: the turns, not the way in."""
+"""Margin around the lines that a map shows: the turns, not the way in."""
 _COLOURS = {ORIGINAL: "#c0392b", EQUAL: "#ca6f1e", IMPROVED: "#1b4f72"}
 _PAPER, _WAY = "#5d6d7e", "#aab7b8"
 

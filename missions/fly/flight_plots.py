@@ -127,7 +127,7 @@ def true_current(flown: Flown) -> Array:
 
 
 def thin(count: int) -> slice:
-    """Every n-th of so many points, that a curve stays light."""
+    """Every n-th of many points, so that a curve stays light."""
     return slice(None, None, max(1, math.ceil(count / _DRAWN)))
 
 

@@ -104,7 +104,7 @@ def room_behind_m(plan: Plan, path: Path, most_m: float) -> float:
     Args:
         plan: whose allowed area counts.
         path: its first leg's course.
-        most_m: as far as it wants to.
+        most_m: the most that is of use.
     """
     start = np.array([path.start_n[0], path.start_e[0]])
     course = float(path.heading_rad[0])

@@ -24,7 +24,7 @@ from missions.fly.simulation import FlightSettings, simulate_plan, with_values
 from missions.values.plan_file import Plan
 
 _STREAM = 50
-"""Of a survey's seed; `fly` and `compare` have others."""
+"""Random stream of a survey's seed; `fly` and `compare` have others."""
 _PERCENTILES = (5.0, 50.0, 95.0)
 
 
@@ -33,20 +33,20 @@ class MonteCarlo:
     """What flights of one plan saw of its area."""
 
     planned: Certificate
-    """Of the plan flown exactly, on the same grid."""
+    """Certificate of the plan flown exactly, on the same grid."""
     covered_share: Array
-    """(N,) of each flight: in at least one picture."""
+    """(N,) share of the area in at least one picture, for each flight."""
     stereo_share: Array
-    """(N,)"""
+    """(N,) share of the area seen in stereo."""
     share_at_overlap: Array
     """(N,)"""
     fewest_pictures: NDArray[np.intp]
-    """(N,) of any camera that see any place."""
+    """(N,) fewest pictures of any camera that see any place."""
     hole_probability: Array
-    """(rows, columns) share of flights that do not cover the place at the overlap asked for; NaN
+    """(rows, columns) share of flights that do not cover the place at the requested overlap; NaN
     outside of the area."""
     endings: dict[str, int]
-    """How the flights ended, and how many so."""
+    """How the flights ended, with counts."""
 
     @property
     def flights(self) -> int:
@@ -78,7 +78,7 @@ class FlightCoverage:
     share_at_overlap: float
     fewest_pictures: int
     short: NDArray[np.uint8]
-    """Where the area is not covered at the overlap asked for, one bit a cell, row by row."""
+    """Where the area is not covered at the requested overlap, one bit a cell, row by row."""
     ending: str
 
 
@@ -117,7 +117,7 @@ def monte_carlo(
         executor: where tasks run.
 
     Raises:
-        PlanError: no flight is asked for.
+        PlanError: no flight is requested.
         VehicleError: the vehicle cannot fly the plan.
     """
     if flights < 1:

@@ -49,14 +49,14 @@ from missions.values.navigation import BelievedNavigation
 from missions.values.plan_file import Plan
 
 _FLOOR_SPACING_M = 0.1
-"""Of the grid that the DVL hears: finer than the spot of a beam."""
+"""Spacing of the grid that the DVL sees: finer than the spot of a beam."""
 _BLIND_ALTITUDES = 1.5
-"""A dive without bottom lock stops so many altitudes above the planned sea floor: half an altitude
-is left for a floor that is shallower."""
+"""A dive without bottom lock stops this many altitudes above the planned sea floor: half an
+altitude is left for a floor that is shallower."""
 _CLIMB_MPS = 0.1
 """Slowest dive and ascent that a mission waits for."""
 _PATIENCE = 3.0
-"""A mission is broken off after so many times the time its plan takes."""
+"""A mission is aborted after this many times the time its plan takes."""
 _PITCH_MARGIN = 0.8
 """Share of the speed at which pitch diverges that a plan may have without a warning (inferred)."""
 _USBL_HZ = 0.5
@@ -74,7 +74,7 @@ class FlightSettings:
     sea: SeaConfig
     navigation: NavigationConfig
     camera: CameraConfig
-    """Where the left port and the DVL sit."""
+    """Placement of the left port and the DVL."""
     turn_rate_limit_deg_s: float
 
 
@@ -135,7 +135,7 @@ def simulate_plan(
 
 
 def longest_mission_s(plan: Plan) -> float:
-    """After how long a mission is broken off."""
+    """After how long a mission is aborted."""
     return _PATIENCE * (plan.duration_s + 2.0 * plan.seafloor_depth_m / _CLIMB_MPS)
 
 

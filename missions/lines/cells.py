@@ -17,8 +17,8 @@ from missions.lines.hops import hop_j, line_j
 from missions.values.costs import Prices
 
 CORNERS = 4
-"""Where a cell is entered: 0 at the begin of its first line, 1 at its end, 2 and 3 the same of
-its last line. Of a cell of one line, 0 and 1 only."""
+"""Where a cell is entered: 0 at the beginning of its first line, 1 at its end, 2 and 3 the same of
+its last line. A cell of one line has 0 and 1 only."""
 
 
 @compiled

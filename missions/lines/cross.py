@@ -1,10 +1,10 @@
 """Cross lines: at right angles to the survey lines, so that these are tied to one another.
 
-Survey lines beside one another form blocks. Over the length of each block a given number of cross
+Neighbouring survey lines form blocks. Over the length of each block a given number of cross
 lines is spread evenly. Where that leaves survey lines uncrossed (the arm of an L, the rest of a row
-beside a no-go zone), the cross lines are moved if as many can cross all; else short ones are added,
-from a neighbour that is crossed to the next. The least number of places that meet all of some
-intervals is found exactly by taking the end of the interval that ends first, again and again
+next to a no-go zone), the cross lines are moved if as many can cross all; else short ones are
+added, from a neighbour that is crossed to the next. The least number of places that meet all of
+some intervals is found exactly by taking the end of the interval that ends first, again and again
 (greedy stabbing; e.g. J. Kleinberg and E. Tardos 2006, chapter 4).
 """
 
@@ -91,7 +91,7 @@ def blocks(pieces: Array) -> tuple[NDArray[np.int64], Array]:
 
     Returns:
         (P,) number of each piece's block, and (P, 2) the longest stretch of u of each that lies
-        beside a piece of a neighbouring row; all of the piece, where there is none.
+        next to a piece of a neighbouring row; all of the piece, where there is none.
     """
     count = pieces.shape[0]
     parent = np.arange(count)

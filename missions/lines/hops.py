@@ -17,7 +17,8 @@ from missions.route.joins import LONGEST_SWAY_M
 from missions.values.costs import Costs, Prices, prices
 
 NOWHERE_J = 1e15
-"""Beyond any battery: stands for what cannot be flown, so that the rest can still be compared."""
+"""More than any battery holds: stands for what cannot be flown, so that the rest can still be
+compared."""
 _SAME_M = 1e-6
 _SAME_RAD = 1e-6
 

@@ -39,12 +39,12 @@ class Laid:
     table: Array
     """(L, 5) north and east of start and end, course."""
     steps: NDArray[np.int64]
-    """(L,) from picture to picture."""
+    """(L,) number of steps from picture to picture."""
     kinds: NDArray[np.int64]
     """(L,) indices of `KINDS`."""
     lines_j: float
     hops_j: float
-    """From home, between lines and home again."""
+    """Energy from home, between lines and home again."""
 
     @property
     def energy_j(self) -> float:
@@ -299,7 +299,7 @@ def _linked(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Single:
-    """Lines that are no part of the grid."""
+    """Lines that are not part of the grid."""
 
     ends: Array
     """(N, 4) north and east of begin and end."""

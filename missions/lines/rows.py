@@ -22,7 +22,7 @@ TOUCH_M = 1e-7
 """Strips are this much narrower at both sides, so that an area that only touches a strip does not
 count; and a line may run this close outside of the allowed area, so that it may follow its edge."""
 _SHORTEST_M = 1e-3
-"""Where the vehicle has less room along a line than this, no line is flown."""
+"""Shortest room along a line: where the vehicle has less, no line is flown."""
 _EVEN = 1e-9
 
 

@@ -17,7 +17,7 @@ class Site:
     survey: Array
     allowed: Array
     parts: tuple[Array, ...]
-    """Of every part of the survey area."""
+    """Edges of every part of the survey area."""
     area_m2: float
 
     @classmethod

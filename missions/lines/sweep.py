@@ -46,7 +46,7 @@ _BEST = 24
 _REFINED = 4
 """Best close costs near which they are taken again."""
 _BESIDE = (-3.0, -2.0, -1.0, 1.0, 2.0, 3.0)
-"""Tenths of a degree beside these at which they are."""
+"""Tenths of a degree on either side at which they are."""
 _FULL = 16
 """Best close costs at which the full cost is taken."""
 _MOST = _SPREAD + 1 + _BEST + _REFINED * (_REFINED + len(_BESIDE)) + _FULL
@@ -64,11 +64,12 @@ class Sweep:
 
     heading_rad: float
     cost_j: float
-    """Of the whole flight from home to home, as lines are ordered (`missions.lines.hops`)."""
+    """Energy of the whole flight from home to home, as lines are ordered (`missions.lines.hops`).
+    """
     width_heading_rad: float
-    """Where the total width of all cells is least."""
+    """Heading for which the total width of all cells is least."""
     width_m: float
-    """That width: how many lines are needed, times their spacing."""
+    """Total width of all cells: how many lines are needed, times their spacing."""
     candidates: tuple[tuple[float, float], ...]
     """Heading, rad, and full cost, J, wherever that was taken, by heading."""
 

@@ -3,7 +3,7 @@
 Few cells are ordered exactly, by dynamic programming over the sets of cells flown (M. Held and
 R. M. Karp 1962) with the corner at which each is entered. Many are ordered by going to the nearest,
 then improving: stretches of the tour are reversed, cells are moved, and corners of entry are chosen
-anew by dynamic programming along the tour, until nothing gains; then it is shaken and improved
+again by dynamic programming along the tour, until nothing gains; then it is shaken and improved
 again.
 """
 
@@ -151,7 +151,7 @@ def _reenter(
     finish: Array,
     fixed: int,
 ) -> None:
-    """Choose the corners of entry along a tour anew, exactly, in place."""
+    """Choose the corners of entry along a tour again, exactly, in place."""
     cells = tour.size
     costs = np.full((cells, CORNERS), np.inf)
     before = np.zeros((cells, CORNERS), np.int64)

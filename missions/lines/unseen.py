@@ -1,8 +1,8 @@
 """What parallel lines leave unseen, exactly along them and by thin strips across.
 
 Strips lie between all offsets at which something changes: corners of the area, sides of the lines'
-swaths, and where the area's edge crosses an end of what is seen beside a gap. On the middle of each
-strip the parts that are seen too seldom are found exactly.
+swaths, and where the area's edge crosses an end of what is seen by a gap. On the middle of each
+strip the parts that are seen too few times are found exactly.
 """
 
 import math
@@ -23,7 +23,7 @@ _TINY_M = 1e-9
 def unseen(
     survey: Array, pattern: Pattern, offsets: Array, pieces: Array, cuts: Array, finest_m: float
 ) -> Array:
-    """What a pattern sees too seldom near the places where it could not be laid.
+    """What a pattern sees too few times near the places where it could not be laid.
 
     Args:
         survey: (E, 4) u, v of the edges of what must be seen.
@@ -113,7 +113,7 @@ def _strips(sides: Array, low: Array, high: Array, finest_m: float) -> tuple[Arr
 def _corners(
     survey: Array, offsets: Array, cuts: Array, half_across: float, half_along: float
 ) -> Array:
-    """Offsets, (N,), where the area's edge crosses an end of what is seen beside a cut.
+    """Offsets, (N,), where the area's edge crosses an end of what is seen next to a cut.
 
     There what is unseen has a corner: without them the middle of a strip may miss most of it.
     """
@@ -138,7 +138,7 @@ def _corners(
 
 @compiled
 def pictures_of(begin: float, end: float, steps: float, u: float, half_along: float) -> int:
-    """How many of the pictures of a piece see a place beside it."""
+    """How many of the pictures of a piece see a place to its side."""
     step = (end - begin) / max(steps, 1.0)
     if step <= 0.0:
         return int(steps) + 1 if abs(u - begin) <= half_along + _TINY_M else 0

@@ -23,7 +23,7 @@ _GPS_EPOCH_S = 315964800.0
 """6 January 1980 in seconds since 1970."""
 _WEEK_S = 604800.0
 _LEAPS = ((1167264018.0, 18.0), (1119744017.0, 17.0), (1025136016.0, 16.0), (0.0, 15.0))
-"""GPS seconds from which GPS was ahead of UTC by so many seconds (IERS Bulletin C: 1 January 2017,
+"""GPS seconds from which GPS led UTC by this many seconds (IERS Bulletin C: 1 January 2017,
 1 July 2015, 1 July 2012)."""
 _FIX_3D = 3
 _DOWN = 25
@@ -37,7 +37,7 @@ _REBOOT_S = 1.0
 
 _Tables = Mapping[str, LogTable]
 _Reader = Callable[[_Tables], tuple[Array, Array] | None]
-"""From tables to times and values; None where a table or a field is missing."""
+"""Takes tables to times and values; None where a table or a field is missing."""
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ _BIN: Mapping[str, tuple[_Source, ...]] = {
     "rates": (_Source("RATE", _take("RATE", ("R", "P", "Y"), float(np.deg2rad(1.0)))),),
     "pwm": (_Source("RCOU", _take("RCOU", [f"C{i}" for i in range(1, 9)])),),
 }
-"""For each role the sources, the best first; degrees, metres, m/s, rad/s."""
+"""Sources of each role, the best first; degrees, metres, m/s, rad/s."""
 _TLOG: Mapping[str, tuple[_Source, ...]] = {
     "navigation": (
         _Source(
@@ -209,10 +209,10 @@ def read_ardusub_bin(path: Path, asked: Mapping[str, str]) -> LoggedDive:
 
     Args:
         path: a .BIN or a text .log.
-        asked: by role (`dive.ROLES`): which message to use, `NAME` or `NAME[instance]`.
+        asked: the message to use for each role (`dive.ROLES`), `NAME` or `NAME[instance]`.
 
     Raises:
-        NavigationError: it is no such log, or lacks what navigation needs.
+        NavigationError: it is not such a log, or lacks what navigation needs.
     """
     lost: Counter[str] = Counter()
     wanted = {source.message for sources in _BIN.values() for source in sources}
@@ -318,7 +318,7 @@ def _signal(
     present: Sequence[str],
     lost: Counter[str],
 ) -> tuple[Signal | None, str]:
-    """The best source that the log holds, or the one that is asked for, and its note."""
+    """The best source that the log holds, or the requested one, and its note."""
     name, _, instance = (asked or "").removesuffix("]").partition("[")
     known = [source.message for source in sources]
     if name and name not in known:
@@ -349,7 +349,7 @@ def _one_instance(
     """The rows of one core or sensor, and a note on the others.
 
     Cores and GPS receivers count from the one that is used. Which barometer is the depth sensor
-    is not identified by its number, so that of several one must be asked for.
+    is not identified by its number, so that one of several must be requested.
     """
     field = next((name for name in _INSTANCE if name in table.columns), None)
     if field is None:
@@ -436,7 +436,7 @@ def _tlog_times(table: LogTable) -> Array:
         return recorded
     boot = table.columns["time_boot_ms"] * 1e-3
     session = np.concatenate([[0], np.cumsum(np.diff(boot) < -_REBOOT_S)])
-    # Components of one system may count from boots of their own.
+    # Components of one system may count from separate boots.
     if COMPONENT in table.columns:
         _, component = np.unique(table.columns[COMPONENT], return_inverse=True)
         if component.max() > 0:

@@ -48,7 +48,7 @@ class BagRecord:
     """
 
     name: str
-    """Of the vehicle: the first part of every topic's name."""
+    """Name of the vehicle: the first part of every topic's name."""
     datum: Datum
     time_s: Array
     """(T,) seconds since the start of the flight, strictly increasing."""
@@ -61,17 +61,18 @@ class BagRecord:
     believed_velocity: Array | None = None
     """(T, 6) as `truth_velocity`."""
     sigma_horizontal_m: Array
-    """(T,) of north and of east each."""
+    """(T,) sigma of north and of east each."""
     sigma_depth_m: Array
     """(T,)."""
     sigma_attitude_rad: Array
-    """(T,) of roll and of pitch each."""
+    """(T,) sigma of roll and of pitch each."""
     sigma_heading_rad: Array
     """(T,)."""
     sigma_velocity_mps: Array | None = None
-    """(T,) of u, v and w each."""
+    """(T,) sigma of u, v and w each."""
     altitude_m: Array | None = None
-    """(T,) of the left port's glass above the sea floor as navigation has it; NaN is not known."""
+    """(T,) altitude of the left port's glass above the sea floor as navigation has it; NaN is not
+    known."""
     thrusters: tuple[str, ...] = ()
     rpm: Array | None = None
     """(T, n) revolutions per minute."""
@@ -87,7 +88,7 @@ class BagRecord:
     dvl_mps: Samples | None = None
     """(M, 3) velocity over ground in the body frame (FRD)."""
     beam_m: Samples | None = None
-    """(M, b) slant ranges of the DVL's beams; NaN of one beam means that it heard nothing."""
+    """(M, b) slant ranges of the DVL's beams; NaN of one beam means no echo."""
     pressure_pa: Samples | None = None
     """(M, 1) absolute."""
     gps: Samples | None = None
@@ -96,7 +97,7 @@ class BagRecord:
     usbl_ned_m: Samples | None = None
     """(M, 3) position fixes in NED."""
     start_utc_ns: int = 0
-    """Of `time_s` 0, nanoseconds since 1970; 0 keeps the flight's own clock."""
+    """Date of `time_s` 0, nanoseconds since 1970; 0 keeps the flight's own clock."""
     notes: dict[str, str] = field(default_factory=dict)
     """Kept in the bag's metadata."""
 
@@ -189,7 +190,7 @@ class _Stream:
     rows: list[int]
     """Rows of the record that the messages are made of."""
     build: Callable[[int, int], Any]
-    """From stamp and row."""
+    """Builds the message from stamp and row."""
 
 
 def _merged(streams: list[_Stream]) -> Iterator[tuple[int, int, int]]:
@@ -378,7 +379,7 @@ def _sensor_streams(record: BagRecord, messages: Messages) -> list[_Stream]:
 
 
 def _beam_streams(record: BagRecord, messages: Messages) -> list[_Stream]:
-    """Ranges along a DVL's beams; a moment at which none was heard still has its messages."""
+    """Ranges along a DVL's beams; a time without any echo still has its messages."""
     samples = record.beam_m
     if samples is None:
         return []

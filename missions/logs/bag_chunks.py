@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from typing import Any
 
 LARGEST_BYTES = 256 << 20
-"""Of a chunk, unpacked. Recorders close theirs after 1 to 4 MB, or after one message."""
+"""Largest chunk, unpacked. Recorders close theirs after 1 to 4 MB, or after one message."""
 
 
 @contextmanager

@@ -18,7 +18,7 @@ COLUMNS = (
     "altitude_m", "sigma_horizontal_m", "sigma_depth_m", "sigma_attitude_deg", "sigma_heading_deg",
     "sigma_altitude_m",
 )  # fmt: skip
-"""Of the navigation CSV, after the time."""
+"""Columns of the navigation CSV, after the time."""
 _LONGEST_S = 1e9
 
 
@@ -27,14 +27,14 @@ class Corrections:
     """What to change of a log."""
 
     declination_deg: float = 0.0
-    """Of the magnetic field, positive to the east: added to the heading."""
+    """Declination of the magnetic field, positive to the east: added to the heading."""
     tide: "float | Signal" = 0.0
     """Height of the water above the level that depths are to count from, metres; or (N, 1) of it
     on the clock of the log after `clock_offset_s`."""
     clock_offset_s: float = 0.0
     """Added to the times of the log."""
     lever_body_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Where on the body (FRD, from its origin) the logged position and depth are."""
+    """Place on the body (FRD, from its origin) that the logged position and depth are of."""
     altitude_offset_m: float = 0.0
     """Added to altitudes: the height of the left port's glass above the sensor."""
 
@@ -176,7 +176,7 @@ def utc_seconds(text: str) -> float:
     """Seconds since 1970 of an ISO 8601 date; one that names no zone is UTC.
 
     Raises:
-        ValueError: it is no date.
+        ValueError: it is not a date.
     """
     date = datetime.fromisoformat(text)
     try:

@@ -105,7 +105,7 @@ def read_dataflash(
         Tables by name, and the names of all messages in the log.
 
     Raises:
-        NavigationError: it is no such log, or cannot be read.
+        NavigationError: it is not such a log, or cannot be read.
     """
     try:
         data = path.read_bytes()

@@ -14,7 +14,7 @@ from alice_survey.base.frames import Array
 ROLES = ("navigation", "depth", "attitude", "altitude")
 """What of a log may be chosen by name."""
 GAP_S, GAP_INTERVALS = 2.0, 5.0
-"""A gap is longer than both so many seconds and so many median intervals, as in the navigation
+"""A gap is longer than both this many seconds and this many median intervals, as in the navigation
 reader of `import-images`."""
 DATED_AFTER_S = 1e8
 """Times since 1970 before this (March 1973) are a simulation's or a processor's own clock."""
@@ -76,7 +76,7 @@ class LoggedDive:
     clock: str
     """Whose clock the times are, in words."""
     dated: bool
-    """Whether times are seconds since 1970, UTC, and not of a clock of their own."""
+    """Whether times are seconds since 1970, UTC, and not of a separate clock."""
     position: Signal
     """(N, 2) latitude and longitude."""
     depth: Signal | None = None
@@ -88,7 +88,7 @@ class LoggedDive:
     altitude_slant: bool = False
     """Whether `altitude` is a range along the body's down axis, not yet a height."""
     sigmas: Mapping[str, Signal] = field(default_factory=dict)
-    """(N, 1) by their column in the navigation CSV."""
+    """(N, 1) sigmas by their column in the navigation CSV."""
     velocity_ned: Signal | None = None
     """(N, 3) over ground, m/s."""
     velocity_body: Signal | None = None
@@ -96,7 +96,7 @@ class LoggedDive:
     rates: Signal | None = None
     """(N, 3) p, q, r, rad/s."""
     rpm: Signal | None = None
-    """(N, n) of the thrusters `thrusters`."""
+    """(N, n) speeds of the thrusters `thrusters`."""
     thrusters: tuple[str, ...] = ()
     pwm: Signal | None = None
     """(N, n) microseconds of servo outputs 1 to n."""

@@ -25,19 +25,19 @@ from missions.logs.corrections import (
 from missions.logs.dive import ROLES, LoggedDive, Signal
 
 _DECIMALS = (10, 10, 5, 6, 6, 6, 5, 6, 6, 6, 6, 6)
-"""Of `COLUMNS`: as of the navigation CSV of `fly`."""
+"""Decimals of `COLUMNS`: as in the navigation CSV of `fly`."""
 _NAMED = 8
 _MICRO = 1e6
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImportOptions:
-    """What `import-log` is asked for."""
+    """Options of `import-log`."""
 
     declination_deg: float = 0.0
     """Added to headings; east is positive."""
     tide: str = "0"
-    """Height of the water above the level that depths shall count from: metres, or a CSV."""
+    """Height of the water above the level that depths are to count from: metres, or a CSV."""
     clock_offset_s: float = 0.0
     """Added to times."""
     start_s: float | None = None
@@ -48,15 +48,15 @@ class ImportOptions:
     datum_deg: tuple[float, float] | None = None
     """Latitude and longitude of the origin that a bag's odometry counts from."""
     lever_body_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Where on the body (FRD) the logged position is."""
+    """Place on the body (FRD) that the logged position is of."""
     altitude_offset_m: float = 0.0
     """Added to altitudes."""
     start_utc: str | None = None
-    """When the first position of a log without dates was, ISO 8601."""
+    """Time of the first position of a log without dates, ISO 8601."""
     time_zone: str = "UTC"
-    """Of dates that name none (QGroundControl's CSV)."""
+    """Time zone of dates that name none (QGroundControl's CSV)."""
     vehicle_log: Path | None = None
-    """Where to write the vehicle log, too."""
+    """Vehicle log to write, too."""
 
 
 def import_log(

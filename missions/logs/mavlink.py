@@ -42,7 +42,7 @@ def checksum(data: bytes) -> int:
 class Message:
     """What one message holds.
 
-    Extensions, which version 2 may append to the fields, are no part of the checksum's seed; none
+    Extensions, which version 2 may append to the fields, are not part of the checksum's seed; none
     is used here, so that none is listed.
     """
 
@@ -119,7 +119,7 @@ MESSAGES = {
         Message(173, "RANGEFINDER", "float distance, float voltage"),
     )
 }  # fmt: skip
-"""By number: those about navigation, and the one that every system sends."""
+"""Messages by number: those about navigation, and the one that every system sends."""
 
 
 class Packet(NamedTuple):
@@ -131,7 +131,7 @@ class Packet(NamedTuple):
     system: int
     component: int
     payload: bytes
-    """As sent: version 2 cuts zeros off its end."""
+    """Payload as sent: version 2 cuts zeros off its end."""
     whole: bool | None
     """Whether its checksum is right; None for a message not in `MESSAGES`, whose is not known."""
 

@@ -185,7 +185,7 @@ class Messages:
         )
 
     def range(self, stamp_ns: int, frame: str, range_m: float) -> Any:
-        """A range; one that is NaN is +inf, nothing heard (REP-117)."""
+        """A range; one that is NaN is +inf, no echo (REP-117)."""
         return self._make(
             RANGE,
             header=self._header(stamp_ns, frame),

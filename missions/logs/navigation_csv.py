@@ -1,4 +1,4 @@
-"""A navigation log of a real dive, and what it says at the moment of each picture."""
+"""A navigation log of a real dive, and what it gives at the time of each picture."""
 
 import csv
 import math
@@ -21,7 +21,7 @@ OPTIONAL = (
 )  # fmt: skip
 _RANGES = {"latitude_deg": (-85.0, 85.0), "longitude_deg": (-180.0, 180.0)}
 _GAP_S, _GAP_INTERVALS = 2.0, 5.0
-"""A gap is longer than both so many seconds and so many median intervals."""
+"""A gap is longer than both this many seconds and this many median intervals."""
 _NAMED = 8
 
 
@@ -34,7 +34,7 @@ class NavigationLog:
     columns: dict[str, Array]
     """(T,) values; NaN where a cell is empty."""
     start_utc: datetime | None
-    """Of the first row, where the log holds dates."""
+    """Date of the first row, where the log holds dates."""
 
     @property
     def longest_gap_s(self) -> float:
@@ -90,7 +90,7 @@ def read_navigation(path: Path, zone: tzinfo) -> NavigationLog:
     """Read a navigation CSV: `time_s` or `time_utc`, latitude, longitude, depth, and optional rest.
 
     A row without a finite time or position, or whose time does not follow the row before, is left
-    out with a warning that names its line; an optional value that is no number is left out alone.
+    out with a warning that names its line; of an optional value only the value is left out.
 
     Args:
         path: the file.
@@ -191,7 +191,7 @@ def _date(cell: str | None, zone: tzinfo) -> datetime:
     try:
         date = datetime.fromisoformat((cell or "").strip())
         return (date.replace(tzinfo=zone) if date.tzinfo is None else date).astimezone(UTC)
-    except (ValueError, OverflowError):  # the latter in the years 1 and 9999
+    except (ValueError, OverflowError):  # OverflowError in the years 1 and 9999
         raise ValueError(f"time_utc is {cell!r}, not a date such as 2024-05-01T12:00:00Z") from None
 
 

@@ -35,7 +35,7 @@ def read_qgc_csv(path: Path, asked: Mapping[str, str], time_zone: str) -> Logged
         time_zone: of the PC.
 
     Raises:
-        NavigationError: it is no such file, or holds no position.
+        NavigationError: it is not such a file, or holds no position.
     """
     wrong = [role for role in asked if role not in ("depth", "altitude")]
     if wrong:
@@ -107,7 +107,7 @@ def _seconds(cell: str, zone: tzinfo) -> float:
     try:
         date = datetime.fromisoformat(cell)
         return (date if date.tzinfo is not None else date.replace(tzinfo=zone)).timestamp()
-    except (ValueError, OverflowError):  # the latter in the years 1 and 9999
+    except (ValueError, OverflowError):  # OverflowError in the years 1 and 9999
         return math.nan
 
 

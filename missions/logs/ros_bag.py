@@ -64,7 +64,7 @@ _SIGMAS: Mapping[str, tuple[tuple[str, ...], float]] = {
     "sigma_attitude_deg": (VARIANCES[3:5], float(np.rad2deg(1.0))),
     "sigma_heading_deg": (VARIANCES[5:6], float(np.rad2deg(1.0))),
 }
-"""By column of the navigation CSV: which variances make it, and its unit."""
+"""For each column of the navigation CSV: which variances make it, and its unit."""
 
 _COLA2 = {
     "cola2_msgs/msg/DecimalLatLon": "float64 latitude\nfloat64 longitude\n",
@@ -76,7 +76,7 @@ _COLA2 = {
         "RPY orientation_rate\nNED position_variance\nRPY orientation_variance\n"
     ),
 }
-"""For bags of ROS 2 before Iron, which hold no definitions."""
+"""Message definitions for bags of ROS 2 before Iron, which hold none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +84,7 @@ class BagOptions:
     """What a bag does not say by itself."""
 
     topics: Mapping[str, str]
-    """By role (`dive.ROLES`): which topic to use."""
+    """Topic to use for each role (`dive.ROLES`)."""
     datum: Datum | None = None
     """Origin of an odometry's world."""
     density_kg_m3: float = 1025.0
@@ -113,7 +113,7 @@ def read_ros_bag(path: Path, options: BagOptions) -> LoggedDive:
         options: what to use of it.
 
     Raises:
-        NavigationError: it is no bag, is damaged, or lacks what navigation needs.
+        NavigationError: it is not a bag, is damaged, or lacks what navigation needs.
     """
     with _opened(path) as reader:
         present = sorted({_Topic(c.topic, c.msgtype.split("/")[-1]) for c in reader.connections},
@@ -216,7 +216,7 @@ def _choose(path: Path, present: Sequence[_Topic], asked: Mapping[str, str]) -> 
 
 
 def _navigation(path: Path, present: Sequence[_Topic]) -> _Topic:
-    """The one topic that navigation comes from when none is asked for."""
+    """The one topic that navigation comes from when none is requested."""
     for kind in _TAKES["navigation"]:
         found = [
             t for t in present
@@ -249,7 +249,7 @@ class _Series:
     time_s: Array
     """(N,) as logged."""
     columns: dict[str, Array]
-    """(N,) by name (`ros_rows.ROWS`), or by joint."""
+    """(N,) columns by name (`ros_rows.ROWS`), or by joint."""
 
 
 def _collect(

@@ -71,7 +71,7 @@ def _imu(m: Any) -> list[float]:
 
 
 def _range(m: Any) -> list[float]:
-    """Not finite, or outside of what the sensor measures, is nothing heard (REP-117)."""
+    """Not finite, or outside of what the sensor measures, is no echo (REP-117)."""
     most = m.max_range if m.max_range > 0 else math.inf
     known = math.isfinite(m.range) and m.min_range <= m.range <= most
     return [m.range if known else _NOTHING]
@@ -87,7 +87,7 @@ ROWS: Mapping[str, tuple[tuple[str, ...], Callable[[Any], list[float]]]] = {
     PRESSURE: (("pressure",), lambda m: [m.fluid_pressure]),
     RANGE: (("altitude",), _range),
 } | {kind: (("number",), lambda m: [m.data]) for kind in NUMBERS}  # fmt: skip
-"""By type: the names of the columns, and what takes them from a message."""
+"""For each type: the names of the columns, and what takes them from a message."""
 
 
 def _is_ned(m: Any) -> bool:

@@ -84,7 +84,7 @@ def packets(
 
     Args:
         file: the log, open at its start.
-        lost: counts packets with a wrong checksum, and bytes that are no message; is added to.
+        lost: counts packets with a wrong checksum, and bytes that are not a message; is added to.
         chunk_bytes: how much to read at once.
     """
     data, place, skipped = b"", 0, 0

@@ -247,7 +247,7 @@ def _draw_bathymetry(axes: Axes, bathymetry: Bathymetry) -> None:
 def _draw_current(axes: Axes, sea: SeaConfig) -> None:
     """An arrow below the area that points where the current flows."""
     (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
-    # In metres: in shares of the axes, which are seldom square, it would point elsewhere.
+    # In metres: in shares of the axes, which are rarely square, it would point elsewhere.
     size = max(east - west, north - south)
     towards = math.radians(sea.current_towards_deg)
     half = 0.035 * size * np.array([math.sin(towards), math.cos(towards)])

@@ -30,22 +30,22 @@ COLOURS = {
     "footprint": "#2e86c1", "contour": "#5d6d7e", "current": "#2471a3", "missed": "#d35400",
     "home": "#1e8449",
 }  # fmt: skip
-"""Of all maps of a plan."""
+"""Colours of all maps of a plan."""
 _RAMP = (
     "#f7fcf0", "#ddf1d9", "#bfe6c4", "#93d3c0", "#60bbc8", "#3597c1", "#1474b0", "#084c8d",
 )  # fmt: skip
 _DETAIL = 1 / 5000
 _FINEST_M = 0.005
 _MOST_CELLS = 420
-"""On a side of the picture of counts."""
+"""Most cells on a side of the picture of counts."""
 _MOST_COUNT = 254
-"""Of pictures in the picture of counts, where 255 is outside of the area."""
+"""Highest number of pictures in the picture of counts, where 255 is outside of the area."""
 _CONTOURS = 10
 _CONTOUR_POINTS = 160
-"""On each side of the grid that contours are drawn from."""
+"""Points on each side of the grid that contours are drawn from."""
 _LEAST_RELIEF_M = 0.01
 _OPAQUE, _MISSED_OPACITY = 215, 190
-"""Of 255."""
+"""Opacities out of 255."""
 
 Layer = PictureLayer | ShapeLayer
 Extent = tuple[float, float, float, float]
@@ -228,7 +228,7 @@ def geodetic_fit(plan: Plan, extent: Extent) -> tuple[list[float], list[float]]:
     n, e = (axis.ravel() for axis in np.meshgrid(norths, easts))
     depth_m = plan.seafloor_depth_m - plan.altitude_m
     rows = plan.datum.geodetic_from_ned(np.column_stack([n, e, np.full(len(n), depth_m)]))
-    # Fitted in units of the map's size, so that no term drowns in another.
+    # Fitted in units of the map's size, so that no term is lost in another.
     scaled = np.column_stack(
         [np.ones(len(n)), n / size, e / size, (n / size) ** 2, n * e / size**2, (e / size) ** 2]
     )
@@ -353,7 +353,7 @@ def counts_picture(seen: Certificate) -> tuple[NDArray[np.uint8], tuple[float, f
     cells[..., 2] = np.where(within, met, 0)
     corners = grid.places_of(block * np.array([[0, 0], [0, 1], [1, 0], [1, 1]]) * within.shape)
     low, high = corners.min(axis=0), corners.max(axis=0)
-    # Half the side of a cell that lies aslant: no cell falls between pixels.
+    # Half the side of a cell that lies diagonally: no cell falls between pixels.
     aslant = abs(math.sin(2.0 * grid.heading_rad)) > 1e-9
     pixel_m = grid.cell_m * block / (2.0 if aslant else 1.0)
     rows, columns = np.maximum(np.ceil((high - low) / pixel_m - 1e-6).astype(int), 1)

@@ -271,7 +271,7 @@ class _Following:
     """How lines follow a bathymetry."""
 
     depths_m: tuple[tuple[float, ...], ...] = ()
-    """Of the glass, at each station of each line."""
+    """Depth of the glass, at each station of each line."""
     text: str = ""
     figures: dict[str, Any] | None = None
 

@@ -39,7 +39,7 @@ def main_settings(plan_json: dict[str, Any]) -> str:
 def plan_rows(
     plan: Plan, seen: Certificate, sweep: Sweep | None, vehicle: VehicleConfig, rig: Rig
 ) -> tuple[Setting, ...]:
-    """What the plan comes to.
+    """The main figures of the plan.
 
     Args:
         plan: the plan.

@@ -22,7 +22,7 @@ from missions.route.energy import (
 from missions.values.costs import Costs
 
 _SPEEDS_MPS = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6, 0.75, 1.0, 1.25, 1.5)
-"""Over ground, that are tried for a way out."""
+"""Speeds over ground that are tried as a way out."""
 _HEADING_STEP_DEG = 5.0
 _HALVINGS = 10
 

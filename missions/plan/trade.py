@@ -30,13 +30,13 @@ class LinePower:
 
     name: str
     drag_w: float
-    """What damping takes from the hull, without body lift."""
+    """Power that damping takes from the hull, without body lift."""
     lift_w: float
-    """What body lift takes from it besides."""
+    """Power that body lift takes from it in addition."""
     thrusters_w: float
-    """Electrical; infinite if it cannot be flown both ways."""
+    """Electrical power; infinite if it cannot be flown both ways."""
     line_w: float
-    """Of the whole vehicle."""
+    """Power of the whole vehicle."""
     crab_deg: float
     """Heading off the course."""
 
@@ -184,7 +184,7 @@ def current_report(config: SurveyConfig, plot: Path | None) -> tuple[str, dict[s
         As of `energy_report`.
 
     Raises:
-        PlanError: cameras and strobes cannot do what is asked, or the picture cannot be written.
+        PlanError: cameras and strobes cannot do it, or the picture cannot be written.
     """
     setup, flown = ImagingSetup.of(config), flight_conditions(config)
     imaging_w = imaging_settings(setup.rig, setup, quiet=True).imaging_w

@@ -4,7 +4,7 @@ Lines keep their order. Of all ways to part them the one with the fewest dives i
 these the one that takes the least energy: a dynamic programme over the lines, exact, since the ways
 between two lines of a dive are the same whatever dive they are in. What is between lines comes from
 sums along the route through all of them; only the ways from home to each line and back are found
-for each line, and only the chosen dives get a route of their own.
+for each line, and only the chosen dives get their own route.
 """
 
 import math
@@ -44,13 +44,13 @@ class _Sums:
     """Energy, J, and time, s, (2, N) each, of a dive's parts."""
 
     home_to: Array
-    """From the surface at home to each line's start."""
+    """Sums from the surface at home to each line's start."""
     until: Array
-    """From the first line's start to each line's start."""
+    """Sums from the first line's start to each line's start."""
     through: Array
-    """From the first line's start to each line's end."""
+    """Sums from the first line's start to each line's end."""
     back: Array
-    """From each line's end to the surface at home."""
+    """Sums from each line's end to the surface at home."""
 
     def of(self, first: int, last: int) -> tuple[float, float]:
         """Of a dive along lines `first` to `last`."""

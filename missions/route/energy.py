@@ -42,10 +42,10 @@ from alice_survey.vehicle.vehicle import Vehicle
 from missions.values.costs import SETTLE_S, Costs
 
 Manner = Literal["held", "crab"]
-"""Of meeting a current from the side: heading held, by sway; or heading turned into it."""
+"""How a current from the side is met: heading held, by sway; or heading turned into it."""
 COURSES = 72
 _HEADINGS = 24
-"""Over which a turn on the spot in a current is averaged."""
+"""Number of headings over which a turn on the spot in a current is averaged."""
 _RATES = np.linspace(1.0, 1.0 / 16.0, 16)
 """Shares of a greatest rate that are tried, downwards."""
 _HEAVES_MPS = np.linspace(0.5, 0.01, 50)
@@ -58,11 +58,11 @@ class FlightConditions:
 
     craft: Vehicle
     manner: Manner
-    """Of flying lines."""
+    """How lines are flown."""
     speed_mps: float
-    """Over ground."""
+    """Speed over ground."""
     line_heading_deg: float | None
-    """Of all lines; None where any will do."""
+    """Heading of all lines; None where any will do."""
     current_ne_mps: Array
     """(2,) mean of the current that is expected."""
     turn_radius_m: float

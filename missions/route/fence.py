@@ -31,12 +31,12 @@ class Fence(NamedTuple):
     edges: Array
     """(E, 4) north and east of both ends; none: nothing is forbidden."""
     firsts: NDArray[np.int32]
-    """(cells + 1,) where each cell's list begins, by rows of equal north."""
+    """(cells + 1,) start of each cell's list, by rows of equal north."""
     listed: NDArray[np.int32]
     """Indices of edges, cell after cell."""
     north_m: float
     east_m: float
-    """Of the grid's corner."""
+    """East of the grid's corner."""
     rows_per_m: float
     columns_per_m: float
     rows: int

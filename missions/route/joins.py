@@ -19,16 +19,17 @@ NONE, AHEAD, ARCS, SPOT, SWAY = 0, 1, 2, 3, 4
 """How two lines are joined; nothing direct, and straight on."""
 
 LONGEST_SWAY_M = 5.0
-"""Of a sway step. Chosen: some line spacings; farther the vehicle had better go ahead, since its
+"""Longest sway step. Chosen: some line spacings; farther the vehicle had better go ahead, since its
 lateral thrusters and its side's drag are made for correction, not for transit."""
 
 COLUMNS = 8
-"""Of a leg: north, east, course, length, curvature, line, turn, side."""
+"""Columns of a leg: north, east, course, length, curvature, line, turn, side."""
 _MOST_LEGS = 8
 _TINY = 1e-9
 _SAME_M = 1e-6
 _DEAR_J = 1e15
-"""Beyond any battery: stands for an infinite cost, so that of two such the shorter is chosen."""
+"""More than any battery holds: stands for an infinite cost, so that of two such the shorter is
+chosen."""
 
 
 @compiled_ieee

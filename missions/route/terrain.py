@@ -1,8 +1,8 @@
 """How deep the glass goes over a known sea floor: as low as altitude, clearance and slope allow.
 
 At each station the highest floor within reach of the vehicle and of its pictures counts. The glass
-is to be the plan's altitude above that, or higher: the deepest profile that is nowhere deeper and
-whose slope is nowhere steeper than the vehicle can follow is
+is to be the plan's altitude above that, or higher: the deepest profile that is never deeper and
+whose slope is never steeper than the vehicle can follow is
 
     z(s) = min over t of (w(t) + g |s - t|)
 
@@ -70,7 +70,7 @@ class DepthProfile:
     along_m: Array
     """(S,) distance from the start, increasing."""
     depth_m: Array
-    """(S,) of the glass."""
+    """(S,) depth of the glass."""
     highest_floor_m: Array
     """(S,) depth of the highest floor within reach."""
     floor_m: Array
@@ -113,7 +113,7 @@ def reach_of(
 
 
 def envelope(along_m: Array, wanted_m: Array, slope: float) -> Array:
-    """The deepest profile that is nowhere deeper than wanted and nowhere steeper than a slope.
+    """The deepest profile that is never deeper than wanted and never steeper than a slope.
 
     Args:
         along_m: (S,) increasing.
@@ -153,7 +153,7 @@ def highest_floor(
     for start in range(0, len(points_ne), rows):
         block = slice(start, start + rows)
         sine, cosine = np.sin(headings_rad[block]), np.cos(headings_rad[block])
-        axes = np.array([[cosine, sine], [-sine, cosine]])  # ahead and beside, north and east
+        axes = np.array([[cosine, sine], [-sine, cosine]])  # ahead and sideways, north and east
         about = np.einsum("oa,axn->nox", offsets, axes)
         # The least of numbers with a NaN among them is NaN: unknown floor is no floor to fly over.
         highest[block] = bathymetry.depth_about(points_ne[block], about).min(axis=1)
@@ -248,7 +248,7 @@ def terrain_report(
     step_m: float,
     extent_m: Callable[[float], tuple[float, float]],
 ) -> tuple[str, dict[str, Any]]:
-    """What following the terrain comes to, and a warning where pictures suffer.
+    """The figures of following the terrain, and a warning where pictures suffer.
 
     Args:
         lines: of the plan.

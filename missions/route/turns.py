@@ -191,7 +191,7 @@ def _legs(table: Array) -> tuple[Leg, ...]:
 
 
 def _warn_of_others(kinds: NDArray[np.intp], turns: Turns) -> None:
-    """Tell how many turns are not as requested."""
+    """Warn of turns that are not as requested."""
     if turns == "auto":
         return
     asked = kinds[kinds != joins.AHEAD]

@@ -142,7 +142,7 @@ class Ways:
     @cached_property
     def _nodes(self) -> Array:
         """(V, 6) corners that ways may bend at, the corner before and the one after."""
-        # Of corners that are as good as one, the turn cannot be told.
+        # Between corners that nearly coincide the turn is undefined.
         single = shapely.remove_repeated_points(self.allowed, 0.1 * TOUCH_M)
         parts = [orient(part) for part in single.geoms]
         rings = [ring for part in parts for ring in (part.exterior, *part.interiors)]

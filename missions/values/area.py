@@ -1,6 +1,6 @@
 """The area to survey and the area where the vehicle may be, kept apart.
 
-Geometry is shapely's with x = north and y = east, the order of NED: only files and maps that want
+Geometry is shapely's with x = north and y = east, the order of NED: only files and maps that need
 east first swap them.
 """
 
@@ -23,8 +23,8 @@ class Area:
     survey: MultiPolygon
     """What must be covered at the overlap requested, to its edge; holes are no-go zones."""
     allowed: MultiPolygon
-    """Where the vehicle may be: by default the survey area and a margin to turn in, less the no-go
-    zones."""
+    """Where the vehicle may be: by default the survey area and a margin to turn in, without the
+    no-go zones."""
     no_go: MultiPolygon
     """Holes of the survey area and other zones to keep out of; may be empty."""
 

@@ -13,8 +13,8 @@ from alice_survey.vehicle.limits import SPOT_RAD_S, STEP_MPS
 from missions.values.legs import Route
 
 SETTLE_S = 6.5
-"""That a stop takes besides its motion: braking, getting steady, under way again. Measured in the
-simulator with exact navigation: ALICE turns by 90 degrees at 15 deg/s in 7.3 s and by 180 in
+"""Time that a stop takes besides its motion: braking, steadying, getting under way again. Measured
+in the simulator with exact navigation: ALICE turns by 90 degrees at 15 deg/s in 7.3 s and by 180 in
 13.3 s, and braking before and gathering way after cost 6 s more."""
 
 
@@ -27,28 +27,28 @@ class Costs:
     """
 
     speed_mps: float
-    """Over ground, on lines and between."""
+    """Speed over ground, on lines and between."""
     line_w: Array
-    """(K,) of the whole vehicle (hotel load, lights, thrusters) on a line, at K courses spread
-    evenly over a full turn from north; in between it is interpolated."""
+    """(K,) power of the whole vehicle (hotel load, lights, thrusters) on a line, at K courses
+    spread evenly over a full turn from north; in between it is interpolated."""
     way_w: Array
-    """(K,) the same between lines."""
+    """(K,) the same power between lines."""
     spot_w: float
-    """While it turns or waits on the spot."""
+    """Power while it turns or waits on the spot."""
     arc_extra_w: float
     """What an arc takes beyond `way_w`: the hull behind the glass swings, and the yaw is damped."""
     turn_rate_rad_s: float
-    """On the spot."""
+    """Rate of turns on the spot."""
     settle_s: float
-    """That a stop (turn on the spot, sway step) takes besides its motion."""
+    """Time that a stop (turn on the spot, sway step) takes besides its motion."""
     sway_mps: float
     """Speed of a sway step."""
     sway_w: Array
-    """(K,) the same of a sway step, by its course; infinite of a vehicle that cannot sway."""
+    """(K,) the same power of a sway step, by its course; infinite of a vehicle that cannot sway."""
     heave_mps: float
-    """Of descent and ascent, on the spot."""
+    """Speed of descent and ascent, on the spot."""
     heave_w: float
-    """Mean of both."""
+    """Mean power of both."""
     refused: Callable[[str], PlanError] | None = field(default=None, compare=False, repr=False)
     """The error that says, of a leg in words, that the current forbids it, with the ways out."""
 

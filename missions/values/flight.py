@@ -22,17 +22,17 @@ class Flight:
 
     plan: Plan
     vehicle: str
-    """Its name."""
+    """Name of the vehicle."""
     truth: Trajectory
-    """Of the body origin."""
+    """True motion of the body origin."""
     glass_ned: Array
     """(T, 3) the left port's outer glass."""
     altitude_m: Array
     """(T,) true, of the left port's glass above the sea floor below it."""
     believed_glass_ned: Array
-    """(T, 3) where navigation had it."""
+    """(T, 3) where navigation placed it."""
     line: Array
-    """(T,) line of the plan that is being flown, -1 between lines; as the pilot believes."""
+    """(T,) line of the plan that is being flown, -1 between lines; as the pilot estimates."""
     trigger_s: Array
     """(S,) when each station's pictures are taken."""
     trigger_line: tuple[int, ...]
@@ -49,7 +49,7 @@ class Flight:
 
     @cached_property
     def line_errors(self) -> tuple[Array, Array]:
-        """How far the left port's glass and the heading truly are off the line, at each moment.
+        """How far the left port's glass and the heading truly are off the line, at each time.
 
         Returns:
             Cross-track error, (T,) metres to starboard, and heading error, (T,) radians; NaN
@@ -64,7 +64,7 @@ class Flight:
 
     @cached_property
     def believed_cross_track(self) -> Array:
-        """(T,) metres: where the vehicle believed the glass to be off the line; NaN between."""
+        """(T,) metres: how far off the line the vehicle estimated the glass; NaN between."""
         return self._cross_track(self.believed_glass_ned)
 
     @cached_property
@@ -76,7 +76,7 @@ class Flight:
     def route_error(self) -> Array:
         """(T,) metres: how far the glass truly was to starboard of the route's tangent.
 
-        The pilot's own figure, less the navigation's error across the path.
+        The pilot's own figure minus the navigation's error across the path.
         """
         heading = self.flown.report[:, PATH_HEADING]
         off = self.glass_ned - self.believed_glass_ned
@@ -114,13 +114,13 @@ class Flight:
 def trigger_times(
     plan: Plan, time_s: Array, line: Array, glass_ne: Array
 ) -> tuple[Array, tuple[int, ...]]:
-    """When the vehicle believes to pass each station of each line.
+    """When each station of each line is passed, by the vehicle's own estimate.
 
     Args:
         plan: its lines and stations.
         time_s: (T,)
         line: (T,) line being flown, -1 between lines.
-        glass_ne: (T, 2) where the vehicle believes the left port's glass to be.
+        glass_ne: (T, 2) the vehicle's estimate of where the left port's glass is.
 
     Returns:
         (S,) seconds, interpolated between ticks, and the line of each; stations that were never

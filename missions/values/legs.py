@@ -42,7 +42,7 @@ class Leg:
 
     start_ne_m: tuple[float, float]
     heading_rad: float
-    """Of the path at its start: the course, from north."""
+    """Course of the path at its start, from north."""
     length_m: float
     """0 of a turn on the spot."""
     curvature_per_m: float
@@ -52,7 +52,7 @@ class Leg:
     turn_rad: float = 0.0
     """How far the vehicle turns on the spot, positive to starboard; 0 of all other legs."""
     side_rad: float = 0.0
-    """The vehicle's heading less the course: 0 where it goes ahead, +-pi/2 in a sway step."""
+    """The vehicle's heading minus the course: 0 where it goes ahead, +-pi/2 in a sway step."""
 
     @property
     def kind(self) -> LegKind:

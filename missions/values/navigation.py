@@ -1,4 +1,4 @@
-"""What the vehicle believed of where it was: the navigation log of a flight."""
+"""The vehicle's own estimate of where it was: the navigation log of a flight."""
 
 import math
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ _DECIMALS = (6, 10, 10, 5, 6, 6, 6, 5, 6, 6, 6, 6, 6)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BelievedNavigation:
-    """Believed position and attitude of the body origin, and altitude of the left port's glass.
+    """Estimated position and attitude of the body origin, and altitude of the left port's glass.
 
     All (T,) but `position_ned` and `attitude_rad`, (T, 3).
     """
@@ -29,12 +29,12 @@ class BelievedNavigation:
     attitude_rad: Array
     """Roll, pitch, heading."""
     altitude_m: Array
-    """NaN while the DVL hears no bottom."""
+    """NaN while the DVL has no bottom lock."""
     sigma_horizontal_m: Array
-    """Of north and of east each."""
+    """Sigma of north and of east each."""
     sigma_depth_m: Array
     sigma_attitude_rad: Array
-    """Of roll and of pitch each."""
+    """Sigma of roll and of pitch each."""
     sigma_heading_rad: Array
     sigma_altitude_m: Array
 

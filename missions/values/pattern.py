@@ -20,9 +20,9 @@ class Pattern:
     """
 
     spacing_m: float
-    """Between neighbouring lines, the same everywhere."""
+    """Distance between neighbouring lines, the same everywhere."""
     step_m: float
-    """From picture to picture on a line."""
+    """Distance from picture to picture on a line."""
     half_across_m: float
     """What every camera surely sees to either side of a line."""
     half_along_m: float

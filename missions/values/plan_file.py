@@ -31,11 +31,11 @@ class Dive:
     """What is flown on one charge: from home along some lines and home again."""
 
     first_line: int
-    """Index of the plan's line."""
+    """Index of the first line in the plan."""
     last_line: int
     """The last one that belongs to it."""
     route: Route
-    """From home to home; lines count as in the plan."""
+    """Route from home to home; lines count as in the plan."""
     duration_s: float
     energy_wh: float
 
@@ -76,7 +76,7 @@ class Plan:
     name: str
     area: Area
     home_ne_m: tuple[float, float]
-    """Where the vehicle is launched and taken in."""
+    """Place where the vehicle is launched and recovered."""
     seafloor_depth_m: float
     altitude_m: float
     speed_mps: float
@@ -90,15 +90,15 @@ class Plan:
     station_spacing_m: float
     reached_forward_overlap: float
     reached_side_overlap: float
-    """Of one camera's pictures, on the middle row and column."""
+    """Side overlap of one camera's pictures, on the middle row and column."""
     lines: tuple[Line, ...]
-    """In the order of flight."""
+    """Lines in the order of flight."""
     dives: tuple[Dive, ...]
-    """In the order of flight; together they fly all lines."""
+    """Dives in the order of flight; together they fly all lines."""
     turn_radius_m: float
     run_in_m: float
     length_m: float
-    """Of the ways of all dives, turns included."""
+    """Length of the ways of all dives, turns included."""
     duration_s: float
     energy_wh: float
     coverage: float
@@ -107,7 +107,7 @@ class Plan:
     """Depth of the glass at each station of each line, where they follow a bathymetry; empty where
     the glass keeps its altitude above a level sea floor."""
     details: dict[str, Any]
-    """What else a reader may want to know; nothing is computed from it."""
+    """Further facts for a reader; nothing is computed from it."""
 
     @property
     def blur_px(self) -> float:
@@ -157,8 +157,8 @@ def read_plan(path: str | Path) -> Plan:
     """Read `plan.json`.
 
     Raises:
-        PlanError: it is no plan, or lacks something.
-        WorkspaceError: it is missing or no JSON.
+        PlanError: it is not a plan, or lacks something.
+        WorkspaceError: it is missing or not JSON.
 
     Example:
         >>> import alice_survey as alice

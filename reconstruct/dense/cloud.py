@@ -31,7 +31,7 @@ _LAZ_EXTRA = {
     "sigma": "standard deviation",
 }
 _NO_DATE = date(2000, 1, 1)
-"""The same bytes on every day."""
+"""Date in the header, the same bytes on every day."""
 
 
 @compiled
@@ -58,8 +58,8 @@ def thin(
     Returns:
         (K, 9) means of position, normal (not of unit length) and colour, and (K,) standard
         deviations, column by column from below. A standard deviation is the weighted mean of those
-        of the points, since points of one cube mostly come from the same few matches and err
-        together.
+        of the points, since points of one cube mostly come from the same few matches and share
+        their errors.
     """
     mean = np.empty((order.size, 9), np.float32)
     sigma = np.empty(order.size, np.float32)

@@ -119,7 +119,7 @@ def fuse_cells(
 
     The gate around the median is `gate` times the larger of the scatter (from the MAD) and the
     median's own sigma. The standard deviation adds the formal one of independent views to the
-    scatter over the square root of the number of views: pixels of one view err together.
+    scatter over the square root of the number of views: pixels of one view share their errors.
 
     Args:
         starts: (C + 1,) where the points of each cell start.

@@ -1,6 +1,6 @@
 """Many depths of one view become one, and views check each other.
 
-A depth is believed where several independent matches agree: partners of one view, then the depth
+A depth is accepted where several independent matches agree: partners of one view, then the depth
 maps of neighbouring views. What only one match claims and nothing confirms is left out.
 """
 
@@ -99,7 +99,7 @@ def count_witnesses(
     Args:
         depth: (H, W) of the reference.
         sigma: (H, W) of it.
-        slopes: (H, W, 2) of the reference, see `sight.slopes_of`.
+        slopes: (H, W, 2) ray slopes of the reference, see `sight.slopes_of`.
         other_from_ref: (3, 4) transform of points from the reference camera to the other.
         other_depth: (h, w) of the other view.
         other_sigma: (h, w) of it.

@@ -38,7 +38,7 @@ class Conditions:
     """How to match the pictures of a survey."""
 
     scale: float
-    """By which pictures are shrunk for matching."""
+    """Factor by which pictures are shrunk for matching."""
     match_sigma_px: float
     """Standard deviation of a match in pixels of the shrunk pictures."""
 

@@ -16,7 +16,7 @@ Float32 = NDArray[np.float32]
 _BLOCK = 16
 """Side of a block of pixels whose points are looked at together, pixels."""
 _ROUNDING = 1e-6
-"""Of coordinates as float32, relative; kernels and arrays differ by less."""
+"""Relative rounding of coordinates as float32; kernels and arrays differ by less."""
 _REACH = 2
 """Normals are spanned by the points this many pixels to either side."""
 

@@ -1,6 +1,6 @@
 """How far errors of poses move the surface: the share of its error that fusing views leaves.
 
-Depths of one place from many views err together, since all of them rest on the same poses. How much
+Depths of one place from many views share errors, since they rest on the same poses. How much
 is known at every sparse point: its covariance from the adjustment (`mapping/covariance.npz`), which
 holds poses and pixels together, less what the pixels of its own observations leave with poses held.
 The rest is what the poses around it do to a surface there.
@@ -24,7 +24,7 @@ _COMPANY = 16
 _NODE_CELLS = 16
 """Cells of the DEM between places where it is computed."""
 _SAME = 1e-6
-"""Of the model's size: how far points of the two files may lie apart."""
+"""Share of the model's size: how far points of the two files may lie apart."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -34,7 +34,7 @@ class PosePart:
     places: Array
     """(P, 2) north and east."""
     variances: Array
-    """(P,) of the height, in the square of the model's unit."""
+    """(P,) variances of the height, in the square of the model's unit."""
 
     @property
     def median(self) -> float:

@@ -19,9 +19,9 @@ from reconstruct.views.model import View
 from reconstruct.views.sight import FAST, KernelLens, field_of, lens_of
 
 _LEAST_COSINE = 0.75
-"""Of the angle by which a view may be turned."""
+"""Least cosine of the angle by which a view may be turned."""
 _ROUNDS = 2
-"""Of depth and the port's shift, which depends on it."""
+"""Rounds of depth and the port's shift, which depends on it."""
 _HALF = 0.5
 """OpenCV counts pixels from the first pixel's centre, the model from its outer corner."""
 

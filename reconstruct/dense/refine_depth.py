@@ -31,12 +31,12 @@ from reconstruct.views.sight import FAST, KernelLens, field_of, lens_of, pixel_a
 Float32 = NDArray[np.float32]
 
 _CONTRAST_SIGMA_PX = 8.0
-"""Of the Gaussian window in which pictures are brought to zero mean and unit contrast."""
+"""Sigma of the Gaussian window in which pictures are brought to zero mean and unit contrast."""
 _LEAST_CONTRAST = 1.5
 """Grey levels of noise that are not blown up to full contrast."""
 _WINDOW_SIGMA_PX = 1.25
-"""Of the Gaussian window that is compared. Wider ones blur the surface, narrower ones are noisier;
-the noise is averaged when views are fused, the blur is not."""
+"""Sigma of the Gaussian window that is compared. Wider ones blur the surface, narrower ones are
+noisier; the noise is averaged when views are fused, the blur is not."""
 _CONVERGED_PX = 0.5
 """A first step below this lands so near that a second round does not lower the error."""
 _WINDOW_PX = 9
@@ -48,11 +48,11 @@ _NONE = np.float32(1e6)
 _ALIKE = 0.5
 """Correlation from which two windows look alike."""
 _LEAST_SHARE = 0.4
-"""Of a window's weight that a neighbour must see."""
+"""Share of a window's weight that a neighbour must see."""
 _OUTLYING = 2.5
 """Deviations beyond which a pixel counts less than half."""
 _LONGEST_STEP_PX = 1.0
-"""Of a round, along the epipolar line of the neighbour that moves most."""
+"""Longest step of a round, along the epipolar line of the neighbour that moves most."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -61,7 +61,7 @@ class ComparedView:
 
     view: View
     contrast: Float32
-    """(H, W) of zero mean and unit variance around every pixel."""
+    """(H, W) grey levels of zero mean and unit variance around every pixel."""
     spline: Float32
     """(H, W) coefficients of the cubic B-spline through it."""
     valid: NDArray[np.bool_]
@@ -78,7 +78,7 @@ def prepared(
 
 
 def even_contrast(grey: Float32) -> Float32:
-    """A picture less its local mean, over its local deviation."""
+    """A picture minus its local mean, over its local deviation."""
     mean = _blur(grey, _CONTRAST_SIGMA_PX)
     rest: Float32 = grey - mean
     variance = _blur(rest * rest, _CONTRAST_SIGMA_PX) + np.float32(_LEAST_CONTRAST**2)
@@ -131,7 +131,7 @@ def compare(
         other_from_ref: (3, 4) transform of points.
 
     Returns:
-        (H, W) reference less warped neighbour; the warped neighbour's change per unit of inverse
+        (H, W) reference minus warped neighbour; the warped neighbour's change per unit of inverse
         depth; and how many of its pixels one unit moves. NaN where it does not see the spot.
     """
     height, width = inverse_depth.shape

@@ -57,18 +57,18 @@ class FuseTask:
     store: ViewStore
     window: Window
     grid: DemGrid
-    """Of the tile with its rim."""
+    """Grid of the tile with its rim."""
     rim: tuple[int, int, int, int]
     """Cells around the tile, top, bottom, left, right, that only serve to judge and fill."""
     views: tuple[tuple[int, View], ...]
     stations: NDArray[np.int64]
-    """Of every view of the survey."""
+    """Station of every view of the survey."""
     light: LightModel
     offset_enu: tuple[float, float, float]
     edge: float
-    """Of the cubes to which the cloud is thinned."""
+    """Edge of the cubes to which the cloud is thinned."""
     doubt: float
-    """By which the standard deviations of refined depths are taken."""
+    """Factor on the standard deviations of refined depths."""
     pose_sigmas: Array | None
     """(m, n) what errors of poses leave unsure of heights, on a lattice over the grid."""
 

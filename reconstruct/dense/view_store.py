@@ -28,7 +28,7 @@ class ViewStore:
 
     folder: Path
     run: str = field(default_factory=lambda: uuid.uuid4().hex)
-    """Tells one run from the next in a process that works for both: files may have changed."""
+    """Distinguishes runs in a process that works for several: files may have changed."""
 
     def path(self, view: int, name: str) -> Path:
         """Where an array is kept."""

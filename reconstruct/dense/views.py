@@ -38,7 +38,7 @@ LOOKS = 4
 """Neighbours by which depth is refined."""
 _DOUBTERS = 12
 _DOUBT_STEP = 7
-"""Views, and pixels between the pixels of each, by which the doubt is measured."""
+"""Views, and pixels between the pixels of each, by which the sigma factor is measured."""
 _LEAST_PIXELS = 100
 """A view with fewer pixels of confirmed depth is left out."""
 
@@ -78,14 +78,14 @@ class RefineTask:
 
 @dataclass(frozen=True, kw_only=True)
 class CheckTask:
-    """One view whose depth the neighbours are asked about."""
+    """One view whose depth is checked against its neighbours."""
 
     store: ViewStore
     index: int
     view: View
     neighbours: tuple[tuple[int, View], ...]
     doubt: float
-    """By which the standard deviations of refined depths are taken."""
+    """Factor on the standard deviations of refined depths."""
 
 
 def prepare_view(task: PrepareTask) -> None:

@@ -16,7 +16,7 @@ from reconstruct.raster import BLOCK, DemGrid, crs_of, frame_tags, transform_of
 from reconstruct.views.model import WorldFrame
 
 _MUCH = 0.5
-"""Share of the ground that is seldom found changed between two surveys."""
+"""Share of the ground that is rarely found changed between two surveys."""
 
 
 @progress.step("find what has changed")

@@ -23,7 +23,7 @@ _LARGEST_BLOCK = 64_000_000
 """Cells that are unpacked at once."""
 _LAS_HEADER = 375
 _COMPRESSED = 0x80
-"""In the point format of a header (LASzip)."""
+"""Bit of a header's point format that marks compression (LASzip)."""
 
 
 def read_reference(path: Path, datum: Datum | None) -> tuple[Array, bool]:
@@ -180,7 +180,7 @@ def _check_chunks(file: BinaryIO, points_at: int, size: int) -> None:
 def _local(points: Array, crs: str, datum: Datum) -> Array:
     """East, north, up of a datum, heights as they are.
 
-    What level these count from is seldom stated; the registration finds the difference. Points that
+    Their reference level is rarely stated; the registration finds the difference. Points that
     their system puts nowhere on Earth are left out.
     """
     from pyproj import CRS, Transformer

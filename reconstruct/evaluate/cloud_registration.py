@@ -26,7 +26,7 @@ _COVER_SPACINGS = 4.0
 """Side of the squares in which a cloud counts as covering the ground, in its own spacings."""
 _ROUNDS = 60
 _STILL = 1e-3
-"""Of the spacing of the reference: motion of the cloud's rim at which the adjustment settles."""
+"""Share of the reference's spacing: motion of the cloud's rim at which the adjustment settles."""
 _LEAST_PAIRS = 200
 
 
@@ -171,11 +171,11 @@ class CloudDistances:
     """Points of one cloud from the surface of another, where that one covers the ground."""
 
     points: Array
-    """(N, 3) of the first."""
+    """(N, 3) points of the first cloud."""
     signed_m: Array
-    """(N,) from the plane through the nearest points of the other; positive above."""
+    """(N,) distances from the plane through the nearest points of the other; positive above."""
     nearest_m: Array
-    """(N,) from the nearest point of the other."""
+    """(N,) distances from the nearest point of the other."""
     covered_share: float
     """Share of the first cloud's points where the other covers the ground."""
 

@@ -11,7 +11,7 @@ from alice_survey.base.frames import Array
 _BLOCKS = 10
 """Blocks along the longer side over which errors are averaged before a bend is fitted."""
 _LEAST_SHARE = 0.25
-"""Of the fullest block that a block must hold to count."""
+"""Share of the fullest block's count that a block must hold to count."""
 _LEAST_BLOCKS = 12
 _PAIRS = 4000
 
@@ -36,7 +36,7 @@ class ModelBend:
     bend_m: float
     """The same along the direction of the strongest bend: a trough as well as a dome."""
     radius_m: float
-    """Of the rim."""
+    """Radius of the rim."""
 
     def to_json(self) -> dict[str, Any]:
         """Figures in millimetres."""

@@ -21,7 +21,7 @@ _TUKEY = 4.685
 """Tukey's constant: 95 % efficient for normal errors."""
 _ROUNDS = 40
 _STILL = 1e-6
-"""Of a cell: motion of the block's rim at which the adjustment has settled."""
+"""Share of a cell: motion of the block's rim at which the adjustment has settled."""
 _MOST_POINTS = 150_000
 _COARSE_CELLS = 320
 _PEAKS = 4
@@ -45,7 +45,7 @@ class HeightFit:
     centre: Array
     """(3,) about which `covariance` holds, in the fixed frame."""
     covariance: Array
-    """(6, 6) of a small turn (rad) and shift (m) of the fixed frame about `centre`."""
+    """(6, 6) covariance of a small turn (rad) and shift (m) of the fixed frame about `centre`."""
     spread: float
     """Robust standard deviation of the height differences left."""
     used: int
@@ -171,13 +171,13 @@ class _Compared:
     """Height differences at one pose, and how they change with a motion of the fixed points."""
 
     index: NDArray[np.int64]
-    """(N,) of the fixed points that lie on the moving survey."""
+    """(N,) indices of the fixed points that lie on the moving survey."""
     miss: Array
     """(N,) height of the moving surface less that of the fixed points, in the moving frame."""
     normals: Array
     """(N, 3) slope of `miss` by the fixed point, in the fixed frame."""
     variance: Array
-    """(N,) of the heights, both surveys; ones where it is not stated."""
+    """(N,) variances of the heights, both surveys; ones where it is not stated."""
 
 
 def _adjust(

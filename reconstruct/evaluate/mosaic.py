@@ -36,7 +36,7 @@ class MosaicScore:
     points_world: Array
     """(N, 3) middles of those patches in the model."""
     points_true: Array
-    """(N, 3) where what they show truly is, NED."""
+    """(N, 3) true places of what they show, NED."""
     pixel_m: float
     coverage: float
     """Share of the survey area that the mosaic shows."""

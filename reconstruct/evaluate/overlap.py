@@ -68,7 +68,7 @@ def overlaps_reached(workspace: Path, truth: Path) -> dict[str, float]:
 
 
 def neighbours(plan: Plan) -> Iterator[tuple[int, int, Polygon]]:
-    """Pairs of survey lines one spacing apart, and the strip across both where they run abreast.
+    """Pairs of survey lines one spacing apart, and the strip across both where both run.
 
     The lines of several cells or parts of an area need not be flown one after the other.
     """

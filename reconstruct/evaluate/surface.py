@@ -29,7 +29,7 @@ GOOD_M = 0.01
 WITHIN_PX = (1, 2, 3, 5)
 """Ground pixels within which completeness is reported."""
 LEAST_STATIONS = 3
-"""Cells seen from so many stations are scored on their own as well."""
+"""Cells seen from this many stations are also scored separately."""
 
 _LATTICE = 4
 """Stations are counted for every fourth cell of every fourth row; the cells around take that."""
@@ -51,9 +51,9 @@ class SurfaceScore:
     distance_m: Array
     """(N,) distance of each filled cell from the nearest point of the true surface."""
     height_m: Array
-    """(N,) height of each filled cell less the true height straight below or above it."""
+    """(N,) height of each filled cell minus the true height straight below or above it."""
     true_height_m: Array
-    """(N,) the latter, positive up."""
+    """(N,) that true height, positive up."""
     sigma_m: Array | None
     """(N,) standard deviation that the model states; None when it states none."""
     stations: NDArray[np.int64] | None

@@ -29,7 +29,7 @@ class LightEquations:
     weights: Array
     """(N, 8) of those, negative for the second side."""
     farther: Array
-    """(N,) by how much the first view is farther off."""
+    """(N,) how much farther off the first view is."""
     views: NDArray[np.int64]
     """(N, 2)."""
     pair: NDArray[np.int64]
@@ -44,7 +44,7 @@ class LightEquations:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LightPrior:
-    """What is known beforehand."""
+    """What is known before the pictures."""
 
     patterns: Array
     """(P + 1, P + 1) normal matrix of nodes and fall-off."""
@@ -53,7 +53,7 @@ class LightPrior:
     gain: Array
     """(V,) inverse variance of each picture's gain."""
     gain_right: Array
-    """(V,) that times the gain expected."""
+    """(V,) inverse variance times the gain expected."""
 
 
 def solve_robustly(

@@ -44,9 +44,9 @@ _FALL_OFF_SIGMA = 4.0
 _SCENE_SIGMA = 0.5
 """Spread of the sea floor's own logarithmic brightness from picture to picture."""
 _FEWEST_PICTURES = 6
-"""Of a camera, for their median to say something."""
+"""Fewest pictures of a camera whose median counts."""
 _LEAST_SHOWN = 0.5
-"""Of a picture's nodes, for its brightness to be known."""
+"""Share of a picture's nodes that must be seen for its brightness to be known."""
 _LARGEST_GAIN = 8.0
 _WHITE_LEVEL, _WHITE_PERCENT = 215.0, 98.0
 _GREY_LEVEL = 128.0
@@ -64,7 +64,7 @@ class LightSamples:
     levels: NDArray[np.float32]
     """(N, 2, 3) logarithm of the low-passed BGR levels."""
     ranges: NDArray[np.float32] | None = None
-    """(N, 2) distances at which the views see the spots; None where they shall not count."""
+    """(N, 2) distances at which the views see the spots; None where they do not count."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -78,9 +78,9 @@ class LightModel:
     white: Array
     """(3,) factors, the same for all pictures, that take the cast of water and light away."""
     fall_off: Array = field(default_factory=lambda: np.zeros(3))
-    """(3,) by how much the logarithm of light falls for each unit of range."""
+    """(3,) decrease of the logarithm of light for each unit of range."""
     fall_off_sigma: Array = field(default_factory=lambda: np.full(3, np.inf))
-    """(3,) of it."""
+    """(3,) sigma of it."""
     middle_range: float = 0.0
     """Range at which patterns and gains hold."""
 

@@ -1,4 +1,4 @@
-"""Whether a mapping is to be believed: stations against navigation, lengths against the rig.
+"""Whether a mapping is credible: stations against navigation, lengths against the rig.
 
 Both are reported, not repaired: a station far off navigation may be a jump of navigation as well
 as a wrong pose, and a scale that the rig's own stereo contradicts a wrong rig as well as a bent
@@ -42,7 +42,7 @@ class FarStation:
     image: str
     off_m: float
     sigmas: float
-    """That over what stations usually miss by."""
+    """Its distance over the usual one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,13 +52,13 @@ class Acceptance:
     checked: int
     """Stations with a position."""
     usual_m: float
-    """Of their distances from navigation, one standard deviation by axis, robustly; NaN without."""
+    """Usual distance from navigation, one standard deviation by axis, robustly; NaN without."""
     far: tuple[FarStation, ...]
     """The farthest first."""
     rig_error: float
     """Relative error of the rig in the finished model; NaN where there is no known rig."""
     scale: ScaleTrend | None
-    """Of the model against its stations' own stereo."""
+    """Scale of the model against its stations' own stereo."""
 
     def notes(self) -> list[str]:
         """A line for every fault."""

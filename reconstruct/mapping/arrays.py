@@ -14,22 +14,22 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Observed:
-    """Keypoints that have a point, picture by picture, as they are at one moment."""
+    """Keypoints that have a point, picture by picture, as they are now."""
 
     pictures: Indices
     """(N,) ids of the registered pictures, ascending."""
     starts: Indices
-    """(N + 1,) where each picture's observations begin."""
+    """(N + 1,) start of each picture's observations."""
     keypoint: Indices
     """(O,) index among the picture's keypoints."""
     pixels: Array
-    """(O, 2) where the keypoints are."""
+    """(O, 2) pixels of the keypoints."""
     point: Indices
     """(O,) index among `point_ids`."""
     point_ids: Indices
     """(P,) ascending."""
     points: Array
-    """(P, 3) in the model's frame."""
+    """(P, 3) points in the model's frame."""
     in_cameras: Array
     """(O, 3) the observations' points in the frames of their cameras."""
 
@@ -42,7 +42,7 @@ class Observed:
         return int(np.searchsorted(self.pictures, picture))
 
     def misses(self, model: pycolmap.Reconstruction) -> Array:
-        """Where the cameras see the points less where the keypoints are, (O, 2) pixels."""
+        """Where the cameras see the points minus where the keypoints are, (O, 2) pixels."""
         found = np.empty((len(self.point), 2))
         for n, number in enumerate(self.pictures.tolist()):
             rows = self.of(n)

@@ -1,4 +1,4 @@
-"""COLMAP's bundle adjustment as this house uses it: poses and points move, rig and cameras do not.
+"""COLMAP's bundle adjustment as used here: poses and points move, rig and cameras do not.
 
 It takes full Gauss-Newton steps, since it starts near its end: COLMAP's own first trust region
 costs ten times the iterations along a block's weak directions.
@@ -22,7 +22,7 @@ _TRUST = 1e12
 """First radius of the trust region: no bound."""
 FULLY, ROUGHLY = 1e-4, 1e-2
 """Relative changes of the cost at which an adjustment ends: for good, and where another follows.
-The last steps of a robust loss are many and small: of a block of 25 stations, whose cameras err by
+The last steps of a robust loss are many and small: in a block of 25 stations with camera errors of
 0.22 mm, an end 10,000 times tighter takes 75 more of them and moves no camera by 0.007 mm."""
 
 

@@ -1,6 +1,6 @@
-"""What the calibration leaves unsure of a block's shape.
+"""How much of a block's shape the calibration leaves uncertain.
 
-An adjustment that holds rig and ports takes their errors as nil. They are not: a lens that is off
+An adjustment that holds rig and ports assumes that they are exact. They are not: a lens that is off
 by its sigma bends the whole block a little, and every picture more does the same again. To first
 order stations and points move with the rig's parameters as the adjustment's normal equations say
 (implicit function theorem), and the covariance of the calibration moves with them.
@@ -33,7 +33,7 @@ from reconstruct.mapping.robust import cauchy_weights, sigma_of
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CalibrationPart:
-    """How a block moves with the parameters of its rig, and how unsure those are."""
+    """How a block moves with the parameters of its rig, and how uncertain those are."""
 
     frames: Indices
     """(F,) ids of COLMAP's frames, ascending."""
@@ -44,7 +44,7 @@ class CalibrationPart:
     points: Array
     """(P, 3, G)."""
     covariance: Array
-    """(G, G) of the parameters."""
+    """(G, G) covariance of the parameters."""
 
     def of_stations(self) -> Array:
         """Covariances (F, 6, 6) of the stations."""
@@ -58,7 +58,7 @@ class CalibrationPart:
         return found
 
     def without(self, gauge: Gauge) -> "CalibrationPart":
-        """The same less what a motion of the whole block does, which is no change of its shape."""
+        """The same minus what a motion of the whole block does, which does not change its shape."""
         flat = self.stations.reshape(-1, self.stations.shape[2])
         whole = gauge.spread @ gauge.flat.T @ (gauge.weights[:, None] * flat)
         return replace(
@@ -86,7 +86,7 @@ def calibration_part(
         given: (F, 6) information of the stations' given poses, as in the adjustment; None without.
 
     Returns:
-        None where the rig states no covariance: then nobody knows.
+        None where the rig states no covariance: then it is unknown.
     """
     names = list(seen.cameras)
     fields = _known(rig, names)

@@ -24,7 +24,7 @@ class Observations:
 
     images: Sequence[ImageRecord]
     cameras: Mapping[str, pycolmap.Camera]
-    """By name; the first is the reference of the rig."""
+    """Cameras by name; the first is the reference of the rig."""
     pixels: Sequence[Array]
     """Keypoints of every picture, (N, 2)."""
     pairs: Sequence[VerifiedPair]

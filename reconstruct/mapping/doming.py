@@ -3,7 +3,7 @@
 Near-parallel views bend a model like a dome while every reprojection error stays small (James &
 Robson 2014, "Mitigating systematic error in topographic models derived from UAV and ground-based
 image networks"). A pressure sensor does not bend, so that the curvature of a paraboloid fitted to
-camera heights less navigation's heights measures it; and a stereo rig carries its own yardstick to
+camera heights minus navigation's heights measures it; and a stereo rig carries its own yardstick to
 every station.
 """
 
@@ -44,7 +44,7 @@ class Bend:
     """Second derivative of the model's height error: positive where ends are too high."""
     sigma_per_m: float
     length_m: float
-    """Of the block along the axis."""
+    """Length of the block along the axis."""
 
     @property
     def sag_m(self) -> float:
@@ -69,7 +69,7 @@ class ScaleTrend:
     """Lengths of the model over those of its stations' own stereo; 1 when they agree."""
     mean_sigma: float
     range: float
-    """Largest less smallest value of the fitted paraboloid over the stations."""
+    """Largest minus smallest value of the fitted paraboloid over the stations."""
     range_sigma: float
 
     @property
@@ -78,7 +78,7 @@ class ScaleTrend:
         return self.range > _SIGMAS * self.range_sigma
 
     def off_by_more_than(self, bound: float) -> bool:
-        """Whether the mean is off by so much and beyond its noise."""
+        """Whether the mean is off by this much and beyond its noise."""
         return abs(self.mean - 1.0) > max(bound, _SIGMAS * self.mean_sigma)
 
 
@@ -177,7 +177,7 @@ def doming_of_survey(
 def bend_of(
     centres: Array, depths_m: Array, sigmas_m: Array, down: Array
 ) -> tuple[Bend | None, Bend | None]:
-    """Curvature of camera heights less navigation's heights, along and across the block.
+    """Curvature of camera heights minus navigation's heights, along and across the block.
 
     A quadratic in the block's principal axes is fitted robustly (Cauchy's weights); sigmas are
     those of the depths or, where larger, of the fit's residuals. Errors of depth are taken as

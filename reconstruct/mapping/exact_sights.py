@@ -34,7 +34,7 @@ class Pixels:
     """Observations, sorted by point."""
 
     starts: Indices
-    """(P + 1,) where the observations of every point begin."""
+    """(P + 1,) start of each point's observations."""
     station: Indices
     """(O,) index of the station."""
     camera: Indices
@@ -130,7 +130,7 @@ def start_state(
 def exact_sights(
     state: RigState, pixels: Pixels, fields: Sequence[str], names: Sequence[str], *, lever: bool
 ) -> Sights:
-    """The observations linearised; those that no light explains count nothing."""
+    """The observations linearised; those that no ray explains count nothing."""
     count = len(fields) + 3 * lever
     arm = state.points[pixels.point] - state.centres[pixels.station]
     by_point = np.zeros((len(arm), 2, 3))

@@ -25,7 +25,7 @@ _FIRST_ERROR_PX = 20.0
 _FIRST_ANGLE_DEG = 3.0
 """Largest angle between a ray and its point at the first triangulation."""
 _ROBUST_PX = 4.0
-"""From which residuals count less in the first adjustment."""
+"""Residuals beyond this count less in the first adjustment."""
 _NO_BOUND = 1e12
 """Radius of the trust region."""
 

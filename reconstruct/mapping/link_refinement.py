@@ -57,13 +57,13 @@ class RigSight:
 def refine_link(
     points: Array, pixels: Array, camera: Indices, sight: RigSight, start: RigidTransform
 ) -> tuple[RigidTransform, Array] | None:
-    """Refine where one station's rig is as another's stereo points show it.
+    """Refine the pose of one station's rig from another's stereo points.
 
     Args:
         points: (N, 3) by the first station's stereo, in its rig's frame.
         pixels: (N, 2) where the second station sees them.
         camera: (N,) by which of its cameras.
-        sight: of the rig of both.
+        sight: cameras of the rig of both.
         start: `second_from_first`.
 
     Returns:

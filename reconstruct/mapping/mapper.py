@@ -38,7 +38,8 @@ _COLLAPSED = 0.05
 _MOST_COLLAPSED = 0.1
 """Share of a frame's points; the sea floor never comes so near."""
 _LEAST_ANGLE_DEG = 6.0
-"""Of the first pair: nadir pictures with 60 % overlap rarely reach COLMAP's 16 degrees."""
+"""Least angle of the first pair: nadir pictures with 60 % overlap rarely reach COLMAP's 16 degrees.
+"""
 _GROWTH = 1.4
 """Growth of a model on a known rig between adjustments of all of it (COLMAP: 1.1); the rig keeps a
 growing model straight, and half the time goes: 17.8 to 8.4 s on 24 stations, for the same rms."""
@@ -53,7 +54,7 @@ class Mapped:
 
     model: pycolmap.Reconstruction
     lenses: Mapping[str, Lens]
-    """By camera, for the cameras of the model."""
+    """Lens of each camera of the model."""
     models: tuple[int, ...]
     """Pictures in each model found, most first; all but the first were dropped."""
     scaled: bool
@@ -61,7 +62,7 @@ class Mapped:
     baseline: float
     """Distance between the first two pinhole centres, in units of the model; NaN for one camera."""
     rig_factor: float
-    """By what the model was multiplied to give the rig its known (or unit) size back."""
+    """Factor on the model that gives the rig its known (or unit) size back."""
     notes: tuple[str, ...] = ()
     """What a reader of the result must know."""
 
@@ -179,7 +180,7 @@ def _globally(
 
 
 def faults_of(found: Sequence[pycolmap.Reconstruction], total: int) -> list[str]:
-    """Why a mapping is not to be accepted as it is: ends of sentences, none when it is sound."""
+    """Reasons to reject a mapping as it is: ends of sentences, none when it is sound."""
     if not found:
         return ["found no model"]
     faults = unsound(found[0])

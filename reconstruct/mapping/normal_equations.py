@@ -32,17 +32,17 @@ class Sights:
     """Linearised observations, sorted by point."""
 
     starts: Indices
-    """(P + 1,) where the observations of every point begin."""
+    """(P + 1,) start of each point's observations."""
     station: Indices
     """(O,) index of the station."""
     by_point: Array
     """(O, 2, 3) slopes of the pixel by the point in the world."""
     arm: Array
-    """(O, 3) from the station's origin to the point, in the world."""
+    """(O, 3) vector from the station's origin to the point, in the world."""
     by_shared: Array
     """(O, 2, G) slopes by what all share; G may be 0."""
     miss: Array
-    """(O, 2) found pixel less the one observed."""
+    """(O, 2) computed pixel minus the observed one."""
 
     @property
     def seen_by(self) -> Indices:

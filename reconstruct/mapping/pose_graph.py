@@ -23,7 +23,7 @@ Indices = NDArray[np.int64]
 _ROUNDS = 8
 _LEAST_ANGLE_RAD = 1e-3
 _LEAST_LENGTH = 1e-3
-"""Share of the links' usual length; with the former, floors of what counts as a contradiction."""
+"""Share of the links' usual length; with the angle, floors of what counts as a contradiction."""
 _MEDIANS = 2.0
 """Residuals of this many medians keep half their weight."""
 

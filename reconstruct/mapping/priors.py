@@ -3,7 +3,7 @@
 A single line of pictures, calibrated and on a rigid rig, still bows slowly along its length;
 navigation does not. COLMAP's adjustment with position priors first fits the model to the priors by
 a similarity, and would so take the scale from navigation: here the priors are made to agree with
-the model's scale beforehand, and the rig's known baseline is put back afterwards.
+the model's scale first, and the rig's known baseline is restored afterwards.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,7 +30,7 @@ _WORST_GROWTH = 1.05
 def pinhole_positions(
     records: Sequence[ImageRecord], rig: Rig, lenses: Mapping[str, Lens], datum: Datum
 ) -> tuple[Array, Array]:
-    """Where navigation says that the pinholes' centres were.
+    """The pinholes' centres by navigation.
 
     Returns:
         (N, 3) positions in NED and their sigmas, both metres; NaN where position, attitude or a
@@ -65,7 +65,7 @@ class NavigationAdjuster:
         lenses: Mapping[str, Lens],
         datum: Datum | None,
     ) -> None:
-        """What navigation says.
+        """Take the positions of navigation.
 
         Args:
             records: pictures; number i has the id i + 1 in the model.

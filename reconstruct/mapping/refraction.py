@@ -1,6 +1,6 @@
 """Exact flat-port refraction with COLMAP's own adjustment of ideal pinholes.
 
-COLMAP knows no refractive camera. The mapper's keypoints are warped to pinholes, exact at one
+COLMAP has no refractive camera. The mapper's keypoints are warped to pinholes, exact at one
 working depth; once a point's depth z before the pinhole's centre is known, where an ideal pinhole
 sees the spot is known too (see `reconstruct.views.range_shift`):
 
@@ -41,10 +41,10 @@ _UNMOVED_PX = 1e-6
 _NEAREST, _FARTHEST = 0.2, 20.0
 """Depths of spots over the working depth; beyond, a point is wrong and is left to the filter."""
 _WRONG_SIGMAS, _LEAST_WRONG_PX, _MOST_WRONG_PX = 5.0, 1.0, 4.0
-"""An observation that misses by so many sigmas of the usual miss is wrong; nothing below the first
+"""An observation that misses by this many sigmas of the usual miss is wrong; none below the first
 bound is called wrong, all beyond the second (COLMAP's) is."""
 _LEAST_ANGLE_DEG = 1.5
-"""Between the rays of a point (COLMAP's)."""
+"""Least angle between the rays of a point (COLMAP's)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,9 +1,9 @@
 """Port, water and rig refined from the survey's own pictures, through the exact flat-port cameras.
 
 An adjustment of stations, points and the rig's parameters, each parameter within what calibration
-knew of it: the covariance of `rig.json`, or wide bounds where it has none. What is asked for is
+knew of it: the covariance of `rig.json`, or wide bounds where it has none. What is requested is
 free; what the calibration was unsure of besides (focal lengths, say) moves with it within its
-covariance, since holding that would push its errors into what is asked for.
+covariance, since holding that would push its errors into what is requested.
 """
 
 from collections.abc import Mapping, Sequence
@@ -50,7 +50,7 @@ _LEVER_SIGMA_M = 0.05
 _MOST_LASTING = 0.98
 """Correlation of navigation's errors from one station to the next."""
 _BASELINE_SIGMA_M = 1e-7
-"""Of an uncalibrated baseline: it is the scale, which no picture determines."""
+"""Sigma of an uncalibrated baseline: it is the scale, which no picture determines."""
 _TURN_INFORMATION = 1.0
 """1/rad^2 of a station whose position is given: a line does not determine its own roll."""
 _ROUNDS = 20
@@ -63,7 +63,7 @@ class RigFit:
     """A refined rig and how well it is known."""
 
     rig: Rig
-    """With the covariance of all that was adjusted; the lever arm is its `body_from_rig`."""
+    """Rig with the covariance of all that was adjusted; the lever arm is its `body_from_rig`."""
     parameters: tuple[str, ...]
     before: Array
     """(G,) values, in the parameters' units."""
@@ -72,12 +72,12 @@ class RigFit:
     covariance: Array
     """(G, G)."""
     sigma_px: float
-    """Of one coordinate of a keypoint."""
+    """Sigma of one coordinate of a keypoint."""
     observations: int
     stations: tuple[RigidTransform, ...]
     """`world_from_rig` at the reference camera's entrance pupil, by ascending frame."""
     points: Array
-    """(P, 3) of those points that took part."""
+    """(P, 3) those points that took part."""
     point_ids: Indices
 
     def to_json(self) -> dict[str, Any]:
@@ -102,7 +102,7 @@ class NavigationFixes:
     """Positions of the body's origin by navigation, in the model's frame."""
 
     positions: Array
-    """(F, 3) by ascending frame; NaN where unknown."""
+    """(F, 3) positions by ascending frame; NaN where unknown."""
     sigmas: Array
 
 
@@ -127,7 +127,7 @@ def fit_rig(
         fixes: positions of the body.
 
     Raises:
-        ReconstructionError: the survey does not determine what is asked for.
+        ReconstructionError: the survey does not determine what is requested.
     """
     names = list(seen.cameras)
     frames = frames_of(mapped.model)
@@ -181,10 +181,10 @@ def fit_rig(
 
 
 def _lasting(fixes: NavigationFixes, state: RigState) -> NavigationFixes:
-    """Sigmas that count how long navigation errs the same way.
+    """Sigmas that account for correlated errors of navigation.
 
-    Errors that last say less than as many new ones: a first-order process with the correlation r
-    from one station to the next widens the sigma of a mean by sqrt((1 + r) / (1 - r)).
+    Correlated errors average out less than independent ones: a first-order process of correlation
+    r from one station to the next widens the sigma of a mean by sqrt((1 + r) / (1 - r)).
     """
     known = np.flatnonzero(np.isfinite(fixes.positions + fixes.sigmas).all(axis=1))
     bodies = state.centres[known] + state.turns[known] @ state.lever
@@ -207,7 +207,7 @@ def _spare(pixels: Pixels, stations: int, shared: int) -> int:
 
 
 def _prior(rig: Rig, names: Sequence[str], *, port: bool, pose: bool) -> Prior:
-    """What is known beforehand of what may move."""
+    """What is known before the pictures of what may move."""
     known: tuple[str, ...] = ()
     if rig.covariance is not None:
         known = tuple(n for n in rig.covariance.parameters if n.split(".")[0] in names)
@@ -273,7 +273,7 @@ def _step(
     drift: Array,
     fixes: NavigationFixes | None,
 ) -> _RigStep:
-    """One Gauss-Newton step of stations and shared parameters, and the covariance of the latter."""
+    """One Gauss-Newton step of stations and shared parameters, and the shared ones' covariance."""
     count = len(state.centres)
     reduced = reduce_points(sights, count)
     shared = reduced.shared / variance + information

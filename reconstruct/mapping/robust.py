@@ -1,6 +1,6 @@
 """How far observations may miss: the sigma of keypoints and the weights of an adjustment.
 
-Keypoints do not all err alike. The edges of shadows move with the lamps, tracks jump from one spot
+Not all keypoints have similar errors. Shadow edges move with the lamps, tracks jump from one spot
 to the next: a few in a hundred miss by many sigmas, and not at random, since lamps go where the
 cameras go. With equal weights they bend a block by more than all other noise together. Cauchy's
 loss (Rey 1983, "Introduction to robust and quasi-robust statistical methods") lets them go by and
@@ -31,7 +31,7 @@ def pixel_sigma(model: pycolmap.Reconstruction) -> float:
 def sigma_of(misses: Array, counts: Indices, stations: int) -> float:
     """Standard deviation of one coordinate, from the median of residuals.
 
-    Residuals are smaller than errors by what points and stations adapt to. Points seen but twice
+    Residuals are smaller than errors by what points and stations adapt to. Points seen only twice
     adapt so much that what is left is not normal: they do not count where there are others.
 
     Args:

@@ -240,7 +240,7 @@ def _cameras(
             width=width,
             height=height,
             params=[focal, width / 2, height / 2, 0.0, 0.0],
-            # EXIF knows nothing of water and of crops: pairs are verified without it.
+            # EXIF does not know of water and crops: pairs are verified without it.
             has_prior_focal_length=False,
         )
     return cameras, stated

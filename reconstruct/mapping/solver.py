@@ -1,4 +1,4 @@
-"""How COLMAP's bundle adjustments are solved in this house."""
+"""How COLMAP's bundle adjustments are solved here."""
 
 import pycolmap
 

@@ -21,9 +21,11 @@ from reconstruct.mapping.working_range import ray_passes
 from reconstruct.matching.matches import Matches
 
 _LARGEST_GAP_PX = 3.0
-"""By which the two rays of a stereo point may miss each other, as seen from the cameras."""
+"""Distance by which the two rays of a stereo point may miss each other, as seen from the cameras.
+"""
 _LARGEST_ERROR_PX = 12.0
-"""Of a resection: stereo depths are noisy, and show as parallax from the next station."""
+"""Largest error of a resection: stereo depths are noisy, and show as parallax from the next
+station."""
 _LEAST_INLIERS = 15
 _LEAST_SHARE = 0.25
 _ENOUGH = 300
@@ -42,13 +44,14 @@ class StationLink:
     second: int
     """Stations."""
     second_from_first: RigidTransform
-    """Between the rigs' frames, metres."""
+    """Transform between the rigs' frames, metres."""
     inliers: int
     share: float
     """Inliers over the points tried."""
     turn_variance: float
     shift_variance: float
-    """Of the pose, but for a factor common to all links (rad^2 and m^2, were points exact)."""
+    """Variances of the turn and the shift, but for a factor common to all links (rad^2 and m^2,
+    were points exact)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

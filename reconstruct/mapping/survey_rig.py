@@ -89,7 +89,7 @@ def refine_as_set(
         settings: `refine_port` and `refine_rig`.
 
     Returns:
-        The survey on its own rig; what kept it from that, where nobody insisted.
+        The survey on its own rig; or what prevented it, where the settings do not insist.
 
     Raises:
         ReconstructionError: as `refine_rig`, where the settings insist.

@@ -68,7 +68,7 @@ class Uncertainty:
     point_noise: Array
     """(P, 3, 3): of it, what the noise of the point's own keypoints does; the rest are poses."""
     sigma_px: float
-    """Of one coordinate of a keypoint, from the residuals."""
+    """Sigma of one coordinate of a keypoint, from the residuals."""
 
 
 def estimate(
@@ -84,7 +84,7 @@ def estimate(
         records: pictures.
         position_sigmas: (N, 3) of the pictures' given positions along the model's axes, NaN where
             none took part in the adjustment; None for an adjustment without.
-        calibration: what errors of the rig do; None where nobody knows.
+        calibration: what errors of the rig do; None where they are unknown.
 
     Raises:
         ReconstructionError: the model is too small to determine its covariance.

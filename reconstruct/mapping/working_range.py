@@ -23,7 +23,7 @@ _LEAST_POINTS = 50
 _LARGEST_GAP_PX = 2.0
 """Rays of a match pass each other by at most this many pixels."""
 _NEAR, _FAR = 0.75, 1.5
-"""Nearest and farthest distances over the working range, when only the latter is known."""
+"""Nearest and farthest distances over the working range, when only the range is known."""
 
 
 @dataclass(frozen=True, kw_only=True)

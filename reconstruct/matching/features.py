@@ -15,9 +15,11 @@ _CONTRAST = 0.01
 _CELLS = 16
 """Cells along the longer side over which features are spread."""
 _MOST_MPX = 1.5
-"""Of a picture in which features are looked for, unless a scale is set (see `detection_scales`)."""
+"""Largest picture in which features are looked for, unless a scale is set (see `detection_scales`).
+"""
 _PIXELS_PER_FEATURE = 100.0
-"""Of a picture of rich texture, with about twice as many features as are wanted."""
+"""Pixels for each feature of a picture of rich texture, with about twice as many features as are
+needed."""
 _SUPPORT = 1.5
 """Diameters around a feature within which a mask must leave the picture free: three sigmas of the
 blur at which it was found."""

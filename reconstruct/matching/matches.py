@@ -35,11 +35,11 @@ _SLACK = 2.0
 _FALSE = 4.0
 """Misses over the median from which a match of the probe is taken for false; relief stays below."""
 _TRIALS = 300
-"""Of the plane through the matches of the probe, most of which are right."""
+"""Trials for the plane through the matches of the probe, most of which are right."""
 _RELIEF = 0.1
 """Farthest that a match of the probe may be from one plane's, as a share of the longer side."""
 _LEAST_RADIUS = 0.02
-"""Of the search, as a share of the picture's longer side."""
+"""Least radius of the search, as a share of the picture's longer side."""
 
 
 @compiled

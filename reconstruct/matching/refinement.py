@@ -29,13 +29,13 @@ from reconstruct.matching.matches import Matches
 from reconstruct.views.interpolation import cubic_level, is_inside
 
 _RADIUS = 7
-"""Of a patch, pixels."""
+"""Radius of a patch, pixels."""
 _SIGMA = 5.0
-"""Of the weight that falls towards the border of a patch, pixels."""
+"""Sigma of the weight that falls towards the border of a patch, pixels."""
 _STEPS = 12
 _SETTLED_PX = 0.005
 _FARTHEST_PX = 3.0
-"""A position that wants to move by more has found something else, and stays."""
+"""A position that would move by more has found something else, and stays."""
 _LEAST_CORRELATION = 0.7
 _LEVELS = 3
 """Pictures tried: the whole, its half and its quarter."""
@@ -72,7 +72,7 @@ class RefinedFeatures:
     """Features after refinement."""
 
     pixels: list[Array]
-    """By picture, (N, 2): all features, moved or not."""
+    """Pixels by picture, (N, 2): all features, moved or not."""
     tracked: int
     """Observations that have a reference in another picture."""
     moved: int
@@ -89,7 +89,7 @@ def refine_tracks(
     """Align every observation of a track with the track's reference.
 
     The reference is the observation that was matched with most others. An observation stays where
-    it is if its patch does not resemble that of the reference, or wants to go far.
+    it is if its patch does not resemble that of the reference, or would move far.
 
     Args:
         features: files of the features of every picture.

@@ -42,7 +42,7 @@ class Atlas:
     box: NDArray[np.int64]
     """(C, 2) width and height of the box, padding included."""
     scale: float
-    """By which pictures are shrunk for the texture; 1 keeps them."""
+    """Factor by which pictures are shrunk for the texture; 1 keeps them."""
 
     def place(self, pixels: Array, chart: NDArray[np.int32]) -> Array:
         """Pixels (W, 2) of pictures, in each one's patch, to pixels of the patches' pages."""

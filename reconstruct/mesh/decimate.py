@@ -24,9 +24,9 @@ _ENOUGH = 0.004
 _SHARE = 0.5
 """Only this share of the edges, the cheapest, may collapse in one round."""
 _RIM_WEIGHT = 3.0
-"""Of the planes that hold the outline of a mesh, over that of its faces."""
+"""Weight of the planes that hold the outline of a mesh, over that of its faces."""
 _LEAST_COSINE = 0.3
-"""Between the normals of a face before and after a collapse."""
+"""Least cosine between the normals of a face before and after a collapse."""
 _LEAST_QUALITY = 0.06
 """4 sqrt(3) area over the sum of squared sides (1 if equilateral) that a face must keep."""
 _SHORTNESS = 1e-4

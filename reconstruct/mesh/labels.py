@@ -20,7 +20,7 @@ from reconstruct.mesh.topology import Triangles, edges_of, face_normals
 from reconstruct.mesh.visibility import Candidates
 
 _SEAM_COST = 0.35
-"""Of an edge of mean length between two views, over the logarithm of a ratio of quality."""
+"""Cost of an edge of mean length between two views, over the logarithm of a ratio of quality."""
 _SWEEPS = 30
 _SMALL_FACES = 60
 """Patches of fewer faces are given away if they can be."""

@@ -30,7 +30,7 @@ from reconstruct.views.model import (
 )
 
 MOST_TRIANGLES = 4_000_000
-"""Where the settings name no number."""
+"""Most triangles where the settings name no number."""
 _LIFT_STEPS = 0.5
 """Height over the surface, in spacings of the cloud, at which lines of sight start."""
 

@@ -22,7 +22,7 @@ from reconstruct.mesh.topology import (
 from reconstruct.ply import CloudFile
 
 _NODES = 12_000_000
-"""Of a tile's lattice, which bounds its memory to some 300 MB."""
+"""Nodes of a tile's lattice, which bound its memory to some 300 MB."""
 _TILE_STEPS = (24, 192)
 """Fewest and most cells along the sides of a tile."""
 _RIM_STEPS = 6
@@ -30,11 +30,11 @@ _RIM_STEPS = 6
 TRIM_STEPS = 1.5
 """The surface ends so far from the nearest point: gaps of twice this are bridged."""
 _NEIGHBOURS, _NEIGHBOURHOOD_STEPS = 4, 2.5
-"""A vertex needs so many points in so many steps around it."""
+"""A vertex needs this many points in this many steps around it."""
 _LEAST_PART_STEPS2 = 400.0
 """Parts with an area of fewer lattice squares are taken for strays."""
 _MOST_WEIGHT = 4.0
-"""Of a point that is better known than the median."""
+"""Largest weight of a point that is better known than the median."""
 _KEY_BITS = 21
 _DENSE_ROUNDS = 12
 _GROWTH = 1.3
@@ -51,7 +51,7 @@ class SurfaceTask:
     """Number of the tile's first cell along x and y."""
     cells: tuple[int, int]
     sigma: float
-    """Of a point of weight 1."""
+    """Sigma of a point of weight 1."""
     error: float
 
 
@@ -70,10 +70,10 @@ class TriangleMesh:
     """Triangles, counter-clockwise seen from the water."""
 
     vertices: Array
-    """(V, 3) in the coordinates of the cloud."""
+    """(V, 3) vertices in the coordinates of the cloud."""
     triangles: Triangles
     error: float
-    """Of the decimation, in the unit of the vertices."""
+    """Error of the decimation, in the unit of the vertices."""
 
 
 def mesh_cloud(

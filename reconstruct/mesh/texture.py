@@ -24,7 +24,7 @@ from reconstruct.views.model import View
 
 Float32 = NDArray[np.float32]
 _SEAM_SIGMA_PX = 4.0
-"""Of the average around a seam's vertices that both sides are compared by."""
+"""Sigma of the average around a seam's vertices by which both sides are compared."""
 _MOST_PAGES = 16
 _JPEG_QUALITY = 93
 
@@ -46,7 +46,7 @@ class Textured:
     label: NDArray[np.int32]
     """(T,) view of every face, negative where no view sees it."""
     scale: float
-    """By which the pictures were shrunk."""
+    """Factor by which the pictures were shrunk."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

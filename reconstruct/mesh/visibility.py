@@ -20,11 +20,11 @@ CANDIDATES = 8
 _RIM_PX = 3.0
 """Pixels at the edges of a picture that are not used."""
 _LEAST_COSINE = 0.15
-"""Between the normal of a face and the line of sight."""
+"""Least cosine between the normal of a face and the line of sight."""
 _BLOCK = 512
 """Vertices that are held against a view's frame at once."""
 _MARGIN = 0.1
-"""Of the frame, for what a port bends."""
+"""Margin of the frame, for what a port bends."""
 _SHRINK = 0.8
 """Rays to the corners of a face start so far from its middle to the corner."""
 _ENU_TO_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])

@@ -1,6 +1,6 @@
 """The mosaic cut for annotation tools: pictures of bounded size with their scale.
 
-TagLab takes at most 32,767 pixels a side, BIIGLE wants plain pictures with their area. Each tile
+TagLab takes at most 32,767 pixels a side, BIIGLE needs plain pictures with their area. Each tile
 has a world file (six lines: pixel size, turns, and the centre of the first pixel) and a line in
 `tiles.csv`.
 """

@@ -27,7 +27,7 @@ class ViewPart:
     """What one view contributes."""
 
     row: int
-    """Of its first pixel in the tile; a multiple of `ALIGNED_PX`."""
+    """Row of its first pixel in the tile; a multiple of `ALIGNED_PX`."""
     column: int
     colour: Float32
     """(h, w, 3); any value where not valid. h and w are multiples of `ALIGNED_PX`."""

@@ -2,7 +2,7 @@
 
 Light that reaches the camera is that of the sea floor, weakened, and that which the water throws
 back (Akkaynak & Treibitz 2018, "A revised underwater image formation model"; the direct and the
-backscattered light have coefficients of their own):
+backscattered light have separate coefficients):
 
     I = J exp(m(camera, place) + g(picture) - b (z - z0)) + A(camera, place)
 
@@ -39,26 +39,27 @@ Float32 = NDArray[np.float32]
 Colour = Literal["even", "water", "raw"]
 
 _FEWEST_PICTURES = 12
-"""Of a camera, for the darkest pixels of a place to be dark."""
+"""Fewest pictures of a camera for the darkest pixels of a place to be dark."""
 _DARK_QUANTILE = 0.15
-"""Of the pictures' darkest light at a place, which a few black outliers do not move."""
+"""Quantile of the pictures' darkest light at a place, which a few black outliers do not move."""
 _GAIN_SIGMA = 1.0
 """Expected size of the logarithm of a picture's own light: a stop and a half either way."""
 _SHARES = np.linspace(0.0, 1.0, 6)
 _MOST_SAMPLES = 20_000
-"""Of those that the share of the additive light is found from."""
+"""Most samples that the share of the additive light is found from."""
 _LARGEST_SIGMA = 0.25
-"""Of a share that is believed."""
+"""Largest sigma of a share that is used."""
 _LARGEST_WATER_SIGMA = 0.15
-"""Of the logarithm of colour ratios that the water took, to put them right by it."""
+"""Largest sigma of the logarithm of the colour ratios lost to the water, for a correction by them.
+"""
 _LARGEST_LIFT = 30.0
 _BRIGHT_LIGHT, _BRIGHT_PERCENT = 0.68, 98.0
 _MIDDLE_LIGHT = 0.22
 _NORM = 6.0
 _BLACK_QUANTILE = 0.01
-"""Of the darkest half percent of pixels around all places of all pictures."""
+"""Quantile of the darkest half percent of pixels around all places of all pictures."""
 _BLACK_SHARE = 0.6
-"""Of that: the rest keeps detail in shadows."""
+"""Share of that light that is taken as black: the rest keeps detail in shadows."""
 _HIGHEST_BLACK = 0.05
 _FEWEST_DARK = 50
 """Places, for the dark of a survey to be known."""
@@ -72,12 +73,13 @@ class ColourModel:
     added: Mapping[str, Array]
     """Per camera (rows, columns, 3): light that the water adds at the nodes, BGR."""
     shares: Array
-    """(3,) of the darkest pixels' light that is taken to be the water's; 0 where not known."""
+    """(3,) share of the darkest pixels' light that is taken to be the water's; 0 where not known.
+    """
     share_sigmas: Array
     """(3,)."""
     notes: tuple[str, ...]
     black: Array = field(default_factory=lambda: np.zeros(3))
-    """(3,) of the corrected light that is shown as black; white stays white."""
+    """(3,) level of the corrected light that is shown as black; white stays white."""
 
     def nodes(self, camera: str, image: str) -> Float32:
         """(rows, columns, 6) factors, and light that is taken away before, at the nodes, BGR."""
@@ -266,7 +268,7 @@ def _levels(
 def without(
     samples: LightSamples, added: Mapping[str, Array], cameras: Sequence[str]
 ) -> LightSamples:
-    """Samples less the light that the water adds; where too little is left they are dropped."""
+    """Samples minus the light that the water adds; where too little is left they are dropped."""
     light = np.exp(samples.levels.astype(np.float64))
     water = sampled(samples, added, cameras)
     left = light - water

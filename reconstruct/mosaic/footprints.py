@@ -29,16 +29,16 @@ _HALVINGS = 20
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PictureFootprint:
-    """Of one picture; lengths in the unit of the model."""
+    """Footprint of one picture; lengths in the unit of the model."""
 
     outline: Array
     """(N, 2) east and north around the picture, those rays alone that meet the surface."""
     area: float
-    """Of the surface's plan within the grid of rays that meet it; 0 where none do."""
+    """Plan area of the surface within the grid of rays that meet it; 0 where none do."""
     ground_pixel: float
     """Root of the plan's area that a pixel of the picture covers; NaN where nothing is met."""
     mean_range: float
-    """From the pinhole's centre; NaN where nothing is met."""
+    """Mean distance from the pinhole's centre; NaN where nothing is met."""
     seen: float
     """Share of the rays over the picture that meet the surface."""
 

@@ -39,11 +39,12 @@ class Block:
     """A part of the mosaic and the views that may see it."""
 
     window: Window
-    """Of the mosaic, in its pixels, a margin included; it may reach beyond the mosaic's edges."""
+    """Part of the mosaic, in its pixels, a margin included; it may reach beyond the mosaic's edges.
+    """
     core: Window
     """The part of the mosaic that this block is to fill."""
     grid: DemGrid
-    """Of the window's pixels."""
+    """Grid of the window's pixels."""
     views: tuple[int, ...]
     """Numbers of views."""
     reach: float
@@ -218,7 +219,7 @@ def dem_around(
 def height_at_pixels(dem: Float32, around: DemGrid, grid: DemGrid) -> Float32:
     """Bilinear heights at the centres of a grid's pixels; NaN where a cell around is unknown.
 
-    At the outer edge of the DEM the last cell's height holds for the half cell beyond its centre;
+    At the outer edge of the DEM the last cell's height is used for the half cell beyond its centre;
     farther out nothing is known.
     """
     columns = (grid.east_of(np.arange(grid.columns) + 0.5) - around.west) / around.cell - 0.5

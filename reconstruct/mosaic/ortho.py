@@ -13,7 +13,7 @@ Float32 = NDArray[np.float32]
 _TAPS = 8
 _FRACTIONS = 1024
 _MOST_ROUNDS, _STILL_PX = 5, 1e-3
-"""Of the fixed point that leads through a flat port; each round gains two digits or more."""
+"""Limits of the fixed-point iteration through a flat port; each round gains two digits or more."""
 
 
 @compiled

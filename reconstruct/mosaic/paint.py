@@ -49,7 +49,7 @@ class SeenView:
     number: int
     view: View
     sharpness: float
-    """Over the survey's median."""
+    """Sharpness over the survey's median."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -26,7 +26,8 @@ from reconstruct.raster import DemGrid, opened_raster, small_cache
 from reconstruct.views.model import View, enu_from_cam
 
 _MOST_CELLS = 16_000_000
-"""Of the DEM for one view; views that see more, to the horizon, are looked at block by block."""
+"""Most cells of the DEM for one view; views that see more, to the horizon, are looked at block by
+block."""
 _SMALL_PX = 432
 """Width of the copies in which views are compared, at most."""
 _LEAST_SHRINK = 4
@@ -35,14 +36,14 @@ DARKEST, BRIGHTEST = 0.001, 0.95
 """Linear light beyond which a broad level is not used."""
 _DARK_PERCENT = 0.5
 _DARK_STEP = 2
-"""Every so manieth pixel along rows and columns is looked at for dark ones."""
+"""Step along rows and columns between pixels that are looked at for dark ones."""
 _BROAD_STEP = 4
 """Pixels of a small copy to one of its broad light, which is blurred by as much."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PictureMeasures:
-    """Of one picture."""
+    """Measures of one picture."""
 
     sharpness: float
     """Mean size of its Laplacian over its mean level; NaN where it is black."""
@@ -203,7 +204,8 @@ def low_levels(
         percent: of the pixels that are darker.
 
     Returns:
-        The level that so many pixels are below, as a step; NaN where fewer than 100 may be used.
+        The level below which that share of pixels lies, as a step; NaN where fewer than 100 are
+        usable.
     """
     rows, columns = len(y) - 1, len(x) - 1
     found = np.full((rows, columns, 3), np.nan)
@@ -236,7 +238,7 @@ def small_path(folder: Path, image: str) -> Path:
 
 
 class SmallCopies:
-    """Small copies as they are asked for; the last few stay in memory."""
+    """Small copies, read on request; the last few stay in memory."""
 
     def __init__(self, folder: Path, kept: int = 40) -> None:
         self._load = lru_cache(maxsize=kept)(lambda image: _read_small(folder, image))
@@ -270,7 +272,7 @@ class ViewTask:
 
     workspace: Path
     scratch: Path
-    """For what tiles will ask for."""
+    """Folder for what tiles need later."""
     view: View
     heights: tuple[float, float]
     """Lowest and highest cell of the DEM."""

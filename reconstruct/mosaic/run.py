@@ -61,11 +61,11 @@ _LIGHT_LATTICE = 24
 """Spots across a picture at which light is compared."""
 _MOST_SAMPLES = 150_000
 _CACHE_MIB = 48
-"""Of files that GDAL reads and writes in this process."""
+"""Cache for files that GDAL reads and writes in this process."""
 _TASK_MIB = 400
 """Memory that a process takes for a block of any kind."""
 _TEMPERATURE_C, _SALINITY_PSU = 15.0, 35.0
-"""Of the sea where nobody says; red and blue move by 2 % of their dispersion from 5 to 30 C."""
+"""Sea water where none is stated; red and blue move by 2 % of their dispersion from 5 to 30 C."""
 
 
 def run_mosaic(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:

@@ -18,12 +18,12 @@ Float32 = NDArray[np.float32]
 MOST_VIEWS = 6
 """Candidates of a cell."""
 LEAST_SHARE = 0.3
-"""Of the best quality that a candidate must have."""
+"""Share of the best quality that a candidate must have."""
 _SWEEPS = 24
 _SEAM_COST = 0.1
-"""Of a seam along one cell where views agree, in logarithms of quality lost in one cell."""
+"""Cost of a seam along one cell where views agree, in logarithms of quality lost in one cell."""
 _DIFFERENCE_COST = 10.0
-"""Of a seam along one cell where views differ by a factor of e."""
+"""Cost of a seam along one cell where views differ by a factor of e."""
 _MOST_DIFFERENCE = 1.0
 
 

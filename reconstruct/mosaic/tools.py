@@ -28,9 +28,9 @@ class MosaicSetup:
     scratch: Path
     scaled: bool
     water: Water | None
-    """Of the port's dispersion; None where channels are not distinguished."""
+    """Water of the port's dispersion; None where channels are not distinguished."""
     run: str = field(default_factory=lambda: uuid.uuid4().hex)
-    """Tells one run from the next in a process that works for both: files may have changed."""
+    """Distinguishes runs in a process that works for several: files may have changed."""
 
 
 class Tools:

@@ -20,7 +20,8 @@ from reconstruct.views.range_shift import RangeShift, range_shift
 from reconstruct.views.sight import pinhole_of
 
 _SPACING_PX = 8.0
-"""Of nodes between which a lens is bilinear: within 0.001 px for the lenses of such cameras."""
+"""Spacing of nodes between which a lens is bilinear: within 0.001 px for the lenses of such
+cameras."""
 _HIDES_CELLS = 2.5
 """Height over a line of sight, in cells of the DEM, at which a cell hides what is behind it."""
 _RIM_PX = 2.0
@@ -87,7 +88,7 @@ class Ground:
         self._visible: dict[str, Visible] = {}
 
     def visible_from(self, view: View) -> Visible:
-        """Cells that a view sees; views that nobody stored are asked in this part of the DEM."""
+        """Cells that a view sees; a view that was not stored is traced in this part of the DEM."""
         if view.image not in self._visible:
             path = None if self._stored is None else visible_path(self._stored, view.image)
             if path is not None and path.is_file():
@@ -108,7 +109,7 @@ class GridHeights:
 
     grid: DemGrid
     height: Float32
-    """(rows, columns) of the grid, up."""
+    """(rows, columns) heights of the grid, up."""
     ground: Ground
 
     def part(self, rows: slice, columns: slice) -> "GridHeights":

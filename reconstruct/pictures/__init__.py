@@ -1,1 +1,1 @@
-"""Pictures on their way in: read, imported, judged, evened out, taken through their lens."""
+"""Pictures before matching: read, imported, assessed, evened out, undistorted."""

@@ -38,7 +38,7 @@ _ADVICE = {
 }
 _NAMED = 3
 _YEARS = range(1970, 2200)
-"""In which a digital camera can have taken a picture."""
+"""Years in which a digital camera can have taken a picture."""
 _GPS, _EXIF = 0x8825, 0x8769
 _DATE, _SUBSECOND, _OFFSET, _FOCAL_35 = 0x9003, 0x9291, 0x9011, 0xA405
 
@@ -53,7 +53,7 @@ class PictureFacts:
     highest: int = 255
     """Largest value of any pixel; above 255 in a picture of 16 bits."""
     time_local: datetime | None = None
-    """When it was taken; with a zone if the camera wrote one."""
+    """Local time at which it was taken; with a zone if the camera wrote one."""
     latitude_deg: float | None = None
     longitude_deg: float | None = None
     altitude_m: float | None = None
@@ -66,7 +66,7 @@ class PictureFolder:
 
     folder: Path
     pictures: tuple[Path, ...]
-    """In the order of the numbers in their names."""
+    """Pictures in the order of the numbers in their names."""
     masks: tuple[Path, ...]
     """`NAME_mask.png` next to the picture `NAME.*`."""
     left_out: Mapping[str, tuple[Path, ...]]

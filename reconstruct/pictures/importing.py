@@ -404,7 +404,7 @@ def _copy(task: tuple[Path, Path, int]) -> None:
 
 
 def _take_frames(video: Path, every_s: float, partial: Path, camera: str) -> list[_Incoming]:
-    """Write a frame every so many seconds as PNG."""
+    """Write a frame at a fixed interval in seconds as PNG."""
     capture = cv2.VideoCapture(str(video))
     if not capture.isOpened():
         raise ImageError(f"{video}: no video that can be read")

@@ -30,7 +30,7 @@ MOST_DARK = 0.5
 OUTLIER_SIGMAS = 4.0
 """Robust standard deviations from the survey's median from which a picture stands out ..."""
 OUTLIER_FACTOR = 1.6
-"""... if it is also worse by this factor: in an even survey small differences are no fault."""
+"""... if it is also worse by this factor: in an even survey small differences are not a fault."""
 
 _BLOCK_PX = 48
 _SMOOTHEST_PERCENT = 10
@@ -183,7 +183,7 @@ def _fine_gain() -> float:
 
 
 def judge(found: Sequence[PictureQuality]) -> list[PictureQuality]:
-    """Add the reasons: limits that hold for any picture, and what stands out of the survey.
+    """Add the reasons: limits for any picture, and what stands out of the survey.
 
     Medians are those of a picture's own camera: two cameras may have unlike lenses and lamps.
     """

@@ -109,7 +109,7 @@ def _where_invertible(lens: Lens, pixels: Array) -> Array:
 
 
 class Pictures:
-    """Pictures of a workspace without refraction and distortion, computed when asked for.
+    """Pictures of a workspace without refraction and distortion, computed on request.
 
     The warps of all cameras are kept (8 bytes a pixel each); pictures are not.
     """

@@ -1,4 +1,4 @@
-"""Control of a model: known points and lengths place and scale it, or show how right it is."""
+"""Control of a model: known points and lengths place and scale it, or show how accurate it is."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ class _Tie:
     spot: Spot
     ned: Array
     sigma: Array
-    """(3,) of `ned`."""
+    """(3,) sigma of `ned`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

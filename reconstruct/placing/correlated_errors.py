@@ -1,4 +1,4 @@
-"""Errors that last: a Markov process with exponential correlation, in linear time.
+"""Correlated errors: a Markov process with exponential correlation, in linear time.
 
 The error of a channel of navigation, over its stated sigma, is taken as
 `u = sqrt(1 - w) m + sqrt(w) n`: m a first-order Gauss-Markov process of unit variance that keeps
@@ -19,12 +19,12 @@ from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 
 LEAST_WHITE = 1e-4
-"""Share of white error that two readings at the same moment need to have any innovation."""
+"""Share of white error that two readings at the same time need to have any innovation."""
 
 
 @compiled
 def _kept(time: Array, sigma: Array, i: int, j: int, tau: float) -> float:
-    """Correlation of the lasting parts of two neighbours."""
+    """Correlation of the Markov parts of two neighbours."""
     lesser, greater = min(sigma[i], sigma[j]), max(sigma[i], sigma[j])
     kept: float = math.exp(-abs(time[j] - time[i]) / tau) * lesser / greater
     return kept
@@ -76,7 +76,7 @@ def whiten(
 def _predictions(
     time: Array, sigma: Array, used: NDArray[np.bool_], values: Array, tau: float, white: float
 ) -> tuple[Array, Array]:
-    """Mean and variance of the lasting part of each used value, given the used ones before it."""
+    """Mean and variance of the Markov part of each used value, given the used ones before it."""
     count = len(values)
     means, variances = np.zeros(count), np.ones(count)
     gain_in = math.sqrt(1.0 - white)
@@ -130,7 +130,7 @@ def surprise(
 def lasting_share(time: Array, tau: float, white: float) -> float:
     """Share of the variance that the plain mean over all times keeps beyond that of white error.
 
-    0 for white error, near 1 where one error lasts throughout. The times are taken as evenly
+    0 for white error, near 1 where one error is constant. The times are taken as evenly
     spread: twice the integral of `(1 - s) exp(-s T / tau)`.
     """
     ratio = float(time[-1] - time[0]) / tau

@@ -29,13 +29,13 @@ class PlaceCovariance:
     """How well a model's place is known: see `georeference.Fit`."""
 
     middle: Array
-    """(3,) in the world."""
+    """(3,) middle of the track in the world."""
     covariance: Array
-    """(7, 7) of rotation, shift of the middle, and logarithm of the scale."""
+    """(7, 7) covariance of rotation, shift of the middle, and logarithm of the scale."""
 
 
 def placed_covariances(poses: RigidTransform, place: PlaceCovariance) -> Array:
-    """What the place alone leaves unsure of poses, (N, 6, 6): the same errors for all of them."""
+    """Covariance of poses from the place alone, (N, 6, 6): the same errors for all of them."""
     away = poses.translation - place.middle
     jacobian = np.zeros((len(away), 6, 7))
     jacobian[:, :3, :3] = -cross_matrices(away)
@@ -54,7 +54,7 @@ def shape_covariances(
     found: Uncertainty,
     world_from_model: Similarity,
 ) -> Array:
-    """What the model's own shape leaves unsure of poses, (N, 6, 6); NaN where it does not say.
+    """Covariance of poses from the model's own shape, (N, 6, 6); NaN where it is unknown.
 
     Args:
         poses: (N,) of the pictures in the world.

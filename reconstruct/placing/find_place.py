@@ -35,7 +35,7 @@ RIG_SCALE_SIGMA = 1e-3
 """Relative, of a scale that a rig gives, where control may correct it: what calibrated rigs reach
 (600 ppm in the built-in demo; the baseline's own sigma leaves out the angle between cameras)."""
 LENGTH_SCALE_SIGMA = 1e-2
-"""The same for one length that a person measured."""
+"""Relative sigma of a scale from one length that a person measured."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

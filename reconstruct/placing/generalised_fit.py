@@ -1,11 +1,11 @@
-"""Generalised least squares for a model's place, with sigmas that count how long errors last.
+"""Generalised least squares for a model's place, with sigmas that account for correlated errors.
 
-Errors of navigation last: weights that take readings as independent state sigmas that are far too
-small. Here every group of channels (horizontal position, depth, tilt, heading) has the marginal
-sigma that navigation states, and a correlation time and white and constant shares that the misfit
-between navigation and the model gives, the model being stiff. They are found by restricted maximum
-likelihood (Patterson & Thompson 1971), which counts what the placement itself has absorbed, and
-the covariance of the placement is averaged over all that are likely.
+Errors of navigation are correlated: weights that take readings as independent give sigmas that are
+far too small. Here every group of channels (horizontal position, depth, tilt, heading) has the
+marginal sigma that navigation states, and a correlation time and white and constant shares that the
+misfit between navigation and the model gives, the model being stiff. They are found by restricted
+maximum likelihood (Patterson & Thompson 1971), which counts what the placement itself has absorbed,
+and the covariance of the placement is averaged over all that are likely.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,7 +30,7 @@ _CONSTANT = (0.0, 0.5, 0.75, 0.9)
 """The varying part's variance goes down by halves: what is not known of a variance is its size."""
 _TAUS = 10
 _SHORTEST_STEPS, _LONGEST_SPANS = 0.2, 30.0
-"""Correlation times looked at: from so many median time steps to so many lengths of the survey."""
+"""Correlation times tried: from this many median time steps to this many lengths of the survey."""
 _GROSS_SIGMAS = 5.0
 _SURPRISE_SIGMAS = 4.5
 """A reading this far from what all others say is left out."""
@@ -43,7 +43,7 @@ _CHI_SIGMAS = 3.0
 
 @dataclass(frozen=True, kw_only=True)
 class Lasting:
-    """How the errors of a group of channels last."""
+    """How the errors of a group of channels are correlated in time."""
 
     tau: float
     """Correlation time of the varying part, in the unit of the epochs' time."""
@@ -52,7 +52,7 @@ class Lasting:
     constant: float = 0.0
     """Share of all variance that one constant error has."""
     factor: float = 1.0
-    """By which the stated sigmas are too small."""
+    """Factor by which the stated sigmas are too small."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -70,14 +70,14 @@ NO_EXTRA = Extra(misfit=np.zeros(0), jacobian=np.zeros((0, PARAMETERS)))
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Estimate:
-    """What the equations say of the parameters' change, and how well."""
+    """The parameters' change that the equations give, with its covariance."""
 
     change: Array
     """(PARAMETERS,), zero for what is held."""
     covariance: Array
     """(PARAMETERS, PARAMETERS), zero for what is held."""
     lasting: Mapping[str, Lasting]
-    """By group, of those with readings."""
+    """Correlation by group, of those with readings."""
     used: NDArray[np.bool_]
     """(M, 6) readings that took part."""
 
@@ -92,10 +92,10 @@ def estimate(
     frame_bounds: Mapping[int, float],
     lasting: Mapping[str, Lasting] | None = None,
 ) -> Estimate:
-    """Solve for the parameters, the lasting of errors and the readings to leave out.
+    """Solve for the parameters, the correlation of errors and the readings to leave out.
 
     Args:
-        time: (M,) moments, not decreasing.
+        time: (M,) times, not decreasing.
         found: equations of navigation.
         used: (M, 6) readings that may take part.
         free: parameters to solve for; nuisances among them need an equation in `extra` or are
@@ -190,7 +190,7 @@ class _PlacementProblem:
         """Normal equations of one group.
 
         A constant error of variance c adds `c 1 1'` to the covariance matrix: its inverse is that
-        of the varying part less a product (Sherman & Morrison 1950).
+        of the varying part minus a product (Sherman & Morrison 1950).
         """
         key = (group, used.tobytes(), lasting.tau, lasting.white, lasting.constant)
         if key not in self.cache:
@@ -315,7 +315,7 @@ def _grid(time: Array) -> list[Lasting]:
 def _likeliest(
     problem: _PlacementProblem, used: NDArray[np.bool_], lasting: Mapping[str, Lasting]
 ) -> dict[str, Lasting]:
-    """The likeliest lasting of every group, one after the other, some times around."""
+    """The likeliest correlation of every group, one after the other, in several rounds."""
     now = {group: how for group, how in lasting.items() if used[:, _channels(group)].any()}
     grid = _grid(problem.time)
     for _ in range(_SWEEPS):
@@ -408,11 +408,11 @@ def _without_surprises(
 def _averaged(
     problem: _PlacementProblem, used: NDArray[np.bool_], lasting: Mapping[str, Lasting]
 ) -> tuple[Array, Array]:
-    """Parameters and covariance over all likely ways in which errors last, (P,) and (P, P).
+    """Parameters and covariance over all likely correlations of errors, (P,) and (P, P).
 
     The covariance is the mean of those of the single ways and the scatter of their solutions.
     """
-    rng = np.random.default_rng(0)  # which draws is of no consequence; the same bytes each time
+    rng = np.random.default_rng(0)  # any draws will do; the same bytes each time
     grid = _grid(problem.time)
     draws: dict[str, list[Lasting]] = {}
     for group, how in lasting.items():

@@ -41,12 +41,12 @@ _TRIMS = 5
 """Rounds of leaving out what stands off the mean plane."""
 _ROBUST_STEPS = 30
 _ROBUST_SIGMAS = 2.0
-"""Beyond so many sigmas the first placement lets a misfit pull no more than in proportion."""
+"""Sigmas beyond which the first placement lets a misfit pull only in proportion."""
 _STEPS = 6
 _SETTLED_SIGMAS = 0.01
 _LEAST_BOUND = 1e-9
 _STRETCH = 0.005
-"""Of positions reckoned from a Doppler log: makers and users say 0.1 to 1 % (as in
+"""Stretch of positions integrated from a Doppler log: makers and users say 0.1 to 1 % (as in
 `vehicle.navigation.sensors`)."""
 
 
@@ -58,7 +58,7 @@ class PlacementFit:
     used: int
     """Stations with a position that took part."""
     left_out: Mapping[str, int]
-    """By group of channels, readings that the rest contradicts."""
+    """For each group of channels, how many readings the rest contradicts."""
     rms_m: Array
     """(3,) north, east, down misses of the positions that took part, root mean square; NaN where
     none did."""
@@ -68,31 +68,31 @@ class PlacementFit:
     middle_ned: Array
     """(3,) middle of the camera track, about which the covariance's rotation and scale act."""
     covariance: Array
-    """(7, 7) of rotation about north, east, down (rad), shift north, east, down of the middle (m),
-    and the logarithm of the scale."""
+    """(7, 7) covariance of rotation about north, east, down (rad), shift north, east, down of the
+    middle (m), and the logarithm of the scale."""
     lasting: Mapping[str, Lasting]
-    """By group, how navigation's errors last."""
+    """For each group, how navigation's errors are correlated."""
     time_unit: str
     mount_sigma_deg: float
 
     @property
     def sigma_position_m(self) -> Array:
-        """(3,) of the middle of the track, north, east and down."""
+        """(3,) sigma of the middle of the track, north, east and down."""
         return np.asarray(np.sqrt(np.diag(self.covariance)[3:6]))
 
     @property
     def sigma_tilt_deg(self) -> Array:
-        """(2,) of rotation about north and about east."""
+        """(2,) sigma of rotation about north and about east."""
         return np.asarray(np.rad2deg(np.sqrt(np.diag(self.covariance)[:2])))
 
     @property
     def sigma_heading_deg(self) -> float:
-        """Of rotation about down."""
+        """Sigma of rotation about down."""
         return float(np.rad2deg(np.sqrt(self.covariance[2, 2])))
 
     @property
     def sigma_scale(self) -> float:
-        """Of the logarithm of the scale, 0 where it is held."""
+        """Sigma of the logarithm of the scale, 0 where it is held."""
         return float(np.sqrt(self.covariance[SCALE, SCALE]))
 
     def to_json(self) -> dict[str, Any]:
@@ -335,7 +335,7 @@ class _NavigationTask:
     def _frame_bounds(self) -> dict[int, float]:
         """How navigation's own frame may be turned and stretched within its positions' sigmas.
 
-        Positions that were reckoned along a wrong heading are turned as a whole by its error; to
+        Positions by dead reckoning on a wrong heading are turned as a whole by its error; to
         take their turn for a second, independent reading of the heading would count one error
         twice as if it were two. In the same way a log's velocities are all wrong by one factor.
         """
@@ -393,7 +393,7 @@ class _NavigationTask:
         return Extra(misfit=np.concatenate(misfits), jacobian=np.concatenate(rows))
 
     def _robust(self, place: Similarity, free: list[int]) -> Similarity:
-        """A placement that a few wrong readings hardly move: readings as independent, soft L1."""
+        """A placement robust to a few wrong readings: readings as independent, soft L1."""
         for _ in range(_ROBUST_STEPS):
             middle = self._middle(place)
             found, extra = equations(self.epochs, place, middle), self._extra(place, middle)

@@ -28,7 +28,7 @@ from reconstruct.placing.control_file import (
 from reconstruct.views.model import SparseModel, read_model
 
 MARKER_SIGMA_PX = 0.2
-"""Of a corner that the detector refined."""
+"""Sigma of a corner that the detector refined."""
 DICTIONARIES = (
     "DICT_4X4_50", "DICT_4X4_250", "DICT_5X5_100", "DICT_6X6_250", "DICT_7X7_100",
     "DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_16h5", "DICT_APRILTAG_25h9", "DICT_APRILTAG_36h11",
@@ -150,7 +150,7 @@ def _look(task: _MarkerTask) -> dict[str, list[Marker]]:
 def _best_dictionary(
     tried: Sequence[str], found: Sequence[dict[str, list[Marker]]]
 ) -> tuple[str, Counter[int]]:
-    """The dictionary with most sightings of markers that two pictures or more show."""
+    """The dictionary with most detections of markers that two pictures or more show."""
     views = {name: Counter(m.number for seen in found for m in seen[name]) for name in tried}
     sightings = {
         name: sum(n for n in counts.values() if n >= _LEAST_VIEWS) for name, counts in views.items()

@@ -1,4 +1,4 @@
-"""What navigation says of a model's place, as linear equations in the placement's parameters.
+"""What navigation gives for a model's place, as linear equations in the placement's parameters.
 
 A placement is `ned = scale * rotation * model + translation`. Its parameters here are small changes
 about a present one, in this order: rotation about north, east and down (radians), shift north, east
@@ -21,11 +21,11 @@ from reconstruct.placing.alignment import Similarity
 
 PARAMETERS = 12
 PLACE = 7
-"""The first so many are those of the placement, the rest nuisances."""
+"""Number of parameters of the placement; the rest are nuisances."""
 SCALE, TURN, STRETCH, MOUNT = 6, 7, 8, slice(9, 12)
 GROUPS = ("horizontal", "depth", "tilt", "heading")
 GROUP_OF = ("horizontal", "horizontal", "depth", "tilt", "tilt", "heading")
-"""Of the six channels: north, east, depth, roll, pitch, heading."""
+"""Groups of the six channels: north, east, depth, roll, pitch, heading."""
 _SIGMA_HORIZONTAL_M = 3.0
 _SIGMA_DEPTH_M = 3.0
 _SIGMA_ATTITUDE_DEG = 2.0
@@ -35,20 +35,20 @@ _SIGMA_HEADING_DEG = 5.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Epochs:
-    """Navigation at the stations of a model, by time: N pictures at M moments."""
+    """Navigation at the stations of a model, by time: N pictures at M times."""
 
     time: Array
     """(M,) seconds, or the station's number where a time is unknown."""
     timed: bool
     """Whether `time` is in seconds."""
     moment: NDArray[np.int64]
-    """(N,) which moment each picture belongs to."""
+    """(N,) which time each picture belongs to."""
     centres: Array
     """(N, 3) camera centres in the model."""
     model_from_body: Rotation
     """(N,) attitudes in the model."""
     levers: Array
-    """(N, 3) body origin less camera centre, in the body frame, metres."""
+    """(N, 3) body origin minus camera centre, in the body frame, metres."""
     measured_ned: Array
     """(N, 3) positions of the body's origin."""
     ned_from_body: Rotation
@@ -76,7 +76,7 @@ def read_epochs(
     body_from_cam: Mapping[str, RigidTransform],
     datum: Datum,
 ) -> Epochs | None:
-    """Collect what navigation says; None where it says no position.
+    """Collect what navigation measured; None where it has no position.
 
     Pictures of one station share one reading of navigation, which must not count twice.
     """
@@ -121,7 +121,7 @@ def read_epochs(
 def without_navigation(
     records: Sequence[ImageRecord], model_from_cam: Sequence[RigidTransform]
 ) -> Epochs:
-    """Epochs of a model of which navigation says nothing."""
+    """Epochs of a model without navigation."""
     stations = sorted({r.station for r in records})
     number = {station: k for k, station in enumerate(stations)}
     count, identity = len(records), Rotation.identity(len(records))
@@ -153,10 +153,10 @@ def _sigmas(rows: Sequence[ImageRecord]) -> Array:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class NavigationEquations:
-    """Six channels at M moments, linear about a placement: misfit + jacobian x change = error."""
+    """Six channels at M times, linear about a placement: misfit + jacobian x change = error."""
 
     misfit: Array
-    """(M, 6) model less navigation, over the stated sigma; NaN where nothing is known."""
+    """(M, 6) model minus navigation, over the stated sigma; NaN where nothing is known."""
     jacobian: Array
     """(M, 6, PARAMETERS) its slopes."""
     sigma: Array

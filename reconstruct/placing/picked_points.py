@@ -58,9 +58,9 @@ class Spot:
 
     name: str
     model: Array
-    """(3,) in the model."""
+    """(3,) place in the model."""
     covariance: Array
-    """(3, 3) by the picks; larger where they disagree."""
+    """(3, 3) covariance by the picks; larger where they disagree."""
     views: int
     left_out: tuple[str, ...]
     """Pictures whose picks are off the common point."""

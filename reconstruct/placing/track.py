@@ -40,13 +40,13 @@ class TrackRow:
     time_s: float
     """NaN when unknown."""
     world_from_cam: RigidTransform
-    """Of the entrance pupil."""
+    """Pose of the entrance pupil."""
     points: int
     """Observations of points of the model."""
     reprojection_px: float
     """Mean over those."""
     world_from_body: Rotation
-    """Attitude of the vehicle; of a nadir camera's bearer where no rig is known."""
+    """Attitude of the vehicle; of what carries a nadir camera where no rig is known."""
 
 
 def track_rows(
@@ -148,7 +148,7 @@ def write_track_geojson(
 ) -> None:
     """Write a point for every picture and a line through the stations, in RFC 7946.
 
-    Heights are those above the WGS 84 ellipsoid, as that format wants. Needs a datum.
+    Heights are those above the WGS 84 ellipsoid, as that format requires. Needs a datum.
     """
     if frame.datum is None:
         raise ValueError("a track without datum has no longitude and latitude")

@@ -31,9 +31,9 @@ from reconstruct.views.model import View, read_model, scaled_view
 _NUMBER = r"(-?\d+(?:\.\d+)?)"
 _PIXEL = re.compile(rf"(?:(?P<image>[^=]+?):)?{_NUMBER},{_NUMBER}")
 _TWO_PICTURES_SIGMA_PX = 0.5
-"""Of a spot picked in two pictures, where no sigma of picking is given."""
+"""Sigma of a spot picked in two pictures, where no sigma of picking is given."""
 _CELL_STEPS = 0.5
-"""Of a ray's march over the DEM, in cells."""
+"""Steps of a ray's march over the DEM, in cells."""
 
 
 @dataclass(frozen=True, kw_only=True)

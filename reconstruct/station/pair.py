@@ -40,7 +40,7 @@ from reconstruct.views.model import View, WorldFrame, scaled_view
 Float32 = NDArray[np.float32]
 
 AXES = ("right", "up", "back")
-"""Of clouds and meshes: of the left picture, the third towards the camera."""
+"""Axes of clouds and meshes: of the left picture, the third towards the camera."""
 _FEATURES = 6000
 _RATIO = 0.8
 _AGREE_SIGMAS = 3.0
@@ -59,15 +59,15 @@ class PairDepth:
 
     view: View
     depth: Float32
-    """Before the left pinhole's centre, metres; NaN where unknown."""
+    """Depth before the left pinhole's centre, metres; NaN where unknown."""
     sigma: Float32
-    """Of matching alone."""
+    """Sigma of matching alone."""
     colour: NDArray[np.uint8]
     """(H, W, 3) BGR, without refraction and distortion."""
     match_sigma_px: float
     """Standard deviation of a match, in pixels of the shrunk picture."""
     inflation: float
-    """By what the sigmas of precise matches of this pair are too small."""
+    """Factor by which the sigmas of precise matches of this pair are too small."""
 
 
 def reconstruct_pair(
@@ -85,12 +85,12 @@ def reconstruct_pair(
 
     Args:
         left: picture of the rig's first camera, as taken.
-        right: of its second, of the same moment.
+        right: picture of its second camera, taken at the same time.
         rig: `rig.json`.
         output: folder to write; what it held of an earlier pair is replaced.
         near_m: nearest distance along the axis; from the pair's own matches when None.
         far_m: farthest one.
-        scale: by which pictures are shrunk for matching; from their size when None.
+        scale: factor by which pictures are shrunk for matching; from their size when None.
         triangles: largest number of the mesh.
 
     Returns:

@@ -27,15 +27,15 @@ Sampler = Callable[[Array], Array]
 _HALF_PX = 7
 """A patch has this many pixels to either side of its middle."""
 _STEP_PX, _STEPS = 0.25, 5
-"""Of disparity between depths tried, and how many to either side."""
+"""Step of disparity between depths tried, and how many to either side."""
 _FITTED = 3
 """Brightness, contrast and depth."""
 _SLOPE_SIGMA_PX = 10.0
-"""Of the Gaussian that takes the slope of the surface from the depth map: wider than a patch, so
-that the noise of the map does not bend it."""
+"""Sigma of the Gaussian that takes the slope of the surface from the depth map: wider than a patch,
+so that the noise of the map does not bend it."""
 _SPLINE = 5
 _MOST_ROWS = 30_000
-"""Of `cv2.remap`, which takes at most 32767."""
+"""Most rows for `cv2.remap`, which takes at most 32767."""
 _LAG_PX = 1
 """Residuals farther apart are independent: the noise of a picture as taken is white, and the spline
 between its pixels joins neighbours only."""
@@ -52,11 +52,11 @@ class PreciseDepth:
     depth: Array
     """(N,) before the left pinhole's centre."""
     sigma: Array
-    """(N,) from the noise of the pictures alone."""
+    """(N,) sigma from the noise of the pictures alone."""
     sigma_px: Array
-    """(N,) the same in pixels of disparity."""
+    """(N,) the same sigma in pixels of disparity."""
     missed_sigmas: Array
-    """(N,) by how much the patches miss each other across the epipolar line; see `inflation`."""
+    """(N,) how far the patches miss each other across the epipolar line; see `inflation`."""
 
 
 def precise_depth(

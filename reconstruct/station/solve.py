@@ -22,7 +22,7 @@ _LEAST_POINTS = 50
 _LARGEST_GAP_PX = 2.0
 """Rays of a match pass each other by at most this many pixels."""
 _STEP_SIGMAS = 0.1
-"""Of a parameter's standard deviation, for slopes."""
+"""Share of a parameter's standard deviation, as the step for slopes."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -202,7 +202,7 @@ def self_calibrated_lens(camera: pycolmap.Camera) -> ColmapLens:
 
 
 _MOST_PX = 100_000
-"""On a side of a picture: beyond it is no size, but damage."""
+"""Most pixels on a side of a picture: a larger size is a sign of damage."""
 
 
 def lens_from_json(data: dict[str, Any]) -> Lens:

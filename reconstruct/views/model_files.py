@@ -1,6 +1,6 @@
 """COLMAP's binary files: looked at before COLMAP reads them, and read where it is slow.
 
-COLMAP takes the counts in these files for true: past the end of a file that was cut short it goes
+COLMAP trusts the counts in these files: past the end of a file that was cut short it goes
 on reading what is not there. The layout is that of COLMAP 4 (scene/reconstruction_io.cc).
 """
 
@@ -22,7 +22,7 @@ _PARAMS = {
 }  # fmt: skip
 """Numbers of parameters by COLMAP's number of a camera model."""
 KEYPOINT = np.dtype([("xy", "<f8", (2,)), ("point", "<i8")])
-"""Where it is, and the id of its point: -1 where it has none."""
+"""Place of a keypoint, and the id of its point: -1 where it has none."""
 _SENSOR, _POSE = struct.calcsize("<iI"), 7 * 8
 
 
@@ -134,4 +134,4 @@ _LENGTHS: dict[str, Callable[[bytes, int], int]] = {
     "rigs.bin": _rig,
     "frames.bin": _frame,
 }
-"""By file: bytes that the entry at a place takes."""
+"""For each file: bytes that the entry at a place takes."""

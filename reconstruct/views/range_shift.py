@@ -1,4 +1,4 @@
-"""What a warp to one pinhole leaves of a flat port's refraction, exact at every distance.
+"""The flat-port refraction that a warp to one pinhole leaves, exact at every distance.
 
 A flat port has no single centre: the ray of a pixel misses the pinhole's centre by an offset s in
 the plane of that centre, and runs straight through the water with slope t. At depth z before the
@@ -7,7 +7,7 @@ that is warped to be right at the working depth z0 therefore shows the spot
 
     ideal = warped + A(warped) (1/z - 1/z0),   A = f s,
 
-without any approximation: one field of vectors over the picture, in pixel metres, says all.
+without any approximation: one field of vectors over the picture, in pixel metres, describes it.
 """
 
 from dataclasses import dataclass, replace
@@ -23,8 +23,8 @@ from reconstruct.views.lens import FlatPortLens, Lens
 _COLUMNS = 129
 """Nodes along the picture's width; fewer along its height."""
 _ROUNDS = 5
-"""Of the fixed-point iteration to a warped pixel: each gains a factor of 10 at a quarter of the
-working depth, of 100 near it."""
+"""Rounds of the fixed-point iteration to a warped pixel: each gains a factor of 10 at a quarter of
+the working depth, of 100 near it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -67,7 +67,7 @@ class RangeShift:
 
     @property
     def arguments(self) -> tuple[NDArray[np.float64], float, float, float]:
-        """What kernels take of it; see `sight.KernelLens`."""
+        """The arguments of kernels; see `sight.KernelLens`."""
         return self.nodes, self.width_px, self.height_px, self.inverse_working
 
     def _shift(self, pixels: Array, depth: Array | float) -> Array:

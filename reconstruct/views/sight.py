@@ -1,6 +1,6 @@
 """Pixels of warped pictures and points before the camera, exact through a flat port, in kernels.
 
-A view's lens is what `lens_of` makes of it: four numbers of the pinhole, and the field with which
+A view's lens is what `lens_of` returns: four numbers of the pinhole, and the field with which
 the port shifts pixels as the depth departs from that of the warp (zeros without a port).
 """
 
@@ -19,12 +19,12 @@ KernelLens = tuple[Array, tuple[NDArray[np.float64], float, float, float]]
 
 
 _ROUNDS = 2
-"""Of the fixed-point iteration to a warped pixel. Each divides the miss by 10 at a quarter of the
-working depth and by 100 near it, so that of a shift of a pixel 0.01 and 0.0001 px remain."""
+"""Rounds of the fixed-point iteration to a warped pixel. Each divides the miss by 10 at a quarter
+of the working depth and by 100 near it, so that of a shift of a pixel 0.01 and 0.0001 px remain."""
 
 
 def lens_of(view: View) -> KernelLens:
-    """What the kernels below take of a view."""
+    """A view's arguments for the kernels below."""
     return pinhole_of(view), view.shift_arguments
 
 
@@ -55,7 +55,7 @@ def field_of(lens: KernelLens, x: float, y: float) -> tuple[float, float]:
 def slopes_of(depth: NDArray[np.float32], lens: KernelLens) -> NDArray[np.float32]:
     """Slopes x/z, y/z (H, W, 2) of the spots that a warped picture shows; NaN without depth.
 
-    Nodes are blended once a row, so that a pixel takes but one step along it.
+    Nodes are blended once a row, so that a pixel takes only one step along it.
 
     Args:
         depth: (H, W) of the view.

@@ -36,7 +36,7 @@ def test_fresh_water_is_that_of_iapws() -> None:
 
     assert 1e-6 < np.abs(miss).max() < 4e-5
     assert np.sqrt(np.mean(miss**2)) < 2e-5
-    # It is relative to air: beside indices relative to vacuum it is 2.8e-4 x 1.33 short.
+    # It is relative to air: compared with indices relative to vacuum it is 2.8e-4 x 1.33 short.
     assert (n_water(t, 0.0, 0.0, nm) - absolute).mean() == pytest.approx(-3.7e-4, abs=0.2e-4)
 
 

@@ -1,4 +1,4 @@
-"""Blocks of the kernels: a row's result is its own, whatever stands beside it."""
+"""Blocks of the kernels: a row's result is its own, whatever the other rows hold."""
 
 import math
 from dataclasses import replace

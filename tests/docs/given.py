@@ -35,7 +35,7 @@ class Run:
 
 
 class Made:
-    """What takes long to make, made once and only when it is asked for."""
+    """What takes long to make, made once and only on request."""
 
     def __init__(self, folder: Path) -> None:
         """Have a folder to make it in."""
@@ -77,7 +77,7 @@ class Made:
         """The folder that the commands of a page leave behind.
 
         Raises:
-            RuntimeError: they fail; the page's own test tells how.
+            RuntimeError: they fail; the page's own test shows how.
         """
         ran = self.run(page)
         if ran.returncode != 0:
@@ -183,7 +183,7 @@ def _own_pictures(folder: Path, made: Made) -> None:
 
 
 def _no_navigation(folder: Path, made: Made) -> None:
-    """The model that the page on real pictures made, without the length it was told."""
+    """The model that the page on real pictures made, without the length it was given."""
     shutil.copytree(made.after("real-pictures.md") / "dive", folder / "dive")
     (folder / "dive/scale.json").unlink()
     _few_features(folder)

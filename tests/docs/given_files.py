@@ -227,7 +227,7 @@ def film(reef: Path, path: Path, stations: Iterable[int]) -> None:
 
 
 def navigation(reef: Path, path: Path, *, dated: bool) -> None:
-    """Write the navigation of the flight at 4 Hz, with dates instead of seconds if asked."""
+    """Write the navigation of the flight at 4 Hz, with dates instead of seconds if requested."""
     rows = rows_of(reef / "flight/navigation.csv")[::5]
     with path.open("w", newline="") as file:
         names = list(rows[0])

@@ -1,4 +1,4 @@
-"""Make the tutorial's pictures anew, from a run of the tutorial's own commands.
+"""Make the tutorial's pictures again, from a run of the tutorial's own commands.
 
 `python -m tests.docs.renew` runs them first; `--folder F` takes a folder where they were run.
 """

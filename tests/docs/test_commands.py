@@ -1,4 +1,4 @@
-"""What the pages of `docs/` tell a reader to type works as it stands there."""
+"""The commands that the pages of `docs/` give work as written."""
 
 import shlex
 import sys
@@ -59,7 +59,7 @@ def test_commands_that_are_mentioned_exist(page: Path) -> None:
 
 def check_command(text: str) -> None:
     """Follow a command's words into groups, and look for its options."""
-    # Newer typers bring a click of their own, so that its classes cannot be asked for.
+    # Newer typers bring their own click, so that its classes cannot be tested for.
     found: Any = typer.main.get_command(app)
     options = {o for p in found.params for o in (*p.opts, *p.secondary_opts)} | {"-h", "--help"}
     for word in shlex.split(text)[1:]:

@@ -152,7 +152,7 @@ def dng(folder: Path) -> None:
 
 
 def read_picture(path: Path) -> object:
-    """As `import-images` does: looked at, decoded, and copied beside itself in memory."""
+    """As `import-images` does: looked at, decoded, and copied in memory."""
     from reconstruct.pictures.files import bits_used, exif_focal_px, inspect
 
     facts = inspect(path)

@@ -210,7 +210,7 @@ def _mutations(
 
 @contextlib.contextmanager
 def _instrumented() -> Iterator[None]:
-    """Modules of the project that are imported meanwhile tell which of their lines are run."""
+    """Modules of the project that are imported inside report which of their lines are run."""
     import atheris
 
     with atheris.instrument_imports(include=_PACKAGES, exclude=_compiled_modules()):

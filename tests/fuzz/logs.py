@@ -112,7 +112,7 @@ def _write(path: Path, rows: list[str]) -> None:
 
 
 def read_nav(path: Path) -> object:
-    """As `import-images --navigation`: read, and asked for other moments."""
+    """As `import-images --navigation`: read, and interpolated at other times."""
     from missions.logs.navigation_csv import read_navigation
 
     log = read_navigation(path, UTC)

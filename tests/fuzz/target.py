@@ -1,4 +1,4 @@
-"""A reader to be tried: the file that is spoilt, what lies beside it, and how it is read."""
+"""A reader to be fuzzed: the file that is damaged, what lies next to it, and how it is read."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,11 +13,11 @@ class Target:
 
     name: str
     syntax: Syntax
-    """How the file is spoilt."""
+    """How the file is damaged."""
     file: str
     """Path below the folder that `build` fills."""
     build: Callable[[Path], None]
-    """Writes a good file, and what its reader needs beside it."""
+    """Writes a good file, and what its reader needs next to it."""
     read: Callable[[Path], object]
     """Takes the path of the file."""
     examples: int = 20

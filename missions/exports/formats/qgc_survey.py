@@ -86,7 +86,7 @@ def _hull(corners_ne: Array) -> Array:
 
 
 def _camera_calc(export: Export) -> dict[str, Any]:
-    """The camera as QGroundControl reckons with it: a pinhole, so with its focal length in water.
+    """The camera as QGroundControl models it: a pinhole, so with its focal length in water.
 
     It is the focal length at which a pinhole in air sees what the real camera sees of the sea floor
     across the track through port and water.

@@ -32,7 +32,7 @@ def chromium() -> Iterator[Any]:
 
 @dataclass
 class Heard:
-    """What a page asked for and complained about, in its order."""
+    """What a page requested and complained about, in its order."""
 
     complaints: list[str] = field(default_factory=list)
     requests: list[str] = field(default_factory=list)

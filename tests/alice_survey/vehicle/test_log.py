@@ -1,4 +1,4 @@
-"""The vehicle log: what is written is read, what is wrong is told, and nothing is lost."""
+"""The vehicle log: what is written is read, what is wrong is reported, and nothing is lost."""
 
 from pathlib import Path
 

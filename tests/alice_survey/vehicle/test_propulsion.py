@@ -17,7 +17,7 @@ DENSITY, DISPLACED = 1025.0, 75.0
 ALICE = vehicle("alice")
 STARBOARD, PORT, VERTICAL, BOW, STERN = ALICE.thrusters
 EVERY = tuple(
-    # Arms that no source tells, so that their law is tested all the same.
+    # Arms that no source gives, so that their law is still tested.
     replace(t, jet_centre_m=0.3) if t.kind == "tunnel" else t
     for t in ALICE.thrusters
 )
@@ -56,7 +56,7 @@ def test_the_wrench_is_that_of_the_textbook(rps: Array, nu: Array) -> None:
 @pytest.mark.parametrize(
     ("thruster", "signs"),
     [
-        # Which way each pushes, and which way it turns the vehicle, told by hand: the starboard
+        # Which way each pushes, and which way it turns the vehicle, by hand: the starboard
         # propeller alone turns the bow to port; it turns left-handed, so that the hull rolls right.
         (STARBOARD, [1, 0, 0, 1, 0, -1]),
         (PORT, [1, 0, 0, -1, 0, 1]),

@@ -29,9 +29,9 @@ def ask(
     """Send a request whose path is not touched.
 
     Args:
-        server: to ask.
+        server: to send it to.
         path: as it goes over the wire.
-        headers: beside Host.
+        headers: besides Host.
         method: any word.
         host: the server's own if empty; None for no such header.
     """

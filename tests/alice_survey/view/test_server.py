@@ -29,7 +29,7 @@ MOSAIC = "/files/mosaic/mosaic.tif"
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A workspace, with a secret beside it, links to the secret, and files not to be shown."""
+    """A workspace, with a secret next to it, links to the secret, and files not to be shown."""
     around = tmp_path_factory.mktemp("around")
     (around / "secret.txt").write_bytes(SECRET)
     (around / "secrets").mkdir()

@@ -50,7 +50,7 @@ def render(cameras: dict[str, FlatPortCamera], range_m: float) -> np.ndarray:
 
 
 def misregistration_px(picture: np.ndarray, channel: int, size: int = 96) -> np.ndarray:
-    """Where patches of a channel lie beside green: (patches, 2), by least squares."""
+    """Shift of a channel's patches against green: (patches, 2), by least squares."""
     green = picture[..., 1].astype(np.float64)
     other = picture[..., channel].astype(np.float64)
     rows, columns = green.shape

@@ -59,7 +59,7 @@ def test_errors_reach_the_cramer_rao_bound_and_match_their_sigmas(known: Intrins
     """25 stereo views, 0.1 px, unknown ports; first values are those of the design.
 
     The bounds are the goals over 200 trials, and nearer ones; without the luck of the draws (see
-    `benchmarks.camera_calibration`) 60 trials tell each figure to 1.5 %, so that no seed decides.
+    `benchmarks.camera_calibration`) 60 trials give each figure to 1.5 %, so that no seed decides.
     """
     mode = run_mode(known, range(TRIALS))
 

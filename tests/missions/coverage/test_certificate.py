@@ -174,7 +174,7 @@ def test_an_endless_pattern_is_seen_as_often_as_it_promises(
     step_m, spacing_m = along_m * (1 - forward), across_m * (1 - side)
     asked = sure_pattern(RIG, altitude_m, spacing_m, step_m)
     if 2 * asked.half_across_m < spacing_m or 2 * asked.half_along_m < step_m:
-        return  # gaps are asked for
+        return  # gaps are requested
     north_m, east_m = 2 * along_m, 2 * across_m
     lines = lawnmower(north_m, east_m, spacing_m, step_m, over_m=2 * across_m)
     stations = stations_of_lines(lines, altitude_m).moved(shift * step_m, shift * spacing_m)

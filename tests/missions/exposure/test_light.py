@@ -30,7 +30,7 @@ CLEAR = WaterOptics(absorption_per_m=np.zeros(3), scattering_per_m=np.zeros(3))
 @pytest.mark.parametrize("jerlov", ["I", "II", "3C", "7C"])
 @pytest.mark.parametrize("altitude_m", [1.5, 2.0, 3.0])
 def test_the_budget_agrees_with_a_rendered_flat_floor(jerlov: str, altitude_m: float) -> None:
-    """The simulator's even spectrum and soft cone; its veil taken off, which is told apart."""
+    """The simulator has an even spectrum and a soft cone here; its veil is computed separately."""
     rig, config = survey(water={"jerlov": jerlov})
     camera, optics = rig.cameras["left"], water_optics(config.water.jerlov)
     light = camera_light(
@@ -117,7 +117,7 @@ def test_the_budget_scales_as_light_does() -> None:
     assert longer.median_e == pytest.approx(2 * base.median_e)
     assert brighter.median_e == pytest.approx(4 * base.median_e)
     assert base.gain_db - longer.gain_db == pytest.approx(20 * math.log10(2))
-    # The aperture and the exposure that are told do fill half the well.
+    # The aperture and the exposure that are stated do fill half the well.
     half = config.camera.model_copy(update={"f_number": base.half_full_f_number})
     filled = light_budget(rig, half, config.imaging, optics, 2.0, 2e-3)
     assert filled.full_share == pytest.approx(0.5)

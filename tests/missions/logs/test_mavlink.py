@@ -208,7 +208,7 @@ def test_a_damaged_packet_costs_itself_alone(version: int, chunk_bytes: int) -> 
         read, lost = found(bytes(log), chunk_bytes)
         times = [int.from_bytes(p.payload[:4], "little") for _, p in read if p.whole]
         assert sorted(times) == sorted(good)
-        # Damage in the number makes another message of it, which is told by its length alone.
+        # Damage in the number makes another message of it, which only its length shows.
         others = [p.number for _, p in read if p.whole is None]
         assert lost.total() == (0 if others else 1) or lost == {NOISE: len(records[2])}
         assert bool(others) == (place - 8 in ((5,) if version == 1 else (7, 8, 9)))

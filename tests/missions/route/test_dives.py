@@ -26,7 +26,7 @@ COSTS = time_costs(0.2)
 
 
 def _lines(count: int, length_m: float = 12.0, spacing_m: float = 1.0) -> list[Line]:
-    """To and fro along east, one beside the other."""
+    """To and fro along east, one next to the other."""
     lines = []
     for i in range(count):
         ends = [(i * spacing_m, 0.0), (i * spacing_m, length_m)][:: 1 if i % 2 == 0 else -1]

@@ -48,7 +48,7 @@ def test_lines_take_the_power_that_the_plan_counts_on() -> None:
         steady_w = float(power_w[rows[len(rows) // 3 :]].mean())
         planned_w = power_at(costs.line_w, line.heading_rad) - CONFIG.vehicle.hotel_w
         across = abs(np.sin(line.heading_rad)) < 0.1
-        # Held by sway it is 9.8 W; along the current 1.2 to 4.1 W, and corrections show beside it.
+        # Held by sway it is 9.8 W; along the current 1.2 to 4.1 W, and corrections show next to it.
         assert planned_w > 9.0 if across else planned_w < 5.0
         assert -0.03 * planned_w < steady_w - planned_w < 0.03 * planned_w + 0.6
 

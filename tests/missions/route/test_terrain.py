@@ -143,7 +143,7 @@ def test_before_a_cliff_the_glass_climbs_at_the_steepest_slope() -> None:
 
 @pytest.mark.parametrize(("rough_m", "off_m"), [(0.02, 0.01), (0.4, 0.3)])
 def test_the_highest_floor_is_found_by_looking_everywhere(rough_m: float, off_m: float) -> None:
-    """Two places a cell may pass beside a peak, by less than the floor changes in half a cell."""
+    """Two places a cell may pass next to a peak, by less than the floor changes in half a cell."""
     rng = np.random.default_rng(7)
     floor = _floor(12.0 - 0.1 * _eastings() + rng.normal(0.0, rough_m, (160, 160)))
     places, headings = rng.uniform(-10, 10, (6, 2)), rng.uniform(0, 6.28, 6)

@@ -81,7 +81,7 @@ def test_a_plane_behind_refutes_and_one_before_says_nothing():
 
 
 def test_witnesses_through_a_tilted_port_equal_their_slow_twin():
-    """Depth of the other is so noisy that which of its pixels is asked decides the answer."""
+    """Depth of the other is so noisy that the pixel chosen there decides the answer."""
     one, other = port_view([0, 0, 0], [1.0, -2.0, 30.0]), port_view([0.2, 0.1, 0], [-1, 1, 28])
     depth = plane_depth(one, 1.2)
     rng = np.random.default_rng(8)

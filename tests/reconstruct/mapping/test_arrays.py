@@ -1,4 +1,4 @@
-"""A model's observations as arrays, against the model asked one by one."""
+"""A model's observations as arrays, against the model's own, one by one."""
 
 from pathlib import Path
 

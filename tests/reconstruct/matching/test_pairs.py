@@ -165,7 +165,7 @@ def test_every_direction_keeps_a_partner() -> None:
     overlaps = {(0, j): 0.9 - 0.8 * float(np.hypot(*centres[j])) for j in range(1, 31)}
     overlaps[0, 31] = 0.35
     chosen = well_conditioned(overlaps, centres, np.zeros(32))
-    # what the others choose among one partner is kept as well, hence only picture 0 is asked
+    # what the others choose among one partner is kept as well, hence only picture 0 is checked
     assert (0, 31) in chosen
     assert max(overlaps, key=overlaps.__getitem__) in chosen
 

@@ -1,4 +1,4 @@
-"""Alignment recovers what was applied, and no scale where none is asked for."""
+"""Alignment recovers what was applied, and no scale where none is requested."""
 
 import numpy as np
 import pytest

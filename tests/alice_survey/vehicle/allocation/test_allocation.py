@@ -49,14 +49,14 @@ def solve(
 
 
 def miss_n(matrix: Array, thrust: Array, wanted: Array) -> float:
-    """Weighted, over the axes that are asked for."""
+    """Weighted, over the axes that are requested."""
     return float(np.linalg.norm(AXIS_WEIGHTS * (matrix @ thrust - wanted)))
 
 
 @pytest.mark.parametrize("craft", [ALICE, SPARUS], ids=lambda craft: craft.name)
 @pytest.mark.parametrize("solver", [allocate_exact, allocate_rpi])
 def test_a_wrench_turns_the_vehicle_the_way_it_says(craft: Vehicle, solver: object) -> None:
-    """A positive yaw turns the bow to starboard, and likewise along the others."""
+    """A positive yaw turns the bow to starboard; the other axes are alike."""
     lower, upper = limits_of(craft)
     axes = [SURGE, HEAVE, YAW] if craft is SPARUS else [SURGE, SWAY, HEAVE, YAW]
     asked = np.where(np.isin(range(6), axes), AXIS_WEIGHTS, 0.0)

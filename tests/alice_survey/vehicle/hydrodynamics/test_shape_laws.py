@@ -127,7 +127,7 @@ def test_body_lift_is_the_papers() -> None:
 
 def test_lift_behind_the_origin_turns_the_bow_back_into_the_flow() -> None:
     """Drifting to starboard going ahead (u, v > 0), water pushes the stern to port: N > 0, the bow
-    to starboard, where the vehicle goes. In heave M < 0 puts the bow down, likewise."""
+    to starboard, where the vehicle goes. In heave M < 0 puts the bow down in the same way."""
     x = lift.centre_of_pressure(1.06, 1.96)
     assert x == pytest.approx(-0.214, abs=1e-3)
     y_uv, z_uw, m_uw, n_uv = lift.body_lift(1.96, 0.23, 1.06, RHO)

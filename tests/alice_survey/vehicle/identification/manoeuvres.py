@@ -1,4 +1,4 @@
-"""Logs of ALICE on manoeuvres rich enough to tell its coefficients, with the noise of sensors."""
+"""Logs of ALICE on manoeuvres rich enough to identify its coefficients, with sensor noise."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ class Noise:
 
 
 def survey_like(time_s: float) -> Array:
-    """Speeds asked of the thrusters, rev/s: surge steps, zigzags, sway, heave and all at once."""
+    """Requested thruster speeds, rev/s: surge steps, zigzags, sway, heave and all at once."""
     t = time_s % 120.0
     zig = 1.0 if (t // 6.0) % 2 == 0 else -1.0
     sway = (0.0, 30.0, -35.0, 20.0)[int(t // 7.0) % 4]
@@ -59,8 +59,8 @@ def fly(
         truth: what flies.
         duration_s: how long.
         current: m/s towards north and east.
-        asked: time to speeds, rev/s.
-        push: gives the force and moment, (6,), that the log does not tell of, for each row.
+        asked: requested speeds by time, rev/s.
+        push: gives the force and moment, (6,), that the log does not show, for each row.
         attitude_rad: to begin with.
     """
     count = len(truth.thrusters)
@@ -94,7 +94,7 @@ def fly(
 
 
 def measured(log: VehicleLog, rng: np.random.Generator, noise: Noise | None = None) -> VehicleLog:
-    """The log as sensors would tell it."""
+    """The log as sensors would measure it."""
     sigma, rows = noise or Noise(), len(log.time_s)
     turns = Rotation.from_rotvec(rng.normal(0, sigma.attitude_rad, (rows, 3)))
     velocity = log.velocity_body + rng.normal(0, sigma.velocity_mps, (rows, 3))

@@ -1,4 +1,4 @@
-"""A real BlueROV2 in a tank: frames and step of its logs, and each run foretold from the others."""
+"""A real BlueROV2 in a tank: frames and step of its logs, each run predicted from the others."""
 
 from pathlib import Path
 
@@ -43,7 +43,7 @@ def test_frames_and_step_of_the_runs_are_as_mapped(runs: list[VehicleLog]) -> No
             assert np.corrcoef(between[:, axis], moved[:, axis])[0, 1] > 0.85
         turned = (rotation[:-1].inv() * rotation[1:]).as_rotvec()
         rates = 0.5 * (run.rates_body[1:] + run.rates_body[:-1])
-        # The step that the turns tell: their spread over that of the rates.
+        # The step that the turns show: their spread over that of the rates.
         step_s = np.sqrt(np.sum(turned**2) / np.sum(rates**2))
         assert step_s == pytest.approx(0.1, rel=0.08)
 

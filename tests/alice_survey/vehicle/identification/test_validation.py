@@ -1,4 +1,4 @@
-"""How well a model foretells a log."""
+"""How well a model predicts a log."""
 
 import numpy as np
 import pytest

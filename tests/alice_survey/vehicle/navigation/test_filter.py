@@ -1,4 +1,4 @@
-"""The filter: beside its dense twin, and against closed forms."""
+"""The filter against its dense twin and against closed forms."""
 
 from collections.abc import Callable
 from dataclasses import replace

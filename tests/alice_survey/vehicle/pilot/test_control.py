@@ -25,7 +25,7 @@ def test_wrench_is_that_of_the_matrices(name: str, demand: Array) -> None:
     pilot.demand[:8] = demand
     control.write_wrench(gains, pilot, wrench)
     np.testing.assert_allclose(wrench, oracle.wrench(gains, demand), atol=1e-9)
-    # Roll and pitch are not asked for, nor sway where nothing gives it.
+    # Roll and pitch are not requested, nor sway where nothing gives it.
     assert wrench[3] == wrench[4] == 0.0
     assert name == "alice" or wrench[1] == 0.0
 

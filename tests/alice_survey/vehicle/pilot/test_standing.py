@@ -1,4 +1,4 @@
-"""Stops: references that can be followed, one tick beside its twin, and closed loops."""
+"""Stops: references that can be followed, one tick against its twin, and closed loops."""
 
 import math
 
