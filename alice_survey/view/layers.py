@@ -45,7 +45,7 @@ _DAMAGES = (RasterioError, IndexError)
 NAMES = (_MOSAIC, *(numbers.name for numbers in number_rasters("m")))
 """Names of layers, in the order in which a page shows them."""
 PATHS = (MOSAIC_FILE, *(numbers.file for numbers in number_rasters("m")))
-"""Folders of their rasters."""
+"""Files of their rasters."""
 
 
 class ChangedError(Exception):

@@ -27,7 +27,7 @@ _ESCAPE = re.compile(r"%(?![0-9A-Fa-f]{2})")
 _NOT_THERE = {
     errno.ENOENT, errno.ENOTDIR, errno.ELOOP, errno.EACCES, errno.ENXIO, errno.ENAMETOOLONG,
 }  # fmt: skip
-"""Reasons, for a reader, also for a link, a socket and unreadable files."""
+"""Errors that count as missing for a reader: also a link, a socket and unreadable files."""
 _UNFINISHED = (".partial", ".replaced")
 
 
@@ -43,7 +43,7 @@ class OpenedFile:
     size: int
     modified_ns: int
     token: str
-    """Names this content: another file, or the same file changed, has another."""
+    """Token of this content: another file, or the same file changed, has another."""
 
     @property
     def path(self) -> str:

@@ -46,7 +46,7 @@ _FARTHEST_OFF = 0.2
 _WEAKEST = 0.15
 """Contrast of a corner over the middle one of the picture."""
 _SECOND_LOOK = 0.5
-"""Factors of smaller windows for points that did not fit."""
+"""Factor of the smaller window for points that did not fit."""
 SMALL_PX, LARGE_PX = 1000, 2000
 """Longest sides of the reduced pictures given to the detectors."""
 _DARK, _FLAT = 8, 4
