@@ -74,7 +74,7 @@ def steady_flight(
         vehicle: the vehicle.
         nu: (N, 6) velocity relative to the water, in the body.
         nu_rate: (N, 6) its rate of change, as when the vehicle turns in a current; 0 if not given.
-        share: of each thruster's greatest speed squared that may be used.
+        share: share of each thruster's greatest speed squared that may be used.
         slips: leave out what no thruster can balance, instead of giving NaN: a vehicle without sway
             that turns is pushed sideways, and goes.
     """

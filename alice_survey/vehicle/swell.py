@@ -60,9 +60,9 @@ def with_swell(
     Args:
         current: without waves.
         height_m: trough to crest.
-        period_s: of the waves.
+        period_s: period of the waves.
         towards_deg: where they travel.
-        depth_m: of the sea floor.
+        depth_m: depth of the sea floor.
         duration_s: how long the waves last.
 
     Raises:

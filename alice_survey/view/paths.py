@@ -51,7 +51,7 @@ class OpenedFile:
         return f"/proc/self/fd/{self.descriptor}"
 
     def is_unchanged(self) -> bool:
-        """Whether nobody wrote to it since it was opened."""
+        """Whether it is unchanged since it was opened."""
         return _token(os.fstat(self.descriptor)) == self.token
 
     def close(self) -> None:
@@ -170,7 +170,7 @@ class Workspace:
         """Token of the state of all finished stages and of some files; any change gives another.
 
         Args:
-            paths: of the files.
+            paths: paths of the files.
         """
         tokens = []
         for path in (*(f"{name}/{STAGE_FILE}" for name in PRODUCTS), *paths):

@@ -70,7 +70,7 @@ class Detection:
     """Number of points seen but not used, by reason."""
 
     def rejections(self, view: str, camera: str) -> tuple[Rejection, ...]:
-        """What took no part, for a calibration's report."""
+        """Points left out, for a calibration's report."""
         if self.refused is not None:
             return (Rejection(view=view, camera=camera, points=0, reason=self.refused),)
         return tuple(

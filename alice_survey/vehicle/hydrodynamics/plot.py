@@ -38,7 +38,7 @@ def draw_coefficients(path: Path, geometry: Geometry, rows: Sequence[Coefficient
 
     Args:
         path: PNG, PDF or SVG.
-        geometry: of a vehicle that is known by name.
+        geometry: geometry of a vehicle that is known by name.
         rows: rows of the comparison.
 
     Raises:

@@ -126,7 +126,7 @@ def fit_output_error(
         simulation: steps and inputs.
         channel_sigma: (9,) noise of velocity over ground, m/s, rates, rad/s, and attitude, rad;
             estimated from the residuals when not given.
-        most_evaluations: of all windows, in each round.
+        most_evaluations: most evaluations of all windows, in each round.
 
     Raises:
         VehicleError: the simulation does not stay finite at the start, the fit does not settle, or

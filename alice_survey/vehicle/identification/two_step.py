@@ -77,7 +77,7 @@ def calibrate(windows: Sequence[Window], parameters: Parameters) -> TwoStep:
     """Calibrate coefficients in turn.
 
     Args:
-        windows: of manoeuvres, with velocities and rates.
+        windows: windows of manoeuvres, with velocities and rates.
         parameters: coefficients to free.
 
     Raises:

@@ -96,8 +96,8 @@ def validate(
     """Compare simulations with windows of a log.
 
     Args:
-        windows: of the log.
-        parameters: of the model.
+        windows: windows of the log.
+        parameters: parameters of the model.
         values: (P,) theirs.
         simulation: steps and inputs.
         horizons_s: times after which forecasts are judged; those longer than a window are left out.

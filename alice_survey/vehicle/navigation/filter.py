@@ -3,9 +3,8 @@
 After J. Sola, Quaternion kinematics for the error-state Kalman filter, 2017, with the attitude's
 error in NED (his global one: truth = exp(error) belief), and measurements as increments of angle
 and velocity, so that prediction is exact but for noise and the course of velocity in a tick. The
-covariance is (25, 25); `state` says what lies where, and `prediction` carries
-it over a tick. Errors of the instruments that do not average out are states, else it would promise
-too much.
+covariance is (25, 25); `state` defines the layout, and `prediction` propagates it over a tick.
+Errors of the instruments that do not average out are states, else it would be too optimistic.
 
 Four choices keep the covariance honest over hours:
 - The attitude's error is in NED, where heading is one number, and is not reset (see `correct`): no
@@ -13,8 +12,8 @@ Four choices keep the covariance honest over hours:
 - The velocity is kept in the body frame. Were it in NED, a ping after a long drop-out would tie it
   to a heading it does not measure, and the next, about another velocity, would count as knowledge.
 - It is kept as the DVL measures it, with the DVL's scale error in it: a ping's row then holds no
-  believed velocity, whose error is in the innovation too. The scale acts where position grows. What
-  it does to accelerations, a part in 500 of them, is process noise.
+  estimated velocity, whose error is in the innovation too. The scale acts where position grows.
+  Its effect on accelerations, a part in 500 of them, is process noise.
 - The scale is considered, not estimated (the Schmidt-Kalman filter; R. G. Brown and P. Y. C. Hwang,
   Introduction to Random Signals and Applied Kalman Filtering): noisy increments as regressors pull
   a factor towards 0, and over half an hour that drove it off by four of its sigmas.
@@ -102,7 +101,7 @@ def absorb(nav: NavigationState, innovation: float, variance: float) -> None:
 
 @kernel
 def remaining(nav: NavigationState, innovation: float) -> float:
-    """An innovation about the belief, minus what this tick's corrections already account for."""
+    """An innovation about the estimate, minus what this tick's corrections already account for."""
     h, error = nav.scratch[ROW], nav.scratch[CORRECTION]
     for j in range(ERROR):
         innovation -= h[j] * error[j]
@@ -127,8 +126,8 @@ def weigh(
         sensors: for the gate.
         instrument: row of `counts`.
         place: in `innovations`.
-        innovation: measured minus believed.
-        noise_variance: of the measurement.
+        innovation: measured minus estimated.
+        noise_variance: noise variance of the measurement.
         doubted: where the errors begin that are widened after too many rejections in a row.
         doubted_count: how many.
 
@@ -314,9 +313,9 @@ def use_fix(
         nav: the filter.
         sensors: the instruments.
         instrument: row of `counts`.
-        place: of the antenna or transponder in `sensors.place`.
-        reading: of north; east follows.
-        noise_variance: of each.
+        place: place of the antenna or transponder in `sensors.place`.
+        reading: reading of north; east follows.
+        noise_variance: noise variance of each.
         bias: where the errors of the fix's bias begin; -1 of none.
 
     Returns:

@@ -43,7 +43,7 @@ takes so long."""
 
 @kernel
 def predict(dt_s: float, sensors: Sensors, nav: NavigationState) -> None:
-    """Move belief and covariance on by the IMU's increments in `readings`.
+    """Propagate estimate and covariance by the IMU's increments in `readings`.
 
     With the velocity v in the body frame, the turn R, the increments a of angle and d of velocity,
     s = v + d + R^T g dt is the new velocity in the old frame; v' = exp(-a) s, R' = R exp(a), and

@@ -48,7 +48,7 @@ class ImuSpec:
     """Reaches the stability in run after an hour (inferred)."""
     accelerometer_noise_mps_per_sqrt_s: float = 60e-6 * GRAVITY
     accelerometer_bias_sigma_mps2: float = GRAVITY * math.radians(0.2)
-    """What the accuracy of roll and pitch at rest amounts to (inferred)."""
+    """Equivalent of the accuracy of roll and pitch at rest (inferred)."""
     accelerometer_bias_walk_mps2_per_sqrt_s: float = 15e-6 * GRAVITY / 60.0
     tilt_sigma_rad: float = math.radians(0.2)
     """Sigma of roll and of pitch at the start."""

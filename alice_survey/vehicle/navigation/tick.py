@@ -89,7 +89,7 @@ LOG_ROW = len(LOG_COLUMNS)
 LOG_SIGMA, LOG_RANGE, LOG_USED, LOG_REJECTED, LOG_CLEARANCE = 13, 20, 24, 30, 36
 """Offsets of sigmas, ranges, counts and clearance in a row."""
 _LEAST_SPREAD = 0.01
-"""Of the ends of the beams, by their greatest: a quarter for a square, 0.19 for three corners."""
+"""Least spread of the beams' ends, over their greatest: 1/4 for a square, 0.19 for 3 corners."""
 
 
 @kernel
@@ -169,7 +169,7 @@ def navigation_tick(
 
 @kernel
 def _use_usbl(nav: NavigationState, suite: Sensors) -> bool:
-    """Weigh the fix of the transponder, as uncertain as its believed distance makes it."""
+    """Weigh the fix of the transponder, with the sigma of its estimated distance."""
     north = lever_row(nav, suite, USBL, 0)
     east = lever_row(nav, suite, USBL, 1)
     sigma = usbl_sigma(suite, north, east, lever_row(nav, suite, USBL, 2))
@@ -209,7 +209,7 @@ def _hear_floor(time_s: float, used: int, nav: NavigationState, suite: Sensors) 
     """Altitude of the followed point and clearance of the hull from a ping: a plane by the beams.
 
     The beams meet the sea floor about the DVL; the followed point is elsewhere. A plane is fitted
-    (least squares) to where they end by the believed attitude, and read below the point. How far
+    (least squares) to their ends by the estimated attitude, and read below the point. How far
     relief departs from a plane is not seen by one ping, whose four ends leave a single degree of
     freedom: the ends' deviation from their mean slope of the last seconds shows it.
     A beam whose velocity was an outlier did not measure the sea floor. Fewer than three

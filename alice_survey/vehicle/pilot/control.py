@@ -39,7 +39,7 @@ def place_demand(
     v (paper, eq. los_sway_control, of the error of the vehicle and with de/dt for its dv/dt).
 
     Args:
-        gains: of all axes.
+        gains: gains of all axes.
         axis: row of gains.
         error: wanted place less place.
         speed: measured.
@@ -62,7 +62,7 @@ def place_sum_step(gains: Gains, axis: int, error: float, full: float, dt_s: flo
     """Increment of k_I times the integral of a place error in a tick; 0 while the force is cut.
 
     Args:
-        gains: of all axes.
+        gains: gains of all axes.
         axis: row of gains.
         error: wanted place less place.
         full: +1 or -1 where the force is cut at its greatest or least, else 0.
@@ -89,7 +89,7 @@ def speed_demand(
     """A PI on speed whose proportional part sees a share of the wanted speed (gains.py).
 
     Args:
-        gains: of all axes.
+        gains: gains of all axes.
         axis: row of gains.
         wanted: speed.
         speed: measured.

@@ -186,7 +186,7 @@ def lateral_pair(body: Body, speed_mps: float) -> tuple[Array, Array]:
     """Sway and yaw rate under way: (v, r)' = A (v, r) + b moment.
 
     Args:
-        body: of the vehicle.
+        body: body of the vehicle.
         speed_mps: surge; without drift or turning.
 
     Returns:
@@ -207,9 +207,9 @@ def heading_loop(body: Body, speed_mps: float, row: Array) -> Array:
     thrusters give.
 
     Args:
-        body: of the vehicle.
+        body: body of the vehicle.
         speed_mps: surge.
-        row: of yaw in `Gains.axes`.
+        row: row of yaw in `Gains.axes`.
 
     Returns:
         (5, 5)
@@ -242,10 +242,10 @@ def _damped_together(
     """Rate and place gains of yaw by the rule above, and the least damping ratio that they give.
 
     Args:
-        body: of the vehicle.
-        speed_mps: of the survey.
+        body: body of the vehicle.
+        speed_mps: speed of the survey.
         bare: (2,) gains of the axis by itself.
-        lag_s: of the thrusters.
+        lag_s: lag of the thrusters.
         omega: natural frequency placed for the axis by itself.
         most_decay: greatest d / m.
         sampled_rad_s: bound on the frequency of a pair of poles.

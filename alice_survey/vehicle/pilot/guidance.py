@@ -89,7 +89,7 @@ def steer(
         estimate: (14,) of the navigation, see estimate_vector.py.
         path: to follow.
         guidance: settings.
-        gains: of the inner loops.
+        gains: gains of the inner loops.
         pilot: memory and report, written.
         wrench: (6,) N and N m, is written: forces and moments commanded of the thrusters.
     """

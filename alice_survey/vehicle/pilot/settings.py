@@ -42,7 +42,7 @@ _RAMP_PERIODS = 2.0
 """A reference gains its speed in this many times 1 / bandwidth of the loop that follows it: a
 critically damped pair has then done most of what it does (inferred)."""
 SWAY_LOOK_AHEAD_M = 2.5 * CONTROL_LENGTH_M
-"""Of `sway`, which goes by it only when far off its path, where none is damped well: the longest
+"""Look-ahead of `sway`, used only far off its path, where none is damped well: the longest
 that Fossen (2011, section 10.3.2) gives."""
 
 
@@ -105,7 +105,7 @@ def pilot_guidance(
     cost less than pushing the hull sideways, and takes over again at half of that (inferred).
 
     Args:
-        gains: of the vehicle.
+        gains: gains of the vehicle.
         path: its speed and altitude count.
         controller: `sway` or `los`.
         most_depth_m: no deeper than this.
@@ -184,7 +184,7 @@ def stop_speeds(
     While it turns about the followed point, the origin sways at the rate times the lever.
 
     Args:
-        gains: of the vehicle.
+        gains: gains of the vehicle.
         lever_m: how far the followed point is ahead of the origin.
         by_sway: whether sway is controlled.
         spot_rad_s: rate that is wanted.
@@ -210,8 +210,8 @@ def turning_speed_mps(gains: Gains, curvature_per_m: float, lever_m: float) -> f
     sways outwards by curvature times speed times the lever.
 
     Args:
-        gains: of the vehicle.
-        curvature_per_m: of the path, not negative.
+        gains: gains of the vehicle.
+        curvature_per_m: curvature of the path, not negative.
         lever_m: how far the followed point is ahead of the origin; 0 where sway is not controlled.
 
     Returns:
@@ -232,10 +232,10 @@ def los_loop(gains: Gains, speed_mps: float, lever_m: float, look_ahead_m: float
     acceleration that the lagging thrusters give. Sway and yaw are those of the hull, coupled.
 
     Args:
-        gains: of the vehicle.
+        gains: gains of the vehicle.
         speed_mps: surge.
         lever_m: how far the followed point is ahead of the origin.
-        look_ahead_m: of the guidance.
+        look_ahead_m: look-ahead of the guidance.
 
     Returns:
         (5, 5)
@@ -287,7 +287,7 @@ def shortest_look_ahead_m(gains: Gains, speed_mps: float, lever_m: float) -> flo
     section 10.3.2) gives 1.5 to 2.5 lengths; COLA2's 5.5 m is too long for lines 1 m apart.
 
     Args:
-        gains: of the vehicle.
+        gains: gains of the vehicle.
         speed_mps: surge.
         lever_m: how far the followed point is ahead of the origin.
 

@@ -227,7 +227,7 @@ def stand(
         estimate: (14,) of the navigation.
         path: legs.
         guidance: settings.
-        gains: of the inner loops.
+        gains: gains of the inner loops.
         pilot: is written.
 
     Returns:

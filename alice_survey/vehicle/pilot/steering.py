@@ -131,7 +131,7 @@ def head_for(
         quicken: the rate of that.
         estimate: (13,)
         dt_s: the tick.
-        gains: of the inner loops.
+        gains: gains of the inner loops.
         pilot: is written.
 
     Returns:
