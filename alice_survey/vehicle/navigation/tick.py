@@ -89,7 +89,8 @@ LOG_ROW = len(LOG_COLUMNS)
 LOG_SIGMA, LOG_RANGE, LOG_USED, LOG_REJECTED, LOG_CLEARANCE = 13, 20, 24, 30, 36
 """Offsets of sigmas, ranges, counts and clearance in a row."""
 _LEAST_SPREAD = 0.01
-"""Least spread of the beams' ends, over their greatest: 1/4 for a square, 0.19 for 3 corners."""
+"""Least determinant of the scatter of the ends over its squared trace: 1/4 for a square, 0.19 for
+three corners."""
 
 
 @kernel
