@@ -115,7 +115,7 @@ def phase_per_sr(cosine: Array, asymmetry: float = ASYMMETRY) -> Array:
     """Henyey-Greenstein phase function: share of the scattered light per steradian.
 
     Args:
-        cosine: of the angle by which light is turned (1 is forward).
+        cosine: cosine of the angle by which light is turned (1 is forward).
         asymmetry: mean cosine.
     """
     g = asymmetry

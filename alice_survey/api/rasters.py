@@ -66,7 +66,7 @@ class Dem(_Raster):
 
         Args:
             east: in the raster's coordinates.
-            north: of the same shape.
+            north: array of the same shape.
         """
         rows, columns = self._shape()
         row = np.floor((self.north - np.asarray(north, dtype=float)) / self.cell).astype(int)

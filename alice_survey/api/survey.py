@@ -76,7 +76,7 @@ class Survey:
             Results by stage, as in its summary.
 
         Raises:
-            AliceError: a stage cannot be done; the message says what to change.
+            AliceError: a stage cannot be done; the message states what to change.
         """
         from alice_survey.base.executor import local_executor
         from alice_survey.stages import names
@@ -110,7 +110,7 @@ class Survey:
 
     @property
     def track(self) -> Track:
-        """Where each picture was taken from, with covariances."""
+        """Positions of the pictures, with covariances."""
         return read_track(self.folder)
 
     @property

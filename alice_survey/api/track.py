@@ -14,7 +14,7 @@ from reconstruct.views.model import WorldFrame, read_frame
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Track:
-    """Where each registered picture was taken from, and how well that is known.
+    """Positions of the registered pictures, with their covariances.
 
     Example:
         >>> import alice_survey as alice
@@ -28,7 +28,7 @@ class Track:
     world_from_cam: RigidTransform
     """(N,) poses of the entrance pupils, RDF camera to the model's frame."""
     frame: WorldFrame
-    """What the coordinates mean: `ned` in metres, or the model's own."""
+    """Frame of the coordinates: `ned` in metres, or the model's own."""
     covariance: Array | None
     """(N, 6, 6) of position in the frame (metres) and of a small turn about its axes (radians);
     None where it was not estimated."""

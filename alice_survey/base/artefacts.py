@@ -192,7 +192,7 @@ def _measured(partial: Path, work: Callable[[Path], None]) -> Spent:
 
 
 def why_stale(workspace: Path, stage: Stage) -> str | None:
-    """What has changed since a stage was made, in a few words; None while it is up to date.
+    """Changes since a stage was made, in a few words; None while it is up to date.
 
     Raises:
         WorkspaceError: an input does not exist.

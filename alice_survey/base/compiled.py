@@ -88,7 +88,7 @@ def note_compiling(kernel: Any, what: str) -> None:
 
 
 def _readable(load: Callable[[], dict[Any, str]]) -> Callable[[], dict[Any, str]]:
-    """How an index of compiled kernels is read: as empty where its types cannot be found.
+    """Reader of an index of compiled kernels: empty where its types cannot be found.
 
     It holds the classes of the arguments by their names, which an older version may have had.
     """

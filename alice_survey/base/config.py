@@ -37,7 +37,7 @@ class Config(BaseModel):
 
 
 class AreaConfig(Config):
-    """Where to survey and where the vehicle may be.
+    """The area to survey and the limits of the vehicle's movement.
 
     The shape to survey is one of: a rectangle at the datum, a polygon, a corridor, well-known text,
     or a file. The datum is the origin of the local North-East-Down frame, on the sea surface; of a
@@ -173,7 +173,7 @@ class WaterConfig(Config):
 
 
 class PlanConfig(Config):
-    """How densely the sea floor is imaged."""
+    """Settings of the plan: altitude, speed, overlap, lines and turns."""
 
     altitude_m: float = Field(2.0, ge=0.3, le=10)
     speed_mps: float = Field(0.2, gt=0, le=3)
@@ -279,7 +279,7 @@ class SeafloorConfig(Config):
 
 
 class ImagingConfig(Config):
-    """How pictures are taken and rendered."""
+    """Settings of taking and rendering pictures."""
 
     scale: int = Field(1, ge=1, le=16)
     image_format: Literal["png", "jpg"] = "png"
@@ -293,7 +293,7 @@ class ImagingConfig(Config):
 
 
 class ReconstructConfig(Config):
-    """How pictures become a model."""
+    """Settings of the reconstruction."""
 
     feature_scale: float | None = Field(None, gt=0.05, le=1)
     max_features: int = Field(8000, ge=200, le=50_000)

@@ -46,7 +46,7 @@ def n_water(
     warning, to about 1e-4; inside, it is good to 4e-5.
 
     Args:
-        temperature_c: of the water, -2 to 35.
+        temperature_c: temperature of the water, -2 to 35.
         salinity_psu: 0 (fresh) to 43.
         depth_m: below the surface, 0 to 11,000.
         wavelength_nm: in air, 380 to 750.

@@ -67,7 +67,7 @@ def read_columns(path: Path, required: Sequence[str]) -> dict[str, Array]:
     """Read the required columns of a CSV file as finite numbers.
 
     Raises:
-        NavigationError: the file is missing, lacks a column, or holds a value that is no finite
+        NavigationError: the file is missing, lacks a column, or holds a value that is not a finite
             number (the message gives its line).
     """
     try:

@@ -233,7 +233,7 @@ def target(
     """Print a calibration target.
 
     A chessboard (inner corners, square), a ChArUco board (squares, square, marker) or a grid of
-    AprilTags (tags, tag, gap over tag) at true scale, and beside it its JSON file.
+    AprilTags (tags, tag, gap over tag) at true scale, with its JSON file next to it.
     """
     from camera_calib.targets.sheet import print_target
 
@@ -352,7 +352,7 @@ def demo(
 
 @app.command(epilog=examples("status -w reef", "status -w reef --json"))
 def status(workspace: Workspace = WORK, survey: SurveyFile = None, as_json: AsJson = False) -> None:
-    """Say what a workspace holds.
+    """Show what a workspace holds.
 
     What is there, what is stale, and what the next command is.
     """

@@ -29,7 +29,7 @@ def report(
     """Write the report of a survey.
 
     One page that needs no network, and the same as PDF: what was mapped, how well, what to do
-    next; map, mesh, errors, calibration, settings. It tells what the workspace holds so far.
+    next; map, mesh, errors, calibration, settings. It shows what the workspace holds so far.
     """
     from alice_survey.survey import run
 

@@ -24,7 +24,7 @@ def session(
     """Within this block a command does its work.
 
     Args:
-        arguments: of the command line, without the program's name.
+        arguments: arguments of the command line, without the program's name.
         quiet: show warnings and errors alone.
         log_file: to add lines to.
         events: file to add events to.

@@ -152,9 +152,9 @@ def save_figure(sheet: Any, path: Path, dpi: float = _DPI, **options: Any) -> No
 
     Args:
         sheet: the figure.
-        path: of the file.
+        path: path of the file.
         dpi: pixels per inch, of what is drawn as pixels.
-        options: of matplotlib's `savefig`.
+        options: options of matplotlib's `savefig`.
 
     Raises:
         ConfigError: the name has another ending, or the file cannot be written.
@@ -208,7 +208,7 @@ def colour_bar(image: Any, axes: Any, label: str, **options: Any) -> Any:
         image: an image, a contour or a collection.
         axes: one or several that share it.
         label: quantity and unit.
-        options: of matplotlib's `colorbar`.
+        options: options of matplotlib's `colorbar`.
     """
     first = np.ravel(axes)[0]
     bar = first.figure.colorbar(image, ax=axes, **{"shrink": 0.85, "pad": 0.02} | options)
@@ -234,7 +234,7 @@ def scale_bar(axes: Any, unit: str = "m", share: float = 0.25) -> None:
 
     Args:
         axes: with one unit on both axes, and their limits set.
-        unit: of the axes.
+        unit: unit of the axes.
         share: most of the axes' width that it may take.
     """
     low, high = sorted(axes.get_xlim())
@@ -287,7 +287,7 @@ def even_limit(values: Array, percent: float = 97.0) -> float:
 
     Args:
         values: any shape.
-        percent: of the known values that are within it.
+        percent: percent of the known values that are within it.
     """
     known = np.abs(values[np.isfinite(values)])
     return max(float(np.percentile(known, percent)), 1e-9) if len(known) else 1.0

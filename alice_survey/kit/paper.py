@@ -31,7 +31,7 @@ def render_pdf(report: Report, date: datetime) -> bytes:
 
     Args:
         report: its content; links to files and interactive parts are left out.
-        date: of the document.
+        date: date of the document.
 
     Returns:
         The PDF, tagged for screen readers.

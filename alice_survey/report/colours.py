@@ -59,7 +59,7 @@ def number_rasters(unit: str) -> tuple[Numbers, ...]:
     """The rasters of numbers that a workspace may hold.
 
     Args:
-        unit: of its lengths.
+        unit: unit of its lengths.
     """
     small, label = (1e3, "mm") if unit == "m" else (1.0, unit)
     return (

@@ -16,11 +16,11 @@ _SEED_STREAM = 3400
 
 FOCAL_TOLERANCE = 0.003
 CENTRE_TOLERANCE_PX = 10.0
-"""Error at full resolution."""
+"""Largest error at full resolution."""
 PORT_TOLERANCE_M = 0.001
 TURN_TOLERANCE_RAD = np.deg2rad(0.3)
 TILT_TOLERANCE = float(np.sin(np.deg2rad(0.3)))
-"""Error of a port's normal, about each axis."""
+"""Largest error of a port's normal, about each axis."""
 BASELINE_TOLERANCE_M = 0.0002
 
 

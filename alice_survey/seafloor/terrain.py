@@ -368,7 +368,7 @@ def survey_terrain(
         within_ne_m: (N, 2) corners of the area the vehicle may be in, as in `plan.json`.
         margin_m: around that area: the altitude of the pictures.
         depth_m: mean depth.
-        seed: of the survey.
+        seed: seed of the survey.
     """
     return build_terrain(
         seafloor,

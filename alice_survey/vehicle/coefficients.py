@@ -1,4 +1,4 @@
-"""Hydrodynamic coefficients by their SNAME names, and the matrices they stand for.
+"""Hydrodynamic coefficients by their SNAME names, and their matrices.
 
 A name is the force or moment, an underscore, and what it is the derivative by: `Y_vdot` (added
 mass), `Y_v` (linear damping), `Y_vv` (of v |v|), `Y_uv` (body lift). Values are as in SNAME:
@@ -27,7 +27,7 @@ class Coefficients:
 
     name: str
     values: Mapping[str, float]
-    """SNAME name to value; what is not named is zero, but for the mirror of an added mass."""
+    """SNAME name to value; others are zero, except for the mirror of an added mass."""
 
     def __post_init__(self) -> None:
         for name, value in self.values.items():
@@ -91,7 +91,7 @@ class Coefficients:
 
 
 def _kind(name: str) -> str | None:
-    """`dot`, `linear`, `quadratic`, `lift`, or None of what is no name."""
+    """`dot`, `linear`, `quadratic`, `lift`, or None if it is not a name."""
     if name in LIFTS:
         return "lift"
     if len(name) < 3 or name[0] not in FORCES or name[1] != "_" or name[2] not in MOTIONS:
@@ -100,7 +100,7 @@ def _kind(name: str) -> str | None:
 
 
 def _mirror(name: str) -> str:
-    """Of an added mass the name with force and motion exchanged; other names as they are."""
+    """Name of an added mass with force and motion exchanged; other names unchanged."""
     if _kind(name) != "dot":
         return name
     force, motion = FORCES.index(name[0]), MOTIONS.index(name[2])

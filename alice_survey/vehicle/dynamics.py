@@ -30,7 +30,7 @@ class Body(NamedTuple):
     in_current: Array
     """(6, 6) what holds the body back in a current. Columns 0 to 2: of M_RB, by the acceleration
     that the vehicle needs to keep up with a current which changes along its way. Columns 3 to 5:
-    the same less the water that is displaced, by the current's acceleration in time, whose pressure
+    the same minus the displaced water, by the current's acceleration in time, whose pressure
     pushes the body as it would that water. Nothing but the low weight is left of these three in a
     neutral vehicle."""
     linear: Array
@@ -40,24 +40,24 @@ class Body(NamedTuple):
     lift: Array
     """(4,) Y_uv, Z_uw, M_uw, N_uv."""
     weight_n: float
-    """In air, without the water inside."""
+    """Weight in air, without the water inside."""
     buoyancy_n: float
     cg: Array
-    """(3,) of the weight, from the centre of buoyancy."""
+    """(3,) lever of the weight, from the centre of buoyancy."""
 
 
 class Plant(NamedTuple):
-    """All that moves: body and thrusters."""
+    """All moving parts: body and thrusters."""
 
     body: Body
     propulsion: Propulsion
 
 
 class Scratch(NamedTuple):
-    """Room for intermediate results, so that a step allocates nothing."""
+    """Work arrays for intermediate results, so that a step allocates nothing."""
 
     stages: Array
-    """(5, N) of the Runge-Kutta step."""
+    """(5, N) stages of the Runge-Kutta step."""
     force: Array
     """(6,)"""
     water: Array
@@ -65,7 +65,7 @@ class Scratch(NamedTuple):
 
 
 def scratch_for(thrusters: int) -> Scratch:
-    """Room for a vehicle with so many thrusters."""
+    """Work arrays for a vehicle with a number of thrusters."""
     return Scratch(np.zeros((5, STATE + thrusters)), np.zeros(6), np.zeros(6))
 
 
@@ -77,7 +77,7 @@ def initial_state(
     Args:
         position_ned: (3,) metres.
         attitude_rad: (3,) roll, pitch, heading.
-        thrusters: how many.
+        thrusters: number of thrusters.
         nu: (6,) velocity relative to the water; at rest if not given.
     """
     from alice_survey.base.frames import rotation_from_attitude
@@ -93,7 +93,7 @@ def initial_state(
 def coriolis_matrix(mass: Array, nu: Array) -> Array:
     """C(nu), (6, 6), of an inertia matrix by Kirchhoff's equations; skew to the last bit.
 
-    It holds for M_RB and M_A alike (Fossen 2011, theorem 3.2).
+    It applies to both M_RB and M_A (Fossen 2011, theorem 3.2).
     """
     linear, angular = mass[:3] @ nu, mass[3:] @ nu
     result = np.zeros((6, 6))
@@ -165,11 +165,11 @@ def derivative(
     Args:
         time_s: for the current.
         state: (13 + n,)
-        command_rps: (n,) speeds asked of the thrusters.
+        command_rps: (n,) commanded speeds of the thrusters.
         load: (6,) other forces and moments on the body, in its frame.
         plant: the vehicle.
         current: the water.
-        scratch: room.
+        scratch: work arrays.
         out: (13 + n,) is written.
     """
     body = plant.body

@@ -29,7 +29,7 @@ _THRUSTER_DEFAULTS: Mapping[str, Any] = {
     "kq_reverse": 0.0, "handedness": 1, "most_rps": 1e3, "dead_band_rps": 0.0,
     "time_constant_s": 0.1,
 }  # fmt: skip
-"""What a thruster is where a file does not say: its thrusts are given, its speeds mean nothing."""
+"""Defaults of a thruster in a file: its thrusts are given, its speeds have no meaning."""
 _NEEDED_FOR_SPEEDS = ("diameter_m", "kt_forward", "kt_reverse", "time_constant_s")
 
 
@@ -37,7 +37,7 @@ def vehicle_from(name_or_file: str) -> Vehicle:
     """A vehicle known by name, or described by a TOML or JSON file.
 
     Raises:
-        VehicleError: neither is known, or the file describes no vehicle.
+        VehicleError: neither is known, or the file does not describe a vehicle.
     """
     path = Path(name_or_file)
     if path.suffix.lower() not in (".toml", ".json"):
@@ -78,7 +78,7 @@ def vehicle_from_file(path: Path) -> Vehicle:
 
 
 def speeds_missing(path: Path) -> list[str]:
-    """Thrusters of a vehicle file that do not say what their speeds mean, in words."""
+    """Thrusters of a vehicle file that do not define what their speeds mean, in words."""
     lacking = []
     for thruster in _read(path).get("thrusters", []):
         missing = [field for field in _NEEDED_FOR_SPEEDS if field not in thruster]
@@ -88,7 +88,7 @@ def speeds_missing(path: Path) -> list[str]:
 
 
 def write_coefficients(path: Path, coefficients: Coefficients, details: Mapping[str, Any]) -> None:
-    """Write a set of coefficients with what else is known of them."""
+    """Write a set of coefficients with their metadata."""
     data = {
         "format": COEFFICIENTS_FORMAT,
         "name": coefficients.name,

@@ -1,4 +1,4 @@
-"""The vehicles that are known by name: ALICE and the SPARUS II it was built from.
+"""The vehicles known by name: ALICE and the SPARUS II it was built from.
 
 Sources as in `hydrodynamics.geometry`: "model" is the public model of SPARUS II in Stonefish,
 "Toulon" the model of the same vehicle in the MIR course there (Parameters.m).
@@ -23,7 +23,7 @@ from alice_survey.vehicle.propulsion import Thruster
 from alice_survey.vehicle.vehicle import RigidBody, Vehicle
 
 DENSITY = 1025.0
-"""Of sea water, kg/m^3; the paper's tables hold for it."""
+"""Density of sea water, kg/m^3, for which the paper's tables apply."""
 GEOMETRIES = {"alice": ALICE, "sparus2": SPARUS2}
 PAPER_SETS = {"estimated": ESTIMATED, "cfd": CFD, "calibrated": CALIBRATED}
 SETS = (*PAPER_SETS, "computed")
@@ -43,7 +43,7 @@ _EFFICIENCY = 0.55
 by the k_q above is 216 W on the shaft. Inferred for SPARUS II's own thrusters, of which no power is
 published."""
 _WAKE, _DEDUCTION = 0.19, 0.17
-"""Of the twin screws, by J. Holtrop and G. G. J. Mennen, Int. Shipbuilding Progress 29, 1982:
+"""w and t of the twin screws, by J. Holtrop and G. G. J. Mennen, Int. Shipb. Progress 29, 1982:
 w = 0.3095 C_B + 10 C_V C_B - 0.23 D / sqrt(B T) and t = 0.325 C_B - 0.1885 D / sqrt(B T), with
 C_B 0.72 (75 L in 1.96 x 0.23 x 0.23 m), C_V 0.006 (ITTC-57 and form factor 1.07 at 0.25 m/s) and
 D 0.08 m. Inferred: it is a regression over ships; Burcher and Rydill's values for submarines,
@@ -141,7 +141,7 @@ def vehicle(name: str, coefficients: str = "calibrated") -> Vehicle:
     """A vehicle by its name, `alice` or `sparus2`, with a named set of coefficients.
 
     Args:
-        name: of the vehicle.
+        name: name of the vehicle.
         coefficients: `estimated`, `cfd` or `calibrated`, the paper's; or `computed` from its shape.
 
     Raises:

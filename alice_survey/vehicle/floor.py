@@ -10,19 +10,19 @@ from alice_survey.vehicle.compiled import kernel
 
 
 class FloorGrid(NamedTuple):
-    """Depths at the nodes of a regular grid; beyond its edges the floor goes on level."""
+    """Depths at the nodes of a regular grid; beyond its edges the floor continues level."""
 
     north_m: float
-    """Of the first row."""
+    """North of the first row."""
     east_m: float
-    """Of the first column."""
+    """East of the first column."""
     spacing_m: float
     depth_m: Array
     """(N, E)."""
 
 
 def level_floor(depth_m: float) -> FloorGrid:
-    """A level sea floor without end."""
+    """A level sea floor of infinite extent."""
     return FloorGrid(0.0, 0.0, 1.0, np.full((2, 2), depth_m))
 
 

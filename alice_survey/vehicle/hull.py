@@ -1,4 +1,4 @@
-"""How far a vehicle's hull reaches from its origin, for keeping it off sea floor and zones."""
+"""Extent of a vehicle's hull from its origin, for keeping it off sea floor and zones."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,16 +19,16 @@ class Hull:
     """Points in the plane of symmetry, from the nose along the keel to the tail, between which the
     lower side of the hull runs straight or inside."""
     half_breadth_m: float
-    """To the outer edge of what is on either side."""
+    """Half width to the outer edge of attachments on either side."""
 
     @property
     def nose_m(self) -> float:
-        """How far it reaches ahead."""
+        """Extent ahead of the origin."""
         return max(point[0] for point in self.profile_body_m)
 
     @property
     def tail_m(self) -> float:
-        """How far it reaches astern."""
+        """Extent astern of the origin."""
         return -min(point[0] for point in self.profile_body_m)
 
     @cached_property
@@ -38,4 +38,4 @@ class Hull:
 
 
 POINT = Hull(profile_body_m=((0.0, 0.0, 0.0),), half_breadth_m=0.0)
-"""Of a vehicle whose shape is not given."""
+"""Hull of a vehicle whose shape is not given."""

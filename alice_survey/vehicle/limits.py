@@ -1,4 +1,4 @@
-"""How fast a vehicle turns and steps aside when it stops: for planner, exports and pilot alike."""
+"""Limits of turns on the spot and sway steps: shared by planner, exports and pilot."""
 
 import math
 

@@ -1,7 +1,7 @@
-"""The vehicle log, one CSV: how a vehicle moved and what its thrusters did.
+"""The vehicle log, one CSV: motion of a vehicle and its thrusters.
 
 docs/vehicle-logs.md describes each column. Every field but the time may be missing, in whole or in
-single rows: NaN is what was not measured.
+single rows: NaN means not measured.
 """
 
 import csv
@@ -30,9 +30,9 @@ ALTITUDE = "altitude_m"
 WRENCH = ("X_n", "Y_n", "Z_n", "K_nm", "M_nm", "N_nm")
 _KNOWN = (TIME, *POSITION, *ANGLES, *QUATERNION, *VELOCITY, *RATES, ALTITUDE, *WRENCH)
 _UNIT = 0.05
-"""How far from 1 a quaternion's length may be: more is no rounding of a written attitude."""
+"""Tolerance of a quaternion's length: more is not rounding of a written attitude."""
 _GAP_STEPS = 10
-"""A gap is longer than so many usual steps, where none is given."""
+"""A gap is longer than this many median steps, where none is given."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -40,19 +40,19 @@ class VehicleLog:
     """Motion and input of a vehicle at times."""
 
     source: str
-    """Where it comes from, for messages."""
+    """Source, for messages."""
     time_s: Array
     """(T,) strictly increasing."""
     position_ned: Array
-    """(T, 3) of the body's origin, metres."""
+    """(T, 3) position of the body's origin, metres."""
     quaternion_xyzw: Array
-    """(T, 4) of ned_from_body, of unit length."""
+    """(T, 4) quaternions of ned_from_body, of unit length."""
     velocity_body: Array
-    """(T, 3) over ground, m/s."""
+    """(T, 3) velocity over ground, m/s."""
     rates_body: Array
-    """(T, 3) rad/s."""
+    """(T, 3) body rates, rad/s."""
     altitude_m: Array
-    """(T,) above the sea floor."""
+    """(T,) height above the sea floor."""
     rpm: Mapping[str, Array]
     """By thruster: (T,) speed in revolutions per minute, positive pushes along its direction."""
     thrust_n: Mapping[str, Array]
@@ -149,14 +149,14 @@ def write_vehicle_log(path: Path, log: VehicleLog) -> None:
 
 
 def read_vehicle_log(path: Path) -> VehicleLog:
-    """Read a log; warns of what it had to mend or leave out.
+    """Read a log; warn of values that were fixed or left out.
 
-    Rows of one time are merged: a later value stands where both rows hold one.
+    Rows of one time are merged: the later value is kept where both rows have one.
 
     Raises:
         VehicleError: the file cannot be read, has no rows or no time column, holds a value that is
-            no number, a time that is missing or goes back, an attitude given twice or in part, a
-            quaternion that is none.
+            not a number, a time that is missing or goes back, an attitude given twice or in part,
+            or an invalid quaternion.
     """
     return log_of_columns(read_number_columns(path), str(path))
 
@@ -196,7 +196,7 @@ def segments(log: VehicleLog, gap_s: float | None = None) -> list[slice]:
 
     Args:
         log: any.
-        gap_s: the longest step that is no gap; 10 of the log's median step when not given.
+        gap_s: the longest step that is not a gap; 10 median steps when not given.
     """
     steps = np.diff(log.time_s)
     if not len(steps):
@@ -210,7 +210,7 @@ def read_number_columns(path: Path) -> dict[str, Array]:
     """Read a CSV file of numbers; empty fields and `nan` are NaN, columns of text are left out.
 
     Raises:
-        VehicleError: the file cannot be read, is no table, has no rows, or a column of numbers
+        VehicleError: the file cannot be read, is not a table, has no rows, or a column of numbers
             holds something else in a line.
     """
     try:
@@ -249,7 +249,7 @@ def read_number_columns(path: Path) -> dict[str, Array]:
 
 
 def _value(text: str) -> float | None:
-    """A number, NaN of an empty field, None of what is neither."""
+    """A number, NaN for an empty field, None for anything else."""
     stripped = text.strip()
     if not stripped:
         return math.nan

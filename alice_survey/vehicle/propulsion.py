@@ -1,4 +1,4 @@
-"""Thrusters: thrust, torque, lag, what the hull and the flow take from them, and their power.
+"""Thrusters: thrust, torque, lag, losses by hull and flow, and power.
 
 A thruster's state is its rotational speed n in revolutions per second, signed: positive pushes the
 vehicle along the thruster's direction. One law holds for all of them, in all four quadrants:
@@ -38,10 +38,10 @@ from alice_survey.vehicle.compiled import kernel
 
 @dataclass(frozen=True, kw_only=True)
 class Thruster:
-    """One thruster and how it sits on the hull.
+    """One thruster and its mounting on the hull.
 
     Raises:
-        VehicleError: a number makes no physical sense.
+        VehicleError: a number is not physical.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Thruster:
     """Unit vector along which positive thrust pushes the vehicle."""
     diameter_m: float
     kt_forward: float
-    """k_t at rest in the water, at positive speed; likewise the three below."""
+    """k_t at rest in the water, at positive speed; the three below in the same way."""
     kt_reverse: float
     kq_forward: float
     kq_reverse: float
@@ -163,12 +163,12 @@ COLUMNS = 27
 _STILL_RPS = 1e-9
 """A propeller slower than this stands; its lag would lead it through the smallest numbers."""
 _REFERENCE_SHARE = 0.03
-"""Of the greatest bollard thrust: the jet against which surge is measured in DISTRUST. ALICE's
+"""Share of the bollard thrust: the jet against which surge is measured in DISTRUST. ALICE's
 laterals give 1.5 N of 49 N each to hold it against 0.1 m/s across (Y_vv 322, 3.2 N)."""
 
 
 class Propulsion(NamedTuple):
-    """Thrusters as compiled code sees them.
+    """Thrusters for compiled code.
 
     One array, since each costs a kernel 56 bytes.
     """
@@ -205,7 +205,7 @@ def pack(thrusters: Sequence[Thruster], density: float, displaced_kg: float) -> 
 
 
 def weakened(propulsion: Propulsion, health: Array) -> Propulsion:
-    """The same thrusters with less speed left to each.
+    """The same thrusters with less speed left in each.
 
     Args:
         propulsion: n thrusters.
@@ -286,7 +286,7 @@ def add_thrust(propulsion: Propulsion, rps: Array, nu: Array, force: Array) -> N
 
 @kernel
 def add_speed_rates(propulsion: Propulsion, rps: Array, command_rps: Array, out: Array) -> None:
-    """Write the rate of change, (n,), of thruster speeds: a first-order lag to what is asked."""
+    """Write the rate of change, (n,), of thruster speeds: a first-order lag to the command."""
     t = propulsion.table
     for i in range(t.shape[0]):
         asked = command_rps[i]
@@ -346,7 +346,7 @@ def _lambert_w(z: float) -> float:
 def speeds_for(propulsion: Propulsion, thrust: Array, nu: Array, command_rps: Array) -> None:
     """Write the speeds, (n,) rev/s, that give thrusts (n,) N at a velocity: `add_thrust` undone.
 
-    The propeller turns the way it is to push, and stands still where no thrust is asked of it. With
+    The propeller turns the way it must push, and stands still where no thrust is requested. With
     T = T_0 exp(-k / |T_0|) the thrust before the jet's loss is T_0 = T exp(W(k / |T|)), W Lambert's
     function, and the speed is the positive root of a quadratic.
     """
@@ -373,7 +373,7 @@ def speeds_for(propulsion: Propulsion, thrust: Array, nu: Array, command_rps: Ar
 def electrical_power(propulsion: Propulsion, rps: Array, nu: Array, out: Array) -> None:
     """Write the electrical power, (n,) W, of each thruster.
 
-    A propeller that the water drives gives nothing back.
+    A propeller that the water drives recovers no power.
 
     Args:
         propulsion: n thrusters.

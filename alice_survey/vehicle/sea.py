@@ -56,7 +56,7 @@ def varying_current(
         mean: with one time.
         sigma_mps: standard deviation of north and of east.
         correlation_s: lag at which the correlation has fallen to 1 / e.
-        duration_s: how long.
+        duration_s: duration.
         rng: source of the process.
     """
     step_s = correlation_s / 10.0
@@ -77,7 +77,7 @@ def read_current(path: Path) -> Current:
     Each depth must be there at each time (an ADCP's bins); one depth, or one time, is enough.
 
     Raises:
-        NavigationError: the file is missing, lacks a column or holds no number.
+        NavigationError: the file is missing, lacks a column or holds a value that is not a number.
         VehicleError: a depth is missing at a time, or is there twice.
     """
     columns = read_columns(path, _COLUMNS)
@@ -96,10 +96,10 @@ def read_current(path: Path) -> Current:
 
 
 def checked_current(current: Current) -> Current:
-    """The current itself.
+    """The current, if it is valid.
 
     Raises:
-        VehicleError: times or depths do not increase, or a value is no finite number, or there are
+        VehicleError: times or depths do not increase, or a value is not finite, or there are
             not as many values as times and depths.
     """
     for name, axis in (("times", current.time_s), ("depths", current.depth_m)):
@@ -121,7 +121,7 @@ class Disturbance:
     """Random forces and moments on the body: first-order Gauss-Markov processes."""
 
     sigma: tuple[float, float, float, float, float, float] = (0.0,) * 6
-    """Of X, Y, Z in N and of K, M, N in N m."""
+    """Sigmas of X, Y, Z in N and of K, M, N in N m."""
     correlation_s: float = 2.0
 
 
@@ -149,8 +149,8 @@ def current_at(current: Current, time_s: float, depth_m: float, out: Array) -> N
 
     Args:
         current: the field.
-        time_s: when.
-        depth_m: where.
+        time_s: time.
+        depth_m: depth.
         out: (6,) north and east velocity, their rates by time, and their slopes by depth.
     """
     i, a = _bracket(current.time_s, time_s)

@@ -1,7 +1,7 @@
 """The closed loop: navigation, guidance, control, allocation and dynamics, tick by tick.
 
-A tick is 0.05 s: the sensors measure the true state for the navigation, the pilot asks
-for a wrench, the allocation turns it into thruster speeds, and the equations of motion advance by
+A tick is 0.05 s: the sensors measure the true state for the navigation, the pilot commands
+a wrench, the allocation converts it to thruster speeds, and the equations of motion advance by
 five Runge-Kutta steps of 10 ms.
 """
 
@@ -65,7 +65,7 @@ _CHUNK_TICKS = 1200
 
 
 class Sea(NamedTuple):
-    """What moves the vehicle from outside."""
+    """External influences on the vehicle."""
 
     current: Current
     gust_sigma: Array
@@ -75,17 +75,17 @@ class Sea(NamedTuple):
 
 
 class Allocation(NamedTuple):
-    """How a wrench becomes thrust."""
+    """Settings of the allocation from wrench to thrust."""
 
     exact: bool
     propulsion: Propulsion
-    """As it is believed to be."""
+    """Propulsion as the allocation assumes it."""
     matrix: Array
     """B, (6, n)."""
     axes: Array
-    """(6,) weight of each axis; 0 where none is asked for."""
+    """(6,) weight of each axis; 0 of one that is not requested."""
     health: Array
-    """(n,) 1 of a sound thruster, 0 of a failed one, see `weakened`."""
+    """(n,) 1 of an intact thruster, 0 of a failed one, see `weakened`."""
     lower: Array
     upper: Array
     weights: Array
@@ -98,7 +98,7 @@ class World(NamedTuple):
     """State that changes from tick to tick, apart from pilot and navigation."""
 
     state: Array
-    """(13 + n,) of the dynamics."""
+    """(13 + n,) state of the dynamics."""
     before: Array
     """(13,) truth at the tick before: position, quaternion, velocity over ground in NED, rates."""
     now: Array
@@ -111,7 +111,7 @@ class World(NamedTuple):
 
 
 class TickRows(NamedTuple):
-    """What is recorded of each tick, a row each."""
+    """Record of all ticks, a row each."""
 
     state: Array
     truth: Array
@@ -176,7 +176,7 @@ def _fly_ticks(
     sea_rng: np.random.Generator,
     rows: TickRows,
 ) -> int:
-    """Fly ticks until the rows are full or the mission is over; how many were flown."""
+    """Fly ticks until the rows are full or the mission is over; return their number."""
     count, thrusters, flown = rows.state.shape[0], allocation.thrust.shape[0], 0
     for k in range(count):
         tick = first + k
@@ -242,7 +242,7 @@ def _fly_ticks(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Setup:
-    """All that decides how a mission goes, but for chance."""
+    """All inputs of a mission except random numbers."""
 
     vehicle: Vehicle
     path: Path
@@ -254,11 +254,11 @@ class Setup:
     disturbance: Disturbance
     exact_allocation: bool = True
     health: Mapping[str, float] = field(default_factory=dict)
-    """What a thruster has left of its greatest speed squared: 0 failed; sound if not named."""
+    """Share of its greatest speed squared left in a thruster: 0 failed; intact if not named."""
     known_health: Mapping[str, float] | None = None
-    """The same as the allocation believes it; as it is if not given."""
+    """The same as the allocation assumes it; the true one if not given."""
     believed: Vehicle | None = None
-    """What the allocation takes the vehicle for, with as many thrusters; the vehicle itself if not
+    """Vehicle that the allocation assumes, with as many thrusters; the vehicle itself if not
     given."""
     start_ne_m: tuple[float, float] = (0.0, 0.0)
     start_heading_rad: float = 0.0
@@ -270,7 +270,7 @@ class Flown:
 
     time_s: Array
     state: Array
-    """(T, 13 + n) of the dynamics."""
+    """(T, 13 + n) states of the dynamics."""
     truth: Array
     """(T, 13) position, quaternion, velocity over ground in NED, body rates."""
     navigation: Array
@@ -278,11 +278,11 @@ class Flown:
     report: Array
     """(T, REPORT) as `guidance` has it."""
     wrench: Array
-    """(T, 6) that was asked for."""
+    """(T, 6) requested wrench."""
     command_rps: Array
     """(T, n)"""
     power_w: Array
-    """(T, n) electrical."""
+    """(T, n) electrical power."""
     thrusters: tuple[str, ...]
 
     @property
@@ -318,8 +318,8 @@ def simulate(
     Args:
         setup: the mission.
         rng: source of all noise.
-        longest_s: the mission is broken off then.
-        label: what the progress bar says; there is none if it is empty.
+        longest_s: the mission ends at this time at the latest.
+        label: text of the progress bar; there is none if it is empty.
         expected_s: how long the mission will take, for that bar.
         sea_rng: source of the gusts, six numbers a tick, so that vehicles can be flown in the same
             ones; `rng` if not given.

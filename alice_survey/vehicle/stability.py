@@ -12,7 +12,7 @@ _VERTICAL = [2, 4]
 _MOST_MPS = 5.0
 _STEP_MPS = 0.02
 _GROWS_PER_S = 1e-6
-"""Growth that rounding errors do not make."""
+"""Growth beyond rounding errors."""
 
 
 def pitch_matrix(vehicle: Vehicle, speed_mps: float) -> Array:

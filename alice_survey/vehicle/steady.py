@@ -1,4 +1,4 @@
-"""Steady motion: what thrusters must do, and the power they take, to keep a velocity.
+"""Steady motion: thruster speeds and power that keep a velocity.
 
 The laws are those of `dynamics`, `propulsion` and `allocation`, called at many velocities: what a
 planner counts on is what the simulator flies. The vehicle is level; what rolls and pitches it is
@@ -31,7 +31,7 @@ BALANCED = (0, 1, 2, 5)
 """Surge, sway, heave and yaw."""
 _ROUNDS = 60
 _MISS_N = 1e-9
-"""A wrench that is missed by no more, N and N m, is met."""
+"""Tolerance, N and N m, within which a wrench is met."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,7 +48,7 @@ class SteadyFlight:
 
 
 class _Room(NamedTuple):
-    """Room for one velocity."""
+    """Work arrays for one velocity."""
 
     lower: Array
     upper: Array
@@ -66,15 +66,15 @@ def steady_flight(
     share: float = 1.0,
     slips: bool = False,
 ) -> SteadyFlight:
-    """What keeps a level vehicle at velocities relative to the water.
+    """Thrusters and power that keep a level vehicle at velocities relative to the water.
 
     Thrusts are those of least effort, as the pilot allocates them.
 
     Args:
-        vehicle: what moves.
+        vehicle: the vehicle.
         nu: (N, 6) velocity relative to the water, in the body.
         nu_rate: (N, 6) its rate of change, as when the vehicle turns in a current; 0 if not given.
-        share: of each thruster's greatest speed squared that may be used.
+        share: share of each thruster's greatest speed squared that may be used.
         slips: leave out what no thruster can balance, instead of giving NaN: a vehicle without sway
             that turns is pushed sideways, and goes.
     """
@@ -155,7 +155,7 @@ def _keep(
         share: (n,) of each thruster's greatest speed squared.
         wanted: (N, 6)
         nu: (N, 6)
-        room: for one velocity.
+        room: work arrays for one velocity.
         made: (N, 6) wrench, is written.
         rps: (N, n) is written.
         power_w: (N, n) is written.

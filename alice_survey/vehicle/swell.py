@@ -1,4 +1,4 @@
-"""Swell: what surface waves do to the water that a vehicle moves through.
+"""Swell: motion of the water by surface waves.
 
 Linear waves over a level sea floor (R. G. Dean and R. A. Dalrymple, Water Wave Mechanics, 1991,
 section 3.4): omega^2 = g k tanh(k h), and horizontally
@@ -17,12 +17,12 @@ from alice_survey.vehicle.dynamics import GRAVITY
 from alice_survey.vehicle.sea import Current, checked_current
 
 _PER_PERIOD = 24
-"""Times a period: straight pieces between are within 1 % of the wave."""
+"""Samples per period: linear pieces between are within 1 % of the wave."""
 _LAYERS = 16
 
 
 def wave_number(period_s: float, depth_m: float) -> float:
-    """Of waves of a period over a depth, rad/m."""
+    """Wave number of waves of a period over a depth, rad/m."""
     from scipy.optimize import brentq
 
     # In deep water k h is this number; in shallow water its root: the root lies between.
@@ -37,10 +37,10 @@ def orbital_speed_mps(
     """Amplitude of the horizontal speed at depths (...) below the surface.
 
     Args:
-        height_m: of the waves, trough to crest.
-        period_s: of the waves.
-        depth_m: of the sea floor.
-        below_m: (...) where.
+        height_m: height of the waves, trough to crest.
+        period_s: period of the waves.
+        depth_m: depth of the sea floor.
+        below_m: (...) depths of the points.
     """
     k = wave_number(period_s, depth_m)
     share = np.cosh(k * (depth_m - np.asarray(below_m))) / math.sinh(k * depth_m)
@@ -60,13 +60,13 @@ def with_swell(
     Args:
         current: without waves.
         height_m: trough to crest.
-        period_s: of the waves.
+        period_s: period of the waves.
         towards_deg: where they travel.
-        depth_m: of the sea floor.
+        depth_m: depth of the sea floor.
         duration_s: how long the waves last.
 
     Raises:
-        VehicleError: a number makes no sense.
+        VehicleError: a number is invalid.
     """
     if not (height_m >= 0 and period_s > 0 and depth_m > 0):
         raise VehicleError(

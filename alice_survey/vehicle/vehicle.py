@@ -1,4 +1,4 @@
-"""A vehicle as a value: rigid body, coefficients and thrusters, and what follows from them."""
+"""A vehicle as a value: rigid body, coefficients and thrusters, and derived matrices."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,15 +19,15 @@ class RigidBody:
     """Mass and its distribution; lengths from the centre of buoyancy, the body's origin."""
 
     dry_kg: float
-    """Weighed in air, drained."""
+    """Mass in air, drained."""
     buoyancy_kg: float
     """Mass of the water that the drained vehicle displaces."""
     entrained_kg: float
     """Water inside the hull that moves along; its weight is carried by its own buoyancy."""
     cg_body_m: tuple[float, float, float]
-    """Of the drained vehicle."""
+    """Centre of gravity of the drained vehicle."""
     inertia_kg_m2: tuple[float, float, float]
-    """Of the drained vehicle about its centre of gravity, roll, pitch, yaw."""
+    """Inertia of the drained vehicle about its centre of gravity, roll, pitch, yaw."""
     entrained_cg_body_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     entrained_inertia_kg_m2: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """About its own centre of gravity."""
@@ -64,14 +64,14 @@ def _cross_matrix(a: tuple[float, float, float]) -> Array:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Vehicle:
-    """Everything the equations of motion need to know of a vehicle."""
+    """All inputs of the equations of motion of a vehicle."""
 
     name: str
     rigid_body: RigidBody
     coefficients: Coefficients
     thrusters: tuple[Thruster, ...]
     hull: Hull = POINT
-    """How far it reaches; nothing but its origin of one that is not to be flown."""
+    """Extent of the hull; its origin alone for a vehicle that is not flown."""
     density_kg_m3: float = 1025.0
 
     @cached_property
@@ -129,7 +129,7 @@ class Vehicle:
         """Share of its greatest speed squared that each thruster has left, (n,).
 
         Args:
-            left: by thruster, 0 failed to 1 sound; sound when not named.
+            left: by thruster, 0 failed to 1 intact; intact when not named.
 
         Raises:
             VehicleError: a thruster is not known.

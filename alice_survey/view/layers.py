@@ -45,7 +45,7 @@ _DAMAGES = (RasterioError, IndexError)
 NAMES = (_MOSAIC, *(numbers.name for numbers in number_rasters("m")))
 """Names of layers, in the order in which a page shows them."""
 PATHS = (MOSAIC_FILE, *(numbers.file for numbers in number_rasters("m")))
-"""Folders of their rasters."""
+"""Files of their rasters."""
 
 
 class ChangedError(Exception):
@@ -120,7 +120,7 @@ class Layers:
             level: 0 is the coarsest, as on the report's page.
             x: column of the tile.
             y: row of the tile.
-            token: of the raster that the page has; None for the current one.
+            token: token of the raster that the page has; None for the current one.
 
         Raises:
             FileNotFoundError: there is no such layer or no such tile.
@@ -162,7 +162,7 @@ class Layers:
                 self._tile_bytes -= len(self._tiles.popitem(last=False)[1])
 
     def close(self) -> None:
-        """Close all files that nobody uses any more."""
+        """Close all files that are no longer in use."""
         with self._lock:
             rasters = list(self._rasters.values())
             self._rasters.clear()

@@ -69,7 +69,7 @@ class Page:
         """The light copy of the mesh as binary glTF, and the token of the mesh.
 
         Args:
-            token: of the mesh that the page has; None for the current one.
+            token: token of the mesh that the page has; None for the current one.
 
         Raises:
             FileNotFoundError: there is no mesh.

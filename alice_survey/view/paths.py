@@ -27,7 +27,7 @@ _ESCAPE = re.compile(r"%(?![0-9A-Fa-f]{2})")
 _NOT_THERE = {
     errno.ENOENT, errno.ENOTDIR, errno.ELOOP, errno.EACCES, errno.ENXIO, errno.ENAMETOOLONG,
 }  # fmt: skip
-"""Reasons, for a reader, also for a link, a socket and unreadable files."""
+"""Errors that count as missing for a reader: also a link, a socket and unreadable files."""
 _UNFINISHED = (".partial", ".replaced")
 
 
@@ -43,7 +43,7 @@ class OpenedFile:
     size: int
     modified_ns: int
     token: str
-    """Names this content: another file, or the same file changed, has another."""
+    """Token of this content: another file, or the same file changed, has another."""
 
     @property
     def path(self) -> str:
@@ -51,7 +51,7 @@ class OpenedFile:
         return f"/proc/self/fd/{self.descriptor}"
 
     def is_unchanged(self) -> bool:
-        """Whether nobody wrote to it since it was opened."""
+        """Whether it is unchanged since it was opened."""
         return _token(os.fstat(self.descriptor)) == self.token
 
     def close(self) -> None:
@@ -170,7 +170,7 @@ class Workspace:
         """Token of the state of all finished stages and of some files; any change gives another.
 
         Args:
-            paths: of the files.
+            paths: paths of the files.
         """
         tokens = []
         for path in (*(f"{name}/{STAGE_FILE}" for name in PRODUCTS), *paths):

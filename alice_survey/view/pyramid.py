@@ -100,7 +100,7 @@ class Pyramid:
             path: as GDAL opens it, as long as this lives.
             read: how its parts are read.
             stop: ends the reading soon after it is set.
-            most_kept_px: of the level that is kept.
+            most_kept_px: most pixels of the level that is kept.
 
         Raises:
             rasterio.errors.RasterioError: it cannot be read.
@@ -210,7 +210,7 @@ def _reduced(part: Part, factor: int, left: int, top: int, right: int, bottom: i
     Args:
         part: finer.
         factor: pixels a side.
-        left: of the coarser pixels wanted, like the other three.
+        left: first column of the wanted part, in coarser pixels, like the other three.
         top: first row.
         right: after the last column.
         bottom: after the last row.

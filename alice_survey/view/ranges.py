@@ -47,9 +47,9 @@ def answer_to(headers: Mapping[str, str], size: int, version: Version, *, is_get
     a server do.
 
     Args:
-        headers: of the request, by their names in small letters.
-        size: of the file, bytes.
-        version: of the file.
+        headers: headers of the request, by their names in small letters.
+        size: size of the file, bytes.
+        version: version of the file.
         is_get: it is not a HEAD, for which ranges have no meaning.
     """
     whole = Answer(status=200, count=size)

@@ -64,7 +64,7 @@ class Server(ThreadingHTTPServer):
         """Listen.
 
         Args:
-            folder: of the workspace.
+            folder: folder of the workspace.
             port: 0 for any that is free.
 
         Raises:

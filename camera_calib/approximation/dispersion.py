@@ -73,11 +73,11 @@ def channel_cameras(
 
     Args:
         camera: as calibrated; green.
-        temperature_c: of the water.
-        salinity_psu: of the water.
+        temperature_c: temperature of the water.
+        salinity_psu: salinity of the water.
         depth_m: below the surface.
         glass: material of the port, one of `glass.GLASSES`.
-        wavelengths_nm: of red, green and blue.
+        wavelengths_nm: wavelengths of red, green and blue.
 
     Raises:
         ConfigError: water, material or wavelengths are out of range or not three.

@@ -53,9 +53,9 @@ def undisperse_files(
         rig: `rig.json`; its indices hold for green.
         camera: whose pictures these are; the rig's first when not given.
         range_m: from the entrance pupil to the scene, along the axis.
-        temperature_c: of the water.
-        salinity_psu: of the water.
-        depth_m: of the camera below the surface.
+        temperature_c: temperature of the water.
+        salinity_psu: salinity of the water.
+        depth_m: depth of the camera below the surface.
         glass: material of the port, one of `glass.GLASSES`.
         wavelengths_nm: of red, green and blue; the middle of their bands when not given.
         executor: where tasks run.

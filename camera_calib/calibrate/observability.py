@@ -1,4 +1,4 @@
-"""What views under water do not determine of the parameters that are taken for granted.
+"""Held parameters that views under water do not determine.
 
 Index of the water, index and thickness of the glass are held (or known before). How far could the
 views have determined them, and how far does a small error in one of them move what is calibrated?
@@ -157,7 +157,7 @@ def advice(
         rig: calibrated, with its covariance.
         measured: (V, cameras, N, 2) pixels used; NaN where unseen.
         residuals_px: (V, cameras, N, 2).
-        names: of the views.
+        names: names of the views.
         rig_from_target: (V,).
         noise_px: standard deviation of one coordinate.
     """

@@ -23,7 +23,7 @@ IN_AIR: Mapping[str, Any] = {
     "n_water": 1.0,
     "normal": (0.0, 0.0, 1.0),
 }
-"""What a camera without a port has."""
+"""Values of a camera without a port."""
 
 
 def camera_matrix(camera: FlatPortCamera) -> Array:
@@ -90,7 +90,7 @@ def camera_in_air(
         key: key of the focal lengths, named when they are wrong.
         size: width and height, px.
         lens: fx, fy, cx, cy in this project's pixels.
-        coefficients: of the distortion, by this project's names.
+        coefficients: coefficients of the distortion, by this project's names.
     """
     fx, fy, cx, cy = map(float, lens)
     if min(fx, fy) <= 0:

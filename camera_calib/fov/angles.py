@@ -69,7 +69,7 @@ def angle_table(
     Args:
         camera_config: sensor, port and f-number; its lens is not used.
         n_water: index of the water in green light; the dispersion is that of sea water.
-        altitude_m: of the outer glass.
+        altitude_m: altitude of the outer glass.
         angles_deg: full angles of the frame's diagonal in air.
 
     Raises:

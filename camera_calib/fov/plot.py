@@ -46,7 +46,7 @@ def draw_fov(
         altitudes_m: altitudes of interest; the curves go some way beyond them.
         choices: circle of confusion, focus, matching noise.
         speeds_mps: speeds of the blur curves.
-        exposures_s: of interest; marked.
+        exposures_s: exposures of interest; marked.
         allowed_px: blur that is allowed; marked.
         angles: distortion against the field of view.
         paper: mark what the paper's table prints; its sensor is drawn.

@@ -147,7 +147,7 @@ def fov_table(
 
     Args:
         lenses_mm: focal lengths in air.
-        altitudes_m: of the left port's outer glass above a level sea floor.
+        altitudes_m: altitudes of the left port's outer glass above a level sea floor.
         n_water: index of refraction of the water; 1 is air.
         camera_config: sensor, port, baseline and f-number.
         choices: circle of confusion, focus, matching noise.
@@ -213,7 +213,7 @@ def blur_table(
     Args:
         rows: lenses and altitudes.
         speeds_mps: over ground.
-        exposures_s: of the shutter, or of the strobe where that alone lights the scene.
+        exposures_s: exposures of the shutter, or of the strobe where that alone lights the scene.
         allowed_px: blur for which the longest exposure is given.
 
     Raises:

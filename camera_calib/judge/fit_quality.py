@@ -1,4 +1,4 @@
-"""How well a calibration fits its pictures, and where in the frames the pictures had points."""
+"""Fit of a calibration to its pictures, and coverage of the frames by points."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -36,7 +36,7 @@ from camera_calib.judge.judgement import Judgement
 
 
 def plot_halves(judged: Judgement) -> bytes:
-    """How far calibrations from either half of the views project apart."""
+    """Difference of projections of calibrations from either half of the views."""
     found = {name: c.halves for name, c in judged.cameras.items() if c.halves is not None}
 
     def draw(figure: Sheet) -> None:
@@ -169,7 +169,7 @@ def plot_homographies(judged: Judgement) -> bytes:
 
 
 def plot_coverage(judged: Judgement) -> bytes:
-    """How many points fell where in each frame; red marks corners that none came near."""
+    """Number of points over each frame; red marks corners that none came near."""
 
     def draw(figure: Sheet) -> None:
         grid = axes_grid(figure, len(judged.cameras))

@@ -35,7 +35,7 @@ def uncertainty_report(
         ranges_m: distances to evaluate; `RANGES_M` if none.
         near_m: nearest distance of the points that poses are estimated from.
         far_m: farthest.
-        noise_px: of one measured coordinate, for comparison.
+        noise_px: noise of one measured coordinate, for comparison.
 
     Raises:
         CalibrationError: the rig has no covariance, or the distances are not in order.

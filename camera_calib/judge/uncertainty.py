@@ -125,7 +125,7 @@ def frame_points(camera: FlatPortCamera, ranges_m: tuple[float, ...], grid: int 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ProjectionSigma:
-    """How uncertain a projection is, along its worst direction, px; shaped as the pixels."""
+    """Uncertainty of a projection, along its worst direction, px; shaped as the pixels."""
 
     plain_px: Array
     """Uncertainty of a point fixed to the camera: applies to a rig that measures by itself."""

@@ -177,7 +177,7 @@ def score_hold_out(held: HeldOut) -> HoldOutScore:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HalvesDifference:
-    """How far two calibrations of one camera project apart, after the best pose."""
+    """Difference of projections of two calibrations of one camera, after the best pose."""
 
     pixels: Array
     """(R, C, 2) where."""
@@ -193,7 +193,7 @@ class HalvesDifference:
 
     @property
     def expected_rms_px(self) -> float:
-        """What `rms_px` should be, if the covariances are true."""
+        """Expected `rms_px`, if the covariances are true."""
         return float(np.sqrt(np.nanmean(self.expected_px**2)))
 
 

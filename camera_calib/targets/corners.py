@@ -20,7 +20,7 @@ from alice_survey.base.frames import Array
 Grey = NDArray[np.uint8] | NDArray[np.float32] | NDArray[np.float64]
 
 FITTED, AT_BORDER, NOT_SETTLED, UNLIKE_A_CORNER, ASTRAY, UNSEEN = range(6)
-"""What became of a corner."""
+"""Status of a corner."""
 REASONS = {
     AT_BORDER: "too near to the border of the picture",
     NOT_SETTLED: "the fit of its edges did not settle",

@@ -46,7 +46,7 @@ _FARTHEST_OFF = 0.2
 _WEAKEST = 0.15
 """Contrast of a corner over the middle one of the picture."""
 _SECOND_LOOK = 0.5
-"""Factors of smaller windows for points that did not fit."""
+"""Factor of the smaller window for points that did not fit."""
 SMALL_PX, LARGE_PX = 1000, 2000
 """Longest sides of the reduced pictures given to the detectors."""
 _DARK, _FLAT = 8, 4
@@ -70,7 +70,7 @@ class Detection:
     """Number of points seen but not used, by reason."""
 
     def rejections(self, view: str, camera: str) -> tuple[Rejection, ...]:
-        """What took no part, for a calibration's report."""
+        """Points left out, for a calibration's report."""
         if self.refused is not None:
             return (Rejection(view=view, camera=camera, points=0, reason=self.refused),)
         return tuple(

@@ -336,7 +336,7 @@ def stage(name: str, **facts: Any) -> Iterator[Callable[..., None]]:
     """A stage is worked on; what is yielded takes the facts to report at its end.
 
     Args:
-        name: of its folder.
+        name: name of its folder.
         facts: to report at its beginning, as JSON values.
     """
     whole = _part.get()
@@ -371,7 +371,7 @@ def step(label: str, total: int | None = None, *, width: int = 1) -> Iterator[St
     try:
         yield begun
         complete = True
-    except GeneratorExit:  # whoever takes the items has enough
+    except GeneratorExit:  # the consumer has enough items
         complete = True
         raise
     finally:

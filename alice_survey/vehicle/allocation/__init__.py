@@ -7,7 +7,7 @@ bounds of thrust (n,), the weights of axes (6,) and of thrusters (n,), and write
   weighted thrust (`exact`);
 - `allocate_rpi`: the redistributed pseudo-inverse of the paper (`rpi`).
 
-An axis of weight 0 is not asked for: of roll and pitch gravity takes care. The others decide what
-is given up when not all can be had, by the square of their weights times the square of the miss.
-A failed thruster has the bounds 0 and 0. A wrench that is not a number gives thrusts that are none.
+An axis of weight 0 is not requested: gravity handles roll and pitch. The others decide what
+is given up when not all is attainable, by the square of their weights times the squared miss.
+A failed thruster has the bounds 0 and 0. A wrench that is not a number gives NaN thrusts.
 """

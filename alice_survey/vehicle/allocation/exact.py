@@ -24,7 +24,7 @@ _FREE, _HELD, _FIXED = 0, 1, 2
 _RANK = 1e-11
 """Columns shorter than this part of the longest, once the others are taken off, depend on them."""
 _SLOPE = 1e-12
-"""Gradients below this part of what they are made of are rounding."""
+"""Gradients below this share of their terms are rounding."""
 
 
 @kernel
@@ -45,13 +45,13 @@ def allocate_exact(
         wrench: (6,) wanted, N and N m.
         lower: (n,) least thrust, N.
         upper: (n,) greatest thrust, N; the same as `lower` of a thruster that has failed.
-        axes: (6,) weights of the axes' misses; 0 of an axis that is not asked for.
+        axes: (6,) weights of the axes' misses; 0 of an axis that is not requested.
         weights: (n,) positive; the cost is the sum of weight times thrust squared.
         thrust: (n,) is written, N.
-        scratch: room.
+        scratch: work arrays.
 
     Returns:
-        How many least-squares problems were solved; negative if that many were not enough, with
+        Number of least-squares problems solved; negative if that many were not enough, with
         `thrust` within the bounds but perhaps not the best.
     """
     n, m = matrix.shape[1], 0
@@ -92,7 +92,7 @@ def _least_miss(
     scratch: AllocationScratch,
     limit: int,
 ) -> int:
-    """Bring x, (n,), to a least |a x - b| within the bounds; how many problems it took.
+    """Bring x, (n,), to a least |a x - b| within the bounds; return the number of problems.
 
     It is 1 if x is of least norm too, as when no bound is in the way. Afterwards thrusters are
     fixed whose bound is in the way of a smaller miss, and the others are free.
@@ -170,7 +170,7 @@ def _least_norm(
     """Bring x, (n,), to the least |x| with the same a x within the bounds.
 
     Returns:
-        How many problems were solved, with those before; negative if they were too many.
+        Number of problems solved, with those before; negative if they were too many.
     """
     made, price = scratch.vectors[6], scratch.vectors[7]
     for total in range(solved + 1, solved + limit + 1):
@@ -209,7 +209,7 @@ def _least_norm(
 def _advance(
     n: int, x: Array, step: Array, low: Array, high: Array, state: NDArray[np.int64]
 ) -> bool:
-    """Go along a step of the free ones as far as the bounds allow; whether one was in the way."""
+    """Take a step of the free ones as far as the bounds allow; return whether one limited it."""
     share, blocking = 1.0, -1
     for i in range(n):
         if state[i] != _FREE:

@@ -1,4 +1,4 @@
-"""What counts most when a wrench cannot be had whole, and which thrusters are preferred."""
+"""Priorities when a wrench is not attainable, and preferences among thrusters."""
 
 import math
 
@@ -9,7 +9,7 @@ from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.propulsion import DISTRUST, Propulsion
 
 AXIS_WEIGHTS: Array = np.array([1.0, 3.0, 30.0, 0.0, 0.0, 10.0])
-"""What counts most when not all can be had. Heave keeps the vehicle off the sea floor; yaw keeps
+"""Priorities when not all is attainable. Heave keeps the vehicle off the sea floor; yaw keeps
 the pictures square and the thrusters pointing where the controller thinks they point; sway keeps to
 the line; surge only costs time. Each counts about ten times the next by the square of its miss, a
 newton metre of yaw, on arms near a metre, as a newton."""

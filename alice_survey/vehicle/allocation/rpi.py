@@ -1,8 +1,8 @@
-"""The redistributed pseudo-inverse, as the paper has it.
+"""The redistributed pseudo-inverse of the paper.
 
 f = -c + W^-1 B^T (B W^-1 B^T + eps I)^-1 (tau + B_0 c): the columns of B of thrusters that are
 saturated are zero, and c holds minus their thrust. The identity has as many rows as there are axes
-asked for (the paper prints I_3 next to a 6 x 5 matrix).
+requested (the paper prints I_3 next to a 6 x 5 matrix).
 """
 
 import math
@@ -12,7 +12,7 @@ from alice_survey.vehicle.allocation.scratch import AllocationScratch
 from alice_survey.vehicle.compiled import kernel
 
 _EPSILON = 1e-9
-"""Of the mean of the diagonal of B W^-1 B^T."""
+"""Regularisation, as a share of the mean diagonal of B W^-1 B^T."""
 
 
 @kernel
@@ -30,7 +30,7 @@ def allocate_rpi(
 
     Each round solves for the thrusters that are not saturated, holds those that came out beyond
     their bounds at the bound, and takes what they give off the wrench. A thruster once held is
-    never let go: when the wrench is not attainable this falls short of what could be had. The paper
+    never released: when the wrench is not attainable this falls short of the optimum. The paper
     weighs thrusters alone; here rows are scaled by the axes' weights too, without which it falls
     shorter still (all weights 1 is the paper's).
 
@@ -39,13 +39,13 @@ def allocate_rpi(
         wrench: (6,) wanted, N and N m.
         lower: (n,) least thrust, N.
         upper: (n,) greatest thrust, N; the same as `lower` of a thruster that has failed.
-        axes: (6,) weights of the axes' misses; 0 of an axis that is not asked for.
+        axes: (6,) weights of the axes' misses; 0 of an axis that is not requested.
         weights: (n,) positive; the cost is the sum of weight times thrust squared.
         thrust: (n,) is written, N.
-        scratch: room.
+        scratch: work arrays.
 
     Returns:
-        How many times it solved.
+        Number of solutions computed.
     """
     n = matrix.shape[1]
     gram, solution, held = scratch.matrices[0], scratch.vectors[0], scratch.states

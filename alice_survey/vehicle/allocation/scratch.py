@@ -1,4 +1,4 @@
-"""Room in which the allocation works, so that it allocates no memory."""
+"""Work arrays of the allocation, so that it allocates no memory."""
 
 from typing import NamedTuple
 
@@ -9,18 +9,18 @@ from alice_survey.base.frames import Array
 
 
 class AllocationScratch(NamedTuple):
-    """Work arrays of both solvers; what they hold between calls means nothing."""
+    """Work arrays of both solvers; their contents between calls have no meaning."""
 
     matrices: Array
     """(5, N, N), N the greater of 6 and the number of thrusters."""
     vectors: Array
     """(9, N)"""
     states: NDArray[np.int64]
-    """(N,) what each thruster is doing."""
+    """(N,) state of each thruster."""
 
 
 def allocation_scratch(thrusters: int) -> AllocationScratch:
-    """Room for so many thrusters."""
+    """Work arrays for a number of thrusters."""
     size = max(6, thrusters)
     return AllocationScratch(
         np.zeros((5, size, size)), np.zeros((9, size)), np.zeros(size, dtype=np.int64)

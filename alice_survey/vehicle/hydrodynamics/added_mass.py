@@ -30,7 +30,7 @@ def _alpha(e: float) -> float:
 
 
 def ellipsoid_mass(length_m: float, diameter_m: float, density: float) -> float:
-    """m_e = 4/3 pi rho (l/2) (d/2)^2, kg: of the water that the spheroid displaces."""
+    """m_e = 4/3 pi rho (l/2) (d/2)^2, kg: mass of the water that the spheroid displaces."""
     return 4.0 / 3.0 * math.pi * density * length_m / 2.0 * (diameter_m / 2.0) ** 2
 
 
@@ -49,11 +49,11 @@ def finned_circle_section(radius_m: Array, span_m: float, density: float) -> Arr
     """Added mass of a circle with two fins, moving at a right angle to them, kg/m.
 
     rho pi (b^2 - r^2 + r^4 / b^2), Newman (1977, table 4.3). As printed in the paper:
-    pi rho (b^2 - r^2) / b^2, which is no mass per length.
+    pi rho (b^2 - r^2) / b^2, which is not a mass per length.
 
     Args:
-        radius_m: of the circle.
-        span_m: from the middle to the tip of a fin, not below the radius.
+        radius_m: radius of the circle.
+        span_m: distance from the middle to the tip of a fin, not below the radius.
         density: kg/m^3.
     """
     r2, b2 = np.asarray(radius_m, dtype=np.float64) ** 2, span_m**2

@@ -1,4 +1,4 @@
-"""The paper's tables of coefficients next to what follows from shape, as numbers."""
+"""The paper's tables of coefficients next to values computed from shape, as numbers."""
 
 from dataclasses import dataclass
 
@@ -49,21 +49,21 @@ _HULL_EQUATIONS = {
 
 @dataclass(frozen=True, kw_only=True)
 class CoefficientRow:
-    """One row of the paper and what is computed for it."""
+    """One row of the paper and the value computed for it."""
 
     table: str
     coefficient: str
     part: str
     printed: float
     paper: float
-    """With its sign corrected."""
+    """Printed value with its sign corrected."""
     computed: float
     difference_percent: float
-    """Of the paper's size; positive is a greater value."""
+    """Difference relative to the paper's size; positive is a greater value."""
     mark: str
     """`reproduced` within 1 %, `near` within 5 %, else `no`."""
     paper_other: float | None
-    """CFD or calibrated."""
+    """CFD or calibrated value."""
     factor: float | None
     """Calibration factor as printed, table V."""
     equation: str

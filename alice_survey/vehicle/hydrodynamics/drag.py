@@ -9,7 +9,7 @@ import math
 CYLINDER_CD = 1.2
 """C_d0 of a long cylinder across the flow, subcritical (paper)."""
 LONG_CYLINDER = 57.5
-"""l / d from which an end no longer matters (paper, after Uematsu and Yamada 1995)."""
+"""l / d from which end effects are negligible (paper, after Uematsu and Yamada 1995)."""
 TUNNEL_CBTO = 0.012
 """C_BTO of a thruster tunnel with sharp edges off the middle of a bow: the upper end of 0.003 to
 0.012 (Holtrop and Mennen 1982, International Shipbuilding Progress 29)."""
@@ -43,7 +43,7 @@ def plate_across(aspect: float) -> float:
     """C_d of a rectangular plate across the flow.
 
     1.10 + 0.02 (a + 1 / a), a fit in common use to the plates of Hoerner (1965, chapter 3), up to
-    an aspect ratio of 30; where it comes from could not be read. On a wall a plate counts with its
+    an aspect ratio of 30; its source could not be read. On a wall a plate counts with its
     mirror image: twice its height over its width.
     """
     return 1.10 + 0.02 * (aspect + 1.0 / aspect)

@@ -1,4 +1,4 @@
-"""The water inside the hull, which moves along: how much, and where.
+"""The water inside the hull, which moves along: its mass and place.
 
 One rule for every set of coefficients: water inside counts to the rigid body's inertia and not to
 its weight (its weight and its buoyancy cancel), and added mass is that of the water outside.
@@ -30,9 +30,9 @@ class Entrained:
 
     mass_kg: float
     x_m: float
-    """Of its centre, from the centre of buoyancy."""
+    """Position of its centre, from the centre of buoyancy."""
     inertia_kg_m2: tuple[float, float, float]
-    """About its own centre: roll, pitch, yaw."""
+    """Inertia about its own centre: roll, pitch, yaw."""
     nose_from_x_m: float
     """Bulkhead from which water fills the nose."""
     tail_to_x_m: float
@@ -45,7 +45,7 @@ def entrained_water(geometry: Geometry, buoyancy_kg: float, density: float) -> E
     Args:
         geometry: the vehicle.
         buoyancy_kg: mass of the water that the drained vehicle displaces.
-        density: of the water, kg/m^3.
+        density: density of the water, kg/m^3.
 
     Raises:
         VehicleError: the envelope has no room for it, or the bulkheads would cross.
@@ -100,7 +100,7 @@ def entrained_water(geometry: Geometry, buoyancy_kg: float, density: float) -> E
 
 
 def _root(function: Callable[[float], float], low: float, high: float) -> float:
-    """Where a function changes its sign between two places, to 1e-12 m.
+    """Root of a function between two places, to 1e-12 m.
 
     The Illinois rule of false position (Dowell & Jarratt, 1971). scipy's solvers would do, but take
     a tenth of a second to load, at every start of a command that plans.

@@ -1,4 +1,4 @@
-"""Shapes of SPARUS II and ALICE: what the coefficients are computed from.
+"""Shapes of SPARUS II and ALICE, from which the coefficients are computed.
 
 Body frame: x forward, y starboard, z down, origin at the centre of buoyancy, where the vertical
 thruster sits (paper, section II). Sources:
@@ -26,24 +26,24 @@ class Mast:
     """The mast: an upright strut of elliptic section on top of the hull."""
 
     x_m: float
-    """Of its middle."""
+    """Position of its middle."""
     chord_m: float
-    """Along x; c_m in the paper."""
+    """Chord along x; c_m in the paper."""
     width_m: float
-    """Across; w_m in the paper."""
+    """Width across; w_m in the paper."""
     root_z_m: float
-    """Where it leaves the hull; z points down."""
+    """Height at which it leaves the hull; z points down."""
     height_m: float
-    """h_m in the paper."""
+    """Height, h_m in the paper."""
 
     @property
     def middle_z_m(self) -> float:
-        """Halfway up: -(d_h + h_m) / 2 in the paper."""
+        """Mid-height: -(d_h + h_m) / 2 in the paper."""
         return self.root_z_m - self.height_m / 2.0
 
     @property
     def volume_m3(self) -> float:
-        """Of the elliptic cylinder."""
+        """Volume of the elliptic cylinder."""
         return math.pi / 4.0 * self.chord_m * self.width_m * self.height_m
 
 
@@ -52,9 +52,9 @@ class Pod:
     """A horizontal thruster: a motor body that carries the nozzle; two, mirrored."""
 
     outline: Outline
-    """Seen from outside, nozzle included."""
+    """Outline from outside, nozzle included."""
     body_diameter_m: float
-    """Of the motor body without the nozzle; d_th in the paper."""
+    """Diameter of the motor body without the nozzle; d_th in the paper."""
     y_m: float
     """Distance of its axis from the middle plane."""
 
@@ -71,12 +71,12 @@ class PodArm:
     aft_x_m: float
     fore_x_m: float
     tip_y_m: float
-    """Where it meets the pod's body: the span b of the finned section."""
+    """Place where it meets the pod's body: the span b of the finned section."""
     thickness_m: float
 
     @property
     def chord_m(self) -> float:
-        """Along x."""
+        """Chord along x."""
         return self.fore_x_m - self.aft_x_m
 
 
@@ -92,7 +92,7 @@ class Tunnel:
 
 @dataclass(frozen=True, kw_only=True)
 class Geometry:
-    """All that the coefficients follow from."""
+    """Geometry from which the coefficients are computed."""
 
     name: str
     outline: Outline
@@ -103,7 +103,7 @@ class Geometry:
 
     @cached_property
     def hull(self) -> Hull:
-        """How far hull and pods reach, to the millimetre."""
+        """Extent of hull and pods, to the millimetre."""
         x, radius = np.array(self.outline.x_m), np.array(self.outline.radius_m)
         keel = x[radius == radius.max()]
         deepest = float(radius.max())
@@ -118,7 +118,7 @@ class Geometry:
 
     @cached_property
     def envelope_volume_m3(self) -> float:
-        """Of hull, mast and pods, water inside the hull included."""
+        """Volume of hull, mast and pods, water inside the hull included."""
         return self.outline.volume_m3 + self.mast.volume_m3 + 2.0 * self.pod.body_volume_m3
 
     @cached_property
@@ -135,12 +135,12 @@ class Geometry:
 
 @dataclass(frozen=True, kw_only=True)
 class ThrusterSize:
-    """Room that a lateral thruster takes inside the hull."""
+    """Space that a lateral thruster takes inside the hull."""
 
     diameter_m: float
-    """Across its nozzle."""
+    """Diameter across its nozzle."""
     length_m: float
-    """Along its axis, with the motor."""
+    """Length along its axis, with the motor."""
     shell_m: float
     """Thickness of the hull around it."""
 
@@ -154,13 +154,13 @@ def farthest_tunnel_x(
 ) -> float:
     """Farthest x at which a hull still holds a lateral thruster.
 
-    The rule: the thruster, a cylinder lying athwartships at z = 0, stays inside the outline less
+    The rule: the thruster, a cylinder lying athwartships at z = 0, stays inside the outline minus
     the shell: r(x + R cos a) - shell >= hypot(L / 2, R sin a) all around its rims.
 
     Args:
-        outline: of the hull.
-        thruster: what has to fit.
-        end: of the hull.
+        outline: outline of the hull.
+        thruster: the thruster that must fit.
+        end: end of the hull.
 
     Returns:
         x of the thruster's axis, metres.
@@ -264,6 +264,6 @@ ALICE = Geometry(
 )
 
 PROPELLER_X_M = -0.573
-"""Of the surge propellers of SPARUS II (model)."""
+"""Position of the surge propellers of SPARUS II (model)."""
 ALICE_PROPELLER_X_M = round(PROPELLER_X_M + _MOVED_M, 3)
 """The same of ALICE, moved with the pods."""

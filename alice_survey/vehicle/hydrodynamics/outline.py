@@ -55,12 +55,12 @@ class Outline:
 
     @property
     def length_m(self) -> float:
-        """From end to end."""
+        """Length from end to end."""
         return self.x_m[-1] - self.x_m[0]
 
     @property
     def diameter_m(self) -> float:
-        """At its thickest."""
+        """Greatest diameter."""
         return 2.0 * max(self.radius_m)
 
     def radius_at(self, x_m: Array) -> Array:
@@ -77,7 +77,7 @@ class Outline:
 
     @cached_property
     def volume_m3(self) -> float:
-        """Inside the outline."""
+        """Volume inside the outline."""
         _, r, w = self.strips()
         return float(np.pi * np.sum(w * r**2))
 
@@ -89,7 +89,7 @@ class Outline:
 
     @cached_property
     def side_area_m2(self) -> float:
-        """Of the silhouette seen from the side."""
+        """Area of the silhouette seen from the side."""
         _, r, w = self.strips()
         return float(2.0 * np.sum(w * r))
 
@@ -100,12 +100,12 @@ class Outline:
 
     @property
     def frontal_area_m2(self) -> float:
-        """Of the largest section."""
+        """Area of the largest section."""
         return math.pi * self.diameter_m**2 / 4.0
 
     @cached_property
     def wetted_area_m2(self) -> float:
-        """Of the surface: frustums of cones, and flat ends if it has any."""
+        """Area of the surface: frustums of cones, and flat ends if it has any."""
         x, r = np.array(self.x_m), np.array(self.radius_m)
         sides = np.sum((r[1:] + r[:-1]) * np.hypot(np.diff(x), np.diff(r)))
         return float(np.pi * (sides + r[0] ** 2 + r[-1] ** 2))

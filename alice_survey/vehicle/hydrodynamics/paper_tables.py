@@ -15,7 +15,7 @@ Table = Literal["III", "IV", "V"]
 Column = Literal["estimated", "other"]
 
 _SIGNS = {"K_vdot": -1, "N_pdot": 1, "M_wdot": 1, "K_pp": -1, "K_vv": -1}
-"""The sign these have; the others are right in print (tests derive all of them)."""
+"""Correct signs of these; the others are right in print (tests derive all of them)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""What each part of a vehicle adds to its inertia and drag.
+"""Contribution of each part of a vehicle to its inertia and drag.
 
 A part is cut into elements. An element at p that feels motion along n adds J J^T times its added
 mass to M_A, with J = (n, p x n) the motion of p along n by the vehicle's six; and its drag
@@ -23,7 +23,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 @dataclass(frozen=True, kw_only=True)
 class Flow:
-    """The water, and the speed at which friction is taken."""
+    """The water, and the speed at which friction is evaluated."""
 
     density_kg_m3: float = 1025.0
     viscosity_m2_s: float = 1.05372e-6
@@ -43,11 +43,11 @@ class Flow:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HullPart:
-    """One part's share."""
+    """One part's contribution."""
 
     name: str
     added_mass: Array
-    """(6, 6) of M_A, about the body's origin."""
+    """(6, 6) share of M_A, about the body's origin."""
     quadratic: Array
     """(6, 6) coefficients of nu |nu|."""
 

@@ -27,7 +27,7 @@ _HULL, _EDGE, _WATER, _PART, _THRUST = "#f4ead5", "#34495e", "#cfe3f1", "#b9c4cc
 _COLOURS = {"reproduced": "#1e8449", "near": "#82b74b", "no": "#d68910"}
 _SIZE_IN, _LEFT_IN, _WIDTH_IN = (15.2, 8.9), 0.75, 8.5
 _X, _SIDE, _TOP = (-1.0, 1.15), (0.26, -0.40), (0.26, -0.26)
-"""Metres shown."""
+"""Limits shown, metres."""
 _FLOOR, _CEILING = 0.1, 10.0
 """Least and greatest ratio that the axis of ratios holds."""
 
@@ -38,11 +38,11 @@ def draw_coefficients(path: Path, geometry: Geometry, rows: Sequence[Coefficient
 
     Args:
         path: PNG, PDF or SVG.
-        geometry: of a vehicle that is known by name.
-        rows: of the comparison.
+        geometry: geometry of a vehicle that is known by name.
+        rows: rows of the comparison.
 
     Raises:
-        ConfigError: the suffix is none of the three.
+        ConfigError: the suffix is not one of the three.
     """
     check_figure_path(path)
     craft = fleet.vehicle(geometry.name)

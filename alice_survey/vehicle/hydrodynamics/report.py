@@ -1,4 +1,4 @@
-"""The paper's tables of coefficients next to what follows from shape: text, CSV, JSON, figure."""
+"""The paper's tables of coefficients next to values from shape: text, CSV, JSON, figure."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, fields

@@ -37,15 +37,15 @@ class ThrustCoefficient:
     way: str
     """`forward` or `reverse`."""
     model: float
-    """Before."""
+    """k_t before the calibration."""
     identified: float
     sigma: float
-    """NaN of a single reading."""
+    """Standard deviation; NaN for a single reading."""
     readings: int
 
     @property
     def factor(self) -> float:
-        """Identified over model."""
+        """Ratio of identified to model value."""
         return self.identified / self.model
 
 
@@ -54,7 +54,7 @@ def read_pulls(path: Path) -> list[Pull]:
 
     Raises:
         VehicleError: the file cannot be read, lacks a column, has no rows, or holds a value that is
-            no number, or a force against its speed.
+            not a number, or a force against its speed.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:

@@ -1,4 +1,4 @@
-"""Logs in other people's columns and frames: a TOML file, `ColumnMap`, says what is what."""
+"""Logs in foreign columns and frames: a TOML file, `ColumnMap`, defines their meaning."""
 
 import tomllib
 from pathlib import Path
@@ -23,11 +23,11 @@ _FLU_FROM_FRD = Rotation.from_matrix(np.diag(_FLU))
 
 
 class ColumnMap(Config):
-    """What the columns of a log mean."""
+    """Meaning of a log's columns."""
 
     time: str | None = None
     time_step_s: float | None = Field(None, gt=0)
-    """Between rows that have no time."""
+    """Interval between rows that have no time."""
     time_unit_s: float = Field(1.0, gt=0)
     """Seconds in one unit of the time column."""
     body: Literal["frd", "flu"] = "frd"
@@ -36,13 +36,13 @@ class ColumnMap(Config):
     """Axes of positions and attitudes; in enu z points upwards."""
     position: Three | None = None
     quaternion_xyzw: tuple[str, str, str, str] | None = None
-    """Of world_from_body."""
+    """Quaternion columns of world_from_body."""
     angles_deg: Three | None = None
-    """Roll, pitch, heading instead; of frd in ned only."""
+    """Roll, pitch, heading instead; for frd in ned only."""
     velocity: Three | None = None
-    """Over ground, in the body's axes, m/s."""
+    """Velocity over ground, in the body's axes, m/s."""
     rates: Three | None = None
-    """About the body's axes, rad/s."""
+    """Rates about the body's axes, rad/s."""
     altitude: str | None = None
     wrench: tuple[str, str, str, str, str, str] | None = None
     """Forces, N, and moments, N m, in the body's axes."""
@@ -53,10 +53,10 @@ class ColumnMap(Config):
 
 
 def read_column_map(path: Path) -> ColumnMap:
-    """Read what the columns of a log mean.
+    """Read the meaning of a log's columns.
 
     Raises:
-        VehicleError: the file cannot be read or says something that is not known.
+        VehicleError: the file cannot be read or has an unknown key or value.
     """
     try:
         with path.open("rb") as file:

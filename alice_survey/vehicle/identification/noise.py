@@ -1,7 +1,7 @@
-"""The noise of a log's channels: how large it is, and how it hangs together in time.
+"""The noise of a log's channels: its size, and its correlation in time.
 
-Residuals of a simulation hold what the model misses and what pushed the vehicle unseen, which last;
-sigmas that take them for white are too small. Here they are autoregressive, with the order that
+Residuals of a simulation include model errors and unmeasured forces, which are correlated;
+sigmas that assume white noise are too small. Here they are autoregressive, with the order that
 the Bayesian information criterion chooses (G. Schwarz, Ann. Statist. 6, 1978); order 0 is white.
 """
 
@@ -15,7 +15,7 @@ from alice_survey.base.frames import Array
 
 _HIGHEST_ORDER = 20
 _FADED = 1e-3
-"""Correlation that counts as none."""
+"""Correlation that counts as zero."""
 _SECOND_DIFFERENCE = 6.0
 """Variance of the second difference of white noise, by its own: 1 + 4 + 1."""
 _MAD = 1.4826
@@ -25,7 +25,7 @@ _MAD = 1.4826
 def noise_sigma(series: Array) -> float:
     """Standard deviation of the white noise on a smooth series, (T,), by second differences.
 
-    NaN rows are passed over. The median keeps steps and outliers out.
+    NaN rows are skipped. The median suppresses steps and outliers.
 
     Returns:
         NaN if fewer than 5 values are known.
@@ -93,15 +93,15 @@ def correlated_information(slopes: Sequence[Array], covariance: Array) -> Array:
 
 
 def score_information(scores: Sequence[Array], lags: int) -> Array:
-    """Covariance of the sum of scores that hang together in time, (P, P), positive definite.
+    """Covariance of the sum of scores correlated in time, (P, P), positive definite.
 
-    A score is what a row of the log adds to S^T e, over all channels: those that one push moves
-    together count together. The covariances at each lag fade out in a straight line (W. K. Newey &
+    A score is what a row of the log adds to S^T e, over all channels: those that one force moves
+    together count together. The covariances at each lag are tapered linearly (W. K. Newey &
     K. D. West, Econometrica 55(3), 1987).
 
     Args:
-        scores: (N_i, P), runs that have nothing to do with one another.
-        lags: how many rows apart scores still hang together.
+        scores: (N_i, P), independent runs.
+        lags: number of rows over which scores are correlated.
     """
     width = scores[0].shape[1]
     total = np.zeros((width, width))

@@ -1,4 +1,4 @@
-"""The joint fit: parameters whose simulation comes closest to all that was measured.
+"""The joint fit: parameters whose simulation comes closest to all measurements.
 
 Output-error least squares (L. Ljung, System Identification, 1999): each window is
 simulated from a start of its own, so that a log in one window is single shooting and one cut into
@@ -30,19 +30,19 @@ from alice_survey.vehicle.identification.windows import Mask, Window, cut, resid
 from alice_survey.vehicle.log import attitude_of
 
 _SHORT_S = 5.0
-"""Parameters are approached on windows no longer than this: over a short time a simulation stays
+"""First approximation uses windows no longer than this: over a short time a simulation stays
 near the measured motion whatever the parameters, so that the fit is led to the right minimum."""
 _ROUGH_STEP_S = 0.1
-"""Steps of the approach."""
+"""Integration steps of the first approximation."""
 _START_SIGMA = np.array([0.5] * 3 + [2.0] * 6)
-"""How far, rad, m/s and rad/s, a start may be from the first measured values before it costs one
+"""Distance, rad, m/s and rad/s, of a start from the first measured values that costs one
 sigma: wide, so that it matters only where nothing was measured."""
 _SETTLED = 1e-2
-"""A start is found when what is left to gain is this small against one sigma squared."""
+"""A start has converged when the remaining gain is this small against one sigma squared."""
 _NOTHING = 1e-6
-"""Or as small against all that is left."""
+"""Or this small against the whole sum of squares."""
 _ROUGH_SHARE = 0.1
-"""Of a channel's spread: what counts as one sigma in the approach, where it is not noise."""
+"""Share of a channel's spread used as sigma in the first approximation, if above noise."""
 _BLIND = 1e-3
 """Sigmas by which all residuals together move where a parameter changes by itself, or by 1 if it is
 smaller: a parameter that does less is not seen at all."""
@@ -50,11 +50,11 @@ _NOTICED = 2e-3
 """Change of the sum of squares, in sigmas squared, that ends a fit: a twentieth of a sigma of one
 parameter."""
 _HANG = 3.0
-"""Residuals are taken to hang together over so many correlation times, at most half a window."""
+"""Residuals count as correlated over this many correlation times, at most half a window."""
 _ROUNDS = 4
-"""Most times that the noise is estimated again."""
+"""Most re-estimations of the noise."""
 _SAME = 0.02
-"""Relative change of the noise that is none."""
+"""Relative change of the noise that counts as zero."""
 _LEAST_SIGMA = np.array([1e-6] * CHANNELS)
 """Noise cannot be estimated smaller: m/s, rad/s, rad."""
 _SINGULAR = 1e-12
@@ -63,17 +63,17 @@ _SINGULAR = 1e-12
 
 @dataclass(frozen=True, kw_only=True)
 class Simulation:
-    """How windows are simulated."""
+    """Settings of the simulation of windows."""
 
     longest_step_s: float = 0.025
     """Rows farther apart are crossed in several steps."""
     hold: bool = False
-    """Inputs stay until the next row; else they run straight between rows."""
+    """Inputs are held until the next row; else they are linear between rows."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class OutputErrorFit:
-    """Parameters and how well they are known."""
+    """Fitted parameters with their covariance."""
 
     parameters: Parameters
     values: Array
@@ -86,9 +86,9 @@ class OutputErrorFit:
     at_bound: Mask
     """(P,) bool: held by a bound, so without sigma."""
     channel_sigma: Array
-    """(9,) of the residuals, NaN where nothing was measured."""
+    """(9,) sigmas of the residuals, NaN where nothing was measured."""
     correlation_s: Array
-    """(9,) time over which residuals hang together: zero if white."""
+    """(9,) correlation time of the residuals: zero if white."""
     windows: Sequence[Window]
     starts: Sequence[Array]
     """(10,) state each window begins with, nu relative to the water."""
@@ -97,13 +97,13 @@ class OutputErrorFit:
 
     @property
     def sigma(self) -> Array:
-        """(P,) NaN of parameters at a bound."""
+        """(P,) sigmas; NaN of parameters at a bound."""
         sigma: Array = np.sqrt(np.diag(self.covariance))
         return np.where(self.at_bound, np.nan, sigma)
 
     @property
     def correlation(self) -> Array:
-        """(P, P); NaN of parameters at a bound."""
+        """(P, P) correlations; NaN of parameters at a bound."""
         sigma = self.sigma
         matrix: Array = self.covariance / np.outer(sigma, sigma)
         return matrix
@@ -126,7 +126,7 @@ def fit_output_error(
         simulation: steps and inputs.
         channel_sigma: (9,) noise of velocity over ground, m/s, rates, rad/s, and attitude, rad;
             estimated from the residuals when not given.
-        most_evaluations: of all windows, in each round.
+        most_evaluations: most evaluations of all windows, in each round.
 
     Raises:
         VehicleError: the simulation does not stay finite at the start, the fit does not settle, or
@@ -190,7 +190,7 @@ class _FitProblem:
         self.measured = [
             np.isfinite(residual_channels(w, _blank(w))) & np.ones(CHANNELS, bool) for w in windows
         ]
-        # Of the parameters whose slopes were last asked for: a trial nearby begins from there, so
+        # Starts of the parameters whose slopes were last requested: a trial nearby begins there, so
         # that it comes back to the same residuals as its step goes to nothing.
         self.samples = sum(int(mask.sum()) for mask in self.measured)
         self.starts = [window.start.copy() for window in windows]
@@ -214,7 +214,7 @@ class _FitProblem:
             raise VehicleError(f"the logs do not determine {', '.join(names)}: do not free them")
 
     def residuals(self, values: Array) -> Array:
-        """All residuals in sigmas, less what the starts explain; infinite where there are none."""
+        """All residuals in sigmas, minus what the starts explain; infinite where there are none."""
         solved = self._solve(values)
         if solved is None:
             size = sum(int(m.sum()) for m in self.measured) + START * len(self.windows)
@@ -242,7 +242,7 @@ class _FitProblem:
         return slopes
 
     def estimate_sigma(self, values: Array) -> float:
-        """Take the noise from the residuals; how much it changed, relative."""
+        """Estimate the noise from the residuals; return its relative change."""
         sigma = self._channel_sigma(self._by_channel(self.residuals(values)))
         known = np.isfinite(sigma)
         new = np.maximum(np.where(known, sigma * self.sigma, 1.0), _LEAST_SIGMA)
@@ -272,7 +272,7 @@ class _FitProblem:
             # Few stretches that have nothing to do with one another show their own spread badly.
             meat *= spread * blocks / (blocks - 1.0)
             coloured = inverse @ (meat + self._prior(table[:, free])) @ inverse
-            # By chance it may come out below that of white noise: such luck is not claimed.
+            # By chance it may come out below that of white noise: this is not used.
             least = np.sqrt(np.maximum(np.diag(inverse) / np.diag(coloured), 1.0))
             coloured *= np.outer(least, least)
         covariance, white = (np.zeros((self.count, self.count)) for _ in range(2))
@@ -420,7 +420,7 @@ class _FitProblem:
 
 
 def _first_sigma(windows: Sequence[Window]) -> Array:
-    """What counts as one sigma at first, (9,): the noise, or a share of the spread if larger."""
+    """First sigma of each channel, (9,): the noise, or a share of the spread if larger."""
     sigma = np.full(CHANNELS, np.nan)
     attitude = [np.unwrap(_known(attitude_of(w.record.attitude)), axis=0) for w in windows]
     for channel in range(CHANNELS):

@@ -31,7 +31,7 @@ TRIMS = ("trim_x_m", "trim_y_m", "trim_z_m")
 BIASES = tuple(f"bias_{m}_{'mps' if i < 3 else 'rad_s'}" for i, m in enumerate(MOTIONS))
 GAINS = tuple(f"gain_{force}" for force in FORCES)
 OTHERS = (*CURRENTS, NET_BUOYANCY, *TRIMS, *BIASES, *GAINS)
-"""Parameters that are no coefficients: a constant current; buoyancy less weight; where the weight
+"""Parameters that are not coefficients: a constant current; buoyancy minus weight; where the weight
 acts from the centre of buoyancy (its righting moment only, not the inertia); constant errors of the
 velocity and rate sensors; and factors on the forces and moments that a log gives, where its thrusts
 are no calibrated ones (speeds of thrusters are not scaled: a bollard pull calibrates those)."""
@@ -44,7 +44,7 @@ _GREATEST: Mapping[int, float] = MappingProxyType({CURRENT: 5.0, TRIM: 1.0})
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Parameters:
-    """Free parameters of a vehicle; everything else stays as the vehicle says."""
+    """Free parameters of a vehicle; everything else is as in the vehicle."""
 
     vehicle: Vehicle
     names: tuple[str, ...]
@@ -91,7 +91,7 @@ class Parameters:
         return self.vehicle.coefficients.replaced(name, free)
 
     def others(self, values: Array) -> dict[str, float]:
-        """All parameters that are no coefficients."""
+        """All parameters that are not coefficients."""
         free = dict(zip(self.names, (float(v) for v in values), strict=True))
         return {name: free.get(name, self._given(name)) for name in OTHERS}
 
@@ -138,7 +138,7 @@ def free_parameters(
 
     Raises:
         VehicleError: a name is not known, comes twice, or is fixed as well; two names stand for one
-            added mass; a fixed one is none of the parameters that are no coefficients.
+            added mass; a fixed one is a coefficient.
     """
     flat = [one for name in names for one in GROUPS.get(name, (name,))]
     if not flat:

@@ -1,4 +1,4 @@
-"""Pictures of an identification: measured motion and the model's, side by side."""
+"""Plots of an identification: measured and simulated motion."""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ def draw_motion(path: Path, title: str, found: MotionValidation) -> None:
 
     Args:
         path: PNG, PDF or SVG.
-        title: of the picture.
+        title: title of the plot.
         found: what to draw.
     """
     figure = new_figure(8.5, 13)
@@ -82,7 +82,7 @@ def _series(values: Array, gaps: Places) -> Array:
 
 
 def _limit(strip: Axes, values: Array, least: float) -> None:
-    """Heights that hold nearly all values: what runs away leaves the strip."""
+    """Limits that include nearly all values: diverging ones leave the strip."""
     known = values[np.isfinite(values)]
     if not len(known):
         return

@@ -49,7 +49,7 @@ from alice_survey.vehicle.vehicle import Vehicle
 
 JOINT_FREE = ("X_uu", "Y_vv", "Z_ww", "N_rr", "current")
 TWO_STEP_FREE = ("X_udot", "X_uu", "Z_wdot", "Z_ww", "N_rdot", "N_rr")
-"""What is free when nothing is said; the second as in the paper's three manoeuvres."""
+"""Parameters free by default; the second as in the paper's three manoeuvres."""
 _HIGH_CORRELATION = 0.9
 _LASTING = 0.2
 """Correlation time, by the length of windows, from which their sigmas are not to be trusted."""
@@ -59,7 +59,7 @@ _POOR = 0.25
 
 @dataclass(frozen=True, kw_only=True)
 class IdentifyOptions:
-    """What `vehicle identify` is asked for."""
+    """Options of `vehicle identify`."""
 
     vehicle: str = "alice"
     """A name, or a TOML or JSON file."""
@@ -69,11 +69,11 @@ class IdentifyOptions:
     bollard: Path | None = None
     free: tuple[str, ...] = ()
     held: tuple[str, ...] = ()
-    """`NAME=VALUE` of parameters that are no coefficients."""
+    """`NAME=VALUE` of parameters that are not coefficients."""
     method: str = "joint"
     """`joint` or `two-step`."""
     columns: Path | None = None
-    """What the columns of logs mean, if they are not the documented ones."""
+    """Column map of the logs, if they do not have the documented columns."""
     given: tuple[str, ...] = ()
     """Rates that follow the log."""
     window_s: float | None = None
@@ -92,7 +92,7 @@ class _Identified:
     fit: OutputErrorFit | None
     """None of the two-step calibration."""
     steps: tuple[str, ...]
-    """In which each was calibrated; none of the joint fit."""
+    """Step in which each was calibrated; none of the joint fit."""
 
 
 def identify_report(
@@ -285,7 +285,7 @@ def _text(
 
 
 def _remarks(result: _Identified) -> list[str]:
-    """What a reader must know of the numbers."""
+    """Caveats on the numbers."""
     lines = [""]
     names, fit = result.parameters.names, result.fit
     poor = poorly_determined(names, result.values, result.sigma)
@@ -383,7 +383,7 @@ def _data(
     own: MotionValidation,
     validation: MotionValidation | None,
 ) -> dict[str, Any]:
-    """The same as JSON values; what is not known is null."""
+    """The same as JSON values; unknown ones are null."""
 
     def known(value: float) -> float | None:
         return float(value) if math.isfinite(value) else None

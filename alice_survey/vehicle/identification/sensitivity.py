@@ -42,11 +42,11 @@ class Record(NamedTuple):
     rps: Array
     """(T, n) speeds of the thrusters; n is 0 where the wrench is given."""
     wrench: Array
-    """(T, 6) given, besides that of the thrusters."""
+    """(T, 6) given wrench, besides that of the thrusters."""
     attitude: Array
     """(T, 4) measured quaternions, NaN where there is none."""
     acceleration: Array
-    """(T, 6) of given motions, from each row to the next."""
+    """(T, 6) accelerations of given motions, from each row to the next."""
 
 
 @kernel
@@ -85,7 +85,7 @@ def _step(
 ) -> None:
     """Advance a state and its sensitivities by one classical Runge-Kutta step.
 
-    Between two rows a wrench runs straight, and a thruster's speed as a first-order lag with its
+    Between two rows a wrench is linear, and a thruster's speed as a first-order lag with its
     time constant does under a constant command: straight if slow, and exact for a thruster that is
     commanded with each row. Held inputs stay at the first row's.
     """
@@ -136,7 +136,7 @@ def observe(
     out: Array,
     slopes: Array,
 ) -> None:
-    """Write what the sensors should tell, (9,), and its slopes, (9, C).
+    """Write the predicted sensor readings, (9,), and their slopes, (9, C).
 
     Velocity over ground and rates in the body frame with their biases, and twice the vector part of
     the turn from the measured attitude to the state's: for small turns the angles about the axes.
@@ -250,7 +250,7 @@ def simulate(
         for i in range(STATES):
             states[row + 1, i] = states[row, i]
         span = record.time_s[row + 1] - record.time_s[row]
-        # A whisker over a step is still one: times are written with rounding.
+        # Slightly over a step is still one step: times are written with rounding.
         count = max(int(np.ceil(span / longest_step_s - 1e-6)), 1)
         for i in range(count):
             _step(

@@ -40,9 +40,9 @@ class Physics(NamedTuple):
     lag_s: Array
     """(n,) time constants of the thrusters."""
     current_ne: Array
-    """(2,) m/s."""
+    """(2,) current, m/s."""
     bias: Array
-    """(6,) added to what the velocity and rate sensors tell."""
+    """(6,) biases added to the velocity and rate readings."""
     gain: Array
     """(6,) by which a given wrench is multiplied."""
     given: Array
@@ -50,7 +50,7 @@ class Physics(NamedTuple):
 
 
 class SlopeScratch(NamedTuple):
-    """Room for intermediate results."""
+    """Work arrays for intermediate results."""
 
     force: Array
     """(3, 6): force, tilted force, rates of nu."""
@@ -73,7 +73,7 @@ class SlopeScratch(NamedTuple):
 
 
 def scratch_for(columns: int, thrusters: int) -> SlopeScratch:
-    """Room for so many columns and thrusters."""
+    """Work arrays for a number of columns and thrusters."""
     return SlopeScratch(
         np.zeros((3, 6)), np.zeros((6, 6)), np.zeros((STATES, STATES)), np.zeros((STATES, columns)),
         np.zeros((3, STATES)), np.zeros((3, STATES, columns)), np.zeros(thrusters), np.zeros(6),

@@ -7,7 +7,7 @@ with little acceleration give the damping of a motion, those with much its added
 adjusted one coefficient after the other by hand until the curves met; here each is a least-squares
 regression, and all are repeated until they agree.
 
-It needs no simulation and no start, but it takes measured velocities as true, so noise pulls the
+It needs no simulation and no start, but it takes measured velocities as true, so noise biases the
 coefficients towards zero, and it cannot find a current. The joint fit has neither limit.
 """
 
@@ -35,9 +35,9 @@ from alice_survey.vehicle.identification.slopes import (
 from alice_survey.vehicle.identification.windows import Mask, Window
 
 STEPS = (("surge", "X"), ("heave", "ZM"), ("turns", "NYK"))
-"""What is calibrated in turn, and the equations that determine it."""
+"""Coefficients calibrated in turn, and the equations that determine them."""
 _SMOOTH_S = 1.0
-"""Over which the equations are averaged."""
+"""Time over which the equations are averaged."""
 _PASSES, _AGREED = 60, 1e-6
 
 
@@ -49,9 +49,9 @@ class TwoStep:
     values: Array
     """(P,)"""
     sigma: Array
-    """(P,) of the regressions."""
+    """(P,) sigmas of the regressions."""
     step: tuple[str, ...]
-    """(P,) in which step each was calibrated."""
+    """(P,) step in which each was calibrated."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -77,11 +77,11 @@ def calibrate(windows: Sequence[Window], parameters: Parameters) -> TwoStep:
     """Calibrate coefficients in turn.
 
     Args:
-        windows: of manoeuvres, with velocities and rates.
+        windows: windows of manoeuvres, with velocities and rates.
         parameters: coefficients to free.
 
     Raises:
-        VehicleError: a free parameter is no coefficient, or the rows do not determine one.
+        VehicleError: a free parameter is not a coefficient, or the rows do not determine one.
     """
     strange = [name for name in parameters.names if name in OTHERS]
     if strange:

@@ -1,4 +1,4 @@
-"""How well a model foretells a log it was not fitted to.
+"""Prediction errors of a model on a log it was not fitted to.
 
 The fit of a velocity is 100 (1 - |y - y_model| / |y - mean(y)|) per cent over the rows where it was
 measured (normalised root mean square, as in the System Identification Toolbox's `compare`): 100 is
@@ -47,15 +47,15 @@ class Forecast:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MotionValidation:
-    """How a model foretells a log."""
+    """Prediction errors of a model on a log."""
 
     source: str
     time_s: Array
-    """(T,) of all windows."""
+    """(T,) times of all windows."""
     measured: Array
     """(T, 6) velocity over ground and rates."""
     simulated: Array
-    """(T, 6) from the start of each window without looking again."""
+    """(T, 6) simulated from the start of each window without correction."""
     constant: Array
     """(T, 6) the velocity at the start of each window."""
     window_s: float
@@ -64,7 +64,7 @@ class MotionValidation:
 
     @property
     def fit_percent(self) -> Array:
-        """(6,) of the model; NaN where nothing was measured or nothing moves."""
+        """(6,) fit of the model; NaN where nothing was measured or nothing moves."""
         return fit_percent(self.measured, self.simulated)
 
     @property
@@ -74,7 +74,7 @@ class MotionValidation:
 
 
 def fit_percent(measured: Array, predicted: Array) -> Array:
-    """Normalised fit of each column, (K,), of (T, K) series; rows with NaN are passed over."""
+    """Normalised fit of each column, (K,), of (T, K) series; rows with NaN are skipped."""
     result = np.full(measured.shape[1], np.nan)
     for k in range(measured.shape[1]):
         known = np.isfinite(measured[:, k]) & np.isfinite(predicted[:, k])
@@ -96,8 +96,8 @@ def validate(
     """Compare simulations with windows of a log.
 
     Args:
-        windows: of the log.
-        parameters: of the model.
+        windows: windows of the log.
+        parameters: parameters of the model.
         values: (P,) theirs.
         simulation: steps and inputs.
         horizons_s: times after which forecasts are judged; those longer than a window are left out.

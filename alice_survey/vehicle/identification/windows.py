@@ -20,7 +20,7 @@ Mask = NDArray[np.bool_]
 CHANNEL_NAMES = ("u", "v", "w", "p", "q", "r", "roll", "pitch", "heading")
 """Velocity over ground, m/s; rates, rad/s; attitude about the body's axes, rad."""
 _FEWEST_ROWS = 5
-"""A shorter stretch gives less than its free start asks."""
+"""Fewest rows: a shorter stretch gives less information than its free start needs."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,7 +55,7 @@ def make_windows(
             a row stays what it was.
         vehicle: whose thrusters they are.
         window_s: longest duration of a window; whole stretches without gaps if not given.
-        gap_s: longest step that is no gap, see `segments`; also the longest that an input is
+        gap_s: longest step that is not a gap, see `segments`; also the longest that an input is
             carried on.
         source: `rpm`, `thrust` or `wrench`: which input to take, if the log holds several.
         given: rates, of p, q and r, that follow the log instead of the forces, such as those of
@@ -162,7 +162,7 @@ def of_windows(windows: Sequence[Window], vehicle: Vehicle) -> Vehicle:
 
 
 def residual_channels(window: Window, observed: Array) -> Array:
-    """Simulated less measured, (T, 9), NaN where nothing was measured."""
+    """Simulated minus measured, (T, 9), NaN where nothing was measured."""
     difference = np.empty((len(observed), CHANNELS))
     difference[:, :6] = observed[:, :6] - window.measured
     difference[:, list(window.given)] = np.nan
@@ -203,7 +203,7 @@ def _given(log: VehicleLog, motion: Array, names: Sequence[str]) -> tuple[int, .
 
 
 def _accelerations(time_s: Array, motion: Array, places: tuple[int, ...]) -> Array:
-    """Of given motions, (T, 6), from each row to the next; zero of others and in the last row."""
+    """Accelerations of given motions, (T, 6), row to row; zero of others and in the last row."""
     result = np.zeros(motion.shape)
     for place in places:
         result[:-1, place] = np.diff(motion[:, place]) / np.diff(time_s)
@@ -226,7 +226,7 @@ def _held(time_s: Array, rps: Array, wrench: Array, gap_s: float | None) -> Mask
 
 
 def _pieces(time_s: Array, known: Mask, window_s: float | None) -> list[slice]:
-    """Runs of rows with an input, cut into equal windows no longer than asked."""
+    """Runs of rows with an input, cut into equal windows no longer than requested."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], known.astype(np.int8), [0]])))
     pieces = []
     for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):

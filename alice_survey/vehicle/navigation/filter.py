@@ -3,18 +3,17 @@
 After J. Sola, Quaternion kinematics for the error-state Kalman filter, 2017, with the attitude's
 error in NED (his global one: truth = exp(error) belief), and measurements as increments of angle
 and velocity, so that prediction is exact but for noise and the course of velocity in a tick. The
-covariance is (25, 25); `state` says what lies where, and `prediction` carries
-it over a tick. Errors of the instruments that do not average out are states, else it would promise
-too much.
+covariance is (25, 25); `state` defines the layout, and `prediction` propagates it over a tick.
+Errors of the instruments that do not average out are states, else it would be too optimistic.
 
 Four choices keep the covariance honest over hours:
 - The attitude's error is in NED, where heading is one number, and is not reset (see `correct`): no
-  correction of the tilt, repeated at random, makes gravity tell of heading.
+  correction of the tilt, repeated at random, makes gravity give information on heading.
 - The velocity is kept in the body frame. Were it in NED, a ping after a long drop-out would tie it
-  to a heading it says nothing of, and the next, about another velocity, would pass for knowledge.
+  to a heading it does not measure, and the next, about another velocity, would count as knowledge.
 - It is kept as the DVL measures it, with the DVL's scale error in it: a ping's row then holds no
-  believed velocity, whose error is in the innovation too. The scale acts where position grows. What
-  it does to accelerations, a part in 500 of them, is process noise.
+  estimated velocity, whose error is in the innovation too. The scale acts where position grows.
+  Its effect on accelerations, a part in 500 of them, is process noise.
 - The scale is considered, not estimated (the Schmidt-Kalman filter; R. G. Brown and P. Y. C. Hwang,
   Introduction to Random Signals and Applied Kalman Filtering): noisy increments as regressors pull
   a factor towards 0, and over half an hour that drove it off by four of its sigmas.
@@ -59,7 +58,7 @@ from alice_survey.vehicle.navigation.state import (
 from alice_survey.vehicle.rotations import matrix_of, turn, wrapped
 
 DOUBT_AFTER = (50, 50, 40, 40, 6, 6)
-"""Rejections in a row, of each instrument, after which the filter doubts itself: 5 s of compass and
+"""Rejections in a row, of each instrument, after which covariances are widened: 5 s of compass and
 depth, 2 s of the DVL, 6 fixes. Outliers do not come like that: of 1 in 20, 6 in a row once in 64
 million."""
 
@@ -102,7 +101,7 @@ def absorb(nav: NavigationState, innovation: float, variance: float) -> None:
 
 @kernel
 def remaining(nav: NavigationState, innovation: float) -> float:
-    """An innovation about the belief, less what this tick's corrections account for already."""
+    """An innovation about the estimate, minus what this tick's corrections already account for."""
     h, error = nav.scratch[ROW], nav.scratch[CORRECTION]
     for j in range(ERROR):
         innovation -= h[j] * error[j]
@@ -127,8 +126,8 @@ def weigh(
         sensors: for the gate.
         instrument: row of `counts`.
         place: in `innovations`.
-        innovation: measured minus believed.
-        noise_variance: of the measurement.
+        innovation: measured minus estimated.
+        noise_variance: noise variance of the measurement.
         doubted: where the errors begin that are widened after too many rejections in a row.
         doubted_count: how many.
 
@@ -167,7 +166,7 @@ def lever_row(nav: NavigationState, sensors: Sensors, place: int, axis: int) -> 
     """Row of an instrument's position along an axis of NED, into ROW.
 
     Returns:
-        What is believed of that coordinate, metres.
+        The estimate of that coordinate, metres.
     """
     h, turned, x = nav.scratch[ROW], nav.turns[BELIEVED], nav.nominal
     for j in range(ERROR):
@@ -256,8 +255,8 @@ def use_beams(nav: NavigationState, sensors: Sensors, through_water: bool) -> in
     if not through_water:
         speed = math.sqrt(u * u + v * v + w * w)
         sigma = sensors.beam_noise + sensors.beam_noise_per_speed * speed
-    # Opposite pairs of beams add up to the same but for noise: where they do not, one heard
-    # something else, and after a drop-out the filter could not tell which. No number fails this.
+    # Opposite pairs of beams add up to the same except for noise: where they do not, one received
+    # another echo, and after a drop-out the filter could not know which. NaN passes this test.
     odd = readings[first] + readings[first + 2] - readings[first + 1] - readings[first + 3]
     if odd * odd > sensors.gate * 4.0 * sigma * sigma:
         nav.counts[instrument, REJECTED] += 1
@@ -314,9 +313,9 @@ def use_fix(
         nav: the filter.
         sensors: the instruments.
         instrument: row of `counts`.
-        place: of the antenna or transponder in `sensors.place`.
-        reading: of north; east follows.
-        noise_variance: of each.
+        place: place of the antenna or transponder in `sensors.place`.
+        reading: reading of north; east follows.
+        noise_variance: noise variance of each.
         bias: where the errors of the fix's bias begin; -1 of none.
 
     Returns:
@@ -359,12 +358,12 @@ def use_fix(
 
 @kernel
 def correct(nav: NavigationState) -> None:
-    """Move the gathered correction into the belief, and forget it.
+    """Apply the gathered correction to the estimate, and clear it.
 
     P stays as it is, as in an invariant filter (A. Barrau and S. Bonnabel, The invariant extended
     Kalman filter as a stable observer, 2017): gravity is what corrects the tilt, and it sees the
-    tilt as it will be counted from the new belief. Sola's reset (314) would let a heading that is
-    off lean on every such correction, and gravity then tell of heading.
+    tilt relative to the new estimate. Sola's reset (314) would let a heading error
+    affect every such correction, and gravity would then give information on heading.
     """
     x, error = nav.nominal, nav.scratch[CORRECTION]
     angle, turned = error[ATTITUDE : ATTITUDE + 3], nav.turns[BELIEVED]

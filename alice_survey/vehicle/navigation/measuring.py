@@ -1,4 +1,4 @@
-"""What the instruments report of the truth: kernels that write `NavigationState.readings`.
+"""Readings of the instruments from the truth: kernels that write `NavigationState.readings`.
 
 The truth is a vector (13,): position NED, quaternion ned_from_body xyzw, velocity of the body's
 origin over ground in NED, body rates.
@@ -49,7 +49,7 @@ from alice_survey.vehicle.rotations import matrix_of, turn_between
 
 @kernel
 def drift(dt_s: float, sensors: Sensors, nav: NavigationState, rng: np.random.Generator) -> None:
-    """Let the instruments' biases move on by a tick: random walks and Gauss-Markov processes."""
+    """Advance the instruments' biases by a tick: random walks and Gauss-Markov processes."""
     hidden, root = nav.hidden, math.sqrt(dt_s)
     for i in range(3):
         hidden[i] += sensors.gyro_walk * root * rng.standard_normal()
@@ -71,7 +71,7 @@ def drift(dt_s: float, sensors: Sensors, nav: NavigationState, rng: np.random.Ge
 def _gauss_markov(
     values: Array, i: int, steps: float, sigma: float, rng: np.random.Generator
 ) -> None:
-    """Move one value on by a part of its correlation time."""
+    """Advance one value by a part of its correlation time."""
     kept = math.exp(-steps)
     values[i] = kept * values[i] + sigma * math.sqrt(1.0 - kept * kept) * rng.standard_normal()
 
@@ -200,7 +200,7 @@ def measure_usbl(
     depth = now[2] + _row(turn, 2, place[0], place[1], place[2])
     a, b = north - sensors.boat_north, east - sensors.boat_east
     c = depth - sensors.boat_depth
-    # A transponder that breaks the surface is not heard.
+    # A transponder that breaks the surface is not received.
     if depth <= 0.0 or math.sqrt(a * a + b * b + c * c) > sensors.usbl_most_range:
         return False
     sigma = usbl_sigma(sensors, north, east, depth)
@@ -225,7 +225,7 @@ def measure_dvl(
     nav: NavigationState,
     rng: np.random.Generator,
 ) -> None:
-    """One ping: ranges and velocities along the beams, and now and then through the water.
+    """One ping: ranges and velocities along the beams, and at intervals through the water.
 
     A velocity along a beam b is b . ((1 + s) Rz(a)^T v + bias), of the velocity v of the instrument
     in the body frame, its scale error s and its misalignment a about the vertical.

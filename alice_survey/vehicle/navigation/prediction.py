@@ -1,6 +1,6 @@
-"""The filter's prediction: kernels that carry belief and covariance over a tick.
+"""The filter's prediction: kernels that propagate estimate and covariance over a tick.
 
-See `filter` for what is believed, and why so.
+See `filter` for the states and the reasons.
 """
 
 import math
@@ -37,13 +37,13 @@ from alice_survey.vehicle.navigation.state import (
 from alice_survey.vehicle.rotations import matrix_of, turn
 
 MANOEUVRE_S = 5.0
-"""How long the vehicle accelerates one way: half a turn of ALICE at 17 deg/s (paper, section VII)
+"""Time of acceleration in one direction: half a turn of ALICE at 17 deg/s (paper, section VII)
 takes so long."""
 
 
 @kernel
 def predict(dt_s: float, sensors: Sensors, nav: NavigationState) -> None:
-    """Move belief and covariance on by the IMU's increments in `readings`.
+    """Propagate estimate and covariance by the IMU's increments in `readings`.
 
     With the velocity v in the body frame, the turn R, the increments a of angle and d of velocity,
     s = v + d + R^T g dt is the new velocity in the old frame; v' = exp(-a) s, R' = R exp(a), and

@@ -1,4 +1,4 @@
-"""What the vehicle carries to know where it is, and how well each instrument measures.
+"""Navigation instruments of the vehicle, and the accuracy of each.
 
 Values are those of instruments a SPARUS II carries or could: an AHRS of the Xsens MTi-300 class, a
 DVL of the 600 kHz to 1 MHz Janus class, a strain-gauge pressure sensor, a GPS receiver, and an
@@ -48,10 +48,10 @@ class ImuSpec:
     """Reaches the stability in run after an hour (inferred)."""
     accelerometer_noise_mps_per_sqrt_s: float = 60e-6 * GRAVITY
     accelerometer_bias_sigma_mps2: float = GRAVITY * math.radians(0.2)
-    """What the accuracy of roll and pitch at rest amounts to (inferred)."""
+    """Equivalent of the accuracy of roll and pitch at rest (inferred)."""
     accelerometer_bias_walk_mps2_per_sqrt_s: float = 15e-6 * GRAVITY / 60.0
     tilt_sigma_rad: float = math.radians(0.2)
-    """Of roll and of pitch at the start."""
+    """Sigma of roll and of pitch at the start."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,15 +74,15 @@ class DvlSpec:
     rate_hz: float = 5.0
     beam_angle_rad: float = math.radians(30.0)
     beam_noise_mps: float = 0.0035
-    """Along a beam at rest, a ping: 5 mm/s horizontally (inferred)."""
+    """Noise of a ping along a beam at rest: 5 mm/s horizontally (inferred)."""
     beam_noise_per_speed: float = 0.002
-    """Added, of the speed over ground (inferred)."""
+    """Noise added, as a share of the speed over ground (inferred)."""
     scale_sigma: float = 0.002
-    """Constant: the speed of sound and the beams' angle."""
+    """Constant scale error: the speed of sound and the beams' angle."""
     bias_sigma_mps: float = 0.001
-    """Constant, of surge and of sway (inferred)."""
+    """Constant bias of surge and of sway (inferred)."""
     misalignment_sigma_rad: float = math.radians(0.2)
-    """Constant, about the vertical, left by calibration (inferred)."""
+    """Constant misalignment about the vertical, after calibration (inferred)."""
     range_noise_m: float = 0.02
     range_noise_fraction: float = 0.003
     """Added in squares, of the range (both inferred)."""
@@ -90,20 +90,20 @@ class DvlSpec:
     """Inferred."""
     most_range_m: float = 75.0
     most_tilt_rad: float = math.radians(25.0)
-    """Of the instrument's axis from the vertical (inferred)."""
+    """Greatest tilt of the instrument's axis from the vertical (inferred)."""
     ping_loss: float = 0.01
     beam_loss: float = 0.01
     """Probabilities of no echo (inferred)."""
     outlier_probability: float = 0.001
-    """That a beam hears something else, a fish or a second echo (inferred)."""
+    """Probability that a beam receives another echo, of a fish or a second one (inferred)."""
     outlier_mps: float = 2.0
-    """Half width of what it then reports."""
+    """Half width of the reading it then gives."""
     dropouts_s: tuple[tuple[float, float], ...] = ()
     """Times (from, to) without any echo."""
     water_every: int = 5
-    """Every so many pings listen to the water; 0: none does. Without bottom lock all do."""
+    """Interval, in pings, of water tracking; 0: never. Without bottom lock all pings do it."""
     water_noise_mps: float = 0.01
-    """Along a beam (inferred)."""
+    """Noise along a beam (inferred)."""
     water_least_altitude_m: float = 6.0
     """The layer must lie clear of the bottom's echo (inferred)."""
 
@@ -134,7 +134,7 @@ class GpsSpec:
     bias_correlation_s: float = 600.0
     """Inferred."""
     most_depth_m: float = 0.3
-    """Of the body's origin, with a fix."""
+    """Greatest depth of the body's origin with a fix."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,14 +142,14 @@ class UsblSpec:
     """Horizontal position by an acoustic transceiver under a boat; off unless it has a rate."""
 
     position_body_m: Place = (-0.39, 0.0, -0.25)
-    """Of the transponder, on the mast (inferred)."""
+    """Position of the transponder, on the mast (inferred)."""
     rate_hz: float = 0.0
     boat_ned_m: Place = (0.0, 0.0, 1.0)
-    """Of the transceiver."""
+    """Position of the transceiver."""
     noise_m: float = 0.5
-    """The boat's own position (inferred)."""
+    """Bias of the boat's own position (inferred)."""
     noise_fraction: float = 0.0175
-    """Added in squares, of the slant range: 1 degree (SeaTrac class, inferred)."""
+    """Added in squares, as a share of the slant range: 1 degree (SeaTrac class, inferred)."""
     outlier_probability: float = 0.05
     """Inferred."""
     outlier_m: float = 20.0
@@ -162,9 +162,9 @@ class Sensors(NamedTuple):
 
     tick_s: float
     place: Array
-    """(6, 3) of the instruments and of the followed point on the body."""
+    """(6, 3) positions of the instruments and of the followed point on the body."""
     hull: Array
-    """(P, 3) points of the vehicle's hull, whose clearance is reckoned."""
+    """(P, 3) points of the vehicle's hull, whose clearance is computed."""
     beams: Array
     """(4, 3) unit vectors in the body frame."""
     dropouts_s: Array
@@ -225,7 +225,7 @@ class Sensors(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class SensorSuite:
-    """All instruments, and how the filter treats them."""
+    """All instruments, and the filter's settings for them."""
 
     imu: ImuSpec = field(default_factory=ImuSpec)
     compass: CompassSpec = field(default_factory=CompassSpec)
@@ -234,7 +234,7 @@ class SensorSuite:
     gps: GpsSpec = field(default_factory=GpsSpec)
     usbl: UsblSpec = field(default_factory=UsblSpec)
     current_sigma_mps: float = 0.3
-    """Of north and of east each: the filter's belief in currents, a Gauss-Markov process."""
+    """Sigma of north and of east each: the filter's prior of currents, a Gauss-Markov process."""
     current_correlation_s: float = 3600.0
     gate_sigmas: float = 5.0
     """A measurement farther from its prediction is not used; by chance 1 in 1.7 million is."""
@@ -243,18 +243,18 @@ class SensorSuite:
     altitude_age_s: float = 2.0
     """An altitude whose last ping is older is not reported."""
     relief_memory_s: float = 10.0
-    """Over which the spread of the beams is averaged; their own footprint at survey speed."""
+    """Time over which the beams' spread is averaged; their own footprint at survey speed."""
 
     def pack(self, hull: Hull = POINT, tick_s: float = 0.05) -> Sensors:
         """For compiled code.
 
         Args:
-            hull: of the vehicle that carries them.
-            tick_s: between calls of the navigation.
+            hull: hull of the vehicle that carries them.
+            tick_s: time between calls of the navigation.
 
         Raises:
-            VehicleError: an instrument's period is no whole number of ticks, or a number is out of
-                its range.
+            VehicleError: an instrument's period is not a multiple of the tick, or a number is out
+                of its range.
         """
         imu, compass, dvl, pressure = self.imu, self.compass, self.dvl, self.pressure
         gps, usbl = self.gps, self.usbl
@@ -351,7 +351,7 @@ class SensorSuite:
 
 
 def janus_beams(angle_rad: float) -> Array:
-    """Directions, (4, 3), of beams so far off the vertical, 45, 135, 225, 315 degrees off the bow.
+    """Directions, (4, 3), of beams at an angle to the vertical, 45, 135, 225, 315 deg off the bow.
 
     Opposite beams are 0 and 2, 1 and 3.
     """

@@ -1,4 +1,4 @@
-"""What the navigation keeps from tick to tick, where each number lies, and how it begins."""
+"""State that the navigation keeps from tick to tick, its layout, and its start."""
 
 import math
 from typing import NamedTuple
@@ -14,7 +14,7 @@ POSITION, VELOCITY, ATTITUDE, GYRO_BIAS, ACCELEROMETER_BIAS = 0, 3, 6, 9, 12
 HEADING_BIAS, DEPTH_BIAS, DVL_SCALE, DVL_ANGLE, DVL_BIAS, GPS_BIAS, WATER = (
     15, 16, 17, 18, 19, 21, 23,
 )  # fmt: skip
-"""Where the errors begin in the error state (25,): position of the IMU in NED, its velocity over
+"""Offsets in the error state (25,): position of the IMU in NED, its velocity over
 ground in the body frame with the DVL's scale error in it, its attitude about the axes of NED, its
 biases, then the compass's, the depth's, scale and misalignment of the DVL, its bias of surge and
 sway, the GPS's bias of north and east, the current."""
@@ -22,14 +22,14 @@ ERROR = 25
 QUATERNION = 6
 NOMINAL = ERROR + 1
 """Length of the nominal state: as the error state, with a quaternion (4) for the attitude (3), so
-that what follows the attitude lies one place further on."""
+that what follows the attitude is one place further on."""
 HIDDEN = WATER - GYRO_BIAS
-"""How many true errors the instruments have; `hidden[i]` is estimated by error `GYRO_BIAS + i`."""
+"""Number of true errors of the instruments; error `GYRO_BIAS + i` estimates `hidden[i]`."""
 
 TURN, PUSH, RATES, HEADING, DEPTH, RANGE, BEAM, WATER_BEAM = 0, 3, 6, 9, 10, 11, 15, 19
 DVL_VELOCITY, WATER_VELOCITY, GPS_FIX, USBL_FIX = 23, 26, 29, 31
 HEADING_TIME, DEPTH_TIME, DVL_TIME, WATER_TIME, GPS_TIME, USBL_TIME = 33, 34, 35, 36, 37, 38
-"""Where each instrument's latest reading lies in `readings`, and when it was taken:
+"""Offsets of each instrument's latest reading in `readings`, and its time:
 increments of angle (3) and velocity (3) over the tick, rates (3), heading, depth, ranges (4) and
 velocities (4) along the beams, velocities through the water (4), bottom and water velocity in the
 body frame at the DVL (3 each), north and east of the GPS antenna and of the transponder (2 each).
@@ -39,12 +39,12 @@ READINGS = 39
 COMPASS_USE, DEPTH_USE, DVL_USE, WATER_USE, GPS_USE, USBL_USE = 0, 1, 2, 3, 4, 5
 """Rows of `counts`."""
 USED, REJECTED, RUN, WIDENED = 0, 1, 2, 3
-"""Columns of `counts`: scalars used and rejected, rejected in a row by now, and how often so many
-in a row made the filter doubt itself."""
+"""Columns of `counts`: scalars used and rejected, rejected in a row by now, and how often too many
+in a row made the filter widen its covariance."""
 INNOVATIONS = 14
 """Compass, depth, DVL (4), water (4), GPS (2), USBL (2): places in `innovations`."""
 INNOVATION_AT = (0, 1, 2, 6, 10, 12)
-"""The place of each instrument's first."""
+"""Place of each instrument's first innovation."""
 
 HEADING_TURNS, ALTITUDE_PING, ALTITUDE_TIME, ALTITUDE_VARIANCE, FOLLOWED_DEPTH = 0, 1, 2, 3, 4
 RELIEF_VARIANCE, RELIEF_PINGS, ALTITUDE_NOW, ALTITUDE_SIGMA = 5, 6, 7, 8
@@ -71,9 +71,9 @@ class NavigationState(NamedTuple):
     """Filter, hidden errors of the instruments, and latest readings; overwritten tick by tick."""
 
     nominal: Array
-    """(26,) what is believed."""
+    """(26,) estimate."""
     covariance: Array
-    """(25, 25) of truth minus belief."""
+    """(25, 25) covariance of truth minus estimate."""
     hidden: Array
     """(14,) the instruments' true biases, scale and misalignment."""
     readings: Array
@@ -89,19 +89,19 @@ class NavigationState(NamedTuple):
 
 
 def new_navigation(sensors: Sensors, truth: Array, rng: np.random.Generator) -> NavigationState:
-    """Begin at a fix: draw the instruments' errors, and an estimate that errs as they do.
+    """Begin at a fix: draw the instruments' errors, and an estimate with the same errors.
 
-    The position comes from the GPS and shares its bias, heading and depth likewise from compass and
-    pressure; the covariance says so. Velocity is that of a vehicle believed at rest if it is, and
-    errs by a DVL's noise.
+    The position comes from the GPS and shares its bias, as do heading and depth from compass and
+    pressure; the covariance includes this. Velocity is the true one, known to be zero at rest, with
+    a DVL's noise.
 
     Args:
         sensors: the instruments.
         truth: (13,) position NED, quaternion, velocity over ground NED, body rates.
-        rng: where all errors come from.
+        rng: source of all errors.
 
     Raises:
-        VehicleError: truth is no finite state.
+        VehicleError: truth is not a finite state.
     """
     from scipy.spatial.transform import Rotation
 
@@ -126,7 +126,7 @@ def new_navigation(sensors: Sensors, truth: Array, rng: np.random.Generator) -> 
     nominal[3:6] += _velocity_sigma(sensors) * rng.standard_normal(3)
     tilt = sensors.tilt_sigma * rng.standard_normal(2)
     turn = bias_of[HEADING_BIAS] + sensors.compass_noise * rng.standard_normal()
-    # The compass errs about the vertical, the tilt about the level axes of the body.
+    # The compass error is about the vertical, the tilt's about the level axes of the body.
     believed = rotation_from_attitude(0.0, 0.0, turn) * attitude * Rotation.from_rotvec([*tilt, 0])
     nominal[QUATERNION : QUATERNION + 4] = believed.as_quat()
     level = attitude.as_matrix()[:, :2]
@@ -159,7 +159,7 @@ def new_navigation(sensors: Sensors, truth: Array, rng: np.random.Generator) -> 
 def initial_covariance(sensors: Sensors) -> Array:
     """(25, 25) at the start, of a level vehicle.
 
-    A fix that errs by bias and noise leaves a position that errs the other way: truth minus belief
+    A fix with bias and noise leaves a position error of opposite sign: truth minus estimate
     is minus the bias minus the noise.
     """
     sigma = np.zeros(ERROR)
@@ -184,5 +184,5 @@ def initial_covariance(sensors: Sensors) -> Array:
 
 
 def _velocity_sigma(sensors: Sensors) -> float:
-    """Of each axis at the start: at rest, known to a few of the DVL's pings."""
+    """Velocity sigma of each axis at the start: at rest, known to a few of the DVL's pings."""
     return 2.0 * sensors.beam_noise + sensors.dvl_bias_sigma

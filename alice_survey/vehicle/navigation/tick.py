@@ -1,7 +1,7 @@
 """The navigation's tick: measure, predict, weigh, and report to the controller and the log.
 
-The tick is what the closed loop calls. Instruments measure the true state of now, the filter never
-sees it otherwise.
+The closed loop calls the tick. Instruments measure the true state at that time, which the filter
+sees in no other way.
 """
 
 import math
@@ -83,13 +83,14 @@ LOG_COLUMNS = (
     "rejected_compass", "rejected_depth", "rejected_dvl", "rejected_water", "rejected_gps",
     "rejected_usbl", "clearance_m",
 )  # fmt: skip
-"""Of a row of `log_row`: the estimate in the order of `estimate_vector`, sigmas, the latest ping's
+"""Columns of `log_row`: the estimate in the order of `estimate_vector`, sigmas, the latest ping's
 ranges, how many measurements of each instrument were used and rejected so far, the clearance."""
 LOG_ROW = len(LOG_COLUMNS)
 LOG_SIGMA, LOG_RANGE, LOG_USED, LOG_REJECTED, LOG_CLEARANCE = 13, 20, 24, 30, 36
-"""Where sigmas, ranges and counts begin in a row, and where the clearance is."""
+"""Offsets of sigmas, ranges, counts and clearance in a row."""
 _LEAST_SPREAD = 0.01
-"""Of the ends of the beams, by their greatest: a quarter for a square, 0.19 for three corners."""
+"""Least determinant of the scatter of the ends over its squared trace: 1/4 for a square, 0.19 for
+three corners."""
 
 
 @kernel
@@ -106,7 +107,7 @@ def navigation_tick(
     rng: np.random.Generator,
     estimate: Array,
 ) -> None:
-    """Carry the navigation from the tick before to now.
+    """Advance the navigation from the previous tick to now.
 
     Args:
         time_s: now, for drop-outs and ages.
@@ -116,10 +117,10 @@ def navigation_tick(
             origin over ground in NED, body rates.
         now: (13,) truth now.
         water_velocity_ned: north and east of the current now come first; the rest is not read.
-        floor: what the DVL hears.
+        floor: the sea floor that the DVL measures.
         suite: the instruments.
         nav: filter and instruments, overwritten.
-        rng: where noise comes from.
+        rng: source of noise.
         estimate: (14,) is written as `estimate_vector` has it; altitude and clearance are NaN
             without bottom lock.
     """
@@ -169,7 +170,7 @@ def navigation_tick(
 
 @kernel
 def _use_usbl(nav: NavigationState, suite: Sensors) -> bool:
-    """Weigh the fix of the transponder, as uncertain as its believed distance makes it."""
+    """Weigh the fix of the transponder, with the sigma of its estimated distance."""
     north = lever_row(nav, suite, USBL, 0)
     east = lever_row(nav, suite, USBL, 1)
     sigma = usbl_sigma(suite, north, east, lever_row(nav, suite, USBL, 2))
@@ -178,7 +179,7 @@ def _use_usbl(nav: NavigationState, suite: Sensors) -> bool:
 
 @kernel
 def _write_estimate(nav: NavigationState, suite: Sensors, estimate: Array) -> None:
-    """Write the estimate of the body's origin, but for the altitude."""
+    """Write the estimate of the body's origin, except for the altitude."""
     x, turned, memory = nav.nominal, nav.turns[BELIEVED], nav.memory
     a, b, c = suite.place[IMU, 0], suite.place[IMU, 1], suite.place[IMU, 2]
     for i in range(3):
@@ -209,11 +210,11 @@ def _hear_floor(time_s: float, used: int, nav: NavigationState, suite: Sensors) 
     """Altitude of the followed point and clearance of the hull from a ping: a plane by the beams.
 
     The beams meet the sea floor about the DVL; the followed point is elsewhere. A plane is fitted
-    (least squares) to where they end by the believed attitude, and read below the point. How far
+    (least squares) to their ends by the estimated attitude, and read below the point. How far
     relief departs from a plane is not seen by one ping, whose four ends leave a single degree of
-    freedom: what the ends stray from their mean slope of the last seconds says so.
-    A beam whose velocity was an outlier heard something else than the sea floor. Fewer than three
-    beams, or three whose ends lie nearly in line, say nothing.
+    freedom: the ends' deviation from their mean slope of the last seconds shows it.
+    A beam whose velocity was an outlier did not measure the sea floor. Fewer than three
+    beams, or three with ends nearly in line, give no plane.
     """
     turned, memory, place = nav.turns[BELIEVED], nav.memory, suite.place
     count = 0
@@ -337,7 +338,7 @@ def _carry_altitude(time_s: float, nav: NavigationState, suite: Sensors) -> None
 def log_row(nav: NavigationState, out: Array) -> None:
     """Write a row of the log, (LOG_ROW,), as `LOG_COLUMNS` names it, of the latest tick.
 
-    Sigmas are of the body's origin, whose position errs by attitude too, and of Euler angles.
+    Sigmas are of the body's origin, whose position error includes attitude, and of Euler angles.
     """
     p, turned = nav.covariance, nav.turns[BELIEVED]
     latest = nav.memory[LATEST : LATEST + ESTIMATE]

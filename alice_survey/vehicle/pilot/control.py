@@ -1,6 +1,6 @@
 """The inner loops: from wanted velocities and accelerations to a wrench.
 
-Feedback asks for an acceleration; inertia, Coriolis forces and drag turn it into forces (computed
+Feedback commands an acceleration; inertia, Coriolis forces and drag convert it to forces (computed
 torque: T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, 2011), at the
 wanted motion over ground. The current is not known, so that what it adds to drag is left to the
 integrals.
@@ -33,13 +33,13 @@ def clamped(value: float, most: float) -> float:
 def place_demand(
     gains: Gains, axis: int, error: float, speed: float, feed: float, total: float, most: float
 ) -> tuple[float, float]:
-    """A PID on place that asks for a speed, and a proportional loop on that speed.
+    """A PID on place that commands a speed, and a proportional loop on that speed.
 
     v_req = feed + k_P e + k_I integral(e) + k_D de/dt, a = inner (v_req - v), with de/dt = feed -
     v (paper, eq. los_sway_control, of the error of the vehicle and with de/dt for its dv/dt).
 
     Args:
-        gains: of all axes.
+        gains: gains of all axes.
         axis: row of gains.
         error: wanted place less place.
         speed: measured.
@@ -59,10 +59,10 @@ def place_demand(
 
 @kernel
 def place_sum_step(gains: Gains, axis: int, error: float, full: float, dt_s: float) -> float:
-    """What a tick adds to k_I times the integral of a place error; 0 while the force is cut.
+    """Increment of k_I times the integral of a place error in a tick; 0 while the force is cut.
 
     Args:
-        gains: of all axes.
+        gains: gains of all axes.
         axis: row of gains.
         error: wanted place less place.
         full: +1 or -1 where the force is cut at its greatest or least, else 0.
@@ -75,7 +75,7 @@ def place_sum_step(gains: Gains, axis: int, error: float, full: float, dt_s: flo
 
 @kernel
 def sum_bound(gains: Gains, axis: int) -> float:
-    """The integral, as a speed, beyond which it alone would ask for more than there is."""
+    """Integral, as a speed, beyond which it alone would exceed the available force."""
     row = gains.axes[axis]
     if row[INNER] == 0.0:
         return 0.0
@@ -89,7 +89,7 @@ def speed_demand(
     """A PI on speed whose proportional part sees a share of the wanted speed (gains.py).
 
     Args:
-        gains: of all axes.
+        gains: gains of all axes.
         axis: row of gains.
         wanted: speed.
         speed: measured.
@@ -114,7 +114,7 @@ def write_wrench(gains: Gains, pilot: PilotState, wrench: Array) -> None:
     Args:
         gains: the vehicle.
         pilot: its demand is read, and the notes are written into it.
-        wrench: (6,) N and N m is written. Roll and pitch are not asked for.
+        wrench: (6,) N and N m is written. Roll and pitch are not controlled.
     """
     body, demand, motion, force = gains.body, pilot.demand, pilot.motion, pilot.force
     for i in range(6):

@@ -54,32 +54,32 @@ _LATERAL = [1, 5]
 MASS, RATE, PLACE, INTEGRAL, INNER, LEAST, MOST, FASTEST, LAG, BANDWIDTH, WEIGHT = range(11)
 """Columns of `Gains.axes`: inertia (kg, kg m^2); rate (1/s), place (1/s^2), integral (1/s^3); inner
 (1/s), the part of rate that the inner speed loop has; least and greatest force or moment; greatest
-speed asked for (m/s, rad/s); lag (s); bandwidth (rad/s); share of a wanted speed that the
+commanded speed (m/s, rad/s); lag (s); bandwidth (rad/s); share of a wanted speed that the
 proportional part of a speed loop sees."""
 
 DAMPING_RATIO = 1.0
-"""Of the placed pair: no overshoot, so that a line beside is not run into."""
+"""Damping ratio of the placed pair: no overshoot, so that a neighbouring line is not reached."""
 INTEGRAL_SHARE = 0.1
-"""Bandwidth of integral action by that of the loop (Fossen 2011, section 12.2)."""
+"""Bandwidth of integral action over that of the loop (Fossen 2011, section 12.2)."""
 SAMPLES_PER_PERIOD = 20.0
 LEAST_SAMPLES_PER_PERIOD = 10.0
-"""Of an oscillation in which heading and sway are coupled."""
+"""Samples per period of an oscillation that couples heading and sway."""
 HEADING_DAMPING = 0.7
-"""Wanted of every mode of the heading loop (inferred: an overshoot of a twentieth)."""
+"""Wanted damping of every mode of the heading loop (inferred: an overshoot of a twentieth)."""
 LEAST_HEADING_DAMPING = 0.5
 """Below it a vehicle is not flown (inferred: an overshoot of a sixth)."""
 PASSING_DAMPING = 0.2
-"""By so much less may the heading loop be damped below the survey's speed (inferred)."""
+"""Reduction of the heading loop's damping below the survey's speed (inferred)."""
 _RATE_FACTORS = np.geomspace(0.5, 8.0, 49)
 _PLACE_FACTORS = np.geomspace(0.5, 16.0, 61)
 _SLOWER = (0.0, 0.5)
 """Shares of the survey's speed."""
 STEADY_SHARE = 0.75
-"""Of the greatest force that a steady motion may take; a quarter stays for feedback (inferred)."""
+"""Share of the greatest force for steady motion; a quarter stays for feedback (inferred)."""
 
 
 class Gains(NamedTuple):
-    """What the inner loops know of the vehicle."""
+    """Model of the vehicle in the inner loops."""
 
     body: Body
     """Inertia and damping, for feed-forward."""
@@ -98,10 +98,10 @@ def gains_for(
 
     Args:
         vehicle: inertia, damping, thrusters.
-        speed_mps: of the survey, at which damping is linearised, without drift or turning.
+        speed_mps: survey speed, at which damping is linearised, without drift or turning.
         tick_s: of the control; half of it is added to the lag (a held value is half a tick old).
         navigation_hz: rate of the navigation's velocities (DVL).
-        most_turn_rad_s: greatest yaw rate asked for, if the thrusters allow it.
+        most_turn_rad_s: greatest commanded yaw rate, if the thrusters allow it.
 
     Raises:
         VehicleError: surge, heave or yaw cannot be controlled, or yaw not damped at that speed.
@@ -186,7 +186,7 @@ def lateral_pair(body: Body, speed_mps: float) -> tuple[Array, Array]:
     """Sway and yaw rate under way: (v, r)' = A (v, r) + b moment.
 
     Args:
-        body: of the vehicle.
+        body: body of the vehicle.
         speed_mps: surge; without drift or turning.
 
     Returns:
@@ -207,9 +207,9 @@ def heading_loop(body: Body, speed_mps: float, row: Array) -> Array:
     thrusters give.
 
     Args:
-        body: of the vehicle.
+        body: body of the vehicle.
         speed_mps: surge.
-        row: of yaw in `Gains.axes`.
+        row: row of yaw in `Gains.axes`.
 
     Returns:
         (5, 5)
@@ -242,10 +242,10 @@ def _damped_together(
     """Rate and place gains of yaw by the rule above, and the least damping ratio that they give.
 
     Args:
-        body: of the vehicle.
-        speed_mps: of the survey.
+        body: body of the vehicle.
+        speed_mps: speed of the survey.
         bare: (2,) gains of the axis by itself.
-        lag_s: of the thrusters.
+        lag_s: lag of the thrusters.
         omega: natural frequency placed for the axis by itself.
         most_decay: greatest d / m.
         sampled_rad_s: bound on the frequency of a pair of poles.

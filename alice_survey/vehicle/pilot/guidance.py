@@ -1,4 +1,4 @@
-"""Guidance: which way to head, how fast to go, and how to sway, tick by tick.
+"""Guidance: heading, speed and sway, tick by tick.
 
 Two ways of following a path (paper, section VII). `los`, of the original vehicle, heads for a point
 a look-ahead distance further on the path's tangent; a cross current holds it off the path
@@ -64,10 +64,10 @@ from alice_survey.vehicle.pilot.steering import (
 
 _DEPTH_SPEED_KEPT_MPS = 0.05
 _CAUTION_M = 0.5
-"""A dive without sight of the bottom stops at least this far above the greatest depth."""
+"""A dive without bottom lock stops at least this far above the greatest depth."""
 _SETTLE_S = 2.0
 _QUICKEST = 2.0
-"""Progress along the path by the wanted speed, at most: a projection may not jump."""
+"""Greatest progress along the path over the wanted speed: a projection may not jump."""
 
 
 @kernel
@@ -89,9 +89,9 @@ def steer(
         estimate: (14,) of the navigation, see estimate_vector.py.
         path: to follow.
         guidance: settings.
-        gains: of the inner loops.
+        gains: gains of the inner loops.
         pilot: memory and report, written.
-        wrench: (6,) N and N m, is written: forces and moments to ask of the thrusters.
+        wrench: (6,) N and N m, is written: forces and moments commanded of the thrusters.
     """
     report, demand = pilot.report, pilot.demand
     for i in range(slot.FULL_SURGE):
@@ -105,7 +105,7 @@ def steer(
         report[slot.REASON] = NO_NAVIGATION
         _enter(pilot, ABORT)
     if report[slot.REASON] == NO_NAVIGATION:
-        # Without knowing how it moves the vehicle can only push itself up.
+        # Without an estimate of its motion the vehicle can only push itself up.
         wrench[2] = STEADY_SHARE * gains.axes[HEAVE, LEAST]
         return
 
@@ -152,7 +152,7 @@ def _abort(reason: int, estimate: Array, pilot: PilotState) -> None:
 
 @kernel
 def _target_m(path: Path, guidance: Guidance, pilot: PilotState) -> float:
-    """Wanted depth of the origin: as deep as it may go unseeing until the bottom is heard.
+    """Wanted depth of the origin: as deep as allowed without bottom lock until there is one.
 
     The smoothed sum of depth and altitude holds by how much the followed point is below the origin.
     """
@@ -164,7 +164,7 @@ def _target_m(path: Path, guidance: Guidance, pilot: PilotState) -> float:
 
 @kernel
 def _goal(path: Path, guidance: Guidance, pilot: PilotState) -> tuple[float, float, float]:
-    """North, east and heading where the way in to the path begins."""
+    """North, east and heading at the start of the approach to the path."""
     leg, along = int(pilot.report[slot.LEG]), pilot.report[slot.ALONG]
     if stands(path, leg):
         # Here the vehicle goes to the place itself, with the heading it has there.
@@ -178,7 +178,7 @@ def _goal(path: Path, guidance: Guidance, pilot: PilotState) -> tuple[float, flo
 
 @kernel
 def _progress_m(estimate: Array, path: Path, guidance: Guidance, pilot: PilotState) -> float:
-    """What should grow in the present phase."""
+    """Quantity that should grow in the present phase."""
     phase = pilot.report[slot.PHASE]
     if phase == DIVE:
         return float(-abs(_target_m(path, guidance, pilot) - estimate[vector.DEPTH]))

@@ -1,4 +1,4 @@
-"""What the pilot remembers from tick to tick, and what it reports."""
+"""State that the pilot keeps from tick to tick, and its report."""
 
 import math
 from typing import NamedTuple
@@ -15,8 +15,8 @@ from alice_survey.base.frames import Array
 to starboard of the path, m; wanted heading, rad; wanted surge over ground, m/s; 1 while the path is
 held by sway, 0 while it is by heading; reason of an abort (safety.py); survey line or -1; wanted
 depth of the body's origin, m; wanted sway over ground, m/s; 1 at the surface after the mission or
-an abort; heading of the path, rad. Phase, leg, distance, the manner of steering and the reason are
-also what the pilot goes by on the next tick."""
+an abort; heading of the path, rad. Phase, leg, distance, the steering mode and the reason are
+also inputs of the pilot on the next tick."""
 REPORT = 13
 
 DIVE, APPROACH, FOLLOW, ASCEND, DONE, ABORT = 0, 1, 2, 3, 4, 5

@@ -3,9 +3,9 @@
 Where a turn on the spot or a sway step begins or ends the vehicle stops, so that the course may
 kink there; its heading never does.
 
-Progress along the path is the arc length `along_m` within a leg. It is never looked for anew: a
+Progress along the path is the arc length `along_m` within a leg. It is never searched again: a
 tick moves it by one Newton step of the projection (`advance`), so that it passes through every leg
-in turn. No acceptance circle ends a leg, hence none swallows a line that lies near.
+in turn. No acceptance circle ends a leg, hence none skips a line nearby.
 """
 
 import math
@@ -45,15 +45,15 @@ class Path(NamedTuple):
     begins_m: Array
     """(L,) distance along the path at which each leg begins."""
     turn_rad: Array
-    """(L,) how far the vehicle turns on the spot, positive to starboard; 0 of all other legs."""
+    """(L,) angle of a turn on the spot, positive to starboard; 0 of all other legs."""
     side_rad: Array
-    """(L,) heading less course: 0 where the vehicle goes ahead, +-pi/2 in a sway step."""
+    """(L,) heading minus course: 0 where the vehicle goes ahead, +-pi/2 in a sway step."""
     stop: Array
     """(L,) 1 where the vehicle comes to rest at the leg's end, else 0."""
     altitude_m: float
-    """Wanted of the followed point."""
+    """Wanted altitude of the followed point."""
     speed_mps: float
-    """Wanted over ground, along the heading."""
+    """Wanted speed over ground, along the heading."""
 
 
 def path_from_legs(
@@ -78,7 +78,7 @@ def path_from_legs(
         altitude_m: wanted above the sea floor, of the followed point.
         speed_mps: wanted over ground.
         turn_rad: (L,) of turns on the spot, else 0; there are none if left out.
-        side_rad: (L,) heading less course, +-pi/2 of sway steps, else 0; there are none if left
+        side_rad: (L,) heading minus course, +-pi/2 of sway steps, else 0; there are none if left
             out.
 
     Raises:
@@ -138,7 +138,7 @@ def path_from_legs(
 
 
 def _check_stops(length: Array, curvature: Array, spot: Array, side: Array) -> None:
-    """Refuse legs that are neither ahead, nor on the spot, nor sideways."""
+    """Reject legs that are neither ahead, nor on the spot, nor sideways."""
     for i in np.flatnonzero((spot != 0) & ((length != 0) | (curvature != 0) | (side != 0))):
         raise VehicleError(
             f"leg {i} of the path turns {math.degrees(spot[i]):.1f} deg on the spot and goes "

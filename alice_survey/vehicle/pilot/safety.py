@@ -1,4 +1,4 @@
-"""When a mission is broken off, and why."""
+"""Conditions that abort a mission, and their reasons."""
 
 import math
 from typing import NamedTuple
@@ -41,45 +41,45 @@ REASONS = {
     NO_NAVIGATION: "the navigation gave no position",
     TOUCHED: "the hull touched the sea floor",
 }
-"""What the codes of `REASON` in a report mean."""
+"""Meaning of the codes of `REASON` in a report."""
 
 _WITHIN_S = 1.0
-"""How long half the clearance or the pitch may be out of bounds: longer than a false echo and a
+"""Time for which half the clearance or the pitch may be out of bounds: above a false echo and a
 wave of pitch."""
 _KEPT = 1.25
-"""By the least clearance: what guidance rises to keep, and below which the vehicle goes slower, to
+"""Over the least clearance: guidance rises to keep this; below it the vehicle goes slower, to
 stand still at the least."""
 _STOP_S = 3.0
-"""After the loss of bottom lock, within which the surge is taken back. The lock is reported lost
+"""Time after the loss of bottom lock to reduce the surge to zero. The lock is reported lost
 two seconds after the last ping, so that the vehicle is at rest some five seconds after it."""
 _STEP_M = 0.1
-"""Less than this is no progress."""
+"""Least distance that counts as progress."""
 
 
 class SafetyLimits(NamedTuple):
-    """Bounds beyond which the vehicle gives up and comes to the surface."""
+    """Bounds beyond which the vehicle aborts and surfaces."""
 
     least_altitude_m: float
-    """Of all parts of the vehicle above the sea floor."""
+    """Least clearance of all parts of the vehicle above the sea floor."""
     most_depth_m: float
     most_pitch_rad: float = math.radians(30.0)
     lost_bottom_s: float = 20.0
     stuck_s: float = 90.0
-    """Without progress of the dive, the approach or the survey."""
+    """Longest time without progress of the dive, the approach or the survey."""
     most_returns: float = 3.0
-    """How often the vehicle may be carried off the path and come back."""
+    """Number of times that the vehicle may be carried off the path and return."""
     longest_s: float = 86400.0
-    """Of the whole mission up to the ascent."""
+    """Longest duration of the mission up to the ascent."""
     climb_s: float = 10.0
     """How long the vehicle may take to climb back to the least altitude; below half of it there is
     no waiting."""
     blind_depth_m: float = math.inf
-    """How deep the vehicle dives before it hears the bottom; by default almost the most."""
+    """Depth of the dive without bottom lock; by default almost the greatest."""
 
 
 @kernel
 def navigates(estimate: Array) -> bool:
-    """Whether the navigation gives all it must: everything but altitude and clearance."""
+    """Whether the navigation gives all required values: all but altitude and clearance."""
     total = 0.0
     for i in range(ESTIMATE):
         if i != ALTITUDE and i != CLEARANCE:
@@ -129,13 +129,13 @@ def watch(
     limits: SafetyLimits,
     pilot: PilotState,
 ) -> int:
-    """Look after the vehicle for a tick.
+    """Check the safety of the vehicle for a tick.
 
     Args:
         time_s: since the start of the mission.
         dt_s: the tick.
         estimate: (14,) of the navigation.
-        progress_m: what should grow in the phase that the pilot reports.
+        progress_m: quantity that should grow in the phase that the pilot reports.
         limits: bounds.
         pilot: its memory is written.
 
@@ -149,7 +149,7 @@ def watch(
     heard = math.isfinite(clear)
     # On the way down the bottom may be out of reach; the watch on the dive's progress covers it.
     memory[LOST_S] = 0.0 if heard or phase == DIVE else memory[LOST_S] + dt_s
-    # An altitude that is not heard neither clears nor adds to the suspicion.
+    # A missing altitude neither clears nor adds to the suspicion.
     if heard:
         least = limits.least_altitude_m
         memory[LOW_S] = memory[LOW_S] + dt_s if clear < least else 0.0
@@ -180,5 +180,5 @@ def watch(
 
 @kernel
 def restart_watch(pilot: PilotState) -> None:
-    """Forget the progress of the phase that ends."""
+    """Reset the progress of the phase that ends."""
     pilot.memory[BEST], pilot.memory[SINCE_BEST_S] = -math.inf, 0.0

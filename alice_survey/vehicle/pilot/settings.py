@@ -1,4 +1,4 @@
-"""Settings of the guidance, and how they follow from the vehicle and the path."""
+"""Settings of the guidance, and their derivation from the vehicle and the path."""
 
 import math
 from typing import Literal, NamedTuple
@@ -35,14 +35,14 @@ CONTROL_LENGTH_M = 1.6
 """The unit of the pilot's distances: the hull of SPARUS II, which the paper (section II) states for
 ALICE too; ALICE's is longer (`Vehicle.hull`)."""
 LOS_DAMPING_RATIO = 0.5
-"""Least of the path loop of `los` (inferred: one overshoot of a sixth)."""
+"""Least damping of the path loop of `los` (inferred: one overshoot of a sixth)."""
 _STRAIGHT_PER_M = 1e-9
 _LOOK_AHEADS_M = np.geomspace(CONTROL_LENGTH_M, 100.0, 400)
 _RAMP_PERIODS = 2.0
-"""A reference gains its speed in so many times 1 / bandwidth of the loop that follows it: a
+"""A reference gains its speed in this many times 1 / bandwidth of the loop that follows it: a
 critically damped pair has then done most of what it does (inferred)."""
 SWAY_LOOK_AHEAD_M = 2.5 * CONTROL_LENGTH_M
-"""Of `sway`, which goes by it only when far off its path, where none is damped well: the longest
+"""Look-ahead of `sway`, used only far off its path, where none is damped well: the longest
 that Fossen (2011, section 10.3.2) gives."""
 
 
@@ -78,11 +78,11 @@ class Guidance(NamedTuple):
     spot_rad_s: float
     """Rate of a turn on the spot."""
     spot_rad_s2: float
-    """How fast that rate is gained and lost."""
+    """Angular acceleration of that turn."""
     step_mps: float
     """Speed of a sway step."""
     step_mps2: float
-    """How fast that speed is gained and lost."""
+    """Acceleration of that step."""
     limits: SafetyLimits
 
 
@@ -105,7 +105,7 @@ def pilot_guidance(
     cost less than pushing the hull sideways, and takes over again at half of that (inferred).
 
     Args:
-        gains: of the vehicle.
+        gains: gains of the vehicle.
         path: its speed and altitude count.
         controller: `sway` or `los`.
         most_depth_m: no deeper than this.
@@ -114,7 +114,7 @@ def pilot_guidance(
             `sway`, where there is none, SWAY_LOOK_AHEAD_M.
         terrain_smoothing_m: relief shorter than this is not followed.
         spot_rad_s: greatest rate of turns on the spot; a vehicle that can do less turns slower.
-        step_mps: greatest speed of sway steps, likewise.
+        step_mps: greatest speed of sway steps; a vehicle that can do less steps slower.
         limits: for safety; half the path's altitude is the least when left out.
 
     Raises:
@@ -184,7 +184,7 @@ def stop_speeds(
     While it turns about the followed point, the origin sways at the rate times the lever.
 
     Args:
-        gains: of the vehicle.
+        gains: gains of the vehicle.
         lever_m: how far the followed point is ahead of the origin.
         by_sway: whether sway is controlled.
         spot_rad_s: rate that is wanted.
@@ -204,14 +204,14 @@ def stop_speeds(
 
 @kernel
 def turning_speed_mps(gains: Gains, curvature_per_m: float, lever_m: float) -> float:
-    """Greatest speed at which a curvature asks for no more yaw and sway than there is.
+    """Greatest speed at which a curvature needs no more yaw and sway than available.
 
     While the followed point goes round an arc with its heading along it, the origin, behind it,
     sways outwards by curvature times speed times the lever.
 
     Args:
-        gains: of the vehicle.
-        curvature_per_m: of the path, not negative.
+        gains: gains of the vehicle.
+        curvature_per_m: curvature of the path, not negative.
         lever_m: how far the followed point is ahead of the origin; 0 where sway is not controlled.
 
     Returns:
@@ -228,14 +228,14 @@ def turning_speed_mps(gains: Gains, curvature_per_m: float, lever_m: float) -> f
 def los_loop(gains: Gains, speed_mps: float, lever_m: float, look_ahead_m: float) -> Array:
     """State matrix of `los` about a straight path without drift.
 
-    States: offset of the followed point, m; heading less the path's; sway, m/s; yaw rate; yaw
+    States: offset of the followed point, m; heading minus the path's; sway, m/s; yaw rate; yaw
     acceleration that the lagging thrusters give. Sway and yaw are those of the hull, coupled.
 
     Args:
-        gains: of the vehicle.
+        gains: gains of the vehicle.
         speed_mps: surge.
         lever_m: how far the followed point is ahead of the origin.
-        look_ahead_m: of the guidance.
+        look_ahead_m: look-ahead of the guidance.
 
     Returns:
         (5, 5)
@@ -256,7 +256,7 @@ def los_loop(gains: Gains, speed_mps: float, lever_m: float, look_ahead_m: float
 
 
 def damped_look_ahead_m(gains: Gains, speed_mps: float, lever_m: float) -> float | None:
-    """As `shortest_look_ahead_m`, but None where there is none."""
+    """As `shortest_look_ahead_m`, or None where there is none."""
     ratios = np.array([
         damping_ratio(los_loop(gains, speed_mps, lever_m, float(each))) for each in _LOOK_AHEADS_M
     ])  # fmt: skip
@@ -278,16 +278,16 @@ def shortest_look_ahead_m(gains: Gains, speed_mps: float, lever_m: float) -> flo
 
     The longer it is, the further does a current hold the vehicle off the path; the shorter, the
     more does it weave, since a slender hull slips through its turns and takes long to go where it
-    points. Not below the length of the hull: what the linear loop promises there hangs on thrusters
+    points. Not below the length of the hull: the linear loop's prediction there assumes thrusters
     that are never at their limits.
 
-    It hangs on the coefficients, by the Munk moment: for SPARUS II at 0.2 m/s, origin followed, it
-    is 2.87 m with `calibrated`, 1.79 with `estimated`, 1.97 with `cfd` and 1.74 with `computed`;
+    It depends on the coefficients, by the Munk moment: for SPARUS II at 0.2 m/s, origin followed,
+    it is 2.87 m with `calibrated`, 1.79 with `estimated`, 1.97 with `cfd` and 1.74 with `computed`;
     with the left port followed 2.23 m and, for the others, the hull's length, 1.6 m. Fossen (2011,
     section 10.3.2) gives 1.5 to 2.5 lengths; COLA2's 5.5 m is too long for lines 1 m apart.
 
     Args:
-        gains: of the vehicle.
+        gains: gains of the vehicle.
         speed_mps: surge.
         lever_m: how far the followed point is ahead of the origin.
 

@@ -2,8 +2,8 @@
 
 The vehicle follows a reference: a place that moves along the leg, or a heading that turns. A ramp
 of bounded speed and acceleration goes ahead of it; its acceleration is fed forward, and the
-reference is what thrusters that lag make of it, v' = (ramp's v - v) / lag, so that a vehicle as it
-is thought to be follows without an error. Over a whole leg the reference goes as far as the ramp,
+reference is the response of lagging thrusters, v' = (ramp's v - v) / lag, so that a vehicle as
+modelled follows without an error. Over a whole leg the reference goes as far as the ramp,
 and by lag times v farther where it begins at a speed v. The place is held by surge and sway, the
 heading by yaw (PIDs on place, control.py). A vehicle without sway holds only the part of the place
 that is along its heading, and drifts with the current across it. The reference waits for a vehicle
@@ -32,7 +32,7 @@ from alice_survey.vehicle.pilot.steering import head_for, sway_by
 from alice_survey.vehicle.rotations import wrapped
 
 STOP_M = 0.1
-"""A stop is left when the place is kept this well (without sway: along the heading) ..."""
+"""A stop ends when the place is kept this well (without sway: along the heading) ..."""
 STOP_RAD = math.radians(3.0)
 """... its heading this well ..."""
 STOP_MPS = 0.05
@@ -42,7 +42,7 @@ _WIDEN_S = 5.0
 """The tolerances grow by their own size in this time: swell and gusts are not waited for."""
 _BEHIND_M = 0.3
 _BEHIND_RAD = math.radians(20.0)
-"""Farther behind than this the reference slows down, and waits at twice of it."""
+"""Lag beyond which the reference slows down; it waits at twice of it."""
 _TINY = 1e-12
 
 
@@ -56,7 +56,7 @@ def stands(path: Path, leg: int) -> bool:
 def must_brake(
     path: Path, guidance: Guidance, gains: Gains, pilot: PilotState, leg: int, along_m: float
 ) -> bool:
-    """Whether a vehicle that goes ahead has to begin to brake for the stop at its leg's end."""
+    """Whether a vehicle that goes ahead must begin to brake for the stop at its leg's end."""
     if path.stop[leg] == 0.0:
         return False
     speed = max(pilot.point[slot.SURGE_SPEED], 0.0)
@@ -97,9 +97,9 @@ def ramp(
     """Move a reference towards its goal for a tick, so that it can still stop there.
 
     Args:
-        at: where it is, at or before the goal.
-        speed: how fast it goes, not negative.
-        goal: where it shall stop.
+        at: its place, at or before the goal.
+        speed: its speed, not negative.
+        goal: place to stop at.
         most: greatest speed.
         acceleration: greatest, either way.
         dt_s: the tick.
@@ -120,7 +120,7 @@ def ramp(
 
 
 class StopReference(NamedTuple):
-    """Where the followed point and the heading shall be in a tick, and how they move."""
+    """Reference of the followed point and the heading in a tick, with their rates."""
 
     north_m: float
     east_m: float
@@ -132,7 +132,7 @@ class StopReference(NamedTuple):
     turn_rad_s: float
     quicken_rad_s2: float
     along_m: float
-    """From the leg's start."""
+    """Distance from the leg's start."""
     over: bool
     """Whether it is at the leg's end."""
 
@@ -227,7 +227,7 @@ def stand(
         estimate: (14,) of the navigation.
         path: legs.
         guidance: settings.
-        gains: of the inner loops.
+        gains: gains of the inner loops.
         pilot: is written.
 
     Returns:
@@ -274,12 +274,12 @@ def _keep_place(
     gains: Gains,
     pilot: PilotState,
 ) -> tuple[float, float]:
-    """Ask for the surge and sway that keep the followed point at the place of a reference.
+    """Command the surge and sway that keep the followed point at the place of a reference.
 
     The integral of surge is kept as a vector in NED, as that of sway is (steering.py).
 
     Returns:
-        How far the place is ahead and to starboard of the followed point.
+        Distance of the place ahead and to starboard of the followed point.
     """
     memory, demand, now = pilot.memory, pilot.demand, estimate[vector.HEADING]
     s, c = math.sin(now), math.cos(now)

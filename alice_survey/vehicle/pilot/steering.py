@@ -1,8 +1,8 @@
-"""The manners of steering: to a depth, to a heading, along a path, to a place and stay there.
+"""Steering modes: to a depth, to a heading, along a path, to a place and stay there.
 
-Each asks the inner loops for velocities and accelerations (`PilotState.demand`). The parts that go
+Each commands velocities and accelerations of the inner loops (`PilotState.demand`). Parts that go
 together are called in the order heave, yaw, surge, sway: surge and sway of the followed point
-depend on the yaw that was asked for.
+depend on the commanded yaw.
 """
 
 import math
@@ -27,21 +27,21 @@ from alice_survey.vehicle.rotations import wrapped
 
 DEPTH_KEPT_M = 0.2
 HEADING_KEPT_RAD = math.radians(10.0)
-"""Nearer than these a depth or heading counts as kept."""
+"""Tolerances within which a depth or heading counts as kept."""
 _AT_REST = 0.1
 """Below this share of the greatest speed an axis is not on its way. Integrals learn while a depth
 or heading is kept, or stays wrong, but no faster than at the edge of being kept; on the way to a
 new one they would only wind up."""
 _MOST_SURPRISE_M = 1.0
-"""A greater step of the sea floor is believed at this rate only: it may be a false echo, and a
+"""A greater step of the sea floor is followed at this rate only: it may be a false echo, and a
 ledge is not to be dived from at once."""
 _RISE_ON_S = 5.0
-"""Without bottom lock the floor is taken to rise on for so long at full speed: for about as much as
+"""Without bottom lock the floor is assumed to rise for this long at full speed: about as long as
 the vehicle goes on until it is at rest (inferred)."""
 _HOVER_M = 2.0
 """Nearer than this a vehicle with sway hovers towards its goal instead of heading for it."""
 _HOVER_SHARE = 0.25
-"""Bandwidth of keeping place by surge, by that of the surge loop."""
+"""Bandwidth of keeping place by surge, over that of the surge loop."""
 
 
 @kernel
@@ -94,7 +94,7 @@ def hear_floor(estimate: Array, dt_s: float, guidance: Guidance, pilot: PilotSta
 def sink_to(
     depth_m: float, feed_mps: float, estimate: Array, dt_s: float, gains: Gains, pilot: PilotState
 ) -> None:
-    """Ask for the heave that takes the origin to a depth, which itself moves at a speed."""
+    """Command the heave that takes the origin to a depth, which itself moves at a speed."""
     memory, demand = pilot.memory, pilot.demand
     error, most = depth_m - estimate[vector.DEPTH], gains.axes[HEAVE, FASTEST]
     demand[slot.REF_HEAVE], demand[slot.ACC_HEAVE] = place_demand(
@@ -123,7 +123,7 @@ def head_for(
     gains: Gains,
     pilot: PilotState,
 ) -> float:
-    """Ask for the yaw that takes the heading to a wanted one.
+    """Command the yaw that takes the heading to a wanted one.
 
     Args:
         heading: wanted.
@@ -131,11 +131,11 @@ def head_for(
         quicken: the rate of that.
         estimate: (13,)
         dt_s: the tick.
-        gains: of the inner loops.
+        gains: gains of the inner loops.
         pilot: is written.
 
     Returns:
-        Wanted less present heading, within -pi and pi.
+        Wanted minus present heading, within -pi and pi.
     """
     memory, demand = pilot.memory, pilot.demand
     error, most = wrapped(heading - estimate[vector.HEADING]), gains.axes[YAW, FASTEST]
@@ -156,7 +156,7 @@ def head_for(
 def surge_at(
     speed: float, dt_s: float, guidance: Guidance, gains: Gains, pilot: PilotState
 ) -> None:
-    """Ask for a surge of the followed point over ground, as far as the sea floor leaves it."""
+    """Command a surge of the followed point over ground, as far as the sea floor permits."""
     memory, demand = pilot.memory, pilot.demand
     speed *= memory[slot.PACE]
     now = pilot.point[slot.SURGE_SPEED]
@@ -177,7 +177,7 @@ def sway_by(
     gains: Gains,
     pilot: PilotState,
 ) -> None:
-    """Ask for the sway that takes away an offset of the followed point to starboard.
+    """Command the sway that removes an offset of the followed point to starboard.
 
     The integral is kept as a vector in NED and turned into the body (Fossen 2011, section 12.2,
     does so for positioning): what holds against a current is still right after a turn.
@@ -300,7 +300,7 @@ def follow(
         surge_at(speed * max(math.cos(error), 0.0), dt_s, guidance, gains, pilot)
         if guidance.sway > 0.0:
             # Lateral thrusters keep the vehicle from slipping sideways, so that it goes where it
-            # heads: else a current could hold it off the path for ever.
+            # heads: else a current could hold it off the path indefinitely.
             sway_by(0.0, 0.0, estimate, dt_s, guidance, gains, pilot)
     report[slot.BY_SWAY] = 1.0 if by_sway else 0.0
     report[slot.CROSS], report[slot.PATH_HEADING] = cross, beta
