@@ -34,7 +34,7 @@ class BlurRates:
     speed: float
     """Motion at the centre, from speed over ground."""
     speed_worst: float
-    """The same in the worst pixel: the port magnifies towards the corners."""
+    """Motion from speed in the worst pixel: the port magnifies towards the corners."""
     roll_pitch: float
     """Motion at the centre, from roll and pitch, each at its rate, in quadrature."""
     yaw: float

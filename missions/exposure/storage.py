@@ -32,7 +32,7 @@ class Storage:
     """Most triggers a second that the disk takes."""
 
     def mission_bytes(self, stations: int) -> int:
-        """Of a whole survey."""
+        """Bytes of a whole survey."""
         return self.station_bytes * stations
 
 

@@ -48,7 +48,7 @@ class Laid:
 
     @property
     def energy_j(self) -> float:
-        """Of the whole flight."""
+        """Energy of the whole flight."""
         return self.lines_j + self.hops_j
 
     def lines(self) -> list[Line]:
@@ -143,7 +143,7 @@ def ordered(
 
 
 def tell_of_planner() -> None:
-    """Say that the first plan after an installation waits until the planner is compiled."""
+    """Report that the first plan after an installation waits until the planner is compiled."""
     note_compiling(hops.flight_parts_j, "the planner, once: this takes 40 s to a minute")
 
 
@@ -347,7 +347,7 @@ class _Closings:
 def _closings(
     corners: Array, steps: NDArray[np.int64], ends: Array, piece: NDArray[np.int64]
 ) -> _Closings:
-    """From the middle of the line that is flown first back to its start."""
+    """Lines from the middle of the line that is flown first back to its start."""
     flat = corners.reshape(-1, 3)
     half = (steps + 1) // 2
     length = np.hypot(ends[piece, 2] - ends[piece, 0], ends[piece, 3] - ends[piece, 1])

@@ -247,7 +247,7 @@ class _Series:
 
     topic: _Topic
     time_s: Array
-    """(N,) as logged."""
+    """(N,) times as logged."""
     columns: dict[str, Array]
     """(N,) columns by name (`ros_rows.ROWS`), or by joint."""
 

@@ -41,7 +41,7 @@ class LinePower:
     """Heading off the course."""
 
     def to_json(self) -> dict[str, Any]:
-        """As numbers; None where it cannot be flown."""
+        """The powers as numbers; None where it cannot be flown."""
         return {
             key: (value if isinstance(value, str) or math.isfinite(value) else None)
             for key, value in vars(self).items()

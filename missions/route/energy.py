@@ -74,7 +74,7 @@ class FlightConditions:
     """Everything but thrusters and strobes."""
 
     def with_vehicle(self, settings: VehicleConfig) -> "FlightConditions":
-        """The same for another vehicle or controller.
+        """The same conditions for another vehicle or controller.
 
         Raises:
             VehicleError: as `sound_craft_of`.
@@ -239,7 +239,7 @@ def has_sway(craft: Vehicle) -> bool:
 
 
 def _manner(craft: Vehicle, settings: VehicleConfig) -> Manner:
-    """Of flying lines: held by sway if the vehicle has it and its controller uses it."""
+    """Manner of flying lines: by sway if the vehicle has it and its controller uses it."""
     return "held" if has_sway(craft) and settings.controller == "sway" else "crab"
 
 

@@ -178,7 +178,7 @@ def common_swath(rig: Rig, altitude_m: float, step_m: float) -> Swath:
 
 
 def joint_swath(rig: Rig, altitude_m: float, step_m: float) -> Swath:
-    """From the outermost edge of one camera to that of another: the swath of the mosaic.
+    """The swath of the mosaic: from the outermost edge of one camera to that of another.
 
     Raises:
         PlanError: the cameras' swaths leave a gap between them.

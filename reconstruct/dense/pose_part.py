@@ -81,7 +81,7 @@ def spread_over(nodes: Array, rows: int, columns: int) -> Array:
 
 @progress.step("find what poses add to errors")
 def find_pose_part(workspace: Path, model: SparseModel) -> PosePart | None:
-    """What the poses leave unsure of the surface; None, with a warning, where it is not known."""
+    """The surface's uncertainty from poses; None, with a warning, where it is not known."""
     path = workspace / "mapping" / "covariance.npz"
     if not path.is_file():
         warn("no mapping/covariance.npz: sigma.tif leaves out what errors of poses do to heights")

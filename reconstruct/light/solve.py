@@ -31,7 +31,7 @@ GRID = (9, 11)
 LOW_WIDTH_PX = 108
 """Width to which pictures are shrunk before their light is compared."""
 _DARKEST, _BRIGHTEST = 3.0, 250.0
-"""Grey levels beyond which a pixel says nothing of the light."""
+"""Grey levels beyond which a pixel does not show the light."""
 _MISFIT = 0.1
 """Difference of logarithms above which two views of a spot count less (shadow, gloss, mismatch)."""
 _NODE_SIGMA, _BEND_SIGMA, _GAIN_SIGMA = 2.0, 0.05, 0.3
@@ -330,7 +330,7 @@ def _typical(nodes: Array, camera_of: NDArray[np.int64], cameras: int) -> tuple[
 
 
 def _brightness(nodes: Array, camera_of: NDArray[np.int64], cameras: int) -> tuple[Array, Array]:
-    """By how much pictures are brighter than their camera's others, (V, 3); whether known, (V,).
+    """How much brighter pictures are than their camera's others, (V, 3); whether known, (V,).
 
     Only nodes that a camera's pictures have in common are compared.
     """

@@ -42,7 +42,7 @@ class StationLink:
 
     first: int
     second: int
-    """Stations."""
+    """The two stations."""
     second_from_first: RigidTransform
     """Transform between the rigs' frames, metres."""
     inliers: int
@@ -162,7 +162,7 @@ def _rays(
 def _resections(
     seen: Observations, points: Sequence[Array], names: Sequence[str]
 ) -> Iterable[_Resection]:
-    """Of the two ways to resect one station from another, the one with more points."""
+    """The better of the two ways to resect one station from another: more points."""
     shared: dict[tuple[int, int], list[tuple[int, int, Matches]]] = {}
     for i, j, pair in seen.pairs:
         a, b = seen.images[i].station, seen.images[j].station

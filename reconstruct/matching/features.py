@@ -97,7 +97,7 @@ def find_features(
 
 
 def detection_scales(size: tuple[int, int], most: int) -> tuple[float, ...]:
-    """By how much a picture of some width and height is reduced before features are looked for.
+    """Factors by which a picture of some width and height is reduced to look for features.
 
     SIFT doubles a picture first. Pictures of rich texture have more features than are kept, and the
     largest are kept, so that those of the first octaves cost most of the time and are thrown away;

@@ -56,7 +56,7 @@ class _Partner:
     reference: Array
     """(N, 2) pixels in the picture of the references."""
     pixels: Array
-    """(N, 2)."""
+    """(N, 2) pixels."""
     support: tuple[Array, Array]
     """(M, 2) pixels of verified matches, in the picture of the references and in this one."""
 
@@ -76,7 +76,7 @@ class RefinedFeatures:
     tracked: int
     """Observations that have a reference in another picture."""
     moved: int
-    """Those that were aligned with it."""
+    """Number of features that were aligned with it."""
 
 
 def refine_tracks(
@@ -118,7 +118,7 @@ def refine_tracks(
 def track_references(
     pairs: Sequence[tuple[int, int, Matches]], starts: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """For every feature, that of its track with most direct matches; the first among equals.
+    """The reference of each feature: that of its track with most direct matches, first of equals.
 
     Args:
         pairs: indices of two pictures and matches.

@@ -99,7 +99,7 @@ def component_areas(vertices: Array, triangles: Triangles) -> tuple[NDArray[np.i
 
 
 def face_areas(vertices: Array, triangles: Triangles) -> Array:
-    """(T,) in squared units of length."""
+    """(T,) areas in squared units of length."""
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     areas: Array = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
     return areas

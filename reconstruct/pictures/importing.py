@@ -58,7 +58,7 @@ class ImportedPictures:
     kinds: Mapping[str, int]
     """Pictures by kind of file."""
     positions: int
-    """How many know where they were taken."""
+    """Number of pictures with a known position."""
     left_out: Mapping[str, int]
     """Files by the reason why they did not come in."""
 

@@ -50,13 +50,13 @@ class Located:
     """Points and how well they are known."""
 
     points: Array
-    """(N, 3), metres."""
+    """(N, 3) points, metres."""
     own: Array
-    """(N, 3, 3) covariance that each point has of its own."""
+    """(N, 3, 3) covariance of each point alone."""
     shared: Array
     """(P, N, 3) how all move with parameters of covariance `parameters`."""
     parameters: Array
-    """(P, P)."""
+    """(P, P) covariance of the parameters."""
     axes: tuple[str, str, str]
     notes: tuple[str, ...]
 

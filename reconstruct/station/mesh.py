@@ -31,7 +31,7 @@ class StationMesh:
     """Triangles in the world of the pair."""
 
     vertices: Array
-    """(V, 3)."""
+    """(V, 3) vertices."""
     triangles: Triangles
     """(T, 3) counter-clockwise seen from the camera."""
 

@@ -146,7 +146,7 @@ def precise_depth(
 
 
 def inflation(found: PreciseDepth) -> float:
-    """By what the sigmas of many pixels are too small, at least 1.
+    """Factor by which the sigmas of many pixels are too small, at least 1.
 
     Aliasing and resampling leave errors that one patch cannot show. Across the epipolar line the
     true miss is the same for all (the calibration's): its scatter (rms, gross errors held back), in
