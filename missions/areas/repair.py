@@ -36,7 +36,7 @@ class Repaired:
     """Valid polygons, metres north and east."""
 
     solid: MultiPolygon
-    """The polygons less their holes."""
+    """The polygons minus their holes."""
     holes: MultiPolygon
     """The holes minus the other polygons; may be empty."""
 

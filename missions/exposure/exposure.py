@@ -43,7 +43,7 @@ class BlurRates:
     """All, in quadrature (rates are taken for independent standard deviations), in the worst of
     the frame's centre, corners and middles of sides."""
     worst: float
-    """All at once with the worst signs, there."""
+    """All at once with the worst signs, at the same place."""
 
 
 def blur_rates(rig: Rig, plan: PlanConfig, altitude_m: float) -> BlurRates:

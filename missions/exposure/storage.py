@@ -25,7 +25,7 @@ class Storage:
     bytes_per_s: float
     """Data rate while a line is flown."""
     own_link_hz: float
-    """Most triggers a second, each camera on a cable of its own."""
+    """Most triggers a second, each camera on its own cable."""
     shared_link_hz: float
     """Most triggers a second with all cameras on one cable."""
     disk_hz: float

@@ -49,7 +49,7 @@ def line_j(prices: Prices, length_m: float, course_rad: float) -> float:
 
 @compiled
 def _spot_j(prices: Prices, turn_rad: float) -> float:
-    """Energy of a turn on the spot, with its stop; nothing of no turn."""
+    """Energy of a turn on the spot, with its stop; 0 without a turn."""
     turn = abs((turn_rad + math.pi) % (2 * math.pi) - math.pi)
     if turn < _SAME_RAD:
         return 0.0

@@ -1,7 +1,7 @@
 """Lay the lines of a survey in order of flight.
 
 Survey lines lie on one grid of offsets over the whole area; cross lines tie them together; a
-closing line goes back over the begin of the first, so that the end of the track is tied to its
+closing line goes back over the start of the first, so that the end of the track is tied to its
 beginning; fill lines see what the pattern cannot because a no-go zone cuts it. Cells of survey
 lines and cross lines are one tour, from home and home again.
 """
@@ -85,7 +85,7 @@ def lay_lines(
         home_ne: where the flight begins and ends.
         cross_lines: how many across the survey lines, over every block of them; more where some
             would stay uncrossed (`missions.lines.cross`); 0: none.
-        closing_line: whether the begin of the first line is flown again at the end.
+        closing_line: whether the start of the first line is flown again at the end.
         most_stations: that a plan may have.
 
     Returns:

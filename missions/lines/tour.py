@@ -199,7 +199,7 @@ def improved_tour(
         inner: the same.
         start: the same.
         finish: (4C,) cost after leaving last at a corner.
-        fixed: how many cells at its begin stay as they are, 0 or 1.
+        fixed: how many cells at its start stay as they are, 0 or 1.
     """
     tour = tour.copy()
     cells = tour.size

@@ -1,4 +1,4 @@
-"""What a vehicle's own log says of a dive, whatever its format: series of numbers against time."""
+"""What a vehicle's own log records of a dive, in any format: series of numbers against time."""
 
 import bisect
 from collections import Counter

@@ -81,7 +81,7 @@ _COLA2 = {
 
 @dataclass(frozen=True, kw_only=True)
 class BagOptions:
-    """What a bag does not say by itself."""
+    """What a bag does not state itself."""
 
     topics: Mapping[str, str]
     """Topic to use for each role (`dive.ROLES`)."""

@@ -38,7 +38,7 @@ class LinePower:
     line_w: float
     """Power of the whole vehicle."""
     crab_deg: float
-    """Heading off the course."""
+    """Angle of the heading off the course."""
 
     def to_json(self) -> dict[str, Any]:
         """The powers as numbers; None where it cannot be flown."""

@@ -189,7 +189,7 @@ def _sums(whole: Route, legs: Array, alone: Sequence[Route], costs: Costs, depth
 def _least_dives(sums: _Sums, limits: DiveLimits) -> list[tuple[int, int]] | None:
     """First and last line of each dive; None where some line fits no dive by itself.
 
-    Of the best parting of the lines up to each: how many dives, what energy, where the last begins.
+    Of the best division of lines up to each: how many dives, what energy, where the last begins.
     """
     count = sums.until.shape[1]
     energy_j, time_s = limits.energy_j, limits.time_s

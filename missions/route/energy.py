@@ -111,10 +111,10 @@ class Motion:
     nu: Array
     """(N, 6) velocity relative to the water, in the body."""
     crab_rad: Array
-    """(N,) heading less course."""
+    """(N,) heading minus course."""
     possible: Array
     """(N,) 1.0, or NaN where the current along the course is not below the speed of a vehicle that
-    crabs: it would have to turn its back on where it goes."""
+    crabs: it would have to face away from where it goes."""
 
 
 def vehicle_costs(

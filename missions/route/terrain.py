@@ -45,9 +45,9 @@ class TerrainLimits:
     """What a profile has to keep."""
 
     altitude_m: float
-    """Wanted, of the glass above the highest floor within reach."""
+    """Wanted height of the glass above the highest floor within reach."""
     least_clearance_m: float
-    """No altitude is lower."""
+    """Lowest altitude allowed."""
     steepest_rad: float
     """Slope that the vehicle follows."""
 

@@ -32,7 +32,7 @@ class Swath:
 
     @property
     def across_m(self) -> float:
-        """Width athwartships."""
+        """Width across the vehicle."""
         return self.port_m + self.starboard_m
 
     @property
@@ -42,7 +42,7 @@ class Swath:
 
     @property
     def half_across_m(self) -> float:
-        """What is seen to the worse of both sides."""
+        """The reach on the side that sees less."""
         return min(self.port_m, self.starboard_m)
 
 

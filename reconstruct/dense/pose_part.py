@@ -2,7 +2,7 @@
 
 Depths of one place from many views share errors, since they rest on the same poses. How much
 is known at every sparse point: its covariance from the adjustment (`mapping/covariance.npz`), which
-holds poses and pixels together, less what the pixels of its own observations leave with poses held.
+holds poses and pixels together, minus what its own observations leave with poses held.
 The rest is what the poses around it do to a surface there.
 """
 

@@ -36,7 +36,7 @@ _NAMED = 8
 
 @dataclass(frozen=True, kw_only=True)
 class FarStation:
-    """A station that lies elsewhere than navigation has it."""
+    """A station that is not where navigation places it."""
 
     station: int
     image: str

@@ -2,7 +2,7 @@
 
 An adjustment of stations, points and the rig's parameters, each parameter within what calibration
 knew of it: the covariance of `rig.json`, or wide bounds where it has none. What is requested is
-free; what the calibration was unsure of besides (focal lengths, say) moves with it within its
+free; other uncertain parameters of the calibration (focal lengths, say) moves with it within its
 covariance, since holding that would push its errors into what is requested.
 """
 

@@ -1,6 +1,6 @@
 """Poses of stereo stations relative to each other, straight from the pictures.
 
-What both cameras of a station see is a metric cloud of its own, so that the pose of any other
+What both cameras of a station see is a metric cloud, so that the pose of any other
 station that shares features with it follows from a resection: no first pair, no growing model and
 no navigation is needed, and every pair of stations costs the same however large the survey is.
 """

@@ -50,7 +50,7 @@ def without_folds(vertices: Array, triangles: Triangles) -> Triangles:
 
 
 def split_fans(vertices: Array, triangles: Triangles) -> tuple[Array, Triangles, NDArray[np.int64]]:
-    """Give each fan of triangles around a vertex a vertex of its own; drop unused vertices.
+    """Give each fan of triangles around a vertex its own vertex; drop unused vertices.
 
     Returns:
         Vertices, triangles, and of which vertex each is a copy.

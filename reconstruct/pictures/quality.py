@@ -1,6 +1,6 @@
 """How good the pictures of a survey are: sharpness, exposure, contrast, noise and overlap.
 
-Every picture is measured by itself, then held against the survey: what lies far from the median of
+Every picture is measured by itself, then compared with the survey: what lies far from the median of
 all is listed with the reason. Nothing is left out of the reconstruction because of it.
 """
 

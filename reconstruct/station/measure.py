@@ -61,7 +61,7 @@ class Located:
     notes: tuple[str, ...]
 
     def sigma(self, figure: Callable[[Array], float]) -> tuple[float, float]:
-        """Standard deviations of a figure of the points: of their own, and of what they share."""
+        """Standard deviations of a figure of the points: independent part, and shared part."""
         slope = np.zeros_like(self.points)
         step = 1e-6 * max(1.0, float(np.abs(self.points).max()))
         for n, axis in np.ndindex(*self.points.shape):
