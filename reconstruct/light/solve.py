@@ -8,7 +8,7 @@ sea lighting effects for visual mapping of abyssal plains"). What overlaps leave
 fall-off across a single line, is taken from the median of all pictures, in which the scene averages
 out; it weighs the more, the more pictures there are. Along a line a lamp brighter ahead looks like
 pictures that grow darker one by one: there the pictures' brightness counts, which the sea floor
-changes at random and a drift would not. Where overlaps speak they outweigh both.
+changes at random and a drift would not. Where there are overlaps they outweigh both.
 """
 
 from collections.abc import Mapping, Sequence

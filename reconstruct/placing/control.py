@@ -63,7 +63,7 @@ class ControlFit:
     ties: tuple[_Tie, ...]
     bars: tuple[_Bar, ...]
     lost: Mapping[str, str]
-    """Why other control is of no use, by name."""
+    """Why other control is not used, by name."""
 
     @property
     def used_points(self) -> tuple[_Tie, ...]:

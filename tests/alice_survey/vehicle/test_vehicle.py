@@ -1,4 +1,4 @@
-"""A vehicle as a value: its matrices from its parts, by hand and by other roads."""
+"""A vehicle as a value: its matrices from its parts, by hand and by other methods."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The joint adjustment: as exact as its Cramer-Rao bound allows, and honest about it."""
+"""The joint adjustment: as exact as its Cramer-Rao bound allows, with sigmas that say so."""
 
 import time
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The sigmas that a placement states are those of its errors, however long errors last."""
+"""The sigmas that a placement states are those of its errors, however correlated errors are."""
 
 from dataclasses import replace
 
