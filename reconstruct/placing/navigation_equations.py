@@ -56,7 +56,7 @@ class Epochs:
     sigma: Array
     """(M, 6) north, east, depth (m), roll, pitch, heading (rad) as navigation states it."""
     known: NDArray[np.bool_]
-    """(M, 6) whether navigation states it."""
+    """(M, 6) whether navigation gives the value."""
 
     def positions(self, ned_from_model: Similarity) -> Array:
         """Body origins in NED, (N, 3)."""
