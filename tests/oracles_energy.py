@@ -24,7 +24,7 @@ def envelope(along_m: Array, wanted_m: Array, slope: float) -> Array:
 def best_parting(
     count: int, cost: Cost, energy_j: float, time_s: float
 ) -> tuple[int, float] | None:
-    """Fewest dives and their least energy, by trying all ways to part so many lines."""
+    """Fewest dives and their least energy, by trying all ways to divide the lines."""
     for dives in range(1, count + 1):
         best = math.inf
         for cuts in combinations(range(1, count), dives - 1):

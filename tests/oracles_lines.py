@@ -111,7 +111,7 @@ def seen_enough(lines: Sequence[Line], points: Array, pattern: Pattern) -> Array
 
 
 def points_in(area: shapely.Geometry, count: int) -> Array:
-    """About so many places, (N, 2), evenly over an area."""
+    """About a given number of places, (N, 2), evenly over an area."""
     x_0, y_0, x_1, y_1 = area.bounds
     pitch = math.sqrt(area.area / count)
     x, y = np.arange(x_0 + pitch / 2, x_1, pitch), np.arange(y_0 + pitch / 2, y_1, pitch)

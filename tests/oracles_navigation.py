@@ -33,7 +33,7 @@ class Belief:
     (2), water (2)."""
 
     def moved(self, error: Array) -> "Belief":
-        """The state that errs by so much: truth = belief moved by the error, (25,)."""
+        """The state with an error: truth = estimate moved by the error, (25,)."""
         return Belief(
             self.position + error[:3],
             self.velocity + error[3:6],
@@ -70,7 +70,7 @@ def kept(sensors: Sensors, dt_s: float) -> Array:
 def next_state(
     state: Belief, turn: Array, push: Array, noise: Array, sensors: Sensors, dt_s: float
 ) -> Belief:
-    """The state a tick later, by increments that err by bias and noise (6,)."""
+    """The state a tick later, by increments with errors of bias and noise (6,)."""
     turned = turn - state.rest[:3] * dt_s - noise[:3]
     pushed = push - state.rest[3:6] * dt_s - noise[3:]
     fall = state.attitude.inv().apply(GRAVITY * dt_s)

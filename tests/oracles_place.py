@@ -1,4 +1,4 @@
-"""Slow, obvious twins of the kernels that weigh errors which last."""
+"""Slow, obvious twins of the kernels that weigh correlated errors."""
 
 import numpy as np
 

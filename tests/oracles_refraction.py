@@ -1,4 +1,4 @@
-"""A refractive bundle adjustment as plain as can be: the twin of what the mapping does in turns."""
+"""A refractive bundle adjustment as plain as possible, a twin of what the mapping does in turns."""
 
 from typing import Any
 

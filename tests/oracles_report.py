@@ -84,7 +84,7 @@ def synthetic_views(
 def adjusted(
     views: Sequence[TargetView], points: Array, start: Rig, freedom: Freedom
 ) -> Calibration:
-    """The calibration that real code makes of some views."""
+    """The calibration that real code computes from some views."""
     poses = RigidTransform.concatenate([locate(start, view, points) for view in views])
     found = adjust(views, points, start, poses, freedom)
     return Calibration(

@@ -119,7 +119,7 @@ def wait_for(
 
 
 def test_killed_fifty_times_it_ends_the_same(undisturbed: Path, tmp_path: Path) -> None:
-    """At random moments of every stage, four or five times in each."""
+    """At random times in every stage, four or five times in each."""
     workspace = settings_in(tmp_path / "killed")
     events = workspace.with_suffix(".jsonl")
     took_s = {

@@ -1,4 +1,4 @@
-"""A stage whose code changed has a new version, or somebody said that its result is the same."""
+"""A stage whose code changed has a new version, or is declared to give the same result."""
 
 import json
 from pathlib import Path

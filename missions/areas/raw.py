@@ -1,4 +1,4 @@
-"""Shapes as they were given: rings, lines and points that nobody has checked yet."""
+"""Shapes as they were given: rings, lines and points, not yet checked."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -19,9 +19,9 @@ class RawLine:
     """A line that stands for a corridor."""
 
     points: Array
-    """(N, 2)."""
+    """(N, 2) points."""
     width_m: float | None = None
-    """None where its source does not say."""
+    """Width; None where its source does not give it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,7 +39,7 @@ class RawShapes:
     """For each polygon its outer ring, then its holes."""
     lines: tuple[RawLine, ...] = ()
     points: Array
-    """(N, 2)."""
+    """(N, 2) points."""
     no_go: "RawShapes | None" = None
     """Zones to keep out of that came in the same file."""
     unused_fence: str = ""
@@ -47,7 +47,7 @@ class RawShapes:
 
     @property
     def coordinates(self) -> Array:
-        """(N, 2) of everything but the zones to keep out of."""
+        """(N, 2) coordinates of everything but the zones to keep out of."""
         rings = [ring for polygon in self.polygons for ring in polygon]
         return np.concatenate([*rings, *(line.points for line in self.lines), self.points])
 
@@ -59,7 +59,7 @@ class RawShapes:
     def mapped(
         self, change: Callable[[Array, str], Array], *, geographic: bool, origin: str | None = None
     ) -> "RawShapes":
-        """With other coordinates.
+        """The shapes with other coordinates.
 
         Args:
             change: takes (N, 2) coordinates and their name, such as `polygon 2, hole 1`.

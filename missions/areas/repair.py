@@ -36,9 +36,9 @@ class Repaired:
     """Valid polygons, metres north and east."""
 
     solid: MultiPolygon
-    """The polygons less their holes."""
+    """The polygons minus their holes."""
     holes: MultiPolygon
-    """The holes less the other polygons; may be empty."""
+    """The holes minus the other polygons; may be empty."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -327,7 +327,7 @@ def buffered_line(points: Array, width_m: float) -> Polygon | MultiPolygon:
 
 
 def widened(geometry: MultiPolygon, by_m: float) -> MultiPolygon:
-    """All within a distance, and sharp corners kept sharp up to `MITRE_LIMIT`."""
+    """All places within a distance, with sharp corners kept sharp up to `MITRE_LIMIT`."""
     if by_m == 0.0 or geometry.is_empty:
         return geometry
     return multipolygon(geometry.buffer(by_m, join_style="mitre", mitre_limit=MITRE_LIMIT))

@@ -75,7 +75,7 @@ class Certificate:
 
     @property
     def area_m2(self) -> float:
-        """Of the survey area."""
+        """Size of the survey area."""
         return float(self.area.survey.area)
 
     @property
@@ -111,17 +111,17 @@ class Certificate:
 
     @property
     def fewest_pictures(self) -> int:
-        """Of any camera that see any place of the area."""
+        """Fewest pictures of any camera that see any place of the area."""
         return int(self.least_pictures[self.inside].min())
 
     @property
     def fewest_lines(self) -> int:
-        """On which any camera sees any place of the area."""
+        """Fewest lines on which any camera sees any place of the area."""
         return int(self.least_lines[self.inside].min())
 
     @property
     def mean_pictures(self) -> float:
-        """Of all cameras, that see a place of the area."""
+        """Mean number of pictures, of all cameras, that see a place of the area."""
         return float(self.pictures[self.inside].mean())
 
     def _share(self, mask: NDArray[np.bool_]) -> float:
@@ -170,7 +170,7 @@ class _TileCounts:
     pictures: list[NDArray[np.intp]]
     """For each camera: how many cells of the area are in 0, 1, ... pictures."""
     lines: list[NDArray[np.intp]]
-    """The same for lines."""
+    """For each camera: how many cells of the area are on 0, 1, ... lines."""
 
 
 def certificate(

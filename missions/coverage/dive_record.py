@@ -67,7 +67,7 @@ class DiveRecord:
     """Start and length of gaps in the log, seconds."""
 
     def to_json(self) -> dict[str, Any]:
-        """All but the stations."""
+        """All fields but the stations."""
         return {
             "log": self.source,
             "triggers": self.triggers,

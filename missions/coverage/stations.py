@@ -57,7 +57,7 @@ class Stations:
         return len(self.glass_ne)
 
     def some(self, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> "Stations":
-        """Those of an index or a mask."""
+        """The stations of an index or a mask."""
         return Stations(
             glass_ne=self.glass_ne[chosen],
             altitude_m=self.altitude_m[chosen],
@@ -67,7 +67,7 @@ class Stations:
         )
 
     def and_then(self, other: "Stations") -> "Stations":
-        """These, and those of a later dive; its lines count on, and its times are not kept."""
+        """These stations and those of a later dive; its lines count on, its times are not kept."""
         after = int(self.line.max(initial=-1)) + 1
         return Stations(
             glass_ne=np.concatenate([self.glass_ne, other.glass_ne]),
@@ -77,7 +77,7 @@ class Stations:
         )
 
     def moved(self, north_m: float, east_m: float) -> "Stations":
-        """The same elsewhere."""
+        """The same stations elsewhere."""
         return replace(self, glass_ne=self.glass_ne + np.array([north_m, east_m]))
 
 

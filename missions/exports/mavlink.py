@@ -51,7 +51,7 @@ def mission_items(
 
 
 def trigger_m(plan: Plan, line: int) -> float:
-    """From picture to picture on a line, at least 0.1 mm short so that its last is not lost; m."""
+    """Distance from picture to picture, at least 0.1 mm short so that a line's last is not lost."""
     wanted = plan.lines[line]
     if wanted.stations < 2:
         return plan.station_spacing_m

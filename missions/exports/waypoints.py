@@ -245,7 +245,7 @@ def _leads_to_line(leg: Leg, following: Leg | None) -> bool:
 
 
 def _switched(points: list[_Point]) -> list[_Point]:
-    """With the camera on where a line begins and off where it ends."""
+    """Way-points with the camera on where a line begins and off where it ends."""
     result = list(points)
     for i, point in enumerate(points):
         if point.kind != "line":
@@ -264,7 +264,7 @@ def _switched(points: list[_Point]) -> list[_Point]:
 def _with_depths(
     points: list[_Point], plan: Plan, line_depths: Sequence[Array] | None
 ) -> list[_Point]:
-    """With a depth at every place: between lines the less deep of those of the lines next to it."""
+    """Way-points with a depth each: between lines the shallower of the lines next to it."""
     if line_depths is None:
         level_m = plan.seafloor_depth_m - plan.altitude_m
         return [replace(point, glass_depth_m=level_m) for point in points]

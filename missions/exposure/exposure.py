@@ -34,7 +34,7 @@ class BlurRates:
     speed: float
     """Motion at the centre, from speed over ground."""
     speed_worst: float
-    """The same in the worst pixel: the port magnifies towards the corners."""
+    """Motion from speed in the worst pixel: the port magnifies towards the corners."""
     roll_pitch: float
     """Motion at the centre, from roll and pitch, each at its rate, in quadrature."""
     yaw: float
@@ -43,7 +43,7 @@ class BlurRates:
     """All, in quadrature (rates are taken for independent standard deviations), in the worst of
     the frame's centre, corners and middles of sides."""
     worst: float
-    """All at once with the worst signs, there."""
+    """All at once with the worst signs, at the same place."""
 
 
 def blur_rates(rig: Rig, plan: PlanConfig, altitude_m: float) -> BlurRates:

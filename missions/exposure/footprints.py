@@ -68,7 +68,7 @@ class Spacing:
     mean_overlap: float
     """Side overlap of one camera's pictures on the middle row, at the mean altitude."""
     top_overlap: float
-    """The same at the top of the relief."""
+    """Side overlap on the middle row at the top of the relief."""
     off_track_overlap: float
     """Side overlap at the top of the relief where two neighbours are each off by the track error,
     away from each other."""

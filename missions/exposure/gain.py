@@ -263,7 +263,7 @@ def noise_sigma(picture: Floats) -> float:
 def _refuse_useless(
     levels: Sequence[PictureLevels], median: float, bright: float, clipped: float
 ) -> None:
-    """Stop where the pictures say nothing of the light.
+    """Stop where the pictures do not show the light.
 
     Raises:
         ImageError: they are black, or white.

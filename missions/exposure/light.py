@@ -63,7 +63,7 @@ class LightBudget:
     median_e: float
     """Median of the mean of the channels over the frame."""
     brightest_e: float
-    """The largest of any channel anywhere in the frame."""
+    """Most electrons of any channel anywhere in the frame."""
     snr_centre: tuple[float, float, float]
     """Signal over shot and read noise."""
     snr_median: float
@@ -225,7 +225,7 @@ def signal_to_noise(electrons: Array, read_noise_e: float) -> Array:
 
 
 def too_dark(budget: LightBudget) -> str:
-    """What to say where the median pixel drowns in noise; empty where it does not."""
+    """What to say where the median pixel is lost in noise; empty where it does not."""
     if budget.snr_median >= LEAST_SNR:
         return ""
     return f"too dark, signal to noise {budget.snr_median:.1f} of {LEAST_SNR:g}"

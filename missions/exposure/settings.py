@@ -77,11 +77,11 @@ class ImagingSetup:
         return design_rig(self.camera, self.water)
 
     def with_camera(self, **values: float) -> Self:
-        """The same with settings of the cameras changed."""
+        """The same setup with settings of the cameras changed."""
         return replace(self, camera=self.camera.model_copy(update=values))
 
     def with_plan(self, **values: float | None) -> Self:
-        """The same with settings of the plan changed."""
+        """The same setup with settings of the plan changed."""
         return replace(self, plan=self.plan.model_copy(update=values))
 
 

@@ -71,7 +71,7 @@ def solve_report(
         dive_s: time of a dive: find the area that fits; with a resolution, at its altitude and
             lens.
         rate_hz: pictures a second: find the speed.
-        lenses: focal lengths at hand, mm.
+        lenses: available focal lengths, mm.
 
     Raises:
         ConfigError: nothing is given.

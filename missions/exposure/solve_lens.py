@@ -118,7 +118,7 @@ def with_lens(setup: ImagingSetup, option: LensOption) -> ImagingSetup:
 
 
 def in_focus(setup: ImagingSetup) -> ImagingSetup:
-    """The same with the aperture closed as far as the relief needs, if diffraction allows it."""
+    """The same setup with the aperture closed as the relief needs, if diffraction allows it."""
     camera, plan = setup.camera, setup.plan
     needed = math.ceil(10 * needed_f_number(setup.rig.cameras["left"], camera, plan) - 1e-9) / 10
     if not camera.f_number < needed <= largest_f_number(camera, plan.sharp_px):

@@ -25,14 +25,14 @@ class Storage:
     bytes_per_s: float
     """Data rate while a line is flown."""
     own_link_hz: float
-    """Most triggers a second, each camera on a cable of its own."""
+    """Most triggers a second, each camera on its own cable."""
     shared_link_hz: float
     """Most triggers a second with all cameras on one cable."""
     disk_hz: float
     """Most triggers a second that the disk takes."""
 
     def mission_bytes(self, stations: int) -> int:
-        """Of a whole survey."""
+        """Bytes of a whole survey."""
         return self.station_bytes * stations
 
 

@@ -46,7 +46,7 @@ class TriggerRow:
     """Edges of one trigger, us since the start."""
 
     trigger: int
-    """Counts from 0."""
+    """Number of the trigger, from 0."""
     trigger_us: int
     """The middle of the exposure."""
     edges: Edges

@@ -22,7 +22,7 @@ class Way:
     price: str
     """What is lost by it, in words and numbers."""
     cost: float
-    """The loss as a share: extra time of the survey, or what is given up of what was requested."""
+    """Loss as a share: extra time of the survey, or what is given up of what was requested."""
 
 
 def conflict(what: str, limits: tuple[str, str], ways: Sequence[Way]) -> PlanError:

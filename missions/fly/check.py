@@ -126,7 +126,7 @@ def check_report(
     """Check a dive, write what is found, and plan the holes again.
 
     Writes `certificate.json`, `coverage.png`, `coverage.tif`, `holes.geojson`; where holes are left
-    `refly/`, a workspace with a plan of its own; after simulated flights `hole_probability.png`.
+    `refly/`, a workspace with its own plan; after simulated flights `hole_probability.png`.
 
     Args:
         workspace: as of `check_log`.

@@ -138,7 +138,7 @@ class Trace:
 
     time_s: Array
     true_ne: Array
-    """(T, 2)"""
+    """(T, 2) true north and east."""
     cross_m: Array
     """(T,) true, to starboard of the route."""
     roll_deg: Array
@@ -160,7 +160,7 @@ class Case:
 
     @property
     def name(self) -> str:
-        """As the command line takes it."""
+        """The current as the command line takes it."""
         current = f"{self.current_mps:g}@{self.towards_deg:g}"
         if self.swell_m == 0.0:
             return current

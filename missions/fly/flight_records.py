@@ -1,4 +1,4 @@
-"""A flight as logs that other tools read, and as the figures people ask for."""
+"""A flight as logs that other tools read, and as summary figures."""
 
 import math
 from typing import Any

@@ -1,4 +1,4 @@
-"""What of a plan is flown: all its dives in one go, or one of them."""
+"""The part of a plan that is flown: all its dives in one go, or one of them."""
 
 import math
 from collections.abc import Iterator

@@ -39,7 +39,7 @@ class MonteCarlo:
     stereo_share: Array
     """(N,) share of the area seen in stereo."""
     share_at_overlap: Array
-    """(N,)"""
+    """(N,) share of the area covered at the requested overlap."""
     fewest_pictures: NDArray[np.intp]
     """(N,) fewest pictures of any camera that see any place."""
     hole_probability: Array
@@ -50,7 +50,7 @@ class MonteCarlo:
 
     @property
     def flights(self) -> int:
-        """How many."""
+        """Number of flights."""
         return len(self.covered_share)
 
     def to_json(self) -> dict[str, Any]:

@@ -333,7 +333,7 @@ def _altitude(floor: FloorGrid, points_ned: Array) -> Array:
 
 
 def navigation_log(flown: Flown) -> BelievedNavigation:
-    """What the navigation believed, tick by tick."""
+    """The navigation's estimate, tick by tick."""
     columns = dict(zip(LOG_COLUMNS, flown.navigation.T, strict=True))
 
     def table(*names: str) -> Array:

@@ -1,1 +1,1 @@
-"""Survey lines: their direction, the strips they look after, the cells they form, their order."""
+"""Survey lines: their direction, the strips they cover, the cells they form, their order."""

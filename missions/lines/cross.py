@@ -19,7 +19,7 @@ from missions.lines.rows import rooms
 
 LEAST_STEPS = 2
 """Survey lines of fewer steps from picture to picture may stay uncrossed. Chosen: a line of one or
-two pictures hangs on its neighbours' and bends nothing."""
+two pictures is tied to its neighbours and does not bend the block."""
 _ROWS_APART = 2
 """A cross line goes on over one row that has no line there."""
 _EVEN = 1e-9

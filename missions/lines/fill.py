@@ -3,7 +3,7 @@
 What must be seen is cut into small patches. Patches near one another are a cluster. For a cluster
 lines are tried along the survey lines, across them, along the edges of the allowed area near by and
 along the cluster itself, at many offsets; the line that sees most for its length is flown, until
-next to nothing is left (the greedy rule for covering a set; V. Chvatal 1979).
+almost nothing is left (the greedy rule for covering a set; V. Chvatal 1979).
 """
 
 import heapq
@@ -56,7 +56,7 @@ def fill_table(
     Args:
         site: the area.
         heading_rad: of the rows.
-        pattern: what lines see. Of one that leaves gaps of itself nothing is filled.
+        pattern: what lines see. A pattern that has gaps by itself is not filled.
         pieces: from `rows.lay_rows`.
         offsets: of the rows.
         cuts: from `rows.lay_rows`.
@@ -108,7 +108,7 @@ def _has_gaps(pattern: Pattern) -> bool:
 
 
 def _finest_m(pattern: Pattern) -> float:
-    """Of patches: a few to what a line sees."""
+    """Size of patches: a few to what a line sees."""
     return min(pattern.half_across_m, pattern.half_along_m) / 4
 
 

@@ -4,7 +4,7 @@ A hop goes from the end of a line to the start of the next by the shortest way i
 area. It is priced as a turn on the spot towards the next start, the way, and a turn onto the next
 line; or, where it is short and direct, as a step sideways and one turn; whichever is less. The
 course of a way round corners counts as that of its straight. The route itself, with arcs where they
-are cheaper, is made later by `missions.route.turns`: this price orders lines, it flies nothing.
+are cheaper, is made later by `missions.route.turns`: this price only orders lines.
 """
 
 import math
@@ -24,7 +24,7 @@ _SAME_RAD = 1e-6
 
 
 def comparable_prices(costs: Costs) -> Prices:
-    """Prices of which nothing is infinite, so that totals with hops nobody can fly compare."""
+    """Prices of which nothing is infinite, so that totals with impossible hops compare."""
     return prices(costs, NOWHERE_J)
 
 
@@ -49,7 +49,7 @@ def line_j(prices: Prices, length_m: float, course_rad: float) -> float:
 
 @compiled
 def _spot_j(prices: Prices, turn_rad: float) -> float:
-    """Energy of a turn on the spot, with its stop; nothing of no turn."""
+    """Energy of a turn on the spot, with its stop; 0 without a turn."""
     turn = abs((turn_rad + math.pi) % (2 * math.pi) - math.pi)
     if turn < _SAME_RAD:
         return 0.0

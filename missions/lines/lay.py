@@ -1,7 +1,7 @@
 """Lay the lines of a survey in order of flight.
 
 Survey lines lie on one grid of offsets over the whole area; cross lines tie them together; a
-closing line goes back over the begin of the first, so that the end of the track is tied to its
+closing line goes back over the start of the first, so that the end of the track is tied to its
 beginning; fill lines see what the pattern cannot because a no-go zone cuts it. Cells of survey
 lines and cross lines are one tour, from home and home again.
 """
@@ -48,7 +48,7 @@ class Laid:
 
     @property
     def energy_j(self) -> float:
-        """Of the whole flight."""
+        """Energy of the whole flight."""
         return self.lines_j + self.hops_j
 
     def lines(self) -> list[Line]:
@@ -85,7 +85,7 @@ def lay_lines(
         home_ne: where the flight begins and ends.
         cross_lines: how many across the survey lines, over every block of them; more where some
             would stay uncrossed (`missions.lines.cross`); 0: none.
-        closing_line: whether the begin of the first line is flown again at the end.
+        closing_line: whether the start of the first line is flown again at the end.
         most_stations: that a plan may have.
 
     Returns:
@@ -143,7 +143,7 @@ def ordered(
 
 
 def tell_of_planner() -> None:
-    """Say that the first plan after an installation waits until the planner is compiled."""
+    """Report that the first plan after an installation waits until the planner is compiled."""
     note_compiling(hops.flight_parts_j, "the planner, once: this takes 40 s to a minute")
 
 
@@ -347,7 +347,7 @@ class _Closings:
 def _closings(
     corners: Array, steps: NDArray[np.int64], ends: Array, piece: NDArray[np.int64]
 ) -> _Closings:
-    """From the middle of the line that is flown first back to its start."""
+    """Lines from the middle of the line that is flown first back to its start."""
     flat = corners.reshape(-1, 3)
     half = (steps + 1) // 2
     length = np.hypot(ends[piece, 2] - ends[piece, 0], ends[piece, 3] - ends[piece, 1])

@@ -2,7 +2,7 @@
 
 In the frame of the lines u runs along them and v to the right of them. A row is a line of one
 offset v; it looks after a strip of v about it. Where the area within the strip has parts, or
-no-go zones bar the way, the row has pieces.
+no-go zones block the way, the row has pieces.
 
 The reach of an area within a strip is its projection on u. It is exact: the outline of the area
 within the strip is made of the area's edges clipped to the strip and of the stretches of the

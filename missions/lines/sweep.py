@@ -6,7 +6,7 @@ and least along one of them (rotating calipers carry this from convex areas, M. 
 any area: W. H. Huang 2001 takes the same sum over cells).
 
 For the full cost no formula is known: it jumps where a line more is needed, and turns, transits and
-the current have their say. A cheap estimate (energy of all pieces of lines, and of a turn to each)
+the current matter. A cheap estimate (energy of all pieces of lines, and of a turn to each)
 is taken at many headings, at the directions of edges and just where the number of lines jumps; at
 the best of these a close one (the tour is only improved, and fill lines are left out, which take
 most of the time and differ little between good headings), then again near the best of all; the full

@@ -3,7 +3,7 @@
 Few cells are ordered exactly, by dynamic programming over the sets of cells flown (M. Held and
 R. M. Karp 1962) with the corner at which each is entered. Many are ordered by going to the nearest,
 then improving: stretches of the tour are reversed, cells are moved, and corners of entry are chosen
-again by dynamic programming along the tour, until nothing gains; then it is shaken and improved
+again by dynamic programming along the tour, until nothing improves; then it is shaken and improved
 again.
 """
 
@@ -123,7 +123,7 @@ def tour_cost(
 def nearest_tour(
     hops: Array, exits: NDArray[np.int64], inner: Array, start: Array
 ) -> NDArray[np.int64]:
-    """From home always on to the cell that is reached with least cost; arguments as below."""
+    """Tour from home always on to the cell reached at least cost; arguments as below."""
     corners = inner.size
     cells = corners // CORNERS
     flown = np.zeros(cells, np.int64)
@@ -199,7 +199,7 @@ def improved_tour(
         inner: the same.
         start: the same.
         finish: (4C,) cost after leaving last at a corner.
-        fixed: how many cells at its begin stay as they are, 0 or 1.
+        fixed: how many cells at its start stay as they are, 0 or 1.
     """
     tour = tour.copy()
     cells = tour.size

@@ -1,8 +1,8 @@
 """What parallel lines leave unseen, exactly along them and by thin strips across.
 
 Strips lie between all offsets at which something changes: corners of the area, sides of the lines'
-swaths, and where the area's edge crosses an end of what is seen by a gap. On the middle of each
-strip the parts that are seen too few times are found exactly.
+swaths, and where the area's edge crosses an end of what is seen next to a gap. On the middle of
+each strip the parts that are seen too few times are found exactly.
 """
 
 import math

@@ -31,7 +31,7 @@ class Samples:
     time_s: Array
     """(M,) seconds of the flight, increasing."""
     values: Array
-    """(M, k)."""
+    """(M, k) values."""
     sigma: float = 0.0
     """Standard deviation of each value; 0 is not known."""
 
@@ -63,11 +63,11 @@ class BagRecord:
     sigma_horizontal_m: Array
     """(T,) sigma of north and of east each."""
     sigma_depth_m: Array
-    """(T,)."""
+    """(T,) sigma of depth."""
     sigma_attitude_rad: Array
     """(T,) sigma of roll and of pitch each."""
     sigma_heading_rad: Array
-    """(T,)."""
+    """(T,) sigma of heading."""
     sigma_velocity_mps: Array | None = None
     """(T,) sigma of u, v and w each."""
     altitude_m: Array | None = None
@@ -77,11 +77,11 @@ class BagRecord:
     rpm: Array | None = None
     """(T, n) revolutions per minute."""
     power_w: Array | None = None
-    """(T, n) electrical."""
+    """(T, n) electrical power."""
     thrust_n: Array | None = None
-    """(T, n)."""
+    """(T, n) thrusts."""
     imu: Samples | None = None
-    """(M, 6) p, q, r, rad/s, and specific force, m/s^2 (acceleration less gravity: -g along down
+    """(M, 6) p, q, r, rad/s, and specific force, m/s^2 (acceleration minus gravity: -g along down
     at rest), in the body frame (FRD)."""
     ahrs_rad: Samples | None = None
     """(M, 3) roll, pitch and heading as measured."""

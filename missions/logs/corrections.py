@@ -32,11 +32,11 @@ class Corrections:
     """Height of the water above the level that depths are to count from, metres; or (N, 1) of it
     on the clock of the log after `clock_offset_s`."""
     clock_offset_s: float = 0.0
-    """Added to the times of the log."""
+    """Offset added to the times of the log."""
     lever_body_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Place on the body (FRD, from its origin) that the logged position and depth are of."""
     altitude_offset_m: float = 0.0
-    """Added to altitudes: the height of the left port's glass above the sensor."""
+    """Offset added to altitudes: the height of the left port's glass above the sensor."""
 
     def __post_init__(self) -> None:
         numbers = [self.declination_deg, self.clock_offset_s, self.altitude_offset_m]

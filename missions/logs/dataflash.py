@@ -86,7 +86,7 @@ class _MessageFormat:
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Of a whole message."""
+        """Record type of a whole message."""
         own = [(field, _FIELDS[kind]) for field, kind in zip(self.fields, self.kinds, strict=True)]
         return np.dtype([(" head", "S3"), *own])
 

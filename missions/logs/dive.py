@@ -1,4 +1,4 @@
-"""What a vehicle's own log says of a dive, whatever its format: series of numbers against time."""
+"""What a vehicle's own log records of a dive, in any format: series of numbers against time."""
 
 import bisect
 from collections import Counter
@@ -80,11 +80,11 @@ class LoggedDive:
     position: Signal
     """(N, 2) latitude and longitude."""
     depth: Signal | None = None
-    """(N, 1) below the surface, metres."""
+    """(N, 1) depth below the surface, metres."""
     attitude: Signal | None = None
     """(N, 3) roll, pitch, heading."""
     altitude: Signal | None = None
-    """(N, 1) metres."""
+    """(N, 1) altitudes, metres."""
     altitude_slant: bool = False
     """Whether `altitude` is a range along the body's down axis, not yet a height."""
     sigmas: Mapping[str, Signal] = field(default_factory=dict)

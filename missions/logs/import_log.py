@@ -35,11 +35,11 @@ class ImportOptions:
     """Options of `import-log`."""
 
     declination_deg: float = 0.0
-    """Added to headings; east is positive."""
+    """Declination added to headings; east is positive."""
     tide: str = "0"
     """Height of the water above the level that depths are to count from: metres, or a CSV."""
     clock_offset_s: float = 0.0
-    """Added to times."""
+    """Offset added to times."""
     start_s: float | None = None
     end_s: float | None = None
     """Seconds from the first position: what is before or after is left out."""
@@ -50,7 +50,7 @@ class ImportOptions:
     lever_body_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Place on the body (FRD) that the logged position is of."""
     altitude_offset_m: float = 0.0
-    """Added to altitudes."""
+    """Offset added to altitudes."""
     start_utc: str | None = None
     """Time of the first position of a log without dates, ISO 8601."""
     time_zone: str = "UTC"

@@ -81,7 +81,7 @@ _COLA2 = {
 
 @dataclass(frozen=True, kw_only=True)
 class BagOptions:
-    """What a bag does not say by itself."""
+    """What a bag does not state itself."""
 
     topics: Mapping[str, str]
     """Topic to use for each role (`dive.ROLES`)."""
@@ -247,7 +247,7 @@ class _Series:
 
     topic: _Topic
     time_s: Array
-    """(N,) as logged."""
+    """(N,) times as logged."""
     columns: dict[str, Array]
     """(N,) columns by name (`ros_rows.ROWS`), or by joint."""
 

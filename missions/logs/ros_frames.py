@@ -25,7 +25,7 @@ def flipped_body(vectors: Array) -> Array:
 
 
 def flipped_quaternion(quaternion_xyzw: Array) -> Array:
-    """Of `ned_from_frd` to that of `enu_from_flu` or back, (..., 4).
+    """Quaternion of `ned_from_frd` to that of `enu_from_flu` or back, (..., 4).
 
     The product of the half turn about (1, 1, 0) / sqrt 2, the quaternion and the half turn about x,
     multiplied out; the sign is chosen so that w is not negative.

@@ -30,7 +30,7 @@ from missions.values.plan_file import Plan, read_plan
 
 _MOST_ARROWS = 500
 _MOST_FOOTPRINTS = 3000
-"""Beyond, single footprints are no longer seen: the count of pictures shows what they cover."""
+"""Most footprints drawn one by one; beyond, the count of pictures shows what they cover."""
 _ALLOWED_BEYOND = 0.3
 """Share of the map by which the allowed area may be larger than all else and is still shown whole.
 """
@@ -269,7 +269,7 @@ def _draw_current(axes: Axes, sea: SeaConfig) -> None:
 
 
 def _points_per_metre(axes: Axes) -> float:
-    """Of the printed map, before it is laid out; a point is 1/72 inch."""
+    """Scale of the printed map, before it is laid out; a point is 1/72 inch."""
     (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
     width_in, height_in = axes.figure.get_size_inches()
     return float(72.0 * 0.8 * min(width_in / (east - west), height_in / (north - south)))

@@ -70,7 +70,7 @@ class Planned:
     terrain: str
     """How lines follow the bathymetry; empty without one."""
     warnings: tuple[str, ...]
-    """What the plan was warned of."""
+    """Warnings of the plan."""
     rows: tuple[Setting, ...]
     """Every setting with its equation, source and limit."""
 

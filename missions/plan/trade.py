@@ -38,10 +38,10 @@ class LinePower:
     line_w: float
     """Power of the whole vehicle."""
     crab_deg: float
-    """Heading off the course."""
+    """Angle of the heading off the course."""
 
     def to_json(self) -> dict[str, Any]:
-        """As numbers; None where it cannot be flown."""
+        """The powers as numbers; None where it cannot be flown."""
         return {
             key: (value if isinstance(value, str) or math.isfinite(value) else None)
             for key, value in vars(self).items()

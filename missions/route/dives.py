@@ -1,6 +1,6 @@
-"""Lines parted into dives: each fits the battery and the time, from home and home again.
+"""Lines divided into dives: each fits the battery and the time, from home and home again.
 
-Lines keep their order. Of all ways to part them the one with the fewest dives is taken, and of
+Lines keep their order. Of all ways to divide them the one with the fewest dives is taken, and of
 these the one that takes the least energy: a dynamic programme over the lines, exact, since the ways
 between two lines of a dive are the same whatever dive they are in. What is between lines comes from
 sums along the route through all of them; only the ways from home to each line and back are found
@@ -32,7 +32,7 @@ class DiveLimits:
 
     energy_j: float
     time_s: float
-    """May be infinite."""
+    """Time limit; may be infinite."""
 
     def hold(self, energy_j: float, time_s: float) -> bool:
         """Whether a dive fits."""
@@ -53,7 +53,7 @@ class _Sums:
     """Sums from each line's end to the surface at home."""
 
     def of(self, first: int, last: int) -> tuple[float, float]:
-        """Of a dive along lines `first` to `last`."""
+        """Energy and time of a dive along lines `first` to `last`."""
         energy, time = (
             self.home_to[:, first]
             + self.through[:, last]
@@ -78,7 +78,7 @@ def split_dives(
     depth_m: float,
     split: bool,
 ) -> tuple[Dive, ...]:
-    """Part lines into dives.
+    """Divide lines into dives.
 
     Args:
         lines: in the order of flight.
@@ -189,7 +189,7 @@ def _sums(whole: Route, legs: Array, alone: Sequence[Route], costs: Costs, depth
 def _least_dives(sums: _Sums, limits: DiveLimits) -> list[tuple[int, int]] | None:
     """First and last line of each dive; None where some line fits no dive by itself.
 
-    Of the best parting of the lines up to each: how many dives, what energy, where the last begins.
+    Of the best division of lines up to each: how many dives, what energy, where the last begins.
     """
     count = sums.until.shape[1]
     energy_j, time_s = limits.energy_j, limits.time_s

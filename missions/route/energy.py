@@ -74,7 +74,7 @@ class FlightConditions:
     """Everything but thrusters and strobes."""
 
     def with_vehicle(self, settings: VehicleConfig) -> "FlightConditions":
-        """The same for another vehicle or controller.
+        """The same conditions for another vehicle or controller.
 
         Raises:
             VehicleError: as `sound_craft_of`.
@@ -111,10 +111,10 @@ class Motion:
     nu: Array
     """(N, 6) velocity relative to the water, in the body."""
     crab_rad: Array
-    """(N,) heading less course."""
+    """(N,) heading minus course."""
     possible: Array
     """(N,) 1.0, or NaN where the current along the course is not below the speed of a vehicle that
-    crabs: it would have to turn its back on where it goes."""
+    crabs: it would have to face away from where it goes."""
 
 
 def vehicle_costs(
@@ -239,7 +239,7 @@ def has_sway(craft: Vehicle) -> bool:
 
 
 def _manner(craft: Vehicle, settings: VehicleConfig) -> Manner:
-    """Of flying lines: held by sway if the vehicle has it and its controller uses it."""
+    """Manner of flying lines: by sway if the vehicle has it and its controller uses it."""
     return "held" if has_sway(craft) and settings.controller == "sway" else "crab"
 
 

@@ -300,7 +300,7 @@ def arc_inside(
     for row in range(first_row, last_row + 1):
         near += fence.firsts[row * fence.columns + last + 1]
         near -= fence.firsts[row * fence.columns + first]
-    # The direction from the centre to the vehicle is its heading less a right angle to the side.
+    # The direction from the centre to the vehicle is its heading minus a right angle to the side.
     ahead = heading - side * 0.5 * math.pi
     cuts = np.empty(2 + 5 * near)
     cuts[0], cuts[1] = 0.0, swept

@@ -205,7 +205,7 @@ def _sideways(
     last = math.hypot(goal[0] - north, goal[1] - east)
     first = (north - end[0]) * cos + (east - end[1]) * sin
     if first < 0.0:
-        # Step at the line's end, and make good for it by another length of run-in.
+        # Step at the line's end, and compensate for it by another length of run-in.
         if abs(along) < _TINY:
             return np.inf, legs[:0]
         last += first / along
@@ -306,7 +306,7 @@ def _goes_on(end: Array, goal: Array) -> bool:
 
 @compiled_ieee
 def price(prices: Prices, legs: Array) -> float:
-    """Energy of legs between lines; never infinite, but dear beyond anything where it were."""
+    """Energy of legs between lines; never infinite, but very high where it would be."""
     total = 0.0
     for i in range(legs.shape[0]):
         course, length, curvature = legs[i, 2], legs[i, 3], legs[i, 4]

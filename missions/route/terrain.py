@@ -45,9 +45,9 @@ class TerrainLimits:
     """What a profile has to keep."""
 
     altitude_m: float
-    """Wanted, of the glass above the highest floor within reach."""
+    """Wanted height of the glass above the highest floor within reach."""
     least_clearance_m: float
-    """No altitude is lower."""
+    """Lowest altitude allowed."""
     steepest_rad: float
     """Slope that the vehicle follows."""
 
@@ -78,17 +78,17 @@ class DepthProfile:
 
     @property
     def altitude_m(self) -> Array:
-        """(S,) of the glass above the floor below it."""
+        """(S,) height of the glass above the floor below it."""
         return self.floor_m - self.depth_m
 
     @property
     def clearance_m(self) -> Array:
-        """(S,) of the glass above the highest floor within reach."""
+        """(S,) height of the glass above the highest floor within reach."""
         return self.highest_floor_m - self.depth_m
 
     @property
     def slopes_rad(self) -> Array:
-        """(S - 1,) of the profile, positive downwards."""
+        """(S - 1,) slopes of the profile, positive downwards."""
         slopes: Array = np.arctan2(np.diff(self.depth_m), np.diff(self.along_m))
         return slopes
 

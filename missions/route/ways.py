@@ -252,7 +252,7 @@ def _tangents(fence: Fence, nodes: Array) -> tuple[NDArray[np.int32], NDArray[np
                 for k in range(count):
                     rows[k], columns[k], lengths[k] = old[0][k], old[1][k], old[2][k]
             rows[count], columns[count] = i, j
-            # Corners of two rings at one place are joined by a way of next to no length.
+            # Corners of two rings at one place are joined by a way of almost no length.
             lengths[count] = max(
                 math.hypot(nodes[j, 0] - nodes[i, 0], nodes[j, 1] - nodes[i, 1]), 1e-12
             )

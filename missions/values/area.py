@@ -36,13 +36,13 @@ class Area:
 
     @property
     def corners_ne(self) -> Array:
-        """(N, 2) of the survey area, holes too."""
+        """(N, 2) corners of the survey area, holes too."""
         corners: Array = shapely.get_coordinates(self.survey)
         return corners
 
     @property
     def allowed_corners_ne(self) -> Array:
-        """(N, 2) of the allowed area: what a simulated sea floor must reach to."""
+        """(N, 2) corners of the allowed area: what a simulated sea floor must reach to."""
         corners: Array = shapely.get_coordinates(self.allowed)
         return corners
 

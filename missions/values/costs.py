@@ -232,7 +232,7 @@ def _at(power_w: Array, place: Array) -> Array:
 
 
 def _integral(power_w: Array, place: Array) -> Array:
-    """From north to places, both counted in samples."""
+    """Integral from north to places, both counted in samples."""
     following = np.roll(power_w, -1)
     whole = np.concatenate([[0.0], np.cumsum((power_w + following) / 2)])
     low = np.floor(place)

@@ -32,7 +32,7 @@ class Swath:
 
     @property
     def across_m(self) -> float:
-        """Width athwartships."""
+        """Width across the vehicle."""
         return self.port_m + self.starboard_m
 
     @property
@@ -42,7 +42,7 @@ class Swath:
 
     @property
     def half_across_m(self) -> float:
-        """What is seen to the worse of both sides."""
+        """The reach on the side that sees less."""
         return min(self.port_m, self.starboard_m)
 
 
@@ -178,7 +178,7 @@ def common_swath(rig: Rig, altitude_m: float, step_m: float) -> Swath:
 
 
 def joint_swath(rig: Rig, altitude_m: float, step_m: float) -> Swath:
-    """From the outermost edge of one camera to that of another: the swath of the mosaic.
+    """The swath of the mosaic: from the outermost edge of one camera to that of another.
 
     Raises:
         PlanError: the cameras' swaths leave a gap between them.

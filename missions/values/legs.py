@@ -76,7 +76,7 @@ class Leg:
 
     @property
     def end_ne_m(self) -> tuple[float, float]:
-        """Where it ends."""
+        """Place where the leg ends."""
         half = self.curvature_per_m * self.length_m / 2
         chord = self.length_m if half == 0.0 else self.length_m * math.sin(half) / half
         mean = self.heading_rad + half
@@ -85,7 +85,7 @@ class Leg:
 
     @property
     def end_heading_rad(self) -> float:
-        """Of the path at its end."""
+        """Course of the path at its end."""
         return self.heading_rad + self.curvature_per_m * self.length_m + self.turn_rad
 
     def to_json(self) -> dict[str, Any]:
@@ -130,7 +130,7 @@ class Route:
 
     @property
     def length_m(self) -> float:
-        """Of all legs."""
+        """Length of all legs."""
         return float(self.starts_m[-1])
 
     def places(self, along_m: Array) -> Array:

@@ -28,7 +28,7 @@ class Line:
 
     @property
     def length_m(self) -> float:
-        """From the first to the last picture."""
+        """Distance from the first to the last picture."""
         return math.dist(self.start_ne_m, self.end_ne_m)
 
     @property

@@ -29,7 +29,7 @@ class BelievedNavigation:
     attitude_rad: Array
     """Roll, pitch, heading."""
     altitude_m: Array
-    """NaN while the DVL has no bottom lock."""
+    """Altitude; NaN while the DVL has no bottom lock."""
     sigma_horizontal_m: Array
     """Sigma of north and of east each."""
     sigma_depth_m: Array

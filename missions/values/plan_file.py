@@ -31,9 +31,9 @@ class Dive:
     """What is flown on one charge: from home along some lines and home again."""
 
     first_line: int
-    """Index of the first line in the plan."""
+    """Index of its first line in the plan."""
     last_line: int
-    """The last one that belongs to it."""
+    """Index of the last line that belongs to it."""
     route: Route
     """Route from home to home; lines count as in the plan."""
     duration_s: float

@@ -149,7 +149,7 @@ def laz_writer(
     of the rasters where there is one.
 
     Yields:
-        A function that hands parts on and writes each to the file.
+        A function that passes parts on and writes each to the file.
     """
     import laspy
     import pyproj

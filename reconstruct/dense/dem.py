@@ -20,7 +20,7 @@ FILL_CELLS = 3
 STRAY_CELLS = 8
 """Reach of the square around a cell in which others must be known."""
 _LEAST_COMPANY = 0.22
-"""Share of that square that must be known; what is lonelier is mostly wrong."""
+"""Share of that square that must be known; what is more isolated is mostly wrong."""
 
 
 def fuse_points(
@@ -266,7 +266,7 @@ def slope_deg(height: Float32, cell: float) -> Float32:
 
 
 def without_strays(height: Float32) -> NDArray[np.bool_]:
-    """Which cells have company: enough known cells in the square around them.
+    """Which cells are not isolated: enough cells are known in the square around them.
 
     Beyond the edge of the array a cell counts as unknown.
     """

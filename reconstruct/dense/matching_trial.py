@@ -29,7 +29,7 @@ _SCALES = 3
 _WORTH = 1.15
 """Half the resolution is taken where it finds this many times the depths."""
 _LEAST_COMMON = 500
-"""Pixels that two partners must share for their difference to say something."""
+"""Pixels that two partners must share for their difference to count."""
 _SIGMA_LIMITS_PX = (0.15, 1.5)
 
 

@@ -2,7 +2,7 @@
 
 Depths of one place from many views share errors, since they rest on the same poses. How much
 is known at every sparse point: its covariance from the adjustment (`mapping/covariance.npz`), which
-holds poses and pixels together, less what the pixels of its own observations leave with poses held.
+holds poses and pixels together, minus what its own observations leave with poses held.
 The rest is what the poses around it do to a surface there.
 """
 
@@ -81,7 +81,7 @@ def spread_over(nodes: Array, rows: int, columns: int) -> Array:
 
 @progress.step("find what poses add to errors")
 def find_pose_part(workspace: Path, model: SparseModel) -> PosePart | None:
-    """What the poses leave unsure of the surface; None, with a warning, where it is not known."""
+    """The surface's uncertainty from poses; None, with a warning, where it is not known."""
     path = workspace / "mapping" / "covariance.npz"
     if not path.is_file():
         warn("no mapping/covariance.npz: sigma.tif leaves out what errors of poses do to heights")

@@ -189,7 +189,7 @@ class RefinedDepth:
     """Depth of a view where pictures agree, arrays of (H, W)."""
 
     depth: Float32
-    """NaN where unknown, or where no neighbour looks alike."""
+    """Depth; NaN where unknown, or where no neighbour looks alike."""
     sigma: Float32
     """Standard deviation from what differs between the pictures, NaN where unknown."""
     likeness: Float32

@@ -45,7 +45,7 @@ from reconstruct.views.model import SparseModel, WorldFrame, read_model, scaled_
 CELL_PIXELS = 2.5
 """Side of a DEM cell in mean ground pixels of the pictures as matched, unless depth is coarser."""
 _WITNESSES = 8
-"""Neighbouring views that a view's depth is held against."""
+"""Neighbouring views that a view's depth is checked against."""
 _MOST_CELLS = 4_000_000_000
 _MOST_POINTS = 40_000_000
 

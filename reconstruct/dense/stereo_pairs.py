@@ -77,7 +77,7 @@ def points_in_sight(model: SparseModel) -> list[Array]:
 
 
 def neighbours(model: SparseModel, most: int) -> list[list[int]]:
-    """For each view the others that share most sparse points with it, best first."""
+    """The other views that share most sparse points with each view, best first."""
     views = len(model.views)
     points, numbers = model.observations.T
     seen = coo_matrix(

@@ -70,7 +70,7 @@ class FuseTask:
     doubt: float
     """Factor on the standard deviations of refined depths."""
     pose_sigmas: Array | None
-    """(m, n) what errors of poses leave unsure of heights, on a lattice over the grid."""
+    """(m, n) sigmas of heights from errors of poses, on a lattice over the grid."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -81,7 +81,7 @@ class Tile:
     height: NDArray[np.float32]
     sigma: NDArray[np.float32]
     slope: NDArray[np.float32]
-    """Degrees."""
+    """Slope, degrees."""
     count: NDArray[np.uint16]
     stations: NDArray[np.uint8]
     vertices: NDArray[Any]

@@ -48,7 +48,7 @@ def evaluate_against(
 ) -> tuple[str, dict[str, Any]]:
     """Compare the surface of a workspace with that of an earlier survey and write the change.
 
-    Writes `difference.tif` (height now less before, m), `significance.tif` (in standard
+    Writes `difference.tif` (height now minus before, m), `significance.tif` (in standard
     deviations), `change.png` and `change.json` into `against/NAME` of the workspace, or `out`.
 
     Args:

@@ -27,11 +27,11 @@ class CameraScore:
     positions_ned: Array
     """(N, 3) aligned entrance pupils."""
     misses_m: Array
-    """(N, 3) aligned less true position, north, east, down."""
+    """(N, 3) aligned minus true position, north, east, down."""
     turns_deg: Array
     """(N,) angle between aligned and true attitude."""
     scale_error: float
-    """Scale of a similarity alignment less one, sign as of the model: positive when too large."""
+    """Scale of a similarity alignment minus one, sign as of the model: positive when too large."""
     georeference_m: Array
     """(3,) mean miss before the alignment, north, east, down."""
 

@@ -49,10 +49,10 @@ class Region:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Change:
-    """Heights now less heights before, on the grid of now."""
+    """Heights now minus heights before, on the grid of now."""
 
     difference: Array
-    """(rows, columns) metres; NaN where one survey knows nothing."""
+    """(rows, columns) metres; NaN where one survey has no height."""
     sigma: Array
     """(rows, columns) standard deviation of it."""
     changed: NDArray[np.bool_]
@@ -61,7 +61,7 @@ class Change:
     """Largest volume first."""
     cell: float
     noise_area: float
-    """Area over which errors go together: the variance of a mean over a larger area A is the
+    """Area over which errors are correlated: the variance of a mean over a larger area A is the
     variance of a cell times this over A."""
     registration_sigma: float
     """Median over the cells."""
@@ -180,7 +180,7 @@ def _changed(significance: Array) -> NDArray[np.int32]:
 
 
 def _noise_area(difference: Array, sigma: Array, stable: NDArray[np.bool_], cell: float) -> float:
-    """Area over which errors of unchanged cells go together, from the scatter of block means.
+    """Area over which errors of unchanged cells are correlated, from the scatter of block means.
 
     For blocks much larger than the reach of the correlation the variance of the mean of `n` cells
     is the cell's times (correlated cells) / n (Rolstad et al. 2009, equation 8): the largest such

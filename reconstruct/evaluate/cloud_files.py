@@ -78,7 +78,7 @@ def read_reference(path: Path, datum: Datum | None) -> tuple[Array, bool]:
 
 
 def _apart(path: Path) -> tuple[Array, str | None]:
-    """As `_read_las`, in a process of its own: damaged LAZ data can end the one that unpacks them.
+    """As `_read_las`, in a separate process: damaged LAZ data can end the one that unpacks them.
 
     Raises:
         ValueError: as `_read_las`, or they did.

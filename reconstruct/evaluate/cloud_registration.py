@@ -35,12 +35,12 @@ class ReferenceSurface:
     """A cloud that knows the plane through the neighbours of each point."""
 
     points: Array
-    """(N, 3)."""
+    """(N, 3) points."""
     tree: cKDTree
 
     @classmethod
     def of(cls, points: Array) -> "ReferenceSurface":
-        """From (N, 3) points."""
+        """The surface through (N, 3) points."""
         return cls(points=points, tree=cKDTree(points))
 
     @property

@@ -22,7 +22,7 @@ def rms(values: Array) -> float:
 
 
 def rounded(value: float, digits: int) -> float | None:
-    """For JSON, which has no NaN: None instead."""
+    """A number for JSON, which has no NaN: None instead."""
     return round(float(value), digits) if math.isfinite(value) else None
 
 
@@ -51,7 +51,7 @@ class ModelBend:
 def fit_doming(places_m: Array, errors_m: Array) -> ModelBend:
     """Fit `error = a + b x + c y + d x^2 + e x y + f y^2` over medians of square blocks.
 
-    Medians keep outliers out. Errors of neighbouring cells go together, so that cells would promise
+    Medians keep outliers out. Errors of neighbouring cells are correlated: cells would promise
     too small a sigma; it comes from how the blocks scatter about the paraboloid. The curvature of a
     fitted paraboloid is the measure of doming of James & Robson (2014) and Refrax (2026).
 

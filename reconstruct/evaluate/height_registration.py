@@ -49,7 +49,7 @@ class HeightFit:
     spread: float
     """Robust standard deviation of the height differences left."""
     used: int
-    """Cells compared."""
+    """Number of cells compared."""
 
     def sigma_at(self, points: Array, normals: Array) -> Array:
         """(N,) sigma of the height difference at (N, 3) points that the registration leaves."""
@@ -76,7 +76,7 @@ def register_heights(
     Args:
         fixed: heights that stay.
         moving: heights of the other survey, in its own frame.
-        fixed_from_moving: as the georeferences say, east, north, up.
+        fixed_from_moving: as the georeferences give, east, north, up.
 
     Raises:
         ReconstructionError: the two hardly overlap.
@@ -98,7 +98,7 @@ def register_heights(
 
 
 def _step(elevation: Elevation) -> int:
-    """Every how many cells are enough."""
+    """Step between cells that suffices."""
     return max(1, int(np.sqrt(elevation.known.sum() / _MOST_POINTS)))
 
 
@@ -108,7 +108,7 @@ def rough_shifts(
     """Shifts (east, north) at which the reliefs correlate best, and no shift at all.
 
     Normalised correlation of images with holes after Padfield (2012, "Masked object registration
-    in the Fourier domain", equation 11), of heights less a plane. Relief like ripples repeats:
+    in the Fourier domain", equation 11), of heights minus a plane. Relief like ripples repeats:
     several peaks are handed on.
     """
     both = max(fixed.height.shape + moving.height.shape)
@@ -157,7 +157,7 @@ def _resampled(
 
 
 def _levelled(height: Array) -> Array:
-    """Heights less the best plane; 0 where unknown."""
+    """Heights minus the best plane; 0 where unknown."""
     rows, columns = np.nonzero(np.isfinite(height))
     design = np.column_stack([np.ones(len(rows)), rows, columns])
     plane, *_ = np.linalg.lstsq(design, height[rows, columns], rcond=None)
@@ -173,7 +173,7 @@ class _Compared:
     index: NDArray[np.int64]
     """(N,) indices of the fixed points that lie on the moving survey."""
     miss: Array
-    """(N,) height of the moving surface less that of the fixed points, in the moving frame."""
+    """(N,) height of the moving surface minus that of the fixed points, in the moving frame."""
     normals: Array
     """(N, 3) slope of `miss` by the fixed point, in the fixed frame."""
     variance: Array
@@ -255,7 +255,7 @@ def _tukey_weights(compared: _Compared) -> Array:
 
 
 def _fit(points: Array, compared: _Compared, pose: RigidTransform, centre: Array) -> HeightFit:
-    """Covariance from how blocks of the survey pull apart: errors of neighbours go together."""
+    """Covariance from the scatter of blocks of the survey: errors of neighbours are correlated."""
     places = points[compared.index]
     jacobian = _jacobian(places - centre, compared.normals)
     weight = _tukey_weights(compared)

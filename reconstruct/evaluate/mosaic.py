@@ -22,7 +22,7 @@ from reconstruct.raster import opened_raster
 _PATCH_PX = 96
 _PATCHES = 400
 _CLEAR = 0.15
-"""Response of phase correlation (1 for equal patches) from which a match is believed."""
+"""Response of phase correlation (1 for equal patches) from which a match is accepted."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -171,7 +171,7 @@ def _painted(terrain: Terrain, texture: Texture, places: Array, pixel_m: float) 
 
 
 def _shift_px(picture: Array, true: Array) -> NDArray[np.float64] | None:
-    """By how many columns and rows the picture is off, or None when that is not clear."""
+    """Columns and rows by which the picture is off, or None when that is not clear."""
     window = cv2.createHanningWindow((_PATCH_PX, _PATCH_PX), cv2.CV_64F)
     flat = [np.log(p + 1e-2 * p.max() + 1e-9) for p in (true, picture.astype(np.float64))]
     flat = [f - cv2.GaussianBlur(f, (0, 0), 8) for f in flat]

@@ -57,7 +57,7 @@ def overlaps_reached(workspace: Path, truth: Path) -> dict[str, float]:
         _shared(swaths[one].intersection(strip), swaths[other].intersection(strip))
         for one, other, strip in neighbours(plan)
         if one in swaths and other in swaths
-        # A line that was broken off may have left nothing there.
+        # A line that was aborted may have left nothing there.
         if swaths[one].intersects(strip) and swaths[other].intersects(strip)
     ]
     reached: dict[str, float] = {}

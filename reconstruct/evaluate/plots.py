@@ -122,7 +122,7 @@ def plot_sheet(
 
 
 def _height_in(width_m: float, height_m: float) -> float:
-    """Of a figure with a map next to something else: higher where the map is."""
+    """Height of a figure with a map next to something else: higher where the map is."""
     return 5.5 * min(max(0.9 * height_m / width_m, 1.0), 1.7)
 
 

@@ -1,4 +1,4 @@
-"""A survey against somebody else's cloud or elevation model of the same place."""
+"""A survey against an independent cloud or elevation model of the same place."""
 
 from pathlib import Path
 from typing import Any

@@ -83,7 +83,7 @@ def run_evaluate(workspace: Path, config: SurveyConfig, executor: Executor, fold
 
 
 def _write_errors(path: Path, dem: Path, errors: Array) -> None:
-    """Height less the true height, on the DEM's own grid."""
+    """Height minus the true height, on the DEM's own grid."""
     with rasterio.open(dem) as source:
         profile = source.profile
     with rasterio.open(path, "w", **profile) as raster:

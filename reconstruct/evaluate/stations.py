@@ -15,7 +15,7 @@ from camera_calib.rig import Rig
 from reconstruct.evaluate.truth import surface_depth
 
 _CLEAR_M = 0.004
-"""A ray to the camera starts so far above the surface that it does not hit its own facet."""
+"""Height above the surface at which a ray to the camera starts, so as not to hit its own facet."""
 
 
 @progress.step("measure a pixel on the ground")

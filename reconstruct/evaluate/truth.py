@@ -13,7 +13,7 @@ from alice_survey.base.trajectory import read_columns
 from alice_survey.seafloor.terrain import Floats, Terrain
 
 _ABOVE_M = 8.0
-"""Rays start so far above the mean sea floor: far enough, and near enough for float32."""
+"""Rays start this far above the mean sea floor: far enough, and near enough for float32."""
 
 
 def read_true_poses(path: Path) -> dict[str, RigidTransform]:

@@ -27,11 +27,11 @@ class LightEquations:
     nodes: NDArray[np.int64]
     """(N, 8) numbers of the nodes of both sides among all cameras'."""
     weights: Array
-    """(N, 8) of those, negative for the second side."""
+    """(N, 8) weights of those nodes, negative for the second side."""
     farther: Array
     """(N,) how much farther off the first view is."""
     views: NDArray[np.int64]
-    """(N, 2)."""
+    """(N, 2) numbers of the two views."""
     pair: NDArray[np.int64]
     """(N,) row of `pairs`."""
     pairs: NDArray[np.int64]
@@ -49,7 +49,7 @@ class LightPrior:
     patterns: Array
     """(P + 1, P + 1) normal matrix of nodes and fall-off."""
     right: Array
-    """(P + 1,)."""
+    """(P + 1,) right side of the normal equations."""
     gain: Array
     """(V,) inverse variance of each picture's gain."""
     gain_right: Array

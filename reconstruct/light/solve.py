@@ -8,7 +8,7 @@ sea lighting effects for visual mapping of abyssal plains"). What overlaps leave
 fall-off across a single line, is taken from the median of all pictures, in which the scene averages
 out; it weighs the more, the more pictures there are. Along a line a lamp brighter ahead looks like
 pictures that grow darker one by one: there the pictures' brightness counts, which the sea floor
-changes at random and a drift would not. Where overlaps speak they outweigh both.
+changes at random and a drift would not. Where there are overlaps they outweigh both.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,7 +31,7 @@ GRID = (9, 11)
 LOW_WIDTH_PX = 108
 """Width to which pictures are shrunk before their light is compared."""
 _DARKEST, _BRIGHTEST = 3.0, 250.0
-"""Grey levels beyond which a pixel says nothing of the light."""
+"""Grey levels beyond which a pixel does not show the light."""
 _MISFIT = 0.1
 """Difference of logarithms above which two views of a spot count less (shadow, gloss, mismatch)."""
 _NODE_SIGMA, _BEND_SIGMA, _GAIN_SIGMA = 2.0, 0.05, 0.3
@@ -330,7 +330,7 @@ def _typical(nodes: Array, camera_of: NDArray[np.int64], cameras: int) -> tuple[
 
 
 def _brightness(nodes: Array, camera_of: NDArray[np.int64], cameras: int) -> tuple[Array, Array]:
-    """By how much pictures are brighter than their camera's others, (V, 3); whether known, (V,).
+    """How much brighter pictures are than their camera's others, (V, 3); whether known, (V,).
 
     Only nodes that a camera's pictures have in common are compared.
     """

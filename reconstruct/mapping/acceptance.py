@@ -36,7 +36,7 @@ _NAMED = 8
 
 @dataclass(frozen=True, kw_only=True)
 class FarStation:
-    """A station that lies elsewhere than navigation has it."""
+    """A station that is not where navigation places it."""
 
     station: int
     image: str
@@ -47,14 +47,14 @@ class FarStation:
 
 @dataclass(frozen=True, kw_only=True)
 class Acceptance:
-    """What speaks against a mapping."""
+    """Signs that a mapping is wrong."""
 
     checked: int
     """Stations with a position."""
     usual_m: float
     """Usual distance from navigation, one standard deviation by axis, robustly; NaN without."""
     far: tuple[FarStation, ...]
-    """The farthest first."""
+    """Stations off navigation, the farthest first."""
     rig_error: float
     """Relative error of the rig in the finished model; NaN where there is no known rig."""
     scale: ScaleTrend | None
@@ -86,7 +86,7 @@ class Acceptance:
         return notes
 
     def to_json(self) -> dict[str, object]:
-        """For `mapping.json`."""
+        """Figures for `mapping.json`."""
         return {
             "checked": self.checked,
             "usual_m": self.usual_m if np.isfinite(self.usual_m) else None,

@@ -27,7 +27,7 @@ class Observed:
     point: Indices
     """(O,) index among `point_ids`."""
     point_ids: Indices
-    """(P,) ascending."""
+    """(P,) ids of the points, ascending."""
     points: Array
     """(P, 3) points in the model's frame."""
     in_cameras: Array

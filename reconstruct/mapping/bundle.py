@@ -21,7 +21,7 @@ changed."""
 _TRUST = 1e12
 """First radius of the trust region: no bound."""
 FULLY, ROUGHLY = 1e-4, 1e-2
-"""Relative changes of the cost at which an adjustment ends: for good, and where another follows.
+"""Relative changes of the cost at which an adjustment ends: the final one, and others.
 The last steps of a robust loss are many and small: in a block of 25 stations with camera errors of
 0.22 mm, an end 10,000 times tighter takes 75 more of them and moves no camera by 0.007 mm."""
 

@@ -42,7 +42,7 @@ class CalibrationPart:
     places: Array
     """(P, 3) points at which the motion is known: enough of them, not all."""
     points: Array
-    """(P, 3, G)."""
+    """(P, 3, G) motions of those points by the parameters."""
     covariance: Array
     """(G, G) covariance of the parameters."""
 

@@ -48,12 +48,12 @@ class Bend:
 
     @property
     def sag_m(self) -> float:
-        """By how much the middle is off against the ends: `curvature * length^2 / 8`."""
+        """How far the middle is off against the ends: `curvature * length^2 / 8`."""
         return self.curvature_per_m * self.length_m**2 / 8.0
 
     @property
     def sag_sigma_m(self) -> float:
-        """Its standard deviation."""
+        """Standard deviation of the sag."""
         return self.sigma_per_m * self.length_m**2 / 8.0
 
     def significant(self, pixel_m: float) -> bool:
@@ -84,17 +84,17 @@ class ScaleTrend:
 
 @dataclass(frozen=True, kw_only=True)
 class Doming:
-    """What speaks for or against a bent model; what could not be measured is None."""
+    """Evidence of a bent model; what could not be measured is None."""
 
     along: Bend | None
     across: Bend | None
     """Perpendicular to the block's longest axis; None for a single line."""
     scale: ScaleTrend | None
     pixel_m: float
-    """Ground pixel."""
+    """Ground pixel, metres."""
 
     def to_json(self) -> dict[str, object]:
-        """For `mapping.json`."""
+        """Figures for `mapping.json`."""
         bends: dict[str, object] = {
             name: None
             if bend is None

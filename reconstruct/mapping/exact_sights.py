@@ -24,7 +24,7 @@ from reconstruct.views.lens import Lens
 _SLOPES = (*PARAMETERS, *TURN_AND_SHIFT)
 """What a camera's pixels depend on: itself, and its place on the rig."""
 _BLOCK = 4096
-"""Observations at a time: what they need besides their results stays in the cache."""
+"""Observations at a time: their intermediate values stay in the cache."""
 _MOST_OBSERVATIONS = 500_000
 """Linearised they take 1.2 kB each; of more, whole points are left out evenly."""
 
@@ -130,7 +130,7 @@ def start_state(
 def exact_sights(
     state: RigState, pixels: Pixels, fields: Sequence[str], names: Sequence[str], *, lever: bool
 ) -> Sights:
-    """The observations linearised; those that no ray explains count nothing."""
+    """The observations linearised; those that no ray explains do not count."""
     count = len(fields) + 3 * lever
     arm = state.points[pixels.point] - state.centres[pixels.station]
     by_point = np.zeros((len(arm), 2, 3))

@@ -177,7 +177,7 @@ def _frame_poses(
     cam_from_rig: Mapping[str, RigidTransform],
     rig_from_world: Mapping[int, RigidTransform],
 ) -> dict[int, RigidTransform]:
-    """By frame of the database, whose rig's frame is that of its first camera."""
+    """Poses by frame of the database, whose rig's frame is that of its first camera."""
     reference = cam_from_rig[next(iter(seen.cameras))]
     return {
         frame: reference * rig_from_world[station]

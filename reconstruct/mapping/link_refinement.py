@@ -30,9 +30,9 @@ class RigSight:
     """How the pinholes of a rig see points in the rig's frame."""
 
     focal_px: Array
-    """(K, 2)."""
+    """(K, 2) focal lengths."""
     centre_px: Array
-    """(K, 2)."""
+    """(K, 2) principal points."""
     turn: Array
     """(K, 3, 3) and (K, 3): `cam_from_rig`."""
     shift: Array

@@ -51,7 +51,7 @@ class Sights:
         return np.repeat(counts, counts)
 
     def weighted(self, weights: Array) -> "Sights":
-        """The same with the squares of every observation weighted, (O,)."""
+        """The same observations with the squares of each weighted, (O,)."""
         root = np.sqrt(weights)[:, None]
         return replace(
             self,
@@ -69,21 +69,21 @@ class ReducedSystem:
     """(F + 1,) and (B,): the blocks of every station's row, and their columns, sorted."""
     columns: Indices
     blocks: Array
-    """(B, 6, 6)."""
+    """(B, 6, 6) blocks."""
     border: Array
-    """(6 F, G) between stations and what is shared."""
+    """(6 F, G) block between stations and what is shared."""
     shared: Array
-    """(G, G)."""
+    """(G, G) block of what is shared."""
     slope: Array
     """(6 F,) gradient by the stations."""
     shared_slope: Array
-    """(G,)."""
+    """(G,) gradient by what is shared."""
     point_inverse: Array
     """(P, 3, 3) covariance of the points where all else is known."""
 
     @property
     def matrix(self) -> csc_matrix:
-        """(6 F, 6 F) of the stations."""
+        """(6 F, 6 F) matrix of the stations."""
         size = POSE * (len(self.pointers) - 1)
         blocks = (self.blocks, self.columns, self.pointers)
         return csc_matrix(bsr_matrix(blocks, shape=(size, size), blocksize=(POSE, POSE)))
@@ -357,7 +357,7 @@ class Gauge:
     """Motions of a whole block that pictures do not see."""
 
     def __init__(self, centres: Array, depth: float, scale_free: bool) -> None:
-        """Of stations at (F, 3); `depth`, a usual one, weighs turns against positions."""
+        """Take stations at (F, 3); `depth`, a usual one, weighs turns against positions."""
         self.middle = centres.mean(axis=0)
         arms = centres - self.middle
         count = len(arms)

@@ -91,7 +91,7 @@ class NavigationAdjuster:
 
     @property
     def sigmas(self) -> Array | None:
-        """(N, 3) of the positions that shaped the last model, along its axes; None without."""
+        """(N, 3) sigmas of positions that shaped the last model, along its axes; None without."""
         return self._given[1] if self._used and self._given is not None else None
 
 

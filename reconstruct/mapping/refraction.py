@@ -49,7 +49,7 @@ _LEAST_ANGLE_DEG = 1.5
 
 @dataclass(frozen=True, kw_only=True)
 class Convergence:
-    """How the keypoints came to rest."""
+    """How the keypoints converged."""
 
     moved_px: tuple[float, ...]
     """Largest shift of a keypoint in every round."""
@@ -68,7 +68,7 @@ class _Picture:
     """Keypoints of one picture, and what the port does to them."""
 
     warped: Array
-    """(N, 2)."""
+    """(N, 2) keypoints as warped."""
     field: Array
     """(N, 2) A at every keypoint, px m; zero where it is not known."""
     working_m: float
@@ -178,9 +178,9 @@ def refract(
 ) -> tuple[Mapped, Convergence]:
     """Make a model exact that was mapped from keypoints warped at one working depth.
 
-    Keypoints are corrected and the model adjusted, in turns, until the keypoints rest. Once, when
-    the model is exact enough, observations are judged again: the wrong go, and those that the warp
-    kept out come in.
+    Keypoints are corrected and the model adjusted, in turns, until the keypoints converge. Once,
+    when the model is exact enough, observations are tested again: wrong ones are removed, and those
+    that the warp kept out are added.
 
     Args:
         mapped: picture i of `seen` has the id i + 1.
@@ -188,12 +188,12 @@ def refract(
         folder: for scratch files.
         adjust: how to adjust, such as with priors.
         cam_from_rig: poses of the flat-port cameras on one rig; None without one.
-        settle: go on until keypoints rest; else end after the first turn, near enough to refine
+        settle: go on until keypoints converge; else end after the first turn, near enough to refine
             the rig from.
         near: the model is exact already but for what the rig has moved since: judge at once.
 
     Returns:
-        The exact model, and how the keypoints came to rest.
+        The exact model, and how the keypoints converged.
     """
     keypoints = Keypoints(mapped, seen)
     if not keypoints.through_ports:
@@ -292,7 +292,7 @@ def _judge_again(
 
 
 def _wrong_px(model: pycolmap.Reconstruction) -> float:
-    """From how large a miss an observation is wrong."""
+    """Size of the miss from which an observation is wrong."""
     return float(np.clip(_WRONG_SIGMAS * pixel_sigma(model), _LEAST_WRONG_PX, _MOST_WRONG_PX))
 
 

@@ -2,7 +2,7 @@
 
 An adjustment of stations, points and the rig's parameters, each parameter within what calibration
 knew of it: the covariance of `rig.json`, or wide bounds where it has none. What is requested is
-free; what the calibration was unsure of besides (focal lengths, say) moves with it within its
+free; other uncertain parameters of the calibration (focal lengths, say) moves with it within its
 covariance, since holding that would push its errors into what is requested.
 """
 
@@ -43,7 +43,7 @@ from reconstruct.mapping.robust import cauchy_weights, sigma_of, variance_of
 
 _PORT_SIGMAS = {"port_distance_m": 0.02, "normal_x": 0.05, "normal_y": 0.05, "n_water": 0.005}
 _RIG_SIGMAS = dict(zip(TURN_AND_SHIFT, [0.02] * 3 + [0.005] * 3, strict=True))
-"""What is known of parameters that no calibration determines: next to nothing."""
+"""Prior sigmas of parameters that no calibration determines: very wide."""
 _LEVER = ("lever.x_m", "lever.y_m", "lever.z_m")
 """The body's origin in the rig's frame."""
 _LEVER_SIGMA_M = 0.05
@@ -70,7 +70,7 @@ class RigFit:
     after: Array
     prior_sigmas: Array
     covariance: Array
-    """(G, G)."""
+    """(G, G) covariance of the values."""
     sigma_px: float
     """Sigma of one coordinate of a keypoint."""
     observations: int
@@ -312,14 +312,14 @@ def _step(
 
 
 def _inverse(matrix: Array) -> Array:
-    """Of a symmetric matrix whose parameters have many units."""
+    """Inverse of a symmetric matrix whose parameters have many units."""
     scale = 1.0 / np.sqrt(np.diag(matrix))
     inverse: Array = np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale)
     return (inverse + inverse.T) / 2.0
 
 
 def _block_diagonal(blocks: Array) -> Any:
-    """Sparse, from (F, 6, 6)."""
+    """Sparse matrix from (F, 6, 6) blocks."""
     from scipy.sparse import block_diag
 
     return block_diag(list(blocks), format="csc") if len(blocks) else diags_array([])

@@ -4,7 +4,7 @@ Not all keypoints have similar errors. Shadow edges move with the lamps, tracks 
 to the next: a few in a hundred miss by many sigmas, and not at random, since lamps go where the
 cameras go. With equal weights they bend a block by more than all other noise together. Cauchy's
 loss (Rey 1983, "Introduction to robust and quasi-robust statistical methods") lets them go by and
-costs next to nothing where errors are normal.
+costs almost nothing where errors are normal.
 """
 
 import numpy as np

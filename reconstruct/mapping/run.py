@@ -71,7 +71,7 @@ class Inputs:
 
     @property
     def datum(self) -> Datum | None:
-        """Of the local frame; None where pictures have no positions."""
+        """Origin of the local frame; None where pictures have no positions."""
         place = self.survey.datum
         return None if place is None else datum_of(place)
 

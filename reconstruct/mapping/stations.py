@@ -1,6 +1,6 @@
 """Poses of stereo stations relative to each other, straight from the pictures.
 
-What both cameras of a station see is a metric cloud of its own, so that the pose of any other
+What both cameras of a station see is a metric cloud, so that the pose of any other
 station that shares features with it follows from a resection: no first pair, no growing model and
 no navigation is needed, and every pair of stations costs the same however large the survey is.
 """
@@ -42,7 +42,7 @@ class StationLink:
 
     first: int
     second: int
-    """Stations."""
+    """The two stations."""
     second_from_first: RigidTransform
     """Transform between the rigs' frames, metres."""
     inliers: int
@@ -162,7 +162,7 @@ def _rays(
 def _resections(
     seen: Observations, points: Sequence[Array], names: Sequence[str]
 ) -> Iterable[_Resection]:
-    """Of the two ways to resect one station from another, the one with more points."""
+    """The better of the two ways to resect one station from another: more points."""
     shared: dict[tuple[int, int], list[tuple[int, int, Matches]]] = {}
     for i, j, pair in seen.pairs:
         a, b = seen.images[i].station, seen.images[j].station

@@ -40,7 +40,7 @@ class RefinedSurvey:
     """Keypoints as warped by the refined rig's lenses."""
     rig: Rig
     convergence: Convergence
-    """How the keypoints came to rest."""
+    """How the keypoints converged."""
     adjust: NavigationAdjuster
     """What adjusted the model."""
 

@@ -64,7 +64,7 @@ class Uncertainty:
     point_ids: Indices
     """(P,) ids of COLMAP's points, ascending."""
     point_cov: Array
-    """(P, 3, 3)."""
+    """(P, 3, 3) covariances of the points."""
     point_noise: Array
     """(P, 3, 3): of it, what the noise of the point's own keypoints does; the rest are poses."""
     sigma_px: float

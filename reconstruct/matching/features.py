@@ -97,12 +97,12 @@ def find_features(
 
 
 def detection_scales(size: tuple[int, int], most: int) -> tuple[float, ...]:
-    """By how much a picture of some width and height is reduced before features are looked for.
+    """Factors by which a picture of some width and height is reduced to look for features.
 
     SIFT doubles a picture first. Pictures of rich texture have more features than are kept, and the
     largest are kept, so that those of the first octaves cost most of the time and are thrown away;
     what the reduction costs in position, the refinement along the tracks gives back. The second
-    scale is for pictures that have too little to show at the first, and for cameras that are yet to
+    scale is for pictures that have too little to show at the first, and for cameras still to
     be calibrated from them: a block of 18 drone pictures bent more with the larger features.
     """
     area = size[0] * size[1]

@@ -1,4 +1,4 @@
-"""Matches between the features of two pictures, and the two-view geometry that vouches for them.
+"""Matches between the features of two pictures, and the two-view geometry that verifies them.
 
 Descriptors are bytes, so that every dot product is a whole number below 2^24 and comes out of
 float32 matrix products exactly: matches depend neither on the number of threads nor on the blocks.

@@ -53,7 +53,7 @@ def choose_pairs(
         records: pictures.
         rig: calibrated cameras, when known.
         datum: origin of local coordinates; None without positions.
-        alike: pairs that look alike, for pictures that navigation says nothing about.
+        alike: pairs that look alike, for pictures without navigation.
     """
     sure = neighbours(records, 0)
     maybe: set[Pair] = set()
@@ -180,7 +180,7 @@ def _overlap(first: Polygon, second: Polygon) -> float:
 
 
 def _reach_m(record: ImageRecord) -> float:
-    """By how much a footprint is widened; 0 where no sigma is known.
+    """Distance by which a footprint is widened; 0 where no sigma is known.
 
     Two together make up the uncertainty of their distance, the root of two of that of one.
     """

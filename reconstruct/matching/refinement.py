@@ -1,7 +1,7 @@
 """Positions of features made consistent along their tracks, to a few hundredths of a pixel.
 
 SIFT places each feature by itself, with an error of a quarter pixel or more. What the mapping needs
-is that all pictures of a track mean the same spot, whichever. So one observation of every track is
+is that all pictures of a track mean the same spot. So one observation of every track is
 its reference, and the patch around it is aligned in all other pictures of the track by least
 squares (Gruen 1985), in the inverse compositional form (Baker & Matthews 2004): an affine warp with
 a gain and an offset of the grey level. The warp starts from the matches around.
@@ -52,11 +52,11 @@ class _Partner:
 
     grey: Path
     nodes: NDArray[np.int64]
-    """(N,) their numbers over all pictures."""
+    """(N,) numbers of the features over all pictures."""
     reference: Array
     """(N, 2) pixels in the picture of the references."""
     pixels: Array
-    """(N, 2)."""
+    """(N, 2) pixels."""
     support: tuple[Array, Array]
     """(M, 2) pixels of verified matches, in the picture of the references and in this one."""
 
@@ -76,7 +76,7 @@ class RefinedFeatures:
     tracked: int
     """Observations that have a reference in another picture."""
     moved: int
-    """Those that were aligned with it."""
+    """Number of features that were aligned with it."""
 
 
 def refine_tracks(
@@ -118,7 +118,7 @@ def refine_tracks(
 def track_references(
     pairs: Sequence[tuple[int, int, Matches]], starts: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """For every feature, that of its track with most direct matches; the first among equals.
+    """The reference of each feature: that of its track with most direct matches, first of equals.
 
     Args:
         pairs: indices of two pictures and matches.
@@ -196,7 +196,7 @@ def align_coarser(
 ) -> Array:
     """As `align_patches`; what fails is tried again on halved pictures, and again on halved ones.
 
-    Noisy and blurred pictures show little within a few pixels: wider patches there resemble.
+    Noisy and blurred pictures show little within a few pixels: wider patches there are alike.
     """
     found = np.full(pixels.shape, np.nan)
     for level in range(_LEVELS):
@@ -227,7 +227,7 @@ def affine_from_neighbours(first: Array, second: Array, at: Array) -> Array:
     source = source - source.mean(axis=1, keepdims=True)
     target = target - target.mean(axis=1, keepdims=True)
     square = np.einsum("nki,nkj->nij", source, source)
-    # where neighbours are in one line they say nothing across it: there nothing is stretched
+    # where neighbours are in one line they give nothing across it: there nothing is stretched
     square = square + np.eye(2) * (1e-3 * np.trace(square, axis1=1, axis2=2)[:, None, None] + 1e-6)
     mixed = np.einsum("nki,nkj->nij", source, target)
     solved: Array = np.linalg.solve(square, mixed).transpose(0, 2, 1)

@@ -50,7 +50,7 @@ def without_folds(vertices: Array, triangles: Triangles) -> Triangles:
 
 
 def split_fans(vertices: Array, triangles: Triangles) -> tuple[Array, Triangles, NDArray[np.int64]]:
-    """Give each fan of triangles around a vertex a vertex of its own; drop unused vertices.
+    """Give each fan of triangles around a vertex its own vertex; drop unused vertices.
 
     Returns:
         Vertices, triangles, and of which vertex each is a copy.
@@ -99,7 +99,7 @@ def component_areas(vertices: Array, triangles: Triangles) -> tuple[NDArray[np.i
 
 
 def face_areas(vertices: Array, triangles: Triangles) -> Array:
-    """(T,) in squared units of length."""
+    """(T,) areas in squared units of length."""
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     areas: Array = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
     return areas

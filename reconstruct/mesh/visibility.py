@@ -22,7 +22,7 @@ _RIM_PX = 3.0
 _LEAST_COSINE = 0.15
 """Least cosine between the normal of a face and the line of sight."""
 _BLOCK = 512
-"""Vertices that are held against a view's frame at once."""
+"""Vertices that are tested against a view's frame at once."""
 _MARGIN = 0.1
 """Margin of the frame, for what a port bends."""
 _SHRINK = 0.8

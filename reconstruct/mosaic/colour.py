@@ -76,7 +76,7 @@ class ColourModel:
     """(3,) share of the darkest pixels' light that is taken to be the water's; 0 where not known.
     """
     share_sigmas: Array
-    """(3,)."""
+    """(3,) sigmas of the shares."""
     notes: tuple[str, ...]
     black: Array = field(default_factory=lambda: np.zeros(3))
     """(3,) level of the corrected light that is shown as black; white stays white."""

@@ -41,7 +41,7 @@ def finish_colours(
     factors_per_pixel: float,
     curve: Float32,
 ) -> None:
-    """From the light that a picture shows to levels of the mosaic, in place.
+    """Turn the light that a picture shows into levels of the mosaic, in place.
 
     What `ColourModel.corrected` and `encoded` do to whole pictures, and the factors by which broad
     tones are made to meet, in one go.

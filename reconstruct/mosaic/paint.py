@@ -94,7 +94,7 @@ class Painted:
 
     window: Window
     rgba: NDArray[np.uint8]
-    """(4, H, W)."""
+    """(4, H, W) colour and opacity."""
     source: NDArray[np.int32]
     """(H, W) number of the view plus one; 0 where nothing is known."""
 

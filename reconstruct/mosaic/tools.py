@@ -48,13 +48,13 @@ class Tools:
         self._kept: dict[str, NDArray[np.uint8]] = {}
 
     def optics(self, view: View) -> CameraOptics:
-        """Of a view's camera (its green channel)."""
+        """Optics of a view's camera (its green channel)."""
         if view.camera not in self._optics:
             self._optics[view.camera] = camera_optics(self._pictures.lens(view.image), self._scaled)
         return self._optics[view.camera]
 
     def channels(self, view: View) -> tuple[CameraOptics, ...] | None:
-        """Of a view's channels, BGR; None where they share one."""
+        """Optics of a view's channels, BGR; None where they share one."""
         lens = self._pictures.lens(view.image)
         if self._water is None or not isinstance(lens, FlatPortLens) or lens.camera.n_water == 1:
             return None

@@ -192,7 +192,7 @@ def _load_visible(path: Path) -> Visible:
 
 
 def camera_optics(lens: Lens, scaled: bool) -> CameraOptics:
-    """Of a lens; without lengths in metres a port's range shift is not known."""
+    """Optics of a lens; without lengths in metres a port's range shift is not known."""
     return CameraOptics(
         taken_nodes=taken_nodes(lens, _SPACING_PX),
         shift=range_shift(lens) if scaled and isinstance(lens, FlatPortLens) else None,
@@ -201,7 +201,7 @@ def camera_optics(lens: Lens, scaled: bool) -> CameraOptics:
 
 
 def channel_optics(lens: FlatPortLens, water: Water, scaled: bool) -> tuple[CameraOptics, ...]:
-    """Of the blue, green and red channel of a camera behind a port, in the order of BGR.
+    """Optics of the blue, green and red channel of a camera behind a port, in the order of BGR.
 
     All see through the pinhole of green; the rays that they take through port and water differ by
     their indices, at the working range and beyond it.

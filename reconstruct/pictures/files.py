@@ -326,7 +326,7 @@ def bits_used(highest: int) -> int:
 
 
 def copy_picture(source: Path, target: Path, bits: int) -> None:
-    """Bring a picture in: JPEG and PNG of 8 bits as they are, all else as PNG of 8 bits.
+    """Import a picture: JPEG and PNG of 8 bits as they are, all else as PNG of 8 bits.
 
     Args:
         source: a file that `inspect` found whole.

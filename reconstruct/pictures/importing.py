@@ -58,9 +58,9 @@ class ImportedPictures:
     kinds: Mapping[str, int]
     """Pictures by kind of file."""
     positions: int
-    """How many know where they were taken."""
+    """Number of pictures with a known position."""
     left_out: Mapping[str, int]
-    """Files by the reason why they did not come in."""
+    """Files that were not imported, by reason."""
 
     def __str__(self) -> str:
         """One line, such as `68 pictures (68 PNG) of left and right, 0 with a position`."""
@@ -73,7 +73,7 @@ class ImportedPictures:
 
 @dataclass(frozen=True, kw_only=True)
 class _Incoming:
-    """One picture on its way in."""
+    """One picture to import."""
 
     source: Path
     camera: str

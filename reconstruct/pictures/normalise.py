@@ -77,7 +77,7 @@ def finely(ratio: NDArray[np.float32]) -> NDArray[np.uint16]:
     """An evened picture in levels far finer than the noise, as bent by no tone curve.
 
     Local equalisation helps descriptors, but its tone curves differ from tile to tile: they move
-    edges by some thousandths of a pixel, alike in every picture, which bends a model.
+    edges by some thousandths of a pixel, the same in every picture, which bends a model.
 
     Args:
         ratio: (H, W) of `even_light`.

@@ -1,6 +1,6 @@
 """How good the pictures of a survey are: sharpness, exposure, contrast, noise and overlap.
 
-Every picture is measured by itself, then held against the survey: what lies far from the median of
+Every picture is measured by itself, then compared with the survey: what lies far from the median of
 all is listed with the reason. Nothing is left out of the reconstruction because of it.
 """
 
@@ -185,7 +185,7 @@ def _fine_gain() -> float:
 def judge(found: Sequence[PictureQuality]) -> list[PictureQuality]:
     """Add the reasons: limits for any picture, and what stands out of the survey.
 
-    Medians are those of a picture's own camera: two cameras may have unlike lenses and lamps.
+    Medians are those of a picture's own camera: two cameras may have different lenses and lamps.
     """
     by_camera: dict[str, list[PictureQuality]] = defaultdict(list)
     for quality in found:

@@ -1,4 +1,4 @@
-"""What is written about the quality of a survey's pictures: a table, and a sheet of the worst."""
+"""Reports on the quality of a survey's pictures: a table, and a sheet of the worst."""
 
 import math
 from collections.abc import Sequence

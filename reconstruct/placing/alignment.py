@@ -37,7 +37,7 @@ def align_rigid(source: Array, target: Array) -> RigidTransform:
 
 
 def align_similarity(source: Array, target: Array) -> Similarity:
-    """The same with a free scale (Umeyama 1991, equations 40 to 43)."""
+    """The same transform with a free scale (Umeyama 1991, equations 40 to 43)."""
     return _align(source, target, with_scale=True)
 
 

@@ -48,7 +48,7 @@ class _Bar:
 
     @property
     def sigma_in_model(self) -> float:
-        """By the picks."""
+        """Sigma of the length by the picks."""
         squares = []
         for a, b in self.pairs:
             way = (b.model - a.model) / np.linalg.norm(b.model - a.model)
@@ -63,16 +63,16 @@ class ControlFit:
     ties: tuple[_Tie, ...]
     bars: tuple[_Bar, ...]
     lost: Mapping[str, str]
-    """Why others are of no use, by name."""
+    """Why other control is not used, by name."""
 
     @property
     def used_points(self) -> tuple[_Tie, ...]:
-        """Those that place the model."""
+        """Points that place the model."""
         return tuple(t for t in self.ties if t.use == "control")
 
     @property
     def used_bars(self) -> tuple[_Bar, ...]:
-        """Those that scale the model."""
+        """Bars that scale the model."""
         return tuple(b for b in self.bars if b.use == "control")
 
     @property

@@ -56,7 +56,7 @@ class KnownPoint:
         return not math.isnan(self.latitude_deg)
 
     def ned(self, datum: Datum | None) -> Array:
-        """(3,) in the local frame of a datum.
+        """(3,) place in the local frame of a datum.
 
         Raises:
             WorkspaceError: its kind of coordinates needs a datum, and there is none.

@@ -144,7 +144,7 @@ class _KnownScale:
     """Metres in a unit of the mapped model."""
     source: str
     sigma: float
-    """Relative."""
+    """Relative sigma of the scale."""
 
 
 def body_from_pinhole(rig: Rig | None, lenses: Mapping[str, Lens]) -> dict[str, RigidTransform]:
@@ -164,7 +164,7 @@ def _fit(
     ties: ControlFit,
     datum: Datum | None,
 ) -> PlacementFit | None:
-    """By navigation and control, by navigation, by control; None where nothing places it."""
+    """The fit to navigation and control, to one of them, or None where nothing places it."""
     # Control corrects a known scale within its sigma; without control it is held.
     sigma = known.sigma if known is not None and ties.informs_scale else 0.0
     fit = None
@@ -242,7 +242,7 @@ def _scale_source(known: _KnownScale | None, ties: ControlFit) -> str:
 
 
 def _known_scale(workspace: Path, mapping: MappingRecord) -> _KnownScale | None:
-    """None where nothing but navigation or control gives it."""
+    """The known scale; None where nothing but navigation or control gives it."""
     if mapping.scaled:
         return _KnownScale(scale=1.0, source="scale from the calibrated rig", sigma=RIG_SCALE_SIGMA)
     path = workspace / SCALE_FILE

@@ -60,9 +60,9 @@ class Extra:
     """Independent further equations, made white: misfit + jacobian x change = N(0, 1)."""
 
     misfit: Array
-    """(E,)."""
+    """(E,) misfits."""
     jacobian: Array
-    """(E, PARAMETERS)."""
+    """(E, PARAMETERS) their slopes."""
 
 
 NO_EXTRA = Extra(misfit=np.zeros(0), jacobian=np.zeros((0, PARAMETERS)))
@@ -73,9 +73,9 @@ class Estimate:
     """The parameters' change that the equations give, with its covariance."""
 
     change: Array
-    """(PARAMETERS,), zero for what is held."""
+    """(PARAMETERS,) change, zero for what is held."""
     covariance: Array
-    """(PARAMETERS, PARAMETERS), zero for what is held."""
+    """(PARAMETERS, PARAMETERS) covariance, zero for what is held."""
     lasting: Mapping[str, Lasting]
     """Correlation by group, of those with readings."""
     used: NDArray[np.bool_]
@@ -207,7 +207,7 @@ class _PlacementProblem:
     def groups(
         self, group: str, used: NDArray[np.bool_], choices: Sequence[Lasting]
     ) -> tuple[Array, Array, Array, Array]:
-        """The same of many choices of one factor: matrices, vectors, squares, log dets."""
+        """The equations of many choices of one factor: matrices, vectors, squares, log dets."""
         key = (group, used.tobytes(), len(choices))
         if key not in self.stacks:
             parts = [self.group(group, used, replace(c, factor=1.0)) for c in choices]
@@ -359,7 +359,7 @@ def _scores(
 def _factor(
     problem: _PlacementProblem, used: NDArray[np.bool_], now: Mapping[str, Lasting], group: str
 ) -> float:
-    """By how much a group's misfits are larger than its sigmas allow, 1 or more."""
+    """Factor by which a group's misfits are larger than its sigmas allow, 1 or more."""
     change, covariance = problem.total(used, now).solve()
     own = problem.group(group, used, now[group])
     square = own.square + 2.0 * float(own.vector @ change) + float(change @ own.matrix @ change)
@@ -433,7 +433,7 @@ def _averaged(
 
 
 def _filled(problem: _PlacementProblem, mean: Array, covariance: Array) -> tuple[Array, Array]:
-    """With zeros for what is held."""
+    """Parameters and covariance with zeros for what is held."""
     full, matrix = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
     full[problem.free] = mean
     matrix[np.ix_(problem.free, problem.free)] = covariance

@@ -38,7 +38,7 @@ from reconstruct.placing.navigation_equations import (
 _LEVEL_SIGMA_DEG = 10.0
 """How far from level the sea floor's mean plane may be, where no attitude was measured."""
 _TRIMS = 5
-"""Rounds of leaving out what stands off the mean plane."""
+"""Rounds of leaving out what is off the mean plane."""
 _ROBUST_STEPS = 30
 _ROBUST_SIGMAS = 2.0
 """Sigmas beyond which the first placement lets a misfit pull only in proportion."""
@@ -270,14 +270,14 @@ def fit_control(
 class _NavigationTask:
     epochs: Epochs
     levelled: Similarity | None
-    """None where control holds the model level."""
+    """The levelled model; None where control holds the model level."""
     known_scale: float | None
     scale_sigma: float
     mount_sigma_rad: float
     control: ExtraOf | None
 
     def fit(self, start: Similarity, free: list[int]) -> PlacementFit:
-        """From a rough placement to the final one."""
+        """Iterate from a rough placement to the final one."""
         epochs = self.epochs
         place = self._robust(start, free)
         found = equations(epochs, place, self._middle(place))

@@ -33,7 +33,7 @@ DICTIONARIES = (
     "DICT_4X4_50", "DICT_4X4_250", "DICT_5X5_100", "DICT_6X6_250", "DICT_7X7_100",
     "DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_16h5", "DICT_APRILTAG_25h9", "DICT_APRILTAG_36h11",
 )  # fmt: skip
-"""Tried one after the other where none is named."""
+"""Dictionaries tried one after the other where none is named."""
 _HEADER = ("image", "point", "x", "y", "sigma_px")
 _TEMPLATE = ("image", "point", "x", "y", "sigma_px", "near_x", "near_y")
 _LEAST_VIEWS = 2

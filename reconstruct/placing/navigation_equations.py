@@ -56,7 +56,7 @@ class Epochs:
     sigma: Array
     """(M, 6) north, east, depth (m), roll, pitch, heading (rad) as navigation states it."""
     known: NDArray[np.bool_]
-    """(M, 6)."""
+    """(M, 6) whether navigation gives the value."""
 
     def positions(self, ned_from_model: Similarity) -> Array:
         """Body origins in NED, (N, 3)."""
@@ -183,7 +183,7 @@ def equations(epochs: Epochs, place: Similarity, middle_ned: Array) -> Navigatio
     away = positions - positions.mean(axis=0)
     jacobian[:, :2, STRETCH] = -away[:, :2]
     jacobian[:, 0, TURN], jacobian[:, 1, TURN] = away[:, 1], -away[:, 0]
-    # Angle by angle: an error of heading must not pass for one of roll where the vehicle leans, nor
+    # Angle by angle: an error of heading must not count as one of roll where the vehicle leans, nor
     # a wrong heading spoil the tilt that was read with it.
     stated, found = (r.as_euler("ZYX")[:, ::-1] for r in (epochs.ned_from_body, attitudes))
     misfit[:, 3:] = (found - stated + np.pi) % (2.0 * np.pi) - np.pi

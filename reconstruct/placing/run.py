@@ -113,7 +113,7 @@ def _mounts(rig: Rig | None) -> dict[str, Rotation]:
 def _covariances(
     workspace: Path, partial: Path, placed: Placed, rows: Sequence[TrackRow]
 ) -> Array | None:
-    """Of all poses in the world; written as far as known, None where their place is not known."""
+    """Covariances of all poses in the world; written as far as known, None where unknown."""
     poses = RigidTransform.concatenate([row.world_from_cam for row in rows])
     names, parts = [row.image for row in rows], []
     total = np.zeros((len(rows), 6, 6))

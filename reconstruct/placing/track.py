@@ -38,7 +38,7 @@ class TrackRow:
     station: int
     camera: str
     time_s: float
-    """NaN when unknown."""
+    """Time; NaN when unknown."""
     world_from_cam: RigidTransform
     """Pose of the entrance pupil."""
     points: int
@@ -97,7 +97,7 @@ def track_rows(
 
 
 def track_sigmas(rows: Sequence[TrackRow], covariances: Array | None) -> Array:
-    """(N, 6) in the order of `SIGMAS`; NaN where no covariance is known.
+    """(N, 6) sigmas in the order of `SIGMAS`; NaN where no covariance is known.
 
     Args:
         rows: the track.

@@ -197,7 +197,7 @@ def _read_mosaic(path: Path) -> tuple[Array, tuple[float, float, float, float], 
 
 
 def _size(extent: tuple[float, float, float, float]) -> tuple[float, float]:
-    """Of a figure for a map with a legend at its right, inches."""
+    """Size of a figure for a map with a legend at its right, inches."""
     wide, high = extent[1] - extent[0], extent[3] - extent[2]
     scale = (_LONGEST_IN - 2.0) / max(wide, high, 1e-9)
     return max(4.0, wide * scale) + 2.4, max(3.0, high * scale) + 0.8

@@ -50,18 +50,18 @@ class Located:
     """Points and how well they are known."""
 
     points: Array
-    """(N, 3), metres."""
+    """(N, 3) points, metres."""
     own: Array
-    """(N, 3, 3) covariance that each point has of its own."""
+    """(N, 3, 3) covariance of each point alone."""
     shared: Array
     """(P, N, 3) how all move with parameters of covariance `parameters`."""
     parameters: Array
-    """(P, P)."""
+    """(P, P) covariance of the parameters."""
     axes: tuple[str, str, str]
     notes: tuple[str, ...]
 
     def sigma(self, figure: Callable[[Array], float]) -> tuple[float, float]:
-        """Standard deviations of a figure of the points: of their own, and of what they share."""
+        """Standard deviations of a figure of the points: independent part, and shared part."""
         slope = np.zeros_like(self.points)
         step = 1e-6 * max(1.0, float(np.abs(self.points).max()))
         for n, axis in np.ndindex(*self.points.shape):

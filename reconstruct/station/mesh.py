@@ -31,7 +31,7 @@ class StationMesh:
     """Triangles in the world of the pair."""
 
     vertices: Array
-    """(V, 3)."""
+    """(V, 3) vertices."""
     triangles: Triangles
     """(T, 3) counter-clockwise seen from the camera."""
 
@@ -40,7 +40,7 @@ class StationMesh:
 def depth_mesh(
     view: View, depth: NDArray[np.float32], sigma: NDArray[np.float32], most: int
 ) -> StationMesh:
-    """Triangles between the pixels of a depth map, less those across jumps, decimated.
+    """Triangles between the pixels of a depth map, without those across jumps, decimated.
 
     Args:
         view: of the depth.

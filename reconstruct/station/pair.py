@@ -163,7 +163,7 @@ def reconstruct_pair(
 
 
 def check_sizes(rig: Rig, pictures: tuple[Path, Path]) -> None:
-    """Hold pictures against the cameras of a rig.
+    """Check pictures against the cameras of a rig.
 
     Raises:
         ImageError: one cannot be read or is of another size.
@@ -285,9 +285,9 @@ def pair_samplers(
 def _match_sigma(
     views: tuple[View, View], greys: tuple[Sampler, Sampler], depth: Float32, sigma: Float32
 ) -> tuple[float, float]:
-    """How well the dense match of this pair is, px, and by what precise sigmas are too small.
+    """Sigma of this pair's dense match, px, and the factor by which precise sigmas are too small.
 
-    Dense depths are held against least-squares matches, which are several times as precise, at
+    Dense depths are compared with least-squares matches, which are several times as precise, at
     pixels spread evenly.
     """
     rows, columns = np.nonzero(np.isfinite(depth))

@@ -146,7 +146,7 @@ def precise_depth(
 
 
 def inflation(found: PreciseDepth) -> float:
-    """By what the sigmas of many pixels are too small, at least 1.
+    """Factor by which the sigmas of many pixels are too small, at least 1.
 
     Aliasing and resampling leave errors that one patch cannot show. Across the epipolar line the
     true miss is the same for all (the calibration's): its scatter (rms, gross errors held back), in
@@ -229,7 +229,7 @@ def remapped(picture: NDArray[Any], pixels: Array, interpolation: int, border: i
 
 
 def _scatter(terms: Array) -> Array:
-    """Variance of the sums of (N, P) terms of square patches, whose neighbours go together.
+    """Variance of the sums of (N, P) terms of square patches, whose neighbours are correlated.
 
     The noise of resampled pictures is not white: products of terms up to some pixels apart count,
     with weights that fall off linearly, so that no variance is negative (Newey & West 1987, "A

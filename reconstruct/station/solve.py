@@ -77,7 +77,7 @@ class PairOptics:
 
     @cached_property
     def views(self) -> tuple[View, View]:
-        """Both, in the world of the rig."""
+        """Both views, in the world of the rig."""
         views = []
         for name, lens, pose in zip(self.rig.names, self.lenses, self.rig.poses, strict=True):
             p = lens.pinhole

@@ -34,7 +34,7 @@ class Pinhole:
 
     @property
     def colmap(self) -> pycolmap.Camera:
-        """The same as COLMAP's camera."""
+        """The pinhole as COLMAP's camera."""
         return pycolmap.Camera(
             model="PINHOLE",
             width=self.width_px,
@@ -57,7 +57,7 @@ class Lens(Protocol):
 
     @property
     def pinhole_from_cam(self) -> RigidTransform:
-        """From the camera's frame (origin at its entrance pupil) to the pinhole's."""
+        """Transform from the camera's frame (origin at its entrance pupil) to the pinhole's."""
 
     def to_pinhole(self, pixels: Array) -> Array:
         """Pixels (N, 2) of the picture as taken to the pinhole's; NaN where there are none."""
@@ -66,7 +66,7 @@ class Lens(Protocol):
         """The inverse of `to_pinhole`."""
 
     def to_json(self) -> dict[str, Any]:
-        """All of it as JSON values."""
+        """All fields as JSON values."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +95,7 @@ class FlatPortLens:
 
     @property
     def pinhole_from_cam(self) -> RigidTransform:
-        """From the entrance pupil to the pinhole's centre on the axis."""
+        """Transform from the entrance pupil to the pinhole's centre on the axis."""
         return self.virtual.virtual_from_cam
 
     def to_pinhole(self, pixels: Array) -> Array:
@@ -107,7 +107,7 @@ class FlatPortLens:
         return self.camera.project(self.virtual.at_depth(pixels, self.virtual.working_range_m))
 
     def to_json(self) -> dict[str, Any]:
-        """All of it as JSON values."""
+        """All fields as JSON values."""
         return {
             "kind": "flat_port",
             "camera": self.camera.to_json(),
@@ -138,7 +138,7 @@ class ColmapLens:
 
     @property
     def pinhole_from_cam(self) -> RigidTransform:
-        """Both share one centre."""
+        """The identity: both share one centre."""
         return RigidTransform.identity()
 
     def to_pinhole(self, pixels: Array) -> Array:
@@ -153,7 +153,7 @@ class ColmapLens:
         return np.asarray(self._colmap.img_from_cam(rays), dtype=np.float64).reshape(-1, 2)
 
     def to_json(self) -> dict[str, Any]:
-        """All of it as JSON values."""
+        """All fields as JSON values."""
         return {
             "kind": "colmap",
             "model": self.model,

@@ -107,7 +107,7 @@ class SparseModel:
     views: tuple[View, ...]
     """Sorted by image name."""
     points_world: Array
-    """(P, 3)."""
+    """(P, 3) points in the world."""
     observations: NDArray[np.int64]
     """(O, 2) rows of point index and view index."""
 
@@ -227,7 +227,7 @@ def _model(stored: CamerasRecord, frame: WorldFrame, model: Any) -> SparseModel:
 
 
 def _shifts(stored: CamerasRecord, frame: WorldFrame) -> dict[str, RangeShift]:
-    """By camera; none for cameras without a port, and none where lengths are not known."""
+    """Range shift by camera; none without a port, and none where lengths are not known."""
     if not frame.scaled:
         return {}
     return {

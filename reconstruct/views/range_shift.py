@@ -57,7 +57,7 @@ class RangeShift:
         return found
 
     def scaled(self, sx: float, sy: float) -> "RangeShift":
-        """The same for a picture that is made smaller by a factor along x and y."""
+        """The same field for a picture that is made smaller by a factor along x and y."""
         return replace(
             self,
             nodes=self.nodes * [sx, sy],
@@ -109,7 +109,7 @@ def field_of(lens: FlatPortLens, warped: Array) -> Array:
 
 
 def no_shift(width_px: int, height_px: int) -> RangeShift:
-    """Of a camera without a port."""
+    """The field of a camera without a port."""
     return RangeShift(
         nodes=np.zeros((2, 2, 2)),
         width_px=float(width_px),

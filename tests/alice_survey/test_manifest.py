@@ -1,4 +1,4 @@
-"""Manifests that a person edited, or a disk spoilt."""
+"""Manifests that a person edited, or that a disk damaged."""
 
 from pathlib import Path
 

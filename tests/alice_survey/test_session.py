@@ -288,7 +288,7 @@ def test_ctrl_c_that_a_library_makes_a_fault_of_is_none(tmp_path: Path) -> None:
 def test_a_terminal_that_closes_ends_what_was_not_meant_to_outlive_it(
     outlives: bool, tmp_path: Path
 ) -> None:
-    """As `nohup` has it. Either can write to nobody any more."""
+    """As `nohup` has it. Nothing reads what either writes any more."""
     (tmp_path / "sleeping.py").write_text(SLEEPING.replace("60", "2" if outlives else "60"))
     (tmp_path / "script.py").write_text(SCRIPT)
     folder, file = tmp_path / "workspace", tmp_path / "events"

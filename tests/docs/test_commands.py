@@ -75,7 +75,7 @@ def check_command(text: str) -> None:
 
 @pytest.mark.parametrize("page", pages(), ids=lambda page: page.stem)
 def test_blocks_are_of_a_kind_that_is_looked_at(page: Path) -> None:
-    """What is not named could hold commands that nobody tries."""
+    """What is not named could hold commands that are never tried."""
     for fence in fences(page):
         assert fence.language in LANGUAGES, f"{name_of(page)} line {fence.line}"
         if fence.language == "toml":

@@ -23,7 +23,7 @@ _DATUM = Datum(32.8, 35.0)
 
 
 def read_area(path: Path, ending: str = "") -> object:
-    """An area for planning, of a file, or of the file whose side file is spoilt."""
+    """An area for planning, of a file, or of the file whose side file is damaged."""
     from missions.areas.survey import survey_area
 
     file = path.with_suffix(ending) if ending else path

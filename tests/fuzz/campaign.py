@@ -1,6 +1,6 @@
-"""Hours of spoilt files by hand: `python -m tests.fuzz.campaign --seconds 600`.
+"""Hours of damaged files by hand: `python -m tests.fuzz.campaign --seconds 600`.
 
-Two engines share the table of targets: `mutations` tries spoilt copies of a good file, `atheris`
+Two engines share the table of targets: `mutations` tries damaged copies of a good file, `atheris`
 (libFuzzer) keeps those that reach new lines of Python and spoils these further. Each runs in a
 process of its own, so that a library's crash is counted and not suffered. Files that led to faults
 are kept in the folder given by `--keep`.

@@ -189,7 +189,7 @@ def read_column_map(path: Path) -> object:
 
 
 def swelling_bag(folder: Path, packed: str, size: int) -> Path:
-    """A navigation log with one message more, of so many zeros, in packed chunks."""
+    """A navigation log with one message more, of a number of zeros, in packed chunks."""
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
     from rosbags.rosbag2 import Writer as Writer2

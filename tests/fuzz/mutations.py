@@ -1,4 +1,4 @@
-"""Files spoilt as users and disks spoil them: by what they hold, and byte by byte.
+"""Files damaged as users and disks damage them: by what they hold, and byte by byte.
 
 Every choice is drawn from one `random.Random`, so that hypothesis can shrink a fault, and a
 campaign can repeat it.
@@ -34,7 +34,7 @@ _SIZES = (0, 1, 2, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xF
 
 
 def mutate(data: bytes, syntax: Syntax, rng: Random) -> bytes:
-    """A spoilt copy of a file, of at most `MOST_BYTES`."""
+    """A damaged copy of a file, of at most `MOST_BYTES`."""
     known = _OF_SYNTAX[syntax]
     for _ in range(rng.randint(1, 4)):
         general = syntax != "binary" and rng.random() < 0.15

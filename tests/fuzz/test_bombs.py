@@ -73,7 +73,7 @@ def test_aliases_of_yaml_are_not_expanded(sandbox: Sandbox) -> None:
 
 
 def zeros(count: int) -> bytes:
-    """So many zeros, packed: pieces of a MiB are packed once and repeated."""
+    """A number of zeros, packed: pieces of a MiB are packed once and repeated."""
     packer = zlib.compressobj(9, zlib.DEFLATED, -15)
     piece = packer.compress(bytes(1 << 20)) + packer.flush(zlib.Z_FULL_FLUSH)
     return piece * (count >> 20) + zlib.compressobj(9, zlib.DEFLATED, -15).flush()

@@ -1,4 +1,4 @@
-"""Every reader, with files spoilt by `mutations`: the short form of `campaign`."""
+"""Every reader, with files damaged by `mutations`: the short form of `campaign`."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What lies in a workspace and a user may edit, or a disk may spoil; and references."""
+"""What lies in a workspace and a user may edit, or a disk may damage; and references."""
 
 import json
 from collections.abc import Callable

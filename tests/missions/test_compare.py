@@ -170,7 +170,7 @@ def test_turns_are_from_a_line_to_the_middle_of_the_next() -> None:
     line = np.array([-1, -1, 0, 0, 0, -1, -1, 1, 1, 1, 1, -1, 2, 2, -1], np.float64)
     following = np.ones(len(line), bool)
     assert turn_rows(line, following) == [slice(5, 9), slice(11, 13)]
-    # A way back to where the line was left is no turn.
+    # A way back to where the line was left is not a turn.
     again = np.array([0, 0, -1, 0, 0], np.float64)
     assert turn_rows(again, np.ones(5, bool)) == []
     assert turn_rows(np.full(4, -1.0), np.ones(4, bool)) == []

@@ -167,7 +167,7 @@ def test_a_vehicle_at_the_fence_begins_without_a_way_in() -> None:
     flown = fly(replace(PLAN, area=replace(PLAN.area, allowed=fence)), survey())
     assert flown.ending == "complete"
     following = flown.flown.report[:, PHASE] == FOLLOW
-    # But for what control and navigation err.
+    # But for the errors of control and navigation.
     assert -0.3 < flown.glass_ned[following, 0].min() < 0.0
 
 

@@ -152,7 +152,7 @@ def test_a_thruster_that_fails_unnoticed_leaves_pictures_off_their_lines() -> No
 def test_figures_of_turns_and_altitude_are_true_ones(flight: Flight) -> None:
     found = flight_summary(flight, survey().vehicle, RIG)
     on_line = flight.line >= 0
-    # Truth and belief differ by what the navigation errs, no more.
+    # Truth and estimate differ by the navigation's error, no more.
     np.testing.assert_allclose(
         flight.route_error[on_line], flight.line_errors[0][on_line], atol=1e-6
     )

@@ -64,7 +64,7 @@ def test_a_mission_passes_through_its_phases_in_order(calm: Flown) -> None:
 def test_the_recorded_velocity_is_that_of_the_recorded_positions(calm: Flown) -> None:
     way = np.diff(calm.truth[:, :3], axis=0)
     mean = 0.5 * (calm.truth[1:, 7:10] + calm.truth[:-1, 7:10])
-    # The trapezium rule errs by the change of acceleration within a tick.
+    # The trapezium rule's error is the change of acceleration within a tick.
     assert np.abs(way / TICK_S - mean).max() < 2e-3
     turned = Rotation.from_quat(calm.truth[:-1, 3:7]).inv() * Rotation.from_quat(
         calm.truth[1:, 3:7]

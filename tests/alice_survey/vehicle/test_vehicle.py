@@ -1,4 +1,4 @@
-"""A vehicle as a value: its matrices from its parts, by hand and by other roads."""
+"""A vehicle as a value: its matrices from its parts, by hand and by other methods."""
 
 import numpy as np
 import pytest
@@ -107,7 +107,7 @@ def test_configuration_matrix_of_alice_by_hand() -> None:
     np.testing.assert_allclose(vertical[[0, 1, 2]], [0, 0, 1], atol=1e-12)
     np.testing.assert_allclose(bow[[0, 1, 2]], [0, 1, 0], atol=1e-12)
     assert bow[5] > 0.3 and stern[5] < -0.3
-    # The surge propellers turn against each other: no roll when they push alike.
+    # The surge propellers turn against each other: no roll when they push equally.
     assert starboard[3] == pytest.approx(-port[3], abs=1e-12)
     assert abs(starboard[3]) > 1e-4
 

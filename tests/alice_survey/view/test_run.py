@@ -99,7 +99,7 @@ def test_a_large_raster_in_little_memory_until_ctrl_c(tmp_path: Path) -> None:
     assert (started.returncode, out, told) == (130, "", "interrupted\n")
     assert list(temporary.iterdir()) == []
     assert grown < MOST_GROWTH_MIB
-    with pytest.raises(OSError):  # nobody listens any more
+    with pytest.raises(OSError):  # the port is closed
         socket.create_connection((ADDRESS, int(url.rsplit(":", 1)[1].strip("/"))), timeout=2)
 
 

@@ -234,7 +234,7 @@ def test_requests_out_of_form_get_nothing(server: Server, request_text: bytes) -
             answer += part
     assert b" 200 " not in answer.split(b"\r\n")[0]
     assert b"name = " not in answer
-    assert answer.count(b"HTTP/1.1 ") <= 1  # what came as a body is no second request
+    assert answer.count(b"HTTP/1.1 ") <= 1  # what came as a body is not a second request
     assert ask(server, "/files/survey.toml").status == 200
 
 

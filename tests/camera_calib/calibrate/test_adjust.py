@@ -1,4 +1,4 @@
-"""The joint adjustment: as exact as its Cramer-Rao bound allows, and honest about it."""
+"""The joint adjustment: as exact as its Cramer-Rao bound allows, with sigmas that say so."""
 
 import time
 from dataclasses import replace
@@ -69,7 +69,7 @@ def test_errors_reach_the_cramer_rao_bound_and_match_their_sigmas(known: Intrins
     low, high = GOAL_OF_SIGMA
     scores = [p.by_sigma_without_luck for p in mode.parameters]
     assert low < 0.95 < min(scores) <= max(scores) < 1.05 < high
-    # Sizes that this geometry gives, so that the bound itself is no slip.
+    # Sizes that this geometry gives, so that the bound itself is checked.
     low_mm, high_mm = {"held": (0.2, 0.45), "prior": (0.3, 1.0), "free": (0.7, 2.4)}[known]
     assert low_mm < 1e3 * found["left.port_distance_m"].bound < high_mm
     assert 0.007 < np.rad2deg(found["left.normal_x"].bound) < 0.09

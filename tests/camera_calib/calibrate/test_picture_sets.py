@@ -1,4 +1,4 @@
-"""Pictures of one moment are found by their numbers, or by their order."""
+"""Pictures of one instant are found by their numbers, or by their order."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Printed targets are true to scale: the files, drawn and measured by others' means, say so."""
+"""Printed targets are true to scale: the files, drawn and measured by other tools, show it."""
 
 import re
 import xml.etree.ElementTree as ET

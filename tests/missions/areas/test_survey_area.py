@@ -107,7 +107,7 @@ def test_a_corridor_has_its_width_flat_ends_and_goes_round() -> None:
     assert bent.survey.area == pytest.approx(4 * 50)
     ring = area_of(corridor_ne_m=(*square(0, 0, 20), (0, 0)), corridor_width_m=2.0)
     assert ring.survey.area == pytest.approx(22**2 - 18**2)
-    # What a corridor goes round is no zone to keep out of.
+    # What a corridor goes round is not a zone to keep out of.
     assert ring.no_go.is_empty
 
 
@@ -130,7 +130,7 @@ def test_parts_holes_and_islands(capsys: pytest.CaptureFixture[str]) -> None:
     area = area_of(wkt=wkt)
     assert area.survey.area == pytest.approx(900 - 400 + 25)
     assert len(area.survey.geoms) == 2
-    # The island in the hole is to be surveyed, so it is no zone to keep out of.
+    # The island in the hole is to be surveyed, so it is not a zone to keep out of.
     assert area.no_go.area == pytest.approx(400 - 25)
     assert "cannot pass between them" in capsys.readouterr().err
 

@@ -121,7 +121,7 @@ def test_the_tolerance_keeps_neighbouring_lines_together() -> None:
     stereo = common_swath(RIG, 2.0, plan.station_spacing_m)
     error_m = line_tolerance_m(plan, RIG, Options(least_tolerance_m=0.01))
 
-    # Two lines that err apart by it just meet; here that is less than half a step of 0.46 m.
+    # Two lines that are off by it, apart, just meet; here that is less than half a step of 0.46 m.
     assert 0.8 + 2 * error_m == pytest.approx(2 * stereo.half_across_m)
     assert 0.2 < error_m < 0.23
     close = line_tolerance_m(small_plan(line_spacing_m=0.7), RIG, Options(least_tolerance_m=0.01))

@@ -236,7 +236,7 @@ def test_the_survey_item_has_what_qgroundcontrol_asks_for(tmp_path: Path) -> Non
     assert {"angle", "entryLocation", "flyAlternateTransects", "splitConcavePolygons"} < set(survey)
     assert len(survey["polygon"]) == 4
     assert data["aliceSurvey"]["name"] == 'a<b&"c'
-    # What QGroundControl reckons with a pinhole is what the camera sees through its port.
+    # What QGroundControl computes with a pinhole is what the camera sees through its port.
     across = calc["SensorWidth"] / calc["FocalLength"] * calc["DistanceToSurface"]
     assert across == pytest.approx(plan.footprint_m[0], abs=1e-6)
     assert across * (1 - calc["SideOverlap"] / 100) == pytest.approx(1.0, abs=1e-4)

@@ -1,4 +1,4 @@
-"""Packets of MAVLink against pymavlink, which is of other hands, and the protocol's text."""
+"""Packets of MAVLink against pymavlink, written independently, and the protocol's text."""
 
 import io
 import itertools
@@ -236,7 +236,7 @@ def test_garbage_between_records_is_passed_over(chunk_bytes: int) -> None:
 
 @pytest.mark.parametrize("version", [1, 2])
 def test_messages_that_are_not_known_are_passed_over_whole(tmp_path: Path, version: int) -> None:
-    """Also one whose payload holds a record; it is no damage, at the end of the log neither."""
+    """Also one whose payload holds a record; it is not damage, nor at the end of the log."""
     inner = record(T0, packed(position(666)))
     carrier = mavlink.MAVLink_data96_message(1, len(inner), inner.ljust(96, b"\x07"))
     log = [(T0, text()), (T0, position(1)), (T0, carrier), (T0, position(2)), (T0, text())]
@@ -275,7 +275,7 @@ def test_a_clock_that_is_set_costs_no_known_message() -> None:
 
 
 def test_a_packet_by_hand() -> None:
-    """Version 1 without extensions, as the protocol has it; pymavlink sends them all the same."""
+    """Version 1 without extensions, as the protocol has it; pymavlink still sends them."""
     payload = struct.pack("<QiiiHHHHBB", 5, 601_000_000, -52_500_000, 7, 1, 2, 3, 4, 3, 9)
     packet = bytes([0xFE, 30, 77, 4, 2, 24]) + payload
     packet += slow_checksum(packet[1:] + bytes([24])).to_bytes(2, "little")

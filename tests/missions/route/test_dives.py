@@ -1,4 +1,4 @@
-"""Lines parted into dives: fewest, then least energy, each within battery and time."""
+"""Lines divided into dives: fewest, then least energy, each within battery and time."""
 
 import re
 from typing import Any

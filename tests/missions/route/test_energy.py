@@ -89,7 +89,7 @@ def test_crabbing_ends_where_the_current_along_outruns_the_vehicle() -> None:
 
 
 def test_costs_turn_with_the_current() -> None:
-    """The vehicle is no compass: turning the current by 40 deg turns the costs by 8 samples."""
+    """Costs do not depend on north: turning the current by 40 deg turns the costs by 8 samples."""
     one, other = survey_costs(_config(towards=90.0)), survey_costs(_config(towards=130.0))
     for name in ("line_w", "way_w", "sway_w"):
         np.testing.assert_allclose(

@@ -243,7 +243,7 @@ def test_what_a_mask_hides_is_not_painted_and_others_fill_it(tmp_path: Path):
 def test_labels_beyond_65535_stay_apart(
     workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """The same survey whose views are the last of 70,000 is painted alike, by other numbers."""
+    """The same survey whose views are the last of 70,000 is painted the same, by other numbers."""
     before = 70_000
     views_of, write = run._seen_views, run.write_tiles
 

@@ -28,7 +28,7 @@ def sea_floor(seed: int, shape: tuple[int, int] = (384, 512)) -> NDArray[np.floa
 
 
 def taken(light: NDArray[np.float64], noise: float = 0.006, seed: int = 0) -> Picture:
-    """What a camera makes of light from 0 to 1."""
+    """What a camera records of light from 0 to 1."""
     noisy = light + noise * np.random.default_rng(seed).normal(size=light.shape)
     grey = np.clip(np.rint(255 * noisy), 0, 255).astype(np.uint8)
     return cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)

@@ -1,4 +1,4 @@
-"""The sigmas that a placement states are those of its errors, however long errors last."""
+"""The sigmas that a placement states are those of its errors, however correlated errors are."""
 
 from dataclasses import replace
 
@@ -119,7 +119,7 @@ def test_lasting_is_found() -> None:
 
 
 def test_a_heading_that_turns_the_reckoned_track_too_is_one_error_not_two() -> None:
-    """Compass error turns both headings and the positions reckoned along them."""
+    """Compass error turns both headings and the positions integrated along them."""
     body, ratios = flight(), []
     for seed in range(7):
         rng = np.random.default_rng([5, seed])

@@ -79,7 +79,7 @@ def test_errors_of_the_place_move_every_picture_as_the_covariance_says() -> None
 
 
 def test_errors_of_a_station_move_its_other_camera_on_its_arm() -> None:
-    """The rig's origin errs in the model; both its pictures follow, in the world."""
+    """The rig's origin is off in the model; both its pictures follow, in the world."""
     rng = np.random.default_rng(3)
     place = Similarity(
         scale=2.0, rotation=Rotation.random(rng=rng), translation=np.array([4.0, 5.0, 6.0])

@@ -130,7 +130,7 @@ def test_of_all_thrusts_that_do_it_is_the_least() -> None:
 
 @st.composite
 def problems(draw: st.DrawFn) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """Any matrix, with ranks that fall short, bounds that meet, axes that nobody asks for."""
+    """Any matrix, with ranks that fall short, bounds that meet, axes that are not requested."""
     seed = draw(st.integers(0, 2**32 - 1))
     count, rank = draw(st.integers(1, 8)), draw(st.integers(1, 6))
     rng = np.random.default_rng(seed)

@@ -126,7 +126,7 @@ def test_foreign_axes_become_ours(tmp_path: Path) -> None:
         'velocity = ["u", "v", "w"]\nrates = ["p", "q", "r"]\n'
         'wrench = ["fx", "fy", "fz", "tx", "ty", "tz"]\nrpm = {}\nthrust = {main = "m1"}\n'
     )
-    # Heading east in ENU is no turn; 30 degrees to port of that is a heading of 60 degrees.
+    # Heading east in ENU is a turn of 0; 30 degrees to port of that is a heading of 60 degrees.
     q = Rotation.from_euler("ZYX", [30.0, -10.0, 20.0], degrees=True).as_quat()
     row = [5_000_000_000, 1, 2, -3, *q, 0.5, 0.1, -0.2, 0.01, 0.02, 0.03, 1, 2, 3, 4, 5, 6, 7]
     other = [6_000_000_000, *row[1:]]

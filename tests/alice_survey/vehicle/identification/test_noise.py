@@ -1,4 +1,4 @@
-"""Noise of channels: how large, and how it hangs together."""
+"""Noise of channels: its size and correlation."""
 
 import numpy as np
 import pytest

@@ -91,7 +91,7 @@ def test_a_window_is_what_the_simulators_equations_give() -> None:
     coarse = run(parameters, parameters.start, record, a_start(), slopes=False, step_s=0.05)[0]
     np.testing.assert_allclose(fine, exact, rtol=0, atol=2e-6)
     error, finer = np.abs(coarse - exact).max(), np.abs(fine - exact).max()
-    # Of fourth order: a step five times as long errs some 625 times as much.
+    # Of fourth order: a step five times as long has some 625 times the error.
     assert 200 < error / finer < 2000
 
 

@@ -55,7 +55,7 @@ def _run(
 
 @dataclass(frozen=True)
 class Run:
-    """What a run left behind; epochs are every so many ticks."""
+    """What a run left behind; epochs are some ticks apart."""
 
     truth: Array
     estimate: Array

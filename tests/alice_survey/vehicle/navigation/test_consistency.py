@@ -1,4 +1,4 @@
-"""Does the navigation err as it says it does? Many runs over one track."""
+"""Are navigation's errors as large as it states? Many runs over one track."""
 
 from functools import cache
 
