@@ -71,7 +71,7 @@ class StageSpec:
     """Files that a report reads: paths below its folder, `.` for all of it."""
 
     def stage(self, workspace: Path, config: SurveyConfig) -> Stage:
-        """What the stage depends on, in a workspace."""
+        """Dependencies of the stage, in a workspace."""
         return Stage(
             name=self.folder,
             version=self.version,

@@ -56,7 +56,7 @@ class Calibration:
     warnings: tuple[str, ...] = ()
     """What the views do not constrain, one line each."""
     freedom: Freedom = HELD
-    """What of the rig was adjusted, and the prior."""
+    """Adjusted parameters of the rig, and the prior."""
     rejected: Array | None = None
     """(V, cameras, N, 2) measured pixels that took no part; NaN elsewhere."""
     blur: Array | None = None

@@ -30,7 +30,7 @@ class AliceError(Exception):
     """
 
     def __str__(self) -> str:
-        """The line, with control characters from file names removed."""
+        """The line, with unprintable characters from file names replaced."""
         text = super().__str__()
         return "".join(c if c.isprintable() or c == "\n" else "\ufffd" for c in text)
 

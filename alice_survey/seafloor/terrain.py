@@ -155,7 +155,7 @@ class Terrain:
         return self.patch().scene
 
     def patch(self, window_ne_m: tuple[float, float, float, float] | None = None) -> Patch:
-        """What lies in a window, as one mesh; objects are whole or left out.
+        """Contents of a window, as one mesh; objects are whole or left out.
 
         Args:
             window_ne_m: least and greatest north, least and greatest east; everything when None.

@@ -25,7 +25,7 @@ _TILT = 1e-6
 
 
 class Terms(NamedTuple):
-    """What each parameter is, (P,): its kind and its places in the matrices."""
+    """Kind of each parameter, (P,), and its places in the matrices."""
 
     kind: NDArray[np.int64]
     row: NDArray[np.int64]

@@ -167,7 +167,7 @@ def _averaged(rows: _Rows, table: Array) -> Array:
 
 
 def _regressor(rows: _Rows, kind: int, force: int, motion: int) -> Array:
-    """What a coefficient is multiplied by, (T,): its force moved to the side of the inertia."""
+    """Factor of a coefficient, (T,): its force moved to the side of the inertia."""
     nu = rows.states[:, 4:]
     if kind == ADDED_MASS:
         return rows.accelerations[:, motion]

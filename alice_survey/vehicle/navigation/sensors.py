@@ -147,7 +147,7 @@ class UsblSpec:
     boat_ned_m: Place = (0.0, 0.0, 1.0)
     """Position of the transceiver."""
     noise_m: float = 0.5
-    """Bias of the boat's own position (inferred)."""
+    """Noise of the boat's own position (inferred)."""
     noise_fraction: float = 0.0175
     """Added in squares, as a share of the slant range: 1 degree (SeaTrac class, inferred)."""
     outlier_probability: float = 0.05
