@@ -13,7 +13,7 @@ from reconstruct.raster import opened_raster
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Raster:
+class _Placed:
     west: float
     """Left edge, in the raster's coordinates (metres where the model is scaled)."""
     north: float
@@ -25,17 +25,12 @@ class _Raster:
     crs: Any
     """`rasterio.crs.CRS`, or None where the model has no place on the Earth."""
 
-    def _shape(self) -> tuple[int, int]:
-        raise NotImplementedError
-
     def _repr_html_(self) -> str:
         title, _, text = repr(self).partition(": ")
         return f"<b>{title}</b>: {text}"
 
-    @property
-    def extent(self) -> tuple[float, float, float, float]:
-        """West, east, south and north edges, as `matplotlib.imshow` takes them."""
-        rows, columns = self._shape()
+    def _extent_of(self, cells: NDArray[Any]) -> tuple[float, float, float, float]:
+        rows, columns = cells.shape[:2]
         return (
             self.west, self.west + columns * self.cell,
             self.north - rows * self.cell, self.north,
@@ -43,7 +38,7 @@ class _Raster:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class Dem(_Raster):
+class Dem(_Placed):
     """Heights of the surface, with their standard deviations.
 
     Example:
@@ -58,8 +53,10 @@ class Dem(_Raster):
     sigma: Array
     """(rows, columns) standard deviations of the heights."""
 
-    def _shape(self) -> tuple[int, int]:
-        return self.height.shape[0], self.height.shape[1]
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """West, east, south and north edges, as `matplotlib.imshow` takes them."""
+        return self._extent_of(self.height)
 
     def height_at(self, east: Array, north: Array) -> Array:
         """Heights of the cells at given coordinates; NaN outside or where none is known.
@@ -68,7 +65,7 @@ class Dem(_Raster):
             east: in the raster's coordinates.
             north: array of the same shape.
         """
-        rows, columns = self._shape()
+        rows, columns = self.height.shape
         row = np.floor((self.north - np.asarray(north, dtype=float)) / self.cell).astype(int)
         column = np.floor((np.asarray(east, dtype=float) - self.west) / self.cell).astype(int)
         inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
@@ -78,7 +75,7 @@ class Dem(_Raster):
         return found
 
     def __repr__(self) -> str:
-        rows, columns = self._shape()
+        rows, columns = self.height.shape
         known = np.isfinite(self.height)
         return (
             f"DEM: {columns} x {rows} cells of {self.cell:.4g} {self.unit}, "
@@ -87,7 +84,7 @@ class Dem(_Raster):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class Mosaic(_Raster):
+class Mosaic(_Placed):
     """The orthomosaic.
 
     Example:
@@ -99,11 +96,13 @@ class Mosaic(_Raster):
     rgba: NDArray[np.uint8]
     """(rows, columns, 4); alpha is 0 where no picture shows the sea floor."""
 
-    def _shape(self) -> tuple[int, int]:
-        return self.rgba.shape[0], self.rgba.shape[1]
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """West, east, south and north edges, as `matplotlib.imshow` takes them."""
+        return self._extent_of(self.rgba)
 
     def __repr__(self) -> str:
-        rows, columns = self._shape()
+        rows, columns = self.rgba.shape[:2]
         share = (self.rgba[..., 3] > 0).mean()
         return (
             f"mosaic: {columns} x {rows} pixels of {self.cell:.4g} {self.unit}, {share:.0%} painted"
