@@ -1,5 +1,6 @@
 """Surface and mosaic of a workspace as arrays."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rasterio.enums import Resampling
+from rasterio.windows import Window
 
 from alice_survey.base.frames import Array
 from reconstruct.raster import opened_raster
@@ -114,7 +116,7 @@ def read_dem(workspace: str | Path, most_cells: int = 4000) -> Dem:
 
     Args:
         workspace: its folder.
-        most_cells: rows and columns at most; a larger raster is averaged down to this.
+        most_cells: rows and columns at most; a larger raster is averaged by blocks.
 
     Raises:
         WorkspaceError: there is no surface, or its file is damaged.
@@ -135,7 +137,7 @@ def read_mosaic(workspace: str | Path, most_pixels: int = 4000) -> Mosaic:
 
     Args:
         workspace: its folder.
-        most_pixels: rows and columns at most; a larger raster is averaged down to this.
+        most_pixels: rows and columns at most; a larger raster is averaged by blocks.
 
     Raises:
         WorkspaceError: there is no mosaic, or its file is damaged.
@@ -152,13 +154,20 @@ def read_mosaic(workspace: str | Path, most_pixels: int = 4000) -> Mosaic:
 def _read(path: Path, bands: list[int], most: int) -> tuple[Any, dict[str, Any]]:
     """Bands (B, rows, columns), and where they lie."""
     with opened_raster(path) as raster:
-        shrink = max(1.0, max(raster.height, raster.width) / most)
-        shape = max(1, int(raster.height / shrink)), max(1, int(raster.width / shrink))
-        values = raster.read(bands, out_shape=(len(bands), *shape), resampling=Resampling.average)
+        shrink = max(1, math.ceil(max(raster.height, raster.width) / most))
+        shape = max(1, raster.height // shrink), max(1, raster.width // shrink)
+        # Whole blocks only, so that cells stay square: less than one at the south and east edges.
+        window = Window(0, 0, shape[1] * shrink, shape[0] * shrink)
+        values = raster.read(
+            bands,
+            window=window,
+            out_shape=(len(bands), *shape),
+            resampling=Resampling.average,
+        )
         place = {
             "west": raster.transform.c,
             "north": raster.transform.f,
-            "cell": raster.transform.a * raster.width / shape[1],
+            "cell": raster.transform.a * shrink,
             "unit": raster.tags().get("UNIT", "m"),
             "crs": raster.crs,
         }

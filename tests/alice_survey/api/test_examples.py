@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
+from rasterio.transform import Affine
 
 import alice_survey as alice
 
@@ -116,3 +118,22 @@ def test_signatures_take_strings_as_paths() -> None:
     for name in ("read_plan", "read_rig", "read_model", "load_config", "read_dem", "read_track"):
         first = next(iter(inspect.signature(getattr(alice, name)).parameters.values()))
         assert str(first.annotation) == "str | pathlib.Path", name
+
+
+def test_an_averaged_surface_stays_in_its_place(tmp_path: Path) -> None:
+    """A plane of known slope, 301 x 203 cells, has the same heights when it is averaged."""
+    (tmp_path / "dense").mkdir()
+    rows, columns = np.mgrid[:301, :203]
+    plane = (0.5 * rows - 0.25 * columns).astype(np.float32)
+    for name in ("dem", "sigma"):
+        with rasterio.open(
+            tmp_path / "dense" / f"{name}.tif", "w", driver="GTiff", dtype="float32", count=1,
+            width=203, height=301, nodata=np.nan, transform=Affine(0.1, 0, 7.0, 0, -0.1, 40.0),
+        ) as raster:  # fmt: skip
+            raster.write(plane, 1)
+    dem = alice.read_dem(tmp_path, most_cells=100)
+    assert dem.height.shape == (75, 50)
+    row, column = np.mgrid[:75, :50]
+    east, north = dem.west + (column + 0.5) * dem.cell, dem.north - (row + 0.5) * dem.cell
+    expected = 0.5 * ((40.0 - north) / 0.1 - 0.5) - 0.25 * ((east - 7.0) / 0.1 - 0.5)
+    np.testing.assert_allclose(dem.height, expected, atol=1e-4)
