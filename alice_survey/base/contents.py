@@ -28,9 +28,13 @@ def taken_from(path: Path, fault: type[AliceError] = WorkspaceError) -> Iterator
     try:
         yield
     except KeyError as error:
-        raise fault(f"{path}: lacks {one_line(error)}: it was changed, make it anew") from None
+        raise fault(
+            f"{path}: lacks {one_line(error)}; it was changed: delete it and run again"
+        ) from None
     except (TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
-        raise fault(f"{path}: is not as it was written ({one_line(error)}): make it anew") from None
+        raise fault(
+            f"{path}: is not as it was written ({one_line(error)}): delete it and run again"
+        ) from None
 
 
 def read_arrays(path: Path, *names: str) -> dict[str, NDArray[np.generic]]:
@@ -43,7 +47,9 @@ def read_arrays(path: Path, *names: str) -> dict[str, NDArray[np.generic]]:
         with np.load(path, allow_pickle=False) as data:
             missing = [name for name in names if name not in data]
             if missing:
-                raise WorkspaceError(f"{path}: lacks {missing[0]}: it was changed, make it anew")
+                raise WorkspaceError(
+                    f"{path}: lacks {missing[0]}; it was changed: delete it and run again"
+                )
             return {name: data[name] for name in names}
     except OSError as error:
         raise WorkspaceError(f"{path}: cannot be read: {why(error)}") from None
@@ -51,7 +57,9 @@ def read_arrays(path: Path, *names: str) -> dict[str, NDArray[np.generic]]:
         zipfile.BadZipFile, zlib.error, ValueError, TypeError, EOFError, KeyError, MemoryError,
         NotImplementedError, RuntimeError, SyntaxError,
     ) as error:  # fmt: skip
-        raise WorkspaceError(f"{path}: is damaged ({one_line(error)}): make it anew") from None
+        raise WorkspaceError(
+            f"{path}: is damaged ({one_line(error)}): delete it and run again"
+        ) from None
 
 
 def one_line(error: BaseException) -> str:

@@ -112,5 +112,5 @@ def _record(path: Path, line: int, row: dict[str, str]) -> ImageRecord:
         if inside.is_absolute() or ".." in inside.parts:
             raise ImageError(f"{path} line {line}: {name} {values[name]!r} leaves its folder")
         if not str(values[name]).isprintable():
-            raise ImageError(f"{path} line {line}: {name} {values[name]!r} is no file's name")
+            raise ImageError(f"{path} line {line}: {name} {values[name]!r} is not a file name")
     return ImageRecord(**values)  # type: ignore[arg-type]

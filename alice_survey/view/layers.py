@@ -229,7 +229,7 @@ class Layers:
         if not unchanged:
             return ChangedError()
         path = self._workspace.folder / _file_of(name)
-        return WorkspaceError(f"{path}: is damaged ({one_line(error)}): make it anew")
+        return WorkspaceError(f"{path}: is damaged ({one_line(error)}): delete it and run again")
 
 
 def _numbers(name: str, unit: str) -> Numbers | None:

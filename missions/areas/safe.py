@@ -48,7 +48,7 @@ def check_file(path: Path) -> None:
     if not path.exists():
         raise PlanError(f"area: {path}: no such file")
     if not path.is_file():
-        raise PlanError(f"area: {path}: it is no file")
+        raise PlanError(f"area: {path} is not a file")
     size = path.stat().st_size
     if size > LARGEST_BYTES:
         raise PlanError(

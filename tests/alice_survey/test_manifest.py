@@ -28,8 +28,8 @@ def test_a_byte_order_mark_is_no_part_of_a_name(tmp_path: Path) -> None:
         ("../a.png,left,0,,0", "leaves its folder"),
         ("/a.png,left,0,,0", "leaves its folder"),
         ("a.png,left,0,../m.png,0", "leaves its folder"),
-        ("a\0.png,left,0,,0", "no file's name|NUL"),
-        ("a\x1b.png,left,0,,0", "no file's name"),
+        ("a\0.png,left,0,,0", "not a file name|NUL"),
+        ("a\x1b.png,left,0,,0", "not a file name"),
         ("x" * 200_000 + ",left,0,,0", "no CSV text"),
     ],
 )  # fmt: skip

@@ -268,7 +268,7 @@ def test_files_that_are_not_what_they_say_are_refused(
 def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:
     assert "no such file" in refusal(file=tmp_path / "none.kml")
     (tmp_path / "folder.shp").mkdir()
-    assert "it is no file" in refusal(file=tmp_path / "folder.shp")
+    assert "folder.shp is not a file" in refusal(file=tmp_path / "folder.shp")
     assert "no such file" in refusal(file=Path("/vsicurl/http:/localhost/a.geojson"))
 
 
