@@ -16,15 +16,17 @@ from pydantic import BaseModel
 
 from alice_survey.base import artefacts, records
 from alice_survey.base.artefacts import Stage, read_json, read_stage, run_stage, why_stale
-from alice_survey.base.config import SurveyConfig
+from alice_survey.base.config import Config, SurveyConfig
 from alice_survey.base.errors import AliceError, WorkspaceError
 from alice_survey.base.executor import Executor
 from alice_survey.base.manifest import read_manifest
 
 Summary = tuple[str, dict[str, Any]]
 """Result of a stage: a line of text, and JSON values."""
-StageWork = Callable[[Path, SurveyConfig, Executor, Path], None]
-"""Takes the workspace, the settings, where tasks run, and the folder to write into."""
+StageWork = Callable[..., None]
+"""Takes the workspace, the folder to write into and where tasks run; the settings by keyword."""
+WHOLE = "survey"
+"""Names all settings at once in `StageSpec.takes`."""
 
 LOOSE_FOLDERS = ("quality", "reference", "against")
 """Folders that commands write next to those of the stages, and that a report shows."""
@@ -49,6 +51,8 @@ class StageSpec:
     """`module:function` of a `StageWork`."""
     summary: Callable[[Path], Summary]
     """Takes the stage's folder."""
+    takes: Sequence[str] = ()
+    """Dotted names of the settings that the work takes, each by the last part of its name."""
     needs: Sequence[str] = ()
     """Stages that it requires."""
     uses: Sequence[str] = ()
@@ -92,10 +96,14 @@ class StageSpec:
         for name in self.needs:
             need(workspace, name)
         module, function = self.work.split(":")
+        taken = {
+            name.rpartition(".")[2]: config if name == WHOLE else attrgetter(name)(config)
+            for name in self.takes
+        }
 
         def work(folder: Path) -> None:
             do: StageWork = getattr(import_module(module), function)
-            do(workspace, config, executor, folder)
+            do(workspace, folder, executor, **taken)
 
         return run_stage(workspace, self.stage(workspace, config), work)
 
@@ -143,7 +151,7 @@ def without(section: str, *names: str) -> SettingsPart:
     return SettingsPart(section=section, without=frozenset(names))
 
 
-def settings_of(wanted: Any, config: SurveyConfig) -> Any:
+def settings_of(wanted: Any, config: Config) -> Any:
     """Settings as JSON values: what a stage's digest is made of.
 
     Args:
@@ -174,7 +182,7 @@ def settings_of(wanted: Any, config: SurveyConfig) -> Any:
     }
 
 
-def files_of(wanted: Sequence[str], config: SurveyConfig) -> list[Path]:
+def files_of(wanted: Sequence[str], config: Config) -> list[Path]:
     """The files that settings name; none for those that are not set."""
     values = [attrgetter(name)(config) for name in wanted]
     return [path for value in values for path in (value if isinstance(value, list) else [value])
@@ -446,6 +454,7 @@ STAGES: tuple[StageSpec, ...] = (
         about="lines, stations and camera settings that image the area",
         version=3,
         work="missions.plan.run:run_plan",
+        takes=(WHOLE,),
         settings={
             "name": "name",
             "area": "area",
@@ -481,6 +490,7 @@ STAGES: tuple[StageSpec, ...] = (
         about="the plan flown by a simulated vehicle",
         version=4,
         work="missions.fly.run:run_fly",
+        takes=(WHOLE,),
         needs=("plan",),
         settings={
             "seed": "seed",
@@ -513,6 +523,7 @@ STAGES: tuple[StageSpec, ...] = (
         about="rendered pictures of a board, to calibrate from",
         version=4,
         work="missions.acquire.run:run_pool",
+        takes=("camera", "water", "imaging", "seed"),
         settings={
             "seed": "seed",
             "camera": "camera",
@@ -533,6 +544,15 @@ STAGES: tuple[StageSpec, ...] = (
         about="the pictures: rendered, or real ones (`import-images`)",
         version=5,
         work="missions.acquire.run:run_images",
+        takes=(
+            "camera",
+            "water",
+            "imaging",
+            "seafloor",
+            "plan.altitude_m",
+            "area.seafloor_depth_m",
+            "seed",
+        ),
         needs=("plan", "fly"),
         settings={
             "seed": "seed",
@@ -558,6 +578,7 @@ STAGES: tuple[StageSpec, ...] = (
         about="the rig, from the pictures of the board",
         version=3,
         work="camera_calib.calibrate.run:run_calibrate",
+        takes=("camera", "water"),
         needs=("pool",),
         settings={"camera": "camera", "water": "water"},
         inputs=_calibrate_inputs,
@@ -576,6 +597,7 @@ STAGES: tuple[StageSpec, ...] = (
         about="cameras and points in the model's own gauge",
         version=4,
         work="reconstruct.mapping.run:run_mapping",
+        takes=("reconstruct", "seed"),
         needs=("image",),
         uses=("calibrate",),
         settings={
@@ -599,6 +621,7 @@ STAGES: tuple[StageSpec, ...] = (
         about="the model placed in the world",
         version=2,
         work="reconstruct.placing.run:run_sparse",
+        takes=("reconstruct",),
         needs=("image", "mapping"),
         uses=("calibrate",),
         settings={"mount_sigma_deg": "reconstruct.mount_sigma_deg"},
@@ -614,6 +637,7 @@ STAGES: tuple[StageSpec, ...] = (
         about="the surface: depth of every view, fused",
         version=3,
         work="reconstruct.dense.run:run_dense",
+        takes=("reconstruct",),
         needs=("image", "placing"),
         settings=only("reconstruct", "dense_scale", "dense_partners", "dem_cell_m"),
         inputs=_dense_inputs,
@@ -634,6 +658,7 @@ STAGES: tuple[StageSpec, ...] = (
         about="the orthomosaic, painted on the surface",
         version=5,
         work="reconstruct.mosaic.run:run_mosaic",
+        takes=("reconstruct", "water", "area.seafloor_depth_m"),
         needs=("image", "placing", "dense"),
         settings={
             "mosaic_pixel_m": "reconstruct.mosaic_pixel_m",
@@ -657,6 +682,7 @@ STAGES: tuple[StageSpec, ...] = (
         about="the textured mesh",
         version=1,
         work="reconstruct.mesh.run:run_mesh",
+        takes=("reconstruct",),
         needs=("image", "placing", "dense"),
         settings=only("reconstruct", "mesh_triangles", "mesh_error_px", "mesh_page_px"),
         inputs=_mesh_inputs,
@@ -672,6 +698,7 @@ STAGES: tuple[StageSpec, ...] = (
         about="errors against the truth of the simulation",
         version=4,
         work="reconstruct.evaluate.run:run_evaluate",
+        takes=("seed",),
         needs=("image", "placing", "dense", "mosaic", "plan"),
         uses=("mesh",),
         settings={"seed": "seed"},

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from alice_survey.base.artefacts import STAGE_FILE, atomic_path
-from alice_survey.base.config import SurveyConfig
 from alice_survey.base.executor import Executor
 from alice_survey.base.records import ReportRecord
 from alice_survey.base.run import progress
@@ -25,7 +24,7 @@ from alice_survey.report.summary import facts, summary
 from alice_survey.report.verdicts import verdicts
 
 
-def run_report(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
+def run_report(workspace: Path, folder: Path, executor: Executor) -> None:
     """Write the report of what the workspace holds."""
     held = Held.of(workspace)
     report, data = build_report(held, folder)

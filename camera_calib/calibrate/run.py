@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from alice_survey.base.config import CameraConfig, SurveyConfig
+from alice_survey.base.config import CameraConfig, WaterConfig
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.executor import Executor
 from alice_survey.base.manifest import read_manifest
@@ -15,7 +15,9 @@ from camera_calib.rig import design_rig
 from camera_calib.targets.target import Target
 
 
-def run_calibrate(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
+def run_calibrate(
+    workspace: Path, folder: Path, executor: Executor, *, camera: CameraConfig, water: WaterConfig
+) -> None:
     """Calibrate the rig from `pool/`.
 
     Intrinsics, ports (with their normals) and the pose of the right camera are found together,
@@ -31,7 +33,7 @@ def run_calibrate(workspace: Path, config: SurveyConfig, executor: Executor, fol
     )
     found = detect_views(_pool_pictures(pool), target, executor)
     warn_of_unseen(found)
-    start = design_rig(config.camera, config.water, _scale(found.sizes["left"], config.camera))
+    start = design_rig(camera, water, _scale(found.sizes["left"], camera))
     calibration = calibrate_through_ports(found.views, target.points, start, "free")
     finish(folder, calibration, found)
 

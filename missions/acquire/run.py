@@ -21,7 +21,7 @@ from alice_survey.base.artefacts import (
     write_csv,
     write_json,
 )
-from alice_survey.base.config import SurveyConfig
+from alice_survey.base.config import CameraConfig, ImagingConfig, SeafloorConfig, WaterConfig
 from alice_survey.base.errors import ImageError, NavigationError
 from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array, interpolate_poses, pose_to_json
@@ -56,25 +56,45 @@ class _Shoot:
     """What all pictures of a stage share."""
 
     folder: Path
-    config: SurveyConfig
+    camera: CameraConfig
+    water: WaterConfig
+    imaging: ImagingConfig
+    seed: int
     exposure_s: float
     altitude_m: float
     stamp: tuple[int, ...] = ()
     """Size and time of the files that workers read, so that none keeps what has changed."""
 
 
-def run_pool(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
+def run_pool(
+    workspace: Path,
+    folder: Path,
+    executor: Executor,
+    *,
+    camera: CameraConfig,
+    water: WaterConfig,
+    imaging: ImagingConfig,
+    seed: int,
+) -> None:
     """Take the stereo pictures of a chessboard in a pool."""
     board = PoolBoard()
-    rig = true_rig(config.camera, config.water, scale=config.imaging.scale, seed=config.seed)
-    rng = np.random.default_rng([config.seed, _POOL_STREAM])
-    poses = pool_poses(board, rig, config.imaging.pool_views, rng)
+    rig = true_rig(camera, water, scale=imaging.scale, seed=seed)
+    rng = np.random.default_rng([seed, _POOL_STREAM])
+    poses = pool_poses(board, rig, imaging.pool_views, rng)
     shown = board_records(rig, poses)
-    shoot = _Shoot(folder=folder, config=config, exposure_s=0.0, altitude_m=0.0)
+    shoot = _Shoot(
+        folder=folder,
+        camera=camera,
+        water=water,
+        imaging=imaging,
+        seed=seed,
+        exposure_s=0.0,
+        altitude_m=0.0,
+    )
     jobs = [
-        (shoot, board, view, camera, rig.cameras[camera], pose.as_matrix())
+        (shoot, board, view, name, rig.cameras[name], pose.as_matrix())
         for view, by_camera in enumerate(shown)
-        for camera, pose in by_camera.items()
+        for name, pose in by_camera.items()
     ]
     records = list(executor.map(_take_board, jobs, label="pool pictures"))
     write_manifest(folder / "manifest.csv", records)
@@ -93,28 +113,40 @@ def run_pool(workspace: Path, config: SurveyConfig, executor: Executor, folder: 
 
 def _take_board(job: tuple[_Shoot, PoolBoard, int, str, FlatPortCamera, Array]) -> ImageRecord:
     shoot, board, view, camera, one, matrix = job
-    config = shoot.config
-    image = f"{camera}/{view:02d}.{config.imaging.image_format}"
+    imaging = shoot.imaging
+    image = f"{camera}/{view:02d}.{imaging.image_format}"
     record = ImageRecord(image=image, camera=camera, station=view)
     if (shoot.folder / image).exists():
         return record
     # Large pixels need more rays for the same precision of an edge on the board.
-    samples = config.imaging.samples + (1 if config.imaging.scale > 1 else 0)
+    samples = imaging.samples + (1 if imaging.scale > 1 else 0)
     light = render_board(board, one, RigidTransform.from_matrix(matrix), samples)
-    sensor = make_sensor(config.camera, one.n_water, 1.0, config.imaging.scale)
+    sensor = make_sensor(shoot.camera, one.n_water, 1.0, imaging.scale)
     white = _POOL_WHITE * sensor.full_well_e
     lit = Sensor(
         electrons_per_radiance=(white, white, white),
         full_well_e=sensor.full_well_e,
         read_noise_e=sensor.read_noise_e,
     )
-    seed = [config.seed, _POOL_NOISE_STREAM, view, CAMERAS.index(camera)]
-    rng = np.random.default_rng(seed) if config.imaging.noise else None
+    seed = [shoot.seed, _POOL_NOISE_STREAM, view, CAMERAS.index(camera)]
+    rng = np.random.default_rng(seed) if imaging.noise else None
     _write_picture(shoot.folder / image, develop(expose(light, lit, rng), 1.0 / white))
     return record
 
 
-def run_images(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
+def run_images(
+    workspace: Path,
+    folder: Path,
+    executor: Executor,
+    *,
+    camera: CameraConfig,
+    water: WaterConfig,
+    imaging: ImagingConfig,
+    seafloor: SeafloorConfig,
+    altitude_m: float,
+    seafloor_depth_m: float,
+    seed: int,
+) -> None:
     """Take the pictures of a flown survey.
 
     Raises:
@@ -131,21 +163,24 @@ def run_images(workspace: Path, config: SurveyConfig, executor: Executor, folder
         raise NavigationError(f"{triggers} holds no trigger: plan a larger area")
     truth = read_track(track)
     believed = _believed(navigation, np.array([t for _, t in stations]))
-    rig = true_rig(config.camera, config.water, scale=config.imaging.scale, seed=config.seed)
+    rig = true_rig(camera, water, scale=imaging.scale, seed=seed)
     terrain = folder / "truth" / "terrain.ply"
     if not terrain.with_suffix(".json").exists():
         floor = survey_terrain(
-            config.seafloor,
+            seafloor,
             planned.area.allowed_corners_ne,
-            margin_m=config.plan.altitude_m,
-            depth_m=config.area.seafloor_depth_m,
-            seed=config.seed,
+            margin_m=altitude_m,
+            depth_m=seafloor_depth_m,
+            seed=seed,
         )
         floor.write(terrain)
     write_rig(folder / "truth" / "rig.json", rig)
     shoot = _Shoot(
         folder=folder,
-        config=config,
+        camera=camera,
+        water=water,
+        imaging=imaging,
+        seed=seed,
         exposure_s=planned.exposure_s,
         altitude_m=planned.altitude_m,
         stamp=(terrain.stat().st_size, terrain.stat().st_mtime_ns),
@@ -221,19 +256,19 @@ def _poses_over_exposure(truth: Trajectory, time_s: float, exposure_s: float) ->
 def _take(job: tuple[_Shoot, int, str, Array]) -> str:
     """Render one picture, unless it is there; returns its path below the folder."""
     shoot, station, camera, body = job
-    config = shoot.config
-    image = f"{camera}/{station:06d}.{config.imaging.image_format}"
+    imaging = shoot.imaging
+    image = f"{camera}/{station:06d}.{imaging.image_format}"
     ranges = shoot.folder / "truth" / "range" / f"{camera}_{station:06d}.tif"
-    wants_range = config.imaging.range_maps and not ranges.exists()
+    wants_range = imaging.range_maps and not ranges.exists()
     if (shoot.folder / image).exists() and not wants_range:
         return image
     scene, rig, lights, sensor, gain = _studio(shoot)
     one, poses = rig.cameras[camera], RigidTransform.from_matrix(body) * rig.body_from_cam(camera)
     try:
         if not (shoot.folder / image).exists():
-            radiance = render(scene, one, lights[camera], poses[:MOMENTS], config.imaging.samples)
-            seed = [config.seed, _NOISE_STREAM, station, CAMERAS.index(camera)]
-            rng = np.random.default_rng(seed) if config.imaging.noise else None
+            radiance = render(scene, one, lights[camera], poses[:MOMENTS], imaging.samples)
+            seed = [shoot.seed, _NOISE_STREAM, station, CAMERAS.index(camera)]
+            rng = np.random.default_rng(seed) if imaging.noise else None
             picture = develop(expose(radiance, sensor, rng), gain)
             _write_picture(shoot.folder / image, picture)
         if wants_range:
@@ -246,16 +281,16 @@ def _take(job: tuple[_Shoot, int, str, Array]) -> str:
 @lru_cache(maxsize=1)
 def _studio(shoot: _Shoot) -> tuple[Scene, Rig, dict[str, CameraLight], Sensor, float]:
     """What a process needs for all of its pictures: sea floor, rig, light, sensor and gain."""
-    config, truth = shoot.config, shoot.folder / "truth"
-    rig, water = read_rig(truth / "rig.json"), water_optics(config.water.jerlov)
-    scene = Scene(terrain=read_terrain(truth / "terrain.ply"), texture=survey_texture(config.seed))
+    truth, imaging = shoot.folder / "truth", shoot.imaging
+    rig, water = read_rig(truth / "rig.json"), water_optics(shoot.water.jerlov)
+    scene = Scene(terrain=read_terrain(truth / "terrain.ply"), texture=survey_texture(shoot.seed))
     reach_m = 2.0 * shoot.altitude_m + 1.0
     lights = {
-        name: camera_light(camera, rig.body_from_cam(name), config.imaging, water, reach_m)
+        name: camera_light(camera, rig.body_from_cam(name), imaging, water, reach_m)
         for name, camera in rig.cameras.items()
     }
     left = rig.cameras["left"]
-    sensor = make_sensor(config.camera, left.n_water, shoot.exposure_s, config.imaging.scale)
+    sensor = make_sensor(shoot.camera, left.n_water, shoot.exposure_s, imaging.scale)
     pupil_m = shoot.altitude_m + left.port_distance_m + left.glass_thickness_m
     nominal = flat_floor_radiance(
         left, lights["left"], pupil_m, SAND_ALBEDO, max(left.width_px // 24, 1)

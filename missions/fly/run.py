@@ -27,32 +27,32 @@ _SEED_STREAM = 20
 TRIGGER_COLUMNS = ("station", "time_s", "line")
 
 
-def run_fly(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
+def run_fly(workspace: Path, folder: Path, executor: Executor, *, survey: SurveyConfig) -> None:
     """Write triggers, navigation, vehicle logs, a bag, the truth and plots.
 
     Raises:
         VehicleError: the vehicle took no picture at all; the message says why.
     """
-    for _ in progress(_steps(folder, workspace / "plan" / "plan.json", config), "flight files", 5):
+    for _ in progress(_steps(folder, workspace / "plan" / "plan.json", survey), "flight files", 5):
         pass
 
 
-def _steps(folder: Path, plan_path: Path, config: SurveyConfig) -> Iterator[str]:
+def _steps(folder: Path, plan_path: Path, survey: SurveyConfig) -> Iterator[str]:
     """Write the files of a flight, and say after each step what is done."""
-    plan = one_dive(read_plan(plan_path), config.vehicle.dive)
+    plan = one_dive(read_plan(plan_path), survey.vehicle.dive)
     planned = stations_of_dives(plan)
     floor = floor_grid(
         survey_terrain(
-            config.seafloor,
+            survey.seafloor,
             plan.area.allowed_corners_ne,
-            margin_m=config.plan.altitude_m,
-            depth_m=config.area.seafloor_depth_m,
-            seed=config.seed,
+            margin_m=survey.plan.altitude_m,
+            depth_m=survey.area.seafloor_depth_m,
+            seed=survey.seed,
         )
     )
     yield "sea floor"
-    rng = np.random.default_rng([config.seed, _SEED_STREAM])
-    flight = simulate_plan(plan, flight_settings(config), floor, rng)
+    rng = np.random.default_rng([survey.seed, _SEED_STREAM])
+    flight = simulate_plan(plan, flight_settings(survey), floor, rng)
     _check_pictures(flight, planned)
     yield "flight"
     write_track(folder / "truth" / "track.csv", flight.truth)
@@ -63,8 +63,8 @@ def _steps(folder: Path, plan_path: Path, config: SurveyConfig) -> Iterator[str]
     write_vehicle_log(folder / "vehicle.csv", believed_log(flight))
     write_bag(folder / "bag", bag_record(flight))
     yield "logs"
-    rig = design_rig(config.camera, config.water)
-    FlightRecord.save(folder / "flight.json", flight_summary(flight, config.vehicle, rig))
+    rig = design_rig(survey.camera, survey.water)
+    FlightRecord.save(folder / "flight.json", flight_summary(flight, survey.vehicle, rig))
     draw_flight(folder / "track.png", flight)
     draw_vehicle(folder / "vehicle.png", flight)
     yield "plots"

@@ -23,16 +23,16 @@ from missions.values.plan_file import Dive, Plan
 _SAME_S = 1e-3
 
 
-def run_plan(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
+def run_plan(workspace: Path, folder: Path, executor: Executor, *, survey: SurveyConfig) -> None:
     """Write plan.json, its certificate, settings, maps and missions for vehicles.
 
     Raises:
         PlanError: no plan meets the settings.
     """
-    rig = design_rig(config.camera, config.water)
-    planned = plan_survey(config, rig)
-    options = options_of(config.camera, config.plan)
-    write_planned(folder, planned, rig, options, config.sea)
+    rig = design_rig(survey.camera, survey.water)
+    planned = plan_survey(survey, rig)
+    options = options_of(survey.camera, survey.plan)
+    write_planned(folder, planned, rig, options, survey.sea)
 
 
 @progress.step("write plan, maps and missions")

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.base.config import ReconstructConfig, SurveyConfig
+from alice_survey.base.config import ReconstructConfig
 from alice_survey.base.errors import ReconstructionError, warn
 from alice_survey.base.executor import Executor
 from alice_survey.base.records import SurfaceRecord
@@ -50,14 +50,16 @@ _MOST_CELLS = 4_000_000_000
 _MOST_POINTS = 40_000_000
 
 
-def run_dense(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
+def run_dense(
+    workspace: Path, folder: Path, executor: Executor, *, reconstruct: ReconstructConfig
+) -> None:
     """Find the surface of a placed model.
 
     Raises:
         ReconstructionError: the views do not overlap, or no depth was found.
         WorkspaceError: the model is damaged.
     """
-    build_surface(workspace, read_model(workspace / "sparse"), folder, config.reconstruct, executor)
+    build_surface(workspace, read_model(workspace / "sparse"), folder, reconstruct, executor)
 
 
 def build_surface(

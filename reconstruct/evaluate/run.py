@@ -14,7 +14,6 @@ import numpy as np
 import rasterio
 
 from alice_survey.base.artefacts import read_stage, write_csv
-from alice_survey.base.config import SurveyConfig
 from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.manifest import read_manifest
@@ -37,7 +36,7 @@ from reconstruct.placing.track import read_track_poses
 _SEED_STREAM = 6100
 
 
-def run_evaluate(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
+def run_evaluate(workspace: Path, folder: Path, executor: Executor, *, seed: int) -> None:
     """Score what `reconstruct` made of a simulated survey."""
     folders = ("plan", "images", "sparse", "dense", "mosaic", "mesh")
     plan, images, sparse, dense, mosaic, mesh = (workspace / name for name in folders)
@@ -62,9 +61,9 @@ def run_evaluate(workspace: Path, config: SurveyConfig, executor: Executor, fold
         dense / "dem.tif", area, terrain, moved, sigma=dense / "sigma.tif", stations=counter
     )
     painted = score_mosaic(
-        mosaic / "mosaic.tif", dense / "dem.tif", area, terrain, survey_texture(config.seed), moved
+        mosaic / "mosaic.tif", dense / "dem.tif", area, terrain, survey_texture(seed), moved
     )
-    rng = np.random.default_rng([config.seed, _SEED_STREAM])
+    rng = np.random.default_rng([seed, _SEED_STREAM])
     score: dict[str, Any] = {
         "cameras": cameras.to_json(),
         "surface": surface.to_json(pixel_m),

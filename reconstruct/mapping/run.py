@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 
 from alice_survey.base.artefacts import atomic_path
-from alice_survey.base.config import ReconstructConfig, SurveyConfig
+from alice_survey.base.config import ReconstructConfig
 from alice_survey.base.errors import ImageError, WorkspaceError, warn
 from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Datum
@@ -86,7 +86,9 @@ class _FeatureTask:
     thrifty: bool
 
 
-def run_mapping(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
+def run_mapping(
+    workspace: Path, folder: Path, executor: Executor, *, reconstruct: ReconstructConfig, seed: int
+) -> None:
     """Map the pictures of `images/`, with the rig of `calibration/` or `images/` if there is one.
 
     Raises:
@@ -94,7 +96,7 @@ def run_mapping(workspace: Path, config: SurveyConfig, executor: Executor, folde
         ReconstructionError: the pictures give no model.
     """
     with executor.started() as started:
-        _map(read_inputs(workspace), config.reconstruct, config.seed, started, folder)
+        _map(read_inputs(workspace), reconstruct, seed, started, folder)
 
 
 def _map(

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.config import ReconstructConfig, SurveyConfig
+from alice_survey.base.config import ReconstructConfig
 from alice_survey.base.errors import warn
 from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
@@ -35,14 +35,16 @@ _LIFT_STEPS = 0.5
 """Height over the surface, in spacings of the cloud, at which lines of sight start."""
 
 
-def run_mesh(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
+def run_mesh(
+    workspace: Path, folder: Path, executor: Executor, *, reconstruct: ReconstructConfig
+) -> None:
     """Mesh and texture a finished surface.
 
     Raises:
         ReconstructionError: the cloud carries no surface.
         WorkspaceError: the model or the cloud is damaged.
     """
-    build_mesh(workspace, read_model(workspace / "sparse"), folder, config.reconstruct, executor)
+    build_mesh(workspace, read_model(workspace / "sparse"), folder, reconstruct, executor)
 
 
 def build_mesh(

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 import rasterio
 
-from alice_survey.base.config import ReconstructConfig, SurveyConfig, WaterConfig
+from alice_survey.base.config import ReconstructConfig, WaterConfig
 from alice_survey.base.executor import Executor
 from alice_survey.base.records import MosaicRecord, PicturesRecord
 from reconstruct.light.solve import joined_samples
@@ -68,7 +68,15 @@ _TEMPERATURE_C, _SALINITY_PSU = 15.0, 35.0
 """Sea water where none is stated; red and blue move by 2 % of their dispersion from 5 to 30 C."""
 
 
-def run_mosaic(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
+def run_mosaic(
+    workspace: Path,
+    folder: Path,
+    executor: Executor,
+    *,
+    reconstruct: ReconstructConfig,
+    water: WaterConfig,
+    seafloor_depth_m: float,
+) -> None:
     """Paint the mosaic on a finished surface.
 
     Raises:
@@ -76,9 +84,9 @@ def run_mosaic(workspace: Path, config: SurveyConfig, executor: Executor, folder
         WorkspaceError: the model or the surface is damaged.
     """
     model = read_model(workspace / "sparse")
-    sea = _sea(config.water, config.area.seafloor_depth_m)
+    sea = _sea(water, seafloor_depth_m)
     with rasterio.Env(GDAL_CACHEMAX=_CACHE_MIB << 20):
-        build_mosaic(workspace, model, folder, config.reconstruct, sea, executor)
+        build_mosaic(workspace, model, folder, reconstruct, sea, executor)
 
 
 def build_mosaic(

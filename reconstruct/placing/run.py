@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.base.config import SurveyConfig
+from alice_survey.base.config import ReconstructConfig
 from alice_survey.base.executor import Executor
 from alice_survey.base.frames import Array
 from alice_survey.base.records import (
@@ -48,7 +48,9 @@ from reconstruct.views.model_files import read_reconstruction
 __all__ = ["read_track_poses", "run_sparse"]
 
 
-def run_sparse(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
+def run_sparse(
+    workspace: Path, folder: Path, executor: Executor, *, reconstruct: ReconstructConfig
+) -> None:
     """Place the model of `mapping/` in the world.
 
     Raises:
@@ -79,7 +81,7 @@ def run_sparse(workspace: Path, config: SurveyConfig, executor: Executor, folder
             datum=inputs.datum,
             survey=inputs.survey,
             mapping=mapping,
-            settings=config.reconstruct,
+            settings=reconstruct,
         )
     )
 

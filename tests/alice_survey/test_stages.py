@@ -153,7 +153,9 @@ def test_a_damaged_record_is_one_line_that_names_it(text: str, tmp_path: Path) -
 @pytest.mark.parametrize("stage", STAGES, ids=lambda stage: stage.name)
 def test_a_stage_declares_what_there_is(stage: StageSpec) -> None:
     module, function = stage.work.split(":")
-    assert len(signature(getattr(import_module(module), function)).parameters) == 4
+    taken = [name.rpartition(".")[2] for name in stage.takes]
+    arguments = list(signature(getattr(import_module(module), function)).parameters)
+    assert arguments == ["workspace", "folder", "executor", *taken]
     earlier = [one.name for one in STAGES[: STAGES.index(stage)]]
     assert set(stage.needs) | set(stage.uses) <= set(earlier)
     json.dumps(stages.settings_of(stage.settings, SurveyConfig()))
@@ -182,9 +184,9 @@ def test_a_stage_is_found_by_its_name_and_by_its_folder() -> None:
 # A stage, added here alone.
 
 
-def count_lines(workspace: Path, config: SurveyConfig, executor: Executor, folder: Path) -> None:
+def count_lines(workspace: Path, folder: Path, executor: Executor, *, seed: int) -> None:
     lines = (workspace / "notes.txt").read_text().splitlines()
-    (folder / "lines.txt").write_text(str(len(lines) * config.seed))
+    (folder / "lines.txt").write_text(str(len(lines) * seed))
 
 
 TOY = StageSpec(
@@ -194,6 +196,7 @@ TOY = StageSpec(
     about="counts the lines of a note",
     version=1,
     work=f"{__name__}:count_lines",
+    takes=("seed",),
     settings={"seed": "seed"},
     inputs=lambda workspace: [workspace / "notes.txt"],
     summary=lambda folder: (f"{(folder / 'lines.txt').read_text()} lines", {}),
