@@ -71,7 +71,7 @@ def plot_dem(dem: Dem) -> Sheet:
             cmap="viridis" if values is dem.height else "cividis",
         )  # fmt: skip
         colour_bar(image, axes, label)
-        map_axes(axes, dem.unit)
+        map_axes(axes, dem.unit, placed=dem.crs is not None)
     return sheet
 
 
@@ -88,7 +88,7 @@ def plot_mosaic(mosaic: Mosaic) -> Sheet:
     """
     sheet, axes = _map()
     axes.imshow(mosaic.rgba, extent=mosaic.extent)
-    map_axes(axes, mosaic.unit)
+    map_axes(axes, mosaic.unit, placed=mosaic.crs is not None)
     return sheet
 
 
@@ -112,7 +112,7 @@ def plot_track(track: Track) -> Sheet:
     )  # fmt: skip
     if sigma is not None:
         colour_bar(dots, axes, f"standard deviation of the position, {track.frame.unit}")
-    map_axes(axes, track.frame.unit)
+    map_axes(axes, track.frame.unit, placed=track.frame.name == "ned")
     return sheet
 
 

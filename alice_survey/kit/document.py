@@ -177,6 +177,8 @@ class SurveyMap:
     """Unit of its axes: m, or unit where the model has no scale."""
     origin: str
     """Where (0, 0) is, in words."""
+    placed: bool = True
+    """Whether its axes are east and north; those of a model without positions are its own."""
     geodetic: tuple[Sequence[float], Sequence[float]] | None = None
     """Degrees of latitude and longitude as quadratics of metres north n and east e: coefficients
     of 1, n, e, n², ne and e²; the map then shows them under the pointer."""

@@ -217,16 +217,19 @@ def colour_bar(image: Any, axes: Any, label: str, **options: Any) -> Any:
     return bar
 
 
-def map_axes(axes: Any, unit: str = "m") -> None:
+def map_axes(axes: Any, unit: str = "m", *, placed: bool = True) -> None:
     """East to the right and north up, at one scale, with a scale bar and an arrow to the north.
 
-    Call it when everything is drawn, since both follow the limits.
+    The axes of a model that is not `placed` are its own, and have no north. Call it when everything
+    is drawn, since bar and arrow follow the limits.
     """
-    axes.set(aspect="equal", xlabel=f"east, {unit}", ylabel=f"north, {unit}")
+    across, up = ("east", "north") if placed else ("x", "y")
+    axes.set(aspect="equal", xlabel=f"{across}, {unit}", ylabel=f"{up}, {unit}")
     for spine in axes.spines.values():
         spine.set_visible(True)
     scale_bar(axes, unit)
-    north_arrow(axes)
+    if placed:
+        north_arrow(axes)
 
 
 def scale_bar(axes: Any, unit: str = "m", share: float = 0.25) -> None:

@@ -153,7 +153,7 @@ function startMap() {
   const decimals = () => Math.min(4, Math.max(0, Math.ceil(Math.log10(2 ** map.getZoom()))));
   function read(word, place) {
     const [e, n] = [place.lng, place.lat].map((v) => v.toFixed(decimals()).replace("-", "−"));
-    let text = word + e + " " + data.unit + " east, " + n + " " + data.unit + " north";
+    let text = word + e + " " + data.unit + " " + data.axes[0] + ", " + n + " " + data.unit + " " + data.axes[1];
     if (data.geodetic) text += "; " + latLon(data.geodetic, place.lat, place.lng);
     if (ruler.on) {
       const total = lengthText(ruled([...ruler.places, place]), data.unit, 4);

@@ -1,5 +1,6 @@
 """The stage `report`: `report.html`, `report.pdf` and `report.json` of whatever is there."""
 
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -51,7 +52,7 @@ def build_report(held: Held, folder: Path) -> tuple[Report, dict[str, Any]]:
         layers: list[PictureLayer | ShapeLayer] = [*picture_layers(held), *shape_layers(held)]
         chart = None
         if layers:
-            chart = with_stills(SurveyMap(layers=layers, unit=held.unit, origin=origin_of(held)))
+            chart = with_stills(survey_map(held, layers))
     mesh = mesh_copy(held, folder / "mesh.glb")
     parts = list(sections(figures, has_map=chart is not None, has_mesh=mesh is not None))
     parts.append(reproduce.section(figures))
@@ -103,14 +104,13 @@ def _title_block(held: Held) -> list[tuple[str, str]]:
     return [row for row in rows if row[1]]
 
 
-def origin_of(held: Held) -> str:
-    """Origin of its map, in words."""
+def survey_map(held: Held, layers: Sequence[PictureLayer | ShapeLayer]) -> SurveyMap:
+    """The map of a workspace, with some layers."""
     datum = held.frame.datum
-    if datum is not None and held.frame.name == "ned":
-        return (
-            f"metres east and north of {datum.latitude_deg:.7f}, {datum.longitude_deg:.7f} (WGS 84)"
-        )
-    return "the model's own axes"
+    if datum is None or held.frame.name != "ned":
+        return SurveyMap(layers=layers, unit=held.unit, origin="the model's own axes", placed=False)
+    place = f"{datum.latitude_deg:.7f}, {datum.longitude_deg:.7f} (WGS 84)"
+    return SurveyMap(layers=layers, unit=held.unit, origin=f"metres east and north of {place}")
 
 
 def _data(figures: Figures, found: Any, said: Any, known: Any) -> dict[str, Any]:

@@ -14,13 +14,12 @@ from alice_survey.kit.document import (
     Report,
     Section,
     ShapeLayer,
-    SurveyMap,
 )
 from alice_survey.kit.page import page_policy, render_html
 from alice_survey.kit.words import count, length
 from alice_survey.report.held import Held
 from alice_survey.report.mesh_copy import mesh_about, mesh_copy, mesh_still
-from alice_survey.report.run import origin_of
+from alice_survey.report.run import survey_map
 from alice_survey.report.shapes import shape_layers
 from alice_survey.view.layers import PATHS, ChangedError, Layers
 from alice_survey.view.paths import Entry, Workspace
@@ -94,7 +93,7 @@ class Page:
         layers: list[PictureLayer | ShapeLayer] = [*pictures, *shape_layers(held)]
         chart = None
         if layers:
-            chart = SurveyMap(layers=layers, unit=held.unit, origin=origin_of(held))
+            chart = survey_map(held, layers)
         mesh = self._mesh_view(held)
         parts = []
         if chart is not None:

@@ -50,7 +50,7 @@ def plot_track_over(mosaic_tif: Path, track_csv: Path, path: Path) -> None:
     poses = read_track_poses(track_csv)
     if not poses:
         raise WorkspaceError(f"{track_csv} has no picture")
-    picture, extent, unit = _read_mosaic(mosaic_tif)
+    picture, extent, tags = _read_mosaic(mosaic_tif)
     names = _stations(track_csv)
     places = np.stack([poses[name].translation for name in names])[:, :2]
     ellipses = _ellipses(track_csv.with_name("track_covariance.npz"), names, places)
@@ -97,7 +97,7 @@ def plot_track_over(mosaic_tif: Path, track_csv: Path, path: Path) -> None:
                   max(extent[3], places[:, 0].max()) + margin)  # fmt: skip
     axes.set_facecolor("0.15")
     axes.grid(visible=False)
-    map_axes(axes, unit)
+    map_axes(axes, tags.get("UNIT", "m"), placed=tags.get("FRAME") != "model")
     axes.set_title(
         f"Camera positions over the mosaic: {len(poses)} pictures at {len(names)} stations"
     )
@@ -176,8 +176,8 @@ def _ellipses(
     return sizes[:, 1], sizes[:, 0], angle, f"2-sigma ellipses, up to {said}"
 
 
-def _read_mosaic(path: Path) -> tuple[Array, tuple[float, float, float, float], str]:
-    """A mosaic reduced, (H, W, 3) from 0 to 1, dark where empty; its west, east, south, north."""
+def _read_mosaic(path: Path) -> tuple[Array, tuple[float, float, float, float], dict[str, str]]:
+    """A mosaic reduced, (H, W, 3) from 0 to 1, dark where empty; west, east, south, north; tags."""
     try:
         with rasterio.open(path) as raster:
             shrink = max(1.0, max(raster.width, raster.height) / _LONGEST_PX)
@@ -186,14 +186,14 @@ def _read_mosaic(path: Path) -> tuple[Array, tuple[float, float, float, float], 
             resampling = rasterio.enums.Resampling.average
             colour = raster.read(bands, out_shape=(len(bands), *shape), resampling=resampling)
             valid = raster.dataset_mask(out_shape=shape) > 0
-            bounds, unit = raster.bounds, raster.tags().get("UNIT", "m")
+            bounds, tags = raster.bounds, raster.tags()
     except rasterio.errors.RasterioIOError as error:
         raise WorkspaceError(f"{path}: no mosaic: {error}") from None
     whole = float(np.iinfo(colour.dtype).max) if colour.dtype.kind == "u" else 1.0
     picture = np.moveaxis(colour.astype(np.float64) / whole, 0, -1)
     picture = np.repeat(picture, 3, axis=-1) if picture.shape[-1] == 1 else picture
     picture = np.where(valid[..., None], np.clip(picture[..., :3], 0, 1), 0.15)
-    return picture, (bounds.left, bounds.right, bounds.bottom, bounds.top), unit
+    return picture, (bounds.left, bounds.right, bounds.bottom, bounds.top), tags
 
 
 def _size(extent: tuple[float, float, float, float]) -> tuple[float, float]:

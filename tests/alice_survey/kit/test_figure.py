@@ -66,6 +66,13 @@ def test_a_scale_bar_is_as_long_as_it_says() -> None:
     assert "N" in [text.get_text() for text in axes.texts]
 
 
+def test_a_map_of_a_model_without_positions_has_no_north() -> None:
+    axes = new_figure(3.0).subplots()
+    map_axes(axes, "unit", placed=False)
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x, unit", "y, unit")
+    assert "N" not in [text.get_text() for text in axes.texts]
+
+
 def test_palettes_run_from_their_first_colour_to_their_last() -> None:
     steps = palette_steps("viridis", 5)
     ends = palette_colours("viridis", np.array([0.0, 1.0]))
