@@ -53,4 +53,4 @@ def view(
     """
     from alice_survey.view.run import run_view
 
-    run_view(workspace, port, browser=browser, tell=typer.echo)
+    run_view(workspace, port, browser=browser, show=typer.echo)

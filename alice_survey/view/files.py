@@ -1,12 +1,9 @@
-"""Files of a workspace as responses: their type, their policy, their bytes."""
+"""Files of a workspace as responses: their type, their policy, the bytes of a request."""
 
-import os
-import socket
+import re
+from email.message import Message
 from pathlib import PurePath
 
-from alice_survey.view.paths import OpenedFile
-
-_CHUNK = 1 << 20
 _TEXT = "text/plain; charset=utf-8"
 _TYPES = {
     ".bin": "application/octet-stream", ".csv": "text/csv; charset=utf-8",
@@ -25,6 +22,7 @@ _CLOSED_PAGE = (
     "script-src 'unsafe-inline'; base-uri 'none'; form-action 'none'; sandbox allow-scripts"
 )
 """Policy of self-contained pages: they run, but reach neither a network nor this server."""
+_RANGE = re.compile(r"bytes=(?:([0-9]{1,18})-([0-9]{0,18})|-([0-9]{1,18}))")
 
 
 def content_type(name: str) -> str:
@@ -37,20 +35,28 @@ def policy_of(name: str) -> str:
     return _CLOSED_PAGE if content_type(name).startswith("text/html") else _INERT
 
 
-def send_part(connection: socket.socket, file: OpenedFile, first: int, count: int) -> int:
-    """Send bytes of a file.
+def requested_bytes(headers: Message, size: int, tag: str) -> tuple[int, int, int]:
+    """Part of a file to send for a request (RFC 9110, sections 13 and 14).
+
+    Of several ranges at once, or one that is of another version, the whole file is the answer, as
+    the standard lets a server do.
+
+    Args:
+        headers: headers of the request.
+        size: size of the file, bytes.
+        tag: entity tag of its content.
 
     Returns:
-        How many were there to send.
-
-    Raises:
-        OSError: the other side went away or takes nothing.
+        Status, first byte and number of bytes.
     """
-    sent = 0
-    while sent < count:
-        chunk = os.pread(file.descriptor, min(_CHUNK, count - sent), first + sent)
-        if not chunk:
-            break
-        connection.sendall(chunk)
-        sent += len(chunk)
-    return sent
+    if tag in re.split(r"(?:\s*,\s*|^)(?:W/)?", headers.get("If-None-Match", "")):
+        return 304, 0, 0
+    found = _RANGE.fullmatch(headers.get("Range", ""))
+    if found is None or headers.get("If-Range", tag) != tag:
+        return 200, 0, size
+    first, last, suffix = found.groups()
+    if last and int(last) < int(first):
+        return 200, 0, size  # no range by the standard's grammar
+    start = int(first) if suffix is None else max(0, size - int(suffix))
+    end = min(int(last) + 1, size) if last else size
+    return (206, start, end - start) if start < end else (416, 0, 0)

@@ -9,14 +9,14 @@ from alice_survey.report.held import Held
 from alice_survey.view.server import Server
 
 
-def run_view(workspace: Path, port: int, *, browser: bool, tell: Callable[[str], None]) -> None:
+def run_view(workspace: Path, port: int, *, browser: bool, show: Callable[[str], None]) -> None:
     """Serve a workspace; Ctrl-C ends it as it ends every command.
 
     Args:
         workspace: the workspace to show.
         port: to listen on; 0 for any that is free.
         browser: open one.
-        tell: prints a line.
+        show: prints a line.
 
     Raises:
         WorkspaceError: there is nothing to show, or the port is taken.
@@ -27,7 +27,7 @@ def run_view(workspace: Path, port: int, *, browser: bool, tell: Callable[[str],
         )
     server = Server(workspace, port)
     try:
-        tell(f"{workspace} is shown at {server.url} to this machine alone; Ctrl-C ends it")
+        show(f"{workspace} is shown at {server.url} to this machine alone; Ctrl-C ends it")
         if browser:
             import webbrowser
 
