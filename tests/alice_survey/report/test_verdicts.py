@@ -6,8 +6,7 @@ import pytest
 from alice_survey.base.artefacts import write_json
 from alice_survey.report.figures import Figures
 from alice_survey.report.held import Held
-from alice_survey.report.summary import facts, summary
-from alice_survey.report.verdicts import Verdict, verdicts
+from alice_survey.report.verdicts import Verdict, facts, summary, verdicts
 from tests.alice_survey.report.tiny import tiny_workspace
 
 

@@ -18,8 +18,7 @@ from rasterio.windows import Window
 from typer.testing import CliRunner
 
 from alice_survey.cli.main import app
-from alice_survey.view import run
-from alice_survey.view.server import ADDRESS
+from alice_survey.view.server import ADDRESS, Server
 from tests.alice_survey.report.tiny import tiny_workspace
 
 SIDE = 20_000
@@ -130,7 +129,7 @@ def test_the_browser_is_opened_unless_it_is_not_wanted(
 
     opened: list[str] = []
     monkeypatch.setattr(webbrowser, "open", opened.append)
-    monkeypatch.setattr(run.Server, "serve_forever", lambda self: None)
+    monkeypatch.setattr(Server, "serve_forever", lambda self: None)
     option = "--browser" if browser else "--no-browser"
     done = CliRunner().invoke(app, ["view", "-w", str(tiny_workspace(tmp_path)), option])
     assert done.exit_code == 0
@@ -139,7 +138,7 @@ def test_the_browser_is_opened_unless_it_is_not_wanted(
 
 
 def test_it_cannot_be_reached_from_another_machine(tmp_path: Path) -> None:
-    server = run.Server(tiny_workspace(tmp_path))
+    server = Server(tiny_workspace(tmp_path))
     assert server.server_address[0] == "127.0.0.1"
     assert server.socket.family == socket.AF_INET
     with pytest.raises(OSError):
