@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Any, Generic, Protocol, TypeVar
 
 from alice_survey.base.errors import AliceError, Level, collected_by, note, say, warn
-from alice_survey.base.run.progress import counted, current, step
+from alice_survey.base.run.progress import current, step
 
 _PR_SET_PDEATHSIG = 1
 _MESSAGES = "messages_of_task"
@@ -86,12 +86,12 @@ class Executor:
         if self._is_local:
             workers = min(workers, _fitting(task_mib), workers if total is None else max(1, total))
         if workers <= 1 and self.pool is None:
-            yield from counted(map(function, items), label, total, 1)
+            yield from progress(map(function, items), label, total)
             return
         with self._running(workers) as pool:
             is_limited = self.pool is not None and workers < self.workers
             queued = workers if is_limited else _QUEUED * workers
-            yield from counted(_in_order(pool, function, items, queued), label, total, workers)
+            yield from progress(_in_order(pool, function, items, queued), label, total)
 
     @contextlib.contextmanager
     def started(self) -> Iterator["Executor"]:
@@ -307,7 +307,7 @@ def progress(items: Iterable[Item], label: str, total: int | None = None) -> Ite
     """Pass items through while standard error shows the progress of the work on them.
 
     Args:
-        items: what the caller works on, one by one.
+        items: what the caller works on, one by one, or results that took work to produce.
         label: what is done, in a few words.
         total: how many items, if that is known.
     """

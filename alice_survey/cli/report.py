@@ -51,6 +51,6 @@ def view(
     Serves map, mesh and files of a workspace to this machine alone, at full resolution, until
     Ctrl-C. A GIS can open its rasters by their addresses.
     """
-    from alice_survey.view.run import run_view
+    from alice_survey.view.server import run_view
 
-    run_view(workspace, port, browser=browser, tell=typer.echo)
+    run_view(workspace, port, browser=browser, show=typer.echo)

@@ -36,7 +36,7 @@ def session(
     run = Run(Console(quiet=quiet), _opened(log_file, events))
     command = shlex.join(["alice-survey", *arguments])
     packages = {"python": platform.python_version(), **versions()}
-    with interrupts.heeded(lambda error: _finish(run, error)):
+    with interrupts.handled(lambda error: _finish(run, error)):
         try:
             with reported_to(run):
                 run.report(

@@ -14,15 +14,13 @@ from alice_survey.kit.document import PictureLayer, Report, ShapeLayer, SurveyMa
 from alice_survey.kit.map_figure import with_stills
 from alice_survey.kit.page import render_html
 from alice_survey.kit.paper import render_pdf
-from alice_survey.report import reproduce
 from alice_survey.report.figures import Figures
 from alice_survey.report.held import Held
 from alice_survey.report.mesh_copy import mesh_copy
 from alice_survey.report.rasters import picture_layers
 from alice_survey.report.sections import sections
 from alice_survey.report.shapes import shape_layers
-from alice_survey.report.summary import facts, summary
-from alice_survey.report.verdicts import verdicts
+from alice_survey.report.verdicts import facts, summary, verdicts
 
 
 def run_report(workspace: Path, folder: Path, executor: Executor) -> None:
@@ -55,7 +53,6 @@ def build_report(held: Held, folder: Path) -> tuple[Report, dict[str, Any]]:
             chart = with_stills(survey_map(held, layers))
     mesh = mesh_copy(held, folder / "mesh.glb")
     parts = list(sections(figures, has_map=chart is not None, has_mesh=mesh is not None))
-    parts.append(reproduce.section(figures))
     report = Report(
         title=held.name,
         subtitle=_subtitle(held),

@@ -1,17 +1,29 @@
-"""The rasters of a workspace as layers of a map: their legends, their tiles."""
+"""The rasters of a workspace as layers of a map, at every resolution: their legends, their tiles.
 
+Level 0 of a pyramid is the finest: each further one has half the columns and rows, rounded up, or
+those of the overview in the file, as of a cloud-optimised GeoTIFF. Where there is none, GDAL
+averages what is known below a pixel.
+"""
+
+import math
 import os
 import threading
-from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import rasterio
+from rasterio.enums import Resampling
 from rasterio.errors import RasterioError
+from rasterio.windows import Window
 
 from alice_survey.base.contents import one_line
 from alice_survey.base.errors import WorkspaceError
+from alice_survey.base.frames import Array
 from alice_survey.kit.document import PictureLayer
 from alice_survey.report.colours import (
     MOSAIC_ABOUT,
@@ -27,70 +39,153 @@ from alice_survey.report.colours import (
     scale_of,
 )
 from alice_survey.report.held import Held
-from alice_survey.view.paths import OpenedFile, Workspace
-from alice_survey.view.pyramid import (
-    Pyramid,
-    read_counts,
-    read_numbers,
-    read_painted,
-    tiles_of_level,
-)
+from alice_survey.view.paths import Workspace
 
-_KEPT_BYTES = 48 << 20
-"""Cache size of encoded tiles."""
+_KEPT_TILES = 1000
+_KEPT_PYRAMIDS = 12
 _MOST_RENDERERS = 4
-_MOSAIC = "mosaic"
-_DAMAGES = (RasterioError, IndexError)
+_ENDING_S = 3.0
+"""Time to wait at the end for tiles in work."""
+_DAMAGES = (RasterioError, IndexError, MemoryError)
 """Errors on reading a damaged raster, or one with too few bands."""
-NAMES = (_MOSAIC, *(numbers.name for numbers in number_rasters("m")))
-"""Names of layers, in the order in which a page shows them."""
-PATHS = (MOSAIC_FILE, *(numbers.file for numbers in number_rasters("m")))
-"""Files of their rasters."""
+FILES = {"mosaic": MOSAIC_FILE} | {one.name: one.file for one in number_rasters("m")}
+"""Files of the layers by their names, in the order in which a page shows them."""
+_GDAL = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_CACHEMAX": 32 << 20}
+"""GDAL options: no sidecar file of a raster is read, and the cache is small."""
+_OPAQUE = 128
+"""Mean opacity, of 255, from which a pixel is shown."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Level:
+    """Size of a level, which covers the whole raster."""
+
+    columns: int
+    rows: int
+    east: float
+    """Width of a pixel, in the raster's unit."""
+    north: float
+    """Height of a pixel."""
+
+    @property
+    def tiles(self) -> tuple[int, int]:
+        """Columns and rows of tiles."""
+        return math.ceil(self.columns / TILE_PX), math.ceil(self.rows / TILE_PX)
+
+
+class Pyramid:
+    """All levels of one raster in its colours."""
+
+    def __init__(self, path: Path, numbers: Numbers | None) -> None:
+        """Open a raster.
+
+        Args:
+            path: path of the file.
+            numbers: its colouring; None for a mosaic, which has its own colours.
+
+        Raises:
+            rasterio.errors.RasterioError: it cannot be read.
+        """
+        self._path, self.numbers = path, numbers
+        with self._opened() as raster:
+            self.west, self.north = raster.transform.c, raster.transform.f
+            self.pixel = raster.transform.a
+            self.limits = None if numbers is None else limits_of(raster, numbers)
+            sizes, factors = [(raster.width, raster.height)], raster.overviews(1)
+        while max(sizes[-1]) > TILE_PX:
+            if 2 ** len(sizes) in factors:
+                with self._opened(overview_level=factors.index(2 ** len(sizes))) as raster:
+                    sizes.append((raster.width, raster.height))
+            else:
+                sizes.append((-(-sizes[-1][0] // 2), -(-sizes[-1][1] // 2)))
+        wide, high = (side * self.pixel for side in sizes[0])
+        self.levels = [
+            Level(columns=columns, rows=rows, east=wide / columns, north=high / rows)
+            for columns, rows in sizes
+        ]
+
+    @contextmanager
+    def _opened(self, **options: int) -> Iterator[Any]:
+        with (
+            rasterio.Env(**_GDAL),
+            rasterio.open(self._path, driver="GTiff", sharing=False, **options) as raster,
+        ):
+            yield raster
+
+    def tile(self, level: int, x: int, y: int) -> Rgba:
+        """Pixels of a tile of a level.
+
+        Raises:
+            FileNotFoundError: there is no such tile.
+            rasterio.errors.RasterioError: the file is damaged.
+        """
+        if not 0 <= level < len(self.levels):
+            raise FileNotFoundError(f"level {level}")
+        size = self.levels[level]
+        columns, rows = size.tiles
+        if not (0 <= x < columns and 0 <= y < rows):
+            raise FileNotFoundError(f"tile {x}, {y}")
+        left, top = x * TILE_PX, y * TILE_PX
+        right, bottom = min(left + TILE_PX, size.columns), min(top + TILE_PX, size.rows)
+        if self.numbers is None or self.limits is None:
+            return self._painted(size, left, top, right, bottom)
+        # One pixel more on each side, so that the shade has no seams.
+        west, north = min(left, 1), min(top, 1)
+        east, south = min(size.columns - right, 1), min(size.rows - bottom, 1)
+        values = self.values(size, left - west, top - north, right + east, bottom + south)
+        whole = coloured(self.numbers.levels(values), self.numbers, self.limits, size.east)
+        return whole[north : whole.shape[0] - south, west : whole.shape[1] - east]
+
+    def values(self, size: Level, left: int, top: int, right: int, bottom: int) -> Array:
+        """Means of known numbers of a part of a level; NaN where none is known."""
+        window, shape = _window(self.levels[0], size, left, top, right, bottom)
+        with self._opened() as raster:
+            read = raster.read(
+                1, window=window, out_shape=shape, out_dtype="float32", masked=True,
+                resampling=Resampling.average,
+            )  # fmt: skip
+        values: Array = read.filled(np.nan)
+        return values
+
+    def _painted(self, size: Level, left: int, top: int, right: int, bottom: int) -> Rgba:
+        window, shape = _window(self.levels[0], size, left, top, right, bottom)
+        options = {"window": window, "resampling": Resampling.average}
+        with self._opened() as raster:
+            bands = raster.read([1, 2, 3], out_shape=(3, *shape), **options)
+            opacity = raster.dataset_mask(out_shape=shape, **options)
+        picture: Rgba = np.dstack([*bands, np.where(opacity < _OPAQUE, 0, 255)]).astype(np.uint8)
+        return picture
+
+
+def _window(
+    full: Level, size: Level, left: int, top: int, right: int, bottom: int
+) -> tuple[Window, tuple[int, int]]:
+    """Part of the full raster, and the shape it is read in."""
+    wide, high = full.columns / size.columns, full.rows / size.rows
+    window = Window(left * wide, top * high, (right - left) * wide, (bottom - top) * high)
+    return window, (bottom - top, right - left)
 
 
 class ChangedError(Exception):
     """The requested file was replaced meanwhile."""
 
 
-@dataclass(kw_only=True)
-class _Raster:
-    """A raster that is shown, as long as its file stays as it is."""
-
-    file: OpenedFile
-    pyramid: Pyramid
-    numbers: Numbers | None
-    """Colouring of the raster; None for the mosaic."""
-    users: int = 0
-    lock: threading.Lock = field(default_factory=threading.Lock)
-    limits: tuple[float, float] | None = None
-
-    def coloured_between(self) -> tuple[float, float]:
-        """Limits of the colours, computed on first use."""
-        with self.lock:
-            if self.limits is None:
-                if self.numbers is None:
-                    raise ValueError("a mosaic has colours of its own")
-                with self.pyramid.opened() as raster:
-                    self.limits = limits_of(raster, self.numbers)
-            return self.limits
-
-
 class Layers:
     """Layers of a map of a workspace; threads may share it."""
 
-    def __init__(self, workspace: Workspace, stop: threading.Event | None = None) -> None:
-        """Take a workspace; `stop` ends long work soon after it is set."""
-        self._workspace, self._stop = workspace, stop or threading.Event()
-        self._lock = threading.Lock()
-        self._rasters: dict[str, _Raster] = {}
-        self._tiles: OrderedDict[tuple[str, ...], bytes] = OrderedDict()
-        self._tile_bytes = 0
-        self._renderers = threading.BoundedSemaphore(min(_MOST_RENDERERS, os.cpu_count() or 1))
+    def __init__(self, workspace: Workspace) -> None:
+        """Take a workspace."""
+        self._workspace = workspace
+        self._most_renderers = min(_MOST_RENDERERS, os.cpu_count() or 1)
+        self._renderers = threading.BoundedSemaphore(self._most_renderers)
+        # By the token of the file, so that a changed raster is read again.
+        self._pyramid = lru_cache(_KEPT_PYRAMIDS)(self._read_pyramid)
+        self._tile = lru_cache(_KEPT_TILES)(self._read_tile)
 
     def picture_layers(self) -> Sequence[PictureLayer]:
         """The layers that are there, for a page that asks for their tiles."""
         found: list[PictureLayer] = []
-        for name in NAMES:
+        for name in FILES:
             try:
                 found.append(self._picture_layer(name, shown=not found))
             except FileNotFoundError:
@@ -98,19 +193,20 @@ class Layers:
         return found
 
     def _picture_layer(self, name: str, *, shown: bool) -> PictureLayer:
-        with self._used(name) as raster:
-            pyramid, numbers = raster.pyramid, raster.numbers
-            scale = None if numbers is None else scale_of(numbers, raster.coloured_between())
-            return PictureLayer(
-                name=name,
-                title=MOSAIC_TITLE if numbers is None else numbers.title,
-                about=MOSAIC_ABOUT if numbers is None else numbers.about,
-                west_m=pyramid.west, north_m=pyramid.north, pixel_m=pyramid.pixel,
-                width_px=pyramid.width, height_px=pyramid.height, tile_px=TILE_PX,
-                levels=len(pyramid.levels), tiles={}, scale=scale, shown=shown,
-                sizes=[(s.columns, s.rows, s.east, s.north) for s in pyramid.levels],
-                address=f"/tiles/{name}/{{}}.webp?v={raster.file.token}",
-            )  # fmt: skip
+        with self._unchanged(name, None) as token:
+            pyramid = self._pyramid(name, token)
+        numbers, limits, full = pyramid.numbers, pyramid.limits, pyramid.levels[0]
+        return PictureLayer(
+            name=name,
+            title=MOSAIC_TITLE if numbers is None else numbers.title,
+            about=MOSAIC_ABOUT if numbers is None else numbers.about,
+            west_m=pyramid.west, north_m=pyramid.north, pixel_m=pyramid.pixel,
+            width_px=full.columns, height_px=full.rows, tile_px=TILE_PX,
+            levels=len(pyramid.levels), tiles={}, shown=shown,
+            scale=None if numbers is None or limits is None else scale_of(numbers, limits),
+            sizes=[(s.columns, s.rows, s.east, s.north) for s in pyramid.levels],
+            address=f"/tiles/{name}/{{}}.webp?v={token}",
+        )  # fmt: skip
 
     def tile(self, name: str, level: int, x: int, y: int, token: str | None) -> tuple[bytes, str]:
         """A tile as WebP, and the token of the raster that it is of.
@@ -127,156 +223,38 @@ class Layers:
             ChangedError: there is another raster by now, or it is being written to.
             WorkspaceError: it is damaged.
         """
-        with self._used(name) as raster:
-            if token is not None and token != raster.file.token:
-                raise ChangedError
-            key = (raster.file.token, name, str(level), str(x), str(y))
-            kept = self._kept(key)
-            if kept is None:
-                with self._renderers:
-                    kept = self._kept(key) or encoded(_painted(raster, level, x, y))
-                if not raster.file.is_unchanged():
-                    raise ChangedError
-                self._keep(key, kept)
-            return kept, raster.file.token
-
-    def painted(self, name: str, level: int, x: int, y: int) -> Rgba:
-        """A tile's pixels before they are encoded; see `tile`."""
-        with self._used(name) as raster:
-            return _painted(raster, level, x, y)
-
-    def _kept(self, key: tuple[str, ...]) -> bytes | None:
-        with self._lock:
-            if key not in self._tiles:
-                return None
-            self._tiles.move_to_end(key)
-            return self._tiles[key]
-
-    def _keep(self, key: tuple[str, ...], tile: bytes) -> None:
-        with self._lock:
-            if key in self._tiles:
-                return
-            self._tiles[key] = tile
-            self._tile_bytes += len(tile)
-            while self._tile_bytes > _KEPT_BYTES:
-                self._tile_bytes -= len(self._tiles.popitem(last=False)[1])
+        with self._unchanged(name, token) as now:
+            return self._tile(name, now, level, x, y), now
 
     def close(self) -> None:
-        """Close all files that are no longer in use."""
-        with self._lock:
-            rasters = list(self._rasters.values())
-            self._rasters.clear()
-        for raster in rasters:
-            self._give_back(raster)
+        """Wait briefly for the tiles in work."""
+        for _ in range(self._most_renderers):
+            self._renderers.acquire(timeout=_ENDING_S / self._most_renderers)
 
     @contextmanager
-    def _used(self, name: str) -> Iterator[_Raster]:
-        """The raster of a layer as it is now; its file stays open within this block."""
-        file = self._workspace.open(_file_of(name).split("/"))
+    def _unchanged(self, name: str, token: str | None) -> Iterator[str]:
+        """The token of a layer's file, which is read within this block."""
+        now = self._workspace.token(FILES[name])
         try:
-            raster = self._take(name, file)
-        except BaseException as error:
-            unchanged = file.is_unchanged()
-            file.close()
-            raise self._fault(name, error, unchanged) from error
-        try:
-            yield raster
-        except (*_DAMAGES, MemoryError) as error:
-            raise self._fault(name, error, raster.file.is_unchanged()) from error
-        finally:
-            self._give_back(raster)
+            if token not in (None, now):
+                raise ChangedError
+            yield now
+        except _DAMAGES as error:
+            if self._workspace.token(FILES[name]) != now:
+                raise ChangedError from None
+            path = self._workspace.folder / FILES[name]
+            raise WorkspaceError(
+                f"{path}: is damaged ({one_line(error)}): delete it and run again"
+            ) from error
+        if self._workspace.token(FILES[name]) != now:
+            raise ChangedError
 
-    def _take(self, name: str, file: OpenedFile) -> _Raster:
-        """The raster that is known of a file, else a new one, which then owns the file."""
-        known = self._known(name, file)
-        if known is not None:
-            return known
-        numbers = _numbers(name, Held.of(self._workspace.folder).unit)
-        read = read_painted if numbers is None else read_numbers
-        if numbers is not None and numbers.counted:
-            read = read_counts
-        pyramid = Pyramid(file.path, read, stop=self._stop)
-        known = self._known(name, file)  # another request may have been quicker
-        if known is not None:
-            return known
-        raster = _Raster(file=file, pyramid=pyramid, numbers=numbers, users=2)  # this one, the next
-        with self._lock:
-            before = self._rasters.get(name)
-            self._rasters[name] = raster
-        if before is not None:
-            self._give_back(before)
-        return raster
+    def _read_pyramid(self, name: str, token: str) -> Pyramid:
+        unit = Held.of(self._workspace.folder).unit
+        numbers = next((one for one in number_rasters(unit) if one.name == name), None)
+        return Pyramid(self._workspace.file(FILES[name].split("/")), numbers)
 
-    def _known(self, name: str, file: OpenedFile) -> _Raster | None:
-        with self._lock:
-            known = self._rasters.get(name)
-            if known is None or known.file.token != file.token:
-                return None
-            known.users += 1
-        file.close()
-        return known
-
-    def _give_back(self, raster: _Raster) -> None:
-        with self._lock:
-            raster.users -= 1
-            if raster.users == 0:
-                raster.file.close()
-
-    def _fault(self, name: str, error: BaseException, unchanged: bool) -> BaseException:
-        """Error to report for a fault in a raster."""
-        if not isinstance(error, (*_DAMAGES, MemoryError)):
-            return error
-        if not unchanged:
-            return ChangedError()
-        path = self._workspace.folder / _file_of(name)
-        return WorkspaceError(f"{path}: is damaged ({one_line(error)}): delete it and run again")
-
-
-def _numbers(name: str, unit: str) -> Numbers | None:
-    return next((numbers for numbers in number_rasters(unit) if numbers.name == name), None)
-
-
-def _file_of(name: str) -> str:
-    """Where the raster of a layer is.
-
-    Raises:
-        FileNotFoundError: no layer has this name.
-    """
-    if name == _MOSAIC:
-        return MOSAIC_FILE
-    numbers = _numbers(name, "m")
-    if numbers is None:
-        raise FileNotFoundError(name)
-    return numbers.file
-
-
-def _painted(raster: _Raster, level: int, x: int, y: int) -> Rgba:
-    """A tile's pixels.
-
-    Raises:
-        FileNotFoundError: there is no such tile.
-    """
-    pyramid = raster.pyramid
-    finest = len(pyramid.levels) - 1 - level
-    if not 0 <= finest < len(pyramid.levels):
-        raise FileNotFoundError(f"level {level}")
-    size = pyramid.levels[finest]
-    columns, rows = tiles_of_level(size)
-    if not (0 <= x < columns and 0 <= y < rows):
-        raise FileNotFoundError(f"tile {x}, {y}")
-    left, top = x * TILE_PX, y * TILE_PX
-    right, bottom = min(left + TILE_PX, size.columns), min(top + TILE_PX, size.rows)
-    if raster.numbers is None:
-        part = pyramid.part(finest, left, top, right, bottom)
-        clear = part.weight < 0.5
-        picture = np.dstack([*np.rint(part.values), np.where(clear, 0, 255)])
-        return picture.astype(np.uint8)
-    # One pixel more on each side, so that the shade has no seams.
-    margin = (min(left, 1), min(top, 1), min(size.columns - right, 1), min(size.rows - bottom, 1))
-    part = pyramid.part(
-        finest, left - margin[0], top - margin[1], right + margin[2], bottom + margin[3]
-    )
-    values = np.where(part.weight > 0, part.values[0], np.nan)
-    level_values = raster.numbers.levels(values)
-    whole = coloured(level_values, raster.numbers, raster.coloured_between(), size.east)
-    return whole[margin[1] : whole.shape[0] - margin[3], margin[0] : whole.shape[1] - margin[2]]
+    def _read_tile(self, name: str, token: str, level: int, x: int, y: int) -> bytes:
+        with self._renderers:
+            pyramid = self._pyramid(name, token)
+            return encoded(pyramid.tile(len(pyramid.levels) - 1 - level, x, y))

@@ -1,8 +1,8 @@
 """The pages that the server makes: the survey with its map, mesh and files, and lists of files."""
 
 import tempfile
-import threading
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 from urllib.parse import quote
 
@@ -21,16 +21,17 @@ from alice_survey.report.held import Held
 from alice_survey.report.mesh_copy import mesh_about, mesh_copy, mesh_still
 from alice_survey.report.run import survey_map
 from alice_survey.report.shapes import shape_layers
-from alice_survey.view.layers import PATHS, ChangedError, Layers
+from alice_survey.view.layers import FILES, ChangedError, Layers
 from alice_survey.view.paths import Entry, Workspace
 
 _STILL_PX = 900
+_MESH = "mesh/mesh.glb"
 _LINKS = (
     ("report/report.html", "The report", "what was mapped, how well, what to do next"),
     ("mosaic/mosaic.tif", "The mosaic", "cloud-optimised GeoTIFF"),
     ("dense/dem.tif", "The elevation model", "GeoTIFF"),
     ("dense/cloud.laz", "The point cloud", "LAZ"),
-    ("mesh/mesh.glb", "The mesh", "glTF"),
+    (_MESH, "The mesh", "glTF"),
     ("sparse/track.csv", "The cameras' track", "CSV"),
     ("plan/plan.html", "The plan", "an interactive map"),
 )
@@ -42,9 +43,8 @@ class Page:
     def __init__(self, workspace: Workspace, layers: Layers) -> None:
         """Take a workspace and its layers."""
         self._workspace, self._layers = workspace, layers
-        self._lock, self._mesh_lock = threading.Lock(), threading.Lock()
-        self._state, self._page = "", (b"", "")
-        self._mesh_state, self._mesh = "", b""
+        self._page = lru_cache(maxsize=1)(self._render)
+        self._mesh = lru_cache(maxsize=1)(self._light_mesh)
 
     def survey(self, host: str) -> tuple[bytes, str]:
         """The page of the survey as it is now, and its policy.
@@ -56,13 +56,11 @@ class Page:
             WorkspaceError: a file of the workspace is damaged.
             FileNotFoundError: a stage was removed meanwhile.
         """
-        with self._lock:
-            state = f"{host} {self._workspace.token(*PATHS)}"
-            if self._state != state:
-                report = self._report(host)
-                self._page = render_html(report).encode(), page_policy(report)
-                self._state = state
-            return self._page
+        return self._page(host, self._workspace.state(tuple(FILES.values())))
+
+    def _render(self, host: str, _state: tuple[str, ...]) -> tuple[bytes, str]:
+        report = self._report(host)
+        return render_html(report).encode(), page_policy(report)
 
     def mesh(self, token: str | None) -> tuple[bytes, str]:
         """The light copy of the mesh as binary glTF, and the token of the mesh.
@@ -75,17 +73,17 @@ class Page:
             ChangedError: there is another mesh by now.
             WorkspaceError: it is damaged.
         """
-        with self._mesh_lock, self._workspace.opened(("mesh", "mesh.glb")) as file:
-            if token is not None and token != file.token:
-                raise ChangedError
-            if self._mesh_state != file.token:
-                with tempfile.TemporaryDirectory(prefix="alice-survey-") as folder:
-                    path = Path(folder) / "mesh.glb"
-                    if mesh_copy(Held.of(self._workspace.folder), path) is None:
-                        raise FileNotFoundError("mesh")
-                    self._mesh = path.read_bytes()
-                self._mesh_state = file.token
-            return self._mesh, file.token
+        now = self._workspace.token(_MESH)
+        if token not in (None, now):
+            raise ChangedError
+        return self._mesh(now), now
+
+    def _light_mesh(self, _token: str) -> bytes:
+        with tempfile.TemporaryDirectory(prefix="alice-survey-") as folder:
+            path = Path(folder) / "mesh.glb"
+            if mesh_copy(Held.of(self._workspace.folder), path) is None:
+                raise FileNotFoundError(_MESH)
+            return path.read_bytes()
 
     def _report(self, host: str) -> Report:
         held = Held.of(self._workspace.folder)
@@ -113,17 +111,15 @@ class Page:
         )
 
     def _mesh_view(self, held: Held) -> Mesh | None:
-        path, picture = held.file("mesh/mesh.glb"), held.file("mesh/mesh.png")
+        path, picture = held.file(_MESH), held.file("mesh/mesh.png")
         mesh = held.read(MeshRecord)
         if path is None or picture is None or mesh is None:
             return None
-        with self._workspace.opened(("mesh", "mesh.glb")) as file:
-            token = file.token
         return Mesh(
             glb=path,
             about=mesh_about(mesh),
             still=mesh_still(picture, _STILL_PX),
-            address=f"/mesh.glb?v={token}",
+            address=f"/mesh.glb?v={self._workspace.token(_MESH)}",
         )
 
 
@@ -135,11 +131,8 @@ def _resolution(layer: PictureLayer, unit: str) -> str:
 def _files(workspace: Workspace, host: str) -> Section:
     links = [Link(text="All files", address="/files/", about="of this workspace")]
     for path, text, about in _LINKS:
-        try:
-            with workspace.opened(path.split("/")):
-                links.append(Link(text=text, address=f"/files/{path}", about=f"({path}): {about}"))
-        except FileNotFoundError:
-            continue
+        if workspace.has(path):
+            links.append(Link(text=text, address=f"/files/{path}", about=f"({path}): {about}"))
     return Section(
         name="files",
         title="Files",

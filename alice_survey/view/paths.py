@@ -1,15 +1,8 @@
-"""Files of a workspace by the names that a request gives; nothing else can be reached.
+"""Files of a workspace by the names that a request gives; nothing else can be reached."""
 
-A path is walked folder by folder from the workspace, each opened below the one before, so that no
-name leads out of it whatever happens to the folders meanwhile. Links are not followed.
-"""
-
-import errno
 import os
 import re
-import stat
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import unquote_to_bytes
@@ -24,39 +17,11 @@ _LONGEST_PATH = 2000
 _LONGEST_NAME = 255
 _MOST_LISTED = 20_000
 _ESCAPE = re.compile(r"%(?![0-9A-Fa-f]{2})")
-_NOT_THERE = {
-    errno.ENOENT, errno.ENOTDIR, errno.ELOOP, errno.EACCES, errno.ENXIO, errno.ENAMETOOLONG,
-}  # fmt: skip
-"""Errors that count as missing for a reader: also a link, a socket and unreadable files."""
 _UNFINISHED = (".partial", ".replaced")
 
 
 class RefusedError(Exception):
     """A path that no file of a workspace can have."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class OpenedFile:
-    """A file, as it was when it was opened."""
-
-    descriptor: int
-    size: int
-    modified_ns: int
-    token: str
-    """Token of this content: another file, or the same file changed, has another."""
-
-    @property
-    def path(self) -> str:
-        """Path by which libraries open the same file, even after another took its name."""
-        return f"/proc/self/fd/{self.descriptor}"
-
-    def is_unchanged(self) -> bool:
-        """Whether it is unchanged since it was opened."""
-        return _token(os.fstat(self.descriptor)) == self.token
-
-    def close(self) -> None:
-        """Close it."""
-        os.close(self.descriptor)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,6 +62,11 @@ def names_of(path: str) -> tuple[str, ...]:
     return names
 
 
+def token_of(status: os.stat_result) -> str:
+    """Token of a file's content: another file, or the same file changed, has another."""
+    return f"{status.st_ino:x}-{status.st_size:x}-{status.st_mtime_ns:x}"
+
+
 class Workspace:
     """A folder, of which files are opened to read."""
 
@@ -104,44 +74,32 @@ class Workspace:
         """Take a folder; it need not hold anything yet."""
         self.folder = folder.resolve()
 
-    @contextmanager
-    def opened(self, names: Sequence[str]) -> Iterator[OpenedFile]:
-        """A file, closed at the end.
-
-        Args:
-            names: along its path, as `names_of` gives them.
+    def file(self, names: Sequence[str]) -> Path:
+        """A file, by the names along its path.
 
         Raises:
-            FileNotFoundError: there is no such file, or it is a link or a folder.
+            FileNotFoundError: there is no such file, or it is a link or below one.
         """
-        file = self.open(names)
-        try:
-            yield file
-        finally:
-            file.close()
+        path = self._unlinked(names)
+        if not path.is_file():
+            raise FileNotFoundError(path)
+        return path
 
-    def open(self, names: Sequence[str]) -> OpenedFile:
-        """A file that the caller closes; see `opened`."""
-        if not names:
-            raise FileNotFoundError
-        with self._folder(names[:-1]) as folder:
-            descriptor = _open(names[-1], os.O_RDONLY | os.O_NONBLOCK, folder)
-        status = os.fstat(descriptor)
-        if not stat.S_ISREG(status.st_mode):
-            os.close(descriptor)
-            raise FileNotFoundError
-        return OpenedFile(
-            descriptor=descriptor,
-            size=status.st_size,
-            modified_ns=status.st_mtime_ns,
-            token=_token(status),
-        )
+    def has(self, path: str) -> bool:
+        """Whether there is such a file; see `file`."""
+        try:
+            return bool(self.file(path.split("/")))
+        except FileNotFoundError:
+            return False
+
+    def token(self, path: str) -> str:
+        """Token of a file as it is now; see `file`."""
+        return token_of(self.file(path.split("/")).stat())
 
     def is_folder(self, names: Sequence[str]) -> bool:
         """Whether a folder, not a link to one, is there."""
         try:
-            with self._folder(names):
-                return True
+            return self._unlinked(names).is_dir()
         except FileNotFoundError:
             return False
 
@@ -151,7 +109,9 @@ class Workspace:
         Raises:
             FileNotFoundError: there is no such folder.
         """
-        with self._folder(names) as folder, os.scandir(folder) as entries:
+        if not self.is_folder(names):
+            raise FileNotFoundError
+        with os.scandir(self._unlinked(names)) as entries:
             found = sorted(
                 (
                     Entry(
@@ -166,41 +126,16 @@ class Workspace:
             )
         return found[:_MOST_LISTED], max(0, len(found) - _MOST_LISTED)
 
-    def token(self, *paths: str) -> str:
-        """Token of the state of all finished stages and of some files; any change gives another.
+    def state(self, paths: Sequence[str]) -> tuple[str, ...]:
+        """Tokens of all finished stages and of some files, empty where there is none."""
+        files = (*(f"{name}/{STAGE_FILE}" for name in PRODUCTS), *paths)
+        return tuple(self.token(path) if self.has(path) else "" for path in files)
 
-        Args:
-            paths: paths of the files.
-        """
-        tokens = []
-        for path in (*(f"{name}/{STAGE_FILE}" for name in PRODUCTS), *paths):
-            try:
-                with self.opened(path.split("/")) as file:
-                    tokens.append(file.token)
-            except FileNotFoundError:
-                tokens.append("")
-        return " ".join(tokens)
-
-    @contextmanager
-    def _folder(self, names: Sequence[str]) -> Iterator[int]:
-        descriptor = _open(str(self.folder), os.O_RDONLY | os.O_DIRECTORY, None)
-        try:
-            for name in names:
-                below = _open(name, os.O_RDONLY | os.O_DIRECTORY, descriptor)
-                os.close(descriptor)
-                descriptor = below
-            yield descriptor
-        finally:
-            os.close(descriptor)
-
-
-def _open(name: str, flags: int, folder: int | None) -> int:
-    try:
-        return os.open(name, flags | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=folder)
-    except OSError as error:
-        if error.errno not in _NOT_THERE:
-            raise
-        raise FileNotFoundError(error.errno, error.strerror) from None
+    def _unlinked(self, names: Sequence[str]) -> Path:
+        path = self.folder.joinpath(*names)
+        if path.resolve() != path:
+            raise FileNotFoundError(path)
+        return path
 
 
 def _is_seen(entry: os.DirEntry[str], *, top: bool) -> bool:
@@ -221,7 +156,3 @@ def _may_be_named(name: str) -> bool:
         and not name.endswith(_UNFINISHED)
         and 0 < len(name.encode()) <= _LONGEST_NAME
     )
-
-
-def _token(status: os.stat_result) -> str:
-    return f"{status.st_ino:x}-{status.st_size:x}-{status.st_mtime_ns:x}"

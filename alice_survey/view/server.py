@@ -5,44 +5,38 @@ server by its address and port is refused, since a page of another site could ot
 through a name of its own (DNS rebinding). Nothing allows another site to read an answer.
 """
 
-import contextlib
+import os
 import re
-import socket
 import socketserver
 import sys
-import threading
-import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
+from email.message import Message
+from email.utils import formatdate
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, cast
 from urllib.parse import quote
 
 from alice_survey.base.errors import AliceError, WorkspaceError, known_fault, why
-from alice_survey.view.files import content_type, policy_of, send_part
-from alice_survey.view.layers import NAMES, ChangedError, Layers
+from alice_survey.base.run.interrupts import for_other_programs
+from alice_survey.report.held import Held
+from alice_survey.view.layers import FILES, ChangedError, Layers
 from alice_survey.view.page import Page, listing
-from alice_survey.view.paths import RefusedError, Workspace, names_of
-from alice_survey.view.pyramid import StoppedError
-from alice_survey.view.ranges import Version, answer_to
+from alice_survey.view.paths import RefusedError, Workspace, names_of, token_of
 
 ADDRESS = "127.0.0.1"
-_MOST_CONNECTIONS = 48
 _IDLE_S = 20.0
 """Time after which a silent connection is closed."""
-_BUSY_S = 2.0
-"""Time a new connection waits while there are too many."""
-_ENDING_S = 3.0
-"""Time to wait at the end for responses in progress."""
 _TILE = re.compile(
-    rf"/tiles/({'|'.join(NAMES)})/([0-9]{{1,2}})/([0-9]{{1,6}})/([0-9]{{1,6}})\.webp"
+    rf"/tiles/({'|'.join(FILES)})/([0-9]{{1,2}})/([0-9]{{1,6}})/([0-9]{{1,6}})\.webp"
 )
 _VERSION = re.compile(r"v=([0-9a-f-]{1,64})")
 _CHANGED = "the survey was worked on meanwhile: load the page again"
 _KEEP = "private, max-age=86400, immutable"
 """Cache policy of requests that state a version."""
 _ASK_AGAIN = "no-cache"
+_CHUNK = 1 << 20
 _NOTHING = "default-src 'none'; sandbox"
 _COMMON = {
     "X-Content-Type-Options": "nosniff",
@@ -51,6 +45,64 @@ _COMMON = {
     "Referrer-Policy": "no-referrer",
     "X-Frame-Options": "DENY",
 }
+
+
+_TEXT = "text/plain; charset=utf-8"
+_TYPES = {
+    ".bin": "application/octet-stream", ".csv": "text/csv; charset=utf-8",
+    ".geojson": "application/geo+json", ".glb": "model/gltf-binary",
+    ".gpkg": "application/geopackage+sqlite3", ".html": "text/html; charset=utf-8",
+    ".jpeg": "image/jpeg", ".jpg": "image/jpeg", ".json": "application/json",
+    ".kml": "application/vnd.google-earth.kml+xml",
+    ".kmz": "application/vnd.google-earth.kmz", ".laz": "application/vnd.laszip",
+    ".md": _TEXT, ".mtl": "model/mtl", ".obj": "model/obj", ".pdf": "application/pdf",
+    ".png": "image/png", ".svg": "image/svg+xml", ".tif": "image/tiff", ".tiff": "image/tiff",
+    ".toml": _TEXT, ".tum": _TEXT, ".txt": _TEXT, ".webp": "image/webp", ".xml": "text/xml",
+}  # fmt: skip
+_INERT = "default-src 'none'; sandbox"
+_CLOSED_PAGE = (
+    "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "
+    "script-src 'unsafe-inline'; base-uri 'none'; form-action 'none'; sandbox allow-scripts"
+)
+"""Policy of self-contained pages: they run, but reach neither a network nor this server."""
+_RANGE = re.compile(r"bytes=(?:([0-9]{1,18})-([0-9]{0,18})|-([0-9]{1,18}))")
+
+
+def content_type(name: str) -> str:
+    """Content type of a file, by the end of its name."""
+    return _TYPES.get(PurePath(name).suffix.lower(), "application/octet-stream")
+
+
+def policy_of(name: str) -> str:
+    """Content security policy of a file in a browser."""
+    return _CLOSED_PAGE if content_type(name).startswith("text/html") else _INERT
+
+
+def requested_bytes(headers: Message, size: int, tag: str) -> tuple[int, int, int]:
+    """Part of a file to send for a request (RFC 9110, sections 13 and 14).
+
+    Of several ranges at once, or one that is of another version, the whole file is the answer, as
+    the standard lets a server do.
+
+    Args:
+        headers: headers of the request.
+        size: size of the file, bytes.
+        tag: entity tag of its content.
+
+    Returns:
+        Status, first byte and number of bytes.
+    """
+    if tag in re.split(r"(?:\s*,\s*|^)(?:W/)?", headers.get("If-None-Match", "")):
+        return 304, 0, 0
+    found = _RANGE.fullmatch(headers.get("Range", ""))
+    if found is None or headers.get("If-Range", tag) != tag:
+        return 200, 0, size
+    first, last, suffix = found.groups()
+    if last and int(last) < int(first):
+        return 200, 0, size  # no range by the standard's grammar
+    start = int(first) if suffix is None else max(0, size - int(suffix))
+    end = min(int(last) + 1, size) if last else size
+    return (206, start, end - start) if start < end else (416, 0, 0)
 
 
 class Server(ThreadingHTTPServer):
@@ -71,12 +123,8 @@ class Server(ThreadingHTTPServer):
             WorkspaceError: the port is not available.
         """
         self.workspace = Workspace(folder)
-        self.stopping = threading.Event()
-        self.layers = Layers(self.workspace, self.stopping)
+        self.layers = Layers(self.workspace)
         self.page = Page(self.workspace, self.layers)
-        self._slots = threading.BoundedSemaphore(_MOST_CONNECTIONS)
-        self._connections: set[socket.socket] = set()
-        self._connections_lock = threading.Lock()
         try:
             super().__init__((ADDRESS, port), Handler)
         except OSError as error:
@@ -98,50 +146,14 @@ class Server(ThreadingHTTPServer):
         socketserver.TCPServer.server_bind(self)
         self.server_name, self.server_port = ADDRESS, self.server_address[1]
 
-    def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer a connection in a thread of its own, unless there are too many."""
-        if not self._slots.acquire(timeout=_BUSY_S):
-            with contextlib.suppress(OSError):
-                request.settimeout(0.1)
-                request.sendall(b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\n\r\n")
-            self.shutdown_request(request)
-            return
-        with self._connections_lock:
-            self._connections.add(request)
-        try:
-            super().process_request(request, client_address)
-        except BaseException:  # no thread could be started
-            self._forget(request)
-            raise
-
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Answer one connection."""
-        try:
-            super().process_request_thread(request, client_address)
-        finally:
-            self._forget(request)
-
-    def _forget(self, request: socket.socket) -> None:
-        with self._connections_lock:
-            self._connections.discard(request)
-        self._slots.release()
-
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore a browser that disconnects; report a bug."""
         if not isinstance(sys.exception(), (ConnectionError, TimeoutError)):
             super().handle_error(request, client_address)
 
     def server_close(self) -> None:
-        """Stop listening, and wait briefly for the responses in progress."""
-        self.stopping.set()
+        """Stop listening, and wait briefly for what is being read."""
         super().server_close()
-        with self._connections_lock:
-            for connection in self._connections:
-                with contextlib.suppress(OSError):
-                    connection.shutdown(socket.SHUT_RD)  # one that waits for a request ends
-        until = time.monotonic() + _ENDING_S
-        while self._connections and time.monotonic() < until:
-            time.sleep(0.01)
         self.layers.close()
 
 
@@ -175,7 +187,7 @@ class Handler(BaseHTTPRequestHandler):
             self._check_request()
         except _AnsweredError as fault:
             self.close_connection = True
-            self._tell(fault.status, str(fault))
+            self._send_line(fault.status, str(fault))
             return False
         return True
 
@@ -200,23 +212,20 @@ class Handler(BaseHTTPRequestHandler):
         try:
             self._answer()
         except _AnsweredError as fault:
-            self._tell(fault.status, str(fault))
+            self._send_line(fault.status, str(fault))
         except RefusedError as fault:
-            self._tell(HTTPStatus.BAD_REQUEST, str(fault))
+            self._send_line(HTTPStatus.BAD_REQUEST, str(fault))
         except ChangedError:
-            self._tell(HTTPStatus.CONFLICT, _CHANGED)
-        except StoppedError:
-            self.close_connection = True
-            self._tell(HTTPStatus.SERVICE_UNAVAILABLE, "the server is shut down")
+            self._send_line(HTTPStatus.CONFLICT, _CHANGED)
         except FileNotFoundError:
-            self._tell(HTTPStatus.NOT_FOUND, "nothing is here")
+            self._send_line(HTTPStatus.NOT_FOUND, "nothing is here")
         except (ConnectionError, TimeoutError):
             raise
         except Exception as fault:
             self.close_connection = True
             known = known_fault(fault)
             if not self._begun:
-                self._tell(HTTPStatus.INTERNAL_SERVER_ERROR, known or "a fault of the program")
+                self._send_line(HTTPStatus.INTERNAL_SERVER_ERROR, known or "a fault of the program")
             if known is None:
                 raise
 
@@ -246,11 +255,11 @@ class Handler(BaseHTTPRequestHandler):
     def _made_page(self, host: str) -> tuple[bytes, str]:
         """The survey's page; a stage that is replaced meanwhile is not an error."""
         workspace = self._served.workspace
-        before = workspace.token()
+        before = workspace.state(())
         try:
             return self._served.page.survey(host)
         except (AliceError, FileNotFoundError):
-            if workspace.token() == before:
+            if workspace.state(()) == before:
                 raise
             raise ChangedError from None
 
@@ -263,25 +272,29 @@ class Handler(BaseHTTPRequestHandler):
         if workspace.is_folder(names):
             self._go_to("/files/" + "/".join(quote(name) for name in names) + "/")
             return
-        with workspace.opened(names) as file:
-            version = Version(token=file.token, modified_s=file.modified_ns / 1e9)
-            given = {name.lower(): text for name, text in self.headers.items()}
-            answer = answer_to(given, file.size, version, is_get=self.command == "GET")
+        with workspace.file(names).open("rb") as file:
+            status = os.fstat(file.fileno())
+            tag, size = f'"{token_of(status)}"', status.st_size
             headers = {
                 "Content-Type": content_type(names[-1]),
                 "Accept-Ranges": "bytes",
-                "ETag": version.tag,
-                "Last-Modified": version.date,
+                "ETag": tag,
+                "Last-Modified": formatdate(int(status.st_mtime), usegmt=True),
             }
-            if answer.status == 206:
-                last = answer.first + answer.count - 1
-                headers["Content-Range"] = f"bytes {answer.first}-{last}/{file.size}"
-            elif answer.status == 416:
-                headers["Content-Range"] = f"bytes */{file.size}"
-            self._begin(answer.status, policy_of(names[-1]), answer.count, _ASK_AGAIN, headers)
-            if self.command == "GET" and answer.count:
-                sent = send_part(self.connection, file, answer.first, answer.count)
-                self.close_connection |= sent < answer.count  # it was cut short meanwhile
+            code, first, count = 200, 0, size
+            if self.command == "GET":  # ranges have no meaning for HEAD
+                code, first, count = requested_bytes(self.headers, size, tag)
+            if code == 206:
+                headers["Content-Range"] = f"bytes {first}-{first + count - 1}/{size}"
+            elif code == 416:
+                headers["Content-Range"] = f"bytes */{size}"
+            self._begin(code, policy_of(names[-1]), count, _ASK_AGAIN, headers)
+            if self.command == "GET":
+                file.seek(first)
+                while count and (chunk := file.read(min(_CHUNK, count))):
+                    self.wfile.write(chunk)
+                    count -= len(chunk)
+                self.close_connection |= count > 0  # it was cut short meanwhile
 
     def _send(self, content: bytes, policy: str, kind: str) -> None:
         """A page that is made for each request."""
@@ -300,7 +313,7 @@ class Handler(BaseHTTPRequestHandler):
     def _go_to(self, place: str) -> None:
         self._begin(HTTPStatus.MOVED_PERMANENTLY, _NOTHING, 0, _ASK_AGAIN, {"Location": place})
 
-    def _tell(self, status: HTTPStatus, text: str) -> None:
+    def _send_line(self, status: HTTPStatus, text: str) -> None:
         """Answer with a line."""
         content = f"{text}\n".encode()
         headers = {"Content-Type": "text/plain; charset=utf-8"}
@@ -332,21 +345,36 @@ class Handler(BaseHTTPRequestHandler):
         """Answer a malformed request in the same format as all others."""
         self.close_connection = True
         self.command = self.command or "GET"
-        self._tell(HTTPStatus(code), message or explain or HTTPStatus(code).phrase)
+        self._send_line(HTTPStatus(code), message or explain or HTTPStatus(code).phrase)
 
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002
         """Do not log requests."""
 
 
-@contextlib.contextmanager
-def serving(folder: Path, port: int = 0) -> Iterator[Server]:
-    """A server that runs in a thread of its own within this block."""
-    server = Server(folder, port)
-    thread = threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True)
-    thread.start()
+def run_view(workspace: Path, port: int, *, browser: bool, show: Callable[[str], None]) -> None:
+    """Serve a workspace; Ctrl-C ends it as it ends every command.
+
+    Args:
+        workspace: the workspace to show.
+        port: to listen on; 0 for any that is free.
+        browser: open one.
+        show: prints a line.
+
+    Raises:
+        WorkspaceError: there is nothing to show, or the port is taken.
+    """
+    if not Held.of(workspace).stages:
+        raise WorkspaceError(
+            f"{workspace} holds nothing to show: run 'alice-survey plan' or 'import-images'"
+        )
+    server = Server(workspace, port)
     try:
-        yield server
+        show(f"{workspace} is shown at {server.url} to this machine alone; Ctrl-C ends it")
+        if browser:
+            import webbrowser
+
+            with for_other_programs():
+                webbrowser.open(server.url)
+        server.serve_forever()
     finally:
-        server.shutdown()
         server.server_close()
-        thread.join()

@@ -160,7 +160,7 @@ def _of_text(name: str, text: Callable[[], str]) -> Callable[[Path], None]:
 
 
 def _target(name: str, file: str, build: Callable[[Path], None], **more: object) -> Target:
-    settings = {"syntax": "binary", "read": read_area, "native": True} | more
+    settings = {"syntax": "binary", "read": read_area} | more
     return Target(name=name, file=file, build=build, **settings)  # type: ignore[arg-type]
 
 
@@ -182,7 +182,7 @@ TARGETS = (
     _target("KML", "a.kml", _of_text("a.kml", kml), syntax="text"),
     _target("KMZ", "a.kmz", _kmz),
     _target("WKT", "a.wkt", _of_text("a.wkt", _wkt), syntax="text"),
-    _target("QGC plan", "a.plan", _of_text("a.plan", qgc_plan), syntax="json", native=False),
+    _target("QGC plan", "a.plan", _of_text("a.plan", qgc_plan), syntax="json"),
     _target("GeoPackage", "a.gpkg", _geopackage),
     _target("shapefile", "a.shp", build_shapefile),
     *(

@@ -192,7 +192,7 @@ def _calibration(
 
 def _image(name: str, file: str, build: Callable[[Path], None], **more: Any) -> Target:
     settings = {"read": read_picture} | more
-    return Target(name=name, syntax="binary", file=file, build=build, native=True, **settings)
+    return Target(name=name, syntax="binary", file=file, build=build, **settings)
 
 
 TARGETS = (

@@ -40,13 +40,10 @@ class Verdict:
     """What a reader did with a file."""
 
     outcome: Literal["value", "refused", "fault"]
-    told: str = ""
+    message: str = ""
     """The message of a refusal; of a fault, what it is and where, the same for the same fault."""
     trace: str = ""
     """Of an exception that is a fault."""
-    took_s: float = 0.0
-    peak_bytes: int = 0
-    """How far resident memory rose meanwhile."""
 
 
 class Sandbox:
@@ -104,38 +101,38 @@ def judge(
     """Let a reader read a file of the sandbox, and judge what it did."""
     started, before = time.monotonic(), _resident()
     outcome: Literal["value", "refused", "fault"] = "value"
-    told = trace = place = ""
+    message = trace = place = ""
     try:
         with sandbox.entered(), _bounded(longest_s), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             read(path)
     except AliceError as error:
-        outcome, told, place = "refused", str(error), _place(error)
+        outcome, message, place = "refused", str(error), _place(error)
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # a library in Rust that panics raises no Exception
         outcome = "fault"
-        told, trace = _signature(error), "".join(traceback.format_exception(error))
+        message, trace = _signature(error), "".join(traceback.format_exception(error))
     took_s, peak = time.monotonic() - started, max(0, _peak() - before)
-    fault = _misworded(told, sandbox) if outcome == "refused" else ""
+    fault = _misworded(message, sandbox) if outcome == "refused" else ""
     if fault:
-        trace, outcome, told = told, "fault", f"{fault} in {place}"
+        trace, outcome, message = message, "fault", f"{fault} in {place}"
     if outcome != "fault" and took_s > longest_s:
-        outcome, told = "fault", f"took over {longest_s:g} s"
+        outcome, message = "fault", f"took over {longest_s:g} s"
     if outcome != "fault" and peak > most_bytes:
-        outcome, told = "fault", f"took over {most_bytes >> 20} MiB"
+        outcome, message = "fault", f"took over {most_bytes >> 20} MiB"
     strays = sandbox.written()
     if strays:
         names = ", ".join(os.path.relpath(p, sandbox.root) for p in strays)
-        outcome, told = "fault", f"wrote or changed {names}"
-    return Verdict(outcome=outcome, told=told, trace=trace, took_s=took_s, peak_bytes=peak)
+        outcome, message = "fault", f"wrote or changed {names}"
+    return Verdict(outcome=outcome, message=message, trace=trace)
 
 
 @contextlib.contextmanager
 def _bounded(longest_s: float) -> Iterator[None]:
     """Less memory than there is, and an alarm.
 
-    The alarm cannot stop a library's own loop; a campaign runs readers in a process to be ended.
+    The alarm cannot stop a library's own loop.
     """
 
     def ring(_: int, __: FrameType | None) -> Any:
@@ -153,13 +150,13 @@ def _bounded(longest_s: float) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-def _misworded(told: str, sandbox: Sandbox) -> str:
+def _misworded(message: str, sandbox: Sandbox) -> str:
     """What is wrong with the wording of a refusal."""
-    if len(told.splitlines()) > 1 or "\x1b" in told:
+    if len(message.splitlines()) > 1 or "\x1b" in message:
         return "message of several lines"
-    if len(told) > LONGEST_MESSAGE:
+    if len(message) > LONGEST_MESSAGE:
         return f"message of over {LONGEST_MESSAGE} characters"
-    if not sandbox.names & set(_NAME.findall(told)):
+    if not sandbox.names & set(_NAME.findall(message)):
         return "message that names no file"
     return ""
 

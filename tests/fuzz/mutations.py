@@ -1,7 +1,7 @@
 """Files damaged as users and disks damage them: by what they hold, and byte by byte.
 
-Every choice is drawn from one `random.Random`, so that hypothesis can shrink a fault, and a
-campaign can repeat it.
+Every choice is drawn from one `random.Random`, so that hypothesis can shrink and
+repeat a fault.
 """
 
 import json

@@ -22,5 +22,3 @@ class Target:
     """Takes the path of the file."""
     examples: int = 20
     """How often the short form tries it: fewer where one try takes long."""
-    native: bool = False
-    """Mostly read by a compiled library, whose paths an engine does not see."""

@@ -1,4 +1,4 @@
-"""The table of everything that is read from outside: both engines go through it."""
+"""The table of everything that is read from outside."""
 
 from collections.abc import Mapping
 from pathlib import Path

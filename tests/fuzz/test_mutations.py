@@ -1,6 +1,5 @@
-"""Every reader, with files damaged by `mutations`: the short form of `campaign`."""
+"""Every reader of files from outside, with files damaged by `mutations`."""
 
-import json
 from pathlib import Path
 from random import Random
 
@@ -10,14 +9,14 @@ from hypothesis import strategies as st
 
 from alice_survey.base.errors import PlanError, WorkspaceError
 from tests.fuzz.judge import Sandbox, judge
-from tests.fuzz.mutations import MOST_BYTES, mutate
-from tests.fuzz.targets import GROUPS, TARGETS, Trial
+from tests.fuzz.mutations import mutate
+from tests.fuzz.targets import TARGETS, Trial
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_spoilt_files_are_read_or_refused_in_one_line(name: str, tmp_path: Path) -> None:
+def test_damaged_files_are_read_or_refused_in_one_line(name: str, tmp_path: Path) -> None:
     trial = Trial(TARGETS[name], tmp_path)
     assert trial.verdict(trial.good).outcome == "value"
     outcomes: list[str] = []
@@ -31,28 +30,10 @@ def test_spoilt_files_are_read_or_refused_in_one_line(name: str, tmp_path: Path)
         data = mutate(trial.good, trial.target.syntax, rng)
         verdict = trial.verdict(data)
         outcomes.append(verdict.outcome)
-        assert verdict.outcome != "fault", f"{verdict.told}\n{verdict.trace}\n{data[:2000]!r}"
+        assert verdict.outcome != "fault", f"{verdict.message}\n{verdict.trace}\n{data[:2000]!r}"
 
     attempt()
     assert len(outcomes) >= trial.target.examples
-
-
-def test_target_names_are_of_one_target_each() -> None:
-    assert len(TARGETS) == sum(len(targets) for targets in GROUPS.values())
-
-
-@pytest.mark.parametrize("syntax", ["json", "toml", "csv", "text", "binary"])
-def test_mutations_spoil_and_repeat(syntax: str) -> None:
-    good = json.dumps({"a": [1.5, {"b": "c"}], "d": None}).encode() + b"\nx = 1, 2\n" * 20
-    first = [mutate(good, syntax, _random(seed)) for seed in range(200)]  # type: ignore[arg-type]
-    again = [mutate(good, syntax, _random(seed)) for seed in range(200)]  # type: ignore[arg-type]
-    assert first == again
-    assert len(set(first)) > 120
-    assert max(map(len, first)) <= MOST_BYTES
-
-
-def _random(seed: int) -> Random:
-    return Random(seed)  # noqa: S311
 
 
 def _slow(_: Path) -> None:
@@ -77,23 +58,23 @@ def _wordy(_: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("read", "told"),
+    ("read", "fault"),
     [
         (_slow, "took over"), (_greedy, "MiB"), (_leaking, "wrote or changed in/more"),
         (_plain, "KeyError"), (_wordy, "several lines"),
     ],
 )  # fmt: skip
-def test_the_judge_sees_each_kind_of_fault(read: object, told: str, tmp_path: Path) -> None:
+def test_the_judge_sees_each_kind_of_fault(read: object, fault: str, tmp_path: Path) -> None:
     sandbox = Sandbox(tmp_path)
     verdict = judge(
         read,  # type: ignore[arg-type]
         sandbox.inside / "file",
         sandbox,
         most_bytes=200 << 20,
-        longest_s=0.3,
+        longest_s=2.0,
     )
     assert verdict.outcome == "fault"
-    assert told in verdict.told
+    assert fault in verdict.message
 
 
 def test_the_judge_takes_a_refusal_for_what_it_is(tmp_path: Path) -> None:

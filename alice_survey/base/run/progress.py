@@ -9,13 +9,15 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from datetime import UTC, datetime
-from typing import Any, TypeVar
+from typing import Any
+
+from rich.progress import Task
 
 from alice_survey.base.errors import LOG, is_in_task
-from alice_survey.base.run.display import Bars, Console
+from alice_survey.base.run.display import Console, progress_bars
 from alice_survey.base.run.events import Event
 
 _REPORTED_EVERY_S = 0.5
@@ -23,86 +25,32 @@ _REPORTED_EVERY_S = 0.5
 _ALIVE_EVERY_S = 5.0
 """Time between two such events where nothing changes."""
 _TICK_S = 1.0
-_KEPT = 256
 _LEVELS = {"warning": logging.WARNING, "error": logging.ERROR}
 
-Item = TypeVar("Item")
 Clock = Callable[[], float]
-
-
-class Remaining:
-    """Remaining time of work on equal items, from when items were done.
-
-    The first items say nothing: processes start, kernels are compiled. Time is counted from the
-    first done on, and of it the last half, so that a slow start and a change of pace are forgotten.
-    Items that are worked on in parallel end together: fewer of them than that say nothing.
-    """
-
-    def __init__(self, width: int) -> None:
-        self._width = width
-        self._seen: list[tuple[float, int]] = []
-
-    def note(self, done: int, now_s: float) -> None:
-        """This number is done by now."""
-        if len(self._seen) >= _KEPT:  # every other one says as much
-            del self._seen[1:-1:2]
-        self._seen.append((now_s, done))
-
-    def left_s(self, total: int, now_s: float) -> float | None:
-        """Remaining time; None as long as it cannot be estimated."""
-        if not self._seen:
-            return None
-        last_s, done = self._seen[-1]
-        waited_s = now_s - last_s
-        if done >= total:
-            return 0.0
-        since_s, count = self._reference(now_s)
-        if done - count < self._width:
-            return None
-        each_s = (last_s - since_s) / (done - count)
-        if waited_s > each_s:  # the next one takes longer than those before
-            each_s = (now_s - since_s) / (done - count + 1)
-        return max(0.0, (total - done) * each_s - min(waited_s, each_s))
-
-    def _reference(self, now_s: float) -> tuple[float, int]:
-        """The last time before half of it all after which enough was done."""
-        first_s, _ = self._seen[0]
-        done = self._seen[-1][1]
-        middle_s = first_s + (now_s - first_s) / 2
-        found = self._seen[0]
-        for at_s, count in self._seen:
-            if at_s > middle_s or done - count < 2 * self._width:
-                break
-            found = (at_s, count)
-        return found
 
 
 class Step:
     """A running part of a stage."""
 
-    def __init__(self, run: "Run", label: str, number: int, total: int | None, width: int) -> None:
-        self._run, self._expected = run, total
-        self.label, self.number = label, number
+    def __init__(self, run: "Run", label: str, number: int, total: int | None) -> None:
+        self._run = run
+        self.label, self.number, self.total = label, number, total
         self.done = None if total is None else 0
-        self.reported_s = self.started_s = run.clock()
-        self._remaining = Remaining(width)
+        self.task = run.begin_task(label, total)
+        self.reported_s = run.clock()
 
     def advance(self, items: int = 1) -> None:
         """Count more items as done."""
         self.done = (self.done or 0) + items
-        self._remaining.note(self.done, self._run.clock())
-        self._run.moved(self)
+        if self.total is not None and self.done > self.total:
+            self.total = self.task.total = None  # more than expected: their number is open
+        self._run.advance(self, items)
 
     @property
-    def total(self) -> int | None:
-        """How many items are expected, unless there are more already."""
-        return None if (self.done or 0) > (self._expected or 0) else self._expected
-
-    @property
-    def left_s(self) -> float | None:
-        """Remaining time; None where it cannot be estimated."""
-        total = self.total
-        return None if total is None else self._remaining.left_s(total, self._run.clock())
+    def remaining_s(self) -> float | None:
+        """Remaining time, from the pace of the last minutes; None where it cannot be estimated."""
+        return None if self.total is None else self.task.time_remaining
 
 
 class Run:
@@ -130,14 +78,13 @@ class Run:
         self.stages_begun = 0
         self._console, self._log = console, log
         self._handlers = [*([console] if console else []), *files]
-        self._bars: Bars | None = console.bars if console else None
+        self._bars = progress_bars(clock, shown=console is not None and console.has_bars)
         self._started_s = clock()
-        self._stages: list[tuple[str, float]] = []
+        self._stages: list[tuple[str, Task]] = []
         self._steps: list[Step] = []
         self._steps_begun = 0
         self._lock = threading.RLock()
         self._ticks, self._closed = ticks, threading.Event()
-        self._ticking: threading.Thread | None = None
 
     @property
     def is_quiet(self) -> bool:
@@ -150,12 +97,11 @@ class Run:
         log.filters[:] = [self._complete]
 
     def close(self) -> None:
-        """Report nothing more."""
+        """Report nothing more, and restore the terminal."""
         self._closed.set()
-        ticking = self._ticking
-        if ticking is not None:
-            ticking.join()
         with self._lock:
+            if not self._bars.disable:
+                self._bars.stop()
             for handler in self._handlers:
                 handler.close()
 
@@ -172,41 +118,37 @@ class Run:
     def begin_stage(self, name: str, title: str, facts: Mapping[str, Any]) -> None:
         """A stage begins; the user sees its title."""
         with self._lock:
-            self._stages.append((name, self.clock()))
+            self._stages.append((name, self.begin_task(name, None)))
             self.stages_begun += 1
             self._emit(self._event("stage_started", elapsed_s=0.0, message=title, **facts))
-            if self._bars:
-                self._bars.show(self._stages[-1], name)
-            self._tick_on()
 
     def end_stage(self, facts: Mapping[str, Any] | None) -> None:
         """It ends; without facts it has failed."""
         with self._lock:
             for step in list(self._steps):  # of generators that nobody went on with
                 self.end_step(step, complete=False)
+            _, task = self._stages[-1]
             if facts is not None:
-                elapsed_s = self.clock() - self._stages[-1][1]
-                self._emit(self._event("stage_finished", elapsed_s=elapsed_s, **facts))
-            ended = self._stages.pop()
-            if self._bars:
-                self._bars.remove(ended)
+                self._emit(self._event("stage_finished", elapsed_s=task.elapsed, **facts))
+            self._stages.pop()
+            self._end_task(task)
 
-    def begin_step(self, label: str, total: int | None, width: int) -> Step:
+    def begin_step(self, label: str, total: int | None) -> Step:
         """A step begins."""
         with self._lock:
-            if self._console:
-                self._console.rest()
             self._steps_begun += 1
-            step = Step(self, label, self._steps_begun, total, width)
+            step = Step(self, label, self._steps_begun, total)
             self._steps.append(step)
             self._emit_step("step_started", step)
-            self._tick_on()
             return step
 
-    def moved(self, step: Step) -> None:
-        """Report more of a step as done."""
-        if self.clock() - step.reported_s >= _REPORTED_EVERY_S:
-            with self._lock:
+    def advance(self, step: Step, items: int) -> None:
+        """Count more items of a step as done; report it now and then."""
+        count = f"{step.done}" if step.total is None else f"{step.done} of {step.total}"
+        with self._lock:
+            if step in self._steps:
+                self._bars.update(step.task.id, advance=items, count=count)
+            if self.clock() - step.reported_s >= _REPORTED_EVERY_S:
                 self._emit_step("step_progress", step)
 
     def end_step(self, step: Step, *, complete: bool) -> None:
@@ -216,22 +158,31 @@ class Run:
                 return
             self._emit_step("step_finished", step, complete=complete)
             self._steps.remove(step)
-            if self._bars:
-                self._bars.remove(step)
+            self._end_task(step.task)
 
     def tick(self) -> None:
-        """Report steps that have been silent for a while."""
+        """Report steps, or a stage without one, that have been silent for a while."""
         with self._lock:
-            now_s = self.clock()
             for step in self._steps:
-                self._show(step)
-                if now_s - step.reported_s >= _ALIVE_EVERY_S:
+                if self.clock() - step.reported_s >= _ALIVE_EVERY_S:
                     self._emit_step("step_progress", step)
-            if self._console and self._steps:
-                self._console.tick(self._event_of("step_progress", self._steps[-1]))
-            elif self._console and self._stages:
-                elapsed_s = now_s - self._stages[-1][1]
-                self._console.tick(self._event("stage_runs", elapsed_s=elapsed_s))
+            if self._stages and not self._steps and self._console and not self.is_quiet:
+                event = self._event("stage_runs", elapsed_s=self._stages[-1][1].elapsed)
+                self._console.emit(logging.makeLogRecord({"event": event}))
+
+    def begin_task(self, label: str, total: int | None) -> Task:
+        """Start a clock, and on a terminal a bar."""
+        if self._ticks:  # not before: signals are blocked by now, also in this thread
+            threading.Thread(target=self._tick_often, name="ticks", daemon=True).start()
+            self._ticks = False
+        self._bars.start()
+        self._bars.add_task(label, total=total, count="" if total is None else f"0 of {total}")
+        return self._bars.tasks[-1]
+
+    def _end_task(self, task: Task) -> None:
+        self._bars.remove_task(task.id)
+        if not self._bars.tasks and not self._bars.disable:
+            self._bars.stop()
 
     def _event(self, name: str, **known: Any) -> Event:
         utc = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
@@ -241,23 +192,20 @@ class Run:
         event = {"time_utc": utc, "event": name, "stage": stage, **known}
         return {key: value for key, value in event.items() if value is not None}
 
-    def _event_of(self, name: str, step: Step, **facts: Any) -> Event:
-        left_s = step.left_s if name == "step_progress" else None
-        return self._event(
-            name,
-            step=step.label,
-            step_number=step.number,
-            done=step.done,
-            total=step.total,
-            elapsed_s=self.clock() - step.started_s,
-            remaining_s=None if left_s is None else round(left_s, 1),
-            **facts,
-        )
-
     def _emit_step(self, name: str, step: Step, **facts: Any) -> None:
         step.reported_s = self.clock()
-        self._emit(self._event_of(name, step, **facts))
-        self._show(step)
+        self._emit(
+            self._event(
+                name,
+                step=step.label,
+                step_number=step.number,
+                done=step.done,
+                total=step.total,
+                elapsed_s=step.task.elapsed,
+                remaining_s=step.remaining_s if name == "step_progress" else None,
+                **facts,
+            )
+        )
 
     def _emit(self, event: Event) -> None:
         level = _LEVELS.get(event["event"], logging.INFO)
@@ -272,22 +220,9 @@ class Run:
             record.event = self._event(name, elapsed_s=elapsed_s, message=record.getMessage())
         return True
 
-    def _show(self, step: Step) -> None:
-        if self._bars and step in self._steps:
-            self._bars.show(step, step.label, step.done, step.total, step.left_s)
-
-    def _tick_on(self) -> None:
-        if self._ticks and self._ticking is None:
-            self._ticking = threading.Thread(target=self._tick_often, name="ticks", daemon=True)
-            self._ticking.start()
-
     def _tick_often(self) -> None:
         while not self._closed.wait(_TICK_S):
-            with self._lock:
-                if not self._steps and not self._stages:
-                    self._ticking = None
-                    return
-                self.tick()
+            self.tick()
 
 
 _runs: list[Run] = []
@@ -357,16 +292,15 @@ def skipped(name: str) -> None:
 
 
 @contextlib.contextmanager
-def step(label: str, total: int | None = None, *, width: int = 1) -> Iterator[Step]:
+def step(label: str, total: int | None = None) -> Iterator[Step]:
     """A step of a stage, or of a command without stages, is worked on; its items are counted on it.
 
     Args:
         label: what it does, in a few words.
         total: how many items are to be done, if they are counted.
-        width: how many are worked on in parallel.
     """
     run = current()
-    begun = run.begin_step(label, total, width)
+    begun = run.begin_step(label, total)
     complete = False
     try:
         yield begun
@@ -376,11 +310,3 @@ def step(label: str, total: int | None = None, *, width: int = 1) -> Iterator[St
         raise
     finally:
         run.end_step(begun, complete=complete)
-
-
-def counted(items: Iterable[Item], label: str, total: int | None, width: int) -> Iterator[Item]:
-    """Pass on items that took work to produce, and count them."""
-    with step(label, total, width=width) as begun:
-        for item in items:
-            begun.advance()
-            yield item

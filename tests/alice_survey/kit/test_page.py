@@ -4,19 +4,16 @@ import base64
 import hashlib
 import json
 import re
-import tomllib
 from dataclasses import replace
-from fnmatch import fnmatch
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
 
 from alice_survey.kit import map as kit_map
-from alice_survey.kit import page
-from alice_survey.kit.document import Report, Section, Table
+from alice_survey.kit.document import Report, Table
 from alice_survey.kit.map import map_extent, round_length
-from alice_survey.kit.page import render_html
+from alice_survey.kit.page import numeric_columns, render_html
 from tests.alice_survey.kit.sketch import RUDE, encoded, picture_layer, seafloor, sketch_report
 
 ROOT = Path(__file__).parents[3]
@@ -94,18 +91,6 @@ def test_policy_names_each_script_and_style(text: str) -> None:
         assert f"'sha256-{digest}'" in policy
 
 
-def test_order_of_the_page(report: Report, text: str) -> None:
-    marks = [
-        "<h1>", *report.summary.values(), report.verdicts[0].text, "pictures placed",
-        "<h2>Contents",
-        *(f">{section.title}</h2>" for section in report.sections),
-    ]  # fmt: skip
-    at = [text.index(mark) for mark in marks]
-    assert at == sorted(at)
-    for _, word in (("bad", "Bad"), ("look", "Look"), ("good", "Good")):
-        assert f"{word}</b><span>" in text
-
-
 def test_a_report_without_scenes_runs_nothing(report: Report) -> None:
     plain = replace(
         report, map=None, mesh=None, sections=[s for s in report.sections if s.scene is None]
@@ -117,27 +102,23 @@ def test_a_report_without_scenes_runs_nothing(report: Report) -> None:
 
 
 def test_contradictions_are_refused(report: Report) -> None:
-    with pytest.raises(ValueError, match="sections share a name"):
-        render_html(replace(report, sections=[*report.sections, report.sections[-1]]))
-    with pytest.raises(ValueError, match="show the map"):
-        render_html(replace(report, map=None))
-    with pytest.raises(ValueError, match="show the mesh"):
-        render_html(replace(report, sections=report.sections[:1]))
     assert report.map is not None
-    again = replace(report.map, layers=[*report.map.layers, report.map.layers[0]])
-    with pytest.raises(ValueError, match="layers share a name"):
-        render_html(replace(report, map=again))
-    twice = [picture_layer(name, name, seafloor(20, 20), shown=True) for name in "ab"]
-    other = replace(report.map, layers=twice)
-    with pytest.raises(ValueError, match="more than one base layer"):
-        render_html(replace(report, map=other))
+    layers, sections = report.map.layers, report.sections
+    shown_twice = [picture_layer(name, name, seafloor(20, 20), shown=True) for name in "ab"]
+    for changes in (
+        {"sections": [*sections, sections[-1]]}, {"map": None}, {"sections": sections[:1]},
+        {"map": replace(report.map, layers=[*layers, layers[0]])},
+        {"map": replace(report.map, layers=shown_twice)},
+    ):  # fmt: skip
+        with pytest.raises(ValueError):
+            render_html(replace(report, **changes))
 
 
 def test_kinds_of_tiles() -> None:
     picture = seafloor(8, 8)
     for kind in ("JPEG", "PNG", "WEBP"):
         assert kit_map.picture_kind(encoded(picture, kind)) == kind.lower()
-    with pytest.raises(ValueError, match="not a JPEG, PNG or WebP"):
+    with pytest.raises(ValueError):
         kit_map.picture_kind(encoded(picture, "GIF"))
 
 
@@ -176,21 +157,10 @@ def test_round_length(length: float, expected: float) -> None:
         ("2026-05-04T10:00:00Z", False),
     ],
 )  # fmt: skip
-def test_numbers_stand_to_the_right(report: Report, cell: str, number: bool) -> None:
-    table = Table(title="T", header=["what", "value"], rows=[["a", cell], ["b", "–"], ["c", ""]])
-    plain = replace(
-        report, map=None, mesh=None, sections=[Section(name="t", title="T", tables=[table])]
-    )
-    assert ('<td class="num">' in render_html(plain)) == number
-
-
-def test_a_word_among_numbers_stands_with_them(report: Report) -> None:
-    rows = [["a", "0.12"], ["b", "0.3"], ["c", "held"]]
-    table = Table(title="T", header=["what", "sigma"], rows=rows)
-    plain = replace(
-        report, map=None, mesh=None, sections=[Section(name="t", title="T", tables=[table])]
-    )
-    assert '<td class="num">held</td>' in render_html(plain)
+def test_columns_of_numbers_are_recognised(cell: str, number: bool) -> None:
+    rows = [["a", cell, "0.12"], ["b", "–", "0.3"], ["c", "", "held"]]
+    table = Table(title="T", header=["what", "value", "sigma"], rows=rows)
+    assert numeric_columns(table) == [False, number, True]
 
 
 def test_committed_libraries_are_those_of_the_lock() -> None:
@@ -207,12 +177,3 @@ def test_committed_libraries_are_those_of_the_lock() -> None:
         assert (ROOM / "web" / file).read_text().startswith(f"/*! {name} {version} (")
         assert f"{name} {version}\n" in licences
         assert re.search(r"Copyright", (ROOM / "web" / file).read_text()[:400])
-
-
-def test_package_carries_what_the_page_reads() -> None:
-    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
-    globs = settings["package-data"]["alice_survey"]
-    files = ("page.css", "web/vendor_map.css", "web/LICENCES", *page._MAP_SCRIPTS)
-    for file in (*files, *page._MESH_SCRIPTS):
-        assert (ROOM / file).is_file()
-        assert any(fnmatch(f"kit/{file}", glob) for glob in globs), file

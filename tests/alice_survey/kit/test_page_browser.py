@@ -127,18 +127,6 @@ def test_fits_its_window(page: Any) -> None:
     assert wide[0] <= wide[1]
 
 
-def test_summary_comes_first(page: Any, report: Report) -> None:
-    page.evaluate("scrollTo({top: 0, behavior: 'instant'})")
-    first = page.get_by_text(next(iter(report.summary.values())))
-    box = first.bounding_box()
-    assert box["y"] + box["height"] < 0.6 * page.viewport_size["height"]
-    sizes = page.evaluate(
-        "[...document.querySelectorAll('.summary dd, .part p')]"
-        ".map((element) => parseFloat(getComputedStyle(element).fontSize))"
-    )
-    assert sizes[0] == max(sizes)
-
-
 def test_map_pans(page: Any) -> None:
     east, north = data(page, MAP, "east"), data(page, MAP, "north")
     px_per_m = 2 ** data(page, MAP, "zoom")
@@ -178,31 +166,6 @@ def test_mosaic_zooms(page: Any) -> None:
     page.get_by_role("button", name="Zoom out").click()
     assert settled(page, MAP, "zoom", before) == before - 1
     page.keyboard.press("Tab")
-
-
-def test_full_resolution_stays_sharp(page: Any) -> None:
-    page.locator(MAP).focus()
-    for _ in range(4):
-        before = data(page, MAP, "zoom")
-        page.keyboard.press("+")
-        settled(page, MAP, "zoom", before)
-    page.wait_for_timeout(300)
-    drawn = page.evaluate(
-        "[...document.querySelectorAll('#map-canvas img.leaflet-image-layer')]"
-        ".map((tile) => getComputedStyle(tile).imageRendering)"
-    )
-    assert drawn and set(drawn) == {"pixelated"}
-
-
-def test_wheel_scrolls_the_page_until_the_map_is_chosen(page: Any) -> None:
-    zoom = data(page, MAP, "zoom")
-    page.evaluate("scrollTo({top: 0, behavior: 'instant'})")
-    point_at(page, MAP)
-    before = page.evaluate("scrollY")
-    page.mouse.wheel(0, 120)
-    page.wait_for_timeout(400)
-    assert page.evaluate("scrollY") > before
-    assert data(page, MAP, "zoom") == zoom
 
 
 def test_layers_switch(page: Any) -> None:
@@ -267,16 +230,6 @@ def test_popups(page: Any) -> None:
     page.keyboard.press("Escape")
 
 
-def test_popup_by_keyboard(page: Any) -> None:
-    page.locator(MAP).focus()
-    page.keyboard.press("Enter")
-    popup = page.locator(".leaflet-popup-content")
-    popup.wait_for()
-    assert popup.inner_text().startswith(("Flown track", "Planned lines", "Check points"))
-    page.keyboard.press("Escape")
-    popup.wait_for(state="detached")
-
-
 def test_mesh_is_drawn_and_turns(page: Any) -> None:
     page.locator(MESH).scroll_into_view_if_needed()
     first = picture_of(page, MESH)
@@ -296,30 +249,6 @@ def test_mesh_is_drawn_and_turns(page: Any) -> None:
     distance = data(page, MESH, "distance")
     page.keyboard.press("+")
     assert settled(page, MESH, "distance", distance) == pytest.approx(distance / 1.2, rel=1e-4)
-
-
-def test_buttons_of_the_mesh(page: Any) -> None:
-    for label, name, by in (
-        ("Turn left", "azimuth", 7.5),
-        ("Turn right", "azimuth", -7.5),
-        ("Look from higher", "above", 7.5),
-        ("Look from lower", "above", -7.5),
-    ):
-        before = data(page, MESH, name)
-        page.get_by_role("button", name=label).click()
-        assert settled(page, MESH, name, before) == pytest.approx(before + by, abs=0.01)
-    for label, factor in (("Nearer", 1 / 1.2), ("Farther", 1.2)):
-        before = data(page, MESH, "distance")
-        page.get_by_role("button", name=label).click()
-        after = settled(page, MESH, "distance", before)
-        assert after == pytest.approx(before * factor, rel=1e-4)
-
-    colours = picture_of(page, MESH)
-    relief = page.get_by_role("button", name="Relief")
-    relief.click()
-    assert relief.get_attribute("aria-pressed") == "true"
-    assert np.abs(picture_of(page, MESH) - colours).mean() > 5
-    relief.click()
 
 
 def test_tab_reaches_every_control(page: Any) -> None:
@@ -384,14 +313,6 @@ def test_paper_shows_all(page: Any) -> None:
     assert len(stills) == 2
     assert all(height > 200 for height in stills)
     assert moving == 0
-
-
-def test_pdf(page: Any) -> None:
-    content = page.pdf(prefer_css_page_size=True)
-    boxes = re.findall(rb"/MediaBox\s*\[0 0 ([\d.]+) ([\d.]+)\]", content)
-    assert 3 <= len(boxes) <= 12
-    # A4 in points.
-    assert {(round(float(w)), round(float(h))) for w, h in boxes} == {(595, 842)}
 
 
 def test_no_complaint_and_no_network(opened: tuple[Any, Heard], file: Path) -> None:

@@ -1,4 +1,3 @@
-import re
 from pathlib import Path
 from typing import Any
 
@@ -7,9 +6,7 @@ import pytest
 from alice_survey.base.artefacts import write_json
 from alice_survey.report.figures import Figures
 from alice_survey.report.held import Held
-from alice_survey.report.sections import sections
-from alice_survey.report.summary import facts, summary
-from alice_survey.report.verdicts import Verdict, verdicts
+from alice_survey.report.verdicts import Verdict, facts, summary, verdicts
 from tests.alice_survey.report.tiny import tiny_workspace
 
 
@@ -106,30 +103,6 @@ def test_every_verdict_that_is_not_good_says_what_to_do(tmp_path: Path) -> None:
     asked = [verdict for verdict in found if verdict.level != "good"]
     assert len(asked) >= 5
     assert all(verdict.action for verdict in asked)
-
-
-def test_values_and_their_sigmas_have_one_unit(tmp_path: Path) -> None:
-    bend = {"sag_m": 0.00459, "sag_sigma_m": 0.0492, "length_m": 5.0}
-    place = {"scale_of_navigation": 0.9993, "scale_of_navigation_sigma": 0.0056}
-    axes = {f"{kind}_{axis}_m": 0.1 for kind in ("rms", "sigma") for axis in
-            ("north", "east", "depth")}  # fmt: skip
-    workspace = tiny_workspace(
-        tmp_path,
-        sparse={"georeference": place | axes | {"sigma_heading_deg": 0.1, "sigma_tilt_deg": 0.1}},
-        mapping={"doming": {"along": bend, "across": None, "notes": [],
-                            "scale": {"mean": 1.0007, "mean_sigma": 0.0056}}},
-    )  # fmt: skip
-    figures, found = judged(workspace)
-    texts = [verdict.text for verdict in found]
-    for section in sections(figures, has_map=False, has_mesh=False):
-        texts += [cell for table in section.tables for row in table.rows for cell in row]
-    pairs = [text for text in texts if "±" in text]
-    assert len(pairs) == 4
-    assert not any("+/-" in text for text in texts)
-    for text in pairs:
-        value, _, unit = re.findall(r"([-+]?[\d.]+) ± ([\d.]+) (\S+)", text)[0]
-        assert unit in ("cm", "%"), text
-        assert float(value) != 0.0
 
 
 def test_a_calibration_whose_own_checks_passed_asks_for_nothing(tmp_path: Path) -> None:

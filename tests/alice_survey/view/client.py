@@ -1,8 +1,12 @@
-"""Requests as no browser would send them, byte by byte."""
+"""A server in a thread, and requests as no browser would send them, byte by byte."""
 
+import contextlib
 import socket
+import threading
+from collections.abc import Iterator
 from dataclasses import dataclass
 from http.client import HTTPResponse
+from pathlib import Path
 
 from alice_survey.view.server import Server
 
@@ -16,6 +20,20 @@ class Reply:
     @property
     def text(self) -> str:
         return self.body.decode()
+
+
+@contextlib.contextmanager
+def serving(folder: Path) -> Iterator[Server]:
+    """A server that runs in a thread within this block."""
+    server = Server(folder)
+    thread = threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True)
+    thread.start()
+    try:
+        yield server
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
 
 
 def ask(

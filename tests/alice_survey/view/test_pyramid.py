@@ -11,20 +11,13 @@ from numpy.typing import NDArray
 from rasterio.transform import Affine
 
 from alice_survey.report.colours import TILE_PX, coloured, limits_of, number_rasters
-from alice_survey.view.layers import ChangedError, Layers
+from alice_survey.view.layers import ChangedError, Layers, Pyramid
 from alice_survey.view.paths import Workspace
-from alice_survey.view.pyramid import (
-    Pyramid,
-    Reader,
-    read_counts,
-    read_numbers,
-    read_painted,
-    tiles_of_level,
-)
 from tests.alice_survey.report.tiny import tiny_workspace
 
-ROWS, COLUMNS = 1301, 1110
-"""Odd, so that no border falls on a whole pixel of a coarser level."""
+ROWS, COLUMNS = 1302, 1110
+"""No multiples of a tile or of a pixel of the third level."""
+NUMBERS = {numbers.name: numbers for numbers in number_rasters("m")}
 Array = NDArray[Any]
 
 
@@ -67,66 +60,61 @@ def mean_of_known(values: Array, weight: Array, side: int) -> tuple[Array, Array
     return total / np.where(sums > 0, sums, np.nan), sums / side**2
 
 
-@pytest.mark.parametrize("most_kept_px", [10_000_000, 1])
-def test_levels_are_means_of_what_is_known(tmp_path: Path, most_kept_px: int) -> None:
+def test_levels_are_means_of_what_is_known(tmp_path: Path) -> None:
     values = heights()
     path = written(tmp_path / "a.tif", values[None], nodata=np.nan)
-    pyramid = Pyramid(str(path), read_numbers, most_kept_px=most_kept_px)
-    assert [(s.columns, s.rows) for s in pyramid.levels] == [(1110, 1301), (555, 651), (278, 326)]
-    assert [s.east for s in pyramid.levels] == pytest.approx([0.01, 0.02, 0.04])
+    pyramid = Pyramid(path, NUMBERS["height"])
+    assert [(s.columns, s.rows) for s in pyramid.levels] == [(1110, 1302), (555, 651), (278, 326)]
+    for size in pyramid.levels:  # each covers the whole raster
+        assert (size.columns * size.east, size.rows * size.north) == pytest.approx((11.10, 13.02))
     known = np.isfinite(values)
-    for level, size in enumerate(pyramid.levels):
-        part = pyramid.part(level, 0, 0, size.columns, size.rows)
+    for level, size in enumerate(pyramid.levels[:2]):
+        found = pyramid.values(size, 0, 0, size.columns, size.rows)
         mean, cover = mean_of_known(np.where(known, values, 0), known.astype(float), 2**level)
-        np.testing.assert_allclose(part.weight, cover, atol=1e-6)
-        np.testing.assert_allclose(part.values[0][cover > 0], mean[cover > 0], atol=4e-6)
-        inner = pyramid.part(level, 31, 17, size.columns, 203)
-        np.testing.assert_allclose(inner.values, part.values[:, 17:203, 31:], atol=2e-6)
+        np.testing.assert_array_equal(np.isfinite(found), cover > 0)
+        np.testing.assert_allclose(found[cover > 0], mean[cover > 0], atol=4e-6)
+        inner = pyramid.values(size, 31, 17, size.columns, 203)
+        np.testing.assert_allclose(inner, found[17:203, 31:], atol=2e-6)
+    third = pyramid.values(pyramid.levels[2], 0, 0, 278, 326)
+    mean, cover = mean_of_known(np.where(known, values, 0), known.astype(float), 4)
+    whole = cover == 1  # pixels are 3.99 cells wide and high here
+    assert np.abs(third - mean)[whole].max() < 0.03
 
 
 def test_counts_of_zero_are_unknown(tmp_path: Path) -> None:
     counts = np.zeros((1, 600, 600), np.uint8)
-    counts[0, :, 301:] = 4
-    part = Pyramid(str(written(tmp_path / "a.tif", counts)), read_counts).part(1, 0, 0, 300, 300)
-    assert set(part.values[0, :, 150:].ravel()) == {4.0}
-    assert set(part.weight[0]) == {0.0, 0.5, 1.0}
+    counts[0, :, 300:] = 4
+    tile = Pyramid(written(tmp_path / "a.tif", counts), NUMBERS["stations"]).tile(1, 0, 0)
+    assert (tile[:, 150:, 3] == 255).all()
+    assert not tile[:, :150, 3].any()
 
 
 def test_a_mosaics_own_levels_are_shown_as_they_are(tmp_path: Path) -> None:
-    bands = painting()
-    plain = written(tmp_path / "plain.tif", bands, photometric="RGB", alpha="YES")
+    plain = written(tmp_path / "plain.tif", painting(), photometric="RGB", alpha="YES")
     cog = tmp_path / "cog.tif"
     with rasterio.open(plain) as raster:
         from rasterio.shutil import copy
 
         copy(raster, cog, driver="COG", blocksize=512, overview_resampling="average")
-    pyramid = Pyramid(str(cog), read_painted)
-    assert [size.own for size in pyramid.levels] == [0, 1, 2]
+    pyramid = Pyramid(cog, None)
     for number in (1, 2):
-        size = pyramid.levels[number]
         with rasterio.open(cog, overview_level=number - 1) as raster:
             own = raster.read()
-            assert (size.rows, size.columns) == raster.shape
-        part = pyramid.part(number, 5, 9, size.columns, size.rows)
-        np.testing.assert_array_equal(part.values, own[:3, 9:, 5:])
-        assert size.columns * size.east == pytest.approx(COLUMNS * 0.01)
-        assert size.rows * size.north == pytest.approx(ROWS * 0.01)
+        size = pyramid.levels[number]
+        assert (size.rows, size.columns) == own.shape[1:]
+        tile = pyramid.tile(number, 0, 0)
+        np.testing.assert_array_equal(tile[..., :3], np.moveaxis(own[:3, :512, :512], 0, -1))
 
 
 def test_a_mosaic_without_levels_is_averaged_without_what_is_clear(tmp_path: Path) -> None:
     bands = painting()
     path = written(tmp_path / "a.tif", bands, photometric="RGB", alpha="YES")
-    pyramid = Pyramid(str(path), read_painted)
-    part = pyramid.part(1, 0, 0, 555, 651)
+    tile = Pyramid(path, None).tile(1, 0, 0)
     for band in range(3):
         mean, cover = mean_of_known(bands[band].astype(float), bands[3] / 255.0, 2)
-        np.testing.assert_allclose(part.values[band][cover > 0], mean[cover > 0], atol=1e-4)
-
-
-def reading(path: Path, numbers: Any) -> Reader:
-    if numbers is None:
-        return read_painted
-    return read_counts if numbers.counted else read_numbers
+        seen = cover[:512, :512] > 0.5
+        assert (tile[..., 3][seen] == 255).all()
+        assert np.abs(tile[..., band] - mean[:512, :512])[seen].max() <= 1
 
 
 @pytest.fixture(scope="module")
@@ -149,35 +137,31 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("name", ["mosaic", "height", "error", "stations"])
 def test_tiles_make_the_whole_level(folder: Path, name: str) -> None:
     """Pixel by pixel before compression, shade included: no seams, no shift, one colour scale."""
-    layers = Layers(Workspace(folder))
-    shown = {layer.name: layer for layer in layers.picture_layers()}[name]
-    numbers = next((n for n in number_rasters("m") if n.name == name), None)
+    shown = {layer.name: layer for layer in Layers(Workspace(folder)).picture_layers()}[name]
+    numbers = NUMBERS.get(name)
     path = folder / ("mosaic/mosaic.tif" if numbers is None else numbers.file)
-    pyramid = Pyramid(str(path), reading(path, numbers))
-    for level in range(shown.levels):
-        size = pyramid.levels[shown.levels - 1 - level]
-        assert shown.size(level) == (size.columns, size.rows, size.east, size.north)
-        part = pyramid.part(shown.levels - 1 - level, 0, 0, size.columns, size.rows)
-        if numbers is None:
-            whole = np.dstack([*np.rint(part.values), np.where(part.weight < 0.5, 0, 255)])
-        else:
-            assert shown.scale is not None
-            with pyramid.opened() as raster:
-                limits = limits_of(raster, numbers)
-            assert limits == (shown.scale.low, shown.scale.high)
-            values = numbers.levels(np.where(part.weight > 0, part.values[0], np.nan))
-            whole = coloured(values, numbers, limits, size.east)
-        columns, rows = tiles_of_level(size)
-        sheet = np.zeros_like(whole)
+    pyramid = Pyramid(path, numbers)
+    for level, size in enumerate(pyramid.levels):
+        assert shown.size(shown.levels - 1 - level) == (
+            size.columns, size.rows, size.east, size.north,
+        )  # fmt: skip
+        sheet = np.zeros((size.rows, size.columns, 4), np.uint8)
+        columns, rows = size.tiles
         for x in range(columns):
             for y in range(rows):
-                tile = layers.painted(name, level, x, y)
+                tile = pyramid.tile(level, x, y)
                 top, left = y * TILE_PX, x * TILE_PX
                 sheet[top : top + tile.shape[0], left : left + tile.shape[1]] = tile
-        # Means may differ in the last bit, and then a colour by one.
-        assert np.abs(sheet.astype(int) - whole).max() <= 1
+        if numbers is None:
+            whole = pyramid._painted(size, 0, 0, size.columns, size.rows)
+        else:
+            assert shown.scale is not None and pyramid.limits is not None
+            assert pyramid.limits == (shown.scale.low, shown.scale.high)
+            values = numbers.levels(pyramid.values(size, 0, 0, size.columns, size.rows))
+            whole = coloured(values, numbers, pyramid.limits, size.east)
+        # Means may differ in the last bits, and then a colour by one or two.
+        assert np.abs(sheet.astype(int) - whole).max() <= 2
         assert (sheet == whole).mean() > 0.999
-    layers.close()
 
 
 def test_encoded_tiles_show_the_rasters_own_pixels(folder: Path) -> None:
@@ -195,7 +179,6 @@ def test_encoded_tiles_show_the_rasters_own_pixels(folder: Path) -> None:
     for missing in ((3, 0, 0), (2, 3, 0), (2, 0, 3), (-1, 0, 0)):
         with pytest.raises(FileNotFoundError):
             layers.tile("mosaic", *missing, None)
-    layers.close()
 
 
 def test_limits_of_a_large_raster_are_close_to_those_of_all_its_values(tmp_path: Path) -> None:
@@ -203,9 +186,8 @@ def test_limits_of_a_large_raster_are_close_to_those_of_all_its_values(tmp_path:
     values = np.kron(rng.normal(0, 1, (40, 40)), np.ones((60, 60))).astype(np.float32)
     values += rng.normal(0, 0.1, values.shape).astype(np.float32)
     values[:1200, :900] = np.nan
-    numbers = next(n for n in number_rasters("m") if n.name == "height")
     with rasterio.open(written(tmp_path / "a.tif", values[None], nodata=np.nan)) as raster:
-        limits = limits_of(raster, numbers)
+        limits = limits_of(raster, NUMBERS["height"])
     expected = np.nanpercentile(values, [1, 99])
     assert limits == pytest.approx(tuple(expected), abs=0.15)
 
@@ -214,9 +196,9 @@ def test_a_raster_of_one_row_and_one_without_a_value(tmp_path: Path) -> None:
     workspace = tiny_workspace(tmp_path)
     written(workspace / "dense" / "dem.tif", np.full((1, 1, 700), -3, np.float32), nodata=np.nan)
     written(workspace / "dense" / "sigma.tif", np.full((1, 9, 7), np.nan, np.float32))
-    layers = Layers(Workspace(workspace))
-    assert layers.painted("height", 0, 0, 0).shape == (1, 350, 4)
-    assert not layers.painted("sigma", 0, 0, 0)[..., 3].any()
-    scale = {layer.name: layer.scale for layer in layers.picture_layers()}["sigma"]
+    dense = workspace / "dense"
+    assert Pyramid(dense / "dem.tif", NUMBERS["height"]).tile(1, 0, 0).shape == (1, 350, 4)
+    assert not Pyramid(dense / "sigma.tif", NUMBERS["sigma"]).tile(0, 0, 0)[..., 3].any()
+    layers = Layers(Workspace(workspace)).picture_layers()
+    scale = {layer.name: layer.scale for layer in layers}["sigma"]
     assert scale is not None and (scale.low, scale.high) == (0.0, 1.0)
-    layers.close()
