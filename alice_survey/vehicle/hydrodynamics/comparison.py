@@ -2,10 +2,9 @@
 
 from dataclasses import dataclass
 
-from alice_survey.vehicle.hydrodynamics.estimate import estimate, part_coefficients
 from alice_survey.vehicle.hydrodynamics.geometry import ALICE, Geometry
 from alice_survey.vehicle.hydrodynamics.paper_tables import TABLES, PaperRow
-from alice_survey.vehicle.hydrodynamics.parts import Flow, parts
+from alice_survey.vehicle.hydrodynamics.parts import Flow, estimate, part_coefficients, parts
 
 CLOSE_PERCENT, NEAR_PERCENT = 1.0, 5.0
 """Differences up to which a row counts as reproduced, and as near."""

@@ -24,8 +24,15 @@ from alice_survey.vehicle.identification.noise import (
     score_information,
 )
 from alice_survey.vehicle.identification.parameters import Parameters
-from alice_survey.vehicle.identification.sensitivity import CHANNELS, START, simulate
-from alice_survey.vehicle.identification.slopes import STATES, Physics, scratch_for, with_given
+from alice_survey.vehicle.identification.sensitivity import (
+    CHANNELS,
+    START,
+    STATES,
+    Physics,
+    scratch_for,
+    simulate,
+    with_given,
+)
 from alice_survey.vehicle.identification.windows import Mask, Window, cut, residual_channels
 from alice_survey.vehicle.log import attitude_of
 

@@ -24,7 +24,7 @@ from alice_survey.base.run.progress import step as named_step
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.identification.noise import autocovariance, correlated_information
 from alice_survey.vehicle.identification.parameters import OTHERS, Parameters
-from alice_survey.vehicle.identification.slopes import (
+from alice_survey.vehicle.identification.sensitivity import (
     ADDED_MASS,
     LIFT,
     LINEAR,

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from alice_survey.base.errors import VehicleError, warn
 from alice_survey.base.frames import Array
-from alice_survey.vehicle.identification.sensitivity import CHANNELS, Record
-from alice_survey.vehicle.identification.slopes import STATES
+from alice_survey.vehicle.identification.sensitivity import CHANNELS, STATES, Record
 from alice_survey.vehicle.log import VehicleLog, segments
 from alice_survey.vehicle.vehicle import Vehicle
 
