@@ -10,17 +10,19 @@ nu_j |nu_j| are those of one motion at a time, as in the paper.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal
 
 import numpy as np
 
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
-from alice_survey.vehicle.coefficients import FORCES, LIFTS, MOTIONS, Coefficients
+from alice_survey.vehicle.coefficients import FORCES, MOTIONS, Coefficients
 from alice_survey.vehicle.hydrodynamics import added_mass, drag
 from alice_survey.vehicle.hydrodynamics.geometry import Geometry, Mast, Outline, Pod, PodArm, Tunnel
 
 _FORWARD, _STARBOARD, _DOWN = np.eye(3)
+_NOTHING = 1e-9
+"""Below this an entry is a zero by symmetry that rounding hides."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 
@@ -92,7 +94,7 @@ def parts(geometry: Geometry, flow: Flow) -> tuple[HullPart, ...]:
     )
 
 
-def _sum(name: str, each: list[HullPart]) -> HullPart:
+def _sum(name: str, each: Sequence[HullPart]) -> HullPart:
     nothing = np.zeros((6, 6))
     return HullPart(
         name=name,
@@ -210,38 +212,24 @@ def _tunnel(tunnel: Tunnel, flow: Flow) -> HullPart:
     )
 
 
-class BodyLift(NamedTuple):
-    """Coefficients of force and moment by u v and u w, kg/m and kg."""
-
-    y_uv: float
-    z_uw: float
-    m_uw: float
-    n_uv: float
-
-
-def lift_slope(length_m: float, diameter_m: float) -> float:
-    """C_L by angle, 1/rad, on d^2: 0.003 (180 / pi) l / d."""
-    return 0.003 * (180.0 / math.pi) * length_m / diameter_m
-
-
 def centre_of_pressure(nose_x_m: float, length_m: float) -> float:
     """x_cp = x_n - 0.65 l, metres."""
     return nose_x_m - 0.65 * length_m
 
 
-def body_lift(length_m: float, diameter_m: float, nose_x_m: float, density: float) -> BodyLift:
-    """Lift of the hull.
+def body_lift(
+    length_m: float, diameter_m: float, nose_x_m: float, density: float
+) -> dict[str, float]:
+    """Lift of a slender hull at a small angle: coefficients of u v and u w, by SNAME name.
 
-    Y_uv = Z_uw = -1/2 rho d^2 C_L. A force at x gives M = -x Z and N = x Y, so that
+    C_L = 0.003 (180 / pi) l / d by angle, 1/rad, on d^2, and Y_uv = Z_uw = -1/2 rho d^2 C_L
+    (Hoerner and Borst 1975; paper, section V.C). A force at x gives M = -x Z and N = x Y, so that
     M_uw = -x_cp Z_uw. As printed: M_uw = Z_uw x_cp; the tables have the right sign.
     """
-    force = -0.5 * density * diameter_m**2 * lift_slope(length_m, diameter_m)
+    slope = 0.003 * (180.0 / math.pi) * length_m / diameter_m
+    force = -0.5 * density * diameter_m**2 * slope
     x = centre_of_pressure(nose_x_m, length_m)
-    return BodyLift(force, force, -x * force, x * force)
-
-
-_NOTHING = 1e-9
-"""Below this an entry is a zero by symmetry that rounding hides."""
+    return {"Y_uv": force, "Z_uw": force, "M_uw": -x * force, "N_uv": x * force}
 
 
 def estimate(geometry: Geometry, flow: Flow | None = None) -> Coefficients:
@@ -255,15 +243,10 @@ def estimate(geometry: Geometry, flow: Flow | None = None) -> Coefficients:
         flow: the water; sea water at the paper's speed if not given.
     """
     flow = flow or Flow()
-    each = parts(geometry, flow)
     outline = geometry.outline
     lift = body_lift(outline.length_m, outline.diameter_m, outline.nose_x_m, flow.density_kg_m3)
-    values = {
-        **named(sum((part.added_mass for part in each), np.zeros((6, 6))), kind="dot"),
-        **named(sum((part.quadratic for part in each), np.zeros((6, 6))), kind="quadratic"),
-        **dict(zip(LIFTS, lift, strict=True)),
-    }
-    return Coefficients(name="computed", values=values)
+    whole = part_coefficients(_sum(geometry.name, parts(geometry, flow)))
+    return Coefficients(name="computed", values={**whole, **lift})
 
 
 def part_coefficients(part: HullPart) -> dict[str, float]:
@@ -271,13 +254,12 @@ def part_coefficients(part: HullPart) -> dict[str, float]:
     return {**named(part.added_mass, kind="dot"), **named(part.quadratic, kind="quadratic")}
 
 
-def named(matrix: Array, *, kind: str) -> dict[str, float]:
+def named(matrix: Array, *, kind: Literal["dot", "quadratic"]) -> dict[str, float]:
     """A (6, 6) matrix by SNAME names: of `dot`, M_A with its sign turned; of `quadratic`, as is."""
-    names: Sequence[tuple[int, int]] = [(i, j) for i in range(6) for j in range(6)]
+    sign = -1.0 if kind == "dot" else 1.0
     return {
-        f"{FORCES[i]}_{MOTIONS[j]}dot" if kind == "dot" else f"{FORCES[i]}_{MOTIONS[j] * 2}": float(
-            -matrix[i, j] if kind == "dot" else matrix[i, j]
-        )
-        for i, j in names
+        f"{FORCES[i]}_{motion}{'dot' if kind == 'dot' else motion}": float(sign * matrix[i, j])
+        for i in range(6)
+        for j, motion in enumerate(MOTIONS)
         if abs(matrix[i, j]) > _NOTHING
     }
