@@ -19,10 +19,13 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from alice_survey.base.frames import Array
-from alice_survey.vehicle.allocation.exact import allocate_exact
-from alice_survey.vehicle.allocation.preference import AXIS_WEIGHTS
-from alice_survey.vehicle.allocation.rpi import allocate_rpi
-from alice_survey.vehicle.allocation.scratch import AllocationScratch, allocation_scratch
+from alice_survey.vehicle.allocation import (
+    AXIS_WEIGHTS,
+    AllocationScratch,
+    allocate_exact,
+    allocate_rpi,
+    allocation_scratch,
+)
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.propulsion import thrust_limits

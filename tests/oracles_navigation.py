@@ -62,8 +62,8 @@ def from_nominal(nominal: Array) -> Belief:
 def kept(sensors: Sensors, dt_s: float) -> Array:
     """What a tick leaves of each error, (25,), of those that decay."""
     times = np.full(25, np.inf)
-    times[15], times[16] = sensors.compass_bias_s, sensors.pressure_bias_s
-    times[21:23], times[23:25] = sensors.gps_bias_s, sensors.water_s
+    times[15], times[16] = sensors.compass.bias_correlation_s, sensors.pressure.bias_correlation_s
+    times[21:23], times[23:25] = sensors.gps.bias_correlation_s, sensors.current_correlation_s
     return np.exp(-dt_s / times)
 
 
@@ -107,16 +107,19 @@ def predict(
     g = jacobian(lambda n: after.error_of(next_state(belief, turn, push, n, sensors, dt_s)), 6)
     gained = push - belief.rest[3:6] * dt_s + belief.attitude.inv().apply(GRAVITY * dt_s)
     covariance = f @ covariance @ f.T
-    variance = sensors.accelerometer_noise**2 * dt_s
+    variance = sensors.imu.accelerometer_noise_mps_per_sqrt_s**2 * dt_s
     variance += covariance[SCALE, SCALE] * gained @ gained * MANOEUVRE_S / dt_s
-    q = np.diag([sensors.gyro_noise**2 * dt_s] * 3 + [variance] * 3)
+    q = np.diag([sensors.imu.gyro_noise_rad_per_sqrt_s**2 * dt_s] * 3 + [variance] * 3)
     sigma = np.zeros(25)
-    sigma[15], sigma[16] = sensors.compass_bias_sigma, sensors.pressure_bias_sigma
-    sigma[21:23], sigma[23:25] = sensors.gps_bias_sigma, sensors.water_sigma
+    sigma[15], sigma[16] = sensors.compass.bias_sigma_rad, sensors.pressure.bias_sigma_m
+    sigma[21:23], sigma[23:25] = sensors.gps.bias_sigma_m, sensors.current_sigma_mps
     covariance = covariance + g @ q @ g.T
     covariance += np.diag(sigma**2 * (1 - kept(sensors, dt_s) ** 2))
     walk = np.zeros(25)
-    walk[9:12], walk[12:15] = sensors.gyro_walk, sensors.accelerometer_walk
+    walk[9:12], walk[12:15] = (
+        sensors.imu.gyro_bias_walk_radps_per_sqrt_s,
+        sensors.imu.accelerometer_bias_walk_mps2_per_sqrt_s,
+    )
     return after, covariance + np.diag(walk**2 * dt_s), f
 
 

@@ -28,21 +28,19 @@ _HANDLE_M = np.array([
     [0.445, 0.100], [0.425, 0.088],
 ])  # fmt: skip
 """Centre line of a handle as (distance along the axis, distance from the axis)."""
+_AROUND, _RINGS = 128, 160
+"""Corners of a ring of the body, and rings."""
 _HANDLE_HALF_WIDTH_M = 0.016
 _HANDLE_HALF_DEPTH_M = 0.010
 
 
-def amphora_mesh(around: int = 128, along: int = 160) -> tuple[Array, NDArray[np.int32]]:
+def amphora_mesh() -> tuple[Array, NDArray[np.int32]]:
     """The amphora in its own frame, metres.
-
-    Args:
-        around: corners of a ring of the body.
-        along: rings of the body.
 
     Returns:
         (V, 3) vertices and (T, 3) triangles, counter-clockwise seen from outside.
     """
-    parts = [_revolve(_resample(_PROFILE_M, along), around)]
+    parts = [_revolve(_resample(_PROFILE_M, _RINGS), _AROUND)]
     line = _resample(_HANDLE_M, 48)
     parts += [_tube(np.column_stack([line[:, 0], side * line[:, 1]]), 24) for side in (1.0, -1.0)]
     first = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])

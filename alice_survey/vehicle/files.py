@@ -9,13 +9,14 @@ too.
 import json
 import tomllib
 from collections.abc import Mapping
-from dataclasses import MISSING, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
+from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
 
 from alice_survey.base.artefacts import write_json
+from alice_survey.base.config import Config
 from alice_survey.base.contents import one_line, shown
 from alice_survey.base.errors import VehicleError, why
 from alice_survey.vehicle.coefficients import FORCES, Coefficients
@@ -23,6 +24,7 @@ from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.propulsion import Thruster
 from alice_survey.vehicle.vehicle import RigidBody, Vehicle
 
+_Kind = TypeVar("_Kind")
 COEFFICIENTS_FORMAT = "alice-survey coefficients 1"
 _THRUSTER_DEFAULTS: Mapping[str, Any] = {
     "kind": "open", "diameter_m": 1.0, "kt_forward": 1.0, "kt_reverse": 1.0, "kq_forward": 0.0,
@@ -30,7 +32,23 @@ _THRUSTER_DEFAULTS: Mapping[str, Any] = {
     "time_constant_s": 0.1,
 }  # fmt: skip
 """Defaults of a thruster in a file: its thrusts are given, its speeds have no meaning."""
+_MOST_FAULTS = 3
+"""Faults of a file that one message names."""
 _NEEDED_FOR_SPEEDS = ("diameter_m", "kt_forward", "kt_reverse", "time_constant_s")
+
+
+def _with_defaults(table: object) -> object:
+    return {**_THRUSTER_DEFAULTS, **table} if isinstance(table, dict) else table
+
+
+class _VehicleFile(Config):
+    """Contents of a vehicle file."""
+
+    name: str | None = None
+    rigid_body: RigidBody
+    coefficients: dict[str, float] = Field(default_factory=dict)
+    thrusters: tuple[Annotated[Thruster, BeforeValidator(_with_defaults)], ...] = ()
+    density_kg_m3: float = 1025.0
 
 
 def vehicle_from(name_or_file: str) -> Vehicle:
@@ -52,35 +70,23 @@ def vehicle_from_file(path: Path) -> Vehicle:
         VehicleError: the file cannot be read, or lacks a field, has one that is not known or makes
             no sense.
     """
-    table = _read(path)
-    _known(path, "", table, {"name", "rigid_body", "coefficients", "thrusters", "density_kg_m3"})
-    values = table.get("coefficients", {})
-    if not isinstance(values, dict):
-        raise VehicleError(f"{path}: coefficients are a table of names and values")
-    name = str(table.get("name", path.stem))
-    thrusters = table.get("thrusters", [])
-    if not isinstance(thrusters, list):
-        raise VehicleError(f"{path}: thrusters are a list of tables")
-    body: RigidBody = _made(path, "rigid_body", RigidBody, table.get("rigid_body"), {})
-    made = tuple(
-        _made(path, f"thrusters[{i}]", Thruster, thruster, _THRUSTER_DEFAULTS)
-        for i, thruster in enumerate(thrusters)
-    )
-    names = [thruster.name for thruster in made]
+    found = validated(path, _VehicleFile, read_table(path))
+    names = [thruster.name for thruster in found.thrusters]
     if len(set(names)) < len(names):
         raise VehicleError(f"{path}: two thrusters have one name")
-    coefficients = _coefficients(path, path.stem, values)
-    density = _number(path, "density_kg_m3", table.get("density_kg_m3", 1025.0))
     return Vehicle(
-        name=name, rigid_body=body, coefficients=coefficients, thrusters=made,
-        density_kg_m3=density,
-    )  # fmt: skip
+        name=found.name or path.stem,
+        rigid_body=found.rigid_body,
+        coefficients=_coefficients(path, path.stem, found.coefficients),
+        thrusters=found.thrusters,
+        density_kg_m3=found.density_kg_m3,
+    )
 
 
 def speeds_missing(path: Path) -> list[str]:
     """Thrusters of a vehicle file that do not define what their speeds mean, in words."""
     lacking = []
-    for thruster in _read(path).get("thrusters", []):
+    for thruster in read_table(path).get("thrusters", []):
         missing = [field for field in _NEEDED_FOR_SPEEDS if field not in thruster]
         if missing:
             lacking.append(f"{thruster.get('name')} ({', '.join(missing)})")
@@ -104,11 +110,12 @@ def coefficients_from_file(path: Path) -> Coefficients:
     Raises:
         VehicleError: the file cannot be read or holds something else.
     """
-    table = _read(path)
+    table = read_table(path)
     values = table.get("values", table)
     if table.get("format", COEFFICIENTS_FORMAT) != COEFFICIENTS_FORMAT:
         raise VehicleError(f"{path}: format {table['format']!r} is not {COEFFICIENTS_FORMAT!r}")
-    if not isinstance(values, dict) or not values:
+    values = validated(path, dict[str, float], values)
+    if not values:
         raise VehicleError(f"{path}: holds no coefficients")
     found = _coefficients(path, str(table.get("name", path.stem)), values)
     driving = np.flatnonzero(np.maximum(np.diag(found.linear), np.diag(found.quadratic)) > 0)
@@ -121,15 +128,19 @@ def coefficients_from_file(path: Path) -> Coefficients:
     return found
 
 
-def _coefficients(path: Path, name: str, values: Mapping[str, Any]) -> Coefficients:
-    named = {str(key): _number(path, str(key), value) for key, value in values.items()}
+def _coefficients(path: Path, name: str, values: Mapping[str, float]) -> Coefficients:
     try:
-        return Coefficients(name=name, values=named)
+        return Coefficients(name=name, values=values)
     except VehicleError as error:
         raise VehicleError(f"{path}: {shown(str(error))}") from None
 
 
-def _read(path: Path) -> dict[str, Any]:
+def read_table(path: Path) -> dict[str, Any]:
+    """Read a TOML file, or a JSON file by its suffix.
+
+    Raises:
+        VehicleError: the file cannot be read or holds no table.
+    """
     try:
         text = path.read_text(encoding="utf-8")
         table = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
@@ -142,43 +153,17 @@ def _read(path: Path) -> dict[str, Any]:
     return table
 
 
-def _made(path: Path, place: str, kind: Any, table: object, defaults: Mapping[str, Any]) -> Any:
-    """A value of a dataclass from a table of its fields."""
-    if not isinstance(table, dict):
-        raise VehicleError(f"{path}: {place} is missing or no table")
-    names = {field.name: field for field in fields(kind)}
-    _known(path, f"{place}.", table, set(names))
-    values = {**defaults, **table}
-    for name, field in names.items():
-        if name not in values and field.default is MISSING:
-            raise VehicleError(f"{path}: {place}.{name} is missing")
-    made: dict[str, Any] = {}
-    for name, value in values.items():
-        where = f"{place}.{name}"
-        if isinstance(value, list):
-            made[name] = tuple(_number(path, where, part) for part in value)
-        elif name in ("name", "kind"):
-            made[name] = value
-        else:
-            made[name] = _number(path, where, value)
-        if ("tuple" in str(names[name].type)) != isinstance(value, list | tuple):
-            raise VehicleError(f"{path}: {where} is {value!r}")
+def validated(path: Path, kind: type[_Kind], table: object) -> _Kind:
+    """The value of a kind that a table read from a file holds.
+
+    Raises:
+        VehicleError: a field is missing, is not known, or has a wrong value.
+    """
     try:
-        return kind(**made)
-    except (TypeError, ValueError) as error:
-        raise VehicleError(f"{path}: {place}: {error}") from None
-
-
-def _known(path: Path, place: str, table: Mapping[str, Any], names: set[str]) -> None:
-    strange = next((key for key in table if key not in names), None)
-    if strange is not None:
-        raise VehicleError(f"{path}: {place}{shown(strange)} is not known; known: {sorted(names)}")
-
-
-def _number(path: Path, place: str, value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise VehicleError(f"{path}: {place} is {value!r:.60}, not a number")
-    try:
-        return float(value)
-    except OverflowError:
-        raise VehicleError(f"{path}: {place} is too large") from None
+        return TypeAdapter(kind).validate_python(table)
+    except ValidationError as error:
+        faults = [
+            f"{shown('.'.join(str(part) for part in fault['loc']))}: {fault['msg']}"
+            for fault in error.errors()[:_MOST_FAULTS]
+        ]
+        raise VehicleError(f"{path}: {'; '.join(faults)}") from None

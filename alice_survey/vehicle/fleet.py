@@ -10,7 +10,6 @@ from typing import Literal
 from alice_survey.base.errors import VehicleError
 from alice_survey.vehicle.coefficients import Coefficients
 from alice_survey.vehicle.hydrodynamics.entrained import entrained_water
-from alice_survey.vehicle.hydrodynamics.estimate import estimate
 from alice_survey.vehicle.hydrodynamics.geometry import (
     ALICE,
     ALICE_PROPELLER_X_M,
@@ -19,6 +18,7 @@ from alice_survey.vehicle.hydrodynamics.geometry import (
     Geometry,
 )
 from alice_survey.vehicle.hydrodynamics.paper_tables import CALIBRATED, CFD, ESTIMATED
+from alice_survey.vehicle.hydrodynamics.parts import estimate
 from alice_survey.vehicle.propulsion import Thruster
 from alice_survey.vehicle.vehicle import RigidBody, Vehicle
 

@@ -32,7 +32,7 @@ _KNOWN = (TIME, *POSITION, *ANGLES, *QUATERNION, *VELOCITY, *RATES, ALTITUDE, *W
 _UNIT = 0.05
 """Tolerance of a quaternion's length: more is not rounding of a written attitude."""
 _GAP_STEPS = 10
-"""A gap is longer than this many median steps, where none is given."""
+"""A gap is longer than this many median steps."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -191,18 +191,16 @@ def log_of_columns(columns: Mapping[str, Array], source: str) -> VehicleLog:
     )  # fmt: skip
 
 
-def segments(log: VehicleLog, gap_s: float | None = None) -> list[slice]:
-    """Cut a log where its times have gaps; together the stretches hold every row.
+def longest_step_s(time_s: Array) -> float:
+    """The longest step between times, (T,), that is not a gap; 0 of one time."""
+    steps = np.diff(time_s)
+    return _GAP_STEPS * float(np.median(steps)) if len(steps) else 0.0
 
-    Args:
-        log: any.
-        gap_s: the longest step that is not a gap; 10 median steps when not given.
-    """
-    steps = np.diff(log.time_s)
-    if not len(steps):
-        return [slice(0, len(log.time_s))]
-    longest = _GAP_STEPS * float(np.median(steps)) if gap_s is None else gap_s
-    cuts = [0, *(np.flatnonzero(steps > longest) + 1).tolist(), len(log.time_s)]
+
+def segments(log: VehicleLog) -> list[slice]:
+    """Cut a log where its times have gaps; together the stretches hold every row."""
+    gaps = np.flatnonzero(np.diff(log.time_s) > longest_step_s(log.time_s))
+    cuts = [0, *(gaps + 1).tolist(), len(log.time_s)]
     return [slice(a, b) for a, b in itertools.pairwise(cuts)]
 
 

@@ -30,6 +30,7 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
+from pydantic import ConfigDict
 
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
@@ -43,6 +44,8 @@ class Thruster:
     Raises:
         VehicleError: a number is not physical.
     """
+
+    __pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     name: str
     kind: Literal["open", "tunnel"]

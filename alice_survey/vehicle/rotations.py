@@ -28,6 +28,26 @@ def matrix_of(quaternion: Array, out: Array) -> None:
 
 
 @kernel
+def applied(matrix: Array, x: float, y: float, z: float) -> Row:
+    """A rotation matrix, (3, 3), times a vector."""
+    return (
+        matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z,
+        matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z,
+        matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z,
+    )
+
+
+@kernel
+def applied_inverse(matrix: Array, x: float, y: float, z: float) -> Row:
+    """The inverse of a rotation matrix, (3, 3), times a vector."""
+    return (
+        matrix[0, 0] * x + matrix[1, 0] * y + matrix[2, 0] * z,
+        matrix[0, 1] * x + matrix[1, 1] * y + matrix[2, 1] * z,
+        matrix[0, 2] * x + matrix[1, 2] * y + matrix[2, 2] * z,
+    )
+
+
+@kernel
 def turn(quaternion: Array, angle: Array) -> None:
     """Turn a unit quaternion (4,), overwritten, by a rotation vector (3,) in its own body frame.
 

@@ -15,10 +15,14 @@ import numpy as np
 from alice_survey.base.compiled import note_compiling
 from alice_survey.base.frames import Array, attitude_from_rotation
 from alice_survey.vehicle import estimate_vector as vector
-from alice_survey.vehicle.allocation.exact import allocate_exact
-from alice_survey.vehicle.allocation.preference import AXIS_WEIGHTS, preference_weights
-from alice_survey.vehicle.allocation.rpi import allocate_rpi
-from alice_survey.vehicle.allocation.scratch import AllocationScratch, allocation_scratch
+from alice_survey.vehicle.allocation import (
+    AXIS_WEIGHTS,
+    AllocationScratch,
+    allocate_exact,
+    allocate_rpi,
+    allocation_scratch,
+    preference_weights,
+)
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.dynamics import (
     STATE,
@@ -29,8 +33,8 @@ from alice_survey.vehicle.dynamics import (
     scratch_for,
 )
 from alice_survey.vehicle.floor import FloorGrid, floor_depth
+from alice_survey.vehicle.navigation.filter import NavigationState, new_navigation
 from alice_survey.vehicle.navigation.sensors import DVL, FOLLOWED, Sensors
-from alice_survey.vehicle.navigation.state import NavigationState, new_navigation
 from alice_survey.vehicle.navigation.tick import LOG_ROW, log_row, navigation_tick
 from alice_survey.vehicle.pilot.gains import Gains
 from alice_survey.vehicle.pilot.guidance import steer

@@ -12,9 +12,13 @@ from typing import NamedTuple
 import numpy as np
 
 from alice_survey.base.frames import Array
-from alice_survey.vehicle.allocation.exact import allocate_exact
-from alice_survey.vehicle.allocation.preference import AXIS_WEIGHTS, preference_weights
-from alice_survey.vehicle.allocation.scratch import AllocationScratch, allocation_scratch
+from alice_survey.vehicle.allocation import (
+    AXIS_WEIGHTS,
+    AllocationScratch,
+    allocate_exact,
+    allocation_scratch,
+    preference_weights,
+)
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.dynamics import Body, add_coriolis, add_damping
 from alice_survey.vehicle.propulsion import (

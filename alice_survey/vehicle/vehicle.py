@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from pydantic import ConfigDict
 
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
@@ -17,6 +18,8 @@ from alice_survey.vehicle.propulsion import Thruster, pack
 @dataclass(frozen=True, kw_only=True)
 class RigidBody:
     """Mass and its distribution; lengths from the centre of buoyancy, the body's origin."""
+
+    __pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     dry_kg: float
     """Mass in air, drained."""

@@ -260,11 +260,11 @@ def sensors_of(navigation: NavigationConfig, camera: CameraConfig) -> SensorSuit
         dvl=DvlSpec(
             position_body_m=camera.dvl_position_body_m,
             beam_noise_mps=navigation.dvl_noise_mps,
-            dropouts_s=navigation.dvl_dropouts_s,
         ),
         usbl=UsblSpec(
             rate_hz=_USBL_HZ if navigation.usbl else 0.0, noise_m=navigation.usbl_noise_m
         ),
+        dvl_dropouts_s=navigation.dvl_dropouts_s,
         followed_body_m=camera.position_body_m,
     )
 

@@ -2,10 +2,9 @@
 
 from dataclasses import dataclass
 
-from alice_survey.vehicle.hydrodynamics.estimate import estimate, part_coefficients
-from alice_survey.vehicle.hydrodynamics.geometry import ALICE, Geometry
+from alice_survey.vehicle.hydrodynamics.geometry import ALICE
 from alice_survey.vehicle.hydrodynamics.paper_tables import TABLES, PaperRow
-from alice_survey.vehicle.hydrodynamics.parts import Flow, parts
+from alice_survey.vehicle.hydrodynamics.parts import Flow, estimate, part_coefficients, parts
 
 CLOSE_PERCENT, NEAR_PERCENT = 1.0, 5.0
 """Differences up to which a row counts as reproduced, and as near."""
@@ -69,13 +68,10 @@ class CoefficientRow:
     equation: str
 
 
-def coefficient_rows(
-    geometry: Geometry = ALICE, flow: Flow | None = None
-) -> tuple[CoefficientRow, ...]:
+def coefficient_rows() -> tuple[CoefficientRow, ...]:
     """Every row of the paper's three tables."""
-    flow = flow or Flow()
-    whole = estimate(geometry, flow).values
-    hull = next(part_coefficients(p) for p in parts(geometry, flow) if p.name == "hull")
+    whole = estimate(ALICE).values
+    hull = next(part_coefficients(p) for p in parts(ALICE, Flow()) if p.name == "hull")
     rows = []
     for row in TABLES:
         computed = (hull if row.part == "hull" else whole)[row.coefficient]

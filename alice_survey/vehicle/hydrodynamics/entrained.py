@@ -17,8 +17,7 @@ import numpy as np
 
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
-from alice_survey.vehicle.hydrodynamics.geometry import Geometry
-from alice_survey.vehicle.hydrodynamics.outline import Outline
+from alice_survey.vehicle.hydrodynamics.geometry import Geometry, Outline
 
 _EXACT_M = 1e-12
 _MOST_STEPS = 200

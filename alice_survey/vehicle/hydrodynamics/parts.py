@@ -7,17 +7,22 @@ follow from places and directions. Drag of two motions at once is not expanded: 
 nu_j |nu_j| are those of one motion at a time, as in the paper.
 """
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
+from alice_survey.vehicle.coefficients import FORCES, MOTIONS, Coefficients
 from alice_survey.vehicle.hydrodynamics import added_mass, drag
-from alice_survey.vehicle.hydrodynamics.geometry import Geometry, Mast, Pod, PodArm, Tunnel
-from alice_survey.vehicle.hydrodynamics.outline import Outline
+from alice_survey.vehicle.hydrodynamics.geometry import Geometry, Mast, Outline, Pod, PodArm, Tunnel
 
 _FORWARD, _STARBOARD, _DOWN = np.eye(3)
+_NOTHING = 1e-9
+"""Below this an entry is a zero by symmetry that rounding hides."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 
@@ -89,7 +94,7 @@ def parts(geometry: Geometry, flow: Flow) -> tuple[HullPart, ...]:
     )
 
 
-def _sum(name: str, each: list[HullPart]) -> HullPart:
+def _sum(name: str, each: Sequence[HullPart]) -> HullPart:
     nothing = np.zeros((6, 6))
     return HullPart(
         name=name,
@@ -205,3 +210,56 @@ def _tunnel(tunnel: Tunnel, flow: Flow) -> HullPart:
         added_mass=np.zeros((6, 6)),
         quadratic=drag_of(points, _FORWARD, np.array([amount])),
     )
+
+
+def centre_of_pressure(nose_x_m: float, length_m: float) -> float:
+    """x_cp = x_n - 0.65 l, metres."""
+    return nose_x_m - 0.65 * length_m
+
+
+def body_lift(
+    length_m: float, diameter_m: float, nose_x_m: float, density: float
+) -> dict[str, float]:
+    """Lift of a slender hull at a small angle: coefficients of u v and u w, by SNAME name.
+
+    C_L = 0.003 (180 / pi) l / d by angle, 1/rad, on d^2, and Y_uv = Z_uw = -1/2 rho d^2 C_L
+    (Hoerner and Borst 1975; paper, section V.C). A force at x gives M = -x Z and N = x Y, so that
+    M_uw = -x_cp Z_uw. As printed: M_uw = Z_uw x_cp; the tables have the right sign.
+    """
+    slope = 0.003 * (180.0 / math.pi) * length_m / diameter_m
+    force = -0.5 * density * diameter_m**2 * slope
+    x = centre_of_pressure(nose_x_m, length_m)
+    return {"Y_uv": force, "Z_uw": force, "M_uw": -x * force, "N_uv": x * force}
+
+
+def estimate(geometry: Geometry, flow: Flow | None = None) -> Coefficients:
+    """Added mass, quadratic damping and body lift of a shape, as the set `computed`.
+
+    Entries that the paper leaves out (Y_rr, Z_qq, Y_pdot ...) are kept: they follow from the same
+    strips.
+
+    Args:
+        geometry: the vehicle.
+        flow: the water; sea water at the paper's speed if not given.
+    """
+    flow = flow or Flow()
+    outline = geometry.outline
+    lift = body_lift(outline.length_m, outline.diameter_m, outline.nose_x_m, flow.density_kg_m3)
+    whole = part_coefficients(_sum(geometry.name, parts(geometry, flow)))
+    return Coefficients(name="computed", values={**whole, **lift})
+
+
+def part_coefficients(part: HullPart) -> dict[str, float]:
+    """One part's share by name."""
+    return {**named(part.added_mass, kind="dot"), **named(part.quadratic, kind="quadratic")}
+
+
+def named(matrix: Array, *, kind: Literal["dot", "quadratic"]) -> dict[str, float]:
+    """A (6, 6) matrix by SNAME names: of `dot`, M_A with its sign turned; of `quadratic`, as is."""
+    sign = -1.0 if kind == "dot" else 1.0
+    return {
+        f"{FORCES[i]}_{motion}{'dot' if kind == 'dot' else motion}": float(sign * matrix[i, j])
+        for i in range(6)
+        for j, motion in enumerate(MOTIONS)
+        if abs(matrix[i, j]) > _NOTHING
+    }

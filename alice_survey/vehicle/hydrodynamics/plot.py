@@ -109,6 +109,19 @@ def _arrows(axes: Axes, thrusters: Sequence[Thruster], down: int) -> None:
         axes.plot(x, y, marker="o", ms=5, mfc="white", mec=_THRUST, mew=1.5, zorder=9)
 
 
+def _tunnels(axes: Axes, geometry: Geometry, across: str) -> None:
+    """Tunnels along the axis `across`, y or z, of the picture, as boxes; the others as circles."""
+    angle = np.linspace(0, 2 * np.pi, 60)
+    for tunnel in geometry.tunnels:
+        radius = tunnel.diameter_m / 2.0
+        if tunnel.axis == across:
+            reach = float(geometry.outline.radius_at(np.array([tunnel.x_m]))[0])
+            _box(axes, tunnel.x_m - radius, -reach, tunnel.diameter_m, 2 * reach, "white")
+        else:
+            axes.plot(tunnel.x_m + radius * np.cos(angle), radius * np.sin(angle), color=_EDGE,
+                      lw=1.2, zorder=6)  # fmt: skip
+
+
 def _draw_side(
     axes: Axes, geometry: Geometry, inside: Entrained, thrusters: Sequence[Thruster]
 ) -> None:
@@ -117,15 +130,7 @@ def _draw_side(
     _box(axes, mast.x_m - mast.chord_m / 2, mast.root_z_m - mast.height_m, mast.chord_m,
          mast.height_m)  # fmt: skip
     _body(axes, pod.x_m, pod.radius_m, 0.0)
-    for tunnel in geometry.tunnels:
-        radius = tunnel.diameter_m / 2.0
-        if tunnel.axis == "y":
-            angle = np.linspace(0, 2 * np.pi, 60)
-            axes.plot(tunnel.x_m + radius * np.cos(angle), radius * np.sin(angle), color=_EDGE,
-                      lw=1.2, zorder=6)  # fmt: skip
-        else:
-            reach = geometry.outline.diameter_m / 2.0
-            _box(axes, tunnel.x_m - radius, -reach, tunnel.diameter_m, 2 * reach, "white")
+    _tunnels(axes, geometry, "z")
     _arrows(axes, thrusters, 2)
     axes.annotate("mast", (mast.x_m + 0.05, mast.root_z_m - 0.2), fontsize=9)
     axes.annotate("pod and nozzle", (pod.x_m[0] - 0.02, 0.115), fontsize=9, ha="center", va="top")
@@ -147,14 +152,9 @@ def _draw_top(
     angle = np.linspace(0, 2 * np.pi, 60)
     axes.fill(mast.x_m + mast.chord_m / 2 * np.cos(angle), mast.width_m / 2 * np.sin(angle),
               fc=_PART, ec=_EDGE, lw=1.0, zorder=6)  # fmt: skip
+    _tunnels(axes, geometry, "y")
     for tunnel in geometry.tunnels:
-        radius = tunnel.diameter_m / 2.0
-        if tunnel.axis == "z":
-            axes.plot(tunnel.x_m + radius * np.cos(angle), radius * np.sin(angle), color=_EDGE,
-                      lw=1.2, zorder=6)  # fmt: skip
-        else:
-            reach = float(geometry.outline.radius_at(np.array([tunnel.x_m]))[0])
-            _box(axes, tunnel.x_m - radius, -reach, tunnel.diameter_m, 2 * reach, "white")
+        if tunnel.axis == "y":
             end, where = (1.12, "right") if tunnel.x_m > 0 else (-0.98, "left")
             axes.annotate(f"{tunnel.name}\nx = {tunnel.x_m:+.2f} m", (end, -0.16), ha=where,
                           fontsize=9)  # fmt: skip

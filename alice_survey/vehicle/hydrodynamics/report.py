@@ -14,8 +14,8 @@ from alice_survey.vehicle.hydrodynamics.comparison import (
     CoefficientRow,
     coefficient_rows,
 )
-from alice_survey.vehicle.hydrodynamics.estimate import estimate
 from alice_survey.vehicle.hydrodynamics.geometry import ALICE, Geometry
+from alice_survey.vehicle.hydrodynamics.parts import estimate
 
 _TITLES = {
     "III": "Table III, estimated by the paper",

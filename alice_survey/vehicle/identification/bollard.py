@@ -11,12 +11,13 @@ import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
-from alice_survey.vehicle.propulsion import Thruster, add_thrust
+from alice_survey.vehicle.propulsion import add_thrust
 from alice_survey.vehicle.vehicle import Vehicle
 
 
@@ -59,13 +60,9 @@ def read_pulls(path: Path) -> list[Pull]:
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file)
-            missing = [
-                name
-                for name in ("thruster", "rpm", "force_n")
-                if name not in (reader.fieldnames or [])
-            ]
-            if missing:
-                raise VehicleError(f"{path}: column {missing[0]} is missing")
+            for name in ("thruster", "rpm", "force_n"):
+                if name not in (reader.fieldnames or []):
+                    raise VehicleError(f"{path}: column {name} is missing")
             pulls = [_pull(path, line, row) for line, row in enumerate(reader, 2)]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise VehicleError(f"{path}: cannot be read: {error}") from None
@@ -120,19 +117,14 @@ def with_thrust(vehicle: Vehicle, found: Sequence[ThrustCoefficient]) -> Vehicle
     """The vehicle with other k_t; k_q follows k_t^1.5, the figure of merit stays."""
     changed = []
     for thruster in vehicle.thrusters:
-        values: dict[str, float] = {}
+        values: dict[str, Any] = {}
         for one in found:
             if thruster.name in one.thrusters:
                 ratio = one.identified / float(getattr(thruster, f"kt_{one.way}"))
                 values[f"kt_{one.way}"] = one.identified
                 values[f"kq_{one.way}"] = float(getattr(thruster, f"kq_{one.way}")) * ratio**1.5
-        changed.append(_changed(thruster, values))
+        changed.append(replace(thruster, **values))
     return replace(vehicle, thrusters=tuple(changed))
-
-
-def _changed(thruster: Thruster, values: dict[str, float]) -> Thruster:
-    fields = {field: getattr(thruster, field) for field in thruster.__dataclass_fields__}
-    return Thruster(**{**fields, **values})
 
 
 def _unit_force(vehicle: Vehicle, group: tuple[str, ...], rps: float) -> float:
@@ -140,9 +132,7 @@ def _unit_force(vehicle: Vehicle, group: tuple[str, ...], rps: float) -> float:
     probe = replace(
         vehicle,
         thrusters=tuple(
-            _changed(
-                t, {"kt_forward": 1.0, "kt_reverse": 1.0, "kq_forward": 0.0, "kq_reverse": 0.0}
-            )
+            replace(t, kt_forward=1.0, kt_reverse=1.0, kq_forward=0.0, kq_reverse=0.0)
             for t in vehicle.thrusters
         ),
     )

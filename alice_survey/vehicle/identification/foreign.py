@@ -1,18 +1,18 @@
 """Logs in foreign columns and frames: a TOML file, `ColumnMap`, defines their meaning."""
 
-import tomllib
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError
+from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from alice_survey.base.config import Config
-from alice_survey.base.contents import one_line, shown
-from alice_survey.base.errors import VehicleError, why
+from alice_survey.base.contents import shown
+from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array, rotation_from_attitude
+from alice_survey.vehicle.files import read_table, validated
 from alice_survey.vehicle.log import TIME, VehicleLog, log_of_columns, read_number_columns
 
 Three = tuple[str, str, str]
@@ -58,17 +58,7 @@ def read_column_map(path: Path) -> ColumnMap:
     Raises:
         VehicleError: the file cannot be read or has an unknown key or value.
     """
-    try:
-        with path.open("rb") as file:
-            found = ColumnMap.model_validate(tomllib.load(file))
-    except OSError as error:
-        raise VehicleError(f"{path}: cannot be read: {why(error)}") from None
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise VehicleError(f"{path}: {shown(place)}: {first['msg']}") from None
-    except (ValueError, RecursionError) as error:  # no TOML, no text, or a number without end
-        raise VehicleError(f"{path}: cannot be read: {one_line(error)}") from None
+    found = validated(path, ColumnMap, read_table(path))
     if (found.time is None) == (found.time_step_s is None):
         raise VehicleError(f"{path}: give time, or time_step_s where the rows have no time")
     if found.angles_deg is not None and (found.body, found.world) != ("frd", "ned"):

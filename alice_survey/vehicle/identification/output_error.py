@@ -24,8 +24,15 @@ from alice_survey.vehicle.identification.noise import (
     score_information,
 )
 from alice_survey.vehicle.identification.parameters import Parameters
-from alice_survey.vehicle.identification.sensitivity import CHANNELS, START, simulate
-from alice_survey.vehicle.identification.slopes import STATES, Physics, scratch_for, with_given
+from alice_survey.vehicle.identification.sensitivity import (
+    CHANNELS,
+    START,
+    STATES,
+    Physics,
+    scratch_for,
+    simulate,
+    with_given,
+)
 from alice_survey.vehicle.identification.windows import Mask, Window, cut, residual_channels
 from alice_survey.vehicle.log import attitude_of
 
@@ -51,6 +58,8 @@ _NOTICED = 2e-3
 parameter."""
 _HANG = 3.0
 """Residuals count as correlated over this many correlation times, at most half a window."""
+_MOST_EVALUATIONS = 60
+"""Most evaluations of all windows, in each round."""
 _ROUNDS = 4
 """Most re-estimations of the noise."""
 _SAME = 0.02
@@ -115,8 +124,6 @@ def fit_output_error(
     parameters: Parameters,
     *,
     simulation: Simulation | None = None,
-    channel_sigma: Array | None = None,
-    most_evaluations: int = 60,
 ) -> OutputErrorFit:
     """Fit parameters to windows.
 
@@ -124,31 +131,25 @@ def fit_output_error(
         windows: all with the thrusters of the parameters' vehicle, or all without.
         parameters: what is free, and where it starts.
         simulation: steps and inputs.
-        channel_sigma: (9,) noise of velocity over ground, m/s, rates, rad/s, and attitude, rad;
-            estimated from the residuals when not given.
-        most_evaluations: most evaluations of all windows, in each round.
 
     Raises:
         VehicleError: the simulation does not stay finite at the start, the fit does not settle, or
             the logs do not determine the parameters.
     """
     how = simulation or Simulation()
-    sigma = _first_sigma(windows) if channel_sigma is None else channel_sigma
     lower, upper = parameters.bounds
     short = [part for window in windows for part in cut(window, _SHORT_S)]
     rough = replace(how, longest_step_s=max(how.longest_step_s, _ROUGH_STEP_S))
-    approach = _FitProblem(short, parameters, rough, sigma, settled=1.0)
+    approach = _FitProblem(short, parameters, rough, _first_sigma(windows), settled=1.0)
     approach.begin(parameters.start)
     result = least_squares(
         approach.residuals, np.clip(parameters.start, lower, upper), approach.jacobian,
         bounds=(lower, upper), x_scale="jac", ftol=1e-3, xtol=1e-10, gtol=None, max_nfev=20,
     )  # fmt: skip
     values, evaluations = result.x, int(result.nfev)
-    if channel_sigma is None:
-        approach.estimate_sigma(values)
-        sigma = approach.sigma
-    problem = _FitProblem(windows, parameters, how, sigma)
-    rounds = (1e2,) * _ROUNDS + (1.0,) if channel_sigma is None else (1.0,)
+    approach.estimate_sigma(values)
+    problem = _FitProblem(windows, parameters, how, approach.sigma)
+    rounds = (1e2,) * _ROUNDS + (1.0,)
     settled = False
     for looseness in progress(rounds, "fit", len(rounds)):
         if settled and looseness > 1.0:
@@ -157,12 +158,12 @@ def fit_output_error(
         result = least_squares(
             problem.residuals, np.clip(values, lower, upper), problem.jacobian,
             bounds=(lower, upper), x_scale="jac", ftol=looseness * _NOTICED / problem.samples,
-            xtol=1e-10, gtol=None, max_nfev=most_evaluations,
+            xtol=1e-10, gtol=None, max_nfev=_MOST_EVALUATIONS,
         )  # fmt: skip
         evaluations += result.nfev
         if result.status == 0:
             raise VehicleError(
-                f"the fit has not settled after {most_evaluations} evaluations: free fewer "
+                f"the fit has not settled after {_MOST_EVALUATIONS} evaluations: free fewer "
                 "parameters, or start from coefficients that are closer"
             )
         values = result.x

@@ -10,7 +10,7 @@ import numpy as np
 from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.coefficients import FORCES, LIFTS, MOTIONS, Coefficients
-from alice_survey.vehicle.identification.slopes import (
+from alice_survey.vehicle.identification.sensitivity import (
     ADDED_MASS,
     BIAS,
     BUOYANCY,

@@ -24,7 +24,7 @@ from alice_survey.base.run.progress import step as named_step
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.identification.noise import autocovariance, correlated_information
 from alice_survey.vehicle.identification.parameters import OTHERS, Parameters
-from alice_survey.vehicle.identification.slopes import (
+from alice_survey.vehicle.identification.sensitivity import (
     ADDED_MASS,
     LIFT,
     LINEAR,
@@ -45,7 +45,6 @@ _PASSES, _AGREED = 60, 1e-6
 class TwoStep:
     """Coefficients by the paper's calibration."""
 
-    parameters: Parameters
     values: Array
     """(P,)"""
     sigma: Array
@@ -112,7 +111,7 @@ def calibrate(windows: Sequence[Window], parameters: Parameters) -> TwoStep:
             f"added mass and damping do not agree after {_PASSES} passes: free fewer of them, or "
             "add manoeuvres"
         )
-    return TwoStep(parameters=parameters, values=values, sigma=sigma, step=tuple(steps))
+    return TwoStep(values=values, sigma=sigma, step=tuple(steps))
 
 
 def _regress(
@@ -160,10 +159,10 @@ def _regress(
 def _averaged(rows: _Rows, table: Array) -> Array:
     """Weighted means, (T, K), over sliding stretches of columns (T, K)."""
     cuts = np.cumsum(rows.runs)[:-1]
-    means = []
-    for run, weights in zip(np.split(table, cuts), rows.weights, strict=True):
-        means.append(fftconvolve(run, weights[:, None], mode="same", axes=0))
-    return np.concatenate(means)
+    runs = zip(np.split(table, cuts), rows.weights, strict=True)
+    return np.concatenate([
+        fftconvolve(run, weights[:, None], mode="same", axes=0) for run, weights in runs
+    ])  # fmt: skip
 
 
 def _regressor(rows: _Rows, kind: int, force: int, motion: int) -> Array:

@@ -17,12 +17,14 @@ from alice_survey.base.errors import VehicleError
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.identification.output_error import Simulation
 from alice_survey.vehicle.identification.parameters import Parameters
-from alice_survey.vehicle.identification.sensitivity import CHANNELS, Record, simulate
-from alice_survey.vehicle.identification.slopes import (
+from alice_survey.vehicle.identification.sensitivity import (
+    CHANNELS,
     STATES,
     Physics,
+    Record,
     Terms,
     scratch_for,
+    simulate,
     with_given,
 )
 from alice_survey.vehicle.identification.windows import Window

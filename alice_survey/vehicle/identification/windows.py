@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from alice_survey.base.errors import VehicleError, warn
 from alice_survey.base.frames import Array
-from alice_survey.vehicle.identification.sensitivity import CHANNELS, Record
-from alice_survey.vehicle.identification.slopes import STATES
-from alice_survey.vehicle.log import VehicleLog, segments
+from alice_survey.vehicle.identification.sensitivity import CHANNELS, STATES, Record
+from alice_survey.vehicle.log import VehicleLog, longest_step_s, segments
 from alice_survey.vehicle.vehicle import Vehicle
 
 RATE_NAMES = ("p", "q", "r")
@@ -43,8 +42,6 @@ def make_windows(
     vehicle: Vehicle,
     *,
     window_s: float | None = None,
-    gap_s: float | None = None,
-    source: str | None = None,
     given: Sequence[str] = (),
 ) -> list[Window]:
     """Cut a log into windows; warns of rows that are left out.
@@ -55,9 +52,6 @@ def make_windows(
             a row stays what it was.
         vehicle: whose thrusters they are.
         window_s: longest duration of a window; whole stretches without gaps if not given.
-        gap_s: longest step that is not a gap, see `segments`; also the longest that an input is
-            carried on.
-        source: `rpm`, `thrust` or `wrench`: which input to take, if the log holds several.
         given: rates, of p, q and r, that follow the log instead of the forces, such as those of
             rolling and pitching that nothing in the log explains; they are not compared then.
 
@@ -65,13 +59,13 @@ def make_windows(
         VehicleError: the log lacks attitude, motion or input, or no stretch is long enough.
     """
     _check(log)
-    rps, wrench = inputs(log, vehicle, source)
+    rps, wrench = inputs(log, vehicle)
     motion = np.concatenate([log.velocity_body, log.rates_body], axis=1)
     places = _given(log, motion, given)
     acceleration = _accelerations(log.time_s, motion, places)
     windows, lost = [], 0
-    for part in segments(log, gap_s):
-        known = _held(log.time_s[part], rps[part], wrench[part], gap_s)
+    for part in segments(log):
+        known = _held(log.time_s[part], rps[part], wrench[part])
         for piece in _pieces(log.time_s[part], known, window_s):
             rows = slice(part.start + piece.start, part.start + piece.stop)
             record = Record(
@@ -98,7 +92,7 @@ def make_windows(
     return windows
 
 
-def inputs(log: VehicleLog, vehicle: Vehicle, source: str | None = None) -> tuple[Array, Array]:
+def inputs(log: VehicleLog, vehicle: Vehicle) -> tuple[Array, Array]:
     """Speeds of the vehicle's thrusters, (T, n) rev/s, and a given wrench, (T, 6).
 
     Of the two the one that the log does not hold has no columns, or is zero. Thrusts act at the
@@ -107,31 +101,22 @@ def inputs(log: VehicleLog, vehicle: Vehicle, source: str | None = None) -> tupl
     Raises:
         VehicleError: the log has no such input, or lacks a thruster of the vehicle.
     """
-    kinds = {
-        "rpm": bool(log.rpm),
-        "thrust": bool(log.thrust_n),
-        "wrench": bool(np.any(np.isfinite(log.wrench))),
-    }
-    chosen = source or next((kind for kind, held in kinds.items() if held), None)
-    if chosen is None or not kinds.get(chosen, False):
-        raise VehicleError(
-            f"{log.source}: has no {chosen or 'input'}: give rpm_NAME, thrust_NAME_n or "
-            "X_n,Y_n,Z_n,K_nm,M_nm,N_nm"
-        )
-    count = len(log.time_s)
-    if chosen == "wrench":
+    count, series = len(log.time_s), log.rpm or log.thrust_n
+    if not series:
+        if not np.any(np.isfinite(log.wrench)):
+            raise VehicleError(
+                f"{log.source}: has no input: give rpm_NAME, thrust_NAME_n or "
+                "X_n,Y_n,Z_n,K_nm,M_nm,N_nm"
+            )
         return np.zeros((count, 0)), log.wrench.copy()
-    series = log.rpm if chosen == "rpm" else log.thrust_n
     names = [thruster.name for thruster in vehicle.thrusters]
-    missing = [name for name in names if name not in series]
-    strange = [name for name in series if name not in names]
-    if missing or strange:
+    if set(names) != set(series):
         raise VehicleError(
             f"{log.source}: thrusters {', '.join(series)} are not those of {vehicle.name}: "
             f"{', '.join(names) or 'none'}"
         )
     table = np.stack([series[name] for name in names], axis=1)
-    if chosen == "rpm":
+    if log.rpm:
         return table / 60.0, np.zeros((count, 6))
     columns = []
     for thruster in vehicle.thrusters:
@@ -158,7 +143,9 @@ def of_windows(windows: Sequence[Window], vehicle: Vehicle) -> Vehicle:
     thrusters = {window.record.rps.shape[1] for window in windows}
     if len(thrusters) > 1:
         raise VehicleError("some logs give thruster speeds and others forces: use one kind")
-    return vehicle if thrusters == {len(vehicle.thrusters)} else _without_thrusters(vehicle)
+    if thrusters == {len(vehicle.thrusters)}:
+        return vehicle
+    return vehicle.without([thruster.name for thruster in vehicle.thrusters])
 
 
 def residual_channels(window: Window, observed: Array) -> Array:
@@ -168,10 +155,6 @@ def residual_channels(window: Window, observed: Array) -> Array:
     difference[:, list(window.given)] = np.nan
     difference[:, 6:] = observed[:, 6:]
     return difference
-
-
-def _without_thrusters(vehicle: Vehicle) -> Vehicle:
-    return vehicle.without([thruster.name for thruster in vehicle.thrusters])
 
 
 def _check(log: VehicleLog) -> None:
@@ -210,13 +193,12 @@ def _accelerations(time_s: Array, motion: Array, places: tuple[int, ...]) -> Arr
     return result
 
 
-def _held(time_s: Array, rps: Array, wrench: Array, gap_s: float | None) -> Mask:
+def _held(time_s: Array, rps: Array, wrench: Array) -> Mask:
     """Fill gaps of the input in place from the row before; (T,) where there is one.
 
-    An input is not carried on for longer than a gap: 10 median steps when not given.
+    An input is not carried on for longer than a gap of the log.
     """
-    steps = np.diff(time_s)
-    longest = 10 * float(np.median(steps)) if gap_s is None and len(steps) else gap_s or 0.0
+    longest = longest_step_s(time_s)
     known = np.all(np.isfinite(rps), axis=1) & np.all(np.isfinite(wrench), axis=1)
     last = np.maximum.accumulate(np.where(known, np.arange(len(time_s)), -1))
     fresh: Mask = (last >= 0) & (time_s - time_s[np.maximum(last, 0)] <= longest)

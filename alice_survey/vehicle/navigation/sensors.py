@@ -16,7 +16,6 @@ and a compass error that varies with heading.
 """
 
 import math
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -33,8 +32,7 @@ IMU, DVL, PRESSURE, GPS, USBL, FOLLOWED = 0, 1, 2, 3, 4, 5
 BEAMS = 4
 
 
-@dataclass(frozen=True, kw_only=True)
-class ImuSpec:
+class ImuSpec(NamedTuple):
     """Gyroscopes and accelerometers, read as increments over each tick.
 
     White noise is given by its random walk, a bias by its value at the start and its own walk.
@@ -54,8 +52,7 @@ class ImuSpec:
     """Sigma of roll and of pitch at the start."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class CompassSpec:
+class CompassSpec(NamedTuple):
     """Heading of the AHRS: a slowly varying bias and white noise."""
 
     rate_hz: float = 10.0
@@ -66,8 +63,7 @@ class CompassSpec:
     """Inferred."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class DvlSpec:
+class DvlSpec(NamedTuple):
     """A Doppler velocity log with four beams in Janus arrangement, 45 degrees off the bow."""
 
     position_body_m: Place = (-0.4145, 0.0, 0.11)
@@ -98,8 +94,6 @@ class DvlSpec:
     """Probability that a beam receives another echo, of a fish or a second one (inferred)."""
     outlier_mps: float = 2.0
     """Half width of the reading it then gives."""
-    dropouts_s: tuple[tuple[float, float], ...] = ()
-    """Times (from, to) without any echo."""
     water_every: int = 5
     """Interval, in pings, of water tracking; 0: never. Without bottom lock all pings do it."""
     water_noise_mps: float = 0.01
@@ -108,8 +102,7 @@ class DvlSpec:
     """The layer must lie clear of the bottom's echo (inferred)."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class PressureSpec:
+class PressureSpec(NamedTuple):
     """Depth from pressure, set to zero at the surface."""
 
     position_body_m: Place = (0.387, 0.0, -0.033)
@@ -122,8 +115,7 @@ class PressureSpec:
     """Inferred."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class GpsSpec:
+class GpsSpec(NamedTuple):
     """Position while the antenna is above water: a slowly varying bias and white noise."""
 
     position_body_m: Place = (-0.39, 0.0, -0.36)
@@ -137,8 +129,7 @@ class GpsSpec:
     """Greatest depth of the body's origin with a fix."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class UsblSpec:
+class UsblSpec(NamedTuple):
     """Horizontal position by an acoustic transceiver under a boat; off unless it has a rate."""
 
     position_body_m: Place = (-0.39, 0.0, -0.25)
@@ -160,6 +151,12 @@ class UsblSpec:
 class Sensors(NamedTuple):
     """The suite as compiled code sees it; `every` counts ticks, 0 is never."""
 
+    imu: ImuSpec
+    compass: CompassSpec
+    dvl: DvlSpec
+    pressure: PressureSpec
+    gps: GpsSpec
+    usbl: UsblSpec
     tick_s: float
     place: Array
     """(6, 3) positions of the instruments and of the followed point on the body."""
@@ -169,70 +166,31 @@ class Sensors(NamedTuple):
     """(4, 3) unit vectors in the body frame."""
     dropouts_s: Array
     """(K, 2)"""
-    gyro_noise: float
-    gyro_walk: float
-    accelerometer_noise: float
-    accelerometer_walk: float
-    gyro_bias_sigma: float
-    accelerometer_bias_sigma: float
-    tilt_sigma: float
-    compass_every: int
-    compass_noise: float
-    compass_bias_sigma: float
-    compass_bias_s: float
-    pressure_every: int
-    pressure_noise: float
-    pressure_bias_sigma: float
-    pressure_bias_s: float
-    dvl_every: int
-    beam_noise: float
-    beam_noise_per_speed: float
-    scale_sigma: float
-    dvl_bias_sigma: float
-    misalignment_sigma: float
-    range_noise: float
-    range_noise_fraction: float
-    least_range: float
-    most_range: float
     least_cos_tilt: float
-    ping_loss: float
-    beam_loss: float
-    dvl_outlier_probability: float
-    dvl_outlier: float
-    water_every: int
-    water_noise: float
-    water_least_altitude: float
-    water_sigma: float
-    water_s: float
+    compass_every: int
+    pressure_every: int
+    dvl_every: int
     gps_every: int
-    gps_noise: float
-    gps_bias_sigma: float
-    gps_bias_s: float
-    gps_most_depth: float
     usbl_every: int
-    boat_north: float
-    boat_east: float
-    boat_depth: float
-    usbl_noise: float
-    usbl_noise_fraction: float
-    usbl_outlier_probability: float
-    usbl_outlier: float
-    usbl_most_range: float
+    current_sigma_mps: float
+    current_correlation_s: float
     gate: float
+    """Square of the sigmas beyond which a measurement is not used."""
     altitude_age_s: float
     relief_memory_s: float
 
 
-@dataclass(frozen=True, kw_only=True)
-class SensorSuite:
+class SensorSuite(NamedTuple):
     """All instruments, and the filter's settings for them."""
 
-    imu: ImuSpec = field(default_factory=ImuSpec)
-    compass: CompassSpec = field(default_factory=CompassSpec)
-    dvl: DvlSpec = field(default_factory=DvlSpec)
-    pressure: PressureSpec = field(default_factory=PressureSpec)
-    gps: GpsSpec = field(default_factory=GpsSpec)
-    usbl: UsblSpec = field(default_factory=UsblSpec)
+    imu: ImuSpec = ImuSpec()
+    compass: CompassSpec = CompassSpec()
+    dvl: DvlSpec = DvlSpec()
+    pressure: PressureSpec = PressureSpec()
+    gps: GpsSpec = GpsSpec()
+    usbl: UsblSpec = UsblSpec()
+    dvl_dropouts_s: tuple[tuple[float, float], ...] = ()
+    """Times (from, to) without any echo of the DVL."""
     current_sigma_mps: float = 0.3
     """Sigma of north and of east each: the filter's prior of currents, a Gauss-Markov process."""
     current_correlation_s: float = 3600.0
@@ -256,98 +214,53 @@ class SensorSuite:
             VehicleError: an instrument's period is not a multiple of the tick, or a number is out
                 of its range.
         """
-        imu, compass, dvl, pressure = self.imu, self.compass, self.dvl, self.pressure
-        gps, usbl = self.gps, self.usbl
+        imu, compass, dvl, pressure, gps, usbl = self[:6]
         self._check()
+        places = [kind.position_body_m for kind in (imu, dvl, pressure, gps, usbl)]
         return Sensors(
+            *self[:6],
             tick_s=tick_s,
-            place=np.array(
-                [
-                    imu.position_body_m, dvl.position_body_m, pressure.position_body_m,
-                    gps.position_body_m, usbl.position_body_m, self.followed_body_m,
-                ], dtype=np.float64,
-            ),
+            place=np.array([*places, self.followed_body_m], dtype=np.float64),
             hull=hull.points_body_m,
             beams=janus_beams(dvl.beam_angle_rad),
-            dropouts_s=np.array(dvl.dropouts_s, dtype=np.float64).reshape(-1, 2),
-            gyro_noise=imu.gyro_noise_rad_per_sqrt_s,
-            gyro_walk=imu.gyro_bias_walk_radps_per_sqrt_s,
-            accelerometer_noise=imu.accelerometer_noise_mps_per_sqrt_s,
-            accelerometer_walk=imu.accelerometer_bias_walk_mps2_per_sqrt_s,
-            gyro_bias_sigma=imu.gyro_bias_sigma_radps,
-            accelerometer_bias_sigma=imu.accelerometer_bias_sigma_mps2,
-            tilt_sigma=imu.tilt_sigma_rad,
-            compass_every=_ticks("compass", compass.rate_hz, tick_s),
-            compass_noise=compass.noise_rad,
-            compass_bias_sigma=compass.bias_sigma_rad,
-            compass_bias_s=compass.bias_correlation_s,
-            pressure_every=_ticks("pressure sensor", pressure.rate_hz, tick_s),
-            pressure_noise=pressure.noise_m,
-            pressure_bias_sigma=pressure.bias_sigma_m,
-            pressure_bias_s=pressure.bias_correlation_s,
-            dvl_every=_ticks("DVL", dvl.rate_hz, tick_s),
-            beam_noise=dvl.beam_noise_mps,
-            beam_noise_per_speed=dvl.beam_noise_per_speed,
-            scale_sigma=dvl.scale_sigma,
-            dvl_bias_sigma=dvl.bias_sigma_mps,
-            misalignment_sigma=dvl.misalignment_sigma_rad,
-            range_noise=dvl.range_noise_m,
-            range_noise_fraction=dvl.range_noise_fraction,
-            least_range=dvl.least_range_m,
-            most_range=dvl.most_range_m,
+            dropouts_s=np.array(self.dvl_dropouts_s, dtype=np.float64).reshape(-1, 2),
             least_cos_tilt=math.cos(dvl.most_tilt_rad),
-            ping_loss=dvl.ping_loss,
-            beam_loss=dvl.beam_loss,
-            dvl_outlier_probability=dvl.outlier_probability,
-            dvl_outlier=dvl.outlier_mps,
-            water_every=dvl.water_every,
-            water_noise=dvl.water_noise_mps,
-            water_least_altitude=dvl.water_least_altitude_m,
-            water_sigma=self.current_sigma_mps,
-            water_s=self.current_correlation_s,
+            compass_every=_ticks("compass", compass.rate_hz, tick_s),
+            pressure_every=_ticks("pressure sensor", pressure.rate_hz, tick_s),
+            dvl_every=_ticks("DVL", dvl.rate_hz, tick_s),
             gps_every=_ticks("GPS", gps.rate_hz, tick_s),
-            gps_noise=gps.noise_m,
-            gps_bias_sigma=gps.bias_sigma_m,
-            gps_bias_s=gps.bias_correlation_s,
-            gps_most_depth=gps.most_depth_m,
             usbl_every=_ticks("USBL", usbl.rate_hz, tick_s),
-            boat_north=usbl.boat_ned_m[0],
-            boat_east=usbl.boat_ned_m[1],
-            boat_depth=usbl.boat_ned_m[2],
-            usbl_noise=usbl.noise_m,
-            usbl_noise_fraction=usbl.noise_fraction,
-            usbl_outlier_probability=usbl.outlier_probability,
-            usbl_outlier=usbl.outlier_m,
-            usbl_most_range=usbl.most_range_m,
+            current_sigma_mps=self.current_sigma_mps,
+            current_correlation_s=self.current_correlation_s,
             gate=self.gate_sigmas**2,
             altitude_age_s=self.altitude_age_s,
             relief_memory_s=self.relief_memory_s,
-        )  # fmt: skip
+        )
 
     def _check(self) -> None:
-        noises = {
-            "the gyroscopes' noise": self.imu.gyro_noise_rad_per_sqrt_s,
-            "the accelerometers' noise": self.imu.accelerometer_noise_mps_per_sqrt_s,
-            "the compass's noise": self.compass.noise_rad,
-            "the pressure sensor's noise": self.pressure.noise_m,
-            "the DVL's noise": self.dvl.beam_noise_mps,
-            "the DVL's noise in water": self.dvl.water_noise_mps,
-            "the DVL's range noise": self.dvl.range_noise_m,
-            "the GPS's noise": self.gps.noise_m,
-            "the USBL's noise": self.usbl.noise_m,
-            "the compass's correlation time": self.compass.bias_correlation_s,
-            "the pressure sensor's correlation time": self.pressure.bias_correlation_s,
-            "the GPS's correlation time": self.gps.bias_correlation_s,
-            "the current's correlation time": self.current_correlation_s,
-            "gate_sigmas": self.gate_sigmas,
-            "relief_memory_s": self.relief_memory_s,
-        }
-        for name, value in noises.items():
-            if not (value > 0 and math.isfinite(value)):
-                raise VehicleError(f"{name} is {value:g}: the filter needs more than 0")
-        for start, end in self.dvl.dropouts_s:
+        for kind, names in _POSITIVE.items():
+            for name in names:
+                value = getattr(getattr(self, kind) if kind else self, name)
+                if not (value > 0 and math.isfinite(value)):
+                    raise VehicleError(
+                        f"{f'{kind}.' if kind else ''}{name} is {value:g}: the filter needs more "
+                        "than 0"
+                    )
+        for start, end in self.dvl_dropouts_s:
             if not start < end:
                 raise VehicleError(f"a DVL drop-out from {start:g} s to {end:g} s ends too early")
+
+
+_POSITIVE = {
+    "imu": ("gyro_noise_rad_per_sqrt_s", "accelerometer_noise_mps_per_sqrt_s"),
+    "compass": ("noise_rad", "bias_correlation_s"),
+    "pressure": ("noise_m", "bias_correlation_s"),
+    "dvl": ("beam_noise_mps", "water_noise_mps", "range_noise_m"),
+    "gps": ("noise_m", "bias_correlation_s"),
+    "usbl": ("noise_m",),
+    "": ("current_correlation_s", "gate_sigmas", "relief_memory_s"),
+}
+"""Numbers of each instrument, and of the suite, that must be greater than 0."""
 
 
 def janus_beams(angle_rad: float) -> Array:

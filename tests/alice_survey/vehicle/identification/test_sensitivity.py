@@ -7,11 +7,14 @@ from scipy.spatial.transform import Rotation
 from alice_survey.base.frames import Array, rotation_from_attitude
 from alice_survey.vehicle.fleet import vehicle
 from alice_survey.vehicle.identification.parameters import Parameters, free_parameters
-from alice_survey.vehicle.identification.sensitivity import CHANNELS, START, Record, simulate
-from alice_survey.vehicle.identification.slopes import (
+from alice_survey.vehicle.identification.sensitivity import (
+    CHANNELS,
+    START,
     STATES,
+    Record,
     Terms,
     scratch_for,
+    simulate,
     with_given,
 )
 from tests.oracles_identification import integrated, numpy_observation

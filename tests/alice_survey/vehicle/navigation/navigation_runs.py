@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from alice_survey.vehicle.compiled import kernel
 from alice_survey.vehicle.estimate_vector import ESTIMATE
 from alice_survey.vehicle.floor import FloorGrid
+from alice_survey.vehicle.navigation.filter import GYRO_BIAS, WATER, NavigationState, new_navigation
 from alice_survey.vehicle.navigation.sensors import IMU, Sensors
-from alice_survey.vehicle.navigation.state import GYRO_BIAS, WATER, NavigationState, new_navigation
 from alice_survey.vehicle.navigation.tick import LOG_ROW, log_row, navigation_tick
 
 Array = NDArray[np.float64]
@@ -107,7 +107,7 @@ def fly(
 ) -> Run:
     """Navigate a known track; the current is drawn from the filter's own belief if not given."""
     rng = np.random.default_rng(seed)
-    drawn = np.array([*(sensors.water_sigma * rng.standard_normal(2)), 0.0])
+    drawn = np.array([*(sensors.current_sigma_mps * rng.standard_normal(2)), 0.0])
     water = drawn if water is None else water
     nav = start or new_navigation(sensors, truth[0], rng)
     count = len(truth)

@@ -17,7 +17,7 @@ RUNS = 50
 DURATION_S = 600.0
 SUITES = {
     "default": SensorSuite(),
-    "drop-out": SensorSuite(dvl=DvlSpec(dropouts_s=((200.0, 230.0),))),
+    "drop-out": SensorSuite(dvl_dropouts_s=((200.0, 230.0),)),
     "usbl": SensorSuite(usbl=UsblSpec(rate_hz=0.2, boat_ned_m=(10.0, 5.0, 1.0))),
 }
 SPACING_M = 0.1
@@ -143,8 +143,8 @@ def test_altitude_errs_as_the_beams_say(floor: FloorGrid, low: float, high: floa
 
 
 def test_altitude_is_carried_by_depth_and_given_up_in_time() -> None:
-    dvl = DvlSpec(dropouts_s=((30.0, 40.0),), outlier_probability=0.0)
-    suite = SensorSuite(dvl=dvl, altitude_age_s=3.0)
+    dvl = DvlSpec(outlier_probability=0.0)
+    suite = SensorSuite(dvl=dvl, dvl_dropouts_s=((30.0, 40.0),), altitude_age_s=3.0)
     truth = straight(60.0, 0.1)
     # Sinks by 2 cm/s all the while.
     truth[:, 2] += 0.02 * np.arange(len(truth)) * 0.05 - 1.0

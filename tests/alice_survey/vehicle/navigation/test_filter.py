@@ -1,7 +1,6 @@
 """The filter against its dense twin and against closed forms."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,27 +9,6 @@ from numpy.random import default_rng
 from alice_survey.vehicle import rotations
 from alice_survey.vehicle.floor import FloorGrid, level_floor
 from alice_survey.vehicle.navigation.filter import (
-    correct,
-    lever_row,
-    use_beams,
-    use_depth,
-    use_heading,
-)
-from alice_survey.vehicle.navigation.measuring import measure_imu
-from alice_survey.vehicle.navigation.prediction import predict
-from alice_survey.vehicle.navigation.sensors import (
-    GPS,
-    USBL,
-    CompassSpec,
-    DvlSpec,
-    GpsSpec,
-    ImuSpec,
-    PressureSpec,
-    Sensors,
-    SensorSuite,
-    UsblSpec,
-)
-from alice_survey.vehicle.navigation.state import (
     BEAM,
     BELIEVED,
     COMPASS_USE,
@@ -54,9 +32,32 @@ from alice_survey.vehicle.navigation.state import (
     WATER_BEAM,
     WIDENED,
     NavigationState,
+    correct,
+    lever_row,
     new_navigation,
+    predict,
+    use_beams,
+    use_depth,
+    use_heading,
 )
-from alice_survey.vehicle.navigation.tick import LOG_COLUMNS, LOG_ROW, navigation_tick
+from alice_survey.vehicle.navigation.sensors import (
+    GPS,
+    USBL,
+    CompassSpec,
+    DvlSpec,
+    GpsSpec,
+    ImuSpec,
+    PressureSpec,
+    Sensors,
+    SensorSuite,
+    UsblSpec,
+)
+from alice_survey.vehicle.navigation.tick import (
+    LOG_COLUMNS,
+    LOG_ROW,
+    measure_imu,
+    navigation_tick,
+)
 from tests import oracles_navigation as oracle
 from tests.alice_survey.vehicle.navigation.navigation_runs import (
     TICK_S,
@@ -156,34 +157,38 @@ def twin_update(
         add(
             lambda b: np.array([heading + rotations.wrapped(oracle.heading(b) - heading)]),
             np.array([wrapped]),
-            np.array([sensors.compass_noise**2]),
+            np.array([sensors.compass.noise_rad**2]),
         )
         add(
             lambda b: np.array([oracle.depth(b, sensors)]),
             readings[DEPTH : DEPTH + 1],
-            np.array([sensors.pressure_noise**2]),
+            np.array([sensors.pressure.noise_m**2]),
         )
     if tick % 20 == 0:
         fix, heard = readings[GPS_FIX : GPS_FIX + 2], readings[USBL_FIX : USBL_FIX + 2]
-        add(lambda b: oracle.gps(b, sensors), fix, np.full(2, sensors.gps_noise**2))
-        boat = np.array([sensors.boat_north, sensors.boat_east, sensors.boat_depth])
+        add(lambda b: oracle.gps(b, sensors), fix, np.full(2, sensors.gps.noise_m**2))
+        boat = np.array(sensors.usbl.boat_ned_m)
         slant2 = np.sum((oracle.place(belief, sensors, USBL) - boat) ** 2)
-        spread = sensors.usbl_noise**2 + sensors.usbl_noise_fraction**2 * slant2
+        spread = sensors.usbl.noise_m**2 + sensors.usbl.noise_fraction**2 * slant2
         add(lambda b: oracle.usbl(b, sensors), heard, np.full(2, spread))
     if tick % 4 == 0:
         rates = readings[RATES : RATES + 3].copy()
         for first, water in ((BEAM, False), (WATER_BEAM, True)):
-            noise = np.full(4, sensors.water_noise**2)
+            noise = np.full(4, sensors.dvl.water_noise_mps**2)
             if not water:
                 along = oracle.beams(belief, sensors, rates, False)
                 velocity = np.linalg.lstsq(sensors.beams, along, rcond=None)[0]
                 bias = np.array([*belief.rest[10:12], 0.0])
                 speed = np.linalg.norm(velocity - bias)
-                noise = np.full(4, (sensors.beam_noise + sensors.beam_noise_per_speed * speed) ** 2)
+                noise = np.full(
+                    4, (sensors.dvl.beam_noise_mps + sensors.dvl.beam_noise_per_speed * speed) ** 2
+                )
             lever = oracle.jacobian(
                 lambda e, w=water: oracle.beams(belief, sensors, rates + e, w), 3
             )
-            noise = noise + sensors.gyro_noise**2 / TICK_S * np.sum(lever**2, axis=1)
+            noise = noise + sensors.imu.gyro_noise_rad_per_sqrt_s**2 / TICK_S * np.sum(
+                lever**2, axis=1
+            )
             add(
                 lambda b, w=water: oracle.beams(b, sensors, rates, w),
                 readings[first : first + 4],
@@ -281,9 +286,9 @@ def test_a_heading_bias_leads_astray_by_distance_times_bias() -> None:
 
 def test_without_the_dvl_a_level_imu_falls_off_as_integrated_noise() -> None:
     # Angle noise tilts gravity: variance g^2 n^2 t^5 / 20; velocity noise adds m^2 t^3 / 3.
-    imu = replace(PERFECT_IMU, gyro_noise_rad_per_sqrt_s=2e-4)
+    imu = PERFECT_IMU._replace(gyro_noise_rad_per_sqrt_s=2e-4)
     suite = SensorSuite(
-        imu=imu, compass=PERFECT_COMPASS, gps=PERFECT_GPS, dvl=replace(PERFECT_DVL, rate_hz=0.0)
+        imu=imu, compass=PERFECT_COMPASS, gps=PERFECT_GPS, dvl=PERFECT_DVL._replace(rate_hz=0.0)
     )
     sensors, time_s = suite.pack(), 40.0
     nav = new_navigation(sensors, straight(time_s)[0], default_rng(0))
@@ -331,8 +336,8 @@ def test_a_usbl_bounds_the_drift() -> None:
 
 def test_outliers_are_refused_and_leave_no_trace() -> None:
     truth = track(120.0)
-    clean = replace(SensorSuite().dvl, outlier_probability=0.0)
-    dirty = replace(clean, outlier_probability=0.1)
+    clean = DvlSpec(outlier_probability=0.0)
+    dirty = clean._replace(outlier_probability=0.1)
     ends = []
     for dvl in (clean, dirty):
         run = fly(SensorSuite(dvl=dvl).pack(), truth, FLOOR, 3)

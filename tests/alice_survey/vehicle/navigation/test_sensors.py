@@ -1,6 +1,5 @@
 """Instruments: what they report of a known truth."""
 
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -12,19 +11,7 @@ from scipy.spatial.transform import Rotation
 from alice_survey.base.errors import VehicleError
 from alice_survey.vehicle import rotations
 from alice_survey.vehicle.floor import FloorGrid, level_floor
-from alice_survey.vehicle.navigation.measuring import measure_dvl, measure_imu, solve_beams
-from alice_survey.vehicle.navigation.sensors import (
-    DVL,
-    IMU,
-    CompassSpec,
-    DvlSpec,
-    GpsSpec,
-    PressureSpec,
-    Sensors,
-    SensorSuite,
-    janus_beams,
-)
-from alice_survey.vehicle.navigation.state import (
+from alice_survey.vehicle.navigation.filter import (
     BEAM,
     DVL_VELOCITY,
     PUSH,
@@ -36,6 +23,17 @@ from alice_survey.vehicle.navigation.state import (
     NavigationState,
     new_navigation,
 )
+from alice_survey.vehicle.navigation.sensors import (
+    DVL,
+    IMU,
+    CompassSpec,
+    GpsSpec,
+    PressureSpec,
+    Sensors,
+    SensorSuite,
+    janus_beams,
+)
+from alice_survey.vehicle.navigation.tick import measure_dvl, measure_imu, solve_beams
 from tests.alice_survey.vehicle.navigation.navigation_runs import (
     TICK_S,
     Array,
@@ -52,11 +50,13 @@ SILENT = 1e-15
 def silent(suite: SensorSuite | None = None) -> Sensors:
     """Instruments without error or loss."""
     packed = (suite or SensorSuite()).pack()
-    names = [
-        name for name in packed._fields
-        if any(word in name for word in ("noise", "walk", "sigma", "loss", "probability"))
-    ]  # fmt: skip
-    return packed._replace(**dict.fromkeys(names, SILENT))
+    words = ("noise", "walk", "sigma", "loss", "probability")
+    kinds = {}
+    for kind in ("imu", "compass", "dvl", "pressure", "gps", "usbl"):
+        spec = getattr(packed, kind)
+        names = [name for name in spec._fields if any(word in name for word in words)]
+        kinds[kind] = spec._replace(**dict.fromkeys(names, SILENT))
+    return packed._replace(**kinds, current_sigma_mps=SILENT)
 
 
 def ping(sensors: Sensors, truth: Array, floor: FloorGrid, count: int = 1) -> NavigationState:
@@ -206,7 +206,7 @@ def test_three_beams_give_the_velocity_as_four_do(velocity: Array, missing: int)
 
 
 def test_no_echo_comes_in_a_drop_out() -> None:
-    suite = SensorSuite(dvl=DvlSpec(dropouts_s=((2.0, 3.0), (5.0, 5.5))))
+    suite = SensorSuite(dvl_dropouts_s=((2.0, 3.0), (5.0, 5.5)))
     run = fly(suite.pack(), straight(8.0), level_floor(15.0), 0)
     heard = np.isfinite(run.innovations[::4, 2:6]).any(axis=1)
     time_s = np.arange(len(heard)) * 0.2
@@ -225,10 +225,10 @@ def test_gps_is_heard_at_the_surface_alone() -> None:
 def test_numbers_out_of_range_are_refused() -> None:
     suite = SensorSuite()
     for wrong, words in (
-        (replace(suite, compass=CompassSpec(rate_hz=7.0)), "compass at 7 Hz"),
-        (replace(suite, gps=GpsSpec(rate_hz=-1.0)), "below 0"),
-        (replace(suite, pressure=PressureSpec(noise_m=0.0)), "more than 0"),
-        (replace(suite, dvl=DvlSpec(dropouts_s=((3.0, 2.0),))), "ends too early"),
+        (suite._replace(compass=CompassSpec(rate_hz=7.0)), "compass at 7 Hz"),
+        (suite._replace(gps=GpsSpec(rate_hz=-1.0)), "below 0"),
+        (suite._replace(pressure=PressureSpec(noise_m=0.0)), "more than 0"),
+        (suite._replace(dvl_dropouts_s=((3.0, 2.0),)), "ends too early"),
     ):
         with pytest.raises(VehicleError, match=words):
             wrong.pack()

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from alice_survey.base.frames import Array
-from alice_survey.vehicle.pilot import control
 from alice_survey.vehicle.pilot import gains as g
 from alice_survey.vehicle.pilot import memory as slot
+from alice_survey.vehicle.pilot import steering
 from alice_survey.vehicle.pilot.memory import new_pilot
 from tests import oracles_guidance as oracle
 from tests.alice_survey.vehicle.pilot.pilot_runs import gains_of
@@ -23,7 +23,7 @@ DEMANDS = arrays(np.float64, 8, elements=st.floats(-0.6, 0.6))
 def test_wrench_is_that_of_the_matrices(name: str, demand: Array) -> None:
     gains, pilot, wrench = gains_of(name), new_pilot(), np.full(6, 9.0)
     pilot.demand[:8] = demand
-    control.write_wrench(gains, pilot, wrench)
+    steering.write_wrench(gains, pilot, wrench)
     np.testing.assert_allclose(wrench, oracle.wrench(gains, demand), atol=1e-9)
     # Roll and pitch are not requested, nor sway where nothing gives it.
     assert wrench[3] == wrench[4] == 0.0
@@ -35,7 +35,7 @@ def test_wrench_is_that_of_the_matrices(name: str, demand: Array) -> None:
 def test_what_is_cut_is_told(demand: Array) -> None:
     gains, pilot, wrench = gains_of("alice"), new_pilot(), np.zeros(6)
     pilot.demand[:8] = demand * np.array([1, 1, 1, 1, 5, 5, 5, 20])
-    control.write_wrench(gains, pilot, wrench)
+    steering.write_wrench(gains, pilot, wrench)
     for axis, degree in enumerate(g.DEGREES):
         full = pilot.demand[slot.FULL_SURGE + axis]
         ends = gains.axes[axis, [g.LEAST, g.MOST]]
@@ -50,7 +50,7 @@ def test_signs_of_a_wrench() -> None:
     for axis, degree in enumerate(g.DEGREES):
         pilot.demand[:] = 0.0
         pilot.demand[slot.ACC_SURGE + axis] = 0.01
-        control.write_wrench(gains, pilot, wrench)
+        steering.write_wrench(gains, pilot, wrench)
         assert wrench[degree] > 0.0  # ahead, to starboard, down, and the bow to starboard
 
 
@@ -63,11 +63,11 @@ def test_place_loop_near_the_place_is_the_placed_one(
     gains = gains_of("alice")
     row = gains.axes[axis]
     most = 100.0
-    steady, acceleration = control.place_demand(gains, axis, error, speed, feed, 0.0, most)
+    steady, acceleration = steering.place_demand(gains, axis, error, speed, feed, 0.0, most)
     # Whatever the share of the inner loop: rate on the speed, place on the place.
     expected = row[g.RATE] * (feed - speed) + row[g.PLACE] * error
     assert acceleration == pytest.approx(expected, abs=1e-12)
-    cut, _ = control.place_demand(gains, axis, error, speed, feed, 0.0, 0.05)
+    cut, _ = steering.place_demand(gains, axis, error, speed, feed, 0.0, 0.05)
     assert abs(cut - feed) <= 0.05 + 1e-12
     assert steady - feed == pytest.approx(row[g.PLACE] / row[g.INNER] * error)
 
@@ -78,8 +78,8 @@ def _hold(gains: g.Gains, push: float, seconds: float, most: float) -> tuple[Arr
     place = speed = force = total = 0.0
     places, totals, full = [], [], 0.0
     for _ in range(round(seconds / dt_s)):
-        _, acceleration = control.place_demand(gains, g.SWAY, -place, speed, 0.0, total, 1.0)
-        total += control.place_sum_step(gains, g.SWAY, -place, full, dt_s)
+        _, acceleration = steering.place_demand(gains, g.SWAY, -place, speed, 0.0, total, 1.0)
+        total += steering.place_sum_step(gains, g.SWAY, -place, full, dt_s)
         asked = row[g.MASS] * acceleration
         full = 1.0 if asked > most else (-1.0 if asked < -most else 0.0)
         asked = min(max(asked, -most), most)
@@ -110,19 +110,19 @@ def test_integral_does_not_wind_up_while_the_force_is_cut() -> None:
     _, totals = _hold(gains, 12.0, 20.0, 10.0)
     bound = 10.0 / (row[g.INNER] * row[g.MASS])
     assert np.abs(totals).max() < 1.2 * bound
-    assert control.place_sum_step(gains, g.SWAY, 1.0, 1.0, 0.05) == 0.0
-    assert control.place_sum_step(gains, g.SWAY, -1.0, 1.0, 0.05) < 0.0
+    assert steering.place_sum_step(gains, g.SWAY, 1.0, 1.0, 0.05) == 0.0
+    assert steering.place_sum_step(gains, g.SWAY, -1.0, 1.0, 0.05) < 0.0
 
 
 def test_speed_integral_is_bounded_by_what_the_thrusters_give() -> None:
     gains = gains_of("alice")
     row, total = gains.axes[g.SURGE], 0.0
     for _ in range(20000):
-        _, total = control.speed_demand(gains, g.SURGE, 1.0, 0.0, 0.0, total, 0.05)
+        _, total = steering.speed_demand(gains, g.SURGE, 1.0, 0.0, 0.0, total, 0.05)
     assert total == pytest.approx(max(-row[g.LEAST], row[g.MOST]) / (row[g.MASS] * row[g.INNER]))
-    held = control.speed_demand(gains, g.SURGE, 1.0, 0.2, 1.0, 0.1, 0.05)
+    held = steering.speed_demand(gains, g.SURGE, 1.0, 0.2, 1.0, 0.1, 0.05)
     assert held == (pytest.approx(row[g.RATE] * (row[g.WEIGHT] - 0.2 + 0.1)), 0.1)
 
 
 def test_an_axis_without_thrusters_has_no_integral() -> None:
-    assert control.sum_bound(gains_of("sparus2"), g.SWAY) == 0.0
+    assert steering.sum_bound(gains_of("sparus2"), g.SWAY) == 0.0

@@ -1,5 +1,17 @@
-"""Exact allocation: bounded weighted least squares, then least thrust, by two small active sets.
+"""Thrust allocation: which thrusters make a wrench.
 
+Both solvers take the matrix B (6, n) of `Vehicle.configuration_matrix`, the wrench wanted (6,), the
+bounds of thrust (n,), the weights of axes (6,) and of thrusters (n,), and write the thrust (n,):
+
+- `allocate_exact`: the least weighted miss within the bounds and, of all ways to it, the least
+  weighted thrust;
+- `allocate_rpi`: the redistributed pseudo-inverse of the paper.
+
+An axis of weight 0 is not requested: gravity handles roll and pitch. The others decide what
+is given up when not all is attainable, by the square of their weights times the squared miss.
+A failed thruster has the bounds 0 and 0. A wrench that is not a number gives NaN thrusts.
+
+The exact solver: bounded weighted least squares, then least thrust, by two small active sets.
 First the least |W_tau (B f - tau)| within the bounds, by the method of C. L. Lawson and R. J.
 Hanson, Solving Least Squares Problems, 1974, chapter 23, extended to two bounds (P. B. Stark and
 R. L. Parker, Computational Statistics 10, 1995). B has rank 4 and five thrusters: the steps are
@@ -8,16 +20,68 @@ wrench is unique, the thrust that makes it is not: of all thrusts that reach it,
 finds the one of least |W_f f|, by the primal active-set method for a strictly convex quadratic
 programme (J. Nocedal and S. J. Wright, Numerical Optimization, 2006, section 16.5). Both work with
 x = W_f f.
+
+The redistributed pseudo-inverse:
+f = -c + W^-1 B^T (B W^-1 B^T + eps I)^-1 (tau + B_0 c): the columns of B of thrusters that are
+saturated are zero, and c holds minus their thrust. The identity has as many rows as there are axes
+requested (the paper prints I_3 next to a 6 x 5 matrix).
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.frames import Array
-from alice_survey.vehicle.allocation.scratch import AllocationScratch
 from alice_survey.vehicle.compiled import kernel
+from alice_survey.vehicle.propulsion import DISTRUST, Propulsion
+
+
+class AllocationScratch(NamedTuple):
+    """Work arrays of both solvers; their contents between calls have no meaning."""
+
+    matrices: Array
+    """(5, N, N), N the greater of 6 and the number of thrusters."""
+    vectors: Array
+    """(9, N)"""
+    states: NDArray[np.int64]
+    """(N,) state of each thruster."""
+
+
+def allocation_scratch(thrusters: int) -> AllocationScratch:
+    """Work arrays for a number of thrusters."""
+    size = max(6, thrusters)
+    return AllocationScratch(
+        np.zeros((5, size, size)), np.zeros((9, size)), np.zeros(size, dtype=np.int64)
+    )
+
+
+AXIS_WEIGHTS: Array = np.array([1.0, 3.0, 30.0, 0.0, 0.0, 10.0])
+"""Priorities when not all is attainable. Heave keeps the vehicle off the sea floor; yaw keeps
+the pictures square and the thrusters pointing where the controller thinks they point; sway keeps to
+the line; surge only costs time. Each counts about ten times the next by the square of its miss, a
+newton metre of yaw, on arms near a metre, as a newton."""
+AXIS_WEIGHTS.setflags(write=False)
+
+_MOST_EXPONENT = 9.0
+
+
+@kernel
+def preference_weights(propulsion: Propulsion, u: float, weights: Array) -> None:
+    """Write the weights of thrusters, (n,), at a surge speed: the cost is sum of weight thrust^2.
+
+    An open thruster weighs 1, a tunnel thruster exp(2 C (u / u_ref)^2): the square of the thrust it
+    must make for what is left after the jet's loss exp(-C (u / u_j)^2), at the jet speed u_ref of
+    3 % of its greatest thrust, as on a survey line. ALICE's laterals thus do 96 % of the yaw at
+    survey speed, by their arms alone (and the horizontal pair, whose torques roll the vehicle when
+    they push apart, 4 %), and hand it over to the pair between 1 and 2 m/s. The growth stops at
+    e^9, so that the equations keep their precision.
+    """
+    t = propulsion.table
+    for i in range(t.shape[0]):
+        weights[i] = math.exp(min(t[i, DISTRUST] * u * u, _MOST_EXPONENT))
+
 
 _FREE, _HELD, _FIXED = 0, 1, 2
 """Between its bounds; at one of them for now; at one for good."""
@@ -339,3 +403,109 @@ def _price(m: int, n: int, rank: int, x: Array, out: Array, scratch: AllocationS
         out[k] = 0.0
         for r in range(rank):
             out[k] += q[r, k] * y[r]
+
+
+_EPSILON = 1e-9
+"""Regularisation, as a share of the mean diagonal of B W^-1 B^T."""
+
+
+@kernel
+def allocate_rpi(
+    matrix: Array,
+    wrench: Array,
+    lower: Array,
+    upper: Array,
+    axes: Array,
+    weights: Array,
+    thrust: Array,
+    scratch: AllocationScratch,
+) -> int:
+    """Allocate a wrench by the redistributed pseudo-inverse.
+
+    Each round solves for the thrusters that are not saturated, holds those that came out beyond
+    their bounds at the bound, and takes what they give off the wrench. A thruster once held is
+    never released: when the wrench is not attainable this falls short of the optimum. The paper
+    weighs thrusters alone; here rows are scaled by the axes' weights too, without which it falls
+    shorter still (all weights 1 is the paper's).
+
+    Args:
+        matrix: (6, n) B, wrench per thrust.
+        wrench: (6,) wanted, N and N m.
+        lower: (n,) least thrust, N.
+        upper: (n,) greatest thrust, N; the same as `lower` of a thruster that has failed.
+        axes: (6,) weights of the axes' misses; 0 of an axis that is not requested.
+        weights: (n,) positive; the cost is the sum of weight times thrust squared.
+        thrust: (n,) is written, N.
+        scratch: work arrays.
+
+    Returns:
+        Number of solutions computed.
+    """
+    n = matrix.shape[1]
+    gram, solution, held = scratch.matrices[0], scratch.vectors[0], scratch.states
+    for i in range(n):
+        held[i] = 1 if upper[i] <= lower[i] else 0
+        thrust[i] = min(max(0.0, lower[i]), upper[i])
+    rounds, again = 0, True
+    while again:
+        rounds, again, m = rounds + 1, False, 0
+        for a in range(6):
+            if axes[a] <= 0.0:
+                continue
+            rest = wrench[a]
+            for i in range(n):
+                if held[i]:
+                    rest -= matrix[a, i] * thrust[i]
+            solution[m] = axes[a] * rest
+            k = 0
+            for b in range(a + 1):
+                if axes[b] <= 0.0:
+                    continue
+                total = 0.0
+                for i in range(n):
+                    if not held[i]:
+                        total += matrix[a, i] * matrix[b, i] / weights[i]
+                gram[m, k] = axes[a] * axes[b] * total
+                k += 1
+            m += 1
+        trace = 0.0
+        for a in range(m):
+            trace += gram[a, a]
+        if trace == 0.0:
+            break
+        for a in range(m):
+            gram[a, a] += _EPSILON * trace / m
+        _solve(gram, solution, m)
+        for i in range(n):
+            if held[i]:
+                continue
+            total, k = 0.0, 0
+            for a in range(6):
+                if axes[a] > 0.0:
+                    total += axes[a] * matrix[a, i] * solution[k]
+                    k += 1
+            thrust[i] = total / weights[i]
+        for i in range(n):
+            if not held[i] and not lower[i] <= thrust[i] <= upper[i]:
+                thrust[i] = min(max(thrust[i], lower[i]), upper[i])
+                held[i] = 1
+                again = True
+    return rounds
+
+
+@kernel
+def _solve(matrix: Array, vector: Array, size: int) -> None:
+    """Solve a symmetric positive definite system, of which the lower half is given, in place."""
+    for i in range(size):
+        for j in range(i + 1):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = math.sqrt(total) if i == j else total / matrix[j, j]
+        for k in range(i):
+            vector[i] -= matrix[i, k] * vector[k]
+        vector[i] /= matrix[i, i]
+    for i in range(size - 1, -1, -1):
+        for k in range(i + 1, size):
+            vector[i] -= matrix[k, i] * vector[k]
+        vector[i] /= matrix[i, i]
