@@ -232,6 +232,12 @@ class FlatPortCamera:
         y = np.arange(0, self.height_px, step) + 0.5
         return np.stack(np.meshgrid(x, y), axis=-1)
 
+    def frame_grid(self, columns: int, rows: int) -> Array:
+        """Pixels over the whole frame, evenly spaced, edges included, (rows, columns, 2)."""
+        x = np.linspace(0.0, self.width_px, columns)
+        y = np.linspace(0.0, self.height_px, rows)
+        return np.stack(np.meshgrid(x, y), axis=-1)
+
     def border(self, points_per_side: int = 16) -> Array:
         """Pixels along the outer border of the frame, (4 * points_per_side, 2), in order."""
         t = np.arange(points_per_side) / points_per_side

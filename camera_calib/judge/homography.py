@@ -10,6 +10,7 @@ radius is an error of the model.
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
@@ -180,7 +181,7 @@ def homography_residuals(
     back = np.linalg.inv(np.stack(columns, axis=-1))
     plane = _plane_coordinates(target_points)
     centre, size = seen.mean(axis=0), np.abs(seen - seen.mean(axis=0)).max()
-    h = _direct_homography(plane, (seen - centre) / size)
+    h = np.ravel(cv2.findHomography(plane, (seen - centre) / size)[0])[:8]
     for _ in range(20):
         mapped, slopes = _map(h, plane)
         miss = np.einsum("nab,nb->na", back, size * mapped + centre - seen)
@@ -202,18 +203,6 @@ def _plane_coordinates(points: Array) -> Array:
     axes = np.linalg.svd(centred, full_matrices=False)[2][:2]
     flat: Array = centred @ axes.T / np.abs(centred @ axes.T).max()
     return flat
-
-
-def _direct_homography(plane: Array, seen: Array) -> Array:
-    """(8,) start: the homography of least algebraic error (DLT), its last entry being 1."""
-    x, y = plane.T
-    one, zero = np.ones_like(x), np.zeros_like(x)
-    u, v = seen.T
-    first = np.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=1)
-    second = np.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], axis=1)
-    h = np.linalg.svd(np.concatenate([first, second]), full_matrices=False)[2][-1]
-    start: Array = h[:8] / h[8]
-    return start
 
 
 def _map(h: Array, plane: Array) -> tuple[Array, Array]:

@@ -11,7 +11,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,17 +127,6 @@ class HoldOutScore:
     """Rms expected from noise and the rig's covariance, as far as a pose cannot absorb it."""
     used_rms_px: float
     outliers: int
-
-    def to_json(self) -> dict[str, Any]:
-        """JSON values."""
-        return {
-            "views": self.views,
-            "points": self.points,
-            "rms_px": round(self.rms_px, 5),
-            "expected_px": round(self.expected_px, 5),
-            "used_rms_px": round(self.used_rms_px, 5),
-            "outliers": self.outliers,
-        }
 
 
 def score_hold_out(held: HeldOut) -> HoldOutScore:
