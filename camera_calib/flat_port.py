@@ -118,11 +118,6 @@ class FlatPortCamera:
     def _fold(self) -> float:
         return lens.fold(self._lens[4:])
 
-    @property
-    def kernel_arguments(self) -> tuple[Array, Array, float]:
-        """The camera as the kernels of `refraction` take it: lens, port and fold."""
-        return self._lens, self._port, self._fold
-
     def parameter(self, name: str) -> float:
         """The value of one of `PARAMETERS`."""
         if name in _NORMAL:
