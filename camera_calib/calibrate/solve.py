@@ -15,11 +15,17 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
-from camera_calib.calibrate.adjust import Adjustment, adjust, stack_views
+from camera_calib.calibrate.adjust import Adjustment, adjust
 from camera_calib.calibrate.normal_equations import Flags
 from camera_calib.calibrate.observability import advice, unobservable
 from camera_calib.calibrate.start import first_cam_from_rig, first_focal_px, locate_all, spans
-from camera_calib.calibration import Calibration, Rejection, TargetView
+from camera_calib.calibration import (
+    Calibration,
+    Rejection,
+    TargetView,
+    residuals_px,
+    stack_views,
+)
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.freedom import (
     PINHOLE,
@@ -440,11 +446,8 @@ def _trimmed(view: TargetView, kept: Flags, rig: Rig) -> TargetView:
 
 def _lengths(adjusted: Adjustment, pixels: Array, points: Array) -> Array:
     """(V, cameras, N) residual lengths of all measured points, also of those left out; px."""
-    misses = np.full(pixels.shape[:-1], np.inf)
-    for c, (name, camera) in enumerate(adjusted.rig.cameras.items()):
-        for v in range(len(pixels)):
-            pose = adjusted.rig.cam_from_rig[name] * adjusted.rig_from_target[v]
-            misses[v, c] = np.linalg.norm(camera.project(pose.apply(points)) - pixels[v, c], axis=1)
+    missed = residuals_px(adjusted.rig, adjusted.rig_from_target, points, pixels)
+    misses = np.linalg.norm(missed, axis=-1)
     return np.where(np.isfinite(misses), misses, np.inf)
 
 

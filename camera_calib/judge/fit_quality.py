@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.frames import Array
-from camera_calib.calibration import Calibration, TargetView
+from camera_calib.calibration import Calibration, stack_views
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.rig import Rig
 
@@ -111,7 +111,8 @@ def camera_residuals(calibration: Calibration, camera: str) -> CameraResiduals:
     residuals = calibration.residuals_px[:, index]
     sigma_px = np.repeat(calibration.sigma_px[:, index, None], residuals.shape[1], axis=1)
     kept = within_gate(residuals, sigma_px)
-    measured = seen_pixels(calibration.views, camera, residuals.shape[1])[kept]
+    pixels = stack_views(calibration.views, calibration.rig, residuals.shape[1])
+    measured = pixels[:, index][kept]
     model = calibration.rig.cameras[camera]
     return CameraResiduals(
         pixels=measured,
@@ -122,12 +123,6 @@ def camera_residuals(calibration: Calibration, camera: str) -> CameraResiduals:
         incidence_deg=incidence_deg(model, measured),
         outward=outward(model, measured),
     )
-
-
-def seen_pixels(views: tuple[TargetView, ...], camera: str, points: int) -> Array:
-    """(V, N, 2) pixels of one camera, NaN where it saw nothing."""
-    nothing = np.full((points, 2), np.nan)
-    return np.stack([view.pixels.get(camera, nothing) for view in views])
 
 
 def radius_px(camera: FlatPortCamera, pixels: Array) -> Array:

@@ -17,7 +17,7 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.frames import Array
 from camera_calib.approximation.virtual_pinhole import VirtualPinhole, best_pinhole
-from camera_calib.calibration import Calibration
+from camera_calib.calibration import Calibration, stack_views
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.judge.fit_quality import (
     Profile,
@@ -25,7 +25,6 @@ from camera_calib.judge.fit_quality import (
     outward,
     profile,
     radius_px,
-    seen_pixels,
 )
 
 _FEWEST_POINTS = 12
@@ -79,7 +78,7 @@ def homography_test(calibration: Calibration, camera: str) -> HomographyTest | N
     index = list(calibration.rig.cameras).index(camera)
     model = calibration.rig.cameras[camera]
     kept = np.isfinite(calibration.residuals_px[:, index, :, 0])
-    measured = seen_pixels(calibration.views, camera, len(points))
+    measured = stack_views(calibration.views, calibration.rig, len(points))[:, index]
     poses = [calibration.rig.cam_from_rig[camera] * pose for pose in calibration.rig_from_target]
     usable = [v for v in range(len(poses)) if kept[v].sum() >= _FEWEST_POINTS]
     if not usable:

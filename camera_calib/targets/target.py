@@ -16,6 +16,7 @@ the top left, as the board is read when it hangs upright.
   camera: its point in row r of R is ours in row R - 1 - r.)
 """
 
+import json
 import re
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -256,7 +257,7 @@ class Target:
             raise CalibrationError(f"target: version {data.get('version')}; {VERSION} is known")
         values = {key: value for key, value in data.items() if key not in ("format", "version")}
         try:
-            return TypeAdapter(cls).validate_python(values)
+            return TypeAdapter(cls).validate_json(json.dumps(values))
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
             key = ".".join(map(str, first["loc"]))
