@@ -23,10 +23,9 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.base.executor import SERIAL, Executor
 from alice_survey.base.frames import Array
 from benchmarks.figures import Figure, Goal
-from camera_calib.calibrate.adjust import stack_views
 from camera_calib.calibrate.normal_equations import CalibrationProblem
 from camera_calib.calibrate.solve import Intrinsics, calibrate_through_ports
-from camera_calib.calibration import TargetView
+from camera_calib.calibration import TargetView, stack_views
 from camera_calib.freedom import (
     PORT,
     Freedom,

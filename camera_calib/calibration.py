@@ -1,6 +1,6 @@
-"""Input and result of a calibration."""
+"""Input and result of a calibration, as values and as arrays over all views."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,3 +80,41 @@ class Calibration:
     def rms_px(self) -> float:
         """Root mean square length of the residuals over all pictures."""
         return float(np.sqrt(np.nanmean((self.residuals_px**2).sum(axis=-1))))
+
+
+def stack_views(views: Sequence[TargetView], rig: Rig, count: int) -> Array:
+    """Measured pixels of all views, (V, cameras, count, 2); NaN where unseen.
+
+    Raises:
+        CalibrationError: a view has another number of points, or a camera the rig lacks.
+    """
+    pixels = np.full((len(views), len(rig.cameras), count, 2), np.nan)
+    order = {name: i for i, name in enumerate(rig.cameras)}
+    for v, view in enumerate(views):
+        for camera, seen in view.pixels.items():
+            if camera not in order:
+                raise CalibrationError(f"view {view.name}: the rig has no camera {camera!r}")
+            if seen.shape != (count, 2):
+                raise CalibrationError(
+                    f"view {view.name}, {camera}: {seen.shape} pixels for {count} target points"
+                )
+            pixels[v, order[camera]] = seen
+    pixels[~np.isfinite(pixels).all(axis=-1)] = np.nan
+    return pixels
+
+
+def residuals_px(rig: Rig, rig_from_target: RigidTransform, points: Array, pixels: Array) -> Array:
+    """Projected minus measured pixels of all views; NaN where unseen or nothing is projected.
+
+    Args:
+        rig: its cameras took the views.
+        rig_from_target: (V,) poses of the target.
+        points: (N, 3) in its frame, metres.
+        pixels: (V, cameras, N, 2) measured.
+    """
+    residuals = np.full(pixels.shape, np.nan)
+    for c, (name, camera) in enumerate(rig.cameras.items()):
+        for v in range(len(pixels)):
+            pose = rig.cam_from_rig[name] * rig_from_target[v]
+            residuals[v, c] = camera.project(pose.apply(points)) - pixels[v, c]
+    return residuals

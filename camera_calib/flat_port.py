@@ -118,11 +118,6 @@ class FlatPortCamera:
     def _fold(self) -> float:
         return lens.fold(self._lens[4:])
 
-    @property
-    def kernel_arguments(self) -> tuple[Array, Array, float]:
-        """The camera as the kernels of `refraction` take it: lens, port and fold."""
-        return self._lens, self._port, self._fold
-
     def parameter(self, name: str) -> float:
         """The value of one of `PARAMETERS`."""
         if name in _NORMAL:
@@ -230,6 +225,12 @@ class FlatPortCamera:
         """Centres of every `step`-th pixel, (rows, columns, 2)."""
         x = np.arange(0, self.width_px, step) + 0.5
         y = np.arange(0, self.height_px, step) + 0.5
+        return np.stack(np.meshgrid(x, y), axis=-1)
+
+    def frame_grid(self, columns: int, rows: int) -> Array:
+        """Pixels over the whole frame, evenly spaced, edges included, (rows, columns, 2)."""
+        x = np.linspace(0.0, self.width_px, columns)
+        y = np.linspace(0.0, self.height_px, rows)
         return np.stack(np.meshgrid(x, y), axis=-1)
 
     def border(self, points_per_side: int = 16) -> Array:

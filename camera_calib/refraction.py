@@ -20,7 +20,7 @@ of what Newton's method solves is 3 at most."""
 _LEAST_ROOT = 0.01
 _BLOCK = 128
 """Points at a time: loops over a block that do not branch become vector instructions."""
-LENS_COUNT, PORT_COUNT = 16, 7
+LENS_COUNT = 16
 PARAMETER_COUNT = LENS_COUNT + 6
 
 

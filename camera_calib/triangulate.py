@@ -5,25 +5,24 @@ perpendicular). From there the sum of the squared reprojection errors of all cam
 over the point, by Gauss-Newton with analytic slopes, damped where it must be (Levenberg-Marquardt).
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.base.compiled import compiled
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from camera_calib.flat_port import FlatPortCamera
-from camera_calib.lens import distort_slopes
-from camera_calib.refraction import air_tangent
 
 _STEPS = 200
 _SETTLED_PX = 1e-10
 """A full step that would move the pixels by less ends the search."""
 _ROUNDING = 1e-11
 """Growth of the squared error, in px^2 or as a share of it, that may be rounding."""
+_SINGULAR = 1e-14
+"""Least over greatest eigenvalue of a matrix that has an inverse."""
 _INSIDE = 1e-4
 """A start out of the water is moved into it by this share of its distance from the camera."""
 
@@ -110,19 +109,7 @@ def triangulate(
     nearest = nearest_to_rays(origins, directions)
     # Weights relative to the best camera keep the search's own threshold in pixels.
     best = float(sigmas.min())
-    rotations = np.stack([pose.rotation.as_matrix() for pose in cam_from_world])
-    translations = np.stack([pose.translation for pose in cam_from_world])
-    models = [camera.kernel_arguments for camera in cameras]
-    points, covariance = _search(
-        nearest,
-        measured,
-        (best / sigmas) ** 2,
-        np.stack([lens for lens, _, _ in models]),
-        np.stack([port for _, port, _ in models]),
-        np.array([fold for _, _, fold in models]),
-        rotations,
-        translations,
-    )
+    points, covariance = _search(cameras, cam_from_world, measured, (best / sigmas) ** 2, nearest)
     return Triangulation(
         points_world=points,
         covariance=covariance * best**2,
@@ -154,12 +141,15 @@ def nearest_to_rays(origins: Array, directions: Array) -> Array:
     Returns:
         (N, 3); NaN where fewer than two rays count or they are parallel.
     """
-    return np.asarray(
-        _nearest(
-            np.ascontiguousarray(origins, dtype=np.float64),
-            np.ascontiguousarray(directions, dtype=np.float64),
-        )
-    )
+    known = np.isfinite(origins).all(axis=-1) & np.isfinite(directions).all(axis=-1)
+    across = np.eye(3) - directions[..., :, None] * directions[..., None, :]
+    across = np.where(known[..., None, None], across, 0.0)
+    right = (across @ np.where(known[..., None], origins, 0.0)[..., None]).sum(axis=0)
+    matrices = across.sum(axis=0)
+    solvable = (known.sum(axis=0) >= 2) & _are_regular(matrices)
+    points = np.full((len(matrices), 3), np.nan)
+    points[solvable] = np.linalg.solve(matrices[solvable], right[solvable])[..., 0]
+    return points
 
 
 def _rays_world(
@@ -174,240 +164,89 @@ def _rays_world(
     return origins, directions
 
 
-@compiled(nogil=True, error_model="numpy")
-def _solve(m: Array, g: Array, damping: float, out: Array) -> bool:
-    """Solve (m + damping diag(m)) out = g, (3, 3) and symmetric, by Cholesky; False if singular."""
-    more = 1.0 + damping
-    a, d, f = m[0, 0] * more, m[1, 1] * more, m[2, 2] * more
-    if not a > 0.0:
-        return False
-    l00 = math.sqrt(a)
-    l10, l20 = m[1, 0] / l00, m[2, 0] / l00
-    rest = d - l10 * l10
-    if not rest > 1e-14 * d:
-        return False
-    l11 = math.sqrt(rest)
-    l21 = (m[2, 1] - l20 * l10) / l11
-    rest = f - l20 * l20 - l21 * l21
-    if not rest > 1e-14 * f:
-        return False
-    l22 = math.sqrt(rest)
-    y0 = g[0] / l00
-    y1 = (g[1] - l10 * y0) / l11
-    y2 = (g[2] - l20 * y0 - l21 * y1) / l22
-    out[2] = y2 / l22
-    out[1] = (y1 - l21 * out[2]) / l11
-    out[0] = (y0 - l10 * out[1] - l20 * out[2]) / l00
-    return True
+def _are_regular(matrices: Array) -> NDArray[np.bool_]:
+    """(N,) which symmetric matrices (N, 3, 3) have an inverse beyond rounding."""
+    values = np.linalg.eigvalsh(matrices)
+    regular: NDArray[np.bool_] = values[:, 0] > _SINGULAR * values[:, -1]
+    return regular
 
 
-@compiled(nogil=True, error_model="numpy")
-def _nearest(origins: Array, directions: Array) -> Array:
-    cameras, count = origins.shape[:2]
-    points = np.full((count, 3), np.nan)
-    m, g = np.empty((3, 3)), np.empty(3)
-    for i in range(count):
-        m[:], g[:] = 0.0, 0.0
-        rays = 0
-        for c in range(cameras):
-            o, d = origins[c, i], directions[c, i]
-            if not math.isfinite(o[0] + d[0]):
-                continue
-            rays += 1
-            for a in range(3):
-                for b in range(3):
-                    across = (1.0 if a == b else 0.0) - d[a] * d[b]
-                    m[a, b] += across
-                    g[a] += across * o[b]
-        if rays >= 2 and not _solve(m, g, 0.0, points[i]):
-            points[i] = np.nan
+def _equations(
+    cameras: Sequence[FlatPortCamera],
+    cam_from_world: Sequence[RigidTransform],
+    pixels: Array,
+    weights: Array,
+    points_world: Array,
+) -> tuple[Array, Array, Array]:
+    """Costs (N,) of points and their normal equations, matrix (N, 3, 3) step = right (N, 3).
+
+    The cost is inf where a camera that sees a point has no pixel for it.
+    """
+    cost, right = np.zeros(len(points_world)), np.zeros((len(points_world), 3))
+    matrix = np.zeros((len(points_world), 3, 3))
+    for camera, pose, measured, weight in zip(
+        cameras, cam_from_world, pixels, weights, strict=True
+    ):
+        found, by_point, _ = camera.project_jacobian(pose.apply(points_world))
+        seen = np.isfinite(measured).all(axis=1)
+        misses = np.where(seen[:, None], found - measured, 0.0)
+        slopes = np.where(seen[:, None, None], by_point @ pose.rotation.as_matrix(), 0.0)
+        cost += weight * (misses**2).sum(axis=1)
+        matrix += weight * np.einsum("nki,nkj->nij", slopes, slopes)
+        right -= weight * np.einsum("nki,nk->ni", slopes, misses)
+    return np.where(np.isnan(cost), np.inf, cost), matrix, right
+
+
+def _in_water(
+    cameras: Sequence[FlatPortCamera],
+    cam_from_world: Sequence[RigidTransform],
+    pixels: Array,
+    points_world: Array,
+) -> Array:
+    """Points, (N, 3), of which those not beyond every port that sees them are moved just inside."""
+    seen = np.isfinite(pixels).all(axis=-1)
+    points = points_world
+    for _ in range(20):
+        before = points
+        for camera, pose, sees in zip(cameras, cam_from_world, seen, strict=True):
+            cam, normal = pose.apply(points), np.array(camera.normal)
+            nearest = camera.port_distance_m + camera.glass_thickness_m
+            lacking = nearest + _INSIDE * np.linalg.norm(cam, axis=1) - cam @ normal
+            push = np.where(sees & (lacking > 0.0), 2.0 * lacking, 0.0)
+            points = points + push[:, None] * pose.rotation.inv().apply(normal)
+        if np.array_equal(points, before, equal_nan=True):
+            break
     return points
 
 
-@compiled(nogil=True, error_model="numpy")
-def _pixel_slopes(p: Array, lens: Array, port: Array, fold: float, out: Array) -> bool:
-    """Pixel of one point and its derivatives by the point, as in `refraction.project_jacobian`.
-
-    Args:
-        p: (3,) in the camera's frame.
-        lens: as there.
-        port: as there.
-        fold: as there.
-        out: (2, 4), filled: derivatives by x, y, z, then the pixel.
-
-    Returns:
-        False where the point has no pixel.
-    """
-    n = port[4:7]
-    along = n[0] * p[0] + n[1] * p[1] + n[2] * p[2]
-    water = along - port[0] - port[1]
-    if not water > 0.0:
-        return False
-    ex, ey, ez = p[0] - along * n[0], p[1] - along * n[1], p[2] - along * n[2]
-    radius = math.sqrt(ex * ex + ey * ey + ez * ez)
-    tangent = 0.0
-    turn = 1.0 / (port[0] + port[1] / port[2] + water / port[3])
-    if radius > 0.0:
-        tangent = air_tangent(radius, water, port)
-        turn = tangent / radius
-        ex, ey, ez = ex / radius, ey / radius, ez / radius
-    dx, dy = turn * radius * ex + n[0], turn * radius * ey + n[1]
-    dz = turn * radius * ez + n[2]
-    if not dz > 0.0:
-        return False
-    u, v = dx / dz, dy / dz
-    if not u * u + v * v < fold:
-        return False
-    t2 = tangent * tangent
-    n_glass2, n_water2 = port[2] * port[2], port[3] * port[3]
-    root_glass = math.sqrt(n_glass2 + (n_glass2 - 1.0) * t2)
-    root_water = math.sqrt(n_water2 + (n_water2 - 1.0) * t2)
-    steep = port[0] + port[1] * n_glass2 / root_glass**3 + water * n_water2 / root_water**3
-    bend, by_h = 1.0 / steep - turn, -tangent / (root_water * steep)
-    x, y, x_u, x_v, y_u, y_v = distort_slopes(u, v, lens[4:])
-    for j in range(3):
-        ej = ex if j == 0 else (ey if j == 1 else ez)
-        outward = bend * ej + by_h * n[j]
-        sx = outward * ex - turn * n[0] * n[j]
-        sy = outward * ey - turn * n[1] * n[j]
-        sz = outward * ez - turn * n[2] * n[j]
-        if j == 0:
-            sx += turn
-        elif j == 1:
-            sy += turn
-        else:
-            sz += turn
-        u_j, v_j = (sx - u * sz) / dz, (sy - v * sz) / dz
-        out[0, j] = lens[0] * (x_u * u_j + x_v * v_j)
-        out[1, j] = lens[1] * (y_u * u_j + y_v * v_j)
-    out[0, 3], out[1, 3] = lens[0] * x + lens[2], lens[1] * y + lens[3]
-    return True
-
-
-@compiled(nogil=True, error_model="numpy")
-def _equations(
-    point: Array,
-    i: int,
-    pixels: Array,
-    weights: Array,
-    lenses: Array,
-    ports: Array,
-    folds: Array,
-    rotations: Array,
-    translations: Array,
-    m: Array,
-    g: Array,
-) -> float:
-    """Fill the normal equations m step = g of one point; its cost, inf where it has no pixel."""
-    p, s, w = np.empty(3), np.empty((2, 4)), np.empty(3)
-    m[:], g[:] = 0.0, 0.0
-    cost = 0.0
-    for c in range(pixels.shape[0]):
-        if not math.isfinite(pixels[c, i, 0] + pixels[c, i, 1]):
-            continue
-        r = rotations[c]
-        for a in range(3):
-            p[a] = translations[c, a]
-            for b in range(3):
-                p[a] += r[a, b] * point[b]
-        if not _pixel_slopes(p, lenses[c], ports[c], folds[c], s):
-            return math.inf
-        for k in range(2):
-            miss = s[k, 3] - pixels[c, i, k]
-            cost += weights[c] * miss * miss
-            for a in range(3):
-                w[a] = s[k, 0] * r[0, a] + s[k, 1] * r[1, a] + s[k, 2] * r[2, a]
-            for a in range(3):
-                g[a] -= weights[c] * w[a] * miss
-                for b in range(3):
-                    m[a, b] += weights[c] * w[a] * w[b]
-    return cost
-
-
-@compiled(nogil=True, error_model="numpy")
-def _into_water(
-    point: Array, i: int, pixels: Array, ports: Array, rotations: Array, translations: Array
-) -> None:
-    """Move a point that is not in the water beyond every port that sees it to just inside."""
-    for _ in range(20):
-        moved = False
-        for c in range(pixels.shape[0]):
-            if not math.isfinite(pixels[c, i, 0] + pixels[c, i, 1]):
-                continue
-            n, r = ports[c, 4:7], rotations[c]
-            along, far2 = 0.0, 0.0
-            for a in range(3):
-                at = translations[c, a]
-                for b in range(3):
-                    at += r[a, b] * point[b]
-                along += n[a] * at
-                far2 += at * at
-            lacking = ports[c, 0] + ports[c, 1] + _INSIDE * math.sqrt(far2) - along
-            if lacking > 0.0:
-                moved = True
-                for b in range(3):
-                    normal = r[0, b] * n[0] + r[1, b] * n[1] + r[2, b] * n[2]
-                    point[b] += 2.0 * lacking * normal
-        if not moved:
-            return
-
-
-@compiled(nogil=True, error_model="numpy")
 def _search(
-    starts: Array,
+    cameras: Sequence[FlatPortCamera],
+    cam_from_world: Sequence[RigidTransform],
     pixels: Array,
     weights: Array,
-    lenses: Array,
-    ports: Array,
-    folds: Array,
-    rotations: Array,
-    translations: Array,
+    starts: Array,
 ) -> tuple[Array, Array]:
     """Points of least cost, (N, 3), and the inverse of their normal matrices, (N, 3, 3)."""
-    count = starts.shape[0]
-    points = np.full((count, 3), np.nan)
-    inverses = np.full((count, 3, 3), np.nan)
-    m, g = np.empty((3, 3)), np.empty(3)
-    new_m, new_g = np.empty((3, 3)), np.empty(3)
-    step, trial, unit = np.empty(3), np.empty(3), np.empty(3)
-    for i in range(count):
-        point = starts[i].copy()
-        if not math.isfinite(point[0]):
-            continue
-        _into_water(point, i, pixels, ports, rotations, translations)
-        cost = _equations(
-            point, i, pixels, weights, lenses, ports, folds, rotations, translations, m, g
-        )
-        damping, settled = 0.0, False
-        for _ in range(_STEPS):
-            if not (cost < math.inf and _solve(m, g, 0.0, step)):
-                break
-            change2 = step[0] * g[0] + step[1] * g[1] + step[2] * g[2]
-            settled = change2 < _SETTLED_PX * _SETTLED_PX
-            if damping > 0.0 and not settled and not _solve(m, g, damping, step):
-                break
-            for a in range(3):
-                trial[a] = point[a] + step[a]
-            new_cost = _equations(
-                trial, i, pixels, weights, lenses, ports, folds, rotations, translations,
-                new_m, new_g,
-            )  # fmt: skip
-            if new_cost <= cost + _ROUNDING * (1.0 + cost):
-                point[:], m[:], g[:] = trial, new_m, new_g
-                cost = new_cost
-                damping = 0.1 * damping if damping > 1e-4 else 0.0
-            else:
-                damping = max(1e-3, 10.0 * damping)
-            if settled or damping > 1e12:
-                break
-        if not settled:
-            continue
-        points[i] = point
-        for a in range(3):
-            unit[:] = 0.0
-            unit[a] = 1.0
-            if not _solve(m, unit, 0.0, inverses[i, a]):
-                inverses[i] = np.nan
-                points[i] = np.nan
-                break
+    points, inverses = np.full(starts.shape, np.nan), np.full((*starts.shape, 3), np.nan)
+    here = _in_water(cameras, cam_from_world, pixels, starts)
+    cost, matrix, right = _equations(cameras, cam_from_world, pixels, weights, here)
+    damping, at = np.zeros(len(starts)), np.flatnonzero(np.isfinite(cost))
+    for _ in range(_STEPS):
+        at = at[_are_regular(matrix[at])]
+        if not at.size:
+            break
+        step = np.linalg.solve(matrix[at], right[at, :, None])[..., 0]
+        settled = (step * right[at]).sum(axis=1) < _SETTLED_PX**2
+        ridge = 1.0 + np.where(settled, 0.0, damping[at])[:, None, None] * np.eye(3)
+        trial = here[at] + np.linalg.solve(ridge * matrix[at], right[at, :, None])[..., 0]
+        tried = _equations(cameras, cam_from_world, pixels[:, at], weights, trial)
+        good = tried[0] <= cost[at] + _ROUNDING * (1.0 + cost[at])
+        better = at[good]
+        here[better] = trial[good]
+        cost[better], matrix[better], right[better] = (values[good] for values in tried)
+        eased = np.where(damping[at] > 1e-4, 0.1 * damping[at], 0.0)
+        damping[at] = np.where(good, eased, np.maximum(1e-3, 10.0 * damping[at]))
+        done = at[settled & _are_regular(matrix[at])]
+        points[done], inverses[done] = here[done], np.linalg.inv(matrix[done])
+        at = at[~settled & (damping[at] <= 1e12)]
     return points, inverses

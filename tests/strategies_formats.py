@@ -1,10 +1,16 @@
 """Random cameras and rigs that formats of other tools must carry, and points to look at."""
 
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
+import pytest
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.base.errors import CalibrationError
 from camera_calib.flat_port import FlatPortCamera
+from camera_calib.formats.rigs import ReadOptions
 from camera_calib.rig import Covariance, Rig
 
 RNG = np.random.default_rng(11)
@@ -111,3 +117,20 @@ def assert_same_geometry(after: Rig, before: Rig, *, pixels: float = 1e-9) -> No
         expected = camera.project(points)
         assert np.isfinite(expected).mean() > 0.2
         np.testing.assert_allclose(other.project(points_after), expected, atol=pixels, rtol=0)
+
+
+def fault_of(
+    read: Callable[[Path, ReadOptions], Rig],
+    path: Path,
+    text: str | None = None,
+    reading: ReadOptions | None = None,
+) -> str:
+    """The one line, which names the file, with which a reader refuses a file of this text."""
+    if text is not None:
+        path.write_text(text, encoding="utf-8")
+    with pytest.raises(CalibrationError) as error:
+        read(path, reading or ReadOptions())
+    shown = str(error.value)
+    assert str(path) in shown
+    assert "\n" not in shown
+    return shown

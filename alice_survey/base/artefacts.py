@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import to_jsonable_python
 
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.run import progress
@@ -342,6 +343,11 @@ def atomic_path(path: Path) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def json_values(data: Any) -> Any:
+    """Values, dataclasses and arrays as JSON holds them; NaN and infinity become None."""
+    return to_jsonable_python(data, inf_nan_mode="null", fallback=lambda array: array.tolist())
 
 
 def write_json(path: Path, data: Any) -> None:

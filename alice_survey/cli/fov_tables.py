@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from alice_survey.base.artefacts import json_values
 from alice_survey.base.config import CameraConfig, SurveyConfig, load_config, parse_config
 from alice_survey.base.errors import ConfigError, warn
 from camera_calib.fov.angles import angle_table
@@ -91,8 +92,8 @@ def fov_report(options: FovOptions, output: Output) -> tuple[str, Any, bool]:
         )  # fmt: skip
     data = {
         "source": "design values" if rig is None else rig.source,
-        "rows": [row.to_json() for row in rows],
-        "blur": [row.to_json() for row in blur],
+        "rows": json_values(rows),
+        "blur": json_values(blur),
     }
     return _printed(fov_tables(rows, blur), output), data, True
 

@@ -8,7 +8,7 @@ port and with other indices. At one working range the channels differ by a warp,
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import cv2
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import RectBivariateSpline
 
+from alice_survey.base.artefacts import json_values
 from alice_survey.base.errors import CalibrationError, ConfigError, ImageError
 from alice_survey.base.frames import Array
 from alice_survey.base.text_table import text_table
@@ -149,7 +150,7 @@ def frame_shifts(cameras: Mapping[str, FlatPortCamera], range_m: float) -> list[
         CalibrationError: a part of the frame sees nothing at that range.
     """
     green = cameras[_REFERENCE]
-    grid = _frame_nodes(green, 15)
+    grid = green.frame_grid(15, 15)
     centre = np.array([green.cx_px, green.cy_px])
     off_centre = centre + np.array([[-1000.0, 0.0], [1000.0, 0.0]])
     inside = bool(np.all((off_centre[:, 0] >= 0) & (off_centre[:, 0] <= green.width_px)))
@@ -257,13 +258,8 @@ def shifts_report(shifts: Sequence[ChannelShift], range_m: float) -> tuple[str, 
         f"shift against green at {range_m:g} m, outward; rest: what a correction leaves at most "
         "where the scene is a quarter nearer or farther"
     )
-    data = {"range_m": range_m, "channels": [_json_row(s) for s in shifts]}
+    data = {"range_m": range_m, "channels": json_values(shifts)}
     return "\n".join([text_table(header, rows), note]), data
-
-
-def _json_row(shift: ChannelShift) -> dict[str, Any]:
-    nothing = math.isnan(shift.shift_1000_px)
-    return asdict(shift) | ({"shift_1000_px": None} if nothing else {})
 
 
 def _others(cameras: Mapping[str, FlatPortCamera]) -> list[str]:
@@ -273,12 +269,6 @@ def _others(cameras: Mapping[str, FlatPortCamera]) -> list[str]:
 def _nodes(size_px: int) -> Array:
     count = max(4, -(-size_px // _NODES_PX) + 1)
     return np.linspace(0.0, size_px, count)
-
-
-def _frame_nodes(camera: FlatPortCamera, count: int) -> Array:
-    x = np.linspace(0.0, camera.width_px, count)
-    y = np.linspace(0.0, camera.height_px, count)
-    return np.stack(np.meshgrid(x, y), axis=-1)
 
 
 def _outward(

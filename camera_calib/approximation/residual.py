@@ -269,9 +269,7 @@ def _fitted(
 
 def _seen(camera: FlatPortCamera, distances: Array, grid: int) -> tuple[Array, Array]:
     """Places in the frame, (grid, grid, 2), and what they see at each distance, (D, ..., 3)."""
-    x = np.linspace(0.0, camera.width_px, grid)
-    y = np.linspace(0.0, camera.height_px, grid)
-    pixels = np.stack(np.meshgrid(x, y), axis=-1)
+    pixels = camera.frame_grid(grid, grid)
     points = np.stack([camera.at_depth(pixels, float(z)) for z in distances])
     if not np.all(np.isfinite(points)):
         raise CalibrationError(

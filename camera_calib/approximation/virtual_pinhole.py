@@ -110,9 +110,7 @@ def residual_px(
     Returns:
         (D, grid, grid) distances in pixels of the pinhole.
     """
-    x = np.linspace(0.0, camera.width_px, grid)
-    y = np.linspace(0.0, camera.height_px, grid)
-    pixels = np.stack(np.meshgrid(x, y), axis=-1)
+    pixels = camera.frame_grid(grid, grid)
     ideal = pinhole.project(camera.at_depth(pixels, pinhole.working_range_m))
     rows = [
         np.linalg.norm(pinhole.project(camera.at_depth(pixels, d)) - ideal, axis=-1)

@@ -18,7 +18,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.frames import Array
 from camera_calib.calibrate.normal_equations import CalibrationProblem, Equations, Flags, State
-from camera_calib.calibration import TargetView
+from camera_calib.calibration import TargetView, stack_views
 from camera_calib.freedom import Freedom
 from camera_calib.rig import Rig
 
@@ -55,27 +55,6 @@ class Adjustment:
     steps: int
     is_settled: bool
     """Whether the last step was as short as requested."""
-
-
-def stack_views(views: Sequence[TargetView], rig: Rig, count: int) -> Array:
-    """Measured pixels of all views, (V, cameras, count, 2); NaN where unseen.
-
-    Raises:
-        CalibrationError: a view has another number of points, or a camera the rig lacks.
-    """
-    pixels = np.full((len(views), len(rig.cameras), count, 2), np.nan)
-    order = {name: i for i, name in enumerate(rig.cameras)}
-    for v, view in enumerate(views):
-        for camera, seen in view.pixels.items():
-            if camera not in order:
-                raise CalibrationError(f"view {view.name}: the rig has no camera {camera!r}")
-            if seen.shape != (count, 2):
-                raise CalibrationError(
-                    f"view {view.name}, {camera}: {seen.shape} pixels for {count} target points"
-                )
-            pixels[v, order[camera]] = seen
-    pixels[~np.isfinite(pixels).all(axis=-1)] = np.nan
-    return pixels
 
 
 def adjust(

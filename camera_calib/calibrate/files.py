@@ -10,11 +10,10 @@ import numpy as np
 from alice_survey.base.artefacts import write_csv
 from alice_survey.base.errors import warn
 from alice_survey.base.records import CalibrationRecord
-from camera_calib.calibrate.adjust import stack_views
 from camera_calib.calibrate.detect_views import Detections
 from camera_calib.calibrate.solve import recalibrate
 from camera_calib.calibrate.start import locate
-from camera_calib.calibration import Calibration, TargetView
+from camera_calib.calibration import Calibration, TargetView, residuals_px, stack_views
 from camera_calib.judge.report import write_report
 from camera_calib.judge.validation import hold_out
 from camera_calib.rig import write_rig
@@ -90,19 +89,18 @@ def _rms(square: Any) -> float:
 def _corner_rows(calibration: Calibration, measured: Sequence[TargetView]) -> Iterator[list[Any]]:
     """Every measured point; weight 0 and, in views without a pose, no residual if left out."""
     rig, points = calibration.rig, calibration.target_points
-    order = {view.name: v for v, view in enumerate(calibration.views)}
     pixels = stack_views(measured, rig, len(points))
-    for m, view in enumerate(measured):
-        v = order.get(view.name)
-        for c, (name, camera) in enumerate(rig.cameras.items()):
-            residuals, weights = np.full((len(points), 2), np.nan), np.zeros(len(points))
-            if v is not None:
-                pose = rig.cam_from_rig[name] * calibration.rig_from_target[v]
-                residuals = camera.project(pose.apply(points)) - pixels[m, c]
-                weights = np.nan_to_num(calibration.weights[v, c])
-            for i in np.flatnonzero(np.isfinite(pixels[m, c, :, 0])).tolist():
-                numbers = [*pixels[m, c, i], *residuals[i], weights[i]]
-                yield [view.name, name, i, *(round(float(number), 5) for number in numbers)]
+    residuals, weights = np.full(pixels.shape, np.nan), np.zeros(pixels.shape[:3])
+    numbers = {view.name: v for v, view in enumerate(calibration.views)}
+    posed = [m for m, view in enumerate(measured) if view.name in numbers]
+    at = [numbers[measured[m].name] for m in posed]
+    poses = calibration.rig_from_target[at]
+    residuals[posed] = residuals_px(rig, poses, points, pixels[posed])
+    weights[posed] = np.nan_to_num(calibration.weights[at])
+    names = list(rig.cameras)
+    for m, c, i in np.argwhere(np.isfinite(pixels[..., 0])).tolist():
+        values = [*pixels[m, c, i], *residuals[m, c, i], weights[m, c, i]]
+        yield [measured[m].name, names[c], i, *(round(float(value), 5) for value in values)]
 
 
 def warn_of_unseen(found: Detections) -> None:

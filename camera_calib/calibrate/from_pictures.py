@@ -18,7 +18,6 @@ from alice_survey.base.executor import Executor, local_executor
 from alice_survey.kit.words import with_sigma
 from camera_calib.calibrate.detect_views import Detections, Size, detect_views
 from camera_calib.calibrate.files import finish, summary, warn_of_unseen
-from camera_calib.calibrate.numbering import same_numbering
 from camera_calib.calibrate.picture_sets import find_pictures, pair_pictures
 from camera_calib.calibrate.solve import (
     Intrinsics,
@@ -28,6 +27,7 @@ from camera_calib.calibrate.solve import (
     calibrate_through_ports,
     first_cameras,
 )
+from camera_calib.calibrate.start import same_numbering
 from camera_calib.calibration import Calibration
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.freedom import intrinsics

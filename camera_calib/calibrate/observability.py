@@ -15,9 +15,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.frames import Array
-from camera_calib.calibrate.adjust import stack_views
 from camera_calib.calibrate.normal_equations import CalibrationProblem
-from camera_calib.calibration import Calibration
+from camera_calib.calibration import Calibration, stack_views
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.freedom import Freedom, of_cameras, value
 from camera_calib.rig import Covariance, Rig

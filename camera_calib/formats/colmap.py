@@ -33,8 +33,7 @@ from camera_calib.formats.camera_files import (
     record_of,
     write_records,
 )
-from camera_calib.formats.documents import read_json_fields
-from camera_calib.formats.fields import Fields, read_bytes, read_text
+from camera_calib.formats.fields import Fields, read_bytes, read_json_fields, read_text
 from camera_calib.formats.opencv_model import behind_port
 from camera_calib.formats.rigs import ReadOptions, assemble
 from camera_calib.rig import Rig

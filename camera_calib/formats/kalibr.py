@@ -15,8 +15,7 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.base.artefacts import atomic_path
 from alice_survey.base.errors import CalibrationError, warn
 from camera_calib.flat_port import FlatPortCamera
-from camera_calib.formats.documents import read_yaml
-from camera_calib.formats.fields import Fields
+from camera_calib.formats.fields import Fields, read_yaml
 from camera_calib.formats.opencv_model import HALF_PIXEL, camera_in_air
 from camera_calib.formats.rigs import ReadOptions, assemble
 from camera_calib.rig import Rig

@@ -16,8 +16,7 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.base.artefacts import atomic_path
 from alice_survey.base.errors import CalibrationError
 from camera_calib.flat_port import FlatPortCamera
-from camera_calib.formats.documents import read_storage
-from camera_calib.formats.fields import Fields
+from camera_calib.formats.fields import Fields, read_storage
 from camera_calib.formats.opencv_model import behind_port, camera_matrix, distortion, read_camera
 from camera_calib.formats.rigs import ReadOptions, assemble, default_names, own_keys
 from camera_calib.rig import Rig

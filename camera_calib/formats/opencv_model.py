@@ -96,24 +96,17 @@ def camera_in_air(
     if min(fx, fy) <= 0:
         raise fields.fault(key, f"has focal lengths of {fx:g} and {fy:g} px")
     try:
-        return _in_air(size, (fx, fy, cx, cy), coefficients)
+        return FlatPortCamera(
+            width_px=size[0],
+            height_px=size[1],
+            fx_px=fx,
+            fy_px=fy,
+            cx_px=cx,
+            cy_px=cy,
+            **{**coefficients, **IN_AIR},
+        )
     except CalibrationError as error:
         raise fields.fault(key, f"is of no camera: {error}") from None
-
-
-def _in_air(
-    size: tuple[int, int], lens: tuple[float, float, float, float], coefficients: dict[str, float]
-) -> FlatPortCamera:
-    fx, fy, cx, cy = lens
-    return FlatPortCamera(
-        width_px=size[0],
-        height_px=size[1],
-        fx_px=fx,
-        fy_px=fy,
-        cx_px=cx,
-        cy_px=cy,
-        **{**coefficients, **IN_AIR},
-    )
 
 
 def behind_port(fields: Fields, key: str, camera: FlatPortCamera, **port: Any) -> FlatPortCamera:

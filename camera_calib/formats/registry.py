@@ -14,8 +14,7 @@ from camera_calib.formats.colmap import (
     write_colmap,
     write_flatport,
 )
-from camera_calib.formats.documents import read_yaml
-from camera_calib.formats.fields import read_text
+from camera_calib.formats.fields import read_text, read_yaml
 from camera_calib.formats.kalibr import read_kalibr, write_kalibr
 from camera_calib.formats.opencv import read_opencv, write_opencv
 from camera_calib.formats.rigs import ReadOptions

@@ -18,8 +18,7 @@ from alice_survey.base.artefacts import atomic_path
 from alice_survey.base.errors import CalibrationError, warn
 from alice_survey.base.frames import Array
 from camera_calib.flat_port import FlatPortCamera
-from camera_calib.formats.documents import read_yaml
-from camera_calib.formats.fields import Fields
+from camera_calib.formats.fields import Fields, read_yaml
 from camera_calib.formats.opencv_model import camera_matrix, distortion, read_camera
 from camera_calib.formats.rigs import ReadOptions, assemble
 from camera_calib.rig import Rig

@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from alice_survey.base.seawater import n_water as n_water_of_colour
 from camera_calib.approximation.virtual_pinhole import best_pinhole, residual_px
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.fov.focus import FocusedLens, apparent_depths, apparent_distance_m
-from camera_calib.fov.table import check_range, json_row
+from camera_calib.fov.table import check_range
 from camera_calib.rig import design_rig
 from camera_calib.water import WAVELENGTH_NM
 
@@ -51,10 +50,6 @@ class AngleRow:
     """Blue (460 nm) minus red (600 nm) in the corner of a colour camera, without correction."""
     corner_blur_px: float
     """Blur circle in the corner when the centre is sharp: the port bends the field."""
-
-    def to_json(self) -> dict[str, Any]:
-        """All fields as JSON values."""
-        return json_row(asdict(self))
 
 
 def angle_table(

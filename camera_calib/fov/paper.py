@@ -10,6 +10,7 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from alice_survey.base.artefacts import json_values
 from alice_survey.base.config import CameraConfig
 from camera_calib.fov.angles import AngleRow, angle_table
 from camera_calib.fov.table import MATCH_SIGMA_PX, TRUSTED_FOV_DEG, FovChoices, FovRow, fov_table
@@ -68,11 +69,6 @@ class PaperCheck:
         """The difference is within the tolerance."""
         return abs(self.difference) <= self.tolerance
 
-    def to_json(self) -> dict[str, Any]:
-        """All fields and properties as JSON values."""
-        judged = {name: getattr(self, name) for name in ("difference", "tolerance", "passed")}
-        return asdict(self) | judged
-
 
 @dataclass(frozen=True, kw_only=True)
 class PaperClaim:
@@ -91,10 +87,6 @@ class PaperClaim:
         """The number is within its bounds."""
         return self.least <= self.computed <= self.most
 
-    def to_json(self) -> dict[str, Any]:
-        """All fields as JSON values, and `passed`."""
-        return asdict(self) | {"passed": self.passed}
-
 
 @dataclass(frozen=True, kw_only=True)
 class PaperValidation:
@@ -112,13 +104,20 @@ class PaperValidation:
 
     def to_json(self) -> dict[str, Any]:
         """Everything as JSON values."""
-        return {
-            "passed": self.passed,
-            "rule": PAPER_RULE,
-            "table": [check.to_json() for check in self.table],
-            "claims": [claim.to_json() for claim in self.claims],
-            "angles": [row.to_json() for row in self.angles],
-        }
+        judged = ("difference", "tolerance", "passed")
+        data: dict[str, Any] = json_values(
+            {
+                "passed": self.passed,
+                "rule": PAPER_RULE,
+                "table": [
+                    asdict(check) | {name: getattr(check, name) for name in judged}
+                    for check in self.table
+                ],
+                "claims": [asdict(claim) | {"passed": claim.passed} for claim in self.claims],
+                "angles": self.angles,
+            }
+        )
+        return data
 
 
 def validate_paper() -> PaperValidation:

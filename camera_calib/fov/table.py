@@ -7,9 +7,8 @@ the closed forms that follow from it.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -113,10 +112,6 @@ class FovRow:
     within_trusted_fov: bool
     """The diagonal is within the 70 degrees for which the paper trusts a flat port."""
 
-    def to_json(self) -> dict[str, Any]:
-        """All fields as JSON values; NaN and inf are null."""
-        return json_row(asdict(self))
-
 
 @dataclass(frozen=True, kw_only=True)
 class BlurRow:
@@ -130,10 +125,6 @@ class BlurRow:
     allowed_px: float
     longest_exposure_s: float
     """Longest exposure for which the blur is `allowed_px`."""
-
-    def to_json(self) -> dict[str, Any]:
-        """All fields as JSON values."""
-        return json_row(asdict(self))
 
 
 def fov_table(
@@ -249,14 +240,6 @@ def check_range(what: str, values: Sequence[float], least: float, most: float, u
             raise ConfigError(
                 f"{what} {value} {unit}".rstrip() + f": allowed {least:g} to {most:g}"
             )
-
-
-def json_row(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The values with NaN and inf, which JSON does not know, as None."""
-    return {
-        key: None if isinstance(value, float) and not math.isfinite(value) else value
-        for key, value in values.items()
-    }
 
 
 def _row(

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from alice_survey.base.artefacts import json_values
 from alice_survey.base.text_table import text_table
 from camera_calib.fov.angles import RELIEF, AngleRow
 from camera_calib.fov.paper import PAPER_RULE, PaperCheck, PaperClaim, PaperValidation
@@ -48,7 +49,7 @@ def fov_csv_rows(rows: Sequence[FovRow], blur: Sequence[BlurRow]) -> list[dict[s
     """Each lens and altitude with each speed and exposure, flat."""
     per_row = len(blur) // max(len(rows), 1)
     return [
-        row.to_json() | moving.to_json()
+        json_values(row) | json_values(moving)
         for i, row in enumerate(rows)
         for moving in blur[i * per_row : (i + 1) * per_row]
     ]

@@ -1,13 +1,12 @@
 """Fit of a calibration to its pictures, and coverage of the frames by points."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.frames import Array
-from camera_calib.calibration import Calibration, TargetView
+from camera_calib.calibration import Calibration, stack_views
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.rig import Rig
 
@@ -51,19 +50,6 @@ class PictureFit:
     """Mean distance of its points from the entrance pupil along the axis."""
     tilt_deg: float
     """Angle between the target's normal and the camera's axis."""
-
-    def to_json(self) -> dict[str, Any]:
-        """JSON values."""
-        return {
-            "view": self.view,
-            "camera": self.camera,
-            "points": self.points,
-            "rms_px": round(self.rms_px, 5),
-            "worst_px": round(self.worst_px, 5),
-            "outliers": self.outliers,
-            "range_m": round(self.range_m, 4),
-            "tilt_deg": round(self.tilt_deg, 2),
-        }
 
 
 def picture_fits(calibration: Calibration) -> list[PictureFit]:
@@ -125,7 +111,8 @@ def camera_residuals(calibration: Calibration, camera: str) -> CameraResiduals:
     residuals = calibration.residuals_px[:, index]
     sigma_px = np.repeat(calibration.sigma_px[:, index, None], residuals.shape[1], axis=1)
     kept = within_gate(residuals, sigma_px)
-    measured = seen_pixels(calibration.views, camera, residuals.shape[1])[kept]
+    pixels = stack_views(calibration.views, calibration.rig, residuals.shape[1])
+    measured = pixels[:, index][kept]
     model = calibration.rig.cameras[camera]
     return CameraResiduals(
         pixels=measured,
@@ -136,12 +123,6 @@ def camera_residuals(calibration: Calibration, camera: str) -> CameraResiduals:
         incidence_deg=incidence_deg(model, measured),
         outward=outward(model, measured),
     )
-
-
-def seen_pixels(views: tuple[TargetView, ...], camera: str, points: int) -> Array:
-    """(V, N, 2) pixels of one camera, NaN where it saw nothing."""
-    nothing = np.full((points, 2), np.nan)
-    return np.stack([view.pixels.get(camera, nothing) for view in views])
 
 
 def radius_px(camera: FlatPortCamera, pixels: Array) -> Array:
@@ -186,20 +167,6 @@ class Profile:
         """(B,) middles of the bins."""
         middle: Array = (self.edges[1:] + self.edges[:-1]) / 2
         return middle
-
-    def to_json(self) -> dict[str, Any]:
-        """JSON values; null in bins with too few points."""
-        return {
-            "edges": np.round(self.edges, 4).tolist(),
-            "count": self.count.tolist(),
-            "rms_px": _with_null(self.rms_px),
-            "expected_px": _with_null(self.expected_px),
-            "outward_px": _with_null(self.outward_px),
-        }
-
-
-def _with_null(values: Array) -> list[float | None]:
-    return [None if v != v else round(v, 6) for v in values.tolist()]
 
 
 def profile(
@@ -275,15 +242,6 @@ class Coverage:
     def empty_share(self) -> float:
         """Share of the cells without a point."""
         return float((self.counts == 0).mean())
-
-    def to_json(self) -> dict[str, Any]:
-        """JSON values."""
-        return {
-            "counts": self.counts.tolist(),
-            "empty_share": round(self.empty_share, 4),
-            "corner_reach": {k: round(v, 4) for k, v in self.corner_reach.items()},
-            "uncovered": list(self.uncovered),
-        }
 
 
 def coverage(camera: FlatPortCamera, pixels: Array, columns: int = 10, rows: int = 8) -> Coverage:

@@ -10,13 +10,14 @@ radius is an error of the model.
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.frames import Array
 from camera_calib.approximation.virtual_pinhole import VirtualPinhole, best_pinhole
-from camera_calib.calibration import Calibration
+from camera_calib.calibration import Calibration, stack_views
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.judge.fit_quality import (
     Profile,
@@ -24,7 +25,6 @@ from camera_calib.judge.fit_quality import (
     outward,
     profile,
     radius_px,
-    seen_pixels,
 )
 
 _FEWEST_POINTS = 12
@@ -78,7 +78,7 @@ def homography_test(calibration: Calibration, camera: str) -> HomographyTest | N
     index = list(calibration.rig.cameras).index(camera)
     model = calibration.rig.cameras[camera]
     kept = np.isfinite(calibration.residuals_px[:, index, :, 0])
-    measured = seen_pixels(calibration.views, camera, len(points))
+    measured = stack_views(calibration.views, calibration.rig, len(points))[:, index]
     poses = [calibration.rig.cam_from_rig[camera] * pose for pose in calibration.rig_from_target]
     usable = [v for v in range(len(poses)) if kept[v].sum() >= _FEWEST_POINTS]
     if not usable:
@@ -180,7 +180,7 @@ def homography_residuals(
     back = np.linalg.inv(np.stack(columns, axis=-1))
     plane = _plane_coordinates(target_points)
     centre, size = seen.mean(axis=0), np.abs(seen - seen.mean(axis=0)).max()
-    h = _direct_homography(plane, (seen - centre) / size)
+    h = np.ravel(cv2.findHomography(plane, (seen - centre) / size)[0])[:8]
     for _ in range(20):
         mapped, slopes = _map(h, plane)
         miss = np.einsum("nab,nb->na", back, size * mapped + centre - seen)
@@ -202,18 +202,6 @@ def _plane_coordinates(points: Array) -> Array:
     axes = np.linalg.svd(centred, full_matrices=False)[2][:2]
     flat: Array = centred @ axes.T / np.abs(centred @ axes.T).max()
     return flat
-
-
-def _direct_homography(plane: Array, seen: Array) -> Array:
-    """(8,) start: the homography of least algebraic error (DLT), its last entry being 1."""
-    x, y = plane.T
-    one, zero = np.ones_like(x), np.zeros_like(x)
-    u, v = seen.T
-    first = np.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=1)
-    second = np.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], axis=1)
-    h = np.linalg.svd(np.concatenate([first, second]), full_matrices=False)[2][-1]
-    start: Array = h[:8] / h[8]
-    return start
 
 
 def _map(h: Array, plane: Array) -> tuple[Array, Array]:

@@ -30,7 +30,6 @@ from camera_calib.judge.uncertainty import (
     baseline_sigma_m,
     compensation,
     covariance_of,
-    frame_pixels,
     overlap_points,
     point_sigmas_m,
     projection_sigma,
@@ -235,7 +234,7 @@ def _camera(
     rig, model = calibration.rig, calibration.rig.cameras[name]
     seen = camera_residuals(calibration, name)
     anchors = anchors_cam(calibration, name)
-    pixels = frame_pixels(model, _MAP_COLUMNS, _MAP_ROWS)
+    pixels = model.frame_grid(_MAP_COLUMNS, _MAP_ROWS)
     halves = None
     if held is not None and held.halves is not None:
         prior = held.used.freedom.prior

@@ -1,23 +1,24 @@
 """The calibration report: one self-contained HTML page, and its numbers as JSON."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
-from alice_survey.base.artefacts import atomic_path
+from alice_survey.base.artefacts import atomic_path, json_values
 from alice_survey.base.records import CalibrationReportRecord
 from alice_survey.base.run import progress
 from alice_survey.kit.document import Figure, Report, Section, Table, Verdict, worst_first
 from alice_survey.kit.page import render_html
 from alice_survey.kit.words import with_sigma
 from camera_calib.calibration import Calibration
-from camera_calib.judge import plots_of_checks, plots_of_fit
+from camera_calib.judge import plots
 from camera_calib.judge.fit_quality import GATE_SIGMAS, TILTED_DEG
-from camera_calib.judge.judgement import Judgement, Parameter, judge, short_label
-from camera_calib.judge.numbers import report_json
-from camera_calib.judge.validation import HeldOut
+from camera_calib.judge.judgement import CameraJudgement, Judgement, Parameter, judge, short_label
+from camera_calib.judge.validation import HeldOut, LengthErrors
 from camera_calib.judge.verdicts import verdicts
 
+_FORMAT = {"format": "alice-survey calibration report", "version": 1}
 _MOST_PICTURES = 60
 """Rows of the table of pictures; those that fit best are left out beyond."""
 
@@ -44,6 +45,69 @@ def write_report(
     CalibrationReportRecord.save(folder / "report.json", report_json(judged, found))
     with atomic_path(folder / "report.html") as path:
         path.write_text(render(judged, found), encoding="utf-8")
+
+
+def report_json(judged: Judgement, found: Sequence[Verdict]) -> dict[str, Any]:
+    """All numbers as JSON values; what is not known is null."""
+    calibration = judged.calibration
+    data: dict[str, Any] = json_values(
+        {
+            **_FORMAT,
+            "source": calibration.rig.source,
+            "views": len(calibration.views),
+            "rms_px": calibration.rms_px,
+            "noise_px": calibration.noise_px,
+            "working_range_m": judged.working_range_m,
+            "warnings": calibration.warnings,
+            "verdicts": [{"level": v.level, "text": v.text} for v in found],
+            "rejections": calibration.rejections,
+            "parameters": judged.parameters,
+            "baselines_m": judged.baselines_m,
+            "pictures": judged.pictures,
+            "cameras": {name: _camera_numbers(c) for name, c in judged.cameras.items()},
+            "stereo": judged.stereo,
+            "lengths": _length_numbers(judged.lengths),
+            "held_out": judged.hold_out,
+            "held_out_lengths": _length_numbers(judged.held_lengths),
+        }
+    )
+    return data
+
+
+def _camera_numbers(camera: CameraJudgement) -> dict[str, Any]:
+    test, halves, coverage = camera.homography, camera.halves, camera.coverage
+    return {
+        "coverage": {
+            "counts": coverage.counts,
+            "empty_share": coverage.empty_share,
+            "corner_reach": coverage.corner_reach,
+            "uncovered": coverage.uncovered,
+        },
+        "residuals_by_radius": camera.profiles.radius,
+        "residuals_by_incidence_deg": camera.profiles.incidence,
+        "projection_sigma": camera.by_range,
+        "homography": test
+        and {
+            "views": test.views,
+            "inner_px": test.inner_px,
+            "outer_px": test.outer_px,
+            "outer_from_px": test.outer_from_px,
+            "by_radius": test.profile,
+        },
+        "halves": halves and {"rms_px": halves.rms_px, "expected_px": halves.expected_rms_px},
+    }
+
+
+def _length_numbers(lengths: LengthErrors | None) -> dict[str, Any] | None:
+    if lengths is None:
+        return None
+    scale, sigma = lengths.scale_ppm()
+    found: dict[str, Any] = {"scale_ppm": scale, "scale_sigma_ppm": sigma}
+    for key, long in (("long", True), ("neighbours", False)):
+        rms, expected = lengths.rms_m(long)
+        count = int((lengths.long == long).sum())
+        found[key] = {"count": count, "rms_m": rms, "expected_m": expected}
+    return found
 
 
 @progress.step("draw the calibration's report")
@@ -158,7 +222,7 @@ def _residuals_section(judged: Judgement) -> Section:
         ),
         figures=[
             Figure(
-                png=plots_of_fit.plot_pictures(judged),
+                png=plots.plot_pictures(judged),
                 title="By picture",
                 alt="Bars: rms of the residuals of every picture, cameras side by side",
                 shows="Rms length of the residuals of each picture; right, against its distance.",
@@ -167,7 +231,7 @@ def _residuals_section(judged: Judgement) -> Section:
                 "exposures, a wrong or bent target. Worse near the camera: the port's model.",
             ),
             Figure(
-                png=plots_of_fit.plot_vectors(judged),
+                png=plots.plot_vectors(judged),
                 title="Over the frame",
                 alt="Arrows over each frame: residuals of all points and their means by cell",
                 shows="Thin lines: all residuals. Arrows: means by cell, coloured where longer "
@@ -177,7 +241,7 @@ def _residuals_section(judged: Judgement) -> Section:
                 "lens model, or the port's parameters set free.",
             ),
             Figure(
-                png=plots_of_fit.plot_profiles(judged),
+                png=plots.plot_profiles(judged),
                 title="Against radius and angle",
                 alt="Lines: rms and mean outward part of residuals against radius and angle",
                 shows="Rms of one coordinate (above) and mean part away from the centre (below), "
@@ -188,7 +252,7 @@ def _residuals_section(judged: Judgement) -> Section:
                 "that starts at the port's normal of the port's distance, glass or index.",
             ),
             Figure(
-                png=plots_of_fit.plot_histogram(judged),
+                png=plots.plot_histogram(judged),
                 title="Against the normal law",
                 alt="Histogram of residuals over noise beside the normal law, by camera",
                 shows="Both coordinates of all residuals over the noise; logarithmic.",
@@ -213,7 +277,7 @@ def _correlations_section(judged: Judgement) -> Section:
         title="Correlations",
         figures=[
             Figure(
-                png=plots_of_fit.plot_correlation(judged),
+                png=plots.plot_correlation(judged),
                 title="Correlation of the parameters",
                 alt="Heat map of the correlation matrix of all calibrated parameters",
                 shows="How far errors of two parameters go together (blue) or against each other "
@@ -233,7 +297,7 @@ def _uncertainty_section(judged: Judgement) -> Section:
     work = f"{judged.working_range_m:.3g} m"
     figures = [
         Figure(
-            png=plots_of_fit.plot_projection(judged),
+            png=plots.plot_projection(judged),
             title=f"Projection at {work}",
             alt="Maps of the projection's standard deviation over each frame",
             shows="One sigma, in its worst direction, of where a point is projected, from the "
@@ -244,7 +308,7 @@ def _uncertainty_section(judged: Judgement) -> Section:
             otherwise="Dark corners need points there; dark everywhere needs more views.",
         ),
         Figure(
-            png=plots_of_fit.plot_ranges(judged),
+            png=plots.plot_ranges(judged),
             title="Against distance",
             alt="Lines: projection uncertainty, and stereo uncertainty, against distance",
             shows="The same over distance, median and worst of the frame; the grey band is where "
@@ -263,7 +327,7 @@ def _uncertainty_section(judged: Judgement) -> Section:
     if judged.stereo_map is not None and len(judged.stereo_map.points_rig) > 3:
         figures.append(
             Figure(
-                png=plots_of_fit.plot_stereo_map(judged),
+                png=plots.plot_stereo_map(judged),
                 title=f"Stereo at {work}",
                 alt="Maps of the standard deviation of triangulated distance over the overlap",
                 shows="One sigma of triangulated distance over the cameras' overlap, from the "
@@ -322,7 +386,7 @@ def _hold_out_section(judged: Judgement) -> Section:
         )
     figures = [
         Figure(
-            png=plots_of_checks.plot_hold_out(judged),
+            png=plots.plot_hold_out(judged),
             title="Views that took no part",
             alt="Lollipops: rms of views used and of views held out",
             shows="The rig is calibrated again without the diamonds, whose poses are then found "
@@ -336,7 +400,7 @@ def _hold_out_section(judged: Judgement) -> Section:
     if any(camera.halves is not None for camera in judged.cameras.values()):
         figures.append(
             Figure(
-                png=plots_of_checks.plot_halves(judged),
+                png=plots.plot_halves(judged),
                 title="Two halves of the views",
                 alt="Maps and arrows: difference of projection between two calibrations",
                 shows="Two calibrations, from every other view each: how far apart they project "
@@ -376,7 +440,7 @@ def _lengths_section(judged: Judgement) -> Section:
     if rows:
         figures.append(
             Figure(
-                png=plots_of_checks.plot_lengths(judged),
+                png=plots.plot_lengths(judged),
                 title="Lengths on the target",
                 alt="Scale error of each view against distance, and histogram of length errors",
                 shows="Points seen by two cameras are triangulated, view by view, and their "
@@ -421,7 +485,7 @@ def _homographies_section(judged: Judgement) -> Section:
         ),
         figures=[
             Figure(
-                png=plots_of_checks.plot_homographies(judged),
+                png=plots.plot_homographies(judged),
                 title="What homographies leave",
                 alt="Lines: rms and mean outward part of homography residuals against radius",
                 shows="Residuals of one homography per picture, against the radius.",
@@ -456,7 +520,7 @@ def _coverage_section(judged: Judgement) -> Section:
         text=bare or ["Points come near all corners of all frames."],
         figures=[
             Figure(
-                png=plots_of_checks.plot_coverage(judged),
+                png=plots.plot_coverage(judged),
                 title="Where points fell",
                 alt="Counts of points by cell of each frame; corners without points hatched",
                 shows="Points seen by cell. In hatched corners there are none: distortion is "
@@ -466,7 +530,7 @@ def _coverage_section(judged: Judgement) -> Section:
                 "frame if it can be read so (ChArUco, AprilTags).",
             ),
             Figure(
-                png=plots_of_checks.plot_spread(judged),
+                png=plots.plot_spread(judged),
                 title="How the target was held",
                 alt="Scatter: tilts of the target, and tilt against distance",
                 shows=f"Tilts about both axes of the camera; the shade is below {TILTED_DEG:g} "

@@ -1,12 +1,12 @@
 """Effects of a calibrated rig's covariance, as a table for the command line."""
 
 import math
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from alice_survey.base.artefacts import json_values
 from alice_survey.base.errors import CalibrationError
 from alice_survey.base.text_table import text_table
 from alice_survey.kit.words import with_sigma
@@ -14,7 +14,6 @@ from camera_calib.judge.judgement import over_frame, rig_parameters
 from camera_calib.judge.uncertainty import (
     baseline_sigma_m,
     compensation,
-    frame_pixels,
     frame_points,
     projection_sigma,
     stereo_sigma,
@@ -63,16 +62,16 @@ def uncertainty_report(
             baselines[name] = [length_m, baseline_sigma_m(rig, name)]
             millimetres = with_sigma(1e3 * length_m, 1e3 * baselines[name][1])
             parts.append(f"{rig.reference} to {name}: {millimetres} mm")
-    maps: dict[str, list[dict[str, float]]] = {}
+    maps = {}
     lines = []
     middle = tuple(np.geomspace(near_m, far_m, 4).tolist())
     for name, camera in rig.cameras.items():
         compensating = compensation(rig, name, frame_points(camera, middle))
-        pixels = frame_pixels(camera, _GRID, _GRID)
+        pixels = camera.frame_grid(_GRID, _GRID)
         found = [
             over_frame(r, projection_sigma(rig, name, pixels, r, compensating)) for r in ranges
         ]
-        maps[name] = [asdict(sigma) for sigma in found]
+        maps[name] = found
         lines += [
             (
                 name,
@@ -87,13 +86,13 @@ def uncertainty_report(
     header = ("camera", "at m", "best pose px", "worst", "held still px", "worst")
     parts.append("one sigma of a projection over the frame\n" + text_table(header, lines))
     data: dict[str, Any] = {
-        "parameters": [asdict(p) for p in parameters],
+        "parameters": parameters,
         "baselines_m": baselines,
         "projection_sigma": maps,
     }
     if len(rig.cameras) > 1:
         stereo = [stereo_sigma(rig, r, noise_px) for r in ranges]
-        data["stereo"] = [asdict(s) for s in stereo]
+        data["stereo"] = stereo
         lines = [
             (
                 f"{s.range_m:g}",
@@ -114,16 +113,8 @@ def uncertainty_report(
             "sigma mm",
         )
         parts.append("one sigma of stereo by calibration alone\n" + text_table(header, lines))
-    return "\n\n".join(parts), _without_nan(data)
+    return "\n\n".join(parts), json_values(data)
 
 
 def _mm(value_m: float) -> str:
     return f"{1e3 * value_m:.3g}"
-
-
-def _without_nan(data: Any) -> Any:
-    if isinstance(data, float):
-        return data if np.isfinite(data) else None
-    if isinstance(data, dict):
-        return {key: _without_nan(value) for key, value in data.items()}
-    return [_without_nan(item) for item in data] if isinstance(data, list | tuple) else data

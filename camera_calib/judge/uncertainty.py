@@ -108,16 +108,9 @@ def taken_up(slopes: Array, moved: Array) -> Array:
     return found
 
 
-def frame_pixels(camera: FlatPortCamera, columns: int, rows: int) -> Array:
-    """Pixels over the whole frame, edges included, (rows, columns, 2)."""
-    x = np.linspace(0.0, camera.width_px, columns)
-    y = np.linspace(0.0, camera.height_px, rows)
-    return np.stack(np.meshgrid(x, y), axis=-1)
-
-
-def frame_points(camera: FlatPortCamera, ranges_m: tuple[float, ...], grid: int = 9) -> Array:
+def frame_points(camera: FlatPortCamera, ranges_m: tuple[float, ...]) -> Array:
     """Points over the frame at some distances, (N, 3) in the camera's frame."""
-    pixels = frame_pixels(camera, grid, grid).reshape(-1, 2)
+    pixels = camera.frame_grid(9, 9).reshape(-1, 2)
     points = np.concatenate([camera.at_depth(pixels, r) for r in ranges_m])
     kept: Array = points[np.isfinite(points).all(axis=1)]
     return kept
@@ -211,16 +204,8 @@ def shape_sigmas_m(rig: Rig, points_rig: Array) -> Array:
     shape = np.full(points_rig.shape, np.nan)
     if known.sum() < 3:
         return shape
-    x, y, z = (points_rig[known] - points_rig[known].mean(axis=0)).T
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    motion = np.stack(
-        [
-            np.stack([zero, z, -y, one, zero, zero], axis=1),
-            np.stack([-z, zero, x, zero, one, zero], axis=1),
-            np.stack([y, -x, zero, zero, zero, one], axis=1),
-        ],
-        axis=1,
-    ).reshape(-1, 6)
+    centred = points_rig[known] - points_rig[known].mean(axis=0)
+    motion = pose_jacobian(np.broadcast_to(np.eye(3), (len(centred), 3, 3)), centred).reshape(-1, 6)
     moved = follow[known].reshape(len(motion), -1)
     left = (moved - motion @ taken_up(motion, moved)).reshape(-1, 3, moved.shape[1])
     variance = np.einsum("nap,pq,naq->na", left, covariance_of(rig).matrix, left)
@@ -249,9 +234,12 @@ def length_sigmas_m(rig: Rig, starts_rig: Array, ends_rig: Array) -> Array:
 def overlap_points(rig: Rig, range_m: float) -> Array:
     """Points at one distance that at least two cameras have in their frames, (N, 3) in `rig`."""
     reference = rig.cameras[rig.reference]
-    pixels = frame_pixels(reference, _OVERLAP_GRID, _OVERLAP_GRID).reshape(-1, 2)
+    pixels = reference.frame_grid(_OVERLAP_GRID, _OVERLAP_GRID).reshape(-1, 2)
     points = rig.cam_from_rig[rig.reference].inv().apply(reference.at_depth(pixels, range_m))
-    kept: Array = points[_seen_twice(rig, points)]
+    count = np.zeros(len(points), dtype=int)
+    for camera, model in rig.cameras.items():
+        count += _in_frame(model, model.project(rig.cam_from_rig[camera].apply(points)))
+    kept: Array = points[count >= 2]
     return kept
 
 
@@ -260,15 +248,6 @@ def _in_frame(camera: FlatPortCamera, pixels: Array) -> NDArray[np.bool_]:
     right, bottom = camera.width_px + _EDGE_PX, camera.height_px + _EDGE_PX
     inside: NDArray[np.bool_] = (x >= -_EDGE_PX) & (x <= right) & (y >= -_EDGE_PX) & (y <= bottom)
     return inside
-
-
-def _seen_twice(rig: Rig, points_rig: Array) -> NDArray[np.bool_]:
-    count = np.zeros(len(points_rig), dtype=int)
-    for camera, model in rig.cameras.items():
-        pixels = model.project(rig.cam_from_rig[camera].apply(points_rig))
-        count += _in_frame(model, pixels)
-    twice: NDArray[np.bool_] = count >= 2
-    return twice
 
 
 @dataclass(frozen=True, kw_only=True)

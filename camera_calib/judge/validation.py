@@ -11,7 +11,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +21,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.base.errors import CalibrationError, warn
 from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
-from camera_calib.calibration import Calibration, TargetView
+from camera_calib.calibration import Calibration, TargetView, residuals_px, stack_views
 from camera_calib.flat_port import FlatPortCamera, pose_jacobian
 from camera_calib.freedom import NO_PRIOR, Prior
 from camera_calib.judge.fit_quality import rms_length_px, within_gate
@@ -93,28 +92,16 @@ def hold_out(
     except CalibrationError as error:
         warn(f"no test by halves: half of {len(views)} views does not calibrate: {error}")
         halves = None
+    posed = tuple(view for view, _ in placed)
+    poses = RigidTransform.concatenate([pose for _, pose in placed])
+    pixels = stack_views(posed, used.rig, len(used.target_points))
     return HeldOut(
         used=used,
-        views=tuple(view for view, _ in placed),
-        rig_from_target=RigidTransform.concatenate([pose for _, pose in placed]),
-        residuals_px=np.stack(
-            [view_residuals(used.rig, view, used.target_points, pose) for view, pose in placed]
-        ),
+        views=posed,
+        rig_from_target=poses,
+        residuals_px=residuals_px(used.rig, poses, used.target_points, pixels),
         halves=halves,
     )
-
-
-def view_residuals(
-    rig: Rig, view: TargetView, target_points: Array, rig_from_target: RigidTransform
-) -> Array:
-    """Projected minus measured, (cameras, N, 2); NaN where unseen."""
-    points_rig = rig_from_target.apply(target_points)
-    residuals = np.full((len(rig.cameras), len(target_points), 2), np.nan)
-    for c, (camera, model) in enumerate(rig.cameras.items()):
-        if camera in view.pixels:
-            points_cam = rig.cam_from_rig[camera].apply(points_rig)
-            residuals[c] = model.project(points_cam) - view.pixels[camera]
-    return residuals
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,17 +115,6 @@ class HoldOutScore:
     """Rms expected from noise and the rig's covariance, as far as a pose cannot absorb it."""
     used_rms_px: float
     outliers: int
-
-    def to_json(self) -> dict[str, Any]:
-        """JSON values."""
-        return {
-            "views": self.views,
-            "points": self.points,
-            "rms_px": round(self.rms_px, 5),
-            "expected_px": round(self.expected_px, 5),
-            "used_rms_px": round(self.used_rms_px, 5),
-            "outliers": self.outliers,
-        }
 
 
 def score_hold_out(held: HeldOut) -> HoldOutScore:
@@ -321,7 +297,7 @@ def length_errors(
     rig: Rig,
     views: Sequence[TargetView],
     rig_from_target: RigidTransform,
-    residuals_px: Array,
+    missed_px: Array,
     target_points: Array,
     noise_px: Array | float,
 ) -> LengthErrors:
@@ -335,22 +311,19 @@ def length_errors(
         rig: calibrated.
         views: (V) where the cameras saw the target.
         rig_from_target: (V,) its poses; they only give the directions of the lengths.
-        residuals_px: (V, cameras, N, 2); outliers among them take no part.
+        missed_px: (V, cameras, N, 2) residuals; outliers among them take no part.
         target_points: (N, 3).
         noise_px: standard deviation of one coordinate, of all or of each picture (V, cameras).
     """
     near = neighbours(target_points)
     sigma_px = np.broadcast_to(noise_px, (len(views), len(rig.cameras)))
+    pixels = stack_views(views, rig, len(target_points))
+    pixels[~within_gate(missed_px, sigma_px[..., None])] = np.nan
     poses = [rig.cam_from_rig[camera] for camera in rig.cameras]
     back = rig.cam_from_rig[rig.reference]
     parts: list[tuple[Array, ...]] = []
-    for v, view in enumerate(views):
-        pixels = np.full((len(rig.cameras), len(target_points), 2), np.nan)
-        for c, camera in enumerate(rig.cameras):
-            if camera in view.pixels:
-                pixels[c] = view.pixels[camera]
-        pixels[~within_gate(residuals_px[v], sigma_px[v, :, None])] = np.nan
-        found = triangulate(list(rig.cameras.values()), poses, pixels, sigma_px[v].tolist())
+    for v in range(len(views)):
+        found = triangulate(list(rig.cameras.values()), poses, pixels[v], sigma_px[v].tolist())
         seen = np.nonzero(np.isfinite(found.points_world).all(axis=1))[0]
         if len(seen) < 2:
             continue

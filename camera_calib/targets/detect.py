@@ -26,8 +26,12 @@ from camera_calib.targets.corners import (
     Grey,
     fit_corners,
 )
-from camera_calib.targets.grow import chessboard_size, grown_chessboard, spans_board
-from camera_calib.targets.neighbours import from_neighbours
+from camera_calib.targets.grow import (
+    chessboard_size,
+    from_neighbours,
+    grown_chessboard,
+    spans_board,
+)
 from camera_calib.targets.target import (
     TAG_BITS,
     TAG_BORDER_BITS,

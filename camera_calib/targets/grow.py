@@ -17,7 +17,6 @@ from scipy.spatial import cKDTree
 
 from alice_survey.base.frames import Array
 from camera_calib.targets.corners import fit_corners
-from camera_calib.targets.neighbours import from_neighbours
 
 Place = tuple[int, int]
 Places = dict[Place, Array]
@@ -43,6 +42,11 @@ _LEAST_SHARE = 0.5
 """Share of the corners that must be fitted."""
 _LEAST_OUTER_SHARE = 0.25
 """The same of each of the outer rows and columns, which show where the board ends."""
+_MOST_NEIGHBOURS = 24
+_NEIGHBOUR_WIDTH = 1.5
+"""Standard deviation of a neighbour's weight, in squares."""
+_STIFFNESS = 0.1
+"""Weight of 'no change of slope' against that of a neighbour one square away."""
 
 
 def grown_chessboard(picture: NDArray[np.uint8], shape: tuple[int, int]) -> Array | None:
@@ -223,13 +227,58 @@ def _next_to(
     if not worth:
         return {}
     tries.update(worth)
-    asked = np.array(worth)
+    tried = np.array(worth)
     board, pixels = np.array(list(known), dtype=np.float64), np.array(list(known.values()))
-    expected, steps = from_neighbours(board, pixels, asked.astype(np.float64))
+    expected, steps = from_neighbours(board, pixels, tried.astype(np.float64))
     fits = fit_corners(picture, expected, steps)
-    good = _alternating(asked) * fits.contrast / middle > _WEAKEST
+    good = _alternating(tried) * fits.contrast / middle > _WEAKEST
     miss = (fits.pixels[good] - expected[good])[..., None]
     off = np.linalg.norm(np.linalg.solve(steps[good], miss)[..., 0], axis=1)
     good[good] = off < _OFF
-    keys = [(int(x), int(y)) for x, y in asked[good]]
+    keys = [(int(x), int(y)) for x, y in tried[good]]
     return dict(zip(keys, fits.pixels[good], strict=True))
+
+
+def from_neighbours(
+    board: Array, pixels: Array, wanted: Array, others: bool = False
+) -> tuple[Array, Array]:
+    """Predict positions of the board's points in the picture, and the size of a square there.
+
+    A homography through all known points, plus an affine change of its misses near each point: so
+    a lens may bend the board.
+
+    Args:
+        board: (M, 2) known points, in squares.
+        pixels: (M, 2) their pixels.
+        wanted: (K, 2) points to predict, in squares.
+        others: ignore a known point at exactly the place of a predicted one.
+
+    Returns:
+        (K, 2) pixels, and (K, 2, 2) pixels per square along x (first column) and y (second); NaN
+        where fewer than 4 points are known, or all on a line.
+    """
+    homography = None
+    if len(board) >= 4 and np.linalg.matrix_rank(board - board.mean(axis=0), tol=0.1) == 2:
+        homography, _ = cv2.findHomography(board, pixels, 0)
+    if homography is None:
+        return np.full((len(wanted), 2), np.nan), np.full((len(wanted), 2, 2), np.nan)
+    predicted, slopes = through(homography, wanted)
+    misses = pixels - through(homography, board)[0]
+    distance, index = cKDTree(board).query(wanted, k=min(_MOST_NEIGHBOURS, len(board)))
+    weight = np.exp(-0.5 * (distance / _NEIGHBOUR_WIDTH) ** 2)
+    if others:
+        weight = np.where(distance < 1e-6, 0.0, weight)
+    terms = np.concatenate([np.ones((*index.shape, 1)), board[index] - wanted[:, None]], axis=2)
+    weighted = (terms * weight[..., None]).transpose(0, 2, 1)
+    normal = weighted @ terms + np.diag([1e-3, _STIFFNESS, _STIFFNESS])
+    change = np.linalg.solve(normal, weighted @ misses[index])
+    return predicted + change[:, 0], slopes + change[:, 1:].transpose(0, 2, 1)
+
+
+def through(homography: Array, points: Array) -> tuple[Array, Array]:
+    """(K, 2) points mapped by a homography, and (K, 2, 2) the slopes of the map."""
+    mapped = np.column_stack([points, np.ones(len(points))]) @ homography.T
+    scale = mapped[:, 2:]
+    pixels = mapped[:, :2] / scale
+    slopes = homography[None, :2, :2] - pixels[:, :, None] * homography[None, 2:, :2]
+    return pixels, slopes / scale[:, :, None]

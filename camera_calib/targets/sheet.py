@@ -55,8 +55,6 @@ class Sheet:
     words: str
     words_at_mm: tuple[float, float]
     """Left end of the words' base line."""
-    target_at_mm: tuple[float, float]
-    """The target's first point."""
 
 
 def lay_out(target: Target, paper: str | None = None) -> Sheet:
@@ -93,7 +91,6 @@ def lay_out(target: Target, paper: str | None = None) -> Sheet:
         rectangles_mm=np.concatenate([pattern, _bar(bar_x, bar_y)]),
         words=words,
         words_at_mm=(bar_x, bar_y - _TICK_MM - 1.0),
-        target_at_mm=(float(place[0]), float(place[1])),
     )
 
 

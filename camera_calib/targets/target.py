@@ -16,8 +16,9 @@ the top left, as the board is read when it hangs upright.
   camera: its point in row r of R is ours in row R - 1 - r.)
 """
 
+import json
 import re
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -25,6 +26,7 @@ from typing import Any, Literal, Self
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from alice_survey.base.artefacts import read_json, write_json
 from alice_survey.base.contents import one_line
@@ -58,6 +60,8 @@ class Target:
     Raises:
         CalibrationError: no such target can be made or used.
     """
+
+    __pydantic_config__ = ConfigDict(extra="forbid", strict=True)
 
     kind: Kind
     columns: int
@@ -235,17 +239,10 @@ class Target:
 
     def to_json(self) -> dict[str, Any]:
         """As a JSON object; what its kind lacks is left out."""
-        data: dict[str, Any] = {"format": FORMAT, "version": VERSION, "kind": self.kind}
-        data |= {"columns": self.columns, "rows": self.rows, "size_m": self.size_m}
-        if self.kind == "charuco":
-            data |= {
-                "marker_m": self.marker_m,
-                "dictionary": self.dictionary,
-                "legacy": self.legacy,
-            }
-        if self.kind == "apriltag":
-            data |= {"spacing": self.spacing}
-        return data
+        data = {key: value for key, value in asdict(self).items() if value is not None}
+        if self.kind != "charuco":
+            del data["legacy"]
+        return {"format": FORMAT, "version": VERSION, **data}
 
     @classmethod
     def from_json(cls, data: Any) -> Self:
@@ -260,29 +257,15 @@ class Target:
             raise CalibrationError(f"target: version {data.get('version')}; {VERSION} is known")
         values = {key: value for key, value in data.items() if key not in ("format", "version")}
         try:
-            for key, kinds in _TYPES.items():
-                if key in values and (
-                    not isinstance(values[key], kinds)
-                    or (isinstance(values[key], bool) and bool not in kinds)
-                ):
-                    raise TypeError(f"{key} is {values[key]!r}")
-            return cls(**values)
-        except (TypeError, ArithmeticError) as error:
-            raise CalibrationError(f"target: its file is wrong: {one_line(error)}") from None
+            return TypeAdapter(cls).validate_json(json.dumps(values))
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            key = ".".join(map(str, first["loc"]))
+            raise CalibrationError(f"target: its file is wrong: {key}: {first['msg']}") from None
 
 
 _COUNTED = {"chessboard": "inner corners", "charuco": "squares", "apriltag": "tags"}
 _SIZED = {"chessboard": "square", "charuco": "square", "apriltag": "tag"}
-_TYPES: dict[str, tuple[type, ...]] = {
-    "kind": (str,),
-    "columns": (int,),
-    "rows": (int,),
-    "size_m": (int, float),
-    "marker_m": (int, float),
-    "dictionary": (str,),
-    "legacy": (bool,),
-    "spacing": (int, float),
-}
 
 
 def parse_target(text: str) -> Target:

@@ -124,3 +124,11 @@ def with_pixels(view: TargetView, camera: str, pixels: Array | None) -> TargetVi
     """The same view with other pixels of one camera, or without that camera."""
     rest: Mapping[str, Array] = {n: p for n, p in view.pixels.items() if n != camera}
     return replace(view, pixels=dict(rest) if pixels is None else {**rest, camera: pixels})
+
+
+def scene(
+    rig: Rig, count: int, seed: int = 1, noise_px: float = 0.1, **poses: float
+) -> list[TargetView]:
+    """Noisy views of the board in random poses (see `board_poses`)."""
+    rng = np.random.default_rng(seed)
+    return views_of(rig, board_poses(rig, count, rng, **poses), noise_px, rng)  # type: ignore[arg-type]

@@ -124,47 +124,12 @@ def test_a_rig_file_is_the_same_each_time(tmp_path: Path, rig: Rig) -> None:
     assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
 
 
-def test_faults_of_a_rig_file_are_one_line_with_its_name(tmp_path: Path, rig: Rig) -> None:
-    path = tmp_path / "rig.json"
-    write_rig(path, rig)
-    good = json.loads(path.read_text())
-
-    def fault(change: dict[str, object]) -> str:
-        path.write_text(json.dumps({**good, **change}))
-        with pytest.raises(AliceError) as error:
-            read_rig(path)
-        return str(error.value)
-
-    left = good["cameras"]["left"]
-    texts = {
-        "version": fault({"version": 9}),
-        "rig file": fault({"format": "something"}),
-        "fx_px": fault({"cameras": {"left": {**left, "fx_px": -1}}}),
-        "k9": fault({"cameras": {"left": {**left, "k9": 0.1}}}),
-        "cam_from_rig": fault(
-            {"cameras": {"left": {k: v for k, v in left.items() if k != "cam_from_rig"}}}
-        ),
-        "translation_m": fault({"body_from_rig": {"quaternion_xyzw": [0, 0, 0, 1]}}),
-        "norm": fault(
-            {"body_from_rig": {"quaternion_xyzw": [0, 0, 0, 0], "translation_m": [0, 0, 0]}}
-        ),
-        "camera": fault({"cameras": {}}),
-    }
-    for words, text in texts.items():
-        assert str(path) in text
-        assert "\n" not in text
-        assert words in text
-
-
-def test_a_missing_or_broken_rig_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(AliceError, match="no such file"):
-        read_rig(tmp_path / "none.json")
-    (tmp_path / "bad.json").write_text("{")
-    with pytest.raises(AliceError, match="not valid JSON"):
-        read_rig(tmp_path / "bad.json")
-    (tmp_path / "list.json").write_text("[1, 2]")
-    with pytest.raises(AliceError, match=r"list\.json"):
-        read_rig(tmp_path / "list.json")
+@pytest.mark.parametrize("text", [None, "{", "[1, 2]"])
+def test_a_missing_or_broken_rig_file_is_named(tmp_path: Path, text: str | None) -> None:
+    if text is not None:
+        (tmp_path / "rig.json").write_text(text)
+    with pytest.raises(AliceError, match=r"rig\.json"):
+        read_rig(tmp_path / "rig.json")
 
 
 def test_every_camera_needs_a_pose(rig: Rig) -> None:
@@ -177,22 +142,33 @@ def test_every_camera_needs_a_pose(rig: Rig) -> None:
 @pytest.mark.parametrize(
     ("place", "value", "words"),
     [
-        (("cameras", "left", "fx_px"), "3387.5", "left: fx_px = '3387.5' is not a number"),
-        (("cameras", "left", "fx_px"), True, "left: fx_px = True is not a number"),
-        (("cameras", "left", "fx_px"), float("nan"), "left: fx_px = nan is not finite"),
-        (("cameras", "left", "fx_px"), 1e300, "exceeds 1e+07 px"),
-        (("cameras", "left", "width_px"), 640.5, "width_px = 640.5 is not a whole number"),
-        (("cameras", "left", "n_water"), 5, "n_water = 5: 1 to 2 allowed"),
-        (("cameras", "left", "glass_thickness_m"), 1e9, "0 to 10 m allowed"),
-        (("cameras", "left", "normal"), [0.0, 1.0], "3 finite numbers wanted"),
-        (("cameras", "left", "normal"), [0.0, 0.0, 1.0, 0.0], "3 finite numbers wanted"),
-        (("cameras", "right", "cam_from_rig"), 5, "right: cam_from_rig is not an object"),
+        (("cameras", "left", "fx_px"), "3387.5", "left: fx_px = '3387.5'"),
+        (("cameras", "left", "fx_px"), True, "left: fx_px = True"),
+        (("cameras", "left", "fx_px"), float("nan"), "left: fx_px = nan"),
+        (("cameras", "left", "fx_px"), 1e300, "1e+07 px"),
+        (("cameras", "left", "width_px"), 640.5, "width_px = 640.5"),
+        (("cameras", "left", "n_water"), 5, "n_water = 5: 1 to 2"),
+        (("cameras", "left", "glass_thickness_m"), 1e9, "0 to 10 m"),
+        (("cameras", "left", "normal"), [0.0, 1.0], "normal"),
+        (("cameras", "left", "normal"), [0.0, 0.0, 1.0, 0.0], "normal"),
+        (("cameras", "right", "cam_from_rig"), 5, "right: cam_from_rig"),
         (("cameras", "right", "cam_from_rig", "translation_m"), [0, 0, float("nan")], "right"),
-        (("cameras", "right", "cam_from_rig", "quaternion_xyzw"), [[0, 0, 0, 1]], "4 finite"),
-        (("cameras",), [], "cameras is not an object"),
-        (("version",), 1, "of version 1; this program reads version 2"),
-        (("covariance", "matrix"), [[0.1, 0.0], [0.0]], "row of left.k1"),
-        (("covariance", "parameters"), ["left.fx_px"], "as many rows"),
+        (
+            ("cameras", "right", "cam_from_rig", "quaternion_xyzw"),
+            [[0, 0, 0, 1]],
+            "quaternion_xyzw",
+        ),
+        (("cameras",), [], "cameras"),
+        (("version",), 1, "version"),
+        (("covariance", "matrix"), [[0.1, 0.0], [0.0]], "left.k1"),
+        (("covariance", "parameters"), ["left.fx_px"], "covariance"),
+        (("format",), "something", "format"),
+        (("cameras", "left", "fx_px"), -1, "fx_px"),
+        (("cameras", "left", "k9"), 0.1, "k9"),
+        (("cameras",), {"left": {}}, "cam_from_rig"),
+        (("cameras",), {}, "camera"),
+        (("body_from_rig",), {"quaternion_xyzw": [0, 0, 0, 1]}, "translation_m"),
+        (("body_from_rig", "quaternion_xyzw"), [0, 0, 0, 0], "norm"),
     ],
 )
 def test_a_wrong_value_of_a_rig_file_is_named(

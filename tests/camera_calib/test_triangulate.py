@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.base.errors import CalibrationError
 from camera_calib.flat_port import FlatPortCamera
-from camera_calib.triangulate import _pixel_slopes, nearest_to_rays, reproject, triangulate
+from camera_calib.triangulate import nearest_to_rays, reproject, triangulate
 from tests.oracles_interface import (
     LENS,
     nearest_slowly,
@@ -180,20 +180,6 @@ def test_parallel_rays_have_no_solution() -> None:
     found = triangulate([UNDERWATER] * 2, [same, same], pixels)
 
     assert np.isnan(found.points_world).all()
-
-
-def test_slopes_are_those_of_the_camera() -> None:
-    points = seafloor(np.random.default_rng(7), 50)
-    points[0] = 1.5 * np.asarray(UNDERWATER.normal)  # on the port's normal, where r = 0
-    pixels, by_point, _ = UNDERWATER.project_jacobian(points)
-    lens, port, fold = UNDERWATER.kernel_arguments
-    out = np.empty((2, 4))
-
-    for i, point in enumerate(points):
-        assert _pixel_slopes(point, lens, port, fold, out)
-        np.testing.assert_allclose(out[:, :3], by_point[i], rtol=1e-12, atol=1e-9)
-        np.testing.assert_allclose(out[:, 3], pixels[i], rtol=1e-14)
-    assert not _pixel_slopes(np.array([0.0, 0.0, 0.02]), lens, port, fold, out)
 
 
 def test_nearest_point_to_two_rays_is_the_middle_of_their_gap() -> None:

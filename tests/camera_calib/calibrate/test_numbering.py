@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from camera_calib.calibrate.numbering import same_numbering
+from camera_calib.calibrate.start import same_numbering
 from camera_calib.calibration import TargetView
 from camera_calib.targets.target import parse_target
 from tests.camera_calib.calibration_scenes import DESIGN, board_poses, built_rig, views_of

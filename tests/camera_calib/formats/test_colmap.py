@@ -4,6 +4,7 @@ import json
 import struct
 import tempfile
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from camera_calib.formats.colmap import read_colmap, write_colmap, write_flatpor
 from camera_calib.formats.registry import detect
 from camera_calib.formats.rigs import ReadOptions
 from camera_calib.rig import Rig
-from tests.strategies_formats import POINTS_RIG, RATIONAL, assert_same_geometry, rigs
+from tests.strategies_formats import POINTS_RIG, RATIONAL, assert_same_geometry, fault_of, rigs
 
 AIR = FlatPortCamera(
     width_px=1920, height_px=1200, fx_px=705.5, fy_px=705.25, cx_px=963.5, cy_px=604.75,
@@ -29,6 +30,9 @@ WET = replace(
     AIR, port_distance_m=0.025, glass_thickness_m=0.01, n_glass=1.49, n_water=1.333,
     normal=(0.6, 0.0, 0.8),
 )  # fmt: skip
+
+
+fault = partial(fault_of, read_colmap)
 
 
 def pair(camera: FlatPortCamera) -> Rig:
@@ -42,15 +46,6 @@ def pair(camera: FlatPortCamera) -> Rig:
         body_from_rig=RigidTransform.identity(),
         source="a test",
     )
-
-
-def fault(path: Path, reading: ReadOptions | None = None) -> str:
-    with pytest.raises(CalibrationError) as error:
-        read_colmap(path, reading or ReadOptions())
-    shown = str(error.value)
-    assert str(path) in shown
-    assert "\n" not in shown
-    return shown
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -246,30 +241,25 @@ def test_an_index_of_air_divides_the_others(tmp_path: Path) -> None:
 def test_faults_name_file_and_line(tmp_path: Path) -> None:
     path = tmp_path / "cameras.txt"
 
-    def text_fault(line: str) -> str:
-        path.write_text(line + "\n")
-        return fault(path)
-
     lens = "1 PINHOLE 9 8 5 6 4 3"
-    faults = {
-        "line 1": text_fault("1 PINHOLE 9"),
-        "OPENCV_FISHEYE is not OpenCV's": text_fault("1 OPENCV_FISHEYE 9 8 1 1 1 1 0 0 0 0"),
-        "PINHOLE has 4 PARAMS: 3 found": text_fault("1 PINHOLE 9 8 5 6 4"),
-        "PINHOLE has 4 PARAMS: 5 found": text_fault(lens + " 1"),
-        "DOMEPORT is not flat": text_fault(lens + " DOMEPORT 0 0 0 0.05 0.007 1 1.52 1.334"),
-        "8 REFRAC_PARAMS: 2 found": text_fault(lens + " FLATPORT 0 0"),
-        "unit normal": text_fault(lens + " FLATPORT 0 0 2 0.05 0.007 1 1.52 1.334"),
-        "indices": text_fault(lens + " FLATPORT 0 0 1 0.05 0.007 1 1.52 0.9"),
-        "port_distance_m": text_fault(lens + " FLATPORT 0 0 1 -0.05 0.007 1 1.52 1.33"),
-        "could not convert": text_fault("1 PINHOLE 9 8 5 6 x 3"),
-        "finite": text_fault("1 PINHOLE 9 8 5 6 nan 3"),
-        "focal": text_fault("1 PINHOLE 9 8 0 6 4 3"),
-        "WIDTH": text_fault("1 PINHOLE 0 8 5 6 4 3"),
-        "holds no camera": text_fault("# nothing"),
-        "of one CAMERA_ID": text_fault(f"{lens}\n{lens}"),
-    }
-    for words, shown in faults.items():
-        assert words in shown
+    for line, named in (
+        ("1 PINHOLE 9", "line 1"),
+        ("1 OPENCV_FISHEYE 9 8 1 1 1 1 0 0 0 0", "OPENCV_FISHEYE"),
+        ("1 PINHOLE 9 8 5 6 4", "4 PARAMS: 3"),
+        (lens + " 1", "4 PARAMS: 5"),
+        (lens + " DOMEPORT 0 0 0 0.05 0.007 1 1.52 1.334", "DOMEPORT"),
+        (lens + " FLATPORT 0 0", "8 REFRAC_PARAMS: 2"),
+        (lens + " FLATPORT 0 0 2 0.05 0.007 1 1.52 1.334", "normal"),
+        (lens + " FLATPORT 0 0 1 0.05 0.007 1 1.52 0.9", "0.9"),
+        (lens + " FLATPORT 0 0 1 -0.05 0.007 1 1.52 1.33", "port_distance_m"),
+        ("1 PINHOLE 9 8 5 6 x 3", "line 1"),
+        ("1 PINHOLE 9 8 5 6 nan 3", "cx"),
+        ("1 PINHOLE 9 8 0 6 4 3", "fx"),
+        ("1 PINHOLE 0 8 5 6 4 3", "WIDTH"),
+        ("# nothing", "camera"),
+        (f"{lens}\n{lens}", "CAMERA_ID"),
+    ):
+        assert named in fault(path, line + "\n")
     binary = tmp_path / "cameras.bin"
     good = struct.pack("<QIiQQ4d", 1, 1, 1, 9, 8, 5, 6, 4, 3)
     for content in (b"", good[:-1], good + b"x", struct.pack("<Q", 1 << 60), b"\xff" * 90):

@@ -1,5 +1,5 @@
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -182,7 +182,6 @@ def test_cameras_that_see_nothing_together_have_no_depth() -> None:
     assert row.horizontal_m < row.baseline_m
     assert row.stereo_overlap == 0.0
     assert math.isnan(row.depth_sigma_mm)
-    assert row.to_json()["depth_sigma_mm"] is None
 
 
 def test_a_designed_rig_gives_the_row_of_its_lens() -> None:
@@ -192,8 +191,9 @@ def test_a_designed_rig_gives_the_row_of_its_lens() -> None:
     rough = {"near_altitude_m", "far_altitude_m", "depth_of_field_m", "hyperfocal_air_m",
              "hyperfocal_altitude_m", "frame_near_altitude_m", "frame_far_altitude_m",
              "corner_blur_px"}  # fmt: skip
-    for key, value in wanted.to_json().items():
-        assert ours.to_json()[key] == pytest.approx(value, rel=0.03 if key in rough else 1e-9), key
+    for key, value in asdict(wanted).items():
+        rel = 0.03 if key in rough else 1e-9
+        assert getattr(ours, key) == pytest.approx(value, rel=rel, nan_ok=True), key
 
 
 def test_a_calibrated_rig_is_seen_with_its_distortion_and_tilt() -> None:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.base.artefacts import json_values
 from camera_calib.judge.fit_quality import (
     CORNERS,
     camera_residuals,
@@ -59,7 +60,7 @@ def test_a_profile_of_noise_is_flat_and_one_of_a_trend_is_not() -> None:
 def test_bins_with_few_points_say_nothing() -> None:
     few = profile(np.arange(5.0), np.ones((5, 2)), np.ones(5), np.ones(5), 12.0)
     assert np.isnan(few.rms_px).all()
-    assert few.to_json()["rms_px"] == [None] * 12
+    assert json_values(few)["rms_px"] == [None] * 12
 
 
 def test_residuals_of_a_sound_calibration_are_noise_everywhere() -> None:

@@ -13,7 +13,6 @@ from camera_calib.judge.judgement import anchors_cam
 from camera_calib.judge.uncertainty import (
     baseline_sigma_m,
     compensation,
-    frame_pixels,
     frame_points,
     length_sigmas_m,
     noise_sigmas_m,
@@ -63,7 +62,7 @@ def test_a_projection_errs_by_its_sigma(seed: int) -> None:
     errors = some_errors(found.rig, seed)
     rig, wrong = with_one_error(found.rig, errors), moved_rig(found.rig, errors)
     camera, anchors = rig.cameras["right"], anchors_cam(found, "right")[::7]
-    pixels = frame_pixels(camera, 5, 4)
+    pixels = camera.frame_grid(5, 4)
 
     sigma = projection_sigma(rig, "right", pixels, 1.5, compensation(rig, "right", anchors))
 
@@ -81,7 +80,7 @@ def test_a_turn_hidden_in_the_principal_point_is_compensated() -> None:
     """Far away, moving the centre of a narrow frame is a turn of the camera."""
     rig = with_one_error(DESIGN, {"left.cx_px": 1.0})
     camera = rig.cameras["left"]
-    pixels = frame_pixels(camera, 5, 5)
+    pixels = camera.frame_grid(5, 5)
     anchors = frame_points(camera, (5.0, 10.0))
 
     sigma = projection_sigma(rig, "left", pixels, 8.0, compensation(rig, "left", anchors))

@@ -17,7 +17,6 @@ from camera_calib.freedom import (
     value,
 )
 from camera_calib.judge.judgement import anchors_cam
-from camera_calib.judge.uncertainty import frame_pixels
 from camera_calib.judge.validation import (
     LengthErrors,
     farthest,
@@ -96,7 +95,7 @@ def test_halves_differ_as_their_covariances_promise() -> None:
         assert held.halves is not None
         for name, camera in found.rig.cameras.items():
             difference = halves_difference(
-                held.halves, name, frame_pixels(camera, 9, 7), 1.5, anchors_cam(found, name)
+                held.halves, name, camera.frame_grid(9, 7), 1.5, anchors_cam(found, name)
             )
             ratios.append(difference.rms_px / difference.expected_rms_px)
     assert 0.6 < np.sqrt(np.mean(np.square(ratios))) < 1.4
@@ -121,7 +120,7 @@ def test_an_error_of_the_prior_is_the_same_in_both_halves() -> None:
             for i in range(2)
         )
         for name, camera in found.rig.cameras.items():
-            pixels, anchors = frame_pixels(camera, 9, 7), anchors_cam(found, name)
+            pixels, anchors = camera.frame_grid(9, 7), anchors_cam(found, name)
             shared = halves_difference((first, second), name, pixels, 1.5, anchors, prior)
             apart = halves_difference((first, second), name, pixels, 1.5, anchors)
             ratios.append(shared.rms_px / shared.expected_rms_px)
@@ -140,7 +139,7 @@ def test_the_same_calibration_twice_does_not_differ() -> None:
             for name, camera in found.rig.cameras.items()
         },
     )
-    anchors, pixels = anchors_cam(found, "left"), frame_pixels(found.rig.cameras["left"], 5, 5)
+    anchors, pixels = anchors_cam(found, "left"), found.rig.cameras["left"].frame_grid(5, 5)
     same = halves_difference((found.rig, found.rig), "left", pixels, 2.0, anchors)
     moved = halves_difference((found.rig, turned), "left", pixels, 2.0, anchors)
     assert same.rms_px < 1e-6

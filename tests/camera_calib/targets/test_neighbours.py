@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from camera_calib.targets.neighbours import from_neighbours, through
+from camera_calib.targets.grow import from_neighbours, through
 
 GRID = np.stack(np.meshgrid(np.arange(8.0), np.arange(6.0)), axis=-1).reshape(-1, 2)
 VIEW = np.array([[40.0, 6, 100], [-5, 38, 80], [0.01, -0.012, 1]])

