@@ -20,7 +20,10 @@ from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
 from benchmarks.planner_areas import planned_area, shapes
 from benchmarks.planner_peers import MARGIN_M, PATTERN, PLANNERS, Measured, measured, own_plan
-from missions.lines.sweep import best_heading, full_cost_j
+from missions.lines.hops import comparable
+from missions.lines.lay import laid
+from missions.lines.rows import Site
+from missions.lines.sweep import best_heading
 from missions.route.ways import Ways
 from missions.values.costs import time_costs
 
@@ -191,7 +194,8 @@ def _angles(rows: int, sampled: int) -> list[Angle]:
             sweep = best_heading(area, PATTERN, ways, costs, home, **kinds)
             seconds = time.perf_counter() - began
         headings = np.arange(sampled) * math.pi / sampled
-        costs_j = [full_cost_j(area, h, PATTERN, ways, costs, home, **kinds) for h in headings]
+        site, bounded = Site.of(area), comparable(costs)
+        costs_j = [laid(site, h, PATTERN, ways, bounded, home, **kinds).energy_j for h in headings]
         edges = np.concatenate([np.diff(ring, axis=0) for ring in area.rings_ne])
         across = np.abs(
             edges[:, 1] * np.cos(headings)[:, None] - edges[:, 0] * np.sin(headings)[:, None]

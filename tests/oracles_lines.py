@@ -3,6 +3,7 @@
 import itertools
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import shapely
@@ -11,6 +12,10 @@ from hypothesis import strategies as st
 from shapely.geometry import LineString, MultiPolygon, Point, Polygon, box
 
 from alice_survey.base.frames import Array, Datum
+from missions.lines.hops import comparable
+from missions.lines.lay import laid
+from missions.lines.rows import Site
+from missions.route.ways import Ways
 from missions.values.area import Area, multipolygon
 from missions.values.costs import Costs, power_at
 from missions.values.line import Line
@@ -178,3 +183,13 @@ def flight_by_hand(
     for line in lines:
         total += line.length_m / costs.speed_mps * power_at(costs.line_w, line.heading_rad)
     return total
+
+
+def full_cost_j(
+    area: Area, heading_rad: float, pattern: Pattern, ways: Ways, costs: Costs,
+    home: tuple[float, float], **kinds: Any,
+) -> float:  # fmt: skip
+    """Energy of the flight through all lines of a heading, as the planner counts it."""
+    return laid(
+        Site.of(area), heading_rad, pattern, ways, comparable(costs), home, **kinds
+    ).energy_j

@@ -107,7 +107,9 @@ def route_cost_by_steps(route: Route, costs: Costs, step_m: float) -> tuple[floa
             seconds += abs(leg.turn_rad) / costs.turn_rate_rad_s + costs.settle_s
             continue
         if leg.side_rad:
-            joules += costs.sway_j(leg.length_m, leg.heading_rad)
+            moving_s = leg.length_m / costs.sway_mps
+            joules += moving_s * power_at(costs.sway_w, leg.heading_rad)
+            joules += costs.settle_s * costs.spot_w
             seconds += leg.length_m / costs.sway_mps + costs.settle_s
             continue
         power_w = costs.line_w if leg.line >= 0 else costs.way_w

@@ -5,8 +5,9 @@ that both are equally blurred; the blur circle there falls as 1 / N, and the Air
 """
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -15,14 +16,13 @@ from alice_survey.base.errors import PlanError
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.fov.focus import FocusedLens, apparent_depths, apparent_distance_m
 from camera_calib.water import WAVELENGTH_NM
-from missions.exposure.settings_table import Setting
-from missions.exposure.ways_out import Way, conflict
+from missions.exposure.settings_table import Setting, settings_of
+from missions.exposure.ways_out import HIGHEST_ALTITUDE_M, Way, conflict, least_that_fits
 
 _GREEN_M = float(WAVELENGTH_NM[1]) * 1e-9
 _AIRY = 2.44
 """Diameter of the first dark ring over wavelength and f-number (Born & Wolf, section 8.5.2)."""
 _PAPER_DEPTH_M = 2.0
-_HIGHEST_M = 10.0
 _SOURCE = "thin lens behind the port: camera_calib.fov.focus (Coddington; Born & Wolf 4.6)"
 _DIFFRACTION = "Airy disc: Born & Wolf, section 8.5.2, at 530 nm"
 
@@ -65,10 +65,7 @@ def plan_focus(camera: FlatPortCamera, limits: CameraConfig, plan: PlanConfig) -
         PlanError: no f-number keeps the relief within `sharp_px`.
     """
     focal_m, pixel_m = limits.focal_mm * 1e-3, limits.pixel_um * 1e-6
-    top, bottom = (
-        apparent_distance_m(camera, plan.altitude_m + sign * plan.relief_m) for sign in (-1, 1)
-    )
-    focus_m = 2.0 / (1.0 / top + 1.0 / bottom)
+    top, focus_m = _top_and_focus_m(camera, plan)
     mean_m = apparent_distance_m(camera, plan.altitude_m)
     if focus_m <= focal_m:
         raise PlanError(
@@ -88,7 +85,7 @@ def plan_focus(camera: FlatPortCamera, limits: CameraConfig, plan: PlanConfig) -
     near, far = depths.sharp_altitudes_m(lens, plan.sharp_px)
     return Focus(
         focus_air_m=focus_m,
-        focus_altitude_m=_altitude_of(camera, focus_m),
+        focus_altitude_m=altitude_of_apparent_m(camera, focus_m),
         focus_mean_air_m=mean_m,
         near_altitude_m=near,
         far_altitude_m=far,
@@ -96,7 +93,9 @@ def plan_focus(camera: FlatPortCamera, limits: CameraConfig, plan: PlanConfig) -
         f_number_needed=needed,
         f_number_diffraction=largest,
         airy_px=airy_px,
-        papers_depth_px=_coc_for_depth_px(camera, limits, mean_m, _PAPER_DEPTH_M),
+        papers_depth_px=_coc_for_depth_px(
+            replace(lens, focus_m=mean_m), _PAPER_DEPTH_M / camera.n_water
+        ),
     )
 
 
@@ -116,10 +115,7 @@ def needed_f_number(camera: FlatPortCamera, limits: CameraConfig, plan: PlanConf
 
     The relief must lie below the glass.
     """
-    top, bottom = (
-        apparent_distance_m(camera, plan.altitude_m + sign * plan.relief_m) for sign in (-1, 1)
-    )
-    focus_m, focal_m = 2.0 / (1.0 / top + 1.0 / bottom), limits.focal_mm * 1e-3
+    (top, focus_m), focal_m = _top_and_focus_m(camera, plan), limits.focal_mm * 1e-3
     if focus_m <= focal_m:
         return math.inf
     lens = FocusedLens(
@@ -133,27 +129,27 @@ def largest_f_number(limits: CameraConfig, sharp_px: float) -> float:
     return sharp_px * limits.pixel_um * 1e-6 / (_AIRY * _GREEN_M)
 
 
-def _altitude_of(camera: FlatPortCamera, apparent_m: float) -> float:
+def _top_and_focus_m(camera: FlatPortCamera, plan: PlanConfig) -> tuple[float, float]:
+    """Apparent distance of the relief's top, and the dioptric middle of top and bottom."""
+    top, bottom = (
+        apparent_distance_m(camera, plan.altitude_m + sign * plan.relief_m) for sign in (-1, 1)
+    )
+    return top, 2.0 / (1.0 / top + 1.0 / bottom)
+
+
+def altitude_of_apparent_m(camera: FlatPortCamera, apparent_m: float) -> float:
+    """Altitude of ground at an apparent distance: the inverse of `apparent_distance_m`."""
     air_m = camera.port_distance_m + camera.glass_thickness_m / camera.n_glass
     return (apparent_m - air_m) * camera.n_water
 
 
-def _coc_for_depth_px(
-    camera: FlatPortCamera, limits: CameraConfig, focus_m: float, depth_m: float
-) -> float:
-    """Circle of confusion for which a depth of metres of water is sharp, focused at focus_m.
+def _coc_for_depth_px(lens: FocusedLens, span_m: float) -> float:
+    """Circle of confusion for which apparent distances that differ by a span are sharp.
 
-    Apparent distances 1 / (1/s -+ k) differ by depth / n: 2 k = (1/s^2 - k^2) depth / n, of which
-    the positive root in k counts.
+    Apparent distances 1 / (1/s -+ k) differ by 2 k / (1/s^2 - k^2), of which the positive root in k
+    counts.
     """
-    lens = FocusedLens(
-        focal_m=limits.focal_mm * 1e-3,
-        f_number=limits.f_number,
-        pixel_m=limits.pixel_um * 1e-6,
-        focus_m=focus_m,
-    )
-    span, middle = depth_m / camera.n_water, 1.0 / focus_m
-    return lens.defocus_px * (math.sqrt(1.0 + (span * middle) ** 2) - 1.0) / span
+    return lens.defocus_px * (math.sqrt(1.0 + (span_m / lens.focus_m) ** 2) - 1.0) / span_m
 
 
 def _up(f_number: float) -> float:
@@ -165,62 +161,51 @@ def _cannot_focus(
 ) -> PlanError:
     """The depth of field cannot hold the relief at any aperture."""
 
-    def fits(change: dict[str, float]) -> bool:
-        changed = plan.model_copy(update=change)
+    def fits(setting: str, value: float) -> bool:
+        changed = plan.model_copy(update={setting: value})
         best = largest_f_number(limits, changed.sharp_px)
         return needed_f_number(camera, limits, changed) <= 0.99 * best
 
-    ways = []
-    altitude_m = _least(lambda value: fits({"altitude_m": value}), plan.altitude_m, _HIGHEST_M)
-    if altitude_m is not None:
-        shown = math.ceil(100 * altitude_m) / 100
-        ways.append(
-            Way(
+    def ways() -> Iterator[Way]:
+        altitude_m = least_that_fits(
+            partial(fits, "altitude_m"), plan.altitude_m, HIGHEST_ALTITUDE_M
+        )
+        if altitude_m is not None:
+            shown = math.ceil(100 * altitude_m) / 100
+            yield Way(
                 change=f"altitude_m {shown:g} instead of {plan.altitude_m:g}",
                 price=f"a pixel grows {shown / plan.altitude_m:.2f} times",
                 cost=shown / plan.altitude_m - 1.0,
             )
-        )
-    sharp_px = _least(lambda value: fits({"sharp_px": value}), plan.sharp_px, 20.0)
-    if sharp_px is not None:
-        shown = math.ceil(10 * sharp_px) / 10
-        changed = plan.model_copy(update={"sharp_px": shown})
-        f_number = _up(needed_f_number(camera, limits, changed))
-        ways.append(
-            Way(
+        sharp_px = least_that_fits(partial(fits, "sharp_px"), plan.sharp_px, 20.0)
+        if sharp_px is not None:
+            shown = math.ceil(10 * sharp_px) / 10
+            changed = plan.model_copy(update={"sharp_px": shown})
+            f_number = _up(needed_f_number(camera, limits, changed))
+            yield Way(
                 change=f"sharp_px {shown:g} instead of {plan.sharp_px:g}, with f_number "
                 f"{f_number:g}",
                 price=f"detail under {shown:g} px is lost at the top and bottom of the relief",
                 cost=shown / plan.sharp_px - 1.0,
             )
+        lower_m = least_that_fits(
+            lambda lower_m: fits("relief_m", plan.relief_m - lower_m), 0.0, plan.relief_m
         )
-    relief_m = _least(lambda value: fits({"relief_m": plan.relief_m - value}), 0.0, plan.relief_m)
-    if relief_m is not None:
-        shown = math.floor(100 * (plan.relief_m - relief_m)) / 100
-        ways.append(
-            Way(
+        if lower_m is not None:
+            shown = math.floor(100 * (plan.relief_m - lower_m)) / 100
+            yield Way(
                 change=f"relief_m {shown:g} instead of {plan.relief_m:g}",
                 price="ground that is higher or lower is not sharp",
                 cost=1.0 - shown / plan.relief_m,
             )
-        )
+
     return conflict(
         f"the lens of {limits.focal_mm:g} mm cannot keep relief of +-{plan.relief_m:g} m at "
         f"{plan.altitude_m:g} m sharp to {plan.sharp_px:g} px: that needs F/{needed:.3g}, and "
         f"diffraction allows F/{largest:.3g}",
         ("relief_m (depth of field)", "sharp_px (diffraction)"),
-        ways,
+        ways(),
     )
-
-
-def _least(fits: Callable[[float], bool], low: float, high: float) -> float | None:
-    """Least value that fits, where all above it do; None where the highest does not."""
-    if not fits(high):
-        return None
-    while high - low > 1e-3:
-        middle = (low + high) / 2
-        low, high = (low, middle) if fits(middle) else (middle, high)
-    return high
 
 
 def focus_rows(
@@ -229,63 +214,26 @@ def focus_rows(
     """Focus, depth of field, aperture and diffraction."""
     n = camera.n_water
     enough = focus.f_number_needed <= limits.f_number
-    return [
-        Setting(
-            group="focus and aperture",
-            name="focus, set in air",
-            value=focus.focus_air_m,
-            unit="m",
-            equation="2 / (1/D_top + 1/D_bottom)",
-            source=_SOURCE,
-            bound_by="relief_m",
-            note=f"equal blur at the top and the bottom of the relief; sharpest "
-            f"{focus.focus_altitude_m:.2f} m below the glass. For the mean altitude alone it is "
-            f"{focus.focus_mean_air_m:.2f} m from the pupil (the paper: {plan.altitude_m:g} m / "
-            f"{n:.3g} = {plan.altitude_m / n:.2f} m; it sets 1.5 m for 2 m)",
-        ),
-        Setting(
-            group="focus and aperture",
-            name="sharp from, to",
-            value=(focus.near_altitude_m, focus.far_altitude_m),
-            unit="m",
-            equation="1 / (1/s +- c N / (f f'))",
-            source=_SOURCE,
-            bound_by="sharp_px",
-            note=f"altitudes in focus to {plan.sharp_px:g} px at F/{limits.f_number:g}, "
-            f"{focus.far_altitude_m - focus.near_altitude_m:.2f} m deep; the relief takes "
-            f"{plan.altitude_m - plan.relief_m:.3g} to {plan.altitude_m + plan.relief_m:.3g} m. "
-            f"The paper's depth of field of 2 m at F/{limits.f_number:g} takes a circle of "
-            f"{focus.papers_depth_px:.1f} px",
-        ),
-        Setting(
-            group="focus and aperture",
-            name="blur at relief's ends",
-            value=focus.blur_px,
-            unit="px",
-            equation="f f' / (N p) |1/D - 1/s|",
-            source=_SOURCE,
-            bound_by="sharp_px" if not enough else "f_number",
-        ),
-        Setting(
-            group="focus and aperture",
-            name="f-number needed",
-            value=focus.f_number_needed,
-            unit="",
-            equation="N blur / sharp_px",
-            source=_SOURCE,
-            bound_by="relief_m",
-            note=f"F/{limits.f_number:g} is set"
-            + (": deeper than the relief needs" if enough else ", which is too open"),
-        ),
-        Setting(
-            group="focus and aperture",
-            name="diffraction",
-            value=focus.airy_px,
-            unit="px",
-            equation="2.44 lambda N (f'/f) / p",
-            source=_DIFFRACTION,
-            bound_by="f_number",
-            note=f"closing the aperture is not free: beyond F/{focus.f_number_diffraction:.3g} the "
-            f"Airy disc alone exceeds {plan.sharp_px:g} px",
-        ),
-    ]
+    return settings_of("focus and aperture", [
+        ("focus, set in air", focus.focus_air_m, "m", "2 / (1/D_top + 1/D_bottom)", _SOURCE,
+         "relief_m",
+         f"equal blur at the top and the bottom of the relief; sharpest "
+         f"{focus.focus_altitude_m:.2f} m below the glass. For the mean altitude alone it is "
+         f"{focus.focus_mean_air_m:.2f} m from the pupil (the paper: {plan.altitude_m:g} m / "
+         f"{n:.3g} = {plan.altitude_m / n:.2f} m; it sets 1.5 m for 2 m)"),
+        ("sharp from, to", (focus.near_altitude_m, focus.far_altitude_m), "m",
+         "1 / (1/s +- c N / (f f'))", _SOURCE, "sharp_px",
+         f"altitudes in focus to {plan.sharp_px:g} px at F/{limits.f_number:g}, "
+         f"{focus.far_altitude_m - focus.near_altitude_m:.2f} m deep; the relief takes "
+         f"{plan.altitude_m - plan.relief_m:.3g} to {plan.altitude_m + plan.relief_m:.3g} m. "
+         f"The paper's depth of field of 2 m at F/{limits.f_number:g} takes a circle of "
+         f"{focus.papers_depth_px:.1f} px"),
+        ("blur at relief's ends", focus.blur_px, "px", "f f' / (N p) |1/D - 1/s|", _SOURCE,
+         "sharp_px" if not enough else "f_number", ""),
+        ("f-number needed", focus.f_number_needed, "", "N blur / sharp_px", _SOURCE, "relief_m",
+         f"F/{limits.f_number:g} is set"
+         + (": deeper than the relief needs" if enough else ", which is too open")),
+        ("diffraction", focus.airy_px, "px", "2.44 lambda N (f'/f) / p", _DIFFRACTION, "f_number",
+         f"closing the aperture is not free: beyond F/{focus.f_number_diffraction:.3g} the "
+         f"Airy disc alone exceeds {plan.sharp_px:g} px"),
+    ])  # fmt: skip

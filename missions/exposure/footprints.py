@@ -14,8 +14,9 @@ from alice_survey.base.config import PlanConfig
 from camera_calib.flat_port import FlatPortCamera
 from camera_calib.fov.focus import apparent_distance_m
 from camera_calib.rig import Rig
-from missions.exposure.settings_table import Setting
-from missions.exposure.ways_out import Way, conflict
+from missions.exposure.focus import altitude_of_apparent_m
+from missions.exposure.settings_table import Setting, settings_of
+from missions.exposure.ways_out import LEAST_ALTITUDE_M, Way, conflict
 from missions.values.footprint import (
     camera_swath,
     common_swath,
@@ -30,8 +31,6 @@ _PORT = (
     "exact flat port: Snell's law at both faces of the glass (camera_calib.flat_port); paraxial "
     "pixel: D = d + g/n_glass + a/n_water"
 )
-LEAST_ALTITUDE_M = 0.3
-"""Least altitude of the glass over any ground; `plan.altitude_m` allows no less either."""
 _GEOMETRY = "geometry of level footprints"
 
 
@@ -110,8 +109,7 @@ def pixel_on_floor_m(camera: FlatPortCamera, altitude_m: float) -> float:
 
 def altitude_for_pixel_m(camera: FlatPortCamera, pixel_m: float) -> float:
     """The inverse of `pixel_on_floor_m`; negative where even the glass is too far."""
-    air_m = camera.port_distance_m + camera.glass_thickness_m / camera.n_glass
-    return (pixel_m * camera.fx_px - air_m) * camera.n_water
+    return altitude_of_apparent_m(camera, pixel_m * camera.fx_px)
 
 
 def top_altitude_m(plan: PlanConfig) -> float:
@@ -299,31 +297,16 @@ def footprint_rows(prints: FootprintRange) -> list[Setting]:
     over = (prints.top, prints.mean, prints.bottom)
     top, mean, bottom = over
     where = f"from {top.altitude_m:.3g} / {mean.altitude_m:.3g} / {bottom.altitude_m:.3g} m"
-    ideal = f"{where} altitude: top, mean and bottom of the relief"
-    rows = [
-        ("footprint across", [p.across_m for p in over], "m", "middle row, traced", ideal),
-        ("footprint along", [p.along_m for p in over], "m", "middle column, traced", ""),
-        ("pixel on the floor", [p.pixel_m * 1e3 for p in over], "mm", "D / f", ""),
-    ]
-    result = [
-        Setting(
-            group="footprint and lines", name=name, value=tuple(values), unit=unit,
-            equation=equation, source=_PORT, bound_by="altitude_m", note=note,
-        )
-        for name, values, unit, equation, note in rows
-    ]  # fmt: skip
-    result.append(
-        Setting(
-            group="footprint and lines",
-            name="stereo swath",
-            value=tuple(p.stereo_across_m for p in over),
-            unit="m",
-            equation="seen by every camera",
-            source=_PORT,
-            bound_by="baseline_m",
-        )
-    )
-    return result
+    return settings_of("footprint and lines", [
+        ("footprint across", tuple(p.across_m for p in over), "m", "middle row, traced", _PORT,
+         "altitude_m", f"{where} altitude: top, mean and bottom of the relief"),
+        ("footprint along", tuple(p.along_m for p in over), "m", "middle column, traced", _PORT,
+         "altitude_m", ""),
+        ("pixel on the floor", tuple(p.pixel_m * 1e3 for p in over), "mm", "D / f", _PORT,
+         "altitude_m", ""),
+        ("stereo swath", tuple(p.stereo_across_m for p in over), "m", "seen by every camera", _PORT,
+         "baseline_m", ""),
+    ])  # fmt: skip
 
 
 def spacing_rows(spacing: Spacing, plan: PlanConfig, prints: FootprintRange) -> list[Setting]:
@@ -336,41 +319,19 @@ def spacing_rows(spacing: Spacing, plan: PlanConfig, prints: FootprintRange) -> 
         note = f"{plan.side_overlap:.0%}, as requested, needs {wanted:.3f} m"
     elif given and math.isclose(spacing.spacing_m, 1.0) and math.isclose(plan.altitude_m, 2.0):
         note = "the paper flew 1 m lines at 2 m and states 45 %: " + _papers_overlap(across_m)
-    return [
-        Setting(
-            group="footprint and lines",
-            name="line spacing",
-            value=spacing.spacing_m,
-            unit="m",
-            equation="as set" if given else "W (1 - O) - 2 e",
-            source=_GEOMETRY,
-            bound_by=spacing.bound_by,
-            note=note,
-        ),
-        Setting(
-            group="footprint and lines",
-            name="side overlap",
-            value=(spacing.mean_overlap, spacing.top_overlap, spacing.off_track_overlap),
-            unit="%",
-            equation="1 - (s + 2 e) / W",
-            source=_GEOMETRY,
-            bound_by="line spacing",
-            note=f"at the mean / over the top of the relief / there with lines each "
-            f"{plan.track_error_m:g} m off (track_error_m). All on the middle row; footprints "
-            f"bulge through a port: by area whole pictures share {spacing.area_overlap:.1%}, "
-            f"and the swaths that lines surely see {spacing.swath_overlap:.1%}, at the mean",
-        ),
-        Setting(
-            group="footprint and lines",
-            name="stereo side overlap",
-            value=spacing.stereo_overlap,
-            unit="%",
-            equation="(2 half swath - s) / swath",
-            source=_GEOMETRY,
-            bound_by="line spacing",
-            note="least of neighbouring stereo swaths; headings alternate, so that like sides meet",
-        ),
-    ]
+    return settings_of("footprint and lines", [
+        ("line spacing", spacing.spacing_m, "m", "as set" if given else "W (1 - O) - 2 e",
+         _GEOMETRY, spacing.bound_by, note),
+        ("side overlap", (spacing.mean_overlap, spacing.top_overlap, spacing.off_track_overlap),
+         "%", "1 - (s + 2 e) / W", _GEOMETRY, "line spacing",
+         f"at the mean / over the top of the relief / there with lines each "
+         f"{plan.track_error_m:g} m off (track_error_m). All on the middle row; footprints "
+         f"bulge through a port: by area whole pictures share {spacing.area_overlap:.1%}, "
+         f"and the swaths that lines surely see {spacing.swath_overlap:.1%}, at the mean"),
+        ("stereo side overlap", spacing.stereo_overlap, "%", "(2 half swath - s) / swath",
+         _GEOMETRY, "line spacing",
+         "least of neighbouring stereo swaths; headings alternate, so that like sides meet"),
+    ])  # fmt: skip
 
 
 def _papers_overlap(across_m: float) -> str:

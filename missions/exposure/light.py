@@ -1,5 +1,7 @@
 """Light budget: from the strobes' lumens to electrons in a pixel, channel by channel.
 
+And of two strobes next to a camera: light that the water throws back, and the shadows they cast.
+
 Each strobe sends `I(angle) = I_0 cos(angle)` within its cone, `I_0 = P / (pi sin^2(half cone))`.
 A level floor of reflectance rho (Lambert) at the distances d from a strobe and s along the pixel's
 ray gets `E = sum I cos(in) / d^2 exp(-c d)` and sends back `L = rho E / pi exp(-c s)`. On the way
@@ -21,8 +23,8 @@ import numpy as np
 from alice_survey.base.config import CameraConfig, ImagingConfig
 from alice_survey.base.frames import Array
 from camera_calib.rig import Rig
-from camera_calib.water import WAVELENGTH_NM, WaterOptics
-from missions.exposure.settings_table import Setting
+from camera_calib.water import WAVELENGTH_NM, WaterOptics, phase_per_sr
+from missions.exposure.settings_table import Setting, settings_of
 from missions.values.footprint import glass_point_cam
 
 FLOOR_REFLECTANCE = np.array([0.40, 0.345, 0.255])
@@ -46,10 +48,13 @@ _LUMENS_PER_WATT = 683.0
 _BANDS_NM = ((600.0, 700.0), (500.0, 600.0), (400.0, 500.0))
 """Bands of red, green and blue."""
 _GRID = (13, 11)
+_STEPS = 400
+"""Pieces of a ray of which scattered light is summed."""
 _SOURCE = (
     "missions.exposure.light; water: Jerlov 1976 and Kirk 1984 (camera_calib.water); LEDs as a "
     f"Planck radiator of {STROBE_KELVIN:g} K; sand; lens transmission 0.9 (inferred)"
 )
+_SCATTER_SOURCE = "missions.exposure.light: single scattering, Henyey-Greenstein 0.924 (Petzold)"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,13 +140,11 @@ def floor_radiance(
     outer, directions = camera.unproject(pixels)
     path = (floor_z - outer[..., 2]) / directions[..., 2]
     spots = outer + path[..., None] * directions
-    cam_from_body = rig.body_from_cam(rig.reference).inv()
-    strobes = cam_from_body.apply(np.asarray(imaging.strobes_body_m, dtype=np.float64))
-    down = cam_from_body.rotation.apply([0.0, 0.0, 1.0])
+    down = rig.body_from_cam(rig.reference).inv().rotation.apply([0.0, 0.0, 1.0])
     power = imaging.strobe_lumens * watts_per_lumen(spectrum)
     half_beam = math.radians(imaging.strobe_beam_deg) / 2
     irradiance = np.zeros((*path.shape, 3))
-    for strobe in strobes:
+    for strobe in _strobes_cam(rig, imaging):
         away = spots - strobe
         distance = np.linalg.norm(away, axis=-1)
         cos_beam = away @ down / distance
@@ -178,7 +181,6 @@ def light_budget(
     water: WaterOptics,
     altitude_m: float,
     exposure_s: float,
-    spectrum: Spectrum = "planck",
 ) -> LightBudget:
     """Electrons, noise, and the gain, aperture and exposure that follow.
 
@@ -189,14 +191,13 @@ def light_budget(
         water: of the three channels.
         altitude_m: of the outer glass.
         exposure_s: in which the strobes shine.
-        spectrum: of the strobes.
     """
     camera = rig.cameras[rig.reference]
     w, h = float(camera.width_px), float(camera.height_px)
     columns, rows = np.linspace(0, w, _GRID[0]), np.linspace(0, h, _GRID[1])
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
     gather = electrons_per_radiance(limits, camera.n_water, exposure_s)
-    radiance = floor_radiance(rig, imaging, water, altitude_m, pixels, spectrum)
+    radiance = floor_radiance(rig, imaging, water, altitude_m, pixels)
     electrons = radiance * lens_falloff(rig, pixels)[..., None] * gather
     corners = electrons[[0, 0, -1, -1], [0, -1, 0, -1]]
     corner = corners[np.argmin(corners.mean(axis=1))]
@@ -251,60 +252,178 @@ def light_rows(
     """Electrons, signal to noise, gain, and the aperture or exposure that would fill the well."""
     strobes = len(imaging.strobes_body_m)
     dark = budget.gain_db > 0
-    return [
-        Setting(
-            group="light",
-            name="electrons, centre",
-            value=budget.centre_e,
-            unit="e",
-            equation="pi L T / (4 N^2 n^2) p^2 t QE / (h nu)",
-            source=_SOURCE,
-            bound_by="exposure",
-            note=f"red / green / blue of a pixel over sand in Jerlov {jerlov} water, {strobes} "
-            f"strobes of {imaging.strobe_lumens:g} lm, F/{limits.f_number:g}; the brightest pixel "
-            f"fills {budget.full_share:.1%} of the well of {limits.full_well_e:g} e",
+    return settings_of("light", [
+        ("electrons, centre", budget.centre_e, "e", "pi L T / (4 N^2 n^2) p^2 t QE / (h nu)",
+         _SOURCE, "exposure",
+         f"red / green / blue of a pixel over sand in Jerlov {jerlov} water, {strobes} "
+         f"strobes of {imaging.strobe_lumens:g} lm, F/{limits.f_number:g}; the brightest pixel "
+         f"fills {budget.full_share:.1%} of the well of {limits.full_well_e:g} e"),
+        ("electrons, corner", budget.corner_e, "e", "the same, with cos^4", _SOURCE, "lens, beam",
+         ""),
+        ("signal to noise", budget.snr_centre, "", "S / sqrt(S + read^2)",
+         "Poisson shot noise and read noise", "electrons",
+         f"at the centre; of the median pixel {budget.snr_median:.1f}, in the corner "
+         + " / ".join(f"{value:.1f}" for value in budget.snr_corner)),
+        ("gain", budget.gain_db, "dB", "20 log10(grey x well / median)", _SOURCE,
+         "light" if dark else "full well",
+         f"brings the median to {MIDDLE_GREY:.0%} of full scale (linear); 0 dB puts the "
+         "full well at full scale. Check it in the water: alice-survey plan gain PICTURES"),
+        ("f-number for half well", budget.half_full_f_number, "", "N sqrt(S / half well)", _SOURCE,
+         "depth of field",
+         f"for the brightest pixel in {exposure_s * 1e3:.3g} ms; or "
+         f"{budget.half_full_exposure_s * 1e3:.3g} ms at F/{limits.f_number:g}"
+         + ("; no common lens opens so far" if budget.half_full_f_number < 1.2 else "")),
+    ])  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scatter:
+    """What the water between strobes, camera and floor does to a picture's middle."""
+
+    veil_share: tuple[float, float, float]
+    """Light scattered once over all light, at the middle of the frame; red, green, blue."""
+    lit_from_m: float
+    """Distance below the glass from which any strobe lights the axis of the camera."""
+    seen_lit_from_m: float
+    """Distance below the glass from which any strobe lights any of the field of view."""
+    lit_share: float
+    """Share of the water column on the axis, from glass to floor, that a strobe lights."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shadows:
+    """What the strobes' places do to an object on the floor below the camera."""
+
+    length_m: tuple[float, ...]
+    """Length of the shadow that each strobe casts of an object."""
+    height_m: float
+    """Height of that object."""
+    between_deg: float
+    """Angle at the floor between the two strobes' light (the largest of any two); 0 of one."""
+    opposite: bool
+    """Whether two strobes stand on opposite sides, so that each lights the other's shadow."""
+
+
+def scatter(rig: Rig, imaging: ImagingConfig, water: WaterOptics, altitude_m: float) -> Scatter:
+    """Backscatter on the axis of the reference camera, single scattering.
+
+    Every piece of the ray sends `E(s) b p(angle) exp(-c s) ds` (as `seafloor.light`, summed here by
+    the trapezium rule on a finer grid near the glass).
+
+    Args:
+        rig: with its place on the vehicle.
+        imaging: the strobes; they point straight down.
+        water: of the three channels.
+        altitude_m: of the outer glass.
+    """
+    camera = rig.cameras[rig.reference]
+    strobes = _strobes_cam(rig, imaging)
+    half_beam = math.radians(imaging.strobe_beam_deg) / 2
+    glass_z = float(glass_point_cam(camera)[2])
+    path = altitude_m * (np.arange(_STEPS + 1) / _STEPS) ** 2
+    points = np.stack([0 * path, 0 * path, glass_z + path], axis=1)
+    power = imaging.strobe_lumens * watts_per_lumen("planck")
+    sent = np.zeros((len(path), 3))
+    lit = np.zeros(len(path), dtype=bool)
+    for strobe in strobes:
+        away = points - strobe
+        distance = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
+        cos_beam = away[:, 2] / distance
+        strength = cone_intensity(cos_beam, half_beam) / distance**2
+        lit |= strength > 0
+        turned = strength * phase_per_sr(-cos_beam)
+        loss = np.exp(-(distance + path)[:, None] * water.attenuation_per_m)
+        sent += turned[:, None] * power * water.scattering_per_m * loss
+    veil = np.trapezoid(sent, path, axis=0)
+    centre = np.array([camera.cx_px, camera.cy_px])
+    signal = floor_radiance(rig, imaging, water, altitude_m, centre)
+    share = veil / (veil + signal)
+    return Scatter(
+        veil_share=(float(share[0]), float(share[1]), float(share[2])),
+        lit_from_m=min(
+            max(0.0, _reach(strobe) / math.tan(half_beam) + strobe[2] - glass_z)
+            for strobe in strobes
         ),
-        Setting(
-            group="light",
-            name="electrons, corner",
-            value=budget.corner_e,
-            unit="e",
-            equation="the same, with cos^4",
-            source=_SOURCE,
-            bound_by="lens, beam",
-        ),
-        Setting(
-            group="light",
-            name="signal to noise",
-            value=budget.snr_centre,
-            unit="",
-            equation="S / sqrt(S + read^2)",
-            source="Poisson shot noise and read noise",
-            bound_by="electrons",
-            note=f"at the centre; of the median pixel {budget.snr_median:.1f}, in the corner "
-            + " / ".join(f"{value:.1f}" for value in budget.snr_corner),
-        ),
-        Setting(
-            group="light",
-            name="gain",
-            value=budget.gain_db,
-            unit="dB",
-            equation="20 log10(grey x well / median)",
-            source=_SOURCE,
-            bound_by="light" if dark else "full well",
-            note=f"brings the median to {MIDDLE_GREY:.0%} of full scale (linear); 0 dB puts the "
-            "full well at full scale. Check it in the water: alice-survey plan gain PICTURES",
-        ),
-        Setting(
-            group="light",
-            name="f-number for half well",
-            value=budget.half_full_f_number,
-            unit="",
-            equation="N sqrt(S / half well)",
-            source=_SOURCE,
-            bound_by="depth of field",
-            note=f"for the brightest pixel in {exposure_s * 1e3:.3g} ms; or "
-            f"{budget.half_full_exposure_s * 1e3:.3g} ms at F/{limits.f_number:g}"
-            + ("; no common lens opens so far" if budget.half_full_f_number < 1.2 else ""),
-        ),
+        seen_lit_from_m=_field_lit_from_m(rig, strobes, half_beam, altitude_m),
+        lit_share=float(np.sum(np.diff(path) * (lit[1:] & lit[:-1])) / altitude_m),
+    )
+
+
+def _field_lit_from_m(rig: Rig, strobes: Array, half_beam: float, altitude_m: float) -> float:
+    """First distance below the glass at which a cone of light meets the field of view."""
+    camera = rig.cameras[rig.reference]
+    outer, directions = camera.unproject(camera.border(16))
+    glass_z = float(glass_point_cam(camera)[2])
+    for below_m in np.linspace(0.0, altitude_m, 801):
+        z = glass_z + below_m
+        spots = outer + ((z - outer[:, 2]) / directions[:, 2])[:, None] * directions
+        for strobe in strobes:
+            radius = (z - strobe[2]) * math.tan(half_beam)
+            nearest = _nearest_in_frame(spots[:, :2], strobe[:2])
+            if radius > 0 and nearest <= radius:
+                return float(below_m)
+    return float(altitude_m)
+
+
+def _nearest_in_frame(border: Array, place: Array) -> float:
+    """Distance from a place to a frame that is given by points of its border; 0 inside."""
+    low, high = border.min(axis=0), border.max(axis=0)
+    outside = np.maximum(np.maximum(low - place, place - high), 0.0)
+    return float(np.hypot(*outside))
+
+
+def shadows(rig: Rig, imaging: ImagingConfig, altitude_m: float, height_m: float) -> Shadows:
+    """Shadows of an object on a level floor below the camera.
+
+    Args:
+        rig: with its place on the vehicle.
+        imaging: the strobes.
+        altitude_m: of the outer glass.
+        height_m: of the object.
+    """
+    camera = rig.cameras[rig.reference]
+    floor_z = float(glass_point_cam(camera)[2]) + altitude_m
+    strobes = _strobes_cam(rig, imaging)
+    lengths = [
+        height_m * _reach(s) / (floor_z - s[2] - height_m)
+        if floor_z - s[2] > height_m
+        else math.inf
+        for s in strobes
     ]
+    sideways = strobes[:, :2] @ strobes[:, :2].T
+    to_strobes = strobes - np.array([0.0, 0.0, floor_z])
+    unit = to_strobes / np.linalg.norm(to_strobes, axis=1)[:, None]
+    cosines = np.clip(unit @ unit.T, -1.0, 1.0)
+    return Shadows(
+        length_m=tuple(lengths),
+        height_m=height_m,
+        between_deg=float(np.degrees(np.arccos(cosines.min()))),
+        opposite=bool(sideways.min() < 0),
+    )
+
+
+def _strobes_cam(rig: Rig, imaging: ImagingConfig) -> Array:
+    """Strobes in the reference camera's frame, (S, 3)."""
+    places = np.asarray(imaging.strobes_body_m, dtype=np.float64)
+    return np.asarray(rig.body_from_cam(rig.reference).inv().apply(places), dtype=np.float64)
+
+
+def _reach(strobe: Array) -> float:
+    """Distance of a strobe from the camera's axis."""
+    return float(np.hypot(strobe[0], strobe[1]))
+
+
+def scatter_rows(water: Scatter, shade: Shadows) -> list[Setting]:
+    """Veiling light and shadows."""
+    return settings_of("light", [
+        ("veil, centre", water.veil_share, "%", "B / (B + L)", _SCATTER_SOURCE, "strobe places",
+         "share of the light that the water throws back before it reached the floor, red / "
+         f"green / blue. Strobes light the axis from {water.lit_from_m:.2f} m below the glass "
+         f"on, the field of view from {water.seen_lit_from_m:.2f} m; {water.lit_share:.0%} of "
+         "the water on the axis is lit"),
+        ("shadows", shade.length_m, "m", "h r / (H - h)", "geometry of the strobes' places",
+         "strobe places",
+         f"of a thing {shade.height_m:g} m high below the camera, by each strobe; their "
+         f"light meets there at {shade.between_deg:.0f} deg"
+         + (" from both sides: each lights the other's shadow" if shade.opposite else "")),
+    ])  # fmt: skip

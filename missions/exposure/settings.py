@@ -3,7 +3,6 @@
 Every number stands as a row (`Setting`) with its equation, its source and the limit that bound it.
 """
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Self
 
@@ -17,13 +16,6 @@ from alice_survey.base.config import (
 from alice_survey.base.errors import PlanError, warn
 from camera_calib.rig import Rig, design_rig
 from camera_calib.water import water_optics
-from missions.exposure.exposure import (
-    EXPOSURE_STEP_S,
-    BlurRates,
-    blur_rates,
-    exposure_for_rate,
-    exposure_rows,
-)
 from missions.exposure.focus import Focus, focus_rows, plan_focus, too_open
 from missions.exposure.footprints import (
     FootprintRange,
@@ -39,14 +31,21 @@ from missions.exposure.light import (
     light_budget,
     light_for_snr_e,
     light_rows,
+    scatter,
+    scatter_rows,
+    shadows,
     too_dark,
 )
-from missions.exposure.scatter import scatter, scatter_rows, shadows
-from missions.exposure.settings_table import Setting, settings_table
+from missions.exposure.settings_table import Setting
 from missions.exposure.storage import Storage, storage_load, storage_rows
 from missions.exposure.strobe import StrobeLoad, strobe_load, strobe_rows
 from missions.exposure.trigger import (
+    EXPOSURE_STEP_S,
+    BlurRates,
     PaperRule,
+    blur_rates,
+    exposure_for_rate,
+    exposure_rows,
     interval_for_overlap_s,
     paper_rule,
     too_fast,
@@ -124,10 +123,6 @@ class ImagingSettings:
     def line_spacing_m(self) -> float:
         """How far apart lines lie."""
         return self.spacing.spacing_m
-
-    def table_text(self, more: Sequence[Setting] = ()) -> str:
-        """The table of all settings, and of more rows, in 100 columns."""
-        return settings_table([*self.rows, *more])
 
     def to_json(self) -> dict[str, Any]:
         """All fields as JSON values."""
@@ -212,9 +207,7 @@ def imaging_settings(rig: Rig, setup: ImagingSetup, *, quiet: bool = False) -> I
         strobe_duty=load.duty,
         imaging_w=load.mean_w,
         frame_j=load.frame_j,
-        paper_rule=paper_rule(
-            plan.speed_mps, altitude_m, plan.forward_overlap, footprint_along_m=along_m
-        ),
+        paper_rule=paper_rule(plan, along_m),
         spacing=spacing,
         blur=rates,
         focus=focus,

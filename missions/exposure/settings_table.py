@@ -11,7 +11,11 @@ _COLUMNS = (23, 24, 31, 16)
 _GAP = "  "
 
 
-@dataclass(frozen=True, kw_only=True)
+Row = tuple[str, float | tuple[float, ...], str, str, str, str, str]
+"""Fields of a `Setting` from its name on, in order."""
+
+
+@dataclass(frozen=True)
 class Setting:
     """A number of the plan, where it comes from, and what kept it from being better."""
 
@@ -42,6 +46,11 @@ class Setting:
         if self.unit == "%":
             return " / ".join(_number(100.0 * v) for v in values) + " %"
         return f"{' / '.join(_number(v) for v in values)} {self.unit}".rstrip()
+
+
+def settings_of(group: str, rows: Sequence[Row]) -> list[Setting]:
+    """The settings of one group."""
+    return [Setting(group, *row) for row in rows]
 
 
 def setting_from_json(row: dict[str, Any]) -> Setting:

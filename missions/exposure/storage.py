@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from alice_survey.base.config import CameraConfig
 from camera_calib.flat_port import FlatPortCamera
-from missions.exposure.settings_table import Setting
+from missions.exposure.settings_table import Setting, settings_of
 
 LINK_BYTES_PER_S = 124e6
 """Capacity of one Gigabit Ethernet cable: the cameras' `StreamBytesPerSecond` at full bandwidth
@@ -31,10 +31,6 @@ class Storage:
     disk_hz: float
     """Most triggers a second that the disk takes."""
 
-    def mission_bytes(self, stations: int) -> int:
-        """Bytes of a whole survey."""
-        return self.station_bytes * stations
-
 
 def raw_bytes(camera: FlatPortCamera, cameras: int, stations: int) -> int:
     """Size of all pictures as the sensor gives them, one byte a pixel."""
@@ -60,10 +56,8 @@ def storage_load(camera: FlatPortCamera, cameras: int, interval_s: float) -> Sto
     )
 
 
-def storage_rows(
-    storage: Storage, limits: CameraConfig, interval_s: float, stations: int | None = None
-) -> list[Setting]:
-    """Picture, flow, limits and, where the stations are known, the whole survey."""
+def storage_rows(storage: Storage, limits: CameraConfig, interval_s: float) -> list[Setting]:
+    """Picture, flow and limits."""
     rate_hz = 1.0 / interval_s
     ceilings = {
         "camera.shortest_interval_s": 1.0 / limits.shortest_interval_s,
@@ -72,39 +66,11 @@ def storage_rows(
     }
     tightest = min(ceilings, key=lambda name: ceilings[name])
     shared = "" if rate_hz <= storage.shared_link_hz else "; ONE CABLE FOR ALL IS TOO SLOW HERE"
-    rows = [
-        Setting(
-            group="data",
-            name="one trigger",
-            value=storage.station_bytes / 1e6,
-            unit="MB",
-            equation="width x height x cameras",
-            source="raw, one byte a pixel",
-            bound_by="sensor",
-        ),
-        Setting(
-            group="data",
-            name="write rate on a line",
-            value=storage.bytes_per_s / 1e6,
-            unit="MB/s",
-            equation="bytes / interval",
-            source=_SOURCE,
-            bound_by="interval",
-            note=f"{rate_hz:.3g} triggers a second of at most {ceilings[tightest]:.3g} ({tightest})"
-            f"; all cameras on one cable take {storage.shared_link_hz:.3g}{shared}",
-        ),
-    ]
-    if stations is not None:
-        rows.append(
-            Setting(
-                group="data",
-                name="whole survey",
-                value=storage.mission_bytes(stations) / 1e9,
-                unit="GB",
-                equation="bytes x triggers",
-                source="raw, one byte a pixel",
-                bound_by="area",
-                note=f"{stations} triggers",
-            )
-        )
-    return rows
+    return settings_of("data", [
+        ("one trigger", storage.station_bytes / 1e6, "MB", "width x height x cameras",
+         "raw, one byte a pixel", "sensor", ""),
+        ("write rate on a line", storage.bytes_per_s / 1e6, "MB/s", "bytes / interval", _SOURCE,
+         "interval",
+         f"{rate_hz:.3g} triggers a second of at most {ceilings[tightest]:.3g} ({tightest})"
+         f"; all cameras on one cable take {storage.shared_link_hz:.3g}{shared}"),
+    ])  # fmt: skip

@@ -7,12 +7,13 @@ budgetlightforum.com, 2024; that ALICE's give the same is inferred), junction to
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from alice_survey.base.config import ImagingConfig, PlanConfig
 from alice_survey.base.errors import PlanError
-from missions.exposure.settings_table import Setting
-from missions.exposure.ways_out import Way, conflict
+from missions.exposure.settings_table import Setting, settings_of
+from missions.exposure.ways_out import Way, conflict, less_overlap
 
 LEDS = 20
 EFFICACY_LM_W = 1354.0 / 13.01
@@ -107,110 +108,56 @@ def _too_long(
 ) -> PlanError:
     """The pulse is too long for the interval."""
     pulse_s, longest_s = exposure_s + 2 * plan.strobe_lead_s, limit * interval_s
-    ways = []
-    if longest_s > exposure_s:
-        lead_s = math.floor((longest_s - exposure_s) / 2 * 1e5) / 1e5
-        ways.append(
-            Way(
+    slower = pulse_s / longest_s
+
+    def ways() -> Iterator[Way]:
+        if longest_s > exposure_s:
+            lead_s = math.floor((longest_s - exposure_s) / 2 * 1e5) / 1e5
+            yield Way(
                 change=f"strobe_lead_s {lead_s:g} instead of {plan.strobe_lead_s:g}",
                 price="the strobe has less time to reach its brightness",
                 cost=1.0 - lead_s / plan.strobe_lead_s,
             )
-        )
-    if longest_s > 2 * plan.strobe_lead_s:
-        share = (longest_s - 2 * plan.strobe_lead_s) / exposure_s
-        blur_px = math.floor(100 * plan.allowed_blur_px * share) / 100
-        ways.append(
-            Way(
+        if longest_s > 2 * plan.strobe_lead_s:
+            share = (longest_s - 2 * plan.strobe_lead_s) / exposure_s
+            blur_px = math.floor(100 * plan.allowed_blur_px * share) / 100
+            yield Way(
                 change=f"allowed_blur_px {blur_px:g} instead of {plan.allowed_blur_px:g}",
                 price=f"{share:.2f} of the light: {-20 * math.log10(share):.1f} dB more gain",
                 cost=1.0 - share,
             )
-        )
-    slower = pulse_s / longest_s
-    reached = 1.0 - (1.0 - plan.forward_overlap) * slower
-    if reached > 0:
-        shown = math.floor(1000 * reached) / 1000
-        ways.append(
-            Way(
-                change=f"forward_overlap {shown:g} instead of {plan.forward_overlap:g}",
-                price=f"a point is seen {1 / (1 - shown):.1f} instead of "
-                f"{1 / (1 - plan.forward_overlap):.1f} times on a line",
-                cost=1.0 - 1.0 / slower,
-            )
-        )
-    lumens = math.floor(imaging.strobe_lumens / slower / 100) * 100
-    ways.append(
-        Way(
+        yield from less_overlap(plan, 1.0 - (1.0 - plan.forward_overlap) * slower)
+        lumens = math.floor(imaging.strobe_lumens / slower / 100) * 100
+        yield Way(
             change=f"strobe_lumens {lumens:g} instead of {imaging.strobe_lumens:g}",
             price=f"{20 * math.log10(slower):.1f} dB more gain",
             cost=1.0 - 1.0 / slower,
         )
-    )
+
     return conflict(
         f"a strobe pulse of {pulse_s:.4f} s (exposure {exposure_s:.4f} s, lead "
         f"{plan.strobe_lead_s:g} s) every {interval_s:.3f} s lights {pulse_s / interval_s:.0%} of "
         f"the time; its LEDs bear {limit:.0%} in water of {WARM_SEA_C:g} C",
         ("strobe pulse", "heat of the strobe"),
-        ways,
+        ways(),
     )
 
 
 def strobe_rows(load: StrobeLoad) -> list[Setting]:
     """Pulse, duty cycle, energy, capacitor, heat."""
-    return [
-        Setting(
-            group="strobes",
-            name="pulse",
-            value=load.pulse_s * 1e3,
-            unit="ms",
-            equation="t + 2 lead",
-            source="strobe covers the exposure",
-            bound_by="exposure",
-            note=f"lit {load.lead_s * 1e3:g} ms before the exposure, out as long after it "
-            "(strobe_lead_s)",
-        ),
-        Setting(
-            group="strobes",
-            name="duty cycle",
-            value=load.duty,
-            unit="%",
-            equation="pulse / interval",
-            source=_SOURCE,
-            bound_by="interval",
-            note=f"LEDs bear {load.duty_limit:.0%} in water of {WARM_SEA_C:g} C",
-        ),
-        Setting(
-            group="strobes",
-            name="energy a trigger",
-            value=load.frame_j,
-            unit="J",
-            equation="lm / (lm/W) x pulse / driver",
-            source=_SOURCE,
-            bound_by="pulse",
-            note=f"{load.count} strobes of {load.lit_w:.0f} W while lit, {load.peak_a:.1f} A from "
-            f"{BUS_V:g} V",
-        ),
-        Setting(
-            group="strobes",
-            name="capacitor, each",
-            value=load.capacitor_f * 1e3,
-            unit="mF",
-            equation="2 E / (V^2 - V_low^2)",
-            source=_SOURCE,
-            bound_by="pulse",
-            note=f"feeds a pulse while its {BUS_V:g} V sag by {BUS_SAG:.0%}; "
-            "continuous drive needs none",
-        ),
-        Setting(
-            group="strobes",
-            name="mean power",
-            value=load.mean_w,
-            unit="W",
-            equation="energy / interval",
-            source=_SOURCE,
-            bound_by="duty cycle",
-            note=f"from the battery, on lines; solder point {load.solder_c:.0f} C, junction "
-            f"{load.junction_c:.0f} C at most. Cameras and recorder are in vehicle.hotel_w",
-        ),
-    ]
+    return settings_of("strobes", [
+        ("pulse", load.pulse_s * 1e3, "ms", "t + 2 lead", "strobe covers the exposure", "exposure",
+         f"lit {load.lead_s * 1e3:g} ms before the exposure, out as long after it "
+         "(strobe_lead_s)"),
+        ("duty cycle", load.duty, "%", "pulse / interval", _SOURCE, "interval",
+         f"LEDs bear {load.duty_limit:.0%} in water of {WARM_SEA_C:g} C"),
+        ("energy a trigger", load.frame_j, "J", "lm / (lm/W) x pulse / driver", _SOURCE, "pulse",
+         f"{load.count} strobes of {load.lit_w:.0f} W while lit, {load.peak_a:.1f} A from "
+         f"{BUS_V:g} V"),
+        ("capacitor, each", load.capacitor_f * 1e3, "mF", "2 E / (V^2 - V_low^2)", _SOURCE, "pulse",
+         f"feeds a pulse while its {BUS_V:g} V sag by {BUS_SAG:.0%}; "
+         "continuous drive needs none"),
+        ("mean power", load.mean_w, "W", "energy / interval", _SOURCE, "duty cycle",
+         f"from the battery, on lines; solder point {load.solder_c:.0f} C, junction "
+         f"{load.junction_c:.0f} C at most. Cameras and recorder are in vehicle.hotel_w"),
+    ])  # fmt: skip

@@ -6,9 +6,10 @@ the cameras open and goes out after they close, by its lead.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from alice_survey.base.artefacts import write_csv
 from alice_survey.base.errors import PlanError
@@ -21,78 +22,29 @@ HEADER = (
 """Columns of the time table: times since the start, then the same relative to the trigger."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Edges:
-    """Edges relative to a trigger, us."""
+def trigger_edges(exposure_s: float, lead_s: float) -> NDArray[np.int64]:
+    """Edges of one trigger: strobe on, camera open, camera close, strobe off; us from its time.
 
-    strobe_on_us: int
-    camera_open_us: int
-    camera_close_us: int
-    strobe_off_us: int
-
-    def __post_init__(self) -> None:
-        order = (
-            self.strobe_on_us, self.camera_open_us, self.camera_close_us, self.strobe_off_us
-        )  # fmt: skip
-        if list(order) != sorted(order) or self.camera_open_us == self.camera_close_us:
-            raise PlanError(
-                f"edges {order} us: the strobe must be lit before the camera opens and after it "
-                "closes; raise the exposure above 1 us and strobe_lead_s to 0 or more"
-            )
-
-
-@dataclass(frozen=True, kw_only=True)
-class TriggerRow:
-    """Edges of one trigger, us since the start."""
-
-    trigger: int
-    """Number of the trigger, from 0."""
-    trigger_us: int
-    """The middle of the exposure."""
-    edges: Edges
-
-    @property
-    def strobe_on_us(self) -> int:
-        """Rising edge of the strobes."""
-        return self.trigger_us + self.edges.strobe_on_us
-
-    @property
-    def camera_open_us(self) -> int:
-        """Rising edge of the cameras."""
-        return self.trigger_us + self.edges.camera_open_us
-
-    @property
-    def camera_close_us(self) -> int:
-        """Falling edge of the cameras."""
-        return self.trigger_us + self.edges.camera_close_us
-
-    @property
-    def strobe_off_us(self) -> int:
-        """Falling edge of the strobes."""
-        return self.trigger_us + self.edges.strobe_off_us
-
-
-def trigger_edges(exposure_s: float, lead_s: float) -> Edges:
-    """Edges of one trigger; the exposure is a whole number of us, the lead rounded up to one.
+    The exposure is a whole number of microseconds, the lead rounded up to one.
 
     Raises:
         PlanError: the exposure is shorter than 1 us or the lead negative.
     """
     exposure_us, lead_us = round(exposure_s * _US), math.ceil(lead_s * _US - 1e-6)
+    if exposure_us < 1 or lead_us < 0:
+        raise PlanError(
+            f"an exposure of {exposure_s:g} s with the strobe lit {lead_s:g} s before it: raise "
+            "the exposure above 1 us and strobe_lead_s to 0 or more"
+        )
     before = exposure_us // 2
     after = exposure_us - before
-    return Edges(
-        strobe_on_us=-before - lead_us,
-        camera_open_us=-before,
-        camera_close_us=after,
-        strobe_off_us=after + lead_us,
-    )
+    return np.array([-before - lead_us, -before, after, after + lead_us])
 
 
 def trigger_table(
     times_s: Sequence[float], exposure_s: float, lead_s: float, shortest_interval_s: float
-) -> list[TriggerRow]:
-    """The time table of some triggers.
+) -> NDArray[np.int64]:
+    """The time table of some triggers, (T, 10) with the columns `HEADER`.
 
     Args:
         times_s: middles of the exposures since the start, rising.
@@ -104,44 +56,34 @@ def trigger_table(
         PlanError: a trigger follows another too soon, overlaps it, or its strobe would have to be
             lit before the start; the message names it.
     """
-    edges = trigger_edges(exposure_s, lead_s)
-    rows = [
-        TriggerRow(trigger=i, trigger_us=round(t * _US), edges=edges) for i, t in enumerate(times_s)
-    ]
+    relative = trigger_edges(exposure_s, lead_s)
+    trigger_us = np.round(np.asarray(times_s, dtype=np.float64) * _US).astype(np.int64)
+    edges = trigger_us[:, None] + relative
     # Rounding moves each trigger by half a microsecond at most.
-    least_us = round(shortest_interval_s * _US) - 1
-    for before, row in pairwise(rows):
-        apart_us = row.trigger_us - before.trigger_us
-        if apart_us < least_us:
-            raise PlanError(
-                f"trigger {row.trigger} at {row.trigger_us / _US:.6f} s follows the one before by "
-                f"{apart_us / _US:.6f} s; the shortest interval is {shortest_interval_s:g} s: "
-                "lower speed_mps or forward_overlap"
-            )
-        if row.strobe_on_us <= before.strobe_off_us:
-            raise PlanError(
-                f"trigger {row.trigger}: its strobe would be lit at {row.strobe_on_us} us, before "
-                f"it goes out at {before.strobe_off_us} us: lower strobe_lead_s or allowed_blur_px"
-            )
-    if rows and rows[0].strobe_on_us < 0:
+    soon = np.flatnonzero(np.diff(trigger_us) < round(shortest_interval_s * _US) - 1)
+    if len(soon):
+        i = int(soon[0]) + 1
         raise PlanError(
-            f"the first trigger, at {times_s[0]:.6f} s, needs its strobe "
-            f"{-rows[0].strobe_on_us} us before the start: begin later"
+            f"trigger {i} at {trigger_us[i] / _US:.6f} s follows the one before by "
+            f"{(trigger_us[i] - trigger_us[i - 1]) / _US:.6f} s; the shortest interval is "
+            f"{shortest_interval_s:g} s: lower speed_mps or forward_overlap"
         )
-    return rows
+    lit = np.flatnonzero(edges[1:, 0] <= edges[:-1, 3])
+    if len(lit):
+        i = int(lit[0]) + 1
+        raise PlanError(
+            f"trigger {i}: its strobe would be lit at {edges[i, 0]} us, before it goes out at "
+            f"{edges[i - 1, 3]} us: lower strobe_lead_s or allowed_blur_px"
+        )
+    if len(edges) and edges[0, 0] < 0:
+        raise PlanError(
+            f"the first trigger, at {times_s[0]:.6f} s, needs its strobe {-edges[0, 0]} us before "
+            "the start: begin later"
+        )
+    count = len(edges)
+    return np.column_stack([np.arange(count), trigger_us, edges, np.tile(relative, (count, 1))])
 
 
-def write_timetable(path: Path, rows: Sequence[TriggerRow]) -> None:
+def write_timetable(path: Path, table: NDArray[np.int64]) -> None:
     """Write a time table as CSV with the columns `HEADER`."""
-    write_csv(
-        path,
-        HEADER,
-        [
-            [
-                row.trigger, row.trigger_us, row.strobe_on_us, row.camera_open_us,
-                row.camera_close_us, row.strobe_off_us, row.edges.strobe_on_us,
-                row.edges.camera_open_us, row.edges.camera_close_us, row.edges.strobe_off_us,
-            ]
-            for row in rows
-        ],
-    )  # fmt: skip
+    write_csv(path, HEADER, table.tolist())

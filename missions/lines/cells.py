@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
 from missions.lines.hops import hop_j, line_j
-from missions.values.costs import Prices
+from missions.values.costs import Costs
 
 CORNERS = 4
 """Where a cell is entered: 0 at the beginning of its first line, 1 at its end, 2 and 3 the same of
@@ -128,7 +128,7 @@ def cell_corners(
 
 @compiled
 def cell_costs(
-    prices: Prices,
+    costs: Costs,
     begins: NDArray[np.int64],
     listed: NDArray[np.int64],
     ends: Array,
@@ -138,7 +138,7 @@ def cell_costs(
     """Energy of flying each cell, from each corner.
 
     Args:
-        prices: of the vehicle.
+        costs: of the vehicle.
         begins: from `chains`.
         listed: from `chains`.
         ends: (P, 4) north and east of begin and end of every piece.
@@ -149,13 +149,14 @@ def cell_costs(
         (C, 4) joules by the corner of entry; inf at corners 2 and 3 of a cell of one line.
     """
     count = begins.size - 1
-    costs = np.zeros((count, CORNERS))
+    energies = np.zeros((count, CORNERS))
+    leave, enter = np.empty(3), np.empty(3)
     for c in range(count):
         size = begins[c + 1] - begins[c]
         for k in range(CORNERS):
             at_end = k % 2
             if size == 1 and k >= 2:
-                costs[c, k] = np.inf
+                energies[c, k] = np.inf
                 continue
             for i in range(size):
                 place = begins[c] + (i if k < 2 else size - 1 - i)
@@ -164,22 +165,17 @@ def cell_costs(
                     ends[piece, 2] - ends[piece, 0], ends[piece, 3] - ends[piece, 1]
                 )
                 here = course + math.pi * at_end
-                costs[c, k] += line_j(prices, length, here)
+                energies[c, k] += line_j(costs, length, here)
                 at_end = 1 - at_end
                 if i == size - 1:
                     continue
                 following = listed[place + 1] if k < 2 else listed[place - 1]
-                costs[c, k] += hop_j(
-                    prices,
-                    ends[piece, 2 * at_end],
-                    ends[piece, 2 * at_end + 1],
-                    here,
-                    ends[following, 2 * at_end],
-                    ends[following, 2 * at_end + 1],
-                    here + math.pi,
-                    links_m[piece if k < 2 else following, at_end],
-                )
-    return costs
+                side = slice(2 * at_end, 2 * at_end + 2)
+                leave[:2], leave[2] = ends[piece, side], here
+                enter[:2], enter[2] = ends[following, side], here + math.pi
+                way_m = links_m[piece if k < 2 else following, at_end]
+                energies[c, k] += hop_j(costs, leave, enter, way_m)
+    return energies
 
 
 @compiled

@@ -16,8 +16,7 @@ from shapely.geometry import MultiPolygon
 
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
-from missions.lines.rows import rooms, to_uv
-from missions.lines.site import Site, edges_of
+from missions.lines.rows import Site, rooms, to_uv
 from missions.lines.unseen import (
     LENGTH,
     LINES,
@@ -29,6 +28,7 @@ from missions.lines.unseen import (
     pictures_of,
     unseen,
 )
+from missions.route.fence import edges_of
 from missions.values.area import Area
 from missions.values.line import Line
 from missions.values.pattern import Pattern
@@ -262,10 +262,10 @@ def _directions(patches: Array, allowed: Array, near_m: float) -> Array:
     if len(patches) > 1:
         spread = np.cov(patches[:, [U, V]].T, aweights=patches[:, LENGTH] * patches[:, WIDTH])
         directions.append(math.atan2(2 * spread[0, 1], spread[0, 0] - spread[1, 1]) / 2)
-    beside = (np.minimum(allowed[:, :2], allowed[:, 2:]) < high).all(axis=1)
-    beside &= (np.maximum(allowed[:, :2], allowed[:, 2:]) > low).all(axis=1)
-    spans = np.clip(allowed[beside, 2:], low, high) - np.clip(allowed[beside, :2], low, high)
-    along = np.arctan2(*(allowed[beside, 2:] - allowed[beside, :2]).T[::-1]) % math.pi
+    near = (np.minimum(allowed[:, :2], allowed[:, 2:]) < high).all(axis=1)
+    near &= (np.maximum(allowed[:, :2], allowed[:, 2:]) > low).all(axis=1)
+    spans = np.clip(allowed[near, 2:], low, high) - np.clip(allowed[near, :2], low, high)
+    along = np.arctan2(*(allowed[near, 2:] - allowed[near, :2]).T[::-1]) % math.pi
     longest = np.argsort(-np.hypot(*spans.T), kind="stable")[:_EDGES]
     return np.array(_different([*directions, *along[longest].tolist()]))
 

@@ -19,10 +19,10 @@ from alice_survey.base.frames import Array
 from alice_survey.base.run import progress
 from missions.lines import cells, cross, hops, rows, tour
 from missions.lines.fill import fill_table
-from missions.lines.site import Site
+from missions.lines.rows import Site
 from missions.route.ways import Ways
 from missions.values.area import Area
-from missions.values.costs import Costs, Prices
+from missions.values.costs import Costs
 from missions.values.line import Line, LineKind
 from missions.values.pattern import Pattern
 
@@ -42,14 +42,8 @@ class Laid:
     """(L,) number of steps from picture to picture."""
     kinds: NDArray[np.int64]
     """(L,) indices of `KINDS`."""
-    lines_j: float
-    hops_j: float
-    """Energy from home, between lines and home again."""
-
-    @property
-    def energy_j(self) -> float:
-        """Energy of the whole flight."""
-        return self.lines_j + self.hops_j
+    energy_j: float
+    """Energy of the whole flight, from home and home again."""
 
     def lines(self) -> list[Line]:
         """The lines as values."""
@@ -95,14 +89,14 @@ def lay_lines(
         PlanError: there are too many stations, no line can be flown, or there is no way inside the
             allowed area between two lines.
     """
-    tell_of_planner()
+    note_planner()
     check_size(area, pattern, most_stations)
     result = laid(
         Site.of(area),
         heading_rad,
         pattern,
         ways,
-        hops.comparable_prices(costs),
+        hops.comparable(costs),
         home_ne,
         cross_lines=cross_lines,
         closing_line=closing_line,
@@ -123,28 +117,23 @@ def ordered(
     """
     if not lines:
         return []
-    ends = np.array([(*line.start_ne_m, *line.end_ne_m) for line in lines])
-    prices, home = hops.comparable_prices(costs), np.array(home_ne, dtype=np.float64)
+    costs, home = hops.comparable(costs), np.array(home_ne, dtype=np.float64)
     corners, inner = np.zeros((len(lines), cells.CORNERS, 3)), np.full((len(lines), 4), np.inf)
     for i, line in enumerate(lines):
         corners[i] = [[*line.start_ne_m, line.heading_rad]] * cells.CORNERS
         corners[i, 1] = [*line.end_ne_m, line.heading_rad + math.pi]
-        inner[i, :2] = [hops.line_j(prices, line.length_m, x) for x in corners[i, :2, 2]]
+        inner[i, :2] = [hops.line_j(costs, line.length_m, x) for x in corners[i, :2, 2]]
     exits = np.tile([1, 0, 1, 0], (len(lines), 1))
-    order = _tour(corners, exits, inner, ways, prices, home, None, len(lines))
-    back = order % cells.CORNERS == 1
-    table = ends[order // cells.CORNERS]
-    table = np.where(back[:, None], table[:, [2, 3, 0, 1]], table)
-    ways_m = ways_between(table, home, ways)
-    if np.isinf(ways_m).any():
-        raise _not_connected(table, home, ways_m)
-    chosen = zip(order.tolist(), back.tolist(), strict=True)
-    return [lines[i // 4].reversed() if b else lines[i // 4] for i, b in chosen]
+    order = _tour(corners, exits, inner, ways, costs, home, None, len(lines))
+    flown = [lines[k // 4].reversed() if k % 4 == 1 else lines[k // 4] for k in order.tolist()]
+    table = np.array([(*x.start_ne_m, *x.end_ne_m, x.heading_rad) for x in flown])
+    _connected_m(*stops(table, home), ways)
+    return flown
 
 
-def tell_of_planner() -> None:
+def note_planner() -> None:
     """Report that the first plan after an installation waits until the planner is compiled."""
-    note_compiling(hops.flight_parts_j, "the planner, once: this takes 40 s to a minute")
+    note_compiling(hops.flight_j, "the planner, once: this takes 40 s to a minute")
 
 
 def check_size(area: Area, pattern: Pattern, most_stations: int = MOST_STATIONS) -> None:
@@ -163,7 +152,7 @@ def laid(
     heading_rad: float,
     pattern: Pattern,
     ways: Ways,
-    prices: Prices,
+    costs: Costs,
     home_ne: tuple[float, float],
     *,
     cross_lines: int,
@@ -185,46 +174,42 @@ def laid(
     follower, links_m = _linked(ends, follower, ways, pattern.spacing_m)
     begins, listed = cells.chains(follower)
     corners, exits = cells.cell_corners(begins, listed, ends, heading_rad)
-    inner = cells.cell_costs(prices, begins, listed, ends, heading_rad, links_m)
+    inner = cells.cell_costs(costs, begins, listed, ends, heading_rad, links_m)
     steps = pieces[:, 3].astype(np.int64)
     survey_count, survey_cells = len(pieces), len(inner)
     if cross_lines:
-        across = _cross(site, heading_rad, pattern, pieces, offsets, cross_lines)
-        alone = np.arange(len(across.steps) + 1)
+        across, cross_steps = _cross(site, heading_rad, pattern, pieces, offsets, cross_lines)
+        alone = np.arange(len(across) + 1)
         course = heading_rad + math.pi / 2
-        more, leaving = cells.cell_corners(alone, alone[:-1], across.ends, course)
-        unlinked = np.zeros((len(across.steps), 2))
-        costs = cells.cell_costs(prices, alone, alone[:-1], across.ends, course, unlinked)
+        more, leaving = cells.cell_corners(alone, alone[:-1], across, course)
+        unlinked = np.zeros((len(across), 2))
+        singly = cells.cell_costs(costs, alone, alone[:-1], across, course, unlinked)
         corners, exits = np.concatenate([corners, more]), np.concatenate([exits, leaving])
-        inner = np.concatenate([inner, costs])
+        inner = np.concatenate([inner, singly])
         begins = np.concatenate([begins, begins[-1] + alone[1:]])
         listed = np.concatenate([listed, survey_count + alone[:-1]])
-        ends, steps = np.concatenate([ends, across.ends]), np.concatenate([steps, across.steps])
+        ends, steps = np.concatenate([ends, across]), np.concatenate([steps, cross_steps])
     home = np.array(home_ne, dtype=np.float64)
-    first_steps = steps[_piece_at(begins, listed)].ravel()
-    closed = _closings(corners, first_steps, ends, _piece_at(begins, listed).ravel())
+    piece = _piece_at(begins, listed).ravel()
+    closing, closing_steps = _closings(corners, steps[piece], ends, piece)
     closes = closing_line and survey_count > 1
     order = _tour(
-        corners, exits, inner, ways, prices, home, closed if closes else None, survey_cells, quick
+        corners, exits, inner, ways, costs, home, closing if closes else None, survey_cells, quick
     )
     flown = cells.flown(order, begins, listed)
     table = _table(ends, flown, heading_rad, survey_count)
     steps = steps[flown[:, 0]]
     kinds = np.where(flown[:, 0] < survey_count, SURVEY, CROSS).astype(np.int64)
     if closes:
-        table = np.concatenate([table, closed.table[order[:1]]])
-        steps = np.concatenate([steps, closed.steps[order[:1]]])
+        table = np.concatenate([table, closing[order[:1]]])
+        steps = np.concatenate([steps, closing_steps[order[:1]]])
         kinds = np.append(kinds, CLOSING)
     fills = cuts[:0] if quick else fill_table(site, heading_rad, pattern, pieces, offsets, cuts)
     if len(fills):
-        table, steps, kinds = _inserted(fills, table, steps, kinds, home, ways, prices)
-    ways_m = ways_between(table, home, ways)
-    if np.isinf(ways_m).any():
-        raise _not_connected(table, home, ways_m)
-    parts = hops.flight_parts_j(prices, home, table, ways_m)
-    return Laid(
-        table=table, steps=steps, kinds=kinds, lines_j=float(parts[0]), hops_j=float(parts[1])
-    )
+        table, steps, kinds = _inserted(fills, table, steps, kinds, home, ways, costs)
+    leave, enter = stops(table, home)
+    energy_j = hops.flight_j(costs, leave, enter, _connected_m(leave, enter, ways))
+    return Laid(table=table, steps=steps, kinds=kinds, energy_j=energy_j)
 
 
 def survey_pieces(site: Site, heading_rad: float, pattern: Pattern) -> tuple[Array, Array, Array]:
@@ -246,16 +231,29 @@ def survey_pieces(site: Site, heading_rad: float, pattern: Pattern) -> tuple[Arr
     return pieces, offsets, cuts
 
 
-def ways_between(table: Array, home: Array, ways: Ways) -> Array:
-    """Lengths, (L + 1,), of the ways before, between and after lines; inf where there is none."""
-    starts = np.concatenate([home[None], table[:, 2:4]])
-    goals = np.concatenate([table[:, :2], home[None]])
-    return _way_lengths(starts, goals, ways)
+def stops(table: Array, home: Array) -> tuple[Array, Array]:
+    """Where hops begin and end, (L + 1, 3) each: home and lines' ends; lines' starts and home."""
+    at_home = np.array([[*home, np.nan]])
+    leave = np.concatenate([at_home, table[:, 2:5]])
+    return leave, np.concatenate([table[:, [0, 1, 4]], at_home])
 
 
-def _way_lengths(starts: Array, goals: Array, ways: Ways) -> Array:
-    """Lengths, (N,), of ways from (N, 2) to (N, 2)."""
-    return ways.lengths_m(starts, goals)
+def _connected_m(leave: Array, enter: Array, ways: Ways) -> Array:
+    """Lengths, (N,), of the ways of hops.
+
+    Raises:
+        PlanError: there is no way for one.
+    """
+    ways_m = ways.lengths_m(leave[:, :2], enter[:, :2])
+    lost = np.flatnonzero(np.isinf(ways_m))
+    if len(lost):
+        (north_0, east_0, _), (north_1, east_1, _) = leave[lost[0]], enter[lost[0]]
+        raise PlanError(
+            f"no way inside the allowed area from {north_0:.2f} m north, {east_0:.2f} m east to "
+            f"{north_1:.2f}, {east_1:.2f}: its parts are not connected; widen area.turn_margin_m "
+            "or survey the parts one by one"
+        )
+    return ways_m
 
 
 def _ends_ne(pieces: Array, offsets: Array, heading_rad: float) -> Array:
@@ -288,7 +286,7 @@ def _linked(
         return follower, links_m
     starts = ends[linked].reshape(-1, 2)
     goals = ends[follower[linked]].reshape(-1, 2)
-    links_m[linked] = _way_lengths(starts, goals, ways).reshape(-1, 2)
+    links_m[linked] = ways.lengths_m(starts, goals).reshape(-1, 2)
     straight = np.hypot(*(goals - starts).T).reshape(-1, 2)
     # Two spacings of detour are worth a choice of the tour.
     far = linked[(links_m[linked] > straight + 2 * spacing_m).any(axis=1)]
@@ -297,19 +295,14 @@ def _linked(
     return follower, links_m
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Single:
-    """Lines that are not part of the grid."""
-
-    ends: Array
-    """(N, 4) north and east of begin and end."""
-    steps: NDArray[np.int64]
-
-
 def _cross(
     site: Site, heading_rad: float, pattern: Pattern, pieces: Array, offsets: Array, count: int
-) -> _Single:
-    """Lines across the survey lines, so that each of these is crossed."""
+) -> tuple[Array, NDArray[np.int64]]:
+    """Lines across the survey lines, so that each of these is crossed.
+
+    Returns:
+        (N, 4) north and east of begin and end, (N,) steps.
+    """
     found = cross.cross_table(
         pieces,
         offsets,
@@ -326,7 +319,7 @@ def _cross(
         along * c - high * s,
         along * s + high * c,
     ]
-    return _Single(ends=np.stack(ends, axis=1), steps=found[:, 3].astype(np.int64))
+    return np.stack(ends, axis=1), found[:, 3].astype(np.int64)
 
 
 def _piece_at(begins: NDArray[np.int64], listed: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -335,19 +328,15 @@ def _piece_at(begins: NDArray[np.int64], listed: NDArray[np.int64]) -> NDArray[n
     return np.stack([first, first, last, last], axis=1)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Closings:
-    """The closing line of a flight that begins at a corner."""
-
-    table: Array
-    """(4C, 5) north and east of start and end, course."""
-    steps: NDArray[np.int64]
-
-
 def _closings(
     corners: Array, steps: NDArray[np.int64], ends: Array, piece: NDArray[np.int64]
-) -> _Closings:
-    """Lines from the middle of the line that is flown first back to its start."""
+) -> tuple[Array, NDArray[np.int64]]:
+    """Lines from the middle of the line that is flown first back to its start.
+
+    Returns:
+        For the flights that begin at each corner (4C, 5) north and east of start and end, course;
+        and (4C,) steps.
+    """
     flat = corners.reshape(-1, 3)
     half = (steps + 1) // 2
     length = np.hypot(ends[piece, 2] - ends[piece, 0], ends[piece, 3] - ends[piece, 1])
@@ -356,7 +345,7 @@ def _closings(
         [np.cos(flat[:, 2]), np.sin(flat[:, 2])], axis=1
     )
     back = flat[:, 2] + math.pi
-    return _Closings(table=np.concatenate([middle, flat[:, :2], back[:, None]], axis=1), steps=half)
+    return np.concatenate([middle, flat[:, :2], back[:, None]], axis=1), half
 
 
 def _tour(
@@ -364,18 +353,18 @@ def _tour(
     exits: NDArray[np.int64],
     inner: Array,
     ways: Ways,
-    prices: Prices,
+    costs: Costs,
     home: Array,
-    closed: _Closings | None,
+    closing: Array | None,
     survey_cells: int,
     quick: bool = False,
 ) -> NDArray[np.int64]:
     """The order of cells: corners of entry, counted through."""
 
-    def improved(first: NDArray[np.int64], finish: Array, fixed: int) -> NDArray[np.int64]:
-        if quick:
-            return tour.improved_tour(first, over, exits, inner, start, finish, fixed)
-        return tour.good_tour(over, exits, inner, start, finish, first, fixed)
+    def improved(first: NDArray[np.int64], problem: tour.Cells, fixed: int) -> NDArray[np.int64]:
+        better = tour.improved_tour if quick else tour.good_tour
+        order: NDArray[np.int64] = better(first, problem, fixed)
+        return order
 
     size = len(inner)
     enter = corners.reshape(-1, 3)
@@ -386,26 +375,24 @@ def _tour(
     places = enter[:, :2]
     home_m = ways.distances_m(home[None], places)
     between_m = ways.distances_m(places, places)
-    start = hops.hops_j(prices, at_home, enter, home_m)[0]
-    over = hops.hops_j(prices, leave, enter, between_m)
-    plain = np.ascontiguousarray(hops.hops_j(prices, leave, at_home, home_m.T)[:, 0])
-    if closed is None:
+    start = hops.hops_j(costs, at_home, enter, home_m)[0]
+    over = hops.hops_j(costs, leave, enter, between_m)
+    plain = np.ascontiguousarray(hops.hops_j(costs, leave, at_home, home_m.T)[:, 0])
+    problem = tour.Cells(hops=over, exits=exits, inner=inner, start=start, finish=plain)
+    if closing is None:
         if size <= tour.EXACT:
-            order = tour.exact_tour(over, exits, inner, start, plain[None], False)[1]
-        else:
-            order = tour.nearest_tour(over, exits, inner, start)
-            order = improved(order, plain, 0)
-        return np.asarray(order)
+            return np.asarray(tour.exact_tour(problem, plain[None], False)[1])
+        return improved(tour.nearest_tour(problem), problem, 0)
     start[cells.CORNERS * survey_cells :] = np.inf
 
     def finishes(first: NDArray[np.int64]) -> Array:
         """Cost after the last cell, (F, 4C), of flights that begin at corners (F,)."""
-        line = closed.table[first]
+        line = closing[first]
         to_m = ways.distances_m(places, line[:, :2])
-        to = hops.hops_j(prices, leave, line[:, [0, 1, 4]], to_m)
-        on = hops.hops_j(prices, line[:, 2:5], at_home, home_m[:, first].T)
+        to = hops.hops_j(costs, leave, line[:, [0, 1, 4]], to_m)
+        on = hops.hops_j(costs, line[:, 2:5], at_home, home_m[:, first].T)
         flown = np.array(
-            [hops.line_j(prices, math.dist(x[:2], x[2:4]), x[4]) for x in line.tolist()]
+            [hops.line_j(costs, math.dist(x[:2], x[2:4]), x[4]) for x in line.tolist()]
         )
         return np.ascontiguousarray(to.T + (flown[:, None] + on))
 
@@ -413,14 +400,10 @@ def _tour(
         finish = np.zeros((len(enter), len(enter)))
         able = np.flatnonzero(np.isfinite(start) & np.isfinite(inner))
         finish[able] = finishes(able)
-        order = tour.exact_tour(over, exits, inner, start, finish, True)[1]
-    else:
-        order = tour.nearest_tour(over, exits, inner, start)
-        order = improved(order, plain, 0)
-        # Now that it is known where the flight begins, so is where it ends.
-        finish_j = finishes(order[:1])[0]
-        order = improved(order, finish_j, 1)
-    return np.asarray(order)
+        return np.asarray(tour.exact_tour(problem, finish, True)[1])
+    order = improved(tour.nearest_tour(problem), problem, 0)
+    # Now that it is known where the flight begins, so is where it ends.
+    return improved(order, problem._replace(finish=finishes(order[:1])[0]), 1)
 
 
 def _table(ends: Array, flown: NDArray[np.int64], heading_rad: float, survey_count: int) -> Array:
@@ -439,20 +422,19 @@ def _inserted(
     kinds: NDArray[np.int64],
     home: Array,
     ways: Ways,
-    prices: Prices,
+    costs: Costs,
 ) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
     """Fly fill lines, (F, 6) a table and steps, each where its detour costs least."""
-    ways_m = ways_between(table, home, ways)
-    at_home = np.array([[*home, np.nan]])
+    leave, enter = stops(table, home)
+    ways_m = ways.lengths_m(leave[:, :2], enter[:, :2])
     for fill in fills:
-        leave = np.concatenate([at_home, table[:, 2:5]])
-        enter = np.concatenate([table[:, [0, 1, 4]], at_home])
-        over_j = hops.chain_j(prices, leave, enter, ways_m)
+        leave, enter = stops(table, home)
+        over_j = hops.chain_j(costs, leave, enter, ways_m)
         both = np.array([fill[:5], [*fill[2:4], *fill[:2], fill[4] + math.pi]])
         begins, ends = np.ascontiguousarray(both[:, [0, 1, 4]]), np.ascontiguousarray(both[:, 2:5])
         # No detour is less than one by straight ways, so the search ends early.
-        least_j = hops.hops_j(prices, leave, begins, _straights(leave, begins))
-        least_j = least_j + hops.hops_j(prices, ends, enter, _straights(ends, enter)).T
+        least_j = hops.hops_j(costs, leave, begins, _straights(leave, begins))
+        least_j = least_j + hops.hops_j(costs, ends, enter, _straights(ends, enter)).T
         least_j -= over_j[:, None]
         best_j, best, place, best_m = np.inf, both[0], 0, np.zeros(2)
         for index in np.argsort(least_j, axis=None, kind="stable").tolist():
@@ -460,8 +442,8 @@ def _inserted(
             if least_j[i, turned] >= best_j:
                 break
             there, then = np.stack([leave[i], ends[turned]]), np.stack([begins[turned], enter[i]])
-            detour_m = _way_lengths(there[:, :2], then[:, :2], ways)
-            detour_j = hops.chain_j(prices, there, then, detour_m).sum() - over_j[i]
+            detour_m = ways.lengths_m(there[:, :2], then[:, :2])
+            detour_j = hops.chain_j(costs, there, then, detour_m).sum() - over_j[i]
             if detour_j < best_j:
                 best_j, best, place, best_m = detour_j, both[turned], i, detour_m
         table = np.insert(table, place, best, axis=0)
@@ -475,17 +457,6 @@ def _straights(a: Array, b: Array) -> Array:
     """Distances, (N, M), between places."""
     distances: Array = np.hypot(a[:, None, 0] - b[:, 0], a[:, None, 1] - b[:, 1])
     return distances
-
-
-def _not_connected(table: Array, home: Array, ways_m: Array) -> PlanError:
-    i = int(np.flatnonzero(np.isinf(ways_m))[0])
-    north_0, east_0 = table[i - 1, 2:4] if i else home
-    north_1, east_1 = table[i, :2] if i < len(table) else home
-    return PlanError(
-        f"no way inside the allowed area from {north_0:.2f} m north, {east_0:.2f} m east to "
-        f"{north_1:.2f}, {east_1:.2f}: its parts are not connected; widen area.turn_margin_m or "
-        "survey the parts one by one"
-    )
 
 
 def _too_many(area: Area, pattern: Pattern, stations: float, most: int) -> PlanError:

@@ -11,12 +11,15 @@ its outline covers.
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.base.compiled import compiled
 from alice_survey.base.frames import Array
+from missions.route.fence import edges_of
+from missions.values.area import Area
 
 TOUCH_M = 1e-7
 """Strips are this much narrower at both sides, so that an area that only touches a strip does not
@@ -24,6 +27,25 @@ count; and a line may run this close outside of the allowed area, so that it may
 _SHORTEST_M = 1e-3
 """Shortest room along a line: where the vehicle has less, no line is flown."""
 _EVEN = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Site:
+    """An area as compiled code takes it."""
+
+    survey: Array
+    """(E, 4) north and east of both ends of every edge, metres."""
+    allowed: Array
+    area_m2: float
+
+    @classmethod
+    def of(cls, area: Area) -> "Site":
+        """The site of an area."""
+        return cls(
+            survey=edges_of(area.survey),
+            allowed=edges_of(area.allowed),
+            area_m2=float(area.survey.area),
+        )
 
 
 @compiled
@@ -46,6 +68,7 @@ def to_uv(edges_ne: Array, heading_rad: float) -> Array:
     return uv
 
 
+@compiled
 def row_offsets(low_m: float, high_m: float, spacing_m: float, edge_m: float, passes: int) -> Array:
     """Offsets of the rows: the fewest of constant spacing, centred, that reach over both sides.
 
@@ -56,10 +79,9 @@ def row_offsets(low_m: float, high_m: float, spacing_m: float, edge_m: float, pa
         edge_m: how far outside of the area the outermost lie at least; negative is inside.
         passes: least number of rows.
     """
-    steps = math.ceil((high_m - low_m + 2 * edge_m) / spacing_m - _EVEN)
-    steps = max(steps, passes - 1, 0)
-    places = np.arange(steps + 1, dtype=np.float64) - steps / 2
-    return (low_m + high_m) / 2 + spacing_m * places
+    steps = max(math.ceil((high_m - low_m + 2 * edge_m) / spacing_m - _EVEN), passes - 1, 0)
+    offsets: Array = (low_m + high_m) / 2 + spacing_m * (np.arange(steps + 1) - steps / 2)
+    return offsets
 
 
 @compiled

@@ -28,11 +28,11 @@ from alice_survey.base.executor import progress
 from alice_survey.base.frames import Array
 from alice_survey.base.run.progress import step
 from missions.lines import cells, hops, rows
-from missions.lines.lay import check_size, laid, tell_of_planner
-from missions.lines.site import Site
+from missions.lines.lay import check_size, laid, note_planner
+from missions.lines.rows import Site
 from missions.route.ways import Ways
 from missions.values.area import Area
-from missions.values.costs import Costs, Prices
+from missions.values.costs import Costs
 from missions.values.pattern import Pattern
 
 _ESTIMATES = 1800
@@ -45,16 +45,16 @@ _BEST = 24
 """Best estimates at which it is taken."""
 _REFINED = 4
 """Best close costs near which they are taken again."""
-_BESIDE = (-3.0, -2.0, -1.0, 1.0, 2.0, 3.0)
+_TENTHS = (-3.0, -2.0, -1.0, 1.0, 2.0, 3.0)
 """Tenths of a degree on either side at which they are."""
 _FULL = 16
 """Best close costs at which the full cost is taken."""
-_MOST = _SPREAD + 1 + _BEST + _REFINED * (_REFINED + len(_BESIDE)) + _FULL
+_MOST = _SPREAD + 1 + _BEST + _REFINED * (_REFINED + len(_TENTHS)) + _FULL
 _TIMED = 10
 """Costs after which is known how long all will take."""
 _WORTH_SHOWING_S = 2.0
 _NEAR_RAD = math.radians(2.0)
-_BESIDE_RAD = 1e-9
+_OFF_JUMP_RAD = 1e-9
 """A jump is left on the side of fewer lines by this."""
 
 
@@ -90,9 +90,9 @@ def best_heading(
     Raises:
         PlanError: the area is too large, or cannot be flown at any heading.
     """
-    tell_of_planner()
+    note_planner()
     check_size(area, pattern)
-    site, prices = Site.of(area), hops.comparable_prices(costs)
+    site, costs = Site.of(area), hops.comparable(costs)
     width_heading, width = least_width(site.survey)
     close: dict[float, float] = {}
     found: dict[float, float] = {}
@@ -108,7 +108,7 @@ def best_heading(
                     heading,
                     pattern,
                     ways,
-                    prices,
+                    costs,
                     home_ne,
                     cross_lines=cross_lines,
                     closing_line=closing_line,
@@ -120,7 +120,7 @@ def best_heading(
 
     def search() -> Iterator[float]:
         headings = _headings(area, site, pattern)
-        estimates = estimate_j(site, headings, pattern, prices, cross_lines)
+        estimates = estimate_j(site, headings, pattern, costs, cross_lines)
         yield from take(close, np.append(np.arange(_SPREAD) * math.pi / _SPREAD, width_heading))
         yield from take(close, _best(headings, estimates, _BEST, math.radians(0.3)))
         for heading in _least(close, _REFINED):
@@ -128,7 +128,7 @@ def best_heading(
             near = apart < _NEAR_RAD
             best = _best(headings[near], estimates[near], _REFINED, math.radians(0.05))
             yield from take(close, best)
-            yield from take(close, heading + math.radians(0.1) * np.array(_BESIDE))
+            yield from take(close, heading + math.radians(0.1) * np.array(_TENTHS))
         yield from take(found, np.array(_least(close, _FULL)))
 
     _run(search())
@@ -159,34 +159,6 @@ def _run(search: Iterator[float]) -> None:
         pass
 
 
-def full_cost_j(
-    area: Area,
-    heading_rad: float,
-    pattern: Pattern,
-    ways: Ways,
-    costs: Costs,
-    home_ne: tuple[float, float],
-    *,
-    cross_lines: int,
-    closing_line: bool,
-) -> float:
-    """Energy of the flight through all lines of a heading; arguments as of `lay.lay_lines`.
-
-    Raises:
-        PlanError: they cannot be flown.
-    """
-    return laid(
-        Site.of(area),
-        heading_rad,
-        pattern,
-        ways,
-        hops.comparable_prices(costs),
-        home_ne,
-        cross_lines=cross_lines,
-        closing_line=closing_line,
-    ).energy_j
-
-
 def least_width(edges: Array) -> tuple[float, float]:
     """The direction, in [0, pi), across which all cells together are narrowest, and that width.
 
@@ -212,10 +184,11 @@ def widths_m(edges: Array, headings: Array) -> Array:
 
 
 def estimate_j(
-    site: Site, headings: Array, pattern: Pattern, prices: Prices, cross_lines: int
+    site: Site, headings: Array, pattern: Pattern, costs: Costs, cross_lines: int
 ) -> Array:
     """Energy, (H,), of all pieces of lines and of a turn to each, at headings (H,)."""
-    turn_j = hops.hop_j(prices, 0.0, 0.0, 0.0, 0.0, pattern.spacing_m, math.pi, pattern.spacing_m)
+    start, goal = np.zeros(3), np.array([0.0, pattern.spacing_m, math.pi])
+    turn_j = hops.hop_j(costs, start, goal, pattern.spacing_m)
     estimates: Array = _estimates(
         site.survey,
         site.allowed,
@@ -226,7 +199,7 @@ def estimate_j(
         pattern.overhang_m,
         pattern.step_m,
         max(1, pattern.pictures - 1),
-        prices,
+        costs,
         turn_j,
         cross_lines,
     )
@@ -244,7 +217,7 @@ def _estimates(
     overhang: float,
     step: float,
     least_steps: int,
-    prices: Prices,
+    costs: Costs,
     turn_j: float,
     cross_lines: int,
 ) -> Array:
@@ -253,18 +226,17 @@ def _estimates(
         heading = headings[i]
         turned, room = rows.to_uv(survey, heading), rows.to_uv(allowed, heading)
         low, high = turned[:, 1].min(), turned[:, 1].max()
-        count = max(math.ceil((high - low + 2 * edge) / spacing - 1e-9), passes - 1, 0) + 1
-        offsets = (low + high) / 2 + spacing * (np.arange(count) - (count - 1) / 2)
+        offsets = rows.row_offsets(low, high, spacing, edge, passes)
         pieces, _ = rows.lay_rows(
             turned, room, offsets, passes * spacing / 2, overhang, step, least_steps
         )
-        ahead = hops.line_j(prices, 1.0, heading)
-        back = hops.line_j(prices, 1.0, heading + math.pi)
+        ahead = hops.line_j(costs, 1.0, heading)
+        back = hops.line_j(costs, 1.0, heading + math.pi)
         length = 0.0
         for p in range(pieces.shape[0]):
             length += pieces[p, 2] - pieces[p, 1]
         parts = cells.chains(cells.followers(pieces))[0].size - 1
-        across = hops.line_j(prices, (high - low) * cross_lines, heading + math.pi / 2)
+        across = hops.line_j(costs, (high - low) * cross_lines, heading + math.pi / 2)
         # From cell to cell the way is some turns long.
         turns = pieces.shape[0] + 2 * parts
         result[i] = length * (ahead + back) / 2 + across + turns * turn_j
@@ -309,7 +281,7 @@ def _jumps(hull: Array, pattern: Pattern) -> Array:
         sine = (least - 2 * pattern.edge_m) / max(distance, 1e-9)
         angle = np.arcsin(sine[(sine > 0) & (sine < 1)])
         # The width grows from 0 on at the bearing, up to a quarter turn from it, and falls again.
-        for heading in (bearing + angle - _BESIDE_RAD, bearing - angle + _BESIDE_RAD):
+        for heading in (bearing + angle - _OFF_JUMP_RAD, bearing - angle + _OFF_JUMP_RAD):
             inside = begin + (heading - begin) % math.pi
             found.append(inside[inside <= end] % math.pi)
     return np.concatenate(found)

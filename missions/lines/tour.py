@@ -7,6 +7,8 @@ again by dynamic programming along the tour, until nothing improves; then it is 
 again.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,25 +25,34 @@ _SHAKES = 60
 _SHAKEN = 1200
 
 
+class Cells(NamedTuple):
+    """What a tour of C cells may cost; corner k of cell c is corner 4 c + k."""
+
+    hops: Array
+    """(4C, 4C) cost from leaving at a corner to entering at another."""
+    exits: NDArray[np.int64]
+    """(4C,) corner where a cell is left that is entered at a corner."""
+    inner: Array
+    """(4C,) cost of a cell by the corner of entry; inf where it cannot be entered."""
+    start: Array
+    """(4C,) cost to enter first at a corner; inf where the tour may not begin."""
+    finish: Array
+    """(4C,) cost after leaving last at a corner."""
+
+
 @compiled
-def exact_tour(
-    hops: Array, exits: NDArray[np.int64], inner: Array, start: Array, finish: Array, each: bool
-) -> tuple[float, NDArray[np.int64]]:
+def exact_tour(problem: Cells, finish: Array, each: bool) -> tuple[float, NDArray[np.int64]]:
     """The cheapest tour.
 
-    Corners are counted through: corner k of cell c is 4 c + k.
-
     Args:
-        hops: (4C, 4C) cost from leaving at a corner to entering at another.
-        exits: (4C,) corner where a cell is left that is entered at a corner.
-        inner: (4C,) cost of a cell by the corner of entry; inf where it cannot be entered.
-        start: (4C,) cost to enter first at a corner; inf where the tour may not begin.
+        problem: what it may cost; its `finish` does not count.
         finish: (4C, 4C) cost after leaving at a corner, by the corner first entered.
         each: whether `finish` depends on the corner first entered; else its first row holds.
 
     Returns:
         Cost, and (C,) the corners of entry in order.
     """
+    hops, exits, inner, start, _ = problem
     corners = inner.size
     cells = corners // CORNERS
     sets = 1 << cells
@@ -81,49 +92,33 @@ def exact_tour(
 
 
 @compiled
-def _link(
-    tour: NDArray[np.int64],
-    i: int,
-    j: int,
-    hops: Array,
-    exits: NDArray[np.int64],
-    start: Array,
-    finish: Array,
-) -> float:
+def _link(tour: NDArray[np.int64], i: int, j: int, problem: Cells) -> float:
     """Cost from place i of the tour to place j; -1 is home before it, its size home after it."""
     cost: float = 0.0
     if i < 0:
-        cost = start[tour[j]]
+        cost = problem.start[tour[j]]
     elif j >= tour.size:
-        cost = finish[exits[tour[i]]]
+        cost = problem.finish[problem.exits[tour[i]]]
     else:
-        cost = hops[exits[tour[i]], tour[j]]
+        cost = problem.hops[problem.exits[tour[i]], tour[j]]
     return cost
 
 
 @compiled
-def tour_cost(
-    tour: NDArray[np.int64],
-    hops: Array,
-    exits: NDArray[np.int64],
-    inner: Array,
-    start: Array,
-    finish: Array,
-) -> float:
-    """Cost of a tour; arguments as of `improved_tour`."""
+def tour_cost(tour: NDArray[np.int64], problem: Cells) -> float:
+    """Cost of a tour."""
     cost = 0.0
     for i in range(-1, tour.size):
-        cost += _link(tour, i, i + 1, hops, exits, start, finish)
+        cost += _link(tour, i, i + 1, problem)
         if i >= 0:
-            cost += inner[tour[i]]
+            cost += problem.inner[tour[i]]
     return cost
 
 
 @compiled
-def nearest_tour(
-    hops: Array, exits: NDArray[np.int64], inner: Array, start: Array
-) -> NDArray[np.int64]:
-    """Tour from home always on to the cell reached at least cost; arguments as below."""
+def nearest_tour(problem: Cells) -> NDArray[np.int64]:
+    """Tour from home always on to the cell reached at least cost."""
+    hops, exits, inner, start, _ = problem
     corners = inner.size
     cells = corners // CORNERS
     flown = np.zeros(cells, np.int64)
@@ -142,16 +137,9 @@ def nearest_tour(
 
 
 @compiled
-def _reenter(
-    tour: NDArray[np.int64],
-    hops: Array,
-    exits: NDArray[np.int64],
-    inner: Array,
-    start: Array,
-    finish: Array,
-    fixed: int,
-) -> None:
+def _reenter(tour: NDArray[np.int64], problem: Cells, fixed: int) -> None:
     """Choose the corners of entry along a tour again, exactly, in place."""
+    hops, exits, inner, start, finish = problem
     cells = tour.size
     costs = np.full((cells, CORNERS), np.inf)
     before = np.zeros((cells, CORNERS), np.int64)
@@ -181,32 +169,21 @@ def _reenter(
 
 
 @compiled
-def improved_tour(
-    tour: NDArray[np.int64],
-    hops: Array,
-    exits: NDArray[np.int64],
-    inner: Array,
-    start: Array,
-    finish: Array,
-    fixed: int,
-) -> NDArray[np.int64]:
+def improved_tour(tour: NDArray[np.int64], problem: Cells, fixed: int) -> NDArray[np.int64]:
     """Improve a tour until no reversal, no move and no other corner of entry gains.
 
     Args:
         tour: (C,) corners of entry in order.
-        hops: as of `exact_tour`.
-        exits: the same.
-        inner: the same.
-        start: the same.
-        finish: (4C,) cost after leaving last at a corner.
+        problem: what it costs.
         fixed: how many cells at its start stay as they are, 0 or 1.
     """
+    hops, exits, inner, start, finish = problem
     tour = tour.copy()
     cells = tour.size
     ahead = np.zeros(cells)
     back = np.zeros(cells)
     for _ in range(_ROUNDS):
-        _reenter(tour, hops, exits, inner, start, finish, fixed)
+        _reenter(tour, problem, fixed)
         gained = False
         for i in range(fixed, cells):
             if i == fixed or gained:
@@ -215,12 +192,12 @@ def improved_tour(
                     one, two = tour[j - 1], tour[j]
                     ahead[j] = ahead[j - 1] + hops[exits[one], two] + inner[two]
                     back[j] = back[j - 1] + hops[two, exits[one]] + inner[exits[two]]
-            enter_i = _link(tour, i - 1, i, hops, exits, start, finish)
+            enter_i = _link(tour, i - 1, i, problem)
             best, best_j, kind, corner = -_GAIN, -1, 0, 0
             for j in range(i, cells):
                 # Fly i to j the other way round.
                 one, two = tour[i], tour[j]
-                leave_j = _link(tour, j, j + 1, hops, exits, start, finish)
+                leave_j = _link(tour, j, j + 1, problem)
                 ahead_ij = ahead[j] - ahead[i] + inner[one]
                 back_ij = back[j] - back[i] + inner[exits[one]]
                 enter = start[exits[two]] if i == 0 else hops[exits[tour[i - 1]], exits[two]]
@@ -229,7 +206,7 @@ def improved_tour(
                 if change < best:
                     best, best_j, kind = change, j, 1
             # Fly i elsewhere.
-            leave_i = _link(tour, i, i + 1, hops, exits, start, finish)
+            leave_i = _link(tour, i, i + 1, problem)
             closed = 0.0
             if i == 0 and cells > 1:
                 closed = start[tour[1]]
@@ -241,7 +218,7 @@ def improved_tour(
             for j in range(fixed - 1, cells):
                 if j == i or j == i - 1:
                     continue
-                broken = _link(tour, j, j + 1, hops, exits, start, finish)
+                broken = _link(tour, j, j + 1, problem)
                 first = tour[i] // CORNERS * CORNERS
                 for k in range(CORNERS):
                     y = first + k
@@ -253,8 +230,6 @@ def improved_tour(
                     if change < best:
                         best, best_j, kind, corner = change, j, 2, y
             if best_j < 0:
-                continue
-            if best >= -_GAIN:
                 continue
             gained = True
             if kind == 1:
@@ -279,34 +254,22 @@ def improved_tour(
 
 
 @compiled
-def good_tour(
-    hops: Array,
-    exits: NDArray[np.int64],
-    inner: Array,
-    start: Array,
-    finish: Array,
-    first: NDArray[np.int64],
-    fixed: int,
-) -> NDArray[np.int64]:
+def good_tour(first: NDArray[np.int64], problem: Cells, fixed: int) -> NDArray[np.int64]:
     """A good tour of many cells: improved, shaken and improved again, the best is kept.
 
     A shake swaps two neighbouring stretches (the double bridge of O. Martin, S. W. Otto and
     E. W. Felten 1991), which no reversal or move undoes. Its places are a fixed sequence.
 
     Args:
-        hops: as of `improved_tour`.
-        exits: the same.
-        inner: the same.
-        start: the same.
-        finish: the same.
         first: (C,) tour to begin with.
+        problem: what it costs.
         fixed: as of `improved_tour`.
     """
-    best: NDArray[np.int64] = improved_tour(first, hops, exits, inner, start, finish, fixed)
+    best: NDArray[np.int64] = improved_tour(first, problem, fixed)
     cells = first.size
     if cells - fixed < 4:
         return best
-    cost = tour_cost(best, hops, exits, inner, start, finish)
+    cost = tour_cost(best, problem)
     number = 1
     cuts = np.empty(3, np.int64)
     for _ in range(min(_SHAKES, _SHAKEN // cells)):
@@ -318,8 +281,8 @@ def good_tour(
         shaken = np.concatenate(
             (best[: cuts[0]], best[cuts[1] : cuts[2]], best[cuts[0] : cuts[1]], best[cuts[2] :])
         )
-        shaken = improved_tour(shaken, hops, exits, inner, start, finish, fixed)
-        other = tour_cost(shaken, hops, exits, inner, start, finish)
+        shaken = improved_tour(shaken, problem, fixed)
+        other = tour_cost(shaken, problem)
         if other < cost - _GAIN:
             best, cost = shaken, other
     return best

@@ -59,8 +59,8 @@ OPEN_WATER = Fence(
 
 def fence_of(allowed: MultiPolygon) -> Fence:
     """Sort the edges of a polygon into a grid with about as many cells as edges."""
-    rings = [ring for part in allowed.geoms for ring in (part.exterior, *part.interiors)]
-    edges = np.concatenate([_edges(shapely.get_coordinates(ring)) for ring in rings])
+    edges = edges_of(allowed)
+    edges = edges[(edges[:, 0] != edges[:, 2]) | (edges[:, 1] != edges[:, 3])]
     low, high = edges.reshape(-1, 2).min(axis=0), edges.reshape(-1, 2).max(axis=0)
     cells = min(_MOST_CELLS, max(1, math.isqrt(len(edges))))
     per_m = cells / np.maximum(high - low, 1.0)
@@ -78,11 +78,14 @@ def fence_of(allowed: MultiPolygon) -> Fence:
     return empty._replace(firsts=firsts, listed=listed)
 
 
-def _edges(corners: Array) -> Array:
-    """(E, 4) of a ring, without those of no length."""
-    edges = np.concatenate([corners[:-1], corners[1:]], axis=1)
-    kept: Array = edges[(edges[:, 0] != edges[:, 2]) | (edges[:, 1] != edges[:, 3])]
-    return kept
+def edges_of(polygons: MultiPolygon) -> Array:
+    """Both ends, (E, 4) north and east, of every edge of every ring."""
+    coordinates, ring_of = shapely.get_coordinates(
+        shapely.get_rings(list(polygons.geoms)), return_index=True
+    )
+    both = np.concatenate([coordinates[:-1], coordinates[1:]], axis=1)
+    edges: Array = np.ascontiguousarray(both[ring_of[:-1] == ring_of[1:]], dtype=np.float64)
+    return edges
 
 
 @compiled_ieee

@@ -13,7 +13,7 @@ from alice_survey.base.compiled import compiled_ieee
 from alice_survey.base.frames import Array
 from missions.route.dubins import moved, shortest_turn
 from missions.route.fence import Fence, straight_inside
-from missions.values.costs import Prices
+from missions.values.costs import Costs, power_at
 
 NONE, AHEAD, ARCS, SPOT, SWAY = 0, 1, 2, 3, 4
 """How two lines are joined; nothing direct, and straight on."""
@@ -34,13 +34,13 @@ chosen."""
 
 @compiled_ieee
 def joined_lines(
-    fence: Fence, prices: Prices, lines: Array, radius: float, run_in: float, wanted: int
+    fence: Fence, costs: Costs, lines: Array, radius: float, run_in: float, wanted: int
 ) -> tuple[Array, NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
     """The legs along all lines and between them.
 
     Args:
         fence: of the allowed area.
-        prices: what to keep low.
+        costs: what to keep low.
         lines: (N, 5) north and east of start and end, heading.
         radius: of arcs.
         run_in: straight before and, for arcs, after each line.
@@ -64,26 +64,21 @@ def joined_lines(
         used = _add(legs, used, lines[i, 0], lines[i, 1], lines[i, 4], length, 0.0)
         legs[rows[i], 5] = i
         if i + 1 < count:
-            end[0], end[1], end[2] = lines[i, 2], lines[i, 3], lines[i, 4]
-            goal[0], goal[1], goal[2] = lines[i + 1, 0], lines[i + 1, 1], lines[i + 1, 4]
-            kinds[i], made, detours[i] = join(
-                fence, prices, end, goal, radius, run_in, run_in, wanted
-            )
-            for k in range(made.shape[0]):
-                for column in range(COLUMNS):
-                    legs[used, column] = made[k, column]
-                used += 1
+            end[:] = lines[i, 2:]
+            goal[:2], goal[2] = lines[i + 1, :2], lines[i + 1, 4]
+            kinds[i], made, detours[i] = join(fence, costs, end, goal, radius, run_in, wanted)
+            legs[used : used + len(made)] = made
+            used += len(made)
     return legs[:used], rows, kinds, detours
 
 
 @compiled_ieee
 def join(
     fence: Fence,
-    prices: Prices,
+    costs: Costs,
     end: Array,
     goal: Array,
     radius: float,
-    run_out: float,
     run_in: float,
     wanted: int,
 ) -> tuple[int, Array, bool]:
@@ -91,12 +86,12 @@ def join(
 
     Args:
         fence: of the allowed area.
-        prices: what to keep low.
+        costs: what to keep low.
         end: (3,) north, east, heading at the end of the line; a heading of NaN is free (home).
         goal: (3,) the same at the start of the next.
         radius: of arcs.
-        run_out: straight after the line if arcs follow.
-        run_in: straight before the next line; after a stop only where it is inside.
+        run_in: straight after the line if arcs follow, and before the next line; after a stop only
+            where it is inside.
         wanted: as of `joined_lines`.
 
     Returns:
@@ -107,11 +102,11 @@ def join(
         ahead = np.empty((1, COLUMNS))
         gap = math.hypot(goal[0] - end[0], goal[1] - end[1])
         return AHEAD, ahead[: _add(ahead, 0, end[0], end[1], end[2], gap, 0.0)], False
-    arcs_j, arcs = _by_arcs(fence, prices, end, goal, radius, run_out, run_in)
+    arcs_j, arcs = _by_arcs(fence, costs, end, goal, radius, run_in)
     if wanted == ARCS and arcs_j < np.inf:
         return ARCS, arcs, False
-    spot_j, spot = _on_the_spot(fence, prices, end, goal, run_in)
-    sway_j, sway = _sideways(fence, prices, end, goal, run_in)
+    spot_j, spot = _on_the_spot(fence, costs, end, goal, run_in)
+    sway_j, sway = _sideways(fence, costs, end, goal, run_in)
     blocked = spot_j == np.inf
     if wanted == SPOT:
         return (NONE if blocked else SPOT), spot, blocked
@@ -129,22 +124,19 @@ def join(
 @compiled_ieee
 def _by_arcs(
     fence: Fence,
-    prices: Prices,
+    costs: Costs,
     end: Array,
     goal: Array,
     radius: float,
-    run_out: float,
     run_in: float,
 ) -> tuple[float, Array]:
     """Run-out, the shortest turn, run-in; infinite if it leaves the fence."""
     legs = np.empty((5, COLUMNS))
     # Home is left and reached on the course straight to or from the other end.
-    start, arrival = np.empty(3), np.empty(3)
-    for k in range(3):
-        start[k], arrival[k] = end[k], goal[k]
+    start, arrival = end.copy(), goal.copy()
     if not math.isnan(end[2]):
-        start[0] += run_out * math.cos(end[2])
-        start[1] += run_out * math.sin(end[2])
+        start[0] += run_in * math.cos(end[2])
+        start[1] += run_in * math.sin(end[2])
     if not math.isnan(goal[2]):
         arrival[0] -= run_in * math.cos(goal[2])
         arrival[1] -= run_in * math.sin(goal[2])
@@ -159,7 +151,7 @@ def _by_arcs(
         return np.inf, legs[:0]
     used = 0
     if not math.isnan(end[2]):
-        used = _add(legs, used, end[0], end[1], end[2], run_out, 0.0)
+        used = _add(legs, used, end[0], end[1], end[2], run_in, 0.0)
     north, east, heading = start[0], start[1], start[2]
     for k in range(3):
         curvature, length = pieces[k, 0], pieces[k, 1]
@@ -167,12 +159,12 @@ def _by_arcs(
         north, east, heading = moved(north, east, heading, curvature, length)
     if not math.isnan(goal[2]):
         used = _add(legs, used, arrival[0], arrival[1], arrival[2], run_in, 0.0)
-    return price(prices, legs[:used]), legs[:used]
+    return price(costs, legs[:used]), legs[:used]
 
 
 @compiled_ieee
 def _on_the_spot(
-    fence: Fence, prices: Prices, end: Array, goal: Array, run_in: float
+    fence: Fence, costs: Costs, end: Array, goal: Array, run_in: float
 ) -> tuple[float, Array]:
     """Turn, straight, turn, run-in; infinite if it leaves the fence."""
     legs = np.empty((4, COLUMNS))
@@ -185,12 +177,12 @@ def _on_the_spot(
     if not math.isnan(goal[2]):
         back = math.hypot(goal[0] - north, goal[1] - east)
         used = _add(legs, used, north, east, goal[2], back, 0.0)
-    return price(prices, legs[:used]), legs[:used]
+    return price(costs, legs[:used]), legs[:used]
 
 
 @compiled_ieee
 def _sideways(
-    fence: Fence, prices: Prices, end: Array, goal: Array, run_in: float
+    fence: Fence, costs: Costs, end: Array, goal: Array, run_in: float
 ) -> tuple[float, Array]:
     """Ahead, a step sideways, a turn if the headings differ, ahead to the line.
 
@@ -229,10 +221,10 @@ def _sideways(
     legs[used, 7] = side
     used = add_spot(legs, used + 1, north, east, end[2], goal[2])
     used = _add(legs, used, north, east, goal[2], last, 0.0)
-    sway_j = _power(prices.sway_w, end[2] - side)
+    sway_j = power_at(costs.sway_w, end[2] - side)
     if sway_j == np.inf:
         return np.inf, legs[:0]
-    return price(prices, legs[:used]), legs[:used]
+    return price(costs, legs[:used]), legs[:used]
 
 
 @compiled_ieee
@@ -269,9 +261,7 @@ def add_spot(
     if math.isnan(turn) or abs(turn) < _TINY:
         return used
     turn = min(max(turn, -math.pi), math.pi)  # but for rounding it is
-    legs[used, 0], legs[used, 1], legs[used, 2] = north, east, heading
-    legs[used, 3], legs[used, 4], legs[used, 5] = 0.0, 0.0, -1.0
-    legs[used, 6], legs[used, 7] = turn, 0.0
+    legs[used] = (north, east, heading, 0.0, 0.0, -1.0, turn, 0.0)
     return used + 1
 
 
@@ -288,9 +278,7 @@ def _add(
     """Add a straight or an arc, unless it is of no length; returns the count of legs."""
     if length <= _TINY:
         return used
-    legs[used, 0], legs[used, 1], legs[used, 2] = north, east, course
-    legs[used, 3], legs[used, 4], legs[used, 5] = length, curvature, -1.0
-    legs[used, 6], legs[used, 7] = 0.0, 0.0
+    legs[used] = (north, east, course, length, curvature, -1.0, 0.0, 0.0)
     return used + 1
 
 
@@ -305,35 +293,23 @@ def _goes_on(end: Array, goal: Array) -> bool:
 
 
 @compiled_ieee
-def price(prices: Prices, legs: Array) -> float:
+def price(costs: Costs, legs: Array) -> float:
     """Energy of legs between lines; never infinite, but very high where it would be."""
     total = 0.0
     for i in range(legs.shape[0]):
         course, length, curvature = legs[i, 2], legs[i, 3], legs[i, 4]
         if legs[i, 6] != 0.0:
-            total += prices.spot_w * (abs(legs[i, 6]) / prices.turn_rate_rad_s + prices.settle_s)
+            total += costs.spot_w * (abs(legs[i, 6]) / costs.turn_rate_rad_s + costs.settle_s)
         elif legs[i, 7] != 0.0:
-            total += length / prices.sway_mps * _power(prices.sway_w, course)
-            total += prices.spot_w * prices.settle_s
+            total += length / costs.sway_mps * power_at(costs.sway_w, course)
+            total += costs.spot_w * costs.settle_s
         else:
-            mean = _mean_power(prices.way_w, course, course + curvature * length)
+            mean = _mean_power(costs.way_w, course, course + curvature * length)
             if curvature != 0.0:
-                mean += prices.arc_extra_w
-            seconds = length / prices.speed_mps
+                mean += costs.arc_extra_w
+            seconds = length / costs.speed_mps
             total += seconds * mean if mean < np.inf else _DEAR_J * (1.0 + seconds)
     return total
-
-
-@compiled_ieee
-def _power(power_w: Array, course: float) -> float:
-    """Power at a course, between the even samples of a full turn."""
-    count = power_w.shape[0]
-    place = course / (2.0 * math.pi) * count
-    low = math.floor(place)
-    share = place - low
-    one, two = power_w[int(low) % count], power_w[(int(low) + 1) % count]
-    value: float = one if share == 0.0 else (1.0 - share) * one + share * two
-    return value
 
 
 @compiled_ieee
@@ -343,12 +319,12 @@ def _mean_power(power_w: Array, start: float, end: float) -> float:
     per_rad = count / (2.0 * math.pi)
     low, high = min(start, end) * per_rad, max(start, end) * per_rad
     if high - low < 1e-6:
-        return float(_power(power_w, 0.5 * (start + end)))
+        return float(power_at(power_w, 0.5 * (start + end)))
     total, place = 0.0, low
     while place < high:
         following = min(high, math.floor(place) + 1.0)
         if following - place > 1e-12:
-            total += (following - place) * _power(power_w, 0.5 * (place + following) / per_rad)
+            total += (following - place) * power_at(power_w, 0.5 * (place + following) / per_rad)
         place = following
     mean: float = total / (high - low)
     return mean

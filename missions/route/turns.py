@@ -18,8 +18,7 @@ from alice_survey.base.frames import Array
 from missions.route import joins
 from missions.route.fence import OPEN_WATER, TOUCH_M, Fence, straight_inside
 from missions.route.ways import Ways
-from missions.values.costs import Costs, Prices, time_costs
-from missions.values.costs import prices as flight_prices
+from missions.values.costs import Costs, time_costs
 from missions.values.legs import Leg, Route
 from missions.values.line import Line
 
@@ -65,10 +64,10 @@ def route_through(
     table = np.array([(*x.start_ne_m, *x.end_ne_m, x.heading_rad) for x in lines])
     fence = OPEN_WATER if ways is None else ways.fence
     _check_lines(table, ways, first_line)
-    prices = flight_prices(time_costs(PAPER_SPEED_MPS) if costs is None else costs)
+    costs = (time_costs(PAPER_SPEED_MPS) if costs is None else costs).compilable()
     wanted = _WANTED[turns]
     legs, rows, kinds, detours = joins.joined_lines(
-        fence, prices, table, turn_radius_m, run_in_m, wanted
+        fence, costs, table, turn_radius_m, run_in_m, wanted
     )
     legs[rows, 5] += first_line
     start, end = table[0, [0, 1, 4]], table[-1, 2:]
@@ -77,7 +76,7 @@ def route_through(
     else:
         home = np.array([*home_ne, _FREE])
         first, last = (
-            _single(ways, prices, a, b, turn_radius_m, run_in_m, wanted)
+            _single(ways, costs, a, b, turn_radius_m, run_in_m, wanted)
             for a, b in ((home, start), (end, home))
         )
     pieces = [first]
@@ -89,7 +88,7 @@ def route_through(
         pieces.append(legs[done:after])
         done = rows[i + 1]
         way = _round_corners(ways, table[i, 2:], table[i + 1, [0, 1, 4]], run_in_m)
-        way, kinds[i] = _cheaper(kinds[i], legs[after:done], way, prices)
+        way, kinds[i] = _cheaper(kinds[i], legs[after:done], way, costs)
         pieces.append(way)
     pieces += [legs[done:], last]
     _warn_of_others(kinds, turns)
@@ -127,7 +126,7 @@ def _run_out(fence: Fence, end: Array, run_out_m: float) -> Array:
 
 def _single(
     ways: Ways | None,
-    prices: Prices,
+    costs: Costs,
     end: Array,
     goal: Array,
     turn_radius_m: float,
@@ -136,18 +135,16 @@ def _single(
 ) -> Array:
     """The way from home or to it, (L, 8)."""
     fence = OPEN_WATER if ways is None else ways.fence
-    kind, way, detour = joins.join(
-        fence, prices, end, goal, turn_radius_m, run_in_m, run_in_m, wanted
-    )
+    kind, way, detour = joins.join(fence, costs, end, goal, turn_radius_m, run_in_m, wanted)
     if detour and ways is not None:
-        way, _ = _cheaper(kind, way, _round_corners(ways, end, goal, run_in_m), prices)
+        way, _ = _cheaper(kind, way, _round_corners(ways, end, goal, run_in_m), costs)
     result: Array = way
     return result
 
 
-def _cheaper(kind: int, direct: Array, round_corners: Array, prices: Prices) -> tuple[Array, int]:
+def _cheaper(kind: int, direct: Array, round_corners: Array, costs: Costs) -> tuple[Array, int]:
     """The direct way, if there is one, or that round corners; and which."""
-    if kind != joins.NONE and joins.price(prices, direct) <= joins.price(prices, round_corners):
+    if kind != joins.NONE and joins.price(costs, direct) <= joins.price(costs, round_corners):
         return direct, kind
     return round_corners, joins.NONE
 

@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
+from alice_survey.base.compiled import compiled_ieee
 from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import Array
 from alice_survey.vehicle.limits import SPOT_RAD_S, STEP_MPS
@@ -18,9 +18,8 @@ in the simulator with exact navigation: ALICE turns by 90 degrees at 15 deg/s in
 13.3 s, and braking before and gathering way after cost 6 s more."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Costs:
-    """Electrical power by course, and what turns take. Compiled code takes the arrays as they are.
+class Costs(NamedTuple):
+    """Electrical power by course, and what turns take; compiled code takes it as it is.
 
     Along a line the heading is held and a current from the side is met by sway; on the way between
     lines the vehicle may crab.
@@ -49,25 +48,23 @@ class Costs:
     """Speed of descent and ascent, on the spot."""
     heave_w: float
     """Mean power of both."""
-    refused: Callable[[str], PlanError] | None = field(default=None, compare=False, repr=False)
+    refused: Callable[[str], PlanError] | None = None
     """The error that says, of a leg in words, that the current forbids it, with the ways out."""
 
-    def line_j(self, length_m: float, course_rad: float) -> float:
-        """Energy of a straight line."""
-        return length_m / self.speed_mps * power_at(self.line_w, course_rad)
+    def compilable(self, most_w: float = math.inf) -> "Costs":
+        """The costs for compiled code.
 
-    def way_j(self, length_m: float, course_rad: float) -> float:
-        """Energy of a straight way between lines."""
-        return length_m / self.speed_mps * power_at(self.way_w, course_rad)
+        Args:
+            most_w: powers by course are no higher; finite where totals have to be compared.
+        """
+        bounded = {
+            name: np.minimum(getattr(self, name), most_w) for name in ("line_w", "way_w", "sway_w")
+        }
+        return self._replace(**bounded, refused=None)
 
     def spot_j(self, turn_rad: float) -> float:
         """Energy of a turn on the spot, with its stop."""
         return self.spot_w * (abs(turn_rad) / self.turn_rate_rad_s + self.settle_s)
-
-    def sway_j(self, length_m: float, course_rad: float) -> float:
-        """Energy of a sway step, with its stop."""
-        moving = length_m / self.sway_mps * power_at(self.sway_w, course_rad)
-        return moving + self.spot_w * self.settle_s
 
     def dive_j(self, depth_m: float) -> float:
         """Energy of going down to a depth and up again."""
@@ -102,6 +99,7 @@ def time_costs(
     )
 
 
+@compiled_ieee
 def power_at(power_w: Array, course_rad: float) -> float:
     """Power at a course, between the even samples of a full turn; infinite next to an infinite one.
 
@@ -109,50 +107,14 @@ def power_at(power_w: Array, course_rad: float) -> float:
         power_w: (K,) from north on.
         course_rad: any angle.
     """
-    place = course_rad / (2 * np.pi) * len(power_w) % len(power_w)
-    low = int(place) % len(power_w)
-    share = place - int(place)
-    if share == 0.0:  # nothing of the next one, though it may be infinite
-        return float(power_w[low])
-    return float((1 - share) * power_w[low] + share * power_w[(low + 1) % len(power_w)])
-
-
-class Prices(NamedTuple):
-    """`Costs` as compiled code takes them."""
-
-    speed_mps: float
-    line_w: Array
-    way_w: Array
-    sway_w: Array
-    spot_w: float
-    arc_extra_w: float
-    turn_rate_rad_s: float
-    settle_s: float
-    sway_mps: float
-
-
-def prices(costs: Costs, most_w: float = math.inf) -> Prices:
-    """The part of the costs that the choice of turns and the order of lines depend on.
-
-    Args:
-        costs: what flying takes.
-        most_w: powers by course are no higher; finite where totals have to be compared.
-    """
-
-    def bounded(power_w: Array) -> Array:
-        return np.minimum(np.ascontiguousarray(power_w, dtype=np.float64), most_w)
-
-    return Prices(
-        speed_mps=float(costs.speed_mps),
-        line_w=bounded(costs.line_w),
-        way_w=bounded(costs.way_w),
-        sway_w=bounded(costs.sway_w),
-        spot_w=float(costs.spot_w),
-        arc_extra_w=float(costs.arc_extra_w),
-        turn_rate_rad_s=float(costs.turn_rate_rad_s),
-        settle_s=float(costs.settle_s),
-        sway_mps=float(costs.sway_mps),
-    )
+    count = power_w.size
+    place = course_rad / (2.0 * math.pi) * count
+    low = math.floor(place)
+    share = place - low
+    one, two = power_w[int(low) % count], power_w[(int(low) + 1) % count]
+    # On a sample nothing of the next one counts, though it may be infinite.
+    power: float = one if share == 0.0 else (1.0 - share) * one + share * two
+    return power
 
 
 def leg_costs(route: Route, costs: Costs) -> tuple[Array, Array]:

@@ -73,12 +73,12 @@ def test_diffraction_of_green_light_at_f4() -> None:
     assert largest_f_number(config.camera, 3.0) == pytest.approx(8.56, abs=0.01)
 
 
-def test_an_aperture_that_is_too_open_is_told_what_to_set() -> None:
+def test_an_aperture_that_is_too_open_gets_the_f_number_to_set() -> None:
     rig, config = survey(plan={"altitude_m": 1.2})
     focus = plan_focus(rig.cameras["left"], config.camera, config.plan)
-    told = math.ceil(10 * needed_f_number(rig.cameras["left"], config.camera, config.plan)) / 10
-    assert f"set camera.f_number to {told:g}" in too_open(focus, config.camera, config.plan)
-    closed = config.camera.model_copy(update={"f_number": told})
+    needed = math.ceil(10 * needed_f_number(rig.cameras["left"], config.camera, config.plan)) / 10
+    assert f"camera.f_number to {needed:g}" in too_open(focus, config.camera, config.plan)
+    closed = config.camera.model_copy(update={"f_number": needed})
     assert not too_open(plan_focus(rig.cameras["left"], closed, config.plan), closed, config.plan)
 
 
@@ -91,8 +91,8 @@ def test_a_lens_that_cannot_focus_gets_ways_out_that_work() -> None:
     assert "relief_m (depth of field) conflicts with sharp_px (diffraction)" in text
     assert len(text.splitlines()) == 4
     for name in ("altitude_m", "sharp_px", "relief_m"):
-        told = float(text.split(f"- {name} ")[1].split(" instead")[0])
-        plan = config.plan.model_copy(update={name: told})
+        value = float(text.split(f"- {name} ")[1].split(" instead")[0])
+        plan = config.plan.model_copy(update={name: value})
         needed = needed_f_number(camera, config.camera, plan)
         best = largest_f_number(config.camera, plan.sharp_px)
         assert 0.9 * best < needed < best

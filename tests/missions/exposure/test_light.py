@@ -18,10 +18,11 @@ from missions.exposure.light import (
     lens_falloff,
     light_budget,
     light_for_snr_e,
+    scatter,
+    shadows,
     signal_to_noise,
     watts_per_lumen,
 )
-from missions.exposure.scatter import scatter, shadows
 from tests.missions.exposure.surveys import survey
 
 CLEAR = WaterOptics(absorption_per_m=np.zeros(3), scattering_per_m=np.zeros(3))

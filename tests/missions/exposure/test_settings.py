@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from alice_survey.base.errors import PlanError
 from missions.exposure.settings import imaging_settings
 from missions.exposure.settings_table import WIDTH, Setting, settings_table
-from missions.exposure.storage import storage_rows
 from tests.missions.exposure.surveys import survey
 
 
@@ -32,19 +31,6 @@ def test_settings_of_the_papers_mission() -> None:
     assert planned.exposure_s < by_speed.exposure_s < 2.24e-3
 
 
-def test_the_table_explains_the_papers_numbers() -> None:
-    planned = imaging_settings(*survey(ideal_port=True, plan={"line_spacing_m": 1.0}))
-    text = " ".join(planned.table_text().split())
-    for words in (
-        "1 m gives 29.3% with this footprint of 1.415 m",
-        "the paper's rule gives 31% overlap, with the picture's short side along the track",
-        "3 ms blurs 1.36 px at 0.2 m/s and 3.40 px at 0.5 m/s, not none",
-        "it sets 1.5 m for 2 m",
-        "The paper's depth of field of 2 m at F/4 takes a circle of 3.0 px",
-    ):
-        assert words in text
-
-
 @settings(max_examples=60, deadline=None)
 @given(
     altitude_m=st.floats(1.0, 8),
@@ -52,7 +38,7 @@ def test_the_table_explains_the_papers_numbers() -> None:
     forward=st.floats(0, 0.9),
     blur_px=st.floats(0.2, 5),
 )
-def test_what_was_asked_for_is_reached(
+def test_what_was_requested_is_reached(
     altitude_m: float, speed_mps: float, forward: float, blur_px: float
 ) -> None:
     rig, config = survey(
@@ -87,12 +73,9 @@ def test_rows_name_equation_source_and_limit() -> None:
 
 
 def test_the_table_fits_a_hundred_columns_and_json_is_plain() -> None:
-    rig, config = survey(plan={"side_overlap": 0.45, "track_error_m": 0.12, "relief_m": 0.0})
-    planned = imaging_settings(rig, config)
-    more = storage_rows(planned.storage, config.camera, planned.interval_s, stations=603)[-1:]
-    text = planned.table_text(more)
-    assert max(len(line) for line in text.splitlines()) <= WIDTH
-    assert "whole survey" in text
+    plan = {"side_overlap": 0.45, "track_error_m": 0.12, "relief_m": 0.0}
+    planned = imaging_settings(*survey(plan=plan))
+    assert max(map(len, settings_table(planned.rows).splitlines())) <= WIDTH
     data = json.loads(json.dumps(planned.to_json(), allow_nan=False))
     assert len(data["rows"]) == len(planned.rows)
     assert data["spacing"]["spacing_m"] == planned.line_spacing_m
@@ -104,19 +87,12 @@ def test_the_table_fits_a_hundred_columns_and_json_is_plain() -> None:
         (0.42812, "Hz", "0.428 Hz"),
         (0.306, "%", "30.6 %"),
         ((1.65, 2.0, 2.345678), "m", "1.65 / 2 / 2.35 m"),
-        (9000.0, "e", "9000 e"),
         (float("inf"), "m", "inf m"),
         (12345678.0, "", "1.23e+07"),
-        (0.0, "dB", "0 dB"),
-        (0.00094, "", "0.00094"),
     ],
 )
 def test_numbers_are_short(value: float | tuple[float, ...], unit: str, shown: str) -> None:
-    row = Setting(
-        group="g", name="n", value=value, unit=unit, equation="q", source="s", bound_by="b"
-    )
-    assert row.text == shown
-    assert shown in settings_table([row])
+    assert Setting("group", "name", value, unit, "equation", "source", "limit").text == shown
 
 
 def test_an_exposure_of_nothing_is_refused_with_what_bounds_it() -> None:
@@ -124,30 +100,30 @@ def test_an_exposure_of_nothing_is_refused_with_what_bounds_it() -> None:
         imaging_settings(*survey(plan={"allowed_blur_px": 0.001}))
 
 
-def test_a_strobe_pulse_that_does_not_fit_is_told() -> None:
+def test_a_strobe_pulse_that_does_not_fit_is_refused() -> None:
     plan = {"speed_mps": 1.0, "forward_overlap": 0.9, "strobe_lead_s": 0.1}
     with pytest.raises(PlanError, match=r"strobe pulse of 0\.2004 s"):
         imaging_settings(*survey(plan=plan))
 
 
 @pytest.mark.parametrize(
-    ("sections", "words"),
+    ("sections", "named"),
     [
-        ({"plan": {"altitude_m": 1.2}}, "set camera.f_number to"),
-        ({"plan": {"altitude_m": 1.2}}, "comes within 0.85 m of the glass"),
-        ({"water": {"jerlov": "9C"}}, "times the light is missing"),
-        ({"plan": {"line_spacing_m": 1.4}}, "lines leave gaps of 0.21 m"),
-        ({"plan": {"forward_overlap": 0.0}}, "pictures leave gaps of 0.20 m"),
-        ({"plan": {"forward_overlap": 0.9, "speed_mps": 1.0}}, "a cable of its own"),
+        ({"plan": {"altitude_m": 1.2}}, "camera.f_number"),
+        ({"plan": {"altitude_m": 1.2}}, "0.85 m"),
+        ({"water": {"jerlov": "9C"}}, "allowed_blur_px"),
+        ({"plan": {"line_spacing_m": 1.4}}, "0.21 m"),
+        ({"plan": {"forward_overlap": 0.0}}, "0.20 m"),
+        ({"plan": {"forward_overlap": 0.9, "speed_mps": 1.0}}, "cable"),
     ],
 )
 def test_what_will_be_poor_is_warned_of(
-    sections: dict[str, Any], words: str, capsys: pytest.CaptureFixture[str]
+    sections: dict[str, Any], named: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     imaging_settings(*survey(**sections), quiet=True)
     assert capsys.readouterr().err == ""
     imaging_settings(*survey(**sections))
-    assert words in capsys.readouterr().err
+    assert named in capsys.readouterr().err
 
 
 def test_the_papers_mission_is_not_warned_of(capsys: pytest.CaptureFixture[str]) -> None:

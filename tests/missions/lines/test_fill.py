@@ -10,8 +10,7 @@ from shapely.geometry import MultiPolygon, box
 
 from missions.lines.fill import fill_table, lines_over
 from missions.lines.lay import survey_pieces
-from missions.lines.rows import to_uv
-from missions.lines.site import Site
+from missions.lines.rows import Site, to_uv
 from missions.lines.unseen import LENGTH, WIDTH, U, V, unseen
 from missions.values.area import multipolygon
 from missions.values.line import Line

@@ -8,9 +8,8 @@ from hypothesis import strategies as st
 from shapely.geometry import MultiPolygon, Point, Polygon, box
 
 from alice_survey.base.errors import PlanError
-from missions.lines.hops import comparable_prices, flight_parts_j
-from missions.lines.lay import lay_lines, ordered, ways_between
-from missions.lines.sweep import full_cost_j
+from missions.lines.hops import chain_j, comparable
+from missions.lines.lay import lay_lines, ordered, stops
 from missions.route.ways import Ways
 from missions.values.costs import Costs, time_costs
 from missions.values.line import Line
@@ -24,14 +23,14 @@ from tests.oracles_lines import (
     areas,
     as_string,
     flight_by_hand,
+    full_cost_j,
     points_in,
     random_area,
     seen_enough,
 )
 
 COURSES = np.arange(16) * 2 * np.pi / 16
-CURRENT = dataclasses.replace(
-    time_costs(0.2),
+CURRENT = time_costs(0.2)._replace(
     line_w=80 + 40 * np.cos(COURSES - 1) ** 2 + 20 * np.cos(COURSES - 2),
     way_w=70 + 20 * np.cos(COURSES - 2),
     spot_w=60.0,
@@ -182,20 +181,17 @@ def test_the_cost_is_that_of_the_lines_flown_by_hand(costs: Costs) -> None:
 def test_the_order_is_better_than_rows_one_after_the_other() -> None:
     """The old way flew every row over all parts before the next row."""
     area = area_of(ELL_WITH_HOLES)
-    ways, home, prices = Ways(area.allowed), (0.0, 0.0), comparable_prices(time_costs(0.2))
+    ways, costs = Ways(area.allowed), comparable(time_costs(0.2))
     lines = lay(ELL_WITH_HOLES, 0.0, cross_lines=0, closing_line=False)
     rows = sorted(lines, key=lambda x: (round(across(x, 0.0), 6), x.start_ne_m))
     plain = [line if i % 2 else line.reversed() for i, line in enumerate(rows)]
-    mine, old = (
-        flight_parts_j(
-            prices,
-            np.array(home),
-            table := np.array([(*x.start_ne_m, *x.end_ne_m, x.heading_rad) for x in some]),
-            ways_between(table, np.array(home), ways),
-        )[1]
-        for some in (lines, plain)
-    )
-    assert mine < 0.8 * old
+    hops_j = []
+    for some in (lines, plain):
+        table = np.array([(*x.start_ne_m, *x.end_ne_m, x.heading_rad) for x in some])
+        leave, enter = stops(table, np.zeros(2))
+        ways_m = ways.lengths_m(leave[:, :2], enter[:, :2])
+        hops_j.append(chain_j(costs, leave, enter, ways_m).sum())
+    assert hops_j[0] < 0.8 * hops_j[1]
 
 
 def test_any_lines_are_put_in_order() -> None:
@@ -220,7 +216,7 @@ def test_parts_without_a_way_between_are_refused() -> None:
 
 
 def test_too_many_stations_are_refused() -> None:
-    with pytest.raises(PlanError, match=r"stations, more than 100000: split the area"):
+    with pytest.raises(PlanError, match="100000"):
         lay(box(0, 0, 1000, 1000))
 
 

@@ -9,7 +9,7 @@ from shapely.geometry import MultiPolygon, box
 
 from alice_survey.base.frames import Array
 from missions.lines.rows import lay_rows, reaches, rooms, row_offsets, to_uv
-from missions.lines.site import edges_of
+from missions.route.fence import edges_of
 from missions.values.area import multipolygon
 from tests.oracles_lines import areas, reaches_by_shapely
 

@@ -1,4 +1,3 @@
-import dataclasses
 import itertools
 import math
 from collections.abc import Iterator
@@ -10,15 +9,15 @@ from hypothesis import strategies as st
 from shapely.geometry import MultiPolygon, Polygon, box
 
 from alice_survey.base.errors import PlanError
-from missions.lines.site import Site
-from missions.lines.sweep import best_heading, full_cost_j, least_width, widths_m
+from missions.lines.sweep import best_heading, least_width, widths_m
+from missions.route.fence import edges_of
 from missions.route.ways import Ways
 from missions.values.costs import Costs, time_costs
-from tests.oracles_lines import ELL, ELL_WITH_HOLES, STEREO, area_of, areas
+from tests.oracles_lines import ELL, ELL_WITH_HOLES, STEREO, area_of, areas, full_cost_j
 
 ALONG = np.arange(16) * 2 * np.pi / 16
-NORTHWARD = dataclasses.replace(
-    time_costs(0.2), line_w=1 + 2 * np.sin(ALONG) ** 2, way_w=np.ones(16), sway_w=np.ones(16)
+NORTHWARD = time_costs(0.2)._replace(
+    line_w=1 + 2 * np.sin(ALONG) ** 2, way_w=np.ones(16), sway_w=np.ones(16)
 )
 """A current along north: courses across it cost thrice as much."""
 QUAD = Polygon([(0, 0), (9, 2), (12, 9), (-1, 8)])
@@ -29,27 +28,15 @@ QUAD = Polygon([(0, 0), (9, 2), (12, 9), (-1, 8)])
 def test_no_direction_is_narrower_than_the_least_width(
     survey: MultiPolygon, heading: float
 ) -> None:
-    edges = Site(
-        survey=np.concatenate(
-            [_edges(r) for p in survey.geoms for r in (p.exterior, *p.interiors)]
-        ),
-        allowed=np.empty((0, 4)),
-        parts=(),
-        area_m2=1.0,
-    ).survey
+    edges = edges_of(survey)
     best, width = least_width(edges)
     sampled = widths_m(edges, np.append(np.arange(720) * math.pi / 720, heading))
     assert width <= sampled.min() + 1e-9
     assert widths_m(edges, np.array([best]))[0] == pytest.approx(width, abs=1e-9)
 
 
-def _edges(ring: Polygon) -> np.ndarray:
-    corners = np.array(ring.coords)
-    return np.concatenate([corners[:-1], corners[1:]], axis=1)
-
-
 def test_the_width_of_a_convex_area_is_that_between_its_outermost_corners() -> None:
-    edges, corners = _edges(QUAD.exterior), np.array(QUAD.exterior.coords)
+    edges, corners = edges_of(MultiPolygon([QUAD])), np.array(QUAD.exterior.coords)
     for heading in np.linspace(0, math.pi, 50):
         across = corners @ np.array([-math.sin(heading), math.cos(heading)])
         assert widths_m(edges, np.array([heading]))[0] == pytest.approx(np.ptp(across), abs=1e-12)
@@ -85,7 +72,7 @@ def test_lines_turn_into_the_current() -> None:
     assert calm.width_m == pytest.approx(15)
 
 
-def test_headings_that_cannot_be_flown_are_told() -> None:
+def test_headings_that_cannot_be_flown_are_refused() -> None:
     parts = area_of(MultiPolygon([box(0, 0, 5, 5), box(20, 0, 25, 5)]), 1.0)
     with pytest.raises(PlanError, match="not connected"):
         best_heading(

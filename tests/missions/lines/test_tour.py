@@ -6,12 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from missions.lines.cells import cell_corners, chains, followers
-from missions.lines.tour import exact_tour, good_tour, nearest_tour, tour_cost
+from missions.lines.tour import Cells, exact_tour, good_tour, nearest_tour, tour_cost
 from tests.oracles_lines import best_tour_by_trial
 
 
-def problem(cells: int, seed: int, symmetric: bool = True) -> tuple[np.ndarray, ...]:
-    """Cells at random places: costs of hops, exits, inner costs, start and finish."""
+def problem(cells: int, seed: int, symmetric: bool = True) -> tuple[Cells, np.ndarray]:
+    """Cells at random places, and the cost of the finish by the corner first entered."""
     rng = np.random.default_rng(seed)
     places = rng.uniform(0, 10, (4 * cells, 2))
     hops = np.linalg.norm(places[:, None] - places, axis=2)
@@ -23,20 +23,23 @@ def problem(cells: int, seed: int, symmetric: bool = True) -> tuple[np.ndarray, 
     )
     inner = rng.uniform(1, 3, 4 * cells)
     start = np.linalg.norm(places, axis=1)
-    return hops, exits, inner, start, rng.uniform(1, 9, (4 * cells, 4 * cells))
+    finish = rng.uniform(1, 9, (4 * cells, 4 * cells))
+    return Cells(hops=hops, exits=exits, inner=inner, start=start, finish=finish[0]), finish
 
 
 @settings(deadline=None, max_examples=25)
 @given(cells=st.integers(1, 3), seed=st.integers(0, 10**6), each=st.booleans())
 def test_few_cells_are_toured_at_the_least_cost(cells: int, seed: int, each: bool) -> None:
-    hops, exits, inner, start, finish = problem(cells, seed, symmetric=False)
+    some, finish = problem(cells, seed, symmetric=False)
     if not each:
         finish = np.repeat(finish[:1], 4 * cells, axis=0)
-    cost, order = exact_tour(hops, exits, inner, start, finish, each)
-    tried = best_tour_by_trial(exits, inner, lambda a, b: float(hops[a, b]), start, finish)
+    cost, order = exact_tour(some, finish, each)
+    tried = best_tour_by_trial(
+        some.exits, some.inner, lambda a, b: float(some.hops[a, b]), some.start, finish
+    )
     assert cost == pytest.approx(tried, rel=1e-12)
     assert sorted(order // 4) == list(range(cells))
-    again = tour_cost(order, hops, exits, inner, start, finish[order[0]])
+    again = tour_cost(order, some._replace(finish=finish[order[0]]))
     assert again == pytest.approx(cost, rel=1e-12)
 
 
@@ -45,28 +48,26 @@ def test_many_cells_are_toured_well_and_each_once(fixed: int) -> None:
     """Against the exact tour where that is still to be had; never worse than where it began."""
     ratios = []
     for seed in range(20):
-        hops, exits, inner, start, finish = problem(7, seed, symmetric=False)
-        first = nearest_tour(hops, exits, inner, start)
-        order = good_tour(hops, exits, inner, start, finish[0], first, fixed)
+        some, finish = problem(7, seed, symmetric=False)
+        first = nearest_tour(some)
+        order = good_tour(first, some, fixed)
         assert sorted(order // 4) == list(range(7))
         if fixed:
             assert order[0] == first[0]
-        mine = tour_cost(order, hops, exits, inner, start, finish[0])
-        assert mine <= tour_cost(first, hops, exits, inner, start, finish[0]) + 1e-9
-        ratios.append(mine / exact_tour(hops, exits, inner, start, finish[:1], False)[0])
+        mine = tour_cost(order, some)
+        assert mine <= tour_cost(first, some) + 1e-9
+        ratios.append(mine / exact_tour(some, finish[:1], False)[0])
     assert min(ratios) >= 1 - 1e-12
     if not fixed:
         assert np.mean(ratios) < 1.03
 
 
 def test_two_hundred_cells_are_toured() -> None:
-    hops, exits, inner, start, finish = problem(200, 3)
-    first = nearest_tour(hops, exits, inner, start)
-    order = good_tour(hops, exits, inner, start, finish[0], first, 0)
+    some = problem(200, 3)[0]
+    first = nearest_tour(some)
+    order = good_tour(first, some, 0)
     assert sorted(order // 4) == list(range(200))
-    gain = tour_cost(first, hops, exits, inner, start, finish[0])
-    gain -= tour_cost(order, hops, exits, inner, start, finish[0])
-    assert gain > 0
+    assert tour_cost(order, some) < tour_cost(first, some)
 
 
 def pieces_of(*rows: list[tuple[float, float]]) -> np.ndarray:

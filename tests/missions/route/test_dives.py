@@ -148,7 +148,7 @@ def test_without_splitting_it_says_how_much_fits() -> None:
 def test_a_course_against_too_much_current_is_refused() -> None:
     line_w = np.ones(8)
     line_w[1:4] = np.inf  # eastwards
-    costs = Costs(**{**vars(COSTS), "line_w": line_w})
+    costs = COSTS._replace(line_w=line_w)
     with pytest.raises(PlanError, match=r"line 0 of 4 .* on course 90 deg cannot be flown"):
         _split(_lines(4), 10.0, costs=costs)
 

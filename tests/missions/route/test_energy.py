@@ -130,7 +130,7 @@ def test_power_between_samples_is_near_that_of_its_own_course() -> None:
     np.testing.assert_allclose(near, exact, rtol=3e-3)
 
 
-def test_power_beside_a_course_that_cannot_be_kept_is_infinite() -> None:
+def test_power_next_to_a_course_that_cannot_be_kept_is_infinite() -> None:
     power = np.array([1.0, 2.0, np.inf, 4.0])
     assert power_at(power, math.pi / 4) == pytest.approx(1.5)
     assert power_at(power, math.pi / 2) == 2.0  # on the sample itself
@@ -396,7 +396,5 @@ def test_costs_compile_nothing() -> None:
 
 def test_seconds_stand_for_joules() -> None:
     costs = time_costs(0.2, sway_mps=0.1, heave_mps=0.2)
-    assert costs.line_j(10.0, 1.0) == costs.way_j(10.0, 2.0) == pytest.approx(50.0)
-    assert costs.sway_j(1.0, 0.0) == pytest.approx(10.0 + costs.settle_s)
     assert costs.spot_j(-costs.turn_rate_rad_s) == pytest.approx(1.0 + costs.settle_s)
     assert costs.dive_j(10.0) == costs.dive_s(10.0) == pytest.approx(100.0)

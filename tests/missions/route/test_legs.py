@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from missions.route.joins import COLUMNS, price
 from missions.route.turns import route_through
-from missions.values.costs import Costs, leg_costs, mean_power, prices, time_costs
+from missions.values.costs import Costs, leg_costs, mean_power, time_costs
 from missions.values.legs import Leg, Route
 from tests.oracles_route import lawn, route_cost, route_cost_by_steps, sampled_leg, turn_counts
 
@@ -74,19 +74,16 @@ def test_a_leg_ends_where_its_circle_does(one: Leg) -> None:
 
 def uneven(seed: int, *, closed: bool = False) -> Costs:
     rng = np.random.default_rng(seed)
-    even = time_costs(0.25)
-    values = {name: getattr(even, name) for name in even.__dataclass_fields__}
     way_w = rng.uniform(50, 150, 24)
     if closed:
         way_w[3:6] = np.inf
-    powers = {
-        "line_w": rng.uniform(50, 150, 36),
-        "way_w": way_w,
-        "spot_w": 40.0,
-        "arc_extra_w": 30.0,
-        "sway_w": rng.uniform(50, 150, 12),
-    }
-    return Costs(**(values | powers))
+    return time_costs(0.25)._replace(
+        line_w=rng.uniform(50, 150, 36),
+        way_w=way_w,
+        spot_w=40.0,
+        arc_extra_w=30.0,
+        sway_w=rng.uniform(50, 150, 12),
+    )
 
 
 @settings(deadline=None)
@@ -113,7 +110,7 @@ def test_a_route_costs_what_its_legs_do(many: list[Leg], seed: int) -> None:
         ]
     ).reshape(-1, COLUMNS)  # fmt: skip
     expected = route_cost(Route(legs=tuple(ways)), costs)[0]
-    assert price(prices(costs), table) == pytest.approx(expected, rel=1e-9)
+    assert price(costs, table) == pytest.approx(expected, rel=1e-9)
 
 
 def test_time_is_what_even_costs_count() -> None:

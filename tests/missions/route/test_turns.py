@@ -132,15 +132,12 @@ def test_auto_is_as_cheap_as_any_way_of_turning(
 
 
 def uneven_costs(rng: np.random.Generator, sway_w: float) -> Costs:
-    even = time_costs(0.2)
-    values = {name: getattr(even, name) for name in even.__dataclass_fields__}
-    powers = {
-        "line_w": rng.uniform(50, 150, 36),
-        "way_w": rng.uniform(50, 150, 36),
-        "spot_w": float(rng.uniform(30, 100)),
-        "sway_w": sway_w * rng.uniform(50, 150, 36),
-    }
-    return Costs(**(values | powers))
+    return time_costs(0.2)._replace(
+        line_w=rng.uniform(50, 150, 36),
+        way_w=rng.uniform(50, 150, 36),
+        spot_w=float(rng.uniform(30, 100)),
+        sway_w=sway_w * rng.uniform(50, 150, 36),
+    )
 
 
 @pytest.mark.parametrize("turns", MODES)
@@ -205,9 +202,7 @@ def test_what_has_no_room_is_flown_otherwise_and_told(capsys: pytest.CaptureFixt
 
 
 def test_a_vehicle_without_sway_never_steps() -> None:
-    even = time_costs(0.2)
-    values = {name: getattr(even, name) for name in even.__dataclass_fields__}
-    costs = Costs(**(values | {"sway_w": np.full(4, np.inf)}))
+    costs = time_costs(0.2)._replace(sway_w=np.full(4, np.inf))
     tight = Ways(multipolygon(box(0.0, -0.1, 10.0, 4.1)))
     for turns in MODES:
         route = route_through(lawn(5, 10, 1.0), 0.5, 0.5, ways=tight, costs=costs, turns=turns)
