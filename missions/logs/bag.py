@@ -223,7 +223,8 @@ def _in_ros(ned_from_body: RigidTransform, velocity_frd: Array) -> tuple[Array, 
 
 def _nanoseconds(time_s: Array) -> list[int]:
     """Times, (N,) seconds, as whole nanoseconds."""
-    return np.rint(time_s * _NS_PER_S).astype(np.int64).tolist()
+    stamps: list[int] = np.rint(time_s * _NS_PER_S).astype(np.int64).tolist()
+    return stamps
 
 
 class _Ros:
@@ -312,7 +313,7 @@ class _Ros:
 
     def fix(self, stamp_ns: int, frame: str, geodetic: Array, variances_enu: Array | None) -> Any:
         """Latitude, longitude (degrees) and height above the ellipsoid, (3,)."""
-        known = variances_enu is not None
+        variances = np.zeros(3) if variances_enu is None else variances_enu
         return self._make(
             FIX,
             header=self._header(stamp_ns, frame),
@@ -320,8 +321,8 @@ class _Ros:
             latitude=float(geodetic[0]),
             longitude=float(geodetic[1]),
             altitude=float(geodetic[2]),
-            position_covariance=np.diag(variances_enu if known else np.zeros(3)).ravel(),
-            position_covariance_type=_DIAGONAL if known else _UNKNOWN,
+            position_covariance=np.diag(variances).ravel(),
+            position_covariance_type=_UNKNOWN if variances_enu is None else _DIAGONAL,
         )
 
     def range(self, stamp_ns: int, frame: str, range_m: float) -> Any:

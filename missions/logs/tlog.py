@@ -144,4 +144,4 @@ def _table(message: Message, records: bytes) -> LogTable:
     columns[RECORDED] *= 1e-6
     for name in message.payload.names or ():
         columns[name] = rows["payload"][name].astype(np.float64)
-    return LogTable(name=message.name, columns=columns, kinds=dict.fromkeys(columns, "d"), texts={})
+    return LogTable(name=message.name, columns=columns, texts={})
