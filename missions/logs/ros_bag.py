@@ -6,6 +6,7 @@ JointState. Orientations and velocities are ENU and FLU (REP-103) unless the fra
 `ned`, as in COLA2 and Stonefish.
 """
 
+import bz2
 import math
 import struct
 from collections import Counter
@@ -22,7 +23,6 @@ from alice_survey.base.contents import one_line
 from alice_survey.base.errors import NavigationError
 from alice_survey.base.executor import progress
 from alice_survey.base.frames import Array, Datum, attitude_from_rotation
-from missions.logs.bag_chunks import bounded_chunks
 from missions.logs.dive import DATED_AFTER_S, LoggedDive, Signal, cleaned, usable_positions
 from missions.logs.ros_frames import flipped_body, flipped_quaternion, flipped_world
 
@@ -55,6 +55,9 @@ _NOT_ALTITUDE = ("beam", "front", "forward", "fls", "obstacle")
 
 _DENSITY_KG_M3, _SURFACE_PA, _GRAVITY_MPS2 = 1025.0, 101325.0, 9.80665
 """What makes a depth of a pressure; the standard atmosphere (ISO 2533)."""
+LARGEST_BYTES = 256 << 20
+"""Largest chunk of a bag, unpacked, since a kilobyte of bz2 or zstd can hold a gigabyte. Recorders
+close theirs after 1 to 4 MB, or after one message."""
 _UNIT = 0.05
 """How far from 1 the length of a quaternion may be."""
 _SIGMAS: Mapping[str, tuple[tuple[str, ...], float]] = {
@@ -145,7 +148,7 @@ def _opened(path: Path) -> Iterator["AnyReader"]:
         RecursionError,
     )  # fmt: skip
     try:
-        with bounded_chunks(), AnyReader([path], default_typestore=store) as reader:
+        with _bounded_chunks(), AnyReader([path], default_typestore=store) as reader:
             yield reader
     except NavigationError:
         raise
@@ -159,6 +162,41 @@ def _opened(path: Path) -> Iterator["AnyReader"]:
             f"{path}: cannot be read as a bag of ROS, is it cut off? ({reason}); `rosbag reindex` "
             "or `ros2 bag reindex` repairs a bag whose recording was killed"
         ) from None
+
+
+@contextmanager
+def _bounded_chunks() -> Iterator[None]:
+    """Meanwhile rosbags unpacks no chunk of over `LARGEST_BYTES`: it raises ValueError.
+
+    It has no setting for that: its tables of what unpacks a chunk are changed, and put back.
+    """
+    import lz4.frame  # type: ignore[import-untyped]
+    from rosbags.rosbag1.reader import decompressors as of_ros1
+    from rosbags.rosbag2.storage_mcap import DECOMPRESSORS as OF_MCAP
+    from rosbags.rosbag2.storage_mcap import zstd  # type: ignore[attr-defined]  # by Python's age
+
+    lz4_frames = _bounded(lambda: lz4.frame.LZ4FrameDecompressor())
+    zstd_frames = _bounded(lambda: zstd.ZstdDecompressor())
+    before = dict(of_ros1), dict(OF_MCAP)
+    of_ros1.update(bz2=_bounded(bz2.BZ2Decompressor), lz4=lz4_frames)
+    OF_MCAP.update(lz4=lambda data, _: lz4_frames(data), zstd=lambda data, _: zstd_frames(data))
+    try:
+        yield
+    finally:
+        of_ros1.update(before[0])
+        OF_MCAP.update(before[1])
+
+
+def _bounded(decompressor: Callable[[], Any]) -> Callable[[bytes], bytes]:
+    def unpack(data: bytes) -> bytes:
+        unpacked: bytes = decompressor().decompress(data, LARGEST_BYTES + 1)
+        if len(unpacked) > LARGEST_BYTES:
+            raise ValueError(
+                f"a chunk of {len(data)} bytes unpacks to over {LARGEST_BYTES >> 20} MiB"
+            )
+        return unpacked
+
+    return unpack
 
 
 def _choose(path: Path, present: Sequence[_Topic], asked: Mapping[str, str]) -> dict[str, _Topic]:
