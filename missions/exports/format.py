@@ -12,7 +12,7 @@ from missions.exports.geometry import lat_lon
 from missions.exports.mavlink import Item, mission_items
 from missions.exports.mount import CameraMount, mount_of
 from missions.exports.options import Options, line_tolerance_m
-from missions.exports.waypoints import Waypoint, all_waypoints
+from missions.exports.waypoints import Waypoint, waypoints
 from missions.values.plan_file import Plan
 
 
@@ -36,12 +36,13 @@ class Export:
         Raises:
             PlanError: the plan's depths do not fit its lines.
         """
-        return all_waypoints(self.plan, self.mount, self.options.turn_rate_rad_s)
+        rate_rad_s = self.options.turn_rate_rad_s
+        return [waypoints(self.plan, dive, self.mount, rate_rad_s) for dive in self.plan.dives]
 
     @cached_property
     def tolerance_m(self) -> float:
         """How far off a line's ends the vehicle may be."""
-        return line_tolerance_m(self.plan, self.rig, self.options)
+        return line_tolerance_m(self.plan, self.rig)
 
     @cached_property
     def home_lat_lon_deg(self) -> tuple[float, float]:

@@ -31,9 +31,20 @@ def rings_ne(polygon: Polygon) -> Iterator[Array]:
         yield corners
 
 
-def polygons(geometry: MultiPolygon) -> list[Polygon]:
-    """The parts, in order."""
-    return list(geometry.geoms)
+def dive_of_line(plan: Plan) -> dict[int, int]:
+    """Number of the dive, from 1 on, that flies each line."""
+    return {
+        line: number
+        for number, dive in enumerate(plan.dives, start=1)
+        for line in range(dive.first_line, dive.last_line + 1)
+    }
+
+
+def line_depths_m(plan: Plan, index: int) -> tuple[float, ...]:
+    """Depth of the glass at each station of a line."""
+    if plan.line_depths_m:
+        return plan.line_depths_m[index]
+    return (plan.seafloor_depth_m - plan.altitude_m,) * plan.lines[index].stations
 
 
 def grown(geometry: MultiPolygon, by_m: float) -> list[Polygon]:

@@ -9,7 +9,6 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from alice_survey.vehicle.limits import SPOT_RAD_S
 from missions.exports.waypoints import Waypoint
 from missions.values.plan_file import Plan
 
@@ -37,7 +36,7 @@ class Item:
 
 
 def mission_items(
-    plan: Plan, points: Sequence[Waypoint], tolerance_m: float, turn_rate_rad_s: float = SPOT_RAD_S
+    plan: Plan, points: Sequence[Waypoint], tolerance_m: float, turn_rate_rad_s: float
 ) -> list[Item]:
     """All items of a dive, without home.
 

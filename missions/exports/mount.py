@@ -10,12 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alice_survey.base.config import CameraConfig
 from alice_survey.base.frames import Array
 from camera_calib.rig import Rig
 from missions.values.footprint import glass_point_cam
-
-_ALTIMETER_BODY_M: tuple[float, float, float] = CameraConfig().dvl_position_body_m
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,9 +62,7 @@ class CameraMount:
         )
 
 
-def mount_of(
-    rig: Rig, altimeter_body_m: tuple[float, float, float] = _ALTIMETER_BODY_M
-) -> CameraMount:
+def mount_of(rig: Rig, altimeter_body_m: tuple[float, float, float]) -> CameraMount:
     """The mount of a rig.
 
     Args:

@@ -9,7 +9,7 @@ from camera_calib.rig import Rig
 from missions.values.footprint import common_swath
 from missions.values.plan_file import Plan
 
-_LEAST_TOLERANCE_M = 0.12
+LEAST_TOLERANCE_M = 0.12
 """The cross-track error that the paper's vehicle holds with its improved controller: a vehicle set
 to pass a place more closely turns back for it."""
 
@@ -25,13 +25,10 @@ class Options:
     camera_on: str = "camera_trigger/enable"
     """COLA2: the service (without arguments) that starts pictures."""
     camera_off: str = "camera_trigger/disable"
-    least_tolerance_m: float = _LEAST_TOLERANCE_M
     turn_rate_rad_s: float = SPOT_RAD_S
     """Rate of turns on the spot, which way-points wait for."""
 
     def __post_init__(self) -> None:
-        if self.least_tolerance_m <= 0 or self.pixel_um <= 0:
-            raise PlanError("a tolerance and a pixel are larger than 0")
         if not self.camera_on or not self.camera_off:
             raise PlanError("name the services that switch pictures on and off")
 
@@ -45,7 +42,7 @@ def options_of(camera: CameraConfig, plan: PlanConfig) -> Options:
     )
 
 
-def line_tolerance_m(plan: Plan, rig: Rig, options: Options) -> float:
+def line_tolerance_m(plan: Plan, rig: Rig) -> float:
     """How far off a line's ends the vehicle may be with the survey still complete.
 
     Half a step along the line, so that its last picture is taken; across it, half of what
@@ -55,4 +52,4 @@ def line_tolerance_m(plan: Plan, rig: Rig, options: Options) -> float:
     stereo = common_swath(rig, plan.altitude_m, plan.station_spacing_m)
     passes = max(1, int(2 * stereo.half_across_m / plan.line_spacing_m + 1e-9))
     spare_m = (2 * stereo.half_across_m - passes * plan.line_spacing_m) / 2
-    return max(options.least_tolerance_m, min(plan.station_spacing_m / 2, spare_m))
+    return max(LEAST_TOLERANCE_M, min(plan.station_spacing_m / 2, spare_m))

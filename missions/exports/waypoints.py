@@ -9,7 +9,6 @@ import numpy as np
 
 from alice_survey.base.errors import PlanError
 from alice_survey.base.frames import Array
-from alice_survey.vehicle.limits import SPOT_RAD_S
 from missions.exports.geometry import chords
 from missions.exports.mount import CameraMount
 from missions.values.costs import SETTLE_S
@@ -36,7 +35,6 @@ class Waypoint:
     """Index of the plan's line that ends, goes on or begins here, else -1."""
     camera: Literal["on", "off"] | None
     """What to switch pictures to on arrival."""
-    glass_ne_m: tuple[float, float]
     vehicle_ne_m: tuple[float, float]
     """North and east of the vehicle's reference point."""
     latitude_deg: float
@@ -51,7 +49,6 @@ class Waypoint:
     altitude_m: float
     """Height of the altimeter above the sea floor."""
     glass_depth_m: float
-    glass_altitude_m: float
     speed_mps: float
     hold_s: float
     """How long to stay: to turn and to settle; 0 where it flies on."""
@@ -69,10 +66,7 @@ class _Point:
 
 
 def waypoints(
-    plan: Plan,
-    dive: Dive,
-    mount: CameraMount,
-    turn_rate_rad_s: float = SPOT_RAD_S,
+    plan: Plan, dive: Dive, mount: CameraMount, turn_rate_rad_s: float
 ) -> tuple[Waypoint, ...]:
     """The way-points of a dive, from the surface to the surface.
 
@@ -107,7 +101,6 @@ def waypoints(
                 kind=point.kind,
                 line=point.line,
                 camera=point.camera,
-                glass_ne_m=point.place_ne_m,
                 vehicle_ne_m=(float(vehicle_ne[i, 0]), float(vehicle_ne[i, 1])),
                 latitude_deg=float(geodetic[i, 0]),
                 longitude_deg=float(geodetic[i, 1]),
@@ -117,21 +110,11 @@ def waypoints(
                 depth_m=0.0 if at_surface else mount.vehicle_depth_m(float(glass_depths[i])),
                 altitude_m=mount.altimeter_altitude_m(plan.altitude_m),
                 glass_depth_m=0.0 if at_surface else float(glass_depths[i]),
-                glass_altitude_m=plan.altitude_m,
                 speed_mps=plan.speed_mps,
                 hold_s=point.hold_s,
             )
         )
     return tuple(result)
-
-
-def all_waypoints(
-    plan: Plan,
-    mount: CameraMount,
-    turn_rate_rad_s: float = SPOT_RAD_S,
-) -> list[tuple[Waypoint, ...]]:
-    """The way-points of each dive."""
-    return [waypoints(plan, dive, mount, turn_rate_rad_s) for dive in plan.dives]
 
 
 def _points(

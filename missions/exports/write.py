@@ -79,7 +79,7 @@ def export_report(
     """
     path = plan_path / "plan.json" if plan_path.is_dir() else plan_path
     plan = read_plan(path)
-    survey = _config_beside(path)
+    survey = _config_of_plan(path)
     rig = design_rig(survey.camera, survey.water)
     options = options_of(survey.camera, survey.plan)
     options = replace(
@@ -89,7 +89,7 @@ def export_report(
     )
     folder = path.parent / "exports" if out is None else out
     files = write_exports(folder, plan, rig, formats=formats, options=options)
-    tolerance_m = line_tolerance_m(plan, rig, options)
+    tolerance_m = line_tolerance_m(plan, rig)
     text = "\n".join(
         [
             f"{folder}: {counted(len(files), 'file')} of {counted(plan.stations, 'station')} in "
@@ -130,7 +130,7 @@ def _write_about(path: Path, export: Export, files: Mapping[Path, str]) -> None:
         temporary.write_text("\n".join(text) + "\n", encoding="utf-8", newline="\n")
 
 
-def _config_beside(path: Path) -> SurveyConfig:
+def _config_of_plan(path: Path) -> SurveyConfig:
     """Camera, water and limits that a plan was made with."""
     stage = read_stage(path.parent)
     settings = {} if stage is None else stage.settings

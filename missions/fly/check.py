@@ -20,6 +20,7 @@ from missions.coverage.geofiles import write_coverage_tif, write_holes
 from missions.coverage.holes import Hole, find_holes
 from missions.coverage.stations import plan_pattern, stations_of_plan
 from missions.exports.options import options_of
+from missions.exports.write import counted, write_exports
 from missions.fly.monte_carlo import MonteCarlo
 from missions.fly.monte_carlo import monte_carlo as fly_often
 from missions.fly.refly import refly_plan
@@ -90,8 +91,10 @@ def check_log(
         plan.area, rig, record.stations, pattern, cell_m=planned.grid.cell_m, executor=executor
     )
     if flown.blind:
-        they = "station looks" if flown.blind == 1 else "stations look"
-        warn(f"{flown.blind} {they} past the sea floor: counted as seeing nothing")
+        warn(
+            f"{counted(flown.blind, 'station')} without the sea floor in view: counted as seeing "
+            "nothing"
+        )
     return Check(
         plan=plan, rig=rig, record=record, planned=planned, flown=flown, holes=find_holes(flown)
     )
@@ -221,8 +224,6 @@ def _write_refly(
     settings: PlanConfig,
 ) -> dict[str, Any]:
     """Write the plan of the holes as a workspace to fly in."""
-    from missions.exports.write import write_exports
-
     values = plan.to_json()
     text = json.dumps(values, sort_keys=True)
     stage = Stage(
@@ -262,7 +263,7 @@ def _draw_flights(folder: Path, plan: Plan, result: MonteCarlo) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     draw_risk(
         folder / "hole_probability.png", plan.area, result.planned.grid, result.hole_probability,
-        f"{plan.name}: holes in {result.flights} simulated flight{_s(result.flights)}",
+        f"{plan.name}: holes in {counted(result.flights, 'simulated flight')}",
         _flights_text(result).strip(),
     )  # fmt: skip
 
@@ -271,7 +272,7 @@ def _check_text(check: Check) -> str:
     record, planned, flown = check.record, check.planned, check.flown
     pattern = flown.pattern
     pictures = pattern.passes * pattern.pictures
-    asked = f"{pattern.passes} line{_s(pattern.passes)}, {pictures} pictures of each camera"
+    asked = f"{counted(pattern.passes, 'line')}, {pictures} pictures of each camera"
     rows = [
         ("in at least one picture", planned.covered_share, flown.covered_share),
         ("in stereo", planned.stereo_share, flown.stereo_share),
@@ -287,7 +288,15 @@ def _check_text(check: Check) -> str:
             f"  left out: {count} ({count / record.triggered:.1%}) {reason}"
             for reason, count in record.left_out.items()
         ),
-        *_way_rows(record),
+        *(
+            [
+                f"  on the way down and up: {record.on_way} "
+                f"({record.on_way / record.triggered:.1%}), before the first and after the last "
+                "picture on a line"
+            ]
+            if record.on_way
+            else []
+        ),
         *(f"  {note}" for note in record.notes),
         f"{check.plan.name}: {flown.area_m2:.1f} m2, cameras {', '.join(flown.cameras)} "
         f"({check.rig.source}), judged every {100 * flown.grid.cell_m:.1f} cm",
@@ -301,22 +310,13 @@ def _check_text(check: Check) -> str:
     return "\n".join(lines)
 
 
-def _way_rows(record: DiveRecord) -> list[str]:
-    if not record.on_way:
-        return []
-    return [
-        f"  on the way down and up: {record.on_way} ({record.on_way / record.triggered:.1%}), "
-        "before the first and after the last picture on a line"
-    ]
-
-
 def _hole_rows(holes: Sequence[Hole]) -> list[str]:
     if not holes:
         return ["no holes"]
     whole = sum(hole.area_m2 for hole in holes)
     unseen = sum(hole.unseen_m2 for hole in holes)
     rows = [
-        f"{len(holes)} hole{_s(len(holes))}, {whole:.2f} m2 short of that overlap, of which "
+        f"{counted(len(holes), 'hole')}, {whole:.2f} m2 short of that overlap, of which "
         f"{unseen:.2f} m2 in no picture; worst first:",
         f"  {'':>3}  {'area m2':>8}  {'unseen m2':>9}  {'size m':>13}  {'latitude':>12}  "
         f"{'longitude':>13}  {'north m':>8}  {'east m':>8}",
@@ -336,27 +336,22 @@ def _hole_rows(holes: Sequence[Hole]) -> list[str]:
 
 def _refly_text(again: dict[str, Any]) -> str:
     return (
-        f"\nto fly the holes again: {again['lines']} line{_s(again['lines'])}, "
-        f"{again['stations']} station{_s(again['stations'])}, "
-        f"{again['length_m']:.0f} m, {again['duration_s'] / 60:.0f} min in {again['dives']} "
-        f"dive{_s(again['dives'])}; then {again['coverage']:.2%} of them are at that overlap: "
-        f"{again['folder']}"
+        f"\nto fly the holes again: {counted(again['lines'], 'line')}, "
+        f"{counted(again['stations'], 'station')}, "
+        f"{again['length_m']:.0f} m, {again['duration_s'] / 60:.0f} min in "
+        f"{counted(again['dives'], 'dive')}; then {again['coverage']:.2%} of them are at that "
+        f"overlap: {again['folder']}"
     )
 
 
 def _flights_text(result: MonteCarlo) -> str:
-    share = result.to_json()["share_at_overlap"]
-    seen = result.to_json()["covered_share"]
-    worst = float(result.to_json()["greatest_hole_probability"])
+    data = result.to_json()
+    share, seen = data["share_at_overlap"], data["covered_share"]
     complete = result.endings.get("complete", 0)
     return (
-        f"\n{result.flights} simulated flight{_s(result.flights)}, {complete} complete: at the "
+        f"\n{counted(result.flights, 'simulated flight')}, {complete} complete: at the "
         f"overlap asked for {share['p50']:.2%} ({share['p05']:.2%} in the worst twentieth), in at "
         f"least one picture {seen['p50']:.2%} ({seen['p05']:.2%});\n"
         f"the place that is missed most is missed in "
-        f"{math.ceil(100 * worst)} % of flights"
+        f"{math.ceil(100 * data['greatest_hole_probability'])} % of flights"
     )
-
-
-def _s(count: int) -> str:
-    return "" if count == 1 else "s"

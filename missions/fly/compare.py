@@ -10,7 +10,8 @@ the vehicle", eq. los_heading), not the left port's glass as in `fly`.
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -142,9 +143,6 @@ class Trace:
     cross_m: Array
     """(T,) true, to starboard of the route."""
     roll_deg: Array
-    surge_mps: Array
-    line: Array
-    """(T,) -1 between lines."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,20 +166,8 @@ class Case:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FlightJob:
-    """One flight to be made."""
-
-    settings: FlightSettings
-    plan: Plan
-    variant: Variant
-    case: Case
-    seed: int
-    traced: bool
-
-
-@dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What a job gives."""
+    """What one flight gives."""
 
     variant: str
     case: Case
@@ -259,25 +245,22 @@ def fly_all(
         executor: where tasks run.
         variants: what flies.
     """
-    jobs = [
-        FlightJob(
-            settings=settings, plan=plan, variant=variant, case=case, seed=seed,
-            traced=seed == seeds[0],
-        )
-        for case in cases for variant in variants for seed in seeds
-    ]  # fmt: skip
-    yield from executor.map(fly_job, jobs, label="flights")
+    fly = partial(fly_one, settings, plan, seeds[0])
+    yield from executor.map(fly, list(itertools.product(cases, variants, seeds)), label="flights")
 
 
-def fly_job(job: FlightJob) -> Outcome:
-    """Make one flight."""
-    setup, flown, flight = fly_variant(job.settings, job.plan, job.variant, job.case, job.seed)
+def fly_one(
+    settings: FlightSettings, plan: Plan, traced_seed: int, which: tuple[Case, Variant, int]
+) -> Outcome:
+    """Make one flight; that of one seed keeps its trace."""
+    case, variant, seed = which
+    setup, flown, flight = fly_variant(settings, plan, variant, case, seed)
     return Outcome(
-        variant=job.variant.name,
-        case=job.case,
-        seed=job.seed,
+        variant=variant.name,
+        case=case,
+        seed=seed,
         figures=figures_of(flight, setup.vehicle),
-        trace=_trace(flight, flown) if job.traced else None,
+        trace=_trace(flight, flown) if seed == traced_seed else None,
         ending=flight.ending,
         look_ahead_m=float(setup.guidance.look_ahead_m),
     )
@@ -407,12 +390,9 @@ def roll_moment(vehicle: Vehicle, flown: Flown, turns: Sequence[slice]) -> Array
 
 def summarised(outcomes: Sequence[Outcome]) -> Summary:
     """Mean and extremes of each figure over flights, and the standard deviation of two or more."""
-    columns = {
-        name: np.array([asdict(outcome.figures)[name] for outcome in outcomes])
-        for name in FlightFigures.__dataclass_fields__
-    }
     summary = {}
-    for name, values in columns.items():
+    for name in FlightFigures.__dataclass_fields__:
+        values = np.array([getattr(outcome.figures, name) for outcome in outcomes])
         summary[name] = {
             "mean": float(values.mean()),
             "least": float(values.min()),
@@ -431,8 +411,6 @@ def _trace(flight: Flight, flown: Flown) -> Trace:
         true_ne=flight.glass_ned[rows, :2],
         cross_m=flight.route_error[rows],
         roll_deg=np.rad2deg(flight.attitude_rad[rows, 0]),
-        surge_mps=true_velocity(flown)[rows, 0],
-        line=flight.line[rows],
     )
 
 

@@ -121,7 +121,7 @@ def line_spans(flight: Flight) -> list[tuple[float, float]]:
 
 
 def true_current(flown: Flown) -> Array:
-    """(T, 2) current at the vehicle towards north and east: over ground less through the water."""
+    """(T, 2) current at the vehicle towards north and east: over ground minus through the water."""
     through = Rotation.from_quat(flown.truth[:, 3:7]).apply(flown.state[:, 7:10])
     return np.asarray((flown.truth[:, 7:10] - through)[:, :2])
 
@@ -227,41 +227,46 @@ def _only(track: Array, rows: Array) -> tuple[Array, Array]:
     return kept[:, 1], kept[:, 0]
 
 
-def _draw_cross_track(axes: Axes, flight: Flight, cross: Array) -> None:
-    some = thin(len(cross))
-    t = flight.truth.time_s[some]
-    believed = flight.believed_cross_track
-    axes.plot(t, cross[some], color=TRUE, lw=1.0, label="true")
-    axes.plot(t, believed[some], color=NAV, lw=0.9, label="believed")
+def _plot(
+    axes: Axes, flight: Flight, values: Array, colour: str, label: str | None = None, **style: float
+) -> None:
+    """A curve of values, (T,), over the time of the flight."""
+    some = thin(len(values))
+    axes.plot(flight.truth.time_s[some], values[some], color=colour, label=label, **style)
+
+
+def _zero(axes: Axes, label: str) -> None:
+    """A line at zero, and the name of what deviates from it."""
     axes.axhline(0, color="#7f8c8d", lw=0.6)
-    axes.set_ylabel("cross-track, m")
+    axes.set_ylabel(label)
+
+
+def _draw_cross_track(axes: Axes, flight: Flight, cross: Array) -> None:
+    believed = flight.believed_cross_track
+    _plot(axes, flight, cross, TRUE, "true", lw=1.0)
+    _plot(axes, flight, believed, NAV, "believed", lw=0.9)
+    _zero(axes, "cross-track, m")
     known = not np.isnan(cross).all()
     said = f"on lines {rms(cross):.3f} m rms true, {rms(believed):.3f} m believed"
     _legend(axes, said if known else "no line was reached")
 
 
 def _draw_attitude(strips: list[Axes], flight: Flight, heading: Array) -> None:
-    some = thin(len(heading))
-    t = flight.truth.time_s[some]
-    attitude = np.rad2deg(flight.attitude_rad[some])
-    degrees = np.rad2deg(heading)
-    strips[0].plot(t, degrees[some], color=TRUE, lw=0.9)
-    strips[0].axhline(0, color="#7f8c8d", lw=0.6)
-    strips[0].set_ylabel("heading error, °")
+    degrees, attitude = np.rad2deg(heading), np.rad2deg(flight.attitude_rad)
+    _plot(strips[0], flight, degrees, TRUE, lw=0.9)
+    _zero(strips[0], "heading error, °")
     if not np.isnan(heading).all():
         strips[0].set_title(f"on lines {rms(degrees):.2f}° rms", loc="left", fontsize=8.5, pad=3)
-    strips[1].plot(t, attitude[:, 0], color=_ROLL, lw=0.8, label="roll")
-    strips[1].plot(t, attitude[:, 1], color=_PITCH, lw=0.8, label="pitch")
-    strips[1].axhline(0, color="#7f8c8d", lw=0.6)
-    strips[1].set_ylabel("attitude, °")
+    _plot(strips[1], flight, attitude[:, 0], _ROLL, "roll", lw=0.8)
+    _plot(strips[1], flight, attitude[:, 1], _PITCH, "pitch", lw=0.8)
+    _zero(strips[1], "attitude, °")
     _legend(strips[1])
 
 
 def _draw_altitude(axes: Axes, flight: Flight) -> None:
-    some = thin(len(flight.line))
     following = flight.flown.report[:, PHASE] == FOLLOW
     altitude, wanted = flight.log.altitude_m, flight.plan.altitude_m
-    axes.plot(flight.truth.time_s[some], altitude[some], color=NAV, lw=0.7, label="as measured")
+    _plot(axes, flight, altitude, NAV, "as measured", lw=0.7)
     axes.axhline(wanted, color=PLAN, lw=1.5, label="planned")
     axes.set_ylabel("altitude, m")
     off = np.abs(altitude[following] - wanted)
@@ -273,18 +278,16 @@ def _draw_altitude(axes: Axes, flight: Flight) -> None:
 
 def _draw_navigation_error(strips: list[Axes], flight: Flight) -> None:
     some = thin(len(flight.line))
-    t = flight.truth.time_s[some]
     off = flight.log.position_ned - flight.truth.ned_from_body.translation
     columns = navigation.LOG_COLUMNS
     for axis, (axes, name) in enumerate(zip(strips, ("north", "east"), strict=True)):
-        sigma = flight.flown.navigation[some, columns.index(f"sigma_{name}_m")]
-        band = _SPREAD_SIGMAS * sigma
+        band = _SPREAD_SIGMAS * flight.flown.navigation[some, columns.index(f"sigma_{name}_m")]
         axes.fill_between(
-            t, -band, band, color=NAV, alpha=0.18, lw=0, label=f"±{_SPREAD_SIGMAS:g} logged sigmas"
-        )
-        axes.plot(t, off[some, axis], color=TRUE, lw=1.0, label="believed minus true")
-        axes.axhline(0, color="#7f8c8d", lw=0.6)
-        axes.set_ylabel(f"{name} error, m")
+            flight.truth.time_s[some], -band, band, color=NAV, alpha=0.18, lw=0,
+            label=f"±{_SPREAD_SIGMAS:g} logged sigmas",
+        )  # fmt: skip
+        _plot(axes, flight, off[:, axis], TRUE, "believed minus true", lw=1.0)
+        _zero(axes, f"{name} error, m")
     _legend(strips[0], "navigation")
 
 
@@ -303,26 +306,21 @@ def _draw_speeds(axes: Axes, flight: Flight, speed: Array) -> None:
 
 
 def _draw_surge(axes: Axes, flight: Flight, surge: Array, speed: Array) -> None:
-    some = thin(len(speed))
-    t = flight.truth.time_s[some]
-    axes.plot(t, speed[some], color="#aab7b8", lw=0.8, label="speed over ground")
-    axes.plot(t, surge[some], color=TRUE, lw=0.9, label="surge")
-    wanted = flight.flown.report[some, WANTED_SURGE]
-    axes.plot(t, wanted, color=NAV, lw=0.9, label="wanted surge of the followed point")
+    wanted = flight.flown.report[:, WANTED_SURGE]
+    _plot(axes, flight, speed, "#aab7b8", "speed over ground", lw=0.8)
+    _plot(axes, flight, surge, TRUE, "surge", lw=0.9)
+    _plot(axes, flight, wanted, NAV, "wanted surge of the followed point", lw=0.9)
     axes.set_ylabel("speed, m/s")
     _legend(axes)
 
 
 def _draw_roll(axes: Axes, flight: Flight) -> None:
-    some = thin(len(flight.line))
-    t = flight.truth.time_s[some]
     roll = np.rad2deg(flight.attitude_rad[:, 0])
     turning = (flight.flown.report[:, PHASE] == FOLLOW) & (flight.line < 0)
     in_turns = np.where(turning, roll, np.nan)
-    axes.plot(t, roll[some], color=_ROLL, lw=0.7, alpha=0.45)
-    axes.plot(t, in_turns[some], color=_ROLL, lw=1.0)
-    axes.axhline(0, color="#7f8c8d", lw=0.6)
-    axes.set_ylabel("roll, °")
+    _plot(axes, flight, roll, _ROLL, lw=0.7, alpha=0.45)
+    _plot(axes, flight, in_turns, _ROLL, lw=1.0)
+    _zero(axes, "roll, °")
     if turning.any():
         worst = float(np.abs(roll[turning]).max())
         title = f"between lines {rms(in_turns):.1f}° rms, {worst:.1f}° at most"
@@ -331,22 +329,18 @@ def _draw_roll(axes: Axes, flight: Flight) -> None:
 
 def _draw_thrusters(axes: Axes, flight: Flight, names: list[str]) -> None:
     """Speeds of some thrusters; their limits as dashes where these are near, else in words."""
-    some = thin(len(flight.line))
-    t = flight.truth.time_s[some]
     speeds = rpm_of(flight.flown)
     limits = {u.name: 60.0 * u.most_rps for u in vehicle(flight.vehicle).thrusters}
-    order = [u.name for u in vehicle(flight.vehicle).thrusters]
     reached = max(float(np.abs(speeds[name]).max()) for name in names)
     for name in names:
-        colour = _THRUSTERS[order.index(name) % len(_THRUSTERS)]
-        axes.plot(t, speeds[name][some], color=colour, lw=0.7, label=name, alpha=0.85)
+        colour = _THRUSTERS[list(limits).index(name) % len(_THRUSTERS)]
+        _plot(axes, flight, speeds[name], colour, name, lw=0.7, alpha=0.85)
     limit = min(limits[name] for name in names)
-    axes.axhline(0, color="#7f8c8d", lw=0.6)
+    _zero(axes, "rpm")
     for end in (-limit, limit):
         axes.axhline(end, color="#c0392b", lw=0.8, ls="--")
     most = 1.08 * limit if reached > 0.5 * limit else max(1.15 * reached, 0.05 * limit)
     axes.set_ylim(-most, most)
-    axes.set_ylabel("rpm")
     _legend(axes, f"speed of thrusters, limits ±{limit:.0f}")
 
 
@@ -376,11 +370,8 @@ def _draw_power(axes: Axes, flight: Flight) -> None:
 
 
 def _draw_current(axes: Axes, flight: Flight) -> None:
-    some = thin(len(flight.line))
-    t = flight.truth.time_s[some]
-    current = true_current(flight.flown)[some]
+    current = true_current(flight.flown)
     for axis, (name, colour) in enumerate((("north", TRUE), ("east", NAV))):
-        axes.plot(t, current[:, axis], color=colour, lw=1.0, label=f"towards {name}")
-    axes.axhline(0, color="#7f8c8d", lw=0.6)
-    axes.set_ylabel("current, m/s")
+        _plot(axes, flight, current[:, axis], colour, f"towards {name}", lw=1.0)
+    _zero(axes, "current, m/s")
     _legend(axes)

@@ -17,7 +17,7 @@ from camera_calib.rig import Rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import plan_pattern, stations_of_flight
 from missions.fly.flight_route import stations_of_dives
-from missions.logs.bag import BagRecord, Samples
+from missions.logs.bag import BagRecord
 from missions.values.flight import Flight, rms
 
 _RANGES = ("range_1_m", "range_2_m", "range_3_m", "range_4_m")
@@ -80,7 +80,8 @@ def bag_record(flight: Flight) -> BagRecord:
         thrusters=flown.thrusters,
         rpm=_RPM * flown.rps[some],
         power_w=flown.power_w[some],
-        beam_m=Samples(time_s=flown.time_s[heard], values=ranges[heard]),
+        beam_time_s=flown.time_s[heard],
+        beam_m=ranges[heard],
         notes={"ending": flight.ending},
     )
 

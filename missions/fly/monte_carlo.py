@@ -6,8 +6,8 @@ is made days before. Its speed and the swell stay as in the survey; so does a me
 """
 
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -82,19 +82,6 @@ class FlightCoverage:
     ending: str
 
 
-@dataclass(frozen=True, kw_only=True)
-class TrialJob:
-    """One flight to be made."""
-
-    plan: Plan
-    settings: FlightSettings
-    seed: int
-    rig: Rig
-    floor: FloorGrid
-    cell_m: float
-    number: int
-
-
 def monte_carlo(
     plan: Plan,
     settings: FlightSettings,
@@ -123,23 +110,11 @@ def monte_carlo(
     if flights < 1:
         raise PlanError(f"{flights} flights: choose 1 or more")
     planned = certificate(plan.area, rig, stations_of_plan(plan), plan_pattern(plan, rig))
-    jobs = [
-        TrialJob(
-            plan=plan,
-            settings=settings,
-            seed=seed,
-            rig=rig,
-            floor=floor,
-            cell_m=planned.grid.cell_m,
-            number=n,
-        )
-        for n in range(flights)
-    ]
+    fly = partial(fly_and_certify, plan, settings, rig, floor, seed, planned.grid.cell_m)
     short = np.zeros(planned.grid.shape)
     results: list[FlightCoverage] = []
-    for flown in _flown(jobs, executor):
-        bits = np.unpackbits(flown.short, count=short.size).reshape(short.shape)
-        short += bits
+    for flown in executor.map(fly, range(flights), label="flights"):
+        short += np.unpackbits(flown.short, count=short.size).reshape(short.shape)
         results.append(flown)
     return MonteCarlo(
         planned=planned,
@@ -152,22 +127,24 @@ def monte_carlo(
     )
 
 
-def fly_job(job: TrialJob) -> FlightCoverage:
-    """Make one flight and certify it."""
-    rng = np.random.default_rng([job.seed, _STREAM, job.number])
+def fly_and_certify(
+    plan: Plan,
+    settings: FlightSettings,
+    rig: Rig,
+    floor: FloorGrid,
+    seed: int,
+    cell_m: float,
+    number: int,
+) -> FlightCoverage:
+    """Make one flight and certify it on cells of a size; other arguments are of `monte_carlo`."""
+    rng = np.random.default_rng([seed, _STREAM, number])
     towards_deg = float(rng.uniform(0.0, 360.0)) % 360.0
-    settings = job.settings
     if settings.sea.current_file is None:
         sea = with_values(settings.sea, current_towards_deg=towards_deg)
         settings = replace(settings, sea=sea)
-    flight = simulate_plan(job.plan, settings, job.floor, rng, label="")
-    seen = certificate(
-        job.plan.area,
-        job.rig,
-        stations_of_flight(flight),
-        plan_pattern(job.plan, job.rig),
-        cell_m=job.cell_m,
-    )
+    flight = simulate_plan(plan, settings, floor, rng, label="")
+    stations, pattern = stations_of_flight(flight), plan_pattern(plan, rig)
+    seen = certificate(plan.area, rig, stations, pattern, cell_m=cell_m)
     return FlightCoverage(
         covered_share=seen.covered_share,
         stereo_share=seen.stereo_share,
@@ -176,10 +153,6 @@ def fly_job(job: TrialJob) -> FlightCoverage:
         short=np.packbits(seen.inside & ~seen.at_overlap),
         ending=flight.ending,
     )
-
-
-def _flown(jobs: list[TrialJob], executor: Executor) -> Iterator[FlightCoverage]:
-    return executor.map(fly_job, jobs, label="flights")
 
 
 def _spread(values: Array | NDArray[np.intp]) -> dict[str, float]:

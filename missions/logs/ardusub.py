@@ -8,7 +8,7 @@ depth; its barometer is zeroed at the surface.
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -36,8 +36,9 @@ _REBOOT_S = 1.0
 """A clock since boot that goes back by more has been started again."""
 
 _Tables = Mapping[str, LogTable]
-_Reader = Callable[[_Tables], tuple[Array, Array] | None]
-"""Takes tables to times and values; None where a table or a field is missing."""
+_Reader = Callable[[LogTable, _Tables], tuple[Array, Array] | None]
+"""Takes the table of a message, and all tables, to times and values; None where a field or another
+table is missing."""
 
 
 @dataclass(frozen=True)
@@ -60,46 +61,35 @@ class _Keep:
 
 
 def _take(
-    message: str, fields: Sequence[str], scale: float | Sequence[float] = 1.0,
-    keep: _Keep | None = None, absent: float | None = None,
-) -> _Reader:  # fmt: skip
-    """Read fields of a message, times scales; `keep` marks rows to use, `absent` what is NaN."""
+    *fields: str, scale: float = 1.0, keep: _Keep | None = None, absent: float | None = None
+) -> _Reader:
+    """Read fields of a message, times a scale; `keep` marks rows to use, `absent` what is NaN."""
 
-    def read(tables: _Tables) -> tuple[Array, Array] | None:
-        table = tables.get(message)
-        needed = (*fields, *(keep.fields if keep is not None else ()))
-        if table is None or any(field not in table.columns for field in needed):
+    def read(table: LogTable, _: _Tables) -> tuple[Array, Array] | None:
+        if not table.has(*fields, *(keep.fields if keep is not None else ())):
             return None
         if keep is not None:
             table = table.rows(keep.rows(table))
         values = table.stacked(*fields)
         if absent is not None:
             values = np.where(values == absent, np.nan, values)
-        return table.columns["time_s"], values * np.asarray(scale)
+        return table.columns["time_s"], values * scale
 
     return read
 
 
-def _from_origin(message: str) -> _Reader:
+def _from_origin(table: LogTable, tables: _Tables) -> tuple[Array, Array] | None:
     """Latitude and longitude of north and east from the filter's origin (message ORGN, type 0)."""
-
-    def read(tables: _Tables) -> tuple[Array, Array] | None:
-        table, origin = tables.get(message), tables.get("ORGN")
-        if table is None or origin is None:
-            return None
-        if any(name not in table.columns for name in ("PN", "PE", "PD")) or any(
-            name not in origin.columns for name in ("Type", "Lat", "Lng")
-        ):
-            return None
-        rows = np.flatnonzero(origin.columns["Type"] == 0)
-        if not len(rows):
-            return None
-        last = rows[-1]
-        datum = Datum(float(origin.columns["Lat"][last]), float(origin.columns["Lng"][last]))
-        ned = table.stacked("PN", "PE", "PD")
-        return table.columns["time_s"], datum.geodetic_from_ned(ned)[:, :2]
-
-    return read
+    origin = tables.get("ORGN")
+    if origin is None or not table.has("PN", "PE", "PD") or not origin.has("Type", "Lat", "Lng"):
+        return None
+    rows = np.flatnonzero(origin.columns["Type"] == 0)
+    if not len(rows):
+        return None
+    last = rows[-1]
+    datum = Datum(float(origin.columns["Lat"][last]), float(origin.columns["Lng"][last]))
+    ned = table.stacked("PN", "PE", "PD")
+    return table.columns["time_s"], datum.geodetic_from_ned(ned)[:, :2]
 
 
 def _has_fix(field: str) -> _Keep:
@@ -126,82 +116,59 @@ def _hears_bottom(table: LogTable) -> Mask:
 
 _SURFACE = "positions are GPS: they hold at the surface only"
 _BACKUP = "positions are those of the backup attitude filter"
+_DEGREES = float(np.rad2deg(1.0))
 _BIN: Mapping[str, tuple[_Source, ...]] = {
     "navigation": (
-        _Source("POS", _take("POS", ("Lat", "Lng"))),
-        _Source("XKF1", _from_origin("XKF1")),
-        _Source("NKF1", _from_origin("NKF1")),
-        _Source("AHR2", _take("AHR2", ("Lat", "Lng")), _BACKUP),
-        _Source("GPS", _take("GPS", ("Lat", "Lng"), keep=_has_fix("Status")), _SURFACE),
+        _Source("POS", _take("Lat", "Lng")),
+        _Source("XKF1", _from_origin),
+        _Source("NKF1", _from_origin),
+        _Source("AHR2", _take("Lat", "Lng"), _BACKUP),
+        _Source("GPS", _take("Lat", "Lng", keep=_has_fix("Status")), _SURFACE),
     ),
     "depth": (
-        _Source("POS", _take("POS", ("RelHomeAlt",), -1.0)),
-        _Source("CTUN", _take("CTUN", ("BAlt",), -1.0)),
-        _Source("XKF1", _take("XKF1", ("PD",))),
-        _Source("NKF1", _take("NKF1", ("PD",))),
-        _Source("BARO", _take("BARO", ("Alt",), -1.0)),
+        _Source("POS", _take("RelHomeAlt", scale=-1.0)),
+        _Source("CTUN", _take("BAlt", scale=-1.0)),
+        _Source("XKF1", _take("PD")),
+        _Source("NKF1", _take("PD")),
+        _Source("BARO", _take("Alt", scale=-1.0)),
     ),
-    "attitude": (
-        _Source("ATT", _take("ATT", ("Roll", "Pitch", "Yaw"))),
-        _Source("XKF1", _take("XKF1", ("Roll", "Pitch", "Yaw"))),
-        _Source("NKF1", _take("NKF1", ("Roll", "Pitch", "Yaw"))),
-        _Source("AHR2", _take("AHR2", ("Roll", "Pitch", "Yaw"))),
+    "attitude": tuple(
+        _Source(message, _take("Roll", "Pitch", "Yaw"))
+        for message in ("ATT", "XKF1", "NKF1", "AHR2")
     ),
-    "altitude": (_Source("RFND", _take("RFND", ("Dist",), keep=_Keep(("Stat",), _sees_down))),),
-    "velocity": (
-        _Source("XKF1", _take("XKF1", ("VN", "VE", "VD"))),
-        _Source("NKF1", _take("NKF1", ("VN", "VE", "VD"))),
-    ),
-    "rates": (_Source("RATE", _take("RATE", ("R", "P", "Y"), float(np.deg2rad(1.0)))),),
-    "pwm": (_Source("RCOU", _take("RCOU", [f"C{i}" for i in range(1, 9)])),),
+    "altitude": (_Source("RFND", _take("Dist", keep=_Keep(("Stat",), _sees_down))),),
+    "velocity": tuple(_Source(message, _take("VN", "VE", "VD")) for message in ("XKF1", "NKF1")),
+    "rates": (_Source("RATE", _take("R", "P", "Y", scale=float(np.deg2rad(1.0)))),),
+    "pwm": (_Source("RCOU", _take(*(f"C{i}" for i in range(1, 9)))),),
 }
 """Sources of each role, the best first; degrees, metres, m/s, rad/s."""
 _TLOG: Mapping[str, tuple[_Source, ...]] = {
     "navigation": (
+        _Source("GLOBAL_POSITION_INT", _take("lat", "lon", scale=1e-7)),
         _Source(
-            "GLOBAL_POSITION_INT", _take("GLOBAL_POSITION_INT", ("lat", "lon"), 1e-7)
-        ),
-        _Source(
-            "GPS_RAW_INT",
-            _take("GPS_RAW_INT", ("lat", "lon"), 1e-7, keep=_has_fix("fix_type")), _SURFACE,
+            "GPS_RAW_INT", _take("lat", "lon", scale=1e-7, keep=_has_fix("fix_type")), _SURFACE
         ),
     ),
     "depth": (
-        _Source(
-            "GLOBAL_POSITION_INT", _take("GLOBAL_POSITION_INT", ("relative_alt",), -1e-3)
-        ),
-        _Source("VFR_HUD", _take("VFR_HUD", ("alt",), -1.0)),
+        _Source("GLOBAL_POSITION_INT", _take("relative_alt", scale=-1e-3)),
+        _Source("VFR_HUD", _take("alt", scale=-1.0)),
     ),
-    "attitude": (
-        _Source("ATTITUDE", _take("ATTITUDE", ("roll", "pitch", "yaw"), float(np.rad2deg(1.0)))),
-    ),
+    "attitude": (_Source("ATTITUDE", _take("roll", "pitch", "yaw", scale=_DEGREES)),),
     "altitude": (
         _Source(
             "DISTANCE_SENSOR",
             _take(
-                "DISTANCE_SENSOR", ("current_distance",), 1e-2,
-                keep=_Keep(
-                    ("orientation", "min_distance", "max_distance"), _hears_bottom
-                ),
+                "current_distance",
+                scale=1e-2,
+                keep=_Keep(("orientation", "min_distance", "max_distance"), _hears_bottom),
             ),
         ),
-        _Source("RANGEFINDER", _take("RANGEFINDER", ("distance",), absent=0.0)),
+        _Source("RANGEFINDER", _take("distance", absent=0.0)),
     ),
-    "velocity": (
-        _Source(
-            "GLOBAL_POSITION_INT", _take("GLOBAL_POSITION_INT", ("vx", "vy", "vz"), 1e-2)
-        ),
-    ),
-    "rates": (
-        _Source("ATTITUDE", _take("ATTITUDE", ("rollspeed", "pitchspeed", "yawspeed"))),
-    ),
-    "pwm": (
-        _Source(
-            "SERVO_OUTPUT_RAW",
-            _take("SERVO_OUTPUT_RAW", [f"servo{i}_raw" for i in range(1, 9)]),
-        ),
-    ),
-}  # fmt: skip
+    "velocity": (_Source("GLOBAL_POSITION_INT", _take("vx", "vy", "vz", scale=1e-2)),),
+    "rates": (_Source("ATTITUDE", _take("rollspeed", "pitchspeed", "yawspeed")),),
+    "pwm": (_Source("SERVO_OUTPUT_RAW", _take(*(f"servo{i}_raw" for i in range(1, 9)))),),
+}
 
 
 def read_ardusub_bin(path: Path, asked: Mapping[str, str]) -> LoggedDive:
@@ -332,7 +299,7 @@ def _signal(
         one, others = _one_instance(path, role, table, instance, bool(name))
         if one is None:
             continue
-        read = source.read({**tables, source.message: one})
+        read = source.read(one, tables)
         if read is None or not len(read[0]):
             continue
         found = cleaned(source.message, *read, lost)
@@ -378,19 +345,13 @@ def _one_instance(
 
 
 def _with_time(table: LogTable, time_s: Array) -> LogTable:
-    return LogTable(
-        name=table.name,
-        columns={**table.columns, "time_s": time_s},
-        kinds=table.kinds,
-        texts=table.texts,
-    )
+    return replace(table, columns={**table.columns, "time_s": time_s})
 
 
 def _since_1970(tables: _Tables) -> tuple[float, bool]:
     """What makes UTC of seconds since boot: the median over all GPS fixes; 0 without one."""
     gps = tables.get("GPS")
-    needed = ("TimeUS", "GMS", "GWk", "Status")
-    if gps is None or any(name not in gps.columns for name in needed):
+    if gps is None or not gps.has("TimeUS", "GMS", "GWk", "Status"):
         return 0.0, False
     fixed = gps.rows((gps.columns["Status"] >= _FIX_3D) & (gps.columns["GWk"] > 0))
     if not len(fixed):

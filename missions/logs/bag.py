@@ -1,15 +1,17 @@
 """A flight as a ROS 2 bag (MCAP): what RViz, Foxglove, PlotJuggler and `ros2 bag` open.
 
 World `map` is ENU with its origin at the datum on the sea surface, the body is FLU (REP-103). Times
-are those of the flight from a start that is an argument: the same flight gives the same bytes.
+are those of the flight: the same flight gives the same bytes. Definitions of the messages:
+ros2/common_interfaces, as shipped with rosbags (those of Humble, which later releases kept).
 """
 
 import heapq
+import itertools
 import math
 import os
 import shutil
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,31 +20,26 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.base.errors import WorkspaceError
 from alice_survey.base.executor import progress
-from alice_survey.base.frames import Array, Datum, rotation_from_attitude
-from missions.logs import messages as kinds
-from missions.logs.messages import Messages, as_nanoseconds
+from alice_survey.base.frames import Array, Datum
 from missions.logs.ros_frames import flipped_body, flipped_quaternion, flipped_world
 
+ODOMETRY = "nav_msgs/msg/Odometry"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+FIX = "sensor_msgs/msg/NavSatFix"
+RANGE = "sensor_msgs/msg/Range"
+JOINTS = "sensor_msgs/msg/JointState"
+NUMBERS = "std_msgs/msg/Float64MultiArray"
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Samples:
-    """What one sensor measured; a row with a NaN was not measured and gets no message."""
-
-    time_s: Array
-    """(M,) seconds of the flight, increasing."""
-    values: Array
-    """(M, k) values."""
-    sigma: float = 0.0
-    """Standard deviation of each value; 0 is not known."""
-
-    def __post_init__(self) -> None:
-        if self.values.ndim != 2 or len(self.values) != len(self.time_s):
-            raise ValueError(f"{self.values.shape} values for {len(self.time_s)} times")
+MAP = "map"
+"""The world's frame: ENU, origin at the datum."""
+_NS_PER_S = 1_000_000_000
+_UNKNOWN, _DIAGONAL = 0, 2
+"""COVARIANCE_TYPE_UNKNOWN and _DIAGONAL_KNOWN of sensor_msgs/NavSatFix."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BagRecord:
-    """A flight as arrays over one clock, (T,) rows; what is None is left out of the bag.
+    """A flight as arrays over one clock, (T,) rows.
 
     Poses are of the body's origin, FRD body to NED with the origin at the datum.
     """
@@ -58,7 +55,7 @@ class BagRecord:
     """(T, 6) u, v, w over ground, m/s, and p, q, r, rad/s, in the body frame."""
     believed: RigidTransform
     """(T,) `ned_from_body` as navigation has it."""
-    believed_velocity: Array | None = None
+    believed_velocity: Array
     """(T, 6) as `truth_velocity`."""
     sigma_horizontal_m: Array
     """(T,) sigma of north and of east each."""
@@ -68,67 +65,23 @@ class BagRecord:
     """(T,) sigma of roll and of pitch each."""
     sigma_heading_rad: Array
     """(T,) sigma of heading."""
-    sigma_velocity_mps: Array | None = None
-    """(T,) sigma of u, v and w each."""
-    altitude_m: Array | None = None
+    altitude_m: Array
     """(T,) altitude of the left port's glass above the sea floor as navigation has it; NaN is not
     known."""
-    thrusters: tuple[str, ...] = ()
-    rpm: Array | None = None
+    thrusters: tuple[str, ...]
+    rpm: Array
     """(T, n) revolutions per minute."""
-    power_w: Array | None = None
+    power_w: Array
     """(T, n) electrical power."""
-    thrust_n: Array | None = None
-    """(T, n) thrusts."""
-    imu: Samples | None = None
-    """(M, 6) p, q, r, rad/s, and specific force, m/s^2 (acceleration minus gravity: -g along down
-    at rest), in the body frame (FRD)."""
-    ahrs_rad: Samples | None = None
-    """(M, 3) roll, pitch and heading as measured."""
-    dvl_mps: Samples | None = None
-    """(M, 3) velocity over ground in the body frame (FRD)."""
-    beam_m: Samples | None = None
-    """(M, b) slant ranges of the DVL's beams; NaN of one beam means no echo."""
-    pressure_pa: Samples | None = None
-    """(M, 1) absolute."""
-    gps: Samples | None = None
-    """(M, 3) latitude and longitude, degrees, height above the ellipsoid, metres; sigma in
-    metres."""
-    usbl_ned_m: Samples | None = None
-    """(M, 3) position fixes in NED."""
-    start_utc_ns: int = 0
-    """Date of `time_s` 0, nanoseconds since 1970; 0 keeps the flight's own clock."""
-    notes: dict[str, str] = field(default_factory=dict)
+    beam_time_s: Array
+    """(M,) times of the DVL's ranges, increasing."""
+    beam_m: Array
+    """(M, b) slant ranges of the DVL's beams; NaN means no echo."""
+    notes: dict[str, str]
     """Kept in the bag's metadata."""
 
-    def __post_init__(self) -> None:
-        rows = len(self.time_s)
-        if not np.all(np.diff(self.time_s) > 0):
-            raise ValueError("time_s must increase strictly")
-        if not np.all(np.isfinite(self.time_s)) or self.time_s.min(initial=0.0) < 0:
-            raise ValueError("time_s must be finite and not negative")
-        if len(self.truth) != rows or len(self.believed) != rows:
-            raise ValueError(f"{len(self.truth)} and {len(self.believed)} poses for {rows} times")
-        columns: dict[str, tuple[int, ...]] = {
-            "truth_velocity": (rows, 6),
-            "believed_velocity": (rows, 6),
-            "sigma_horizontal_m": (rows,),
-            "sigma_depth_m": (rows,),
-            "sigma_attitude_rad": (rows,),
-            "sigma_heading_rad": (rows,),
-            "sigma_velocity_mps": (rows,),
-            "altitude_m": (rows,),
-            "rpm": (rows, len(self.thrusters)),
-            "power_w": (rows, len(self.thrusters)),
-            "thrust_n": (rows, len(self.thrusters)),
-        }
-        for name, shape in columns.items():
-            values = getattr(self, name)
-            if values is not None and values.shape != shape:
-                raise ValueError(f"{name} has the shape {values.shape}, not {shape}")
 
-
-def write_bag(path: Path, record: BagRecord) -> int:
+def write_bag(path: Path, record: BagRecord) -> None:
     """Write a flight as a ROS 2 bag of MCAP storage: the folder `path`, whole or not at all.
 
     Messages are made one by one in the order of their times, so that memory holds the record and
@@ -138,9 +91,6 @@ def write_bag(path: Path, record: BagRecord) -> int:
     Args:
         path: folder to write; it must not exist.
         record: the flight.
-
-    Returns:
-        How many messages were written.
 
     Raises:
         WorkspaceError: the folder exists, or cannot be written.
@@ -159,245 +109,250 @@ def write_bag(path: Path, record: BagRecord) -> int:
         with writer:
             for key, value in sorted(record.notes.items()):
                 writer.set_custom_data(key, value)
-            messages = Messages()
-            streams = _streams(record, messages)
-            connections = {
-                stream.topic: writer.add_connection(
-                    stream.topic, stream.kind, typestore=messages.store
+            ros = _Ros()
+            topics = _topics(record, ros)
+            connections = [
+                writer.add_connection(topic.name, topic.kind, typestore=ros.store)
+                for topic in topics
+            ]
+            ordered = heapq.merge(
+                *(
+                    zip(topic.stamps_ns, itertools.repeat(rank), itertools.count(), strict=False)
+                    for rank, topic in enumerate(topics)
                 )
-                for stream in streams
-            }
-            total = sum(len(stream.stamps_ns) for stream in streams)
-            for stamp, rank, row in progress(_merged(streams), "bag", total):
-                stream = streams[rank]
-                data = messages.store.serialize_cdr(stream.build(stamp, row), stream.kind)
-                writer.write(connections[stream.topic], stamp, data)
+            )
+            total = sum(len(topic.stamps_ns) for topic in topics)
+            for stamp, rank, row in progress(ordered, "bag", total):
+                topic = topics[rank]
+                data = ros.store.serialize_cdr(topic.message(stamp, row), topic.kind)
+                writer.write(connections[rank], stamp, data)
         os.replace(outer / path.name, path)  # noqa: PTH105 (a folder onto a free name)
     except OSError as error:
         raise WorkspaceError(f"{path}: cannot be written: {error.strerror}") from None
     finally:
         shutil.rmtree(outer, ignore_errors=True)
-    return total
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Stream:
+@dataclass(frozen=True)
+class _Topic:
     """One topic: when its messages are, and how to make one."""
 
-    topic: str
+    name: str
     kind: str
     stamps_ns: list[int]
-    rows: list[int]
-    """Rows of the record that the messages are made of."""
-    build: Callable[[int, int], Any]
-    """Builds the message from stamp and row."""
+    message: Callable[[int, int], Any]
+    """Makes the message of a stamp and a row of the record."""
 
 
-def _merged(streams: list[_Stream]) -> Iterator[tuple[int, int, int]]:
-    """Stamp, number of the stream and row of every message, in the order of their times."""
-
-    def numbered(rank: int) -> Iterator[tuple[int, int, int]]:
-        stream = streams[rank]
-        for stamp, row in zip(stream.stamps_ns, stream.rows, strict=True):
-            yield stamp, rank, row
-
-    return heapq.merge(*(numbered(rank) for rank in range(len(streams))))
-
-
-def _streams(record: BagRecord, messages: Messages) -> list[_Stream]:
+def _topics(record: BagRecord, ros: "_Ros") -> list[_Topic]:
     """All topics of a record."""
-    return [
-        *_datum_stream(record, messages),
-        *_pose_streams(record, messages),
-        *_thruster_streams(record, messages),
-        *_sensor_streams(record, messages),
-    ]
-
-
-def _datum_stream(record: BagRecord, messages: Messages) -> list[_Stream]:
-    """Where the map's origin is, once."""
-    datum = record.datum
-    place = np.array([datum.latitude_deg, datum.longitude_deg, datum.height_m])
-
-    def origin(stamp: int, _: int) -> Any:
-        return messages.fix(stamp, kinds.MAP, place, None)
-
-    stamps = as_nanoseconds(record.time_s[:1], record.start_utc_ns)
-    return [
-        _Stream(
-            topic=f"/{record.name}/datum", kind=kinds.FIX, stamps_ns=stamps,
-            rows=[0] * len(stamps), build=origin,
-        )
-    ]  # fmt: skip
-
-
-def _pose_streams(record: BagRecord, messages: Messages) -> list[_Stream]:
-    """Truth and navigation."""
-    name, rows = record.name, list(range(len(record.time_s)))
-    stamps = as_nanoseconds(record.time_s, record.start_utc_ns)
-    true_enu = flipped_world(record.truth.translation)
-    true_turn = flipped_quaternion(record.truth.rotation.as_quat())
-    true_speed = _flu(record.truth_velocity)
-    enu = flipped_world(record.believed.translation)
-    turn = flipped_quaternion(record.believed.rotation.as_quat())
-    geodetic = record.datum.geodetic_from_ned(record.believed.translation)
-    geodetic[:, 2] = record.datum.height_m - geodetic[:, 2]
-    horizontal, vertical = record.sigma_horizontal_m**2, record.sigma_depth_m**2
-    tilt, heading = record.sigma_attitude_rad**2, record.sigma_heading_rad**2
-    position_variances = np.column_stack([horizontal, horizontal, vertical])
-    pose_variances = np.column_stack([position_variances, tilt, tilt, heading])
-    believed_speed = record.believed_velocity
-    speed = np.zeros((len(rows), 6)) if believed_speed is None else _flu(believed_speed)
-    speed_variances = np.zeros((len(rows), 6))
-    if record.sigma_velocity_mps is not None:
-        speed_variances[:, :3] = record.sigma_velocity_mps[:, None] ** 2
-    if believed_speed is None:
-        # The first element of a covariance says that there is nothing (as in sensor_msgs/Imu).
-        speed_variances[:, 0] = -1.0
-    exact = np.zeros(6)
+    name, datum = record.name, record.datum
     body, true_body = f"{name}/base_link", f"{name}/base_link_truth"
+    place, turn, speed = _in_ros(record.believed, record.believed_velocity)
+    true_place, true_turn, true_speed = _in_ros(record.truth, record.truth_velocity)
+    origin = np.array([datum.latitude_deg, datum.longitude_deg, datum.height_m])
+    geodetic = datum.geodetic_from_ned(record.believed.translation)
+    geodetic[:, 2] = datum.height_m - geodetic[:, 2]
+    horizontal, tilt = record.sigma_horizontal_m**2, record.sigma_attitude_rad**2
+    variances = np.column_stack(
+        [
+            horizontal, horizontal, record.sigma_depth_m**2,
+            tilt, tilt, record.sigma_heading_rad**2,
+        ]
+    )  # fmt: skip
+    exact = np.zeros(6)
+    rad_s = record.rpm * (2.0 * math.pi / 60.0)
+    label = ",".join(record.thrusters)
+    stamps, heard = _nanoseconds(record.time_s), _nanoseconds(record.beam_time_s)
 
-    def truth(stamp: int, i: int) -> Any:
-        return messages.odometry(
-            stamp, true_body, true_enu[i], true_turn[i], exact, true_speed[i], exact
-        )
-
-    def believed(stamp: int, i: int) -> Any:
-        return messages.odometry(
-            stamp, body, enu[i], turn[i], pose_variances[i], speed[i], speed_variances[i]
-        )
-
-    def fix(stamp: int, i: int) -> Any:
-        return messages.fix(stamp, body, geodetic[i], position_variances[i])
-
-    def transforms(stamp: int, i: int) -> Any:
-        return messages.transforms(
-            stamp, {body: (enu[i], turn[i]), true_body: (true_enu[i], true_turn[i])}
-        )
-
-    streams = [
-        (f"/{name}/truth/odometry", kinds.ODOMETRY, truth),
-        (f"/{name}/navigation/odometry", kinds.ODOMETRY, believed),
-        (f"/{name}/navigation/fix", kinds.FIX, fix),
-        ("/tf", kinds.TRANSFORMS, transforms),
-    ]
-    altitude = record.altitude_m
-    if altitude is not None:
-
-        def level(stamp: int, i: int) -> Any:
-            return messages.range(stamp, f"{name}/port", float(altitude[i]))
-
-        streams.append((f"/{name}/navigation/altitude", kinds.RANGE, level))
-    return [
-        _Stream(topic=topic, kind=kind, stamps_ns=stamps, rows=rows, build=build)
-        for topic, kind, build in streams
-    ]
-
-
-def _thruster_streams(record: BagRecord, messages: Messages) -> list[_Stream]:
-    rows = list(range(len(record.time_s)))
-    stamps = as_nanoseconds(record.time_s, record.start_utc_ns)
-    streams: list[tuple[str, str, Callable[[int, int], Any]]] = []
-    rpm, thrust, power = record.rpm, record.thrust_n, record.power_w
-    if rpm is not None:
-        radps = rpm * (2.0 * math.pi / 60.0)
-
-        def state(stamp: int, i: int) -> Any:
-            efforts = None if thrust is None else thrust[i]
-            return messages.joints(stamp, record.thrusters, radps[i], efforts)
-
-        streams.append(("state", kinds.JOINTS, state))
-    if power is not None:
-        label = ",".join(record.thrusters)
-
-        def watts(_: int, i: int) -> Any:
-            return messages.numbers(label, power[i])
-
-        streams.append(("power", kinds.NUMBERS, watts))
-    return [
-        _Stream(
-            topic=f"/{record.name}/thrusters/{topic}", kind=kind, stamps_ns=stamps, rows=rows,
-            build=build,
-        )
-        for topic, kind, build in streams
-    ]  # fmt: skip
-
-
-def _sensor_streams(record: BagRecord, messages: Messages) -> list[_Stream]:
-    """What sensors measured, each by its own clock."""
-    name = record.name
-    streams: list[_Stream] = []
-
-    def add(
-        topic: str, kind: str, samples: Samples | None, build: Callable[[int, Array], Any]
-    ) -> None:
-        if samples is None:
-            return
-        measured = np.flatnonzero(np.isfinite(samples.values).all(axis=1))
-        values = samples.values
-        streams.append(
-            _Stream(
-                topic=f"/{name}/{topic}",
-                kind=kind,
-                stamps_ns=as_nanoseconds(samples.time_s[measured], record.start_utc_ns),
-                rows=measured.tolist(),
-                build=lambda stamp, i: build(stamp, values[i]),
-            )
-        )
-
-    def variance(samples: Samples | None) -> float:
-        return 0.0 if samples is None else samples.sigma**2
-
-    def attitude(stamp: int, row: Array) -> Any:
-        turn = flipped_quaternion(rotation_from_attitude(*row).as_quat())
-        return messages.imu(
-            stamp, f"{name}/base_link", enu_from_flu=turn, variance=variance(record.ahrs_rad)
-        )
-
-    def gps(stamp: int, row: Array) -> Any:
-        known = variance(record.gps)
-        variances = np.full(3, known) if known else None
-        return messages.fix(stamp, f"{name}/gps", row, variances)
-
-    add("imu", kinds.IMU, record.imu, lambda stamp, row: messages.imu(
-        stamp, f"{name}/base_link", rate_flu=flipped_body(row[:3]),
-        force_flu=flipped_body(row[3:]),
-    ))  # fmt: skip
-    add("ahrs", kinds.IMU, record.ahrs_rad, attitude)
-    add("dvl/velocity", kinds.TWIST, record.dvl_mps, lambda stamp, row: messages.twist(
-        stamp, f"{name}/base_link", flipped_body(row), variance(record.dvl_mps),
-    ))  # fmt: skip
-    add("pressure", kinds.PRESSURE, record.pressure_pa, lambda stamp, row: messages.pressure(
-        stamp, f"{name}/pressure", float(row[0]), variance(record.pressure_pa),
-    ))  # fmt: skip
-    add("gps/fix", kinds.FIX, record.gps, gps)
-    add("usbl/position", kinds.POSE, record.usbl_ned_m, lambda stamp, row: messages.position(
-        stamp, flipped_world(row), variance(record.usbl_ned_m),
-    ))  # fmt: skip
-    streams += _beam_streams(record, messages)
-    return streams
-
-
-def _beam_streams(record: BagRecord, messages: Messages) -> list[_Stream]:
-    """Ranges along a DVL's beams; a time without any echo still has its messages."""
-    samples = record.beam_m
-    if samples is None:
-        return []
-    stamps = as_nanoseconds(samples.time_s, record.start_utc_ns)
-
-    def stream(beam: int) -> _Stream:
-        def heard(stamp: int, i: int) -> Any:
-            frame = f"{record.name}/dvl_beam_{beam + 1}"
-            return messages.range(stamp, frame, float(samples.values[i, beam]))
-
-        return _Stream(
-            topic=f"/{record.name}/dvl/beam_{beam + 1}", kind=kinds.RANGE, stamps_ns=stamps,
-            rows=list(range(len(stamps))), build=heard,
+    def beam(number: int) -> _Topic:
+        frame, ranges = f"{name}/dvl_beam_{number + 1}", record.beam_m[:, number]
+        return _Topic(
+            f"/{name}/dvl/beam_{number + 1}", RANGE, heard,
+            lambda stamp, i: ros.range(stamp, frame, ranges[i]),
         )  # fmt: skip
 
-    return [stream(beam) for beam in range(samples.values.shape[1])]
+    return [
+        _Topic(
+            f"/{name}/datum", FIX, stamps[:1], lambda stamp, _: ros.fix(stamp, MAP, origin, None)
+        ),
+        _Topic(
+            f"/{name}/truth/odometry", ODOMETRY, stamps,
+            lambda stamp, i: ros.odometry(
+                stamp, true_body, true_place[i], true_turn[i], exact, true_speed[i]
+            ),
+        ),
+        _Topic(
+            f"/{name}/navigation/odometry", ODOMETRY, stamps,
+            lambda stamp, i: ros.odometry(stamp, body, place[i], turn[i], variances[i], speed[i]),
+        ),
+        _Topic(
+            f"/{name}/navigation/fix", FIX, stamps,
+            lambda stamp, i: ros.fix(stamp, body, geodetic[i], variances[i, :3]),
+        ),
+        _Topic(
+            "/tf", TRANSFORMS, stamps,
+            lambda stamp, i: ros.transforms(
+                stamp, {body: (place[i], turn[i]), true_body: (true_place[i], true_turn[i])}
+            ),
+        ),
+        _Topic(
+            f"/{name}/navigation/altitude", RANGE, stamps,
+            lambda stamp, i: ros.range(stamp, f"{name}/port", record.altitude_m[i]),
+        ),
+        _Topic(
+            f"/{name}/thrusters/state", JOINTS, stamps,
+            lambda stamp, i: ros.joints(stamp, record.thrusters, rad_s[i]),
+        ),
+        _Topic(
+            f"/{name}/thrusters/power", NUMBERS, stamps,
+            lambda _, i: ros.numbers(label, record.power_w[i]),
+        ),
+        *(beam(number) for number in range(record.beam_m.shape[1])),
+    ]  # fmt: skip
 
 
-def _flu(velocity_frd: Array) -> Array:
-    """(T, 6) velocities from FRD to FLU."""
-    return np.hstack([flipped_body(velocity_frd[:, :3]), flipped_body(velocity_frd[:, 3:])])
+def _in_ros(ned_from_body: RigidTransform, velocity_frd: Array) -> tuple[Array, Array, Array]:
+    """Positions in ENU, quaternions `enu_from_flu`, and velocities (T, 6) in FLU."""
+    return (
+        flipped_world(ned_from_body.translation),
+        flipped_quaternion(ned_from_body.rotation.as_quat()),
+        np.hstack([flipped_body(velocity_frd[:, :3]), flipped_body(velocity_frd[:, 3:])]),
+    )
+
+
+def _nanoseconds(time_s: Array) -> list[int]:
+    """Times, (N,) seconds, as whole nanoseconds."""
+    stamps: list[int] = np.rint(time_s * _NS_PER_S).astype(np.int64).tolist()
+    return stamps
+
+
+class _Ros:
+    """Builds messages from numbers in ENU and FLU."""
+
+    def __init__(self) -> None:
+        from rosbags.typesys import Stores, get_typestore
+
+        self.store = get_typestore(Stores.ROS2_HUMBLE)
+
+    def _make(self, kind: str, **fields: Any) -> Any:
+        return self.store.types[kind](**fields)
+
+    def _header(self, stamp_ns: int, frame: str) -> Any:
+        sec, nanosec = divmod(stamp_ns, _NS_PER_S)
+        stamp = self._make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+        return self._make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+
+    def _vector(self, xyz: Array, kind: str = "Vector3") -> Any:
+        x, y, z = (float(v) for v in xyz)
+        return self._make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
+
+    def _quaternion(self, xyzw: Array) -> Any:
+        x, y, z, w = (float(v) for v in xyzw)
+        return self._make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+
+    def odometry(
+        self,
+        stamp_ns: int,
+        child: str,
+        position_enu: Array,
+        enu_from_flu: Array,
+        pose_variances: Array,
+        velocity_flu: Array,
+    ) -> Any:
+        """A pose in the map and a velocity in the body, whose covariance is not known.
+
+        Args:
+            stamp_ns: of the header.
+            child: the body's frame.
+            position_enu: (3,).
+            enu_from_flu: (4,) quaternion xyzw.
+            pose_variances: (6,) of east, north, up, and of small turns about them.
+            velocity_flu: (6,).
+        """
+        pose = self._make(
+            "geometry_msgs/msg/Pose",
+            position=self._vector(position_enu, "Point"),
+            orientation=self._quaternion(enu_from_flu),
+        )
+        twist = self._make(
+            "geometry_msgs/msg/Twist",
+            linear=self._vector(velocity_flu[:3]),
+            angular=self._vector(velocity_flu[3:]),
+        )
+        return self._make(
+            ODOMETRY,
+            header=self._header(stamp_ns, MAP),
+            child_frame_id=child,
+            pose=self._make(
+                "geometry_msgs/msg/PoseWithCovariance",
+                pose=pose,
+                covariance=np.diag(pose_variances).ravel(),
+            ),
+            twist=self._make(
+                "geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)
+            ),
+        )
+
+    def transforms(self, stamp_ns: int, children: dict[str, tuple[Array, Array]]) -> Any:
+        """Transforms of bodies in the map: of each position ENU, (3,), and quaternion, (4,)."""
+        stamped = [
+            self._make(
+                "geometry_msgs/msg/TransformStamped",
+                header=self._header(stamp_ns, MAP),
+                child_frame_id=child,
+                transform=self._make(
+                    "geometry_msgs/msg/Transform",
+                    translation=self._vector(position),
+                    rotation=self._quaternion(quaternion),
+                ),
+            )
+            for child, (position, quaternion) in children.items()
+        ]
+        return self._make(TRANSFORMS, transforms=stamped)
+
+    def fix(self, stamp_ns: int, frame: str, geodetic: Array, variances_enu: Array | None) -> Any:
+        """Latitude, longitude (degrees) and height above the ellipsoid, (3,)."""
+        variances = np.zeros(3) if variances_enu is None else variances_enu
+        return self._make(
+            FIX,
+            header=self._header(stamp_ns, frame),
+            status=self._make("sensor_msgs/msg/NavSatStatus", status=0, service=1),
+            latitude=float(geodetic[0]),
+            longitude=float(geodetic[1]),
+            altitude=float(geodetic[2]),
+            position_covariance=np.diag(variances).ravel(),
+            position_covariance_type=_UNKNOWN if variances_enu is None else _DIAGONAL,
+        )
+
+    def range(self, stamp_ns: int, frame: str, range_m: float) -> Any:
+        """A range; one that is NaN is +inf, no echo (REP-117)."""
+        return self._make(
+            RANGE,
+            header=self._header(stamp_ns, frame),
+            radiation_type=0,
+            field_of_view=0.0,
+            min_range=0.0,
+            max_range=math.inf,
+            range=math.inf if math.isnan(range_m) else float(range_m),
+        )
+
+    def joints(self, stamp_ns: int, names: tuple[str, ...], speed_radps: Array) -> Any:
+        """Speeds, (n,), of propellers."""
+        return self._make(
+            JOINTS,
+            header=self._header(stamp_ns, ""),
+            name=list(names),
+            position=np.zeros(0),
+            velocity=np.ascontiguousarray(speed_radps),
+            effort=np.zeros(0),
+        )
+
+    def numbers(self, label: str, values: Array) -> Any:
+        """A row of numbers whose dimension carries a label."""
+        size = len(values)
+        dimension = self._make(
+            "std_msgs/msg/MultiArrayDimension", label=label, size=size, stride=size
+        )
+        layout = self._make("std_msgs/msg/MultiArrayLayout", dim=[dimension], data_offset=0)
+        return self._make(NUMBERS, layout=layout, data=np.ascontiguousarray(values))

@@ -1,6 +1,5 @@
 """From what a vehicle logged to what a survey needs: clock, declination, tide, lever arms."""
 
-import csv
 import math
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -11,14 +10,10 @@ import numpy as np
 from alice_survey.base.contents import shown
 from alice_survey.base.errors import NavigationError
 from alice_survey.base.frames import Array, Datum, rotation_from_attitude
-from missions.logs.dive import LoggedDive, Signal
+from missions.logs.dive import DATED_AFTER_S, LoggedDive, Signal
+from missions.logs.navigation_csv import csv_rows, utc_date
+from missions.values.navigation import COLUMNS
 
-COLUMNS = (
-    "latitude_deg", "longitude_deg", "depth_m", "roll_deg", "pitch_deg", "heading_deg",
-    "altitude_m", "sigma_horizontal_m", "sigma_depth_m", "sigma_attitude_deg", "sigma_heading_deg",
-    "sigma_altitude_m",
-)  # fmt: skip
-"""Columns of the navigation CSV, after the time."""
 _LONGEST_S = 1e9
 
 
@@ -140,15 +135,9 @@ def read_tide(text: str, *, dated: bool) -> "float | Signal":
         path = Path(text)
     column = "time_utc" if dated else "time_s"
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            names = [name.strip() for name in reader.fieldnames or []]
-            reader.fieldnames = names
-            rows = [(reader.line_num, row) for row in reader]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise NavigationError(
-            f"--tide {text!r} is neither metres nor a CSV that can be read: {error}"
-        ) from None
+        names, rows = csv_rows(path)
+    except NavigationError as error:
+        raise NavigationError(f"--tide is neither metres nor a CSV: {error}") from None
     for name in (column, "height_m"):
         if name not in names:
             raise NavigationError(
@@ -159,7 +148,7 @@ def read_tide(text: str, *, dated: bool) -> "float | Signal":
     for line, row in rows:
         try:
             cell = (row[column] or "").strip()
-            times.append(utc_seconds(cell) if dated else float(cell))
+            times.append(utc_date(cell).timestamp() if dated else float(cell))
             heights.append(float(row["height_m"] or ""))
         except ValueError:
             raise NavigationError(
@@ -172,23 +161,8 @@ def read_tide(text: str, *, dated: bool) -> "float | Signal":
     return Signal(source=text, time_s=np.array(times), values=np.array(heights)[:, None])
 
 
-def utc_seconds(text: str) -> float:
-    """Seconds since 1970 of an ISO 8601 date; one that names no zone is UTC.
-
-    Raises:
-        ValueError: it is not a date.
-    """
-    date = datetime.fromisoformat(text)
-    try:
-        return (date if date.tzinfo is not None else date.replace(tzinfo=UTC)).timestamp()
-    except OverflowError:  # in the years 1 and 9999
-        raise ValueError(f"{text} is no date of ours") from None
-
-
 def moment(time_s: float) -> str:
     """A time as people read it: a date where it is one."""
-    from missions.logs.dive import DATED_AFTER_S
-
     if time_s < DATED_AFTER_S:
         return f"{time_s:.1f} s"
     return datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%d %H:%M:%S")

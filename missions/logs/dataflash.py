@@ -39,20 +39,21 @@ class LogTable:
     name: str
     columns: dict[str, Array]
     """(N,) numbers by field, in the units that the field's type scales to."""
-    kinds: dict[str, str]
-    """Type of each field, one letter."""
     texts: dict[str, list[str]]
     """Fields of text."""
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values()), ()))
 
+    def has(self, *names: str) -> bool:
+        """Whether all of these columns are there."""
+        return all(name in self.columns for name in names)
+
     def rows(self, keep: Mask) -> "LogTable":
         """The rows where a mask, (N,), holds."""
         return LogTable(
             name=self.name,
             columns={name: column[keep] for name, column in self.columns.items()},
-            kinds=self.kinds,
             texts={
                 name: [text for text, good in zip(column, keep, strict=True) if good]
                 for name, column in self.texts.items()
@@ -190,12 +191,7 @@ def _table(form: _MessageFormat, records: Any) -> LogTable:
             texts[name] = [t.split(b"\0")[0].decode("utf-8", "replace") for t in records[name]]
         else:
             columns[name] = records[name].astype(np.float64) / _DIVISORS.get(kind, 1.0)
-    return LogTable(
-        name=form.name,
-        columns=columns,
-        kinds=dict(zip(form.fields, form.kinds, strict=True)),
-        texts=texts,
-    )
+    return LogTable(name=form.name, columns=columns, texts=texts)
 
 
 def _read_text(
@@ -243,6 +239,4 @@ def _text_table(
             except ValueError:
                 lost[f"{name}: {field} is no number"] += 1
         columns[field] = values
-    return LogTable(
-        name=name, columns=columns, kinds=dict(zip(fields, kinds, strict=False)), texts=texts
-    )
+    return LogTable(name=name, columns=columns, texts=texts)

@@ -10,12 +10,10 @@ from numpy.typing import NDArray
 
 from alice_survey.base.errors import NavigationError
 from alice_survey.base.frames import Array
+from missions.logs.navigation_csv import interpolated
 
 ROLES = ("navigation", "depth", "attitude", "altitude")
 """What of a log may be chosen by name."""
-GAP_S, GAP_INTERVALS = 2.0, 5.0
-"""A gap is longer than both this many seconds and this many median intervals, as in the navigation
-reader of `import-images`."""
 DATED_AFTER_S = 1e8
 """Times since 1970 before this (March 1973) are a simulation's or a processor's own clock."""
 
@@ -34,13 +32,6 @@ class Signal:
     values: Array
     """(N, k); NaN is not known."""
 
-    @property
-    def longest_gap_s(self) -> float:
-        """Seconds between rows beyond which nothing is interpolated."""
-        if len(self.time_s) < 2:
-            return GAP_S
-        return max(GAP_S, GAP_INTERVALS * float(np.median(np.diff(self.time_s))))
-
     def at(self, time_s: Array, *, turning: bool = False) -> Array:
         """Values, (M, k), at other times, interpolated; NaN in gaps and beyond the ends.
 
@@ -48,23 +39,10 @@ class Signal:
             time_s: (M,).
             turning: whether values are angles in degrees, which turn the short way round.
         """
-        return np.stack(
-            [self._column_at(column, time_s, turning) for column in self.values.T], axis=1
+        columns = (
+            interpolated(self.time_s, column, time_s, turning=turning) for column in self.values.T
         )
-
-    def _column_at(self, values: Array, at_s: Array, turning: bool) -> Array:
-        known = np.isfinite(values)
-        times, values = self.time_s[known], values[known]
-        found = np.full(at_s.shape, np.nan)
-        if not len(times):
-            return found
-        after = np.clip(np.searchsorted(times, at_s), 0, len(times) - 1)
-        before = np.clip(np.searchsorted(times, at_s, side="right") - 1, 0, len(times) - 1)
-        inside = (at_s >= times[0]) & (at_s <= times[-1])
-        inside &= times[after] - times[before] <= self.longest_gap_s
-        smooth = np.unwrap(values, period=360.0) if turning else values
-        found[inside] = np.interp(at_s[inside], times, smooth)
-        return found
+        return np.stack(list(columns), axis=1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

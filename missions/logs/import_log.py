@@ -11,21 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.base.artefacts import write_csv
 from alice_survey.base.errors import NavigationError, warn
 from alice_survey.base.frames import Array, Datum, rotation_from_attitude
-from missions.logs.corrections import (
-    COLUMNS,
-    Corrections,
-    moment,
-    navigation_table,
-    read_tide,
-    utc_seconds,
-)
+from missions.logs.corrections import Corrections, moment, navigation_table, read_tide
 from missions.logs.dive import ROLES, LoggedDive, Signal
+from missions.logs.navigation_csv import longest_gap_s, utc_date
+from missions.values.navigation import COLUMNS, write_navigation_rows
 
-_DECIMALS = (10, 10, 5, 6, 6, 6, 5, 6, 6, 6, 6, 6)
-"""Decimals of `COLUMNS`: as in the navigation CSV of `fly`."""
 _NAMED = 8
 _MICRO = 1e6
 
@@ -111,7 +103,8 @@ def import_log(
     time_s = time_s[complete]
     columns = {name: column[complete] for name, column in columns.items()}
     try:
-        write_navigation_csv(out, time_s, columns, dated=dated)
+        texts = [_date(t) if dated else f"{t:.6f}" for t in time_s.tolist()]
+        write_navigation_rows(out, texts, columns, "time_utc" if dated else "time_s")
         if asked.vehicle_log is not None:
             _write_vehicle_log(asked.vehicle_log, dive, corrections, asked)
     except OSError as error:
@@ -128,7 +121,7 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
     """
     from missions.logs.ardusub import read_ardusub_bin, read_ardusub_tlog
     from missions.logs.qgc_csv import read_qgc_csv
-    from missions.logs.ros_bag import BagOptions, is_bag, read_ros_bag
+    from missions.logs.ros_bag import is_bag, read_ros_bag
 
     if not path.exists():
         raise NavigationError(f"{path}: no such file or folder")
@@ -138,7 +131,7 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
         raise NavigationError("--datum is for the odometry of a bag of ROS: leave it out")
     if path.is_dir() or is_bag(path):
         datum = None if options.datum_deg is None else Datum(*options.datum_deg)
-        return read_ros_bag(path, BagOptions(topics=asked, datum=datum))
+        return read_ros_bag(path, asked, datum)
     if suffix in (".bin", ".log"):
         return read_ardusub_bin(path, asked)
     if suffix == ".tlog":
@@ -149,23 +142,6 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
         f"{path}: no log that is known: a ROS bag (.bag, .mcap, .db3 or a folder), ArduSub's .BIN, "
         ".log or .tlog, or QGroundControl's .csv"
     )
-
-
-def write_navigation_csv(
-    path: Path, time_s: Array, columns: Mapping[str, Array], *, dated: bool
-) -> None:
-    """Write the navigation CSV; positions to 0.01 mm, times to 1 us.
-
-    Args:
-        path: file to write.
-        time_s: (N,) seconds, since 1970 where they are dated.
-        columns: `corrections.COLUMNS`, (N,) each; NaN becomes an empty cell.
-        dated: whether to write dates instead of seconds.
-    """
-    texts = [[_date(t) for t in time_s.tolist()] if dated else [f"{t:.6f}" for t in time_s]]
-    for name, decimals in zip(COLUMNS, _DECIMALS, strict=True):
-        texts.append(["" if math.isnan(v) else f"{v:.{decimals}f}" for v in columns[name].tolist()])
-    write_csv(path, ("time_utc" if dated else "time_s", *COLUMNS), zip(*texts, strict=True))
 
 
 def _date(time_s: float) -> str:
@@ -193,7 +169,7 @@ def _dated(dive: LoggedDive, start_utc: str) -> LoggedDive:
     if dive.dated:
         raise NavigationError("--start-utc is for logs without dates; this one has dates")
     try:
-        start_s = utc_seconds(start_utc)
+        start_s = utc_date(start_utc).timestamp()
     except ValueError:
         raise NavigationError(
             f"--start-utc {start_utc!r} is no date such as 2024-05-01T12:00:00Z"
@@ -302,7 +278,7 @@ def _report(
     tidal: bool,
 ) -> tuple[str, dict[str, Any]]:
     """What was read, from where, and what is missing; warns of what was left out and of gaps."""
-    gaps = _gaps(time_s, dive)
+    gaps = _gaps(time_s)
     if lost:
         warn(f"{path}: left out: " + "; ".join(f"{n} {why}" for why, n in sorted(lost.items())))
     if gaps:
@@ -355,7 +331,7 @@ def _report(
     return "\n".join(lines), data
 
 
-def _gaps(time_s: Array, dive: LoggedDive) -> list[tuple[float, float]]:
+def _gaps(time_s: Array) -> list[tuple[float, float]]:
     """Start and length of steps that nothing is interpolated over."""
-    longest = replace(dive.position, time_s=time_s).longest_gap_s
+    longest = longest_gap_s(time_s)
     return [(a, b - a) for a, b in itertools.pairwise(time_s.tolist()) if b - a > longest]

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
+from typing import Any
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
@@ -13,12 +14,9 @@ import numpy as np
 from alice_survey.base.contents import shown
 from alice_survey.base.errors import NavigationError, warn, why
 from alice_survey.base.frames import Array
+from missions.values.navigation import COLUMNS
 
-POSITION = ("latitude_deg", "longitude_deg", "depth_m")
-OPTIONAL = (
-    "roll_deg", "pitch_deg", "heading_deg", "altitude_m", "sigma_horizontal_m", "sigma_depth_m",
-    "sigma_attitude_deg", "sigma_heading_deg", "sigma_altitude_m",
-)  # fmt: skip
+POSITION, OPTIONAL = COLUMNS[:3], COLUMNS[3:]
 _RANGES = {"latitude_deg": (-85.0, 85.0), "longitude_deg": (-180.0, 180.0)}
 _GAP_S, _GAP_INTERVALS = 2.0, 5.0
 """A gap is longer than both this many seconds and this many median intervals."""
@@ -39,9 +37,7 @@ class NavigationLog:
     @property
     def longest_gap_s(self) -> float:
         """Seconds between rows beyond which nothing is interpolated."""
-        if len(self.time_s) < 2:
-            return _GAP_S
-        return max(_GAP_S, _GAP_INTERVALS * float(np.median(np.diff(self.time_s))))
+        return longest_gap_s(self.time_s)
 
     def at(self, time_s: Array) -> dict[str, Array]:
         """All columns at other times, (N,) each.
@@ -52,24 +48,45 @@ class NavigationLog:
         return {name: self._at(name, values, time_s) for name, values in self.columns.items()}
 
     def _at(self, name: str, values: Array, at_s: Array) -> Array:
-        known = np.isfinite(values)
-        times, values = self.time_s[known], values[known]
-        found = np.full(at_s.shape, np.nan)
-        if not len(times):
-            return found
-        after = np.clip(np.searchsorted(times, at_s), 0, len(times) - 1)
-        before = np.clip(np.searchsorted(times, at_s, side="right") - 1, 0, len(times) - 1)
-        with np.errstate(invalid="ignore"):
-            inside = (at_s >= times[0]) & (at_s <= times[-1])
-            inside &= times[after] - times[before] <= self.longest_gap_s
         turning = name in ("roll_deg", "pitch_deg", "heading_deg", "longitude_deg")
-        smooth = np.unwrap(values, period=360.0) if turning else values
-        found[inside] = np.interp(at_s[inside], times, smooth)
+        found = interpolated(self.time_s, values, at_s, turning=turning)
         if name == "heading_deg":
-            found %= 360.0
-        elif turning:
-            found = (found + 180.0) % 360.0 - 180.0
+            return found % 360.0
+        return (found + 180.0) % 360.0 - 180.0 if turning else found
+
+
+def longest_gap_s(time_s: Array) -> float:
+    """Seconds between rows, at times (T,), beyond which nothing is interpolated."""
+    if len(time_s) < 2:
+        return _GAP_S
+    return max(_GAP_S, _GAP_INTERVALS * float(np.median(np.diff(time_s))))
+
+
+def interpolated(time_s: Array, values: Array, at_s: Array, *, turning: bool) -> Array:
+    """Values at other times; NaN in gaps, beyond the ends, and where a time is NaN.
+
+    Args:
+        time_s: (T,) increasing.
+        values: (T,); NaN is not known.
+        at_s: (N,).
+        turning: whether values are angles in degrees, which turn the short way round.
+
+    Returns:
+        (N,) values; angles go on beyond a full turn.
+    """
+    known = np.isfinite(values)
+    times, values = time_s[known], values[known]
+    found = np.full(at_s.shape, np.nan)
+    if not len(times):
         return found
+    after = np.clip(np.searchsorted(times, at_s), 0, len(times) - 1)
+    before = np.clip(np.searchsorted(times, at_s, side="right") - 1, 0, len(times) - 1)
+    with np.errstate(invalid="ignore"):
+        inside = (at_s >= times[0]) & (at_s <= times[-1])
+        inside &= times[after] - times[before] <= longest_gap_s(time_s)
+    smooth = np.unwrap(values, period=360.0) if turning else values
+    found[inside] = np.interp(at_s[inside], times, smooth)
+    return found
 
 
 def find_zone(name: str) -> tzinfo:
@@ -86,6 +103,35 @@ def find_zone(name: str) -> tzinfo:
         ) from None
 
 
+def utc_date(text: str, zone: tzinfo = UTC) -> datetime:
+    """The moment of an ISO 8601 date; one that names no zone is of `zone`.
+
+    Raises:
+        ValueError: it is not a date.
+    """
+    date = datetime.fromisoformat(text)
+    try:
+        return (date.replace(tzinfo=zone) if date.tzinfo is None else date).astimezone(UTC)
+    except OverflowError:  # in the years 1 and 9999
+        raise ValueError(f"{text} is not within the years 1 to 9999 in UTC") from None
+
+
+def csv_rows(path: Path) -> tuple[list[str], list[tuple[int, dict[str, Any]]]]:
+    """Names of a CSV's columns, and its rows with the number of their line.
+
+    Raises:
+        NavigationError: the file cannot be read.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file, skipinitialspace=True)
+            header = [name.strip() for name in reader.fieldnames or []]
+            reader.fieldnames = header
+            return header, [(reader.line_num, row) for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise NavigationError(f"{path}: cannot be read: {why(error)}") from None
+
+
 def read_navigation(path: Path, zone: tzinfo) -> NavigationLog:
     """Read a navigation CSV: `time_s` or `time_utc`, latitude, longitude, depth, and optional rest.
 
@@ -99,14 +145,7 @@ def read_navigation(path: Path, zone: tzinfo) -> NavigationLog:
     Raises:
         NavigationError: the file cannot be read, lacks a column, or holds no usable row.
     """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            header = [name.strip() for name in reader.fieldnames or []]
-            reader.fieldnames = header
-            rows = [(reader.line_num, row) for row in reader]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise NavigationError(f"{path}: cannot be read: {why(error)}") from None
+    header, rows = csv_rows(path)
     time_name = next((name for name in ("time_s", "time_utc") if name in header), None)
     if time_name is None:
         raise NavigationError(
@@ -189,9 +228,8 @@ def _number(row: dict[str, str | None], name: str) -> float:
 
 def _date(cell: str | None, zone: tzinfo) -> datetime:
     try:
-        date = datetime.fromisoformat((cell or "").strip())
-        return (date.replace(tzinfo=zone) if date.tzinfo is None else date).astimezone(UTC)
-    except (ValueError, OverflowError):  # OverflowError in the years 1 and 9999
+        return utc_date((cell or "").strip(), zone)
+    except ValueError:
         raise ValueError(f"time_utc is {cell!r}, not a date such as 2024-05-01T12:00:00Z") from None
 
 

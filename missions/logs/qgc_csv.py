@@ -4,15 +4,15 @@ import csv
 import math
 from collections import Counter
 from collections.abc import Mapping
-from datetime import UTC, datetime, tzinfo
+from datetime import tzinfo
 from pathlib import Path
-from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
 
 from alice_survey.base.contents import shown
 from alice_survey.base.errors import NavigationError
 from missions.logs.dive import LoggedDive, cleaned, usable_positions
+from missions.logs.navigation_csv import find_zone, utc_date
 
 _TIME = "Timestamp"
 _PLACE = ("gps.lat", "gps.lon")
@@ -20,7 +20,6 @@ _DEPTH = "altitudeRelative"
 _ANGLES = ("roll", "pitch", "heading")
 _ALTITUDES = ("distanceSensor.rotationPitch270", "apmSubInfo.rangefinderDistance")
 """The first has metres; of the second ArduSub's RANGEFINDER message, metres."""
-_UNKNOWN = ("", "--", "--.--", "nan", "NaN")
 
 
 def read_qgc_csv(path: Path, asked: Mapping[str, str], time_zone: str) -> LoggedDive:
@@ -40,7 +39,7 @@ def read_qgc_csv(path: Path, asked: Mapping[str, str], time_zone: str) -> Logged
     wrong = [role for role in asked if role not in ("depth", "altitude")]
     if wrong:
         raise NavigationError(f"--topic {wrong[0]}: of a CSV only depth and altitude can be chosen")
-    zone = _zone(time_zone)
+    zone = find_zone(time_zone)
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             header, *rows = [row for row in csv.reader(file) if row] or [[]]
@@ -94,26 +93,14 @@ def read_qgc_csv(path: Path, asked: Mapping[str, str], time_zone: str) -> Logged
     )
 
 
-def _zone(name: str) -> tzinfo:
-    try:
-        return UTC if name == "UTC" else ZoneInfo(name)
-    except (ZoneInfoNotFoundError, ValueError, OSError):
-        raise NavigationError(
-            f"--time-zone {name!r} is not known; give a name such as Europe/Oslo or UTC"
-        ) from None
-
-
 def _seconds(cell: str, zone: tzinfo) -> float:
     try:
-        date = datetime.fromisoformat(cell)
-        return (date if date.tzinfo is not None else date.replace(tzinfo=zone)).timestamp()
-    except (ValueError, OverflowError):  # OverflowError in the years 1 and 9999
+        return utc_date(cell, zone).timestamp()
+    except ValueError:
         return math.nan
 
 
 def _number(cell: str) -> float:
-    if cell in _UNKNOWN:
-        return math.nan
     try:
         return float(cell)
     except ValueError:

@@ -6,9 +6,11 @@ JointState. Orientations and velocities are ENU and FLU (REP-103) unless the fra
 `ned`, as in COLA2 and Stonefish.
 """
 
+import bz2
+import math
 import struct
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,29 +23,24 @@ from alice_survey.base.contents import one_line
 from alice_survey.base.errors import NavigationError
 from alice_survey.base.executor import progress
 from alice_survey.base.frames import Array, Datum, attitude_from_rotation
-from missions.logs.bag_chunks import bounded_chunks
 from missions.logs.dive import DATED_AFTER_S, LoggedDive, Signal, cleaned, usable_positions
-from missions.logs.ros_rows import (
-    ANGLES,
-    FIX,
-    IMU,
-    JOINTS,
-    NAV_STS,
-    NED,
-    NUMBERS,
-    ODOMETRY,
-    PLACE,
-    PRESSURE,
-    QUATERNION,
-    RANGE,
-    RATES,
-    ROWS,
-    VARIANCES,
-    VELOCITY,
-)
+from missions.logs.ros_frames import flipped_body, flipped_quaternion, flipped_world
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
+
+NAV_STS, ODOMETRY, FIX = "NavSts", "Odometry", "NavSatFix"
+IMU, PRESSURE, RANGE, JOINTS = "Imu", "FluidPressure", "Range", "JointState"
+NUMBERS = ("Float32", "Float64")
+
+VARIANCES = ("var_north", "var_east", "var_depth", "var_roll", "var_pitch", "var_heading")
+ANGLES = ("roll", "pitch", "heading")
+QUATERNION = ("qx", "qy", "qz", "qw")
+NED = ("north", "east", "down")
+VELOCITY, RATES = ("u", "v", "w"), ("p", "q", "r")
+PLACE = ("latitude", "longitude")
+
+_NOTHING = math.nan
 
 _TAKES: Mapping[str, tuple[str, ...]] = {
     "navigation": (NAV_STS, ODOMETRY, FIX),
@@ -56,6 +53,11 @@ _TRUTH = ("truth", "ground_truth", "_gt", "/gt")
 _ORIGIN = ("datum", "origin")
 _NOT_ALTITUDE = ("beam", "front", "forward", "fls", "obstacle")
 
+_DENSITY_KG_M3, _SURFACE_PA, _GRAVITY_MPS2 = 1025.0, 101325.0, 9.80665
+"""What makes a depth of a pressure; the standard atmosphere (ISO 2533)."""
+LARGEST_BYTES = 256 << 20
+"""Largest chunk of a bag, unpacked, since a kilobyte of bz2 or zstd can hold a gigabyte. Recorders
+close theirs after 1 to 4 MB, or after one message."""
 _UNIT = 0.05
 """How far from 1 the length of a quaternion may be."""
 _SIGMAS: Mapping[str, tuple[tuple[str, ...], float]] = {
@@ -79,20 +81,6 @@ _COLA2 = {
 """Message definitions for bags of ROS 2 before Iron, which hold none."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class BagOptions:
-    """What a bag does not state itself."""
-
-    topics: Mapping[str, str]
-    """Topic to use for each role (`dive.ROLES`)."""
-    datum: Datum | None = None
-    """Origin of an odometry's world."""
-    density_kg_m3: float = 1025.0
-    surface_pressure_pa: float = 101325.0
-    """Both to make a depth of a pressure; the standard atmosphere (ISO 2533)."""
-    gravity_mps2: float = 9.80665
-
-
 @dataclass(frozen=True)
 class _Topic:
     name: str
@@ -105,12 +93,13 @@ def is_bag(path: Path) -> bool:
     return path.suffix.lower() in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").is_file()
 
 
-def read_ros_bag(path: Path, options: BagOptions) -> LoggedDive:
+def read_ros_bag(path: Path, asked: Mapping[str, str], datum: Datum | None) -> LoggedDive:
     """Read a bag.
 
     Args:
         path: a ROS 1 file, a ROS 2 folder, or the single .mcap or .db3 of one.
-        options: what to use of it.
+        asked: the topic to use for each role (`dive.ROLES`).
+        datum: origin of an odometry's world, where the bag does not state it.
 
     Raises:
         NavigationError: it is not a bag, is damaged, or lacks what navigation needs.
@@ -118,21 +107,21 @@ def read_ros_bag(path: Path, options: BagOptions) -> LoggedDive:
     with _opened(path) as reader:
         present = sorted({_Topic(c.topic, c.msgtype.split("/")[-1]) for c in reader.connections},
                          key=lambda topic: topic.name)  # fmt: skip
-        chosen = _choose(path, present, options.topics)
+        chosen = _choose(path, present, asked)
         origin = [
             topic for topic in present
             if topic.kind == FIX and topic.name.rsplit("/", 1)[-1] in _ORIGIN
         ]  # fmt: skip
-        if chosen["navigation"].kind == ODOMETRY and options.datum is None and not origin:
+        if chosen["navigation"].kind == ODOMETRY and datum is None and not origin:
             raise NavigationError(
                 f"{path}: {chosen['navigation'].name} counts from an origin that the bag does not "
-                "tell: give --datum LATITUDE LONGITUDE"
+                "hold: give --datum LATITUDE LONGITUDE"
             )
         joints = [topic for topic in present if topic.kind == JOINTS]
         lost: Counter[str] = Counter()
         notes: list[str] = []
         series = _collect(reader, {*chosen.values(), *origin, *joints}, lost, notes)
-    return _BagReading(path, options, chosen, series, lost, notes).dive(origin, joints)
+    return _BagReading(path, datum, chosen, series, lost, notes).dive(origin, joints)
 
 
 @contextmanager
@@ -159,7 +148,7 @@ def _opened(path: Path) -> Iterator["AnyReader"]:
         RecursionError,
     )  # fmt: skip
     try:
-        with bounded_chunks(), AnyReader([path], default_typestore=store) as reader:
+        with _bounded_chunks(), AnyReader([path], default_typestore=store) as reader:
             yield reader
     except NavigationError:
         raise
@@ -171,8 +160,43 @@ def _opened(path: Path) -> Iterator["AnyReader"]:
         reason = one_line(error)
         raise NavigationError(
             f"{path}: cannot be read as a bag of ROS, is it cut off? ({reason}); `rosbag reindex` "
-            "or `ros2 bag reindex` mends a bag whose recording was killed"
+            "or `ros2 bag reindex` repairs a bag whose recording was killed"
         ) from None
+
+
+@contextmanager
+def _bounded_chunks() -> Iterator[None]:
+    """Meanwhile rosbags unpacks no chunk of over `LARGEST_BYTES`: it raises ValueError.
+
+    It has no setting for that: its tables of what unpacks a chunk are changed, and put back.
+    """
+    import lz4.frame  # type: ignore[import-untyped]
+    from rosbags.rosbag1.reader import decompressors as of_ros1
+    from rosbags.rosbag2.storage_mcap import DECOMPRESSORS as OF_MCAP
+    from rosbags.rosbag2.storage_mcap import zstd  # type: ignore[attr-defined]  # by Python's age
+
+    lz4_frames = _bounded(lambda: lz4.frame.LZ4FrameDecompressor())
+    zstd_frames = _bounded(lambda: zstd.ZstdDecompressor())
+    before = dict(of_ros1), dict(OF_MCAP)
+    of_ros1.update(bz2=_bounded(bz2.BZ2Decompressor), lz4=lz4_frames)
+    OF_MCAP.update(lz4=lambda data, _: lz4_frames(data), zstd=lambda data, _: zstd_frames(data))
+    try:
+        yield
+    finally:
+        of_ros1.update(before[0])
+        OF_MCAP.update(before[1])
+
+
+def _bounded(decompressor: Callable[[], Any]) -> Callable[[bytes], bytes]:
+    def unpack(data: bytes) -> bytes:
+        unpacked: bytes = decompressor().decompress(data, LARGEST_BYTES + 1)
+        if len(unpacked) > LARGEST_BYTES:
+            raise ValueError(
+                f"a chunk of {len(data)} bytes unpacks to over {LARGEST_BYTES >> 20} MiB"
+            )
+        return unpacked
+
+    return unpack
 
 
 def _choose(path: Path, present: Sequence[_Topic], asked: Mapping[str, str]) -> dict[str, _Topic]:
@@ -249,7 +273,7 @@ class _Series:
     time_s: Array
     """(N,) times as logged."""
     columns: dict[str, Array]
-    """(N,) columns by name (`ros_rows.ROWS`), or by joint."""
+    """(N,) columns by name (`ROWS`), or by joint."""
 
 
 def _collect(
@@ -310,13 +334,13 @@ class _BagReading:
     def __init__(
         self,
         path: Path,
-        options: BagOptions,
+        datum: Datum | None,
         chosen: Mapping[str, _Topic],
         series: Mapping[_Topic, _Series],
         lost: Counter[str],
         notes: list[str],
     ) -> None:
-        self.path, self.options, self.chosen = path, options, chosen
+        self.path, self.datum, self.chosen = path, datum, chosen
         self.series, self.lost, self.notes = series, lost, notes
         self._counted: set[_Topic] = set()
 
@@ -365,12 +389,12 @@ class _BagReading:
         return self.series[self.chosen.get(role, self.chosen["navigation"])]
 
     def _datum(self, origin: Sequence[_Topic]) -> Datum:
-        if self.options.datum is not None:
-            return self.options.datum
+        if self.datum is not None:
+            return self.datum
         fixes = self.series[origin[0]].columns if origin else {}
         place = [fixes[name][0] for name in (*PLACE, "height") if len(fixes.get(name, ()))]
         if len(place) < 3 or not np.all(np.isfinite(place)):
-            raise NavigationError(f"{self.path}: {origin[0].name} tells no place: give --datum")
+            raise NavigationError(f"{self.path}: {origin[0].name} holds no place: give --datum")
         return Datum(*(float(value) for value in place))
 
     def _add_geodetic(self, datum: Datum) -> None:
@@ -384,15 +408,14 @@ class _BagReading:
                 series.columns.update(zip((*PLACE, "depth"), place.T, strict=True))
 
     def _depth(self) -> Signal | None:
-        series, options = self._of("depth"), self.options
+        series = self._of("depth")
         if series.topic.kind != PRESSURE:
             return self._signal(series, ("number",)) or self._signal(series, ("depth",))
         self.notes.append(
-            f"depth is pressure less {options.surface_pressure_pa:g} Pa, in water of "
-            f"{options.density_kg_m3:g} kg/m^3"
+            f"depth is pressure minus {_SURFACE_PA:g} Pa, in water of {_DENSITY_KG_M3:g} kg/m^3"
         )
-        per_metre = options.density_kg_m3 * options.gravity_mps2
-        values = (series.columns["pressure"] - options.surface_pressure_pa) / per_metre
+        per_metre = _DENSITY_KG_M3 * _GRAVITY_MPS2
+        values = (series.columns["pressure"] - _SURFACE_PA) / per_metre
         return self._cleaned(series, values)
 
     def _attitude(self) -> Signal | None:
@@ -448,3 +471,71 @@ class _BagReading:
         series = self.series[joints[0]]
         names = tuple(series.columns)
         return self._signal(series, names, scale=60.0 / (2.0 * np.pi)) if names else None, names
+
+
+def _nav_sts(m: Any) -> list[float]:
+    place, turn, spread, spin = (
+        m.global_position, m.orientation, m.position_variance, m.orientation_variance,
+    )  # fmt: skip
+    v, rate = m.body_velocity, m.orientation_rate
+    return [
+        place.latitude, place.longitude, m.position.depth, m.altitude,
+        turn.roll, turn.pitch, turn.yaw,
+        spread.north, spread.east, spread.depth, spin.roll, spin.pitch, spin.yaw,
+        v.x, v.y, v.z, rate.roll, rate.pitch, rate.yaw,
+    ]  # fmt: skip
+
+
+def _odometry(m: Any) -> list[float]:
+    """A twist whose covariance begins with a negative number is not given (as in Imu)."""
+    p, q = m.pose.pose.position, m.pose.pose.orientation
+    v, rate = m.twist.twist.linear, m.twist.twist.angular
+    place, turn = np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w])
+    motion = np.array([[v.x, v.y, v.z], [rate.x, rate.y, rate.z]])
+    if not _is_ned(m):
+        place, turn, motion = flipped_world(place), flipped_quaternion(turn), flipped_body(motion)
+    if m.twist.covariance[0] < 0:
+        motion = np.full((2, 3), _NOTHING)
+    c = m.pose.covariance
+    return [*place, *turn, *c[[0, 7, 14, 21, 28, 35]], *motion.ravel()]
+
+
+def _fix(m: Any) -> list[float]:
+    """No place without a fix (STATUS_NO_FIX is -1)."""
+    if m.status.status < 0:
+        return [_NOTHING] * 5
+    c, known = m.position_covariance, m.position_covariance_type > 0
+    variances = [c[0], c[4]] if known else [_NOTHING, _NOTHING]
+    return [m.latitude, m.longitude, m.altitude, *variances]
+
+
+def _imu(m: Any) -> list[float]:
+    q = m.orientation
+    if m.orientation_covariance[0] < 0:
+        return [_NOTHING] * 4
+    turn = np.array([q.x, q.y, q.z, q.w])
+    return list(turn if _is_ned(m) else flipped_quaternion(turn))
+
+
+def _range(m: Any) -> list[float]:
+    """Not finite, or outside of what the sensor measures, is no echo (REP-117)."""
+    most = m.max_range if m.max_range > 0 else math.inf
+    known = math.isfinite(m.range) and m.min_range <= m.range <= most
+    return [m.range if known else _NOTHING]
+
+
+ROWS: Mapping[str, tuple[tuple[str, ...], Callable[[Any], list[float]]]] = {
+    NAV_STS: (
+        (*PLACE, "depth", "altitude", *ANGLES, *VARIANCES, *VELOCITY, *RATES), _nav_sts,
+    ),
+    ODOMETRY: ((*NED, *QUATERNION, *VARIANCES, *VELOCITY, *RATES), _odometry),
+    FIX: ((*PLACE, "height", "var_north", "var_east"), _fix),
+    IMU: (QUATERNION, _imu),
+    PRESSURE: (("pressure",), lambda m: [m.fluid_pressure]),
+    RANGE: (("altitude",), _range),
+} | {kind: (("number",), lambda m: [m.data]) for kind in NUMBERS}  # fmt: skip
+"""For each type: the names of the columns, and what takes them from a message."""
+
+
+def _is_ned(m: Any) -> bool:
+    return "ned" in m.header.frame_id.lower()

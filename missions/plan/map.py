@@ -66,9 +66,9 @@ def draw_plan(
     path: Path,
     plan: Plan,
     rig: Rig,
-    certificate: Certificate | None = None,
-    bathymetry: Bathymetry | None = None,
-    sea: SeaConfig | None = None,
+    certificate: Certificate,
+    bathymetry: Bathymetry | None,
+    sea: SeaConfig,
 ) -> None:
     """Draw a plan, east to the right, north up.
 
@@ -77,7 +77,7 @@ def draw_plan(
         plan: what to draw.
         rig: its first camera's footprints are drawn.
         certificate: how many pictures see each place.
-        bathymetry: contours to draw.
+        bathymetry: contours to draw, or None.
         sea: its mean current near the sea floor is shown.
 
     Raises:
@@ -90,9 +90,9 @@ def draw_plan(
 def plan_figure(
     plan: Plan,
     rig: Rig,
-    certificate: Certificate | None = None,
-    bathymetry: Bathymetry | None = None,
-    sea: SeaConfig | None = None,
+    certificate: Certificate,
+    bathymetry: Bathymetry | None,
+    sea: SeaConfig,
 ) -> Sheet:
     """The map as a figure; arguments are those of `draw_plan`."""
     outline = footprint_outline(plan, rig)
@@ -104,16 +104,15 @@ def plan_figure(
     figure, axes = map_sheet(
         _bounds(np.vstack([plan.area.corners_ne[:, :2], *shapes, *ways]), plan)
     )
-    if certificate is not None:
-        draw_counts(axes, certificate, opacity=0.6)
+    draw_counts(axes, certificate, opacity=0.6)
     if len(shapes) <= _MOST_FOOTPRINTS:
-        _draw_footprints(axes, shapes, rig, faint=certificate is not None)
+        _draw_footprints(axes, shapes, rig)
     _draw_area(axes, plan)
     _draw_route(axes, plan, ways)
     _draw_lines(axes, plan)
     if bathymetry is not None:
         _draw_bathymetry(axes, bathymetry)
-    if sea is not None and sea.current_mps > 0 and sea.current_file is None:
+    if sea.current_mps > 0 and sea.current_file is None:
         _draw_current(axes, sea)
     finish_map(figure, axes, plan.datum, plan.name, _summary(plan))
     return figure
@@ -149,15 +148,14 @@ def _bounds(points_ne: Array, plan: Plan) -> tuple[float, float, float, float]:
     )
 
 
-def _draw_footprints(axes: Axes, shapes: list[Array], rig: Rig, *, faint: bool) -> None:
-    colour = COLOURS["footprint"]
+def _draw_footprints(axes: Axes, shapes: list[Array], rig: Rig) -> None:
     axes.add_collection(
         PolyCollection(
             [shape[:, ::-1] for shape in shapes],
-            facecolors="none" if faint else colour,
-            edgecolors=colour if faint else "none",
+            facecolors="none",
+            edgecolors=COLOURS["footprint"],
             linewidths=0.35,
-            alpha=0.35 if faint else 0.16,
+            alpha=0.35,
             zorder=1,
             label=f"footprints ({rig.reference} camera)",
         )

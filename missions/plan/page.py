@@ -1,6 +1,6 @@
 """A plan as one HTML page: an interactive map and all figures, without any network."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from urllib.parse import quote
@@ -24,13 +24,13 @@ def write_page(
     path: Path,
     plan: Plan,
     rig: Rig,
-    certificate: Certificate | None = None,
-    settings_rows: Sequence[Setting] = (),
+    certificate: Certificate,
+    settings_rows: Sequence[Setting],
     *,
-    bathymetry: Bathymetry | None = None,
-    sea: SeaConfig | None = None,
-    warnings: Sequence[str] = (),
-    links: Sequence[Link] = (),
+    bathymetry: Bathymetry | None,
+    sea: SeaConfig,
+    warnings: Sequence[str],
+    links: Sequence[Link],
 ) -> None:
     """Write a plan as a page with an interactive map.
 
@@ -38,9 +38,9 @@ def write_page(
         path: of the HTML file.
         plan: the plan.
         rig: its cameras; footprints are of the first.
-        certificate: how many pictures see each place; None leaves that layer out.
+        certificate: how many pictures see each place.
         settings_rows: of the table of imaging settings.
-        bathymetry: contours to draw.
+        bathymetry: contours to draw, or None.
         sea: its mean current near the sea floor is shown.
         warnings: where the plan differs from what was requested.
         links: files to point to, their addresses as paths relative to the page.
@@ -56,7 +56,15 @@ def write_page(
         subtitle=_subtitle(plan),
         facts=_facts(plan, rig),
         verdicts=[Verdict(level="look", text=text) for text in warnings],
-        sections=list(_sections(plan, certificate, settings_rows, links)),
+        sections=[
+            Section(name="map", title="Map", scene="map"),
+            Section(title="Coverage", tables=[_coverage(certificate)]),
+            Section(title="Dives", tables=[_dives(plan)]),
+            _settings(settings_rows),
+            Section(
+                title="Files", links=[replace(link, address=quote(link.address)) for link in links]
+            ),
+        ],
         map=chart,
         footer="Places are of the left port's outer glass, metres north and east of the datum "
         f"{place_text(plan.datum)}; latitude and longitude are WGS 84.",
@@ -97,24 +105,6 @@ def _facts(plan: Plan, rig: Rig) -> list[tuple[str, str]]:
         ("dives", f"{len(plan.dives)}"),
         ("energy", f"{plan.energy_wh:.0f} Wh"),
     ]
-
-
-def _sections(
-    plan: Plan,
-    certificate: Certificate | None,
-    settings_rows: Sequence[Setting],
-    links: Sequence[Link],
-) -> Iterator[Section]:
-    yield Section(name="map", title="Map", scene="map")
-    if certificate is not None:
-        yield Section(title="Coverage", tables=[_coverage(certificate)])
-    yield Section(title="Dives", tables=[_dives(plan)])
-    if settings_rows:
-        yield _settings(settings_rows)
-    if links:
-        yield Section(
-            title="Files", links=[replace(link, address=quote(link.address)) for link in links]
-        )
 
 
 def _coverage(seen: Certificate) -> Table:

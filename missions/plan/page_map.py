@@ -55,30 +55,27 @@ Extent = tuple[float, float, float, float]
 def plan_map(
     plan: Plan,
     rig: Rig,
-    certificate: Certificate | None = None,
-    bathymetry: Bathymetry | None = None,
-    sea: SeaConfig | None = None,
+    certificate: Certificate,
+    bathymetry: Bathymetry | None,
+    sea: SeaConfig,
 ) -> SurveyMap:
     """The layers of a plan's map.
 
     Args:
         plan: the plan.
         rig: its cameras; footprints are of the first.
-        certificate: how many pictures see each place; None leaves these layers out.
+        certificate: how many pictures see each place.
         bathymetry: for contours, or None.
-        sea: for the current, or None.
+        sea: for the current.
     """
     outline = footprint_outline(plan, rig)
     extent = map_extent(plan, outline)
     detail_m = max(_FINEST_M, max(extent[2] - extent[0], extent[3] - extent[1]) * _DETAIL)
-    layers: list[Layer] = []
-    if certificate is not None:
-        layers += _coverage_layers(certificate)
-    layers += _area_layers(plan, detail_m)
+    layers = [*_coverage_layers(certificate), *_area_layers(plan, detail_m)]
     if bathymetry is not None:
         layers += _contour_layer(bathymetry, extent, detail_m)
     camera = f"Footprints ({rig.reference} camera)"
-    layers.append(_derived("footprints", camera, "polygon", "footprint", certificate is None))
+    layers.append(_derived("footprints", camera, "polygon", "footprint", shown=False))
     layers += _dive_layers(plan, detail_m)
     layers.append(_derived("stations", "Stations", "point", "survey", shown=True))
     layers.append(
@@ -88,7 +85,7 @@ def plan_map(
             texts=[_north_east(plan.home_ne_m)],
         )
     )  # fmt: skip
-    if sea is not None and sea.current_mps > 0 and sea.current_file is None:
+    if sea.current_mps > 0 and sea.current_file is None:
         layers.append(_current_layer(sea, extent))
     return SurveyMap(
         layers=layers,
@@ -98,7 +95,7 @@ def plan_map(
     )
 
 
-def station_data(plan: Plan, rig: Rig, certificate: Certificate | None) -> dict[str, Any]:
+def station_data(plan: Plan, rig: Rig, certificate: Certificate) -> dict[str, Any]:
     """What the map's script starts from, as JSON values.
 
     `lines` holds, by layer and in the order of its shapes, the number of the line, of its first
@@ -114,7 +111,7 @@ def station_data(plan: Plan, rig: Rig, certificate: Certificate | None) -> dict[
         "outline": np.round(outline, 4).tolist(),
         "across": plan.footprint_m[0],
         "spacing": plan.line_spacing_m,
-        "counts": None if certificate is None else _counts_data(certificate),
+        "counts": _counts_data(certificate),
     }
 
 

@@ -394,7 +394,14 @@ def _details(
     camera = rig.cameras[rig.reference]
     return {
         "imaging": imaging.to_json(),
-        "heading": None if sweep is None else _sweep_json(sweep),
+        "heading": None
+        if sweep is None
+        else {
+            "heading_deg": math.degrees(sweep.heading_rad),
+            "cost_j": sweep.cost_j,
+            "least_width_heading_deg": math.degrees(sweep.width_heading_rad),
+            "least_width_m": sweep.width_m,
+        },
         "wanted_forward_overlap": plan.forward_overlap,
         "wanted_side_overlap": plan.side_overlap,
         "stereo_swath_m": stereo.across_m,
@@ -402,13 +409,4 @@ def _details(
         "mosaic_swath_m": joint_swath(rig, plan.altitude_m, imaging.station_spacing_m).across_m,
         "turn_rate_deg_s": turn_rate_deg_s(plan),
         "raw_bytes_per_s": raw_bytes(camera, len(rig.cameras), 1) / imaging.interval_s,
-    }
-
-
-def _sweep_json(sweep: Sweep) -> dict[str, float]:
-    return {
-        "heading_deg": math.degrees(sweep.heading_rad),
-        "cost_j": sweep.cost_j,
-        "least_width_heading_deg": math.degrees(sweep.width_heading_rad),
-        "least_width_m": sweep.width_m,
     }

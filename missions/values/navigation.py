@@ -1,6 +1,7 @@
 """The vehicle's own estimate of where it was: the navigation log of a flight."""
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,12 +10,14 @@ import numpy as np
 from alice_survey.base.artefacts import write_csv
 from alice_survey.base.frames import Array, Datum
 
-NAVIGATION_COLUMNS = (
-    "time_s", "latitude_deg", "longitude_deg", "depth_m", "roll_deg", "pitch_deg", "heading_deg",
+COLUMNS = (
+    "latitude_deg", "longitude_deg", "depth_m", "roll_deg", "pitch_deg", "heading_deg",
     "altitude_m", "sigma_horizontal_m", "sigma_depth_m", "sigma_attitude_deg", "sigma_heading_deg",
     "sigma_altitude_m",
 )  # fmt: skip
-_DECIMALS = (6, 10, 10, 5, 6, 6, 6, 5, 6, 6, 6, 6, 6)
+"""Columns of a navigation CSV, after the time."""
+_DECIMALS = (10, 10, 5, 6, 6, 6, 5, 6, 6, 6, 6, 6)
+"""Decimals of `COLUMNS`; positions to 0.01 mm."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -40,29 +43,40 @@ class BelievedNavigation:
 
 
 def write_navigation(path: Path, log: BelievedNavigation, datum: Datum) -> None:
-    """Write `navigation.csv`; positions in latitude and longitude to 0.01 mm; NaN as nothing."""
+    """Write `navigation.csv` of a flight; positions in latitude and longitude."""
     geodetic = datum.geodetic_from_ned(log.position_ned)
     roll, pitch, heading = np.rad2deg(log.attitude_rad).T
-    table = np.column_stack(
-        [
-            log.time_s,
-            geodetic[:, 0],
-            geodetic[:, 1],
-            log.position_ned[:, 2],
-            roll,
-            pitch,
-            heading % 360.0,
-            log.altitude_m,
-            log.sigma_horizontal_m,
-            log.sigma_depth_m,
-            np.rad2deg(log.sigma_attitude_rad),
-            np.rad2deg(log.sigma_heading_rad),
-            log.sigma_altitude_m,
-        ]
+    columns = (
+        geodetic[:, 0],
+        geodetic[:, 1],
+        log.position_ned[:, 2],
+        roll,
+        pitch,
+        heading % 360.0,
+        log.altitude_m,
+        log.sigma_horizontal_m,
+        log.sigma_depth_m,
+        np.rad2deg(log.sigma_attitude_rad),
+        np.rad2deg(log.sigma_heading_rad),
+        log.sigma_altitude_m,
     )
-    write_csv(path, NAVIGATION_COLUMNS, (_texts(row) for row in table.tolist()))
+    times = [f"{time_s:.6f}" for time_s in log.time_s.tolist()]
+    write_navigation_rows(path, times, dict(zip(COLUMNS, columns, strict=True)))
 
 
-def _texts(row: list[float]) -> list[str]:
-    pairs = zip(row, _DECIMALS, strict=True)
-    return ["" if math.isnan(value) else f"{value:.{decimals}f}" for value, decimals in pairs]
+def write_navigation_rows(
+    path: Path, times: Sequence[str], columns: Mapping[str, Array], time_column: str = "time_s"
+) -> None:
+    """Write a navigation CSV.
+
+    Args:
+        path: file to write.
+        times: (N,) as text.
+        columns: `COLUMNS`, (N,) each; NaN becomes an empty cell.
+        time_column: `time_s`, or `time_utc` where times are dates.
+    """
+    texts = [
+        ["" if math.isnan(value) else f"{value:.{decimals}f}" for value in columns[name].tolist()]
+        for name, decimals in zip(COLUMNS, _DECIMALS, strict=True)
+    ]
+    write_csv(path, (time_column, *COLUMNS), zip(times, *texts, strict=True))

@@ -8,9 +8,8 @@ import pytest
 from alice_survey.base.config import SurveyConfig, parse_config
 from alice_survey.vehicle.floor import level_floor
 from camera_calib.rig import design_rig
-from missions.exports.mount import mount_of
+from missions.exports.format import Export
 from missions.exports.options import options_of
-from missions.exports.waypoints import all_waypoints
 from missions.fly.simulation import flight_settings, simulate_plan
 from missions.plan.planner import plan_survey
 from missions.values.costs import SETTLE_S
@@ -53,12 +52,13 @@ def test_a_slow_turn_is_planned_as_it_is_flown() -> None:
 def test_way_points_wait_for_turns_at_the_rate_that_is_flown(limit_deg_s: float) -> None:
     config = _survey(limit_deg_s)
     rig, plan = design_rig(config.camera, config.water), _planned(config)
-    rate = options_of(config.camera, config.plan).turn_rate_rad_s
+    options = options_of(config.camera, config.plan)
+    rate = options.turn_rate_rad_s
     assert rate == pytest.approx(math.radians(min(limit_deg_s, 15.0)))
     holds = [
         point.hold_s - SETTLE_S
-        for dive in all_waypoints(plan, mount_of(rig), rate)
-        for point in dive
+        for points in Export(plan=plan, rig=rig, options=options).dives
+        for point in points
         if point.kind == "turn"
     ]
     assert sum(holds) * rate == pytest.approx(_turned_rad(plan), rel=1e-9)

@@ -1,7 +1,7 @@
 """A plan as tables: lines, stations, and the way-points of the paper's lawnmower; CSV."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from alice_survey.base.artefacts import write_csv
 from missions.exports.format import Export, ExportFile, ExportFormat
-from missions.exports.geometry import lat_lon
+from missions.exports.geometry import dive_of_line, lat_lon, line_depths_m
 from missions.exports.waypoints import Waypoint
 from missions.values.plan_file import Plan
 
@@ -28,7 +28,7 @@ def write_lines(path: Path, export: Export, _dive: int = 0) -> None:
     ends = ends_ne.reshape(-1, 4)
     rows = []
     for index, line in enumerate(plan.lines):
-        depths = plan.line_depths_m[index] if plan.line_depths_m else (depth_m,)
+        depths = line_depths_m(plan, index)
         rows.append(
             [
                 index, line.kind,
@@ -58,20 +58,16 @@ def write_waypoints(path: Path, export: Export, _dive: int = 0) -> None:
         "heading_deg", "action", "line", "hold_s", "vehicle_latitude_deg", "vehicle_longitude_deg",
         "vehicle_depth_m", "altimeter_altitude_m",
     )  # fmt: skip
-    write_csv(path, header, _waypoints(export.dives))
+    write_csv(path, header, _waypoints(export))
 
 
 def _stations(plan: Plan) -> Iterator[list[Any]]:
     depth_m = plan.seafloor_depth_m - plan.altitude_m
-    dive_of = {
-        line: number
-        for number, dive in enumerate(plan.dives, start=1)
-        for line in range(dive.first_line, dive.last_line + 1)
-    }
+    dive_of = dive_of_line(plan)
     station = 0
     for index, line in enumerate(plan.lines):
         places = line.stations_ne
-        depths = plan.line_depths_m[index] if plan.line_depths_m else [depth_m] * line.stations
+        depths = line_depths_m(plan, index)
         heading = f"{math.degrees(line.heading_rad):.6f}"
         for place, (lat, lon), depth in zip(
             places, lat_lon(plan.datum, places, depth_m), depths, strict=True
@@ -84,14 +80,14 @@ def _stations(plan: Plan) -> Iterator[list[Any]]:
             station += 1
 
 
-def _waypoints(dives: Sequence[Sequence[Waypoint]]) -> Iterator[list[Any]]:
+def _waypoints(export: Export) -> Iterator[list[Any]]:
     number = 1
-    for dive, points in enumerate(dives, start=1):
+    for dive, points in enumerate(export.dives, start=1):
         for point in points:
             yield [
                 number, dive, f"{point.glass_latitude_deg:.10f}",
                 f"{point.glass_longitude_deg:.10f}", f"{point.glass_depth_m:.3f}",
-                f"{point.glass_altitude_m:.3f}", point.speed_mps,
+                f"{export.plan.altitude_m:.3f}", point.speed_mps,
                 f"{math.degrees(point.heading_rad):.4f}", _action(point),
                 point.line if point.line >= 0 else None, f"{point.hold_s:.1f}",
                 f"{point.latitude_deg:.10f}", f"{point.longitude_deg:.10f}",

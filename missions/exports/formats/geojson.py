@@ -15,10 +15,10 @@ from alice_survey.base.frames import Array, Datum
 from camera_calib.rig import Rig
 from missions.exports.format import Export, ExportFile, ExportFormat
 from missions.exports.geometry import (
+    dive_of_line,
     footprint_outline,
     footprints_ne,
     lat_lon,
-    polygons,
     rings_ne,
     route_ne,
 )
@@ -46,9 +46,8 @@ def _features(plan: Plan, rig: Rig) -> Iterator[str]:
     yield from _areas(plan, "no_go", plan.area.no_go)
     (home,) = _lon_lat(plan.datum, np.array([plan.home_ne_m]), 0.0)
     yield _feature("Point", home, {"role": "home"})
-    dive_of: dict[int, int] = {}
+    dive_of = dive_of_line(plan)
     for number, dive in enumerate(plan.dives, start=1):
-        dive_of |= dict.fromkeys(range(dive.first_line, dive.last_line + 1), number)
         about = {
             "role": "route", "dive": number, "length_m": round(dive.route.length_m, 4),
             "duration_s": round(dive.duration_s, 1), "energy_wh": round(dive.energy_wh, 2),
@@ -92,7 +91,7 @@ def _stations(
 
 
 def _areas(plan: Plan, role: str, geometry: MultiPolygon) -> Iterator[str]:
-    for polygon in polygons(geometry):
+    for polygon in geometry.geoms:
         edges = [
             _ring(_lon_lat(plan.datum, ring, plan.seafloor_depth_m), hole=index > 0)
             for index, ring in enumerate(rings_ne(polygon))
@@ -107,7 +106,7 @@ def _feature(kind: str, coordinates: Any, properties: dict[str, Any]) -> str:
 
 
 def _ring(lon_lat: list[list[float]], *, hole: bool) -> list[list[float]]:
-    """A closed ring; as RFC 7946 asks for, outer ones counter-clockwise and holes clockwise."""
+    """A closed ring; as RFC 7946 has it, outer ones counter-clockwise and holes clockwise."""
     closed = [*lon_lat, lon_lat[0]]
     return closed if shapely.LinearRing(closed).is_ccw != hole else closed[::-1]
 

@@ -1,12 +1,12 @@
 """GPX 1.1 (topografix.com) for chart plotters: home, ends of lines, a route for each dive."""
 
 from pathlib import Path
-from xml.etree.ElementTree import Element, register_namespace
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from missions.exports.format import Export, ExportFile, ExportFormat
-from missions.exports.geometry import lat_lon
+from missions.exports.geometry import lat_lon, line_depths_m
 from missions.exports.xml_text import child, degrees, metres, write_xml
 
 _GPX = "http://www.topografix.com/GPX/1/1"
@@ -15,18 +15,17 @@ _GPX = "http://www.topografix.com/GPX/1/1"
 def write_gpx(path: Path, export: Export, _dive: int = 0) -> None:
     """Write way-points of the left port's glass; elevations are negative depths."""
     plan = export.plan
-    register_namespace("", _GPX)
-    root = Element(f"{{{_GPX}}}gpx", {"version": "1.1", "creator": "alice-survey"})
-    metadata = _child(root, "metadata")
-    _child(metadata, "name", plan.name)
-    _child(metadata, "desc", "Places of the left port's glass; elevation is the negative depth.")
+    root = Element("gpx", {"xmlns": _GPX, "version": "1.1", "creator": "alice-survey"})
+    metadata = child(root, "metadata")
+    child(metadata, "name", plan.name)
+    child(metadata, "desc", "Places of the left port's glass; elevation is the negative depth.")
     ((lat, lon),) = lat_lon(plan.datum, np.array([plan.home_ne_m]), 0.0)
     _point(root, "wpt", float(lat), float(lon), 0.0, "home")
     glass_m = plan.seafloor_depth_m - plan.altitude_m
     ends_ne = np.array([end for line in plan.lines for end in (line.start_ne_m, line.end_ne_m)])
     ends = lat_lon(plan.datum, ends_ne, glass_m)
     for index, line in enumerate(plan.lines):
-        depths = plan.line_depths_m[index] if plan.line_depths_m else (glass_m,)
+        depths = line_depths_m(plan, index)
         for place, depth_m, name in (
             (ends[2 * index], depths[0], "start"),
             (ends[2 * index + 1], depths[-1], "end"),
@@ -36,9 +35,9 @@ def write_gpx(path: Path, export: Export, _dive: int = 0) -> None:
                 f"line {index} {name}", line.kind,
             )  # fmt: skip
     for index, points in enumerate(export.dives, start=1):
-        route = _child(root, "rte")
-        _child(route, "name", f"{plan.name} dive {index}")
-        _child(route, "number", index)
+        route = child(root, "rte")
+        child(route, "name", f"{plan.name} dive {index}")
+        child(route, "number", index)
         for number, point in enumerate(points):
             _point(
                 route, "rtept", point.glass_latitude_deg, point.glass_longitude_deg,
@@ -51,15 +50,11 @@ def _point(
     parent: Element, tag: str, lat: float, lon: float, elevation_m: float, name: str,
     kind: str | None = None,
 ) -> None:  # fmt: skip
-    point = child(parent, f"{{{_GPX}}}{tag}", lat=degrees(lat), lon=degrees(lon))
-    _child(point, "ele", metres(elevation_m))
-    _child(point, "name", name)
+    point = child(parent, tag, lat=degrees(lat), lon=degrees(lon))
+    child(point, "ele", metres(elevation_m))
+    child(point, "name", name)
     if kind is not None:
-        _child(point, "type", kind)
-
-
-def _child(parent: Element, tag: str, text: str | float | None = None) -> Element:
-    return child(parent, f"{{{_GPX}}}{tag}", text)
+        child(point, "type", kind)
 
 
 FORMAT = ExportFormat(

@@ -2,14 +2,14 @@
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from xml.etree.ElementTree import Element, register_namespace
+from xml.etree.ElementTree import Element
 
 import numpy as np
 from shapely.geometry import MultiPolygon
 
 from alice_survey.base.frames import Array
 from missions.exports.format import Export, ExportFile, ExportFormat
-from missions.exports.geometry import lat_lon, polygons, rings_ne, route_ne
+from missions.exports.geometry import lat_lon, line_depths_m, rings_ne, route_ne
 from missions.exports.xml_text import child, degrees, metres, write_xml
 from missions.values.plan_file import Plan
 
@@ -30,10 +30,9 @@ _STYLES = {
 def write_kml(path: Path, export: Export, _dive: int = 0) -> None:
     """Write areas, lines and routes of the left port's glass; heights are negative depths."""
     plan = export.plan
-    register_namespace("", _KML)
-    root = Element(f"{{{_KML}}}kml")
-    document = _child(root, "Document")
-    _child(document, "name", plan.name)
+    root = Element("kml", xmlns=_KML)
+    document = child(root, "Document")
+    child(document, "name", plan.name)
     for name, (colour, width, fill) in _STYLES.items():
         _style(document, name, colour, width, fill)
     glass_m = plan.seafloor_depth_m - plan.altitude_m
@@ -46,10 +45,10 @@ def write_kml(path: Path, export: Export, _dive: int = 0) -> None:
         _areas(areas, plan, name, style, geometry)
     home = _placemark(areas, "home", None, {"role": "home"})
     place = lat_lon(plan.datum, np.array([plan.home_ne_m]), 0.0)
-    _coordinates(_child(home, "Point"), place, [0.0], on_surface=True)
+    _coordinates(child(home, "Point"), place, [0.0], on_surface=True)
     lines = _folder(document, "Lines")
     for index, line in enumerate(plan.lines):
-        depths = plan.line_depths_m[index] if plan.line_depths_m else (glass_m,)
+        depths = line_depths_m(plan, index)
         about = {
             "line": index,
             "kind": line.kind,
@@ -61,7 +60,7 @@ def write_kml(path: Path, export: Export, _dive: int = 0) -> None:
         }
         mark = _placemark(lines, f"line {index}", line.kind, about)
         ends = lat_lon(plan.datum, np.array([line.start_ne_m, line.end_ne_m]), depths[0])
-        _coordinates(_child(mark, "LineString"), ends, [depths[0], depths[-1]])
+        _coordinates(child(mark, "LineString"), ends, [depths[0], depths[-1]])
     routes = _folder(document, "Routes")
     for index, dive in enumerate(plan.dives, start=1):
         about = {
@@ -72,66 +71,62 @@ def write_kml(path: Path, export: Export, _dive: int = 0) -> None:
         }
         mark = _placemark(routes, f"dive {index}", "route", about)
         corners = lat_lon(plan.datum, route_ne(dive.route), glass_m)
-        _coordinates(_child(mark, "LineString"), corners, [glass_m] * len(corners))
+        _coordinates(child(mark, "LineString"), corners, [glass_m] * len(corners))
     write_xml(path, root)
 
 
 def _areas(folder: Element, plan: Plan, name: str, style: str, geometry: MultiPolygon) -> None:
-    for polygon in polygons(geometry):
+    for polygon in geometry.geoms:
         mark = _placemark(folder, name, style, {"role": style})
-        shape = _child(mark, "Polygon")
+        shape = child(mark, "Polygon")
         for index, ring in enumerate(rings_ne(polygon)):
-            edge = _child(shape, "outerBoundaryIs" if index == 0 else "innerBoundaryIs")
+            edge = child(shape, "outerBoundaryIs" if index == 0 else "innerBoundaryIs")
             _ring(edge, lat_lon(plan.datum, ring, plan.seafloor_depth_m))
 
 
-def _child(parent: Element, tag: str, text: str | float | None = None) -> Element:
-    return child(parent, f"{{{_KML}}}{tag}", text)
-
-
 def _folder(document: Element, name: str) -> Element:
-    folder = _child(document, "Folder")
-    _child(folder, "name", name)
+    folder = child(document, "Folder")
+    child(folder, "name", name)
     return folder
 
 
 def _style(document: Element, name: str, colour: str, width: str, fill: str) -> None:
-    style = child(document, f"{{{_KML}}}Style", id=name)
-    line = _child(style, "LineStyle")
-    _child(line, "color", colour)
-    _child(line, "width", width)
-    _child(_child(style, "PolyStyle"), "color", fill)
+    style = child(document, "Style", id=name)
+    line = child(style, "LineStyle")
+    child(line, "color", colour)
+    child(line, "width", width)
+    child(child(style, "PolyStyle"), "color", fill)
 
 
 def _placemark(
     folder: Element, name: str, style: str | None, about: Mapping[str, object]
 ) -> Element:
-    mark = _child(folder, "Placemark")
-    _child(mark, "name", name)
+    mark = child(folder, "Placemark")
+    child(mark, "name", name)
     if style is not None:
-        _child(mark, "styleUrl", f"#{style}")
-    data = _child(mark, "ExtendedData")
+        child(mark, "styleUrl", f"#{style}")
+    data = child(mark, "ExtendedData")
     for key, value in about.items():
-        _child(child(data, f"{{{_KML}}}Data", name=key), "value", str(value))
+        child(child(data, "Data", name=key), "value", str(value))
     return mark
 
 
 def _ring(edge: Element, corners: Array) -> None:
-    ring = _child(edge, "LinearRing")
+    ring = child(edge, "LinearRing")
     closed = np.vstack([corners, corners[:1]])
     text = " ".join(f"{degrees(lon)},{degrees(lat)}" for lat, lon in closed)
-    _child(ring, "coordinates", text)
+    child(ring, "coordinates", text)
 
 
 def _coordinates(
     geometry: Element, rows: Array, depths_m: Iterable[float], *, on_surface: bool = False
 ) -> None:
-    _child(geometry, "altitudeMode", "clampToGround" if on_surface else "absolute")
+    child(geometry, "altitudeMode", "clampToGround" if on_surface else "absolute")
     text = " ".join(
         f"{degrees(lon)},{degrees(lat)},{metres(-depth)}"
         for (lat, lon), depth in zip(rows, depths_m, strict=True)
     )
-    _child(geometry, "coordinates", text)
+    child(geometry, "coordinates", text)
 
 
 FORMAT = ExportFormat(

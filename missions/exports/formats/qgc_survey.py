@@ -8,12 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import shapely
-from shapely.geometry import Polygon
-
 from alice_survey.base.artefacts import write_json
-from alice_survey.base.frames import Array
 from missions.exports.format import Export, ExportFile, ExportFormat
 from missions.exports.formats.qgc import (
     ALTITUDE_MODES,
@@ -50,8 +45,7 @@ def _survey(export: Export, dive: int, items: Sequence[Item], number: int) -> di
     plan, points = export.plan, export.dives[dive]
     ways = [item for item in items if item.frame != FRAME_MISSION]
     parts = plan.area.survey.geoms
-    corners_ne = np.vstack([np.asarray(part.exterior.coords)[:, :2] for part in parts])
-    outline = parts[0] if len(parts) == 1 else Polygon(_hull(corners_ne))
+    outline: Any = parts[0] if len(parts) == 1 else plan.area.survey.convex_hull
     heading = plan.lines[0].heading_rad
     flown = {point.line for point in points if point.line >= 0}
     shots = sum(plan.lines[index].stations for index in flown)
@@ -63,7 +57,7 @@ def _survey(export: Export, dive: int, items: Sequence[Item], number: int) -> di
         "entryLocation": 0,
         "flyAlternateTransects": False,
         "splitConcavePolygons": False,
-        "polygon": corners(plan, Polygon(outline.exterior)),
+        "polygon": corners(plan, outline),
         "TransectStyleComplexItem": {
             "version": 2,
             "CameraCalc": _camera_calc(export),
@@ -77,12 +71,6 @@ def _survey(export: Export, dive: int, items: Sequence[Item], number: int) -> di
             "VisualTransectPoints": [[item.params[4], item.params[5]] for item in ways],
         },
     }
-
-
-def _hull(corners_ne: Array) -> Array:
-    """Corners of the convex hull of (N, 2) places."""
-    hull: Array = shapely.get_coordinates(shapely.MultiPoint(corners_ne).convex_hull)
-    return hull
 
 
 def _camera_calc(export: Export) -> dict[str, Any]:

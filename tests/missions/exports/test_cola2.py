@@ -7,6 +7,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 
 from camera_calib.rig import Rig
+from missions.exports import options
 from missions.exports.mount import mount_of
 from missions.exports.options import Options, line_tolerance_m
 from missions.exports.write import write_exports
@@ -116,18 +117,21 @@ def test_an_arc_is_flown_as_chords_that_lie_near_it() -> None:
     assert 0.5 * (1 - math.cos(widest / 2)) <= 0.02
 
 
-def test_the_tolerance_keeps_neighbouring_lines_together() -> None:
+def test_the_tolerance_keeps_neighbouring_lines_together(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # Never COLA2's 1.5 m, never less than what a vehicle holds.
+    assert line_tolerance_m(small_plan(line_spacing_m=1.26), RIG) == 0.12
+    monkeypatch.setattr(options, "LEAST_TOLERANCE_M", 0.01)
     plan = small_plan(line_spacing_m=0.8)
     stereo = common_swath(RIG, 2.0, plan.station_spacing_m)
-    error_m = line_tolerance_m(plan, RIG, Options(least_tolerance_m=0.01))
+    error_m = line_tolerance_m(plan, RIG)
 
     # Two lines that are off by it, apart, just meet; here that is less than half a step of 0.46 m.
     assert 0.8 + 2 * error_m == pytest.approx(2 * stereo.half_across_m)
     assert 0.2 < error_m < 0.23
-    close = line_tolerance_m(small_plan(line_spacing_m=0.7), RIG, Options(least_tolerance_m=0.01))
+    close = line_tolerance_m(small_plan(line_spacing_m=0.7), RIG)
     assert close == pytest.approx(0.23)
-    # Never COLA2's 1.5 m, never less than what a vehicle holds.
-    assert line_tolerance_m(small_plan(line_spacing_m=1.26), RIG, Options()) == 0.12
     written = [s.values["tolerance_xy"] for s in steps_of(plan, RIG) if s.kind == "section"]
     assert written == pytest.approx([error_m] * len(written), abs=1e-4)
 
@@ -154,9 +158,9 @@ def test_version_1_flies_the_same_places(plan: Plan) -> None:
 
 
 def test_names_of_actions_are_the_vehicles_own() -> None:
-    options = Options(camera_on="/rig/start", camera_off="/rig/stop & wait")
+    named = Options(camera_on="/rig/start", camera_off="/rig/stop & wait")
     with tempfile.TemporaryDirectory() as folder:
-        write_exports(Path(folder), small_plan(), RIG, formats=["cola2"], options=options)
+        write_exports(Path(folder), small_plan(), RIG, formats=["cola2"], options=named)
         steps = read_cola2(Path(folder) / "mission_dive1.xml")
     calls = [action for step in steps for action in step.actions]
     assert calls == ["/rig/start", "/rig/stop & wait"] * 3
@@ -197,7 +201,7 @@ def test_dives_of_one_line_without_a_run_in() -> None:
 @settings(max_examples=25, deadline=None)
 @given(rig=rigs())
 def test_the_mount_is_where_the_glass_was_designed(rig: Rig) -> None:
-    mount = mount_of(rig)
+    mount = mount_of(rig, (0.0, 0.0, 0.11))
     forward, right = mount.glass_body_m[:2]
     for heading in (0.0, 1.0, math.pi, -2.0):
         vehicle = mount.vehicle_ne(np.array([[3.0, 4.0]]), np.array([heading]))[0]

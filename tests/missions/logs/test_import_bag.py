@@ -105,7 +105,6 @@ def test_a_flight_comes_back_from_its_bag(tmp_path: Path) -> None:
     expected = np.rad2deg(attitude_from_rotation(record.believed.rotation))
     np.testing.assert_allclose((angles - expected + 180) % 360 - 180, 0, atol=1e-6)
     # Ranges are float32 in ROS; row 7 has no bottom.
-    assert record.altitude_m is not None and record.rpm is not None
     np.testing.assert_allclose(read.columns["altitude_m"][8:], record.altitude_m[8:], atol=1e-5)
     for name, sigma in (
         ("sigma_horizontal_m", record.sigma_horizontal_m),
@@ -115,7 +114,6 @@ def test_a_flight_comes_back_from_its_bag(tmp_path: Path) -> None:
     ):
         np.testing.assert_allclose(read.columns[name], sigma, atol=1e-6)
     vehicle = read_vehicle_log(tmp_path / "vehicle.csv")
-    assert record.believed_velocity is not None
     np.testing.assert_allclose(vehicle.velocity_body, record.believed_velocity[:, :3], atol=1e-8)
     np.testing.assert_allclose(vehicle.rates_body, record.believed_velocity[:, 3:], atol=1e-8)
     np.testing.assert_allclose(vehicle.rpm["starboard"], record.rpm[:, 1], atol=1e-6)
@@ -124,7 +122,7 @@ def test_a_flight_comes_back_from_its_bag(tmp_path: Path) -> None:
 
 
 def test_a_simulations_clock_gives_seconds(tmp_path: Path) -> None:
-    write_bag(tmp_path / "dive", flight(start_utc_ns=0))
+    write_bag(tmp_path / "dive", flight())
     _, data = import_log(tmp_path / "dive", tmp_path / "n.csv")
     assert not data["dated"]
     times = numbers(tmp_path / "n.csv", "time_s")[:, 0]

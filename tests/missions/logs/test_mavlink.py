@@ -16,8 +16,18 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from alice_survey.base.errors import NavigationError
-from missions.logs.mavlink import MESSAGES, Message, Packet, checksum, packet_at
-from missions.logs.tlog import COMPONENT, RECORDED, SYSTEM, packets, read_tlog
+from missions.logs.tlog import (
+    COMPONENT,
+    MESSAGES,
+    RECORDED,
+    SYSTEM,
+    Message,
+    Packet,
+    checksum,
+    packet_at,
+    packets,
+    read_tlog,
+)
 from tests.missions.logs.log_files import tlog
 
 CRC_EXTRA = {0: 50, 24: 24, 30: 39, 33: 104, 36: 222, 74: 20, 132: 85, 173: 83}

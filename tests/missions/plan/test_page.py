@@ -71,14 +71,26 @@ def run_node(*arguments: str) -> Any:
     return json.loads(done.stdout)
 
 
-def layers_of(plan: Plan, **more: Any) -> dict[str, PictureLayer | ShapeLayer]:
-    return {layer.name: layer for layer in plan_map(plan, RIG, **more).layers}
+def layers_of(
+    plan: Plan, bathymetry: Bathymetry | None = None
+) -> dict[str, PictureLayer | ShapeLayer]:
+    sea = SeaConfig(current_mps=0.0)
+    layers = plan_map(plan, RIG, seen_of(plan), bathymetry, sea).layers
+    return {layer.name: layer for layer in layers}
+
+
+def write(path: Path, plan: Plan, cell_m: float | None = None, **more: Any) -> None:
+    """Write a page."""
+    values: dict[str, Any] = {
+        "bathymetry": None, "sea": SeaConfig(), "warnings": [], "links": [], **more,
+    }  # fmt: skip
+    write_page(path, plan, RIG, seen_of(plan, cell_m), [ROW], **values)
 
 
 def test_nothing_in_a_plan_can_become_markup_or_script(tmp_path: Path) -> None:
     path = tmp_path / "plan.html"
     link = Link(text="b.xml", address='exports/a"b<c.xml', about=NASTY)
-    write_page(path, small_plan(name=NASTY), RIG, None, [ROW], warnings=[NASTY], links=[link])
+    write(path, small_plan(name=NASTY), warnings=[NASTY], links=[link])
     page = Texts(path)
     assert page.texts["h1"] == page.texts["title"] == [NASTY]
     assert NASTY in page.texts["span"]
@@ -90,7 +102,7 @@ def test_nothing_in_a_plan_can_become_markup_or_script(tmp_path: Path) -> None:
 def test_the_same_plan_gives_the_same_page_that_loads_nothing(tmp_path: Path) -> None:
     plan = small_plan()
     for name in ("a.html", "b.html"):
-        write_page(tmp_path / name, plan, RIG, seen_of(plan), [ROW], sea=SeaConfig())
+        write(tmp_path / name, plan)
     text = (tmp_path / "a.html").read_text(encoding="utf-8")
     assert text == (tmp_path / "b.html").read_text(encoding="utf-8")
     assert "default-src 'none'; img-src data: blob:;" in text
@@ -104,8 +116,7 @@ def test_pages_stay_small(tmp_path: Path) -> None:
     large = [line((0.0, float(i)), (46.0, float(i)), step=0.4647) for i in range(1000)]
     for lines, most in ((paper, 260_000), (large, 500_000)):
         plan = plan_of(lines, [(0, len(lines) - 1)])
-        seen = seen_of(plan, cell_m=0.25 if lines is large else None)
-        write_page(tmp_path / "plan.html", plan, RIG, seen)
+        write(tmp_path / "plan.html", plan, cell_m=0.25 if lines is large else None)
         assert 200_000 < (tmp_path / "plan.html").stat().st_size < most
     assert plan.stations == 100_000
 
@@ -169,7 +180,7 @@ def test_the_script_finds_lines_and_stations() -> None:
 @pytest.mark.parametrize("size", [(1280, 900), (400, 800)])
 def test_pointing_and_layers(size: tuple[int, int], tmp_path: Path) -> None:
     plan, path = small_plan(), tmp_path / "plan.html"
-    write_page(path, plan, RIG, seen_of(plan), [ROW], sea=SeaConfig())
+    write(path, plan)
     north, east = plan.lines[1].stations_ne[3].tolist()
     with chromium() as browser:
         page = browser.new_page(viewport={"width": size[0], "height": size[1]})
@@ -224,7 +235,7 @@ def test_a_plan_without_extras_has_no_layers_for_them() -> None:
     plan = plan_of([line((0.0, 0.0), (3.0, 0.0))], [(0, 0)])
     layers = layers_of(plan)
     assert layers["dive-1-survey"].title == "1 survey line"
-    assert not {"contours", "current", "no_go", "counts", "missed"} & set(layers)
+    assert not {"contours", "current", "no_go"} & set(layers)
 
 
 def test_contours_of_a_plane_are_straight_and_where_they_should_be() -> None:
@@ -248,7 +259,7 @@ def test_contours_of_a_plane_are_straight_and_where_they_should_be() -> None:
         vertical_datum="none",
         reading="depths",
     )
-    contours = layers_of(plan, bathymetry=bathymetry)["contours"]
+    contours = layers_of(plan, bathymetry)["contours"]
 
     assert isinstance(contours, ShapeLayer)
     depths = [float(text.removesuffix(" m")) for text in contours.texts]
@@ -259,8 +270,3 @@ def test_contours_of_a_plane_are_straight_and_where_they_should_be() -> None:
         points = np.array(shape)
         assert points[:, 1] == pytest.approx((depth - 15.0) / 0.1, abs=0.01)
         assert np.ptp(points[:, 0]) > 8.0
-
-
-def test_a_level_floor_has_no_contours_and_a_still_sea_no_arrow() -> None:
-    layers = layers_of(small_plan(), sea=SeaConfig(current_mps=0.0))
-    assert not {"contours", "current"} & set(layers)

@@ -14,10 +14,13 @@ from shapely.geometry import MultiPolygon
 from alice_survey.base.config import SeaConfig, parse_config
 from alice_survey.base.errors import ConfigError
 from alice_survey.base.executor import SERIAL
+from alice_survey.kit.figure import Sheet, save_figure
 from alice_survey.stages import spec
-from missions.plan.map import draw_plan, map_report, plan_figure
+from missions.coverage.certificate import certificate
+from missions.coverage.stations import plan_pattern, stations_of_plan
+from missions.plan.map import map_report, plan_figure
 from missions.values.plan_file import Plan
-from tests.missions.exports.plans import RIG, line, plan_of, small_plan
+from tests.missions.exports.plans import RIG, line, plan_of
 
 
 def rows(count: int, length_m: float) -> Plan:
@@ -31,10 +34,17 @@ def rows(count: int, length_m: float) -> Plan:
     return plan_of(lines, [(0, count - 1)])
 
 
+def figure_of(plan: Plan, **sea: float) -> Sheet:
+    """The map of a plan, its coverage counted on a coarse grid."""
+    pattern = plan_pattern(plan, RIG)
+    seen = certificate(plan.area, RIG, stations_of_plan(plan), pattern, cell_m=0.25)
+    return plan_figure(plan, RIG, seen, None, SeaConfig(**sea))
+
+
 def test_a_long_area_leaves_no_empty_sheet(tmp_path: Path) -> None:
     heights = {}
     for name, plan in {"long": rows(4, 40.0), "square": rows(20, 20.0)}.items():
-        draw_plan(tmp_path / f"{name}.png", plan, RIG)
+        save_figure(figure_of(plan), tmp_path / f"{name}.png")
         with Image.open(tmp_path / f"{name}.png") as picture:
             pixels = np.asarray(picture.convert("L"))
         heights[name] = pixels.shape[0]
@@ -46,8 +56,7 @@ def test_a_long_area_leaves_no_empty_sheet(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("towards_deg", [0.0, 30.0, 135.0, 250.0])
 def test_the_current_points_where_it_flows_on_a_map_of_any_shape(towards_deg: float) -> None:
-    sea = SeaConfig(current_mps=0.1, current_towards_deg=towards_deg)
-    figure = plan_figure(rows(4, 40.0), RIG, sea=sea)
+    figure = figure_of(rows(4, 40.0), current_mps=0.1, current_towards_deg=towards_deg)
     figure.draw_without_rendering()
     axes = figure.axes[0]
     (arrow,) = (t for t in axes.texts if t.get_text() == "" and hasattr(t, "xyann"))
@@ -62,7 +71,7 @@ def test_the_current_points_where_it_flows_on_a_map_of_any_shape(towards_deg: fl
 
 @pytest.mark.parametrize("count", [5, 120])
 def test_lines_leave_room_between_them(count: int) -> None:
-    figure = plan_figure(rows(count, float(count)), RIG)
+    figure = figure_of(rows(count, float(count)))
     figure.draw_without_rendering()
     axes = figure.axes[0]
     (drawn_lines,) = (c for c in axes.collections if isinstance(c, LineCollection))
@@ -74,19 +83,14 @@ def test_lines_leave_room_between_them(count: int) -> None:
 
 def test_the_allowed_area_is_whole_on_the_map_unless_it_is_much_larger() -> None:
     plan = rows(16, 15.0)
-    axes = plan_figure(plan, RIG).axes[0]
+    axes = figure_of(plan).axes[0]
     south, west, north, east = plan.area.allowed.bounds
     assert axes.get_xlim()[0] < west < east < axes.get_xlim()[1]
     assert axes.get_ylim()[0] < south < north < axes.get_ylim()[1]
     sea = MultiPolygon([shapely.box(-500, -500, 500, 500)])
     wide = replace(plan, area=replace(plan.area, allowed=sea))
-    axes = plan_figure(wide, RIG).axes[0]
+    axes = figure_of(wide).axes[0]
     assert np.ptp(axes.get_xlim()) < 2 * 15
-
-
-def test_an_unknown_suffix_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError):
-        draw_plan(tmp_path / "map.xyz", small_plan(), RIG)
 
 
 @pytest.mark.parametrize(
